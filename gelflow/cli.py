@@ -1,0 +1,188 @@
+"""The command line: `python -m gelflow train|finetune|evaluate|compare|predict|pairs`.
+
+Exit status: 0 done, 1 done in part, 2 wrong input, 130 interrupted. Nothing heavy is imported before a command runs.
+"""
+
+import sys
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import App, CycloptsError, Parameter
+
+from gelflow import __version__
+from gelflow.errors import InputError
+
+app = App(
+    name="gelflow",
+    version=__version__,
+    help="Learned optical flow for vision-based tactile sensors.\n\nWith --debug, a mistake shows its traceback.",
+    result_action="return_value",
+    suppress_keyboard_interrupt=False,
+)
+
+Device = Literal["auto", "cpu", "cuda"]
+Paths = Annotated[list[Path], Parameter(help="Folders of pairs: of synth, of `pairs`, or NAME_1.png, NAME_2.png.")]
+AsJson = Annotated[bool, Parameter("--json", negative=(), help="Print the answer as JSON on stdout.")]
+Size = Annotated[str | None, Parameter(help="ROWSxCOLUMNS at which the network works; default: as in training.")]
+Assignments = Annotated[list[str] | None, Parameter("--set", help="KEY=VALUE, such as loss.lambda_dc=10; repeatable.")]
+Out = Annotated[Path, Parameter(help="Folder for the results.")]
+Validation = Annotated[list[Path] | None, Parameter(help="Folders of pairs to validate on.")]
+Config = Annotated[Path | None, Parameter(help="TOML file with the settings of the run.")]
+Steps = Annotated[int | None, Parameter(help="Optimiser steps.")]
+Resume = Annotated[bool, Parameter(negative=(), help="Go on with the run that --out holds.")]
+OnDevice = Annotated[Device, Parameter(help="Where networks run; auto: a CUDA device where there is one.")]
+TrainDevice = Annotated[Device | None, Parameter(help="Where to train; auto: a CUDA device where there is one.")]
+
+
+@app.command
+def train(
+    data: Paths,
+    /,
+    *,
+    out: Out,
+    validation: Validation = None,
+    config: Config = None,
+    assignments: Assignments = None,
+    steps: Steps = None,
+    device: TrainDevice = None,
+    resume: Resume = False,
+) -> int:
+    """Trains a network on image pairs."""
+    from gelflow.commands import run_train
+
+    options = {"steps": steps, "device": device}
+    return run_train(data, validation or [], out, config, assignments or [], options, resume, None)
+
+
+@app.command
+def finetune(
+    data: Paths,
+    /,
+    *,
+    weights: Annotated[Path, Parameter(help="File of weights to start from.")],
+    out: Out,
+    validation: Validation = None,
+    config: Config = None,
+    assignments: Assignments = None,
+    steps: Steps = None,
+    device: TrainDevice = None,
+    resume: Resume = False,
+) -> int:
+    """Trains on, from given weights, whose architecture is kept."""
+    from gelflow.commands import run_train
+
+    options = {"steps": steps, "device": device}
+    return run_train(data, validation or [], out, config, assignments or [], options, resume, weights)
+
+
+@app.command
+def evaluate(
+    data: Paths,
+    /,
+    *,
+    weights: Annotated[Path, Parameter(help="File of weights of a network.")],
+    size: Size = None,
+    device: OnDevice = "auto",
+    as_json: AsJson = False,
+) -> int:
+    """Scores one file of weights on image pairs."""
+    from gelflow.commands import run_evaluate
+
+    return run_evaluate(data, weights, size, device, as_json)
+
+
+@app.command
+def compare(
+    data: Paths,
+    /,
+    *,
+    out: Annotated[Path | None, Parameter(help="Folder for scores.csv, scores.json, table.md and table.png.")] = None,
+    methods: Annotated[
+        str, Parameter(help="Classical methods, separated by commas; an empty text for none of them.")
+    ] = "none,farneback,dis-ultrafast,dis-fast,dis-medium,tvl1",
+    weights: Annotated[list[str] | None, Parameter(help="FILE or LABEL=FILE of a network; repeatable.")] = None,
+    size: Size = None,
+    device: OnDevice = "auto",
+    as_json: AsJson = False,
+) -> int:
+    """Scores several methods on the same image pairs."""
+    from gelflow.commands import run_compare
+
+    return run_compare(data, out, methods, weights or [], size, device, as_json)
+
+
+@app.command
+def predict(
+    inputs: Annotated[list[Path], Parameter(help="Two images, or one video or folder of frames.")],
+    /,
+    *,
+    out: Out,
+    weights: Annotated[Path | None, Parameter(help="File of weights of a network; or give --method.")] = None,
+    method: Annotated[
+        str | None, Parameter(help="A classical method: farneback, dis-ultrafast, dis-fast, dis-medium, tvl1.")
+    ] = None,
+    reference: Annotated[
+        Literal["first", "previous"], Parameter(help="Of a video: flow from its first frame, or from the one before.")
+    ] = "first",
+    every: Annotated[int, Parameter(help="Of a video: take every n-th frame.")] = 1,
+    size: Size = None,
+    device: OnDevice = "auto",
+    as_json: AsJson = False,
+) -> int:
+    """Flow of a pair of images or of a video, to EXR, .flo and pictures."""
+    from gelflow.commands import run_predict
+
+    return run_predict(inputs, out, weights, method, reference, every, size, device, as_json)
+
+
+@app.command
+def pairs(
+    inputs: Annotated[list[str], Parameter(help="Videos, folders of videos or images, patterns like 'day1/*.mp4'.")],
+    /,
+    *,
+    out: Out,
+    per_video: Annotated[int, Parameter(help="Most pairs from one recording.")] = 10,
+    min_motion: Annotated[float, Parameter(help="Least motion in px, 95th percentile over the image.")] = 2.0,
+    max_motion: Annotated[float, Parameter(help="Most motion in px.")] = 60.0,
+    min_difference: Annotated[
+        float, Parameter(help="Least difference in px between the flows of two pairs of one recording.")
+    ] = 1.0,
+    frames: Annotated[int, Parameter(help="Most frames of a recording that are looked at.")] = 40,
+    tries: Annotated[int, Parameter(help="Most pairs of a recording that are tried.")] = 200,
+    seed: Annotated[int, Parameter(help="Seed of the random choice.")] = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Chooses image pairs with enough motion from recordings; goes on where the same job was interrupted."""
+    from gelflow.commands import run_pairs
+    from gelflow.data.choose import ChoiceConfig
+
+    config = ChoiceConfig(per_video, min_motion, max_motion, min_difference, frames, tries, seed)
+    return run_pairs(inputs, out, config, as_json)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs a command and returns the exit status. A mistake is one line on stderr, or a traceback with --debug."""
+    tokens = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in tokens
+    tokens = [token for token in tokens if token != "--debug"]
+    try:
+        status = app(tokens, exit_on_error=False, print_error=False)
+    except (InputError, CycloptsError, OSError) as error:
+        if debug:
+            traceback.print_exc()
+        print(f"gelflow: {_one_line(error)}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt as interrupt:
+        if debug:
+            traceback.print_exc()
+        print(f"gelflow: {str(interrupt) or 'interrupted; what is finished has been kept'}", file=sys.stderr)
+        return 130
+    return status if isinstance(status, int) else 0
+
+
+def _one_line(error: Exception) -> str:
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return " ".join(str(error).split())

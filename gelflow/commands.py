@@ -1,0 +1,202 @@
+"""What the commands do once their arguments are known. Imported when one of them runs.
+
+Each function returns the exit status: 0 done, 1 done in part.
+"""
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from statistics import quantiles
+from typing import Any
+
+from gelflow.baselines import Method, named_methods
+from gelflow.baselines.learned import Learned
+from gelflow.compare import compare
+from gelflow.data import PairDataset, join, open_pairs
+from gelflow.data.choose import ChoiceConfig
+from gelflow.data.extract import extract_pairs, find_recordings
+from gelflow.data.pairset import FILE, PairSet, SourceReport
+from gelflow.errors import InputError
+from gelflow.evaluate import PairScore, summarise
+from gelflow.overrides import train_config
+from gelflow.predict import Prediction, Reference, predict_pair, predict_video
+from gelflow.report import FILES, MOST_PAIRS_IN_A_TABLE, as_json_text, pair_table, summary_table
+from gelflow.terminal import progress, show_table
+
+
+def open_all(paths: Sequence[Path]) -> PairDataset:
+    """Several folders of pairs as one data set.
+
+    Raises:
+        InputError: One of them cannot be opened.
+    """
+    return join([open_pairs(path) for path in paths])
+
+
+def parse_size(text: str | None) -> tuple[int, int] | None:
+    """ROWSxCOLUMNS as numbers.
+
+    Raises:
+        InputError: The text is something else.
+    """
+    if text is None:
+        return None
+    rows, _, columns = text.lower().partition("x")
+    if not (rows.isdigit() and columns.isdigit()):
+        raise InputError(f"--size {text}: ROWSxCOLUMNS is needed, for instance --size 512x640")
+    return int(rows), int(columns)
+
+
+def run_train(
+    data: Sequence[Path],
+    validation: Sequence[Path],
+    out: Path,
+    config: Path | None,
+    assignments: Sequence[str],
+    options: dict[str, Any],
+    resume: bool,
+    weights: Path | None,
+) -> int:
+    """`train`, and `finetune` where weights are given."""
+    from gelflow.train import train
+    from gelflow.train.checkpoint import load_weights
+
+    start = {} if weights is None else {"model": load_weights(weights).config.model_dump()}
+    settings = train_config(config, assignments, options, start)
+    validation_set = open_all(validation) if validation else None
+    result = train(settings, open_all(data), validation_set, out, initial=weights, resume=resume)
+    print(result)
+    return 0
+
+
+def run_evaluate(data: Sequence[Path], weights: Path, size: str | None, device: str, as_json: bool) -> int:
+    """`evaluate`."""
+    return _score(data, [Learned(weights, size=parse_size(size), device=device)], None, as_json)
+
+
+def run_compare(
+    data: Sequence[Path],
+    out: Path | None,
+    methods: str,
+    weights: Sequence[str],
+    size: str | None,
+    device: str,
+    as_json: bool,
+) -> int:
+    """`compare`; `methods` are separated by commas, `weights` are FILE or LABEL=FILE."""
+    chosen = named_methods([name.strip() for name in methods.split(",") if name.strip()])
+    for given in weights:
+        label, equals, file = given.partition("=")
+        chosen.append(Learned(Path(file if equals else given), label if equals else None, parse_size(size), device))
+    return _score(data, chosen, out, as_json)
+
+
+def _score(data: Sequence[Path], methods: Sequence[Method], out: Path | None, as_json: bool) -> int:
+    dataset = open_all(data)
+    done = 0
+    with progress("pairs", not as_json) as advance:
+
+        def step(score: PairScore) -> None:
+            nonlocal done
+            done += 1
+            advance(done, len(dataset) * len(methods), f"{score.method}, {score.pair}")
+
+        scores = compare(methods, dataset, out, step)
+    means = summarise(scores)
+    if as_json:
+        print(as_json_text([dataset.source], means, scores))
+        return 0
+    show_table(f"means over {len(dataset)} pairs of {dataset.source}", *summary_table(means))
+    if len(dataset) <= MOST_PAIRS_IN_A_TABLE:
+        show_table("each pair: PSNR dB / SSIM, endpoint error, (distance to dots)", *pair_table(scores))
+    if out is not None:
+        print(f"written: {', '.join(str(out / name) for name in FILES)}")
+    return 0
+
+
+def run_predict(
+    inputs: Sequence[Path],
+    out: Path,
+    weights: Path | None,
+    method: str | None,
+    reference: Reference,
+    every: int,
+    size: str | None,
+    device: str,
+    as_json: bool,
+) -> int:
+    """`predict`."""
+    if len(inputs) not in (1, 2):
+        raise InputError(f"{len(inputs)} inputs given; allowed: two images, or one video or folder of frames")
+    for path in inputs:
+        if not path.exists():
+            raise InputError(f"{path}: there is no such file or folder")
+    if method is not None and weights is None:
+        estimator = named_methods([method])[0]
+    elif weights is not None and method is None:
+        estimator = Learned(weights, size=parse_size(size), device=device)
+    else:
+        raise InputError("give either --weights FILE (of a network) or --method NAME (a classical one)")
+    if len(inputs) == 2:
+        result = predict_pair(estimator, inputs[0], inputs[1], out)
+    else:
+        with progress("frames, then overlay", not as_json) as advance:
+            result = predict_video(estimator, inputs[0], out, reference, every, lambda n, total: advance(n, total, ""))
+    _show_prediction(result, estimator.name, as_json)
+    return 0
+
+
+def _show_prediction(result: Prediction, name: str, as_json: bool) -> None:
+    if as_json:
+        motions = [asdict(motion) for motion in result.motions]
+        print(json.dumps({"files": [str(file) for file in result.files], "motions": motions}))
+        return
+    largest = max(result.motions, key=lambda motion: motion.p95_px)
+    where = f" in frame {largest.frame}, the one with most motion," if len(result.motions) > 1 else ""
+    print(f"{name}:{where} mean motion {largest.mean_px:.3g} px, 95th percentile {largest.p95_px:.3g} px")
+    shown = result.files if len(result.files) <= 6 else [result.files[0], "...", *result.files[-3:]]
+    print(f"written: {', '.join(str(file) for file in shown)}")
+
+
+def run_pairs(inputs: Sequence[str], out: Path, config: ChoiceConfig, as_json: bool) -> int:
+    """`pairs`."""
+    total = len(find_recordings(inputs))
+    with progress("recordings", not as_json) as advance:
+
+        def step(done: int, _: int, name: str, outcome: SourceReport | str) -> None:
+            if isinstance(outcome, str):
+                print(f"gelflow: skipped: {outcome}", file=sys.stderr)
+            advance(done, total, name)
+
+        result = extract_pairs(inputs, out, config, step)
+    if not result.sources:
+        raise InputError(f"none of the {len(result.failures)} recordings can be read; the reasons are in {out / FILE}")
+    if not result.pairs:
+        raise InputError(
+            f"no pair of the {len(result.sources)} recordings has a motion of {config.minimum_motion_px:g} to "
+            f"{config.maximum_motion_px:g} px; give a lower --min-motion and another --out"
+        )
+    _show_pairs(result, out, as_json)
+    return 1 if result.failures else 0
+
+
+def _show_pairs(result: PairSet, out: Path, as_json: bool) -> None:
+    motions = sorted(pair.motion_px for pair in result.pairs)
+    deciles = [round(value, 1) for value in quantiles(motions, n=10)] if len(motions) > 1 else motions
+    empty = sum(report.chosen == 0 for report in result.sources.values())
+    if as_json:
+        answer = {
+            "out": str(out),
+            "pairs": len(motions),
+            "recordings": len(result.sources),
+            "without_pairs": empty,
+            "failures": result.failures,
+            "motion_deciles_px": deciles,
+        }
+        print(json.dumps(answer))
+        return
+    counts = f"{empty} without enough motion, {len(result.failures)} unreadable"
+    print(f"{len(motions)} pairs from {len(result.sources)} recordings ({counts}) in {out}")
+    print(f"motion (95th percentile over the image, px): {motions[0]:.1f} to {motions[-1]:.1f}, deciles {deciles}")

@@ -1,0 +1,201 @@
+"""Settings of the network, of the losses and of a training run: validated once, at the edge, then passed down in parts.
+
+Where the paper (Zhang, Yang and Yin, "GelFlow") is silent or can be read in more than one way, the reading is a field
+here, its default is stated with its reason, and the alternatives stand beside it. Quantities in px are px of the scale
+that they belong to; scale s has 1/2^s of the image's resolution.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from gelflow.errors import InputError
+
+MINIMUM_SIDE = 64
+"""Images with a side below this many px have no coarsest scale worth decoding."""
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class ModelConfig(_Frozen):
+    """The network: what its weights depend on. Stored with the weights."""
+
+    levels: int = Field(default=8, ge=4, le=8)
+    """Scales l of the pyramid, the image (s = 0) included; features at s = 1 .. levels-1. Paper: 8."""
+    finest_scale: int = Field(default=2, ge=1, le=3)
+    """Finest scale that is decoded; finer flows are bilinear enlargements of it. Paper: V0 is up4 of V2."""
+    correlation_radius: int = Field(default=4, ge=1, le=8)
+    """Search range of the cost volume in px of the scale: (2 r + 1)^2 displacements, mean over channels. PWC-Net: 4."""
+    projected_channels: int = Field(default=32, ge=8, le=128)
+    """Channels to which each scale's features are projected by 1x1 convolutions (ARFlow: 32)."""
+    estimator: Literal["per_scale", "shared"] = "per_scale"
+    """A flow estimator and context network for each scale (PWC-Net; 9.3 million weights) or one for all (ARFlow's
+    PWC-lite; 3.3 million). The paper names both ancestors and does not say. The time of a step is the same, but the
+    shared one needs two to three times as many steps to start to follow the motion."""
+    normalise_features: bool = True
+    """Bring both images' features to mean 0 and variance 1 (jointly, per scale and sample) before they are correlated
+    (UFlow). The paper is silent; without it a network trained from scratch found no motion within 1000 steps."""
+    lffm: bool = True
+    """The local flow fusion module; False for the ablation."""
+    lffm_region: Literal[3, 5] = 3
+    """Side of the module's window in px of the scale. Paper: 3."""
+    lffm_scale: Literal["inverse_sqrt", "none"] = "inverse_sqrt"
+    """Factor on the dot products before the softmax: 1/sqrt(C), or 1 as published. Unscaled products of long feature
+    vectors turn the softmax into a selection of the centre, and the module into the identity."""
+
+    @model_validator(mode="after")
+    def _decodes_something(self) -> ModelConfig:
+        if self.finest_scale >= self.levels - 1:
+            raise ValueError(f"finest_scale = {self.finest_scale} must be below the coarsest scale {self.levels - 1}")
+        return self
+
+
+class LossConfig(_Frozen):
+    """The losses and their weights. Letters are the paper's."""
+
+    alpha: float = Field(default=0.85, ge=0, le=1)
+    """Share of SSIM in the photometric loss; the rest is the absolute difference."""
+    mask_outside: bool = True
+    """Pixels whose flow leaves the image do not count in the photometric loss. The paper is silent on occlusion; the
+    second image holds no evidence for them."""
+    smoothness: Literal["helmholtz", "first_order", "none"] = "helmholtz"
+    """Regulariser with weight lambda_dc: the paper's decomposition loss, or the edge-aware first-order smoothness of
+    SelfFlow (the paper's comparison; there the deformation loss is left out), or none."""
+    lambda_dc: float = Field(default=75.0, ge=0)
+    """Weight of the regulariser."""
+    lambda_theta: float = Field(default=0.01, ge=0)
+    """Weight of the shear distortion rate within the decomposition loss."""
+    lambda_zeta: float = Field(default=0.01, ge=0)
+    """Weight of the rotation within the decomposition loss."""
+    flow_normalisation: Literal["min_side", "none"] = "min_side"
+    """Divide the flow by the shorter side of the image (scale 0, in px, for all scales alike, as ARFlow does) before
+    the regulariser. Without it, lambda_dc = 75 makes the true flow of a 4 px press score ten times worse than no flow,
+    and training collapses to no flow."""
+    lambda_df: float = Field(default=0.01, ge=0)
+    """Weight of the deformation loss."""
+    ratio: Literal["product", "det"] = "product"
+    """Area ratio in the deformation loss: R_x R_y as published (a rotation by 0.1 rad gives 0.990), or the determinant
+    of the deformation gradient (1 for every rotation, up to the flow's discretisation)."""
+    beta: float = Field(default=10.0, ge=0)
+    """Steepness of the weight in the image gradient."""
+    weight: Literal["anti_edge", "edge_aware", "floor"] = "anti_edge"
+    """Weight of the decomposition and deformation losses at a pixel: 1 - exp(-beta |grad I|) as published, which
+    vanishes where there is no texture; exp(-beta |grad I|); or the published one raised to at least weight_floor."""
+    weight_floor: float = Field(default=0.1, ge=0, le=1)
+    """Smallest weight of weight = "floor"."""
+    lambda_s: tuple[float, ...] = (1.0,) * 7
+    """Weight of each scale, finest (s = 0) first; levels - 1 numbers. Paper: 1 for s = 0 .. 6. A scale of weight 0 is
+    not computed."""
+
+    @model_validator(mode="after")
+    def _some_scale_counts(self) -> LossConfig:
+        if any(value < 0 for value in self.lambda_s) or not any(value > 0 for value in self.lambda_s):
+            raise ValueError(f"lambda_s = {list(self.lambda_s)} must be numbers >= 0, at least one of them above 0")
+        return self
+
+
+class TrainConfig(_Frozen):
+    """A training run. Together with the data, the seed and the initial weights it determines the result."""
+
+    model: ModelConfig = ModelConfig()
+    loss: LossConfig = LossConfig()
+    supervision: Literal["self", "flow"] = "self"
+    """Train on the images alone (the paper), or on the exact flow by the multi-scale endpoint loss."""
+    image_size: tuple[int, int] | None = None
+    """Rows and columns to which images are resized before the network (the paper: 512, 640); None: as they are."""
+    crop_size: tuple[int, int] | None = None
+    """Rows and columns of a random crop taken after resizing, for training only; None: the whole image. Cuts the time
+    of a step without changing the scale of the pattern."""
+    flip: bool = True
+    """Random horizontal and vertical flips. The paper is silent on augmentation."""
+    color_jitter: float = Field(default=0.0, ge=0, le=0.5)
+    """Standard deviation of the logarithm of a random gain per colour channel, common to both images of a pair."""
+    batch_size: int = Field(default=4, ge=1)
+    """Pairs per step and device. Paper: 4."""
+    steps: int = Field(default=66_400, ge=1)
+    """Optimiser steps. The paper's 200 epochs of 1327 pairs in batches of 4."""
+    learning_rate: float = Field(default=1e-4, gt=0)
+    """Adam's learning rate (its peak, for one_cycle). The paper is silent; ARFlow: 1e-4."""
+    schedule: Literal["constant", "one_cycle"] = "constant"
+    """Learning rate over the run: constant after the warm-up, or falling from its peak to zero as a half cosine."""
+    warmup_steps: int = Field(default=0, ge=0)
+    """Steps over which the learning rate rises linearly from zero."""
+    weight_decay: float = Field(default=1e-6, ge=0)
+    """Adam's L2 penalty. The paper is silent; ARFlow: 1e-6."""
+    gradient_clip: float | None = Field(default=None, gt=0)
+    """Largest norm of the gradient; None: no limit."""
+    validate_every: int = Field(default=500, ge=1)
+    """Steps between validations."""
+    save_every: int = Field(default=500, ge=1)
+    """Steps between saves of the whole state; it is also saved at the end and on Ctrl-C."""
+    workers: int = Field(default=0, ge=0)
+    """Processes that load data; 0: in the training process."""
+    seed: int = Field(default=0, ge=0)
+    """Seed of the initial weights, of the order of the pairs and of the augmentation."""
+    precision: Literal["32", "bf16"] = "32"
+    """float32, or bfloat16 for the convolutions; flows and losses are float32 in both."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to train; auto: a CUDA device where there is one."""
+    devices: int = Field(default=1, ge=1)
+    """Number of devices (on a CPU: processes) on this machine; each takes batch_size pairs a step."""
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> TrainConfig:
+        scales = self.model.levels - 1
+        if len(self.loss.lambda_s) != scales:
+            raise ValueError(f"loss.lambda_s has {len(self.loss.lambda_s)} numbers; model.levels asks for {scales}")
+        for name, size in (("image_size", self.image_size), ("crop_size", self.crop_size)):
+            if size is not None and min(size) < MINIMUM_SIDE:
+                raise ValueError(f"{name} = {list(size)}: each side must be at least {MINIMUM_SIDE} px")
+        if self.image_size and self.crop_size and _exceeds(self.crop_size, self.image_size):
+            raise ValueError(f"crop_size = {list(self.crop_size)} does not fit into image_size {list(self.image_size)}")
+        if self.warmup_steps >= self.steps:
+            raise ValueError(f"warmup_steps = {self.warmup_steps} must be below steps = {self.steps}")
+        return self
+
+
+def _exceeds(inner: tuple[int, int], outer: tuple[int, int]) -> bool:
+    return inner[0] > outer[0] or inner[1] > outer[1]
+
+
+Config = TypeVar("Config", bound=_Frozen)
+
+
+def validated(kind: type[Config], values: Mapping[str, Any], source: str) -> Config:
+    """Builds a configuration from plain values.
+
+    Args:
+        kind: `ModelConfig`, `LossConfig` or `TrainConfig`.
+        values: Field names and values, nested as the configuration is.
+        source: What the values come from (a path, an option), for the message.
+
+    Raises:
+        InputError: A field that does not exist, has the wrong type or lies outside its range; one line per field.
+    """
+    try:
+        return kind.model_validate(dict(values))
+    except ValidationError as error:
+        lines = []
+        for item in error.errors():
+            field = ".".join(str(part) for part in item["loc"]) or "(whole configuration)"
+            given = "" if item["type"] in ("value_error", "missing") else f" (given: {item['input']!r})"
+            if item["type"] == "extra_forbidden":
+                allowed = _fields_at(kind, item["loc"][:-1])
+                lines.append(f"{field}: there is no such setting; allowed: {', '.join(allowed)}")
+            else:
+                lines.append(f"{field}: {item['msg'].removeprefix('Value error, ')}{given}")
+        raise InputError(f"{source}: " + "; ".join(lines)) from error
+
+
+def _fields_at(kind: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
+    for name in location:
+        annotation = kind.model_fields[str(name)].annotation
+        if not (isinstance(annotation, type) and issubclass(annotation, BaseModel)):
+            return []
+        kind = annotation
+    return list(kind.model_fields)

@@ -1,0 +1,223 @@
+"""The job behind `gelflow pairs`: recordings in, a pair set on disk out.
+
+A recording is a video file or a folder of images, which are its frames in the natural order of their names. Each is
+looked at on its own, with a generator seeded from the job's seed and the recording's name, so that the result depends
+neither on the other recordings nor on interruptions.
+"""
+
+import glob
+import hashlib
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gelflow.data.choose import ChoiceConfig, Choices, choose_pairs
+from gelflow.data.pairset import FILE, ChosenPair, PairSet, SourceReport, read_pair_set, write_pair_set
+from gelflow.errors import InputError
+from gelflow.files.image import MINIMUM_SIDE, write_png
+from gelflow.files.video import SUFFIXES, describe, frames, image_files
+from gelflow.raster import Bytes3
+
+Progress = Callable[[int, int, str, SourceReport | str], None]
+"""Called after each recording: done, total, its name, and its report or why it failed."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A video file or a folder of frames, under a name that is unique within the job."""
+
+    name: str
+    path: Path
+
+
+def find_recordings(inputs: Sequence[str]) -> list[Recording]:
+    """Recordings among files, folders and glob patterns, sorted by path.
+
+    A folder stands for the videos in it; if it holds none, for its images as one recording; if it holds neither, for
+    each of its folders of images.
+
+    Raises:
+        InputError: A path does not exist, a pattern matches nothing, or a folder holds nothing to read.
+    """
+    paths: set[Path] = set()
+    for given in inputs:
+        matches = [Path(given)] if Path(given).exists() else [Path(match) for match in glob.glob(given, recursive=True)]
+        if not matches:
+            raise InputError(f"{given}: no file or folder of this name, and nothing that matches it as a pattern")
+        for match in matches:
+            paths.update(_recordings_at(match))
+    ordered = sorted(paths)
+    names = [path.stem if path.is_file() else path.name for path in ordered]
+    if len(set(names)) < len(names):
+        names = ["__".join(path.with_suffix("").parts[-2:]) if path.is_file() else "__".join(path.parts[-2:])
+                 for path in ordered]  # fmt: skip
+    repeated = sorted({name for name in names if names.count(name) > 1})
+    if repeated:
+        raise InputError(f"two recordings are called {repeated[0]}; rename one, or make two pair sets")
+    return [Recording(name, path) for name, path in zip(names, ordered, strict=True)]
+
+
+def _recordings_at(path: Path) -> list[Path]:
+    if path.is_file():
+        if path.suffix.lower() not in SUFFIXES:
+            raise InputError(f"{path}: not a video; allowed: {', '.join(sorted(SUFFIXES))}, or a folder of images")
+        return [path]
+    videos = [p for p in path.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file()]
+    if videos:
+        return videos
+    if image_files(path):
+        return [path]
+    folders = [p for p in path.iterdir() if p.is_dir() and image_files(p)]
+    if not folders:
+        raise InputError(f"{path}: the folder holds neither videos ({', '.join(sorted(SUFFIXES))}) nor images")
+    return folders
+
+
+def extract_pairs(inputs: Sequence[str], out: Path, config: ChoiceConfig, progress: Progress | None = None) -> PairSet:
+    """Chooses pairs from recordings and writes them as a pair set; goes on where the same job was interrupted.
+
+    Args:
+        inputs: Files, folders and glob patterns.
+        out: Folder of the pair set; new, empty, or with part of the same job.
+        config: What makes a pair worth taking.
+        progress: Called after each recording.
+
+    Returns:
+        The finished pair set. Recordings that cannot be read are in `failures`.
+
+    Raises:
+        InputError: Nothing to read, a value out of range, or `out` holds something else than this job.
+        OSError: The disk is full or not writable; what is there stays and the same command goes on from it.
+    """
+    _check(config)
+    recordings = find_recordings(inputs)
+    job = {
+        "sources": {recording.name: _size(recording.path) for recording in recordings},
+        "settings": asdict(config),
+    }
+    content = _opened(out, job)
+    for done, recording in enumerate(recordings, start=1):
+        if recording.name in content.sources or recording.name in content.failures:
+            continue
+        outcome: SourceReport | str
+        try:
+            outcome, pairs = _extract_one(recording, out, config)
+        except InputError as error:
+            outcome = str(error)
+            content = content.model_copy(update={"failures": content.failures | {recording.name: outcome}})
+        else:
+            content = content.model_copy(
+                update={"sources": content.sources | {recording.name: outcome}, "pairs": content.pairs + tuple(pairs)}
+            )
+        write_pair_set(out, content)
+        if progress:
+            progress(done, len(recordings), recording.name, outcome)
+    if not content.complete:
+        content = content.model_copy(update={"complete": True})
+        write_pair_set(out, content)
+    return content
+
+
+def _check(config: ChoiceConfig) -> None:
+    for name in ("per_source", "tries"):
+        if getattr(config, name) < 1:
+            raise InputError(f"{name} = {getattr(config, name)}: at least 1 is needed")
+    if config.frames < 2:
+        raise InputError(f"frames = {config.frames}: at least 2 frames of a recording are needed for a pair")
+    if not 0 <= config.minimum_motion_px <= config.maximum_motion_px:
+        raise InputError(
+            f"motion from {config.minimum_motion_px:g} to {config.maximum_motion_px:g} px: "
+            "the limits must be at least 0, the lower one first"
+        )
+
+
+def _size(path: Path) -> int:
+    return sum(file.stat().st_size for file in image_files(path)) if path.is_dir() else path.stat().st_size
+
+
+def _opened(out: Path, job: dict[str, Any]) -> PairSet:
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        content = PairSet(job=job)
+        write_pair_set(out, content)
+        return content
+    if not (out / FILE).is_file():
+        raise InputError(f"{out}: exists and holds other things; give an empty or a new folder as --out")
+    content = read_pair_set(out)
+    if content.job != job:
+        raise InputError(
+            f"{out}: holds the pairs of another job: {'; '.join(_differences(content.job, job))}; "
+            "give another --out, or remove this folder"
+        )
+    return content
+
+
+def _differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
+    """What differs between two jobs, in words."""
+    differences = []
+    old, new = there.get("settings", {}), here["settings"]
+    for name in sorted(old.keys() | new.keys()):
+        if old.get(name) != new.get(name):
+            differences.append(f"{name} is {old.get(name)} there and {new.get(name)} here")
+    before, now = there.get("sources", {}), here["sources"]
+    for label, names in (
+        ("only there", sorted(before.keys() - now.keys())),
+        ("only here", sorted(now.keys() - before.keys())),
+        ("of another size", sorted(name for name in before.keys() & now.keys() if before[name] != now[name])),
+    ):
+        if names:
+            more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+            differences.append(f"recordings {label}: {names[0]}{more}")
+    return differences
+
+
+def _extract_one(recording: Recording, out: Path, config: ChoiceConfig) -> tuple[SourceReport, list[ChosenPair]]:
+    count = describe(recording.path).frames
+    every = max(1, -(-count // config.frames))
+    indices: list[int] = []
+    pictures: list[Bytes3] = []
+    for index, frame in frames(recording.path, every):
+        if frame is None:
+            continue
+        if pictures and frame.shape != pictures[0].shape:
+            raise InputError(f"{recording.path}: frame {index} has another size than the first")
+        indices.append(index)
+        pictures.append(frame)
+    if len(pictures) < 2:
+        raise InputError(f"{recording.path}: {len(pictures)} of its {count} frames decode; two are needed for a pair")
+    height, width = pictures[0].shape[:2]
+    if min(height, width) < MINIMUM_SIDE:
+        raise InputError(f"{recording.path}: frames of {width} x {height} px; each side needs {MINIMUM_SIDE}")
+    choices = choose_pairs(pictures, config, _generator(config.seed, recording.name))
+    lost = -(-count // every) - len(pictures)
+    pairs = _write(recording.name, choices, indices, pictures, out)
+    report = SourceReport(
+        frames=len(pictures),
+        frames_rejected=choices.frames_rejected | ({"undecodable": lost} if lost > 0 else {}),
+        tried=choices.tried,
+        rejected=choices.rejected,
+        chosen=len(pairs),
+    )
+    return report, pairs
+
+
+def _generator(seed: int, name: str) -> np.random.Generator:
+    digest = hashlib.sha256(f"{seed}:{name}".encode()).digest()
+    return np.random.default_rng(int.from_bytes(digest[:16], "big"))
+
+
+def _write(
+    source: str, choices: Choices, indices: Sequence[int], pictures: Sequence[Bytes3], out: Path
+) -> list[ChosenPair]:
+    pairs = []
+    for choice in sorted(choices.pairs, key=lambda c: (c.first, c.second)):
+        i, j = indices[choice.first], indices[choice.second]
+        name = f"{source}__{i:05d}_{j:05d}"
+        files = [f"images/{name}_{k}.png" for k in (1, 2)]
+        for file, picture in zip(files, (pictures[choice.first], pictures[choice.second]), strict=True):
+            write_png(out / file, picture)
+        pairs.append(ChosenPair(name=name, image1=files[0], image2=files[1], source=source, frames=(i, j),
+                                motion_px=round(choice.motion_px, 2)))  # fmt: skip
+    return pairs

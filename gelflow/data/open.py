@@ -1,0 +1,36 @@
+"""Opening whatever holds image pairs: a data set of synth, a pair set of `gelflow pairs`, or a plain folder."""
+
+from pathlib import Path
+
+from gelflow.data.folder import folder_records, is_pair_folder
+from gelflow.data.pairs import PairDataset
+from gelflow.data.pairset import FILE as PAIR_SET_FILE
+from gelflow.data.pairset import pair_set_records
+from gelflow.data.synthetic import is_synthetic, synthetic_records
+from gelflow.errors import InputError
+
+
+def open_pairs(path: Path | str) -> PairDataset:
+    """Opens a folder of image pairs, recognised by what lies in it.
+
+    Args:
+        path: A data set of synth (dataset.json), a pair set (pairs.json), or a folder of NAME_1.png and NAME_2.png.
+
+    Raises:
+        InputError: There is no such folder, it is none of these or empty, or it is damaged.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        kind = "is a file, not a folder" if folder.exists() else "there is no such folder"
+        raise InputError(f"{folder}: {kind}; a folder with image pairs is needed")
+    if (folder / PAIR_SET_FILE).is_file():
+        return PairDataset(str(folder), pair_set_records(folder))
+    if is_synthetic(folder):
+        return PairDataset(str(folder), synthetic_records(folder))
+    if is_pair_folder(folder):
+        return PairDataset(str(folder), folder_records(folder))
+    content = "is empty" if not any(folder.iterdir()) else "holds no image pairs"
+    raise InputError(
+        f"{folder}: the folder {content}; allowed: a data set of synth (dataset.json), a pair set of "
+        "`python -m gelflow pairs` (pairs.json), or files NAME_1.png and NAME_2.png"
+    )

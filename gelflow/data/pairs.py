@@ -1,0 +1,197 @@
+"""Image pairs as a map-style data set for torch.
+
+A sample is a dictionary:
+
+    image1, image2  (3, H, W) float32, RGB in [0, 1]
+    name            str, unique within the data set
+    flow            (2, H, W) float32, U right and V down in px, I1(x) = I2(x + flow(x)); NaN where no gel is seen
+    visible         (1, H, W) float32, 1 where the point of the pixel is seen in image 2, else 0
+
+`flow` and `visible` are there if any pair of the data set has an exact flow; a pair without one then has NaN and 0
+throughout, so that samples of both kinds fit into one batch.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from gelflow.errors import InputError
+from gelflow.files.exr import FlowField, read_flow
+from gelflow.files.image import read_pair
+from gelflow.raster import ImageArray, MarkerArray
+
+
+@dataclass(frozen=True)
+class PairRecord:
+    """Where one pair lies on disk.
+
+    Attributes:
+        name: Unique within its data set.
+        image1, image2: Image files of one size.
+        flow: EXR file with the exact flow in both directions, or None.
+        markers: CSV file with tracked dots (columns x1, y1, x2, y2 in px), or None.
+        exchanged: The images have been exchanged: the exact flow is the file's `backward`.
+    """
+
+    name: str
+    image1: Path
+    image2: Path
+    flow: Path | None = None
+    markers: Path | None = None
+    exchanged: bool = False
+
+
+class PairDataset(Dataset[dict[str, Tensor | str]]):
+    """Image pairs that are read from disk when they are asked for.
+
+    Args:
+        source: The folder or folders they come from, for messages.
+        records: At least one.
+
+    Raises:
+        InputError: There is no pair.
+    """
+
+    def __init__(self, source: str, records: Sequence[PairRecord]) -> None:
+        if not records:
+            raise InputError(f"{source}: holds no image pair")
+        self.source = source
+        self.records = tuple(records)
+        self.has_flow = any(record.flow is not None for record in self.records)
+
+    def __len__(self) -> int:
+        return len(self.records)
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the pairs, in order."""
+        return [record.name for record in self.records]
+
+    def images(self, index: int) -> tuple[ImageArray, ImageArray]:
+        """Both images of a pair, (H, W, 3) float32 in [0, 1].
+
+        Raises:
+            InputError: An image is missing, damaged or too small, or the two differ in size.
+        """
+        record = self.records[index]
+        return read_pair(record.image1, record.image2)
+
+    def truth(self, index: int) -> FlowField | None:
+        """Exact flow (H, W, 2) in px and its visibility (H, W) bool; None where the pair has none.
+
+        Raises:
+            InputError: The EXR file is missing or damaged, or lacks this direction.
+        """
+        record = self.records[index]
+        if record.flow is None:
+            return None
+        return read_flow(record.flow, "backward" if record.exchanged else "forward")
+
+    def markers(self, index: int) -> MarkerArray | None:
+        """Tracked dots of a pair, (N, 4) float64: x1, y1, x2, y2 in px; None where the pair has none.
+
+        Raises:
+            InputError: The CSV file lacks a column or holds something other than numbers.
+        """
+        record = self.records[index]
+        if record.markers is None:
+            return None
+        markers = read_markers(record.markers)
+        return markers[:, [2, 3, 0, 1]] if record.exchanged else markers
+
+    def __getitem__(self, index: int) -> dict[str, Tensor | str]:
+        """The sample described at the top of this module.
+
+        Raises:
+            InputError: A file of the pair is missing or damaged, or the sizes differ.
+        """
+        image1, image2 = self.images(index)
+        sample: dict[str, Tensor | str] = {
+            "image1": _channels_first(image1),
+            "image2": _channels_first(image2),
+            "name": self.records[index].name,
+        }
+        if self.has_flow:
+            truth = self.truth(index)
+            if truth is None:
+                sample["flow"] = torch.full((2, *image1.shape[:2]), torch.nan)
+                sample["visible"] = torch.zeros((1, *image1.shape[:2]))
+            else:
+                if truth.flow.shape[:2] != image1.shape[:2]:
+                    raise InputError(
+                        f"{self.records[index].flow}: the flow has {truth.flow.shape[1]} x {truth.flow.shape[0]} px, "
+                        f"the images have {image1.shape[1]} x {image1.shape[0]} px"
+                    )
+                sample["flow"] = _channels_first(truth.flow)
+                sample["visible"] = torch.from_numpy(truth.visible[None].astype(np.float32))
+        return sample
+
+    def both_directions(self) -> "PairDataset":
+        """Each pair, and after it the same pair with its images exchanged and its backward flow."""
+        records = []
+        for record in self.records:
+            records += [record, replace(record, name=f"{record.name}~back", exchanged=not record.exchanged,
+                                        image1=record.image2, image2=record.image1)]  # fmt: skip
+        return PairDataset(self.source, records)
+
+
+def _channels_first(array: NDArray[np.float32]) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(np.moveaxis(array, -1, 0)))
+
+
+def join(datasets: Sequence[PairDataset]) -> PairDataset:
+    """Several data sets as one, in order; with more than one, names begin with the folder's name.
+
+    Raises:
+        InputError: There is none.
+    """
+    if not datasets:
+        raise InputError("no data set given")
+    if len(datasets) == 1:
+        return datasets[0]
+    records: list[PairRecord] = []
+    taken: set[str] = set()
+    for dataset in datasets:
+        label = stem = Path(dataset.source).name
+        number = 2
+        while label in taken:
+            label, number = f"{stem}-{number}", number + 1
+        taken.add(label)
+        records += [replace(record, name=f"{label}/{record.name}") for record in dataset.records]
+    return PairDataset(", ".join(dataset.source for dataset in datasets), records)
+
+
+def read_markers(path: Path) -> MarkerArray:
+    """Reads tracked dots from a CSV file with the columns x1, y1, x2, y2 (px).
+
+    Returns:
+        (N, 4) float64: x1, y1, x2, y2.
+
+    Raises:
+        InputError: The file is missing, lacks a column or a row, or holds something other than finite numbers.
+    """
+    import csv
+
+    columns = ("x1", "y1", "x2", "y2")
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file")
+    rows: list[list[float]] = []
+    with path.open(newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file)
+        if not set(columns) <= set(reader.fieldnames or ()):
+            raise InputError(f"{path}: needs the columns x1,y1,x2,y2; it has: {','.join(reader.fieldnames or ())}")
+        for row in reader:
+            try:
+                rows.append([float(row[name]) for name in columns])
+            except (TypeError, ValueError) as error:
+                raise InputError(f"{path}, line {reader.line_num}: four numbers are needed") from error
+    markers = np.array(rows, np.float64).reshape(-1, 4)
+    if not len(markers) or not np.isfinite(markers).all():
+        raise InputError(f"{path}: holds no marker, or one that is not finite")
+    return markers

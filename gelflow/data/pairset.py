@@ -1,0 +1,100 @@
+"""The pair set that `gelflow pairs` writes.
+
+    DIR/pairs.json                    below
+    DIR/images/NAME_1.png NAME_2.png  the frames as the video's decoder gave them
+
+`pairs.json` is rewritten, as a whole, after each source, so that an interrupted job can go on:
+
+    schema_version  1
+    job             what determines the result: sources (name, bytes) and settings, the seed among them
+    complete        whether every source has been looked at
+    sources         by name: frames looked at, frames rejected by reason, pairs tried, pairs rejected by reason
+    failures        by name: why nothing could be read
+    pairs           name, image1, image2 (relative paths), source, frames [i, j], motion_px
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from gelflow.data.pairs import PairRecord
+from gelflow.errors import InputError
+from gelflow.files.atomic import write_text
+
+FILE = "pairs.json"
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class ChosenPair(_Record):
+    """One pair of the set; `motion_px` is the 95th percentile of the length of a cheap flow, in px."""
+
+    name: str
+    image1: str
+    image2: str
+    source: str
+    frames: tuple[int, int]
+    motion_px: float
+
+
+class SourceReport(_Record):
+    """What became of one video or folder of frames."""
+
+    frames: int
+    frames_rejected: dict[str, int]
+    tried: int
+    rejected: dict[str, int]
+    chosen: int
+
+
+class PairSet(_Record):
+    """The contents of pairs.json."""
+
+    schema_version: int = 1
+    job: dict[str, Any]
+    complete: bool = False
+    sources: dict[str, SourceReport] = {}
+    failures: dict[str, str] = {}
+    pairs: tuple[ChosenPair, ...] = ()
+
+
+def read_pair_set(folder: Path) -> PairSet:
+    """Reads pairs.json.
+
+    Raises:
+        InputError: It is missing, damaged or of a newer format.
+    """
+    path = folder / FILE
+    try:
+        content = PairSet.model_validate_json(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: there is no such file") from error
+    except (ValidationError, UnicodeDecodeError) as error:
+        detail = f"{error.errors()[0]['msg']}" if isinstance(error, ValidationError) else str(error)
+        raise InputError(f"{path}: not the description of a pair set ({detail})") from error
+    if content.schema_version != 1:
+        raise InputError(f"{path}: schema_version {content.schema_version} is not 1, which this gelflow reads")
+    return content
+
+
+def write_pair_set(folder: Path, content: PairSet) -> None:
+    """Writes pairs.json as a whole."""
+    write_text(folder / FILE, json.dumps(content.model_dump(mode="json"), indent=1) + "\n")
+
+
+def pair_set_records(folder: Path) -> list[PairRecord]:
+    """The pairs of a finished pair set, in the order in which they were chosen.
+
+    Raises:
+        InputError: pairs.json is damaged or the job was interrupted.
+    """
+    content = read_pair_set(folder)
+    if not content.complete:
+        raise InputError(
+            f"{folder / FILE}: `gelflow pairs` was interrupted; run the same command again, it goes on where it stopped"
+        )
+    return [PairRecord(pair.name, folder / pair.image1, folder / pair.image2) for pair in content.pairs]

@@ -1,0 +1,84 @@
+"""Data sets that synth writes: image pairs with exact flow.
+
+    DIR/dataset.json               schema_version, scene, seed, n, conventions ...
+    DIR/manifest.jsonl             a line per finished sample; its `index` is the folder's number
+    DIR/samples/000000/            image1.png  image2.png  flow.exr  meta.json
+
+Only samples that the manifest lists count: a folder that it does not list may be unfinished.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from gelflow.data.pairs import PairRecord
+from gelflow.errors import InputError
+
+SCHEMA_VERSION = 1
+"""Newest major version of the format that is understood here."""
+
+
+def is_synthetic(folder: Path) -> bool:
+    """Whether a folder is, or was meant to be, a data set of synth."""
+    return (folder / "dataset.json").is_file() or (folder / "manifest.jsonl").is_file()
+
+
+def synthetic_records(folder: Path) -> list[PairRecord]:
+    """The finished samples of a synth data set, by index.
+
+    Raises:
+        InputError: dataset.json or the manifest is missing or damaged, comes from a newer format, lists no sample, or
+            lists a file that is not there.
+    """
+    _check_header(folder / "dataset.json")
+    records = []
+    for index in sorted(_indices(folder / "manifest.jsonl")):
+        name = f"{index:06d}"
+        sample = folder / "samples" / name
+        record = PairRecord(name, sample / "image1.png", sample / "image2.png", sample / "flow.exr")
+        for path in (record.image1, record.image2, sample / "flow.exr"):
+            if not path.is_file():
+                raise InputError(
+                    f"{path}: the file is missing although {folder / 'manifest.jsonl'} lists sample {index}; "
+                    "make the data set again, or remove that line"
+                )
+        records.append(record)
+    if not records:
+        raise InputError(f"{folder / 'manifest.jsonl'}: lists no finished sample; let synth generate finish first")
+    return records
+
+
+def _check_header(path: Path) -> None:
+    try:
+        header = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: the file is missing; this is not a whole synth data set") from error
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not valid JSON ({error})") from error
+    version = header.get("schema_version") if isinstance(header, dict) else None
+    try:
+        major = int(str(version).split(".")[0])
+    except ValueError as error:
+        raise InputError(f"{path}: schema_version is {version!r}; a number is needed") from error
+    if major > SCHEMA_VERSION:
+        raise InputError(f"{path}: schema_version {version} is newer than {SCHEMA_VERSION}, which this gelflow reads")
+
+
+def _indices(path: Path) -> set[int]:
+    """Indices in the manifest. A last line without its line end was cut by an interruption and does not count."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: the file is missing; no sample has been finished") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a text file ({error})") from error
+    indices = set()
+    for number, line in enumerate(text.split("\n")[:-1], start=1):
+        if not line.strip():
+            continue
+        try:
+            entry: Any = json.loads(line)
+            indices.add(int(entry["index"]))
+        except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+            raise InputError(f"{path}, line {number}: not a sample's entry with an `index`") from error
+    return indices

@@ -1,0 +1,69 @@
+"""Flow between images of any size by a trained network: resize, estimate, bring the flow back."""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from gelflow.arrays import Flow, Images
+from gelflow.config import MINIMUM_SIDE
+from gelflow.errors import InputError
+from gelflow.models import GelFlow
+from gelflow.models.gelflow import check_shapes
+
+
+def resize_images(images: Images, size: tuple[int, int]) -> Images:
+    """Images of another size: bilinear between pixel centres, low-pass filtered first where they shrink."""
+    if images.shape[-2:] == torch.Size(size):
+        return images
+    resized: Tensor = F.interpolate(images, size=size, mode="bilinear", align_corners=False, antialias=True)
+    return resized
+
+
+def resize_flow(flow: Flow, size: tuple[int, int]) -> Flow:
+    """A flow for images of another size: bilinear between pixel centres, U and V each scaled with its own side.
+
+    A pixel that touches a NaN of the given flow becomes NaN.
+    """
+    height, width = flow.shape[-2:]
+    if (height, width) == size:
+        return flow
+    resized: Tensor = F.interpolate(flow, size=size, mode="bilinear", align_corners=False)
+    return resized * flow.new_tensor([size[1] / width, size[0] / height]).view(1, 2, 1, 1)
+
+
+def estimate_flow(model: GelFlow, image1: Images, image2: Images, size: tuple[int, int] | None = None) -> Flow:
+    """The flow from image 1 to image 2: ``I1(x) = I2(x + V(x))``.
+
+    Args:
+        model: The network; used on the device that it is on, in evaluation mode, and left as it was.
+        image1: (B, 3, H, W) float32 in [0, 1].
+        image2: The same shape.
+        size: Rows and columns at which the network works; None: those to which its training images were resized
+            (`GelFlow.image_size`), or those of the given images where they were not.
+
+    Returns:
+        (B, 2, H, W) float32, px of the given images, on their device, without gradient.
+
+    Raises:
+        InputError: Shapes that differ, sides below 64 px where no size is given, other than three colours, values that
+            are not finite.
+    """
+    size = size or model.image_size
+    if size is not None and min(size) < MINIMUM_SIDE:
+        raise InputError(f"size {size[0]}x{size[1]}: each side must be at least {MINIMUM_SIDE} px")
+    if size is None or image1.shape != image2.shape or image1.ndim != 4 or image1.shape[1] != 3:
+        check_shapes(image1, image2)
+    for name, image in (("image 1", image1), ("image 2", image2)):
+        if not torch.isfinite(image).all():
+            raise InputError(f"{name} holds NaN or infinite values; images must be finite, in [0, 1]")
+    device = next(model.parameters()).device
+    native = (image1.shape[-2], image1.shape[-1])
+    inputs = [resize_images(image.to(device, torch.float32), size or native) for image in (image1, image2)]
+    was_training = model.training
+    model.eval()
+    try:
+        with torch.no_grad():
+            flow = resize_flow(model(*inputs)[0], native)
+    finally:
+        model.train(was_training)
+    return flow.to(image1.device)

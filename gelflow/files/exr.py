@@ -1,0 +1,97 @@
+"""Flow fields in OpenEXR files, with the channels of a synth dataset's `flow.exr`.
+
+    forward.U forward.V forward.visible     I1(x) = I2(x + forward(x))
+    backward.U backward.V backward.visible  the same with the images exchanged
+
+float32, ZIP-compressed; U right, V down, px of the image; a flow belongs to its pixel's centre, (c + 0.5, r + 0.5).
+`visible` is 1 where the point of the pixel is seen in the other image, 0 where it is hidden or has left the image;
+U and V are NaN only where the pixel sees no gel.
+"""
+
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import InputError
+from gelflow.files.atomic import replacing
+from gelflow.files.quiet import quiet
+from gelflow.raster import FlowArray, MaskArray
+
+Direction = Literal["forward", "backward"]
+
+
+class FlowField(NamedTuple):
+    """A flow (H, W, 2) in px and where its end point is seen, (H, W) bool."""
+
+    flow: FlowArray
+    visible: MaskArray
+
+
+def read_channels(path: Path) -> dict[str, NDArray[np.float32]]:
+    """All channels of an EXR file by name, each (H, W), converted to float32.
+
+    Raises:
+        InputError: The file is missing, is no EXR file, or is truncated or damaged.
+    """
+    import OpenEXR
+
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file")
+    try:
+        with quiet(), OpenEXR.File(str(path), separate_channels=True) as file:
+            channels = {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
+    except (RuntimeError, ValueError, OSError) as error:
+        raise InputError(f"{path}: not a readable EXR file (truncated or damaged?)") from error
+    return channels
+
+
+def read_flow(path: Path, direction: Direction = "forward") -> FlowField:
+    """One direction of a flow file. A file without a `visible` channel is visible wherever the flow is finite.
+
+    Raises:
+        InputError: The file cannot be read, or lacks the U or V channel of this direction.
+    """
+    channels = read_channels(path)
+    needed = [f"{direction}.U", f"{direction}.V"]
+    missing = [name for name in needed if name not in channels]
+    if missing:
+        present = ", ".join(sorted(channels)) or "none"
+        raise InputError(f"{path}: lacks the channel {' and '.join(missing)}; it has: {present}")
+    flow = np.stack([channels[name] for name in needed], axis=-1)
+    finite = np.isfinite(flow).all(axis=-1)
+    visible = channels.get(f"{direction}.visible")
+    seen = finite if visible is None else np.logical_and(finite, visible > 0.5)
+    return FlowField(flow, np.asarray(seen, np.bool_))
+
+
+def write_flow(path: Path, forward: FlowArray, visible: MaskArray | None = None) -> None:
+    """Writes a forward flow, and where it is visible if that is known; replaces the file as a whole.
+
+    Args:
+        path: The file, ending in .exr.
+        forward: (H, W, 2) px.
+        visible: (H, W) bool; None leaves the channel out (an estimate does not know it).
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    import OpenEXR
+
+    planes = {f"forward.{name}": np.ascontiguousarray(forward[..., k], np.float32) for k, name in enumerate("UV")}
+    if visible is not None:
+        planes["forward.visible"] = visible.astype(np.float32)
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "flow.units": "px",
+        "flow.directions": "U right, V down; I1(x) = I2(x + forward(x))",
+        "flow.pixelCentre": "pixel (c, r) has its centre at (c + 0.5, r + 0.5); the flow belongs to the centre",
+    }
+    with replacing(path) as temporary:
+        try:
+            with quiet():
+                OpenEXR.File(header, planes).write(str(temporary))
+        except RuntimeError as error:
+            raise OSError(f"cannot write {path}: {error}") from error

@@ -1,0 +1,134 @@
+"""Images: PNG (8 or 16 bit, grey or colour, with or without alpha) and 8-bit JPEG, BMP or TIFF.
+
+In memory an image is (H, W, 3) float32, RGB in [0, 1]: a grey image has three equal channels, alpha is dropped.
+"""
+
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from gelflow.errors import InputError
+from gelflow.files.atomic import replacing
+from gelflow.files.quiet import quiet
+from gelflow.raster import Bytes3, FlowArray, Grey8, ImageArray
+
+SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"})
+MINIMUM_SIDE = 16
+"""Optical flow of an image with a side of fewer px is not attempted."""
+
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+
+def check_png(path: Path, data: bytes) -> None:
+    """Walks through the chunks of a PNG file and compares their checksums (PNG specification, section 5).
+
+    OpenCV decodes a damaged file without complaint that a program could catch.
+
+    Raises:
+        InputError: The file is truncated or damaged.
+    """
+    position = len(_PNG_SIGNATURE)
+    while position + 12 <= len(data):
+        end = position + 8 + int.from_bytes(data[position : position + 4], "big")
+        if end + 4 > len(data):
+            break
+        if zlib.crc32(data[position + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            raise InputError(f"{path}: damaged PNG file (a checksum is wrong at byte {position})")
+        if data[position + 4 : position + 8] == b"IEND":
+            return
+        position = end + 4
+    raise InputError(f"{path}: truncated PNG file ({len(data)} bytes, its end is missing)")
+
+
+def _check_other(path: Path) -> None:
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            image.load()
+    except UnidentifiedImageError as error:
+        raise InputError(f"{path}: not an image; allowed: PNG, JPEG, BMP, TIFF") from error
+    except (OSError, SyntaxError, ValueError) as error:
+        raise InputError(f"{path}: truncated or damaged image ({error})") from error
+
+
+def read_image(path: Path) -> ImageArray:
+    """Reads an image as (H, W, 3) float32, RGB in [0, 1].
+
+    Raises:
+        InputError: The file is missing, is no image, is truncated or damaged, or has neither 8 nor 16 bits.
+    """
+    import cv2
+
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such image file")
+    data = path.read_bytes()
+    if not data:
+        raise InputError(f"{path}: the image file is empty")
+    if data.startswith(_PNG_SIGNATURE):
+        check_png(path, data)
+    else:
+        _check_other(path)
+    with quiet():
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise InputError(f"{path}: the image does not decode")
+    if pixels.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"{path}: {pixels.dtype} pixels; allowed: 8 or 16 bits per channel")
+    largest = np.iinfo(pixels.dtype).max
+    if pixels.ndim == 2:
+        pixels = pixels[..., None]
+    colour = pixels[..., 2::-1] if pixels.shape[2] >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
+    return np.ascontiguousarray(colour, np.float32) / np.float32(largest)
+
+
+def read_pair(path1: Path, path2: Path) -> tuple[ImageArray, ImageArray]:
+    """Reads two images and checks that a flow between them makes sense.
+
+    Raises:
+        InputError: One of them cannot be read, is smaller than `MINIMUM_SIDE`, or their sizes differ.
+    """
+    image1, image2 = read_image(path1), read_image(path2)
+    for path, image in ((path1, image1), (path2, image2)):
+        if min(image.shape[:2]) < MINIMUM_SIDE:
+            raise InputError(
+                f"{path}: {_size(image)} px are too few for optical flow; each side needs at least {MINIMUM_SIDE} px"
+            )
+    if image1.shape != image2.shape:
+        raise InputError(
+            f"{path1} has {_size(image1)} px, {path2} has {_size(image2)} px; both images of a pair need one size"
+        )
+    return image1, image2
+
+
+def _size(image: ImageArray | FlowArray) -> str:
+    return f"{image.shape[1]} x {image.shape[0]}"
+
+
+def to_bytes(image: ImageArray) -> Bytes3:
+    """An image in [0, 1] as (H, W, 3) uint8, rounded to nearest; values outside are clipped."""
+    return np.clip(np.rint(image * 255.0), 0, 255).astype(np.uint8)
+
+
+def to_grey(image: ImageArray) -> Grey8:
+    """Luma of an image as (H, W) uint8: round(.299 R + .587 G + .114 B) of its 8-bit channels (ITU-R BT.601)."""
+    import cv2
+
+    return cv2.cvtColor(to_bytes(image), cv2.COLOR_RGB2GRAY)
+
+
+def write_png(path: Path, pixels: Bytes3 | Grey8) -> None:
+    """Writes (H, W, 3) RGB or (H, W) grey uint8 as PNG; replaces the file as a whole.
+
+    Raises:
+        OSError: The file cannot be written.
+    """
+    import cv2
+
+    bgr = pixels[..., ::-1] if pixels.ndim == 3 else pixels
+    encoded, data = cv2.imencode(".png", np.ascontiguousarray(bgr))
+    if not encoded:
+        raise OSError(f"cannot encode the picture for {path}")
+    with replacing(path) as temporary:
+        temporary.write_bytes(data.tobytes())

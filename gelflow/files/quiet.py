@@ -1,0 +1,34 @@
+"""Keeping C libraries from writing to the terminal.
+
+libpng, FFmpeg and OpenEXR print their complaints about a broken file straight to the process's output, some of them
+many times. gelflow says once, in its own words, which file is broken; what the library printed is dropped.
+"""
+
+import io
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Sends the file descriptors 1 and 2 to the null device while the block runs. Exceptions pass through.
+
+    `sys.stdout` and `sys.stderr` are replaced, too: OpenEXR warns through Python. Works for the whole process, so hold
+    it only around a library's call.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    saved = [os.dup(1), os.dup(2)]
+    null = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(null, 1)
+        os.dup2(null, 2)
+        with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
+            yield
+    finally:
+        os.dup2(saved[0], 1)
+        os.dup2(saved[1], 2)
+        for descriptor in (*saved, null):
+            os.close(descriptor)

@@ -1,0 +1,115 @@
+"""Frames of a video file, or of a folder of images in the natural order of their names.
+
+Frames are (H, W, 3) uint8, RGB, as the decoder gives them.
+"""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gelflow.errors import InputError
+from gelflow.files.image import SUFFIXES as IMAGE_SUFFIXES
+from gelflow.files.image import read_image, to_bytes
+from gelflow.files.quiet import quiet
+from gelflow.raster import Bytes3
+
+SUFFIXES = frozenset({".avi", ".mp4", ".m4v", ".mov", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv"})
+
+
+def natural_key(name: str) -> list[tuple[int, int, str]]:
+    """Sorting key under which frame2 comes before frame10."""
+    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name) if part]
+
+
+def image_files(folder: Path) -> list[Path]:
+    """The image files directly in a folder, in natural order; hidden files are left out."""
+    found = (p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith("."))
+    return sorted((p for p in found if p.is_file()), key=lambda p: natural_key(p.name))
+
+
+@dataclass(frozen=True)
+class VideoInfo:
+    """Number of frames and their rate per second. Of a damaged video fewer frames may decode."""
+
+    frames: int
+    frames_per_second: float
+
+
+def describe(path: Path) -> VideoInfo:
+    """Number of frames and their rate; a folder of images has a nominal rate of 25 frames/s.
+
+    The number is the header's; where the header does not know it, frames are counted.
+
+    Raises:
+        InputError: The video is missing or does not open, or the folder holds no image.
+    """
+    if path.is_dir():
+        files = image_files(path)
+        if not files:
+            raise InputError(f"{path}: the folder holds no image; allowed: {', '.join(sorted(IMAGE_SUFFIXES))}")
+        return VideoInfo(len(files), 25.0)
+    import cv2
+
+    capture = _open(path)
+    with quiet():
+        count, rate = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), float(capture.get(cv2.CAP_PROP_FPS))
+        if count < 1:
+            count = 0
+            while capture.grab():
+                count += 1
+        capture.release()
+    return VideoInfo(count, rate if 1.0 <= rate <= 1000.0 else 25.0)
+
+
+def frames(path: Path, every: int = 1) -> Iterator[tuple[int, Bytes3 | None]]:
+    """Yields (index, frame) of every `every`-th frame, beginning with frame 0.
+
+    A video ends at the first frame that does not decode. An image of a folder that cannot be read is yielded as None.
+
+    Raises:
+        InputError: The video is missing or does not open.
+    """
+    if path.is_dir():
+        for index, file in enumerate(image_files(path)):
+            if index % every == 0:
+                yield index, _image_or_none(file)
+        return
+    capture = _open(path)
+    index = 0
+    try:
+        while True:
+            frame = None
+            with quiet():
+                decoded = capture.grab()
+                if decoded and index % every == 0:
+                    decoded, frame = capture.retrieve()
+            if not decoded:
+                return
+            if frame is not None:
+                if frame.ndim == 2:
+                    frame = frame[..., None].repeat(3, axis=2)
+                yield index, frame[..., ::-1].copy()
+            index += 1
+    finally:
+        capture.release()
+
+
+def _image_or_none(path: Path) -> Bytes3 | None:
+    try:
+        return to_bytes(read_image(path))
+    except InputError:
+        return None
+
+
+def _open(path: Path) -> Any:  # a cv2.VideoCapture; OpenCV has no types
+    import cv2
+
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such video")
+    with quiet():
+        capture = cv2.VideoCapture(str(path))
+    if not capture.isOpened():
+        raise InputError(f"{path}: the video does not open (not a video, or truncated or damaged)")
+    return capture

@@ -1,0 +1,32 @@
+"""Decomposition loss (paper, eq. 3-6): the L1 norm of the parts of the flow's gradient by Helmholtz's theorem.
+
+``L_dc = w ( |e_xx| + |e_yy| + lambda_theta 2 |e_xy| + lambda_zeta 2 |omega| )`` with the linear distortion rates
+``e_xx = u_x``, ``e_yy = v_y``, the shear distortion rate ``e_xy = (u_y + v_x) / 2``, the rotation
+``omega = (v_x - u_y) / 2`` and the weight w of `gelflow.losses.weight`. Forward differences, as in eq. 2; mean over
+the pixels that have a right and a lower neighbour. Zero for every translation.
+"""
+
+from gelflow.arrays import Flow, Mask, Scalar
+from gelflow.ops.gradients import forward_differences
+
+
+def decomposition_loss(flow: Flow, weight: Mask, lambda_theta: float = 0.01, lambda_zeta: float = 0.01) -> Scalar:
+    """The decomposition loss at one scale.
+
+    Args:
+        flow: (B, 2, H, W), in px or, as `LossConfig.flow_normalisation` says, divided by the image's shorter side.
+        weight: (B, 1, H-1, W-1).
+        lambda_theta: Weight of the shear distortion rate.
+        lambda_zeta: Weight of the rotation.
+
+    Returns:
+        A scalar >= 0; 0 for a scale of a single row or column, which has no such gradient.
+    """
+    across, down = forward_differences(flow)
+    if across.numel() == 0:
+        return flow.sum() * 0
+    u_x, v_x = across.split(1, dim=1)
+    u_y, v_y = down.split(1, dim=1)
+    linear = u_x.abs() + v_y.abs()
+    shear, rotation = (u_y + v_x).abs(), (v_x - u_y).abs()
+    return (weight * (linear + lambda_theta * shear + lambda_zeta * rotation)).mean()

@@ -1,0 +1,68 @@
+"""Photometric loss (paper, eq. 10): how well image 2, warped by the flow, matches image 1.
+
+``L_ph = alpha (1 - SSIM) / 2 + (1 - alpha) |I~1 - I1|``, averaged over colours and pixels.
+
+SSIM is taken over 3x3 windows with equal weights, C1 = 0.01^2, C2 = 0.03^2, for images in [0, 1]; at the border the
+window is what of it lies inside the image. The paper is silent on pixels that leave the image: with the mask, their
+absolute difference does not count, nor does the SSIM of any window that holds one of them.
+"""
+
+import torch.nn.functional as F
+from torch import Tensor
+
+from gelflow.arrays import Flow, Images, Mask, Scalar
+from gelflow.ops.warp import inside, warp
+
+C1 = 0.01**2
+C2 = 0.03**2
+
+
+def structural_similarity(first: Images, second: Images) -> Tensor:
+    """SSIM (Wang et al. 2004) of each pixel's 3x3 window, in [-1, 1].
+
+    Args:
+        first: (B, C, H, W) in [0, 1].
+        second: The same shape.
+
+    Returns:
+        (B, C, H, W).
+    """
+
+    def mean(values: Tensor) -> Tensor:
+        return F.avg_pool2d(values, 3, stride=1, padding=1, count_include_pad=False)
+
+    mean1, mean2 = mean(first), mean(second)
+    variance1 = mean(first * first) - mean1 * mean1
+    variance2 = mean(second * second) - mean2 * mean2
+    covariance = mean(first * second) - mean1 * mean2
+    luminance = (2 * mean1 * mean2 + C1) / (mean1 * mean1 + mean2 * mean2 + C1)
+    return luminance * (2 * covariance + C2) / (variance1 + variance2 + C2)
+
+
+def photometric_loss(
+    image1: Images, image2: Images, flow: Flow, alpha: float = 0.85, mask_outside: bool = True
+) -> Scalar:
+    """The photometric loss at one scale.
+
+    Args:
+        image1: (B, 3, H, W) in [0, 1], of this scale.
+        image2: The same shape.
+        flow: (B, 2, H, W), px of this scale.
+        alpha: Share of SSIM.
+        mask_outside: Leave out the pixels that the flow takes out of the image.
+
+    Returns:
+        A scalar >= 0; 0 where the flow maps image 2 onto image 1. Where no pixel stays inside: 0.
+    """
+    warped = warp(image2, flow)
+    dissimilarity = (1 - structural_similarity(image1.to(flow.dtype), warped)) / 2
+    difference = (warped - image1).abs()
+    if not mask_outside:
+        return alpha * dissimilarity.mean() + (1 - alpha) * difference.mean()
+    pixels = inside(flow)
+    windows = -F.max_pool2d(-pixels, 3, stride=1, padding=1)
+    return alpha * _masked_mean(dissimilarity, windows) + (1 - alpha) * _masked_mean(difference, pixels)
+
+
+def _masked_mean(values: Tensor, mask: Mask) -> Scalar:
+    return (values * mask).sum() / (mask.sum() * values.shape[1]).clamp(min=1)

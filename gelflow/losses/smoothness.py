@@ -1,0 +1,31 @@
+"""Edge-aware first-order smoothness (UFlow, ARFlow), the regulariser of the paper's comparison "SelfFlow".
+
+``L_sm = ( exp(-beta |I_x|) (|u_x| + |v_x|) + exp(-beta |I_y|) (|u_y| + |v_y|) ) / 2``, |I_x| as a mean over colours.
+Zero for every translation.
+"""
+
+import torch
+
+from gelflow.arrays import Flow, Images, Scalar
+from gelflow.ops.gradients import forward_differences
+
+
+def first_order_loss(flow: Flow, image: Images, beta: float = 10.0) -> Scalar:
+    """The smoothness loss at one scale.
+
+    Args:
+        flow: (B, 2, H, W), in px or divided by the image's shorter side.
+        image: Image 1 of this scale, (B, 3, H, W) in [0, 1].
+        beta: Steepness of the weight in the image gradient.
+
+    Returns:
+        A scalar >= 0, the mean over the pixels that have a right and a lower neighbour and over both directions; 0 for
+        a scale of a single row or column.
+    """
+    if min(flow.shape[-2:]) < 2:
+        return flow.sum() * 0
+    terms = [
+        torch.exp(-beta * brightness.abs().mean(dim=1, keepdim=True)) * motion.abs().sum(dim=1, keepdim=True)
+        for brightness, motion in zip(forward_differences(image), forward_differences(flow), strict=True)
+    ]
+    return (terms[0] + terms[1]).mean() / 2

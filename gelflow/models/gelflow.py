@@ -1,0 +1,130 @@
+"""The GelFlow network (paper, section 3.1): PWC-Net's coarse-to-fine estimation with local flow fusion at each scale.
+
+From the coarsest scale to `finest_scale`: enlarge the flow so far, warp the second image's features by it, correlate,
+estimate a coarse flow, refine it by the context network, fuse it locally. Finer flows, down to the image's own
+resolution, are bilinear enlargements: ``V1 = 2 up2(V2)``, ``V0 = 4 up4(V2)``.
+
+What it cannot do: at `finest_scale` = 2 it resolves no detail of the motion finer than about 4 px.
+"""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from gelflow.arrays import Features, Flow, Images
+from gelflow.config import MINIMUM_SIDE, ModelConfig
+from gelflow.errors import InputError
+from gelflow.models.context import ContextNetwork
+from gelflow.models.encoder import CHANNELS, Encoder
+from gelflow.models.estimator import Estimator
+from gelflow.models.layers import SLOPE
+from gelflow.models.lffm import LocalFlowFusion
+from gelflow.ops.correlation import local_correlation
+from gelflow.ops.pyramid import enlarge_flow
+from gelflow.ops.warp import warp
+
+
+class GelFlow(nn.Module):
+    """Flow from image 1 to image 2 at all scales.
+
+    Args:
+        config: The architecture.
+
+    Attributes:
+        config: The architecture.
+        image_size: Rows and columns of the images that it was trained on, where they were resized; else None.
+    """
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.image_size: tuple[int, int] | None = None
+        scales = range(config.finest_scale, config.levels)
+        costs = (2 * config.correlation_radius + 1) ** 2
+        networks = 1 if config.estimator == "shared" else len(scales)
+        self.encoder = Encoder(config.levels)
+        self.projections = nn.ModuleList(_projection(CHANNELS[s - 1], config.projected_channels) for s in scales)
+        self.estimators = nn.ModuleList(Estimator(costs + config.projected_channels + 2) for _ in range(networks))
+        self.contexts = nn.ModuleList(ContextNetwork() for _ in range(networks))
+        self.fusion = LocalFlowFusion(config.lffm_region, config.lffm_scale) if config.lffm else None
+
+    def forward(self, image1: Images, image2: Images) -> list[Flow]:
+        """Estimates the flow.
+
+        Args:
+            image1: (B, 3, H, W) float32 in [0, 1]; H, W >= 64, of any parity.
+            image2: The same shape.
+
+        Returns:
+            Flows for s = 0 .. levels-2, finest first: (B, 2, ceil(H / 2^s), ceil(W / 2^s)) float32, px of scale s.
+
+        Raises:
+            InputError: The images' shapes differ or are not (B, 3, H >= 64, W >= 64).
+        """
+        check_shapes(image1, image2)
+        batch, _, height, width = image1.shape
+        features = self.encoder(torch.cat([image1, image2]))
+        flow: Flow | None = None
+        decoded: dict[int, Flow] = {}
+        for scale in range(self.config.levels - 1, self.config.finest_scale - 1, -1):
+            first, second = features[scale - 1].split(batch)
+            size = (first.shape[-2], first.shape[-1])
+            if flow is None:
+                start = first.new_zeros(batch, 2, *size, dtype=torch.float32)
+            else:
+                start = enlarge_flow(flow, 1, size)
+            flow = self._decode(scale, first, second, start)
+            decoded[scale] = flow
+        finest = self.config.finest_scale
+        for scale in range(finest):
+            size = (-(-height // 2**scale), -(-width // 2**scale))
+            decoded[scale] = enlarge_flow(decoded[finest], finest - scale, size)
+        return [decoded[scale] for scale in range(self.config.levels - 1)]
+
+    def _decode(self, scale: int, first: Features, second: Features, start: Flow) -> Flow:
+        """The flow of one scale from its features (B, C, H, W) and the enlarged flow of the coarser one."""
+        place = scale - self.config.finest_scale
+        network = 0 if self.config.estimator == "shared" else place
+        moved = warp(second, start)
+        pair = normalised(first.float(), moved) if self.config.normalise_features else (first.float(), moved)
+        costs = local_correlation(*pair, self.config.correlation_radius)
+        projected = self.projections[place](first)
+        evidence = torch.cat([F.leaky_relu(costs, SLOPE), projected, start], dim=1)
+        context, correction = self.estimators[network](evidence)
+        coarse = start + correction.float()
+        refined = coarse + self.contexts[network](context, coarse).float()
+        return self.fusion(refined, context.float()) if self.fusion is not None else refined
+
+
+def _projection(inputs: int, outputs: int) -> nn.Module:
+    layer = nn.Conv2d(inputs, outputs, 1)
+    nn.init.kaiming_normal_(layer.weight, a=SLOPE)
+    nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
+    return nn.Sequential(layer, nn.LeakyReLU(SLOPE))
+
+
+def normalised(first: Features, second: Features) -> tuple[Tensor, Tensor]:
+    """Both images' features shifted and scaled alike, to mean 0 and variance 1 per sample over channels and pixels."""
+    both = torch.stack([first, second])
+    mean = both.mean(dim=(0, 2, 3, 4), keepdim=True)
+    variance = both.var(dim=(0, 2, 3, 4), keepdim=True, unbiased=False)
+    one, two = (both - mean) / torch.sqrt(variance + 1e-6)
+    return one, two
+
+
+def check_shapes(image1: Images, image2: Images) -> None:
+    """Refuses images that the network cannot take.
+
+    Raises:
+        InputError: See `GelFlow.forward`.
+    """
+    if image1.shape != image2.shape:
+        raise InputError(f"the two images differ in shape: {_size(image1)} and {_size(image2)}; give two of one size")
+    if image1.ndim != 4 or image1.shape[1] != 3:
+        raise InputError(f"images of shape {tuple(image1.shape)}: (pairs, 3 colours, rows, columns) are needed")
+    if min(image1.shape[-2:]) < MINIMUM_SIDE:
+        raise InputError(f"image of {_size(image1)} px: each side must be at least {MINIMUM_SIDE} px; enlarge it first")
+
+
+def _size(image: Tensor) -> str:
+    return "x".join(str(side) for side in image.shape[-2:]) if image.ndim == 4 else str(tuple(image.shape))

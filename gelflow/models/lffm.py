@@ -1,0 +1,48 @@
+"""Local flow fusion module (paper, section 3.2): a flow smoothed where neighbouring context features agree.
+
+``V'(x) = sum_d w(x, d) V(x + d)``,  ``w(x, .) = softmax_d( k <C(x), C(x + d)> )`` over the neighbours d of a square
+window that lie inside the image. The paper has k = 1; the default here is k = 1/sqrt(number of channels), as in
+scaled dot-product attention, because with k = 1 the weight of the centre tends to one as features grow. Neighbours
+beyond the border get no weight, so a constant flow stays exactly as it is, and every fused flow lies between the
+flows that it was made from.
+"""
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from gelflow.arrays import Features, Flow
+from gelflow.ops.correlation import local_correlation
+
+
+class LocalFlowFusion(nn.Module):
+    """The module; it has no parameters.
+
+    Args:
+        region: Side of the window, odd, px.
+        scale: "inverse_sqrt" or "none", see `gelflow.config.ModelConfig.lffm_scale`.
+    """
+
+    def __init__(self, region: int, scale: str) -> None:
+        super().__init__()
+        self.region = region
+        self.scale = scale
+
+    def weights(self, context: Features) -> Tensor:
+        """Weight of each neighbour, (B, region^2, H, W), row by row; at every pixel they sum to one."""
+        channels, height, width = context.shape[1:]
+        radius = self.region // 2
+        factor = math.sqrt(channels) if self.scale == "inverse_sqrt" else channels  # the correlation is a mean over C
+        similarity = factor * local_correlation(context, context, radius)
+        exists = F.unfold(context.new_ones(1, 1, height, width), self.region, padding=radius)
+        beyond = exists.view(1, self.region**2, height, width) == 0
+        return torch.softmax(similarity.masked_fill(beyond, -torch.inf), dim=1)
+
+    def forward(self, flow: Flow, context: Features) -> Flow:
+        """Fuses a flow (B, 2, H, W) by the context (B, C, H, W)."""
+        batch, _, height, width = flow.shape
+        neighbours = F.unfold(flow, self.region, padding=self.region // 2)
+        neighbours = neighbours.view(batch, 2, self.region**2, height, width)
+        return (neighbours * self.weights(context).unsqueeze(1)).sum(dim=2)

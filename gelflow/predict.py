@@ -1,0 +1,200 @@
+"""Flow of a pair of images or of a video, written as EXR, Middlebury .flo and pictures."""
+
+import csv
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from gelflow.baselines.method import Method
+from gelflow.errors import InputError
+from gelflow.files.atomic import replacing
+from gelflow.files.exr import read_flow, write_flow
+from gelflow.files.flo import write_flo
+from gelflow.files.image import read_pair, write_png
+from gelflow.files.quiet import quiet
+from gelflow.files.video import describe, frames
+from gelflow.raster import Bytes3, FlowArray, ImageArray
+from gelflow.viz import draw_overlay, round_up, write_flow_picture
+
+Reference = Literal["first", "previous"]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What was found between two images.
+
+    Attributes:
+        frame: Index of the second image in its video; 1 for a pair.
+        mean_px, p95_px, p99_px: Mean and percentiles of the flow's length, px.
+        seconds: Run time of the method.
+    """
+
+    frame: int
+    mean_px: float
+    p95_px: float
+    p99_px: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What `predict` did: the files it wrote, in order, and the motion of each pair of frames."""
+
+    files: list[Path]
+    motions: list[Motion]
+
+
+def predict_pair(method: Method, path1: Path, path2: Path, out: Path) -> Prediction:
+    """Writes NAME.exr, NAME.flo and NAME.png, the flow from the first image to the second; replaces older ones.
+
+    NAME is what the two file names have in front of _1 and _2, else FIRST_to_SECOND.
+
+    Raises:
+        InputError: An image cannot be read or the two do not fit.
+        OSError: A file cannot be written.
+    """
+    image1, image2 = read_pair(path1, path2)
+    stem1, stem2 = path1.stem, path2.stem
+    common = stem1.removesuffix("_1")
+    name = common if stem1 == f"{common}_1" and stem2 == f"{common}_2" else f"{stem1}_to_{stem2}"
+    flow, motion = _estimate(method, image1, image2, 1)
+    files = [out / f"{name}{suffix}" for suffix in (".exr", ".flo", ".png")]
+    write_flow(files[0], flow)
+    write_flo(files[1], flow)
+    write_flow_picture(files[2], image1, image2, flow, f"{name} ({method.name})")
+    return Prediction(files, [motion])
+
+
+def predict_video(
+    method: Method,
+    path: Path,
+    out: Path,
+    reference: Reference = "first",
+    every: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> Prediction:
+    """Writes flow/000001.exr ... (numbered by frame), motion.csv and overlay.mp4; replaces older ones.
+
+    Args:
+        method: Estimates the flow.
+        path: A video file, or a folder of images in the natural order of their names.
+        out: Folder for the results.
+        reference: Flow from the first frame to each frame, or from each frame's predecessor to it.
+        every: Take every n-th frame only.
+        progress: Called with the number of frames done and to be done; each frame counts twice, flow and overlay.
+
+    Raises:
+        InputError: The video does not open, fewer than two frames decode, or a frame cannot be used.
+        OSError: A file cannot be written.
+    """
+    if every < 1:
+        raise InputError(f"every = {every}: at least 1 is needed")
+    total = 2 * max(0, -(-describe(path).frames // every) - 1)
+    files: list[Path] = []
+    motions: list[Motion] = []
+    for index, image1, image2 in _frame_pairs(path, every, reference):
+        try:
+            flow, motion = _estimate(method, _as_float(image1), _as_float(image2), index)
+        except InputError as error:
+            raise InputError(f"{path}, frame {index}, {method.name}: {error}") from error
+        files.append(out / "flow" / f"{index:06d}.exr")
+        write_flow(files[-1], flow)
+        motions.append(motion)
+        if progress:
+            progress(len(motions), total)
+    if not motions:
+        raise InputError(f"{path}: fewer than two frames decode; a flow needs two")
+    table = out / "motion.csv"
+    with replacing(table) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["frame", "mean_px", "p95_px", "p99_px", "seconds"])
+        writer.writerows([m.frame, m.mean_px, m.p95_px, m.p99_px, m.seconds] for m in motions)
+    scale = round_up(max(motion.p99_px for motion in motions))
+    pictures = _overlays(path, every, reference, out / "flow", scale, len(motions), total, progress)
+    overlay = _write_overlay(pictures, out, describe(path).frames_per_second / every)
+    return Prediction([*files, table, *overlay], motions)
+
+
+def _estimate(method: Method, image1: ImageArray, image2: ImageArray, frame: int) -> tuple[FlowArray, Motion]:
+    started = time.perf_counter()
+    flow = method.flow(image1, image2)
+    seconds = time.perf_counter() - started
+    length = np.hypot(flow[..., 0], flow[..., 1])
+    p95, p99 = (float(value) for value in np.nanpercentile(length, (95, 99)))
+    return flow, Motion(frame, float(np.nanmean(length)), p95, p99, seconds)
+
+
+def _as_float(frame: Bytes3) -> ImageArray:
+    return frame.astype(np.float32) / np.float32(255)
+
+
+def _frame_pairs(path: Path, every: int, reference: Reference) -> Iterator[tuple[int, Bytes3, Bytes3]]:
+    """(index of the second frame, reference frame, second frame)."""
+    before: Bytes3 | None = None
+    for index, frame in frames(path, every):
+        if frame is None:
+            raise InputError(f"{path}: image number {index} of the folder cannot be read (truncated or damaged)")
+        if before is not None:
+            if frame.shape != before.shape:
+                raise InputError(f"{path}: frame {index} has another size than the frame before it")
+            yield index, before, frame
+        if before is None or reference == "previous":
+            before = frame
+
+
+def _overlays(
+    path: Path,
+    every: int,
+    reference: Reference,
+    folder: Path,
+    scale: float,
+    done: int,
+    total: int,
+    progress: Callable[[int, int], None] | None,
+) -> Iterator[Bytes3]:
+    for count, (index, _, frame) in enumerate(_frame_pairs(path, every, reference), start=1):
+        yield draw_overlay(frame, read_flow(folder / f"{index:06d}.exr").flow, scale)
+        if progress:
+            progress(done + count, total)
+
+
+def _write_overlay(pictures: Iterator[Bytes3], out: Path, frames_per_second: float) -> list[Path]:
+    """Writes overlay.mp4, or overlay/000000.png ... where OpenCV has no encoder for it."""
+    import cv2
+
+    first = next(pictures)
+    video, temporary = out / "overlay.mp4", out / ".overlay.part.mp4"
+    try:
+        with quiet():
+            rate, size = max(frames_per_second, 1.0), (first.shape[1], first.shape[0])
+            writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
+        if not writer.isOpened():
+            return _write_sequence(first, pictures, out / "overlay")
+        count = 0
+        for picture in chain([first], pictures):
+            writer.write(np.ascontiguousarray(picture[..., ::-1]))
+            count += 1
+        with quiet():
+            writer.release()
+        # OpenCV does not report a failed write (a full disk): count what arrived.
+        if not temporary.is_file() or describe(temporary).frames != count:
+            raise OSError(f"cannot write {video}: the encoder did not take all {count} frames (is the disk full?)")
+        os.replace(temporary, video)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return [video]
+
+
+def _write_sequence(first: Bytes3, rest: Iterator[Bytes3], folder: Path) -> list[Path]:
+    files = [folder / "000000.png"]
+    write_png(files[0], first)
+    for number, picture in enumerate(rest, start=1):
+        files.append(folder / f"{number:06d}.png")
+        write_png(files[-1], picture)
+    return files

@@ -1,0 +1,49 @@
+"""What the command line shows: progress bars with rate and estimate on stderr, tables on stdout."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
+
+Advance = Callable[[int, int, str], None]
+"""Takes the number of items done, the number of all, and a word on the present one."""
+
+
+class _Rate(ProgressColumn):
+    """Items per second, or seconds per item where that is slow."""
+
+    def render(self, task: Task) -> Text:
+        speed = task.finished_speed or task.speed
+        if not speed:
+            return Text("")
+        return Text(f"{speed:.1f}/s" if speed >= 1 else f"{1 / speed:.1f} s each", style="cyan")
+
+
+@contextmanager
+def progress(label: str, shown: bool = True) -> Iterator[Advance]:
+    """A progress bar on stderr while the block runs, if that is a terminal; yields the function that moves it."""
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(), TimeRemainingColumn(),
+               TextColumn("{task.fields[item]}"))  # fmt: skip
+    with Progress(*columns, console=console, disable=not (shown and console.is_terminal), transient=True) as bar:
+        task = bar.add_task(label, total=None, item="")
+
+        def advance(done: int, total: int, item: str) -> None:
+            bar.update(task, completed=done, total=total, item=item)
+
+        yield advance
+
+
+def show_table(title: str, header: list[str], rows: list[list[str]]) -> None:
+    """Prints a table on stdout; columns but the first to the right, nothing cut off."""
+    table = Table(title=title, title_justify="left", title_style="bold")
+    for number, name in enumerate(header):
+        table.add_column(name, justify="right" if number else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    # Wider than the terminal rather than with cells cut off; a file or pipe has no width at all.
+    console = Console(width=max(Console().width, 250))
+    console.print(table)

@@ -1,0 +1,113 @@
+"""Weights on disk: safetensors, with the architecture in the file's metadata. Nothing here ever unpickles.
+
+Metadata (all texts): `format` = "gelflow", `version` of gelflow, `model` (the `ModelConfig` as JSON), `image_size`
+("null" or "[rows, columns]" to which training images were resized), and whatever else `save_weights` was given.
+"""
+
+import json
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from gelflow import __version__
+from gelflow.config import ModelConfig, validated
+from gelflow.errors import InputError
+from gelflow.files.atomic import replacing
+from gelflow.models import GelFlow
+
+FORMAT = "gelflow"
+RETRAIN = "give a file that `python -m gelflow train` wrote (weights.safetensors)"
+
+
+def save_weights(path: Path, model: GelFlow, **metadata: str) -> None:
+    """Writes a network's weights, as a whole or not at all.
+
+    Args:
+        path: File to write; folders are made.
+        model: The network.
+        metadata: Further texts to keep with the weights.
+
+    Raises:
+        OSError: The disk is full or the folder cannot be written to.
+    """
+    texts = metadata | {
+        "format": FORMAT,
+        "version": __version__,
+        "model": model.config.model_dump_json(),
+        "image_size": json.dumps(model.image_size),
+    }
+    tensors = {name: value.detach().contiguous().cpu() for name, value in model.state_dict().items()}
+    data = save(tensors, texts)
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def read_metadata(path: Path) -> dict[str, str]:
+    """The texts that `save_weights` kept with the weights.
+
+    Raises:
+        InputError: No such file, not a safetensors file, damaged, or not weights of GelFlow.
+    """
+    return _read(path)[0]
+
+
+def load_weights(path: Path, device: str = "cpu") -> GelFlow:
+    """Builds the network that a file describes and gives it the file's weights.
+
+    Args:
+        path: A file that `save_weights` wrote.
+        device: Where the network is put.
+
+    Returns:
+        The network, in evaluation mode, float32.
+
+    Raises:
+        InputError: No such file, not a safetensors file, damaged, or weights of another model.
+    """
+    metadata, tensors = _read(path)
+    try:
+        values = json.loads(metadata["model"])
+        size = json.loads(metadata.get("image_size", "null"))
+    except (KeyError, json.JSONDecodeError) as error:
+        raise InputError(f"{path}: its metadata do not describe a network ({error!r}); {RETRAIN}") from error
+    if not isinstance(values, dict):
+        raise InputError(f"{path}: its metadata do not describe a network (given: {values!r}); {RETRAIN}")
+    model = GelFlow(validated(ModelConfig, values, f"{path}, architecture in its metadata"))
+    _check_tensors(path, tensors, model)
+    model.load_state_dict(tensors)
+    model.image_size = None if size is None else (int(size[0]), int(size[1]))
+    return model.to(device).eval()
+
+
+def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file; {RETRAIN}")
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+    except (SafetensorError, OSError) as error:
+        raise InputError(
+            f"{path}: not a whole safetensors file ({error}); pickled files (.pt, .pth, .ckpt) are not opened, because "
+            f"that can run code; {RETRAIN}"
+        ) from error
+    if metadata.get("format") != FORMAT:
+        raise InputError(f"{path}: a safetensors file, but not weights of GelFlow (its metadata lack it); {RETRAIN}")
+    return metadata, tensors
+
+
+def _check_tensors(path: Path, tensors: dict[str, Tensor], model: GelFlow) -> None:
+    expected = model.state_dict()
+    wrong = [f"{name} is missing" for name in expected if name not in tensors]
+    wrong += [f"{name} is unknown" for name in tensors if name not in expected]
+    for name, value in tensors.items():
+        if name in expected and value.shape != expected[name].shape:
+            wrong.append(f"{name} has shape {tuple(value.shape)}, not {tuple(expected[name].shape)}")
+        elif not torch.isfinite(value).all():
+            wrong.append(f"{name} holds values that are not finite")
+    if wrong:
+        more = f" and {len(wrong) - 3} more" if len(wrong) > 3 else ""
+        raise InputError(f"{path}: its weights do not fit its architecture: {'; '.join(wrong[:3])}{more}; {RETRAIN}")

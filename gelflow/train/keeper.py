@@ -1,0 +1,148 @@
+"""What happens around the steps of a run: saving, choosing the best weights, showing progress, stopping on Ctrl-C."""
+
+import signal
+import sys
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import lightning as L
+import torch
+
+from gelflow.config import TrainConfig
+from gelflow.errors import InputError
+from gelflow.terminal import Advance
+from gelflow.train.checkpoint import save_weights
+from gelflow.train.module import LOG_EVERY, FlowModule
+from gelflow.train.state import WEIGHTS, State, save_state
+
+
+class Stopped(Exception):
+    """The user asked to stop; the state is saved up to the step in the folder."""
+
+
+class Keeper(L.Callback):
+    """Saves the state, keeps the best weights, reports progress; stops between two steps when asked to.
+
+    Args:
+        config: The run.
+        out: Its folder.
+        validates: Whether there are validation pairs.
+        score: Best score so far, of a resumed run.
+        metrics: Results of the last validation of a resumed run.
+    """
+
+    def __init__(
+        self, config: TrainConfig, out: Path, validates: bool, score: float | None, metrics: Mapping[str, float]
+    ) -> None:
+        self.config = config
+        self.out = out
+        self.validates = validates
+        self.score = score
+        self.metrics = dict(metrics)
+        self.stop = False
+        self.advance: Advance | None = None
+
+    def validates_at(self, step: int) -> bool:
+        """Whether a validation follows this step."""
+        return self.validates and (step % self.config.validate_every == 0 or step == self.config.steps)
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: L.LightningModule, *_: Any) -> None:
+        """Shows progress; saves where it is due and no validation follows, which saves itself."""
+        flow_module = _ours(module)
+        step = flow_module.step
+        if step % LOG_EVERY == 0 or step == self.config.steps:
+            self._check(flow_module)
+            if self.advance is not None:
+                item = f"step {step} of {self.config.steps}, loss {float(flow_module.last_loss):.4g}"
+                done = step - flow_module.start
+                self.advance(done, self.config.steps - flow_module.start, f"{item}{_brief(self.metrics)}")
+        if self.validates_at(step):
+            return
+        if self.stop or step % self.config.save_every == 0 or step == self.config.steps:
+            self._save(trainer, flow_module)
+        if self.stop:
+            raise Stopped
+
+    def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        """Keeps the weights if they are the best so far, and saves."""
+        flow_module = _ours(module)
+        self.metrics = flow_module.metrics
+        score = self.metrics.get("endpoint_error_px", self.metrics.get("photometric_loss"))
+        if score is None:
+            raise InputError("validation: no pair has a finite result; look at the validation pairs")
+        if self.score is None or score < self.score:
+            self.score = score
+            if trainer.is_global_zero:
+                save_weights(self.out / WEIGHTS, flow_module.model, **weights_metadata(self.config, flow_module.step))
+        self._save(trainer, flow_module)
+        if trainer.is_global_zero:
+            print(f"step {flow_module.step}: {describe(self.metrics)}", file=sys.stderr)
+        if self.stop:
+            raise Stopped
+
+    def _check(self, module: FlowModule) -> None:
+        if not torch.isfinite(module.last_loss):
+            raise InputError(
+                f"step {module.step}: loss {float(module.last_loss)}: training has diverged; lower learning_rate "
+                f"({self.config.learning_rate:g}) or set gradient_clip (now {self.config.gradient_clip})"
+            )
+
+    def _save(self, trainer: L.Trainer, module: FlowModule) -> None:
+        self._check(module)
+        if trainer.is_global_zero:
+            optimiser = trainer.optimizers[0].state_dict()
+            save_state(
+                self.out, State(module.step, module.model.state_dict(), optimiser, self.score, dict(self.metrics))
+            )
+
+
+def _ours(module: L.LightningModule) -> FlowModule:
+    if not isinstance(module, FlowModule):
+        raise TypeError(f"Keeper works with FlowModule, not {type(module).__name__}")
+    return module
+
+
+def weights_metadata(config: TrainConfig, step: int) -> dict[str, str]:
+    """What is kept with the weights: the run's settings and the step they are of."""
+    return {"train": config.model_dump_json(), "step": str(step)}
+
+
+def describe(metrics: Mapping[str, float]) -> str:
+    """The results of a validation in words."""
+    texts = []
+    if "endpoint_error_px" in metrics:
+        still = metrics["no_motion_endpoint_error_px"]
+        texts.append(f"endpoint error {metrics['endpoint_error_px']:.3f} px (no motion {still:.3f} px)")
+    if "psnr_db" in metrics:
+        texts.append(f"PSNR {metrics['psnr_db']:.2f} dB (no motion {metrics['no_motion_psnr_db']:.2f} dB)")
+    return ", ".join(texts)
+
+
+def _brief(metrics: Mapping[str, float]) -> str:
+    if "endpoint_error_px" in metrics:
+        return f", validation {metrics['endpoint_error_px']:.3f} px"
+    return f", validation {metrics['psnr_db']:.2f} dB" if "psnr_db" in metrics else ""
+
+
+@contextmanager
+def stopping(keeper: Keeper) -> Iterator[None]:
+    """While the block runs, the first Ctrl-C asks the keeper to stop after the step; the second stops at once."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def ask(_: int, __: FrameType | None) -> None:
+        if keeper.stop:
+            raise Stopped
+        keeper.stop = True
+        print("stopping after this step (Ctrl-C once more: at once, back to the last save)", file=sys.stderr)
+
+    former = signal.signal(signal.SIGINT, ask)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, former)

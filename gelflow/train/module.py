@@ -1,0 +1,159 @@
+"""The optimisation as a Lightning module: one step, one validation, the optimiser and its learning rate.
+
+The module knows at which step of the whole run it starts, so that learning rate and logs of a resumed run go on where
+they were.
+"""
+
+import math
+from typing import Any
+
+import lightning as L
+import torch
+from torch import Tensor
+from torch.optim import Adam
+from torch.optim.lr_scheduler import LambdaLR
+
+from gelflow.config import TrainConfig
+from gelflow.estimate import estimate_flow
+from gelflow.losses import flow_loss, self_supervised_loss
+from gelflow.losses.photometric import photometric_loss
+from gelflow.models import GelFlow
+from gelflow.ops.warp import inside, warp
+
+LOG_EVERY = 10
+"""Steps between entries in the logs."""
+
+
+def learning_rate_factor(config: TrainConfig, step: int) -> float:
+    """The learning rate of a step (0 .. steps-1) over its peak: a linear rise, then constant or a half cosine to 0."""
+    if step < config.warmup_steps:
+        return (step + 1) / config.warmup_steps
+    if config.schedule == "constant":
+        return 1.0
+    share = (step - config.warmup_steps) / (config.steps - config.warmup_steps)
+    return 0.5 * (1 + math.cos(math.pi * min(share, 1.0)))
+
+
+class FlowModule(L.LightningModule):
+    """Training of one network.
+
+    Args:
+        config: The run.
+        model: The network, at the state it starts from.
+        start: Steps that were done before.
+        optimiser: State of the optimiser after those steps, or None.
+
+    Attributes:
+        metrics: Results of the last validation, see `validation_metrics`.
+        last_loss: Loss of the last step, detached.
+    """
+
+    def __init__(
+        self, config: TrainConfig, model: GelFlow, start: int = 0, optimiser: dict[str, Any] | None = None
+    ) -> None:
+        super().__init__()
+        self.config = config
+        self.model = model
+        self.start = start
+        self.optimiser_state = optimiser
+        self.metrics: dict[str, float] = {}
+        self.last_loss: Tensor = torch.zeros(())
+        self._sums: dict[str, Tensor] = {}
+
+    @property
+    def step(self) -> int:
+        """Optimiser steps done, those before this session included."""
+        return self.start + self.trainer.global_step
+
+    def configure_optimizers(self) -> Any:
+        """Adam, at its former state where there is one."""
+        optimiser = Adam(self.model.parameters(), lr=self.config.learning_rate, weight_decay=self.config.weight_decay)
+        if self.optimiser_state is not None:
+            optimiser.load_state_dict(self.optimiser_state)
+        schedule = LambdaLR(optimiser, lambda count: learning_rate_factor(self.config, self.start + count))
+        return {"optimizer": optimiser, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def training_step(self, batch: dict[str, Any], _: int) -> Tensor:
+        """The loss of one batch."""
+        flows = self.model(batch["image1"], batch["image2"])
+        if self.config.supervision == "flow":
+            loss, parts = flow_loss(flows, batch["flow"], self.config.loss)
+        else:
+            loss, parts = self_supervised_loss(flows, batch["image1"], batch["image2"], self.config.loss)
+        self.last_loss = loss.detach()
+        if (self.step + 1) % LOG_EVERY == 0:
+            rate = self.config.learning_rate * learning_rate_factor(self.config, self.step)
+            self._write({"train/loss": float(loss.detach()), "train/learning_rate": rate}
+                        | {f"train/{name}": float(value) for name, value in parts.items()}, self.step + 1)  # fmt: skip
+        return loss
+
+    def on_validation_epoch_start(self) -> None:
+        """Forgets the sums of the last validation."""
+        self._sums = {}
+
+    def validation_step(self, batch: dict[str, Any], _: int) -> None:
+        """Adds one pair's metrics, in px of its own images."""
+        flow = estimate_flow(self.model, batch["image1"], batch["image2"], self.config.image_size)
+        for name, value in validation_metrics(batch, flow, self.config).items():
+            if torch.isfinite(value):
+                addend = torch.stack([value.double(), torch.ones_like(value, dtype=torch.float64)])
+                self._sums[name] = self._sums.get(name, torch.zeros_like(addend)) + addend
+
+    def on_validation_epoch_end(self) -> None:
+        """Means over all pairs of all processes, into `metrics` and the logs."""
+        means = {}
+        for name in METRICS:
+            sums = self._sums.get(name, torch.zeros(2, dtype=torch.float64, device=self.device))
+            if self.trainer.world_size > 1:
+                sums = torch.as_tensor(self.all_gather(sums)).sum(dim=0)
+            if sums[1] > 0:
+                means[name] = float(sums[0] / sums[1])
+        self.metrics = means
+        self._write({f"validation/{name}": value for name, value in means.items()}, self.step)
+
+    def _write(self, values: dict[str, float], step: int) -> None:
+        for logger in self.loggers:
+            logger.log_metrics(values, step)
+
+
+METRICS = (
+    "endpoint_error_px",
+    "no_motion_endpoint_error_px",
+    "psnr_db",
+    "no_motion_psnr_db",
+    "photometric_loss",
+)
+"""Results of a validation: mean over the pairs that have them."""
+
+
+def validation_metrics(batch: dict[str, Any], flow: Tensor, config: TrainConfig) -> dict[str, Tensor]:
+    """How good the flow of one pair is: against the truth where there is one, and by the warped image.
+
+    Args:
+        batch: One pair as a batch of one.
+        flow: (1, 2, H, W), px of its images.
+        config: For the photometric loss.
+
+    Returns:
+        Scalars by the names in `METRICS`; endpoint errors only where a flow is known. PSNR is that of floats over the
+        pixels that stay inside the image, not the 8-bit one of the comparison tables.
+    """
+    image1, image2 = batch["image1"], batch["image2"]
+    still = torch.zeros_like(flow)
+    metrics = {
+        "psnr_db": _psnr(image1, image2, flow),
+        "no_motion_psnr_db": _psnr(image1, image2, still),
+        "photometric_loss": photometric_loss(image1, image2, flow, config.loss.alpha, config.loss.mask_outside),
+    }
+    if "flow" in batch:
+        truth = batch["flow"]
+        known = torch.isfinite(truth).all(dim=1)
+        metrics["endpoint_error_px"] = (flow - truth).norm(dim=1)[known].mean()
+        metrics["no_motion_endpoint_error_px"] = truth.norm(dim=1)[known].mean()
+    return metrics
+
+
+def _psnr(image1: Tensor, image2: Tensor, flow: Tensor) -> Tensor:
+    mask = inside(flow)
+    squared = ((warp(image2, flow) - image1).square() * mask).sum() / (3 * mask.sum()).clamp(min=1)
+    return -10 * torch.log10(squared.clamp(min=1e-10))

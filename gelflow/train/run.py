@@ -1,0 +1,228 @@
+"""A training run from start to end: `train`.
+
+Lightning drives the steps in sections that end at multiples of `validate_every`, counted from the start of the whole
+run, so that a resumed run validates where an uninterrupted one does. On a CPU, with the same number of threads, both
+end with the same weights, bit by bit.
+"""
+
+import logging
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+from lightning.pytorch.utilities import rank_zero_only
+from torch.utils.data import DataLoader, Dataset
+
+from gelflow.config import TrainConfig
+from gelflow.errors import InputError
+from gelflow.models import GelFlow
+from gelflow.terminal import progress
+from gelflow.train.checkpoint import load_weights, save_weights
+from gelflow.train.keeper import Keeper, Stopped, describe, stopping, weights_metadata
+from gelflow.train.module import FlowModule
+from gelflow.train.samples import StepSampler, TrainingSamples, checked, collate
+from gelflow.train.state import STATE, WEIGHTS, load_state, open_run
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """What a run ended with.
+
+    Attributes:
+        weights: File of the best weights on the validation pairs; without such pairs, of the last.
+        steps: Optimiser steps done.
+        metrics: Results of the last validation (`gelflow.train.module.METRICS`); empty without validation pairs.
+        best: Best validation score: endpoint error in px where the flow is known, else photometric loss; else None.
+    """
+
+    weights: Path
+    steps: int
+    metrics: dict[str, float]
+    best: float | None
+
+    def __str__(self) -> str:
+        """The result in a line."""
+        return "; ".join(text for text in (f"{self.steps} steps", describe(self.metrics), f"{self.weights}") if text)
+
+
+def train(
+    config: TrainConfig,
+    train_set: Dataset[Any],
+    validation_set: Dataset[Any] | None,
+    out: Path,
+    *,
+    initial: Path | None = None,
+    resume: bool = False,
+) -> TrainResult:
+    """Trains a network and writes its weights.
+
+    Args:
+        config: The run.
+        train_set: Map-style, with a length; samples are dictionaries with `image1` and `image2` (3, H, W) float32 in
+            [0, 1], `name`, and where it is known `flow` (2, H, W) float32 in px, NaN where no gel is seen.
+        validation_set: The same; None: no validation.
+        out: Folder of the run, see `gelflow.train.state`.
+        initial: Weights to start from (fine-tuning); their architecture must be `config.model`.
+        resume: Go on with the run that `out` holds.
+
+    Returns:
+        Where the weights are, and the last results.
+
+    Raises:
+        InputError: Settings, data, folder or weights that cannot be used; a loss that is no longer finite.
+        KeyboardInterrupt: Ctrl-C; the state has been saved, the message says how to go on.
+        OSError: The disk is full or the folder cannot be written to.
+    """
+    pairs, validation_pairs = _length(train_set), 0 if validation_set is None else _length(validation_set)
+    if pairs == 0 or (validation_set is not None and validation_pairs == 0):
+        raise InputError(f"{'training' if pairs == 0 else 'validation'} set: holds no pair")
+    device = _device(config)
+    model = _initial_network(config, initial)
+    checked(train_set[0], supervised=config.supervision == "flow")
+    first = _is_first_process()
+    if first:
+        state = open_run(out, config, pairs, validation_pairs, initial, resume)
+    else:
+        state = load_state(out) if resume else None
+    if state is not None:
+        model.load_state_dict(state.model)
+    module = FlowModule(config, model, state.step if state else 0, state.optimiser if state else None)
+    keeper = Keeper(config, out, validation_pairs > 0, state.score if state else None, state.metrics if state else {})
+    if module.start < config.steps:
+        _fit(module, keeper, _Data(config, train_set, validation_set, module), device)
+    weights = out / WEIGHTS
+    if validation_set is None and first:
+        save_weights(weights, module.model.cpu(), **weights_metadata(config, config.steps))
+    return TrainResult(weights, config.steps, keeper.metrics, keeper.score)
+
+
+def _length(data: Dataset[Any]) -> int:
+    return len(data)  # type: ignore[arg-type]  # Dataset itself declares no __len__
+
+
+def _is_first_process() -> bool:
+    return not getattr(rank_zero_only, "rank", 0)
+
+
+def _device(config: TrainConfig) -> str:
+    available = torch.cuda.is_available()
+    if config.device == "cuda" and not available:
+        raise InputError("device = cuda: no CUDA device was found; use device = cpu")
+    device = ("cuda" if available else "cpu") if config.device == "auto" else config.device
+    if device == "cuda" and config.devices > torch.cuda.device_count():
+        raise InputError(f"devices = {config.devices}: this machine has {torch.cuda.device_count()} CUDA devices")
+    return device
+
+
+def _initial_network(config: TrainConfig, initial: Path | None) -> GelFlow:
+    if initial is None:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(config.seed)
+            model = GelFlow(config.model)
+    else:
+        model = load_weights(initial)
+        if model.config != config.model:
+            theirs, ours = model.config.model_dump(), config.model.model_dump()
+            names = [
+                f"{name}: {theirs[name]!r} there, {ours[name]!r} here" for name in ours if theirs[name] != ours[name]
+            ]
+            raise InputError(f"{initial}: its architecture is not that of the run ({'; '.join(names)})")
+    model.image_size = config.image_size
+    return model.train()
+
+
+def _fit(module: FlowModule, keeper: Keeper, data: "_Data", device: str) -> None:
+    """Runs the remaining steps; a stop by the user becomes a KeyboardInterrupt that says how to go on."""
+    config, out = keeper.config, keeper.out
+    session = f"from_step_{module.start:06d}"
+    with ExitStack() as stack:
+        stack.enter_context(_quiet())
+        trainer = L.Trainer(
+            accelerator="gpu" if device == "cuda" else "cpu",
+            devices=config.devices,
+            strategy="ddp" if config.devices > 1 else "auto",
+            precision="bf16-mixed" if config.precision == "bf16" else "32-true",
+            max_steps=config.steps - module.start,
+            max_epochs=-1,
+            gradient_clip_val=config.gradient_clip,
+            logger=[
+                TensorBoardLogger(out / "logs", name="tensorboard", version=session),
+                CSVLogger(out / "logs", name="csv", version=session),
+            ],
+            callbacks=[keeper],
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            num_sanity_val_steps=0,
+            use_distributed_sampler=False,
+            reload_dataloaders_every_n_epochs=1,
+        )
+        keeper.advance = stack.enter_context(progress("training", shown=trainer.is_global_zero))
+        stack.enter_context(stopping(keeper))
+        try:
+            trainer.fit(module, datamodule=data)
+        except Stopped:
+            saved = load_state(out).step if (out / STATE).exists() else 0
+            message = (
+                f"stopped; step {saved} of {config.steps} is saved in {out}; go on with the same command and --resume"
+            )
+            print(message, file=sys.stderr)
+            raise KeyboardInterrupt(message) from None
+
+
+class _Data(L.LightningDataModule):
+    """Loaders for the section of the run that begins at the module's present step."""
+
+    def __init__(
+        self, config: TrainConfig, train_set: Dataset[Any], validation_set: Dataset[Any] | None, module: FlowModule
+    ) -> None:
+        super().__init__()
+        self.config = config
+        self.train_set = train_set
+        self.validation_set = validation_set
+        self.module = module
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        """Batches up to the next validation, or to the end."""
+        config, trainer, start = self.config, self.module.trainer, self.module.step
+        stop = config.steps
+        if self.validation_set is not None:
+            stop = min(stop, (start // config.validate_every + 1) * config.validate_every)
+        sampler = StepSampler(_length(self.train_set), config, start, stop, trainer.global_rank, trainer.world_size)
+        samples = TrainingSamples(self.train_set, config)
+        return DataLoader(samples, batch_sampler=sampler, num_workers=config.workers, collate_fn=collate)
+
+    def val_dataloader(self) -> Any:
+        """Every pair once, alone in its batch, shared among the processes."""
+        if self.validation_set is None:
+            return []
+        trainer = self.module.trainer
+        mine = range(trainer.global_rank, _length(self.validation_set), trainer.world_size)
+        return DataLoader(
+            self.validation_set, batch_size=1, sampler=mine, num_workers=self.config.workers, collate_fn=_one_pair
+        )
+
+
+def _one_pair(samples: list[dict[str, Any]]) -> dict[str, Any]:
+    return collate([checked(sample) for sample in samples])
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps Lightning's notes on hardware, workers and products off the terminal; warnings of torch stay."""
+    logger = logging.getLogger("lightning.pytorch")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", module=r"lightning\..*")
+            yield
+    finally:
+        logger.setLevel(level)

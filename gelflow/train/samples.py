@@ -1,0 +1,156 @@
+"""From a data set of pairs to batches: the order of the pairs, resizing, cropping, augmentation.
+
+Draw k of a run (k = 0, 1, ...) is a pair and its augmentation, both fixed by (seed, k) alone: by neither the number of
+workers nor where a run was interrupted. Each pass over the pairs is a new permutation.
+"""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset, Sampler
+
+from gelflow.config import MINIMUM_SIDE, TrainConfig
+from gelflow.errors import InputError
+from gelflow.estimate import resize_flow, resize_images
+
+Sample = dict[str, Any]
+"""image1, image2: (3, H, W) float32 in [0, 1]; name; perhaps flow: (2, H, W) float32, px, NaN where no gel is seen."""
+
+ORDER, AUGMENTATION = 0, 1
+"""What a random stream is for: second word of its seed, after the run's."""
+
+
+class StepSampler(Sampler[list[tuple[int, int]]]):
+    """Batches of (index of the pair, draw) for the optimiser steps start .. stop-1 of one of `world` processes."""
+
+    def __init__(self, pairs: int, config: TrainConfig, start: int, stop: int, rank: int = 0, world: int = 1) -> None:
+        self.pairs = pairs
+        self.seed = config.seed
+        self.size = config.batch_size
+        self.steps = range(start, stop)
+        self.rank = rank
+        self.world = world
+
+    def __len__(self) -> int:
+        return len(self.steps)
+
+    def __iter__(self) -> Iterator[list[tuple[int, int]]]:
+        orders: dict[int, np.ndarray] = {}
+        for step in self.steps:
+            first = (step * self.world + self.rank) * self.size
+            batch = []
+            for draw in range(first, first + self.size):
+                turn, place = divmod(draw, self.pairs)
+                if turn not in orders:
+                    orders = {turn: np.random.default_rng([self.seed, ORDER, turn]).permutation(self.pairs)}
+                batch.append((int(orders[turn][place]), draw))
+            yield batch
+
+
+class TrainingSamples(Dataset[Sample]):
+    """Pairs resized, cropped and augmented for training; its keys are those of `StepSampler`."""
+
+    def __init__(self, pairs: Dataset[Any], config: TrainConfig) -> None:
+        self.pairs = pairs
+        self.config = config
+
+    def __getitem__(self, key: tuple[int, int]) -> Sample:
+        index, draw = key
+        sample = checked(self.pairs[index], supervised=self.config.supervision == "flow")
+        if self.config.image_size is not None:
+            sample = resized(sample, self.config.image_size)
+        elif min(sample["image1"].shape[1:]) < MINIMUM_SIDE:
+            size = "x".join(str(side) for side in sample["image1"].shape[1:])
+            raise InputError(f"pair {sample['name']}: {size} px, but each side must be at least {MINIMUM_SIDE} px; "
+                             "set image_size to enlarge the images")  # fmt: skip
+        return augmented(sample, self.config, np.random.default_rng([self.config.seed, AUGMENTATION, draw]))
+
+
+def checked(sample: Sample, supervised: bool = False) -> Sample:
+    """What training needs of a sample.
+
+    Raises:
+        InputError: A part is missing, has another shape, or an image holds values that are not finite.
+    """
+    name = sample.get("name", "(without a name)")
+    for key in ("image1", "image2"):
+        image = sample.get(key)
+        if not isinstance(image, Tensor) or image.ndim != 3 or image.shape[0] != 3:
+            raise InputError(f"pair {name}: {key} must be a (3, rows, columns) tensor")
+        if not torch.isfinite(image).all():
+            raise InputError(f"pair {name}: {key} holds NaN or infinite values")
+    if sample["image1"].shape != sample["image2"].shape:
+        sizes = [tuple(sample[key].shape[1:]) for key in ("image1", "image2")]
+        raise InputError(f"pair {name}: its images have different sizes, {sizes[0]} and {sizes[1]}")
+    kept = {key: sample[key] for key in ("image1", "image2")} | {"name": name}
+    flow = sample.get("flow")
+    if flow is not None:
+        if flow.shape[1:] != sample["image1"].shape[1:]:
+            raise InputError(f"pair {name}: its flow has another size than its images")
+        kept["flow"] = flow
+    if supervised and (flow is None or not torch.isfinite(flow).any()):
+        raise InputError(f'pair {name}: has no exact flow, which supervision = "flow" needs; use supervision = "self"')
+    return kept
+
+
+def resized(sample: Sample, size: tuple[int, int]) -> Sample:
+    """The sample at another size, its flow in px of that size."""
+    new = dict(sample)
+    for key in ("image1", "image2"):
+        new[key] = resize_images(sample[key][None], size)[0]
+    if "flow" in sample:
+        new["flow"] = resize_flow(sample["flow"][None], size)[0]
+    return new
+
+
+def augmented(sample: Sample, config: TrainConfig, random: np.random.Generator) -> Sample:
+    """The sample after the augmentation that the configuration asks for.
+
+    Raises:
+        InputError: The crop does not fit into the images.
+    """
+    new = dict(sample)
+    height, width = sample["image1"].shape[-2:]
+    fields = [key for key in ("image1", "image2", "flow") if key in sample]
+    if config.crop_size is not None:
+        rows, columns = config.crop_size
+        if rows > height or columns > width:
+            raise InputError(
+                f"pair {sample['name']}: crop_size {rows}x{columns} does not fit into its {height}x{width} px"
+            )
+        top, left = random.integers(height - rows + 1), random.integers(width - columns + 1)
+        for key in fields:
+            new[key] = new[key][:, top : top + rows, left : left + columns]
+    if config.flip:
+        for axis, component in ((-1, 0), (-2, 1)):
+            if random.random() < 0.5:
+                for key in fields:
+                    new[key] = new[key].flip(axis)
+                if "flow" in new:
+                    sign = torch.ones(2, 1, 1)
+                    sign[component] = -1
+                    new["flow"] = new["flow"] * sign
+    if config.color_jitter > 0:
+        gain = torch.from_numpy(np.exp(random.normal(0, config.color_jitter, (3, 1, 1)))).float()
+        for key in ("image1", "image2"):
+            new[key] = (new[key] * gain).clamp(0, 1)
+    return new
+
+
+def collate(samples: list[Sample]) -> Sample:
+    """A batch from samples of one size; the flow is kept where all of them have one.
+
+    Raises:
+        InputError: The samples differ in size.
+    """
+    sizes = {tuple(sample["image1"].shape[-2:]) for sample in samples}
+    if len(sizes) > 1:
+        names = ", ".join(str(sample["name"]) for sample in samples)
+        raise InputError(f"pairs {names} have images of different sizes; set image_size (or crop_size) to one size")
+    keys = ["image1", "image2"] + (["flow"] if all("flow" in sample for sample in samples) else [])
+    batch: Sample = {key: torch.stack([sample[key] for sample in samples]) for key in keys}
+    batch["name"] = [sample["name"] for sample in samples]
+    return batch

@@ -1,0 +1,145 @@
+"""The folder of a run: what it holds, whether it may be used, and the whole state that a run resumes from.
+
+run.json             the configuration and what it was given, written when the run starts
+state.ckpt           network, optimiser, step and best score so far: everything a resumed run needs
+weights.safetensors  the best weights on the validation pairs so far; without such pairs, the last, at the end
+logs/                TensorBoard and CSV, a subfolder per session
+"""
+
+import hashlib
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any
+
+import torch
+
+from gelflow import __version__
+from gelflow.config import TrainConfig, validated
+from gelflow.errors import InputError
+from gelflow.files.atomic import replacing, write_text
+
+RUN, STATE, WEIGHTS = "run.json", "state.ckpt", "weights.safetensors"
+
+FREE = ("steps", "validate_every", "save_every", "workers", "device")
+"""Settings that a resumed run may change; steps only under a constant learning rate."""
+
+
+@dataclass(frozen=True)
+class State:
+    """Everything that a run resumes from.
+
+    Attributes:
+        step: Optimiser steps done.
+        model: The network's state dictionary.
+        optimiser: The optimiser's state dictionary, or None at step 0.
+        score: Best validation score so far (lower is better), or None.
+        metrics: Results of the last validation.
+    """
+
+    step: int
+    model: dict[str, Any]
+    optimiser: dict[str, Any] | None
+    score: float | None
+    metrics: dict[str, float]
+
+
+def save_state(out: Path, state: State) -> None:
+    """Writes the state, as a whole or not at all.
+
+    Raises:
+        OSError: The disk is full or the folder cannot be written to.
+    """
+    with replacing(out / STATE) as temporary, temporary.open("wb") as file:
+        torch.save(dict(vars(state)), file)
+
+
+def load_state(out: Path) -> State:
+    """Reads the state of a run. Only tensors and plain values are read; nothing in the file can run code.
+
+    Raises:
+        InputError: There is none, or it is damaged.
+    """
+    path = out / STATE
+    try:
+        values = torch.load(path, map_location="cpu", weights_only=True)
+        return State(**values)
+    except FileNotFoundError as error:
+        raise InputError(f"{out}: no run to resume there ({STATE} is missing); start it without --resume") from error
+    except (OSError, RuntimeError, EOFError, UnpicklingError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: damaged, the run cannot be resumed from it: {error}") from error
+
+
+def open_run(
+    out: Path, config: TrainConfig, pairs: int, validation_pairs: int, initial: Path | None, resume: bool
+) -> State | None:
+    """Claims the folder for a new run, or checks that it holds this very run.
+
+    Args:
+        out: The folder; made where it is missing.
+        config: The run's settings.
+        pairs: Training pairs.
+        validation_pairs: Validation pairs, 0 without.
+        initial: Weights that the run starts from.
+        resume: Go on with the run in the folder.
+
+    Returns:
+        The state to resume from; None for a new run.
+
+    Raises:
+        InputError: A folder that holds a run although resume is False; none, or another one, although it is True.
+    """
+    record = {
+        "gelflow": __version__,
+        "pairs": pairs,
+        "validation_pairs": validation_pairs,
+        "initial_sha256": None if initial is None else hashlib.sha256(initial.read_bytes()).hexdigest(),
+        "config": config.model_dump(mode="json"),
+    }
+    if not resume:
+        if out.exists() and not out.is_dir():
+            raise InputError(f"{out}: a file is in the way; give a folder")
+        if (out / STATE).exists() or (out / WEIGHTS).exists():
+            raise InputError(f"{out}: holds a run already; add --resume to go on with it, or give another folder")
+        write_text(out / RUN, json.dumps(record, indent=2) + "\n")
+        return None
+    state = load_state(out)
+    former = _read_run(out)
+    differences = [
+        f"{name}: {former.get(name)!r} there, {record[name]!r} now"
+        for name in ("pairs", "validation_pairs", "initial_sha256")
+        if former.get(name) != record[name]
+    ]
+    before = validated(TrainConfig, former.get("config", {}), str(out / RUN))
+    differences += _differences(before, config)
+    if differences:
+        raise InputError(f"{out}: holds another run than the one to resume ({'; '.join(differences)})")
+    if state.step > config.steps:
+        raise InputError(f"{out}: its run has done {state.step} steps, more than the {config.steps} asked for")
+    write_text(out / RUN, json.dumps(record, indent=2) + "\n")
+    return state
+
+
+def _read_run(out: Path) -> dict[str, Any]:
+    try:
+        values = json.loads((out / RUN).read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{out / RUN}: missing or damaged, the run cannot be resumed: {error}") from error
+    if not isinstance(values, dict):
+        raise InputError(f"{out / RUN}: damaged, the run cannot be resumed")
+    return values
+
+
+def _differences(before: TrainConfig, now: TrainConfig) -> list[str]:
+    free = FREE if now.schedule == "constant" else FREE[1:]
+    old, new = _flat(before.model_dump(mode="json")), _flat(now.model_dump(mode="json"))
+    return [f"{name}: {old[name]!r} there, {new[name]!r} now"
+            for name in new if name not in free and old[name] != new[name]]  # fmt: skip
+
+
+def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in values.items():
+        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return flat

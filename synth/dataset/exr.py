@@ -1,0 +1,134 @@
+"""`flow.exr`: an exact flow as an OpenEXR image, float32, ZIP-compressed.
+
+Channels (of two directions, both read `I1(x) = I2(x + forward(x))`, `I2(x) = I1(x + backward(x))`):
+
+    forward.U forward.V forward.visible   backward.U backward.V backward.visible
+    and by name whatever FlowField.extras holds: depth1.Z normal1.X displacement.X traction.X contact.Y ...
+    R G B    the same numbers as forward.U forward.V forward.visible once more
+
+U is right, V is down, px at the pixel's centre (c + 0.5, r + 0.5); NaN where the pixel sees no gel. R, G, B are there
+for programs that know no named channels: tev shows them first, and OpenCV reads nothing else. An OpenCV built with
+OpenEXR (its 4.x wheels are, with OPENCV_IO_ENABLE_OPENEXR=1 set before the import; its 5.0 wheels are not) gives with
+`cv2.imread(path, cv2.IMREAD_UNCHANGED)` an (H, W, 3) float32 image of [visible, V, U]. ZIP compression finds the
+repetition: it costs 2 % of the file.
+
+Reference: OpenEXR file layout, https://openexr.com/en/latest/OpenEXRFileLayout.html
+"""
+
+import contextlib
+import io
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from synth.dataset.exr_layout import check_whole
+from synth.errors import InputError
+from synth.flow.field import FlowArray, FlowField
+
+ALIASES = {"R": "forward.U", "G": "forward.V", "B": "forward.visible"}
+CONVENTIONS = {
+    "flow.units": "px",
+    "flow.directions": "I1(x) = I2(x + forward(x)), I2(x) = I1(x + backward(x)); U is +x, right; V is +y, down",
+    "flow.pixelCentre": "pixel (column c, row r) has its centre at (c + 0.5, r + 0.5); its flow belongs to the centre",
+    "flow.visible": "1 where the pixel's material point is seen in the other image, else 0; U and V hold there, too",
+    "flow.nan": "the pixel sees no gel",
+    "flow.aliases": "R = forward.U, G = forward.V, B = forward.visible",
+}
+"""Header attributes of every file."""
+
+_PARTS = ("U", "V", "visible")
+
+
+def write_flow(path: Path, flow: FlowField, attributes: Mapping[str, str | int]) -> None:
+    """Writes a flow field; the same field and attributes give the same bytes.
+
+    Args:
+        path: the file, replaced if it is there.
+        flow: (H, W) fields.
+        attributes: added to the header beside `CONVENTIONS`; integers must fit 32 bits.
+
+    Raises:
+        OSError: The storage refuses.
+    """
+    import OpenEXR
+
+    planes = channels_of(flow)
+    planes |= {alias: planes[name] for alias, name in ALIASES.items()}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **CONVENTIONS, **attributes}
+    try:
+        OpenEXR.File(header, planes).write(str(path))
+    except RuntimeError as error:  # How the library reports a failing disk.
+        raise OSError(str(error)) from error
+
+
+def channels_of(flow: FlowField) -> dict[str, FlowArray]:
+    """The field's planes (H, W) float32 by channel name, without the aliases."""
+    planes: dict[str, FlowArray] = {}
+    for direction, motion, visible in (
+        ("forward", flow.forward, flow.forward_visible),
+        ("backward", flow.backward, flow.backward_visible),
+    ):
+        if motion is None or visible is None:
+            continue
+        planes[f"{direction}.U"] = motion[..., 0]
+        planes[f"{direction}.V"] = motion[..., 1]
+        planes[f"{direction}.visible"] = visible
+    planes |= flow.extras
+    return {name: np.ascontiguousarray(plane, np.float32) for name, plane in planes.items()}
+
+
+def read_flow(path: Path) -> FlowField:
+    """The flow field in a file.
+
+    Raises:
+        InputError: As `read_channels`, or a channel of the forward flow, or a part of the backward flow, is missing.
+    """
+    return flow_of(path, read_channels(path)[0])
+
+
+def flow_of(path: Path, channels: Mapping[str, FlowArray]) -> FlowField:
+    """Sorts channels into a field; `path` is for the message.
+
+    Raises:
+        InputError: A channel of the forward flow, or a part of the backward flow, is missing.
+    """
+    forward = _direction(path, channels, "forward")
+    given = any(name.startswith("backward.") for name in channels)
+    backward, seen = _direction(path, channels, "backward") if given else (None, None)
+    own = {*ALIASES, *(f"{direction}.{part}" for direction in ("forward", "backward") for part in _PARTS)}
+    extras = {name: plane for name, plane in channels.items() if name not in own}
+    return FlowField(*forward, backward=backward, backward_visible=seen, extras=extras)
+
+
+def _direction(path: Path, channels: Mapping[str, FlowArray], direction: str) -> tuple[FlowArray, FlowArray]:
+    """(H, W, 2) flow and (H, W) visibility."""
+    names = [f"{direction}.{part}" for part in _PARTS]
+    missing = [name for name in names if name not in channels]
+    if missing:
+        present = ", ".join(sorted(channels)) or "none"
+        raise InputError(f"{path}: lacks the channel {' and '.join(missing)}; it has {present}")
+    u, v, visible = (channels[name] for name in names)
+    return np.stack([u, v], axis=-1), visible
+
+
+def read_channels(path: Path) -> tuple[dict[str, FlowArray], dict[str, str | int]]:
+    """All channels, (H, W) float32 by name, and the header's text and integer attributes.
+
+    Raises:
+        InputError: The file is missing, no OpenEXR image, truncated or damaged, or its channels differ in size.
+    """
+    import OpenEXR
+
+    check_whole(path)
+    try:
+        # The library prints remarks about a damaged file to standard output before it raises.
+        with contextlib.redirect_stdout(io.StringIO()), OpenEXR.File(str(path), separate_channels=True) as file:
+            header = file.header()
+            planes = {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
+    except (RuntimeError, ValueError, OSError, TypeError) as error:
+        raise InputError(f"{path}: the OpenEXR image cannot be decoded ({error}); the file is damaged") from error
+    shapes = {plane.shape for plane in planes.values()}
+    if len(shapes) != 1 or len(next(iter(shapes))) != 2:
+        raise InputError(f"{path}: its channels have the sizes {sorted(shapes)}; a flow file's are all height x width")
+    return planes, {key: value for key, value in header.items() if isinstance(value, (str, int))}

@@ -1,0 +1,73 @@
+"""JSON text of this project's files: keys in the order given, exact for float64, strict (no NaN, no Infinity).
+
+Python prints the shortest decimal that reads back as the same float64, so equal data give equal bytes. A number that is
+not finite has no JSON form and becomes `null`.
+"""
+
+import json
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel
+
+from synth.errors import InputError
+
+_BREAK = re.compile(r"\n\s+")
+
+
+def jsonable(value: object) -> Any:
+    """The value with NumPy arrays, tuples, paths and pydantic models turned into JSON's types.
+
+    Raises:
+        TypeError: Something that has no JSON form.
+    """
+    if isinstance(value, BaseModel):
+        return jsonable(value.model_dump(mode="json"))
+    if isinstance(value, Mapping):
+        return {str(key): jsonable(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return jsonable(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [jsonable(item) for item in value]
+    if isinstance(value, np.generic):
+        return jsonable(value.item())
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Path):
+        return str(value)
+    if value is None or isinstance(value, (str, bool, int)):
+        return value
+    raise TypeError(f"{type(value).__name__} has no JSON form")
+
+
+def to_line(value: object) -> str:
+    """One line of a .jsonl file, with its newline."""
+    return json.dumps(jsonable(value), ensure_ascii=False, allow_nan=False, separators=(", ", ": ")) + "\n"
+
+
+def to_document(value: object) -> str:
+    """A .json file that a person can read: indented, with lists of plain values on one line."""
+    text = json.dumps(jsonable(value), ensure_ascii=False, allow_nan=False, indent=1)
+    # A newline in a string is escaped, so a real one is always indentation.
+    return re.sub(r"\[\n\s+([^\[\]{}]*?)\n\s+\]", lambda found: f"[{re.sub(_BREAK, ' ', found[1])}]", text) + "\n"
+
+
+def read_document(path: Path) -> dict[str, Any]:
+    """The object in a .json file.
+
+    Raises:
+        InputError: The file is missing, unreadable, or holds no JSON object.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except ValueError as error:
+        raise InputError(f"{path}: not valid JSON ({error}); the file is damaged") from error
+    if not isinstance(content, dict):
+        raise InputError(f"{path}: holds a JSON {type(content).__name__}, not an object; the file is damaged")
+    return content

@@ -1,0 +1,142 @@
+"""Files of one JSON object a line that survive a killed writer: manifest.jsonl and failures.jsonl.
+
+A line counts when it is ended by a newline and parses. Appending is one write, flushed to the disk; a run that was
+killed in between leaves at most one torn line, the last, which a writer cuts off and a reader passes over.
+"""
+
+import errno
+import json
+import os
+from collections.abc import Callable, Hashable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from synth.dataset.jsontext import to_line
+from synth.dataset.storage import flush, partial_name, storage_errors
+from synth.errors import InputError
+
+Key = TypeVar("Key", bound=Hashable)
+
+
+@dataclass(frozen=True)
+class LineTable(Generic[Key]):
+    """Where the lines of a file are.
+
+    Attributes:
+        places: key -> (offset, length) in bytes, of the last line with that key; in the file's order of first keys.
+        end: bytes up to the end of the last intact line.
+        tidy: the file holds the intact lines in the order of their keys, each once, and nothing else.
+    """
+
+    places: dict[Key, tuple[int, int]]
+    end: int
+    tidy: bool
+
+
+def scan_lines(path: Path, key: Callable[[dict[str, Any]], Key]) -> LineTable[Key]:
+    """Reads through a file.
+
+    Args:
+        path: the file; missing is as empty.
+        key: of a line's object; KeyError, TypeError, ValueError or IndexError where it is not a line of this file.
+
+    Raises:
+        InputError: The file cannot be read, or a line other than the last is damaged.
+    """
+    places: dict[Key, tuple[int, int]] = {}
+    end, lines, torn, ordered, previous = 0, 0, False, True, None
+    try:
+        with path.open("rb") as file:
+            for line in file:
+                if torn:
+                    raise InputError(
+                        f"{path}: line {lines + 1} is damaged; delete that line "
+                        "(what it stood for is then made again) and try again"
+                    )
+                found = _key_of(line, key)
+                if found is None:
+                    torn = True
+                    continue
+                ordered = ordered and (previous is None or previous < found)
+                previous = found
+                places[found] = (end, len(line))
+                end += len(line)
+                lines += 1
+    except FileNotFoundError:
+        return LineTable({}, 0, True)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    return LineTable(places, end, ordered and not torn)
+
+
+def _key_of(line: bytes, key: Callable[[dict[str, Any]], Key]) -> Any:
+    """The key of an intact line, else None."""
+    if not line.endswith(b"\n"):
+        return None
+    try:
+        return key(json.loads(line))
+    except (ValueError, KeyError, TypeError, IndexError):
+        return None
+
+
+def read_line(path: Path, place: tuple[int, int]) -> dict[str, Any]:
+    """The object in one line.
+
+    Raises:
+        InputError: The file cannot be read or has changed since it was scanned.
+    """
+    offset, length = place
+    try:
+        with path.open("rb") as file:
+            file.seek(offset)
+            record = json.loads(file.read(length))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except ValueError as error:
+        raise InputError(f"{path}: the line at byte {offset} is damaged, or was rewritten since; try again") from error
+    return dict(record)
+
+
+def append_line(path: Path, record: object) -> None:
+    """Adds a line in one write and flushes it; when the storage refuses, the file is as before.
+
+    Raises:
+        InputError: The storage refuses.
+    """
+    line = to_line(record).encode("utf-8")
+    with storage_errors(path):
+        descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+        try:
+            before = os.fstat(descriptor).st_size
+            try:
+                if os.write(descriptor, line) != len(line):
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+                os.fsync(descriptor)
+            except OSError:
+                os.ftruncate(descriptor, before)
+                raise
+        finally:
+            os.close(descriptor)
+
+
+def rewrite_lines(path: Path, places: Iterable[tuple[int, int]]) -> None:
+    """Gives the file these of its lines, in this order, and no others; whole or not at all, a line at a time.
+
+    Raises:
+        InputError: The storage refuses; the file is as before.
+    """
+    partial = partial_name(path)
+    with storage_errors(path):
+        path.touch()
+        try:
+            with path.open("rb") as old, partial.open("wb") as new:
+                for offset, length in places:
+                    old.seek(offset)
+                    new.write(old.read(length))
+            flush(partial)
+            os.replace(partial, path)
+            flush(path.parent)
+        except BaseException:
+            partial.unlink(missing_ok=True)
+            raise

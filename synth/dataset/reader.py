@@ -1,0 +1,179 @@
+"""Reading a dataset, a sample's folder, or a part of either; nothing is cached and nothing is written."""
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from synth.arrays import FloatArray
+from synth.dataset.exr import read_flow
+from synth.dataset.images import Raster, read_png
+from synth.dataset.job import read_job_record
+from synth.dataset.jsontext import read_document
+from synth.dataset.lines import LineTable, read_line, scan_lines
+from synth.dataset.npz import read_npz
+from synth.dataset.sample import SAMPLES_FOLDER, ManifestEntry, sample_name
+from synth.dataset.writer import FAILURES_FILE, MANIFEST_FILE
+from synth.errors import InputError
+from synth.flow.field import FlowField
+from synth.scene import Scene
+from synth.surface import ContactFaces, GelSurface
+
+
+@dataclass(frozen=True)
+class SampleData:
+    """What a sample's folder holds; see `synth.dataset.sample.Sample`. `meta` is meta.json."""
+
+    image1: Raster
+    image2: Raster
+    flow: FlowField
+    surface: GelSurface
+    displacement1: FloatArray
+    displacement2: FloatArray
+    meta: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """A dataset directory as it was when it was opened.
+
+    Attributes:
+        path: the directory.
+        info: dataset.json.
+    """
+
+    path: Path
+    info: Mapping[str, Any]
+    _table: LineTable[int]
+
+    @property
+    def samples(self) -> list[int]:
+        """Indices of the finished samples, ascending."""
+        return sorted(self._table.places)
+
+    @property
+    def failures(self) -> list[dict[str, Any]]:
+        """The records of failures.jsonl, by index and draw."""
+        path = self.path / FAILURES_FILE
+        table = scan_lines(path, lambda record: (int(record["index"]), int(record["draw"])))
+        return [read_line(path, table.places[key]) for key in sorted(table.places)]
+
+    def folder(self, index: int) -> Path:
+        """DIR/samples/NNNNNN.
+
+        Raises:
+            InputError: There is no such sample.
+        """
+        if index not in self._table.places:
+            known = self.samples
+            span = f"{known[0]} to {known[-1]} ({len(known)} of {self.info['n']})" if known else "none"
+            raise InputError(f"{self.path}: has no finished sample {index}; it has {span}")
+        return self.path / SAMPLES_FOLDER / sample_name(index)
+
+    def entry(self, index: int) -> ManifestEntry:
+        """The sample's line in the manifest.
+
+        Raises:
+            InputError: There is no such sample.
+        """
+        self.folder(index)
+        return ManifestEntry.from_record(read_line(self.path / MANIFEST_FILE, self._table.places[index]))
+
+    def scene_of(self, index: int) -> Scene:
+        """The draw that the sample was made from.
+
+        Raises:
+            InputError: No such sample, or its meta.json is missing or damaged.
+        """
+        return read_scene(self.folder(index))
+
+    def read(self, index: int) -> SampleData:
+        """The sample's files.
+
+        Raises:
+            InputError: No such sample, or a file is missing or damaged.
+        """
+        return read_sample(self.folder(index))
+
+    def check_hashes(self, index: int) -> list[str]:
+        """One message for each file whose content is not what the manifest says, or that is missing; empty: all well.
+
+        Raises:
+            InputError: There is no such sample.
+        """
+        folder, problems = self.folder(index), []
+        for name, expected in self.entry(index).sha256.items():
+            try:
+                found = hashlib.sha256((folder / name).read_bytes()).hexdigest()
+            except OSError as error:
+                problems.append(f"{folder / name}: cannot be read: {error.strerror or error}")
+                continue
+            if found != expected:
+                problems.append(f"{folder / name}: sha256 is {found[:16]}..., the manifest says {expected[:16]}...")
+        return problems
+
+
+def read_dataset(path: Path | str) -> Dataset:
+    """Opens a dataset directory, finished or not.
+
+    Raises:
+        InputError: Not a dataset, or its dataset.json or manifest is damaged.
+    """
+    directory = Path(path)
+    if not directory.is_dir():
+        raise InputError(f"{directory}: there is no such directory")
+    info = read_job_record(directory)
+    manifest = directory / MANIFEST_FILE
+    if not manifest.is_file():
+        raise InputError(f"{manifest}: missing; the dataset is damaged, or its first run was stopped at once")
+    return Dataset(directory, info, scan_lines(manifest, lambda record: ManifestEntry.from_record(record).index))
+
+
+def read_sample(folder: Path) -> SampleData:
+    """The files of one sample's folder.
+
+    Raises:
+        InputError: A file is missing or damaged, or they do not fit each other.
+    """
+    meta = read_document(folder / "meta.json")
+    image1, image2 = read_png(folder / "image1.png"), read_png(folder / "image2.png")
+    flow = read_flow(folder / "flow.exr")
+    names = ("nodes", "faces", "subdivisions", "displacement1", "displacement2")
+    arrays = read_npz(folder / "surface.npz", names)
+    size = flow.forward.shape[:2]
+    if image1.shape[:2] != size or image2.shape != image1.shape:
+        raise InputError(
+            f"{folder}: image1.png is {image1.shape}, image2.png {image2.shape}, flow.exr {size}; they must agree"
+        )
+    nodes = arrays["nodes"]
+    if any(arrays[name].shape != nodes.shape for name in ("displacement1", "displacement2")):
+        raise InputError(f"{folder / 'surface.npz'}: nodes and displacements differ in shape; the file is damaged")
+    return SampleData(
+        image1=image1,
+        image2=image2,
+        flow=flow,
+        surface=GelSurface(ContactFaces(nodes, arrays["faces"].astype(np.int32)), int(arrays["subdivisions"])),
+        displacement1=arrays["displacement1"],
+        displacement2=arrays["displacement2"],
+        meta=meta,
+    )
+
+
+def read_scene(folder: Path) -> Scene:
+    """The drawn scene in a sample's meta.json.
+
+    Raises:
+        InputError: The file is missing or damaged, or of a scene that this version does not know.
+    """
+    path = folder / "meta.json"
+    meta = read_document(path)
+    try:
+        return Scene.model_validate(meta["scene"])
+    except KeyError as error:
+        raise InputError(f"{path}: holds no scene; the file is damaged") from error
+    except ValidationError as error:
+        raise InputError(f"{path}: its scene does not fit this version of synth: {error.errors()[0]['msg']}") from error

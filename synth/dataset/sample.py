@@ -1,0 +1,112 @@
+"""One sample: two images of a gel, the exact flow between them, and all it was made from."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from synth.arrays import FloatArray
+from synth.dataset.images import Raster
+from synth.flow.field import FlowField
+from synth.scene import Scene
+from synth.surface import GelSurface
+
+SAMPLES_FOLDER = "samples"
+SAMPLE_FILES = ("image1.png", "image2.png", "flow.exr", "meta.json", "surface.npz")
+
+
+def sample_name(index: int) -> str:
+    """Name of a sample's folder: the index with at least six digits."""
+    return f"{index:06d}"
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A finished sample, before it is written.
+
+    Attributes:
+        index: its number in the dataset.
+        trajectory: number of the trajectory that its frames belong to.
+        frames: (i, j), states of that trajectory shown in image 1 and image 2.
+        seed: of the job.
+        image1, image2: (H, W) grey or (H, W, 3) RGB, uint8 or uint16 (full scale 65535).
+        flow: (H, W) fields.
+        scene: the draw that was simulated and rendered.
+        surface: what was rendered and traced.
+        displacement1, displacement2: (n, 3) float64 mm of `surface.coarse.nodes`.
+        diagnostics: JSON-able; "solver" is a list with a record for each of the two frames (depth_mm, shear_mm,
+            twist_deg, converged, newton_iterations, residual, min_jacobian, max_penetration_mm).
+        force_n, torque_nmm: (2, 3) of the indenter on the gel, per frame.
+        seconds: stage -> wall time.
+    """
+
+    index: int
+    trajectory: int
+    frames: tuple[int, int]
+    seed: int
+    image1: Raster
+    image2: Raster
+    flow: FlowField
+    scene: Scene
+    surface: GelSurface
+    displacement1: FloatArray
+    displacement2: FloatArray
+    diagnostics: Mapping[str, Any] = field(default_factory=dict)
+    force_n: FloatArray = field(default_factory=lambda: np.zeros((2, 3)))
+    torque_nmm: FloatArray = field(default_factory=lambda: np.zeros((2, 3)))
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuses parts that do not fit each other (a programming error)."""
+        size = self.flow.forward.shape[:2]
+        nodes = self.surface.coarse.nodes.shape
+        if self.image1.shape[:2] != size or self.image2.shape != self.image1.shape:
+            raise ValueError(f"images of {self.image1.shape} and {self.image2.shape} with a flow of {size}")
+        if self.displacement1.shape != nodes or self.displacement2.shape != nodes:
+            raise ValueError(
+                f"displacements of {self.displacement1.shape} and {self.displacement2.shape} at {nodes} nodes"
+            )
+
+
+@dataclass(frozen=True)
+class ManifestEntry:
+    """A line of manifest.jsonl. `sha256` is by file name; `max_flow_px` is None where no pixel sees the gel."""
+
+    index: int
+    trajectory: int
+    frames: tuple[int, int]
+    seed: int
+    sha256: Mapping[str, str]
+    seconds: Mapping[str, float]
+    diagnostics: Mapping[str, Any]
+    force_n: tuple[tuple[float, ...], ...]
+    torque_nmm: tuple[tuple[float, ...], ...]
+    max_flow_px: float | None
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> "ManifestEntry":
+        """From the line's JSON object; KeyError or TypeError where it is not one of a sample."""
+        return cls(
+            index=int(record["index"]),
+            trajectory=int(record["trajectory"]),
+            frames=(int(record["frames"][0]), int(record["frames"][1])),
+            seed=int(record["seed"]),
+            sha256=dict(record["sha256"]),
+            seconds=dict(record["seconds"]),
+            diagnostics=dict(record["diagnostics"]),
+            force_n=tuple(tuple(row) for row in record["force_n"]),
+            torque_nmm=tuple(tuple(row) for row in record["torque_nmm"]),
+            max_flow_px=record["max_flow_px"],
+        )
+
+    def record(self) -> dict[str, Any]:
+        """The line's JSON object."""
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+
+
+def largest_motion(flow: FlowField) -> float | None:
+    """Length in px of the longest forward vector; None where no pixel sees the gel."""
+    length = np.hypot(*np.moveaxis(flow.forward.astype(np.float64), -1, 0))
+    finite = length[np.isfinite(length)]
+    return float(finite.max()) if finite.size else None

@@ -1,0 +1,114 @@
+"""A sample's folder: written aside, flushed, renamed into place. Any process may do it; nothing else is touched."""
+
+import hashlib
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from synth.dataset.exr import CONVENTIONS, write_flow
+from synth.dataset.images import encode_png
+from synth.dataset.job import Job
+from synth.dataset.jsontext import jsonable, to_document
+from synth.dataset.npz import encode_npz
+from synth.dataset.sample import SAMPLES_FOLDER, ManifestEntry, Sample, largest_motion, sample_name
+from synth.dataset.storage import install_folder, partial_name, storage_errors
+
+
+def write_sample_files(directory: Path, sample: Sample, job: Job) -> ManifestEntry:
+    """Writes DIR/samples/NNNNNN whole or not at all; equal samples give equal bytes (times are only in the entry).
+
+    An older folder of that number is replaced: without a line in the manifest it counts as unfinished.
+
+    Args:
+        directory: the dataset, opened by a `DatasetWriter` of some process.
+        sample: what to write.
+        job: for the header of flow.exr.
+
+    Returns:
+        What `DatasetWriter.record` appends to the manifest.
+
+    Raises:
+        InputError: The storage refuses (disk full, no permission).
+    """
+    final = directory / SAMPLES_FOLDER / sample_name(sample.index)
+    partial = partial_name(final)
+    files = {
+        "image1.png": encode_png(sample.image1),
+        "image2.png": encode_png(sample.image2),
+        "meta.json": to_document(_meta(sample, job)).encode("utf-8"),
+        "surface.npz": _surface(sample),
+    }
+    with storage_errors(final):
+        try:
+            partial.mkdir(parents=True)
+            for name, content in files.items():
+                (partial / name).write_bytes(content)
+            write_flow(partial / "flow.exr", sample.flow, _attributes(sample, job))
+            sha256 = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in sorted(partial.iterdir())}
+            install_folder(partial, final)
+        except BaseException:
+            shutil.rmtree(partial, ignore_errors=True)
+            raise
+    return ManifestEntry(
+        index=sample.index,
+        trajectory=sample.trajectory,
+        frames=sample.frames,
+        seed=sample.seed,
+        sha256=sha256,
+        seconds={stage: round(value, 4) for stage, value in sample.seconds.items()},
+        diagnostics=jsonable(sample.diagnostics),
+        force_n=tuple(tuple(row) for row in np.asarray(sample.force_n, np.float64).tolist()),
+        torque_nmm=tuple(tuple(row) for row in np.asarray(sample.torque_nmm, np.float64).tolist()),
+        max_flow_px=largest_motion(sample.flow),
+    )
+
+
+def _attributes(sample: Sample, job: Job) -> dict[str, str | int]:
+    """Of flow.exr. The seed is text: OpenEXR's integers have 32 bits."""
+    return {
+        "scene.name": job.scene_name,
+        "scene.hash": job.scene_hash,
+        "seed": str(sample.seed),
+        "index": sample.index,
+        "trajectory": sample.trajectory,
+        "frames": f"{sample.frames[0]} {sample.frames[1]}",
+        "software": ", ".join(f"{name} {version}" for name, version in job.software.items()),
+    }
+
+
+def _meta(sample: Sample, job: Job) -> dict[str, object]:
+    """meta.json: everything but the times."""
+    height, width = sample.image1.shape[:2]
+    return {
+        "index": sample.index,
+        "trajectory": sample.trajectory,
+        "frames": sample.frames,
+        "seed": sample.seed,
+        "scene_hash": job.scene_hash,
+        "image": {
+            "width": width,
+            "height": height,
+            "channels": 1 if sample.image1.ndim == 2 else 3,
+            "bits": 8 * sample.image1.itemsize,
+        },
+        "max_flow_px": largest_motion(sample.flow),
+        "force_n": sample.force_n,
+        "torque_nmm": sample.torque_nmm,
+        "diagnostics": sample.diagnostics,
+        "conventions": CONVENTIONS,
+        "scene": sample.scene,
+    }
+
+
+def _surface(sample: Sample) -> bytes:
+    """surface.npz: what the flow was traced on, so that it can be derived again without the solver."""
+    return encode_npz(
+        {
+            "nodes": sample.surface.coarse.nodes,
+            "faces": sample.surface.coarse.faces,
+            "subdivisions": np.array(sample.surface.subdivisions),
+            "displacement1": np.asarray(sample.displacement1, np.float64),
+            "displacement2": np.asarray(sample.displacement2, np.float64),
+        }
+    )

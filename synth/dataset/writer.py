@@ -1,0 +1,201 @@
+"""A dataset directory while it is being written, possibly in several goes.
+
+    DIR/dataset.json      the job
+    DIR/manifest.jsonl    a line per finished sample
+    DIR/failures.jsonl    a line per failed draw
+    DIR/samples/000000/   image1.png image2.png flow.exr meta.json surface.npz
+    DIR/.lock             held by the process that writes
+
+A sample is finished when its folder is whole and its line is in the manifest, written in this order. Whatever a killed
+run leaves (a torn line, a hidden partial folder, a folder without a line) is put right on the next opening. `finalise`
+sorts both files, so that they do not depend on the number of workers or on interruptions; only `seconds` does.
+"""
+
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from synth.dataset.job import DATASET_FILE, Job, continued, differences, read_job_record
+from synth.dataset.jsontext import to_document
+from synth.dataset.lines import append_line, rewrite_lines, scan_lines
+from synth.dataset.lock import LOCK_FILE, DirectoryLock
+from synth.dataset.sample import SAMPLE_FILES, SAMPLES_FOLDER, ManifestEntry, Sample, sample_name
+from synth.dataset.sample_files import write_sample_files
+from synth.dataset.storage import PARTIAL, remove_partials, replace_file, storage_errors
+from synth.errors import InputError
+
+MANIFEST_FILE = "manifest.jsonl"
+FAILURES_FILE = "failures.jsonl"
+
+
+class DatasetWriter:
+    """Writes one job's samples; one process holds it, workers call `write_sample_files` and hand back the entry."""
+
+    def __init__(self, directory: Path | str, job: Job) -> None:
+        """Creates the directory, or goes on with the job that it holds.
+
+        Args:
+            directory: empty, missing, or a dataset of the same job (n may differ).
+            job: what to write.
+
+        Raises:
+            InputError: The directory holds another job (the message lists what differs) or something else, another
+                process is writing it, its manifest is damaged, or the storage refuses.
+        """
+        self.directory = Path(directory)
+        self.job = job
+        _check_place(self.directory)
+        with storage_errors(self.directory):
+            self.directory.mkdir(parents=True, exist_ok=True)
+        self._lock = DirectoryLock(self.directory)
+        try:
+            self._adopt_job()
+            with storage_errors(self.directory):
+                (self.directory / SAMPLES_FOLDER).mkdir(exist_ok=True)
+                remove_partials(self.directory)
+                remove_partials(self.directory / SAMPLES_FOLDER)
+            self._finished = self._repair_manifest()
+            self._failed = self._repair_failures()
+        except BaseException:
+            self._lock.release()
+            raise
+
+    @property
+    def finished(self) -> set[int]:
+        """Indices of the samples that are whole and in the manifest."""
+        return set(self._finished)
+
+    @property
+    def failed(self) -> set[tuple[int, int]]:
+        """(index, draw) of the failures on record."""
+        return set(self._failed)
+
+    def write(self, sample: Sample) -> ManifestEntry:
+        """Writes a sample's folder and its line in the manifest.
+
+        Raises:
+            InputError: The storage refuses; the sample counts as unfinished.
+        """
+        entry = write_sample_files(self.directory, sample, self.job)
+        self.record(entry)
+        return entry
+
+    def record(self, entry: ManifestEntry) -> None:
+        """Appends the line of a sample whose folder `write_sample_files` has written; again for a known one: nothing.
+
+        Raises:
+            InputError: The storage refuses, or the folder is not there.
+        """
+        if entry.index in self._finished:
+            return
+        if not self._is_whole(entry.index):
+            folder = self.directory / SAMPLES_FOLDER / sample_name(entry.index)
+            raise InputError(f"{folder}: the sample's files are not there; was it written to another place?")
+        append_line(self.directory / MANIFEST_FILE, entry.record())
+        self._finished.add(entry.index)
+
+    def fail(self, index: int, draw: int, stage: str, reason: str, last_good_state: Any = None) -> None:
+        """Records a draw that failed, once, also over several runs.
+
+        Args:
+            index: the sample that it was to become.
+            draw: 0 for the first draw, 1 for the next.
+            stage: where it failed, e.g. "simulate".
+            reason: for the user.
+            last_good_state: JSON-able, or None.
+
+        Raises:
+            InputError: The storage refuses.
+        """
+        if (index, draw) in self._failed:
+            return
+        record = {"index": index, "draw": draw, "stage": stage, "reason": reason, "last_good_state": last_good_state}
+        append_line(self.directory / FAILURES_FILE, record)
+        self._failed.add((index, draw))
+
+    def finalise(self) -> None:
+        """Sorts manifest and failures by index; called on leaving a `with` block, too.
+
+        Raises:
+            InputError: The storage refuses; the files are as before.
+        """
+        self._repair_manifest()
+        self._repair_failures()
+
+    def close(self) -> None:
+        """Lets other processes write; harmless when repeated."""
+        self._lock.release()
+
+    def __enter__(self) -> "DatasetWriter":
+        """For `with`."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Finalises (unless an error is on its way that this might hide) and closes."""
+        try:
+            if error is None or isinstance(error, KeyboardInterrupt):
+                self.finalise()
+        finally:
+            self.close()
+
+    def _adopt_job(self) -> None:
+        path = self.directory / DATASET_FILE
+        if not path.exists():
+            replace_file(path, self.job.document())
+            return
+        record = read_job_record(self.directory)
+        different = differences(self.job, record)
+        if different:
+            listed = "".join(f"\n  {line}" for line in different[:20])
+            more = f"\n  and {len(different) - 20} more" if len(different) > 20 else ""
+            raise InputError(
+                f"{self.directory}: holds another job; it differs in{listed}{more}\n"
+                "give another --out, or the options of that job to go on with it"
+            )
+        content = continued(self.job, record)
+        if content != record:
+            replace_file(path, to_document(content).encode("utf-8"))
+
+    def _repair_manifest(self) -> set[int]:
+        path = self.directory / MANIFEST_FILE
+        table = scan_lines(path, _manifest_key)
+        whole = {index: place for index, place in table.places.items() if self._is_whole(index)}
+        if not table.tidy or len(whole) < len(table.places) or not path.exists():
+            rewrite_lines(path, [whole[index] for index in sorted(whole)])
+        return set(whole)
+
+    def _repair_failures(self) -> set[tuple[int, int]]:
+        path = self.directory / FAILURES_FILE
+        table = scan_lines(path, _failure_key)
+        if not table.tidy or not path.exists():
+            rewrite_lines(path, [table.places[key] for key in sorted(table.places)])
+        return set(table.places)
+
+    def _is_whole(self, index: int) -> bool:
+        folder = self.directory / SAMPLES_FOLDER / sample_name(index)
+        return all((folder / name).is_file() for name in SAMPLE_FILES)
+
+
+def _check_place(directory: Path) -> None:
+    """Refuses a file, and a folder with something else in it, before anything in it is touched."""
+    if directory.exists() and not directory.is_dir():
+        raise InputError(f"{directory}: is a file; --out needs a directory")
+    if not directory.is_dir() or (directory / DATASET_FILE).exists():
+        return
+    with storage_errors(directory):
+        strange = sorted(
+            entry.name for entry in directory.iterdir() if entry.name != LOCK_FILE and PARTIAL not in entry.name
+        )
+    if strange:
+        listed = ", ".join(strange[:5]) + (", ..." if len(strange) > 5 else "")
+        raise InputError(f"{directory}: is not empty and not a dataset (it holds {listed}); give another --out")
+
+
+def _manifest_key(record: dict[str, Any]) -> int:
+    return ManifestEntry.from_record(record).index
+
+
+def _failure_key(record: dict[str, Any]) -> tuple[int, int]:
+    return int(record["index"]), int(record["draw"])

@@ -1,0 +1,9 @@
+"""The one exception that synth raises for something a user can put right."""
+
+
+class InputError(ValueError):
+    """A file, option or value that cannot be used.
+
+    The message says what was given, where, what is allowed and what to do. The command line prints it without a
+    traceback and exits with status 2.
+    """

@@ -1,0 +1,277 @@
+"""Nearest hits of rays with a triangle surface, in float64 and deterministic, by Warp kernels.
+
+The surface's triangles are binned into the cells of a grid over x and y, each into every cell that its bounding box
+(widened by far more than rounding) touches. Inside the gel a ray is straight, so it visits the cells under its track
+one after the other (Amanatides & Woo 1987) from where it enters the slab of z that the surface occupies, tests the
+triangles of each (Möller & Trumbore 1997) and stops at the first cell that holds its nearest hit.
+
+Edges belong to both their triangles: barycentric coordinates down to -1e-9 count as inside, which is far above the
+rounding of the test (about 1e-13) and far below anything visible, so no ray falls through between two triangles. Of
+several hits the nearest counts, and of equally near ones the triangle of lowest index: an order that does not depend on
+that in which triangles are met, so results are the same in every run. Edge-on triangles are never hit themselves; their
+neighbours' edges are.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from synth.arrays import FloatArray, Points, Triangles
+
+wp.config.log_level = wp.LOG_WARNING
+wp.set_module_options({"enable_backward": False})
+
+_TRIANGLES_PER_CELL = 2.0
+"""Cells are as large as so many triangles are on average."""
+
+
+@dataclass(frozen=True)
+class Hits:
+    """Nearest hits, one for each ray.
+
+    Attributes:
+        triangle: (..., n) int32, -1 where the ray hits nothing.
+        barycentric: (..., n, 3) float64 weights of the triangle's vertices; NaN where nothing is hit.
+        distance: (..., n) float64 mm along the unit direction; infinite where nothing is hit.
+    """
+
+    triangle: NDArray[np.int32]
+    barycentric: FloatArray
+    distance: FloatArray
+
+    def interpolate(self, triangles: Triangles, values: FloatArray) -> FloatArray:
+        """Values (n, c) at the hits from values (v, c) at the vertices; NaN where nothing is hit. Not for batches."""
+        return np.einsum("ni,nic->nc", self.barycentric, values[triangles[self.triangle]])
+
+
+def trace(positions: Points, triangles: Triangles, origins: Points, directions: Points, device: str = "cpu") -> Hits:
+    """Find where rays first meet a surface.
+
+    Args:
+        positions: (v, 3) or, for a batch of states, (b, v, 3) float64 mm.
+        triangles: (f, 3) int32 into `positions`.
+        origins: (n, 3) or (b, n, 3) float64 mm; NaN for rays that do not exist.
+        directions: of `origins`' shape, unit, with a negative z: rays go toward the contact surface.
+        device: Warp device.
+
+    Returns:
+        Hits of the batch's shape. Rays start at their origin: what lies behind it is not hit.
+    """
+    batched = positions.ndim == 3
+    if not batched:
+        positions, origins, directions = positions[None], origins[None], directions[None]
+    batches, rays = origins.shape[:2]
+    outputs = (
+        wp.empty((batches, rays), dtype=wp.int32, device=device),
+        wp.empty((batches, rays), dtype=wp.vec3d, device=device),
+        wp.empty((batches, rays), dtype=wp.float64, device=device),
+    )
+    vertices = wp.array(np.ascontiguousarray(positions, dtype=np.float64), dtype=wp.vec3d, device=device)
+    corners = wp.array(np.ascontiguousarray(triangles, dtype=np.int32), dtype=wp.int32, device=device)
+    grid = _Grid.around(positions, len(triangles))
+    first, members = _bin(grid, vertices, corners, device)
+    starts = wp.array(np.ascontiguousarray(origins, dtype=np.float64), dtype=wp.vec3d, device=device)
+    ways = wp.array(np.ascontiguousarray(directions, dtype=np.float64), dtype=wp.vec3d, device=device)
+    wp.launch(
+        _nearest_hit,
+        dim=(batches, rays),
+        inputs=[grid.struct(), vertices, corners, first, members, starts, ways],
+        outputs=list(outputs),
+        device=device,
+    )
+    triangle, barycentric, distance = (array.numpy() for array in outputs)
+    return Hits(triangle, barycentric, distance) if batched else Hits(triangle[0], barycentric[0], distance[0])
+
+
+@wp.struct
+class _Cells:
+    """Grid over x and y, shared by a batch, and the slab of z in which all triangles lie."""
+
+    x: wp.float64
+    y: wp.float64
+    size: wp.float64
+    margin: wp.float64
+    bottom: wp.float64
+    top: wp.float64
+    columns: wp.int32
+    rows: wp.int32
+
+
+@dataclass(frozen=True)
+class _Grid:
+    low: FloatArray
+    high: FloatArray
+    size: float
+    margin: float
+    columns: int
+    rows: int
+
+    @staticmethod
+    def around(positions: Points, triangles: int) -> "_Grid":
+        low, high = positions.min((0, 1)), positions.max((0, 1))
+        extent = high - low
+        margin = 1e-9 * float(extent.max())  # coordinates round at about 1e-16 of the extent
+        low, high = low - 2 * margin, high + 2 * margin
+        area = max(float(extent[0] * extent[1]), 1e-6 * float(extent[:2].max()) ** 2)
+        size = float(np.sqrt(_TRIANGLES_PER_CELL * area / triangles))
+        columns, rows = (int(np.ceil((high - low)[axis] / size)) for axis in (0, 1))
+        return _Grid(low, high, size, margin, columns, rows)
+
+    def struct(self) -> Any:
+        cells = _Cells()
+        cells.x, cells.y, cells.size, cells.margin = self.low[0], self.low[1], self.size, self.margin
+        cells.bottom, cells.top = self.low[2], self.high[2]
+        cells.columns, cells.rows = self.columns, self.rows
+        return cells
+
+
+def _bin(grid: _Grid, vertices: Any, corners: Any, device: str) -> tuple[Any, Any]:
+    """Triangles of each cell of each state: the start of every cell's list (one more than cells), and the lists."""
+    batches, triangles = vertices.shape[0], corners.shape[0]
+    count = wp.zeros(batches * grid.rows * grid.columns + 1, dtype=wp.int32, device=device)
+    inputs = [grid.struct(), vertices, corners]
+    wp.launch(_count, dim=(batches, triangles), inputs=inputs, outputs=[count], device=device)
+    first = wp.empty_like(count)
+    wp.utils.array_scan(count, first, inclusive=False)
+    members = wp.empty(int(first.numpy()[-1]), dtype=wp.int32, device=device)
+    taken = wp.clone(first)
+    wp.launch(_fill, dim=(batches, triangles), inputs=inputs, outputs=[taken, members], device=device)
+    return first, members
+
+
+@wp.func
+def _column(cells: _Cells, x: wp.float64) -> wp.int32:
+    return wp.clamp(wp.int32(wp.floor((x - cells.x) / cells.size)), 0, cells.columns - 1)
+
+
+@wp.func
+def _row(cells: _Cells, y: wp.float64) -> wp.int32:
+    return wp.clamp(wp.int32(wp.floor((y - cells.y) / cells.size)), 0, cells.rows - 1)
+
+
+@wp.func
+def _touched(cells: _Cells, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.vec4i:
+    """First and last column, first and last row that a triangle's widened bounding box touches."""
+    return wp.vec4i(
+        _column(cells, wp.min(wp.min(a[0], b[0]), c[0]) - cells.margin),
+        _column(cells, wp.max(wp.max(a[0], b[0]), c[0]) + cells.margin),
+        _row(cells, wp.min(wp.min(a[1], b[1]), c[1]) - cells.margin),
+        _row(cells, wp.max(wp.max(a[1], b[1]), c[1]) + cells.margin),
+    )
+
+
+@wp.kernel
+def _count(
+    cells: _Cells, vertices: wp.array2d[wp.vec3d], corners: wp.array2d[wp.int32], count: wp.array[wp.int32]
+) -> None:
+    batch, t = wp.tid()
+    span = _touched(
+        cells, vertices[batch, corners[t, 0]], vertices[batch, corners[t, 1]], vertices[batch, corners[t, 2]]
+    )
+    for row in range(span[2], span[3] + 1):
+        for column in range(span[0], span[1] + 1):
+            wp.atomic_add(count, (batch * cells.rows + row) * cells.columns + column, 1)
+
+
+@wp.kernel
+def _fill(
+    cells: _Cells,
+    vertices: wp.array2d[wp.vec3d],
+    corners: wp.array2d[wp.int32],
+    taken: wp.array[wp.int32],
+    members: wp.array[wp.int32],
+) -> None:
+    batch, t = wp.tid()
+    span = _touched(
+        cells, vertices[batch, corners[t, 0]], vertices[batch, corners[t, 1]], vertices[batch, corners[t, 2]]
+    )
+    for row in range(span[2], span[3] + 1):
+        for column in range(span[0], span[1] + 1):
+            place = wp.atomic_add(taken, (batch * cells.rows + row) * cells.columns + column, 1)
+            members[place] = t
+
+
+@wp.func
+def _intersect(o: wp.vec3d, d: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.vec4d:
+    """Distance and barycentric coordinates; the distance is negative where the triangle is not hit."""
+    miss = wp.vec4d(wp.float64(-1.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0))
+    tolerance = wp.float64(-1e-9)
+    ab, ac, ao = b - a, c - a, o - a
+    normal = wp.cross(ab, ac)
+    slant = -wp.dot(d, normal)
+    if wp.abs(slant) <= wp.float64(1e-12) * wp.length(normal):
+        return miss
+    moment = wp.cross(ao, d)
+    v = wp.dot(ac, moment) / slant
+    w = -wp.dot(ab, moment) / slant
+    u = wp.float64(1.0) - v - w
+    if u < tolerance or v < tolerance or w < tolerance:
+        return miss
+    return wp.vec4d(wp.dot(ao, normal) / slant, u, v, w)
+
+
+@wp.kernel
+def _nearest_hit(
+    cells: _Cells,
+    vertices: wp.array2d[wp.vec3d],
+    corners: wp.array2d[wp.int32],
+    first: wp.array[wp.int32],
+    members: wp.array[wp.int32],
+    origins: wp.array2d[wp.vec3d],
+    directions: wp.array2d[wp.vec3d],
+    triangle: wp.array2d[wp.int32],
+    barycentric: wp.array2d[wp.vec3d],
+    distance: wp.array2d[wp.float64],
+) -> None:
+    batch, ray = wp.tid()
+    o, d = origins[batch, ray], directions[batch, ray]
+    infinite = wp.float64(wp.inf)
+    nearest, weights, found = infinite, wp.vec3d(wp.float64(wp.nan)), wp.int32(-1)
+    if d[2] < wp.float64(0.0):
+        enter = wp.max((cells.top - o[2]) / d[2], wp.float64(0.0))
+        leave = (cells.bottom - o[2]) / d[2]
+        p = o + enter * d
+        column, row = (
+            wp.int32(wp.floor((p[0] - cells.x) / cells.size)),
+            wp.int32(wp.floor((p[1] - cells.y) / cells.size)),
+        )
+        step_x, step_y = wp.int32(1), wp.int32(1)
+        if d[0] < wp.float64(0.0):
+            step_x = wp.int32(-1)
+        if d[1] < wp.float64(0.0):
+            step_y = wp.int32(-1)
+        at = enter
+        while at <= leave:
+            # Where the ray crosses the sides of this cell that lie ahead of it.
+            next_x, next_y = infinite, infinite
+            if d[0] != wp.float64(0.0):
+                next_x = (cells.x + wp.float64(column + wp.max(step_x, 0)) * cells.size - o[0]) / d[0]
+            if d[1] != wp.float64(0.0):
+                next_y = (cells.y + wp.float64(row + wp.max(step_y, 0)) * cells.size - o[1]) / d[1]
+            exit = wp.min(next_x, next_y)
+            if column >= 0 and column < cells.columns and row >= 0 and row < cells.rows:
+                cell = (batch * cells.rows + row) * cells.columns + column
+                for k in range(first[cell], first[cell + 1]):
+                    t = members[k]
+                    hit = _intersect(
+                        o,
+                        d,
+                        vertices[batch, corners[t, 0]],
+                        vertices[batch, corners[t, 1]],
+                        vertices[batch, corners[t, 2]],
+                    )
+                    if hit[0] >= wp.float64(0.0) and (hit[0] < nearest or (hit[0] == nearest and t < found)):
+                        nearest, weights, found = hit[0], wp.vec3d(hit[1], hit[2], hit[3]), t
+            if nearest <= exit:
+                break
+            at = exit
+            if next_x <= next_y:
+                column += step_x
+            else:
+                row += step_y
+    triangle[batch, ray] = found
+    barycentric[batch, ray] = weights
+    distance[batch, ray] = nearest

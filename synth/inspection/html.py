@@ -1,0 +1,180 @@
+"""One HTML file that needs nothing else: pictures inline as base64 PNG, arrows as SVG, no script."""
+
+import base64
+from functools import cache
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synth.dataset.images import encode_png
+from synth.dataset.storage import replace_file
+from synth.inspection.arrows import Arrows
+from synth.inspection.inspection import Inspection, evenly_spaced
+from synth.inspection.panels import CLOSURE_RANGE_PX, Panel, image_picture, panels_of
+from synth.inspection.table import about_rows
+from synth.inspection.text import facts, percent, short
+from synth.inspection.view import View
+from synth.inspection.wheel import flow_colours, robust_scale, wheel_legend
+
+PICTURED = 24
+"""Samples of a dataset that are shown with pictures, evenly spaced."""
+
+_STYLE = """
+:root { color-scheme: light dark; --line: #8885; --soft: #8881; }
+body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 1500px; padding: 0 1.2rem; }
+h1 { font-size: 1.5rem; margin: 0 0 .6rem; } h2 { font-size: 1.1rem; margin: 2.2rem 0 .6rem; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
+td, th { padding: .18rem .7rem .18rem 0; text-align: left; vertical-align: top; }
+th { font-weight: 600; white-space: nowrap; }
+table.rows td, table.rows th { text-align: right; vertical-align: middle; white-space: nowrap; }
+table.rows tr > * { border-bottom: 1px solid var(--line); }
+table.rows td:first-child, table.rows th:first-child { text-align: left; }
+table.rows img { width: 110px; display: block; }
+.scroll { overflow-x: auto; }
+.pictures { display: grid; grid-template-columns: repeat(auto-fill, minmax(270px, 1fr)); gap: 1rem; }
+figure { margin: 0; } figcaption { font-size: .85rem; padding: .25rem 0; }
+.frame { position: relative; line-height: 0; border: 1px solid var(--line); }
+.frame img.picture, .frame svg { width: 100%; image-rendering: pixelated; }
+.frame svg { position: absolute; inset: 0; height: 100%; }
+.frame .wheel { position: absolute; right: 2%; bottom: 2%; width: 17%; border-radius: 50%; }
+details { margin-top: .8rem; } summary { cursor: pointer; }
+p.note { color: #888; font-size: .85rem; max-width: 60rem; }
+"""
+
+
+def write_html(inspection: Inspection, html: Path | str) -> None:
+    """Writes the page; a file of that name is replaced.
+
+    Raises:
+        InputError: A sample's file has gone or is damaged, or the storage refuses.
+    """
+    body = _dataset_body(inspection) if inspection.kind == "dataset" else _view_body(inspection)
+    title = escape(f"synth: {inspection.title}")
+    page = (
+        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
+        f'<meta name="viewport" content="width=device-width"><style>{_STYLE}</style></head>\n<body>\n{body}\n'
+        f'<p class="note">{_NOTE}</p>\n</body></html>\n'
+    )
+    replace_file(Path(html), page.encode("utf-8"))
+
+
+_NOTE = (
+    "Flow: I1(x) = I2(x + forward(x)); U is right, V is down, px at pixel centres. Colours: direction is the hue, "
+    "length the saturation, the wheel's rim the length given below the picture; longer is darker; grey sees no gel. "
+    "Closure is |forward(x) + backward(x + forward(x))| by cubic interpolation between pixels, which is not exact at "
+    f"kinks; its colours are logarithmic from {CLOSURE_RANGE_PX[0]:g} (dark) to {CLOSURE_RANGE_PX[1]:g} px (yellow). "
+    "Differences are shares of full scale over visible pixels: blue below zero, red above, to the ± of the caption."
+)
+
+
+def _view_body(inspection: Inspection) -> str:
+    view = inspection.view(0)
+    numbers = inspection.numbers[0]
+    return f"<h1>{escape(str(inspection.path))}</h1>\n{_facts(facts(numbers))}\n{_pictures(view, numbers)}"
+
+
+def _dataset_body(inspection: Inspection) -> str:
+    """Facts, a row per sample, then each pictured sample in full."""
+    pictured = set(evenly_spaced(len(inspection.places), PICTURED))
+    rows, sections = [], []
+    for number, numbers in enumerate(inspection.numbers):
+        view = inspection.view(number) if number in pictured else None
+        rows.append(_row(numbers, view))
+        if view is not None:
+            name = escape(numbers["name"])
+            sections.append(
+                f'<h2 id="s{name}">Sample {name}</h2>\n{_pictures(view, numbers)}\n'
+                f"<details><summary>all numbers</summary>{_facts(facts(numbers))}</details>"
+            )
+    heads = "".join(f"<th>{head}</th>" for head in _HEADS)
+    note = (
+        ""
+        if len(pictured) == len(rows)
+        else f'<p class="note">{len(pictured)} of {len(rows)} samples have pictures.</p>'
+    )
+    return (
+        f"<h1>{escape(str(inspection.path))}</h1>\n{_facts(about_rows(inspection))}\n<h2>Samples</h2>\n{note}"
+        f'<div class="scroll"><table class="rows"><tr>{heads}</tr>\n{"".join(rows)}</table></div>\n{"".join(sections)}'
+    )
+
+
+_HEADS = (
+    "sample", "image 1", "image 2", "forward flow", "frames", "flow median", "95 %", "max", "no gel", "visible",
+    "closure 95 %", "difference", "warped", "depth", "force z", "converged",
+)  # fmt: skip
+
+
+def _row(numbers: dict[str, Any], view: View | None) -> str:
+    motion, difference = numbers["forward"], numbers["difference"]
+    solver = numbers["solver"][-1] if numbers["solver"] else {}
+    name = escape(numbers["name"])
+    cells = [f'<a href="#s{name}">{name}</a>' if view is not None else name, *_thumbnails(view)]
+    cells += [
+        "–".join(str(frame) for frame in numbers["frames"]),
+        short(motion["median_px"], "px"),
+        short(motion["p95_px"], "px"),
+        short(motion["max_px"], "px"),
+        percent(motion["nan_share"]),
+        percent(motion["visible_share"]),
+        short((numbers["closure"] or {}).get("p95_px"), "px"),
+        percent(difference["before_rmse"]),
+        percent(difference["after_rmse"]),
+        short(solver.get("depth_mm"), "mm"),
+        short(float(numbers["force_n"][1][2]), "N"),
+        short(solver.get("converged")),
+    ]
+    return "<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>\n"
+
+
+def _thumbnails(view: View | None) -> list[str]:
+    if view is None or view.image1 is None or view.image2 is None:
+        return ["", "", ""]
+    step = max(1, view.size[1] // 160)
+    flow = flow_colours(view.flow.forward, robust_scale(view.flow.forward))
+    pictures = (image_picture(view.image1), image_picture(view.image2), flow)
+    return [f'<img alt="" src="{_inline(picture[::step, ::step])}">' for picture in pictures]
+
+
+def _facts(rows: list[tuple[str, str]]) -> str:
+    cells = "".join(f"<tr><th>{escape(name)}</th><td>{escape(value)}</td></tr>" for name, value in rows)
+    return f"<table>{cells}</table>"
+
+
+def _pictures(view: View, numbers: dict[str, Any]) -> str:
+    """Every picture that the view has."""
+    return f'<div class="pictures">{"".join(_figure(panel) for panel in panels_of(view, numbers))}</div>'
+
+
+def _figure(panel: Panel) -> str:
+    caption = escape(panel.caption)
+    wheel = _wheel() if panel.scale == "wheel" else ""
+    arrows = "" if panel.arrows is None else _arrows(panel.arrows, panel.picture.shape[1], panel.picture.shape[0])
+    image = f'<img class="picture" alt="{caption}" src="{_inline(panel.picture)}">'
+    return f'<figure><div class="frame">{image}{arrows}{wheel}</div><figcaption>{caption}</figcaption></figure>\n'
+
+
+def _arrows(arrows: Arrows, width: int, height: int) -> str:
+    """Lines with a head, as one SVG path over the picture."""
+    along = arrows.tip - arrows.start
+    across = np.column_stack([-along[:, 1], along[:, 0]])
+    barbs = [arrows.tip - 0.28 * along + side * 0.16 * across for side in (1, -1)]
+    corners = np.stack([arrows.start, arrows.tip, barbs[0], arrows.tip, barbs[1]], axis=1).round(2)
+    path = "".join("M" + "L".join(f"{x:g} {y:g}" for x, y in line) for line in corners)
+    return (
+        f'<svg viewBox="0 0 {width} {height}"><path d="{path}" fill="none" stroke="#b00020" '
+        f'stroke-width="{width / 200:.3g}"/></svg>'
+    )
+
+
+def _inline(picture: NDArray[np.uint8]) -> str:
+    """A data URL."""
+    return f"data:image/png;base64,{base64.b64encode(encode_png(picture)).decode('ascii')}"
+
+
+@cache
+def _wheel() -> str:
+    """The legend, as an image; the style makes it round."""
+    return f'<img class="wheel" alt="colour wheel" src="{_inline(wheel_legend(96)[..., :3])}">'

@@ -1,0 +1,127 @@
+"""What `inspect` finds at a path."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from synth.dataset.job import DATASET_FILE
+from synth.dataset.reader import read_dataset
+from synth.errors import InputError
+from synth.inspection.numbers import numbers_of
+from synth.inspection.view import View, view_flow, view_sample
+
+Kind = Literal["dataset", "sample", "flow"]
+Progress = Callable[[int, int], None]
+"""Called with (samples looked at, samples to look at)."""
+
+_ALLOWED = "a dataset, a sample's folder or an .exr file with a flow"
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """Numbers, and where the pictures come from (they are read again when they are drawn).
+
+    Attributes:
+        kind: what `path` is.
+        path: as given.
+        about: facts of the whole: scene, seed, device ...; empty for a sample or flow file.
+        places: folder or file of each view that was looked at.
+        numbers: of each of them, see `synth.inspection.numbers.numbers_of`.
+    """
+
+    kind: Kind
+    path: Path
+    about: Mapping[str, Any]
+    places: tuple[Path, ...]
+    numbers: tuple[dict[str, Any], ...]
+
+    @property
+    def title(self) -> str:
+        """For headings."""
+        return self.path.resolve().name
+
+    def as_dict(self) -> dict[str, Any]:
+        """For --json."""
+        return {"kind": self.kind, "path": str(self.path), **self.about, "samples": list(self.numbers)}
+
+    def view(self, number: int) -> View:
+        """Reads a view again.
+
+        Raises:
+            InputError: A file has gone or is damaged.
+        """
+        return _look(self.kind, self.places[number])
+
+
+def evenly_spaced(total: int, count: int) -> list[int]:
+    """At most `count` of 0 ... total - 1, the first and the last among them."""
+    return sorted({int(i) for i in np.linspace(0, total - 1, min(count, total)).round()})
+
+
+def inspect(path: Path | str, limit: int = 100, progress: Progress | None = None) -> Inspection:
+    """Looks at a dataset, a sample's folder or one flow file.
+
+    Args:
+        path: what to look at.
+        limit: of a dataset, look at no more than so many samples, evenly spaced; `about` says how many there are.
+        progress: told after each sample.
+
+    Raises:
+        InputError: Nothing that can be inspected, or a file is missing or damaged.
+    """
+    place = Path(path)
+    if not place.exists():
+        raise InputError(f"{place}: there is no such file or directory")
+    about: dict[str, Any] = {}
+    places, kind = [place], _kind_of(place)
+    if kind == "dataset":
+        about, folders = _about(place)
+        places = [folders[i] for i in evenly_spaced(len(folders), limit)]
+        about["inspected"] = len(places)
+    numbers = []
+    for done, item in enumerate(places):
+        numbers.append(numbers_of(_look(kind, item)))
+        if progress is not None:
+            progress(done + 1, len(places))
+    return Inspection(kind, place, about, tuple(places), tuple(numbers))
+
+
+def _kind_of(place: Path) -> Kind:
+    if place.is_file():
+        if place.suffix.lower() != ".exr":
+            raise InputError(f"{place}: cannot be inspected; give {_ALLOWED}")
+        return "flow"
+    if (place / DATASET_FILE).exists():
+        return "dataset"
+    if (place / "flow.exr").exists() or (place / "meta.json").exists():
+        return "sample"
+    raise InputError(f"{place}: holds neither {DATASET_FILE} nor flow.exr; give {_ALLOWED}")
+
+
+def _look(kind: Kind, place: Path) -> View:
+    return view_flow(place) if kind == "flow" else view_sample(place)
+
+
+def _about(place: Path) -> tuple[dict[str, Any], list[Path]]:
+    """Facts of a dataset, and its samples' folders."""
+    dataset = read_dataset(place)
+    info, indices = dataset.info, dataset.samples
+    seconds: dict[str, float] = {}
+    for index in indices:
+        for stage, value in dataset.entry(index).seconds.items():
+            seconds[stage] = seconds.get(stage, 0.0) + value
+    about = {
+        "scene": info.get("scene_name"),
+        "scene_hash": info["scene_hash"],
+        "seed": info["seed"],
+        "n": info["n"],
+        "finished": len(indices),
+        "failed_draws": len(dataset.failures),
+        "device": info.get("device", {}),
+        "software": info.get("software", {}),
+        "seconds": {stage: round(value, 2) for stage, value in seconds.items()},
+    }
+    return about, [dataset.folder(index) for index in indices]

@@ -1,0 +1,79 @@
+"""The numbers of one view: a JSON-able record with one form for samples and flow files."""
+
+from typing import Any
+
+import numpy as np
+
+from synth.arrays import BoolArray, FloatArray
+from synth.flow.field import FlowArray
+from synth.inspection.view import View
+
+
+def numbers_of(view: View) -> dict[str, Any]:
+    """What a view says in numbers; None where there is nothing to say it from.
+
+    Returns:
+        name, width, height, bits, forward and backward (min_px, median_px, p95_px, max_px over the pixels that see gel;
+        nan_share of all pixels; visible_share of those with gel), closure (median_px, p95_px, max_px, pixels),
+        difference (before_rmse, after_rmse as shares of full scale over visible pixels), and from a sample's meta.json
+        index, trajectory, frames, force_n, torque_nmm, solver.
+    """
+    height, width = view.size
+    flow, meta = view.flow, view.meta
+    backward = None
+    if flow.backward is not None and flow.backward_visible is not None:
+        backward = _motion(flow.backward, flow.backward_visible > 0.5, view.visible_known)
+    return {
+        "name": view.name,
+        "index": meta.get("index"),
+        "trajectory": meta.get("trajectory"),
+        "frames": meta.get("frames"),
+        "width": width,
+        "height": height,
+        "bits": None if view.image1 is None else 8 * view.image1.itemsize,
+        "forward": _motion(flow.forward, view.visible, view.visible_known),
+        "backward": backward,
+        "closure": None if view.closure is None else _spread(view.closure),
+        "difference": _difference(view),
+        "force_n": meta.get("force_n"),
+        "torque_nmm": meta.get("torque_nmm"),
+        "solver": meta.get("diagnostics", {}).get("solver") if isinstance(meta.get("diagnostics"), dict) else None,
+        "channels": sorted(flow.extras),
+    }
+
+
+def _motion(flow: FlowArray, visible: BoolArray, visible_known: bool) -> dict[str, float | None]:
+    length = np.hypot(flow[..., 0].astype(np.float64), flow[..., 1].astype(np.float64))
+    gel = np.isfinite(length)
+    found = length[gel]
+    if not found.size:
+        return dict.fromkeys(("min_px", "median_px", "p95_px", "max_px", "visible_share"), None) | {"nan_share": 1.0}
+    low, median, high, top = np.percentile(found, [0, 50, 95, 100])
+    return {
+        "min_px": float(low),
+        "median_px": float(median),
+        "p95_px": float(high),
+        "max_px": float(top),
+        "nan_share": float(1 - gel.mean()),
+        "visible_share": float(visible[gel].mean()) if visible_known else None,
+    }
+
+
+def _spread(values: FloatArray) -> dict[str, float | int | None]:
+    found = values[np.isfinite(values)]
+    if not found.size:
+        return {"median_px": None, "p95_px": None, "max_px": None, "pixels": 0}
+    median, high, top = np.percentile(found, [50, 95, 100])
+    return {"median_px": float(median), "p95_px": float(high), "max_px": float(top), "pixels": int(found.size)}
+
+
+def _difference(view: View) -> dict[str, float | None] | None:
+    if view.differences is None:
+        return None
+    before, after = (_rms(values) for values in view.differences)
+    return {"before_rmse": before, "after_rmse": after}
+
+
+def _rms(values: FloatArray) -> float | None:
+    found = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(found**2))) if found.size else None

@@ -1,0 +1,71 @@
+"""The numbers of an inspection as tables for the terminal."""
+
+from collections.abc import Callable
+from typing import Any
+
+from rich.table import Table
+
+from synth.inspection.inspection import Inspection
+from synth.inspection.text import facts, percent, short
+
+_COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
+    ("sample", lambda n: n["name"]),
+    ("size\npx", lambda n: f"{n['width']}x{n['height']}"),
+    ("frames", lambda n: "-".join(str(frame) for frame in n["frames"])),
+    ("depth\nmm", lambda n: short(_solver(n).get("depth_mm"))),
+    ("Fz\nN", lambda n: short(float(n["force_n"][1][2]))),
+    ("flow med.\npx", lambda n: short(n["forward"]["median_px"])),
+    ("95 %\npx", lambda n: short(n["forward"]["p95_px"])),
+    ("max\npx", lambda n: short(n["forward"]["max_px"])),
+    ("no gel", lambda n: percent(n["forward"]["nan_share"])),
+    ("visible", lambda n: percent(n["forward"]["visible_share"])),
+    ("closure\n95 %, px", lambda n: short((n["closure"] or {}).get("p95_px"))),
+    ("difference\nbefore", lambda n: percent(n["difference"]["before_rmse"])),
+    ("warped", lambda n: percent(n["difference"]["after_rmse"])),
+    ("con-\nverged", lambda n: short(_solver(n).get("converged"))),
+)
+
+
+def _solver(numbers: dict[str, Any]) -> dict[str, Any]:
+    """The record of the second frame."""
+    return numbers["solver"][-1] if numbers["solver"] else {}
+
+
+def tables(inspection: Inspection) -> list[Table]:
+    """For `rich.console.Console.print`: of a dataset its facts and a row per sample, else one table of all numbers."""
+    if inspection.kind != "dataset":
+        table = _pairs(str(inspection.path))
+        for name, value in facts(inspection.numbers[0]):
+            table.add_row(name, value)
+        return [table]
+    about = _pairs(str(inspection.path))
+    for name, value in about_rows(inspection):
+        about.add_row(name, value)
+    rows = Table(title="samples", title_justify="left", header_style="bold")
+    for name, _ in _COLUMNS:
+        rows.add_column(name, justify="right", no_wrap=True)
+    for numbers in inspection.numbers:
+        rows.add_row(*(text(numbers) for _, text in _COLUMNS))
+    return [about, rows]
+
+
+def about_rows(inspection: Inspection) -> list[tuple[str, str]]:
+    """A dataset's facts as (name, value)."""
+    about = inspection.about
+    seconds = ", ".join(f"{stage} {value:.3g} s" for stage, value in about["seconds"].items())
+    shown = "" if about["inspected"] == about["finished"] else f" ({about['inspected']} of them looked at)"
+    return [
+        ("scene, seed", f"{about['scene']}, {about['seed']}"),
+        ("finished samples", f"{about['finished']} of {about['n']}{shown}"),
+        ("failed draws", str(about["failed_draws"])),
+        ("device", ", ".join(f"{key} {value}" for key, value in about["device"].items()) or "not recorded"),
+        ("software", ", ".join(f"{key} {value}" for key, value in about["software"].items()) or "not recorded"),
+        ("time", seconds or "not recorded"),
+    ]
+
+
+def _pairs(title: str) -> Table:
+    table = Table(title=title, title_justify="left", show_header=False)
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column(overflow="fold")
+    return table

@@ -1,0 +1,84 @@
+"""Numbers as short text, the same in table, sheet and page."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+NONE = "–"
+
+
+def short(value: object, unit: str = "") -> str:
+    """A number to three digits, a truth as yes or no, nothing as a dash."""
+    if value is None:
+        return NONE
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    text = f"{value:.3g}" if isinstance(value, float) else str(value)
+    return f"{text} {unit}".strip()
+
+
+def percent(share: float | None) -> str:
+    """A share as percent."""
+    return NONE if share is None else f"{100 * share:.4g} %"
+
+
+def vector(values: Sequence[float] | None, unit: str = "") -> str:
+    """Components to three digits."""
+    return NONE if values is None else f"({', '.join(f'{value:.3g}' for value in values)}) {unit}".strip()
+
+
+def facts(numbers: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """(name, value) of all that `numbers_of` found."""
+    rows = [("size", f"{numbers['width']} x {numbers['height']} px" + _bits(numbers))]
+    if numbers["frames"] is not None and numbers["trajectory"] is not None:
+        frames = numbers["frames"]
+        rows.append(
+            ("trajectory, frames", f"{numbers['trajectory']}, {frames if isinstance(frames, str) else vector(frames)}")
+        )
+    for direction in ("forward", "backward"):
+        motion = numbers[direction]
+        if motion is None:
+            rows.append((direction, "not in the file"))
+            continue
+        lengths = " / ".join(short(motion[key]) for key in ("min_px", "median_px", "p95_px", "max_px"))
+        rows.append((f"{direction} min / median / 95 % / max", f"{lengths} px"))
+        rows.append(
+            (f"{direction} without gel, visible", f"{percent(motion['nan_share'])}, {percent(motion['visible_share'])}")
+        )
+    closure = numbers["closure"]
+    if closure is not None:
+        lengths = " / ".join(short(closure[key]) for key in ("median_px", "p95_px", "max_px"))
+        rows.append(("closure (interpolated) median / 95 % / max", f"{lengths} px"))
+    difference = numbers["difference"]
+    if difference is not None:
+        before, after = difference["before_rmse"], difference["after_rmse"]
+        rows.append(
+            ("image difference (RMS) before, after warping", f"{percent(before)}, {percent(after)} of full scale")
+        )
+    rows += _states(numbers)
+    if numbers["channels"]:
+        rows.append(("other channels", ", ".join(numbers["channels"])))
+    return rows
+
+
+def _bits(numbers: Mapping[str, Any]) -> str:
+    return "" if numbers["bits"] is None else f", {numbers['bits']} bits"
+
+
+def _states(numbers: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Forces and solver diagnostics, both frames in one value."""
+    rows = []
+    for key, name, unit in (("force_n", "force", "N"), ("torque_nmm", "torque", "N mm")):
+        if numbers[key] is not None:
+            rows.append((f"{name} in frames 1, 2", "; ".join(vector(row) for row in numbers[key]) + f" {unit}"))
+    for name in _SOLVER if numbers["solver"] else ():
+        values = [state.get(name) for state in numbers["solver"] if isinstance(state, dict)]
+        if any(value is not None for value in values):
+            shown = (vector(value) if isinstance(value, list) else short(value) for value in values)
+            rows.append((name.replace("_", " "), "; ".join(shown)))
+    return rows
+
+
+_SOLVER = (
+    "depth_mm", "shear_mm", "twist_deg", "converged", "newton_iterations", "residual", "min_jacobian",
+    "max_penetration_mm",
+)  # fmt: skip

@@ -1,0 +1,127 @@
+"""What can be seen of one sample or flow file, and the fields derived from it for looking at.
+
+Closure by interpolation at pixel x of image 1, zero for exact continuous fields where x is visible:
+
+.. math::  e(x) = |forward(x) + backward(x + forward(x))|
+
+`backward` is interpolated between pixel centres, so e includes the interpolation's error (third order, large where the
+flow has kinks); `verify` traces rays and has none. Warped difference: I2(x + forward(x)) - I1(x), as a share of full
+scale; noise and shading that changes with the surface's tilt remain in it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from synth.arrays import BoolArray, FloatArray
+from synth.dataset.exr import flow_of, read_channels
+from synth.dataset.images import Raster, read_png
+from synth.dataset.jsontext import read_document
+from synth.flow.field import FlowField
+from synth.inspection.interpolation import sample_at
+
+
+@dataclass(frozen=True)
+class View:
+    """One sample, or one flow file (then there are no images and `meta` is its header).
+
+    Attributes:
+        name: for titles.
+        flow: (H, W) fields.
+        visible_known: False for a flow file that does not tell (an estimate).
+        image1, image2: see `synth.dataset.sample.Sample`, or None.
+        meta: meta.json, or the header's attributes.
+    """
+
+    name: str
+    flow: FlowField
+    visible_known: bool = True
+    image1: Raster | None = None
+    image2: Raster | None = None
+    meta: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height, width in px."""
+        height, width = self.flow.forward.shape[:2]
+        return height, width
+
+    @cached_property
+    def gel(self) -> BoolArray:
+        """(H, W): the pixel sees gel."""
+        return np.asarray(np.isfinite(self.flow.forward).all(axis=-1))
+
+    @cached_property
+    def visible(self) -> BoolArray:
+        """(H, W): and its point is seen in image 2."""
+        return self.gel & (self.flow.forward_visible > 0.5)
+
+    @cached_property
+    def target(self) -> tuple[FloatArray, FloatArray]:
+        """X + forward(x): two (H, W) float64 px; NaN where the pixel sees no gel."""
+        height, width = self.size
+        rows, columns = np.mgrid[:height, :width]
+        forward = self.flow.forward.astype(np.float64)
+        return columns + 0.5 + forward[..., 0], rows + 0.5 + forward[..., 1]
+
+    @cached_property
+    def closure(self) -> FloatArray | None:
+        """(H, W) px, NaN where the pixel is not visible or interpolation meets an edge; None without backward flow."""
+        if self.flow.backward is None:
+            return None
+        back = sample_at(self.flow.backward, *self.target)
+        error = np.linalg.norm(self.flow.forward + back, axis=-1)
+        return np.where(self.visible, error, np.nan)
+
+    @cached_property
+    def differences(self) -> tuple[FloatArray, FloatArray] | None:
+        """I2(x) - I1(x) and I2(x + forward(x)) - I1(x): (H, W, C), shares of full scale, NaN where not visible."""
+        if self.image1 is None or self.image2 is None:
+            return None
+        first, second = (_linear(image) for image in (self.image1, self.image2))
+        visible = self.visible[..., None]
+        warped = sample_at(second, *self.target)
+        known = visible & np.isfinite(warped)
+        return np.where(known, second - first, np.nan), np.where(known, warped - first, np.nan)
+
+
+def view_sample(folder: Path) -> View:
+    """Of a sample's folder.
+
+    Raises:
+        InputError: A file is missing or damaged.
+    """
+    meta = read_document(folder / "meta.json")
+    channels, _ = read_channels(folder / "flow.exr")
+    return View(
+        name=folder.name,
+        flow=flow_of(folder / "flow.exr", channels),
+        image1=read_png(folder / "image1.png"),
+        image2=read_png(folder / "image2.png"),
+        meta=meta,
+    )
+
+
+def view_flow(path: Path) -> View:
+    """Of a flow file, also one without visibility.
+
+    Raises:
+        InputError: The file is missing or damaged, or holds no flow.
+    """
+    channels, header = read_channels(path)
+    known = "forward.visible" in channels
+    for direction in ("forward", "backward"):
+        parts = [channels.get(f"{direction}.{part}") for part in ("U", "V")]
+        if f"{direction}.visible" not in channels and parts[0] is not None and parts[1] is not None:
+            channels[f"{direction}.visible"] = np.isfinite(parts[0] + parts[1]).astype(np.float32)
+    return View(path.name, flow_of(path, channels), known, meta=header)
+
+
+def _linear(image: Raster) -> FloatArray:
+    """(H, W, C) in [0, 1]."""
+    values = image.astype(np.float64) / np.iinfo(image.dtype).max
+    return values[..., None] if values.ndim == 2 else values

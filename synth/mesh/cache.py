@@ -1,0 +1,78 @@
+"""Meshes are kept by content: made once per pad, edge length and mesher version, then read.
+
+fTetWild is not deterministic, so the cache is also what makes a dataset reproducible: a dataset directory keeps the
+meshes it used and a later run on it reads those first.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+
+from synth.mesh.pad import PadMesh
+from synth.mesh.tetrahedralise import ENVELOPE, GRADING, tetrahedralise_box
+from synth.scene import Gel, Numerics
+
+
+def default_edge_length(gel: Gel) -> float:
+    """A fifth of the gel's thickness, at most 1 mm."""
+    return min(gel.size_mm[2] / 5, 1.0)
+
+
+def mesh_key(gel: Gel, numerics: Numerics) -> str:
+    """Name of the mesh of a pad: everything that its making depends on."""
+    recipe = {
+        "shape": gel.shape,
+        "size_mm": gel.size_mm,
+        "edge_length_mm": numerics.edge_length_mm or default_edge_length(gel),
+        "grading": GRADING,
+        "envelope": ENVELOPE,
+        "mesher": "pytetwild " + version("pytetwild"),
+    }
+    return hashlib.sha256(json.dumps(recipe, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def user_cache() -> Path:
+    """Where meshes are kept between runs: $XDG_CACHE_HOME or ~/.cache."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gelflow-synth" / "meshes"
+
+
+def pad_mesh(gel: Gel, numerics: Numerics, folders: Sequence[Path] | None = None) -> PadMesh:
+    """The mesh of a pad, from the first folder that holds it, else made; afterwards every folder holds it.
+
+    Args:
+        gel: the pad.
+        numerics: its edge length.
+        folders: searched in order; default the user's cache.
+    """
+    key = mesh_key(gel, numerics)
+    paths = [folder / f"{key}.npz" for folder in (folders if folders is not None else [user_cache()])]
+    mesh = next((found for path in paths if (found := _read(path, gel)) is not None), None)
+    if mesh is None:
+        mesh = tetrahedralise_box(gel.size_mm, numerics.edge_length_mm or default_edge_length(gel))
+    for path in paths:
+        if _read(path, gel) is None:
+            _write(path, mesh)
+    return mesh
+
+
+def _read(path: Path, gel: Gel) -> PadMesh | None:
+    """A kept mesh, or None where there is none or the file is damaged (it is then made again)."""
+    try:
+        with np.load(path) as data:
+            return PadMesh(data["points"], data["tets"], gel.size_mm)
+    except (OSError, ValueError, KeyError, BadZipFile):
+        return None
+
+
+def _write(path: Path, mesh: PadMesh) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    aside = path.with_name(f".{path.name}.{os.getpid()}")
+    with aside.open("wb") as file:
+        np.savez(file, points=mesh.points, tets=mesh.tets)
+    aside.replace(path)

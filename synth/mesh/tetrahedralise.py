@@ -1,0 +1,123 @@
+"""Tetrahedral mesh of a box of gel by fTetWild (Hu et al., ACM TOG 2020; pytetwild), graded from contact to window.
+
+What fTetWild leaves to do: its flat faces are up to epsilon off, so boundary vertices are snapped to the planes of the
+box; its orientation is negative; and it is not deterministic, so a mesh is made once and kept (`synth.mesh.cache`).
+"""
+
+import contextlib
+import tempfile
+
+import numpy as np
+
+from synth.arrays import Points, Tets
+from synth.errors import InputError
+from synth.mesh.pad import PadMesh, boundary_faces, signed_volumes
+
+GRADING = 2.0
+"""Edge length at the window over edge length at the contact face."""
+ENVELOPE = 1e-3
+"""fTetWild's epsilon, relative to the bounding box's diagonal."""
+WORST_SHAPE = 0.02
+"""Smallest accepted ratio of inscribed to circumscribed radius, times 3 (1 for a regular tetrahedron)."""
+
+
+def tetrahedralise_box(size_mm: tuple[float, float, float], edge_length_mm: float, attempts: int = 3) -> PadMesh:
+    """Mesh a box whose tetrahedra have edges of edge_length_mm at the contact face.
+
+    Args:
+        size_mm: edge lengths of the box.
+        edge_length_mm: target edge length at z = 0; GRADING times that at the window.
+        attempts: the mesher is random; a mesh below WORST_SHAPE is made again so often.
+
+    Raises:
+        InputError: no attempt gave a valid mesh.
+    """
+    problem = ""
+    for _ in range(attempts):
+        points, tets = _ftetwild(size_mm, edge_length_mm)
+        points, tets = _repair(points, tets, size_mm)
+        problem = _fault(points, tets, size_mm)
+        if not problem:
+            return PadMesh(points, tets, size_mm)
+    raise InputError(
+        f"no valid mesh of a {size_mm} mm pad with edge length {edge_length_mm} mm in {attempts} attempts: {problem}; "
+        "try another numerics.edge_length_mm"
+    )
+
+
+def shape_quality(points: Points, tets: Tets) -> np.ndarray:
+    """(m,) 3 x inscribed radius / circumscribed radius: 1 for a regular tetrahedron, 0 for a flat one."""
+    a, b, c, d = (points[tets[:, i]] for i in range(4))
+    volume = np.abs(signed_volumes(points, tets))
+    area = sum(
+        np.linalg.norm(np.cross(q - p, r - p), axis=1) / 2 for p, q, r in ((a, b, c), (a, b, d), (a, c, d), (b, c, d))
+    )
+    u, v, w = b - a, c - a, d - a
+    numerator = np.linalg.norm(
+        (u**2).sum(1)[:, None] * np.cross(v, w)
+        + (v**2).sum(1)[:, None] * np.cross(w, u)
+        + (w**2).sum(1)[:, None] * np.cross(u, v),
+        axis=1,
+    )
+    return np.asarray(108 * volume**2 / np.maximum(area * numerator, 1e-300))
+
+
+def _ftetwild(size: tuple[float, float, float], edge: float) -> tuple[Points, Tets]:
+    import pytetwild
+
+    half = np.array([size[0] / 2, size[1] / 2])
+    corners = np.array([(x, y, z) for z in (0.0, size[2]) for y in (-half[1], half[1]) for x in (-half[0], half[0])])
+    quads = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5))
+    faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))], dtype=np.int32)
+    margin = 1.01  # the background mesh covers the box with room to spare
+    cube_tets = np.array(
+        [(0, 1, 3, 7), (0, 3, 2, 7), (0, 2, 6, 7), (0, 6, 4, 7), (0, 4, 5, 7), (0, 5, 1, 7)], dtype=np.int32
+    )
+    centre = np.array([0.0, 0.0, size[2] / 2])
+    background = centre + margin * (corners - centre)
+    target = edge * (1 + (GRADING - 1) * np.clip(background[:, 2] / size[2], 0, 1))
+    # fTetWild leaves a __tracked_surface.stl in the working directory.
+    with tempfile.TemporaryDirectory() as scratch, contextlib.chdir(scratch):
+        points, tets = pytetwild.tetrahedralize(
+            corners,
+            faces,
+            edge_length_abs=GRADING * edge,
+            epsilon=ENVELOPE,
+            bg_vertices=background,
+            bg_tets=cube_tets,
+            bg_values=target,
+        )
+    return np.asarray(points, dtype=np.float64), np.asarray(tets, dtype=np.int32)
+
+
+def _repair(points: Points, tets: Tets, size: tuple[float, float, float]) -> tuple[Points, Tets]:
+    """Snap boundary vertices to the box's planes, drop unused vertices, orient positively."""
+    used, renumbered = np.unique(tets, return_inverse=True)
+    points, tets = points[used].copy(), renumbered.reshape(tets.shape).astype(np.int32)
+    planes = [(0, -size[0] / 2), (0, size[0] / 2), (1, -size[1] / 2), (1, size[1] / 2), (2, 0.0), (2, size[2])]
+    tolerance = 2 * ENVELOPE * float(np.linalg.norm(size))
+    for face in boundary_faces(tets):
+        corner = points[face]
+        # The plane of a boundary face is the one to which all three of its corners are near.
+        off = [np.abs(corner[:, axis] - value).max() for axis, value in planes]
+        nearest = int(np.argmin(off))
+        if off[nearest] <= tolerance:
+            axis, value = planes[nearest]
+            points[face, axis] = value
+    flipped = signed_volumes(points, tets) < 0
+    tets[flipped] = tets[flipped][:, [0, 2, 1, 3]]
+    return points, tets
+
+
+def _fault(points: Points, tets: Tets, size: tuple[float, float, float]) -> str:
+    """What is wrong with a mesh, or an empty string."""
+    volumes = signed_volumes(points, tets)
+    if volumes.min() <= 0:
+        return f"a tetrahedron has volume {volumes.min():.3g} mm^3"
+    box = float(np.prod(size))
+    if abs(volumes.sum() / box - 1) > 1e-9:  # sums of some 1e4 volumes round to about 1e-13
+        return f"the mesh fills {volumes.sum():.9g} of {box:.9g} mm^3"
+    worst = float(shape_quality(points, tets).min())
+    if worst < WORST_SHAPE:
+        return f"worst tetrahedron has shape quality {worst:.3g} < {WORST_SHAPE}"
+    return ""

@@ -1,0 +1,1 @@
+"""Images of the deformed gel: pattern, lights, path tracing, camera sensor."""

@@ -1,0 +1,67 @@
+"""The gel's surface in the renderer's frame.
+
+The scene's axes are a left-handed triple (+x right, +y down, +z toward the viewer); Mitsuba's are right-handed. So y is
+mirrored on the way in, for geometry, lights and camera alike, and nothing needs mirroring on the way out.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synth.arrays import FloatArray, Points
+from synth.surface import GelSurface
+
+MIRROR = np.array([1.0, -1.0, 1.0])
+"""Componentwise factor from the scene's frame to the renderer's and back."""
+
+
+@dataclass(frozen=True, eq=False)
+class GelMesh:
+    """Topology and texture coordinates of the gel's surface, and the arrays that Mitsuba takes per frame.
+
+    Attributes:
+        surface: the surface whose deformed positions are rendered.
+        size_mm: width and height of the contact face, which the texture spans.
+    """
+
+    surface: GelSurface
+    size_mm: tuple[float, float]
+
+    def faces(self) -> NDArray[np.uint32]:
+        """(3 f,) vertex indices; turned over, because mirroring y turns every triangle's normal."""
+        return np.ascontiguousarray(self.surface.triangles[:, ::-1]).astype(np.uint32).ravel()
+
+    def texture_coordinates(self) -> NDArray[np.float32]:
+        """(2 v,) u along +x and v along -y, each 0..1 over the face: Mitsuba's v = 1 is a picture's first row."""
+        material = self.surface.material
+        u = material[:, 0] / self.size_mm[0] + 0.5
+        v = 0.5 - material[:, 1] / self.size_mm[1]
+        return np.column_stack([u, v]).astype(np.float32).ravel()
+
+    def positions(self, positions: Points) -> NDArray[np.float32]:
+        """(3 v,) in the renderer's frame, from positions (v, 3) float64 mm."""
+        return (positions * MIRROR).astype(np.float32).ravel()
+
+    def normals(self, positions: Points) -> NDArray[np.float32]:
+        """(3 v,) area-weighted unit normals in the renderer's frame, from positions (v, 3) float64 mm.
+
+        Mitsuba's own sums are atomic, so their rounding depends on the number of threads; this one's does not.
+        """
+        a, b, c = (positions[corner] for corner in self.surface.triangles.T)
+        normals = self._incidence @ np.cross(b - a, c - a)
+        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+        # Components of a cross product of mirrored vectors: the mirrored components, negated.  The faces are turned
+        # over as well, which negates once more.
+        return (normals * MIRROR).astype(np.float32).ravel()
+
+    @cached_property
+    def _incidence(self) -> FloatArray:
+        """Sparse (v, f) matrix of ones where a triangle touches a vertex."""
+        import scipy.sparse as sp
+
+        triangles = self.surface.triangles
+        columns = np.repeat(np.arange(len(triangles)), 3)
+        ones = np.ones(triangles.size)
+        return sp.csr_matrix((ones, (triangles.ravel(), columns)), shape=(len(self.surface.material), len(triangles)))

@@ -1,0 +1,83 @@
+"""The LEDs: rectangular area emitters inside the index-matched body of gel and window.
+
+A rectangle of area A that emits the power Φ as a Lambertian source to one side has the radiance L = Φ / (π A).
+Its first size runs parallel to the contact face, its second at right angles to it and to the viewing direction; a light
+that shines straight down has its first size along x. Its back is black.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from synth.arrays import FloatArray
+from synth.errors import InputError
+from synth.optics import Optics
+from synth.render.gel_mesh import MIRROR
+from synth.scene import Light, Sensor
+
+
+def emitters(sensor: Sensor, mi: Any) -> dict[str, Any]:
+    """Mitsuba's description of all lights that shine, in the renderer's frame.
+
+    Raises:
+        InputError: a light aims at itself or stands in the camera's view.
+    """
+    check_view(sensor)
+    shapes = {}
+    for i, light in enumerate(sensor.lights):
+        if light.power == 0:
+            continue
+        frame = np.eye(4)
+        frame[:3, :3] = light_axes(light).T * [light.size_mm[0] / 2, light.size_mm[1] / 2, 1.0]
+        frame[:3, 3] = light.position_mm
+        # Mirroring alone would make the frame left-handed and turn the rectangle's normal: negate its first axis too.
+        frame[:3] *= MIRROR[:, None]
+        frame[:3, 0] *= -1
+        radiance = light.power / (np.pi * light.size_mm[0] * light.size_mm[1]) * np.array(light.color)
+        shapes[f"light{i}"] = {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f(frame.tolist()),
+            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance.tolist()}},
+        }
+    return shapes
+
+
+def light_axes(light: Light) -> FloatArray:
+    """Unit vectors (3, 3) float64 along a light's first size, its second size and its direction, in the scene's frame.
+
+    Raises:
+        InputError: position_mm and aim_mm are the same point.
+    """
+    direction = np.array(light.aim_mm) - np.array(light.position_mm)
+    distance = np.linalg.norm(direction)
+    if distance < 1e-9:
+        raise InputError(f"a light at position_mm = {list(light.position_mm)} aims at itself: move its aim_mm")
+    direction /= distance
+    first = np.cross([0.0, 0.0, 1.0], direction)
+    first = first / np.linalg.norm(first) if np.linalg.norm(first) > 1e-6 else np.array([1.0, 0.0, 0.0])
+    return np.stack([first, np.cross(direction, first), direction])
+
+
+def check_view(sensor: Sensor) -> None:
+    """Refuse lights that the camera would see: they would hide gel that the flow says is visible.
+
+    Raises:
+        InputError: names the light and the pixel.
+    """
+    optics, camera = Optics.of(sensor), sensor.camera
+    across = np.linspace(-0.5, 0.5, 33)
+    u, v = (axis.ravel() for axis in np.meshgrid(across, across))
+    for i, light in enumerate(sensor.lights):
+        first, second, _ = light_axes(light)
+        points = (
+            np.array(light.position_mm) + np.outer(u * light.size_mm[0], first) + np.outer(v * light.size_mm[1], second)
+        )
+        pixels = optics.project(points[(points[:, 2] > 0) & (points[:, 2] < optics.face_z)])
+        inside = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(1)
+        if inside.any():
+            x, y = pixels[inside][0]
+            raise InputError(
+                f"sensor.lights[{i}] at position_mm = {list(light.position_mm)} stands between the camera and the gel "
+                f"(at pixel {x:.0f}, {y:.0f}): move it out of the camera's view"
+            )

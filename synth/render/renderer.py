@@ -1,0 +1,206 @@
+"""Path-traced radiance of the gel's coating, as the camera receives it before its sensor adds anything.
+
+One Mitsuba scene per sensor draw: the coated surface, the LEDs, and nothing outside (black). The indenter is hidden by
+the opaque coating and never part of it. For a frame only vertex positions and normals are exchanged.
+
+What it leaves out: light that is reflected back into the body by the window's faces, and by the pad's sides. Such light
+reaches the gel on specular paths from small LEDs, which path tracing finds only by chance, and then as bright specks:
+with it a frame is several times noisier, for a mean that changes by some percent (docs/decisions.md).
+
+Pixels are box-filtered. In vectorised variants the samples of one pixel are neighbours in the wavefront and are summed
+in a fixed order, not by atomic adds: the same seed gives the same bits with any number of threads.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from synth.arrays import FloatArray, Image, Points
+from synth.render.camera_rays import CameraRays, pinhole
+from synth.render.gel_mesh import GelMesh
+from synth.render.lights import emitters
+from synth.render.variant import Variant
+from synth.scene import Coating, Render, Sensor
+from synth.surface import GelSurface
+
+_MAX_WAVEFRONT = 2**22
+"""Samples traced at once: 50 MB of results. A constant, because the split into passes decides the random numbers."""
+
+
+class Renderer:
+    """The renderer of one sensor draw.
+
+    Args:
+        sensor: the finger.
+        render: samples and path length; `samples_per_pixel` is rounded up to the next full grid (see `full_grid`).
+        surface: the contact surface whose positions `radiance` gets.
+        albedo: (rows, columns, 3) float32 reflectance over the contact face, from `pattern.albedo`.
+        variant: from `choose_variant`.
+
+    Raises:
+        InputError: a light in the camera's view; a lens that a scalar variant cannot render.
+    """
+
+    def __init__(self, sensor: Sensor, render: Render, surface: GelSurface, albedo: Image, variant: Variant) -> None:
+        self._variant, self._camera = variant, sensor.camera
+        self._samples = full_grid(render.samples_per_pixel, sum(light.power > 0 for light in sensor.lights))
+        self._mesh = GelMesh(surface, sensor.gel.size_mm[:2])
+        mi = variant.load()
+        contents = {"type": "scene", "gel": self._build_gel(mi, sensor.coating, albedo), **emitters(sensor, mi)}
+        refracts = sensor.window.refractive_index != 1
+        if not variant.is_vectorised and refracts:
+            contents["window"] = _window(sensor, mi)
+        self._scene = mi.load_dict(contents)
+        self._parameters = mi.traverse(self._scene)
+        # A path through Mitsuba's window is one interaction longer than one that starts inside.
+        depth = render.max_depth + (1 if not variant.is_vectorised and refracts else 0)
+        self._integrator = mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": True})
+        self._sampler = mi.load_dict({"type": "multijitter", "sample_count": self._samples})
+        if variant.is_vectorised:
+            self._rays = CameraRays(sensor, mi)
+        else:
+            self._sensor = self._build_pinhole(mi, sensor)
+
+    @property
+    def samples_per_pixel(self) -> int:
+        """Samples that are really taken."""
+        return self._samples
+
+    def radiance(self, positions: Points, seed: int) -> Image:
+        """Linear radiance of the deformed gel; zero where a pixel sees past it.
+
+        Args:
+            positions: (v, 3) float64 mm, deformed positions of the surface's vertices.
+            seed: non-negative; frames with different seeds have independent noise.
+
+        Returns:
+            (H, W, 3) float32; three equal channels in mono variants.
+        """
+        mi = self._variant.load()
+        self._deform(positions)
+        if self._variant.is_vectorised:
+            return self._trace(mi, seed)
+        image = mi.render(self._scene, sensor=self._sensor, integrator=self._integrator, seed=_fold(seed, 0))
+        return np.array(image, dtype=np.float32)
+
+    def _deform(self, positions: Points) -> None:
+        """Move the vertices; normals go in a second update, since one of positions makes Mitsuba recompute normals."""
+        self._parameters["gel.vertex_positions"] = self._mesh.positions(positions)
+        self._parameters.update()
+        self._parameters["gel.vertex_normals"] = self._mesh.normals(positions)
+        self._parameters.update()
+
+    def _trace(self, mi: Any, seed: int) -> Image:
+        """All pixels in passes of whole pixels, each pixel's samples one after another in the wavefront."""
+        camera, samples = self._camera, self._samples
+        pixels = camera.width * camera.height
+        step = max(1, _MAX_WAVEFRONT // samples)
+        parts = [
+            self._trace_pixels(mi, first, min(step, pixels - first), _fold(seed, k))
+            for k, first in enumerate(range(0, pixels, step))
+        ]
+        image = np.concatenate(parts) / np.float32(samples)
+        return np.ascontiguousarray(np.broadcast_to(image, (pixels, 3))).reshape(camera.height, camera.width, 3)
+
+    def _trace_pixels(self, mi: Any, first: int, count: int, seed: int) -> FloatArray:
+        """Summed samples (count, channels) float32 of `count` pixels from `first` on."""
+        import drjit as dr
+
+        sampler = self._sampler
+        sampler.set_samples_per_wavefront(self._samples)
+        sampler.seed(seed, count * self._samples)
+        pixel = dr.arange(mi.UInt32, count * self._samples) // dr.opaque(mi.UInt32, self._samples)
+        pixel += dr.opaque(mi.UInt32, first)
+        ray, weight, valid = self._rays.sample(pixel, sampler.next_2d())
+        color, seen, _ = self._integrator.sample(self._scene, sampler, ray, active=valid)
+        channels = [dr.select(valid & seen, color[i] * weight, 0) for i in range(1 if self._variant.is_mono else 3)]
+        dr.eval(channels)  # all at once: each sum alone would trace everything anew
+        return np.stack([np.array(dr.block_sum(channel, self._samples)) for channel in channels], axis=-1)
+
+    def _build_gel(self, mi: Any, coating: Coating, albedo: Image) -> Any:
+        """The mesh with its coating; smooth-shaded, seen from either side."""
+        texture = albedo.mean(axis=2, keepdims=True) if self._variant.is_mono else albedo
+        reflectance = {
+            "type": "bitmap",
+            "bitmap": mi.Bitmap(np.ascontiguousarray(texture)),
+            "raw": True,
+            "wrap_mode": "clamp",
+        }
+        if coating.roughness == 1 and coating.metallic == 0:
+            bsdf = {"type": "diffuse", "reflectance": reflectance}
+        else:
+            bsdf = {
+                "type": "principled",
+                "base_color": reflectance,
+                "roughness": coating.roughness,
+                "metallic": coating.metallic,
+            }
+        properties = mi.Properties()
+        properties["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": bsdf})
+        surface, mesh = self._mesh.surface, self._mesh
+        shape = mi.Mesh(
+            "gel",
+            len(surface.material),
+            len(surface.triangles),
+            has_vertex_normals=True,
+            has_vertex_texcoords=True,
+            props=properties,
+        )
+        parameters = mi.traverse(shape)
+        parameters["faces"] = mesh.faces()
+        parameters["vertex_texcoords"] = mesh.texture_coordinates()
+        parameters["vertex_positions"] = mesh.positions(surface.material)
+        parameters.update()
+        return shape
+
+    def _build_pinhole(self, mi: Any, sensor: Sensor) -> Any:
+        camera = sensor.camera
+        description = pinhole(sensor)
+        description["to_world"] = mi.ScalarTransform4f(description["to_world"])
+        description["film"] = {
+            "type": "hdrfilm",
+            "width": camera.width,
+            "height": camera.height,
+            "rfilter": {"type": "box"},
+            "pixel_format": "rgb",
+            "component_format": "float32",
+        }
+        description["sampler"] = self._sampler
+        return mi.load_dict(description)
+
+
+def full_grid(samples: int, lights: int) -> int:
+    """Samples per pixel rounded up to a full grid of nearly equal sides, and to a multiple of the number of lights.
+
+    Multi-jittered sampling needs the grid. The multiple gives every light the same share of a pixel's samples, which
+    halves the noise (measured with three lights: 6 % at 35 samples, 3 % at 36).
+    """
+    while True:
+        side = math.isqrt(samples)
+        if samples % side == 0 and samples % max(lights, 1) == 0:
+            return samples
+        samples += 1
+
+
+def _window(sensor: Sensor, mi: Any) -> dict[str, Any]:
+    """The window's outer face for scalar variants: refracts, and absorbs what it reflects (see the module)."""
+    thickness = sensor.gel.size_mm[2]
+    reach = 10 * (sensor.camera.position_mm[2] + max(sensor.gel.size_mm))
+    transform = mi.ScalarTransform4f
+    return {
+        "type": "rectangle",
+        "to_world": transform().translate([0, 0, thickness + sensor.window.thickness_mm])
+        @ transform().scale([reach, reach, 1]),
+        "bsdf": {
+            "type": "dielectric",
+            "int_ior": sensor.window.refractive_index,
+            "ext_ior": 1.0,
+            "specular_reflectance": {"type": "rgb", "value": 0.0},
+        },
+    }
+
+
+def _fold(seed: int, part: int) -> int:
+    """The 32-bit seed that Mitsuba takes, from a seed of any size and the number of a pass."""
+    return int(np.random.SeedSequence([seed, part]).generate_state(1)[0])

@@ -1,0 +1,331 @@
+"""The schema of a scene: one sensor, one contact, one motion, every number fixed.
+
+A scene file may hold distributions in place of numbers (`synth.template`); drawing from them (`synth.sampling`)
+gives a `Scene` of this schema. Lengths are mm, angles degrees, stiffness kPa, image quantities px; the unit is in the
+field's name. Frame: origin at the centre of the undeformed contact surface, +z from there through the gel toward the
+camera, +x right and +y down in the image (a left-handed triple, see docs/decisions.md).
+"""
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Vector2 = tuple[float, float]
+Vector3 = tuple[float, float, float]
+Color = tuple[Fraction, Fraction, Fraction]
+
+
+class Part(BaseModel):
+    """Base of every part of a scene: frozen, closed to unknown keys, finite numbers only."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Gel(Part):
+    """The soft pad: a box bonded to the window on its +z side."""
+
+    size_mm: tuple[
+        Annotated[float, Field(ge=1, le=200)],
+        Annotated[float, Field(ge=1, le=200)],
+        Annotated[float, Field(ge=0.2, le=50)],
+    ]
+    shape: Literal["box"] = "box"
+    youngs_modulus_kpa: Annotated[float, Field(ge=0.1, le=1e6)]
+    poisson_ratio: Annotated[float, Field(ge=0, lt=0.5)] = 0.4999
+
+
+class Window(Part):
+    """Rigid clear support between gel and camera, index-matched to the gel; flat, at z = gel thickness."""
+
+    refractive_index: Annotated[float, Field(ge=1, le=2.5)] = 1.45
+    thickness_mm: Annotated[float, Field(ge=0, le=100)] = 5.0
+
+
+class Coating(Part):
+    """Opaque layer that carries the pattern. roughness 1 and metallic 0 is Lambertian, else Disney principled."""
+
+    reflectance: Color = (0.6, 0.6, 0.6)
+    roughness: Annotated[float, Field(ge=0.05, le=1)] = 1.0
+    metallic: Fraction = 0.0
+
+
+class NoPattern(Part):
+    """Bare coating."""
+
+    kind: Literal["none"]
+
+
+class Dots(Part):
+    """Printed dots on a grid whose first dot lies offset_mm from the pad's centre."""
+
+    kind: Literal["dots"]
+    spacing_mm: tuple[Positive, Positive]
+    radius_mm: Positive
+    offset_mm: Vector2 = (0.0, 0.0)
+    jitter_mm: NonNegative = 0.0
+    """Standard deviation of each dot's centre around the grid."""
+    radius_jitter: Fraction = 0.0
+    """Relative standard deviation of each dot's radius."""
+    softness_mm: NonNegative = 0.02
+    """Width of the dot's edge."""
+    reflectance: Color = (0.03, 0.03, 0.03)
+
+
+class RandomColor(Part):
+    """Dense random-colour cells (DelTact: Zhang et al., RA-L 2022)."""
+
+    kind: Literal["random_color"]
+    cell_mm: Positive
+    saturation: Fraction = 1.0
+    softness_mm: NonNegative = 0.02
+
+
+class Speckle(Part):
+    """Random dark grains, as sprayed for digital image correlation."""
+
+    kind: Literal["speckle"]
+    grain_mm: Positive
+    coverage: Annotated[float, Field(gt=0, lt=1)] = 0.5
+    reflectance: Color = (0.03, 0.03, 0.03)
+
+
+Pattern = Annotated[NoPattern | Dots | RandomColor | Speckle, Field(discriminator="kind")]
+
+
+class Light(Part):
+    """A rectangular LED inside the index-matched body, radiating as a Lambertian area toward aim_mm.
+
+    Lights are real obstacles: they must stay out of the camera's view, and one may shade another.
+    """
+
+    position_mm: Vector3
+    aim_mm: Vector3 = (0.0, 0.0, 0.0)
+    size_mm: tuple[Positive, Positive]
+    """Along the contact face, and at right angles to that and to the aim."""
+    color: Color
+    power: NonNegative
+    """Radiant power, in units in which exposure 1 maps a radiance of 1 to full scale."""
+
+
+class Camera(Part):
+    """Brown-Conrady camera in air behind the window, and its sensor. Image right is +x, down is +y for a view along -z."""
+
+    width: Annotated[int, Field(ge=16, le=8192)]
+    height: Annotated[int, Field(ge=16, le=8192)]
+    fx: Positive
+    fy: Positive
+    cx: float
+    cy: float
+    position_mm: Vector3
+    look_at_mm: Vector3 = (0.0, 0.0, 0.0)
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """k1, k2, p1, p2, k3 as in OpenCV."""
+    exposure: Positive = 1.0
+    gamma: Annotated[float, Field(ge=0.2, le=4)] = 2.2
+    """Encoded value = linear value ** (1 / gamma)."""
+    blur_px: NonNegative = 0.0
+    """Standard deviation of the lens's Gaussian point spread."""
+    vignetting: Fraction = 0.0
+    """Relative loss of light at the image's corner, growing with the square of the distance from (cx, cy)."""
+    read_noise: Annotated[float, Field(ge=0, le=0.5)] = 0.0
+    """Standard deviation as a fraction of full scale, linear, independent of the signal."""
+    shot_noise: Annotated[float, Field(ge=0, le=0.5)] = 0.0
+    """Standard deviation at full scale; grows with the square root of the linear signal."""
+    bit_depth: Literal[8, 10, 12, 14, 16] = 8
+
+
+class Sensor(Part):
+    """Everything that belongs to the finger."""
+
+    gel: Gel
+    window: Window = Window()
+    coating: Coating = Coating()
+    pattern: Pattern
+    lights: tuple[Light, ...] = Field(min_length=1)
+    camera: Camera
+
+    @model_validator(mode="after")
+    def _arranged(self) -> "Sensor":
+        thickness = self.gel.size_mm[2]
+        outside = thickness + self.window.thickness_mm
+        if self.camera.position_mm[2] <= outside:
+            raise ValueError(
+                f"camera.position_mm z = {self.camera.position_mm[2]} lies inside the sensor; "
+                f"it must be beyond the window, z > {outside} (gel {thickness} + window {self.window.thickness_mm})"
+            )
+        if self.camera.look_at_mm[2] >= self.camera.position_mm[2]:
+            raise ValueError("camera.look_at_mm must lie on the gel's side of the camera (smaller z)")
+        for i, light in enumerate(self.lights):
+            if not 0 < light.position_mm[2] < outside:
+                raise ValueError(
+                    f"lights[{i}].position_mm z = {light.position_mm[2]} must lie inside the gel and window, 0 < z < {outside}"
+                )
+        return self
+
+
+class Posed(Part):
+    """Base of the indenters: turned about x, then y, then z before it is pressed with its lowest point first."""
+
+    rotation_deg: Vector3 = (0.0, 0.0, 0.0)
+
+
+class Sphere(Posed):
+    """Ball."""
+
+    shape: Literal["sphere"]
+    radius_mm: Annotated[float, Field(ge=0.05, le=500)]
+
+
+class Cylinder(Posed):
+    """Round bar along its own z axis; unrotated it is a flat punch."""
+
+    shape: Literal["cylinder"]
+    radius_mm: Annotated[float, Field(ge=0.05, le=500)]
+    length_mm: Annotated[float, Field(ge=0.1, le=500)] = 20.0
+    fillet_mm: Annotated[float, Field(ge=0.01, le=100)] = 0.2
+
+
+class Box(Posed):
+    """Block with rounded edges."""
+
+    shape: Literal["box"]
+    size_mm: tuple[Positive, Positive, Positive]
+    fillet_mm: Annotated[float, Field(ge=0.01, le=100)] = 0.2
+
+
+class Cone(Posed):
+    """Cone whose rounded tip points at the gel."""
+
+    shape: Literal["cone"]
+    half_angle_deg: Annotated[float, Field(ge=5, le=85)]
+    height_mm: Annotated[float, Field(ge=0.1, le=500)] = 10.0
+    fillet_mm: Annotated[float, Field(ge=0.01, le=100)] = 0.2
+    """Radius of the tip and of the base's edge."""
+
+
+class Torus(Posed):
+    """Ring in its own xy plane."""
+
+    shape: Literal["torus"]
+    radius_mm: Annotated[float, Field(ge=0.1, le=500)]
+    tube_mm: Annotated[float, Field(ge=0.05, le=100)]
+
+
+class MeshIndenter(Posed):
+    """Closed triangle surface from any file that pyvista reads (STL, PLY, OBJ, VTP), in mm after scaling."""
+
+    shape: Literal["mesh"]
+    file: str
+    scale: Positive = 1.0
+    cell_mm: Annotated[float, Field(ge=0.01, le=10)] = 0.1
+    """Spacing of the grid on which its signed distance is sampled."""
+
+
+Indenter = Annotated[Sphere | Cylinder | Box | Cone | Torus | MeshIndenter, Field(discriminator="shape")]
+
+
+class Contact(Part):
+    """A rigid indenter and Coulomb friction."""
+
+    indenter: Indenter
+    friction: Annotated[float, Field(ge=0, le=10)] = 0.5
+
+
+class Motion(Part):
+    """Press at position_mm to depth_mm, then shear and twist together about the indenter's axis."""
+
+    depth_mm: float
+    """How far the indenter's lowest point goes past the undeformed surface; negative: it stays off by so much."""
+    shear_mm: Vector2 = (0.0, 0.0)
+    twist_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
+    """Positive turns +x toward +y."""
+    position_mm: Vector2 = (0.0, 0.0)
+    steps: Annotated[int, Field(ge=1, le=1000)] = 6
+    """Recorded states after the undeformed one, split between press and shear by the length of their paths."""
+
+
+class Render(Part):
+    """Path tracing."""
+
+    samples_per_pixel: Annotated[int, Field(ge=1, le=65536)] = 36
+    """At least so many; rounded up to a full grid and a multiple of the number of lights."""
+    max_depth: Annotated[int, Field(ge=2, le=64)] = 4
+    """Longest light path in surfaces and lights; 2 is direct light only. The window does not count."""
+
+
+class Numerics(Part):
+    """Resolution and tolerances of the simulation."""
+
+    element: Literal["auto", "p1p1"] = "auto"
+    edge_length_mm: Positive | None = None
+    """Tetrahedron edge; default a fifth of the gel's thickness, at most 1 mm."""
+    max_step_mm: Positive = 0.25
+    """Longest motion of the indenter in one load step; steps are halved when Newton fails."""
+    tolerance: Annotated[float, Field(ge=1e-12, le=1e-2)] = 1e-6
+    """Newton stops when the residual is below this fraction of the reaction force."""
+    penalty: Annotated[float, Field(ge=1, le=1e4)] = 50.0
+    """Contact stiffness in multiples of E per mm, before augmented-Lagrangian updates."""
+
+
+class Outputs(Part):
+    """Optional channels of flow.exr."""
+
+    backward: bool = True
+    depth: bool = False
+    normal: bool = False
+    displacement: bool = False
+    traction: bool = False
+    contact: bool = False
+
+
+class Sampling(Part):
+    """How draws are shared: samples of one trajectory, trajectories of one sensor."""
+
+    pairs_per_trajectory: Annotated[int, Field(ge=1, le=1000)] = 2
+    trajectories_per_sensor: Annotated[int, Field(ge=1, le=100000)] = 2
+
+
+class Scene(Part):
+    """One fully determined scene."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_\-]+$")]
+    description: str = ""
+    references: tuple[str, ...] = ()
+    sensor: Sensor
+    contact: Contact
+    motion: Motion
+    render: Render = Render()
+    numerics: Numerics = Numerics()
+    outputs: Outputs = Outputs()
+    sampling: Sampling = Sampling()
+
+    @model_validator(mode="after")
+    def _plausible(self) -> "Scene":
+        size, motion = self.sensor.gel.size_mm, self.motion
+        deepest = 0.85 * size[2]
+        if motion.depth_mm > deepest:
+            raise ValueError(
+                f"motion.depth_mm = {motion.depth_mm} is more than 85 % of the gel's thickness ({size[2]} mm); "
+                f"at most {deepest:.3g}"
+            )
+        if motion.depth_mm < -50:
+            raise ValueError(f"motion.depth_mm = {motion.depth_mm} leaves the indenter farther than 50 mm off the gel")
+        for axis, x, half in zip("xy", motion.position_mm, (size[0] / 2, size[1] / 2), strict=True):
+            if abs(x) > half:
+                raise ValueError(
+                    f"motion.position_mm {axis} = {x} puts the indenter beside the pad (|{axis}| <= {half})"
+                )
+        for axis, s in zip("xy", motion.shear_mm, strict=True):
+            if abs(s) > 2 * size[2]:
+                raise ValueError(
+                    f"motion.shear_mm {axis} = {s} is more than twice the gel's thickness ({size[2]} mm): check its unit"
+                )
+        edge = self.numerics.edge_length_mm
+        if edge is not None and not min(size) / 60 <= edge <= min(size):
+            raise ValueError(
+                f"numerics.edge_length_mm = {edge} must lie between {min(size) / 60:.3g} and {min(size)} for this pad"
+            )
+        return self

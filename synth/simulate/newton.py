@@ -1,0 +1,110 @@
+"""Newton's method with a residual line search, for a batch of independent samples with masks.
+
+A saddle-point problem has no energy to descend, so the search looks at the residual's norm; a step is also halved until
+det F > 0 everywhere. One sample's failure stops that sample only.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from synth.arrays import BoolArray, FloatArray
+from synth.simulate.contact import Indenters
+from synth.simulate.system import Balance, System, Unknowns
+
+MAX_ITERATIONS = 20
+SHORTEST = 1 / 1024
+"""Shortest step of the line search."""
+INDIFFERENT = 0.3
+"""Below this step length any valid state is taken: a kink of the contact set can make every step raise the residual."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Outcome per sample.
+
+    Attributes:
+        state: the last iterate (meaningless where not converged).
+        balance: its residual.
+        converged: (B,) bool.
+        iterations: (B,) int.
+        residual: (B,) norm of the free residual over the norm of all nodal forces.
+    """
+
+    state: Unknowns
+    balance: Balance
+    converged: BoolArray
+    iterations: np.ndarray
+    residual: FloatArray
+
+
+def relative_residual(balance: Balance) -> FloatArray:
+    """(B,) norm of the free residual over the norm of all nodal forces; 0 where nothing acts."""
+    force = np.linalg.norm(balance.reaction.reshape(len(balance.free), -1), axis=1)
+    norm = np.linalg.norm(balance.free, axis=1)
+    return np.divide(norm, force, out=np.zeros_like(norm), where=force > 0)
+
+
+def solve(
+    system: System,
+    start: Unknowns,
+    indenters: Indenters,
+    active: BoolArray,
+    tolerance: FloatArray,
+    limit: int = MAX_ITERATIONS,
+) -> Solution:
+    """Bring the active samples into balance.
+
+    Args:
+        system: the pad.
+        start: first iterates.
+        indenters: where they are.
+        active: (B,) bool.
+        tolerance: (B,) of `relative_residual`.
+        limit: most iterations.
+    """
+    state, balance = start, system.balance(start, indenters, active)
+    running = active & (balance.smallest_jacobian > 0)
+    converged = np.zeros_like(active)
+    iterations = np.zeros(len(active), dtype=int)
+    for iteration in range(limit + 1):
+        relative = relative_residual(balance)
+        done = running & (relative <= tolerance) & ((iterations > 0) | (relative == 0))
+        converged |= done
+        running &= ~done & np.isfinite(relative)
+        if iteration >= 5:
+            running &= relative < 0.5
+        if iteration == limit or not running.any():
+            break
+        values = system.tangent(state, indenters, running)
+        step = system.newton_step(values, balance.free, running)
+        running &= np.isfinite(step.u).all(axis=(1, 2))
+        state, balance, running = _line_search(system, state, balance, step, indenters, running)
+        iterations[running] += 1
+    return Solution(state, balance, converged, iterations, relative_residual(balance))
+
+
+def _line_search(
+    system: System, state: Unknowns, balance: Balance, step: Unknowns, indenters: Indenters, running: BoolArray
+) -> tuple[Unknowns, Balance, BoolArray]:
+    before = np.linalg.norm(balance.free, axis=1)
+    scale = np.ones(len(running))
+    pending = running.copy()
+    while pending.any():
+        trial = state.plus(step, np.where(pending, scale, 0.0))
+        after = system.balance(trial, indenters, pending)
+        valid = pending & (after.smallest_jacobian > 0)
+        norm = np.linalg.norm(after.free, axis=1)
+        good = valid & ((norm <= before * (1 - 1e-4 * scale)) | (scale < INDIFFERENT))
+        state = trial.where(good, state)
+        balance = Balance(
+            np.where(good[:, None], after.free, balance.free),
+            np.where(good[:, None, None], after.reaction, balance.reaction),
+            np.where(good, after.smallest_jacobian, balance.smallest_jacobian),
+        )
+        pending &= ~good
+        scale[pending] /= 2
+        lost = pending & (scale < SHORTEST)
+        pending &= ~lost
+        running = running & ~lost
+    return state, balance, running

@@ -1,0 +1,62 @@
+"""What a simulation returns."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from synth.arrays import FloatArray
+
+
+@dataclass(frozen=True)
+class State:
+    """One recorded, converged state of the gel.
+
+    Attributes:
+        depth_mm, shear_mm, twist_deg: the indenter's pose.
+        displacement: (n, 3) float64 mm at all nodes.
+        traction: (s, 3) float64 MPa on the gel at the contact nodes, per undeformed area.
+        force_n, torque_nmm: of the indenter on the gel; torque about the origin of the frame.
+        residual: of the unknowns over the norm of the nodal forces.
+        min_jacobian: smallest det F at any quadrature point.
+        max_penetration_mm: deepest contact point inside the indenter.
+    """
+
+    depth_mm: float
+    shear_mm: tuple[float, float]
+    twist_deg: float
+    displacement: FloatArray
+    traction: FloatArray
+    force_n: tuple[float, float, float]
+    torque_nmm: tuple[float, float, float]
+    newton_iterations: int
+    residual: float
+    min_jacobian: float
+    max_penetration_mm: float
+
+    def summary(self) -> dict[str, Any]:
+        """The state without its fields, as trajectory.json has it."""
+        return {
+            "depth_mm": self.depth_mm,
+            "shear_mm": list(self.shear_mm),
+            "twist_deg": self.twist_deg,
+            "force_n": list(self.force_n),
+            "torque_nmm": list(self.torque_nmm),
+            "converged": True,
+            "newton_iterations": self.newton_iterations,
+            "residual": self.residual,
+            "min_jacobian": self.min_jacobian,
+            "max_penetration_mm": self.max_penetration_mm,
+        }
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """Converged states only, the undeformed one first.
+
+    status "complete": every state asked for; "partial": the first ones, up to the last good state; "failed": none after
+    the undeformed one. `reason` says why when it is not complete.
+    """
+
+    states: tuple[State, ...]
+    status: Literal["complete", "partial", "failed"]
+    reason: str
+    seconds: float

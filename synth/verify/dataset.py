@@ -1,0 +1,83 @@
+"""Verification of samples and datasets: all checks together."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from synth.dataset.reader import Dataset, SampleData, read_dataset
+from synth.errors import InputError
+from synth.scene import Scene
+from synth.verify.camera import ForwardCamera
+from synth.verify.motion import check_motion
+from synth.verify.photometry import check_photometry
+from synth.verify.report import Check, Report, SampleReport
+from synth.verify.sheet import Sheet
+
+
+def verify_dataset(
+    path: Path | str,
+    *,
+    samples: Sequence[int] | None = None,
+    on_sample: Callable[[SampleReport], None] | None = None,
+) -> Report:
+    """Verifies a dataset directory.
+
+    Args:
+        path: the dataset.
+        samples: indices to verify; by default all finished ones.
+        on_sample: called after each sample.
+
+    Returns:
+        The report; `ok` is False where any check failed or there is no sample.
+
+    Raises:
+        InputError: not a dataset, or a sample asked for that it lacks. A damaged sample is a failed check.
+    """
+    dataset = read_dataset(path)
+    wanted = dataset.samples if samples is None else list(samples)
+    for index in wanted:
+        dataset.folder(index)
+    reports = []
+    for index in wanted:
+        report = _verify_files(dataset, index)
+        reports.append(report)
+        if on_sample is not None:
+            on_sample(report)
+    return Report(dataset.path, tuple(reports))
+
+
+def verify_sample(index: int, scene: Scene, sample: SampleData, problems: Sequence[str] = ()) -> SampleReport:
+    """Verifies one sample against its own geometry.
+
+    Args:
+        index: its number.
+        scene: the draw it was made from.
+        sample: its images, flow, surface and displacements.
+        problems: what is wrong with its files (from `Dataset.check_hashes`).
+    """
+    camera, flow = scene.sensor.camera, sample.flow
+    forward = ForwardCamera.of(scene.sensor)
+    states = [
+        Sheet(forward, sample.surface.triangles, sample.surface.positions(u), camera.width, camera.height)
+        for u in (sample.displacement1, sample.displacement2)
+    ]
+    checks = [_files(problems), *check_motion("forward", states[0], states[1], flow.forward, flow.forward_visible)]
+    if flow.backward is not None and flow.backward_visible is not None:
+        checks += check_motion("backward", states[1], states[0], flow.backward, flow.backward_visible)
+    elif scene.outputs.backward:
+        checks.append(Check("backward flow", 1.0, 0, "missing", "the scene asks for it and flow.exr lacks it"))
+    size = (camera.height, camera.width)
+    if flow.forward.shape[:2] == size and sample.image1.shape[:2] == size:
+        checks.append(check_photometry(scene.sensor, sample.image1, sample.image2, flow.forward, flow.forward_visible))
+    return SampleReport(index, tuple(checks))
+
+
+def _verify_files(dataset: Dataset, index: int) -> SampleReport:
+    problems = dataset.check_hashes(index)
+    try:
+        return verify_sample(index, dataset.scene_of(index), dataset.read(index), problems)
+    except InputError as error:
+        return SampleReport(index, (_files([*problems, str(error)]),))
+
+
+def _files(problems: Sequence[str]) -> Check:
+    return Check("files", float(len(problems)), 0, "problems", "; ".join(problems) or "as the manifest says")

@@ -1,0 +1,128 @@
+r"""Does image 2, warped by the recorded flow, meet image 1 within the noise?
+
+Both images are linearised and smoothed (Gaussian, σ = 1 px), image 2 is fetched at x + F(x) by bicubic interpolation,
+and its local brightness is matched to image 1's (ratio of means over a Gaussian of σ = 6 px): the motion changes the
+shading, but not the pattern's reflectance. At textured pixels the remaining difference, divided by image 1's gradient,
+is a motion that the flow fails to explain:
+
+.. math::  e = |w(I_2) - I_1| / |∇I_1|   \text{in px}
+
+The image is cut into blocks; the figure is the median of e in the block that exceeds its noise most. For a right flow
+it is what noise leaves, 0.6745 σ_d / |∇I|, with σ_d from the scene's read and shot noise and bit depth, and a remainder
+of shading, rendering noise and interpolation. A flow that is wrong by d gives about 0.7 d (the median of |cos|) while d
+is smaller than the pattern's details, and for larger d half the width of the pattern's edges, one px or more. Medians
+leave the few pixels aside at which shadows or highlights pass; only a diffuse pattern can be compared.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synth.arrays import BoolArray, FloatArray
+from synth.flow.field import FlowArray
+from synth.scene import Camera, NoPattern, Sensor
+from synth.verify.report import Check
+
+NAME = "image 2 warped to image 1"
+ALLOWANCE_PX = 0.1
+"""For what is not the sensor's noise."""
+_NOISE_FACTOR = 1.5
+"""The median of 60 values scatters by 15 % of itself: three standard deviations."""
+_FEWEST = 60
+_BLOCKS = 6
+"""Blocks along the image's shorter side."""
+_SMOOTHING_PX = 1.0
+_SHADING_PX = 6.0
+_TEXTURE_IN_NOISE = 6.0
+"""A pixel is textured if moving by 1 px changes it by more than so many standard deviations of the difference..."""
+_TEXTURE_IN_EDGES = 0.25
+"""... and by more than this share of what the pattern's strongest edges change, relative to the brightness around."""
+
+Raster = NDArray[np.uint8] | NDArray[np.uint16]
+
+
+def check_photometry(sensor: Sensor, image1: Raster, image2: Raster, flow: FlowArray, visible: FlowArray) -> Check:
+    """Compares the images through the forward flow.
+
+    Args:
+        sensor: its camera's response and noise, and its pattern.
+        image1: (H, W) or (H, W, 3).
+        image2: the same.
+        flow: (H, W, 2) px, forward.
+        visible: (H, W).
+    """
+    if isinstance(sensor.pattern, NoPattern):
+        return Check(NAME, None, ALLOWANCE_PX, "px", "not applicable: the coating is bare")
+    usable = _usable(flow, visible)
+    channels = range(1 if image1.ndim == 2 else image1.shape[2])
+    parts = [
+        _unexplained(sensor.camera, _channel(image1, i), _channel(image2, i), flow, usable)
+        for i in channels
+        if usable.any()
+    ]
+    if not parts:
+        return Check(NAME, None, ALLOWANCE_PX, "px", "not applicable: no part of image 1 is seen in image 2")
+    error, noise, row, column = (np.concatenate(part) for part in zip(*parts, strict=True))
+    side = min(usable.shape) // _BLOCKS
+    block = row // side * usable.shape[1] + column // side
+    worst: tuple[float, Check] | None = None
+    names, counts = np.unique(block, return_counts=True)
+    for name in names[counts >= _FEWEST]:
+        here = block == name
+        figure = float(np.median(error[here]))
+        tolerance = ALLOWANCE_PX + _NOISE_FACTOR * 0.6745 * float(np.median(noise[here]))
+        if worst is None or figure / tolerance > worst[0]:
+            place = f"row {int(np.median(row[here]))}, column {int(np.median(column[here]))}"
+            detail = f"worst around {place}; over the image {np.median(error):.2g} px"
+            worst = figure / tolerance, Check(NAME, figure, tolerance, "px", detail)
+    if worst is None:
+        return Check(
+            NAME, None, ALLOWANCE_PX, "px", f"not applicable: {len(error)} textured pixels stand out of the noise"
+        )
+    return worst[1]
+
+
+def _unexplained(
+    camera: Camera, one: FloatArray, two: FloatArray, flow: FlowArray, usable: BoolArray
+) -> tuple[FloatArray, FloatArray, NDArray[np.intp], NDArray[np.intp]]:
+    """Error and standard deviation of its noise (n,) px at textured pixels, and their rows and columns."""
+    import cv2
+
+    row, column = np.mgrid[: one.shape[0], : one.shape[1]]
+    at = [(base + np.nan_to_num(flow[..., i])).astype(np.float32) for i, base in enumerate((column, row))]
+    linear = [image**camera.gamma for image in (one, two)]
+    smooth = [cv2.GaussianBlur(image, (0, 0), _SMOOTHING_PX) for image in linear]
+    warped = cv2.remap(smooth[1], *at, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    share = cv2.GaussianBlur(usable.astype(np.float64), (0, 0), _SHADING_PX) + 1e-12
+    means = [cv2.GaussianBlur(np.where(usable, image, 0), (0, 0), _SHADING_PX) / share for image in (smooth[0], warped)]
+    gain = np.divide(means[0], means[1], out=np.ones_like(means[0]), where=means[1] > 1e-6)
+    # A Gaussian of σ = s smooths independent noise by a factor 1 / (2 √π s); both images carry it.
+    deviation = np.sqrt(1 + gain**2) * _noise(linear[0], camera) / (2 * np.sqrt(np.pi) * _SMOOTHING_PX)
+    slope = np.hypot(*(cv2.Sobel(smooth[0], cv2.CV_64F, 1 - y, y, scale=1 / 8) for y in (0, 1)))
+    relative = slope / np.maximum(means[0], 1e-6)
+    loud = usable & (slope > _TEXTURE_IN_NOISE * deviation)
+    if loud.any():
+        loud &= relative > _TEXTURE_IN_EDGES * np.quantile(relative[loud], 0.95)
+    rows, columns = np.nonzero(loud)
+    return np.abs(gain * warped - smooth[0])[loud] / slope[loud], deviation[loud] / slope[loud], rows, columns
+
+
+def _channel(image: Raster, channel: int) -> FloatArray:
+    """One channel (H, W), full scale 1."""
+    plane = image if image.ndim == 2 else image[..., channel]
+    return plane.astype(np.float64) / np.iinfo(image.dtype).max
+
+
+def _noise(linear: FloatArray, camera: Camera) -> FloatArray:
+    """Standard deviation of the linear signal: read and shot noise, and the rounding of the encoded value."""
+    clipped = np.maximum(linear, 1e-4)
+    step = camera.gamma * clipped ** (1 - 1 / camera.gamma) / (2**camera.bit_depth - 1)
+    return np.sqrt(camera.read_noise**2 + camera.shot_noise**2 * clipped + step**2 / 12)
+
+
+def _usable(flow: FlowArray, visible: FlowArray) -> BoolArray:
+    """Pixels whose neighbourhood in image 1 is seen in image 2, away from the border by the filters' reach."""
+    import cv2
+
+    seen = (visible > 0.5) & np.isfinite(flow).all(2)
+    seen[[0, -1]] = seen[:, [0, -1]] = False
+    return cv2.erode(seen.astype(np.uint8), np.ones((9, 9), np.uint8), borderValue=0) > 0

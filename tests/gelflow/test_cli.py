@@ -1,0 +1,145 @@
+"""The command line: exit statuses, one line per mistake, no heavy imports."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from textures import as_bytes, moved, save, write_folder, write_synthetic, write_video
+
+from gelflow.cli import main
+
+HEAVY = {"torch", "cv2", "matplotlib", "scipy", "skimage", "lightning", "numpy", "OpenEXR", "pydantic"}
+
+
+def fails(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    """Runs a command that must end with status 2 and one line on stderr; returns the line."""
+    assert main([str(argument) for argument in arguments]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("gelflow: ")
+    assert captured.err.count("\n") == 1
+    return captured.err
+
+
+def video(path: Path) -> Path:
+    write_video(path, [as_bytes(moved(64, 96, shift, 0)) for shift in (0, 3, 6, 9)])
+    return path
+
+
+def test_help_imports_nothing_heavy() -> None:
+    """The time itself depends on the machine; what is imported does not."""
+    code = (
+        "import sys; from gelflow.cli import main; main(['compare', '--help']); import gelflow;"
+        f"print(sorted({HEAVY!r} & set(sys.modules)), file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr.strip() == "[]"
+    assert "--methods" in done.stdout
+
+
+def test_module_runs_and_passes_the_status_on() -> None:
+    done = subprocess.run([sys.executable, "-m", "gelflow", "compare", "/nothing/here"], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr == "gelflow: /nothing/here: there is no such folder; a folder with image pairs is needed\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["fly"], "Unknown command"),
+        (["compare"], "DATA"),
+        (["pairs", "x"], "--out"),
+        (["compare", ".", "--wings"], "--wings"),
+        (["pairs", ".", "--out", "o", "--seed", "many"], "seed"),
+        (["predict", "a.png", "b.png", "--out", "o", "--method", "none"], "a.png"),
+        (["predict", ".", ".", ".", "--out", "o", "--method", "none"], "3 inputs"),
+        (["predict", ".", "--out", "o"], "--weights"),
+        (["predict", ".", "--out", "o", "--method", "raft"], "raft"),
+        (["evaluate", ".", "--weights", "none.safetensors"], "none.safetensors"),
+        (["compare", ".", "--weights", "best=none.safetensors"], "none.safetensors"),
+        (["compare", ".", "--weights", "x", "--size", "big"], "--size big"),
+        (["compare", ".", "--methods", "none,none"], "twice"),
+        (["train", ".", "--out", "o", "--set", "loss"], "KEY=VALUE"),
+        (["train", ".", "--out", "o", "--set", "loss.wings=2"], "loss.wings"),
+        (["train", ".", "--out", "o", "--steps", "0"], "steps"),
+        (["train", ".", "--out", "o", "--config", "none.toml"], "none.toml"),
+        (["train", ".", "--out", "o"], "no image pairs"),
+        (["finetune", ".", "--out", "o", "--weights", "none.safetensors"], "none.safetensors"),
+    ],
+)
+def test_mistake_is_one_line_and_status_2(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    word: str,
+) -> None:
+    (tmp_path / "notes.txt").touch()
+    monkeypatch.chdir(tmp_path)
+    assert word in fails(capsys, *arguments)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["notes.txt"]
+
+
+def test_debug_shows_the_traceback(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--debug", "compare", "/nothing/here"]) == 2
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_compare_prints_tables_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_synthetic(tmp_path / "data", [(2.0, 1.0)])
+    assert main(["compare", str(folder), "--methods", "none,dis-fast", "--out", str(tmp_path / "out")]) == 0
+    text = capsys.readouterr().out
+    assert "DIS fast" in text
+    assert "000000" in text
+    assert main(["compare", str(folder), "--methods", "none", "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["methods"][0]["endpoint_error_px"] == pytest.approx(5**0.5, rel=1e-6)  # float32 flow
+
+
+def test_pair_of_two_sizes_and_one_pixel_image(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save(tmp_path / "a_1.png", moved(32, 32, 0, 0))
+    save(tmp_path / "a_2.png", moved(32, 40, 0, 0))
+    save(tmp_path / "b.png", moved(1, 1, 0, 0))
+    assert "40 x 32" in fails(capsys, "compare", tmp_path, "--methods", "none")
+    tail = ["--out", tmp_path / "out", "--method", "farneback"]
+    assert "40 x 32" in fails(capsys, "predict", tmp_path / "a_1.png", tmp_path / "a_2.png", *tail)
+    assert "1 x 1" in fails(capsys, "predict", tmp_path / "b.png", tmp_path / "b.png", *tail)
+
+
+def test_predict_pair_and_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_folder(tmp_path / "in", {"a": (1, 0)})
+    tail = ["--out", str(tmp_path / "out"), "--method", "farneback"]
+    assert main(["predict", str(folder / "a_1.png"), str(folder / "a_2.png"), *tail]) == 0
+    assert "a.exr" in capsys.readouterr().out
+    assert main(["predict", str(video(tmp_path / "v.avi")), *tail, "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert [motion["frame"] for motion in answer["motions"]] == [1, 2, 3]
+    assert all(Path(file).is_file() for file in answer["files"])
+
+
+def test_pairs_exit_statuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """0 if every recording could be read, 1 if some could not, 2 if none could or no pair has motion."""
+    good, bad = video(tmp_path / "good.avi"), tmp_path / "bad.avi"
+    bad.write_bytes(b"junk" * 100)
+    assert main(["pairs", str(good), "--out", str(tmp_path / "a"), "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["recordings"] == 1
+    assert answer["pairs"] >= 2
+    assert main(["pairs", str(good), str(bad), "--out", str(tmp_path / "b")]) == 1
+    captured = capsys.readouterr()
+    assert "bad.avi" in captured.err
+    assert "1 unreadable" in captured.out
+    assert main(["pairs", str(bad), "--out", str(tmp_path / "c")]) == 2
+    assert "none of the 1 recordings" in capsys.readouterr().err
+    assert "--min-motion" in fails(capsys, "pairs", good, "--out", tmp_path / "d", "--min-motion", "50")
+    assert "seed is 0 there and 1 here" in fails(capsys, "pairs", good, "--out", tmp_path / "a", "--seed", "1")
+
+
+def test_unwritable_output_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_folder(tmp_path / "in", {"a": (1, 0)})
+    (tmp_path / "file").touch()
+    images = [folder / f"a_{k}.png" for k in (1, 2)]
+    line = fails(capsys, "predict", *images, "--method", "none", "--out", tmp_path / "file" / "x")
+    assert str(tmp_path / "file") in line

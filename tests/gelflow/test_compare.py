@@ -1,0 +1,118 @@
+"""Comparing methods: the numbers, the files, and refusals."""
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from textures import write_folder, write_synthetic
+
+from gelflow.baselines import named_methods
+from gelflow.compare import compare
+from gelflow.data import open_pairs
+from gelflow.errors import InputError
+from gelflow.evaluate import evaluate, summarise
+from gelflow.raster import FlowArray, ImageArray
+from gelflow.report import markdown, pair_table, summary_table
+
+
+@dataclass(frozen=True)
+class Constant:
+    """Test double: the same flow everywhere."""
+
+    name: str
+    u: float
+    v: float
+
+    def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
+        return np.full((*image1.shape[:2], 2), (self.u, self.v), np.float32)
+
+
+def test_errors_of_known_flows_are_exact(tmp_path: Path) -> None:
+    dataset = open_pairs(write_synthetic(tmp_path, [(3.0, 4.0), (0.0, 0.5)]))
+    scores = evaluate(Constant("zero", 0, 0), dataset)
+    assert [score.endpoint_error_px for score in scores] == [5.0, 0.5]
+    assert [score.outliers_1px for score in scores] == [1.0, 0.0]
+    (mean,) = summarise(scores)
+    assert mean.endpoint_error_px == 2.75
+    assert mean.outliers_01px == 1.0
+    assert mean.pairs == 2
+    assert evaluate(Constant("true", 3, 4), dataset)[0].endpoint_error_px == 0.0
+
+
+def test_true_flow_warps_best(tmp_path: Path) -> None:
+    """Sign and scale: the true flow is above no flow, the opposite one, and itself times 0.8 and 1.2."""
+    dataset = open_pairs(write_folder(tmp_path, {"a": (2.5, -1.5)}))
+    best = evaluate(Constant("true", 2.5, -1.5), dataset)[0]
+    for factor in (0.0, -1.0, 0.8, 1.2):
+        other = evaluate(Constant("other", 2.5 * factor, -1.5 * factor), dataset)[0]
+        assert best.psnr_db > other.psnr_db
+        assert best.ssim > other.ssim
+
+
+def test_files_hold_every_score(tmp_path: Path) -> None:
+    dataset = open_pairs(write_synthetic(tmp_path / "data", [(1.0, 0.0), (0.0, 2.0)]))
+    methods = named_methods(["none", "farneback", "dis-medium"])
+    scores = compare(methods, dataset, tmp_path / "out")
+    with (tmp_path / "out" / "scores.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["method"], row["pair"]) for row in rows] == [(score.method, score.pair) for score in scores]
+    assert float(rows[0]["endpoint_error_px"]) == scores[0].endpoint_error_px == 1.0
+    content = json.loads((tmp_path / "out" / "scores.json").read_text())
+    assert [method["method"] for method in content["methods"]] == ["no motion", "Farnebäck", "DIS medium"]
+    assert content["methods"][1]["endpoint_error_px"] < content["methods"][0]["endpoint_error_px"] / 3
+    assert "| DIS medium |" in (tmp_path / "out" / "table.md").read_text()
+    assert (tmp_path / "out" / "table.png").stat().st_size > 5000
+
+
+def test_equal_images_give_valid_json(tmp_path: Path) -> None:
+    dataset = open_pairs(write_folder(tmp_path / "data", {"a": (0, 0)}))
+    compare(named_methods(["none"]), dataset, tmp_path / "out")
+    text = (tmp_path / "out" / "scores.json").read_text()
+    assert "Infinity" not in text
+    assert json.loads(text)["scores"][0]["psnr_db"] is None
+
+
+def test_markers_are_scored(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path, {"a": (3, 4), "b": (1, 0)})
+    (folder / "a_markers.csv").write_text("x1,y1,x2,y2\n20,20,23,24\n40,30,43,34\n")
+    scores = evaluate(Constant("zero", 0, 0), open_pairs(folder))
+    assert scores[0].marker_distance_px == 5.0
+    assert scores[1].marker_distance_px is None
+    assert "(5.00 px)" in pair_table(scores)[1][0][1]
+
+
+def test_tables_leave_out_what_no_method_has(tmp_path: Path) -> None:
+    scores = evaluate(Constant("zero", 0, 0), open_pairs(write_folder(tmp_path, {"a": (1, 0)})))
+    header, rows = summary_table(summarise(scores))
+    assert header == ["method", "PSNR dB", "SSIM", "ms/pair"]
+    assert markdown((header, rows)).splitlines()[1] == "| --- | ---: | ---: | ---: |"
+
+
+def test_earlier_results_are_replaced_on_the_same_data_only(tmp_path: Path) -> None:
+    first = open_pairs(write_folder(tmp_path / "first", {"a": (1, 0)}))
+    second = open_pairs(write_folder(tmp_path / "second", {"a": (1, 0)}))
+    compare(named_methods(["none"]), first, tmp_path / "out")
+    compare(named_methods(["none", "dis-fast"]), first, tmp_path / "out")
+    assert "DIS fast" in (tmp_path / "out" / "table.md").read_text()
+    with pytest.raises(InputError, match=r"comparison on .*first.* not on .*second"):
+        compare(named_methods(["none"]), second, tmp_path / "out")
+    with pytest.raises(InputError, match="holds other things"):
+        compare(named_methods(["none"]), first, tmp_path / "first")
+
+
+def test_no_method_and_two_of_one_name_are_refused(tmp_path: Path) -> None:
+    dataset = open_pairs(write_folder(tmp_path, {"a": (1, 0)}))
+    with pytest.raises(InputError, match="no method"):
+        compare([], dataset)
+    with pytest.raises(InputError, match="two methods are called 'x'"):
+        compare([Constant("x", 0, 0), Constant("x", 1, 0)], dataset)
+
+
+def test_broken_pair_is_named(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path, {"a": (1, 0), "b": (1, 0)})
+    (folder / "b_2.png").write_bytes(b"broken")
+    with pytest.raises(InputError, match=r"b_2\.png"):
+        compare(named_methods(["none"]), open_pairs(folder))

@@ -1,0 +1,166 @@
+"""Images and flow files: what is written comes back; what is broken is named."""
+
+import errno
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from textures import as_bytes, moved, save
+
+from gelflow.errors import InputError
+from gelflow.files.atomic import replacing
+from gelflow.files.exr import read_channels, read_flow, write_flow
+from gelflow.files.flo import read_flo, write_flo
+from gelflow.files.image import read_image, read_pair, write_png
+from gelflow.raster import FlowArray
+
+
+def some_flow() -> FlowArray:
+    flow = np.random.default_rng(0).normal(size=(17, 23, 2)).astype(np.float32)
+    flow[2, 3] = np.nan
+    return flow
+
+
+def test_flo_round_trip_keeps_every_bit_and_nan(tmp_path: Path) -> None:
+    write_flo(tmp_path / "a.flo", some_flow())
+    np.testing.assert_array_equal(read_flo(tmp_path / "a.flo"), some_flow())
+
+
+def test_flo_is_middleburys_layout(tmp_path: Path) -> None:
+    flow = np.arange(12, dtype=np.float32).reshape(2, 3, 2)
+    write_flo(tmp_path / "a.flo", flow)
+    data = (tmp_path / "a.flo").read_bytes()
+    assert data[:4] == b"PIEH"
+    assert np.frombuffer(data, "<i4", 2, 4).tolist() == [3, 2]
+    assert np.frombuffer(data, "<f4", -1, 12).tolist() == list(range(12))
+
+
+def test_exr_round_trip_keeps_every_bit_and_nan(tmp_path: Path) -> None:
+    visible = np.ones((17, 23), bool)
+    visible[5] = False
+    write_flow(tmp_path / "a.exr", some_flow(), visible)
+    field = read_flow(tmp_path / "a.exr")
+    np.testing.assert_array_equal(field.flow, some_flow())
+    assert not field.visible[2, 3]  # no gel there
+    assert not field.visible[5].any()
+    assert field.visible.sum() == 17 * 23 - 23 - 1
+    assert sorted(read_channels(tmp_path / "a.exr")) == ["forward.U", "forward.V", "forward.visible"]
+
+
+def test_exr_without_the_asked_direction_is_named(tmp_path: Path) -> None:
+    write_flow(tmp_path / "a.exr", some_flow())
+    with pytest.raises(InputError, match=r"a\.exr.*backward\.U"):
+        read_flow(tmp_path / "a.exr", "backward")
+
+
+def _png(path: Path) -> None:
+    save(path, moved(40, 50, 0, 0))
+
+
+def _jpg(path: Path) -> None:
+    assert cv2.imwrite(str(path), as_bytes(moved(40, 50, 0, 0)))
+
+
+def _exr(path: Path) -> None:
+    write_flow(path, some_flow())
+
+
+def _flo(path: Path) -> None:
+    write_flo(path, some_flow())
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.7, 0.99])
+@pytest.mark.parametrize(
+    ("name", "write", "read"),
+    [("a.png", _png, read_image), ("a.jpg", _jpg, read_image), ("a.exr", _exr, read_flow), ("a.flo", _flo, read_flo)],
+)
+def test_truncated_file_is_named(
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+    name: str,
+    write: Callable[[Path], None],
+    read: Callable[[Path], object],
+    share: float,
+) -> None:
+    path = tmp_path / name
+    write(path)
+    read(path)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(InputError, match=name):
+        read(path)
+    assert capfd.readouterr() == ("", "")  # the libraries below keep quiet
+
+
+@pytest.mark.parametrize(
+    ("name", "write", "read"), [("a.png", _png, read_image), ("a.exr", _exr, read_flow), ("a.flo", _flo, read_flo)]
+)
+def test_missing_and_foreign_files_are_named(
+    tmp_path: Path, name: str, write: Callable[[Path], None], read: Callable[[Path], object]
+) -> None:
+    with pytest.raises(InputError, match=name):
+        read(tmp_path / name)
+    (tmp_path / name).write_bytes(b"something else entirely" * 20)
+    with pytest.raises(InputError, match=name):
+        read(tmp_path / name)
+
+
+def test_flipped_bit_in_a_png_is_noticed(tmp_path: Path) -> None:
+    _png(tmp_path / "a.png")
+    data = bytearray((tmp_path / "a.png").read_bytes())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "a.png").write_bytes(data)
+    with pytest.raises(InputError, match=r"a\.png.*damaged"):
+        read_image(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_bit_depths_give_the_same_image(tmp_path: Path, dtype: type) -> None:
+    largest = np.iinfo(dtype).max
+    image = moved(20, 30, 0, 0)
+    assert cv2.imwrite(str(tmp_path / "a.png"), np.rint(image * largest).astype(dtype)[..., ::-1])
+    # Rounding to the bit depth: half a step.
+    np.testing.assert_allclose(read_image(tmp_path / "a.png"), image, atol=0.5001 / largest)
+
+
+def test_grey_has_three_equal_channels_and_alpha_is_dropped(tmp_path: Path) -> None:
+    rgb = as_bytes(moved(20, 30, 0, 0))
+    assert cv2.imwrite(str(tmp_path / "grey.png"), rgb[..., 0])
+    grey = read_image(tmp_path / "grey.png")
+    assert grey.shape == (20, 30, 3)
+    assert (grey == grey[..., :1]).all()
+    assert cv2.imwrite(str(tmp_path / "alpha.png"), np.dstack([rgb[..., ::-1], rgb[..., 0]]))
+    np.testing.assert_array_equal(np.rint(read_image(tmp_path / "alpha.png") * 255), rgb)
+
+
+def test_pair_of_two_sizes_and_one_pixel_images_are_refused(tmp_path: Path) -> None:
+    save(tmp_path / "a.png", moved(20, 30, 0, 0))
+    save(tmp_path / "b.png", moved(20, 31, 0, 0))
+    save(tmp_path / "c.png", moved(1, 1, 0, 0))
+    with pytest.raises(InputError, match=r"30 x 20 px.*31 x 20 px"):
+        read_pair(tmp_path / "a.png", tmp_path / "b.png")
+    with pytest.raises(InputError, match=r"c\.png: 1 x 1 px"):
+        read_pair(tmp_path / "c.png", tmp_path / "c.png")
+
+
+def test_write_png_round_trip(tmp_path: Path) -> None:
+    pixels = as_bytes(moved(20, 30, 0, 0))
+    write_png(tmp_path / "new" / "a.png", pixels)
+    np.testing.assert_array_equal(np.rint(read_image(tmp_path / "new" / "a.png") * 255), pixels)
+
+
+def test_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+
+    def fail() -> None:
+        with replacing(path) as temporary:
+            temporary.write_text("half")
+            raise OSError(errno.ENOSPC, "disk full")
+
+    with pytest.raises(OSError, match=r"disk full.*a\.txt"):
+        fail()
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]

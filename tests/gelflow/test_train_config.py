@@ -1,0 +1,57 @@
+"""Settings: the paper's values, refusals that name the field, imports that stay light."""
+
+import subprocess
+import sys
+
+import pytest
+
+from gelflow.config import LossConfig, ModelConfig, TrainConfig, validated
+from gelflow.errors import InputError
+
+
+def test_defaults_are_the_readings_of_the_paper() -> None:
+    model, loss, run = ModelConfig(), LossConfig(), TrainConfig()
+    assert (model.levels, model.finest_scale, model.correlation_radius, model.lffm_region) == (8, 2, 4, 3)
+    assert (loss.alpha, loss.beta, loss.lambda_theta, loss.lambda_zeta) == (0.85, 10, 0.01, 0.01)
+    assert (loss.lambda_dc, loss.lambda_df, loss.lambda_s) == (75, 0.01, (1,) * 7)
+    assert (loss.smoothness, loss.flow_normalisation, loss.ratio, loss.weight) == (
+        "helmholtz", "min_side", "product", "anti_edge")  # fmt: skip
+    assert (run.batch_size, run.learning_rate, run.weight_decay, run.supervision) == (4, 1e-4, 1e-6, "self")
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"lr": 1}, "lr: there is no such setting; allowed: model, loss"),
+        ({"loss": {"lambda_x": 1}}, "loss.lambda_x: there is no such setting; allowed: alpha"),
+        ({"loss": {"alpha": 2}}, r"loss.alpha: .*less than or equal to 1 \(given: 2\)"),
+        ({"loss": {"alpha": "high"}}, "loss.alpha: .*number.*high"),
+        ({"model": {"estimator": "both"}}, "model.estimator: .*'per_scale' or 'shared'.*both"),
+        ({"model": {"levels": 4, "finest_scale": 3}}, "finest_scale = 3 must be below the coarsest scale 3"),
+        ({"model": {"levels": 6}}, "loss.lambda_s has 7 numbers; model.levels asks for 5"),
+        ({"loss": {"lambda_s": [0.0] * 7}}, "at least one of them above 0"),
+        ({"crop_size": [32, 64]}, r"crop_size = \[32, 64\]: each side must be at least 64 px"),
+        ({"image_size": [64, 64], "crop_size": [64, 80]}, "does not fit into image_size"),
+        ({"steps": 10, "warmup_steps": 10}, "warmup_steps = 10 must be below steps = 10"),
+        ({"steps": 0}, "steps: .*greater than or equal to 1"),
+        ({"learning_rate": float("nan")}, "learning_rate"),
+    ],
+)
+def test_wrong_values_are_named_with_what_is_allowed(values: dict, words: str) -> None:
+    with pytest.raises(InputError, match=words) as error:
+        validated(TrainConfig, values, "run.toml")
+    assert str(error.value).startswith("run.toml: ")
+    assert "\n" not in str(error.value)
+
+
+def test_a_configuration_survives_json() -> None:
+    config = TrainConfig(image_size=(64, 80), loss=LossConfig(weight="floor"))
+    assert validated(TrainConfig, config.model_dump(mode="json"), "json") == config
+
+
+def test_importing_the_package_and_the_settings_loads_nothing_heavy() -> None:
+    code = (
+        "import sys, gelflow, gelflow.config; print([m for m in ('torch', 'numpy', 'lightning') if m in sys.modules])"
+    )
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert answer.stdout.strip() == "[]"

@@ -1,0 +1,201 @@
+"""Whole runs, small: they learn, they resume bit by bit, they refuse what is not theirs."""
+
+import csv
+import json
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import torch
+from torch.utils.data import Dataset
+from waves import Shifts
+
+from gelflow.config import ModelConfig, TrainConfig
+from gelflow.errors import InputError
+from gelflow.estimate import estimate_flow
+from gelflow.train import train
+from gelflow.train.checkpoint import load_weights, read_metadata
+from gelflow.train.module import learning_rate_factor
+from gelflow.train.state import load_state
+
+SMALL = {
+    "model": {"levels": 4, "projected_channels": 8},
+    "loss": {"lambda_s": [1.0, 1.0, 1.0]},
+    "batch_size": 2,
+    "learning_rate": 1e-3,
+    "device": "cpu",
+}
+
+
+@pytest.fixture(autouse=True)
+def one_thread() -> Iterator[None]:
+    former = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(former)
+
+
+def small(**values: object) -> TrainConfig:
+    return TrainConfig.model_validate(SMALL | values)
+
+
+@pytest.fixture(scope="module")
+def pairs() -> Shifts:
+    return Shifts(3, 64, 2.0, seed=1)
+
+
+class CtrlC(Dataset):
+    """Pairs of which the n-th one asked for comes with a Ctrl-C."""
+
+    def __init__(self, pairs: Shifts, at: int) -> None:
+        self.pairs, self.left = pairs, at
+
+    def __len__(self) -> int:
+        return len(self.pairs)
+
+    def __getitem__(self, index: int) -> dict:
+        self.left -= 1
+        if self.left == 0:
+            os.kill(os.getpid(), signal.SIGINT)
+        return self.pairs[index]
+
+
+def weights_of(path: Path) -> dict[str, torch.Tensor]:
+    return load_weights(path).state_dict()
+
+
+@pytest.mark.parametrize("validates", [True, False])
+def test_a_run_interrupted_by_ctrl_c_ends_with_the_same_weights(
+    pairs: Shifts, tmp_path: Path, validates: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = small(steps=7, validate_every=3, save_every=2, schedule="one_cycle", warmup_steps=2)
+    validation = pairs if validates else None
+    whole = train(config, pairs, validation, tmp_path / "whole")
+    with pytest.raises(KeyboardInterrupt, match=r"step 5 of 7 is saved.*--resume"):
+        train(config, CtrlC(pairs, 1 + 2 * 4 + 1), validation, tmp_path / "cut")  # one to check, then two a step
+    assert "--resume" in capsys.readouterr().err
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert load_state(tmp_path / "cut").step == 5
+    resumed = train(config, pairs, validation, tmp_path / "cut", resume=True)
+    first, second = weights_of(whole.weights), weights_of(resumed.weights)
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    states = [load_state(tmp_path / name) for name in ("whole", "cut")]
+    assert states[0].step == states[1].step == 7
+    assert all(torch.equal(states[0].model[name], states[1].model[name]) for name in states[0].model)
+    assert resumed.metrics == whole.metrics
+    assert bool(resumed.metrics) == validates
+
+
+def test_a_run_killed_between_saves_goes_back_to_the_last_one_and_ends_the_same(pairs: Shifts, tmp_path: Path) -> None:
+    class Killed(CtrlC):
+        def __getitem__(self, index: int) -> dict:
+            self.left -= 1
+            if self.left == 0:
+                raise RuntimeError("power cut")
+            return self.pairs[index]
+
+    config = small(steps=6, save_every=2)
+    whole = train(config, pairs, None, tmp_path / "whole")
+    with pytest.raises(RuntimeError, match="power cut"):
+        train(config, Killed(pairs, 1 + 2 * 5), None, tmp_path / "cut")
+    assert load_state(tmp_path / "cut").step == 4
+    resumed = train(config, pairs, None, tmp_path / "cut", resume=True)
+    first, second = weights_of(whole.weights), weights_of(resumed.weights)
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_the_folder_of_a_run_holds_logs_weights_and_settings(pairs: Shifts, tmp_path: Path) -> None:
+    config = small(steps=20, validate_every=10)
+    result = train(config, pairs, pairs, tmp_path)
+    rows = list(csv.DictReader(next(tmp_path.glob("logs/csv/*/metrics.csv")).open()))
+    assert [row["step"] for row in rows if row["train/loss"]] == ["10", "20"]
+    errors = [float(row["validation/endpoint_error_px"]) for row in rows if row["validation/endpoint_error_px"]]
+    assert len(errors) == 2
+    assert list(tmp_path.glob("logs/tensorboard/*/events*"))
+    assert json.loads((tmp_path / "run.json").read_text())["config"]["steps"] == 20
+    assert result.metrics["endpoint_error_px"] == pytest.approx(errors[-1], rel=1e-6)
+    assert result.best == pytest.approx(min(errors), rel=1e-6)
+    # the mean length of the flows, which are constant over each image
+    still = sum(pairs[i]["flow"][:, 0, 0].norm().item() for i in range(3)) / 3
+    assert result.metrics["no_motion_endpoint_error_px"] == pytest.approx(still, rel=1e-5)
+    metadata = read_metadata(result.weights)
+    assert metadata["step"] == str(10 * (1 + errors.index(min(errors))))
+    assert json.loads(metadata["train"])["learning_rate"] == 1e-3
+    assert "endpoint error" in str(result)
+    # the kept weights are those that were validated
+    network = load_weights(result.weights)
+    means = [
+        (estimate_flow(network, p["image1"][None], p["image2"][None])[0] - p["flow"]).norm(dim=0).mean().item()
+        for p in (pairs[i] for i in range(3))
+    ]
+    assert sum(means) / 3 == pytest.approx(result.best, rel=1e-4)
+
+
+def test_without_truth_the_photometric_loss_chooses(tmp_path: Path) -> None:
+    pairs = Shifts(2, 64, 1.0, seed=2, flow=False)
+    result = train(small(steps=2, validate_every=1), pairs, pairs, tmp_path)
+    assert set(result.metrics) == {"psnr_db", "no_motion_psnr_db", "photometric_loss"}
+    assert result.best is not None
+    assert result.best <= result.metrics["photometric_loss"]
+
+
+def test_learning_rate_rises_and_falls() -> None:
+    config = TrainConfig(steps=110, warmup_steps=10, schedule="one_cycle")
+    factors = [learning_rate_factor(config, step) for step in range(111)]
+    assert factors[0] == 0.1
+    assert factors[9] == factors[10] == 1
+    assert factors[60] == pytest.approx(0.5)
+    assert factors[110] == pytest.approx(0, abs=1e-15)
+    assert learning_rate_factor(TrainConfig(), 1000) == 1
+
+
+def test_fine_tuning_starts_from_the_given_weights(pairs: Shifts, tmp_path: Path) -> None:
+    first = train(small(steps=1), pairs, None, tmp_path / "first")
+    # a learning rate of 1e-12 changes float32 weights of size 1e-2 by less than their rounding
+    second = train(small(steps=1, learning_rate=1e-12, seed=5), pairs, None, tmp_path / "second", initial=first.weights)
+    old, new = weights_of(first.weights), weights_of(second.weights)
+    assert all(torch.allclose(old[name], new[name], rtol=0, atol=1e-10) for name in old)
+    with pytest.raises(InputError, match=r"its architecture is not that of the run .levels: 4 there, 5 here"):
+        train(
+            TrainConfig(model=ModelConfig(levels=5, projected_channels=8), loss={"lambda_s": [1] * 4}),
+            pairs, None, tmp_path / "third", initial=first.weights)  # fmt: skip
+
+
+def test_folders_of_other_runs_are_refused(pairs: Shifts, tmp_path: Path) -> None:
+    config = small(steps=2)
+    with pytest.raises(InputError, match="no run to resume there"):
+        train(config, pairs, None, tmp_path / "run", resume=True)
+    train(config, pairs, None, tmp_path / "run")
+    before = (tmp_path / "run" / "weights.safetensors").read_bytes()
+    with pytest.raises(InputError, match="holds a run already; add --resume"):
+        train(config, pairs, None, tmp_path / "run")
+    with pytest.raises(InputError, match=r"another run than the one to resume .learning_rate: 0.001 there, 0.1 now"):
+        train(small(steps=2, learning_rate=0.1), pairs, None, tmp_path / "run", resume=True)
+    with pytest.raises(InputError, match="pairs: 3 there, 1 now"):
+        train(config, Shifts(1, 64, 1.0, seed=3), None, tmp_path / "run", resume=True)
+    with pytest.raises(InputError, match="has done 2 steps, more than the 1 asked for"):
+        train(small(steps=1), pairs, None, tmp_path / "run", resume=True)
+    assert (tmp_path / "run" / "weights.safetensors").read_bytes() == before
+    assert train(small(steps=3), pairs, None, tmp_path / "run", resume=True).steps == 3  # longer: a constant rate
+    (tmp_path / "run" / "state.ckpt").write_bytes(b"PK damaged")
+    with pytest.raises(InputError, match=r"state\.ckpt: damaged"):
+        train(small(steps=4), pairs, None, tmp_path / "run", resume=True)
+
+
+def test_settings_that_the_data_or_the_machine_cannot_serve(pairs: Shifts, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match='supervision = "self"'):
+        train(small(supervision="flow"), Shifts(1, 64, 1.0, seed=3, flow=False), None, tmp_path / "a")
+    with pytest.raises(InputError, match="training set: holds no pair"):
+        train(small(), Shifts(0, 64, 1.0, seed=3), None, tmp_path / "b")
+    if not torch.cuda.is_available():
+        with pytest.raises(InputError, match="no CUDA device was found"):
+            train(small(device="cuda"), pairs, None, tmp_path / "c")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_that_diverges_says_so_and_keeps_no_ruined_state(pairs: Shifts, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="training has diverged; lower learning_rate"):
+        train(small(steps=20, learning_rate=1e30), pairs, None, tmp_path)
+    assert not (tmp_path / "state.ckpt").exists()

@@ -1,0 +1,115 @@
+"""Order, augmentation and batches: fixed by (seed, draw) alone, physically consistent, with clear refusals."""
+
+import pytest
+import torch
+from torch.utils.data import Dataset
+from waves import Shifts
+
+from gelflow.config import TrainConfig
+from gelflow.errors import InputError
+from gelflow.ops.warp import inside, warp
+from gelflow.train.samples import StepSampler, TrainingSamples, checked, collate, resized
+
+
+def test_every_pass_sees_every_pair_once_in_another_order() -> None:
+    batches = list(StepSampler(6, TrainConfig(batch_size=4), 0, 6))
+    indices = [index for batch in batches for index, _ in batch]
+    assert all(sorted(indices[i : i + 6]) == list(range(6)) for i in range(0, 24, 6))
+    assert indices[:6] != indices[6:12] or indices[6:12] != indices[12:18]
+    assert [draw for batch in batches for _, draw in batch] == list(range(24))
+
+
+def test_a_later_start_goes_on_with_the_same_batches_and_processes_share_them() -> None:
+    config = TrainConfig(batch_size=4, seed=3)
+    whole = list(StepSampler(7, config, 0, 10))
+    assert list(StepSampler(7, config, 4, 10)) == whole[4:]
+    halves = [list(StepSampler(7, TrainConfig(batch_size=2, seed=3), 0, 10, rank, 2)) for rank in (0, 1)]
+    assert [first + second for first, second in zip(*halves, strict=True)] == whole
+    assert list(StepSampler(7, TrainConfig(batch_size=4, seed=4), 0, 10)) != whole
+
+
+class Still(Dataset):
+    """One sample of 96 x 112 px whose flow at the left half is unknown."""
+
+    def __len__(self) -> int:
+        return 1
+
+    def __getitem__(self, _: int) -> dict:
+        sample = Shifts(1, 112, 3.0, seed=5)[0]
+        for key in ("image1", "image2", "flow"):
+            sample[key] = sample[key][:, :96].clone()
+        sample["flow"][:, :, :56] = torch.nan
+        return sample
+
+
+def test_augmented_pairs_still_obey_their_flow() -> None:
+    config = TrainConfig(supervision="flow", crop_size=(64, 80), color_jitter=0.1)
+    samples = TrainingSamples(Still(), config)
+    flipped, jittered = set(), set()
+    for draw in range(12):
+        sample = samples[(0, draw)]
+        flow = sample["flow"]
+        assert sample["image1"].shape == (3, 64, 80)
+        known = torch.isfinite(flow).all(dim=0)
+        filled = torch.nan_to_num(flow)[None]
+        counts = (known & (inside(filled)[0, 0] > 0)).expand(3, 64, 80)
+        error = (warp(sample["image2"][None], filled)[0] - sample["image1"])[counts].abs().mean()
+        still = (sample["image2"] - sample["image1"])[counts].abs().mean()
+        # bilinear interpolation of waves of 8 px and more: at most 5 % of what the motion makes, here
+        assert error < 0.2 * still
+        flipped.add(tuple(flow[:, known][:, 0].sign().tolist()))
+        jittered.add(round(sample["image1"].mean().item(), 4))
+        assert torch.equal(samples[(0, draw)]["image1"], sample["image1"])
+    assert len(flipped) == 4
+    assert len(jittered) == 12
+
+
+def test_resizing_brings_flow_and_images_to_the_new_px() -> None:
+    sample = resized(checked(Shifts(1, 96, 6.0, seed=6)[0]), (64, 192))
+    flow = sample["flow"]
+    former = Shifts(1, 96, 6.0, seed=6)[0]["flow"]
+    torch.testing.assert_close(flow[0, 0, 0], former[0, 0, 0] * 2)
+    torch.testing.assert_close(flow[1, 0, 0], former[1, 0, 0] * 64 / 96)
+    keep = inside(flow[None])[0].expand(3, 64, 192) > 0
+    error = (warp(sample["image2"][None], flow[None])[0] - sample["image1"])[keep].abs().mean()
+    # low-pass filters of the resampling act near the border and attenuate waves alike elsewhere
+    assert error < 0.1 * (sample["image2"] - sample["image1"]).abs().mean()
+
+
+def broken(**changes: object) -> dict:
+    sample = Shifts(1, 64, 1.0, seed=7)[0]
+    sample.update(changes)
+    return sample
+
+
+@pytest.mark.parametrize(
+    ("sample", "words"),
+    [
+        (broken(image1=None), "pair shift_0: image1 must be"),
+        (broken(image2=torch.zeros(1, 64, 64)), r"image2 must be a \(3, rows, columns\)"),
+        (broken(image1=torch.zeros(3, 64, 65)), "different sizes"),
+        (broken(image1=torch.full((3, 64, 64), torch.nan)), "image1 holds NaN"),
+        (broken(flow=torch.zeros(2, 5, 5)), "its flow has another size"),
+        (broken(flow=torch.full((2, 64, 64), torch.nan)), 'use supervision = "self"'),
+        (broken(flow=None), 'use supervision = "self"'),
+    ],
+)
+def test_samples_that_cannot_be_used_are_named(sample: dict, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        checked(sample, supervised=True)
+
+
+def test_batches_need_one_size_and_enough_pixels() -> None:
+    small, large = checked(Shifts(1, 64, 1.0, seed=8)[0]), checked(Shifts(1, 80, 1.0, seed=8)[0])
+    with pytest.raises(InputError, match="different sizes; set image_size"):
+        collate([small, large])
+    with pytest.raises(InputError, match="48x48 px, but each side must be at least 64"):
+        TrainingSamples(Shifts(1, 48, 1.0, seed=8), TrainConfig())[(0, 0)]
+    with pytest.raises(InputError, match="crop_size 72x64 does not fit"):
+        TrainingSamples(Shifts(1, 64, 1.0, seed=8), TrainConfig(crop_size=(72, 64)))[(0, 0)]
+
+
+def test_a_batch_has_flow_only_if_all_its_samples_do() -> None:
+    both = [checked(Shifts(1, 64, 1.0, seed=9, flow=known)[0]) for known in (True, False)]
+    assert "flow" not in collate(both)
+    assert collate([both[0], both[0]])["flow"].shape == (2, 2, 64, 64)

@@ -1,0 +1,111 @@
+"""Samples for the tests of dataset, inspection and export: a flat gel that moves as a whole under a pinhole camera.
+
+A patterned plane z = 0 seen from straight above at `scale` px per mm: a shift of s mm in x moves every pixel by exactly
+U = scale * s, V = 0. The texture is a sum of cosines, so both images are exact.
+"""
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+
+from synth.dataset.job import Job
+from synth.dataset.sample import Sample
+from synth.flow.field import FlowField
+from synth.scene import Scene
+from synth.surface import ContactFaces, GelSurface
+
+HEIGHT, WIDTH = 24, 32
+SCENE = {
+    "name": "flat",
+    "sensor": {
+        "gel": {"size_mm": [4.0, 3.0, 1.0], "youngs_modulus_kpa": 100.0},
+        "pattern": {"kind": "none"},
+        "lights": [{"position_mm": [0.0, 0.0, 0.5], "size_mm": [1.0, 1.0], "color": [1.0, 1.0, 1.0], "power": 1.0}],
+        "camera": {"width": 32, "height": 24, "fx": 80, "fy": 80, "cx": 16, "cy": 12, "position_mm": [0.0, 0.0, 20.0]},
+    },
+    "contact": {"indenter": {"shape": "sphere", "radius_mm": 1.0}},
+    "motion": {"depth_mm": 0.1},
+}
+
+
+def flat_surface() -> GelSurface:
+    """Four triangles over the pad of `SCENE`."""
+    nodes = np.array([[-2, -1.5, 0], [2, -1.5, 0], [2, 1.5, 0], [-2, 1.5, 0], [0, 0, 0]], np.float64)
+    faces = np.array([[0, 4, 1], [1, 4, 2], [2, 4, 3], [3, 4, 0]], np.int32)
+    return GelSurface(ContactFaces(nodes, faces), subdivisions=2)
+
+
+def texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """(..., 3) in [0, 1]."""
+    waves = [np.cos(0.7 * x + 0.3 * y + k) + np.cos(0.4 * y - 0.2 * x + 2 * k) for k in range(3)]
+    return 0.5 + 0.2 * np.stack(waves, axis=-1)
+
+
+def translation_sample(
+    index: int = 0,
+    shift: tuple[float, float] = (1.25, -0.5),
+    *,
+    dtype: type = np.uint8,
+    grey: bool = False,
+) -> Sample:
+    """The gel moves by `shift` px. The last two columns see no gel; what moves off the image is not visible."""
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    x, y = columns + 0.5, rows + 0.5
+    full = np.iinfo(dtype).max
+    images = [np.rint(texture(x - k * shift[0], y - k * shift[1]) * full).astype(dtype) for k in (0, 1)]
+    if grey:
+        images = [np.ascontiguousarray(image[:, :, 0]) for image in images]
+    gel = columns < WIDTH - 2
+    forward = np.where(gel[..., None], np.array(shift), np.nan).astype(np.float32)
+    ahead = (x + shift[0] < WIDTH) & (x + shift[0] > 0) & (y + shift[1] < HEIGHT) & (y + shift[1] > 0) & gel
+    behind = (x - shift[0] < WIDTH) & (x - shift[0] > 0) & (y - shift[1] < HEIGHT) & (y - shift[1] > 0) & gel
+    surface = flat_surface()
+    rest = np.zeros_like(surface.coarse.nodes)
+    solver = {
+        "depth_mm": 0.1, "shear_mm": [0.0, 0.0], "twist_deg": 0.0, "converged": True, "newton_iterations": 4,
+        "residual": 1e-9, "min_jacobian": 0.97, "max_penetration_mm": 1e-4,
+    }  # fmt: skip
+    return Sample(
+        index=index,
+        trajectory=index // 2,
+        frames=(0, 3),
+        seed=7,
+        image1=images[0],
+        image2=images[1],
+        flow=FlowField(
+            forward,
+            ahead.astype(np.float32),
+            -forward,
+            behind.astype(np.float32),
+            extras={"contact.Y": np.where(gel, index, np.nan).astype(np.float32)},
+        ),
+        scene=Scene.model_validate(SCENE),
+        surface=surface,
+        displacement1=rest,
+        displacement2=rest + np.array([shift[0] / 4, shift[1] / 4, 0.0]),
+        diagnostics={"solver": [solver, {**solver, "depth_mm": np.float64(0.2)}]},
+        force_n=np.array([[0.0, 0.0, 0.5], [0.1, 0.0, 1.5]]),
+        torque_nmm=np.zeros((2, 3)),
+        seconds={"simulate": 0.1 + index, "render": 0.2},
+    )
+
+
+def job(n: int = 3, *, seed: int = 7, **changes: object) -> Job:
+    """A job whose scene is `SCENE` with top-level keys changed."""
+    scene = {**SCENE, **changes}
+    return Job(
+        scene=scene,
+        scene_name="flat",
+        scene_hash=hashlib.sha256(repr(scene).encode()).hexdigest()[:16],
+        seed=seed,
+        n=n,
+        software={"synth": "0.1.0"},
+        device={"device": "cpu", "variant": "scalar_rgb"},
+    )
+
+
+def tree(directory: Path) -> dict[str, bytes]:
+    """Every file's content by relative path, the lock left out."""
+    files = (file for file in sorted(directory.rglob("*")) if file.is_file() and file.name != ".lock")
+    return {str(file.relative_to(directory)): file.read_bytes() for file in files}

@@ -1,0 +1,229 @@
+"""Inspection of flows that are known, and what its pictures and pages must contain."""
+
+import dataclasses
+import json
+import re
+
+import cv2
+import numpy as np
+import pytest
+from rich.console import Console
+from samples import HEIGHT, WIDTH, job, translation_sample
+
+from synth.dataset.exr import write_flow
+from synth.dataset.writer import DatasetWriter
+from synth.errors import InputError
+from synth.inspection import inspect, tables, write_html, write_sheet
+from synth.inspection.arrows import arrows_of
+from synth.inspection.inspection import evenly_spaced
+from synth.inspection.interpolation import sample_at
+from synth.inspection.view import View
+from synth.inspection.wheel import NO_GEL, flow_colours, robust_scale, wheel_legend
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    directory = tmp_path_factory.mktemp("inspect") / "d"
+    with DatasetWriter(directory, job(3)) as writer:
+        for index in range(3):
+            writer.write(translation_sample(index))
+        writer.fail(1, 0, "simulate", "Newton failed")
+    return directory
+
+
+def test_translation_in_numbers(dataset):
+    """Every number has a closed form: |(1.25, -0.5)| everywhere, closure 0, the gel's last two columns missing."""
+    found = inspect(dataset / "samples" / "000000").as_dict()["samples"][0]
+    length = np.hypot(1.25, 0.5)
+    for direction in ("forward", "backward"):
+        assert found[direction]["min_px"] == found[direction]["max_px"] == found[direction]["median_px"] == length
+        assert found[direction]["nan_share"] == pytest.approx(2 / WIDTH)
+    # x + 0.5 + 1.25 < 32 keeps columns 0 ... 29 whole; y + 0.5 - 0.5 > 0 loses row 0: 23 of 24 rows.
+    assert found["forward"]["visible_share"] == pytest.approx(23 / 24)
+    assert found["closure"]["max_px"] == 0
+    # Between 4 x 4 pixels with gel (columns 0 ... 29, rows 0 ... 23): column
+    # c + 1.25 takes c ... c + 3, so c = 0 ... 26. Row r - 0.5 takes r - 2 ... r + 1, so r = 2 ... 22.
+    assert found["closure"]["pixels"] == 27 * 21
+    assert (found["width"], found["height"], found["bits"]) == (WIDTH, HEIGHT, 8)
+    assert found["force_n"][1] == [0.1, 0.0, 1.5]
+    assert found["solver"][1]["depth_mm"] == 0.2
+    # Rounding of both images to 1/255 has an RMS of 0.29/255 each; interpolation adds less than that again.
+    assert found["difference"]["after_rmse"] < 2 * 0.29 / 255
+    assert found["difference"]["before_rmse"] > 0.05
+
+
+def test_exchanged_directions_show_in_closure(tmp_path, dataset):
+    """Forward + backward(...) of a field that is not its own inverse is twice the flow."""
+    flow = translation_sample().flow
+    wrong = dataclasses.replace(flow, backward=flow.forward)
+    write_flow(tmp_path / "wrong.exr", wrong, {})
+    found = inspect(tmp_path / "wrong.exr").numbers[0]
+    assert found["closure"]["median_px"] == pytest.approx(2 * np.hypot(1.25, 0.5))
+    assert found["difference"] is None
+    assert found["force_n"] is None
+
+
+def test_flow_file_without_visibility(tmp_path):
+    """An estimate does not know it; that is said, not made up."""
+    import OpenEXR
+
+    flow = translation_sample().flow.forward
+    planes = {"forward.U": np.ascontiguousarray(flow[..., 0]), "forward.V": np.ascontiguousarray(flow[..., 1])}
+    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, planes).write(
+        str(tmp_path / "e.exr")
+    )
+    inspection = inspect(tmp_path / "e.exr")
+    assert inspection.numbers[0]["forward"]["visible_share"] is None
+    assert inspection.numbers[0]["backward"] is None
+    write_html(inspection, tmp_path / "e.html")
+    assert "visible in image 2: not given" in (tmp_path / "e.html").read_text()
+
+
+def test_dataset_page_is_self_contained(dataset, tmp_path):
+    inspection = inspect(dataset)
+    write_html(inspection, tmp_path / "d.html")
+    page = (tmp_path / "d.html").read_text(encoding="utf-8")
+    assert not re.search(r'(src|href)="(?!data:image/png;base64,|#)', page)
+    assert "<script" not in page
+    for name in ("000000", "000001", "000002"):
+        assert f'<h2 id="s{name}">' in page
+    assert page.count("<figure>") == 3 * 9
+    assert page.count("<svg ") == 3
+
+
+@pytest.mark.parametrize("part", ["", "samples/000001", "samples/000001/flow.exr"])
+def test_sheet_is_a_picture(dataset, tmp_path, part):
+    write_sheet(inspect(dataset / part), tmp_path / "s.png")
+    sheet = cv2.imread(str(tmp_path / "s.png"))
+    assert min(sheet.shape[:2]) > 300
+    assert len(np.unique(sheet.reshape(-1, 3), axis=0)) > 100
+
+
+def test_tables_and_json(dataset):
+    inspection = inspect(dataset)
+    record = json.loads(json.dumps(inspection.as_dict(), allow_nan=False))
+    assert (record["kind"], record["finished"], record["failed_draws"], record["seed"]) == ("dataset", 3, 1, 7)
+    console = Console(width=200, record=True)
+    for table in tables(inspection):
+        console.print(table)
+    text = console.export_text()
+    assert "000002" in text
+    assert "1.35" in text  # |(1.25, -0.5)| = 1.346 px
+    assert "simulate 3.3 s" in text
+
+
+def test_limit_is_told(dataset):
+    inspection = inspect(dataset, limit=2)
+    assert [numbers["name"] for numbers in inspection.numbers] == ["000000", "000002"]
+    assert (inspection.about["finished"], inspection.about["inspected"]) == (3, 2)
+    assert evenly_spaced(0, 5) == []
+    assert evenly_spaced(100, 3) == [0, 50, 99]
+
+
+def test_empty_dataset(tmp_path):
+    DatasetWriter(tmp_path / "d", job()).close()
+    inspection = inspect(tmp_path / "d")
+    assert inspection.as_dict()["samples"] == []
+    write_sheet(inspection, tmp_path / "d.png")
+    write_html(inspection, tmp_path / "d.html")
+    assert len(tables(inspection)) == 2
+
+
+def test_gel_out_of_sight(tmp_path):
+    """No pixel sees the gel, nothing moves, nothing is visible: numbers say so and pictures are drawn."""
+    flow = translation_sample().flow
+    nowhere = dataclasses.replace(
+        flow, forward=np.full_like(flow.forward, np.nan), forward_visible=np.zeros_like(flow.forward_visible)
+    )
+    still = dataclasses.replace(flow, forward=np.zeros_like(flow.forward), backward=np.zeros_like(flow.forward))
+    for name, field in (("nowhere", nowhere), ("still", still)):
+        write_flow(tmp_path / f"{name}.exr", field, {})
+        inspection = inspect(tmp_path / f"{name}.exr")
+        write_sheet(inspection, tmp_path / "s.png")
+        write_html(inspection, tmp_path / "s.html")
+        assert inspection.numbers[0]["forward"]["max_px"] == {"nowhere": None, "still": 0.0}[name]
+
+
+def test_what_cannot_be_inspected(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        inspect(tmp_path / "none")
+    with pytest.raises(InputError, match=r"holds neither dataset\.json nor flow\.exr"):
+        inspect(tmp_path)
+    (tmp_path / "a.txt").write_text("x")
+    with pytest.raises(InputError, match=r"a\.txt: cannot be inspected"):
+        inspect(tmp_path / "a.txt")
+    (tmp_path / "flow.exr").write_bytes(b"x")
+    with pytest.raises(InputError, match=r"meta\.json.*cannot be read"):
+        inspect(tmp_path)
+
+
+def test_interpolation_is_exact_to_second_degree():
+    rows, columns = np.mgrid[:12, :15] + 0.5
+    rng = np.random.default_rng(1)
+    x, y = rng.uniform(2.5, 12, 200), rng.uniform(2.5, 9, 200)
+
+    def quadratic(x, y):
+        return 1 + 2 * x - y + 0.3 * x * x - 0.2 * x * y + 0.1 * y * y
+
+    found = sample_at(quadratic(columns, rows)[..., None], x, y)[:, 0]
+    # Rounding only: values up to 50, a few eps each of 16 terms.
+    np.testing.assert_allclose(found, quadratic(x, y), atol=1e-12)
+
+
+def test_interpolation_is_of_third_order():
+    """Halving the spacing divides the error of a sine by 8 (Keys 1981)."""
+    errors = []
+    for count in (16, 32, 64, 128):
+        step = 2 * np.pi / count
+        grid = (np.arange(count) + 0.5) * step
+        values = np.tile(np.sin(grid), (8, 1))[..., None]
+        x = np.linspace(2.1, 4.1, 300)
+        errors.append(np.abs(sample_at(values, x / step, np.full(300, 4.5))[:, 0] - np.sin(x)).max())
+    rates = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert (rates > 2.7).all()
+
+
+def test_interpolation_at_borders_and_gaps():
+    values = np.arange(36.0).reshape(6, 6, 1)
+    values[5, 5] = np.nan
+    x = np.array([0.5, 0.4, 1.0, 2.0, 5.5, 4.5, np.nan])
+    y = np.array([0.5, 0.5, 0.5, 0.5, 5.5, 4.5, 1.0])
+    found = sample_at(values, x, y)[:, 0]
+    # A pixel centre needs its pixel alone; column 1.0 would need one at -1; (2.0, 0.5) interpolates 0 1 2 3 along x.
+    np.testing.assert_allclose(found, [0, np.nan, np.nan, 1.5, np.nan, 28, np.nan], equal_nan=True)
+
+
+def test_colour_wheel():
+    """Baker et al. 2011: right is red, down is yellow-ish, zero is white, beyond the rim is darker, NaN is grey."""
+    flow = np.array([[[1, 0], [0, 0], [2, 0], [np.nan, 0], [0, 1], [-1, 0]]], np.float32)
+    right, none, beyond, gap, down, left = flow_colours(flow, 1.0)[0].astype(int)
+    assert right.tolist() == [255, 0, 0]
+    assert none.tolist() == [255, 255, 255]
+    assert beyond.tolist() == [191, 0, 0]
+    assert gap.tolist() == list(NO_GEL)
+    # A quarter turn is 13.75 of 55 steps of the wheel, of which yellow is at 15: green 13.75 / 15.
+    assert down.tolist() == [255, round(255 * 13.75 / 15), 0]
+    # Half a turn is 27.5, between cyan (25) and blue (36).
+    assert left.tolist() == [0, round(255 * (1 - 2.5 / 11)), 255]
+    legend = wheel_legend(64)
+    assert legend[0, 0, 3] == 0
+    assert legend[32, 63, :3].tolist()[0] == 255
+
+
+@pytest.mark.parametrize("size", [1e-4, 0.013, 1.0, 37.0])
+def test_scale_follows_small_flows_and_ignores_outliers(size):
+    flow = np.zeros((100, 100, 2), np.float32)
+    flow[:50, :, 0] = size
+    flow[0, 0] = 1e4
+    assert size <= robust_scale(flow) * (1 + 1e-6) <= 1.1 * size * (1 + 1e-6)
+    assert robust_scale(np.full((4, 4, 2), np.nan, np.float32)) == 1e-6
+
+
+@pytest.mark.parametrize("size", [1e-3, 0.2, 30.0])
+def test_arrows_can_be_seen_at_any_flow(size):
+    field = translation_sample(shift=(size, 0.0)).flow
+    arrows = arrows_of(View("v", field), across=8)
+    drawn = np.linalg.norm(arrows.tip - arrows.start, axis=1)
+    # Spacing 4 px: at most 1.6 of it; steps 1 2 3 5 7 10 at least half of that, less 5 % for the scale's rounding.
+    assert (drawn <= 1.6 * 4 + 1e-9).all()
+    assert (drawn >= 0.45 * 1.6 * 4).all()

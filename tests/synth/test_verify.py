@@ -1,0 +1,257 @@
+"""Verification passes exact samples and finds every kind of damage."""
+
+import io
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from kinematic_double import LENS, OBLIQUE, STRAIGHT, optics, pixel_centres, sensor, sheet
+from rich.console import Console
+from verified_sample import HEIGHT, WIDTH, as_sample, make_sample, pressed, scene
+
+from synth.dataset.exr import write_flow
+from synth.dataset.job import Job
+from synth.dataset.reader import SampleData
+from synth.dataset.writer import DatasetWriter
+from synth.errors import InputError
+from synth.flow.exact import exact_flow
+from synth.flow.field import FlowField
+from synth.verify import Check, Report, SampleReport, verify_dataset, verify_sample
+from synth.verify.camera import ForwardCamera
+from synth.verify.motion import check_motion
+from synth.verify.photometry import NAME as PHOTOMETRY
+from synth.verify.photometry import check_photometry
+from synth.verify.sheet import Sheet
+
+SCENE = scene()
+
+
+@pytest.fixture(scope="module")
+def sample() -> SampleData:
+    """Between two presses, not from rest: up to some 6 px of motion."""
+    return make_sample(SCENE, pressed(0.8, (0.1, 0.0)), pressed(1.1, (0.8, -0.5), 0.05))
+
+
+def _failed(flow: FlowField, sample: SampleData) -> set[str]:
+    report = verify_sample(0, SCENE, replace(sample, flow=flow))
+    assert report.ok == all(check.passed for check in report.checks)
+    return {check.name for check in report.checks if not check.passed}
+
+
+def _failed_motion(name: str, sample: SampleData, **changes: np.ndarray) -> set[str]:
+    """The same for one direction alone."""
+    flow, camera = sample.flow, ForwardCamera.of(SCENE.sensor)
+    states = [
+        Sheet(camera, sample.surface.triangles, sample.surface.positions(u), WIDTH, HEIGHT)
+        for u in (sample.displacement1, sample.displacement2)
+    ]
+    fields = {"flow": getattr(flow, name), "visible": getattr(flow, f"{name}_visible"), **changes}
+    checks = check_motion(name, *(states if name == "forward" else states[::-1]), fields["flow"], fields["visible"])
+    return {check.name for check in checks if not check.passed}
+
+
+@pytest.mark.parametrize("index", [1.0, 1.45])
+@pytest.mark.parametrize("view", [STRAIGHT, OBLIQUE])
+@pytest.mark.parametrize("lens", [(0.0,) * 5, LENS])
+def test_the_two_cameras_agree(index, view, lens):
+    points = np.random.default_rng(1).uniform((-7, -5, 0), (7, 5, 4), (500, 3))
+    points[0] = (*view["position_mm"][:2], 1.0)  # under the camera
+    camera = {"index": index, "distortion": lens, **view}
+    np.testing.assert_allclose(
+        ForwardCamera.of(sensor(**camera)).see(points), optics(**camera).project(points), atol=1e-10
+    )
+
+
+def test_shares_no_code_with_the_generator():
+    """Neither the camera, nor the tracer, nor Mitsuba are even loaded."""
+    program = (
+        "import sys, synth.verify; print([m for m in sys.modules if m.split('.')[0] in ('synth', 'mitsuba', 'warp')])"
+    )
+    loaded = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert "synth.verify.sheet" in loaded
+    for name in ("synth.optics", "synth.flow.trace", "synth.flow.exact", "mitsuba", "warp"):
+        assert f"'{name}'" not in loaded
+
+
+def test_exact_sample_passes(sample):
+    report = verify_sample(3, SCENE, sample)
+    assert report.ok, [check for check in report.checks if not check.passed]
+    figures = {check.name: check.figure for check in report.checks}
+    assert len(figures) == 10
+    assert None not in figures.values()  # every check applied
+    motion = np.linalg.norm(sample.flow.forward, axis=2)
+    assert np.nanmax(motion) > 3
+    for direction in ("forward", "backward"):
+        # float32 flow below 8 px rounds to 5e-7 px; the closure multiplies it by the strain.
+        assert figures[f"{direction} flow"] < 1e-6
+        assert figures[f"{direction} closure"] < 2e-6
+
+
+def test_one_pixel_off_by_a_twentieth_is_found(sample):
+    for name, axis in (("forward", 0), ("backward", 1)):
+        field = getattr(sample.flow, name).copy()
+        field[70, 90, axis] += np.float32(0.05)
+        assert _failed_motion(name, sample, flow=field) == {f"{name} flow", f"{name} closure"}
+
+
+def test_exchanged_directions_are_found(sample):
+    flow = sample.flow
+    exchanged = FlowField(flow.backward, flow.backward_visible, flow.forward, flow.forward_visible)
+    failed = _failed(exchanged, sample)
+    assert {"forward flow", "forward closure", "backward flow", "backward closure", PHOTOMETRY} <= failed
+
+
+def test_exchanged_components_are_found(sample):
+    flow = sample.flow
+    turned = replace(flow, forward=flow.forward[..., ::-1].copy(), backward=flow.backward[..., ::-1].copy())
+    assert {"forward flow", "forward closure", "backward flow", "backward closure", PHOTOMETRY} <= _failed(
+        turned, sample
+    )
+
+
+def test_wrong_visibility_is_found(sample):
+    visible = sample.flow.forward_visible.copy()
+    visible[70, 90] = 0
+    assert _failed_motion("forward", sample, visible=visible) == {"forward visibility"}
+    hidden = sample.flow.backward_visible.copy()
+    hidden[70, 90] = 0.5  # neither
+    assert _failed_motion("backward", sample, visible=hidden) == {"backward visibility"}
+
+
+def test_wrong_mask_is_found(sample):
+    gone = sample.flow.forward.copy()
+    gone[70, 90] = np.nan
+    assert "forward pixels without gel" in _failed_motion("forward", sample, flow=gone)
+    half = sample.flow.forward.copy()
+    half[70, 90, 1] = np.nan
+    assert "forward pixels without gel" in _failed_motion("forward", sample, flow=half)
+    filled = sample.flow.backward.copy()
+    nothing = np.argwhere(np.isnan(filled[..., 0]))
+    assert 0 < len(nothing) < 0.5 * WIDTH * HEIGHT
+    filled[tuple(nothing[0])] = 0
+    assert _failed_motion("backward", sample, flow=filled) == {"backward pixels without gel"}
+
+
+def test_missing_backward_flow_and_wrong_size_are_found(sample):
+    assert _failed(replace(sample.flow, backward=None, backward_visible=None), sample) == {"backward flow"}
+    small = FlowField(sample.flow.forward[1:], sample.flow.forward_visible[1:])
+    assert "forward flow" in _failed(small, sample)
+
+
+@pytest.mark.parametrize("index", [1.0, 1.45])
+def test_folds_pass_and_their_visibility_is_checked(index):
+    """The sheet's right half folded over itself: silhouettes, hidden points, steep flanks."""
+    surface = sheet(80, 20, 16.0, 12.0)
+    x = surface.material[:, 0]
+    folded, over = surface.material.copy(), x > 2
+    folded[over, 0] = 2 - (x[over] - 2) / 3
+    folded[over, 2] = np.minimum((x[over] - 2) * 4, 1.0)
+    camera = ForwardCamera.of(sensor(index=index))
+    width, height = pixel_centres().shape[1::-1]
+    near, far = (Sheet(camera, surface.triangles, p, width, height) for p in (surface.material, folded))
+    flow = exact_flow(surface, surface.material, folded, optics(index=index), width, height)
+    for check in check_motion("forward", near, far, flow.forward, flow.forward_visible):
+        assert check.passed, check
+    for check in check_motion("backward", far, near, flow.backward, flow.backward_visible):
+        assert check.passed, check
+    hidden = np.argwhere((flow.forward_visible == 0) & np.isfinite(flow.forward[..., 0]))
+    assert len(hidden) > 50
+    wrong = flow.forward_visible.copy()
+    wrong[tuple(hidden[len(hidden) // 2])] = 1
+    checks = {check.name: check for check in check_motion("forward", near, far, flow.forward, wrong)}
+    assert not checks["forward visibility"].passed
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_crumpled_surfaces_pass(seed):
+    """Far beyond what a gel does: dozens of folds that pass through each other, seen from aslant."""
+    rng = np.random.default_rng(seed)
+    surface = sheet(30, 22, 20.0, 15.0, 2)
+    size = pixel_centres().shape[1::-1]
+    camera = {"index": 1.45, "distortion": LENS, **OBLIQUE}
+
+    def crumpled():
+        waves = [rng.normal(size=(2, 3)) for _ in range(6)]
+        phase = [np.sin(2 * surface.material[:, :2] @ k[0, :2] + 6 * k[0, 2])[:, None] * k[1] for k in waves]
+        return surface.material + (0, 0, 2) + 0.2 * sum(phase)
+
+    states = [crumpled(), crumpled()]
+    flow = exact_flow(surface, *states, optics(**camera), *size)
+    assert 0.1 < flow.forward_visible.mean() < 0.9
+    sheets = [Sheet(ForwardCamera.of(sensor(**camera)), surface.triangles, p, *size) for p in states]
+    checks = check_motion("forward", *sheets, flow.forward, flow.forward_visible)
+    checks += check_motion("backward", *sheets[::-1], flow.backward, flow.backward_visible)
+    assert all(check.passed for check in checks), [check for check in checks if not check.passed]
+
+
+@pytest.mark.parametrize("pattern", ["dots", "bare"])
+def test_photometry_needs_a_pattern(pattern, sample):
+    kinds = {"dots": {"kind": "dots", "spacing_mm": (1, 1), "radius_mm": 0.2}, "bare": {"kind": "none"}}
+    check = check_photometry(
+        scene(kinds[pattern]).sensor, sample.image1, sample.image2, sample.flow.forward, sample.flow.forward_visible
+    )
+    assert (check.figure is None) == (pattern == "bare")
+    assert check.passed
+
+
+def test_photometry_tells_the_right_flow_from_wrong_ones(sample):
+    forward, visible = sample.flow.forward, sample.flow.forward_visible
+    pair = SCENE.sensor, sample.image1, sample.image2
+    right = check_photometry(*pair, forward, visible)
+    assert right.passed
+    assert right.figure < 0.8 * right.tolerance
+    wrong = {
+        "none": 0 * forward,
+        "reversed": -forward,
+        "exchanged": forward[..., ::-1],
+        "shifted": forward + np.float32(0.4),
+    }
+    for name, flow in wrong.items():
+        check = check_photometry(*pair, np.ascontiguousarray(flow), visible)
+        assert not check.passed, (name, check)
+
+
+def test_dataset_on_disk(tmp_path, sample):
+    path = tmp_path / "data"
+    with DatasetWriter(path, Job(SCENE.model_dump(mode="json"), "double", "0", seed=0, n=2)) as writer:
+        writer.write(as_sample(0, SCENE, sample))
+        writer.write(as_sample(1, SCENE, sample))
+    seen = []
+    report = verify_dataset(path, samples=[1], on_sample=seen.append)
+    assert report.ok
+    assert [s.index for s in report.samples] == [s.index for s in seen] == [1]
+    json.dumps(report.record())
+
+    forward = sample.flow.forward.copy()
+    forward[70, 90, 1] -= np.float32(0.05)
+    write_flow(path / "samples" / "000000" / "flow.exr", replace(sample.flow, forward=forward), {})
+    flow = path / "samples" / "000001" / "flow.exr"
+    flow.write_bytes(flow.read_bytes()[:2000])
+    damaged = verify_dataset(path)
+    assert not damaged.ok
+    failed = {check.name: check.detail for check in damaged.samples[0].checks if not check.passed}
+    assert set(failed) == {"files", "forward flow", "forward closure"}
+    assert "flow.exr" in failed["files"]
+    assert "row 70, column 90" in failed["forward flow"]
+    assert not damaged.samples[1].ok
+    assert "truncated" in damaged.samples[1].checks[0].detail
+    with pytest.raises(InputError, match="no finished sample 7"):
+        verify_dataset(path, samples=[7])
+    with pytest.raises(InputError):
+        verify_dataset(tmp_path)
+
+
+def test_report():
+    good = Check("a", 1.0, 2.0, "px")
+    bad, unknown, skipped = replace(good, figure=3.0), replace(good, figure=float("nan")), replace(good, figure=None)
+    assert [c.passed for c in (good, bad, unknown, skipped)] == [True, False, False, True]
+    assert not Report("x", ()).ok
+    report = Report("x", (SampleReport(0, (good,)), SampleReport(4, (bad,))))
+    assert not report.ok
+    text = io.StringIO()
+    Console(width=120, file=text).print(report.table())
+    assert "FAILED" in text.getvalue()
+    assert "samples 4" in text.getvalue()
