@@ -38,7 +38,10 @@ class Gel(Part):
 
 
 class Window(Part):
-    """Rigid clear support between gel and camera, index-matched to the gel; flat, at z = gel thickness."""
+    """Rigid clear support between gel and camera, index-matched to the gel; flat, from z = gel thickness on.
+
+    Its outer face refracts; light that it reflects back into the body is left out.
+    """
 
     refractive_index: Annotated[float, Field(ge=1, le=2.5)] = 1.45
     thickness_mm: Annotated[float, Field(ge=0, le=100)] = 5.0

@@ -6,7 +6,6 @@ end with the same weights, bit by bit.
 """
 
 import logging
-import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -173,7 +172,6 @@ def _fit(module: FlowModule, keeper: Keeper, data: "_Data", device: str) -> None
             message = (
                 f"stopped; step {saved} of {config.steps} is saved in {out}; go on with the same command and --resume"
             )
-            print(message, file=sys.stderr)
             raise KeyboardInterrupt(message) from None
 
 

@@ -4,6 +4,7 @@ fTetWild is not deterministic, so the cache is also what makes a dataset reprodu
 meshes it used and a later run on it reads those first.
 """
 
+import contextlib
 import hashlib
 import json
 import os
@@ -71,8 +72,10 @@ def _read(path: Path, gel: Gel) -> PadMesh | None:
 
 
 def _write(path: Path, mesh: PadMesh) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """Keep a mesh, whole or not at all. A folder that cannot be written keeps none: the mesh itself is not at stake."""
     aside = path.with_name(f".{path.name}.{os.getpid()}")
-    with aside.open("wb") as file:
-        np.savez(file, points=mesh.points, tets=mesh.tets)
-    aside.replace(path)
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with aside.open("wb") as file:
+            np.savez(file, points=mesh.points, tets=mesh.tets)
+        aside.replace(path)

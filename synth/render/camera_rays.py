@@ -1,7 +1,7 @@
 r"""Rays through the camera's pixels, for Mitsuba.
 
-Vectorised variants get every lens exactly: rays are made here and start inside the body, refracted by Snell's law at the
-window's outer face and weighted by
+Vectorised variants get every lens exactly: rays are made here and start inside the body, refracted by Snell's law at
+the window's outer face and weighted by
 
 .. math::  \frac{1 - F(\theta)}{n^2},
 
@@ -84,7 +84,7 @@ class CameraRays:
         return ray, (1 - reflected) / dr.square(self._index), valid
 
     def _undistort(self, pixel: Any, x: Any, y: Any) -> tuple[Any, Any]:
-        """Newton from the pixel centre's exact solution: two steps leave (half a pixel / f)^4, below float32's rounding."""
+        """Newton from the pixel centre's solution: two steps leave (half a pixel / f)⁴, below float32's rounding."""
         k1, k2, p1, p2, k3 = self._distortion  # type: ignore[misc]
         u, v = (self._dr.gather(type(x), start, pixel) for start in self._start)
         for _ in range(2):
@@ -109,15 +109,14 @@ def pinhole(sensor: Sensor) -> dict[str, Any]:
         InputError: the camera has distortion or pixels that are not square.
     """
     optics, camera = Optics.of(sensor), sensor.camera
+    need = f"needs LLVM 16 or newer, or an NVIDIA GPU, which this machine lacks ({LLVM_HINT})"
     if any(camera.distortion):
         raise InputError(
-            f"sensor.camera.distortion = {list(camera.distortion)} cannot be rendered on this machine, which has no LLVM "
-            f"of version 16 or newer and no GPU: set it to [0, 0, 0, 0, 0] or get LLVM ({LLVM_HINT})"
+            f"sensor.camera.distortion = {list(camera.distortion)} {need}; without, set it to [0, 0, 0, 0, 0]"
         )
     if camera.fx != camera.fy:
         raise InputError(
-            f"sensor.camera.fx = {camera.fx} and fy = {camera.fy} differ, which cannot be rendered on this machine: it has "
-            f"no LLVM of version 16 or newer and no GPU; make them equal or get LLVM ({LLVM_HINT})"
+            f"sensor.camera.fx = {camera.fx} and fy = {camera.fy} differ, which {need}; without, make them equal"
         )
     frame = np.eye(4)
     # Mitsuba's camera looks along its z axis, with x to the left and y up.

@@ -34,10 +34,10 @@ class GelMesh:
         return np.ascontiguousarray(self.surface.triangles[:, ::-1]).astype(np.uint32).ravel()
 
     def texture_coordinates(self) -> NDArray[np.float32]:
-        """(2 v,) u along +x and v along -y, each 0..1 over the face: Mitsuba's v = 1 is a picture's first row."""
+        """(2 v,) u along +x and v along +y, each 0..1 over the face; Mitsuba's v = 0 is a texture's first row."""
         material = self.surface.material
         u = material[:, 0] / self.size_mm[0] + 0.5
-        v = 0.5 - material[:, 1] / self.size_mm[1]
+        v = material[:, 1] / self.size_mm[1] + 0.5
         return np.column_stack([u, v]).astype(np.float32).ravel()
 
     def positions(self, positions: Points) -> NDArray[np.float32]:

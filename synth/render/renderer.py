@@ -3,9 +3,10 @@
 One Mitsuba scene per sensor draw: the coated surface, the LEDs, and nothing outside (black). The indenter is hidden by
 the opaque coating and never part of it. For a frame only vertex positions and normals are exchanged.
 
-What it leaves out: light that is reflected back into the body by the window's faces, and by the pad's sides. Such light
-reaches the gel on specular paths from small LEDs, which path tracing finds only by chance, and then as bright specks:
-with it a frame is several times noisier, for a mean that changes by some percent (docs/decisions.md).
+What it leaves out: light that the window's faces reflect back onto the gel, and light that the pad's sides reflect. The
+window's share is smooth, but not small: 3 to 22 % of the mean, most of it totally reflected. It comes on specular paths
+from small LEDs, which path tracing finds only by chance and then as bright specks: at 576 samples a pixel it raises the
+noise from 0.4 % to 6 % (deltact) and from 0.6 % to 110 % (the red LEDs of gelsight_mini). See docs/decisions.md.
 
 Pixels are box-filtered. In vectorised variants the samples of one pixel are neighbours in the wavefront and are summed
 in a fixed order, not by atomic adds: the same seed gives the same bits with any number of threads.
@@ -16,10 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from synth.arrays import FloatArray, Image, Points
+from synth.arrays import Image, Points
 from synth.render.camera_rays import CameraRays, pinhole
 from synth.render.gel_mesh import GelMesh
 from synth.render.lights import emitters
+from synth.render.pattern import is_grey
 from synth.render.variant import Variant
 from synth.scene import Coating, Render, Sensor
 from synth.surface import GelSurface
@@ -40,9 +42,12 @@ class Renderer:
 
     Raises:
         InputError: a light in the camera's view; a lens that a scalar variant cannot render.
+        ValueError: a mono variant for a sensor that is not grey.
     """
 
     def __init__(self, sensor: Sensor, render: Render, surface: GelSurface, albedo: Image, variant: Variant) -> None:
+        if variant.is_mono and not is_grey(sensor):
+            raise ValueError(f"{variant.name} renders grey sensors only: choose the variant with grey=is_grey(sensor)")
         self._variant, self._camera = variant, sensor.camera
         self._samples = full_grid(render.samples_per_pixel, sum(light.power > 0 for light in sensor.lights))
         self._mesh = GelMesh(surface, sensor.gel.size_mm[:2])
@@ -53,6 +58,8 @@ class Renderer:
             contents["window"] = _window(sensor, mi)
         self._scene = mi.load_dict(contents)
         self._parameters = mi.traverse(self._scene)
+        if variant.is_vectorised:
+            self._share_kernels()
         # A path through Mitsuba's window is one interaction longer than one that starts inside.
         depth = render.max_depth + (1 if not variant.is_vectorised and refracts else 0)
         self._integrator = mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": True})
@@ -91,6 +98,16 @@ class Renderer:
         self._parameters["gel.vertex_normals"] = self._mesh.normals(positions)
         self._parameters.update()
 
+    def _share_kernels(self) -> None:
+        """Keep the lights' places out of the compiled code, so that another draw of the sensor needs no compiler."""
+        import drjit as dr
+
+        for key in [key for key in self._parameters.keys() if key.endswith(".to_world")]:  # noqa: SIM118
+            transform = self._parameters[key]
+            dr.make_opaque(transform)
+            self._parameters[key] = transform
+        self._parameters.update()
+
     def _trace(self, mi: Any, seed: int) -> Image:
         """All pixels in passes of whole pixels, each pixel's samples one after another in the wavefront."""
         camera, samples = self._camera, self._samples
@@ -100,10 +117,11 @@ class Renderer:
             self._trace_pixels(mi, first, min(step, pixels - first), _fold(seed, k))
             for k, first in enumerate(range(0, pixels, step))
         ]
-        image = np.concatenate(parts) / np.float32(samples)
-        return np.ascontiguousarray(np.broadcast_to(image, (pixels, 3))).reshape(camera.height, camera.width, 3)
+        image: Image = np.empty((camera.height, camera.width, 3), dtype=np.float32)
+        image.reshape(pixels, 3)[:] = np.concatenate(parts) / samples  # a single channel fills all three
+        return image
 
-    def _trace_pixels(self, mi: Any, first: int, count: int, seed: int) -> FloatArray:
+    def _trace_pixels(self, mi: Any, first: int, count: int, seed: int) -> Image:
         """Summed samples (count, channels) float32 of `count` pixels from `first` on."""
         import drjit as dr
 
@@ -127,15 +145,10 @@ class Renderer:
             "raw": True,
             "wrap_mode": "clamp",
         }
-        if coating.roughness == 1 and coating.metallic == 0:
-            bsdf = {"type": "diffuse", "reflectance": reflectance}
-        else:
-            bsdf = {
-                "type": "principled",
-                "base_color": reflectance,
-                "roughness": coating.roughness,
-                "metallic": coating.metallic,
-            }
+        bsdf: dict[str, Any] = {"type": "diffuse", "reflectance": reflectance}
+        if coating.roughness < 1 or coating.metallic > 0:
+            shine = {"roughness": coating.roughness, "metallic": coating.metallic}
+            bsdf = {"type": "principled", "base_color": reflectance, **shine}
         properties = mi.Properties()
         properties["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": bsdf})
         surface, mesh = self._mesh.surface, self._mesh

@@ -7,6 +7,7 @@ library is opened only where nothing newer was found.
 """
 
 import ctypes
+import functools
 import os
 import re
 import subprocess
@@ -85,8 +86,9 @@ class Variant:
         return mi
 
 
+@functools.cache
 def choose_variant(device: Device = "auto", grey: bool = False) -> Variant:
-    """The fastest variant that works here.
+    """The fastest variant that works here; the machine is asked once per process.
 
     Args:
         device: "auto"; "cpu": never CUDA; "cuda": nothing else.
@@ -134,7 +136,7 @@ def llvm_candidates() -> list[Path]:
     ]
     found += Path(sys.prefix).glob("Library/bin/LLVM-C.dll")
     if os.name == "nt":
-        found += Path(os.environ.get("ProgramFiles", "C:/Program Files")).glob("LLVM/bin/LLVM-C.dll")
+        found += Path(os.environ.get("PROGRAMFILES", "C:/Program Files")).glob("LLVM/bin/LLVM-C.dll")
     unique = {path.resolve(): path.resolve() for path in found}
     ordered = sorted(unique.values(), key=_name_version, reverse=True)
     return [Path(named), *ordered] if named else ordered

@@ -1,17 +1,18 @@
 r"""Does image 2, warped by the recorded flow, meet image 1 within the noise?
 
 Both images are linearised and smoothed (Gaussian, σ = 1 px), image 2 is fetched at x + F(x) by bicubic interpolation,
-and its local brightness is matched to image 1's (ratio of means over a Gaussian of σ = 6 px): the motion changes the
+and its local brightness is matched to image 1's (ratio of means over a Gaussian of σ = 3 px): the motion changes the
 shading, but not the pattern's reflectance. At textured pixels the remaining difference, divided by image 1's gradient,
 is a motion that the flow fails to explain:
 
 .. math::  e = |w(I_2) - I_1| / |∇I_1|   \text{in px}
 
-The image is cut into blocks; the figure is the median of e in the block that exceeds its noise most. For a right flow
-it is what noise leaves, 0.6745 σ_d / |∇I|, with σ_d from the scene's read and shot noise and bit depth, and a remainder
-of shading, rendering noise and interpolation. A flow that is wrong by d gives about 0.7 d (the median of |cos|) while d
-is smaller than the pattern's details, and for larger d half the width of the pattern's edges, one px or more. Medians
-leave the few pixels aside at which shadows or highlights pass; only a diffuse pattern can be compared.
+The image is cut into blocks with a median of e each, and the quarter of them is taken that changes most when nothing
+is moved, i.e. where the images themselves show motion; the median of those is the figure. For a right flow it is what
+noise leaves, 0.6745 σ_d / |∇I|, with σ_d from the scene's read and shot noise and bit depth, and a remainder of
+shading, rendering noise and interpolation. A flow that is wrong by d gives about 0.5 d while d is smaller than the
+pattern's details, and for larger d half the width of the pattern's edges, 0.7 px or more. Medians leave aside the
+places where shadows and highlights pass.
 """
 
 import numpy as np
@@ -23,21 +24,23 @@ from synth.scene import Camera, NoPattern, Sensor
 from synth.verify.report import Check
 
 NAME = "image 2 warped to image 1"
-ALLOWANCE_PX = 0.1
-"""For what is not the sensor's noise."""
+ALLOWANCE_PX = 0.15
+"""For what is not the sensor's noise. Simulated presses under the three shipped
+scenes leave 0.03 to 0.10 px; their flow reversed or its U and V exchanged leave 0.5 px and more, unless it is small."""
 _NOISE_FACTOR = 1.5
 """The median of 60 values scatters by 15 % of itself: three standard deviations."""
 _FEWEST = 60
 _BLOCKS = 6
 """Blocks along the image's shorter side."""
 _SMOOTHING_PX = 1.0
-_SHADING_PX = 6.0
+_SHADING_PX = 3.0
 _TEXTURE_IN_NOISE = 6.0
 """A pixel is textured if moving by 1 px changes it by more than so many standard deviations of the difference..."""
 _TEXTURE_IN_EDGES = 0.25
 """... and by more than this share of what the pattern's strongest edges change, relative to the brightness around."""
 
 Raster = NDArray[np.uint8] | NDArray[np.uint16]
+Textured = tuple[FloatArray, FloatArray, NDArray[np.intp], NDArray[np.intp]]
 
 
 def check_photometry(sensor: Sensor, image1: Raster, image2: Raster, flow: FlowArray, visible: FlowArray) -> Check:
@@ -53,37 +56,41 @@ def check_photometry(sensor: Sensor, image1: Raster, image2: Raster, flow: FlowA
     if isinstance(sensor.pattern, NoPattern):
         return Check(NAME, None, ALLOWANCE_PX, "px", "not applicable: the coating is bare")
     usable = _usable(flow, visible)
-    channels = range(1 if image1.ndim == 2 else image1.shape[2])
-    parts = [
-        _unexplained(sensor.camera, _channel(image1, i), _channel(image2, i), flow, usable)
-        for i in channels
-        if usable.any()
-    ]
-    if not parts:
-        return Check(NAME, None, ALLOWANCE_PX, "px", "not applicable: no part of image 1 is seen in image 2")
-    error, noise, row, column = (np.concatenate(part) for part in zip(*parts, strict=True))
     side = min(usable.shape) // _BLOCKS
-    block = row // side * usable.shape[1] + column // side
-    worst: tuple[float, Check] | None = None
-    names, counts = np.unique(block, return_counts=True)
-    for name in names[counts >= _FEWEST]:
-        here = block == name
-        figure = float(np.median(error[here]))
-        tolerance = ALLOWANCE_PX + _NOISE_FACTOR * 0.6745 * float(np.median(noise[here]))
-        if worst is None or figure / tolerance > worst[0]:
-            place = f"row {int(np.median(row[here]))}, column {int(np.median(column[here]))}"
-            detail = f"worst around {place}; over the image {np.median(error):.2g} px"
-            worst = figure / tolerance, Check(NAME, figure, tolerance, "px", detail)
-    if worst is None:
+    pairs = _channels(image1, image2)
+    moved, still = (
+        _block_medians([_unexplained(sensor.camera, one, two, motion, usable) for one, two in pairs], side)
+        for motion in (flow, np.zeros_like(flow))
+    )
+    common = sorted(moved.keys() & still.keys(), key=lambda block: -still[block][0])
+    if not common:
         return Check(
-            NAME, None, ALLOWANCE_PX, "px", f"not applicable: {len(error)} textured pixels stand out of the noise"
+            NAME, None, ALLOWANCE_PX, "px", "not applicable: no block has enough texture that stands out of the noise"
         )
-    return worst[1]
+    most = common[: max(1, len(common) // 4)]
+    figure, noise, unmoved = (
+        float(np.median([column[b][i] for b in most])) for column, i in ((moved, 0), (moved, 1), (still, 0))
+    )
+    detail = f"{len(most)} of {len(common)} textured blocks; without motion {unmoved:.2g} px"
+    return Check(NAME, figure, ALLOWANCE_PX + _NOISE_FACTOR * 0.6745 * noise, "px", detail)
 
 
-def _unexplained(
-    camera: Camera, one: FloatArray, two: FloatArray, flow: FlowArray, usable: BoolArray
-) -> tuple[FloatArray, FloatArray, NDArray[np.intp], NDArray[np.intp]]:
+def _block_medians(channels: list[Textured], side: int) -> dict[tuple[int, int], tuple[float, float]]:
+    """Medians of error and noise in the blocks of `side` px with enough textured values, by (row, column)."""
+    error, noise, row, column = (np.concatenate(part) for part in zip(*channels, strict=True))
+    blocks, member, count = np.unique(
+        np.column_stack([row, column]) // side, axis=0, return_inverse=True, return_counts=True
+    )
+    return {
+        (int(blocks[i, 0]), int(blocks[i, 1])): (
+            float(np.median(error[member == i])),
+            float(np.median(noise[member == i])),
+        )
+        for i in np.flatnonzero(count >= _FEWEST)
+    }
+
+
+def _unexplained(camera: Camera, one: FloatArray, two: FloatArray, flow: FlowArray, usable: BoolArray) -> Textured:
     """Error and standard deviation of its noise (n,) px at textured pixels, and their rows and columns."""
     import cv2
 
@@ -106,10 +113,10 @@ def _unexplained(
     return np.abs(gain * warped - smooth[0])[loud] / slope[loud], deviation[loud] / slope[loud], rows, columns
 
 
-def _channel(image: Raster, channel: int) -> FloatArray:
-    """One channel (H, W), full scale 1."""
-    plane = image if image.ndim == 2 else image[..., channel]
-    return plane.astype(np.float64) / np.iinfo(image.dtype).max
+def _channels(image1: Raster, image2: Raster) -> list[tuple[FloatArray, FloatArray]]:
+    """Each channel of both images, (H, W), full scale 1."""
+    planes = [np.atleast_3d(image).astype(np.float64) / np.iinfo(image.dtype).max for image in (image1, image2)]
+    return [(planes[0][..., i], planes[1][..., i]) for i in range(planes[0].shape[2])]
 
 
 def _noise(linear: FloatArray, camera: Camera) -> FloatArray:

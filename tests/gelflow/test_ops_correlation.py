@@ -24,7 +24,7 @@ def by_definition(first: Tensor, second: Tensor, radius: int) -> Tensor:
     return costs
 
 
-@pytest.mark.parametrize(("size", "radius"), [((4, 5), 1), ((3, 6), 2), ((1, 1), 4), ((2, 7), 4)])
+@pytest.mark.parametrize(("size", "radius"), [((3, 4), 1), ((2, 5), 2), ((1, 1), 4)])
 def test_it_is_the_mean_product_over_channels(size: tuple[int, int], radius: int) -> None:
     first, second = torch.rand(2, 2, 3, *size, dtype=torch.float64)
     # sums of three products of numbers below one, in another order: a few times 2^-53

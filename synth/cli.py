@@ -1,0 +1,158 @@
+"""The command line: `python -m synth generate|plan|simulate|inspect|verify|export|doctor`.
+
+Exit status: 0 done, 1 done with failed samples or a failed check, 2 wrong input, 130 interrupted. Nothing heavy is
+imported before a command runs.
+"""
+
+import sys
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Literal
+
+from cyclopts import App, CycloptsError, Parameter
+
+from synth import __version__
+from synth.errors import InputError
+
+app = App(
+    name="synth",
+    version=__version__,
+    help="Image pairs of vision-based tactile sensors with exact optical flow.\n\nWith --debug, a mistake shows its traceback.",
+    result_action="return_value",
+    suppress_keyboard_interrupt=False,
+)
+
+SceneName = Annotated[str, Parameter(name="--scene", help="A shipped scene's name or a TOML file.")]
+Assignments = Annotated[
+    list[str] | None, Parameter("--set", help="KEY=VALUE with a TOML value, such as motion.depth_mm=1.2; repeatable.")
+]
+Device = Annotated[Literal["auto", "cpu", "cuda"], Parameter(help="Where to render; auto: a GPU with OptiX if any.")]
+AsJson = Annotated[bool, Parameter("--json", negative=(), help="Print the answer as JSON on stdout.")]
+Dataset = Annotated[Path, Parameter(help="A dataset directory.")]
+
+DEFAULT_SCENE = "gelsight_mini"
+
+
+@app.command
+def generate(
+    *,
+    scene: SceneName = DEFAULT_SCENE,
+    n: Annotated[int, Parameter(help="Samples in the dataset.")] = 8,
+    out: Annotated[
+        Path, Parameter(help="Directory of the dataset; one that holds part of the same job goes on.")
+    ] = Path("data/demo"),
+    seed: Annotated[int, Parameter(help="Seed of everything random.")] = 0,
+    assignments: Assignments = None,
+    device: Device = "auto",
+    workers: Annotated[int, Parameter(help="Processes.")] = 1,
+    dry_run: Annotated[bool, Parameter(negative=(), help="Only show the plan.")] = False,
+    as_json: AsJson = False,
+) -> int:
+    """Generates image pairs with exact flow."""
+    from synth.commands import run_generate
+
+    return run_generate(scene, n, out, seed, assignments or [], device, workers, dry_run, as_json)
+
+
+@app.command
+def plan(
+    *,
+    scene: SceneName = DEFAULT_SCENE,
+    n: Annotated[int, Parameter(help="Samples to predict time and size for.")] = 8,
+    assignments: Assignments = None,
+    device: Device = "auto",
+    as_json: AsJson = False,
+) -> int:
+    """Shows what will run, what is left out and why, and the predicted time and size."""
+    from synth.commands import run_plan
+
+    return run_plan(scene, n, assignments or [], device, as_json)
+
+
+@app.command
+def simulate(
+    *,
+    scene: SceneName,
+    out: Annotated[Path, Parameter(help="Directory for trajectory.json and a VTU file per state.")],
+    seed: Annotated[int, Parameter(help="Seed of the draw.")] = 0,
+    index: Annotated[int, Parameter(help="Number of the trajectory that is drawn.")] = 0,
+    assignments: Assignments = None,
+    as_json: AsJson = False,
+) -> int:
+    """Runs the finite-element simulation alone; renders nothing."""
+    from synth.commands import run_simulate
+
+    return run_simulate(scene, out, seed, index, assignments or [], as_json)
+
+
+@app.command
+def inspect(
+    path: Annotated[Path, Parameter(help="A dataset, a sample's folder or one flow EXR.")],
+    /,
+    *,
+    png: Annotated[Path | None, Parameter(help="Write a picture sheet.")] = None,
+    html: Annotated[Path | None, Parameter(help="Write one self-contained page.")] = None,
+    limit: Annotated[int, Parameter(help="Most samples of a dataset to look at.")] = 100,
+    as_json: AsJson = False,
+) -> int:
+    """Shows a dataset, a sample or a flow in numbers and pictures."""
+    from synth.commands import run_inspect
+
+    return run_inspect(path, png, html, limit, as_json)
+
+
+@app.command
+def verify(path: Dataset, /, *, as_json: AsJson = False) -> int:
+    """Derives the ground truth again by an independent way; exit status 1 if it disagrees."""
+    from synth.commands import run_verify
+
+    return run_verify(path, as_json)
+
+
+@app.command
+def export(
+    path: Dataset,
+    /,
+    *,
+    format: Annotated[Literal["flo", "kitti", "npz", "webdataset"], Parameter(help="Layout to write.")],
+    out: Annotated[Path, Parameter(help="Directory to write to.")],
+) -> int:
+    """Writes a dataset in another layout."""
+    from synth.commands import run_export
+
+    return run_export(path, format, out)
+
+
+@app.command
+def doctor(*, as_json: AsJson = False) -> int:
+    """Tells what this machine can run, and how to get the rest."""
+    from synth.doctor import run_doctor
+
+    return run_doctor(as_json)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs a command and returns the exit status. A mistake is shown without a traceback unless --debug is given."""
+    tokens = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in tokens
+    tokens = [token for token in tokens if token != "--debug"]
+    try:
+        status = app(tokens, exit_on_error=False, print_error=False)
+    except (InputError, CycloptsError, OSError) as error:
+        if debug:
+            traceback.print_exc()
+        print(f"synth: {_message(error)}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        if debug:
+            traceback.print_exc()
+        print("synth: interrupted; finished samples are kept: run the same command again to go on", file=sys.stderr)
+        return 130
+    return status if isinstance(status, int) else 0
+
+
+def _message(error: Exception) -> str:
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return str(error).strip()

@@ -1,0 +1,222 @@
+"""What the commands do, between the command line and the stages."""
+
+import json
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+from rich.text import Text
+
+from synth.errors import InputError
+from synth.generate import Summary, job_variant, make_job
+from synth.generate import generate as generate_samples
+from synth.plan import Plan, plan
+from synth.render.variant import Device, Variant
+from synth.template import Template, load_scene
+
+
+def run_generate(
+    scene: str,
+    n: int,
+    out: Path,
+    seed: int,
+    assignments: Sequence[str],
+    device: Device,
+    workers: int,
+    dry_run: bool,
+    as_json: bool,
+) -> int:
+    """See `synth.cli.generate`."""
+    template = load_scene(scene, assignments)
+    variant = job_variant(template, device)
+    make_job(template, n, seed, variant)  # checks n and seed before a dry run promises anything
+    if dry_run:
+        return _show_plan(plan(template, variant), n, as_json)
+    _say_hint(variant)
+    with _progress(f"{template.name}: pairs", n) as advance:
+        summary = generate_samples(template, n, out, seed, variant, workers, advance)
+    if as_json:
+        print(json.dumps({**vars(summary), "directory": str(summary.directory)}))
+    else:
+        _show_summary(summary, variant)
+    return 1 if summary.given_up else 0
+
+
+def run_plan(scene: str, n: int, assignments: Sequence[str], device: Device, as_json: bool) -> int:
+    """See `synth.cli.plan`."""
+    template = load_scene(scene, assignments)
+    variant = job_variant(template, device)
+    if not as_json:
+        _say_hint(variant)
+    return _show_plan(plan(template, variant), n, as_json)
+
+
+def run_simulate(scene: str, out: Path, seed: int, index: int, assignments: Sequence[str], as_json: bool) -> int:
+    """See `synth.cli.simulate`."""
+    from synth.mesh import pad_mesh
+    from synth.sampling import draw
+    from synth.simulate import simulate
+    from synth.simulate.files import write_trajectory
+
+    template = load_scene(scene, assignments)
+    drawn = draw(template, seed, index)
+    mesh = pad_mesh(drawn.sensor.gel, drawn.numerics)
+    trajectory = simulate(drawn, mesh, template.source.parent)
+    record = write_trajectory(out, drawn, mesh, trajectory)
+    if as_json:
+        print(json.dumps(record))
+    else:
+        table = Table("depth mm", "shear mm", "twist deg", "force N", "det F >=", "penetration mm", "iterations")
+        for state in trajectory.states:
+            table.add_row(
+                f"{state.depth_mm:.3f}",
+                f"{state.shear_mm[0]:.3f}, {state.shear_mm[1]:.3f}",
+                f"{state.twist_deg:.2f}",
+                ", ".join(f"{f:.4f}" for f in state.force_n),
+                f"{state.min_jacobian:.3f}",
+                f"{state.max_penetration_mm:.4f}",
+                str(state.newton_iterations),
+            )
+        console = Console()
+        console.print(table)
+        console.print(f"{trajectory.status} in {trajectory.seconds:.1f} s: {out / 'trajectory.json'}", highlight=False)
+    if trajectory.status != "complete":
+        print(f"synth: simulation {trajectory.status}: {trajectory.reason}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def run_inspect(path: Path, png: Path | None, html: Path | None, limit: int, as_json: bool) -> int:
+    """See `synth.cli.inspect`."""
+    from synth.inspection import inspect, tables, write_html, write_sheet
+
+    inspection = inspect(path, limit)
+    if as_json:
+        print(json.dumps(inspection.as_dict()))
+    else:
+        console = Console()
+        for table in tables(inspection):
+            console.print(table)
+    if png is not None:
+        write_sheet(inspection, png)
+    if html is not None:
+        write_html(inspection, html)
+    return 0
+
+
+def run_verify(path: Path, as_json: bool) -> int:
+    """See `synth.cli.verify`."""
+    from synth.dataset.reader import read_dataset
+    from synth.verify.dataset import verify_dataset
+
+    count = len(read_dataset(path).samples)
+    done = iter(range(1, count + 1))
+    with _progress("verify: samples", count) as advance:
+        report = verify_dataset(path, on_sample=lambda _: advance(next(done), count))
+    if as_json:
+        print(json.dumps(report.record()))
+    else:
+        Console().print(report.table())
+    return 0 if report.ok else 1
+
+
+def run_export(path: Path, format: str, out: Path) -> int:
+    """See `synth.cli.export`."""
+    from synth.dataset.export import export
+
+    with _progress("export: samples", None) as advance:
+        count = export(path, format, out, advance)
+    Console().print(f"{count} samples written to {out}", highlight=False)
+    return 0
+
+
+def _say_hint(variant: Variant) -> None:
+    if variant.hint is not None:
+        print(f"synth: rendering with {variant.name} ({variant.reason}); {variant.hint}", file=sys.stderr)
+
+
+def _show_plan(planned: Plan, n: int, as_json: bool) -> int:
+    if as_json:
+        print(json.dumps({**planned.record(), "n": n}))
+        return 0
+    console = Console()
+    table = Table("feature", "runs", "because", title=f"{planned.scene} with {planned.variant}", title_justify="left")
+    for decision in planned.decisions:
+        table.add_row(decision.feature, "yes" if decision.runs else "left out", decision.reason)
+    console.print(table)
+    seconds = sum(planned.seconds_per_pair.values())
+    stages = ", ".join(f"{stage} {value:.2f} s" for stage, value in planned.seconds_per_pair.items())
+    console.print(
+        f"mesh: edges {planned.edge_length_mm:g} mm at the contact face, about {planned.nodes} nodes\n"
+        f"predicted per pair: {stages}; {planned.bytes_per_pair / 1e6:.2f} MB\n"
+        f"predicted for {n} pairs: {_duration(n * seconds)} on one core, {n * planned.bytes_per_pair / 1e9:.2f} GB\n"
+        "predicted within a factor of three; the simulation's discretisation error is not predicted",
+        highlight=False,
+    )
+    return 0
+
+
+def _show_summary(summary: Summary, variant: Variant) -> None:
+    console = Console()
+    total = sum(summary.stages.values())
+    stages = ", ".join(f"{name} {seconds / total:.0%}" for name, seconds in summary.stages.items()) if total else ""
+    rate = f", {summary.made / summary.seconds:.2f} pairs/s" if summary.made else ""
+    console.print(
+        f"{summary.made} pairs made ({summary.found} were there) in {_duration(summary.seconds)}{rate} "
+        f"with {variant.name}: {summary.directory}",
+        highlight=False,
+    )
+    if stages:
+        console.print(f"time: {stages}", highlight=False)
+    if summary.failed_draws:
+        console.print(f"{summary.failed_draws} draws failed and were drawn again (failures.jsonl)", highlight=False)
+    if summary.given_up:
+        print(
+            f"synth: {len(summary.given_up)} samples could not be made, see {summary.directory}/failures.jsonl",
+            file=sys.stderr,
+        )
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 90:
+        return f"{seconds:.1f} s"
+    return f"{seconds / 60:.1f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
+class _Rate(ProgressColumn):
+    """Items per second, or seconds per item where that is slow."""
+
+    def render(self, task: Task) -> Text:
+        speed = task.finished_speed or task.speed
+        if not speed:
+            return Text("")
+        return Text(f"{speed:.1f}/s" if speed >= 1 else f"{1 / speed:.1f} s each", style="cyan")
+
+
+@contextmanager
+def _progress(label: str, total: int | None) -> Iterator[Any]:
+    """A bar on stderr with rate and estimate; a plain line per item where stderr is no terminal would only be noise."""
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(), TimeElapsedColumn(),
+               TimeRemainingColumn())  # fmt: skip
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
+        task = bar.add_task(label, total=total)
+
+        def advance(done: int, total: int) -> None:
+            bar.update(task, completed=done, total=total)
+
+        yield advance

@@ -1,0 +1,70 @@
+"""Small sensors for the tests of rendering: a flat pad, one light, and every number known."""
+
+import numpy as np
+
+from synth.arrays import Image
+from synth.scene import Camera, Coating, Gel, Light, NoPattern, Pattern, Render, Sensor, Window
+from synth.surface import ContactFaces, GelSurface
+
+DIRECT = Render(samples_per_pixel=36, max_depth=2)
+
+
+def small_sensor(
+    index: float = 1.0,
+    pattern: Pattern | None = None,
+    lights: tuple[Light, ...] | None = None,
+    **camera: object,
+) -> Sensor:
+    """A pad of 12 x 9 x 3 mm seen at about 8 px per mm from the height of 20 mm, slightly off its middle."""
+    numbers: dict = {"width": 80, "height": 60, "fx": 140.0, "fy": 140.0, "cx": 42.5, "cy": 28.5}
+    numbers |= {"position_mm": (0.2, -0.1, 20.0), "look_at_mm": (0.2, -0.1, 0.0)}
+    light = Light(position_mm=(7.0, 2.0, 4.0), aim_mm=(0.0, 0.0, 0.0), size_mm=(0.05, 0.05), color=(1, 1, 1), power=100)
+    return Sensor(
+        gel=Gel(size_mm=(12.0, 9.0, 3.0), youngs_modulus_kpa=200),
+        window=Window(refractive_index=index, thickness_mm=3.0),
+        coating=Coating(reflectance=(0.6, 0.6, 0.6)),
+        pattern=pattern or NoPattern(kind="none"),
+        lights=lights or (light,),
+        camera=Camera(**(numbers | camera)),
+    )
+
+
+def flat_surface(sensor: Sensor, cells: int = 12) -> GelSurface:
+    """The undeformed contact face as a regular grid of triangles whose normals point out of the gel (-z)."""
+    width, height = sensor.gel.size_mm[:2]
+    x, y = np.meshgrid(np.linspace(-width / 2, width / 2, cells + 1), np.linspace(-height / 2, height / 2, cells + 1))
+    nodes = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    index = np.arange(len(nodes), dtype=np.int32).reshape(x.shape)
+    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]))
+    faces = np.vstack([np.column_stack([a, c, b]), np.column_stack([b, c, d])])
+    return GelSurface(ContactFaces(nodes, faces), subdivisions=2)
+
+
+def plain(value: float = 0.6) -> Image:
+    """A texture of one reflectance."""
+    return np.full((4, 4, 3), value, dtype=np.float32)
+
+
+def refracted_pixel(sensor: Sensor, x: float, y: float) -> tuple[float, float]:
+    """Pixel of the point (x, y, 0) for a camera that looks straight down: Snell's law solved by bisection.
+
+    Written from R = h tan(a) + d tan(g), sin(a) = n sin(g), and OpenCV's distortion formula; shares no code with synth.
+    """
+    camera, index = sensor.camera, sensor.window.refractive_index
+    depth = sensor.gel.size_mm[2] + sensor.window.thickness_mm
+    above = camera.position_mm[2] - depth
+    dx, dy = x - camera.position_mm[0], y - camera.position_mm[1]
+    distance = np.hypot(dx, dy)
+    low, high = 0.0, np.pi / 2 - 1e-9
+    for _ in range(80):
+        angle = (low + high) / 2
+        reached = above * np.tan(angle) + depth * np.tan(np.arcsin(np.sin(angle) / index))
+        low, high = (angle, high) if reached < distance else (low, angle)
+    scale = np.tan(angle) / distance if distance > 0 else 0.0
+    u, v = dx * scale, dy * scale
+    k1, k2, p1, p2, k3 = camera.distortion
+    s = u * u + v * v
+    radial = 1 + k1 * s + k2 * s**2 + k3 * s**3
+    ud = u * radial + 2 * p1 * u * v + p2 * (s + 2 * u * u)
+    vd = v * radial + p1 * (s + 2 * v * v) + 2 * p2 * u * v
+    return camera.fx * ud + camera.cx, camera.fy * vd + camera.cy

@@ -1,0 +1,77 @@
+"""The camera's sensor: levels, noise, blur and vignette against their formulas."""
+
+import numpy as np
+import pytest
+from render_scenes import small_sensor
+
+from synth.render.camera_image import camera_image, expected_signal, vignette
+
+SIZE = {"width": 200, "height": 150, "cx": 100.0, "cy": 75.0}
+
+
+def _flat(value: float) -> np.ndarray:
+    return np.full((150, 200, 3), value, dtype=np.float32)
+
+
+def _camera(**fields):
+    return small_sensor(**(SIZE | fields)).camera
+
+
+def test_noiseless_levels_follow_exposure_and_gamma() -> None:
+    image = camera_image(_flat(0.25), _camera(gamma=2.0, exposure=1.44), np.random.default_rng(0))
+    assert image.dtype == np.uint8
+    assert np.all(image == round(255 * (0.25 * 1.44) ** 0.5))
+
+
+def test_overexposure_clips() -> None:
+    assert np.all(camera_image(_flat(3.0), _camera(), np.random.default_rng(0)) == 255)
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14, 16])
+def test_deeper_images_fill_16_bits_in_steps_of_their_own(bits: int) -> None:
+    ramp = np.linspace(0, 1, 150 * 200 * 3, dtype=np.float32).reshape(150, 200, 3)
+    image = camera_image(ramp, _camera(gamma=1.0, bit_depth=bits), np.random.default_rng(0))
+    assert image.dtype == np.uint16
+    assert image.min() == 0
+    assert image.max() == 65535
+    levels = 2**bits - 1
+    steps = image * (levels / 65535)
+    assert np.abs(steps - np.round(steps)).max() <= 0.5 * levels / 65535 + 1e-9  # rounding to 16 bits
+
+
+@pytest.mark.parametrize("signal", [0.1, 0.4])
+def test_noise_has_the_photon_transfer_variance(signal: float) -> None:
+    camera = _camera(gamma=1.0, bit_depth=16, read_noise=0.01, shot_noise=0.05)
+    image = camera_image(_flat(signal), camera, np.random.default_rng(0)) / 65535
+    expected = 0.01**2 + 0.05**2 * signal
+    # The variance of n = 90000 samples has the relative standard deviation sqrt(2 / n) = 0.5 %; four of those.
+    assert image.var() == pytest.approx(expected, rel=0.02)
+    assert image.mean() == pytest.approx(signal, abs=4 * np.sqrt(expected / image.size))
+
+
+def test_noise_comes_from_the_generator_alone() -> None:
+    camera = _camera(read_noise=0.02)
+    first, again, other = (camera_image(_flat(0.5), camera, np.random.default_rng(seed)) for seed in (1, 1, 2))
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+def test_blur_is_a_normalised_gaussian() -> None:
+    impulse = np.zeros((150, 200, 3), dtype=np.float32)
+    impulse[75, 100] = 1
+    blurred = expected_signal(impulse, _camera(blur_px=1.5))[:, :, 1]
+    x = np.arange(200) - 100
+    assert blurred.sum() == pytest.approx(1, rel=1e-6)
+    # A sampled Gaussian of sigma >= 1 px keeps its second moment to 1e-7; cutting it at 4 sigma costs below 2e-3.
+    assert (blurred.sum(0) * x**2).sum() == pytest.approx(1.5**2, rel=2e-3)
+
+
+def test_vignette_is_one_at_the_principal_point_and_least_in_the_farthest_corner() -> None:
+    camera = _camera(vignetting=0.6, cx=50.5, cy=20.5)
+    fall = vignette(camera)
+    assert fall[20, 50] == 1
+    assert fall.argmin() == fall.size - 1
+    # The corner pixel's centre is half a pixel short of the corner itself.
+    ratio = ((199.5 - 50.5) ** 2 + (149.5 - 20.5) ** 2) / ((200 - 50.5) ** 2 + (150 - 20.5) ** 2)
+    assert fall[-1, -1] == pytest.approx(1 - 0.6 * ratio, rel=1e-12)
+    assert np.allclose(expected_signal(_flat(0.5), camera)[:, :, 0], 0.5 * fall)

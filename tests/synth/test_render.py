@@ -1,0 +1,253 @@
+"""The renderer: radiometry and geometry against closed forms, exact reproducibility, and what it leaves out."""
+
+import hashlib
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from render_scenes import DIRECT, flat_surface, plain, refracted_pixel, small_sensor
+
+from synth.errors import InputError
+from synth.render.pattern import albedo
+from synth.render.renderer import Renderer, full_grid
+from synth.render.variant import Variant, choose_variant
+from synth.scene import Coating, Dots, Light, Render
+
+FAST = choose_variant("cpu")
+SCALAR = Variant("scalar_rgb", "test")
+VARIANTS = [SCALAR] if not FAST.is_vectorised else [FAST, SCALAR]
+needs_llvm = pytest.mark.skipif(not FAST.is_vectorised, reason="no LLVM of version 16 or newer here")
+names = {"ids": lambda value: value.name if isinstance(value, Variant) else str(value)}
+
+
+def _render(sensor, variant, texture=None, render=DIRECT, seed=0):
+    surface = flat_surface(sensor)
+    texture = plain() if texture is None else texture
+    return Renderer(sensor, render, surface, texture, variant).radiance(surface.material, seed)
+
+
+@pytest.mark.parametrize("variant", VARIANTS, **names)
+@pytest.mark.parametrize("index", [1.0, 1.45])
+def test_radiance_of_a_flat_lambertian_face_under_a_small_light(variant: Variant, index: float) -> None:
+    """L = ρ/π · Φ/π · cos θ_light cos θ_face / d² · (1 - F) / n², at the middle of the image."""
+    sensor = small_sensor(index)
+    image = _render(sensor, variant)
+    light = sensor.lights[0]
+    foot = np.array([*sensor.camera.position_mm[:2], 0.0])  # seen straight down, at the principal point
+    arm = foot - light.position_mm
+    distance = np.linalg.norm(arm)
+    direction = -np.array(light.position_mm) / np.linalg.norm(light.position_mm)
+    irradiance = light.power / np.pi * (arm @ direction / distance) * (light.position_mm[2] / distance) / distance**2
+    reflected = ((index - 1) / (index + 1)) ** 2
+    expected = 0.6 / np.pi * irradiance * (1 - reflected) / index**2
+    # Irradiance is smooth: the mean over 5 x 5 px (0.7 mm) differs by its curvature, (0.2/8)²·3.
+    # Mitsuba's scalar window drops the reflected share by chance: of 900 samples, F = 3 % ± 0.6 %.
+    tolerance = 3e-3 if variant.is_vectorised or index == 1 else 2e-2
+    assert image[26:31, 40:45].mean((0, 1)) == pytest.approx(expected, rel=tolerance)
+
+
+@pytest.mark.parametrize("variant", VARIANTS, **names)
+@pytest.mark.parametrize("index", [1.0, 1.45])
+def test_dots_are_seen_where_pinhole_and_snell_put_them(variant: Variant, index: float) -> None:
+    errors = _dot_errors(small_sensor(index, _dots()), variant)
+    # Mitsuba's scalar window loses 3 % ± 1 % of a pixel's samples at random, 2e-2 px for a single dot: three of those.
+    noise = 0.06 if index > 1 and not variant.is_vectorised else 0.02
+    assert errors == pytest.approx(0, abs=noise)
+    assert errors.mean(0) == pytest.approx(0, abs=0.02)
+
+
+@needs_llvm
+def test_lens_distortion_and_oblong_pixels_are_exact() -> None:
+    lens = {"fy": 155.0, "distortion": (-0.25, 0.08, 0.004, -0.003, 0.01)}
+    assert _dot_errors(small_sensor(1.41, _dots(), **lens), FAST) == pytest.approx(0, abs=0.02)
+
+
+def _dots() -> Dots:
+    return Dots(kind="dots", spacing_mm=(2.5, 2.0), radius_mm=0.45, offset_mm=(0.3, 0.1), reflectance=(0.1, 0.1, 0.1))
+
+
+def _dot_errors(sensor, variant) -> np.ndarray:
+    """Centroid minus expected pixel (n, 2) of every dot that lies wholly in the image.
+
+    Dividing by the same face without dots removes the shading. What remains is the edge of the dots sampled 144 times
+    a pixel: a jittered grid of that size leaves below 1e-2 of a pixel's coverage, over some 20 edge pixels of a dot of
+    30 px area at a lever of 3 px: sqrt(20) · 1e-2 · 3 / 30 = 4e-3 px. The perspective of a disk 0.9 mm wide moves its
+    centroid by (r/f)² · 40 px < 0.01 px. Hence 0.02 px.
+    """
+    render = Render(samples_per_pixel=144, max_depth=2)
+    texture = albedo(sensor, np.random.default_rng(0))
+    ratio = _render(sensor, variant, texture, render)[:, :, 0] / _render(sensor, variant, plain(), render)[:, :, 0]
+    if not variant.is_vectorised and sensor.window.refractive_index > 1:
+        ratio = np.where(ratio > 0.9, 1, ratio)  # the scalar window's chance losses, away from the dots
+    darkness = np.clip(1 - ratio, 0, None)
+    rows, columns = np.mgrid[0:60, 0:80] + 0.5
+    errors = []
+    for x in np.arange(-2, 3) * 2.5 + 0.3:
+        for y in np.arange(-2, 3) * 2.0 + 0.1:
+            u, v = refracted_pixel(sensor, x, y)
+            near = np.hypot(columns - u, rows - v) < 6.5
+            if 7 < u < 73 and 7 < v < 53:
+                total = darkness[near].sum()
+                errors.append([(darkness * columns)[near].sum() / total - u, (darkness * rows)[near].sum() / total - v])
+    assert len(errors) >= 9
+    return np.array(errors)
+
+
+@pytest.mark.parametrize("variant", VARIANTS, **names)
+def test_same_seed_same_bits_and_other_seed_other_noise(variant: Variant) -> None:
+    sensor = small_sensor(1.45, _dots())
+    surface, texture = flat_surface(sensor), albedo(small_sensor(1.45, _dots()), np.random.default_rng(0))
+    renderer = Renderer(sensor, DIRECT, surface, texture, variant)
+    raised = surface.material + np.array([0.3, 0.1, 0.4])
+    first, moved, again, other = (
+        renderer.radiance(positions, seed)
+        for positions, seed in (
+            (surface.material, 7),
+            (raised, 7),
+            (surface.material, 7),
+            (surface.material, 2**40 + 7),
+        )
+    )
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, moved)
+    assert not np.array_equal(first, other)
+    assert first.shape == (60, 80, 3)
+    assert first.dtype == np.float32
+
+
+THREADS = """
+import sys
+sys.path.insert(0, sys.argv[2])
+import test_render as t
+t.FAST.load()
+import drjit as dr
+dr.set_thread_count(int(sys.argv[1]))
+print(t.bumpy_frame_hash())
+"""
+
+
+def bumpy_frame_hash() -> str:
+    """Digest of a frame with everything that could depend on the order of sums: bump, window, indirect light."""
+    sensor = small_sensor(1.45, _dots(), width=160, height=120, fx=280.0, fy=280.0, cx=80.0, cy=60.0)
+    surface = flat_surface(sensor, 24)
+    positions = surface.material.copy()
+    positions[:, 2] += np.exp(-(positions[:, :2] ** 2).sum(1))
+    render = Render(samples_per_pixel=36, max_depth=3)
+    texture = albedo(sensor, np.random.default_rng(0))
+    return hashlib.sha256(Renderer(sensor, render, surface, texture, FAST).radiance(positions, 1).tobytes()).hexdigest()
+
+
+@needs_llvm
+def test_bits_do_not_depend_on_the_number_of_threads() -> None:
+    here = Path(__file__).parent
+    command = [sys.executable, "-c", THREADS]
+    digests = {
+        subprocess.run(
+            [*command, str(threads), str(here)], cwd=here.parents[1], capture_output=True, text=True, check=True
+        ).stdout
+        for threads in (1, 3)
+    }
+    assert len(digests) == 1
+
+
+@needs_llvm
+def test_nothing_is_compiled_for_another_frame_or_another_draw_of_the_sensor() -> None:
+    FAST.load()
+    import drjit as dr
+
+    def compiled(sensor, seeds) -> list[int]:
+        surface = flat_surface(sensor)
+        renderer = Renderer(sensor, DIRECT, surface, plain(), FAST)
+        counts = []
+        for seed in seeds:
+            dr.kernel_history_clear()
+            renderer.radiance(surface.material + np.array([0, 0, 0.01 * seed]), seed)
+            kernels = [kernel for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT]
+            assert kernels
+            counts.append(sum(not kernel["cache_hit"] for kernel in kernels))
+        return counts
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        compiled(small_sensor(1.45), [0, 1])
+        light = Light(position_mm=(-6.5, 1.0, 3.0), size_mm=(1, 2), color=(1, 0.5, 0), power=70)
+        other = small_sensor(1.41, lights=(light,), fx=143.0, fy=141.0, cx=40.0, position_mm=(0.1, 0.0, 21.0))
+        assert compiled(other, [2, 3]) == [0, 0]
+
+
+@needs_llvm
+def test_grey_scenes_look_the_same_in_one_channel() -> None:
+    sensor = small_sensor(1.45, _dots())
+    texture = albedo(sensor, np.random.default_rng(0))
+    color = _render(sensor, FAST, texture)
+    mono = _render(sensor, replace(FAST, name="llvm_ad_mono"), texture)
+    # The same samples; only the luminance weights 0.2126 + 0.7152 + 0.0722 round differently.
+    assert mono == pytest.approx(color, rel=1e-5)
+
+
+def test_mono_variant_refuses_colors() -> None:
+    light = Light(position_mm=(7, 0, 4), size_mm=(1, 1), color=(1, 0, 0), power=1)
+    with pytest.raises(ValueError, match="grey"):
+        _render(small_sensor(lights=(light,)), replace(FAST, name="llvm_ad_mono"))
+
+
+@pytest.mark.parametrize("variant", VARIANTS, **names)
+def test_beside_the_pad_it_is_black(variant: Variant) -> None:
+    light = Light(position_mm=(17.0, 0.0, 5.5), size_mm=(1, 1), color=(1, 1, 1), power=1000)
+    sensor = small_sensor(lights=(light,), fx=40.0, fy=40.0, cx=40.0, cy=30.0)  # 2 px per mm: 24 x 18 px of pad
+    image = _render(sensor, variant)
+    assert np.all(image[:, :10] == 0)
+    assert np.all(image[:8] == 0)
+    assert np.all(image[25:35, 35:45] > 0)
+
+
+@needs_llvm
+def test_light_from_one_side_brightens_the_slope_that_faces_it() -> None:
+    """A dent toward the camera: the flank on the side of the light is lit, the other one shaded, in x as in y."""
+    for position, bright, dark in [
+        ((7.0, 0.0, 3.0), np.s_[25:35, 46:52], np.s_[25:35, 28:34]),
+        ((0.0, 5.5, 3.0), np.s_[36:42, 35:45], np.s_[18:24, 35:45]),
+    ]:
+        light = Light(position_mm=position, size_mm=(1, 1), color=(1, 1, 1), power=100)
+        sensor = small_sensor(lights=(light,), cx=40.0, cy=30.0, position_mm=(0, 0, 20), look_at_mm=(0, 0, 0))
+        surface = flat_surface(sensor, 24)
+        dented = surface.material.copy()
+        dented[:, 2] += np.exp(-(dented[:, :2] ** 2).sum(1) / 2)
+        renderer = Renderer(sensor, DIRECT, surface, plain(), FAST)
+        change = renderer.radiance(dented, 0) - renderer.radiance(surface.material, 0)
+        assert change[bright].mean() > 0 > change[dark].mean()
+
+
+@needs_llvm
+def test_glossy_coating_renders_and_differs_from_a_matt_one() -> None:
+    matt = small_sensor()
+    glossy = matt.model_copy(update={"coating": Coating(reflectance=(0.6, 0.6, 0.6), roughness=0.4, metallic=0.5)})
+    assert np.abs(_render(glossy, FAST) / _render(matt, FAST) - 1).max() > 0.1
+
+
+def test_samples_fill_a_grid_and_serve_every_light_alike() -> None:
+    for samples in (1, 5, 32, 100):
+        for lights in (0, 1, 3, 4, 9):
+            got = full_grid(samples, lights)
+            side = int(np.sqrt(got))
+            assert got >= samples
+            assert got % side == 0
+            assert got % max(lights, 1) == 0
+    assert full_grid(36, 3) == 36
+
+
+def test_light_in_the_view_is_refused() -> None:
+    light = Light(position_mm=(1.0, 0.0, 3.0), size_mm=(1, 1), color=(1, 1, 1), power=1)
+    sensor = small_sensor(lights=(light,))
+    with pytest.raises(InputError, match=r"lights\[0\].*between the camera and the gel"):
+        _render(sensor, VARIANTS[0])
+
+
+@pytest.mark.parametrize(
+    ("field", "change"), [("distortion", {"distortion": (0.1, 0, 0, 0, 0)}), ("fx", {"fy": 150.0})]
+)
+def test_scalar_variants_refuse_lenses_that_they_cannot_render(field: str, change: dict) -> None:
+    with pytest.raises(InputError, match=f"{field}.*LLVM"):
+        _render(small_sensor(**change), SCALAR)
