@@ -4,13 +4,14 @@ Exit status: 0 done, 1 done with failed samples or a failed check, 2 wrong input
 imported before a command runs.
 """
 
+import re
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from cyclopts import App, CycloptsError, Parameter
+from cyclopts import App, CycloptsError, Parameter, Token
 
 from synth import __version__
 from synth.errors import InputError
@@ -18,10 +19,24 @@ from synth.errors import InputError
 app = App(
     name="synth",
     version=__version__,
-    help="Image pairs of vision-based tactile sensors with exact optical flow.\n\nWith --debug, a mistake shows its traceback.",
+    help="Image pairs of vision-based tactile sensors with exact optical flow.\n\n"
+    "With --debug, a mistake shows its traceback.",
     result_action="return_value",
     suppress_keyboard_interrupt=False,
 )
+
+
+def _whole(at_least: int) -> Callable[[Any, Sequence[Token]], int]:
+    """Converter for a whole number; cyclopts' own would round 1.5 to 2."""
+
+    def convert(_: Any, tokens: Sequence[Token]) -> int:
+        text = tokens[0].value
+        if not re.fullmatch(r"[+-]?\d+", text) or int(text) < at_least:
+            raise ValueError(f"it is {text!r}, allowed are whole numbers from {at_least} on")
+        return int(text)
+
+    return convert
+
 
 SceneName = Annotated[str, Parameter(name="--scene", help="A shipped scene's name or a TOML file.")]
 Assignments = Annotated[
@@ -38,14 +53,14 @@ DEFAULT_SCENE = "gelsight_mini"
 def generate(
     *,
     scene: SceneName = DEFAULT_SCENE,
-    n: Annotated[int, Parameter(help="Samples in the dataset.")] = 8,
+    n: Annotated[int, Parameter(converter=_whole(1), help="Samples in the dataset.")] = 8,
     out: Annotated[
         Path, Parameter(help="Directory of the dataset; one that holds part of the same job goes on.")
     ] = Path("data/demo"),
-    seed: Annotated[int, Parameter(help="Seed of everything random.")] = 0,
+    seed: Annotated[int, Parameter(converter=_whole(0), help="Seed of everything random.")] = 0,
     assignments: Assignments = None,
     device: Device = "auto",
-    workers: Annotated[int, Parameter(help="Processes.")] = 1,
+    workers: Annotated[int, Parameter(converter=_whole(1), help="Processes that make samples; the same come out.")] = 1,
     dry_run: Annotated[bool, Parameter(negative=(), help="Only show the plan.")] = False,
     as_json: AsJson = False,
 ) -> int:
@@ -59,7 +74,7 @@ def generate(
 def plan(
     *,
     scene: SceneName = DEFAULT_SCENE,
-    n: Annotated[int, Parameter(help="Samples to predict time and size for.")] = 8,
+    n: Annotated[int, Parameter(converter=_whole(1), help="Samples to predict time and size for.")] = 8,
     assignments: Assignments = None,
     device: Device = "auto",
     as_json: AsJson = False,
@@ -75,8 +90,8 @@ def simulate(
     *,
     scene: SceneName,
     out: Annotated[Path, Parameter(help="Directory for trajectory.json and a VTU file per state.")],
-    seed: Annotated[int, Parameter(help="Seed of the draw.")] = 0,
-    index: Annotated[int, Parameter(help="Number of the trajectory that is drawn.")] = 0,
+    seed: Annotated[int, Parameter(converter=_whole(0), help="Seed of the draw.")] = 0,
+    index: Annotated[int, Parameter(converter=_whole(0), help="Number of the trajectory that is drawn.")] = 0,
     assignments: Assignments = None,
     as_json: AsJson = False,
 ) -> int:
@@ -93,7 +108,7 @@ def inspect(
     *,
     png: Annotated[Path | None, Parameter(help="Write a picture sheet.")] = None,
     html: Annotated[Path | None, Parameter(help="Write one self-contained page.")] = None,
-    limit: Annotated[int, Parameter(help="Most samples of a dataset to look at.")] = 100,
+    limit: Annotated[int, Parameter(converter=_whole(1), help="Most samples of a dataset to look at.")] = 100,
     as_json: AsJson = False,
 ) -> int:
     """Shows a dataset, a sample or a flow in numbers and pictures."""

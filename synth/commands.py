@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -21,12 +22,12 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
-from synth.errors import InputError
-from synth.generate import Summary, job_variant, make_job
+from synth.dataset.export import ExportFormat, export
+from synth.generate import Summary, job_variant
 from synth.generate import generate as generate_samples
-from synth.plan import Plan, plan
+from synth.plan import Plan, check_buildable, plan
 from synth.render.variant import Device, Variant
-from synth.template import Template, load_scene
+from synth.template import load_scene
 
 
 def run_generate(
@@ -43,7 +44,7 @@ def run_generate(
     """See `synth.cli.generate`."""
     template = load_scene(scene, assignments)
     variant = job_variant(template, device)
-    make_job(template, n, seed, variant)  # checks n and seed before a dry run promises anything
+    check_buildable(template, variant)
     if dry_run:
         return _show_plan(plan(template, variant), n, as_json)
     _say_hint(variant)
@@ -60,6 +61,7 @@ def run_plan(scene: str, n: int, assignments: Sequence[str], device: Device, as_
     """See `synth.cli.plan`."""
     template = load_scene(scene, assignments)
     variant = job_variant(template, device)
+    check_buildable(template, variant)
     if not as_json:
         _say_hint(variant)
     return _show_plan(plan(template, variant), n, as_json)
@@ -67,6 +69,7 @@ def run_plan(scene: str, n: int, assignments: Sequence[str], device: Device, as_
 
 def run_simulate(scene: str, out: Path, seed: int, index: int, assignments: Sequence[str], as_json: bool) -> int:
     """See `synth.cli.simulate`."""
+    from synth.dataset.storage import storage_errors
     from synth.mesh import pad_mesh
     from synth.sampling import draw
     from synth.simulate import simulate
@@ -74,26 +77,28 @@ def run_simulate(scene: str, out: Path, seed: int, index: int, assignments: Sequ
 
     template = load_scene(scene, assignments)
     drawn = draw(template, seed, index)
+    with storage_errors(out):
+        out.mkdir(parents=True, exist_ok=True)  # before minutes of work, not after
     mesh = pad_mesh(drawn.sensor.gel, drawn.numerics)
     trajectory = simulate(drawn, mesh, template.source.parent)
     record = write_trajectory(out, drawn, mesh, trajectory)
     if as_json:
         print(json.dumps(record))
     else:
-        table = Table("depth mm", "shear mm", "twist deg", "force N", "det F >=", "penetration mm", "iterations")
+        table = Table("depth", "shear", "twist", "force", "det F", "penetr.", "iter.", title="mm, degrees, N")
         for state in trajectory.states:
             table.add_row(
                 f"{state.depth_mm:.3f}",
-                f"{state.shear_mm[0]:.3f}, {state.shear_mm[1]:.3f}",
-                f"{state.twist_deg:.2f}",
-                ", ".join(f"{f:.4f}" for f in state.force_n),
+                " ".join(f"{s:.3f}" for s in np.add(state.shear_mm, 0.0)),  # + 0: no negative zero
+                f"{state.twist_deg + 0.0:.2f}",
+                " ".join(f"{f:.3g}" for f in state.force_n),
                 f"{state.min_jacobian:.3f}",
                 f"{state.max_penetration_mm:.4f}",
                 str(state.newton_iterations),
             )
         console = Console()
         console.print(table)
-        console.print(f"{trajectory.status} in {trajectory.seconds:.1f} s: {out / 'trajectory.json'}", highlight=False)
+        _say(console, f"{trajectory.status} in {trajectory.seconds:.1f} s: {out / 'trajectory.json'}")
     if trajectory.status != "complete":
         print(f"synth: simulation {trajectory.status}: {trajectory.reason}", file=sys.stderr)
         return 1
@@ -134,13 +139,11 @@ def run_verify(path: Path, as_json: bool) -> int:
     return 0 if report.ok else 1
 
 
-def run_export(path: Path, format: str, out: Path) -> int:
+def run_export(path: Path, format: ExportFormat, out: Path) -> int:
     """See `synth.cli.export`."""
-    from synth.dataset.export import export
-
     with _progress("export: samples", None) as advance:
         count = export(path, format, out, advance)
-    Console().print(f"{count} samples written to {out}", highlight=False)
+    _say(Console(), f"{count} samples written to {out}")
     return 0
 
 
@@ -160,12 +163,12 @@ def _show_plan(planned: Plan, n: int, as_json: bool) -> int:
     console.print(table)
     seconds = sum(planned.seconds_per_pair.values())
     stages = ", ".join(f"{stage} {value:.2f} s" for stage, value in planned.seconds_per_pair.items())
-    console.print(
+    _say(
+        console,
         f"mesh: edges {planned.edge_length_mm:g} mm at the contact face, about {planned.nodes} nodes\n"
         f"predicted per pair: {stages}; {planned.bytes_per_pair / 1e6:.2f} MB\n"
         f"predicted for {n} pairs: {_duration(n * seconds)} on one core, {n * planned.bytes_per_pair / 1e9:.2f} GB\n"
         "predicted within a factor of three; the simulation's discretisation error is not predicted",
-        highlight=False,
     )
     return 0
 
@@ -175,20 +178,25 @@ def _show_summary(summary: Summary, variant: Variant) -> None:
     total = sum(summary.stages.values())
     stages = ", ".join(f"{name} {seconds / total:.0%}" for name, seconds in summary.stages.items()) if total else ""
     rate = f", {summary.made / summary.seconds:.2f} pairs/s" if summary.made else ""
-    console.print(
+    _say(
+        console,
         f"{summary.made} pairs made ({summary.found} were there) in {_duration(summary.seconds)}{rate} "
         f"with {variant.name}: {summary.directory}",
-        highlight=False,
     )
     if stages:
-        console.print(f"time: {stages}", highlight=False)
+        _say(console, f"time: {stages}")
     if summary.failed_draws:
-        console.print(f"{summary.failed_draws} draws failed and were drawn again (failures.jsonl)", highlight=False)
+        _say(console, f"{summary.failed_draws} draws failed and were drawn again (failures.jsonl)")
     if summary.given_up:
         print(
             f"synth: {len(summary.given_up)} samples could not be made, see {summary.directory}/failures.jsonl",
             file=sys.stderr,
         )
+
+
+def _say(console: Console, text: str) -> None:
+    """Plain text: square brackets in a path are no markup."""
+    console.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 def _duration(seconds: float) -> str:

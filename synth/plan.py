@@ -1,22 +1,27 @@
 """What a scene needs, decided once: what runs, what is left out and why, and what a pair will cost.
 
-The costs are predictions from constants measured on one core of a 2-core x86-64 server; other machines differ by a factor
-of two or three either way. Discretisation error is not predicted: see docs/reports for what was measured.
+The costs are predictions from constants measured on one core of a 2-core x86-64 server; other machines differ by a
+factor of two or three either way. Discretisation error is not predicted: see docs/reports for what was measured.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from synth.errors import InputError
 from synth.mesh import default_edge_length
+from synth.render.camera_rays import pinhole
+from synth.render.lights import check_view
 from synth.render.pattern import is_grey
 from synth.render.variant import Variant
 from synth.scene import Scene
+from synth.simulate.indenter import rigid_body
 from synth.simulate.path import TWIST_ARM_MM
 from synth.simulate.system import DISPLACEMENT_ONLY_BELOW
 from synth.template import Template
 
-NODES_PER_VOLUME = 1.25
-"""Mesh nodes per cubed edge length of the contact face, for the grading of `synth.mesh.tetrahedralise`."""
+NODES_PER_VOLUME, NODES_PER_AREA, FEWEST_NODES = 0.72, 0.25, 300
+"""Mesh nodes per cube and per square of the contact face's edge length, with `synth.mesh.tetrahedralise`'s grading."""
 SOLVE_SECONDS = 0.035
 """One Newton iteration (assembly, factorisation, solution) of a frictional press with SOLVE_NODES nodes."""
 SOLVE_NODES = 2000
@@ -72,13 +77,32 @@ class Plan:
         }
 
 
+def check_buildable(template: Template, variant: Variant) -> None:
+    """Build what fits the schema and may still be impossible, so that a job does not find out after its first hour.
+
+    Raises:
+        InputError: at a corner of the distributions, an indenter whose parts do not fit or whose file is no closed
+            surface, a light in the camera's view, or a lens that this variant cannot render.
+    """
+    try:
+        for sensor in dict.fromkeys(corner.sensor for corner in template.corners):
+            check_view(sensor)
+            if not variant.is_vectorised:
+                pinhole(sensor)
+        for indenter in dict.fromkeys(corner.contact.indenter for corner in template.corners):
+            rigid_body(indenter, template.source.parent)
+    except InputError as error:
+        raise InputError(f"{template.source}: {error}") from error
+
+
 def plan(template: Template, variant: Variant) -> Plan:
     """Plan a template by the corners of its distributions."""
     corners = template.corners
     scene = corners[0]
     gel, camera = scene.sensor.gel, scene.sensor.camera
     edge = scene.numerics.edge_length_mm or default_edge_length(gel)
-    nodes = round(NODES_PER_VOLUME * gel.size_mm[0] * gel.size_mm[1] * gel.size_mm[2] / edge**3 / 2)
+    x, y, z = (length / edge for length in gel.size_mm)
+    nodes = max(FEWEST_NODES, round(NODES_PER_VOLUME * x * y * z + NODES_PER_AREA * 2 * (x * y + y * z + z * x)))
     pairs = scene.sampling.pairs_per_trajectory
     simulate = sum(_simulation_seconds(corner, nodes) for corner in corners) / len(corners)
     pixels = camera.width * camera.height
@@ -112,45 +136,34 @@ def _simulation_seconds(scene: Scene, nodes: int) -> float:
 
 
 def _decisions(corners: tuple[Scene, ...], variant: Variant) -> list[Decision]:
-    scene = corners[0]
-    touches = any(corner.motion.depth_mm > 0 for corner in corners)
-    slips = any(corner.contact.friction > 0 for corner in corners)
-    mixed = scene.sensor.gel.poisson_ratio >= DISPLACEMENT_ONLY_BELOW
-    refracts = scene.sensor.window.refractive_index != 1
-    lens = any(any(corner.sensor.camera.distortion) for corner in corners)
-    depth = scene.render.max_depth
-    grey = all(is_grey(corner.sensor) for corner in corners)
-    optional = [
-        name for name in ("depth", "normal", "displacement", "traction", "contact") if getattr(scene.outputs, name)
-    ]
+    outputs = corners[0].outputs
+    depth, friction = [c.motion.depth_mm for c in corners], [c.contact.friction for c in corners]
+    poisson = [c.sensor.gel.poisson_ratio for c in corners]
+    index, bounces = [c.sensor.window.refractive_index for c in corners], [c.render.max_depth for c in corners]
+    mixed = max(poisson) >= DISPLACEMENT_ONLY_BELOW
+    lens = any(any(c.sensor.camera.distortion) for c in corners)
+    grey = all(is_grey(c.sensor) for c in corners)
+    hue = "lights, coating and pattern are grey" if grey else "a light, the coating or the pattern has colour"
+    if grey and not variant.is_mono:
+        hue += f", but {variant.name} has no grey counterpart here"
+    optional = [name for name in ("depth", "normal", "displacement", "traction", "contact") if getattr(outputs, name)]
+    foam = "" if mixed else ": a compressible foam needs none"
+    smooth = "" if max(friction) > 0 else ": half the matrix is enough"
     return [
-        Decision("simulation", touches, "some draws press the gel" if touches else "no draw touches the gel"),
-        Decision(
-            "friction state",
-            slips,
-            "contact.friction > 0" if slips else "contact.friction = 0: half the matrix is enough",
-        ),
-        Decision(
-            "pressure field",
-            mixed,
-            f"Poisson's ratio {scene.sensor.gel.poisson_ratio} "
-            + (
-                f">= {DISPLACEMENT_ONLY_BELOW}"
-                if mixed
-                else f"< {DISPLACEMENT_ONLY_BELOW}: a compressible foam needs none"
-            ),
-        ),
-        Decision(
-            "window refraction", refracts, f"sensor.window.refractive_index = {scene.sensor.window.refractive_index}"
-        ),
+        Decision("simulation", max(depth) > 0, _span("motion.depth_mm", depth)),
+        Decision("friction state", max(friction) > 0, _span("contact.friction", friction) + smooth),
+        Decision("pressure field", mixed, _span("sensor.gel.poisson_ratio", poisson) + foam),
+        Decision("window refraction", max(index) > 1, _span("sensor.window.refractive_index", index)),
         Decision("lens distortion", lens, "sensor.camera.distortion" + ("" if lens else " is zero: a pinhole")),
-        Decision("indirect light", depth > 2, f"render.max_depth = {depth}"),
-        Decision(
-            "colour",
-            not variant.is_mono,
-            "lights, coating and pattern are grey" if grey else "a light or the pattern has colour",
-        ),
-        Decision("backward flow", scene.outputs.backward, f"outputs.backward = {str(scene.outputs.backward).lower()}"),
+        Decision("indirect light", max(bounces) > 2, _span("render.max_depth", bounces)),
+        Decision("colour", not variant.is_mono, hue),
+        Decision("backward flow", outputs.backward, f"outputs.backward = {str(outputs.backward).lower()}"),
         Decision("optional channels", bool(optional), ", ".join(optional) or "none asked for in outputs"),
         Decision("indenter in the picture", False, "the coating is opaque"),
     ]
+
+
+def _span(name: str, values: Sequence[float]) -> str:
+    """What a field is at the corners."""
+    low, high = min(values), max(values)
+    return f"{name} = {low:g}" if low == high else f"{name} = {low:g} to {high:g}"

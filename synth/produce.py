@@ -6,13 +6,14 @@ undeformed frame of a sensor) is a pure function of (scene, seed, sensor).
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from synth.arrays import FloatArray, Image
+from synth.dataset.images import Raster
 from synth.dataset.job import Job
 from synth.dataset.sample import ManifestEntry, Sample
 from synth.dataset.sample_files import write_sample_files
@@ -25,14 +26,14 @@ from synth.render.camera_image import camera_image
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
 from synth.render.variant import Variant
-from synth.sampling import Pair, draw, pairs_of, stream
+from synth.sampling import MAX_DRAWS, Pair, draw, draw_sensor, pairs_of, sensor_of, stream
 from synth.scene import Scene
 from synth.simulate import State, Trajectory, simulate
 from synth.surface import GelSurface
 from synth.template import Template
 
-MAX_DRAWS = 10
-"""A trajectory whose simulation failed is drawn anew so often before its samples are given up."""
+Task = tuple[int, tuple[int, ...]]
+"""A trajectory and its samples that are wanted."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,15 @@ class Workplace:
 
 @dataclass(frozen=True)
 class Failure:
-    """A draw that gave no trajectory."""
+    """A draw that gave no trajectory.
+
+    Attributes:
+        index: of the trajectory's first sample.
+        draw: 0 for the trajectory's first failed draw, and so on.
+        stage: "sensor", "draw" or "simulate".
+        reason: for the user.
+        last_good_state: of a simulation.
+    """
 
     index: int
     draw: int
@@ -76,12 +85,31 @@ class Outcome:
     given_up: tuple[int, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class _Finger:
+    """What all trajectories of one sensor share; `rest` is the radiance of its undeformed gel."""
+
+    sensor: int
+    surface: GelSurface
+    optics: Optics
+    renderer: Renderer
+    rest: Image
+
+
+@dataclass(frozen=True, eq=False)
+class _Frame:
+    """A rendered state: vertex positions (v, 3) mm and radiance."""
+
+    positions: FloatArray
+    radiance: Image
+
+
 class Producer:
     """Makes trajectories' samples; keeps the last sensor's renderer."""
 
     def __init__(self, workplace: Workplace) -> None:
         self._place = workplace
-        self._sensor: int | None = None
+        self._finger: _Finger | None = None
 
     def produce(self, trajectory: int, wanted: Sequence[int]) -> Outcome:
         """Write the wanted samples of a trajectory.
@@ -89,77 +117,76 @@ class Producer:
         Args:
             trajectory: its number.
             wanted: indices of the samples that are not there yet.
+
+        Raises:
+            InputError: the storage refuses.
         """
-        failures: list[Failure] = []
         template, seed = self._place.template, self._place.job.seed
-        count = template.corners[0].sampling.pairs_per_trajectory
-        for attempt in range(MAX_DRAWS):
+        first = trajectory * template.corners[0].sampling.pairs_per_trajectory
+        sensor = draw_sensor(template, seed, sensor_of(template, trajectory))
+        failures = [Failure(first, number, "sensor", reason, None) for number, reason in enumerate(sensor.rejected)]
+        for attempt in range(MAX_DRAWS if sensor.content is not None else 0):
             stage = "draw"
             try:
-                scene = draw(template, seed, trajectory, attempt)
+                scene = draw(template, seed, trajectory, attempt, sensor)
                 stage = "simulate"
                 mesh = pad_mesh(scene.sensor.gel, scene.numerics, self._place.mesh_folders)
                 result = simulate(scene, mesh, template.source.parent)
             except InputError as error:
-                failures.append(Failure(trajectory * count, attempt, stage, str(error), None))
+                failures.append(Failure(first, len(failures), stage, str(error), None))
                 continue
             if result.status == "complete":
                 pairs = [p for p in pairs_of(template, seed, trajectory, scene.motion.steps) if p.index in wanted]
                 return Outcome(tuple(self._samples(scene, mesh, result, pairs)), tuple(failures), ())
-            last = result.states[-1].summary()
-            failures.append(Failure(trajectory * count, attempt, stage, result.reason, last))
+            failures.append(Failure(first, len(failures), stage, result.reason, result.states[-1].summary()))
         return Outcome((), tuple(failures), tuple(wanted))
 
     def _samples(self, scene: Scene, mesh: PadMesh, result: Trajectory, pairs: Sequence[Pair]) -> list[ManifestEntry]:
-        self._prepare(scene, mesh, pairs[0].sensor)
-        frames: dict[int, tuple[FloatArray, Image, float]] = {}
+        frames: dict[int, _Frame] = {}
         entries = []
         for pair in pairs:
+            started = time.perf_counter()
+            finger = self._prepared(scene, mesh, pair.sensor)
             for frame in pair.frames:
                 if frame not in frames:
-                    frames[frame] = self._frame(mesh, result.states[frame], pair, frame)
-            sample = self._sample(scene, mesh, result, pair, frames, len(pairs))
-            started = time.perf_counter()
+                    frames[frame] = self._rendered(finger, mesh, result.states[frame], pair.trajectory, frame)
+            rendered = time.perf_counter()
+            sample = self._sample(scene, mesh, result, pair, finger, [frames[frame] for frame in pair.frames])
+            traced = time.perf_counter()
             entry = write_sample_files(self._place.directory, sample, self._place.job)
-            seconds = {**entry.seconds, "write": round(time.perf_counter() - started, 4)}
-            entries.append(ManifestEntry(**{**entry.record(), "seconds": seconds}))
+            seconds = {
+                "simulate": result.seconds / len(pairs),
+                "render": rendered - started,
+                "flow": traced - rendered,
+                "write": time.perf_counter() - traced,
+            }
+            entries.append(replace(entry, seconds={stage: round(value, 4) for stage, value in seconds.items()}))
         return entries
 
-    def _prepare(self, scene: Scene, mesh: PadMesh, sensor: int) -> None:
-        """Renderer, camera and undeformed frame of a sensor, unless they are there already."""
-        if self._sensor == sensor:
-            return
-        template, seed = self._place.template, self._place.job.seed
-        variant = self._place.variant
-        variant.load()
-        if self._place.threads is not None and variant.is_vectorised:
-            import drjit
+    def _prepared(self, scene: Scene, mesh: PadMesh, sensor: int) -> _Finger:
+        """Renderer, camera and undeformed frame of a sensor, kept until another one is wanted."""
+        if self._finger is None or self._finger.sensor != sensor:
+            variant = self._place.variant
+            variant.load()
+            if self._place.threads is not None and variant.is_vectorised:
+                import drjit
 
-            drjit.set_thread_count(self._place.threads)
-        self._surface = GelSurface(mesh.contact_faces)
-        self._optics = Optics.of(scene.sensor)
-        texture = albedo(scene.sensor, stream(template, seed, "pattern", sensor))
-        self._renderer = Renderer(scene.sensor, scene.render, self._surface, texture, variant)
-        started = time.perf_counter()
-        rest = self._surface.material
-        self._rest = (
-            rest,
-            self._renderer.radiance(rest, self._frame_seed("rest", sensor)),
-            time.perf_counter() - started,
-        )
-        self._sensor = sensor
+                drjit.set_thread_count(self._place.threads)
+            surface = GelSurface(mesh.contact_faces)
+            texture = albedo(scene.sensor, stream(self._place.template, self._place.job.seed, "pattern", sensor))
+            renderer = Renderer(scene.sensor, scene.render, surface, texture, variant)
+            rest = renderer.radiance(surface.material, self._frame_seed("rest", sensor))
+            self._finger = _Finger(sensor, surface, Optics.of(scene.sensor), renderer, rest)
+        return self._finger
 
     def _frame_seed(self, purpose: str, *numbers: int) -> int:
         return int(stream(self._place.template, self._place.job.seed, f"render {purpose}", *numbers).integers(2**31))
 
-    def _frame(self, mesh: PadMesh, state: State, pair: Pair, frame: int) -> tuple[FloatArray, Image, float]:
-        """Positions, radiance and render time of one state."""
+    def _rendered(self, finger: _Finger, mesh: PadMesh, state: State, trajectory: int, frame: int) -> _Frame:
         if frame == 0:
-            return self._rest
-        started = time.perf_counter()
-        positions = self._surface.positions(state.displacement[mesh.contact_nodes])
-        radiance = self._renderer.radiance(positions, self._frame_seed("frame", pair.trajectory, frame))
-        return positions, radiance, time.perf_counter() - started
+            return _Frame(finger.surface.material, finger.rest)
+        positions = finger.surface.positions(state.displacement[mesh.contact_nodes])
+        return _Frame(positions, finger.renderer.radiance(positions, self._frame_seed("frame", trajectory, frame)))
 
     def _sample(
         self,
@@ -167,17 +194,11 @@ class Producer:
         mesh: PadMesh,
         result: Trajectory,
         pair: Pair,
-        frames: dict[int, tuple[FloatArray, Image, float]],
-        sharing: int,
+        finger: _Finger,
+        frames: Sequence[_Frame],
     ) -> Sample:
-        """One sample; the trajectory's simulation is shared by `sharing` samples."""
         first, second = (result.states[frame] for frame in pair.frames)
-        started = time.perf_counter()
-        flow = self._flow(scene, frames[pair.frames[0]][0], frames[pair.frames[1]][0], second)
-        traced = time.perf_counter() - started
-        images = [
-            self._photograph(scene, frames[frame][1], pair.index, number) for number, frame in enumerate(pair.frames)
-        ]
+        images = [self._photograph(scene, frame.radiance, pair.index, number) for number, frame in enumerate(frames)]
         return Sample(
             index=pair.index,
             trajectory=pair.trajectory,
@@ -185,43 +206,40 @@ class Producer:
             seed=self._place.job.seed,
             image1=images[0],
             image2=images[1],
-            flow=flow,
+            flow=_flow(scene, finger, frames, second),
             scene=scene,
-            surface=self._surface,
+            surface=finger.surface,
             displacement1=first.displacement[mesh.contact_nodes],
             displacement2=second.displacement[mesh.contact_nodes],
             diagnostics={"solver": [first.summary(), second.summary()], "mesh": mesh.hash},
             force_n=np.array([first.force_n, second.force_n]),
             torque_nmm=np.array([first.torque_nmm, second.torque_nmm]),
-            seconds={
-                "simulate": result.seconds / sharing,
-                "render": sum(frames[frame][2] for frame in pair.frames),
-                "flow": traced,
-            },
         )
 
-    def _flow(self, scene: Scene, positions1: FloatArray, positions2: FloatArray, pressed: State) -> FlowField:
-        outputs, camera, surface = scene.outputs, scene.sensor.camera, self._surface
-        traction = surface.interpolate_linear(pressed.traction) if outputs.traction else None
-        touching = (np.linalg.norm(pressed.traction, axis=1, keepdims=True) > 0).astype(np.float64)
-        return exact_flow(
-            surface,
-            positions1,
-            positions2,
-            self._optics,
-            camera.width,
-            camera.height,
-            backward=outputs.backward,
-            depth=outputs.depth,
-            normal=outputs.normal,
-            displacement=outputs.displacement,
-            traction=traction,
-            contact=surface.interpolate_linear(touching)[:, 0] if outputs.contact else None,
-        )
-
-    def _photograph(self, scene: Scene, radiance: Image, index: int, number: int) -> np.ndarray:
+    def _photograph(self, scene: Scene, radiance: Image, index: int, number: int) -> Raster:
         """What the camera makes of a frame, with noise of its own for every image; grey where the variant is."""
         rng = stream(self._place.template, self._place.job.seed, "noise", index, number)
         if self._place.variant.is_mono:
             return camera_image(radiance[:, :, :1], scene.sensor.camera, rng)[:, :, 0]
         return camera_image(radiance, scene.sensor.camera, rng)
+
+
+def _flow(scene: Scene, finger: _Finger, frames: Sequence[_Frame], pressed: State) -> FlowField:
+    """The exact flow between two frames, with what else the scene's outputs ask for; `pressed` is the second state."""
+    outputs, camera, surface = scene.outputs, scene.sensor.camera, finger.surface
+    traction = surface.interpolate_linear(pressed.traction) if outputs.traction else None
+    touching = (np.linalg.norm(pressed.traction, axis=1, keepdims=True) > 0).astype(np.float64)
+    return exact_flow(
+        surface,
+        frames[0].positions,
+        frames[1].positions,
+        finger.optics,
+        camera.width,
+        camera.height,
+        backward=outputs.backward,
+        depth=outputs.depth,
+        normal=outputs.normal,
+        displacement=outputs.displacement,
+        traction=traction,
+        contact=surface.interpolate_linear(touching)[:, 0] if outputs.contact else None,
+    )

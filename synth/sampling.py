@@ -1,8 +1,8 @@
 """One concrete draw: what sample i shows depends on (scene, seed, i) alone.
 
-Sample i belongs to trajectory i // pairs_per_trajectory, and a trajectory to a sensor in the same way. Each level has its
-own random streams, seeded by the scene's hash, the job's seed, the level's name, its number and (for a trajectory that
-had to be redrawn) the attempt. Workers, batches and resumption do not enter.
+Sample i belongs to trajectory i // pairs_per_trajectory, and a trajectory to a sensor in the same way. Each level has
+its own random streams, seeded by the scene's hash, the job's seed, the level's name, its number and the attempt: a draw
+that cannot be used is drawn again. Workers, batches and resumption do not enter.
 """
 
 import zlib
@@ -11,51 +11,29 @@ from typing import Any
 
 import numpy as np
 
-from synth.scene import Sampling, Scene
-from synth.template import Template
+from synth.errors import InputError
+from synth.render.lights import check_view
+from synth.scene import Render, Sampling, Scene, Sensor
+from synth.schema_errors import validated
+from synth.template import Chooser, Template, replaced
 
 TRAJECTORY_PARTS = ("contact", "motion")
 """Drawn anew for every trajectory; everything else belongs to the sensor."""
+MAX_DRAWS = 10
+"""A sensor, and a trajectory on it, is drawn at most so often before the samples are given up."""
 
 
-def stream(template: Template, seed: int, purpose: str, *numbers: int) -> np.random.Generator:
-    """The random stream of one purpose."""
-    entropy = [int(template.hash, 16), seed, zlib.crc32(purpose.encode()), *numbers]
-    return np.random.default_rng(np.random.SeedSequence(entropy))
+@dataclass(frozen=True)
+class SensorDraw:
+    """The parts of a scene that all trajectories of one sensor share.
 
-
-def draw(template: Template, seed: int, trajectory: int, attempt: int = 0) -> Scene:
-    """The scene of one trajectory.
-
-    Raises:
-        InputError: the draw breaks the schema (a wide `normal`, say).
+    Attributes:
+        content: parts by name; None where no draw can be used.
+        rejected: why earlier draws, or all of them, could not be used.
     """
-    sensor = trajectory // _sampling(template).trajectories_per_sensor
-    streams = {
-        True: stream(template, seed, "contact", trajectory, attempt),
-        False: stream(template, seed, "sensor", sensor),
-    }
 
-    def resolver(kind: str, arguments: list[Any], where: str) -> Any:
-        return _drawn(kind, arguments, streams[where.split(".")[0] in TRAJECTORY_PARTS])
-
-    return template.resolve(resolver)
-
-
-def _drawn(kind: str, arguments: list[Any], rng: np.random.Generator) -> Any:
-    match kind:
-        case "uniform":
-            return float(rng.uniform(*arguments))
-        case "normal":
-            return float(rng.normal(*arguments))
-        case "log_uniform":
-            return float(np.exp(rng.uniform(*np.log(arguments))))
-        case _:
-            return arguments[int(rng.integers(len(arguments)))]
-
-
-def _sampling(template: Template) -> Sampling:
-    return template.corners[0].sampling
+    content: dict[str, Any] | None
+    rejected: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -68,17 +46,90 @@ class Pair:
     frames: tuple[int, int]
 
 
+def stream(template: Template, seed: int, purpose: str, *numbers: int) -> np.random.Generator:
+    """The random stream of one purpose."""
+    entropy = [int(template.hash, 16), seed, zlib.crc32(purpose.encode()), *numbers]
+    return np.random.default_rng(np.random.SeedSequence(entropy))
+
+
+def sensor_of(template: Template, trajectory: int) -> int:
+    """Number of the sensor that a trajectory belongs to."""
+    return trajectory // _sampling(template).trajectories_per_sensor
+
+
+def draw_sensor(template: Template, seed: int, sensor: int) -> SensorDraw:
+    """The first draw of a sensor that fits the schema and keeps its lights out of the camera's view."""
+    rejected: list[str] = []
+    for attempt in range(MAX_DRAWS):
+        choose = _chooser(stream(template, seed, "sensor", sensor, attempt))
+        content = {part: replaced(template.content[part], choose) for part in _parts(template, of_trajectory=False)}
+        try:
+            validated(content.get("render", {}), str(template.source), Render, "render")
+            check_view(validated(content["sensor"], str(template.source), Sensor, "sensor"))
+        except InputError as error:
+            rejected.append(str(error))
+            continue
+        return SensorDraw(content, tuple(rejected))
+    return SensorDraw(None, tuple(rejected))
+
+
+def draw(template: Template, seed: int, trajectory: int, attempt: int = 0, sensor: SensorDraw | None = None) -> Scene:
+    """The scene of one trajectory.
+
+    Args:
+        template: the scene file.
+        seed: of the job.
+        trajectory: its number.
+        attempt: 0, or how many draws of contact and motion were of no use.
+        sensor: the draw of the trajectory's sensor, where the caller has it.
+
+    Raises:
+        InputError: this draw breaks the schema (the tail of a `normal`, say), or no draw of the sensor can be used.
+    """
+    sensor = sensor or draw_sensor(template, seed, sensor_of(template, trajectory))
+    if sensor.content is None:
+        raise InputError(sensor.rejected[-1])
+    choose = _chooser(stream(template, seed, "contact", trajectory, attempt))
+    own = {part: replaced(template.content[part], choose) for part in _parts(template, of_trajectory=True)}
+    return validated({**sensor.content, **own}, str(template.source), Scene)
+
+
 def pairs_of(template: Template, seed: int, trajectory: int, steps: int) -> list[Pair]:
     """All samples of a trajectory with that many recorded states.
 
-    The first shows the undeformed gel and the last state; the others are drawn from all other pairs i < j.
+    The first shows the undeformed gel and the last state; the others are drawn from all other pairs i < j. Where a
+    scene asks for more samples than there are pairs, they come again, each time with noise of its own.
     """
     sampling = _sampling(template)
     count = sampling.pairs_per_trajectory
     others = [(i, j) for i in range(steps) for j in range(i + 1, steps + 1) if (i, j) != (0, steps)]
     rng = stream(template, seed, "pairs", trajectory)
-    order = [others[k] for k in rng.permutation(len(others))]
-    frames = [(0, steps), *order]
-    first = trajectory * count
-    sensor = trajectory // sampling.trajectories_per_sensor
-    return [Pair(first + k, trajectory, sensor, frames[k % len(frames)]) for k in range(count)]
+    frames = [(0, steps), *(others[k] for k in rng.permutation(len(others)))]
+    sensor = sensor_of(template, trajectory)
+    return [Pair(trajectory * count + k, trajectory, sensor, frames[k % len(frames)]) for k in range(count)]
+
+
+def _chooser(rng: np.random.Generator) -> Chooser:
+    """Draws from distributions one after the other."""
+
+    def choose(kind: str, arguments: list[Any]) -> Any:
+        match kind:
+            case "uniform":
+                return float(rng.uniform(*arguments))
+            case "normal":
+                return float(rng.normal(*arguments))
+            case "log_uniform":
+                return float(np.exp(rng.uniform(*np.log(arguments))))
+            case _:
+                return arguments[int(rng.integers(len(arguments)))]
+
+    return choose
+
+
+def _parts(template: Template, *, of_trajectory: bool) -> list[str]:
+    """Names of the template's parts of one level, in an order that the file's does not enter."""
+    return sorted(part for part in template.content if (part in TRAJECTORY_PARTS) == of_trajectory)
+
+
+def _sampling(template: Template) -> Sampling:
+    return template.corners[0].sampling

@@ -114,7 +114,7 @@ class Light(Part):
 
 
 class Camera(Part):
-    """Brown-Conrady camera in air behind the window, and its sensor. Image right is +x, down is +y for a view along -z."""
+    """Brown-Conrady camera in air behind the window, and its sensor. Right is +x and down +y for a view along -z."""
 
     width: Annotated[int, Field(ge=16, le=8192)]
     height: Annotated[int, Field(ge=16, le=8192)]
@@ -164,7 +164,8 @@ class Sensor(Part):
         for i, light in enumerate(self.lights):
             if not 0 < light.position_mm[2] < outside:
                 raise ValueError(
-                    f"lights[{i}].position_mm z = {light.position_mm[2]} must lie inside the gel and window, 0 < z < {outside}"
+                    f"lights[{i}].position_mm z = {light.position_mm[2]} must lie inside the gel and window, "
+                    f"0 < z < {outside}"
                 )
         return self
 
@@ -324,7 +325,8 @@ class Scene(Part):
         for axis, s in zip("xy", motion.shear_mm, strict=True):
             if abs(s) > 2 * size[2]:
                 raise ValueError(
-                    f"motion.shear_mm {axis} = {s} is more than twice the gel's thickness ({size[2]} mm): check its unit"
+                    f"motion.shear_mm {axis} = {s} is more than twice the gel's thickness ({size[2]} mm): "
+                    "check its unit"
                 )
         edge = self.numerics.edge_length_mm
         if edge is not None and not min(size) / 60 <= edge <= min(size):

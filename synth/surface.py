@@ -1,8 +1,8 @@
 r"""The gel's inner surface as it is rendered and traced: the FEM's contact faces, subdivided and smoothed.
 
-Linear elements leave a faceted surface whose edges would show in the shading and as kinks in the flow. Each contact face
-is split into n x n triangles, and displacement is carried to their corners by blending the first-order expansions at
-the face's three nodes (barycentric coordinates λ, recovered nodal gradients G):
+Linear elements leave a faceted surface whose edges would show in the shading and as kinks in the flow. Each contact
+face is split into n x n triangles, and displacement is carried to their corners by blending the first-order expansions
+at the face's three nodes (barycentric coordinates λ, recovered nodal gradients G):
 
 .. math::  u(x) = \sum_i λ_i(x) [ u_i + ½ G_i (x - x_i) ]
 
@@ -14,6 +14,7 @@ which images and flow are exact; its distance from the continuum's is part of th
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -73,7 +74,7 @@ class GelSurface:
         return np.einsum("vi,vic->vc", weights, nodal[corners])
 
     @cached_property
-    def _smooth(self):  # noqa: ANN202  (scipy.sparse is imported lazily)
+    def _smooth(self) -> Any:
         import scipy.sparse as sp
 
         material, _, weights, corners = self._refined
@@ -100,23 +101,22 @@ def _subdivide(coarse: ContactFaces, n: int) -> tuple[Points, Triangles, FloatAr
             small.append((number[i, j], number[i + 1, j], number[i, j + 1]))
             if i + j < n - 1:
                 small.append((number[i + 1, j], number[i + 1, j + 1], number[i, j + 1]))
-    # A vertex is identified by its (coarse node, integer weight) pairs, so shared edges are merged exactly.
-    order = np.argsort(faces, axis=1)
-    weight = np.take_along_axis(np.broadcast_to(local, (len(faces), *local.shape)), order[:, None, :], axis=2)
-    corner = np.broadcast_to(np.sort(faces, axis=1)[:, None, :], weight.shape)
-    corner = np.where(weight > 0, corner, -1)
-    label = np.stack([corner, weight], axis=-1).reshape(-1, 6)
-    unique, first, inverse = np.unique(label, axis=0, return_index=True, return_inverse=True)
+    # A vertex is its (coarse node, integer weight) pairs, those of weight 0 left out: shared edges merge exactly.
+    weight = np.broadcast_to(local, (len(faces), *local.shape))
+    corner = np.where(weight > 0, faces[:, None, :], -1)
+    order = np.argsort(corner, axis=2, kind="stable")
+    label = np.stack([np.take_along_axis(a, order, axis=2) for a in (corner, weight)], axis=-1).reshape(-1, 6)
+    unique, inverse = np.unique(label, axis=0, return_inverse=True)
     inverse = inverse.reshape(len(faces), len(local))
     triangles = inverse[:, np.array(small)].reshape(-1, 3).astype(np.int32)
     weights = unique[:, 1::2] / n
-    corners = np.sort(faces, axis=1)[first // len(local)].astype(np.int32)
+    corners = np.maximum(unique[:, 0::2], 0).astype(np.int32)  # any node will do where the weight is 0
     material = np.einsum("vi,vic->vc", weights, nodes[corners])
     return material, triangles, weights, corners
 
 
-def _recovered_gradients(coarse: ContactFaces):  # noqa: ANN202
-    """Three sparse (n, n) matrices: nodal values -> x, y, z components of the recovered surface gradient at the nodes."""
+def _recovered_gradients(coarse: ContactFaces) -> list[Any]:
+    """Three sparse (n, n) matrices: nodal values -> x, y, z of the recovered surface gradient at the nodes."""
     import scipy.sparse as sp
 
     nodes, faces = coarse.nodes, coarse.faces

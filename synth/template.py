@@ -3,32 +3,30 @@
     { uniform = [a, b] }   { normal = [mean, sd] }   { log_uniform = [a, b] }   { choice = [...] }
 
 `choice` may hold whole tables (indenters, say) with distributions inside. A file is checked when it is loaded: at the
-lower and upper end of all its distributions and for every choice, so that a mistake shows before any work is done.
+lower and upper end of all its distributions and for every choice, so that a mistake shows before any work is done. A
+`normal` is checked at its mean: a draw from its tails that breaks the schema is drawn again (`synth.sampling`).
 """
 
 import hashlib
 import json
 import tomllib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ValidationError
-
 from synth.errors import InputError
-from synth.scene import Scene
+from synth.scene import MeshIndenter, Scene
+from synth.schema_errors import DISTRIBUTIONS, validated
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
 """The shipped scene files."""
-DISTRIBUTIONS = ("uniform", "normal", "log_uniform", "choice")
 FIXED = ("name", "description", "references", "numerics", "outputs", "sampling")
 """Parts that all samples of a dataset share."""
 
-Resolver = Callable[[str, list[Any], str], Any]
-"""Kind, arguments and path of a distribution -> a value."""
+Chooser = Callable[[str, list[Any]], Any]
+"""Kind and arguments of a distribution -> a value; of a choice, the option, which may hold distributions again."""
 
 
 @dataclass(frozen=True)
@@ -50,28 +48,33 @@ class Template:
 
     @cached_property
     def hash(self) -> str:
-        """SHA-256 (16 hex digits) of everything that decides pixels: all but description and references."""
+        """SHA-256 (16 hex digits) of what decides pixels: the scene less description and references, and mesh files."""
         decisive = {key: value for key, value in self.content.items() if key not in ("description", "references")}
-        return hashlib.sha256(json.dumps(decisive, sort_keys=True).encode()).hexdigest()[:16]
-
-    def resolve(self, resolver: Resolver) -> Scene:
-        """The scene with every distribution replaced by what `resolver` returns for it.
-
-        Raises:
-            InputError: the result breaks the schema.
-        """
-        return validated(_replaced(self.content, resolver, ""), self.source)
+        digest = hashlib.sha256(json.dumps(decisive, sort_keys=True).encode())
+        for file in self._mesh_files():
+            digest.update(hashlib.sha256(file.read_bytes()).digest())
+        return digest.hexdigest()[:16]
 
     @cached_property
     def corners(self) -> tuple[Scene, ...]:
-        """The scene at the lower ends, at the upper ends, and with every choice taken once."""
-        widest = max([1, *(len(arguments) for kind, arguments, _ in self.distributions() if kind == "choice")])
-        scenes = [self.resolve(_end(high, turn)) for turn in range(widest) for high in (False, True)]
-        return tuple(dict.fromkeys(scenes))
+        """The scene at the lower ends, at the upper ends, and with every option of every choice taken once.
 
-    def distributions(self) -> list[tuple[str, list[Any], str]]:
+        Raises:
+            InputError: one of them breaks the schema.
+        """
+        turns = range(_options(self.content))
+        contents = [_corner(self.content, high, turn) for turn in turns for high in (False, True)]
+        return tuple(dict.fromkeys(validated(content, str(self.source), Scene) for content in contents))
+
+    def distributions(self) -> list[tuple[str, Any, str]]:
         """Kind, arguments and path of every distribution, nested ones after their choice."""
         return list(_distributions(self.content, ""))
+
+    def _mesh_files(self) -> list[Path]:
+        """Every file that an indenter is read from, without repetition."""
+        indenters = [corner.contact.indenter for corner in self.corners]
+        names = sorted({indenter.file for indenter in indenters if isinstance(indenter, MeshIndenter)})
+        return [self.source.parent / name for name in names]
 
 
 def load_scene(name_or_path: str | Path, overrides: Sequence[str] = ()) -> Template:
@@ -93,11 +96,15 @@ def load_scene(name_or_path: str | Path, overrides: Sequence[str] = ()) -> Templ
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     for override in overrides:
         _apply(content, override)
-    return checked_template(content, path)
+    return checked_template(json.loads(json.dumps(content, default=str)), path)  # TOML's dates become text
 
 
 def checked_template(content: dict[str, Any], source: Path) -> Template:
-    """A template whose distributions and corners have been checked.
+    """A template whose distributions, corners and mesh files have been checked.
+
+    Args:
+        content: JSON-able.
+        source: see `Template`.
 
     Raises:
         InputError: what is wrong, where.
@@ -107,7 +114,9 @@ def checked_template(content: dict[str, Any], source: Path) -> Template:
         problem = _distribution_problem(kind, arguments, where)
         if problem:
             raise InputError(f"{source}: {where}: {problem}")
-    template.corners  # noqa: B018  (validates)
+    for file in template._mesh_files():
+        if not file.is_file():
+            raise InputError(f"{source}: contact.indenter.file: there is no file {file}")
     return template
 
 
@@ -116,24 +125,27 @@ def shipped_scenes() -> list[str]:
     return sorted(path.stem for path in SCENES.glob("*.toml"))
 
 
-def validated(content: dict[str, Any], source: Path) -> Scene:
-    """A Scene of plain content.
+def replaced(value: Any, choose: Chooser) -> Any:
+    """A part of a template with every distribution replaced by what `choose` returns for it.
 
-    Raises:
-        InputError: one line per problem with file, path, what was given and what is allowed.
+    Tables are gone through in the order of their keys' names, so that the order of a file's lines decides nothing.
     """
-    try:
-        return Scene.model_validate(content)
-    except ValidationError as error:
-        lines = [_explain(problem, content) for problem in error.errors()]
-        raise InputError("\n".join(f"{source}: {line}" for line in dict.fromkeys(lines))) from error
+    if _is_distribution(value):
+        ((kind, arguments),) = value.items()
+        chosen = choose(kind, arguments)
+        return replaced(chosen, choose) if kind == "choice" else chosen
+    if isinstance(value, dict):
+        return {key: replaced(value[key], choose) for key in sorted(value)}
+    if isinstance(value, list):
+        return [replaced(inner, choose) for inner in value]
+    return value
 
 
 def _find(name_or_path: str | Path) -> Path:
     path = Path(name_or_path)
-    if path.suffix == ".toml" or path.exists():
-        if path.is_file():
-            return path
+    if path.is_file():
+        return path
+    if path.suffix == ".toml":
         raise InputError(f"there is no scene file {path}")
     shipped = SCENES / f"{name_or_path}.toml"
     if shipped.is_file():
@@ -154,13 +166,20 @@ def _apply(content: dict[str, Any], override: str) -> None:
     except tomllib.TOMLDecodeError:
         value = text.strip()  # a bare word is a string
     target: Any = content
-    for step, following in zip(steps, [*steps[1:], None], strict=True):
+    for depth, step in enumerate(steps):
         place: Any = int(step) if isinstance(target, list) and step.isdigit() else step
         if isinstance(target, list) and not (isinstance(place, int) and place < len(target)):
-            raise InputError(f"--set {override!r}: {step!r} is not an entry of a list of {len(target)}")
+            raise InputError(
+                f"--set {override!r}: {step!r} is not an entry of a list of {len(target)} (0 is the first)"
+            )
+        if _is_distribution(target):
+            above = ".".join(steps[:depth])
+            raise InputError(
+                f"--set {override!r}: {above} is a distribution; give all of it, as in --set '{above}=...'"
+            )
         if not isinstance(target, list | dict):
             raise InputError(f"--set {override!r}: {step!r} lies inside a value that is not a table")
-        if following is None:
+        if depth == len(steps) - 1:
             target[place] = value
         elif isinstance(target, dict):
             target = target.setdefault(step, {})
@@ -172,7 +191,7 @@ def _is_distribution(value: Any) -> bool:
     return isinstance(value, dict) and len(value) == 1 and next(iter(value)) in DISTRIBUTIONS
 
 
-def _distributions(value: Any, where: str) -> Iterable[tuple[str, list[Any], str]]:
+def _distributions(value: Any, where: str) -> Iterator[tuple[str, Any, str]]:
     if _is_distribution(value):
         ((kind, arguments),) = value.items()
         yield kind, arguments, where
@@ -187,27 +206,30 @@ def _distributions(value: Any, where: str) -> Iterable[tuple[str, list[Any], str
             yield from _distributions(inner, f"{where}[{i}]")
 
 
-def _replaced(value: Any, resolver: Resolver, where: str) -> Any:
+def _options(value: Any) -> int:
+    """How many corners it takes to see every option of every choice in a part of a template."""
+    if _is_distribution(value):
+        return sum(_options(option) for option in value["choice"]) if "choice" in value else 1
+    inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return max((_options(part) for part in inner), default=1)
+
+
+def _corner(value: Any, high: bool, turn: int) -> Any:
+    """The lower or upper end of a part of a template, with the options of its choices that this turn shows."""
     if _is_distribution(value):
         ((kind, arguments),) = value.items()
-        chosen = resolver(kind, arguments, where)
-        return _replaced(chosen, resolver, where) if kind == "choice" else chosen
+        if kind != "choice":
+            return float(arguments[0] if kind == "normal" or not high else arguments[1])  # as a draw: never whole
+        turn %= _options(value)
+        for option in arguments:
+            if turn < _options(option):
+                return _corner(option, high, turn)
+            turn -= _options(option)
     if isinstance(value, dict):
-        return {key: _replaced(inner, resolver, f"{where}.{key}" if where else key) for key, inner in value.items()}
+        return {key: _corner(inner, high, turn) for key, inner in value.items()}
     if isinstance(value, list):
-        return [_replaced(inner, resolver, f"{where}[{i}]") for i, inner in enumerate(value)]
+        return [_corner(inner, high, turn) for inner in value]
     return value
-
-
-def _end(high: bool, turn: int) -> Resolver:
-    def resolver(kind: str, arguments: list[Any], where: str) -> Any:
-        if kind == "choice":
-            return arguments[turn % len(arguments)]
-        if kind == "normal":
-            return arguments[0]
-        return arguments[1 if high else 0]
-
-    return resolver
 
 
 def _distribution_problem(kind: str, arguments: Any, where: str) -> str:
@@ -215,9 +237,8 @@ def _distribution_problem(kind: str, arguments: Any, where: str) -> str:
         return f"a distribution is not allowed here; {', '.join(FIXED)} are the same for all samples"
     if kind == "choice":
         return "" if isinstance(arguments, list) and arguments else "choice needs a list with at least one entry"
-    numbers = isinstance(arguments, list) and len(arguments) == 2
-    if not numbers or not all(isinstance(a, int | float) and not isinstance(a, bool) for a in arguments):
-        return f"{kind} needs two numbers, it has {arguments!r}"
+    if not isinstance(arguments, list) or len(arguments) != 2 or not all(map(_is_number, arguments)):
+        return f"{kind} needs two finite numbers, it has {arguments!r}"
     if kind == "normal":
         return "" if arguments[1] >= 0 else f"normal's standard deviation must not be negative, it is {arguments[1]}"
     if arguments[0] > arguments[1]:
@@ -227,44 +248,6 @@ def _distribution_problem(kind: str, arguments: Any, where: str) -> str:
     return ""
 
 
-def _explain(problem: Any, content: dict[str, Any]) -> str:
-    """One pydantic error as a line of our own."""
-    where, _ = _path(problem["loc"], content)
-    if problem["type"] == "extra_forbidden":
-        close = get_close_matches(str(problem["loc"][-1]), _field_names(), n=1)
-        return f"{where}: unknown key" + (f"; did you mean {close[0]!r}?" if close else "")
-    message = problem["msg"].removeprefix("Value error, ")
-    message = message[0].lower() + message[1:]
-    given = problem["input"]
-    shown = "" if isinstance(given, dict) or problem["type"] == "missing" else f" = {given!r}"
-    return f"{where}{shown}: {message}" if where else message
-
-
-def _path(location: Sequence[Any], content: Any) -> tuple[str, Any]:
-    """Dotted path without the discriminator tags that pydantic puts in it."""
-    where, value = "", content
-    for part in location:
-        if isinstance(part, int):
-            where += f"[{part}]"
-            value = value[part] if isinstance(value, list | tuple) and part < len(value) else None
-        elif isinstance(value, dict) and part not in value and part in (value.get("kind"), value.get("shape")):
-            continue
-        else:
-            where += f".{part}" if where else str(part)
-            value = value.get(part) if isinstance(value, dict) else None
-    return where, value
-
-
-def _field_names() -> list[str]:
-    """Every field name of the schema."""
-    names: set[str] = set()
-
-    def visit(model: type[BaseModel]) -> None:
-        names.update(model.model_fields)
-        for subclass in model.__subclasses__():
-            visit(subclass)
-
-    from synth.scene import Part
-
-    visit(Part)
-    return sorted(names)
+def _is_number(value: Any) -> bool:
+    """Finite, and not so large that a difference overflows."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300

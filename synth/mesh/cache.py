@@ -1,4 +1,4 @@
-"""Meshes are kept by content: made once per pad, edge length and mesher version, then read.
+"""Meshes are kept by content: made once per pad and edge length, then read.
 
 fTetWild is not deterministic, so the cache is also what makes a dataset reproducible: a dataset directory keeps the
 meshes it used and a later run on it reads those first.
@@ -9,7 +9,6 @@ import hashlib
 import json
 import os
 from collections.abc import Sequence
-from importlib.metadata import version
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -33,7 +32,6 @@ def mesh_key(gel: Gel, numerics: Numerics) -> str:
         "edge_length_mm": numerics.edge_length_mm or default_edge_length(gel),
         "grading": GRADING,
         "envelope": ENVELOPE,
-        "mesher": "pytetwild " + version("pytetwild"),
     }
     return hashlib.sha256(json.dumps(recipe, sort_keys=True).encode()).hexdigest()[:16]
 
@@ -67,7 +65,7 @@ def _read(path: Path, gel: Gel) -> PadMesh | None:
     try:
         with np.load(path) as data:
             return PadMesh(data["points"], data["tets"], gel.size_mm)
-    except (OSError, ValueError, KeyError, BadZipFile):
+    except (OSError, EOFError, ValueError, KeyError, BadZipFile):
         return None
 
 

@@ -8,7 +8,7 @@ of shape function a and h_a = F^{-T} g_a:
     r_a  = ∫ μ F g_a + (pJ - μ) h_a
     K_ab = ∫ μ g_a.g_b I + (μ - pJ) h_b h_a^T + pJ h_a h_b^T          K_ac = ∫ J h_a N_c
 
-Where `bulk_modulus` is 0 the pressure is a field of its own; otherwise it is λ (J - 1) at each quadrature point
+Where `bulk_modulus` is negative the pressure is a field of its own; otherwise it is λ (J - 1) at each quadrature point
 (displacement-only, for compressible foams), K_ab gains λ J² h_a h_b^T and the pressure rows are left empty.
 float64; leading axis of every state array is the batch; stresses are relative to the pad's Young's modulus.
 """
@@ -35,10 +35,12 @@ def bulk_residual(
     residual_p: wp.array2d(dtype=wp.float64),
     jacobian: wp.array2d(dtype=wp.float64),
 ):
-    """One thread per (sample, element). jacobian: smallest det F of the element; no residual is added where it is <= 0."""
+    """One thread per (sample, element). jacobian: smallest det F of the element; where it is <= 0 no residual is added."""
     s, e = wp.tid()
     if active[s] == 0:
         return
+    mixed = bulk_modulus[e] < wp.float64(0.0)
+    bulk = wp.max(bulk_modulus[e], wp.float64(0.0))
     smallest = wp.float64(1.0e30)
     for q in range(weight.shape[1]):
         F = wp.identity(n=3, dtype=wp.float64)
@@ -46,11 +48,11 @@ def bulk_residual(
             F += wp.outer(u[s, nodes[e, a]], gradient[e, q, a])
         J = wp.determinant(F)
         smallest = wp.min(smallest, J)
-        if J > wp.float64(0.0):
+        if wp.float64(0.0) < J:
             w = weight[e, q]
             Fit = wp.transpose(wp.inverse(F))
-            pressure = bulk_modulus[e] * (J - wp.float64(1.0))
-            if bulk_modulus[e] == wp.float64(0.0):
+            pressure = bulk * (J - wp.float64(1.0))
+            if mixed:
                 for c in range(4):
                     pressure += pressure_shape[q, c] * p[s, pressure_nodes[e, c]]
                     wp.atomic_add(residual_p, s, pressure_nodes[e, c], w * (J - wp.float64(1.0)) * pressure_shape[q, c])
@@ -59,7 +61,7 @@ def bulk_residual(
                 force = (w * mu[e]) * (F * gradient[e, q, a]) + volumetric * (Fit * gradient[e, q, a])
                 wp.atomic_add(residual_u, s, nodes[e, a], force)
     jacobian[s, e] = smallest
-    if bulk_modulus[e] == wp.float64(0.0):
+    if mixed:
         for c in range(4):
             row = wp.float64(0.0)
             for d in range(4):
@@ -90,6 +92,8 @@ def bulk_tangent(
     s, e = wp.tid()
     if active[s] == 0:
         return
+    mixed = bulk_modulus[e] < wp.float64(0.0)
+    bulk = wp.max(bulk_modulus[e], wp.float64(0.0))
     count = nodes.shape[1]
     for q in range(weight.shape[1]):
         F = wp.identity(n=3, dtype=wp.float64)
@@ -98,8 +102,8 @@ def bulk_tangent(
         J = wp.determinant(F)
         Fit = wp.transpose(wp.inverse(F))
         w = weight[e, q]
-        pressure = bulk_modulus[e] * (J - wp.float64(1.0))
-        if bulk_modulus[e] == wp.float64(0.0):
+        pressure = bulk * (J - wp.float64(1.0))
+        if mixed:
             for c in range(4):
                 pressure += pressure_shape[q, c] * p[s, pressure_nodes[e, c]]
         pJ = pressure * J
@@ -109,20 +113,20 @@ def bulk_tangent(
                 hb = Fit * gradient[e, q, b]
                 diagonal = w * mu[e] * wp.dot(gradient[e, q, a], gradient[e, q, b])
                 block = (w * (mu[e] - pJ)) * wp.outer(hb, ha)
-                block += (w * (pJ + bulk_modulus[e] * J * J)) * wp.outer(ha, hb)
+                block += (w * (pJ + bulk * J * J)) * wp.outer(ha, hb)
                 for i in range(3):
                     for j in range(3):
                         entry = block[i, j]
                         if i == j:
                             entry += diagonal
                         wp.atomic_add(values, s, slot[e, 3 * a + i, 3 * b + j], entry)
-            if bulk_modulus[e] == wp.float64(0.0):
+            if mixed:
                 for c in range(4):
                     coupling = (w * J * pressure_shape[q, c]) * ha
                     for i in range(3):
                         wp.atomic_add(values, s, slot[e, 3 * a + i, 3 * count + c], coupling[i])
                         wp.atomic_add(values, s, slot[e, 3 * count + c, 3 * a + i], coupling[i])
-    if bulk_modulus[e] == wp.float64(0.0):
+    if mixed:
         for c in range(4):
             for d in range(4):
                 wp.atomic_add(values, s, slot[e, 3 * count + c, 3 * count + d], pressure_matrix[e, c, d])

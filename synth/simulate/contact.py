@@ -22,6 +22,9 @@ from synth.simulate.distance import normal_derivative, shape_vector, signed_dist
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
+ON_CONE = wp.constant(wp.float64(1.0 - 1.0e-9))
+"""A point slips whose traction is this share of the limit. (Inside a kernel 1.0 - 1.0e-9 would be float32, that is 1.)"""
+
 
 @wp.struct
 class Indenters:
@@ -76,7 +79,7 @@ def _position(faces: Faces, u: wp.array2d(dtype=wp.vec3d), s: int, f: int, q: in
 def _trial(
     state: ContactState, rotation: wp.mat33d, y: wp.vec3d, penalty: wp.float64, s: int, f: int, q: int
 ) -> wp.vec3d:
-    """m in world axes."""
+    """The trial traction m, in world axes."""
     return rotation * (state.tangent[s, f, q] - penalty * (y - state.anchor[s, f, q]))
 
 
@@ -211,7 +214,7 @@ def settle(
 ):
     """At the end of a step: anchor new contacts, drag the anchors of slipping points along, free points that left."""
     s, f, q = wp.tid()
-    if active[s] == 0:
+    if active[s] == 0 or indenters.friction[s] == wp.float64(0.0):
         return
     rotation = indenters.rotation[s]
     pressure = state.normal[s, f, q] - penalty * gap[s, f, q]
@@ -228,5 +231,5 @@ def settle(
         state.anchored[s, f, q] = 1
         return
     t = wp.transpose(rotation) * tangential[s, f, q]
-    if wp.length(t) >= wp.float64(1.0 - 1.0e-12) * indenters.friction[s] * pressure:
+    if wp.length(t) >= ON_CONE * indenters.friction[s] * pressure:
         state.anchor[s, f, q] = y - (state.tangent[s, f, q] - t) / penalty

@@ -59,10 +59,10 @@ def _box(y: wp.vec3d, half: wp.vec3d) -> wp.vec4d:
 
 @wp.func
 def _revolve(y: wp.vec3d, gradient: wp.vec2d, distance: wp.float64) -> wp.vec4d:
-    """From the half plane (distance from the axis, z) to space."""
+    """From the half plane (distance from the axis, z) to space; on the axis any radial direction will do."""
     rho = wp.sqrt(y[0] * y[0] + y[1] * y[1])
     if rho < TINY:
-        return wp.vec4d(ZERO, ZERO, gradient[1], distance)
+        return wp.vec4d(gradient[0], ZERO, gradient[1], distance)
     return wp.vec4d(gradient[0] * y[0] / rho, gradient[0] * y[1] / rho, gradient[1], distance)
 
 
@@ -141,19 +141,22 @@ def _bspline_slope(t: wp.float64) -> wp.vec4d:
 
 @wp.func
 def _grid(
-    y: wp.vec3d, corner: wp.vec3d, cell: wp.float64, s: int, coefficients: wp.array4d(dtype=wp.float64)
+    y: wp.vec3d,
+    corner: wp.vec3d,
+    cell: wp.float64,
+    counts: wp.vec3d,
+    s: int,
+    coefficients: wp.array4d(dtype=wp.float64),
 ) -> wp.vec4d:
-    """Cubic B-spline on a grid; beyond the grid the distance from its border is added."""
-    upper = wp.vec3d(
-        wp.float64(coefficients.shape[1] - 3),
-        wp.float64(coefficients.shape[2] - 3),
-        wp.float64(coefficients.shape[3] - 3),
-    )
+    """Cubic B-spline on a grid of counts points (the batch's array is as large as its largest grid); beyond the grid the
+    distance from its border is added.
+    """
+    upper = counts - wp.vec3d(wp.float64(3.0), wp.float64(3.0), wp.float64(3.0))
     g = (y - corner) / cell
     held = wp.vec3d(wp.clamp(g[0], ONE, upper[0]), wp.clamp(g[1], ONE, upper[1]), wp.clamp(g[2], ONE, upper[2]))
-    i = wp.min(int(held[0]), coefficients.shape[1] - 4)
-    j = wp.min(int(held[1]), coefficients.shape[2] - 4)
-    k = wp.min(int(held[2]), coefficients.shape[3] - 4)
+    i = wp.min(int(held[0]), int(upper[0]) - 1)
+    j = wp.min(int(held[1]), int(upper[1]) - 1)
+    k = wp.min(int(held[2]), int(upper[2]) - 1)
     tx = held[0] - wp.float64(i)
     ty = held[1] - wp.float64(j)
     tz = held[2] - wp.float64(k)
@@ -182,7 +185,7 @@ def signed_distance(
     """Outward unit normal (first three) and signed distance (last) at y, mm in the indenter's frame.
 
     shape: [fillet, then: sphere radius | cylinder radius, half length | box half edges | cone base radius, height
-    | torus ring radius | mesh grid corner x, y, z, cell], of the sharp shape.
+    | torus ring radius | mesh grid corner x, y, z, cell, counts x, y, z], of the sharp shape.
     """
     if kind == 0:
         d = _sphere(y, shape[1])
@@ -195,7 +198,8 @@ def signed_distance(
     elif kind == 4:
         d = _torus(y, shape[1])
     else:
-        d = _grid(y, wp.vec3d(shape[1], shape[2], shape[3]), shape[4], s, coefficients)
+        corner = wp.vec3d(shape[1], shape[2], shape[3])
+        d = _grid(y, corner, shape[4], wp.vec3d(shape[5], shape[6], shape[7]), s, coefficients)
     return wp.vec4d(d[0], d[1], d[2], d[3] - shape[0])
 
 

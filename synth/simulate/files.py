@@ -6,37 +6,57 @@ from typing import Any
 
 import numpy as np
 
+from synth.dataset.storage import replace_file, storage_errors
 from synth.mesh import PadMesh
 from synth.scene import Scene
-from synth.simulate.trajectory import Trajectory
+from synth.simulate.trajectory import State, Trajectory
 
 
 def write_trajectory(directory: Path, scene: Scene, mesh: PadMesh, trajectory: Trajectory) -> dict[str, Any]:
-    """Write DIR/trajectory.json and DIR/state_000.vtu and so on; returns the JSON's content.
+    """Write DIR/trajectory.json and DIR/state_000.vtu and so on, in the place of an earlier trajectory's.
 
-    The VTU files hold the deformed contact surface with the fields displacement (mm) and traction (MPa).
+    The VTU files hold the deformed contact surface with the fields displacement (mm) and traction (MPa), and the mesh's
+    hash as the field datum "mesh".
+
+    Returns:
+        The JSON's content.
+
+    Raises:
+        InputError: the storage refuses.
     """
-    import pyvista as pv
-
-    directory.mkdir(parents=True, exist_ok=True)
-    faces = mesh.contact_faces
-    cells = np.column_stack([np.full(len(faces.faces), 3), faces.faces]).ravel()
-    types = np.full(len(faces.faces), pv.CellType.TRIANGLE)
-    for number, state in enumerate(trajectory.states):
-        displacement = state.displacement[mesh.contact_nodes]
-        grid = pv.UnstructuredGrid(cells, types, faces.nodes + displacement)
-        grid.point_data["displacement"] = displacement
-        grid.point_data["traction"] = state.traction
-        grid.save(directory / f"state_{number:03d}.vtu")
     record = {
         "scene": scene.model_dump(mode="json"),
-        "mesh": mesh.hash,
         "steps": [state.summary() for state in trajectory.states],
         "status": trajectory.status,
         "reason": trajectory.reason,
         "seconds": trajectory.seconds,
     }
-    aside = directory / ".trajectory.json"
-    aside.write_text(json.dumps(record, indent=1), encoding="utf-8")
-    aside.replace(directory / "trajectory.json")
+    with storage_errors(directory):
+        directory.mkdir(parents=True, exist_ok=True)
+        (directory / "trajectory.json").unlink(missing_ok=True)  # while it is missing, the states are not complete
+        for old in directory.glob("state_*.vtu"):
+            old.unlink()
+    for number, state in enumerate(trajectory.states):
+        replace_file(directory / f"state_{number:03d}.vtu", _vtu(mesh, state))
+    replace_file(directory / "trajectory.json", json.dumps(record, indent=1).encode("utf-8"))
     return record
+
+
+def _vtu(mesh: PadMesh, state: State) -> bytes:
+    """The contact surface of a state as a VTK XML file."""
+    import pyvista as pv
+    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
+
+    faces = mesh.contact_faces
+    cells = np.column_stack([np.full(len(faces.faces), 3), faces.faces]).ravel()
+    types = np.full(len(faces.faces), pv.CellType.TRIANGLE)
+    displacement = state.displacement[mesh.contact_nodes]
+    grid = pv.UnstructuredGrid(cells, types, faces.nodes + displacement)
+    grid.point_data["displacement"] = displacement
+    grid.point_data["traction"] = state.traction
+    grid.field_data["mesh"] = [mesh.hash]
+    writer = vtkXMLUnstructuredGridWriter()  # to memory: VTK does not say when a disk is full
+    writer.SetInputData(grid)
+    writer.WriteToOutputStringOn()
+    writer.Write()
+    return str(writer.GetOutputString()).encode("ascii")

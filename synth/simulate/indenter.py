@@ -86,7 +86,8 @@ def rigid_body(indenter: Indenter, folder: Path | None = None, resolution_mm: fl
             lengths, reach = [tube, radius], radius * radial + tube
         case MeshIndenter():
             corner, vertices, coefficients = _distance_grid(indenter, folder or Path())
-            lengths, reach = [0.0, *corner, indenter.cell_mm], float((vertices @ up).max())
+            lengths = [0.0, *corner, indenter.cell_mm, *coefficients.shape]
+            reach = float((vertices @ up).max())
     shape = np.zeros(SHAPE_LENGTH)
     shape[: len(lengths)] = lengths
     return RigidBody(KINDS[indenter.shape], shape, rotation, reach, coefficients)
@@ -125,8 +126,8 @@ def _distance_grid(indenter: MeshIndenter, folder: Path) -> tuple[FloatArray, Fl
         )
     surface.points = np.asarray(surface.points, dtype=np.float64) * indenter.scale
     surface.points -= (surface.points.min(axis=0) + surface.points.max(axis=0)) / 2
-    if surface.volume < 0 or not surface.is_manifold:
-        surface = surface.compute_normals(auto_orient_normals=True, consistent_normals=True, split_vertices=False)
+    # The sign of the distance follows the triangles' orientation, which files get wrong.
+    surface = surface.compute_normals(auto_orient_normals=True, consistent_normals=True, split_vertices=False)
     vertices = np.asarray(surface.points, dtype=np.float64)
     pad = 4 * indenter.cell_mm
     corner = vertices.min(axis=0) - pad

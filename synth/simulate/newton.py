@@ -15,6 +15,8 @@ from synth.simulate.system import Balance, System, Unknowns
 MAX_ITERATIONS = 20
 SHORTEST = 1 / 1024
 """Shortest step of the line search."""
+NOTHING = 1e-6
+"""Force in E mm² that is none: where the indenter has slid off, only rounding (about 1e-13) is left to compare with."""
 INDIFFERENT = 0.3
 """Below this step length any valid state is taken: a kink of the contact set can make every step raise the residual."""
 
@@ -39,10 +41,9 @@ class Solution:
 
 
 def relative_residual(balance: Balance) -> FloatArray:
-    """(B,) norm of the free residual over the norm of all nodal forces; 0 where nothing acts."""
+    """(B,) norm of the free residual over the norm of all nodal forces, which counts as NOTHING at least."""
     force = np.linalg.norm(balance.reaction.reshape(len(balance.free), -1), axis=1)
-    norm = np.linalg.norm(balance.free, axis=1)
-    return np.divide(norm, force, out=np.zeros_like(norm), where=force > 0)
+    return np.asarray(np.linalg.norm(balance.free, axis=1) / np.maximum(force, NOTHING))
 
 
 def solve(

@@ -32,14 +32,28 @@ def simulate(scene: Scene, mesh: PadMesh, folder: FilePath | None = None, device
 def simulate_batch(
     scenes: Sequence[Scene], mesh: PadMesh, folder: FilePath | None = None, device: str = "cpu"
 ) -> list[Trajectory]:
-    """Simulate scenes that share pad, Poisson's ratio and numerics side by side; each as if it were alone."""
+    """Simulate scenes that share pad, Poisson's ratio and numerics side by side; each as if it were alone.
+
+    Scenes with and without friction are kept apart, because the latter need half a matrix only.
+    """
     first = scenes[0]
     for scene in scenes:
         if scene.sensor.gel.size_mm != mesh.size_mm:
             raise InputError(f"the mesh is of a {mesh.size_mm} mm pad, the scene's is {scene.sensor.gel.size_mm} mm")
         if (scene.sensor.gel.poisson_ratio, scene.numerics) != (first.sensor.gel.poisson_ratio, first.numerics):
             raise InputError("the scenes of a batch must share sensor.gel.poisson_ratio and numerics")
-    friction = [scene.contact.friction for scene in scenes]
+    trajectories: dict[int, Trajectory] = {}
+    for slippery in (True, False):
+        group = [i for i, scene in enumerate(scenes) if (scene.contact.friction == 0) == slippery]
+        if group:
+            trajectories.update(
+                zip(group, _side_by_side([scenes[i] for i in group], mesh, folder, device), strict=True)
+            )
+    return [trajectories[i] for i in range(len(scenes))]
+
+
+def _side_by_side(scenes: Sequence[Scene], mesh: PadMesh, folder: FilePath | None, device: str) -> list[Trajectory]:
+    first, friction = scenes[0], [scene.contact.friction for scene in scenes]
     system = System(
         mesh,
         first.sensor.gel.poisson_ratio,

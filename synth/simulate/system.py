@@ -125,7 +125,7 @@ class System:
             warp_array(element.barycentric, wp.float64, d),
             warp_array(pressure_matrix, wp.float64, d),
             warp_array(np.full(count, mu), wp.float64, d),
-            warp_array(np.full(count, 0.0 if self.mixed else lame), wp.float64, d),
+            warp_array(np.full(count, -1.0 if self.mixed else lame), wp.float64, d),
         ]
 
     def _face_arrays(self, mesh: PadMesh, element: Element) -> tuple[Faces, np.ndarray]:
@@ -141,6 +141,8 @@ class System:
 
     def _pattern(self) -> None:
         """CSR pattern of the free unknowns and, per element and face, where its entries go."""
+        import scipy.sparse as sp
+
         n, tets = self.nodes, self.mesh.tets.astype(np.int64)
         total = 3 * n + (n if self.mixed else 0)
         held = np.zeros(total, dtype=bool)
@@ -160,11 +162,18 @@ class System:
                 keep = keep & (row <= column)
             return np.where(keep, row * len(self.free) + column, -1)
 
-        element_keys = keys(unknowns(tets, self.mixed))
-        entries = np.unique(element_keys)
-        entries = entries[entries >= 0]
-        self.indices = (entries % len(self.free)).astype(np.int32)
-        self.indptr = np.searchsorted(entries // len(self.free), np.arange(len(self.free) + 1)).astype(np.int32)
+        local = unknowns(tets, self.mixed)
+        element, place = np.nonzero(local >= 0)
+        incidence = sp.csr_matrix(
+            (np.ones(len(element), dtype=np.int32), (element, local[element, place])), shape=(len(tets), len(self.free))
+        )
+        coupled = (incidence.T @ incidence).tocsr()
+        if self.symmetric:
+            coupled = sp.triu(coupled, format="csr")
+        coupled.sort_indices()
+        self.indptr, self.indices = coupled.indptr.astype(np.int32), coupled.indices.astype(np.int32)
+        entries = np.repeat(np.arange(len(self.free)), np.diff(self.indptr)) * len(self.free) + self.indices
+        element_keys = keys(local)
 
         def slots(wanted: np.ndarray) -> wp.array:
             place = np.where(wanted >= 0, np.searchsorted(entries, wanted), len(entries))
@@ -211,7 +220,9 @@ class System:
         )
         reaction = force.numpy()
         full = [reaction.reshape(self.batch, -1)] + ([volume.numpy()] if self.mixed else [])
-        return Balance(np.concatenate(full, axis=1)[:, self.free], reaction, jacobian.numpy().min(axis=1))
+        # Indexing columns leaves them strided, and sums over a row would then depend on the size of the batch.
+        free = np.ascontiguousarray(np.concatenate(full, axis=1)[:, self.free])
+        return Balance(free, reaction, jacobian.numpy().min(axis=1))
 
     def tangent(self, state: Unknowns, indenters: Indenters, active: np.ndarray) -> FloatArray:
         """CSR values (B, nnz) of the derivative of the free residual."""

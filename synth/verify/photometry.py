@@ -72,7 +72,10 @@ def check_photometry(sensor: Sensor, image1: Raster, image2: Raster, flow: FlowA
         float(np.median([column[b][i] for b in most])) for column, i in ((moved, 0), (moved, 1), (still, 0))
     )
     detail = f"{len(most)} of {len(common)} textured blocks; without motion {unmoved:.2g} px"
-    return Check(NAME, figure, ALLOWANCE_PX + _NOISE_FACTOR * 0.6745 * noise, "px", detail)
+    tolerance = ALLOWANCE_PX + _NOISE_FACTOR * 0.6745 * noise
+    if figure > tolerance and unmoved < 2 * tolerance:
+        return Check(NAME, None, tolerance, "px", f"not applicable: too little motion to tell ({detail})")
+    return Check(NAME, figure, tolerance, "px", detail)
 
 
 def _block_medians(channels: list[Textured], side: int) -> dict[tuple[int, int], tuple[float, float]]:
@@ -98,7 +101,7 @@ def _unexplained(camera: Camera, one: FloatArray, two: FloatArray, flow: FlowArr
     at = [(base + np.nan_to_num(flow[..., i])).astype(np.float32) for i, base in enumerate((column, row))]
     linear = [image**camera.gamma for image in (one, two)]
     smooth = [cv2.GaussianBlur(image, (0, 0), _SMOOTHING_PX) for image in linear]
-    warped = cv2.remap(smooth[1], *at, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    warped = cv2.remap(smooth[1], at[0], at[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     share = cv2.GaussianBlur(usable.astype(np.float64), (0, 0), _SHADING_PX) + 1e-12
     means = [cv2.GaussianBlur(np.where(usable, image, 0), (0, 0), _SHADING_PX) / share for image in (smooth[0], warped)]
     gain = np.divide(means[0], means[1], out=np.ones_like(means[0]), where=means[1] > 1e-6)

@@ -1,0 +1,131 @@
+"""Scene files: distributions, overrides, corners, and the hash that says which scene it is."""
+
+import pickle
+from pathlib import Path
+
+import pytest
+from tiny_scene import CONTACT, TEXT, write_tiny
+
+from synth.errors import InputError
+from synth.template import SCENES, checked_template, load_scene, replaced, shipped_scenes
+
+
+@pytest.fixture
+def tiny(tmp_path: Path) -> Path:
+    return write_tiny(tmp_path)
+
+
+def test_shipped_scenes_are_known_by_name() -> None:
+    assert shipped_scenes() == ["deltact", "gelsight", "gelsight_mini"]
+    assert load_scene("gelsight_mini").source == SCENES / "gelsight_mini.toml"
+
+
+def test_a_folder_of_a_scenes_name_does_not_hide_the_scene(tmp_path, monkeypatch) -> None:
+    (tmp_path / "gelsight_mini").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert load_scene("gelsight_mini").name == "gelsight_mini"
+
+
+def test_overrides_set_tables_lists_and_words(tiny: Path) -> None:
+    template = load_scene(
+        tiny,
+        [
+            "motion.depth_mm=0.25",
+            "sensor.lights.1.power=7",
+            "name=another",
+            "outputs.depth=true",
+            'contact.indenter={ shape = "torus", radius_mm = 1.0, tube_mm = 0.3 }',
+            "sensor.camera.position_mm=[0, 0, 21.5]",
+        ],
+    )
+    scene = template.corners[0]
+    assert (scene.motion.depth_mm, scene.sensor.lights[1].power, scene.name) == (0.25, 7, "another")
+    assert scene.outputs.depth
+    assert scene.contact.indenter.shape == "torus"
+    assert scene.sensor.camera.position_mm == (0, 0, 21.5)
+
+
+def test_later_overrides_win(tiny: Path) -> None:
+    assert load_scene(tiny, ["motion.steps=3", "motion.steps=4"]).corners[0].motion.steps == 4
+
+
+def test_corners_are_the_ends_of_the_distributions(tiny: Path) -> None:
+    corners = load_scene(tiny).corners
+    assert [corner.motion.depth_mm for corner in corners] == [0.1, 0.3]
+    assert [corner.sensor.gel.youngs_modulus_kpa for corner in corners] == [100, 300]
+    assert {corner.sensor.camera.cx for corner in corners} == {16.0}  # a normal is at its mean
+
+
+def test_corners_see_every_option_of_nested_choices(tiny: Path) -> None:
+    """A choice of two in a choice of three, beside another choice of two: each option turns up."""
+    sphere = '{ shape = "sphere", radius_mm = { choice = [0.5, { uniform = [1.0, 2.0] }, 3.0] } }'
+    cone = '{ shape = "cone", half_angle_deg = { choice = [30, 60] } }'
+    template = load_scene(tiny, [f"contact.indenter={{ choice = [{cone}, {sphere}] }}", "motion.steps={choice=[1, 2]}"])
+    seen = {
+        (indenter.shape, *indenter.model_dump().values()) for indenter in (c.contact.indenter for c in template.corners)
+    }
+    angles = {c.contact.indenter.half_angle_deg for c in template.corners if c.contact.indenter.shape == "cone"}
+    radii = {c.contact.indenter.radius_mm for c in template.corners if c.contact.indenter.shape == "sphere"}
+    assert angles == {30, 60}
+    assert radii == {0.5, 1.0, 2.0, 3.0}
+    assert {c.motion.steps for c in template.corners} == {1, 2}
+    assert len(seen) == 6
+
+
+def test_a_wrong_option_of_a_nested_choice_is_found_when_the_file_is_loaded(tiny: Path) -> None:
+    sphere = '{ shape = "sphere", radius_mm = { choice = [1.0, -2.0] } }'
+    with pytest.raises(InputError, match=r"contact.indenter.radius_mm = -2.0: must be greater than or equal to 0.05"):
+        load_scene(
+            tiny, [f'contact.indenter={{ choice = [{sphere}, {{ shape = "torus", radius_mm = 1, tube_mm = 0.2 }}] }}']
+        )
+
+
+def test_replaced_asks_for_each_distribution_and_leaves_the_rest() -> None:
+    content = {"b": [1, {"uniform": [2, 3]}], "a": {"choice": [{"x": {"normal": [0, 1]}}, 5]}, "c": "word"}
+    asked = []
+
+    def choose(kind: str, arguments: list) -> object:
+        asked.append(kind)
+        return arguments[0]
+
+    assert replaced(content, choose) == {"a": {"x": 0}, "b": [1, 2], "c": "word"}
+    assert asked == ["choice", "normal", "uniform"]  # by the keys' names, not by their order
+
+
+def test_hash_is_of_the_content_not_of_its_layout(tmp_path: Path, tiny: Path) -> None:
+    template = load_scene(tiny)
+    assert len(template.hash) == 16
+    parts = TEXT.split("[contact]")
+    assert CONTACT.strip().startswith("[contact]")
+    (tmp_path / "other.toml").write_text(
+        'description = "words"\nreferences = ["a book"]\nname = "tiny"\n[contact]'
+        + parts[1]
+        + parts[0].replace('name = "tiny"', "")
+    )
+    assert load_scene(tmp_path / "other.toml").hash == template.hash
+    assert load_scene(tiny, ["motion.steps=3"]).hash != template.hash
+    assert load_scene(tiny, ["name=other"]).hash != template.hash
+    assert pickle.loads(pickle.dumps(template)).hash == template.hash
+
+
+def test_hash_covers_the_files_of_mesh_indenters(tiny: Path) -> None:
+    """A dataset must not go on with another object under the same file name."""
+    override = 'contact.indenter={ shape = "mesh", file = { choice = ["a.stl", "b.stl"] } }'
+    (tiny.parent / "a.stl").write_text("first")
+    with pytest.raises(InputError, match=r"there is no file .*b\.stl"):
+        load_scene(tiny, [override])
+    (tiny.parent / "b.stl").write_text("second")
+    before = load_scene(tiny, [override]).hash
+    (tiny.parent / "b.stl").write_text("changed")
+    assert load_scene(tiny, [override]).hash != before
+
+
+def test_a_template_needs_no_file(tmp_path: Path) -> None:
+    content = dict(load_scene("deltact").content)
+    assert checked_template(content, tmp_path / "none.toml").hash == load_scene("deltact").hash
+
+
+def test_content_is_plain_json(tmp_path: Path) -> None:
+    """TOML knows dates; what is kept in dataset.json does not."""
+    (tmp_path / "s.toml").write_text("description = 2026-11-21\n" + TEXT)
+    assert load_scene(tmp_path / "s.toml").content["description"] == "2026-11-21"
