@@ -22,13 +22,13 @@ from synth.template import Template
 
 NODES_PER_VOLUME, NODES_PER_AREA, FEWEST_NODES = 0.72, 0.25, 300
 """Mesh nodes per cube and per square of the contact face's edge length, with `synth.mesh.tetrahedralise`'s grading."""
-SOLVE_SECONDS = 0.035
+SOLVE_SECONDS = 0.065
 """One Newton iteration (assembly, factorisation, solution) of a frictional press with SOLVE_NODES nodes."""
 SOLVE_NODES = 2000
 SOLVE_GROWTH = 1.6
 """Exponent of a solve's time in the number of nodes (between 2D's 1.5 and 3D's 2 for a thin pad)."""
-ITERATIONS_PER_STEP, STEPS_PER_RECORD = 6.0, 1.5
-SECONDS_PER_MILLION_SAMPLES = {"llvm": 0.25, "scalar": 1.0, "cuda": 0.002}
+ITERATIONS_PER_STEP, STEPS_PER_RECORD = 10.0, 1.5
+SECONDS_PER_MILLION_SAMPLES = {"llvm": 0.4, "scalar": 1.0, "cuda": 0.002}
 """Path-traced camera samples of one frame."""
 FLOW_SECONDS_PER_MEGAPIXEL = 3.0
 BYTES_PER_PIXEL_OF_FLOW = 14.0
@@ -52,7 +52,7 @@ class Plan:
         decisions: feature by feature.
         edge_length_mm: of the mesh at the contact face.
         nodes: predicted mesh nodes.
-        seconds_per_pair: predicted, by stage, on one core (rendering: on all).
+        seconds_per_pair: predicted, by stage, on one core.
         bytes_per_pair: predicted size on disk.
     """
 

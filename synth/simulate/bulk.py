@@ -35,7 +35,7 @@ def bulk_residual(
     residual_p: wp.array2d(dtype=wp.float64),
     jacobian: wp.array2d(dtype=wp.float64),
 ):
-    """One thread per (sample, element). jacobian: smallest det F of the element; where it is <= 0 no residual is added."""
+    """One thread per (sample, element). jacobian: its smallest det F; where that is <= 0 no residual is added."""
     s, e = wp.tid()
     if active[s] == 0:
         return

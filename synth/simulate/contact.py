@@ -1,19 +1,20 @@
 r"""Contact and Coulomb friction with a rigid indenter at surface quadrature points, as Warp kernels.
 
-Augmented Lagrangian (Simo & Laursen 1992). At a quadrature point x with gap g, outward indenter normal n (into the gel):
+Augmented Lagrangian (Simo & Laursen 1992). At a quadrature point x with gap g, outward indenter
+normal n (into the gel):
 
 .. math::  t_n = \max(0, λ_n - ε g), \qquad  t_T = \text{return}(P m), \quad m = λ_T - ε (x - a), \quad P = I - n n^T
 
-where a is the point's anchor, carried by the indenter. The return map leaves |t_T| <= μ t_n: stick inside the cone, slip
-along the trial direction τ outside. Linearisation (H is the derivative of n):
+where a is the point's anchor, carried by the indenter. The return map leaves |t_T| <= μ t_n: stick inside the cone,
+slip along the trial direction τ outside. Linearisation (H is the derivative of n):
 
     -∂(t_n n)/∂x = ε n n^T - t_n H
     -∂(P m)/∂x   = A = ε P + (n.m) H + n (H m)^T                              stick
     -∂t_T/∂x     = μ ε τ n^T + (μ t_n / |P m|) (I - τ τ^T) A                  slip
 
 Tractions are per undeformed area. A point that touches during a step has no friction until the step is accepted; its
-anchor is then where it touched, an error that vanishes with the step. Anchors and λ_T live in the indenter's frame and so
-turn with it. Without friction none of this state is touched.
+anchor is then where it touched, an error that vanishes with the step. Anchors and λ_T live in the indenter's frame and
+so turn with it. Without friction none of this state is touched.
 """
 
 import warp as wp
@@ -23,7 +24,7 @@ from synth.simulate.distance import normal_derivative, shape_vector, signed_dist
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 ON_CONE = wp.constant(wp.float64(1.0 - 1.0e-9))
-"""A point slips whose traction is this share of the limit. (Inside a kernel 1.0 - 1.0e-9 would be float32, that is 1.)"""
+"""A point slips whose traction is this share of the limit. (Inside a kernel 1.0 - 1.0e-9 would be float32: 1.)"""
 
 
 @wp.struct
@@ -58,7 +59,7 @@ class Faces:
 
 @wp.struct
 class ContactState:
-    """Multipliers and anchors (B, f, nq), frame of the indenter for vectors; anchored is 1 where a point sticks or slips."""
+    """Multipliers and anchors (B, f, nq), vectors in the indenter's frame; anchored: 1 where it sticks or slips."""
 
     normal: wp.array3d(dtype=wp.float64)
     tangent: wp.array3d(dtype=wp.vec3d)

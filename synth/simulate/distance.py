@@ -148,8 +148,8 @@ def _grid(
     s: int,
     coefficients: wp.array4d(dtype=wp.float64),
 ) -> wp.vec4d:
-    """Cubic B-spline on a grid of counts points (the batch's array is as large as its largest grid); beyond the grid the
-    distance from its border is added.
+    """Cubic B-spline on a grid of counts points (the batch's array is as large as its largest grid); beyond the grid
+    the distance from its border is added.
     """
     upper = counts - wp.vec3d(wp.float64(3.0), wp.float64(3.0), wp.float64(3.0))
     g = (y - corner) / cell

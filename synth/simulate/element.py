@@ -37,8 +37,9 @@ class Element:
 
 
 CONTACT_SPLIT = 3
-"""Contact is integrated over each face split into so many parts an edge: with three points a face, an edge of the indenter
-that is sharper than an element made Newton's method chatter (2 of 6 trial presses completed, 6 of 6 with 27 points)."""
+"""Contact is integrated over each face split into so many parts an edge: with three points a face, an edge of the
+indenter that is sharper than an element made Newton's method chatter (2 of 6 trial presses completed, 6 of 6 with 27
+points)."""
 
 
 def p1p1(stabilisation: float = 2.0) -> Element:

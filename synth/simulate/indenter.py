@@ -101,7 +101,8 @@ def _rounded(fillet: float, resolution: float, half_thickness: float) -> float:
 def _require(holds: bool, indenter: Indenter, field: str, allowed: str) -> None:
     if not holds:
         raise InputError(
-            f"contact.indenter.{field} = {getattr(indenter, field)} does not fit this {indenter.shape}: allowed is {allowed}"
+            f"contact.indenter.{field} = {getattr(indenter, field)} does not fit this {indenter.shape}: "
+            f"allowed is {allowed}"
         )
 
 
@@ -134,8 +135,9 @@ def _distance_grid(indenter: MeshIndenter, folder: Path) -> tuple[FloatArray, Fl
     counts = np.ceil((vertices.max(axis=0) + pad - corner) / indenter.cell_mm).astype(int) + 1
     if counts.prod() > LARGEST_GRID:
         raise InputError(
-            f"contact.indenter.cell_mm = {indenter.cell_mm}: a {vertices.max(axis=0) - vertices.min(axis=0)} mm mesh needs "
-            f"{counts.prod()} grid points, more than {LARGEST_GRID}; use a larger cell_mm or cut away what never touches"
+            f"contact.indenter.cell_mm = {indenter.cell_mm}: a {vertices.max(axis=0) - vertices.min(axis=0)} mm mesh "
+            f"needs {counts.prod()} grid points, more than {LARGEST_GRID}; use a larger cell_mm or cut away what never "
+            "touches"
         )
     grid = pv.ImageData(dimensions=counts, spacing=(indenter.cell_mm,) * 3, origin=corner)
     distance = grid.compute_implicit_distance(surface)["implicit_distance"]

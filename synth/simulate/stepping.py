@@ -1,10 +1,10 @@
 """Load stepping: move the indenters along their paths, recording converged states, halving steps that fail.
 
-Each step starts from a linear extrapolation of the last two states. On the way a loose tolerance is enough; at a recorded
-state the full one holds and augmented-Lagrangian passes take penetration and elastic slip away. The passes correct what
-is recorded only: the path goes on from the state before them, because multipliers that stay behind on a moving contact
-upset Newton's method at sharp edges. An unconverged field is never recorded: a sample whose step would have to become
-shorter than SHORTEST_STEP ends at its last good state.
+Each step starts from a linear extrapolation of the last two states. On the way a loose tolerance is enough; at a
+recorded state the full one holds and augmented-Lagrangian passes take penetration and elastic slip away. The passes
+correct what is recorded only: the path goes on from the state before them, because multipliers that stay behind on a
+moving contact upset Newton's method at sharp edges. An unconverged field is never recorded: a sample whose step would
+have to become shorter than SHORTEST_STEP ends at its last good state.
 """
 
 import time
@@ -31,8 +31,8 @@ EASY = 7
 """A step that took at most so many iterations is followed by a longer one."""
 GROWTH = 1.5
 PASSES = 2
-"""Most augmented-Lagrangian passes at a recorded state: on a linear face pressed on a curved body not every contact point
-can come to rest on the surface, so that a third pass still moved a sphere's force by 0.1 % only."""
+"""Most augmented-Lagrangian passes at a recorded state: on a linear face pressed on a curved body not every contact
+point can come to rest on the surface, so that a third pass still moved a sphere's force by 0.1 % only."""
 CORRECTION_ITERATIONS = 8
 """Newton iterations of one pass; a correction that needs more is dropped."""
 PENETRATION = 2e-3
@@ -131,16 +131,16 @@ class Stepper:
         arriving = np.array([s.finished or t in s.waypoints for s, t in zip(self.samples, targets, strict=True)])
         tolerance = np.where(arriving, self.numerics.tolerance, np.maximum(LOOSE, self.numerics.tolerance))
         solution = solve(self.system, self._predicted(targets, active), self.indenters, active, tolerance)
-        for s in np.flatnonzero(active):
+        for s in map(int, np.flatnonzero(active)):
             self.samples[s].iterations += int(solution.iterations[s])
         good = solution.converged & active
-        self.system.settle(solution.state, self.indenters, good)
         self.previous = self.state.where(good, self.previous)
         self.state = solution.state.where(good, self.state)
         recording = good & np.array([t in sample.recorded for sample, t in zip(self.samples, targets, strict=True)])
         if recording.any():
             self._record(solution, recording, targets)
-        for s in np.flatnonzero(active):
+        self.system.settle(self.state, self.indenters, good)
+        for s in map(int, np.flatnonzero(active)):
             self._control(self.samples[s], targets[s], bool(good[s]), int(solution.iterations[s]))
 
     def _place(self, at: Sequence[float]) -> None:
@@ -151,7 +151,7 @@ class Stepper:
     def _predicted(self, targets: Sequence[float], active: BoolArray) -> Unknowns:
         """Linear extrapolation where it leaves every det F > 0, else the last state."""
         ratio = np.zeros(len(self.samples))
-        for s in np.flatnonzero(active):
+        for s in map(int, np.flatnonzero(active)):
             sample = self.samples[s]
             corner = sample.path.press_mm
             if sample.previous is not None and not sample.previous < corner <= sample.at:
@@ -174,7 +174,7 @@ class Stepper:
             before = _copy(self.system.contact)
             self.system.augment(solution.state, self.indenters, pending)
             better = solve(self.system, solution.state, self.indenters, pending, tolerance, CORRECTION_ITERATIONS)
-            for s in np.flatnonzero(pending):
+            for s in map(int, np.flatnonzero(pending)):
                 self.samples[s].iterations += int(better.iterations[s])
             failed = pending & ~better.converged
             if failed.any():
@@ -190,7 +190,7 @@ class Stepper:
         solution = self._augmented(solution, recording)
         force, torque, traction = self.system.forces(solution.state)
         residual, deepest = relative_residual(solution.balance), self.system.deepest()
-        for s in np.flatnonzero(recording):
+        for s in map(int, np.flatnonzero(recording)):
             sample, pose = self.samples[s], self.samples[s].path.pose(targets[s])
             sample.states.append(
                 State(
@@ -209,6 +209,7 @@ class Stepper:
             )
             sample.iterations = 0
         _restore(self.system.contact, kept, recording)
+        self.system.balance(self.state, self.indenters, recording)
 
     def _control(self, sample: _Sample, target: float, good: bool, iterations: int) -> None:
         """Longer steps after easy ones; half the step after a failure, and the end below the shortest."""
@@ -226,8 +227,9 @@ class Stepper:
             if sample.step < SHORTEST_STEP * longest:
                 pose = sample.path.pose(sample.at)
                 sample.reason = (
-                    f"Newton's method found no balance {target - sample.at:.2g} mm beyond depth {pose.depth_mm:.3g} mm, "
-                    f"shear {np.hypot(*pose.shear_mm):.3g} mm, twist {pose.twist_deg:.3g} deg"
+                    f"Newton's method found no balance {target - sample.at:.2g} mm beyond "
+                    f"depth {pose.depth_mm:.3g} mm, shear {np.hypot(*pose.shear_mm):.3g} mm, "
+                    f"twist {pose.twist_deg:.3g} deg"
                 )
 
 

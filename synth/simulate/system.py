@@ -297,5 +297,6 @@ class System:
         count = len(self.mesh.contact_nodes)
         area, total = np.zeros(count), np.zeros((self.batch, count, 3))
         np.add.at(area, local, share)
-        np.add.at(total, (slice(None), local), nodal)
+        for s in range(self.batch):
+            np.add.at(total[s], local, nodal[s])
         return force, moment, total / area[:, None]

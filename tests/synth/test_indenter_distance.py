@@ -4,6 +4,8 @@ Each comment "fails with" names a change of `synth.simulate` that was tried.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -98,7 +100,9 @@ def surface(indenter: Indenter) -> FloatArray:
             low = -(height - 2 * f)
             base = -low * np.tan(np.radians(angle))
             flank = rounded([(0, low), (base, low), (0, 0)], f)
-            top = np.linspace(np.radians(angle), np.pi / 2, int(2 * f / SPACING) + 9)  # the rounded tip about the origin
+            top = np.linspace(
+                np.radians(angle), np.pi / 2, int(2 * f / SPACING) + 9
+            )  # the rounded tip about the origin
             tip = f * np.column_stack([np.cos(top), np.sin(top)])
             return revolved(np.concatenate([flank, tip]))
         case Torus(radius_mm=r, tube_mm=t):
@@ -144,7 +148,7 @@ def inside(indenter: Indenter, points: FloatArray) -> np.ndarray:
             low, slope = -(height - 2 * f), np.tan(np.radians(angle))
             share = np.linspace(0, 1, int(4 * height / SPACING))[:, None]
             corners = np.array([(0, 0), (-low * slope, low), (0, low)])
-            sides = np.concatenate([p + share * (q - p) for p, q in zip(corners[:-1], corners[1:], strict=True)])
+            sides = np.concatenate([p + share * (q - p) for p, q in pairwise(corners)])
             core = (z < 0) & (z > low) & (rho < -z * slope)
             return core | (cKDTree(sides).query(np.column_stack([rho, z]))[0] < f)
     raise TypeError(indenter)
@@ -157,8 +161,8 @@ def test_distance_against_sampled_surface(indenter: Indenter) -> None:
     points = scattered(indenter, rng)
     distance, _, _ = measure(rigid_body(indenter), points)
     nearest, _ = cKDTree(surface(indenter)).query(points)
-    # At distance d the nearest sample is at most sqrt(d^2 + s^2) away, s = SPACING (a diagonal of half cells, with room),
-    # and never nearer than the surface; on edges samples lie on their arcs, so the surface itself is exact.
+    # At distance d the nearest sample is at most sqrt(d^2 + s^2) away, s = SPACING (a diagonal of half cells, with
+    # room), and never nearer than the surface; on edges samples lie on their arcs, so the surface itself is exact.
     assert (nearest >= np.abs(distance) - 1e-9).all()
     assert (nearest <= np.sqrt(distance**2 + SPACING**2) + 1e-9).all()
     sure = np.abs(distance) > SPACING
@@ -179,8 +183,8 @@ def test_normal_is_the_gradient(indenter: Indenter) -> None:
         step = h * np.eye(3)[axis]
         (ahead, to, _), (behind, fro, _) = measure(body, points + step), measure(body, points - step)
         slope[:, axis], turning[:, :, axis] = (ahead - behind) / (2 * h), (to - fro) / (2 * h)
-    # Central difference: h^2 times the curvature's slope, 1e-10 * 1 / (0.05 mm)^2 where a fillet's centre is near. A point
-    # within h of a medial axis has no gradient: none of these 400 random points should be, one is allowed.
+    # Central difference: h^2 times the curvature's slope, 1e-10 * 1 / (0.05 mm)^2 where a fillet's centre is near. A
+    # point within h of a medial axis has no gradient: none of these 400 random points should be, one is allowed.
     wrong = np.linalg.norm(slope - normal, axis=1) > 1e-6
     assert wrong.sum() <= 1
     # The derivative of a gradient is symmetric, and it does not turn along the normal.
@@ -207,7 +211,8 @@ def test_points_on_axes_have_a_unit_normal() -> None:
         points = np.array([[0, 0, z] for z in (-3.0, -0.5, 0.0, 0.5, 3.0)], dtype=float)
         distance, normal, _ = measure(rigid_body(indenter), points)
         assert np.isfinite(distance).all()
-        # Fails without the radial part in _revolve: inside a cone and in the middle of a ring the gradient points sideways.
+        # Fails without the radial part in _revolve: inside a cone and in the middle of a ring the gradient points
+        # sideways.
         np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0, atol=1e-12)
 
 
@@ -223,7 +228,8 @@ def test_reach_is_the_highest_point(indenter: Indenter, turn: tuple[float, float
     x, y, z = (rotation_about(axis, np.radians(angle)) for axis, angle in enumerate(turn))
     world = surface(indenter) @ (z @ y @ x).T
     np.testing.assert_allclose(body.rotation, z @ y @ x, atol=1e-15)
-    # Of samples SPACING apart on a surface of radius 0.25 mm or more the highest is SPACING^2 / (2 * 0.25) too low at most.
+    # Of samples SPACING apart on a surface of radius 0.25 mm or more the highest is SPACING^2 / (2 * 0.25) too low at
+    # most.
     assert world[:, 2].max() <= body.reach_mm + 1e-9
     assert body.reach_mm <= world[:, 2].max() + SPACING**2 / 0.5
 
@@ -267,13 +273,13 @@ def test_mesh_of_a_sphere_is_the_sphere(tmp_path: Path, flip: bool) -> None:
     distance, normal, _ = measure(body, points)
     exact, radial, _ = measure(rigid_body(SPHERE), points)
     near = np.abs(exact) < 0.25  # two cells from the grid's border, where the spline's end condition is forgotten
-    # Facets of edge e = 1.5 * 1.1 / 16 = 0.1 mm lie e^2 / (6 r) = 1.2e-3 mm inside the ball at their middle; the spline of
-    # the piecewise smooth distance adds less. Their normals are off by e / (2 r) = 0.035 at most.
+    # Facets of edge e = 1.5 * 1.1 / 16 = 0.1 mm lie e^2 / (6 r) = 1.2e-3 mm inside the ball at their middle; the
+    # spline of the piecewise smooth distance adds less. Their normals are off by e / (2 r) = 0.035 at most.
     np.testing.assert_allclose(distance[near], exact[near], atol=2.5e-3)
     assert (np.linalg.norm(normal - radial, axis=1)[near] < 0.04).all()
     assert body.reach_mm == pytest.approx(1.5, abs=2.5e-3)
-    # Beyond the grid, which ends 0.4 mm off the ball's box, distances are those to the border and from there: still right
-    # in sign, and less than a quarter off.
+    # Beyond the grid, which ends 0.4 mm off the ball's box, distances are those to the border and from there: still
+    # right in sign, and less than a quarter off.
     far = np.array([[4.0, 0.0, 0.0], [0.0, -3.0, 2.0], [2.5, 2.5, 2.5]])
     np.testing.assert_allclose(measure(body, far)[0], np.linalg.norm(far, axis=1) - 1.5, rtol=0.25)
 
@@ -291,6 +297,16 @@ def test_mesh_normal_is_the_gradient(tmp_path: Path) -> None:
     # The normal is the spline's unit gradient; the gradient's own length is 1 to within the facets' angle, 0.035.
     np.testing.assert_allclose(slope / np.linalg.norm(slope, axis=1, keepdims=True), normal, atol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(slope, axis=1), 1.0, atol=0.04)
+
+
+def test_grid_in_a_larger_batch_is_read_to_its_own_end(tmp_path: Path) -> None:
+    # Fails with the shape of `coefficients` for the grid's own counts in _grid.
+    ball(tmp_path)
+    body = rigid_body(MeshIndenter(shape="mesh", file="ball.stl", cell_mm=0.3), tmp_path)
+    padded = replace(body, coefficients=np.pad(body.coefficients, ((0, 9), (0, 20), (0, 3))))
+    points = np.random.default_rng(5).uniform(-4.0, 4.0, (200, 3))
+    for alone, together in zip(measure(body, points), measure(padded, points), strict=True):
+        assert (alone == together).all()
 
 
 def test_mesh_scale_and_turn(tmp_path: Path) -> None:

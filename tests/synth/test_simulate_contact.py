@@ -131,8 +131,8 @@ def test_tangent_is_the_derivative_of_the_residual(friction: float, shape: str) 
         assert (modes[0] == modes[1]).all()
         difference = (ends[0] - ends[1]) / (2 * h)
         along = np.concatenate([direction.u.ravel(), direction.p.ravel()])[body.free]
-        # Central difference: rounding 1e-16 * 1e2 / 1e-6 of the residual and h^2 of its third derivative; the kernels' H
-        # is a central difference itself (1e-9).
+        # Central difference: rounding 1e-16 * 1e2 / 1e-6 of the residual and h^2 of its third derivative; the
+        # kernels' H is a central difference itself (1e-9).
         assert np.linalg.norm(matrix @ along - difference) < 1e-6 * np.linalg.norm(difference)
 
 
@@ -174,7 +174,7 @@ def test_nodal_forces_and_moments_are_the_tractions() -> None:
 
 
 def test_law_does_not_depend_on_the_frame() -> None:
-    """Gel, indenter and anchors turned together about z: tractions turn with them, because anchors are the indenter's."""
+    """Gel and indenter turned together about z: tractions turn with them, because anchors are the indenter's."""
     # Fails with anchors or multipliers kept in world axes.
     made = touch(0.7)
     before = made.body.traction.numpy()[0].copy()

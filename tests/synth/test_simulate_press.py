@@ -8,7 +8,7 @@ from pathlib import Path as FilePath
 
 import numpy as np
 import pytest
-from pads import SIZE, brick, scene
+from pads import brick, scene
 
 import synth.simulate.linear as linear
 import synth.simulate.stepping as stepping
@@ -85,7 +85,8 @@ def test_window_bears_what_the_indenter_does(friction: float) -> None:
     balance = body.balance(stepper.state, stepper.indenters, np.array([True]))
     force, moment, _ = (values[0] for values in body.forces(stepper.state))
     held = balance.reaction[0] * MESH.bonded[:, None]
-    # What is left on the free nodes is the residual: 1e-6 of the nodal forces' norm, on some 100 nodes and arms of 5 mm.
+    # What is left on the free nodes is the residual: 1e-6 of the nodal forces' norm, on some 100 nodes and arms of 5
+    # mm.
     scale = 10 * TOLERANCE * np.linalg.norm(balance.reaction)
     assert np.linalg.norm(force) > 1e3 * scale
     np.testing.assert_allclose(held.sum(axis=0), -force, atol=scale)
@@ -173,27 +174,31 @@ def test_twist_turns_the_gel_along(twist: float) -> None:
 def test_long_shear_slides_at_the_friction_coefficient() -> None:
     """A flat punch dragged far slips everywhere: |t_T| = mu t_n at each point, and T / N tends to mu."""
     # Fails with the limit of _returned halved, or with anchors of slipping points not dragged along.
-    mu = 0.15
-    stepper = run(scene(indenter=PUNCH, friction=mu, motion={"depth_mm": 0.4, "shear_mm": [2.5, 0.0], "steps": 3}))
+    mu = 0.3
+    motion = {"depth_mm": 0.4, "shear_mm": [3.0, 0.0], "position_mm": [-1.8, 0.0], "steps": 4}
+    stepper = run(scene(indenter=PUNCH, friction=mu, motion=motion, numerics={"max_step_mm": 0.1}))
     body, last = stepper.system, stepper.samples[0].states[-1]
     stepper._place([stepper.samples[0].at])
     body.balance(stepper.state, stepper.indenters, np.array([True]))
-    along = body.tangential.numpy()[0]
-    pressure = np.linalg.norm(body.traction.numpy()[0] - along, axis=-1)
-    length = np.linalg.norm(along, axis=-1)
+    along, weight = body.tangential.numpy()[0], body._faces.weight.numpy()
+    normal = body.traction.numpy()[0] - along
+    pressure, length = np.linalg.norm(normal, axis=-1), np.linalg.norm(along, axis=-1)
     assert (length <= mu * pressure * (1 + 1e-9)).all()
-    weight = body._faces.weight.numpy()
     slipping = length >= mu * pressure * (1 - 1e-6)
-    # All but what touched in the last steps, at the leading edge, slips.
-    assert (weight * pressure)[slipping].sum() > 0.95 * (weight * pressure).sum()
-    # Pulled against the drag by mu N; normals of the rounded rim lean, some 0.2 over a tenth of the load.
-    assert last.force_n[0] / last.force_n[2] == pytest.approx(mu, abs=0.02)
-    assert abs(last.force_n[1]) < 0.01 * last.force_n[2]
+    # All slips but what touched in the last step, which has no friction yet: 0.1 mm of 4 mm, some 3 %.
+    assert (weight * pressure)[slipping].sum() > 0.97 * (weight * pressure).sum()
+    pull = np.einsum("fq,fqc->c", weight, along)
+    load = np.einsum("fq,fqc->c", weight, normal)
+    assert pull[0] / load[2] == pytest.approx(mu, rel=0.03)
+    assert abs(pull[1]) < 0.01 * pull[0]
+    # The recorded force has the pressure's sideways part, too: the rim's normals lean by up to a fifth.
+    assert last.force_n[0] / last.force_n[2] == pytest.approx(mu + load[0] / load[2], rel=0.05)
 
 
 def test_each_of_a_batch_is_as_if_it_were_alone(tmp_path: FilePath) -> None:
-    """Six very different scenes, bitwise: no touch, no friction, friction, two mesh indenters of unequal grids, failure."""
-    # Fails with one matrix for all (symmetric or not), with Pardiso's matching, with a grid read up to the batch's size.
+    """Six very different scenes, bitwise: no touch, no friction, friction, and mesh indenters of unequal grids."""
+    # Fails with one matrix for all (symmetric or not), with Pardiso's matching, with a strided right side in
+    # PardisoSolver.solve or a strided residual in System.balance.
     import pyvista as pv
 
     pv.Icosphere(radius=2.5, nsub=3).save(tmp_path / "large.stl")
@@ -204,7 +209,9 @@ def test_each_of_a_batch_is_as_if_it_were_alone(tmp_path: FilePath) -> None:
         gentle(friction=0.0),
         gentle(gel={"youngs_modulus_kpa": 50.0}, indenter=PUNCH, motion=short),
         gentle(indenter={"shape": "mesh", "file": "large.stl", "cell_mm": 0.3}, motion=short),
-        gentle(indenter={"shape": "mesh", "file": "small.stl", "cell_mm": 0.25}, motion={**short, "position_mm": [-1, 1]}),
+        gentle(
+            indenter={"shape": "mesh", "file": "small.stl", "cell_mm": 0.25}, motion={**short, "position_mm": [-1, 1]}
+        ),
         gentle(indenter={"shape": "torus", "radius_mm": 1.5, "tube_mm": 0.7}, motion=short),
     ]
     together = simulate_batch(scenes, MESH, tmp_path)
@@ -231,7 +238,9 @@ def test_no_touch_needs_no_solve(monkeypatch: pytest.MonkeyPatch) -> None:
     for depth in (-0.5, 0.0):
         result = simulate(gentle(motion={**DRAG, "depth_mm": depth}), MESH)
         assert (result.status, len(result.states)) == ("complete", 5)
-        assert not any(state.displacement.any() or state.traction.any() or any(state.force_n) for state in result.states)
+        assert not any(
+            state.displacement.any() or state.traction.any() or any(state.force_n) for state in result.states
+        )
         assert result.states[-1].depth_mm == depth
         assert result.states[-1].shear_mm == pytest.approx((0.8, -0.3))
 
@@ -254,20 +263,25 @@ def test_slides_off_the_pad() -> None:
     assert np.abs(result.states[-1].force_n).max() < 1e-9
 
 
+WIRE = scene(
+    indenter={"shape": "torus", "radius_mm": 1.5, "tube_mm": 0.3},
+    friction=0.2,
+    motion={"depth_mm": 3.3, "steps": 8},
+    numerics={"edge_length_mm": 0.1},
+)
+"""A ring of thin wire pressed through four fifths of a pad whose faces are three times as wide as the wire."""
+
+
 def test_hopeless_press_ends_honestly() -> None:
-    motion = {"depth_mm": 3.2, "steps": 8}
-    needle = {"shape": "cone", "half_angle_deg": 10.0, "height_mm": 10.0, "fillet_mm": 0.1}
-    result = simulate(scene(indenter=needle, friction=0.3, motion=motion), MESH)
-    assert result.status in ("partial", "failed")
+    result = simulate(WIRE, MESH)
+    assert result.status == "partial"
     assert "no balance" in result.reason
-    assert len(result.states) < 9
-    assert (result.status == "failed") == (len(result.states) == 1)
+    assert 1 < len(result.states) < 9
     for state in result.states:
         assert state.residual <= TOLERANCE
         assert state.min_jacobian > 0
         assert np.isfinite(state.displacement).all()
-        # A rigid needle this thin meets no more than the whole pad squeezed flat does.
-        assert abs(state.force_n[2]) < 0.2 * SIZE[0] * SIZE[1]
+        assert 0 <= state.force_n[2] < 20.0  # N; a pad squeezed flat by a whole ball takes some 40
 
 
 @pytest.mark.parametrize("broken", ["singular", "nonsense"])
@@ -283,12 +297,11 @@ def test_a_solver_that_fails_is_a_failed_trajectory(monkeypatch: pytest.MonkeyPa
     assert "no balance" in result.reason
 
 
-def test_one_bad_sample_does_not_spoil_its_batch(monkeypatch: pytest.MonkeyPatch) -> None:
-    needle = {"shape": "cone", "half_angle_deg": 10.0, "height_mm": 10.0, "fillet_mm": 0.1}
-    bad = scene(indenter=needle, friction=0.3, motion={"depth_mm": 3.2, "steps": 8})
-    lost, kept = simulate_batch([bad, gentle()], MESH)
-    assert lost.status != "complete"
-    assert same(kept, dragged())
+def test_one_bad_sample_does_not_spoil_its_batch() -> None:
+    numerics = {"edge_length_mm": 0.1}
+    lost, kept = simulate_batch([WIRE, gentle(numerics=numerics)], MESH)
+    assert lost.status == "partial"
+    assert same(kept, simulate(gentle(numerics=numerics), MESH))
 
 
 def test_step_length_does_not_change_a_press_without_friction() -> None:
@@ -301,17 +314,18 @@ def test_step_length_does_not_change_a_press_without_friction() -> None:
         assert end.force_n[2] == pytest.approx(ends[0].force_n[2], rel=10 * TOLERANCE)
 
 
-def test_friction_converges_with_the_step() -> None:
-    """The error of friction's history goes down with the step: a quarter of the step, less than half the change."""
+def test_friction_hardly_depends_on_the_step() -> None:
+    """The way is remembered with an error that vanishes with the step: 1 % between steps of 0.2 and 0.0125 mm."""
+    # Fails with anchors set to the position at the start of the path, or left where they first were.
     motion = {"depth_mm": 0.6, "shear_mm": [0.5, 0.0], "steps": 2}
 
     def pull(h: float) -> float:
         posed = scene(friction=0.4, motion=motion, numerics={"max_step_mm": h})
         return simulate(posed, MESH).states[-1].force_n[0]
 
-    coarse, middle, fine = pull(0.2), pull(0.05), pull(0.0125)
-    assert abs(middle - fine) < 0.5 * abs(coarse - fine)
-    assert coarse == pytest.approx(fine, rel=0.1)
+    fine = pull(0.0125)
+    assert pull(0.2) == pytest.approx(fine, rel=0.01)
+    assert pull(0.05) == pytest.approx(fine, rel=0.01)
 
 
 def test_correction_passes_take_penetration_away(monkeypatch: pytest.MonkeyPatch) -> None:

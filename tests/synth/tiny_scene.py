@@ -1,9 +1,20 @@
 """A scene that takes the whole chain about a second: a small pad, a coarse mesh, 32 x 24 pixels, real everything else."""
 
+import atexit
+import functools
 import hashlib
 import json
+import os
+import shutil
+import tempfile
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+
+import pytest
+
+from synth.generate import generate
+from synth.template import load_scene
 
 SENSOR = """
 name = "tiny"
@@ -94,3 +105,28 @@ def fingerprint(dataset: Path) -> dict[str, Any]:
     lines = (dataset / "manifest.jsonl").read_text().splitlines()
     found["manifest.jsonl"] = [without_times(json.loads(line)) for line in lines]
     return found
+
+
+@functools.cache
+def _home() -> Path:
+    """A folder for this test session."""
+    folder = Path(tempfile.mkdtemp(prefix="synth-tests-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
+def own_cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep meshes apart from the user's and share them within the session; Warp's compiled kernels stay where they are."""
+    kept = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    monkeypatch.setenv(
+        "WARP_CACHE_PATH", os.environ.get("WARP_CACHE_PATH") or str(kept / "warp" / version("warp-lang"))
+    )
+    monkeypatch.setenv("XDG_CACHE_HOME", str(_home() / "cache"))
+
+
+@functools.cache
+def reference() -> Path:
+    """Five samples of the scene, seed 0, made in one go in this process; made once per session, after `own_cache`."""
+    out = _home() / "reference"
+    generate(load_scene(write_tiny(_home())), 5, out)
+    return out

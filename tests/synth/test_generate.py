@@ -1,0 +1,235 @@
+"""The whole chain in one process: what lands on disk, going on, growing, and draws that fail."""
+
+import json
+import resource
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_scene import fingerprint, own_cache, reference, write_tiny
+
+from synth.dataset.reader import read_dataset
+from synth.errors import InputError
+from synth.generate import generate, job_variant
+from synth.sampling import draw
+from synth.template import Template, load_scene
+from synth.verify import verify_dataset
+
+
+@pytest.fixture(autouse=True)
+def _cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One mesh for all runs: the mesher is random."""
+    own_cache(monkeypatch)
+
+
+@pytest.fixture
+def tiny(tmp_path: Path) -> Path:
+    return write_tiny(tmp_path)
+
+
+def test_the_dataset_is_what_was_asked_for_and_verifies() -> None:
+    dataset = read_dataset(reference())
+    assert dataset.samples == [0, 1, 2, 3, 4]  # of three trajectories of two: the last one is not finished
+    assert [dataset.entry(i).trajectory for i in range(5)] == [0, 0, 1, 1, 2]
+    assert dataset.failures == []
+    assert dataset.info["n"] == 5
+    assert set(dataset.info["software"]) >= {"gelflow-synth", "mitsuba", "warp-lang", "pytetwild"}
+    for index in range(5):
+        entry, sample = dataset.entry(index), dataset.read(index)
+        assert entry.force_n[1][2] > 0  # a press
+        assert set(entry.seconds) == {"simulate", "render", "flow", "write"}
+        assert entry.max_flow_px is not None
+        assert entry.max_flow_px > 0.05  # 0.1 mm of depth or more at 4 px per mm
+        assert sample.image1.shape == (24, 32, 3)
+        assert sample.image1.std() > 5  # dots and lights are in it
+    assert dataset.entry(0).frames[0] == 0
+    report = verify_dataset(reference())
+    assert report.ok, report.record()
+
+
+def test_trajectories_of_one_sensor_show_the_same_undeformed_gel() -> None:
+    """Samples 0 and 2 are of one sensor: their first images differ by the camera's noise only, sample 4's by its dots."""
+    dataset = read_dataset(reference())
+    first = [dataset.read(i).image1.astype(float) for i in (0, 2, 4)]
+    assert dataset.scene_of(0).sensor == dataset.scene_of(2).sensor != dataset.scene_of(4).sensor
+    # read_noise 0.002 in linear light is at most 255 * 0.002 ** (1 / 2.2) = 15 levels in black, and 0.2 in white.
+    assert 0 < np.abs(first[0] - first[1]).mean() < 3
+    assert np.abs(first[0] - first[2]).mean() > 5
+
+
+def test_growing_in_steps_gives_the_same_files(tiny: Path, tmp_path: Path) -> None:
+    """1, then 3 (which finishes a trajectory and begins another), then 5; n is in dataset.json alone."""
+    template = load_scene(tiny)
+    out = tmp_path / "grown"
+    made = [(s.made, s.found) for s in (generate(template, n, out) for n in (1, 3, 5, 5, 2))]
+    assert made == [(1, 0), (2, 1), (2, 3), (0, 5), (0, 2)]
+    assert fingerprint(out) == fingerprint(reference())
+
+
+def test_a_lost_folder_and_a_foreign_line_are_made_good(tiny: Path, tmp_path: Path) -> None:
+    """Deleted files, a torn line and leftovers of a killed writer."""
+    import shutil
+
+    out = tmp_path / "mended"
+    shutil.copytree(reference(), out)
+    (out / "samples" / "000002" / "flow.exr").unlink()
+    shutil.rmtree(out / "samples" / "000004")
+    (out / "samples" / ".000003.partial-1").mkdir()
+    with (out / "manifest.jsonl").open("a") as file:
+        file.write('{"index": 5, "tra')
+    summary = generate(load_scene(tiny), 5, out)
+    assert (summary.made, summary.found) == (2, 3)
+    assert fingerprint(out) == fingerprint(reference())
+
+
+def test_progress_counts_up_to_n(tiny: Path, tmp_path: Path) -> None:
+    calls = []
+    template = load_scene(tiny, ["motion.depth_mm=-1"])  # no touch: fast
+    summary = generate(template, 3, tmp_path / "d", progress=lambda done, total: calls.append((done, total)))
+    assert calls == [(2, 3), (3, 3)]
+    assert summary.seconds > sum(summary.stages.values()) > 0
+    entry = read_dataset(tmp_path / "d").entry(0)
+    assert entry.max_flow_px == pytest.approx(0, abs=1e-4)  # float32 of a pixel number: 32 * 2^-24
+
+
+@pytest.mark.parametrize(
+    ("changes", "difference"),
+    [
+        ({"seed": 1}, "seed: 0 there, 1 now"),
+        ({"overrides": ["motion.steps=3"]}, "scene.motion.steps: 2 there, 3 now"),
+        ({"overrides": ["motion.depth_mm=0.1"]}, "scene.motion.depth_mm: "),
+        ({"variant": "another"}, "device.variant: "),
+    ],
+)
+def test_a_directory_of_another_job_is_refused_and_left_alone(tiny: Path, changes: dict, difference: str) -> None:
+    template = load_scene(tiny, changes.get("overrides", ()))
+    variant = job_variant(template, "cpu")
+    if "variant" in changes:
+        variant = type(variant)("scalar_rgb" if variant.is_vectorised else "llvm_ad_rgb", "")
+    before = fingerprint(reference())
+    with pytest.raises(InputError, match="holds another job") as caught:
+        generate(template, 5, reference(), changes.get("seed", 0), variant)
+    assert difference in str(caught.value)
+    assert fingerprint(reference()) == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [({"n": 0}, "--n = 0"), ({"n": 1, "seed": -1}, "--seed = -1"), ({"n": 1, "workers": 0}, "--workers = 0")],
+)
+def test_wrong_numbers_write_nothing(tiny: Path, tmp_path: Path, arguments: dict, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        generate(load_scene(tiny), directory=tmp_path / "d", **arguments)
+    assert not (tmp_path / "d").exists()
+
+
+def test_a_scene_that_cannot_be_built_writes_nothing(tiny: Path, tmp_path: Path) -> None:
+    template = load_scene(tiny, ['contact.indenter={ shape = "torus", radius_mm = 1, tube_mm = 2 }'])
+    with pytest.raises(InputError, match="tube_mm"):
+        generate(template, 1, tmp_path / "d")
+    assert not (tmp_path / "d").exists()
+
+
+def _first_seed_whose_draws(template: Template, wanted: list[bool]) -> int:
+    """A seed for which the attempts of trajectory 0 fit the schema as wanted."""
+
+    def fits(seed: int, attempt: int) -> bool:
+        try:
+            draw(template, seed, 0, attempt)
+        except InputError:
+            return False
+        return True
+
+    return next(seed for seed in range(1000) if [fits(seed, k) for k in range(len(wanted))] == wanted)
+
+
+def test_failed_draws_are_logged_and_redrawn_the_same_way_in_every_run(tiny: Path, tmp_path: Path) -> None:
+    """A depth of which many draws are more than the gel's thickness; going on logs nothing twice."""
+    template = load_scene(tiny, ["motion.depth_mm={ normal = [-1.5, 4.0] }"])
+    seed = _first_seed_whose_draws(template, [False, False, True])
+    whole = generate(template, 3, tmp_path / "whole", seed)
+    assert whole.failed_draws >= 2
+    assert whole.given_up == ()
+    failures = read_dataset(tmp_path / "whole").failures
+    assert [(f["index"], f["draw"], f["stage"]) for f in failures[:2]] == [(0, 0, "draw"), (0, 1, "draw")]
+    assert "motion.depth_mm" in failures[0]["reason"]
+    assert failures[0]["last_good_state"] is None
+    generate(template, 1, tmp_path / "parts", seed)
+    generate(template, 3, tmp_path / "parts", seed)
+    assert fingerprint(tmp_path / "parts") == fingerprint(tmp_path / "whole")
+
+
+def test_a_simulation_that_fails_is_logged_with_its_last_good_state_and_redrawn(tiny: Path, tmp_path: Path) -> None:
+    """Stuck to a ball that moves by twice its thickness the gel tears; should the solver learn it, ask for more here."""
+    hard = ["contact.friction=10", "motion.depth_mm=1.0", "numerics.max_step_mm=2.0"]
+    template = load_scene(tiny, [*hard, "motion.shear_mm={ choice = [[0.05, 0.0], [4.9, 4.9]] }", "motion.steps=2"])
+
+    def is_wanted(seed: int) -> bool:
+        return [draw(template, seed, 0, attempt).motion.shear_mm[0] for attempt in (0, 1)] == [4.9, 0.05]
+
+    seed = next(seed for seed in range(1000) if is_wanted(seed))
+    summary = generate(template, 1, tmp_path / "d", seed)
+    assert (summary.made, summary.failed_draws) == (1, 1)
+    (failure,) = read_dataset(tmp_path / "d").failures
+    assert (failure["index"], failure["draw"], failure["stage"]) == (0, 0, "simulate")
+    assert "Newton" in failure["reason"]
+    assert failure["last_good_state"]["converged"]
+    assert failure["last_good_state"]["shear_mm"][0] < 4.9
+    assert read_dataset(tmp_path / "d").scene_of(0).motion.shear_mm == (0.05, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("override", "stage"),
+    [
+        ("motion.depth_mm={ normal = [0.2, 1e9] }", "draw"),
+        ("sensor.camera.vignetting={ normal = [0.0, 1e9] }", "sensor"),
+    ],
+)
+def test_samples_whose_every_draw_fails_are_given_up(tiny: Path, tmp_path: Path, override: str, stage: str) -> None:
+    template = load_scene(tiny, [override])
+    for _ in range(2):  # again: neither more samples nor more lines
+        summary = generate(template, 3, tmp_path / "d")
+        assert (summary.made, summary.given_up, summary.failed_draws) == (0, (0, 1, 2), 20)
+        dataset = read_dataset(tmp_path / "d")
+        assert dataset.samples == []
+        assert [(f["index"], f["draw"]) for f in dataset.failures] == [(i, k) for i in (0, 2) for k in range(10)]
+        assert {f["stage"] for f in dataset.failures} == {stage}
+
+
+@pytest.fixture
+def largest_file() -> Iterator[None]:
+    """No file may become larger than 6000 bytes: a write beyond that fails as on a full disk, at the same place."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (6000, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.usefixtures("largest_file")
+def test_a_mesh_that_cannot_be_kept_stops_the_job(tiny: Path, tmp_path: Path) -> None:
+    """Without it every trajectory would be computed on a mesh of its own."""
+    with pytest.raises(InputError, match=r"meshes/\w+\.npz: the mesh cannot be written"):
+        generate(load_scene(tiny), 1, tmp_path / "d")
+    assert list((tmp_path / "d" / "samples").iterdir()) == []
+
+
+def test_a_full_disk_loses_nothing_and_tears_nothing(tiny: Path, tmp_path: Path, request) -> None:
+    """The second half of the job meets the limit; with space again, it ends as if nothing had been."""
+    template, out = load_scene(tiny), tmp_path / "d"
+    generate(template, 2, out)
+    finished = fingerprint(out)
+    request.getfixturevalue("largest_file")
+    with pytest.raises(InputError, match="cannot be written: .*File too large.*finished before is safe"):
+        generate(template, 5, out)
+    now = fingerprint(out)
+    assert {k: v for k, v in now.items() if k != "dataset.json"} == {
+        k: v for k, v in finished.items() if k != "dataset.json"
+    }
+    assert json.loads((out / "dataset.json").read_text())["n"] == 5
+    soft = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, soft))
+    generate(template, 5, out)
+    assert fingerprint(out) == fingerprint(reference())

@@ -1,0 +1,187 @@
+"""Who may import whom, what stays unloaded, and how long a file may be."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from tiny_scene import own_cache, write_tiny
+
+ROOT = Path(__file__).parents[2]
+STAGES = (
+    "synth",  # the package itself: its version
+    "synth.errors",
+    "synth.arrays",
+    "synth.dataset.storage",  # how a file gets to the disk as a whole; knows nothing of datasets
+    "synth.scene",
+    "synth.schema_errors",
+    "synth.template",
+    "synth.surface",
+    "synth.optics",
+    "synth.mesh",
+    "synth.simulate",
+    "synth.render",
+    "synth.sampling",
+    "synth.flow",
+    "synth.dataset",
+    "synth.verify",
+    "synth.inspection",
+    "synth.plan",
+    "synth.produce",
+    "synth.processes",
+    "synth.generate",
+    "synth.doctor",
+    "synth.commands",
+    "synth.cli",
+    "synth.__main__",
+)
+"""A module imports from its own stage and from those above it in this list, never from those below."""
+
+HEAVY = {
+    "numpy", "scipy", "pydantic", "mitsuba", "drjit", "warp", "pytetwild", "pyvista", "vtk", "vtkmodules", "cv2", "skimage",
+    "matplotlib", "torch", "lightning", "torchmetrics", "OpenEXR", "ray", "pypardiso", "fsspec", "tensorboard",
+}  # fmt: skip
+
+
+def _modules(package: str) -> dict[str, ast.Module]:
+    """Parsed modules by dotted name."""
+    found = {}
+    for path in sorted((ROOT / package).rglob("*.py")):
+        parts = path.relative_to(ROOT).with_suffix("").parts
+        name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+        found[name] = ast.parse(path.read_text(encoding="utf-8"), str(path))
+    return found
+
+
+def _imports(name: str, tree: ast.Module, is_package: bool) -> set[str]:
+    """Dotted names of everything that a module imports, wherever in it; `from a import b` counts as a.b if that is one."""
+    found: set[str] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                above = name.split(".")[: None if is_package and node.level == 1 else -(node.level - is_package)]
+                base = ".".join([*above, *([base] if base else [])])
+            found |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
+    return found
+
+
+def _stage(module: str) -> int:
+    """Number of the most specific stage that a module lies in."""
+    fitting = [stage for stage in STAGES[1:] if module == stage or module.startswith(f"{stage}.")]
+    return STAGES.index(max(fitting, key=len)) if fitting else 0
+
+
+SYNTH = _modules("synth")
+GELFLOW = _modules("gelflow")
+
+
+def _imports_of(modules: dict[str, ast.Module]) -> dict[str, set[str]]:
+    packages = {name.rpartition(".")[0] for name in modules}
+    return {name: _imports(name, tree, name in packages) for name, tree in modules.items()}
+
+
+def test_every_module_has_a_stage() -> None:
+    assert len(SYNTH) > 80
+    assert [name for name in SYNTH if name != "synth" and _stage(name) == 0] == []
+    assert [stage for stage in STAGES if stage not in SYNTH] == []
+
+
+def test_synth_imports_only_from_earlier_stages() -> None:
+    wrong = [
+        f"{name} imports {imported}, which comes later"
+        for name, all_imported in _imports_of(SYNTH).items()
+        for imported in sorted(all_imported)
+        if imported in SYNTH and _stage(imported) > _stage(name)
+    ]
+    assert wrong == []
+
+
+def test_the_finder_of_imports_sees_every_form() -> None:
+    """A test of the test: one that finds nothing would pass always."""
+    source = """
+import synth.cli
+from synth import generate
+from synth.commands import run_plan as r
+def f():
+    from . import plan
+    from .mesh.pad import PadMesh
+    if True:
+        import torch.nn as nn
+"""
+    found = _imports("synth.errors", ast.parse(source), False)
+    assert {"synth.cli", "synth.generate", "synth.commands", "synth.plan", "synth.mesh.pad", "torch.nn"} <= found
+    assert "synth.simulate.path" in _imports("synth.simulate", ast.parse("from .path import Path"), True)
+    assert _stage("synth.dataset.storage") < _stage("synth.simulate.files") < _stage("synth.dataset.writer")
+
+
+@pytest.mark.parametrize(
+    ("modules", "forbidden"),
+    [
+        (SYNTH, {"gelflow", "torch", "lightning", "torchmetrics"}),
+        (GELFLOW, {"synth", "warp", "mitsuba", "drjit", "pytetwild", "pypardiso", "pyvista"}),
+    ],
+    ids=["synth", "gelflow"],
+)
+def test_the_two_programs_share_nothing(modules: dict[str, ast.Module], forbidden: set[str]) -> None:
+    wrong = [
+        f"{name} imports {imported}"
+        for name, all_imported in _imports_of(modules).items()
+        for imported in sorted(all_imported)
+        if imported.split(".")[0] in forbidden
+    ]
+    assert wrong == []
+
+
+def _loaded_after(code: str, *arguments: str) -> set[str]:
+    """Top-level modules that a fresh interpreter holds after `code`."""
+    report = "\nimport sys\nsys.stderr.write('\\nLOADED ' + ' '.join({name.split('.')[0] for name in sys.modules}))"
+    done = subprocess.run(
+        [sys.executable, "-c", code + report, *arguments], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    return set(done.stderr.rpartition("LOADED ")[2].split())
+
+
+MAIN = "import sys\nfrom {0}.cli import main\nassert main(sys.argv[1:]) == 0"
+
+
+@pytest.mark.parametrize(
+    ("code", "arguments"),
+    [
+        ("import synth", ()),
+        ("import gelflow", ()),
+        (MAIN.format("synth"), ("--help",)),
+        (MAIN.format("synth"), ("generate", "--help")),
+        (MAIN.format("synth"), ("--version",)),
+        (MAIN.format("gelflow"), ("--help",)),
+        (MAIN.format("gelflow"), ("train", "--help")),
+    ],
+    ids=lambda value: "" if isinstance(value, str) else " ".join(value),
+)
+def test_help_loads_nothing_heavy(code: str, arguments: tuple[str, ...]) -> None:
+    """The reason that it answers in a fraction of a second; seconds themselves depend on the machine."""
+    assert _loaded_after(code, *arguments) & HEAVY == set()
+
+
+def test_simulate_loads_no_renderer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    own_cache(monkeypatch)
+    scene = write_tiny(tmp_path)
+    loaded = _loaded_after(
+        MAIN.format("synth"), "simulate", "--scene", str(scene), "--out", str(tmp_path / "out"), "--json"
+    )
+    assert "warp" in loaded
+    assert not loaded & {"mitsuba", "drjit", "torch", "matplotlib", "OpenEXR"}
+    assert (tmp_path / "out" / "trajectory.json").exists()
+
+
+def test_files_stay_short() -> None:
+    long = [
+        f"{path.relative_to(ROOT)}: {count} lines"
+        for package in ("synth", "gelflow")
+        for path in sorted((ROOT / package).rglob("*.py"))
+        if (count := len(path.read_text(encoding="utf-8").splitlines())) > 350
+    ]
+    assert long == []

@@ -1,0 +1,163 @@
+"""The refined contact surface: one closed sheet that interpolates the nodes and keeps affine and quadratic fields.
+
+Each comment "fails with" names a change of `synth.surface` that was tried.
+"""
+
+import numpy as np
+import pytest
+from pads import SIZE, brick, crooked
+
+from synth.arrays import FloatArray, Points
+from synth.surface import ContactFaces, GelSurface
+
+CROOKED = crooked((3.0, 2.0, 2.0)).contact_faces
+REGULAR = brick(SIZE, (8, 6, 1)).contact_faces
+SUBDIVISIONS = [1, 2, 3, 4, 5]
+
+
+def edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Each edge once, and how many triangles it belongs to."""
+    pairs = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    return np.unique(pairs, axis=0, return_counts=True)
+
+
+def normals(points: Points, triangles: np.ndarray) -> FloatArray:
+    a, b, c = (points[triangles[:, i]] for i in range(3))
+    return np.asarray(np.cross(b - a, c - a))
+
+
+def at(surface: GelSurface, nodes: Points) -> np.ndarray:
+    """Refined vertices that are the coarse nodes."""
+    distance = np.linalg.norm(surface.material[:, None] - nodes[None], axis=2)
+    assert np.allclose(distance.min(axis=0), 0.0, atol=1e-14)
+    return distance.argmin(axis=0)
+
+
+@pytest.mark.parametrize("n", SUBDIVISIONS)
+@pytest.mark.parametrize("coarse", [CROOKED, REGULAR], ids=["crooked", "regular"])
+def test_refined_sheet_is_one_and_conforming(coarse: ContactFaces, n: int) -> None:
+    """Every vertex is shared: a rectangle stays one disc (V - E + F = 1) with each inner edge between two triangles."""
+    # Fails with labels whose pairs of weight 0 are not moved to one place (vertices on shared edges double).
+    surface = GelSurface(coarse, n)
+    pairs, count = edges(surface.triangles)
+    assert len(surface.triangles) == n * n * len(coarse.faces)
+    assert len(surface.material) - len(pairs) + len(surface.triangles) == 1
+    assert set(count) <= {1, 2}
+    half = coarse.nodes[:, :2].max(axis=0)
+    border = surface.material[pairs[count == 1], :2]
+    low, high = (np.isclose(border, end, rtol=0, atol=1e-12).all(axis=1) for end in (-half, half))
+    assert (low | high).any(axis=1).all()
+    assert (np.unique(surface.triangles) == np.arange(len(surface.material))).all()
+
+
+@pytest.mark.parametrize("n", SUBDIVISIONS)
+def test_triangles_keep_area_and_orientation(n: int) -> None:
+    # Fails with two indices exchanged in either kind of small triangle.
+    surface = GelSurface(CROOKED, n)
+    area = normals(surface.material, surface.triangles) / 2
+    assert (area[:, 2] < 0).all()
+    assert -area[:, 2].sum() == pytest.approx(6.0, rel=1e-12)
+    whole = np.repeat(normals(CROOKED.nodes, CROOKED.faces)[:, 2] / 2, n * n) / n**2
+    # The n * n parts of a face follow each other and are equal, to rounding.
+    np.testing.assert_allclose(area[:, 2], whole, rtol=1e-9)
+
+
+@pytest.mark.parametrize("n", SUBDIVISIONS)
+def test_nodes_are_interpolated(n: int) -> None:
+    surface = GelSurface(CROOKED, n)
+    nodal = np.random.default_rng(1).standard_normal((len(CROOKED.nodes), 3))
+    found = at(surface, CROOKED.nodes)
+    # One product with the weight 1, and the others with exact zeros.
+    np.testing.assert_allclose(surface.interpolate(nodal)[found], nodal, atol=1e-15)
+    np.testing.assert_allclose(surface.interpolate_linear(nodal)[found], nodal, atol=1e-15)
+    np.testing.assert_allclose(surface.positions(nodal)[found], CROOKED.nodes + nodal, atol=1e-14)
+
+
+@pytest.mark.parametrize("n", SUBDIVISIONS)
+def test_affine_fields_are_exact(n: int) -> None:
+    # Fails with recovered gradients that are not means (weights that do not sum to 1 do not matter here: see
+    # quadratic).
+    surface = GelSurface(CROOKED, n)
+    rng = np.random.default_rng(2)
+    A, b = rng.standard_normal((3, 3)), rng.standard_normal(3)
+    wanted = surface.material @ A.T + b
+    np.testing.assert_allclose(surface.interpolate(CROOKED.nodes @ A.T + b), wanted, atol=1e-13)
+    np.testing.assert_allclose(surface.interpolate_linear(CROOKED.nodes @ A.T + b), wanted, atol=1e-13)
+
+
+def test_a_rigid_motion_moves_the_sheet_rigidly() -> None:
+    surface = GelSurface(CROOKED, 4)
+    turn = np.linalg.qr(np.random.default_rng(3).standard_normal((3, 3)))[0]
+    displacement = CROOKED.nodes @ turn.T + [1.0, -2.0, 0.5] - CROOKED.nodes
+    np.testing.assert_allclose(
+        surface.positions(displacement), surface.material @ turn.T + [1.0, -2.0, 0.5], atol=1e-13
+    )
+
+
+def quadratic(points: Points) -> FloatArray:
+    x, y = points[:, 0], points[:, 1]
+    return np.column_stack([x * x, x * y - 0.5 * y * y, 0.3 * x - 0.2 * x * y + 0.1 * x * x])
+
+
+def smooth(points: Points) -> FloatArray:
+    x, y = points[:, 0], points[:, 1]
+    return np.column_stack([np.sin(0.8 * x + 0.3 * y), np.cos(0.6 * y), np.exp(0.2 * x) * np.sin(0.5 * y)])
+
+
+@pytest.mark.parametrize("n", [2, 4])
+def test_quadratic_fields_are_exact_inside_a_regular_mesh(n: int) -> None:
+    """Where each node's faces are point-symmetric about it the mean gradient is exact, and so is the blend."""
+    # Fails with 0.5 of the correction changed, with x - x_i turned, or without the weights by area (on `crooked` only).
+    surface = GelSurface(REGULAR, n)
+    error = np.abs(surface.interpolate(quadratic(REGULAR.nodes)) - quadratic(surface.material)).max(axis=1)
+    inside = (np.abs(surface.material[:, :2]) <= np.array(SIZE[:2]) / 2 - 1.0).all(axis=1)
+    assert inside.sum() > 20
+    assert error[inside].max() < 1e-12
+    # Piecewise linear interpolation of x^2 between nodes 1 mm apart is 1/4 off in the middle.
+    linear = np.abs(surface.interpolate_linear(quadratic(REGULAR.nodes)) - quadratic(surface.material)).max(axis=1)
+    assert linear[inside].max() > 0.2
+
+
+def test_smooth_fields_converge_at_third_order() -> None:
+    """Halving the edges divides the error inside by 8, where linear interpolation divides it by 4."""
+
+    def errors(cells: int) -> tuple[float, float]:
+        coarse = brick((4.0, 4.0, 1.0), (cells, cells, 1)).contact_faces
+        surface = GelSurface(coarse, 4)
+        inside = (np.abs(surface.material[:, :2]) <= 1.0).all(axis=1)
+        wanted, nodal = smooth(surface.material)[inside], smooth(coarse.nodes)
+        return (
+            float(np.abs(surface.interpolate(nodal)[inside] - wanted).max()),
+            float(np.abs(surface.interpolate_linear(nodal)[inside] - wanted).max()),
+        )
+
+    (coarse, coarse_linear), (fine, fine_linear) = errors(8), errors(16)
+    # The next term of the expansion is an edge length smaller, 0.25 of the leading one at worst: rates 3 and 2, -0.3.
+    assert np.log2(coarse / fine) > 2.7
+    assert 1.7 < np.log2(coarse_linear / fine_linear) < 2.3
+
+
+def test_displaced_sheet_has_no_gaps() -> None:
+    """Both faces at an edge give the same points there, for any nodal values."""
+    surface = GelSurface(CROOKED, 3)
+    nodal = np.random.default_rng(4).standard_normal((len(CROOKED.nodes), 3))
+    moved = surface.positions(nodal)
+    for k, face in enumerate(CROOKED.faces):
+        alone = GelSurface(ContactFaces(CROOKED.nodes, face[None]), 3)
+        own = surface.triangles[9 * k : 9 * k + 9]
+        np.testing.assert_allclose(surface.material[own], alone.material[alone.triangles], atol=1e-14)
+    # What is one vertex has one place: conforming, tested above, leaves no more to ask but that it is finite.
+    assert np.isfinite(moved).all()
+
+
+def test_the_map_is_linear_and_local() -> None:
+    surface = GelSurface(CROOKED, 2)
+    one = np.zeros((len(CROOKED.nodes), 1))
+    node = int(np.argmin(np.linalg.norm(CROOKED.nodes, axis=1)))
+    one[node] = 1.0
+    reached = np.abs(surface.interpolate(one)[:, 0]) > 0
+    near = {int(j) for face in CROOKED.faces if node in face for j in face}
+    ring = [k for k, face in enumerate(CROOKED.faces) if near & set(map(int, face))]
+    allowed = np.unique(surface.triangles.reshape(len(CROOKED.faces), -1)[ring])
+    assert reached.any()
+    assert set(np.flatnonzero(reached)) <= set(allowed)

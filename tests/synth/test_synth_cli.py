@@ -1,0 +1,358 @@
+"""Every command of `python -m synth`: what it prints, writes and returns."""
+
+import ctypes.util
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_scene import fingerprint, own_cache, reference, write_tiny
+
+from synth.cli import main
+
+ROOT = Path(__file__).parents[2]
+COMMANDS = ["generate", "plan", "simulate", "inspect", "verify", "export", "doctor"]
+
+
+@pytest.fixture(autouse=True)
+def _cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One mesh for all runs: the mesher is random."""
+    own_cache(monkeypatch)
+
+
+@pytest.fixture
+def tiny(tmp_path: Path) -> Path:
+    return write_tiny(tmp_path)
+
+
+def _complaint(capsys: pytest.CaptureFixture[str], status: int, expected: int = 2) -> str:
+    """The one thing that was said, on stderr, without a traceback."""
+    out, err = capsys.readouterr()
+    assert status == expected, err
+    assert out == ""
+    assert err.startswith("synth: ")
+    assert "Traceback" not in err
+    return err.removeprefix("synth: ").rstrip()
+
+
+def test_help_lists_every_command(capsys) -> None:
+    assert main(["--help"]) == 0
+    out = capsys.readouterr().out
+    assert all(command in out for command in COMMANDS)
+    assert "--debug" in out
+
+
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [
+        ("generate", ["--scene", "--n", "--out", "--seed", "--set", "--device", "--workers", "--dry-run", "--json"]),
+        ("plan", ["--scene", "--set", "--n", "--device", "--json"]),
+        ("simulate", ["--scene", "--out", "--seed", "--set", "--json"]),
+        ("inspect", ["PATH", "--png", "--html", "--json"]),
+        ("verify", ["PATH", "--json"]),
+        ("export", ["PATH", "--format", "--out"]),
+        ("doctor", ["--json"]),
+    ],
+)
+def test_help_of_a_command_lists_its_options(capsys, command: str, options: list[str]) -> None:
+    assert main([command, "--help"]) == 0
+    out = capsys.readouterr().out
+    assert [option for option in options if option not in out] == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["frobnicate"], 'Unknown command "frobnicate"'),
+        (["generate", "--frobnicate"], "frobnicate"),
+        (["generate", "--n", "0"], "--n: it is '0', allowed are whole numbers from 1 on"),
+        (["generate", "--n", "-3"], "--n: it is '-3'"),
+        (["generate", "--n", "1.5"], "--n: it is '1.5'"),
+        (["generate", "--n", "many"], "--n: it is 'many'"),
+        (["generate", "--seed", "-1"], "--seed: it is '-1', allowed are whole numbers from 0 on"),
+        (["generate", "--workers", "0"], "--workers: it is '0'"),
+        (["generate", "--device", "tpu"], "tpu"),
+        (["generate", "--scene", "gelsight_mni"], "there is no scene 'gelsight_mni'"),
+        (["generate", "--set", "motion"], "--set 'motion': give key=value"),
+        (["generate", "--set", "motion.dept_mm=1"], "motion.dept_mm: unknown key; did you mean 'depth_mm'?"),
+        (["generate", "--set", "sensor.gel.poisson_ratio=0.5"], "must be less than 0.5"),
+        (["generate", "--set", "sensor.lights.0.position_mm=[0, 0, 3]"], "between the camera and the gel"),
+        (["plan", "--set", "contact.indenter={shape='torus',radius_mm=1,tube_mm=2}"], "contact.indenter.tube_mm = 2"),
+        (["plan", "--n", "0"], "--n: it is '0'"),
+        (["simulate", "--scene", "deltact"], "--out"),
+        (["simulate", "--out", "x"], "--scene"),
+        (["simulate", "--scene", "deltact", "--out", "x", "--seed", "-1"], "--seed: it is '-1'"),
+        (["simulate", "--scene", "deltact", "--out", "x", "--index", "-1"], "--index: it is '-1'"),
+        (["inspect"], "PATH"),
+        (["inspect", "nowhere"], "nowhere: there is no such file or directory"),
+        (["inspect", ".", "--limit", "0"], "--limit: it is '0'"),
+        (["verify", "nowhere"], "nowhere: there is no such directory"),
+        (["verify", "."], "not a dataset"),
+        (["export", ".", "--format", "flo"], "--out"),
+        (["export", ".", "--format", "gif", "--out", "x"], "gif"),
+        (["export", ".", "--format", "flo", "--out", "x"], "not a dataset"),
+    ],
+)
+def test_wrong_input_is_one_message_and_status_2(capsys, tmp_path, monkeypatch, arguments, message) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert message in _complaint(capsys, main(arguments))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_debug_adds_the_traceback(capsys) -> None:
+    assert main(["plan", "--scene", "nowhere", "--debug"]) == 2
+    err = capsys.readouterr().err
+    assert "Traceback" in err
+    assert err.rstrip().splitlines()[-1].startswith("synth: there is no scene 'nowhere'")
+
+
+def test_a_mistake_of_the_program_keeps_its_traceback(monkeypatch) -> None:
+    """Only what a user can put right is turned into a message."""
+
+    def broken(*_: object) -> int:
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr("synth.commands.run_verify", broken)
+    with pytest.raises(RuntimeError, match="a bug"):
+        main(["verify", "x"])
+
+
+def test_plan_explains_and_predicts(capsys, tiny: Path) -> None:
+    assert main(["plan", "--scene", str(tiny), "--set", "contact.friction=0", "--n", "100"]) == 0
+    out = capsys.readouterr().out
+    for words in (
+        "friction state",
+        "left out",
+        "contact.friction = 0",
+        "predicted per pair",
+        "for 100 pairs",
+        "factor of",
+    ):
+        assert words in out
+    assert main(["plan", "--scene", str(tiny), "--json", "--n", "100"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["n"] == 100
+    assert {"feature", "runs", "reason"} == set(answer["decisions"][0])
+
+
+def test_a_dry_run_writes_nothing(capsys, tiny: Path, tmp_path: Path) -> None:
+    assert main(["generate", "--scene", str(tiny), "--out", str(tmp_path / "d"), "--dry-run", "--n", "3"]) == 0
+    assert "for 3 pairs" in capsys.readouterr().out
+    assert list(tmp_path.iterdir()) == [tiny]
+
+
+def test_generate_says_what_it_did(capsys, tiny: Path, tmp_path: Path) -> None:
+    """In a folder whose name would be markup in a careless print."""
+    out = tmp_path / "[bold] data [/x]"
+    command = ["generate", "--scene", str(tiny), "--out", str(out), "--n", "2"]
+    assert main(command) == 0
+    assert str(out) in capsys.readouterr().out
+    assert main([*command, "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert (answer["made"], answer["found"], answer["given_up"]) == (0, 2, [])
+    for name in ("000000", "000001"):
+        found, expected = (fingerprint(d) for d in (out, reference()))
+        files = [file for file in expected if file.startswith(f"samples/{name}/")]
+        assert len(files) == 5
+        assert [found[file] for file in files] == [expected[file] for file in files]
+
+
+def test_a_job_that_partly_fails_has_status_1(capsys, tiny: Path, tmp_path: Path) -> None:
+    out = tmp_path / "d"
+    assert (
+        main(
+            [
+                "generate",
+                "--scene",
+                str(tiny),
+                "--out",
+                str(out),
+                "--n",
+                "1",
+                "--set",
+                "motion.depth_mm={normal=[0, 1e9]}",
+            ]
+        )
+        == 1
+    )
+    said, err = capsys.readouterr()
+    assert f"synth: 1 samples could not be made, see {out}/failures.jsonl" in err
+    assert "10 draws failed" in said
+
+
+def test_the_default_scene_is_the_gelsight_mini(capsys) -> None:
+    assert main(["plan", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["scene"] == "gelsight_mini"
+
+
+@pytest.mark.parametrize("kind", ["file", "foreign", "another job", "below a file"])
+def test_places_that_cannot_take_the_dataset(capsys, tiny: Path, tmp_path: Path, kind: str) -> None:
+    out = tmp_path / "d"
+    match kind:
+        case "file":
+            out.write_text("mine")
+        case "foreign":
+            out.mkdir()
+            (out / "thesis.tex").write_text("mine")
+        case "another job":
+            shutil.copytree(reference(), out)
+        case _:
+            (tmp_path / "file").write_text("mine")
+            out = tmp_path / "file" / "d"
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file() and path.name != ".lock"}
+    said = _complaint(capsys, main(["generate", "--scene", str(tiny), "--out", str(out), "--seed", "5", "--n", "1"]))
+    assert str(out) in said
+    assert before == {
+        path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file() and path.name != ".lock"
+    }
+    if kind == "another job":
+        assert "seed: 0 there, 5 now" in said
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a folder in which not even root may write")
+def test_a_folder_that_may_not_be_written(capsys, tiny: Path) -> None:
+    said = _complaint(capsys, main(["generate", "--scene", str(tiny), "--out", "/proc/synth", "--n", "1"]))
+    assert said.startswith("/proc/synth: cannot be written: ")
+
+
+STEP = {
+    "depth_mm", "shear_mm", "twist_deg", "force_n", "torque_nmm", "converged", "newton_iterations", "residual",
+    "min_jacobian", "max_penetration_mm",
+}  # fmt: skip
+
+
+def test_simulate_writes_the_trajectory_of_the_contract(capsys, tiny: Path, tmp_path: Path) -> None:
+    import pyvista as pv
+
+    out = tmp_path / "s"
+    out.mkdir()
+    (out / "state_009.vtu").write_text("of an earlier run")
+    assert main(["simulate", "--scene", str(tiny), "--out", str(out), "--index", "1", "--json"]) == 0
+    record = json.loads((out / "trajectory.json").read_text())
+    assert record == json.loads(capsys.readouterr().out)
+    assert set(record) == {"scene", "steps", "status", "reason", "seconds"}
+    assert record["status"] == "complete"
+    assert record["seconds"] > 0
+    assert all(set(step) == STEP for step in record["steps"])
+    assert all(step["converged"] for step in record["steps"])
+    motion = record["scene"]["motion"]
+    assert record["steps"][0]["force_n"] == [0, 0, 0]
+    last = record["steps"][-1]
+    assert last["depth_mm"] == pytest.approx(motion["depth_mm"])
+    assert last["shear_mm"] == pytest.approx(motion["shear_mm"])
+    assert all(step["force_n"][2] > 0 for step in record["steps"][1:])
+    assert 0 < last["min_jacobian"] < 1
+    names = sorted(path.name for path in out.glob("*.vtu"))
+    assert names == [f"state_{number:03d}.vtu" for number in range(3)]
+    rest, pressed = (pv.read(out / names[i]) for i in (0, 2))
+    assert np.abs(rest.point_data["displacement"]).max() == 0
+    np.testing.assert_allclose(pressed.points, rest.points + pressed.point_data["displacement"], atol=1e-12)
+    # Traction is per undeformed area: its integral over the flat face is the force. 1e-6 is the solver's tolerance.
+    areas = rest.compute_cell_sizes().cell_data["Area"]
+    mean = pressed.point_data_to_cell_data().cell_data["traction"]
+    np.testing.assert_allclose((areas[:, None] * mean).sum(0), last["force_n"], atol=2e-3 * last["force_n"][2])
+
+
+def test_simulate_prints_a_table_and_redraws_the_same(capsys, tiny: Path, tmp_path: Path) -> None:
+    assert main(["simulate", "--scene", str(tiny), "--out", str(tmp_path / "s"), "--set", "motion.depth_mm=-0.2"]) == 0
+    out = capsys.readouterr().out
+    assert "force" in out
+    assert "-0.200" in out
+    assert "complete" in out
+
+
+def test_simulate_into_a_file_is_refused_before_the_work(capsys, tiny: Path) -> None:
+    assert "cannot be written" in _complaint(capsys, main(["simulate", "--scene", str(tiny), "--out", str(tiny)]))
+
+
+def test_a_simulation_that_ends_early_is_written_and_has_status_1(capsys, tiny: Path, tmp_path: Path) -> None:
+    overrides = ["contact.friction=10", "motion.depth_mm=1.0", "numerics.max_step_mm=2.0", "motion.shear_mm=[4.9, 4.9]"]
+    sets = [word for override in overrides for word in ("--set", override)]
+    assert main(["simulate", "--scene", str(tiny), "--out", str(tmp_path / "s"), *sets]) == 1
+    err = capsys.readouterr().err
+    assert "synth: simulation partial: Newton's method found no balance" in err
+    record = json.loads((tmp_path / "s" / "trajectory.json").read_text())
+    assert record["status"] == "partial"
+    assert "Newton" in record["reason"]
+    assert len(record["steps"]) == len(list((tmp_path / "s").glob("*.vtu"))) < 3
+
+
+def test_inspect_verify_and_export_take_a_dataset(capsys, tmp_path: Path) -> None:
+    data = str(reference())
+    assert main(["inspect", data, "--png", str(tmp_path / "a.png"), "--html", str(tmp_path / "a.html")]) == 0
+    assert "tiny, 0" in capsys.readouterr().out
+    assert (tmp_path / "a.png").stat().st_size > 10_000
+    assert (tmp_path / "a.html").read_text().lstrip().lower().startswith("<!doctype html>")
+    assert main(["inspect", data, "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["samples"]) == 5
+    assert main(["verify", data, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["ok"]
+    assert main(["export", data, "--format", "npz", "--out", str(tmp_path / "npz")]) == 0
+    assert "5 samples written to" in capsys.readouterr().out
+    assert len(list((tmp_path / "npz").iterdir())) == 5
+
+
+def test_verify_has_status_1_where_a_file_was_changed(capsys, tmp_path: Path) -> None:
+    copy = tmp_path / "d"
+    shutil.copytree(reference(), copy)
+    with (copy / "samples" / "000001" / "flow.exr").open("r+b") as file:
+        file.truncate(3000)
+    assert main(["verify", str(copy)]) == 1
+    assert "FAILED" in capsys.readouterr().out
+
+
+def test_doctor_tells_what_there_is(capsys) -> None:
+    assert main(["doctor", "--json"]) == 0
+    findings = {finding["what"]: finding for finding in json.loads(capsys.readouterr().out)}
+    assert findings["machine"]["state"] == "ok"
+    assert "Mitsuba" in findings["rendering on the CPU"]["detail"]
+    assert findings["meshing"]["state"] == "ok"
+    assert main(["doctor"]) == 0
+    assert "Mitsuba" in capsys.readouterr().out
+
+
+def test_doctor_says_how_to_get_what_is_missing(capsys, monkeypatch) -> None:
+    import synth.doctor
+
+    def nothing(name: str) -> str:
+        raise synth.doctor.PackageNotFoundError(name)
+
+    monkeypatch.setattr(synth.doctor, "version", nothing)
+    monkeypatch.setattr("synth.simulate.linear.has_pardiso", lambda: False)
+    assert main(["doctor", "--json"]) == 1
+    findings = {finding["what"]: finding for finding in json.loads(capsys.readouterr().out)}
+    assert findings["meshing"] == {"what": "meshing", "state": "missing", "detail": "pip install pytetwild"}
+    assert "pip install pypardiso" in findings["linear solver"]["detail"]
+
+
+NO_LLVM = """
+import sys
+import synth.render.variant as variant
+variant._PATTERNS = ()
+variant.sys.prefix = "/nonexistent"
+from synth.cli import main
+sys.exit(main(["doctor", "--json"]))
+"""
+
+
+@pytest.mark.parametrize("library", ["none", "old"])
+def test_doctor_survives_a_machine_without_a_usable_llvm(tmp_path: Path, library: str) -> None:
+    """DRJIT_LIBLLVM_PATH names a file that is not there, or one that is no LLVM of version 16: say so, never abort."""
+    libc = next(Path("/").glob("lib*/**/libc.so.6"), None) or ctypes.util.find_library("c")
+    named = str(tmp_path / "libLLVM.so") if library == "none" else str(libc)
+    done = subprocess.run(
+        [sys.executable, "-c", NO_LLVM],
+        cwd=ROOT,
+        env={"PATH": "/usr/bin:/bin", "HOME": str(tmp_path), "DRJIT_LIBLLVM_PATH": named},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    (rendering,) = [f for f in json.loads(done.stdout) if f["what"] == "rendering on the CPU"]
+    assert rendering["state"] == "slow"
+    assert "scalar_rgb" in rendering["detail"]
+    assert "apt install libllvm19" in rendering["detail"]
