@@ -13,8 +13,9 @@ slip along the trial direction τ outside. Linearisation (H is the derivative of
     -∂t_T/∂x     = μ ε τ n^T + (μ t_n / |P m|) (I - τ τ^T) A                  slip
 
 Tractions are per undeformed area. A point that touches during a step has no friction until the step is accepted; its
-anchor is then where it touched, an error that vanishes with the step. Anchors and λ_T live in the indenter's frame and
-so turn with it. Without friction none of this state is touched.
+anchor is then where it came to lie. That error vanishes with the step: a flat punch of 2 mm that slides by 0.25 mm a
+step lacks 10 to 28 % of its friction, at its leading edge, a ball of 3 mm 2 to 12 %; at 0.1 mm both lack 0 to 4 %.
+Anchors and λ_T live in the indenter's frame and so turn with it. Without friction none of this state is touched.
 """
 
 import warp as wp

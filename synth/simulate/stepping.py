@@ -139,6 +139,7 @@ class Stepper:
         recording = good & np.array([t in sample.recorded for sample, t in zip(self.samples, targets, strict=True)])
         if recording.any():
             self._record(solution, recording, targets)
+        # After the record, whose passes must still see how far points slipped in this step.
         self.system.settle(self.state, self.indenters, good)
         for s in map(int, np.flatnonzero(active)):
             self._control(self.samples[s], targets[s], bool(good[s]), int(solution.iterations[s]))

@@ -156,7 +156,7 @@ def inside(indenter: Indenter, points: FloatArray) -> np.ndarray:
 
 @pytest.mark.parametrize("indenter", SHAPES, ids=lambda i: i.shape)
 def test_distance_against_sampled_surface(indenter: Indenter) -> None:
-    # Fails with the fillet left out of signed_distance, radius - fillet turned into radius, a cone of twice the angle.
+    # Fails with the fillet left out of signed_distance, or a cone of half the angle.
     rng = np.random.default_rng(1)
     points = scattered(indenter, rng)
     distance, _, _ = measure(rigid_body(indenter), points)
@@ -172,7 +172,7 @@ def test_distance_against_sampled_surface(indenter: Indenter) -> None:
 
 @pytest.mark.parametrize("indenter", SHAPES, ids=lambda i: i.shape)
 def test_normal_is_the_gradient(indenter: Indenter) -> None:
-    # Fails with a component's sign turned, or the gradient of the sharp box inside.
+    # Fails with the sign of the gradient kept inside a cone.
     rng = np.random.default_rng(2)
     body, points = rigid_body(indenter), scattered(indenter, rng)
     _, normal, bending = measure(body, points)
@@ -266,7 +266,7 @@ def ball(folder: Path, name: str = "ball.stl", flip: bool = False, centre: tuple
 
 @pytest.mark.parametrize("flip", [False, True])
 def test_mesh_of_a_sphere_is_the_sphere(tmp_path: Path, flip: bool) -> None:
-    # Fails with the sign of the grid turned, with order="C", and, flipped, without auto_orient_normals.
+    # The flipped one fails without auto_orient_normals.
     ball(tmp_path, flip=flip, centre=(5.0, -2.0, 1.0))
     body = rigid_body(MeshIndenter(shape="mesh", file="ball.stl", cell_mm=0.15), tmp_path)
     points = scattered(SPHERE, np.random.default_rng(3))
@@ -310,6 +310,7 @@ def test_grid_in_a_larger_batch_is_read_to_its_own_end(tmp_path: Path) -> None:
 
 
 def test_mesh_scale_and_turn(tmp_path: Path) -> None:
+    # Fails with order="C".
     import pyvista as pv
 
     pv.Cube(x_length=1.0, y_length=2.0, z_length=3.0).triangulate().save(tmp_path / "block.stl")

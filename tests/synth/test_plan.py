@@ -112,7 +112,7 @@ def test_the_number_of_nodes_is_about_the_meshs(tiny: Path, tmp_path: Path) -> N
     template = load_scene(tiny, ["numerics.edge_length_mm=0.6"])
     scene = template.corners[0]
     mesh = pad_mesh(scene.sensor.gel, scene.numerics, [tmp_path / "meshes"])
-    # The fit is 12 % off here; the mesher is random, and a factor of three is promised of times, which grow as nodes^1.6.
+    # The fit is 12 % off here and the mesher is random; promised is a factor of three in times, as nodes^1.6.
     assert plan(template, LLVM).nodes == pytest.approx(len(mesh.points), rel=0.3)
 
 
@@ -154,6 +154,7 @@ def _write_stl(path: Path, *, closed: bool) -> None:
         (["sensor.camera.fy=83"], SCALAR, "LLVM 16"),
     ],
 )
+@pytest.mark.filterwarnings("ignore:The VTK reader")
 def test_what_cannot_be_built_is_refused_with_the_file_and_the_field(
     tiny: Path, overrides: list[str], variant: Variant, message: str
 ) -> None:

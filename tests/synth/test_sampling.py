@@ -13,7 +13,7 @@ from synth.sampling import MAX_DRAWS, draw, draw_sensor, pairs_of, stream
 from synth.scene import Scene
 from synth.template import Template, load_scene, shipped_scenes
 
-COUNT = 400
+COUNT = 200
 SURE = 1e-4
 """Probability at which a test of the right distribution would fail; with fixed seeds it fails always or never."""
 

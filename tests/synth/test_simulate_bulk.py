@@ -127,7 +127,7 @@ def turn(rng: np.random.Generator) -> FloatArray:
 
 @pytest.mark.parametrize("nu", [FOAM, MIXED])
 def test_rigid_motion_is_free_of_stress(nu: float) -> None:
-    # Fails with F for Fit in the volumetric force.
+    # Fails with F^-1 for its transpose.
     rng = np.random.default_rng(4)
     body = system(MESH, nu)
     for _ in range(3):
@@ -163,7 +163,7 @@ def test_inner_forces_and_moments_cancel() -> None:
 def test_patch(nu: float) -> None:
     """Affine displacement on the boundary of an irregular mesh: affine inside, with the exact constant pressure.
 
-    Fails without the 1/16 of the stabilisation or with one element's weight or gradient changed.
+    Fails without the 1/16 of the stabilisation.
     """
     from scipy.sparse import csr_matrix
     from scipy.sparse.linalg import spsolve
@@ -195,7 +195,7 @@ def test_patch(nu: float) -> None:
 def test_stress_of_a_uniform_strain(nu: float) -> None:
     """Nodal forces do the work of the closed form's stress P = mu (F - F^-T) + lambda J (J - 1) F^-T.
 
-    Fails with any wrong constant, as lambda = nu / (1 - 2 nu).
+    Fails with 1 - nu for 1 - 2 nu in lambda.
     """
     body = system(LOOSE, nu)
     F = np.eye(3) + GRADIENT

@@ -85,7 +85,7 @@ def sphere_law(made: Touch) -> tuple[FloatArray, FloatArray]:
 
 @pytest.mark.parametrize("friction", [0.0, SLIP, 0.7, STICK])
 def test_traction_is_the_law(friction: float) -> None:
-    # Fails with any sign turned, rotation for its transpose, or `limit / length` left out of _returned.
+    # Fails with the sign of y - a turned, or `limit / length` left out of _returned.
     made = touch(friction)
     normal, along = sphere_law(made)
     assert 0.2 < (normal != 0).any(axis=-1).mean() < 0.95  # some points touch and some do not
@@ -155,7 +155,7 @@ def test_tangent_without_friction_is_symmetric() -> None:
 
 def test_nodal_forces_and_moments_are_the_tractions() -> None:
     """`forces` and the residual say the same: what the indenter does to the gel, the nodes get."""
-    # Fails with the position of the undeformed points in `forces`, or a weight left out.
+    # Fails with the position of the undeformed points in `forces`.
     made = touch(0.7)
     body = made.body
     reaction = body.balance(made.state, made.indenters, everything(body)).reaction[0]
@@ -175,7 +175,7 @@ def test_nodal_forces_and_moments_are_the_tractions() -> None:
 
 def test_law_does_not_depend_on_the_frame() -> None:
     """Gel and indenter turned together about z: tractions turn with them, because anchors are the indenter's."""
-    # Fails with anchors or multipliers kept in world axes.
+    # Fails with `rotation *` left out of _trial.
     made = touch(0.7)
     before = made.body.traction.numpy()[0].copy()
     turn = np.array([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])

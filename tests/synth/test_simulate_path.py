@@ -14,7 +14,7 @@ def path(indenter: dict | None = None, **motion: object) -> Path:
 
 
 def test_lowest_point_follows_the_depth() -> None:
-    # Fails with the reach left out, or with depth measured downward.
+    # Fails with the reach left out.
     way = path(depth_mm=1.0, shear_mm=[0.5, -0.2], position_mm=[1.0, 2.0])
     for s in (0.0, 0.3, 1.0):
         pose = way.pose(s)

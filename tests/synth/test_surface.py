@@ -52,7 +52,7 @@ def test_refined_sheet_is_one_and_conforming(coarse: ContactFaces, n: int) -> No
 
 @pytest.mark.parametrize("n", SUBDIVISIONS)
 def test_triangles_keep_area_and_orientation(n: int) -> None:
-    # Fails with two indices exchanged in either kind of small triangle.
+    # Fails with two indices of the inverted small triangles exchanged.
     surface = GelSurface(CROOKED, n)
     area = normals(surface.material, surface.triangles) / 2
     assert (area[:, 2] < 0).all()
@@ -75,8 +75,7 @@ def test_nodes_are_interpolated(n: int) -> None:
 
 @pytest.mark.parametrize("n", SUBDIVISIONS)
 def test_affine_fields_are_exact(n: int) -> None:
-    # Fails with recovered gradients that are not means (weights that do not sum to 1 do not matter here: see
-    # quadratic).
+    # Fails with weights that do not sum to 1.
     surface = GelSurface(CROOKED, n)
     rng = np.random.default_rng(2)
     A, b = rng.standard_normal((3, 3)), rng.standard_normal(3)
@@ -107,7 +106,7 @@ def smooth(points: Points) -> FloatArray:
 @pytest.mark.parametrize("n", [2, 4])
 def test_quadratic_fields_are_exact_inside_a_regular_mesh(n: int) -> None:
     """Where each node's faces are point-symmetric about it the mean gradient is exact, and so is the blend."""
-    # Fails with 0.5 of the correction changed, with x - x_i turned, or without the weights by area (on `crooked` only).
+    # Fails with 0.5 of the correction changed, or with x - x_i turned.
     surface = GelSurface(REGULAR, n)
     error = np.abs(surface.interpolate(quadratic(REGULAR.nodes)) - quadratic(surface.material)).max(axis=1)
     inside = (np.abs(surface.material[:, :2]) <= np.array(SIZE[:2]) / 2 - 1.0).all(axis=1)

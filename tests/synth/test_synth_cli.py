@@ -1,6 +1,5 @@
 """Every command of `python -m synth`: what it prints, writes and returns."""
 
-import ctypes.util
 import json
 import shutil
 import subprocess
@@ -269,7 +268,12 @@ def test_simulate_into_a_file_is_refused_before_the_work(capsys, tiny: Path) -> 
 
 
 def test_a_simulation_that_ends_early_is_written_and_has_status_1(capsys, tiny: Path, tmp_path: Path) -> None:
-    overrides = ["contact.friction=10", "motion.depth_mm=1.0", "numerics.max_step_mm=2.0", "motion.shear_mm=[4.9, 4.9]"]
+    overrides = [
+        "contact.friction=10",
+        "motion.depth_mm=1.0",
+        "numerics.max_step_mm=20.0",
+        "motion.shear_mm=[4.9, 4.9]",
+    ]
     sets = [word for override in overrides for word in ("--set", override)]
     assert main(["simulate", "--scene", str(tiny), "--out", str(tmp_path / "s"), *sets]) == 1
     err = capsys.readouterr().err
@@ -331,22 +335,23 @@ def test_doctor_says_how_to_get_what_is_missing(capsys, monkeypatch) -> None:
 NO_LLVM = """
 import sys
 import synth.render.variant as variant
-variant._PATTERNS = ()
+variant._PATTERNS = (sys.argv[1],)
 variant.sys.prefix = "/nonexistent"
 from synth.cli import main
 sys.exit(main(["doctor", "--json"]))
 """
 
 
-@pytest.mark.parametrize("library", ["none", "old"])
-def test_doctor_survives_a_machine_without_a_usable_llvm(tmp_path: Path, library: str) -> None:
-    """DRJIT_LIBLLVM_PATH names a file that is not there, or one that is no LLVM of version 16: say so, never abort."""
-    libc = next(Path("/").glob("lib*/**/libc.so.6"), None) or ctypes.util.find_library("c")
-    named = str(tmp_path / "libLLVM.so") if library == "none" else str(libc)
+def test_doctor_survives_a_machine_without_a_usable_llvm(tmp_path: Path) -> None:
+    """DRJIT_LIBLLVM_PATH names a file that is not there, and what is there is too old: say so, never abort."""
+    loads = next(Path("/").glob("lib*/**/libc.so.6"), None)  # and has no LLVMGetVersion, like LLVM 15
+    if loads is None:
+        pytest.skip("no C library found to stand in for an old LLVM")
+    (tmp_path / "libLLVM-15.so.1").symlink_to(loads)
     done = subprocess.run(
-        [sys.executable, "-c", NO_LLVM],
+        [sys.executable, "-c", NO_LLVM, str(tmp_path / "libLLVM*.so*")],
         cwd=ROOT,
-        env={"PATH": "/usr/bin:/bin", "HOME": str(tmp_path), "DRJIT_LIBLLVM_PATH": named},
+        env={"PATH": "/usr/bin:/bin", "HOME": str(tmp_path), "DRJIT_LIBLLVM_PATH": str(tmp_path / "libLLVM.so.19")},
         capture_output=True,
         text=True,
         check=False,
@@ -355,4 +360,5 @@ def test_doctor_survives_a_machine_without_a_usable_llvm(tmp_path: Path, library
     (rendering,) = [f for f in json.loads(done.stdout) if f["what"] == "rendering on the CPU"]
     assert rendering["state"] == "slow"
     assert "scalar_rgb" in rendering["detail"]
+    assert "only too old or unusable ones were found" in rendering["detail"]
     assert "apt install libllvm19" in rendering["detail"]

@@ -1,4 +1,4 @@
-"""A scene that takes the whole chain about a second: a small pad, a coarse mesh, 32 x 24 pixels, real everything else."""
+"""A scene that takes the whole chain about a second: a small pad, a coarse mesh, 32 x 24 pixels; all else is real."""
 
 import atexit
 import functools
@@ -7,7 +7,6 @@ import json
 import os
 import shutil
 import tempfile
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -116,11 +115,9 @@ def _home() -> Path:
 
 
 def own_cache(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Keep meshes apart from the user's and share them within the session; Warp's compiled kernels stay where they are."""
+    """Keep meshes apart from the user's and share them within the session; Warp's kernels stay where they are."""
     kept = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    monkeypatch.setenv(
-        "WARP_CACHE_PATH", os.environ.get("WARP_CACHE_PATH") or str(kept / "warp" / version("warp-lang"))
-    )
+    monkeypatch.setenv("WARP_CACHE_PATH", os.environ.get("WARP_CACHE_PATH") or str(kept / "warp"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(_home() / "cache"))
 
 
