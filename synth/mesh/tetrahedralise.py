@@ -5,7 +5,10 @@ box; its orientation is negative; and it is not deterministic, so a mesh is made
 """
 
 import contextlib
+import signal
 import tempfile
+import threading
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -77,7 +80,7 @@ def _ftetwild(size: tuple[float, float, float], edge: float) -> tuple[Points, Te
     background = centre + margin * (corners - centre)
     target = edge * (1 + (GRADING - 1) * np.clip(background[:, 2] / size[2], 0, 1))
     # fTetWild leaves a __tracked_surface.stl in the working directory.
-    with tempfile.TemporaryDirectory() as scratch, contextlib.chdir(scratch):
+    with _interrupts_kept(), tempfile.TemporaryDirectory() as scratch, contextlib.chdir(scratch):
         points, tets = pytetwild.tetrahedralize(
             corners,
             faces,
@@ -88,6 +91,17 @@ def _ftetwild(size: tuple[float, float, float], edge: float) -> tuple[Points, Te
             bg_values=target,
         )
     return np.asarray(points, dtype=np.float64), np.asarray(tets, dtype=np.int32)
+
+
+@contextlib.contextmanager
+def _interrupts_kept() -> Iterator[None]:
+    """Python's Ctrl-C again: fTetWild's library sets the system's default, which ends the process without a word."""
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, before)
 
 
 def _repair(points: Points, tets: Tets, size: tuple[float, float, float]) -> tuple[Points, Tets]:

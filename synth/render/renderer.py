@@ -56,7 +56,7 @@ class Renderer:
         refracts = sensor.window.refractive_index != 1
         if not variant.is_vectorised and refracts:
             contents["window"] = _window(sensor, mi)
-        self._scene = mi.load_dict(contents)
+        self._scene = mi.load_dict(contents, optimize=False)
         self._parameters = mi.traverse(self._scene)
         if variant.is_vectorised:
             self._share_kernels()
