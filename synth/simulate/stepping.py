@@ -137,12 +137,26 @@ class Stepper:
         self.previous = self.state.where(good, self.previous)
         self.state = solution.state.where(good, self.state)
         recording = good & np.array([t in sample.recorded for sample, t in zip(self.samples, targets, strict=True)])
+        recording &= ~self._slipped_through(recording, targets)
         if recording.any():
             self._record(solution, recording, targets)
         # After the record, whose passes must still see how far points slipped in this step.
         self.system.settle(self.state, self.indenters, good)
         for s in map(int, np.flatnonzero(active)):
             self._control(self.samples[s], targets[s], bool(good[s]), int(solution.iterations[s]))
+
+    def _slipped_through(self, recording: BoolArray, targets: Sequence[float]) -> BoolArray:
+        """Samples whose indenter, still pressing, touches nothing: a step or a face let it pass. Ends them with a reason."""
+        untouched = recording & (self.system.deepest() == 0) & ~np.any(self.system.traction.numpy(), axis=(1, 2, 3))
+        for s in map(int, np.flatnonzero(untouched)):
+            sample = self.samples[s]
+            untouched[s] = targets[s] <= sample.path.press_mm
+            if untouched[s]:
+                sample.reason = (
+                    f"pressed {targets[s]:.3g} mm deep, the indenter touches no contact point: it is too small for the "
+                    "mesh or for the steps; lower numerics.edge_length_mm or numerics.max_step_mm"
+                )
+        return untouched
 
     def _place(self, at: Sequence[float]) -> None:
         poses = [sample.path.pose(s) for sample, s in zip(self.samples, at, strict=True)]

@@ -354,3 +354,16 @@ def test_scipy_and_pardiso_agree(monkeypatch: pytest.MonkeyPatch) -> None:
         # Two solvers differ by rounding, which Newton's loose way stations (1e-3) may let grow to 1e-6.
         np.testing.assert_allclose(slow.force_n, fast.force_n, rtol=10 * TOLERANCE, atol=1e-8)
         np.testing.assert_allclose(slow.displacement, fast.displacement, atol=10 * TOLERANCE)
+
+
+def test_a_body_that_passes_through_fails_with_a_reason() -> None:
+    """A needle between the contact points touches none of them; without the check it ended "complete" with no force."""
+    size = (8.0, 6.0, 2.5)
+    posed = scene(
+        size,
+        indenter={"shape": "sphere", "radius_mm": 0.1},
+        motion={"depth_mm": 0.5, "steps": 2, "position_mm": (0.3, 0.2)},
+    )
+    result = simulate(posed, brick(size, (6, 5, 2)))
+    assert result.status == "failed"
+    assert "touches no contact point" in result.reason
