@@ -17,7 +17,7 @@ import warp as wp
 from synth.arrays import BoolArray, FloatArray
 from synth.scene import Numerics
 from synth.simulate.contact import Indenters
-from synth.simulate.distance import shape_vector
+from synth.simulate.distance import KINDS, shape_vector
 from synth.simulate.newton import Solution, relative_residual, solve
 from synth.simulate.path import Path, Pose
 from synth.simulate.system import System, Unknowns, warp_array
@@ -146,17 +146,23 @@ class Stepper:
             self._control(self.samples[s], targets[s], bool(good[s]), int(solution.iterations[s]))
 
     def _slipped_through(self, recording: BoolArray, targets: Sequence[float]) -> BoolArray:
-        """Samples whose indenter, still pressing, touches nothing: a step or a face let it pass. Ends them with a reason."""
+        """Samples whose indenter, pressing on the pad, touches nothing: it passed between points. Ends them, saying so."""
         untouched = recording & (self.system.deepest() == 0) & ~np.any(self.system.traction.numpy(), axis=(1, 2, 3))
         for s in map(int, np.flatnonzero(untouched)):
             sample = self.samples[s]
-            untouched[s] = targets[s] <= sample.path.press_mm
+            untouched[s] = targets[s] <= sample.path.press_mm and self._is_over_pad(sample.path)
             if untouched[s]:
                 sample.reason = (
                     f"pressed {targets[s]:.3g} mm deep, the indenter touches no contact point: it is too small for the "
                     "mesh or for the steps; lower numerics.edge_length_mm or numerics.max_step_mm"
                 )
         return untouched
+
+    def _is_over_pad(self, path: Path) -> bool:
+        """Whether the body's lowest point, a ring's rim for a torus, comes down on the contact face."""
+        rim = float(path.body.shape[1]) if path.body.kind == KINDS["torus"] else 0.0
+        half = np.array(self.system.mesh.size_mm[:2]) / 2
+        return bool(np.all(np.abs(path.motion.position_mm) + rim < half))
 
     def _place(self, at: Sequence[float]) -> None:
         poses = [sample.path.pose(s) for sample, s in zip(self.samples, at, strict=True)]
