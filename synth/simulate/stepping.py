@@ -146,7 +146,7 @@ class Stepper:
             self._control(self.samples[s], targets[s], bool(good[s]), int(solution.iterations[s]))
 
     def _slipped_through(self, recording: BoolArray, targets: Sequence[float]) -> BoolArray:
-        """Samples whose indenter, pressing on the pad, touches nothing: it passed between points. Ends them, saying so."""
+        """Samples whose indenter, pressing on the pad, passed between the contact points. Ends them, saying so."""
         untouched = recording & (self.system.deepest() == 0) & ~np.any(self.system.traction.numpy(), axis=(1, 2, 3))
         for s in map(int, np.flatnonzero(untouched)):
             sample = self.samples[s]
