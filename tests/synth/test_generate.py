@@ -1,5 +1,6 @@
 """The whole chain in one process: what lands on disk, going on, growing, and draws that fail."""
 
+import contextlib
 import json
 import resource
 from collections.abc import Iterator
@@ -162,7 +163,7 @@ def test_failed_draws_are_logged_and_redrawn_the_same_way_in_every_run(tiny: Pat
 
 def test_a_simulation_that_fails_is_logged_with_its_last_good_state_and_redrawn(tiny: Path, tmp_path: Path) -> None:
     """A gel stuck to a ball that moves by twice its thickness tears; should the solver learn it, ask for more here."""
-    hard = ["contact.friction=10", "motion.depth_mm=1.0", "numerics.max_step_mm=20.0"]
+    hard = ["contact.friction=10", "motion.depth_mm=0.6", "numerics.max_step_mm=20.0"]
     template = load_scene(tiny, [*hard, "motion.shear_mm={ choice = [[0.05, 0.0], [4.9, 4.9]] }", "motion.steps=2"])
 
     def is_wanted(seed: int) -> bool:
@@ -170,8 +171,10 @@ def test_a_simulation_that_fails_is_logged_with_its_last_good_state_and_redrawn(
 
     seed = next(seed for seed in range(1000) if is_wanted(seed))
     summary = generate(template, 1, tmp_path / "d", seed)
-    assert (summary.made, summary.failed_draws) == (1, 1)
-    (failure,) = read_dataset(tmp_path / "d").failures
+    assert summary.made == 1
+    failures = read_dataset(tmp_path / "d").failures  # on some of the mesher's random meshes the press fails, too
+    assert len(failures) == summary.failed_draws >= 1
+    failure = failures[0]
     assert (failure["index"], failure["draw"], failure["stage"]) == (0, 0, "simulate")
     assert "Newton" in failure["reason"]
     assert failure["last_good_state"]["converged"]
@@ -197,9 +200,12 @@ def test_samples_whose_every_draw_fails_are_given_up(tiny: Path, tmp_path: Path,
         assert {f["stage"] for f in dataset.failures} == {stage}
 
 
-@pytest.fixture
+@contextlib.contextmanager
 def largest_file() -> Iterator[None]:
-    """No file may become larger than 6000 bytes: a write beyond that fails as on a full disk, at the same place."""
+    """No file may become larger than 6000 bytes: a write beyond that fails as on a full disk, at the same place.
+
+    Held no longer than the call it is for: pytest's own output may go to a file.
+    """
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (6000, hard))
     try:
@@ -208,28 +214,25 @@ def largest_file() -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-@pytest.mark.usefixtures("largest_file")
 def test_a_mesh_that_cannot_be_kept_stops_the_job(tiny: Path, tmp_path: Path) -> None:
     """Without it every trajectory would be computed on a mesh of its own."""
-    with pytest.raises(InputError, match=r"meshes/\w+\.npz: the mesh cannot be written"):
+    with pytest.raises(InputError, match=r"meshes/\w+\.npz: the mesh cannot be written"), largest_file():
         generate(load_scene(tiny), 1, tmp_path / "d")
     assert list((tmp_path / "d" / "samples").iterdir()) == []
 
 
-def test_a_full_disk_loses_nothing_and_tears_nothing(tiny: Path, tmp_path: Path, request) -> None:
+def test_a_full_disk_loses_nothing_and_tears_nothing(tiny: Path, tmp_path: Path) -> None:
     """The second half of the job meets the limit; with space again, it ends as if nothing had been."""
     template, out = load_scene(tiny), tmp_path / "d"
     generate(template, 2, out)
     finished = fingerprint(out)
-    request.getfixturevalue("largest_file")
-    with pytest.raises(InputError, match=r"cannot be written: .*File too large.*finished before is safe"):
+    refusal = r"cannot be written: .*File too large.*finished before is safe"
+    with pytest.raises(InputError, match=refusal), largest_file():
         generate(template, 5, out)
     now = fingerprint(out)
     assert {k: v for k, v in now.items() if k != "dataset.json"} == {
         k: v for k, v in finished.items() if k != "dataset.json"
     }
     assert json.loads((out / "dataset.json").read_text())["n"] == 5
-    soft = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
-    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, soft))
     generate(template, 5, out)
     assert fingerprint(out) == fingerprint(reference())
