@@ -1,0 +1,142 @@
+"""Running the cases: each in a process that is killed when its budget is spent, then judged from what it left."""
+
+import contextlib
+import json
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from synth.dataset.storage import storage_errors
+from synth.stress.cases import EXTREME, Run, all_runs, compared, load_expectations, selected
+from synth.stress.check import Result, judged
+
+Report = Callable[[Result], None]
+WORKER = (sys.executable, "-m", "synth.stress.worker")
+
+
+def run_stress(out: Path, only: Sequence[str] | None, workers: int, as_json: bool, scenes: Path = EXTREME) -> int:
+    """Run the cases and write stress.csv, stress.json, stress.md and stress.png.
+
+    Args:
+        out: directory for these, for the meshes, and for a folder per run.
+        only: shell patterns of cases or groups; cases that others are compared with come along. Default all.
+        workers: processes at a time.
+        as_json: print stress.json instead of the table.
+        scenes: folder of base.toml and expected.toml.
+
+    Returns:
+        0, or 1 when any case ended otherwise than written down.
+
+    Raises:
+        InputError: unknown case; the expectations or the storage are not usable.
+    """
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from synth.stress.report import outcome_table, record, remarks, summary, write_report
+    from synth.stress.sheet import write_sheet
+
+    expectations = load_expectations(scenes / "expected.toml")
+    runs = selected(all_runs(expectations, (scenes / "base.toml").resolve()), only)
+    console = Console(stderr=True)
+    started = time.perf_counter()
+    with Progress(console=console, disable=not console.is_terminal, transient=True) as bar:
+        task = bar.add_task("stress: cases", total=len(runs))
+        results = all_results(runs, out, workers, lambda _: bar.advance(task))
+    verdicts = [judged(result, comparable(result, results)) for result in results]
+    seconds = time.perf_counter() - started
+    write_report(out, verdicts, expectations, only, seconds)
+    write_sheet(verdicts, out / "stress.png")
+    if as_json:
+        print(json.dumps(record(verdicts, seconds)))
+    else:
+        shown = Console()
+        shown.print(outcome_table(verdicts))
+        for line in ["", *remarks(verdicts), f"{summary(verdicts, seconds)}: {out / 'stress.md'}"]:
+            shown.print(line, markup=False, highlight=False, soft_wrap=True)
+    return 0 if all(verdict.ok for verdict in verdicts) else 1
+
+
+def all_results(runs: Sequence[Run], out: Path, workers: int, report: Report = lambda _: None) -> list[Result]:
+    """Results in the order of the runs.
+
+    Runs that others are compared with come first and one by one: they make the meshes that the others then read
+    (the mesher is not deterministic), and the first of all compiles the solver's kernels.
+    """
+    with storage_errors(out):
+        (out / "meshes").mkdir(parents=True, exist_ok=True)
+    names = {other.name for run in runs for other in compared(run, runs)}
+    found: dict[str, Result] = {}
+
+    def attempt(run: Run) -> Result:
+        return result_of(run, out / "cases" / run.name, out / "meshes")
+
+    for run in runs:
+        if run.name in names:
+            found[run.name] = attempt(run)
+            report(found[run.name])
+    with ThreadPoolExecutor(workers) as pool:
+        futures = [pool.submit(attempt, run) for run in runs if run.name not in names]
+        try:
+            for future in as_completed(futures):
+                result = future.result()
+                found[result.run.name] = result
+                report(result)
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return [found[run.name] for run in runs]
+
+
+def result_of(run: Run, folder: Path, meshes: Path, worker: Sequence[str] = WORKER) -> Result:
+    """Run one case in a process of its own.
+
+    Args:
+        run: what to run.
+        folder: emptied, then holds run.json, log.txt and what the process writes.
+        meshes: where meshes are kept.
+        worker: the command; folder and meshes are appended.
+    """
+    with storage_errors(folder):
+        if folder.exists():
+            shutil.rmtree(folder)
+        folder.mkdir(parents=True)
+        told = {"element": run.element, "budget_s": run.budget_s, "base": str(run.base)}
+        told["case"] = run.case.model_dump(mode="json", by_alias=True)
+        (folder / "run.json").write_text(json.dumps(told), encoding="utf-8")
+    started, status = time.perf_counter(), None
+    with (folder / "log.txt").open("wb") as log, contextlib.suppress(subprocess.TimeoutExpired):
+        command = [*worker, str(folder), str(meshes)]
+        status = subprocess.run(command, stdout=log, stderr=log, timeout=run.budget_s, check=False).returncode
+    seconds = time.perf_counter() - started
+    if status is None:
+        return Result(run, "hung", "", seconds, {}, {})
+    if status != 0 or not (folder / "result.json").is_file():
+        return Result(run, "crashed", _last_words(folder / "log.txt", status), seconds, {}, {})
+    record: dict[str, Any] = json.loads((folder / "result.json").read_text(encoding="utf-8"))
+    arrays: dict[str, np.ndarray] = {}
+    if record["outcome"] != "refused":
+        with np.load(folder / "states.npz") as states:
+            arrays = dict(states)
+    return Result(run, record["outcome"], record["message"], seconds, record, arrays)
+
+
+def comparable(result: Result, results: Sequence[Result]) -> dict[str, Result]:
+    """The results that a result is compared with, by their case's name."""
+    runs = {other.run.name: other for other in results}
+    others = compared(result.run, [other.run for other in results])
+    return {other.case.name: runs[other.name] for other in others}
+
+
+def _last_words(log: Path, status: int) -> str:
+    """What a process that ended badly said last."""
+    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    said = lines[-1] if lines else "it said nothing"
+    return f"signal {-status}: {said}" if status < 0 else f"exit status {status}: {said}"

@@ -1,0 +1,114 @@
+"""One run in a process of its own: `python -m synth.stress.worker FOLDER MESHES`.
+
+FOLDER holds run.json; result.json and states.npz are written there when the run ends by itself. Nothing is caught here
+but what the stages promise (InputError), so anything else shows as a traceback and an exit status.
+"""
+
+import json
+import os
+import sys
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from synth.errors import InputError
+from synth.mesh import PadMesh, pad_mesh
+from synth.mesh.tetrahedralise import shape_quality
+from synth.scene import Scene
+from synth.simulate import Trajectory, pattern, simulate
+from synth.simulate.footprint import footprint
+from synth.simulate.indenter import rigid_body
+from synth.simulate.path import Path as IndenterPath
+from synth.simulate.resolution import MARGIN, graded_mesh
+from synth.stress.cases import Case, Run
+from synth.stress.inputs import altered_mesh, write_surface
+from synth.template import load_scene
+
+ACROSS = 6
+"""Elements across the contact of a graded mesh."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Run what FOLDER/run.json says."""
+    folder, meshes = Path(arguments[0]), Path(arguments[1])
+    asked = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+    run = Run(Case.model_validate(asked["case"]), asked["element"], asked["budget_s"], Path(asked["base"]))
+    if run.case.factor == "double":
+        # No scene can ask for it: it would only cost time. This process runs nothing else.
+        pattern.direct_factor = partial(pattern.direct_factor, single=False)
+    try:
+        scene, mesh, trajectory = simulated(run, folder, meshes)
+        record = saved(scene, mesh, trajectory, folder)
+    except InputError as error:
+        record = {"outcome": "refused", "message": _without_folders(str(error), folder, run.base)}
+    (folder / "result.json").write_text(json.dumps(record, indent=1), encoding="utf-8")
+    return 0
+
+
+def simulated(run: Run, folder: Path, meshes: Path) -> tuple[Scene, PadMesh, Trajectory]:
+    """Load, mesh and simulate a run's scene, as `synth simulate` does.
+
+    Raises:
+        InputError: one of the stages refuses.
+    """
+    assignments = run.assignments
+    if run.case.surface is not None:
+        file = folder.resolve() / "indenter.ply"
+        write_surface(run.case.surface, file)
+        assignments = [*assignments, f"contact.indenter={{ shape = 'mesh', file = '{file}' }}"]
+    template = load_scene(run.base, assignments)
+    scene = template.corners[0]  # no distributions: all corners are the same
+    mesh = _mesh(scene, folder, meshes)
+    if run.case.mesh != "as made":
+        mesh = altered_mesh(mesh, run.case.mesh)
+    return scene, mesh, simulate(scene, mesh, folder)
+
+
+def _mesh(scene: Scene, folder: Path, meshes: Path) -> PadMesh:
+    """Of even edge length where the scene gives one, else graded around the contact."""
+    gel = scene.sensor.gel
+    if scene.numerics.edge_length_mm is not None:
+        return pad_mesh(gel, scene.numerics, [meshes])
+    way = IndenterPath(scene.motion, rigid_body(scene.contact.indenter, folder))
+    return graded_mesh(gel, footprint(way, gel.size_mm, MARGIN), ACROSS)[0]
+
+
+def saved(scene: Scene, mesh: PadMesh, trajectory: Trajectory, folder: Path) -> dict[str, Any]:
+    """Write the states' fields; return everything else, JSON-able."""
+    space = trajectory.space
+    np.savez_compressed(
+        folder / "states.npz",
+        displacement=np.array([state.displacement for state in trajectory.states]),
+        traction=np.array([state.traction for state in trajectory.states]),
+        points=space.points,
+        nodes=space.nodes,
+        surface_nodes=space.surface_nodes,
+        surface_faces=space.surface.faces,
+    )
+    return {
+        "outcome": trajectory.status,
+        "message": trajectory.reason,
+        "seconds": trajectory.seconds,
+        "states": [state.summary() for state in trajectory.states],
+        "states_asked": scene.motion.steps + 1,
+        "tolerance": scene.numerics.tolerance,
+        "mesh": mesh.hash,
+        "nodes": len(mesh.points),
+        "tetrahedra": len(mesh.tets),
+        "worst_shape": float(shape_quality(mesh.points, mesh.tets).min()),
+    }
+
+
+def _without_folders(message: str, *places: Path) -> str:
+    """File names alone: a report is read on other machines."""
+    for place in places:
+        folder = place.resolve() if place.is_dir() else place.resolve().parent
+        message = message.replace(f"{folder}{os.sep}", "")
+    return message
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,370 @@
+"""`synth stress`: the checker sees what is wrong, the processes are watched, and the shipped expectations make sense.
+
+Each comment "fails with" names a change of `synth.stress` that was tried.
+"""
+
+import csv
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pads import brick
+
+from synth.errors import InputError
+from synth.mesh.pad import signed_volumes
+from synth.mesh.tetrahedralise import shape_quality
+from synth.simulate.element import p2p1
+from synth.simulate.space import function_space
+from synth.stress.cases import (
+    EXTREME,
+    Case,
+    Comparison,
+    Deviation,
+    Run,
+    all_runs,
+    compared,
+    load_expectations,
+    selected,
+)
+from synth.stress.check import GAUSS, Result, faults, judged, measured, smallest_jacobian
+from synth.stress.inputs import altered_mesh, write_surface
+from synth.stress.suite import result_of, run_stress
+from synth.template import load_scene
+
+MESH = brick()
+STRETCH = np.diag([0.9, 0.95, 1.1])
+"""A deformation that any check must pass: det F = 0.94."""
+
+
+def run(**fields: Any) -> Run:
+    case = Case.model_validate({"name": "a", "group": "g", "why": "w", "outcome": ["complete"], **fields})
+    return Run(case, "p1p1", case.budget_s or 60.0, EXTREME / "base.toml")
+
+
+def state(**fields: Any) -> dict[str, Any]:
+    return {
+        "depth_mm": 0.4, "shear_mm": [0.0, 0.0], "twist_deg": 0.0, "force_n": [0.3, 0.4, 1.0], "torque_nmm": [0.0] * 3,
+        "converged": True, "newton_iterations": 5, "residual": 1e-7, "min_jacobian": 0.94, "max_penetration_mm": 0.01,
+        **fields,
+    }  # fmt: skip
+
+
+def result(asked: Run | None = None, outcome: str = "complete", message: str = "", **changes: Any) -> Result:
+    """A sound result of two states; changes: last (fields of its last state), record, displacement."""
+    moved = MESH.points @ (STRETCH - np.eye(3))
+    displacement = np.array([0 * moved, changes.get("displacement", moved)])
+    last = state(**changes.get("last", {}))
+    states = [state(residual=0.0, min_jacobian=1.0, force_n=[0.0] * 3), last]
+    record = {"states": states, "states_asked": 2, "tolerance": 1e-6, "mesh": MESH.hash, **changes.get("record", {})}
+    nodes = np.unique(MESH.tets)
+    arrays = {
+        "displacement": displacement, "traction": np.zeros((2, 5, 3)), "points": MESH.points, "nodes": MESH.tets,
+        "surface_nodes": nodes, "surface_faces": MESH.tets[:, :3],
+    }  # fmt: skip
+    return Result(asked or run(), outcome, message, 1.0, record, arrays)
+
+
+def folded() -> np.ndarray:
+    """Displacement that turns one tetrahedron inside out."""
+    moved = np.zeros_like(MESH.points)
+    node = int(MESH.tets[0, 0])
+    moved[node] = 2 * (MESH.points[MESH.tets[0, 1:]].mean(axis=0) - MESH.points[node])
+    return moved
+
+
+def nan_at_one_node() -> np.ndarray:
+    moved = np.zeros_like(MESH.points)
+    moved[7, 1] = np.nan
+    return moved
+
+
+def test_a_sound_result_is_as_expected() -> None:
+    verdict = judged(result(), {})
+    assert (verdict.broken, verdict.word, verdict.ok) == ((), "as expected", True)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"displacement": nan_at_one_node()}, "state 1: a field is not finite"),
+        ({"last": {"force_n": [0.0, float("nan"), 1.0]}}, "state 1: force_n is not finite"),
+        ({"last": {"residual": 2e-6}}, "residual 2e-06 is above the tolerance 1e-06"),
+        ({"last": {"residual": float("nan")}}, "residual is not finite"),
+        ({"last": {"min_jacobian": 0.0}}, "smallest det F is 0"),
+        ({"displacement": folded()}, "det F of the stored displacements is -"),
+        ({"record": {"states_asked": 3}}, "complete with 2 of 3 states"),
+        ({"outcome": "partial", "message": "why", "record": {"states_asked": 2}}, "partial with 2 of 2 states"),
+        ({"outcome": "partial", "record": {"states_asked": 3}}, "partial without a reason"),
+        ({"outcome": "hung"}, "hung: killed after its budget of 60 s"),
+        ({"outcome": "crashed", "message": "exit status 1"}, "crashed: exit status 1"),
+    ],
+)
+def test_no_result_may(wrong: dict[str, Any], message: str) -> None:
+    """Fails with a tenfold tolerance, without the stored det F, or without the look at the fields' numbers."""
+    lenient = {"outcome": ["complete", "partial"], "deviation": {"outcome": ["complete", "partial"], "because": "b"}}
+    verdict = judged(result(run(**lenient), **wrong), {})
+    assert any(message in text for text in verdict.broken), verdict.broken
+    assert not verdict.ok
+
+
+@pytest.mark.parametrize(
+    ("entry", "ended", "message"),
+    [
+        ({"outcome": ["partial"]}, {}, "complete, expected partial"),
+        ({"says": "too small"}, {"outcome": "failed", "message": "no"}, "does not say 'too small'"),
+        ({"bounds": {"force_z_n": [0.1, 0.9]}}, {}, "force_z_n = 1 is not within [0.1, 0.9]"),
+        ({"bounds": {"side_ratio": [0.6, 0.9]}}, {}, "side_ratio = 0.5 is not within"),
+        ({"bounds": {"penetration_mm": [0, 0.009]}}, {}, "penetration_mm = 0.01 is not within"),
+        ({"bounds": {"weight": [0, 1]}}, {}, "weight is not measured"),
+        ({"compare": {"with": "b", "force_ratio": [1.1, 2]}}, {}, "force 1 N is 1 of b's"),
+        ({"compare": {"with": "b", "displacement": 1e-9}}, {"displacement": 0 * MESH.points}, "differs from b's by 1"),
+        ({"compare": {"with": "b", "displacement": 1}}, {"record": {"mesh": "other"}}, "another mesh"),
+        ({"compare": {"with": "c", "displacement": 1}}, {}, "cannot be compared with c, which was not run"),
+    ],
+)
+def test_expectations_are_compared(entry: dict[str, Any], ended: dict[str, Any], message: str) -> None:
+    """Fails with the upper bounds left out, or with the smallest difference in place of the largest."""
+    verdict = judged(result(run(**entry), **ended), {"b": result()})
+    assert any(message in text for text in verdict.broken), verdict.broken
+
+
+def test_a_noted_deviation_is_accepted_only_as_it_is_noted() -> None:
+    entry: dict[str, Any] = {"bounds": {"force_z_n": [2, 3]}, "deviation": {"outcome": ["complete"], "because": "b"}}
+    verdict = judged(result(run(**entry)), {})
+    assert (verdict.ok, verdict.deviates, verdict.word) == (True, True, "explained")
+    entry["deviation"]["bounds"] = {"force_z_n": [4, 5]}
+    verdict = judged(result(run(**entry)), {})
+    assert (verdict.ok, verdict.deviates) == (False, False)
+    assert "[2, 3]" in verdict.broken[0]  # what was expected first, not the excuse
+    entry["bounds"] = {"force_z_n": [0, 1]}
+    assert judged(result(run(**entry)), {}).word == "as expected"
+
+
+def test_jacobian_of_linear_and_quadratic_elements() -> None:
+    """An affine map has det F everywhere; u_x = c x^2 has 1 + 2 c x.
+
+    Fails with the midpoints' derivatives exchanged.
+    """
+    space = function_space(MESH, p2p1())
+    places = np.concatenate([np.eye(4), GAUSS])
+    for points, nodes in ((MESH.points, MESH.tets), (space.points, space.nodes)):
+        affine = points @ (STRETCH - np.eye(3))
+        # Rounding of 3 x 3 determinants of order 1.
+        assert smallest_jacobian(points, nodes, affine, places) == pytest.approx(np.linalg.det(STRETCH), abs=1e-13)
+    square = np.zeros_like(space.points)
+    square[:, 0] = 0.1 * space.points[:, 0] ** 2
+    at_corners = smallest_jacobian(space.points, space.nodes, square, np.eye(4))
+    assert at_corners == pytest.approx(1 + 0.2 * MESH.points[:, 0].min(), abs=1e-13)
+    lowest = min(float((place @ MESH.points[MESH.tets][:, :, 0].T).min()) for place in GAUSS)
+    assert smallest_jacobian(space.points, space.nodes, square, GAUSS) == pytest.approx(1 + 0.2 * lowest, abs=1e-13)
+
+    square[0] = np.nan
+    assert np.isnan(smallest_jacobian(space.points, space.nodes, square, places))
+
+
+def test_a_quadratic_element_folded_at_a_corner_is_held_against_any_state() -> None:
+    """1 + 2 c x changes sign between the corner at x = -4 and the nearest integration point at -3.72 (b = 0.138).
+
+    Fails with the last state's corners alone, or with the largest of the states.
+    """
+    space = function_space(MESH, p2p1())
+    square = np.zeros_like(space.points)
+    square[:, 0] = space.points[:, 0] ** 2 / (2 * 3.85)
+    for fields in ((0 * square, square), (square, 0 * square)):
+        sound = result()
+        arrays = {**sound.arrays, "points": space.points, "nodes": space.nodes, "displacement": np.array(fields)}
+        bent = replace(sound, arrays=arrays)
+        assert faults(bent) == []
+        assert any("corner_jacobian = -0.03" in text for text in judged(bent, {}).broken)  # 1 - 4 / 3.85
+        excused = {"outcome": ["complete"], "because": "b", "bounds": {"corner_jacobian": [-0.1, 1.0]}}
+        assert judged(replace(bent, run=run(deviation=excused)), {}).word == "explained"
+
+
+def test_measured_are_of_the_last_state_or_the_worst() -> None:
+    worse = state(max_penetration_mm=0.5, residual=9e-7, min_jacobian=0.1, newton_iterations=7)
+    record = {"states": [state(), worse, state()]}
+    found = measured(result(record=record))
+    assert (found["penetration_mm"], found["residual"], found["min_jacobian"]) == (0.5, 9e-7, 0.1)
+    assert (found["iterations"], found["states"], found["force_z_n"]) == (17, 2, 1.0)
+    assert found["side_ratio"] == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    ("script", "budget", "outcome", "message"),
+    [
+        ("import time; time.sleep(60)", 0.7, "hung", ""),
+        ("raise RuntimeError('boom')", 30, "crashed", "exit status 1: RuntimeError: boom"),
+        ("import os; os.kill(os.getpid(), 11)", 30, "crashed", "signal 11"),
+        ("pass", 30, "crashed", "exit status 0: it said nothing"),
+        ("import sys; open(sys.argv[1] + '/result.json', 'w').write('{}'); sys.exit(3)", 30, "crashed", "status 3"),
+    ],
+)
+def test_processes_are_watched(tmp_path: Path, script: str, budget: float, outcome: str, message: str) -> None:
+    """Fails without the timeout (by taking a minute), with the folder not emptied, or without the exit status."""
+    asked = replace(run(), budget_s=budget)
+    (tmp_path / "case").mkdir()
+    (tmp_path / "case" / "result.json").write_text("{}")  # of an earlier run: must not count
+    found = result_of(asked, tmp_path / "case", tmp_path, (sys.executable, "-c", script))
+    assert (found.outcome, found.wall_s < 25) == (outcome, True)
+    assert message in found.message
+    assert not judged(found, {}).ok
+
+
+COARSE = """
+set = ["numerics.edge_length_mm=2.0", "motion.depth_mm=0.3", "motion.steps=1"%s]
+"""
+SUITE = f"""
+elements = ["p1p1"]
+budget_s = 60.0
+not_covered = ["all else"]
+[[case]]
+name = "soft"
+group = "small"
+why = "a press"
+outcome = ["complete"]
+bounds = {{ force_z_n = [0.05, 0.5], depth_mm = [0.3, 0.3] }}
+{COARSE % ""}
+[[case]]
+name = "hard"
+group = "small"
+why = "the same displacement and a tenfold force, which is not what is written down here"
+outcome = ["complete"]
+compare = {{ with = "soft", displacement = 1e-9, force_ratio = [1.0, 1.1] }}
+{COARSE % ', "sensor.gel.youngs_modulus_kpa=2000"'}
+[[case]]
+name = "hopeless"
+group = "wrong"
+why = "a pad of 20 m"
+elements = ["auto"]
+outcome = ["refused"]
+says = "size_mm"
+set = ["sensor.gel.size_mm=[20000, 15000, 4000]"]
+"""
+
+
+def test_a_small_suite_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Fails with status 0 for any good case, with no partner for a comparison, or with folders left in messages."""
+    scenes, out = tmp_path / "scenes", tmp_path / "out"
+    scenes.mkdir()
+    (scenes / "base.toml").write_text((EXTREME / "base.toml").read_text())
+    (scenes / "expected.toml").write_text(SUITE)
+    assert run_stress(out, None, 2, True, scenes) == 1
+    report = json.loads(capsys.readouterr().out)
+    assert [(case["case"], case["outcome"], case["ok"]) for case in report["cases"]] == [
+        ("soft", "complete", True),
+        ("hard", "complete", False),
+        ("hopeless", "refused", True),
+    ]
+    hard = report["cases"][1]
+    assert len(hard["broken"]) == 1  # the displacement is the same; only the force is not
+    assert "is 10 of soft's, not within [1, 1.1]" in hard["broken"][0]
+    assert json.loads((out / "stress.json").read_text()) == report
+    rows = list(csv.DictReader((out / "stress.csv").read_text().splitlines()))
+    assert [row["verdict"] for row in rows] == ["as expected", "OTHERWISE", "as expected"]
+    text = (out / "stress.md").read_text()
+    assert "- all else" in text
+    assert "| `hard-p1p1` |" in text
+    assert str(tmp_path) not in text  # a report is read elsewhere
+    assert (out / "stress.png").stat().st_size > 10_000
+    # Only what is asked for, with what it is compared with.
+    assert run_stress(out, ["hard"], 1, False, scenes) == 1
+    assert "soft-p1p1" in capsys.readouterr().out
+    assert run_stress(out, ["wrong"], 1, False, scenes) == 0
+    with pytest.raises(InputError, match=r"no case or group of that name; cases are soft, hard, hopeless"):
+        run_stress(out, ["nothing"], 1, False, scenes)
+
+
+def test_shipped_expectations_can_be_met() -> None:
+    """Every case loads, or refuses where it is expected to; what is bounded is measured; comparisons have partners."""
+    expectations = load_expectations(EXTREME / "expected.toml")
+    runs = all_runs(expectations)
+    assert len({one.name for one in runs}) == len(runs) >= 70
+    known = set(measured(result(last={"slip_ratio": 1.0})))
+    for one in runs:
+        case = one.case
+        assert set(case.bounds) <= known, case.name
+        assert len(compared(one, runs)) >= (case.compare is not None), case.name
+        for low, high in case.bounds.values():
+            assert low <= high, case.name
+        if case.mesh == "as made" and case.surface is None and case.outcome == ("refused",):
+            with pytest.raises(InputError) as refusal:
+                load_scene(one.base, one.assignments)
+            assert case.says in str(refusal.value)
+        else:
+            assert load_scene(one.base, one.assignments).corners[0].motion.steps >= 1
+
+
+def test_selection_brings_partners_along() -> None:
+    runs = all_runs(load_expectations(EXTREME / "expected.toml"))
+    chosen = selected(runs, ["poisson_0.5"])
+    assert [one.case.name for one in chosen if one.element == chosen[0].element] == [
+        "reference", "poisson_0.499999", "poisson_0.5",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (SUITE.replace('name = "hard"', 'name = "soft"'), "there are two cases 'soft'"),
+        (SUITE.replace('with = "soft"', 'with = "sfot"'), "compares with 'sfot', which is none"),
+        (SUITE.replace("says =", "say ="), "say: Extra inputs"),
+        (SUITE.replace('["refused"]', '["exploded"]'), "outcome.0: Input should be"),
+        ("elements = [", "not valid TOML"),
+    ],
+)
+def test_a_wrong_file_is_refused(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "expected.toml"
+    path.write_text(text)
+    with pytest.raises(InputError) as refusal:
+        load_expectations(path)
+    assert str(refusal.value).startswith(str(path))
+    assert message in str(refusal.value)
+
+
+def test_altered_meshes_are_what_they_are_called() -> None:
+    volume = float(MESH.volumes.sum())
+    sliver = altered_mesh(MESH, "sliver")
+    assert sliver.volumes.min() > 0
+    assert sliver.volumes.sum() == pytest.approx(volume, rel=1e-12)  # sums of some 300 volumes round to 1e-14
+    assert shape_quality(sliver.points, sliver.tets).min() < 1e-2 < shape_quality(MESH.points, MESH.tets).min()
+    assert abs(altered_mesh(MESH, "flat").volumes.min()) < 1e-12
+    assert (altered_mesh(MESH, "one inverted").volumes < 0).sum() == 1
+    assert (altered_mesh(MESH, "all inverted").volumes < 0).all()
+    assert np.isnan(altered_mesh(MESH, "nan").points).sum() == 1
+    loose = altered_mesh(MESH, "loose node")
+    assert len(np.unique(loose.tets)) == len(loose.points) - 1
+    assert altered_mesh(MESH, "another pad").size_mm != MESH.size_mm
+    assert signed_volumes(MESH.points, MESH.tets).min() > 0  # the given mesh is left alone
+
+
+def test_altered_surfaces_are_what_they_are_called(tmp_path: Path) -> None:
+    import pyvista as pv
+
+    def made(variant: Any) -> Any:
+        write_surface(variant, tmp_path / "ball.ply")
+        return pv.read(tmp_path / "ball.ply")
+
+    ball = made("ball")
+    assert ball.n_open_edges == 0
+    turned = made("inside out")
+    assert (turned.regular_faces == ball.regular_faces[:, ::-1]).all()
+    same = (made("mixed").regular_faces == ball.regular_faces).all(axis=1)
+    assert 0.6 < same.mean() < 0.7
+    slivers = made("slivers")
+    assert slivers.n_open_edges == 0
+    assert slivers.n_cells == ball.n_cells + 2 * (ball.n_cells // 10)
+    areas = slivers.compute_cell_sizes()["Area"]
+    assert areas.min() < 1e-4 * np.median(areas)
+    assert made("open").n_open_edges > 0
+    assert made("metres").length < 0.02
+
+
+def test_a_deviation_needs_a_reason() -> None:
+    with pytest.raises(ValueError, match="because"):
+        Deviation.model_validate({"outcome": ["complete"]})
+    assert Comparison.model_validate({"with": "x"}).force_ratio is None
+    assert faults(result()) == []
