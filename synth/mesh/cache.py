@@ -14,8 +14,10 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from synth.errors import InputError
 from synth.mesh.pad import PadMesh
-from synth.mesh.tetrahedralise import ENVELOPE, GRADING, tetrahedralise_box
+from synth.mesh.sizing import GRADING
+from synth.mesh.tetrahedralise import ENVELOPE, tetrahedralise_box
 from synth.scene import Gel, Numerics
 
 
@@ -48,7 +50,14 @@ def pad_mesh(gel: Gel, numerics: Numerics, folders: Sequence[Path] | None = None
         gel: the pad.
         numerics: its edge length.
         folders: searched in order; default the user's cache.
+
+    Raises:
+        InputError: the pad has layers, whose interfaces fTetWild does not keep as planes.
     """
+    if gel.layers:
+        raise InputError(
+            "sensor.gel.layers: a mesh of even edge length cannot follow layers; leave out numerics.edge_length_mm"
+        )
     key = mesh_key(gel, numerics)
     paths = [folder / f"{key}.npz" for folder in (folders if folders is not None else [user_cache()])]
     mesh = next((found for path in paths if (found := _read(path, gel)) is not None), None)

@@ -1,12 +1,14 @@
 """The gel pad's tetrahedral mesh and what the later stages ask of it."""
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from synth.arrays import BoolArray, FloatArray, Points, Tets, Triangles
+from synth.errors import InputError
 from synth.surface import ContactFaces
 
 _FACES_OF_TET = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])  # normals point out of a positive tetrahedron
@@ -20,11 +22,24 @@ class PadMesh:
         points: (n, 3) float64 mm.
         tets: (m, 4) int32; (b - a) x (c - a) . (d - a) > 0 by components.
         size_mm: edge lengths of the box.
+        layer: (m,) int32, the layer of material that each tetrahedron lies in, counted from the contact face; left
+            out, all lie in layer 0.
+
+    Raises:
+        ValueError: `layer` is not one number per tetrahedron.
     """
 
     points: Points
     tets: Tets
     size_mm: tuple[float, float, float]
+    layer: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, dtype=np.int32))
+
+    def __post_init__(self) -> None:
+        """Fill in the single layer."""
+        if self.layer.size == 0:
+            object.__setattr__(self, "layer", np.zeros(len(self.tets), dtype=np.int32))
+        if self.layer.shape != (len(self.tets),):
+            raise ValueError(f"layer has shape {self.layer.shape}, expected ({len(self.tets)},)")
 
     @cached_property
     def volumes(self) -> FloatArray:
@@ -35,6 +50,19 @@ class PadMesh:
     def bonded(self) -> BoolArray:
         """(n,) nodes glued to the window."""
         return self.points[:, 2] == self.size_mm[2]
+
+    @cached_property
+    def touchable(self) -> Triangles:
+        """(k, 3) int32 into `points`: boundary faces that are not bonded, normals pointing out."""
+        faces = self._boundary
+        return faces[~self.bonded[faces].all(axis=1)]
+
+    @cached_property
+    def spacing_mm(self) -> float:
+        """Length of the contact face's short edges, their 10 % quantile: what the finest part resolves."""
+        faces = self._contact_triangles
+        edges = self.points[faces] - self.points[np.roll(faces, 1, axis=1)]
+        return float(np.quantile(np.linalg.norm(edges, axis=2), 0.1))
 
     @cached_property
     def contact_nodes(self) -> np.ndarray:
@@ -50,16 +78,42 @@ class PadMesh:
 
     @cached_property
     def _contact_triangles(self) -> Triangles:
-        faces = boundary_faces(self.tets)
+        faces = self._boundary
         return faces[(self.points[faces][:, :, 2] == 0).all(axis=1)]
 
     @cached_property
+    def _boundary(self) -> Triangles:
+        return boundary_faces(self.tets)
+
+    @cached_property
     def hash(self) -> str:
-        """SHA-256 of points and tetrahedra: the mesher is not deterministic, so results name the mesh they used."""
+        """SHA-256 of points, tetrahedra and, where there are several, their layers.
+
+        fTetWild is not deterministic, so results name the mesh they used.
+        """
         digest = hashlib.sha256()
         digest.update(np.ascontiguousarray(self.points, dtype="<f8").tobytes())
         digest.update(np.ascontiguousarray(self.tets, dtype="<i4").tobytes())
+        if self.layer.any():
+            digest.update(np.ascontiguousarray(self.layer, dtype="<i4").tobytes())
         return digest.hexdigest()
+
+
+def check_mesh(mesh: PadMesh) -> None:
+    """Refuse what no element can be built on.
+
+    Raises:
+        InputError: points that are not finite, an element without volume or inside out, a node of no element.
+    """
+    if not np.isfinite(mesh.points).all():
+        raise InputError("the mesh has points that are not finite")
+    if mesh.volumes.min() <= 0:
+        number = int(mesh.volumes.argmin())
+        volume = mesh.volumes[number]
+        raise InputError(f"tetrahedron {number} of the mesh has a volume of {volume:.3g} mm^3; it must be > 0")
+    loose = np.setdiff1d(np.arange(len(mesh.points)), mesh.tets)
+    if len(loose):
+        raise InputError(f"node {loose[0]} of the mesh belongs to no tetrahedron ({len(loose)} such nodes)")
 
 
 def signed_volumes(points: Points, tets: Tets) -> FloatArray:
@@ -71,5 +125,7 @@ def signed_volumes(points: Points, tets: Tets) -> FloatArray:
 def boundary_faces(tets: Tets) -> Triangles:
     """(k, 3) int32: faces of exactly one tetrahedron, normals pointing out."""
     faces = tets[:, _FACES_OF_TET].reshape(-1, 3)
-    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
+    nodes = int(tets.max()) + 1  # below 2e6, so that a face's nodes fit one 64-bit number
+    name = np.sort(faces, axis=1).astype(np.int64) @ np.array([nodes * nodes, nodes, 1])
+    _, first, count = np.unique(name, return_index=True, return_counts=True)
     return np.ascontiguousarray(faces[np.sort(first[count == 1])], dtype=np.int32)

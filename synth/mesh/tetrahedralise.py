@@ -1,4 +1,4 @@
-"""Tetrahedral mesh of a box of gel by fTetWild (Hu et al., ACM TOG 2020; pytetwild), graded from contact to window.
+"""Tetrahedral mesh of a box of gel by fTetWild (Hu et al., ACM TOG 2020; pytetwild), small elements at the contact.
 
 What fTetWild leaves to do: its flat faces are up to epsilon off, so boundary vertices are snapped to the planes of the
 box; its orientation is negative; and it is not deterministic, so a mesh is made once and kept (`synth.mesh.cache`).
@@ -14,30 +14,48 @@ import numpy as np
 
 from synth.arrays import Points, Tets
 from synth.errors import InputError
+from synth.mesh.focus import Focus
 from synth.mesh.pad import PadMesh, boundary_faces, signed_volumes
+from synth.mesh.sizing import Background, around_focus, through_thickness
 
-GRADING = 2.0
-"""Edge length at the window over edge length at the contact face."""
 ENVELOPE = 1e-3
 """fTetWild's epsilon, relative to the bounding box's diagonal."""
+COARSENING = 4.0
+"""With a focus: largest edge length over the one in the focus, where none is given."""
 WORST_SHAPE = 0.02
 """Smallest accepted ratio of inscribed to circumscribed radius, times 3 (1 for a regular tetrahedron)."""
 
 
-def tetrahedralise_box(size_mm: tuple[float, float, float], edge_length_mm: float, attempts: int = 3) -> PadMesh:
-    """Mesh a box whose tetrahedra have edges of edge_length_mm at the contact face.
+def tetrahedralise_box(
+    size_mm: tuple[float, float, float],
+    edge_length_mm: float,
+    attempts: int = 3,
+    focus: Focus | None = None,
+    coarse_mm: float | None = None,
+) -> PadMesh:
+    """Mesh a box whose tetrahedra have edges of edge_length_mm at the contact face, or in a zone of it.
 
     Args:
         size_mm: edge lengths of the box.
-        edge_length_mm: target edge length at z = 0; GRADING times that at the window.
+        edge_length_mm: target edge length at z = 0 or, with a focus, in that zone of z = 0.
         attempts: the mesher is random; a mesh below WORST_SHAPE is made again so often.
+        focus: where edges are edge_length_mm long; they grow away from it. Without it they grow from the contact face
+            to GRADING times that at the window.
+        coarse_mm: with a focus, the largest target edge length; default 4 times edge_length_mm.
 
     Raises:
+        ValueError: coarse_mm without a focus, or below edge_length_mm.
         InputError: no attempt gave a valid mesh.
     """
+    if coarse_mm is not None and (focus is None or coarse_mm < edge_length_mm):
+        raise ValueError(f"coarse_mm = {coarse_mm} needs a focus, and at least edge_length_mm = {edge_length_mm}")
+    if focus is None:
+        background = through_thickness(size_mm, edge_length_mm)
+    else:
+        background = around_focus(size_mm, edge_length_mm, focus, coarse_mm or COARSENING * edge_length_mm)
     problem = ""
     for _ in range(attempts):
-        points, tets = _ftetwild(size_mm, edge_length_mm)
+        points, tets = _ftetwild(size_mm, background)
         points, tets = _repair(points, tets, size_mm)
         problem = _fault(points, tets, size_mm)
         if not problem:
@@ -65,30 +83,23 @@ def shape_quality(points: Points, tets: Tets) -> np.ndarray:
     return np.asarray(108 * volume**2 / np.maximum(area * numerator, 1e-300))
 
 
-def _ftetwild(size: tuple[float, float, float], edge: float) -> tuple[Points, Tets]:
+def _ftetwild(size: tuple[float, float, float], background: Background) -> tuple[Points, Tets]:
     import pytetwild
 
     half = np.array([size[0] / 2, size[1] / 2])
     corners = np.array([(x, y, z) for z in (0.0, size[2]) for y in (-half[1], half[1]) for x in (-half[0], half[0])])
     quads = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5))
     faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))], dtype=np.int32)
-    margin = 1.01  # the background mesh covers the box with room to spare
-    cube_tets = np.array(
-        [(0, 1, 3, 7), (0, 3, 2, 7), (0, 2, 6, 7), (0, 6, 4, 7), (0, 4, 5, 7), (0, 5, 1, 7)], dtype=np.int32
-    )
-    centre = np.array([0.0, 0.0, size[2] / 2])
-    background = centre + margin * (corners - centre)
-    target = edge * (1 + (GRADING - 1) * np.clip(background[:, 2] / size[2], 0, 1))
     # fTetWild leaves a __tracked_surface.stl in the working directory.
     with _interrupts_kept(), tempfile.TemporaryDirectory() as scratch, contextlib.chdir(scratch):
         points, tets = pytetwild.tetrahedralize(
             corners,
             faces,
-            edge_length_abs=GRADING * edge,
+            edge_length_abs=float(background.values.max()),
             epsilon=ENVELOPE,
-            bg_vertices=background,
-            bg_tets=cube_tets,
-            bg_values=target,
+            bg_vertices=background.points,
+            bg_tets=background.tets.copy(),  # read-only arrays are refused
+            bg_values=background.values,
         )
     return np.asarray(points, dtype=np.float64), np.asarray(tets, dtype=np.int32)
 

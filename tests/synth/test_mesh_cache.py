@@ -7,8 +7,9 @@ import pytest
 from pads import crooked
 
 import synth.mesh.cache as cache
+from synth.errors import InputError
 from synth.mesh import PadMesh, default_edge_length, mesh_key, pad_mesh
-from synth.scene import Gel, Numerics
+from synth.scene import Gel, Layer, Numerics
 
 GEL = Gel(size_mm=(4.0, 4.0, 3.0), youngs_modulus_kpa=200.0)
 NUMERICS = Numerics(edge_length_mm=1.5)
@@ -87,6 +88,14 @@ def test_key_depends_on_what_the_mesh_depends_on_only() -> None:
     assert mesh_key(GEL.model_copy(update={"youngs_modulus_kpa": 7.0, "poisson_ratio": 0.3}), NUMERICS) == key
     assert mesh_key(GEL, Numerics(edge_length_mm=1.5, tolerance=1e-4)) == key
     assert mesh_key(GEL, Numerics()) == mesh_key(GEL, Numerics(edge_length_mm=default_edge_length(GEL)))
+
+
+def test_layered_pad_is_refused(tmp_path: Path, made: list[float]) -> None:
+    """Every tetrahedron would count as the first layer."""
+    layered = GEL.model_copy(update={"layers": (Layer(thickness_mm=0.1, youngs_modulus_kpa=900.0),)})
+    with pytest.raises(InputError, match="cannot follow layers"):
+        pad_mesh(layered, NUMERICS, [tmp_path])
+    assert made == []
 
 
 @pytest.mark.parametrize(("thickness", "edge"), [(2.0, 0.4), (4.0, 0.8), (8.0, 1.0)])

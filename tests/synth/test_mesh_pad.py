@@ -9,7 +9,8 @@ from pads import brick
 
 from synth.mesh import PadMesh
 from synth.mesh.pad import boundary_faces, signed_volumes
-from synth.mesh.tetrahedralise import GRADING, WORST_SHAPE, _fault, _repair, shape_quality, tetrahedralise_box
+from synth.mesh.sizing import GRADING
+from synth.mesh.tetrahedralise import WORST_SHAPE, _fault, _repair, shape_quality, tetrahedralise_box
 
 SIZE = (7.0, 5.0, 2.5)
 EDGE = 0.6

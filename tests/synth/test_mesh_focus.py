@@ -1,0 +1,113 @@
+"""Local refinement by fTetWild's sizing field, and the zone that it follows."""
+
+import numpy as np
+import pytest
+
+from synth.arrays import FloatArray
+from synth.mesh import Focus, PadMesh
+from synth.mesh.pad import boundary_faces, signed_volumes
+from synth.mesh.sizing import GRADING, SLOPE, around_focus, through_thickness
+from synth.mesh.tetrahedralise import WORST_SHAPE, shape_quality, tetrahedralise_box
+
+SIZE = (12.0, 9.0, 3.0)
+FOCUS = Focus((1.5, -1.0), (2.0, 1.5))
+EDGE, COARSE = 0.6, 2.0
+
+
+@pytest.fixture(scope="module")
+def pad() -> PadMesh:
+    return tetrahedralise_box(SIZE, EDGE, focus=FOCUS, coarse_mm=COARSE)
+
+
+def distance_from_zone(points: FloatArray) -> FloatArray:
+    """(n,) mm from the zone of the contact face."""
+    away = np.abs(points[:, :2] - FOCUS.centre_mm) - FOCUS.half_mm
+    return np.hypot(np.linalg.norm(np.maximum(away, 0), axis=1), np.maximum(points[:, 2], 0))
+
+
+def test_mesh_is_as_good_as_any(pad: PadMesh) -> None:
+    assert pad.volumes.min() > 0
+    # Sums of some 2000 volumes round to 1e-14 relative.
+    assert pad.volumes.sum() == pytest.approx(np.prod(SIZE), rel=1e-12)
+    assert shape_quality(pad.points, pad.tets).min() >= WORST_SHAPE
+    low, high = np.array([-6.0, -4.5, 0.0]), np.array([6.0, 4.5, 3.0])
+    corners = pad.points[boundary_faces(pad.tets)]
+    assert ((corners == low).all(axis=1) | (corners == high).all(axis=1)).any(axis=1).all()
+
+
+def test_edges_are_small_in_the_focus_only(pad: PadMesh) -> None:
+    contact = pad.contact_faces
+    corners = contact.nodes[contact.faces]
+    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean(axis=1)
+    away = distance_from_zone(corners.mean(axis=1))
+    # fTetWild splits edges longer than 4/3 of the target and collapses those shorter than 4/5, so the mean over many
+    # lies within these. Fails without bg_values (1.7 mm everywhere).
+    assert 4 / 5 * EDGE < edges[away == 0].mean() < 4 / 3 * EDGE
+    assert edges[away > 2.5].mean() > 1.5 * edges[away == 0].mean()
+    # Evenly fine, the contact face would have so many equilateral triangles of that edge: this has less than half.
+    assert len(corners) < 0.5 * SIZE[0] * SIZE[1] / (np.sqrt(3) / 4 * EDGE**2)
+
+
+@pytest.mark.parametrize(
+    "focus",
+    [FOCUS, Focus((5.5, 4.4), (2.0, 2.0)), Focus((0, 0), (50, 50)), Focus((9, 0), (1, 0)), Focus((3.9, 0), (2, 1))],
+)
+def test_background_grows_smoothly_from_the_focus(focus: Focus) -> None:
+    field = around_focus(SIZE, EDGE, focus, COARSE)
+    assert (field.values >= EDGE).all()
+    assert (field.values <= COARSE).all()
+    assert signed_volumes(field.points, field.tets).min() > 0
+    assert (field.points.min(axis=0) <= [-6, -4.5, 0]).all()
+    assert (field.points.max(axis=0) >= [6, 4.5, 3]).all()
+    edge = np.concatenate([field.tets[:, [i, j]] for i in range(4) for j in range(i)])
+    length = np.linalg.norm(field.points[edge[:, 0]] - field.points[edge[:, 1]], axis=1)
+    # The distance from a convex set has slope 1, and moving the outermost points outward lengthens edges.
+    assert (np.abs(field.values[edge[:, 0]] - field.values[edge[:, 1]]) <= SLOPE * length + 1e-12).all()
+    # The field is linear between planes of the grid: it is EDGE throughout the focus if its ends are planes.
+    # Fails with the ends left out of the grid.
+    points = np.clip(field.points, [-6, -4.5, 0], [6, 4.5, 3])
+    inside = points[:, 2] == 0
+    for axis in (0, 1):
+        low, high = focus.span(axis, SIZE[axis])
+        assert {low, high} <= set(points[:, axis])
+        inside &= (points[:, axis] >= low) & (points[:, axis] <= high)
+    assert (field.values[inside] == EDGE).all()
+
+
+def test_background_is_edge_in_the_focus_and_coarse_far_away() -> None:
+    field = around_focus(SIZE, EDGE, FOCUS, COARSE)
+    away = distance_from_zone(np.clip(field.points, [-6, -4.5, 0], [6, 4.5, 3]))
+    np.testing.assert_allclose(field.values, np.minimum(EDGE + SLOPE * away, COARSE), atol=1e-12)
+    assert (away == 0).sum() >= 4
+    assert (field.values == COARSE).any()
+
+
+def test_without_a_focus_edges_grow_toward_the_window() -> None:
+    field = through_thickness(SIZE, EDGE)
+    assert sorted(set(field.values)) == [EDGE, GRADING * EDGE]
+    assert ((field.values == EDGE) == (field.points[:, 2] < 0)).all()
+    volumes = signed_volumes(field.points, field.tets)
+    assert volumes.min() > 0
+    # 1.01 times the box along each axis.
+    assert volumes.sum() == pytest.approx(1.01**3 * np.prod(SIZE), rel=1e-12)
+
+
+@pytest.mark.parametrize("wrong", [{"coarse_mm": 2.0}, {"coarse_mm": 0.5, "focus": FOCUS}])
+def test_coarse_edges_that_make_no_sense(wrong: dict) -> None:
+    with pytest.raises(ValueError, match="needs a focus"):
+        tetrahedralise_box(SIZE, EDGE, **wrong)
+
+
+def test_focus_is_clipped_to_the_pad() -> None:
+    assert FOCUS.clipped(SIZE) == FOCUS
+    over = Focus((5.0, 0.0), (3.0, 1.0)).clipped(SIZE)
+    assert over == Focus((4.0, 0.0), (2.0, 1.0))
+    beside = Focus((20.0, -9.0), (3.0, 1.0)).clipped(SIZE)
+    assert beside == Focus((6.0, -4.5), (0.0, 0.0))
+    assert Focus((0.0, 0.0), (99.0, 99.0)).clipped(SIZE) == Focus((0.0, 0.0), (6.0, 4.5))
+
+
+@pytest.mark.parametrize("half", [(-0.1, 1.0), (np.nan, 1.0), (1.0, np.inf)])
+def test_focus_that_is_no_rectangle(half: tuple[float, float]) -> None:
+    with pytest.raises(ValueError, match="half widths >= 0"):
+        Focus((0.0, 0.0), half)
