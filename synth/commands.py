@@ -70,18 +70,18 @@ def run_plan(scene: str, n: int, assignments: Sequence[str], device: Device, as_
 def run_simulate(scene: str, out: Path, seed: int, index: int, assignments: Sequence[str], as_json: bool) -> int:
     """See `synth.cli.simulate`."""
     from synth.dataset.storage import storage_errors
-    from synth.mesh import pad_mesh
     from synth.sampling import draw
     from synth.simulate import simulate
     from synth.simulate.files import write_trajectory
+    from synth.simulate.resolution import resolve
 
     template = load_scene(scene, assignments)
     drawn = draw(template, seed, index)
     with storage_errors(out):
         out.mkdir(parents=True, exist_ok=True)  # before minutes of work, not after
-    mesh = pad_mesh(drawn.sensor.gel, drawn.numerics)
-    trajectory = simulate(drawn, mesh, template.source.parent)
-    record = write_trajectory(out, drawn, mesh, trajectory)
+    resolution = resolve(drawn, template.source.parent)
+    trajectory = simulate(drawn, resolution.mesh, template.source.parent)
+    record = write_trajectory(out, drawn, trajectory)
     if as_json:
         print(json.dumps(record))
     else:
@@ -165,12 +165,26 @@ def _show_plan(planned: Plan, n: int, as_json: bool) -> int:
     stages = ", ".join(f"{stage} {value:.2f} s" for stage, value in planned.seconds_per_pair.items())
     _say(
         console,
-        f"mesh: edges {planned.edge_length_mm:g} mm at the contact face, about {planned.nodes} nodes\n"
-        f"predicted per pair: {stages}; {planned.bytes_per_pair / 1e6:.2f} MB\n"
+        f"mesh: {planned.resolution}, about {planned.nodes} displacement nodes\n"
+        + _error_line(planned)
+        + f"predicted per pair: {stages}; {planned.bytes_per_pair / 1e6:.2f} MB\n"
         f"predicted for {n} pairs: {_duration(n * seconds)} on one core, {n * planned.bytes_per_pair / 1e9:.2f} GB\n"
-        "predicted within a factor of three; the simulation's discretisation error is not predicted",
+        "times are predicted within a factor of three",
     )
     return 0
+
+
+def _error_line(planned: Plan) -> str:
+    """What the plan says of the simulation's discretisation error."""
+    if np.isnan(planned.target_error_px):
+        return "with an edge length given, the simulation's discretisation error is not predicted\n"
+    median, largest = planned.error_px
+    line = f"predicted error of the flow from the simulation: {median:.2g} px (median), {largest:.2g} px (largest)"
+    if largest > planned.target_error_px:
+        return (
+            f"{line}; the target of {planned.target_error_px:g} px is out of reach of the finest mesh for some draws\n"
+        )
+    return f"{line}; target {planned.target_error_px:g} px\n"
 
 
 def _show_summary(summary: Summary, variant: Variant) -> None:

@@ -158,14 +158,14 @@ def _tasks(place: Workplace, n: int, finished: set[int]) -> Iterator[Task]:
         sensor = sensor_of(template, trajectory)
         if sensor != meshed:
             drawn = draw_sensor(template, place.job.seed, sensor)
-            if drawn.content is not None:
+            if drawn.content is not None and template.corners[0].numerics.edge_length_mm is not None:
                 _keep_mesh(place, Gel.model_validate(drawn.content["sensor"]["gel"]))
             meshed = sensor
         yield trajectory, wanted
 
 
 def _keep_mesh(place: Workplace, gel: Gel) -> None:
-    """Have the dataset hold a pad's mesh: without, every trajectory would make another one."""
+    """Have the dataset hold a pad's fTetWild mesh: without, every trajectory would make another one."""
     numerics = place.template.corners[0].numerics
     pad_mesh(gel, numerics, place.mesh_folders)
     kept = place.mesh_folders[0] / f"{mesh_key(gel, numerics)}.npz"

@@ -1,33 +1,42 @@
 """What a scene needs, decided once: what runs, what is left out and why, and what a pair will cost.
 
 The costs are predictions from constants measured on one core of a 2-core x86-64 server; other machines differ by a
-factor of two or three either way. Discretisation error is not predicted: see docs/reports for what was measured.
+factor of two or three either way. Errors are predictions of `synth.simulate.resolution`.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from synth.errors import InputError
-from synth.mesh import default_edge_length
 from synth.render.camera_rays import pinhole
 from synth.render.lights import check_view
 from synth.render.pattern import is_grey
 from synth.render.variant import Variant
+from synth.sampling import draw
 from synth.scene import Scene
 from synth.simulate.indenter import rigid_body
+from synth.simulate.material import DISPLACEMENT_ONLY_BELOW
 from synth.simulate.path import TWIST_ARM_MM
-from synth.simulate.system import DISPLACEMENT_ONLY_BELOW
+from synth.simulate.resolution import DEFAULT_TARGET_PX, Resolution, resolve
 from synth.template import Template
 
+DRAWS = 12
+"""Draws of the scene whose meshes are chosen to predict error and time."""
 NODES_PER_VOLUME, NODES_PER_AREA, FEWEST_NODES = 0.72, 0.25, 300
-"""Mesh nodes per cube and per square of the contact face's edge length, with `synth.mesh.tetrahedralise`'s grading."""
-SOLVE_SECONDS = 0.065
-"""One Newton iteration (assembly, factorisation, solution) of a frictional press with SOLVE_NODES nodes."""
-SOLVE_NODES = 2000
-SOLVE_GROWTH = 1.6
-"""Exponent of a solve's time in the number of nodes (between 2D's 1.5 and 3D's 2 for a thin pad)."""
-ITERATIONS_PER_STEP, STEPS_PER_RECORD = 10.0, 1.5
+"""Mesh vertices per cube and per square of the contact face's edge length, for fTetWild's meshes."""
+VERTICES_TO_P2 = 7.0
+"""Displacement nodes of P2 elements per vertex of the mesh."""
+SOLVE_SECONDS = 0.06
+"""One Newton iteration (assembly, factorisation, solution) without friction, with SOLVE_NODES displacement nodes."""
+SOLVE_NODES = 5000
+SOLVE_GROWTH = 1.5
+"""Exponent of a solve's time in the number of nodes, as for nested dissection of a thin pad."""
+FRICTION = 1.5
+"""Time of an iteration with friction over one without."""
+ITERATIONS_PER_STEP, ITERATIONS_PER_RECORD = 4.5, 7.0
 SECONDS_PER_MILLION_SAMPLES = {"llvm": 0.4, "scalar": 1.0, "cuda": 0.002}
 """Path-traced camera samples of one frame."""
 FLOW_SECONDS_PER_MEGAPIXEL = 3.0
@@ -50,8 +59,11 @@ class Plan:
 
     Attributes:
         decisions: feature by feature.
-        edge_length_mm: of the mesh at the contact face.
-        nodes: predicted mesh nodes.
+        resolution: how fine the meshes are, in words.
+        error_px: predicted error of the flow from the simulation: median and largest of DRAWS draws; NaN where the
+            mesh is given by an edge length, for which nothing is predicted.
+        target_error_px: what was asked for; NaN with an edge length.
+        nodes: displacement nodes, mean of the draws.
         seconds_per_pair: predicted, by stage, on one core.
         bytes_per_pair: predicted size on disk.
     """
@@ -59,7 +71,9 @@ class Plan:
     scene: str
     variant: str
     decisions: tuple[Decision, ...]
-    edge_length_mm: float
+    resolution: str
+    error_px: tuple[float, float]
+    target_error_px: float
     nodes: int
     seconds_per_pair: dict[str, float]
     bytes_per_pair: int
@@ -70,7 +84,9 @@ class Plan:
             "scene": self.scene,
             "variant": self.variant,
             "decisions": [vars(decision) for decision in self.decisions],
-            "edge_length_mm": self.edge_length_mm,
+            "resolution": self.resolution,
+            "error_px": None if np.isnan(self.target_error_px) else list(self.error_px),
+            "target_error_px": None if np.isnan(self.target_error_px) else self.target_error_px,
             "nodes": self.nodes,
             "seconds_per_pair": self.seconds_per_pair,
             "bytes_per_pair": self.bytes_per_pair,
@@ -99,12 +115,10 @@ def plan(template: Template, variant: Variant) -> Plan:
     """Plan a template by the corners of its distributions."""
     corners = template.corners
     scene = corners[0]
-    gel, camera = scene.sensor.gel, scene.sensor.camera
-    edge = scene.numerics.edge_length_mm or default_edge_length(gel)
-    x, y, z = (length / edge for length in gel.size_mm)
-    nodes = max(FEWEST_NODES, round(NODES_PER_VOLUME * x * y * z + NODES_PER_AREA * 2 * (x * y + y * z + z * x)))
+    camera = scene.sensor.camera
     pairs = scene.sampling.pairs_per_trajectory
-    simulate = sum(_simulation_seconds(corner, nodes) for corner in corners) / len(corners)
+    meshes = _meshes(template)
+    simulate = sum(_simulation_seconds(draw, nodes) for draw, nodes in meshes.draws) / len(meshes.draws)
     pixels = camera.width * camera.height
     kind = variant.name.split("_")[0]
     frame = pixels * scene.render.samples_per_pixel / 1e6 * SECONDS_PER_MILLION_SAMPLES[kind]
@@ -114,8 +128,10 @@ def plan(template: Template, variant: Variant) -> Plan:
         scene=template.name,
         variant=variant.name,
         decisions=tuple(_decisions(corners, variant)),
-        edge_length_mm=edge,
-        nodes=nodes,
+        resolution=meshes.resolution,
+        error_px=meshes.error_px,
+        target_error_px=meshes.target_error_px,
+        nodes=round(sum(nodes for _, nodes in meshes.draws) / len(meshes.draws)),
         seconds_per_pair={
             "simulate": round(simulate / pairs, 3),
             "render": round(frame * frames_per_pair, 3),
@@ -125,14 +141,58 @@ def plan(template: Template, variant: Variant) -> Plan:
     )
 
 
+@dataclass(frozen=True)
+class _Meshes:
+    """Some draws with their displacement nodes, and what Plan says of their meshes."""
+
+    draws: tuple[tuple[Scene, int], ...]
+    resolution: str
+    error_px: tuple[float, float]
+    target_error_px: float
+
+
+def _meshes(template: Template) -> _Meshes:
+    """Choose the meshes of the first DRAWS trajectories, as `generate` will."""
+    numerics = template.corners[0].numerics
+    if numerics.edge_length_mm is not None:
+        nodes = _tetwild_nodes(template.corners[0])
+        text = f"fTetWild meshes with edges of {numerics.edge_length_mm:g} mm at the contact face"
+        return _Meshes(tuple((c, nodes) for c in template.corners), text, (np.nan, np.nan), np.nan)
+    found: list[tuple[Scene, Resolution]] = []
+    for trajectory in range(DRAWS):
+        try:
+            drawn = draw(template, 0, trajectory)
+        except InputError:  # an impossible draw: generate redraws it
+            continue
+        found.append((drawn, resolve(drawn, template.source.parent)))
+    if not found:
+        raise InputError(f"{template.source}: none of {DRAWS} draws is possible; try `simulate` to see why")
+    across = [resolution.across for _, resolution in found]
+    errors = [resolution.error_px for _, resolution in found]
+    spacings = [resolution.spacing_mm for _, resolution in found]
+    text = f"{min(across)} to {max(across)} elements across the contact, {min(spacings):.2g} to {max(spacings):.2g} mm"
+    order = 1 if numerics.element == "p1p1" else VERTICES_TO_P2
+    draws = tuple((drawn, round(order * len(resolution.mesh.points))) for drawn, resolution in found)
+    target = numerics.target_error_px or DEFAULT_TARGET_PX
+    return _Meshes(draws, text, (float(np.median(errors)), max(errors)), target)
+
+
+def _tetwild_nodes(scene: Scene) -> int:
+    x, y, z = (length / (scene.numerics.edge_length_mm or 1.0) for length in scene.sensor.gel.size_mm)
+    vertices = NODES_PER_VOLUME * x * y * z + NODES_PER_AREA * 2 * (x * y + y * z + z * x)
+    order = 1 if scene.numerics.element == "p1p1" else VERTICES_TO_P2
+    return max(FEWEST_NODES, round(order * vertices))
+
+
 def _simulation_seconds(scene: Scene, nodes: int) -> float:
     motion = scene.motion
-    if motion.depth_mm <= 0:
+    if motion.depth_mm <= 0 and not motion.then:
         return 0.0
     drag = abs(motion.shear_mm[0]) + abs(motion.shear_mm[1]) + abs(motion.twist_deg) * 0.01745 * TWIST_ARM_MM
-    steps = max((motion.depth_mm + drag) / scene.numerics.max_step_mm, STEPS_PER_RECORD * motion.steps)
-    friction = 1.0 if scene.contact.friction > 0 else 0.6
-    return steps * ITERATIONS_PER_STEP * SOLVE_SECONDS * friction * (nodes / SOLVE_NODES) ** SOLVE_GROWTH
+    steps = max((motion.depth_mm + drag) / scene.numerics.max_step_mm, motion.steps)
+    iterations = ITERATIONS_PER_STEP * steps + ITERATIONS_PER_RECORD * motion.steps
+    friction = FRICTION if scene.contact.friction > 0 else 1.0
+    return iterations * SOLVE_SECONDS * friction * (nodes / SOLVE_NODES) ** SOLVE_GROWTH
 
 
 def _decisions(corners: tuple[Scene, ...], variant: Variant) -> list[Decision]:

@@ -20,7 +20,6 @@ from synth.dataset.sample_files import write_sample_files
 from synth.errors import InputError
 from synth.flow.exact import exact_flow
 from synth.flow.field import FlowField
-from synth.mesh import PadMesh, pad_mesh
 from synth.optics import Optics
 from synth.render.camera_image import camera_image
 from synth.render.pattern import albedo
@@ -29,8 +28,12 @@ from synth.render.variant import Variant
 from synth.sampling import MAX_DRAWS, Pair, draw, draw_sensor, pairs_of, sensor_of, stream
 from synth.scene import Scene
 from synth.simulate import State, Trajectory, simulate
-from synth.surface import GelSurface
+from synth.simulate.resolution import Resolution, resolve
+from synth.surface import ContactFaces, GelSurface
 from synth.template import Template
+
+SUBDIVISIONS = {1: 4, 2: 3}
+"""Parts of a contact face's edge in the rendered surface, by the element's order."""
 
 Task = tuple[int, tuple[int, ...]]
 """A trajectory and its samples that are wanted."""
@@ -90,7 +93,6 @@ class _Finger:
     """What all trajectories of one sensor share; `rest` is the radiance of its undeformed gel."""
 
     sensor: int
-    surface: GelSurface
     optics: Optics
     renderer: Renderer
     rest: Image
@@ -130,28 +132,33 @@ class Producer:
             try:
                 scene = draw(template, seed, trajectory, attempt, sensor)
                 stage = "simulate"
-                mesh = pad_mesh(scene.sensor.gel, scene.numerics, self._place.mesh_folders)
-                result = simulate(scene, mesh, template.source.parent)
+                resolution = resolve(scene, template.source.parent, self._place.mesh_folders)
+                every = pairs_of(template, seed, trajectory, scene.motion.steps)
+                frames = frozenset(frame for pair in every for frame in pair.frames)
+                result = simulate(scene, resolution.mesh, template.source.parent, frames=frames)
             except InputError as error:
                 failures.append(Failure(first, len(failures), stage, str(error), None))
                 continue
             if result.status == "complete":
-                pairs = [p for p in pairs_of(template, seed, trajectory, scene.motion.steps) if p.index in wanted]
-                return Outcome(tuple(self._samples(scene, mesh, result, pairs)), tuple(failures), ())
+                pairs = [pair for pair in every if pair.index in wanted]
+                return Outcome(tuple(self._samples(scene, resolution, result, pairs)), tuple(failures), ())
             failures.append(Failure(first, len(failures), stage, result.reason, result.states[-1].summary()))
         return Outcome((), tuple(failures), tuple(wanted))
 
-    def _samples(self, scene: Scene, mesh: PadMesh, result: Trajectory, pairs: Sequence[Pair]) -> list[ManifestEntry]:
+    def _samples(
+        self, scene: Scene, resolution: Resolution, result: Trajectory, pairs: Sequence[Pair]
+    ) -> list[ManifestEntry]:
+        surface = GelSurface(result.space.surface, SUBDIVISIONS[result.space.element.order])
         frames: dict[int, _Frame] = {}
         entries = []
         for pair in pairs:
             started = time.perf_counter()
-            finger = self._prepared(scene, mesh, pair.sensor)
+            finger = self._prepared(scene, pair.sensor)
             for frame in pair.frames:
                 if frame not in frames:
-                    frames[frame] = self._rendered(finger, mesh, result.states[frame], pair.trajectory, frame)
+                    frames[frame] = self._rendered(finger, surface, result, pair.trajectory, frame)
             rendered = time.perf_counter()
-            sample = self._sample(scene, mesh, result, pair, finger, [frames[frame] for frame in pair.frames])
+            sample = self._sample(scene, resolution, result, pair, finger, surface, [frames[k] for k in pair.frames])
             traced = time.perf_counter()
             entry = write_sample_files(self._place.directory, sample, self._place.job)
             seconds = {
@@ -163,7 +170,7 @@ class Producer:
             entries.append(replace(entry, seconds={stage: round(value, 4) for stage, value in seconds.items()}))
         return entries
 
-    def _prepared(self, scene: Scene, mesh: PadMesh, sensor: int) -> _Finger:
+    def _prepared(self, scene: Scene, sensor: int) -> _Finger:
         """Renderer, camera and undeformed frame of a sensor, kept until another one is wanted."""
         if self._finger is None or self._finger.sensor != sensor:
             variant = self._place.variant
@@ -172,29 +179,33 @@ class Producer:
                 import drjit
 
                 drjit.set_thread_count(self._place.threads)
-            surface = GelSurface(mesh.contact_faces)
+            surface = flat_surface(scene.sensor.gel.size_mm)
             texture = albedo(scene.sensor, stream(self._place.template, self._place.job.seed, "pattern", sensor))
             renderer = Renderer(scene.sensor, scene.render, surface, texture, variant)
             rest = renderer.radiance(surface.material, self._frame_seed("rest", sensor))
-            self._finger = _Finger(sensor, surface, Optics.of(scene.sensor), renderer, rest)
+            self._finger = _Finger(sensor, Optics.of(scene.sensor), renderer, rest)
         return self._finger
 
     def _frame_seed(self, purpose: str, *numbers: int) -> int:
         return int(stream(self._place.template, self._place.job.seed, f"render {purpose}", *numbers).integers(2**31))
 
-    def _rendered(self, finger: _Finger, mesh: PadMesh, state: State, trajectory: int, frame: int) -> _Frame:
+    def _rendered(
+        self, finger: _Finger, surface: GelSurface, result: Trajectory, trajectory: int, frame: int
+    ) -> _Frame:
         if frame == 0:
-            return _Frame(finger.surface.material, finger.rest)
-        positions = finger.surface.positions(state.displacement[mesh.contact_nodes])
+            return _Frame(surface.material, finger.rest)
+        positions = surface.positions(result.states[frame].displacement[result.space.surface_nodes])
+        finger.renderer.take(surface)
         return _Frame(positions, finger.renderer.radiance(positions, self._frame_seed("frame", trajectory, frame)))
 
     def _sample(
         self,
         scene: Scene,
-        mesh: PadMesh,
+        resolution: Resolution,
         result: Trajectory,
         pair: Pair,
         finger: _Finger,
+        surface: GelSurface,
         frames: Sequence[_Frame],
     ) -> Sample:
         first, second = (result.states[frame] for frame in pair.frames)
@@ -206,12 +217,18 @@ class Producer:
             seed=self._place.job.seed,
             image1=images[0],
             image2=images[1],
-            flow=_flow(scene, finger, frames, second),
+            flow=_flow(scene, finger.optics, surface, frames, second),
             scene=scene,
-            surface=finger.surface,
-            displacement1=first.displacement[mesh.contact_nodes],
-            displacement2=second.displacement[mesh.contact_nodes],
-            diagnostics={"solver": [first.summary(), second.summary()], "mesh": mesh.hash},
+            surface=surface,
+            displacement1=first.displacement[result.space.surface_nodes],
+            displacement2=second.displacement[result.space.surface_nodes],
+            diagnostics={
+                "solver": [first.summary(), second.summary()],
+                "mesh": resolution.mesh.hash,
+                "element": result.space.element.name,
+                "elements_across_contact": resolution.across,
+                "predicted_error_px": None if np.isnan(resolution.error_px) else round(resolution.error_px, 4),
+            },
             force_n=np.array([first.force_n, second.force_n]),
             torque_nmm=np.array([first.torque_nmm, second.torque_nmm]),
         )
@@ -224,16 +241,23 @@ class Producer:
         return camera_image(radiance, scene.sensor.camera, rng)
 
 
-def _flow(scene: Scene, finger: _Finger, frames: Sequence[_Frame], pressed: State) -> FlowField:
+def flat_surface(size_mm: tuple[float, float, float]) -> GelSurface:
+    """The undeformed contact face as two triangles: its picture must not depend on which trajectory came first."""
+    x, y = size_mm[0] / 2, size_mm[1] / 2
+    nodes = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
+    return GelSurface(ContactFaces(nodes, np.array([[0, 2, 1], [0, 3, 2]], dtype=np.int32)), 1)
+
+
+def _flow(scene: Scene, optics: Optics, surface: GelSurface, frames: Sequence[_Frame], pressed: State) -> FlowField:
     """The exact flow between two frames, with what else the scene's outputs ask for; `pressed` is the second state."""
-    outputs, camera, surface = scene.outputs, scene.sensor.camera, finger.surface
+    outputs, camera = scene.outputs, scene.sensor.camera
     traction = surface.interpolate_linear(pressed.traction) if outputs.traction else None
     touching = (np.linalg.norm(pressed.traction, axis=1, keepdims=True) > 0).astype(np.float64)
     return exact_flow(
         surface,
         frames[0].positions,
         frames[1].positions,
-        finger.optics,
+        optics,
         camera.width,
         camera.height,
         backward=outputs.backward,

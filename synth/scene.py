@@ -8,20 +8,19 @@ camera, +x right and +y down in the image (a left-handed triple, see docs/decisi
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-Fraction = Annotated[float, Field(ge=0, le=1)]
-Positive = Annotated[float, Field(gt=0)]
-NonNegative = Annotated[float, Field(ge=0)]
-Vector2 = tuple[float, float]
-Vector3 = tuple[float, float, float]
-Color = tuple[Fraction, Fraction, Fraction]
+from synth.scene_indenters import Color, Fraction, Indenter, NonNegative, Part, Positive, Vector2, Vector3
 
 
-class Part(BaseModel):
-    """Base of every part of a scene: frozen, closed to unknown keys, finite numbers only."""
+class Layer(Part):
+    """A layer of another material on the pad's contact side, such as a stiff coating film."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    thickness_mm: Annotated[float, Field(ge=0.02, le=20)]
+    youngs_modulus_kpa: Annotated[float, Field(ge=0.1, le=1e6)]
+    poisson_ratio: Annotated[float, Field(ge=0.3, le=0.5)] = 0.4999
+    stiffening: tuple[NonNegative, NonNegative] = (0.0, 0.0)
+    """As of the gel."""
 
 
 class Gel(Part):
@@ -34,7 +33,23 @@ class Gel(Part):
     ]
     shape: Literal["box"] = "box"
     youngs_modulus_kpa: Annotated[float, Field(ge=0.1, le=1e6)]
-    poisson_ratio: Annotated[float, Field(ge=0, lt=0.5)] = 0.4999
+    poisson_ratio: Annotated[float, Field(ge=0, le=0.5)] = 0.4999
+    """0.5 is exactly incompressible; below 0.3 no pressure field is needed."""
+    stiffening: tuple[NonNegative, NonNegative] = (0.0, 0.0)
+    """Yeoh's C20/C10 and C30/C10 (Rubber Chem. Technol. 66, 1993); zeros: neo-Hookean."""
+    layers: tuple[Layer, ...] = ()
+    """From the contact face inward, within size_mm; what is left of the thickness is the gel's own material."""
+
+    @model_validator(mode="after")
+    def _layered(self) -> "Gel":
+        covered = sum(layer.thickness_mm for layer in self.layers)
+        if covered >= self.size_mm[2]:
+            raise ValueError(
+                f"layers are {covered:.4g} mm thick together and leave nothing of the gel's {self.size_mm[2]} mm"
+            )
+        if self.layers and self.poisson_ratio < 0.3:
+            raise ValueError(f"poisson_ratio = {self.poisson_ratio}: a layered pad needs at least 0.3")
+        return self
 
 
 class Window(Part):
@@ -170,67 +185,6 @@ class Sensor(Part):
         return self
 
 
-class Posed(Part):
-    """Base of the indenters: turned about x, then y, then z before it is pressed with its lowest point first."""
-
-    rotation_deg: Vector3 = (0.0, 0.0, 0.0)
-
-
-class Sphere(Posed):
-    """Ball."""
-
-    shape: Literal["sphere"]
-    radius_mm: Annotated[float, Field(ge=0.05, le=500)]
-
-
-class Cylinder(Posed):
-    """Round bar along its own z axis; unrotated it is a flat punch."""
-
-    shape: Literal["cylinder"]
-    radius_mm: Annotated[float, Field(ge=0.05, le=500)]
-    length_mm: Annotated[float, Field(ge=0.1, le=500)] = 20.0
-    fillet_mm: Annotated[float, Field(ge=0.01, le=100)] = 0.2
-
-
-class Box(Posed):
-    """Block with rounded edges."""
-
-    shape: Literal["box"]
-    size_mm: tuple[Positive, Positive, Positive]
-    fillet_mm: Annotated[float, Field(ge=0.01, le=100)] = 0.2
-
-
-class Cone(Posed):
-    """Cone whose rounded tip points at the gel."""
-
-    shape: Literal["cone"]
-    half_angle_deg: Annotated[float, Field(ge=5, le=85)]
-    height_mm: Annotated[float, Field(ge=0.1, le=500)] = 10.0
-    fillet_mm: Annotated[float, Field(ge=0.01, le=100)] = 0.2
-    """Radius of the tip and of the base's edge."""
-
-
-class Torus(Posed):
-    """Ring in its own xy plane."""
-
-    shape: Literal["torus"]
-    radius_mm: Annotated[float, Field(ge=0.1, le=500)]
-    tube_mm: Annotated[float, Field(ge=0.05, le=100)]
-
-
-class MeshIndenter(Posed):
-    """Closed triangle surface from any file that pyvista reads (STL, PLY, OBJ, VTP), in mm after scaling."""
-
-    shape: Literal["mesh"]
-    file: str
-    scale: Positive = 1.0
-    cell_mm: Annotated[float, Field(ge=0.01, le=10)] = 0.1
-    """Spacing of the grid on which its signed distance is sampled."""
-
-
-Indenter = Annotated[Sphere | Cylinder | Box | Cone | Torus | MeshIndenter, Field(discriminator="shape")]
-
-
 class Contact(Part):
     """A rigid indenter and Coulomb friction."""
 
@@ -238,8 +192,16 @@ class Contact(Part):
     friction: Annotated[float, Field(ge=0, le=10)] = 0.5
 
 
+class Pose(Part):
+    """Where the indenter is, as Motion's own fields give the end of its press and shear."""
+
+    depth_mm: NonNegative
+    shear_mm: Vector2 = (0.0, 0.0)
+    twist_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
+
+
 class Motion(Part):
-    """Press at position_mm to depth_mm, then shear and twist together about the indenter's axis."""
+    """Press at position_mm to depth_mm, then shear and twist together about the indenter's axis, then what follows."""
 
     depth_mm: float
     """How far the indenter's lowest point goes past the undeformed surface; negative: it stays off by so much."""
@@ -248,7 +210,9 @@ class Motion(Part):
     """Positive turns +x toward +y."""
     position_mm: Vector2 = (0.0, 0.0)
     steps: Annotated[int, Field(ge=1, le=1000)] = 6
-    """Recorded states after the undeformed one, split between press and shear by the length of their paths."""
+    """Recorded states after the undeformed one, split between the legs by the length of their paths."""
+    then: tuple[Pose, ...] = ()
+    """Poses to which the indenter moves next, one after another: a reversed shear, a release."""
 
 
 class Render(Part):
@@ -263,15 +227,25 @@ class Render(Part):
 class Numerics(Part):
     """Resolution and tolerances of the simulation."""
 
-    element: Literal["auto", "p1p1"] = "auto"
+    element: Literal["auto", "p1p1", "p2p1"] = "auto"
+    """auto is p2p1: at every run time it was the more accurate."""
+    target_error_px: Positive | None = None
+    """Root-mean-square error that the flow over the contact face may have from the simulation; default 0.5. The mesh is
+    made as fine under each draw's contact as this asks for."""
     edge_length_mm: Positive | None = None
-    """Tetrahedron edge; default a fifth of the gel's thickness, at most 1 mm."""
+    """Instead of a target: one fTetWild mesh for all draws with tetrahedra of this edge at the contact face."""
     max_step_mm: Positive = 0.25
     """Longest motion of the indenter in one load step; steps are halved when Newton fails."""
     tolerance: Annotated[float, Field(ge=1e-12, le=1e-2)] = 1e-6
     """Newton stops when the residual is below this fraction of the reaction force."""
     penalty: Annotated[float, Field(ge=1, le=1e4)] = 50.0
     """Contact stiffness in multiples of E per mm, before augmented-Lagrangian updates."""
+
+    @model_validator(mode="after")
+    def _one_resolution(self) -> "Numerics":
+        if self.target_error_px is not None and self.edge_length_mm is not None:
+            raise ValueError("target_error_px and edge_length_mm both fix the mesh: give one of them")
+        return self
 
 
 class Outputs(Part):
@@ -310,11 +284,6 @@ class Scene(Part):
     def _plausible(self) -> "Scene":
         size, motion = self.sensor.gel.size_mm, self.motion
         deepest = 0.85 * size[2]
-        if motion.depth_mm > deepest:
-            raise ValueError(
-                f"motion.depth_mm = {motion.depth_mm} is more than 85 % of the gel's thickness ({size[2]} mm); "
-                f"at most {deepest:.3g}"
-            )
         if motion.depth_mm < -50:
             raise ValueError(f"motion.depth_mm = {motion.depth_mm} leaves the indenter farther than 50 mm off the gel")
         for axis, x, half in zip("xy", motion.position_mm, (size[0] / 2, size[1] / 2), strict=True):
@@ -322,12 +291,24 @@ class Scene(Part):
                 raise ValueError(
                     f"motion.position_mm {axis} = {x} puts the indenter beside the pad (|{axis}| <= {half})"
                 )
-        for axis, s in zip("xy", motion.shear_mm, strict=True):
-            if abs(s) > 2 * size[2]:
+        legs: dict[str, Motion | Pose] = {"motion": motion}
+        legs.update({f"motion.then[{i}]": pose for i, pose in enumerate(motion.then)})
+        for name, pose in legs.items():
+            if pose.depth_mm > deepest:
                 raise ValueError(
-                    f"motion.shear_mm {axis} = {s} is more than twice the gel's thickness ({size[2]} mm): "
-                    "check its unit"
+                    f"{name}.depth_mm = {pose.depth_mm} is more than 85 % of the gel's thickness ({size[2]} mm); "
+                    f"at most {deepest:.3g}"
                 )
+            for axis, s in zip("xy", pose.shear_mm, strict=True):
+                if abs(s) > 2 * size[2]:
+                    raise ValueError(
+                        f"{name}.shear_mm {axis} = {s} is more than twice the gel's thickness ({size[2]} mm): "
+                        "check its unit"
+                    )
+        if self.numerics.edge_length_mm is not None and self.sensor.gel.layers:
+            raise ValueError(
+                "numerics.edge_length_mm: fTetWild's meshes have no layers; leave it out for a layered gel"
+            )
         edge = self.numerics.edge_length_mm
         if edge is not None and not min(size) / 60 <= edge <= min(size):
             raise ValueError(

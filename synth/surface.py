@@ -1,8 +1,9 @@
-r"""The gel's inner surface as it is rendered and traced: the FEM's contact faces, subdivided and smoothed.
+r"""The gel's inner surface as it is rendered and traced: the FEM's contact faces, subdivided.
 
-Linear elements leave a faceted surface whose edges would show in the shading and as kinks in the flow. Each contact
-face is split into n x n triangles, and displacement is carried to their corners by blending the first-order expansions
-at the face's three nodes (barycentric coordinates λ, recovered nodal gradients G):
+Each contact face is split into n x n triangles. Faces of quadratic elements (three vertices, then the midpoints of
+FACE_EDGES) carry displacement to the corners of these by their own shape functions. Linear elements would leave a
+faceted surface whose edges show in the shading and as kinks in the flow; there the first-order expansions at the
+face's three nodes are blended (barycentric coordinates λ, recovered nodal gradients G):
 
 .. math::  u(x) = \sum_i λ_i(x) [ u_i + ½ G_i (x - x_i) ]
 
@@ -12,6 +13,7 @@ fixed linear map of the nodal displacements, kept as one sparse matrix. The surf
 which images and flow are exact; its distance from the continuum's is part of the simulation's discretisation error.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -20,6 +22,26 @@ import numpy as np
 
 from synth.arrays import FloatArray, Points, Triangles
 
+FACE_EDGES = ((0, 1), (1, 2), (2, 0))
+"""The edges whose midpoints are nodes 3, 4, 5 of a quadratic face."""
+
+
+def quadratic_face(barycentric: FloatArray) -> FloatArray:
+    """(n, 6) quadratic shape functions of a triangle at barycentric coordinates (n, 3)."""
+    corners = barycentric * (2 * barycentric - 1)
+    edges = [4 * barycentric[:, i] * barycentric[:, j] for i, j in FACE_EDGES]
+    return np.column_stack([corners, *edges])
+
+
+def broken_linear_face(barycentric: FloatArray) -> FloatArray:
+    """(n, 6) the same nodes' piecewise linear functions on the four triangles between them: never negative."""
+    edges = []
+    for i, j in FACE_EDGES:
+        near_i, near_j = barycentric[:, i] > 0.5, barycentric[:, j] > 0.5
+        inner = np.where(barycentric.max(axis=1) > 0.5, 0.0, 1 - 2 * barycentric[:, 3 - i - j])
+        edges.append(np.where(near_i, 2 * barycentric[:, j], np.where(near_j, 2 * barycentric[:, i], inner)))
+    return np.column_stack([np.maximum(2 * barycentric - 1, 0), *edges])
+
 
 @dataclass(frozen=True)
 class ContactFaces:
@@ -27,11 +49,17 @@ class ContactFaces:
 
     Attributes:
         nodes: (n, 3) float64 mm, undeformed positions.
-        faces: (k, 3) int32 into `nodes`; their normals (right-hand rule on the components) point out of the gel.
+        faces: (k, 3) or, quadratic, (k, 6) int32 into `nodes`; the normals of their vertices (right-hand rule on the
+            components) point out of the gel.
     """
 
     nodes: Points
     faces: Triangles
+
+    @property
+    def is_quadratic(self) -> bool:
+        """Whether the faces have nodes on their edges."""
+        return self.faces.shape[1] == 6
 
 
 @dataclass(frozen=True)
@@ -47,7 +75,7 @@ class GelSurface:
     subdivisions: int = 4
 
     @cached_property
-    def _refined(self) -> tuple[Points, Triangles, FloatArray, Triangles]:
+    def _refined(self) -> tuple[Points, Triangles, FloatArray, Triangles, np.ndarray]:
         return _subdivide(self.coarse, self.subdivisions)
 
     @property
@@ -70,30 +98,57 @@ class GelSurface:
 
     def interpolate_linear(self, nodal: FloatArray) -> FloatArray:
         """Piecewise linear interpolation (v, c) of nodal values (n, c), for fields that jump (traction)."""
-        _, _, weights, corners = self._refined
-        return np.einsum("vi,vic->vc", weights, nodal[corners])
+        return np.asarray(self._linear @ nodal)
+
+    @cached_property
+    def _linear(self) -> Any:
+        if self.coarse.is_quadratic:
+            return self._matrix(broken_linear_face)
+        import scipy.sparse as sp
+
+        _, _, weights, corners, _ = self._refined
+        rows, shape = np.repeat(np.arange(len(weights)), 3), (len(weights), len(self.coarse.nodes))
+        return sp.csr_matrix((weights.ravel(), (rows, corners.ravel())), shape=shape)
 
     @cached_property
     def _smooth(self) -> Any:
+        if self.coarse.is_quadratic:
+            return self._matrix(quadratic_face)
         import scipy.sparse as sp
 
-        material, _, weights, corners = self._refined
+        material, _, weights, corners, _ = self._refined
         nodes, n, v = self.coarse.nodes, len(self.coarse.nodes), len(material)
         rows = np.repeat(np.arange(v), 3)
-        linear = sp.csr_matrix((weights.ravel(), (rows, corners.ravel())), shape=(v, n))
         correction = sp.csr_matrix((v, n))
         offset = material[:, None, :] - nodes[corners]
         for axis, gradient in enumerate(_recovered_gradients(self.coarse)):
             arm = sp.csr_matrix(((0.5 * weights * offset[:, :, axis]).ravel(), (rows, corners.ravel())), shape=(v, n))
             correction = correction + arm @ gradient
-        return (linear + correction).tocsr()
+        return (self._linear + correction).tocsr()
+
+    def _matrix(self, shape: Callable[[FloatArray], FloatArray]) -> Any:
+        """Sparse (v, n) map of nodal values by a quadratic face's shape functions at the refined vertices."""
+        import scipy.sparse as sp
+
+        faces, local, vertex = self.coarse.faces, _grid(self.subdivisions)[1], self._members
+        values = shape(local / self.subdivisions)
+        # A vertex on an edge belongs to two faces, which agree there: the last one is taken.
+        face, place = np.zeros(len(self.material), dtype=int), np.zeros(len(self.material), dtype=int)
+        face[vertex], place[vertex] = np.indices(vertex.shape)
+        rows = np.repeat(np.arange(len(face)), 6)
+        size = (len(face), len(self.coarse.nodes))
+        return sp.csr_matrix((values[place].ravel(), (rows, faces[face].ravel())), shape=size)
+
+    @cached_property
+    def _members(self) -> np.ndarray:
+        """(k, (n + 1)(n + 2) / 2) the refined vertices of each coarse face, in the order of `_grid`."""
+        return self._refined[4]
 
 
-def _subdivide(coarse: ContactFaces, n: int) -> tuple[Points, Triangles, FloatArray, Triangles]:
-    """Split each face into n x n triangles; returns vertices, triangles, and each vertex's weights and coarse nodes."""
-    nodes, faces = coarse.nodes, coarse.faces.astype(np.int64)
+def _grid(n: int) -> tuple[list[tuple[int, int, int]], np.ndarray]:
+    """The n x n parts of a triangle as vertices, and the vertices' integer barycentric coordinates, sum n."""
     grid = np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)])
-    local = np.column_stack([n - grid.sum(1), grid])  # integer barycentric coordinates, sum n
+    local = np.column_stack([n - grid.sum(1), grid])
     number = {(int(i), int(j)): k for k, (i, j) in enumerate(grid)}
     small = []
     for i in range(n):
@@ -101,6 +156,17 @@ def _subdivide(coarse: ContactFaces, n: int) -> tuple[Points, Triangles, FloatAr
             small.append((number[i, j], number[i + 1, j], number[i, j + 1]))
             if i + j < n - 1:
                 small.append((number[i + 1, j], number[i + 1, j + 1], number[i, j + 1]))
+    return small, local
+
+
+def _subdivide(coarse: ContactFaces, n: int) -> tuple[Points, Triangles, FloatArray, Triangles, np.ndarray]:
+    """Split each face into n x n triangles.
+
+    Returns:
+        Vertices; triangles; each vertex's weights and the coarse corners they belong to; each coarse face's vertices.
+    """
+    nodes, faces = coarse.nodes, coarse.faces[:, :3].astype(np.int64)
+    small, local = _grid(n)
     # A vertex is its (coarse node, integer weight) pairs, those of weight 0 left out: shared edges merge exactly.
     weight = np.broadcast_to(local, (len(faces), *local.shape))
     corner = np.where(weight > 0, faces[:, None, :], -1)
@@ -112,7 +178,7 @@ def _subdivide(coarse: ContactFaces, n: int) -> tuple[Points, Triangles, FloatAr
     weights = unique[:, 1::2] / n
     corners = np.maximum(unique[:, 0::2], 0).astype(np.int32)  # any node will do where the weight is 0
     material = np.einsum("vi,vic->vc", weights, nodes[corners])
-    return material, triangles, weights, corners
+    return material, triangles, weights, corners, inverse
 
 
 def _recovered_gradients(coarse: ContactFaces) -> list[Any]:

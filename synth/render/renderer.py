@@ -74,6 +74,17 @@ class Renderer:
         """Samples that are really taken."""
         return self._samples
 
+    def take(self, surface: GelSurface) -> None:
+        """Render this surface from now on: `radiance` gets the positions of its vertices."""
+        if surface is self._mesh.surface:
+            return
+        self._mesh = GelMesh(surface, self._mesh.size_mm)
+        self._parameters["gel.faces"] = self._mesh.faces()
+        self._parameters["gel.vertex_texcoords"] = self._mesh.texture_coordinates()
+        self._parameters["gel.vertex_positions"] = self._mesh.positions(surface.material)
+        self._parameters["gel.vertex_normals"] = self._mesh.normals(surface.material)
+        self._parameters.update()
+
     def radiance(self, positions: Points, seed: int) -> Image:
         """Linear radiance of the deformed gel; zero where a pixel sees past it.
 

@@ -1,16 +1,23 @@
-r"""Residual and tangent of a nearly incompressible neo-Hookean solid in displacement and pressure, as Warp kernels.
+r"""Residual and tangent of the bulk in displacement and pressure, as Warp kernels.
 
-.. math::  Π = ∫ μ/2 (I_1 - 3 - 2 \ln J) + p (J - 1) - p²/(2λ) \,dV - \sum_e α/(2μ) |p - Π_0 p|²_e
+The energy is `synth.simulate.material`'s, stabilised as in `synth.simulate.element` and, with a pressure field p, by
 
-(Simo & Taylor's perturbed Lagrangian form; stabilised as in `synth.simulate.element`.) With g_a the undeformed gradient
-of shape function a and h_a = F^{-T} g_a:
+.. math::  ½ γ(p) D², \qquad D = J - 1 - p/λ, \qquad γ = C \max(0, -\bar p), γ ≤ λ/2   (p̄: mean over the element)
 
-    r_a  = ∫ μ F g_a + (pJ - μ) h_a
-    K_ab = ∫ μ g_a.g_b I + (μ - pJ) h_b h_a^T + pJ h_a h_b^T          K_ac = ∫ J h_a N_c
+Mixed elements hold D = 0 in the mean only. Under high pressure the second variation p δ²J of modes that leave that mean
+alone is unstable although the gel is not (Auricchio et al., Comput. Methods Appl. Mech. Eng. 194, 2005): with a fine
+mesh pressed to half its thickness, |p| of 9 μ, single elements collapsed to det F = 0.47. γ (δD)² holds them. D is zero
+for the exact solution, so that nothing is added that the mesh resolves.
 
-Where `bulk_modulus` is negative the pressure is a field of its own; otherwise it is λ (J - 1) at each quadrature point
-(displacement-only, for compressible foams), K_ab gains λ J² h_a h_b^T and the pressure rows are left empty.
-float64; leading axis of every state array is the batch; stresses are relative to the pad's Young's modulus.
+With g_a the undeformed gradient of shape function a, h_a = F^{-T} g_a, s = I_1 - 3 - 2 ln J, d_a = F g_a - h_a,
+W' = μ/2 (1 + 2 c_2 s + 3 c_3 s²), P = p + γ D and γ_c = ∂γ/∂p_c:
+
+    r_a  = ∫ 2 W' d_a + P J h_a                 r_c = ∫ N_c (D - γ D / λ) + γ_c D²/2
+    K_ab = ∫ 2 W' (g_a.g_b I + h_b h_a^T) + 4 W'' d_a d_b^T + (P J + γ J²) h_a h_b^T - P J h_b h_a^T
+    K_ac = ∫ J h_a (N_c (1 - γ/λ) + γ_c D)      K_cd = ∫ -N_c N_d (1/λ - γ/λ²) - D (γ_c N_d + γ_d N_c)/λ
+
+Without a pressure field P = λ (J - 1), γ J² is λ J² and the pressure rows are left empty. Only the upper triangle of
+the symmetric tangent is assembled. float64; leading axis of every state array is the batch.
 """
 
 import warp as wp
@@ -18,19 +25,90 @@ import warp as wp
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 
+@wp.struct
+class Bulk:
+    """Tables of a pad's elements.
+
+    Attributes:
+        nodes: (m, nn) displacement nodes.
+        pressure_nodes: (m, 4).
+        gradient: (m, nq, nn) 1/mm, undeformed gradients of the displacement's shape functions.
+        weight: (m, nq) mm³.
+        pressure_shape: (nq, 4).
+        stabilisation: (m, 4, 4) constant pressure block of `synth.simulate.element`.
+        shear: (m,) μ.
+        compliance: (m,) 1/λ.
+        mixed: whether there is a pressure field.
+        yeoh: (m,) c_2, c_3.
+    """
+
+    nodes: wp.array2d(dtype=wp.int32)
+    pressure_nodes: wp.array2d(dtype=wp.int32)
+    gradient: wp.array3d(dtype=wp.vec3d)
+    weight: wp.array2d(dtype=wp.float64)
+    pressure_shape: wp.array2d(dtype=wp.float64)
+    stabilisation: wp.array3d(dtype=wp.float64)
+    shear: wp.array(dtype=wp.float64)
+    compliance: wp.array(dtype=wp.float64)
+    mixed: int
+    yeoh: wp.array(dtype=wp.vec2d)
+
+
+@wp.func
+def _deformation_gradient(bulk: Bulk, u: wp.array2d(dtype=wp.vec3d), s: int, e: int, q: int) -> wp.mat33d:
+    F = wp.identity(n=3, dtype=wp.float64)
+    for a in range(bulk.nodes.shape[1]):
+        F += wp.outer(u[s, bulk.nodes[e, a]], bulk.gradient[e, q, a])
+    return F
+
+
+HOLD = wp.constant(wp.float64(2.0))
+"""C: the second variation of D² in an unstable mode is about that of J, so that γ = |p| would balance it."""
+
+
+@wp.func
+def _dilation(bulk: Bulk, p: wp.array2d(dtype=wp.float64), J: wp.float64, s: int, e: int, q: int) -> wp.vec4d:
+    """P, the stiffness beside J², D, and dγ/dp_c at a quadrature point."""
+    zero = wp.float64(0.0)
+    if bulk.mixed == 0:
+        stiffness = wp.float64(1.0) / bulk.compliance[e]
+        return wp.vec4d(stiffness * (J - wp.float64(1.0)), stiffness, zero, zero)
+    pressure = zero
+    mean = zero
+    for c in range(4):
+        nodal = p[s, bulk.pressure_nodes[e, c]]
+        pressure += bulk.pressure_shape[q, c] * nodal
+        mean += wp.float64(0.25) * nodal
+    gamma = zero
+    slope = zero
+    if mean < zero:
+        gamma = -HOLD * mean
+        slope = wp.float64(-0.25) * HOLD
+        if gamma * bulk.compliance[e] > wp.float64(0.5):
+            gamma = wp.float64(0.5) / bulk.compliance[e]
+            slope = zero
+    D = J - wp.float64(1.0) - pressure * bulk.compliance[e]
+    return wp.vec4d(pressure + gamma * D, gamma, D, slope)
+
+
+@wp.func
+def _slopes(bulk: Bulk, F: wp.mat33d, J: wp.float64, e: int) -> wp.vec2d:
+    """2 W' and 4 W''."""
+    yeoh = bulk.yeoh[e]
+    if yeoh[0] == wp.float64(0.0) and yeoh[1] == wp.float64(0.0):
+        return wp.vec2d(bulk.shear[e], wp.float64(0.0))
+    s = wp.ddot(F, F) - wp.float64(3.0) - wp.float64(2.0) * wp.log(J)
+    first = wp.float64(1.0) + wp.float64(2.0) * yeoh[0] * s + wp.float64(3.0) * yeoh[1] * s * s
+    second = wp.float64(4.0) * yeoh[0] + wp.float64(12.0) * yeoh[1] * s
+    return wp.vec2d(bulk.shear[e] * first, bulk.shear[e] * second)
+
+
 @wp.kernel
 def bulk_residual(
     u: wp.array2d(dtype=wp.vec3d),
     p: wp.array2d(dtype=wp.float64),
     active: wp.array(dtype=wp.int32),
-    nodes: wp.array2d(dtype=wp.int32),
-    pressure_nodes: wp.array2d(dtype=wp.int32),
-    gradient: wp.array3d(dtype=wp.vec3d),
-    weight: wp.array2d(dtype=wp.float64),
-    pressure_shape: wp.array2d(dtype=wp.float64),
-    pressure_matrix: wp.array3d(dtype=wp.float64),
-    mu: wp.array(dtype=wp.float64),
-    bulk_modulus: wp.array(dtype=wp.float64),
+    bulk: Bulk,
     residual_u: wp.array2d(dtype=wp.vec3d),
     residual_p: wp.array2d(dtype=wp.float64),
     jacobian: wp.array2d(dtype=wp.float64),
@@ -39,94 +117,146 @@ def bulk_residual(
     s, e = wp.tid()
     if active[s] == 0:
         return
-    mixed = bulk_modulus[e] < wp.float64(0.0)
-    bulk = wp.max(bulk_modulus[e], wp.float64(0.0))
     smallest = wp.float64(1.0e30)
-    for q in range(weight.shape[1]):
-        F = wp.identity(n=3, dtype=wp.float64)
-        for a in range(nodes.shape[1]):
-            F += wp.outer(u[s, nodes[e, a]], gradient[e, q, a])
+    for q in range(bulk.weight.shape[1]):
+        F = _deformation_gradient(bulk, u, s, e, q)
         J = wp.determinant(F)
         smallest = wp.min(smallest, J)
         if wp.float64(0.0) < J:
-            w = weight[e, q]
+            w = bulk.weight[e, q]
             Fit = wp.transpose(wp.inverse(F))
-            pressure = bulk * (J - wp.float64(1.0))
-            if mixed:
+            dilation = _dilation(bulk, p, J, s, e, q)
+            slope = _slopes(bulk, F, J, e)
+            if bulk.mixed == 1:
+                D = dilation[2]
+                defect = w * D * (wp.float64(1.0) - dilation[1] * bulk.compliance[e])
+                bias = wp.float64(0.5) * w * dilation[3] * D * D
                 for c in range(4):
-                    pressure += pressure_shape[q, c] * p[s, pressure_nodes[e, c]]
-                    wp.atomic_add(residual_p, s, pressure_nodes[e, c], w * (J - wp.float64(1.0)) * pressure_shape[q, c])
-            volumetric = w * (pressure * J - mu[e])
-            for a in range(nodes.shape[1]):
-                force = (w * mu[e]) * (F * gradient[e, q, a]) + volumetric * (Fit * gradient[e, q, a])
-                wp.atomic_add(residual_u, s, nodes[e, a], force)
+                    row = defect * bulk.pressure_shape[q, c] + bias
+                    wp.atomic_add(residual_p, s, bulk.pressure_nodes[e, c], row)
+            volumetric = w * (dilation[0] * J - slope[0])
+            for a in range(bulk.nodes.shape[1]):
+                g = bulk.gradient[e, q, a]
+                wp.atomic_add(residual_u, s, bulk.nodes[e, a], (w * slope[0]) * (F * g) + volumetric * (Fit * g))
     jacobian[s, e] = smallest
-    if mixed:
+    if bulk.mixed == 1:
         for c in range(4):
             row = wp.float64(0.0)
             for d in range(4):
-                row += pressure_matrix[e, c, d] * p[s, pressure_nodes[e, d]]
-            wp.atomic_add(residual_p, s, pressure_nodes[e, c], row)
+                row += bulk.stabilisation[e, c, d] * p[s, bulk.pressure_nodes[e, d]]
+            wp.atomic_add(residual_p, s, bulk.pressure_nodes[e, c], row)
 
 
 @wp.kernel
-def bulk_tangent(
+def linearise(
     u: wp.array2d(dtype=wp.vec3d),
     p: wp.array2d(dtype=wp.float64),
     active: wp.array(dtype=wp.int32),
-    nodes: wp.array2d(dtype=wp.int32),
-    pressure_nodes: wp.array2d(dtype=wp.int32),
-    gradient: wp.array3d(dtype=wp.vec3d),
-    weight: wp.array2d(dtype=wp.float64),
-    pressure_shape: wp.array2d(dtype=wp.float64),
-    pressure_matrix: wp.array3d(dtype=wp.float64),
-    mu: wp.array(dtype=wp.float64),
-    bulk_modulus: wp.array(dtype=wp.float64),
-    slot: wp.array3d(dtype=wp.int32),
-    values: wp.array2d(dtype=wp.float64),
+    bulk: Bulk,
+    factor: wp.array3d(dtype=wp.vec4d),
+    pushed: wp.array4d(dtype=wp.vec3d),
+    drift: wp.array4d(dtype=wp.vec3d),
+    jacobian: wp.array3d(dtype=wp.float64),
 ):
-    """One thread per (sample, element); adds the element's matrix to the entries slot[e, i, j] of the sparse values.
+    """One thread per (sample, element): what the blocks of `bulk_tangent` share.
 
-    Local unknowns: 3 per displacement node, then 4 pressures. Entries of held unknowns share one slot past the end.
+    factor: (B, m, nq) w times 2 W', 4 W'', P J + γ J² and P J.
+    pushed: (B, m, nq, nn + 1) h_a, then (γ, D, γ_c). jacobian: (B, m, nq) J.
+    drift: d_a, filled only where 4 W'' is not zero.
     """
     s, e = wp.tid()
     if active[s] == 0:
         return
-    mixed = bulk_modulus[e] < wp.float64(0.0)
-    bulk = wp.max(bulk_modulus[e], wp.float64(0.0))
-    count = nodes.shape[1]
-    for q in range(weight.shape[1]):
-        F = wp.identity(n=3, dtype=wp.float64)
-        for a in range(count):
-            F += wp.outer(u[s, nodes[e, a]], gradient[e, q, a])
+    count = bulk.nodes.shape[1]
+    for q in range(bulk.weight.shape[1]):
+        F = _deformation_gradient(bulk, u, s, e, q)
         J = wp.determinant(F)
+        jacobian[s, e, q] = J
         Fit = wp.transpose(wp.inverse(F))
-        w = weight[e, q]
-        pressure = bulk * (J - wp.float64(1.0))
-        if mixed:
-            for c in range(4):
-                pressure += pressure_shape[q, c] * p[s, pressure_nodes[e, c]]
-        pJ = pressure * J
+        w = bulk.weight[e, q]
+        dilation = _dilation(bulk, p, J, s, e, q)
+        PJ = dilation[0] * J
+        slope = _slopes(bulk, F, J, e)
+        factor[s, e, q] = wp.vec4d(w * slope[0], w * slope[1], w * (PJ + dilation[1] * J * J), w * PJ)
         for a in range(count):
-            ha = Fit * gradient[e, q, a]
-            for b in range(count):
-                hb = Fit * gradient[e, q, b]
-                diagonal = w * mu[e] * wp.dot(gradient[e, q, a], gradient[e, q, b])
-                block = (w * (mu[e] - pJ)) * wp.outer(hb, ha)
-                block += (w * (pJ + bulk * J * J)) * wp.outer(ha, hb)
-                for i in range(3):
-                    for j in range(3):
-                        entry = block[i, j]
-                        if i == j:
-                            entry += diagonal
-                        wp.atomic_add(values, s, slot[e, 3 * a + i, 3 * b + j], entry)
-            if mixed:
-                for c in range(4):
-                    coupling = (w * J * pressure_shape[q, c]) * ha
-                    for i in range(3):
-                        wp.atomic_add(values, s, slot[e, 3 * a + i, 3 * count + c], coupling[i])
-                        wp.atomic_add(values, s, slot[e, 3 * count + c, 3 * a + i], coupling[i])
-    if mixed:
+            h = Fit * bulk.gradient[e, q, a]
+            pushed[s, e, q, a] = h
+            if slope[1] != wp.float64(0.0):
+                drift[s, e, q, a] = F * bulk.gradient[e, q, a] - h
+        pushed[s, e, q, count] = wp.vec3d(dilation[1], dilation[2], dilation[3])
+
+
+@wp.kernel
+def bulk_tangent(
+    active: wp.array(dtype=wp.int32),
+    bulk: Bulk,
+    pairs: wp.array(dtype=wp.vec2i),
+    factor: wp.array3d(dtype=wp.vec4d),
+    pushed: wp.array4d(dtype=wp.vec3d),
+    drift: wp.array4d(dtype=wp.vec3d),
+    slot: wp.array3d(dtype=wp.int32),
+    values: wp.array2d(dtype=wp.float64),
+):
+    """One thread per (sample, element, pair a <= b of displacement nodes).
+
+    Adds the block K_ab to the entries slot[e, pair, 3 i + j] of the sparse values; entries of held unknowns and below
+    the diagonal share one slot past the end.
+    """
+    s, e, k = wp.tid()
+    if active[s] == 0:
+        return
+    a = pairs[k][0]
+    b = pairs[k][1]
+    block = wp.mat33d()
+    isotropic = wp.float64(0.0)
+    for q in range(bulk.weight.shape[1]):
+        f = factor[s, e, q]
+        ha = pushed[s, e, q, a]
+        hb = pushed[s, e, q, b]
+        isotropic += f[0] * wp.dot(bulk.gradient[e, q, a], bulk.gradient[e, q, b])
+        block += (f[0] - f[3]) * wp.outer(hb, ha) + f[2] * wp.outer(ha, hb)
+        if f[1] != wp.float64(0.0):
+            block += f[1] * wp.outer(drift[s, e, q, a], drift[s, e, q, b])
+    for i in range(3):
+        for j in range(3):
+            entry = block[i, j]
+            if i == j:
+                entry += isotropic
+            wp.atomic_add(values, s, slot[e, k, 3 * i + j], entry)
+
+
+@wp.kernel
+def pressure_tangent(
+    active: wp.array(dtype=wp.int32),
+    bulk: Bulk,
+    pushed: wp.array4d(dtype=wp.vec3d),
+    jacobian: wp.array3d(dtype=wp.float64),
+    coupling_slot: wp.array3d(dtype=wp.int32),
+    pressure_slot: wp.array3d(dtype=wp.int32),
+    values: wp.array2d(dtype=wp.float64),
+):
+    """One thread per (sample, element): the blocks K_ac and K_cd."""
+    s, e = wp.tid()
+    if active[s] == 0:
+        return
+    count = bulk.nodes.shape[1]
+    inverse = bulk.compliance[e]
+    for a in range(count):
         for c in range(4):
-            for d in range(4):
-                wp.atomic_add(values, s, slot[e, 3 * count + c, 3 * count + d], pressure_matrix[e, c, d])
+            coupling = wp.vec3d()
+            for q in range(bulk.weight.shape[1]):
+                held = pushed[s, e, q, count]
+                share = bulk.pressure_shape[q, c] * (wp.float64(1.0) - held[0] * inverse) + held[2] * held[1]
+                coupling += (bulk.weight[e, q] * jacobian[s, e, q] * share) * pushed[s, e, q, a]
+            for i in range(3):
+                wp.atomic_add(values, s, coupling_slot[e, 4 * a + c, i], coupling[i])
+    for c in range(4):
+        for d in range(4):
+            entry = bulk.stabilisation[e, c, d]
+            for q in range(bulk.weight.shape[1]):
+                held = pushed[s, e, q, count]
+                nc = bulk.pressure_shape[q, c]
+                nd = bulk.pressure_shape[q, d]
+                soft = inverse * (wp.float64(1.0) - held[0] * inverse)
+                entry -= bulk.weight[e, q] * (nc * nd * soft + held[1] * held[2] * inverse * (nc + nd))
+            wp.atomic_add(values, s, pressure_slot[e, c, d], entry)

@@ -1,21 +1,23 @@
 r"""Contact and Coulomb friction with a rigid indenter at surface quadrature points, as Warp kernels.
 
-Augmented Lagrangian (Simo & Laursen 1992). At a quadrature point x with gap g, outward indenter
-normal n (into the gel):
+Augmented Lagrangian (Simo & Laursen 1992). At a quadrature point x with gap g, outward indenter normal n (into the
+gel), and y the point in the indenter's frame:
 
-.. math::  t_n = \max(0, λ_n - ε g), \qquad  t_T = \text{return}(P m), \quad m = λ_T - ε (x - a), \quad P = I - n n^T
+.. math::  t_n = \max(0, λ_n - ε g), \qquad  t_T = \text{return}(P m), \quad m = λ_T - ε (y - a), \quad P = I - n n^T
 
 where a is the point's anchor, carried by the indenter. The return map leaves |t_T| <= μ t_n: stick inside the cone,
-slip along the trial direction τ outside. Linearisation (H is the derivative of n):
+slip along the trial direction τ outside. A point that touches during a load step is anchored where it touched: with
+place y_0 and gap g_0 > 0 before the step, at a = y - ρ (y - y_0), ρ = -g / (g_0 - g). Linearisation (H is the
+derivative of n, D = -∂m/∂x):
 
+    D = ε I,  for a new point  ε (ρ I - g_0 / (g_0 - g)² (y - y_0) n^T)
     -∂(t_n n)/∂x = ε n n^T - t_n H
-    -∂(P m)/∂x   = A = ε P + (n.m) H + n (H m)^T                              stick
+    -∂(P m)/∂x   = A = P D + (n.m) H + n (H m)^T                              stick
     -∂t_T/∂x     = μ ε τ n^T + (μ t_n / |P m|) (I - τ τ^T) A                  slip
 
-Tractions are per undeformed area. A point that touches during a step has no friction until the step is accepted; its
-anchor is then where it came to lie. That error vanishes with the step: a flat punch of 2 mm that slides by 0.25 mm a
-step lacks 10 to 28 % of its friction, at its leading edge, a ball of 3 mm 2 to 12 %; at 0.1 mm both lack 0 to 4 %.
-Anchors and λ_T live in the indenter's frame and so turn with it. Without friction none of this state is touched.
+The linear solver takes a symmetric matrix and what is left over apart (`synth.simulate.linear`): the symmetric share is
+that of all terms but μ ε τ n^T and the (y - y_0) n^T in D. Tractions are per undeformed area. Anchors and λ_T live in
+the indenter's frame and so turn with it. Without friction none of this state is touched.
 """
 
 import warp as wp
@@ -60,16 +62,31 @@ class Faces:
 
 @wp.struct
 class ContactState:
-    """Multipliers and anchors (B, f, nq), vectors in the indenter's frame; anchored: 1 where it sticks or slips."""
+    """What contact remembers, (B, f, nq), vectors in the indenter's frame.
+
+    Attributes:
+        normal, tangent: multipliers λ_n, λ_T.
+        anchor: a, where anchored is 1.
+        anchored: 1 for points that touched at the last accepted step.
+        place, gap: y_0 and g_0 at the last accepted step.
+    """
 
     normal: wp.array3d(dtype=wp.float64)
     tangent: wp.array3d(dtype=wp.vec3d)
     anchor: wp.array3d(dtype=wp.vec3d)
     anchored: wp.array3d(dtype=wp.int32)
+    place: wp.array3d(dtype=wp.vec3d)
+    gap: wp.array3d(dtype=wp.float64)
+
+
+FAR = wp.constant(wp.float64(1.0e30))
+"""Gap of points that were not looked at, and of points before the first step."""
+NEAR = wp.constant(wp.float64(1.0))
+"""Faces farther than this (mm) from the indenter are passed over; no load step is that long."""
 
 
 @wp.func
-def _position(faces: Faces, u: wp.array2d(dtype=wp.vec3d), s: int, f: int, q: int) -> wp.vec3d:
+def position(faces: Faces, u: wp.array2d(dtype=wp.vec3d), s: int, f: int, q: int) -> wp.vec3d:
     x = wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(0.0))
     for a in range(faces.nodes.shape[1]):
         node = faces.nodes[f, a]
@@ -78,11 +95,42 @@ def _position(faces: Faces, u: wp.array2d(dtype=wp.vec3d), s: int, f: int, q: in
 
 
 @wp.func
+def anchor_of(state: ContactState, y: wp.vec3d, gap: wp.float64, s: int, f: int, q: int) -> wp.vec4d:
+    """The anchor (indenter's frame) and ρ: 1 for an old one, 0 where the point has none."""
+    if state.anchored[s, f, q] == 1:
+        a = state.anchor[s, f, q]
+        return wp.vec4d(a[0], a[1], a[2], wp.float64(1.0))
+    before = state.gap[s, f, q]
+    if gap >= wp.float64(0.0) or before <= wp.float64(0.0) or before >= FAR:
+        return wp.vec4d(y[0], y[1], y[2], wp.float64(0.0))
+    share = -gap / (before - gap)
+    a = y - share * (y - state.place[s, f, q])
+    return wp.vec4d(a[0], a[1], a[2], share)
+
+
+@wp.func
 def _trial(
-    state: ContactState, rotation: wp.mat33d, y: wp.vec3d, penalty: wp.float64, s: int, f: int, q: int
+    state: ContactState, rotation: wp.mat33d, y: wp.vec3d, anchor: wp.vec4d, penalty: wp.float64, s: int, f: int, q: int
 ) -> wp.vec3d:
     """The trial traction m, in world axes."""
-    return rotation * (state.tangent[s, f, q] - penalty * (y - state.anchor[s, f, q]))
+    return rotation * (state.tangent[s, f, q] - penalty * (y - wp.vec3d(anchor[0], anchor[1], anchor[2])))
+
+
+@wp.func
+def _is_far(faces: Faces, indenters: Indenters, u: wp.array2d(dtype=wp.vec3d), s: int, f: int) -> bool:
+    """Whether no point of a face can touch: its centre is farther away than its size and NEAR."""
+    count = faces.nodes.shape[1]
+    centre = wp.vec3d()
+    for a in range(count):
+        node = faces.nodes[f, a]
+        centre += (faces.points[node] + u[s, node]) / wp.float64(count)
+    size = wp.float64(0.0)
+    for a in range(count):
+        node = faces.nodes[f, a]
+        size = wp.max(size, wp.length(faces.points[node] + u[s, node] - centre))
+    y = wp.transpose(indenters.rotation[s]) * (centre - indenters.centre[s])
+    d = signed_distance(indenters.kind[s], indenters.shape[s], y, s, indenters.coefficients)
+    return d[3] > wp.float64(1.5) * size + NEAR
 
 
 @wp.func
@@ -114,8 +162,14 @@ def contact_residual(
     if active[s] == 0:
         return
     rotation = indenters.rotation[s]
+    far = _is_far(faces, indenters, u, s, f)
     for q in range(faces.weight.shape[1]):
-        x = _position(faces, u, s, f, q)
+        if far:
+            gap[s, f, q] = FAR
+            tangential[s, f, q] = wp.vec3d()
+            traction[s, f, q] = wp.vec3d()
+            continue
+        x = position(faces, u, s, f, q)
         y = wp.transpose(rotation) * (x - indenters.centre[s])
         d = signed_distance(indenters.kind[s], indenters.shape[s], y, s, indenters.coefficients)
         gap[s, f, q] = d[3]
@@ -125,8 +179,9 @@ def contact_residual(
         if pressure > wp.float64(0.0):
             n = rotation * wp.vec3d(d[0], d[1], d[2])
             t = pressure * n
-            if indenters.friction[s] > wp.float64(0.0) and state.anchored[s, f, q] == 1:
-                m = _trial(state, rotation, y, penalty, s, f, q)
+            anchor = anchor_of(state, y, d[3], s, f, q)
+            if indenters.friction[s] > wp.float64(0.0) and anchor[3] > wp.float64(0.0):
+                m = _trial(state, rotation, y, anchor, penalty, s, f, q)
                 along = _returned(m - wp.dot(n, m) * n, indenters.friction[s] * pressure)
                 t += along
             for a in range(faces.nodes.shape[1]):
@@ -136,25 +191,36 @@ def contact_residual(
 
 
 @wp.kernel
-def contact_tangent(
+def contact_stiffness(
     u: wp.array2d(dtype=wp.vec3d),
     active: wp.array(dtype=wp.int32),
     faces: Faces,
     indenters: Indenters,
     state: ContactState,
     penalty: wp.float64,
-    slot: wp.array3d(dtype=wp.int32),
-    values: wp.array2d(dtype=wp.float64),
+    touching: wp.array2d(dtype=wp.int32),
+    symmetric: wp.array3d(dtype=wp.mat33d),
+    remainder: wp.array3d(dtype=wp.mat33d),
 ):
-    """One thread per (sample, face); adds -∂t/∂x to the entries slot[f, i, j] of the sparse values."""
+    """One thread per (sample, face): -∂t/∂x at its points, as a symmetric matrix and what is left over.
+
+    touching: (B, f) 0: nothing touches, the matrices are not written; 1: without friction; 2: with friction.
+    """
     s, f = wp.tid()
+    touching[s, f] = 0
     if active[s] == 0:
+        return
+    if _is_far(faces, indenters, u, s, f):
         return
     rotation = indenters.rotation[s]
     friction = indenters.friction[s]
     identity = wp.identity(n=3, dtype=wp.float64)
+    zero = wp.mat33d()
+    half = wp.float64(0.5)
     for q in range(faces.weight.shape[1]):
-        x = _position(faces, u, s, f, q)
+        symmetric[s, f, q] = zero
+        remainder[s, f, q] = zero
+        x = position(faces, u, s, f, q)
         y = wp.transpose(rotation) * (x - indenters.centre[s])
         d = signed_distance(indenters.kind[s], indenters.shape[s], y, s, indenters.coefficients)
         pressure = state.normal[s, f, q] - penalty * d[3]
@@ -163,75 +229,52 @@ def contact_tangent(
             local = normal_derivative(indenters.kind[s], indenters.shape[s], y, s, indenters.coefficients)
             H = rotation * local * wp.transpose(rotation)
             block = penalty * wp.outer(n, n) - pressure * H
-            if friction > wp.float64(0.0) and state.anchored[s, f, q] == 1:
-                m = _trial(state, rotation, y, penalty, s, f, q)
+            touching[s, f] = wp.max(touching[s, f], 1)
+            anchor = anchor_of(state, y, d[3], s, f, q)
+            if friction > wp.float64(0.0) and anchor[3] > wp.float64(0.0):
+                touching[s, f] = 2
+                m = _trial(state, rotation, y, anchor, penalty, s, f, q)
                 tangential = m - wp.dot(n, m) * n
                 length = wp.length(tangential)
                 limit = friction * pressure
-                A = penalty * (identity - wp.outer(n, n)) + wp.dot(n, m) * H + wp.outer(n, H * m)
-                if length <= limit:
-                    block += A
-                else:
+                P = identity - wp.outer(n, n)
+                A = (penalty * anchor[3]) * P + wp.dot(n, m) * H + wp.outer(n, H * m)
+                fresh = zero
+                if state.anchored[s, f, q] == 0:
+                    before = state.gap[s, f, q]
+                    slope = before / ((before - d[3]) * (before - d[3]))
+                    fresh = (-penalty * slope) * wp.outer(P * (rotation * (y - state.place[s, f, q])), n)
+                onto = identity
+                rest = zero
+                if length > limit:
                     tau = tangential / length
-                    block += (friction * penalty) * wp.outer(tau, n)
-                    block += (limit / length) * ((identity - wp.outer(tau, tau)) * A)
-            for a in range(faces.nodes.shape[1]):
-                for b in range(faces.nodes.shape[1]):
-                    scale = faces.weight[f, q] * faces.shape[q, a] * faces.shape[q, b]
-                    for i in range(3):
-                        for j in range(3):
-                            wp.atomic_add(values, s, slot[f, 3 * a + i, 3 * b + j], scale * block[i, j])
+                    onto = (limit / length) * (identity - wp.outer(tau, tau))
+                    rest = (friction * penalty) * wp.outer(tau, n)
+                A = onto * A
+                mean = half * (A + wp.transpose(A))
+                remainder[s, f, q] = rest + onto * fresh + (A - mean)
+                block += mean
+            symmetric[s, f, q] = half * (block + wp.transpose(block))
 
 
 @wp.kernel
-def augment(
-    u: wp.array2d(dtype=wp.vec3d),
-    active: wp.array(dtype=wp.int32),
+def contact_tangent(
     faces: Faces,
-    indenters: Indenters,
-    gap: wp.array3d(dtype=wp.float64),
-    tangential: wp.array3d(dtype=wp.vec3d),
-    penalty: wp.float64,
-    state: ContactState,
+    pairs: wp.array(dtype=wp.vec2i),
+    touching: wp.array2d(dtype=wp.int32),
+    symmetric: wp.array3d(dtype=wp.mat33d),
+    slot: wp.array3d(dtype=wp.int32),
+    values: wp.array2d(dtype=wp.float64),
 ):
-    """Multipliers take the present traction, so that the next solution needs less penetration and elastic slip."""
-    s, f, q = wp.tid()
-    if active[s] == 0:
+    """One thread per (sample, face, pair a <= b of its nodes); as `synth.simulate.bulk.bulk_tangent`."""
+    s, f, k = wp.tid()
+    if touching[s, f] == 0:
         return
-    state.normal[s, f, q] = wp.max(wp.float64(0.0), state.normal[s, f, q] - penalty * gap[s, f, q])
-    if state.anchored[s, f, q] == 1:
-        state.tangent[s, f, q] = wp.transpose(indenters.rotation[s]) * tangential[s, f, q]
-
-
-@wp.kernel
-def settle(
-    u: wp.array2d(dtype=wp.vec3d),
-    active: wp.array(dtype=wp.int32),
-    faces: Faces,
-    indenters: Indenters,
-    gap: wp.array3d(dtype=wp.float64),
-    tangential: wp.array3d(dtype=wp.vec3d),
-    penalty: wp.float64,
-    state: ContactState,
-):
-    """At the end of a step: anchor new contacts, drag the anchors of slipping points along, free points that left."""
-    s, f, q = wp.tid()
-    if active[s] == 0 or indenters.friction[s] == wp.float64(0.0):
-        return
-    rotation = indenters.rotation[s]
-    pressure = state.normal[s, f, q] - penalty * gap[s, f, q]
-    zero = wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(0.0))
-    if pressure <= wp.float64(0.0):
-        state.normal[s, f, q] = wp.float64(0.0)
-        state.tangent[s, f, q] = zero
-        state.anchored[s, f, q] = 0
-        return
-    y = wp.transpose(rotation) * (_position(faces, u, s, f, q) - indenters.centre[s])
-    if state.anchored[s, f, q] == 0:
-        state.tangent[s, f, q] = zero
-        state.anchor[s, f, q] = y
-        state.anchored[s, f, q] = 1
-        return
-    t = wp.transpose(rotation) * tangential[s, f, q]
-    if wp.length(t) >= ON_CONE * indenters.friction[s] * pressure:
-        state.anchor[s, f, q] = y - (state.tangent[s, f, q] - t) / penalty
+    a = pairs[k][0]
+    b = pairs[k][1]
+    block = wp.mat33d()
+    for q in range(faces.weight.shape[1]):
+        block += (faces.weight[f, q] * faces.shape[q, a] * faces.shape[q, b]) * symmetric[s, f, q]
+    for i in range(3):
+        for j in range(3):
+            wp.atomic_add(values, s, slot[f, k, 3 * i + j], block[i, j])

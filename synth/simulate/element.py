@@ -1,62 +1,111 @@
-"""The mixed tetrahedron: shape functions, quadrature and pressure stabilisation of the P1/P1 element.
+"""Mixed tetrahedra: shape functions and quadrature of displacement, pressure and contact.
 
-Linear displacement and linear continuous pressure violate the inf-sup condition; the projection of Dohrmann & Bochev
-(Int. J. Numer. Meth. Fluids 46, 2004) restores it: the energy loses (alpha / 2 mu) |p - mean(p)|^2 in each element.
-The deformation gradient and so the integrands of the momentum balance are constant in the element (pressure enters only
-through its mean), so one quadrature point is exact.
+P2/P1 (Taylor-Hood): quadratic displacement, linear continuous pressure; inf-sup stable. P1/P1: both linear, which
+violates the inf-sup condition; the projection of Dohrmann & Bochev (Int. J. Numer. Meth. Fluids 46, 2004) restores it:
+the energy loses (alpha / 2 mu) |p - mean(p)|^2 in each element. P1 alone has no pressure and locks when the material is
+nearly incompressible; it exists for foams and as the benchmark's warning.
+
+Nodes of a quadratic tetrahedron: its four vertices, then the midpoints of EDGES; of a quadratic face: as in
+`synth.surface`.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from synth.arrays import FloatArray, Points, Tets
+from synth.surface import quadratic_face
+
+EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
+
+CONTACT_SPLIT = 3
+"""Contact is integrated over each face split into so many parts an edge. With three points a face, an edge of the
+indenter that is sharper than an element made Newton's method chatter: of 8 presses and slides of a ball and a flat
+punch with P2 faces 5 completed with 3 points a face, 7 with 12, 8 with 27. A frictionless press alone takes a third
+fewer iterations with 3 points and has the same error."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Element:
     """Tables of a tetrahedral element.
 
     Attributes:
-        barycentric: (nq, 4) quadrature points.
+        name: "p2p1", "p1p1" or "p1".
+        order: polynomial degree of the displacement.
+        barycentric: (nq, 4) quadrature points; also the (linear) pressure's shape functions there.
         weights: (nq,) their weights, sum 1.
-        shape: (nq, nn) displacement shape functions at the quadrature points.
-        derivative: (nq, nn, 4) their derivatives with respect to the barycentric coordinates.
+        derivative: (nq, nn, 4) derivatives of the displacement's shape functions by the barycentric coordinates.
         stabilisation: alpha; 0 for an inf-sup stable pair.
-        face_barycentric, face_weights, face_shape: the same on a face, (nf, 3), (nf,), (nf, ns), for contact.
+        face_barycentric: (nf, 3) quadrature points of a face.
+        face_weights: (nf,) their weights, sum 1.
+        face_shape: (nf, ns) the displacement's shape functions there.
     """
 
+    name: Literal["p2p1", "p1p1", "p1"]
+    order: Literal[1, 2]
     barycentric: FloatArray
     weights: FloatArray
-    shape: FloatArray
     derivative: FloatArray
     stabilisation: float
     face_barycentric: FloatArray
     face_weights: FloatArray
     face_shape: FloatArray
 
+    @property
+    def has_pressure(self) -> bool:
+        """Whether a pressure field may be used with it."""
+        return self.name != "p1"
 
-CONTACT_SPLIT = 3
-"""Contact is integrated over each face split into so many parts an edge: with three points a face, an edge of the
-indenter that is sharper than an element made Newton's method chatter (2 of 6 trial presses completed, 6 of 6 with 27
-points)."""
 
-
-def p1p1(stabilisation: float = 2.0) -> Element:
-    """Stabilised linear-linear element."""
-    centre = np.full((1, 4), 0.25)
-    inner = np.array([[2 / 3, 1 / 6, 1 / 6], [1 / 6, 2 / 3, 1 / 6], [1 / 6, 1 / 6, 2 / 3]])
-    points = np.concatenate([inner @ corners for corners in _split_triangle(CONTACT_SPLIT)])
+def p2p1(contact_split: int = CONTACT_SPLIT) -> Element:
+    """Taylor-Hood. Four points integrate quadratics: exact for the mass-like terms, one order short for det F."""
+    a, b = (5 + 3 * np.sqrt(5)) / 20, (5 - np.sqrt(5)) / 20
+    points = np.full((4, 4), b) + (a - b) * np.eye(4)
+    face, weights = _face_rule(contact_split)
     return Element(
-        barycentric=centre,
-        weights=np.ones(1),
-        shape=centre.copy(),
-        derivative=np.eye(4)[None],
-        stabilisation=stabilisation,
-        face_barycentric=points,
-        face_weights=np.full(len(points), 1 / len(points)),
-        face_shape=points,
+        "p2p1", 2, points, np.full(4, 0.25), _quadratic_derivative(points), 0.0, face, weights, quadratic_face(face)
     )
+
+
+def p1p1(stabilisation: float = 2.0, contact_split: int = CONTACT_SPLIT) -> Element:
+    """Stabilised linear-linear element; its strain is constant, so that one point is exact."""
+    centre = np.full((1, 4), 0.25)
+    face, weights = _face_rule(contact_split)
+    return Element("p1p1", 1, centre, np.ones(1), np.eye(4)[None], stabilisation, face, weights, face)
+
+
+def p1(contact_split: int = CONTACT_SPLIT) -> Element:
+    """Linear displacement alone."""
+    mixed = p1p1(0.0, contact_split)
+    return Element(
+        "p1", 1, mixed.barycentric, mixed.weights, mixed.derivative, 0.0, mixed.face_barycentric, mixed.face_weights,
+        mixed.face_shape,
+    )  # fmt: skip
+
+
+def quadratic_shape(barycentric: FloatArray) -> FloatArray:
+    """(n, 10) quadratic shape functions at barycentric coordinates (n, 4)."""
+    corners = barycentric * (2 * barycentric - 1)
+    edges = [4 * barycentric[:, i] * barycentric[:, j] for i, j in EDGES]
+    return np.column_stack([corners, *edges])
+
+
+def _quadratic_derivative(barycentric: FloatArray) -> FloatArray:
+    derivative = np.zeros((len(barycentric), 10, 4))
+    for i in range(4):
+        derivative[:, i, i] = 4 * barycentric[:, i] - 1
+    for k, (i, j) in enumerate(EDGES):
+        derivative[:, 4 + k, i] = 4 * barycentric[:, j]
+        derivative[:, 4 + k, j] = 4 * barycentric[:, i]
+    return derivative
+
+
+def _face_rule(split: int) -> tuple[FloatArray, FloatArray]:
+    """Points (n, 3) and weights (n,) of the three-point rule on each of a triangle's split x split parts."""
+    inner = np.array([[2 / 3, 1 / 6, 1 / 6], [1 / 6, 2 / 3, 1 / 6], [1 / 6, 1 / 6, 2 / 3]])
+    points = np.concatenate([inner @ corners for corners in _split_triangle(split)])
+    return points, np.full(len(points), 1 / len(points))
 
 
 def _split_triangle(n: int) -> list[FloatArray]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from synth.arrays import FloatArray
 from synth.errors import InputError
-from synth.scene import Box, Cone, Cylinder, Indenter, MeshIndenter, Sphere, Torus
+from synth.scene_indenters import Box, Cone, Cylinder, Indenter, MeshIndenter, Sphere, Torus
 from synth.simulate.distance import KINDS, SHAPE_LENGTH
 
 LARGEST_GRID = 4_000_000

@@ -1,10 +1,12 @@
-"""Sparse direct solution: Pardiso through pypardiso where there is one, else SuperLU.
+"""Linear systems of Newton's method: a sparse direct factor of the symmetric part, and GMRES for what it leaves.
 
-The pattern is analysed once per mesh. Pardiso runs on one thread in its reproducible mode: two presses side by side use
-two cores better than one press on both, and the same numbers come out on every run.
+The tangent is A = S + R: S symmetric (its upper triangle is kept), R the unsymmetric remainder of friction, which has
+entries at touching faces only. S is factorised in single precision, which halves the time; flexible GMRES (Saad 1993)
+in double precision, preconditioned by the factor, takes away the rounding of the factor and R. Pardiso (through
+pypardiso's MKL) where there is one, else SuperLU in double precision. The pattern is analysed once per mesh.
 """
 
-import copy
+import ctypes
 import weakref
 from functools import cache
 from typing import Any, Protocol
@@ -13,102 +15,209 @@ import numpy as np
 
 from synth.arrays import FloatArray
 
-
-class DirectSolver(Protocol):
-    """Solves A x = b for matrices of one pattern."""
-
-    def solve(self, values: FloatArray, right: FloatArray) -> FloatArray:
-        """The (n,) float64 solution for CSR data `values` (nnz,) and right side `right` (n,); NaN if A is singular."""
+GMRES_TOLERANCE = 1e-3
+"""Of the linear residual, relative to the right side; Newton's convergence is then as with an exact solution."""
+GMRES_LIMIT = 40
+"""Most iterations; where they do not do, the direction is used as it is and the line search judges it."""
 
 
-def direct_solver(indptr: np.ndarray, indices: np.ndarray, symmetric: bool) -> DirectSolver:
-    """The best solver there is for this CSR pattern (upper triangle only where symmetric)."""
-    if not has_pardiso():
-        return SuperLUSolver(indptr, indices, symmetric)
-    return PardisoSolver(indptr, indices, symmetric)
+class Factor(Protocol):
+    """A factorised symmetric matrix, applied as an approximate inverse."""
+
+    def factorise(self, values: FloatArray) -> bool:
+        """Take new CSR data of the upper triangle; whether it went well."""
+
+    def apply(self, right: FloatArray) -> FloatArray:
+        """The approximate solution (n,) float64 for a right side (n,)."""
+
+
+def direct_factor(indptr: np.ndarray, indices: np.ndarray, single: bool = True) -> Factor:
+    """The best factor there is for this pattern of an upper triangle (CSR, sorted)."""
+    if has_pardiso():
+        return PardisoFactor(indptr, indices, single)
+    return SuperLUFactor(indptr, indices)
+
+
+def gmres(matrix: Any, remainder: Any, factor: Factor, right: FloatArray) -> tuple[FloatArray, int]:
+    """Solve (S + R) x = right by flexible GMRES without restart.
+
+    Args:
+        matrix: upper triangle of S, SciPy CSR.
+        remainder: R, SciPy CSR, or None.
+        factor: of S.
+        right: (n,) float64.
+
+    Returns:
+        (n,) the solution, NaN where the factor gave no numbers; and the iterations.
+    """
+    diagonal = matrix.diagonal()
+    transposed = matrix.T
+
+    def product(x: FloatArray) -> FloatArray:
+        y = matrix @ x + transposed @ x - diagonal * x
+        return np.asarray(y if remainder is None else y + remainder @ x)
+
+    size = _norm(right)
+    if size == 0:
+        return np.zeros_like(right), 0
+    basis: list[FloatArray] = [right / size]
+    corrections: list[FloatArray] = []
+    hessenberg = np.zeros((GMRES_LIMIT + 1, GMRES_LIMIT))
+    weights: FloatArray = np.zeros(1)
+    for k in range(GMRES_LIMIT):
+        corrections.append(factor.apply(basis[k]))
+        w = product(corrections[k])
+        if not np.isfinite(w).all():
+            return np.full_like(right, np.nan), k
+        for i in range(k + 1):
+            hessenberg[i, k] = float(np.sum(w * basis[i]))  # np.sum: the same bits whatever the number of BLAS threads
+            w -= hessenberg[i, k] * basis[i]
+        hessenberg[k + 1, k] = _norm(w)
+        small = hessenberg[: k + 2, : k + 1]
+        first = np.zeros(k + 2)
+        first[0] = size
+        weights = np.asarray(np.linalg.lstsq(small, first, rcond=None)[0], dtype=np.float64)
+        left = _norm(small @ weights - first) / size
+        if left < GMRES_TOLERANCE or hessenberg[k + 1, k] == 0:
+            break
+        basis.append(w / hessenberg[k + 1, k])
+    solution = np.zeros_like(right)
+    for weight, correction in zip(weights, corrections, strict=True):
+        solution += weight * correction
+    return solution, len(corrections)
+
+
+def _norm(x: FloatArray) -> float:
+    return float(np.sqrt(np.sum(x * x)))
 
 
 @cache
 def has_pardiso() -> bool:
     """Whether pypardiso and its MKL can be loaded."""
     try:
-        _loaded()
+        _mkl()
     except ImportError:
         return False
     return True
 
 
 @cache
-def _loaded() -> Any:
-    """One PyPardisoSolver to copy: each construction searches the whole environment for MKL, half a second."""
+def _mkl() -> Any:
+    """MKL as pypardiso finds it (it searches the whole environment: half a second), one thread, reproducible."""
     from pypardiso.pardiso_wrapper import PyPardisoSolver
 
-    solver = PyPardisoSolver()
-    solver.libmkl.MKL_Set_Num_Threads(1)
-    solver.libmkl.MKL_CBWR_Set(2)  # MKL_CBWR_AUTO: same result whatever the memory alignment
-    return solver
+    library = PyPardisoSolver().libmkl
+    library.MKL_Set_Num_Threads(1)
+    library.MKL_CBWR_Set(2)  # MKL_CBWR_AUTO: same result whatever the memory alignment
+    return library
 
 
-class PardisoSolver:
-    """MKL Pardiso, symmetric indefinite (mtype -2) or structurally symmetric (mtype 1).
+class PardisoFactor:
+    """MKL Pardiso, symmetric indefinite (mtype -2), one thread: two presses side by side use two cores better.
 
     Matching and scaling are off: they would make the analysis, and so the last bits of every later solution, depend on
     the values of the first matrix, that is on which sample of a batch came first.
     """
 
-    ANALYSE, FACTOR, SOLVE = 11, 22, 33
+    ANALYSE, FACTORISE, SOLVE, RELEASE = 11, 22, 33, -1
+    SYMMETRIC_INDEFINITE = -2
 
-    def __init__(self, indptr: np.ndarray, indices: np.ndarray, symmetric: bool) -> None:
-        import scipy.sparse as sp
-
+    def __init__(self, indptr: np.ndarray, indices: np.ndarray, single: bool = True) -> None:
+        self._type = np.float32 if single else np.float64
+        self._size = len(indptr) - 1
+        self._indptr = np.ascontiguousarray(indptr, dtype=np.int32)
+        self._indices = np.ascontiguousarray(indices, dtype=np.int32)
+        self._values = np.zeros(len(indices), dtype=self._type)
+        self._handle = np.zeros(64, dtype=np.int64)
+        self._settings = np.zeros(64, dtype=np.int32)
+        # own settings; METIS; pivots of 1e-8 (1e-5 in single precision) replace smaller ones; Bunch-Kaufman; single;
+        # indices from 0; no refinement of its own
+        for place, value in ((1, 1), (2, 2), (8, 0), (10, 5 if single else 8), (21, 1), (28, int(single)), (35, 1)):
+            self._settings[place - 1] = value
         self._analysed = False
-        self._solver = copy.copy(_loaded())
-        self._solver.mtype = -2 if symmetric else 1
-        self._solver.pt, self._solver.iparm = np.zeros_like(self._solver.pt), np.zeros_like(self._solver.iparm)
-        for index, value in ((1, 1), (2, 2), (8, 0), (10, 8 if symmetric else 13), (11, 0), (13, 0), (21, 1), (24, 0)):
-            self._solver.set_iparm(index, value)
-        size = len(indptr) - 1
-        self._matrix = sp.csr_matrix((np.ones(len(indices)), indices, indptr), shape=(size, size))
 
-    def solve(self, values: FloatArray, right: FloatArray) -> FloatArray:
-        """See DirectSolver."""
-        from pypardiso.pardiso_wrapper import PyPardisoError
+    def factorise(self, values: FloatArray) -> bool:
+        """See Factor."""
+        self._values[:] = values
+        if not np.isfinite(self._values).all():  # MKL was seen to crash on a matrix of NaN
+            return False
+        nothing = np.zeros(self._size, dtype=self._type)
+        if not self._analysed:
+            if self._call(self.ANALYSE, nothing, nothing) != 0:
+                return False
+            self._analysed = True
+            weakref.finalize(self, _release, self._handle, self._settings, self._size)
+        return self._call(self.FACTORISE, nothing, nothing) == 0
 
-        self._matrix.data[:] = values
-        right = np.ascontiguousarray(right)  # pypardiso hands over the bare pointer
-        try:
-            if not self._analysed:
-                self._phase(self.ANALYSE, right)
-                self._analysed = True
-                weakref.finalize(self, self._solver.free_memory, everything=True)
-            self._phase(self.FACTOR, right)
-            return self._phase(self.SOLVE, right)
-        except PyPardisoError:
-            return np.full_like(right, np.nan)
+    def apply(self, right: FloatArray) -> FloatArray:
+        """See Factor; NaN where Pardiso reports an error."""
+        b = right.astype(self._type)
+        x = np.zeros_like(b)
+        if self._call(self.SOLVE, b, x) != 0:
+            return np.full(self._size, np.nan)
+        return x.astype(np.float64)
 
-    def _phase(self, phase: int, right: FloatArray) -> FloatArray:
-        self._solver.set_phase(phase)
-        return np.asarray(self._solver._call_pardiso(self._matrix, right))
+    def _call(self, phase: int, right: np.ndarray, solution: np.ndarray) -> int:
+        return _pardiso(
+            self._handle, phase, self._size, self._values, self._indptr, self._indices, self._settings, right, solution
+        )
 
 
-class SuperLUSolver:
+def _pardiso(handle: np.ndarray, phase: int, size: int, *arrays: np.ndarray) -> int:
+    """One call of Pardiso; arrays: values, row pointers, columns, settings, right side, solution. Its error code."""
+    values, indptr, indices, settings, right, solution = (a.ctypes.data_as(ctypes.c_void_p) for a in arrays)
+    one, kind, silent, error = ctypes.c_int32(1), ctypes.c_int32(-2), ctypes.c_int32(0), ctypes.c_int32(0)
+    call = _mkl().pardiso
+    call.argtypes, call.restype = None, None
+    call(
+        handle.ctypes.data_as(ctypes.c_void_p),
+        ctypes.byref(one),
+        ctypes.byref(one),
+        ctypes.byref(kind),
+        ctypes.byref(ctypes.c_int32(phase)),
+        ctypes.byref(ctypes.c_int32(size)),
+        values,
+        indptr,
+        indices,
+        None,
+        ctypes.byref(one),
+        settings,
+        ctypes.byref(silent),
+        right,
+        solution,
+        ctypes.byref(error),
+    )
+    return int(error.value)
+
+
+def _release(handle: np.ndarray, settings: np.ndarray, size: int) -> None:
+    empty = np.zeros(1, dtype=np.int32)
+    _pardiso(handle, PardisoFactor.RELEASE, size, empty, empty, empty, settings, empty, empty)
+
+
+class SuperLUFactor:
     """SciPy's SuperLU: everywhere, and several times slower."""
 
-    def __init__(self, indptr: np.ndarray, indices: np.ndarray, symmetric: bool) -> None:
+    def __init__(self, indptr: np.ndarray, indices: np.ndarray) -> None:
         import scipy.sparse as sp
 
         size = len(indptr) - 1
         self._matrix = sp.csr_matrix((np.zeros(len(indices)), indices, indptr), shape=(size, size))
-        self._symmetric = symmetric
+        self._factor: Any = None
 
-    def solve(self, values: FloatArray, right: FloatArray) -> FloatArray:
-        """See DirectSolver."""
+    def factorise(self, values: FloatArray) -> bool:
+        """See Factor."""
         import scipy.sparse as sp
         from scipy.sparse.linalg import splu
 
         self._matrix.data[:] = values
-        full = self._matrix + sp.triu(self._matrix, k=1).T if self._symmetric else self._matrix
+        full = self._matrix + sp.triu(self._matrix, k=1).T
         try:
-            return np.asarray(splu(full.tocsc()).solve(right))
+            self._factor = splu(full.tocsc())
         except RuntimeError:  # exactly singular
-            return np.full_like(right, np.nan)
+            return False
+        return True
+
+    def apply(self, right: FloatArray) -> FloatArray:
+        """See Factor."""
+        return np.asarray(self._factor.solve(right))

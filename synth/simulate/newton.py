@@ -77,8 +77,8 @@ def solve(
             running &= relative < 0.5
         if iteration == limit or not running.any():
             break
-        values = system.tangent(state, indenters, running)
-        step = system.newton_step(values, balance.free, running)
+        tangent = system.tangent(state, indenters, running)
+        step = system.newton_step(tangent, balance.free, running)
         running &= np.isfinite(step.u).all(axis=(1, 2))
         state, balance, running = _line_search(system, state, balance, step, indenters, running)
         iterations[running] += 1

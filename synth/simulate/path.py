@@ -1,10 +1,10 @@
-"""Where the indenter is along its way: first down, then sideways and round at once.
+"""Where the indenter is along its way: down, then sideways and round at once, then from pose to pose.
 
-The path parameter is a length in mm: depth while pressing, then the distance that the farthest touching point moves
-while shearing and twisting.
+The path parameter is a length in mm: the distance that the farthest touching point moves, leg by leg.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -34,39 +34,64 @@ class Path:
     motion: Motion
     body: RigidBody
 
+    @cached_property
+    def corners(self) -> FloatArray:
+        """(k, 4) depth, shear x, shear y (mm) and twist (deg) at the start and at the end of each leg that moves."""
+        motion = self.motion
+        start = min(motion.depth_mm, 0.0)
+        poses = [(start, 0.0, 0.0, 0.0), (motion.depth_mm, 0.0, 0.0, 0.0)]
+        poses.append((motion.depth_mm, *motion.shear_mm, motion.twist_deg))
+        poses += [(pose.depth_mm, *pose.shear_mm, pose.twist_deg) for pose in motion.then]
+        kept = [poses[0]]
+        for pose in poses[1:]:
+            if pose != kept[-1]:
+                kept.append(pose)
+        return np.array(kept)
+
+    @cached_property
+    def ends(self) -> FloatArray:
+        """(k,) path length at each of the corners."""
+        step = np.diff(self.corners, axis=0)
+        turned = np.radians(np.abs(step[:, 3])) * TWIST_ARM_MM
+        return np.concatenate([[0.0], np.cumsum(np.linalg.norm(step[:, :3], axis=1) + turned)])
+
     @property
     def press_mm(self) -> float:
-        """Length of the first leg."""
+        """Length of the first leg, straight down."""
         return max(self.motion.depth_mm, 0.0)
 
     @property
-    def drag_mm(self) -> float:
-        """Length of the second leg."""
-        turned = abs(np.radians(self.motion.twist_deg)) * TWIST_ARM_MM
-        return float(np.hypot(*self.motion.shear_mm) + turned)
+    def length_mm(self) -> float:
+        """Of the whole way."""
+        return float(self.ends[-1])
 
     def pose(self, s: float) -> Pose:
-        """The indenter at path length s, 0 <= s <= press_mm + drag_mm."""
+        """The indenter at path length s, 0 <= s <= length_mm."""
+        depth, x, y, twist = (float(np.interp(s, self.ends, column)) for column in self.corners.T)
         motion = self.motion
-        depth = min(s, motion.depth_mm) if motion.depth_mm > 0 else motion.depth_mm
-        share = float(np.clip((s - self.press_mm) / self.drag_mm, 0, 1)) if self.drag_mm > 0 else 0.0
-        shear = (share * motion.shear_mm[0], share * motion.shear_mm[1])
-        twist = share * motion.twist_deg
-        centre = np.array(
-            [motion.position_mm[0] + shear[0], motion.position_mm[1] + shear[1], depth - self.body.reach_mm]
-        )
-        return Pose(depth, shear, twist, centre, rotation_about(2, np.radians(twist)) @ self.body.rotation)
+        centre = np.array([motion.position_mm[0] + x, motion.position_mm[1] + y, depth - self.body.reach_mm])
+        return Pose(depth, (x, y), twist, centre, rotation_about(2, np.radians(twist)) @ self.body.rotation)
 
     def records(self) -> FloatArray:
-        """(steps,) path lengths at which states are recorded: both legs in equal parts, their common end among them."""
-        steps, press, drag = self.motion.steps, self.press_mm, self.drag_mm
-        if press == 0 or drag == 0 or steps == 1:
-            return np.linspace(0, press + drag, steps + 1)[1:]
-        first = int(np.clip(round(steps * press / (press + drag)), 1, steps - 1))
-        return np.concatenate(
-            [np.linspace(0, press, first + 1)[1:], press + np.linspace(0, drag, steps - first + 1)[1:]]
-        )
+        """(steps,) path lengths at which states are recorded: each leg in equal parts, its end among them.
+
+        Steps are dealt to the legs by their lengths, one at least to each; with fewer steps than legs, or where
+        nothing moves, the whole way is cut in equal parts.
+        """
+        steps, lengths = self.motion.steps, np.diff(self.ends)
+        if len(lengths) == 0 or steps < len(lengths):
+            return np.linspace(0, self.length_mm, steps + 1)[1:]
+        share = np.ones(len(lengths), dtype=int)
+        while share.sum() < steps:  # the next step goes where they are longest
+            share[np.argmax(lengths / share)] += 1
+        parts = [np.linspace(a, b, n + 1)[1:] for a, b, n in zip(self.ends[:-1], self.ends[1:], share, strict=True)]
+        return np.concatenate(parts)
 
     def waypoints(self) -> FloatArray:
-        """The records, and the end of the press where a single record would step over it."""
-        return np.unique(np.concatenate([self.records(), [self.press_mm] if self.press_mm > 0 else []]))
+        """(k,) the records and the ends of the legs, where the way turns; rising, without the start."""
+        stops = np.unique(np.concatenate([self.records(), self.ends]))
+        return stops[stops > 0]
+
+    def turns_between(self, before: float, now: float) -> bool:
+        """Whether the way turns after `before` and not after `now`, so that extrapolation across is meaningless."""
+        return bool(np.any((self.ends > before) & (self.ends <= now)))

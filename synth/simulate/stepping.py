@@ -12,29 +12,31 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import warp as wp
 
 from synth.arrays import BoolArray, FloatArray
 from synth.scene import Numerics
-from synth.simulate.contact import Indenters
-from synth.simulate.distance import KINDS, shape_vector
-from synth.simulate.newton import Solution, relative_residual, solve
+from synth.simulate.distance import KINDS
+from synth.simulate.driver import STANDARD, Driver
+from synth.simulate.memory import kept_contact, restore_contact
+from synth.simulate.newton import NOTHING, Solution, relative_residual, solve
 from synth.simulate.path import Path, Pose
-from synth.simulate.system import System, Unknowns, warp_array
+from synth.simulate.space import Space
+from synth.simulate.system import System, Unknowns
+from synth.simulate.tables import pack_indenters
 from synth.simulate.trajectory import State, Trajectory
 
-LOOSE = 1e-3
-"""Tolerance between recorded states (the error of these does not reach the recorded ones without friction)."""
 SHORTEST_STEP = 1 / 128
 """Shortest step, as a share of max_step_mm."""
 EASY = 7
 """A step that took at most so many iterations is followed by a longer one."""
 GROWTH = 1.5
+STUCK = 1e6
+"""Coefficient of friction at which nothing slides."""
+NUDGE = 1e-3
+"""Share of a step over which the derivative along the path is taken."""
 PASSES = 2
 """Most augmented-Lagrangian passes at a recorded state: on a linear face pressed on a curved body not every contact
 point can come to rest on the surface, so that a third pass still moved a sphere's force by 0.1 % only."""
-CORRECTION_ITERATIONS = 8
-"""Newton iterations of one pass; a correction that needs more is dropped."""
 PENETRATION = 2e-3
 """Passes end when no contact point is deeper inside the indenter than this share of the press depth."""
 
@@ -46,6 +48,7 @@ class _Sample:
     path: Path
     waypoints: FloatArray
     recorded: frozenset[float]
+    corrected: frozenset[float]
     step: float
     next: int = 0
     at: float = 0.0
@@ -75,15 +78,27 @@ class Stepper:
         friction: Sequence[float],
         numerics: Numerics,
         moduli_mpa: Sequence[float],
+        driver: Driver = STANDARD,
+        frames: frozenset[int] | None = None,
     ) -> None:
-        self.system, self.numerics, self.moduli = system, numerics, moduli_mpa
+        """frames: numbers of the states that are wanted; the others are recorded without correction passes."""
+        self.system, self.numerics, self.moduli, self.driver = system, numerics, moduli_mpa, driver
         self.samples = []
         for path in paths:
-            waypoints = path.waypoints()
-            waypoints = waypoints[waypoints > 0]
-            sample = _Sample(path, waypoints, frozenset(map(float, path.records())), numerics.max_step_mm)
+            records = path.records()
+            wanted = records if frames is None else [record for k, record in enumerate(records, 1) if k in frames]
+            sample = _Sample(
+                path,
+                path.waypoints(),
+                frozenset(map(float, records)),
+                frozenset(map(float, wanted)),
+                numerics.max_step_mm,
+            )
             self.samples.append(sample)
-        self.indenters = _indenters(paths, friction, system.device)
+        self.rubs = np.array(friction) > 0
+        self.indenters = pack_indenters(paths, friction, system.device)
+        self.stuck = pack_indenters(paths, [STUCK] * len(paths), system.device)
+        self.stuck.centre, self.stuck.rotation = self.indenters.centre, self.indenters.rotation
         self.state = system.zero()
         self.previous = system.zero()
 
@@ -94,21 +109,24 @@ class Stepper:
         while not all(sample.finished for sample in self.samples):
             self._advance(np.array([not sample.finished for sample in self.samples]))
         seconds = (time.perf_counter() - started) / len(self.samples)
-        return [_trajectory(sample, seconds) for sample in self.samples]
+        return [_trajectory(sample, seconds, self.system.space) for sample in self.samples]
 
     def _start(self) -> None:
         """The undeformed states; a path that never touches stays in them and needs no solve."""
-        for s, sample in enumerate(self.samples):
-            rest = self._rest(sample.path.pose(0.0))
-            sample.states = [rest]
-            if len(sample.waypoints) == 0 or sample.path.press_mm == 0:
+        for sample in self.samples:
+            sample.states = [self._rest(sample.path.pose(0.0))]
+            if sample.path.corners[:, 0].max() <= 0:
                 for record in sample.path.records():
                     sample.states.append(self._rest(sample.path.pose(float(record))))
                 sample.next = len(sample.waypoints)
-            self.state.u[s] = 0.0
+        running = np.array([not sample.finished for sample in self.samples])
+        if running.any():
+            self._place([0.0] * len(self.samples))
+            self.system.balance(self.state, self.indenters, running)
+            self.system.settle(self.state, self.indenters, running)
 
     def _rest(self, pose: Pose) -> State:
-        nodes, contact = self.system.nodes, len(self.system.mesh.contact_nodes)
+        nodes, contact = len(self.system.space.points), len(self.system.space.surface_nodes)
         zero = (0.0, 0.0, 0.0)
         return State(
             pose.depth_mm,
@@ -122,6 +140,7 @@ class Stepper:
             0.0,
             1.0,
             0.0,
+            0.0,
         )
 
     def _advance(self, active: BoolArray) -> None:
@@ -129,7 +148,7 @@ class Stepper:
         targets = [sample.target() if active[s] else sample.at for s, sample in enumerate(self.samples)]
         self._place(targets)
         arriving = np.array([s.finished or t in s.waypoints for s, t in zip(self.samples, targets, strict=True)])
-        tolerance = np.where(arriving, self.numerics.tolerance, np.maximum(LOOSE, self.numerics.tolerance))
+        tolerance = np.where(arriving, self.numerics.tolerance, np.maximum(self.driver.loose, self.numerics.tolerance))
         solution = solve(self.system, self._predicted(targets, active), self.indenters, active, tolerance)
         for s in map(int, np.flatnonzero(active)):
             self.samples[s].iterations += int(solution.iterations[s])
@@ -146,22 +165,25 @@ class Stepper:
             self._control(self.samples[s], targets[s], bool(good[s]), int(solution.iterations[s]))
 
     def _slipped_through(self, recording: BoolArray, targets: Sequence[float]) -> BoolArray:
-        """Samples whose indenter, pressing on the pad, passed between the contact points. Ends them, saying so."""
-        untouched = recording & (self.system.deepest() == 0) & ~np.any(self.system.traction.numpy(), axis=(1, 2, 3))
-        for s in map(int, np.flatnonzero(untouched)):
-            sample = self.samples[s]
-            untouched[s] = targets[s] <= sample.path.press_mm and self._is_over_pad(sample.path)
-            if untouched[s]:
-                sample.reason = (
-                    f"pressed {targets[s]:.3g} mm deep, the indenter touches no contact point: it is too small for the "
-                    "mesh or for the steps; lower numerics.edge_length_mm or numerics.max_step_mm"
-                )
-        return untouched
+        """Samples whose indenter, at the end of its press, bears on nothing: it passed between the contact points.
+
+        Ends them, saying so.
+        """
+        ending = np.array(
+            [t == s.path.press_mm and self._is_over_pad(s.path) for s, t in zip(self.samples, targets, strict=True)]
+        )
+        through = recording & ending & (self.system.forces(self.state)[0][:, 2] <= NOTHING)
+        for s in map(int, np.flatnonzero(through)):
+            self.samples[s].reason = (
+                f"pressed {targets[s]:.3g} mm deep, the indenter touches no contact point that bears it: it is too "
+                "small for the mesh or for the steps; lower numerics.target_error_px or edge_length_mm, or max_step_mm"
+            )
+        return through
 
     def _is_over_pad(self, path: Path) -> bool:
         """Whether the body's lowest point, a ring's rim for a torus, comes down on the contact face."""
         rim = float(path.body.shape[1]) if path.body.kind == KINDS["torus"] else 0.0
-        half = np.array(self.system.mesh.size_mm[:2]) / 2
+        half = np.array(self.system.space.mesh.size_mm[:2]) / 2
         return bool(np.all(np.abs(path.motion.position_mm) + rim < half))
 
     def _place(self, at: Sequence[float]) -> None:
@@ -170,36 +192,57 @@ class Stepper:
         self.indenters.rotation.assign(np.array([pose.rotation for pose in poses]))
 
     def _predicted(self, targets: Sequence[float], active: BoolArray) -> Unknowns:
-        """Linear extrapolation where it leaves every det F > 0, else the last state."""
-        ratio = np.zeros(len(self.samples))
+        """Linear extrapolation, or after a turn the gel carried along; the last state where det F would not be > 0."""
+        ratio, turned = np.zeros(len(self.samples)), np.zeros(len(self.samples), dtype=bool)
         for s in map(int, np.flatnonzero(active)):
             sample = self.samples[s]
-            corner = sample.path.press_mm
-            if sample.previous is not None and not sample.previous < corner <= sample.at:
+            if sample.previous is not None and not sample.path.turns_between(sample.previous, sample.at):
                 ratio[s] = (targets[s] - sample.at) / (sample.at - sample.previous)
-        if not ratio.any():
-            return self.state
+            else:
+                turned[s] = self.rubs[s] and sample.at > 0
         ahead = self.state.plus(Unknowns(self.state.u - self.previous.u, self.state.p - self.previous.p), ratio)
+        if turned.any():
+            ahead = self._carried(targets, turned).where(turned, ahead)
+        elif not ratio.any():
+            return self.state
         valid = self.system.balance(ahead, self.indenters, active).smallest_jacobian > 0
         return ahead.where(valid, self.state)
+
+    def _carried(self, targets: Sequence[float], active: BoolArray) -> Unknowns:
+        """The last state moved with the indenter as if every touching point stuck to it, to first order.
+
+        From the last state itself a step of the indenter aside looks like sliding at every point, and in that regime
+        Newton's method does not find the state where most points stick. The derivative along the path is taken over a
+        small share of the step: over the whole of it the trial tractions of stuck points would be beyond linear.
+        """
+        state, stuck = self.state, self.stuck
+        here = [sample.at for sample in self.samples]
+        self._place(here)
+        tangent = self.system.tangent(state, stuck, active)
+        self._place([at + NUDGE * (target - at) for at, target in zip(here, targets, strict=True)])
+        moved = self.system.balance(state, stuck, active).free
+        step = self.system.newton_step(tangent, moved, active)
+        self._place(targets)
+        return state.plus(step, np.where(active & np.isfinite(step.u).all(axis=(1, 2)), 1 / NUDGE, 0.0))
 
     def _augmented(self, solution: Solution, recording: BoolArray) -> Solution:
         """Passes of multiplier update and solve; a pass that fails is dropped and ends the passes of its sample."""
         pending = recording.copy()
         tolerance = np.full(len(pending), self.numerics.tolerance)
-        press = np.array([max(sample.path.press_mm, 0.1) for sample in self.samples])
+        press = np.array([max(float(sample.path.corners[:, 0].max()), 0.1) for sample in self.samples])
         for _ in range(PASSES):
             pending &= self.system.deepest() > PENETRATION * press
             if not pending.any():
                 break
-            before = _copy(self.system.contact)
-            self.system.augment(solution.state, self.indenters, pending)
-            better = solve(self.system, solution.state, self.indenters, pending, tolerance, CORRECTION_ITERATIONS)
+            before = kept_contact(self.system.contact)
+            self.system.augment(self.indenters, pending)
+            limit = self.driver.correction_iterations
+            better = solve(self.system, solution.state, self.indenters, pending, tolerance, limit)
             for s in map(int, np.flatnonzero(pending)):
                 self.samples[s].iterations += int(better.iterations[s])
             failed = pending & ~better.converged
             if failed.any():
-                _restore(self.system.contact, before, failed)
+                restore_contact(self.system.contact, before, failed)
                 self.system.balance(solution.state, self.indenters, failed)
             solution = _merge(pending & better.converged, better, solution)
             pending &= better.converged
@@ -207,10 +250,13 @@ class Stepper:
 
     def _record(self, solution: Solution, recording: BoolArray, targets: Sequence[float]) -> None:
         """Record the corrected states, then put contact back to where the path goes on."""
-        kept = _copy(self.system.contact)
-        solution = self._augmented(solution, recording)
+        kept = kept_contact(self.system.contact)
+        wanted = recording & np.array([t in s.corrected for s, t in zip(self.samples, targets, strict=True)])
+        self.system.anchor(solution.state, self.indenters, wanted)
+        solution = self._augmented(solution, wanted)
         force, torque, traction = self.system.forces(solution.state)
         residual, deepest = relative_residual(solution.balance), self.system.deepest()
+        slipping = self.system.slip_ratio(self.indenters)
         for s in map(int, np.flatnonzero(recording)):
             sample, pose = self.samples[s], self.samples[s].path.pose(targets[s])
             sample.states.append(
@@ -226,10 +272,11 @@ class Stepper:
                     residual=float(residual[s]),
                     min_jacobian=float(solution.balance.smallest_jacobian[s]),
                     max_penetration_mm=float(deepest[s]),
+                    slip_ratio=float(slipping[s]),
                 )
             )
             sample.iterations = 0
-        _restore(self.system.contact, kept, recording)
+        restore_contact(self.system.contact, kept, recording)
         self.system.balance(self.state, self.indenters, recording)
 
     def _control(self, sample: _Sample, target: float, good: bool, iterations: int) -> None:
@@ -237,7 +284,7 @@ class Stepper:
         longest = self.numerics.max_step_mm
         if good:
             taken = target - sample.at
-            sample.previous, sample.at = sample.at, target
+            sample.previous, sample.at = sample.at if self.driver.extrapolate else None, target
             if target == sample.waypoints[sample.next]:
                 sample.next += 1
             if iterations <= EASY:
@@ -254,28 +301,11 @@ class Stepper:
                 )
 
 
-def _indenters(paths: Sequence[Path], friction: Sequence[float], device: str) -> Indenters:
-    bodies = [path.body for path in paths]
-    largest = np.max([body.coefficients.shape for body in bodies], axis=0)
-    coefficients = np.zeros((len(bodies), *largest))
-    for s, body in enumerate(bodies):
-        i, j, k = body.coefficients.shape
-        coefficients[s, :i, :j, :k] = body.coefficients
-    packed = Indenters()
-    packed.kind = warp_array(np.array([body.kind for body in bodies], dtype=np.int32), wp.int32, device)
-    packed.shape = warp_array(np.array([body.shape for body in bodies]), shape_vector, device)
-    packed.coefficients = warp_array(coefficients, wp.float64, device)
-    packed.centre = wp.zeros(len(bodies), dtype=wp.vec3d, device=device)
-    packed.rotation = wp.zeros(len(bodies), dtype=wp.mat33d, device=device)
-    packed.friction = warp_array(np.array(friction, dtype=np.float64), wp.float64, device)
-    return packed
-
-
-def _trajectory(sample: _Sample, seconds: float) -> Trajectory:
+def _trajectory(sample: _Sample, seconds: float, space: Space) -> Trajectory:
     states = tuple(sample.states)
     if not sample.reason:
-        return Trajectory(states, "complete", "", seconds)
-    return Trajectory(states, "partial" if len(states) > 1 else "failed", sample.reason, seconds)
+        return Trajectory(states, "complete", "", seconds, space)
+    return Trajectory(states, "partial" if len(states) > 1 else "failed", sample.reason, seconds, space)
 
 
 def _merge(mask: BoolArray, new: Solution, old: Solution) -> Solution:
@@ -290,21 +320,6 @@ def _merge(mask: BoolArray, new: Solution, old: Solution) -> Solution:
         iterations=old.iterations,
         residual=np.where(mask, new.residual, old.residual),
     )
-
-
-_CONTACT_FIELDS = ("normal", "tangent", "anchor", "anchored")
-
-
-def _copy(contact: object) -> dict[str, np.ndarray]:
-    return {name: getattr(contact, name).numpy().copy() for name in _CONTACT_FIELDS}
-
-
-def _restore(contact: object, kept: dict[str, np.ndarray], mask: BoolArray) -> None:
-    for name, before in kept.items():
-        array = getattr(contact, name)
-        now = array.numpy().copy()
-        now[mask] = before[mask]
-        array.assign(now)
 
 
 def _triple(values: FloatArray) -> tuple[float, float, float]:

@@ -1,43 +1,31 @@
-"""The discrete system of one pad for a batch of samples: unknowns, sparse pattern, residual and tangent.
+"""The discrete system of one pad for a batch of samples: unknowns, residual, tangent, Newton direction.
 
-Unknowns of a sample: 3 displacements per node, then one pressure per node (none for displacement-only foams); bonded
-displacements are held at zero. Everything is scaled by the pad's Young's modulus, so stiffness never enters the
-conditioning: a pad a thousand times stiffer deforms identically.
+Unknowns of a sample: 3 displacements per node, then the pressures (none for displacement-only foams); held ones keep
+their value. Everything is in units of the gel's Young's modulus, so stiffness never enters the conditioning: a pad
+a thousand times stiffer deforms identically.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from typing import Any
 
 import numpy as np
 import warp as wp
 
 from synth.arrays import FloatArray
-from synth.mesh import PadMesh
-from synth.simulate.bulk import bulk_residual, bulk_tangent
-from synth.simulate.contact import (
-    ContactState,
-    Faces,
-    Indenters,
-    augment,
-    contact_residual,
-    contact_tangent,
-    settle,
-)
-from synth.simulate.element import Element, barycentric_gradients
-from synth.simulate.linear import DirectSolver, direct_solver
-
-DISPLACEMENT_ONLY_BELOW = 0.3
-"""Poisson ratio under which no pressure field is needed; at 0 the mixed form would not even be defined."""
-
-
-def warp_array(values: np.ndarray, dtype: type, device: str) -> wp.array:
-    """A Warp array of contiguous values; vectors and matrices take the trailing axes."""
-    return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+from synth.simulate.bulk import bulk_residual, bulk_tangent, linearise, pressure_tangent
+from synth.simulate.contact import ContactState, Indenters, contact_residual, contact_stiffness, contact_tangent
+from synth.simulate.linear import gmres
+from synth.simulate.material import Material
+from synth.simulate.multipliers import augment, settle
+from synth.simulate.pattern import pattern_of
+from synth.simulate.space import Space
+from synth.simulate.tables import bulk_tables, face_tables, warp_array
+from synth.surface import broken_linear_face
 
 
 @dataclass(frozen=True)
 class Unknowns:
-    """State of a batch: displacement (B, n, 3) mm and pressure (B, n) in units of E."""
+    """State of a batch: displacement (B, n, 3) mm and pressure (B, k) in units of E."""
 
     u: FloatArray
     p: FloatArray
@@ -66,130 +54,91 @@ class Balance:
     smallest_jacobian: FloatArray
 
 
+@dataclass(frozen=True)
+class Tangent:
+    """Derivative of the free residual of a batch.
+
+    Attributes:
+        values: (B, nnz) CSR data of the symmetric part's upper triangle.
+        remainder: per sample the unsymmetric rest of friction, SciPy CSR over the free unknowns, or None.
+    """
+
+    values: FloatArray
+    remainder: tuple[Any, ...]
+
+
 class System:
     """Kernels, arrays and sparse pattern of one pad; see the module's docstring.
 
     Args:
-        mesh: the pad.
-        poisson_ratio: below 0.5.
+        space: the pad's finite-element space.
+        material: of its elements.
         batch: number of samples.
-        symmetric: no friction anywhere: half the matrix is kept and factorised.
         penalty: contact stiffness, E per mm.
-        element: tables.
+        load: (n, 3) dead nodal forces in E mm², or None.
         device: Warp device.
     """
 
     def __init__(
         self,
-        mesh: PadMesh,
-        poisson_ratio: float,
-        batch: int,
-        symmetric: bool,
-        penalty: float,
-        element: Element,
+        space: Space,
+        material: Material,
+        batch: int = 1,
+        penalty: float = 50.0,
+        load: FloatArray | None = None,
         device: str = "cpu",
     ) -> None:
-        self.mesh, self.batch, self.symmetric, self.penalty, self.device = mesh, batch, symmetric, penalty, device
-        self.nodes, self.mixed = len(mesh.points), poisson_ratio >= DISPLACEMENT_ONLY_BELOW
-        self._bulk = self._bulk_arrays(mesh, poisson_ratio, element)
-        self._faces, self._face_nodes = self._face_arrays(mesh, element)
-        self._pattern()
-        shape = (batch, len(mesh.contact_faces.faces), len(element.face_weights))
-        self.contact = ContactState()
-        self.contact.normal = wp.zeros(shape, dtype=wp.float64, device=device)
-        self.contact.tangent = wp.zeros(shape, dtype=wp.vec3d, device=device)
-        self.contact.anchor = wp.zeros(shape, dtype=wp.vec3d, device=device)
-        self.contact.anchored = wp.zeros(shape, dtype=wp.int32, device=device)
-        self.gap = wp.zeros(shape, dtype=wp.float64, device=device)
-        self.tangential = wp.zeros(shape, dtype=wp.vec3d, device=device)
-        self.traction = wp.zeros(shape, dtype=wp.vec3d, device=device)
-        self._solver: DirectSolver | None = None
+        self.space, self.batch, self.penalty, self.device, self.load = space, batch, penalty, device, load
+        self.mixed = material.mixed and space.element.has_pressure
+        self._pattern = pattern_of(space, self.mixed)
+        self._bulk = bulk_tables(space, material, self.mixed, device)
+        self._faces = face_tables(space, device)
+        self._pairs = warp_array(self._pattern.element_pairs, wp.vec2i, device)
+        self._face_pairs = warp_array(self._pattern.face_pairs, wp.vec2i, device)
+        slots = (self._pattern.block_slot, self._pattern.coupling_slot, self._pattern.pressure_slot)
+        self._block_slot, self._coupling_slot, self._pressure_slot = (warp_array(s, wp.int32, device) for s in slots)
+        self._face_slot = warp_array(self._pattern.face_slot, wp.int32, device)
+        self._allocate()
 
-    def _bulk_arrays(self, mesh: PadMesh, poisson_ratio: float, element: Element) -> list[wp.array]:
-        barycentric = barycentric_gradients(mesh.points, mesh.tets)
-        gradient = np.einsum("qak,ekd->eqad", element.derivative, barycentric)
-        weight = mesh.volumes[:, None] * element.weights
-        mu = 1 / (2 * (1 + poisson_ratio))
-        lame = poisson_ratio / ((1 + poisson_ratio) * (1 - 2 * poisson_ratio))
-        mass = (np.ones((4, 4)) + np.eye(4)) / 20
-        matrix = -element.stabilisation / mu * (mass - 1 / 16)
-        if self.mixed:
-            matrix = matrix - mass / lame
-        pressure_matrix = mesh.volumes[:, None, None] * matrix
-        count, d = len(mesh.tets), self.device
-        return [
-            warp_array(mesh.tets, wp.int32, d),
-            warp_array(mesh.tets, wp.int32, d),
-            warp_array(gradient, wp.vec3d, d),
-            warp_array(weight, wp.float64, d),
-            warp_array(element.barycentric, wp.float64, d),
-            warp_array(pressure_matrix, wp.float64, d),
-            warp_array(np.full(count, mu), wp.float64, d),
-            warp_array(np.full(count, -1.0 if self.mixed else lame), wp.float64, d),
-        ]
+    @property
+    def free(self) -> np.ndarray:
+        """(k,) numbers of the unknowns that are not held."""
+        return self._pattern.free
 
-    def _face_arrays(self, mesh: PadMesh, element: Element) -> tuple[Faces, np.ndarray]:
-        nodes = mesh.contact_nodes[mesh.contact_faces.faces].astype(np.int32)
-        a, b, c = (mesh.points[nodes[:, i]] for i in range(3))
-        area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-        faces = Faces()
-        faces.nodes = warp_array(nodes, wp.int32, self.device)
-        faces.shape = warp_array(element.face_shape, wp.float64, self.device)
-        faces.weight = warp_array(area[:, None] * element.face_weights, wp.float64, self.device)
-        faces.points = warp_array(mesh.points, wp.vec3d, self.device)
-        return faces, nodes
-
-    def _pattern(self) -> None:
-        """CSR pattern of the free unknowns and, per element and face, where its entries go."""
+    def matrix(self, values: FloatArray) -> Any:
+        """The upper triangle of one sample's symmetric part as SciPy CSR."""
         import scipy.sparse as sp
 
-        n, tets = self.nodes, self.mesh.tets.astype(np.int64)
-        total = 3 * n + (n if self.mixed else 0)
-        held = np.zeros(total, dtype=bool)
-        held[: 3 * n] = np.repeat(self.mesh.bonded, 3)
-        self.free = np.flatnonzero(~held)
-        number = np.full(total, -1, dtype=np.int64)
-        number[self.free] = np.arange(len(self.free))
+        size = len(self.free)
+        return sp.csr_matrix((values, self._pattern.indices, self._pattern.indptr), shape=(size, size))
 
-        def unknowns(nodes: np.ndarray, pressures: bool) -> np.ndarray:
-            moves = (3 * nodes[:, :, None] + np.arange(3)).reshape(len(nodes), -1)
-            return number[np.concatenate([moves, 3 * n + nodes], axis=1) if pressures else moves]
-
-        def keys(local: np.ndarray) -> np.ndarray:
-            row, column = local[:, :, None], local[:, None, :]
-            keep = (row >= 0) & (column >= 0)
-            if self.symmetric:
-                keep = keep & (row <= column)
-            return np.where(keep, row * len(self.free) + column, -1)
-
-        local = unknowns(tets, self.mixed)
-        element, place = np.nonzero(local >= 0)
-        incidence = sp.csr_matrix(
-            (np.ones(len(element), dtype=np.int32), (element, local[element, place])), shape=(len(tets), len(self.free))
-        )
-        coupled = (incidence.T @ incidence).tocsr()
-        if self.symmetric:
-            coupled = sp.triu(coupled, format="csr")
-        coupled.sort_indices()
-        self.indptr, self.indices = coupled.indptr.astype(np.int32), coupled.indices.astype(np.int32)
-        entries = np.repeat(np.arange(len(self.free)), np.diff(self.indptr)) * len(self.free) + self.indices
-        element_keys = keys(local)
-
-        def slots(wanted: np.ndarray) -> wp.array:
-            place = np.where(wanted >= 0, np.searchsorted(entries, wanted), len(entries))
-            return warp_array(place.astype(np.int32), wp.int32, self.device)
-
-        self._element_slot = slots(element_keys)
-        self._face_slot = slots(keys(unknowns(self._face_nodes.astype(np.int64), False)))
-        self._values = wp.zeros((self.batch, len(entries) + 1), dtype=wp.float64, device=self.device)
+    def _allocate(self) -> None:
+        d, element, count = self.device, self.space.element, len(self.space.nodes)
+        points = (self.batch, len(self.space.faces), len(element.face_weights))
+        self.contact = ContactState()
+        self.contact.normal = wp.zeros(points, dtype=wp.float64, device=d)
+        self.contact.tangent = wp.zeros(points, dtype=wp.vec3d, device=d)
+        self.contact.anchor = wp.zeros(points, dtype=wp.vec3d, device=d)
+        self.contact.anchored = wp.zeros(points, dtype=wp.int32, device=d)
+        self.contact.place = wp.zeros(points, dtype=wp.vec3d, device=d)
+        self.contact.gap = wp.full(points, 1e30, dtype=wp.float64, device=d)
+        self.gap = wp.full(points, 1e30, dtype=wp.float64, device=d)
+        self.tangential = wp.zeros(points, dtype=wp.vec3d, device=d)
+        self.traction = wp.zeros(points, dtype=wp.vec3d, device=d)
+        self._stiffness = wp.zeros(points, dtype=wp.mat33d, device=d)
+        self._remainder = wp.zeros(points, dtype=wp.mat33d, device=d)
+        self._touching = wp.zeros(points[:2], dtype=wp.int32, device=d)
+        at_points = (self.batch, count, len(element.weights))
+        self._factor = wp.zeros(at_points, dtype=wp.vec4d, device=d)
+        self._pushed = wp.zeros((*at_points, self.space.nodes.shape[1] + 1), dtype=wp.vec3d, device=d)
+        self._drift = wp.zeros((*at_points, self.space.nodes.shape[1]), dtype=wp.vec3d, device=d)
+        self._jacobian = wp.zeros(at_points, dtype=wp.float64, device=d)
+        self._values = wp.zeros((self.batch, self._pattern.size + 1), dtype=wp.float64, device=d)
 
     def zero(self) -> Unknowns:
         """The undeformed batch."""
-        return Unknowns(np.zeros((self.batch, self.nodes, 3)), np.zeros((self.batch, self.nodes)))
-
-    @cached_property
-    def _elements(self) -> int:
-        return len(self.mesh.tets)
+        pressures = self.space.pressures if self.mixed else 0
+        return Unknowns(np.zeros((self.batch, len(self.space.points), 3)), np.zeros((self.batch, pressures)))
 
     def _device_state(self, state: Unknowns, active: np.ndarray) -> tuple[wp.array, wp.array, wp.array]:
         return (
@@ -201,13 +150,14 @@ class System:
     def balance(self, state: Unknowns, indenters: Indenters, active: np.ndarray) -> Balance:
         """Residual of the active samples (others: zeros)."""
         u, p, mask = self._device_state(state, active)
-        force = wp.zeros((self.batch, self.nodes), dtype=wp.vec3d, device=self.device)
-        volume = wp.zeros((self.batch, self.nodes), dtype=wp.float64, device=self.device)
-        jacobian = wp.full((self.batch, self._elements), 1.0, dtype=wp.float64, device=self.device)
+        count = len(self.space.nodes)
+        force = wp.zeros((self.batch, len(self.space.points)), dtype=wp.vec3d, device=self.device)
+        volume = wp.zeros(state.p.shape, dtype=wp.float64, device=self.device)
+        jacobian = wp.full((self.batch, count), 1.0, dtype=wp.float64, device=self.device)
         wp.launch(
             bulk_residual,
-            (self.batch, self._elements),
-            inputs=[u, p, mask, *self._bulk],
+            (self.batch, count),
+            inputs=[u, p, mask, self._bulk],
             outputs=[force, volume, jacobian],
             device=self.device,
         )
@@ -219,58 +169,111 @@ class System:
             device=self.device,
         )
         reaction = force.numpy()
-        full = [reaction.reshape(self.batch, -1)] + ([volume.numpy()] if self.mixed else [])
+        if self.load is not None:
+            reaction = reaction - self.load * active[:, None, None]
+        full = np.concatenate([reaction.reshape(self.batch, -1), volume.numpy()], axis=1)
         # Indexing columns leaves them strided, and sums over a row would then depend on the size of the batch.
-        free = np.ascontiguousarray(np.concatenate(full, axis=1)[:, self.free])
-        return Balance(free, reaction, jacobian.numpy().min(axis=1))
+        return Balance(np.ascontiguousarray(full[:, self.free]), reaction, jacobian.numpy().min(axis=1))
 
-    def tangent(self, state: Unknowns, indenters: Indenters, active: np.ndarray) -> FloatArray:
-        """CSR values (B, nnz) of the derivative of the free residual."""
+    def tangent(self, state: Unknowns, indenters: Indenters, active: np.ndarray) -> Tangent:
+        """Derivative of the free residual of the active samples."""
         u, p, mask = self._device_state(state, active)
+        elements, d = (self.batch, len(self.space.nodes)), self.device
+        shared, jacobian = [self._factor, self._pushed, self._drift], self._jacobian
         self._values.zero_()
+        wp.launch(linearise, elements, inputs=[u, p, mask, self._bulk], outputs=[*shared, jacobian], device=d)
         wp.launch(
             bulk_tangent,
-            (self.batch, self._elements),
-            inputs=[u, p, mask, *self._bulk, self._element_slot],
+            (*elements, len(self._pattern.element_pairs)),
+            inputs=[mask, self._bulk, self._pairs, *shared, self._block_slot],
             outputs=[self._values],
-            device=self.device,
+            device=d,
+        )
+        if self.mixed:
+            wp.launch(
+                pressure_tangent,
+                elements,
+                inputs=[mask, self._bulk, self._pushed, jacobian, self._coupling_slot, self._pressure_slot],
+                outputs=[self._values],
+                device=d,
+            )
+        wp.launch(
+            contact_stiffness,
+            self.gap.shape[:2],
+            inputs=[u, mask, self._faces, indenters, self.contact, self.penalty],
+            outputs=[self._touching, self._stiffness, self._remainder],
+            device=d,
         )
         wp.launch(
             contact_tangent,
-            self.gap.shape[:2],
-            inputs=[u, mask, self._faces, indenters, self.contact, self.penalty, self._face_slot],
+            (*self.gap.shape[:2], len(self._pattern.face_pairs)),
+            inputs=[self._faces, self._face_pairs, self._touching, self._stiffness, self._face_slot],
             outputs=[self._values],
-            device=self.device,
+            device=d,
         )
-        return np.asarray(self._values.numpy()[:, :-1])
+        values = self._values.numpy()[:, :-1]
+        return Tangent(values, tuple(self._unsymmetric(s) for s in range(self.batch)))
 
-    def newton_step(self, values: FloatArray, residual: FloatArray, active: np.ndarray) -> Unknowns:
+    def _unsymmetric(self, sample: int) -> Any:
+        """The remainder of one sample's friction as a sparse matrix, or None where there is none."""
+        import scipy.sparse as sp
+
+        rubbing = np.flatnonzero(self._touching.numpy()[sample] == 2)
+        if len(rubbing) == 0:
+            return None
+        shape, weight = self.space.element.face_shape, self._faces.weight.numpy()[rubbing]
+        blocks = weight[:, :, None, None] * self._remainder.numpy()[sample, rubbing]
+        pairs = np.einsum("qa,qb->qab", shape, shape).reshape(len(shape), -1)
+        count, nodes = len(rubbing), shape.shape[1]
+        dense = np.matmul(pairs.T, blocks.reshape(count, len(shape), 9)).reshape(count, nodes, nodes, 3, 3)
+        dense = dense.transpose(0, 1, 3, 2, 4).reshape(count, 3 * nodes, 3 * nodes)
+        number = self._pattern.face_unknowns[rubbing]
+        row, column = np.broadcast_arrays(number[:, :, None], number[:, None, :])
+        kept = (row >= 0) & (column >= 0)
+        size = len(self.free)
+        return sp.csr_matrix((dense[kept], (row[kept], column[kept])), shape=(size, size))
+
+    def newton_step(self, tangent: Tangent, residual: FloatArray, active: np.ndarray) -> Unknowns:
         """-K^-1 r of each active sample; NaN where the matrix is singular."""
         step = self.zero()
-        full = np.zeros(3 * self.nodes + (self.nodes if self.mixed else 0))
-        if self._solver is None:
-            self._solver = direct_solver(self.indptr, self.indices, self.symmetric)
+        moves = step.u[0].size
+        full = np.zeros(moves + step.p.shape[1])
+        factor = self._pattern.factor
         for s in np.flatnonzero(active):
-            full[self.free] = -self._solver.solve(values[s], residual[s])
-            step.u[s] = full[: 3 * self.nodes].reshape(-1, 3)
-            if self.mixed:
-                step.p[s] = full[3 * self.nodes :]
+            full[self.free] = np.nan
+            if factor.factorise(tangent.values[s]):
+                matrix = self.matrix(tangent.values[s])
+                full[self.free] = -gmres(matrix, tangent.remainder[s], factor, residual[s])[0]
+            step.u[s], step.p[s] = full[:moves].reshape(-1, 3), full[moves:]
         return step
 
-    def augment(self, state: Unknowns, indenters: Indenters, active: np.ndarray) -> None:
+    def augment(self, indenters: Indenters, active: np.ndarray) -> None:
         """Augmented-Lagrangian update of the active samples at the last balance."""
-        self._launch_contact(augment, state, indenters, active)
+        mask = warp_array(active.astype(np.int32), wp.int32, self.device)
+        wp.launch(
+            augment,
+            self.gap.shape,
+            inputs=[mask, indenters, self.gap, self.tangential, self.penalty],
+            outputs=[self.contact],
+            device=self.device,
+        )
+
+    def anchor(self, state: Unknowns, indenters: Indenters, active: np.ndarray) -> None:
+        """Anchor the points of the active samples that touch for the first time."""
+        self._launch_contact(settle, state, indenters, active, 1)
 
     def settle(self, state: Unknowns, indenters: Indenters, active: np.ndarray) -> None:
         """Accept the step of the active samples: friction's anchors follow."""
-        self._launch_contact(settle, state, indenters, active)
+        self._launch_contact(settle, state, indenters, active, 0)
 
-    def _launch_contact(self, kernel: wp.Kernel, state: Unknowns, indenters: Indenters, active: np.ndarray) -> None:
+    def _launch_contact(
+        self, kernel: wp.Kernel, state: Unknowns, indenters: Indenters, active: np.ndarray, *options: int
+    ) -> None:
         u, _, mask = self._device_state(state, active)
         wp.launch(
             kernel,
             self.gap.shape,
-            inputs=[u, mask, self._faces, indenters, self.gap, self.tangential, self.penalty, self.contact],
+            inputs=[u, mask, self._faces, indenters, self.gap, self.tangential, self.penalty, *options, self.contact],
             device=self.device,
         )
 
@@ -278,25 +281,47 @@ class System:
         """(B,) largest penetration at the last balance, mm."""
         return np.maximum(0.0, -self.gap.numpy().min(axis=(1, 2)))
 
+    def slip_ratio(self, indenters: Indenters) -> FloatArray:
+        """(B,) area of the points that slip at the last balance over that of all touching points; 0 without any.
+
+        Without friction everything that touches slips.
+        """
+        weight, traction = self._faces.weight.numpy(), self.traction.numpy()
+        along = np.linalg.norm(self.tangential.numpy(), axis=3)
+        pressure = np.sqrt(np.maximum((traction**2).sum(axis=3) - along**2, 0.0))
+        limit = indenters.friction.numpy()[:, None, None] * pressure
+        touching = pressure > 0
+        slipping = touching & (along >= (1 - 1e-6) * limit)
+        area = (weight * touching).sum(axis=(1, 2))
+        return np.asarray((weight * slipping).sum(axis=(1, 2)) / np.where(area > 0, area, 1.0))
+
     def forces(self, state: Unknowns) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Of the indenter on the gel at the last balance, in units of E.
 
         Returns:
-            (B, 3) force in E mm²; (B, 3) moment about the frame's origin in E mm³; (B, s, 3) traction at the contact
-            nodes (E, per undeformed area), the mean of the quadrature points weighted by the node's shape function.
+            (B, 3) force in E mm²; (B, 3) moment about the frame's origin in E mm³; (B, s, 3) traction at the nodes of
+            the coated surface (E, per undeformed area), the mean of the quadrature points near a node, weighted by the
+            node's piecewise linear function.
         """
-        shape, weight = self._faces.shape.numpy(), self._faces.weight.numpy()
+        shape, weight = self.space.element.face_shape, self._faces.weight.numpy()
         traction = self.traction.numpy()
-        position = (self.mesh.points + state.u)[:, self._face_nodes]
+        position = (self.space.points + state.u)[:, self.space.faces]
         arm = np.einsum("qa,sfac->sfqc", shape, position)
         force = np.einsum("fq,sfqc->sc", weight, traction)
         moment = np.einsum("fq,sfqc->sc", weight, np.cross(arm, traction))
-        local = self.mesh.contact_faces.faces
-        share = np.einsum("fq,qa->fa", weight, shape)
-        nodal = np.einsum("fq,qa,sfqc->sfac", weight, shape, traction)
-        count = len(self.mesh.contact_nodes)
-        area, total = np.zeros(count), np.zeros((self.batch, count, 3))
-        np.add.at(area, local, share)
+        return force, moment, self._nodal(weight, traction)
+
+    def _nodal(self, weight: FloatArray, traction: FloatArray) -> FloatArray:
+        """Traction at the surface's nodes; the mean with the shape functions themselves would weigh P2 corners by 0."""
+        element = self.space.element
+        hat = element.face_shape if element.order == 1 else broken_linear_face(element.face_barycentric)
+        coated = (self.space.points[self.space.faces][:, :, 2] == 0).all(axis=1)  # the sides would water down the rim
+        faces, weight, traction = self.space.faces[coated], weight[coated], traction[:, coated]
+        nodal = np.zeros((self.batch, len(self.space.points), 3))
+        area = np.zeros(len(self.space.points))
+        np.add.at(area, faces, np.einsum("fq,qa->fa", weight, hat))
+        shares = np.einsum("fq,qa,sfqc->sfac", weight, hat, traction)
         for s in range(self.batch):
-            np.add.at(total[s], local, nodal[s])
-        return force, moment, total / area[:, None]
+            np.add.at(nodal[s], faces, shares[s])
+        wanted = self.space.surface_nodes
+        return np.asarray(nodal[:, wanted] / area[wanted, None])

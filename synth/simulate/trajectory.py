@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from synth.arrays import FloatArray
+from synth.simulate.space import Space
 
 
 @dataclass(frozen=True)
@@ -12,12 +13,13 @@ class State:
 
     Attributes:
         depth_mm, shear_mm, twist_deg: the indenter's pose.
-        displacement: (n, 3) float64 mm at all nodes.
-        traction: (s, 3) float64 MPa on the gel at the contact nodes, per undeformed area.
+        displacement: (n, 3) float64 mm at all nodes of the trajectory's space.
+        traction: (s, 3) float64 MPa on the gel at the space's surface nodes, per undeformed area.
         force_n, torque_nmm: of the indenter on the gel; torque about the origin of the frame.
         residual: of the unknowns over the norm of the nodal forces.
         min_jacobian: smallest det F at any quadrature point.
         max_penetration_mm: deepest contact point inside the indenter.
+        slip_ratio: of the touching area, the part that slipped in the last load step.
     """
 
     depth_mm: float
@@ -31,6 +33,7 @@ class State:
     residual: float
     min_jacobian: float
     max_penetration_mm: float
+    slip_ratio: float
 
     def summary(self) -> dict[str, Any]:
         """The state without its fields, as trajectory.json has it."""
@@ -45,6 +48,7 @@ class State:
             "residual": self.residual,
             "min_jacobian": self.min_jacobian,
             "max_penetration_mm": self.max_penetration_mm,
+            "slip_ratio": self.slip_ratio,
         }
 
 
@@ -53,10 +57,11 @@ class Trajectory:
     """Converged states only, the undeformed one first.
 
     status "complete": every state asked for; "partial": the first ones, up to the last good state; "failed": none after
-    the undeformed one. `reason` says why when it is not complete.
+    the undeformed one. `reason` says why when it is not complete. `space` tells where the displacements are.
     """
 
     states: tuple[State, ...]
     status: Literal["complete", "partial", "failed"]
     reason: str
     seconds: float
+    space: Space

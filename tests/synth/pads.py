@@ -4,24 +4,40 @@
 rounding, and free of the mesher's randomness.
 """
 
+from collections.abc import Callable
 from itertools import permutations
 from typing import Any
 
 import numpy as np
 
-from synth.arrays import FloatArray
+from synth.arrays import BoolArray, FloatArray
 from synth.mesh import PadMesh
 from synth.mesh.pad import signed_volumes
 from synth.scene import Scene
+from synth.simulate import Trajectory
 from synth.simulate.contact import Indenters
-from synth.simulate.element import p1p1
+from synth.simulate.element import Element, p1, p1p1, p2p1
 from synth.simulate.indenter import rigid_body
+from synth.simulate.material import pad_material, uniform
 from synth.simulate.path import Path
-from synth.simulate.stepping import _indenters
-from synth.simulate.system import System
+from synth.simulate.space import function_space
+from synth.simulate.stepping import Stepper
+from synth.simulate.system import System, Tangent
+from synth.simulate.tables import pack_indenters
 
 SIZE = (8.0, 6.0, 4.0)
 SPHERE = {"shape": "sphere", "radius_mm": 3.0}
+PUNCH = {"shape": "cylinder", "radius_mm": 2.0, "length_mm": 6.0, "fillet_mm": 0.5}
+DRAG: dict[str, Any] = {
+    "depth_mm": 0.6,
+    "shear_mm": [0.8, -0.3],
+    "twist_deg": 10.0,
+    "position_mm": [0.4, 0.2],
+    "steps": 4,
+}
+ELEMENT: dict[str, Callable[[], Element]] = {"p1": p1, "p1p1": p1p1, "p2p1": p2p1}
+MIXED = ["p1p1", "p2p1"]
+"""Names of the elements that have a pressure field, to be a test's parameters."""
 
 
 def brick(size: tuple[float, float, float] = SIZE, counts: tuple[int, int, int] = (4, 4, 3)) -> PadMesh:
@@ -60,7 +76,7 @@ def crooked(size: tuple[float, float, float] = (3.0, 2.0, 2.0), seed: int = 0) -
 
 
 def scene(size: tuple[float, float, float] = SIZE, **parts: Any) -> Scene:
-    """A scene of a bare pad. parts: gel, indenter, friction, motion, numerics as in a scene file."""
+    """A scene of a bare pad, P1/P1 by default. parts: gel, indenter, friction, motion, numerics as in a scene file."""
     return Scene.model_validate(
         {
             "name": "pad",
@@ -74,22 +90,62 @@ def scene(size: tuple[float, float, float] = SIZE, **parts: Any) -> Scene:
             },
             "contact": {"indenter": parts.get("indenter", SPHERE), "friction": parts.get("friction", 0.0)},
             "motion": {"depth_mm": 0.5, "steps": 1, **parts.get("motion", {})},
-            "numerics": {"edge_length_mm": min(size) / 4, **parts.get("numerics", {})},
+            "numerics": {
+                **({} if parts.get("gel", {}).get("layers") else {"edge_length_mm": min(size) / 4}),
+                "element": "p1p1", **parts.get("numerics", {}),
+            },
         }
     )  # fmt: skip
 
 
+def gentle(**parts: Any) -> Scene:
+    """A scene of a ball that presses, shears and twists with friction; parts as in `scene`."""
+    return scene(**{"friction": 0.4, "motion": DRAG, **parts})
+
+
+def same(a: Trajectory, b: Trajectory) -> bool:
+    """Bitwise, but for the time it took."""
+    assert (a.status, a.reason, len(a.states)) == (b.status, b.reason, len(b.states))
+    return all(
+        (s.displacement == t.displacement).all() and (s.traction == t.traction).all() and s.summary() == t.summary()
+        for s, t in zip(a.states, b.states, strict=True)
+    )
+
+
 def system(
-    mesh: PadMesh, poisson_ratio: float, symmetric: bool = True, batch: int = 1, penalty: float = 50.0
+    mesh: PadMesh, poisson_ratio: float, batch: int = 1, penalty: float = 50.0, element: Element | None = None
 ) -> System:
-    """The discrete system of a pad of E = 1."""
-    return System(mesh, poisson_ratio, batch=batch, symmetric=symmetric, penalty=penalty, element=p1p1())
+    """The discrete system of a pad of E = 1; P1/P1 unless said otherwise."""
+    space = function_space(mesh, element or p1p1())
+    return System(space, uniform(len(mesh.tets), poisson_ratio), batch=batch, penalty=penalty)
+
+
+def run(posed: Scene, mesh: PadMesh) -> Stepper:
+    """A stepper at the end of a scene's path, which it must have reached."""
+    gel, numerics = posed.sensor.gel, posed.numerics
+    name = "p2p1" if numerics.element == "auto" else numerics.element
+    space = function_space(mesh, ELEMENT[name]())
+    body = System(space, pad_material(gel, mesh), penalty=numerics.penalty)
+    path = Path(posed.motion, rigid_body(posed.contact.indenter, resolution_mm=0.5))
+    stepper = Stepper(body, [path], [posed.contact.friction], numerics, [gel.youngs_modulus_kpa / 1000])
+    ended = stepper.run()[0]
+    assert (ended.status, ended.reason) == ("complete", "")
+    return stepper
+
+
+def dense(body: System, tangent: Tangent, sample: int = 0) -> FloatArray:
+    """(k, k) the whole derivative of one sample's free residual: symmetric part and remainder."""
+    upper = body.matrix(tangent.values[sample]).toarray()
+    assert not np.tril(upper, -1).any()
+    whole = upper + np.triu(upper, 1).T
+    rest = tangent.remainder[sample]
+    return np.asarray(whole if rest is None else whole + rest.toarray())
 
 
 def indenters(posed: Scene, at: float, batch: int = 1) -> Indenters:
     """The kernels' view of a scene's indenter at a path length (mm), the same for every sample of a batch."""
     path = Path(posed.motion, rigid_body(posed.contact.indenter))
-    packed = _indenters([path] * batch, [posed.contact.friction] * batch, "cpu")
+    packed = pack_indenters([path] * batch, [posed.contact.friction] * batch, "cpu")
     pose = path.pose(at)
     packed.centre.assign(np.tile(pose.centre, (batch, 1)))
     packed.rotation.assign(np.tile(pose.rotation, (batch, 1, 1)))
@@ -101,6 +157,6 @@ def far_away() -> Indenters:
     return indenters(scene(motion={"depth_mm": -40.0}), 0.0)
 
 
-def everything(system: System) -> FloatArray:
+def everything(system: System) -> BoolArray:
     """(1,) all samples active."""
     return np.ones(system.batch, dtype=bool)

@@ -60,7 +60,7 @@ def test_keys_and_types(tiny: Path, override: str, message: str) -> None:
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("sensor.gel.poisson_ratio=0.5", "sensor.gel.poisson_ratio = 0.5: must be less than 0.5"),
+        ("sensor.gel.poisson_ratio=0.51", "sensor.gel.poisson_ratio = 0.51: must be less than or equal to 0.5"),
         ("sensor.gel.size_mm=[20000, 6, 2.5]", "sensor.gel.size_mm[0] = 20000: must be less than or equal to 200"),
         ("sensor.gel.youngs_modulus_kpa=0", "sensor.gel.youngs_modulus_kpa = 0: must be greater than or equal to 0.1"),
         ("motion.depth_mm=2.4", "motion.depth_mm = 2.4 is more than 85 % of the gel's thickness (2.5 mm)"),

@@ -1,93 +1,174 @@
-"""Direct solvers against dense solutions of saddle-point matrices; what makes their answers repeatable.
+"""Direct factors and GMRES against dense solutions of saddle-point matrices; what makes their answers repeatable.
 
 Each comment "fails with" names a change of `synth.simulate.linear` that was tried.
 """
+
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.sparse import csr_matrix, triu
 
+import synth.simulate.linear as linear
 from synth.arrays import FloatArray
-from synth.simulate.linear import DirectSolver, PardisoSolver, SuperLUSolver, direct_solver, has_pardiso
+from synth.simulate.linear import Factor, PardisoFactor, SuperLUFactor, direct_factor, gmres, has_pardiso
 
 SIZE = 120
-SOLVERS = [SuperLUSolver, pytest.param(PardisoSolver, marks=pytest.mark.skipif(not has_pardiso(), reason="no MKL"))]
+needs_mkl = pytest.mark.skipif(not has_pardiso(), reason="no MKL")
+FACTORS = [
+    SuperLUFactor,
+    pytest.param(partial(PardisoFactor, single=False), marks=needs_mkl, id="double"),
+    pytest.param(partial(PardisoFactor, single=True), marks=needs_mkl, id="single"),
+]
+each_factor = pytest.mark.parametrize("kind", FACTORS)
 
 
-def saddle(seed: int, symmetric: bool) -> csr_matrix:
-    """Indefinite, as displacement and pressure make it: [[A, B], [B^T, -C]], some rows of A unsymmetric if asked."""
+def saddle(seed: int) -> csr_matrix:
+    """Upper triangle; indefinite, as displacement and pressure make it: [[A, B], [B^T, -C]]."""
     rng = np.random.default_rng(seed)
     keep = np.random.default_rng(0).random((SIZE, SIZE)) < 0.1  # one pattern for all seeds
     keep |= keep.T | np.eye(SIZE, dtype=bool)
     full = rng.standard_normal((SIZE, SIZE))
     full = full + full.T + np.diag(np.where(np.arange(SIZE) < 90, 20.0, -20.0))
-    if not symmetric:
-        full[:10] += rng.standard_normal((10, SIZE))
     rows, columns = np.nonzero(keep)
-    return csr_matrix((full[rows, columns], (rows, columns)), shape=(SIZE, SIZE))
+    return triu(csr_matrix((full[rows, columns], (rows, columns)), shape=(SIZE, SIZE)), format="csr")
 
 
-def stored(matrix: csr_matrix, symmetric: bool) -> csr_matrix:
-    return triu(matrix, format="csr") if symmetric else matrix
+def whole(upper: csr_matrix) -> FloatArray:
+    return np.asarray((upper + triu(upper, 1).T).toarray())
 
 
-def make(kind: type, matrix: csr_matrix, symmetric: bool) -> DirectSolver:
-    kept = stored(matrix, symmetric)
-    return kind(kept.indptr, kept.indices, symmetric)
+def remainder(rows: int, size: float = 5.0) -> csr_matrix:
+    """Unsymmetric, of rank `rows`: what friction of a few faces leaves over."""
+    rng = np.random.default_rng(9)
+    rest = np.zeros((SIZE, SIZE))
+    chosen = rng.choice(90, rows, replace=False)
+    rest[chosen] = size * rng.standard_normal((rows, SIZE)) * (rng.random((rows, SIZE)) < 0.1)
+    return csr_matrix(rest)
+
+
+def make(kind: Any, matrix: csr_matrix) -> Factor:
+    return kind(matrix.indptr, matrix.indices)
 
 
 def right_side(seed: int) -> FloatArray:
     return np.random.default_rng(seed).standard_normal(SIZE)
 
 
-@pytest.mark.parametrize("symmetric", [True, False])
-@pytest.mark.parametrize("kind", SOLVERS)
-def test_solution_is_the_dense_one(kind: type, symmetric: bool) -> None:
-    solver = make(kind, saddle(1, symmetric), symmetric)
+def rounding(kind: Any) -> float:
+    """Of the factor's precision, times a condition number of some 10 to 100 and the size."""
+    return 1e-3 if isinstance(kind, partial) and kind.keywords["single"] else 1e-11
+
+
+@each_factor
+def test_factor_is_the_inverse(kind: Any) -> None:
+    factor = make(kind, saddle(1))
     for seed in (1, 2, 3):
-        matrix, b = saddle(seed, symmetric), right_side(seed)
-        x = solver.solve(stored(matrix, symmetric).data, b)
-        # Rounding 1e-16 times a condition number of some 10 to 100 and the size.
-        np.testing.assert_allclose(x, np.linalg.solve(matrix.toarray(), b), rtol=0, atol=1e-11)
+        matrix, b = saddle(seed), right_side(seed)
+        assert factor.factorise(matrix.data)
+        expected = np.linalg.solve(whole(matrix), b)
+        assert np.linalg.norm(factor.apply(b) - expected) < rounding(kind) * np.linalg.norm(expected)
 
 
-@pytest.mark.parametrize("kind", SOLVERS)
-def test_strided_right_side(kind: type) -> None:
+@each_factor
+def test_strided_right_side(kind: Any) -> None:
     """A row of a batch may be strided."""
-    # Fails without ascontiguousarray: pypardiso hands over the bare pointer.
-    matrix, b = saddle(1, True), np.asfortranarray(np.stack([right_side(1), right_side(2)]))
-    solver = make(kind, matrix, True)
+    matrix, b = saddle(1), np.asfortranarray(np.stack([right_side(1), right_side(2)]))
+    factor = make(kind, matrix)
+    factor.factorise(matrix.data)
     assert not b[1].flags.c_contiguous
-    x = solver.solve(stored(matrix, True).data, b[1])
-    np.testing.assert_allclose(x, np.linalg.solve(matrix.toarray(), right_side(2)), rtol=0, atol=1e-11)
+    assert (factor.apply(b[1]) == factor.apply(right_side(2))).all()
 
 
-@pytest.mark.parametrize("symmetric", [True, False])
-@pytest.mark.parametrize("kind", SOLVERS)
-def test_answer_does_not_depend_on_what_was_solved_before(kind: type, symmetric: bool) -> None:
+@each_factor
+def test_answer_does_not_depend_on_what_was_solved_before(kind: Any) -> None:
     """Else a sample's last bits would depend on its batch."""
     # Fails with Pardiso's matching and scaling on: its analysis then uses the values of the first matrix.
-    matrix, b = stored(saddle(1, symmetric), symmetric), right_side(1)
-    fresh = make(kind, saddle(1, symmetric), symmetric).solve(matrix.data, b)
-    used = make(kind, saddle(1, symmetric), symmetric)
+    matrix, b = saddle(1), right_side(1)
+    fresh, used = make(kind, matrix), make(kind, matrix)
+    fresh.factorise(matrix.data)
     for seed, scale in ((2, 1.0), (3, 1e6)):
-        used.solve(scale * stored(saddle(seed, symmetric), symmetric).data, right_side(seed))
-    assert (used.solve(matrix.data, b) == fresh).all()
+        used.factorise(scale * saddle(seed).data)
+        used.apply(right_side(seed))
+    used.factorise(matrix.data)
+    assert (used.apply(b) == fresh.apply(b)).all()
 
 
-@pytest.mark.parametrize("kind", SOLVERS)
-def test_singular_matrix_gives_no_numbers_to_trust(kind: type) -> None:
-    """NaN, or, where Pardiso perturbs the pivots, a step so large that no line search takes it."""
-    matrix = saddle(1, False)
-    x = make(kind, matrix, False).solve(np.zeros_like(matrix.data), right_side(1))
-    assert not np.isfinite(x).all() or np.abs(x).max() > 1e6
+@each_factor
+@pytest.mark.parametrize("values", [0.0, np.nan])
+def test_matrix_without_inverse_gives_no_step_to_trust(kind: Any, values: float) -> None:
+    """Refused, NaN, or, where Pardiso perturbs the pivots, a direction that leaves the residual where it was."""
+    matrix, b = saddle(1), right_side(1)
+    matrix.data[:] = values
+    factor = make(kind, matrix)
+    if factor.factorise(matrix.data):
+        x = gmres(matrix, None, factor, b)[0]
+        assert not np.isfinite(x).all() or np.linalg.norm(whole(matrix) @ x - b) >= 0.999 * np.linalg.norm(b)
 
 
-def test_best_solver_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
-    import synth.simulate.linear as linear
+@each_factor
+@pytest.mark.parametrize("rest", [None, remainder(12)], ids=["symmetric", "unsymmetric"])
+def test_gmres_solves_with_the_remainder(kind: Any, rest: csr_matrix | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Fails with the remainder left out of the product, or the diagonal counted twice in it.
+    matrix, b = saddle(1), right_side(1)
+    full = whole(matrix) if rest is None else whole(matrix) + rest.toarray()
+    factor = make(kind, matrix)
+    factor.factorise(matrix.data)
+    x = gmres(matrix, rest, factor, b)[0]
+    # The residual that the Arnoldi relation predicts is the true one but for rounding.
+    assert np.linalg.norm(full @ x - b) < 1.001 * linear.GMRES_TOLERANCE * np.linalg.norm(b)
+    monkeypatch.setattr(linear, "GMRES_TOLERANCE", 1e-12)
+    exact = np.linalg.solve(full, b)
+    # 1e-12 of the residual, times a condition number of some 100; single precision too.
+    np.testing.assert_allclose(gmres(matrix, rest, factor, b)[0], exact, atol=1e-9 * np.abs(exact).max())
 
-    kept = stored(saddle(1, True), True)
-    expected = PardisoSolver if has_pardiso() else SuperLUSolver
-    assert isinstance(direct_solver(kept.indptr, kept.indices, True), expected)
+
+def test_gmres_ends_after_the_remainders_rank(monkeypatch: pytest.MonkeyPatch) -> None:
+    """(S + R) S^-1 is the identity but for a matrix of R's rank: one iteration more than that is enough."""
+    # Fails with `basis[i]` orthogonalised against the first vector only.
+    monkeypatch.setattr(linear, "GMRES_TOLERANCE", 1e-10)
+    matrix, b = saddle(1), right_side(1)
+    factor = SuperLUFactor(matrix.indptr, matrix.indices)
+    factor.factorise(matrix.data)
+    for rank in (1, 5, 12):
+        assert gmres(matrix, remainder(rank), factor, b)[1] <= rank + 1
+    assert gmres(matrix, None, factor, b)[1] == 1
+
+
+def test_gmres_without_a_right_side() -> None:
+    matrix = saddle(1)
+    x, iterations = gmres(matrix, remainder(5), SuperLUFactor(matrix.indptr, matrix.indices), np.zeros(SIZE))
+    assert not x.any()
+    assert iterations == 0
+
+
+def test_gmres_passes_nan_on() -> None:
+    class Broken:
+        def factorise(self, values: FloatArray) -> bool:
+            return True
+
+        def apply(self, right: FloatArray) -> FloatArray:
+            return np.full_like(right, np.nan)
+
+    assert np.isnan(gmres(saddle(1), None, Broken(), right_side(1))[0]).all()
+
+
+def test_gmres_stops_at_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A remainder too large for so few iterations: the best direction so far, not an endless loop."""
+    monkeypatch.setattr(linear, "GMRES_LIMIT", 3)
+    matrix, rest, b = saddle(1), remainder(60, 50.0), right_side(1)
+    factor = SuperLUFactor(matrix.indptr, matrix.indices)
+    factor.factorise(matrix.data)
+    x, iterations = gmres(matrix, rest, factor, b)
+    assert iterations == 3
+    left = np.linalg.norm((whole(matrix) + rest.toarray()) @ x - b) / np.linalg.norm(b)
+    assert linear.GMRES_TOLERANCE < left < 1
+
+
+def test_best_factor_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
+    kept = saddle(1)
+    expected = PardisoFactor if has_pardiso() else SuperLUFactor
+    assert isinstance(direct_factor(kept.indptr, kept.indices), expected)
     monkeypatch.setattr(linear, "has_pardiso", lambda: False)
-    assert isinstance(direct_solver(kept.indptr, kept.indices, True), SuperLUSolver)
+    assert isinstance(direct_factor(kept.indptr, kept.indices), SuperLUFactor)

@@ -1,15 +1,20 @@
-"""Poses along a path, and where states are recorded."""
+"""Poses along a path of several legs, and where states are recorded.
+
+Each comment "fails with" names a change of `synth.simulate.path` that was tried.
+"""
+
+from typing import Any
 
 import numpy as np
 import pytest
-from pads import scene
+from pads import SPHERE, scene
 
 from synth.simulate.indenter import rigid_body, rotation_about
 from synth.simulate.path import TWIST_ARM_MM, Path
 
 
-def path(indenter: dict | None = None, **motion: object) -> Path:
-    posed = scene(motion=motion, **({"indenter": indenter} if indenter else {}))
+def path(indenter: dict | None = None, **motion: Any) -> Path:
+    posed = scene(motion=motion, indenter=indenter or SPHERE)
     return Path(posed.motion, rigid_body(posed.contact.indenter))
 
 
@@ -20,16 +25,17 @@ def test_lowest_point_follows_the_depth() -> None:
         pose = way.pose(s)
         assert pose.depth_mm == pytest.approx(s)
         np.testing.assert_allclose(pose.centre, [1.0, 2.0, s - 3.0])
-    end = way.pose(way.press_mm + way.drag_mm)
+    end = way.pose(way.length_mm)
     np.testing.assert_allclose(end.centre, [1.5, 1.8, 1.0 - 3.0])
     assert end.shear_mm == pytest.approx((0.5, -0.2))
 
 
 def test_shear_and_twist_go_together_after_the_press() -> None:
     way = path(depth_mm=1.0, shear_mm=[0.6, 0.8], twist_deg=30.0)
-    assert way.drag_mm == pytest.approx(1.0 + np.radians(30.0) * TWIST_ARM_MM)
+    drag = way.length_mm - way.press_mm
+    assert drag == pytest.approx(1.0 + np.radians(30.0) * TWIST_ARM_MM)
     assert way.pose(1.0).twist_deg == 0.0
-    half = way.pose(1.0 + way.drag_mm / 2)
+    half = way.pose(1.0 + drag / 2)
     assert (half.depth_mm, half.twist_deg) == (1.0, pytest.approx(15.0))
     assert half.shear_mm == pytest.approx((0.3, 0.4))
     np.testing.assert_allclose(half.rotation, rotation_about(2, np.radians(15.0)), atol=1e-15)
@@ -39,7 +45,7 @@ def test_shear_and_twist_go_together_after_the_press() -> None:
 def test_twist_turns_the_turned_body_about_the_world_axis() -> None:
     bar = {"shape": "cylinder", "radius_mm": 1.0, "length_mm": 4.0, "rotation_deg": [90.0, 0.0, 20.0]}
     way = path(bar, depth_mm=0.5, twist_deg=40.0)
-    start, end = way.pose(0.0), way.pose(way.press_mm + way.drag_mm)
+    start, end = way.pose(0.0), way.pose(way.length_mm)
     np.testing.assert_allclose(end.rotation, rotation_about(2, np.radians(40.0)) @ start.rotation, atol=1e-15)
     assert start.centre[2] == end.centre[2] - 0.5 == pytest.approx(-1.0)
 
@@ -48,22 +54,82 @@ def test_twist_turns_the_turned_body_about_the_world_axis() -> None:
     {"depth_mm": 1.0, "steps": 1}, {"depth_mm": 1.0, "steps": 5}, {"depth_mm": 0.2, "shear_mm": [2.0, 0.0], "steps": 6},
     {"depth_mm": 1.0, "shear_mm": [0.1, 0.0], "steps": 2}, {"depth_mm": 1.0, "twist_deg": 5.0, "steps": 1},
     {"depth_mm": -1.0, "shear_mm": [1.0, 0.0], "steps": 3}, {"depth_mm": -1.0, "steps": 3}, {"depth_mm": 0.0, "steps":
-    2},
+    2}, {"depth_mm": 1.0, "steps": 7, "then": [{"depth_mm": 0.5}, {"depth_mm": 0.5, "twist_deg": 20}]},
 ])  # fmt: skip
 def test_records_are_as_many_as_steps_and_end_at_the_end(motion: dict) -> None:
     way = path(**motion)
     records = way.records()
     assert len(records) == motion["steps"]
     assert (np.diff(records) >= 0).all()
-    last = way.pose(float(records[-1]))
-    assert last.depth_mm == motion["depth_mm"]
-    assert last.shear_mm == pytest.approx(tuple(motion.get("shear_mm", (0.0, 0.0))))
-    assert last.twist_deg == pytest.approx(motion.get("twist_deg", 0.0))
-    assert set(records) <= set(way.waypoints())
-    # No step may cut the corner between press and drag.
-    assert way.press_mm == 0 or way.press_mm in way.waypoints()
+    last, goal = way.pose(float(records[-1])), motion.get("then", [motion])[-1]
+    assert last.depth_mm == goal["depth_mm"]
+    assert last.shear_mm == pytest.approx(tuple(goal.get("shear_mm", (0.0, 0.0))))
+    assert last.twist_deg == pytest.approx(goal.get("twist_deg", 0.0))
+    # No step may cut a corner, and where nothing moves there is nowhere to go.
+    assert set(way.waypoints()) == (set(records) | set(way.ends)) - {0.0}
 
 
 def test_both_legs_get_their_share_of_records() -> None:
     way = path(depth_mm=1.0, shear_mm=[2.0, 0.0], steps=6)
     np.testing.assert_allclose(way.records(), [0.5, 1.0, 1.5, 2.0, 2.5, 3.0])
+
+
+BACK_AND_OFF: dict[str, Any] = {
+    "depth_mm": 1.0,
+    "shear_mm": [0.6, 0.0],
+    "then": [{"depth_mm": 1.0, "shear_mm": [-0.6, 0.0]}, {"depth_mm": 0.0, "shear_mm": [-0.6, 0.0]}],
+}
+
+
+def test_legs_follow_one_another() -> None:
+    # Fails with the legs of `then` relative to the shear before.
+    way = path(**BACK_AND_OFF)
+    np.testing.assert_allclose(way.ends, [0, 1, 1.6, 2.8, 3.8])
+    for s, depth, x in ((1.6, 1.0, 0.6), (2.2, 1.0, 0.0), (2.8, 1.0, -0.6), (3.3, 0.5, -0.6), (3.8, 0.0, -0.6)):
+        pose = way.pose(s)
+        assert pose.depth_mm == pytest.approx(depth)
+        assert pose.shear_mm == pytest.approx((x, 0.0))
+        np.testing.assert_allclose(pose.centre, [x, 0.0, depth - 3.0], atol=1e-12)
+
+
+def test_twist_goes_on_from_where_it_was() -> None:
+    way = path(depth_mm=0.5, twist_deg=20.0, then=[{"depth_mm": 0.5, "twist_deg": -20.0}])
+    assert way.length_mm == pytest.approx(0.5 + np.radians(60.0) * TWIST_ARM_MM)
+    assert way.pose((way.ends[1] + way.ends[2]) / 2).twist_deg == pytest.approx(10.0)
+    assert way.pose((way.ends[2] + way.ends[3]) / 2).twist_deg == pytest.approx(0.0)
+
+
+def test_pose_that_repeats_is_no_leg() -> None:
+    here: dict[str, Any] = {"depth_mm": 1.0, "shear_mm": [0.5, 0.0]}
+    way = path(**here, then=[here, here, {"depth_mm": 0.2, "shear_mm": [0.5, 0.0]}])
+    np.testing.assert_allclose(way.ends, [0, 1, 1.5, 2.3])
+
+
+def test_records_are_dealt_by_length_and_every_leg_has_one() -> None:
+    # Fails with the longest leg given all that is left.
+    way = path(**BACK_AND_OFF, steps=8)  # legs of 1, 0.6, 1.2 and 1 mm
+    np.testing.assert_allclose(way.records(), [0.5, 1.0, 1.3, 1.6, 2.2, 2.8, 3.3, 3.8])
+    np.testing.assert_allclose(path(**BACK_AND_OFF, steps=5).records(), [1.0, 1.6, 2.2, 2.8, 3.8])
+    np.testing.assert_allclose(path(**BACK_AND_OFF, steps=2).records(), [1.9, 3.8])
+
+
+def test_fewer_records_than_legs_still_stop_at_the_corners() -> None:
+    way = path(**BACK_AND_OFF, steps=2)
+    np.testing.assert_allclose(way.waypoints(), [1.0, 1.6, 1.9, 2.8, 3.8])
+
+
+def test_turns_are_seen() -> None:
+    # Fails with >= for >.
+    way = path(**BACK_AND_OFF)
+    assert way.turns_between(0.9, 1.0)  # the way turns at 1.0: what was learnt before does not hold after
+    assert way.turns_between(1.5, 1.7)
+    assert not way.turns_between(1.0, 1.2)
+    assert not way.turns_between(0.2, 0.9)
+
+
+def test_press_after_a_start_off_the_pad() -> None:
+    """A first pose that stays off the gel may be followed by a press."""
+    way = path(depth_mm=-0.5, then=[{"depth_mm": 0.4}])
+    np.testing.assert_allclose(way.ends, [0.0, 0.9])
+    assert way.pose(0.0).depth_mm == -0.5
+    assert way.pose(0.9).depth_mm == pytest.approx(0.4)

@@ -14,6 +14,7 @@ STAGES = (
     "synth.errors",
     "synth.arrays",
     "synth.dataset.storage",  # how a file gets to the disk as a whole; knows nothing of datasets
+    "synth.scene_indenters",
     "synth.scene",
     "synth.schema_errors",
     "synth.template",
@@ -31,6 +32,8 @@ STAGES = (
     "synth.produce",
     "synth.processes",
     "synth.generate",
+    "synth.bench",
+    "synth.stress",
     "synth.doctor",
     "synth.commands",
     "synth.cli",

@@ -45,6 +45,7 @@ samples_per_pixel = 4
 max_depth = 2
 
 [numerics]
+element = "p1p1"
 edge_length_mm = 1.25
 """
 # Five lights: a scene whose lights came in another order every time would be the same by chance in 1 of 120 runs.

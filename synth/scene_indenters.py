@@ -1,0 +1,79 @@
+"""The part of a scene's schema that is the indenters, and what all parts share."""
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Positive = Annotated[float, Field(gt=0)]
+NonNegative = Annotated[float, Field(ge=0)]
+Vector2 = tuple[float, float]
+Vector3 = tuple[float, float, float]
+Color = tuple[Fraction, Fraction, Fraction]
+
+
+class Part(BaseModel):
+    """Base of every part of a scene: frozen, closed to unknown keys, finite numbers only."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Posed(Part):
+    """Base of the indenters: turned about x, then y, then z before it is pressed with its lowest point first."""
+
+    rotation_deg: Vector3 = (0.0, 0.0, 0.0)
+
+
+class Sphere(Posed):
+    """Ball."""
+
+    shape: Literal["sphere"]
+    radius_mm: Annotated[float, Field(ge=0.05, le=500)]
+
+
+class Cylinder(Posed):
+    """Round bar along its own z axis; unrotated it is a flat punch."""
+
+    shape: Literal["cylinder"]
+    radius_mm: Annotated[float, Field(ge=0.05, le=500)]
+    length_mm: Annotated[float, Field(ge=0.1, le=500)] = 20.0
+    fillet_mm: Annotated[float, Field(ge=0.01, le=100)] = 0.2
+
+
+class Box(Posed):
+    """Block with rounded edges."""
+
+    shape: Literal["box"]
+    size_mm: tuple[Positive, Positive, Positive]
+    fillet_mm: Annotated[float, Field(ge=0.01, le=100)] = 0.2
+
+
+class Cone(Posed):
+    """Cone whose rounded tip points at the gel."""
+
+    shape: Literal["cone"]
+    half_angle_deg: Annotated[float, Field(ge=5, le=85)]
+    height_mm: Annotated[float, Field(ge=0.1, le=500)] = 10.0
+    fillet_mm: Annotated[float, Field(ge=0.01, le=100)] = 0.2
+    """Radius of the tip and of the base's edge."""
+
+
+class Torus(Posed):
+    """Ring in its own xy plane."""
+
+    shape: Literal["torus"]
+    radius_mm: Annotated[float, Field(ge=0.1, le=500)]
+    tube_mm: Annotated[float, Field(ge=0.05, le=100)]
+
+
+class MeshIndenter(Posed):
+    """Closed triangle surface from any file that pyvista reads (STL, PLY, OBJ, VTP), in mm after scaling."""
+
+    shape: Literal["mesh"]
+    file: str
+    scale: Positive = 1.0
+    cell_mm: Annotated[float, Field(ge=0.01, le=10)] = 0.1
+    """Spacing of the grid on which its signed distance is sampled."""
+
+
+Indenter = Annotated[Sphere | Cylinder | Box | Cone | Torus | MeshIndenter, Field(discriminator="shape")]

@@ -1,0 +1,71 @@
+"""Constant arrays of a pad's elements and faces and of its indenters, as the kernels take them."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from synth.simulate.bulk import Bulk
+from synth.simulate.contact import Faces, Indenters
+from synth.simulate.distance import shape_vector
+from synth.simulate.element import barycentric_gradients
+from synth.simulate.material import Material
+from synth.simulate.path import Path
+from synth.simulate.space import Space
+
+
+def warp_array(values: np.ndarray, dtype: type, device: str) -> wp.array:
+    """A Warp array of contiguous values; vectors and matrices take the trailing axes."""
+    return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+
+
+def bulk_tables(space: Space, material: Material, mixed: bool, d: str) -> Bulk:
+    """The elements of a space with their material, on Warp device d."""
+    mesh, element = space.mesh, space.element
+    gradient = np.einsum("qak,ekd->eqad", element.derivative, barycentric_gradients(mesh.points, mesh.tets))
+    mass = (np.ones((4, 4)) + np.eye(4)) / 20
+    scale = (mesh.volumes * element.stabilisation / material.shear)[:, None, None]
+    bulk = Bulk()
+    bulk.nodes = warp_array(space.nodes, wp.int32, d)
+    bulk.pressure_nodes = warp_array(space.pressure_nodes, wp.int32, d)
+    bulk.gradient = warp_array(gradient, wp.vec3d, d)
+    bulk.weight = warp_array(mesh.volumes[:, None] * element.weights, wp.float64, d)
+    bulk.pressure_shape = warp_array(element.barycentric, wp.float64, d)
+    bulk.stabilisation = warp_array(-scale * (mass - 1 / 16), wp.float64, d)
+    bulk.shear = warp_array(material.shear, wp.float64, d)
+    with np.errstate(divide="ignore"):  # without lateral strain (λ = 0) there is no pressure: 1 / inf in the kernel
+        bulk.compliance = warp_array(1 / material.lame, wp.float64, d)
+    bulk.mixed = int(mixed)
+    bulk.yeoh = warp_array(material.yeoh, wp.vec2d, d)
+    return bulk
+
+
+def face_tables(space: Space, d: str) -> Faces:
+    """The faces of a space that can touch, on Warp device d."""
+    element = space.element
+    a, b, c = (space.points[space.faces[:, i]] for i in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    faces = Faces()
+    faces.nodes = warp_array(space.faces, wp.int32, d)
+    faces.shape = warp_array(element.face_shape, wp.float64, d)
+    faces.weight = warp_array(area[:, None] * element.face_weights, wp.float64, d)
+    faces.points = warp_array(space.points, wp.vec3d, d)
+    return faces
+
+
+def pack_indenters(paths: Sequence[Path], friction: Sequence[float], device: str) -> Indenters:
+    """The bodies of a batch of paths; where they are is set later."""
+    bodies = [path.body for path in paths]
+    largest = np.max([body.coefficients.shape for body in bodies], axis=0)
+    coefficients = np.zeros((len(bodies), *largest))
+    for s, body in enumerate(bodies):
+        i, j, k = body.coefficients.shape
+        coefficients[s, :i, :j, :k] = body.coefficients
+    packed = Indenters()
+    packed.kind = warp_array(np.array([body.kind for body in bodies], dtype=np.int32), wp.int32, device)
+    packed.shape = warp_array(np.array([body.shape for body in bodies]), shape_vector, device)
+    packed.coefficients = warp_array(coefficients, wp.float64, device)
+    packed.centre = wp.zeros(len(bodies), dtype=wp.vec3d, device=device)
+    packed.rotation = wp.zeros(len(bodies), dtype=wp.mat33d, device=device)
+    packed.friction = warp_array(np.array(friction, dtype=np.float64), wp.float64, device)
+    return packed

@@ -1,0 +1,80 @@
+"""The sparse pattern of the tangent: shared by meshes of one topology, and by nothing else.
+
+Each comment "fails with" names a change of `synth.simulate.pattern` that was tried. That every entry lands where it
+belongs is in test_simulate_bulk (tangent against differences).
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pads import ELEMENT, MIXED, crooked
+
+import synth.simulate.pattern as pattern_module
+from synth.mesh import PadMesh
+from synth.simulate.pattern import pattern_of
+from synth.simulate.space import function_space
+
+MESH, OTHER = crooked(), crooked(seed=1)
+
+
+@pytest.fixture(autouse=True)
+def _empty(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pattern_module, "_KEPT", type(pattern_module._KEPT)())
+
+
+@pytest.mark.parametrize("element", MIXED)
+def test_same_topology_shares_the_pattern_and_its_factor(element: str) -> None:
+    # Fails with the coordinates in the key.
+    assert not np.array_equal(MESH.points, OTHER.points)
+    one, other = (pattern_of(function_space(mesh, ELEMENT[element]()), True) for mesh in (MESH, OTHER))
+    assert one is other
+    assert one.factor is other.factor
+
+
+def test_what_differs_in_topology_does_not_share() -> None:
+    # Fails with pressure_nodes, held or mixed left out of the key.
+    space = function_space(MESH, ELEMENT["p1p1"]())
+    layer = (MESH.points[MESH.tets].mean(axis=1)[:, 2] > 1).astype(np.int32)
+    layered = function_space(PadMesh(MESH.points, MESH.tets, MESH.size_mm, layer), ELEMENT["p1p1"]())
+    held = space.held.copy()
+    held[0] = ~held[0]
+    shuffled = MESH.tets[np.random.default_rng(0).permutation(len(MESH.tets))]
+    others = [
+        (space, False),
+        (layered, True),
+        (replace(space, held=held), True),
+        (function_space(PadMesh(MESH.points, shuffled, MESH.size_mm), ELEMENT["p1p1"]()), True),
+        (function_space(MESH, ELEMENT["p2p1"]()), True),
+    ]
+    first = pattern_of(space, True)
+    for other, mixed in others:
+        assert pattern_of(other, mixed) is not first
+        assert pattern_of(space, True) is first
+
+
+def test_only_the_last_few_are_kept() -> None:
+    # Fails without popitem, or with the oldest kept: a job of many meshes would fill the memory.
+    space = function_space(MESH, ELEMENT["p1p1"]())
+    first = pattern_of(space, True)
+    most = pattern_module._MOST_KEPT
+    for k in range(most):
+        held = space.held.copy()
+        held[k] = ~held[k]
+        pattern_of(replace(space, held=held), True)
+        assert len(pattern_module._KEPT) <= most
+    assert pattern_of(space, True) is not first
+
+
+@pytest.mark.parametrize("mixed", [True, False])
+@pytest.mark.parametrize("element", MIXED)
+def test_upper_triangle_in_order_with_its_diagonal(element: str, mixed: bool) -> None:
+    """As Pardiso wants it."""
+    space = function_space(MESH, ELEMENT[element]())
+    made = pattern_of(space, mixed)
+    rows = np.repeat(np.arange(len(made.free)), np.diff(made.indptr))
+    assert (made.indices >= rows).all()
+    assert (made.indices[made.indptr[:-1]] == np.arange(len(made.free))).all()
+    key = rows * len(made.free) + made.indices
+    assert (np.diff(key) > 0).all()
+    assert len(made.free) == 3 * len(space.points) - space.held.sum() + mixed * space.pressures

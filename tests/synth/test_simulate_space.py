@@ -1,0 +1,142 @@
+"""Function spaces: where displacement and pressure live, what can touch; fields at points of the contact face.
+
+Each comment "fails with" names a change of `synth.simulate.space`, `synth.simulate.probe` or `synth.surface` that was
+tried.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from pads import ELEMENT, MIXED, brick, crooked
+
+from synth.arrays import FloatArray, Points
+from synth.errors import InputError
+from synth.mesh import PadMesh
+from synth.simulate.element import EDGES, quadratic_shape
+from synth.simulate.probe import probe
+from synth.simulate.space import Space, function_space
+from synth.surface import FACE_EDGES, broken_linear_face, quadratic_face
+
+MESH = crooked()
+each = pytest.mark.parametrize("element", MIXED)
+
+
+def space_of(element: str, mesh: PadMesh = MESH) -> Space:
+    return function_space(mesh, ELEMENT[element]())
+
+
+def test_quadratic_nodes_lie_on_the_middles_of_edges() -> None:
+    # Fails with the order of the middles reversed, of the elements or of the faces.
+    space = space_of("p2p1")
+    assert len(np.unique(space.points.round(9), axis=0)) == len(space.points)  # an edge has one node
+    for k, (i, j) in enumerate(EDGES):
+        ends = space.points[space.nodes[:, [i, j]]].mean(axis=1)
+        np.testing.assert_allclose(space.points[space.nodes[:, 4 + k]], ends, atol=1e-15)
+    for k, (i, j) in enumerate(FACE_EDGES):
+        ends = space.points[space.faces[:, [i, j]]].mean(axis=1)
+        np.testing.assert_allclose(space.points[space.faces[:, 3 + k]], ends, atol=1e-15)
+
+
+@each
+def test_bonded_face_is_held_and_no_other_node(element: str) -> None:
+    # Fails with `any` for `all` of an edge's ends.
+    space = space_of(element)
+    assert (space.held == (space.points[:, 2] == MESH.size_mm[2])[:, None]).all()
+
+
+@each
+def test_all_faces_but_the_window_can_touch(element: str) -> None:
+    space = space_of(element)
+    x, y, z = MESH.size_mm
+    a, b, c = (space.points[space.faces[:, i]] for i in range(3))
+    normal = np.cross(b - a, c - a) / 2
+    assert np.linalg.norm(normal, axis=1).sum() == pytest.approx(x * y + 2 * (x + y) * z)
+    # Out of the gel, and closed but for the window: the area vectors add up to minus the window's.
+    np.testing.assert_allclose(normal.sum(axis=0), [0, 0, -x * y], atol=1e-12)
+    assert (np.einsum("fc,fc->f", normal, a - [0, 0, z / 2]) > 0).all()
+
+
+@each
+def test_coated_surface_is_the_face_at_z_0(element: str) -> None:
+    space = space_of(element)
+    surface = space.surface
+    assert (surface.nodes == space.points[space.surface_nodes]).all()
+    assert (surface.nodes[:, 2] == 0).all()
+    assert len(surface.nodes) == (space.points[:, 2] == 0).sum()
+    a, b, c = (surface.nodes[surface.faces[:, i]] for i in range(3))
+    normal = np.cross(b - a, c - a) / 2
+    assert (normal[:, 2] < 0).all()
+    assert normal[:, 2].sum() == pytest.approx(-MESH.size_mm[0] * MESH.size_mm[1])
+
+
+@each
+def test_pressure_is_doubled_at_interfaces(element: str) -> None:
+    # Fails with the layer left out of the pressure's numbering.
+    mesh = brick((4.0, 4.0, 3.0), (2, 2, 3))
+    layer = np.minimum(mesh.points[mesh.tets].mean(axis=1)[:, 2].astype(np.int32), 1)  # the interface is at z = 1
+    plain, layered = space_of(element, mesh), space_of(element, PadMesh(mesh.points, mesh.tets, mesh.size_mm, layer))
+    assert plain.pressures == len(mesh.points)
+    assert layered.pressures == len(mesh.points) + (mesh.points[:, 2] == 1).sum()
+    assert (layered.points == plain.points).all()
+    assert (layered.nodes == plain.nodes).all()
+    # No pressure unknown belongs to two layers or to two vertices.
+    owner = np.stack([np.repeat(layer, 4), mesh.tets.ravel()], axis=1)
+    pairs = np.unique(np.column_stack([layered.pressure_nodes.ravel(), owner]), axis=0)
+    assert len(pairs) == layered.pressures
+    assert (pairs[:, 0] == np.arange(layered.pressures)).all()
+
+
+def barycentric(count: int, corners: int) -> FloatArray:
+    return np.random.default_rng(0).dirichlet(np.ones(corners), count)
+
+
+@pytest.mark.parametrize("shape", [quadratic_face, broken_linear_face])
+def test_face_functions_are_a_partition_of_unity(shape: Callable[[FloatArray], FloatArray]) -> None:
+    # Fails with 1 + 2 b for 1 - 2 b in the inner triangle, or 2 b - 1 not cut off at 0.
+    at = np.concatenate([barycentric(500, 3), np.eye(3), (np.eye(3) + np.roll(np.eye(3), 1, axis=1)) / 2])
+    values = shape(at)
+    np.testing.assert_allclose(values.sum(axis=1), 1.0, atol=1e-14)
+    nodes = np.array([*np.eye(3), *(np.eye(3)[[i, j]].mean(axis=0) for i, j in FACE_EDGES)])
+    np.testing.assert_allclose(shape(nodes), np.eye(6), atol=1e-15)
+    np.testing.assert_allclose(values @ nodes, at, atol=1e-14)  # affine fields are exact
+    if shape is broken_linear_face:
+        assert values.min() >= 0
+
+
+def test_tetrahedrons_functions_are_a_partition_of_unity() -> None:
+    at = barycentric(200, 4)
+    np.testing.assert_allclose(quadratic_shape(at).sum(axis=1), 1.0, atol=1e-14)
+    nodes = np.array([*np.eye(4), *(np.eye(4)[[i, j]].mean(axis=0) for i, j in EDGES)])
+    np.testing.assert_allclose(quadratic_shape(nodes), np.eye(10), atol=1e-15)
+
+
+def field(points: Points, degree: int) -> FloatArray:
+    x, y = points[:, 0], points[:, 1]
+    return 0.3 + 0.7 * x - 0.4 * y + (degree == 2) * (0.2 * x**2 - 0.5 * x * y + 0.1 * y**2)
+
+
+@pytest.mark.parametrize(("element", "degree"), [("p1p1", 1), ("p2p1", 2)])
+def test_probe_reproduces_the_elements_polynomials(element: str, degree: int) -> None:
+    # Fails with linear shape functions on quadratic faces, or the second and third barycentric coordinate exchanged.
+    space = space_of(element, crooked((6.0, 4.0, 2.0)))
+    half = np.array(space.mesh.size_mm[:2]) / 2
+    points = np.random.default_rng(2).uniform(-half, half, (300, 2))
+    points[:4] = half * [[1, 1], [-1, 1], [1, -1], [-1, -1]]
+    points[4] = half * [1, 0.3]
+    # Rounding of barycentric coordinates, amplified by a face's aspect ratio.
+    np.testing.assert_allclose(probe(space, points) @ field(space.points, degree), field(points, degree), atol=1e-12)
+
+
+@each
+def test_probe_at_nodes_takes_their_values(element: str) -> None:
+    space = space_of(element)
+    values = np.random.default_rng(3).standard_normal(len(space.points))
+    nodes = space.surface_nodes
+    np.testing.assert_allclose(probe(space, space.points[nodes, :2]) @ values, values[nodes], atol=1e-12)
+
+
+def test_probe_beside_the_pad_is_an_error() -> None:
+    # Fails with OUTSIDE = 1.
+    with pytest.raises(InputError, match="no point of the contact face"):
+        probe(space_of("p1p1"), np.array([[0.0, 0.0], [MESH.size_mm[0] / 2 + 0.01, 0.0]]))

@@ -1,0 +1,100 @@
+"""Small indentation of a bonded layer against the integral equation, and of a thick pad against Hertz.
+
+Elements, contact and multipliers together, at depths at which the layer is linear; `bonded_layer` is held against the
+literature's values in `test_verify_solver_layer_theory`. Each comment "fails with" names a change of `synth.simulate`
+that was tried.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from bonded_layer import compliance, punch_factor, wave_numbers
+from quarter_disc import ball_ratio, body, growing, lowered, press, quarter_disc
+
+from synth.simulate.element import Element, p1p1, p2p1
+
+LINEAR = 0.005
+"""Depth over thickness; finite strain changes the force by some 0.2 % there (see the vanishing depth below)."""
+
+
+@pytest.mark.parametrize(("radius", "nu"), [(20.0, 0.5), (80.0, 0.5), (320.0, 0.5), (80.0, 0.4999), (80.0, 0.3)])
+def test_ball_on_a_layer(radius: float, nu: float) -> None:
+    """Contact radii of 0.4, 0.8 and 1.9 thicknesses, where an incompressible layer is 1.4 to 10 times a half space."""
+    # Fails with λ = 30 for ∞ at nu = 0.5, with multipliers that are never updated (R = 320: 1.7 %), and with the shear
+    # modulus of nu = 0.4 throughout.
+    # Four elements across the contact leave 0.1 to 1 %, falling with their size (next test).
+    assert ball_ratio(p2p1(), nu, radius, LINEAR, 4) == pytest.approx(1.0, abs=0.012)
+
+
+@pytest.mark.parametrize("nu", [0.0, 0.2])
+def test_ball_on_a_foam(nu: float) -> None:
+    """Displacement-only, where no pressure field is needed."""
+    # Fails with the shear modulus of nu = 0.4.
+    assert ball_ratio(p2p1(), nu, 80.0, LINEAR, 4) == pytest.approx(1.0, abs=0.015)
+
+
+@pytest.mark.parametrize("nu", [0.2, 0.5])
+def test_linear_elements_approach_the_layer_from_above(nu: float) -> None:
+    """Twice as many elements halve P1/P1's error at least: 5 % with 4 across the contact, 2.5 % with 8."""
+    # Fails with alpha = 40 (the pad is then too soft), and with λ = 30 for ∞.
+    coarse, fine = (ball_ratio(p1p1(), nu, 80.0, LINEAR, cells) - 1 for cells in (4, 8))
+    assert 0 < fine < 0.6 * coarse
+    assert fine < 0.035
+
+
+def test_ball_approaches_linear_theory_as_the_depth_vanishes() -> None:
+    """What finite strain and the ball's roundness take from the force vanishes with the depth, and faster than √δ."""
+    # Fails with the pressure along z in place of the normal.
+    shallow, middle, deep = (ball_ratio(p2p1(), 0.5, 20.0, depth, 4) for depth in (LINEAR, 0.02, 0.08))
+    # The discretisation error is the same share of all three, whose meshes follow the contact radius. With a law δ^q
+    # the first difference over the second is (4^q - 1) / (16^q - 1): 1/3 for q = 1/2, 1/2 for q -> 0.
+    assert 0 < shallow - middle < 0.45 * (shallow - deep)
+    assert 0.005 < shallow - deep < 0.03
+
+
+@pytest.mark.parametrize(
+    ("element", "nu", "ratio", "cells", "tolerance"),
+    [
+        (p2p1, 0.5, 0.4, 4, 0.03),
+        (p2p1, 0.5, 1.0, 4, 0.03),
+        (p2p1, 0.5, 2.0, 4, 0.03),
+        (p2p1, 0.3, 1.0, 4, 0.03),
+        (p1p1, 0.5, 1.0, 8, 0.08),
+    ],
+)
+def test_flat_punch_on_a_layer(
+    element: Callable[[], Element], nu: float, ratio: float, cells: int, tolerance: float
+) -> None:
+    """A cylinder whose fillet is a four hundredth of its radius; κ = 1.7, 3.6 and 9.1 where incompressible."""
+    # Fails with the distance from the cylinder's axis 3 % too large, with λ = 30 for ∞, and with multipliers that are
+    # never updated (κ = 9.1).
+    radius, thickness, stretch = 4.0, 4.0 / ratio, 1.8 if element is p2p1 else 1.5
+    towards_edge = radius - growing(0.0, radius, cells, stretch)[::-1]
+    radii = np.concatenate([[0.0], towards_edge[1:], [radius], growing(radius, 2.5 * thickness, cells + 1, stretch)])
+    depths = np.concatenate([[0.0], growing(0.0, thickness, cells, 1.4)])
+    quarter = body(quarter_disc(radii, depths), element(), nu)
+    shape: dict[str, object] = {"shape": "cylinder", "radius_mm": radius + 0.005, "fillet_mm": 0.01, "length_mm": 4.0}
+    depth = LINEAR * thickness
+    force = press(quarter, lowered(shape, depth, thickness), (5.0, 100.0))
+    half_space = 2 * radius * depth / (1 - nu**2)
+    # The pressure's singularity at the edge costs a share of the energy that is proportional to the smallest element:
+    # 0.08 a of P2/P1 (0 to 2.5 %), 0.04 a of P1/P1, which has half the order.
+    assert force / half_space == pytest.approx(punch_factor(radius, thickness, nu), rel=tolerance)
+
+
+@pytest.mark.parametrize("nu", [0.0, 0.3, 0.5])
+def test_hertz_for_a_thick_pad(nu: float) -> None:
+    """A pad 25 contact radii thick and wide: Hertz, and the 3 to 5 % that the window adds, 1 + 2/π ∫ (1 - L) a/h."""
+    # Fails with the shear modulus of nu = 0.4.
+    contact, radius, thickness = 0.1, 10.0, 2.5
+    depth, reach = contact**2 / radius, 1.2 * contact
+    radii = np.concatenate([np.linspace(0, reach, 5), growing(reach, thickness, 5, 1.9)])
+    depths = np.concatenate([[0.0], growing(0.0, thickness, 6, 2.0)])
+    quarter = body(quarter_disc(radii, depths), p2p1(), nu)
+    force = press(quarter, lowered({"shape": "sphere", "radius_mm": radius}, depth, thickness), (50.0, 1000.0))
+    hertz = 4 / 3 / (1 - nu**2) * np.sqrt(radius) * depth**1.5
+    x, dx = wave_numbers()
+    window = 1 + 2 / np.pi * dx @ (1 - compliance(x, nu)) * contact / thickness
+    # As for the layer: 4 elements across the contact, first plane at 0.4 a: up to 1.5 %.
+    assert force / hertz == pytest.approx(window, rel=0.02)
