@@ -1,4 +1,4 @@
-"""The command line: `python -m synth generate|plan|simulate|inspect|verify|export|doctor`.
+"""The command line: `python -m synth generate|plan|simulate|bench|stress|inspect|verify|export|doctor`.
 
 Exit status: 0 done, 1 done with failed samples or a failed check, 2 wrong input, 130 interrupted. Nothing heavy is
 imported before a command runs.
@@ -99,6 +99,35 @@ def simulate(
     from synth.commands import run_simulate
 
     return run_simulate(scene, out, seed, index, assignments or [], as_json)
+
+
+@app.command
+def bench(
+    what: Annotated[Literal["fem"], Parameter(help="What to measure.")] = "fem",
+    /,
+    *,
+    out: Annotated[Path, Parameter(help="Directory for the table, the plot and the report.")] = Path("data/bench"),
+    quick: Annotated[bool, Parameter(negative=(), help="One case and a few settings.")] = False,
+    as_json: AsJson = False,
+) -> int:
+    """Measures error against run time."""
+    from synth.bench import run_bench
+
+    return run_bench(what, out, quick, as_json)
+
+
+@app.command
+def stress(
+    *,
+    out: Annotated[Path, Parameter(help="Directory for the table, the pictures and the report.")] = Path("data/stress"),
+    only: Annotated[list[str] | None, Parameter(help="Names or patterns of cases; repeatable.")] = None,
+    workers: Annotated[int, Parameter(converter=_whole(1), help="Cases that run at once.")] = 1,
+    as_json: AsJson = False,
+) -> int:
+    """Runs the stiff and extreme cases and says how each ends."""
+    from synth.stress import run_stress
+
+    return run_stress(out, only, workers, as_json)
 
 
 @app.command
