@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from synth.errors import InputError
-from synth.scene import MeshIndenter, Scene
+from synth.scene import Scene
+from synth.scene_indenters import MeshIndenter
 from synth.schema_errors import DISTRIBUTIONS, validated
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
