@@ -39,6 +39,7 @@ class Bulk:
         shear: (m,) μ.
         compliance: (m,) 1/λ.
         mixed: whether there is a pressure field.
+        hold: C, of `synth.simulate.element`.
         yeoh: (m,) c_2, c_3.
     """
 
@@ -51,6 +52,7 @@ class Bulk:
     shear: wp.array(dtype=wp.float64)
     compliance: wp.array(dtype=wp.float64)
     mixed: int
+    hold: wp.float64
     yeoh: wp.array(dtype=wp.vec2d)
 
 
@@ -60,10 +62,6 @@ def _deformation_gradient(bulk: Bulk, u: wp.array2d(dtype=wp.vec3d), s: int, e: 
     for a in range(bulk.nodes.shape[1]):
         F += wp.outer(u[s, bulk.nodes[e, a]], bulk.gradient[e, q, a])
     return F
-
-
-HOLD = wp.constant(wp.float64(2.0))
-"""C: the second variation of D² in an unstable mode is about that of J, so that γ = |p| would balance it."""
 
 
 @wp.func
@@ -82,8 +80,8 @@ def _dilation(bulk: Bulk, p: wp.array2d(dtype=wp.float64), J: wp.float64, s: int
     gamma = zero
     slope = zero
     if mean < zero:
-        gamma = -HOLD * mean
-        slope = wp.float64(-0.25) * HOLD
+        gamma = -bulk.hold * mean
+        slope = wp.float64(-0.25) * bulk.hold
         if gamma * bulk.compliance[e] > wp.float64(0.5):
             gamma = wp.float64(0.5) / bulk.compliance[e]
             slope = zero

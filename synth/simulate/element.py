@@ -26,6 +26,11 @@ punch with P2 faces 5 completed with 3 points a face, 7 with 12, 8 with 27. A fr
 fewer iterations with 3 points and has the same error."""
 
 
+P2_HOLD = 2.0
+"""The second variation of D² in an unstable mode is about that of J, so that γ = |p| would balance it. P1 elements,
+whose det F is constant, it would lock."""
+
+
 @dataclass(frozen=True, eq=False)
 class Element:
     """Tables of a tetrahedral element.
@@ -37,6 +42,7 @@ class Element:
         weights: (nq,) their weights, sum 1.
         derivative: (nq, nn, 4) derivatives of the displacement's shape functions by the barycentric coordinates.
         stabilisation: alpha; 0 for an inf-sup stable pair.
+        hold: C of `synth.simulate.bulk`, by which dilation is held where pressure is high.
         face_barycentric: (nf, 3) quadrature points of a face.
         face_weights: (nf,) their weights, sum 1.
         face_shape: (nf, ns) the displacement's shape functions there.
@@ -48,6 +54,7 @@ class Element:
     weights: FloatArray
     derivative: FloatArray
     stabilisation: float
+    hold: float
     face_barycentric: FloatArray
     face_weights: FloatArray
     face_shape: FloatArray
@@ -64,7 +71,16 @@ def p2p1(contact_split: int = CONTACT_SPLIT) -> Element:
     points = np.full((4, 4), b) + (a - b) * np.eye(4)
     face, weights = _face_rule(contact_split)
     return Element(
-        "p2p1", 2, points, np.full(4, 0.25), _quadratic_derivative(points), 0.0, face, weights, quadratic_face(face)
+        "p2p1",
+        2,
+        points,
+        np.full(4, 0.25),
+        _quadratic_derivative(points),
+        0.0,
+        P2_HOLD,
+        face,
+        weights,
+        quadratic_face(face),
     )
 
 
@@ -72,15 +88,15 @@ def p1p1(stabilisation: float = 2.0, contact_split: int = CONTACT_SPLIT) -> Elem
     """Stabilised linear-linear element; its strain is constant, so that one point is exact."""
     centre = np.full((1, 4), 0.25)
     face, weights = _face_rule(contact_split)
-    return Element("p1p1", 1, centre, np.ones(1), np.eye(4)[None], stabilisation, face, weights, face)
+    return Element("p1p1", 1, centre, np.ones(1), np.eye(4)[None], stabilisation, 0.0, face, weights, face)
 
 
 def p1(contact_split: int = CONTACT_SPLIT) -> Element:
     """Linear displacement alone."""
     mixed = p1p1(0.0, contact_split)
     return Element(
-        "p1", 1, mixed.barycentric, mixed.weights, mixed.derivative, 0.0, mixed.face_barycentric, mixed.face_weights,
-        mixed.face_shape,
+        "p1", 1, mixed.barycentric, mixed.weights, mixed.derivative, 0.0, 0.0, mixed.face_barycentric,
+        mixed.face_weights, mixed.face_shape,
     )  # fmt: skip
 
 

@@ -36,6 +36,7 @@ def bulk_tables(space: Space, material: Material, mixed: bool, d: str) -> Bulk:
     with np.errstate(divide="ignore"):  # without lateral strain (λ = 0) there is no pressure: 1 / inf in the kernel
         bulk.compliance = warp_array(1 / material.lame, wp.float64, d)
     bulk.mixed = int(mixed)
+    bulk.hold = element.hold
     bulk.yeoh = warp_array(material.yeoh, wp.vec2d, d)
     return bulk
 

@@ -16,7 +16,7 @@ from synth.arrays import FloatArray
 from synth.simulate.material import Material
 from synth.simulate.space import Space
 
-HOLD = 2.0
+HOLD = {"p2p1": 2.0, "p1p1": 0.0}
 """C of `synth.simulate.bulk`: γ is so many times the pressure, where that is compressive."""
 
 
@@ -111,7 +111,7 @@ class Integrals:
         """(m, q) of a mixed element: the pressure field p, D = J - 1 - p/λ, and γ, that of `synth.simulate.bulk`."""
         local = nodal[self.space.pressure_nodes]
         p, inverse = local @ self.barycentric.T, 1 / material.lame[:, None]
-        gamma = HOLD * np.maximum(0.0, -local.mean(axis=1, keepdims=True))
+        gamma = HOLD[self.space.element.name] * np.maximum(0.0, -local.mean(axis=1, keepdims=True))
         with np.errstate(divide="ignore"):
             gamma = np.minimum(gamma, 0.5 / inverse)
         return p, np.linalg.det(F) - 1 - p * inverse, np.broadcast_to(gamma, p.shape)

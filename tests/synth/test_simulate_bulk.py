@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from pads import ELEMENT, crooked, dense, everything, far_away, indenters, scene
 
-import synth.simulate.bulk as bulk
 from synth.arrays import FloatArray
+from synth.simulate.element import P2_HOLD
 from synth.simulate.material import Material, uniform
 from synth.simulate.newton import solve
 from synth.simulate.space import function_space
@@ -21,7 +21,7 @@ LOOSE = replace(MESH, size_mm=(*MESH.size_mm[:2], 99.0))
 """The same mesh with no node where the window would be: nothing is held."""
 GRADIENT = np.array([[0.06, 0.10, -0.04], [-0.03, 0.05, 0.08], [0.02, -0.06, -0.09]])
 """Of an affine displacement."""
-HOLD = float(bulk.HOLD.value)
+HOLD = {"p2p1": P2_HOLD, "p1p1": 0.0}
 """C of `synth.simulate.bulk`."""
 NEO_HOOKEAN, YEOH = (0.0, 0.0), (0.7, 0.4)
 
@@ -108,7 +108,7 @@ def energy(case: Case, body: System, state: Unknowns) -> float:
         gradients = np.linalg.inv(np.column_stack([np.ones(4), corners]))[1:].T
         p = state.p[0, space.pressure_nodes[element]] if case.mixed else np.zeros(4)
         points = quadrature(case)
-        hold = min(HOLD * max(0.0, -p.mean()), lame / 2)
+        hold = min(HOLD.get(case.element, 0.0) * max(0.0, -p.mean()), lame / 2)
         for at in points:
             F = np.eye(3) + state.u[0, nodes].T @ shape_gradients(case, at, gradients)
             J = np.linalg.det(F)
