@@ -1,4 +1,4 @@
-"""The command line: `python -m gelflow train|finetune|evaluate|compare|predict|pairs`.
+"""The command line: `python -m gelflow train|finetune|evaluate|compare|predict|export|pairs`.
 
 Exit status: 0 done, 1 done in part, 2 wrong input, 130 interrupted. Nothing heavy is imported before a command runs.
 """
@@ -29,7 +29,9 @@ Size = Annotated[str | None, Parameter(help="ROWSxCOLUMNS at which the network w
 Assignments = Annotated[list[str] | None, Parameter("--set", help="KEY=VALUE, such as loss.lambda_dc=10; repeatable.")]
 Out = Annotated[Path, Parameter(help="Folder for the results.")]
 Validation = Annotated[list[Path] | None, Parameter(help="Folders of pairs to validate on.")]
-Config = Annotated[Path | None, Parameter(help="TOML file with the settings of the run.")]
+Config = Annotated[
+    str | None, Parameter(help="Settings of the run: paper, selfflow, arflow, best, or a TOML file; default: paper.")
+]
 Steps = Annotated[int | None, Parameter(help="Optimiser steps.")]
 Resume = Annotated[bool, Parameter(negative=(), help="Go on with the run that --out holds.")]
 OnDevice = Annotated[Device, Parameter(help="Where networks run; auto: a CUDA device where there is one.")]
@@ -98,11 +100,24 @@ def compare(
     data: Paths,
     /,
     *,
-    out: Annotated[Path | None, Parameter(help="Folder for scores.csv, scores.json, table.md and table.png.")] = None,
+    out: Annotated[Path | None, Parameter(help="Folder for tables, plots and all numbers.")] = None,
     methods: Annotated[
-        str, Parameter(help="Classical methods, separated by commas; an empty text for none of them.")
-    ] = "none,farneback,dis-ultrafast,dis-fast,dis-medium,tvl1",
-    weights: Annotated[list[str] | None, Parameter(help="FILE or LABEL=FILE of a network; repeatable.")] = None,
+        str,
+        Parameter(
+            help="Methods, separated by commas; an empty text for none. Beside the default ones: al-dic (pyALDIC)."
+        ),
+    ] = "none,lucas-kanade,farneback,dis-ultrafast,dis-fast,dis-medium,tvl1",
+    weights: Annotated[
+        list[str] | None,
+        Parameter(help="FILE or LABEL=FILE of a network, GelFlow (.safetensors) or RAFT (.pth); repeatable."),
+    ] = None,
+    ft: Annotated[
+        int, Parameter(help="Steps of test-time optimisation of each GelFlow network on these pairs, reported apart.")
+    ] = 0,
+    ft_config: Annotated[
+        str | None, Parameter(help="Its settings; default: those of the network's own training. A preset or TOML file.")
+    ] = None,
+    batch: Annotated[int, Parameter(help="Pairs at once where networks' speed and memory are measured; 0: not.")] = 1,
     size: Size = None,
     device: OnDevice = "auto",
     as_json: AsJson = False,
@@ -110,7 +125,7 @@ def compare(
     """Scores several methods on the same image pairs."""
     from gelflow.commands import run_compare
 
-    return run_compare(data, out, methods, weights or [], size, device, as_json)
+    return run_compare(data, out, methods, weights or [], size, device, as_json, (ft, ft_config), batch)
 
 
 @app.command
@@ -121,7 +136,8 @@ def predict(
     out: Out,
     weights: Annotated[Path | None, Parameter(help="File of weights of a network; or give --method.")] = None,
     method: Annotated[
-        str | None, Parameter(help="A classical method: farneback, dis-ultrafast, dis-fast, dis-medium, tvl1.")
+        str | None,
+        Parameter(help="Instead: lucas-kanade, farneback, dis-ultrafast, dis-fast, dis-medium, tvl1, al-dic."),
     ] = None,
     reference: Annotated[
         Literal["first", "previous"], Parameter(help="Of a video: flow from its first frame, or from the one before.")
@@ -135,6 +151,20 @@ def predict(
     from gelflow.commands import run_predict
 
     return run_predict(inputs, out, weights, method, reference, every, size, device, as_json)
+
+
+@app.command
+def export(
+    weights: Annotated[Path, Parameter(help="File of weights of a network.")],
+    /,
+    *,
+    out: Annotated[Path, Parameter(help="File to write, ending in .onnx.")],
+    size: Annotated[str | None, Parameter(help="ROWSxCOLUMNS of the images; default: as in training.")] = None,
+) -> int:
+    """Writes a network as ONNX: image1, image2 in, flow out, at one size."""
+    from gelflow.commands import run_export
+
+    return run_export(weights, out, size)
 
 
 @app.command

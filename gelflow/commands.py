@@ -12,7 +12,8 @@ from statistics import quantiles
 from typing import Any
 
 from gelflow.baselines import Method, named_methods
-from gelflow.baselines.learned import Learned
+from gelflow.baselines.finetuned import fine_tuned
+from gelflow.baselines.learned import Learned, PublishedRaft, open_network
 from gelflow.compare import compare
 from gelflow.data import PairDataset, join, open_pairs
 from gelflow.data.choose import ChoiceConfig
@@ -20,9 +21,10 @@ from gelflow.data.extract import extract_pairs, find_recordings
 from gelflow.data.pairset import FILE, PairSet, SourceReport
 from gelflow.errors import InputError
 from gelflow.evaluate import PairScore, summarise
+from gelflow.export import export_onnx
 from gelflow.overrides import train_config
 from gelflow.predict import Prediction, Reference, predict_pair, predict_video
-from gelflow.report import FILES, MOST_PAIRS_IN_A_TABLE, as_json_text, pair_table, summary_table
+from gelflow.report import FILES, as_json_text, machine, tables
 from gelflow.terminal import progress, show_table
 
 
@@ -53,7 +55,7 @@ def run_train(
     data: Sequence[Path],
     validation: Sequence[Path],
     out: Path,
-    config: Path | None,
+    config: str | None,
     assignments: Sequence[str],
     options: dict[str, Any],
     resume: bool,
@@ -73,7 +75,8 @@ def run_train(
 
 def run_evaluate(data: Sequence[Path], weights: Path, size: str | None, device: str, as_json: bool) -> int:
     """`evaluate`."""
-    return _score(data, [Learned(weights, size=parse_size(size), device=device)], None, as_json)
+    network = open_network(weights, None, parse_size(size), device)
+    return _score(open_all(data), [network], None, as_json, 1)
 
 
 def run_compare(
@@ -84,17 +87,32 @@ def run_compare(
     size: str | None,
     device: str,
     as_json: bool,
+    fine_tuning: tuple[int, str | None],
+    batch: int,
 ) -> int:
-    """`compare`; `methods` are separated by commas, `weights` are FILE or LABEL=FILE."""
+    """`compare`; `methods` are separated by commas, `weights` are FILE or LABEL=FILE.
+
+    `fine_tuning` is the number of steps, 0 for none, and the configuration of a test-time optimisation.
+    """
     chosen = named_methods([name.strip() for name in methods.split(",") if name.strip()])
-    for given in weights:
-        label, equals, file = given.partition("=")
-        chosen.append(Learned(Path(file if equals else given), label if equals else None, parse_size(size), device))
-    return _score(data, chosen, out, as_json)
-
-
-def _score(data: Sequence[Path], methods: Sequence[Method], out: Path | None, as_json: bool) -> int:
+    networks = [_labelled(given, size, device) for given in weights]
+    steps, config = fine_tuning
+    own = [network for network in networks if isinstance(network, Learned)]
     dataset = open_all(data)
+    if steps > 0:
+        if out is None or not own:
+            raise InputError(f"--ft {steps}: needs --weights of GelFlow, and --out beside which their copies are kept")
+        folder = out.with_name(f"{out.name}_ft")
+        networks += [fine_tuned(one, dataset, folder / one.name.replace("/", "_"), steps, config) for one in own]
+    return _score(dataset, [*chosen, *networks], out, as_json, batch)
+
+
+def _labelled(given: str, size: str | None, device: str) -> Learned | PublishedRaft:
+    label, equals, file = given.partition("=")
+    return open_network(Path(file if equals else given), label if equals else None, parse_size(size), device)
+
+
+def _score(dataset: PairDataset, methods: Sequence[Method], out: Path | None, as_json: bool, batch: int) -> int:
     done = 0
     with progress("pairs", not as_json) as advance:
 
@@ -103,14 +121,13 @@ def _score(data: Sequence[Path], methods: Sequence[Method], out: Path | None, as
             done += 1
             advance(done, len(dataset) * len(methods), f"{score.method}, {score.pair}")
 
-        scores = compare(methods, dataset, out, step)
-    means = summarise(scores)
+        result = compare(methods, dataset, out, step, batch)
     if as_json:
-        print(as_json_text([dataset.source], means, scores))
+        print(as_json_text([dataset.source], summarise(result.scores), result.scores, result.speeds))
         return 0
-    show_table(f"means over {len(dataset)} pairs of {dataset.source}", *summary_table(means))
-    if len(dataset) <= MOST_PAIRS_IN_A_TABLE:
-        show_table("each pair: PSNR dB / SSIM, endpoint error, (distance to dots)", *pair_table(scores))
+    print(f"{dataset.source}; times on {machine(result.speeds)}")
+    for title, table in tables(result.scores, result.speeds):
+        show_table(title, *table)
     if out is not None:
         print(f"written: {', '.join(str(out / name) for name in FILES)}")
     return 0
@@ -136,7 +153,7 @@ def run_predict(
     if method is not None and weights is None:
         estimator = named_methods([method])[0]
     elif weights is not None and method is None:
-        estimator = Learned(weights, size=parse_size(size), device=device)
+        estimator = open_network(weights, None, parse_size(size), device)
     else:
         raise InputError("give either --weights FILE (of a network) or --method NAME (a classical one)")
     if len(inputs) == 2:
@@ -158,6 +175,13 @@ def _show_prediction(result: Prediction, name: str, as_json: bool) -> None:
     print(f"{name}:{where} mean motion {largest.mean_px:.3g} px, 95th percentile {largest.p95_px:.3g} px")
     shown = result.files if len(result.files) <= 6 else [result.files[0], "...", *result.files[-3:]]
     print(f"written: {', '.join(str(file) for file in shown)}")
+
+
+def run_export(weights: Path, out: Path, size: str | None) -> int:
+    """`export`."""
+    rows, columns = export_onnx(weights, out, parse_size(size))
+    print(f"written: {out} (image1, image2: 1x3x{rows}x{columns} in [0, 1]; flow: 1x2x{rows}x{columns} in px)")
+    return 0
 
 
 def run_pairs(inputs: Sequence[str], out: Path, config: ChoiceConfig, as_json: bool) -> int:

@@ -3,12 +3,22 @@
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
+from gelflow.baselines.learned import Learned, PublishedRaft
 from gelflow.baselines.method import Method
 from gelflow.data.pairs import PairDataset
 from gelflow.errors import InputError
 from gelflow.evaluate import PairScore, evaluate
 from gelflow.report import write_report
+from gelflow.speed import Speed, network_speed
+
+
+class Comparison(NamedTuple):
+    """Scores of every method on every pair, method after method, and the speed of the networks by name."""
+
+    scores: list[PairScore]
+    speeds: dict[str, Speed]
 
 
 def compare(
@@ -16,15 +26,17 @@ def compare(
     dataset: PairDataset,
     out: Path | None = None,
     progress: Callable[[PairScore], None] | None = None,
-) -> list[PairScore]:
+    batch: int = 1,
+) -> Comparison:
     """Scores every method on every pair, method after method.
 
     Args:
         methods: At least one, with names that differ.
         dataset: The pairs.
-        out: Folder for scores.csv, scores.json, table.md and table.png; written anew after each method, so that an
-            interruption loses one method at most. An earlier comparison on the same data is replaced.
+        out: Folder for the files of `gelflow.report.FILES`; written anew after each method, so that an interruption
+            loses one method at most. An earlier comparison on the same data is replaced.
         progress: Called after each pair.
+        batch: Pairs at once where the speed of networks is measured; 0: it is not.
 
     Raises:
         InputError: No method, two of one name, `out` holds other things, or a pair cannot be read.
@@ -39,11 +51,16 @@ def compare(
     if out is not None:
         _check_out(out, dataset.source)
     scores: list[PairScore] = []
+    speeds: dict[str, Speed] = {}
     for method in methods:
         scores += evaluate(method, dataset, progress)
+        if batch > 0 and isinstance(method, Learned | PublishedRaft):
+            shape = dataset.images(0)[0].shape
+            size = method.size or getattr(method.model, "image_size", None) or (shape[0], shape[1])
+            speeds[method.name] = network_speed(method.model, size, batch, method.device)
         if out is not None:
-            write_report(out, [dataset.source], scores)
-    return scores
+            write_report(out, [dataset.source], scores, speeds)
+    return Comparison(scores, speeds)
 
 
 def _check_out(out: Path, source: str) -> None:

@@ -48,10 +48,18 @@ class ModelConfig(_Frozen):
     """Factor on the dot products before the softmax: 1/sqrt(C), or 1 as published. Unscaled products of long feature
     vectors turn the softmax into a selection of the centre, and the module into the identity."""
 
+    refine: Literal["none", "half", "full"] = "none"
+    """A refinement head after the last decoded flow: local correlation of fine features around the flow so far, at half
+    or at full resolution. Not in the paper, whose finest flow is an enlargement of V2."""
+    refine_iterations: int = Field(default=3, ge=1, le=16)
+    """Times that the refinement head, with the same weights, corrects the flow."""
+
     @model_validator(mode="after")
     def _decodes_something(self) -> ModelConfig:
         if self.finest_scale >= self.levels - 1:
             raise ValueError(f"finest_scale = {self.finest_scale} must be below the coarsest scale {self.levels - 1}")
+        if self.refine == "half" and self.finest_scale == 1:
+            raise ValueError('refine = "half" adds nothing to finest_scale = 1, which decodes that scale already')
         return self
 
 
@@ -60,12 +68,32 @@ class LossConfig(_Frozen):
 
     alpha: float = Field(default=0.85, ge=0, le=1)
     """Share of SSIM in the photometric loss; the rest is the absolute difference."""
+    lambda_ph: float = Field(default=1.0, ge=0)
+    """Weight of the photometric loss."""
+    lambda_census: float = Field(default=0.0, ge=0)
+    """Weight of the ternary census loss (Meister, Hur and Roth 2018) beside it: indifferent to brightness."""
+    warping: Literal["bilinear", "bicubic"] = "bilinear"
+    """Interpolation of the second image in the loss. The paper names none; bilinear blurs, most at half a px."""
+    compare_at: Literal["scale", "image"] = "scale"
+    """Where each scale's flow is judged: on the images of its own scale (the paper), whose pattern is averaged away at
+    coarse scales, or, enlarged, on the images themselves."""
+    occlusion: Literal["none", "forward_backward"] = "none"
+    """Pixels that do not count in the photometric loss beside those outside: none (the paper is silent), or those whose
+    flow there and back does not close within a tolerance (Meister et al.). The latter estimates both directions and
+    trains on both, which takes twice the time."""
     mask_outside: bool = True
     """Pixels whose flow leaves the image do not count in the photometric loss. The paper is silent on occlusion; the
     second image holds no evidence for them."""
-    smoothness: Literal["helmholtz", "first_order", "none"] = "helmholtz"
+    smoothness: Literal["helmholtz", "first_order", "second_order", "none"] = "helmholtz"
     """Regulariser with weight lambda_dc: the paper's decomposition loss, or the edge-aware first-order smoothness of
-    SelfFlow (the paper's comparison; there the deformation loss is left out), or none."""
+    SelfFlow (the paper's comparison), or ARFlow's of second order, or none. The deformation loss goes with the first
+    only."""
+    smoothness_s: tuple[float, ...] | None = None
+    """Weight of the regulariser at each scale, finest first, in place of lambda_s; None: lambda_s (the paper). ARFlow:
+    1 at s = 0 only."""
+    lambda_ar: float = Field(default=0.0, ge=0)
+    """Weight of ARFlow's augmentation as regularisation: on transformed images the network should see the transformed
+    flow. Takes a second pass of the network. ARFlow: 0.01."""
     lambda_dc: float = Field(default=75.0, ge=0)
     """Weight of the regulariser."""
     lambda_theta: float = Field(default=0.01, ge=0)
@@ -96,6 +124,13 @@ class LossConfig(_Frozen):
     def _some_scale_counts(self) -> LossConfig:
         if any(value < 0 for value in self.lambda_s) or not any(value > 0 for value in self.lambda_s):
             raise ValueError(f"lambda_s = {list(self.lambda_s)} must be numbers >= 0, at least one of them above 0")
+        if self.lambda_ph == 0 and self.lambda_census == 0:
+            raise ValueError("lambda_ph and lambda_census are both 0: nothing would compare the images")
+        if self.smoothness_s is not None:
+            if len(self.smoothness_s) != len(self.lambda_s):
+                raise ValueError(f"smoothness_s has {len(self.smoothness_s)} numbers, lambda_s {len(self.lambda_s)}")
+            if any(value < 0 for value in self.smoothness_s):
+                raise ValueError(f"smoothness_s = {list(self.smoothness_s)} must be numbers >= 0")
         return self
 
 
@@ -139,6 +174,11 @@ class TrainConfig(_Frozen):
     """Seed of the initial weights, of the order of the pairs and of the augmentation."""
     precision: Literal["32", "bf16"] = "32"
     """float32, or bfloat16 for the convolutions; flows and losses are float32 in both."""
+    ema_decay: float = Field(default=0.0, ge=0, lt=1)
+    """Validate and keep an exponential moving average of the weights, decay per step (0.999 is usual); 0: the weights
+    themselves (the paper is silent)."""
+    compile: bool = False
+    """Compile the network with torch.compile: minutes at the start, faster steps on a GPU."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to train; auto: a CUDA device where there is one."""
     devices: int = Field(default=1, ge=1)

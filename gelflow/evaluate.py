@@ -3,13 +3,17 @@
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from statistics import fmean, median
+
+import numpy as np
 
 from gelflow.baselines.method import Method
 from gelflow.data.pairs import PairDataset
 from gelflow.errors import InputError
-from gelflow.metrics import flow_errors, image_similarity, marker_distance
+from gelflow.metrics import endpoint_error, flow_errors, image_similarity, marker_distance
+from gelflow.strata import Stratum, pair_strata
 
 
 @dataclass(frozen=True)
@@ -23,6 +27,7 @@ class PairScore:
         outliers_1px, outliers_01px: Share of pixels with an endpoint error above 1 px and 0.1 px.
         marker_distance_px: Median distance to tracked dots.
         seconds: Run time of the method, images in memory to flow in memory.
+        strata: Its endpoint errors sorted by what they may depend on.
     """
 
     method: str
@@ -35,6 +40,7 @@ class PairScore:
     outliers_01px: float | None
     marker_distance_px: float | None
     seconds: float
+    strata: tuple[Stratum, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -73,6 +79,11 @@ def score_pair(method: Method, dataset: PairDataset, index: int) -> PairScore:
         errors = flow_errors(flow, truth.flow, truth.visible) if truth else None
     except InputError as error:
         raise InputError(f"{dataset.records[index].flow}: {error}") from error
+    strata: tuple[Stratum, ...] = ()
+    if truth is not None:
+        compared = np.logical_and(truth.visible, np.isfinite(truth.flow).all(axis=-1))
+        scene = dataset.records[index].scene
+        strata = pair_strata(endpoint_error(flow, truth.flow), truth.flow, compared, truth.contact, scene)
     return PairScore(
         method=method.name,
         pair=name,
@@ -84,6 +95,7 @@ def score_pair(method: Method, dataset: PairDataset, index: int) -> PairScore:
         outliers_01px=errors.outliers_01px if errors else None,
         marker_distance_px=marker_distance(flow, markers) if markers is not None else None,
         seconds=seconds,
+        strata=strata,
     )
 
 
@@ -92,10 +104,14 @@ def evaluate(
 ) -> list[PairScore]:
     """Scores a method on all pairs, in order; `progress` is called after each.
 
+    The first pair is estimated once before, untimed: libraries and devices take longer the first time.
+
     Raises:
         InputError: A pair cannot be read, or the method cannot work on it.
     """
     scores = []
+    with suppress(InputError):  # is raised again, with the pair's name, when the pair is scored
+        method.flow(*dataset.images(0))
     for index in range(len(dataset)):
         scores.append(score_pair(method, dataset, index))
         if progress:

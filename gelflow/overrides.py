@@ -1,16 +1,23 @@
-"""A training configuration from a TOML file, `--set` assignments and options, the later ones winning."""
+"""A training configuration from a preset or TOML file, `--set` assignments and options, the later ones winning.
+
+Presets are TOML files in `gelflow/presets`; the comment at the head of each says what it is and where it comes from.
+"""
 
 import tomllib
 from collections.abc import Mapping, Sequence
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from gelflow.config import TrainConfig, validated
 from gelflow.errors import InputError
 
+PRESETS = ("best", "paper", "selfflow", "arflow")
+"""Names of the configurations that come with the package."""
+
 
 def train_config(
-    path: Path | None = None,
+    path: Path | str | None = None,
     assignments: Sequence[str] = (),
     options: Mapping[str, Any] | None = None,
     start: Mapping[str, Any] | None = None,
@@ -18,7 +25,7 @@ def train_config(
     """Puts a configuration together and validates it once.
 
     Args:
-        path: TOML file with the fields of `TrainConfig`; tables [model] and [loss].
+        path: A preset's name, or a TOML file with the fields of `TrainConfig`; tables [model] and [loss].
         assignments: `key=value`, key with dots (`loss.lambda_dc=10`), value in TOML; a value that is no TOML is text.
         options: Top-level fields given by options of their own; None values are left out.
         start: Fields that stand before the file is read.
@@ -41,9 +48,17 @@ def train_config(
     return validated(TrainConfig, values, " with ".join(sources) or "default configuration")
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path | str) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        if str(path) in PRESETS:
+            text = files("gelflow").joinpath("presets", f"{path}.toml").read_text(encoding="utf-8")
+        else:
+            text = Path(path).read_text(encoding="utf-8")
+        return tomllib.loads(text)
+    except FileNotFoundError as error:
+        raise InputError(
+            f"{path}: neither a configuration file nor a preset; presets are {', '.join(PRESETS)}"
+        ) from error
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(f"{path}: cannot be read as a TOML configuration: {error}") from error
 

@@ -1,20 +1,29 @@
-"""A comparison on paper: table in Markdown, numbers in CSV and JSON, a plot."""
+"""A comparison on paper: tables in Markdown, numbers in CSV and JSON, plots.
+
+Methods whose name ends in "+ft" were optimised on the very pairs that they are scored on; they have a table of their
+own.
+"""
 
 import csv
 import json
 import math
-from collections.abc import Sequence
+import os
+import platform
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
 from gelflow.evaluate import MethodScore, PairScore, summarise
 from gelflow.files.atomic import replacing, write_text
+from gelflow.report_plots import FINE_TUNED, plot_means, plot_work_precision
+from gelflow.speed import Speed
+from gelflow.strata import Stratum, merged
 
 MOST_PAIRS_IN_A_TABLE = 12
 """Above this many pairs, tables show means only; CSV and JSON always have every pair."""
 
-FILES = ("scores.csv", "scores.json", "table.md", "table.png")
+FILES = ("scores.csv", "strata.csv", "scores.json", "table.md", "table.png", "work_precision.png")
 """What `write_report` writes."""
 
 Table = tuple[list[str], list[list[str]]]
@@ -78,85 +87,119 @@ def markdown(table: Table) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
 
 
-def write_report(out: Path, data: Sequence[str], scores: Sequence[PairScore]) -> None:
-    """Writes scores.csv, scores.json, table.md and table.png into a folder, each as a whole.
+def method_strata(scores: Sequence[PairScore]) -> dict[str, list[Stratum]]:
+    """Bins over all pairs, per method."""
+    methods = dict.fromkeys(score.method for score in scores)
+    return {name: merged(b for score in scores if score.method == name for b in score.strata) for name in methods}
+
+
+def strata_table(scores: Sequence[PairScore]) -> Table:
+    """Mean endpoint error in px, a row per bin, a column per method; every pixel of a bin counts the same."""
+    by_method = method_strata(scores)
+    cells = {(name, s.kind, s.bin): s.error_px / s.pixels for name, strata in by_method.items() for s in strata}
+    sizes = {(s.kind, s.bin): s.pixels for strata in by_method.values() for s in strata}
+    rows = [
+        [f"{kind}: {part}", str(pixels), *(number(cells.get((name, kind, part)), 3) for name in by_method)]
+        for (kind, part), pixels in sizes.items()
+    ]
+    return ["where", "pixels", *by_method], rows
+
+
+def speed_table(speeds: Mapping[str, Speed]) -> Table:
+    """A row per network."""
+    header = ["network", "device", "pairs at once", "size", "pairs/s", "peak memory MiB"]
+    rows = [
+        [name, s.device, str(s.batch), f"{s.size[0]}x{s.size[1]}", f"{s.pairs_per_second:.2f}", number(s.memory_mib, 0)]
+        for name, s in speeds.items()
+    ]
+    return header, rows
+
+
+def tables(scores: Sequence[PairScore], speeds: Mapping[str, Speed]) -> list[tuple[str, Table]]:
+    """All tables of a comparison, each with its title."""
+    means = summarise(scores)
+    pairs = len({score.pair for score in scores})
+    apart = [score for score in means if score.method.endswith(FINE_TUNED)]
+    found = [(f"Means over {pairs} pairs; ms/pair is the median after a warm-up.",
+              summary_table([score for score in means if score not in apart]))]  # fmt: skip
+    if apart:
+        found.append(("Fine-tuned on these very pairs (test-time optimisation, not comparable with the rest).",
+                      summary_table(apart)))  # fmt: skip
+    if pairs <= MOST_PAIRS_IN_A_TABLE:
+        title = "Each pair: PSNR dB / SSIM, endpoint error and (distance to tracked dots) where known."
+        found.append((title, pair_table(scores)))
+    strata = strata_table(scores)
+    if strata[1]:
+        found.append(
+            ("Mean endpoint error in px by the true motion, place and scene, over all pixels of a bin.", strata)
+        )
+    if speeds:
+        found.append(("Networks alone, forward pass.", speed_table(speeds)))
+    return [(title, table) for title, table in found if table[1]]
+
+
+def write_report(
+    out: Path, data: Sequence[str], scores: Sequence[PairScore], speeds: Mapping[str, Speed] | None = None
+) -> None:
+    """Writes `FILES` into a folder, each as a whole.
 
     Args:
         out: The folder; made if missing.
         data: The folders that were compared on.
         scores: Of all methods on all pairs; at least one.
+        speeds: Of the networks, by name.
 
     Raises:
         OSError: A file cannot be written.
     """
     means = summarise(scores)
     pairs = len({score.pair for score in scores})
-    with replacing(out / "scores.csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+    names = [field.name for field in fields(PairScore) if field.name != "strata"]
+    _write_csv(out / "scores.csv", names, [[getattr(score, name) for name in names] for score in scores])
+    strata = method_strata(scores).items()
+    rows = [[name, s.kind, s.bin, s.pixels, s.error_px / s.pixels, s.above_1px / s.pixels, s.above_01px / s.pixels]
+            for name, bins in strata for s in bins]  # fmt: skip
+    header = ["method", "kind", "bin", "pixels", "endpoint_error_px", "outliers_1px", "outliers_01px"]
+    _write_csv(out / "strata.csv", header, rows)
+    write_text(out / "scores.json", as_json_text(data, means, scores, speeds) + "\n")
+    parts = [f"Pairs of {', '.join(data)}; times on {machine(speeds)}.\n"]
+    parts += [f"{title}\n\n{markdown(table)}" for title, table in tables(scores, speeds or {})]
+    write_text(out / "table.md", "\n".join(parts))
+    plot_means(out / "table.png", means, pairs)
+    plot_work_precision(out / "work_precision.png", means, f"{pairs} pairs; {machine(speeds)}")
+
+
+def machine(speeds: Mapping[str, Speed] | None) -> str:
+    """What the times were measured on."""
+    devices = sorted({speed.device for speed in (speeds or {}).values()} - {"cpu"})
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    here = f"{cores} CPU cores ({platform.machine()})"
+    return f"{here}, networks on {', '.join(devices)}" if devices else here
+
+
+def _write_csv(path: Path, header: list[str], rows: list[list[Any]]) -> None:
+    with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        names = [field.name for field in fields(PairScore)]
-        writer.writerow(names)
-        writer.writerows([getattr(score, name) for name in names] for score in scores)
-    write_text(out / "scores.json", as_json_text(data, means, scores) + "\n")
-    text = f"Means over {pairs} pairs of {', '.join(data)}; ms/pair is the median.\n\n{markdown(summary_table(means))}"
-    if pairs <= MOST_PAIRS_IN_A_TABLE:
-        text += "\nEach pair: PSNR dB / SSIM, endpoint error and (distance to tracked dots) where known.\n\n"
-        text += markdown(pair_table(scores))
-    write_text(out / "table.md", text)
-    _plot(out / "table.png", means, pairs)
+        writer.writerow(header)
+        writer.writerows(rows)
 
 
-def as_json_text(data: Sequence[str], means: Sequence[MethodScore], scores: Sequence[PairScore]) -> str:
+def as_json_text(
+    data: Sequence[str],
+    means: Sequence[MethodScore],
+    scores: Sequence[PairScore],
+    speeds: Mapping[str, Speed] | None = None,
+) -> str:
     """The comparison as JSON; numbers that are not finite (PSNR of equal images) become null."""
     answer = {
         "data": list(data),
         "methods": [_plain(asdict(score)) for score in means],
-        "scores": [_plain(asdict(score)) for score in scores],
+        "scores": [_plain({k: v for k, v in asdict(score).items() if k != "strata"}) for score in scores],
+        "strata": {name: [_plain(asdict(one)) for one in bins] for name, bins in method_strata(scores).items()},
+        "networks": {name: asdict(speed) for name, speed in (speeds or {}).items()},
     }
     return json.dumps(answer, indent=1)
 
 
 def _plain(record: dict[str, Any]) -> dict[str, Any]:
     return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in record.items()}
-
-
-def _plot(path: Path, means: Sequence[MethodScore], pairs: int) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    candidates: list[tuple[str, list[float | None], str]] = [
-        ("PSNR (dB), more is better", [score.psnr_db for score in means], "linear"),
-        ("SSIM, more is better", [score.ssim for score in means], "linear"),
-        ("endpoint error (px), less is better", [score.endpoint_error_px for score in means], "log"),
-        ("time (ms/pair)", [1000 * score.seconds for score in means], "log"),
-    ]
-    panels = [panel for panel in candidates if any(value is not None for value in panel[1])]
-    figure = Figure(figsize=(3.2 * len(panels) + 1, 0.45 * len(means) + 1.3), dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
-    places = list(range(len(means)))
-    for axis, (label, values, scale) in zip(axes, panels, strict=True):
-        drawn = [(value, place) for value, place in zip(values, places, strict=True)
-                 if value is not None and math.isfinite(value) and (scale == "linear" or value > 0)]  # fmt: skip
-        axis.set_xscale(scale)
-        axis.plot([value for value, _ in drawn], [place for _, place in drawn], "o", color="#4477aa")
-        for value, place in drawn:
-            axis.annotate(
-                f"{value:.4g}" if value < 1000 else f"{value:.0f}",
-                (value, place),
-                (0, 6),
-                textcoords="offset points",
-                ha="center",
-                fontsize=8,
-            )
-        axis.margins(x=0.2)
-        axis.set_title(label, fontsize=9)
-        axis.tick_params(labelsize=8)
-        axis.xaxis.set_minor_formatter("")
-        axis.grid(color="0.9")
-        axis.set_axisbelow(True)
-        axis.spines[["top", "right"]].set_visible(False)
-    axes[0].set_yticks(places, [score.method for score in means])
-    axes[0].set_ylim(len(means) - 0.4, -0.8)
-    figure.suptitle(f"means over {pairs} pairs", fontsize=10)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, format="png")

@@ -37,6 +37,7 @@ class PairRecord:
         flow: EXR file with the exact flow in both directions, or None.
         markers: CSV file with tracked dots (columns x1, y1, x2, y2 in px), or None.
         exchanged: The images have been exchanged: the exact flow is the file's `backward`.
+        scene: Scene and kind of pattern of a synthetic pair, or None.
     """
 
     name: str
@@ -45,6 +46,7 @@ class PairRecord:
     flow: Path | None = None
     markers: Path | None = None
     exchanged: bool = False
+    scene: str | None = None
 
 
 class PairDataset(Dataset[dict[str, Tensor | str]]):

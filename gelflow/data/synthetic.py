@@ -30,12 +30,13 @@ def synthetic_records(folder: Path) -> list[PairRecord]:
         InputError: dataset.json or the manifest is missing or damaged, comes from a newer format, lists no sample, or
             lists a file that is not there.
     """
-    _check_header(folder / "dataset.json")
+    header = _read_header(folder / "dataset.json")
     records = []
     for index in sorted(_indices(folder / "manifest.jsonl")):
         name = f"{index:06d}"
         sample = folder / "samples" / name
-        record = PairRecord(name, sample / "image1.png", sample / "image2.png", sample / "flow.exr")
+        scene = _scene(header, sample / "meta.json")
+        record = PairRecord(name, sample / "image1.png", sample / "image2.png", sample / "flow.exr", scene=scene)
         for path in (record.image1, record.image2, sample / "flow.exr"):
             if not path.is_file():
                 raise InputError(
@@ -48,7 +49,19 @@ def synthetic_records(folder: Path) -> list[PairRecord]:
     return records
 
 
-def _check_header(path: Path) -> None:
+def _scene(header: dict[str, Any], meta: Path) -> str | None:
+    """Scene and kind of pattern, "gelsight_mini, dots"; where the kind is drawn, that of the sample's own scene."""
+    try:
+        scene = header["scene"]
+        kind = scene["sensor"]["pattern"]["kind"]
+        if not isinstance(kind, str):
+            kind = json.loads(meta.read_text(encoding="utf-8"))["scene"]["sensor"]["pattern"]["kind"]
+        return f"{scene['name']}, {kind}"
+    except (KeyError, TypeError, OSError, ValueError):
+        return None  # written by another program, or before patterns were recorded
+
+
+def _read_header(path: Path) -> dict[str, Any]:
     try:
         header = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
@@ -62,6 +75,7 @@ def _check_header(path: Path) -> None:
         raise InputError(f"{path}: schema_version is {version!r}; a number is needed") from error
     if major > SCHEMA_VERSION:
         raise InputError(f"{path}: schema_version {version} is newer than {SCHEMA_VERSION}, which this gelflow reads")
+    return dict(header)
 
 
 def _indices(path: Path) -> set[int]:

@@ -23,10 +23,14 @@ Direction = Literal["forward", "backward"]
 
 
 class FlowField(NamedTuple):
-    """A flow (H, W, 2) in px and where its end point is seen, (H, W) bool."""
+    """A flow (H, W, 2) in px, where its end point is seen, and where the gel is touched in state 2, both (H, W) bool.
+
+    The contact is at the pixels of image 1, and None where the file lacks it or the flow is the backward one.
+    """
 
     flow: FlowArray
     visible: MaskArray
+    contact: MaskArray | None = None
 
 
 def read_channels(path: Path) -> dict[str, NDArray[np.float32]]:
@@ -63,7 +67,9 @@ def read_flow(path: Path, direction: Direction = "forward") -> FlowField:
     finite = np.isfinite(flow).all(axis=-1)
     visible = channels.get(f"{direction}.visible")
     seen = finite if visible is None else np.logical_and(finite, visible > 0.5)
-    return FlowField(flow, np.asarray(seen, np.bool_))
+    touched = channels.get("contact.Y") if direction == "forward" else None
+    contact = None if touched is None else np.asarray(touched > 0.5, np.bool_)
+    return FlowField(flow, np.asarray(seen, np.bool_), contact)
 
 
 def write_flow(path: Path, forward: FlowArray, visible: MaskArray | None = None) -> None:

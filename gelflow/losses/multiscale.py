@@ -1,60 +1,89 @@
 """Losses summed over scales (paper, eq. 11): ``L = sum_s lambda_s (L_ph + lambda_dc L_dc + lambda_df L_df)``.
 
 The images of scale s are means over 2^s x 2^s blocks. Flows are in px of their scale, so a gradient of the flow means
-the same at every scale.
+the same at every scale. With `compare_at` = "image" every scale's flow is enlarged and judged on the images themselves:
+averaged images hold no pattern at coarse scales, so that there the published loss prefers too little motion.
 """
 
 import torch
 from torch import Tensor
 
-from gelflow.arrays import Flow, Images, Scalar
+from gelflow.arrays import Flow, Images, Mask, Scalar
 from gelflow.config import LossConfig
+from gelflow.losses.census import census_loss
 from gelflow.losses.decomposition import decomposition_loss
 from gelflow.losses.deformation import deformation_loss
 from gelflow.losses.endpoint import endpoint_loss
-from gelflow.losses.photometric import photometric_loss
-from gelflow.losses.smoothness import first_order_loss
+from gelflow.losses.photometric import appearance_loss
+from gelflow.losses.smoothness import first_order_loss, second_order_loss
 from gelflow.losses.weight import regulariser_weight
-from gelflow.ops.pyramid import flow_pyramid, image_pyramid
+from gelflow.ops.pyramid import enlarge_flow, flow_pyramid, image_pyramid
+from gelflow.ops.warp import inside, warp
 
 
 def self_supervised_loss(
-    flows: list[Flow], image1: Images, image2: Images, config: LossConfig
+    flows: list[Flow], image1: Images, image2: Images, config: LossConfig, visible: Mask | None = None
 ) -> tuple[Scalar, dict[str, Tensor]]:
-    """The paper's loss, or that of its comparison SelfFlow, from the images alone.
+    """The paper's loss, or that of one of its comparisons, from the images alone.
 
     Args:
         flows: For s = 0 .. n-1, finest first, (B, 2, ceil(H / 2^s), ceil(W / 2^s)), px of scale s.
         image1: (B, 3, H, W) in [0, 1].
         image2: The same shape.
         config: Weights; `lambda_s` has n entries.
+        visible: (B, 1, H, W), 0 where the photometric losses should not count beside what leaves the image; or None.
 
     Returns:
         The loss, and its weighted parts "photometric", "smoothness" and "deformation", detached, which add up to it.
     """
     side = min(image1.shape[-2:]) if config.flow_normalisation == "min_side" else 1
-    first, second = image_pyramid(image1, len(flows)), image_pyramid(image2, len(flows))
-    zero = flows[0].new_zeros(())
-    photometric, smoothness, deformation = zero, zero, zero
+    coarse = len(flows) if config.compare_at == "scale" else 1
+    first, second = image_pyramid(image1, coarse), image_pyramid(image2, coarse)
+    seen = None if visible is None else image_pyramid(visible, coarse)
+    parts = dict.fromkeys(("photometric", "smoothness", "deformation"), flows[0].new_zeros(()))
     for scale, flow in enumerate(flows):
         share = config.lambda_s[scale]
-        if share == 0:
-            continue
-        photometric = photometric + share * photometric_loss(
-            first[scale], second[scale], flow, config.alpha, config.mask_outside
-        )
-        if config.smoothness == "first_order":
-            smooth = first_order_loss(flow / side, first[scale], config.beta)
-            smoothness = smoothness + share * config.lambda_dc * smooth
-        elif config.smoothness == "helmholtz":
-            weight = regulariser_weight(first[scale], config.weight, config.beta, config.weight_floor)
-            smooth = decomposition_loss(flow / side, weight, config.lambda_theta, config.lambda_zeta)
-            smoothness = smoothness + share * config.lambda_dc * smooth
-            if config.lambda_df > 0:
-                deformed = deformation_loss(flow, weight, config.ratio)
-                deformation = deformation + share * config.lambda_df * deformed
-    parts = {"photometric": photometric, "smoothness": smoothness, "deformation": deformation}
-    return photometric + smoothness + deformation, {name: value.detach() for name, value in parts.items()}
+        smooth_share = share if config.smoothness_s is None else config.smoothness_s[scale]
+        place = 0 if config.compare_at == "image" else scale
+        if place < scale and (share or smooth_share):
+            flow = enlarge_flow(flow, scale, (image1.shape[-2], image1.shape[-1]))
+        if share > 0:
+            mask = None if seen is None else seen[place]
+            loss = _appearance(first[place], second[place], flow, config, mask)
+            parts["photometric"] = parts["photometric"] + share * loss
+        if smooth_share > 0:
+            smooth, deformed = _regulariser(flow, first[place], config, side)
+            parts["smoothness"] = parts["smoothness"] + smooth_share * smooth
+            parts["deformation"] = parts["deformation"] + smooth_share * deformed
+    return torch.stack(list(parts.values())).sum(), {name: value.detach() for name, value in parts.items()}
+
+
+def _appearance(image1: Images, image2: Images, flow: Flow, config: LossConfig, visible: Mask | None) -> Scalar:
+    """Weighted photometric and census loss of one flow on images of its size."""
+    warped = warp(image2, flow, config.warping)
+    pixels = inside(flow) if config.mask_outside else None
+    if visible is not None:
+        pixels = visible if pixels is None else pixels * visible
+    loss = warped.new_zeros(())
+    if config.lambda_ph > 0:
+        loss = loss + config.lambda_ph * appearance_loss(image1, warped, pixels, config.alpha)
+    if config.lambda_census > 0:
+        loss = loss + config.lambda_census * census_loss(image1, warped, pixels)
+    return loss
+
+
+def _regulariser(flow: Flow, image: Images, config: LossConfig, side: int) -> tuple[Scalar, Scalar]:
+    """Weighted smoothness and deformation loss of one flow on image 1 of its size."""
+    zero = flow.new_zeros(())
+    if config.smoothness in ("first_order", "second_order"):
+        loss = first_order_loss if config.smoothness == "first_order" else second_order_loss
+        return config.lambda_dc * loss(flow / side, image, config.beta), zero
+    if config.smoothness == "none":
+        return zero, zero
+    weight = regulariser_weight(image, config.weight, config.beta, config.weight_floor)
+    smooth = decomposition_loss(flow / side, weight, config.lambda_theta, config.lambda_zeta)
+    deformed = config.lambda_df * deformation_loss(flow, weight, config.ratio) if config.lambda_df > 0 else zero
+    return config.lambda_dc * smooth, deformed
 
 
 def flow_loss(flows: list[Flow], truth: Flow, config: LossConfig) -> tuple[Scalar, dict[str, Tensor]]:

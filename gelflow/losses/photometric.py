@@ -54,12 +54,22 @@ def photometric_loss(
     Returns:
         A scalar >= 0; 0 where the flow maps image 2 onto image 1. Where no pixel stays inside: 0.
     """
-    warped = warp(image2, flow)
-    dissimilarity = (1 - structural_similarity(image1.to(flow.dtype), warped)) / 2
+    return appearance_loss(image1, warp(image2, flow), inside(flow) if mask_outside else None, alpha)
+
+
+def appearance_loss(image1: Images, warped: Images, pixels: Mask | None, alpha: float) -> Scalar:
+    """The photometric loss of an image that has been warped already.
+
+    Args:
+        image1: (B, 3, H, W) in [0, 1].
+        warped: Image 2 brought to image 1, the same shape.
+        pixels: (B, 1, H, W), 1 where the warped image is worth comparing; None: everywhere.
+        alpha: Share of SSIM.
+    """
+    dissimilarity = (1 - structural_similarity(image1.to(warped.dtype), warped)) / 2
     difference = (warped - image1).abs()
-    if not mask_outside:
+    if pixels is None:
         return alpha * dissimilarity.mean() + (1 - alpha) * difference.mean()
-    pixels = inside(flow)
     windows = -F.max_pool2d(-pixels, 3, stride=1, padding=1)
     return alpha * _masked_mean(dissimilarity, windows) + (1 - alpha) * _masked_mean(difference, pixels)
 

@@ -4,7 +4,7 @@ From the coarsest scale to `finest_scale`: enlarge the flow so far, warp the sec
 estimate a coarse flow, refine it by the context network, fuse it locally. Finer flows, down to the image's own
 resolution, are bilinear enlargements: ``V1 = 2 up2(V2)``, ``V0 = 4 up4(V2)``.
 
-What it cannot do: at `finest_scale` = 2 it resolves no detail of the motion finer than about 4 px.
+What it cannot do: at `finest_scale` = 2 and without `refine` it resolves no detail of the motion finer than about 4 px.
 """
 
 import torch
@@ -19,6 +19,7 @@ from gelflow.models.encoder import CHANNELS, Encoder
 from gelflow.models.estimator import Estimator
 from gelflow.models.layers import SLOPE
 from gelflow.models.lffm import LocalFlowFusion
+from gelflow.models.refinement import RefinementHead
 from gelflow.ops.correlation import local_correlation
 from gelflow.ops.pyramid import enlarge_flow
 from gelflow.ops.warp import warp
@@ -47,6 +48,10 @@ class GelFlow(nn.Module):
         self.estimators = nn.ModuleList(Estimator(costs + config.projected_channels + 2) for _ in range(networks))
         self.contexts = nn.ModuleList(ContextNetwork() for _ in range(networks))
         self.fusion = LocalFlowFusion(config.lffm_region, config.lffm_scale) if config.lffm else None
+        self.refined_scale = {"none": None, "half": 1, "full": 0}[config.refine]
+        self.refinement = None
+        if self.refined_scale is not None:
+            self.refinement = RefinementHead(self.refined_scale, config.refine_iterations)
 
     def forward(self, image1: Images, image2: Images) -> list[Flow]:
         """Estimates the flow.
@@ -63,7 +68,8 @@ class GelFlow(nn.Module):
         """
         check_shapes(image1, image2)
         batch, _, height, width = image1.shape
-        features = self.encoder(torch.cat([image1, image2]))
+        images = torch.cat([image1, image2])
+        features = self.encoder(images)
         flow: Flow | None = None
         decoded: dict[int, Flow] = {}
         for scale in range(self.config.levels - 1, self.config.finest_scale - 1, -1):
@@ -76,9 +82,12 @@ class GelFlow(nn.Module):
             flow = self._decode(scale, first, second, start)
             decoded[scale] = flow
         finest = self.config.finest_scale
-        for scale in range(finest):
+        for scale in range(finest - 1, -1, -1):
             size = (-(-height // 2**scale), -(-width // 2**scale))
             decoded[scale] = enlarge_flow(decoded[finest], finest - scale, size)
+            if self.refinement is not None and scale == self.refined_scale:
+                decoded[scale] = self.refinement(decoded[scale], images, features[0])
+                finest = scale
         return [decoded[scale] for scale in range(self.config.levels - 1)]
 
     def _decode(self, scale: int, first: Features, second: Features, start: Flow) -> Flow:

@@ -66,5 +66,15 @@ def local_correlation(first: Features, second: Features, radius: int) -> Tensor:
     Returns:
         (B, (2 r + 1)^2, H, W). Differentiable once.
     """
+    if torch.compiler.is_exporting() or torch.onnx.is_in_onnx_export():
+        return _unfolded(first, second, radius)
     costs: Tensor = _LocalCorrelation.apply(first.contiguous(), second.contiguous(), radius)
     return costs
+
+
+def _unfolded(first: Tensor, second: Tensor, radius: int) -> Tensor:
+    """The same in operations that an exported graph can hold, with (2 r + 1)^2 times the memory."""
+    batch, channels, height, width = first.shape
+    side = 2 * radius + 1
+    windows = F.unfold(second, side, padding=radius).view(batch, channels, side * side, height, width)
+    return (first.unsqueeze(2) * windows).mean(dim=1)

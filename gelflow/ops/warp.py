@@ -20,8 +20,8 @@ def pixel_indices(flow: Flow) -> tuple[Tensor, Tensor]:
     return columns, rows
 
 
-def warp(image: Features, flow: Flow) -> Features:
-    """Samples an image at x + flow(x), bilinearly; outside the image its border is repeated.
+def warp(image: Features, flow: Flow, mode: str = "bilinear") -> Features:
+    """Samples an image at x + flow(x); outside the image its border is repeated.
 
     In float32 the sampling position is rounded to about 1e-7 of the image's width (3e-5 px at 640 px). Where the flow
     is not finite the result is NaN; `grid_sample` itself would crash the process there, on a CPU, in its gradient.
@@ -29,6 +29,7 @@ def warp(image: Features, flow: Flow) -> Features:
     Args:
         image: The second image or its features, (B, C, H, W).
         flow: (B, 2, H, W), px of this image.
+        mode: "bilinear", or "bicubic" (Keys 1981, A = -0.75), which overshoots at edges.
 
     Returns:
         (B, C, H, W), dtype of the flow.
@@ -40,7 +41,7 @@ def warp(image: Features, flow: Flow) -> Features:
     finite = torch.isfinite(x) & torch.isfinite(y)
     grid = torch.stack([x, y], dim=-1).clamp(-2, 2)  # far outside, the border is the border
     grid = torch.where(finite.unsqueeze(-1), grid, 0.0)
-    sampled = F.grid_sample(image.to(flow.dtype), grid, mode="bilinear", padding_mode="border", align_corners=False)
+    sampled = F.grid_sample(image.to(flow.dtype), grid, mode=mode, padding_mode="border", align_corners=False)
     return sampled.masked_fill(~finite.unsqueeze(1), torch.nan)
 
 

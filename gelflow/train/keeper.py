@@ -18,6 +18,7 @@ from gelflow.terminal import Advance
 from gelflow.train.checkpoint import save_weights
 from gelflow.train.module import LOG_EVERY, FlowModule
 from gelflow.train.state import WEIGHTS, State, save_state
+from gelflow.train.throughput import Throughput, peak_memory_mib
 
 
 class Stopped(Exception):
@@ -45,6 +46,7 @@ class Keeper(L.Callback):
         self.metrics = dict(metrics)
         self.stop = False
         self.advance: Advance | None = None
+        self.throughput = Throughput()
 
     def validates_at(self, step: int) -> bool:
         """Whether a validation follows this step."""
@@ -54,10 +56,15 @@ class Keeper(L.Callback):
         """Shows progress; saves where it is due and no validation follows, which saves itself."""
         flow_module = _ours(module)
         step = flow_module.step
+        self.throughput.add(self.config.batch_size * trainer.world_size)
         if step % LOG_EVERY == 0 or step == self.config.steps:
             self._check(flow_module)
+            rate, memory = self.throughput.pairs_per_second, peak_memory_mib()
+            known = {"train/pairs_per_second": rate, "train/peak_memory_mib": memory}
+            flow_module.write({name: value for name, value in known.items() if value is not None}, step)
             if self.advance is not None:
                 item = f"step {step} of {self.config.steps}, loss {float(flow_module.last_loss):.4g}"
+                item += "" if rate is None else f", {rate:.3g} pairs/s"
                 done = step - flow_module.start
                 self.advance(done, self.config.steps - flow_module.start, f"{item}{_brief(self.metrics)}")
         if self.validates_at(step):
@@ -67,8 +74,13 @@ class Keeper(L.Callback):
         if self.stop:
             raise Stopped
 
+    def on_validation_start(self, *_: Any) -> None:
+        """Stops the clock."""
+        self.throughput.pause()
+
     def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         """Keeps the weights if they are the best so far, and saves."""
+        self.throughput.resume()
         flow_module = _ours(module)
         self.metrics = flow_module.metrics
         score = self.metrics.get("endpoint_error_px", self.metrics.get("photometric_loss"))
@@ -77,7 +89,9 @@ class Keeper(L.Callback):
         if self.score is None or score < self.score:
             self.score = score
             if trainer.is_global_zero:
-                save_weights(self.out / WEIGHTS, flow_module.model, **weights_metadata(self.config, flow_module.step))
+                save_weights(
+                    self.out / WEIGHTS, flow_module.evaluated, **weights_metadata(self.config, flow_module.step)
+                )
         self._save(trainer, flow_module)
         if trainer.is_global_zero:
             print(f"step {flow_module.step}: {describe(self.metrics)}", file=sys.stderr)
@@ -95,9 +109,9 @@ class Keeper(L.Callback):
         self._check(module)
         if trainer.is_global_zero:
             optimiser = trainer.optimizers[0].state_dict()
-            save_state(
-                self.out, State(module.step, module.model.state_dict(), optimiser, self.score, dict(self.metrics))
-            )
+            average = None if module.average is None else module.average.state_dict()
+            model, metrics = module.model.state_dict(), dict(self.metrics)
+            save_state(self.out, State(module.step, model, optimiser, self.score, metrics, average))
 
 
 def _ours(module: L.LightningModule) -> FlowModule:

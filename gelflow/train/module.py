@@ -4,6 +4,7 @@ The module knows at which step of the whole run it starts, so that learning rate
 they were.
 """
 
+import copy
 import math
 from typing import Any
 
@@ -16,6 +17,8 @@ from torch.optim.lr_scheduler import LambdaLR
 from gelflow.config import TrainConfig
 from gelflow.estimate import estimate_flow
 from gelflow.losses import flow_loss, self_supervised_loss
+from gelflow.losses.analogy import analogy_loss, transformed_pair
+from gelflow.losses.occlusion import visible_both_ways
 from gelflow.losses.photometric import photometric_loss
 from gelflow.models import GelFlow
 from gelflow.ops.warp import inside, warp
@@ -42,6 +45,7 @@ class FlowModule(L.LightningModule):
         model: The network, at the state it starts from.
         start: Steps that were done before.
         optimiser: State of the optimiser after those steps, or None.
+        average: State of the weights' moving average after those steps, or None.
 
     Attributes:
         metrics: Results of the last validation, see `validation_metrics`.
@@ -49,16 +53,33 @@ class FlowModule(L.LightningModule):
     """
 
     def __init__(
-        self, config: TrainConfig, model: GelFlow, start: int = 0, optimiser: dict[str, Any] | None = None
+        self,
+        config: TrainConfig,
+        model: GelFlow,
+        start: int = 0,
+        optimiser: dict[str, Any] | None = None,
+        average: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
         self.config = config
         self.model = model
+        self.average = None
+        if config.ema_decay > 0:
+            self.average = copy.deepcopy(model).eval().requires_grad_(False)
+            if average is not None:
+                self.average.load_state_dict(average)
+        # Not a submodule: its parameters are the model's own.
+        self._compiled = [torch.compile(model)] if config.compile else []
         self.start = start
         self.optimiser_state = optimiser
         self.metrics: dict[str, float] = {}
         self.last_loss: Tensor = torch.zeros(())
         self._sums: dict[str, Tensor] = {}
+
+    @property
+    def network(self) -> Any:
+        """The network as it is called in training: compiled where the configuration asks for it."""
+        return self._compiled[0] if self._compiled else self.model
 
     @property
     def step(self) -> int:
@@ -75,17 +96,49 @@ class FlowModule(L.LightningModule):
 
     def training_step(self, batch: dict[str, Any], _: int) -> Tensor:
         """The loss of one batch."""
-        flows = self.model(batch["image1"], batch["image2"])
+        image1, image2 = batch["image1"], batch["image2"]
         if self.config.supervision == "flow":
-            loss, parts = flow_loss(flows, batch["flow"], self.config.loss)
+            loss, parts = flow_loss(self.network(image1, image2), batch["flow"], self.config.loss)
         else:
-            loss, parts = self_supervised_loss(flows, batch["image1"], batch["image2"], self.config.loss)
+            loss, parts = self._self_supervised(image1, image2)
         self.last_loss = loss.detach()
         if (self.step + 1) % LOG_EVERY == 0:
             rate = self.config.learning_rate * learning_rate_factor(self.config, self.step)
-            self._write({"train/loss": float(loss.detach()), "train/learning_rate": rate}
+            self.write({"train/loss": float(loss.detach()), "train/learning_rate": rate}
                         | {f"train/{name}": float(value) for name, value in parts.items()}, self.step + 1)  # fmt: skip
         return loss
+
+    def _self_supervised(self, image1: Tensor, image2: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss without truth; both directions where occlusion asks for them, a second pass where lambda_ar does."""
+        config, visible = self.config.loss, None
+        if config.occlusion == "forward_backward":
+            image1, image2 = torch.cat([image1, image2]), torch.cat([image2, image1])
+        flows = self.network(image1, image2)
+        if config.occlusion == "forward_backward":
+            there, back = flows[0].chunk(2)
+            visible = visible_both_ways(flows[0], torch.cat([back, there]))
+        loss, parts = self_supervised_loss(flows, image1, image2, config, visible)
+        if config.lambda_ar > 0:
+            # Fixed by (seed, step), so that a resumed run shows the same.
+            random = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
+            first, second, target, pixels = transformed_pair(image1, image2, flows[0].detach(), random)
+            analogy = config.lambda_ar * analogy_loss(self.network(first, second)[0], target, pixels)
+            loss, parts = loss + analogy, parts | {"analogy": analogy.detach()}
+        return loss, parts
+
+    def optimizer_step(self, *arguments: Any, **options: Any) -> None:
+        """An optimiser step, and the average of the weights after it: before any callback saves the state."""
+        super().optimizer_step(*arguments, **options)
+        if self.average is not None:
+            share = 1 - self.config.ema_decay
+            with torch.no_grad():
+                for kept, new in zip(self.average.parameters(), self.model.parameters(), strict=True):
+                    kept.lerp_(new, share)
+
+    @property
+    def evaluated(self) -> GelFlow:
+        """The network that is validated and kept: the average where there is one."""
+        return self.model if self.average is None else self.average
 
     def on_validation_epoch_start(self) -> None:
         """Forgets the sums of the last validation."""
@@ -93,7 +146,7 @@ class FlowModule(L.LightningModule):
 
     def validation_step(self, batch: dict[str, Any], _: int) -> None:
         """Adds one pair's metrics, in px of its own images."""
-        flow = estimate_flow(self.model, batch["image1"], batch["image2"], self.config.image_size)
+        flow = estimate_flow(self.evaluated, batch["image1"], batch["image2"], self.config.image_size)
         for name, value in validation_metrics(batch, flow, self.config).items():
             if torch.isfinite(value):
                 addend = torch.stack([value.double(), torch.ones_like(value, dtype=torch.float64)])
@@ -109,9 +162,10 @@ class FlowModule(L.LightningModule):
             if sums[1] > 0:
                 means[name] = float(sums[0] / sums[1])
         self.metrics = means
-        self._write({f"validation/{name}": value for name, value in means.items()}, self.step)
+        self.write({f"validation/{name}": value for name, value in means.items()}, self.step)
 
-    def _write(self, values: dict[str, float], step: int) -> None:
+    def write(self, values: dict[str, float], step: int) -> None:
+        """Puts values into all logs."""
         for logger in self.loggers:
             logger.log_metrics(values, step)
 

@@ -28,6 +28,7 @@ from gelflow.train.keeper import Keeper, Stopped, describe, stopping, weights_me
 from gelflow.train.module import FlowModule
 from gelflow.train.samples import StepSampler, TrainingSamples, checked, collate
 from gelflow.train.state import STATE, WEIGHTS, load_state, open_run
+from gelflow.train.throughput import peak_memory_mib
 
 
 @dataclass(frozen=True)
@@ -39,16 +40,23 @@ class TrainResult:
         steps: Optimiser steps done.
         metrics: Results of the last validation (`gelflow.train.module.METRICS`); empty without validation pairs.
         best: Best validation score: endpoint error in px where the flow is known, else photometric loss; else None.
+        pairs_per_second: Of this session after its first step, validation left out; None if it did fewer than two.
+        memory_mib: Peak memory of the device (on a CPU: of the process), MiB; None where it is not known.
     """
 
     weights: Path
     steps: int
     metrics: dict[str, float]
     best: float | None
+    pairs_per_second: float | None = None
+    memory_mib: float | None = None
 
     def __str__(self) -> str:
         """The result in a line."""
-        return "; ".join(text for text in (f"{self.steps} steps", describe(self.metrics), f"{self.weights}") if text)
+        speed = "" if self.pairs_per_second is None else f"{self.pairs_per_second:.3g} pairs/s"
+        memory = "" if self.memory_mib is None else f"peak memory {self.memory_mib:.0f} MiB"
+        texts = (f"{self.steps} steps", describe(self.metrics), speed, memory, f"{self.weights}")
+        return "; ".join(text for text in texts if text)
 
 
 def train(
@@ -92,14 +100,18 @@ def train(
         state = load_state(out) if resume else None
     if state is not None:
         model.load_state_dict(state.model)
-    module = FlowModule(config, model, state.step if state else 0, state.optimiser if state else None)
+    if state is None:
+        module = FlowModule(config, model)
+    else:
+        module = FlowModule(config, model, state.step, state.optimiser, state.average)
     keeper = Keeper(config, out, validation_pairs > 0, state.score if state else None, state.metrics if state else {})
     if module.start < config.steps:
         _fit(module, keeper, _Data(config, train_set, validation_set, module), device)
     weights = out / WEIGHTS
     if validation_set is None and first:
-        save_weights(weights, module.model.cpu(), **weights_metadata(config, config.steps))
-    return TrainResult(weights, config.steps, keeper.metrics, keeper.score)
+        save_weights(weights, module.evaluated.cpu(), **weights_metadata(config, config.steps))
+    rate = keeper.throughput.pairs_per_second
+    return TrainResult(weights, config.steps, keeper.metrics, keeper.score, rate, peak_memory_mib())
 
 
 def _length(data: Dataset[Any]) -> int:

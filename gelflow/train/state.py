@@ -10,7 +10,6 @@ import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Any
 
 import torch
@@ -19,6 +18,7 @@ from gelflow import __version__
 from gelflow.config import TrainConfig, validated
 from gelflow.errors import InputError
 from gelflow.files.atomic import replacing, write_text
+from gelflow.files.tensors import Unreadable, load_tensors
 
 RUN, STATE, WEIGHTS = "run.json", "state.ckpt", "weights.safetensors"
 
@@ -36,6 +36,7 @@ class State:
         optimiser: The optimiser's state dictionary, or None at step 0.
         score: Best validation score so far (lower is better), or None.
         metrics: Results of the last validation.
+        average: State dictionary of the weights' moving average, where there is one.
     """
 
     step: int
@@ -43,6 +44,7 @@ class State:
     optimiser: dict[str, Any] | None
     score: float | None
     metrics: dict[str, float]
+    average: dict[str, Any] | None = None
 
 
 def save_state(out: Path, state: State) -> None:
@@ -63,11 +65,10 @@ def load_state(out: Path) -> State:
     """
     path = out / STATE
     try:
-        values = torch.load(path, map_location="cpu", weights_only=True)
-        return State(**values)
+        return State(**load_tensors(path))
     except FileNotFoundError as error:
         raise InputError(f"{out}: no run to resume there ({STATE} is missing); start it without --resume") from error
-    except (OSError, RuntimeError, EOFError, UnpicklingError, TypeError, ValueError) as error:
+    except (Unreadable, TypeError) as error:
         raise InputError(f"{path}: damaged, the run cannot be resumed from it: {error}") from error
 
 

@@ -1,10 +1,14 @@
 """Classical methods on a motion that is known exactly."""
 
+from importlib.util import find_spec
+
 import numpy as np
 import pytest
 from textures import moved
 
 from gelflow.baselines import CLASSICAL, named_methods
+from gelflow.baselines.aldic import ALDIC, INSTALL
+from gelflow.baselines.scattered import dense_flow
 from gelflow.errors import InputError
 from gelflow.raster import ImageArray
 
@@ -14,7 +18,15 @@ SHIFT = (0.7, -0.4)
 # Median error in px: a matching error of a sixteenth of a px at the finest resolution that the method looks at. DIS
 # ultrafast and fast stop at a quarter of the resolution (OpenCV: finest scale 2), DIS medium at a half; Farnebäck and
 # TV-L1 end at full resolution, but TV-L1 is biased towards a flow without gradients: the same limit as DIS medium.
-TOLERANCE = {"farneback": 1 / 16, "dis-ultrafast": 4 / 16, "dis-fast": 4 / 16, "dis-medium": 2 / 16, "tvl1": 2 / 16}
+# Lucas-Kanade iterates at full resolution until steps are below 0.001 px; what is left is the rounding to 8 bit.
+TOLERANCE = {
+    "lucas-kanade": 1 / 16,
+    "farneback": 1 / 16,
+    "dis-ultrafast": 4 / 16,
+    "dis-fast": 4 / 16,
+    "dis-medium": 2 / 16,
+    "tvl1": 2 / 16,
+}
 
 
 @pytest.mark.parametrize("name", list(TOLERANCE))
@@ -57,3 +69,45 @@ def test_refuses_unknown_and_repeated_names(names: list[str]) -> None:
 def test_works_on_the_smallest_allowed_images(name: str) -> None:
     image = moved(16, 16, 0, 0)
     assert named_methods([name])[0].flow(image, image).shape == (16, 16, 2)
+
+
+def test_interpolation_is_exact_for_affine_motion_inside_and_nearest_outside() -> None:
+    """Fails with columns and rows of the points exchanged."""
+    generator = np.random.default_rng(3)
+    points = generator.uniform([5, 5], [35, 25], (60, 2))
+    points[:4] = [(5, 5), (35, 5), (5, 25), (35, 25)]
+    motion = points @ np.array([[0.1, -0.05], [0.02, 0.2]]) + (1.0, -2.0)
+    flow = dense_flow(points, motion, 30, 40)
+    columns, rows = np.meshgrid(np.arange(40.0), np.arange(30.0))
+    true = np.stack([columns, rows], axis=-1) @ np.array([[0.1, -0.05], [0.02, 0.2]]) + (1.0, -2.0)
+    # SciPy estimates the gradients iteratively, to 1e-6 of the values; float32 rounds 6e-7.
+    np.testing.assert_allclose(flow[6:25, 6:35], true[6:25, 6:35], atol=2e-4)
+    np.testing.assert_allclose(flow[0, 0], motion[0], rtol=1e-6)
+
+
+def test_interpolation_of_few_points_is_the_nearest_one() -> None:
+    assert (dense_flow(np.array([[3.0, 4.0]]), np.array([[1.0, 2.0]]), 8, 9) == (1.0, 2.0)).all()
+    line = np.stack([np.arange(6.0), np.arange(6.0)], axis=1)
+    assert dense_flow(line, line, 8, 9)[5, 5, 0] == 5.0
+
+
+def test_lucas_kanade_says_that_nothing_can_be_tracked() -> None:
+    grey = np.full((40, 40, 3), 0.5, np.float32)
+    with pytest.raises(InputError, match="no corner"):
+        named_methods(["lucas-kanade"])[0].flow(grey, grey)
+
+
+@pytest.mark.skipif(find_spec("al_dic") is not None, reason="pyALDIC is installed")
+def test_a_missing_package_is_named_with_how_to_get_it() -> None:
+    image = moved(64, 64, 0, 0)
+    with pytest.raises(InputError, match="pyALDIC cannot be imported") as error:
+        named_methods(["al-dic"])[0].flow(image, image)
+    assert INSTALL in str(error.value)
+
+
+@pytest.mark.skipif(find_spec("al_dic") is None, reason="pyALDIC is not installed")
+@pytest.mark.slow
+def test_aldic_recovers_a_sub_pixel_shift() -> None:
+    flow = ALDIC().flow(moved(96, 128, 0, 0), moved(96, 128, *SHIFT))
+    # DIC reaches 0.01 to 0.02 px (Reu et al. 2022).
+    assert np.median(np.hypot(flow[..., 0] - SHIFT[0], flow[..., 1] - SHIFT[1])) < 0.02

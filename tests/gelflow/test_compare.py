@@ -55,7 +55,7 @@ def test_true_flow_warps_best(tmp_path: Path) -> None:
 def test_files_hold_every_score(tmp_path: Path) -> None:
     dataset = open_pairs(write_synthetic(tmp_path / "data", [(1.0, 0.0), (0.0, 2.0)]))
     methods = named_methods(["none", "farneback", "dis-medium"])
-    scores = compare(methods, dataset, tmp_path / "out")
+    scores = compare(methods, dataset, tmp_path / "out").scores
     with (tmp_path / "out" / "scores.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [(row["method"], row["pair"]) for row in rows] == [(score.method, score.pair) for score in scores]

@@ -1,0 +1,106 @@
+"""RAFT's published weights: state dictionaries of princeton-vl/RAFT (BSD-3-Clause), loaded without running code.
+
+Mapping of names, file to `gelflow.models.raft.RAFT`:
+
+    module.X                         X       (the published files were saved from a data-parallel wrapper)
+    *.layerN.M.norm3.* (large)       dropped: the same tensors again as *.layerN.M.downsample.1.*
+    *.layerN.M.norm4.* (small)       dropped likewise
+    everything else                  the same name
+
+Which of the two networks a file is of is read from the shapes: 128 feature channels (small) or 256 (large).
+"""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from gelflow.errors import InputError
+from gelflow.files.tensors import Unreadable, load_tensors
+from gelflow.models.raft.network import RAFT
+
+SUFFIXES = (".pth", ".pt")
+"""Of files that are taken for RAFT's."""
+
+
+def looks_like_raft(path: Path) -> bool:
+    """Whether a file of weights is, by its name, one of RAFT's and not of gelflow's own (.safetensors)."""
+    return path.suffix.lower() in SUFFIXES
+
+
+def load_raft(path: Path, device: str = "cpu", iterations: int = 20) -> RAFT:
+    """Builds the network that a file's shapes describe and gives it the file's weights.
+
+    Only tensors are read: a file with anything else in it is refused before any of it runs.
+
+    Args:
+        path: A state dictionary saved by `torch.save`.
+        device: Where the network is put.
+        iterations: Recurrent updates.
+
+    Returns:
+        The network, in evaluation mode, float32.
+
+    Raises:
+        InputError: No such file, damaged, one that would run code, or not RAFT's weights.
+    """
+    tensors = renamed(_read(path), path)
+    last = tensors.get("fnet.conv2.weight")
+    if last is None or last.shape[0] not in (128, 256):
+        raise InputError(
+            f"{path}: not weights of RAFT small or large (fnet.conv2.weight is missing or of another "
+            "size); give a state dictionary of princeton-vl/RAFT"
+        )
+    model = RAFT(large=last.shape[0] == 256, iterations=iterations)
+    expected = model.state_dict()
+    wrong = [f"{name} is missing" for name in expected if name not in tensors]
+    wrong += [f"{name} is unknown" for name in tensors if name not in expected]
+    wrong += [
+        f"{name} has shape {tuple(value.shape)}, not {tuple(expected[name].shape)}"
+        for name, value in tensors.items()
+        if name in expected and value.shape != expected[name].shape
+    ]
+    wrong += [f"{name} holds values that are not finite" for name, value in tensors.items()
+              if value.is_floating_point() and not torch.isfinite(value).all()]  # fmt: skip
+    if wrong:
+        more = f" and {len(wrong) - 3} more" if len(wrong) > 3 else ""
+        raise InputError(
+            f"{path}: does not fit RAFT {'large' if model.large else 'small'}: {'; '.join(wrong[:3])}{more}"
+        )
+    model.load_state_dict(tensors)
+    return model.to(device).eval()
+
+
+def renamed(tensors: Mapping[str, Tensor], path: Path) -> dict[str, Tensor]:
+    """The tensors under this package's names, see the top of this module.
+
+    Raises:
+        InputError: A tensor that is stored twice differs from its copy.
+    """
+    plain = {name.removeprefix("module."): value for name, value in tensors.items()}
+    kept = {}
+    for name, value in plain.items():
+        match = re.fullmatch(r"(.*layer\d\.\d)\.norm[34]\.(\w+)", name)
+        copy = f"{match[1]}.downsample.1.{match[2]}" if match else ""
+        if copy not in plain:
+            kept[name] = value
+        elif not torch.equal(value, plain[copy]):
+            raise InputError(f"{path}: {name} and {copy} must be one tensor, but differ")
+    return kept
+
+
+def _read(path: Path) -> dict[str, Tensor]:
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such file")
+    try:
+        values = load_tensors(path)
+    except Unreadable as error:
+        raise InputError(
+            f"{path}: not a readable file of tensors (truncated, damaged, or holding objects that could run code): "
+            f"{error}"
+        ) from error
+    if not isinstance(values, Mapping) or not all(isinstance(value, Tensor) for value in values.values()):
+        raise InputError(f"{path}: holds something other than a dictionary of tensors")
+    return dict(values)

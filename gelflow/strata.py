@@ -1,0 +1,125 @@
+"""Where the error is: endpoint errors sorted by the length of the true motion, by the distance to the contact's edge,
+and by scene and pattern.
+
+Each kind sorts the compared pixels of a pair into bins; sums over pixels are kept, so that bins of many pairs add up
+with every pixel counting the same. The distance to the contact's edge is signed, negative inside the contact, and
+needs the channel contact.Y (synth: `--set outputs.contact=true`); pairs without it, or without a contact, have no such
+bins.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.raster import FlowArray, MaskArray
+
+MOTION_PX = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, np.inf)
+EDGE_PX = (-np.inf, -16.0, -4.0, 0.0, 4.0, 16.0, 64.0, np.inf)
+MOTION, EDGE, SCENE = "motion", "distance to contact edge", "scene and pattern"
+
+
+@dataclass(frozen=True)
+class Stratum:
+    """Sums over the pixels of one bin.
+
+    Attributes:
+        kind, bin: What was sorted by, and which part of it.
+        pixels: Compared pixels.
+        error_px: Sum of their endpoint errors.
+        above_1px, above_01px: How many err by more than 1 px and 0.1 px.
+    """
+
+    kind: str
+    bin: str
+    pixels: int
+    error_px: float
+    above_1px: int
+    above_01px: int
+
+
+def pair_strata(
+    error: NDArray[np.float64],
+    truth: FlowArray,
+    compared: MaskArray,
+    contact: MaskArray | None = None,
+    scene: str | None = None,
+) -> tuple[Stratum, ...]:
+    """The bins of one pair that hold pixels.
+
+    Args:
+        error: Endpoint error (H, W) px.
+        truth: True flow (H, W, 2) px.
+        compared: (H, W), where the two were compared.
+        contact: (H, W), where the gel touches the indenter in the second state, at pixels of image 1; or None.
+        scene: Name of the scene and pattern, or None.
+    """
+    motion = np.hypot(truth[..., 0], truth[..., 1])[compared]
+    chosen = error[compared]
+    strata = _binned(MOTION, MOTION_PX, motion, chosen)
+    if contact is not None and contact.any() and not contact.all():
+        strata += _binned(EDGE, EDGE_PX, signed_distance(contact)[compared], chosen)
+    if scene is not None:
+        strata.append(_stratum(SCENE, scene, chosen))
+    return tuple(strata)
+
+
+def signed_distance(region: MaskArray) -> NDArray[np.float64]:
+    """Distance of each pixel's centre to the nearest edge between a region and the rest, px; negative inside.
+
+    The edge lies half a px beyond the last pixel's centre.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    outside = np.asarray(distance_transform_edt(~region), np.float64)
+    inside = np.asarray(distance_transform_edt(region), np.float64)
+    return np.where(region, 0.5 - inside, outside - 0.5)
+
+
+def _binned(
+    kind: str, limits: Sequence[float], values: NDArray[np.floating], error: NDArray[np.float64]
+) -> list[Stratum]:
+    places = np.digitize(values, limits[1:-1])
+    return [
+        _stratum(kind, _name(low, high), error[places == place])
+        for place, (low, high) in enumerate(pairwise(limits))
+        if (places == place).any()
+    ]
+
+
+def _name(low: float, high: float) -> str:
+    if np.isinf(high):
+        return f"above {low:g} px"
+    return f"below {high:g} px" if np.isinf(low) else f"{low:g} to {high:g} px"
+
+
+def _stratum(kind: str, name: str, error: NDArray[np.float64]) -> Stratum:
+    above = [int(np.count_nonzero(~(error <= limit))) for limit in (1.0, 0.1)]
+    return Stratum(kind, name, int(error.size), float(error.sum()), *above)
+
+
+def merged(strata: Iterable[Stratum]) -> list[Stratum]:
+    """Bins of many pairs added up; kinds and bins in their own order, scenes by name."""
+    sums: dict[tuple[str, str], Stratum] = {}
+    for one in strata:
+        so_far = sums.get((one.kind, one.bin))
+        if so_far is not None:
+            one = Stratum(
+                one.kind,
+                one.bin,
+                one.pixels + so_far.pixels,
+                one.error_px + so_far.error_px,
+                one.above_1px + so_far.above_1px,
+                one.above_01px + so_far.above_01px,
+            )
+        sums[one.kind, one.bin] = one
+    return sorted(sums.values(), key=_order)
+
+
+def _order(stratum: Stratum) -> tuple[int, int, str]:
+    limits = {MOTION: MOTION_PX, EDGE: EDGE_PX}.get(stratum.kind, ())
+    names = [_name(low, high) for low, high in pairwise(limits)]
+    place = names.index(stratum.bin) if stratum.bin in names else 0
+    return (MOTION, EDGE, SCENE).index(stratum.kind), place, stratum.bin

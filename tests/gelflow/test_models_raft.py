@@ -1,0 +1,234 @@
+"""RAFT: published names and shapes, published weights where they lie beside the repository, padding, lookup."""
+
+import pickle
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+from waves import moved_pair
+
+from gelflow.errors import InputError
+from gelflow.models.raft import RAFT, load_raft
+from gelflow.models.raft.correlation import correlation_pyramid, lookup
+from gelflow.models.raft.network import enlarge_bilinear, enlarge_convex
+
+PUBLISHED = Path(__file__).resolve().parents[2].parent / "shared" / "weights" / "raft-small" / "raft-small.pth"
+needs_weights = pytest.mark.skipif(
+    not PUBLISHED.is_file(), reason="no published RAFT-small weights beside the repository"
+)
+
+
+@pytest.fixture(scope="module")
+def small() -> RAFT:
+    torch.manual_seed(0)
+    return RAFT(large=False, iterations=3).eval()
+
+
+def shifted(u: float, v: float, size: tuple[int, int] = (101, 131)) -> tuple[Tensor, Tensor]:
+    flow = torch.tensor([u, v], dtype=torch.float64).view(2, 1, 1).expand(2, *size)
+    return tuple(image[None].float() for image in moved_pair(flow, seed=4))  # type: ignore[return-value]
+
+
+def published_names(large: bool) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of the published state dictionaries, from the paper's description and the small file's list."""
+    shapes: dict[str, tuple[int, ...]] = {}
+
+    def conv(name: str, outputs: int, inputs: int, rows: int, columns: int | None = None) -> None:
+        shapes[f"{name}.weight"] = (outputs, inputs, rows, columns or rows)
+        shapes[f"{name}.bias"] = (outputs,)
+
+    def norm(name: str, channels: int, batch: bool) -> None:
+        if batch:
+            shapes.update({f"{name}.{part}": (channels,) for part in ("weight", "bias", "running_mean", "running_var")})
+            shapes[f"{name}.num_batches_tracked"] = ()
+
+    stages = (64, 96, 128) if large else (32, 64, 96)
+    for net, outputs in (("fnet", 256 if large else 128), ("cnet", 256 if large else 160)):
+        batch = large and net == "cnet"
+        conv(f"{net}.conv1", stages[0], 3, 7)
+        norm(f"{net}.norm1", stages[0], batch)
+        inputs = stages[0]
+        for stage, channels in enumerate(stages, start=1):
+            for unit in (0, 1):
+                at = f"{net}.layer{stage}.{unit}"
+                if large:
+                    conv(f"{at}.conv1", channels, inputs, 3)
+                    conv(f"{at}.conv2", channels, channels, 3)
+                else:
+                    conv(f"{at}.conv1", channels // 4, inputs, 1)
+                    conv(f"{at}.conv2", channels // 4, channels // 4, 3)
+                    conv(f"{at}.conv3", channels, channels // 4, 1)
+                norm(f"{at}.norm1", channels, batch)
+                norm(f"{at}.norm2", channels, batch)
+                if unit == 0 and stage > 1:
+                    conv(f"{at}.downsample.0", channels, inputs, 1)
+                    norm(f"{at}.downsample.1", channels, batch)
+                    norm(f"{at}.norm3", channels, batch)  # the same tensors again
+                inputs = channels
+        conv(f"{net}.conv2", outputs, stages[2], 1)
+    block = "update_block"
+    conv(f"{block}.encoder.convc1", 256 if large else 96, 4 * (81 if large else 49), 1)
+    if large:
+        conv(f"{block}.encoder.convc2", 192, 256, 3)
+    conv(f"{block}.encoder.convf1", 128 if large else 64, 2, 7)
+    conv(f"{block}.encoder.convf2", 64 if large else 32, 128 if large else 64, 3)
+    conv(f"{block}.encoder.conv", 126 if large else 80, 256 if large else 128, 3)
+    hidden, inputs = (128, 128 + 128 + 128) if large else (96, 96 + 64 + 82)
+    for gate in "zrq":
+        if large:
+            conv(f"{block}.gru.conv{gate}1", hidden, inputs, 1, 5)
+            conv(f"{block}.gru.conv{gate}2", hidden, inputs, 5, 1)
+        else:
+            conv(f"{block}.gru.conv{gate}", hidden, inputs, 3)
+    conv(f"{block}.flow_head.conv1", 256 if large else 128, hidden, 3)
+    conv(f"{block}.flow_head.conv2", 2, 256 if large else 128, 3)
+    if large:
+        conv(f"{block}.mask.0", 256, 128, 3)
+        conv(f"{block}.mask.2", 576, 256, 1)
+    return shapes
+
+
+@pytest.mark.parametrize("large", [False, True])
+def test_a_published_state_dictionary_loads_strictly(large: bool, tmp_path: Path) -> None:
+    """Fails with `convc2` left out of the motion encoder, and with names that keep `module.`."""
+    torch.manual_seed(1)
+    tensors: dict[str, Tensor] = {}
+    for name, shape in published_names(large).items():
+        copy = name.replace("norm3", "downsample.1")
+        tensors[name] = tensors[copy] if copy in tensors else 0.01 * torch.rand(shape)
+    path = tmp_path / "raft.pth"
+    torch.save({f"module.{name}": value for name, value in tensors.items()}, path)
+    network = load_raft(path)
+    loaded = network.state_dict()
+    assert set(loaded) == {name for name in tensors if "norm3" not in name}
+    assert all(torch.equal(loaded[name], tensors[name].to(loaded[name].dtype)) for name in loaded)
+    # the published numbers of weights, in millions: 5.3 and 1.0 (paper, table 1 and section 4.5)
+    assert sum(p.numel() for p in network.parameters()) == (5_257_536 if large else 990_162)
+
+
+@pytest.mark.parametrize(("large", "size"), [(False, (64, 64)), (False, (67, 90)), (True, (65, 72))])
+def test_the_flow_has_the_images_size(large: bool, size: tuple[int, int]) -> None:
+    images = torch.rand(2, 2, 3, *size).unbind()
+    with torch.no_grad():
+        flow = RAFT(large=large, iterations=2).eval()(*images)
+    assert flow.shape == (2, 2, *size)
+    assert torch.isfinite(flow).all()
+
+
+def test_the_encoders_see_images_between_minus_one_and_one(small: RAFT) -> None:
+    """Fails with images handed on in [0, 1], which the published weights would hardly show."""
+    seen: list[tuple[float, float]] = []
+    handles = [net.register_forward_pre_hook(lambda _, inputs: seen.append((inputs[0].min(), inputs[0].max())))
+               for net in (small.fnet, small.cnet)]  # fmt: skip
+    image = torch.zeros(1, 3, 64, 64)
+    image[..., 32:] = 1
+    with torch.no_grad():
+        small(image, image)
+    for handle in handles:
+        handle.remove()
+    assert seen == [(-1, 1)] * 3
+
+
+def test_pairs_of_a_batch_do_not_see_each_other(small: RAFT) -> None:
+    images = torch.rand(2, 2, 3, 64, 72).unbind()
+    with torch.no_grad():
+        both = small(*images)
+        alone = small(*(image[1:] for image in images))
+    # The same sums in another order: float32 rounding (6e-8) through three updates and upsampling by 8, on 1 px.
+    torch.testing.assert_close(both[1:], alone, rtol=0, atol=1e-4)
+
+
+def test_padding_does_not_shift_the_flow(small: RAFT) -> None:
+    """What is cut off is what was added. Fails with the crop taken from the corner in place of the padding's inside."""
+    inner = torch.rand(2, 1, 3, 76, 84).unbind()
+    framed = [torch.nn.functional.pad(image, (2, 2, 2, 2), mode="replicate") for image in inner]
+    with torch.no_grad():
+        # 76 x 84 is padded by 2 px on each side to 80 x 88, which is what `framed` is already.
+        torch.testing.assert_close(small(*inner), small(*framed)[..., 2:-2, 2:-2], rtol=0, atol=1e-4)
+
+
+def test_the_lookup_reads_indices_and_orders_displacements_column_by_column() -> None:
+    """Fails with the half-pixel position (i + 1/2) / 2^k - 1/2, and with rows before columns."""
+    features1, features2 = torch.rand(2, 1, 5, 16, 24, dtype=torch.float64)
+    pyramid = correlation_pyramid(features1, features2)
+    product = torch.einsum("bchw,bcij->bhwij", features1, features2) / 5**0.5
+    assert [tuple(level.shape[2:]) for level in pyramid] == [(16, 24), (8, 12), (4, 6), (2, 3)]
+    row, column, radius = 6, 8, 1
+    position = torch.full((1, 2, 16, 24), 0.0, dtype=torch.float64)
+    position[0, 0], position[0, 1] = column + 0.0, row + 2.0
+    found = lookup(pyramid, position, radius)[0, :, row, column]
+    assert found.shape == (4 * 9,)
+    at_pixel = product[0, row, column]
+    for across in (-1, 0, 1):
+        for down in (-1, 0, 1):
+            channel = (across + 1) * 3 + (down + 1)
+            # exact reads at integers: double precision
+            assert abs(found[channel] - at_pixel[row + 2 + down, column + across]) < 1e-12
+            # level 1: index 8 is read at 4, index 8 (row) at 4; each value is the mean of a 2x2 block
+            block = at_pixel[2 * (4 + down) : 2 * (4 + down) + 2, 2 * (4 + across) : 2 * (4 + across) + 2].mean()
+            assert abs(found[9 + channel] - block) < 1e-12
+
+
+def test_enlarging_keeps_a_constant_and_multiplies_by_eight() -> None:
+    flow = torch.tensor([1.5, -0.25]).view(1, 2, 1, 1).expand(1, 2, 4, 5).contiguous()
+    assert torch.allclose(enlarge_bilinear(flow), 8 * flow[..., :1, :1].expand(1, 2, 32, 40))
+    weights = torch.randn(1, 9 * 64, 4, 5)
+    fine = enlarge_convex(flow, weights)[..., 8:24, 8:32]  # away from the border, where zeros are neighbours
+    assert torch.allclose(fine, (8 * flow[..., :1, :1]).expand_as(fine), atol=1e-5)
+    # All weight on the centre (neighbour 4): a block of constant flow per coarse pixel.
+    chosen = torch.full((1, 9, 64, 4, 5), -1e4)
+    chosen[:, 4] = 0
+    flow = torch.rand(1, 2, 4, 5)
+    blocks = enlarge_convex(flow, chosen.view(1, 576, 4, 5))
+    assert torch.allclose(blocks, 8 * flow.repeat_interleave(8, -1).repeat_interleave(8, -2))
+
+
+@needs_weights
+def test_published_small_weights_see_shifts_and_no_motion() -> None:
+    """Fails with the two components of the flow exchanged."""
+    network = load_raft(PUBLISHED)
+    for u, v in ((0.0, 0.0), (1.5, -0.75), (3.3, 2.1), (6.0, -4.0)):
+        with torch.no_grad():
+            flow = network(*shifted(u, v))[0, :, 16:-16, 16:-16]
+        error = (flow - torch.tensor([u, v]).view(2, 1, 1)).norm(dim=0)
+        # The network works at an eighth of the resolution: 0.3 px is 0.04 px there. Seen: .05, .10, .07, .19 px.
+        assert error.mean() < (0.1 if (u, v) == (0, 0) else 0.3), (u, v, error.mean())
+
+
+class Evil:
+    """Pickled, it would make a file when it is loaded."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple:
+        return (Path.touch, (self.path,))
+
+
+@pytest.mark.parametrize("kind", ["text", "truncated", "pickle", "evil", "list", "other", "missing key", "nan"])
+def test_files_that_are_not_raft_are_refused_without_running_them(kind: str, tmp_path: Path) -> None:
+    path, trace = tmp_path / "weights.pth", tmp_path / "ran"
+    tensors = {f"module.{name}": torch.zeros(shape) for name, shape in published_names(False).items()}
+    torch.save(tensors, path)
+    if kind == "text":
+        path.write_text("not weights")
+    elif kind == "truncated":
+        path.write_bytes(path.read_bytes()[:100_000])
+    elif kind == "pickle":
+        path.write_bytes(pickle.dumps({"a": Evil(trace)}))
+    elif kind == "evil":
+        torch.save({"a": Evil(trace)}, path)
+    elif kind == "list":
+        torch.save([1, 2], path)
+    elif kind == "other":
+        torch.save({"layer.weight": torch.zeros(3)}, path)
+    elif kind == "missing key":
+        torch.save({name: value for name, value in tensors.items() if "convf1" not in name}, path)
+    else:
+        tensors["module.fnet.conv1.bias"][3] = torch.nan
+        torch.save(tensors, path)
+    with pytest.raises(InputError, match=r"weights\.pth: ") as error:
+        load_raft(path)
+    assert "\n" not in str(error.value)
+    assert not trace.exists()

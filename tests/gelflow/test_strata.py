@@ -1,0 +1,102 @@
+"""Errors sorted by motion, distance to the contact and scene: closed forms, and through a data set with a contact."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+from test_compare import Constant
+from textures import write_synthetic
+
+from gelflow.compare import compare
+from gelflow.data import open_pairs
+from gelflow.evaluate import evaluate
+from gelflow.report import strata_table
+from gelflow.strata import EDGE, MOTION, SCENE, merged, pair_strata, signed_distance
+
+
+def test_distance_is_signed_and_measured_from_the_edge_between_pixels() -> None:
+    """Fails with the sign exchanged and without the half pixel."""
+    region = np.zeros((5, 12), bool)
+    region[:, :4] = True
+    np.testing.assert_array_equal(signed_distance(region)[2], [-3.5, -2.5, -1.5, -0.5, *np.arange(0.5, 8)])
+
+
+def test_bins_hold_every_compared_pixel_once() -> None:
+    generator = np.random.default_rng(0)
+    truth = generator.normal(0, 6, (20, 30, 2)).astype(np.float32)
+    error = generator.exponential(0.4, (20, 30))
+    compared = generator.random((20, 30)) < 0.8
+    contact = np.zeros((20, 30), bool)
+    contact[5:15, 8:20] = True
+    strata = pair_strata(error, truth, compared, contact, "gelsight, speckle")
+    for kind in (MOTION, EDGE, SCENE):
+        mine = [stratum for stratum in strata if stratum.kind == kind]
+        assert sum(s.pixels for s in mine) == compared.sum()
+        assert sum(s.error_px for s in mine) == pytest.approx(error[compared].sum(), rel=1e-12)
+        assert sum(s.above_1px for s in mine) == (error[compared] > 1).sum()
+        assert sum(s.above_01px for s in mine) == (error[compared] > 0.1).sum()
+    length = np.hypot(*np.moveaxis(truth, -1, 0))
+    (bin_,) = (s for s in strata if s.bin == "2 to 4 px")
+    assert bin_.error_px == pytest.approx(error[compared & (length >= 2) & (length < 4)].sum(), rel=1e-12)
+
+
+def test_pairs_add_up_pixel_by_pixel_in_the_order_of_the_bins() -> None:
+    one = pair_strata(np.full((2, 3), 0.5), np.full((2, 3, 2), 0.1, np.float32), np.ones((2, 3), bool))
+    two = pair_strata(np.full((4, 3), 2.0), np.full((4, 3, 2), 9.0, np.float32), np.ones((4, 3), bool))
+    both = merged([*two, *one, *one])
+    assert [(s.bin, s.pixels, s.error_px, s.above_1px) for s in both] == [
+        ("0 to 0.5 px", 12, 6.0, 0),
+        ("8 to 16 px", 12, 24.0, 12),
+    ]
+
+
+def test_no_contact_or_contact_everywhere_gives_no_distances() -> None:
+    error, truth, compared = np.ones((4, 4)), np.ones((4, 4, 2), np.float32), np.ones((4, 4), bool)
+    for contact in (None, np.zeros((4, 4), bool), np.ones((4, 4), bool)):
+        assert {s.kind for s in pair_strata(error, truth, compared, contact)} == {MOTION}
+
+
+def with_contact(folder: Path) -> Path:
+    """A data set as synth writes it, with a contact in the left half and with patterns that differ by sample."""
+    write_synthetic(folder, [(3.0, 0.0), (0.0, 0.25)])
+    scene = {"name": "toy", "sensor": {"pattern": {"kind": {"choice": ["dots", "speckle"]}}}}
+    (folder / "dataset.json").write_text(json.dumps({"schema_version": 1, "scene": scene}))
+    for index, kind in enumerate(["dots", "speckle"]):
+        sample = folder / "samples" / f"{index:06d}"
+        meta = {"scene": {"name": "toy", "sensor": {"pattern": {"kind": kind}}}}
+        (sample / "meta.json").write_text(json.dumps(meta))
+        with OpenEXR.File(str(sample / "flow.exr"), separate_channels=True) as file:
+            channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+        channels["contact.Y"] = np.zeros_like(channels["forward.U"])
+        channels["contact.Y"][:, :40] = 1.0
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        OpenEXR.File(header, channels).write(str(sample / "flow.exr"))
+    return folder
+
+
+def test_a_data_set_with_contact_and_patterns_is_sorted(tmp_path: Path) -> None:
+    dataset = open_pairs(with_contact(tmp_path / "data"))
+    result = compare([Constant("zero", 0, 0), Constant("right", 3, 0)], dataset, tmp_path / "out")
+    header, rows = strata_table(result.scores)
+    assert header == ["where", "pixels", "zero", "right"]
+    cells = {row[0]: row[1:] for row in rows}
+    # 64 rows; columns 8 to 71 are known and visible
+    assert cells["motion: 2 to 4 px"] == ["4096", "3.000", "0.000"]
+    assert cells["motion: 0 to 0.5 px"] == ["4096", "0.250", f"{np.hypot(3, 0.25):.3f}"]
+    assert cells["scene and pattern: toy, dots"][1] == "3.000"
+    assert cells["scene and pattern: toy, speckle"][1] == "0.250"
+    # columns 36 to 39 are within 4 px of the edge at 40, on its inner side, in both samples
+    assert cells["distance to contact edge: -4 to 0 px"] == [str(2 * 64 * 4), "1.625", f"{np.hypot(3, 0.25) / 2:.3f}"]
+    with (tmp_path / "out" / "strata.csv").open(newline="") as file:
+        table = {(row["method"], row["bin"]): row for row in csv.DictReader(file)}
+    assert float(table["zero", "2 to 4 px"]["outliers_1px"]) == 1.0
+    assert float(table["zero", "0 to 0.5 px"]["outliers_1px"]) == 0.0
+    assert float(table["zero", "0 to 0.5 px"]["outliers_01px"]) == 1.0
+
+
+def test_data_without_them_have_no_such_rows(tmp_path: Path) -> None:
+    scores = evaluate(Constant("zero", 0, 0), open_pairs(write_synthetic(tmp_path, [(1.0, 0.0)])))
+    assert {stratum.kind for stratum in scores[0].strata} == {MOTION}

@@ -1,0 +1,120 @@
+"""Practice: moving average, both directions and analogy resume bit by bit; bf16; compile; two processes; speed."""
+
+import csv
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from textures import write_folder
+from waves import Shifts
+
+from gelflow.config import TrainConfig
+from gelflow.data import open_pairs
+from gelflow.train import train
+from gelflow.train.checkpoint import load_weights
+from gelflow.train.state import load_state
+
+SMALL = {
+    "model": {"levels": 4, "projected_channels": 8},
+    "loss": {"lambda_s": [1.0, 1.0, 1.0]},
+    "batch_size": 2,
+    "learning_rate": 1e-3,
+    "device": "cpu",
+}
+
+
+def small(**values: object) -> TrainConfig:
+    return TrainConfig.model_validate(SMALL | values)
+
+
+@pytest.fixture(scope="module")
+def pairs() -> Shifts:
+    torch.set_num_threads(1)
+    return Shifts(3, 64, 2.0, seed=1)
+
+
+def test_the_average_follows_the_weights_and_is_what_is_kept(pairs: Shifts, tmp_path: Path) -> None:
+    """Fails with the average moved before the optimiser's step."""
+    kept = []
+    for steps in (1, 2):
+        result = train(small(steps=steps, ema_decay=0.75), pairs, None, tmp_path / str(steps))
+        state = load_state(tmp_path / str(steps))
+        assert state.average is not None
+        kept.append((state.model, state.average))
+        loaded = load_weights(result.weights).state_dict()
+        assert all(torch.equal(loaded[name], state.average[name]) for name in loaded)
+    for name, average in kept[1][1].items():
+        # average_2 = 0.75 average_1 + 0.25 weights_2, one rounding each
+        expected = 0.75 * kept[0][1][name] + 0.25 * kept[1][0][name]
+        torch.testing.assert_close(average, expected, rtol=1e-6, atol=1e-7)
+
+
+def test_a_resumed_run_with_everything_on_ends_with_the_same_weights(pairs: Shifts, tmp_path: Path) -> None:
+    """Fails with the average left out of the saved state, and with an unseeded analogy."""
+    loss = {"lambda_s": [1.0, 1.0, 1.0], "occlusion": "forward_backward", "lambda_ar": 0.01, "lambda_census": 0.1}
+    options = {"loss": loss, "ema_decay": 0.9}
+    whole = train(small(steps=4, **options), pairs, None, tmp_path / "whole")
+    train(small(steps=2, **options), pairs, None, tmp_path / "cut")
+    resumed = train(small(steps=4, **options), pairs, None, tmp_path / "cut", resume=True)
+    first, second = (load_weights(result.weights).state_dict() for result in (whole, resumed))
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_bfloat16_trains_and_keeps_float32_weights(pairs: Shifts, tmp_path: Path) -> None:
+    result = train(small(steps=2, precision="bf16"), pairs, None, tmp_path)
+    values = load_weights(result.weights).state_dict().values()
+    assert all(value.dtype == torch.float32 and torch.isfinite(value).all() for value in values)
+
+
+@pytest.mark.slow
+def test_a_compiled_network_is_asked_for_and_keeps_its_names(
+    pairs: Shifts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the compiler's own backend for tests: the graph is captured and run as it is, nothing is built."""
+    compiled = torch.compile
+    monkeypatch.setattr(torch, "compile", lambda model: compiled(model, backend="eager"))
+    options = {"steps": 2, "model": SMALL["model"] | {"correlation_radius": 1, "lffm": False, "finest_scale": 2}}
+    plain = train(small(**options), pairs, None, tmp_path / "plain")
+    fast = train(small(compile=True, **options), pairs, None, tmp_path / "compiled")
+    first, second = (load_weights(result.weights).state_dict() for result in (plain, fast))
+    assert first.keys() == second.keys()
+    # The same operations: differences can only come from their order. Two Adam steps of 1e-3 change a weight by 2e-3.
+    assert max((first[name] - second[name]).abs().max().item() for name in first) < 2e-4
+
+
+@pytest.mark.slow
+def test_two_processes_end_as_one_with_twice_the_batch(tmp_path: Path) -> None:
+    """Gradients are averaged over processes, so that 2 x 1 pairs are 1 x 2 pairs.
+
+    Fails with both processes given the same pairs.
+    """
+    folder = write_folder(tmp_path / "data", dict.fromkeys("abcd", (1.0, 0.5)), (64, 64))
+    options = {"steps": 3, "learning_rate": 1e-4, "loss": SMALL["loss"] | {"mask_outside": False}}
+    one = train(small(batch_size=2, **options), open_pairs(folder), None, tmp_path / "one").weights
+    settings = tmp_path / "settings.toml"
+    settings.write_text("steps = 3\nbatch_size = 1\ndevices = 2\n[model]\nlevels = 4\nprojected_channels = 8\n"
+                        "[loss]\nlambda_s = [1.0, 1.0, 1.0]\nmask_outside = false\n")  # fmt: skip
+    command = [sys.executable, "-m", "gelflow", "train", str(folder), "--out", str(tmp_path / "two"), "--device", "cpu",
+               "--config", str(settings)]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr
+    first, second = (load_weights(path).state_dict() for path in (one, tmp_path / "two" / "weights.safetensors"))
+    # The same gradients up to float32 rounding. Adam's first steps are the sign of the gradient times 1e-4, so that a
+    # gradient near zero may turn: all but a few weights must agree to a hundredth of a step.
+    differences = torch.cat([(first[name] - second[name]).abs().flatten() for name in first])
+    assert (differences < 1e-6).float().mean() > 0.99
+    assert differences.max() < 6.1e-4  # three steps, each to the other side
+
+
+def test_speed_and_memory_are_reported(pairs: Shifts, tmp_path: Path) -> None:
+    result = train(small(steps=10), pairs, None, tmp_path)
+    assert result.pairs_per_second is not None
+    assert result.pairs_per_second > 0
+    assert "pairs/s" in str(result)
+    rows = list(csv.DictReader(next(tmp_path.glob("logs/csv/*/metrics.csv")).open()))
+    assert float(rows[-1]["train/pairs_per_second"]) > 0
+    if result.memory_mib is not None:  # Linux
+        assert "peak memory" in str(result)
+        assert result.memory_mib > 100  # torch alone
