@@ -101,10 +101,13 @@ def simulate(
     return run_simulate(scene, out, seed, index, assignments or [], as_json)
 
 
-@app.command
-def bench(
-    what: Annotated[Literal["fem"], Parameter(help="What to measure.")] = "fem",
-    /,
+bench = App(name="bench", help="Measures how exact the simulation is, and at what cost. Without a command: fem.")
+app.command(bench)
+
+
+@bench.default
+@bench.command
+def fem(
     *,
     out: Annotated[Path, Parameter(help="Directory for the table, the plot and the report.")] = Path("data/bench"),
     quick: Annotated[bool, Parameter(negative=(), help="One case and a few settings.")] = False,
@@ -113,7 +116,31 @@ def bench(
     """Measures error against run time."""
     from synth.bench import run_bench
 
-    return run_bench(what, out, quick, as_json)
+    return run_bench("fem", out, quick, as_json)
+
+
+@bench.command
+def budget(
+    *,
+    scene: Annotated[
+        list[str] | None,
+        Parameter(name="--scene", help="A scene's name or TOML file; repeatable. Default: all shipped."),
+    ] = None,
+    out: Annotated[
+        Path, Parameter(help="Directory for table, plot and report; one that holds part of the same study goes on.")
+    ] = Path("data/bench"),
+    draws: Annotated[int, Parameter(converter=_whole(1), help="Draws of each scene.")] = 20,
+    seed: Annotated[int, Parameter(converter=_whole(0), help="Seed of the draws; the error model saw 0 and 1.")] = 2,
+    workers: Annotated[int, Parameter(converter=_whole(1), help="Presses that run at once.")] = 1,
+    minutes: Annotated[
+        float | None, Parameter(help="Begin no press that will not end within them; the same command goes on.")
+    ] = None,
+    as_json: AsJson = False,
+) -> int:
+    """Compares random draws with much finer solutions: is the error within its target, at little more than it takes?"""
+    from synth.bench import run_budget
+
+    return run_budget(scene or [], out, draws, seed, workers, minutes, as_json)
 
 
 @app.command
@@ -161,11 +188,12 @@ def export(
     *,
     format: Annotated[Literal["flo", "kitti", "npz", "webdataset"], Parameter(help="Layout to write.")],
     out: Annotated[Path, Parameter(help="Directory to write to.")],
+    camera: Annotated[str, Parameter(help="Name of a further camera; default: the main one.")] = "",
 ) -> int:
     """Writes a dataset in another layout."""
     from synth.commands import run_export
 
-    return run_export(path, format, out)
+    return run_export(path, format, out, camera)
 
 
 @app.command

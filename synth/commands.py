@@ -139,10 +139,10 @@ def run_verify(path: Path, as_json: bool) -> int:
     return 0 if report.ok else 1
 
 
-def run_export(path: Path, format: ExportFormat, out: Path) -> int:
+def run_export(path: Path, format: ExportFormat, out: Path, camera: str) -> int:
     """See `synth.cli.export`."""
     with _progress("export: samples", None) as advance:
-        count = export(path, format, out, advance)
+        count = export(path, format, out, advance, camera)
     _say(Console(), f"{count} samples written to {out}")
     return 0
 

@@ -101,7 +101,7 @@ def check_buildable(template: Template, variant: Variant) -> None:
             surface, a light in the camera's view, or a lens that this variant cannot render.
     """
     try:
-        for sensor in dict.fromkeys(corner.sensor for corner in template.corners):
+        for sensor in dict.fromkeys(view for corner in template.corners for view in corner.sensor.views.values()):
             check_view(sensor)
             if not variant.is_vectorised:
                 pinhole(sensor)
@@ -115,11 +115,11 @@ def plan(template: Template, variant: Variant) -> Plan:
     """Plan a template by the corners of its distributions."""
     corners = template.corners
     scene = corners[0]
-    camera = scene.sensor.camera
+    cameras = [view.camera for view in scene.sensor.views.values()]
     pairs = scene.sampling.pairs_per_trajectory
     meshes = _meshes(template)
     simulate = sum(_simulation_seconds(draw, nodes) for draw, nodes in meshes.draws) / len(meshes.draws)
-    pixels = camera.width * camera.height
+    pixels = sum(camera.width * camera.height for camera in cameras)
     kind = variant.name.split("_")[0]
     frame = pixels * scene.render.samples_per_pixel / 1e6 * SECONDS_PER_MILLION_SAMPLES[kind]
     directions = 2 if scene.outputs.backward else 1
@@ -201,7 +201,9 @@ def _decisions(corners: tuple[Scene, ...], variant: Variant) -> list[Decision]:
     poisson = [c.sensor.gel.poisson_ratio for c in corners]
     index, bounces = [c.sensor.window.refractive_index for c in corners], [c.render.max_depth for c in corners]
     mixed = max(poisson) >= DISPLACEMENT_ONLY_BELOW
-    lens = any(any(c.sensor.camera.distortion) for c in corners)
+    cameras = [view.camera for c in corners for view in c.sensor.views.values()]
+    lens = any(any(camera.distortion) or camera.lens == "fisheye" for camera in cameras)
+    mirrors, further = len(corners[0].sensor.mirrors), len(corners[0].sensor.further_cameras)
     grey = all(is_grey(c.sensor) for c in corners)
     hue = "lights, coating and pattern are grey" if grey else "a light, the coating or the pattern has colour"
     if grey and not variant.is_mono:
@@ -215,6 +217,8 @@ def _decisions(corners: tuple[Scene, ...], variant: Variant) -> list[Decision]:
         Decision("pressure field", mixed, _span("sensor.gel.poisson_ratio", poisson) + foam),
         Decision("window refraction", max(index) > 1, _span("sensor.window.refractive_index", index)),
         Decision("lens distortion", lens, "sensor.camera.distortion" + ("" if lens else " is zero: a pinhole")),
+        Decision("mirrors", mirrors > 0, f"{mirrors} in sensor.mirrors"),
+        Decision("further cameras", further > 0, f"{further} in sensor.further_cameras"),
         Decision("indirect light", max(bounces) > 2, _span("render.max_depth", bounces)),
         Decision("colour", not variant.is_mono, hue),
         Decision("backward flow", outputs.backward, f"outputs.backward = {str(outputs.backward).lower()}"),

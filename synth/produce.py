@@ -15,7 +15,7 @@ import numpy as np
 from synth.arrays import FloatArray, Image
 from synth.dataset.images import Raster
 from synth.dataset.job import Job
-from synth.dataset.sample import ManifestEntry, Sample
+from synth.dataset.sample import CameraPair, ManifestEntry, Sample
 from synth.dataset.sample_files import write_sample_files
 from synth.errors import InputError
 from synth.flow.exact import exact_flow
@@ -26,7 +26,7 @@ from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
 from synth.render.variant import Variant
 from synth.sampling import MAX_DRAWS, Pair, draw, draw_sensor, pairs_of, sensor_of, stream
-from synth.scene import Scene
+from synth.scene import Camera, Scene
 from synth.simulate import State, Trajectory, simulate
 from synth.simulate.resolution import Resolution, resolve
 from synth.surface import ContactFaces, GelSurface
@@ -90,20 +90,27 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False)
 class _Finger:
-    """What all trajectories of one sensor share; `rest` is the radiance of its undeformed gel."""
+    """What all trajectories of one sensor share, by camera ("" is the main one) where there may be several.
+
+    Attributes:
+        sensor: its number.
+        optics: of each camera.
+        renderer: of all of them.
+        rest: radiance of the undeformed gel in each camera.
+    """
 
     sensor: int
-    optics: Optics
+    optics: dict[str, Optics]
     renderer: Renderer
-    rest: Image
+    rest: dict[str, Image]
 
 
 @dataclass(frozen=True, eq=False)
 class _Frame:
-    """A rendered state: vertex positions (v, 3) mm and radiance."""
+    """A rendered state: vertex positions (v, 3) mm, and radiance by camera."""
 
     positions: FloatArray
-    radiance: Image
+    radiance: dict[str, Image]
 
 
 class Producer:
@@ -182,8 +189,9 @@ class Producer:
             surface = flat_surface(scene.sensor.gel.size_mm)
             texture = albedo(scene.sensor, stream(self._place.template, self._place.job.seed, "pattern", sensor))
             renderer = Renderer(scene.sensor, scene.render, surface, texture, variant)
-            rest = renderer.radiance(surface.material, self._frame_seed("rest", sensor))
-            self._finger = _Finger(sensor, Optics.of(scene.sensor), renderer, rest)
+            rest = renderer.radiances(surface.material, self._frame_seed("rest", sensor))
+            optics = {name: Optics.of(view) for name, view in scene.sensor.views.items()}
+            self._finger = _Finger(sensor, optics, renderer, rest)
         return self._finger
 
     def _frame_seed(self, purpose: str, *numbers: int) -> int:
@@ -196,7 +204,7 @@ class Producer:
             return _Frame(surface.material, finger.rest)
         positions = surface.positions(result.states[frame].displacement[result.space.surface_nodes])
         finger.renderer.take(surface)
-        return _Frame(positions, finger.renderer.radiance(positions, self._frame_seed("frame", trajectory, frame)))
+        return _Frame(positions, finger.renderer.radiances(positions, self._frame_seed("frame", trajectory, frame)))
 
     def _sample(
         self,
@@ -209,15 +217,24 @@ class Producer:
         frames: Sequence[_Frame],
     ) -> Sample:
         first, second = (result.states[frame] for frame in pair.frames)
-        images = [self._photograph(scene, frame.radiance, pair.index, number) for number, frame in enumerate(frames)]
+        views = {}
+        for k, (name, view) in enumerate(scene.sensor.views.items()):
+            own = (k,) if k else ()  # of each further camera's noise
+            images = [
+                self._photograph(view.camera, frame.radiance[name], (pair.index, number, *own))
+                for number, frame in enumerate(frames)
+            ]
+            flow = _flow(scene, view.camera, finger.optics[name], surface, frames, second)
+            views[name] = CameraPair(images[0], images[1], flow)
+        main = views.pop("")
         return Sample(
             index=pair.index,
             trajectory=pair.trajectory,
             frames=pair.frames,
             seed=self._place.job.seed,
-            image1=images[0],
-            image2=images[1],
-            flow=_flow(scene, finger.optics, surface, frames, second),
+            image1=main.image1,
+            image2=main.image2,
+            flow=main.flow,
             scene=scene,
             surface=surface,
             displacement1=first.displacement[result.space.surface_nodes],
@@ -231,14 +248,15 @@ class Producer:
             },
             force_n=np.array([first.force_n, second.force_n]),
             torque_nmm=np.array([first.torque_nmm, second.torque_nmm]),
+            further=views,
         )
 
-    def _photograph(self, scene: Scene, radiance: Image, index: int, number: int) -> Raster:
-        """What the camera makes of a frame, with noise of its own for every image; grey where the variant is."""
-        rng = stream(self._place.template, self._place.job.seed, "noise", index, number)
+    def _photograph(self, camera: Camera, radiance: Image, numbers: tuple[int, ...]) -> Raster:
+        """What a camera makes of a frame, with noise of its own for every image; grey where the variant is."""
+        rng = stream(self._place.template, self._place.job.seed, "noise", *numbers)
         if self._place.variant.is_mono:
-            return camera_image(radiance[:, :, :1], scene.sensor.camera, rng)[:, :, 0]
-        return camera_image(radiance, scene.sensor.camera, rng)
+            return camera_image(radiance[:, :, :1], camera, rng)[:, :, 0]
+        return camera_image(radiance, camera, rng)
 
 
 def flat_surface(size_mm: tuple[float, float, float]) -> GelSurface:
@@ -248,9 +266,11 @@ def flat_surface(size_mm: tuple[float, float, float]) -> GelSurface:
     return GelSurface(ContactFaces(nodes, np.array([[0, 2, 1], [0, 3, 2]], dtype=np.int32)), 1)
 
 
-def _flow(scene: Scene, optics: Optics, surface: GelSurface, frames: Sequence[_Frame], pressed: State) -> FlowField:
+def _flow(
+    scene: Scene, camera: Camera, optics: Optics, surface: GelSurface, frames: Sequence[_Frame], pressed: State
+) -> FlowField:
     """The exact flow between two frames, with what else the scene's outputs ask for; `pressed` is the second state."""
-    outputs, camera = scene.outputs, scene.sensor.camera
+    outputs = scene.outputs
     traction = surface.interpolate_linear(pressed.traction) if outputs.traction else None
     touching = (np.linalg.norm(pressed.traction, axis=1, keepdims=True) > 0).astype(np.float64)
     return exact_flow(

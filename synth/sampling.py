@@ -65,7 +65,8 @@ def draw_sensor(template: Template, seed: int, sensor: int) -> SensorDraw:
         content = {part: replaced(template.content[part], choose) for part in _parts(template, of_trajectory=False)}
         try:
             validated(content.get("render", {}), str(template.source), Render, "render")
-            check_view(validated(content["sensor"], str(template.source), Sensor, "sensor"))
+            for view in validated(content["sensor"], str(template.source), Sensor, "sensor").views.values():
+                check_view(view)
         except InputError as error:
             rejected.append(str(error))
             continue

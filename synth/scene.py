@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from synth.scene_camera import Camera, FurtherCamera, Mirror
 from synth.scene_indenters import Color, Fraction, Indenter, NonNegative, Part, Positive, Vector2, Vector3
 
 
@@ -128,33 +129,6 @@ class Light(Part):
     """Radiant power, in units in which exposure 1 maps a radiance of 1 to full scale."""
 
 
-class Camera(Part):
-    """Brown-Conrady camera in air behind the window, and its sensor. Right is +x and down +y for a view along -z."""
-
-    width: Annotated[int, Field(ge=16, le=8192)]
-    height: Annotated[int, Field(ge=16, le=8192)]
-    fx: Positive
-    fy: Positive
-    cx: float
-    cy: float
-    position_mm: Vector3
-    look_at_mm: Vector3 = (0.0, 0.0, 0.0)
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """k1, k2, p1, p2, k3 as in OpenCV."""
-    exposure: Positive = 1.0
-    gamma: Annotated[float, Field(ge=0.2, le=4)] = 2.2
-    """Encoded value = linear value ** (1 / gamma)."""
-    blur_px: NonNegative = 0.0
-    """Standard deviation of the lens's Gaussian point spread."""
-    vignetting: Fraction = 0.0
-    """Relative loss of light at the image's corner, growing with the square of the distance from (cx, cy)."""
-    read_noise: Annotated[float, Field(ge=0, le=0.5)] = 0.0
-    """Standard deviation as a fraction of full scale, linear, independent of the signal."""
-    shot_noise: Annotated[float, Field(ge=0, le=0.5)] = 0.0
-    """Standard deviation at full scale; grows with the square root of the linear signal."""
-    bit_depth: Literal[8, 10, 12, 14, 16] = 8
-
-
 class Sensor(Part):
     """Everything that belongs to the finger."""
 
@@ -164,18 +138,42 @@ class Sensor(Part):
     pattern: Pattern
     lights: tuple[Light, ...] = Field(min_length=1)
     camera: Camera
+    further_cameras: tuple[FurtherCamera, ...] = ()
+    mirrors: tuple[Mirror, ...] = ()
+    """Between cameras and window. They take no part in the lighting: a mirror neither shades nor lights the gel."""
+
+    @property
+    def views(self) -> dict[str, "Sensor"]:
+        """The sensor as each camera sees it: the main camera's under "", the others' by their names."""
+        others = {camera.name: self.model_copy(update={"camera": camera}) for camera in self.further_cameras}
+        return {"": self, **others}
 
     @model_validator(mode="after")
     def _arranged(self) -> "Sensor":
         thickness = self.gel.size_mm[2]
         outside = thickness + self.window.thickness_mm
-        if self.camera.position_mm[2] <= outside:
-            raise ValueError(
-                f"camera.position_mm z = {self.camera.position_mm[2]} lies inside the sensor; "
-                f"it must be beyond the window, z > {outside} (gel {thickness} + window {self.window.thickness_mm})"
-            )
-        if self.camera.look_at_mm[2] >= self.camera.position_mm[2]:
-            raise ValueError("camera.look_at_mm must lie on the gel's side of the camera (smaller z)")
+        cameras: dict[str, Camera] = {"camera": self.camera}
+        cameras.update({f"further_cameras[{i}]": camera for i, camera in enumerate(self.further_cameras)})
+        for where, camera in cameras.items():
+            if camera.position_mm[2] <= outside:
+                raise ValueError(
+                    f"{where}.position_mm z = {camera.position_mm[2]} lies inside the sensor; "
+                    f"it must be beyond the window, z > {outside} (gel {thickness} + window {self.window.thickness_mm})"
+                )
+            if camera.look_at_mm[2] >= camera.position_mm[2] and not self.mirrors:
+                raise ValueError(
+                    f"{where}.look_at_mm must lie on the gel's side of the camera (smaller z); only a mirror could "
+                    "turn its view back"
+                )
+        names = [camera.name for camera in self.further_cameras]
+        if len(set(names)) < len(names):
+            raise ValueError(f"further_cameras: names must differ, they are {', '.join(names)}")
+        for i, mirror in enumerate(self.mirrors):
+            if mirror.lowest_mm <= outside:
+                raise ValueError(
+                    f"mirrors[{i}] reaches down to z = {mirror.lowest_mm:.4g}; mirrors stand in air, beyond the "
+                    f"window: z > {outside}"
+                )
         for i, light in enumerate(self.lights):
             if not 0 < light.position_mm[2] < outside:
                 raise ValueError(
@@ -239,7 +237,8 @@ class Numerics(Part):
     tolerance: Annotated[float, Field(ge=1e-12, le=1e-2)] = 1e-6
     """Newton stops when the residual is below this fraction of the reaction force."""
     penalty: Annotated[float, Field(ge=1, le=1e4)] = 50.0
-    """Contact stiffness in multiples of E per mm, before augmented-Lagrangian updates."""
+    """Contact stiffness in multiples of E per mm, before augmented-Lagrangian updates; sharp bodies get up to four times
+    as much."""
 
     @model_validator(mode="after")
     def _one_resolution(self) -> "Numerics":

@@ -44,7 +44,9 @@ Progress = Callable[[int, int], None]
 """Called with (samples done, samples in all)."""
 
 
-def export(path: Path | str, format: ExportFormat, out: Path | str, progress: Progress | None = None) -> int:
+def export(
+    path: Path | str, format: ExportFormat, out: Path | str, progress: Progress | None = None, camera: str = ""
+) -> int:
     """Writes all finished samples of a dataset in another format.
 
     Args:
@@ -52,13 +54,14 @@ def export(path: Path | str, format: ExportFormat, out: Path | str, progress: Pr
         format: see the module's docstring.
         out: a directory that is missing or empty; it appears when everything is written.
         progress: told after each sample.
+        camera: the name of a further camera, whose images and flow to write instead of the main camera's.
 
     Returns:
         How many samples were written.
 
     Raises:
-        InputError: Unknown format, `out` is not empty, no finished sample, a damaged file, a flow beyond KITTI's range,
-            or the storage refuses.
+        InputError: Unknown format or camera, `out` is not empty, no finished sample, a damaged file, a flow beyond
+            KITTI's range, or the storage refuses.
     """
     if format not in get_args(ExportFormat):
         raise InputError(f"--format {format}: unknown; allowed are {', '.join(get_args(ExportFormat))}")
@@ -73,7 +76,7 @@ def export(path: Path | str, format: ExportFormat, out: Path | str, progress: Pr
         try:
             shutil.rmtree(partial, ignore_errors=True)
             partial.mkdir(parents=True)
-            _write_all(dataset, format, partial, progress)
+            _write_all(dataset, format, partial, progress, camera)
             if final.exists():
                 final.rmdir()
             partial.rename(final)
@@ -83,14 +86,14 @@ def export(path: Path | str, format: ExportFormat, out: Path | str, progress: Pr
     return len(dataset.samples)
 
 
-def _write_all(dataset: Dataset, format: ExportFormat, out: Path, progress: Progress | None) -> None:
+def _write_all(dataset: Dataset, format: ExportFormat, out: Path, progress: Progress | None, camera: str) -> None:
     """Writes sample after sample; OSError where the storage refuses."""
     write = {"flo": _write_flo, "kitti": _write_kitti, "npz": _write_npz, "webdataset": _append_to_shard}[format]
     total = len(dataset.samples)
     for done, index in enumerate(dataset.samples):
-        source = dataset.path / SAMPLES_FOLDER / sample_name(index)
+        source = dataset.path / SAMPLES_FOLDER / sample_name(index) / camera
         target = out / f"shard-{done // SAMPLES_PER_SHARD:06d}.tar" if format == "webdataset" else out
-        write(target, sample_name(index), source, dataset.read(index))
+        write(target, sample_name(index), source, dataset.read(index, camera))
         if progress is not None:
             progress(done + 1, total)
 

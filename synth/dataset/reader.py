@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from synth.dataset.job import read_job_record
 from synth.dataset.jsontext import read_document
 from synth.dataset.lines import LineTable, read_line, scan_lines
 from synth.dataset.npz import read_npz
-from synth.dataset.sample import SAMPLES_FOLDER, ManifestEntry, sample_name
+from synth.dataset.sample import SAMPLES_FOLDER, CameraPair, ManifestEntry, further_cameras, sample_name
 from synth.dataset.writer import FAILURES_FILE, MANIFEST_FILE
 from synth.errors import InputError
 from synth.flow.field import FlowField
@@ -35,6 +35,21 @@ class SampleData:
     displacement1: FloatArray
     displacement2: FloatArray
     meta: Mapping[str, Any]
+    further: Mapping[str, CameraPair] = field(default_factory=dict)
+
+    def seen_by(self, camera: str) -> "SampleData":
+        """The same sample with the images and flow of one camera; "" is the main camera.
+
+        Raises:
+            InputError: there is no camera of that name.
+        """
+        if not camera:
+            return self
+        if camera not in self.further:
+            names = ", ".join(self.further) or "none"
+            raise InputError(f"the sample has no camera {camera!r}; beside the main camera it has: {names}")
+        pair = self.further[camera]
+        return replace(self, image1=pair.image1, image2=pair.image2, flow=pair.flow)
 
 
 @dataclass(frozen=True)
@@ -91,13 +106,13 @@ class Dataset:
         """
         return read_scene(self.folder(index))
 
-    def read(self, index: int) -> SampleData:
-        """The sample's files.
+    def read(self, index: int, camera: str = "") -> SampleData:
+        """The sample's files; image1, image2 and flow are those of the camera of that name, by default the main one.
 
         Raises:
-            InputError: No such sample, or a file is missing or damaged.
+            InputError: No such sample or camera, or a file is missing or damaged.
         """
-        return read_sample(self.folder(index))
+        return read_sample(self.folder(index)).seen_by(camera)
 
     def check_hashes(self, index: int) -> list[str]:
         """One message for each file whose content is not what the manifest says, or that is missing; empty: all well.
@@ -140,27 +155,38 @@ def read_sample(folder: Path) -> SampleData:
         InputError: A file is missing or damaged, or they do not fit each other.
     """
     meta = read_document(folder / "meta.json")
-    image1, image2 = read_png(folder / "image1.png"), read_png(folder / "image2.png")
-    flow = read_flow(folder / "flow.exr")
+    pair = read_pair(folder)
     names = ("nodes", "faces", "subdivisions", "displacement1", "displacement2")
     arrays = read_npz(folder / "surface.npz", names)
+    nodes = arrays["nodes"]
+    if any(arrays[name].shape != nodes.shape for name in ("displacement1", "displacement2")):
+        raise InputError(f"{folder / 'surface.npz'}: nodes and displacements differ in shape; the file is damaged")
+    return SampleData(
+        image1=pair.image1,
+        image2=pair.image2,
+        flow=pair.flow,
+        surface=GelSurface(ContactFaces(nodes, arrays["faces"].astype(np.int32)), int(arrays["subdivisions"])),
+        displacement1=arrays["displacement1"],
+        displacement2=arrays["displacement2"],
+        meta=meta,
+        further={name: read_pair(folder / name) for name in further_cameras(meta.get("scene", {}))},
+    )
+
+
+def read_pair(folder: Path) -> CameraPair:
+    """One camera's images and flow.
+
+    Raises:
+        InputError: A file is missing or damaged, or they do not fit each other.
+    """
+    image1, image2 = read_png(folder / "image1.png"), read_png(folder / "image2.png")
+    flow = read_flow(folder / "flow.exr")
     size = flow.forward.shape[:2]
     if image1.shape[:2] != size or image2.shape != image1.shape:
         raise InputError(
             f"{folder}: image1.png is {image1.shape}, image2.png {image2.shape}, flow.exr {size}; they must agree"
         )
-    nodes = arrays["nodes"]
-    if any(arrays[name].shape != nodes.shape for name in ("displacement1", "displacement2")):
-        raise InputError(f"{folder / 'surface.npz'}: nodes and displacements differ in shape; the file is damaged")
-    return SampleData(
-        image1=image1,
-        image2=image2,
-        flow=flow,
-        surface=GelSurface(ContactFaces(nodes, arrays["faces"].astype(np.int32)), int(arrays["subdivisions"])),
-        displacement1=arrays["displacement1"],
-        displacement2=arrays["displacement2"],
-        meta=meta,
-    )
+    return CameraPair(image1, image2, flow)
 
 
 def read_scene(folder: Path) -> Scene:

@@ -13,12 +13,35 @@ from synth.scene import Scene
 from synth.surface import GelSurface
 
 SAMPLES_FOLDER = "samples"
-SAMPLE_FILES = ("image1.png", "image2.png", "flow.exr", "meta.json", "surface.npz")
+VIEW_FILES = ("image1.png", "image2.png", "flow.exr")
+"""Of each camera: the main camera's in the sample's folder, another's in a folder of its name therein."""
+SAMPLE_FILES = (*VIEW_FILES, "meta.json", "surface.npz")
 
 
 def sample_name(index: int) -> str:
     """Name of a sample's folder: the index with at least six digits."""
     return f"{index:06d}"
+
+
+def further_cameras(scene: Mapping[str, Any]) -> list[str]:
+    """Names of the cameras beside the main one, from a scene as JSON holds it."""
+    cameras = scene.get("sensor", {}).get("further_cameras", ())
+    return [str(camera["name"]) for camera in cameras] if isinstance(cameras, list | tuple) else []
+
+
+@dataclass(frozen=True)
+class CameraPair:
+    """What one camera contributes to a sample: fields as of `Sample`."""
+
+    image1: Raster
+    image2: Raster
+    flow: FlowField
+
+    def __post_init__(self) -> None:
+        """Refuses parts that do not fit each other (a programming error)."""
+        size = self.flow.forward.shape[:2]
+        if self.image1.shape[:2] != size or self.image2.shape != self.image1.shape:
+            raise ValueError(f"images of {self.image1.shape} and {self.image2.shape} with a flow of {size}")
 
 
 @dataclass(frozen=True)
@@ -30,7 +53,7 @@ class Sample:
         trajectory: number of the trajectory that its frames belong to.
         frames: (i, j), states of that trajectory shown in image 1 and image 2.
         seed: of the job.
-        image1, image2: (H, W) grey or (H, W, 3) RGB, uint8 or uint16 (full scale 65535).
+        image1, image2: (H, W) grey or (H, W, 3) RGB, uint8 or uint16 (full scale 65535), of the main camera.
         flow: (H, W) fields.
         scene: the draw that was simulated and rendered.
         surface: what was rendered and traced.
@@ -39,6 +62,7 @@ class Sample:
             twist_deg, converged, newton_iterations, residual, min_jacobian, max_penetration_mm).
         force_n, torque_nmm: (2, 3) of the indenter on the gel, per frame.
         seconds: stage -> wall time.
+        further: what the other cameras saw, by their names.
     """
 
     index: int
@@ -56,13 +80,12 @@ class Sample:
     force_n: FloatArray = field(default_factory=lambda: np.zeros((2, 3)))
     torque_nmm: FloatArray = field(default_factory=lambda: np.zeros((2, 3)))
     seconds: Mapping[str, float] = field(default_factory=dict)
+    further: Mapping[str, CameraPair] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Refuses parts that do not fit each other (a programming error)."""
-        size = self.flow.forward.shape[:2]
+        CameraPair(self.image1, self.image2, self.flow)
         nodes = self.surface.coarse.nodes.shape
-        if self.image1.shape[:2] != size or self.image2.shape != self.image1.shape:
-            raise ValueError(f"images of {self.image1.shape} and {self.image2.shape} with a flow of {size}")
         if self.displacement1.shape != nodes or self.displacement2.shape != nodes:
             raise ValueError(
                 f"displacements of {self.displacement1.shape} and {self.displacement2.shape} at {nodes} nodes"
@@ -71,7 +94,11 @@ class Sample:
 
 @dataclass(frozen=True)
 class ManifestEntry:
-    """A line of manifest.jsonl. `sha256` is by file name; `max_flow_px` is None where no pixel sees the gel."""
+    """A line of manifest.jsonl.
+
+    `sha256` is by file name, "left/flow.exr" for a further camera's; `max_flow_px` is the main camera's, None where no
+    pixel of it sees the gel.
+    """
 
     index: int
     trajectory: int

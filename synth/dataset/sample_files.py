@@ -2,6 +2,7 @@
 
 import hashlib
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from synth.dataset.images import encode_png
 from synth.dataset.job import Job
 from synth.dataset.jsontext import jsonable, to_document
 from synth.dataset.npz import encode_npz
-from synth.dataset.sample import SAMPLES_FOLDER, ManifestEntry, Sample, largest_motion, sample_name
+from synth.dataset.sample import SAMPLES_FOLDER, CameraPair, ManifestEntry, Sample, largest_motion, sample_name
 from synth.dataset.storage import install_folder, partial_name, storage_errors
 
 
@@ -33,19 +34,19 @@ def write_sample_files(directory: Path, sample: Sample, job: Job) -> ManifestEnt
     """
     final = directory / SAMPLES_FOLDER / sample_name(sample.index)
     partial = partial_name(final)
-    files = {
-        "image1.png": encode_png(sample.image1),
-        "image2.png": encode_png(sample.image2),
-        "meta.json": to_document(_meta(sample, job)).encode("utf-8"),
-        "surface.npz": _surface(sample),
-    }
+    files = {"meta.json": to_document(_meta(sample, job)).encode("utf-8"), "surface.npz": _surface(sample)}
+    views = {"": CameraPair(sample.image1, sample.image2, sample.flow), **sample.further}
     with storage_errors(final):
         try:
             partial.mkdir(parents=True)
             for name, content in files.items():
                 (partial / name).write_bytes(content)
-            write_flow(partial / "flow.exr", sample.flow, _attributes(sample, job))
-            sha256 = {file.name: hashlib.sha256(file.read_bytes()).hexdigest() for file in sorted(partial.iterdir())}
+            for camera, pair in views.items():
+                _write_view(partial / camera, pair, _attributes(sample, job, camera))
+            written = sorted(file for file in partial.rglob("*") if file.is_file())
+            sha256 = {
+                file.relative_to(partial).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest() for file in written
+            }
             install_folder(partial, final)
         except BaseException:
             shutil.rmtree(partial, ignore_errors=True)
@@ -64,9 +65,19 @@ def write_sample_files(directory: Path, sample: Sample, job: Job) -> ManifestEnt
     )
 
 
-def _attributes(sample: Sample, job: Job) -> dict[str, str | int]:
+def _write_view(folder: Path, pair: CameraPair, attributes: Mapping[str, str | int]) -> None:
+    """Images and flow of one camera."""
+    folder.mkdir(exist_ok=True)
+    (folder / "image1.png").write_bytes(encode_png(pair.image1))
+    (folder / "image2.png").write_bytes(encode_png(pair.image2))
+    write_flow(folder / "flow.exr", pair.flow, attributes)
+
+
+def _attributes(sample: Sample, job: Job, camera: str) -> dict[str, str | int]:
     """Of flow.exr. The seed is text: OpenEXR's integers have 32 bits."""
+    named = {"camera": camera} if camera else {}
     return {
+        **named,
         "scene.name": job.scene_name,
         "scene.hash": job.scene_hash,
         "seed": str(sample.seed),

@@ -76,8 +76,8 @@ def install_folder(partial: Path, final: Path) -> None:
     Raises:
         OSError: The storage refuses.
     """
-    for file in partial.iterdir():
-        flush(file)
+    for entry in partial.rglob("*"):  # files and folders
+        flush(entry)
     flush(partial)
     if final.exists():
         old = final.with_name(f".{final.name}.old{PARTIAL}{os.getpid()}")

@@ -3,7 +3,8 @@
     DIR/dataset.json      the job
     DIR/manifest.jsonl    a line per finished sample
     DIR/failures.jsonl    a line per failed draw
-    DIR/samples/000000/   image1.png image2.png flow.exr meta.json surface.npz
+    DIR/samples/000000/   image1.png image2.png flow.exr meta.json surface.npz, and for each further camera a folder of
+                          its name with its own image1.png image2.png flow.exr
     DIR/.lock             held by the process that writes
 
 A sample is finished when its folder is whole and its line is in the manifest, written in this order. Whatever a killed
@@ -19,7 +20,15 @@ from synth.dataset.job import DATASET_FILE, Job, continued, differences, read_jo
 from synth.dataset.jsontext import to_document
 from synth.dataset.lines import append_line, rewrite_lines, scan_lines
 from synth.dataset.lock import LOCK_FILE, DirectoryLock
-from synth.dataset.sample import SAMPLE_FILES, SAMPLES_FOLDER, ManifestEntry, Sample, sample_name
+from synth.dataset.sample import (
+    SAMPLE_FILES,
+    SAMPLES_FOLDER,
+    VIEW_FILES,
+    ManifestEntry,
+    Sample,
+    further_cameras,
+    sample_name,
+)
 from synth.dataset.sample_files import write_sample_files
 from synth.dataset.storage import PARTIAL, remove_partials, replace_file, storage_errors
 from synth.errors import InputError
@@ -175,7 +184,8 @@ class DatasetWriter:
 
     def _is_whole(self, index: int) -> bool:
         folder = self.directory / SAMPLES_FOLDER / sample_name(index)
-        return all((folder / name).is_file() for name in SAMPLE_FILES)
+        names = [f"{camera}/{name}" for camera in further_cameras(self.job.scene) for name in VIEW_FILES]
+        return all((folder / name).is_file() for name in (*SAMPLE_FILES, *names))
 
 
 def _check_place(directory: Path) -> None:

@@ -4,11 +4,14 @@ The ray of each pixel centre of one image is traced to the deformed surface (`sy
 barycentric coordinates that it hits name a material point; that point's position in the other state is projected into
 the other image (`synth.optics`). Nothing is interpolated over the image, and neither state has to be undeformed.
 
-A point is visible in the other image where its pixel lies inside that image (0 <= x < width, 0 <= y < height) and
-nothing of the surface lies in front of it along the ray of that pixel.
+A pixel that looks by a mirror gets the motion of its point's image in the same mirror, and one that looks straight that
+of the image seen straight: `synth.optics` numbers these paths. A point is visible in the other image where its pixel
+lies inside that image (0 <= x < width, 0 <= y < height), that pixel looks by the same path (it has not left the
+mirror, and no mirror stands before it), and nothing of the surface lies in front of it along the ray of that pixel.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -17,7 +20,7 @@ from synth.errors import InputError
 from synth.flow.field import FlowArray, FlowField
 from synth.flow.normals import vertex_normals
 from synth.flow.trace import Hits, trace
-from synth.optics import Optics
+from synth.optics import Optics, Rays
 from synth.surface import GelSurface
 
 OCCLUSION_TOLERANCE_MM = 1e-6
@@ -55,8 +58,9 @@ def exact_flow(
         width: columns of both images.
         height: rows of both images.
         backward: also the flow from image 2 to image 1.
-        depth: depth1.Z and depth2.Z, mm: distance of the surface point from the camera along the camera's viewing axis,
-            measured straight through the window (where the point is, not where refraction makes it appear).
+        depth: depth1.Z and depth2.Z, mm: distance of the surface point from the camera along the camera's viewing axis
+            (folded where the pixel looks by a mirror), measured straight through the window: where the point is, not
+            where refraction makes it appear.
         normal: normal1.X/Y/Z and normal2.X/Y/Z: unit, smooth across triangles, pointing from the surface into the gel,
             toward the camera.
         displacement: displacement.X/Y/Z, mm: state 2 minus state 1 at the pixels of image 1.
@@ -86,7 +90,8 @@ def exact_flow(
     hits2 = view.first_hits(positions2) if backward or depth or normal else None
     if depth and hits2 is not None:
         for number, hits, positions in (("1", hits1, positions1), ("2", hits2, positions2)):
-            extras[f"depth{number}.Z"] = view.image(optics.depth(hits.interpolate(triangles, positions)))
+            depths = optics.depth(hits.interpolate(triangles, positions), view.own.path)
+            extras[f"depth{number}.Z"] = view.image(depths)
     if normal and hits2 is not None:
         for number, hits, positions in (("1", hits1, positions1), ("2", hits2, positions2)):
             smooth = hits.interpolate(triangles, -vertex_normals(positions, triangles))
@@ -113,30 +118,36 @@ class _View:
     height: int
     device: str
 
-    @property
+    @cached_property
     def centres(self) -> Pixels:
         row, column = np.mgrid[: self.height, : self.width]
         return np.column_stack([column.ravel() + 0.5, row.ravel() + 0.5])
 
+    @cached_property
+    def own(self) -> Rays:
+        """The rays of the pixel centres."""
+        return self.optics.look(self.centres)
+
     def first_hits(self, positions: Points) -> Hits:
         """What the pixel centres see of a state."""
-        return trace(positions, self.triangles, *self.optics.rays(self.centres), device=self.device)
+        return trace(positions, self.triangles, self.own.origins, self.own.directions, device=self.device)
 
     def motion(self, hits: Hits, target: Points) -> tuple[FlowArray, FlowArray]:
         """Flow (H, W, 2) and visibility (H, W) of the hits' material points when the surface moves to `target`."""
         points = hits.interpolate(self.triangles, target)
-        pixels = self.optics.project(points)
+        pixels = self.optics.project(points, self.own.path)
         with np.errstate(invalid="ignore"):
             inside: BoolArray = np.all((pixels >= 0) & (pixels < (self.width, self.height)), axis=1)
         visible = inside.copy()
-        visible[inside] = self._is_unobstructed(points[inside], pixels[inside], target)
+        rays = self.optics.look(pixels[inside])
+        same = rays.path == self.own.path[inside]
+        visible[inside] = same & self._is_unobstructed(points[inside], rays, target)
         flow = (pixels - self.centres).astype(np.float32).reshape(self.height, self.width, 2)
         return flow, self.image(visible)
 
-    def _is_unobstructed(self, points: Points, pixels: Pixels, positions: Points) -> BoolArray:
-        origins, directions = self.optics.rays(pixels)
-        distance = np.linalg.norm(points - origins, axis=1)
-        first = trace(positions, self.triangles, origins, directions, device=self.device).distance
+    def _is_unobstructed(self, points: Points, rays: Rays, positions: Points) -> BoolArray:
+        distance = np.linalg.norm(points - rays.origins, axis=1)
+        first = trace(positions, self.triangles, rays.origins, rays.directions, device=self.device).distance
         return first >= distance - OCCLUSION_TOLERANCE_MM
 
     def image(self, values: FloatArray | BoolArray) -> FlowArray:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from synth.dataset.images import encode_png
 from synth.dataset.storage import replace_file
 from synth.inspection.arrows import Arrows
-from synth.inspection.inspection import Inspection, evenly_spaced
+from synth.inspection.inspection import Inspection
 from synth.inspection.panels import CLOSURE_RANGE_PX, Panel, image_picture, panels_of
 from synth.inspection.table import about_rows
 from synth.inspection.text import facts, percent, short
@@ -20,7 +20,7 @@ from synth.inspection.view import View
 from synth.inspection.wheel import flow_colours, robust_scale, wheel_legend
 
 PICTURED = 24
-"""Samples of a dataset that are shown with pictures, evenly spaced."""
+"""Samples (and cameras) of a dataset that are shown with pictures, evenly spaced."""
 
 _STYLE = """
 :root { color-scheme: light dark; --line: #8885; --soft: #8881; }
@@ -71,14 +71,17 @@ _NOTE = (
 
 
 def _view_body(inspection: Inspection) -> str:
-    view = inspection.view(0)
-    numbers = inspection.numbers[0]
-    return f"<h1>{escape(str(inspection.path))}</h1>\n{_facts(facts(numbers))}\n{_pictures(view, numbers)}"
+    parts = [f"<h1>{escape(str(inspection.path))}</h1>"]
+    for number, numbers in enumerate(inspection.numbers):
+        if number:
+            parts.append(f"<h2>{escape(numbers['name'])}</h2>")
+        parts += [_facts(facts(numbers)), _pictures(inspection.view(number), numbers)]
+    return "\n".join(parts)
 
 
 def _dataset_body(inspection: Inspection) -> str:
     """Facts, a row per sample, then each pictured sample in full."""
-    pictured = set(evenly_spaced(len(inspection.places), PICTURED))
+    pictured = set(inspection.spread(PICTURED))
     rows, sections = [], []
     for number, numbers in enumerate(inspection.numbers):
         view = inspection.view(number) if number in pictured else None

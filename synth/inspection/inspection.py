@@ -8,10 +8,12 @@ from typing import Any, Literal
 import numpy as np
 
 from synth.dataset.job import DATASET_FILE
+from synth.dataset.jsontext import read_document
 from synth.dataset.reader import read_dataset
+from synth.dataset.sample import further_cameras
 from synth.errors import InputError
 from synth.inspection.numbers import numbers_of
-from synth.inspection.view import View, view_flow, view_sample
+from synth.inspection.view import META_FILE, View, view_flow, view_sample
 
 Kind = Literal["dataset", "sample", "flow"]
 Progress = Callable[[int, int], None]
@@ -28,8 +30,10 @@ class Inspection:
         kind: what `path` is.
         path: as given.
         about: facts of the whole: scene, seed, device ...; empty for a sample or flow file.
-        places: folder or file of each view that was looked at.
+        places: folder or file of each view that was looked at; of a sample with further cameras first its own folder,
+            then theirs.
         numbers: of each of them, see `synth.inspection.numbers.numbers_of`.
+        cameras: how many of the places belong to one sample.
     """
 
     kind: Kind
@@ -37,6 +41,12 @@ class Inspection:
     about: Mapping[str, Any]
     places: tuple[Path, ...]
     numbers: tuple[dict[str, Any], ...]
+    cameras: int = 1
+
+    def spread(self, count: int) -> list[int]:
+        """Numbers of the places of at most about `count`, evenly spaced; all cameras of a sample or none."""
+        samples = evenly_spaced(len(self.places) // self.cameras, max(1, count // self.cameras))
+        return [sample * self.cameras + camera for sample in samples for camera in range(self.cameras)]
 
     @property
     def title(self) -> str:
@@ -81,12 +91,20 @@ def inspect(path: Path | str, limit: int = 100, progress: Progress | None = None
         about, folders = _about(place)
         places = [folders[i] for i in evenly_spaced(len(folders), limit)]
         about["inspected"] = len(places)
+    names = _further(places[0]) if places and kind != "flow" else []
+    places = [folder / name for folder in places for name in ("", *names)]
     numbers = []
     for done, item in enumerate(places):
         numbers.append(numbers_of(_look(kind, item)))
         if progress is not None:
             progress(done + 1, len(places))
-    return Inspection(kind, place, about, tuple(places), tuple(numbers))
+    return Inspection(kind, place, about, tuple(places), tuple(numbers), 1 + len(names))
+
+
+def _further(folder: Path) -> list[str]:
+    """Names of the further cameras of a sample's folder."""
+    path = folder / META_FILE
+    return further_cameras(read_document(path).get("scene", {})) if path.exists() else []
 
 
 def _kind_of(place: Path) -> Kind:

@@ -1,4 +1,4 @@
-"""A PNG sheet: of a sample or flow file every picture large, of a dataset a row of pictures per sample.
+"""A PNG sheet: of a sample or flow file every picture large, of a dataset a row of pictures per sample and camera.
 
 Everything is drawn into one axes whose unit is an inch, with the origin in the upper left; an axes for each of a
 dataset's 72 pictures would take several times as long.
@@ -12,7 +12,7 @@ import numpy as np
 
 from synth.dataset.images import encode_png
 from synth.dataset.storage import replace_file
-from synth.inspection.inspection import Inspection, evenly_spaced
+from synth.inspection.inspection import Inspection
 from synth.inspection.panels import CLOSURE_MAP, CLOSURE_RANGE_PX, Panel, panels_of
 from synth.inspection.text import facts
 from synth.inspection.wheel import wheel_legend
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 ROWS = 8
-"""Samples on the sheet of a dataset, evenly spaced."""
+"""Rows on the sheet of a dataset, evenly spaced."""
 _DPI = 100
 _COLUMNS = 3
 _TOP, _MARGIN, _GAP = 0.4, 0.12, 0.1
@@ -60,29 +60,35 @@ def write_sheet(inspection: Inspection, png: Path | str) -> None:
 
 
 def _draw_view(figure: "Figure", inspection: Inspection) -> None:
-    """Pictures in three columns, all numbers to the right."""
-    view, numbers = inspection.view(0), inspection.numbers[0]
-    panels = panels_of(view, numbers)
-    rows = -(-len(panels) // _COLUMNS)
+    """Pictures in three columns, all numbers to the right; a block of both for each camera."""
     width, caption, beside = 4.2, 0.3, 4.0
-    height = width * view.size[0] / view.size[1]
     right = _MARGIN + _COLUMNS * (width + _GAP)
-    lines = [line for name, value in facts(numbers) for line in (name, f"    {value}")]
-    tall = max(rows * (height + caption), 0.185 * len(lines))
-    axes = _page(figure, right + beside, _TOP + tall + _MARGIN, str(inspection.path))
-    for place, panel in enumerate(panels):
-        row, column = divmod(place, _COLUMNS)
-        x, y = _MARGIN + column * (width + _GAP), _TOP + row * (height + caption) + caption
-        _draw(axes, panel, _Cell(x, y, width, height, letters=10))
-    axes.text(right + _GAP, _TOP + caption, "\n".join(lines), va="top", fontsize=9.5, linespacing=1.3)
+    views = [inspection.view(number) for number in range(len(inspection.places))]
+    blocks = [panels_of(view, numbers) for view, numbers in zip(views, inspection.numbers, strict=True)]
+    texts = [[line for name, value in facts(n) for line in (name, f"    {value}")] for n in inspection.numbers]
+    heights = [width * view.size[0] / view.size[1] for view in views]
+    tall = [
+        max(-(-len(panels) // _COLUMNS) * (height + caption), 0.185 * len(lines))
+        for panels, height, lines in zip(blocks, heights, texts, strict=True)
+    ]
+    axes = _page(figure, right + beside, _TOP + sum(tall) + _MARGIN, str(inspection.path))
+    top = _TOP
+    for number, panels in enumerate(blocks):
+        for place, panel in enumerate(panels):
+            row, column = divmod(place, _COLUMNS)
+            x, y = _MARGIN + column * (width + _GAP), top + row * (heights[number] + caption) + caption
+            _draw(axes, panel, _Cell(x, y, width, heights[number], letters=10))
+        named = [views[number].name, *texts[number]] if len(views) > 1 else texts[number]
+        axes.text(right + _GAP, top + caption, "\n".join(named), va="top", fontsize=9.5, linespacing=1.3)
+        top += tall[number]
 
 
 def _draw_dataset(figure: "Figure", inspection: Inspection) -> None:
-    """A row per sample, a column per picture."""
+    """A row per sample and camera, a column per picture."""
     about = inspection.about
     title = f"{inspection.path}: {about['finished']} of {about['n']} samples"
     title += f", scene {about['scene']}, seed {about['seed']}"
-    chosen = evenly_spaced(len(inspection.places), ROWS)
+    chosen = inspection.spread(ROWS)
     if not chosen:
         _page(figure, 8.0, 1.0, title)
         return

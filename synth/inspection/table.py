@@ -32,12 +32,14 @@ def _solver(numbers: dict[str, Any]) -> dict[str, Any]:
 
 
 def tables(inspection: Inspection) -> list[Table]:
-    """For `rich.console.Console.print`: of a dataset its facts and a row per sample, else one table of all numbers."""
+    """For `rich.console.Console.print`: of a dataset its facts and a row per sample and camera, else all numbers."""
     if inspection.kind != "dataset":
-        table = _pairs(str(inspection.path))
-        for name, value in facts(inspection.numbers[0]):
-            table.add_row(name, value)
-        return [table]
+        found = []
+        for place, numbers in zip(inspection.places, inspection.numbers, strict=True):
+            found.append(_pairs(str(place)))
+            for name, value in facts(numbers):
+                found[-1].add_row(name, value)
+        return found
     about = _pairs(str(inspection.path))
     for name, value in about_rows(inspection):
         about.add_row(name, value)

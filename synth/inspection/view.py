@@ -24,6 +24,8 @@ from synth.dataset.jsontext import read_document
 from synth.flow.field import FlowField
 from synth.inspection.interpolation import sample_at
 
+META_FILE = "meta.json"
+
 
 @dataclass(frozen=True)
 class View:
@@ -90,15 +92,16 @@ class View:
 
 
 def view_sample(folder: Path) -> View:
-    """Of a sample's folder.
+    """Of a sample's folder, or of a further camera's folder therein.
 
     Raises:
         InputError: A file is missing or damaged.
     """
-    meta = read_document(folder / "meta.json")
+    is_further = not (folder / META_FILE).exists() and (folder.parent / META_FILE).exists()
+    meta = read_document((folder.parent if is_further else folder) / META_FILE)
     channels, _ = read_channels(folder / "flow.exr")
     return View(
-        name=folder.name,
+        name=f"{folder.parent.name}/{folder.name}" if is_further else folder.name,
         flow=flow_of(folder / "flow.exr", channels),
         image1=read_png(folder / "image1.png"),
         image2=read_png(folder / "image2.png"),

@@ -49,9 +49,9 @@ def expected_signal(radiance: Image, camera: Camera) -> FloatArray:
         import cv2
 
         radius = max(1, math.ceil(4 * camera.blur_px))  # the tail beyond 4 sigma holds 6e-5 of a Gaussian's weight
-        signal = cv2.GaussianBlur(
-            signal, (2 * radius + 1, 2 * radius + 1), camera.blur_px, borderType=cv2.BORDER_REPLICATE
-        )
+        size = (2 * radius + 1, 2 * radius + 1)
+        blurred = cv2.GaussianBlur(signal, size, camera.blur_px, borderType=cv2.BORDER_REPLICATE)
+        signal = blurred.reshape(signal.shape)  # OpenCV drops the axis of a single channel
     if camera.vignetting > 0:
         signal = signal * vignette(camera)[:, :, None]
     return camera.exposure * signal

@@ -1,7 +1,7 @@
 r"""Rays through the camera's pixels, for Mitsuba.
 
-Vectorised variants get every lens exactly: rays are made here and start inside the body, refracted by Snell's law at
-the window's outer face and weighted by
+Vectorised variants get every lens and mirror exactly: rays are made here and start inside the body, refracted by
+Snell's law at the window's outer face and weighted by
 
 .. math::  \frac{1 - F(\theta)}{n^2},
 
@@ -9,18 +9,20 @@ Fresnel's transmittance for unpolarised light and the radiance law for the passa
 tracer finds on average behind a smooth dielectric, without its noise.
 
 Scalar variants trace far too slowly from Python and use Mitsuba's own pinhole camera, which knows square pixels and no
-lens distortion.
+lens distortion, fisheye or mirror.
 """
 
 import math
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from synth.arrays import Pixels
+from synth.arrays import FloatArray
 from synth.errors import InputError
 from synth.optics import Optics
+from synth.optics.mirror import FlatMirror
 from synth.render.gel_mesh import MIRROR
 from synth.render.variant import LLVM_HINT
 from synth.scene import Camera, Sensor
@@ -37,21 +39,27 @@ class CameraRays:
 
         optics, camera = Optics.of(sensor), sensor.camera
         self._mi, self._dr, self._width = mi, dr, dr.opaque(mi.UInt32, camera.width)
-        self._focal = [dr.opaque(mi.Float, value) for value in optics.focal]
-        self._centre = [dr.opaque(mi.Float, value) for value in optics.centre]
-        axes = (optics.right, optics.down, optics.forward, optics.position)
-        self._right, self._down, self._forward, self._position = (
-            mi.Vector3f(*(dr.opaque(mi.Float, value) for value in axis * MIRROR)) for axis in axes
-        )
+        self._focal = [dr.opaque(mi.Float, value) for value in optics.lens.focal]
+        self._centre = [dr.opaque(mi.Float, value) for value in optics.lens.centre]
+        pose = optics.pose
+        axes = (pose.right, pose.down, pose.forward, pose.position)
+        self._right, self._down, self._forward, self._position = (self._vector(axis) for axis in axes)
+        self._mirrors = [_Mirror.of(mirror, self._vector, mi, dr) for mirror in optics.mirrors]
         self._refracts = optics.index != 1
         self._index = dr.opaque(mi.Float, optics.index)
         self._face = dr.opaque(mi.Float, optics.face_z)
-        self._distortion = [dr.opaque(mi.Float, k) for k in optics.distortion] if any(optics.distortion) else None
-        if self._distortion is not None:
-            undistorted = _undistorted_centres(optics, camera)
-            self._seen = mi.Bool(np.isfinite(undistorted[:, 0]))
-            start = np.nan_to_num(undistorted).astype(np.float32)
-            self._start = [mi.Float(np.ascontiguousarray(start[:, axis])) for axis in (0, 1)]
+        self._is_fisheye = camera.lens == "fisheye"
+        self._distortion = [dr.opaque(mi.Float, k) for k in camera.distortion] if any(camera.distortion) else None
+        if self._distortion is not None or self._is_fisheye:
+            local = _centres(optics, camera)
+            self._seen = mi.Bool(np.isfinite(local[:, 0]))
+            start = np.nan_to_num(local).astype(np.float32)
+            self._start = [mi.Float(np.ascontiguousarray(start[:, axis])) for axis in range(start.shape[1])]
+
+    def _vector(self, vector: FloatArray) -> Any:
+        """A vector (3,) of the scene in the renderer's frame."""
+        mi, dr = self._mi, self._dr
+        return mi.Vector3f(*(dr.opaque(mi.Float, value) for value in vector * MIRROR))
 
     def sample(self, pixel: Any, offset: Any) -> tuple[Any, Any, Any]:
         """Rays through points of pixels.
@@ -68,20 +76,64 @@ class CameraRays:
         x = (mi.Float(column) - self._centre[0] + offset.x) / self._focal[0]
         y = (mi.Float(row) - self._centre[1] + offset.y) / self._focal[1]
         valid = mi.Bool(True)
-        if self._distortion is not None:
+        forward = self._forward
+        if self._is_fisheye:
+            valid = dr.gather(mi.Bool, self._seen, pixel)
+            x, y, along = self._unbend(pixel, x, y)
+            forward = forward * along
+        elif self._distortion is not None:
             valid = dr.gather(mi.Bool, self._seen, pixel)
             x, y = self._undistort(pixel, x, y)
-        air = dr.normalize(self._right * x + self._down * y + self._forward)
+        air = dr.normalize(self._right * x + self._down * y + forward)
+        eye = self._position
+        if self._mirrors:
+            eye, air, unhindered = self._reflect(air)
+            valid &= unhindered
         if not self._refracts:
-            return mi.RayDifferential3f(mi.Ray3f(mi.Point3f(self._position), air)), mi.Float(1), valid
+            return mi.RayDifferential3f(mi.Ray3f(mi.Point3f(eye), air)), mi.Float(1), valid
         valid &= air.z < 0
-        origin = self._position + air * ((self._face - self._position.z) / air.z)
+        origin = eye + air * ((self._face - eye.z) / air.z)
         origin.z = self._face
         across = mi.Vector2f(air.x, air.y) / self._index
         inside = mi.Vector3f(across.x, across.y, -dr.sqrt(dr.maximum(1 - dr.squared_norm(across), 0)))
         reflected, *_ = mi.fresnel(-air.z, self._index)
         ray = mi.RayDifferential3f(mi.Ray3f(mi.Point3f(origin + inside * _START_MM), inside))
         return ray, (1 - reflected) / dr.square(self._index), valid
+
+    def _reflect(self, air: Any) -> tuple[Any, Any, Any]:
+        """Where rays in air start after their mirror, their directions, and whether they may go on.
+
+        The rules are those of `synth.optics.mirror.first_met`, for every sample by itself: a pixel on a mirror's edge
+        sees both sides.
+        """
+        mi, dr = self._mi, self._dr
+        start, onward = mi.Vector3f(self._position), mi.Vector3f(air)
+        nearest, which, free = mi.Float(dr.inf), mi.UInt32(0), mi.Bool(True)
+        for number, mirror in enumerate(self._mirrors, 1):
+            distance, facing = mirror.met(self._position, air)
+            closer = distance < nearest
+            nearest, which = dr.select(closer, distance, nearest), dr.select(closer, number, which)
+            free = dr.select(closer, facing, free)
+            start = dr.select(closer, self._position + air * distance, start)
+            onward = dr.select(closer, air - 2 * dr.dot(air, mirror.normal) * mirror.normal, onward)
+        for number, mirror in enumerate(self._mirrors, 1):
+            free &= (which == 0) | (which == number) | ~dr.isfinite(mirror.met(start, onward)[0])
+        return start, onward, free
+
+    def _unbend(self, pixel: Any, x: Any, y: Any) -> tuple[Any, Any, Any]:
+        """Direction through a fisheye lens: Newton from the pixel centre's angle, as `_undistort`."""
+        dr = self._dr
+        radius = dr.sqrt(x * x + y * y)
+        angle = radius
+        if self._distortion is not None:
+            k1, k2, k3, k4 = self._distortion
+            angle = dr.gather(type(x), self._start[2], pixel)
+            for _ in range(2):
+                s = angle * angle
+                miss = angle * (1 + s * (k1 + s * (k2 + s * (k3 + s * k4)))) - radius
+                angle = angle - miss / (1 + s * (3 * k1 + s * (5 * k2 + s * (7 * k3 + s * 9 * k4))))
+        scale = dr.select(radius > 1e-6, dr.sin(angle) / radius, 1)
+        return x * scale, y * scale, dr.cos(angle)
 
     def _undistort(self, pixel: Any, x: Any, y: Any) -> tuple[Any, Any]:
         """Newton from the pixel centre's solution: two steps leave (half a pixel / f)⁴, below float32's rounding."""
@@ -102,14 +154,45 @@ class CameraRays:
         return u, v
 
 
+@dataclass(frozen=True, eq=False)
+class _Mirror:
+    """A mirror of `synth.optics.mirror` in the renderer's frame, opaque to Dr.Jit."""
+
+    centre: Any
+    axes: tuple[Any, Any]
+    normal: Any
+    half: tuple[Any, Any]
+
+    @staticmethod
+    def of(mirror: FlatMirror, vector: Callable[[FloatArray], Any], mi: Any, dr: Any) -> "_Mirror":
+        width, height = (dr.opaque(mi.Float, value) for value in mirror.half)
+        axes = (vector(mirror.axes[0]), vector(mirror.axes[1]))
+        return _Mirror(vector(mirror.centre), axes, vector(mirror.normal), (width, height))
+
+    def met(self, origin: Any, direction: Any) -> tuple[Any, Any]:
+        """How far rays go to the mirror, infinite where they miss it, and whether they meet its front."""
+        import drjit as dr
+
+        slope = dr.dot(direction, self.normal)
+        distance = dr.dot(self.centre - origin, self.normal) / slope
+        arm = origin + direction * distance - self.centre
+        hit = distance > 0
+        for axis, half in zip(self.axes, self.half, strict=True):
+            hit &= dr.abs(dr.dot(arm, axis)) <= half
+        return dr.select(hit, distance, dr.inf), slope < 0
+
+
 def pinhole(sensor: Sensor) -> dict[str, Any]:
     """Mitsuba's perspective camera, less its film and sampler, for scalar variants.
 
     Raises:
-        InputError: the camera has distortion or pixels that are not square.
+        InputError: the camera has a fisheye lens, a mirror, distortion or pixels that are not square.
     """
     optics, camera = Optics.of(sensor), sensor.camera
     need = f"needs LLVM 16 or newer, or an NVIDIA GPU, which this machine lacks ({LLVM_HINT})"
+    if camera.lens != "pinhole" or sensor.mirrors:
+        what = "sensor.mirrors" if sensor.mirrors else f"sensor.camera.lens = {camera.lens!r}"
+        raise InputError(f"{what} {need}; there is no way to render it without")
     if any(camera.distortion):
         raise InputError(
             f"sensor.camera.distortion = {list(camera.distortion)} {need}; without, set it to [0, 0, 0, 0, 0]"
@@ -120,7 +203,8 @@ def pinhole(sensor: Sensor) -> dict[str, Any]:
         )
     frame = np.eye(4)
     # Mitsuba's camera looks along its z axis, with x to the left and y up.
-    frame[:3] = np.column_stack([-optics.right, -optics.down, optics.forward, optics.position]) * MIRROR[:, None]
+    pose = optics.pose
+    frame[:3] = np.column_stack([-pose.right, -pose.down, pose.forward, pose.position]) * MIRROR[:, None]
     return {
         "type": "perspective",
         "to_world": frame.tolist(),
@@ -133,9 +217,13 @@ def pinhole(sensor: Sensor) -> dict[str, Any]:
     }
 
 
-def _undistorted_centres(optics: Optics, camera: Camera) -> Pixels:
-    """(H·W, 2) undistorted, normalised image coordinates of the pixel centres; NaN where the lens does not look."""
+def _centres(optics: Optics, camera: Camera) -> FloatArray:
+    """Where Newton's method starts, at pixel centres: undistorted x, y and, for a fisheye lens, the angle to the axis.
+
+    (H·W, 2) or (H·W, 3) float64, NaN where the lens does not look.
+    """
     columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    _, air = replace(optics, index=1.0).rays(np.column_stack([columns.ravel(), rows.ravel()]))
-    along = air @ optics.forward
-    return np.column_stack([(air @ optics.right) / along, (air @ optics.down) / along])
+    local = optics.lens.directions(np.column_stack([columns.ravel(), rows.ravel()]))
+    if camera.lens == "fisheye":
+        return np.column_stack([local[:, :2], np.arctan2(np.hypot(local[:, 0], local[:, 1]), local[:, 2])])
+    return local[:, :2] / local[:, 2:]

@@ -1,7 +1,8 @@
 """Path-traced radiance of the gel's coating, as the camera receives it before its sensor adds anything.
 
 One Mitsuba scene per sensor draw: the coated surface, the LEDs, and nothing outside (black). The indenter is hidden by
-the opaque coating and never part of it. For a frame only vertex positions and normals are exchanged.
+the opaque coating and never part of it. For a frame only vertex positions and normals are exchanged; several cameras
+are several sets of rays in that one scene.
 
 What it leaves out: light that the window's faces reflect back onto the gel, and light that the pad's sides reflect. The
 window's share is smooth, but not small: 3 to 22 % of the mean, most of it totally reflected. It comes on specular paths
@@ -18,9 +19,10 @@ from typing import Any
 import numpy as np
 
 from synth.arrays import Image, Points
+from synth.errors import InputError
 from synth.render.camera_rays import CameraRays, pinhole
 from synth.render.gel_mesh import GelMesh
-from synth.render.lights import emitters
+from synth.render.lights import check_view, emitters
 from synth.render.pattern import is_grey
 from synth.render.variant import Variant
 from synth.scene import Coating, Render, Sensor
@@ -48,7 +50,10 @@ class Renderer:
     def __init__(self, sensor: Sensor, render: Render, surface: GelSurface, albedo: Image, variant: Variant) -> None:
         if variant.is_mono and not is_grey(sensor):
             raise ValueError(f"{variant.name} renders grey sensors only: choose the variant with grey=is_grey(sensor)")
-        self._variant, self._camera = variant, sensor.camera
+        self._variant, self._views = variant, sensor.views
+        for name, view in self._views.items():
+            if name:
+                _check_further(name, view)
         self._samples = full_grid(render.samples_per_pixel, sum(light.power > 0 for light in sensor.lights))
         self._mesh = GelMesh(surface, sensor.gel.size_mm[:2])
         mi = variant.load()
@@ -65,9 +70,9 @@ class Renderer:
         self._integrator = mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": True})
         self._sampler = mi.load_dict({"type": "multijitter", "sample_count": self._samples})
         if variant.is_vectorised:
-            self._rays = CameraRays(sensor, mi)
+            self._rays = {name: CameraRays(view, mi) for name, view in self._views.items()}
         else:
-            self._sensor = self._build_pinhole(mi, sensor)
+            self._sensors = {name: self._build_pinhole(mi, view) for name, view in self._views.items()}
 
     @property
     def samples_per_pixel(self) -> int:
@@ -86,7 +91,7 @@ class Renderer:
         self._parameters.update()
 
     def radiance(self, positions: Points, seed: int) -> Image:
-        """Linear radiance of the deformed gel; zero where a pixel sees past it.
+        """Linear radiance of the deformed gel in the main camera; zero where a pixel sees past it.
 
         Args:
             positions: (v, 3) float64 mm, deformed positions of the surface's vertices.
@@ -95,11 +100,21 @@ class Renderer:
         Returns:
             (H, W, 3) float32; three equal channels in mono variants.
         """
-        mi = self._variant.load()
         self._deform(positions)
+        return self._frame("", seed)
+
+    def radiances(self, positions: Points, seed: int) -> dict[str, Image]:
+        """`radiance` in every camera, by name ("" is the main camera); independent noise in each."""
+        self._deform(positions)
+        return {name: self._frame(name, seed) for name in self._views}
+
+    def _frame(self, name: str, seed: int) -> Image:
+        mi = self._variant.load()
+        number = list(self._views).index(name)
         if self._variant.is_vectorised:
-            return self._trace(mi, seed)
-        image = mi.render(self._scene, sensor=self._sensor, integrator=self._integrator, seed=_fold(seed, 0))
+            return self._trace(mi, name, seed, number)
+        folded = _fold(seed, 0, number)
+        image = mi.render(self._scene, sensor=self._sensors[name], integrator=self._integrator, seed=folded)
         return np.array(image, dtype=np.float32)
 
     def _deform(self, positions: Points) -> None:
@@ -119,20 +134,20 @@ class Renderer:
             self._parameters[key] = transform
         self._parameters.update()
 
-    def _trace(self, mi: Any, seed: int) -> Image:
+    def _trace(self, mi: Any, name: str, seed: int, number: int) -> Image:
         """All pixels in passes of whole pixels, each pixel's samples one after another in the wavefront."""
-        camera, samples = self._camera, self._samples
+        camera, samples = self._views[name].camera, self._samples
         pixels = camera.width * camera.height
         step = max(1, _MAX_WAVEFRONT // samples)
         parts = [
-            self._trace_pixels(mi, first, min(step, pixels - first), _fold(seed, k))
+            self._trace_pixels(mi, self._rays[name], first, min(step, pixels - first), _fold(seed, k, number))
             for k, first in enumerate(range(0, pixels, step))
         ]
         image: Image = np.empty((camera.height, camera.width, 3), dtype=np.float32)
         image.reshape(pixels, 3)[:] = np.concatenate(parts) / samples  # a single channel fills all three
         return image
 
-    def _trace_pixels(self, mi: Any, first: int, count: int, seed: int) -> Image:
+    def _trace_pixels(self, mi: Any, rays: CameraRays, first: int, count: int, seed: int) -> Image:
         """Summed samples (count, channels) float32 of `count` pixels from `first` on."""
         import drjit as dr
 
@@ -141,7 +156,7 @@ class Renderer:
         sampler.seed(seed, count * self._samples)
         pixel = dr.arange(mi.UInt32, count * self._samples) // dr.opaque(mi.UInt32, self._samples)
         pixel += dr.opaque(mi.UInt32, first)
-        ray, weight, valid = self._rays.sample(pixel, sampler.next_2d())
+        ray, weight, valid = rays.sample(pixel, sampler.next_2d())
         color, seen, _ = self._integrator.sample(self._scene, sampler, ray, active=valid)
         channels = [dr.select(valid & seen, color[i] * weight, 0) for i in range(1 if self._variant.is_mono else 3)]
         dr.eval(channels)  # all at once: each sum alone would trace everything anew
@@ -225,6 +240,19 @@ def _window(sensor: Sensor, mi: Any) -> dict[str, Any]:
     }
 
 
-def _fold(seed: int, part: int) -> int:
-    """The 32-bit seed that Mitsuba takes, from a seed of any size and the number of a pass."""
-    return int(np.random.SeedSequence([seed, part]).generate_state(1)[0])
+def _check_further(name: str, view: Sensor) -> None:
+    """Refuse lights in a further camera's view; `emitters` looks after the main camera's.
+
+    Raises:
+        InputError: names the camera, the light and the pixel.
+    """
+    try:
+        check_view(view)
+    except InputError as error:
+        raise InputError(f"sensor.further_cameras {name!r}: {error}") from error
+
+
+def _fold(seed: int, part: int, camera: int) -> int:
+    """The 32-bit seed that Mitsuba takes, from a seed of any size and the numbers of a pass and of a camera."""
+    numbers = [seed, part, camera] if camera else [seed, part]
+    return int(np.random.SeedSequence(numbers).generate_state(1)[0])

@@ -1,13 +1,16 @@
 r"""The camera, derived a second time: nothing here is shared with `synth.optics`.
 
-Refraction is Fermat's principle: light from a point takes the path of least optical length through the window's face,
+A mirror is dealt with by moving what is behind it: the point, and the window's face, are reflected at the mirror's
+plane, and the camera looks at their images. Refraction is Fermat's principle: light from a point takes the path of
+least optical length through that face,
 
 .. math::  L(s) = \sqrt{s^2 + h_c^2} + n \sqrt{(R - s)^2 + h_p^2}
 
-whose stationary point s (lateral distance from the camera to the crossing) lies between that of the straight line and
-R and is bracketed there by the Illinois variant of regula falsi. The lens and the pinhole are OpenCV's `projectPoints`,
-in OpenCV's right-handed world: the scene's with z reversed. There is no map from pixels to rays: `synth.verify.sheet`
-inverts this one by root search.
+whose stationary point s (distance along the face from the camera's foot to the crossing) lies between that of the
+straight line and R and is bracketed there by the Illinois variant of regula falsi. Pinhole and lenses are OpenCV's
+`projectPoints` and `fisheye.projectPoints`, in OpenCV's right-handed world: the scene's with z reversed. There is no
+map from pixels to rays: `synth.verify.sheet` inverts this one by root search. Whether light of a point really gets to
+the camera on a path is decided from the points at which that path turns (`reaches`).
 """
 
 from dataclasses import dataclass
@@ -15,10 +18,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from synth.arrays import FloatArray, Pixels, Points
-from synth.scene import Sensor
+from synth.arrays import BoolArray, FloatArray, Pixels, Points
+from synth.scene import Camera, Sensor
+from synth.verify.plate import Plate
 
 _MIRROR = np.array([1.0, 1.0, -1.0])
+_UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,19 +34,23 @@ class ForwardCamera:
         eye: (3,) mm, scene frame.
         rotation: (3, 3), mirrored world to camera, right-handed.
         matrix: (3, 3) px, pinhole.
-        distortion: k1, k2, p1, p2, k3.
+        distortion: k1, k2, p1, p2, k3, or k1, k2, k3, k4 of a fisheye lens.
+        is_fisheye: which of the two.
         index: refractive index of gel and window.
         face_z: mm, the window's outer face.
-        field: undistorted radius at which the lens model turns back.
+        field: angle to the axis, radians, at which the lens model turns back.
+        plates: the mirrors; path k > 0 is by plates[k - 1], path 0 is straight.
     """
 
     eye: FloatArray
     rotation: FloatArray
     matrix: FloatArray
     distortion: FloatArray
+    is_fisheye: bool
     index: float
     face_z: float
     field: float
+    plates: tuple[Plate, ...]
 
     @staticmethod
     def of(sensor: Sensor) -> "ForwardCamera":
@@ -56,57 +65,102 @@ class ForwardCamera:
             rotation=np.array([np.cross(below, ahead), below, ahead]),
             matrix=np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]]),
             distortion=np.array(camera.distortion),
+            is_fisheye=camera.lens == "fisheye",
             index=sensor.window.refractive_index,
             face_z=sensor.gel.size_mm[2] + sensor.window.thickness_mm,
-            field=_turning_radius(*(camera.distortion[i] for i in (0, 1, 4))),
+            field=_turning_angle(camera),
+            plates=tuple(Plate.of(mirror) for mirror in sensor.mirrors),
         )
 
-    def see(self, points: Points) -> Pixels:
-        """Pixels (n, 2) of points (n, 3) mm below the window's face; NaN beyond the lens model's field."""
-        aim = self._crossing(points) if self.index > 1 else points
-        local = (aim - self.eye) * _MIRROR @ self.rotation.T
-        lost = ~(local[:, 2] > 0) | ~(np.hypot(local[:, 0], local[:, 1]) < self.field * local[:, 2])
+    @property
+    def paths(self) -> range:
+        """The numbers of all paths."""
+        return range(len(self.plates) + 1)
+
+    def see(self, points: Points, path: int = 0) -> Pixels:
+        """Pixels (n, 2) of points (n, 3) mm below the window's face; NaN beyond the lens model's field.
+
+        By a mirror also where the mirror has ended: see `reaches`.
+        """
+        local = (self._aim(points, path) - self.eye) * _MIRROR @ self.rotation.T
+        lost = ~(np.arctan2(np.hypot(local[:, 0], local[:, 1]), local[:, 2]) < self.field)
         local[lost] = (0, 0, 1)
+        if not len(local):
+            return local[:, :2]
         zero = np.zeros(3)
-        pixels = (
-            cv2.projectPoints(local[:, None], zero, zero, self.matrix, self.distortion)[0][:, 0]
-            if len(local)
-            else local
-        )
-        return np.where(lost[:, None], np.nan, pixels[:, :2])
+        project = cv2.fisheye.projectPoints if self.is_fisheye else cv2.projectPoints
+        pixels = project(local[:, None], zero, zero, self.matrix, self.distortion)[0][:, 0]
+        return np.where(lost[:, None], np.nan, pixels)
 
-    def _crossing(self, points: Points) -> Points:
-        """Where light from the points crosses the window's face on its way to the eye, (n, 3) mm."""
-        arm = points[:, :2] - self.eye[:2]
-        reach = np.hypot(arm[:, 0], arm[:, 1])
-        above, below = self.eye[2] - self.face_z, self.face_z - points[:, 2]
+    def reaches(self, points: Points, path: int) -> BoolArray:
+        """Whether light from points (n, 3) that a path shows meets its mirror, and no other mirror before or after."""
+        aim = self._aim(points, path)
+        free = np.asarray(np.isfinite(aim).all(axis=1))
+        if path == 0:
+            for plate in self.plates:
+                free &= ~plate.crossed(self.eye, aim)
+            return free
+        own = self.plates[path - 1]
+        free &= own.crossed(self.eye, aim) & own.is_before(self.eye)
+        turn = own.crossing(self.eye, aim)
+        end = own.reflected(aim)
+        for plate in self.plates:
+            if plate is not own:
+                free &= ~plate.crossed(self.eye, turn) & ~plate.crossed(turn, end)
+        return free
+
+    def _aim(self, points: Points, path: int) -> Points:
+        """Where the camera has to look, straight, to see points: the crossing of the window's face, or the points."""
+        origin, up = np.array([0.0, 0.0, self.face_z]), _UP
+        if path > 0:
+            plate = self.plates[path - 1]
+            tip = plate.reflected(origin + up)
+            points, origin = plate.reflected(points), plate.reflected(origin)
+            up = tip - origin
+        return self._crossing(points, origin, up) if self.index > 1 else points
+
+    def _crossing(self, points: Points, origin: FloatArray, up: FloatArray) -> Points:
+        """Where light from points crosses a face through `origin` whose side of the air is `up`, (n, 3) mm."""
+        above = float((self.eye - origin) @ up)
+        below = (origin - points) @ up
+        if above <= 0:
+            return np.full_like(points, np.nan)
+        foot = self.eye - above * up
+        arm = points - foot + below[:, None] * up
+        reach = np.linalg.norm(arm, axis=1)
 
         def slope(s: FloatArray) -> FloatArray:
             rest = reach - s
             return s / np.hypot(s, above) - self.index * rest / np.hypot(rest, below)
 
-        low, high = reach * above / (above + below), reach.copy()
-        at_low, at_high = slope(low), slope(high)
-        s = low
-        for _ in range(60):
-            with np.errstate(invalid="ignore", divide="ignore"):
+        with np.errstate(invalid="ignore", divide="ignore"):
+            low, high = reach * above / (above + below), reach.copy()
+            at_low, at_high = slope(low), slope(high)
+            s = low
+            for _ in range(60):
                 step = np.where(at_high != at_low, at_high * (high - low) / (at_high - at_low), 0.0)
-            previous, s = s, high - step
-            value = slope(s)
-            # The end kept is `low`; where the new value falls on the side of `high`, low's value is halved (Illinois).
-            crossed = value * at_high < 0
-            low, at_low = np.where(crossed, high, low), np.where(crossed, at_high, at_low / 2)
-            high, at_high = s, value
-            if np.all(np.abs(s - previous) <= 1e-13 * reach):
-                break
+                previous, s = s, high - step
+                value = slope(s)
+                # The end kept is `low`; where the new value falls on the side of `high`, low's value is halved.
+                crossed = value * at_high < 0
+                low, at_low = np.where(crossed, high, low), np.where(crossed, at_high, at_low / 2)
+                high, at_high = s, value
+                if np.all(np.abs(s - previous) <= 1e-13 * reach):
+                    break
         share = np.divide(s, reach, out=np.zeros_like(s), where=reach > 0)
-        return np.column_stack([self.eye[:2] + arm * share[:, None], np.full(len(points), self.face_z)])
+        return foot + arm * share[:, None]
 
 
-def _turning_radius(k1: float, k2: float, k3: float) -> float:
-    """Undistorted radius at which the distorted one first stops growing, from a table; infinite where it never does."""
-    radius = np.linspace(0, 20, 200_001)
-    square = radius**2
-    distorted = radius * (1 + k1 * square + k2 * square**2 + k3 * square**3)
-    stops = np.flatnonzero(np.diff(distorted) <= 0)
-    return float(radius[stops[0]]) if len(stops) else np.inf
+def _turning_angle(camera: Camera) -> float:
+    """Angle to the axis at which the image's radius first stops growing, from a table; at most a right angle."""
+    if camera.lens == "fisheye":
+        angle = np.linspace(0, np.pi / 2, 200_001)
+        k1, k2, k3, k4 = camera.distortion
+        radius = angle * (1 + k1 * angle**2 + k2 * angle**4 + k3 * angle**6 + k4 * angle**8)
+    else:
+        tangent = np.linspace(0, 20, 200_001)
+        angle = np.arctan(tangent)
+        k1, k2, _, _, k3 = camera.distortion
+        radius = tangent * (1 + k1 * tangent**2 + k2 * tangent**4 + k3 * tangent**6)
+    stops = np.flatnonzero(np.diff(radius) <= 0)
+    return float(angle[stops[0]]) if len(stops) else np.pi / 2

@@ -1,11 +1,12 @@
 """Verification of samples and datasets: all checks together."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from synth.dataset.reader import Dataset, SampleData, read_dataset
 from synth.errors import InputError
-from synth.scene import Scene
+from synth.scene import Scene, Sensor
 from synth.verify.camera import ForwardCamera
 from synth.verify.motion import check_motion
 from synth.verify.photometry import check_photometry
@@ -54,21 +55,34 @@ def verify_sample(index: int, scene: Scene, sample: SampleData, problems: Sequen
         sample: its images, flow, surface and displacements.
         problems: what is wrong with its files (from `Dataset.check_hashes`).
     """
-    camera, flow = scene.sensor.camera, sample.flow
-    forward = ForwardCamera.of(scene.sensor)
+    checks = [_files(problems)]
+    for name, sensor in scene.sensor.views.items():
+        prefix = f"{name}: " if name else ""
+        if name and name not in sample.further:
+            checks.append(Check(f"{prefix}images", 1.0, 0, "missing", "the scene has this camera, the sample has not"))
+            continue
+        own = _view_checks(sensor, scene.outputs.backward, sample.seen_by(name))
+        checks += [replace(check, name=prefix + check.name) for check in own]
+    return SampleReport(index, tuple(checks))
+
+
+def _view_checks(sensor: Sensor, backward: bool, sample: SampleData) -> list[Check]:
+    """Checks of what one camera recorded."""
+    camera, flow = sensor.camera, sample.flow
+    forward = ForwardCamera.of(sensor)
     states = [
         Sheet(forward, sample.surface.triangles, sample.surface.positions(u), camera.width, camera.height)
         for u in (sample.displacement1, sample.displacement2)
     ]
-    checks = [_files(problems), *check_motion("forward", states[0], states[1], flow.forward, flow.forward_visible)]
+    checks = check_motion("forward", states[0], states[1], flow.forward, flow.forward_visible)
     if flow.backward is not None and flow.backward_visible is not None:
         checks += check_motion("backward", states[1], states[0], flow.backward, flow.backward_visible)
-    elif scene.outputs.backward:
+    elif backward:
         checks.append(Check("backward flow", 1.0, 0, "missing", "the scene asks for it and flow.exr lacks it"))
     size = (camera.height, camera.width)
     if flow.forward.shape[:2] == size and sample.image1.shape[:2] == size:
-        checks.append(check_photometry(scene.sensor, sample.image1, sample.image2, flow.forward, flow.forward_visible))
-    return SampleReport(index, tuple(checks))
+        checks.append(check_photometry(sensor, sample.image1, sample.image2, flow.forward, flow.forward_visible))
+    return checks
 
 
 def _verify_files(dataset: Dataset, index: int) -> SampleReport:

@@ -44,6 +44,7 @@ class Derived:
         visible: (n,) whether the material point is seen in the other image.
         closure: (n,) px between a place and where its flow's end comes from; NaN where the flow ends out of sight.
         z: (n,) mm, height of the material point in the other state.
+        path: (n,) by which path of the camera the place sees it.
         touched: (n,) whether another part of the surface covers the point there so closely that it may count as hidden.
     """
 
@@ -51,6 +52,7 @@ class Derived:
     visible: BoolArray
     closure: FloatArray
     z: FloatArray
+    path: Indices
     touched: BoolArray
 
 
@@ -106,7 +108,7 @@ def derive(near: Sheet, far: Sheet, places: Pixels, recorded: FloatArray) -> Der
     points = seen.carried(near.triangles, far.positions)
     flow = np.full(places.shape, np.nan)
     on_gel = seen.triangle >= 0
-    flow[on_gel] = near.camera.see(points[on_gel]) - places[on_gel]
+    flow[on_gel] = near.pixels(points[on_gel], seen.path[on_gel]) - places[on_gel]
     with np.errstate(invalid="ignore"):
         same = np.linalg.norm(flow - recorded, axis=1) <= _SAME_PLACE_PX
     target = places + np.where(same[:, None], recorded, flow)
@@ -116,7 +118,8 @@ def derive(near: Sheet, far: Sheet, places: Pixels, recorded: FloatArray) -> Der
     end = np.clip(target[query], 0, (near.width, near.height))
     first, origin = _back(near, far, end)
     visible, touched = (np.zeros(len(places), dtype=np.bool_) for _ in range(2))
-    visible[query] = first.z <= points[query, 2] + _HIDDEN_MM
+    visible[query] = _is_first(first, points[query, 2] + _HIDDEN_MM, seen.path[query])
+    visible[query] &= far.reached_by(points[query], seen.path[query])
     touched[query] = (
         visible[query] & (first.z > points[query, 2] + _TOUCHING_MM) & (first.triangle != seen.triangle[query])
     )
@@ -125,7 +128,7 @@ def derive(near: Sheet, far: Sheet, places: Pixels, recorded: FloatArray) -> Der
     closure[~(visible & same)] = np.nan
     astray = np.flatnonzero(~same & _is_inside(places + recorded, near))
     closure[astray] = np.linalg.norm(_back(near, far, places[astray] + recorded[astray])[1] - places[astray], axis=1)
-    return Derived(flow, visible, closure, points[:, 2], touched)
+    return Derived(flow, visible, closure, points[:, 2], seen.path, touched)
 
 
 def _back(near: Sheet, far: Sheet, ends: Pixels) -> tuple[Seen, Pixels]:
@@ -133,8 +136,13 @@ def _back(near: Sheet, far: Sheet, ends: Pixels) -> tuple[Seen, Pixels]:
     seen = far.seen(ends)
     found = seen.triangle >= 0
     pixels = np.full(ends.shape, np.nan)
-    pixels[found] = near.camera.see(seen.carried(far.triangles, near.positions)[found])
+    pixels[found] = near.pixels(seen.carried(far.triangles, near.positions)[found], seen.path[found])
     return seen, pixels
+
+
+def _is_first(found: Seen, limit: FloatArray, path: Indices) -> BoolArray:
+    """Whether what is found by the same path lies no higher than a limit (n,), or nothing is found by that path."""
+    return np.asarray((found.z <= limit) | (found.path != path))
 
 
 def _is_inside(pixels: Pixels, image: Sheet) -> BoolArray:
@@ -173,7 +181,9 @@ def _turns_beside(far: Sheet, derived: Derived, places: Pixels, visible: FlowArr
         end = places[at] + derived.flow[at] + shift
         query = np.flatnonzero(_is_inside(end, far))
         seen = np.zeros(len(at), dtype=np.bool_)
-        seen[query] = far.seen(end[query]).z <= derived.z[at][query] + _NEAR_MM
+        path = derived.path[at][query]
+        found = far.seen(end[query])
+        seen[query] = (found.z <= derived.z[at][query] + _NEAR_MM) & (found.path == path)
         agreed |= seen == visible[at]
     return agreed
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from synth.arrays import FloatArray, Points
 from synth.optics import Optics
-from synth.scene import Camera, Gel, Light, NoPattern, Sensor, Window
+from synth.scene import Camera, Gel, Light, Mirror, NoPattern, Sensor, Window
 from synth.surface import ContactFaces, GelSurface
 
 WIDTH, HEIGHT = 64, 48
@@ -15,7 +15,18 @@ STRAIGHT = {"position_mm": (1.0, -0.5, 24.0), "look_at_mm": (1.0, -0.5, 0.0)}
 OBLIQUE = {"position_mm": (3.0, -2.0, 22.0), "look_at_mm": (-0.5, 0.7, 0.0)}
 
 
-def sensor(*, index: float = 1.0, **camera: object) -> Sensor:
+FISHEYE = {"lens": "fisheye", "distortion": (0.05, -0.02, 0.004, -0.001), "fx": 52.0, "fy": 53.0}
+SIDES = (
+    {"position_mm": (6.0, -0.5, 16.0), "normal": (-1.0, 0.0, -0.25), "size_mm": (12.0, 8.0), "rotation_deg": 4.0},
+    {"position_mm": (-5.0, -0.5, 16.0), "normal": (1.0, 0.1, -0.2), "size_mm": (13.0, 7.0)},
+)
+"""Two mirrors beside the view, one a little turned: with STRAIGHT, the gel is seen three times."""
+PERISCOPE = ({"position_mm": (0.0, -2.0, 16.0), "normal": (0.05, -1.0, -1.1), "size_mm": (16.0, 9.0)},)
+"""One mirror at about 45 degrees, for a camera that looks along +y: LEVEL."""
+LEVEL = {"position_mm": (0.4, -16.0, 15.0), "look_at_mm": (0.0, -2.0, 15.5)}
+
+
+def sensor(*, index: float = 1.0, mirrors: tuple[dict, ...] = (), **camera: object) -> Sensor:
     """A 20 x 15 x 4 mm pad with a 5 mm window (outer face at z = 9) and a camera of 64 x 48 px."""
     given = {"width": WIDTH, "height": HEIGHT, "fx": 70.0, "fy": 71.0, "cx": 31.7, "cy": 24.4, **STRAIGHT, **camera}
     return Sensor(
@@ -24,11 +35,12 @@ def sensor(*, index: float = 1.0, **camera: object) -> Sensor:
         pattern=NoPattern(kind="none"),
         lights=(Light(position_mm=(9, 0, 3), size_mm=(1, 1), color=(1, 1, 1), power=1),),
         camera=Camera(**given),
+        mirrors=tuple(Mirror(**mirror) for mirror in mirrors),
     )
 
 
-def optics(*, index: float = 1.0, **camera: object) -> Optics:
-    return Optics.of(sensor(index=index, **camera))
+def optics(*, index: float = 1.0, mirrors: tuple[dict, ...] = (), **camera: object) -> Optics:
+    return Optics.of(sensor(index=index, mirrors=mirrors, **camera))
 
 
 def sheet(columns: int, rows: int, width: float, height: float, subdivisions: int = 1) -> GelSurface:

@@ -6,7 +6,7 @@ import pytest
 from tiny_scene import TEXT, write_tiny
 
 from synth.errors import InputError
-from synth.template import load_scene
+from synth.template import load_scene, shipped_scenes
 
 
 @pytest.fixture
@@ -172,7 +172,7 @@ def test_files(tmp_path: Path, content: str, message: str) -> None:
 
 def test_files_that_are_not_there_or_not_text(tmp_path: Path) -> None:
     assert _refusal("gelsight_mni") == (
-        "there is no scene 'gelsight_mni'; shipped: deltact, gelsight, gelsight_mini; or give a .toml file"
+        f"there is no scene 'gelsight_mni'; shipped: {', '.join(shipped_scenes())}; or give a .toml file"
     )
     assert _refusal(tmp_path / "none.toml") == f"there is no scene file {tmp_path / 'none.toml'}"
     (tmp_path / "folder.toml").mkdir()

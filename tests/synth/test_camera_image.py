@@ -66,6 +66,15 @@ def test_blur_is_a_normalised_gaussian() -> None:
     assert (blurred.sum(0) * x**2).sum() == pytest.approx(1.5**2, rel=2e-3)
 
 
+def test_a_grey_image_is_a_channel_of_a_grey_coloured_one() -> None:
+    """Fails without the reshape after the blur: OpenCV drops the axis of a single channel."""
+    camera = _camera(blur_px=0.8, vignetting=0.3)
+    ramp = np.linspace(0, 1, 150 * 200, dtype=np.float32).reshape(150, 200, 1)
+    grey, colour = (expected_signal(image, camera) for image in (ramp, np.repeat(ramp, 3, axis=2)))
+    assert grey.shape == (150, 200, 1)
+    np.testing.assert_array_equal(grey[:, :, 0], colour[:, :, 1])
+
+
 def test_vignette_is_one_at_the_principal_point_and_least_in_the_farthest_corner() -> None:
     camera = _camera(vignetting=0.6, cx=50.5, cy=20.5)
     fall = vignette(camera)

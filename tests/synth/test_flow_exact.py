@@ -27,11 +27,11 @@ def _flow(camera, motion1, motion2, **options):
 def _homography(camera, motion1, motion2):
     """The map from image 1 to image 2 of the plane z = 0 moved from one rigid pose to another: H2 inv(H1)."""
     intrinsic = np.array([[70.0, 0, 31.7], [0, 71.0, 24.4], [0, 0, 1]])
-    axes = np.array([camera.right, camera.down, camera.forward])
+    axes = np.array([camera.pose.right, camera.pose.down, camera.pose.forward])
 
     def plane_to_image(motion):
         origin, x, y = motion(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]))
-        return intrinsic @ axes @ np.column_stack([x - origin, y - origin, origin - camera.position])
+        return intrinsic @ axes @ np.column_stack([x - origin, y - origin, origin - camera.pose.position])
 
     return plane_to_image(motion2) @ np.linalg.inv(plane_to_image(motion1))
 
@@ -158,7 +158,8 @@ def test_extra_channels():
         return np.stack([flow.extras[f"{name}.{axis}"] for axis in "XYZ"], axis=-1).reshape(-1, 3)
 
     single = 2e-6  # float32 of values below 32
-    np.testing.assert_allclose(flow.extras["depth1.Z"].ravel(), (at - camera.position) @ camera.forward, atol=single)
+    depth = (at - camera.pose.position) @ camera.pose.forward
+    np.testing.assert_allclose(flow.extras["depth1.Z"].ravel(), depth, atol=single)
     np.testing.assert_allclose(channels("normal1"), np.tile([0, 0, 1], (len(at), 1)), atol=single)
     np.testing.assert_allclose(channels("normal2"), np.tile(tilt @ [0, 0, 1], (len(at), 1)), atol=single)
     np.testing.assert_allclose(channels("displacement"), at @ tilt.T + (0, 0, 1.0) - at, atol=single)

@@ -38,9 +38,9 @@ def test_image_axes():
 def test_lens_is_opencvs():
     camera = optics(distortion=LENS, **OBLIQUE)
     mirror = np.array([1.0, 1.0, -1.0])  # OpenCV's world is right-handed
-    axes = np.array([camera.right, camera.down, camera.forward]) * mirror
+    axes = np.array([camera.pose.right, camera.pose.down, camera.pose.forward]) * mirror
     matrix = np.array([[70.0, 0, 31.7], [0, 71.0, 24.4], [0, 0, 1]])
-    shift = -axes @ (camera.position * mirror)
+    shift = -axes @ (camera.pose.position * mirror)
     expected, _ = cv2.projectPoints(POINTS * mirror, cv2.Rodrigues(axes)[0], shift, matrix, np.array(LENS))
     np.testing.assert_allclose(camera.project(POINTS), expected[:, 0], atol=1e-11)
 

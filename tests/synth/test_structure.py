@@ -15,6 +15,7 @@ STAGES = (
     "synth.arrays",
     "synth.dataset.storage",  # how a file gets to the disk as a whole; knows nothing of datasets
     "synth.scene_indenters",
+    "synth.scene_camera",
     "synth.scene",
     "synth.schema_errors",
     "synth.template",

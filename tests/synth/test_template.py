@@ -16,7 +16,8 @@ def tiny(tmp_path: Path) -> Path:
 
 
 def test_shipped_scenes_are_known_by_name() -> None:
-    assert shipped_scenes() == ["deltact", "gelsight", "gelsight_mini"]
+    names = "deltact digit fingervision gelsight gelsight_mini gelslim gelstereo omnitact soft_bubble tac3d"
+    assert shipped_scenes() == names.split()
     assert load_scene("gelsight_mini").source == SCENES / "gelsight_mini.toml"
 
 

@@ -1,0 +1,93 @@
+"""Presses spread over worker processes of one thread each; as `synth.processes` does for samples."""
+
+import contextlib
+import os
+import threading
+from collections.abc import Generator, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+
+from synth.bench.budget_press import Pressed, press
+from synth.bench.budget_schedule import Schedule
+from synth.bench.budget_study import Job, Study
+from synth.errors import InputError
+from synth.processes import _interrupts_blocked, _leave_with_driver
+
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+def presses(study: Study, schedule: Schedule, workers: int, machine: str) -> Generator[Pressed, None, None]:
+    """What the jobs gave, in the order in which they end.
+
+    Args:
+        study: that they belong to.
+        schedule: which to begin.
+        workers: processes; 1 stays in this one.
+        machine: to be noted with each press.
+
+    Raises:
+        InputError: a worker process died.
+    """
+    if workers == 1:
+        while job := schedule.begin():
+            pressed = press(study, job, machine)
+            schedule.end(job)
+            yield pressed
+        return
+    context = get_context("spawn")  # Warp does not survive a fork
+    leash, held = context.Pipe(duplex=False)
+    with leash, held, ProcessPoolExecutor(workers, context, _begin, (study, machine, leash)) as pool:
+        pending: set[Future[Pressed]] = set()
+        try:
+            while True:
+                while len(pending) < workers and (job := schedule.begin()):
+                    with _interrupts_blocked(), _one_thread():
+                        pending.add(pool.submit(_work, job))
+                if not pending:
+                    return
+                done, pending = wait(pending, return_when=FIRST_COMPLETED)
+                for future in done:
+                    schedule.end(future.result().measurement.job)
+                    yield future.result()
+        except BrokenProcessPool as error:
+            raise InputError(
+                "a worker process died (out of memory, or killed); finished presses are kept: "
+                "give the same command again to go on, with fewer --workers"
+            ) from error
+        except BaseException:
+            held.close()
+            raise
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Processes started meanwhile use one thread in every library: the time of a press is that of all its threads."""
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+_task: tuple[Study, str] | None = None
+"""What a worker process works on, set when it starts."""
+
+
+def _begin(study: Study, machine: str, leash: Connection) -> None:
+    global _task
+    threading.Thread(target=_leave_with_driver, args=(leash,), daemon=True).start()
+    _task = study, machine
+
+
+def _work(job: Job) -> Pressed:
+    if _task is None:
+        raise RuntimeError("the worker process was not set up by _begin")
+    study, machine = _task
+    return press(study, job, machine)

@@ -1,0 +1,243 @@
+"""What the study of the error budget runs: draws of scenes, each on meshes of the ladder and on a reference's.
+
+A draw is the one that `generate` makes a trajectory of: same streams, same mesh, same wanted states. The states that
+its pairs show are judged.
+"""
+
+import hashlib
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from synth.errors import InputError
+from synth.mesh import Counts, Focus, PadMesh, graded_box
+from synth.mesh.graded import spacing
+from synth.plan import ITERATIONS_PER_RECORD, ITERATIONS_PER_STEP, SOLVE_GROWTH
+from synth.sampling import MAX_DRAWS, draw, draw_sensor, pairs_of, sensor_of
+from synth.scene import Gel, Scene
+from synth.simulate.footprint import footprint
+from synth.simulate.indenter import rigid_body
+from synth.simulate.newton import MAX_ITERATIONS
+from synth.simulate.path import Path as IndenterPath
+from synth.simulate.resolution import (
+    DEFAULT_TARGET_PX,
+    LADDER,
+    MARGIN,
+    STEEPEST_DEPTH,
+    Resolution,
+    graded_mesh,
+    predicted_error_mm,
+    resolve,
+    scale_px_per_mm,
+)
+from synth.template import Template
+
+BEYOND = 2
+"""Rungs that are run above the chosen one."""
+REFERENCE = 0
+"""In place of a rung's number of elements across, for the reference."""
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What errors are measured against; all else is as for any draw.
+
+    Attributes:
+        across: elements across the contact.
+        beside: elements beside it, along x and along y; three and two on the ladder.
+        step_mm: longest load step.
+        correction_iterations: of Newton's method in one augmented-Lagrangian pass; with a draw's fewer, some passes
+            are dropped.
+    """
+
+    across: int = 18
+    beside: tuple[int, int] = (4, 3)
+    step_mm: float = 0.125
+    correction_iterations: int = MAX_ITERATIONS
+
+    def mesh(self, gel: Gel, focus: Focus) -> tuple[PadMesh, float]:
+        """The mesh of a pad, and the spacing under the contact (mm).
+
+        Through the thickness it has one element more than `graded_mesh` would have for as many across; the first is
+        still as high as wide, or lower.
+        """
+        size, across = gel.size_mm, (self.across, self.across)
+        flat = Counts(across, self.beside)
+        fine = float(np.sqrt(np.prod([spacing(size[k], focus.span(k, size[k]), flat, k)[0] for k in (0, 1)])))
+        height = size[2] / fine
+        through = max(2, math.ceil(math.log1p(height * (STEEPEST_DEPTH - 1)) / math.log(STEEPEST_DEPTH))) + 1
+        counts = Counts(across, self.beside, through, growth=_growth(through, height))
+        return graded_box(size, focus, counts, tuple(layer.thickness_mm for layer in gel.layers)), fine
+
+
+def _growth(count: int, height: float) -> float:
+    """Ratio of the spacings of which `count` reach `height` when the first is 1; 1 where equal ones reach farther."""
+    low, high = 1.0, STEEPEST_DEPTH
+    for _ in range(50):
+        middle = (low + high) / 2
+        if sum(middle**k for k in range(count)) < height:
+            low = middle
+        else:
+            high = middle
+    return high if height > count else 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """One draw of a scene.
+
+    Attributes:
+        template: of the scene.
+        index: number of the trajectory.
+        attempt: how many draws before it the schema or the mesher refused.
+        scene: what was drawn.
+        focus: where it touches.
+        frames: numbers of the states that the trajectory's pairs show.
+        chosen: the mesh that its budget asks for.
+        target_px: the budget.
+    """
+
+    template: Template
+    index: int
+    attempt: int
+    scene: Scene
+    focus: Focus
+    frames: frozenset[int]
+    chosen: Resolution
+    target_px: float
+
+    @property
+    def judged(self) -> list[int]:
+        """The frames in which the gel is pressed."""
+        return sorted(self.frames - {0})
+
+    def mesh(self, across: int) -> tuple[PadMesh, float]:
+        """The mesh of a rung, and its spacing under the contact (mm)."""
+        return graded_mesh(self.scene.sensor.gel, self.focus, across)
+
+    def predicted_px(self, spacing_mm: float) -> float:
+        """What the error model says of a mesh, as `resolve` asks it."""
+        camera, size, scale = self.scene.sensor.camera, self.scene.sensor.gel.size_mm, scale_px_per_mm(self.scene)
+        seen = min(camera.width * camera.height / scale**2, size[0] * size[1])
+        return scale * predicted_error_mm(self.scene, self.focus, spacing_mm, seen)
+
+
+def drawn(template: Template, seed: int, index: int) -> Drawn:
+    """The draw of a trajectory: as `generate`, the first that the schema and the mesher take.
+
+    Raises:
+        InputError: none of its attempts can be used.
+    """
+    sensor, refused = draw_sensor(template, seed, sensor_of(template, index)), ""
+    for attempt in range(MAX_DRAWS):
+        try:
+            scene = draw(template, seed, index, attempt, sensor)
+            chosen = resolve(scene, template.source.parent)
+            body = rigid_body(scene.contact.indenter, template.source.parent)
+        except InputError as error:
+            refused = str(error)
+            continue
+        focus = footprint(IndenterPath(scene.motion, body), scene.sensor.gel.size_mm, MARGIN)
+        frames = frozenset(k for pair in pairs_of(template, seed, index, scene.motion.steps) for k in pair.frames)
+        target = scene.numerics.target_error_px or DEFAULT_TARGET_PX
+        return Drawn(template, index, attempt, scene, focus, frames, chosen, target)
+    raise InputError(f"{template.name}, draw {index}: none of {MAX_DRAWS} attempts can be used: {refused}")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One press: scene's name, number of its draw, elements across the contact or REFERENCE."""
+
+    scene: str
+    index: int
+    rung: int
+
+
+@dataclass(frozen=True)
+class Study:
+    """What is asked for.
+
+    Attributes:
+        templates: scenes of different names, whose meshes are chosen by a budget.
+        seed: of the draws.
+        draws: of each scene.
+        ladder: elements across, rising.
+        reference: what errors are measured against.
+
+    Raises:
+        InputError: two scenes of one name, or one with an edge length in place of a budget.
+    """
+
+    templates: tuple[Template, ...]
+    seed: int
+    draws: int
+    ladder: tuple[int, ...] = LADDER
+    reference: Reference = Reference()
+
+    def __post_init__(self) -> None:
+        """Refuse what has no budget or cannot be told apart."""
+        names = [template.name for template in self.templates]
+        for template in self.templates:
+            if names.count(template.name) > 1:
+                raise InputError(f"--scene: {names.count(template.name)} scenes are named {template.name!r}; give one")
+            if template.corners[0].numerics.edge_length_mm is not None:
+                raise InputError(
+                    f"{template.source}: numerics.edge_length_mm is given, so that there is no error budget to be "
+                    "studied; give target_error_px instead"
+                )
+
+    def record(self) -> dict[str, Any]:
+        """What tells a study from others, JSON-able; more draws may be added to one."""
+        return {
+            "scenes": {template.name: template.hash for template in self.templates},
+            "solver": solver(),
+            "seed": self.seed,
+            "ladder": list(self.ladder),
+            "reference": {**asdict(self.reference), "beside": list(self.reference.beside)},
+        }
+
+    def template(self, name: str) -> Template:
+        """The scene of that name."""
+        return next(template for template in self.templates if template.name == name)
+
+    def rungs(self, chosen: int) -> list[int]:
+        """Elements across of the meshes that a draw is run on: up to BEYOND rungs above the chosen one, and the finest,
+        whose difference from the reference tells how far that can be trusted.
+        """
+        above = [across for across in self.ladder if across > chosen]
+        limit = above[min(BEYOND, len(above)) - 1] if above else chosen
+        return sorted({*(across for across in self.ladder if across <= limit), chosen, self.ladder[-1]})
+
+
+def solver() -> str:
+    """SHA-256 (16 hex digits) of the code that meshes and simulates: one study is of one solver."""
+    digest = hashlib.sha256()
+    for folder in ("mesh", "simulate"):
+        for file in sorted((Path(__file__).parents[1] / folder).glob("*.py")):
+            digest.update(file.name.encode() + file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def jobs(study: Study, draws: Sequence[Drawn]) -> dict[Job, float]:
+    """All presses with their work, in a unit of its own; references first, and the most work first of each kind, so
+    that the last do not wait for one.
+    """
+    found: list[tuple[bool, float, str, int, int]] = []
+    for one in draws:
+        gel, numerics = one.scene.sensor.gel, one.scene.numerics
+        path = IndenterPath(one.scene.motion, rigid_body(one.scene.contact.indenter, one.template.source.parent))
+        for rung in [REFERENCE, *study.rungs(one.chosen.across)]:
+            on_ladder, step = rung != REFERENCE, numerics.max_step_mm
+            if on_ladder:
+                mesh, _ = one.mesh(rung)
+            else:
+                mesh, _ = study.reference.mesh(gel, one.focus)
+                step = min(step, study.reference.step_mm)
+            iterations = ITERATIONS_PER_STEP * path.length_mm / step + ITERATIONS_PER_RECORD * one.scene.motion.steps
+            work = iterations * len(mesh.points) ** SOLVE_GROWTH
+            found.append((on_ladder, -work, one.template.name, one.index, rung))
+    return {Job(name, index, rung): -work for _, work, name, index, rung in sorted(found)}

@@ -1,0 +1,167 @@
+r"""Whether a draw's mesh met its budget, and whether a cheaper one would have.
+
+The error that is judged is measured against a reference that errs, too. Two estimates of how much that may change:
+
+- the difference of the ladder's finest rung from the reference, added to the error;
+- where errors fall as h^1.6 and rung and reference err alike, the error itself, from a difference d of the two, is
+
+.. math::  d / (1 - (h_r / h)^{1.6})
+
+with h and h_r their spacings under the contact. Where their errors are independent it is less than d.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+from synth.bench.budget_press import Measurement
+from synth.bench.report import RATE
+from synth.plan import SOLVE_GROWTH
+
+LARGEST_RATIO = 2.0
+"""Of the chosen mesh's cost over that of the cheapest rung within the budget."""
+
+
+@dataclass(frozen=True)
+class Rung:
+    """One mesh that a draw was run on.
+
+    Attributes:
+        measurement: of its press.
+        error_px: against the reference; NaN where there is none.
+    """
+
+    measurement: Measurement
+    error_px: float
+
+    @property
+    def across(self) -> int:
+        """Elements across the contact."""
+        return self.measurement.rung
+
+    @property
+    def seconds(self) -> float:
+        """Processor time of its press."""
+        return self.measurement.seconds
+
+    @property
+    def nominal(self) -> float:
+        """Cost that depends on nothing but the mesh, as `synth.plan` has it for an iteration."""
+        return float(self.measurement.unknowns**SOLVE_GROWTH)
+
+    def within(self, target_px: float) -> bool:
+        """Whether its error is; not where there is none."""
+        return self.error_px <= target_px
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One draw.
+
+    Attributes:
+        scene, index: which.
+        body: shape of the indenter.
+        depth_mm: of the press.
+        target_px: its budget.
+        chosen: elements across of its mesh.
+        predicted_px: of that mesh.
+        rungs: those that were run, rising; without those that are still to do.
+        reference: its press; None while that is to do.
+        missing: presses that are still to do.
+    """
+
+    scene: str
+    index: int
+    body: str
+    depth_mm: float
+    target_px: float
+    chosen: int
+    predicted_px: float
+    rungs: tuple[Rung, ...]
+    reference: Measurement | None
+    missing: int = 0
+
+    @cached_property
+    def trouble(self) -> str:
+        """Why nothing can be said of the draw; empty where it can."""
+        if self.unfinished or self.reference is None:
+            return f"unfinished: {self.missing} presses to do"
+        if not self.reference.complete:
+            return f"the reference is {self.reference.status}: {self.reference.reason}"
+        press = self._rung(self.chosen).measurement
+        if not press.complete:
+            return f"the chosen mesh's press is {press.status}, so that `generate` replaces the draw: {press.reason}"
+        if math.isnan(self.error_px):
+            return "the camera sees a point of the gel nowhere, so that there is no error in px"
+        return ""
+
+    @property
+    def unfinished(self) -> bool:
+        """Whether presses are still to do."""
+        return self.missing > 0
+
+    def _rung(self, across: int) -> Rung:
+        return next(rung for rung in self.rungs if rung.across == across)
+
+    @property
+    def judged(self) -> bool:
+        """Whether something can be said of it."""
+        return not self.trouble
+
+    @property
+    def chosen_rung(self) -> Rung:
+        """The press on the mesh that `generate` takes."""
+        return self._rung(self.chosen)
+
+    @property
+    def error_px(self) -> float:
+        """Of the chosen mesh."""
+        return self.chosen_rung.error_px
+
+    @property
+    def within(self) -> bool:
+        """Whether the chosen mesh met the budget."""
+        return self.chosen_rung.within(self.target_px)
+
+    @property
+    def doubt_px(self) -> float:
+        """Difference of the finest rung from the reference."""
+        return self.rungs[-1].error_px
+
+    @property
+    def added_px(self) -> float:
+        """The error with all of the doubt added to it."""
+        return self.error_px + self.doubt_px
+
+    @property
+    def extrapolated_px(self) -> float:
+        """The error if rung and reference err alike."""
+        if self.reference is None or self.error_px == 0:
+            return self.error_px
+        ratio = self.reference.spacing_mm / self.chosen_rung.measurement.spacing_mm
+        return self.error_px / (1 - ratio**RATE) if ratio < 1 else math.nan
+
+    def cheapest(self, nominal: bool = False) -> Rung | None:
+        """Of the rungs that met the budget, the one of the least cost; None where none did."""
+        return _cheapest(self.rungs, self.target_px, nominal)
+
+    def ratio(self, nominal: bool = False) -> float:
+        """Cost of the chosen mesh over that of the cheapest rung within the budget; NaN where no rung is.
+
+        Below 1 where the chosen mesh is not within it and costs less than the first that is.
+        """
+        cheapest = self.cheapest(nominal)
+        if cheapest is None:
+            return math.nan
+        chosen = self.chosen_rung
+        return chosen.nominal / cheapest.nominal if nominal else chosen.seconds / cheapest.seconds
+
+    def affordable(self, nominal: bool = False) -> bool:
+        """Whether the chosen mesh costs at most LARGEST_RATIO times the cheapest within the budget."""
+        return self.ratio(nominal) <= LARGEST_RATIO
+
+
+def _cheapest(rungs: Sequence[Rung], target_px: float, nominal: bool) -> Rung | None:
+    good = [rung for rung in rungs if rung.within(target_px)]
+    return min(good, key=lambda rung: rung.nominal if nominal else rung.seconds, default=None)

@@ -1,0 +1,163 @@
+"""The camera: rays from pixels and pixels from points, through the lens, by a mirror and through the window.
+
+A path says how a pixel sees: 0 straight through the window, k by mirror k - 1, -1 not at all. With mirrors one material
+point may be seen in several places of one image, one for each path; a camera without mirrors has path 0 alone.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synth.arrays import BoolArray, FloatArray, Pixels, Points
+from synth.optics.lens import Lens, lens_of
+from synth.optics.mirror import DIRECT, NOTHING, FlatMirror, first_met
+from synth.optics.pose import Pose
+from synth.optics.window import Window
+from synth.scene import Sensor
+
+Paths = NDArray[np.intp]
+"""(n,) path numbers."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """How pixels look.
+
+    Attributes:
+        origins: (n, 3) mm on the window's outer face; at index 1 the camera's position, or its mirror image. NaN for
+            pixels that no ray reaches: outside the range of the lens model, looking away from the window, or at the
+            back of a mirror or by two mirrors.
+        directions: (n, 3) unit, inside the gel; NaN as the origins.
+        path: (n,) path numbers, -1 where there is no ray.
+    """
+
+    origins: Points
+    directions: Points
+    path: Paths
+
+
+@dataclass(frozen=True, eq=False)
+class Optics:
+    """A camera, what stands before it, and the window that it looks through.
+
+    Attributes:
+        pose: the camera's place.
+        lens: its lens.
+        window: the face at which light bends.
+        mirrors: in the scene's order.
+        size: width and height of the image, px.
+    """
+
+    pose: Pose
+    lens: Lens
+    window: Window
+    mirrors: tuple[FlatMirror, ...]
+    size: tuple[int, int]
+
+    @staticmethod
+    def of(sensor: Sensor) -> "Optics":
+        """The optics of a sensor's main camera; `Sensor.views` gives the others.
+
+        Raises:
+            InputError: the view is along x.
+        """
+        camera = sensor.camera
+        return Optics(
+            pose=Pose.of(camera),
+            lens=lens_of(camera),
+            window=Window(sensor.window.refractive_index, sensor.gel.size_mm[2] + sensor.window.thickness_mm),
+            mirrors=tuple(FlatMirror.of(mirror) for mirror in sensor.mirrors),
+            size=(camera.width, camera.height),
+        )
+
+    @property
+    def index(self) -> float:
+        """Refractive index of gel and window."""
+        return self.window.index
+
+    @property
+    def face_z(self) -> float:
+        """Z of the window's outer face, mm."""
+        return self.window.face_z
+
+    @cached_property
+    def poses(self) -> tuple[Pose, ...]:
+        """The camera's place and its mirror images, by path number."""
+        return (self.pose, *(mirror.virtual(self.pose) for mirror in self.mirrors))
+
+    def project(self, points: Points, path: Paths | int | None = None) -> Pixels:
+        """Pixels at which points inside the gel or window are seen.
+
+        Args:
+            points: (n, 3) float64 mm.
+            path: by which path, one for all points or one for each; by default the first by which the point is seen
+                inside the image, or else straight.
+
+        Returns:
+            (n, 2) float64 px, also outside the image and, where a path is given, beyond the ends of a mirror; NaN for
+            points that have no image: behind the camera, above the window's outer face (where there is one), or beyond
+            the field of the lens model; for path -1; and by default where a mirror hides what would be in the image.
+        """
+        points = np.asarray(points, dtype=np.float64)
+        if not self.mirrors:
+            return self._project_by(self.pose, points)
+        chosen = self._first_path(points) if path is None else np.broadcast_to(np.asarray(path), len(points))
+        pixels = np.full((len(points), 2), np.nan)
+        for number, pose in enumerate(self.poses):
+            at = chosen == number
+            pixels[at] = self._project_by(pose, points[at])
+        if path is None:
+            pixels[self.is_inside(pixels) & (self.look(pixels).path != chosen)] = np.nan
+        return pixels
+
+    def look(self, pixels: Pixels) -> Rays:
+        """Rays along which pixels (n, 2) look, anywhere, also between pixel centres, and their paths."""
+        air = self.pose.world(self.lens.directions(np.asarray(pixels, dtype=np.float64)))
+        if not self.mirrors:
+            origins, directions = self.window.enter(self.pose.position, air)
+            return Rays(origins, directions, np.where(np.isnan(directions[:, 0]), NOTHING, DIRECT))
+        path = first_met(self.mirrors, self.pose.position, air)
+        origins, directions = np.full_like(air, np.nan), np.full_like(air, np.nan)
+        for number, pose in enumerate(self.poses):
+            at = path == number
+            onward = air[at] if number == DIRECT else self.mirrors[number - 1].turned(air[at])
+            origins[at], directions[at] = self.window.enter(pose.position, onward)
+        return Rays(origins, directions, np.where(np.isnan(directions[:, 0]), NOTHING, path))
+
+    def rays(self, pixels: Pixels) -> tuple[Points, Points]:
+        """Origins (n, 3) and directions (n, 3) of `look`."""
+        seen = self.look(pixels)
+        return seen.origins, seen.directions
+
+    def depth(self, points: Points, path: Paths | int = DIRECT) -> FloatArray:
+        """Distance (n,) mm of points (n, 3) mm along the viewing axis, folded at the path's mirror.
+
+        Straight through the window; NaN for path -1.
+        """
+        if not self.mirrors:
+            return np.asarray((points - self.pose.position) @ self.pose.forward)
+        chosen = np.broadcast_to(np.asarray(path), len(points))
+        depth = np.full(len(points), np.nan)
+        for number, pose in enumerate(self.poses):
+            at = chosen == number
+            depth[at] = (points[at] - pose.position) @ pose.forward
+        return depth
+
+    def is_inside(self, pixels: Pixels) -> BoolArray:
+        """Whether pixels (n, 2) lie inside the image; False for NaN."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray(np.all((pixels >= 0) & (pixels < self.size), axis=1))
+
+    def _project_by(self, pose: Pose, points: Points) -> Pixels:
+        return self.lens.project(pose.local(self.window.aim(points, pose.position)))
+
+    def _first_path(self, points: Points) -> Paths:
+        """The lowest number of a path by which points (n, 3) are seen inside the image; 0 where there is none."""
+        path = np.full(len(points), DIRECT)
+        for number in reversed(range(len(self.poses))):
+            pixels = self._project_by(self.poses[number], points)
+            seen = np.flatnonzero(self.is_inside(pixels))
+            path[seen[self.look(pixels[seen]).path == number]] = number
+        return path

@@ -1,0 +1,118 @@
+"""OpenCV's pinhole with Brown-Conrady distortion (k1, k2, p1, p2, k3).
+
+The inverse is Newton's method with the analytic Jacobian. The model is used only where it is one-to-one: up to the
+field radius at which the radial polynomial turns back. Points beyond that and pixels that no ray reaches give NaN.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from synth.arrays import BoolArray, FloatArray, Pixels, Points
+from synth.scene import Camera
+
+_RELATIVE_STEP = 1e-9
+"""Newton's error after a relative step s is of order s²; below 1e-9 the next iterate is exact to rounding."""
+_MAX_ITERATIONS = 40
+
+
+@dataclass(frozen=True, eq=False)
+class PinholeLens:
+    """Pinhole and distortion.
+
+    Attributes:
+        focal: (fx, fy) px.
+        centre: (cx, cy) px.
+        distortion: k1, k2, p1, p2, k3.
+    """
+
+    focal: FloatArray
+    centre: FloatArray
+    distortion: tuple[float, ...]
+
+    @staticmethod
+    def of(camera: Camera) -> "PinholeLens":
+        """The lens of a camera."""
+        return PinholeLens(np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy]), camera.distortion)
+
+    def project(self, local: Points) -> Pixels:
+        """Pixels (n, 2) of directions (n, 3) in the camera's frame; NaN behind it or beyond the lens's field."""
+        depth = local[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x, y = local[:, 0] / depth, local[:, 1] / depth
+            seen = (depth > 0) & (x * x + y * y < self.field_limit)
+        distorted = self._distort(np.where(seen, x, np.nan), np.where(seen, y, np.nan))
+        return np.column_stack(distorted) * self.focal + self.centre
+
+    def directions(self, pixels: Pixels) -> Points:
+        """Directions (n, 3) with z = 1 of pixels (n, 2); x and y are NaN where the lens does not look."""
+        undistorted = self._undistort((pixels - self.centre) / self.focal)
+        return np.column_stack([undistorted, np.ones(len(undistorted))])
+
+    @property
+    def field_limit(self) -> float:
+        """Square of the undistorted radius (dimensionless) up to which the lens model is one-to-one."""
+        k1, k2, _, _, k3 = self.distortion
+        roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])  # d/dr of r (1 + k1 r² + k2 r⁴ + k3 r⁶), in r²
+        real = roots[np.abs(roots.imag) <= 1e-9 * np.abs(roots)].real
+        positive = real[real > 0]
+        return float(positive.min()) if len(positive) else np.inf
+
+    def _distort(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        k1, k2, p1, p2, k3 = self.distortion
+        s = x * x + y * y
+        radial = 1 + s * (k1 + s * (k2 + s * k3))
+        return x * radial + 2 * p1 * x * y + p2 * (s + 2 * x * x), y * radial + p1 * (s + 2 * y * y) + 2 * p2 * x * y
+
+    def _distortion_jacobian(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The symmetric Jacobian of `_distort`: its xx, xy and yy components."""
+        k1, k2, p1, p2, k3 = self.distortion
+        s = x * x + y * y
+        radial = 1 + s * (k1 + s * (k2 + s * k3))
+        slope = k1 + s * (2 * k2 + s * 3 * k3)
+        xy = 2 * (x * y * slope + p1 * x + p2 * y)
+        return (
+            radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x,
+            xy,
+            radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x,
+        )
+
+    def _undistort(self, target: FloatArray) -> FloatArray:
+        """Newton with step halving; (n, 2) -> (n, 2), NaN where the target has no preimage inside the field."""
+        if not any(self.distortion):
+            return target
+        tx, ty = target[:, 0], target[:, 1]
+        limit = self.field_limit
+        # Start inside the field: pixels far outside a barrel lens' image circle would start beyond it.
+        shrink = np.minimum(1, 0.9 * np.sqrt(limit / np.maximum(tx * tx + ty * ty, 1e-300)))
+        x, y = tx * shrink, ty * shrink
+        error = self._error(x, y, target)
+        for _ in range(_MAX_ITERATIONS):
+            xx, xy, yy = self._distortion_jacobian(x, y)
+            fx, fy = self._distort(x, y)
+            determinant = xx * yy - xy * xy
+            with np.errstate(divide="ignore", invalid="ignore"):
+                dx = (yy * (tx - fx) - xy * (ty - fy)) / determinant
+                dy = (xx * (ty - fy) - xy * (tx - fx)) / determinant
+            dx, dy = np.nan_to_num(dx), np.nan_to_num(dy)
+            scale = np.ones_like(dx)
+            for _halving in range(8):  # only where the residual would grow
+                worse = self._error(x + scale * dx, y + scale * dy, target) > error
+                if not worse.any():
+                    break
+                scale[worse] /= 2
+            x, y = x + scale * dx, y + scale * dy
+            error = self._error(x, y, target)
+            if not np.any(np.hypot(dx, dy) > _RELATIVE_STEP * (1 + np.hypot(x, y))):
+                break
+        return np.where(self._is_inside(x, y, error)[:, None], np.column_stack([x, y]), np.nan)
+
+    def _error(self, x: FloatArray, y: FloatArray, target: FloatArray) -> FloatArray:
+        fx, fy = self._distort(x, y)
+        return np.hypot(fx - target[:, 0], fy - target[:, 1])
+
+    def _is_inside(self, x: FloatArray, y: FloatArray, error: FloatArray) -> BoolArray:
+        """Converged (to rounding of a coordinate of order 1) and on the branch of the lens model that is one-to-one."""
+        xx, xy, yy = self._distortion_jacobian(x, y)
+        inside = (x * x + y * y < self.field_limit) & (xx * yy - xy * xy > 0) & (xx + yy > 0)
+        return inside & (error <= 1e-12 * (1 + np.hypot(x, y)))

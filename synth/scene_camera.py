@@ -1,0 +1,95 @@
+"""The part of a scene's schema that forms images: cameras with their lenses, and flat mirrors."""
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from synth.scene_indenters import Fraction, NonNegative, Part, Positive, Vector3
+
+COEFFICIENTS = {"pinhole": "k1, k2, p1, p2, k3", "fisheye": "k1, k2, k3, k4"}
+"""Names of a lens's distortion coefficients, as OpenCV orders them."""
+
+
+class Camera(Part):
+    """A camera in air behind the window, and its image sensor. Right is +x and down +y for a view along -z."""
+
+    width: Annotated[int, Field(ge=16, le=8192)]
+    height: Annotated[int, Field(ge=16, le=8192)]
+    fx: Positive
+    fy: Positive
+    cx: float
+    cy: float
+    position_mm: Vector3
+    look_at_mm: Vector3 = (0.0, 0.0, 0.0)
+    lens: Literal["pinhole", "fisheye"] = "pinhole"
+    """pinhole: Brown-Conrady; fisheye: Kannala-Brandt as in cv2.fisheye, below 180 degrees."""
+    distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    """As in OpenCV: k1, k2, p1, p2, k3 of a pinhole lens; k1, k2, k3, k4 of a fisheye lens."""
+    exposure: Positive = 1.0
+    gamma: Annotated[float, Field(ge=0.2, le=4)] = 2.2
+    """Encoded value = linear value ** (1 / gamma)."""
+    blur_px: NonNegative = 0.0
+    """Standard deviation of the lens's Gaussian point spread."""
+    vignetting: Fraction = 0.0
+    """Relative loss of light at the image's corner, growing with the square of the distance from (cx, cy)."""
+    read_noise: Annotated[float, Field(ge=0, le=0.5)] = 0.0
+    """Standard deviation as a fraction of full scale, linear, independent of the signal."""
+    shot_noise: Annotated[float, Field(ge=0, le=0.5)] = 0.0
+    """Standard deviation at full scale; grows with the square root of the linear signal."""
+    bit_depth: Literal[8, 10, 12, 14, 16] = 8
+
+    @model_validator(mode="after")
+    def _coefficients(self) -> "Camera":
+        names = COEFFICIENTS[self.lens]
+        if len(self.distortion) != names.count(",") + 1:
+            raise ValueError(
+                f"distortion has {len(self.distortion)} numbers; a {self.lens} lens needs distortion = [{names}], "
+                "zeros for an ideal lens"
+            )
+        return self
+
+
+class FurtherCamera(Camera):
+    """Another camera that looks at the same gel; its files lie in a folder of its name in each sample."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_\-]+$")]
+
+
+class Mirror(Part):
+    """A flat, ideal, rectangular mirror in air between cameras and window; its back is black."""
+
+    position_mm: Vector3
+    """Its centre."""
+    normal: Vector3
+    """Away from its reflecting side; of any length."""
+    size_mm: tuple[Positive, Positive]
+    """Along the contact face, and at right angles to that and to the normal; along x and y for a normal along z."""
+    rotation_deg: float = 0.0
+    """Turns the rectangle in its own plane, from its first size's direction toward its second's."""
+
+    @property
+    def axes(self) -> tuple[Vector3, Vector3, Vector3]:
+        """Unit vectors along the first size, along the second size, and of the normal."""
+        length = math.hypot(*self.normal)
+        nx, ny, nz = (component / length for component in self.normal)
+        level = math.hypot(nx, ny)
+        a = (-ny / level, nx / level, 0.0) if level > 1e-9 else (1.0, 0.0, 0.0)
+        b = (ny * a[2] - nz * a[1], nz * a[0] - nx * a[2], nx * a[1] - ny * a[0])
+        turn = math.radians(self.rotation_deg)
+        c, s = math.cos(turn), math.sin(turn)
+        first = (c * a[0] + s * b[0], c * a[1] + s * b[1], c * a[2] + s * b[2])
+        second = (c * b[0] - s * a[0], c * b[1] - s * a[1], c * b[2] - s * a[2])
+        return first, second, (nx, ny, nz)
+
+    @property
+    def lowest_mm(self) -> float:
+        """The smallest z of its corners."""
+        first, second, _ = self.axes
+        return self.position_mm[2] - (abs(first[2]) * self.size_mm[0] + abs(second[2]) * self.size_mm[1]) / 2
+
+    @model_validator(mode="after")
+    def _facing(self) -> "Mirror":
+        if math.hypot(*self.normal) < 1e-9:
+            raise ValueError("normal is zero: give the direction that the mirror faces, such as [0, -1, -1]")
+        return self
