@@ -237,8 +237,8 @@ class Numerics(Part):
     tolerance: Annotated[float, Field(ge=1e-12, le=1e-2)] = 1e-6
     """Newton stops when the residual is below this fraction of the reaction force."""
     penalty: Annotated[float, Field(ge=1, le=1e4)] = 50.0
-    """Contact stiffness in multiples of E per mm, before augmented-Lagrangian updates; sharp bodies get up to four times
-    as much."""
+    """Contact stiffness in multiples of E per mm, before augmented-Lagrangian updates; sharp bodies get up to four
+    times as much."""
 
     @model_validator(mode="after")
     def _one_resolution(self) -> "Numerics":

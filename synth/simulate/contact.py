@@ -40,6 +40,7 @@ class Indenters:
         centre: (B,) world position of the origin of the indenter's frame, mm.
         rotation: (B,) its frame's axes as columns.
         friction: (B,) Coulomb coefficient.
+        sharpness: (B,) factor on the contact stiffness ε; see `synth.simulate.indenter`.
     """
 
     kind: wp.array(dtype=wp.int32)
@@ -48,6 +49,7 @@ class Indenters:
     centre: wp.array(dtype=wp.vec3d)
     rotation: wp.array(dtype=wp.mat33d)
     friction: wp.array(dtype=wp.float64)
+    sharpness: wp.array(dtype=wp.float64)
 
 
 @wp.struct
@@ -110,10 +112,17 @@ def anchor_of(state: ContactState, y: wp.vec3d, gap: wp.float64, s: int, f: int,
 
 @wp.func
 def _trial(
-    state: ContactState, rotation: wp.mat33d, y: wp.vec3d, anchor: wp.vec4d, penalty: wp.float64, s: int, f: int, q: int
+    state: ContactState,
+    rotation: wp.mat33d,
+    y: wp.vec3d,
+    anchor: wp.vec4d,
+    stiffness: wp.float64,
+    s: int,
+    f: int,
+    q: int,
 ) -> wp.vec3d:
     """The trial traction m, in world axes."""
-    return rotation * (state.tangent[s, f, q] - penalty * (y - wp.vec3d(anchor[0], anchor[1], anchor[2])))
+    return rotation * (state.tangent[s, f, q] - stiffness * (y - wp.vec3d(anchor[0], anchor[1], anchor[2])))
 
 
 @wp.func
@@ -162,6 +171,7 @@ def contact_residual(
     if active[s] == 0:
         return
     rotation = indenters.rotation[s]
+    stiffness = penalty * indenters.sharpness[s]
     far = _is_far(faces, indenters, u, s, f)
     for q in range(faces.weight.shape[1]):
         if far:
@@ -175,13 +185,13 @@ def contact_residual(
         gap[s, f, q] = d[3]
         t = wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(0.0))
         along = wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(0.0))
-        pressure = state.normal[s, f, q] - penalty * d[3]
+        pressure = state.normal[s, f, q] - stiffness * d[3]
         if pressure > wp.float64(0.0):
             n = rotation * wp.vec3d(d[0], d[1], d[2])
             t = pressure * n
             anchor = anchor_of(state, y, d[3], s, f, q)
             if indenters.friction[s] > wp.float64(0.0) and anchor[3] > wp.float64(0.0):
-                m = _trial(state, rotation, y, anchor, penalty, s, f, q)
+                m = _trial(state, rotation, y, anchor, stiffness, s, f, q)
                 along = _returned(m - wp.dot(n, m) * n, indenters.friction[s] * pressure)
                 t += along
             for a in range(faces.nodes.shape[1]):
@@ -214,6 +224,7 @@ def contact_stiffness(
         return
     rotation = indenters.rotation[s]
     friction = indenters.friction[s]
+    stiffness = penalty * indenters.sharpness[s]
     identity = wp.identity(n=3, dtype=wp.float64)
     zero = wp.mat33d()
     half = wp.float64(0.5)
@@ -223,33 +234,33 @@ def contact_stiffness(
         x = position(faces, u, s, f, q)
         y = wp.transpose(rotation) * (x - indenters.centre[s])
         d = signed_distance(indenters.kind[s], indenters.shape[s], y, s, indenters.coefficients)
-        pressure = state.normal[s, f, q] - penalty * d[3]
+        pressure = state.normal[s, f, q] - stiffness * d[3]
         if pressure > wp.float64(0.0):
             n = rotation * wp.vec3d(d[0], d[1], d[2])
             local = normal_derivative(indenters.kind[s], indenters.shape[s], y, s, indenters.coefficients)
             H = rotation * local * wp.transpose(rotation)
-            block = penalty * wp.outer(n, n) - pressure * H
+            block = stiffness * wp.outer(n, n) - pressure * H
             touching[s, f] = wp.max(touching[s, f], 1)
             anchor = anchor_of(state, y, d[3], s, f, q)
             if friction > wp.float64(0.0) and anchor[3] > wp.float64(0.0):
                 touching[s, f] = 2
-                m = _trial(state, rotation, y, anchor, penalty, s, f, q)
+                m = _trial(state, rotation, y, anchor, stiffness, s, f, q)
                 tangential = m - wp.dot(n, m) * n
                 length = wp.length(tangential)
                 limit = friction * pressure
                 P = identity - wp.outer(n, n)
-                A = (penalty * anchor[3]) * P + wp.dot(n, m) * H + wp.outer(n, H * m)
+                A = (stiffness * anchor[3]) * P + wp.dot(n, m) * H + wp.outer(n, H * m)
                 fresh = zero
                 if state.anchored[s, f, q] == 0:
                     before = state.gap[s, f, q]
                     slope = before / ((before - d[3]) * (before - d[3]))
-                    fresh = (-penalty * slope) * wp.outer(P * (rotation * (y - state.place[s, f, q])), n)
+                    fresh = (-stiffness * slope) * wp.outer(P * (rotation * (y - state.place[s, f, q])), n)
                 onto = identity
                 rest = zero
                 if length > limit:
                     tau = tangential / length
                     onto = (limit / length) * (identity - wp.outer(tau, tau))
-                    rest = (friction * penalty) * wp.outer(tau, n)
+                    rest = (friction * stiffness) * wp.outer(tau, n)
                 A = onto * A
                 mean = half * (A + wp.transpose(A))
                 remainder[s, f, q] = rest + onto * fresh + (A - mean)

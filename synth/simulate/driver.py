@@ -19,7 +19,7 @@ class Driver:
 
     loose: float = 1e-3
     extrapolate: bool = True
-    correction_iterations: int = 7
+    correction_iterations: int = 10
 
 
 STANDARD = Driver()

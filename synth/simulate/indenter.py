@@ -14,6 +14,9 @@ from synth.errors import InputError
 from synth.scene_indenters import Box, Cone, Cylinder, Indenter, MeshIndenter, Sphere, Torus
 from synth.simulate.distance import KINDS, SHAPE_LENGTH
 
+BLUNT_MM = 1.0
+"""Smallest radius at which the contact stiffness of `numerics.penalty` is enough."""
+SHARPEST = 4.0
 LARGEST_GRID = 4_000_000
 """Cells of a mesh indenter's distance grid (32 MB)."""
 
@@ -28,6 +31,7 @@ class RigidBody:
         rotation: (3, 3) its axes as columns, before any twist.
         reach_mm: from its origin to its farthest point in +z, the point that touches first.
         coefficients: (i, j, k) B-spline coefficients of a mesh's distance grid, else (1, 1, 1) zeros.
+        sharpest_mm: its smallest radius of curvature: fillet, tip, tube or, of a mesh, the cell of its grid.
     """
 
     kind: int
@@ -35,6 +39,18 @@ class RigidBody:
     rotation: FloatArray
     reach_mm: float
     coefficients: FloatArray
+    sharpest_mm: float
+
+    @property
+    def sharpness(self) -> float:
+        """Factor on the contact stiffness: 1 for blunt bodies, up to SHARPEST for those with sharp edges.
+
+        Where pressure of some E meets an edge, the gel must not sink in by as much as the edge's radius: the surface
+        that it is held by, and the direction of the force, are lost there. With the stiffness of blunt bodies a block
+        of fillet 0.2 mm, 1.2 mm deep, sank in by 0.15 mm and lacked 8 % of its force; with four times that stiffness
+        by 0.05 mm, and it lacked 1.5 %.
+        """
+        return float(np.clip(BLUNT_MM / self.sharpest_mm, 1.0, SHARPEST))
 
 
 def rotation_about(axis: int, angle: float) -> FloatArray:
@@ -64,33 +80,36 @@ def rigid_body(indenter: Indenter, folder: Path | None = None, resolution_mm: fl
     coefficients = np.zeros((1, 1, 1))
     match indenter:
         case Sphere(radius_mm=radius):
-            lengths, reach = [0.0, radius], radius
+            lengths, reach, sharpest = [0.0, radius], radius, radius
         case Cylinder(radius_mm=radius, length_mm=length, fillet_mm=fillet):
             _require(fillet < min(radius, length / 2), indenter, "fillet_mm", f"less than {min(radius, length / 2)}")
             fillet = _rounded(fillet, resolution_mm, min(radius, length / 2))
+            sharpest = fillet
             core, half = radius - fillet, length / 2 - fillet
             lengths, reach = [fillet, core, half], core * radial + half * abs(axial) + fillet
         case Box(size_mm=size, fillet_mm=fillet):
             _require(fillet < min(size) / 2, indenter, "fillet_mm", f"less than {min(size) / 2}")
             fillet = _rounded(fillet, resolution_mm, min(size) / 2)
+            sharpest = fillet
             half_edges = np.array(size) / 2 - fillet
             lengths, reach = [fillet, *half_edges], float(np.abs(up) @ half_edges) + fillet
         case Cone(half_angle_deg=angle, height_mm=height, fillet_mm=fillet):
             _require(2 * fillet < height, indenter, "fillet_mm", f"less than {height / 2}")
             fillet = _rounded(fillet, resolution_mm, height / 2)
+            sharpest = fillet
             core = height - 2 * fillet
             base = core * float(np.tan(np.radians(angle)))
             lengths, reach = [fillet, base, core], max(0.0, base * radial - core * axial) + fillet
         case Torus(radius_mm=radius, tube_mm=tube):
             _require(tube < radius, indenter, "tube_mm", f"less than radius_mm = {radius}")
-            lengths, reach = [tube, radius], radius * radial + tube
+            lengths, reach, sharpest = [tube, radius], radius * radial + tube, tube
         case MeshIndenter():
             corner, vertices, coefficients = _distance_grid(indenter, folder or Path())
             lengths = [0.0, *corner, indenter.cell_mm, *coefficients.shape]
-            reach = float((vertices @ up).max())
+            reach, sharpest = float((vertices @ up).max()), indenter.cell_mm
     shape = np.zeros(SHAPE_LENGTH)
     shape[: len(lengths)] = lengths
-    return RigidBody(KINDS[indenter.shape], shape, rotation, reach, coefficients)
+    return RigidBody(KINDS[indenter.shape], shape, rotation, reach, coefficients, sharpest)
 
 
 def _rounded(fillet: float, resolution: float, half_thickness: float) -> float:

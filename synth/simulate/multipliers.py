@@ -12,20 +12,27 @@ wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 @wp.kernel
 def augment(
-    active: wp.array(dtype=wp.int32),
+    share: wp.array(dtype=wp.float64),
     indenters: Indenters,
     gap: wp.array3d(dtype=wp.float64),
     tangential: wp.array3d(dtype=wp.vec3d),
     penalty: wp.float64,
     state: ContactState,
 ):
-    """Multipliers take the present traction, so that the next solution needs less penetration and elastic slip."""
+    """Multipliers go a share (B,) of the way to the present traction.
+
+    The next solution then needs less penetration and elastic slip.
+    """
     s, f, q = wp.tid()
-    if active[s] == 0:
+    if share[s] == wp.float64(0.0):
         return
-    state.normal[s, f, q] = wp.max(wp.float64(0.0), state.normal[s, f, q] - penalty * gap[s, f, q])
+    stiffness = penalty * indenters.sharpness[s]
+    before = state.normal[s, f, q]
+    state.normal[s, f, q] = wp.max(wp.float64(0.0), before - share[s] * stiffness * gap[s, f, q])
     if state.anchored[s, f, q] == 1:
-        state.tangent[s, f, q] = wp.transpose(indenters.rotation[s]) * tangential[s, f, q]
+        held = state.tangent[s, f, q]
+        now = wp.transpose(indenters.rotation[s]) * tangential[s, f, q]
+        state.tangent[s, f, q] = held + share[s] * (now - held)
 
 
 @wp.kernel
@@ -52,7 +59,8 @@ def settle(
     y = zero
     if gap[s, f, q] < FAR:
         y = wp.transpose(rotation) * (position(faces, u, s, f, q) - indenters.centre[s])
-    pressure = state.normal[s, f, q] - penalty * gap[s, f, q]
+    stiffness = penalty * indenters.sharpness[s]
+    pressure = state.normal[s, f, q] - stiffness * gap[s, f, q]
     if pressure > wp.float64(0.0) and state.anchored[s, f, q] == 0:
         anchor = anchor_of(state, y, gap[s, f, q], s, f, q)
         state.tangent[s, f, q] = zero
@@ -69,4 +77,4 @@ def settle(
         return
     t = wp.transpose(rotation) * tangential[s, f, q]
     if wp.length(t) >= ON_CONE * indenters.friction[s] * pressure:
-        state.anchor[s, f, q] = y - (state.tangent[s, f, q] - t) / penalty
+        state.anchor[s, f, q] = y - (state.tangent[s, f, q] - t) / stiffness

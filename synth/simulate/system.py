@@ -247,13 +247,12 @@ class System:
             step.u[s], step.p[s] = full[:moves].reshape(-1, 3), full[moves:]
         return step
 
-    def augment(self, indenters: Indenters, active: np.ndarray) -> None:
-        """Augmented-Lagrangian update of the active samples at the last balance."""
-        mask = warp_array(active.astype(np.int32), wp.int32, self.device)
+    def augment(self, indenters: Indenters, share: FloatArray) -> None:
+        """Augmented-Lagrangian update at the last balance: of each sample its share (B,), 1 for all of it."""
         wp.launch(
             augment,
             self.gap.shape,
-            inputs=[mask, indenters, self.gap, self.tangential, self.penalty],
+            inputs=[warp_array(share, wp.float64, self.device), indenters, self.gap, self.tangential, self.penalty],
             outputs=[self.contact],
             device=self.device,
         )

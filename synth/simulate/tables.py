@@ -69,4 +69,5 @@ def pack_indenters(paths: Sequence[Path], friction: Sequence[float], device: str
     packed.centre = wp.zeros(len(bodies), dtype=wp.vec3d, device=device)
     packed.rotation = wp.zeros(len(bodies), dtype=wp.mat33d, device=device)
     packed.friction = warp_array(np.array(friction, dtype=np.float64), wp.float64, device)
+    packed.sharpness = warp_array(np.array([body.sharpness for body in bodies]), wp.float64, device)
     return packed

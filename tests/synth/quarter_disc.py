@@ -74,7 +74,7 @@ def press(quarter: System, indenter: Indenters, penalties: tuple[float, ...] = (
         if k < len(penalties):
             quarter.penalty = penalties[k]
         else:
-            quarter.augment(indenter, ACTIVE)
+            quarter.augment(indenter, np.ones(1))
         solution = solve(quarter, state, indenter, ACTIVE, np.array([TOLERANCE]))
         assert solution.converged[0], f"solve {k}: residual {solution.residual[0]:.1e}"
         state = solution.state

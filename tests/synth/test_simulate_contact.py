@@ -137,7 +137,7 @@ def test_augmenting_takes_the_present_traction() -> None:
     made = touch(0.7, multipliers=False)
     contact = made.body.contact
     normal, along = sphere_law(made)
-    made.body.augment(made.indenters, everything(made.body))
+    made.body.augment(made.indenters, np.ones(made.body.batch))
     np.testing.assert_allclose(contact.normal.numpy()[0], np.linalg.norm(normal, axis=-1), atol=1e-13)
     np.testing.assert_allclose(contact.tangent.numpy()[0], along @ made.rotation, atol=1e-13)
     # Where the gap is closed exactly the traction then needs no penetration: t = lambda - eps g.

