@@ -111,12 +111,13 @@ def fem(
     *,
     out: Annotated[Path, Parameter(help="Directory for the table, the plot and the report.")] = Path("data/bench"),
     quick: Annotated[bool, Parameter(negative=(), help="One case and a few settings.")] = False,
+    workers: Annotated[int, Parameter(converter=_whole(1), help="Presses that run at once.")] = 2,
     as_json: AsJson = False,
 ) -> int:
     """Measures error against run time."""
     from synth.bench import run_bench
 
-    return run_bench("fem", out, quick, as_json)
+    return run_bench("fem", out, quick, as_json, workers)
 
 
 @bench.command

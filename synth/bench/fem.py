@@ -7,6 +7,7 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import nullcontext
 from dataclasses import dataclass
 from multiprocessing import get_context
+from typing import Any
 
 import numpy as np
 
@@ -113,61 +114,80 @@ class Results:
 
     def of(self, case: Case) -> list[Row]:
         """The rows of a case."""
-        return [row for row in self.rows if row.case is case]
+        return [row for row in self.rows if row.case == case]
 
 
 def measure(suite: Suite, px_per_mm: float, processes: int = 2, say: Say = lambda _: None) -> Results:
-    """Run a suite: references first, side by side, then one setting after another on an otherwise idle machine.
+    """Run a suite: references first, then the cases, side by side; of a case one setting after another.
 
     Args:
         suite: what to run.
         px_per_mm: image scale that errors are given in.
-        processes: for the references; 1 runs them in this process.
+        processes: how many presses run at once; 1 runs them in this process.
         say: told what was done.
     """
     started = time.perf_counter()
     cases = [case for case, _ in suite.cases]
-    references = _references(cases, (suite.reference, suite.check), processes, say)
-    rows, trust = [], {}
-    meshes: dict[tuple[str, MeshKind], tuple[PadMesh, float]] = {}
-    for (case, settings), ((good, press_s, unknowns), (less_good, check_s, _)) in zip(
-        suite.cases, references, strict=True
-    ):
-        trust[case.name] = Trust(errors(less_good, good, case, px_per_mm), (press_s, check_s), unknowns)
-        pressed(case, settings[0], Fine(2, 2).mesh(case), 0.0)  # compiles what is not yet compiled
-        for setting in settings:
-            key = (case.name, setting.mesh)
-            if key not in meshes:
-                began = time.perf_counter()
-                mesh = setting.mesh.mesh(case)
-                meshes[key] = (mesh, time.perf_counter() - began)
-            mesh, mesh_s = meshes[key]
-            press = pressed(case, setting, mesh)
-            row = Row(case, setting, press, errors(answer(press.trajectory), good, case, px_per_mm), mesh_s)
-            rows.append(row)
-            say(f"{case.name}: {setting.name}: {row.seconds:.2f} s, {row.percent:.2f} %, force {row.force:.2f} %")
+    count = min(processes, os.cpu_count() or 1)
+    with ProcessPoolExecutor(count, get_context("spawn")) if count > 1 else nullcontext() as pool:  # no fork: Warp
+        at_once: Callable[..., Any] = pool.map if pool else map
+        references = _references(cases, (suite.reference, suite.check), at_once, say)
+        trust = {
+            case.name: Trust(
+                errors(check.found, good.found, case, px_per_mm), (good.seconds, check.seconds), good.unknowns
+            )
+            for case, (good, check) in zip(cases, references, strict=True)
+        }
+        rows: list[Row] = []
+        settings, answers = [of_case for _, of_case in suite.cases], [good.found for good, _ in references]
+        for found in at_once(_rows, cases, settings, answers, [px_per_mm] * len(cases)):
+            rows += found
+            for row in found:
+                say(f"{row.case.name}: {row.setting.name}: {row.seconds:.2f} s, {row.percent:.2f} %, {row.force:.2f} %")
     stepper = ready_stepper(cases[0], suite.profiled, suite.profiled.mesh.mesh(cases[0]))
     shares = time_shares(stepper.run)
     return Results(suite, tuple(rows), trust, shares, px_per_mm, time.perf_counter() - started)
 
 
-Solved = tuple[Answer, float, int]
+def _rows(case: Case, settings: Sequence[Setting], reference: Answer, px_per_mm: float) -> list[Row]:
+    """All settings of a case."""
+    pressed(case, settings[0], Fine(2, 2).mesh(case), 0.0)  # compiles what is not yet compiled
+    meshes: dict[MeshKind, tuple[PadMesh, float]] = {}
+    rows = []
+    for setting in settings:
+        if setting.mesh not in meshes:
+            began = time.perf_counter()
+            mesh = setting.mesh.mesh(case)
+            meshes[setting.mesh] = (mesh, time.perf_counter() - began)
+        mesh, mesh_s = meshes[setting.mesh]
+        press = pressed(case, setting, mesh)
+        rows.append(Row(case, setting, press, errors(answer(press.trajectory), reference, case, px_per_mm), mesh_s))
+    return rows
 
 
-def _references(cases: Sequence[Case], meshes: Sequence[Fine], processes: int, say: Say) -> list[tuple[Solved, ...]]:
+@dataclass(frozen=True)
+class Solved:
+    """A reference."""
+
+    found: Answer
+    seconds: float
+    unknowns: int
+
+
+def _references(
+    cases: Sequence[Case], meshes: Sequence[Fine], at_once: Callable[..., Any], say: Say
+) -> list[tuple[Solved, ...]]:
     """For each case what `_solve` gives on each of the meshes."""
     jobs = [(case, mesh) for mesh in meshes for case in cases]  # the longest first
-    count = min(processes, os.cpu_count() or 1, len(jobs))
-    solved = []
-    with ProcessPoolExecutor(count, get_context("spawn")) if count > 1 else nullcontext() as pool:  # no fork: Warp
-        for (case, mesh), one in zip(jobs, (pool.map if pool else map)(_solve, *zip(*jobs, strict=True)), strict=True):
-            say(f"{case.name}: reference, {mesh}: {one[1]:.1f} s")
-            solved.append(one)
+    solved: list[Solved] = []
+    for (case, mesh), one in zip(jobs, at_once(_solve, *zip(*jobs, strict=True)), strict=True):
+        say(f"{case.name}: reference, {mesh}: {one.seconds:.1f} s")
+        solved.append(one)
     return [tuple(solved[k :: len(cases)]) for k in range(len(cases))]
 
 
 def _solve(case: Case, mesh: Fine) -> Solved:
-    """A reference: answer, seconds, unknowns.
+    """A reference.
 
     Raises:
         RuntimeError: it did not reach its end, or a correction of penetration was dropped.
@@ -178,4 +198,4 @@ def _solve(case: Case, mesh: Fine) -> Solved:
         raise RuntimeError(
             f"no errors can be given: the reference of {case.name} on {mesh} is {ended}, {deepest:.2g} mm in the ball"
         )
-    return answer(press.trajectory), press.seconds, press.unknowns
+    return Solved(answer(press.trajectory), press.seconds, press.unknowns)

@@ -9,7 +9,7 @@ from synth.errors import InputError
 BENCHES = ("fem",)
 
 
-def run_bench(what: str, out: Path, quick: bool, as_json: bool) -> int:
+def run_bench(what: str, out: Path, quick: bool, as_json: bool, processes: int = 2) -> int:
     """Measure error against run time and write OUT/fem.csv, fem.png and fem.md.
 
     Args:
@@ -17,6 +17,7 @@ def run_bench(what: str, out: Path, quick: bool, as_json: bool) -> int:
         out: directory.
         quick: a handful of settings of the first case, in about two minutes.
         as_json: print the rows instead of the summary.
+        processes: how many presses run at once.
 
     Returns:
         0, or 1 when a setting of the standard family did not reach the end of its press.
@@ -39,6 +40,7 @@ def run_bench(what: str, out: Path, quick: bool, as_json: bool) -> int:
     results = measure(
         suite.quick() if quick else suite.whole(),
         scale,
+        processes,
         say=lambda line: print(f"synth: {line}", file=sys.stderr, flush=True),
     )
     write_results(out, results, "python -m synth bench fem" + (" --quick" if quick else ""))
