@@ -1,4 +1,4 @@
-"""The command line: `python -m synth generate|plan|simulate|bench|stress|inspect|verify|export|doctor`.
+"""The command line: `python -m synth generate|plan|simulate|bench|stress|calibrate|inspect|verify|export|doctor`.
 
 Exit status: 0 done, 1 done with failed samples or a failed check, 2 wrong input, 130 interrupted. Nothing heavy is
 imported before a command runs.
@@ -55,19 +55,31 @@ def generate(
     scene: SceneName = DEFAULT_SCENE,
     n: Annotated[int, Parameter(converter=_whole(1), help="Samples in the dataset.")] = 8,
     out: Annotated[
-        Path, Parameter(help="Directory of the dataset; one that holds part of the same job goes on.")
-    ] = Path("data/demo"),
+        str,
+        Parameter(help="Directory or fsspec URL of the dataset; one that holds part of the same job goes on."),
+    ] = "data/demo",
     seed: Annotated[int, Parameter(converter=_whole(0), help="Seed of everything random.")] = 0,
     assignments: Assignments = None,
     device: Device = "auto",
-    workers: Annotated[int, Parameter(converter=_whole(1), help="Processes that make samples; the same come out.")] = 1,
+    workers: Annotated[
+        int | None, Parameter(converter=_whole(1), help="Processes that make samples; the same come out. Default: 1.")
+    ] = None,
+    ray: Annotated[
+        str | None, Parameter(help="Address of a Ray cluster to make samples on, such as auto; local begins one here.")
+    ] = None,
+    shard: Annotated[
+        str | None,
+        Parameter(
+            help="i/N: make every N-th trajectory from i on (from 0), beside other processes with the same --out."
+        ),
+    ] = None,
     dry_run: Annotated[bool, Parameter(negative=(), help="Only show the plan.")] = False,
     as_json: AsJson = False,
 ) -> int:
     """Generates image pairs with exact flow."""
     from synth.commands import run_generate
 
-    return run_generate(scene, n, out, seed, assignments or [], device, workers, dry_run, as_json)
+    return run_generate(scene, n, out, seed, assignments or [], device, workers, ray, shard, dry_run, as_json)
 
 
 @app.command
@@ -132,6 +144,7 @@ def budget(
     ] = Path("data/bench"),
     draws: Annotated[int, Parameter(converter=_whole(1), help="Draws of each scene.")] = 20,
     seed: Annotated[int, Parameter(converter=_whole(0), help="Seed of the draws; the error model saw 0 and 1.")] = 2,
+    reference: Annotated[int, Parameter(converter=_whole(8), help="Elements across the contact of the truth.")] = 18,
     workers: Annotated[int, Parameter(converter=_whole(1), help="Presses that run at once.")] = 1,
     minutes: Annotated[
         float | None, Parameter(help="Begin no press that will not end within them; the same command goes on.")
@@ -141,7 +154,33 @@ def budget(
     """Compares random draws with much finer solutions: is the error within its target, at little more than it takes?"""
     from synth.bench import run_budget
 
-    return run_budget(scene or [], out, draws, seed, workers, minutes, as_json)
+    return run_budget(scene or [], out, draws, seed, reference, workers, minutes, as_json)
+
+
+@bench.command
+def scale(
+    *,
+    scene: SceneName = DEFAULT_SCENE,
+    out: Annotated[
+        Path, Parameter(help="Directory for the table and the report; pairs are made there and removed.")
+    ] = Path("data/bench"),
+    n: Annotated[int, Parameter(converter=_whole(1), help="Half of the pairs of each run.")] = 8,
+    size: Annotated[
+        list[str] | None,
+        Parameter(help="Image, such as 640x480; repeatable. Default: the scene's own, and half of it."),
+    ] = None,
+    workers: Annotated[
+        list[int] | None, Parameter(help="Processes; repeatable. Default: 1, 2, 4 ... up to the number of cores.")
+    ] = None,
+    device: Device = "auto",
+    seed: Annotated[int, Parameter(converter=_whole(0), help="Seed of the draws.")] = 0,
+    minutes: Annotated[float | None, Parameter(help="Begin no further run after them.")] = None,
+    as_json: AsJson = False,
+) -> int:
+    """Measures pairs per second, where the time goes, and what larger jobs would take."""
+    from synth.bench import run_scale
+
+    return run_scale(scene, out, n, size or [], workers or [], device, seed, minutes, as_json)
 
 
 @app.command
@@ -156,6 +195,32 @@ def stress(
     from synth.stress import run_stress
 
     return run_stress(out, only, workers, as_json)
+
+
+@app.command
+def calibrate(
+    *,
+    frames: Annotated[list[Path], Parameter(consume_multiple=True, help="Images of the undeformed gel, to be fitted.")],
+    scene: SceneName = DEFAULT_SCENE,
+    out: Annotated[Path, Parameter(help="Directory for scene.toml, calibration.png and calibration.json.")] = Path(
+        "data/calibration"
+    ),
+    judge: Annotated[
+        list[Path] | None, Parameter(consume_multiple=True, help="More of such images, to judge the fit by.")
+    ] = None,
+    spacing_mm: Annotated[
+        float | None, Parameter(help="Distance of the dots' columns where known; else the scene's field of view holds.")
+    ] = None,
+    steps: Annotated[
+        int, Parameter(converter=_whole(0), help="Most steps of the lights' geometry; 0: powers only.")
+    ] = 30,
+    assignments: Assignments = None,
+    as_json: AsJson = False,
+) -> int:
+    """Fits a scene's lights, dots and camera to images of your own sensor."""
+    from synth.calibrate import run_calibrate
+
+    return run_calibrate(scene, frames, judge or [], out, assignments or [], spacing_mm, steps, as_json)
 
 
 @app.command

@@ -23,7 +23,10 @@ from rich.table import Table
 from rich.text import Text
 
 from synth.dataset.export import ExportFormat, export
-from synth.generate import Summary, job_variant
+from synth.dataset.output import output_of
+from synth.dataset.shard import Shard
+from synth.dataset.summary import shares
+from synth.generate import Scheduling, Summary, job_variant
 from synth.generate import generate as generate_samples
 from synth.plan import Plan, check_buildable, plan
 from synth.render.variant import Device, Variant
@@ -33,15 +36,18 @@ from synth.template import load_scene
 def run_generate(
     scene: str,
     n: int,
-    out: Path,
+    out: str,
     seed: int,
     assignments: Sequence[str],
     device: Device,
-    workers: int,
+    workers: int | None,
+    ray: str | None,
+    shard: str | None,
     dry_run: bool,
     as_json: bool,
 ) -> int:
     """See `synth.cli.generate`."""
+    scheduling = Scheduling(workers, ray, Shard.parse(shard) if shard else None)
     template = load_scene(scene, assignments)
     variant = job_variant(template, device)
     check_buildable(template, variant)
@@ -49,9 +55,9 @@ def run_generate(
         return _show_plan(plan(template, variant), n, as_json)
     _say_hint(variant)
     with _progress(f"{template.name}: pairs", n) as advance:
-        summary = generate_samples(template, n, out, seed, variant, workers, advance)
+        summary = generate_samples(template, n, output_of(out), seed, variant, scheduling, advance)
     if as_json:
-        print(json.dumps({**vars(summary), "directory": str(summary.directory)}))
+        print(json.dumps({"directory": str(summary.directory), **summary.record()}))
     else:
         _show_summary(summary, variant)
     return 1 if summary.given_up else 0
@@ -189,18 +195,19 @@ def _error_line(planned: Plan) -> str:
 
 def _show_summary(summary: Summary, variant: Variant) -> None:
     console = Console()
-    total = sum(summary.stages.values())
-    stages = ", ".join(f"{name} {seconds / total:.0%}" for name, seconds in summary.stages.items()) if total else ""
-    rate = f", {summary.made / summary.seconds:.2f} pairs/s" if summary.made else ""
+    stages = ", ".join(f"{name} {share:.0%}" for name, share in shares(summary.stages).items())
+    rate = f", {summary.samples_per_second:.2f} pairs/s" if summary.made else ""
     _say(
         console,
         f"{summary.made} pairs made ({summary.found} were there) in {_duration(summary.seconds)}{rate} "
-        f"with {variant.name}: {summary.directory}",
+        f"with {variant.name}: {summary.directory}" + (f", shard {summary.shard}" if summary.shard else ""),
     )
     if stages:
         _say(console, f"time: {stages}")
     if summary.failed_draws:
-        _say(console, f"{summary.failed_draws} draws failed and were drawn again (failures.jsonl)")
+        _say(console, f"{summary.failed_draws} draws failed and were drawn again (failures.jsonl):")
+        for reason, count in summary.failures.most_common(5):
+            _say(console, f"  {count} x {reason}")
     if summary.given_up:
         print(
             f"synth: {len(summary.given_up)} samples could not be made, see {summary.directory}/failures.jsonl",

@@ -1,19 +1,25 @@
 """Scheduling: which trajectories are still to do, who does them, and what happened.
 
-In-process by default; with workers, one process each (`synth.processes`). The driver alone writes manifest and
-failures; samples' folders are written where they are made. The same command goes on where it stopped.
+In-process by default; with workers, one process each (`synth.processes`); with Ray, on a cluster (`synth.ray_pool`);
+or one shard of the job, beside others. The driver alone writes manifest and failures; samples' folders are written
+where they are made. The same command goes on where it stopped.
 """
 
 import re
 import time
+from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
+from typing import Any
 
 from synth import __version__
 from synth.dataset.job import Job
+from synth.dataset.output import Output, is_shared, open_writer, output_of
+from synth.dataset.shard import Shard
+from synth.dataset.summary import reason_group, shares
+from synth.dataset.url_writer import UrlWriter
 from synth.dataset.writer import DatasetWriter
 from synth.errors import InputError
 from synth.mesh import mesh_key, pad_mesh
@@ -21,37 +27,89 @@ from synth.mesh.cache import user_cache
 from synth.plan import check_buildable
 from synth.processes import outcomes_of_processes
 from synth.produce import Outcome, Producer, Task, Workplace
+from synth.ray_pool import outcomes_of_ray
 from synth.render.pattern import is_grey
 from synth.render.variant import Device, Variant, choose_variant
 from synth.sampling import draw_sensor, sensor_of
 from synth.scene import Gel
 from synth.template import Template
 
-MESHES_FOLDER = "meshes"
 PACKAGES = ("mitsuba", "drjit", "warp-lang", "pytetwild", "pypardiso", "numpy", "scipy", "OpenEXR")
 
 
 @dataclass(frozen=True)
+class Scheduling:
+    """Who makes a job's samples; they are the same whoever does.
+
+    Attributes:
+        workers: processes; 1 stays in this one. With Ray: tasks at once, None for all cores of the cluster.
+        ray: address of a Ray cluster, or "local".
+        shard: make this part of the job only.
+    """
+
+    workers: int | None = None
+    ray: str | None = None
+    shard: Shard | None = None
+
+
+@dataclass
 class Summary:
     """What `generate` did.
 
     Attributes:
-        directory: of the dataset.
-        made: samples written by this call.
+        directory: of the dataset, or its URL.
+        shard: "i/N", or None for the whole job.
+        asked_for: samples that it was to see to.
         found: samples that were there already.
+        made: samples written by this call.
         given_up: indices whose every draw failed.
         failed_draws: draws that failed and were redrawn.
+        failures: stage and reason, numbers left out -> how many draws.
         seconds: wall time.
         stages: stage -> its seconds summed over samples.
     """
 
-    directory: Path
-    made: int
+    directory: Output
+    shard: str | None
+    asked_for: int
     found: int
-    given_up: tuple[int, ...]
-    failed_draws: int
-    seconds: float
-    stages: dict[str, float]
+    made: int = 0
+    given_up: list[int] = field(default_factory=list)
+    failed_draws: int = 0
+    failures: Counter[str] = field(default_factory=Counter)
+    seconds: float = 0.0
+    stages: dict[str, float] = field(default_factory=dict)
+
+    def add(self, outcome: Outcome) -> None:
+        """Count what a task did."""
+        self.made += len(outcome.entries)
+        self.given_up = sorted([*self.given_up, *outcome.given_up])
+        self.failed_draws += len(outcome.failures)
+        self.failures.update(reason_group(failure.stage, failure.reason) for failure in outcome.failures)
+        for entry in outcome.entries:
+            for stage, seconds in entry.seconds.items():
+                self.stages[stage] = self.stages.get(stage, 0.0) + seconds
+
+    @property
+    def samples_per_second(self) -> float:
+        """Of this call, start-up included."""
+        return self.made / self.seconds if self.seconds > 0 else 0.0
+
+    def record(self) -> dict[str, Any]:
+        """For summary.json and `--json`; without the place, so that a dataset can be moved."""
+        return {
+            "shard": self.shard,
+            "asked_for": self.asked_for,
+            "found": self.found,
+            "made": self.made,
+            "given_up": self.given_up,
+            "failed_draws": self.failed_draws,
+            "failures": dict(self.failures.most_common()),
+            "seconds": round(self.seconds, 3),
+            "samples_per_second": round(self.samples_per_second, 4),
+            "stages": {stage: round(seconds, 3) for stage, seconds in self.stages.items()},
+            "shares": shares(self.stages),
+        }
 
 
 Progress = Callable[[int, int], None]
@@ -93,56 +151,66 @@ def make_job(template: Template, n: int, seed: int, variant: Variant) -> Job:
 def generate(
     template: Template,
     n: int,
-    directory: Path,
+    out: Output,
     seed: int = 0,
     variant: Variant | None = None,
-    workers: int = 1,
+    scheduling: Scheduling | None = None,
     progress: Progress | None = None,
 ) -> Summary:
-    """Write samples 0 .. n - 1 of a scene; those that are there already are kept.
+    """Write samples 0 .. n - 1 of a scene, or one shard of them; those that are there already are kept.
 
     Args:
         template: the scene.
         n: samples in the dataset.
-        directory: of the dataset.
+        out: the dataset's directory or fsspec URL.
         seed: of everything random.
         variant: that renders; default the fastest here.
-        workers: processes; 1 stays in this one.
+        scheduling: who makes them; default this process.
         progress: told after each trajectory.
 
     Raises:
-        InputError: wrong arguments, a scene that cannot be built, a directory of another job, storage that refuses.
+        InputError: wrong arguments, a scene that cannot be built, a place of another job, storage that refuses.
     """
-    if workers < 1:
-        raise InputError(f"--workers = {workers}: at least 1")
     started = time.perf_counter()
+    scheduling, out = scheduling or Scheduling(), output_of(out)
+    _check(scheduling, out)
     variant = variant or job_variant(template, "auto")
     job = make_job(template, n, seed, variant)
     check_buildable(template, variant)
-    with DatasetWriter(directory, job) as writer:
-        place = Workplace(template, job, directory, variant, (directory / MESHES_FOLDER, user_cache()))
+    count = template.corners[0].sampling.pairs_per_trajectory
+    with open_writer(out, job, scheduling.shard, count) as writer:
+        place = Workplace(template, job, out, variant, user_cache())
         finished = writer.finished
-        found = sum(i < n for i in finished)
-        made, failed = 0, 0
-        given_up: list[int] = []
-        stages: dict[str, float] = {}
-        with closing(_outcomes(place, _tasks(place, n, finished), workers)) as outcomes:
+        shard = scheduling.shard or Shard(0, 1)
+        asked = sum(shard.makes(i // count) for i in range(n))
+        found = sum(i < n and shard.makes(i // count) for i in finished)
+        summary = Summary(out, str(shard) if scheduling.shard else None, asked, found)
+        tasks = _tasks(place, writer, n, finished, shard)
+        with closing(_outcomes(place, tasks, scheduling)) as outcomes:
             for outcome in outcomes:
                 for failure in outcome.failures:
                     writer.fail(failure.index, failure.draw, failure.stage, failure.reason, failure.last_good_state)
                 for entry in outcome.entries:
                     writer.record(entry)
-                    for stage, seconds in entry.seconds.items():
-                        stages[stage] = stages.get(stage, 0.0) + seconds
-                made += len(outcome.entries)
-                given_up += outcome.given_up
-                failed += len(outcome.failures)
+                summary.add(outcome)
                 if progress is not None:
-                    progress(found + made + len(given_up), n)
-    return Summary(directory, made, found, tuple(sorted(given_up)), failed, time.perf_counter() - started, stages)
+                    progress(summary.found + summary.made + len(summary.given_up), summary.asked_for)
+        summary.seconds = time.perf_counter() - started
+        writer.note_run(summary.record())
+    return summary
 
 
-def _tasks(place: Workplace, n: int, finished: set[int]) -> Iterator[Task]:
+def _check(scheduling: Scheduling, out: Output) -> None:
+    workers = scheduling.workers
+    if workers is not None and workers < 1:
+        raise InputError(f"--workers = {workers}: at least 1")
+    if not is_shared(out) and (scheduling.ray is not None or (workers or 1) > 1):
+        raise InputError(f"--out {out}: is seen by one process only; leave out --workers and --ray, or give another")
+
+
+def _tasks(
+    place: Workplace, writer: DatasetWriter | UrlWriter, n: int, finished: set[int], shard: Shard
+) -> Iterator[Task]:
     """Trajectories with samples to make. Their meshes are made here: the mesher is random, so one process does it.
 
     Raises:
@@ -151,31 +219,35 @@ def _tasks(place: Workplace, n: int, finished: set[int]) -> Iterator[Task]:
     template = place.template
     count = template.corners[0].sampling.pairs_per_trajectory
     meshed = None
-    for trajectory in range((n + count - 1) // count):
+    for trajectory in range(shard.number, (n + count - 1) // count, shard.count):
         wanted = tuple(i for i in range(trajectory * count, min(n, (trajectory + 1) * count)) if i not in finished)
         if not wanted:
             continue
         sensor = sensor_of(template, trajectory)
         if sensor != meshed:
             drawn = draw_sensor(template, place.job.seed, sensor)
-            if drawn.content is not None and template.corners[0].numerics.edge_length_mm is not None:
-                _keep_mesh(place, Gel.model_validate(drawn.content["sensor"]["gel"]))
+            if drawn.content is not None and place.needs_meshes:
+                _keep_mesh(place, writer, Gel.model_validate(drawn.content["sensor"]["gel"]))
             meshed = sensor
         yield trajectory, wanted
 
 
-def _keep_mesh(place: Workplace, gel: Gel) -> None:
+def _keep_mesh(place: Workplace, writer: DatasetWriter | UrlWriter, gel: Gel) -> None:
     """Have the dataset hold a pad's fTetWild mesh: without, every trajectory would make another one."""
     numerics = place.template.corners[0].numerics
-    pad_mesh(gel, numerics, place.mesh_folders)
-    kept = place.mesh_folders[0] / f"{mesh_key(gel, numerics)}.npz"
-    if not kept.is_file():
-        raise InputError(f"{kept}: the mesh cannot be written; put this right and give the same command again to go on")
+    with writer.making_meshes() as folder:
+        pad_mesh(gel, numerics, (folder, place.cache))
+        kept = folder / f"{mesh_key(gel, numerics)}.npz"
+        if not kept.is_file():
+            raise InputError(f"{kept}: the mesh cannot be written; put this right and give the same command again")
 
 
-def _outcomes(place: Workplace, tasks: Iterator[Task], workers: int) -> Generator[Outcome, None, None]:
-    if workers > 1:
-        yield from outcomes_of_processes(place, tasks, workers)
+def _outcomes(place: Workplace, tasks: Iterator[Task], scheduling: Scheduling) -> Generator[Outcome, None, None]:
+    if scheduling.ray is not None:
+        yield from outcomes_of_ray(place, tasks, scheduling.ray, scheduling.workers)
+        return
+    if (scheduling.workers or 1) > 1:
+        yield from outcomes_of_processes(place, tasks, scheduling.workers or 1)
         return
     producer = Producer(place)
     for trajectory, wanted in tasks:

@@ -37,6 +37,8 @@ SOLVE_GROWTH = 1.5
 FRICTION = 1.5
 """Time of an iteration with friction over one without."""
 ITERATIONS_PER_STEP, ITERATIONS_PER_RECORD = 4.5, 7.0
+AUTO_SAMPLES = 64
+"""What samples_per_pixel = "auto" counts for, before a sensor has been measured."""
 SECONDS_PER_MILLION_SAMPLES = {"llvm": 0.4, "scalar": 1.0, "cuda": 0.002}
 """Path-traced camera samples of one frame."""
 FLOW_SECONDS_PER_MEGAPIXEL = 3.0
@@ -121,7 +123,8 @@ def plan(template: Template, variant: Variant) -> Plan:
     simulate = sum(_simulation_seconds(draw, nodes) for draw, nodes in meshes.draws) / len(meshes.draws)
     pixels = sum(camera.width * camera.height for camera in cameras)
     kind = variant.name.split("_")[0]
-    frame = pixels * scene.render.samples_per_pixel / 1e6 * SECONDS_PER_MILLION_SAMPLES[kind]
+    samples = AUTO_SAMPLES if scene.render.samples_per_pixel == "auto" else scene.render.samples_per_pixel
+    frame = pixels * samples / 1e6 * SECONDS_PER_MILLION_SAMPLES[kind]
     directions = 2 if scene.outputs.backward else 1
     frames_per_pair = 1 + 1 / pairs
     return Plan(

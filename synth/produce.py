@@ -15,8 +15,8 @@ import numpy as np
 from synth.arrays import FloatArray, Image
 from synth.dataset.images import Raster
 from synth.dataset.job import Job
+from synth.dataset.output import Output, mesh_folder, write_sample
 from synth.dataset.sample import CameraPair, ManifestEntry, Sample
-from synth.dataset.sample_files import write_sample_files
 from synth.errors import InputError
 from synth.flow.exact import exact_flow
 from synth.flow.field import FlowField
@@ -46,18 +46,23 @@ class Workplace:
     Attributes:
         template: the scene.
         job: what the dataset was asked for.
-        directory: of the dataset.
+        out: of the dataset.
         variant: that renders.
-        mesh_folders: where meshes are kept, the dataset's first.
+        cache: where meshes are kept beside the dataset.
         threads: for rendering; None for all cores.
     """
 
     template: Template
     job: Job
-    directory: Path
+    out: Output
     variant: Variant
-    mesh_folders: tuple[Path, ...]
+    cache: Path
     threads: int | None = None
+
+    @property
+    def needs_meshes(self) -> bool:
+        """Whether pads are meshed by fTetWild, which is random, so that all must use the same mesh."""
+        return self.template.corners[0].numerics.edge_length_mm is not None
 
 
 @dataclass(frozen=True)
@@ -133,13 +138,14 @@ class Producer:
         template, seed = self._place.template, self._place.job.seed
         first = trajectory * template.corners[0].sampling.pairs_per_trajectory
         sensor = draw_sensor(template, seed, sensor_of(template, trajectory))
+        meshes = (mesh_folder(self._place.out), self._place.cache) if self._place.needs_meshes else None
         failures = [Failure(first, number, "sensor", reason, None) for number, reason in enumerate(sensor.rejected)]
         for attempt in range(MAX_DRAWS if sensor.content is not None else 0):
             stage = "draw"
             try:
                 scene = draw(template, seed, trajectory, attempt, sensor)
                 stage = "simulate"
-                resolution = resolve(scene, template.source.parent, self._place.mesh_folders)
+                resolution = resolve(scene, template.source.parent, meshes)
                 every = pairs_of(template, seed, trajectory, scene.motion.steps)
                 frames = frozenset(frame for pair in every for frame in pair.frames)
                 result = simulate(scene, resolution.mesh, template.source.parent, frames=frames)
@@ -167,7 +173,7 @@ class Producer:
             rendered = time.perf_counter()
             sample = self._sample(scene, resolution, result, pair, finger, surface, [frames[k] for k in pair.frames])
             traced = time.perf_counter()
-            entry = write_sample_files(self._place.directory, sample, self._place.job)
+            entry = write_sample(self._place.out, sample, self._place.job)
             seconds = {
                 "simulate": result.seconds / len(pairs),
                 "render": rendered - started,

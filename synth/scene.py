@@ -84,6 +84,8 @@ class Dots(Part):
     spacing_mm: tuple[Positive, Positive]
     radius_mm: Positive
     offset_mm: Vector2 = (0.0, 0.0)
+    rotation_deg: Annotated[float, Field(ge=-90, le=90)] = 0.0
+    """Turns the grid about its first dot; positive turns +x toward +y."""
     jitter_mm: NonNegative = 0.0
     """Standard deviation of each dot's centre around the grid."""
     radius_jitter: Fraction = 0.0
@@ -216,8 +218,9 @@ class Motion(Part):
 class Render(Part):
     """Path tracing."""
 
-    samples_per_pixel: Annotated[int, Field(ge=1, le=65536)] = 36
-    """At least so many; rounded up to a full grid and a multiple of the number of lights."""
+    samples_per_pixel: Annotated[int, Field(ge=1, le=65536)] | Literal["auto"] = 36
+    """At least so many; rounded up to a full grid and a multiple of the number of lights. auto: for every sensor drawn,
+    so many that the renderer's noise is a quarter of the main camera's own."""
     max_depth: Annotated[int, Field(ge=2, le=64)] = 4
     """Longest light path in surfaces and lights; 2 is direct light only. The window does not count."""
 

@@ -1,6 +1,7 @@
-"""Benchmarks: error against run time, and whether the error budget holds."""
+"""Benchmarks: error against run time, and whether the error budget holds, pairs per second."""
 
 from synth.bench.budget import run_budget
 from synth.bench.run import run_bench
+from synth.bench.scale import run_scale
 
-__all__ = ["run_bench", "run_budget"]
+__all__ = ["run_bench", "run_budget", "run_scale"]

@@ -22,7 +22,14 @@ PACKAGES = ("numpy", "scipy", "warp-lang", "pypardiso")
 
 
 def run_budget(
-    scenes: Sequence[str], out: Path, draws: int, seed: int, workers: int, minutes: float | None, as_json: bool
+    scenes: Sequence[str],
+    out: Path,
+    draws: int,
+    seed: int,
+    reference: int,
+    workers: int,
+    minutes: float | None,
+    as_json: bool,
 ) -> int:
     """Measure the draws' errors and costs and write OUT/budget.csv, budget.md and budget.png.
 
@@ -33,6 +40,7 @@ def run_budget(
         out: directory.
         draws: of each scene.
         seed: of the draws.
+        reference: elements across the contact of what errors are measured against; only coarser rungs are run.
         workers: presses that run at once, each in a process of its own.
         minutes: begin no press that is not expected to end within them; those that have begun are waited for.
         as_json: print the counts instead of the summary.
@@ -43,16 +51,21 @@ def run_budget(
     Raises:
         InputError: a scene is wrong or has no budget, the directory holds another study, the storage refuses.
     """
-    from synth.bench.budget_study import Study
+    from synth.bench.budget_study import Reference, Study
+    from synth.simulate.resolution import LADDER
     from synth.template import load_scene, shipped_scenes
 
+    ladder = tuple(across for across in LADDER if across < reference)
+    if len(ladder) < 2:
+        raise InputError(f"--reference {reference}: must be finer than two meshes, {LADDER[0]} and {LADDER[1]} across")
     if minutes is not None and not minutes > 0:
         raise InputError(f"--minutes = {minutes:g}: must be above 0")
     deadline = math.inf if minutes is None else time.monotonic() + 60 * minutes
     templates = tuple(load_scene(scene) for scene in scenes or shipped_scenes())
-    command = f"python -m synth bench budget --draws {draws} --seed {seed}"
+    command = f"python -m synth bench budget --draws {draws} --seed {seed} --reference {reference}"
     command += "".join(f" --scene {shlex.quote(Path(scene).name)}" for scene in scenes)
-    return study_budget(Study(templates, seed, draws), out, command, workers, deadline, as_json)
+    study = Study(templates, seed, draws, ladder, Reference(reference))
+    return study_budget(study, out, command, workers, deadline, as_json)
 
 
 def study_budget(

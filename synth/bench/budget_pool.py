@@ -13,7 +13,7 @@ from synth.bench.budget_press import Pressed, press
 from synth.bench.budget_schedule import Schedule
 from synth.bench.budget_study import Job, Study
 from synth.errors import InputError
-from synth.processes import _interrupts_blocked, _leave_with_driver
+from synth.processes import interrupts_blocked, leave_with_driver
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -43,7 +43,7 @@ def presses(study: Study, schedule: Schedule, workers: int, machine: str) -> Gen
         try:
             while True:
                 while len(pending) < workers and (job := schedule.begin()):
-                    with _interrupts_blocked(), _one_thread():
+                    with interrupts_blocked(), _one_thread():
                         pending.add(pool.submit(_work, job))
                 if not pending:
                     return
@@ -82,7 +82,7 @@ _task: tuple[Study, str] | None = None
 
 def _begin(study: Study, machine: str, leash: Connection) -> None:
     global _task
-    threading.Thread(target=_leave_with_driver, args=(leash,), daemon=True).start()
+    threading.Thread(target=leave_with_driver, args=(leash,), daemon=True).start()
     _task = study, machine
 
 

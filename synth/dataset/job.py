@@ -74,15 +74,41 @@ def read_job_record(directory: Path) -> dict[str, Any]:
     if not path.is_file():
         raise InputError(f"{directory}: not a dataset: it has no {DATASET_FILE}")
     record = read_document(path)
-    missing = [key for key in ("schema_version", "scene_hash", "seed", "n", "scene") if key not in record]
+    check_record(record, str(path))
+    return record
+
+
+def check_record(record: Any, where: str) -> None:
+    """Refuses what is not the content of a dataset.json of this version.
+
+    Raises:
+        InputError: Something is missing, or it is of another version of the format.
+    """
+    keys = ("schema_version", "scene_hash", "seed", "n", "scene")
+    missing = [key for key in keys if not isinstance(record, Mapping) or key not in record]
     if missing:
-        raise InputError(f"{path}: lacks {', '.join(missing)}; the file is damaged or not of a dataset")
+        raise InputError(f"{where}: lacks {', '.join(missing)}; the file is damaged or not of a dataset")
     if record["schema_version"] != SCHEMA_VERSION:
         raise InputError(
-            f"{path}: written in version {record['schema_version']} of the format; "
+            f"{where}: written in version {record['schema_version']} of the format; "
             f"this program reads version {SCHEMA_VERSION}"
         )
-    return record
+
+
+def refuse_another_job(job: Job, record: Mapping[str, Any], where: str) -> None:
+    """Compares a job with the dataset.json of a place.
+
+    Raises:
+        InputError: They differ; the message says in what.
+    """
+    different = differences(job, record)
+    if different:
+        listed = "".join(f"\n  {line}" for line in different[:20])
+        more = f"\n  and {len(different) - 20} more" if len(different) > 20 else ""
+        raise InputError(
+            f"{where}: holds another job; it differs in{listed}{more}\n"
+            "give another --out, or the options of that job to go on with it"
+        )
 
 
 def differences(job: Job, record: Mapping[str, Any]) -> list[str]:

@@ -10,7 +10,7 @@ import os
 from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, BinaryIO, Generic, TypeVar
 
 from synth.dataset.jsontext import to_line
 from synth.dataset.storage import flush, partial_name, storage_errors
@@ -118,6 +118,38 @@ def append_line(path: Path, record: object) -> None:
                 raise
         finally:
             os.close(descriptor)
+
+
+def join_lines(path: Path, others: Iterable[Path], key: Callable[[dict[str, Any]], Any]) -> None:
+    """Adds the intact lines of other files to a file; whole or not at all, a piece at a time.
+
+    Raises:
+        InputError: A file is damaged, or the storage refuses; the file is as before.
+    """
+    partial = partial_name(path)
+    path.touch()
+    sources = [(source, scan_lines(source, key).end) for source in (path, *others)]
+    with storage_errors(path):
+        try:
+            with partial.open("wb") as joined:
+                for source, end in sources:
+                    _copy(source, end, joined)
+            flush(partial)
+            os.replace(partial, path)
+            flush(path.parent)
+        except BaseException:
+            partial.unlink(missing_ok=True)
+            raise
+
+
+def _copy(source: Path, size: int, target: BinaryIO) -> None:
+    """The first `size` bytes of a file that may be missing where there are none."""
+    if size == 0:
+        return
+    with source.open("rb") as file:
+        while size > 0 and (piece := file.read(min(size, 1 << 20))):
+            target.write(piece)
+            size -= len(piece)
 
 
 def rewrite_lines(path: Path, places: Iterable[tuple[int, int]]) -> None:

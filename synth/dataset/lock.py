@@ -1,56 +1,121 @@
-"""One process at a time writes into a dataset.
+"""Who may write into a dataset: one run, or the shards of one job side by side.
 
-A POSIX record lock (`fcntl.lockf`) on DIR/.lock: the kernel drops it when the process ends, however it ends, and forked
-children do not inherit it, so that orphaned workers of a killed run hold nothing. It guards against other processes,
-not against a second writer in the same one.
+POSIX record locks (`fcntl.lockf`) on bytes of DIR/.lock: the kernel drops them when the process ends, however it ends,
+and forked children do not inherit them, so that orphaned workers of a killed run hold nothing. They hold between
+machines where the file system passes them on (NFS 4, Lustre mounted with flock), and guard against other processes, not
+against a second writer in the same one.
+
+    WHOLE    held alone by a plain run, together by all shards that run
+    SETUP    held for moments while a shard comes or goes, or a mesh is made that all share
+    shard i  held by the process that makes shard i
 """
 
 import contextlib
 import errno
 import fcntl
 import os
+import socket
+from collections.abc import Iterator
 from pathlib import Path
 
+from synth.dataset.shard import Shard
 from synth.dataset.storage import storage_errors
 from synth.errors import InputError
 
 LOCK_FILE = ".lock"
+WHOLE, SETUP, _FIRST_SHARD = 0, 1, 2
+_ROOM = 64
+"""Bytes of the lock file for each lock: the first is locked, all hold the holder's name."""
 
 
 class DirectoryLock:
-    """Holds DIR/.lock from creation until `release` or the end of the process."""
+    """DIR/.lock, open until `release` or the end of the process."""
 
     def __init__(self, directory: Path) -> None:
-        """Takes the lock.
+        """Opens the file; holds nothing yet.
 
         Raises:
-            InputError: Another process holds it, or the file system offers no locks.
+            InputError: The storage refuses.
         """
-        path = directory / LOCK_FILE
-        with storage_errors(path):
-            self._descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o644)
+        self._directory = directory
+        self._path = directory / LOCK_FILE
+        with storage_errors(self._path):
+            self._descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o644)
+
+    def take_whole(self) -> None:
+        """The dataset alone.
+
+        Raises:
+            InputError: Another process writes it, or the file system offers no locks.
+        """
+        if not self.try_alone():
+            raise self._held(WHOLE, "another process", "is writing this dataset")
+        self._sign(WHOLE, _signature())
+
+    def take_shard(self, shard: Shard) -> None:
+        """One shard, and a part in the dataset; within `setup`, and whether or not `try_alone` succeeded before.
+
+        Raises:
+            InputError: A plain run writes the dataset, or another process this shard.
+        """
+        if not self._take(WHOLE, fcntl.LOCK_SH | fcntl.LOCK_NB):
+            raise self._held(WHOLE, "another process", "is writing this dataset, without --shard")
+        if not self._take(_FIRST_SHARD + shard.number, fcntl.LOCK_EX | fcntl.LOCK_NB):
+            raise self._held(_FIRST_SHARD + shard.number, "another process", f"is making shard {shard}")
+        self._sign(WHOLE, "shards")
+        self._sign(_FIRST_SHARD + shard.number, _signature())
+
+    def try_alone(self) -> bool:
+        """Hold WHOLE alone if nobody else holds a part of it.
+
+        Raises:
+            InputError: The file system offers no locks.
+        """
+        return self._take(WHOLE, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+    def leave(self) -> None:
+        """Let go of this process's part of WHOLE."""
+        fcntl.lockf(self._descriptor, fcntl.LOCK_UN, 1, WHOLE * _ROOM)
+
+    @contextlib.contextmanager
+    def setup(self) -> Iterator[None]:
+        """Alone among shards that come or go; waits for others.
+
+        Raises:
+            InputError: The file system offers no locks.
+        """
+        self._take(SETUP, fcntl.LOCK_EX)
         try:
-            fcntl.lockf(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            holder = os.pread(self._descriptor, 32, 0).decode("ascii", "replace").strip()
-            os.close(self._descriptor)
-            self._descriptor = -1
-            if error.errno in (errno.EACCES, errno.EAGAIN):
-                raise InputError(
-                    f"{directory}: another process{f' ({holder})' if holder else ''} is writing this dataset; "
-                    "wait for it to end, or give another --out"
-                ) from error
-            raise InputError(
-                f"{path}: this file system offers no locks ({error.strerror}); give an --out on another"
-            ) from error
-        with contextlib.suppress(
-            OSError
-        ):  # The number only serves the message above; a full disk must not matter here.
-            os.ftruncate(self._descriptor, 0)
-            os.pwrite(self._descriptor, f"pid {os.getpid()}\n".encode("ascii"), 0)
+            yield
+        finally:
+            fcntl.lockf(self._descriptor, fcntl.LOCK_UN, 1, SETUP * _ROOM)
 
     def release(self) -> None:
-        """Lets go of the lock; harmless when repeated."""
+        """Lets go of everything; harmless when repeated."""
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1
+
+    def _take(self, place: int, how: int) -> bool:
+        try:
+            fcntl.lockf(self._descriptor, how, 1, place * _ROOM)
+        except OSError as error:
+            if error.errno in (errno.EACCES, errno.EAGAIN):
+                return False
+            raise InputError(
+                f"{self._path}: this file system offers no locks ({error.strerror}); give an --out on another"
+            ) from error
+        return True
+
+    def _sign(self, place: int, text: str) -> None:
+        with contextlib.suppress(OSError):  # It only serves messages; a full disk must not matter here.
+            os.pwrite(self._descriptor, f"{text}\n".encode("ascii", "replace")[:_ROOM].ljust(_ROOM), place * _ROOM)
+
+    def _held(self, place: int, who: str, does: str) -> InputError:
+        holder = os.pread(self._descriptor, _ROOM, place * _ROOM).decode("ascii", "replace").strip(" \n\0")
+        named = f"{who} ({holder})" if holder else who
+        return InputError(f"{self._directory}: {named} {does}; wait for it to end, or give another --out")
+
+
+def _signature() -> str:
+    return f"pid {os.getpid()} on {socket.gethostname()}"

@@ -13,11 +13,11 @@ from synth.arrays import FloatArray
 from synth.dataset.exr import read_flow
 from synth.dataset.images import Raster, read_png
 from synth.dataset.job import read_job_record
+from synth.dataset.joining import FAILURES_FILE, MANIFEST_FILE, failure_key, manifest_key
 from synth.dataset.jsontext import read_document
 from synth.dataset.lines import LineTable, read_line, scan_lines
 from synth.dataset.npz import read_npz
 from synth.dataset.sample import SAMPLES_FOLDER, CameraPair, ManifestEntry, further_cameras, sample_name
-from synth.dataset.writer import FAILURES_FILE, MANIFEST_FILE
 from synth.errors import InputError
 from synth.flow.field import FlowField
 from synth.scene import Scene
@@ -74,7 +74,7 @@ class Dataset:
     def failures(self) -> list[dict[str, Any]]:
         """The records of failures.jsonl, by index and draw."""
         path = self.path / FAILURES_FILE
-        table = scan_lines(path, lambda record: (int(record["index"]), int(record["draw"])))
+        table = scan_lines(path, failure_key)
         return [read_line(path, table.places[key]) for key in sorted(table.places)]
 
     def folder(self, index: int) -> Path:
@@ -145,7 +145,7 @@ def read_dataset(path: Path | str) -> Dataset:
     manifest = directory / MANIFEST_FILE
     if not manifest.is_file():
         raise InputError(f"{manifest}: missing; the dataset is damaged, or its first run was stopped at once")
-    return Dataset(directory, info, scan_lines(manifest, lambda record: ManifestEntry.from_record(record).index))
+    return Dataset(directory, info, scan_lines(manifest, manifest_key))
 
 
 def read_sample(folder: Path) -> SampleData:

@@ -5,15 +5,22 @@ the folder is then flushed, too, because a rename lives in the folder.
 """
 
 import contextlib
+import errno
 import os
 import shutil
-from collections.abc import Iterator
+import uuid
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from synth.errors import InputError
 
 PARTIAL = ".partial-"
-"""In the hidden name of anything unfinished: `.NAME.partial-PID`."""
+"""In the hidden name of anything unfinished: `.NAME.partial-PID-TOKEN`."""
+
+_OLD = ".old"
+
+_TOKEN = uuid.uuid4().hex[:8]
+"""Processes on several machines may have the same number."""
 
 
 @contextlib.contextmanager
@@ -31,12 +38,14 @@ def storage_errors(path: Path) -> Iterator[None]:
 
 def partial_name(path: Path) -> Path:
     """Where this process prepares the content of `path`."""
-    return path.with_name(f".{path.name}{PARTIAL}{os.getpid()}")
+    return path.with_name(f".{path.name}{PARTIAL}{os.getpid()}-{_TOKEN}")
 
 
-def remove_partials(directory: Path) -> None:
-    """Removes what killed processes left unfinished in a folder."""
+def remove_partials(directory: Path, of: Callable[[str], bool] = lambda name: True) -> None:
+    """Removes what killed processes left unfinished in a folder; only of names for which `of` is true."""
     for entry in directory.glob(f".*{PARTIAL}*"):
+        if not of(entry.name[1:].partition(PARTIAL)[0].removesuffix(_OLD)):
+            continue
         if entry.is_dir():
             shutil.rmtree(entry)
         else:
@@ -73,17 +82,24 @@ def replace_file(path: Path, content: bytes) -> None:
 def install_folder(partial: Path, final: Path) -> None:
     """Renames a finished folder into place and flushes it; an older folder of that name gives way.
 
+    Two processes may install the same name at once (a task that was given up for lost, and its repetition): the last
+    one stays.
+
     Raises:
         OSError: The storage refuses.
     """
     for entry in partial.rglob("*"):  # files and folders
         flush(entry)
     flush(partial)
-    if final.exists():
-        old = final.with_name(f".{final.name}.old{PARTIAL}{os.getpid()}")
-        os.rename(final, old)
-        os.rename(partial, final)
-        shutil.rmtree(old)
-    else:
-        os.rename(partial, final)
+    while True:
+        try:
+            os.rename(partial, final)
+            break
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
+                raise
+        old = partial_name(final.with_name(f"{final.name}{_OLD}"))
+        with contextlib.suppress(FileNotFoundError):  # the other process was faster
+            os.rename(final, old)
+        shutil.rmtree(old, ignore_errors=True)
     flush(final.parent)

@@ -5,18 +5,24 @@
     DIR/failures.jsonl    a line per failed draw
     DIR/samples/000000/   image1.png image2.png flow.exr meta.json surface.npz, and for each further camera a folder of
                           its name with its own image1.png image2.png flow.exr
+    DIR/summary.json      what it took
+    DIR/meshes/           of pads with an even edge length
     DIR/.lock             held by the process that writes
+    DIR/shards/           lines of shards that run, or that were stopped: see `synth.dataset.shard_writer`
 
 A sample is finished when its folder is whole and its line is in the manifest, written in this order. Whatever a killed
 run leaves (a torn line, a hidden partial folder, a folder without a line) is put right on the next opening. `finalise`
 sorts both files, so that they do not depend on the number of workers or on interruptions; only `seconds` does.
 """
 
+import contextlib
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from synth.dataset.job import DATASET_FILE, Job, continued, differences, read_job_record
+from synth.dataset.job import DATASET_FILE, Job, continued, read_job_record, refuse_another_job
+from synth.dataset.joining import FAILURES_FILE, MANIFEST_FILE, failure_key, join_shards, manifest_key
 from synth.dataset.jsontext import to_document
 from synth.dataset.lines import append_line, rewrite_lines, scan_lines
 from synth.dataset.lock import LOCK_FILE, DirectoryLock
@@ -31,10 +37,10 @@ from synth.dataset.sample import (
 )
 from synth.dataset.sample_files import write_sample_files
 from synth.dataset.storage import PARTIAL, remove_partials, replace_file, storage_errors
+from synth.dataset.summary import write_summary
 from synth.errors import InputError
 
-MANIFEST_FILE = "manifest.jsonl"
-FAILURES_FILE = "failures.jsonl"
+MESHES_FOLDER = "meshes"
 
 
 class DatasetWriter:
@@ -53,18 +59,14 @@ class DatasetWriter:
         """
         self.directory = Path(directory)
         self.job = job
+        self._home = self.directory
+        self._run: Mapping[str, Any] | None = None
         _check_place(self.directory)
         with storage_errors(self.directory):
             self.directory.mkdir(parents=True, exist_ok=True)
         self._lock = DirectoryLock(self.directory)
         try:
-            self._adopt_job()
-            with storage_errors(self.directory):
-                (self.directory / SAMPLES_FOLDER).mkdir(exist_ok=True)
-                remove_partials(self.directory)
-                remove_partials(self.directory / SAMPLES_FOLDER)
-            self._finished = self._repair_manifest()
-            self._failed = self._repair_failures()
+            self._finished, self._failed = self._open()
         except BaseException:
             self._lock.release()
             raise
@@ -100,7 +102,7 @@ class DatasetWriter:
         if not self._is_whole(entry.index):
             folder = self.directory / SAMPLES_FOLDER / sample_name(entry.index)
             raise InputError(f"{folder}: the sample's files are not there; was it written to another place?")
-        append_line(self.directory / MANIFEST_FILE, entry.record())
+        append_line(self._home / MANIFEST_FILE, entry.record())
         self._finished.add(entry.index)
 
     def fail(self, index: int, draw: int, stage: str, reason: str, last_good_state: Any = None) -> None:
@@ -119,17 +121,28 @@ class DatasetWriter:
         if (index, draw) in self._failed:
             return
         record = {"index": index, "draw": draw, "stage": stage, "reason": reason, "last_good_state": last_good_state}
-        append_line(self.directory / FAILURES_FILE, record)
+        append_line(self._home / FAILURES_FILE, record)
         self._failed.add((index, draw))
 
+    @contextlib.contextmanager
+    def making_meshes(self) -> Iterator[Path]:
+        """The folder of meshes that all who write this dataset share; within, nobody else makes one."""
+        with self._lock.setup():
+            yield self.directory / MESHES_FOLDER
+
+    def note_run(self, run: Mapping[str, Any]) -> None:
+        """What `finalise` writes to summary.json about this run, beside the totals of the dataset."""
+        self._run = run
+
     def finalise(self) -> None:
-        """Sorts manifest and failures by index; called on leaving a `with` block, too.
+        """Sorts manifest and failures by index, writes the summary; called on leaving a `with` block, too.
 
         Raises:
             InputError: The storage refuses; the files are as before.
         """
-        self._repair_manifest()
-        self._repair_failures()
+        self._tidy()
+        if self._run is not None:
+            write_summary(self.directory, self._run)
 
     def close(self) -> None:
         """Lets other processes write; harmless when repeated."""
@@ -149,27 +162,35 @@ class DatasetWriter:
         finally:
             self.close()
 
+    def _open(self) -> tuple[set[int], set[tuple[int, int]]]:
+        """Take the dataset for this process; what is finished and what has failed."""
+        self._lock.take_whole()
+        self._adopt_job()
+        return self._tidy()
+
+    def _tidy(self) -> tuple[set[int], set[tuple[int, int]]]:
+        """Put right what interrupted runs left, take in what shards made; nobody else may be writing."""
+        with storage_errors(self.directory):
+            (self.directory / SAMPLES_FOLDER).mkdir(exist_ok=True)
+            remove_partials(self.directory)
+            remove_partials(self.directory / SAMPLES_FOLDER)
+        join_shards(self.directory)
+        return self._repair_manifest(), self._repair_failures()
+
     def _adopt_job(self) -> None:
         path = self.directory / DATASET_FILE
         if not path.exists():
             replace_file(path, self.job.document())
             return
         record = read_job_record(self.directory)
-        different = differences(self.job, record)
-        if different:
-            listed = "".join(f"\n  {line}" for line in different[:20])
-            more = f"\n  and {len(different) - 20} more" if len(different) > 20 else ""
-            raise InputError(
-                f"{self.directory}: holds another job; it differs in{listed}{more}\n"
-                "give another --out, or the options of that job to go on with it"
-            )
+        refuse_another_job(self.job, record, str(self.directory))
         content = continued(self.job, record)
         if content != record:
             replace_file(path, to_document(content).encode("utf-8"))
 
     def _repair_manifest(self) -> set[int]:
         path = self.directory / MANIFEST_FILE
-        table = scan_lines(path, _manifest_key)
+        table = scan_lines(path, manifest_key)
         whole = {index: place for index, place in table.places.items() if self._is_whole(index)}
         if not table.tidy or len(whole) < len(table.places) or not path.exists():
             rewrite_lines(path, [whole[index] for index in sorted(whole)])
@@ -177,7 +198,7 @@ class DatasetWriter:
 
     def _repair_failures(self) -> set[tuple[int, int]]:
         path = self.directory / FAILURES_FILE
-        table = scan_lines(path, _failure_key)
+        table = scan_lines(path, failure_key)
         if not table.tidy or not path.exists():
             rewrite_lines(path, [table.places[key] for key in sorted(table.places)])
         return set(table.places)
@@ -198,14 +219,6 @@ def _check_place(directory: Path) -> None:
         strange = sorted(
             entry.name for entry in directory.iterdir() if entry.name != LOCK_FILE and PARTIAL not in entry.name
         )
-    if strange:
+    if strange and DATASET_FILE not in strange:  # it may have come meanwhile, from another shard
         listed = ", ".join(strange[:5]) + (", ..." if len(strange) > 5 else "")
         raise InputError(f"{directory}: is not empty and not a dataset (it holds {listed}); give another --out")
-
-
-def _manifest_key(record: dict[str, Any]) -> int:
-    return ManifestEntry.from_record(record).index
-
-
-def _failure_key(record: dict[str, Any]) -> tuple[int, int]:
-    return int(record["index"]), int(record["draw"])

@@ -14,10 +14,13 @@ from functools import singledispatch
 import numpy as np
 
 from synth.arrays import FloatArray, Image
+from synth.errors import InputError
+from synth.optics import Optics
 from synth.scene import Dots, NoPattern, RandomColor, Sensor, Speckle
 
 TEXELS_PER_PIXEL = 4
 """Texels per image pixel and axis on the undeformed contact face: bilinear lookup stays below the pixel's own blur."""
+_STEP_MM = 0.01
 MAX_TEXELS = 3072
 """Per axis; a finer pattern than this would not fit on many GPUs."""
 
@@ -43,10 +46,39 @@ def albedo(sensor: Sensor, rng: np.random.Generator) -> Image:
 
 
 def pixels_per_mm(sensor: Sensor) -> float:
-    """Image scale at the centre of the undeformed contact face: max(fx, fy) over the window-corrected distance."""
-    camera, face = sensor.camera, sensor.gel.size_mm[2] + sensor.window.thickness_mm
-    distance = camera.position_mm[2] - face + face / sensor.window.refractive_index
-    return max(camera.fx, camera.fy) / distance
+    """Image scale on the undeformed contact face: the finest of all cameras and directions.
+
+    It is taken at the pad's middle; for a camera that does not see that, where a grid of its pixels meets the pad.
+
+    Raises:
+        InputError: no camera sees the pad.
+    """
+    finest = max(_scale(Optics.of(view), view) for view in sensor.views.values())
+    if finest == 0:
+        raise InputError("no camera sees the gel pad: check sensor.camera's position_mm, look_at_mm and the mirrors")
+    return round(finest, 6)
+
+
+def _scale(optics: Optics, sensor: Sensor) -> float:
+    """Largest stretch of the map from the contact face to pixels, in px per mm; 0 where nothing is seen."""
+    pixels = optics.project(np.zeros((1, 3)))
+    if not optics.is_inside(pixels).all():
+        edges = (np.linspace(0, side, 13) for side in (sensor.camera.width, sensor.camera.height))
+        pixels = np.column_stack([axis.ravel() for axis in np.meshgrid(*edges)])
+    rays = optics.look(pixels)
+    points = rays.origins - rays.directions * (rays.origins[:, 2:] / rays.directions[:, 2:])
+    with np.errstate(invalid="ignore"):
+        seen = np.all(np.abs(points[:, :2]) <= np.array(sensor.gel.size_mm[:2]) / 2, axis=1)
+    if not seen.any():
+        return 0.0
+    points, path = points[seen], rays.path[seen]
+    moved = [
+        (optics.project(points + arm, path) - optics.project(points - arm, path)) / (2 * _STEP_MM)
+        for arm in _STEP_MM * np.eye(3)[:2]
+    ]
+    jacobian = np.stack(moved, axis=2)
+    jacobian = jacobian[np.isfinite(jacobian).all(axis=(1, 2))]  # at the edge of a lens's field a step may leave it
+    return float(np.linalg.svd(jacobian, compute_uv=False)[:, 0].max(initial=0.0))
 
 
 def is_grey(sensor: Sensor) -> bool:
@@ -80,10 +112,14 @@ def _dots(pattern: Dots, x: FloatArray, y: FloatArray, coating: FloatArray, rng:
     softness = max(pattern.softness_mm, pitch)
     coverage = np.zeros((len(y), len(x)))
     (sx, sy), (ox, oy) = pattern.spacing_mm, pattern.offset_mm
-    for j in range(math.floor((y[0] - oy) / sy), math.ceil((y[-1] - oy) / sy) + 1):
-        for i in range(math.floor((x[0] - ox) / sx), math.ceil((x[-1] - ox) / sx) + 1):
+    c, s = math.cos(math.radians(pattern.rotation_deg)), math.sin(math.radians(pattern.rotation_deg))
+    corners = [(u - ox, v - oy) for u in (x[0], x[-1]) for v in (y[0], y[-1])]
+    along, across = [(u * c + v * s) / sx for u, v in corners], [(v * c - u * s) / sy for u, v in corners]
+    for j in range(math.floor(min(across)), math.ceil(max(across)) + 1):
+        for i in range(math.floor(min(along)), math.ceil(max(along)) + 1):
             dx, dy, grow = rng.standard_normal(3)
-            cx, cy = ox + i * sx + pattern.jitter_mm * dx, oy + j * sy + pattern.jitter_mm * dy
+            cx = ox + i * sx * c - j * sy * s + pattern.jitter_mm * dx
+            cy = oy + i * sx * s + j * sy * c + pattern.jitter_mm * dy
             radius = pattern.radius_mm * max(0.0, 1 + pattern.radius_jitter * grow)
             reach = radius + softness
             rows = slice(*np.searchsorted(y, [cy - reach, cy + reach]))

@@ -24,12 +24,15 @@ from synth.render.camera_rays import CameraRays, pinhole
 from synth.render.gel_mesh import GelMesh
 from synth.render.lights import check_view, emitters
 from synth.render.pattern import is_grey
+from synth.render.sample_count import PILOT, needed_samples
 from synth.render.variant import Variant
 from synth.scene import Coating, Render, Sensor
 from synth.surface import GelSurface
 
 _MAX_WAVEFRONT = 2**22
 """Samples traced at once: 50 MB of results. A constant, because the split into passes decides the random numbers."""
+
+_PILOT_SEEDS = (1, 2)
 
 
 class Renderer:
@@ -54,7 +57,9 @@ class Renderer:
         for name, view in self._views.items():
             if name:
                 _check_further(name, view)
-        self._samples = full_grid(render.samples_per_pixel, sum(light.power > 0 for light in sensor.lights))
+        self._lit = sum(light.power > 0 for light in sensor.lights)
+        wanted = render.samples_per_pixel
+        self._samples = full_grid(PILOT if wanted == "auto" else wanted, self._lit)
         self._mesh = GelMesh(surface, sensor.gel.size_mm[:2])
         mi = variant.load()
         contents = {"type": "scene", "gel": self._build_gel(mi, sensor.coating, albedo), **emitters(sensor, mi)}
@@ -72,6 +77,17 @@ class Renderer:
         if variant.is_vectorised:
             self._rays = {name: CameraRays(view, mi) for name, view in self._views.items()}
         else:
+            self._sensors = {name: self._build_pinhole(mi, view) for name, view in self._views.items()}
+        if wanted == "auto":
+            self._choose_samples(mi, surface)
+
+    def _choose_samples(self, mi: Any, surface: GelSurface) -> None:
+        """From two pilots of the undeformed gel; fixed seeds, so that a sensor always gets the same number."""
+        first, second = (self.radiance(surface.material, seed) for seed in _PILOT_SEEDS)
+        needed = needed_samples(first, second, self._views[""].camera, self._samples)
+        self._samples = full_grid(needed, self._lit)
+        self._sampler = mi.load_dict({"type": "multijitter", "sample_count": self._samples})
+        if not self._variant.is_vectorised:
             self._sensors = {name: self._build_pinhole(mi, view) for name, view in self._views.items()}
 
     @property

@@ -14,12 +14,13 @@ import warp as wp
 from synth.arrays import FloatArray
 from synth.simulate.bulk import bulk_residual, bulk_tangent, linearise, pressure_tangent
 from synth.simulate.contact import ContactState, Indenters, contact_residual, contact_stiffness, contact_tangent
+from synth.simulate.fold import fold_residual, fold_tangent
 from synth.simulate.linear import gmres
 from synth.simulate.material import Material
 from synth.simulate.multipliers import augment, settle
 from synth.simulate.pattern import pattern_of
 from synth.simulate.space import Space
-from synth.simulate.tables import bulk_tables, face_tables, warp_array
+from synth.simulate.tables import bulk_tables, face_tables, fold_tables, warp_array
 from synth.surface import broken_linear_face
 
 
@@ -93,6 +94,7 @@ class System:
         self._pattern = pattern_of(space, self.mixed)
         self._bulk = bulk_tables(space, material, self.mixed, device)
         self._faces = face_tables(space, device)
+        self._lattice = fold_tables(space, material, device)
         self._pairs = warp_array(self._pattern.element_pairs, wp.vec2i, device)
         self._face_pairs = warp_array(self._pattern.face_pairs, wp.vec2i, device)
         slots = (self._pattern.block_slot, self._pattern.coupling_slot, self._pattern.pressure_slot)
@@ -161,6 +163,9 @@ class System:
             outputs=[force, volume, jacobian],
             device=self.device,
         )
+        if self._lattice is not None:
+            inputs, outputs = [u, mask, self._lattice], [force, jacobian]
+            wp.launch(fold_residual, (self.batch, count), inputs=inputs, outputs=outputs, device=self.device)
         wp.launch(
             contact_residual,
             self.gap.shape[:2],
@@ -189,6 +194,9 @@ class System:
             outputs=[self._values],
             device=d,
         )
+        if self._lattice is not None:
+            inputs = [u, mask, self._lattice, self._pairs, self._block_slot]
+            wp.launch(fold_tangent, elements, inputs=inputs, outputs=[self._values], device=d)
         if self.mixed:
             wp.launch(
                 pressure_tangent,

@@ -8,7 +8,8 @@ import warp as wp
 from synth.simulate.bulk import Bulk
 from synth.simulate.contact import Faces, Indenters
 from synth.simulate.distance import shape_vector
-from synth.simulate.element import barycentric_gradients
+from synth.simulate.element import EDGES, barycentric_gradients
+from synth.simulate.fold import LATTICE, Lattice
 from synth.simulate.material import Material
 from synth.simulate.path import Path
 from synth.simulate.space import Space
@@ -39,6 +40,30 @@ def bulk_tables(space: Space, material: Material, mixed: bool, d: str) -> Bulk:
     bulk.hold = element.hold
     bulk.yeoh = warp_array(material.yeoh, wp.vec2d, d)
     return bulk
+
+
+def fold_tables(space: Space, material: Material, d: str) -> "Lattice | None":
+    """Where `synth.simulate.fold` looks, on Warp device d; None for linear elements, which cannot fold."""
+    if space.element.order == 1:
+        return None
+    share, along = np.zeros((4, 10)), np.full((4, 10), -1)
+    for i in range(4):
+        share[i, :4], along[i, :4] = -1.0, np.arange(4)
+        share[i, i] = 3.0
+        for k, edge in enumerate(EDGES):
+            if i in edge:
+                share[i, 4 + k], along[i, 4 + k] = 4.0, sum(edge) - i
+    n = LATTICE
+    steps = [(i, j, k) for i in range(n + 1) for j in range(n + 1 - i) for k in range(n + 1 - i - j)]
+    at = np.array([(i, j, k, n - i - j - k) for i, j, k in steps]) / n
+    lattice = Lattice()
+    lattice.nodes = warp_array(space.nodes, wp.int32, d)
+    lattice.at = warp_array(at, wp.vec4d, d)
+    lattice.share = warp_array(share, wp.float64, d)
+    lattice.along = warp_array(along, wp.int32, d)
+    lattice.gradient = warp_array(barycentric_gradients(space.mesh.points, space.mesh.tets), wp.vec3d, d)
+    lattice.weight = warp_array(material.shear * space.mesh.volumes / len(at), wp.float64, d)
+    return lattice
 
 
 def face_tables(space: Space, d: str) -> Faces:

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import resource
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,8 +12,9 @@ import pytest
 from tiny_scene import fingerprint, own_cache, reference, write_tiny
 
 from synth.dataset.reader import read_dataset
+from synth.dataset.shard import Shard
 from synth.errors import InputError
-from synth.generate import generate, job_variant
+from synth.generate import Scheduling, generate, job_variant
 from synth.sampling import draw
 from synth.template import Template, load_scene
 from synth.verify import verify_dataset
@@ -68,6 +70,44 @@ def test_growing_in_steps_gives_the_same_files(tiny: Path, tmp_path: Path) -> No
     assert fingerprint(out) == fingerprint(reference())
 
 
+def test_three_shards_in_any_order_give_the_same_files(tiny: Path, tmp_path: Path) -> None:
+    """Fails with shards of blocks of trajectories (counts), or with another step through them (files are missing)."""
+    template, out = load_scene(tiny), tmp_path / "d"
+    done = [generate(template, 5, out, scheduling=Scheduling(shard=Shard(k, 3))) for k in (2, 0, 1)]
+    assert [(s.shard, s.made, s.asked_for, s.found) for s in done] == [  # trajectories of samples 0 1 | 2 3 | 4
+        ("2/3", 1, 1, 0),
+        ("0/3", 2, 2, 0),
+        ("1/3", 2, 2, 0),
+    ]
+    assert fingerprint(out) == fingerprint(reference())
+
+
+def test_ray_that_is_not_installed(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)  # what an import of a missing package does
+    with pytest.raises(InputError, match=r"--ray needs Ray: pip install 'gelflow-synth\[cluster\]'"):
+        generate(load_scene(tiny), 1, tmp_path / "d", scheduling=Scheduling(ray="local"))
+
+
+def test_the_summary_adds_up(tiny: Path, tmp_path: Path) -> None:
+    """Totals of the manifest, whatever runs they were made in; failures by reason, numbers left out."""
+    template, out = load_scene(tiny, ["motion.depth_mm={ normal = [-1.5, 4.0] }"]), tmp_path / "d"
+    seed = _first_seed_whose_draws(template, [False, False, True])
+    first, second = generate(template, 1, out, seed), generate(template, 3, out, seed)
+    summary = json.loads((out / "summary.json").read_text())
+    assert (summary["samples"], summary["asked_for"]) == (3, 3)
+    assert summary["last_run"] == json.loads(json.dumps(second.record()))
+    assert (second.made, second.found) == (2, 1)
+    assert second.samples_per_second == second.made / second.seconds
+    assert first.failures.total() == first.failed_draws >= 2
+    assert all("#" in reason and reason.startswith("draw: ") for reason in first.failures)
+    lines = [json.loads(line) for line in (out / "manifest.jsonl").read_text().splitlines()]
+    for stage, seconds in summary["seconds_per_stage"].items():
+        # Rounded to 0.0005 here.
+        assert seconds == pytest.approx(sum(line["seconds"][stage] for line in lines), abs=5e-4)
+    assert sum(summary["share_per_stage"].values()) == pytest.approx(1, abs=2e-4)  # four, each rounded to 0.00005
+    assert summary["failed_draws"] == len((out / "failures.jsonl").read_text().splitlines())
+
+
 def test_a_lost_folder_and_a_foreign_line_are_made_good(tiny: Path, tmp_path: Path) -> None:
     """Deleted files, a torn line and leftovers of a killed writer."""
     import shutil
@@ -117,11 +157,15 @@ def test_a_directory_of_another_job_is_refused_and_left_alone(tiny: Path, change
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
-    [({"n": 0}, "--n = 0"), ({"n": 1, "seed": -1}, "--seed = -1"), ({"n": 1, "workers": 0}, "--workers = 0")],
+    [
+        ({"n": 0}, "--n = 0"),
+        ({"n": 1, "seed": -1}, "--seed = -1"),
+        ({"n": 1, "scheduling": Scheduling(workers=0)}, "--workers = 0"),
+    ],
 )
 def test_wrong_numbers_write_nothing(tiny: Path, tmp_path: Path, arguments: dict, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        generate(load_scene(tiny), directory=tmp_path / "d", **arguments)
+        generate(load_scene(tiny), out=tmp_path / "d", **arguments)
     assert not (tmp_path / "d").exists()
 
 
@@ -151,7 +195,7 @@ def test_failed_draws_are_logged_and_redrawn_the_same_way_in_every_run(tiny: Pat
     seed = _first_seed_whose_draws(template, [False, False, True])
     whole = generate(template, 3, tmp_path / "whole", seed)
     assert whole.failed_draws >= 2
-    assert whole.given_up == ()
+    assert whole.given_up == []
     failures = read_dataset(tmp_path / "whole").failures
     assert [(f["index"], f["draw"], f["stage"]) for f in failures[:2]] == [(0, 0, "draw"), (0, 1, "draw")]
     assert "motion.depth_mm" in failures[0]["reason"]
@@ -193,7 +237,7 @@ def test_samples_whose_every_draw_fails_are_given_up(tiny: Path, tmp_path: Path,
     template = load_scene(tiny, [override])
     for _ in range(2):  # again: neither more samples nor more lines
         summary = generate(template, 3, tmp_path / "d")
-        assert (summary.made, summary.given_up, summary.failed_draws) == (0, (0, 1, 2), 20)
+        assert (summary.made, summary.given_up, summary.failed_draws) == (0, [0, 1, 2], 20)
         dataset = read_dataset(tmp_path / "d")
         assert dataset.samples == []
         assert [(f["index"], f["draw"]) for f in dataset.failures] == [(i, k) for i in (0, 2) for k in range(10)]

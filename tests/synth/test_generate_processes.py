@@ -1,23 +1,34 @@
-"""Real processes: two workers, kill -9, Ctrl-C. Whatever happens, the same command ends with the same files."""
+"""Real processes: workers, kill -9, Ctrl-C. Whatever happens, the same command ends with the same files."""
 
+import contextlib
 import os
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
+from processes_of import (
+    HAS_PROC,
+    PATIENCE_S,
+    ROOT,
+    alive,
+    descendants,
+    lines,
+    own_words,
+    start,
+    wait_for,
+    workers_of,
+)
 from tiny_scene import fingerprint, own_cache, reference, write_tiny
 
 from synth.cli import main
 from synth.generate import generate
 from synth.template import load_scene
 
-ROOT = Path(__file__).parents[2]
-PATIENCE_S = 120.0
+needs_proc = pytest.mark.skipif(not HAS_PROC, reason="finds child processes in Linux's /proc")
 
 
 @pytest.fixture(autouse=True)
@@ -26,62 +37,19 @@ def _cache(monkeypatch: pytest.MonkeyPatch) -> None:
     own_cache(monkeypatch)
 
 
-def _start(scene: Path, out: Path, *options: str) -> "subprocess.Popen[str]":
-    """The command in a session of its own, as from a terminal."""
-    command = [sys.executable, "-m", "synth", "generate", "--scene", str(scene), "--out", str(out), *options]
-    pipe = subprocess.PIPE
-    return subprocess.Popen(command, cwd=ROOT, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
-
-
-def _lines(out: Path) -> int:
-    manifest = out / "manifest.jsonl"
-    return manifest.read_bytes().count(b"\n") if manifest.exists() else 0
-
-
-def _wait_for(what: str, holds: Callable[[], bool], process: "subprocess.Popen[str] | None" = None) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not holds():
-        assert time.monotonic() < deadline, f"waited {PATIENCE_S} s for {what}"
-        if process is not None and process.poll() is not None:
-            raise AssertionError(f"ended with {process.returncode} before {what}: {process.communicate()[1]}")
-        time.sleep(0.005)
-
-
-def _alive(pids: Sequence[int]) -> list[int]:
-    """Those that run; a process that has ended and that nobody has asked about yet is none."""
-
-    def runs(pid: int) -> bool:
-        try:
-            return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-        except OSError:
-            return False
-
-    return [pid for pid in pids if runs(pid)]
-
-
-def _descendants(pid: int) -> list[int]:
-    children = [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
-    return children + [below for child in children for below in _descendants(child)]
-
-
-def _own_words(stderr: str) -> list[str]:
-    """What synth said; Warp remarks on a missing GPU by itself, and Python's semaphores on a killed parent."""
-    return [line for line in stderr.splitlines() if line.startswith("synth:") or "Traceback" in line or "Error" in line]
-
-
-@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds child processes in Linux's /proc")
+@needs_proc
 def test_killed_with_two_workers_and_started_again(tmp_path: Path) -> None:
     scene, out = write_tiny(tmp_path), tmp_path / "d"
-    process = _start(scene, out, "--n", "5", "--workers", "2")
-    _wait_for("the first sample", lambda: _lines(out) > 0, process)
-    family = _descendants(process.pid)
+    process = start(scene, out, "--n", "5", "--workers", "2")
+    wait_for("the first sample", lambda: lines(out) > 0, process)
+    family = descendants(process.pid)
     assert len(family) >= 2
     process.kill()
     process.communicate()
     assert process.returncode == -signal.SIGKILL
-    assert 0 < _lines(out) < 5
-    _wait_for("the workers to leave with their driver", lambda: not _alive(family))
-    again = _start(scene, out, "--n", "5", "--workers", "2")
+    assert 0 < lines(out) < 5
+    wait_for("the workers to leave with their driver", lambda: not alive(family))
+    again = start(scene, out, "--n", "5", "--workers", "2")
     stdout, stderr = again.communicate(timeout=PATIENCE_S)
     assert again.returncode == 0, stderr
     assert "were there" in stdout
@@ -101,19 +69,19 @@ def _assert_goes_on(scene: Path, out: Path) -> None:
 INTERRUPTED = "synth: interrupted; finished samples are kept: run the same command again to go on"
 
 
-@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds child processes in Linux's /proc")
+@needs_proc
 def test_ctrl_c_with_workers_ends_with_130_one_line_and_no_orphans(tmp_path: Path) -> None:
     scene, out = write_tiny(tmp_path), tmp_path / "d"
-    process = _start(scene, out, "--n", "400", "--workers", "2")
-    _wait_for("the first sample", lambda: _lines(out) > 0, process)
-    family = _descendants(process.pid)
+    process = start(scene, out, "--n", "400", "--workers", "2")
+    wait_for("the first sample", lambda: lines(out) > 0, process)
+    family = descendants(process.pid)
     assert len(family) >= 2
     os.killpg(process.pid, signal.SIGINT)  # a terminal sends it to the whole group
     _, stderr = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 130, stderr
-    assert _own_words(stderr) == [INTERRUPTED]
-    _wait_for("the workers to leave", lambda: not _alive(family))
-    assert _lines(out) < 400
+    assert own_words(stderr) == [INTERRUPTED]
+    wait_for("the workers to leave", lambda: not alive(family))
+    assert lines(out) < 400
     _assert_goes_on(scene, out)
 
 
@@ -121,7 +89,7 @@ def test_ctrl_c_in_one_process_ends_with_130_and_one_line(tmp_path: Path, capsys
     scene, out = write_tiny(tmp_path), tmp_path / "d"
 
     def press_ctrl_c() -> None:
-        _wait_for("the first sample", lambda: _lines(out) > 0)
+        wait_for("the first sample", lambda: lines(out) > 0)
         os.kill(os.getpid(), signal.SIGINT)
 
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # whatever other tests left: pytest must survive
@@ -133,25 +101,42 @@ def test_ctrl_c_in_one_process_ends_with_130_and_one_line(tmp_path: Path, capsys
         thread.join()
         signal.signal(signal.SIGINT, before)
     assert status == 130
-    assert _own_words(capsys.readouterr().err) == [INTERRUPTED]
-    assert _lines(out) < 400
+    assert own_words(capsys.readouterr().err) == [INTERRUPTED]
+    assert lines(out) < 400
     _assert_goes_on(scene, out)
 
 
-@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="finds child processes in Linux's /proc")
-def test_a_worker_that_dies_is_said_in_one_line(tmp_path: Path) -> None:
+@needs_proc
+def test_a_killed_worker_is_replaced(tmp_path: Path) -> None:
+    """One of two, in mid-task; the run goes on and ends with the files of an undisturbed one."""
     scene, out = write_tiny(tmp_path), tmp_path / "d"
-    process = _start(scene, out, "--n", "400", "--workers", "2")
-    _wait_for("the first sample", lambda: _lines(out) > 0, process)
-    family = _descendants(process.pid)
-    workers = [pid for pid in family if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
-    assert len(workers) == 2
-    os.kill(workers[0], signal.SIGKILL)
+    process = start(scene, out, "--n", "5", "--workers", "2")
+    wait_for("the first sample", lambda: lines(out) > 0, process)
+    os.kill(workers_of(process.pid)[0], signal.SIGKILL)
     _, stderr = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0, stderr
+    (words,) = own_words(stderr)
+    assert words.startswith("synth: a worker process died; trajectories ")
+    assert fingerprint(out) == fingerprint(reference())
+
+
+@needs_proc
+def test_workers_that_die_again_and_again_are_said_in_one_line(tmp_path: Path) -> None:
+    """Each pool loses its workers as soon as they are there: the third is the last."""
+    scene, out = write_tiny(tmp_path), tmp_path / "d"
+    process = start(scene, out, "--n", "400", "--workers", "2")
+    while process.poll() is None:
+        for pid in workers_of(process.pid):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        time.sleep(0.02)
+    _, stderr = process.communicate()
     assert process.returncode == 2, stderr
-    (words,) = _own_words(stderr)
-    assert words.startswith("synth: a worker process died")
-    _wait_for("the other worker to leave", lambda: not _alive(family))
+    *notes, words = own_words(stderr)
+    assert len(notes) == 2
+    assert words.startswith("synth: worker processes died 3 times in a row")
+    assert lines(out) == 0
+    assert list((out / "samples").iterdir()) == []
 
 
 AFTER_MESHING = """

@@ -6,6 +6,7 @@ from render_scenes import small_sensor
 
 from synth.render.pattern import albedo, is_grey, pixels_per_mm
 from synth.scene import Dots, Light, NoPattern, RandomColor, Speckle
+from synth.scene_camera import FurtherCamera, Mirror
 
 
 def _texel_mm(sensor, texture):
@@ -82,3 +83,29 @@ def test_grey_is_what_has_no_color_anywhere() -> None:
     assert not is_grey(small_sensor(pattern=Speckle(kind="speckle", grain_mm=1, reflectance=(0.1, 0.1, 0.2))))
     red = Light(position_mm=(7, 0, 4), size_mm=(1, 1), color=(1, 0, 0), power=1)
     assert not is_grey(small_sensor(lights=(red,)))
+
+
+def test_texture_is_as_fine_as_the_finest_view_sees_it() -> None:
+    """Fails with the main camera's height for its distance: gelslim's goes by a mirror, and gave 4 times too fine."""
+    sensor = small_sensor(position_mm=(0.0, 0.0, 20.0), look_at_mm=(0.0, 0.0, 0.0))
+    near = FurtherCamera(**(sensor.camera.model_dump() | {"name": "near", "position_mm": (0.0, 0.0, 14.0)}))
+    both = sensor.model_copy(update={"further_cameras": (near,)})
+    assert pixels_per_mm(both) == pytest.approx(10.0)  # 140 px over 14 mm
+    mirror = Mirror(position_mm=(0.0, 0.0, 20.0), normal=(0.0, 1.0, -1.0), size_mm=(20.0, 30.0))
+    aside = sensor.camera.model_copy(update={"position_mm": (0.0, 15.0, 20.0), "look_at_mm": (0.0, 0.0, 20.0)})
+    folded = sensor.model_copy(update={"camera": aside, "mirrors": (mirror,)})
+    assert pixels_per_mm(folded) == pytest.approx(4.0)  # 15 mm to the mirror and 20 mm from there to the gel
+
+
+def test_a_turned_grid_turns_about_its_first_dot() -> None:
+    dots = Dots(kind="dots", spacing_mm=(3.0, 30.0), radius_mm=0.4, offset_mm=(0.5, 0.2), rotation_deg=30.0,
+                reflectance=(0, 0, 0))  # fmt: skip
+    sensor = small_sensor(pattern=dots)
+    texture = albedo(sensor, np.random.default_rng(0))
+    x, y = _texel_mm(sensor, texture)
+    weight = 1 - texture[:, :, 0] / 0.6
+    near = np.hypot(x[None] - (0.5 + 3 * np.cos(np.pi / 6)), y[:, None] - (0.2 + 1.5)) < 0.7
+    # +x turns toward +y. The next dot's centroid is met within a thirtieth of a texel (0.036 mm).
+    assert (weight * near).sum() * (x[1] - x[0]) * (y[1] - y[0]) == pytest.approx(np.pi * 0.4**2, rel=1e-2)
+    assert (weight * near * x).sum() / (weight * near).sum() == pytest.approx(0.5 + 3 * np.cos(np.pi / 6), abs=2e-3)
+    assert (weight * near * y[:, None]).sum() / (weight * near).sum() == pytest.approx(1.7, abs=2e-3)

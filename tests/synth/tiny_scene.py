@@ -99,8 +99,11 @@ def without_times(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def fingerprint(dataset: Path) -> dict[str, Any]:
-    """SHA-256 of every file of a dataset by relative path; manifest lines less their seconds; the lock left out."""
-    files = [file for file in sorted(dataset.rglob("*")) if file.is_file() and file.name != ".lock"]
+    """SHA-256 of every file of a dataset by relative path; manifest lines less their seconds.
+
+    The lock and summary.json, which tells of times, are left out.
+    """
+    files = [f for f in sorted(dataset.rglob("*")) if f.is_file() and f.name not in (".lock", "summary.json")]
     found: dict[str, Any] = {str(f.relative_to(dataset)): hashlib.sha256(f.read_bytes()).hexdigest() for f in files}
     lines = (dataset / "manifest.jsonl").read_text().splitlines()
     found["manifest.jsonl"] = [without_times(json.loads(line)) for line in lines]

@@ -1,0 +1,99 @@
+"""The fitted sensor rendered, beside the frame that it is to match."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from synth.arrays import BoolArray, FloatArray
+from synth.produce import flat_surface
+from synth.render.camera_image import expected_signal
+from synth.render.pattern import albedo
+from synth.render.renderer import Renderer
+from synth.render.variant import Variant
+from synth.scene import Dots, Render, Sensor
+
+AMPLIFIED = 8
+"""Factor of the differences in the picture."""
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A frame and the sensor's picture of it, both (H, W, 3) in [0, 1], encoded.
+
+    Attributes:
+        frame: real.
+        rendered: without noise and quantisation.
+        outside: (H, W) pixels without dots in either picture.
+    """
+
+    frame: FloatArray
+    rendered: FloatArray
+    outside: BoolArray
+
+    def numbers(self) -> dict[str, Any]:
+        """Mean absolute and signed differences per channel, levels of 255."""
+        difference = 255 * (self.rendered - self.frame)
+        bare = difference[self.outside]
+        return {
+            "mean_absolute_outside_dots": [round(float(x), 3) for x in np.abs(bare).mean(axis=0)],
+            "bias_outside_dots": [round(float(x), 3) for x in bare.mean(axis=0)],
+            "p95_outside_dots": [round(float(x), 3) for x in np.percentile(np.abs(bare), 95, axis=0)],
+            "mean_absolute": [round(float(x), 3) for x in np.abs(difference).mean(axis=(0, 1))],
+            "pixels_outside_dots": int(self.outside.sum()),
+        }
+
+
+def render_undeformed(sensor: Sensor, render: Render, variant: Variant) -> FloatArray:
+    """The undeformed gel's picture (H, W, 3), encoded, in [0, 1], without noise and quantisation.
+
+    Dots are drawn on their grid without jitter, which no frame tells for another gel.
+    """
+    plain = sensor
+    if isinstance(sensor.pattern, Dots):
+        even = sensor.pattern.model_copy(update={"jitter_mm": 0.0, "radius_jitter": 0.0})
+        plain = sensor.model_copy(update={"pattern": even})
+    surface = flat_surface(sensor.gel.size_mm)
+    renderer = Renderer(sensor, render, surface, albedo(plain, np.random.default_rng(0)), variant)
+    signal = expected_signal(renderer.radiance(surface.material, 0), sensor.camera)
+    return np.asarray(np.clip(signal, 0, 1) ** (1 / sensor.camera.gamma))
+
+
+def compare(frame: FloatArray, rendered: FloatArray, bare: BoolArray, sensor: Sensor) -> Comparison:
+    """Frame against picture; `bare` are the frame's own pixels without dots.
+
+    Dots of the picture are left out by their own darkness: they may lie beside the frame's where a gel was moved.
+    """
+    outside = bare.copy()
+    if isinstance(sensor.pattern, Dots):
+        import cv2
+
+        from synth.calibrate.dots import find_dots
+        from synth.render.pattern import pixels_per_mm
+
+        pitch = sensor.pattern.spacing_mm[0] * pixels_per_mm(sensor)
+        outside &= ~find_dots(rendered**sensor.camera.gamma, pitch).covered
+        outside = cv2.erode(outside.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=1) > 0
+    return Comparison(frame, rendered, outside)
+
+
+def picture(rows: dict[str, Comparison]) -> bytes:
+    """A PNG: a row per comparison with the frame, the fitted sensor, and their difference, amplified around grey."""
+    import io
+
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12.6, 3.4 * len(rows) + 0.3), dpi=100)
+    axes = figure.subplots(len(rows), 3, squeeze=False)
+    for line, (name, row) in zip(axes, rows.items(), strict=True):
+        difference = 0.5 + AMPLIFIED * (row.rendered - row.frame)
+        errors = " ".join(f"{value:.1f}" for value in row.numbers()["mean_absolute_outside_dots"])
+        titles = (name, "fitted sensor, rendered", f"difference x {AMPLIFIED}; outside dots {errors} of 255")
+        for axis, image, title in zip(line, (row.frame, row.rendered, difference), titles, strict=True):
+            axis.imshow(np.clip(image, 0, 1), interpolation="nearest")
+            axis.set_title(title, fontsize=9)
+            axis.set_axis_off()
+    figure.tight_layout()
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png")
+    return buffer.getvalue()

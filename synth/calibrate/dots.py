@@ -1,0 +1,124 @@
+"""Dark dots of a frame: where they are, and the brightness of the coating around and beneath them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from synth.arrays import BoolArray, FloatArray, Pixels
+from synth.errors import InputError
+
+_FEWEST = 9
+_CLEAREST = 0.75
+"""A dot's middle is at least so much darker than the coating around: ratio of linear brightness."""
+
+
+@dataclass(frozen=True, eq=False)
+class FoundDots:
+    """Dots that lie wholly in the image.
+
+    Attributes:
+        centres: (n, 2) px, centroids of darkness.
+        radii: (n,) px, of disks of the same integrated darkness.
+        ratio: (H, W, 3) linear brightness over that of the coating around.
+        covered: (H, W) whether a pixel may hold some of a dot's darkness, at the image's border as well.
+    """
+
+    centres: Pixels
+    radii: FloatArray
+    ratio: FloatArray
+    covered: BoolArray
+
+
+def find_dots(linear: FloatArray, pitch_px: float) -> FoundDots:
+    """Find dots and measure them against the coating around.
+
+    Args:
+        linear: (H, W, 3) in [0, 1].
+        pitch_px: about how far dots are apart.
+
+    Raises:
+        InputError: fewer than nine whole dots.
+    """
+    import cv2
+
+    grey = linear.mean(axis=2)
+    window = 2 * int(pitch_px / 2) + 1
+    coarse = cv2.medianBlur(np.round(255 * np.sqrt(np.clip(grey, 0, 1))).astype(np.uint8), window)
+    ratio = grey / np.maximum((coarse / 255.0) ** 2, 1e-4)
+    depth = float(np.percentile(ratio, 1))
+    if depth > _CLEAREST:
+        raise _too_few(0, pitch_px)
+    threshold = (1 + depth) / 2
+    _, labels, table, _ = cv2.connectedComponentsWithStats((ratio < threshold).astype(np.uint8))
+    area = table[1:, cv2.CC_STAT_AREA].astype(np.float64)
+    large = area > 0.3 * np.median(area[area > (0.1 * pitch_px) ** 2]) if (area > (0.1 * pitch_px) ** 2).any() else []
+    if not np.any(large):
+        raise _too_few(0, pitch_px)
+    typical = float(np.median(area[large]))
+    radius = float(np.sqrt(typical / np.pi))
+    margin = max(2, round(0.45 * radius))
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
+    covered = cv2.dilate((np.isin(labels, 1 + np.flatnonzero(area > 0.05 * typical))).astype(np.uint8), kernel) > 0
+    around = np.maximum(_around(linear, covered, 0.35 * pitch_px), 1e-6)
+    bright = linear.sum(axis=2) / around.sum(axis=2)  # weighs channels by their light: a dark one's kinks count little
+    whole = [k for k in np.flatnonzero((area > 0.5 * typical) & (area < 2 * typical)) if _inside(table[k + 1], labels)]
+    found = [_measure(bright, labels == k + 1, radius) for k in whole]
+    if len(found) < _FEWEST:
+        raise _too_few(len(found), pitch_px)
+    centres, radii = (np.array(part) for part in zip(*found, strict=True))
+    return FoundDots(centres, radii, linear / around, covered)
+
+
+def _around(linear: FloatArray, covered: BoolArray, sigma: float) -> FloatArray:
+    """The coating's brightness, continued beneath the dots: a Gaussian-weighted plane fitted to bare pixels."""
+    import cv2
+
+    rows, columns = np.mgrid[: covered.shape[0], : covered.shape[1]].astype(np.float64)
+    bare = (~covered).astype(np.float64)
+
+    def smooth(field: FloatArray) -> FloatArray:
+        return np.asarray(cv2.GaussianBlur(field * bare, (0, 0), sigma, borderType=cv2.BORDER_CONSTANT))
+
+    weight = np.maximum(smooth(np.ones_like(bare)), 1e-9)
+    x, y = smooth(columns) / weight - columns, smooth(rows) / weight - rows
+    xx = smooth(columns**2) / weight - (x + columns) ** 2 + 1e-6
+    yy = smooth(rows**2) / weight - (y + rows) ** 2 + 1e-6
+    xy = smooth(columns * rows) / weight - (x + columns) * (y + rows)
+    determinant = xx * yy - xy * xy
+    planes = []
+    for channel in np.moveaxis(linear, 2, 0):
+        mean = smooth(channel) / weight
+        xv = smooth(channel * columns) / weight - (x + columns) * mean
+        yv = smooth(channel * rows) / weight - (y + rows) * mean
+        slope_x, slope_y = (yy * xv - xy * yv) / determinant, (xx * yv - xy * xv) / determinant
+        planes.append(mean - x * slope_x - y * slope_y)
+    return np.stack(planes, axis=2)
+
+
+def _inside(box: FloatArray, labels: FloatArray) -> bool:
+    left, top, width, height = box[:4]
+    return bool(left > 1 and top > 1 and left + width < labels.shape[1] - 1 and top + height < labels.shape[0] - 1)
+
+
+def _measure(ratio: FloatArray, member: BoolArray, radius: float) -> tuple[FloatArray, float]:
+    """Centroid (2,) px of a dot's darkness, and the radius of the disk of its integrated darkness."""
+    rows, columns = np.nonzero(member)
+    centre = np.array([columns.mean() + 0.5, rows.mean() + 0.5])
+    reach = 1.5 * radius + 1.5
+    top, left = (int(max(0, np.floor(c - reach))) for c in centre[::-1])
+    patch = ratio[top : int(centre[1] + reach) + 1, left : int(centre[0] + reach) + 1]
+    y, x = np.mgrid[: patch.shape[0], : patch.shape[1]] + 0.5
+    x, y = x + left, y + top
+    depth = 1 - float(np.median(ratio[member & (ratio < np.median(ratio[member]))]))
+    for _ in range(3):
+        darkness = np.where(np.hypot(x - centre[0], y - centre[1]) < reach, np.clip(1 - patch, -0.1, 1), 0)
+        weight = np.where(darkness > 0.08 * depth, darkness, 0)  # what is fainter is noise of the coating
+        centre = np.array([(weight * x).sum(), (weight * y).sum()]) / weight.sum()
+    return centre, float(np.sqrt(max(darkness.sum(), 0.0) / depth / np.pi))
+
+
+def _too_few(count: int, pitch_px: float) -> InputError:
+    return InputError(
+        f"{count} whole dark dots were found in the frame, at least {_FEWEST} are needed; dots were expected about "
+        f"{pitch_px:.0f} px apart: check sensor.pattern.spacing_mm of the preset (--set), or take a preset without dots"
+    )

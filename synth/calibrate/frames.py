@@ -1,0 +1,74 @@
+"""Frames of a user's sensor: read, made linear, averaged."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from synth.arrays import FloatArray
+from synth.errors import InputError
+
+_SAME = 6.0
+"""Levels of 255 by which frames of one undeformed gel may differ on average."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """What the frames show together.
+
+    Attributes:
+        encoded: (H, W, 3) float64 RGB in [0, 1], the mean of all frames.
+        single: (H, W, 3) the first of them, with all of its noise.
+        count: number of frames.
+        step: of one level of quantisation, full scale 1.
+    """
+
+    encoded: FloatArray
+    single: FloatArray
+    count: int
+    step: float
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height, px."""
+        return self.encoded.shape[1], self.encoded.shape[0]
+
+
+def read_frames(paths: Sequence[Path]) -> Frames:
+    """Frames of one sensor with its gel undeformed.
+
+    Args:
+        paths: image files of 8 or 16 bits in any format of OpenCV's; grey ones get three equal channels.
+
+    Raises:
+        InputError: none given; one that is missing or no image; sizes that differ; frames that show different things.
+    """
+    import cv2
+
+    if not paths:
+        raise InputError("no frames: give one or a few images of the undeformed gel")
+    images, steps = [], []
+    for path in paths:
+        if not path.is_file():
+            raise InputError(f"{path}: there is no such file")
+        raw = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+        if raw is None or raw.dtype not in (np.uint8, np.uint16):
+            raise InputError(f"{path}: is no image of 8 or 16 bits that OpenCV can read, such as a PNG")
+        steps.append(1.0 / float(np.iinfo(raw.dtype).max))
+        images.append(raw[:, :, ::-1].astype(np.float64) * steps[-1])
+        if images[-1].shape != images[0].shape:
+            raise InputError(
+                f"{path}: has {_size(images[-1])} pixels, {paths[0]} has {_size(images[0])}; give one size"
+            )
+        difference = 255 * float(np.abs(images[-1] - images[0]).mean())
+        if difference > _SAME:
+            raise InputError(
+                f"{path}: differs from {paths[0]} by {difference:.1f} of 255 on average (allowed are {_SAME:g}); "
+                "all frames must show the same undeformed gel"
+            )
+    return Frames(np.mean(images, axis=0), images[0], len(images), max(steps))
+
+
+def _size(image: FloatArray) -> str:
+    return f"{image.shape[1]} x {image.shape[0]}"

@@ -1,0 +1,247 @@
+r"""Lights fitted to a picture of the undeformed gel: powers in closed form, geometry by steps around that.
+
+The undeformed picture is linear in the lights' powers: with the signal of pixel p in channel c
+
+.. math::  s_{pc} = e \, v_p \sum_i P_{ic} E_{ipc}(\theta)
+
+(exposure e, vignette v, contributions E of `synth.calibrate.irradiance`) the best non-negative powers for a given
+geometry θ are a small least-squares problem per channel with one exact answer (Lawson and Hanson, 1974). What is left,
+
+.. math::  J(\theta) = \min_{P \ge 0} \frac{M}{2 σ^2 n} \sum_{pc} w_{pc}^2 (s_{pc} - \hat s_{pc})^2
+                       + \frac12 |\theta|^2,
+
+depends on θ alone (variable projection, Golub and Pereyra 1973). Gauss-Newton steps descend it, with the derivatives of
+E from Dr.Jit and Kaufman's Jacobian (BIT 15, 1975): what a change of θ does to the picture, less what other powers
+would make of it. w is the slope of the camera's response, so that residuals are in encoded values, as they are seen. θ
+are displacements from where the fit starts, in units of how far a light may plausibly be from there: what the picture
+does not tell stays where it was.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from synth.arrays import BoolArray, FloatArray
+from synth.calibrate.irradiance import FlatGel, LightGeometry
+
+CENTRE_MM, DIRECTION, LOG_SIZE, VIGNETTING = 2.0, 0.4, 0.5, 0.3
+"""Standard deviations of the prior: of a light's place, of its unit direction, of the logarithm of its sizes, and of
+the vignetting."""
+_SIZES = 1.5
+"""Bound of the sizes' displacements: by a factor of 2.1 either way."""
+RESIDUAL = 1 / 255
+"""Standard deviation of what the model may leave, encoded."""
+INDEPENDENT = 300.0
+"""Number of independent values that a smooth picture counts for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """What the lights are to explain, at n pixels.
+
+    Attributes:
+        signal: (n, 3) linear, full scale 1.
+        slope: (n, 3) derivative of the encoded value with respect to the linear one.
+        gain: (n,) or scalar: exposure.
+        corner: (n,) squared distance from the principal point over that of the farthest corner.
+    """
+
+    signal: FloatArray
+    slope: FloatArray
+    gain: float
+    corner: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """Box of each light's centre (m, 3) mm: inside the body and outside the camera's view."""
+
+    low: FloatArray
+    high: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class LightFit:
+    """What was found.
+
+    Attributes:
+        geometry: of the lights.
+        powers: (m, 3) per channel.
+        power_sd: (m, 3) standard error of the powers with the geometry held, from the residual; 0 where the power is
+            held at zero.
+        vignetting: of the camera.
+        residual: root mean square, encoded, full scale 1.
+        steps: Gauss-Newton steps taken.
+    """
+
+    geometry: LightGeometry
+    powers: FloatArray
+    power_sd: FloatArray
+    vignetting: float
+    residual: float
+    steps: int
+
+
+def fit_lights(
+    gel: FlatGel, target: Target, start: LightGeometry, shines: BoolArray, vignetting: float, bounds: Bounds, steps: int
+) -> LightFit:
+    """Fit powers, geometry and vignetting.
+
+    Args:
+        gel: the pixels.
+        target: at the same pixels.
+        start: geometry to start from; its distance is what the prior penalises.
+        shines: (m, 3) channels in which each light may have power.
+        vignetting: of the camera at the start.
+        bounds: for the centres.
+        steps: at most so many Gauss-Newton steps; 0 fits the powers alone.
+    """
+    problem = _Problem(gel, target, start, shines, vignetting)
+    if steps == 0:
+        return problem.result(np.zeros(problem.size), 0)
+    from scipy.optimize import least_squares
+
+    low, high = problem.box(bounds)
+    found = least_squares(
+        problem.residual,
+        np.clip(np.zeros(problem.size), low + 1e-6, high - 1e-6),
+        jac=problem.jacobian,
+        bounds=(low, high),
+        max_nfev=steps,
+        ftol=1e-3,
+        xtol=1e-3,
+    )
+    return problem.result(found.x, int(found.njev))
+
+
+class _Problem:
+    """J of the module's docstring."""
+
+    def __init__(
+        self, gel: FlatGel, target: Target, start: LightGeometry, shines: BoolArray, vignetting: float
+    ) -> None:
+        unit = start.direction / np.linalg.norm(start.direction, axis=1, keepdims=True)
+        self._start = replace(start, direction=unit)
+        self._gel, self._target, self._shines, self._vignetting = gel, target, shines, vignetting
+        self._kept: tuple[FloatArray, tuple[FloatArray, FloatArray, LightGeometry]] | None = None
+        self._lights = len(start.centre)
+        self.size = 8 * self._lights + 1
+        self._factor = float(np.sqrt(INDEPENDENT / target.signal.size)) / RESIDUAL
+
+    def geometry(self, theta: FloatArray) -> LightGeometry:
+        m = self._lights
+        centre, direction, size = (part.reshape(m, -1) for part in np.split(theta[:-1], [3 * m, 6 * m]))
+        return LightGeometry(
+            self._start.centre + CENTRE_MM * centre,
+            self._start.direction + DIRECTION * direction,
+            self._start.size * np.exp(LOG_SIZE * size),
+        )
+
+    def box(self, bounds: Bounds) -> tuple[FloatArray, FloatArray]:
+        """Bounds of theta."""
+        wide = np.concatenate([np.full(3 * self._lights, 4.0), np.full(2 * self._lights, _SIZES)])
+        low = (bounds.low - self._start.centre) / CENTRE_MM
+        high = (bounds.high - self._start.centre) / CENTRE_MM
+        dark = ((0 - self._vignetting) / VIGNETTING, (0.9 - self._vignetting) / VIGNETTING)
+        return np.r_[low.ravel(), -wide, dark[0]], np.r_[high.ravel(), wide, dark[1]]
+
+    def residual(self, theta: FloatArray) -> FloatArray:
+        """(3 n + len(theta),): weighted misfit by channel, and the prior."""
+        basis, powers, _ = self._solved(theta)
+        miss = np.einsum("mpc,mc->pc", basis, powers) - self._target.signal
+        return np.concatenate([(self._factor * self._target.slope * miss).T.ravel(), theta])
+
+    def jacobian(self, theta: FloatArray) -> FloatArray:
+        """Kaufman's, of `residual`."""
+        basis, powers, geometry = self._solved(theta)
+        weight = self._factor * self._target.slope
+        vignette = self._vignette(theta)[None, None, :, None]
+        change = self._gel.derivatives(geometry) * (self._target.gain * vignette)
+        change[:, :3] *= CENTRE_MM
+        change[:, 3:6] *= DIRECTION
+        change[:, 6:] *= LOG_SIZE * geometry.size[:, :, None, None]
+        radiance = np.einsum("mpc,mc->pc", basis, powers) / self._vignette(theta)[:, None]
+        corner = -VIGNETTING * self._target.corner[:, None] * radiance
+        blocks = []
+        for channel in range(3):
+            moved = change[..., channel] * powers[:, None, None, channel]
+            columns = np.column_stack([_by_number(moved), corner[:, channel]]) * weight[:, channel, None]
+            lit = powers[:, channel] > 0
+            if lit.any():
+                span = np.linalg.qr((basis[lit, :, channel] * weight[:, channel]).T)[0]
+                columns = columns - span @ (span.T @ columns)
+            blocks.append(columns)
+        return np.vstack([*blocks, np.eye(self.size)])
+
+    def result(self, theta: FloatArray, steps: int) -> LightFit:
+        """The fit at theta."""
+        basis, powers, geometry = self._solved(theta)
+        _, errors = fit_powers(basis, self._target, self._shines)
+        miss = self._target.slope * (np.einsum("mpc,mc->pc", basis, powers) - self._target.signal)
+        return LightFit(geometry, powers, errors, self._loss(theta), float(np.sqrt(np.mean(miss**2))), steps)
+
+    def _solved(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, LightGeometry]:
+        """Signals (m, n, 3) under lights of power 1, the best powers (m, 3), and the geometry; kept for one theta."""
+        if self._kept is None or not np.array_equal(self._kept[0], theta):
+            geometry = self.geometry(theta)
+            gain = self._target.gain * self._vignette(theta)
+            basis = self._gel.contributions(geometry) * gain[None, :, None]
+            self._kept = (theta.copy(), (basis, fit_powers(basis, self._target, self._shines)[0], geometry))
+        return self._kept[1]
+
+    def _loss(self, theta: FloatArray) -> float:
+        """The vignetting: relative loss in the corner."""
+        return float(self._vignetting + VIGNETTING * theta[-1])
+
+    def _vignette(self, theta: FloatArray) -> FloatArray:
+        return 1 - self._loss(theta) * self._target.corner
+
+
+def _by_number(change: FloatArray) -> FloatArray:
+    """(n, 8 m) in the order of theta, from (m, 8, n)."""
+    parts = (change[:, :3], change[:, 3:6], change[:, 6:])
+    return np.concatenate([part.reshape(-1, change.shape[2]) for part in parts]).T
+
+
+def fit_powers(basis: FloatArray, target: Target, shines: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Non-negative least squares per channel.
+
+    Args:
+        basis: (m, n, 3) signal under each light of power 1.
+        target: at the same n pixels.
+        shines: (m, 3) channels in which each light may have power.
+
+    Returns:
+        Powers (m, 3), and their standard errors (m, 3), as if INDEPENDENT pixels had independent residuals.
+    """
+    from scipy.optimize import nnls
+
+    powers, errors = np.zeros((len(basis), 3)), np.zeros((len(basis), 3))
+    for channel in range(3):
+        lights = np.flatnonzero(shines[:, channel] & (basis[:, :, channel] > 0).any(axis=1))
+        if not len(lights):
+            continue
+        weight = target.slope[:, channel]
+        matrix = (basis[lights, :, channel] * weight).T
+        scale = np.linalg.norm(matrix, axis=0)
+        triangle, right = _reduced(matrix / scale, target.signal[:, channel] * weight)
+        solution, _ = nnls(triangle, right)
+        powers[lights, channel] = solution / scale
+        errors[lights, channel] = _standard_errors(triangle, right, solution, len(matrix)) / scale
+    return powers, errors
+
+
+def _reduced(matrix: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The same least-squares problem in as many rows as unknowns, and one more for what no solution explains."""
+    factor: FloatArray = np.asarray(np.linalg.qr(np.column_stack([matrix, right]), mode="r"))
+    return factor[:, :-1], factor[:, -1]
+
+
+def _standard_errors(triangle: FloatArray, right: FloatArray, solution: FloatArray, rows: int) -> FloatArray:
+    """Of the solution's positive part."""
+    free = solution > 0
+    variance = float(((triangle @ solution - right) ** 2).sum()) / rows
+    covariance = np.linalg.pinv(triangle[:, free].T @ triangle[:, free]) * variance * rows / INDEPENDENT
+    errors = np.zeros(len(solution))
+    errors[free] = np.sqrt(np.diag(covariance))
+    return errors

@@ -1,0 +1,117 @@
+"""What calibration writes: the fitted scene's content and its numbers."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from synth.calibrate.comparison import Comparison
+from synth.calibrate.frames import Frames
+from synth.calibrate.sensor_fit import SensorFit
+from synth.scene import Dots, Sensor
+from synth.template import Template
+
+
+def fitted_content(template: Template, fit: SensorFit, folder: str) -> dict[str, Any]:
+    """The preset's content with the fitted sensor in place of its own; everything else keeps its distributions.
+
+    Args:
+        template: the preset.
+        fit: what was found.
+        folder: of the preset, relative to where the fitted scene will lie; indenters' files are found through it.
+    """
+    sensor = fit.sensor.model_dump(mode="json")
+    given = template.content["sensor"]
+    # What no undeformed frame tells keeps the preset's distributions: the pad's mechanics.
+    sensor["gel"] = given["gel"]
+    content = {key: _relocated(value, folder) for key, value in template.content.items() if key != "sensor"}
+    content["name"] = f"{template.name}_calibrated"
+    content["description"] = f"{template.content.get('description', template.name)} Calibrated."
+    ordered: dict[str, Any] = {key: content.pop(key) for key in ("name", "description", "references") if key in content}
+    return {**ordered, "sensor": {key: value for key, value in sensor.items() if value not in ((), [])}, **content}
+
+
+def _relocated(value: Any, folder: str) -> Any:
+    """Relative paths of indenters' files, as seen from the fitted scene."""
+    if isinstance(value, dict):
+        return {
+            key: str(Path(folder) / inner) if key == "file" and isinstance(inner, str) else _relocated(inner, folder)
+            for key, inner in value.items()
+        }
+    return [_relocated(inner, folder) for inner in value] if isinstance(value, list) else value
+
+
+def numbers(
+    preset: str,
+    frames: Sequence[Path],
+    fit: SensorFit,
+    start: Sensor,
+    rows: dict[str, Comparison],
+    given: Frames,
+    seconds: float,
+) -> dict[str, Any]:
+    """JSON-able: everything that was found, how sure it is, and how well it fits."""
+    camera = fit.sensor.camera
+    record: dict[str, Any] = {
+        "preset": preset,
+        "frames": [str(path) for path in frames],
+        "size": list(given.size),
+        "seconds": round(seconds, 1),
+        "steps": fit.lights.steps,
+        "residual_of_the_lights": round(255 * fit.lights.residual, 3),
+        "differences": {name: row.numbers() for name, row in rows.items()},
+        "lights": _lights(fit, start),
+        "camera": {
+            key: getattr(camera, key)
+            for key in ("fx", "fy", "cx", "cy", "look_at_mm", "distortion", "blur_px", "vignetting")
+        }
+        | {"read_noise": camera.read_noise, "shot_noise": camera.shot_noise},
+        "coating": {
+            "reflectance": list(fit.sensor.coating.reflectance),
+            "note": "held at the preset's: an undeformed frame tells its product with the lights' powers alone",
+        },
+    }
+    pattern = fit.sensor.pattern
+    if isinstance(pattern, Dots) and fit.lattice is not None:
+        miss = fit.lattice.residual_px
+        record["pattern"] = pattern.model_dump(mode="json")
+        record["dots"] = {
+            "found": 0 if fit.dots is None else len(fit.dots.centres),
+            "in_grid": len(fit.lattice.used),
+            "off_grid_px_rms": round(float(np.sqrt(np.mean(miss**2))), 4),
+            "off_grid_px_max": round(float(np.hypot(*miss.T).max()), 4),
+        }
+    return record
+
+
+def _lights(fit: SensorFit, start: Sensor) -> list[dict[str, Any]]:
+    """One entry for each light of the preset, the dark ones included."""
+    found = []
+    for i, light in enumerate(start.lights):
+        moved = fit.lights.geometry.centre[i] - light.position_mm
+        found.append(
+            {
+                "power_per_channel": [float(f"{value:.6g}") for value in fit.lights.powers[i]],
+                "standard_error": [float(f"{value:.3g}") for value in fit.lights.power_sd[i]],
+                "preset_power_per_channel": [round(light.power * value, 3) for value in light.color],
+                "position_mm": np.round(fit.lights.geometry.centre[i], 4).tolist(),
+                "moved_mm": round(float(np.linalg.norm(moved)), 3),
+                "size_mm": np.round(fit.lights.geometry.size[i], 4).tolist(),
+            }
+        )
+    return found
+
+
+def summary(record: dict[str, Any]) -> list[str]:
+    """Lines for the terminal."""
+    lines = [f"{record['preset']}: fitted in {record['seconds']} s, {record['steps']} steps of the lights' geometry"]
+    for name, difference in record["differences"].items():
+        errors = " ".join(f"{value:.2f}" for value in difference["mean_absolute_outside_dots"])
+        lines.append(f"{name}: mean absolute difference outside dots {errors} of 255 (red green blue)")
+    if "dots" in record:
+        dots = record["dots"]
+        lines.append(
+            f"dots: {dots['in_grid']} of {dots['found']} on the grid, {dots['off_grid_px_rms']:.2f} px off it (rms)"
+        )
+    return lines

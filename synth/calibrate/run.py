@@ -1,0 +1,83 @@
+"""`synth calibrate`: what the command does."""
+
+import json
+import os
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from synth.errors import InputError
+
+SCENE, PICTURE, NUMBERS = "scene.toml", "calibration.png", "calibration.json"
+
+
+def run_calibrate(
+    scene: str,
+    frames: Sequence[Path],
+    judge: Sequence[Path],
+    out: Path,
+    assignments: Sequence[str],
+    spacing_mm: float | None,
+    steps: int,
+    as_json: bool,
+) -> int:
+    """Fit a preset to frames of a user's sensor; write OUT/scene.toml, calibration.png and calibration.json.
+
+    Args:
+        scene: the preset: a shipped scene's name or a TOML file.
+        frames: images of the undeformed gel to fit.
+        judge: further images of the same undeformed gel, which the fit does not see.
+        out: directory.
+        assignments: KEY=VALUE changes of the preset.
+        spacing_mm: distance of the dots' columns where it is known; without, the preset's field of view is trusted.
+        steps: most steps for the lights' geometry.
+        as_json: print the numbers instead of a summary.
+
+    Returns:
+        0.
+
+    Raises:
+        InputError: frames, preset or storage are at fault, or this machine has no differentiable variant.
+    """
+    from synth.calibrate.comparison import compare, picture, render_undeformed
+    from synth.calibrate.frames import read_frames
+    from synth.calibrate.preset import render_settings, start_sensor
+    from synth.calibrate.report import fitted_content, numbers, summary
+    from synth.calibrate.sensor_fit import bare_pixels, fit_sensor
+    from synth.calibrate.toml_text import toml_text
+    from synth.dataset.storage import replace_file, storage_errors
+    from synth.render.variant import LLVM_HINT, choose_variant
+    from synth.template import checked_template, load_scene
+
+    started = time.perf_counter()
+    template = load_scene(scene, assignments)
+    variant = choose_variant("auto")
+    if not variant.is_vectorised:
+        raise InputError(f"calibration differentiates the rendering, which needs LLVM or an NVIDIA GPU: {LLVM_HINT}")
+    given = read_frames(frames)
+    others = {str(path): read_frames([path]) for path in judge}
+    for name, other in others.items():
+        if other.size != given.size:
+            raise InputError(f"{name}: has {other.size} pixels, the frames that are fitted have {given.size}")
+    with storage_errors(out):
+        out.mkdir(parents=True, exist_ok=True)  # before minutes of work, not after
+    start = start_sensor(template, given.size)
+    print("synth: fitting the sensor to the frames", file=sys.stderr, flush=True)
+    fit = fit_sensor(start, given, variant, spacing_mm, steps)
+    rendered = render_undeformed(fit.sensor, render_settings(template), variant)
+    rows = {"frames": compare(given.encoded, rendered, fit.bare, fit.sensor)}
+    for name, other in others.items():
+        rows[f"not fitted: {Path(name).name}"] = compare(
+            other.encoded, rendered, bare_pixels(other, fit.sensor), fit.sensor
+        )
+    content = fitted_content(template, fit, os.path.relpath(template.source.parent.resolve(), out.resolve()))
+    file = out / SCENE
+    checked_template(content, file)
+    record = numbers(template.name, frames, fit, start, rows, given, time.perf_counter() - started)
+    comment = f"Fitted by `synth calibrate --scene {scene}` to {len(frames)} frame(s); numbers in {NUMBERS}."
+    replace_file(file, toml_text(content, comment).encode())
+    replace_file(out / PICTURE, picture(rows))
+    replace_file(out / NUMBERS, (json.dumps(record, indent=1) + "\n").encode())
+    print(json.dumps(record) if as_json else "\n".join([*summary(record), f"written: {file}"]))
+    return 0

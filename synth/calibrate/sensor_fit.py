@@ -1,0 +1,219 @@
+"""A sensor fitted to frames of its undeformed gel: layout and camera first, then dots, lights and noise."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from synth.arrays import BoolArray, FloatArray, Pixels
+from synth.calibrate.dots import FoundDots, find_dots
+from synth.calibrate.frames import Frames
+from synth.calibrate.irradiance import FlatGel, LightGeometry
+from synth.calibrate.lattice import LatticeFit, fit_lattice
+from synth.calibrate.lights import Bounds, LightFit, Target, fit_lights
+from synth.calibrate.noise import fit_noise
+from synth.calibrate.profile import DotProfile, blur_of, fit_profile
+from synth.errors import InputError
+from synth.optics import Optics
+from synth.render.lights import check_view, light_axes
+from synth.render.pattern import pixels_per_mm
+from synth.render.variant import Variant
+from synth.scene import Camera, Dots, Light, Sensor
+
+_PIXELS = 2500
+"""Pixels that the lights are fitted to: the picture without dots is smooth."""
+_REACH_MM = 4.0
+"""How far a light may move from the preset's place, along each axis."""
+_VIEW_MM = 0.3
+"""Lights stay so far outside the camera's view."""
+_PUSH_MM, _LONGEST_PUSH = 0.25, 40
+_DARKEST, _BRIGHTEST = 2 / 255, 253 / 255
+"""Encoded values beyond these are clipped and tell nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class SensorFit:
+    """The fitted sensor and how it was found.
+
+    Attributes:
+        sensor: all of it.
+        lights: powers and geometry.
+        dots, lattice, profile: None for a bare coating.
+        bare: (H, W) pixels that show nothing but coating.
+    """
+
+    sensor: Sensor
+    lights: LightFit
+    dots: FoundDots | None
+    lattice: LatticeFit | None
+    profile: DotProfile | None
+    bare: BoolArray
+
+
+def fit_sensor(start: Sensor, frames: Frames, variant: Variant, spacing_mm: float | None, steps: int) -> SensorFit:
+    """Fit everything that undeformed frames tell.
+
+    Args:
+        start: the preset, its camera of the frames' size.
+        frames: of the user's sensor.
+        variant: a vectorised one.
+        spacing_mm: of the dots' columns, where known; without, the preset's field of view is trusted.
+        steps: most steps for the lights' geometry.
+
+    Raises:
+        InputError: no dots, or no grid, where the preset has some.
+    """
+    gamma = start.camera.gamma
+    linear = frames.encoded**gamma
+    sensor, dots, lattice, profile = start, None, None, None
+    bare = np.ones(linear.shape[:2], dtype=bool)
+    if isinstance(start.pattern, Dots):
+        dots = find_dots(linear, start.pattern.spacing_mm[0] * pixels_per_mm(start))
+        lattice = fit_lattice(start, start.pattern, dots.centres, spacing_mm)
+        profile = fit_profile(dots)
+        bare = ~dots.covered
+        sensor = start.model_copy(update=_look(start, lattice, profile))
+    pixels = _spread(bare & _sees_gel(sensor))
+    at = (pixels[:, 1].astype(int), pixels[:, 0].astype(int))
+    smooth = _smoothed(frames.encoded, bare)[at]
+    gel = FlatGel(sensor, pixels, variant)
+    target = _target(smooth, sensor.camera, pixels)
+    shines = np.array([light.color for light in sensor.lights]) > 0
+    fit = fit_lights(gel, target, _geometry(sensor.lights), shines, sensor.camera.vignetting, _bounds(sensor), steps)
+    if steps > 0:
+        clear = _clear_of_view(sensor, fit.geometry)
+        again = fit_lights(gel, target, clear, shines, fit.vignetting, _bounds(sensor), 0)
+        fit = replace(again, steps=fit.steps)
+    read, shot = fit_noise(frames.single, bare, gamma, frames.step)
+    noise: dict[str, Any] = {"read_noise": round(read, 6), "shot_noise": round(shot, 6)}
+    camera = sensor.camera.model_copy(update={"vignetting": round(fit.vignetting, 4), **noise})
+    lit = [i for i in range(len(sensor.lights)) if fit.powers[i].max() > 0]
+    if not lit:
+        raise InputError("no light of the preset explains any of the frames' brightness; are the frames black?")
+    lights = tuple(_shining(_placed(sensor.lights[i], fit.geometry, i), fit.powers[i]) for i in lit)
+    sensor = sensor.model_copy(update={"camera": camera, "lights": lights})
+    return SensorFit(sensor, fit, dots, lattice, profile, bare)
+
+
+def bare_pixels(frames: Frames, sensor: Sensor) -> BoolArray:
+    """(H, W): pixels of a frame that show nothing but coating."""
+    if not isinstance(sensor.pattern, Dots):
+        return np.ones(frames.encoded.shape[:2], dtype=bool)
+    pitch = sensor.pattern.spacing_mm[0] * pixels_per_mm(sensor)
+    return ~find_dots(frames.encoded**sensor.camera.gamma, pitch).covered
+
+
+def _look(start: Sensor, lattice: LatticeFit, profile: DotProfile) -> dict[str, Any]:
+    """Pattern and camera with what the dots told."""
+    scale = pixels_per_mm(start.model_copy(update={"camera": lattice.camera}))
+    softness = lattice.pattern.softness_mm
+    coating = np.array(start.coating.reflectance)
+    pattern = lattice.pattern.model_copy(
+        update={
+            "radius_mm": round(profile.radius_px / scale, 4),
+            "radius_jitter": round(min(profile.radius_jitter, 1.0), 4),
+            "reflectance": tuple(float(value) for value in np.round(profile.ratio * coating, 4)),
+        }
+    )
+    blur = {"blur_px": round(blur_of(profile, softness * scale), 3)}
+    return {"pattern": pattern, "camera": lattice.camera.model_copy(update=blur)}
+
+
+def _target(encoded: FloatArray, camera: Camera, pixels: Pixels) -> Target:
+    """Signals at pixels; clipped values get no weight."""
+    level = np.clip(encoded, _DARKEST, 1)
+    slope = level ** (1 - camera.gamma) / camera.gamma
+    slope[(encoded > _BRIGHTEST) | (encoded < _DARKEST)] = 0
+    x, y = np.abs(pixels - [camera.cx, camera.cy]).T
+    corner = max(abs(camera.cx), abs(camera.width - camera.cx)) ** 2
+    corner += max(abs(camera.cy), abs(camera.height - camera.cy)) ** 2
+    return Target(encoded**camera.gamma, slope, camera.exposure, (x**2 + y**2) / corner)
+
+
+def _smoothed(encoded: FloatArray, bare: BoolArray) -> FloatArray:
+    """Means (H, W, 3) over bare pixels near by, which takes noise away and leaves shading."""
+    import cv2
+
+    weight = cv2.GaussianBlur(bare.astype(np.float64), (0, 0), 1.5)
+    blurred = cv2.GaussianBlur(encoded * bare[:, :, None], (0, 0), 1.5)
+    return np.asarray(blurred / np.maximum(weight, 1e-9)[:, :, None], dtype=np.float64)
+
+
+def _spread(usable: BoolArray) -> Pixels:
+    """Centres (n, 2) of some _PIXELS usable pixels, on a regular grid."""
+    step = max(1, int(np.sqrt(usable.size / _PIXELS)))
+    rows, columns = np.nonzero(usable[step // 2 :: step, step // 2 :: step])
+    return np.asarray(np.column_stack([columns, rows]) * float(step) + step // 2 + 0.5, dtype=np.float64)
+
+
+def _sees_gel(sensor: Sensor) -> BoolArray:
+    """(H, W): whether a pixel sees the undeformed contact face."""
+    camera = sensor.camera
+    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    origins, directions = Optics.of(sensor).rays(np.column_stack([columns.ravel(), rows.ravel()]))
+    with np.errstate(invalid="ignore"):
+        hit = (origins - directions * (origins[:, 2:] / directions[:, 2:]))[:, :2]
+        inside = np.all(np.abs(hit) < np.array(sensor.gel.size_mm[:2]) / 2, axis=1)
+    return np.asarray(inside.reshape(camera.height, camera.width))
+
+
+def _geometry(lights: tuple[Light, ...]) -> LightGeometry:
+    centre = np.array([light.position_mm for light in lights])
+    return LightGeometry(
+        centre, np.array([light.aim_mm for light in lights]) - centre, np.array([light.size_mm for light in lights])
+    )
+
+
+def _bounds(sensor: Sensor) -> Bounds:
+    """Each light stays near its place, in the body, and on its side of what the camera sees of the contact face."""
+    camera = sensor.camera
+    u, v = np.meshgrid(np.linspace(0, camera.width, 5), np.linspace(0, camera.height, 5))
+    origins, directions = Optics.of(sensor).rays(np.column_stack([u.ravel(), v.ravel()]))
+    seen = (origins - directions * (origins[:, 2:] / directions[:, 2:]))[:, :2]
+    geometry = _geometry(sensor.lights)
+    centre = geometry.centre
+    low, high = centre - _REACH_MM, centre + _REACH_MM
+    face = sensor.gel.size_mm[2] + sensor.window.thickness_mm
+    low[:, 2], high[:, 2] = np.maximum(low[:, 2], 0.4), np.minimum(high[:, 2], face - 0.4)
+    axes = np.array([light_axes(light)[:2] for light in sensor.lights])
+    extent = (np.abs(axes) * geometry.size[:, :, None] / 2).sum(axis=1)
+    for axis in range(2):
+        least = np.nanmin(seen[:, axis]) - _VIEW_MM - extent[:, axis]
+        most = np.nanmax(seen[:, axis]) + _VIEW_MM + extent[:, axis]
+        at = centre[:, axis]
+        high[:, axis] = np.where(at < least, np.minimum(high[:, axis], least), high[:, axis])
+        low[:, axis] = np.where(at > most, np.maximum(low[:, axis], most), low[:, axis])
+    return Bounds(low, high)
+
+
+def _clear_of_view(sensor: Sensor, geometry: LightGeometry) -> LightGeometry:
+    """The same lights, those that turned into the camera's view moved outward until they are out of it."""
+    centre = geometry.centre.copy()
+    for i, light in enumerate(sensor.lights):
+        outward = centre[i, :2] / max(float(np.linalg.norm(centre[i, :2])), 1e-9)
+        for _ in range(_LONGEST_PUSH):
+            moved = _placed(light, LightGeometry(centre, geometry.direction, geometry.size), i)
+            try:
+                check_view(sensor.model_copy(update={"lights": (moved,)}))
+                break
+            except InputError:
+                centre[i, :2] += _PUSH_MM * outward
+    return replace(geometry, centre=centre)
+
+
+def _placed(light: Light, geometry: LightGeometry, i: int) -> Light:
+    """The light with the i-th place, direction and size; its aim stays as far away as it was."""
+    direction = geometry.direction[i] / np.linalg.norm(geometry.direction[i])
+    distance = float(np.linalg.norm(np.subtract(light.aim_mm, light.position_mm)))
+    fields = {
+        "position_mm": geometry.centre[i],
+        "aim_mm": geometry.centre[i] + distance * direction,
+        "size_mm": geometry.size[i],
+    }
+    return light.model_copy(update={key: tuple(np.round(value, 4).tolist()) for key, value in fields.items()})
+
+
+def _shining(light: Light, power: FloatArray) -> Light:
+    """The light with the powers (3,) of its channels: its brightest channel has colour 1."""
+    color = tuple(np.round(power / power.max(), 4).tolist())
+    return light.model_copy(update={"color": color, "power": float(f"{power.max():.6g}")})

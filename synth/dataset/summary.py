@@ -1,0 +1,73 @@
+"""summary.json: what a dataset took, and what its last run did.
+
+The totals are counted from manifest and failures, so that they hold whatever was interrupted in between:
+
+    {"samples", "asked_for", "seconds_per_stage", "share_per_stage", "failed_draws", "failures_by_reason", "last_run"}
+"""
+
+import json
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from synth.dataset.job import read_job_record
+from synth.dataset.joining import FAILURES_FILE, MANIFEST_FILE
+from synth.dataset.jsontext import to_document
+from synth.dataset.storage import replace_file
+
+SUMMARY_FILE = "summary.json"
+
+
+def reason_group(stage: str, reason: str) -> str:
+    """Stage and reason with the numbers left out: draws that fail alike fall into one group."""
+    line = reason.strip().splitlines()[0] if reason.strip() else "no reason given"
+    return f"{stage}: {re.sub(r'[-+]?[0-9]+([.][0-9]+)?(e[-+]?[0-9]+)?', '#', line)[:200]}"
+
+
+def shares(seconds: Mapping[str, float]) -> dict[str, float]:
+    """Each stage's part of the sum."""
+    total = sum(seconds.values())
+    return {stage: round(value / total, 4) for stage, value in seconds.items()} if total > 0 else {}
+
+
+def totals(entries: Iterable[Mapping[str, Any]], failures: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
+    """Counts over lines of manifest and failures."""
+    seconds: Counter[str] = Counter()
+    samples = 0
+    for entry in entries:
+        samples += 1
+        for stage, value in entry["seconds"].items():
+            seconds[stage] += value
+    reasons = Counter(reason_group(failure["stage"], failure["reason"]) for failure in failures)
+    return {
+        "samples": samples,
+        "seconds_per_stage": {stage: round(value, 3) for stage, value in seconds.items()},
+        "share_per_stage": shares(seconds),
+        "failed_draws": reasons.total(),
+        "failures_by_reason": dict(sorted(reasons.items(), key=lambda item: (-item[1], item[0]))),
+    }
+
+
+def summary_document(folder: Path, run: Mapping[str, Any], asked_for: int) -> bytes:
+    """The file's content, from a folder that holds sorted manifest and failures."""
+    counted = totals(_lines(folder / MANIFEST_FILE), _lines(folder / FAILURES_FILE))
+    ordered = {"samples": counted.pop("samples"), "asked_for": asked_for, **counted, "last_run": run}
+    return to_document(ordered).encode("utf-8")
+
+
+def write_summary(directory: Path, run: Mapping[str, Any]) -> None:
+    """Writes DIR/summary.json.
+
+    Raises:
+        InputError: The storage refuses.
+    """
+    asked_for = int(read_job_record(directory)["n"])
+    replace_file(directory / SUMMARY_FILE, summary_document(directory, run, asked_for))
+
+
+def _lines(path: Path) -> Iterator[dict[str, Any]]:
+    with path.open("rb") as file:
+        for line in file:
+            yield json.loads(line)

@@ -1,0 +1,72 @@
+"""Watching and waiting for the command's processes, in tests that kill them; Linux's /proc."""
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+PATIENCE_S = 120.0
+HAS_PROC = Path("/proc/self/task").exists()
+
+
+def start(scene: Path, out: Path | str, *options: str) -> "subprocess.Popen[str]":
+    """The command `generate` in a session of its own, as from a terminal."""
+    command = [sys.executable, "-m", "synth", "generate", "--scene", str(scene), "--out", str(out), *options]
+    pipe = subprocess.PIPE
+    return subprocess.Popen(command, cwd=ROOT, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
+
+
+def lines(out: Path) -> int:
+    """Samples on record."""
+    manifest = out / "manifest.jsonl"
+    return manifest.read_bytes().count(b"\n") if manifest.exists() else 0
+
+
+def wait_for(what: str, holds: Callable[[], bool], process: "subprocess.Popen[str] | None" = None) -> None:
+    """Until something holds; fails after a while, or when the process ends before."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not holds():
+        assert time.monotonic() < deadline, f"waited {PATIENCE_S} s for {what}"
+        if process is not None and process.poll() is not None:
+            raise AssertionError(f"ended with {process.returncode} before {what}: {process.communicate()[1]}")
+        time.sleep(0.005)
+
+
+def alive(pids: Sequence[int]) -> list[int]:
+    """Those that run; a process that has ended and that nobody has asked about yet is none."""
+
+    def runs(pid: int) -> bool:
+        try:
+            return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+        except OSError:
+            return False
+
+    return [pid for pid in pids if runs(pid)]
+
+
+def descendants(pid: int) -> list[int]:
+    """Children, their children, and so on."""
+    try:
+        children = [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    except OSError:
+        return []
+    return children + [below for child in children for below in descendants(child)]
+
+
+def workers_of(pid: int, name: bytes = b"spawn_main") -> list[int]:
+    """Descendants with a name in their command line."""
+
+    def command(pid: int) -> bytes:
+        try:
+            return Path(f"/proc/{pid}/cmdline").read_bytes()
+        except OSError:
+            return b""
+
+    return [child for child in descendants(pid) if name in command(child)]
+
+
+def own_words(stderr: str) -> list[str]:
+    """What synth said; Warp remarks on a missing GPU by itself, and Python's semaphores on a killed parent."""
+    return [line for line in stderr.splitlines() if line.startswith("synth:") or "Traceback" in line or "Error" in line]

@@ -1,0 +1,290 @@
+"""Calibration recovers what a synthetic frame was made with, and what it writes is a scene that generates."""
+
+import json
+import os
+import tomllib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from render_scenes import small_sensor
+
+from synth.arrays import FloatArray
+from synth.calibrate.dots import find_dots
+from synth.calibrate.frames import Frames, read_frames
+from synth.calibrate.irradiance import FlatGel, LightGeometry
+from synth.calibrate.lattice import lattice_index, pattern_points
+from synth.calibrate.noise import fit_noise
+from synth.calibrate.sensor_fit import SensorFit, fit_sensor
+from synth.calibrate.toml_text import toml_text
+from synth.cli import main
+from synth.errors import InputError
+from synth.optics import Optics
+from synth.produce import flat_surface
+from synth.render.camera_image import camera_image
+from synth.render.pattern import albedo
+from synth.render.renderer import Renderer
+from synth.render.variant import choose_variant
+from synth.scene import Camera, Coating, Dots, Light, Render, Sensor
+from synth.template import load_scene
+
+FAST = choose_variant("cpu")
+needs_llvm = pytest.mark.skipif(not FAST.is_vectorised, reason="no LLVM of version 16 or newer here")
+CLIPS = Path(__file__).parents[3] / "shared/real/gelsight_mini/clips"
+POWERS = np.array([[420.0, 80, 30], [60, 390, 90], [45, 120, 510]])
+
+
+def _start(**coating: float) -> Sensor:
+    """Three white lights around a dotted pad of 12 x 9 mm at 160 x 120 px."""
+    places = [(7.0, 0.5, 3.0), (-4.0, 5.6, 4.0), (-3.5, -5.6, 2.5)]
+    lights = tuple(Light(position_mm=p, size_mm=(1.5, 0.6), color=(1, 1, 1), power=300) for p in places)
+    pattern = Dots(kind="dots", spacing_mm=(1.6, 1.6), radius_mm=0.33, offset_mm=(0.2, 0.1), reflectance=(0.06,) * 3)
+    view = {"width": 160, "height": 120, "fx": 265.0, "fy": 265.0, "cx": 80.0, "cy": 60.0, "gamma": 2.2}
+    sensor = small_sensor(1.41, pattern, lights, vignetting=0.2, **view)
+    return sensor.model_copy(update={"coating": Coating(**coating)}) if coating else sensor
+
+
+def _truth(start: Sensor) -> Sensor:
+    """The same sensor with other colours and powers, its lights some 0.5 mm off, and another grid, lens and noise."""
+    rng = np.random.default_rng(1)
+    lights = []
+    for light, power in zip(start.lights, POWERS, strict=True):
+        shift = 0.3 * rng.standard_normal(3)
+        place = {"position_mm": np.add(light.position_mm, shift), "aim_mm": np.add(light.aim_mm, shift)}
+        shine = {"power": float(power.max()), "color": tuple(power / power.max())}
+        lights.append(light.model_copy(update={key: tuple(value) for key, value in place.items()} | shine))
+    grid = {"spacing_mm": (1.55, 1.62), "rotation_deg": 2.0, "offset_mm": (0.33, -0.2), "radius_mm": 0.3}
+    pattern = start.pattern.model_copy(update=grid | {"reflectance": (0.1, 0.08, 0.05)})
+    lens = {"vignetting": 0.35, "blur_px": 0.8, "distortion": (0.04, 0.0, 0.0, 0.0, 0.0)}
+    camera = start.camera.model_copy(update=lens | {"read_noise": 0.002, "shot_noise": 0.005})
+    return start.model_copy(update={"lights": tuple(lights), "pattern": pattern, "camera": camera})
+
+
+def _frame(sensor: Sensor) -> FloatArray:
+    """The undeformed gel's picture as an 8-bit camera gives it, in [0, 1]."""
+    surface = flat_surface(sensor.gel.size_mm)
+    texture = albedo(sensor, np.random.default_rng(0))
+    radiance = Renderer(sensor, Render(samples_per_pixel=144, max_depth=2), surface, texture, FAST).radiance(
+        surface.material, 1
+    )
+    return camera_image(radiance, sensor.camera, np.random.default_rng(5)) / 255
+
+
+def _frames(image: FloatArray) -> Frames:
+    return Frames(image, image, 1, 1 / 255)
+
+
+@pytest.fixture(scope="module")
+def recovered() -> tuple[Sensor, SensorFit]:
+    truth = _truth(_start())
+    return truth, fit_sensor(_start(), _frames(_frame(truth)), FAST, None, 20)
+
+
+@needs_llvm
+def test_colours_and_powers_of_displaced_lights_are_recovered(recovered: tuple[Sensor, SensorFit]) -> None:
+    """Measured: powers within 2.1 %, colours within 0.1 %; the issue asks for 5 %. Fails without the steps (24 %)."""
+    _, fit = recovered
+    assert fit.lights.powers == pytest.approx(POWERS, rel=0.05)
+    colour = POWERS / POWERS.max(axis=1, keepdims=True)
+    assert np.array([light.color for light in fit.sensor.lights]) == pytest.approx(colour, rel=0.01)
+
+
+@needs_llvm
+def test_lights_are_found_where_they_are(recovered: tuple[Sensor, SensorFit]) -> None:
+    """They start 0.2 to 0.8 mm away; measured: within 0.05 mm. Fails with the derivative of the centre's z negated."""
+    truth, fit = recovered
+    assert fit.lights.geometry.centre == pytest.approx(
+        np.array([light.position_mm for light in truth.lights]), abs=0.15
+    )
+
+
+@needs_llvm
+def test_dots_are_predicted_within_a_tenth_of_a_pixel(recovered: tuple[Sensor, SensorFit]) -> None:
+    """Measured: 0.03 px at most. Fails without `rotation_deg` in the fit and without the plane beneath the dots."""
+    truth, fit = recovered
+    true = _all_dots(truth)
+    true = true[((true > 6) & (true < [154, 114])).all(axis=1)]
+    assert len(true) > 30
+    found = _all_dots(fit.sensor)
+    away = np.linalg.norm(true[:, None] - found[None], axis=2).min(axis=1)
+    assert away.max() < 0.1
+
+
+def _all_dots(sensor: Sensor) -> FloatArray:
+    index = np.stack(np.meshgrid(np.arange(-9, 10), np.arange(-9, 10)), axis=-1).reshape(-1, 2)
+    return Optics.of(sensor).project(pattern_points(sensor.pattern, index))
+
+
+@needs_llvm
+def test_dots_blur_vignetting_and_noise_are_recovered(recovered: tuple[Sensor, SensorFit]) -> None:
+    truth, fit = recovered
+    camera, pattern = fit.sensor.camera, fit.sensor.pattern
+    assert pattern.radius_mm == pytest.approx(0.3, rel=0.03)  # the texture's soft edge is at least a texel, 0.03 mm
+    assert pattern.reflectance == pytest.approx(truth.pattern.reflectance, abs=0.01)
+    assert camera.blur_px == pytest.approx(0.8, abs=0.1)
+    assert camera.vignetting == pytest.approx(0.35, abs=0.03)  # shares its shape with the lights' own fall-off
+    # Four standard errors of a variance from some 8000 pixels in 36 bands, and rendering noise on top of the camera's.
+    assert camera.read_noise == pytest.approx(0.002, rel=0.25)
+    assert camera.shot_noise == pytest.approx(0.005, rel=0.25)
+
+
+@needs_llvm
+def test_a_known_spacing_gives_the_focal_length() -> None:
+    truth = _truth(_start())
+    fit = fit_sensor(_start(), _frames(_frame(truth)), FAST, 1.55 * 1.1, 0)
+    # The same dots 10 % farther apart are seen by a lens that is 10 % shorter.
+    assert fit.sensor.camera.fx == pytest.approx(265 / 1.1, rel=2e-3)
+    assert fit.sensor.pattern.spacing_mm == pytest.approx((1.55 * 1.1, 1.62 * 1.1), rel=2e-3)
+
+
+@needs_llvm
+@pytest.mark.parametrize("coating", [{}, {"roughness": 0.5, "metallic": 0.6}], ids=["matt", "metallic"])
+def test_contributions_are_what_the_renderer_renders(coating: dict[str, float]) -> None:
+    """They share Mitsuba's BSDF and the rays, not the integral. Fails without (1 - F) / n², the cosine or the shade."""
+    sensor = _start(**coating)
+    light = sensor.lights[1].model_copy(update={"power": 200.0, "size_mm": (3.0, 0.5)})
+    dark = light.model_copy(update={"position_mm": (-3.0, 4.8, 2.2), "size_mm": (3.0, 0.6), "power": 1e-9})
+    sensor = sensor.model_copy(update={"lights": (light, dark)})  # the second shades a part of what the first lights
+    surface = flat_surface(sensor.gel.size_mm)
+    plain = np.full((4, 4, 3), 0.6, dtype=np.float32)
+    render = Render(samples_per_pixel=256, max_depth=2)
+    image = Renderer(sensor, render, surface, plain, FAST).radiance(surface.material, 0)
+    columns, rows = (axis.ravel() for axis in np.meshgrid(np.arange(2, 160, 8), np.arange(2, 120, 8)))
+    gel = FlatGel(sensor, np.column_stack([columns, rows]) + 0.5, FAST)
+    lit = 200 * gel.contributions(_geometry(sensor))[0]
+    # Half of 256 samples, stratified, leave some 1 % at a pixel and 0.1 % in the mean over 300 pixels. The shade, 20 %
+    # of the light, has an edge that the light's 24 cells resolve in steps of 4 %: below 1 % of the mean remains.
+    assert lit.mean(axis=0) == pytest.approx(image[rows, columns].mean(axis=0), rel=0.012)
+    assert np.median(np.abs(lit / image[rows, columns] - 1)) < 0.02
+
+
+@needs_llvm
+def test_derivatives_agree_with_finite_differences() -> None:
+    """Fails with MIRROR's sign dropped from the y components."""
+    sensor = _start()
+    columns, rows = (axis.ravel() for axis in np.meshgrid(np.arange(2, 160, 16), np.arange(2, 120, 16)))
+    gel, geometry = FlatGel(sensor, np.column_stack([columns, rows]) + 0.5, FAST), _geometry(sensor)
+    exact = gel.derivatives(geometry)
+    step = 0.02
+    for number in range(8):
+        name, axis = [("centre", number), ("direction", number - 3), ("size", number - 6)][(number > 2) + (number > 5)]
+        lit = []
+        for sign in (1, -1):
+            moved = getattr(geometry, name).copy()
+            moved[:, axis] += sign * step
+            lit.append(gel.contributions(LightGeometry(**{**vars(geometry), name: moved})))
+        difference = (lit[0] - lit[1]) / (2 * step)
+        # Central differences err by step² / 6 times a third derivative of order E / (3 mm)³: 2e-5; float32 less.
+        assert exact[:, number] == pytest.approx(difference, abs=3e-3 * np.abs(exact).max())
+
+
+def _geometry(sensor: Sensor) -> LightGeometry:
+    centre = np.array([light.position_mm for light in sensor.lights])
+    aim, size = ([getattr(light, name) for light in sensor.lights] for name in ("aim_mm", "size_mm"))
+    return LightGeometry(centre, np.array(aim) - centre, np.array(size))
+
+
+@needs_llvm
+def test_the_command_writes_a_scene_that_loads_and_generates(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    preset = tmp_path / "preset.toml"
+    preset.write_text(toml_text(_preset()))
+    frame, other = tmp_path / "frame.png", tmp_path / "other.png"
+    for path in (frame, other):
+        cv2.imwrite(str(path), np.round(255 * _frame(_truth(_start())))[:, :, ::-1])
+    out = tmp_path / "mine"
+    command = ["calibrate", "--scene", str(preset), "--frames", str(frame), "--judge", str(other), "--out", str(out)]
+    assert main([*command, "--steps", "6", "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record == json.loads((out / "calibration.json").read_text())
+    assert set(record["differences"]) == {"frames", "not fitted: other.png"}
+    for difference in record["differences"].values():
+        # The fit itself leaves below 0.5; rounding to 8 bits and the camera's noise of 1 level, 0.8 on average.
+        assert max(difference["mean_absolute_outside_dots"]) < 2
+    assert cv2.imread(str(out / "calibration.png")) is not None
+    fitted = load_scene(out / "scene.toml")
+    assert fitted.corners[0].contact.indenter.radius_mm == 2.0  # what no frame tells keeps its distribution
+    assert fitted.content["contact"]["indenter"]["radius_mm"] == {"uniform": [2.0, 3.0]}
+    small = ["--set", "sensor.camera.width=40", "--set", "sensor.camera.height=30"]
+    assert (
+        main(["generate", "--scene", str(out / "scene.toml"), "--n", "1", "--out", str(tmp_path / "data"), *small]) == 0
+    )
+
+
+def _preset() -> dict:
+    return {
+        "name": "preset",
+        "sensor": _start().model_dump(mode="json", exclude={"further_cameras", "mirrors"}),
+        "contact": {"indenter": {"shape": "sphere", "radius_mm": {"uniform": [2.0, 3.0]}}},
+        "motion": {"depth_mm": 0.2, "steps": 1},
+        "render": {"samples_per_pixel": 36, "max_depth": 2},
+        "numerics": {"element": "p1p1", "edge_length_mm": 1.5},
+        "sampling": {"pairs_per_trajectory": 1},
+    }
+
+
+def test_toml_text_reads_back_as_it_was() -> None:
+    content = _preset() | {"description": 'a "quoted" name: größe\n', "flags": {"on": True, "off": False}}
+    content["odd key"] = {"choice": [{"a": 1.0, "b": [1e-7, 1e22]}, {"a": -0.5}]}
+    assert tomllib.loads(toml_text(content, "first\nsecond")) == content
+
+
+def test_frames_that_do_not_belong_together_are_refused(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    for name, image in [
+        ("a", rng.integers(0, 99, (30, 40, 3))),
+        ("b", rng.integers(100, 255, (30, 40, 3))),
+        ("c", np.zeros((20, 40, 3))),
+    ]:
+        cv2.imwrite(str(tmp_path / f"{name}.png"), image.astype(np.uint8))
+    (tmp_path / "text.png").write_text("no image")
+    for names, message in [
+        (["a", "b"], r"b\.png: differs from .*a\.png by .* of 255"),
+        (["a", "c"], r"c\.png: has 40 x 20 pixels"),
+        (["text"], r"text\.png: is no image"),
+        (["missing"], r"missing\.png: there is no such file"),
+        ([], "no frames"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            read_frames([tmp_path / f"{name}.png" for name in names])
+
+
+def test_a_frame_without_dots_and_dots_without_a_grid_are_refused() -> None:
+    with pytest.raises(InputError, match="0 whole dark dots"):
+        find_dots(np.full((120, 160, 3), 0.3), 15.0)
+    with pytest.raises(InputError, match="grid"):
+        lattice_index(np.random.default_rng(0).uniform(0, 100, (12, 2)))
+
+
+def test_a_preset_that_calibration_does_not_know_is_refused(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "frame.png"), np.zeros((24, 32, 3), dtype=np.uint8))
+    command = ["calibrate", "--frames", str(tmp_path / "frame.png"), "--out", str(tmp_path / "out"), "--scene"]
+    assert main([*command, "deltact"]) == 2
+    assert main([*command, "gelslim"]) == 2
+
+
+def test_noise_is_measured_through_the_response() -> None:
+    """Fails without the slope of the response."""
+    camera = Camera(width=320, height=240, fx=1, fy=1, cx=0, cy=0, position_mm=(0, 0, 1), gamma=2.2, read_noise=0.002,
+                    shot_noise=0.012)  # fmt: skip
+    ramp = np.linspace(0.02, 0.6, 320, dtype=np.float32)[None, :, None] * np.ones((240, 1, 3), dtype=np.float32)
+    image = camera_image(ramp, camera, np.random.default_rng(0)) / 255
+    read, shot = fit_noise(image, np.ones((240, 320), dtype=bool), 2.2, 1 / 255)
+    # Each of 36 bands of 6000 pixels knows its variance within 4 % (median, kernel's correlations): 1 % for the slope.
+    assert shot == pytest.approx(0.012, rel=0.05)
+    assert read == pytest.approx(0.002, rel=0.25)  # a few per cent of the variance in all but the darkest bands
+
+
+@needs_llvm
+@pytest.mark.skipif(not CLIPS.is_dir(), reason="the real recordings are not here")
+def test_a_real_frame_that_was_not_fitted_is_met_within_8_levels(tmp_path: Path) -> None:
+    """Undeformed gels after the object was lost; measured 3.9, 2.0 and 5.0 of 255."""
+    for name, number in [("screw_driver_red__exp_num_2__camera_0", 344), ("avocado_real__exp_num_7__camera_0", 408)]:
+        clip = cv2.VideoCapture(os.fspath(CLIPS / f"{name}.avi"))
+        for _ in range(number + 1):
+            image = clip.read()[1]
+        cv2.imwrite(str(tmp_path / f"{number}.png"), image)
+    frames = ["--frames", str(tmp_path / "344.png"), "--judge", str(tmp_path / "408.png")]
+    assert main(["calibrate", *frames, "--steps", "6", "--out", str(tmp_path / "out")]) == 0
+    differences = json.loads((tmp_path / "out/calibration.json").read_text())["differences"]
+    assert max(differences["not fitted: 408.png"]["mean_absolute_outside_dots"]) < 8

@@ -1,0 +1,153 @@
+"""Datasets under fsspec URLs: the same objects as the files of a directory, in one go or after any stop."""
+
+import json
+import os
+import time
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from samples import job, translation_sample
+from tiny_scene import fingerprint, own_cache, reference, write_tiny
+
+from synth.dataset.lease import EXPIRES_S
+from synth.dataset.shard import Shard
+from synth.dataset.url_store import UrlStore
+from synth.dataset.url_writer import UrlWriter, put_sample
+from synth.errors import InputError
+from synth.generate import Scheduling, generate
+from synth.template import load_scene
+
+
+@pytest.fixture(autouse=True)
+def _cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One mesh for all runs: the mesher is random."""
+    own_cache(monkeypatch)
+
+
+@pytest.fixture
+def url() -> Iterator[str]:
+    """An empty place in this process's memory."""
+    import fsspec
+
+    place = f"memory://{uuid.uuid4().hex}/data"
+    yield place
+    fsspec.filesystem("memory").rm(place.removeprefix("memory:/").rpartition("/")[0], recursive=True)
+
+
+def _download(url: str, folder: Path) -> Path:
+    import fsspec
+
+    system, root = fsspec.core.url_to_fs(url)
+    for path in system.find(root):
+        target = folder / path.removeprefix(root).lstrip("/")
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(system.cat_file(path))
+    return folder
+
+
+def test_the_same_as_in_a_directory_in_shards_and_steps(url: str, tmp_path: Path) -> None:
+    """Fails with `_fetch_lines` left out: what is there is made again, and `found` is 0."""
+    template = load_scene(write_tiny(tmp_path))
+    assert generate(template, 1, url).made == 1
+    shard = generate(template, 5, url, scheduling=Scheduling(shard=Shard(0, 2)))
+    assert (shard.asked_for, shard.found, shard.made) == (3, 1, 2)  # trajectories 0 and 2: samples 0 1 4
+    rest = generate(template, 5, url)
+    assert (rest.found, rest.made) == (3, 2)
+    copy = _download(url, tmp_path / "copy")
+    assert fingerprint(copy) == fingerprint(reference())
+    assert json.loads((copy / "summary.json").read_text())["samples"] == 5
+
+
+def test_a_file_url_is_a_directory(tmp_path: Path) -> None:
+    template = load_scene(write_tiny(tmp_path), ["motion.depth_mm=-1"])
+    summary = generate(template, 1, f"file://{tmp_path}/with%20space")
+    assert summary.directory == tmp_path / "with space"
+    assert (tmp_path / "with space" / ".lock").exists()
+
+
+def _stop(writer: UrlWriter) -> None:
+    """What is left of a killed run: nothing finalised. Its lease is this process's, which lives; so remove it."""
+    writer.close()
+
+
+def test_a_stopped_run_leaves_a_journal_that_the_next_one_reads(url: str) -> None:
+    writer = UrlWriter(url, job(3))
+    writer.record(put_sample(url, translation_sample(2), job()))
+    writer.fail(1, 0, "simulate", "Newton failed")
+    put_sample(url, translation_sample(0), job())  # without its line: does not count
+    _stop(writer)
+    store = UrlStore(url)
+    assert store.names("journal") == ["000001-0.json", "000002.json"]
+    assert store.read("manifest.jsonl") is None
+    with UrlWriter(url, job(3)) as again:
+        assert again.finished == {2}
+        again.fail(1, 0, "simulate", "Newton failed")  # known
+        for index in (1, 0):
+            again.record(put_sample(url, translation_sample(index), job()))
+    assert store.names("journal") == []
+    manifest = (store.read("manifest.jsonl") or b"").splitlines()
+    assert [json.loads(line)["index"] for line in manifest] == [0, 1, 2]
+    assert len((store.read("failures.jsonl") or b"").splitlines()) == 1
+
+
+def test_who_is_refused(url: str) -> None:
+    """Fails with the lease's check left out."""
+    with UrlWriter(url, job()):
+        with pytest.raises(InputError, match=rf"another process \(pid {os.getpid()} on .*\) is writing"):
+            UrlWriter(url, job())
+        with pytest.raises(InputError, match="another process"):
+            UrlWriter(url, job(), Shard(0, 2))
+    with UrlWriter(url, job(), Shard(0, 2)), UrlWriter(url, job(), Shard(1, 2)):
+        with pytest.raises(InputError, match="another process"):
+            UrlWriter(url, job(), Shard(1, 2))
+        with pytest.raises(InputError, match="another process"):
+            UrlWriter(url, job())
+    with pytest.raises(InputError, match="seed: 7 there, 8 now"):
+        UrlWriter(url, job(seed=8))
+    UrlStore(url).delete(["dataset.json"])
+    with pytest.raises(InputError, match=r"holds .* but no dataset"):
+        UrlWriter(url, job())
+
+
+@pytest.mark.parametrize(
+    "note",
+    [
+        {"pid": 1, "host": "elsewhere", "time": time.time() - EXPIRES_S - 1},  # not renewed
+        {"pid": 2**22 + 1, "host": os.uname().nodename, "time": time.time()},  # beyond Linux's largest number
+    ],
+    ids=["expired", "dead"],
+)
+def test_a_killed_run_holds_nothing_for_long(url: str, note: dict[str, object]) -> None:
+    UrlWriter(url, job()).close()
+    UrlStore(url).write("leases/whole.json", json.dumps(note).encode())
+    UrlWriter(url, job()).close()
+
+
+def test_storage_that_refuses_ends_with_one_message_and_goes_on(
+    url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from fsspec.implementations.memory import MemoryFileSystem
+
+    template = load_scene(write_tiny(tmp_path))
+    generate(template, 2, url)
+
+    def refuse(*_: object, **__: object) -> None:
+        raise RuntimeError("403 Forbidden")  # a driver's own error, no OSError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(MemoryFileSystem, "put_file", refuse)
+        with pytest.raises(InputError, match=r"samples/000002: the storage refuses: RuntimeError: 403 Forbidden"):
+            generate(template, 5, url)
+    assert generate(template, 5, url).found == 2
+    assert fingerprint(_download(url, tmp_path / "copy")) == fingerprint(reference())
+
+
+@pytest.mark.parametrize(
+    ("out", "message"),
+    [("nowhere://bucket/x", "Protocol not known"), ("memory://x", "is seen by one process only")],
+)
+def test_places_that_cannot_be(tmp_path: Path, out: str, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        generate(load_scene(write_tiny(tmp_path)), 1, out, scheduling=Scheduling(workers=2))
