@@ -1,0 +1,184 @@
+"""Presses per second of the batched simulation, and what a cycle's time goes into.
+
+    python -m synth.bench.batched --batch 512 --seconds 60
+
+prints one JSON line. A press is a ball of 2 to 6 mm radius at a random place of a 20 x 15 x 4 mm pad, pressed to half
+its thickness with friction, every step converged as in `synth generate`, and one state recorded and corrected. Bodies
+that begin and end are counted as they do in production: slots are refilled, and the rate is counted from when as many
+have ended as there are slots. Results travel to the host within that time.
+"""
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Sequence
+from itertools import cycle
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from synth.mesh import Counts, Focus, PadMesh, graded_box
+from synth.scene import Scene
+from synth.simulate.batched.machine import INNER
+from synth.simulate.batched.many import jobs_of
+from synth.simulate.batched.pad import Pad, prepare
+from synth.simulate.batched.run import Run
+from synth.simulate.driver import STANDARD
+from synth.simulate.linear import GMRES_TOLERANCE
+
+SIZE_MM = (20.0, 15.0, 4.0)
+PLACES_MM = (6.0, 4.0)
+"""Half width of the rectangle that the balls' centres are drawn from."""
+PROFILED_CYCLES = 20
+DRAWS = 2048
+"""Different presses; they are gone through again and again, so that drawing them takes no part of the time."""
+
+
+def ball_scene(rng: np.random.Generator, depth_mm: float, drag_mm: float, steps: int) -> Scene:
+    """A ball at a random place, with friction, that is dragged by drag_mm in a random direction once it is down."""
+    angle = rng.uniform(0, 2 * np.pi)
+    light = {"position_mm": [0, 0, 0.1], "size_mm": [1, 1], "color": [1, 1, 1], "power": 1}
+    camera = {"width": 16, "height": 16, "fx": 9, "fy": 9, "cx": 8, "cy": 8, "position_mm": [0, 0, 90]}
+    return Scene.model_validate(
+        {
+            "name": "bench",
+            "sensor": {
+                "gel": {"size_mm": SIZE_MM, "youngs_modulus_kpa": 200.0, "poisson_ratio": 0.4999},
+                "pattern": {"kind": "none"},
+                "lights": [light],
+                "camera": camera,
+            },
+            "contact": {
+                "indenter": {"shape": "sphere", "radius_mm": float(rng.uniform(2, 6))},
+                "friction": float(rng.uniform(0.3, 1.0)),
+            },
+            "motion": {
+                "depth_mm": depth_mm,
+                "shear_mm": [float(drag_mm * np.cos(angle)), float(drag_mm * np.sin(angle))],
+                "position_mm": [float(rng.uniform(-half, half)) for half in PLACES_MM],
+                "steps": steps,
+            },
+        }
+    )
+
+
+def shared_mesh(across: Sequence[int], through: int, growth: float) -> PadMesh:
+    """Even along x and y with `across` elements, `growth` per element through the thickness."""
+    counts = Counts((across[0] - 2, across[1] - 2), (1, 1), through, growth=growth)
+    return graded_box(SIZE_MM, Focus((0.0, 0.0), (SIZE_MM[0] / 2, SIZE_MM[1] / 2)), counts)
+
+
+def measure(
+    pad: Pad,
+    batch: int,
+    seconds: float,
+    depth_mm: float = 2.0,
+    drag_mm: float = 0.0,
+    steps: int = 1,
+    forcing: float = GMRES_TOLERANCE,
+    inner: int = INNER,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """The rate on one pad; see the module's docstring.
+
+    Args:
+        pad: of SIZE_MM, on the device that is measured.
+        batch: number of slots.
+        seconds: after which no more results are waited for.
+        depth_mm: of the press.
+        drag_mm: sideways after it.
+        steps: states that are recorded.
+        forcing: relative residual that ends a linear solve.
+        inner: Krylov iterations of a cycle.
+        seed: of the draws.
+    """
+    rng = np.random.default_rng(seed)
+    draws = [ball_scene(rng, depth_mm, drag_mm, steps) for _ in range(max(DRAWS, batch))]
+    began = time.perf_counter()
+    order = cycle(range(len(draws)))
+    run = Run(jobs_of(draws, pad), pad, draws[0].numerics, STANDARD, None, batch, order, forcing, inner)
+    for _ in range(2):  # with all slots empty: compiles the kernels and captures the graph
+        run.advance()
+    loaded = time.perf_counter() - began
+    began = time.perf_counter()
+    ends, complete, iterations = [], 0, 0
+    for _, result in run:
+        ends.append(time.perf_counter() - began)
+        complete += result.status == "complete"
+        iterations += sum(state.newton_iterations for state in result.states)
+        if ends[-1] > seconds:
+            break
+    found: dict[str, Any] = {
+        "processor": wp.get_device(pad.device).name,
+        "batch": batch,
+        "unknowns": len(pad.free),
+        "elements": len(pad.mesh.tets),
+        "presses": len(ends),
+        "complete": complete,
+        "seconds": round(ends[-1], 3),
+        "presses_per_s": round(_steady(ends, batch), 2),
+        "newton_per_press": round(iterations / len(ends), 2),
+        "ms_per_cycle": round(1e3 * ends[-1] / run.cycles, 3),
+        "cycles": run.cycles,
+        "load_s": round(loaded, 2),
+    }
+    found["profile"] = _profile(run, pad.device)
+    return found
+
+
+def _steady(ends: Sequence[float], batch: int) -> float:
+    """Rate from the end of the first batch's median press on; of everything where the run was too short for that."""
+    first = min(batch, len(ends) // 2)
+    return (len(ends) - first) / (ends[-1] - ends[first - 1]) if first else len(ends) / ends[-1]
+
+
+def _profile(run: Run, device: str) -> dict[str, float]:
+    """Shares of the parts of a cycle, each waited for; and ms of such a cycle, which is slower than others."""
+    spent: dict[str, float] = {}
+    wp.synchronize_device(device)
+    last = [time.perf_counter()]
+
+    def watch(part: str) -> None:
+        wp.synchronize_device(device)
+        now = time.perf_counter()
+        spent[part] = spent.get(part, 0.0) + now - last[0]
+        last[0] = now
+
+    run.machine.watch = watch
+    for _ in range(PROFILED_CYCLES):
+        run.machine.cycle(run.table)
+    whole = sum(spent.values())
+    shares = {part: round(value / whole, 4) for part, value in sorted(spent.items(), key=lambda item: -item[1])}
+    return {**shares, "ms_per_watched_cycle": round(1e3 * whole / PROFILED_CYCLES, 3)}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure and print a JSON line per batch size."""
+    parser = argparse.ArgumentParser(description="presses/s of the batched simulation")
+    parser.add_argument("--device", default="cuda")
+    parser.add_argument("--batch", type=int, nargs="+", default=[512])
+    parser.add_argument("--seconds", type=float, default=60.0, help="of each batch size")
+    parser.add_argument("--across", type=int, nargs=2, default=[14, 10], help="elements along x and y")
+    parser.add_argument("--through", type=int, default=3)
+    parser.add_argument("--growth", type=float, default=1.3)
+    parser.add_argument("--depth", type=float, default=2.0, help="mm")
+    parser.add_argument("--drag", type=float, default=0.0, help="mm")
+    parser.add_argument("--steps", type=int, default=1, help="recorded states")
+    parser.add_argument("--forcing", type=float, default=GMRES_TOLERANCE, help="relative residual of linear solves")
+    parser.add_argument("--inner", type=int, default=INNER, help="Krylov iterations of a cycle")
+    given = parser.parse_args(arguments)
+    mesh = shared_mesh(given.across, given.through, given.growth)
+    began = time.perf_counter()
+    pad = prepare(ball_scene(np.random.default_rng(0), given.depth, given.drag, given.steps), mesh, given.device)
+    prepared = round(time.perf_counter() - began, 2)
+    for batch in given.batch:
+        path = (given.depth, given.drag, given.steps)
+        found = measure(pad, batch, given.seconds, *path, given.forcing, given.inner)
+        print(json.dumps({**vars(given), **found, "prepare_s": prepared}), flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

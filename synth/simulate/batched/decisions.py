@@ -1,0 +1,252 @@
+"""What happens next to a slot, as Warp kernels of one thread a slot.
+
+The rules are those of `synth.simulate.newton` and `synth.simulate.stepping`, whose constants they use; what differs is
+that each slot follows them at its own pace.
+"""
+
+# Kernels are written in Warp's own language; their annotations only look like Python's.
+# mypy: disable-error-code="valid-type, no-untyped-def"
+
+import warp as wp
+
+from synth.simulate import newton, stepping
+from synth.simulate.batched.slots import (
+    ACCEPT,
+    ADVANCE,
+    BEGIN,
+    CARRY_READY,
+    COMPLETE,
+    ENDED,
+    FALL_BACK,
+    FIRST,
+    FRESH,
+    LOST,
+    NO_BALANCE,
+    NO_CONTACT,
+    NUDGED,
+    PASS,
+    PASSING,
+    READY,
+    RECORD,
+    REPAIR,
+    SEARCH,
+    SOLVED,
+    START,
+    STEP,
+    TAKE,
+    TOUCHED,
+    UNDO,
+    Jobs,
+    Settings,
+    Slots,
+)
+
+wp.set_module_options({"enable_backward": False, "fast_math": False})
+
+ZERO = wp.constant(wp.float64(0.0))
+ONE = wp.constant(wp.float64(1.0))
+NOTHING = wp.constant(wp.float64(newton.NOTHING))
+INDIFFERENT = wp.constant(wp.float64(newton.INDIFFERENT))
+SHORTEST = wp.constant(wp.float64(newton.SHORTEST))
+SHORTEST_STEP = wp.constant(wp.float64(stepping.SHORTEST_STEP))
+GROWTH = wp.constant(wp.float64(stepping.GROWTH))
+EASY = wp.constant(stepping.EASY)
+PASSES = wp.constant(stepping.PASSES)
+SMALLEST_SHARE = wp.constant(wp.float64(stepping.SMALLEST_SHARE))
+PENETRATION = wp.constant(wp.float64(stepping.PENETRATION))
+DECREASE = wp.constant(wp.float64(1.0e-4))
+LATE = wp.constant(5)
+HOPELESS = wp.constant(wp.float64(0.5))
+"""Newton's method ends after LATE iterations where the relative residual is still so large."""
+
+
+@wp.kernel
+def judge(slots: Slots, settings: Settings):
+    """After an evaluation: is the trial taken, and is it the solution?"""
+    s = wp.tid()
+    phase = slots.phase[s]
+    slots.move[s] = 0
+    norm = slots.trial_norm[s]
+    relative = norm / wp.max(slots.trial_force[s], NOTHING)
+    valid = slots.trial_jacobian[s] > ZERO
+    if phase == FRESH:
+        slots.phase[s] = FIRST
+        return
+    if phase == NUDGED:
+        slots.norm[s] = norm
+        slots.phase[s] = CARRY_READY
+        return
+    if phase != START and phase != SEARCH and phase != REPAIR:
+        return
+    if phase == START and not valid:
+        if slots.predicted[s] == 1:
+            slots.predicted[s] = 0
+            slots.move[s] = FALL_BACK
+        else:
+            slots.phase[s] = LOST
+        return
+    if phase == SEARCH:
+        scale = slots.scale[s]
+        if not (valid and (norm <= slots.norm[s] * (ONE - DECREASE * scale) or scale < INDIFFERENT)):
+            slots.scale[s] = wp.float64(0.5) * scale
+            if slots.scale[s] < SHORTEST:
+                slots.phase[s] = LOST
+            return
+        slots.move[s] = TAKE
+        slots.iteration[s] = slots.iteration[s] + 1
+    slots.norm[s] = norm
+    slots.relative[s] = relative
+    slots.jacobian[s] = slots.trial_jacobian[s]
+    iteration = slots.iteration[s]
+    if phase == REPAIR:
+        slots.phase[s] = PASSING
+    elif relative <= slots.tolerance[s] and (iteration > 0 or relative == ZERO):
+        slots.phase[s] = SOLVED
+    elif (not wp.isfinite(relative)) or (iteration >= LATE and relative >= HOPELESS) or iteration == slots.limit[s]:
+        slots.phase[s] = LOST
+    else:
+        slots.phase[s] = READY
+
+
+@wp.kernel
+def conclude(slots: Slots, jobs: Jobs, settings: Settings):
+    """After Newton's method: accept, halve, or end the step; count the pass or undo it."""
+    s = wp.tid()
+    phase = slots.phase[s]
+    slots.move[s] = 0
+    if phase != SOLVED and phase != LOST:
+        return
+    slots.total[s] = slots.total[s] + slots.iteration[s]
+    if slots.stage[s] == PASS:
+        if phase == SOLVED:
+            slots.phase[s] = PASSING
+        else:
+            slots.share[s] = wp.float64(0.5) * slots.share[s]
+            slots.move[s] = UNDO
+            slots.phase[s] = REPAIR
+        return
+    if phase == LOST:
+        slots.step[s] = wp.float64(0.5) * (slots.target[s] - slots.at[s])
+        slots.has_previous[s] = 0
+        slots.phase[s] = BEGIN
+        if slots.step[s] < SHORTEST_STEP * settings.longest:
+            slots.reason[s] = NO_BALANCE
+            slots.phase[s] = ENDED
+        return
+    slots.eased[s] = slots.iteration[s]
+    slots.move[s] = ACCEPT
+    j = slots.job[s]
+    stop = slots.next[s]
+    slots.phase[s] = ADVANCE
+    if slots.target[s] == jobs.waypoints[j, stop] and jobs.kind_of[j, stop] > 0:
+        slots.phase[s] = TOUCHED
+
+
+@wp.kernel
+def bear(slots: Slots, jobs: Jobs, sums: wp.array2d(dtype=wp.float64)):
+    """At a recorded state: end where the press bears on nothing; else correct it where it is wanted."""
+    s = wp.tid()
+    slots.keep[s] = 0
+    if slots.phase[s] != TOUCHED:
+        return
+    j = slots.job[s]
+    slots.kept[s] = 0
+    if slots.target[s] == jobs.press[j] and jobs.over_pad[j] == 1 and sums[s, 2] <= NOTHING:
+        slots.reason[s] = NO_CONTACT
+        slots.phase[s] = ENDED
+        return
+    slots.phase[s] = RECORD
+    if jobs.kind_of[j, slots.next[s]] == 2:
+        slots.keep[s] = 1
+        slots.kept[s] = 1
+        slots.passes[s] = 0
+        slots.share[s] = ONE
+        slots.phase[s] = PASSING
+
+
+@wp.kernel
+def choose_pass(slots: Slots, jobs: Jobs, settings: Settings):
+    """Another pass, or the record."""
+    s = wp.tid()
+    slots.share_now[s] = ZERO
+    if slots.phase[s] != PASSING:
+        return
+    too_deep = slots.deepest[s] > PENETRATION * jobs.deepest[slots.job[s]]
+    if slots.passes[s] == PASSES or slots.share[s] < SMALLEST_SHARE or not too_deep:
+        slots.phase[s] = RECORD
+        return
+    slots.passes[s] = slots.passes[s] + 1
+    slots.share_now[s] = slots.share[s]
+    slots.stage[s] = PASS
+    slots.iteration[s] = 0
+    slots.limit[s] = settings.correction_limit
+    slots.tolerance[s] = settings.tolerance
+    slots.predicted[s] = 0
+    slots.phase[s] = START
+
+
+@wp.kernel
+def recorded(slots: Slots):
+    """After the record."""
+    s = wp.tid()
+    if slots.phase[s] == RECORD:
+        slots.records[s] = slots.records[s] + 1
+        slots.total[s] = 0
+        slots.phase[s] = ADVANCE
+
+
+@wp.func
+def _turns(jobs: Jobs, j: int, before: wp.float64, now: wp.float64) -> bool:
+    """`Path.turns_between`."""
+    turns = wp.int32(0)
+    for k in range(jobs.legs[j]):
+        if jobs.ends[j, k] > before and jobs.ends[j, k] <= now:
+            turns = wp.int32(1)
+    return turns == 1
+
+
+@wp.kernel
+def control(slots: Slots, jobs: Jobs, settings: Settings):
+    """After an accepted step its length and the next waypoint; then the next target and its first iterate's kind."""
+    s = wp.tid()
+    j = slots.job[s]
+    slots.move[s] = 0
+    phase = slots.phase[s]
+    if phase == ADVANCE:
+        target = slots.target[s]
+        taken = target - slots.at[s]
+        slots.previous[s] = slots.at[s]
+        slots.has_previous[s] = settings.extrapolate
+        slots.at[s] = target
+        if target == jobs.waypoints[j, slots.next[s]]:
+            slots.next[s] = slots.next[s] + 1
+        if slots.eased[s] <= EASY:
+            slots.step[s] = wp.min(settings.longest, GROWTH * wp.max(taken, slots.step[s] / GROWTH))
+        phase = BEGIN
+        if slots.next[s] == jobs.stops[j]:
+            slots.reason[s] = COMPLETE
+            phase = ENDED
+    elif phase == FIRST:
+        phase = BEGIN
+    if phase == BEGIN:
+        at = slots.at[s]
+        goal = jobs.waypoints[j, slots.next[s]]
+        parts = wp.ceil((goal - at) / slots.step[s] - wp.float64(1.0e-9))
+        slots.target[s] = goal
+        slots.tolerance[s] = settings.tolerance
+        if parts > ONE:
+            slots.target[s] = at + (goal - at) / parts
+            slots.tolerance[s] = wp.max(settings.loose, settings.tolerance)
+        slots.stage[s] = STEP
+        slots.iteration[s] = 0
+        slots.limit[s] = settings.limit
+        slots.ratio[s] = ZERO
+        slots.predicted[s] = 0
+        slots.move[s] = FALL_BACK
+        phase = START
+        if slots.has_previous[s] == 1 and not _turns(jobs, j, slots.previous[s], at):
+            slots.ratio[s] = (slots.target[s] - at) / (at - slots.previous[s])
+            slots.predicted[s] = 1
+        elif jobs.friction[j] > ZERO and at > ZERO:
+            phase = NUDGED
+    slots.phase[s] = phase

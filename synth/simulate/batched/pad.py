@@ -1,0 +1,56 @@
+"""What all trajectories of a batch share: the discrete pad and its preconditioner on a device."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from synth.mesh import PadMesh, check_mesh
+from synth.scene import Scene
+from synth.simulate.batched.reference import Reference, stiffness
+from synth.simulate.contact import Indenters
+from synth.simulate.indenter import RigidBody
+from synth.simulate.material import Material, pad_material
+from synth.simulate.path import Path
+from synth.simulate.solve import ELEMENTS
+from synth.simulate.space import Space, function_space
+from synth.simulate.system import System
+from synth.simulate.tables import pack_indenters
+
+AWAY_MM = 1e3
+"""Where an indenter touches nothing."""
+
+
+@dataclass(frozen=True)
+class Pad:
+    """See the module's docstring; free: (k,) numbers of the unknowns that are not held, displacements first."""
+
+    mesh: PadMesh
+    space: Space
+    material: Material
+    free: np.ndarray
+    reference: Reference
+    device: str
+
+
+def prepare(scene: Scene, mesh: PadMesh, device: str) -> Pad:
+    """The pad of a scene, for all scenes of the same mesh, materials and element.
+
+    The dense inverse costs 2 k³ flops on the host: 1 s for 5,000 unknowns and 15 s for 13,000 at 300 GFLOP/s.
+    """
+    check_mesh(mesh)
+    material = pad_material(scene.sensor.gel, mesh)
+    space = function_space(mesh, ELEMENTS[scene.numerics.element]())
+    system = System(space, material)
+    inverse = np.asarray(np.linalg.inv(stiffness(system, _away(scene))), dtype=np.float64)
+    return Pad(mesh, space, material, system.free, Reference(inverse, device), device)
+
+
+def _away(scene: Scene) -> Indenters:
+    """A ball that touches nothing."""
+    ball = RigidBody(0, np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]), np.eye(3), 1.0, np.zeros((1, 1, 1)), 1.0)
+    path = Path(scene.motion.model_copy(update={"depth_mm": -AWAY_MM}), ball)
+    packed = pack_indenters([path], [0.0], "cpu")
+    pose = path.pose(0.0)
+    packed.centre.assign(pose.centre[None])
+    packed.rotation.assign(pose.rotation[None])
+    return packed

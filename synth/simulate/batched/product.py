@@ -1,0 +1,253 @@
+r"""The tangent times a vector for a whole batch, without a matrix, in single precision.
+
+With G = Σ_b v_b ⊗ g_b the vector's gradient, δ = F^{-T} : G its dilation over J, and π its pressure, the blocks of
+`synth.simulate.bulk` give, at a quadrature point of weight w,
+
+.. math::  S = w [2W' G + (2W' - P J) F^{-T} G^T F^{-T} + ((P J + γ J²) δ + J π') F^{-T} + 4W'' η (F - F^{-T})]
+
+with η = (F - F^{-T}) : G and π' = Σ_c π_c (N_c (1 - γ/λ) + γ_c D); node a gets S g_a, pressure c gets
+w J δ (N_c (1 - γ/λ) + γ_c D) + Σ_d K_cd π_d. What depends on the state is evaluated once per Newton iteration, by the
+functions of `synth.simulate.bulk` in double precision, and stored; so is contact's 3 x 3 stiffness at touching points
+with friction's unsymmetric part, by `contact_stiffness` itself.
+
+Vectors are (rows, B): all displacements of a free node in three rows, then the pressures, and neighbouring threads work
+on neighbouring slots of the same element, so that every access to them is one piece of memory.
+"""
+
+# Kernels are written in Warp's own language; their annotations only look like Python's.
+# mypy: disable-error-code="valid-type, no-untyped-def"
+
+from functools import cache
+
+import warp as wp
+
+from synth.simulate.bulk import Bulk, _deformation_gradient, _dilation, _slopes
+
+wp.set_module_options({"enable_backward": False, "fast_math": False})
+
+RUNNING = wp.constant(1)
+"""State of a slot's linear solve in which it takes part in products."""
+STORED = 16
+"""Numbers stored per quadrature point: F^{-T} (9), w 2W', w (2W' - P J), w (P J + γ J²), w J (1 - γ/λ), w J γ_c D,
+w (1 - γ/λ)/λ, w γ_c D/λ."""
+STORED_YEOH = 26
+"""With a stiffening law also w 4W'' and F - F^{-T} (9)."""
+
+
+@wp.struct
+class Single:
+    """Tables of the elements in single precision, and where their nodes are in a vector.
+
+    Attributes:
+        row: (m, nn) first row of a node's displacement, -1 where it is held.
+        pressure_row: (m, 4).
+        gradient, pressure_shape, stabilisation: as in `synth.simulate.bulk.Bulk`.
+    """
+
+    row: wp.array2d(dtype=wp.int32)
+    pressure_row: wp.array2d(dtype=wp.int32)
+    gradient: wp.array3d(dtype=wp.vec3f)
+    pressure_shape: wp.array2d(dtype=wp.float32)
+    stabilisation: wp.array3d(dtype=wp.float32)
+
+
+@wp.kernel
+def store(
+    mask: wp.array(dtype=wp.int32),
+    u: wp.array2d(dtype=wp.vec3d),
+    p: wp.array2d(dtype=wp.float64),
+    bulk: Bulk,
+    stored: wp.array4d(dtype=wp.float32),
+):
+    """One thread per (element, slot): (m, nq, STORED, B)."""
+    e, s = wp.tid()
+    if mask[s] == 0:
+        return
+    one = wp.float64(1.0)
+    inverse = bulk.compliance[e]
+    for q in range(bulk.weight.shape[1]):
+        F = _deformation_gradient(bulk, u, s, e, q)
+        J = wp.determinant(F)
+        Fit = wp.transpose(wp.inverse(F))
+        w = bulk.weight[e, q]
+        dilation = _dilation(bulk, p, J, s, e, q)
+        slope = _slopes(bulk, F, J, e)
+        PJ = dilation[0] * J
+        for i in range(3):
+            for j in range(3):
+                stored[e, q, 3 * i + j, s] = wp.float32(Fit[i, j])
+        stored[e, q, 9, s] = wp.float32(w * slope[0])
+        stored[e, q, 10, s] = wp.float32(w * (slope[0] - PJ))
+        stored[e, q, 11, s] = wp.float32(w * (PJ + dilation[1] * J * J))
+        if bulk.mixed == 1:
+            softened = one - dilation[1] * inverse
+            drift = dilation[3] * dilation[2]
+            stored[e, q, 12, s] = wp.float32(w * J * softened)
+            stored[e, q, 13, s] = wp.float32(w * J * drift)
+            stored[e, q, 14, s] = wp.float32(w * softened * inverse)
+            stored[e, q, 15, s] = wp.float32(w * drift * inverse)
+        if stored.shape[2] > 16:
+            stored[e, q, 16, s] = wp.float32(w * slope[1])
+            for i in range(3):
+                for j in range(3):
+                    stored[e, q, 17 + 3 * i + j, s] = wp.float32(F[i, j] - Fit[i, j])
+
+
+@cache
+def bulk_product(nodes: int, mixed: bool, stabilised: bool, yeoh: bool) -> wp.Kernel:
+    """The kernel that adds the bulk's tangent times x to y; one thread per (element, slot).
+
+    Args:
+        nodes: displacement nodes of an element; known to the compiler, so that their values stay in registers.
+        mixed: whether there is a pressure field.
+        stabilised: whether it is stabilised.
+        yeoh: whether the material stiffens.
+    """
+    count = wp.constant(nodes)
+    nodal = wp.types.matrix(shape=(nodes, 3), dtype=wp.float32)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def product(
+        running: wp.array(dtype=wp.int32),
+        single: Single,
+        stored: wp.array4d(dtype=wp.float32),
+        x: wp.array2d(dtype=wp.float32),
+        y: wp.array2d(dtype=wp.float32),
+    ):
+        e, s = wp.tid()
+        if running[s] != RUNNING:
+            return
+        v = nodal()
+        r = nodal()
+        for a in range(count):
+            row = single.row[e, a]
+            if row >= 0:
+                v[a, 0] = x[row, s]
+                v[a, 1] = x[row + 1, s]
+                v[a, 2] = x[row + 2, s]
+        pressure = wp.vec4f()
+        rows = wp.vec4f()
+        total = wp.float32(0.0)
+        if wp.static(mixed):
+            for c in range(4):
+                pressure[c] = x[single.pressure_row[e, c], s]
+                total += pressure[c]
+        for q in range(single.gradient.shape[1]):
+            G = wp.mat33f()
+            for a in range(count):
+                G += wp.outer(wp.vec3f(v[a, 0], v[a, 1], v[a, 2]), single.gradient[e, q, a])
+            h = wp.mat33f(
+                stored[e, q, 0, s], stored[e, q, 1, s], stored[e, q, 2, s],
+                stored[e, q, 3, s], stored[e, q, 4, s], stored[e, q, 5, s],
+                stored[e, q, 6, s], stored[e, q, 7, s], stored[e, q, 8, s],
+            )  # fmt: skip
+            dilation = wp.ddot(h, G)
+            spherical = stored[e, q, 11, s] * dilation
+            if wp.static(mixed):
+                shape = wp.vec4f(
+                    single.pressure_shape[q, 0], single.pressure_shape[q, 1],
+                    single.pressure_shape[q, 2], single.pressure_shape[q, 3],
+                )  # fmt: skip
+                here = wp.dot(shape, pressure)
+                coupling = stored[e, q, 12, s]
+                drift = stored[e, q, 13, s]
+                soft = stored[e, q, 14, s]
+                bias = stored[e, q, 15, s]
+                spherical += coupling * here + drift * total
+                rows += (coupling * dilation - soft * here - bias * total) * shape
+                level = drift * dilation - bias * here
+                rows += wp.vec4f(level, level, level, level)
+            S = stored[e, q, 9, s] * G + stored[e, q, 10, s] * (h * wp.transpose(G) * h) + spherical * h
+            if wp.static(yeoh):
+                d = wp.mat33f(
+                    stored[e, q, 17, s], stored[e, q, 18, s], stored[e, q, 19, s],
+                    stored[e, q, 20, s], stored[e, q, 21, s], stored[e, q, 22, s],
+                    stored[e, q, 23, s], stored[e, q, 24, s], stored[e, q, 25, s],
+                )  # fmt: skip
+                S += (stored[e, q, 16, s] * wp.ddot(d, G)) * d
+            for a in range(count):
+                t = S * single.gradient[e, q, a]
+                r[a, 0] += t[0]
+                r[a, 1] += t[1]
+                r[a, 2] += t[2]
+        for a in range(count):
+            row = single.row[e, a]
+            if row >= 0:
+                wp.atomic_add(y, row, s, r[a, 0])
+                wp.atomic_add(y, row + 1, s, r[a, 1])
+                wp.atomic_add(y, row + 2, s, r[a, 2])
+        if wp.static(mixed):
+            for c in range(4):
+                if wp.static(stabilised):
+                    for d in range(4):
+                        rows[c] += single.stabilisation[e, c, d] * pressure[d]
+                wp.atomic_add(y, single.pressure_row[e, c], s, rows[c])
+
+    return product
+
+
+@wp.kernel
+def store_contact(
+    mask: wp.array(dtype=wp.int32),
+    touching: wp.array2d(dtype=wp.int32),
+    weight: wp.array2d(dtype=wp.float64),
+    symmetric: wp.array3d(dtype=wp.mat33d),
+    remainder: wp.array3d(dtype=wp.mat33d),
+    stored: wp.array3d(dtype=wp.mat33f),
+    touched: wp.array2d(dtype=wp.int32),
+):
+    """One thread per (slot, face): w times the whole of -∂t/∂x at its points, where it touches."""
+    s, f = wp.tid()
+    if mask[s] == 0:
+        return
+    touched[s, f] = touching[s, f]
+    if touching[s, f] == 0:
+        return
+    for q in range(weight.shape[1]):
+        stored[s, f, q] = wp.mat33f(weight[f, q] * (symmetric[s, f, q] + remainder[s, f, q]))
+
+
+@cache
+def contact_product(nodes: int) -> wp.Kernel:
+    """The kernel that adds contact's tangent times x to y; one thread per (slot, face of so many nodes)."""
+    count = wp.constant(nodes)
+    nodal = wp.types.matrix(shape=(nodes, 3), dtype=wp.float32)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def product(
+        running: wp.array(dtype=wp.int32),
+        touched: wp.array2d(dtype=wp.int32),
+        row: wp.array2d(dtype=wp.int32),
+        shape: wp.array2d(dtype=wp.float32),
+        stored: wp.array3d(dtype=wp.mat33f),
+        x: wp.array2d(dtype=wp.float32),
+        y: wp.array2d(dtype=wp.float32),
+    ):
+        s, f = wp.tid()
+        if running[s] != RUNNING or touched[s, f] == 0:
+            return
+        v = nodal()
+        r = nodal()
+        for a in range(count):
+            first = row[f, a]
+            if first >= 0:
+                v[a, 0] = x[first, s]
+                v[a, 1] = x[first + 1, s]
+                v[a, 2] = x[first + 2, s]
+        for q in range(shape.shape[0]):
+            here = wp.vec3f()
+            for a in range(count):
+                here += shape[q, a] * wp.vec3f(v[a, 0], v[a, 1], v[a, 2])
+            t = stored[s, f, q] * here
+            for a in range(count):
+                r[a, 0] += shape[q, a] * t[0]
+                r[a, 1] += shape[q, a] * t[1]
+                r[a, 2] += shape[q, a] * t[2]
+        for a in range(count):
+            first = row[f, a]
+            if first >= 0:
+                wp.atomic_add(y, first, s, r[a, 0])
+                wp.atomic_add(y, first + 1, s, r[a, 1])
+                wp.atomic_add(y, first + 2, s, r[a, 2])
+
+    return product

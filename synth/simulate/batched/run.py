@@ -1,0 +1,112 @@
+"""Many trajectories through the slots of one machine: what the host does."""
+
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from synth.scene import Numerics
+from synth.simulate.batched import slots as phases
+from synth.simulate.batched.jobs import Ended, Job, body_tables, job_tables, trajectory
+from synth.simulate.batched.machine import INNER, Machine
+from synth.simulate.batched.pad import Pad
+from synth.simulate.driver import Driver
+from synth.simulate.linear import GMRES_TOLERANCE
+from synth.simulate.newton import MAX_ITERATIONS
+from synth.simulate.trajectory import Trajectory
+
+LOOK = 2
+"""Cycles between looks at which slots have ended: a slot waits for half of them on average, some 1 % of its time."""
+
+
+class Run:
+    """An iterator over (number of the job, trajectory) in the order in which they end.
+
+    Args:
+        jobs: trajectories whose indenters touch.
+        pad: they run on.
+        numerics: of all of them.
+        driver: how Newton's method is led.
+        frames: numbers of the states that are corrected, default all.
+        batch: number of slots.
+        order: numbers of the jobs in which they begin, default each once.
+        forcing: relative residual that ends a linear solve. Four dragged balls took 77, 81 and 99 Newton iterations
+            each with 1e-3, 1e-2 and 5e-2, and 1632, 1293 and 1185 Krylov iterations; but a correction pass may take
+            only so many of the former.
+        inner: Krylov iterations of a cycle.
+    """
+
+    def __init__(
+        self,
+        jobs: Sequence[Job],
+        pad: Pad,
+        numerics: Numerics,
+        driver: Driver,
+        frames: frozenset[int] | None,
+        batch: int,
+        order: Iterable[int] | None = None,
+        forcing: float = GMRES_TOLERANCE,
+        inner: int = INNER,
+    ) -> None:
+        self._jobs, self._pad = jobs, pad
+        self.table = job_tables(jobs, pad.mesh.size_mm, frames, pad.device)
+        self._shapes, self._grids, grid = body_tables(jobs, pad.device)
+        settings = phases.Settings()
+        settings.tolerance, settings.loose = numerics.tolerance, driver.loose
+        settings.longest, settings.extrapolate = numerics.max_step_mm, int(driver.extrapolate)
+        settings.forcing = forcing
+        settings.limit, settings.correction_limit = MAX_ITERATIONS, driver.correction_iterations
+        records = max(len(job.path.records()) for job in jobs)
+        self.machine = Machine(pad, batch, records, grid, settings, numerics.penalty, inner)
+        self._order = range(len(jobs)) if order is None else order
+        self._graph: Any = None
+        self.cycles = 0
+
+    def __iter__(self) -> Iterator[tuple[int, Trajectory]]:
+        """Run all jobs."""
+        machine, batch = self.machine, self.machine.batch
+        working = np.full(batch, -1)
+        begun = np.zeros(batch)
+        waiting = iter(self._order)
+        empty = np.arange(batch)
+        while True:
+            assignment = np.full(batch, -1)
+            for slot in empty:
+                working[slot] = assignment[slot] = next(waiting, -2)
+            begun[empty] = time.perf_counter()
+            if len(empty):
+                machine.fill(assignment, self.table, self._shapes, self._grids)
+            if (working < 0).all():
+                return
+            for _ in range(LOOK):
+                self.advance()
+            empty = np.flatnonzero(machine.slots.phase.numpy() == phases.ENDED)
+            yield from self._collect(empty, working, begun)
+
+    def advance(self) -> None:
+        """One cycle; on CUDA a graph that is captured the second time, when all kernels are loaded."""
+        self.cycles += 1
+        device = wp.get_device(self._pad.device)
+        if not device.is_cuda or self.cycles == 1:
+            self.machine.cycle(self.table)
+            return
+        if self._graph is None:
+            with wp.ScopedCapture(device=device, force_module_load=False) as capture:
+                self.machine.cycle(self.table)
+            self._graph = capture.graph
+        wp.capture_launch(self._graph)
+
+    def _collect(self, slots: np.ndarray, working: np.ndarray, begun: np.ndarray) -> Iterator[tuple[int, Trajectory]]:
+        if not len(slots):
+            return
+        state = self.machine.slots
+        count, reason, at, target = (array.numpy() for array in (state.records, state.reason, state.at, state.target))
+        now = time.perf_counter()
+        for s in map(int, slots):
+            number = int(working[s])
+            ended = Ended(int(reason[s]), float(at[s]), float(target[s]))
+            records = self.machine.record_of(s, int(count[s]))
+            seconds = (now - begun[s]) / self.machine.batch
+            yield number, trajectory(self._jobs[number], records, ended, seconds, self._pad.space)

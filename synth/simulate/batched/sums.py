@@ -1,0 +1,203 @@
+"""Sums over a slot's nodes and faces, as Warp kernels: norms of the residual, forces, and what a record holds."""
+
+# Kernels are written in Warp's own language; their annotations only look like Python's.
+# mypy: disable-error-code="valid-type, no-untyped-def"
+
+import warp as wp
+
+from synth.simulate.batched.slots import Slots
+from synth.simulate.contact import Faces, Indenters, position
+
+wp.set_module_options({"enable_backward": False, "fast_math": False})
+
+CHUNK = wp.constant(32)
+"""Nodes, pressures or elements that one thread sums."""
+SLIPS = wp.constant(wp.float64(1.0 - 1.0e-6))
+"""Share of the friction limit from which a point counts as slipping, as in `System.slip_ratio`."""
+SCALARS = 12
+"""Numbers of a record before its fields: force (3), moment (3), touching and slipping area, then those of `write`."""
+
+
+@wp.kernel
+def partial_norms(
+    mask: wp.array(dtype=wp.int32),
+    force: wp.array2d(dtype=wp.vec3d),
+    volume: wp.array2d(dtype=wp.float64),
+    jacobian: wp.array2d(dtype=wp.float64),
+    node_row: wp.array(dtype=wp.int32),
+    partial: wp.array2d(dtype=wp.vec3d),
+):
+    """One thread per (slot, chunk): squares of the free residual and of all forces; the smallest det F.
+
+    Chunks of nodes come first, then chunks of pressures, then chunks of elements.
+    """
+    s, c = wp.tid()
+    if mask[s] == 0:
+        return
+    free = wp.float64(0.0)
+    whole = wp.float64(0.0)
+    smallest = wp.float64(1.0e30)
+    nodes = (force.shape[1] + CHUNK - 1) // CHUNK
+    pressures = (volume.shape[1] + CHUNK - 1) // CHUNK
+    if c < nodes:
+        for i in range(c * CHUNK, wp.min((c + 1) * CHUNK, force.shape[1])):
+            square = wp.length_sq(force[s, i])
+            whole += square
+            if node_row[i] >= 0:
+                free += square
+    elif c < nodes + pressures:
+        first = (c - nodes) * CHUNK
+        for i in range(first, wp.min(first + CHUNK, volume.shape[1])):
+            free += volume[s, i] * volume[s, i]
+    else:
+        first = (c - nodes - pressures) * CHUNK
+        for i in range(first, wp.min(first + CHUNK, jacobian.shape[1])):
+            smallest = wp.min(smallest, jacobian[s, i])
+    partial[s, c] = wp.vec3d(free, whole, smallest)
+
+
+@wp.kernel
+def norms(mask: wp.array(dtype=wp.int32), partial: wp.array2d(dtype=wp.vec3d), slots: Slots):
+    """One thread per slot: the trial's norms from the chunks'."""
+    s = wp.tid()
+    if mask[s] == 0:
+        return
+    free = wp.float64(0.0)
+    whole = wp.float64(0.0)
+    smallest = wp.float64(1.0e30)
+    for c in range(partial.shape[1]):
+        chunk = partial[s, c]
+        free += chunk[0]
+        whole += chunk[1]
+        smallest = wp.min(smallest, chunk[2])
+    slots.trial_norm[s] = wp.sqrt(free)
+    slots.trial_force[s] = wp.sqrt(whole)
+    slots.trial_jacobian[s] = smallest
+
+
+@wp.kernel
+def blank(mask: wp.array(dtype=wp.int32), slots: Slots, values: wp.array2d(dtype=wp.float64)):
+    """One thread per (slot, number): zeros for the sums, and no penetration."""
+    s, i = wp.tid()
+    if mask[s] == 0:
+        return
+    values[s, i] = wp.float64(0.0)
+    slots.deepest[s] = wp.float64(0.0)
+
+
+@wp.kernel
+def depths(mask: wp.array(dtype=wp.int32), gap: wp.array3d(dtype=wp.float64), slots: Slots):
+    """One thread per (slot, face): the largest penetration."""
+    s, f = wp.tid()
+    if mask[s] == 0:
+        return
+    deepest = wp.float64(0.0)
+    for q in range(gap.shape[2]):
+        deepest = wp.max(deepest, -gap[s, f, q])
+    if deepest > wp.float64(0.0):
+        wp.atomic_max(slots.deepest, s, deepest)
+
+
+@wp.kernel
+def forces(
+    mask: wp.array(dtype=wp.int32),
+    u: wp.array2d(dtype=wp.vec3d),
+    faces: Faces,
+    indenters: Indenters,
+    traction: wp.array3d(dtype=wp.vec3d),
+    tangential: wp.array3d(dtype=wp.vec3d),
+    sums: wp.array2d(dtype=wp.float64),
+):
+    """One thread per (slot, face): adds the indenter's force, moment about the origin, touching and slipping area."""
+    s, f = wp.tid()
+    if mask[s] == 0:
+        return
+    zero = wp.float64(0.0)
+    force = wp.vec3d()
+    moment = wp.vec3d()
+    touching = zero
+    slipping = zero
+    for q in range(traction.shape[2]):
+        t = traction[s, f, q]
+        square = wp.length_sq(t)
+        if square > zero:
+            w = faces.weight[f, q]
+            force += w * t
+            moment += w * wp.cross(position(faces, u, s, f, q), t)
+            along = wp.length(tangential[s, f, q])
+            pressure = wp.sqrt(wp.max(square - along * along, zero))
+            if pressure > zero:
+                touching += w
+                if along >= SLIPS * (indenters.friction[s] * pressure):
+                    slipping += w
+    if touching == zero:
+        return
+    for i in range(3):
+        wp.atomic_add(sums, s, i, force[i])
+        wp.atomic_add(sums, s, 3 + i, moment[i])
+    wp.atomic_add(sums, s, 6, touching)
+    wp.atomic_add(sums, s, 7, slipping)
+
+
+@wp.kernel
+def write(
+    mask: wp.array(dtype=wp.int32),
+    slots: Slots,
+    u: wp.array2d(dtype=wp.vec3d),
+    sums: wp.array2d(dtype=wp.float64),
+    surface: int,
+    records: wp.array3d(dtype=wp.float64),
+):
+    """One thread per (slot, node): a record's scalars and displacement, and zeros for its tractions.
+
+    records: (B, R, SCALARS + 3 n + 3 surface): force, moment, areas, residual, smallest det F, penetration and Newton
+    iterations, then the displacement of all nodes and the traction at the surface's nodes.
+    """
+    s, i = wp.tid()
+    if mask[s] == 0:
+        return
+    r = slots.records[s]
+    if i == 0:
+        for k in range(8):
+            records[s, r, k] = sums[s, k]
+        records[s, r, 8] = slots.relative[s]
+        records[s, r, 9] = slots.jacobian[s]
+        records[s, r, 10] = slots.deepest[s]
+        records[s, r, 11] = wp.float64(slots.total[s])
+    first = 12 + 3 * i
+    for k in range(3):
+        records[s, r, first + k] = u[s, i][k]
+    if i < surface:
+        first = 12 + 3 * u.shape[1] + 3 * i
+        for k in range(3):
+            records[s, r, first + k] = wp.float64(0.0)
+
+
+@wp.kernel
+def write_tractions(
+    mask: wp.array(dtype=wp.int32),
+    slots: Slots,
+    faces: Faces,
+    hat: wp.array2d(dtype=wp.float64),
+    number: wp.array2d(dtype=wp.int32),
+    area: wp.array(dtype=wp.float64),
+    traction: wp.array3d(dtype=wp.vec3d),
+    nodes: int,
+    records: wp.array3d(dtype=wp.float64),
+):
+    """One thread per (slot, face): adds its share to the tractions at the surface's nodes, see `System.forces`.
+
+    hat: (nq, ns); number: (f, ns) of a face's nodes in the surface, -1 on other faces; area: (s,) of the nodes' hats.
+    """
+    s, f = wp.tid()
+    if mask[s] == 0 or number[f, 0] < 0:
+        return
+    r = slots.records[s]
+    for a in range(number.shape[1]):
+        share = wp.vec3d()
+        for q in range(hat.shape[0]):
+            share += (faces.weight[f, q] * hat[q, a]) * traction[s, f, q]
+        node = number[f, a]
+        if wp.length_sq(share) > wp.float64(0.0):
+            for k in range(3):
+                wp.atomic_add(records, s, r, 12 + 3 * nodes + 3 * node + k, share[k] / area[node])
