@@ -102,8 +102,8 @@ def test_the_summary_adds_up(tiny: Path, tmp_path: Path) -> None:
     assert all("#" in reason and reason.startswith("draw: ") for reason in first.failures)
     lines = [json.loads(line) for line in (out / "manifest.jsonl").read_text().splitlines()]
     for stage, seconds in summary["seconds_per_stage"].items():
-        # Rounded to 0.0005 here.
-        assert seconds == pytest.approx(sum(line["seconds"][stage] for line in lines), abs=5e-4)
+        # Rounded to a thousandth there: up to 5e-4 off, and the rounding of a tie.
+        assert seconds == pytest.approx(sum(line["seconds"][stage] for line in lines), abs=5.1e-4)
     assert sum(summary["share_per_stage"].values()) == pytest.approx(1, abs=2e-4)  # four, each rounded to 0.00005
     assert summary["failed_draws"] == len((out / "failures.jsonl").read_text().splitlines())
 
