@@ -113,7 +113,9 @@ def simulate(
     return run_simulate(scene, out, seed, index, assignments or [], as_json)
 
 
-bench = App(name="bench", help="Measures how exact the simulation is, and at what cost. Without a command: fem.")
+bench = App(
+    name="bench", help="Measures how exact simulation and rendering are, and at what cost. Without a command: fem."
+)
 app.command(bench)
 
 
@@ -155,6 +157,31 @@ def budget(
     from synth.bench import run_budget
 
     return run_budget(scene or [], out, draws, seed, reference, workers, minutes, as_json)
+
+
+@bench.command
+def render(
+    *,
+    scene: SceneName = DEFAULT_SCENE,
+    out: Annotated[Path, Parameter(help="Directory for the tables, the plot and the report.")] = Path("data/bench"),
+    size: Annotated[
+        str | None,
+        Parameter(help="Image whose errors are measured, such as 160x120. Default: half the scene's. Flow: its own."),
+    ] = None,
+    reference: Annotated[
+        int, Parameter(converter=_whole(64), help="Samples per pixel of what images are held against.")
+    ] = 4096,
+    seeds: Annotated[
+        int, Parameter(converter=_whole(3), help="Seeds of each of the two states whose flow is measured.")
+    ] = 6,
+    device: Device = "auto",
+    seed: Annotated[int, Parameter(converter=_whole(0), help="Seed of the draw.")] = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Measures image error against rendering time, and the render noise that optical flow notices."""
+    from synth.bench import run_render
+
+    return run_render(scene, out, size, reference, seeds, seed, device, as_json)
 
 
 @bench.command

@@ -13,7 +13,7 @@ import numpy as np
 from synth.errors import InputError
 from synth.render.camera_rays import pinhole
 from synth.render.lights import check_view
-from synth.render.pattern import is_grey
+from synth.render.pattern import check_pattern, is_grey
 from synth.render.variant import Variant
 from synth.sampling import draw
 from synth.scene import Scene
@@ -100,13 +100,16 @@ def check_buildable(template: Template, variant: Variant) -> None:
 
     Raises:
         InputError: at a corner of the distributions, an indenter whose parts do not fit or whose file is no closed
-            surface, a light in the camera's view, or a lens that this variant cannot render.
+            surface, a light in the camera's view, a lens that this variant cannot render, or a pattern that no pixel
+            could show or whose file is no picture.
     """
     try:
         for sensor in dict.fromkeys(view for corner in template.corners for view in corner.sensor.views.values()):
             check_view(sensor)
             if not variant.is_vectorised:
                 pinhole(sensor)
+        for sensor in dict.fromkeys(corner.sensor for corner in template.corners):
+            check_pattern(sensor, template.source.parent)
         for indenter in dict.fromkeys(corner.contact.indenter for corner in template.corners):
             rigid_body(indenter, template.source.parent)
     except InputError as error:
@@ -206,6 +209,7 @@ def _decisions(corners: tuple[Scene, ...], variant: Variant) -> list[Decision]:
     mixed = max(poisson) >= DISPLACEMENT_ONLY_BELOW
     cameras = [view.camera for c in corners for view in c.sensor.views.values()]
     lens = any(any(camera.distortion) or camera.lens == "fisheye" for camera in cameras)
+    flat = all(c.sensor.gel.shape == "box" for c in corners)
     mirrors, further = len(corners[0].sensor.mirrors), len(corners[0].sensor.further_cameras)
     grey = all(is_grey(c.sensor) for c in corners)
     hue = "lights, coating and pattern are grey" if grey else "a light, the coating or the pattern has colour"
@@ -220,6 +224,7 @@ def _decisions(corners: tuple[Scene, ...], variant: Variant) -> list[Decision]:
         Decision("pressure field", mixed, _span("sensor.gel.poisson_ratio", poisson) + foam),
         Decision("window refraction", max(index) > 1, _span("sensor.window.refractive_index", index)),
         Decision("lens distortion", lens, "sensor.camera.distortion" + ("" if lens else " is zero: a pinhole")),
+        Decision("shared undeformed frame", flat, "sensor.gel.shape" + ("" if flat else ": domes have own meshes")),
         Decision("mirrors", mirrors > 0, f"{mirrors} in sensor.mirrors"),
         Decision("further cameras", further > 0, f"{further} in sensor.further_cameras"),
         Decision("indirect light", max(bounces) > 2, _span("render.max_depth", bounces)),

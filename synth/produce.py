@@ -20,6 +20,8 @@ from synth.dataset.sample import CameraPair, ManifestEntry, Sample
 from synth.errors import InputError
 from synth.flow.exact import exact_flow
 from synth.flow.field import FlowField
+from synth.mesh import flat_surface as flat_surface
+from synth.mesh import rest_surface
 from synth.optics import Optics
 from synth.render.camera_image import camera_image
 from synth.render.pattern import albedo
@@ -29,11 +31,13 @@ from synth.sampling import MAX_DRAWS, Pair, draw, draw_sensor, pairs_of, sensor_
 from synth.scene import Camera, Scene
 from synth.simulate import State, Trajectory, simulate
 from synth.simulate.resolution import Resolution, resolve
-from synth.surface import ContactFaces, GelSurface
+from synth.surface import GelSurface
 from synth.template import Template
 
 SUBDIVISIONS = {1: 4, 2: 3}
 """Parts of a contact face's edge in the rendered surface, by the element's order."""
+FINER_DOME = 2
+"""Factor on that for domes, which are curved away from the contact, too, where faces are large."""
 
 Task = tuple[int, tuple[int, ...]]
 """A trajectory and its samples that are wanted."""
@@ -101,7 +105,7 @@ class _Finger:
         sensor: its number.
         optics: of each camera.
         renderer: of all of them.
-        rest: radiance of the undeformed gel in each camera.
+        rest: radiance of the undeformed gel in each camera; empty for a dome, whose triangles are each trajectory's.
     """
 
     sensor: int
@@ -161,7 +165,8 @@ class Producer:
     def _samples(
         self, scene: Scene, resolution: Resolution, result: Trajectory, pairs: Sequence[Pair]
     ) -> list[ManifestEntry]:
-        surface = GelSurface(result.space.surface, SUBDIVISIONS[result.space.element.order])
+        parts = SUBDIVISIONS[result.space.element.order] * (FINER_DOME if scene.sensor.gel.dome_radius_mm else 1)
+        surface = GelSurface(result.space.surface, parts)
         frames: dict[int, _Frame] = {}
         entries = []
         for pair in pairs:
@@ -192,10 +197,12 @@ class Producer:
                 import drjit
 
                 drjit.set_thread_count(self._place.threads)
-            surface = flat_surface(scene.sensor.gel.size_mm)
-            texture = albedo(scene.sensor, stream(self._place.template, self._place.job.seed, "pattern", sensor))
+            surface = rest_surface(scene.sensor.gel)
+            template, seed = self._place.template, self._place.job.seed
+            texture = albedo(scene.sensor, stream(template, seed, "pattern", sensor), template.source.parent)
             renderer = Renderer(scene.sensor, scene.render, surface, texture, variant)
-            rest = renderer.radiances(surface.material, self._frame_seed("rest", sensor))
+            flat = scene.sensor.gel.dome_radius_mm is None
+            rest = renderer.radiances(surface.material, self._frame_seed("rest", sensor)) if flat else {}
             optics = {name: Optics.of(view) for name, view in scene.sensor.views.items()}
             self._finger = _Finger(sensor, optics, renderer, rest)
         return self._finger
@@ -206,7 +213,7 @@ class Producer:
     def _rendered(
         self, finger: _Finger, surface: GelSurface, result: Trajectory, trajectory: int, frame: int
     ) -> _Frame:
-        if frame == 0:
+        if frame == 0 and finger.rest:
             return _Frame(surface.material, finger.rest)
         positions = surface.positions(result.states[frame].displacement[result.space.surface_nodes])
         finger.renderer.take(surface)
@@ -263,13 +270,6 @@ class Producer:
         if self._place.variant.is_mono:
             return camera_image(radiance[:, :, :1], camera, rng)[:, :, 0]
         return camera_image(radiance, camera, rng)
-
-
-def flat_surface(size_mm: tuple[float, float, float]) -> GelSurface:
-    """The undeformed contact face as two triangles: its picture must not depend on which trajectory came first."""
-    x, y = size_mm[0] / 2, size_mm[1] / 2
-    nodes = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
-    return GelSurface(ContactFaces(nodes, np.array([[0, 2, 1], [0, 3, 2]], dtype=np.int32)), 1)
 
 
 def _flow(

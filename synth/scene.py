@@ -11,46 +11,15 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from synth.scene_camera import Camera, FurtherCamera, Mirror
+from synth.scene_gel import Gel as Gel
+from synth.scene_gel import Layer as Layer
 from synth.scene_indenters import Color, Fraction, Indenter, NonNegative, Part, Positive, Vector2, Vector3
-
-
-class Layer(Part):
-    """A layer of another material on the pad's contact side, such as a stiff coating film."""
-
-    thickness_mm: Annotated[float, Field(ge=0.02, le=20)]
-    youngs_modulus_kpa: Annotated[float, Field(ge=0.1, le=1e6)]
-    poisson_ratio: Annotated[float, Field(ge=0.3, le=0.5)] = 0.4999
-    stiffening: tuple[NonNegative, NonNegative] = (0.0, 0.0)
-    """As of the gel."""
-
-
-class Gel(Part):
-    """The soft pad: a box bonded to the window on its +z side."""
-
-    size_mm: tuple[
-        Annotated[float, Field(ge=1, le=200)],
-        Annotated[float, Field(ge=1, le=200)],
-        Annotated[float, Field(ge=0.2, le=50)],
-    ]
-    shape: Literal["box"] = "box"
-    youngs_modulus_kpa: Annotated[float, Field(ge=0.1, le=1e6)]
-    poisson_ratio: Annotated[float, Field(ge=0, le=0.5)] = 0.4999
-    """0.5 is exactly incompressible; below 0.3 no pressure field is needed."""
-    stiffening: tuple[NonNegative, NonNegative] = (0.0, 0.0)
-    """Yeoh's C20/C10 and C30/C10 (Rubber Chem. Technol. 66, 1993); zeros: neo-Hookean."""
-    layers: tuple[Layer, ...] = ()
-    """From the contact face inward, within size_mm; what is left of the thickness is the gel's own material."""
-
-    @model_validator(mode="after")
-    def _layered(self) -> "Gel":
-        covered = sum(layer.thickness_mm for layer in self.layers)
-        if covered >= self.size_mm[2]:
-            raise ValueError(
-                f"layers are {covered:.4g} mm thick together and leave nothing of the gel's {self.size_mm[2]} mm"
-            )
-        if self.layers and self.poisson_ratio < 0.3:
-            raise ValueError(f"poisson_ratio = {self.poisson_ratio}: a layered pad needs at least 0.3")
-        return self
+from synth.scene_pattern import Bitmap as Bitmap
+from synth.scene_pattern import Dots as Dots
+from synth.scene_pattern import NoPattern as NoPattern
+from synth.scene_pattern import Pattern
+from synth.scene_pattern import RandomColor as RandomColor
+from synth.scene_pattern import Speckle as Speckle
 
 
 class Window(Part):
@@ -70,50 +39,10 @@ class Coating(Part):
     roughness: Annotated[float, Field(ge=0.05, le=1)] = 1.0
     metallic: Fraction = 0.0
 
-
-class NoPattern(Part):
-    """Bare coating."""
-
-    kind: Literal["none"]
-
-
-class Dots(Part):
-    """Printed dots on a grid whose first dot lies offset_mm from the pad's centre."""
-
-    kind: Literal["dots"]
-    spacing_mm: tuple[Positive, Positive]
-    radius_mm: Positive
-    offset_mm: Vector2 = (0.0, 0.0)
-    rotation_deg: Annotated[float, Field(ge=-90, le=90)] = 0.0
-    """Turns the grid about its first dot; positive turns +x toward +y."""
-    jitter_mm: NonNegative = 0.0
-    """Standard deviation of each dot's centre around the grid."""
-    radius_jitter: Fraction = 0.0
-    """Relative standard deviation of each dot's radius."""
-    softness_mm: NonNegative = 0.02
-    """Width of the dot's edge."""
-    reflectance: Color = (0.03, 0.03, 0.03)
-
-
-class RandomColor(Part):
-    """Dense random-colour cells (DelTact: Zhang et al., RA-L 2022)."""
-
-    kind: Literal["random_color"]
-    cell_mm: Positive
-    saturation: Fraction = 1.0
-    softness_mm: NonNegative = 0.02
-
-
-class Speckle(Part):
-    """Random dark grains, as sprayed for digital image correlation."""
-
-    kind: Literal["speckle"]
-    grain_mm: Positive
-    coverage: Annotated[float, Field(gt=0, lt=1)] = 0.5
-    reflectance: Color = (0.03, 0.03, 0.03)
-
-
-Pattern = Annotated[NoPattern | Dots | RandomColor | Speckle, Field(discriminator="kind")]
+    @property
+    def is_matt(self) -> bool:
+        """Whether it is Lambertian."""
+        return self.roughness == 1 and self.metallic == 0
 
 
 class Light(Part):
@@ -162,6 +91,11 @@ class Sensor(Part):
                     f"{where}.position_mm z = {camera.position_mm[2]} lies inside the sensor; "
                     f"it must be beyond the window, z > {outside} (gel {thickness} + window {self.window.thickness_mm})"
                 )
+            if camera.lowest_mm <= outside:
+                raise ValueError(
+                    f"{where}.aperture_mm = {camera.aperture_mm}: the tilted pupil reaches down to z = "
+                    f"{camera.lowest_mm:.4g}, into the window; it must stay above z = {outside}"
+                )
             if camera.look_at_mm[2] >= camera.position_mm[2] and not self.mirrors:
                 raise ValueError(
                     f"{where}.look_at_mm must lie on the gel's side of the camera (smaller z); only a mirror could "
@@ -182,6 +116,8 @@ class Sensor(Part):
                     f"lights[{i}].position_mm z = {light.position_mm[2]} must lie inside the gel and window, "
                     f"0 < z < {outside}"
                 )
+            if light.position_mm[2] <= self.gel.face_mm(*light.position_mm[:2]):
+                raise ValueError(f"lights[{i}].position_mm lies outside the domed gel")
         return self
 
 
@@ -285,7 +221,7 @@ class Scene(Part):
     @model_validator(mode="after")
     def _plausible(self) -> "Scene":
         size, motion = self.sensor.gel.size_mm, self.motion
-        deepest = 0.85 * size[2]
+        deepest = 0.85 * (size[2] - self.sensor.gel.face_mm(*motion.position_mm))
         if motion.depth_mm < -50:
             raise ValueError(f"motion.depth_mm = {motion.depth_mm} leaves the indenter farther than 50 mm off the gel")
         for axis, x, half in zip("xy", motion.position_mm, (size[0] / 2, size[1] / 2), strict=True):

@@ -30,7 +30,13 @@ class Camera(Part):
     gamma: Annotated[float, Field(ge=0.2, le=4)] = 2.2
     """Encoded value = linear value ** (1 / gamma)."""
     blur_px: NonNegative = 0.0
-    """Standard deviation of the lens's Gaussian point spread."""
+    """Standard deviation of the lens's Gaussian point spread, everywhere the same; defocus adds to it."""
+    aperture_mm: NonNegative = 0.0
+    """Diameter of the entrance pupil, a disc around position_mm; 0: a pinhole, sharp everywhere. The flow is that of
+    the pupil's centre in either case: the middle of each blurred point."""
+    focus_mm: Positive | None = None
+    """How far from the pupil things are sharp, along the viewing axis, by mirrors and on into the gel, in true mm: for
+    a camera that looks straight down, its own z less that of the sharp plane. Only an aperture needs it."""
     vignetting: Fraction = 0.0
     """Relative loss of light at the image's corner, growing with the square of the distance from (cx, cy)."""
     read_noise: Annotated[float, Field(ge=0, le=0.5)] = 0.0
@@ -48,6 +54,35 @@ class Camera(Part):
                 "zeros for an ideal lens"
             )
         return self
+
+    @model_validator(mode="after")
+    def _focused(self) -> "Camera":
+        if not self.aperture_mm:
+            return self
+        if self.lens == "fisheye":
+            raise ValueError(
+                f"aperture_mm = {self.aperture_mm}: a fisheye lens has no flat plane of focus, and it is sharp nearly "
+                "everywhere; leave aperture_mm out, and use blur_px for a blur that is the same in all of the image"
+            )
+        if self.focus_mm is None:
+            raise ValueError(
+                f"aperture_mm = {self.aperture_mm} needs focus_mm, the distance at which the picture is sharp; for the "
+                "undeformed gel it is position_mm's z, where the camera looks straight down"
+            )
+        if self.aperture_mm > self.focus_mm:
+            raise ValueError(
+                f"aperture_mm = {self.aperture_mm} is wider than focus_mm = {self.focus_mm}; no lens takes in so "
+                "wide a cone: both are in mm, and the aperture is the pupil's diameter, not the f-number"
+            )
+        return self
+
+    @property
+    def lowest_mm(self) -> float:
+        """The smallest z of its pupil."""
+        along = [at - eye for at, eye in zip(self.look_at_mm, self.position_mm, strict=True)]
+        length = math.hypot(*along)
+        level = math.hypot(along[0], along[1]) / length if length > 0 else 1.0
+        return self.position_mm[2] - self.aperture_mm / 2 * level
 
 
 class FurtherCamera(Camera):

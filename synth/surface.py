@@ -78,10 +78,27 @@ class GelSurface:
     def _refined(self) -> tuple[Points, Triangles, FloatArray, Triangles, np.ndarray]:
         return _subdivide(self.coarse, self.subdivisions)
 
-    @property
+    @cached_property
     def material(self) -> Points:
-        """(v, 3) float64 mm: undeformed positions of the refined vertices."""
-        return self._refined[0]
+        """(v, 3) float64 mm: undeformed positions of the refined vertices.
+
+        Faces whose mid-edge nodes lie beside their edges' middles, as on a dome, are curved: they follow their own
+        shape functions.
+        """
+        straight = self._refined[0]
+        if not self.coarse.is_quadratic:
+            return straight
+        bulge = self._bulge
+        return np.asarray(straight + self._matrix(quadratic_face) @ bulge) if bulge.any() else straight
+
+    @property
+    def _bulge(self) -> FloatArray:
+        """(n, 3) mm from the middles of the coarse faces' edges to their nodes; zeros at the corners."""
+        nodes, faces = self.coarse.nodes, self.coarse.faces
+        bulge = np.zeros_like(nodes)
+        for k, (i, j) in enumerate(FACE_EDGES, 3):
+            bulge[faces[:, k]] = nodes[faces[:, k]] - (nodes[faces[:, i]] + nodes[faces[:, j]]) / 2
+        return bulge
 
     @property
     def triangles(self) -> Triangles:
@@ -133,7 +150,8 @@ class GelSurface:
         faces, local, vertex = self.coarse.faces, _grid(self.subdivisions)[1], self._members
         values = shape(local / self.subdivisions)
         # A vertex on an edge belongs to two faces, which agree there: the last one is taken.
-        face, place = np.zeros(len(self.material), dtype=int), np.zeros(len(self.material), dtype=int)
+        vertices = len(self._refined[0])
+        face, place = np.zeros(vertices, dtype=int), np.zeros(vertices, dtype=int)
         face[vertex], place[vertex] = np.indices(vertex.shape)
         rows = np.repeat(np.arange(len(face)), 6)
         size = (len(face), len(self.coarse.nodes))

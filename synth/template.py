@@ -19,6 +19,7 @@ from typing import Any
 from synth.errors import InputError
 from synth.scene import Scene
 from synth.scene_indenters import MeshIndenter
+from synth.scene_pattern import Bitmap
 from synth.schema_errors import DISTRIBUTIONS, validated
 
 SCENES = Path(__file__).resolve().parent.parent / "scenes"
@@ -36,7 +37,7 @@ class Template:
 
     Attributes:
         content: the parsed TOML after overrides.
-        source: the file, for messages and as the place that mesh files are relative to.
+        source: the file, for messages and as the place that meshes and bitmaps are relative to.
     """
 
     content: dict[str, Any]
@@ -49,10 +50,10 @@ class Template:
 
     @cached_property
     def hash(self) -> str:
-        """SHA-256 (16 hex digits) of what decides pixels: the scene less description and references, and mesh files."""
+        """SHA-256 (16 hex digits) of what decides pixels: scene less description and references, meshes, bitmaps."""
         decisive = {key: value for key, value in self.content.items() if key not in ("description", "references")}
         digest = hashlib.sha256(json.dumps(decisive, sort_keys=True).encode())
-        for file in self._mesh_files():
+        for _, file in self._files():
             digest.update(hashlib.sha256(file.read_bytes()).digest())
         return digest.hexdigest()[:16]
 
@@ -71,11 +72,12 @@ class Template:
         """Kind, arguments and path of every distribution, nested ones after their choice."""
         return list(_distributions(self.content, ""))
 
-    def _mesh_files(self) -> list[Path]:
-        """Every file that an indenter is read from, without repetition."""
-        indenters = [corner.contact.indenter for corner in self.corners]
-        names = sorted({indenter.file for indenter in indenters if isinstance(indenter, MeshIndenter)})
-        return [self.source.parent / name for name in names]
+    def _files(self) -> list[tuple[str, Path]]:
+        """Every file that an indenter or a pattern is read from, with the key that names it, without repetition."""
+        parts: list[tuple[str, Any]] = [("contact.indenter", corner.contact.indenter) for corner in self.corners]
+        parts += [("sensor.pattern", corner.sensor.pattern) for corner in self.corners]
+        names = sorted({(f"{key}.file", part.file) for key, part in parts if isinstance(part, MeshIndenter | Bitmap)})
+        return [(key, self.source.parent / name) for key, name in names]
 
 
 def load_scene(name_or_path: str | Path, overrides: Sequence[str] = ()) -> Template:
@@ -115,9 +117,9 @@ def checked_template(content: dict[str, Any], source: Path) -> Template:
         problem = _distribution_problem(kind, arguments, where)
         if problem:
             raise InputError(f"{source}: {where}: {problem}")
-    for file in template._mesh_files():
+    for key, file in template._files():
         if not file.is_file():
-            raise InputError(f"{source}: contact.indenter.file: there is no file {file}")
+            raise InputError(f"{source}: {key}: there is no file {file}")
     return template
 
 

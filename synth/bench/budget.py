@@ -55,8 +55,8 @@ def run_budget(
     from synth.simulate.resolution import LADDER
     from synth.template import load_scene, shipped_scenes
 
-    ladder = tuple(across for across in LADDER if across < reference)
-    if len(ladder) < 2:
+    finer = tuple(across for across in LADDER if across < reference)
+    if len(finer) < 2:
         raise InputError(f"--reference {reference}: must be finer than two meshes, {LADDER[0]} and {LADDER[1]} across")
     if minutes is not None and not minutes > 0:
         raise InputError(f"--minutes = {minutes:g}: must be above 0")
@@ -64,7 +64,7 @@ def run_budget(
     templates = tuple(load_scene(scene) for scene in scenes or shipped_scenes())
     command = f"python -m synth bench budget --draws {draws} --seed {seed} --reference {reference}"
     command += "".join(f" --scene {shlex.quote(Path(scene).name)}" for scene in scenes)
-    study = Study(templates, seed, draws, ladder, Reference(reference))
+    study = Study(templates, seed, draws, finer, Reference(reference))
     return study_budget(study, out, command, workers, deadline, as_json)
 
 
@@ -104,8 +104,7 @@ def study_budget(
             store.keep(pressed)
             done += 1
             one = pressed.measurement
-            what = f"{one.rung} across" if one.rung else "reference"
-            _say(f"{one.scene} {one.index}: {what}: {one.status}, {one.seconds:.1f} s ({done} of {len(every)})")
+            _say(f"{one.scene} {one.index}: {one.rung}: {one.status}, {one.seconds:.1f} s ({done} of {len(every)})")
         verdicts = [_verdict(study, one, store) for one in draws]
         picture = can_draw() and any(verdict.judged for verdict in verdicts)
         if picture:
@@ -147,7 +146,7 @@ def _verdict(study: "Study", one: "Drawn", store: "Store") -> "Verdict":
     from synth.bench.budget_verdict import Rung, Verdict
 
     name = one.template.name
-    asked = [Job(name, one.index, rung) for rung in [REFERENCE, *study.rungs(one.chosen.across)]]
+    asked = [Job(name, one.index, rung) for rung in [REFERENCE, *study.rungs(one)]]
     known = [store.measurements[job] for job in asked if job in store.measurements]
     reference = next((measurement for measurement in known if measurement.rung == REFERENCE), None)
     truth = store.field(reference.job) if reference is not None and reference.complete else None
@@ -164,7 +163,7 @@ def _verdict(study: "Study", one: "Drawn", store: "Store") -> "Verdict":
         body=one.scene.contact.indenter.shape,
         depth_mm=one.scene.motion.depth_mm,
         target_px=one.target_px,
-        chosen=one.chosen.across,
+        chosen=one.chosen_rung,
         predicted_px=one.chosen.error_px,
         rungs=tuple(rungs),
         reference=reference,
@@ -174,10 +173,10 @@ def _verdict(study: "Study", one: "Drawn", store: "Store") -> "Verdict":
 
 def _machine(workers: int) -> str:
     """Processor, cores, what works on them, and versions; for a machine that has no mesher, too."""
-    from synth.bench.machine import _processor
+    from synth.bench.machine import processor
     from synth.simulate.linear import has_pardiso
 
-    parts = [f"{_processor()}, {os.cpu_count()} cores, {workers} presses at once"]
+    parts = [f"{processor()}, {os.cpu_count()} cores, {workers} presses at once"]
     parts += ["Pardiso" if has_pardiso() else "SuperLU, no Pardiso", f"synth {__version__}"]
     for package in PACKAGES:
         try:

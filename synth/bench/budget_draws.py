@@ -23,7 +23,7 @@ def misses(verdicts: Sequence[Verdict], undrawn: Sequence[tuple[str, str]]) -> l
     return [
         "Draws above their target, dearer than wanted by either measure of cost, or that cannot be judged:",
         "",
-        "| scene | draw | indenter | depth, mm | across | predicted, px | error, px | target, px | why |",
+        "| scene | draw | indenter | depth, mm | mesh | predicted, px | error, px | target, px | why |",
         "|---|---|---|---|---|---|---|---|---|",
         *found,
     ]
@@ -31,7 +31,7 @@ def misses(verdicts: Sequence[Verdict], undrawn: Sequence[tuple[str, str]]) -> l
 
 def _cells(verdict: Verdict) -> list[str]:
     error = number(verdict.error_px) if verdict.judged else "–"
-    return [verdict.scene, str(verdict.index), verdict.body, f"{verdict.depth_mm:.2f}", str(verdict.chosen),
+    return [verdict.scene, str(verdict.index), verdict.body, f"{verdict.depth_mm:.2f}", verdict.chosen,
             number(verdict.predicted_px), error, f"{verdict.target_px:g}"]  # fmt: skip
 
 
@@ -51,13 +51,13 @@ def _why(verdict: Verdict) -> list[str]:
         why.append(f"{left:.3f} mm of penetration left in the chosen mesh's states")
         if cheapest is None:
             why.append("no mesh that was run met the target")
-        elif cheapest.across != verdict.chosen:
-            why.append(f"{cheapest.across} across would have, {number(1 / verdict.ratio())} times the time")
+        elif cheapest.name != verdict.chosen:
+            why.append(f"{cheapest.name} would have, {number(1 / verdict.ratio())} times the time")
     elif cheapest is not None and not (verdict.affordable() and verdict.affordable(nominal=True)):
         predicted = cheapest.measurement.predicted_px
         why.append(
             f"{verdict.ratio():.1f} times the time ({verdict.ratio(nominal=True):.1f} by unknowns) of "
-            f"{cheapest.across} across, whose error is {number(cheapest.error_px)} px and was predicted as "
+            f"{cheapest.name}, whose error is {number(cheapest.error_px)} px and was predicted as "
             f"{number(predicted)} px"
         )
     return why
@@ -69,13 +69,13 @@ def all_draws(verdicts: Sequence[Verdict]) -> list[str]:
         "Errors of the rungs in px, the chosen one's in bold; the ratio is of the chosen mesh's cost to the cheapest "
         "within the target, by time / by unknowns; penetration is what is left in the chosen mesh's judged states.",
         "",
-        "| scene | draw | indenter | depth, mm | across | predicted, px | error, px | target, px | rungs | ratio | "
+        "| scene | draw | indenter | depth, mm | mesh | predicted, px | error, px | target, px | rungs | ratio | "
         "penetration, mm |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for verdict in verdicts:
-        rungs = [f"{'**' if r.across == verdict.chosen else ''}{r.across}: {number(r.error_px)}"
-                 f"{'**' if r.across == verdict.chosen else ''}" for r in verdict.rungs]  # fmt: skip
+        rungs = [f"{'**' if r.name == verdict.chosen else ''}{r.name}: {number(r.error_px)}"
+                 f"{'**' if r.name == verdict.chosen else ''}" for r in verdict.rungs]  # fmt: skip
         cells = [*_cells(verdict), ", ".join(rungs)]
         if verdict.judged:
             cells.append(f"{number(verdict.ratio())} / {number(verdict.ratio(nominal=True))}")

@@ -16,6 +16,7 @@ import numpy as np
 from synth.arrays import FloatArray
 from synth.dataset.npz import encode_npz, read_npz
 from synth.dataset.storage import replace_file
+from synth.mesh.pad import face_height
 from synth.optics import Optics
 from synth.scene import Scene
 from synth.simulate import Trajectory
@@ -30,7 +31,7 @@ def places(scene: Scene) -> FloatArray:
     sizes = scene.sensor.gel.size_mm[:2]
     x, y = (np.linspace(-length / 2, length / 2, n) for length, n in zip(sizes, GRID, strict=True))
     points = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-    camera, seen = scene.sensor.camera, Optics.of(scene.sensor).project(_at_rest(points))
+    camera, seen = scene.sensor.camera, Optics.of(scene.sensor).project(_at_rest(points, scene))
     inside = (seen > 0).all(axis=1) & (seen[:, 0] < camera.width) & (seen[:, 1] < camera.height)
     return np.asarray(points[inside])
 
@@ -43,7 +44,7 @@ def field(trajectory: Trajectory, frames: Sequence[int], points: FloatArray) -> 
 
 def picture_errors(found: FloatArray, reference: FloatArray, scene: Scene) -> FloatArray:
     """(k,) px: see the module. Both fields are (k, n, 3) mm at the points of `places`."""
-    optics, rest = Optics.of(scene.sensor), _at_rest(places(scene))
+    optics, rest = Optics.of(scene.sensor), _at_rest(places(scene), scene)
     errors = []
     for u, r in zip(found, reference, strict=True):
         distance = np.linalg.norm(optics.project(rest + u) - optics.project(rest + r), axis=1)
@@ -74,5 +75,5 @@ def read_field(file: Path) -> FloatArray:
     return np.asarray(read_npz(file, ("displacement",))["displacement"], dtype=np.float64)
 
 
-def _at_rest(points: FloatArray) -> FloatArray:
-    return np.column_stack([points, np.zeros(len(points))])
+def _at_rest(points: FloatArray, scene: Scene) -> FloatArray:
+    return np.column_stack([points, face_height(points, scene.sensor.gel.dome_radius_mm)])

@@ -56,7 +56,7 @@ def _panel(axis: Any, verdicts: Sequence[Verdict]) -> None:
 
     for body, colour in COLOURS.items():
         own = [verdict for verdict in verdicts if verdict.body == body]
-        small = [(r.measurement.predicted_px, r.error_px) for v in own for r in v.rungs if r.across != v.chosen]
+        small = [(r.measurement.predicted_px, r.error_px) for v in own for r in v.rungs if r.name != v.chosen]
         large = [(v.predicted_px, v.error_px) for v in own]
         if small:
             axis.plot(*zip(*small, strict=True), "o", color=colour, markersize=3, alpha=0.4, zorder=2)

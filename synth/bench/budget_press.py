@@ -10,7 +10,7 @@ import numpy as np
 from synth.arrays import FloatArray
 from synth.bench.budget_field import field, places
 from synth.bench.budget_study import REFERENCE, Drawn, Job, Reference, Study, drawn
-from synth.bench.press import REPEATS, SHORT_S, _factorise_at_rest
+from synth.bench.press import REPEATS, SHORT_S, factorise_at_rest
 from synth.errors import InputError
 from synth.mesh import PadMesh
 from synth.scene import Scene
@@ -49,7 +49,7 @@ class Measurement:
 
     scene: str
     index: int
-    rung: int
+    rung: str
     status: str
     reason: str
     seconds: float
@@ -186,9 +186,10 @@ def ready_stepper(
     """
     gel, numerics = scene.sensor.gel, scene.numerics
     space = function_space(mesh, ELEMENTS[numerics.element]())
-    path = Path(scene.motion, rigid_body(scene.contact.indenter, folder, mesh.spacing_mm / (2 * space.element.order)))
+    body = rigid_body(scene.contact.indenter, folder, mesh.spacing_mm / (2 * space.element.order))
+    path = Path(scene.motion, body, gel.dome_radius_mm)
     system = System(space, pad_material(gel, mesh), penalty=numerics.penalty)
     modulus = gel.youngs_modulus_kpa / 1000
     stepper = Stepper(system, [path], [scene.contact.friction], numerics, [modulus], driver, frames)
-    _factorise_at_rest(stepper, path)
+    factorise_at_rest(stepper, path)
     return stepper

@@ -73,12 +73,11 @@ def rows(verdicts: Sequence[Verdict]) -> list[dict[str, Any]]:
     for verdict in verdicts:
         own = [Rung(verdict.reference, 0.0)] if verdict.reference else []
         for rung in [*own, *verdict.rungs]:
-            is_reference = rung.across == REFERENCE
+            is_reference = rung.name == REFERENCE
             has_error = not is_reference and not math.isnan(rung.error_px)
             values = {
                 **asdict(rung.measurement),
-                "rung": "reference" if is_reference else rung.across,
-                "chosen": rung.across == verdict.chosen,
+                "chosen": rung.name == verdict.chosen,
                 "body": verdict.body,
                 "depth_mm": verdict.depth_mm,
                 "target_px": verdict.target_px,
@@ -191,8 +190,9 @@ def _definitions(study: Study) -> list[str]:
         "**Cost**: processor time of the press in a process of one thread, the median of "
         f"{REPEATS} below {SHORT_S:g} s, without mesh, compilation and the analysis of the sparse pattern; and, as "
         f"times scatter on a busy machine, unknowns to the power {SOLVE_GROWTH:g}. The chosen mesh is compared with "
-        f"the cheapest that met the target of those run: {', '.join(map(str, study.ladder))} elements across up to "
-        f"{BEYOND} rungs above the chosen one, and the finest.",
+        f"the cheapest that met the target of those run: the draw's ladder of meshes, of {study.across[0]} to "
+        f"{study.across[-1]} elements across, up to {BEYOND} above the chosen one, and the finest. 8x3 is a mesh of 8 "
+        "elements across the contact and 3 through the thickness.",
     ]
 
 

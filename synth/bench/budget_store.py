@@ -16,7 +16,7 @@ from typing import Any
 from synth.arrays import FloatArray
 from synth.bench.budget_field import read_field, write_field
 from synth.bench.budget_press import Measurement, Pressed
-from synth.bench.budget_study import REFERENCE, Job, Study
+from synth.bench.budget_study import Job, Study
 from synth.dataset.jsontext import read_document, to_document
 from synth.dataset.lines import append_line, read_line, rewrite_lines, scan_lines
 from synth.dataset.lock import DirectoryLock
@@ -109,11 +109,10 @@ class Store:
         return read_field(self._file(job))
 
     def _file(self, job: Job) -> Path:
-        rung = "reference" if job.rung == REFERENCE else f"{job.rung:02d}"
-        return self._directory / FIELDS / f"{job.scene}-{job.index:03d}-{rung}.npz"
+        return self._directory / FIELDS / f"{job.scene}-{job.index:03d}-{job.rung}.npz"
 
 
-def _key(line: dict[str, Any]) -> tuple[str, int, int]:
+def _key(line: dict[str, Any]) -> tuple[str, int, str]:
     measurement = _measurement(line)
     return measurement.scene, measurement.index, measurement.rung
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from synth.errors import InputError
-from synth.mesh import Counts, Focus, PadMesh, graded_box
+from synth.mesh import Counts, Focus, PadMesh, domed, graded_box
 from synth.mesh.graded import spacing
 from synth.plan import ITERATIONS_PER_RECORD, ITERATIONS_PER_STEP, SOLVE_GROWTH
 from synth.sampling import MAX_DRAWS, draw, draw_sensor, pairs_of, sensor_of
@@ -28,18 +28,20 @@ from synth.simulate.resolution import (
     LADDER,
     MARGIN,
     STEEPEST_DEPTH,
+    Fineness,
     Resolution,
     graded_mesh,
+    ladder,
     predicted_error_mm,
     resolve,
     scale_px_per_mm,
 )
 from synth.template import Template
 
-BEYOND = 2
+BEYOND = 3
 """Rungs that are run above the chosen one."""
-REFERENCE = 0
-"""In place of a rung's number of elements across, for the reference."""
+REFERENCE = "reference"
+"""In place of a rung's name."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,8 @@ class Reference:
         height = size[2] / fine
         through = max(2, math.ceil(math.log1p(height * (STEEPEST_DEPTH - 1)) / math.log(STEEPEST_DEPTH))) + 1
         counts = Counts(across, self.beside, through, growth=_growth(through, height))
-        return graded_box(size, focus, counts, tuple(layer.thickness_mm for layer in gel.layers)), fine
+        box = graded_box(size, focus, counts, tuple(layer.thickness_mm for layer in gel.layers))
+        return domed(box, gel.dome_radius_mm), fine
 
 
 def _growth(count: int, height: float) -> float:
@@ -115,9 +118,14 @@ class Drawn:
         """The frames in which the gel is pressed."""
         return sorted(self.frames - {0})
 
-    def mesh(self, across: int) -> tuple[PadMesh, float]:
+    @property
+    def chosen_rung(self) -> str:
+        """The name of the mesh that its budget asks for."""
+        return str(Fineness(self.chosen.across, self.chosen.through))
+
+    def mesh(self, rung: str) -> tuple[PadMesh, float]:
         """The mesh of a rung, and its spacing under the contact (mm)."""
-        return graded_mesh(self.scene.sensor.gel, self.focus, across)
+        return graded_mesh(self.scene.sensor.gel, self.focus, *Fineness.of(rung))
 
     def predicted_px(self, spacing_mm: float) -> float:
         """What the error model says of a mesh, as `resolve` asks it."""
@@ -141,7 +149,8 @@ def drawn(template: Template, seed: int, index: int) -> Drawn:
         except InputError as error:
             refused = str(error)
             continue
-        focus = footprint(IndenterPath(scene.motion, body), scene.sensor.gel.size_mm, MARGIN)
+        gel = scene.sensor.gel
+        focus = footprint(IndenterPath(scene.motion, body, gel.dome_radius_mm), gel.size_mm, MARGIN)
         frames = frozenset(k for pair in pairs_of(template, seed, index, scene.motion.steps) for k in pair.frames)
         target = scene.numerics.target_error_px or DEFAULT_TARGET_PX
         return Drawn(template, index, attempt, scene, focus, frames, chosen, target)
@@ -150,11 +159,11 @@ def drawn(template: Template, seed: int, index: int) -> Drawn:
 
 @dataclass(frozen=True)
 class Job:
-    """One press: scene's name, number of its draw, elements across the contact or REFERENCE."""
+    """One press: scene's name, number of its draw, and rung: a `Fineness` as text, or REFERENCE."""
 
     scene: str
     index: int
-    rung: int
+    rung: str
 
 
 @dataclass(frozen=True)
@@ -165,7 +174,7 @@ class Study:
         templates: scenes of different names, whose meshes are chosen by a budget.
         seed: of the draws.
         draws: of each scene.
-        ladder: elements across, rising.
+        across: elements across that rungs may have, rising.
         reference: what errors are measured against.
 
     Raises:
@@ -175,7 +184,7 @@ class Study:
     templates: tuple[Template, ...]
     seed: int
     draws: int
-    ladder: tuple[int, ...] = LADDER
+    across: tuple[int, ...] = LADDER
     reference: Reference = Reference()
 
     def __post_init__(self) -> None:
@@ -196,7 +205,7 @@ class Study:
             "scenes": {template.name: template.hash for template in self.templates},
             "solver": solver(),
             "seed": self.seed,
-            "ladder": list(self.ladder),
+            "across": list(self.across),
             "reference": {**asdict(self.reference), "beside": list(self.reference.beside)},
         }
 
@@ -204,13 +213,15 @@ class Study:
         """The scene of that name."""
         return next(template for template in self.templates if template.name == name)
 
-    def rungs(self, chosen: int) -> list[int]:
-        """Elements across of the meshes that a draw is run on: up to BEYOND rungs above the chosen one, and the finest,
-        whose difference from the reference tells how far that can be trusted.
+    def rungs(self, one: Drawn) -> list[str]:
+        """The meshes that a draw is run on, cheapest first: those of its ladder up to BEYOND above the chosen one, and
+        the finest, whose difference from the reference tells how far that can be trusted.
         """
-        above = [across for across in self.ladder if across > chosen]
-        limit = above[min(BEYOND, len(above)) - 1] if above else chosen
-        return sorted({*(across for across in self.ladder if across <= limit), chosen, self.ladder[-1]})
+        names = [str(fineness) for fineness in ladder(one.scene.sensor.gel, one.focus, self.across)]
+        chosen = one.chosen_rung
+        if chosen not in names:  # finer than all of them
+            return [*names, chosen]
+        return [*names[: names.index(chosen) + BEYOND + 1], *names[names.index(chosen) + BEYOND + 1 :][-1:]]
 
 
 def solver() -> str:
@@ -226,11 +237,12 @@ def jobs(study: Study, draws: Sequence[Drawn]) -> dict[Job, float]:
     """All presses with their work, in a unit of its own; references first, and the most work first of each kind, so
     that the last do not wait for one.
     """
-    found: list[tuple[bool, float, str, int, int]] = []
+    found: list[tuple[bool, float, str, int, str]] = []
     for one in draws:
         gel, numerics = one.scene.sensor.gel, one.scene.numerics
-        path = IndenterPath(one.scene.motion, rigid_body(one.scene.contact.indenter, one.template.source.parent))
-        for rung in [REFERENCE, *study.rungs(one.chosen.across)]:
+        body = rigid_body(one.scene.contact.indenter, one.template.source.parent)
+        path = IndenterPath(one.scene.motion, body, gel.dome_radius_mm)
+        for rung in [REFERENCE, *study.rungs(one)]:
             on_ladder, step = rung != REFERENCE, numerics.max_step_mm
             if on_ladder:
                 mesh, _ = one.mesh(rung)

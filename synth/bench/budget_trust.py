@@ -21,9 +21,8 @@ def trust(study: Study, verdicts: Sequence[Verdict], counted: Sequence[Tally]) -
         verdicts: of all draws.
         counted: of each scene, and perhaps of all.
     """
-    finest = study.ladder[-1]
     lines = [
-        f"A reference's own error is not known. Its difference from the press on {finest} across, with the draw's own "
+        "A reference's own error is not known. Its difference from the press on the finest mesh, with the draw's own "
         "load steps and driver, is one estimate of it, and is added to the error in the second column. If the errors "
         f"of a rung and the reference fell with the power {RATE:g} of the spacing and had one shape, their difference "
         "would be smaller than the rung's error; the third column has the errors that this makes of the measured "

@@ -36,8 +36,8 @@ class Rung:
     error_px: float
 
     @property
-    def across(self) -> int:
-        """Elements across the contact."""
+    def name(self) -> str:
+        """Which."""
         return self.measurement.rung
 
     @property
@@ -64,7 +64,7 @@ class Verdict:
         body: shape of the indenter.
         depth_mm: of the press.
         target_px: its budget.
-        chosen: elements across of its mesh.
+        chosen: name of the rung that its budget asks for.
         predicted_px: of that mesh.
         rungs: those that were run, rising; without those that are still to do.
         reference: its press; None while that is to do.
@@ -76,7 +76,7 @@ class Verdict:
     body: str
     depth_mm: float
     target_px: float
-    chosen: int
+    chosen: str
     predicted_px: float
     rungs: tuple[Rung, ...]
     reference: Measurement | None
@@ -101,8 +101,8 @@ class Verdict:
         """Whether presses are still to do."""
         return self.missing > 0
 
-    def _rung(self, across: int) -> Rung:
-        return next(rung for rung in self.rungs if rung.across == across)
+    def _rung(self, name: str) -> Rung:
+        return next(rung for rung in self.rungs if rung.name == name)
 
     @property
     def judged(self) -> bool:

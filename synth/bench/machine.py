@@ -13,7 +13,7 @@ PACKAGES = ("numpy", "scipy", "warp-lang", "pytetwild")
 
 def machine_line() -> str:
     """Processor, cores, how busy the machine was, and versions."""
-    parts = [f"{_processor()}, {os.cpu_count()} cores"]
+    parts = [f"{processor()}, {os.cpu_count()} cores"]
     if hasattr(os, "getloadavg"):
         parts.append(f"load {os.getloadavg()[2]:.1f} over the last 15 minutes, this run included")
     parts.append("Pardiso" if has_pardiso() else "SuperLU, no Pardiso")
@@ -22,7 +22,7 @@ def machine_line() -> str:
     return ", ".join(parts)
 
 
-def _processor() -> str:
+def processor() -> str:
     """Its name where the system tells."""
     told = Path("/proc/cpuinfo")
     if told.is_file():

@@ -1,6 +1,5 @@
 """One press of the benchmark: built, warmed up, and timed."""
 
-import copy
 import statistics
 import time
 from dataclasses import dataclass
@@ -12,7 +11,6 @@ from synth.bench.setting import Setting
 from synth.mesh import PadMesh
 from synth.simulate import Trajectory
 from synth.simulate.indenter import rigid_body
-from synth.simulate.linear import direct_factor
 from synth.simulate.material import pad_material
 from synth.simulate.path import Path
 from synth.simulate.space import function_space
@@ -46,16 +44,6 @@ class Press:
     unknowns: int
 
 
-class DoubleSystem(System):
-    """A system whose tangents are factorised in double precision."""
-
-    def __init__(self, *args: object, **options: object) -> None:
-        super().__init__(*args, **options)  # type: ignore[arg-type]
-        own = copy.copy(self._pattern)  # the original is shared with other systems on this topology
-        own.factor = direct_factor(own.indptr, own.indices, single=False)
-        self._pattern = own
-
-
 def pressed(case: Case, setting: Setting, mesh: PadMesh, short_s: float = SHORT_S) -> Press:
     """Run a case and time it.
 
@@ -82,16 +70,16 @@ def pressed(case: Case, setting: Setting, mesh: PadMesh, short_s: float = SHORT_
 def ready_stepper(case: Case, setting: Setting, mesh: PadMesh) -> Stepper:
     """A stepper at the start of the path, kernels compiled and the sparse pattern analysed."""
     space = function_space(mesh, setting.built_element())
-    kind = DoubleSystem if setting.double else System
-    system = kind(space, pad_material(GEL, mesh), penalty=setting.numerics.penalty)
+    single = setting.driver.single_precision
+    system = System(space, pad_material(GEL, mesh), penalty=setting.numerics.penalty, single=single)
     body = rigid_body(INDENTER, None, mesh.spacing_mm / (2 * space.element.order))
     path, modulus = Path(case.motion, body), GEL.youngs_modulus_kpa / 1000
     stepper = Stepper(system, [path], [case.friction], setting.numerics, [modulus], setting.driver)
-    _factorise_at_rest(stepper, path)
+    factorise_at_rest(stepper, path)
     return stepper
 
 
-def _factorise_at_rest(stepper: Stepper, path: Path) -> None:
+def factorise_at_rest(stepper: Stepper, path: Path) -> None:
     """A Newton step in the undeformed state, thrown away: it makes the solver analyse the pattern."""
     system, indenters, active = stepper.system, stepper.indenters, np.ones(1, dtype=bool)
     pose = path.pose(0.0)

@@ -64,7 +64,7 @@ def _plain(row: Row, rows: list[Row], on_front: bool) -> dict[str, Any]:
         "penalty": setting.numerics.penalty,
         "loose_tolerance": setting.driver.loose,
         "extrapolation": setting.driver.extrapolate,
-        "factor": "float64" if setting.double else "float32",
+        "factor": "float32" if setting.driver.single_precision else "float64",
         "unknowns": press.unknowns,
         "status": press.trajectory.status,
         "seconds": press.seconds,

@@ -173,7 +173,7 @@ def _seconds_per_frame(template: Template, seed: int, variant: Variant, dataset:
     index = dataset.samples[0]
     sample, scene = dataset.read(index), dataset.scene_of(index)
     sensor = sensor_of(template, dataset.entry(index).trajectory)
-    texture = albedo(scene.sensor, stream(template, seed, "pattern", sensor))
+    texture = albedo(scene.sensor, stream(template, seed, "pattern", sensor), template.source.parent)
     renderer = Renderer(scene.sensor, scene.render, flat_surface(scene.sensor.gel.size_mm), texture, variant)
     positions = sample.surface.positions(sample.displacement2)
     renderer.take(sample.surface)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from synth import __version__
-from synth.bench.machine import _processor
+from synth.bench.machine import processor
 from synth.bench.scale_measure import Cell
 from synth.dataset.sample import SAMPLE_FILES
 from synth.dataset.storage import replace_file
@@ -176,7 +176,7 @@ def _seconds(cell: Cell, pairs: int) -> float:
 
 
 def _machine() -> str:
-    parts = [f"{_processor()}, {os.cpu_count()} cores"]
+    parts = [f"{processor()}, {os.cpu_count()} cores"]
     if hasattr(os, "getloadavg"):
         parts.append(f"load {os.getloadavg()[2]:.1f} over the last 15 minutes, this run included")
     parts += ["Pardiso" if has_pardiso() else "SuperLU, no Pardiso", f"synth {__version__}"]

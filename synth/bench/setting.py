@@ -17,16 +17,19 @@ WRITTEN = {"p2p1": "P2/P1", "p1p1": "P1/P1", "p1": "P1"}
 
 @dataclass(frozen=True)
 class Graded:
-    """The structured mesh that scenes are simulated on, with so many elements across the contact."""
+    """The structured mesh that scenes are simulated on: elements across the contact, and through the thickness or, for
+    None, as many as keep them no higher than wide.
+    """
 
     across: int
+    through: int | None = None
 
     def __str__(self) -> str:
-        return f"{self.across} across"
+        return f"{self.across} across" + ("" if self.through is None else f", {self.through} through")
 
     def mesh(self, case: Case) -> PadMesh:
         """The mesh of a case."""
-        return graded_mesh(GEL, case.focus, self.across)[0]
+        return graded_mesh(GEL, case.focus, self.across, self.through)[0]
 
 
 @dataclass(frozen=True)
@@ -90,7 +93,6 @@ class Setting:
         contact_split: contact is integrated at 3 points on each of contact_split² parts of a face.
         numerics: steps, tolerance and penalty.
         driver: of Newton's method.
-        double: factorise in double precision.
         detail: what differs from the standard, for a variant.
     """
 
@@ -100,7 +102,6 @@ class Setting:
     contact_split: int = 3
     numerics: Numerics = field(default_factory=Numerics)
     driver: Driver = STANDARD
-    double: bool = False
     detail: str = ""
 
     @property

@@ -8,8 +8,8 @@ from synth.scene import Numerics
 from synth.simulate.driver import Driver
 
 PLAIN_MESH = Uniform((20, 16, 4))
-PLAIN_DRIVER = Driver(loose=0.0, extrapolate=False)
-PLAIN = Setting("plain driver", PLAIN_MESH, driver=PLAIN_DRIVER, double=True)
+PLAIN_DRIVER = Driver(loose=0.0, extrapolate=False, single_precision=False)
+PLAIN = Setting("plain driver", PLAIN_MESH, driver=PLAIN_DRIVER)
 """What a textbook would do: a uniform mesh, every step solved to the full tolerance from the last state, and factors in
 double precision. Elements, contact and line search are the same."""
 BASE = Setting("graded P2/P1", Graded(8))
@@ -44,14 +44,15 @@ def variants() -> list[Setting]:
         for value in (25.0, 100.0, 200.0)
     ]
     found += [replace(BASE, family="contact points", contact_split=1, detail="3 points a face")]
-    found += [replace(BASE, family="factor", double=True, detail="float64")]
-    found += [replace(BASE, family="plain driver", driver=PLAIN_DRIVER, double=True)]
+    found += [replace(BASE, family="factor", driver=Driver(single_precision=False), detail="float64")]
+    found += [replace(BASE, family="plain driver", driver=PLAIN_DRIVER)]
     return found
 
 
 def whole() -> Suite:
     """Some ten minutes on two cores."""
     held = of_family("graded", "p2p1", *map(Graded, (4, 6, 8, 10, 12, 14)))
+    held += of_family("graded, few layers", "p2p1", Graded(6, 2), Graded(8, 2), Graded(10, 2))
     held += of_family("graded", "p1p1", *map(Graded, (4, 6, 8, 10, 12, 14)))
     held += of_family("graded", "p1", Graded(8))
     held += of_family("fTetWild", "p2p1", Wild(1.0, 3.0), Wild(0.75, 2.5), Wild(0.6, 2.2))
@@ -60,6 +61,7 @@ def whole() -> Suite:
     held += of_family("uniform", "p1p1", Uniform((14, 10, 3)), PLAIN_MESH)
     held += of_family("uniform", "p1", PLAIN_MESH)
     others = of_family("graded", "p2p1", *map(Graded, (4, 6, 8, 10, 12)))
+    others += of_family("graded, few layers", "p2p1", Graded(6, 2), Graded(8, 2))
     others += of_family("graded", "p1p1", *map(Graded, (8, 12)))
     others += of_family("fTetWild", "p2p1", Wild(1.0, 3.0), Wild(0.75, 2.5))
     few = [v for v in variants() if v.family in ("contact points", "load step", "factor")]

@@ -21,7 +21,7 @@ def fitted_content(template: Template, fit: SensorFit, folder: str) -> dict[str,
         fit: what was found.
         folder: of the preset, relative to where the fitted scene will lie; indenters' files are found through it.
     """
-    sensor = fit.sensor.model_dump(mode="json")
+    sensor = fit.sensor.model_dump(mode="json", exclude_none=True)
     given = template.content["sensor"]
     # What no undeformed frame tells keeps the preset's distributions: the pad's mechanics.
     sensor["gel"] = given["gel"]

@@ -1,8 +1,22 @@
 """Tetrahedral meshes of the gel pad."""
 
 from synth.mesh.cache import default_edge_length, mesh_key, pad_mesh
+from synth.mesh.dome import domed, flat_surface, rest_surface
 from synth.mesh.focus import Focus
 from synth.mesh.graded import Counts, graded_box
-from synth.mesh.pad import PadMesh, check_mesh
+from synth.mesh.pad import PadMesh, check_mesh, face_height
 
-__all__ = ["Counts", "Focus", "PadMesh", "check_mesh", "default_edge_length", "graded_box", "mesh_key", "pad_mesh"]
+__all__ = [
+    "Counts",
+    "Focus",
+    "PadMesh",
+    "check_mesh",
+    "default_edge_length",
+    "domed",
+    "face_height",
+    "flat_surface",
+    "graded_box",
+    "mesh_key",
+    "pad_mesh",
+    "rest_surface",
+]

@@ -1,4 +1,4 @@
-"""Meshes are kept by content: made once per pad and edge length, then read.
+"""Meshes are kept by content: made once per pad and edge length, then read. A dome's is its box's, bulged when read.
 
 fTetWild is not deterministic, so the cache is also what makes a dataset reproducible: a dataset directory keeps the
 meshes it used and a later run on it reads those first.
@@ -15,6 +15,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from synth.errors import InputError
+from synth.mesh.dome import domed
 from synth.mesh.pad import PadMesh
 from synth.mesh.sizing import GRADING
 from synth.mesh.tetrahedralise import ENVELOPE, tetrahedralise_box
@@ -52,7 +53,8 @@ def pad_mesh(gel: Gel, numerics: Numerics, folders: Sequence[Path] | None = None
         folders: searched in order; default the user's cache.
 
     Raises:
-        InputError: the pad has layers, whose interfaces fTetWild does not keep as planes.
+        InputError: the pad has layers, whose interfaces fTetWild does not keep as planes; a dome turns a tetrahedron
+            over.
     """
     if gel.layers:
         raise InputError(
@@ -66,7 +68,7 @@ def pad_mesh(gel: Gel, numerics: Numerics, folders: Sequence[Path] | None = None
     for path in paths:
         if _read(path, gel) is None:
             _write(path, mesh)
-    return mesh
+    return domed(mesh, gel.dome_radius_mm)
 
 
 def _read(path: Path, gel: Gel) -> PadMesh | None:

@@ -18,12 +18,15 @@ _FACES_OF_TET = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])  # normal
 class PadMesh:
     """A box of gel: contact surface at z = 0, bonded to the window at z = size[2], centred in x and y.
 
+    The contact surface of a domed pad is part of a sphere that touches z = 0 at x = y = 0, see `synth.mesh.dome`.
+
     Attributes:
         points: (n, 3) float64 mm.
         tets: (m, 4) int32; (b - a) x (c - a) . (d - a) > 0 by components.
         size_mm: edge lengths of the box.
         layer: (m,) int32, the layer of material that each tetrahedron lies in, counted from the contact face; left
             out, all lie in layer 0.
+        dome_radius_mm: of the contact face; None where it is flat. Its nodes lie on the sphere to the last bit.
 
     Raises:
         ValueError: `layer` is not one number per tetrahedron.
@@ -33,6 +36,7 @@ class PadMesh:
     tets: Tets
     size_mm: tuple[float, float, float]
     layer: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, dtype=np.int32))
+    dome_radius_mm: float | None = None
 
     def __post_init__(self) -> None:
         """Fill in the single layer."""
@@ -50,6 +54,11 @@ class PadMesh:
     def bonded(self) -> BoolArray:
         """(n,) nodes glued to the window."""
         return self.points[:, 2] == self.size_mm[2]
+
+    @cached_property
+    def on_face(self) -> BoolArray:
+        """(n,) nodes of the contact face."""
+        return self.points[:, 2] == face_height(self.points[:, :2], self.dome_radius_mm)
 
     @cached_property
     def touchable(self) -> Triangles:
@@ -71,7 +80,7 @@ class PadMesh:
 
     @cached_property
     def contact_faces(self) -> ContactFaces:
-        """The faces at z = 0, numbered within `contact_nodes`."""
+        """The faces of the contact surface, numbered within `contact_nodes`."""
         nodes = self.contact_nodes
         faces = np.searchsorted(nodes, self._contact_triangles).astype(np.int32)
         return ContactFaces(self.points[nodes], faces)
@@ -79,7 +88,7 @@ class PadMesh:
     @cached_property
     def _contact_triangles(self) -> Triangles:
         faces = self._boundary
-        return faces[(self.points[faces][:, :, 2] == 0).all(axis=1)]
+        return faces[self.on_face[faces].all(axis=1)]
 
     @cached_property
     def _boundary(self) -> Triangles:
@@ -97,6 +106,14 @@ class PadMesh:
         if self.layer.any():
             digest.update(np.ascontiguousarray(self.layer, dtype="<i4").tobytes())
         return digest.hexdigest()
+
+
+def face_height(places: FloatArray, dome_radius_mm: float | None) -> FloatArray:
+    """Z (n,) mm of the undeformed contact face at places (n, 2) mm: R - sqrt(R² - r²), without its cancellation."""
+    if dome_radius_mm is None:
+        return np.zeros(len(places))
+    square = (places**2).sum(axis=1)
+    return np.asarray(square / (dome_radius_mm + np.sqrt(dome_radius_mm**2 - square)))
 
 
 def check_mesh(mesh: PadMesh) -> None:

@@ -6,10 +6,11 @@ Snell's law at the window's outer face and weighted by
 .. math::  \frac{1 - F(\theta)}{n^2},
 
 Fresnel's transmittance for unpolarised light and the radiance law for the passage between media. That is what a path
-tracer finds on average behind a smooth dielectric, without its noise.
+tracer finds on average behind a smooth dielectric, without its noise. With an aperture (`synth.render.thin_lens`) each
+ray starts at its own point of the pupil.
 
 Scalar variants trace far too slowly from Python and use Mitsuba's own pinhole camera, which knows square pixels and no
-lens distortion, fisheye or mirror.
+lens distortion, fisheye, mirror or aperture.
 """
 
 import math
@@ -24,6 +25,7 @@ from synth.errors import InputError
 from synth.optics import Optics
 from synth.optics.mirror import FlatMirror
 from synth.render.gel_mesh import MIRROR
+from synth.render.thin_lens import ThinLens
 from synth.render.variant import LLVM_HINT
 from synth.scene import Camera, Sensor
 
@@ -50,6 +52,9 @@ class CameraRays:
         self._face = dr.opaque(mi.Float, optics.face_z)
         self._is_fisheye = camera.lens == "fisheye"
         self._distortion = [dr.opaque(mi.Float, k) for k in camera.distortion] if any(camera.distortion) else None
+        thin = ThinLens.of(sensor)
+        self._radius = dr.opaque(mi.Float, thin.radius_mm) if thin else None
+        self._focus = dr.opaque(mi.Float, thin.distance_mm) if thin else None
         if self._distortion is not None or self._is_fisheye:
             local = _centres(optics, camera)
             self._seen = mi.Bool(np.isfinite(local[:, 0]))
@@ -61,12 +66,18 @@ class CameraRays:
         mi, dr = self._mi, self._dr
         return mi.Vector3f(*(dr.opaque(mi.Float, value) for value in vector * MIRROR))
 
-    def sample(self, pixel: Any, offset: Any) -> tuple[Any, Any, Any]:
+    @property
+    def has_aperture(self) -> bool:
+        """Whether `sample` needs points of a pupil; without an aperture none may be drawn for it."""
+        return self._radius is not None
+
+    def sample(self, pixel: Any, offset: Any, pupil: Any | None = None) -> tuple[Any, Any, Any]:
         """Rays through points of pixels.
 
         Args:
             pixel: mi.UInt32, row-major index of the pixel.
             offset: mi.Point2f in [0, 1)², the point within the pixel (right, down).
+            pupil: mi.Point2f in [0, 1)², made into a uniform point of the pupil; None: its centre, the pinhole.
 
         Returns:
             Ray (mi.RayDifferential3f), weight (mi.Float) and whether the lens looks there at all (mi.Bool).
@@ -84,10 +95,14 @@ class CameraRays:
         elif self._distortion is not None:
             valid = dr.gather(mi.Bool, self._seen, pixel)
             x, y = self._undistort(pixel, x, y)
-        air = dr.normalize(self._right * x + self._down * y + forward)
         eye = self._position
+        if pupil is not None:
+            point = mi.warp.square_to_uniform_disk_concentric(pupil) * self._radius
+            eye = eye + self._right * point.x + self._down * point.y
+            x, y = x - point.x / self._focus, y - point.y / self._focus
+        air = dr.normalize(self._right * x + self._down * y + forward)
         if self._mirrors:
-            eye, air, unhindered = self._reflect(air)
+            eye, air, unhindered = self._reflect(eye, air)
             valid &= unhindered
         if not self._refracts:
             return mi.RayDifferential3f(mi.Ray3f(mi.Point3f(eye), air)), mi.Float(1), valid
@@ -100,21 +115,21 @@ class CameraRays:
         ray = mi.RayDifferential3f(mi.Ray3f(mi.Point3f(origin + inside * _START_MM), inside))
         return ray, (1 - reflected) / dr.square(self._index), valid
 
-    def _reflect(self, air: Any) -> tuple[Any, Any, Any]:
-        """Where rays in air start after their mirror, their directions, and whether they may go on.
+    def _reflect(self, eye: Any, air: Any) -> tuple[Any, Any, Any]:
+        """Where rays in air from `eye` start after their mirror, their directions, and whether they may go on.
 
         The rules are those of `synth.optics.mirror.first_met`, for every sample by itself: a pixel on a mirror's edge
         sees both sides.
         """
         mi, dr = self._mi, self._dr
-        start, onward = mi.Vector3f(self._position), mi.Vector3f(air)
+        start, onward = mi.Vector3f(eye), mi.Vector3f(air)
         nearest, which, free = mi.Float(dr.inf), mi.UInt32(0), mi.Bool(True)
         for number, mirror in enumerate(self._mirrors, 1):
-            distance, facing = mirror.met(self._position, air)
+            distance, facing = mirror.met(eye, air)
             closer = distance < nearest
             nearest, which = dr.select(closer, distance, nearest), dr.select(closer, number, which)
             free = dr.select(closer, facing, free)
-            start = dr.select(closer, self._position + air * distance, start)
+            start = dr.select(closer, eye + air * distance, start)
             onward = dr.select(closer, air - 2 * dr.dot(air, mirror.normal) * mirror.normal, onward)
         for number, mirror in enumerate(self._mirrors, 1):
             free &= (which == 0) | (which == number) | ~dr.isfinite(mirror.met(start, onward)[0])
@@ -186,7 +201,7 @@ def pinhole(sensor: Sensor) -> dict[str, Any]:
     """Mitsuba's perspective camera, less its film and sampler, for scalar variants.
 
     Raises:
-        InputError: the camera has a fisheye lens, a mirror, distortion or pixels that are not square.
+        InputError: the camera has a fisheye lens, a mirror, distortion, an aperture or pixels that are not square.
     """
     optics, camera = Optics.of(sensor), sensor.camera
     need = f"needs LLVM 16 or newer, or an NVIDIA GPU, which this machine lacks ({LLVM_HINT})"
@@ -197,6 +212,8 @@ def pinhole(sensor: Sensor) -> dict[str, Any]:
         raise InputError(
             f"sensor.camera.distortion = {list(camera.distortion)} {need}; without, set it to [0, 0, 0, 0, 0]"
         )
+    if camera.aperture_mm:
+        raise InputError(f"sensor.camera.aperture_mm = {camera.aperture_mm} {need}; without, set it to 0, a pinhole")
     if camera.fx != camera.fy:
         raise InputError(
             f"sensor.camera.fx = {camera.fx} and fy = {camera.fy} differ, which {need}; without, make them equal"

@@ -5,18 +5,25 @@ at y = -size_y / 2 (x right, y down), and the centre of texel (row r, column c) 
 
     x = ((c + 0.5) / columns - 0.5) · size_x,   y = ((r + 0.5) / rows - 0.5) · size_y.
 
-Edges are at least one texel wide, so that the texture holds no detail beyond its own resolution.
+Edges are at least one texel wide, so that the texture holds no detail beyond its own resolution. Marks that lie above a
+coating that shines come with their coverage: the renderer blends the two reflections (`render.coating`). On a dome the
+texture is laid on along z; its resolution is that at the apex.
 """
 
 import math
+from dataclasses import dataclass
 from functools import singledispatch
+from pathlib import Path
 
 import numpy as np
 
 from synth.arrays import FloatArray, Image
 from synth.errors import InputError
 from synth.optics import Optics
-from synth.scene import Dots, NoPattern, RandomColor, Sensor, Speckle
+from synth.render.bitmap import laid_over, read_picture
+from synth.render.marks import dots_coverage, speckle_coverage
+from synth.scene import Sensor
+from synth.scene_pattern import Bitmap, Dots, NoPattern, Pattern, RandomColor, Speckle
 
 TEXELS_PER_PIXEL = 4
 """Texels per image pixel and axis on the undeformed contact face: bilinear lookup stays below the pixel's own blur."""
@@ -25,24 +32,80 @@ MAX_TEXELS = 3072
 """Per axis; a finer pattern than this would not fit on many GPUs."""
 
 
-def albedo(sensor: Sensor, rng: np.random.Generator) -> Image:
+def albedo(sensor: Sensor, rng: np.random.Generator, folder: Path | None = None) -> Image:
     """Reflectance over the contact face (see the module for the mapping).
 
     Args:
         sensor: pad size, coating, pattern, and the camera, which sets the resolution.
         rng: draws the pattern.
+        folder: that a bitmap's file is relative to; default is the current directory.
 
     Returns:
-        (rows, columns, 3) float32 in [0, 1]; linear.
+        (rows, columns, 3) float32 in [0, 1]; linear. Where marks lie above a coating that shines, (rows, columns, 4):
+        the marks' reflectance and the share of each texel that they cover.
+
+    Raises:
+        InputError: a pattern finer than the camera could see, or a bitmap that cannot be read.
     """
+    x, y = _texels(sensor)
+    _check_detail(sensor.pattern, max(x[1] - x[0], y[1] - y[0]))
+    coating = np.array(sensor.coating.reflectance)
+    canvas = _Canvas(x, y, coating, rng, folder or Path())
+    if isinstance(sensor.pattern, Dots | Speckle | Bitmap):
+        colors, coverage = _mark(sensor.pattern, canvas)
+        if sensor.pattern.layer == "above_coating" and not sensor.coating.is_matt:
+            whole = np.broadcast_to(colors, (*coverage.shape, 3))
+            return np.clip(np.dstack([whole, coverage]), 0, 1).astype(np.float32)
+        painted = coating + coverage[:, :, None] * (colors - coating)
+    else:
+        painted = _paint(sensor.pattern, canvas)
+    return np.clip(painted, 0, 1).astype(np.float32)
+
+
+def check_pattern(sensor: Sensor, folder: Path) -> None:
+    """Find out whether `albedo` could paint a sensor's pattern, without painting it.
+
+    Raises:
+        InputError: as `albedo`.
+    """
+    if isinstance(sensor.pattern, Bitmap):
+        read_picture(sensor.pattern, folder)
+    if not isinstance(sensor.pattern, NoPattern):
+        x, y = _texels(sensor)
+        _check_detail(sensor.pattern, max(x[1] - x[0], y[1] - y[0]))
+
+
+def _texels(sensor: Sensor) -> tuple[FloatArray, FloatArray]:
+    """Centres of the texels, x (columns,) and y (rows,), mm."""
     width, height = sensor.gel.size_mm[:2]
     density = TEXELS_PER_PIXEL * pixels_per_mm(sensor)
     density = min(density, MAX_TEXELS / max(width, height))
     columns, rows = max(4, math.ceil(width * density)), max(4, math.ceil(height * density))
     x = ((np.arange(columns) + 0.5) / columns - 0.5) * width
     y = ((np.arange(rows) + 0.5) / rows - 0.5) * height
-    coating = np.array(sensor.coating.reflectance)
-    return np.clip(_paint(sensor.pattern, x, y, coating, rng), 0, 1).astype(np.float32)
+    return x, y
+
+
+def _check_detail(pattern: Pattern, texel_mm: float) -> None:
+    """Refuse what a texture cannot hold, and would take hours to paint.
+
+    Raises:
+        InputError: a spacing, cell or grain below one texel.
+    """
+    match pattern:
+        case Dots(spacing_mm=spacing):
+            field, detail = "spacing_mm", min(spacing)
+        case RandomColor(cell_mm=cell):
+            field, detail = "cell_mm", cell
+        case Speckle(grain_mm=grain):
+            field, detail = "grain_mm", grain
+        case _:
+            return
+    if detail < texel_mm:
+        raise InputError(
+            f"sensor.pattern.{field} = {detail}: far finer than this camera's pixels on the gel; "
+            f"it must be at least {texel_mm:.4g}"
+        )
 
 
 def pixels_per_mm(sensor: Sensor) -> float:
@@ -84,7 +147,7 @@ def _scale(optics: Optics, sensor: Sensor) -> float:
 def is_grey(sensor: Sensor) -> bool:
     """Whether coating, pattern and lights are all grey, so that one channel tells everything."""
     pattern = sensor.pattern
-    if isinstance(pattern, RandomColor) and pattern.saturation > 0:
+    if isinstance(pattern, Bitmap) or (isinstance(pattern, RandomColor) and pattern.saturation > 0):
         return False
     colors = [sensor.coating.reflectance, *(light.color for light in sensor.lights)]
     if isinstance(pattern, Dots | Speckle):
@@ -92,53 +155,57 @@ def is_grey(sensor: Sensor) -> bool:
     return all(color[0] == color[1] == color[2] for color in colors)
 
 
+@dataclass(frozen=True, eq=False)
+class _Canvas:
+    """What a pattern is painted on: texel centres x (columns,) and y (rows,) in mm, and the bare coating (3,)."""
+
+    x: FloatArray
+    y: FloatArray
+    coating: FloatArray
+    rng: np.random.Generator
+    folder: Path
+
+
 @singledispatch
-def _paint(pattern: object, x: FloatArray, y: FloatArray, coating: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """(rows, columns, 3) reflectance at texel centres x (columns,) and y (rows,), mm."""
+def _mark(pattern: object, canvas: _Canvas) -> tuple[FloatArray, FloatArray]:
+    """Reflectance of the marks, (3,) or (rows, columns, 3), and the share that they cover, (rows, columns)."""
+    raise TypeError(f"no way to mark {type(pattern).__name__}")
+
+
+@_mark.register
+def _dots(pattern: Dots, canvas: _Canvas) -> tuple[FloatArray, FloatArray]:
+    return np.array(pattern.reflectance), dots_coverage(pattern, canvas.x, canvas.y, canvas.rng)
+
+
+@_mark.register
+def _speckle(pattern: Speckle, canvas: _Canvas) -> tuple[FloatArray, FloatArray]:
+    return np.array(pattern.reflectance), speckle_coverage(pattern, canvas.x, canvas.y, canvas.rng)
+
+
+@_mark.register
+def _bitmap(pattern: Bitmap, canvas: _Canvas) -> tuple[FloatArray, FloatArray]:
+    colors, coverage = laid_over(pattern, read_picture(pattern, canvas.folder), canvas.x, canvas.y)
+    return colors * canvas.coating, coverage
+
+
+@singledispatch
+def _paint(pattern: object, canvas: _Canvas) -> FloatArray:
+    """(rows, columns, 3) reflectance of a pattern that covers everything."""
     raise TypeError(f"no way to paint {type(pattern).__name__}")
 
 
 @_paint.register
-def _bare(
-    pattern: NoPattern, x: FloatArray, y: FloatArray, coating: FloatArray, rng: np.random.Generator
-) -> FloatArray:
-    return np.broadcast_to(coating, (len(y), len(x), 3)).copy()
+def _bare(pattern: NoPattern, canvas: _Canvas) -> FloatArray:
+    return np.broadcast_to(canvas.coating, (len(canvas.y), len(canvas.x), 3)).copy()
 
 
 @_paint.register
-def _dots(pattern: Dots, x: FloatArray, y: FloatArray, coating: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Disks on a jittered grid; coverage falls from 1 to 0 over `softness_mm` around the radius."""
-    pitch = max(x[1] - x[0], y[1] - y[0])
-    softness = max(pattern.softness_mm, pitch)
-    coverage = np.zeros((len(y), len(x)))
-    (sx, sy), (ox, oy) = pattern.spacing_mm, pattern.offset_mm
-    c, s = math.cos(math.radians(pattern.rotation_deg)), math.sin(math.radians(pattern.rotation_deg))
-    corners = [(u - ox, v - oy) for u in (x[0], x[-1]) for v in (y[0], y[-1])]
-    along, across = [(u * c + v * s) / sx for u, v in corners], [(v * c - u * s) / sy for u, v in corners]
-    for j in range(math.floor(min(across)), math.ceil(max(across)) + 1):
-        for i in range(math.floor(min(along)), math.ceil(max(along)) + 1):
-            dx, dy, grow = rng.standard_normal(3)
-            cx = ox + i * sx * c - j * sy * s + pattern.jitter_mm * dx
-            cy = oy + i * sx * s + j * sy * c + pattern.jitter_mm * dy
-            radius = pattern.radius_mm * max(0.0, 1 + pattern.radius_jitter * grow)
-            reach = radius + softness
-            rows = slice(*np.searchsorted(y, [cy - reach, cy + reach]))
-            columns = slice(*np.searchsorted(x, [cx - reach, cx + reach]))
-            distance = np.hypot(x[None, columns] - cx, y[rows, None] - cy)
-            disk = np.clip((radius - distance) / softness + 0.5, 0, 1)
-            coverage[rows, columns] = np.maximum(coverage[rows, columns], disk)
-    return coating + coverage[:, :, None] * (np.array(pattern.reflectance) - coating)
-
-
-@_paint.register
-def _random_color(
-    pattern: RandomColor, x: FloatArray, y: FloatArray, coating: FloatArray, rng: np.random.Generator
-) -> FloatArray:
+def _random_color(pattern: RandomColor, canvas: _Canvas) -> FloatArray:
     """Square cells of random hue and value, each hue at least 1/8 turn from its left and upper neighbours'.
 
     The coating's reflectance scales the colours, so that a white cell reflects what the bare coating would.
     """
-    cell = pattern.cell_mm
+    x, y, rng, cell = canvas.x, canvas.y, canvas.rng, pattern.cell_mm
     columns = math.ceil((x[-1] - x[0]) / cell) + 2
     rows = math.ceil((y[-1] - y[0]) / cell) + 2
     hue = rng.random((rows, columns))
@@ -156,25 +223,7 @@ def _random_color(
     offset = rng.random(2) * cell
     horizontal = _blend_matrix(x, x[0] - offset[0], cell, columns, pattern.softness_mm)
     vertical = _blend_matrix(y, y[0] - offset[1], cell, rows, pattern.softness_mm)
-    return np.einsum("yr,rxk->yxk", vertical, np.einsum("xc,rck->rxk", horizontal, colors)) * coating
-
-
-@_paint.register
-def _speckle(
-    pattern: Speckle, x: FloatArray, y: FloatArray, coating: FloatArray, rng: np.random.Generator
-) -> FloatArray:
-    """Smooth noise of correlation length `grain_mm`, cut at the level that leaves `coverage` of the area dark."""
-    from scipy.ndimage import gaussian_filter
-
-    pitch = (y[1] - y[0], x[1] - x[0])
-    # Level sets of Gaussian-filtered noise have blobs of about 4 sigma across.
-    sigma = [max(0.5, pattern.grain_mm / 4 / step) for step in pitch]
-    noise = gaussian_filter(rng.standard_normal((len(y), len(x))), sigma, mode="wrap")
-    noise /= noise.std()
-    level = np.quantile(noise, 1 - pattern.coverage)
-    # The noise's rms slope is 1 / (sqrt(2) sigma) per texel: this makes the edge about one texel wide.
-    coverage = np.clip((noise - level) * math.sqrt(2) * min(sigma) + 0.5, 0, 1)
-    return coating + coverage[:, :, None] * (np.array(pattern.reflectance) - coating)
+    return np.einsum("yr,rxk->yxk", vertical, np.einsum("xc,rck->rxk", horizontal, colors)) * canvas.coating
 
 
 def _hue_distance(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -21,10 +21,12 @@ import numpy as np
 from synth.arrays import Image, Points
 from synth.errors import InputError
 from synth.render.camera_rays import CameraRays, pinhole
+from synth.render.coating import reflection
 from synth.render.gel_mesh import GelMesh
 from synth.render.lights import check_view, emitters
 from synth.render.pattern import is_grey
 from synth.render.sample_count import PILOT, needed_samples
+from synth.render.thin_lens import ThinLens
 from synth.render.variant import Variant
 from synth.scene import Coating, Render, Sensor
 from synth.surface import GelSurface
@@ -42,11 +44,11 @@ class Renderer:
         sensor: the finger.
         render: samples and path length; `samples_per_pixel` is rounded up to the next full grid (see `full_grid`).
         surface: the contact surface whose positions `radiance` gets.
-        albedo: (rows, columns, 3) float32 reflectance over the contact face, from `pattern.albedo`.
+        albedo: (rows, columns, 3 or 4) float32 over the contact face, from `pattern.albedo`.
         variant: from `choose_variant`.
 
     Raises:
-        InputError: a light in the camera's view; a lens that a scalar variant cannot render.
+        InputError: a light in the camera's view; a lens that cannot focus, or that a scalar variant cannot render.
         ValueError: a mono variant for a sensor that is not grey.
     """
 
@@ -100,11 +102,20 @@ class Renderer:
         if surface is self._mesh.surface:
             return
         self._mesh = GelMesh(surface, self._mesh.size_mm)
-        self._parameters["gel.faces"] = self._mesh.faces()
-        self._parameters["gel.vertex_texcoords"] = self._mesh.texture_coordinates()
-        self._parameters["gel.vertex_positions"] = self._mesh.positions(surface.material)
-        self._parameters["gel.vertex_normals"] = self._mesh.normals(surface.material)
+        self._replace("gel.faces", self._mesh.faces())
+        self._replace("gel.vertex_texcoords", self._mesh.texture_coordinates())
+        self._replace("gel.vertex_positions", self._mesh.positions(surface.material))
+        self._replace("gel.vertex_normals", self._mesh.normals(surface.material))
         self._parameters.update()
+
+    def _replace(self, key: str, values: Any) -> None:
+        """Set an array of another length. Scalar variants compare old and new by elements, and stop at that."""
+        if self._variant.is_vectorised:
+            self._parameters[key] = values
+            return
+        owner, kind, *_ = self._parameters.properties[key]
+        self._parameters.set_property(owner, kind, type(self._parameters[key])(values))
+        self._parameters.set_dirty(key)
 
     def radiance(self, positions: Points, seed: int) -> Image:
         """Linear radiance of the deformed gel in the main camera; zero where a pixel sees past it.
@@ -172,7 +183,9 @@ class Renderer:
         sampler.seed(seed, count * self._samples)
         pixel = dr.arange(mi.UInt32, count * self._samples) // dr.opaque(mi.UInt32, self._samples)
         pixel += dr.opaque(mi.UInt32, first)
-        ray, weight, valid = rays.sample(pixel, sampler.next_2d())
+        offset = sampler.next_2d()
+        pupil = sampler.next_2d() if rays.has_aperture else None
+        ray, weight, valid = rays.sample(pixel, offset, pupil)
         color, seen, _ = self._integrator.sample(self._scene, sampler, ray, active=valid)
         channels = [dr.select(valid & seen, color[i] * weight, 0) for i in range(1 if self._variant.is_mono else 3)]
         dr.eval(channels)  # all at once: each sum alone would trace everything anew
@@ -180,19 +193,8 @@ class Renderer:
 
     def _build_gel(self, mi: Any, coating: Coating, albedo: Image) -> Any:
         """The mesh with its coating; smooth-shaded, seen from either side."""
-        texture = albedo.mean(axis=2, keepdims=True) if self._variant.is_mono else albedo
-        reflectance = {
-            "type": "bitmap",
-            "bitmap": mi.Bitmap(np.ascontiguousarray(texture)),
-            "raw": True,
-            "wrap_mode": "clamp",
-        }
-        bsdf: dict[str, Any] = {"type": "diffuse", "reflectance": reflectance}
-        if coating.roughness < 1 or coating.metallic > 0:
-            shine = {"roughness": coating.roughness, "metallic": coating.metallic}
-            bsdf = {"type": "principled", "base_color": reflectance, **shine}
         properties = mi.Properties()
-        properties["bsdf"] = mi.load_dict({"type": "twosided", "bsdf": bsdf})
+        properties["bsdf"] = reflection(mi, coating, albedo, self._variant.is_mono)
         surface, mesh = self._mesh.surface, self._mesh
         shape = mi.Mesh(
             "gel",
@@ -257,13 +259,14 @@ def _window(sensor: Sensor, mi: Any) -> dict[str, Any]:
 
 
 def _check_further(name: str, view: Sensor) -> None:
-    """Refuse lights in a further camera's view; `emitters` looks after the main camera's.
+    """Refuse what is wrong with a further camera; `emitters` and `CameraRays` look after the main one.
 
     Raises:
-        InputError: names the camera, the light and the pixel.
+        InputError: names the camera, and the light and pixel where a light stands in its view.
     """
     try:
         check_view(view)
+        ThinLens.of(view)
     except InputError as error:
         raise InputError(f"sensor.further_cameras {name!r}: {error}") from error
 

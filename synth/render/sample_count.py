@@ -1,9 +1,8 @@
 r"""How many samples a pixel needs so that nobody sees the renderer's noise behind the camera's own.
 
 Two pilot pictures with different seeds differ by √2 times the renderer's noise, after the lens's blur and in encoded
-values, as they are seen. The camera's own noise there is
-
-.. math::  σ^2 = (read^2 + shot^2 s) \left(\frac{dv}{ds}\right)^2 + \frac{step^2}{12}
+values, as they are seen. The camera's own noise there is that of v(s + e), with v the response and e Gaussian of the
+variance read² + shot² s, by quadrature, because in the dark the response is no straight line over e; and step² / 12.
 
 Stratified sampling's noise falls at least as 1 / √samples, so the least number whose noise is below SHARE of the
 camera's follows from one pilot, on the safe side. Fewer than the pilot's are never chosen: there noise grows faster.
@@ -22,8 +21,7 @@ SHARE = 0.25
 PILOT = 16
 """Samples a pixel of the pilots."""
 MOST = 4096
-_DARKEST = 1 / 255
-"""Encoded values below have no finite slope of their response."""
+_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(15)
 
 
 def needed_samples(first: Image, second: Image, camera: Camera, samples: int) -> int:
@@ -48,11 +46,15 @@ def render_noise(first: Image, second: Image, camera: Camera) -> float:
 
 def camera_noise(radiance: Image, camera: Camera) -> float:
     """Root mean square of the camera's own noise, quantisation included, encoded, full scale 1."""
-    signal = np.clip(expected_signal(radiance, camera), _DARKEST**camera.gamma, 1)
-    slope = signal ** (1 / camera.gamma - 1) / camera.gamma
+    signal = np.clip(expected_signal(radiance, camera), 0, 1)
+    deviation = np.sqrt(camera.read_noise**2 + camera.shot_noise**2 * signal)
+    mean, square = np.zeros_like(signal), np.zeros_like(signal)
+    for node, weight in zip(_NODES, _WEIGHTS / _WEIGHTS.sum(), strict=True):
+        value = encoded(signal + node * deviation, camera)
+        mean += weight * value
+        square += weight * value**2
     step = 1 / (2**camera.bit_depth - 1)
-    variance = (camera.read_noise**2 + camera.shot_noise**2 * signal) * slope**2 + step**2 / 12
-    return float(np.sqrt(variance.mean()))
+    return float(np.sqrt(np.maximum(square - mean**2, 0.0).mean() + step**2 / 12))
 
 
 def encoded(signal: FloatArray, camera: Camera) -> FloatArray:

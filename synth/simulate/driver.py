@@ -15,11 +15,13 @@ class Driver:
             iterations instead of 96.)
         correction_iterations: of Newton's method in one augmented-Lagrangian pass; a correction that needs more is
             dropped.
+        single_precision: factorise the tangent in float32; its rounding is iterated away (`synth.simulate.linear`).
     """
 
     loose: float = 1e-3
     extrapolate: bool = True
     correction_iterations: int = 10
+    single_precision: bool = True
 
 
 STANDARD = Driver()

@@ -1,32 +1,28 @@
 """Where on the contact face an indenter will touch, from its shape and path alone.
 
-The overlap is the part of the undeformed gel, z >= 0, that lies inside the indenter at a pose; its footprint is the
-smallest axis-parallel rectangle of the contact face over it. The true contact differs: gel bulges at the contact's rim
+The overlap is the part of the undeformed gel that lies inside the indenter at a pose; its footprint is the smallest
+axis-parallel rectangle of the contact face over it. The true contact differs: gel bulges at the contact's rim
 and lifts with it, friction drags it along. `margin` is for that. A drag carries the gel it sticks to, so the gel that
 is touched is that under the press, and beyond it what the indenter reaches on its way.
 
 The search halves cells of space (branch and bound) and leaves those that hold nothing of the body or could not make
 the rectangle larger, so that no part is missed however thin. With d and n the signed distance and its gradient at a
 cell's centre and h the cell's half edges, the distance in the cell is at least d - |n| . h (by components) for a convex
-body, whose distance is a convex function, and d - |h| for any.
+body, whose distance is a convex function, and d - |h| for any. So it is for the height of a domed face over a point,
+which is convex, too: the cells hold no gel where it is above zero throughout.
 """
-
-# Kernels are written in Warp's own language; their annotations only look like Python's.
-# mypy: disable-error-code="valid-type, no-untyped-def"
 
 from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
-import warp as wp
 
 from synth.arrays import BoolArray, FloatArray, Points
 from synth.mesh.focus import Focus
-from synth.simulate.distance import KINDS, shape_vector, signed_distance
-from synth.simulate.indenter import RigidBody
+from synth.mesh.pad import face_height
+from synth.simulate.distance import KINDS
+from synth.simulate.measure import Distance
 from synth.simulate.path import Path, Pose
-
-wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 RESOLUTION = 2e-3
 """The rectangle falls short of the true one, on each side, by at most this fraction of its smaller width."""
@@ -57,12 +53,10 @@ def footprint(path: Path, size_mm: tuple[float, float, float], margin: float) ->
     """
     if not margin > -1:
         raise ValueError(f"margin = {margin} must be above -1")
-    press = _rectangle(path.body, [path.pose(path.press_mm)], size_mm)
+    press = _rectangle(path, [path.pose(path.press_mm)], size_mm)
     even = np.linspace(path.press_mm, path.length_mm, POSES)
     after = np.unique(np.concatenate([even, path.ends[path.ends > path.press_mm]]))
-    drag = (
-        _rectangle(path.body, [path.pose(float(s)) for s in after], size_mm) if path.length_mm > path.press_mm else None
-    )
+    drag = _rectangle(path, [path.pose(float(s)) for s in after], size_mm) if path.length_mm > path.press_mm else None
     found = []
     if press is not None:
         found.append(press + margin / 2 * (press[1] - press[0]) * np.array([[-1.0], [1.0]]))
@@ -77,13 +71,14 @@ def footprint(path: Path, size_mm: tuple[float, float, float], margin: float) ->
     return Focus((float(centre[0]), float(centre[1])), (float(half[0]), float(half[1]))).clipped(size_mm)
 
 
-def _rectangle(body: RigidBody, poses: Sequence[Pose], size_mm: tuple[float, float, float]) -> FloatArray | None:
+def _rectangle(path: Path, poses: Sequence[Pose], size_mm: tuple[float, float, float]) -> FloatArray | None:
     """(2, 2) lower and upper x, y of the pad's overlap with a body at any of the poses; None where there is none."""
-    poses = [pose for pose in poses if pose.depth_mm > 0]
+    body = path.body
+    poses = [pose for pose in poses if pose.depth_mm + path.face_mm > 0]
     if not poses:
         return None
-    distance = _Distance(body, poses)
-    deepest = min(max(pose.depth_mm for pose in poses), size_mm[2])
+    distance = Distance(body, np.array([p.centre for p in poses]), np.array([p.rotation for p in poses]))
+    deepest = min(max(pose.depth_mm for pose in poses) + path.face_mm, size_mm[2])
     lower, upper = (
         np.array([-size_mm[0] / 2, -size_mm[1] / 2, 0.0]),
         np.array([size_mm[0] / 2, size_mm[1] / 2, deepest]),
@@ -95,9 +90,10 @@ def _rectangle(body: RigidBody, poses: Sequence[Pose], size_mm: tuple[float, flo
     found: FloatArray | None = None
     while True:
         normal, away = distance(centres, pose)
-        found = _joined(found, centres[away <= 0, :2])
+        lack, slope = _lack(centres, path.dome_radius_mm)
+        found = _joined(found, centres[(away <= 0) & (lack <= 0), :2])
         reach = np.abs(normal) @ half if body.kind in _CONVEX else np.linalg.norm(half)
-        keep = (away <= reach) & _beyond(found, centres, half)
+        keep = (away <= reach) & (lack <= slope @ half) & _beyond(found, centres, half)
         if not keep.any():
             return found
         centres, pose = centres[keep], pose[keep]
@@ -107,6 +103,18 @@ def _rectangle(body: RigidBody, poses: Sequence[Pose], size_mm: tuple[float, flo
         signs = np.array(list(product(*((-0.5, 0.5) if cut else (0.0,) for cut in split))))
         centres = (centres[:, None, :] + signs * half).reshape(-1, 3)
         pose, half = np.repeat(pose, len(signs)), np.where(split, half / 2, half)
+
+
+def _lack(points: Points, dome_radius_mm: float | None) -> tuple[FloatArray, FloatArray]:
+    """How far (n,) mm points (n, 3) on a pad's side of z = 0 are from being gel along z, and the slopes (n, 3) of that.
+
+    Slopes are without signs.
+    """
+    if dome_radius_mm is None:
+        return -points[:, 2], np.tile([0.0, 0.0, 1.0], (len(points), 1))
+    face = face_height(points[:, :2], dome_radius_mm)
+    tilt = np.abs(points[:, :2]) / (dome_radius_mm - face)[:, None]
+    return face - points[:, 2], np.column_stack([tilt, np.ones(len(points))])
 
 
 def _joined(rectangle: FloatArray | None, points: FloatArray) -> FloatArray | None:
@@ -122,44 +130,3 @@ def _beyond(found: FloatArray | None, centres: Points, half: FloatArray) -> Bool
     allowed = RESOLUTION * (found[1] - found[0]).min()
     low, high = centres[:, :2] - half[:2] < found[0] - allowed, centres[:, :2] + half[:2] > found[1] + allowed
     return np.asarray((low | high).any(axis=1))
-
-
-class _Distance:
-    """Signed distance of points of the gel from one body at one of several poses."""
-
-    def __init__(self, body: RigidBody, poses: Sequence[Pose]) -> None:
-        """Hand body and poses to the kernel's device."""
-        self._kind = body.kind
-        self._constant = [
-            wp.array(body.shape[None], dtype=shape_vector, device="cpu"),
-            wp.array(body.coefficients[None], dtype=wp.float64, device="cpu"),
-            wp.array(np.array([pose.centre for pose in poses]), dtype=wp.vec3d, device="cpu"),
-            wp.array(np.array([pose.rotation for pose in poses]), dtype=wp.mat33d, device="cpu"),
-        ]
-
-    def __call__(self, points: Points, pose: np.ndarray) -> tuple[FloatArray, FloatArray]:
-        """Outward normals (n, 3), pad's frame, and distances (n,) mm of points (n, 3) from the body at poses (n,)."""
-        found = wp.empty(len(points), dtype=wp.vec4d, device="cpu")
-        posed = [wp.array(points, dtype=wp.vec3d, device="cpu"), wp.array(pose, dtype=wp.int32, device="cpu")]
-        wp.launch(_measure, len(points), inputs=[self._kind, *self._constant, *posed], outputs=[found], device="cpu")
-        values = found.numpy()
-        return values[:, :3], values[:, 3]
-
-
-@wp.kernel
-def _measure(
-    kind: int,
-    shape: wp.array(dtype=shape_vector),
-    coefficients: wp.array4d(dtype=wp.float64),
-    centres: wp.array(dtype=wp.vec3d),
-    rotations: wp.array(dtype=wp.mat33d),
-    points: wp.array(dtype=wp.vec3d),
-    pose: wp.array(dtype=int),
-    found: wp.array(dtype=wp.vec4d),
-):
-    i = wp.tid()
-    p = pose[i]
-    y = wp.transpose(rotations[p]) * (points[i] - centres[p])
-    d = signed_distance(kind, shape[0], y, 0, coefficients)
-    n = rotations[p] * wp.vec3d(d[0], d[1], d[2])
-    found[i] = wp.vec4d(n[0], n[1], n[2], d[3])

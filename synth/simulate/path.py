@@ -1,6 +1,12 @@
 """Where the indenter is along its way: down, then sideways and round at once, then from pose to pose.
 
 The path parameter is a length in mm: the distance that the farthest touching point moves, leg by leg.
+
+Depth counts from the undeformed face below motion.position_mm: at 0 the indenter's lowest point is level with it. On a
+flat pad that is where it touches, and where the path starts. On a dome a body that comes down beside the apex meets the
+gel toward the apex before that, and one whose lowest points are off its axis (a ring) touches later: there the path
+starts where it first touches the sphere of which the face is a part. Sideways moves keep the level, whatever the face
+does.
 """
 
 from dataclasses import dataclass
@@ -9,11 +15,16 @@ from functools import cached_property
 import numpy as np
 
 from synth.arrays import FloatArray
+from synth.mesh.pad import face_height
 from synth.scene import Motion
+from synth.simulate.distance import KINDS
 from synth.simulate.indenter import RigidBody, rotation_about
+from synth.simulate.measure import Distance
 
 TWIST_ARM_MM = 3.0
 """Lever that turns a twist angle into a path length: about a contact's radius."""
+TOUCH_MM = 1e-6
+"""The path starts so far off the gel, at most."""
 
 
 @dataclass(frozen=True)
@@ -29,16 +40,57 @@ class Pose:
 
 @dataclass(frozen=True)
 class Path:
-    """The way of one indenter."""
+    """The way of one indenter over a pad whose face is flat or of the given radius."""
 
     motion: Motion
     body: RigidBody
+    dome_radius_mm: float | None = None
+
+    @cached_property
+    def face_mm(self) -> float:
+        """Z of the undeformed face at motion.position_mm."""
+        return float(face_height(np.array([self.motion.position_mm]), self.dome_radius_mm)[0])
+
+    @cached_property
+    def touch_mm(self) -> float:
+        """Depth at which the body first touches on its way straight down; if the press ends before that, its depth.
+
+        The body touches the sphere where the sphere's centre is a radius away from it: found by halving. For meshes,
+        whose distance is approximate so far away, the depth at which they are level with the apex.
+        """
+        radius = self.dome_radius_mm
+        if radius is None:
+            return 0.0
+        low, high = 0.0 - self.face_mm, max(self.motion.depth_mm, 0.0)
+        if self.body.kind == KINDS["mesh"]:
+            return low
+        if self._off_mm(high, radius) >= 0:
+            return high
+        while high - low > TOUCH_MM:
+            middle = (low + high) / 2
+            low, high = (low, middle) if self._off_mm(middle, radius) < 0 else (middle, high)
+        return low
+
+    def _off_mm(self, depth: float, radius: float) -> float:
+        """How far the body at a depth is from the dome's sphere."""
+        place = np.array([[*self.motion.position_mm, self._level(depth)]])
+        distance = Distance(self.body, place, self.body.rotation[None])
+        return float(distance(np.array([[0.0, 0.0, radius]]), np.zeros(1, dtype=np.int32))[1][0]) - radius
+
+    @property
+    def may_touch(self) -> bool:
+        """Whether the body ever goes below the undeformed face: for a dome, below its apex."""
+        return bool(self.corners[:, 0].max() + self.face_mm > 0)
+
+    def _level(self, depth: float) -> float:
+        """Z of the body's origin."""
+        return depth + self.face_mm - self.body.reach_mm
 
     @cached_property
     def corners(self) -> FloatArray:
         """(k, 4) depth, shear x, shear y (mm) and twist (deg) at the start and at the end of each leg that moves."""
         motion = self.motion
-        start = min(motion.depth_mm, 0.0)
+        start = min(motion.depth_mm, self.touch_mm)
         poses = [(start, 0.0, 0.0, 0.0), (motion.depth_mm, 0.0, 0.0, 0.0)]
         poses.append((motion.depth_mm, *motion.shear_mm, motion.twist_deg))
         poses += [(pose.depth_mm, *pose.shear_mm, pose.twist_deg) for pose in motion.then]
@@ -58,7 +110,7 @@ class Path:
     @property
     def press_mm(self) -> float:
         """Length of the first leg, straight down."""
-        return max(self.motion.depth_mm, 0.0)
+        return max(self.motion.depth_mm - self.touch_mm, 0.0)
 
     @property
     def length_mm(self) -> float:
@@ -69,7 +121,7 @@ class Path:
         """The indenter at path length s, 0 <= s <= length_mm."""
         depth, x, y, twist = (float(np.interp(s, self.ends, column)) for column in self.corners.T)
         motion = self.motion
-        centre = np.array([motion.position_mm[0] + x, motion.position_mm[1] + y, depth - self.body.reach_mm])
+        centre = np.array([motion.position_mm[0] + x, motion.position_mm[1] + y, self._level(depth)])
         return Pose(depth, (x, y), twist, centre, rotation_about(2, np.radians(twist)) @ self.body.rotation)
 
     def records(self) -> FloatArray:

@@ -6,7 +6,6 @@ it the linear solver's symbolic analysis.
 
 import hashlib
 from collections import OrderedDict
-from functools import cached_property
 
 import numpy as np
 
@@ -52,6 +51,7 @@ class Pattern:
         self.face_pairs = _pairs(space.faces.shape[1])
         self.face_slot = self._blocks(faces, self.face_pairs)
         self.face_unknowns = faces.reshape(len(faces), -1)
+        self._factors: dict[bool, Factor] = {}
         del self._keys
 
     @property
@@ -59,10 +59,11 @@ class Pattern:
         """Number of entries."""
         return len(self.indices)
 
-    @cached_property
-    def factor(self) -> Factor:
-        """The linear solver's factor for this pattern, analysed once."""
-        return direct_factor(self.indptr, self.indices)
+    def factor(self, single: bool = True) -> Factor:
+        """The linear solver's factor for this pattern in single or double precision, analysed once."""
+        if single not in self._factors:
+            self._factors[single] = direct_factor(self.indptr, self.indices, single)
+        return self._factors[single]
 
     def _couple(self, moves: np.ndarray, pressures: np.ndarray | None) -> None:
         import scipy.sparse as sp

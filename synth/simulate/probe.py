@@ -27,7 +27,7 @@ def probe(space: Space, points: FloatArray) -> Any:
     """
     import scipy.sparse as sp
 
-    faces = space.faces[(space.points[space.faces[:, :3]][:, :, 2] == 0).all(axis=1)]
+    faces = space.faces[space.coated]
     a, b, c = np.moveaxis(space.points[faces[:, :3], :2], 1, 0)
     face, best = np.zeros(len(points), dtype=np.int64), np.zeros((len(points), 3))
     for first in range(0, len(points), CHUNK):

@@ -6,6 +6,7 @@ from pathlib import Path as FilePath
 from synth.errors import InputError
 from synth.mesh import PadMesh, check_mesh
 from synth.scene import Gel, Scene
+from synth.simulate.driver import STANDARD, Driver
 from synth.simulate.element import Element, p1p1, p2p1
 from synth.simulate.indenter import rigid_body
 from synth.simulate.material import pad_material
@@ -24,6 +25,7 @@ def simulate(
     folder: FilePath | None = None,
     device: str = "cpu",
     frames: frozenset[int] | None = None,
+    driver: Driver = STANDARD,
 ) -> Trajectory:
     """Press, shear and twist one scene's indenter into its pad.
 
@@ -34,11 +36,12 @@ def simulate(
         device: Warp device.
         frames: numbers of the states that are wanted, default all. The others are part of the trajectory, but keep the
             penalty's penetration; those that are wanted are the same to the bit.
+        driver: of Newton's method.
 
     Raises:
         InputError: the indenter cannot be built.
     """
-    return simulate_batch([scene], mesh, folder, device, frames)[0]
+    return simulate_batch([scene], mesh, folder, device, frames, driver)[0]
 
 
 def simulate_batch(
@@ -47,12 +50,17 @@ def simulate_batch(
     folder: FilePath | None = None,
     device: str = "cpu",
     frames: frozenset[int] | None = None,
+    driver: Driver = STANDARD,
 ) -> list[Trajectory]:
     """Simulate scenes that share pad, materials and numerics side by side; each as if it were alone."""
     first = scenes[0]
     for scene in scenes:
-        if scene.sensor.gel.size_mm != mesh.size_mm:
-            raise InputError(f"the mesh is of a {mesh.size_mm} mm pad, the scene's is {scene.sensor.gel.size_mm} mm")
+        gel = scene.sensor.gel
+        if (gel.size_mm, gel.dome_radius_mm) != (mesh.size_mm, mesh.dome_radius_mm):
+            raise InputError(
+                f"the mesh is of a {mesh.size_mm} mm pad of dome radius {mesh.dome_radius_mm}, "
+                f"the scene's is {gel.size_mm} mm with {gel.dome_radius_mm}"
+            )
         if (_elastic(scene.sensor.gel), scene.numerics) != (_elastic(first.sensor.gel), first.numerics):
             raise InputError("the scenes of a batch must share the gel's materials and numerics")
     check_mesh(mesh)
@@ -64,12 +72,14 @@ def simulate_batch(
         batch=len(scenes),
         penalty=first.numerics.penalty,
         device=device,
+        single=driver.single_precision,
     )
     resolved = mesh.spacing_mm / (2 * space.element.order)
-    paths = [Path(scene.motion, rigid_body(scene.contact.indenter, folder, resolved)) for scene in scenes]
+    bodies = [rigid_body(scene.contact.indenter, folder, resolved) for scene in scenes]
+    paths = [Path(scene.motion, body, mesh.dome_radius_mm) for scene, body in zip(scenes, bodies, strict=True)]
     moduli = [scene.sensor.gel.youngs_modulus_kpa / 1000 for scene in scenes]
     friction = [scene.contact.friction for scene in scenes]
-    return Stepper(system, paths, friction, first.numerics, moduli, frames=frames).run()
+    return Stepper(system, paths, friction, first.numerics, moduli, driver, frames).run()
 
 
 def _elastic(gel: Gel) -> tuple[float, ...]:

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from synth.arrays import BoolArray, Points, Tets
-from synth.mesh import PadMesh
+from synth.mesh import PadMesh, face_height
 from synth.simulate.element import EDGES, Element
 from synth.surface import FACE_EDGES, ContactFaces
 
@@ -41,18 +41,23 @@ class Space:
 
     @cached_property
     def surface_nodes(self) -> np.ndarray:
-        """(s,) int: displacement nodes of the coated face z = 0, in the order of `surface.nodes`."""
+        """(s,) int: displacement nodes of the coated contact face, in the order of `surface.nodes`."""
         return np.unique(self._coated)
 
     @cached_property
     def surface(self) -> ContactFaces:
-        """The coated face z = 0."""
+        """The coated contact face."""
         nodes = self.surface_nodes
         return ContactFaces(self.points[nodes], np.searchsorted(nodes, self._coated).astype(np.int32))
 
     @cached_property
     def _coated(self) -> np.ndarray:
-        return self.faces[(self.points[self.faces][:, :, 2] == 0).all(axis=1)]
+        return self.faces[self.coated]
+
+    @cached_property
+    def coated(self) -> BoolArray:
+        """(f,) which of the faces make up the contact face; the others are the pad's sides."""
+        return np.asarray(self.mesh.on_face[self.faces[:, :3]].all(axis=1))
 
 
 def function_space(mesh: PadMesh, element: Element) -> Space:
@@ -63,7 +68,7 @@ def function_space(mesh: PadMesh, element: Element) -> Space:
     bonded = mesh.bonded
     if element.order == 2:
         edges, number = _edges(mesh.tets)
-        points = np.concatenate([mesh.points, mesh.points[edges].mean(axis=1)])
+        points = np.concatenate([mesh.points, _middles(mesh, edges)])
         nodes = np.concatenate([mesh.tets, vertices + number], axis=1)
         key = edges[:, 0].astype(np.int64) * vertices + edges[:, 1]
         middle = []
@@ -84,6 +89,19 @@ def function_space(mesh: PadMesh, element: Element) -> Space:
         held=np.repeat(bonded[:, None], 3, axis=1),
         faces=np.ascontiguousarray(faces, dtype=np.int32),
     )
+
+
+def _middles(mesh: PadMesh, edges: np.ndarray) -> Points:
+    """(e, 3) mid-edge nodes: half way, but those of a dome's face on the sphere.
+
+    What touches, and what is rendered, is then smooth. The bulk is integrated over straight-sided elements, which makes
+    an error of the order of h²/R, as their chords do.
+    """
+    middles = np.asarray(mesh.points[edges].mean(axis=1))
+    if mesh.dome_radius_mm is not None:
+        on_face = mesh.on_face[edges].all(axis=1)
+        middles[on_face, 2] = face_height(middles[on_face, :2], mesh.dome_radius_mm)
+    return middles
 
 
 def _edges(tets: Tets) -> tuple[np.ndarray, np.ndarray]:

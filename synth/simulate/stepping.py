@@ -118,7 +118,7 @@ class Stepper:
         """The undeformed states; a path that never touches stays in them and needs no solve."""
         for sample in self.samples:
             sample.states = [self._rest(sample.path.pose(0.0))]
-            if sample.path.corners[:, 0].max() <= 0:
+            if not sample.path.may_touch:
                 for record in sample.path.records():
                     sample.states.append(self._rest(sample.path.pose(float(record))))
                 sample.next = len(sample.waypoints)

@@ -78,6 +78,7 @@ class System:
         penalty: contact stiffness, E per mm.
         load: (n, 3) dead nodal forces in E mm², or None.
         device: Warp device.
+        single: factorise tangents in single precision.
     """
 
     def __init__(
@@ -88,10 +89,12 @@ class System:
         penalty: float = 50.0,
         load: FloatArray | None = None,
         device: str = "cpu",
+        single: bool = True,
     ) -> None:
         self.space, self.batch, self.penalty, self.device, self.load = space, batch, penalty, device, load
         self.mixed = material.mixed and space.element.has_pressure
         self._pattern = pattern_of(space, self.mixed)
+        self._single = single
         self._bulk = bulk_tables(space, material, self.mixed, device)
         self._faces = face_tables(space, device)
         self._lattice = fold_tables(space, material, device)
@@ -246,7 +249,7 @@ class System:
         step = self.zero()
         moves = step.u[0].size
         full = np.zeros(moves + step.p.shape[1])
-        factor = self._pattern.factor
+        factor = self._pattern.factor(self._single)
         for s in np.flatnonzero(active):
             full[self.free] = np.nan
             if factor.factorise(tangent.values[s]):
@@ -322,7 +325,7 @@ class System:
         """Traction at the surface's nodes; the mean with the shape functions themselves would weigh P2 corners by 0."""
         element = self.space.element
         hat = element.face_shape if element.order == 1 else broken_linear_face(element.face_barycentric)
-        coated = (self.space.points[self.space.faces][:, :, 2] == 0).all(axis=1)  # the sides would water down the rim
+        coated = self.space.coated  # the sides would water down the rim
         faces, weight, traction = self.space.faces[coated], weight[coated], traction[:, coated]
         nodal = np.zeros((self.batch, len(self.space.points), 3))
         area = np.zeros(len(self.space.points))

@@ -8,27 +8,21 @@ import json
 import os
 import sys
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from synth.errors import InputError
-from synth.mesh import PadMesh, pad_mesh
+from synth.mesh import PadMesh
 from synth.mesh.tetrahedralise import shape_quality
 from synth.scene import Scene
-from synth.simulate import Trajectory, pattern, simulate
-from synth.simulate.footprint import footprint
-from synth.simulate.indenter import rigid_body
-from synth.simulate.path import Path as IndenterPath
-from synth.simulate.resolution import MARGIN, graded_mesh
+from synth.simulate import Trajectory, simulate
+from synth.simulate.driver import Driver
+from synth.simulate.resolution import resolve
 from synth.stress.cases import Case, Run
 from synth.stress.inputs import altered_mesh, write_surface
 from synth.template import load_scene
-
-ACROSS = 6
-"""Elements across the contact of a graded mesh."""
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -36,9 +30,6 @@ def main(arguments: Sequence[str]) -> int:
     folder, meshes = Path(arguments[0]), Path(arguments[1])
     asked = json.loads((folder / "run.json").read_text(encoding="utf-8"))
     run = Run(Case.model_validate(asked["case"]), asked["element"], asked["budget_s"], Path(asked["base"]))
-    if run.case.factor == "double":
-        # No scene can ask for it: it would only cost time. This process runs nothing else.
-        pattern.direct_factor = partial(pattern.direct_factor, single=False)
     try:
         scene, mesh, trajectory = simulated(run, folder, meshes)
         record = saved(scene, mesh, trajectory, folder)
@@ -61,19 +52,11 @@ def simulated(run: Run, folder: Path, meshes: Path) -> tuple[Scene, PadMesh, Tra
         assignments = [*assignments, f"contact.indenter={{ shape = 'mesh', file = '{file}' }}"]
     template = load_scene(run.base, assignments)
     scene = template.corners[0]  # no distributions: all corners are the same
-    mesh = _mesh(scene, folder, meshes)
+    mesh = resolve(scene, folder, [meshes]).mesh
     if run.case.mesh != "as made":
         mesh = altered_mesh(mesh, run.case.mesh)
-    return scene, mesh, simulate(scene, mesh, folder)
-
-
-def _mesh(scene: Scene, folder: Path, meshes: Path) -> PadMesh:
-    """Of even edge length where the scene gives one, else graded around the contact."""
-    gel = scene.sensor.gel
-    if scene.numerics.edge_length_mm is not None:
-        return pad_mesh(gel, scene.numerics, [meshes])
-    way = IndenterPath(scene.motion, rigid_body(scene.contact.indenter, folder))
-    return graded_mesh(gel, footprint(way, gel.size_mm, MARGIN), ACROSS)[0]
+    driver = Driver(single_precision=run.case.factor == "single")
+    return scene, mesh, simulate(scene, mesh, folder, driver=driver)
 
 
 def saved(scene: Scene, mesh: PadMesh, trajectory: Trajectory, folder: Path) -> dict[str, Any]:

@@ -109,6 +109,11 @@ class ForwardCamera:
                 free &= ~plate.crossed(self.eye, turn) & ~plate.crossed(turn, end)
         return free
 
+    def entrances(self, points: Points, path: int) -> Points:
+        """Where light from points (n, 3) leaves the body on its way to the camera; at index 1 the eye or its image."""
+        aim = self._aim(points, path) if self.index > 1 else np.broadcast_to(self.eye, points.shape)
+        return self.plates[path - 1].reflected(aim) if path > 0 else aim
+
     def _aim(self, points: Points, path: int) -> Points:
         """Where the camera has to look, straight, to see points: the crossing of the window's face, or the points."""
         origin, up = np.array([0.0, 0.0, self.face_z]), _UP

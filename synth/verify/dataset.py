@@ -8,6 +8,7 @@ from synth.dataset.reader import Dataset, SampleData, read_dataset
 from synth.errors import InputError
 from synth.scene import Scene, Sensor
 from synth.verify.camera import ForwardCamera
+from synth.verify.dome import check_dome
 from synth.verify.motion import check_motion
 from synth.verify.photometry import check_photometry
 from synth.verify.report import Check, Report, SampleReport
@@ -74,7 +75,10 @@ def _view_checks(sensor: Sensor, backward: bool, sample: SampleData) -> list[Che
         Sheet(forward, sample.surface.triangles, sample.surface.positions(u), camera.width, camera.height)
         for u in (sample.displacement1, sample.displacement2)
     ]
-    checks = check_motion("forward", states[0], states[1], flow.forward, flow.forward_visible)
+    checks = []
+    if sensor.gel.dome_radius_mm is not None:
+        checks.append(check_dome(forward, sample.surface, sensor.gel.dome_radius_mm, camera))
+    checks += check_motion("forward", states[0], states[1], flow.forward, flow.forward_visible)
     if flow.backward is not None and flow.backward_visible is not None:
         checks += check_motion("backward", states[1], states[0], flow.backward, flow.backward_visible)
     elif backward:

@@ -28,12 +28,12 @@ from synth.cli import main
 from synth.errors import InputError
 from synth.sampling import draw, pairs_of
 from synth.simulate import simulate
-from synth.simulate.resolution import resolve, scale_px_per_mm
+from synth.simulate.resolution import LADDER, Fineness, ladder, resolve, scale_px_per_mm
 from synth.template import load_scene
 
 ROOT = Path(__file__).parents[2]
-TARGET = 0.007
-"""px, such that the first draw is given 6 elements across and the second 4."""
+TARGET = 0.004
+"""px, such that the first draw is given 4 elements across and the second 6."""
 BUDGETED = TEXT.replace("edge_length_mm = 1.25", f"target_error_px = {TARGET}").replace("steps = 2", "steps = 3")
 SMALL = Reference(across=8, step_mm=0.1)
 
@@ -60,10 +60,11 @@ def done(study: Study, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def measured(rung: int, seconds: float = 1.0, unknowns: int = 100, status: str = "complete") -> Measurement:
-    spacing = 1.8 / rung if rung else 0.1
+def measured(rung: int | str, seconds: float = 1.0, unknowns: int = 100, status: str = "complete") -> Measurement:
+    name = rung if isinstance(rung, str) else f"{rung}x2"
+    spacing = 0.1 if isinstance(rung, str) else 1.8 / rung
     return Measurement(
-        scene="tiny", index=0, rung=rung, status=status, reason="" if status == "complete" else "stuck",
+        scene="tiny", index=0, rung=name, status=status, reason="" if status == "complete" else "stuck",
         seconds=seconds, wall_s=seconds, setup_s=0.0, unknowns=unknowns, spacing_mm=spacing, predicted_px=0.4,
         penetration_mm=0.001, iterations=1, attempt=0, mesh="", machine="m",
     )  # fmt: skip
@@ -72,7 +73,7 @@ def measured(rung: int, seconds: float = 1.0, unknowns: int = 100, status: str =
 def judged(errors: dict[int, float], chosen: int, target: float = 0.5, **changes: object) -> Verdict:
     """A draw whose rungs cost across seconds, and by unknowns (across / 4)^1.5."""
     rungs = tuple(Rung(measured(k, seconds=k, unknowns=25 * k), error) for k, error in errors.items())
-    verdict = Verdict("tiny", 0, "sphere", 0.5, target, chosen, 0.4, rungs, measured(REFERENCE))
+    verdict = Verdict("tiny", 0, "sphere", 0.5, target, f"{chosen}x2", 0.4, rungs, measured(REFERENCE))
     return replace(verdict, **changes)  # type: ignore[arg-type]
 
 
@@ -101,7 +102,7 @@ def test_chosen_is_cheaper_than_needed() -> None:
     assert verdict.ratio() == 0.5
     assert verdict.affordable()
     (row,) = [line for line in misses([verdict], []) if line.startswith("| tiny")]
-    assert "8 across would have, 2 times the time" in row
+    assert "8x2 would have, 2 times the time" in row
     assert "predicted 1.5 times too little" in row
 
 
@@ -197,7 +198,7 @@ def test_a_draw_is_that_of_generate(study: Study) -> None:
     frames = {k for pair in pairs_of(template, 2, 1, one.scene.motion.steps) for k in pair.frames}
     assert one.frames == frames
     assert one.judged == sorted(frames - {0})
-    mesh, spacing_mm = one.mesh(one.chosen.across)
+    mesh, spacing_mm = one.mesh(one.chosen_rung)
     assert mesh.hash == one.chosen.mesh.hash
     assert one.predicted_px(spacing_mm) == one.chosen.error_px
 
@@ -206,7 +207,7 @@ def test_a_press_is_that_of_generate(study: Study) -> None:
     """To the bit. Fails with corrections dropped after 1 iteration, all frames wanted, and another penalty."""
     one = drawn(study.templates[0], 2, 1)
     assert len(one.judged) < one.scene.motion.steps  # else it says nothing about the frames
-    mesh, _ = one.mesh(4)
+    mesh, _ = one.mesh("4x2")
     folder = one.template.source.parent
     theirs = simulate(one.scene, mesh, folder, frames=one.frames)
     ours = ready_stepper(one.scene, mesh, folder, one.frames).run()[0]
@@ -223,10 +224,10 @@ def test_a_press_that_cannot_be_set_up(study: Study, tmp_path: Path, monkeypatch
 
     monkeypatch.setattr(budget_press, "ready_stepper", refuse)
     with Store(tmp_path, study) as store:
-        store.keep(press(study, Job("tiny", 1, 4)))
+        store.keep(press(study, Job("tiny", 1, "4x2")))
     with Store(tmp_path, study) as store:
         (kept,) = store.measurements.values()
-    assert (kept.job, kept.status, kept.reason) == (Job("tiny", 1, 4), "refused", "no body")
+    assert (kept.job, kept.status, kept.reason) == (Job("tiny", 1, "4x2"), "refused", "no body")
     assert np.isnan([kept.seconds, kept.penetration_mm]).all()
     assert list((tmp_path / "fields").iterdir()) == []
 
@@ -247,7 +248,7 @@ def test_reference_is_finer_every_way() -> None:
     for index in (3, 12):  # the smallest and the largest contact of the first twenty
         one = drawn(template, 2, index)
         mesh, fine = Reference().mesh(one.scene.sensor.gel, one.focus)
-        finest, spacing_mm = one.mesh(16)
+        finest, spacing_mm = one.mesh(str(ladder(one.scene.sensor.gel, one.focus)[-1]))
         assert fine < spacing_mm
         planes, theirs = (np.unique(m.points[:, 2]) for m in (mesh, finest))
         assert len(planes) > len(theirs)
@@ -261,22 +262,25 @@ def test_reference_is_finer_every_way() -> None:
 
 def test_rungs_and_order_of_work(study: Study) -> None:
     """Fails with one rung beyond the chosen one, and with the ladder's presses first."""
-    whole = replace(study, ladder=(4, 6, 8, 10, 12, 14, 16))
-    assert whole.rungs(4) == [4, 6, 8, 16]
-    assert whole.rungs(12) == [4, 6, 8, 10, 12, 14, 16]
-    assert whole.rungs(16) == [4, 6, 8, 10, 12, 14, 16]
+    whole = replace(study, across=LADDER)
     draws = [drawn(study.templates[0], 2, index) for index in range(2)]
-    assert [one.chosen.across for one in draws] == [6, 4]
+    assert [one.chosen.across for one in draws] == [4, 6]
+    names = [str(fineness) for fineness in ladder(draws[0].scene.sensor.gel, draws[0].focus)]
+    for place, fineness in enumerate(map(Fineness.of, names)):
+        chosen = replace(draws[0].chosen, across=fineness.across, through=fineness.through)
+        found = whole.rungs(replace(draws[0], chosen=chosen))
+        assert found == [*names[: place + 4], *([names[-1]] if place + 4 < len(names) else [])]
     every = list(jobs(whole, draws))
     assert [job.rung for job in every[:2]] == [REFERENCE, REFERENCE]
-    assert [job.rung for job in every[2:]] == sorted((job.rung for job in every[2:]), reverse=True)
+    sizes = [len(draws[job.index].mesh(job.rung)[0].points) for job in every[2:]]
+    assert sizes[0] > 3 * sizes[-1]  # by work, in which the length of the path counts, too
 
 
 def test_what_would_end_too_late_is_not_begun() -> None:
     """Fails with the deadline left out, with a begun job begun again, and with the last pace, not the largest."""
     now = [0.0]
-    long, middle, short = (Job("tiny", 0, rung) for rung in (16, 8, 4))
-    other = Job("tiny", 1, 16)
+    long, middle, short = (Job("tiny", 0, rung) for rung in ("16x4", "8x3", "4x2"))
+    other = Job("tiny", 1, "16x4")
     schedule = Schedule({long: 8.0, other: 8.0, middle: 2.0, short: 1.0}, 100.0, lambda: now[0])
     assert schedule.begin() == long  # nothing is known yet
     now[0] = OVERHEAD_S + 20.0  # 2.5 s for each of its 8
@@ -296,23 +300,24 @@ def test_the_whole_study(done: Path, study: Study, capsys: pytest.CaptureFixture
     """The tables agree with the fields on the disk."""
     with (done / "budget.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    assert [row["rung"] for row in rows] == ["reference", "4", "6"] * 2
+    ladders = [study.rungs(drawn(study.templates[0], 2, index)) for index in range(2)]
+    assert [row["rung"] for row in rows] == [name for rungs in ladders for name in (REFERENCE, *rungs)]
     assert {row["status"] for row in rows} == {"complete"}
     with Store(done, study) as store:
         for row in rows:
             if row["rung"] == "reference":
                 continue
             one = drawn(study.templates[0], 2, int(row["index"]))
-            truth, own = (store.field(Job("tiny", one.index, rung)) for rung in (REFERENCE, int(row["rung"])))
+            truth, own = (store.field(Job("tiny", one.index, rung)) for rung in (REFERENCE, row["rung"]))
             assert own.shape == (len(one.judged), len(places(one.scene)), 3)
             error = picture_errors(own, truth, one.scene).max()
             assert float(row["error_px"]) == pytest.approx(error, rel=1e-4)  # five digits
             assert row["within"] == str(error <= TARGET)
-            assert row["chosen"] == str(int(row["rung"]) == one.chosen.across)
+            assert row["chosen"] == str(row["rung"] == one.chosen_rung)
             assert float(row["seconds"]) > 0
     for index in ("0", "1"):
-        coarse, fine = (float(row["error_px"]) for row in rows if row["index"] == index and row["rung"] != "reference")
-        assert 0 < fine < coarse
+        errors = [float(row["error_px"]) for row in rows if row["index"] == index and row["rung"] != REFERENCE]
+        assert 0 < errors[-1] < errors[0]
     assert (done / "budget.png").read_bytes().startswith(b"\x89PNG")
     text = (done / "budget.md").read_text(encoding="utf-8")
     for heading in ("## Answer", "## Misses", "## How far the references", "## All draws", "## What is not covered"):
@@ -334,7 +339,7 @@ def test_a_study_goes_on_where_it_stopped(
 ) -> None:
     """Cut in pieces, in the middle of a line, and with workers: the same fields. Fails with the torn line kept."""
     assert study_budget(study, tmp_path, "c", deadline=time.monotonic()) == 1
-    assert "unfinished: 0 of 6 presses" in capsys.readouterr().err
+    assert "unfinished: 0 of 8 presses" in capsys.readouterr().err
     first, second = list(jobs(study, [drawn(study.templates[0], 2, index) for index in range(2)]))[:2]
     with Store(tmp_path, study) as store:
         store.keep(press(study, first, "here"))
@@ -360,14 +365,14 @@ def test_another_study_is_refused(done: Path, study: Study, tmp_path: Path, monk
     before = (done / "budget.jsonl").read_bytes()
     for changed in (
         replace(study, seed=3),
-        replace(study, ladder=(4, 8)),
+        replace(study, across=(4, 8)),
         replace(study, reference=replace(SMALL, step_mm=0.2)),
         replace(study, templates=(other,)),
     ):
         with pytest.raises(InputError, match="holds another study"):
             Store(done, changed)
     with Store(done, replace(study, draws=3)) as store:  # more draws are more of the same
-        assert len(store.measurements) == 6
+        assert len(store.measurements) == 8
     monkeypatch.setattr(budget_study, "solver", lambda: "of tomorrow")
     with pytest.raises(InputError, match=r"solver: .* there, of tomorrow now"):
         Store(done, study)

@@ -27,7 +27,7 @@ from synth.simulate.driver import STANDARD
 
 SHALLOW = Case("shallow", Motion(depth_mm=0.6, steps=1), 0.0, (0,), ("0.6 mm",))
 COARSE = Numerics(max_step_mm=0.5)
-PLAIN = Setting("plain driver", Graded(2), numerics=COARSE, driver=PLAIN_DRIVER, double=True)
+PLAIN = Setting("plain driver", Graded(2), numerics=COARSE, driver=PLAIN_DRIVER)
 SMALL = Suite(
     ((SHALLOW, (PLAIN, *(replace(s, numerics=COARSE) for s in of_family("graded", "p2p1", Graded(2), Graded(4))))),),
     Fine(8, 2),
@@ -190,7 +190,7 @@ def test_the_plain_driver_needs_more_iterations() -> None:
 
 
 def test_double_factor_solves_to_double_precision() -> None:
-    """Fails with System in place of DoubleSystem: 1e-6."""
+    """Fails with single left out of `direct_factor`'s arguments: 1e-6."""
     stepper = ready_stepper(SHALLOW, PLAIN, Graded(2).mesh(SHALLOW))
     system, active = stepper.system, np.ones(1, dtype=bool)
     tangent = system.tangent(system.zero(), stepper.indenters, active)

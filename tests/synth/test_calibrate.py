@@ -214,7 +214,7 @@ def test_the_command_writes_a_scene_that_loads_and_generates(tmp_path: Path, cap
 def _preset() -> dict:
     return {
         "name": "preset",
-        "sensor": _start().model_dump(mode="json", exclude={"further_cameras", "mirrors"}),
+        "sensor": _start().model_dump(mode="json", exclude={"further_cameras", "mirrors"}, exclude_none=True),
         "contact": {"indenter": {"shape": "sphere", "radius_mm": {"uniform": [2.0, 3.0]}}},
         "motion": {"depth_mm": 0.2, "steps": 1},
         "render": {"samples_per_pixel": 36, "max_depth": 2},

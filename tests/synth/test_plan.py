@@ -1,6 +1,7 @@
 """What `plan` decides and predicts, and what it refuses before any work is done."""
 
 import json
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -171,5 +172,9 @@ def test_what_cannot_be_built_is_refused_with_the_file_and_the_field(
 
 
 def test_a_closed_surface_can_be_built(tiny: Path) -> None:
-    _write_stl(tiny.parent / "closed.stl", closed=True)
-    check_buildable(load_scene(tiny, ['contact.indenter={ shape = "mesh", file = "closed.stl" }']), LLVM)
+    """It is refused once a triangle is missing, and not before."""
+    for closed in (True, False):
+        _write_stl(tiny.parent / "solid.stl", closed=closed)
+        template = load_scene(tiny, ['contact.indenter={ shape = "mesh", file = "solid.stl" }'])
+        with nullcontext() if closed else pytest.raises(InputError, match="surface must be closed"):
+            check_buildable(template, LLVM)

@@ -118,6 +118,20 @@ def test_same_seed_same_bits_and_other_seed_other_noise(variant: Variant) -> Non
     assert first.dtype == np.float32
 
 
+@pytest.mark.parametrize("variant", VARIANTS, **names)
+def test_another_surface_is_rendered_as_by_a_renderer_of_its_own(variant: Variant) -> None:
+    """Finer, then coarser. Fails with the texture coordinates of the surface before; scalar variants once stopped here."""
+    sensor = small_sensor(1.45, _dots())
+    texture, surfaces = albedo(sensor, np.random.default_rng(0)), [flat_surface(sensor, n) for n in (4, 9, 2)]
+    renderer = Renderer(sensor, DIRECT, surfaces[0], texture, variant)
+    for surface in surfaces[1:]:
+        raised = surface.material + np.array([0.3, 0.1, 0.4])
+        raised[:, 2] += 0.1 * raised[:, 0]
+        renderer.take(surface)
+        own = Renderer(sensor, DIRECT, surface, texture, variant)
+        assert np.array_equal(renderer.radiance(raised, 3), own.radiance(raised, 3))
+
+
 THREADS = """
 import sys
 sys.path.insert(0, sys.argv[2])

@@ -73,8 +73,9 @@ def test_predicted_error_bounds_the_error_against_a_finer_mesh(indenter: dict[st
         result = simulate(posed, mesh, frames=frozenset({2}))
         assert result.status == "complete"
         found[across] = fine, probe(result.space, places) @ result.states[-1].displacement
-    error = float(np.sqrt(((found[4][1] - found[8][1]) ** 2).sum(axis=1).mean()))
+    error = float(np.sqrt(((found[4][1] - found[8][1])[:, :2] ** 2).sum(axis=1).mean()))  # what a camera above sees
     predicted = predicted_error_mm(posed, focus, found[4][0], SIZE[0] * SIZE[1])
-    # A bound in 95 of 100 draws; a model that says ten times too much would be of no use. 8 elements across err by
-    # about a third of 4 (h^1.6), so that the difference is some 30 % off the true error at worst.
-    assert 0.1 * predicted < error < predicted
+    # The model's scatter is 0.15 of the logarithm, two of which are 1.35 times the mean or 1.13 times what is
+    # predicted; 8 elements across err by about a third of 4 (h^1.6), in which the difference may be off the true error.
+    # Fails with the depth's power left out, and with the shape's scale of another body.
+    assert 0.4 * predicted < error < 1.2 * predicted

@@ -29,7 +29,8 @@ def test_same_topology_shares_the_pattern_and_its_factor(element: str) -> None:
     assert not np.array_equal(MESH.points, OTHER.points)
     one, other = (pattern_of(function_space(mesh, ELEMENT[element]()), True) for mesh in (MESH, OTHER))
     assert one is other
-    assert one.factor is other.factor
+    assert one.factor() is other.factor()
+    assert one.factor() is not one.factor(single=False)  # fails with one factor for both
 
 
 def test_what_differs_in_topology_does_not_share() -> None:

@@ -16,6 +16,8 @@ STAGES = (
     "synth.dataset.storage",  # how a file gets to the disk as a whole; knows nothing of datasets
     "synth.scene_indenters",
     "synth.scene_camera",
+    "synth.scene_pattern",
+    "synth.scene_gel",
     "synth.scene",
     "synth.schema_errors",
     "synth.template",

@@ -16,8 +16,8 @@ def tiny(tmp_path: Path) -> Path:
 
 
 def test_shipped_scenes_are_known_by_name() -> None:
-    names = "deltact digit fingervision gelsight gelsight_mini gelslim gelstereo omnitact soft_bubble tac3d"
-    assert shipped_scenes() == names.split()
+    flat = "deltact digit fingervision gelsight gelsight_fingertip gelsight_mini gelslim gelstereo omnitact soft_bubble"
+    assert shipped_scenes() == sorted([*flat.split(), "densetact", "tac3d"])
     assert load_scene("gelsight_mini").source == SCENES / "gelsight_mini.toml"
 
 

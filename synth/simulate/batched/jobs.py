@@ -27,7 +27,7 @@ class Job:
     @property
     def touches(self) -> bool:
         """Whether the indenter ever goes below the undeformed surface."""
-        return bool(self.path.corners[:, 0].max() > 0)
+        return self.path.may_touch
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def job_tables(jobs: Sequence[Job], size_mm: tuple[float, float, float], frames:
     table.deepest = warp_array(np.array(deepest), wp.float64, d)
     table.over_pad = warp_array(np.array([_is_over_pad(path, size_mm) for path in paths]), wp.int32, d)
     table.position = warp_array(np.array([path.motion.position_mm for path in paths], dtype=np.float64), wp.vec2d, d)
-    table.reach = warp_array(np.array([path.body.reach_mm for path in paths]), wp.float64, d)
+    table.reach = warp_array(np.array([path.body.reach_mm - path.face_mm for path in paths]), wp.float64, d)
     table.rotation = warp_array(np.array([path.body.rotation for path in paths]), wp.mat33d, d)
     table.kind = warp_array(np.array([path.body.kind for path in paths]), wp.int32, d)
     table.grid = warp_array(np.array(grids), wp.int32, d)

@@ -50,8 +50,12 @@ def simulate_many(
         return
     first = scenes[0]
     for scene in scenes:
-        if scene.sensor.gel.size_mm != mesh.size_mm:
-            raise InputError(f"the mesh is of a {mesh.size_mm} mm pad, the scene's is {scene.sensor.gel.size_mm} mm")
+        gel = scene.sensor.gel
+        if (gel.size_mm, gel.dome_radius_mm) != (mesh.size_mm, mesh.dome_radius_mm):
+            raise InputError(
+                f"the mesh is of a {mesh.size_mm} mm pad of dome radius {mesh.dome_radius_mm}, "
+                f"the scene's is {gel.size_mm} mm with {gel.dome_radius_mm}"
+            )
         if (_elastic(scene.sensor.gel), scene.numerics) != (_elastic(first.sensor.gel), first.numerics):
             raise InputError("the scenes of a batch must share the gel's materials and numerics")
     pad = pad or prepare(first, mesh, device)
@@ -71,7 +75,11 @@ def jobs_of(scenes: Sequence[Scene], pad: Pad, folder: FilePath | None = None) -
     resolved = pad.mesh.spacing_mm / (2 * pad.space.element.order)
     return [
         Job(
-            Path(scene.motion, rigid_body(scene.contact.indenter, folder, resolved)),
+            Path(
+                scene.motion,
+                rigid_body(scene.contact.indenter, folder, resolved),
+                scene.sensor.gel.dome_radius_mm,
+            ),
             scene.contact.friction,
             scene.sensor.gel.youngs_modulus_kpa / 1000,
         )

@@ -85,7 +85,7 @@ def surface_tables(space: Space, weight: FloatArray, device: str) -> SurfaceTabl
     """Tables for face weights (f, nq) in mm²."""
     element = space.element
     hat = element.face_shape if element.order == 1 else broken_linear_face(element.face_barycentric)
-    coated = (space.points[space.faces][:, :, 2] == 0).all(axis=1)
+    coated = space.coated
     number = np.full(space.faces.shape, -1, dtype=np.int32)
     number[coated] = np.searchsorted(space.surface_nodes, space.faces[coated])
     area = np.zeros(len(space.surface_nodes))

@@ -1,0 +1,52 @@
+"""How the contact face reflects: one coating, or a coating with matt marks on its camera's side.
+
+The coating is Lambertian at roughness 1 and metallic 0, else Disney's principled model (Burley, SIGGRAPH 2012 course).
+Marks above it are Lambertian. Where they cover a share m of the surface,
+
+    f = (1 - m) · f_coating + m · f_mark,
+
+which is exact for opaque marks without thickness: m is 0 or 1 but at their edges, where it is an average over area.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from synth.arrays import Image
+from synth.scene import Coating
+
+
+def reflection(mi: Any, coating: Coating, texture: Image, is_mono: bool) -> Any:
+    """The face's reflection, the same from either side.
+
+    Args:
+        mi: the Mitsuba module.
+        coating: roughness and metallic, and its reflectance where marks lie above it.
+        texture: (rows, columns, 3 or 4) float32, from `pattern.albedo`.
+        is_mono: colours are grey, and one channel is wanted.
+
+    Returns:
+        Mitsuba's BSDF.
+    """
+    colors = texture[:, :, :3].mean(axis=2, keepdims=True) if is_mono else texture[:, :, :3]
+    if texture.shape[2] == 3:
+        return mi.load_dict({"type": "twosided", "bsdf": _coat(mi, coating, colors)})
+    bare = np.broadcast_to(np.array(coating.reflectance, dtype=np.float32), (2, 2, 3))[:, :, : colors.shape[2]]
+    layers = {
+        "type": "blendbsdf",
+        "weight": _map(mi, texture[:, :, 3:]),
+        "coating": _coat(mi, coating, bare),
+        "marks": {"type": "diffuse", "reflectance": _map(mi, colors)},
+    }
+    return mi.load_dict({"type": "twosided", "bsdf": layers})
+
+
+def _coat(mi: Any, coating: Coating, colors: Image) -> dict[str, Any]:
+    if coating.is_matt:
+        return {"type": "diffuse", "reflectance": _map(mi, colors)}
+    shine = {"roughness": coating.roughness, "metallic": coating.metallic}
+    return {"type": "principled", "base_color": _map(mi, colors), **shine}
+
+
+def _map(mi: Any, values: Image) -> dict[str, Any]:
+    return {"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(values)), "raw": True, "wrap_mode": "clamp"}

@@ -1,0 +1,85 @@
+"""The part of a scene's schema that is the soft pad: its size, the shape of its contact face, its materials."""
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from synth.scene_indenters import NonNegative, Part, Positive
+
+THINNEST = 0.3
+"""A domed pad keeps at least this share of its thickness at the corners. Elements there are flattened to that share of
+their height at the apex, see `synth.mesh.dome` for what becomes of their quality."""
+STEEPEST_DEG = 60.0
+"""Largest slope of a dome's face, at its corners."""
+
+
+class Layer(Part):
+    """A layer of another material on the pad's contact side, such as a stiff coating film."""
+
+    thickness_mm: Annotated[float, Field(ge=0.02, le=20)]
+    youngs_modulus_kpa: Annotated[float, Field(ge=0.1, le=1e6)]
+    poisson_ratio: Annotated[float, Field(ge=0.3, le=0.5)] = 0.4999
+    stiffening: tuple[NonNegative, NonNegative] = (0.0, 0.0)
+    """As of the gel."""
+
+
+class Gel(Part):
+    """The soft pad: a box bonded to the window on its +z side, its contact face flat or part of a sphere."""
+
+    size_mm: tuple[
+        Annotated[float, Field(ge=1, le=200)],
+        Annotated[float, Field(ge=1, le=200)],
+        Annotated[float, Field(ge=0.2, le=50)],
+    ]
+    """The third is the thickness, of a domed pad that at the apex."""
+    shape: Literal["box", "dome"] = "box"
+    dome_radius_mm: Positive | None = None
+    """Radius of a dome's contact face, which touches z = 0 at its apex (0, 0) and curves away from the indenter; None:
+    flat. Patterns are laid on it along z: their places are x and y."""
+    youngs_modulus_kpa: Annotated[float, Field(ge=0.1, le=1e6)]
+    poisson_ratio: Annotated[float, Field(ge=0, le=0.5)] = 0.4999
+    """0.5 is exactly incompressible; below 0.3 no pressure field is needed."""
+    stiffening: tuple[NonNegative, NonNegative] = (0.0, 0.0)
+    """Yeoh's C20/C10 and C30/C10 (Rubber Chem. Technol. 66, 1993); zeros: neo-Hookean."""
+    layers: tuple[Layer, ...] = ()
+    """From the contact face inward, within size_mm; what is left of the thickness is the gel's own material. Under a
+    dome their thicknesses are those at the apex; elsewhere they shrink with the pad's."""
+
+    def face_mm(self, x: float, y: float) -> float:
+        """Z of the undeformed contact face, mm; the thickness where a dome's sphere does not reach."""
+        radius, square = self.dome_radius_mm, x * x + y * y
+        if radius is None:
+            return 0.0
+        return radius - math.sqrt(radius**2 - square) if square < radius**2 else self.size_mm[2]
+
+    @model_validator(mode="after")
+    def _layered(self) -> "Gel":
+        covered = sum(layer.thickness_mm for layer in self.layers)
+        if covered >= self.size_mm[2]:
+            raise ValueError(
+                f"layers are {covered:.4g} mm thick together and leave nothing of the gel's {self.size_mm[2]} mm"
+            )
+        if self.layers and self.poisson_ratio < 0.3:
+            raise ValueError(f"poisson_ratio = {self.poisson_ratio}: a layered pad needs at least 0.3")
+        return self
+
+    @model_validator(mode="after")
+    def _domed(self) -> "Gel":
+        if (self.shape == "dome") != (self.dome_radius_mm is not None):
+            raise ValueError('shape = "dome" and dome_radius_mm belong together: give both, or neither for a flat face')
+        if self.dome_radius_mm is None:
+            return self
+        x, y, thickness = self.size_mm
+        corner = math.hypot(x, y) / 2
+        # The sphere that comes down so far at the corners, or that is so steep there, whichever is the larger.
+        deepest = min((1 - THINNEST) * thickness, corner * math.tan(math.radians(STEEPEST_DEG / 2)))
+        least = (corner**2 + deepest**2) / (2 * deepest)
+        if self.dome_radius_mm < least:
+            raise ValueError(
+                f"dome_radius_mm = {self.dome_radius_mm} curves too much for a pad of size_mm = {list(self.size_mm)}: "
+                f"at its corners, {corner:.4g} mm from the apex, {100 * THINNEST:.0f} % of the thickness must be left "
+                f"and the face must slope by less than {STEEPEST_DEG:.0f} degrees; use at least {least:.4g} mm, or a "
+                "smaller or thicker pad"
+            )
+        return self

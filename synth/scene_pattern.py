@@ -1,0 +1,105 @@
+"""The part of a scene's schema that is the pattern on the contact face.
+
+A pattern lies in material coordinates: it is printed on the undeformed face and moves with it. Positions are those of
+the scene's frame, x right and y down in the image, with the origin at the pad's middle.
+"""
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from synth.scene_indenters import Color, Fraction, NonNegative, Part, Positive, Vector2
+
+
+class NoPattern(Part):
+    """Bare coating."""
+
+    kind: Literal["none"]
+
+
+MarkLayer = Literal["in_coating", "above_coating"]
+"""Where marks lie. in_coating: they change the coating's reflectance and share its roughness and metallic.
+above_coating: they are matt paint on the camera's side of the coating and take no part in its shine, as where markers
+are printed on the gel and the coating is laid over them (GelSight: Yuan et al., Sensors 17(12):2762, 2017, figures 3
+and 4). The paint has no thickness: it moves with the coating, and the flow is that of the coating."""
+
+
+class Dots(Part):
+    """Printed dots on a grid whose first dot lies offset_mm from the pad's centre."""
+
+    kind: Literal["dots"]
+    spacing_mm: tuple[Positive, Positive]
+    radius_mm: Positive
+    """Of a round dot; from the middle to the corners of a diamond."""
+    shape: Literal["round", "diamond"] = "round"
+    """diamond: a square whose corners point along the grid. With a radius of half the spacing neighbours touch and make
+    a checkerboard, the continuous marker pattern of arXiv:2305.11782."""
+    offset_mm: Vector2 = (0.0, 0.0)
+    rotation_deg: Annotated[float, Field(ge=-90, le=90)] = 0.0
+    """Turns the grid about its first dot; positive turns +x toward +y."""
+    jitter_mm: NonNegative = 0.0
+    """Standard deviation of each dot's centre around the grid, along x and along y."""
+    radius_jitter: Fraction = 0.0
+    """Relative standard deviation of each dot's radius."""
+    softness_mm: NonNegative = 0.02
+    """Width of the dot's edge."""
+    reflectance: Color = (0.03, 0.03, 0.03)
+    layer: MarkLayer = "in_coating"
+
+    @model_validator(mode="after")
+    def _leaves_coating(self) -> "Dots":
+        across, down = self.spacing_mm
+        most = math.hypot(across, down) / 2 if self.shape == "round" else (across + down) / 2
+        if self.radius_mm >= most:
+            raise ValueError(
+                f"radius_mm = {self.radius_mm} at a spacing of {across} x {down} mm: the dots cover everything; "
+                f"it must be less than {most:.4g}"
+            )
+        return self
+
+
+class RandomColor(Part):
+    """Dense random-colour cells (DelTact: Zhang et al., RA-L 2022), offset at random by up to a cell."""
+
+    kind: Literal["random_color"]
+    cell_mm: Positive
+    saturation: Fraction = 1.0
+    """Upper end; each cell's own lies between 60 and 100 % of it."""
+    softness_mm: NonNegative = 0.02
+    """Width of the border between two cells; at most cell_mm."""
+
+
+class Speckle(Part):
+    """Random dark grains, as sprayed for digital image correlation."""
+
+    kind: Literal["speckle"]
+    grain_mm: Positive
+    """Size of a grain. At a coverage of one half a straight line stays within one for 1.11 of it on average."""
+    coverage: Annotated[float, Field(gt=0, lt=1)] = 0.5
+    reflectance: Color = (0.03, 0.03, 0.03)
+    layer: MarkLayer = "in_coating"
+
+
+class Bitmap(Part):
+    """A picture of the user's own, its upper left corner at the image's upper left.
+
+    Its values are sRGB and scale the coating's reflectance, so that white is the bare coating; where it is transparent,
+    and around it, there is bare coating, too. Scenes with a bitmap are rendered in colour.
+    """
+
+    kind: Literal["bitmap"]
+    file: Annotated[str, Field(min_length=1)]
+    """PNG, TIFF, JPEG or another format that OpenCV reads, 8 or 16 bit, grey or colour, with or without transparency;
+    relative to the scene file."""
+    width_mm: Annotated[float, Field(ge=0.1, le=1000)]
+    """Of the whole picture; its height follows from square pixels."""
+    offset_mm: Vector2 = (0.0, 0.0)
+    """The picture's middle."""
+    rotation_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
+    """About its middle; positive turns +x toward +y."""
+    layer: MarkLayer = "in_coating"
+    """above_coating: what is not transparent is a layer of its own."""
+
+
+Pattern = Annotated[NoPattern | Dots | RandomColor | Speckle | Bitmap, Field(discriminator="kind")]

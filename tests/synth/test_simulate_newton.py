@@ -1,0 +1,42 @@
+"""Newton's method: convergence, and how it ends where there is none."""
+
+import numpy as np
+from pads import SIZE, brick, indenters, scene, system
+
+from synth.simulate.newton import relative_residual, solve
+
+PRESSED = 0.3
+"""mm of depth, in one go."""
+MESH = brick(SIZE, (4, 4, 2))
+EXACT = np.full(1, 1e-9)
+ALL = np.ones(1, dtype=bool)
+
+
+def test_a_press_converges() -> None:
+    """Fails with a tolerance a thousand times larger."""
+    body, ball = system(MESH, 0.49), indenters(scene(), PRESSED)
+    found = solve(body, body.zero(), ball, ALL, EXACT)
+    assert found.converged.all()
+    assert 2 <= found.iterations[0] <= 12
+    again = body.balance(found.state, ball, ALL)
+    assert relative_residual(again)[0] <= EXACT[0]
+
+
+def test_the_limit_is_kept_and_said() -> None:
+    """Fails with one iteration more than the limit, and with a sample at its limit counted as converged."""
+    body, ball = system(MESH, 0.49), indenters(scene(), PRESSED)
+    needed = int(solve(body, body.zero(), ball, ALL, EXACT).iterations[0])
+    for limit in (1, needed - 1, needed):
+        found = solve(body, body.zero(), ball, ALL, EXACT, limit=limit)
+        assert found.iterations[0] == limit
+        assert found.converged[0] == (limit == needed)
+        assert (found.residual[0] <= EXACT[0]) == (limit == needed)
+
+
+def test_a_balanced_start_costs_one_iteration_and_no_force_costs_none() -> None:
+    """A start that happens to be within the tolerance is improved once. Fails with `iterations > 0` left out."""
+    body, ball = system(MESH, 0.49), indenters(scene(), PRESSED)
+    first = solve(body, body.zero(), ball, ALL, EXACT)
+    assert solve(body, first.state, ball, ALL, EXACT).iterations[0] == 1
+    away = indenters(scene(motion={"depth_mm": -1.0}), 0.0)
+    assert solve(body, body.zero(), away, ALL, EXACT).iterations[0] == 0
