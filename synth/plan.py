@@ -14,6 +14,7 @@ from synth.errors import InputError
 from synth.render.camera_rays import pinhole
 from synth.render.lights import check_view
 from synth.render.pattern import check_pattern, is_grey
+from synth.render.thin_lens import ThinLens
 from synth.render.variant import Variant
 from synth.sampling import draw
 from synth.scene import Scene
@@ -106,6 +107,7 @@ def check_buildable(template: Template, variant: Variant) -> None:
     try:
         for sensor in dict.fromkeys(view for corner in template.corners for view in corner.sensor.views.values()):
             check_view(sensor)
+            ThinLens.of(sensor)
             if not variant.is_vectorised:
                 pinhole(sensor)
         for sensor in dict.fromkeys(corner.sensor for corner in template.corners):
@@ -210,6 +212,8 @@ def _decisions(corners: tuple[Scene, ...], variant: Variant) -> list[Decision]:
     cameras = [view.camera for c in corners for view in c.sensor.views.values()]
     lens = any(any(camera.distortion) or camera.lens == "fisheye" for camera in cameras)
     flat = all(c.sensor.gel.shape == "box" for c in corners)
+    apertures = [camera.aperture_mm for camera in cameras]
+    blurred = max(apertures) > 0
     mirrors, further = len(corners[0].sensor.mirrors), len(corners[0].sensor.further_cameras)
     grey = all(is_grey(c.sensor) for c in corners)
     hue = "lights, coating and pattern are grey" if grey else "a light, the coating or the pattern has colour"
@@ -225,6 +229,11 @@ def _decisions(corners: tuple[Scene, ...], variant: Variant) -> list[Decision]:
         Decision("window refraction", max(index) > 1, _span("sensor.window.refractive_index", index)),
         Decision("lens distortion", lens, "sensor.camera.distortion" + ("" if lens else " is zero: a pinhole")),
         Decision("shared undeformed frame", flat, "sensor.gel.shape" + ("" if flat else ": domes have own meshes")),
+        Decision(
+            "depth of field",
+            blurred,
+            _span("sensor.camera.aperture_mm", apertures) + ("" if blurred else ": a pinhole"),
+        ),
         Decision("mirrors", mirrors > 0, f"{mirrors} in sensor.mirrors"),
         Decision("further cameras", further > 0, f"{further} in sensor.further_cameras"),
         Decision("indirect light", max(bounces) > 2, _span("render.max_depth", bounces)),

@@ -13,6 +13,7 @@ import numpy as np
 
 from synth.errors import InputError
 from synth.render.lights import check_view
+from synth.render.thin_lens import ThinLens
 from synth.scene import Render, Sampling, Scene, Sensor
 from synth.schema_errors import validated
 from synth.template import Chooser, Template, replaced
@@ -67,6 +68,7 @@ def draw_sensor(template: Template, seed: int, sensor: int) -> SensorDraw:
             validated(content.get("render", {}), str(template.source), Render, "render")
             for view in validated(content["sensor"], str(template.source), Sensor, "sensor").views.values():
                 check_view(view)
+                ThinLens.of(view)
         except InputError as error:
             rejected.append(str(error))
             continue

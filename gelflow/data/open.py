@@ -1,4 +1,4 @@
-"""Opening whatever holds image pairs: a data set of synth, a pair set of `gelflow pairs`, or a plain folder."""
+"""Opening whatever holds pairs: a data set of synth or its shards, a pair set of `gelflow pairs`, a plain folder."""
 
 from pathlib import Path
 
@@ -6,31 +6,38 @@ from gelflow.data.folder import folder_records, is_pair_folder
 from gelflow.data.pairs import PairDataset
 from gelflow.data.pairset import FILE as PAIR_SET_FILE
 from gelflow.data.pairset import pair_set_records
+from gelflow.data.shards import shard_files, shard_records
 from gelflow.data.synthetic import is_synthetic, synthetic_records
 from gelflow.errors import InputError
 
 
 def open_pairs(path: Path | str) -> PairDataset:
-    """Opens a folder of image pairs, recognised by what lies in it.
+    """Opens a folder of image pairs, recognised by what lies in it, or one shard.
 
     Args:
-        path: A data set of synth (dataset.json), a pair set (pairs.json), or a folder of NAME_1.png and NAME_2.png.
+        path: A data set of synth (dataset.json), a pair set (pairs.json), a folder of NAME_1.png and NAME_2.png, or a
+            folder of WebDataset shards (*.tar) or one of them.
 
     Raises:
         InputError: There is no such folder, it is none of these or empty, or it is damaged.
     """
     folder = Path(path)
-    if not folder.is_dir():
-        kind = "is a file, not a folder" if folder.exists() else "there is no such folder"
-        raise InputError(f"{folder}: {kind}; a folder with image pairs is needed")
+    if not folder.is_dir() and not shard_files(folder):
+        if folder.exists():
+            raise InputError(
+                f"{folder}: is a file, not a folder; a folder with image pairs or a shard (.tar) is needed"
+            )
+        raise InputError(f"{folder}: there is no such folder; a folder with image pairs is needed")
     if (folder / PAIR_SET_FILE).is_file():
         return PairDataset(str(folder), pair_set_records(folder))
     if is_synthetic(folder):
         return PairDataset(str(folder), synthetic_records(folder))
     if is_pair_folder(folder):
         return PairDataset(str(folder), folder_records(folder))
+    if shards := shard_files(folder):
+        return PairDataset(str(folder), shard_records(shards))
     content = "is empty" if not any(folder.iterdir()) else "holds no image pairs"
     raise InputError(
         f"{folder}: the folder {content}; allowed: a data set of synth (dataset.json), a pair set of "
-        "`python -m gelflow pairs` (pairs.json), or files NAME_1.png and NAME_2.png"
+        "`python -m gelflow pairs` (pairs.json), shards (*.tar), or files NAME_1.png and NAME_2.png"
     )

@@ -14,6 +14,7 @@ throughout, so that samples of both kinds fit into one batch.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
@@ -21,29 +22,30 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from gelflow.data.member import FlowMembers, Member
 from gelflow.errors import InputError
-from gelflow.files.exr import FlowField, read_flow
+from gelflow.files.exr import Direction, FlowField, read_flow
 from gelflow.files.image import read_pair
 from gelflow.raster import ImageArray, MarkerArray
 
 
 @dataclass(frozen=True)
 class PairRecord:
-    """Where one pair lies on disk.
+    """Where one pair lies on disk: in files of its own, or in a shard.
 
     Attributes:
         name: Unique within its data set.
         image1, image2: Image files of one size.
-        flow: EXR file with the exact flow in both directions, or None.
+        flow: EXR file, or members of a shard, with the exact flow in both directions, or None.
         markers: CSV file with tracked dots (columns x1, y1, x2, y2 in px), or None.
         exchanged: The images have been exchanged: the exact flow is the file's `backward`.
         scene: Scene and kind of pattern of a synthetic pair, or None.
     """
 
     name: str
-    image1: Path
-    image2: Path
-    flow: Path | None = None
+    image1: Path | Member
+    image2: Path | Member
+    flow: Path | FlowMembers | None = None
     markers: Path | None = None
     exchanged: bool = False
     scene: str | None = None
@@ -82,18 +84,22 @@ class PairDataset(Dataset[dict[str, Tensor | str]]):
             InputError: An image is missing, damaged or too small, or the two differ in size.
         """
         record = self.records[index]
-        return read_pair(record.image1, record.image2)
+        # Of a path, read_pair asks for is_file, read_bytes and its text: all that a member of a shard has, too.
+        return read_pair(cast(Path, record.image1), cast(Path, record.image2))
 
     def truth(self, index: int) -> FlowField | None:
         """Exact flow (H, W, 2) in px and its visibility (H, W) bool; None where the pair has none.
 
         Raises:
-            InputError: The EXR file is missing or damaged, or lacks this direction.
+            InputError: The file is missing or damaged, or lacks this direction.
         """
         record = self.records[index]
         if record.flow is None:
             return None
-        return read_flow(record.flow, "backward" if record.exchanged else "forward")
+        direction: Direction = "backward" if record.exchanged else "forward"
+        if isinstance(record.flow, FlowMembers):
+            return record.flow.read(direction)
+        return read_flow(record.flow, direction)
 
     def markers(self, index: int) -> MarkerArray | None:
         """Tracked dots of a pair, (N, 4) float64: x1, y1, x2, y2 in px; None where the pair has none.

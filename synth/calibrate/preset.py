@@ -41,6 +41,11 @@ def start_sensor(template: Template, size: tuple[int, int]) -> Sensor:
         raise InputError(
             f"{template.source}: calibration knows one camera without mirrors; take them out of the preset"
         )
+    if sensor.camera.aperture_mm:
+        raise InputError(
+            f"{template.source}: sensor.camera.aperture_mm = {sensor.camera.aperture_mm}: calibration fits one blur "
+            "for the whole image; take the aperture out of the preset"
+        )
     camera, (width, height) = sensor.camera, size
     scale = width / camera.width
     view = {

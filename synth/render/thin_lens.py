@@ -17,11 +17,11 @@ what is sharp, as seen from the air, at
 .. math::  s'_s = e + b / n, \qquad s'_t = e + \frac{b \cos^2 θ}{n \cos^2 θ'}
 
 across and in the plane of incidence. The lens takes the mean of their inverses, which makes the root-mean-square blur
-of that point least; both are e + b / n where the axis is at right angles to the window. (E. Hecht, Optics, 5th ed.,
-sections 5.2 and 6.3; J. P. C. Southall, Mirrors, Prisms and Lenses, 1918, on oblique refraction.)
+of that point least; both are e + b / n where the axis is at right angles to the window. (W. T. Welford, Aberrations of
+Optical Systems, 1986.)
 
 The radiance of a pixel is the plain mean over the pupil. The fall-off of light across the image is the camera's
-`vignetting`, as for a pinhole.
+`vignetting`, as for a pinhole. The LEDs take nothing out of the cone of rays.
 """
 
 from dataclasses import dataclass

@@ -153,9 +153,9 @@ def _growth(through: int, height: float) -> float:
 
 ERROR_SCALES = {"sphere": 0.084, "cone": 0.061, "bar": 0.13, "punch": 0.212, "box": 0.17, "torus": 0.173, "mesh": 0.22}
 """k of the error model; a bar is a cylinder that lies, a punch one that stands. Fitted to 40 draws of two scenes on
-five meshes each against finer ones (docs/reports/budget.md). Where a draw needs more than the coarsest mesh the logarithm
-of measured over predicted scatters by 0.10, and by 0.15 for draws left out of the fit; elsewhere by 0.24. "mesh" was not
-measured: it is set as the worst of the others."""
+five meshes each against finer ones (docs/reports/budget.md). Where a draw needs more than the coarsest mesh the
+logarithm of measured over predicted scatters by 0.10, and by 0.15 for draws left out of the fit; elsewhere by 0.24.
+"mesh" was not measured: it is set as the worst of the others."""
 CERTAINTY = 1.2
 """Factor on the model's mean."""
 DEFAULT_TARGET_PX = 0.5

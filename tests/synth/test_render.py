@@ -120,7 +120,7 @@ def test_same_seed_same_bits_and_other_seed_other_noise(variant: Variant) -> Non
 
 @pytest.mark.parametrize("variant", VARIANTS, **names)
 def test_another_surface_is_rendered_as_by_a_renderer_of_its_own(variant: Variant) -> None:
-    """Finer, then coarser. Fails with the texture coordinates of the surface before; scalar variants once stopped here."""
+    """Finer, then coarser. Fails with the texture coordinates of the one before; scalar variants once stopped here."""
     sensor = small_sensor(1.45, _dots())
     texture, surfaces = albedo(sensor, np.random.default_rng(0)), [flat_surface(sensor, n) for n in (4, 9, 2)]
     renderer = Renderer(sensor, DIRECT, surfaces[0], texture, variant)

@@ -265,7 +265,7 @@ def test_correction_passes_take_penetration_away(monkeypatch: pytest.MonkeyPatch
         return last.force_n[2], last.max_penetration_mm
 
     (soft, deep), (hard, _) = press(10.0), press(200.0)
-    monkeypatch.setattr(stepping, "PASSES", 0)
+    monkeypatch.setattr(stepping, "PENETRATION", np.inf)
     (soft_alone, deep_alone), (hard_alone, _) = press(10.0), press(200.0)
     assert deep < 0.5 * deep_alone
     assert abs(hard - soft) < 0.5 * abs(hard_alone - soft_alone)

@@ -51,8 +51,8 @@ SHORTEST = wp.constant(wp.float64(newton.SHORTEST))
 SHORTEST_STEP = wp.constant(wp.float64(stepping.SHORTEST_STEP))
 GROWTH = wp.constant(wp.float64(stepping.GROWTH))
 EASY = wp.constant(stepping.EASY)
-PASSES = wp.constant(stepping.PASSES)
-SMALLEST_SHARE = wp.constant(wp.float64(stepping.SMALLEST_SHARE))
+FAILURES = wp.constant(stepping.FAILURES)
+ENOUGH = wp.constant(wp.float64(stepping.ENOUGH))
 PENETRATION = wp.constant(wp.float64(stepping.PENETRATION))
 DECREASE = wp.constant(wp.float64(1.0e-4))
 LATE = wp.constant(5)
@@ -119,8 +119,11 @@ def conclude(slots: Slots, jobs: Jobs, settings: Settings):
     slots.total[s] = slots.total[s] + slots.iteration[s]
     if slots.stage[s] == PASS:
         if phase == SOLVED:
+            slots.done[s] = slots.done[s] + slots.share[s]
+            slots.share[s] = wp.min(ONE, wp.float64(2.0) * slots.share[s])
             slots.phase[s] = PASSING
         else:
+            slots.failures[s] = slots.failures[s] + 1
             slots.share[s] = wp.float64(0.5) * slots.share[s]
             slots.move[s] = UNDO
             slots.phase[s] = REPAIR
@@ -159,8 +162,9 @@ def bear(slots: Slots, jobs: Jobs, sums: wp.array2d(dtype=wp.float64)):
     if jobs.kind_of[j, slots.next[s]] == 2:
         slots.keep[s] = 1
         slots.kept[s] = 1
-        slots.passes[s] = 0
+        slots.failures[s] = 0
         slots.share[s] = ONE
+        slots.done[s] = ZERO
         slots.phase[s] = PASSING
 
 
@@ -172,10 +176,9 @@ def choose_pass(slots: Slots, jobs: Jobs, settings: Settings):
     if slots.phase[s] != PASSING:
         return
     too_deep = slots.deepest[s] > PENETRATION * jobs.deepest[slots.job[s]]
-    if slots.passes[s] == PASSES or slots.share[s] < SMALLEST_SHARE or not too_deep:
+    if slots.failures[s] == FAILURES or slots.done[s] >= ENOUGH or not too_deep:
         slots.phase[s] = RECORD
         return
-    slots.passes[s] = slots.passes[s] + 1
     slots.share_now[s] = slots.share[s]
     slots.stage[s] = PASS
     slots.iteration[s] = 0

@@ -68,7 +68,8 @@ class Slots:
         norm, relative, jacobian: of the iterate: norm of the free residual, the same relative to the forces, smallest
             det F.
         trial_norm, trial_force, trial_jacobian: of the trial.
-        passes, share: augmented-Lagrangian passes done and the share of the next; share_now: of the one that begins.
+        failures, done, share: of augmented-Lagrangian passes: those that failed, the shares of the others together, and
+            the share of the next; share_now: of the one that begins.
         keep: whether contact's memory is put aside in this cycle; kept: whether it is put aside.
         deepest: penetration at the last evaluation, mm.
         records: states recorded; reason: why it ended.
@@ -98,7 +99,8 @@ class Slots:
     trial_norm: wp.array(dtype=wp.float64)
     trial_force: wp.array(dtype=wp.float64)
     trial_jacobian: wp.array(dtype=wp.float64)
-    passes: wp.array(dtype=wp.int32)
+    failures: wp.array(dtype=wp.int32)
+    done: wp.array(dtype=wp.float64)
     share: wp.array(dtype=wp.float64)
     share_now: wp.array(dtype=wp.float64)
     keep: wp.array(dtype=wp.int32)

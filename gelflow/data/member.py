@@ -1,0 +1,113 @@
+"""Members of a shard: where a file lies in an uncompressed tar, and reading it and the flow that such files hold.
+
+A member is read by opening the shard, one seek and one read; nothing stays open, so that loader workers and processes
+share no file handle. PNG images carry checksums. `.npy` arrays carry none: their type, shape and size are checked, but
+a flipped bit among their numbers is not noticed.
+
+Reference: NumPy's file format, numpy.lib.format.
+"""
+
+import io
+import tokenize
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.errors import InputError
+from gelflow.files.exr import Direction, FlowField
+
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """One file in a shard; it offers what readers of images ask of a path.
+
+    Attributes:
+        shard: The tar file.
+        name: Name of the member.
+        offset, size: Where its content lies, bytes.
+    """
+
+    shard: Path
+    name: str
+    offset: int
+    size: int
+
+    def __str__(self) -> str:
+        return f"{self.shard}, member {self.name}"
+
+    def is_file(self) -> bool:
+        """Whether the shard is there."""
+        return self.shard.is_file()
+
+    def read_bytes(self) -> bytes:
+        """The content.
+
+        Raises:
+            InputError: The shard cannot be read or has become shorter, or a member called .png is none.
+        """
+        try:
+            with self.shard.open("rb") as file:
+                file.seek(self.offset)
+                data = file.read(self.size)
+        except OSError as error:
+            raise InputError(f"{self}: cannot be read: {error.strerror or error}") from error
+        if len(data) < self.size:
+            raise InputError(f"{self}: ends after {len(data)} of {self.size} bytes; the shard changed after opening")
+        if self.name.endswith(".png") and not data.startswith(_PNG_SIGNATURE):
+            raise InputError(f"{self}: not a PNG file, or damaged; export or copy the shard again")
+        return data
+
+
+@dataclass(frozen=True, slots=True)
+class FlowMembers:
+    """The exact flow of one pair in a shard: `.npy` files of flow and visibility, backward where it was exported."""
+
+    forward: Member
+    forward_visible: Member
+    backward: Member | None = None
+    backward_visible: Member | None = None
+
+    def __str__(self) -> str:
+        return str(self.forward)
+
+    def read(self, direction: Direction) -> FlowField:
+        """One direction, as `gelflow.files.exr.read_flow` gives it. Shards hold no contact.
+
+        Raises:
+            InputError: This direction is not there, or an array is damaged or of another type or shape.
+        """
+        if direction == "forward":
+            motion, seen = self.forward, self.forward_visible
+        elif self.backward is not None and self.backward_visible is not None:
+            motion, seen = self.backward, self.backward_visible
+        else:
+            raise InputError(f"{self.forward}: beside it there is no backward flow; export a data set that has one")
+        flow, visible = _read_array(motion, np.float32), _read_array(seen, np.uint8)
+        if flow.ndim != 3 or flow.shape[2] != 2 or visible.shape != flow.shape[:2]:
+            raise InputError(f"{motion}: shapes {flow.shape} and {visible.shape} of flow and visibility; "
+                             "(rows, columns, 2) and (rows, columns) are needed")  # fmt: skip
+        finite = np.isfinite(flow).all(axis=-1)
+        return FlowField(flow, np.asarray(finite & (visible > 0), np.bool_))
+
+
+def _read_array(member: Member, dtype: type[np.generic]) -> NDArray[Any]:
+    """The array of a .npy file, whose size is checked before memory is taken for it."""
+    data = member.read_bytes()
+    stream = io.BytesIO(data)
+    try:
+        if np.lib.format.read_magic(stream) != (1, 0):
+            raise ValueError("not version 1.0 of the format")
+        shape, column_major, found = np.lib.format.read_array_header_1_0(stream)
+    except (ValueError, TypeError, SyntaxError, tokenize.TokenError) as error:
+        raise InputError(f"{member}: not a readable .npy file (damaged?)") from error
+    if found != dtype or column_major:
+        raise InputError(f"{member}: {found} values, column-major: {column_major}; {np.dtype(dtype)} by rows is needed")
+    expected = int(np.prod(shape, dtype=object)) * found.itemsize
+    if len(data) - stream.tell() != expected:
+        raise InputError(f"{member}: {len(data) - stream.tell()} bytes of numbers, its header says {expected}; damaged")
+    return np.frombuffer(data, dtype, offset=stream.tell()).reshape(shape).copy()

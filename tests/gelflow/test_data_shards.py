@@ -1,0 +1,344 @@
+"""Shards that synth exports, read as they are: the same bits as from the data set; damage is named."""
+
+import gzip
+import io
+import json
+import pickle
+import shutil
+import tarfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from textures import as_bytes, moved
+
+from gelflow.cli import main
+from gelflow.config import TrainConfig
+from gelflow.data import PairDataset, open_pairs
+from gelflow.errors import InputError
+from gelflow.train import train
+from gelflow.train.checkpoint import load_weights
+from synth.dataset import export as exporting
+from synth.dataset.job import Job
+from synth.dataset.sample import Sample
+from synth.dataset.writer import DatasetWriter
+from synth.flow.field import FlowField
+from synth.scene import Scene
+from synth.surface import ContactFaces, GelSurface
+
+SIDE = 64
+SCENE = {
+    "name": "shards",
+    "sensor": {
+        "gel": {"size_mm": [4.0, 4.0, 1.0], "youngs_modulus_kpa": 100.0},
+        "pattern": {"kind": "none"},
+        "lights": [{"position_mm": [0.0, 0.0, 0.5], "size_mm": [1.0, 1.0], "color": [1.0, 1.0, 1.0], "power": 1.0}],
+        "camera": {"width": SIDE, "height": SIDE, "fx": 80, "fy": 80, "cx": 32, "cy": 32, "position_mm": [0, 0, 20]},
+    },
+    "contact": {"indenter": {"shape": "sphere", "radius_mm": 1.0}},
+    "motion": {"depth_mm": 0.1},
+}
+INDICES = (0, 1, 999999, 1000000)
+"""With a gap, and with the last key before the first in the order of texts."""
+SETTINGS = """batch_size = 2
+validate_every = 2
+supervision = "flow"
+[model]
+levels = 4
+projected_channels = 8
+[loss]
+lambda_s = [1.0, 1.0, 1.0]
+"""
+
+
+def sample(index: int, dtype: type = np.uint8, backward: bool = True) -> Sample:
+    """Waves that move, and random flow and visibility beside them: an exchange of any two arrays shows."""
+    rng = np.random.default_rng(index)
+    images: list[np.ndarray] = [as_bytes(moved(SIDE, SIDE, k * 1.5, -k, seed=index)).astype(dtype) for k in (0, 1)]
+    flows = rng.normal(0, 2, (2, SIDE, SIDE, 2)).astype(np.float32)
+    seen = (rng.random((2, SIDE, SIDE)) < 0.7).astype(np.float32)
+    flows[:, :4, :9], seen[:, :4, :9] = np.nan, 0
+    nodes = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float64)
+    field = FlowField(flows[0], seen[0], flows[1], seen[1]) if backward else FlowField(flows[0], seen[0])
+    return Sample(
+        index=index,
+        trajectory=0,
+        frames=(0, 1),
+        seed=1,
+        image1=images[0],
+        image2=images[1],
+        flow=field,
+        scene=Scene.model_validate(SCENE),
+        surface=GelSurface(ContactFaces(nodes, np.array([[0, 2, 1]], np.int32))),
+        displacement1=np.zeros((3, 3)),
+        displacement2=np.zeros((3, 3)),
+    )
+
+
+def write_both(parent: Path, samples: list[Sample]) -> tuple[Path, Path]:
+    """A data set, and its shards of two samples each."""
+    with DatasetWriter(parent / "data", Job(scene=SCENE, scene_name="shards", scene_hash="0", seed=1, n=9)) as writer:
+        for one in samples:
+            writer.write(one)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(exporting, "SAMPLES_PER_SHARD", 2)
+        exporting.export(parent / "data", "webdataset", parent / "shards")
+    return parent / "data", parent / "shards"
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    torch.set_num_threads(1)
+    return write_both(tmp_path_factory.mktemp("shards"), [sample(index) for index in INDICES])
+
+
+@pytest.fixture
+def shard(both: tuple[Path, Path], tmp_path: Path) -> Path:
+    """A copy of the first shard, to be damaged."""
+    return Path(shutil.copy(both[1] / "shard-000000.tar", tmp_path))
+
+
+def bits(item: dict[str, torch.Tensor | str]) -> dict[str, tuple[object, ...]]:
+    """Every part of a sample with its type, shape and bytes: NaN equals itself, 0 does not equal -0."""
+    parts = {key: value.numpy() if isinstance(value, torch.Tensor) else np.array(value) for key, value in item.items()}
+    return {key: (part.dtype, part.shape, part.tobytes()) for key, part in parts.items()}
+
+
+def all_bits(dataset: PairDataset) -> list[dict[str, tuple[object, ...]]]:
+    return [bits(dataset[index]) for index in range(len(dataset))]
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_shards_give_the_bits_of_the_data_set(tmp_path: Path, dtype: type) -> None:
+    """Fails with the order of keys as texts, visibility left out, and U and V exchanged."""
+    data, shards = (open_pairs(path) for path in write_both(tmp_path, [sample(index, dtype) for index in INDICES]))
+    assert len(list((tmp_path / "shards").glob("*.tar"))) == 2
+    assert shards.names == data.names == [f"{index:06d}" for index in INDICES]
+    assert [record.scene for record in shards.records] == [record.scene for record in data.records]
+    assert shards.records[0].scene == "shards, none"
+    assert set(shards[0]) == {"image1", "image2", "name", "flow", "visible"}
+    assert all_bits(shards) == all_bits(data)
+
+
+def test_backward_flow_is_that_of_the_data_set(both: tuple[Path, Path]) -> None:
+    """Fails with the forward flow, or its visibility, in the backward's place."""
+    data, shards = (open_pairs(path).both_directions() for path in both)
+    assert all_bits(shards) == all_bits(data)
+
+
+def test_without_a_backward_flow_the_forward_one_is_read(tmp_path: Path) -> None:
+    data, shards = (open_pairs(path).both_directions() for path in write_both(tmp_path, [sample(0, backward=False)]))
+    assert bits(shards[0]) == bits(data[0])
+    with pytest.raises(InputError, match=r"000000\.forward\.npy.*no backward flow"):
+        shards[1]
+
+
+def test_one_shard_alone_is_a_data_set(both: tuple[Path, Path]) -> None:
+    shard = open_pairs(both[1] / "shard-000001.tar")
+    assert shard.names == ["999999", "1000000"]
+    assert bits(shard[1]) == bits(open_pairs(both[0])[3])
+
+
+def test_workers_and_copies_read_the_same(both: tuple[Path, Path]) -> None:
+    dataset = open_pairs(both[1])
+    dataset[0]  # before the workers start: whatever this left open they would share
+    loader = torch.utils.data.DataLoader(dataset, batch_size=None, num_workers=2, multiprocessing_context="fork")
+    expected = all_bits(open_pairs(both[0]))
+    assert [bits(item) for item in loader] == expected
+    assert all_bits(pickle.loads(pickle.dumps(dataset))) == expected
+
+
+def test_training_from_shards_gives_the_weights_of_the_data_set(both: tuple[Path, Path], tmp_path: Path) -> None:
+    """One run from the directory, and one from shards that is interrupted half way and resumed.
+
+    Fails with the shards in reverse order.
+    """
+    model = {"levels": 4, "projected_channels": 8}
+    values = {"batch_size": 2, "learning_rate": 1e-3, "device": "cpu", "loss": {"lambda_s": [1.0, 1.0, 1.0]}}
+    short, whole = (
+        TrainConfig.model_validate({**values, "model": model, "supervision": "flow", "steps": n}) for n in (2, 4)
+    )
+    data, shards = (open_pairs(path) for path in both)
+    first = train(whole, data, data, tmp_path / "data")
+    train(short, shards, shards, tmp_path / "shards")
+    second = train(whole, shards, shards, tmp_path / "shards", resume=True)
+    weights, same = (load_weights(result.weights).state_dict() for result in (first, second))
+    assert all(torch.equal(weights[name], same[name]) for name in weights)
+    assert first.metrics == second.metrics
+    start = train(whole.model_copy(update={"steps": 1}), data, None, tmp_path / "one")
+    assert any(
+        not torch.equal(value, weights[name]) for name, value in load_weights(start.weights).state_dict().items()
+    )
+
+
+def test_commands_take_shards(both: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data, shards = (str(path) for path in both)
+    settings = tmp_path / "settings.toml"
+    settings.write_text(SETTINGS)
+    options = ["--out", str(tmp_path / "run"), "--config", str(settings), "--steps", "1", "--device", "cpu"]
+    assert main(["train", shards, "--validation", f"{shards}/shard-000000.tar", *options]) == 0
+    capsys.readouterr()
+    scores = []
+    for path in (data, shards):
+        weights = str(tmp_path / "run" / "weights.safetensors")
+        assert main(["evaluate", path, "--weights", weights, "--device", "cpu", "--json"]) == 0
+        answers = [json.loads(capsys.readouterr().out)]
+        assert main(["compare", path, "--methods", "none", "--batch", "0", "--json"]) == 0
+        answers.append(json.loads(capsys.readouterr().out))
+        pairs = [score for answer in answers for score in answer["scores"]]
+        scores.append([{key: value for key, value in score.items() if key != "seconds"} for score in pairs])
+        scores[-1] += [answer["strata"] for answer in answers]
+    assert len(scores[0]) == 2 * (len(INDICES) + 1)
+    assert scores[0] == scores[1]
+    assert main(["evaluate", f"{shards}/none.tar", "--weights", weights]) == 2
+
+
+def offsets(shard: Path) -> list[tarfile.TarInfo]:
+    with tarfile.open(shard) as archive:
+        return archive.getmembers()
+
+
+def _inside_a_member(shard: Path) -> bytes:
+    return shard.read_bytes()[: offsets(shard)[-2].offset_data + 100]
+
+
+def _inside_a_header(shard: Path) -> bytes:
+    return shard.read_bytes()[: offsets(shard)[-1].offset + 100]
+
+
+def _between_members(shard: Path) -> bytes:
+    return shard.read_bytes()[: offsets(shard)[-1].offset]
+
+
+def _between_samples(shard: Path) -> bytes:
+    return shard.read_bytes()[: offsets(shard)[7].offset]
+
+
+def _in_the_last_padding(shard: Path) -> bytes:
+    last = offsets(shard)[-1]
+    return shard.read_bytes()[: last.offset_data + last.size]
+
+
+def _header_flipped(shard: Path) -> bytes:
+    data = bytearray(shard.read_bytes())
+    data[offsets(shard)[7].offset + 3] ^= 1
+    return bytes(data)
+
+
+def _zipped(shard: Path) -> bytes:
+    return gzip.compress(shard.read_bytes())
+
+
+def _text(shard: Path) -> bytes:
+    return b"not a tar file " * 100
+
+
+def _nothing(shard: Path) -> bytes:
+    return b""
+
+
+DAMAGE = [
+    _inside_a_member, _inside_a_header, _between_members, _between_samples, _in_the_last_padding, _header_flipped,
+    _zipped, _text, _nothing,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_truncated_and_damaged_shards_are_named(shard: Path, damage: Callable[[Path], bytes]) -> None:
+    """Fails without the look at the end of the tar: tarfile then gives the samples before a damaged header as all."""
+    assert len(open_pairs(shard)) == 2
+    shard.write_bytes(damage(shard))
+    for path in (shard, shard.parent):
+        with pytest.raises(InputError, match=r"shard-000000\.tar: .*truncated"):
+            open_pairs(path)
+
+
+def rewrite(shard: Path, change: Callable[[str, bytes], Iterator[tuple[str, bytes]]]) -> None:
+    """Replaces each member (name, content) by those that `change` yields for it."""
+    with tarfile.open(shard) as archive:
+        members = [(info.name, archive.extractfile(info).read()) for info in archive]  # type: ignore[union-attr]
+    with tarfile.open(shard, "w", format=tarfile.USTAR_FORMAT) as archive:
+        for name, content in members:
+            for new, data in change(name, content):
+                info = tarfile.TarInfo(new)
+                info.size = len(data)
+                archive.addfile(info, io.BytesIO(data))
+
+
+@pytest.mark.parametrize("suffix", ["image1.png", "image2.png", "forward.npy", "forward_visible.npy",
+                                    "backward.npy", "backward_visible.npy", "json"])  # fmt: skip
+def test_a_missing_member_is_named(shard: Path, suffix: str) -> None:
+    rewrite(shard, lambda name, data: iter([(name, data)] if name != f"000001.{suffix}" else []))
+    with pytest.raises(InputError, match=rf"shard-000000\.tar: sample 000001 lacks {suffix};"):
+        open_pairs(shard)
+
+
+def test_two_samples_of_one_key_are_named(shard: Path) -> None:
+    """Fails with the later of the two taken."""
+    shutil.copy(shard, shard.with_name("other.tar"))
+    with pytest.raises(InputError, match=r"shard-000000\.tar: sample 000000 is in .*other\.tar, too"):
+        open_pairs(shard.parent)
+    rewrite(shard, lambda name, data: iter([(name.replace("000001", "000000"), data)]))
+    with pytest.raises(InputError, match=r"shard-000000\.tar, member 000000\.image1\.png: occurs twice"):
+        open_pairs(shard)
+
+
+def _npy(array: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    np.lib.format.write_array(buffer, array, allow_pickle=array.dtype == object)
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("suffix", "content", "words"),
+    [
+        ("image2.png", lambda data: data[:300] + bytes([data[300] ^ 1]) + data[301:], "damaged PNG"),
+        ("image2.png", lambda data: data[:-20], "truncated PNG"),
+        ("image2.png", lambda data: b"GIF" + data[3:], "not a PNG"),
+        ("image2.png", lambda data: b"", "not a PNG"),
+        ("forward.npy", lambda data: data[:-4], "header says"),
+        ("forward.npy", lambda data: data[:50], r"not a readable \.npy"),
+        ("forward.npy", lambda data: data.replace(b"'shape': (", b"'shape': ["), r"not a readable \.npy"),
+        ("forward.npy", lambda data: data.replace(b"(64, 64, 2)", b"(6444444444444, 64, 2)"), "not a readable|says"),
+        ("forward.npy", lambda data: b"", r"not a readable \.npy"),
+        ("forward.npy", lambda data: _npy(np.zeros((64, 64, 2))), "float64"),
+        ("forward.npy", lambda data: _npy(np.array([[{}]])), "object"),
+        ("forward.npy", lambda data: _npy(np.zeros((64, 64), np.float32)), "shapes"),
+        ("forward_visible.npy", lambda data: _npy(np.zeros((64, 60), np.uint8)), "shapes"),
+    ],
+)
+def test_a_damaged_member_is_named(shard: Path, suffix: str, content: Callable[[bytes], bytes], words: str) -> None:
+    rewrite(shard, lambda name, data: iter([(name, content(data) if name == f"000001.{suffix}" else data)]))
+    dataset = open_pairs(shard)
+    with pytest.raises(InputError, match=rf"shard-000000\.tar, member 000001\.(forward|image2)[^ ]*: .*({words})"):
+        dataset[1]
+    dataset[0]
+
+
+def test_a_shard_that_changes_after_opening_is_named(shard: Path) -> None:
+    dataset = open_pairs(shard)
+    shard.write_bytes(shard.read_bytes()[:1000])
+    with pytest.raises(InputError, match=r"member 000000\.image1\.png: ends after \d+ of \d+ bytes"):
+        dataset[0]
+    shard.unlink()
+    with pytest.raises(InputError, match=r"shard-000000\.tar"):
+        dataset[0]
+    with pytest.raises(InputError, match=r"shard-000000\.tar"):
+        dataset.truth(0)
+
+
+def test_what_holds_no_sample_is_named(tmp_path: Path) -> None:
+    with tarfile.open(tmp_path / "a.tar", "w"):
+        pass
+    with pytest.raises(InputError, match="holds no image pair"):
+        open_pairs(tmp_path)
+    with tarfile.open(tmp_path / "a.tar", "w") as archive:
+        archive.addfile(tarfile.TarInfo("notes.txt"))
+    with pytest.raises(InputError, match=r"a\.tar: sample notes lacks image1\.png and .*synth export"):
+        open_pairs(tmp_path)
+    (tmp_path / "a.tar").unlink()
+    (tmp_path / "a.tar").mkdir()  # a folder of that name is no shard
+    with pytest.raises(InputError, match="no image pairs"):
+        open_pairs(tmp_path)
