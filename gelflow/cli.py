@@ -23,7 +23,9 @@ app = App(
 )
 
 Device = Literal["auto", "cpu", "cuda"]
-Paths = Annotated[list[Path], Parameter(help="Folders of pairs: of synth, its *.tar shards, of `pairs`, or NAME_1.png, NAME_2.png.")]
+Paths = Annotated[
+    list[Path], Parameter(help="Folders of pairs: of synth or its *.tar shards, of `pairs`, or NAME_1.png, NAME_2.png.")
+]
 AsJson = Annotated[bool, Parameter("--json", negative=(), help="Print the answer as JSON on stdout.")]
 Size = Annotated[str | None, Parameter(help="ROWSxCOLUMNS at which the network works; default: as in training.")]
 Assignments = Annotated[list[str] | None, Parameter("--set", help="KEY=VALUE, such as loss.lambda_dc=10; repeatable.")]

@@ -16,6 +16,7 @@ from synth.bench.accuracy import GRID, Answer, Errors, answer, errors, worst
 from synth.bench.cases import GEL, HELD, OFF_CENTRE, SHEARED, Case
 from synth.bench.comparison import cheapest, pareto_front, rivalry, speed_up
 from synth.bench.fem import Results, Row, measure
+from synth.bench.picture import STYLES
 from synth.bench.press import Press, pressed, ready_stepper
 from synth.bench.report import record, summary, write_results
 from synth.bench.setting import Fine, Graded, Setting, Uniform, of_family
@@ -211,6 +212,7 @@ def test_suites_are_well_formed() -> None:
             names = [setting.name for setting in settings]
             assert len(set(names)) == len(names)
             assert suites.BASE in settings or suite.cases[0][0] is not case
+            assert {setting.family for setting in settings} <= set(STYLES)  # else the plot would leave them out
     assert len(suites.whole().cases) == 3
     uniform = Uniform((6, 4, 2)).mesh(HELD)
     for axis, count in enumerate((6, 4, 2)):
