@@ -14,6 +14,10 @@ from synth.surface import ContactFaces
 _FACES_OF_TET = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])  # normals point out of a positive tetrahedron
 
 
+FLAT = 1e-10
+"""Volume over the longest edge cubed of a tetrahedron that counts as flat: rounding leaves up to some 1e-17."""
+
+
 @dataclass(frozen=True)
 class PadMesh:
     """A box of gel: contact surface at z = 0, bonded to the window at z = size[2], centred in x and y.
@@ -124,10 +128,15 @@ def check_mesh(mesh: PadMesh) -> None:
     """
     if not np.isfinite(mesh.points).all():
         raise InputError("the mesh has points that are not finite")
-    if mesh.volumes.min() <= 0:
-        number = int(mesh.volumes.argmin())
-        volume = mesh.volumes[number]
-        raise InputError(f"tetrahedron {number} of the mesh has a volume of {volume:.3g} mm^3; it must be > 0")
+    corners = mesh.points[mesh.tets]
+    longest = np.linalg.norm(corners[:, :, None] - corners[:, None], axis=-1).max(axis=(1, 2))
+    share = mesh.volumes / np.maximum(longest, np.finfo(float).tiny ** 0.25) ** 3
+    if share.min() <= FLAT:
+        number = int(share.argmin())
+        raise InputError(
+            f"tetrahedron {number} of the mesh has a volume of {mesh.volumes[number]:.3g} mm^3; it must be > 0, and more "
+            f"than {FLAT:g} of its longest edge cubed"
+        )
     loose = np.setdiff1d(np.arange(len(mesh.points)), mesh.tets)
     if len(loose):
         raise InputError(f"node {loose[0]} of the mesh belongs to no tetrahedron ({len(loose)} such nodes)")
