@@ -134,8 +134,8 @@ def check_mesh(mesh: PadMesh) -> None:
     if share.min() <= FLAT:
         number = int(share.argmin())
         raise InputError(
-            f"tetrahedron {number} of the mesh has a volume of {mesh.volumes[number]:.3g} mm^3; it must be > 0, and more "
-            f"than {FLAT:g} of its longest edge cubed"
+            f"tetrahedron {number} of the mesh has a volume of {mesh.volumes[number]:.3g} mm^3; it must be > 0, and "
+            f"more than {FLAT:g} of its longest edge cubed"
         )
     loose = np.setdiff1d(np.arange(len(mesh.points)), mesh.tets)
     if len(loose):

@@ -54,15 +54,7 @@ def simulate_batch(
 ) -> list[Trajectory]:
     """Simulate scenes that share pad, materials and numerics side by side; each as if it were alone."""
     first = scenes[0]
-    for scene in scenes:
-        gel = scene.sensor.gel
-        if (gel.size_mm, gel.dome_radius_mm) != (mesh.size_mm, mesh.dome_radius_mm):
-            raise InputError(
-                f"the mesh is of a {mesh.size_mm} mm pad of dome radius {mesh.dome_radius_mm}, "
-                f"the scene's is {gel.size_mm} mm with {gel.dome_radius_mm}"
-            )
-        if (_elastic(scene.sensor.gel), scene.numerics) != (_elastic(first.sensor.gel), first.numerics):
-            raise InputError("the scenes of a batch must share the gel's materials and numerics")
+    check_shared(scenes, mesh)
     check_mesh(mesh)
     gel = first.sensor.gel
     space = function_space(mesh, ELEMENTS[first.numerics.element]())
@@ -80,6 +72,26 @@ def simulate_batch(
     moduli = [scene.sensor.gel.youngs_modulus_kpa / 1000 for scene in scenes]
     friction = [scene.contact.friction for scene in scenes]
     return Stepper(system, paths, friction, first.numerics, moduli, driver, frames).run()
+
+
+def check_shared(scenes: Sequence[Scene], mesh: PadMesh) -> None:
+    """Refuse scenes that are not of the mesh's pad, or differ in what a batch has in common.
+
+    Raises:
+        InputError: a scene's pad is not the mesh's, or its materials or numerics are not the first scene's.
+    """
+    first = scenes[0]
+    for scene in scenes:
+        gel = scene.sensor.gel
+        own, other = _pad(gel.size_mm, gel.dome_radius_mm), _pad(mesh.size_mm, mesh.dome_radius_mm)
+        if own != other:
+            raise InputError(f"the mesh is of a {other}, the scene's is a {own}")
+        if (_elastic(gel), scene.numerics) != (_elastic(first.sensor.gel), first.numerics):
+            raise InputError("the scenes of a batch must share the gel's materials and numerics")
+
+
+def _pad(size_mm: tuple[float, float, float], dome_radius_mm: float | None) -> str:
+    return f"{size_mm} mm pad" + ("" if dome_radius_mm is None else f" of dome radius {dome_radius_mm} mm")
 
 
 def _elastic(gel: Gel) -> tuple[float, ...]:

@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Sequence
 from pathlib import Path as FilePath
 
-from synth.errors import InputError
 from synth.mesh import PadMesh
 from synth.scene import Scene
 from synth.simulate.batched.jobs import Job, untouched
@@ -12,7 +11,7 @@ from synth.simulate.batched.run import Run
 from synth.simulate.driver import STANDARD, Driver
 from synth.simulate.indenter import rigid_body
 from synth.simulate.path import Path
-from synth.simulate.solve import _elastic
+from synth.simulate.solve import check_shared
 from synth.simulate.trajectory import Trajectory
 
 LARGEST_BATCH = 512
@@ -49,15 +48,7 @@ def simulate_many(
     if not scenes:
         return
     first = scenes[0]
-    for scene in scenes:
-        gel = scene.sensor.gel
-        if (gel.size_mm, gel.dome_radius_mm) != (mesh.size_mm, mesh.dome_radius_mm):
-            raise InputError(
-                f"the mesh is of a {mesh.size_mm} mm pad of dome radius {mesh.dome_radius_mm}, "
-                f"the scene's is {gel.size_mm} mm with {gel.dome_radius_mm}"
-            )
-        if (_elastic(scene.sensor.gel), scene.numerics) != (_elastic(first.sensor.gel), first.numerics):
-            raise InputError("the scenes of a batch must share the gel's materials and numerics")
+    check_shared(scenes, mesh)
     pad = pad or prepare(first, mesh, device)
     jobs = jobs_of(scenes, pad, folder)
     for number, job in enumerate(jobs):
