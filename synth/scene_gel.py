@@ -1,10 +1,11 @@
 """The part of a scene's schema that is the soft pad: its size, the shape of its contact face, its materials."""
 
 import math
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 from pydantic import Field, model_validator
 
+from synth.arrays import FloatArray
 from synth.scene_indenters import NonNegative, Part, Positive
 
 THINNEST = 0.3
@@ -12,6 +13,14 @@ THINNEST = 0.3
 their height at the apex, see `synth.mesh.dome` for what becomes of their quality."""
 STEEPEST_DEG = 60.0
 """Largest slope of a dome's face, at its corners."""
+
+
+Number = TypeVar("Number", float, FloatArray)
+
+
+def dome_height(square_mm2: Number, radius_mm: float) -> Number:
+    """R - sqrt(R² - r²), mm, without its cancellation: z of a dome's face at squared distances r² from the axis."""
+    return square_mm2 / (radius_mm + (radius_mm**2 - square_mm2) ** 0.5)
 
 
 class Layer(Part):
@@ -51,7 +60,7 @@ class Gel(Part):
         radius, square = self.dome_radius_mm, x * x + y * y
         if radius is None:
             return 0.0
-        return radius - math.sqrt(radius**2 - square) if square < radius**2 else self.size_mm[2]
+        return float(dome_height(square, radius)) if square < radius**2 else self.size_mm[2]
 
     @model_validator(mode="after")
     def _layered(self) -> "Gel":

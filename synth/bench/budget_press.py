@@ -16,13 +16,8 @@ from synth.mesh import PadMesh
 from synth.scene import Scene
 from synth.simulate import Trajectory
 from synth.simulate.driver import STANDARD, Driver
-from synth.simulate.indenter import rigid_body
-from synth.simulate.material import pad_material
-from synth.simulate.path import Path
-from synth.simulate.solve import ELEMENTS
-from synth.simulate.space import function_space
+from synth.simulate.solve import stepper_of
 from synth.simulate.stepping import Stepper
-from synth.simulate.system import System
 
 
 @dataclass(frozen=True)
@@ -184,12 +179,6 @@ def ready_stepper(
     Raises:
         InputError: the indenter cannot be built.
     """
-    gel, numerics = scene.sensor.gel, scene.numerics
-    space = function_space(mesh, ELEMENTS[numerics.element]())
-    body = rigid_body(scene.contact.indenter, folder, mesh.spacing_mm / (2 * space.element.order))
-    path = Path(scene.motion, body, gel.dome_radius_mm)
-    system = System(space, pad_material(gel, mesh), penalty=numerics.penalty)
-    modulus = gel.youngs_modulus_kpa / 1000
-    stepper = Stepper(system, [path], [scene.contact.friction], numerics, [modulus], driver, frames)
-    factorise_at_rest(stepper, path)
+    stepper = stepper_of([scene], mesh, folder, frames=frames, driver=driver)
+    factorise_at_rest(stepper, stepper.samples[0].path)
     return stepper

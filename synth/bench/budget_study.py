@@ -11,11 +11,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from synth.errors import InputError
 from synth.mesh import Counts, Focus, PadMesh, domed, graded_box
-from synth.mesh.graded import spacing
 from synth.plan import ITERATIONS_PER_RECORD, ITERATIONS_PER_STEP, SOLVE_GROWTH
 from synth.sampling import MAX_DRAWS, draw, draw_sensor, pairs_of, sensor_of
 from synth.scene import Gel, Scene
@@ -30,8 +27,10 @@ from synth.simulate.resolution import (
     STEEPEST_DEPTH,
     Fineness,
     Resolution,
+    depth_growth,
     graded_mesh,
     ladder,
+    lateral_spacing,
     predicted_error_mm,
     resolve,
     scale_px_per_mm,
@@ -68,25 +67,12 @@ class Reference:
         still as high as wide, or lower.
         """
         size, across = gel.size_mm, (self.across, self.across)
-        flat = Counts(across, self.beside)
-        fine = float(np.sqrt(np.prod([spacing(size[k], focus.span(k, size[k]), flat, k)[0] for k in (0, 1)])))
+        fine = lateral_spacing(gel, focus, Counts(across, self.beside))
         height = size[2] / fine
         through = max(2, math.ceil(math.log1p(height * (STEEPEST_DEPTH - 1)) / math.log(STEEPEST_DEPTH))) + 1
-        counts = Counts(across, self.beside, through, growth=_growth(through, height))
+        counts = Counts(across, self.beside, through, growth=depth_growth(through, height))
         box = graded_box(size, focus, counts, tuple(layer.thickness_mm for layer in gel.layers))
         return domed(box, gel.dome_radius_mm), fine
-
-
-def _growth(count: int, height: float) -> float:
-    """Ratio of the spacings of which `count` reach `height` when the first is 1; 1 where equal ones reach farther."""
-    low, high = 1.0, STEEPEST_DEPTH
-    for _ in range(50):
-        middle = (low + high) / 2
-        if sum(middle**k for k in range(count)) < height:
-            low = middle
-        else:
-            high = middle
-    return high if height > count else 1.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,9 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
+from synth.dataset.finalising import Finalising
 from synth.dataset.job import DATASET_FILE, Job, check_record, continued, refuse_another_job
 from synth.dataset.joining import FAILURES_FILE, MANIFEST_FILE, failure_key, manifest_key
 from synth.dataset.jsontext import to_document, to_line
@@ -45,7 +45,7 @@ def put_sample(url: str, sample: Sample, job: Job) -> ManifestEntry:
     return entry
 
 
-class UrlWriter:
+class UrlWriter(Finalising):
     """As `synth.dataset.writer.DatasetWriter`, for a URL."""
 
     def __init__(self, url: str, job: Job, shard: Shard | None = None) -> None:
@@ -145,20 +145,6 @@ class UrlWriter:
         """Lets other processes write; harmless when repeated."""
         self._lease.release()
         self._temporary.cleanup()
-
-    def __enter__(self) -> "UrlWriter":
-        """For `with`."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Finalises (unless an error is on its way that this might hide) and closes."""
-        try:
-            if error is None or isinstance(error, KeyboardInterrupt):
-                self.finalise()
-        finally:
-            self.close()
 
     def _there(self) -> dict[str, Any] | None:
         """The job that is there, if it is this one; None where there is nothing."""

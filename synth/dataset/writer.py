@@ -18,9 +18,9 @@ sorts both files, so that they do not depend on the number of workers or on inte
 import contextlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
+from synth.dataset.finalising import Finalising
 from synth.dataset.job import DATASET_FILE, Job, continued, read_job_record, refuse_another_job
 from synth.dataset.joining import FAILURES_FILE, MANIFEST_FILE, failure_key, join_shards, manifest_key
 from synth.dataset.jsontext import to_document
@@ -43,7 +43,7 @@ from synth.errors import InputError
 MESHES_FOLDER = "meshes"
 
 
-class DatasetWriter:
+class DatasetWriter(Finalising):
     """Writes one job's samples; one process holds it, workers call `write_sample_files` and hand back the entry."""
 
     def __init__(self, directory: Path | str, job: Job) -> None:
@@ -147,20 +147,6 @@ class DatasetWriter:
     def close(self) -> None:
         """Lets other processes write; harmless when repeated."""
         self._lock.release()
-
-    def __enter__(self) -> "DatasetWriter":
-        """For `with`."""
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Finalises (unless an error is on its way that this might hide) and closes."""
-        try:
-            if error is None or isinstance(error, KeyboardInterrupt):
-                self.finalise()
-        finally:
-            self.close()
 
     def _open(self) -> tuple[set[int], set[tuple[int, int]]]:
         """Take the dataset for this process; what is finished and what has failed."""

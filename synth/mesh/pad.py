@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from synth.arrays import BoolArray, FloatArray, Points, Tets, Triangles
 from synth.errors import InputError
+from synth.scene_gel import dome_height
 from synth.surface import ContactFaces
 
 _FACES_OF_TET = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])  # normals point out of a positive tetrahedron
-
 
 FLAT = 1e-10
 """Volume over the longest edge cubed of a tetrahedron that counts as flat: rounding leaves up to some 1e-17."""
@@ -113,11 +113,10 @@ class PadMesh:
 
 
 def face_height(places: FloatArray, dome_radius_mm: float | None) -> FloatArray:
-    """Z (n,) mm of the undeformed contact face at places (n, 2) mm: R - sqrt(R² - r²), without its cancellation."""
+    """Z (n,) mm of the undeformed contact face at places (n, 2) mm."""
     if dome_radius_mm is None:
         return np.zeros(len(places))
-    square = (places**2).sum(axis=1)
-    return np.asarray(square / (dome_radius_mm + np.sqrt(dome_radius_mm**2 - square)))
+    return np.asarray(dome_height((places**2).sum(axis=1), dome_radius_mm))
 
 
 def check_mesh(mesh: PadMesh) -> None:

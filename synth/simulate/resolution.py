@@ -82,7 +82,7 @@ def ladder(gel: Gel, focus: Focus, across: Sequence[int] = LADDER) -> list[Finen
     found = []
     for number in across:
         counts = Counts((number, number), OUTER)
-        wide, fewest = _lateral_spacing(gel, focus, number), 2
+        wide, fewest = lateral_spacing(gel, focus, counts), 2
         while size[2] / wide > TALLEST * _reach(fewest):
             fewest += 1
         for through in (fewest, fewest + 1):
@@ -110,20 +110,20 @@ def graded_mesh(gel: Gel, focus: Focus, across: int, through: int | None = None)
         through: elements through the thickness; None for as many as keep those under the zone no higher than wide.
     """
     size = gel.size_mm
-    wide = _lateral_spacing(gel, focus, across)
+    wide = lateral_spacing(gel, focus, Counts((across, across), OUTER))
     if through is None:
         through = 2
         while _reach(through) * wide < size[2]:
             through += 1
-    growth = _growth(through, size[2] / wide)
+    growth = depth_growth(through, size[2] / wide)
     layers = tuple(layer.thickness_mm for layer in gel.layers)
     box = graded_box(size, focus, Counts((across, across), OUTER, through, growth=growth), layers)
     return domed(box, gel.dome_radius_mm), _spacing(wide, size[2] / _reach(through))
 
 
-def _lateral_spacing(gel: Gel, focus: Focus, across: int) -> float:
-    """Width of the elements in the zone, mm: geometric mean of the two directions."""
-    counts, size = Counts((across, across), OUTER), gel.size_mm
+def lateral_spacing(gel: Gel, focus: Focus, counts: Counts) -> float:
+    """Width of the elements in a zone, mm: geometric mean of the two directions."""
+    size = gel.size_mm
     return float(np.sqrt(np.prod([spacing(size[k], focus.span(k, size[k]), counts, k)[0] for k in (0, 1)])))
 
 
@@ -139,7 +139,7 @@ def _reach(through: int) -> float:
     return float(sum(STEEPEST_DEPTH**k for k in range(through)))
 
 
-def _growth(through: int, height: float) -> float:
+def depth_growth(through: int, height: float) -> float:
     """The growth with which so many elements fill `height` when the first is 1; at most STEEPEST_DEPTH."""
     low, high = 1.0, STEEPEST_DEPTH
     for _ in range(40):
@@ -154,8 +154,8 @@ def _growth(through: int, height: float) -> float:
 ERROR_SCALES = {"sphere": 0.084, "cone": 0.061, "bar": 0.13, "punch": 0.212, "box": 0.17, "torus": 0.173, "mesh": 0.22}
 """k of the error model; a bar is a cylinder that lies, a punch one that stands. Fitted to 40 draws of two scenes on
 five meshes each against finer ones (docs/reports/budget.md). Where a draw needs more than the coarsest mesh the
-logarithm of measured over predicted scatters by 0.10, and by 0.15 for draws left out of the fit; elsewhere by 0.24.
-"mesh" was not measured: it is set as the worst of the others."""
+logarithm of measured over predicted scatters by 0.10, and by 0.15 for draws left out of the fit; over all of them by
+0.24. "mesh" was not measured: it is set as the worst of the others."""
 CERTAINTY = 1.2
 """Factor on the model's mean."""
 DEFAULT_TARGET_PX = 0.5

@@ -53,6 +53,18 @@ def simulate_batch(
     driver: Driver = STANDARD,
 ) -> list[Trajectory]:
     """Simulate scenes that share pad, materials and numerics side by side; each as if it were alone."""
+    return stepper_of(scenes, mesh, folder, device, frames, driver).run()
+
+
+def stepper_of(
+    scenes: Sequence[Scene],
+    mesh: PadMesh,
+    folder: FilePath | None = None,
+    device: str = "cpu",
+    frames: frozenset[int] | None = None,
+    driver: Driver = STANDARD,
+) -> Stepper:
+    """What `simulate_batch` runs, at the start of the scenes' paths; arguments and errors as there."""
     first = scenes[0]
     check_shared(scenes, mesh)
     check_mesh(mesh)
@@ -71,7 +83,7 @@ def simulate_batch(
     paths = [Path(scene.motion, body, mesh.dome_radius_mm) for scene, body in zip(scenes, bodies, strict=True)]
     moduli = [scene.sensor.gel.youngs_modulus_kpa / 1000 for scene in scenes]
     friction = [scene.contact.friction for scene in scenes]
-    return Stepper(system, paths, friction, first.numerics, moduli, driver, frames).run()
+    return Stepper(system, paths, friction, first.numerics, moduli, driver, frames)
 
 
 def check_shared(scenes: Sequence[Scene], mesh: PadMesh) -> None:

@@ -122,7 +122,10 @@ def test_who_is_refused(url: str) -> None:
 def test_a_killed_run_holds_nothing_for_long(url: str, note: dict[str, object]) -> None:
     UrlWriter(url, job()).close()
     UrlStore(url).write("leases/whole.json", json.dumps(note).encode())
-    UrlWriter(url, job()).close()
+    with UrlWriter(url, job()):
+        held = UrlStore(url).read("leases/whole.json")
+        assert held is not None
+        assert json.loads(held)["pid"] == os.getpid()  # taken over; fails with an InputError where it is not
 
 
 def test_storage_that_refuses_ends_with_one_message_and_goes_on(
