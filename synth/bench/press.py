@@ -70,8 +70,8 @@ def pressed(case: Case, setting: Setting, mesh: PadMesh, short_s: float = SHORT_
 def ready_stepper(case: Case, setting: Setting, mesh: PadMesh) -> Stepper:
     """A stepper at the start of the path, kernels compiled and the sparse pattern analysed."""
     space = function_space(mesh, setting.built_element())
-    single = setting.driver.single_precision
-    system = System(space, pad_material(GEL, mesh), penalty=setting.numerics.penalty, single=single)
+    single, keep = setting.driver.single_precision, setting.driver.keep_factors
+    system = System(space, pad_material(GEL, mesh), penalty=setting.numerics.penalty, single=single, keep=keep)
     body = rigid_body(INDENTER, None, mesh.spacing_mm / (2 * space.element.order))
     path, modulus = Path(case.motion, body), GEL.youngs_modulus_kpa / 1000
     stepper = Stepper(system, [path], [case.friction], setting.numerics, [modulus], setting.driver)

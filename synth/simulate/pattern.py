@@ -51,7 +51,7 @@ class Pattern:
         self.face_pairs = _pairs(space.faces.shape[1])
         self.face_slot = self._blocks(faces, self.face_pairs)
         self.face_unknowns = faces.reshape(len(faces), -1)
-        self._factors: dict[bool, Factor] = {}
+        self._factors: dict[tuple[bool, int], Factor] = {}
         del self._keys
 
     @property
@@ -59,11 +59,12 @@ class Pattern:
         """Number of entries."""
         return len(self.indices)
 
-    def factor(self, single: bool = True) -> Factor:
-        """The linear solver's factor for this pattern in single or double precision, analysed once."""
-        if single not in self._factors:
-            self._factors[single] = direct_factor(self.indptr, self.indices, single)
-        return self._factors[single]
+    def factor(self, single: bool = True, sample: int = 0) -> Factor:
+        """The factor of a sample of a batch, in single or double precision; analysed once."""
+        key = (single, sample)
+        if key not in self._factors:
+            self._factors[key] = direct_factor(self.indptr, self.indices, single)
+        return self._factors[key]
 
     def _couple(self, moves: np.ndarray, pressures: np.ndarray | None) -> None:
         import scipy.sparse as sp

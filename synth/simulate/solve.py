@@ -77,6 +77,7 @@ def stepper_of(
         penalty=first.numerics.penalty,
         device=device,
         single=driver.single_precision,
+        keep=driver.keep_factors,
     )
     resolved = mesh.spacing_mm / (2 * space.element.order)
     bodies = [rigid_body(scene.contact.indenter, folder, resolved) for scene in scenes]

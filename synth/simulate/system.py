@@ -15,7 +15,7 @@ from synth.arrays import FloatArray
 from synth.simulate.bulk import bulk_residual, bulk_tangent, linearise, pressure_tangent
 from synth.simulate.contact import ContactState, Indenters, contact_residual, contact_stiffness, contact_tangent
 from synth.simulate.fold import fold_residual, fold_tangent
-from synth.simulate.linear import gmres
+from synth.simulate.linear import Directions
 from synth.simulate.material import Material
 from synth.simulate.multipliers import augment, settle
 from synth.simulate.pattern import pattern_of
@@ -79,6 +79,7 @@ class System:
         load: (n, 3) dead nodal forces in E mm², or None.
         device: Warp device.
         single: factorise tangents in single precision.
+        keep: use the factors of earlier tangents where that pays.
     """
 
     def __init__(
@@ -90,11 +91,12 @@ class System:
         load: FloatArray | None = None,
         device: str = "cpu",
         single: bool = True,
+        keep: bool = True,
     ) -> None:
         self.space, self.batch, self.penalty, self.device, self.load = space, batch, penalty, device, load
         self.mixed = material.mixed and space.element.has_pressure
         self._pattern = pattern_of(space, self.mixed)
-        self._single = single
+        self._directions = [Directions(self._pattern.factor(single, s), keep) for s in range(batch)]
         self._bulk = bulk_tables(space, material, self.mixed, device)
         self._faces = face_tables(space, device)
         self._lattice = fold_tables(space, material, device)
@@ -249,12 +251,9 @@ class System:
         step = self.zero()
         moves = step.u[0].size
         full = np.zeros(moves + step.p.shape[1])
-        factor = self._pattern.factor(self._single)
-        for s in np.flatnonzero(active):
-            full[self.free] = np.nan
-            if factor.factorise(tangent.values[s]):
-                matrix = self.matrix(tangent.values[s])
-                full[self.free] = -gmres(matrix, tangent.remainder[s], factor, residual[s])[0]
+        for s in map(int, np.flatnonzero(active)):
+            matrix = self.matrix(tangent.values[s])
+            full[self.free] = -self._directions[s].solve(matrix, tangent.remainder[s], residual[s])
             step.u[s], step.p[s] = full[:moves].reshape(-1, 3), full[moves:]
         return step
 

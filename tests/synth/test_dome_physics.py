@@ -104,7 +104,7 @@ def test_mesh_and_scene_must_be_of_one_dome() -> None:
     focus = Focus((0.0, 0.0), (1.0, 1.0))
     drawn = scene(20.0, (10.0, 8.0, 4.0), BALL, depth_mm=0.1)
     flat = scene(None, (10.0, 8.0, 4.0), BALL, depth_mm=0.1)
-    with pytest.raises(InputError, match=r"the mesh is of a [^,]*, [^,]*, [^,]* mm pad, the scene's .* pad of dome radius 20"):
+    with pytest.raises(InputError, match=r"the mesh is of a \([^)]*\) mm pad, the scene's .* of dome radius 20"):
         simulate(drawn, graded_mesh(flat.sensor.gel, focus, 4)[0])
 
 

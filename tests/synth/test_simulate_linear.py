@@ -12,7 +12,7 @@ from scipy.sparse import csr_matrix, triu
 
 import synth.simulate.linear as linear
 from synth.arrays import FloatArray
-from synth.simulate.linear import Factor, PardisoFactor, SuperLUFactor, direct_factor, gmres, has_pardiso
+from synth.simulate.linear import Directions, Factor, PardisoFactor, SuperLUFactor, direct_factor, gmres, has_pardiso
 
 SIZE = 120
 needs_mkl = pytest.mark.skipif(not has_pardiso(), reason="no MKL")
@@ -109,7 +109,7 @@ def test_matrix_without_inverse_gives_no_step_to_trust(kind: Any, values: float)
 
 @each_factor
 @pytest.mark.parametrize("rest", [None, remainder(12)], ids=["symmetric", "unsymmetric"])
-def test_gmres_solves_with_the_remainder(kind: Any, rest: csr_matrix | None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gmres_solves_with_the_remainder(kind: Any, rest: csr_matrix | None) -> None:
     # Fails with the remainder left out of the product, or the diagonal counted twice in it.
     matrix, b = saddle(1), right_side(1)
     full = whole(matrix) if rest is None else whole(matrix) + rest.toarray()
@@ -118,33 +118,33 @@ def test_gmres_solves_with_the_remainder(kind: Any, rest: csr_matrix | None, mon
     x = gmres(matrix, rest, factor, b)[0]
     # The residual that the Arnoldi relation predicts is the true one but for rounding.
     assert np.linalg.norm(full @ x - b) < 1.001 * linear.GMRES_TOLERANCE * np.linalg.norm(b)
-    monkeypatch.setattr(linear, "GMRES_TOLERANCE", 1e-12)
     exact = np.linalg.solve(full, b)
     # 1e-12 of the residual, times a condition number of some 100; single precision too.
-    np.testing.assert_allclose(gmres(matrix, rest, factor, b)[0], exact, atol=1e-9 * np.abs(exact).max())
+    np.testing.assert_allclose(gmres(matrix, rest, factor, b, 1e-12)[0], exact, atol=1e-9 * np.abs(exact).max())
 
 
-def test_gmres_ends_after_the_remainders_rank(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gmres_ends_after_the_remainders_rank() -> None:
     """(S + R) S^-1 is the identity but for a matrix of R's rank: one iteration more than that is enough."""
     # Fails with `basis[i]` orthogonalised against the first vector only.
-    monkeypatch.setattr(linear, "GMRES_TOLERANCE", 1e-10)
     matrix, b = saddle(1), right_side(1)
     factor = SuperLUFactor(matrix.indptr, matrix.indices)
     factor.factorise(matrix.data)
     for rank in (1, 5, 12):
-        assert gmres(matrix, remainder(rank), factor, b)[1] <= rank + 1
-    assert gmres(matrix, None, factor, b)[1] == 1
+        assert gmres(matrix, remainder(rank), factor, b, 1e-10)[1] <= rank + 1
+    assert gmres(matrix, None, factor, b, 1e-10)[1] == 1
 
 
 def test_gmres_without_a_right_side() -> None:
     matrix = saddle(1)
-    x, iterations = gmres(matrix, remainder(5), SuperLUFactor(matrix.indptr, matrix.indices), np.zeros(SIZE))
+    x, iterations, _ = gmres(matrix, remainder(5), SuperLUFactor(matrix.indptr, matrix.indices), np.zeros(SIZE))
     assert not x.any()
     assert iterations == 0
 
 
 def test_gmres_passes_nan_on() -> None:
     class Broken:
+        made = 0
+
         def factorise(self, values: FloatArray) -> bool:
             return True
 
@@ -154,16 +154,60 @@ def test_gmres_passes_nan_on() -> None:
     assert np.isnan(gmres(saddle(1), None, Broken(), right_side(1))[0]).all()
 
 
-def test_gmres_stops_at_its_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_gmres_stops_at_its_limit() -> None:
     """A remainder too large for so few iterations: the best direction so far, not an endless loop."""
-    monkeypatch.setattr(linear, "GMRES_LIMIT", 3)
     matrix, rest, b = saddle(1), remainder(60, 50.0), right_side(1)
     factor = SuperLUFactor(matrix.indptr, matrix.indices)
     factor.factorise(matrix.data)
-    x, iterations = gmres(matrix, rest, factor, b)
+    x, iterations, told = gmres(matrix, rest, factor, b, limit=3)
     assert iterations == 3
     left = np.linalg.norm((whole(matrix) + rest.toarray()) @ x - b) / np.linalg.norm(b)
     assert linear.GMRES_TOLERANCE < left < 1
+    assert told == pytest.approx(left, rel=1e-6)
+
+
+def nearly(matrix: csr_matrix, rank: int) -> csr_matrix:
+    """The upper triangle changed in so many diagonal entries, as where contact changed."""
+    changed = matrix.copy()
+    diagonal = changed.diagonal()
+    diagonal[:rank] += 30.0 * np.arange(1, rank + 1)
+    changed.setdiag(diagonal)
+    return changed
+
+
+def test_factor_is_kept_while_it_serves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fails with the limit of kept factors left at GMRES_LIMIT (the third is not made), or with `_own` not compared."""
+    monkeypatch.setattr(linear, "KEPT_FROM", SIZE)
+    monkeypatch.setattr(linear, "KEPT_LIMIT", 4)
+    first, b = saddle(1), right_side(1)
+    factor = SuperLUFactor(first.indptr, first.indices)
+    one = Directions(factor, keep=True)
+    one.solve(first, None, b)
+    near = nearly(first, 1)  # with the remainder of rank 2 GMRES ends after 4 iterations
+    x = one.solve(near, remainder(2), b)
+    assert factor.made == 1
+    full = whole(near) + remainder(2).toarray()
+    assert np.linalg.norm(full @ x - b) < 1.001 * linear.KEPT_TOLERANCE * np.linalg.norm(b)
+    far = nearly(first, 30)  # takes GMRES more iterations
+    y = one.solve(far, None, b)
+    assert factor.made == 2
+    assert np.linalg.norm(whole(far) @ y - b) < 1.001 * linear.GMRES_TOLERANCE * np.linalg.norm(b)
+    # What another sample left in the factor would make the bits depend on the batch.
+    alone = Directions(SuperLUFactor(first.indptr, first.indices), keep=True)
+    Directions(factor, keep=True).solve(first, None, b)
+    np.testing.assert_array_equal(one.solve(near, None, b), alone.solve(near, None, b))
+
+
+def test_factor_is_made_anew_for_small_systems_and_where_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Fails with KEPT_FROM or `keep` left out of the condition (checked one at a time).
+    matrix, b = saddle(1), right_side(1)
+    for keep, least in ((True, SIZE + 1), (False, SIZE)):
+        monkeypatch.setattr(linear, "KEPT_FROM", least)
+        factor = SuperLUFactor(matrix.indptr, matrix.indices)
+        solver = Directions(factor, keep)
+        for _ in range(2):
+            solver.solve(matrix, None, b)
+        assert factor.made == 2
 
 
 def test_best_factor_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:

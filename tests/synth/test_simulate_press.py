@@ -208,6 +208,8 @@ def test_hopeless_press_ends_honestly() -> None:
 class Broken:
     """A factor that refuses, gives NaN, or nonsense."""
 
+    made = 0
+
     def __init__(self, how: str) -> None:
         self.how = how
 
