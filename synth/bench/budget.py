@@ -40,7 +40,7 @@ def run_budget(
         out: directory.
         draws: of each scene.
         seed: of the draws.
-        reference: elements across the contact of what errors are measured against; only coarser rungs are run.
+        reference: most elements across the contact of what errors are measured against; only coarser rungs are run.
         workers: presses that run at once, each in a process of its own.
         minutes: begin no press that is not expected to end within them; those that have begun are waited for.
         as_json: print the counts instead of the summary.

@@ -98,7 +98,7 @@ def press(study: Study, job: Job, machine: str = "") -> Pressed:
     one = drawn(study.template(job.scene), study.seed, job.index)
     scene, driver = one.scene, STANDARD
     if job.rung == REFERENCE:
-        mesh, spacing_mm = study.reference.mesh(scene.sensor.gel, one.focus)
+        mesh, spacing_mm = study.reference.mesh(scene.sensor.gel, one.focus, one.chosen.spacing_mm)
         scene, driver = _as_reference(scene, study.reference)
     else:
         mesh, spacing_mm = one.mesh(job.rung)

@@ -182,8 +182,9 @@ def _definitions(study: Study) -> list[str]:
         "",
         "**Error**: the root mean square over the picture of the distance in px between where a material point is "
         "seen and where it is seen in the reference, the largest of the states that the draw's pairs show. The "
-        f"reference has {reference.across} elements across the contact, {reference.beside[0]} and "
-        f"{reference.beside[1]} beside it, one more through the thickness than a draw's mesh would have, load steps of "
+        f"reference has elements {reference.finer:g} times smaller than the chosen mesh's, but at most "
+        f"{reference.across} across the contact; {reference.beside[0]} and {reference.beside[1]} beside it, one more "
+        "through the thickness than a draw's mesh would have, load steps of "
         f"{reference.step_mm:g} mm, and up to {reference.correction_iterations} iterations in each correction of "
         "penetration.",
         "",
@@ -191,8 +192,8 @@ def _definitions(study: Study) -> list[str]:
         f"{REPEATS} below {SHORT_S:g} s, without mesh, compilation and the analysis of the sparse pattern; and, as "
         f"times scatter on a busy machine, unknowns to the power {SOLVE_GROWTH:g}. The chosen mesh is compared with "
         f"the cheapest that met the target of those run: the draw's ladder of meshes, of {study.across[0]} to "
-        f"{study.across[-1]} elements across, up to {BEYOND} above the chosen one, and the finest. 8x3 is a mesh of 8 "
-        "elements across the contact and 3 through the thickness.",
+        f"{study.across[-1]} elements across, up to {BEYOND} above the chosen one and coarser than the reference. 8x3 "
+        "is a mesh of 8 elements across the contact and 3 through the thickness.",
     ]
 
 

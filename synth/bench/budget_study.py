@@ -48,7 +48,9 @@ class Reference:
     """What errors are measured against; all else is as for any draw.
 
     Attributes:
-        across: elements across the contact.
+        across: elements across the contact, at most.
+        finer: how many times smaller than the chosen mesh's elements its own are to be. Errors fall with the power 1.6
+            of their size: a quarter of the chosen mesh's error is left.
         beside: elements beside it, along x and along y; three and two on the ladder.
         step_mm: longest load step.
         correction_iterations: of Newton's method in one augmented-Lagrangian pass; with a draw's fewer, some passes
@@ -56,17 +58,26 @@ class Reference:
     """
 
     across: int = 18
+    finer: float = 2.4
     beside: tuple[int, int] = (4, 3)
     step_mm: float = 0.125
     correction_iterations: int = MAX_ITERATIONS
 
-    def mesh(self, gel: Gel, focus: Focus) -> tuple[PadMesh, float]:
-        """The mesh of a pad, and the spacing under the contact (mm).
+    def across_of(self, gel: Gel, focus: Focus, chosen_mm: float) -> int:
+        """Elements across a draw's contact, given the size of those of its chosen mesh."""
+        for number in range(LADDER[1], self.across, 2):
+            if self.finer * lateral_spacing(gel, focus, Counts((number, number), self.beside)) <= chosen_mm:
+                return number
+        return self.across
+
+    def mesh(self, gel: Gel, focus: Focus, chosen_mm: float) -> tuple[PadMesh, float]:
+        """The mesh of a pad, and the spacing under the contact (mm); arguments as of `across_of`.
 
         Through the thickness it has one element more than `graded_mesh` would have for as many across; the first is
         still as high as wide, or lower.
         """
-        size, across = gel.size_mm, (self.across, self.across)
+        number = self.across_of(gel, focus, chosen_mm)
+        size, across = gel.size_mm, (number, number)
         fine = lateral_spacing(gel, focus, Counts(across, self.beside))
         height = size[2] / fine
         through = max(2, math.ceil(math.log1p(height * (STEEPEST_DEPTH - 1)) / math.log(STEEPEST_DEPTH))) + 1
@@ -200,14 +211,16 @@ class Study:
         return next(template for template in self.templates if template.name == name)
 
     def rungs(self, one: Drawn) -> list[str]:
-        """The meshes that a draw is run on, cheapest first: those of its ladder up to BEYOND above the chosen one, and
-        the finest, whose difference from the reference tells how far that can be trusted.
+        """The meshes that a draw is run on, cheapest first: those of its ladder up to BEYOND above the chosen one that
+        have fewer elements across the contact than the reference.
         """
-        names = [str(fineness) for fineness in ladder(one.scene.sensor.gel, one.focus, self.across)]
+        gel = one.scene.sensor.gel
+        finest = self.reference.across_of(gel, one.focus, one.chosen.spacing_mm)
+        names = [str(fineness) for fineness in ladder(gel, one.focus, self.across) if fineness.across < finest]
         chosen = one.chosen_rung
         if chosen not in names:  # finer than all of them
             return [*names, chosen]
-        return [*names[: names.index(chosen) + BEYOND + 1], *names[names.index(chosen) + BEYOND + 1 :][-1:]]
+        return names[: names.index(chosen) + BEYOND + 1]
 
 
 def solver() -> str:
@@ -233,7 +246,7 @@ def jobs(study: Study, draws: Sequence[Drawn]) -> dict[Job, float]:
             if on_ladder:
                 mesh, _ = one.mesh(rung)
             else:
-                mesh, _ = study.reference.mesh(gel, one.focus)
+                mesh, _ = study.reference.mesh(gel, one.focus, one.chosen.spacing_mm)
                 step = min(step, study.reference.step_mm)
             iterations = ITERATIONS_PER_STEP * path.length_mm / step + ITERATIONS_PER_RECORD * one.scene.motion.steps
             work = iterations * len(mesh.points) ** SOLVE_GROWTH

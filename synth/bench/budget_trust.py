@@ -22,13 +22,14 @@ def trust(study: Study, verdicts: Sequence[Verdict], counted: Sequence[Tally]) -
         counted: of each scene, and perhaps of all.
     """
     lines = [
-        "A reference's own error is not known. Its difference from the press on the finest mesh, with the draw's own "
-        "load steps and driver, is one estimate of it, and is added to the error in the second column. If the errors "
-        f"of a rung and the reference fell with the power {RATE:g} of the spacing and had one shape, their difference "
-        "would be smaller than the rung's error; the third column has the errors that this makes of the measured "
-        "ones. Where the two errors are independent, the true one is smaller than measured.",
+        "A reference's own error is not known. If errors fall with the power "
+        f"{RATE:g} of the spacing, its difference from the press on the finest mesh below it, with the draw's own load "
+        "steps and driver, tells how large it is; the second column has it added to the errors. If moreover the errors "
+        "of chosen mesh and reference had one shape, their difference would be smaller than the former by a known "
+        "factor; the third column has the errors that this makes of the measured ones. Where the two errors are "
+        "independent, the true one is smaller than measured.",
         "",
-        "| scene | within target | with the difference added | extrapolated |",
+        "| scene | within target | with the reference's own error added | extrapolated |",
         "|---|---|---|---|",
         *(
             f"| {one.name} | {share(one.within, one.judged)} | {share(one.added, one.judged)} | "
@@ -36,7 +37,7 @@ def trust(study: Study, verdicts: Sequence[Verdict], counted: Sequence[Tally]) -
             for one in counted
         ),
         "",
-        "| scene | references run | complete | difference / target: median | largest | penetration left, mm: median | "
+        "| scene | references run | complete | own error / target: median | largest | penetration left, mm: median | "
         f"largest | above {LARGEST_PENETRATION_MM:g} mm |",
         "|---|---|---|---|---|---|---|---|",
     ]

@@ -2,7 +2,8 @@ r"""Whether a draw's mesh met its budget, and whether a cheaper one would have.
 
 The error that is judged is measured against a reference that errs, too. Two estimates of how much that may change:
 
-- the difference of the ladder's finest rung from the reference, added to the error;
+- the reference's own error, added to the error: d_r / ((h_f / h_r)^{1.6} - 1), where d_r is the difference of the
+  finest rung that was run, of spacing h_f, from the reference;
 - where errors fall as h^1.6 and rung and reference err alike, the error itself, from a difference d of the two, is
 
 .. math::  d / (1 - (h_r / h)^{1.6})
@@ -126,8 +127,12 @@ class Verdict:
 
     @property
     def doubt_px(self) -> float:
-        """Difference of the finest rung from the reference."""
-        return self.rungs[-1].error_px
+        """The reference's own error, by Richardson's extrapolation from the finest rung that was run."""
+        if self.reference is None:
+            return math.nan
+        finest = self.rungs[-1]
+        ratio = finest.measurement.spacing_mm / self.reference.spacing_mm
+        return finest.error_px / (ratio**RATE - 1) if ratio > 1 else math.nan
 
     @property
     def added_px(self) -> float:

@@ -28,7 +28,7 @@ from synth.cli import main
 from synth.errors import InputError
 from synth.sampling import draw, pairs_of
 from synth.simulate import simulate
-from synth.simulate.resolution import LADDER, Fineness, ladder, resolve, scale_px_per_mm
+from synth.simulate.resolution import LADDER, Fineness, Resolution, ladder, resolve, scale_px_per_mm
 from synth.template import load_scene
 
 ROOT = Path(__file__).parents[2]
@@ -150,11 +150,12 @@ def test_draws_of_which_nothing_can_be_said_are_told() -> None:
 def test_two_estimates_of_what_the_reference_leaves_open() -> None:
     """A reference of half the spacing has 0.5^1.6 of the error. Fails with the rate's sign changed."""
     verdict = judged({4: 0.3, 9: 0.2, 16: 0.04}, chosen=9)
-    assert verdict.added_px == pytest.approx(0.24)
+    own = 0.04 / (1.125**1.6 - 1)  # of the reference: the finest rung has a spacing of 1.8 / 16 = 0.1125 mm
+    assert verdict.added_px == pytest.approx(0.2 + own)
     assert verdict.extrapolated_px == pytest.approx(0.2 / (1 - 0.5**1.6))  # spacings of 0.2 and 0.1 mm
     assert judged({4: 0.0}, chosen=4).extrapolated_px == 0
-    counted = tally("tiny", [replace(verdict, target_px=target) for target in (0.19, 0.22, 0.27, 0.31)])
-    assert (counted.within, counted.added, counted.extrapolated) == (3, 2, 1)
+    counted = tally("tiny", [replace(verdict, target_px=target) for target in (0.19, 0.22, 0.3, 0.41)])
+    assert (counted.within, counted.added, counted.extrapolated) == (3, 1, 2)
 
 
 def test_tally_of_known_numbers() -> None:
@@ -243,13 +244,19 @@ def test_a_draw_that_no_attempt_gives(study: Study, tmp_path: Path, capsys: pyte
 
 
 def test_reference_is_finer_every_way() -> None:
-    """Also through the thickness. Fails with as many elements there as `graded_mesh` would have."""
+    """Also through the thickness. Fails with as many elements there as `graded_mesh` would have, and with the chosen
+    mesh's own spacing asked of it.
+    """
     template = load_scene("gelsight")
+    whole = Study((template,), 2, 20)
     for index in (3, 12):  # the smallest and the largest contact of the first twenty
         one = drawn(template, 2, index)
-        mesh, fine = Reference().mesh(one.scene.sensor.gel, one.focus)
-        finest, spacing_mm = one.mesh(str(ladder(one.scene.sensor.gel, one.focus)[-1]))
+        mesh, fine = Reference().mesh(one.scene.sensor.gel, one.focus, one.chosen.spacing_mm)
+        finest, spacing_mm = one.mesh(whole.rungs(one)[-1])
         assert fine < spacing_mm
+        number = Reference().across_of(one.scene.sensor.gel, one.focus, one.chosen.spacing_mm)
+        assert 2.4 * fine <= one.chosen.spacing_mm < 2.4 * fine * number / (number - 2)
+        assert Reference(across=8).across_of(one.scene.sensor.gel, one.focus, one.chosen.spacing_mm) == 8
         planes, theirs = (np.unique(m.points[:, 2]) for m in (mesh, finest))
         assert len(planes) > len(theirs)
         assert planes[1] < 1.01 * fine
@@ -261,15 +268,19 @@ def test_reference_is_finer_every_way() -> None:
 
 
 def test_rungs_and_order_of_work(study: Study) -> None:
-    """Fails with one rung beyond the chosen one, and with the ladder's presses first."""
-    whole = replace(study, across=LADDER)
+    """Fails with one rung beyond the chosen one, with rungs finer than the reference, and with the ladder first."""
+    whole = replace(study, across=LADDER, reference=replace(SMALL, across=14))
     draws = [drawn(study.templates[0], 2, index) for index in range(2)]
     assert [one.chosen.across for one in draws] == [4, 6]
     names = [str(fineness) for fineness in ladder(draws[0].scene.sensor.gel, draws[0].focus)]
     for place, fineness in enumerate(map(Fineness.of, names)):
-        chosen = replace(draws[0].chosen, across=fineness.across, through=fineness.through)
+        spacing_mm = draws[0].mesh(str(fineness))[1]
+        chosen = Resolution(draws[0].chosen.mesh, fineness.across, fineness.through, spacing_mm, 0.0)
         found = whole.rungs(replace(draws[0], chosen=chosen))
-        assert found == [*names[: place + 4], *([names[-1]] if place + 4 < len(names) else [])]
+        finest = whole.reference.across_of(draws[0].scene.sensor.gel, draws[0].focus, spacing_mm)
+        coarser = [name for name in names[: place + 4] if Fineness.of(name).across < finest]
+        assert found == (coarser if str(fineness) in coarser else [*coarser, str(fineness)])
+        assert finest <= 14
     every = list(jobs(whole, draws))
     assert [job.rung for job in every[:2]] == [REFERENCE, REFERENCE]
     sizes = [len(draws[job.index].mesh(job.rung)[0].points) for job in every[2:]]
