@@ -2,10 +2,11 @@
 
     python -m synth.bench.batched --batch 512 --seconds 60
 
-prints one JSON line. A press is a ball of 2 to 6 mm radius at a random place of a 20 x 15 x 4 mm pad, pressed to half
-its thickness with friction, every step converged as in `synth generate`, and one state recorded and corrected. Bodies
-that begin and end are counted as they do in production: slots are refilled, and the rate is counted from when as many
-have ended as there are slots. Results travel to the host within that time.
+prints one JSON line per batch size; with --table also what each kernel takes of a cycle. A press is a ball of 2 to 6 mm
+radius at a random place of a 20 x 15 x 4 mm pad, pressed to half its thickness with friction, every step converged as
+in `synth generate`, and one state recorded and corrected. Bodies that begin and end are counted as they do in
+production: slots are refilled, and the rate is counted from when as many have ended as there are slots. Results travel
+to the host within that time.
 """
 
 import argparse
@@ -13,7 +14,8 @@ import json
 import sys
 import time
 from collections.abc import Sequence
-from itertools import cycle
+from dataclasses import replace
+from itertools import cycle, pairwise
 from typing import Any
 
 import numpy as np
@@ -21,12 +23,13 @@ import warp as wp
 
 from synth.mesh import Counts, Focus, PadMesh, graded_box
 from synth.scene import Scene
+from synth.simulate.batched.gemm import dense
+from synth.simulate.batched.krylov import RUNNING, WAITING
 from synth.simulate.batched.machine import INNER
 from synth.simulate.batched.many import jobs_of
 from synth.simulate.batched.pad import Pad, prepare
 from synth.simulate.batched.run import Run
 from synth.simulate.driver import STANDARD
-from synth.simulate.linear import GMRES_TOLERANCE
 
 SIZE_MM = (20.0, 15.0, 4.0)
 PLACES_MM = (6.0, 4.0)
@@ -77,7 +80,7 @@ def measure(
     depth_mm: float = 2.0,
     drag_mm: float = 0.0,
     steps: int = 1,
-    forcing: float = GMRES_TOLERANCE,
+    forcing: float = STANDARD.forcing,
     inner: int = INNER,
     seed: int = 0,
 ) -> dict[str, Any]:
@@ -90,7 +93,7 @@ def measure(
         depth_mm: of the press.
         drag_mm: sideways after it.
         steps: states that are recorded.
-        forcing: relative residual that ends a linear solve.
+        forcing: relative residual that ends a linear solve, at most.
         inner: Krylov iterations of a cycle.
         seed: of the draws.
     """
@@ -98,7 +101,8 @@ def measure(
     draws = [ball_scene(rng, depth_mm, drag_mm, steps) for _ in range(max(DRAWS, batch))]
     began = time.perf_counter()
     order = cycle(range(len(draws)))
-    run = Run(jobs_of(draws, pad), pad, draws[0].numerics, STANDARD, None, batch, order, forcing, inner)
+    driver = replace(STANDARD, forcing=forcing)
+    run = Run(jobs_of(draws, pad), pad, draws[0].numerics, driver, None, batch, order, inner)
     for _ in range(2):  # with all slots empty: compiles the kernels and captures the graph
         run.advance()
     loaded = time.perf_counter() - began
@@ -134,24 +138,108 @@ def _steady(ends: Sequence[float], batch: int) -> float:
     return (len(ends) - first) / (ends[-1] - ends[first - 1]) if first else len(ends) / ends[-1]
 
 
-def _profile(run: Run, device: str) -> dict[str, float]:
-    """Shares of the parts of a cycle, each waited for; and ms of such a cycle, which is slower than others."""
-    spent: dict[str, float] = {}
-    wp.synchronize_device(device)
-    last = [time.perf_counter()]
+def _profile(run: Run, device: str) -> dict[str, Any]:
+    """What a cycle's time goes into.
 
-    def watch(part: str) -> None:
-        wp.synchronize_device(device)
-        now = time.perf_counter()
-        spent[part] = spent.get(part, 0.0) + now - last[0]
-        last[0] = now
-
-    run.machine.watch = watch
+    Returns:
+        `parts` and `kernels`: ms a cycle; `launches` of a cycle; `ms_per_profiled_cycle`; `krylov_occupancy`: share of
+        the places for Krylov iterations (slots times iterations of a cycle) that are used.
+    """
+    krylov, inner = run.machine.krylov, run.machine.inner
+    clock = Events(device) if wp.get_device(device).is_cuda else Clock()
+    kernels: dict[tuple[str, str], float] = {}
+    launches = used = 0
     for _ in range(PROFILED_CYCLES):
+        before = np.where(krylov.running.numpy() == RUNNING, krylov.k.numpy(), 0)
+        clock.start()
+        run.machine.watch = clock.mark
         run.machine.cycle(run.table)
-    whole = sum(spent.values())
-    shares = {part: round(value / whole, 4) for part, value in sorted(spent.items(), key=lambda item: -item[1])}
-    return {**shares, "ms_per_watched_cycle": round(1e3 * whole / PROFILED_CYCLES, 3)}
+        run.machine.watch = lambda part, kernel: None
+        marks = clock.stop()
+        launches += len(marks)
+        for part, kernel, ms in marks:
+            kernels[part, kernel] = kernels.get((part, kernel), 0.0) + ms
+        used += int(np.where(krylov.running.numpy() != WAITING, krylov.k.numpy() - before, 0).sum())
+    parts: dict[str, float] = {}
+    for (part, _), ms in kernels.items():
+        parts[part] = parts.get(part, 0.0) + ms
+    return {
+        "parts": _each_cycle(parts),
+        "kernels": _each_cycle({f"{part}: {kernel}": ms for (part, kernel), ms in kernels.items()}),
+        "launches": launches // PROFILED_CYCLES,
+        "ms_per_profiled_cycle": round(sum(parts.values()) / PROFILED_CYCLES, 3),
+        "krylov_occupancy": round(used / (PROFILED_CYCLES * inner * run.machine.batch), 3),
+    }
+
+
+def _each_cycle(times: dict[str, float]) -> dict[str, float]:
+    """Of all profiled cycles -> of one, the largest first."""
+    return {name: round(ms / PROFILED_CYCLES, 4) for name, ms in sorted(times.items(), key=lambda item: -item[1])}
+
+
+class Clock:
+    """Times between marks on the CPU, where a launch ends when the kernel does."""
+
+    def start(self) -> None:
+        """Begin."""
+        self._marks: list[tuple[str, str, float]] = []
+        self._last = time.perf_counter()
+
+    def mark(self, part: str, kernel: str) -> None:
+        """Note what ran since the last mark."""
+        now = time.perf_counter()
+        self._marks.append((part, kernel, 1e3 * (now - self._last)))
+        self._last = now
+
+    def stop(self) -> list[tuple[str, str, float]]:
+        """Part, kernel and ms of each mark."""
+        return self._marks
+
+
+class Events:
+    """The same on CUDA, by events in the stream.
+
+    The GPU is kept busy by other work until the host has queued the whole cycle, so that no time between two events is
+    the host's.
+    """
+
+    AHEAD_MS, SIZE = 40.0, 4096
+
+    def __init__(self, device: str) -> None:
+        self._device = wp.get_device(device)
+        self._dense = dense(device)
+        matrix = (self.SIZE, self.SIZE)
+        self._a, self._b, self._c = (wp.zeros(matrix, dtype=wp.float32, device=device) for _ in range(3))
+        self._all = wp.ones(self.SIZE, dtype=wp.int32, device=device)
+        self._times = 1
+        for _ in range(2):  # the first takes longer
+            first = self._event()
+            self._be_busy()
+            last = self._event()
+            wp.synchronize_device(self._device)
+        self._times = 1 + int(self.AHEAD_MS / wp.get_event_elapsed_time(first, last))
+
+    def _event(self) -> wp.Event:
+        return self._device.stream.record_event(wp.Event(self._device, enable_timing=True))
+
+    def _be_busy(self) -> None:
+        for _ in range(self._times):
+            self._dense.product(self._a, self._b, self._c, self._all)
+
+    def start(self) -> None:
+        """Begin."""
+        self._be_busy()
+        self._marks = [("", "", self._event())]
+
+    def mark(self, part: str, kernel: str) -> None:
+        """Note what was queued since the last mark."""
+        self._marks.append((part, kernel, self._event()))
+
+    def stop(self) -> list[tuple[str, str, float]]:
+        """Part, kernel and ms of each mark."""
+        wp.synchronize_device(self._device)
+        pairs = pairwise(self._marks)
+        return [(part, kernel, wp.get_event_elapsed_time(last, this)) for (_, _, last), (part, kernel, this) in pairs]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -166,8 +254,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--depth", type=float, default=2.0, help="mm")
     parser.add_argument("--drag", type=float, default=0.0, help="mm")
     parser.add_argument("--steps", type=int, default=1, help="recorded states")
-    parser.add_argument("--forcing", type=float, default=GMRES_TOLERANCE, help="relative residual of linear solves")
+    parser.add_argument(
+        "--forcing", type=float, default=STANDARD.forcing, help="relative residual of linear solves, at most"
+    )
     parser.add_argument("--inner", type=int, default=INNER, help="Krylov iterations of a cycle")
+    parser.add_argument("--table", action="store_true", help="print the time of every kernel, too")
     given = parser.parse_args(arguments)
     mesh = shared_mesh(given.across, given.through, given.growth)
     began = time.perf_counter()
@@ -176,7 +267,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for batch in given.batch:
         path = (given.depth, given.drag, given.steps)
         found = measure(pad, batch, given.seconds, *path, given.forcing, given.inner)
+        kernels = found["profile"].pop("kernels")
         print(json.dumps({**vars(given), **found, "prepare_s": prepared}), flush=True)
+        if given.table:
+            print("\n".join(f"{ms:9.4f} ms a cycle  {name}" for name, ms in kernels.items()), flush=True)
     return 0
 
 

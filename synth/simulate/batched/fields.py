@@ -63,7 +63,7 @@ def attempt(
 ):
     """One thread per (slot, node and then pressure): the trial, and zeros for its residual.
 
-    step: (rows, B); node_row: first row of a node's displacement or -1 where it is held.
+    step: (B, rows); node_row: first row of a node's displacement or -1 where it is held.
     """
     s, i = wp.tid()
     if mask[s] == 0:
@@ -76,7 +76,7 @@ def attempt(
         u = fields.iterate_u[s, i]
         row = node_row[i]
         if row >= 0 and scale != wp.float64(0.0):
-            move = wp.vec3d(wp.float64(step[row, s]), wp.float64(step[row + 1, s]), wp.float64(step[row + 2, s]))
+            move = wp.vec3d(wp.float64(step[s, row]), wp.float64(step[s, row + 1]), wp.float64(step[s, row + 2]))
             u += scale * move
         fields.trial_u[s, i] = u
         force[s, i] = wp.vec3d()
@@ -84,7 +84,7 @@ def attempt(
         k = i - count
         p = fields.iterate_p[s, k]
         if scale != wp.float64(0.0):
-            p += scale * wp.float64(step[pressure_row[k], s])
+            p += scale * wp.float64(step[s, pressure_row[k]])
         fields.trial_p[s, k] = p
         volume[s, k] = wp.float64(0.0)
 
@@ -107,12 +107,12 @@ def carry(
         row = node_row[i]
         u = fields.state_u[s, i]
         if row >= 0:
-            move = wp.vec3d(wp.float64(step[row, s]), wp.float64(step[row + 1, s]), wp.float64(step[row + 2, s]))
+            move = wp.vec3d(wp.float64(step[s, row]), wp.float64(step[s, row + 1]), wp.float64(step[s, row + 2]))
             u += (wp.float64(1.0) / share) * move
         fields.iterate_u[s, i] = u
     else:
         k = i - count
-        p = fields.state_p[s, k] + (wp.float64(1.0) / share) * wp.float64(step[pressure_row[k], s])
+        p = fields.state_p[s, k] + (wp.float64(1.0) / share) * wp.float64(step[s, pressure_row[k]])
         fields.iterate_p[s, k] = p
 
 

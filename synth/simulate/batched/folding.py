@@ -38,9 +38,14 @@ def find_folding(
     e, s = wp.tid()
     if mask[s] == 0:
         return
+    F0 = _at_corner(lattice, u, s, e, 0)
+    F1 = _at_corner(lattice, u, s, e, 1)
+    F2 = _at_corner(lattice, u, s, e, 2)
+    F3 = _at_corner(lattice, u, s, e, 3)
     found = wp.int32(0)
     for p in range(lattice.at.shape[0]):
-        if wp.determinant(_between(lattice, u, s, e, lattice.at[p])) < _ONSET:
+        at = lattice.at[p]
+        if wp.determinant(at[0] * F0 + at[1] * F1 + at[2] * F2 + at[3] * F3) < _ONSET:
             found = wp.int32(1)
     folding[e, s] = found
 

@@ -39,14 +39,16 @@ class Ended:
     target: float
 
 
-def job_tables(jobs: Sequence[Job], size_mm: tuple[float, float, float], frames: frozenset[int] | None, d: str) -> Jobs:
-    """All jobs on device d. frames: numbers of the states that are to be corrected, default all."""
+def job_tables(
+    jobs: Sequence[Job], size_mm: tuple[float, float, float], frames: Sequence[frozenset[int]] | None, d: str
+) -> Jobs:
+    """All jobs on device d. frames: numbers of each job's states that are to be corrected, default all."""
     paths = [job.path for job in jobs]
     corners, ends = _stacked([path.corners for path in paths]), _stacked([path.ends for path in paths])
     kinds = []
-    for path in paths:
-        records = path.records()
-        kind = {float(r): 2 if frames is None or k in frames else 1 for k, r in enumerate(records, 1)}
+    for number, path in enumerate(paths):
+        wanted = None if frames is None else frames[number]
+        kind = {float(r): 2 if wanted is None or k in wanted else 1 for k, r in enumerate(path.records(), 1)}
         kinds.append(np.array([kind.get(float(stop), 0) for stop in path.waypoints()]))
     grids = _grids(paths)[1]
     table = Jobs()

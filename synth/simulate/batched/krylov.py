@@ -1,27 +1,42 @@
 """Flexible GMRES without restart for many systems at once, each at its own iteration, as Warp kernels.
 
-Saad, SIAM J. Sci. Comput. 14, 1993; classical Gram-Schmidt and Givens rotations, in single precision: what is solved
-to TOLERANCE is a correction, and Newton's residual is in double precision. A slot's solve begins when its matrix
+Saad, SIAM J. Sci. Comput. 14, 1993; modified Gram-Schmidt and Givens rotations, in single precision: what is solved
+to a slot's goal is a correction, and Newton's residual is in double precision. A slot's solve begins when its matrix
 is ready, goes on through as many cycles as it takes, and ends when the next cycle finds it DONE; no slot waits for
-another. Vectors are (rows, B).
+another.
+
+Memory decides the time, so one block of threads has a slot's vector in its registers and reads every basis vector once
+an iteration: vectors of a slot lie together, in fours, (B, ..., rows / 4), and each slot goes through as many as it
+has. The tangent's product wants slots next to each other, (rows, B); `synth.simulate.batched.gemm` turns its argument
+and its result. Sums are taken by a block in a fixed order, so that nothing here depends on other slots (what
+goes in does on a GPU: see `synth.simulate.batched.machine`).
 """
 
 # Kernels are written in Warp's own language; their annotations only look like Python's.
 # mypy: disable-error-code="valid-type, no-untyped-def"
 
+from functools import cache
+
 import warp as wp
 
-from synth.simulate.batched.slots import CARRY, CARRY_READY, LINEAR, LOST, READY, SEARCH, START, Slots
-from synth.simulate.linear import GMRES_LIMIT
+from synth.simulate.batched.slots import CARRY, CARRY_READY, LINEAR, LOST, READY, SEARCH, START, Settings, Slots
+from synth.simulate.linear import GMRES_LIMIT, GMRES_TOLERANCE
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 WAITING, RUNNING, DONE = wp.constant(0), wp.constant(1), wp.constant(2)
 LIMIT = wp.constant(GMRES_LIMIT)
-ROWS = wp.constant(32)
-"""Rows of a vector that one thread sums."""
 NONE = wp.constant(wp.float32(0.0))
 UNIT = wp.constant(wp.float32(1.0))
+TIGHTEST = wp.constant(wp.float64(GMRES_TOLERANCE))
+"""Relative residual that ends a linear solve, at least; `Settings.forcing` at most."""
+SHARE, ENOUGH = wp.constant(wp.float64(0.9)), wp.constant(wp.float64(0.3))
+HELD = 84
+"""Numbers of a vector that one thread holds, at most: two vectors and what else there is fit its 255 registers."""
+SMALLEST_BLOCK, LARGEST_BLOCK = 64, 512
+TOGETHER = 256
+"""Threads that are to run side by side on a multiprocessor, which has 65,536 registers. So few keep its memory busy,
+because each asks for a whole vector's share before it waits."""
 
 
 @wp.struct
@@ -31,32 +46,65 @@ class Krylov:
     Attributes:
         running: (B,) WAITING, RUNNING or DONE.
         k: (B,) iterations done.
-        size: (B,) norm of the right side.
-        basis: (LIMIT + 1, rows, B); corrections: (LIMIT, rows, B), the preconditioned basis.
-        current: (rows, B) the basis' last vectors; corrected: preconditioned; image: times the tangent.
-        hessenberg: (LIMIT + 1, B) the present column; triangle: (LIMIT, LIMIT, B) rotated.
-        cosine, sine: (LIMIT, B); residual: (LIMIT + 1, B) of the rotated right side.
-        weight: (LIMIT, B) of the corrections in the solution.
-        partial: (chunks, LIMIT + 1, B) sums over ROWS rows.
-        step: (rows, B) the solution.
+        size: (B,) norm of the right side; goal: of the residual, relative to it.
+        basis: (B, LIMIT + 1, rows / 4); corrections: (B, LIMIT, rows / 4), the preconditioned basis.
+        current: (B, rows / 4) the last basis vector; preconditioned: K_0^{-1} times it; corrected: the same, (rows, B).
+        image: (rows, B) the tangent times corrected; product: the same, (B, rows / 4).
+        triangle: (B, LIMIT, LIMIT) rotated Hessenberg matrices by columns.
+        cosine, sine: (B, LIMIT); residual: (B, LIMIT + 1) of the rotated right side.
+        step: (B, rows / 4) the solution.
     """
 
     running: wp.array(dtype=wp.int32)
     k: wp.array(dtype=wp.int32)
     size: wp.array(dtype=wp.float64)
-    basis: wp.array3d(dtype=wp.float32)
-    corrections: wp.array3d(dtype=wp.float32)
-    current: wp.array2d(dtype=wp.float32)
+    goal: wp.array(dtype=wp.float32)
+    basis: wp.array3d(dtype=wp.vec4f)
+    corrections: wp.array3d(dtype=wp.vec4f)
+    current: wp.array2d(dtype=wp.vec4f)
+    preconditioned: wp.array2d(dtype=wp.vec4f)
     corrected: wp.array2d(dtype=wp.float32)
     image: wp.array2d(dtype=wp.float32)
-    hessenberg: wp.array2d(dtype=wp.float32)
+    product: wp.array2d(dtype=wp.vec4f)
     triangle: wp.array3d(dtype=wp.float32)
     cosine: wp.array2d(dtype=wp.float32)
     sine: wp.array2d(dtype=wp.float32)
     residual: wp.array2d(dtype=wp.float32)
-    weight: wp.array2d(dtype=wp.float32)
-    partial: wp.array3d(dtype=wp.float32)
-    step: wp.array2d(dtype=wp.float32)
+    step: wp.array2d(dtype=wp.vec4f)
+
+
+def shapes(rows: int, batch: int) -> dict[str, tuple[int, ...]]:
+    """Of a Krylov's arrays, by name."""
+    slots, turned, each, limit = (batch,), (rows, batch), (batch, rows // 4), GMRES_LIMIT
+    return {
+        "running": slots, "k": slots, "size": slots, "goal": slots,
+        "basis": (batch, limit + 1, rows // 4), "corrections": (batch, limit, rows // 4),
+        "current": each, "preconditioned": each, "corrected": turned, "image": turned, "product": each,
+        "triangle": (batch, limit, limit), "cosine": (batch, limit), "sine": (batch, limit),
+        "residual": (batch, limit + 1), "step": each,
+    }  # fmt: skip
+
+
+def plain(vectors: wp.array) -> wp.array:
+    """(B, rows) view of (B, rows / 4) vectors."""
+    return vectors.view(wp.float32).reshape((vectors.shape[0], -1))
+
+
+def block_size(unknowns: int) -> int:
+    """Threads that share a vector: the smallest power of two with at most HELD numbers each."""
+    block = SMALLEST_BLOCK
+    while block * HELD < unknowns and block < LARGEST_BLOCK:
+        block *= 2
+    return block
+
+
+def padded(unknowns: int) -> int:
+    """Rows of a vector: as many fours for each thread of a block, so that none has to ask where the vector ends.
+
+    A multiple of 64, which matrix products on a GPU want, too: those of other sizes took three times as long.
+    """
+    share = 4 * block_size(unknowns)
+    return -(-unknowns // share) * share
 
 
 @wp.kernel
@@ -67,190 +115,173 @@ def begin_vectors(
     volume: wp.array2d(dtype=wp.float64),
     krylov: Krylov,
 ):
-    """One thread per (row, slot): the first basis vector, minus the residual over its norm.
+    """One thread per (slot, four rows): the first basis vector, minus the residual over its norm.
 
     free: (rows,) number of the unknown, displacements of all nodes first, or -1 for rows that fill up.
     """
-    i, s = wp.tid()
+    s, i = wp.tid()
     if slots.phase[s] != READY and slots.phase[s] != CARRY_READY:
         return
-    value = wp.float64(0.0)
     size = slots.norm[s]
-    unknown = free[i]
-    if unknown >= 0 and size > wp.float64(0.0):
-        moves = 3 * force.shape[1]
-        if unknown < moves:  # noqa: SIM108 (Warp evaluates both sides of a conditional expression)
-            value = -force[s, unknown // 3][unknown % 3] / size
-        else:
-            value = -volume[s, unknown - moves] / size
-    krylov.basis[0, i, s] = wp.float32(value)
-    krylov.current[i, s] = wp.float32(value)
+    moves = 3 * force.shape[1]
+    found = wp.vec4f()
+    for k in range(4):
+        unknown = free[4 * i + k]
+        if unknown >= 0 and size > wp.float64(0.0):
+            value = wp.float64(0.0)
+            if unknown < moves:
+                value = -force[s, unknown // 3][unknown % 3] / size
+            else:
+                value = -volume[s, unknown - moves] / size
+            found[k] = wp.float32(value)
+    krylov.basis[s, 0, i] = found
+    krylov.current[s, i] = found
+
+
+@wp.func
+def _goal(slots: Slots, settings: Settings, s: int, before: wp.float64) -> wp.float64:
+    """The second choice of Eisenstat & Walker (SIAM J. Sci. Comput. 17, 1996), and no more than Newton's method needs.
+
+    Ten pressed balls (8 x 6 x 2 elements, friction) took 38.3, 39.2 and 38.8 Newton iterations each with 1e-3 in every
+    solve, 1e-2 in every solve, and these; and 1045, 794 and 705 Krylov iterations.
+
+    before: norm of the last solve's right side. With these bounds their safeguard, which looks at the last goal, has
+    nothing to do.
+    """
+    if slots.phase[s] == CARRY_READY:
+        return TIGHTEST
+    loosest = wp.float64(settings.forcing)
+    goal = loosest
+    if slots.iteration[s] > 0:
+        fallen = slots.norm[s] / before
+        goal = SHARE * fallen * fallen
+    goal = wp.max(goal, ENOUGH * slots.tolerance[s] / slots.relative[s])
+    return wp.max(wp.min(goal, loosest), TIGHTEST)
 
 
 @wp.kernel
-def begin(slots: Slots, krylov: Krylov):
+def begin(slots: Slots, settings: Settings, krylov: Krylov):
     """One thread per slot."""
     s = wp.tid()
     phase = slots.phase[s]
-    if phase == READY:
-        slots.phase[s] = LINEAR
-    elif phase == CARRY_READY:
-        slots.phase[s] = CARRY
-    else:
+    if phase != READY and phase != CARRY_READY:
         return
-    krylov.k[s] = 0
+    krylov.goal[s] = wp.float32(_goal(slots, settings, s, krylov.size[s]))
     krylov.size[s] = slots.norm[s]
-    krylov.residual[0, s] = UNIT
+    krylov.k[s] = 0
+    slots.phase[s] = LINEAR
+    if phase == CARRY_READY:
+        slots.phase[s] = CARRY
+    krylov.residual[s, 0] = UNIT
     krylov.running[s] = RUNNING
     if slots.norm[s] == wp.float64(0.0):
         krylov.running[s] = DONE
 
 
-@wp.kernel
-def keep_corrected(krylov: Krylov):
-    """One thread per (row, slot): put the preconditioned vector by, and clear its image."""
-    i, s = wp.tid()
-    if krylov.running[s] == RUNNING:
-        krylov.corrections[krylov.k[s], i, s] = krylov.corrected[i, s]
-        krylov.image[i, s] = NONE
+@cache
+def arnoldi(rows: int) -> wp.Kernel:
+    """The kernel of an iteration from the product on; one block per slot, for vectors of so many rows.
 
-
-@wp.kernel
-def partial_products(krylov: Krylov):
-    """One thread per (chunk, slot): of the image with every basis vector."""
-    c, s = wp.tid()
-    if krylov.running[s] != RUNNING:
-        return
-    last = wp.min((c + 1) * ROWS, krylov.image.shape[0])
-    for j in range(krylov.k[s] + 1):
-        total = wp.float32(0.0)
-        for i in range(c * ROWS, last):
-            total += krylov.basis[j, i, s] * krylov.image[i, s]
-        krylov.partial[c, j, s] = total
-
-
-@wp.kernel
-def products(krylov: Krylov):
-    """One thread per (basis vector, slot)."""
-    j, s = wp.tid()
-    if krylov.running[s] != RUNNING or j > krylov.k[s]:
-        return
-    total = wp.float32(0.0)
-    for c in range(krylov.partial.shape[0]):
-        total += krylov.partial[c, j, s]
-    krylov.hessenberg[j, s] = total
-
-
-@wp.kernel
-def orthogonalise(krylov: Krylov):
-    """One thread per (chunk, slot): the image without its parts along the basis, and the squares of what is left."""
-    c, s = wp.tid()
-    if krylov.running[s] != RUNNING:
-        return
-    count = krylov.k[s] + 1
-    total = wp.float32(0.0)
-    for i in range(c * ROWS, wp.min((c + 1) * ROWS, krylov.image.shape[0])):
-        value = krylov.image[i, s]
-        for j in range(count):
-            value -= krylov.hessenberg[j, s] * krylov.basis[j, i, s]
-        krylov.image[i, s] = value
-        total += value * value
-    krylov.partial[c, 0, s] = total
-
-
-@wp.kernel
-def rotate(krylov: Krylov, tolerance: wp.float32):
-    """One thread per slot: the Givens rotation of the new column; the solve ends where the residual is small."""
-    s = wp.tid()
-    if krylov.running[s] != RUNNING:
-        return
-    square = wp.float32(0.0)
-    for chunk in range(krylov.partial.shape[0]):
-        square += krylov.partial[chunk, 0, s]
-    k = krylov.k[s]
-    below = wp.sqrt(square)
-    above = krylov.hessenberg[0, s]
-    for j in range(k):
-        following = krylov.hessenberg[j + 1, s]
-        krylov.triangle[j, k, s] = krylov.cosine[j, s] * above + krylov.sine[j, s] * following
-        above = krylov.cosine[j, s] * following - krylov.sine[j, s] * above
-    length = wp.sqrt(above * above + below * below)
-    cosine = wp.float32(1.0)
-    sine = wp.float32(0.0)
-    if length > NONE:
-        cosine = above / length
-        sine = below / length
-    krylov.cosine[k, s] = cosine
-    krylov.sine[k, s] = sine
-    krylov.triangle[k, k, s] = length
-    left = krylov.residual[k, s]
-    krylov.residual[k, s] = cosine * left
-    left = -sine * left
-    krylov.residual[k + 1, s] = left
-    krylov.hessenberg[k + 1, s] = below
-    krylov.k[s] = k + 1
-    if wp.abs(left) < tolerance or below == NONE or k + 1 == LIMIT or not wp.isfinite(length):
-        krylov.running[s] = DONE
-
-
-@wp.kernel
-def extend(krylov: Krylov):
-    """One thread per (row, slot): the next basis vector."""
-    i, s = wp.tid()
-    if krylov.running[s] != RUNNING:
-        return
-    k = krylov.k[s]
-    value = krylov.image[i, s] / krylov.hessenberg[k, s]
-    krylov.basis[k, i, s] = value
-    krylov.current[i, s] = value
-
-
-@wp.kernel
-def finish(slots: Slots, krylov: Krylov, begun: wp.array(dtype=wp.int32)):
-    """One thread per slot: the weights of the solution where a solve is done, and the slot's next phase.
-
-    begun: (B,) 1 where the solution is that of a carried first iterate.
+    The new basis vector, the Givens rotation of its column of the Hessenberg matrix, and whether the solve ends.
     """
-    s = wp.tid()
-    begun[s] = 0
-    if krylov.running[s] != DONE:
-        return
-    k = krylov.k[s]
-    finite = wp.int32(1)
-    for back in range(k):
-        j = k - 1 - back
-        total = krylov.residual[j, s]
-        for i in range(j + 1, k):
-            total -= krylov.triangle[j, i, s] * krylov.weight[i, s]
-        pivot = krylov.triangle[j, j, s]
-        value = NONE
-        if pivot != NONE:
-            value = total / pivot
-        krylov.weight[j, s] = value
-        if not wp.isfinite(value):
-            finite = wp.int32(0)
-    if slots.phase[s] == CARRY:
-        slots.phase[s] = START
-        if finite == 1:
-            slots.predicted[s] = 1
-            begun[s] = 1
-    elif finite == 1:
-        slots.phase[s] = SEARCH
-        slots.scale[s] = wp.float64(1.0)
-    else:
-        slots.phase[s] = LOST
+    count = wp.constant(rows // 4)
+    bounds = (block_size(rows), max(1, TOGETHER // block_size(rows)))
+
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=bounds)
+    def iteration(krylov: Krylov):
+        s, lane = wp.tid()
+        if krylov.running[s] != RUNNING:
+            return
+        k = krylov.k[s]
+        w = wp.tile_load(krylov.product[s], shape=count, bounds_check=False)
+        above = wp.float32(0.0)
+        for j in range(k + 1):
+            v = wp.tile_load(krylov.basis[s, j], shape=count, bounds_check=False)
+            along = wp.tile_extract(wp.tile_dot(v, w), 0)
+            wp.tile_axpy(-along, v, w)
+            if j == 0:
+                above = along
+            else:
+                cosine = krylov.cosine[s, j - 1]
+                sine = krylov.sine[s, j - 1]
+                if lane == 0:
+                    krylov.triangle[s, k, j - 1] = cosine * above + sine * along
+                above = cosine * along - sine * above
+        below = wp.sqrt(wp.tile_extract(wp.tile_dot(w, w), 0))
+        scale = wp.float32(0.0)
+        if below > NONE:
+            scale = UNIT / below
+        z = wp.tile_load(krylov.preconditioned[s], shape=count, bounds_check=False)
+        wp.tile_store(krylov.corrections[s, k], z, bounds_check=False)
+        v = w * scale
+        wp.tile_store(krylov.basis[s, k + 1], v, bounds_check=False)
+        wp.tile_store(krylov.current[s], v, bounds_check=False)
+        if lane == 0:
+            length = wp.sqrt(above * above + below * below)
+            cosine = wp.float32(1.0)
+            sine = wp.float32(0.0)
+            if length > NONE:
+                cosine = above / length
+                sine = below / length
+            krylov.cosine[s, k] = cosine
+            krylov.sine[s, k] = sine
+            krylov.triangle[s, k, k] = length
+            left = krylov.residual[s, k]
+            krylov.residual[s, k] = cosine * left
+            krylov.residual[s, k + 1] = -sine * left
+            krylov.k[s] = k + 1
+            over = wp.abs(sine * left) < krylov.goal[s] or below == NONE or k + 1 == LIMIT
+            if over or not wp.isfinite(length):
+                krylov.running[s] = DONE
+
+    return iteration
 
 
-@wp.kernel
-def combine(krylov: Krylov):
-    """One thread per (row, slot): the solution where a solve is done."""
-    i, s = wp.tid()
-    if krylov.running[s] != DONE:
-        return
-    total = wp.float32(0.0)
-    for j in range(krylov.k[s]):
-        total += krylov.weight[j, s] * krylov.corrections[j, i, s]
-    krylov.step[i, s] = wp.float32(krylov.size[s]) * total
+@cache
+def solution(rows: int) -> wp.Kernel:
+    """The kernel that finds the solution where a solve is done, and the slot's next phase; one block per slot."""
+    count = wp.constant(rows // 4)
+    bounds = (block_size(rows), max(1, TOGETHER // block_size(rows)))
+
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=bounds)
+    def finish(slots: Slots, krylov: Krylov, begun: wp.array(dtype=wp.int32)):
+        """begun: (B,) 1 where the solution is that of a carried first iterate."""
+        s, lane = wp.tid()
+        if lane == 0:
+            begun[s] = 0
+        if krylov.running[s] != DONE:
+            return
+        k = krylov.k[s]
+        right = wp.tile_load(krylov.residual[s], shape=LIMIT)
+        total = wp.tile_zeros(shape=count, dtype=wp.vec4f)
+        finite = wp.int32(1)
+        for back in range(k):
+            j = k - 1 - back
+            column = wp.tile_load(krylov.triangle[s, j], shape=LIMIT)
+            z = wp.tile_load(krylov.corrections[s, j], shape=count, bounds_check=False)
+            pivot = krylov.triangle[s, j, j]
+            weight = NONE
+            if pivot != NONE:
+                weight = wp.tile_extract(right, j) / pivot
+            if not wp.isfinite(weight):
+                finite = wp.int32(0)
+            wp.tile_axpy(-weight, column, right)
+            wp.tile_axpy(weight, z, total)
+        wp.tile_store(krylov.step[s], total * wp.float32(krylov.size[s]), bounds_check=False)
+        if lane > 0:
+            return
+        if slots.phase[s] == CARRY:
+            slots.phase[s] = START
+            if finite == 1:
+                slots.predicted[s] = 1
+                begun[s] = 1
+        elif finite == 1:
+            slots.phase[s] = SEARCH
+            slots.scale[s] = wp.float64(1.0)
+        else:
+            slots.phase[s] = LOST
+
+    return finish
 
 
 @wp.kernel

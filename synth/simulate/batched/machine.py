@@ -3,6 +3,10 @@
 A cycle takes up the linear solves that are done, tries their directions, lets every slot decide what is next, begins
 linear solves, and does INNER Krylov iterations of all that are running. It is the same sequence of launches each time,
 whatever the slots are at, so that on CUDA it is captured once as a graph; the host only asks which slots have ended.
+
+On a CPU a trajectory's bits depend neither on its neighbours nor on its slot. On a GPU residuals and products are added
+up by atomic operations in any order and cuBLAS chooses its algorithm by the size of the batch, so that the last bits of
+a Newton iterate change from run to run even for the same batch; what converges agrees within Newton's tolerance.
 """
 
 from collections.abc import Callable
@@ -21,7 +25,7 @@ from synth.simulate.batched.folding import find_folding, fold_product
 from synth.simulate.batched.numbering import number_rows, surface_tables
 from synth.simulate.batched.pad import Pad
 from synth.simulate.batched.placing import NUDGE, place, refill, take_grids
-from synth.simulate.batched.product import bulk_product, contact_product, store, store_contact
+from synth.simulate.batched.product import BLOCK, bulk_product, contact_product, store, store_contact
 from synth.simulate.batched.storage import Storage
 from synth.simulate.bulk import bulk_residual
 from synth.simulate.contact import contact_residual, contact_stiffness
@@ -63,22 +67,31 @@ class Machine:
         mixed, yeoh = material.mixed and space.element.has_pressure, bool(material.yeoh.any())
         rows = pad.reference.rows
         self._bulk, self._faces = bulk_tables(space, material, mixed, device), face_tables(space, device)
-        self._inner = inner
+        self.inner = inner
         self._lattice = fold_tables(space, material, device)
         self._rows = number_rows(space, pad.free, rows, self._bulk, device)
         self._surface = surface_tables(space, self._faces.weight.numpy(), device)
         stabilised = space.element.stabilisation > 0
         self._product = bulk_product(space.nodes.shape[1], mixed, stabilised, yeoh)
         self._contact_product = contact_product(space.faces.shape[1])
+        self._block = gmres.block_size(rows)
+        self._arnoldi, self._solution = gmres.arnoldi(rows), gmres.solution(rows)
         self._at = Storage(space, mixed, yeoh, rows, batch, records, grid, device)
-        self.slots = self._at.slots
-        self._vectors, self._elements = (rows, batch), (batch, len(space.nodes))
+        self.slots, self.krylov = self._at.slots, self._at.krylov
+        self._vectors = (batch, rows // 4)
         self._each = (batch, len(space.points) + self._at.volume.shape[1])
-        self.watch: Callable[[str], None] = lambda part: None
-        """Called after each part of a cycle with the part's name, for profiles."""
+        self.watch: Callable[[str, str], None] = lambda part, kernel: None
+        """Called after each launch with the part of the cycle and the kernel's name, for profiles."""
+        self._part = ""
 
-    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], *arguments: Any) -> None:
-        wp.launch(kernel, dim, inputs=list(arguments), device=self.device)
+    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], *arguments: Any, block: int = 256) -> None:
+        wp.launch(kernel, dim, inputs=list(arguments), device=self.device, block_dim=block)
+        self.watch(self._part, kernel.key)
+
+    def _launch_blocks(self, kernel: wp.Kernel, block: int, *arguments: Any) -> None:
+        """One block of so many threads per slot."""
+        wp.launch_tiled(kernel, dim=[self.batch], inputs=list(arguments), block_dim=block, device=self.device)
+        self.watch(self._part, kernel.key)
 
     def _select(self, *wanted: int) -> None:
         at = self._at
@@ -93,36 +106,30 @@ class Machine:
         self._take_up()
         for _ in range(ROUNDS):
             self._evaluate(jobs)
-        self.watch("residual")
         self._advance(jobs)
-        self.watch("stepping")
         self._evaluate(jobs)
-        self.watch("residual")
         self._linearise(jobs)
-        self.watch("tangent")
-        for _ in range(self._inner):
+        for _ in range(self.inner):
             self._iterate()
 
     def _take_up(self) -> None:
         """Solutions of the linear solves that are done."""
         at = self._at
-        k, vectors = at.krylov, self._vectors
-        self._launch(gmres.finish, self.batch, self.slots, k, at.begun)
-        self._launch(gmres.combine, vectors, k)
+        k, self._part = at.krylov, "krylov"
+        self._launch_blocks(self._solution, self._block, self.slots, k, at.begun)
         self._launch(gmres.rest, self.batch, k)
         where = (self._rows.node_row, self._rows.pressure_row, at.fields)
-        self._launch(moves.carry, self._each, at.begun, NUDGE, k.step, *where)
-        self.watch("krylov")
+        self._launch(moves.carry, self._each, at.begun, NUDGE, at.step, *where)
 
     def _evaluate(self, jobs: phases.Jobs) -> None:
         """Residuals of all slots that wait for one, and what follows from them."""
-        at = self._at
+        at, self._part = self._at, "residual"
         s, f, mask = self.slots, at.fields, at.mask
         elements = (self.batch, len(self.pad.space.nodes))
         self._place(jobs)
         self._select(phases.FRESH, phases.START, phases.SEARCH, phases.REPAIR, phases.NUDGED)
         where = (self._rows.node_row, self._rows.pressure_row)
-        self._launch(moves.attempt, self._each, s, mask, at.krylov.step, *where, f, at.force, at.volume)
+        self._launch(moves.attempt, self._each, s, mask, at.step, *where, f, at.force, at.volume)
         residual = (at.force, at.volume, at.jacobian)
         self._launch(bulk_residual, elements, f.trial_u, f.trial_p, mask, self._bulk, *residual)
         if self._lattice is not None:
@@ -130,14 +137,13 @@ class Machine:
         found = (at.force, at.gap, at.tangential, at.traction)
         law = (self._faces, at.indenters, at.contact, self.penalty)
         self._launch(contact_residual, at.points[:2], f.trial_u, mask, *law, *found)
-        self._launch(sums.partial_norms, at.partial.shape, mask, *residual, self._rows.node_row, at.partial)
-        self._launch(sums.norms, self.batch, mask, at.partial, s)
+        self._launch_blocks(sums.norms, sums.BLOCK, mask, *residual, self._rows.node_row, s)
         self._launch(judge, self.batch, s, self.settings)
         self._launch(moves.move, self._each, s, 0, f)
 
     def _advance(self, jobs: phases.Jobs) -> None:
         """Slots whose Newton solve ended: accept, correct, record, and choose the next step."""
-        at = self._at
+        at, self._part = self._at, "stepping"
         s, f, memory = self.slots, at.fields, (at.contact, at.gap, at.tangential)
         self._launch(conclude, self.batch, s, jobs, self.settings)
         self._launch(moves.move, self._each, s, phases.bits(phases.TOUCHED, phases.PASSING), f)
@@ -188,7 +194,7 @@ class Machine:
 
     def _linearise(self, jobs: phases.Jobs) -> None:
         """Tangents of all slots that are ready for a linear solve, and its begin."""
-        at = self._at
+        at, self._part = self._at, "tangent"
         f, mask = at.fields, at.mask
         self._place(jobs)
         self._select(phases.READY, phases.CARRY_READY)
@@ -203,31 +209,31 @@ class Machine:
         self._launch(store_contact, at.points[:2], mask, at.touching, self._faces.weight, *matrices, *stored)
         right = (self._rows.free, at.force, at.volume, at.krylov)
         self._launch(gmres.begin_vectors, self._vectors, self.slots, *right)
-        self._launch(gmres.begin, self.batch, self.slots, at.krylov)
+        self._launch(gmres.begin, self.batch, self.slots, self.settings, at.krylov)
 
     def _iterate(self) -> None:
         """One Krylov iteration of all running solves."""
         at = self._at
-        k, b, rows, limit = at.krylov, self.batch, self._vectors[0], gmres.GMRES_LIMIT
-        chunks = k.partial.shape[0]
-        self.pad.reference.apply(k)
-        self.watch("preconditioner")
-        self._launch(gmres.keep_corrected, (rows, b), k)
-        self.watch("krylov")
-        elements = (len(self.pad.space.nodes), b)
-        self._launch(self._product, elements, k.running, self._rows.single, at.stored, k.corrected, k.image)
+        k, elements, reference = at.krylov, (len(self.pad.space.nodes), self.batch), self.pad.reference
+        self._part = "preconditioner"
+        reference.precondition(k)
+        self.watch(self._part, "product with the inverse")
+        self._part = "product"
+        reference.turn_corrected(k)
+        self.watch(self._part, "transpose")
+        k.image.zero_()
+        self.watch(self._part, "zeros")
+        found = (at.stored, k.corrected, k.image)
+        self._launch(self._product, elements, k.running, self._rows.single, *found, block=BLOCK)
         if self._lattice is not None:
             where = (at.folding, at.fields.iterate_u, self._lattice, self._rows.single.row)
             self._launch(fold_product, elements, k.running, *where, k.corrected, k.image)
         contact = (at.touched, self._rows.face_row, self._rows.face_shape, at.stored_contact)
         self._launch(self._contact_product, at.points[:2], k.running, *contact, k.corrected, k.image)
-        self.watch("product")
-        self._launch(gmres.partial_products, (chunks, b), k)
-        self._launch(gmres.products, (limit + 1, b), k)
-        self._launch(gmres.orthogonalise, (chunks, b), k)
-        self._launch(gmres.rotate, b, k, self.settings.forcing)
-        self._launch(gmres.extend, (rows, b), k)
-        self.watch("krylov")
+        reference.turn_image(k)
+        self.watch(self._part, "transpose")
+        self._part = "krylov"
+        self._launch_blocks(self._arnoldi, self._block, k)
 
     def fill(self, assignment: np.ndarray, jobs: phases.Jobs, shapes: wp.array, grids: wp.array) -> None:
         """Begin trajectories. assignment: (B,) number of the job, -1: go on, -2: leave empty."""

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path as FilePath
 
 from synth.mesh import PadMesh
-from synth.scene import Scene
+from synth.scene import Numerics, Scene
 from synth.simulate.batched.jobs import Job, untouched
 from synth.simulate.batched.pad import Pad, prepare
 from synth.simulate.batched.run import Run
@@ -22,7 +22,7 @@ def simulate_many(
     mesh: PadMesh,
     folder: FilePath | None = None,
     device: str = "cuda",
-    frames: frozenset[int] | None = None,
+    frames: frozenset[int] | Sequence[frozenset[int]] | None = None,
     batch: int = LARGEST_BATCH,
     driver: Driver = STANDARD,
     pad: Pad | None = None,
@@ -34,7 +34,7 @@ def simulate_many(
         mesh: of their pad.
         folder: what a mesh indenter's file name is relative to.
         device: Warp device.
-        frames: numbers of the states that are wanted, see `synth.simulate.simulate`.
+        frames: numbers of the states that are wanted, see `synth.simulate.simulate`: of all scenes, or of each.
         batch: most trajectories at a time.
         driver: how Newton's method is led along the paths.
         pad: of these scenes on that device, if it was prepared before.
@@ -44,35 +44,59 @@ def simulate_many(
 
     Raises:
         InputError: scenes that do not share a pad; an indenter that cannot be built; CUDA without cuBLAS.
+        ValueError: not as many sets of frames as scenes.
     """
     if not scenes:
         return
     first = scenes[0]
     check_shared(scenes, mesh)
     pad = pad or prepare(first, mesh, device)
-    jobs = jobs_of(scenes, pad, folder)
+    wanted = frames if isinstance(frames, Sequence) else None if frames is None else [frames] * len(scenes)
+    yield from run_jobs(jobs_of(scenes, pad, folder), pad, first.numerics, wanted, batch, driver)
+
+
+def run_jobs(
+    jobs: Sequence[Job],
+    pad: Pad,
+    numerics: Numerics,
+    frames: Sequence[frozenset[int]] | None = None,
+    batch: int = LARGEST_BATCH,
+    driver: Driver = STANDARD,
+) -> Iterator[tuple[int, Trajectory]]:
+    """Run jobs of one pad; arguments, what is yielded and what is raised as of `simulate_many`.
+
+    Args:
+        jobs: from `job_of`.
+        pad: theirs.
+        numerics: of all of them.
+        frames: numbers of the states that are wanted, of each job.
+        batch: most trajectories at a time.
+        driver: how Newton's method is led along the paths.
+    """
+    if frames is not None and len(frames) != len(jobs):
+        raise ValueError(f"{len(frames)} sets of frames for {len(jobs)} jobs")
     for number, job in enumerate(jobs):
         if not job.touches:
             yield number, untouched(job, pad.space)
     touching = [number for number, job in enumerate(jobs) if job.touches]
     if touching:
-        run = Run([jobs[n] for n in touching], pad, first.numerics, driver, frames, min(batch, len(touching)))
+        theirs = None if frames is None else [frames[n] for n in touching]
+        run = Run([jobs[n] for n in touching], pad, numerics, driver, theirs, min(batch, len(touching)))
         for number, result in run:
             yield touching[number], result
 
 
 def jobs_of(scenes: Sequence[Scene], pad: Pad, folder: FilePath | None = None) -> list[Job]:
     """What is to be run of each scene."""
-    resolved = pad.mesh.spacing_mm / (2 * pad.space.element.order)
-    return [
-        Job(
-            Path(
-                scene.motion,
-                rigid_body(scene.contact.indenter, folder, resolved),
-                scene.sensor.gel.dome_radius_mm,
-            ),
-            scene.contact.friction,
-            scene.sensor.gel.youngs_modulus_kpa / 1000,
-        )
-        for scene in scenes
-    ]
+    return [job_of(scene, pad, folder) for scene in scenes]
+
+
+def job_of(scene: Scene, pad: Pad, folder: FilePath | None = None) -> Job:
+    """What is to be run of a scene.
+
+    Raises:
+        InputError: the indenter cannot be built.
+    """
+    gel = scene.sensor.gel
+    body = rigid_body(scene.contact.indenter, folder, pad.mesh.spacing_mm / (2 * pad.space.element.order))
+    return Job(Path(scene.motion, body, gel.dome_radius_mm), scene.contact.friction, gel.youngs_modulus_kpa / 1000)

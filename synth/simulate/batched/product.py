@@ -11,7 +11,8 @@ functions of `synth.simulate.bulk` in double precision, and stored; so is contac
 with friction's unsymmetric part, by `contact_stiffness` itself.
 
 Vectors are (rows, B): all displacements of a free node in three rows, then the pressures, and neighbouring threads work
-on neighbouring slots of the same element, so that every access to them is one piece of memory.
+on neighbouring slots of the same element, so that every access to them is one piece of memory. Elements add to a row in
+no particular order on a GPU: there the last bits differ from run to run, on a CPU they do not.
 """
 
 # Kernels are written in Warp's own language; their annotations only look like Python's.
@@ -27,6 +28,9 @@ wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 RUNNING = wp.constant(1)
 """State of a slot's linear solve in which it takes part in products."""
+BLOCK, TOGETHER = 128, 4
+"""Threads of a block of `bulk_product`, and blocks that a multiprocessor is to run side by side. Left to itself the
+compiler takes 168 registers a thread, with which only half as many can wait for memory at a time."""
 STORED = 16
 """Numbers stored per quadrature point: F^{-T} (9), w 2W', w (2W' - P J), w (P J + γ J²), w J (1 - γ/λ), w J γ_c D,
 w (1 - γ/λ)/λ, w γ_c D/λ."""
@@ -106,7 +110,7 @@ def bulk_product(nodes: int, mixed: bool, stabilised: bool, yeoh: bool) -> wp.Ke
     count = wp.constant(nodes)
     nodal = wp.types.matrix(shape=(nodes, 3), dtype=wp.float32)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(BLOCK, TOGETHER))
     def product(
         running: wp.array(dtype=wp.int32),
         single: Single,

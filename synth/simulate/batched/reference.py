@@ -1,24 +1,18 @@
 """The preconditioner of a whole batch: the inverse of the undeformed pad's stiffness, as one dense matrix.
 
 All slots share a mesh, so that K_0^{-1} times all their vectors is one matrix product (a loaded P2/P1 tangent needs
-8 to 40 iterations to 1e-3 with it). The inverse is found in double precision and applied in single: on CUDA by cuBLAS
-with products rounded to TF32, which flexible GMRES allows for, elsewhere by NumPy, one slot after the other, so that a
-slot's numbers do not depend on its neighbours.
+8 to 40 iterations to 1e-3 with it). The inverse is found in double precision and applied in single, on CUDA with
+products rounded to TF32: a preconditioner that changes a little with its argument, which flexible GMRES allows for.
 """
-
-from typing import Any
 
 import numpy as np
 import warp as wp
 
 from synth.arrays import FloatArray
-from synth.simulate.batched.gemm import Gemm
-from synth.simulate.batched.krylov import RUNNING, Krylov
+from synth.simulate.batched.gemm import dense
+from synth.simulate.batched.krylov import Krylov, padded, plain
 from synth.simulate.contact import Indenters
 from synth.simulate.system import System
-
-PAD = 64
-"""Rows are filled up to a multiple of it: matrix products of other sizes took three times as long."""
 
 
 def stiffness(system: System, away: Indenters) -> FloatArray:
@@ -29,26 +23,29 @@ def stiffness(system: System, away: Indenters) -> FloatArray:
 
 
 class Reference:
-    """K_0^{-1} on a device, filled up with zeros to a multiple of PAD rows.
+    """K_0^{-1} on a device, filled up with zeros to as many rows as the Krylov vectors have.
 
     Args:
-        inverse: (k, k) float64.
+        inverse: (k, k) float64, symmetric.
         device: Warp device.
     """
 
     def __init__(self, inverse: FloatArray, device: str) -> None:
-        self.rows = -(-len(inverse) // PAD) * PAD
-        padded = np.zeros((self.rows, self.rows), dtype=np.float32)
-        padded[: len(inverse), : len(inverse)] = inverse
-        self.matrix = wp.array(padded, dtype=wp.float32, device=device)
-        self._host = None if wp.get_device(device).is_cuda else padded
-        self._gemm: Any = None if self._host is not None else Gemm(device)
+        self.rows = padded(len(inverse))
+        filled = np.zeros((self.rows, self.rows), dtype=np.float32)
+        filled[: len(inverse), : len(inverse)] = inverse
+        self.matrix = wp.array(filled, dtype=wp.float32, device=device)
+        self._dense = dense(device)
 
-    def apply(self, krylov: Krylov) -> None:
-        """krylov.corrected = K_0^{-1} krylov.current, at least where a solve is running."""
-        if self._host is None:
-            self._gemm(self.matrix, krylov.current, krylov.corrected)
-            return
-        given, found = krylov.current.numpy(), krylov.corrected.numpy()
-        for s in np.flatnonzero(krylov.running.numpy() == RUNNING):
-            found[:, s] = self._host @ np.ascontiguousarray(given[:, s])
+    def precondition(self, krylov: Krylov) -> None:
+        """`preconditioned` = K_0^{-1} `current`, at least where a solve is running."""
+        given, found = plain(krylov.current), plain(krylov.preconditioned)
+        self._dense.product(self.matrix, given, found, krylov.running)
+
+    def turn_corrected(self, krylov: Krylov) -> None:
+        """`corrected` = `preconditioned`, slots next to each other."""
+        self._dense.transpose(plain(krylov.preconditioned), krylov.corrected)
+
+    def turn_image(self, krylov: Krylov) -> None:
+        """`product` = `image`, rows next to each other."""
+        self._dense.transpose(krylov.image, plain(krylov.product))

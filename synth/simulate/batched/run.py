@@ -13,7 +13,6 @@ from synth.simulate.batched.jobs import Ended, Job, body_tables, job_tables, tra
 from synth.simulate.batched.machine import INNER, Machine
 from synth.simulate.batched.pad import Pad
 from synth.simulate.driver import Driver
-from synth.simulate.linear import GMRES_TOLERANCE
 from synth.simulate.newton import MAX_ITERATIONS
 from synth.simulate.trajectory import Trajectory
 
@@ -29,12 +28,9 @@ class Run:
         pad: they run on.
         numerics: of all of them.
         driver: how Newton's method is led.
-        frames: numbers of the states that are corrected, default all.
+        frames: numbers of the states that are corrected, of each job; default all.
         batch: number of slots.
         order: numbers of the jobs in which they begin, default each once.
-        forcing: relative residual that ends a linear solve. Four dragged balls took 77, 81 and 99 Newton iterations
-            each with 1e-3, 1e-2 and 5e-2, and 1632, 1293 and 1185 Krylov iterations; but a correction pass may take
-            only so many of the former.
         inner: Krylov iterations of a cycle.
     """
 
@@ -44,10 +40,9 @@ class Run:
         pad: Pad,
         numerics: Numerics,
         driver: Driver,
-        frames: frozenset[int] | None,
+        frames: Sequence[frozenset[int]] | None,
         batch: int,
         order: Iterable[int] | None = None,
-        forcing: float = GMRES_TOLERANCE,
         inner: int = INNER,
     ) -> None:
         self._jobs, self._pad = jobs, pad
@@ -56,13 +51,14 @@ class Run:
         settings = phases.Settings()
         settings.tolerance, settings.loose = numerics.tolerance, driver.loose
         settings.longest, settings.extrapolate = numerics.max_step_mm, int(driver.extrapolate)
-        settings.forcing = forcing
+        settings.forcing = driver.forcing
         settings.limit, settings.correction_limit = MAX_ITERATIONS, driver.correction_iterations
         records = max(len(job.path.records()) for job in jobs)
         self.machine = Machine(pad, batch, records, grid, settings, numerics.penalty, inner)
         self._order = range(len(jobs)) if order is None else order
         self._graph: Any = None
         self.cycles = 0
+        self._spent = 0.0
 
     def __iter__(self) -> Iterator[tuple[int, Trajectory]]:
         """Run all jobs."""
@@ -75,7 +71,8 @@ class Run:
             assignment = np.full(batch, -1)
             for slot in empty:
                 working[slot] = assignment[slot] = next(waiting, -2)
-            begun[empty] = time.perf_counter()
+            began = time.perf_counter()
+            begun[empty] = self._spent
             if len(empty):
                 machine.fill(assignment, self.table, self._shapes, self._grids)
             if (working < 0).all():
@@ -83,6 +80,7 @@ class Run:
             for _ in range(LOOK):
                 self.advance()
             empty = np.flatnonzero(machine.slots.phase.numpy() == phases.ENDED)
+            self._spent += time.perf_counter() - began  # without what whoever takes the results does meanwhile
             yield from self._collect(empty, working, begun)
 
     def advance(self) -> None:
@@ -103,10 +101,9 @@ class Run:
             return
         state = self.machine.slots
         count, reason, at, target = (array.numpy() for array in (state.records, state.reason, state.at, state.target))
-        now = time.perf_counter()
         for s in map(int, slots):
             number = int(working[s])
             ended = Ended(int(reason[s]), float(at[s]), float(target[s]))
             records = self.machine.record_of(s, int(count[s]))
-            seconds = (now - begun[s]) / self.machine.batch
+            seconds = float(self._spent - begun[s]) / self.machine.batch
             yield number, trajectory(self._jobs[number], records, ended, seconds, self._pad.space)

@@ -145,7 +145,7 @@ class Jobs:
 class Settings:
     """Of all trajectories: `synth.scene.Numerics`, `synth.simulate.driver.Driver`, and limits of Newton's method.
 
-    forcing: of the linear residual, relative to the right side.
+    forcing: of the linear residual, relative to the right side, at most; see `synth.simulate.batched.krylov`.
     """
 
     tolerance: wp.float64

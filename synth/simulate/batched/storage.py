@@ -9,10 +9,10 @@ from typing import Any
 import warp as wp
 
 from synth.simulate.batched.fields import Fields, Kept
-from synth.simulate.batched.krylov import GMRES_LIMIT, ROWS, Krylov
+from synth.simulate.batched.krylov import Krylov, plain, shapes
 from synth.simulate.batched.product import STORED, STORED_YEOH
 from synth.simulate.batched.slots import Slots
-from synth.simulate.batched.sums import CHUNK, SCALARS
+from synth.simulate.batched.sums import SCALARS
 from synth.simulate.contact import ContactState, Indenters
 from synth.simulate.distance import shape_vector
 from synth.simulate.space import Space
@@ -62,7 +62,6 @@ class Storage:
         self.kept: Kept = _filled(Kept, lambda _: self.points, device)
         self.force, self.volume = zeros((batch, nodes), wp.vec3d), zeros((batch, pressures), wp.float64)
         self.jacobian = zeros((batch, elements), wp.float64)
-        self.partial = zeros((batch, sum(-(-n // CHUNK) for n in (nodes, pressures, elements))), wp.vec3d)
         self.gap, self.tangential = zeros(self.points, wp.float64), zeros(self.points, wp.vec3d)
         self.traction = zeros(self.points, wp.vec3d)
         self.normal_before, self.tangent_before = zeros(self.points, wp.float64), zeros(self.points, wp.vec3d)
@@ -82,11 +81,6 @@ class Storage:
         self.touching, self.touched = zeros(self.points[:2], wp.int32), zeros(self.points[:2], wp.int32)
         self.symmetric, self.remainder = zeros(self.points, wp.mat33d), zeros(self.points, wp.mat33d)
         self.stored_contact = zeros(self.points, wp.mat33f)
-        limit = GMRES_LIMIT
-        shapes: dict[str, tuple[int, ...]] = {
-            "running": (batch,), "k": (batch,), "size": (batch,), "basis": (limit + 1, rows, batch),
-            "corrections": (limit, rows, batch), "hessenberg": (limit + 1, batch), "triangle": (limit, limit, batch),
-            "cosine": (limit, batch), "sine": (limit, batch), "residual": (limit + 1, batch),
-            "weight": (limit, batch), "partial": (-(-rows // ROWS), limit + 1, batch),
-        }  # fmt: skip
-        self.krylov: Krylov = _filled(Krylov, lambda name: shapes.get(name, (rows, batch)), device)
+        sizes = shapes(rows, batch)
+        self.krylov: Krylov = _filled(Krylov, lambda name: sizes[name], device)
+        self.step = plain(self.krylov.step)

@@ -10,8 +10,8 @@ from synth.simulate.contact import Faces, Indenters, position
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
-CHUNK = wp.constant(32)
-"""Nodes, pressures or elements that one thread sums."""
+BLOCK = 256
+"""Threads that sum a slot's residual. One thread that adds up what others found would take 0.1 ms for 200 numbers."""
 SLIPS = wp.constant(wp.float64(1.0 - 1.0e-6))
 """Share of the friction limit from which a point counts as slipping, as in `System.slip_ratio`."""
 SCALARS = 12
@@ -19,60 +19,37 @@ SCALARS = 12
 
 
 @wp.kernel
-def partial_norms(
+def norms(
     mask: wp.array(dtype=wp.int32),
     force: wp.array2d(dtype=wp.vec3d),
     volume: wp.array2d(dtype=wp.float64),
     jacobian: wp.array2d(dtype=wp.float64),
     node_row: wp.array(dtype=wp.int32),
-    partial: wp.array2d(dtype=wp.vec3d),
+    slots: Slots,
 ):
-    """One thread per (slot, chunk): squares of the free residual and of all forces; the smallest det F.
-
-    Chunks of nodes come first, then chunks of pressures, then chunks of elements.
-    """
-    s, c = wp.tid()
+    """One block per slot: the trial's norms of the free residual and of all forces, and its smallest det F."""
+    s, lane = wp.tid()
     if mask[s] == 0:
         return
     free = wp.float64(0.0)
     whole = wp.float64(0.0)
     smallest = wp.float64(1.0e30)
-    nodes = (force.shape[1] + CHUNK - 1) // CHUNK
-    pressures = (volume.shape[1] + CHUNK - 1) // CHUNK
-    if c < nodes:
-        for i in range(c * CHUNK, wp.min((c + 1) * CHUNK, force.shape[1])):
-            square = wp.length_sq(force[s, i])
-            whole += square
-            if node_row[i] >= 0:
-                free += square
-    elif c < nodes + pressures:
-        first = (c - nodes) * CHUNK
-        for i in range(first, wp.min(first + CHUNK, volume.shape[1])):
-            free += volume[s, i] * volume[s, i]
-    else:
-        first = (c - nodes - pressures) * CHUNK
-        for i in range(first, wp.min(first + CHUNK, jacobian.shape[1])):
-            smallest = wp.min(smallest, jacobian[s, i])
-    partial[s, c] = wp.vec3d(free, whole, smallest)
-
-
-@wp.kernel
-def norms(mask: wp.array(dtype=wp.int32), partial: wp.array2d(dtype=wp.vec3d), slots: Slots):
-    """One thread per slot: the trial's norms from the chunks'."""
-    s = wp.tid()
-    if mask[s] == 0:
-        return
-    free = wp.float64(0.0)
-    whole = wp.float64(0.0)
-    smallest = wp.float64(1.0e30)
-    for c in range(partial.shape[1]):
-        chunk = partial[s, c]
-        free += chunk[0]
-        whole += chunk[1]
-        smallest = wp.min(smallest, chunk[2])
-    slots.trial_norm[s] = wp.sqrt(free)
-    slots.trial_force[s] = wp.sqrt(whole)
-    slots.trial_jacobian[s] = smallest
+    for i in range(lane, force.shape[1], wp.block_dim()):
+        square = wp.length_sq(force[s, i])
+        whole += square
+        if node_row[i] >= 0:
+            free += square
+    for i in range(lane, volume.shape[1], wp.block_dim()):
+        free += volume[s, i] * volume[s, i]
+    for i in range(lane, jacobian.shape[1], wp.block_dim()):
+        smallest = wp.min(smallest, jacobian[s, i])
+    free = wp.tile_extract(wp.tile_sum(wp.tile(free)), 0)
+    whole = wp.tile_extract(wp.tile_sum(wp.tile(whole)), 0)
+    smallest = wp.tile_extract(wp.tile_min(wp.tile(smallest)), 0)
+    if lane == 0:
+        slots.trial_norm[s] = wp.sqrt(free)
+        slots.trial_force[s] = wp.sqrt(whole)
+        slots.trial_jacobian[s] = smallest
 
 
 @wp.kernel
