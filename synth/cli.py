@@ -62,7 +62,12 @@ def generate(
     assignments: Assignments = None,
     device: Device = "auto",
     workers: Annotated[
-        int | None, Parameter(converter=_whole(1), help="Processes that make samples; the same come out. Default: 1.")
+        int | None,
+        Parameter(
+            converter=_whole(1),
+            help="Processes that make samples; the same come out. Default: 1. With numerics.solver = batched: "
+            "processes beside the one that simulates and renders; default on a GPU: one for every other core.",
+        ),
     ] = None,
     ray: Annotated[
         str | None, Parameter(help="Address of a Ray cluster to make samples on, such as auto; local begins one here.")
@@ -146,7 +151,7 @@ def budget(
     ] = Path("data/bench"),
     draws: Annotated[int, Parameter(converter=_whole(1), help="Draws of each scene.")] = 20,
     seed: Annotated[int, Parameter(converter=_whole(0), help="Seed of the draws; the error model saw 0 and 1.")] = 2,
-    reference: Annotated[int, Parameter(converter=_whole(8), help="Elements across the contact of the truth.")] = 18,
+    reference: Annotated[int, Parameter(converter=_whole(8), help="Most elements across a contact in the truth.")] = 18,
     workers: Annotated[int, Parameter(converter=_whole(1), help="Presses that run at once.")] = 1,
     minutes: Annotated[
         float | None, Parameter(help="Begin no press that will not end within them; the same command goes on.")
@@ -208,6 +213,25 @@ def scale(
     from synth.bench import run_scale
 
     return run_scale(scene, out, n, size or [], workers or [], device, seed, minutes, as_json)
+
+
+@bench.command
+def light(
+    scenes: Annotated[list[str], Parameter(help="Names or files of scenes.")],
+    /,
+    *,
+    out: Annotated[Path, Parameter(help="Directory for the report.")] = Path("data/bench"),
+    reference: Annotated[
+        int, Parameter(converter=_whole(64), help="Samples per pixel of what is held against, path traced.")
+    ] = 4096,
+    device: Device = "auto",
+    seed: Annotated[int, Parameter(converter=_whole(0), help="Seed of the draws.")] = 0,
+    as_json: AsJson = False,
+) -> int:
+    """Measures separated light against path tracing: pictures, time, and what flow methods make of them."""
+    from synth.bench import run_light
+
+    return run_light(scenes, out, reference, seed, device, as_json)
 
 
 @app.command

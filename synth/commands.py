@@ -79,13 +79,13 @@ def run_simulate(scene: str, out: Path, seed: int, index: int, assignments: Sequ
     from synth.sampling import draw
     from synth.simulate import simulate
     from synth.simulate.files import write_trajectory
-    from synth.simulate.resolution import resolve
+    from synth.simulate.shared import resolution_of
 
     template = load_scene(scene, assignments)
     drawn = draw(template, seed, index)
     with storage_errors(out):
         out.mkdir(parents=True, exist_ok=True)  # before minutes of work, not after
-    resolution = resolve(drawn, template.source.parent)
+    resolution = resolution_of(drawn, template.source.parent)
     trajectory = simulate(drawn, resolution.mesh, template.source.parent)
     record = write_trajectory(out, drawn, trajectory)
     if as_json:
@@ -187,9 +187,7 @@ def _error_line(planned: Plan) -> str:
     median, largest = planned.error_px
     line = f"predicted error of the flow from the simulation: {median:.2g} px (median), {largest:.2g} px (largest)"
     if largest > planned.target_error_px:
-        return (
-            f"{line}; the target of {planned.target_error_px:g} px is out of reach of the finest mesh for some draws\n"
-        )
+        return f"{line}; for some draws the mesh does not reach the target of {planned.target_error_px:g} px\n"
     return f"{line}; target {planned.target_error_px:g} px\n"
 
 

@@ -14,6 +14,7 @@ from synth.errors import InputError
 from synth.render.camera_rays import pinhole
 from synth.render.lights import check_view
 from synth.render.pattern import check_pattern, is_grey
+from synth.render.separated_light import check_light
 from synth.render.thin_lens import ThinLens
 from synth.render.variant import Variant
 from synth.sampling import draw
@@ -21,7 +22,8 @@ from synth.scene import Scene
 from synth.simulate.indenter import rigid_body
 from synth.simulate.material import DISPLACEMENT_ONLY_BELOW
 from synth.simulate.path import TWIST_ARM_MM
-from synth.simulate.resolution import DEFAULT_TARGET_PX, Resolution, resolve
+from synth.simulate.resolution import DEFAULT_TARGET_PX, Resolution
+from synth.simulate.shared import resolution_of
 from synth.template import Template
 
 DRAWS = 12
@@ -38,6 +40,12 @@ SOLVE_GROWTH = 1.5
 FRICTION = 1.5
 """Time of an iteration with friction over one without."""
 ITERATIONS_PER_STEP, ITERATIONS_PER_RECORD = 4.5, 7.0
+BATCHED_SECONDS = {"cuda": 1.3e-4, "cpu": 0.8}
+"""One Newton iteration of one trajectory by the batched solver, with BATCHED_NODES displacement nodes; on a GPU among
+hundreds of trajectories (docs/reports/batched_fem.md)."""
+BATCHED_NODES = 3500
+BATCHED_GROWTH = 1.6
+"""Exponent of that in the number of nodes: the preconditioner is a dense matrix, the rest is linear."""
 AUTO_SAMPLES = 64
 """What samples_per_pixel = "auto" counts for, before a sensor has been measured."""
 SECONDS_PER_MILLION_SAMPLES = {"llvm": 0.4, "scalar": 1.0, "cuda": 0.002}
@@ -101,8 +109,8 @@ def check_buildable(template: Template, variant: Variant) -> None:
 
     Raises:
         InputError: at a corner of the distributions, an indenter whose parts do not fit or whose file is no closed
-            surface, a light in the camera's view, a lens that this variant cannot render, or a pattern that no pixel
-            could show or whose file is no picture.
+            surface, a light in the camera's view, a lens or a kind of light that this variant or coating cannot have,
+            or a pattern that no pixel could show or whose file is no picture.
     """
     try:
         for sensor in dict.fromkeys(view for corner in template.corners for view in corner.sensor.views.values()):
@@ -112,6 +120,8 @@ def check_buildable(template: Template, variant: Variant) -> None:
                 pinhole(sensor)
         for sensor in dict.fromkeys(corner.sensor for corner in template.corners):
             check_pattern(sensor, template.source.parent)
+            if template.corners[0].render.light == "separated":
+                check_light(sensor, variant)
         for indenter in dict.fromkeys(corner.contact.indenter for corner in template.corners):
             rigid_body(indenter, template.source.parent)
     except InputError as error:
@@ -124,8 +134,8 @@ def plan(template: Template, variant: Variant) -> Plan:
     scene = corners[0]
     cameras = [view.camera for view in scene.sensor.views.values()]
     pairs = scene.sampling.pairs_per_trajectory
-    meshes = _meshes(template)
-    simulate = sum(_simulation_seconds(draw, nodes) for draw, nodes in meshes.draws) / len(meshes.draws)
+    meshes, gpu = _meshes(template), variant.name.startswith("cuda")
+    simulate = sum(_simulation_seconds(draw, nodes, gpu) for draw, nodes in meshes.draws) / len(meshes.draws)
     pixels = sum(camera.width * camera.height for camera in cameras)
     kind = variant.name.split("_")[0]
     samples = AUTO_SAMPLES if scene.render.samples_per_pixel == "auto" else scene.render.samples_per_pixel
@@ -135,7 +145,7 @@ def plan(template: Template, variant: Variant) -> Plan:
     return Plan(
         scene=template.name,
         variant=variant.name,
-        decisions=tuple(_decisions(corners, variant)),
+        decisions=(_batching(template), *_decisions(corners, variant)),
         resolution=meshes.resolution,
         error_px=meshes.error_px,
         target_error_px=meshes.target_error_px,
@@ -170,15 +180,17 @@ def _meshes(template: Template) -> _Meshes:
     for trajectory in range(DRAWS):
         try:
             drawn = draw(template, 0, trajectory)
+            found.append((drawn, resolution_of(drawn, template.source.parent)))
         except InputError:  # an impossible draw: generate redraws it
             continue
-        found.append((drawn, resolve(drawn, template.source.parent)))
     if not found:
         raise InputError(f"{template.source}: none of {DRAWS} draws is possible; try `simulate` to see why")
     across = [resolution.across for _, resolution in found]
     errors = [resolution.error_px for _, resolution in found]
     spacings = [resolution.spacing_mm for _, resolution in found]
     text = f"{min(across)} to {max(across)} elements across the contact, {min(spacings):.2g} to {max(spacings):.2g} mm"
+    if numerics.solver == "batched":
+        text = " x ".join(map(str, numerics.cells)) + f" elements for all draws of a pad, {text}"
     order = 1 if numerics.element == "p1p1" else VERTICES_TO_P2
     draws = tuple((drawn, round(order * len(resolution.mesh.points))) for drawn, resolution in found)
     target = numerics.target_error_px or DEFAULT_TARGET_PX
@@ -192,15 +204,30 @@ def _tetwild_nodes(scene: Scene) -> int:
     return max(FEWEST_NODES, round(order * vertices))
 
 
-def _simulation_seconds(scene: Scene, nodes: int) -> float:
+def _simulation_seconds(scene: Scene, nodes: int, gpu: bool) -> float:
     motion = scene.motion
     if motion.depth_mm <= 0 and not motion.then:
         return 0.0
     drag = abs(motion.shear_mm[0]) + abs(motion.shear_mm[1]) + abs(motion.twist_deg) * 0.01745 * TWIST_ARM_MM
     steps = max((motion.depth_mm + drag) / scene.numerics.max_step_mm, motion.steps)
     iterations = ITERATIONS_PER_STEP * steps + ITERATIONS_PER_RECORD * motion.steps
+    if scene.numerics.solver == "batched":
+        return iterations * BATCHED_SECONDS["cuda" if gpu else "cpu"] * (nodes / BATCHED_NODES) ** BATCHED_GROWTH
     friction = FRICTION if scene.contact.friction > 0 else 1.0
     return iterations * SOLVE_SECONDS * friction * (nodes / SOLVE_NODES) ** SOLVE_GROWTH
+
+
+def _batching(template: Template) -> Decision:
+    """Whether trajectories are simulated many at once, and whether that is worth it."""
+    solver = template.corners[0].numerics.solver
+    reason = f'numerics.solver = "{solver}"'
+    if solver == "batched":
+        # Without layers stiffness only scales forces, so that pads which differ in nothing else share a mesh.
+        alike = () if template.corners[0].sensor.gel.layers else ("sensor.gel.youngs_modulus_kpa",)
+        drawn = [at for _, _, at in template.distributions() if at.startswith("sensor.gel.") and at not in alike]
+        if drawn:
+            reason += f": but {', '.join(drawn)} make each sensor's pad another, with a mesh and a batch of its own"
+    return Decision("batched simulation", solver == "batched", reason)
 
 
 def _decisions(corners: tuple[Scene, ...], variant: Variant) -> list[Decision]:
@@ -215,6 +242,7 @@ def _decisions(corners: tuple[Scene, ...], variant: Variant) -> list[Decision]:
     apertures = [camera.aperture_mm for camera in cameras]
     blurred = max(apertures) > 0
     mirrors, further = len(corners[0].sensor.mirrors), len(corners[0].sensor.further_cameras)
+    light = corners[0].render.light
     grey = all(is_grey(c.sensor) for c in corners)
     hue = "lights, coating and pattern are grey" if grey else "a light, the coating or the pattern has colour"
     if grey and not variant.is_mono:
@@ -236,6 +264,7 @@ def _decisions(corners: tuple[Scene, ...], variant: Variant) -> list[Decision]:
         ),
         Decision("mirrors", mirrors > 0, f"{mirrors} in sensor.mirrors"),
         Decision("further cameras", further > 0, f"{further} in sensor.further_cameras"),
+        Decision("separated light", light == "separated", f"render.light = {light}"),
         Decision("indirect light", max(bounces) > 2, _span("render.max_depth", bounces)),
         Decision("colour", not variant.is_mono, hue),
         Decision("backward flow", outputs.backward, f"outputs.backward = {str(outputs.backward).lower()}"),

@@ -159,6 +159,13 @@ class Render(Part):
     so many that the renderer's noise is a quarter of the main camera's own."""
     max_depth: Annotated[int, Field(ge=2, le=64)] = 4
     """Longest light path in surfaces and lights; 2 is direct light only. The window does not count."""
+    light: Literal["path_traced", "separated"] = "path_traced"
+    """separated: direct light in closed form, what is blocked of it and bounced light sampled at their own rates; with
+    as many samples a quarter of the noise or less (docs/reports/light.md). For matt coatings, with LLVM or a GPU."""
+
+
+Cells = Annotated[int, Field(ge=4, le=200, multiple_of=2)]
+"""An even number of elements, so that a mesh is its own mirror image."""
 
 
 class Numerics(Part):
@@ -171,6 +178,11 @@ class Numerics(Part):
     made as fine under each draw's contact as this asks for."""
     edge_length_mm: Positive | None = None
     """Instead of a target: one fTetWild mesh for all draws with tetrahedra of this edge at the contact face."""
+    solver: Literal["single", "batched"] = "single"
+    """batched: many trajectories at once on one mesh for all draws of a pad, for GPUs; `cells` or edge_length_mm say
+    which, and a target is only what `plan` compares with. The same laws and tolerances, other meshes: other samples."""
+    cells: tuple[Cells, Cells, Annotated[int, Field(ge=1, le=20)]] = (16, 12, 2)
+    """Elements of the batched solver's mesh along x and y, where they are even in size, and through the thickness."""
     max_step_mm: Positive = 0.25
     """Longest motion of the indenter in one load step; steps are halved when Newton fails."""
     tolerance: Annotated[float, Field(ge=1e-12, le=1e-2)] = 1e-6

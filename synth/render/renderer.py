@@ -26,6 +26,7 @@ from synth.render.gel_mesh import GelMesh
 from synth.render.lights import check_view, emitters
 from synth.render.pattern import is_grey
 from synth.render.sample_count import PILOT, needed_samples
+from synth.render.separated_light import SeparatedLight, check_light
 from synth.render.thin_lens import ThinLens
 from synth.render.variant import Variant
 from synth.scene import Coating, Render, Sensor
@@ -35,6 +36,9 @@ _MAX_WAVEFRONT = 2**22
 """Samples traced at once: 50 MB of results. A constant, because the split into passes decides the random numbers."""
 
 _PILOT_SEEDS = (1, 2)
+
+_LIGHT_PART = 2**31
+"""Stands for the number of a pass in the seed of what all pixels share."""
 
 
 class Renderer:
@@ -48,7 +52,8 @@ class Renderer:
         variant: from `choose_variant`.
 
     Raises:
-        InputError: a light in the camera's view; a lens that cannot focus, or that a scalar variant cannot render.
+        InputError: a light in the camera's view; a lens that cannot focus, or that a scalar variant cannot render;
+            separated light with a coating that shines or a scalar variant.
         ValueError: a mono variant for a sensor that is not grey.
     """
 
@@ -59,12 +64,15 @@ class Renderer:
         for name, view in self._views.items():
             if name:
                 _check_further(name, view)
-        self._lit = sum(light.power > 0 for light in sensor.lights)
+        if is_separated := render.light == "separated":  # every light at every sample
+            check_light(sensor, variant)
+        self._lit = 1 if is_separated else sum(light.power > 0 for light in sensor.lights)
         wanted = render.samples_per_pixel
         self._samples = full_grid(PILOT if wanted == "auto" else wanted, self._lit)
         self._mesh = GelMesh(surface, sensor.gel.size_mm[:2])
         mi = variant.load()
-        contents = {"type": "scene", "gel": self._build_gel(mi, sensor.coating, albedo), **emitters(sensor, mi)}
+        gel = self._build_gel(mi, sensor.coating, albedo)
+        contents = {"type": "scene", "gel": gel, **emitters(sensor, mi)}
         refracts = sensor.window.refractive_index != 1
         if not variant.is_vectorised and refracts:
             contents["window"] = _window(sensor, mi)
@@ -72,6 +80,8 @@ class Renderer:
         self._parameters = mi.traverse(self._scene)
         if variant.is_vectorised:
             self._share_kernels()
+        shared = (self._scene, gel, self._parameters, render.max_depth, variant.is_mono, mi)
+        self._light = SeparatedLight(sensor, *shared) if is_separated else None
         # A path through Mitsuba's window is one interaction longer than one that starts inside.
         depth = render.max_depth + (1 if not variant.is_vectorised and refracts else 0)
         self._integrator = mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": True})
@@ -127,12 +137,12 @@ class Renderer:
         Returns:
             (H, W, 3) float32; three equal channels in mono variants.
         """
-        self._deform(positions)
+        self._deform(positions, seed)
         return self._frame("", seed)
 
     def radiances(self, positions: Points, seed: int) -> dict[str, Image]:
         """`radiance` in every camera, by name ("" is the main camera); independent noise in each."""
-        self._deform(positions)
+        self._deform(positions, seed)
         return {name: self._frame(name, seed) for name in self._views}
 
     def _frame(self, name: str, seed: int) -> Image:
@@ -144,12 +154,19 @@ class Renderer:
         image = mi.render(self._scene, sensor=self._sensors[name], integrator=self._integrator, seed=folded)
         return np.array(image, dtype=np.float32)
 
-    def _deform(self, positions: Points) -> None:
-        """Move the vertices; normals go in a second update, since one of positions makes Mitsuba recompute normals."""
+    def _deform(self, positions: Points, seed: int) -> None:
+        """Move the vertices, and find what light is the same for all cameras.
+
+        Normals go in a second update, since one of positions makes Mitsuba recompute normals.
+        """
         self._parameters["gel.vertex_positions"] = self._mesh.positions(positions)
         self._parameters.update()
         self._parameters["gel.vertex_normals"] = self._mesh.normals(positions)
         self._parameters.update()
+        if self._light is not None:
+            camera = self._views[""].camera
+            primary = camera.width * camera.height * self._samples
+            self._light.prepare(self._mesh, primary, _fold(seed, _LIGHT_PART, 0))
 
     def _share_kernels(self) -> None:
         """Keep the lights' places out of the compiled code, so that another draw of the sensor needs no compiler."""
@@ -186,7 +203,10 @@ class Renderer:
         offset = sampler.next_2d()
         pupil = sampler.next_2d() if rays.has_aperture else None
         ray, weight, valid = rays.sample(pixel, offset, pupil)
-        color, seen, _ = self._integrator.sample(self._scene, sampler, ray, active=valid)
+        if self._light is not None:
+            color, seen = self._light.radiance(ray, sampler, valid)
+        else:
+            color, seen, _ = self._integrator.sample(self._scene, sampler, ray, active=valid)
         channels = [dr.select(valid & seen, color[i] * weight, 0) for i in range(1 if self._variant.is_mono else 3)]
         dr.eval(channels)  # all at once: each sum alone would trace everything anew
         return np.stack([np.array(dr.block_sum(channel, self._samples)) for channel in channels], axis=-1)

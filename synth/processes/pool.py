@@ -1,10 +1,10 @@
-"""Tasks spread over worker processes of this machine.
+"""Items of work spread over worker processes.
 
 Workers live and die with the driver: each holds the reading end of a pipe that the driver alone can write to, and
 leaves when it closes, which the system does when the driver is killed. Ctrl-C reaches all processes of a terminal at
 once; the workers are started with it blocked, and the driver, which gets it, closes the pipe.
 
-A worker that dies (killed, out of memory) takes the pool with it. What was under way goes to a new pool: a task may be
+A worker that dies (killed, out of memory) takes the pool with it. What was under way goes to a new pool: an item may be
 done twice, with the same result.
 """
 
@@ -14,38 +14,62 @@ import signal
 import sys
 import threading
 from collections import deque
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
+from itertools import islice
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
+from typing import Any, TypeAlias, TypeVar
 
 from synth.errors import InputError
 from synth.produce import Outcome, Producer, Task, Workplace
+
+Item = TypeVar("Item")
+Maker: TypeAlias = Callable[[Item], Outcome]
+"""What a worker does with an item."""
 
 MAX_DEATHS = 3
 """Pools that may break one after the other without a finished task between them."""
 
 
 def outcomes_of_processes(place: Workplace, tasks: Iterator[Task], workers: int) -> Generator[Outcome, None, None]:
-    """Outcomes in the order in which they are ready; at most two tasks per worker are waiting at any time.
+    """Outcomes of whole trajectories, each made by one worker; see `spread`."""
+    place = replace(place, threads=max(1, (os.cpu_count() or 1) // workers))
+    yield from spread(place, _trajectory_maker, tasks, workers, _trajectory)
+
+
+def spread(
+    place: Workplace,
+    make: Callable[[Workplace], Maker[Item]],
+    items: Iterator[Item],
+    workers: int,
+    number: Callable[[Item], int],
+) -> Generator[Outcome, None, None]:
+    """Outcomes in the order in which they are ready; at most two items per worker are waiting at any time.
+
+    Args:
+        place: of the job.
+        make: gives, in each worker process, what makes an outcome of an item; like the items it is picklable.
+        items: to do.
+        workers: processes.
+        number: trajectory of an item, for messages.
 
     Raises:
         InputError: the storage refuses, or worker processes die again and again.
     """
-    place = replace(place, threads=max(1, (os.cpu_count() or 1) // workers))
-    again: deque[Task] = deque()
+    again: deque[Item] = deque()
     deaths = 0
     while True:
         try:
-            for outcome in _outcomes_of_pool(place, tasks, again, workers):
+            for outcome in _outcomes_of_pool(place, make, items, again, workers):
                 deaths = 0
                 yield outcome
             return
         except BrokenProcessPool as error:
             deaths += 1
-            numbers = ", ".join(str(trajectory) for trajectory, _ in sorted(again)[:8])
+            numbers = ", ".join(map(str, sorted(map(number, again))[:8]))
             if deaths == MAX_DEATHS:
                 raise InputError(
                     f"worker processes died {deaths} times in a row (out of memory, or killed), at trajectories "
@@ -56,24 +80,32 @@ def outcomes_of_processes(place: Workplace, tasks: Iterator[Task], workers: int)
 
 
 def _outcomes_of_pool(
-    place: Workplace, tasks: Iterator[Task], again: deque[Task], workers: int
+    place: Workplace,
+    make: Callable[[Workplace], Maker[Item]],
+    items: Iterator[Item],
+    again: deque[Item],
+    workers: int,
 ) -> Generator[Outcome, None, None]:
-    """Outcomes of `again`, then of `tasks`; when the pool breaks, `again` holds what it had not finished."""
+    """Outcomes of `again`, then of `items`; when the pool breaks, `again` holds what it had not finished."""
     context = get_context("spawn")  # Dr.Jit and Warp do not survive a fork
     leash, held = context.Pipe(duplex=False)
-    under_way: dict[Future[Outcome], Task] = {}
-    with leash, held, ProcessPoolExecutor(workers, context, _begin, (place, leash)) as pool:
+    under_way: dict[Future[Outcome], Item] = {}
+    with leash, held, ProcessPoolExecutor(workers, context, _begin, (place, make, leash)) as pool:
         try:
             while True:
-                while len(under_way) < 2 * workers and (task := again[0] if again else next(tasks, None)) is not None:
-                    if not again:
-                        again.append(task)  # not lost should the pool be broken already
+                room = len(under_way) < 2 * workers
+                if room and not again:
+                    again.extend(islice(items, 1))
+                begins = room and bool(again)
+                if begins:
+                    item = again[0]  # not lost should the pool be broken already
                     with interrupts_blocked():
-                        under_way[pool.submit(_work, *task)] = task
+                        under_way[pool.submit(_work, item)] = item
                     again.popleft()
                 if not under_way:
                     return
-                done, _ = wait(under_way, return_when=FIRST_COMPLETED)
+                # Items may take long to come: what is ready meanwhile does not wait for the last of them.
+                done, _ = wait(under_way, 0 if begins else None, FIRST_COMPLETED)
                 for future in sorted(done, key=lambda future: future.exception() is not None):
                     outcome = future.result()
                     del under_way[future]
@@ -103,17 +135,26 @@ def leave_with_driver(leash: Connection) -> None:
     os._exit(1)
 
 
-_producer: Producer | None = None
-"""A worker process's producer, set when the process starts."""
+_maker: Maker[Any] | None = None
+"""What a worker process does, set when the process starts."""
 
 
-def _begin(place: Workplace, leash: Connection) -> None:
-    global _producer
+def _begin(place: Workplace, make: Callable[[Workplace], Maker[Any]], leash: Connection) -> None:
+    global _maker
     threading.Thread(target=leave_with_driver, args=(leash,), daemon=True).start()
-    _producer = Producer(place)
+    _maker = make(place)
 
 
-def _work(trajectory: int, wanted: tuple[int, ...]) -> Outcome:
-    if _producer is None:
+def _work(item: Any) -> Outcome:
+    if _maker is None:
         raise RuntimeError("the worker process was not set up by _begin")
-    return _producer.produce(trajectory, wanted)
+    return _maker(item)
+
+
+def _trajectory_maker(place: Workplace) -> Maker[Task]:
+    producer = Producer(place)
+    return lambda task: producer.produce(*task)
+
+
+def _trajectory(task: Task) -> int:
+    return task[0]

@@ -1,0 +1,11 @@
+"""Work spread over worker processes of this machine.
+
+pool         workers that each make whole trajectories, or finish rendered ones
+batches      one process with solver and renderer, workers for everything else
+ahead        an iterator that runs in a thread of its own
+"""
+
+from synth.processes.batches import outcomes_of_batches
+from synth.processes.pool import interrupts_blocked, leave_with_driver, outcomes_of_processes
+
+__all__ = ["interrupts_blocked", "leave_with_driver", "outcomes_of_batches", "outcomes_of_processes"]

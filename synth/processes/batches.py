@@ -1,0 +1,91 @@
+"""Batched simulation beside rendering beside writing.
+
+    solver's thread -> a few simulated trajectories -> this thread: rendering -> worker processes: flow, noise, files
+
+Simulation and rendering share this process's GPU, each on a stream of its own, and nothing else uses it. Textures are
+painted in further threads as soon as their sensor's turn is near. Every line between two stages has room for a few
+trajectories: whoever is ahead waits, so that memory does not grow with the number of samples. A killed run loses what
+is in the lines; failed draws and samples come out the same the next time.
+"""
+
+from collections.abc import Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
+from functools import partial
+
+from synth.arrays import Image
+from synth.processes.ahead import ahead
+from synth.processes.pool import Maker, spread
+from synth.produce import Developed, Outcome, Studio, Task, Workplace, develop, finish, in_batches
+from synth.produce.batches import Result
+from synth.produce.studio import paint
+
+AHEAD = 16
+"""Simulated trajectories that wait to be rendered, at most; their sensors' textures take up to 94 MB each."""
+PAINTERS = 6
+"""Threads that paint textures."""
+
+Painted = tuple[Result, Future[Image] | None]
+"""A result, and the texture of its sensor where that is another one than the last result's."""
+
+
+def outcomes_of_batches(
+    place: Workplace, tasks: Iterator[Task], workers: int, batch: int | None
+) -> Generator[Outcome, None, None]:
+    """Outcomes in the order in which they are ready.
+
+    Args:
+        place: of the job.
+        tasks: to do; they are taken in the solver's thread.
+        workers: processes for flow, noise and files; 1: this one does everything, one thing after another.
+        batch: most trajectories simulated at a time; None for what suits the device.
+
+    Raises:
+        InputError: the storage refuses, CUDA without cuBLAS, or worker processes die again and again.
+    """
+    studio, results = Studio(place), in_batches(place, tasks, batch)
+    if workers == 1:
+        for result in results:
+            yield result if isinstance(result, Outcome) else finish(place, develop(studio, result))
+        return
+    pairs = place.template.corners[0].sampling.pairs_per_trajectory
+
+    def number(item: Developed | Outcome) -> int:
+        return item.trajectory if isinstance(item, Developed) else item.given_up[0] // pairs
+
+    with ThreadPoolExecutor(PAINTERS) as painters:
+        try:
+            with ahead(_painted(place, results, painters), AHEAD) as ready, closing(_developed(studio, ready)) as items:
+                yield from spread(place, _finisher, items, workers, number)
+        finally:
+            painters.shutdown(wait=False, cancel_futures=True)
+
+
+def _painted(place: Workplace, results: Iterable[Result], painters: ThreadPoolExecutor) -> Iterator[Painted]:
+    """Results, with their sensors' textures on the way."""
+    last: int | None = None
+    for result in results:
+        if isinstance(result, Outcome):
+            yield result, None
+            continue
+        drawn = result.drawn
+        new, last = drawn.sensor != last, drawn.sensor
+        yield result, painters.submit(paint, place, drawn.sensor, drawn.scene.sensor) if new else None
+
+
+def _developed(studio: Studio, ready: Iterable[Painted]) -> Generator[Developed | Outcome, None, None]:
+    """Rendered, in this thread: Mitsuba has one variant a process and Dr.Jit one stream a thread."""
+    for result, texture in ready:
+        yield result if isinstance(result, Outcome) else develop(studio, result, texture)
+
+
+def _finisher(place: Workplace) -> Maker[Developed | Outcome]:
+    """In a worker process. OpenCV would use all cores in each of them."""
+    import cv2
+
+    cv2.setNumThreads(1)
+    return partial(_finished, place)
+
+
+def _finished(place: Workplace, item: Developed | Outcome) -> Outcome:
+    return item if isinstance(item, Outcome) else finish(place, item)

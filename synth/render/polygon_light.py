@@ -1,0 +1,126 @@
+r"""Rectangular lights for vectorised variants: their irradiance in closed form, and points on them.
+
+A Lambertian rectangle of radiance L, seen whole, lights a surface with normal n by (Lambert, Photometria, 1760)
+
+.. math::  E = \frac{L}{2} \sum_i \theta_i \; n \cdot \frac{a_i \times a_{i+1}}{|a_i \times a_{i+1}|},
+
+where a_i are the unit vectors to its corners, the part below the surface's horizon cut off, and θ_i the angles between
+neighbours. With c = a_i · a_{i+1} = cos θ the factor θ / sin θ = (θ/2 / sin(θ/2)) / cos(θ/2) needs no arc cosine: the
+first quotient is smooth in 1 - cos(θ/2) up to θ = π and is taken from a polynomial.
+
+The rectangles are those of `synth.render.lights`, in the renderer's frame, and shine to their front only.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.polynomial import Chebyshev, Polynomial
+
+from synth.arrays import FloatArray
+from synth.render.gel_mesh import MIRROR
+from synth.render.lights import light_axes
+from synth.scene import Light
+
+_DEGREE = 9
+"""Of the polynomial: it errs by 2e-8, less than float32's rounding."""
+
+
+class PolygonLight:
+    """One light that shines. Every number is opaque to Dr.Jit, so that another draw of it needs no compiler.
+
+    Args:
+        light: with power.
+        mi: the Mitsuba module, of a vectorised variant.
+    """
+
+    def __init__(self, light: Light, mi: Any) -> None:
+        import drjit as dr
+
+        def vector(values: FloatArray) -> Any:
+            return mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in values * MIRROR))
+
+        across, along, direction = light_axes(light)
+        centre, (width, height) = np.array(light.position_mm), light.size_mm
+        first, second = across * width, along * height
+        self._mi = mi
+        self._corners = [vector(centre + s * first + t * second) for s, t in _CORNERS]
+        self._corner, self._sides = self._corners[0], (vector(first), vector(second))
+        self._front = vector(direction)
+        self._area = dr.opaque(mi.Float, width * height)
+        radiance = light.power / (np.pi * width * height) * np.array(light.color)
+        self.radiance = [dr.opaque(mi.Float, float(value)) for value in radiance]
+
+    def whole(self, point: Any, normal: Any) -> Any:
+        """Irradiance per radiance (mi.Float) of surface points with unit normals where nothing stands in between."""
+        import drjit as dr
+
+        rays = [dr.normalize(corner - point) for corner in self._corners]
+        heights = [dr.dot(ray, normal) for ray in rays]
+        lowest = dr.minimum(dr.minimum(heights[0], heights[1]), dr.minimum(heights[2], heights[3]))
+        value = dr.if_stmt((rays, heights, normal), lowest >= 0, self._risen, self._cut)
+        return dr.select(dr.dot(point - self._corner, self._front) > 0, value, 0)
+
+    def sample(self, point: Any, normal: Any, offset: Any) -> tuple[Any, Any]:
+        """A point of the light, and what the light gives as if all of it stood there.
+
+        Args:
+            point: mi.Point3f of the surface.
+            normal: mi.Vector3f, unit.
+            offset: mi.Point2f in [0, 1)².
+
+        Returns:
+            The point (mi.Point3f) and the irradiance per radiance (mi.Float): `whole` is the latter's mean.
+        """
+        import drjit as dr
+
+        place = self._corner + self._sides[0] * offset.x + self._sides[1] * offset.y
+        way = place - point
+        square = dr.squared_norm(way)
+        cosines = dr.maximum(dr.dot(way, normal), 0) * dr.maximum(-dr.dot(way, self._front), 0)
+        return self._mi.Point3f(place), cosines * self._area / dr.square(square)
+
+    def _risen(self, rays: list[Any], heights: list[Any], normal: Any) -> Any:
+        import drjit as dr
+
+        return 0.5 * dr.abs(sum(_edge(rays[i], rays[(i + 1) % 4], normal) for i in range(4)))
+
+    def _cut(self, rays: list[Any], heights: list[Any], normal: Any) -> Any:
+        """As `_risen`, cut at the horizon: one edge more, from where the outline sets to where it rises."""
+        import drjit as dr
+
+        mi = self._mi
+        total, setting, rising = mi.Float(0), mi.Vector3f(0), mi.Vector3f(0)
+        for i in range(4):
+            (a, b), (high, low) = ((values[i], values[(i + 1) % 4]) for values in (rays, heights))
+            sets, rises = (high > 0) & (low <= 0), (high <= 0) & (low > 0)
+            at = dr.normalize(a + (b - a) * (high / (high - low)))
+            part = _edge(dr.select(rises, at, a), dr.select(sets, at, b), normal)
+            total += dr.select((high > 0) | (low > 0), part, 0)
+            setting, rising = dr.select(sets, at, setting), dr.select(rises, at, rising)
+        total += dr.select(dr.squared_norm(setting) > 0, _edge(setting, rising, normal), 0)
+        return 0.5 * dr.abs(total)
+
+
+_CORNERS = ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))
+
+
+def _edge(a: Any, b: Any, normal: Any) -> Any:
+    """θ n · (a × b) / |a × b| of unit vectors."""
+    import drjit as dr
+
+    half = dr.sqrt(dr.maximum(0.5 + 0.5 * dr.dot(a, b), 1e-12))  # cos(θ/2)
+    quotient = type(half)(0)
+    for coefficient in reversed(_SERIES):
+        quotient = dr.fma(quotient, 1 - half, coefficient)
+    return quotient / half * dr.dot(dr.cross(a, b), normal)
+
+
+def _series() -> list[float]:
+    """Coefficients of (θ/2) / sin(θ/2) in powers of 1 - cos(θ/2), for 0 <= θ <= π."""
+    nodes = 0.5 - 0.5 * np.cos(np.pi * (np.arange(400) + 0.5) / 400)
+    values = np.arccos(1 - nodes) / np.sqrt(nodes * (2 - nodes))
+    fitted = Chebyshev.fit(nodes, values, _DEGREE, domain=[0, 1]).convert(kind=Polynomial)
+    return [float(value) for value in fitted.coef]
+
+
+_SERIES = _series()

@@ -1,0 +1,262 @@
+r"""Light of a matt gel, each part sampled at its own rate: an alternative to path tracing, for vectorised variants.
+
+A Lambertian surface's radiance is its albedo ρ times its irradiance E over π, and
+
+.. math::  E = \sum_l (E_l - B_l) + E_{bounced} .
+
+- ρ is looked up, and the direct light E_l of light l is computed in closed form (`synth.render.polygon_light`), at
+  every sample of every pixel: neither has any noise but the pixel filter's.
+- B_l, what of it the gel or another light blocks, is sampled: one shadow ray for each light and sample. It is a
+  control variate: nothing blocked, no noise, and the expectation is path tracing's.
+- From faces of which all pilot rays reached a light, and from their neighbours, no shadow ray is traced to it.
+- E_bounced, light that the gel reflects onto itself, does not depend on the view. It is sampled at points of the gel's
+  faces and projected (L²) onto functions that are linear on each face, or constant where few of the face's pilots saw
+  gel: such faces get little, and its mean is less noisy than its slope. Where no pilot at all saw gel there is none.
+
+What remains of systematic error: shadows that all pilot rays of a neighbourhood missed, and how bounced light departs
+from linear within one triangle; docs/reports/light.md measures both. Random numbers are the sampler's, sums are of
+fixed order: the same seed gives the same bits.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synth.arrays import BoolArray, Image
+from synth.errors import InputError
+from synth.render.gel_mesh import GelMesh
+from synth.render.polygon_light import PolygonLight
+from synth.render.variant import LLVM_HINT, Variant
+from synth.scene import Sensor
+
+PILOTS = 16
+"""Rays from each face to each light, and to the gel."""
+_MANY = 4
+"""Of a face's pilots that saw gel, from which on its bounced light is linear."""
+_STEP = 4
+"""Bounced rays of a face are squares of its multiples: a sampler's size is compiled into the kernel."""
+_SHIFT = (0.7548776662466927, 0.5698402909980532)
+"""Of one light's shadow rays against the one before's: R2 sequence (Roberts 2018), on a torus to keep the strata."""
+
+
+def check_light(sensor: Sensor, variant: Variant) -> None:
+    """Find out whether separated light can render a sensor.
+
+    Raises:
+        InputError: the coating shines, or the variant is scalar.
+    """
+    coating = sensor.coating
+    if not coating.is_matt:
+        raise InputError(
+            f'render.light = "separated" needs a matt coating (roughness = 1, metallic = 0), but this sensor\'s has '
+            f"roughness = {coating.roughness:g} and metallic = {coating.metallic:g}: what shines depends on the view; "
+            'set render.light to "path_traced"'
+        )
+    if not variant.is_vectorised:
+        raise InputError(
+            'render.light = "separated" needs LLVM 16 or newer, or an NVIDIA GPU, which this machine lacks '
+            f'({LLVM_HINT}); without, set it to "path_traced"'
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Points:
+    """Points on faces, each face's one after another: surface interactions, unit normals into the gel, barycentrics."""
+
+    at: Any
+    normal: Any
+    weights: tuple[Any, Any, Any]
+
+
+class SeparatedLight:
+    """Light on one renderer's gel.
+
+    Args:
+        sensor: its lights are used.
+        scene: Mitsuba's.
+        gel: the shape in it.
+        parameters: the scene's, of which the gel's vertices are read.
+        max_depth: longest path in surfaces and lights.
+        is_mono: one channel is wanted.
+        mi: the Mitsuba module.
+    """
+
+    def __init__(
+        self, sensor: Sensor, scene: Any, gel: Any, parameters: Any, max_depth: int, is_mono: bool, mi: Any
+    ) -> None:
+        self._mi, self._scene, self._gel, self._parameters = mi, scene, gel, parameters
+        self._reflection = gel.bsdf()
+        self._depth, self._channels = max_depth, 1 if is_mono else 3
+        self._lights = [PolygonLight(light, mi) for light in sensor.lights if light.power > 0]
+
+    def prepare(self, mesh: GelMesh, primary: int, seed: int) -> None:
+        """Pilots and bounced light for the gel as it lies now, for all cameras.
+
+        Args:
+            mesh: the gel's, whose vertices the scene has.
+            primary: samples that a camera takes of it in all.
+            seed: non-negative, below 2^32.
+        """
+        mi = self._mi
+        triangles = mesh.surface.triangles
+        self._corners = [mi.UInt32(column) for column in np.ascontiguousarray(mesh.faces().reshape(-1, 3).T)]
+        met = self._pilots(len(triangles), seed)
+        touched: BoolArray = np.zeros((len(mesh.surface.material), len(self._lights)), dtype=bool)
+        for corner in triangles.T:
+            np.logical_or.at(touched, corner, met[:, :-1] > 0)
+        near: BoolArray = np.any(touched[triangles], axis=1)
+        self._shaded = [mi.Bool(np.ascontiguousarray(near[:, number])) for number in range(len(self._lights))]
+        self._any_bounce = self._depth > 2 and bool(met[:, -1].any())
+        if self._any_bounce:
+            self._gather(met[:, -1] >= _MANY, primary, seed)
+
+    def radiance(self, ray: Any, sampler: Any, active: Any) -> tuple[list[Any], Any]:
+        """Radiance (channels of mi.Float) along rays from the camera, and whether they meet the gel (mi.Bool)."""
+        import drjit as dr
+
+        mi = self._mi
+        hit = self._scene.ray_intersect_preliminary(ray, active=active)
+        at = hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
+        seen = active & at.is_valid() & (hit.shape == mi.ShapePtr(self._gel))
+        normal = dr.mulsign(mi.Vector3f(at.sh_frame.n), at.wi.z)  # the coating reflects on either side
+        light = self._direct(at, normal, hit.prim_index, sampler.next_2d(), seen)
+        if self._any_bounce:
+            weights = (1 - hit.prim_uv.x - hit.prim_uv.y, hit.prim_uv.x, hit.prim_uv.y)
+            for channel, values in enumerate(self._bounced):
+                for value, weight in zip(values, weights, strict=True):
+                    light[channel] += dr.gather(mi.Float, value, hit.prim_index, seen) * weight
+        albedo = self._albedo(at, seen)
+        return [dr.select(seen, a * e / dr.pi, 0) for a, e in zip(albedo, light, strict=True)], seen
+
+    def _direct(self, at: Any, normal: Any, face: Any, offset: Any, active: Any) -> list[Any]:
+        """Irradiance (channels) of points on faces, by all lights, less what is blocked."""
+        import drjit as dr
+
+        mi = self._mi
+        total = [mi.Float(0) for _ in range(self._channels)]
+        for number, (light, shaded) in enumerate(zip(self._lights, self._shaded, strict=True)):
+            blocked = self._blocked(
+                light, number, at, normal, offset, active & dr.gather(mi.Bool, shaded, face, active)
+            )
+            value = light.whole(at.p, normal) - blocked
+            total = [dr.fma(value, color, sum_) for color, sum_ in zip(light.radiance, total, strict=False)]
+        return total
+
+    def _blocked(self, light: PolygonLight, number: int, at: Any, normal: Any, offset: Any, active: Any) -> Any:
+        """Irradiance per radiance that a point of the light would give if its ray were not blocked, else 0."""
+        import drjit as dr
+
+        moved = [offset.x + number * _SHIFT[0] % 1, offset.y + number * _SHIFT[1] % 1]
+        place, value = light.sample(at.p, normal, self._mi.Point2f(*(x - dr.floor(x) for x in moved)))
+        active = active & (value > 0)
+        return dr.select(self._scene.ray_test(at.spawn_ray_to(place), active), value, 0)
+
+    def _albedo(self, at: Any, active: Any) -> list[Any]:
+        color = self._reflection.eval_diffuse_reflectance(at, active)
+        return [color[channel] for channel in range(self._channels)]
+
+    def _pilots(self, faces: int, seed: int) -> NDArray[np.uint32]:
+        """(faces, lights + 1) counts of a face's pilots that were blocked on their way to a light, or met the gel."""
+        import drjit as dr
+
+        mi = self._mi
+        sampler = self._sampler(PILOTS, faces, seed, 0)
+        points = self._points(dr.arange(mi.UInt32, faces), PILOTS, sampler)
+        offset, everywhere = sampler.next_2d(), mi.Bool(True)
+        met = [
+            self._blocked(light, number, points.at, points.normal, offset, everywhere) > 0
+            for number, light in enumerate(self._lights)
+        ]
+        met.append(self._onward(points.at, points.normal, sampler.next_2d(), everywhere)[2])
+        counts = [dr.select(one, mi.UInt32(1), 0) for one in met]
+        dr.eval(counts)
+        return np.stack([np.array(dr.block_sum(count, PILOTS)) for count in counts], axis=-1)
+
+    def _gather(self, often: BoolArray, rays: int, seed: int) -> None:
+        """Bounced light on all faces from about so many rays; linear on faces where `often` (faces,)."""
+        import drjit as dr
+
+        mi, faces = self._mi, len(often)
+        count = (_STEP * max(1, round(math.sqrt(rays / faces) / _STEP))) ** 2
+        sampler = self._sampler(count, faces, seed, 1)
+        points = self._points(dr.arange(mi.UInt32, faces), count, sampler)
+        values = _projected(self._bounces(points, sampler), points.weights, count, often)
+        self._bounced = [[mi.Float(np.ascontiguousarray(one)) for one in rows.T] for rows in values.swapaxes(0, 1)]
+
+    def _bounces(self, points: _Points, sampler: Any) -> list[Any]:
+        """Irradiance (channels) from the gel itself, one path from each point."""
+        import drjit as dr
+
+        mi = self._mi
+        at, normal, count = points.at, points.normal, dr.width(points.at.p)
+        total = [dr.zeros(mi.Float, count) for _ in range(self._channels)]
+        share = [dr.full(mi.Float, 1, count) for _ in range(self._channels)]
+        start = dr.arange(mi.UInt32, count)
+        for _ in range(self._depth - 2):
+            ray, hit, active = self._onward(at, normal, dr.gather(mi.Point2f, sampler.next_2d(), start), True)
+            offset = dr.gather(mi.Point2f, sampler.next_2d(), start)
+            dr.eval(ray, hit, active, offset, start, share)  # at once: each gather alone would trace everything anew
+            kept = dr.compress(active)  # few paths meet the gel: only these go on
+            if dr.width(kept) == 0:
+                break
+            ray, hit, offset, start = (dr.gather(type(x), x, kept) for x in (ray, hit, offset, start))
+            at = hit.compute_surface_interaction(ray)
+            normal = -mi.Vector3f(at.sh_frame.n)
+            albedo = self._albedo(at, mi.Bool(True))
+            share = [dr.gather(mi.Float, s, kept) * a for s, a in zip(share, albedo, strict=True)]
+            light = self._direct(at, normal, hit.prim_index, offset, mi.Bool(True))
+            for sum_, s, e in zip(total, share, light, strict=True):
+                dr.scatter_add(sum_, s * e, start)
+        return total
+
+    def _onward(self, at: Any, normal: Any, offset: Any, active: Any) -> tuple[Any, Any, Any]:
+        """Rays in the cosine's distribution, their next hits, and whether these are on the gel's lit side."""
+        mi = self._mi
+        ray = at.spawn_ray(mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(offset)))
+        hit = self._scene.ray_intersect_preliminary(ray, active=active)
+        nearest = hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
+        return ray, hit, nearest.is_valid() & (hit.shape == mi.ShapePtr(self._gel)) & (nearest.wi.z < 0)
+
+    def _sampler(self, count: int, faces: int, seed: int, part: int) -> Any:
+        sampler = self._mi.load_dict({"type": "multijitter", "sample_count": count})
+        sampler.set_samples_per_wavefront(count)
+        sampler.seed((seed + part) % 2**32, faces * count)
+        return sampler
+
+    def _points(self, faces: Any, count: int, sampler: Any) -> _Points:
+        """Evenly distributed points, `count` on each of the faces (mi.UInt32)."""
+        import drjit as dr
+
+        mi = self._mi
+        number = dr.arange(mi.UInt32, dr.width(faces) * count) // dr.opaque(mi.UInt32, count)
+        face = dr.gather(mi.UInt32, faces, number)
+        place = mi.warp.square_to_uniform_triangle(sampler.next_2d())
+        weights = (1 - place.x - place.y, place.x, place.y)
+        corners = [dr.gather(mi.UInt32, column, face) for column in self._corners]
+        positions = dr.unravel(mi.Point3f, self._parameters["gel.vertex_positions"])
+        normals = dr.unravel(mi.Vector3f, self._parameters["gel.vertex_normals"])
+        a, b, c = (dr.gather(mi.Point3f, positions, corner) for corner in corners)
+        at = dr.zeros(mi.SurfaceInteraction3f, dr.width(number))
+        at.p = a * weights[0] + b * weights[1] + c * weights[2]
+        at.n = mi.Normal3f(dr.normalize(dr.cross(b - a, c - a)))
+        normal = sum(dr.gather(mi.Vector3f, normals, i) * w for i, w in zip(corners, weights, strict=True))
+        return _Points(at, -dr.normalize(normal), weights)  # vertex normals point out of the gel
+
+
+def _projected(values: list[Any], weights: tuple[Any, Any, Any], count: int, is_linear: BoolArray) -> Image:
+    """Corner values (faces, channels, 3) of the functions nearest to samples of evenly distributed points.
+
+    The corners' functions φ have the mass matrix A/12 (1 + I), whose inverse makes of the means m_i of φ_i f the
+    values 12 m_i - 3 Σ m. The nearest constant is Σ m, since Σ φ = 1.
+    """
+    import drjit as dr
+
+    parts = [value * weight for value in values for weight in weights]
+    dr.eval(parts)
+    means = np.stack([np.array(dr.block_sum(part, count)) for part in parts], axis=-1) / count
+    means = means.reshape(-1, len(values), 3)
+    whole = means.sum(axis=2, keepdims=True)
+    return np.where(is_linear[:, None, None], 12 * means - 3 * whole, whole).astype(np.float32)

@@ -1,0 +1,128 @@
+"""The mesh that all draws of a pad share where they are simulated many at once, and what it is expected to cost.
+
+One mesh serves every draw of a batch, wherever its indenter touches: it is even along x and y, `numerics.cells` says
+how fine, and graded through the thickness so that elements at the contact face are about as high as wide. Or it is
+fTetWild's, with `numerics.edge_length_mm`. Each draw has a predicted error of its own, by the model of
+`synth.simulate.resolution`, which was fitted to meshes graded around the contact: here it extrapolates.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path as FilePath
+
+import numpy as np
+
+from synth.mesh import Counts, Focus, PadMesh, domed, graded_box, pad_mesh
+from synth.scene import Gel, Numerics, Scene
+from synth.simulate.footprint import footprint
+from synth.simulate.indenter import rigid_body
+from synth.simulate.path import Path
+from synth.simulate.resolution import (
+    MARGIN,
+    Resolution,
+    depth_growth,
+    predicted_error_mm,
+    resolve,
+    scale_px_per_mm,
+)
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """How well a mesh resolves one draw.
+
+    Attributes:
+        across: whole elements across the contact, along its shorter side; 0 where less than one, and for an fTetWild
+            mesh, whose elements are not counted.
+        error_px: predicted root-mean-square error of the flow over the contact face; NaN for an fTetWild mesh.
+    """
+
+    across: int
+    error_px: float
+
+    @staticmethod
+    def of(resolution: Resolution) -> "Accuracy":
+        """Of a mesh that was made for its draw."""
+        return Accuracy(resolution.across, resolution.error_px)
+
+
+def shared_mesh(gel: Gel, numerics: Numerics, mesh_folders: Sequence[FilePath] | None = None) -> PadMesh:
+    """The mesh of all draws of a pad.
+
+    Args:
+        gel: the pad; its Young's modulus does not enter.
+        numerics: `edge_length_mm` or `cells` are used.
+        mesh_folders: where fTetWild's meshes are kept.
+
+    Raises:
+        InputError: the mesh cannot be made.
+    """
+    if numerics.edge_length_mm is not None:
+        return pad_mesh(gel, numerics, mesh_folders)
+    layers = tuple(layer.thickness_mm for layer in gel.layers)
+    return _even_mesh(gel.size_mm, gel.dome_radius_mm, layers, numerics.cells)
+
+
+@lru_cache(maxsize=4)
+def _even_mesh(
+    size_mm: tuple[float, float, float],
+    dome_radius_mm: float | None,
+    layers_mm: tuple[float, ...],
+    cells: tuple[int, int, int],
+) -> PadMesh:
+    """The structured mesh; kept, since a job asks for the same one again and again."""
+    whole = Focus((0.0, 0.0), (size_mm[0] / 2, size_mm[1] / 2))
+    counts = Counts((cells[0] - 2, cells[1] - 2), (1, 1), cells[2], growth=_growth(size_mm, cells))
+    return domed(graded_box(size_mm, whole, counts, layers_mm), dome_radius_mm)
+
+
+def _width(size_mm: tuple[float, float, float], cells: tuple[int, int, int]) -> float:
+    """Of the elements, mm: geometric mean of both directions."""
+    return float(np.sqrt(size_mm[0] / cells[0] * size_mm[1] / cells[1]))
+
+
+def _growth(size_mm: tuple[float, float, float], cells: tuple[int, int, int]) -> float:
+    return depth_growth(cells[2], size_mm[2] / _width(size_mm, cells))
+
+
+def spacing_mm(gel: Gel, numerics: Numerics) -> float:
+    """Size of the elements at the contact face as the error model takes it: see `synth.simulate.resolution`."""
+    size, cells = gel.size_mm, numerics.cells
+    wide, growth = _width(size, cells), _growth(size, cells)
+    high = size[2] / sum(growth**k for k in range(cells[2]))
+    return float(np.sqrt(wide * max(wide, high)))
+
+
+def accuracy(scene: Scene, folder: FilePath | None = None) -> Accuracy:
+    """What the shared mesh gives for one draw.
+
+    Args:
+        scene: fully drawn.
+        folder: what a mesh indenter's file name is relative to.
+
+    Raises:
+        InputError: the indenter cannot be built.
+    """
+    gel, numerics, camera = scene.sensor.gel, scene.numerics, scene.sensor.camera
+    if numerics.edge_length_mm is not None:
+        return Accuracy(0, float("nan"))
+    path = Path(scene.motion, rigid_body(scene.contact.indenter, folder), gel.dome_radius_mm)
+    focus = footprint(path, gel.size_mm, MARGIN)
+    scale = scale_px_per_mm(scene)
+    seen = min(camera.width * camera.height / scale**2, gel.size_mm[0] * gel.size_mm[1])
+    error = scale * predicted_error_mm(scene, focus, spacing_mm(gel, numerics), seen)
+    return Accuracy(int(2 * min(focus.half_mm) / _width(gel.size_mm, numerics.cells)), error)
+
+
+def resolution_of(
+    scene: Scene, folder: FilePath | None = None, mesh_folders: Sequence[FilePath] | None = None
+) -> Resolution:
+    """The mesh of a draw, made for it or shared, as `numerics.solver` says; arguments and errors as of `resolve`."""
+    gel, numerics = scene.sensor.gel, scene.numerics
+    if numerics.solver == "single" or numerics.edge_length_mm is not None:
+        return resolve(scene, folder, mesh_folders)
+    found = accuracy(scene, folder)
+    return Resolution(
+        shared_mesh(gel, numerics), found.across, numerics.cells[2], spacing_mm(gel, numerics), found.error_px
+    )

@@ -1,0 +1,325 @@
+"""Samples by the batched solver: the same whatever ran beside them, and the single solver's within its tolerance.
+
+The scene's draws fail in every way: bodies that cannot be built, bodies too thin for the mesh, and draws that break the
+schema; its sensors have two different pads. Comments "fails with" name changes that were tried.
+"""
+
+import hashlib
+import json
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pads import brick, gentle
+from processes_of import HAS_PROC, alive, descendants, lines, start, wait_for
+from tiny_scene import TEXT, fingerprint, own_cache, write_tiny
+
+from synth.dataset.shard import Shard
+from synth.errors import InputError
+from synth.generate import Scheduling, generate, job_variant, make_job
+from synth.plan import plan
+from synth.processes.ahead import ahead
+from synth.produce import Failure, Outcome, Producer, Task, Workplace, in_batches
+from synth.produce.batches import by_sensor
+from synth.produce.drawing import Draws, Solved
+from synth.render.variant import Variant
+from synth.sampling import MAX_DRAWS, draw, draw_sensor, sensor_of
+from synth.scene import Gel, Numerics, Scene
+from synth.simulate import simulate
+from synth.simulate.batched import simulate_many
+from synth.simulate.shared import accuracy, resolution_of, shared_mesh, spacing_mm
+from synth.template import Template, load_scene
+
+SPHERE = 'shape = "sphere"\nradius_mm = { uniform = [1.5, 2.5] }'
+CHOICE = """choice = [
+  { shape = "sphere", radius_mm = { uniform = [1.5, 2.5] } },
+  { shape = "box", size_mm = [{ uniform = [1.4, 2.4] }, 2.4, 2.4], fillet_mm = { uniform = [0.4, 1.1] } },
+  { shape = "sphere", radius_mm = 0.06 },
+]"""
+BATCHED = (
+    TEXT.replace("edge_length_mm = 1.25", 'solver = "batched"\ncells = [6, 4, 2]')
+    .replace("[8.0, 6.0, 2.5]", "[8.0, 6.0, { choice = [2.5, 2.2] }]")
+    .replace(SPHERE, CHOICE)
+    .replace("steps = 2", "steps = 3")
+    .replace("position_mm = [{ uniform = [-1.0, 1.0] }", "position_mm = [{ normal = [0.0, 3.0] }")
+)
+SAMPLES, SEED = 10, 10
+"""Five trajectories of three sensors and two pads; draws of every kind fail."""
+
+
+@pytest.fixture(autouse=True)
+def _cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    own_cache(monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def template(tmp_path_factory: pytest.TempPathFactory) -> Template:
+    return load_scene(write_tiny(tmp_path_factory.mktemp("scene"), BATCHED))
+
+
+@pytest.fixture(scope="module")
+def whole(template: Template, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dataset in one go, all trajectories at once."""
+    out = tmp_path_factory.mktemp("whole") / "d"
+    summary = generate(template, SAMPLES, out, SEED, scheduling=Scheduling(batch=8))
+    assert (summary.made, summary.given_up) == (SAMPLES, [])
+    return out
+
+
+@pytest.fixture(scope="module")
+def place(template: Template, tmp_path_factory: pytest.TempPathFactory) -> Workplace:
+    variant, out = job_variant(template, "cpu"), tmp_path_factory.mktemp("place")
+    return Workplace(template, make_job(template, SAMPLES, SEED, variant), out, variant, out / "cache")
+
+
+def _tasks(numbers: Iterable[int]) -> Iterator[Task]:
+    return ((number, (2 * number, 2 * number + 1)) for number in numbers)
+
+
+def test_batch_and_shards_change_no_bit(template: Template, whole: Path, tmp_path: Path) -> None:
+    # Fails with the first trajectory's frames for all, and with a chunk's failed draws forgotten.
+    out = tmp_path / "d"
+    for number, batch in ((1, 1), (0, 3)):
+        generate(template, SAMPLES, out, SEED, scheduling=Scheduling(batch=batch, shard=Shard(number, 2)))
+    assert fingerprint(out) == fingerprint(whole)
+
+
+@pytest.mark.skipif(not HAS_PROC, reason="finds child processes in Linux's /proc")
+def test_killed_with_workers_and_gone_on_with_alone(template: Template, whole: Path, tmp_path: Path) -> None:
+    """The driver with solver and renderer is killed; nobody is left behind, what is on record stays."""
+    # Fails with workers that do not watch their driver.
+    out = tmp_path / "d"
+    process = start(template.source, out, "--n", str(SAMPLES), "--seed", str(SEED), "--workers", "2")
+    wait_for("the first sample", lambda: lines(out) > 0, process)
+    family = descendants(process.pid)
+    process.kill()
+    process.wait()
+    assert len(family) >= 2
+    before = (out / "manifest.jsonl").read_text().splitlines()
+    assert 0 < len(before) < SAMPLES
+    wait_for("the workers to leave with their driver", lambda: not alive(family))
+    process.communicate()
+    generate(template, SAMPLES, out, SEED, scheduling=Scheduling(batch=2, workers=1))
+    assert set(before) <= set((out / "manifest.jsonl").read_text().splitlines())
+    assert fingerprint(out) == fingerprint(whole)
+
+
+def test_one_trajectory_alone_is_the_same(place: Workplace, whole: Path) -> None:
+    """As a task of a cluster. Its second draw can be used."""
+    # Fails with the single solver in `Producer`.
+    outcome = Producer(place).produce(4, (8, 9))
+    assert [failure.stage for failure in outcome.failures] == ["simulate"]
+    for entry in outcome.entries:
+        for name, digest in entry.sha256.items():
+            file = whole / "samples" / f"{entry.index:06d}" / name
+            assert hashlib.sha256(file.read_bytes()).hexdigest() == digest, name
+
+
+def test_failed_draws_are_replaced(whole: Path) -> None:
+    failures = [json.loads(line) for line in (whole / "failures.jsonl").read_text().splitlines()]
+    kinds = Counter((failure["stage"], failure["last_good_state"] is None) for failure in failures)
+    # Broken schema; a body that cannot be built; a body that finds no contact point, with the state before.
+    assert set(kinds) == {("draw", True), ("simulate", True), ("simulate", False)}
+    for first in {failure["index"] for failure in failures}:
+        assert [f["draw"] for f in failures if f["index"] == first] == list(
+            range(sum(f["index"] == first for f in failures))
+        )
+
+
+AGREEMENT = 2e-4
+"""Of displacements, relative. With tolerances of 1e-6 at recorded states and 1e-3 on the way, which friction remembers,
+docs/reports/batched_fem.md saw 4e-9 to 3e-5; here
+6e-5 was seen once and 3e-7 else. States that are not corrected are off by 0.07 to 0.16."""
+
+
+def test_a_batch_agrees_with_the_single_solver(place: Workplace) -> None:
+    """On the same meshes: the same draws fail for the same reasons, and what is left is the same motion."""
+    # Fails with the first trajectory's frames for all, and with one `pad_key` for all.
+    results = {_trajectory(result): result for result in in_batches(place, _tasks(range(5)), 4)}
+    assert sorted(results) == list(range(5))
+    for task in _tasks(range(5)):
+        draws = Draws(place, task, draw_sensor(place.template, SEED, sensor_of(place.template, task[0])))
+        alone = _alone(place, draws)
+        together = results[task[0]]
+        assert isinstance(together, Solved)
+        assert (together.drawn.scene, together.drawn.frames) == (alone.drawn.scene, alone.drawn.frames)
+        assert [_said(failure) for failure in together.failures] == [_said(failure) for failure in alone.failures]
+        assert together.states.keys() == alone.states.keys()
+        for number, state in alone.states.items():
+            other = together.states[number]
+            scale = np.linalg.norm(state.displacement)
+            assert np.linalg.norm(other.displacement - state.displacement) <= AGREEMENT * scale
+            np.testing.assert_allclose(other.force_n, state.force_n, rtol=0, atol=1e-3 * np.linalg.norm(state.force_n))
+
+
+def _said(failure: Failure) -> tuple[object, ...]:
+    return failure.index, failure.draw, failure.stage, failure.reason
+
+
+def _trajectory(result: Solved | Outcome) -> int:
+    assert isinstance(result, Solved)
+    return result.drawn.trajectory
+
+
+def _alone(place: Workplace, draws: Draws) -> Solved:
+    """By the single solver, as `Producer` does it."""
+    while (drawn := draws.next()) is not None:
+        try:
+            result = simulate(drawn.scene, drawn.mesh, frames=drawn.frames)
+        except InputError as error:
+            draws.fail("simulate", str(error))
+            continue
+        if draws.accepts(result):
+            return Solved.of(draws, drawn, result)
+    raise AssertionError("no draw could be used")
+
+
+def test_a_trajectory_whose_every_draw_fails_is_given_up(place: Workplace) -> None:
+    needle = 'contact.indenter={shape = "sphere", radius_mm = 0.06}'
+    template = load_scene(place.template.source, [needle, "motion.position_mm=[0.3, 0.2]"])
+    (result,) = in_batches(replace(place, template=template), _tasks([0]), 2)
+    assert isinstance(result, Outcome)
+    assert (result.given_up, len(result.failures)) == ((0, 1), MAX_DRAWS)
+
+
+def test_frames_of_each_job_are_its_own() -> None:
+    """Those that are wanted are the same to the bit as when all are; others keep their penetration."""
+    # Fails with the first job's frames for all.
+    scenes = [gentle(motion={"depth_mm": 0.4, "steps": 3}), gentle(motion={"depth_mm": 0.5, "steps": 3})]
+    mesh, wanted = brick(counts=(4, 4, 2)), [frozenset({1}), frozenset({3})]
+    every = dict(simulate_many(scenes, mesh, device="cpu"))
+    some = dict(simulate_many(scenes, mesh, device="cpu", frames=wanted))
+    for number, frames in enumerate(wanted):
+        for k in (1, 2, 3):
+            one, other = every[number].states[k], some[number].states[k]
+            assert (one.displacement == other.displacement).all() == (k in frames)
+    with pytest.raises(ValueError, match="1 sets of frames for 2 jobs"):
+        list(simulate_many(scenes, mesh, device="cpu", frames=wanted[:1]))
+
+
+@pytest.mark.parametrize(
+    ("ends", "out"), [([0, 2, 1, 3, 5, 4], [0, 1, 2, 3, 5, 4]), ([4, 5, 2, 0, 1, 3], [4, 5, 0, 1, 2, 3])]
+)
+def test_the_trajectories_of_a_sensor_come_together(template: Template, ends: list[int], out: list[int]) -> None:
+    """Two a sensor; handed on when the second has ended."""
+    # Fails with results handed on as they end.
+    assert _order(template, ends) == out
+
+
+def test_a_sensor_of_many_trajectories_does_not_wait_for_all(template: Template) -> None:
+    # Fails without ENOUGH: then 20 wait for the last one.
+    one = load_scene(template.source, ["sampling.trajectories_per_sensor=1000"])
+    assert _order(one, range(20)) == list(range(20))
+
+
+def _order(template: Template, ends: Iterable[int]) -> list[int]:
+    """Trajectories in the order in which they are handed on; of a sensor of many, more are to come."""
+    sensors = Counter(sensor_of(template, trajectory) for trajectory in ends)
+    if template.corners[0].sampling.trajectories_per_sensor > 2:
+        sensors[0] += 1
+    named = ((trajectory, Outcome((), (), (trajectory,))) for trajectory in ends)
+    return [result.given_up[0] for result in by_sensor(template, named, sensors) if isinstance(result, Outcome)]
+
+
+def test_items_made_ahead_come_in_order_and_errors_with_them() -> None:
+    def failing() -> Iterator[int]:
+        yield from range(5)
+        raise InputError("no more")
+
+    with ahead(failing(), 2) as items:
+        assert [next(items) for _ in range(5)] == list(range(5))
+        with pytest.raises(InputError, match="no more"):
+            next(items)
+
+
+def test_no_more_are_made_than_there_is_room_for() -> None:
+    # Fails with an unlimited line, and with a thread that does not look whether it is still wanted.
+    made: list[int] = []
+
+    def counting() -> Iterator[int]:
+        for number in range(100):
+            made.append(number)
+            yield number
+
+    before = threading.active_count()
+    with ahead(counting(), 3) as items:
+        assert next(items) == 0
+        time.sleep(0.3)
+        assert len(made) <= 5  # one taken, three in line, one in hand
+    assert threading.active_count() == before
+    assert len(made) <= 6
+
+
+GEL = Gel(size_mm=(20.0, 15.0, 4.0), youngs_modulus_kpa=200.0)
+
+
+def test_the_shared_mesh_is_even_and_as_high_as_wide() -> None:
+    """Planes through the thickness: the first element is as high as the others are wide, as far as growth allows."""
+    # Fails with the growth of `Counts`.
+    numerics = Numerics(solver="batched", cells=(16, 12, 2))
+    mesh = shared_mesh(GEL, numerics)
+    assert mesh is shared_mesh(GEL.model_copy(update={"youngs_modulus_kpa": 100.0}), numerics)
+    assert len(mesh.tets) == 6 * 16 * 12 * 2
+    x, y, z = (np.unique(mesh.points[:, axis]) for axis in range(3))
+    np.testing.assert_allclose(np.diff(x), 1.25, atol=1e-9)  # coordinates are multiples of 2e-10 mm
+    np.testing.assert_allclose(np.diff(y), 1.25, atol=1e-9)
+    assert z[1] == pytest.approx(max(1.25, 4.0 / 3.2), abs=1e-6)  # 1 + growth of at most 2.2
+    assert spacing_mm(GEL, numerics) == pytest.approx(1.25, abs=1e-6)
+
+
+def test_the_predicted_error_falls_with_the_spacing(template: Template) -> None:
+    """By the model's exponent of 1.6, at equal proportions of the elements; and `resolution_of` says the same."""
+    # Fails with a spacing that is not the mesh's.
+    drawn = draw(template, SEED, 0)
+    fine = drawn.model_copy(update={"numerics": drawn.numerics.model_copy(update={"cells": (16, 12, 2)})})
+    coarse, better = accuracy(drawn), accuracy(fine)
+    ratio = _spacing_of(drawn) / _spacing_of(fine)
+    assert ratio > 1.5
+    # Coordinates are multiples of 2e-10 mm.
+    assert coarse.error_px / better.error_px == pytest.approx(ratio**1.6, rel=1e-8)
+    assert better.across > coarse.across >= 0
+    found = resolution_of(fine)
+    assert (found.across, found.error_px, found.through) == (better.across, better.error_px, 2)
+    assert len(found.mesh.tets) == 6 * 16 * 12 * 2
+
+
+def _spacing_of(drawn: Scene) -> float:
+    """Of the mesh itself: width, or where the elements are higher than wide the geometric mean of both."""
+    x, y, z = (np.unique(shared_mesh(drawn.sensor.gel, drawn.numerics).points[:, axis]) for axis in range(3))
+    wide = float(np.sqrt((x[1] - x[0]) * (y[1] - y[0])))
+    return float(np.sqrt(wide * max(wide, z[1] - z[0])))
+
+
+def test_the_diagnostics_tell_of_the_shared_mesh(place: Workplace, whole: Path) -> None:
+    entries = [json.loads(line) for line in (whole / "manifest.jsonl").read_text().splitlines()]
+    assert len({entry["diagnostics"]["mesh"] for entry in entries}) == 2  # of two pads
+    first = entries[0]["diagnostics"]
+    scene = Scene.model_validate_json(json.dumps(json.loads((whole / "samples/000000/meta.json").read_text())["scene"]))
+    assert first["mesh"] == shared_mesh(scene.sensor.gel, scene.numerics).hash
+    assert first["predicted_error_px"] == round(accuracy(scene).error_px, 4)
+
+
+def test_plan_says_what_is_batched(template: Template) -> None:
+    planned = plan(template, Variant("cuda_ad_rgb", ""))
+    batched = next(decision for decision in planned.decisions if decision.feature == "batched simulation")
+    assert batched.runs
+    assert "sensor.gel.size_mm[2]" in batched.reason
+    assert planned.resolution.startswith("6 x 4 x 2 elements for all draws of a pad")
+    alike = load_scene(template.source, ["sensor.gel.size_mm=[8.0, 6.0, 2.5]"])
+    assert "another" not in plan(alike, Variant("cuda_ad_rgb", "")).decisions[0].reason
+
+
+@pytest.mark.parametrize("wrong", ["[5, 4, 2]", "[6, 2, 2]", "[6, 4, 0]", "[6, 4]"])
+def test_wrong_numbers_of_elements_are_refused(template: Template, wrong: str) -> None:
+    with pytest.raises(InputError, match=r"numerics\.cells"):
+        load_scene(template.source, [f"numerics.cells={wrong}"])
+
+
+def test_a_batch_of_none_is_refused(template: Template, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="batch = 0"):
+        generate(template, 1, tmp_path / "d", scheduling=Scheduling(batch=0))
