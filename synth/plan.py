@@ -121,7 +121,7 @@ def check_buildable(template: Template, variant: Variant) -> None:
         for sensor in dict.fromkeys(corner.sensor for corner in template.corners):
             check_pattern(sensor, template.source.parent)
             if template.corners[0].render.light == "separated":
-                check_light(sensor, variant)
+                check_light(sensor.coating)
         for indenter in dict.fromkeys(corner.contact.indenter for corner in template.corners):
             rigid_body(indenter, template.source.parent)
     except InputError as error:
@@ -243,6 +243,8 @@ def _decisions(corners: tuple[Scene, ...], variant: Variant) -> list[Decision]:
     blurred = max(apertures) > 0
     mirrors, further = len(corners[0].sensor.mirrors), len(corners[0].sensor.further_cameras)
     light = corners[0].render.light
+    separated = light == "separated" and variant.is_vectorised
+    instead = f", but {variant.name} path-traces" if light == "separated" and not separated else ""
     grey = all(is_grey(c.sensor) for c in corners)
     hue = "lights, coating and pattern are grey" if grey else "a light, the coating or the pattern has colour"
     if grey and not variant.is_mono:
@@ -264,7 +266,7 @@ def _decisions(corners: tuple[Scene, ...], variant: Variant) -> list[Decision]:
         ),
         Decision("mirrors", mirrors > 0, f"{mirrors} in sensor.mirrors"),
         Decision("further cameras", further > 0, f"{further} in sensor.further_cameras"),
-        Decision("separated light", light == "separated", f"render.light = {light}"),
+        Decision("separated light", separated, f"render.light = {light}{instead}"),
         Decision("indirect light", max(bounces) > 2, _span("render.max_depth", bounces)),
         Decision("colour", not variant.is_mono, hue),
         Decision("backward flow", outputs.backward, f"outputs.backward = {str(outputs.backward).lower()}"),

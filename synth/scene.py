@@ -161,7 +161,8 @@ class Render(Part):
     """Longest light path in surfaces and lights; 2 is direct light only. The window does not count."""
     light: Literal["path_traced", "separated"] = "path_traced"
     """separated: direct light in closed form, what is blocked of it and bounced light sampled at their own rates; with
-    as many samples a quarter of the noise or less (docs/reports/light.md). For matt coatings, with LLVM or a GPU."""
+    as many samples a quarter of the noise or less (docs/reports/light.md). For matt coatings; scalar variants, where
+    there is neither LLVM nor a GPU, path-trace what has the same expectation."""
 
 
 Cells = Annotated[int, Field(ge=4, le=200, multiple_of=2)]

@@ -95,7 +95,7 @@ def _measure(
     from synth.template import load_scene
 
     began = time.perf_counter()
-    template = load_scene(scene)
+    template = load_scene(scene, ['render.light="path_traced"'])  # `bench light` compares it with the other kind
     fastest = job_variant(template, device)
     every, absent = variants(device, fastest.is_mono)
     _say(f"{template.name}: pressing")

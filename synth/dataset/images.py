@@ -15,7 +15,7 @@ Raster: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _COMPRESSION = 4
-"""zlib level: noisy 640x480 images take 15 % less than at level 1, and level 9 gains no more than 1 %."""
+"""zlib level; run-length matching makes nothing of it but that it is not zero."""
 
 
 def encode_png(image: Raster) -> bytes:
@@ -32,7 +32,10 @@ def encode_png(image: Raster) -> bytes:
     if image.dtype not in (np.uint8, np.uint16) or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
         raise ValueError(f"an image must be (H, W) or (H, W, 3), uint8 or uint16, not {image.shape} {image.dtype}")
     stored = image if image.ndim == 2 else image[:, :, ::-1]
-    done, data = cv2.imencode(".png", np.ascontiguousarray(stored), [cv2.IMWRITE_PNG_COMPRESSION, _COMPRESSION])
+    # Noise repeats itself nowhere: against zlib's search for repetitions, matching runs alone takes half the time, and
+    # files come out 1 to 15 % smaller (14 kinds of sensors).
+    options = [cv2.IMWRITE_PNG_COMPRESSION, _COMPRESSION, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
+    done, data = cv2.imencode(".png", np.ascontiguousarray(stored), options)
     if not done:
         raise ValueError(f"OpenCV could not encode an image of {image.shape} {image.dtype} as PNG")
     return bytes(data)

@@ -10,26 +10,15 @@ lies inside that image (0 <= x < width, 0 <= y < height), that pixel looks by th
 mirror, and no mirror stands before it), and nothing of the surface lies in front of it along the ray of that pixel.
 """
 
-from dataclasses import dataclass
-from functools import cached_property
-
 import numpy as np
 
-from synth.arrays import BoolArray, FloatArray, Pixels, Points, Triangles
+from synth.arrays import FloatArray, Points
 from synth.errors import InputError
 from synth.flow.field import FlowArray, FlowField
 from synth.flow.normals import vertex_normals
-from synth.flow.trace import Hits, trace
-from synth.optics import Optics, Rays
+from synth.flow.view import View
+from synth.optics import Optics
 from synth.surface import GelSurface
-
-OCCLUSION_TOLERANCE_MM = 1e-6
-"""A hit nearer than the point itself by more than this hides it.
-
-Projection and its inverse agree to about 1e-12 px, so the ray of a point's own pixel passes it at less than 1e-12 mm
-and meets its own surface within 1e-12 mm / sin(grazing angle): below the tolerance for every angle above 1e-6 rad.
-Parts of the surface less than 1e-6 mm apart touch.
-"""
 
 
 def exact_flow(
@@ -47,6 +36,7 @@ def exact_flow(
     traction: FloatArray | None = None,
     contact: FloatArray | None = None,
     device: str = "cpu",
+    view: View | None = None,
 ) -> FlowField:
     """Exact flow between two states, and what else the surface knows at each pixel.
 
@@ -69,6 +59,7 @@ def exact_flow(
         contact: (v,) 0 or 1 at the vertices; gives contact.Y, 1 where the linear interpolation is at least one half, at
             the pixels of image 1.
         device: Warp device of the tracing.
+        view: of this surface, camera and size, kept from another pair: saves what both have in common.
 
     Returns:
         The flow, float32. Beside pixels that see no gel, NaN marks the rare material point that has no image at all
@@ -76,6 +67,7 @@ def exact_flow(
 
     Raises:
         InputError: an array has the wrong length.
+        ValueError: a view of another surface, camera or size.
     """
     triangles, vertices = surface.triangles, len(surface.material)
     for name, array in (("positions1", positions1), ("positions2", positions2), ("traction", traction)):
@@ -83,7 +75,10 @@ def exact_flow(
             raise InputError(f"{name} has shape {array.shape}; this surface needs ({vertices}, 3), one row per vertex")
     if contact is not None and contact.shape != (vertices,):
         raise InputError(f"contact has shape {contact.shape}; this surface needs ({vertices},), one value per vertex")
-    view = _View(optics, triangles, width, height, device)
+    if view is None:
+        view = View(surface, optics, width, height, device)
+    elif view.surface is not surface or view.optics is not optics or (view.width, view.height) != (width, height):
+        raise ValueError("the view is of another surface, camera or size")
     hits1 = view.first_hits(positions1)
     forward, forward_visible = view.motion(hits1, positions2)
     extras: dict[str, FlowArray] = {}
@@ -106,52 +101,3 @@ def exact_flow(
     if not backward or hits2 is None:
         return FlowField(forward, forward_visible, extras=extras)
     return FlowField(forward, forward_visible, *view.motion(hits2, positions1), extras=extras)
-
-
-@dataclass(frozen=True, eq=False)
-class _View:
-    """One camera looking at states of one surface."""
-
-    optics: Optics
-    triangles: Triangles
-    width: int
-    height: int
-    device: str
-
-    @cached_property
-    def centres(self) -> Pixels:
-        row, column = np.mgrid[: self.height, : self.width]
-        return np.column_stack([column.ravel() + 0.5, row.ravel() + 0.5])
-
-    @cached_property
-    def own(self) -> Rays:
-        """The rays of the pixel centres."""
-        return self.optics.look(self.centres)
-
-    def first_hits(self, positions: Points) -> Hits:
-        """What the pixel centres see of a state."""
-        return trace(positions, self.triangles, self.own.origins, self.own.directions, device=self.device)
-
-    def motion(self, hits: Hits, target: Points) -> tuple[FlowArray, FlowArray]:
-        """Flow (H, W, 2) and visibility (H, W) of the hits' material points when the surface moves to `target`."""
-        points = hits.interpolate(self.triangles, target)
-        pixels = self.optics.project(points, self.own.path)
-        with np.errstate(invalid="ignore"):
-            inside: BoolArray = np.all((pixels >= 0) & (pixels < (self.width, self.height)), axis=1)
-        visible = inside.copy()
-        rays = self.optics.look(pixels[inside])
-        same = rays.path == self.own.path[inside]
-        visible[inside] = same & self._is_unobstructed(points[inside], rays, target)
-        flow = (pixels - self.centres).astype(np.float32).reshape(self.height, self.width, 2)
-        return flow, self.image(visible)
-
-    def _is_unobstructed(self, points: Points, rays: Rays, positions: Points) -> BoolArray:
-        distance = np.linalg.norm(points - rays.origins, axis=1)
-        first = trace(positions, self.triangles, rays.origins, rays.directions, device=self.device).distance
-        return first >= distance - OCCLUSION_TOLERANCE_MM
-
-    def image(self, values: FloatArray | BoolArray) -> FlowArray:
-        return values.astype(np.float32).reshape(self.height, self.width)
-
-    def vector(self, name: str, values: FloatArray) -> dict[str, FlowArray]:
-        return {f"{name}.{axis}": self.image(values[:, i]) for i, axis in enumerate("XYZ")}

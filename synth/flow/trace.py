@@ -3,7 +3,8 @@
 The surface's triangles are binned into the cells of a grid over x and y, each into every cell that its bounding box
 (widened by far more than rounding) touches. Inside the gel a ray is straight, so it visits the cells under its track
 one after the other (Amanatides & Woo 1987) from where it enters the slab of z that the surface occupies, tests the
-triangles of each (Möller & Trumbore 1997) and stops at the first cell that holds its nearest hit.
+triangles of each (Möller & Trumbore 1997) and stops at the first cell that holds its nearest hit. Cells above whose
+highest triangle it still is are passed without a test.
 
 Edges belong to both their triangles: barycentric coordinates down to -1e-9 count as inside, which is far above the
 rounding of the test (about 1e-13) and far below anything visible, so no ray falls through between two triangles. Of
@@ -17,34 +18,15 @@ from typing import Any
 
 import numpy as np
 import warp as wp
-from numpy.typing import NDArray
 
 from synth.arrays import FloatArray, Points, Triangles
+from synth.flow.hits import Hits
 
 wp.config.log_level = wp.LOG_WARNING
 wp.set_module_options({"enable_backward": False})
 
-_TRIANGLES_PER_CELL = 2.0
-"""Cells are as large as so many triangles are on average."""
-
-
-@dataclass(frozen=True)
-class Hits:
-    """Nearest hits, one for each ray.
-
-    Attributes:
-        triangle: (..., n) int32, -1 where the ray hits nothing.
-        barycentric: (..., n, 3) float64 weights of the triangle's vertices; NaN where nothing is hit.
-        distance: (..., n) float64 mm along the unit direction; infinite where nothing is hit.
-    """
-
-    triangle: NDArray[np.int32]
-    barycentric: FloatArray
-    distance: FloatArray
-
-    def interpolate(self, triangles: Triangles, values: FloatArray) -> FloatArray:
-        """Values (n, c) at the hits from values (v, c) at the vertices; NaN where nothing is hit. Not for batches."""
-        return np.einsum("ni,nic->nc", self.barycentric, values[triangles[self.triangle]])
+_TRIANGLES_PER_CELL = 0.25
+"""Cells are as large as so many triangles are on average: measured to be fastest, and it changes no bit of a result."""
 
 
 def trace(positions: Points, triangles: Triangles, origins: Points, directions: Points, device: str = "cpu") -> Hits:
@@ -69,21 +51,26 @@ def trace(positions: Points, triangles: Triangles, origins: Points, directions: 
         wp.empty((batches, rays), dtype=wp.vec3d, device=device),
         wp.empty((batches, rays), dtype=wp.float64, device=device),
     )
-    vertices = wp.array(np.ascontiguousarray(positions, dtype=np.float64), dtype=wp.vec3d, device=device)
-    corners = wp.array(np.ascontiguousarray(triangles, dtype=np.int32), dtype=wp.int32, device=device)
+    vertices = _given(positions, np.float64, wp.vec3d, device)
+    corners = _given(triangles, np.int32, wp.int32, device)
     grid = _Grid.around(positions, len(triangles))
-    first, members = _bin(grid, vertices, corners, device)
-    starts = wp.array(np.ascontiguousarray(origins, dtype=np.float64), dtype=wp.vec3d, device=device)
-    ways = wp.array(np.ascontiguousarray(directions, dtype=np.float64), dtype=wp.vec3d, device=device)
+    bins = _bin(grid, vertices, corners, device)
+    starts = _given(origins, np.float64, wp.vec3d, device)
+    ways = _given(directions, np.float64, wp.vec3d, device)
     wp.launch(
         _nearest_hit,
         dim=(batches, rays),
-        inputs=[grid.struct(), vertices, corners, first, members, starts, ways],
+        inputs=[grid.struct(), vertices, corners, *bins, starts, ways],
         outputs=list(outputs),
         device=device,
     )
     triangle, barycentric, distance = (array.numpy() for array in outputs)
     return Hits(triangle, barycentric, distance) if batched else Hits(triangle[0], barycentric[0], distance[0])
+
+
+def _given(array: Any, kind: type, element: Any, device: str) -> Any:
+    """A Warp array; on the CPU it is the caller's own memory, which kernels only read."""
+    return wp.array(np.ascontiguousarray(array, dtype=kind), dtype=element, device=device, copy=False)
 
 
 @wp.struct
@@ -128,18 +115,20 @@ class _Grid:
         return cells
 
 
-def _bin(grid: _Grid, vertices: Any, corners: Any, device: str) -> tuple[Any, Any]:
-    """Triangles of each cell of each state: the start of every cell's list (one more than cells), and the lists."""
+def _bin(grid: _Grid, vertices: Any, corners: Any, device: str) -> tuple[Any, Any, Any]:
+    """Triangles of each cell of each state: starts of the cells' lists (one more than cells), the lists, their tops."""
     batches, triangles = vertices.shape[0], corners.shape[0]
-    count = wp.zeros(batches * grid.rows * grid.columns + 1, dtype=wp.int32, device=device)
+    cells = batches * grid.rows * grid.columns
+    count = wp.zeros(cells + 1, dtype=wp.int32, device=device)
+    ceiling = wp.full(cells, -np.inf, dtype=wp.float64, device=device)
     inputs = [grid.struct(), vertices, corners]
-    wp.launch(_count, dim=(batches, triangles), inputs=inputs, outputs=[count], device=device)
+    wp.launch(_count, dim=(batches, triangles), inputs=inputs, outputs=[count, ceiling], device=device)
     first = wp.empty_like(count)
     wp.utils.array_scan(count, first, inclusive=False)
     members = wp.empty(int(first.numpy()[-1]), dtype=wp.int32, device=device)
     taken = wp.clone(first)
     wp.launch(_fill, dim=(batches, triangles), inputs=inputs, outputs=[taken, members], device=device)
-    return first, members
+    return first, members, ceiling
 
 
 @wp.func
@@ -165,15 +154,22 @@ def _touched(cells: _Cells, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) -> wp.vec4i:
 
 @wp.kernel
 def _count(
-    cells: _Cells, vertices: wp.array2d[wp.vec3d], corners: wp.array2d[wp.int32], count: wp.array[wp.int32]
+    cells: _Cells,
+    vertices: wp.array2d[wp.vec3d],
+    corners: wp.array2d[wp.int32],
+    count: wp.array[wp.int32],
+    ceiling: wp.array[wp.float64],
 ) -> None:
+    """How many triangles every cell holds, and how far up they reach."""
     batch, t = wp.tid()
-    span = _touched(
-        cells, vertices[batch, corners[t, 0]], vertices[batch, corners[t, 1]], vertices[batch, corners[t, 2]]
-    )
+    a, b, c = vertices[batch, corners[t, 0]], vertices[batch, corners[t, 1]], vertices[batch, corners[t, 2]]
+    span = _touched(cells, a, b, c)
+    top = wp.max(wp.max(a[2], b[2]), c[2]) + wp.float64(4.0) * cells.margin
     for row in range(span[2], span[3] + 1):
         for column in range(span[0], span[1] + 1):
-            wp.atomic_add(count, (batch * cells.rows + row) * cells.columns + column, 1)
+            cell = (batch * cells.rows + row) * cells.columns + column
+            wp.atomic_add(count, cell, 1)
+            wp.atomic_max(ceiling, cell, top)
 
 
 @wp.kernel
@@ -202,13 +198,13 @@ def _intersect(o: wp.vec3d, d: wp.vec3d, a: wp.vec3d, b: wp.vec3d, c: wp.vec3d) 
     ab, ac, ao = b - a, c - a, o - a
     normal = wp.cross(ab, ac)
     slant = -wp.dot(d, normal)
-    if wp.abs(slant) <= wp.float64(1e-12) * wp.length(normal):
-        return miss
     moment = wp.cross(ao, d)
     v = wp.dot(ac, moment) / slant
+    if v < tolerance:
+        return miss
     w = -wp.dot(ab, moment) / slant
     u = wp.float64(1.0) - v - w
-    if u < tolerance or v < tolerance or w < tolerance:
+    if w < tolerance or u < tolerance or wp.abs(slant) <= wp.float64(1e-12) * wp.length(normal):
         return miss
     return wp.vec4d(wp.dot(ao, normal) / slant, u, v, w)
 
@@ -220,6 +216,7 @@ def _nearest_hit(
     corners: wp.array2d[wp.int32],
     first: wp.array[wp.int32],
     members: wp.array[wp.int32],
+    ceiling: wp.array[wp.float64],
     origins: wp.array2d[wp.vec3d],
     directions: wp.array2d[wp.vec3d],
     triangle: wp.array2d[wp.int32],
@@ -254,7 +251,10 @@ def _nearest_hit(
             exit = wp.min(next_x, next_y)
             if column >= 0 and column < cells.columns and row >= 0 and row < cells.rows:
                 cell = (batch * cells.rows + row) * cells.columns + column
-                for k in range(first[cell], first[cell + 1]):
+                end = first[cell + 1]
+                if o[2] + exit * d[2] > ceiling[cell]:  # leaves the cell above all of its triangles
+                    end = first[cell]
+                for k in range(first[cell], end):
                     t = members[k]
                     hit = _intersect(
                         o,

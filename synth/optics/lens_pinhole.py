@@ -59,6 +59,8 @@ class PinholeLens:
         return float(positive.min()) if len(positive) else np.inf
 
     def _distort(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+        if not any(self.distortion):
+            return x, y
         k1, k2, p1, p2, k3 = self.distortion
         s = x * x + y * y
         radial = 1 + s * (k1 + s * (k2 + s * k3))

@@ -64,11 +64,13 @@ class Window:
         above, below = eye[2] - self.face_z, self.face_z - points[:, 2]
         below = np.where(below >= 0, below, np.nan)
         n2 = self.index**2
-        square = ((points[:, :2] - eye[:2]) ** 2).sum(1)
+        x, y = points[:, 0] - eye[0], points[:, 1] - eye[1]
+        bend = (n2 - 1) * (x * x + y * y)
         slope = 1 / (above + below / self.index)
         for _ in range(_MAX_ITERATIONS):
-            root = np.sqrt(n2 + (n2 - 1) * square * slope**2)
-            step = (1 - above * slope - below * slope / root) / (above + below * n2 / root**3)
+            square = n2 + bend * (slope * slope)
+            root = np.sqrt(square)
+            step = (1 - above * slope - below * slope / root) / (above + below * n2 / (root * square))
             slope = slope + step
             if not np.any(np.abs(step) > _RELATIVE_STEP * slope):
                 break

@@ -22,7 +22,7 @@ def reflection(mi: Any, coating: Coating, texture: Image, is_mono: bool) -> Any:
     Args:
         mi: the Mitsuba module.
         coating: roughness and metallic, and its reflectance where marks lie above it.
-        texture: (rows, columns, 3 or 4) float32, from `pattern.albedo`.
+        texture: (rows, columns, 3 or 4) float32, from `pattern.albedo`; must not be changed afterwards.
         is_mono: colours are grey, and one channel is wanted.
 
     Returns:
@@ -49,4 +49,9 @@ def _coat(mi: Any, coating: Coating, colors: Image) -> dict[str, Any]:
 
 
 def _map(mi: Any, values: Image) -> dict[str, Any]:
-    return {"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(values)), "raw": True, "wrap_mode": "clamp"}
+    """A texture; on the CPU it shares the array's memory, where a bitmap would be copied three times."""
+    import drjit as dr
+
+    values = np.ascontiguousarray(values)
+    given = {"data": mi.TensorXf(values)} if dr.is_jit_v(mi.Float) else {"bitmap": mi.Bitmap(values)}
+    return {"type": "bitmap", **given, "raw": True, "wrap_mode": "clamp"}

@@ -11,6 +11,7 @@ texture is laid on along z; its resolution is that at the apex.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import singledispatch
 from pathlib import Path
@@ -30,6 +31,8 @@ TEXELS_PER_PIXEL = 4
 _STEP_MM = 0.01
 MAX_TEXELS = 3072
 """Per axis; a finer pattern than this would not fit on many GPUs."""
+_STRIP = 32
+"""Rows of the texture that are worked on at a time."""
 
 
 def albedo(sensor: Sensor, rng: np.random.Generator, folder: Path | None = None) -> Image:
@@ -51,15 +54,46 @@ def albedo(sensor: Sensor, rng: np.random.Generator, folder: Path | None = None)
     _check_detail(sensor.pattern, max(x[1] - x[0], y[1] - y[0]))
     coating = np.array(sensor.coating.reflectance)
     canvas = _Canvas(x, y, coating, rng, folder or Path())
-    if isinstance(sensor.pattern, Dots | Speckle | Bitmap):
-        colors, coverage = _mark(sensor.pattern, canvas)
-        if sensor.pattern.layer == "above_coating" and not sensor.coating.is_matt:
-            whole = np.broadcast_to(colors, (*coverage.shape, 3))
-            return np.clip(np.dstack([whole, coverage]), 0, 1).astype(np.float32)
-        painted = coating + coverage[:, :, None] * (colors - coating)
-    else:
-        painted = _paint(sensor.pattern, canvas)
-    return np.clip(painted, 0, 1).astype(np.float32)
+    if not isinstance(sensor.pattern, Dots | Speckle | Bitmap):
+        return _stored(_paint(sensor.pattern, canvas))
+    colors, coverage = _mark(sensor.pattern, canvas)
+    if sensor.pattern.layer == "above_coating" and not sensor.coating.is_matt:
+        return _layered(colors, coverage)
+    return _blended(coating, colors, coverage)
+
+
+def _stored(painted: FloatArray) -> Image:
+    """Values (rows, columns, 3) limited to [0, 1], as float32; like what follows in strips, which stay in the cache."""
+    texture: Image = np.empty(painted.shape, dtype=np.float32)
+    for strip in _strips(len(painted)):
+        texture[strip] = np.clip(painted[strip], 0, 1)
+    return texture
+
+
+def _layered(colors: FloatArray, coverage: FloatArray) -> Image:
+    """Marks' reflectance, (3,) or (rows, columns, 3), and coverage (rows, columns) side by side."""
+    texture: Image = np.empty((*coverage.shape, 4), dtype=np.float32)
+    whole = np.broadcast_to(colors, (*coverage.shape, 3))
+    for strip in _strips(len(coverage)):
+        texture[strip, :, :3] = np.clip(whole[strip], 0, 1)
+        texture[strip, :, 3] = np.clip(coverage[strip], 0, 1)
+    return texture
+
+
+def _blended(coating: FloatArray, colors: FloatArray, coverage: FloatArray) -> Image:
+    """The coating with marks over it: coating + coverage · (colors - coating), computed where anything is covered."""
+    texture: Image = np.empty((*coverage.shape, 3), dtype=np.float32)
+    texture[:] = np.clip(coating, 0, 1)
+    for strip in _strips(len(coverage)):
+        covered = np.flatnonzero(coverage[strip])
+        share = coverage[strip].reshape(-1)[covered]
+        mark = colors if colors.ndim == 1 else colors[strip].reshape(-1, 3)[covered]
+        texture[strip].reshape(-1, 3)[covered] = np.clip(coating + share[:, None] * (mark - coating), 0, 1)
+    return texture
+
+
+def _strips(rows: int) -> Iterator[slice]:
+    return (slice(first, first + _STRIP) for first in range(0, rows, _STRIP))
 
 
 def check_pattern(sensor: Sensor, folder: Path) -> None:
@@ -196,7 +230,7 @@ def _paint(pattern: object, canvas: _Canvas) -> FloatArray:
 
 @_paint.register
 def _bare(pattern: NoPattern, canvas: _Canvas) -> FloatArray:
-    return np.broadcast_to(canvas.coating, (len(canvas.y), len(canvas.x), 3)).copy()
+    return np.broadcast_to(canvas.coating, (len(canvas.y), len(canvas.x), 3))
 
 
 @_paint.register

@@ -48,12 +48,13 @@ class Renderer:
         sensor: the finger.
         render: samples and path length; `samples_per_pixel` is rounded up to the next full grid (see `full_grid`).
         surface: the contact surface whose positions `radiance` gets.
-        albedo: (rows, columns, 3 or 4) float32 over the contact face, from `pattern.albedo`.
+        albedo: (rows, columns, 3 or 4) float32 over the contact face, from `pattern.albedo`; must not be changed
+            afterwards.
         variant: from `choose_variant`.
 
     Raises:
         InputError: a light in the camera's view; a lens that cannot focus, or that a scalar variant cannot render;
-            separated light with a coating that shines or a scalar variant.
+            separated light with a coating that shines.
         ValueError: a mono variant for a sensor that is not grey.
     """
 
@@ -64,8 +65,9 @@ class Renderer:
         for name, view in self._views.items():
             if name:
                 _check_further(name, view)
-        if is_separated := render.light == "separated":  # every light at every sample
-            check_light(sensor, variant)
+        if render.light == "separated":
+            check_light(sensor.coating)
+        is_separated = render.light == "separated" and variant.is_vectorised  # every light at every sample
         self._lit = 1 if is_separated else sum(light.power > 0 for light in sensor.lights)
         wanted = render.samples_per_pixel
         self._samples = full_grid(PILOT if wanted == "auto" else wanted, self._lit)

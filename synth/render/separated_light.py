@@ -29,8 +29,7 @@ from synth.arrays import BoolArray, Image
 from synth.errors import InputError
 from synth.render.gel_mesh import GelMesh
 from synth.render.polygon_light import PolygonLight
-from synth.render.variant import LLVM_HINT, Variant
-from synth.scene import Sensor
+from synth.scene import Coating, Sensor
 
 PILOTS = 16
 """Rays from each face to each light, and to the gel."""
@@ -42,23 +41,17 @@ _SHIFT = (0.7548776662466927, 0.5698402909980532)
 """Of one light's shadow rays against the one before's: R2 sequence (Roberts 2018), on a torus to keep the strata."""
 
 
-def check_light(sensor: Sensor, variant: Variant) -> None:
-    """Find out whether separated light can render a sensor.
+def check_light(coating: Coating) -> None:
+    """Find out whether light on a coating can be separated.
 
     Raises:
-        InputError: the coating shines, or the variant is scalar.
+        InputError: it shines.
     """
-    coating = sensor.coating
     if not coating.is_matt:
         raise InputError(
             f'render.light = "separated" needs a matt coating (roughness = 1, metallic = 0), but this sensor\'s has '
             f"roughness = {coating.roughness:g} and metallic = {coating.metallic:g}: what shines depends on the view; "
             'set render.light to "path_traced"'
-        )
-    if not variant.is_vectorised:
-        raise InputError(
-            'render.light = "separated" needs LLVM 16 or newer, or an NVIDIA GPU, which this machine lacks '
-            f'({LLVM_HINT}); without, set it to "path_traced"'
         )
 
 

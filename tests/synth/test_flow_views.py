@@ -70,7 +70,7 @@ def test_flow_is_the_independent_projections(view):
 def test_folds_in_mirrors_are_hidden_rightly(view):
     """The sheet folds over at x = 3 and covers 0 < x < 3 from 1 mm above, of which either mirror sees a part.
 
-    Fails with the comparison of paths left out of `_View.motion`: pixels that left their mirror are called visible; and
+    Fails with the comparison of paths left out of `View.motion`: pixels that left their mirror are called visible; and
     with `reached_by` left out of `derive`: the derivation calls them visible.
     """
     surface = sheet(40, 24, 20.0, 15.0, 2)

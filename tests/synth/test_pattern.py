@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from render_scenes import small_sensor
 
+from synth.render.marks import dots_coverage
 from synth.render.pattern import albedo, is_grey, pixels_per_mm
 from synth.scene import Dots, Light, NoPattern, RandomColor, Speckle
 from synth.scene_camera import FurtherCamera, Mirror
@@ -32,6 +33,19 @@ def test_dot_lies_where_the_scene_says_and_has_its_area() -> None:
     assert area == pytest.approx(np.pi * 0.7**2, rel=2e-3)
     assert (weight * x).sum() / weight.sum() == pytest.approx(2.0, abs=1e-3)
     assert (weight * y[:, None]).sum() / weight.sum() == pytest.approx(-1.5, abs=1e-3)
+
+
+def test_strips_blend_as_the_whole_to_the_bit() -> None:
+    """Fails with the last, shorter strip left out, and with rows of a strip's coverage taken for the next one's."""
+    dots = Dots(kind="dots", spacing_mm=(1.3, 1.1), radius_mm=0.4, softness_mm=0.3, reflectance=(0.1, 0.2, 0.9))
+    sensor = small_sensor(pattern=dots)
+    texture = albedo(sensor, np.random.default_rng(3))
+    x, y = _texel_mm(sensor, texture)
+    assert len(y) % 32
+    share = dots_coverage(dots, x, y, np.random.default_rng(3))[:, :, None]
+    coating = np.array(sensor.coating.reflectance)
+    painted = coating + share * (np.array(dots.reflectance) - coating)
+    np.testing.assert_array_equal(texture, painted.astype(np.float32))
 
 
 def test_resolution_follows_the_camera_and_is_capped() -> None:

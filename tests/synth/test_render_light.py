@@ -146,9 +146,16 @@ def test_what_shines_is_refused() -> None:
         _renderer(Coating(roughness=0.5), FAST)
 
 
-def test_scalar_variants_are_refused() -> None:
-    with pytest.raises(InputError, match=r"separated.* needs LLVM 16"):
-        _renderer(Coating(roughness=1), Variant("scalar_rgb", "cpu"))
+def test_scalar_variants_path_trace() -> None:
+    """Fails with `variant.is_vectorised` left out of the renderer's choice."""
+    scalar = Variant("scalar_rgb", "cpu")
+    sensor = small_sensor(1.0, None, LIGHTS)
+    surface = flat_surface(sensor)
+    images = [
+        Renderer(sensor, Render(light=light), surface, _texture(), scalar).radiance(surface.material, 3)
+        for light in ("separated", "path_traced")
+    ]
+    np.testing.assert_array_equal(*images)
 
 
 @needs_llvm

@@ -1,0 +1,128 @@
+"""One camera that looks at the states of one surface: what does not change between them, and what a state has shown.
+
+Kept are the rays of the pixel centres, and the last few states' first hits: a trajectory's pairs share their states,
+and each state of a pair is needed both ways.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from synth.arrays import BoolArray, FloatArray, Pixels, Points, Triangles
+from synth.flow.field import FlowArray
+from synth.flow.hits import Hits
+from synth.flow.overlap import boundary_edges, may_overlap
+from synth.flow.trace import trace
+from synth.optics import Optics, Rays
+from synth.surface import GelSurface
+
+OCCLUSION_TOLERANCE_MM = 1e-6
+"""A hit nearer than the point itself by more than this hides it.
+
+Projection and its inverse agree to about 1e-12 px, so the ray of a point's own pixel passes it at less than 1e-12 mm
+and meets its own surface within 1e-12 mm / sin(grazing angle): below the tolerance for every angle above 1e-6 rad.
+Parts of the surface less than 1e-6 mm apart touch.
+"""
+_KEPT = 3
+"""States whose first hits are kept: 12 MB each at 640 x 480."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One camera looking at states of one surface.
+
+    Attributes:
+        surface: its `triangles` are used.
+        optics: the camera.
+        width: columns of the image.
+        height: rows of the image.
+        device: Warp device of the tracing.
+    """
+
+    surface: GelSurface
+    optics: Optics
+    width: int
+    height: int
+    device: str = "cpu"
+
+    @property
+    def triangles(self) -> Triangles:
+        """(f, 3) int32 of the surface."""
+        return self.surface.triangles
+
+    @cached_property
+    def centres(self) -> Pixels:
+        """(n, 2) of all pixels, row by row."""
+        row, column = np.mgrid[: self.height, : self.width]
+        return np.column_stack([column.ravel() + 0.5, row.ravel() + 0.5])
+
+    @cached_property
+    def own(self) -> Rays:
+        """The rays of the pixel centres."""
+        return self.optics.look(self.centres)
+
+    @cached_property
+    def _is_whole(self) -> bool:
+        """Whether every place in the image looks straight at the window."""
+        corners = np.array([(x, y) for x in (0.0, self.width) for y in (0.0, self.height)])
+        return bool((self.own.path == 0).all() and (self.optics.look(corners).path == 0).all())
+
+    @cached_property
+    def _boundary(self) -> Triangles:
+        return boundary_edges(self.triangles)
+
+    @cached_property
+    def _seen(self) -> "deque[tuple[Points, Hits]]":
+        return deque(maxlen=_KEPT)
+
+    def first_hits(self, positions: Points) -> Hits:
+        """What the pixel centres see of a state (v, 3) mm; the array must not be changed afterwards."""
+        for known, hits in self._seen:
+            if known is positions:
+                return hits
+        hits = trace(positions, self.triangles, self.own.origins, self.own.directions, device=self.device)
+        self._seen.append((positions, hits))
+        return hits
+
+    def motion(self, hits: Hits, target: Points) -> tuple[FlowArray, FlowArray]:
+        """Flow (H, W, 2) and visibility (H, W) of the hits' material points when the surface moves to `target`."""
+        points = hits.interpolate(self.triangles, target)
+        pixels = self.optics.project(points, self.own.path)
+        x, y = pixels[:, 0], pixels[:, 1]
+        with np.errstate(invalid="ignore"):
+            visible: BoolArray = (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+        doubtful = self._may_be_hidden(pixels, visible, target)
+        rays = self.optics.look(pixels[doubtful])
+        same = rays.path == self.own.path[doubtful]
+        visible[doubtful] = same & self._is_unobstructed(points[doubtful], rays, target)
+        flow = (pixels - self.centres).astype(np.float32).reshape(self.height, self.width, 2)
+        return flow, self.image(visible)
+
+    def _may_be_hidden(self, pixels: Pixels, inside: BoolArray, target: Points) -> NDArray[np.intp]:
+        """Which of the points that are seen in pixels (n, 2), if in any, must be looked at."""
+        at = np.flatnonzero(inside)
+        if not self._is_whole:
+            return at
+        overlap = may_overlap(target, self.triangles, self._boundary, self.optics, (self.width, self.height))
+        if not overlap.any():
+            return at[:0]
+        column, row = pixels[at].astype(np.intp).T
+        return at[overlap[row, column]]
+
+    def _is_unobstructed(self, points: Points, rays: Rays, positions: Points) -> BoolArray:
+        if len(points) == 0:
+            return np.ones(0, dtype=bool)
+        distance = np.linalg.norm(points - rays.origins, axis=1)
+        first = trace(positions, self.triangles, rays.origins, rays.directions, device=self.device).distance
+        return first >= distance - OCCLUSION_TOLERANCE_MM
+
+    def image(self, values: FloatArray | BoolArray) -> FlowArray:
+        """Values (n,) of the pixels as an image (H, W)."""
+        return values.astype(np.float32).reshape(self.height, self.width)
+
+    def vector(self, name: str, values: FloatArray) -> dict[str, FlowArray]:
+        """Vectors (n, 3) of the pixels as three channels."""
+        return {f"{name}.{axis}": self.image(values[:, i]) for i, axis in enumerate("XYZ")}
