@@ -111,7 +111,10 @@ def compare(
     ] = "none,lucas-kanade,farneback,dis-ultrafast,dis-fast,dis-medium,tvl1",
     weights: Annotated[
         list[str] | None,
-        Parameter(help="FILE or LABEL=FILE of a network, GelFlow (.safetensors) or RAFT (.pth); repeatable."),
+        Parameter(
+            help="FILE or LABEL=FILE of a network, GelFlow (.safetensors) or RAFT (.pth); repeatable. "
+            "Labels that differ after # alone (best#0, best#1) are seeds: one row, mean and standard deviation."
+        ),
     ] = None,
     ft: Annotated[
         int, Parameter(help="Steps of test-time optimisation of each GelFlow network on these pairs, reported apart.")
@@ -120,6 +123,10 @@ def compare(
         str | None, Parameter(help="Its settings; default: those of the network's own training. A preset or TOML file.")
     ] = None,
     batch: Annotated[int, Parameter(help="Pairs at once where networks' speed and memory are measured; 0: not.")] = 1,
+    every: Annotated[int, Parameter(help="Take every n-th pair only, for methods that are slow.")] = 1,
+    add: Annotated[
+        bool, Parameter(negative=(), help="Keep the methods that --out holds already; pairs are known by their names.")
+    ] = False,
     size: Size = None,
     device: OnDevice = "auto",
     as_json: AsJson = False,
@@ -127,7 +134,7 @@ def compare(
     """Scores several methods on the same image pairs."""
     from gelflow.commands import run_compare
 
-    return run_compare(data, out, methods, weights or [], size, device, as_json, (ft, ft_config), batch)
+    return run_compare(data, out, methods, weights or [], size, device, as_json, (ft, ft_config), batch, every, add)
 
 
 @app.command

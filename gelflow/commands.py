@@ -15,16 +15,18 @@ from gelflow.baselines import Method, named_methods
 from gelflow.baselines.finetuned import fine_tuned
 from gelflow.baselines.learned import Learned, PublishedRaft, open_network
 from gelflow.compare import compare
+from gelflow.comparison import Comparison
 from gelflow.data import PairDataset, join, open_pairs
 from gelflow.data.choose import ChoiceConfig
 from gelflow.data.extract import extract_pairs, find_recordings
 from gelflow.data.pairset import FILE, PairSet, SourceReport
 from gelflow.errors import InputError
-from gelflow.evaluate import PairScore, summarise
+from gelflow.evaluate import PairScore
 from gelflow.export import export_onnx
 from gelflow.overrides import train_config
 from gelflow.predict import Prediction, Reference, predict_pair, predict_video
-from gelflow.report import FILES, as_json_text, machine, tables
+from gelflow.report import FILES, devices
+from gelflow.report_tables import tables
 from gelflow.terminal import progress, show_table
 
 
@@ -76,7 +78,8 @@ def run_train(
 def run_evaluate(data: Sequence[Path], weights: Path, size: str | None, device: str, as_json: bool) -> int:
     """`evaluate`."""
     network = open_network(weights, None, parse_size(size), device)
-    return _score(open_all(data), [network], None, as_json, 1)
+    _score(open_all(data), [network], None, as_json, 1)
+    return 0
 
 
 def run_compare(
@@ -89,22 +92,30 @@ def run_compare(
     as_json: bool,
     fine_tuning: tuple[int, str | None],
     batch: int,
+    every: int,
+    add: bool,
 ) -> int:
-    """`compare`; `methods` are separated by commas, `weights` are FILE or LABEL=FILE.
+    """`compare`; `methods` are separated by commas, `weights` are FILE or LABEL=FILE, of the pairs each `every`-th.
 
     `fine_tuning` is the number of steps, 0 for none, and the configuration of a test-time optimisation.
     """
+    if add and out is None:
+        raise InputError("--add: give the folder of the earlier comparison as --out")
+    if every < 1:
+        raise InputError(f"--every {every}: a number from 1 on is needed")
     chosen = named_methods([name.strip() for name in methods.split(",") if name.strip()])
     networks = [_labelled(given, size, device) for given in weights]
     steps, config = fine_tuning
     own = [network for network in networks if isinstance(network, Learned)]
     dataset = open_all(data)
+    dataset = PairDataset(dataset.source, dataset.records[::every])
     if steps > 0:
         if out is None or not own:
             raise InputError(f"--ft {steps}: needs --weights of GelFlow, and --out beside which their copies are kept")
         folder = out.with_name(f"{out.name}_ft")
         networks += [fine_tuned(one, dataset, folder / one.name.replace("/", "_"), steps, config) for one in own]
-    return _score(dataset, [*chosen, *networks], out, as_json, batch)
+    _score(dataset, [*chosen, *networks], out, as_json, batch, add)
+    return 0
 
 
 def _labelled(given: str, size: str | None, device: str) -> Learned | PublishedRaft:
@@ -112,7 +123,9 @@ def _labelled(given: str, size: str | None, device: str) -> Learned | PublishedR
     return open_network(Path(file if equals else given), label if equals else None, parse_size(size), device)
 
 
-def _score(dataset: PairDataset, methods: Sequence[Method], out: Path | None, as_json: bool, batch: int) -> int:
+def _score(
+    dataset: PairDataset, methods: Sequence[Method], out: Path | None, as_json: bool, batch: int, add: bool = False
+) -> Comparison:
     done = 0
     with progress("pairs", not as_json) as advance:
 
@@ -121,16 +134,16 @@ def _score(dataset: PairDataset, methods: Sequence[Method], out: Path | None, as
             done += 1
             advance(done, len(dataset) * len(methods), f"{score.method}, {score.pair}")
 
-        result = compare(methods, dataset, out, step, batch)
+        result = compare(methods, dataset, out, step, batch, add)
     if as_json:
-        print(as_json_text([dataset.source], summarise(result.scores), result.scores, result.speeds))
-        return 0
-    print(f"{dataset.source}; times on {machine(result.speeds)}")
-    for title, table in tables(result.scores, result.speeds):
+        print(result.to_json())
+        return result
+    print(f"{', '.join(result.data)}; times on {devices(result)}")
+    for title, table in tables(result):
         show_table(title, *table)
     if out is not None:
-        print(f"written: {', '.join(str(out / name) for name in FILES)}")
-    return 0
+        print(f"written: {', '.join(str(out / name) for name in FILES if (out / name).is_file())}")
+    return result
 
 
 def run_predict(

@@ -22,8 +22,31 @@ class _Frozen(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
+class ElasticConfig(_Frozen):
+    """Elastic refinement of the network's flow on the images themselves, see `gelflow.models.elastic`. Not learned."""
+
+    spacings: tuple[int, ...] = (16, 8, 4)
+    """Distances of the control points, coarse to fine, px of the images that the network sees."""
+    iterations: int = Field(default=6, ge=1, le=100)
+    """Gauss-Newton steps at each spacing."""
+    brightness: float = Field(default=1.0, ge=0)
+    """Weight of the colours as they are: flow that explains shading, too."""
+    structure: float = Field(default=0.3, ge=0)
+    """Weight of the colours after their local mean and contrast have been taken out: indifferent to illumination."""
+    stiffness: float = Field(default=5e-5, gt=0)
+    """Weight of the correction's bending."""
+
+    @model_validator(mode="after")
+    def _compares_something(self) -> ElasticConfig:
+        if not self.spacings or any(spacing < 2 for spacing in self.spacings):
+            raise ValueError(f"spacings = {list(self.spacings)} must be at least one whole number of px, each >= 2")
+        if self.brightness == 0 and self.structure == 0:
+            raise ValueError("brightness and structure are both 0: nothing would compare the images")
+        return self
+
+
 class ModelConfig(_Frozen):
-    """The network: what its weights depend on. Stored with the weights."""
+    """The network: what its weights depend on, and how its flow is refined. Stored with the weights."""
 
     levels: int = Field(default=8, ge=4, le=8)
     """Scales l of the pyramid, the image (s = 0) included; features at s = 1 .. levels-1. Paper: 8."""
@@ -53,6 +76,9 @@ class ModelConfig(_Frozen):
     or at full resolution. Not in the paper, whose finest flow is an enlargement of V2."""
     refine_iterations: int = Field(default=3, ge=1, le=16)
     """Times that the refinement head, with the same weights, corrects the flow."""
+    elastic: ElasticConfig | None = None
+    """Refinement of the finished flow where it is used (validation, evaluation, prediction; neither the training steps
+    nor the exported network). Takes no part in the weights, so that a fine-tuning may switch it on or change it."""
 
     @model_validator(mode="after")
     def _decodes_something(self) -> ModelConfig:
@@ -119,6 +145,9 @@ class LossConfig(_Frozen):
     lambda_s: tuple[float, ...] = (1.0,) * 7
     """Weight of each scale, finest (s = 0) first; levels - 1 numbers. Paper: 1 for s = 0 .. 6. A scale of weight 0 is
     not computed."""
+    flow_s: tuple[float, ...] | None = None
+    """Weight of each scale in training on the exact flow, finest first, errors in px of the scale; None: lambda_s.
+    Coarse scales that no image can judge are told their flow here."""
 
     @model_validator(mode="after")
     def _some_scale_counts(self) -> LossConfig:
@@ -126,12 +155,30 @@ class LossConfig(_Frozen):
             raise ValueError(f"lambda_s = {list(self.lambda_s)} must be numbers >= 0, at least one of them above 0")
         if self.lambda_ph == 0 and self.lambda_census == 0:
             raise ValueError("lambda_ph and lambda_census are both 0: nothing would compare the images")
-        if self.smoothness_s is not None:
-            if len(self.smoothness_s) != len(self.lambda_s):
-                raise ValueError(f"smoothness_s has {len(self.smoothness_s)} numbers, lambda_s {len(self.lambda_s)}")
-            if any(value < 0 for value in self.smoothness_s):
-                raise ValueError(f"smoothness_s = {list(self.smoothness_s)} must be numbers >= 0")
+        for name, weights in (("smoothness_s", self.smoothness_s), ("flow_s", self.flow_s)):
+            if weights is None:
+                continue
+            if len(weights) != len(self.lambda_s):
+                raise ValueError(f"{name} has {len(weights)} numbers, lambda_s {len(self.lambda_s)}")
+            if any(value < 0 for value in weights):
+                raise ValueError(f"{name} = {list(weights)} must be numbers >= 0")
+        if self.flow_s is not None and not any(self.flow_s):
+            raise ValueError("flow_s is 0 at every scale: nothing would be compared with the exact flow")
         return self
+
+
+class MotionConfig(_Frozen):
+    """Motion added to training pairs by moving image 2, see `gelflow.train.motion`.
+
+    Uniform up to these limits, times a common factor that is uniform between 0 and 1.
+    """
+
+    shift_px: float = Field(default=12.0, ge=0)
+    """Along each axis, px of the images before cropping."""
+    turn_deg: float = Field(default=12.0, ge=0, le=45)
+    """About the image's centre, to either side."""
+    zoom: float = Field(default=0.08, ge=0, le=0.5)
+    """Enlargement or reduction, as a share."""
 
 
 class TrainConfig(_Frozen):
@@ -139,8 +186,12 @@ class TrainConfig(_Frozen):
 
     model: ModelConfig = ModelConfig()
     loss: LossConfig = LossConfig()
-    supervision: Literal["self", "flow"] = "self"
-    """Train on the images alone (the paper), or on the exact flow by the multi-scale endpoint loss."""
+    supervision: Literal["self", "flow", "mixed"] = "self"
+    """Train on the images alone (the paper), or on the exact flow by the multi-scale endpoint loss, or on whichever a
+    pair has: exact flow where it is known, the images alone where it is not (synthetic and real pairs side by side)."""
+    mixed_self: float = Field(default=10.0, gt=0)
+    """Weight of the self-supervised loss beside the endpoint loss under supervision = "mixed". The photometric loss
+    changes by about 0.1 per px of error, the endpoint loss by 1."""
     image_size: tuple[int, int] | None = None
     """Rows and columns to which images are resized before the network (the paper: 512, 640); None: as they are."""
     crop_size: tuple[int, int] | None = None
@@ -150,6 +201,9 @@ class TrainConfig(_Frozen):
     """Random horizontal and vertical flips. The paper is silent on augmentation."""
     color_jitter: float = Field(default=0.0, ge=0, le=0.5)
     """Standard deviation of the logarithm of a random gain per colour channel, common to both images of a pair."""
+    motion: MotionConfig | None = None
+    """Motion added to each pair, for a network that meets larger motions than its training pairs show; None: none (the
+    paper is silent)."""
     batch_size: int = Field(default=4, ge=1)
     """Pairs per step and device. Paper: 4."""
     steps: int = Field(default=66_400, ge=1)

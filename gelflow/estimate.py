@@ -8,6 +8,7 @@ from gelflow.arrays import Flow, Images
 from gelflow.config import MINIMUM_SIDE
 from gelflow.errors import InputError
 from gelflow.models import GelFlow
+from gelflow.models.elastic import refined
 from gelflow.models.gelflow import check_shapes
 
 
@@ -63,7 +64,10 @@ def estimate_flow(model: GelFlow, image1: Images, image2: Images, size: tuple[in
     model.eval()
     try:
         with torch.no_grad():
-            flow = resize_flow(model(*inputs)[0], native)
+            flow = model(*inputs)[0]
+            if model.config.elastic is not None:
+                flow = refined(flow, inputs[0], inputs[1], model.config.elastic)
+            flow = resize_flow(flow, native)
     finally:
         model.train(was_training)
     return flow.to(image1.device)

@@ -12,26 +12,34 @@ import numpy as np
 from gelflow.baselines.method import Method
 from gelflow.data.pairs import PairDataset
 from gelflow.errors import InputError
+from gelflow.hardware import hardware
 from gelflow.metrics import endpoint_error, flow_errors, image_similarity, marker_distance
 from gelflow.strata import Stratum, pair_strata
 
 
 @dataclass(frozen=True)
 class PairScore:
-    """How one method did on one pair; None where the pair has no exact flow or no markers.
+    """How one method did on one pair; None where the pair has no exact flow, scene or markers.
 
     Attributes:
         method, pair: Their names.
+        scene: Scene and kind of pattern of a synthetic pair, "gelsight_mini, dots".
         psnr_db, ssim: Of image 1 and image 2 warped by the flow.
         endpoint_error_px, median_error_px: Mean and median endpoint error.
         outliers_1px, outliers_01px: Share of pixels with an endpoint error above 1 px and 0.1 px.
         marker_distance_px: Median distance to tracked dots.
+        motion_px: Mean length of the true motion over the compared pixels.
         seconds: Run time of the method, images in memory to flow in memory.
+        processor_seconds: Time of all its threads on the processor meanwhile; unlike `seconds` it does not grow with
+            what else the machine does.
+        device: What the method ran on.
+        on_gpu: Whether that was a CUDA device.
         strata: Its endpoint errors sorted by what they may depend on.
     """
 
     method: str
     pair: str
+    scene: str | None
     psnr_db: float
     ssim: float
     endpoint_error_px: float | None
@@ -39,13 +47,17 @@ class PairScore:
     outliers_1px: float | None
     outliers_01px: float | None
     marker_distance_px: float | None
+    motion_px: float | None
     seconds: float
+    processor_seconds: float
+    device: str
+    on_gpu: bool
     strata: tuple[Stratum, ...] = ()
 
 
 @dataclass(frozen=True)
 class MethodScore:
-    """Means over pairs, pair by pair with equal weight; `seconds` is the median. None where no pair has the number."""
+    """Means over pairs, pair by pair with equal weight; times are medians. None where no pair has the number."""
 
     method: str
     pairs: int
@@ -57,6 +69,14 @@ class MethodScore:
     outliers_01px: float | None
     marker_distance_px: float | None
     seconds: float
+    processor_seconds: float
+    device: str
+    on_gpu: bool
+
+    @property
+    def cost_seconds(self) -> float:
+        """What a pair costs: time on a GPU as it passes, on a processor that of one core, whatever else it does."""
+        return self.seconds if self.on_gpu else self.processor_seconds
 
 
 def score_pair(method: Method, dataset: PairDataset, index: int) -> PairScore:
@@ -68,25 +88,29 @@ def score_pair(method: Method, dataset: PairDataset, index: int) -> PairScore:
     name = dataset.records[index].name
     image1, image2 = dataset.images(index)
     truth, markers = dataset.truth(index), dataset.markers(index)
-    started = time.perf_counter()
+    started, busy = time.perf_counter(), time.process_time()
     try:
         flow = method.flow(image1, image2)
     except InputError as error:
         raise InputError(f"{dataset.source}, pair {name}, {method.name}: {error}") from error
-    seconds = time.perf_counter() - started
+    seconds, processor_seconds = time.perf_counter() - started, time.process_time() - busy
     similarity = image_similarity(image1, image2, flow)
     try:
         errors = flow_errors(flow, truth.flow, truth.visible) if truth else None
     except InputError as error:
         raise InputError(f"{dataset.records[index].flow}: {error}") from error
     strata: tuple[Stratum, ...] = ()
+    motion = None
     if truth is not None:
         compared = np.logical_and(truth.visible, np.isfinite(truth.flow).all(axis=-1))
-        scene = dataset.records[index].scene
-        strata = pair_strata(endpoint_error(flow, truth.flow), truth.flow, compared, truth.contact, scene)
+        away = endpoint_error(flow, truth.flow)
+        strata = pair_strata(away, truth.flow, compared, truth.contact, dataset.records[index].scene)
+        motion = float(np.hypot(truth.flow[..., 0], truth.flow[..., 1])[compared].mean(dtype=np.float64))
+    device = str(getattr(method, "device", "cpu"))
     return PairScore(
         method=method.name,
         pair=name,
+        scene=dataset.records[index].scene,
         psnr_db=similarity[0],
         ssim=similarity[1],
         endpoint_error_px=errors.mean_px if errors else None,
@@ -94,7 +118,11 @@ def score_pair(method: Method, dataset: PairDataset, index: int) -> PairScore:
         outliers_1px=errors.outliers_1px if errors else None,
         outliers_01px=errors.outliers_01px if errors else None,
         marker_distance_px=marker_distance(flow, markers) if markers is not None else None,
+        motion_px=motion,
         seconds=seconds,
+        processor_seconds=processor_seconds,
+        device=hardware(device),
+        on_gpu=device == "cuda",
         strata=strata,
     )
 
@@ -137,6 +165,9 @@ def _mean_score(name: str, scores: Sequence[PairScore]) -> MethodScore:
         outliers_01px=_mean(s.outliers_01px for s in scores),
         marker_distance_px=_mean(s.marker_distance_px for s in scores),
         seconds=median(s.seconds for s in scores),
+        processor_seconds=median(s.processor_seconds for s in scores),
+        device=scores[0].device,
+        on_gpu=scores[0].on_gpu,
     )
 
 

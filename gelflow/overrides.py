@@ -12,7 +12,7 @@ from typing import Any
 from gelflow.config import TrainConfig, validated
 from gelflow.errors import InputError
 
-PRESETS = ("best", "paper", "selfflow", "arflow")
+PRESETS = ("best", "real", "paper", "selfflow", "arflow")
 """Names of the configurations that come with the package."""
 
 
@@ -82,7 +82,9 @@ def _assign(values: dict[str, Any], assignment: str) -> None:
         value = text
     table = values
     for name in names[:-1]:
-        table = table.setdefault(name, {})
+        if table.get(name) is None:  # a part that is switched off, such as model.elastic, is switched on by its fields
+            table[name] = {}
+        table = table[name]
         if not isinstance(table, dict):
             raise InputError(f"--set {assignment}: {name} is a value, not a table")
     table[names[-1]] = value

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gelflow.hardware import hardware
+
 CLEAR_PEAK, STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")
 
 
@@ -25,7 +27,7 @@ class Speed:
         memory_mib: Peak memory of a batch, MiB; None where it cannot be measured.
         batch: Pairs in a batch.
         size: Rows and columns of the images.
-        device: "cpu" or the name of the CUDA device.
+        device: Name of the processor or CUDA device.
     """
 
     pairs_per_second: float
@@ -68,8 +70,7 @@ def network_speed(
             seconds.append(time.perf_counter() - started)
     peak = _peak_memory(cuda)
     memory = None if peak is None or start is None else max(0.0, (peak - start) / 2**20)
-    name = torch.cuda.get_device_name() if cuda else "cpu"
-    return Speed(batch / statistics.median(seconds), memory, batch, size, name)
+    return Speed(batch / statistics.median(seconds), memory, batch, size, hardware(device))
 
 
 def _start_memory(cuda: bool) -> float | None:

@@ -1,10 +1,11 @@
 """Where the error is: endpoint errors sorted by the length of the true motion, by the distance to the contact's edge,
-and by scene and pattern.
+by pattern, and by scene and pattern.
 
 Each kind sorts the compared pixels of a pair into bins; sums over pixels are kept, so that bins of many pairs add up
 with every pixel counting the same. The distance to the contact's edge is signed, negative inside the contact, and
 needs the channel contact.Y (synth: `--set outputs.contact=true`); pairs without it, or without a contact, have no such
-bins.
+bins. Between pictures of a gel without a pattern nothing but shading can be followed, and errors are as large as the
+motion: such pairs have bins of motion and distance of their own, lest they hide all others.
 """
 
 from collections.abc import Iterable, Sequence
@@ -18,7 +19,10 @@ from gelflow.raster import FlowArray, MaskArray
 
 MOTION_PX = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, np.inf)
 EDGE_PX = (-np.inf, -16.0, -4.0, 0.0, 4.0, 16.0, 64.0, np.inf)
-MOTION, EDGE, SCENE = "motion", "distance to contact edge", "scene and pattern"
+MOTION, EDGE, PATTERN, SCENE = "motion", "distance to contact edge", "pattern", "scene and pattern"
+NO_PATTERN = "none"
+BARE = ", bare gel"
+"""End of the kinds of bins of gels without a pattern."""
 
 
 @dataclass(frozen=True)
@@ -54,15 +58,17 @@ def pair_strata(
         truth: True flow (H, W, 2) px.
         compared: (H, W), where the two were compared.
         contact: (H, W), where the gel touches the indenter in the second state, at pixels of image 1; or None.
-        scene: Name of the scene and pattern, or None.
+        scene: Scene and kind of pattern, "gelsight_mini, dots", or None.
     """
     motion = np.hypot(truth[..., 0], truth[..., 1])[compared]
     chosen = error[compared]
-    strata = _binned(MOTION, MOTION_PX, motion, chosen)
+    pattern = None if scene is None else scene.rpartition(", ")[2]
+    apart = BARE if pattern == NO_PATTERN else ""
+    strata = _binned(MOTION + apart, MOTION_PX, motion, chosen)
     if contact is not None and contact.any() and not contact.all():
-        strata += _binned(EDGE, EDGE_PX, signed_distance(contact)[compared], chosen)
-    if scene is not None:
-        strata.append(_stratum(SCENE, scene, chosen))
+        strata += _binned(EDGE + apart, EDGE_PX, signed_distance(contact)[compared], chosen)
+    if scene is not None and pattern is not None:
+        strata += [_stratum(PATTERN, pattern, chosen), _stratum(SCENE, scene, chosen)]
     return tuple(strata)
 
 
@@ -101,7 +107,7 @@ def _stratum(kind: str, name: str, error: NDArray[np.float64]) -> Stratum:
 
 
 def merged(strata: Iterable[Stratum]) -> list[Stratum]:
-    """Bins of many pairs added up; kinds and bins in their own order, scenes by name."""
+    """Bins of many pairs added up; kinds and bins in their own order, patterns and scenes by name."""
     sums: dict[tuple[str, str], Stratum] = {}
     for one in strata:
         so_far = sums.get((one.kind, one.bin))
@@ -119,7 +125,8 @@ def merged(strata: Iterable[Stratum]) -> list[Stratum]:
 
 
 def _order(stratum: Stratum) -> tuple[int, int, str]:
-    limits = {MOTION: MOTION_PX, EDGE: EDGE_PX}.get(stratum.kind, ())
+    limits = {MOTION: MOTION_PX, EDGE: EDGE_PX}.get(stratum.kind.removesuffix(BARE), ())
     names = [_name(low, high) for low, high in pairwise(limits)]
     place = names.index(stratum.bin) if stratum.bin in names else 0
-    return (MOTION, EDGE, SCENE).index(stratum.kind), place, stratum.bin
+    kinds = (MOTION, EDGE, PATTERN, SCENE, MOTION + BARE, EDGE + BARE)
+    return kinds.index(stratum.kind), place, stratum.bin

@@ -67,6 +67,8 @@ class ALDIC:
 
 def _package() -> tuple[Any, Any]:
     try:
+        # Numba's OpenMP layer would change torch's number of threads: networks took five times as long afterwards.
+        import_module("numba").config.THREADING_LAYER = "workqueue"
         return import_module("al_dic"), import_module("al_dic.core.data_structures").GridxyROIRange
     except ImportError as error:
         raise InputError(f"method al-dic: pyALDIC cannot be imported ({error}); {INSTALL}") from error

@@ -50,14 +50,14 @@ def synthetic_records(folder: Path) -> list[PairRecord]:
 
 
 def _scene(header: dict[str, Any], meta: Path) -> str | None:
-    """Scene and kind of pattern, "gelsight_mini, dots"; where the kind is drawn, that of the sample's own scene."""
+    """Scene and kind of pattern, "gelsight_mini, dots"; where either is drawn, that of the sample's own scene."""
     try:
         scene = header["scene"]
-        kind = scene["sensor"]["pattern"]["kind"]
+        kind = scene["sensor"]["pattern"].get("kind")
         if not isinstance(kind, str):
             kind = json.loads(meta.read_text(encoding="utf-8"))["scene"]["sensor"]["pattern"]["kind"]
         return f"{scene['name']}, {kind}"
-    except (KeyError, TypeError, OSError, ValueError):
+    except (KeyError, TypeError, AttributeError, OSError, ValueError):
         return None  # written by another program, or before patterns were recorded
 
 

@@ -92,12 +92,13 @@ def flow_loss(flows: list[Flow], truth: Flow, config: LossConfig) -> tuple[Scala
     Args:
         flows: As for `self_supervised_loss`.
         truth: (B, 2, H, W), px; NaN where the pixel sees no gel.
-        config: Only `lambda_s` matters.
+        config: Only `flow_s`, or `lambda_s` in its absence, matters.
 
     Returns:
         The loss, and its part "endpoint": the loss of the finest scale alone, px, detached.
     """
     truths = flow_pyramid(truth, len(flows))
+    shares = config.lambda_s if config.flow_s is None else config.flow_s
     losses = [endpoint_loss(flow, known) for flow, known in zip(flows, truths, strict=True)]
-    total = torch.stack([share * loss for share, loss in zip(config.lambda_s, losses, strict=True)]).sum()
+    total = torch.stack([share * loss for share, loss in zip(shares, losses, strict=True)]).sum()
     return total, {"endpoint": losses[0].detach()}

@@ -99,6 +99,8 @@ class FlowModule(L.LightningModule):
         image1, image2 = batch["image1"], batch["image2"]
         if self.config.supervision == "flow":
             loss, parts = flow_loss(self.network(image1, image2), batch["flow"], self.config.loss)
+        elif self.config.supervision == "mixed":
+            loss, parts = self._mixed(image1, image2, batch.get("flow"))
         else:
             loss, parts = self._self_supervised(image1, image2)
         self.last_loss = loss.detach()
@@ -107,6 +109,25 @@ class FlowModule(L.LightningModule):
             self.write({"train/loss": float(loss.detach()), "train/learning_rate": rate}
                         | {f"train/{name}": float(value) for name, value in parts.items()}, self.step + 1)  # fmt: skip
         return loss
+
+    def _mixed(self, image1: Tensor, image2: Tensor, truth: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
+        """The endpoint loss of the pairs with a flow and the weighted self-supervised loss of the others.
+
+        Each is a mean over its pairs and counts with their share of the batch.
+        """
+        known = torch.zeros(image1.shape[0], dtype=torch.bool, device=image1.device)
+        if truth is not None:
+            known = torch.isfinite(truth).all(dim=1).flatten(1).any(dim=1)
+        share = known.float().mean()
+        loss = image1.new_zeros(())
+        parts: dict[str, Tensor] = {}
+        if truth is not None and bool(known.any()):
+            supervised, parts = flow_loss(self.network(image1[known], image2[known]), truth[known], self.config.loss)
+            loss = loss + share * supervised
+        if not bool(known.all()):
+            alone, more = self._self_supervised(image1[~known], image2[~known])
+            loss, parts = loss + (1 - share) * self.config.mixed_self * alone, parts | more
+        return loss, parts
 
     def _self_supervised(self, image1: Tensor, image2: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss without truth; both directions where occlusion asks for them, a second pass where lambda_ar does."""

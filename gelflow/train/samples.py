@@ -15,6 +15,7 @@ from torch.utils.data import Dataset, Sampler
 from gelflow.config import MINIMUM_SIDE, TrainConfig
 from gelflow.errors import InputError
 from gelflow.estimate import resize_flow, resize_images
+from gelflow.train.motion import with_more_motion
 
 Sample = dict[str, Any]
 """image1, image2: (3, H, W) float32 in [0, 1]; name; perhaps flow: (2, H, W) float32, px, NaN where no gel is seen."""
@@ -112,7 +113,7 @@ def augmented(sample: Sample, config: TrainConfig, random: np.random.Generator) 
     Raises:
         InputError: The crop does not fit into the images.
     """
-    new = dict(sample)
+    new = dict(sample) if config.motion is None else with_more_motion(sample, config.motion, random)
     height, width = sample["image1"].shape[-2:]
     fields = [key for key in ("image1", "image2", "flow") if key in sample]
     if config.crop_size is not None:

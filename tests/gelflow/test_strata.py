@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,10 +12,10 @@ from test_compare import Constant
 from textures import write_synthetic
 
 from gelflow.compare import compare
-from gelflow.data import open_pairs
+from gelflow.data import PairDataset, open_pairs
 from gelflow.evaluate import evaluate
-from gelflow.report import strata_table
-from gelflow.strata import EDGE, MOTION, SCENE, merged, pair_strata, signed_distance
+from gelflow.report_tables import strata_table, tables
+from gelflow.strata import EDGE, MOTION, PATTERN, SCENE, merged, pair_strata, signed_distance
 
 
 def test_distance_is_signed_and_measured_from_the_edge_between_pixels() -> None:
@@ -32,7 +33,7 @@ def test_bins_hold_every_compared_pixel_once() -> None:
     contact = np.zeros((20, 30), bool)
     contact[5:15, 8:20] = True
     strata = pair_strata(error, truth, compared, contact, "gelsight, speckle")
-    for kind in (MOTION, EDGE, SCENE):
+    for kind in (MOTION, EDGE, PATTERN, SCENE):
         mine = [stratum for stratum in strata if stratum.kind == kind]
         assert sum(s.pixels for s in mine) == compared.sum()
         assert sum(s.error_px for s in mine) == pytest.approx(error[compared].sum(), rel=1e-12)
@@ -59,10 +60,14 @@ def test_no_contact_or_contact_everywhere_gives_no_distances() -> None:
         assert {s.kind for s in pair_strata(error, truth, compared, contact)} == {MOTION}
 
 
-def with_contact(folder: Path) -> Path:
+DRAWN_KIND = {"kind": {"choice": ["dots", "speckle"]}}
+DRAWN_PATTERN = {"choice": [{"kind": "dots", "radius_mm": 0.2}, {"kind": "speckle"}]}
+
+
+def with_contact(folder: Path, pattern: dict) -> Path:
     """A data set as synth writes it, with a contact in the left half and with patterns that differ by sample."""
     write_synthetic(folder, [(3.0, 0.0), (0.0, 0.25)])
-    scene = {"name": "toy", "sensor": {"pattern": {"kind": {"choice": ["dots", "speckle"]}}}}
+    scene = {"name": "toy", "sensor": {"pattern": pattern}}
     (folder / "dataset.json").write_text(json.dumps({"schema_version": 1, "scene": scene}))
     for index, kind in enumerate(["dots", "speckle"]):
         sample = folder / "samples" / f"{index:06d}"
@@ -77,16 +82,18 @@ def with_contact(folder: Path) -> Path:
     return folder
 
 
-def test_a_data_set_with_contact_and_patterns_is_sorted(tmp_path: Path) -> None:
-    dataset = open_pairs(with_contact(tmp_path / "data"))
+@pytest.mark.parametrize("pattern", [DRAWN_KIND, DRAWN_PATTERN], ids=["kind", "pattern"])
+def test_a_data_set_with_contact_and_patterns_is_sorted(pattern: dict, tmp_path: Path) -> None:
+    """Fails, where the whole pattern is drawn, with the kind looked up in the header alone."""
+    dataset = open_pairs(with_contact(tmp_path / "data", pattern))
     result = compare([Constant("zero", 0, 0), Constant("right", 3, 0)], dataset, tmp_path / "out")
-    header, rows = strata_table(result.scores)
+    header, rows = strata_table(result.strata)
     assert header == ["where", "pixels", "zero", "right"]
     cells = {row[0]: row[1:] for row in rows}
     # 64 rows; columns 8 to 71 are known and visible
     assert cells["motion: 2 to 4 px"] == ["4096", "3.000", "0.000"]
     assert cells["motion: 0 to 0.5 px"] == ["4096", "0.250", f"{np.hypot(3, 0.25):.3f}"]
-    assert cells["scene and pattern: toy, dots"][1] == "3.000"
+    assert cells["scene and pattern: toy, dots"][1] == cells["pattern: dots"][1] == "3.000"
     assert cells["scene and pattern: toy, speckle"][1] == "0.250"
     # columns 36 to 39 are within 4 px of the edge at 40, on its inner side, in both samples
     assert cells["distance to contact edge: -4 to 0 px"] == [str(2 * 64 * 4), "1.625", f"{np.hypot(3, 0.25) / 2:.3f}"]
@@ -100,3 +107,20 @@ def test_a_data_set_with_contact_and_patterns_is_sorted(tmp_path: Path) -> None:
 def test_data_without_them_have_no_such_rows(tmp_path: Path) -> None:
     scores = evaluate(Constant("zero", 0, 0), open_pairs(write_synthetic(tmp_path, [(1.0, 0.0)])))
     assert {stratum.kind for stratum in scores[0].strata} == {MOTION}
+
+
+def test_bare_gels_are_left_out_of_a_second_table_of_means(tmp_path: Path) -> None:
+    """Nothing can be followed on a gel without a pattern, whose errors would hide all others."""
+    dataset = open_pairs(with_contact(tmp_path, DRAWN_KIND))  # a pair moves by 3 px, the other by 0.25 px
+    first = dataset.records[0]
+    bare = PairDataset(dataset.source, [replace(first, scene="toy, none"), *dataset.records[1:]])
+    result = compare([Constant("zero", 0, 0)], bare)
+    found = {title: rows for title, (_, rows) in tables(result) if title.startswith("Means")}
+    assert [rows[0][3] for rows in found.values()] == ["1.625", "0.250"]
+    assert "the 1 pairs of gels with a pattern" in list(found)[1]
+    cells = {row[0]: row[2] for row in strata_table(result.strata)[1]}
+    assert cells["motion, bare gel: 2 to 4 px"] == "3.000"
+    assert cells["distance to contact edge, bare gel: -4 to 0 px"] == "3.000"
+    assert cells["distance to contact edge: -4 to 0 px"] == cells["motion: 0 to 0.5 px"] == "0.250"
+    assert "motion: 2 to 4 px" not in cells
+    assert len([title for title, _ in tables(compare([Constant("zero", 0, 0)], dataset)) if "Means" in title]) == 1

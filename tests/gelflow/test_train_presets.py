@@ -72,5 +72,7 @@ def test_assignments_and_files_still_work(tmp_path: Path) -> None:
     path.write_text("steps = 7\n[loss]\nlambda_dc = 3.0\n")
     assert train_config(path, ["loss.lambda_df=0.5"]).loss.lambda_df == 0.5
     assert train_config(path).steps == 7
-    with pytest.raises(InputError, match=r"papier: neither a configuration file nor a preset; presets are best, paper"):
+    with pytest.raises(
+        InputError, match=r"papier: neither a configuration file nor a preset; presets are best, real, paper"
+    ):
         train_config("papier")

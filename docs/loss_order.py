@@ -1,0 +1,62 @@
+"""Does the true flow score best? `python docs/loss_order.py data/test/* --every 5`
+
+For each configuration and each scale alone: the share of pairs whose true flow has a lower loss than no flow, than
+0.9 and than 1.1 times itself. Pixels that see no gel get no flow; nothing else is hidden from the losses.
+"""
+
+import argparse
+from pathlib import Path
+
+import torch
+
+from gelflow.commands import open_all
+from gelflow.data import PairDataset
+from gelflow.losses import self_supervised_loss
+from gelflow.ops.pyramid import flow_pyramid
+from gelflow.overrides import train_config
+from gelflow.report import markdown
+
+FACTORS = (0.0, 0.9, 1.1)
+
+
+def wins(dataset: PairDataset, preset: str) -> torch.Tensor:
+    """(scales, 3): share of pairs whose true flow beats itself times each factor."""
+    loss = train_config(preset).loss
+    scales = len(loss.lambda_s)
+    counts = torch.zeros(scales, len(FACTORS))
+    for index in range(len(dataset)):
+        sample = dataset[index]
+        image1, image2, flow = (torch.as_tensor(sample[name])[None] for name in ("image1", "image2", "flow"))
+        flows = flow_pyramid(torch.nan_to_num(flow), scales)
+        for scale in range(scales):
+            alone = loss.model_copy(
+                update={"lambda_s": tuple(float(s == scale) for s in range(scales)), "smoothness_s": None}
+            )
+            values = [self_supervised_loss([f * v for v in flows], image1, image2, alone)[0] for f in (1.0, *FACTORS)]
+            counts[scale] += torch.stack([values[0] < value for value in values[1:]])
+    return counts / len(dataset)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("datasets", nargs="+", type=Path)
+    parser.add_argument("--every", type=int, default=1)
+    parser.add_argument("--presets", default="paper,selfflow,best")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    torch.set_grad_enabled(False)
+    dataset = open_all(arguments.datasets)
+    dataset = PairDataset(dataset.source, dataset.records[:: arguments.every])
+    shares = {preset: wins(dataset, preset) for preset in arguments.presets.split(",")}
+    scales = max(len(share) for share in shares.values())
+    rows = [
+        [preset, *(" / ".join(f"{100 * one:.0f}" for one in line) for line in share)]
+        for preset, share in shares.items()
+    ]
+    print(f"{len(dataset)} pairs; % whose true flow beats no flow / 0.9 times / 1.1 times itself")
+    print(markdown((["losses", *(f"s = {scale}" for scale in range(scales))], rows)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,61 @@
+"""Added motion: the flow follows image 2 exactly, stays as it was without it, and is fixed by the draw."""
+
+import numpy as np
+import pytest
+import torch
+from waves import Shifts, pixel_centres, wave_image
+
+from gelflow.config import MotionConfig, TrainConfig
+from gelflow.ops.warp import warp
+from gelflow.overrides import train_config
+from gelflow.train.motion import with_more_motion
+from gelflow.train.samples import TrainingSamples
+
+
+def sample() -> dict:
+    """96 x 112 px with a flow of a turn and a stretch that image 2 obeys exactly, unknown in a corner."""
+    x, y = pixel_centres(96, 112)
+    flow = torch.stack([0.04 * (y - 48) + 2, -0.03 * (x - 56) - 1])
+    image1, image2 = (wave_image(a, b, 3, 12, 30).float() for a, b in ((x + flow[0], y + flow[1]), (x, y)))
+    flow[:, :4, :4] = torch.nan
+    return {"image1": image1, "image2": image2, "flow": flow.float(), "name": "one"}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_moved_pair_obeys_its_flow(seed: int) -> None:
+    """Fails with the shift added instead of taken away, with the turn's sense reversed, and with the zoom inverted."""
+    before = sample()
+    after = with_more_motion(before, MotionConfig(), np.random.default_rng(seed))
+    assert torch.equal(after["image1"], before["image1"])
+    assert torch.isnan(after["flow"][:, :4, :4]).all()
+    assert (after["flow"] - before["flow"]).nan_to_num().abs().max() > 0.5
+    middle = (slice(None), slice(32, 64), slice(36, 76))  # 12 px of shift and turn do not carry the border in here
+    found = warp(after["image2"][None], torch.nan_to_num(after["flow"])[None], "bicubic")[0]
+    error = (found - after["image1"])[middle].abs().mean()
+    # Two bicubic interpolations of waves of 12 px and more: below 1 % of their height each.
+    assert error < 0.05 * (after["image2"] - after["image1"])[middle].abs().mean()
+
+
+def test_no_motion_leaves_everything_as_it_is() -> None:
+    before = sample()
+    after = with_more_motion(before, MotionConfig(shift_px=0, turn_deg=0, zoom=0), np.random.default_rng(0))
+    # Sampling positions are rounded to 1e-7 of 112 px, the waves' slope is below 0.1 per px.
+    torch.testing.assert_close(after["image2"], before["image2"], rtol=0, atol=1e-5)
+    torch.testing.assert_close(after["flow"], before["flow"], rtol=0, atol=1e-5, equal_nan=True)
+
+
+def test_training_draws_it_where_the_configuration_asks_for_it() -> None:
+    """Fails with `augmented` passing over `config.motion`."""
+    pairs = Shifts(1, 80, 1.0, seed=2)
+    plain, more = (
+        TrainingSamples(pairs, TrainConfig(supervision="flow", flip=False, motion=motion))
+        for motion in (None, MotionConfig(turn_deg=0, zoom=0))
+    )
+    assert torch.equal(plain[(0, 3)]["flow"], pairs[0]["flow"])
+    added = [(more[(0, draw)]["flow"] - pairs[0]["flow"]).mean(dim=(1, 2)) for draw in range(20)]
+    assert all(shift.abs().max() <= 12 for shift in added)
+    assert max(float(shift.abs().max()) for shift in added) > 4
+    assert torch.equal(more[(0, 3)]["image2"], more[(0, 3)]["image2"])
+    assert train_config(None, ["motion.turn_deg=5"]).motion == MotionConfig(turn_deg=5)
+    unlabelled = TrainingSamples(Shifts(1, 80, 1.0, seed=2, flow=False), TrainConfig(motion=MotionConfig()))
+    assert "flow" not in unlabelled[(0, 0)]
