@@ -16,7 +16,7 @@ class Driver:
         correction_iterations: of Newton's method in one augmented-Lagrangian pass; a correction that needs more is
             dropped.
         single_precision: factorise the tangent in float32; its rounding is iterated away (`synth.simulate.linear`).
-        keep_factors: use the factors of earlier tangents where that pays.
+        keep_factors: use the factors of earlier tangents (`synth.simulate.linear.Directions`).
         forcing: of the batched solver: relative residual that ends a linear solve, at most (Eisenstat and Walker 1996;
             `synth.simulate.batched.krylov`). With 0.1 a ring of wire far too thin for its mesh went through the
             surface, where Newton's method ended the trajectory in time before.

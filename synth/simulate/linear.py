@@ -26,8 +26,8 @@ KEPT_TOLERANCE = 0.02
 KEPT_LIMIT = 12
 """Iterations after which an earlier tangent's factor is given up."""
 KEPT_FROM = 10_000
-"""Unknowns from which factors are kept: below, a factor costs no more than the iterations that keeping it takes.
-Presses with 13,800 unknowns took 0.71 to 0.82 of the time with kept factors, draws with 3,000 to 7,000 0.7 to 1.3."""
+"""Unknowns from which factors are kept. Presses with 13,800 unknowns took 0.6 to 0.8 of the time, draws of a scene with
+fewer 0.85 on an idle machine; but last iterations then only just meet Newton's tolerance."""
 
 
 class Factor(Protocol):
@@ -68,10 +68,17 @@ class Directions:
         self._factor, self._keep = factor, keep
         self._own = -1  # number of the factor's matrix that was this sample's last
 
-    def solve(self, matrix: Any, remainder: Any, right: FloatArray) -> FloatArray:
-        """The solution (n,) of (S + R) x = right, NaN where the matrix is singular; arguments as of `gmres`."""
+    def begin(self) -> None:
+        """Start with a new factor: what is solved next has nothing to do with what was solved before."""
+        self._own = -1
+
+    def solve(self, matrix: Any, remainder: Any, right: FloatArray, fresh: bool = False) -> FloatArray:
+        """The solution (n,) of (S + R) x = right, NaN where the matrix is singular; arguments as of `gmres`.
+
+        fresh: with the factor of this matrix.
+        """
         factor = self._factor
-        if self._keep and len(right) >= KEPT_FROM and factor.made == self._own:
+        if self._keep and not fresh and len(right) >= KEPT_FROM and factor.made == self._own:
             solution, _, left = gmres(matrix, remainder, factor, right, KEPT_TOLERANCE, KEPT_LIMIT)
             if left < KEPT_TOLERANCE:
                 return solution

@@ -118,6 +118,7 @@ class Stepper:
 
     def _start(self) -> None:
         """The undeformed states; a path that never touches stays in them and needs no solve."""
+        self.system.begin()
         for sample in self.samples:
             sample.states = [self._rest(sample.path.pose(0.0))]
             if not sample.path.may_touch:

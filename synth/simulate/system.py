@@ -79,7 +79,7 @@ class System:
         load: (n, 3) dead nodal forces in E mm², or None.
         device: Warp device.
         single: factorise tangents in single precision.
-        keep: use the factors of earlier tangents where that pays.
+        keep: use the factors of earlier tangents.
     """
 
     def __init__(
@@ -246,14 +246,19 @@ class System:
         size = len(self.free)
         return sp.csr_matrix((dense[kept], (row[kept], column[kept])), shape=(size, size))
 
-    def newton_step(self, tangent: Tangent, residual: FloatArray, active: np.ndarray) -> Unknowns:
-        """-K^-1 r of each active sample; NaN where the matrix is singular."""
+    def begin(self) -> None:
+        """Forget the factors of earlier tangents, so that a trajectory does not depend on what ran before it."""
+        for directions in self._directions:
+            directions.begin()
+
+    def newton_step(self, tangent: Tangent, residual: FloatArray, active: np.ndarray, fresh: bool = False) -> Unknowns:
+        """-K^-1 r of each active sample; NaN where the matrix is singular. fresh: with factors of this tangent."""
         step = self.zero()
         moves = step.u[0].size
         full = np.zeros(moves + step.p.shape[1])
         for s in map(int, np.flatnonzero(active)):
             matrix = self.matrix(tangent.values[s])
-            full[self.free] = -self._directions[s].solve(matrix, tangent.remainder[s], residual[s])
+            full[self.free] = -self._directions[s].solve(matrix, tangent.remainder[s], residual[s], fresh)
             step.u[s], step.p[s] = full[:moves].reshape(-1, 3), full[moves:]
         return step
 

@@ -198,16 +198,28 @@ def test_factor_is_kept_while_it_serves(monkeypatch: pytest.MonkeyPatch) -> None
     np.testing.assert_array_equal(one.solve(near, None, b), alone.solve(near, None, b))
 
 
-def test_factor_is_made_anew_for_small_systems_and_where_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Fails with KEPT_FROM or `keep` left out of the condition (checked one at a time).
+def test_factor_is_made_anew_where_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Fails with `keep`, `fresh` or KEPT_FROM left out of the condition, and with `begin` doing nothing.
     matrix, b = saddle(1), right_side(1)
-    for keep, least in ((True, SIZE + 1), (False, SIZE)):
-        monkeypatch.setattr(linear, "KEPT_FROM", least)
-        factor = SuperLUFactor(matrix.indptr, matrix.indices)
-        solver = Directions(factor, keep)
-        for _ in range(2):
-            solver.solve(matrix, None, b)
-        assert factor.made == 2
+    small = Directions(SuperLUFactor(matrix.indptr, matrix.indices), keep=True)
+    for _ in range(2):
+        small.solve(matrix, None, b)
+    assert small._factor.made == 2
+    monkeypatch.setattr(linear, "KEPT_FROM", SIZE)
+    factor = SuperLUFactor(matrix.indptr, matrix.indices)
+    never = Directions(factor, keep=False)
+    for _ in range(2):
+        never.solve(matrix, None, b)
+    assert factor.made == 2
+    one = Directions(factor, keep=True)
+    one.solve(matrix, None, b)
+    one.solve(matrix, None, b, fresh=True)
+    assert factor.made == 4
+    one.begin()
+    one.solve(matrix, None, b)
+    assert factor.made == 5
+    one.solve(matrix, None, b)
+    assert factor.made == 5
 
 
 def test_best_factor_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
