@@ -233,6 +233,12 @@ class TrainConfig(_Frozen):
     themselves (the paper is silent)."""
     compile: bool = False
     """Compile the network with torch.compile: minutes at the start, faster steps on a GPU."""
+    cuda_graph: bool = True
+    """On a CUDA device, record the network's two passes at the first step and replay them, unless `compile` is set."""
+    cache: bool = True
+    """On a CUDA device, decode all pairs at the start (by `workers`) and keep them there, if they take no more than
+    half of its free memory: a pair of 320 x 240 px with its flow takes 1 MiB. Otherwise the files of a pair are decoded
+    anew whenever a step asks for it."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to train; auto: a CUDA device where there is one."""
     devices: int = Field(default=1, ge=1)

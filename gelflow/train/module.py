@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.optim import Adam
 from torch.optim.lr_scheduler import LambdaLR
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from gelflow.config import TrainConfig
 from gelflow.estimate import estimate_flow
@@ -22,6 +23,7 @@ from gelflow.losses.occlusion import visible_both_ways
 from gelflow.losses.photometric import photometric_loss
 from gelflow.models import GelFlow
 from gelflow.ops.warp import inside, warp
+from gelflow.train.graph import GraphedNetwork
 
 LOG_EVERY = 10
 """Steps between entries in the logs."""
@@ -68,8 +70,8 @@ class FlowModule(L.LightningModule):
             self.average = copy.deepcopy(model).eval().requires_grad_(False)
             if average is not None:
                 self.average.load_state_dict(average)
-        # Not a submodule: its parameters are the model's own.
-        self._compiled = [torch.compile(model)] if config.compile else []
+        # In a tuple, because a submodule's parameters would count twice: they are the model's own.
+        self._network: tuple[Any] = (torch.compile(model) if config.compile else model,)
         self.start = start
         self.optimiser_state = optimiser
         self.metrics: dict[str, float] = {}
@@ -78,8 +80,13 @@ class FlowModule(L.LightningModule):
 
     @property
     def network(self) -> Any:
-        """The network as it is called in training: compiled where the configuration asks for it."""
-        return self._compiled[0] if self._compiled else self.model
+        """The network as it is called once a step: compiled or recorded where the configuration asks for it."""
+        return self._network[0]
+
+    def on_fit_start(self) -> None:
+        """Prepares for the device."""
+        if self.config.cuda_graph and self.device.type == "cuda" and not self.config.compile:
+            self._network = (GraphedNetwork(self.model),)
 
     @property
     def step(self) -> int:
@@ -115,26 +122,38 @@ class FlowModule(L.LightningModule):
 
         Each is a mean over its pairs and counts with their share of the batch.
         """
-        known = torch.zeros(image1.shape[0], dtype=torch.bool, device=image1.device)
+        pairs = image1.shape[0]
+        known = torch.zeros(pairs, dtype=torch.bool, device=image1.device)
         if truth is not None:
             known = torch.isfinite(truth).all(dim=1).flatten(1).any(dim=1)
         share = known.float().mean()
+        image1, image2 = self._directions(image1, image2)
+        flows = self.network(image1, image2)
         loss = image1.new_zeros(())
         parts: dict[str, Tensor] = {}
         if truth is not None and bool(known.any()):
-            supervised, parts = flow_loss(self.network(image1[known], image2[known]), truth[known], self.config.loss)
+            supervised, parts = flow_loss([flow[:pairs][known] for flow in flows], truth[known], self.config.loss)
             loss = loss + share * supervised
         if not bool(known.all()):
-            alone, more = self._self_supervised(image1[~known], image2[~known])
+            others = ~known.repeat(image1.shape[0] // pairs)
+            alone, more = self._judged([flow[others] for flow in flows], image1[others], image2[others])
             loss, parts = loss + (1 - share) * self.config.mixed_self * alone, parts | more
         return loss, parts
 
     def _self_supervised(self, image1: Tensor, image2: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """The loss without truth; both directions where occlusion asks for them, a second pass where lambda_ar does."""
+        """The loss without truth."""
+        image1, image2 = self._directions(image1, image2)
+        return self._judged(self.network(image1, image2), image1, image2)
+
+    def _directions(self, image1: Tensor, image2: Tensor) -> tuple[Tensor, Tensor]:
+        """The pairs, and after them the same with their images exchanged where occlusion asks for both directions."""
+        if self.config.loss.occlusion != "forward_backward":
+            return image1, image2
+        return torch.cat([image1, image2]), torch.cat([image2, image1])
+
+    def _judged(self, flows: list[Tensor], image1: Tensor, image2: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """The self-supervised loss of flows of `_directions`, with a second pass where lambda_ar asks for one."""
         config, visible = self.config.loss, None
-        if config.occlusion == "forward_backward":
-            image1, image2 = torch.cat([image1, image2]), torch.cat([image2, image1])
-        flows = self.network(image1, image2)
         if config.occlusion == "forward_backward":
             there, back = flows[0].chunk(2)
             visible = visible_both_ways(flows[0], torch.cat([back, there]))
@@ -143,7 +162,8 @@ class FlowModule(L.LightningModule):
             # Fixed by (seed, step), so that a resumed run shows the same.
             random = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
             first, second, target, pixels = transformed_pair(image1, image2, flows[0].detach(), random)
-            analogy = config.lambda_ar * analogy_loss(self.network(first, second)[0], target, pixels)
+            # Not `network`, which a step may call only once.
+            analogy = config.lambda_ar * analogy_loss(self.model(first, second)[0], target, pixels)
             loss, parts = loss + analogy, parts | {"analogy": analogy.detach()}
         return loss, parts
 
@@ -151,10 +171,8 @@ class FlowModule(L.LightningModule):
         """An optimiser step, and the average of the weights after it: before any callback saves the state."""
         super().optimizer_step(*arguments, **options)
         if self.average is not None:
-            share = 1 - self.config.ema_decay
-            with torch.no_grad():
-                for kept, new in zip(self.average.parameters(), self.model.parameters(), strict=True):
-                    kept.lerp_(new, share)
+            kept, new = list(self.average.parameters()), list(self.model.parameters())
+            get_ema_multi_avg_fn(self.config.ema_decay)(kept, new, None)
 
     @property
     def evaluated(self) -> GelFlow:

@@ -37,11 +37,13 @@ def with_more_motion(sample: dict[str, Any], config: MotionConfig, random: np.ra
     matrix = zoom * torch.tensor([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
     shift = config.shift_px * torch.tensor([shift_x, shift_y])
     image2: Tensor = sample["image2"][None]
-    matrix, shift = matrix.to(image2), shift.to(image2)
+    inverse = torch.linalg.inv(matrix)
+    # Not blocking: the CPU draws the next sample while the device is busy with the last step.
+    matrix, inverse, shift = (value.to(image2, non_blocking=True) for value in (matrix, inverse, shift))
     added = displacement(image2[:, :2], matrix, shift)
     new = dict(sample, image2=warp(image2, added, "bicubic").clamp(0, 1)[0])
     if "flow" in sample:
-        new["flow"] = _composed(sample["flow"], torch.linalg.inv(matrix), shift)
+        new["flow"] = _composed(sample["flow"], inverse, shift)
     return new
 
 

@@ -6,6 +6,7 @@ end with the same weights, bit by bit.
 """
 
 import logging
+import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -26,7 +27,8 @@ from gelflow.terminal import progress
 from gelflow.train.checkpoint import load_weights, save_weights
 from gelflow.train.keeper import Keeper, Stopped, describe, stopping, weights_metadata
 from gelflow.train.module import FlowModule
-from gelflow.train.samples import StepSampler, TrainingSamples, checked, collate
+from gelflow.train.resident import ResidentPairs, resident
+from gelflow.train.samples import CheckedPairs, StepSampler, TrainingSamples, checked, collate
 from gelflow.train.state import STATE, WEIGHTS, load_state, open_run
 from gelflow.train.throughput import peak_memory_mib
 
@@ -197,19 +199,36 @@ class _Data(L.LightningDataModule):
     ) -> None:
         super().__init__()
         self.config = config
-        self.train_set = train_set
+        self.train_set: CheckedPairs | ResidentPairs = CheckedPairs(train_set, config.supervision == "flow")
         self.validation_set = validation_set
         self.module = module
+        self._tried_cache = False
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Batches up to the next validation, or to the end."""
         config, trainer, start = self.config, self.module.trainer, self.module.step
+        self._cache()
         stop = config.steps
         if self.validation_set is not None:
             stop = min(stop, (start // config.validate_every + 1) * config.validate_every)
-        sampler = StepSampler(_length(self.train_set), config, start, stop, trainer.global_rank, trainer.world_size)
+        sampler = StepSampler(len(self.train_set), config, start, stop, trainer.global_rank, trainer.world_size)
         samples = TrainingSamples(self.train_set, config)
-        return DataLoader(samples, batch_sampler=sampler, num_workers=config.workers, collate_fn=collate)
+        workers = 0 if isinstance(self.train_set, ResidentPairs) else config.workers
+        return DataLoader(samples, batch_sampler=sampler, num_workers=workers, collate_fn=collate)
+
+    def _cache(self) -> None:
+        """Puts the training pairs on the device, once, where the configuration and the memory allow it."""
+        device = self.module.device
+        if self._tried_cache or not self.config.cache or device.type != "cuda":
+            return
+        self._tried_cache = True
+        if isinstance(self.train_set, CheckedPairs):
+            kept = resident(self.train_set, device, self.config.workers)
+            if kept is None:
+                print("the pairs take more than half of the device's free memory: read anew for every step",
+                      file=sys.stderr)  # fmt: skip
+            else:
+                self.train_set = kept
 
     def val_dataloader(self) -> Any:
         """Every pair once, alone in its batch, shared among the processes."""

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
@@ -51,16 +52,35 @@ class StepSampler(Sampler[list[tuple[int, int]]]):
             yield batch
 
 
-class TrainingSamples(Dataset[Sample]):
-    """Pairs resized, cropped and augmented for training; its keys are those of `StepSampler`."""
+class CheckedPairs(Dataset[Sample]):
+    """Pairs with what training needs of them, see `checked`; a pair that cannot be used is refused.
 
-    def __init__(self, pairs: Dataset[Any], config: TrainConfig) -> None:
+    Args:
+        pairs: Map-style, with a length.
+        supervised: Whether every pair must have an exact flow.
+    """
+
+    def __init__(self, pairs: Dataset[Any], supervised: bool) -> None:
+        self.pairs = pairs
+        self.supervised = supervised
+
+    def __len__(self) -> int:
+        return len(self.pairs)  # type: ignore[arg-type]  # Dataset itself declares no __len__
+
+    def __getitem__(self, index: int) -> Sample:
+        return checked(self.pairs[index], self.supervised)
+
+
+class TrainingSamples(Dataset[Sample]):
+    """Checked pairs resized, cropped and augmented for training; its keys are those of `StepSampler`."""
+
+    def __init__(self, pairs: Dataset[Sample], config: TrainConfig) -> None:
         self.pairs = pairs
         self.config = config
 
     def __getitem__(self, key: tuple[int, int]) -> Sample:
         index, draw = key
-        sample = checked(self.pairs[index], supervised=self.config.supervision == "flow")
+        sample = self.pairs[index]
         if self.config.image_size is not None:
             sample = resized(sample, self.config.image_size)
         elif min(sample["image1"].shape[1:]) < MINIMUM_SIDE:
@@ -110,35 +130,51 @@ def resized(sample: Sample, size: tuple[int, int]) -> Sample:
 def augmented(sample: Sample, config: TrainConfig, random: np.random.Generator) -> Sample:
     """The sample after the augmentation that the configuration asks for.
 
+    Images that are judged by their flow and are smaller than the crop are continued beyond their border by its colours,
+    with no flow there, so that data sets of several sensors can be trained on together.
+
     Raises:
-        InputError: The crop does not fit into the images.
+        InputError: The crop does not fit into images that are judged on themselves.
     """
     new = dict(sample) if config.motion is None else with_more_motion(sample, config.motion, random)
-    height, width = sample["image1"].shape[-2:]
     fields = [key for key in ("image1", "image2", "flow") if key in sample]
     if config.crop_size is not None:
         rows, columns = config.crop_size
-        if rows > height or columns > width:
+        height, width = sample["image1"].shape[-2:]
+        if (rows > height or columns > width) and not _judged_by_flow(sample, config):
             raise InputError(
                 f"pair {sample['name']}: crop_size {rows}x{columns} does not fit into its {height}x{width} px"
             )
-        top, left = random.integers(height - rows + 1), random.integers(width - columns + 1)
+        down, right = max(rows - height, 0), max(columns - width, 0)
+        above, before = random.integers(down + 1), random.integers(right + 1)
+        top, left = random.integers(max(height - rows, 0) + 1), random.integers(max(width - columns, 0) + 1)
         for key in fields:
-            new[key] = new[key][:, top : top + rows, left : left + columns]
+            cut = new[key][:, top : top + rows, left : left + columns]
+            if down or right:
+                border = (before, right - before, above, down - above)
+                cut = F.pad(cut, border, value=torch.nan) if key == "flow" else F.pad(cut, border, mode="replicate")
+            new[key] = cut
     if config.flip:
         for axis, component in ((-1, 0), (-2, 1)):
             if random.random() < 0.5:
                 for key in fields:
                     new[key] = new[key].flip(axis)
                 if "flow" in new:
-                    sign = torch.ones(2, 1, 1)
-                    sign[component] = -1
-                    new["flow"] = new["flow"] * sign
+                    parts = list(new["flow"])
+                    parts[component] = -parts[component]
+                    new["flow"] = torch.stack(parts)
     if config.color_jitter > 0:
         gain = torch.from_numpy(np.exp(random.normal(0, config.color_jitter, (3, 1, 1)))).float()
+        gain = gain.to(new["image1"].device, non_blocking=True)
         for key in ("image1", "image2"):
             new[key] = (new[key] * gain).clamp(0, 1)
     return new
+
+
+def _judged_by_flow(sample: Sample, config: TrainConfig) -> bool:
+    if config.supervision == "mixed":
+        return "flow" in sample and bool(torch.isfinite(sample["flow"]).any())
+    return config.supervision == "flow"
 
 
 def collate(samples: list[Sample]) -> Sample:

@@ -8,7 +8,8 @@ from waves import Shifts
 from gelflow.config import TrainConfig
 from gelflow.errors import InputError
 from gelflow.ops.warp import inside, warp
-from gelflow.train.samples import StepSampler, TrainingSamples, checked, collate, resized
+from gelflow.train.resident import resident
+from gelflow.train.samples import CheckedPairs, StepSampler, TrainingSamples, checked, collate, resized
 
 
 def test_every_pass_sees_every_pair_once_in_another_order() -> None:
@@ -113,3 +114,49 @@ def test_a_batch_has_flow_only_if_all_its_samples_do() -> None:
     both = [checked(Shifts(1, 64, 1.0, seed=9, flow=known)[0]) for known in (True, False)]
     assert "flow" not in collate(both)
     assert collate([both[0], both[0]])["flow"].shape == (2, 2, 64, 64)
+
+
+@pytest.mark.parametrize("supervision", ["flow", "mixed"])
+def test_a_pair_smaller_than_the_crop_is_set_into_it_without_flow_around(supervision: str) -> None:
+    config = TrainConfig(supervision=supervision, crop_size=(96, 160), flip=False)
+    with pytest.raises(InputError, match="crop_size 96x160 does not fit into its 80x80 px"):
+        TrainingSamples(Shifts(1, 80, 1.0, seed=8, flow=False), TrainConfig(crop_size=(96, 160)))[(0, 0)]
+    samples = TrainingSamples(Shifts(1, 80, 1.0, seed=8), config)
+    first = Shifts(1, 80, 1.0, seed=8)[0]
+    places = set()
+    for draw in range(6):
+        sample = samples[(0, draw)]
+        assert sample["image1"].shape == (3, 96, 160)
+        known = torch.isfinite(sample["flow"]).all(dim=0).nonzero()
+        top, left = known.min(dim=0).values.tolist()
+        assert (known.max(dim=0).values - known.min(dim=0).values).tolist() == [79, 79]
+        assert len(known) == 80 * 80
+        for key in ("image1", "image2", "flow"):
+            assert torch.equal(sample[key][:, top : top + 80, left : left + 80], first[key])
+        # Fails with the images padded by zeros.
+        assert torch.equal(sample["image2"][:, 0, left : left + 80], first["image2"][:, 0])
+        places.add((top, left))
+    assert len(places) > 1
+
+
+def test_resident_pairs_are_those_of_the_files() -> None:
+    class Bytes(Shifts):
+        def __getitem__(self, index: int) -> dict:
+            sample = super().__getitem__(index)
+            return sample | {"image1": (255 * sample["image1"]).round() / 255}
+
+    pairs = CheckedPairs(Bytes(3, 64, 1.0, seed=8), supervised=True)
+    kept = resident(pairs, torch.device("cpu"), 0, room=10**7)
+    assert kept is not None
+    assert len(kept) == 3
+    for index in range(3):
+        original, sample = pairs[index], kept[index]
+        assert sample.keys() == original.keys()
+        assert sample["name"] == original["name"]
+        # image1 was kept as bytes, image2, whose values are no whole 255ths, as it is.
+        for key in ("image1", "image2", "flow"):
+            assert torch.equal(sample[key], original[key])
+    pixels = 64 * 64
+    assert resident(pairs, torch.device("cpu"), 0, room=3 * pixels * (3 + 12 + 8)) is not None
+    # Fails with images that are always kept as float32, and without a limit.
+    assert resident(pairs, torch.device("cpu"), 0, room=3 * pixels * (3 + 12 + 8) - 1) is None

@@ -1,0 +1,68 @@
+"""Pairs that are decoded once and stay on the CUDA device: there, decoding files would take far longer than training.
+
+Images whose values are whole 255ths stay bytes; everything else is float32, so that samples are those of the files bit
+by bit.
+"""
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader, Dataset
+
+from gelflow.train.samples import CheckedPairs, Sample
+
+SHARE_OF_MEMORY = 0.5
+"""Of the device's free memory, so much at most is taken by pairs."""
+
+
+class ResidentPairs(Dataset[Sample]):
+    """Checked samples on a device; see `resident`."""
+
+    def __init__(self, samples: list[Sample]) -> None:
+        self._samples = samples
+
+    def __len__(self) -> int:
+        return len(self._samples)
+
+    def __getitem__(self, index: int) -> Sample:
+        """The sample as the files give it, its tensors on the device."""
+        return {key: _unpacked(value) for key, value in self._samples[index].items()}
+
+
+def resident(pairs: CheckedPairs, device: torch.device, workers: int, room: int | None = None) -> ResidentPairs | None:
+    """Decodes all pairs and puts them on a device.
+
+    Args:
+        pairs: The pairs, as training needs them.
+        device: Where to.
+        workers: Processes that decode; 0: this one.
+        room: Bytes that they may take; None: half of what is free on the CUDA device.
+
+    Returns:
+        The pairs, or None where they do not fit.
+
+    Raises:
+        InputError: A pair cannot be used.
+    """
+    if room is None:
+        room = int(SHARE_OF_MEMORY * torch.cuda.mem_get_info(device)[0])
+    samples: list[Sample] = []
+    for sample in DataLoader(pairs, batch_size=None, num_workers=workers):
+        packed = {key: _packed(value) for key, value in sample.items()}
+        room -= sum(value.nbytes for value in packed.values() if isinstance(value, Tensor))
+        if room < 0:
+            return None
+        samples.append({key: value.to(device) if isinstance(value, Tensor) else value for key, value in packed.items()})
+    return ResidentPairs(samples)
+
+
+def _packed(value: Any) -> Any:
+    if not isinstance(value, Tensor) or value.shape[0] != 3:
+        return value
+    levels = (255 * value).round()
+    return levels.to(torch.uint8) if torch.equal(levels.clamp(0, 255) / 255, value) else value
+
+
+def _unpacked(value: Any) -> Any:
+    return value.float() / 255 if isinstance(value, Tensor) and value.dtype == torch.uint8 else value

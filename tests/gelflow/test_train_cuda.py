@@ -1,0 +1,96 @@
+"""Training on a CUDA device: recorded passes, resident pairs and the device's correlation against plain execution."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch.nn.utils import parameters_to_vector
+from waves import Shifts
+
+from gelflow.config import LossConfig, ModelConfig, TrainConfig
+from gelflow.models import GelFlow
+from gelflow.ops.correlation import local_correlation
+from gelflow.train import train
+from gelflow.train.checkpoint import load_weights
+from gelflow.train.graph import GraphedNetwork
+
+pytestmark = [
+    pytest.mark.cuda,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
+]
+
+SMALL = ModelConfig(levels=5, estimator="shared", refine="half")
+
+
+def images(seed: int, side: int = 96) -> list[torch.Tensor]:
+    random = torch.Generator().manual_seed(seed)
+    return [torch.rand(2, 3, side, side, generator=random).cuda() for _ in range(2)]
+
+
+def loss_and_gradient(network: object, model: GelFlow, pair: list[torch.Tensor]) -> tuple[float, torch.Tensor]:
+    model.zero_grad()
+    loss = sum(flow.square().mean() for flow in network(*pair))  # type: ignore[operator]
+    loss.backward()
+    return float(loss), torch.cat([parameter.grad.flatten().clone() for parameter in model.parameters()])
+
+
+def test_recorded_passes_are_the_networks_own() -> None:
+    torch.manual_seed(0)
+    model = GelFlow(SMALL).cuda().train()
+    graphed = GraphedNetwork(model)
+    for seed in range(3):
+        pair = images(seed)
+        loss, gradient = loss_and_gradient(graphed, model, pair)
+        expected, plain = loss_and_gradient(model, model, pair)
+        # float32 with sums in another order, TF32 in the convolutions of both.
+        assert loss == pytest.approx(expected, rel=1e-3)
+        assert (gradient - plain).norm() < 1e-2 * plain.norm()
+        with torch.no_grad():  # the recording reads the weights anew. Fails with a copy of the model recorded
+            for parameter in model.parameters():
+                parameter.mul_(1.1)
+    assert graphed(*images(9, 64))[0].shape == (2, 2, 64, 64)
+
+
+def test_recorded_passes_in_bfloat16_follow_the_weights() -> None:
+    torch.manual_seed(0)
+    model = GelFlow(SMALL).cuda().train()
+    graphed = GraphedNetwork(model)
+    for seed in range(2):
+        with torch.autocast("cuda", torch.bfloat16):
+            loss, _ = loss_and_gradient(graphed, model, images(seed))
+            expected, _ = loss_and_gradient(model, model, images(seed))
+        assert loss == pytest.approx(expected, rel=0.05)
+        with torch.no_grad():
+            for parameter in model.parameters():
+                parameter.mul_(1.3)
+
+
+@pytest.mark.parametrize("radius", [1, 4])
+def test_correlation_is_that_of_the_cpu(radius: int) -> None:
+    random = torch.Generator().manual_seed(1)
+    one, two = (torch.randn(2, 8, 12, 17, generator=random, dtype=torch.float64, requires_grad=True) for _ in range(2))
+    there = [state.detach().cuda().requires_grad_() for state in (one, two)]
+    here = local_correlation(one, two, radius)
+    costs = local_correlation(*there, radius)
+    torch.testing.assert_close(costs.cpu(), here, rtol=1e-12, atol=1e-12)
+    weights = torch.randn(here.shape, generator=random, dtype=torch.float64)
+    (here * weights).sum().backward()
+    (costs * weights.cuda()).sum().backward()
+    for plain, moved in zip((one, two), there, strict=True):
+        torch.testing.assert_close(moved.grad.cpu(), plain.grad, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("supervision", ["flow", "mixed", "self"])
+def test_a_run_with_graph_and_cache_is_one_without(tmp_path: Path, supervision: str) -> None:
+    pairs = Shifts(6, 96, 2.0, seed=1)
+    weights = []
+    for fast in (True, False):
+        config = TrainConfig(supervision=supervision, batch_size=2, steps=4, model=SMALL, cuda_graph=fast, cache=fast,
+                             loss=LossConfig(lambda_s=(1.0,) * 4), device="cuda")  # fmt: skip
+        result = train(config, pairs, None, tmp_path / str(fast))
+        weights.append(parameters_to_vector(load_weights(result.weights).parameters()).detach())
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        start = parameters_to_vector(GelFlow(SMALL).parameters()).detach()
+    # Adam's first steps are the learning rate times the gradient's sign: signs of gradients near zero may differ.
+    assert (weights[0] - weights[1]).norm() < 0.2 * (weights[1] - start).norm()
