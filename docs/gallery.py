@@ -1,4 +1,7 @@
-"""The README's gallery: `python docs/gallery.py data/gallery/* --out docs/images/gallery.jpg`."""
+"""The README's gallery, scenes as ordered: `python docs/gallery.py data/gallery/* --out docs/images/gallery.jpg`.
+
+Each of data/gallery is made by `python -m synth generate --scene NAME --n 2 --out data/gallery/NAME`.
+"""
 
 import argparse
 from pathlib import Path
