@@ -8,9 +8,9 @@ that they belong to; scale s has 1/2^s of the image's resolution.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from gelflow.errors import InputError
 
@@ -226,7 +226,7 @@ class TrainConfig(_Frozen):
     """Processes that load data; 0: in the training process."""
     seed: int = Field(default=0, ge=0)
     """Seed of the initial weights, of the order of the pairs and of the augmentation."""
-    precision: Literal["32", "bf16"] = "32"
+    precision: Annotated[Literal["32", "bf16"], BeforeValidator(str)] = "32"
     """float32, or bfloat16 for the convolutions; flows and losses are float32 in both."""
     ema_decay: float = Field(default=0.0, ge=0, lt=1)
     """Validate and keep an exponential moving average of the weights, decay per step (0.999 is usual); 0: the weights
