@@ -32,11 +32,22 @@ Assignments = Annotated[list[str] | None, Parameter("--set", help="KEY=VALUE, su
 Out = Annotated[Path, Parameter(help="Folder for the results.")]
 Validation = Annotated[list[Path] | None, Parameter(help="Folders of pairs to validate on.")]
 Config = Annotated[
-    str | None, Parameter(help="Settings of the run: paper, selfflow, arflow, best, or a TOML file; default: paper.")
+    str | None,
+    Parameter(help="Settings of the run: paper, selfflow, arflow, best, real, or a TOML file; default: paper."),
 ]
 Steps = Annotated[int | None, Parameter(help="Optimiser steps.")]
 Resume = Annotated[bool, Parameter(negative=(), help="Go on with the run that --out holds.")]
-OnDevice = Annotated[Device, Parameter(help="Where networks run; auto: a CUDA device where there is one.")]
+OnDevice = Annotated[
+    Device, Parameter(help="Where networks and elastic refinement run; auto: a CUDA device where there is one.")
+]
+ElasticUse = Annotated[
+    Literal["on", "off"] | None,
+    Parameter(
+        help="Correct the network's flow by elastic refinement on the images: brings image 2 closer to image 1, not "
+        "always the flow closer to the motion. Default: as the weights' training asked for; on takes their settings, "
+        "or those of the preset real."
+    ),
+]
 TrainDevice = Annotated[Device | None, Parameter(help="Where to train; auto: a CUDA device where there is one.")]
 
 
@@ -87,6 +98,7 @@ def evaluate(
     /,
     *,
     weights: Annotated[Path, Parameter(help="File of weights of a network.")],
+    elastic: ElasticUse = None,
     size: Size = None,
     device: OnDevice = "auto",
     as_json: AsJson = False,
@@ -94,7 +106,7 @@ def evaluate(
     """Scores one file of weights on image pairs."""
     from gelflow.commands import run_evaluate
 
-    return run_evaluate(data, weights, size, device, as_json)
+    return run_evaluate(data, weights, elastic, size, device, as_json)
 
 
 @app.command
@@ -106,7 +118,9 @@ def compare(
     methods: Annotated[
         str,
         Parameter(
-            help="Methods, separated by commas; an empty text for none. Beside the default ones: al-dic (pyALDIC)."
+            help="Methods, separated by commas; an empty text for none. Beside the default ones, which are the "
+            "paper's: dis-elastic (DIS medium, then elastic refinement), exact (the exact flow of synthetic pairs), "
+            "al-dic (pyALDIC)."
         ),
     ] = "none,lucas-kanade,farneback,dis-ultrafast,dis-fast,dis-medium,tvl1",
     weights: Annotated[
@@ -116,11 +130,23 @@ def compare(
             "Labels that differ after # alone (best#0, best#1) are seeds: one row, mean and standard deviation."
         ),
     ] = None,
+    elastic: Annotated[
+        Literal["on", "off", "both"] | None,
+        Parameter(
+            help="Elastic refinement of GelFlow networks; their rows' names end with +elastic. both: a row without and "
+            "one with, of the same weights. Default: as the weights' training asked for; on takes their settings, or "
+            "those of the preset real."
+        ),
+    ] = None,
     ft: Annotated[
         int, Parameter(help="Steps of test-time optimisation of each GelFlow network on these pairs, reported apart.")
     ] = 0,
     ft_config: Annotated[
-        str | None, Parameter(help="Its settings; default: those of the network's own training. A preset or TOML file.")
+        str | None,
+        Parameter(
+            help="A preset or TOML file with its losses, learning rate, batch and flips; default: those of the "
+            "network's own training, in batches of 4. What it takes of neither: gelflow/baselines/finetuned.py."
+        ),
     ] = None,
     batch: Annotated[int, Parameter(help="Pairs at once where networks' speed and memory are measured; 0: not.")] = 1,
     every: Annotated[int, Parameter(help="Take every n-th pair only, for methods that are slow.")] = 1,
@@ -134,7 +160,9 @@ def compare(
     """Scores several methods on the same image pairs."""
     from gelflow.commands import run_compare
 
-    return run_compare(data, out, methods, weights or [], size, device, as_json, (ft, ft_config), batch, every, add)
+    return run_compare(
+        data, out, methods, weights or [], elastic, size, device, as_json, (ft, ft_config), batch, every, add
+    )
 
 
 @app.command
@@ -146,8 +174,11 @@ def predict(
     weights: Annotated[Path | None, Parameter(help="File of weights of a network; or give --method.")] = None,
     method: Annotated[
         str | None,
-        Parameter(help="Instead: lucas-kanade, farneback, dis-ultrafast, dis-fast, dis-medium, tvl1, al-dic."),
+        Parameter(
+            help="Instead: lucas-kanade, farneback, dis-ultrafast, dis-fast, dis-medium, tvl1, dis-elastic, al-dic."
+        ),
     ] = None,
+    elastic: ElasticUse = None,
     reference: Annotated[
         Literal["first", "previous"], Parameter(help="Of a video: flow from its first frame, or from the one before.")
     ] = "first",
@@ -159,7 +190,7 @@ def predict(
     """Flow of a pair of images or of a video, to EXR, .flo and pictures."""
     from gelflow.commands import run_predict
 
-    return run_predict(inputs, out, weights, method, reference, every, size, device, as_json)
+    return run_predict(inputs, out, weights, method, elastic, reference, every, size, device, as_json)
 
 
 @app.command

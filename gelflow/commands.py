@@ -9,11 +9,11 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from statistics import quantiles
-from typing import Any
+from typing import Any, Literal
 
 from gelflow.baselines import Method, named_methods
 from gelflow.baselines.finetuned import fine_tuned
-from gelflow.baselines.learned import Learned, PublishedRaft, open_network
+from gelflow.baselines.learned import Elastic, Learned, PublishedRaft, open_network
 from gelflow.compare import compare
 from gelflow.comparison import Comparison
 from gelflow.data import PairDataset, join, open_pairs
@@ -75,9 +75,11 @@ def run_train(
     return 0
 
 
-def run_evaluate(data: Sequence[Path], weights: Path, size: str | None, device: str, as_json: bool) -> int:
+def run_evaluate(
+    data: Sequence[Path], weights: Path, elastic: Elastic, size: str | None, device: str, as_json: bool
+) -> int:
     """`evaluate`."""
-    network = open_network(weights, None, parse_size(size), device)
+    network = open_network(weights, None, parse_size(size), device, elastic)
     _score(open_all(data), [network], None, as_json, 1)
     return 0
 
@@ -87,6 +89,7 @@ def run_compare(
     out: Path | None,
     methods: str,
     weights: Sequence[str],
+    elastic: Elastic | Literal["both"],
     size: str | None,
     device: str,
     as_json: bool,
@@ -97,30 +100,42 @@ def run_compare(
 ) -> int:
     """`compare`; `methods` are separated by commas, `weights` are FILE or LABEL=FILE, of the pairs each `every`-th.
 
-    `fine_tuning` is the number of steps, 0 for none, and the configuration of a test-time optimisation.
+    `elastic` is for GelFlow's networks, "both" for a row without and one with; `fine_tuning` is the number of steps, 0
+    for none, and the configuration of a test-time optimisation.
     """
     if add and out is None:
         raise InputError("--add: give the folder of the earlier comparison as --out")
     if every < 1:
         raise InputError(f"--every {every}: a number from 1 on is needed")
-    chosen = named_methods([name.strip() for name in methods.split(",") if name.strip()])
-    networks = [_labelled(given, size, device) for given in weights]
+    chosen = named_methods([name.strip() for name in methods.split(",") if name.strip()], device)
+    networks = [network for given in weights for network in _labelled(given, elastic, size, device)]
     steps, config = fine_tuning
     own = [network for network in networks if isinstance(network, Learned)]
+    if elastic is not None and not own:
+        raise InputError(f"--elastic {elastic}: needs --weights of GelFlow; of DIS there is the method dis-elastic")
     dataset = open_all(data)
     dataset = PairDataset(dataset.source, dataset.records[::every])
     if steps > 0:
         if out is None or not own:
             raise InputError(f"--ft {steps}: needs --weights of GelFlow, and --out beside which their copies are kept")
         folder = out.with_name(f"{out.name}_ft")
-        networks += [fine_tuned(one, dataset, folder / one.name.replace("/", "_"), steps, config) for one in own]
+        networks += [fine_tuned(one, dataset, folder / one.label.replace("/", "_"), steps, config) for one in own]
     _score(dataset, [*chosen, *networks], out, as_json, batch, add)
     return 0
 
 
-def _labelled(given: str, size: str | None, device: str) -> Learned | PublishedRaft:
+def _labelled(
+    given: str, elastic: Elastic | Literal["both"], size: str | None, device: str
+) -> list[Learned | PublishedRaft]:
+    """The rows of one --weights: of GelFlow as many as --elastic asks for, of RAFT, which it does not concern, one."""
+    from gelflow.models.raft import looks_like_raft
+
     label, equals, file = given.partition("=")
-    return open_network(Path(file if equals else given), label if equals else None, parse_size(size), device)
+    path, name = Path(file if equals else given), label if equals else None
+    choices: tuple[Elastic, ...] = ("off", "on") if elastic == "both" else (elastic,)
+    if looks_like_raft(path):
+        choices = (None,)
+    return [open_network(path, name, parse_size(size), device, choice) for choice in choices]
 
 
 def _score(
@@ -151,6 +166,7 @@ def run_predict(
     out: Path,
     weights: Path | None,
     method: str | None,
+    elastic: Elastic,
     reference: Reference,
     every: int,
     size: str | None,
@@ -164,9 +180,11 @@ def run_predict(
         if not path.exists():
             raise InputError(f"{path}: there is no such file or folder")
     if method is not None and weights is None:
-        estimator = named_methods([method])[0]
+        if elastic is not None:
+            raise InputError(f"--elastic {elastic}: is for --weights of GelFlow; of DIS there is --method dis-elastic")
+        estimator = named_methods([method], device)[0]
     elif weights is not None and method is None:
-        estimator = open_network(weights, None, parse_size(size), device)
+        estimator = open_network(weights, None, parse_size(size), device, elastic)
     else:
         raise InputError("give either --weights FILE (of a network) or --method NAME (a classical one)")
     if len(inputs) == 2:

@@ -69,7 +69,7 @@ def _speed(method: Method, dataset: PairDataset, batch: int) -> Speed | None:
         return None
     shape = dataset.images(0)[0].shape
     size = method.size or getattr(method.model, "image_size", None) or (shape[0], shape[1])
-    return network_speed(method.model, size, batch, method.device)
+    return network_speed(method.forward, size, batch, method.device)
 
 
 def _earlier(out: Path, dataset: PairDataset, add: bool) -> Comparison | None:

@@ -9,6 +9,7 @@ from statistics import fmean, median
 
 import numpy as np
 
+from gelflow.baselines.exact import ExactFlow
 from gelflow.baselines.method import Method
 from gelflow.data.pairs import PairDataset
 from gelflow.errors import InputError
@@ -90,7 +91,7 @@ def score_pair(method: Method, dataset: PairDataset, index: int) -> PairScore:
     truth, markers = dataset.truth(index), dataset.markers(index)
     started, busy = time.perf_counter(), time.process_time()
     try:
-        flow = method.flow(image1, image2)
+        flow = method.of(truth) if isinstance(method, ExactFlow) else method.flow(image1, image2)
     except InputError as error:
         raise InputError(f"{dataset.source}, pair {name}, {method.name}: {error}") from error
     seconds, processor_seconds = time.perf_counter() - started, time.process_time() - busy

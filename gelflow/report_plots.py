@@ -10,7 +10,8 @@ from gelflow.files.atomic import replacing
 from gelflow.seeds import Group, group_name
 from gelflow.strata import EDGE, MOTION, PATTERN, Stratum, merged
 
-NO_MOTION = "no motion"
+UNTIMED = ("no motion", "exact flow")
+"""What takes no time worth drawing."""
 BLUE, RED = "#4477aa", "#cc6677"
 COLOURS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb", "#000000")
 MARKERS = "osD^vPX"
@@ -67,10 +68,10 @@ def plot_work_precision(path: Path, groups: Sequence[Group], note: str) -> None:
 
     Args:
         path: The PNG.
-        groups: The methods; "no motion" takes no time worth drawing and is left out.
+        groups: The methods; those of `UNTIMED` are left out.
         note: What the times were measured on.
     """
-    shown = [group for group in groups if group.name != NO_MOTION]
+    shown = [group for group in groups if group.name not in UNTIMED]
     candidates = [("mean endpoint error (px)", "endpoint_error_px", 1.0), ("PSNR (dB)", "psnr_db", -1.0)]
     panels = [panel for panel in candidates if any(_finite(group.mean(panel[1])) for group in shown)]
     looks = _looks([group.name for group in groups])

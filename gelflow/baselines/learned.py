@@ -1,17 +1,31 @@
 """Networks with weights from a file behind the interface of all methods: GelFlow's own, and RAFT's published ones."""
 
+import re
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-import numpy as np
-
+from gelflow.baselines.elastic import preset_elastic
 from gelflow.baselines.method import check_images
+from gelflow.baselines.tensors import as_array, as_tensor, chosen_device
 from gelflow.errors import InputError
 from gelflow.raster import FlowArray, ImageArray
 
+Elastic = Literal["on", "off"] | None
+"""The elastic refinement after a network: with it, without it, or as the weights' training asked for."""
+
+ELASTIC_SUFFIX = "+elastic"
+"""In the name of every GelFlow network whose flow is refined."""
+
+_END = re.compile(r"((?:#\d+)?(?:\+ft)?)$")
+"""The number of a seed and the mark of fine-tuning, which names end with (see `gelflow.seeds`)."""
+
 
 def open_network(
-    path: Path, name: str | None = None, size: tuple[int, int] | None = None, device: str = "auto"
+    path: Path,
+    name: str | None = None,
+    size: tuple[int, int] | None = None,
+    device: str = "auto",
+    elastic: Elastic = None,
 ) -> "Learned | PublishedRaft":
     """The network that a file of weights belongs to: GelFlow (.safetensors) or RAFT (.pth).
 
@@ -20,27 +34,19 @@ def open_network(
         name: Name in tables; None: the name of the file's folder and file.
         size: Rows and columns at which the network works; None: those of its training, or of the images.
         device: "auto" (a CUDA device where there is one), "cpu" or "cuda".
+        elastic: See `Learned`.
 
     Raises:
-        InputError: The file is missing, damaged or of another network, or the device is not there.
+        InputError: The file is missing, damaged or of another network, the device is not there, or `elastic` is given
+            for RAFT.
     """
     from gelflow.models.raft import looks_like_raft
 
-    return (PublishedRaft if looks_like_raft(path) else Learned)(path, name, size, device)
-
-
-def chosen_device(device: str) -> str:
-    """The device that an option stands for.
-
-    Raises:
-        InputError: A CUDA device is asked for and there is none.
-    """
-    import torch
-
-    available = torch.cuda.is_available()
-    if device == "cuda" and not available:
-        raise InputError("--device cuda: no CUDA device was found; use --device cpu")
-    return ("cuda" if available else "cpu") if device == "auto" else device
+    if not looks_like_raft(path):
+        return Learned(path, name, size, device, elastic)
+    if elastic is not None:
+        raise InputError(f"--elastic {elastic}: {path} is RAFT; only GelFlow's networks have the elastic refinement")
+    return PublishedRaft(path, name, size, device)
 
 
 class Learned:
@@ -48,23 +54,42 @@ class Learned:
 
     Args:
         path: Weights, as `gelflow train` writes them.
-        name: Name in tables; None: the name of the file's folder and file.
+        name: Name in tables; None: the name of the file's folder and file. "+elastic" is added where the flow is
+            refined and the name does not say so, in front of a seed's number and of "+ft".
         size: Rows and columns at which the network works; None: those of its training.
         device: "auto" (a CUDA device where there is one), "cpu" or "cuda".
+        elastic: None: the elastic refinement that the weights' training asked for, if any; "on": the same, or where
+            it asked for none, that of the preset `real`; "off": none.
+
+    Attributes:
+        label: The name without what is added to it.
+        trained: The architecture as the file has it, its own elastic refinement included.
 
     Raises:
         InputError: The file is missing, damaged or of another model, or the device is not there.
     """
 
     def __init__(
-        self, path: Path, name: str | None = None, size: tuple[int, int] | None = None, device: str = "auto"
+        self,
+        path: Path,
+        name: str | None = None,
+        size: tuple[int, int] | None = None,
+        device: str = "auto",
+        elastic: Elastic = None,
     ) -> None:
         from gelflow.train.checkpoint import load_weights
 
         self.path = path
         self.device = chosen_device(device)
+        self.elastic = elastic
         self.model: Any = load_weights(path, self.device)
-        self.name = name or "/".join(path.with_suffix("").parts[-2:])
+        self.trained = self.model.config
+        if elastic is not None:
+            config = None if elastic == "off" else self.trained.elastic or preset_elastic()
+            self.model.config = self.trained.model_copy(update={"elastic": config})
+        self.label = name or "/".join(path.with_suffix("").parts[-2:])
+        refined = self.model.config.elastic is not None and ELASTIC_SUFFIX not in self.label
+        self.name = _END.sub(rf"{ELASTIC_SUFFIX}\1", self.label, count=1) if refined else self.label
         self.size = size
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
@@ -72,8 +97,24 @@ class Learned:
         from gelflow.estimate import estimate_flow
 
         check_images(image1, image2)
-        tensors = [_tensor(image, self.device) for image in (image1, image2)]
-        return _array(estimate_flow(self.model, tensors[0], tensors[1], self.size))
+        tensors = [as_tensor(image, self.device) for image in (image1, image2)]
+        return as_array(estimate_flow(self.model, tensors[0], tensors[1], self.size))
+
+    def forward(self, image1: Any, image2: Any) -> Any:
+        """What `flow` costs beside reading and resizing: the network and, where it is on, the elastic refinement.
+
+        Args:
+            image1: Tensor (B, 3, H, W) in [0, 1] on the network's device.
+            image2: The same shape.
+
+        Returns:
+            (B, 2, H, W), px.
+        """
+        from gelflow.models.elastic import refined
+
+        flow = self.model(image1, image2)[0]
+        config = self.model.config.elastic
+        return flow if config is None else refined(flow, image1, image2, config)
 
 
 class PublishedRaft:
@@ -101,16 +142,10 @@ class PublishedRaft:
 
         check_images(image1, image2)
         native = (image1.shape[0], image1.shape[1])
-        tensors = [resize_images(_tensor(image, self.device), self.size or native) for image in (image1, image2)]
+        tensors = [resize_images(as_tensor(image, self.device), self.size or native) for image in (image1, image2)]
         with torch.no_grad():
-            return _array(resize_flow(self.model(*tensors), native))
+            return as_array(resize_flow(self.model(*tensors), native))
 
-
-def _tensor(image: ImageArray, device: str) -> Any:
-    import torch
-
-    return torch.from_numpy(np.ascontiguousarray(np.moveaxis(image, -1, 0)))[None].to(device)
-
-
-def _array(flow: Any) -> FlowArray:
-    return np.ascontiguousarray(np.moveaxis(flow[0].float().cpu().numpy(), 0, -1))
+    def forward(self, image1: Any, image2: Any) -> Any:
+        """See `Learned.forward`."""
+        return self.model(image1, image2)

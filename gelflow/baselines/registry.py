@@ -4,6 +4,8 @@ from collections.abc import Callable, Sequence
 
 from gelflow.baselines.aldic import ALDIC
 from gelflow.baselines.classical import DIS, TVL1, Farneback, NoMotion
+from gelflow.baselines.elastic import ElasticDIS
+from gelflow.baselines.exact import ExactFlow
 from gelflow.baselines.lucas_kanade import LucasKanade
 from gelflow.baselines.method import Method
 from gelflow.errors import InputError
@@ -17,19 +19,27 @@ CLASSICAL: dict[str, Callable[[], Method]] = {
     "dis-medium": lambda: DIS("medium"),
     "tvl1": TVL1,
 }
-"""Methods that need nothing but this package's requirements."""
+"""The paper's methods that need no training, and no motion."""
 
-OPTIONAL: dict[str, Callable[[], Method]] = {"al-dic": ALDIC}
-"""Methods that need another package, which they name where it is missing."""
+BESIDE: dict[str, Callable[[], Method]] = {"exact": ExactFlow, "al-dic": ALDIC}
+"""Methods that the paper does not have: the answer itself, where the data have it, and pyALDIC, another package that
+is named where it is missing. Beside these two `dis-elastic`, which may run on a device."""
+
+ELASTIC = "dis-elastic"
+"""DIS medium with this project's elastic refinement, see `gelflow.baselines.elastic`; not in the paper."""
 
 
-def named_methods(names: Sequence[str]) -> list[Method]:
-    """Classical methods by name, in the given order.
+def named_methods(names: Sequence[str], device: str = "cpu") -> list[Method]:
+    """Methods without weights by name, in the given order.
+
+    Args:
+        names: Keys of `CLASSICAL` and `BESIDE`, or `ELASTIC`.
+        device: "auto", "cpu" or "cuda": for what can run on another device than the processor.
 
     Raises:
-        InputError: A name is not known, or is given twice.
+        InputError: A name is not known, or is given twice, or the device is not there.
     """
-    known = CLASSICAL | OPTIONAL
+    known = CLASSICAL | {ELASTIC: lambda: ElasticDIS(device)} | BESIDE
     for name in names:
         if name not in known:
             raise InputError(f"there is no method {name!r}; allowed: {', '.join(known)}")

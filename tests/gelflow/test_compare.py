@@ -119,3 +119,16 @@ def test_broken_pair_is_named(tmp_path: Path) -> None:
     (folder / "b_2.png").write_bytes(b"broken")
     with pytest.raises(InputError, match=r"b_2\.png"):
         compare(named_methods(["none"]), open_pairs(folder))
+
+
+def test_the_exact_flow_is_a_row_on_synthetic_pairs_only(tmp_path: Path) -> None:
+    """Fails with the truth negated, and with its gaps left in: the strip without gel is black in the warped image."""
+    dataset = open_pairs(write_synthetic(tmp_path / "exact", [(2.0, 1.0)]))
+    (exact,) = evaluate(named_methods(["exact"])[0], dataset)
+    (true,) = evaluate(Constant("true", 2, 1), dataset)
+    (none,) = evaluate(Constant("none", 0, 0), dataset)
+    assert (exact.method, exact.endpoint_error_px, exact.outliers_01px) == ("exact flow", 0.0, 0.0)
+    assert none.psnr_db + 3 < exact.psnr_db < true.psnr_db  # the strip of 8 of 80 px does move in these images
+    plain = open_pairs(write_folder(tmp_path / "plain", {"a": (1, 0)}))
+    with pytest.raises(InputError, match="pair a, exact flow: the pair has no exact flow; leave the method exact out"):
+        evaluate(named_methods(["exact"])[0], plain)

@@ -1,0 +1,37 @@
+"""Images and flows between the arrays of methods, (H, W, C), and torch's tensors, (1, C, H, W)."""
+
+from typing import Any
+
+import numpy as np
+
+from gelflow.errors import InputError
+from gelflow.raster import FlowArray, ImageArray
+
+
+def chosen_device(device: str) -> str:
+    """The device that an option stands for.
+
+    Args:
+        device: "auto" (a CUDA device where there is one), "cpu" or "cuda".
+
+    Raises:
+        InputError: A CUDA device is asked for and there is none.
+    """
+    import torch
+
+    available = torch.cuda.is_available()
+    if device == "cuda" and not available:
+        raise InputError("--device cuda: no CUDA device was found; use --device cpu")
+    return ("cuda" if available else "cpu") if device == "auto" else device
+
+
+def as_tensor(image: ImageArray, device: str) -> Any:
+    """An image or flow (H, W, C) float32 as a tensor (1, C, H, W) on a device."""
+    import torch
+
+    return torch.from_numpy(np.ascontiguousarray(np.moveaxis(image, -1, 0)))[None].to(device)
+
+
+def as_array(flow: Any) -> FlowArray:
+    """The first flow of a tensor (B, 2, H, W) as (H, W, 2) float32; waits for the device."""
+    return np.ascontiguousarray(np.moveaxis(flow[0].float().cpu().numpy(), 0, -1))
