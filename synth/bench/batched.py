@@ -67,10 +67,27 @@ def ball_scene(rng: np.random.Generator, depth_mm: float, drag_mm: float, steps:
     )
 
 
-def shared_mesh(across: Sequence[int], through: int, growth: float) -> PadMesh:
-    """Even along x and y with `across` elements, `growth` per element through the thickness."""
-    counts = Counts((across[0] - 2, across[1] - 2), (1, 1), through, growth=growth)
-    return graded_box(SIZE_MM, Focus((0.0, 0.0), (SIZE_MM[0] / 2, SIZE_MM[1] / 2)), counts)
+def shared_mesh(
+    across: Sequence[int],
+    through: int,
+    growth: float,
+    zone_mm: Sequence[float] | None = None,
+    outside: Sequence[int] = (1, 1),
+) -> PadMesh:
+    """A mesh for presses anywhere in PLACES_MM.
+
+    Args:
+        across: elements along x and y, in all or, with a zone, in it.
+        through: the thickness.
+        growth: per element through the thickness.
+        zone_mm: half width of a rectangle beyond which elements grow; none: they are even.
+        outside: elements on either side of it, along x and y.
+    """
+    if zone_mm is None:
+        counts = Counts((across[0] - 2, across[1] - 2), (1, 1), through, growth=growth)
+        return graded_box(SIZE_MM, Focus((0.0, 0.0), (SIZE_MM[0] / 2, SIZE_MM[1] / 2)), counts)
+    counts = Counts((across[0], across[1]), (outside[0], outside[1]), through, growth=growth)
+    return graded_box(SIZE_MM, Focus((0.0, 0.0), (zone_mm[0], zone_mm[1])), counts)
 
 
 def measure(
@@ -248,7 +265,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--batch", type=int, nargs="+", default=[512])
     parser.add_argument("--seconds", type=float, default=60.0, help="of each batch size")
-    parser.add_argument("--across", type=int, nargs=2, default=[14, 10], help="elements along x and y")
+    parser.add_argument("--across", type=int, nargs=2, default=[14, 10], help="elements along x and y, or in the zone")
+    parser.add_argument("--zone", type=float, nargs=2, help="mm; half width of the rectangle of even elements")
+    parser.add_argument("--outside", type=int, nargs=2, default=[2, 2], help="elements on either side of the zone")
     parser.add_argument("--through", type=int, default=3)
     parser.add_argument("--growth", type=float, default=1.3)
     parser.add_argument("--depth", type=float, default=2.0, help="mm")
@@ -260,7 +279,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--inner", type=int, default=INNER, help="Krylov iterations of a cycle")
     parser.add_argument("--table", action="store_true", help="print the time of every kernel, too")
     given = parser.parse_args(arguments)
-    mesh = shared_mesh(given.across, given.through, given.growth)
+    mesh = shared_mesh(given.across, given.through, given.growth, given.zone, given.outside)
     began = time.perf_counter()
     pad = prepare(ball_scene(np.random.default_rng(0), given.depth, given.drag, given.steps), mesh, given.device)
     prepared = round(time.perf_counter() - began, 2)

@@ -3,6 +3,8 @@
 pool         workers that each make whole trajectories, or finish rendered ones
 batches      one process with solver and renderer, workers for everything else
 ahead        an iterator that runs in a thread of its own
+textures     painted ahead of their turn
+threads      of the workers' libraries
 """
 
 from synth.processes.batches import outcomes_of_batches

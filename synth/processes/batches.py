@@ -3,9 +3,10 @@
     solver's thread -> a few simulated trajectories -> this thread: rendering -> worker processes: flow, noise, files
 
 Simulation and rendering share this process's GPU, each on a stream of its own, and nothing else uses it. Textures are
-painted in further threads as soon as their sensor's turn is near. Every line between two stages has room for a few
-trajectories: whoever is ahead waits, so that memory does not grow with the number of samples. A killed run loses what
-is in the lines; failed draws and samples come out the same the next time.
+painted in further threads as soon as their sensor's turn is near. Every line between two stages has room for a fixed
+number of trajectories: whoever is ahead waits, so that memory does not grow with the number of samples. The solver's is
+long enough that rendering goes on while the next chunk is drawn. A killed run loses what is in the lines; failed draws
+and samples come out the same the next time.
 """
 
 from collections.abc import Generator, Iterable, Iterator
@@ -16,12 +17,13 @@ from functools import partial
 from synth.arrays import Image
 from synth.processes.ahead import ahead
 from synth.processes.pool import Maker, spread
+from synth.processes.textures import Textures
+from synth.processes.threads import one_thread_each
 from synth.produce import Developed, Outcome, Studio, Task, Workplace, develop, finish, in_batches
 from synth.produce.batches import Result
-from synth.produce.studio import paint
 
-AHEAD = 16
-"""Simulated trajectories that wait to be rendered, at most; their sensors' textures take up to 94 MB each."""
+AHEAD = 256
+"""Simulated trajectories that wait to be rendered, at most: some hundred kilobytes each."""
 PAINTERS = 6
 """Threads that paint textures."""
 
@@ -53,15 +55,17 @@ def outcomes_of_batches(
     def number(item: Developed | Outcome) -> int:
         return item.trajectory if isinstance(item, Developed) else item.given_up[0] // pairs
 
-    with ThreadPoolExecutor(PAINTERS) as painters:
+    with one_thread_each(), ThreadPoolExecutor(PAINTERS) as painters:
+        textures = Textures(place, painters)
         try:
-            with ahead(_painted(place, results, painters), AHEAD) as ready, closing(_developed(studio, ready)) as items:
+            painted = _painted(results, textures)
+            with ahead(painted, AHEAD) as ready, closing(_developed(studio, ready, textures)) as items:
                 yield from spread(place, _finisher, items, workers, number)
         finally:
             painters.shutdown(wait=False, cancel_futures=True)
 
 
-def _painted(place: Workplace, results: Iterable[Result], painters: ThreadPoolExecutor) -> Iterator[Painted]:
+def _painted(results: Iterable[Result], textures: Textures) -> Iterator[Painted]:
     """Results, with their sensors' textures on the way."""
     last: int | None = None
     for result in results:
@@ -70,13 +74,19 @@ def _painted(place: Workplace, results: Iterable[Result], painters: ThreadPoolEx
             continue
         drawn = result.drawn
         new, last = drawn.sensor != last, drawn.sensor
-        yield result, painters.submit(paint, place, drawn.sensor, drawn.scene.sensor) if new else None
+        yield result, textures.ask(drawn.sensor, drawn.scene.sensor) if new else None
 
 
-def _developed(studio: Studio, ready: Iterable[Painted]) -> Generator[Developed | Outcome, None, None]:
+def _developed(
+    studio: Studio, ready: Iterable[Painted], textures: Textures
+) -> Generator[Developed | Outcome, None, None]:
     """Rendered, in this thread: Mitsuba has one variant a process and Dr.Jit one stream a thread."""
     for result, texture in ready:
-        yield result if isinstance(result, Outcome) else develop(studio, result, texture)
+        developed = result if isinstance(result, Outcome) else develop(studio, result, texture)
+        if texture is not None:
+            textures.used()
+        del result, texture  # the texture is the renderer's own now
+        yield developed
 
 
 def _finisher(place: Workplace) -> Maker[Developed | Outcome]:

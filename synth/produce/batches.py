@@ -27,7 +27,8 @@ from synth.template import Template
 BATCH = {True: 256, False: 8}
 """Trajectories at once, with a GPU and without."""
 CHUNK = 4
-"""Trajectories of a chunk in batches: its last ones run beside empty slots."""
+"""Trajectories of a chunk in batches: its last ones run beside empty slots. The first chunk is one batch: nothing
+can be rendered while it is drawn."""
 
 ENOUGH = 16
 """Trajectories that are worth a change of the sensor."""
@@ -106,8 +107,9 @@ class _Solving:
 
     def __iter__(self) -> Iterator[tuple[int, Result]]:
         again: list[Draws] = []
-        while chunk := [*again, *self._begun(self.chunk - len(again))]:
-            again = []
+        most = self.batch
+        while chunk := [*again, *self._begun(most - len(again))]:
+            again, most = [], self.chunk
             ready: dict[Gel, list[tuple[Draws, Drawn]]] = {}
             for draws in chunk:
                 drawn = draws.next()

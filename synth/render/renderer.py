@@ -189,12 +189,14 @@ class Renderer:
             self._trace_pixels(mi, self._rays[name], first, min(step, pixels - first), _fold(seed, k, number))
             for k, first in enumerate(range(0, pixels, step))
         ]
+        # Read when all passes are queued: a GPU works on one while the next is being recorded.
+        sums = np.concatenate([np.stack([np.array(channel) for channel in part], axis=-1) for part in parts])
         image: Image = np.empty((camera.height, camera.width, 3), dtype=np.float32)
-        image.reshape(pixels, 3)[:] = np.concatenate(parts) / samples  # a single channel fills all three
+        image.reshape(pixels, 3)[:] = sums / samples  # a single channel fills all three
         return image
 
-    def _trace_pixels(self, mi: Any, rays: CameraRays, first: int, count: int, seed: int) -> Image:
-        """Summed samples (count, channels) float32 of `count` pixels from `first` on."""
+    def _trace_pixels(self, mi: Any, rays: CameraRays, first: int, count: int, seed: int) -> list[Any]:
+        """Summed samples of `count` pixels from `first` on: (count,) mi.Float of each channel, queued."""
         import drjit as dr
 
         sampler = self._sampler
@@ -211,7 +213,7 @@ class Renderer:
             color, seen, _ = self._integrator.sample(self._scene, sampler, ray, active=valid)
         channels = [dr.select(valid & seen, color[i] * weight, 0) for i in range(1 if self._variant.is_mono else 3)]
         dr.eval(channels)  # all at once: each sum alone would trace everything anew
-        return np.stack([np.array(dr.block_sum(channel, self._samples)) for channel in channels], axis=-1)
+        return [dr.block_sum(channel, self._samples) for channel in channels]
 
     def _build_gel(self, mi: Any, coating: Coating, albedo: Image) -> Any:
         """The mesh with its coating; smooth-shaded, seen from either side."""

@@ -24,7 +24,7 @@ TINY = [
     "motion.steps=2",
     "motion.depth_mm=0.5",
     "motion.shear_mm=[0.2, 0.1]",
-    "numerics.edge_length_mm=2.0",
+    "numerics.target_error_px=5.0",
     'contact.indenter={shape="sphere", radius_mm=4.0}',
 ]
 
@@ -55,7 +55,7 @@ def test_generated_on_a_gpu_verifies_and_agrees_with_the_cpu(cuda: Variant, tmp_
 @pytest.mark.cuda
 def test_batched_on_a_gpu_with_workers_verifies_and_agrees_with_the_cpu(cuda: Variant, tmp_path: Path) -> None:
     """The whole way: solver's thread, renderer, worker processes; on the CPU one thing after another."""
-    shared = [change for change in TINY if "edge_length_mm" not in change]
+    shared = [change for change in TINY if "target_error_px" not in change]
     template = load_scene("gelsight_mini", [*shared, 'numerics.solver="batched"', "numerics.cells=[6, 4, 2]"])
     generate(template, 6, tmp_path / "cuda", variant=cuda, scheduling=Scheduling(workers=2))
     generate(template, 6, tmp_path / "cpu", variant=choose_variant("cpu"), scheduling=Scheduling(workers=1))

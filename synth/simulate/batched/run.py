@@ -91,7 +91,9 @@ class Run:
             self.machine.cycle(self.table)
             return
         if self._graph is None:
-            with wp.ScopedCapture(device=device, force_module_load=False) as capture:
+            # Relaxed: the garbage collector may free a renderer's memory in this thread meanwhile.
+            mode = wp.CaptureMode.RELAXED
+            with wp.ScopedCapture(device=device, force_module_load=False, capture_mode=mode) as capture:
                 self.machine.cycle(self.table)
             self._graph = capture.graph
         wp.capture_launch(self._graph)

@@ -1,0 +1,85 @@
+"""What the driver of a batched job prepares beside rendering, and the threads that it leaves to its workers."""
+
+import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from processes_of import HAS_PROC, workers_of
+from tiny_scene import TEXT, own_cache, write_tiny
+
+from synth.arrays import Image
+from synth.generate import job_variant, make_job
+from synth.processes import outcomes_of_batches, textures
+from synth.processes.threads import THREADS, one_thread_each
+from synth.produce import Workplace
+from synth.scene import Sensor
+from synth.template import load_scene
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Workplace:
+    own_cache(monkeypatch)
+    text = TEXT.replace("edge_length_mm = 1.25", 'solver = "batched"\ncells = [4, 4, 2]')
+    template = load_scene(write_tiny(tmp_path, text))
+    variant = job_variant(template, "cpu")
+    return Workplace(template, make_job(template, 2, 0, variant), tmp_path / "d", variant, tmp_path / "cache")
+
+
+def test_textures_are_painted_in_order_and_few_at_a_time(place: Workplace, monkeypatch: pytest.MonkeyPatch) -> None:
+    # Fails with the last texture asked for painted first, and without regard to room.
+    begun: list[int] = []
+    lock = threading.Lock()
+
+    def painted(_: Workplace, sensor: int, scene: Sensor) -> Image:
+        with lock:
+            begun.append(sensor)
+        if sensor == 5:
+            raise MemoryError("no room for sensor 5")
+        return np.full((1, 1, 3), sensor, dtype=np.float32)
+
+    monkeypatch.setattr(textures, "paint", painted)
+    scene = place.template.corners[0].sensor
+    with ThreadPoolExecutor(1) as painters:
+        ahead = textures.Textures(place, painters, room=2)
+        asked = [ahead.ask(sensor, scene) for sensor in range(6)]
+        for sensor, texture in enumerate(asked[:5]):
+            assert texture.result(10)[0, 0, 0] == sensor
+            assert begun == list(range(len(begun)))
+            assert len(begun) <= sensor + 2
+            ahead.used()
+        with pytest.raises(MemoryError, match="sensor 5"):
+            asked[5].result(10)
+
+
+def test_one_thread_each_leaves_the_environment_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Fails without the values of before.
+    monkeypatch.setenv(THREADS[0], "3")
+    monkeypatch.delenv(THREADS[1], raising=False)
+    with one_thread_each():
+        assert [os.environ[name] for name in THREADS] == ["1"] * len(THREADS)
+    assert os.environ[THREADS[0]] == "3"
+    assert THREADS[1] not in os.environ
+
+
+@pytest.mark.skipif(not HAS_PROC, reason="reads child processes' environment in Linux's /proc")
+def test_finishing_workers_use_one_thread_each(
+    place: Workplace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Fifteen of them beside a solver would fight for the cores."""
+    # Fails with workers that are started as this process is.
+    for name in THREADS:
+        monkeypatch.setenv(name, "7")
+    (tmp_path / "d" / "samples").mkdir(parents=True)
+    outcomes = outcomes_of_batches(place, iter([(0, (0, 1))]), 2, 1)
+    assert len(next(outcomes).entries) == 2
+    workers = workers_of(os.getpid())
+    assert workers
+    for worker in workers:
+        variables = Path(f"/proc/{worker}/environ").read_bytes().split(b"\0")
+        for name in THREADS:
+            assert f"{name}=1".encode() in variables
+    outcomes.close()
+    assert os.environ[THREADS[0]] == "7"
