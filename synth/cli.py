@@ -4,16 +4,17 @@ Exit status: 0 done, 1 done with failed samples or a failed check, 2 wrong input
 imported before a command runs.
 """
 
-import re
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
-from cyclopts import App, CycloptsError, Parameter, Token
+from cyclopts import App, CycloptsError, Parameter
 
 from synth import __version__
+from synth.cli_bench import bench
+from synth.cli_options import DEFAULT_SCENE, AsJson, Assignments, Dataset, Device, SceneName, whole
 from synth.errors import InputError
 
 app = App(
@@ -26,45 +27,22 @@ app = App(
 )
 
 
-def _whole(at_least: int) -> Callable[[Any, Sequence[Token]], int]:
-    """Converter for a whole number; cyclopts' own would round 1.5 to 2."""
-
-    def convert(_: Any, tokens: Sequence[Token]) -> int:
-        text = tokens[0].value
-        if not re.fullmatch(r"[+-]?\d+", text) or int(text) < at_least:
-            raise ValueError(f"it is {text!r}, allowed are whole numbers from {at_least} on")
-        return int(text)
-
-    return convert
-
-
-SceneName = Annotated[str, Parameter(name="--scene", help="A shipped scene's name or a TOML file.")]
-Assignments = Annotated[
-    list[str] | None, Parameter("--set", help="KEY=VALUE with a TOML value, such as motion.depth_mm=1.2; repeatable.")
-]
-Device = Annotated[Literal["auto", "cpu", "cuda"], Parameter(help="Where to render; auto: a GPU with OptiX if any.")]
-AsJson = Annotated[bool, Parameter("--json", negative=(), help="Print the answer as JSON on stdout.")]
-Dataset = Annotated[Path, Parameter(help="A dataset directory.")]
-
-DEFAULT_SCENE = "gelsight_mini"
-
-
 @app.command
 def generate(
     *,
     scene: SceneName = DEFAULT_SCENE,
-    n: Annotated[int, Parameter(converter=_whole(1), help="Samples in the dataset.")] = 8,
+    n: Annotated[int, Parameter(converter=whole(1), help="Samples in the dataset.")] = 8,
     out: Annotated[
         str,
         Parameter(help="Directory or fsspec URL of the dataset; one that holds part of the same job goes on."),
     ] = "data/demo",
-    seed: Annotated[int, Parameter(converter=_whole(0), help="Seed of everything random.")] = 0,
+    seed: Annotated[int, Parameter(converter=whole(0), help="Seed of everything random.")] = 0,
     assignments: Assignments = None,
     device: Device = "auto",
     workers: Annotated[
         int | None,
         Parameter(
-            converter=_whole(1),
+            converter=whole(1),
             help="Processes that make samples; the same come out. Default: 1. With numerics.solver = batched: "
             "processes beside the one that simulates and renders; default on a GPU: one for every other core.",
         ),
@@ -91,7 +69,7 @@ def generate(
 def plan(
     *,
     scene: SceneName = DEFAULT_SCENE,
-    n: Annotated[int, Parameter(converter=_whole(1), help="Samples to predict time and size for.")] = 8,
+    n: Annotated[int, Parameter(converter=whole(1), help="Samples to predict time and size for.")] = 8,
     assignments: Assignments = None,
     device: Device = "auto",
     as_json: AsJson = False,
@@ -107,8 +85,8 @@ def simulate(
     *,
     scene: SceneName,
     out: Annotated[Path, Parameter(help="Directory for trajectory.json and a VTU file per state.")],
-    seed: Annotated[int, Parameter(converter=_whole(0), help="Seed of the draw.")] = 0,
-    index: Annotated[int, Parameter(converter=_whole(0), help="Number of the trajectory that is drawn.")] = 0,
+    seed: Annotated[int, Parameter(converter=whole(0), help="Seed of the draw.")] = 0,
+    index: Annotated[int, Parameter(converter=whole(0), help="Number of the trajectory that is drawn.")] = 0,
     assignments: Assignments = None,
     as_json: AsJson = False,
 ) -> int:
@@ -118,120 +96,7 @@ def simulate(
     return run_simulate(scene, out, seed, index, assignments or [], as_json)
 
 
-bench = App(
-    name="bench", help="Measures how exact simulation and rendering are, and at what cost. Without a command: fem."
-)
 app.command(bench)
-
-
-@bench.default
-@bench.command
-def fem(
-    *,
-    out: Annotated[Path, Parameter(help="Directory for the table, the plot and the report.")] = Path("data/bench"),
-    quick: Annotated[bool, Parameter(negative=(), help="One case and a few settings.")] = False,
-    workers: Annotated[int, Parameter(converter=_whole(1), help="Presses that run at once.")] = 2,
-    as_json: AsJson = False,
-) -> int:
-    """Measures error against run time."""
-    from synth.bench import run_bench
-
-    return run_bench("fem", out, quick, as_json, workers)
-
-
-@bench.command
-def budget(
-    *,
-    scene: Annotated[
-        list[str] | None,
-        Parameter(name="--scene", help="A scene's name or TOML file; repeatable. Default: all shipped."),
-    ] = None,
-    out: Annotated[
-        Path, Parameter(help="Directory for table, plot and report; one that holds part of the same study goes on.")
-    ] = Path("data/bench"),
-    draws: Annotated[int, Parameter(converter=_whole(1), help="Draws of each scene.")] = 20,
-    seed: Annotated[int, Parameter(converter=_whole(0), help="Seed of the draws; the error model saw 0 and 1.")] = 2,
-    reference: Annotated[int, Parameter(converter=_whole(8), help="Most elements across a contact in the truth.")] = 18,
-    workers: Annotated[int, Parameter(converter=_whole(1), help="Presses that run at once.")] = 1,
-    minutes: Annotated[
-        float | None, Parameter(help="Begin no press that will not end within them; the same command goes on.")
-    ] = None,
-    as_json: AsJson = False,
-) -> int:
-    """Compares random draws with much finer solutions: is the error within its target, at little more than it takes?"""
-    from synth.bench import run_budget
-
-    return run_budget(scene or [], out, draws, seed, reference, workers, minutes, as_json)
-
-
-@bench.command
-def render(
-    *,
-    scene: SceneName = DEFAULT_SCENE,
-    out: Annotated[Path, Parameter(help="Directory for the tables, the plot and the report.")] = Path("data/bench"),
-    size: Annotated[
-        str | None,
-        Parameter(help="Image whose errors are measured, such as 160x120. Default: half the scene's. Flow: its own."),
-    ] = None,
-    reference: Annotated[
-        int, Parameter(converter=_whole(64), help="Samples per pixel of what images are held against.")
-    ] = 4096,
-    seeds: Annotated[
-        int, Parameter(converter=_whole(3), help="Seeds of each of the two states whose flow is measured.")
-    ] = 6,
-    device: Device = "auto",
-    seed: Annotated[int, Parameter(converter=_whole(0), help="Seed of the draw.")] = 0,
-    as_json: AsJson = False,
-) -> int:
-    """Measures image error against rendering time, and the render noise that optical flow notices."""
-    from synth.bench import run_render
-
-    return run_render(scene, out, size, reference, seeds, seed, device, as_json)
-
-
-@bench.command
-def scale(
-    *,
-    scene: SceneName = DEFAULT_SCENE,
-    out: Annotated[
-        Path, Parameter(help="Directory for the table and the report; pairs are made there and removed.")
-    ] = Path("data/bench"),
-    n: Annotated[int, Parameter(converter=_whole(1), help="Half of the pairs of each run.")] = 8,
-    size: Annotated[
-        list[str] | None,
-        Parameter(help="Image, such as 640x480; repeatable. Default: the scene's own, and half of it."),
-    ] = None,
-    workers: Annotated[
-        list[int] | None, Parameter(help="Processes; repeatable. Default: 1, 2, 4 ... up to the number of cores.")
-    ] = None,
-    device: Device = "auto",
-    seed: Annotated[int, Parameter(converter=_whole(0), help="Seed of the draws.")] = 0,
-    minutes: Annotated[float | None, Parameter(help="Begin no further run after them.")] = None,
-    as_json: AsJson = False,
-) -> int:
-    """Measures pairs per second, where the time goes, and what larger jobs would take."""
-    from synth.bench import run_scale
-
-    return run_scale(scene, out, n, size or [], workers or [], device, seed, minutes, as_json)
-
-
-@bench.command
-def light(
-    scenes: Annotated[list[str], Parameter(help="Names or files of scenes.")],
-    /,
-    *,
-    out: Annotated[Path, Parameter(help="Directory for the report.")] = Path("data/bench"),
-    reference: Annotated[
-        int, Parameter(converter=_whole(64), help="Samples per pixel of what is held against, path traced.")
-    ] = 4096,
-    device: Device = "auto",
-    seed: Annotated[int, Parameter(converter=_whole(0), help="Seed of the draws.")] = 0,
-    as_json: AsJson = False,
-) -> int:
-    """Measures separated light against path tracing: pictures, time, and what flow methods make of them."""
-    from synth.bench import run_light
-
-    return run_light(scenes, out, reference, seed, device, as_json)
 
 
 @app.command
@@ -239,7 +104,7 @@ def stress(
     *,
     out: Annotated[Path, Parameter(help="Directory for the table, the pictures and the report.")] = Path("data/stress"),
     only: Annotated[list[str] | None, Parameter(help="Names or patterns of cases; repeatable.")] = None,
-    workers: Annotated[int, Parameter(converter=_whole(1), help="Cases that run at once.")] = 1,
+    workers: Annotated[int, Parameter(converter=whole(1), help="Cases that run at once.")] = 1,
     as_json: AsJson = False,
 ) -> int:
     """Runs the stiff and extreme cases and says how each ends."""
@@ -263,7 +128,7 @@ def calibrate(
         float | None, Parameter(help="Distance of the dots' columns where known; else the scene's field of view holds.")
     ] = None,
     steps: Annotated[
-        int, Parameter(converter=_whole(0), help="Most steps of the lights' geometry; 0: powers only.")
+        int, Parameter(converter=whole(0), help="Most steps of the lights' geometry; 0: powers only.")
     ] = 30,
     assignments: Assignments = None,
     as_json: AsJson = False,
@@ -281,7 +146,7 @@ def inspect(
     *,
     png: Annotated[Path | None, Parameter(help="Write a picture sheet.")] = None,
     html: Annotated[Path | None, Parameter(help="Write one self-contained page.")] = None,
-    limit: Annotated[int, Parameter(converter=_whole(1), help="Most samples of a dataset to look at.")] = 100,
+    limit: Annotated[int, Parameter(converter=whole(1), help="Most samples of a dataset to look at.")] = 100,
     as_json: AsJson = False,
 ) -> int:
     """Shows a dataset, a sample or a flow in numbers and pictures."""

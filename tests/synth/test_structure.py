@@ -41,6 +41,8 @@ STAGES = (
     "synth.stress",
     "synth.doctor",
     "synth.commands",
+    "synth.cli_options",
+    "synth.cli_bench",
     "synth.cli",
     "synth.__main__",
 )
