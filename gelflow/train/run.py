@@ -28,7 +28,7 @@ from gelflow.train.checkpoint import load_weights, save_weights
 from gelflow.train.keeper import Keeper, Stopped, describe, stopping, weights_metadata
 from gelflow.train.module import FlowModule
 from gelflow.train.resident import ResidentPairs, resident
-from gelflow.train.samples import CheckedPairs, StepSampler, TrainingSamples, checked, collate
+from gelflow.train.samples import CheckedPairs, StepSampler, TrainingBatches, TrainingSamples, checked, collate
 from gelflow.train.state import STATE, WEIGHTS, load_state, open_run
 from gelflow.train.throughput import peak_memory_mib
 
@@ -214,7 +214,7 @@ class _Data(L.LightningDataModule):
         sampler = StepSampler(len(self.train_set), config, start, stop, trainer.global_rank, trainer.world_size)
         samples = TrainingSamples(self.train_set, config)
         workers = 0 if isinstance(self.train_set, ResidentPairs) else config.workers
-        return DataLoader(samples, batch_sampler=sampler, num_workers=workers, collate_fn=collate)
+        return DataLoader(samples, batch_sampler=sampler, num_workers=workers, collate_fn=TrainingBatches(config))
 
     def _cache(self) -> None:
         """Puts the training pairs on the device, once, where the configuration and the memory allow it."""

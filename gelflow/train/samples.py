@@ -4,7 +4,7 @@ Draw k of a run (k = 0, 1, ...) is a pair and its augmentation, both fixed by (s
 workers nor where a run was interrupted. Each pass over the pairs is a new permutation.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from torch.utils.data import Dataset, Sampler
 from gelflow.config import MINIMUM_SIDE, TrainConfig
 from gelflow.errors import InputError
 from gelflow.estimate import resize_flow, resize_images
-from gelflow.train.motion import with_more_motion
+from gelflow.train.augment import augmented
 
 Sample = dict[str, Any]
 """image1, image2: (3, H, W) float32 in [0, 1]; name; perhaps flow: (2, H, W) float32, px, NaN where no gel is seen."""
@@ -71,14 +71,17 @@ class CheckedPairs(Dataset[Sample]):
         return checked(self.pairs[index], self.supervised)
 
 
-class TrainingSamples(Dataset[Sample]):
-    """Checked pairs resized, cropped and augmented for training; its keys are those of `StepSampler`."""
+class TrainingSamples(Dataset[tuple[Sample, np.random.Generator]]):
+    """Checked pairs resized and cropped, each with the source of the random numbers of its augmentation.
+
+    Its keys are those of `StepSampler`.
+    """
 
     def __init__(self, pairs: Dataset[Sample], config: TrainConfig) -> None:
         self.pairs = pairs
         self.config = config
 
-    def __getitem__(self, key: tuple[int, int]) -> Sample:
+    def __getitem__(self, key: tuple[int, int]) -> tuple[Sample, np.random.Generator]:
         index, draw = key
         sample = self.pairs[index]
         if self.config.image_size is not None:
@@ -87,7 +90,19 @@ class TrainingSamples(Dataset[Sample]):
             size = "x".join(str(side) for side in sample["image1"].shape[1:])
             raise InputError(f"pair {sample['name']}: {size} px, but each side must be at least {MINIMUM_SIDE} px; "
                              "set image_size to enlarge the images")  # fmt: skip
-        return augmented(sample, self.config, np.random.default_rng([self.config.seed, AUGMENTATION, draw]))
+        random = np.random.default_rng([self.config.seed, AUGMENTATION, draw])
+        return cropped(sample, self.config, random), random
+
+
+class TrainingBatches:
+    """Puts samples of `TrainingSamples` together to an augmented batch."""
+
+    def __init__(self, config: TrainConfig) -> None:
+        self.config = config
+
+    def __call__(self, drawn: Sequence[tuple[Sample, np.random.Generator]]) -> Sample:
+        """See `collate` and `augmented`."""
+        return augmented(collate([sample for sample, _ in drawn]), self.config, [random for _, random in drawn])
 
 
 def checked(sample: Sample, supervised: bool = False) -> Sample:
@@ -127,8 +142,8 @@ def resized(sample: Sample, size: tuple[int, int]) -> Sample:
     return new
 
 
-def augmented(sample: Sample, config: TrainConfig, random: np.random.Generator) -> Sample:
-    """The sample after the augmentation that the configuration asks for.
+def cropped(sample: Sample, config: TrainConfig, random: np.random.Generator) -> Sample:
+    """A random crop of the configuration's size, if it has one.
 
     Images that are judged by their flow and are smaller than the crop are continued beyond their border by its colours,
     with no flow there, so that data sets of several sensors can be trained on together.
@@ -136,38 +151,23 @@ def augmented(sample: Sample, config: TrainConfig, random: np.random.Generator) 
     Raises:
         InputError: The crop does not fit into images that are judged on themselves.
     """
-    new = dict(sample) if config.motion is None else with_more_motion(sample, config.motion, random)
-    fields = [key for key in ("image1", "image2", "flow") if key in sample]
-    if config.crop_size is not None:
-        rows, columns = config.crop_size
-        height, width = sample["image1"].shape[-2:]
-        if (rows > height or columns > width) and not _judged_by_flow(sample, config):
-            raise InputError(
-                f"pair {sample['name']}: crop_size {rows}x{columns} does not fit into its {height}x{width} px"
-            )
-        down, right = max(rows - height, 0), max(columns - width, 0)
-        above, before = random.integers(down + 1), random.integers(right + 1)
-        top, left = random.integers(max(height - rows, 0) + 1), random.integers(max(width - columns, 0) + 1)
-        for key in fields:
-            cut = new[key][:, top : top + rows, left : left + columns]
+    if config.crop_size is None:
+        return sample
+    rows, columns = config.crop_size
+    height, width = sample["image1"].shape[-2:]
+    if (rows > height or columns > width) and not _judged_by_flow(sample, config):
+        raise InputError(f"pair {sample['name']}: crop_size {rows}x{columns} does not fit into its {height}x{width} px")
+    down, right = max(rows - height, 0), max(columns - width, 0)
+    above, before = random.integers(down + 1), random.integers(right + 1)
+    top, left = random.integers(max(height - rows, 0) + 1), random.integers(max(width - columns, 0) + 1)
+    new = dict(sample)
+    for key in ("image1", "image2", "flow"):
+        if key in sample:
+            cut = sample[key][:, top : top + rows, left : left + columns]
             if down or right:
                 border = (before, right - before, above, down - above)
                 cut = F.pad(cut, border, value=torch.nan) if key == "flow" else F.pad(cut, border, mode="replicate")
             new[key] = cut
-    if config.flip:
-        for axis, component in ((-1, 0), (-2, 1)):
-            if random.random() < 0.5:
-                for key in fields:
-                    new[key] = new[key].flip(axis)
-                if "flow" in new:
-                    parts = list(new["flow"])
-                    parts[component] = -parts[component]
-                    new["flow"] = torch.stack(parts)
-    if config.color_jitter > 0:
-        gain = torch.from_numpy(np.exp(random.normal(0, config.color_jitter, (3, 1, 1)))).float()
-        gain = gain.to(new["image1"].device, non_blocking=True)
-        for key in ("image1", "image2"):
-            new[key] = (new[key] * gain).clamp(0, 1)
     return new
 
 

@@ -8,8 +8,8 @@ from waves import Shifts, pixel_centres, wave_image
 from gelflow.config import MotionConfig, TrainConfig
 from gelflow.ops.warp import warp
 from gelflow.overrides import train_config
-from gelflow.train.motion import with_more_motion
-from gelflow.train.samples import TrainingSamples
+from gelflow.train.augment import augmented
+from gelflow.train.samples import TrainingBatches, TrainingSamples, collate
 
 
 def sample() -> dict:
@@ -21,11 +21,18 @@ def sample() -> dict:
     return {"image1": image1, "image2": image2, "flow": flow.float(), "name": "one"}
 
 
+def moved(before: dict, motion: MotionConfig, seed: int) -> dict:
+    """A sample after motion alone, in a batch between two others."""
+    config = TrainConfig(motion=motion, flip=False)
+    randoms = [np.random.default_rng(number) for number in (seed + 50, seed, seed + 90)]
+    return {key: value[1] for key, value in augmented(collate([before] * 3), config, randoms).items()}
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_the_moved_pair_obeys_its_flow(seed: int) -> None:
     """Fails with the shift added instead of taken away, with the turn's sense reversed, and with the zoom inverted."""
     before = sample()
-    after = with_more_motion(before, MotionConfig(), np.random.default_rng(seed))
+    after = moved(before, MotionConfig(), seed)
     assert torch.equal(after["image1"], before["image1"])
     assert torch.isnan(after["flow"][:, :4, :4]).all()
     assert (after["flow"] - before["flow"]).nan_to_num().abs().max() > 0.5
@@ -38,7 +45,7 @@ def test_the_moved_pair_obeys_its_flow(seed: int) -> None:
 
 def test_no_motion_leaves_everything_as_it_is() -> None:
     before = sample()
-    after = with_more_motion(before, MotionConfig(shift_px=0, turn_deg=0, zoom=0), np.random.default_rng(0))
+    after = moved(before, MotionConfig(shift_px=0, turn_deg=0, zoom=0), 0)
     # Sampling positions are rounded to 1e-7 of 112 px, the waves' slope is below 0.1 per px.
     torch.testing.assert_close(after["image2"], before["image2"], rtol=0, atol=1e-5)
     torch.testing.assert_close(after["flow"], before["flow"], rtol=0, atol=1e-5, equal_nan=True)
@@ -47,15 +54,18 @@ def test_no_motion_leaves_everything_as_it_is() -> None:
 def test_training_draws_it_where_the_configuration_asks_for_it() -> None:
     """Fails with `augmented` passing over `config.motion`."""
     pairs = Shifts(1, 80, 1.0, seed=2)
-    plain, more = (
-        TrainingSamples(pairs, TrainConfig(supervision="flow", flip=False, motion=motion))
-        for motion in (None, MotionConfig(turn_deg=0, zoom=0))
-    )
-    assert torch.equal(plain[(0, 3)]["flow"], pairs[0]["flow"])
-    added = [(more[(0, draw)]["flow"] - pairs[0]["flow"]).mean(dim=(1, 2)) for draw in range(20)]
+
+    def flow(draw: int, motion: MotionConfig | None) -> torch.Tensor:
+        config = TrainConfig(supervision="flow", flip=False, motion=motion)
+        return TrainingBatches(config)([TrainingSamples(pairs, config)[(0, draw)]])["flow"][0]
+
+    assert torch.equal(flow(3, None), pairs[0]["flow"])
+    shifts = MotionConfig(turn_deg=0, zoom=0)
+    added = [(flow(draw, shifts) - pairs[0]["flow"]).mean(dim=(1, 2)) for draw in range(20)]
     assert all(shift.abs().max() <= 12 for shift in added)
     assert max(float(shift.abs().max()) for shift in added) > 4
-    assert torch.equal(more[(0, 3)]["image2"], more[(0, 3)]["image2"])
+    assert torch.equal(flow(3, shifts), flow(3, shifts))
     assert train_config(None, ["motion.turn_deg=5"]).motion == MotionConfig(turn_deg=5)
-    unlabelled = TrainingSamples(Shifts(1, 80, 1.0, seed=2, flow=False), TrainConfig(motion=MotionConfig()))
-    assert "flow" not in unlabelled[(0, 0)]
+    config = TrainConfig(motion=MotionConfig())
+    unlabelled = TrainingSamples(Shifts(1, 80, 1.0, seed=2, flow=False), config)
+    assert "flow" not in TrainingBatches(config)([unlabelled[(0, 0)]])

@@ -1,0 +1,59 @@
+"""Augmentation of whole batches, on whatever device they are: motion, flips, colours.
+
+Each pair has its own random numbers. They are drawn on the CPU and travel in one copy that nobody waits for, so that a
+GPU need not finish a step before the CPU prepares the next.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gelflow.config import TrainConfig
+from gelflow.train.motion import drawn_motion, moved_flow, moved_images
+
+
+def augmented(batch: dict[str, Any], config: TrainConfig, randoms: Sequence[np.random.Generator]) -> dict[str, Any]:
+    """The batch after the augmentation that the configuration asks for.
+
+    Args:
+        batch: image1, image2 (B, 3, H, W); perhaps flow (B, 2, H, W) px, NaN where unknown.
+        config: Its `motion`, `flip` and `color_jitter` count.
+        randoms: A source of random numbers for each pair.
+
+    Returns:
+        A new batch; what is not named above is passed on.
+    """
+    new = dict(batch)
+    numbers = torch.from_numpy(np.stack([_drawn(config, random) for random in randoms]))
+    numbers = numbers.to(batch["image1"], non_blocking=True)
+    if config.motion is not None:
+        matrices, inverses, shifts = numbers[:, :4].view(-1, 2, 2), numbers[:, 4:8].view(-1, 2, 2), numbers[:, 8:10]
+        new["image2"] = moved_images(new["image2"], matrices, shifts)
+        if "flow" in new:
+            new["flow"] = moved_flow(new["flow"], inverses, shifts)
+    if config.flip:
+        for column, axis in ((10, -1), (11, -2)):
+            turned = numbers[:, column].view(-1, 1, 1, 1) < 0
+            for key in ("image1", "image2", "flow"):
+                if key in new:
+                    new[key] = torch.where(turned, new[key].flip(axis), new[key])
+        if "flow" in new:
+            new["flow"] = new["flow"] * numbers[:, 10:12, None, None]
+    if config.color_jitter > 0:
+        gain = numbers[:, 12:15, None, None]
+        for key in ("image1", "image2"):
+            new[key] = (new[key] * gain).clamp(0, 1)
+    return new
+
+
+def _drawn(config: TrainConfig, random: np.random.Generator) -> NDArray[np.float32]:
+    """M, M^-1, t of the motion, -1 for a flip along x and y, gain of each colour: 15 numbers."""
+    matrix, shift = np.eye(2), np.zeros(2)
+    if config.motion is not None:
+        matrix, shift = drawn_motion(config.motion, random)
+    flips = np.where(random.random(2) < 0.5, -1.0, 1.0)
+    gain = np.exp(random.normal(0, config.color_jitter, 3))
+    return np.concatenate([matrix.ravel(), np.linalg.inv(matrix).ravel(), shift, flips, gain]).astype(np.float32)
