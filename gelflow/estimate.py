@@ -1,5 +1,7 @@
 """Flow between images of any size by a trained network: resize, estimate, bring the flow back."""
 
+from collections.abc import Callable
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -32,7 +34,13 @@ def resize_flow(flow: Flow, size: tuple[int, int]) -> Flow:
     return resized * flow.new_tensor([size[1] / width, size[0] / height]).view(1, 2, 1, 1)
 
 
-def estimate_flow(model: GelFlow, image1: Images, image2: Images, size: tuple[int, int] | None = None) -> Flow:
+def estimate_flow(
+    model: GelFlow,
+    image1: Images,
+    image2: Images,
+    size: tuple[int, int] | None = None,
+    network: Callable[[Images, Images], list[Flow]] | None = None,
+) -> Flow:
     """The flow from image 1 to image 2: ``I1(x) = I2(x + V(x))``.
 
     Args:
@@ -41,6 +49,7 @@ def estimate_flow(model: GelFlow, image1: Images, image2: Images, size: tuple[in
         image2: The same shape.
         size: Rows and columns at which the network works; None: those to which its training images were resized
             (`GelFlow.image_size`), or those of the given images where they were not.
+        network: What to call in the model's place, such as a `RecordedNetwork` of it.
 
     Returns:
         (B, 2, H, W) float32, px of the given images, on their device, without gradient.
@@ -64,7 +73,7 @@ def estimate_flow(model: GelFlow, image1: Images, image2: Images, size: tuple[in
     model.eval()
     try:
         with torch.no_grad():
-            flow = model(*inputs)[0]
+            flow = (network or model)(*inputs)[0]
             if model.config.elastic is not None:
                 flow = refined(flow, inputs[0], inputs[1], model.config.elastic)
             flow = resize_flow(flow, native)

@@ -77,12 +77,14 @@ class Learned:
         device: str = "auto",
         elastic: Elastic = None,
     ) -> None:
+        from gelflow.models.recorded import RecordedNetwork
         from gelflow.train.checkpoint import load_weights
 
         self.path = path
         self.device = chosen_device(device)
         self.elastic = elastic
         self.model: Any = load_weights(path, self.device)
+        self.network = RecordedNetwork(self.model)
         self.trained = self.model.config
         if elastic is not None:
             config = None if elastic == "off" else self.trained.elastic or preset_elastic()
@@ -98,7 +100,7 @@ class Learned:
 
         check_images(image1, image2)
         tensors = [as_tensor(image, self.device) for image in (image1, image2)]
-        return as_array(estimate_flow(self.model, tensors[0], tensors[1], self.size))
+        return as_array(estimate_flow(self.model, tensors[0], tensors[1], self.size, self.network))
 
     def forward(self, image1: Any, image2: Any) -> Any:
         """What `flow` costs beside reading and resizing: the network and, where it is on, the elastic refinement.
@@ -112,7 +114,7 @@ class Learned:
         """
         from gelflow.models.elastic import refined
 
-        flow = self.model(image1, image2)[0]
+        flow = self.network(image1, image2)[0]
         config = self.model.config.elastic
         return flow if config is None else refined(flow, image1, image2, config)
 
