@@ -33,7 +33,7 @@ Out = Annotated[Path, Parameter(help="Folder for the results.")]
 Validation = Annotated[list[Path] | None, Parameter(help="Folders of pairs to validate on.")]
 Config = Annotated[
     str | None,
-    Parameter(help="Settings of the run: paper, selfflow, arflow, best, real, or a TOML file; default: paper."),
+    Parameter(help="Settings: best, real, paper, selfflow, arflow, or a TOML file. Default: best; for finetune, real."),
 ]
 Steps = Annotated[int | None, Parameter(help="Optimiser steps.")]
 Resume = Annotated[bool, Parameter(negative=(), help="Go on with the run that --out holds.")]
@@ -68,7 +68,7 @@ def train(
     from gelflow.commands import run_train
 
     options = {"steps": steps, "device": device}
-    return run_train(data, validation or [], out, config, assignments or [], options, resume, None)
+    return run_train(data, validation or [], out, config or "best", assignments or [], options, resume, None)
 
 
 @app.command
@@ -76,8 +76,8 @@ def finetune(
     data: Paths,
     /,
     *,
-    weights: Annotated[Path, Parameter(help="File of weights to start from.")],
     out: Out,
+    weights: Annotated[Path | None, Parameter(help="File of weights to start from; default: the shipped ones.")] = None,
     validation: Validation = None,
     config: Config = None,
     assignments: Assignments = None,
@@ -87,9 +87,10 @@ def finetune(
 ) -> int:
     """Trains on, from given weights, whose architecture is kept."""
     from gelflow.commands import run_train
+    from gelflow.shipped import weights_file
 
-    options = {"steps": steps, "device": device}
-    return run_train(data, validation or [], out, config, assignments or [], options, resume, weights)
+    options, start = {"steps": steps, "device": device}, weights_file(weights)
+    return run_train(data, validation or [], out, config or "real", assignments or [], options, resume, start)
 
 
 @app.command
@@ -97,7 +98,7 @@ def evaluate(
     data: Paths,
     /,
     *,
-    weights: Annotated[Path, Parameter(help="File of weights of a network.")],
+    weights: Annotated[Path | None, Parameter(help="File of weights; default: the shipped ones.")] = None,
     elastic: ElasticUse = None,
     size: Size = None,
     device: OnDevice = "auto",
@@ -105,8 +106,9 @@ def evaluate(
 ) -> int:
     """Scores one file of weights on image pairs."""
     from gelflow.commands import run_evaluate
+    from gelflow.shipped import weights_file
 
-    return run_evaluate(data, weights, elastic, size, device, as_json)
+    return run_evaluate(data, weights_file(weights), elastic, size, device, as_json)
 
 
 @app.command
@@ -126,7 +128,7 @@ def compare(
     weights: Annotated[
         list[str] | None,
         Parameter(
-            help="FILE or LABEL=FILE of a network, GelFlow (.safetensors) or RAFT (.pth); repeatable. "
+            help="FILE or LABEL=FILE of a network: GelFlow (.safetensors; best: ours) or RAFT (.pth); repeatable. "
             "Labels that differ after # alone (best#0, best#1) are seeds: one row, mean and standard deviation."
         ),
     ] = None,
@@ -171,7 +173,7 @@ def predict(
     /,
     *,
     out: Out,
-    weights: Annotated[Path | None, Parameter(help="File of weights of a network; or give --method.")] = None,
+    weights: Annotated[Path | None, Parameter(help="File of weights of a network; default: the shipped ones.")] = None,
     method: Annotated[
         str | None,
         Parameter(
@@ -195,7 +197,7 @@ def predict(
 
 @app.command
 def export(
-    weights: Annotated[Path, Parameter(help="File of weights of a network.")],
+    weights: Annotated[Path, Parameter(help="File of weights of a network, or best for the shipped ones.")],
     /,
     *,
     out: Annotated[Path, Parameter(help="File to write, ending in .onnx.")],
@@ -203,8 +205,9 @@ def export(
 ) -> int:
     """Writes a network as ONNX: image1, image2 in, flow out, at one size."""
     from gelflow.commands import run_export
+    from gelflow.shipped import weights_file
 
-    return run_export(weights, out, size)
+    return run_export(weights_file(weights), out, size)
 
 
 @app.command

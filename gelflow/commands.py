@@ -27,6 +27,7 @@ from gelflow.overrides import train_config
 from gelflow.predict import Prediction, Reference, predict_pair, predict_video
 from gelflow.report import FILES, devices
 from gelflow.report_tables import tables
+from gelflow.shipped import weights_file
 from gelflow.terminal import progress, show_table
 
 
@@ -131,7 +132,7 @@ def _labelled(
     from gelflow.models.raft import looks_like_raft
 
     label, equals, file = given.partition("=")
-    path, name = Path(file if equals else given), label if equals else None
+    path, name = weights_file(Path(file if equals else given)), label if equals else None
     choices: tuple[Elastic, ...] = ("off", "on") if elastic == "both" else (elastic,)
     if looks_like_raft(path):
         choices = (None,)
@@ -183,8 +184,8 @@ def run_predict(
         if elastic is not None:
             raise InputError(f"--elastic {elastic}: is for --weights of GelFlow; of DIS there is --method dis-elastic")
         estimator = named_methods([method], device)[0]
-    elif weights is not None and method is None:
-        estimator = open_network(weights, None, parse_size(size), device, elastic)
+    elif method is None:
+        estimator = open_network(weights_file(weights), None, parse_size(size), device, elastic)
     else:
         raise InputError("give either --weights FILE (of a network) or --method NAME (a classical one)")
     if len(inputs) == 2:

@@ -100,7 +100,7 @@ def test_predictions_scale_with_what_they_are_of(tiny: Path) -> None:
     seconds, size = predicted()
     large, large_size = predicted("sensor.camera.width=320", "sensor.camera.height=240")
     assert large_size == pytest.approx(100 * size, rel=1e-3)  # rounded to bytes
-    assert large["flow"] == pytest.approx(100 * seconds["flow"], rel=0.2)  # rounded to ms, of some 5 ms
+    assert large["flow"] == pytest.approx(100 * seconds["flow"], rel=0.4)  # rounded to ms, of some 2 ms
     fine, _ = predicted("render.samples_per_pixel=4000")
     assert fine["render"] > 500 * seconds["render"]
     deep, _ = predicted("motion.depth_mm=2.0")
