@@ -99,6 +99,8 @@ def measure(
     steps: int = 1,
     forcing: float = STANDARD.forcing,
     inner: int = INNER,
+    loose: float = STANDARD.loose,
+    step_mm: float | None = None,
     seed: int = 0,
 ) -> dict[str, Any]:
     """The rate on one pad; see the module's docstring.
@@ -112,14 +114,19 @@ def measure(
         steps: states that are recorded.
         forcing: relative residual that ends a linear solve, at most.
         inner: Krylov iterations of a cycle.
+        loose: tolerance of Newton's method on the way to a recorded state.
+        step_mm: longest load step; default the scenes'.
         seed: of the draws.
     """
     rng = np.random.default_rng(seed)
     draws = [ball_scene(rng, depth_mm, drag_mm, steps) for _ in range(max(DRAWS, batch))]
     began = time.perf_counter()
     order = cycle(range(len(draws)))
-    driver = replace(STANDARD, forcing=forcing)
-    run = Run(jobs_of(draws, pad), pad, draws[0].numerics, driver, None, batch, order, inner)
+    driver = replace(STANDARD, forcing=forcing, loose=loose)
+    numerics = draws[0].numerics
+    if step_mm is not None:
+        numerics = numerics.model_copy(update={"max_step_mm": step_mm})
+    run = Run(jobs_of(draws, pad), pad, numerics, driver, None, batch, order, inner)
     for _ in range(2):  # with all slots empty: compiles the kernels and captures the graph
         run.advance()
     loaded = time.perf_counter() - began
@@ -276,6 +283,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--forcing", type=float, default=STANDARD.forcing, help="relative residual of linear solves, at most"
     )
+    parser.add_argument("--loose", type=float, default=STANDARD.loose, help="Newton's tolerance on the way")
+    parser.add_argument("--step", type=float, help="mm; longest load step, default as in scenes")
     parser.add_argument("--inner", type=int, default=INNER, help="Krylov iterations of a cycle")
     parser.add_argument("--table", action="store_true", help="print the time of every kernel, too")
     given = parser.parse_args(arguments)
@@ -285,7 +294,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     prepared = round(time.perf_counter() - began, 2)
     for batch in given.batch:
         path = (given.depth, given.drag, given.steps)
-        found = measure(pad, batch, given.seconds, *path, given.forcing, given.inner)
+        found = measure(pad, batch, given.seconds, *path, given.forcing, given.inner, given.loose, given.step)
         kernels = found["profile"].pop("kernels")
         print(json.dumps({**vars(given), **found, "prepare_s": prepared}), flush=True)
         if given.table:

@@ -1,7 +1,10 @@
 """What happens next to a slot, as Warp kernels of one thread a slot.
 
 The rules are those of `synth.simulate.newton` and `synth.simulate.stepping`, whose constants they use; what differs is
-that each slot follows them at its own pace.
+that each slot follows them at its own pace, and that the full tolerance holds for what is recorded only. A step that
+ends at a state to be corrected, and every pass but the last, is solved as loosely as the way is: what they find is
+changed by the next pass. A state whose passes end early, because they fail or nothing is deep any more, is brought to
+the full tolerance before it is recorded (POLISH); where that fails, the step is halved as if it had not been taken.
 """
 
 # Kernels are written in Warp's own language; their annotations only look like Python's.
@@ -13,6 +16,7 @@ from synth.simulate import newton, stepping
 from synth.simulate.batched.slots import (
     ACCEPT,
     ADVANCE,
+    BACK,
     BEGIN,
     CARRY_READY,
     COMPLETE,
@@ -26,9 +30,11 @@ from synth.simulate.batched.slots import (
     NUDGED,
     PASS,
     PASSING,
+    POLISH,
     READY,
     RECORD,
     REPAIR,
+    REVERT,
     SEARCH,
     SOLVED,
     START,
@@ -128,13 +134,20 @@ def conclude(slots: Slots, jobs: Jobs, settings: Settings):
             slots.move[s] = UNDO
             slots.phase[s] = REPAIR
         return
+    polish = slots.stage[s] == POLISH
     if phase == LOST:
         slots.step[s] = wp.float64(0.5) * (slots.target[s] - slots.at[s])
         slots.has_previous[s] = 0
         slots.phase[s] = BEGIN
+        if polish:
+            slots.move[s] = REVERT
+            slots.phase[s] = BACK
         if slots.step[s] < SHORTEST_STEP * settings.longest:
             slots.reason[s] = NO_BALANCE
             slots.phase[s] = ENDED
+        return
+    if polish:
+        slots.phase[s] = RECORD
         return
     slots.eased[s] = slots.iteration[s]
     slots.move[s] = ACCEPT
@@ -170,28 +183,37 @@ def bear(slots: Slots, jobs: Jobs, sums: wp.array2d(dtype=wp.float64)):
 
 @wp.kernel
 def choose_pass(slots: Slots, jobs: Jobs, settings: Settings):
-    """Another pass, or the record."""
+    """Another pass, the full tolerance, or the record."""
     s = wp.tid()
     slots.share_now[s] = ZERO
     if slots.phase[s] != PASSING:
         return
     too_deep = slots.deepest[s] > PENETRATION * jobs.deepest[slots.job[s]]
-    if slots.failures[s] == FAILURES or slots.done[s] >= ENOUGH or not too_deep:
+    over = slots.failures[s] == FAILURES or slots.done[s] >= ENOUGH or not too_deep
+    if over and slots.relative[s] <= settings.tolerance:
         slots.phase[s] = RECORD
         return
-    slots.share_now[s] = slots.share[s]
-    slots.stage[s] = PASS
-    slots.iteration[s] = 0
-    slots.limit[s] = settings.correction_limit
     slots.tolerance[s] = settings.tolerance
+    if over:
+        slots.stage[s] = POLISH
+        slots.limit[s] = settings.limit
+    else:
+        slots.share_now[s] = slots.share[s]
+        slots.stage[s] = PASS
+        slots.limit[s] = settings.correction_limit
+        if slots.done[s] + slots.share[s] < ENOUGH:
+            slots.tolerance[s] = wp.max(settings.loose, settings.tolerance)
+    slots.iteration[s] = 0
     slots.predicted[s] = 0
     slots.phase[s] = START
 
 
 @wp.kernel
 def recorded(slots: Slots):
-    """After the record."""
+    """After the record, or the way back."""
     s = wp.tid()
+    if slots.phase[s] == BACK:
+        slots.phase[s] = BEGIN
     if slots.phase[s] == RECORD:
         slots.records[s] = slots.records[s] + 1
         slots.total[s] = 0
@@ -239,6 +261,7 @@ def control(slots: Slots, jobs: Jobs, settings: Settings):
         slots.tolerance[s] = settings.tolerance
         if parts > ONE:
             slots.target[s] = at + (goal - at) / parts
+        if parts > ONE or jobs.kind_of[j, slots.next[s]] == 2:
             slots.tolerance[s] = wp.max(settings.loose, settings.tolerance)
         slots.stage[s] = STEP
         slots.iteration[s] = 0

@@ -5,7 +5,7 @@
 
 import warp as wp
 
-from synth.simulate.batched.slots import ACCEPT, FALL_BACK, FRESH, SEARCH, TAKE, UNDO, Slots
+from synth.simulate.batched.slots import ACCEPT, FALL_BACK, FRESH, REVERT, SEARCH, TAKE, UNDO, Slots
 from synth.simulate.contact import FAR, ContactState
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -141,6 +141,9 @@ def move(slots: Slots, touched: int, fields: Fields):
         elif kind == ACCEPT:
             fields.previous_u[s, i] = fields.state_u[s, i]
             fields.state_u[s, i] = x
+        elif kind == REVERT:
+            x = fields.previous_u[s, i]
+            fields.state_u[s, i] = x
         fields.iterate_u[s, i] = x
         if keep == 1:
             fields.recorded_u[s, i] = x
@@ -157,6 +160,9 @@ def move(slots: Slots, touched: int, fields: Fields):
                 p += slots.ratio[s] * (p - fields.previous_p[s, k])
         elif kind == ACCEPT:
             fields.previous_p[s, k] = fields.state_p[s, k]
+            fields.state_p[s, k] = p
+        elif kind == REVERT:
+            p = fields.previous_p[s, k]
             fields.state_p[s, k] = p
         fields.iterate_p[s, k] = p
         if keep == 1:

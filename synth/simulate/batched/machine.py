@@ -189,6 +189,7 @@ class Machine:
         where = (self._surface.hat, self._surface.number, self._surface.area, at.traction, nodes)
         self._launch(sums.write_tractions, at.points[:2], at.mask, s, self._faces, *where, at.records)
         memory = (at.contact, at.gap, at.tangential)
+        self._select(phases.RECORD, phases.BACK)
         self._launch(moves.recall, at.points, at.mask, s, at.kept, *memory)
         self._launch(recorded, self.batch, s)
 

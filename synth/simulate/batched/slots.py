@@ -15,6 +15,7 @@ a trajectory. Phases, in the order in which a load step passes through them:
     TOUCHED      a step that ends at a recorded state
     PASSING      before the next augmented-Lagrangian pass; REPAIR: a failed pass was undone, to be evaluated
     RECORD       a state to be written down
+    BACK         no balance to the full tolerance at a recorded state: goes back to before the step
     ADVANCE      the step is accepted
     ENDED        waits for the host; IDLE: empty
 """
@@ -43,13 +44,16 @@ REPAIR = wp.constant(15)
 RECORD = wp.constant(16)
 ADVANCE = wp.constant(17)
 ENDED = wp.constant(18)
+BACK = wp.constant(19)
 
-STEP, PASS = wp.constant(0), wp.constant(1)
-"""What Newton's method is solving: a load step, or a pass at a recorded state."""
+STEP, PASS, POLISH = wp.constant(0), wp.constant(1), wp.constant(2)
+"""What Newton's method is solving: a load step, a pass at a recorded state, or that state to the full tolerance."""
 COMPLETE, NO_BALANCE, NO_CONTACT = wp.constant(0), wp.constant(1), wp.constant(2)
 """Why a trajectory ended."""
 TAKE, FALL_BACK, UNDO, ACCEPT = wp.constant(1), wp.constant(2), wp.constant(3), wp.constant(4)
-"""Moves of a slot's fields: trial to iterate; state to iterate; recorded solution to iterate; iterate to state."""
+REVERT = wp.constant(5)
+"""Moves of a slot's fields: trial to iterate; state to iterate; recorded solution to iterate; iterate to state; the
+state before the last to state."""
 
 
 @wp.struct
