@@ -123,9 +123,7 @@ def measure(
     began = time.perf_counter()
     order = cycle(range(len(draws)))
     driver = replace(STANDARD, forcing=forcing, loose=loose)
-    numerics = draws[0].numerics
-    if step_mm is not None:
-        numerics = numerics.model_copy(update={"max_step_mm": step_mm})
+    numerics = draws[0].numerics.model_copy(update={} if step_mm is None else {"max_step_mm": step_mm})
     run = Run(jobs_of(draws, pad), pad, numerics, driver, None, batch, order, inner)
     for _ in range(2):  # with all slots empty: compiles the kernels and captures the graph
         run.advance()
@@ -280,9 +278,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--depth", type=float, default=2.0, help="mm")
     parser.add_argument("--drag", type=float, default=0.0, help="mm")
     parser.add_argument("--steps", type=int, default=1, help="recorded states")
-    parser.add_argument(
-        "--forcing", type=float, default=STANDARD.forcing, help="relative residual of linear solves, at most"
-    )
+    parser.add_argument("--forcing", type=float, default=STANDARD.forcing, help="of linear solves: relative residual")
     parser.add_argument("--loose", type=float, default=STANDARD.loose, help="Newton's tolerance on the way")
     parser.add_argument("--step", type=float, help="mm; longest load step, default as in scenes")
     parser.add_argument("--inner", type=int, default=INNER, help="Krylov iterations of a cycle")

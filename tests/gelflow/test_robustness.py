@@ -92,7 +92,8 @@ def test_damaged_weights_are_named_and_never_run(
 def test_a_state_to_resume_from_cannot_run_code(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_folder(tmp_path / "data", {"a": (1, 0)})
     run, trace = tmp_path / "run", tmp_path / "ran"
-    small = ["--set", "model.levels=4", "--set", "loss.lambda_s=[1.0, 1.0, 1.0]", "--device", "cpu"]
+    (tmp_path / "small.toml").write_text("model.levels = 4\nloss.lambda_s = [1.0, 1.0, 1.0]\n", encoding="utf-8")
+    small = ["--config", tmp_path / "small.toml", "--device", "cpu"]
     command = ["train", folder, "--out", run, "--steps", "1", *small]
     assert main([str(word) for word in command]) == 0
     capsys.readouterr()

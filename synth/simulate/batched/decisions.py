@@ -2,9 +2,10 @@
 
 The rules are those of `synth.simulate.newton` and `synth.simulate.stepping`, whose constants they use; what differs is
 that each slot follows them at its own pace, and that the full tolerance holds for what is recorded only. A step that
-ends at a state to be corrected, and every pass but the last, is solved as loosely as the way is: what they find is
-changed by the next pass. A state whose passes end early, because they fail or nothing is deep any more, is brought to
-the full tolerance before it is recorded (POLISH); where that fails, the step is halved as if it had not been taken.
+ends at a recorded state, and every pass but the last, is solved as loosely as the way is: what they find is changed by
+the next pass. A state without passes, or whose passes end early, because they fail or nothing is deep any more, is
+brought to the full tolerance before it is recorded (POLISH); where that fails, the step is halved as if it had not been
+taken. The way goes on from the loose state, so that it does not depend on which states are corrected.
 """
 
 # Kernels are written in Warp's own language; their annotations only look like Python's.
@@ -160,9 +161,10 @@ def conclude(slots: Slots, jobs: Jobs, settings: Settings):
 
 @wp.kernel
 def bear(slots: Slots, jobs: Jobs, sums: wp.array2d(dtype=wp.float64)):
-    """At a recorded state: end where the press bears on nothing; else correct it where it is wanted."""
+    """At a recorded state: end where the press bears on nothing; else put contact's memory aside, to correct it."""
     s = wp.tid()
     slots.keep[s] = 0
+    slots.anchor[s] = 0
     if slots.phase[s] != TOUCHED:
         return
     j = slots.job[s]
@@ -171,14 +173,14 @@ def bear(slots: Slots, jobs: Jobs, sums: wp.array2d(dtype=wp.float64)):
         slots.reason[s] = NO_CONTACT
         slots.phase[s] = ENDED
         return
-    slots.phase[s] = RECORD
+    slots.keep[s] = 1
+    slots.kept[s] = 1
+    slots.failures[s] = 0
+    slots.share[s] = ONE
+    slots.done[s] = ZERO
+    slots.phase[s] = PASSING
     if jobs.kind_of[j, slots.next[s]] == 2:
-        slots.keep[s] = 1
-        slots.kept[s] = 1
-        slots.failures[s] = 0
-        slots.share[s] = ONE
-        slots.done[s] = ZERO
-        slots.phase[s] = PASSING
+        slots.anchor[s] = 1
 
 
 @wp.kernel
@@ -188,8 +190,10 @@ def choose_pass(slots: Slots, jobs: Jobs, settings: Settings):
     slots.share_now[s] = ZERO
     if slots.phase[s] != PASSING:
         return
-    too_deep = slots.deepest[s] > PENETRATION * jobs.deepest[slots.job[s]]
+    j = slots.job[s]
+    too_deep = slots.deepest[s] > PENETRATION * jobs.deepest[j]
     over = slots.failures[s] == FAILURES or slots.done[s] >= ENOUGH or not too_deep
+    over = over or jobs.kind_of[j, slots.next[s]] == 1
     if over and slots.relative[s] <= settings.tolerance:
         slots.phase[s] = RECORD
         return
@@ -261,7 +265,7 @@ def control(slots: Slots, jobs: Jobs, settings: Settings):
         slots.tolerance[s] = settings.tolerance
         if parts > ONE:
             slots.target[s] = at + (goal - at) / parts
-        if parts > ONE or jobs.kind_of[j, slots.next[s]] == 2:
+        if parts > ONE or jobs.kind_of[j, slots.next[s]] > 0:
             slots.tolerance[s] = wp.max(settings.loose, settings.tolerance)
         slots.stage[s] = STEP
         slots.iteration[s] = 0

@@ -152,7 +152,7 @@ class Machine:
         self._sum(phases.TOUCHED)
         self._launch(bear, self.batch, s, jobs, at.sums)
         self._launch(moves.keep, at.points, s.keep, *memory, at.kept)
-        self._settle(s.keep, 1)
+        self._settle(s.anchor, 1)
         self._select(phases.PASSING)
         self._launch(sums.blank, (self.batch, 8), at.mask, s, at.sums)
         self._launch(sums.depths, at.points[:2], at.mask, at.gap, s)

@@ -75,8 +75,8 @@ class Run:
     def __iter__(self) -> Iterator[tuple[int, Trajectory]]:
         """Run all jobs.
 
-        Results are made and handed over while the device works on the next cycles: with 1,024 slots on an H200 it had
-        waited for that for a seventh of the time.
+        Results are made and handed over while the device works on the next cycles. When it waited for that, a cycle of
+        1,024 slots took 22.8 ms on an H200, of which its kernels took 19.4.
         """
         machine, batch = self.machine, self.machine.batch
         working = np.full(batch, -1)
@@ -98,8 +98,8 @@ class Run:
                     self.advance()
             self._spent += time.perf_counter() - began  # without what whoever takes the results does meanwhile
             for one in fetched:
-                number = one.number
-                yield number, trajectory(self._jobs[number], one.records, one.ended, one.seconds, self._pad.space)
+                result = trajectory(self._jobs[one.number], one.records, one.ended, one.seconds, self._pad.space)
+                yield one.number, result
             if not ongoing:
                 return
             began = time.perf_counter()

@@ -74,7 +74,8 @@ class Slots:
         trial_norm, trial_force, trial_jacobian: of the trial.
         failures, done, share: of augmented-Lagrangian passes: those that failed, the shares of the others together, and
             the share of the next; share_now: of the one that begins.
-        keep: whether contact's memory is put aside in this cycle; kept: whether it is put aside.
+        keep: whether contact's memory is put aside in this cycle; kept: whether it is put aside; anchor: whether points
+            that have come to touch are anchored for passes.
         deepest: penetration at the last evaluation, mm.
         records: states recorded; reason: why it ended.
     """
@@ -109,6 +110,7 @@ class Slots:
     share_now: wp.array(dtype=wp.float64)
     keep: wp.array(dtype=wp.int32)
     kept: wp.array(dtype=wp.int32)
+    anchor: wp.array(dtype=wp.int32)
     deepest: wp.array(dtype=wp.float64)
     records: wp.array(dtype=wp.int32)
     reason: wp.array(dtype=wp.int32)

@@ -1,0 +1,94 @@
+"""Many trajectories at once: what is recorded meets the full tolerance, however loosely the way to it is solved."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pads import SPHERE, brick, same, scene
+
+from synth.scene import Scene
+from synth.simulate import Trajectory
+from synth.simulate.batched import run as running
+from synth.simulate.batched import simulate_many
+from synth.simulate.batched import slots as phases
+from synth.simulate.batched.many import jobs_of
+from synth.simulate.batched.pad import prepare
+from synth.simulate.driver import Driver
+
+MESH = brick(counts=(4, 4, 2))
+TOLERANCE = 1e-8
+LOOSE = 1e-2
+STRICT_WAY, LOOSE_WAY = Driver(loose=0.0, forcing=1e-3), Driver(loose=LOOSE, forcing=1e-3)
+
+
+def pressed(penalty: float = 50.0, depth_mm: float = 0.6, steps: int = 2) -> Scene:
+    """A ball that is pressed and dragged with friction. With a penalty of 5,000 nothing is deep enough to correct."""
+    motion = {"depth_mm": depth_mm, "shear_mm": [0.0, 0.0], "steps": steps}
+    if steps > 1:
+        motion["shear_mm"] = [0.15, -0.05]
+    numerics = {"element": "p1p1", "tolerance": TOLERANCE, "penalty": penalty}
+    return scene(indenter=SPHERE, friction=0.5, motion=motion, numerics=numerics)
+
+
+def led(posed: Scene, driver: Driver, frames: frozenset[int] | None = None) -> Trajectory:
+    """The only one of its batch."""
+    ((_, result),) = simulate_many([posed], MESH, device="cpu", driver=driver, frames=frames)
+    return result
+
+
+@pytest.mark.parametrize("penalty", [50.0, 5000.0])
+def test_what_is_recorded_meets_the_full_tolerance(penalty: float) -> None:
+    """After whole passes, and where none is needed, so that only a loose step came before."""
+    # Fails with a record at the end of the passes whatever the residual is (5,000), or with that and every pass loose
+    # (both).
+    one, other = led(pressed(penalty), STRICT_WAY), led(pressed(penalty), LOOSE_WAY)
+    assert one.status == other.status == "complete"
+    assert sum(s.newton_iterations for s in other.states) < sum(s.newton_iterations for s in one.states)
+    for strict, loose in zip(one.states[1:], other.states[1:], strict=True):
+        assert max(strict.residual, loose.residual) <= TOLERANCE
+        distance = np.linalg.norm(strict.displacement - loose.displacement)
+        # Friction remembers the way: a residual of 1e-2 of the force moved the surface of six balls by up to 4e-4.
+        assert distance < 1e-3 * np.linalg.norm(strict.displacement)
+
+
+def test_states_that_are_not_corrected_meet_it_too() -> None:
+    """And the way does not depend on which are: the corrected one is the same to the bit."""
+    # Fails with a record without corrections whatever the residual is.
+    every, last = led(pressed(), LOOSE_WAY), led(pressed(), LOOSE_WAY, frozenset({2}))
+    assert max(state.residual for state in last.states) <= TOLERANCE
+    assert last.states[1].max_penetration_mm > every.states[1].max_penetration_mm
+    assert same(replace(last, states=last.states[2:]), replace(every, states=every.states[2:]))
+
+
+def test_a_state_without_balance_to_the_full_tolerance_leaves_no_trace(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three iterations suffice for the way, but not for what is to be recorded: back to where the step began."""
+    # Fails with a state that stays the rejected one, or with anchors that are not put back.
+    monkeypatch.setattr(running, "MAX_ITERATIONS", 3)
+    posed = pressed(5000.0, depth_mm=0.2, steps=1)
+    pad = prepare(posed, MESH, "cpu")
+    run = running.Run(jobs_of([posed], pad), pad, posed.numerics, Driver(loose=0.3), None, 1)
+    machine = run.machine
+    fields, contact, phase, stage = machine._at.fields, machine._at.contact, machine.slots.phase, machine.slots.stage
+    begun: list[np.ndarray] = []
+    rejected: list[np.ndarray] = []
+    changed: list[bool] = []
+
+    def memory() -> list[np.ndarray]:
+        arrays = (fields.state_u, fields.state_p, contact.anchored, contact.anchor, contact.normal, contact.tangent)
+        return [array.numpy().copy() for array in arrays]
+
+    def look(part: str, kernel: str) -> None:
+        if kernel == "control" and (phase.numpy()[0], stage.numpy()[0]) == (phases.START, phases.STEP):
+            begun[:] = memory()
+        elif kernel == "conclude" and phase.numpy()[0] == phases.BACK:
+            rejected[:] = memory()
+        elif kernel == "recorded" and rejected:
+            changed.append(any((a != b).any() for a, b in zip(rejected, begun, strict=True)))
+            assert all((a == b).all() for a, b in zip(memory(), begun, strict=True))
+            rejected.clear()
+
+    machine.watch = look
+    ((_, result),) = run
+    assert changed
+    assert all(changed)
+    assert (result.status, "no balance" in result.reason, len(result.states)) == ("failed", True, 1)
