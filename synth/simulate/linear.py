@@ -5,7 +5,8 @@ entries at touching faces only. S is factorised in single precision, which halve
 in double precision, preconditioned by the factor, takes away the rounding of the factor and R. Pardiso (through
 pypardiso's MKL) where there is one, else SuperLU in double precision. The pattern is analysed once per mesh.
 
-Of large systems the factor of an earlier tangent is kept for as long as GMRES gets along with it (`Directions`).
+Where Newton's method can do with a rough direction, the factor of an earlier tangent is kept for as long as GMRES gets
+along with it (`Directions`).
 """
 
 import ctypes
@@ -21,13 +22,10 @@ GMRES_TOLERANCE = 1e-3
 """Of the linear residual, relative to the right side; Newton's convergence is then as with an exact solution."""
 GMRES_LIMIT = 40
 """Most iterations; where they do not do, the direction is used as it is and the line search judges it."""
-KEPT_TOLERANCE = 0.02
-"""Of the linear residual with an earlier tangent's factor: Newton's method then takes a few iterations more."""
+ROUGH_TOLERANCE = 0.01
+"""Of the linear residual of a rough direction, with this tangent's factor or an earlier one's."""
 KEPT_LIMIT = 12
 """Iterations after which an earlier tangent's factor is given up."""
-KEPT_FROM = 10_000
-"""Unknowns from which factors are kept. Presses with 13,800 unknowns took 0.6 to 0.8 of the time, draws of a scene with
-fewer 0.85 on an idle machine; but last iterations then only just meet Newton's tolerance."""
 
 
 class Factor(Protocol):
@@ -57,11 +55,11 @@ class Directions:
     """Solves the linear systems of one sample, one after another.
 
     Neighbouring tangents differ where contact changed. With the factor of an earlier one GMRES takes some 6 iterations
-    to KEPT_TOLERANCE; one of six tangents is factorised, and a factor of 14,000 unknowns costs as much as 15 of them.
+    to ROUGH_TOLERANCE; a factor of 7,000 to 14,000 unknowns costs as much as 10 to 15 of them.
 
     Args:
         factor: of this sample's matrices; others may use it, too, and then this sample begins with a new one.
-        keep: use factors of earlier matrices.
+        keep: solve roughly where that is enough, with factors of earlier matrices.
     """
 
     def __init__(self, factor: Factor, keep: bool) -> None:
@@ -72,20 +70,22 @@ class Directions:
         """Start with a new factor: what is solved next has nothing to do with what was solved before."""
         self._own = -1
 
-    def solve(self, matrix: Any, remainder: Any, right: FloatArray, fresh: bool = False) -> FloatArray:
+    def solve(self, matrix: Any, remainder: Any, right: FloatArray, rough: bool = False) -> FloatArray:
         """The solution (n,) of (S + R) x = right, NaN where the matrix is singular; arguments as of `gmres`.
 
-        fresh: with the factor of this matrix.
+        rough: to ROUGH_TOLERANCE, with the factor of an earlier matrix if it serves; else with this matrix's factor.
         """
-        factor = self._factor
-        if self._keep and not fresh and len(right) >= KEPT_FROM and factor.made == self._own:
-            solution, _, left = gmres(matrix, remainder, factor, right, KEPT_TOLERANCE, KEPT_LIMIT)
-            if left < KEPT_TOLERANCE:
-                return solution
+        factor, tolerance = self._factor, GMRES_TOLERANCE
+        if self._keep and rough:
+            tolerance = ROUGH_TOLERANCE
+            if factor.made == self._own:
+                solution, _, left = gmres(matrix, remainder, factor, right, tolerance, KEPT_LIMIT)
+                if left < tolerance:
+                    return solution
         if not factor.factorise(matrix.data):
             return np.full_like(right, np.nan)
         self._own = factor.made
-        return gmres(matrix, remainder, factor, right)[0]
+        return gmres(matrix, remainder, factor, right, tolerance)[0]
 
 
 def gmres(

@@ -14,8 +14,13 @@ from synth.simulate.system import Balance, System, Unknowns
 
 MAX_ITERATIONS = 20
 PATIENCE = 5
-"""Iterations that may use factors of earlier tangents. Far from the solution, or where a nearly incompressible gel is
-sheared as a whole (Cook's membrane), directions that are 2 % off do not get there in MAX_ITERATIONS."""
+"""Iterations that may take rough directions. Far from the solution, or where a nearly incompressible gel is sheared as
+a whole (Cook's membrane), directions that are 1 % off do not get there in MAX_ITERATIONS."""
+LOOSE = 1e-4
+"""A tolerance above it is reached with rough directions."""
+NEAR = 1e-2
+"""Relative residual below which a smaller tolerance is approached with exact directions: the last iterations then
+surpass it by as much as ever. Above, changes of the contact set count for more than 1 % of a direction."""
 SHORTEST = 1 / 1024
 """Shortest step of the line search."""
 NOTHING = 1e-6
@@ -81,7 +86,8 @@ def solve(
         if iteration == limit or not running.any():
             break
         tangent = system.tangent(state, indenters, running)
-        step = system.newton_step(tangent, balance.free, running, fresh=iteration >= PATIENCE)
+        rough = (iteration < PATIENCE) & ((tolerance > LOOSE) | (relative > NEAR))
+        step = system.newton_step(tangent, balance.free, running, rough)
         running &= np.isfinite(step.u).all(axis=(1, 2))
         state, balance, running = _line_search(system, state, balance, step, indenters, running)
         iterations[running] += 1

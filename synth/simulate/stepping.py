@@ -283,6 +283,7 @@ class Stepper:
             )
             sample.iterations = 0
         restore_contact(self.system.contact, kept, recording)
+        self.system.begin(recording)
         self.system.balance(self.state, self.indenters, recording)
 
     def _control(self, sample: _Sample, target: float, good: bool, iterations: int) -> None:

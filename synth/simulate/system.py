@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synth.arrays import FloatArray
+from synth.arrays import BoolArray, FloatArray
 from synth.simulate.bulk import bulk_residual, bulk_tangent, linearise, pressure_tangent
 from synth.simulate.contact import ContactState, Indenters, contact_residual, contact_stiffness, contact_tangent
 from synth.simulate.fold import fold_residual, fold_tangent
@@ -79,7 +79,7 @@ class System:
         load: (n, 3) dead nodal forces in E mm², or None.
         device: Warp device.
         single: factorise tangents in single precision.
-        keep: use the factors of earlier tangents.
+        keep: of `synth.simulate.linear.Directions`.
     """
 
     def __init__(
@@ -246,19 +246,28 @@ class System:
         size = len(self.free)
         return sp.csr_matrix((dense[kept], (row[kept], column[kept])), shape=(size, size))
 
-    def begin(self) -> None:
-        """Forget the factors of earlier tangents, so that a trajectory does not depend on what ran before it."""
-        for directions in self._directions:
-            directions.begin()
+    def begin(self, samples: BoolArray | None = None) -> None:
+        """Forget the factors of these samples' earlier tangents (None: of all), so that what follows depends on the
+        state alone.
+        """
+        for number, directions in enumerate(self._directions):
+            if samples is None or samples[number]:
+                directions.begin()
 
-    def newton_step(self, tangent: Tangent, residual: FloatArray, active: np.ndarray, fresh: bool = False) -> Unknowns:
-        """-K^-1 r of each active sample; NaN where the matrix is singular. fresh: with factors of this tangent."""
+    def newton_step(
+        self, tangent: Tangent, residual: FloatArray, active: BoolArray, rough: BoolArray | None = None
+    ) -> Unknowns:
+        """-K^-1 r of each active sample; NaN where the matrix is singular.
+
+        rough: (B,) samples for which a rough direction is enough (`synth.simulate.linear.Directions`); default none.
+        """
         step = self.zero()
         moves = step.u[0].size
         full = np.zeros(moves + step.p.shape[1])
         for s in map(int, np.flatnonzero(active)):
             matrix = self.matrix(tangent.values[s])
-            full[self.free] = -self._directions[s].solve(matrix, tangent.remainder[s], residual[s], fresh)
+            enough = rough is not None and bool(rough[s])
+            full[self.free] = -self._directions[s].solve(matrix, tangent.remainder[s], residual[s], enough)
             step.u[s], step.p[s] = full[:moves].reshape(-1, 3), full[moves:]
         return step
 

@@ -177,48 +177,42 @@ def nearly(matrix: csr_matrix, rank: int) -> csr_matrix:
 
 def test_factor_is_kept_while_it_serves(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fails with the limit of kept factors left at GMRES_LIMIT (the third is not made), or with `_own` not compared."""
-    monkeypatch.setattr(linear, "KEPT_FROM", SIZE)
     monkeypatch.setattr(linear, "KEPT_LIMIT", 4)
     first, b = saddle(1), right_side(1)
     factor = SuperLUFactor(first.indptr, first.indices)
     one = Directions(factor, keep=True)
     one.solve(first, None, b)
     near = nearly(first, 1)  # with the remainder of rank 2 GMRES ends after 4 iterations
-    x = one.solve(near, remainder(2), b)
+    x = one.solve(near, remainder(2), b, rough=True)
     assert factor.made == 1
     full = whole(near) + remainder(2).toarray()
-    assert np.linalg.norm(full @ x - b) < 1.001 * linear.KEPT_TOLERANCE * np.linalg.norm(b)
+    assert np.linalg.norm(full @ x - b) < 1.001 * linear.ROUGH_TOLERANCE * np.linalg.norm(b)
     far = nearly(first, 30)  # takes GMRES more iterations
-    y = one.solve(far, None, b)
+    y = one.solve(far, None, b, rough=True)
     assert factor.made == 2
-    assert np.linalg.norm(whole(far) @ y - b) < 1.001 * linear.GMRES_TOLERANCE * np.linalg.norm(b)
+    assert np.linalg.norm(whole(far) @ y - b) < 1.001 * linear.ROUGH_TOLERANCE * np.linalg.norm(b)
     # What another sample left in the factor would make the bits depend on the batch.
     alone = Directions(SuperLUFactor(first.indptr, first.indices), keep=True)
     Directions(factor, keep=True).solve(first, None, b)
-    np.testing.assert_array_equal(one.solve(near, None, b), alone.solve(near, None, b))
+    np.testing.assert_array_equal(one.solve(near, None, b, rough=True), alone.solve(near, None, b, rough=True))
 
 
-def test_factor_is_made_anew_where_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Fails with `keep`, `fresh` or KEPT_FROM left out of the condition, and with `begin` doing nothing.
+def test_factor_is_made_anew_where_told() -> None:
+    # Fails with `keep` or `rough` left out of the condition, and with `begin` doing nothing.
     matrix, b = saddle(1), right_side(1)
-    small = Directions(SuperLUFactor(matrix.indptr, matrix.indices), keep=True)
-    for _ in range(2):
-        small.solve(matrix, None, b)
-    assert small._factor.made == 2
-    monkeypatch.setattr(linear, "KEPT_FROM", SIZE)
     factor = SuperLUFactor(matrix.indptr, matrix.indices)
     never = Directions(factor, keep=False)
     for _ in range(2):
-        never.solve(matrix, None, b)
+        never.solve(matrix, None, b, rough=True)
     assert factor.made == 2
     one = Directions(factor, keep=True)
+    one.solve(matrix, None, b, rough=True)
     one.solve(matrix, None, b)
-    one.solve(matrix, None, b, fresh=True)
     assert factor.made == 4
     one.begin()
-    one.solve(matrix, None, b)
+    one.solve(matrix, None, b, rough=True)
     assert factor.made == 5
-    one.solve(matrix, None, b)
+    one.solve(matrix, None, b, rough=True)
     assert factor.made == 5
 
 
