@@ -106,9 +106,8 @@ def evaluate(
 ) -> int:
     """Scores one file of weights on image pairs."""
     from gelflow.commands import run_evaluate
-    from gelflow.shipped import weights_file
 
-    return run_evaluate(data, weights_file(weights), elastic, size, device, as_json)
+    return run_evaluate(data, weights, elastic, size, device, as_json)
 
 
 @app.command
@@ -205,9 +204,8 @@ def export(
 ) -> int:
     """Writes a network as ONNX: image1, image2 in, flow out, at one size."""
     from gelflow.commands import run_export
-    from gelflow.shipped import weights_file
 
-    return run_export(weights_file(weights), out, size)
+    return run_export(weights, out, size)
 
 
 @app.command

@@ -77,10 +77,10 @@ def run_train(
 
 
 def run_evaluate(
-    data: Sequence[Path], weights: Path, elastic: Elastic, size: str | None, device: str, as_json: bool
+    data: Sequence[Path], weights: Path | None, elastic: Elastic, size: str | None, device: str, as_json: bool
 ) -> int:
     """`evaluate`."""
-    network = open_network(weights, None, parse_size(size), device, elastic)
+    network = open_network(weights_file(weights), None, parse_size(size), device, elastic)
     _score(open_all(data), [network], None, as_json, 1)
     return 0
 
@@ -211,7 +211,7 @@ def _show_prediction(result: Prediction, name: str, as_json: bool) -> None:
 
 def run_export(weights: Path, out: Path, size: str | None) -> int:
     """`export`."""
-    rows, columns = export_onnx(weights, out, parse_size(size))
+    rows, columns = export_onnx(weights_file(weights), out, parse_size(size))
     print(f"written: {out} (image1, image2: 1x3x{rows}x{columns} in [0, 1]; flow: 1x2x{rows}x{columns} in px)")
     return 0
 

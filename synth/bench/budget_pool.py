@@ -1,9 +1,7 @@
 """Presses spread over worker processes of one thread each; as `synth.processes` does for samples."""
 
-import contextlib
-import os
 import threading
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
@@ -14,8 +12,7 @@ from synth.bench.budget_schedule import Schedule
 from synth.bench.budget_study import Job, Study
 from synth.errors import InputError
 from synth.processes import interrupts_blocked, leave_with_driver
-
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+from synth.processes.threads import one_thread_each
 
 
 def presses(study: Study, schedule: Schedule, workers: int, machine: str) -> Generator[Pressed, None, None]:
@@ -43,7 +40,7 @@ def presses(study: Study, schedule: Schedule, workers: int, machine: str) -> Gen
         try:
             while True:
                 while len(pending) < workers and (job := schedule.begin()):
-                    with interrupts_blocked(), _one_thread():
+                    with interrupts_blocked(), one_thread_each():
                         pending.add(pool.submit(_work, job))
                 if not pending:
                     return
@@ -59,21 +56,6 @@ def presses(study: Study, schedule: Schedule, workers: int, machine: str) -> Gen
         except BaseException:
             held.close()
             raise
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Processes started meanwhile use one thread in every library: the time of a press is that of all its threads."""
-    before = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 _task: tuple[Study, str] | None = None
