@@ -84,8 +84,8 @@ def test_irradiance_beside_a_disc_light_has_its_closed_form() -> None:
     surface = flat_surface(sensor)
     many = DIRECT.model_copy(update={"samples_per_pixel": 36 * 64})
     image = Renderer(sensor, many, surface, plain(), FAST).radiance(surface.material, 0)
-    # Along a strip cos² / r² varies by its own size: 1 / √2304 = 2 % a pixel, 0.2 % in the mean of 9 x 9 px; the strips'
-    # area adds 0.14 %. Measured: 0.2 % more.
+    # Along a strip cos² / r² varies by its own size: 1 / √2304 = 2 % a pixel, 0.2 % in the mean of 9 x 9 px; strips
+    # cover 0.14 % more. Measured: 0.2 % more.
     assert image[24:33, 38:47].mean() == pytest.approx(0.6 / np.pi * np.pi * radiance * disc, rel=6e-3)
 
 
