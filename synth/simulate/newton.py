@@ -10,13 +10,14 @@ import numpy as np
 
 from synth.arrays import BoolArray, FloatArray
 from synth.simulate.contact import Indenters
-from synth.simulate.system import Balance, System, Unknowns
+from synth.simulate.system import System
+from synth.simulate.unknowns import Balance, Unknowns
 
 MAX_ITERATIONS = 20
 PATIENCE = 5
 """Iterations that may take rough directions. Far from the solution, or where a nearly incompressible gel is sheared as
 a whole (Cook's membrane), directions that are 1 % off do not get there in MAX_ITERATIONS."""
-LOOSE = 1e-4
+LOOSE = 1e-5
 """A tolerance above it is reached with rough directions."""
 NEAR = 1e-2
 """Relative residual below which a smaller tolerance is approached with exact directions: the last iterations then
@@ -46,6 +47,16 @@ class Solution:
     converged: BoolArray
     iterations: np.ndarray
     residual: FloatArray
+
+    def where(self, mask: BoolArray, other: "Solution") -> "Solution":
+        """This where mask (B,) is true, else other."""
+        return Solution(
+            self.state.where(mask, other.state),
+            self.balance.where(mask, other.balance),
+            np.where(mask, self.converged, other.converged),
+            np.where(mask, self.iterations, other.iterations),
+            np.where(mask, self.residual, other.residual),
+        )
 
 
 def relative_residual(balance: Balance) -> FloatArray:
@@ -107,11 +118,7 @@ def _line_search(
         norm = np.linalg.norm(after.free, axis=1)
         good = valid & ((norm <= before * (1 - 1e-4 * scale)) | (scale < INDIFFERENT))
         state = trial.where(good, state)
-        balance = Balance(
-            np.where(good[:, None], after.free, balance.free),
-            np.where(good[:, None, None], after.reaction, balance.reaction),
-            np.where(good, after.smallest_jacobian, balance.smallest_jacobian),
-        )
+        balance = after.where(good, balance)
         pending &= ~good
         scale[pending] /= 2
         lost = pending & (scale < SHORTEST)

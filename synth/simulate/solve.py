@@ -35,7 +35,7 @@ def simulate(
         folder: what a mesh indenter's file name is relative to.
         device: Warp device.
         frames: numbers of the states that are wanted, default all. The others are part of the trajectory, but keep the
-            penalty's penetration; those that are wanted are the same to the bit.
+            penalty's penetration and the way's tolerance; those that are wanted are the same to the bit.
         driver: of Newton's method.
 
     Raises:

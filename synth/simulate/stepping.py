@@ -1,9 +1,10 @@
 """Load stepping: move the indenters along their paths, recording converged states, halving steps that fail.
 
-Each step starts from a linear extrapolation of the last two states. On the way a loose tolerance is enough; at a
-recorded state the full one holds and augmented-Lagrangian passes take penetration and elastic slip away. The passes
-correct what is recorded only: the path goes on from the state before them, because multipliers that stay behind on a
-moving contact upset Newton's method at sharp edges. An unconverged field is never recorded: a sample whose step would
+Each step starts from a linear extrapolation of the last two states. On the way a loose tolerance is enough. At a state
+that is wanted augmented-Lagrangian passes take penetration and elastic slip away, and the full tolerance holds; what
+the passes begin from and what all but the last find needs less, because the next one changes it (MULTIPLIERS). All of
+this is for what is recorded only: the path goes on from the loose state before, because multipliers that stay behind on
+a moving contact upset Newton's method at sharp edges. An unconverged field is never recorded: a sample whose step would
 have to become shorter than SHORTEST_STEP ends at its last good state.
 """
 
@@ -18,12 +19,13 @@ from synth.scene import Numerics
 from synth.simulate.distance import KINDS
 from synth.simulate.driver import STANDARD, Driver
 from synth.simulate.memory import kept_contact, restore_contact
-from synth.simulate.newton import NOTHING, Solution, relative_residual, solve
+from synth.simulate.newton import MAX_ITERATIONS, NOTHING, Solution, relative_residual, solve
 from synth.simulate.path import Path, Pose
 from synth.simulate.space import Space
-from synth.simulate.system import System, Unknowns
+from synth.simulate.system import System
 from synth.simulate.tables import pack_indenters
 from synth.simulate.trajectory import State, Trajectory
+from synth.simulate.unknowns import Unknowns
 
 SHORTEST_STEP = 1 / 128
 """Shortest step, as a share of max_step_mm."""
@@ -42,6 +44,10 @@ FAILURES = 3
 """Of attempts at them, after which the passes end. Where a whole update upsets Newton's method (a ball pressed in by
 60 %, blocks up to their edges) a part of it does not: halved after a failure and doubled after a success, updates took
 that ball's penetration from 0.14 to 0.006 mm, and its force from 8 % too little to what finer meshes have."""
+MULTIPLIERS = 20.0
+"""Tolerance of states that multipliers are updated from, over the full one. Two updates do not forget what they began
+with: from states as loose as the way (1e-3) the ends of two frictionless ways to one place differed by up to 6e-5 mm,
+so by less than 1e-5."""
 PENETRATION = 2e-3
 """Passes end when no contact point is deeper inside the indenter than this share of the press depth."""
 
@@ -86,20 +92,14 @@ class Stepper:
         driver: Driver = STANDARD,
         frames: frozenset[int] | None = None,
     ) -> None:
-        """frames: numbers of the states that are wanted; the others are recorded without correction passes."""
+        """frames: numbers of the states that are wanted; the others are recorded as the way goes through them."""
         self.system, self.numerics, self.moduli, self.driver = system, numerics, moduli_mpa, driver
         self.samples = []
         for path in paths:
             records = path.records()
             wanted = records if frames is None else [record for k, record in enumerate(records, 1) if k in frames]
-            sample = _Sample(
-                path,
-                path.waypoints(),
-                frozenset(map(float, records)),
-                frozenset(map(float, wanted)),
-                numerics.max_step_mm,
-            )
-            self.samples.append(sample)
+            recorded, corrected = (frozenset(map(float, places)) for places in (records, wanted))
+            self.samples.append(_Sample(path, path.waypoints(), recorded, corrected, numerics.max_step_mm))
         self.rubs = np.array(friction) > 0
         self.indenters = pack_indenters(paths, friction, system.device)
         self.stuck = pack_indenters(paths, [STUCK] * len(paths), system.device)
@@ -153,24 +153,28 @@ class Stepper:
         """One step of every active sample."""
         targets = [sample.target() if active[s] else sample.at for s, sample in enumerate(self.samples)]
         self._place(targets)
-        arriving = np.array([s.finished or t in s.waypoints for s, t in zip(self.samples, targets, strict=True)])
-        tolerance = np.where(arriving, self.numerics.tolerance, np.maximum(self.driver.loose, self.numerics.tolerance))
+        tight = np.array([t in s.waypoints and t not in s.recorded for s, t in zip(self.samples, targets, strict=True)])
+        tolerance = np.where(tight, self.numerics.tolerance, self._loose())
         solution = solve(self.system, self._predicted(targets, active), self.indenters, active, tolerance)
         for s in map(int, np.flatnonzero(active)):
             self.samples[s].iterations += int(solution.iterations[s])
         good = solution.converged & active
+        recording = good & np.array([t in sample.recorded for sample, t in zip(self.samples, targets, strict=True)])
+        recording &= ~self._slipped_through(recording, targets, solution.state)
+        if recording.any():
+            good &= self._record(solution, recording, targets)
         self.previous = self.state.where(good, self.previous)
         self.state = solution.state.where(good, self.state)
-        recording = good & np.array([t in sample.recorded for sample, t in zip(self.samples, targets, strict=True)])
-        recording &= ~self._slipped_through(recording, targets)
-        if recording.any():
-            self._record(solution, recording, targets)
         # After the record, whose passes must still see how far points slipped in this step.
         self.system.settle(self.state, self.indenters, good)
         for s in map(int, np.flatnonzero(active)):
             self._control(self.samples[s], targets[s], bool(good[s]), int(solution.iterations[s]))
 
-    def _slipped_through(self, recording: BoolArray, targets: Sequence[float]) -> BoolArray:
+    def _loose(self) -> float:
+        """Tolerance on the way."""
+        return max(self.driver.loose, self.numerics.tolerance)
+
+    def _slipped_through(self, recording: BoolArray, targets: Sequence[float], state: Unknowns) -> BoolArray:
         """Samples whose indenter, at the end of its press, bears on nothing: it passed between the contact points.
 
         Ends them, saying so.
@@ -178,7 +182,9 @@ class Stepper:
         ending = np.array(
             [t == s.path.press_mm and self._is_over_pad(s.path) for s, t in zip(self.samples, targets, strict=True)]
         )
-        through = recording & ending & (self.system.forces(self.state)[0][:, 2] <= NOTHING)
+        through = recording & ending
+        if through.any():
+            through &= self.system.forces(state)[0][:, 2] <= NOTHING
         for s in map(int, np.flatnonzero(through)):
             self.samples[s].reason = (
                 f"pressed {targets[s]:.3g} mm deep, the indenter touches no contact point that bears it: it is too "
@@ -231,19 +237,22 @@ class Stepper:
         self._place(targets)
         return state.plus(step, np.where(active & np.isfinite(step.u).all(axis=(1, 2)), 1 / NUDGE, 0.0))
 
-    def _augmented(self, solution: Solution, recording: BoolArray) -> Solution:
-        """Passes of multiplier update and solve, by whole updates or as large a share of them as converges."""
-        count = len(recording)
-        pending, share, done, failures = recording.copy(), np.ones(count), np.zeros(count), np.zeros(count)
-        tolerance = np.full(len(pending), self.numerics.tolerance)
+    def _augmented(self, solution: Solution, wanted: BoolArray) -> Solution:
+        """Passes of multiplier update and solve, by whole updates or as large a share of them as converges.
+
+        The last of two whole updates is solved to the full tolerance; where the passes end before it, none is.
+        """
+        between = min(self._loose(), MULTIPLIERS * self.numerics.tolerance)
+        count = len(wanted)
+        pending, share, done, failures = wanted.copy(), np.ones(count), np.zeros(count), np.zeros(count)
         press = np.array([max(float(sample.path.corners[:, 0].max()), 0.1) for sample in self.samples])
+        solution = self._polished(solution, wanted & (self.system.deepest() > PENETRATION * press), between)
+        pending &= solution.converged
         while (pending := pending & (self.system.deepest() > PENETRATION * press)).any():
             before = kept_contact(self.system.contact)
             self.system.augment(self.indenters, np.where(pending, share, 0.0))
-            limit = self.driver.correction_iterations
-            better = solve(self.system, solution.state, self.indenters, pending, tolerance, limit)
-            for s in map(int, np.flatnonzero(pending)):
-                self.samples[s].iterations += int(better.iterations[s])
+            tolerance = np.where(done + share < ENOUGH, between, self.numerics.tolerance)
+            better = self._solved_again(solution, pending, tolerance, self.driver.correction_iterations)
             converged, failed = pending & better.converged, pending & ~better.converged
             if failed.any():
                 restore_contact(self.system.contact, before, failed)
@@ -251,19 +260,39 @@ class Stepper:
             done, failures = done + np.where(converged, share, 0.0), failures + failed
             share = np.where(failed, share / 2, np.where(converged, np.minimum(1.0, 2 * share), share))
             pending &= (done < ENOUGH) & (failures < FAILURES)
-            solution = _merge(converged, better, solution)
+            solution = better.where(converged, solution)
         return solution
 
-    def _record(self, solution: Solution, recording: BoolArray, targets: Sequence[float]) -> None:
-        """Record the corrected states, then put contact back to where the path goes on."""
+    def _polished(self, solution: Solution, wanted: BoolArray, limit: float) -> Solution:
+        """The wanted samples brought to a tolerance where they are not there yet; see `converged`."""
+        rough = wanted & solution.converged & (relative_residual(solution.balance) > limit)
+        if not rough.any():
+            return solution
+        better = self._solved_again(solution, rough, np.full(len(wanted), limit), MAX_ITERATIONS)
+        return better.where(rough, solution)
+
+    def _solved_again(self, solution: Solution, active: BoolArray, tolerance: FloatArray, limit: int) -> Solution:
+        """From a solution on, its iterations counted."""
+        better = solve(self.system, solution.state, self.indenters, active, tolerance, limit)
+        for s in map(int, np.flatnonzero(active)):
+            self.samples[s].iterations += int(better.iterations[s])
+        return better
+
+    def _record(self, step: Solution, recording: BoolArray, targets: Sequence[float]) -> BoolArray:
+        """Record the corrected states, then put contact back to where the path goes on.
+
+        Returns:
+            (B,) False where a corrected state does not reach the full tolerance: nothing is recorded there.
+        """
         kept = kept_contact(self.system.contact)
         wanted = recording & np.array([t in s.corrected for s, t in zip(self.samples, targets, strict=True)])
-        self.system.anchor(solution.state, self.indenters, wanted)
-        solution = self._augmented(solution, wanted)
+        self.system.anchor(step.state, self.indenters, wanted)
+        solution = self._polished(self._augmented(step, wanted), wanted, self.numerics.tolerance)
+        lost = wanted & ~solution.converged
         force, torque, traction = self.system.forces(solution.state)
         residual, deepest = relative_residual(solution.balance), self.system.deepest()
         slipping = self.system.slip_ratio(self.indenters)
-        for s in map(int, np.flatnonzero(recording)):
+        for s in map(int, np.flatnonzero(recording & ~lost)):
             sample, pose = self.samples[s], self.samples[s].path.pose(targets[s])
             sample.states.append(
                 State(
@@ -284,7 +313,8 @@ class Stepper:
             sample.iterations = 0
         restore_contact(self.system.contact, kept, recording)
         self.system.begin(recording)
-        self.system.balance(self.state, self.indenters, recording)
+        self.system.balance(step.state, self.indenters, recording)
+        return ~lost
 
     def _control(self, sample: _Sample, target: float, good: bool, iterations: int) -> None:
         """Longer steps after easy ones; half the step after a failure, and the end below the shortest."""
@@ -315,19 +345,6 @@ def _trajectory(sample: _Sample, seconds: float, space: Space) -> Trajectory:
     return Trajectory(states, "partial" if len(states) > 1 else "failed", sample.reason, seconds, space)
 
 
-def _merge(mask: BoolArray, new: Solution, old: Solution) -> Solution:
-    return Solution(
-        state=new.state.where(mask, old.state),
-        balance=type(old.balance)(
-            np.where(mask[:, None], new.balance.free, old.balance.free),
-            np.where(mask[:, None, None], new.balance.reaction, old.balance.reaction),
-            np.where(mask, new.balance.smallest_jacobian, old.balance.smallest_jacobian),
-        ),
-        converged=old.converged,
-        iterations=old.iterations,
-        residual=np.where(mask, new.residual, old.residual),
-    )
-
-
 def _triple(values: FloatArray) -> tuple[float, float, float]:
-    return float(values[0]), float(values[1]), float(values[2])
+    x, y, z = map(float, values)
+    return x, y, z

@@ -5,14 +5,13 @@ their value. Everything is in units of the gel's Young's modulus, so stiffness n
 a thousand times stiffer deforms identically.
 """
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from synth.arrays import BoolArray, FloatArray
-from synth.simulate.bulk import bulk_residual, bulk_tangent, linearise, pressure_tangent
+from synth.simulate.bulk import bulk_residual
 from synth.simulate.contact import ContactState, Indenters, contact_residual, contact_stiffness, contact_tangent
 from synth.simulate.fold import fold_residual, fold_tangent
 from synth.simulate.linear import Directions
@@ -20,52 +19,10 @@ from synth.simulate.material import Material
 from synth.simulate.multipliers import augment, settle
 from synth.simulate.pattern import pattern_of
 from synth.simulate.space import Space
-from synth.simulate.tables import bulk_tables, face_tables, fold_tables, warp_array
+from synth.simulate.stiffness import bulk_tangent, linearise, pressure_tangent
+from synth.simulate.tables import bulk_tables, face_tables, fold_tables, laplace_table, warp_array
+from synth.simulate.unknowns import Balance, Tangent, Unknowns
 from synth.surface import broken_linear_face
-
-
-@dataclass(frozen=True)
-class Unknowns:
-    """State of a batch: displacement (B, n, 3) mm and pressure (B, k) in units of E."""
-
-    u: FloatArray
-    p: FloatArray
-
-    def plus(self, step: "Unknowns", scale: FloatArray) -> "Unknowns":
-        """This plus scale (B,) times step."""
-        return Unknowns(self.u + scale[:, None, None] * step.u, self.p + scale[:, None] * step.p)
-
-    def where(self, mask: np.ndarray, other: "Unknowns") -> "Unknowns":
-        """This where mask (B,) is true, else other."""
-        return Unknowns(np.where(mask[:, None, None], self.u, other.u), np.where(mask[:, None], self.p, other.p))
-
-
-@dataclass(frozen=True)
-class Balance:
-    """Residual of a batch.
-
-    Attributes:
-        free: (B, k) residual of the unknowns that are not held.
-        reaction: (B, n, 3) all nodal forces including those on held nodes, in units of E mm².
-        smallest_jacobian: (B,) smallest det F; the residual means nothing where it is <= 0.
-    """
-
-    free: FloatArray
-    reaction: FloatArray
-    smallest_jacobian: FloatArray
-
-
-@dataclass(frozen=True)
-class Tangent:
-    """Derivative of the free residual of a batch.
-
-    Attributes:
-        values: (B, nnz) CSR data of the symmetric part's upper triangle.
-        remainder: per sample the unsymmetric rest of friction, SciPy CSR over the free unknowns, or None.
-    """
-
-    values: FloatArray
-    remainder: tuple[Any, ...]
 
 
 class System:
@@ -98,6 +55,7 @@ class System:
         self._pattern = pattern_of(space, self.mixed)
         self._directions = [Directions(self._pattern.factor(single, s), keep) for s in range(batch)]
         self._bulk = bulk_tables(space, material, self.mixed, device)
+        self._laplace = laplace_table(space, material, self._pattern.element_pairs, device)
         self._faces = face_tables(space, device)
         self._lattice = fold_tables(space, material, device)
         self._pairs = warp_array(self._pattern.element_pairs, wp.vec2i, device)
@@ -137,9 +95,10 @@ class System:
         self._touching = wp.zeros(points[:2], dtype=wp.int32, device=d)
         at_points = (self.batch, count, len(element.weights))
         self._factor = wp.zeros(at_points, dtype=wp.vec4d, device=d)
-        self._pushed = wp.zeros((*at_points, self.space.nodes.shape[1] + 1), dtype=wp.vec3d, device=d)
-        self._drift = wp.zeros((*at_points, self.space.nodes.shape[1]), dtype=wp.vec3d, device=d)
-        self._jacobian = wp.zeros(at_points, dtype=wp.float64, device=d)
+        self._held = wp.zeros(at_points, dtype=wp.vec4d, device=d)
+        self._pushed, self._drift = (
+            wp.zeros((*at_points, self.space.nodes.shape[1]), dtype=wp.vec3d, device=d) for _ in range(2)
+        )
         self._values = wp.zeros((self.batch, self._pattern.size + 1), dtype=wp.float64, device=d)
 
     def zero(self) -> Unknowns:
@@ -189,13 +148,13 @@ class System:
         """Derivative of the free residual of the active samples."""
         u, p, mask = self._device_state(state, active)
         elements, d = (self.batch, len(self.space.nodes)), self.device
-        shared, jacobian = [self._factor, self._pushed, self._drift], self._jacobian
+        linearised = [self._factor, self._held, self._pushed, self._drift]
         self._values.zero_()
-        wp.launch(linearise, elements, inputs=[u, p, mask, self._bulk], outputs=[*shared, jacobian], device=d)
+        wp.launch(linearise, elements, inputs=[u, p, mask, self._bulk], outputs=linearised, device=d)
         wp.launch(
             bulk_tangent,
-            (*elements, len(self._pattern.element_pairs)),
-            inputs=[mask, self._bulk, self._pairs, *shared, self._block_slot],
+            elements,
+            inputs=[mask, self._bulk, self._laplace, self._factor, self._pushed, self._drift, self._block_slot],
             outputs=[self._values],
             device=d,
         )
@@ -206,7 +165,7 @@ class System:
             wp.launch(
                 pressure_tangent,
                 elements,
-                inputs=[mask, self._bulk, self._pushed, jacobian, self._coupling_slot, self._pressure_slot],
+                inputs=[mask, self._bulk, self._held, self._pushed, self._coupling_slot, self._pressure_slot],
                 outputs=[self._values],
                 device=d,
             )

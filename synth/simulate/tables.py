@@ -42,6 +42,16 @@ def bulk_tables(space: Space, material: Material, mixed: bool, d: str) -> Bulk:
     return bulk
 
 
+def laplace_table(space: Space, material: Material, pairs: np.ndarray, d: str) -> wp.array:
+    """(m, np) integrals of μ g_a.g_b over the elements of a space, for pairs (np, 2) of local nodes."""
+    mesh, element = space.mesh, space.element
+    corner = barycentric_gradients(mesh.points, mesh.tets)
+    metric = (material.shear * mesh.volumes)[:, None, None] * np.einsum("eci,edi->ecd", corner, corner)
+    first, second = (element.derivative[:, pairs[:, i]] for i in range(2))
+    form = np.einsum("q,qkc,qkd->kcd", element.weights, first, second).reshape(len(pairs), 16)
+    return warp_array(metric.reshape(len(metric), 16) @ form.T, wp.float64, d)
+
+
 def fold_tables(space: Space, material: Material, d: str) -> "Lattice | None":
     """Where `synth.simulate.fold` looks, on Warp device d; None for linear elements, which cannot fold."""
     if space.element.order == 1:

@@ -9,7 +9,7 @@ import numpy as np
 import warp as wp
 
 from synth.arrays import FloatArray
-from synth.simulate.batched.gemm import dense
+from synth.simulate.batched.gemm import Dense, dense
 from synth.simulate.batched.krylov import Krylov, padded, plain
 from synth.simulate.contact import Indenters
 from synth.simulate.system import System
@@ -28,14 +28,15 @@ class Reference:
     Args:
         inverse: (k, k) float64, symmetric.
         device: Warp device.
+        products: default the device's own.
     """
 
-    def __init__(self, inverse: FloatArray, device: str) -> None:
+    def __init__(self, inverse: FloatArray, device: str, products: Dense | None = None) -> None:
         self.rows = padded(len(inverse))
         filled = np.zeros((self.rows, self.rows), dtype=np.float32)
         filled[: len(inverse), : len(inverse)] = inverse
         self.matrix = wp.array(filled, dtype=wp.float32, device=device)
-        self._dense = dense(device)
+        self._dense = products or dense(device)
 
     def precondition(self, krylov: Krylov) -> None:
         """`preconditioned` = K_0^{-1} `current`, at least where a solve is running."""

@@ -1,0 +1,103 @@
+"""Draws of a scene and what the batched solver makes of them on a device, for `synth.bench.agreement`."""
+
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+from synth.bench.agreement_rounding import Rounded
+from synth.errors import InputError
+from synth.mesh import PadMesh
+from synth.sampling import draw, pairs_of
+from synth.scene import Scene
+from synth.simulate import Trajectory
+from synth.simulate.batched.many import job_of, run_jobs
+from synth.simulate.batched.pad import prepare
+from synth.simulate.driver import Driver
+from synth.simulate.shared import shared_mesh
+from synth.simulate.solve import check_shared
+from synth.template import Template
+
+LARGEST_BATCH = 256
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """A trajectory to be simulated; picklable.
+
+    Attributes:
+        number: of the trajectory.
+        scene: fully drawn.
+        mesh: the pad's.
+        frames: numbers of the states that its samples show.
+        folder: what a mesh indenter's file name is relative to.
+    """
+
+    number: int
+    scene: Scene
+    mesh: PadMesh
+    frames: frozenset[int]
+    folder: Path
+
+
+def drawn_of(template: Template, count: int, seed: int) -> list[Drawn]:
+    """The first draws of so many trajectories, as `generate` makes them; those that break the schema are left out.
+
+    Raises:
+        InputError: a scene or mesh that cannot be used; draws of different pads.
+    """
+    found: list[Drawn] = []
+    first = template.corners[0]
+    mesh = shared_mesh(first.sensor.gel, first.numerics)
+    for number in range(count):
+        try:
+            scene = draw(template, seed, number)
+        except InputError:
+            continue
+        frames = {frame for pair in pairs_of(template, seed, number, scene.motion.steps) for frame in pair.frames}
+        found.append(Drawn(number, scene, mesh, frozenset(frames), template.source.parent))
+    if found:
+        check_shared([one.scene for one in found], mesh)
+    return found
+
+
+def together(drawn: Sequence[Drawn], device: str, driver: Driver, rounded: bool = False) -> list[Trajectory | str]:
+    """All draws in one batch.
+
+    Args:
+        drawn: of one pad.
+        device: Warp device.
+        driver: how Newton's method is led.
+        rounded: on a CPU, with a GPU's rounding.
+
+    Returns:
+        Each one's trajectory, or why its indenter cannot be built.
+    """
+    first = drawn[0]
+    pad = prepare(first.scene, first.mesh, device, Rounded() if rounded else None)
+    jobs, which = [], []
+    found: dict[int, Trajectory | str] = {}
+    for n, one in enumerate(drawn):
+        try:
+            jobs.append(job_of(one.scene, pad, one.folder))
+        except InputError as error:
+            found[n] = str(error)
+            continue
+        which.append(n)
+    frames = [drawn[n].frames for n in which]
+    for k, trajectory in run_jobs(jobs, pad, first.scene.numerics, frames, LARGEST_BATCH, driver):
+        found[which[k]] = trajectory
+    return [found[n] for n in range(len(drawn))]
+
+
+def one_by_one(drawn: Sequence[Drawn], driver: Driver, processes: int) -> list[Trajectory | str]:
+    """Each draw in a batch of its own on the CPU, in so many processes; what is returned as of `together`."""
+    if processes == 1:
+        return [_alone(one, driver) for one in drawn]
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+        return list(pool.map(_alone, drawn, [driver] * len(drawn)))
+
+
+def _alone(one: Drawn, driver: Driver) -> Trajectory | str:
+    return together([one], "cpu", driver)[0]
