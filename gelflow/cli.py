@@ -38,14 +38,14 @@ Config = Annotated[
 Steps = Annotated[int | None, Parameter(help="Optimiser steps.")]
 Resume = Annotated[bool, Parameter(negative=(), help="Go on with the run that --out holds.")]
 OnDevice = Annotated[
-    Device, Parameter(help="Where networks and elastic refinement run; auto: a CUDA device where there is one.")
+    Device, Parameter(help="Where networks and registration run; auto: a CUDA device where there is one.")
 ]
-ElasticUse = Annotated[
-    Literal["on", "off"] | None,
+Registered = Literal["none", "motion", "brightness"]
+Registration = Annotated[
+    Registered | None,
     Parameter(
-        help="Correct the network's flow by elastic refinement on the images: brings image 2 closer to image 1, not "
-        "always the flow closer to the motion. Default: as the weights' training asked for; on takes their settings, "
-        "or those of the preset real."
+        help="Correct the network's flow on the images: to follow the gel's motion, or to bring image 2 as close to "
+        "image 1 as can be, shading included. Default: as the weights' training asked for; the shipped ones: motion."
     ),
 ]
 TrainDevice = Annotated[Device | None, Parameter(help="Where to train; auto: a CUDA device where there is one.")]
@@ -99,7 +99,7 @@ def evaluate(
     /,
     *,
     weights: Annotated[Path | None, Parameter(help="File of weights; default: the shipped ones.")] = None,
-    elastic: ElasticUse = None,
+    registration: Registration = None,
     size: Size = None,
     device: OnDevice = "auto",
     as_json: AsJson = False,
@@ -107,7 +107,7 @@ def evaluate(
     """Scores one file of weights on image pairs."""
     from gelflow.commands import run_evaluate
 
-    return run_evaluate(data, weights, elastic, size, device, as_json)
+    return run_evaluate(data, weights, registration, size, device, as_json)
 
 
 @app.command
@@ -120,8 +120,8 @@ def compare(
         str,
         Parameter(
             help="Methods, separated by commas; an empty text for none. Beside the default ones, which are the "
-            "paper's: dis-elastic (DIS medium, then elastic refinement), exact (the exact flow of synthetic pairs), "
-            "al-dic (pyALDIC)."
+            "paper's: dis-motion and dis-brightness (DIS medium, then registration), exact (the exact flow of "
+            "synthetic pairs), al-dic (pyALDIC)."
         ),
     ] = "none,lucas-kanade,farneback,dis-ultrafast,dis-fast,dis-medium,tvl1",
     weights: Annotated[
@@ -131,12 +131,11 @@ def compare(
             "Labels that differ after # alone (best#0, best#1) are seeds: one row, mean and standard deviation."
         ),
     ] = None,
-    elastic: Annotated[
-        Literal["on", "off", "both"] | None,
+    registration: Annotated[
+        list[Registered] | None,
         Parameter(
-            help="Elastic refinement of GelFlow networks; their rows' names end with +elastic. both: a row without and "
-            "one with, of the same weights. Default: as the weights' training asked for; on takes their settings, or "
-            "those of the preset real."
+            help="Registration of GelFlow networks, see predict; repeatable, a row of each, whose name ends with "
+            "+motion or +brightness. Default: as the weights' training asked for."
         ),
     ] = None,
     ft: Annotated[
@@ -162,7 +161,7 @@ def compare(
     from gelflow.commands import run_compare
 
     return run_compare(
-        data, out, methods, weights or [], elastic, size, device, as_json, (ft, ft_config), batch, every, add
+        data, out, methods, weights or [], registration, size, device, as_json, (ft, ft_config), batch, every, add
     )
 
 
@@ -176,10 +175,11 @@ def predict(
     method: Annotated[
         str | None,
         Parameter(
-            help="Instead: lucas-kanade, farneback, dis-ultrafast, dis-fast, dis-medium, tvl1, dis-elastic, al-dic."
+            help="Instead: lucas-kanade, farneback, dis-ultrafast, dis-fast, dis-medium, tvl1, dis-motion, "
+            "dis-brightness, al-dic."
         ),
     ] = None,
-    elastic: ElasticUse = None,
+    registration: Registration = None,
     reference: Annotated[
         Literal["first", "previous"], Parameter(help="Of a video: flow from its first frame, or from the one before.")
     ] = "first",
@@ -191,7 +191,7 @@ def predict(
     """Flow of a pair of images or of a video, to EXR, .flo and pictures."""
     from gelflow.commands import run_predict
 
-    return run_predict(inputs, out, weights, method, elastic, reference, every, size, device, as_json)
+    return run_predict(inputs, out, weights, method, registration, reference, every, size, device, as_json)
 
 
 @app.command

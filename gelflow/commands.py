@@ -9,13 +9,14 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from statistics import quantiles
-from typing import Any, Literal
+from typing import Any
 
 from gelflow.baselines import Method, named_methods
 from gelflow.baselines.finetuned import fine_tuned
-from gelflow.baselines.learned import Elastic, Learned, PublishedRaft, open_network
+from gelflow.baselines.learned import Learned, PublishedRaft, open_network
 from gelflow.compare import compare
 from gelflow.comparison import Comparison
+from gelflow.config import Registration
 from gelflow.data import PairDataset, join, open_pairs
 from gelflow.data.choose import ChoiceConfig
 from gelflow.data.extract import extract_pairs, find_recordings
@@ -77,10 +78,15 @@ def run_train(
 
 
 def run_evaluate(
-    data: Sequence[Path], weights: Path | None, elastic: Elastic, size: str | None, device: str, as_json: bool
+    data: Sequence[Path],
+    weights: Path | None,
+    registration: Registration | None,
+    size: str | None,
+    device: str,
+    as_json: bool,
 ) -> int:
     """`evaluate`."""
-    network = open_network(weights_file(weights), None, parse_size(size), device, elastic)
+    network = open_network(weights_file(weights), None, parse_size(size), device, registration)
     _score(open_all(data), [network], None, as_json, 1)
     return 0
 
@@ -90,7 +96,7 @@ def run_compare(
     out: Path | None,
     methods: str,
     weights: Sequence[str],
-    elastic: Elastic | Literal["both"],
+    registrations: Sequence[Registration] | None,
     size: str | None,
     device: str,
     as_json: bool,
@@ -101,19 +107,19 @@ def run_compare(
 ) -> int:
     """`compare`; `methods` are separated by commas, `weights` are FILE or LABEL=FILE, of the pairs each `every`-th.
 
-    `elastic` is for GelFlow's networks, "both" for a row without and one with; `fine_tuning` is the number of steps, 0
-    for none, and the configuration of a test-time optimisation.
+    `registrations` are for GelFlow's networks, a row of each; `fine_tuning` is the number of steps, 0 for none, and the
+    configuration of a test-time optimisation.
     """
     if add and out is None:
         raise InputError("--add: give the folder of the earlier comparison as --out")
     if every < 1:
         raise InputError(f"--every {every}: a number from 1 on is needed")
     chosen = named_methods([name.strip() for name in methods.split(",") if name.strip()], device)
-    networks = [network for given in weights for network in _labelled(given, elastic, size, device)]
+    networks = [network for given in weights for network in _labelled(given, registrations, size, device)]
     steps, config = fine_tuning
     own = [network for network in networks if isinstance(network, Learned)]
-    if elastic is not None and not own:
-        raise InputError(f"--elastic {elastic}: needs --weights of GelFlow; of DIS there is the method dis-elastic")
+    if registrations and not own:
+        raise InputError("--registration: needs --weights of GelFlow; of DIS there are dis-motion and dis-brightness")
     dataset = open_all(data)
     dataset = PairDataset(dataset.source, dataset.records[::every])
     if steps > 0:
@@ -126,16 +132,14 @@ def run_compare(
 
 
 def _labelled(
-    given: str, elastic: Elastic | Literal["both"], size: str | None, device: str
+    given: str, registrations: Sequence[Registration] | None, size: str | None, device: str
 ) -> list[Learned | PublishedRaft]:
-    """The rows of one --weights: of GelFlow as many as --elastic asks for, of RAFT, which it does not concern, one."""
+    """The rows of one --weights: of GelFlow one for each --registration, of RAFT, which it does not concern, one."""
     from gelflow.models.raft import looks_like_raft
 
     label, equals, file = given.partition("=")
     path, name = weights_file(Path(file if equals else given)), label if equals else None
-    choices: tuple[Elastic, ...] = ("off", "on") if elastic == "both" else (elastic,)
-    if looks_like_raft(path):
-        choices = (None,)
+    choices = (None,) if not registrations or looks_like_raft(path) else tuple(registrations)
     return [open_network(path, name, parse_size(size), device, choice) for choice in choices]
 
 
@@ -167,7 +171,7 @@ def run_predict(
     out: Path,
     weights: Path | None,
     method: str | None,
-    elastic: Elastic,
+    registration: Registration | None,
     reference: Reference,
     every: int,
     size: str | None,
@@ -181,11 +185,13 @@ def run_predict(
         if not path.exists():
             raise InputError(f"{path}: there is no such file or folder")
     if method is not None and weights is None:
-        if elastic is not None:
-            raise InputError(f"--elastic {elastic}: is for --weights of GelFlow; of DIS there is --method dis-elastic")
+        if registration is not None:
+            raise InputError(
+                "--registration: is for --weights of GelFlow; of DIS there are --method dis-motion and dis-brightness"
+            )
         estimator = named_methods([method], device)[0]
     elif method is None:
-        estimator = open_network(weights_file(weights), None, parse_size(size), device, elastic)
+        estimator = open_network(weights_file(weights), None, parse_size(size), device, registration)
     else:
         raise InputError("give either --weights FILE (of a network) or --method NAME (a classical one)")
     if len(inputs) == 2:

@@ -22,27 +22,42 @@ class _Frozen(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
-class ElasticConfig(_Frozen):
-    """Elastic refinement of the network's flow on the images themselves, see `gelflow.models.elastic`. Not learned."""
+class RegistrationConfig(_Frozen):
+    """Registration of the images from the network's flow on, see `gelflow.models.registration`. Not learned."""
 
-    spacings: tuple[int, ...] = (16, 8, 4)
-    """Distances of the control points, coarse to fine, px of the images that the network sees."""
-    iterations: int = Field(default=6, ge=1, le=100)
-    """Gauss-Newton steps at each spacing."""
-    brightness: float = Field(default=1.0, ge=0)
-    """Weight of the colours as they are: flow that explains shading, too."""
-    structure: float = Field(default=0.3, ge=0)
-    """Weight of the colours after their local mean and contrast have been taken out: indifferent to illumination."""
-    stiffness: float = Field(default=5e-5, gt=0)
-    """Weight of the correction's bending."""
+    windows_px: tuple[float, ...] = (12.0, 8.0, 5.0)
+    """Standard deviation of the Gaussian window of each stage, px of the images that the network sees."""
+    smoothing_px: tuple[float, ...] = (8.0, 3.0, 2.0)
+    """Standard deviation of the Gaussian that smooths the flow before each stage, px; 0: none."""
+    iterations: int = Field(default=2, ge=1, le=100)
+    """Gauss-Newton steps of each stage."""
+    prior_px: float = Field(default=0.2, gt=0)
+    """Error of each component of the flow that a stage starts from, as far as anybody knows without the images."""
+    background_px: float | None = Field(default=4.0, gt=0)
+    """The residual counts without its mean under a Gaussian of this standard deviation, px: shading does not move with
+    the gel. None: as it is, flow that explains shading, too."""
 
     @model_validator(mode="after")
-    def _compares_something(self) -> ElasticConfig:
-        if not self.spacings or any(spacing < 2 for spacing in self.spacings):
-            raise ValueError(f"spacings = {list(self.spacings)} must be at least one whole number of px, each >= 2")
-        if self.brightness == 0 and self.structure == 0:
-            raise ValueError("brightness and structure are both 0: nothing would compare the images")
+    def _has_stages(self) -> RegistrationConfig:
+        if not self.windows_px or len(self.windows_px) != len(self.smoothing_px):
+            given = f"{list(self.windows_px)} and {list(self.smoothing_px)}"
+            raise ValueError(f"windows_px and smoothing_px need one number each for every stage, at least one: {given}")
+        if min(self.windows_px) < 1 or min(self.smoothing_px) < 0:
+            raise ValueError("windows_px must be at least 1, smoothing_px at least 0")
         return self
+
+
+Registration = Literal["none", "motion", "brightness"]
+
+REGISTRATIONS: dict[Registration, RegistrationConfig | None] = {
+    "none": None,
+    "motion": RegistrationConfig(),
+    "brightness": RegistrationConfig(
+        windows_px=(12.0, 6.0, 3.0, 1.0), smoothing_px=(4.0, 2.0, 1.0, 0.0), iterations=4, prior_px=1.0,
+        background_px=None,
+    ),
+}  # fmt: skip
+"""Nothing, what measures the gel's motion best, and what brings image 2 closest to image 1."""
 
 
 class ModelConfig(_Frozen):
@@ -76,9 +91,10 @@ class ModelConfig(_Frozen):
     or at full resolution. Not in the paper, whose finest flow is an enlargement of V2."""
     refine_iterations: int = Field(default=3, ge=1, le=16)
     """Times that the refinement head, with the same weights, corrects the flow."""
-    elastic: ElasticConfig | None = None
-    """Refinement of the finished flow where it is used (validation, evaluation, prediction; neither the training steps
-    nor the exported network). Takes no part in the weights, so that a fine-tuning may switch it on or change it."""
+    registration: RegistrationConfig | None = None
+    """Correction of the network's flow on the images where it is used (validation, evaluation, prediction; neither the
+    training steps nor the exported network). Takes no part in the weights: a fine-tuning may change it. Not in the
+    paper."""
 
     @model_validator(mode="after")
     def _decodes_something(self) -> ModelConfig:
@@ -98,7 +114,7 @@ class LossConfig(_Frozen):
     """Weight of the photometric loss."""
     lambda_census: float = Field(default=0.0, ge=0)
     """Weight of the ternary census loss (Meister, Hur and Roth 2018) beside it: indifferent to brightness."""
-    warping: Literal["bilinear", "bicubic"] = "bilinear"
+    warping: Literal["bilinear", "spline"] = "bilinear"
     """Interpolation of the second image in the loss. The paper names none; bilinear blurs, most at half a px."""
     compare_at: Literal["scale", "image"] = "scale"
     """Where each scale's flow is judged: on the images of its own scale (the paper), whose pattern is averaged away at

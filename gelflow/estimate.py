@@ -10,7 +10,6 @@ from gelflow.arrays import Flow, Images
 from gelflow.config import MINIMUM_SIDE
 from gelflow.errors import InputError
 from gelflow.models import GelFlow
-from gelflow.models.elastic import refined
 from gelflow.models.gelflow import check_shapes
 
 
@@ -39,7 +38,7 @@ def estimate_flow(
     image1: Images,
     image2: Images,
     size: tuple[int, int] | None = None,
-    network: Callable[[Images, Images], list[Flow]] | None = None,
+    flow: Callable[[Images, Images], Flow] | None = None,
 ) -> Flow:
     """The flow from image 1 to image 2: ``I1(x) = I2(x + V(x))``.
 
@@ -49,7 +48,7 @@ def estimate_flow(
         image2: The same shape.
         size: Rows and columns at which the network works; None: those to which its training images were resized
             (`GelFlow.image_size`), or those of the given images where they were not.
-        network: What to call in the model's place, such as a `RecordedNetwork` of it.
+        flow: What to call in place of `GelFlow.flow`, such as a `RecordedNetwork` of the model.
 
     Returns:
         (B, 2, H, W) float32, px of the given images, on their device, without gradient.
@@ -73,10 +72,7 @@ def estimate_flow(
     model.eval()
     try:
         with torch.no_grad():
-            flow = (network or model)(*inputs)[0]
-            if model.config.elastic is not None:
-                flow = refined(flow, inputs[0], inputs[1], model.config.elastic)
-            flow = resize_flow(flow, native)
+            found = resize_flow((flow or model.flow)(*inputs), native)
     finally:
         model.train(was_training)
-    return flow.to(image1.device)
+    return found.to(image1.device)

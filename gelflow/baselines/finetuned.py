@@ -15,8 +15,8 @@ or those of `--ft-config`. Nothing else of a training carries over, whatever its
 - the weights themselves are kept, not their moving average, which few steps hardly move;
 - what belongs to the machine of the training: its devices and processes, compilation.
 
-The elastic refinement has no part in the training steps. The copy keeps what its weights had, and is used with what was
-asked of the network that it came from.
+Registration has no part in the training steps. The copy keeps what its weights had, and is used with what was asked of
+the network that it came from.
 """
 
 import json
@@ -89,7 +89,7 @@ def fine_tuned(method: Learned, dataset: PairDataset, out: Path, steps: int, con
         method: The network; stays as it is.
         dataset: The pairs.
         out: Folder for the run; a run of the same settings that it holds is gone on with, or used if it is finished.
-            With and without elastic refinement it is the same run.
+            It is the same run however the flow is registered.
         steps: Optimiser steps.
         config: See `fine_tuning_settings`.
 
@@ -110,4 +110,4 @@ def fine_tuned(method: Learned, dataset: PairDataset, out: Path, steps: int, con
         raise InputError(f"--ft {steps}: the pairs have {given} px, a batch needs one size; give --size ROWSxCOLUMNS")
     resume = (out / STATE).is_file()
     result = train(settings, dataset, None, out, initial=method.path, resume=resume)
-    return Learned(result.weights, f"{method.name}{SUFFIX}", method.size, method.device, method.elastic)
+    return Learned(result.weights, f"{method.name}{SUFFIX}", method.size, method.device, method.registration)

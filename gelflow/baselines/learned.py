@@ -2,19 +2,13 @@
 
 import re
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from gelflow.baselines.elastic import preset_elastic
 from gelflow.baselines.method import check_images
 from gelflow.baselines.tensors import as_array, as_tensor, chosen_device
+from gelflow.config import REGISTRATIONS, Registration, RegistrationConfig
 from gelflow.errors import InputError
 from gelflow.raster import FlowArray, ImageArray
-
-Elastic = Literal["on", "off"] | None
-"""The elastic refinement after a network: with it, without it, or as the weights' training asked for."""
-
-ELASTIC_SUFFIX = "+elastic"
-"""In the name of every GelFlow network whose flow is refined."""
 
 _END = re.compile(r"((?:#\d+)?(?:\+ft)?)$")
 """The number of a seed and the mark of fine-tuning, which names end with (see `gelflow.seeds`)."""
@@ -25,7 +19,7 @@ def open_network(
     name: str | None = None,
     size: tuple[int, int] | None = None,
     device: str = "auto",
-    elastic: Elastic = None,
+    registration: Registration | None = None,
 ) -> "Learned | PublishedRaft":
     """The network that a file of weights belongs to: GelFlow (.safetensors) or RAFT (.pth).
 
@@ -34,18 +28,18 @@ def open_network(
         name: Name in tables; None: the name of the file's folder and file.
         size: Rows and columns at which the network works; None: those of its training, or of the images.
         device: "auto" (a CUDA device where there is one), "cpu" or "cuda".
-        elastic: See `Learned`.
+        registration: See `Learned`.
 
     Raises:
-        InputError: The file is missing, damaged or of another network, the device is not there, or `elastic` is given
-            for RAFT.
+        InputError: The file is missing, damaged or of another network, the device is not there, or `registration` is
+            given for RAFT.
     """
     from gelflow.models.raft import looks_like_raft
 
     if not looks_like_raft(path):
-        return Learned(path, name, size, device, elastic)
-    if elastic is not None:
-        raise InputError(f"--elastic {elastic}: {path} is RAFT; only GelFlow's networks have the elastic refinement")
+        return Learned(path, name, size, device, registration)
+    if registration is not None:
+        raise InputError(f"--registration {registration}: {path} is RAFT; only the flow of GelFlow's is registered")
     return PublishedRaft(path, name, size, device)
 
 
@@ -54,16 +48,15 @@ class Learned:
 
     Args:
         path: Weights, as `gelflow train` writes them.
-        name: Name in tables; None: the name of the file's folder and file. "+elastic" is added where the flow is
-            refined and the name does not say so, in front of a seed's number and of "+ft".
+        name: Name in tables; None: the name of the file's folder and file. Where the flow is registered and the name
+            does not say so, "+motion" or "+brightness" is added in front of a seed's number and of "+ft".
         size: Rows and columns at which the network works; None: those of its training.
         device: "auto" (a CUDA device where there is one), "cpu" or "cuda".
-        elastic: None: the elastic refinement that the weights' training asked for, if any; "on": the same, or where
-            it asked for none, that of the preset `real`; "off": none.
+        registration: One of `gelflow.config.REGISTRATIONS`; None: what the weights' training asked for.
 
     Attributes:
         label: The name without what is added to it.
-        trained: The architecture as the file has it, its own elastic refinement included.
+        trained: The architecture as the file has it, its own registration included.
 
     Raises:
         InputError: The file is missing, damaged or of another model, or the device is not there.
@@ -75,23 +68,23 @@ class Learned:
         name: str | None = None,
         size: tuple[int, int] | None = None,
         device: str = "auto",
-        elastic: Elastic = None,
+        registration: Registration | None = None,
     ) -> None:
         from gelflow.models.recorded import RecordedNetwork
         from gelflow.train.checkpoint import load_weights
 
         self.path = path
         self.device = chosen_device(device)
-        self.elastic = elastic
+        self.registration = registration
         self.model: Any = load_weights(path, self.device)
-        self.network = RecordedNetwork(self.model)
         self.trained = self.model.config
-        if elastic is not None:
-            config = None if elastic == "off" else self.trained.elastic or preset_elastic()
-            self.model.config = self.trained.model_copy(update={"elastic": config})
+        if registration is not None:
+            settings = {"registration": REGISTRATIONS[registration]}
+            self.model.config = self.trained.model_copy(update=settings)
+        self.network = RecordedNetwork(self.model)
         self.label = name or "/".join(path.with_suffix("").parts[-2:])
-        refined = self.model.config.elastic is not None and ELASTIC_SUFFIX not in self.label
-        self.name = _END.sub(rf"{ELASTIC_SUFFIX}\1", self.label, count=1) if refined else self.label
+        added = _suffix(self.model.config.registration)
+        self.name = self.label if added in self.label else _END.sub(rf"{added}\1", self.label, count=1)
         self.size = size
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
@@ -103,7 +96,7 @@ class Learned:
         return as_array(estimate_flow(self.model, tensors[0], tensors[1], self.size, self.network))
 
     def forward(self, image1: Any, image2: Any) -> Any:
-        """What `flow` costs beside reading and resizing: the network and, where it is on, the elastic refinement.
+        """What `flow` costs beside reading and resizing: the network and, where it is on, the registration.
 
         Args:
             image1: Tensor (B, 3, H, W) in [0, 1] on the network's device.
@@ -112,11 +105,12 @@ class Learned:
         Returns:
             (B, 2, H, W), px.
         """
-        from gelflow.models.elastic import refined
+        return self.network(image1, image2)
 
-        flow = self.network(image1, image2)[0]
-        config = self.model.config.elastic
-        return flow if config is None else refined(flow, image1, image2, config)
+
+def _suffix(settings: RegistrationConfig | None) -> str:
+    known = next((name for name, config in REGISTRATIONS.items() if config == settings), "registration")
+    return "" if known == "none" else f"+{known}"
 
 
 class PublishedRaft:

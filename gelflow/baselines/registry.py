@@ -4,10 +4,11 @@ from collections.abc import Callable, Sequence
 
 from gelflow.baselines.aldic import ALDIC
 from gelflow.baselines.classical import DIS, TVL1, Farneback, NoMotion
-from gelflow.baselines.elastic import ElasticDIS
 from gelflow.baselines.exact import ExactFlow
 from gelflow.baselines.lucas_kanade import LucasKanade
 from gelflow.baselines.method import Method
+from gelflow.baselines.registered import RegisteredDIS
+from gelflow.config import REGISTRATIONS
 from gelflow.errors import InputError
 
 CLASSICAL: dict[str, Callable[[], Method]] = {
@@ -23,26 +24,27 @@ CLASSICAL: dict[str, Callable[[], Method]] = {
 
 BESIDE: dict[str, Callable[[], Method]] = {"exact": ExactFlow, "al-dic": ALDIC}
 """Methods that the paper does not have: the answer itself, where the data have it, and pyALDIC, another package that
-is named where it is missing. Beside these two `dis-elastic`, which may run on a device."""
+is named where it is missing."""
 
-ELASTIC = "dis-elastic"
-"""DIS medium with this project's elastic refinement, see `gelflow.baselines.elastic`; not in the paper."""
+REGISTERED = {f"dis-{aim}": (aim, settings) for aim, settings in REGISTRATIONS.items() if settings is not None}
+"""DIS medium with this project's registration, which may run on a device; not in the paper."""
 
 
 def named_methods(names: Sequence[str], device: str = "cpu") -> list[Method]:
     """Methods without weights by name, in the given order.
 
     Args:
-        names: Keys of `CLASSICAL` and `BESIDE`, or `ELASTIC`.
+        names: Keys of `CLASSICAL`, `BESIDE` and `REGISTERED`.
         device: "auto", "cpu" or "cuda": for what can run on another device than the processor.
 
     Raises:
         InputError: A name is not known, or is given twice, or the device is not there.
     """
-    known = CLASSICAL | {ELASTIC: lambda: ElasticDIS(device)} | BESIDE
+    known = [*CLASSICAL, *REGISTERED, *BESIDE]
     for name in names:
         if name not in known:
             raise InputError(f"there is no method {name!r}; allowed: {', '.join(known)}")
         if list(names).count(name) > 1:
             raise InputError(f"the method {name!r} is given twice")
-    return [known[name]() for name in names]
+    plain = CLASSICAL | BESIDE
+    return [plain[name]() if name in plain else RegisteredDIS(*REGISTERED[name], device) for name in names]

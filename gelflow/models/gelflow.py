@@ -20,6 +20,7 @@ from gelflow.models.estimator import Estimator
 from gelflow.models.layers import SLOPE
 from gelflow.models.lffm import LocalFlowFusion
 from gelflow.models.refinement import RefinementHead
+from gelflow.models.registration import registered
 from gelflow.ops.correlation import local_correlation
 from gelflow.ops.pyramid import enlarge_flow
 from gelflow.ops.warp import warp
@@ -89,6 +90,15 @@ class GelFlow(nn.Module):
                 decoded[scale] = self.refinement(decoded[scale], images, features[0])
                 finest = scale
         return [decoded[scale] for scale in range(self.config.levels - 1)]
+
+    def flow(self, image1: Images, image2: Images) -> Flow:
+        """The flow as it is used: the finest of `forward`, registered where the configuration says so.
+
+        Without gradient, except where nothing is registered. Arguments and exceptions as for `forward`.
+        """
+        flow: Flow = self(image1, image2)[0]
+        settings = self.config.registration
+        return flow if settings is None else registered(flow, image1, image2, settings)
 
     def _decode(self, scale: int, first: Features, second: Features, start: Flow) -> Flow:
         """The flow of one scale from its features (B, C, H, W) and the enlarged flow of the coarser one."""

@@ -1,4 +1,7 @@
-"""A network in use as a CUDA graph: one launch a pair in place of some thousand, which take longer than the kernels."""
+"""A network in use, registration included, as a CUDA graph: one launch a pair in place of a thousand.
+
+Launching them takes longer than the kernels do.
+"""
 
 import torch
 from torch import Tensor
@@ -22,20 +25,19 @@ class RecordedNetwork:
         self._shape: torch.Size | None = None
         self._graph: torch.cuda.CUDAGraph | None = None
         self._images: list[Tensor] = []
-        self._flows: list[Tensor] = []
+        self._flow = torch.empty(0)
 
     @torch.no_grad()
-    def __call__(self, image1: Images, image2: Images) -> list[Flow]:
-        """As `GelFlow.forward`."""
+    def __call__(self, image1: Images, image2: Images) -> Flow:
+        """As `GelFlow.flow`."""
         if not image1.is_cuda or image1.shape != image2.shape or image1.shape != self._shape:
             self._shape, self._graph = image1.shape, None
-            flows: list[Tensor] = self.model(image1, image2)
-            return flows
+            return self.model.flow(image1, image2)
         graph = self._graph or self._record(image1, image2)
         for kept, new in zip(self._images, (image1, image2), strict=True):
             kept.copy_(new)
         graph.replay()
-        return [flow.clone() for flow in self._flows]
+        return self._flow.clone()
 
     def _record(self, image1: Images, image2: Images) -> torch.cuda.CUDAGraph:
         self._images = [image1.clone(), image2.clone()]
@@ -43,9 +45,9 @@ class RecordedNetwork:
         aside = torch.cuda.Stream(image1.device)
         aside.wait_stream(torch.cuda.current_stream(image1.device))
         with torch.cuda.stream(aside):
-            self.model(*self._images)
+            self.model.flow(*self._images)
         torch.cuda.current_stream(image1.device).wait_stream(aside)
         self._graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(self._graph):
-            self._flows = self.model(*self._images)
+            self._flow = self.model.flow(*self._images)
         return self._graph

@@ -5,11 +5,14 @@
 way with ``align_corners=False``: its coordinate -1 is the image's left edge (0 px), +1 its right edge (W px).
 """
 
+from typing import Literal
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from gelflow.arrays import Features, Flow, Mask
+from gelflow.ops.spline import SplineImage
 
 
 def pixel_indices(flow: Flow) -> tuple[Tensor, Tensor]:
@@ -20,7 +23,13 @@ def pixel_indices(flow: Flow) -> tuple[Tensor, Tensor]:
     return columns, rows
 
 
-def warp(image: Features, flow: Flow, mode: str = "bilinear") -> Features:
+def positions(flow: Flow) -> tuple[Tensor, Tensor]:
+    """Columns and rows x + flow(x) that each pixel is found at, (B, H, W) px from the centre of the first pixel."""
+    columns, rows = pixel_indices(flow)
+    return columns + flow[:, 0], rows + flow[:, 1]
+
+
+def warp(image: Features, flow: Flow, mode: Literal["bilinear", "spline"] = "bilinear") -> Features:
     """Samples an image at x + flow(x); outside the image its border is repeated.
 
     In float32 the sampling position is rounded to about 1e-7 of the image's width (3e-5 px at 640 px). Where the flow
@@ -29,19 +38,22 @@ def warp(image: Features, flow: Flow, mode: str = "bilinear") -> Features:
     Args:
         image: The second image or its features, (B, C, H, W).
         flow: (B, 2, H, W), px of this image.
-        mode: "bilinear", or "bicubic" (Keys 1981, A = -0.75), which overshoots at edges.
+        mode: "bilinear", or "spline" (cubic, see `gelflow.ops.spline`), which overshoots at edges.
 
     Returns:
         (B, C, H, W), dtype of the flow.
     """
     height, width = flow.shape[-2:]
-    columns, rows = pixel_indices(flow)
-    x = (2 * (columns + flow[:, 0]) + 1) / width - 1
-    y = (2 * (rows + flow[:, 1]) + 1) / height - 1
+    x, y = positions(flow)
     finite = torch.isfinite(x) & torch.isfinite(y)
-    grid = torch.stack([x, y], dim=-1).clamp(-2, 2)  # far outside, the border is the border
-    grid = torch.where(finite.unsqueeze(-1), grid, 0.0)
-    sampled = F.grid_sample(image.to(flow.dtype), grid, mode=mode, padding_mode="border", align_corners=False)
+    # Far outside, the border is the border.
+    x = torch.where(finite, x, 0.0).clamp(-width, 2 * width)
+    y = torch.where(finite, y, 0.0).clamp(-height, 2 * height)
+    if mode == "spline":
+        sampled = SplineImage(image.to(flow.dtype)).at(x, y)
+    else:
+        grid = torch.stack([(2 * x + 1) / width - 1, (2 * y + 1) / height - 1], dim=-1)
+        sampled = F.grid_sample(image.to(flow.dtype), grid, padding_mode="border", align_corners=False)
     return sampled.masked_fill(~finite.unsqueeze(1), torch.nan)
 
 
@@ -51,6 +63,5 @@ def inside(flow: Flow) -> Mask:
     A flow of zero keeps every pixel, the border included. The mask carries no gradient.
     """
     height, width = flow.shape[-2:]
-    columns, rows = pixel_indices(flow)
-    x, y = columns + flow[:, 0].detach(), rows + flow[:, 1].detach()
+    x, y = positions(flow.detach())
     return ((x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)).to(flow.dtype).unsqueeze(1)

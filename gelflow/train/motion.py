@@ -2,7 +2,7 @@
 
 Image 2 is read at ``A(y) = c + M (y - c) + t``, c its centre and M = s R, so that what lay at A(y) lies at y. A point
 of image 1 that was found at x + V(x) is then found at ``x + V'(x) = c + M^-1 (x + V(x) - c - t)``. The flow stays
-exact; image 2 is resampled (bicubic), and where A(y) lies outside its border is repeated.
+exact; image 2 is resampled (by splines), and where A(y) lies outside its border is repeated.
 
 Lights are turned with the gel, which real lights are not: angles and shifts should stay small beside the motion of the
 recordings that the network is meant for.
@@ -33,7 +33,7 @@ def moved_images(images: Images, matrices: Tensor, shifts: Tensor) -> Images:
     """Second images (B, C, H, W) read at A(y); M is (B, 2, 2), t is (B, 2) in px."""
     place = _from_centre(images)
     more = torch.einsum("bij,jhw->bihw", matrices, place) - place + shifts[:, :, None, None]
-    return warp(images, more, "bicubic").clamp(0, 1)
+    return warp(images, more, "spline").clamp(0, 1)
 
 
 def moved_flow(flow: Flow, inverses: Tensor, shifts: Tensor) -> Flow:

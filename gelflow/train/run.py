@@ -141,8 +141,8 @@ def _initial_network(config: TrainConfig, initial: Path | None) -> GelFlow:
             model = GelFlow(config.model)
     else:
         model = load_weights(initial)
-        # The elastic refinement has no weights: a fine-tuning may switch it on or change it.
-        model.config = model.config.model_copy(update={"elastic": config.model.elastic})
+        # Registration has no weights: a fine-tuning may switch it on or change it.
+        model.config = model.config.model_copy(update={"registration": config.model.registration})
         if model.config != config.model:
             theirs, ours = model.config.model_dump(), config.model.model_dump()
             names = [

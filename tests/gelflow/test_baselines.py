@@ -9,11 +9,11 @@ from textures import moved
 
 from gelflow.baselines import CLASSICAL, named_methods
 from gelflow.baselines.aldic import ALDIC, INSTALL
-from gelflow.baselines.registry import ELASTIC
+from gelflow.baselines.registry import REGISTERED
 from gelflow.baselines.scattered import dense_flow
+from gelflow.config import REGISTRATIONS, Registration
 from gelflow.errors import InputError
-from gelflow.models.elastic import refined
-from gelflow.overrides import train_config
+from gelflow.models.registration import registered
 from gelflow.raster import ImageArray
 
 SHIFT = (0.7, -0.4)
@@ -22,9 +22,8 @@ SHIFT = (0.7, -0.4)
 # Median error in px: a matching error of a sixteenth of a px at the finest resolution that the method looks at. DIS
 # ultrafast and fast stop at a quarter of the resolution (OpenCV: finest scale 2), DIS medium at a half; Farnebäck and
 # TV-L1 end at full resolution, but TV-L1 is biased towards a flow without gradients: the same limit as DIS medium.
-# Lucas-Kanade iterates at full resolution until steps are below 0.001 px; what is left is the rounding to 8 bit. The
-# elastic refinement follows the errors of bilinear interpolation, 4 % of the height of the shortest waves: the limit of
-# DIS medium, where it starts.
+# Lucas-Kanade iterates at full resolution until steps are below 0.001 px; what is left is the rounding to 8 bit.
+# Registration is to make of DIS medium's flow what Lucas-Kanade reaches.
 TOLERANCE = {
     "lucas-kanade": 1 / 16,
     "farneback": 1 / 16,
@@ -32,7 +31,8 @@ TOLERANCE = {
     "dis-fast": 4 / 16,
     "dis-medium": 2 / 16,
     "tvl1": 2 / 16,
-    "dis-elastic": 2 / 16,
+    "dis-motion": 1 / 16,
+    "dis-brightness": 1 / 16,
 }
 
 
@@ -51,7 +51,7 @@ def test_no_motion_is_zero() -> None:
     assert not method.flow(moved(20, 30, 0, 0), moved(20, 30, 1, 1)).any()
 
 
-@pytest.mark.parametrize("name", [*CLASSICAL, ELASTIC])
+@pytest.mark.parametrize("name", [*CLASSICAL, *REGISTERED])
 @pytest.mark.parametrize(
     ("image1", "image2", "word"),
     [
@@ -72,28 +72,29 @@ def test_refuses_unknown_and_repeated_names(names: list[str]) -> None:
         named_methods(names)
 
 
-@pytest.mark.parametrize("name", [*CLASSICAL, ELASTIC])
+@pytest.mark.parametrize("name", [*CLASSICAL, *REGISTERED])
 def test_works_on_the_smallest_allowed_images(name: str) -> None:
     image = moved(16, 16, 0, 0)
     assert named_methods([name])[0].flow(image, image).shape == (16, 16, 2)
 
 
-def test_dis_elastic_is_the_refinement_of_dis_medium_with_the_presets_settings() -> None:
-    """Fails with the images exchanged before the refinement, and with other settings than the preset's."""
+@pytest.mark.parametrize("aim", ["motion", "brightness"])
+def test_a_registered_dis_is_dis_medium_registered(aim: Registration) -> None:
+    """Fails with the images exchanged before the registration, and with the aims exchanged."""
     images = moved(72, 96, 0, 0), moved(72, 96, *SHIFT)
-    start, found = (method.flow(*images) for method in named_methods(["dis-medium", ELASTIC]))
+    start, found = (method.flow(*images) for method in named_methods(["dis-medium", f"dis-{aim}"]))
     tensors = [torch.from_numpy(np.moveaxis(array, -1, 0).copy())[None] for array in (start, *images)]
-    elastic = train_config("real").model.elastic
-    assert elastic is not None
-    np.testing.assert_array_equal(np.moveaxis(found, -1, 0), refined(*tensors, elastic)[0].numpy())
+    settings = REGISTRATIONS[aim]
+    assert settings is not None
+    np.testing.assert_array_equal(np.moveaxis(found, -1, 0), registered(*tensors, settings)[0].numpy())
     assert np.abs(found - start).max() > 0.01
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
-def test_the_elastic_refinement_runs_where_it_is_asked_to() -> None:
-    assert getattr(named_methods([ELASTIC], "auto")[0], "device", None) == "cpu"
+def test_registration_runs_where_it_is_asked_to() -> None:
+    assert getattr(named_methods(["dis-motion"], "auto")[0], "device", None) == "cpu"
     with pytest.raises(InputError, match="no CUDA device"):
-        named_methods([ELASTIC], "cuda")
+        named_methods(["dis-motion"], "cuda")
 
 
 def test_interpolation_is_exact_for_affine_motion_inside_and_nearest_outside() -> None:

@@ -11,7 +11,7 @@ from textures import write_folder, write_synthetic
 
 from gelflow.baselines.finetuned import fine_tuned, fine_tuning_settings
 from gelflow.baselines.learned import Learned
-from gelflow.config import ElasticConfig, ModelConfig, MotionConfig, TrainConfig
+from gelflow.config import ModelConfig, MotionConfig, RegistrationConfig, TrainConfig
 from gelflow.data import PairDataset, join, open_pairs
 from gelflow.errors import InputError
 from gelflow.models import GelFlow
@@ -43,7 +43,7 @@ def test_whatever_the_preset_the_pairs_are_seen_as_they_are_and_without_truth(pr
     """Fails with any one of the fixed settings left out that this preset sets otherwise."""
     recorded = train_config(preset)
     levels = recorded.model.levels
-    model = ModelConfig(levels=levels, projected_channels=8, estimator="shared", elastic=ElasticConfig())
+    model = ModelConfig(levels=levels, projected_channels=8, estimator="shared", registration=RegistrationConfig())
     rate = min(recorded.learning_rate, 1e-4) if recorded.schedule == "one_cycle" else recorded.learning_rate
     method = Learned(network(tmp_path / "w.safetensors", model, recorded, recorded.image_size), device="cpu")
     for config in (None, preset):
@@ -56,7 +56,7 @@ def test_whatever_the_preset_the_pairs_are_seen_as_they_are_and_without_truth(pr
         assert (settings.schedule, settings.warmup_steps, settings.learning_rate) == ("constant", 0, rate)
         assert settings.image_size == recorded.image_size
         assert settings.loss == recorded.loss
-        assert settings.model == model  # its elastic refinement included
+        assert settings.model == model  # its registration included
         # From the weights the paper's batches of 4, so that 1600 steps are 800 epochs; a file's own, if pairs suffice.
         assert settings.batch_size == (4 if config is None else min(recorded.batch_size, 8))
 

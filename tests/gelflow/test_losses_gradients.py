@@ -14,7 +14,7 @@ TERMS = {
     "absolute difference": {"smoothness": "none", "alpha": 0.0},
     "structural similarity": {"smoothness": "none", "alpha": 1.0},
     "outside counts": {**ALONE, "mask_outside": False},
-    "bicubic": {**ALONE, "warping": "bicubic"},
+    "spline": {**ALONE, "warping": "spline"},
     "on the images": {**ALONE, "compare_at": "image"},
     "census": {"smoothness": "none", "lambda_ph": 0.0, "lambda_census": 1.0},
     "decomposition": REGULARISER,

@@ -8,7 +8,7 @@ import torch
 from waves import press_flow
 
 from gelflow.cli import app
-from gelflow.config import ModelConfig
+from gelflow.config import REGISTRATIONS, ModelConfig
 from gelflow.errors import InputError
 from gelflow.estimate import estimate_flow
 from gelflow.files.image import write_png
@@ -33,7 +33,7 @@ def test_the_card_describes_the_file() -> None:
     metadata = read_metadata(path)
     assert json.loads(metadata["train"])["supervision"] == "mixed"
     assert f"then {metadata['step']} steps" in card
-    assert ModelConfig.model_validate_json(metadata["model"]).elastic is None
+    assert ModelConfig.model_validate_json(metadata["model"]).registration == REGISTRATIONS["motion"]
 
 
 def dotted(side: int, flow: torch.Tensor) -> torch.Tensor:

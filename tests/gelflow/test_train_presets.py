@@ -53,7 +53,7 @@ def test_the_comparisons_differ_from_the_paper_in_what_they_say() -> None:
 
 def test_best_trains_on_the_exact_flow() -> None:
     best = train_config("best")
-    assert (best.supervision, best.loss.compare_at, best.loss.warping) == ("flow", "image", "bicubic")
+    assert (best.supervision, best.loss.compare_at, best.loss.warping) == ("flow", "image", "spline")
     assert best.ema_decay > 0
 
 

@@ -1,0 +1,43 @@
+"""DIS medium, registered (`gelflow.models.registration`). Not one of the paper's methods.
+
+Registration learns nothing and starts from any flow, so what it adds to a network has to be held against what it adds
+to the best classical method.
+"""
+
+from dataclasses import dataclass
+
+from gelflow.baselines.classical import DIS
+from gelflow.baselines.tensors import as_array, as_tensor, chosen_device
+from gelflow.config import RegistrationConfig
+from gelflow.raster import FlowArray, ImageArray
+
+
+@dataclass(frozen=True)
+class RegisteredDIS:
+    """DIS medium on the processor, then registration at the images' own size.
+
+    Attributes:
+        aim: What the settings are for, as the table shall name it.
+        settings: Of the registration.
+        device: Where the registration runs: "auto", "cpu" or "cuda".
+    """
+
+    aim: str
+    settings: RegistrationConfig
+    device: str = "cpu"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "device", chosen_device(self.device))
+
+    @property
+    def name(self) -> str:
+        """Name in tables."""
+        return f"DIS medium+{self.aim}"
+
+    def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
+        """See `Method.flow`."""
+        from gelflow.models.registration import registered
+
+        start = DIS("medium").flow(image1, image2)
+        first, second = as_tensor(image1, self.device), as_tensor(image2, self.device)
+        return as_array(registered(as_tensor(start, self.device), first, second, self.settings))

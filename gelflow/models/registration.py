@@ -1,0 +1,90 @@
+"""Registration: the network's flow, corrected by what still differs between the images. Nothing is learned.
+
+At each of a few stages the flow so far is smoothed to ``U``, and Gauss-Newton steps look at each pixel for the
+correction ``d`` with the largest posterior probability, if the residual within a Gaussian window w is noise and the
+network is wrong by some ``p`` px:
+
+    sum_y w(y - x) |F2(y + U + d) - F1(y)|^2 / s^2 + |d|^2 / p^2  ->  min,
+
+``s^2`` the variance of the residual in the window, at least that of a camera's noise. Where the window holds no
+texture, the flow remains the network's. F are the colours; with `background_px`, the residual is taken without its mean
+over a neighbourhood of that width, so that shading, which does not move with the gel, does not count. Without, and with
+a wide ``p``, the images' difference is what is minimised, whatever it comes from: a high PSNR, and a flow that follows
+shading.
+
+Sliding dots by less than half their distance is all that it can do: dots taken for their neighbours stay so.
+
+Lucas and Kanade 1981, with a prior (Simoncelli, Adelson and Heeger, "Probability distributions of optical flow", 1991);
+smoothing the field between the steps: Thirion's demons, 1998.
+"""
+
+import torch
+from torch import Tensor
+
+from gelflow.arrays import Features, Flow, Images
+from gelflow.config import RegistrationConfig
+from gelflow.ops.gaussian import Smoother, WindowSums
+from gelflow.ops.spline import SplineImage
+from gelflow.ops.warp import inside, positions
+
+NOISE = 0.01
+"""Standard deviation of a camera's noise in each colour, of a white of 1: the least residual that is believed."""
+LARGEST_STEP_PX = 1.0
+"""Limit on a Gauss-Newton step of each component."""
+TINY = 1e-6
+
+
+def registered(flow: Flow, image1: Images, image2: Images, config: RegistrationConfig) -> Flow:
+    """Corrects a flow.
+
+    Args:
+        flow: (B, 2, H, W), px.
+        image1: (B, C, H, W) in [0, 1], on the same device.
+        image2: The same shape.
+        config: Windows and weights.
+
+    Returns:
+        The corrected flow, same shape, float32, without gradient. Each pair of a batch is treated on its own.
+    """
+    size = (flow.shape[-2], flow.shape[-1])
+    with torch.no_grad(), torch.autocast(flow.device.type, enabled=False):
+        flow, first, second = flow.float(), image1.float(), SplineImage(image2.float())
+        width = config.background_px
+        background = None if width is None else WindowSums(*size, width, flow)
+        for window_px, smoothing_px in zip(config.windows_px, config.smoothing_px, strict=True):
+            window = WindowSums(*size, window_px, flow)
+            start = Smoother(*size, smoothing_px, flow)(flow)
+            flow = start
+            for _ in range(config.iterations):
+                residual, across, down, counts = _evidence(flow, first, second, background)
+                step = _posterior(residual, across, down, counts, flow - start, window, config.prior_px)
+                flow = flow + step.clamp(-LARGEST_STEP_PX, LARGEST_STEP_PX)
+    return flow
+
+
+def _evidence(
+    flow: Flow, first: Images, second: SplineImage, background: WindowSums | None
+) -> tuple[Features, Features, Features, Tensor]:
+    """Residual and its derivatives along x and y, (B, C, H, W); 1 where the flow stays in the image and they count."""
+    counts = inside(flow)
+    moved = second.at(*positions(flow))
+    residual = counts * (moved - first)
+    if background is not None:
+        residual = counts * (residual - background(residual) / background(counts).clamp(min=TINY))
+    # The mean of both images' gradients converges from further away than either alone.
+    across, down = torch.gradient((moved + first) / 2, dim=(-1, -2))
+    return residual, counts * across, counts * down, counts
+
+
+def _posterior(
+    residual: Features, across: Features, down: Features, counts: Tensor, so_far: Flow, window: WindowSums, prior: float
+) -> Flow:
+    """The Gauss-Newton step (B, 2, H, W): the solution of a system of two equations at each pixel."""
+    products = ((across, across), (across, down), (down, down), (across, residual), (down, residual), (residual,) * 2)
+    moments = torch.cat([*((one * other).sum(dim=1, keepdim=True) for one, other in products), counts], dim=1)
+    xx, xy, yy, xr, yr, rr, pixels = window(moments).split(1, dim=1)
+    variance = rr / (residual.shape[1] * pixels).clamp(min=TINY) + NOISE**2
+    weight = variance / prior**2
+    xx, yy = xx + weight, yy + weight
+    u, v = (-torch.cat([xr, yr], dim=1) - weight * so_far).split(1, dim=1)
+    return torch.cat([yy * u - xy * v, xx * v - xy * u], dim=1) / (xx * yy - xy.square())

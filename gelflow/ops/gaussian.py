@@ -1,0 +1,78 @@
+"""Gaussian windows over images, as one matrix for each axis: ``G_y F G_x^T`` for a field F (B, C, H, W).
+
+Windows end at three standard deviations. On a processor a product with a dense matrix of 240 to 480 rows takes a
+seventh to a half of the time of the same window as a convolution.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+
+from gelflow.arrays import Features
+
+
+class WindowSums:
+    """Sums under a Gaussian of height one around each pixel; nothing is added where the window leaves the image.
+
+    Args:
+        rows: Of the fields.
+        columns: Of the fields.
+        deviation: Standard deviation of the Gaussian, px.
+        like: Gives dtype and device.
+    """
+
+    def __init__(self, rows: int, columns: int, deviation: float, like: Tensor) -> None:
+        self._y, self._x = (
+            _window(pixels, 0, deviation, math.ceil(3 * deviation), like).to(like) for pixels in (rows, columns)
+        )
+
+    def __call__(self, field: Features) -> Features:
+        """The sums of each channel of (B, C, H, W), same shape."""
+        return self._y @ field @ self._x.T
+
+
+class Smoother:
+    """Mean under a Gaussian around each pixel. Beyond the border fields go on turned about their border's pixel.
+
+    Hence affine fields stay as they are, the border included; under a mean over what lies inside, the border of a
+    rotation or an enlargement would follow the inside.
+
+    Args:
+        rows: Of the fields.
+        columns: Of the fields.
+        deviation: Standard deviation of the Gaussian, px; 0 leaves fields as they are.
+        like: Gives dtype and device.
+    """
+
+    def __init__(self, rows: int, columns: int, deviation: float, like: Tensor) -> None:
+        self._y, self._x = (_mean(pixels, deviation, like).to(like) for pixels in (rows, columns))
+
+    def __call__(self, field: Features) -> Features:
+        """The means of each channel of (B, C, H, W), same shape."""
+        return self._y @ field @ self._x.T
+
+
+def _window(pixels: int, beyond: int, deviation: float, reach: int, like: Tensor) -> Tensor:
+    """exp(-d² / 2 s²) of the distance d of pixels and positions up to `beyond` outside, (n, n + 2 beyond), float64."""
+    place = torch.arange(-beyond, pixels + beyond, device=like.device)
+    distance = place[beyond : beyond + pixels].view(-1, 1) - place.view(1, -1)
+    weight = torch.exp(-torch.arange(pixels + 2 * beyond, device=like.device).double().square() / (2 * deviation**2))
+    weight[reach + 1 :] = 0.0
+    return weight[distance.abs()]
+
+
+def _mean(pixels: int, deviation: float, like: Tensor) -> Tensor:
+    """Matrix (n, n) of the mean along one axis, float64."""
+    if deviation == 0:
+        return torch.eye(pixels, dtype=torch.float64, device=like.device)
+    beyond = min(math.ceil(3 * deviation), pixels - 1)
+    weight = _window(pixels, beyond, deviation, beyond, like)
+    before, matrix, after = (weight / weight.sum(dim=1, keepdim=True)).split([beyond, pixels, beyond], dim=1)
+    # F(-k) = 2 F(0) - F(k), and the same at the other end.
+    matrix = matrix.clone()
+    matrix[:, 0] += 2 * before.sum(dim=1)
+    matrix[:, -1] += 2 * after.sum(dim=1)
+    matrix[:, 1 : beyond + 1] -= before.flip(1)
+    matrix[:, -beyond - 1 : -1] -= after.flip(1)
+    return matrix

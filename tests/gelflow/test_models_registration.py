@@ -1,0 +1,155 @@
+"""Registration: reaches the true flow, keeps it, believes in it without texture, and ignores shading unless asked."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from textures import grid, texture
+from torch import Tensor
+from waves import Shifts
+
+from gelflow.config import REGISTRATIONS, ModelConfig, RegistrationConfig, TrainConfig
+from gelflow.errors import InputError
+from gelflow.estimate import estimate_flow
+from gelflow.models import GelFlow
+from gelflow.models.registration import registered
+from gelflow.overrides import train_config
+from gelflow.train import train
+from gelflow.train.checkpoint import load_weights, save_weights
+
+HEIGHT, WIDTH = 96, 112
+MOTION, BRIGHTNESS = RegistrationConfig(), REGISTRATIONS["brightness"]
+
+
+def pair(size: float = 1.0) -> tuple[Tensor, Tensor, Tensor]:
+    """Images with a smooth flow of up to `size` px, exact: image 1 is the texture at the moved places."""
+    x, y = grid(HEIGHT, WIDTH)
+    u, v = size * np.sin(np.pi * x / WIDTH), size * np.cos(np.pi * y / HEIGHT) * np.sin(np.pi * x / WIDTH)
+    image1, image2 = (torch.from_numpy(im).permute(2, 0, 1)[None] for im in (texture(x + u, y + v), texture(x, y)))
+    return image1, image2, torch.from_numpy(np.stack([u, v])).float()[None]
+
+
+def error(flow: Tensor, truth: Tensor) -> float:
+    """Mean endpoint error, px."""
+    return (flow - truth).norm(dim=1).mean().item()
+
+
+def test_it_finds_the_flow_from_none_and_keeps_it() -> None:
+    """Fails with the residual's sign turned, and with the gradients of x and y exchanged."""
+    image1, image2, truth = pair()
+    start = torch.zeros_like(truth)
+    assert error(start, truth) > 0.6
+    for config in REGISTRATIONS.values():
+        if config is not None:
+            # What the last smoothing, by 2 px, takes of a motion that turns within 100 px is worth 0.01 px.
+            assert error(registered(start, image1, image2, config), truth) < 0.02
+            assert error(registered(truth, image1, image2, config), truth) < 0.01
+
+
+def test_noise_in_the_flow_is_reduced_by_texture() -> None:
+    """Fails with the flow not smoothed before a stage (0.17 px)."""
+    image1, image2, truth = pair()
+    noise = 0.2 * torch.randn(truth.shape, generator=torch.Generator().manual_seed(0))
+    # White noise under a Gaussian of 8 px keeps 1 / (2 sqrt(pi) 8) = 4 % of its height, before any texture.
+    assert error(registered(truth + noise, image1, image2, MOTION), truth) < 0.01
+
+
+def test_without_texture_the_flow_stays() -> None:
+    """Fails with a prior of no weight: the system has no solution."""
+    grey = torch.full((1, 3, 64, 64), 0.5)
+    flow = torch.full((1, 2, 64, 64), 1.5)
+    torch.testing.assert_close(registered(flow, grey, grey, MOTION), flow, rtol=0, atol=1e-4)
+
+
+@pytest.mark.parametrize("iterations", [1, 20])
+def test_an_error_of_the_flow_is_weighed_against_the_images_as_the_prior_says(iterations: int) -> None:
+    """At one wave: d = x g / (g + s² / p²), after one step, and where all steps end.
+
+    Fails with the prior's p not squared, and with what was done so far left out of the prior, or its sign turned.
+    """
+    wave = 0.02
+    x, _ = grid(64, 64)
+    image1 = torch.from_numpy(0.5 + wave * np.sin(2 * np.pi * x / 16)).float().expand(1, 3, 64, 64)
+    off = 0.05
+    flow = torch.zeros(1, 2, 64, 64)
+    flow[:, 0] = off
+    for prior in (0.01, 0.1):
+        config = RegistrationConfig(
+            windows_px=(4,), smoothing_px=(0,), iterations=iterations, prior_px=prior, background_px=None
+        )
+        found = registered(flow, image1, image1, config)[0, 0, 32, 32].item()
+        gradient2 = (wave * np.sin(2 * np.pi / 16)) ** 2 / 2  # mean square of a central difference
+        pixels = 2 * np.pi * 4**2
+        variance = gradient2 * off**2 + 0.01**2
+        # Sums of squares over a window of four pixels differ from half by exp(-2 (4 · 2 π / 16)²) = 0.7 %.
+        step = -off * 3 * pixels * gradient2 / (3 * pixels * gradient2 + variance / prior**2)
+        assert found == pytest.approx(off + step, abs=0.04 * off)
+
+
+def test_shading_is_ignored_unless_brightness_is_asked_for() -> None:
+    """Fails with the background left in the residual."""
+    image1, image2, truth = pair()
+    x, y = grid(HEIGHT, WIDTH)
+    light = torch.from_numpy(0.15 * np.exp(-((x - 60) ** 2 + (y - 50) ** 2) / (2 * 15**2))).float()
+    lit = 0.7 * image2 + light
+    motion = error(registered(truth, 0.7 * image1, lit, MOTION), truth)
+    assert BRIGHTNESS is not None
+    brightness = error(registered(truth, 0.7 * image1, lit, BRIGHTNESS), truth)
+    # Under the background's 4 px a shade of 15 px keeps (4 / 15)² = 7 % of its curvature.
+    assert motion < 0.1
+    assert brightness > 4 * motion
+
+
+def test_pairs_of_a_batch_do_not_see_each_other() -> None:
+    image1, image2, truth = pair()
+    both = [torch.cat([image, image.flip(-1)]) for image in (image1, image2)]
+    start = torch.zeros_like(truth)
+    together = registered(torch.cat([start, start]), *both, MOTION)
+    torch.testing.assert_close(together[:1], registered(start, image1, image2, MOTION), rtol=0, atol=1e-4)
+    mirrored = together[1:].flip(-1) * torch.tensor([-1.0, 1.0]).view(1, 2, 1, 1)
+    torch.testing.assert_close(mirrored, together[:1], rtol=0, atol=1e-3)
+
+
+def test_what_leaves_the_image_stays_as_it_was() -> None:
+    image1, image2, _ = pair()
+    flow = torch.full((1, 2, HEIGHT, WIDTH), 200.0)
+    torch.testing.assert_close(registered(flow, image1, image2, MOTION), flow, rtol=0, atol=1e-3)
+
+
+def test_weights_keep_it_and_a_fine_tuning_may_switch_it_on(tmp_path: Path) -> None:
+    """Fails with `registration` compared as part of the architecture, and with `estimate_flow` not asking for it."""
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    plain = GelFlow(ModelConfig(levels=4))
+    save_weights(tmp_path / "plain.safetensors", plain)
+    image1, image2, truth = pair()
+    assert error(estimate_flow(plain, image1, image2), truth) > 0.5  # untrained: next to no motion
+    settings = {"windows_px": (12, 6), "smoothing_px": (2, 2), "prior_px": 1.0}
+    values = plain.config.model_dump() | {"registration": settings}
+    config = TrainConfig(
+        model=ModelConfig.model_validate(values), steps=1, batch_size=1, learning_rate=1e-9, device="cpu",
+        loss={"lambda_s": (1, 0, 0)},
+    )  # fmt: skip
+    result = train(config, Shifts(1, 64, 1.0, seed=1), None, tmp_path / "run", initial=tmp_path / "plain.safetensors")
+    network = load_weights(result.weights)
+    assert network.config.registration == RegistrationConfig.model_validate(settings)
+    assert error(estimate_flow(network, image1, image2), truth) < 0.1
+    other = ModelConfig.model_validate(values | {"lffm": False})
+    with pytest.raises(InputError, match="lffm: True there, False here"):
+        train(config.model_copy(update={"model": other}), Shifts(1, 64, 1.0, seed=1), None, tmp_path / "other",
+              initial=tmp_path / "plain.safetensors")  # fmt: skip
+
+
+def test_it_is_set_field_by_field() -> None:
+    start = {"model": ModelConfig().model_dump()}
+    config = train_config(None, ["model.registration.prior_px=0.3", "model.registration.iterations=3"], start=start)
+    assert config.model.registration == RegistrationConfig(prior_px=0.3, iterations=3)
+    wrong = (("windows_px=[]", "at least one"), ("windows_px=[3]", "one number each"), ("prior_px=0", "prior_px"))
+    for assignment, words in (
+        *wrong,
+        ("smoothing_px=[1, 1, -1]", "at least 0"),
+        ("windows_px=[3, 3, 0.5]", "at least 1"),
+    ):
+        with pytest.raises(InputError, match=words):
+            train_config(None, [f"model.registration.{assignment}"], start=start)
