@@ -277,7 +277,7 @@ def contact_tangent(
     slot: wp.array3d(dtype=wp.int32),
     values: wp.array2d(dtype=wp.float64),
 ):
-    """One thread per (sample, face, pair a <= b of its nodes); as `synth.simulate.bulk.bulk_tangent`."""
+    """One thread per (sample, face, pair a <= b of its nodes); as `synth.simulate.stiffness.bulk_tangent`."""
     s, f, k = wp.tid()
     if touching[s, f] == 0:
         return

@@ -8,8 +8,9 @@ class Driver:
     """Settings of `synth.simulate.stepping.Stepper`.
 
     Attributes:
-        loose: tolerance between recorded states, whose error does not reach the recorded ones without friction; the
-            scene's own tolerance holds where it is larger, so that 0 asks for that everywhere.
+        loose: tolerance on the way, also in recorded states that are not wanted. Its error does not reach those that
+            are without friction; with friction about a twentieth of it does. The scene's own tolerance holds where it
+            is larger, so that 0 asks for that everywhere.
         extrapolate: start each step from a linear extrapolation of the last two states, else from the last one, with
             friction carried along as after a turn. (From the last state as it is, a ball's shear and twist took 2800
             iterations instead of 96.)

@@ -35,7 +35,8 @@ def simulate(
         folder: what a mesh indenter's file name is relative to.
         device: Warp device.
         frames: numbers of the states that are wanted, default all. The others are part of the trajectory, but keep the
-            penalty's penetration and the way's tolerance; those that are wanted are the same to the bit.
+            penalty's penetration and the way's tolerance; those that are wanted are the same to the bit, unless one of
+            them misses the full tolerance and its step is halved.
         driver: of Newton's method.
 
     Raises:

@@ -227,12 +227,12 @@ class Stepper:
         Newton's method does not find the state where most points stick. The derivative along the path is taken over a
         small share of the step: over the whole of it the trial tractions of stuck points would be beyond linear.
         """
-        state, stuck = self.state, self.stuck
-        here = [sample.at for sample in self.samples]
+        state, stuck, here = self.state, self.stuck, [sample.at for sample in self.samples]
         self._place(here)
         tangent = self.system.tangent(state, stuck, active)
+        unbalanced = self.system.balance(state, stuck, active).free
         self._place([at + NUDGE * (target - at) for at, target in zip(here, targets, strict=True)])
-        moved = self.system.balance(state, stuck, active).free
+        moved = self.system.balance(state, stuck, active).free - unbalanced  # of a loose state 1 / NUDGE times too much
         step = self.system.newton_step(tangent, moved, active)
         self._place(targets)
         return state.plus(step, np.where(active & np.isfinite(step.u).all(axis=(1, 2)), 1 / NUDGE, 0.0))

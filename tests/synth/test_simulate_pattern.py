@@ -67,6 +67,29 @@ def test_only_the_last_few_are_kept() -> None:
     assert pattern_of(space, True) is not first
 
 
+def test_entries_are_bounded_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The last ones stay that are together within the bound, and the very last whatever its size."""
+    # Fails with the bound taken for one pattern's entries, with more than it kept, and without `len(_KEPT) > 1`, which
+    # forgets the pattern that was asked for.
+    space = function_space(MESH, ELEMENT["p1p1"]())
+    large = function_space(MESH, ELEMENT["p2p1"]())
+    spaces = []
+    for k in range(4):
+        held = space.held.copy()
+        held[k] = ~held[k]
+        spaces.append(replace(space, held=held))
+    sizes = [pattern_of(one, True).size for one in spaces]
+    assert len(pattern_module._KEPT) == 4
+    pattern_module._KEPT.clear()
+    monkeypatch.setattr(pattern_module, "_MOST_ENTRIES", sum(sizes[1:]))
+    made = [pattern_of(one, True) for one in spaces]
+    assert list(pattern_module._KEPT.values()) == made[1:]
+    alone = pattern_of(large, True)
+    assert alone.size > sum(sizes[1:])
+    assert list(pattern_module._KEPT.values()) == [alone]
+    assert pattern_of(large, True) is alone
+
+
 @pytest.mark.parametrize("mixed", [True, False])
 @pytest.mark.parametrize("element", MIXED)
 def test_upper_triangle_in_order_with_its_diagonal(element: str, mixed: bool) -> None:

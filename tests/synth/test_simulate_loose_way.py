@@ -1,0 +1,167 @@
+"""What is solved loosely on the way, and what is not: states, multipliers, and records that do not come about.
+
+Each comment "fails with" names a change of `synth.simulate.stepping` that was tried.
+"""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from pads import brick, gentle, same, scene
+
+import synth.simulate.stepping as stepping
+from synth.scene import Scene
+from synth.simulate import Trajectory, simulate
+from synth.simulate.driver import STANDARD, Driver
+from synth.simulate.memory import kept_contact
+from synth.simulate.newton import Solution, relative_residual, solve
+from synth.simulate.solve import stepper_of
+from synth.simulate.stepping import Stepper
+from synth.simulate.unknowns import Balance
+
+MESH = brick(counts=(4, 4, 2))
+TOLERANCE = 1e-8
+LOOSE = Driver(loose=1e-2)
+BETWEEN = stepping.MULTIPLIERS * TOLERANCE
+POLISHES = {"before the passes": (2e-3, BETWEEN), "after a pass": (0.06, TOLERANCE), "for no pass": (np.inf, TOLERANCE)}
+"""stepping.PENETRATION, and a polish's tolerance: the ball is 0.08 of its depth inside, after a pass less than 0.06."""
+each = pytest.mark.parametrize("polish", list(POLISHES))
+
+
+def pressed(friction: float = 0.5, steps: int = 2) -> Scene:
+    """A ball that is pressed and dragged."""
+    motion = {"depth_mm": 0.6, "shear_mm": [0.15, -0.05], "steps": steps}
+    return scene(friction=friction, motion=motion, numerics={"tolerance": TOLERANCE})
+
+
+def residuals(result: Trajectory) -> list[float]:
+    assert (result.status, result.reason) == ("complete", "")
+    return [state.residual for state in result.states[1:]]
+
+
+def test_wanted_states_meet_the_full_tolerance_and_others_the_ways() -> None:
+    """The last one, alone wanted, is the same to the bit."""
+    # Fails with all recorded states polished, with a way of 0.3, and with the gaps of the corrected state left for what
+    # `settle` looks at.
+    every, last = (simulate(pressed(steps=4), MESH, frames=f, driver=LOOSE) for f in (None, frozenset({4})))
+    assert max(residuals(every)) <= TOLERANCE
+    *others, wanted = residuals(last)
+    assert wanted <= TOLERANCE < max(others) <= LOOSE.loose
+    assert last.states[1].max_penetration_mm > every.states[1].max_penetration_mm
+    assert same(replace(last, states=last.states[4:]), replace(every, states=every.states[4:]))
+
+
+def test_multipliers_are_updated_from_tight_states(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Fails without the polish before the passes, with passes solved to the way's tolerance, and with multipliers not
+    # put back, or the balance not evaluated anew, after a pass that failed.
+    stepper = stepper_of([pressed()], MESH, driver=replace(LOOSE, correction_iterations=2))
+    body = stepper.system
+    balance, augment = body.balance, body.augment
+    latest: list[Balance] = []
+    begun: list[float] = []
+
+    def watched(*given: Any) -> Balance:
+        latest[:] = [balance(*given)]
+        return latest[0]
+
+    def updated(*given: Any) -> None:
+        begun.append(float(relative_residual(latest[0])[0]))
+        augment(*given)
+
+    monkeypatch.setattr(body, "balance", watched)
+    monkeypatch.setattr(body, "augment", updated)
+    assert max(residuals(stepper.run()[0])) <= TOLERANCE
+    assert len(begun) >= 4  # passes at both records
+    assert max(begun) <= BETWEEN
+
+
+class Losing:
+    """Newton's method for the stepper, which ends `most` polishes of the first sample after three iterations."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, most: int, polish: str = "before the passes") -> None:
+        self.lost, self._most = 0, most
+        penetration, self._tolerance = POLISHES[polish]
+        monkeypatch.setattr(stepping, "PENETRATION", penetration)
+        monkeypatch.setattr(stepping, "solve", self)
+
+    def __call__(self, system: Any, start: Any, indenters: Any, active: Any, tolerance: Any, *limit: int) -> Solution:
+        polishes = limit == (stepping.MAX_ITERATIONS,) and active[0] and tolerance[0] == self._tolerance
+        if not polishes or self.lost == self._most:
+            return solve(system, start, indenters, active, tolerance, *limit)
+        self.lost += 1
+        never = np.where(np.arange(len(active)) == 0, 0.0, tolerance)
+        return solve(system, start, indenters, active, never, 3)
+
+
+def memory(stepper: Stepper) -> list[np.ndarray]:
+    """What the next step goes on from: the states, contact, and where each sample is."""
+    places = np.array([(sample.at, sample.next, len(sample.states)) for sample in stepper.samples])
+    return [stepper.state.u.copy(), stepper.state.p.copy(), *kept_contact(stepper.system.contact).values(), places]
+
+
+def followed(stepper: Stepper, losing: Losing, monkeypatch: pytest.MonkeyPatch) -> tuple[Trajectory, int]:
+    """Of one sample: where it ends, and in how many steps; a step that loses its record must leave no trace."""
+    advance, steps = stepper._advance, [0]
+
+    def step(active: Any) -> None:
+        before, lost, length = memory(stepper), losing.lost, stepper.samples[0].target() - stepper.samples[0].at
+        advance(active)
+        steps[0] += 1
+        if losing.lost > lost:
+            assert all((a == b).all() for a, b in zip(memory(stepper), before, strict=True))
+            assert stepper.samples[0].step == length / 2
+
+    monkeypatch.setattr(stepper, "_advance", step)
+    return stepper.run()[0], steps[0]
+
+
+@each
+def test_a_lost_record_leaves_no_trace_and_is_tried_again(monkeypatch: pytest.MonkeyPatch, polish: str) -> None:
+    # Fails with a state recorded that is not converged, with good steps that do not ask `_record`, with contact put
+    # back or settled as if the step were good, and with self.state set before the record.
+    losing = Losing(monkeypatch, most=1, polish=polish)
+    result, _ = followed(stepper_of([pressed()], MESH, driver=LOOSE), losing, monkeypatch)
+    assert losing.lost == 1
+    assert len(result.states) == 3
+    assert max(residuals(result)) <= TOLERANCE
+
+
+@each
+def test_a_record_that_is_always_lost_ends_the_way(monkeypatch: pytest.MonkeyPatch, polish: str) -> None:
+    """Each loss halves what is left of the way, so that SHORTEST_STEP is soon reached."""
+    # Fails with a lost record that counts as a good step: then it ends "complete", without the state.
+    losing = Losing(monkeypatch, most=1000, polish=polish)
+    posed = pressed(steps=1)
+    result, steps = followed(stepper_of([posed], MESH, driver=LOOSE), losing, monkeypatch)
+    assert (result.status, "no balance" in result.reason, len(result.states)) == ("failed", True, 1)
+    # The last step is shorter than max_step_mm / 64; each loss is followed by one good step of half its length.
+    halvings = 1 + np.log2(1 / stepping.SHORTEST_STEP)
+    assert losing.lost <= halvings
+    assert steps <= 0.8 / posed.numerics.max_step_mm + 2 * halvings
+
+
+def test_a_lost_record_does_not_touch_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Fails with all samples of the batch held back by one that is lost.
+    posed, other = pressed(), pressed(friction=0.3)
+    alone = stepper_of([other], MESH, driver=LOOSE).run()[0]
+    losing = Losing(monkeypatch, most=1)
+    first, second = stepper_of([posed, other], MESH, driver=LOOSE).run()
+    assert losing.lost == 1
+    assert max(residuals(first)) <= TOLERANCE
+    assert same(second, alone)
+
+
+def test_a_loose_way_ends_where_a_tight_one_does() -> None:
+    """With the standard driver; friction remembers the way, and so its error."""
+    # Fails with a way of 1e-2.
+    posed = gentle(friction=0.4)
+    loose, tight = (simulate(posed, brick(), driver=driver) for driver in (STANDARD, Driver(loose=0.0)))
+    assert max(residuals(loose) + residuals(tight)) <= posed.numerics.tolerance
+    assert sum(s.newton_iterations for s in loose.states) < sum(s.newton_iterations for s in tight.states)
+    for one, other in zip(loose.states[1:], tight.states[1:], strict=True):
+        # Forces that are wrong by `loose` of their norm move a linear body by that share of its displacement. A record
+        # is balanced anew, and remembers of it what the anchors do: a fortieth was seen, of 1e-2 a twentieth.
+        most = STANDARD.loose / 4
+        assert np.linalg.norm(one.displacement - other.displacement) < most * np.linalg.norm(other.displacement)
+        assert np.linalg.norm(np.subtract(one.force_n, other.force_n)) < most * np.linalg.norm(other.force_n)
