@@ -11,6 +11,7 @@ from synth.bench.budget_schedule import OVERHEAD_S, Schedule
 from synth.bench.budget_study import REFERENCE, Job
 from synth.bench.budget_tally import tally
 from synth.bench.budget_verdict import Rung, Verdict
+from synth.plan import SOLVE_GROWTH
 
 
 def measured(rung: int | str, seconds: float = 1.0, unknowns: int = 100, status: str = "complete") -> Measurement:
@@ -43,7 +44,7 @@ def test_chosen_is_dearer_than_needed() -> None:
     verdict = judged({4: 0.6, 6: 0.4, 8: 0.3, 14: 0.1}, chosen=14)
     assert verdict.cheapest() is verdict.rungs[1]
     assert verdict.ratio() == pytest.approx(14 / 6)
-    assert verdict.ratio(nominal=True) == pytest.approx((14 / 6) ** 1.5)
+    assert verdict.ratio(nominal=True) == pytest.approx((14 / 6) ** SOLVE_GROWTH)
     assert not verdict.affordable()
     assert judged({4: 0.6, 6: 0.4, 12: 0.1}, chosen=12).affordable()  # twice is allowed
     assert not judged({4: 0.6, 6: 0.4, 12: 0.1}, chosen=12).affordable(nominal=True)
