@@ -12,7 +12,7 @@ over a neighbourhood of that width, so that shading, which does not move with th
 a wide ``p``, the images' difference is what is minimised, whatever it comes from: a high PSNR, and a flow that follows
 shading.
 
-Sliding dots by less than half their distance is all that it can do: dots taken for their neighbours stay so.
+It stays in the basin that it starts in: dots that the network took for their neighbours stay so.
 
 Lucas and Kanade 1981, with a prior (Simoncelli, Adelson and Heeger, "Probability distributions of optical flow", 1991);
 smoothing the field between the steps: Thirion's demons, 1998.
