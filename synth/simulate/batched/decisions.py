@@ -1,11 +1,12 @@
 """What happens next to a slot, as Warp kernels of one thread a slot.
 
-The rules are those of `synth.simulate.newton` and `synth.simulate.stepping`, whose constants they use; what differs is
-that each slot follows them at its own pace, and that the full tolerance holds for what is recorded only. A step that
-ends at a recorded state, and every pass but the last, is solved as loosely as the way is: what they find is changed by
-the next pass. A state without passes, or whose passes end early, because they fail or nothing is deep any more, is
-brought to the full tolerance before it is recorded (POLISH); where that fails, the step is halved as if it had not been
-taken. The way goes on from the loose state, so that it does not depend on which states are corrected.
+The rules are those of `synth.simulate.newton` and `synth.simulate.stepping`, whose constants they use; what differs
+is that each slot follows them at its own pace, and that where the way is loose the full tolerance holds for what is
+recorded only. A step that ends at a recorded state, and every pass but the last, is solved as loosely as the way is:
+what they find is changed by the next pass. A state without passes, or whose passes end early, because they fail or
+nothing is deep any more, is brought to the full tolerance before it is recorded (POLISH); where that fails, the step
+is halved as if it had not been taken. The way goes on from the loose state, so that it does not depend on which
+states are corrected.
 """
 
 # Kernels are written in Warp's own language; their annotations only look like Python's.
