@@ -36,6 +36,8 @@ class RegistrationConfig(_Frozen):
     background_px: float | None = Field(default=4.0, gt=0)
     """The residual counts without its mean under a Gaussian of this standard deviation, px: shading does not move with
     the gel. None: as it is, flow that explains shading, too."""
+    propagation_px: tuple[Annotated[int, Field(ge=1)], ...] = ()
+    """Distances of the neighbours whose flow is tried before the first stage, under its window; none: no such step."""
 
     @model_validator(mode="after")
     def _has_stages(self) -> RegistrationConfig:
@@ -54,7 +56,7 @@ REGISTRATIONS: dict[Registration, RegistrationConfig | None] = {
     "motion": RegistrationConfig(),
     "brightness": RegistrationConfig(
         windows_px=(12.0, 6.0, 3.0, 1.0), smoothing_px=(4.0, 2.0, 1.0, 0.0), iterations=4, prior_px=1.0,
-        background_px=None,
+        background_px=None, propagation_px=(8, 16, 32),
     ),
 }  # fmt: skip
 """Nothing, what measures the gel's motion best, and what brings image 2 closest to image 1."""
@@ -248,7 +250,8 @@ class TrainConfig(_Frozen):
     """Validate and keep an exponential moving average of the weights, decay per step (0.999 is usual); 0: the weights
     themselves (the paper is silent)."""
     compile: bool = False
-    """Compile the network with torch.compile: minutes at the start, faster steps on a GPU."""
+    """Compile the network with torch.compile: minutes at the start, then faster steps on a GPU than without, slower ones than
+    with `cuda_graph`."""
     cuda_graph: bool = True
     """On a CUDA device, record the network's two passes at the first step and replay them, unless `compile` is set."""
     cache: bool = True

@@ -12,7 +12,8 @@ over a neighbourhood of that width, so that shading, which does not move with th
 a wide ``p``, the images' difference is what is minimised, whatever it comes from: a high PSNR, and a flow that follows
 shading.
 
-It stays in the basin that it starts in: dots that the network took for their neighbours stay so.
+It stays in the basin that it starts in: dots that the network took for their neighbours stay so. With `propagation_px`,
+neighbours' flows are tried first (`gelflow.models.propagation`).
 
 Lucas and Kanade 1981, with a prior (Simoncelli, Adelson and Heeger, "Probability distributions of optical flow", 1991);
 smoothing the field between the steps: Thirion's demons, 1998.
@@ -23,6 +24,7 @@ from torch import Tensor
 
 from gelflow.arrays import Features, Flow, Images
 from gelflow.config import RegistrationConfig
+from gelflow.models.propagation import propagated
 from gelflow.ops.gaussian import Smoother, WindowSums
 from gelflow.ops.spline import SplineImage
 from gelflow.ops.warp import inside, positions
@@ -51,6 +53,9 @@ def registered(flow: Flow, image1: Images, image2: Images, config: RegistrationC
         flow, first, second = flow.float(), image1.float(), SplineImage(image2.float())
         width = config.background_px
         background = None if width is None else WindowSums(*size, width, flow)
+        if config.propagation_px:
+            window = WindowSums(*size, config.windows_px[0], flow)
+            flow = propagated(flow, first, second, window, config.propagation_px, NOISE)
         for window_px, smoothing_px in zip(config.windows_px, config.smoothing_px, strict=True):
             window = WindowSums(*size, window_px, flow)
             start = Smoother(*size, smoothing_px, flow)(flow)

@@ -7,7 +7,7 @@ radius (--radii) at a random place of a 20 x 15 x 4 mm pad, pressed to half its 
 converged as in `synth generate` (on the way less, with --loose), and one state recorded and corrected. Bodies that
 begin and end are counted as they do in production: slots are refilled, and the rate is counted from when as many have
 ended as there are slots. Results travel to the host within that time. With --errors N it prints instead how wrong the
-first N presses are on that mesh, found on the CPU.
+first N presses are on that mesh with that --loose and --step, found on the CPU.
 """
 
 import argparse
@@ -171,7 +171,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     mesh = shared_mesh(given.across, given.through, given.growth, given.zone, given.outside)
     if given.errors is not None:
-        for found in surface_errors(mesh, given.errors, given.depth, given.radii):
+        driver = replace(DRIVER, loose=given.loose)
+        for found in surface_errors(mesh, given.errors, given.depth, given.radii, driver=driver, step_mm=given.step):
             print(json.dumps(found), flush=True)
         return 0
     began = time.perf_counter()

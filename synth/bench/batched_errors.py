@@ -1,7 +1,8 @@
 """How wrong presses of `synth.bench.batched` are on its mesh, against one refined around each press.
 
 Relative L2 error of the contact face's displacement on a grid of points, and of the force; both by the solver for one
-sample, which gives what the batched one does (`tests/synth/test_simulate_batched.py`).
+sample, which gives what the batched one does (`tests/synth/test_simulate_batched.py`). The judged press is led along
+its path as the benchmark's, the reference as in `synth.simulate`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,6 +15,7 @@ from synth.bench.batched_presses import RADII_MM, SIZE_MM, ball_scene
 from synth.mesh import Focus, PadMesh
 from synth.scene import Scene
 from synth.simulate import Trajectory, simulate
+from synth.simulate.driver import STANDARD, Driver
 from synth.simulate.probe import probe
 from synth.simulate.resolution import graded_mesh
 
@@ -24,7 +26,13 @@ POINTS = (81, 61)
 
 
 def surface_errors(
-    mesh: PadMesh, count: int, depth_mm: float, radii_mm: Sequence[float] = RADII_MM, across: int = ACROSS
+    mesh: PadMesh,
+    count: int,
+    depth_mm: float,
+    radii_mm: Sequence[float] = RADII_MM,
+    across: int = ACROSS,
+    driver: Driver = STANDARD,
+    step_mm: float | None = None,
 ) -> Iterator[dict[str, Any]]:
     """Of the first presses of the benchmark.
 
@@ -34,6 +42,8 @@ def surface_errors(
         depth_mm: of each.
         radii_mm: of the balls, smallest and largest.
         across: elements across the contact in the reference.
+        driver: of Newton's method on the mesh that is judged.
+        step_mm: longest load step there; default the scenes'.
 
     Yields:
         Of each press its ball, whether both simulations are complete, and errors in per cent, None where one is not.
@@ -44,7 +54,9 @@ def surface_errors(
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     for _ in range(count):
         scene = ball_scene(rng, depth_mm, 0.0, 1, radii_mm)
-        found, truth = simulate(scene, mesh), simulate(scene, reference_mesh(scene, across))
+        numerics = scene.numerics.model_copy(update={} if step_mm is None else {"max_step_mm": step_mm})
+        judged = scene.model_copy(update={"numerics": numerics})
+        found, truth = simulate(judged, mesh, driver=driver), simulate(scene, reference_mesh(scene, across))
         complete = found.status == truth.status == "complete"
         wrong = _apart(_surface(found, points), _surface(truth, points)) if complete else None
         force = found.states[-1].force_n[2] / truth.states[-1].force_n[2] - 1 if complete else None

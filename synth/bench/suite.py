@@ -51,7 +51,7 @@ def variants() -> list[Setting]:
 
 
 def whole() -> Suite:
-    """Some ten minutes on two cores."""
+    """Some fifteen minutes on two cores."""
     held = of_family("graded", "p2p1", *map(Graded, (4, 6, 8, 10, 12, 14)))
     held += of_family("graded, few layers", "p2p1", Graded(6, 2), Graded(8, 2), Graded(10, 2))
     held += of_family("graded", "p1p1", *map(Graded, (4, 6, 8, 10, 12, 14)))
