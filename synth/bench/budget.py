@@ -5,7 +5,7 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,8 +14,9 @@ from synth import __version__
 from synth.errors import InputError
 
 if TYPE_CHECKING:
+    from synth.bench.budget_press import Measurement
     from synth.bench.budget_store import Store
-    from synth.bench.budget_study import Drawn, Study
+    from synth.bench.budget_study import Drawn, Job, Study
     from synth.bench.budget_verdict import Verdict
 
 PACKAGES = ("numpy", "scipy", "warp-lang", "pypardiso")
@@ -98,14 +99,16 @@ def study_budget(
     with Store(out, study) as store:
         draws, undrawn = _drawn(study)
         every = jobs(study, draws)
-        left = {job: work for job, work in every.items() if job not in store.measurements}
+        known = store.known(draws)
+        left = {job: work for job, work in every.items() if job not in known}
         done = len(every) - len(left)
         for pressed in presses(study, Schedule(left, deadline), workers, _machine(workers)):
             store.keep(pressed)
             done += 1
             one = pressed.measurement
+            known[one.job] = one
             _say(f"{one.scene} {one.index}: {one.rung}: {one.status}, {one.seconds:.1f} s ({done} of {len(every)})")
-        verdicts = [_verdict(study, one, store) for one in draws]
+        verdicts = [_verdict(study, one, known, store) for one in draws]
         picture = can_draw() and any(verdict.judged for verdict in verdicts)
         if picture:
             replace_file(out / "budget.png", measured_against_predicted(verdicts))
@@ -139,7 +142,7 @@ def _drawn(study: "Study") -> tuple[list["Drawn"], list[tuple[str, str]]]:
     return draws, undrawn
 
 
-def _verdict(study: "Study", one: "Drawn", store: "Store") -> "Verdict":
+def _verdict(study: "Study", one: "Drawn", measured: "Mapping[Job, Measurement]", store: "Store") -> "Verdict":
     """What is known of a draw."""
     from synth.bench.budget_field import picture_errors
     from synth.bench.budget_study import REFERENCE, Job
@@ -147,16 +150,18 @@ def _verdict(study: "Study", one: "Drawn", store: "Store") -> "Verdict":
 
     name = one.template.name
     asked = [Job(name, one.index, rung) for rung in [REFERENCE, *study.rungs(one)]]
-    known = [store.measurements[job] for job in asked if job in store.measurements]
+    known = [measured[job] for job in asked if job in measured]
     reference = next((measurement for measurement in known if measurement.rung == REFERENCE), None)
     truth = store.field(reference.job) if reference is not None and reference.complete else None
-    rungs = []
+    rungs, seen = [], 1.0
     for measurement in known:
         if measurement.rung != REFERENCE:
             error = math.nan
             if truth is not None and measurement.complete:
-                error = float(picture_errors(store.field(measurement.job), truth, one.scene).max())
-            rungs.append(Rung(measurement, error))
+                errors, shares = picture_errors(store.field(measurement.job), truth, one.scene)
+                error = float(errors.max())
+                seen = min(seen, float(shares.min()))
+            rungs.append(Rung(measurement, error, one.predicted_px(measurement.spacing_mm)))
     return Verdict(
         scene=name,
         index=one.index,
@@ -167,6 +172,7 @@ def _verdict(study: "Study", one: "Drawn", store: "Store") -> "Verdict":
         predicted_px=one.chosen.error_px,
         rungs=tuple(rungs),
         reference=reference,
+        seen=seen,
         missing=len(asked) - len(known),
     )
 

@@ -54,7 +54,7 @@ def _why(verdict: Verdict) -> list[str]:
         elif cheapest.name != verdict.chosen:
             why.append(f"{cheapest.name} would have, {number(1 / verdict.ratio())} times the time")
     elif cheapest is not None and not (verdict.affordable() and verdict.affordable(nominal=True)):
-        predicted = cheapest.measurement.predicted_px
+        predicted = cheapest.predicted_px
         why.append(
             f"{verdict.ratio():.1f} times the time ({verdict.ratio(nominal=True):.1f} by unknowns) of "
             f"{cheapest.name}, whose error is {number(cheapest.error_px)} px and was predicted as "

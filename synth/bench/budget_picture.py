@@ -1,6 +1,7 @@
 """Measured against predicted error, a panel for each scene."""
 
 import io
+import math
 from collections.abc import Sequence
 from importlib.util import find_spec
 from typing import Any
@@ -16,6 +17,7 @@ COLOURS = {
     "mesh": "tab:brown",
 }
 """Of the indenter's shapes."""
+COLUMNS = 4
 LEGEND_INCHES = 2.1
 
 
@@ -33,13 +35,21 @@ def measured_against_predicted(verdicts: Sequence[Verdict]) -> bytes:
 
     judged = [verdict for verdict in verdicts if verdict.judged]
     names = list(dict.fromkeys(verdict.scene for verdict in verdicts))
-    figure = Figure(figsize=(4.6 * len(names) + LEGEND_INCHES, 5.0), dpi=110)
-    axes = figure.subplots(1, len(names), squeeze=False, sharex=True, sharey=True)[0]
-    for axis, name in zip(axes, names, strict=True):
+    columns = min(COLUMNS, len(names))
+    lines = math.ceil(len(names) / columns)
+    figure = Figure(figsize=(4.0 * columns + LEGEND_INCHES, 4.2 * lines), dpi=90)
+    grid = figure.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
+    axes = list(grid.flat)[: len(names)]
+    for place, (axis, name) in enumerate(zip(axes, names, strict=True)):
         _panel(axis, [verdict for verdict in judged if verdict.scene == name])
         axis.set_title(name, fontsize=11)
-        axis.set_xlabel("predicted error, px")
-    axes[0].set_ylabel("measured error, px")
+        if place + columns >= len(names):
+            axis.set_xlabel("predicted error, px")
+            axis.tick_params(labelbottom=True)
+    for axis in list(grid.flat)[len(names) :]:
+        axis.remove()
+    for axis in grid[:, 0]:
+        axis.set_ylabel("measured error, px")
     shown: dict[str, Any] = {}
     for axis in axes:
         handles, labels = axis.get_legend_handles_labels()
@@ -56,7 +66,7 @@ def _panel(axis: Any, verdicts: Sequence[Verdict]) -> None:
 
     for body, colour in COLOURS.items():
         own = [verdict for verdict in verdicts if verdict.body == body]
-        small = [(r.measurement.predicted_px, r.error_px) for v in own for r in v.rungs if r.name != v.chosen]
+        small = [(r.predicted_px, r.error_px) for v in own for r in v.rungs if r.name != v.chosen]
         large = [(v.predicted_px, v.error_px) for v in own]
         if small:
             axis.plot(*zip(*small, strict=True), "o", color=colour, markersize=3, alpha=0.4, zorder=2)

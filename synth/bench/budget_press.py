@@ -34,7 +34,6 @@ class Measurement:
         setup_s: processor time of that analysis.
         unknowns: displacement components and pressures that are not held.
         spacing_mm: edge length under the contact.
-        predicted_px: by the error model.
         penetration_mm: deepest contact point inside the indenter in the judged states that were reached.
         iterations: Newton's, in all.
         attempt: of the draw.
@@ -52,7 +51,6 @@ class Measurement:
     setup_s: float
     unknowns: int
     spacing_mm: float
-    predicted_px: float
     penetration_mm: float
     iterations: int
     attempt: int
@@ -104,11 +102,10 @@ def press(study: Study, job: Job, machine: str = "") -> Pressed:
         mesh, spacing_mm = one.mesh(job.rung)
     points = places(scene)
     same = (one.attempt, mesh.hash, machine)
-    predicted = one.predicted_px(spacing_mm)
     try:
         trajectory, (seconds, wall_s), setup_s, unknowns = _timed(scene, mesh, one, driver)
     except InputError as error:
-        nothing = (np.nan, np.nan, np.nan, 0, spacing_mm, predicted, np.nan, 0)
+        nothing = (np.nan, np.nan, np.nan, 0, spacing_mm, np.nan, 0)
         refused = Measurement(job.scene, job.index, job.rung, "refused", str(error), *nothing, *same)
         return Pressed(refused, points, tuple(one.judged), None)
     reached = [trajectory.states[k].max_penetration_mm for k in one.judged if k < len(trajectory.states)]
@@ -123,7 +120,6 @@ def press(study: Study, job: Job, machine: str = "") -> Pressed:
         setup_s=setup_s,
         unknowns=unknowns,
         spacing_mm=spacing_mm,
-        predicted_px=predicted,
         penetration_mm=max(reached, default=float("nan")),
         iterations=sum(state.newton_iterations for state in trajectory.states),
         attempt=one.attempt,

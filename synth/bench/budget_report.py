@@ -11,7 +11,7 @@ from statistics import median
 from typing import Any
 
 from synth.bench.budget_draws import all_draws, misses
-from synth.bench.budget_study import BEYOND, REFERENCE, Drawn, Study
+from synth.bench.budget_study import BEYOND, Drawn, Study
 from synth.bench.budget_tally import GOAL, Tally, tally
 from synth.bench.budget_text import number, share, span
 from synth.bench.budget_trust import trust
@@ -26,9 +26,9 @@ NOT_COVERED = (
     "Flow between two pressed states: its error is the difference of the two states', each of which is judged by "
     "itself.",
     "Meshing, reading files, compiling kernels, the analysis of the sparse pattern (`setup_s` in the CSV), rendering.",
-    "Cameras besides the main one, and views by mirrors.",
-    "Errors outside the picture; inside it, what falls between the points that it is sampled at, some 2000, which is "
-    "worth a few percent of an error.",
+    "Cameras besides the main one; where mirrors show a point twice, the second view of it.",
+    "Errors outside the picture, and of points that slide out of it; inside it, what falls between the points that it "
+    "is sampled at, 600 to 4000, which is worth a few percent of an error.",
 )
 
 PICTURE = (
@@ -71,17 +71,17 @@ def rows(verdicts: Sequence[Verdict]) -> list[dict[str, Any]]:
     """A plain dictionary per press that is done."""
     found = []
     for verdict in verdicts:
-        own = [Rung(verdict.reference, 0.0)] if verdict.reference else []
+        own = [Rung(verdict.reference, math.nan, math.nan)] if verdict.reference else []
         for rung in [*own, *verdict.rungs]:
-            is_reference = rung.name == REFERENCE
-            has_error = not is_reference and not math.isnan(rung.error_px)
+            has_error = not math.isnan(rung.error_px)
             values = {
                 **asdict(rung.measurement),
                 "chosen": rung.name == verdict.chosen,
                 "body": verdict.body,
                 "depth_mm": verdict.depth_mm,
                 "target_px": verdict.target_px,
-                "error_px": rung.error_px if has_error else None,
+                "predicted_px": rung.predicted_px,
+                "error_px": rung.error_px,
                 "within": rung.within(verdict.target_px) if has_error else None,
             }
             found.append({name: _rounded(value) for name, value in values.items()})
@@ -132,7 +132,7 @@ def write_report(
         "",
         *_machines(verdicts),
         "",
-        *_definitions(study),
+        *_definitions(study, verdicts),
         "",
         *_answer(counted),
         "",
@@ -174,15 +174,17 @@ def _machines(verdicts: Sequence[Verdict]) -> list[str]:
     return lines or ["- (nothing has been run yet)"]
 
 
-def _definitions(study: Study) -> list[str]:
+def _definitions(study: Study, verdicts: Sequence[Verdict]) -> list[str]:
     reference = study.reference
     return [
         f"{study.draws} draws of each scene with seed {study.seed}, drawn and pressed as `generate` does: the mesh "
         "that `numerics.target_error_px` chooses, load steps, driver and the states that the draw's pairs show.",
         "",
         "**Error**: the root mean square over the picture of the distance in px between where a material point is "
-        "seen and where it is seen in the reference, the largest of the states that the draw's pairs show. The "
-        f"reference has elements {reference.finer:g} times smaller than the chosen mesh's, but at most "
+        "seen and where it is seen in the reference, the largest of the states that the draw's pairs show; over the "
+        "points that stay in the picture in both (by the same mirror, where there are mirrors), "
+        f"{_least_seen(verdicts)} of those that are seen at rest. The reference has elements at least "
+        f"{reference.finer:g} times smaller than the chosen mesh's, but at most "
         f"{reference.across} across the contact; {reference.beside[0]} and {reference.beside[1]} beside it, one more "
         "through the thickness than a draw's mesh would have, load steps of "
         f"{reference.step_mm:g} mm, and up to {reference.correction_iterations} iterations in each correction of "
@@ -195,6 +197,10 @@ def _definitions(study: Study) -> list[str]:
         f"{study.across[-1]} elements across, up to {BEYOND} above the chosen one and coarser than the reference. 8x3 "
         "is a mesh of 8 elements across the contact and 3 through the thickness.",
     ]
+
+
+def _least_seen(verdicts: Sequence[Verdict]) -> str:
+    return f"{100 * min([verdict.seen for verdict in verdicts], default=1.0):.0f} % or more"
 
 
 def _answer(counted: Sequence[Tally]) -> list[str]:
@@ -221,7 +227,22 @@ def _answer(counted: Sequence[Tally]) -> list[str]:
         "",
         "Measured over predicted error of the chosen meshes: geometric mean, and standard deviation of the logarithm. "
         f"The goal of cost is counted by time, over the draws of which a rung met the target: "
-        f"{counted[-1].payable} of {counted[-1].judged}.",
+        f"{counted[-1].payable} of {counted[-1].judged}. Times of different machines do not compare: where the "
+        f"presses to be compared ran on several, which are {counted[-1].untimed} of the draws, unknowns count instead.",
+        *_not_judged(counted[-1]),
+    ]
+
+
+def _not_judged(every: Tally) -> list[str]:
+    """What became of the draws that nothing can be said of, and what the answer would be at worst."""
+    open_ones = every.draws - every.unfinished - every.judged - every.replaced
+    if not open_ones and not every.replaced:
+        return []
+    return [
+        "",
+        f"Not judged are {every.replaced} draws whose press on the chosen mesh stops on its way, so that `generate` "
+        f"draws again, and {open_ones} others, most of which have a reference that stops (see below). Were these all "
+        f"above their targets, {share(every.within, every.judged + open_ones)} would be within.",
     ]
 
 

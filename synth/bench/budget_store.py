@@ -8,6 +8,7 @@ A field is written before its line, so that what has a line has its field. One p
 """
 
 import math
+from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
@@ -16,7 +17,7 @@ from typing import Any
 from synth.arrays import FloatArray
 from synth.bench.budget_field import read_field, write_field
 from synth.bench.budget_press import Measurement, Pressed
-from synth.bench.budget_study import Job, Study
+from synth.bench.budget_study import REFERENCE, Drawn, Job, Study
 from synth.dataset.jsontext import read_document, to_document
 from synth.dataset.lines import append_line, read_line, rewrite_lines, scan_lines
 from synth.dataset.lock import DirectoryLock
@@ -30,7 +31,7 @@ class Store:
     """The measurements in a directory; hold it open while writing.
 
     Attributes:
-        measurements: by their job, in the order in which they were made.
+        measurements: by their job, in the order in which they were made; also such as nobody asks for any more.
     """
 
     def __init__(self, directory: Path, study: Study) -> None:
@@ -39,7 +40,7 @@ class Store:
         Raises:
             InputError: it holds another study, is damaged, is in use, or the storage refuses.
         """
-        self._directory, self._lines = directory, directory / LINES_FILE
+        self._directory, self._lines, self._study = directory, directory / LINES_FILE, study
         with storage_errors(directory):
             (directory / FIELDS).mkdir(parents=True, exist_ok=True)
         self._lock = DirectoryLock(directory)
@@ -88,8 +89,18 @@ class Store:
         found = (_measurement(read_line(self._lines, place)) for place in table.places.values())
         return {measurement.job: measurement for measurement in found}
 
+    def known(self, draws: Iterable[Drawn]) -> dict[Job, Measurement]:
+        """The measurements that answer what is asked of draws; see `Study.answered`."""
+        found = {}
+        for one in draws:
+            for rung in [REFERENCE, *self._study.rungs(one)]:
+                measurement = self.measurements.get(Job(one.template.name, one.index, rung))
+                if measurement is not None and self._study.answered(one, rung, measurement.mesh):
+                    found[measurement.job] = measurement
+        return found
+
     def keep(self, pressed: Pressed) -> None:
-        """Write a press.
+        """Write a press, in place of an earlier one of the same job.
 
         Raises:
             InputError: the storage refuses.

@@ -2,11 +2,15 @@
 
 A draw is the one that `generate` makes a trajectory of: same streams, same mesh, same wanted states. The states that
 its pairs show are judged.
+
+What a press gives is decided by its draw, its mesh and the solver. So a study is of scenes, seed and solver, a press is
+known again by its mesh, and which of the meshes the error model would choose is no part of either: a changed model asks
+for some other meshes and leaves what was measured as it is.
 """
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -31,9 +35,8 @@ from synth.simulate.resolution import (
     graded_mesh,
     ladder,
     lateral_spacing,
-    predicted_error_mm,
+    predicted_error_px,
     resolve,
-    scale_px_per_mm,
 )
 from synth.template import Template
 
@@ -41,6 +44,8 @@ BEYOND = 3
 """Rungs that are run above the chosen one."""
 REFERENCE = "reference"
 """In place of a rung's name."""
+CHOOSERS = ("error_model.py", "resolution.py", "shared.py")
+"""Of `synth.simulate`: choose a mesh, and have no part in a press on it."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +54,8 @@ class Reference:
 
     Attributes:
         across: elements across the contact, at most.
-        finer: how many times smaller than the chosen mesh's elements its own are to be. Errors fall with the power 1.6
-            of their size: a quarter of the chosen mesh's error is left.
+        finer: how many times smaller than the chosen mesh's elements its own are to be, at least. Errors fall with the
+            power 1.6 of their size: a quarter of the chosen mesh's error is left.
         beside: elements beside it, along x and along y; three and two on the ladder.
         step_mm: longest load step.
         correction_iterations: of Newton's method in one augmented-Lagrangian pass; with a draw's fewer, some passes
@@ -76,7 +81,14 @@ class Reference:
         Through the thickness it has one element more than `graded_mesh` would have for as many across; the first is
         still as high as wide, or lower.
         """
-        number = self.across_of(gel, focus, chosen_mm)
+        return next(self.meshes(gel, focus, chosen_mm))
+
+    def meshes(self, gel: Gel, focus: Focus, chosen_mm: float) -> Iterator[tuple[PadMesh, float]]:
+        """That mesh, then finer ones, which do as well; as of `mesh`."""
+        for number in sorted({*range(self.across_of(gel, focus, chosen_mm), self.across, 2), self.across}):
+            yield self._mesh(gel, focus, number)
+
+    def _mesh(self, gel: Gel, focus: Focus, number: int) -> tuple[PadMesh, float]:
         size, across = gel.size_mm, (number, number)
         fine = lateral_spacing(gel, focus, Counts(across, self.beside))
         height = size[2] / fine
@@ -126,9 +138,7 @@ class Drawn:
 
     def predicted_px(self, spacing_mm: float) -> float:
         """What the error model says of a mesh, as `resolve` asks it."""
-        camera, size, scale = self.scene.sensor.camera, self.scene.sensor.gel.size_mm, scale_px_per_mm(self.scene)
-        seen = min(camera.width * camera.height / scale**2, size[0] * size[1])
-        return scale * predicted_error_mm(self.scene, self.focus, spacing_mm, seen)
+        return predicted_error_px(self.scene, self.focus, spacing_mm)
 
 
 def drawn(template: Template, seed: int, index: int) -> Drawn:
@@ -222,13 +232,23 @@ class Study:
             return [*names, chosen]
         return names[: names.index(chosen) + BEYOND + 1]
 
+    def answered(self, one: Drawn, rung: str, mesh_hash: str) -> bool:
+        """Whether a press on the mesh of that hash is what is asked for: on the rung's mesh, or on a reference's that
+        is as fine as is wanted, or finer.
+        """
+        if rung != REFERENCE:
+            return one.mesh(rung)[0].hash == mesh_hash
+        found = self.reference.meshes(one.scene.sensor.gel, one.focus, one.chosen.spacing_mm)
+        return any(mesh.hash == mesh_hash for mesh, _ in found)
+
 
 def solver() -> str:
-    """SHA-256 (16 hex digits) of the code that meshes and simulates: one study is of one solver."""
+    """SHA-256 (16 hex digits) of the code that simulates on a given mesh: one study is of one solver."""
     digest = hashlib.sha256()
     for folder in ("mesh", "simulate"):
         for file in sorted((Path(__file__).parents[1] / folder).glob("*.py")):
-            digest.update(file.name.encode() + file.read_bytes())
+            if not (folder == "simulate" and file.name in CHOOSERS):
+                digest.update(file.name.encode() + file.read_bytes())
     return digest.hexdigest()[:16]
 
 

@@ -12,7 +12,6 @@ with h and h_r their spacings under the contact. Where their errors are independ
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -31,10 +30,12 @@ class Rung:
     Attributes:
         measurement: of its press.
         error_px: against the reference; NaN where there is none.
+        predicted_px: by the error model.
     """
 
     measurement: Measurement
     error_px: float
+    predicted_px: float
 
     @property
     def name(self) -> str:
@@ -69,6 +70,7 @@ class Verdict:
         predicted_px: of that mesh.
         rungs: those that were run, rising; without those that are still to do.
         reference: its press; None while that is to do.
+        seen: smallest share of the picture's points at which one of the errors is taken.
         missing: presses that are still to do.
     """
 
@@ -81,6 +83,7 @@ class Verdict:
     predicted_px: float
     rungs: tuple[Rung, ...]
     reference: Measurement | None
+    seen: float = 1.0
     missing: int = 0
 
     @cached_property
@@ -88,19 +91,24 @@ class Verdict:
         """Why nothing can be said of the draw; empty where it can."""
         if self.unfinished or self.reference is None:
             return f"unfinished: {self.missing} presses to do"
+        if self.replaced:
+            press = self.chosen_rung.measurement
+            return f"the chosen mesh's press is {press.status}, so that `generate` replaces the draw: {press.reason}"
         if not self.reference.complete:
             return f"the reference is {self.reference.status}: {self.reference.reason}"
-        press = self._rung(self.chosen).measurement
-        if not press.complete:
-            return f"the chosen mesh's press is {press.status}, so that `generate` replaces the draw: {press.reason}"
         if math.isnan(self.error_px):
-            return "the camera sees a point of the gel nowhere, so that there is no error in px"
+            return f"only {100 * self.seen:.0f} % of the picture's points stay in the picture, too few to judge by"
         return ""
 
     @property
     def unfinished(self) -> bool:
         """Whether presses are still to do."""
         return self.missing > 0
+
+    @property
+    def replaced(self) -> bool:
+        """Whether the press on the chosen mesh stops on its way, so that `generate` draws again."""
+        return not self.unfinished and not self.chosen_rung.measurement.complete
 
     def _rung(self, name: str) -> Rung:
         return next(rung for rung in self.rungs if rung.name == name)
@@ -147,12 +155,33 @@ class Verdict:
         ratio = self.reference.spacing_mm / self.chosen_rung.measurement.spacing_mm
         return self.error_px / (1 - ratio**RATE) if ratio < 1 else math.nan
 
+    @property
+    def timed_together(self) -> bool:
+        """Whether the chosen mesh and the coarser ones within the budget were pressed on one machine, so that their
+        times compare. (Finer ones cost more, but for luck; those of other machines are then left out.)
+        """
+        chosen, good = self.chosen_rung, self._good
+        coarser = [rung for rung in good if rung.nominal < chosen.nominal]
+        return all(self._beside(rung) for rung in coarser) and (not good or any(map(self._beside, good)))
+
+    @property
+    def _good(self) -> list[Rung]:
+        return [rung for rung in self.rungs if rung.within(self.target_px)]
+
+    def _beside(self, rung: Rung) -> bool:
+        return rung.measurement.machine == self.chosen_rung.measurement.machine
+
     def cheapest(self, nominal: bool = False) -> Rung | None:
-        """Of the rungs that met the budget, the one of the least cost; None where none did."""
-        return _cheapest(self.rungs, self.target_px, nominal)
+        """Of the rungs that met the budget, the one of the least cost; None where none did.
+
+        By time; `nominal`, or where times do not compare, by unknowns.
+        """
+        if nominal or not self.timed_together:
+            return min(self._good, key=lambda rung: rung.nominal, default=None)
+        return min(filter(self._beside, self._good), key=lambda rung: rung.seconds, default=None)
 
     def ratio(self, nominal: bool = False) -> float:
-        """Cost of the chosen mesh over that of the cheapest rung within the budget; NaN where no rung is.
+        """Cost of the chosen mesh over that of the `cheapest` rung within the budget; NaN where no rung is.
 
         Below 1 where the chosen mesh is not within it and costs less than the first that is.
         """
@@ -160,13 +189,10 @@ class Verdict:
         if cheapest is None:
             return math.nan
         chosen = self.chosen_rung
-        return chosen.nominal / cheapest.nominal if nominal else chosen.seconds / cheapest.seconds
+        if nominal or not self.timed_together:
+            return chosen.nominal / cheapest.nominal
+        return chosen.seconds / cheapest.seconds
 
     def affordable(self, nominal: bool = False) -> bool:
         """Whether the chosen mesh costs at most LARGEST_RATIO times the cheapest within the budget."""
         return self.ratio(nominal) <= LARGEST_RATIO
-
-
-def _cheapest(rungs: Sequence[Rung], target_px: float, nominal: bool) -> Rung | None:
-    good = [rung for rung in rungs if rung.within(target_px)]
-    return min(good, key=lambda rung: rung.nominal if nominal else rung.seconds, default=None)

@@ -2,8 +2,9 @@
 
 With `numerics.edge_length_mm` the mesh is fTetWild's, everywhere as fine as that says, the same for all draws of a pad.
 Otherwise it is structured and graded around where the draw's indenter will touch: `across` elements across the contact,
-as many through the thickness as keep elements under the contact about as high as wide. Both come from the error model
-of `predicted_error_mm`, which was calibrated, and is tested, against much finer solutions (docs/reports/budget.md).
+as many through the thickness as keep elements under the contact about as high as wide. It is the cheapest mesh whose
+predicted error is within the budget; the prediction (`synth.simulate.error_model`) was calibrated, and is tested,
+against much finer solutions (docs/reports/budget.md).
 """
 
 from collections.abc import Sequence
@@ -15,9 +16,10 @@ import numpy as np
 
 from synth.mesh import Counts, Focus, PadMesh, domed, graded_box, pad_mesh
 from synth.mesh.graded import spacing
+from synth.mesh.pad import face_height
 from synth.optics import Optics
 from synth.scene import Gel, Scene
-from synth.scene_indenters import Cylinder, Indenter
+from synth.simulate.error_model import face_error
 from synth.simulate.footprint import footprint
 from synth.simulate.indenter import rigid_body
 from synth.simulate.path import Path
@@ -151,48 +153,42 @@ def depth_growth(through: int, height: float) -> float:
     return high
 
 
-ERROR_SCALES = {"sphere": 0.084, "cone": 0.061, "bar": 0.13, "punch": 0.212, "box": 0.17, "torus": 0.173, "mesh": 0.22}
-"""k of the error model; a bar is a cylinder that lies, a punch one that stands. Fitted to 40 draws of two scenes on
-five meshes each against finer ones (docs/reports/budget.md). Where a draw needs more than the coarsest mesh the
-logarithm of measured over predicted scatters by 0.10, and by 0.15 for draws left out of the fit; over all of them by
-0.24. "mesh" was not measured: it is set as the worst of the others."""
-CERTAINTY = 1.2
-"""Factor on the model's mean."""
 DEFAULT_TARGET_PX = 0.5
+_FACE, _ZONE = (41, 33), (9, 9)
+"""Points along x and y at which it is looked up what the camera sees, of the contact face and of the zone."""
+_LEAST_SEEN = 0.1
+"""Share of the error that is counted at least, however little of the zone the camera sees."""
 
 
-def predicted_error_mm(scene: Scene, focus: Focus, spacing_mm: float, seen_mm2: float) -> float:
-    r"""Root-mean-square error of the surface's displacement in the picture, over the seen part of the contact face.
+def predicted_error_px(scene: Scene, focus: Focus, spacing_mm: float) -> float:
+    r"""Root-mean-square error of the picture's flow, over the seen part of the contact face.
 
-    .. math::  e = 1.2 k h^{1.6} d^{0.55} m^{0.65} A^{-0.5}, \qquad m = d + \max (1.3 |s| + 1.7 w |\theta|)
+    .. math::  e = M E \sqrt{f / A}
 
-    with lengths in mm: h size of the elements under the contact, d press depth, s shear, w larger half width of the
-    zone, theta twist in rad, A seen area, k of the indenter's shape. For P2/P1 elements on `graded_mesh`; fitted to
-    flat pads of 3.5 to 4.5 mm, depths to 40 % of the thickness and friction of 0.3 to 1: elsewhere it extrapolates.
+    with E the error of the face (`face_error`), M the magnification, A the seen area, and f the share of the zone that
+    is seen, which is that of E² that counts.
 
     Args:
         scene: a draw.
         focus: where it touches.
         spacing_mm: size of the elements under the contact.
-        seen_mm2: area over which the mean is taken.
     """
-    motion = scene.motion
-    poses = [(motion.depth_mm, motion.shear_mm, motion.twist_deg)]
-    poses += [(pose.depth_mm, pose.shear_mm, pose.twist_deg) for pose in motion.then]
-    depth = max(pose[0] for pose in poses)
-    if depth <= 0:
-        return 0.0
-    width = max(focus.half_mm)
-    drag = max(1.3 * np.hypot(*shear) + 1.7 * width * abs(np.radians(twist)) for _, shear, twist in poses)
-    scale = CERTAINTY * ERROR_SCALES[_class_of(scene.contact.indenter)]
-    return float(scale * spacing_mm**1.6 * depth**0.55 * (depth + drag) ** 0.65 / np.sqrt(seen_mm2))
+    size = scene.sensor.gel.size_mm[:2]
+    face = _seen(scene, Focus((0.0, 0.0), (size[0] / 2, size[1] / 2)), _FACE) or 1.0  # where none is, all
+    zone, area = max(_seen(scene, focus, _ZONE), _LEAST_SEEN), face * size[0] * size[1]
+    return scale_px_per_mm(scene) * face_error(scene, focus, spacing_mm) * float(np.sqrt(zone / area))
 
 
-def _class_of(indenter: Indenter) -> str:
-    if not isinstance(indenter, Cylinder):
-        return indenter.shape
-    tilted = np.hypot(np.sin(np.radians(indenter.rotation_deg[0])), np.sin(np.radians(indenter.rotation_deg[1])))
-    return "bar" if tilted > 0.5 else "punch"
+def _seen(scene: Scene, part: Focus, counts: tuple[int, int]) -> float:
+    """The share of a part of the undeformed contact face that is in the picture."""
+    axes = [
+        centre + half * (2 * np.arange(n) + 1 - n) / n
+        for centre, half, n in zip(part.centre_mm, part.half_mm, counts, strict=True)
+    ]
+    places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    optics = Optics.of(scene.sensor)
+    points = np.column_stack([places, face_height(places, scene.sensor.gel.dome_radius_mm)])
+    return float(optics.is_inside(optics.project(points)).mean())
 
 
 def scale_px_per_mm(scene: Scene) -> float:
@@ -221,12 +217,10 @@ def resolve(scene: Scene, folder: FilePath | None = None, mesh_folders: Sequence
         return Resolution(mesh, 0, 0, numerics.edge_length_mm, float("nan"))
     path = Path(scene.motion, rigid_body(scene.contact.indenter, folder), gel.dome_radius_mm)
     focus = footprint(path, gel.size_mm, MARGIN)
-    target, scale = numerics.target_error_px or DEFAULT_TARGET_PX, scale_px_per_mm(scene)
-    camera = scene.sensor.camera
-    seen = min(camera.width * camera.height / scale**2, gel.size_mm[0] * gel.size_mm[1])
+    target = numerics.target_error_px or DEFAULT_TARGET_PX
     for fineness in ladder(gel, focus):
         mesh, fine = graded_mesh(gel, focus, *fineness)
-        error = scale * predicted_error_mm(scene, focus, fine, seen)
+        error = predicted_error_px(scene, focus, fine)
         if error <= target:
             break
     return Resolution(mesh, *fineness, fine, error)

@@ -2,8 +2,8 @@
 
 One mesh serves every draw of a batch, wherever its indenter touches: it is even along x and y, `numerics.cells` says
 how fine, and graded through the thickness so that elements at the contact face are about as high as wide. Or it is
-fTetWild's, with `numerics.edge_length_mm`. Each draw has a predicted error of its own, by the model of
-`synth.simulate.resolution`, which was fitted to meshes graded around the contact: here it extrapolates.
+fTetWild's, with `numerics.edge_length_mm`. Each draw has a predicted error of its own, by
+`synth.simulate.error_model`, which was fitted to meshes graded around the contact: here it extrapolates.
 """
 
 from collections.abc import Sequence
@@ -22,9 +22,8 @@ from synth.simulate.resolution import (
     MARGIN,
     Resolution,
     depth_growth,
-    predicted_error_mm,
+    predicted_error_px,
     resolve,
-    scale_px_per_mm,
 )
 
 
@@ -104,14 +103,12 @@ def accuracy(scene: Scene, folder: FilePath | None = None) -> Accuracy:
     Raises:
         InputError: the indenter cannot be built.
     """
-    gel, numerics, camera = scene.sensor.gel, scene.numerics, scene.sensor.camera
+    gel, numerics = scene.sensor.gel, scene.numerics
     if numerics.edge_length_mm is not None:
         return Accuracy(0, float("nan"))
     path = Path(scene.motion, rigid_body(scene.contact.indenter, folder), gel.dome_radius_mm)
     focus = footprint(path, gel.size_mm, MARGIN)
-    scale = scale_px_per_mm(scene)
-    seen = min(camera.width * camera.height / scale**2, gel.size_mm[0] * gel.size_mm[1])
-    error = scale * predicted_error_mm(scene, focus, spacing_mm(gel, numerics), seen)
+    error = predicted_error_px(scene, focus, spacing_mm(gel, numerics))
     return Accuracy(int(2 * min(focus.half_mm) / _width(gel.size_mm, numerics.cells)), error)
 
 

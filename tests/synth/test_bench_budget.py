@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 import subprocess
 import sys
 import time
@@ -25,11 +26,11 @@ from synth.cli import main
 from synth.errors import InputError
 from synth.sampling import draw, pairs_of
 from synth.simulate import simulate
-from synth.simulate.resolution import LADDER, Fineness, Resolution, ladder, resolve, scale_px_per_mm
+from synth.simulate.resolution import LADDER, Fineness, Resolution, ladder, resolve
 from synth.template import load_scene
 
 ROOT = Path(__file__).parents[2]
-TARGET = 0.004
+TARGET = 0.0065
 """px, such that the first draw is given 4 elements across and the second 6."""
 BUDGETED = TEXT.replace("edge_length_mm = 1.25", f"target_error_px = {TARGET}").replace("steps = 2", "steps = 3")
 SMALL = Reference(across=8, step_mm=0.1)
@@ -55,24 +56,6 @@ def done(study: Study, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("done")
     study_budget(study, out, "the command")
     return out
-
-
-def test_errors_of_known_fields(study: Study) -> None:
-    """A shift along the face is one of the picture. Fails with the mean in place of the root mean square."""
-    scene = draw(study.templates[0], 2, 0)
-    points, scale = places(scene), scale_px_per_mm(scene)
-    camera, size = scene.sensor.camera, scene.sensor.gel.size_mm
-    # Of the pad's points those in the picture: the picture's share of the pad's area, within a row and a column.
-    share = camera.width * camera.height / scale**2 / (size[0] * size[1])
-    assert len(points) == pytest.approx(share * 81 * 67, rel=0.05)
-    zero = np.zeros((3, len(points), 3))
-    moved = zero.copy()
-    moved[0] += (0.03, 0.04, 0.0)
-    half = np.arange(len(points)) % 2 == 0
-    moved[1, half] += (0.0, 0.1, 0.0)
-    found = picture_errors(moved, zero, scene)
-    # The magnification is the same all over the face, to the 1e-3 by which slanted rays refract otherwise.
-    np.testing.assert_allclose(found, [0.05 * scale, 0.1 * scale * np.sqrt(half.mean()), 0], rtol=5e-3)
 
 
 def test_a_draw_is_that_of_generate(study: Study) -> None:
@@ -185,8 +168,9 @@ def test_the_whole_study(done: Path, study: Study, capsys: pytest.CaptureFixture
             one = drawn(study.templates[0], 2, int(row["index"]))
             truth, own = (store.field(Job("tiny", one.index, rung)) for rung in (REFERENCE, row["rung"]))
             assert own.shape == (len(one.judged), len(places(one.scene)), 3)
-            error = picture_errors(own, truth, one.scene).max()
+            error = picture_errors(own, truth, one.scene)[0].max()
             assert float(row["error_px"]) == pytest.approx(error, rel=1e-4)  # five digits
+            assert float(row["predicted_px"]) == pytest.approx(one.predicted_px(float(row["spacing_mm"])), rel=1e-4)
             assert row["within"] == str(error <= TARGET)
             assert row["chosen"] == str(row["rung"] == one.chosen_rung)
             assert float(row["seconds"]) > 0
@@ -252,6 +236,24 @@ def test_another_study_is_refused(done: Path, study: Study, tmp_path: Path, monk
     with pytest.raises(InputError, match=r"solver: .* there, of tomorrow now"):
         Store(done, study)
     assert (done / "budget.jsonl").read_bytes() == before
+
+
+def test_a_press_on_another_mesh_is_made_again(
+    done: Path, study: Study, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In place of the one that is there. Fails with measurements known by their job alone."""
+    shutil.copytree(done, tmp_path / "copy")
+    lines = tmp_path / "copy" / "budget.jsonl"
+    kept = [json.loads(line) for line in lines.read_text().splitlines()]
+    stale = next(line for line in kept if line["rung"] == "4x3" and line["index"] == 1)
+    lines.write_text("".join(json.dumps({**line, "mesh": "other"} if line is stale else line) + "\n" for line in kept))
+    capsys.readouterr()
+    assert study_budget(study, tmp_path / "copy", "c") == study_budget(study, done, "c")
+    assert capsys.readouterr().err.count("complete") == 1
+    with Store(tmp_path / "copy", study) as store:
+        assert {job: measurement.mesh for job, measurement in store.measurements.items()} == {
+            Job(line["scene"], line["index"], line["rung"]): line["mesh"] for line in kept
+        }
 
 
 def test_wrong_input(tmp_path: Path, study: Study, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,19 +14,21 @@ from synth.bench.budget_verdict import Rung, Verdict
 from synth.plan import SOLVE_GROWTH
 
 
-def measured(rung: int | str, seconds: float = 1.0, unknowns: int = 100, status: str = "complete") -> Measurement:
+def measured(
+    rung: int | str, seconds: float = 1.0, unknowns: int = 100, status: str = "complete", machine: str = "m"
+) -> Measurement:
     name = rung if isinstance(rung, str) else f"{rung}x2"
     spacing = 0.1 if isinstance(rung, str) else 1.8 / rung
     return Measurement(
         scene="tiny", index=0, rung=name, status=status, reason="" if status == "complete" else "stuck",
-        seconds=seconds, wall_s=seconds, setup_s=0.0, unknowns=unknowns, spacing_mm=spacing, predicted_px=0.4,
-        penetration_mm=0.001, iterations=1, attempt=0, mesh="", machine="m",
+        seconds=seconds, wall_s=seconds, setup_s=0.0, unknowns=unknowns, spacing_mm=spacing,
+        penetration_mm=0.001, iterations=1, attempt=0, mesh="", machine=machine,
     )  # fmt: skip
 
 
 def judged(errors: dict[int, float], chosen: int, target: float = 0.5, **changes: object) -> Verdict:
     """A draw whose rungs cost across seconds, and by unknowns (across / 4)^1.5."""
-    rungs = tuple(Rung(measured(k, seconds=k, unknowns=25 * k), error) for k, error in errors.items())
+    rungs = tuple(Rung(measured(k, seconds=k, unknowns=25 * k), error, 0.4) for k, error in errors.items())
     verdict = Verdict("tiny", 0, "sphere", 0.5, target, f"{chosen}x2", 0.4, rungs, measured(REFERENCE))
     return replace(verdict, **changes)  # type: ignore[arg-type]
 
@@ -78,23 +80,47 @@ def test_a_coarse_rung_may_be_within_where_a_finer_one_is_not() -> None:
     """Errors need not fall from rung to rung; a press that did not end is none that would have done."""
     verdict = judged({4: 0.45, 6: 0.55, 8: 0.3}, chosen=8)
     assert verdict.ratio() == 2
-    ended = (Rung(measured(4, status="partial"), float("nan")), *verdict.rungs[1:])
+    ended = (Rung(measured(4, status="partial"), float("nan"), 0.4), *verdict.rungs[1:])
     assert replace(verdict, rungs=ended).ratio() == 1
+
+
+def test_times_of_different_machines_are_not_compared() -> None:
+    """By unknowns where they would be. Fails with the machine not looked at: 0.5 s there are not less than 8 s here."""
+    coarse, fitting, fine = (
+        Rung(measured(k, seconds=k, unknowns=25 * k), error, 0.4) for k, error in ((4, 0.6), (6, 0.4), (8, 0.3))
+    )
+    there = [Rung(measured(k, seconds=0.5, unknowns=25 * k, machine="fast"), 0.4, 0.4) for k in (6, 10)]
+    verdict = judged({}, chosen=8, rungs=(coarse, there[0], fine))
+    assert not verdict.timed_together
+    assert verdict.cheapest() is there[0]
+    assert verdict.ratio() == verdict.ratio(nominal=True) == pytest.approx((8 / 6) ** SOLVE_GROWTH)
+    finer_there = judged({}, chosen=8, rungs=(coarse, fitting, fine, there[1]))
+    assert finer_there.timed_together
+    assert finer_there.cheapest() is fitting
+    assert finer_there.ratio() == pytest.approx(8 / 6)
+    missed = judged({}, chosen=4, rungs=(coarse, there[0]))
+    assert missed.ratio() == pytest.approx((4 / 6) ** SOLVE_GROWTH)
+    assert tally("tiny", [verdict, finer_there, missed]).untimed == 2
+
+
+def test_too_little_left_in_the_picture_is_told() -> None:
+    blind = judged({4: float("nan")}, 4, seen=0.6)
+    assert blind.trouble == "only 60 % of the picture's points stay in the picture, too few to judge by"
 
 
 def test_draws_of_which_nothing_can_be_said_are_told() -> None:
     """Fails with any of the three left out of `trouble`."""
     errors = {4: 0.4, 6: 0.3}
     no_reference = judged(errors, 4, reference=measured(REFERENCE, status="partial"))
-    ended = Rung(measured(4, status="failed"), float("nan"))
-    no_press = judged(errors, 4, rungs=(ended, Rung(measured(6), 0.3)))
+    ended = Rung(measured(4, status="failed"), float("nan"), 0.4)
+    no_press = judged(errors, 4, rungs=(ended, Rung(measured(6), 0.3, 0.4)))
     unfinished = judged(errors, 4, missing=1)
     for verdict in (no_reference, no_press, unfinished):
         assert not verdict.judged
     assert "the reference is partial: stuck" in no_reference.trouble
     assert "`generate` replaces the draw" in no_press.trouble
     counted = tally("tiny", [no_reference, no_press, unfinished, judged(errors, 4)], undrawn=1)
-    assert (counted.draws, counted.unfinished, counted.judged, counted.within) == (5, 1, 1, 1)
+    assert (counted.draws, counted.unfinished, counted.judged, counted.within, counted.replaced) == (5, 1, 1, 1, 1)
     told = "\n".join(misses([no_reference, no_press, unfinished], [("tiny", "no | attempt")]))
     assert told.count("| tiny |") == 3
     assert "the reference is partial" in told
