@@ -250,7 +250,7 @@ class TrainConfig(_Frozen):
     """Validate and keep an exponential moving average of the weights, decay per step (0.999 is usual); 0: the weights
     themselves (the paper is silent)."""
     compile: bool = False
-    """Compile the network with torch.compile: minutes at the start; then faster steps on a GPU than launched one by one,
+    """Compile the network with torch.compile: minutes at the start; then faster steps on a GPU than launched singly,
     slower ones than with `cuda_graph`."""
     cuda_graph: bool = True
     """On a CUDA device, record the network's two passes at the first step and replay them, unless `compile` is set."""
