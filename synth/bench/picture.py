@@ -9,6 +9,7 @@ from synth.bench.fem import Results, Row
 STYLES = {
     "graded P2/P1": ("o", "tab:blue"),
     "graded, few layers P2/P1": ("X", "navy"),
+    "graded, wide P2/P1": ("P", "deepskyblue"),
     "graded P1/P1": ("s", "tab:orange"),
     "graded P1": ("x", "tab:red"),
     "fTetWild P2/P1": ("^", "tab:green"),

@@ -14,6 +14,8 @@ PLAIN = Setting("plain driver", PLAIN_MESH, driver=PLAIN_DRIVER)
 tangent factorised, in double precision. Elements, contact and line search are the same."""
 BASE = Setting("graded P2/P1", Graded(8))
 """What the variants vary."""
+WIDE = Setting("graded, wide P2/P1", Fine(12))
+"""A mesh like the references', with more elements beside the contact; no scene chooses it."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ def whole() -> Suite:
         (
             (HELD, (PLAIN, *held, *variants())),
             (OFF_CENTRE, (PLAIN, *others)),
-            (SHEARED, (PLAIN, *others, *few)),
+            (SHEARED, (PLAIN, *others, WIDE, *few)),
         ),
         Fine(16),
         Fine(12),

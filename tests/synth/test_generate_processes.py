@@ -37,6 +37,13 @@ def _cache(monkeypatch: pytest.MonkeyPatch) -> None:
     own_cache(monkeypatch)
 
 
+@pytest.fixture(autouse=True)
+def _ctrl_c() -> None:
+    """A shell starts background jobs with Ctrl-C ignored, and the processes that tests start would inherit it."""
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 @needs_proc
 def test_killed_with_two_workers_and_started_again(tmp_path: Path) -> None:
     scene, out = write_tiny(tmp_path), tmp_path / "d"
