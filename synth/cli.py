@@ -43,8 +43,9 @@ def generate(
         int | None,
         Parameter(
             converter=whole(1),
-            help="Processes that make samples; the same come out. Default: 1. With numerics.solver = batched: "
-            "processes beside the one that simulates and renders; default on a GPU: one for every other core.",
+            help="Processes that make samples on one core each; the same come out. Default: none, this process makes "
+            "them and renders on all cores. With numerics.solver = batched: processes beside the one that simulates "
+            "and renders, 1 for none; default on a GPU: one for every other core.",
         ),
     ] = None,
     ray: Annotated[

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from cyclopts import App, Parameter
 
-from synth.cli_options import DEFAULT_SCENE, AsJson, Device, SceneName, whole
+from synth.cli_options import DEFAULT_SCENE, AsJson, Assignments, Device, SceneName, whole
 
 bench = App(
     name="bench", help="Measures how exact simulation and rendering are, and at what cost. Without a command: fem."
@@ -90,17 +90,21 @@ def scale(
         Parameter(help="Image, such as 640x480; repeatable. Default: the scene's own, and half of it."),
     ] = None,
     workers: Annotated[
-        list[int] | None, Parameter(help="Processes; repeatable. Default: 1, 2, 4 ... up to the number of cores.")
+        list[int] | None,
+        Parameter(
+            help="Processes of one core each, beside a run without; repeatable. Default: 1, 2, 4 ... up to the cores."
+        ),
     ] = None,
     device: Device = "auto",
     seed: Annotated[int, Parameter(converter=whole(0), help="Seed of the draws.")] = 0,
+    assignments: Assignments = None,
     minutes: Annotated[float | None, Parameter(help="Begin no further run after them.")] = None,
     as_json: AsJson = False,
 ) -> int:
     """Measures pairs per second, where the time goes, and what larger jobs would take."""
     from synth.bench import run_scale
 
-    return run_scale(scene, out, n, size or [], workers or [], device, seed, minutes, as_json)
+    return run_scale(scene, out, n, size or [], workers or [], device, seed, assignments or [], minutes, as_json)
 
 
 @bench.command

@@ -1,12 +1,11 @@
 """Scheduling: which trajectories are still to do, who does them, and what happened.
 
-In-process by default; with workers, one process each (`synth.processes`); with Ray, on a cluster (`synth.ray_pool`);
-or one shard of the job, beside others. With the batched solver this process simulates and renders, and the workers do
-the rest. The driver alone writes manifest and failures; samples' folders are written where they are made. The same
-command goes on where it stopped.
+In this process by default, which renders on all cores; with workers, in processes of one core each (`synth.processes`);
+with Ray, on a cluster (`synth.ray_pool`); or one shard of the job, beside others. With the batched solver this process
+simulates and renders, and the workers do the rest. The driver alone writes manifest and failures; samples' folders are
+written where they are made. The same command goes on where it stopped.
 """
 
-import os
 import re
 import time
 from collections import Counter
@@ -27,7 +26,7 @@ from synth.errors import InputError
 from synth.mesh import mesh_key, pad_mesh
 from synth.mesh.cache import user_cache
 from synth.plan import check_buildable
-from synth.processes import outcomes_of_batches, outcomes_of_processes
+from synth.processes import cores, outcomes_of_batches, outcomes_of_processes
 from synth.produce import Outcome, Producer, Task, Workplace
 from synth.ray_pool import outcomes_of_ray
 from synth.render.pattern import is_grey
@@ -44,8 +43,9 @@ class Scheduling:
     """Who makes a job's samples; they are the same whoever does.
 
     Attributes:
-        workers: processes; 1 stays in this one, None is 1, or with the batched solver on a GPU one for every other
-            core. With Ray: tasks at once, None for all cores of the cluster.
+        workers: processes that make samples, on one core each; None: this process alone, which renders on all cores.
+            With the batched solver: processes beside this one, 1 for none, None for one for every other core where
+            there is a GPU, else none. With Ray: tasks at once, None for all cores of the cluster.
         ray: address of a Ray cluster, or "local".
         shard: make this part of the job only.
         batch: most trajectories that the batched solver has under way at a time; None for what suits the device.
@@ -211,7 +211,7 @@ def _check(scheduling: Scheduling, out: Output) -> None:
         raise InputError(f"--workers = {workers}: at least 1")
     if scheduling.batch is not None and scheduling.batch < 1:
         raise InputError(f"batch = {scheduling.batch}: at least 1 trajectory at a time")
-    if not is_shared(out) and (scheduling.ray is not None or (workers or 1) > 1):
+    if not is_shared(out) and (scheduling.ray is not None or workers is not None):
         raise InputError(f"--out {out}: is seen by one process only; leave out --workers and --ray, or give another")
 
 
@@ -256,8 +256,8 @@ def _outcomes(place: Workplace, tasks: Iterator[Task], scheduling: Scheduling) -
     if place.is_batched:
         yield from outcomes_of_batches(place, tasks, _finishers(place, scheduling), scheduling.batch)
         return
-    if (scheduling.workers or 1) > 1:
-        yield from outcomes_of_processes(place, tasks, scheduling.workers or 1)
+    if scheduling.workers is not None:
+        yield from outcomes_of_processes(place, tasks, scheduling.workers)
         return
     producer = Producer(place)
     for trajectory, wanted in tasks:
@@ -268,7 +268,7 @@ def _finishers(place: Workplace, scheduling: Scheduling) -> int:
     """Worker processes beside the one that simulates and renders; 1 for none."""
     if scheduling.workers is not None or not place.has_gpu or not is_shared(place.out):
         return scheduling.workers or 1
-    return max(1, len(os.sched_getaffinity(0)) - 1 if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 2) - 1)
+    return max(1, cores() - 1)
 
 
 def _versions() -> dict[str, str]:

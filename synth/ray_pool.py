@@ -14,10 +14,10 @@ import socket
 import uuid
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import Any
 
 from synth.errors import InputError
+from synth.processes.threads import render_on_one_core
 from synth.produce import Outcome, Producer, Task, Workplace
 
 LOCAL = "local"
@@ -53,7 +53,7 @@ def outcomes_of_ray(
         if gpus and not ray.cluster_resources().get("GPU"):
             raise InputError(f"--ray {address}: the cluster has no GPU; give --device cpu, or add one")
         work = ray.remote(max_retries=MAX_RETRIES, num_cpus=1, num_gpus=gpus)(_work)
-        shared, token = ray.put(replace(place, threads=1)), uuid.uuid4().hex
+        shared, token = ray.put(place), uuid.uuid4().hex
         under_way: dict[Any, Task] = {}
         while True:
             most = workers or 2 * max(1, int(ray.cluster_resources().get("CPU", 1)))
@@ -129,5 +129,6 @@ _producer: tuple[str, Producer] | None = None
 def _work(place: Workplace, token: str, trajectory: int, wanted: tuple[int, ...]) -> Outcome:
     global _producer
     if _producer is None or _producer[0] != token:
+        render_on_one_core(place.variant)  # Ray itself keeps linear algebra to a task's one core
         _producer = token, Producer(place)
     return _producer[1].produce(trajectory, wanted)

@@ -1,7 +1,7 @@
 """`synth bench scale`: pairs per second against workers and image size, and what larger jobs would take."""
 
-import os
 import re
+import shlex
 import sys
 import time
 from collections.abc import Sequence
@@ -22,6 +22,7 @@ def run_scale(
     workers: Sequence[int],
     device: Literal["auto", "cpu", "cuda"],
     seed: int,
+    assignments: Sequence[str],
     minutes: float | None,
     as_json: bool,
 ) -> int:
@@ -32,9 +33,10 @@ def run_scale(
         out: directory; the pairs are made in it, too, and removed.
         n: each run makes 2 n pairs, and a trajectory per worker before them.
         sizes: "WIDTHxHEIGHT"; none: the scene's own, and half of it.
-        workers: process counts; none: 1, 2, 4 ... as many as there are cores.
+        workers: process counts, beside a run without workers; none: 1, 2, 4 ... as many as there are cores.
         device: that renders.
         seed: of the draws.
+        assignments: "key=value", changes of the scene.
         minutes: begin no further run after them.
         as_json: print the rows instead of the summary.
 
@@ -49,7 +51,7 @@ def run_scale(
     from synth.dataset.jsontext import to_line
     from synth.dataset.storage import storage_errors
 
-    settings = _settings(scene, sizes, workers)
+    settings = _settings(scene, assignments, sizes, workers)
     with storage_errors(out):
         out.mkdir(parents=True, exist_ok=True)
     deadline = None if minutes is None else time.monotonic() + 60 * minutes
@@ -57,15 +59,16 @@ def run_scale(
     for setting in settings:
         if cells and deadline is not None and time.monotonic() > deadline:
             break
-        cells.append(measure(scene, setting, n, device, seed, out / "scale-run"))
+        cells.append(measure(scene, assignments, setting, n, device, seed, out / "scale-run"))
         cell = cells[-1]
         print(
-            f"synth: {setting.width} x {setting.height}, {setting.workers} workers: {cell.pairs} pairs in "
+            f"synth: {setting.width} x {setting.height}, {setting.by}: {cell.pairs} pairs in "
             f"{cell.seconds:.1f} s, {cell.pairs_per_second:.2f} pairs/s ({len(cells)} of {len(settings)})",
             file=sys.stderr,
             flush=True,
         )
-    write_report(out, scene, cells, len(settings) - len(cells), _command(scene, n, sizes, workers, device, seed))
+    command = _command(scene, n, sizes, workers, device, seed, assignments)
+    write_report(out, scene, cells, len(settings) - len(cells), command)
     if as_json:
         print(to_line(record(cells)), end="")
     else:
@@ -73,15 +76,17 @@ def run_scale(
     return 0 if len(cells) == len(settings) else 1
 
 
-def _settings(scene: str, sizes: Sequence[str], workers: Sequence[int]) -> "list[Setting]":
+def _settings(scene: str, assignments: Sequence[str], sizes: Sequence[str], workers: Sequence[int]) -> "list[Setting]":
     from synth.bench.scale_measure import Setting
+    from synth.processes import cores
     from synth.template import load_scene
 
-    camera = load_scene(scene).corners[0].sensor.camera
+    camera = load_scene(scene, assignments).corners[0].sensor.camera
     pixels = [_size(size) for size in sizes] or [(camera.width // 2, camera.height // 2), (camera.width, camera.height)]
-    cores = os.cpu_count() or 1
-    counts = list(workers) or [2**k for k in range(cores.bit_length()) if 2**k <= cores]
-    return [Setting(width, height, count) for width, height in pixels for count in counts]
+    if wrong := [count for count in workers if count < 1]:
+        raise InputError(f"--workers {wrong[0]}: at least 1; there is a run without workers anyway")
+    counts = list(workers) or [2**k for k in range(cores().bit_length())]
+    return [Setting(width, height, count) for width, height in pixels for count in (None, *counts)]
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -91,9 +96,18 @@ def _size(text: str) -> tuple[int, int]:
     return int(found[1]), int(found[2])
 
 
-def _command(scene: str, n: int, sizes: Sequence[str], workers: Sequence[int], device: str, seed: int) -> str:
+def _command(
+    scene: str,
+    n: int,
+    sizes: Sequence[str],
+    workers: Sequence[int],
+    device: str,
+    seed: int,
+    assignments: Sequence[str],
+) -> str:
     """For the report."""
-    parts = [f"python -m synth bench scale --scene {Path(scene).name} --n {n}"]
-    parts += [f"--size {size}" for size in sizes] + [f"--workers {count}" for count in workers]
-    parts += [f"--device {device}"] * (device != "auto") + [f"--seed {seed}"] * (seed != 0)
-    return " ".join(parts)
+    options = [("--scene", Path(scene).name), ("--n", n)]
+    options += [("--size", size) for size in sizes] + [("--workers", count) for count in workers]
+    options += [("--device", device)] * (device != "auto") + [("--seed", seed)] * (seed != 0)
+    options += [("--set", assignment) for assignment in assignments]
+    return "python -m synth bench scale " + shlex.join(str(part) for option in options for part in option)

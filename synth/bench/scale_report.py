@@ -14,6 +14,7 @@ from synth.bench.machine import processor
 from synth.bench.scale_measure import Cell
 from synth.dataset.sample import SAMPLE_FILES
 from synth.dataset.storage import replace_file
+from synth.processes import cores
 from synth.simulate.linear import has_pardiso
 
 JOBS = (5_000, 500_000, 50_000_000)
@@ -49,7 +50,7 @@ def summary(cells: Sequence[Cell]) -> list[str]:
     best = fastest(cells)
     return [
         f"{best.setting.width} x {best.setting.height}: {best.pairs_per_second:.2f} pairs/s with "
-        f"{best.setting.workers} workers and {best.variant}; "
+        f"{best.setting.by} and {best.variant}; "
         f"{JOBS[0]} pairs in {_duration(_seconds(best, JOBS[0]))}, {_bytes(JOBS[0] * best.bytes_per_pair)}"
     ]
 
@@ -86,14 +87,16 @@ def report(scene: str, cells: Sequence[Cell], left_out: int, command: str) -> st
         f"Made by `{command}` on {_machine()}; rendered with {cells[0].variant}.",
         f"{left_out} runs were left out for lack of time." if left_out else "",
         "## Workers and image size",
-        "Beyond start-up, which is the time until each worker has made its first trajectory. Workers share the cores; "
-        "one alone already renders on all of them. The last two columns: time(2 n) / time(n), and the same of the "
-        "work that the stages' own clocks counted, which differs from 2 as the draws of the two halves differ; where "
-        "cost is linear the two agree.",
+        "Beyond start-up, which is the time until each worker has made its first trajectory. A worker takes one core; "
+        "without workers one process makes everything and renders on all cores. The last two columns: "
+        "time(2 n) / time(n), and the same of the work that the stages' own clocks counted, which differs from 2 as "
+        "the draws of the two halves differ; where cost is linear the two agree, with several workers within a "
+        "trajectory of each.",
         _throughput(cells),
         "## Where the time goes",
-        "Seconds per pair with one worker, beside what the core of a stage takes alone for the same frames and "
-        "bytes. The rest of `render` is building and moving the scene; the rest of `write` is encoding.",
+        "Seconds per pair of one worker, beside what the innermost part of a stage takes alone on one core for the "
+        "same frames and bytes. The rest of `render` is building and moving the scene; the rest of `write` is "
+        "encoding; `other` is drawing, meshing, and the driver.",
         _stages(cells),
         "## Larger jobs",
         _larger(fastest(cells)),
@@ -111,7 +114,7 @@ def _throughput(cells: Sequence[Cell]) -> str:
         one = alone.get((cell.setting.width, cell.setting.height))
         gain = f"{cell.pairs_per_second / one:.2f}" if one else "–"
         lines.append(
-            f"| {cell.setting.width} x {cell.setting.height} | {cell.setting.workers} | {cell.pairs} "
+            f"| {cell.setting.width} x {cell.setting.height} | {cell.setting.workers or 'none'} | {cell.pairs} "
             f"| {cell.startup_s:.1f} | {cell.pairs_per_second:.3f} | {gain} | {cell.growth:.3f} "
             f"| {cell.draws_growth:.3f} |"
         )
@@ -124,7 +127,7 @@ def _stages(cells: Sequence[Cell]) -> str:
         if cell.setting.workers != 1:
             continue
         total = cell.seconds / cell.pairs
-        rows = {**cell.stages, "driver": max(0.0, total - sum(cell.stages.values()))}
+        rows = {**cell.stages, "other": max(0.0, total - sum(cell.stages.values()))}
         for stage, seconds in rows.items():
             limit = cell.limits.get(stage)
             beside = f"{limit:.4f} | {seconds / limit:.2f}" if limit else "– | –"
@@ -138,7 +141,7 @@ def _larger(cell: Cell) -> str:
     index = index_bytes()
     lines = [
         f"Extrapolated from {cell.pairs} pairs of {cell.setting.width} x {cell.setting.height} with "
-        f"{cell.setting.workers} workers, {cell.pairs_per_second:.3f} pairs/s and {_bytes(cell.bytes_per_pair)} a pair "
+        f"{cell.setting.by}, {cell.pairs_per_second:.3f} pairs/s and {_bytes(cell.bytes_per_pair)} a pair "
         f"in {len(SAMPLE_FILES)} files. The index that a run keeps in memory takes {index:.0f} bytes a finished pair; "
         "nothing else grows.",
         "",
@@ -176,7 +179,7 @@ def _seconds(cell: Cell, pairs: int) -> float:
 
 
 def _machine() -> str:
-    parts = [f"{processor()}, {os.cpu_count()} cores"]
+    parts = [f"{processor()}, {cores()} cores"]
     if hasattr(os, "getloadavg"):
         parts.append(f"load {os.getloadavg()[2]:.1f} over the last 15 minutes, this run included")
     parts += ["Pardiso" if has_pardiso() else "SuperLU, no Pardiso", f"synth {__version__}"]

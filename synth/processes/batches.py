@@ -18,7 +18,6 @@ from synth.arrays import Image
 from synth.processes.ahead import ahead
 from synth.processes.pool import Maker, spread
 from synth.processes.textures import Textures
-from synth.processes.threads import one_thread_each
 from synth.produce import Developed, Outcome, Studio, Task, Workplace, develop, finish, in_batches
 from synth.produce.batches import Result
 
@@ -55,7 +54,7 @@ def outcomes_of_batches(
     def number(item: Developed | Outcome) -> int:
         return item.trajectory if isinstance(item, Developed) else item.given_up[0] // pairs
 
-    with one_thread_each(), ThreadPoolExecutor(PAINTERS) as painters:
+    with ThreadPoolExecutor(PAINTERS) as painters:
         textures = Textures(place, painters)
         try:
             painted = _painted(results, textures)
@@ -90,10 +89,7 @@ def _developed(
 
 
 def _finisher(place: Workplace) -> Maker[Developed | Outcome]:
-    """In a worker process. OpenCV would use all cores in each of them."""
-    import cv2
-
-    cv2.setNumThreads(1)
+    """In a worker process."""
     return partial(_finished, place)
 
 

@@ -1,5 +1,8 @@
 """Items of work spread over worker processes.
 
+A worker takes one core: one thread in every library. As many workers as a job has cores fill them, however many the
+machine has.
+
 Workers live and die with the driver: each holds the reading end of a pipe that the driver alone can write to, and
 leaves when it closes, which the system does when the driver is killed. Ctrl-C reaches all processes of a terminal at
 once; the workers are started with it blocked, and the driver, which gets it, closes the pipe.
@@ -17,13 +20,13 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import replace
 from itertools import islice
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from typing import Any, TypeAlias, TypeVar
 
 from synth.errors import InputError
+from synth.processes.threads import one_thread_each, render_on_one_core
 from synth.produce import Outcome, Producer, Task, Workplace
 
 Item = TypeVar("Item")
@@ -35,8 +38,7 @@ MAX_DEATHS = 3
 
 
 def outcomes_of_processes(place: Workplace, tasks: Iterator[Task], workers: int) -> Generator[Outcome, None, None]:
-    """Outcomes of whole trajectories, each made by one worker; see `spread`."""
-    place = replace(place, threads=max(1, (os.cpu_count() or 1) // workers))
+    """Outcomes of whole trajectories, each made by one worker on one core; see `spread`."""
     yield from spread(place, _trajectory_maker, tasks, workers, _trajectory)
 
 
@@ -51,7 +53,8 @@ def spread(
 
     Args:
         place: of the job.
-        make: gives, in each worker process, what makes an outcome of an item; like the items it is picklable.
+        make: gives, in each worker process, what makes an outcome of an item, and keeps a renderer to one core; like
+            the items it is picklable.
         items: to do.
         workers: processes.
         number: trajectory of an item, for messages.
@@ -90,7 +93,8 @@ def _outcomes_of_pool(
     context = get_context("spawn")  # Dr.Jit and Warp do not survive a fork
     leash, held = context.Pipe(duplex=False)
     under_way: dict[Future[Outcome], Item] = {}
-    with leash, held, ProcessPoolExecutor(workers, context, _begin, (place, make, leash)) as pool:
+    pool = ProcessPoolExecutor(workers, context, _begin, (place, make, leash))
+    with leash, held, one_thread_each(), pool:
         try:
             while True:
                 room = len(under_way) < 2 * workers
@@ -152,6 +156,7 @@ def _work(item: Any) -> Outcome:
 
 
 def _trajectory_maker(place: Workplace) -> Maker[Task]:
+    render_on_one_core(place.variant)
     producer = Producer(place)
     return lambda task: producer.produce(*task)
 

@@ -27,7 +27,6 @@ class Workplace:
         out: of the dataset.
         variant: that renders.
         cache: where meshes are kept beside the dataset.
-        threads: for rendering; None for all cores.
     """
 
     template: Template
@@ -35,7 +34,6 @@ class Workplace:
     out: Output
     variant: Variant
     cache: Path
-    threads: int | None = None
 
     @property
     def needs_meshes(self) -> bool:

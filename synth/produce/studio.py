@@ -99,10 +99,6 @@ class Studio:
         if self._finger is None or self._finger.sensor != sensor:
             variant = self._place.variant
             variant.load()
-            if self._place.threads is not None and variant.is_vectorised:
-                import drjit
-
-                drjit.set_thread_count(self._place.threads)
             surface = rest_surface(scene.sensor.gel)
             painted = paint(self._place, sensor, scene.sensor) if texture is None else texture.result()
             renderer = Renderer(scene.sensor, scene.render, surface, painted, variant)

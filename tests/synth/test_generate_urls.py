@@ -148,9 +148,13 @@ def test_storage_that_refuses_ends_with_one_message_and_goes_on(
 
 
 @pytest.mark.parametrize(
-    ("out", "message"),
-    [("nowhere://bucket/x", "Protocol not known"), ("memory://x", "is seen by one process only")],
+    ("out", "workers", "message"),
+    [
+        ("nowhere://bucket/x", 2, "Protocol not known"),
+        ("memory://x", 2, "is seen by one process only"),
+        ("memory://x", 1, "is seen by one process only"),
+    ],
 )
-def test_places_that_cannot_be(tmp_path: Path, out: str, message: str) -> None:
+def test_places_that_cannot_be(tmp_path: Path, out: str, workers: int, message: str) -> None:
     with pytest.raises(InputError, match=message):
-        generate(load_scene(write_tiny(tmp_path)), 1, out, scheduling=Scheduling(workers=2))
+        generate(load_scene(write_tiny(tmp_path)), 1, out, scheduling=Scheduling(workers))

@@ -1,0 +1,55 @@
+"""Workers that make whole trajectories: one core each, and the bits of a run without them."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from tiny_scene import fingerprint, own_cache, reference, write_tiny
+
+from synth.generate import Scheduling, generate, job_variant, make_job
+from synth.processes import outcomes_of_processes, pool
+from synth.processes.threads import THREADS
+from synth.produce import Task, Workplace
+from synth.template import load_scene
+
+
+@pytest.fixture(autouse=True)
+def _cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One mesh for all runs: the mesher is random."""
+    own_cache(monkeypatch)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_workers_change_no_bit(tmp_path: Path, workers: int) -> None:
+    """The reference was rendered in this process, on all cores."""
+    out = tmp_path / "d"
+    generate(load_scene(write_tiny(tmp_path)), 5, out, scheduling=Scheduling(workers))
+    assert fingerprint(out) == fingerprint(reference())
+
+
+def _threads(place: Workplace) -> Callable[[Task], tuple[int, ...]]:
+    """In a worker that is ready for trajectories: its process, and the threads of renderer, OpenCV and the rest."""
+    pool._trajectory_maker(place)
+    import cv2
+    import drjit
+
+    return lambda _: (os.getpid(), drjit.thread_count(), cv2.getNumThreads(), *(int(os.environ[k]) for k in THREADS))
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_worker_is_a_process_that_takes_one_core(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, workers: int
+) -> None:
+    """Fails without `render_on_one_core` in the worker, and with workers that are started as this process is."""
+    for name in THREADS:
+        monkeypatch.setenv(name, "2")
+    monkeypatch.setattr(pool, "_trajectory_maker", _threads)
+    template = load_scene(write_tiny(tmp_path))
+    variant = job_variant(template, "cpu")
+    place = Workplace(template, make_job(template, 8, 0, variant), tmp_path / "d", variant, tmp_path / "cache")
+    found = list(outcomes_of_processes(place, ((k, (2 * k, 2 * k + 1)) for k in range(4)), workers))
+    assert len(found) == 4
+    assert os.getpid() not in {process for process, *_ in found}
+    assert {tuple(threads) for _, *threads in found} == {(1,) * (2 + len(THREADS))}
+    assert [os.environ[name] for name in THREADS] == ["2"] * len(THREADS)
