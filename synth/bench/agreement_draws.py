@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 
-from synth.bench.agreement_rounding import Rounded
+from synth.bench.agreement_noise import Noisy
 from synth.errors import InputError
 from synth.mesh import PadMesh
 from synth.sampling import draw, pairs_of
@@ -62,20 +62,20 @@ def drawn_of(template: Template, count: int, seed: int) -> list[Drawn]:
     return found
 
 
-def together(drawn: Sequence[Drawn], device: str, driver: Driver, rounded: bool = False) -> list[Trajectory | str]:
+def together(drawn: Sequence[Drawn], device: str, driver: Driver, noise: float = 0.0) -> list[Trajectory | str]:
     """All draws in one batch.
 
     Args:
         drawn: of one pad.
         device: Warp device.
         driver: how Newton's method is led.
-        rounded: on a CPU, with a GPU's rounding.
+        noise: on a CPU, share by which the preconditioner's numbers are off.
 
     Returns:
         Each one's trajectory, or why its indenter cannot be built.
     """
     first = drawn[0]
-    pad = prepare(first.scene, first.mesh, device, Rounded() if rounded else None)
+    pad = prepare(first.scene, first.mesh, device, Noisy(noise) if noise else None)
     jobs, which = [], []
     found: dict[int, Trajectory | str] = {}
     for n, one in enumerate(drawn):

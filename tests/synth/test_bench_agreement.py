@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import warp as wp
 
 from synth.bench.agreement import WANTED, compare, main
 from synth.bench.agreement_draws import drawn_of, together
-from synth.bench.agreement_rounding import to_tf32
+from synth.bench.agreement_noise import Noisy
 from synth.simulate import Trajectory
 from synth.simulate.batched.many import DRIVER
 from synth.template import load_scene
@@ -28,31 +29,39 @@ def run(capsys: pytest.CaptureFixture[str], *options: str) -> dict[str, Any]:
     return found
 
 
-def test_rounding_keeps_ten_bits() -> None:
-    # Fails with bits that are cut off.
-    given = np.array([1 + 2**-10, 1 + 2**-11, -1 - 2**-11, 1 + 2**-12, 0.0], dtype=np.float32)
-    assert to_tf32(given).tolist() == [1 + 2**-10, 1 + 2**-10, -1 - 2**-10, 1.0, 0.0]
-    many = np.random.default_rng(0).standard_normal(1000).astype(np.float32)
-    # Half a unit of the tenth bit; and some are as far off as that.
-    off = np.abs(to_tf32(many) / many.astype(np.float64) - 1)
-    assert 2**-12 < off.max() <= 2**-11
+def test_noise_has_the_size_that_was_asked_for() -> None:
+    # Fails with noise in rows that are not wanted, or with the same noise in every product.
+    size, wanted = 400, wp.array([1, 0, 1], dtype=wp.int32, device="cpu")
+    unit = wp.array(np.eye(size, dtype=np.float32), device="cpu")
+    ones, noisy = wp.array(np.ones((3, size), dtype=np.float32), device="cpu"), Noisy(0.1)
+    first, second = (wp.zeros((3, size), dtype=wp.float32, device="cpu") for _ in range(2))
+    noisy.product(unit, ones, first, wanted)
+    noisy.product(unit, ones, second, wanted)
+    off = np.concatenate([first.numpy()[[0, 2]], second.numpy()[[0, 2]]]) - 1
+    # A standard deviation from 400 draws is known to 1 / sqrt(800) = 3.5 %.
+    np.testing.assert_allclose(off.std(axis=1), 0.1, rtol=0.15)
+    assert np.abs(np.corrcoef(off) - np.eye(4)).max() < 0.2
+    assert (first.numpy()[1] == 0).all()
 
 
 def test_the_cpu_agrees_with_itself(capsys: pytest.CaptureFixture[str]) -> None:
     """A trajectory's bits depend neither on its neighbours nor on its slot."""
-    # Fails with a device that is rounded.
+    # Fails with a device that has noise.
     found = run(capsys)
     assert (found["draws"], found["same_outcome"], found["other_outcomes"]) == (4, 4, [])
     assert found["complete"] == found["within_1e-6"] == 4
     assert found["displacement_largest"] == found["traction_largest"] == found["flow_px_largest"] == 0
 
 
-def test_a_gpus_rounding_stays_within_what_is_wanted(capsys: pytest.CaptureFixture[str]) -> None:
-    """With the default way; a loose one lets friction remember what was rounded."""
-    # Fails with a way to 1e-3 as the default.
-    found, loose = run(capsys, "--rounded"), run(capsys, "--rounded", "--loose", "1e-3")
-    assert found["same_outcome"] == loose["same_outcome"] == 4
-    assert 0 < found["displacement_largest"] <= WANTED < loose["displacement_largest"]
+def test_noise_in_the_directions_stays_within_what_is_wanted(capsys: pytest.CaptureFixture[str]) -> None:
+    """With the default way; a loose one lets friction remember the noise, rough directions leave it in the record."""
+    # Fails with either as the default.
+    found, *others = (run(capsys, "--noise", "0.1", *way) for way in ([], ["--loose", "1e-3"], ["--forcing", "0.03"]))
+    assert found["same_outcome"] == 4
+    assert 0 < found["displacement_largest"] <= WANTED
+    for other in others:
+        assert other["same_outcome"] == 4
+        assert other["displacement_median"] > 2 * found["displacement_median"]
     # At most some ten px of flow, within 1e-6 of them.
     assert 0 < found["flow_px_largest_mean"] <= found["flow_px_largest"] < 1e-4
 
@@ -72,7 +81,7 @@ def test_outcomes_are_counted() -> None:
 
 @pytest.mark.parametrize(
     ("options", "told"),
-    [(["--device", "cuda", "--rounded"], "use cpu"), (["--device", "cpu", "--trajectories", "0"], "at least 1")],
+    [(["--device", "cuda", "--noise", "0.1"], "use cpu"), (["--device", "cpu", "--trajectories", "0"], "at least 1")],
 )
 def test_what_cannot_be_compared(capsys: pytest.CaptureFixture[str], options: list[str], told: str) -> None:
     assert main(options) == 2
