@@ -1,0 +1,55 @@
+#!/bin/sh
+# The measurements of docs/reports/h200.md on one GPU: sh docs/h200.sh OUT [PAIRS [REAL]]
+#
+# PAIRS is a folder of folders of pairs (docs/test_set.sh), REAL one of real pairs: for the times of `compare`, left out without them.
+# Each part writes its JSON, log or table into OUT; a part that OUT holds is not run again. Some ten minutes. CORES (default 0-15) are
+# the cores that generate may use, SHARDS (default "4:3 2:7") processes on the GPU and workers of each; the data go to /dev/shm.
+set -eu
+out=$1 pairs=${2:-} real=${3:-}
+mkdir -p "$out"
+
+part() { # file, command
+    file=$out/$1
+    shift
+    [ -s "$file" ] || "$@" > "$file" 2> "$file.err" || echo "failed: $* (see $file.err)"
+}
+
+shards() { # processes, workers: 1,000 pairs; a line a second: seconds, pairs that are there
+    data=/dev/shm/shards_$1 began=$(date +%s) running=
+    for i in $(seq 0 $(($1 - 1))); do
+        taskset -c "${CORES:-0-15}" python -m synth generate --scene gelsight_mini --n "${N:-1000}" --seed 5 --shard "$i/$1" --workers "$2" \
+            --device cuda --set numerics.solver=batched --set sensor.camera.width=640 --set sensor.camera.height=480 \
+            --set sensor.camera.fx=900.4 --set sensor.camera.fy=900.4 --set 'sensor.camera.cx={normal=[320.0,6.0]}' \
+            --set 'sensor.camera.cy={normal=[240.0,6.0]}' --set render.samples_per_pixel=64 --set 'render.light="path_traced"' \
+            --json --out "$data" > "$out/shard_$1_$i.json" &
+        running="$running $!"
+    done
+    # shellcheck disable=SC2086 # several numbers
+    while kill -0 $running 2>/dev/null; do
+        echo "$(($(date +%s) - began)) $(find "$data/samples" -mindepth 1 -maxdepth 1 -name '[0-9]*' 2>/dev/null | wc -l)"
+        sleep 1
+    done
+    wait
+    du -sm "$data"
+    rm -rf "$data"
+}
+
+presses="python -m synth.bench.batched --across 16 12 --through 2 --growth 2 --radii 3 6 --step 0.334"
+# shellcheck disable=SC2086 # several words
+{
+    part presses_fast.jsonl $presses --forcing 0.03 --loose 1e-2 --batch 2048 2048 2048 1024 1024 1024 --seconds 10
+    part presses.jsonl $presses --batch 1024 2048 --seconds 16
+}
+for each in ${SHARDS:-4:3 2:7}; do part "shards_${each%:*}.log" shards "${each%:*}" "${each#*:}"; done
+for batch in 16 256; do
+    part "agreement_$batch.json" python -m synth.bench.agreement --trajectories "$batch" --processes "${PROCESSES:-16}"
+    part "agreement_rough_$batch.json" python -m synth.bench.agreement --trajectories "$batch" --processes "${PROCESSES:-16}" --forcing 0.03
+done
+part agreement_failing.json python -m synth.bench.agreement --trajectories 64 --processes "${PROCESSES:-16}" \
+    --set motion.depth_mm=2.6 --set contact.friction=1.2 --set motion.twist_deg=40
+part cuda_tests.log python -m pytest -m cuda
+R="--device cuda --methods none --weights best --registration none --registration motion --registration brightness"
+# shellcheck disable=SC2086 # several words
+[ -z "$real" ] || for batch in 1 16; do part "times_$batch.log" python -m gelflow compare "$real" $R --batch "$batch" --out "$out/times_$batch"; done
+# shellcheck disable=SC2086 # several words
+[ -z "$pairs" ] || part times_sizes.log python -m gelflow compare "$pairs"/* $R --batch 0 --out "$out/times_sizes"
