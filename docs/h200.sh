@@ -24,10 +24,11 @@ shards() { # processes, workers: 1,000 pairs; a line a second: seconds, pairs th
             --json --out "$data" > "$out/shard_$1_$i.json" &
         running="$running $!"
     done
-    # shellcheck disable=SC2086 # several numbers
-    while kill -0 $running 2>/dev/null; do
-        echo "$(($(date +%s) - began)) $(find "$data/samples" -mindepth 1 -maxdepth 1 -name '[0-9]*' 2>/dev/null | wc -l)"
-        sleep 1
+    for process in $running; do
+        while kill -0 "$process" 2>/dev/null; do
+            echo "$(($(date +%s) - began)) $(find "$data/samples" -mindepth 1 -maxdepth 1 -name '[0-9]*' 2>/dev/null | wc -l)"
+            sleep 1
+        done
     done
     wait
     du -sm "$data"

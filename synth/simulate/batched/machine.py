@@ -6,7 +6,8 @@ whatever the slots are at, so that on CUDA it is captured once as a graph; the h
 
 On a CPU a trajectory's bits depend neither on its neighbours nor on its slot. On a GPU residuals and products are added
 up by atomic operations in any order and cuBLAS chooses its algorithm by the size of the batch, so that the last bits of
-a Newton iterate change from run to run even for the same batch; what converges agrees within Newton's tolerance.
+a Newton iterate change from run to run even for the same batch; what converges meets Newton's tolerance, but may be
+another balance (docs/reports/batched_fem.md, Rounding).
 """
 
 from collections.abc import Callable
