@@ -239,8 +239,14 @@ def arnoldi(rows: int) -> wp.Kernel:
 
 @cache
 def solution(rows: int) -> wp.Kernel:
-    """The kernel that finds the solution where a solve is done, and the slot's next phase; one block per slot."""
+    """The kernel that finds the solution where a solve is done, and the slot's next phase; one block per slot.
+
+    Each thread substitutes backwards by itself. Warp keeps a tile of which single numbers are extracted in shared
+    memory, and changing it does not wait for threads that have yet to read: on a GPU with several blocks on a
+    multiprocessor some read too late, and their rows of the solution lacked a part.
+    """
     count = wp.constant(rows // 4)
+    coefficients = wp.types.vector(length=GMRES_LIMIT, dtype=wp.float32)
     bounds = (block_size(rows), max(1, TOGETHER // block_size(rows)))
 
     @wp.kernel(module="unique", enable_backward=False, launch_bounds=bounds)
@@ -252,20 +258,22 @@ def solution(rows: int) -> wp.Kernel:
         if krylov.running[s] != DONE:
             return
         k = krylov.k[s]
-        right = wp.tile_load(krylov.residual[s], shape=LIMIT)
+        right = coefficients()
+        for i in range(k):
+            right[i] = krylov.residual[s, i]
         total = wp.tile_zeros(shape=count, dtype=wp.vec4f)
         finite = wp.int32(1)
         for back in range(k):
             j = k - 1 - back
-            column = wp.tile_load(krylov.triangle[s, j], shape=LIMIT)
-            z = wp.tile_load(krylov.corrections[s, j], shape=count, bounds_check=False)
             pivot = krylov.triangle[s, j, j]
             weight = NONE
             if pivot != NONE:
-                weight = wp.tile_extract(right, j) / pivot
+                weight = right[j] / pivot
             if not wp.isfinite(weight):
                 finite = wp.int32(0)
-            wp.tile_axpy(-weight, column, right)
+            for i in range(j):
+                right[i] -= weight * krylov.triangle[s, j, i]
+            z = wp.tile_load(krylov.corrections[s, j], shape=count, bounds_check=False)
             wp.tile_axpy(weight, z, total)
         wp.tile_store(krylov.step[s], total * wp.float32(krylov.size[s]), bounds_check=False)
         if lane > 0:
