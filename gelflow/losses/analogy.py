@@ -29,7 +29,7 @@ def transformed_pair(
         image1: (B, 3, H, W) in [0, 1].
         image2: The same shape.
         flow: (B, 2, H, W) px; its gradient is not followed.
-        random: On the CPU; the same transformation for all pairs of the batch.
+        random: On the CPU; the same transformation for all pairs of the batch. Noise is drawn on the images' device.
 
     Returns:
         Both images, the flow that belongs to them, and a mask of the pixels where it is known.
@@ -42,9 +42,10 @@ def transformed_pair(
     motion = displacement(flow, matrix.to(flow), shift.to(flow))
     turned = torch.einsum("ij,bjhw->bihw", torch.linalg.inv(matrix).to(flow), warp(flow.detach(), motion))
     gain = (1 + GAIN * draw[4:7].float()).view(1, 3, 1, 1).to(image1)
+    grain = torch.Generator(image1.device).manual_seed(int(torch.randint(2**62, (), generator=random)))
     shown = []
     for image in (image1, image2):
-        noise = NOISE * torch.randn(image.shape, generator=random).to(image)
+        noise = NOISE * torch.randn(image.shape, generator=grain, device=image.device)
         shown.append((gain * warp(image, motion) + noise).clamp(0, 1))
     return shown[0], shown[1], turned, inside(motion)
 
