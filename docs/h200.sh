@@ -38,13 +38,12 @@ shards() { # processes, workers: 1,000 pairs; a line a second: seconds, pairs th
 presses="python -m synth.bench.batched --across 16 12 --through 2 --growth 2 --radii 3 6 --step 0.334"
 # shellcheck disable=SC2086 # several words
 {
-    part presses_fast.jsonl $presses --forcing 0.03 --loose 1e-2 --batch 2048 2048 2048 1024 1024 1024 --seconds 10
+    part presses_fast.jsonl $presses --loose 1e-2 --batch 2048 2048 2048 1024 1024 1024 --seconds 10
     part presses.jsonl $presses --batch 1024 2048 --seconds 16
 }
 for each in ${SHARDS:-4:3 2:7}; do part "shards_${each%:*}.log" shards "${each%:*}" "${each#*:}"; done
-for batch in 16 256; do
-    part "agreement_$batch.json" python -m synth.bench.agreement --trajectories "$batch" --processes "${PROCESSES:-16}"
-    part "agreement_rough_$batch.json" python -m synth.bench.agreement --trajectories "$batch" --processes "${PROCESSES:-16}" --forcing 0.03
+for forcing in 0.03 1e-3; do
+    part "agreement_$forcing.json" python -m synth.bench.agreement --trajectories 256 --processes "${PROCESSES:-16}" --forcing "$forcing"
 done
 part agreement_failing.json python -m synth.bench.agreement --trajectories 64 --processes "${PROCESSES:-16}" \
     --set motion.depth_mm=2.6 --set contact.friction=1.2 --set motion.twist_deg=40

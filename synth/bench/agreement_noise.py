@@ -1,10 +1,7 @@
-"""A GPU's noise, on a CPU: the preconditioner's product with every number off by some share.
+"""How near a draw is to another balance: the preconditioner's product with every number off by some share at random.
 
-What two devices round otherwise makes directions of Newton's method differ by as much as linear solves leave, and a
-draw whose contact is not resolved by the mesh may then end in another balance. TF32's rounding of the factors alone
-shows nothing of that: it moves displacements by 1e-9, where an H200 moved them by 2e-7 in the median of 254 draws and
-sent a quarter of them another way. A tenth of noise on every number does the same, whatever a GPU's own source of it
-is (docs/reports/batched_fem.md, Rounding).
+An H200, whose products are rounded to TF32, is off by 3e-4. Newton's method corrects what that changes, but for draws
+near a second balance, which any other rounding would decide, too (docs/reports/batched_fem.md, Rounding).
 """
 
 import numpy as np

@@ -16,10 +16,8 @@ from synth.simulate.solve import check_shared
 from synth.simulate.trajectory import Trajectory
 
 LARGEST_BATCH = 512
-DRIVER = replace(STANDARD, loose=0.0, forcing=1e-3)
-"""The scene's tolerance all the way and Newton's own directions, because friction remembers the way and rough meshes
-have more than one balance to end in: what a GPU rounds otherwise would choose between them
-(docs/reports/batched_fem.md, Rounding). It takes a third more Krylov iterations than forcing = 0.03."""
+DRIVER = replace(STANDARD, loose=0.0)
+"""The scene's tolerance all the way, because friction remembers the way (docs/reports/batched_fem.md, Rounding)."""
 
 
 def simulate_many(
