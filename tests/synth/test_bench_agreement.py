@@ -55,12 +55,13 @@ def test_the_cpu_agrees_with_itself(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_noise_in_the_directions_stays_within_what_is_wanted(capsys: pytest.CaptureFixture[str]) -> None:
     """With the default way; a loose one lets friction remember the noise, rougher directions leave more of it."""
-    # Fails with a loose way as the default.
-    ways: list[list[str]] = [[], ["--forcing", "1e-3"], ["--loose", "1e-3"]]
-    found, exact, loose = (run(capsys, "--noise", "3e-4", *way) for way in ways)
-    assert found["same_outcome"] == exact["same_outcome"] == loose["same_outcome"] == 4
+    # Fails with either as the default.
+    ways: list[list[str]] = [[], ["--forcing", "0.03"], ["--loose", "1e-3"]]
+    found, rough, loose = (run(capsys, "--noise", "3e-4", *way) for way in ways)
+    assert found["same_outcome"] == rough["same_outcome"] == loose["same_outcome"] == 4
     assert 0 < found["displacement_largest"] <= WANTED
-    assert exact["displacement_median"] < found["displacement_median"] < loose["displacement_median"]
+    assert found["displacement_median"] < rough["displacement_median"]
+    assert 2 * found["displacement_median"] < loose["displacement_median"]
     # At most some ten px of flow, within 1e-6 of them.
     assert 0 < found["flow_px_largest_mean"] <= found["flow_px_largest"] < 1e-4
 
