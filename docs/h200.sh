@@ -1,8 +1,8 @@
 #!/bin/sh
-# The measurements of docs/reports/h200.md on one GPU: sh docs/h200.sh OUT [PAIRS [REAL]]
+# Most measurements of docs/reports/h200.md on one GPU: sh docs/h200.sh OUT [PAIRS [REAL]]
 #
 # PAIRS is a folder of folders of pairs (docs/test_set.sh), REAL one of real pairs: for the times of `compare`, left out without them.
-# Each part writes its JSON, log or table into OUT; a part that OUT holds is not run again. Some ten minutes. CORES (default 0-15) are
+# Each part writes its JSON, log or table into OUT; a part that OUT holds is not run again. CORES (default 0-15) are
 # the cores that generate may use, SHARDS (default "4:3 2:7") processes on the GPU and workers of each; the data go to /dev/shm.
 set -eu
 out=$1 pairs=${2:-} real=${3:-}
@@ -46,7 +46,7 @@ for each in ${SHARDS:-4:3 2:7}; do part "shards_${each%:*}.log" shards "${each%:
 for forcing in 0.03 1e-3; do
     part "agreement_$forcing.json" python -m synth.bench.agreement --trajectories 256 --processes "${PROCESSES:-16}" --forcing "$forcing"
 done
-part agreement_failing.json python -m synth.bench.agreement --trajectories 64 --processes "${PROCESSES:-16}" \
+part agreement_failing.json python -m synth.bench.agreement --trajectories 64 --processes "${PROCESSES:-16}" --forcing 0.03 \
     --set motion.depth_mm=2.6 --set contact.friction=1.2 --set motion.twist_deg=40
 part cuda_tests.log python -m pytest -m cuda
 R="--device cuda --methods none --weights best --registration none --registration motion --registration brightness"
