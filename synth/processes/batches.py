@@ -42,7 +42,7 @@ def outcomes_of_batches(
         batch: most trajectories simulated at a time; None for what suits the device.
 
     Raises:
-        InputError: the storage refuses, CUDA without cuBLAS, or worker processes die again and again.
+        InputError: the storage refuses, CUDA without cuBLAS or cuSOLVER, or worker processes die again and again.
     """
     studio, results = Studio(place), in_batches(place, tasks, batch)
     if workers == 1:

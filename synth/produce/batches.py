@@ -49,7 +49,7 @@ class Pads:
         """The pad of a draw.
 
         Raises:
-            InputError: a mesh that no element can be built on, or CUDA without cuBLAS.
+            InputError: a mesh that no element can be built on, or CUDA without cuBLAS or cuSOLVER.
         """
         key = pad_key(drawn)
         if self._kept is None or self._kept[0] != key:
@@ -84,7 +84,7 @@ def in_batches(place: Workplace, tasks: Iterator[Task], batch: int | None = None
         batch: most trajectories at a time; changes no bit of what comes out.
 
     Raises:
-        InputError: the storage refuses, or CUDA without cuBLAS.
+        InputError: the storage refuses, or CUDA without cuBLAS or cuSOLVER.
     """
     size = batch or BATCH[place.has_gpu]
     solving = _Solving(place, tasks, size, CHUNK * size)

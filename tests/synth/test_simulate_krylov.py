@@ -15,13 +15,16 @@ from synth.simulate.batched.krylov import (
     Krylov,
     arnoldi,
     begin,
+    begin_vectors,
     block_size,
     padded,
     plain,
     shapes,
     solution,
 )
+from synth.simulate.batched.reference import Reference, inverse
 from synth.simulate.batched.slots import READY, Settings, Slots
+from synth.simulate.batched.tf32 import round_matrix
 from synth.simulate.driver import STANDARD
 
 
@@ -105,21 +108,89 @@ def test_every_slot_solves_its_own_system(device: str, batch: int) -> None:
         assert (solved(np.array([i]))[0][0] == together_found[i]).all()
 
 
+def _bits(numbers: np.ndarray) -> np.ndarray:
+    """The 13 bits of single precision that TF32 does not have."""
+    return np.ascontiguousarray(numbers).view(np.uint32) & 0x1FFF
+
+
+def test_numbers_are_rounded_to_the_nearest_of_tf32() -> None:
+    """1 + k / 1024 are neighbours; 1 + 1/2048 lies between two."""
+    # Fails with numbers that are cut off, or with an infinite or undefined one that becomes a number.
+    given = np.array([1 + 0.4 / 1024, 1 + 0.6 / 1024, -1 - 0.5 / 1024, 3e38, 0.0, np.inf, -np.inf, np.nan])
+    most = np.array([0x7FFFFFFF], dtype=np.uint32).view(np.float32)  # what CUDA returns of 0 / 0
+    matrix = wp.array(np.append(given, most)[None].astype(np.float32), device="cpu")
+    wp.launch(round_matrix, matrix.shape, inputs=[matrix], device="cpu")
+    found = matrix.numpy()[0]
+    np.testing.assert_array_equal(found[:3], [1, 1 + 1 / 1024, -1 - 1 / 1024])
+    assert found[3] == pytest.approx(3e38, rel=1 / 2048)
+    np.testing.assert_array_equal(found[4:], [0, np.inf, -np.inf, np.nan, np.nan])
+    assert (_bits(found[:-1]) == 0).all()
+
+
+def test_a_preconditioner_takes_tf32_from_the_first_vector_on() -> None:
+    """Else a GPU would round what a CPU does not."""
+    # Fails with a vector or a matrix that is not rounded, in each of the three places.
+    rng = np.random.default_rng(3)
+    matrix = rng.standard_normal((150, 150))
+    reference = Reference(matrix + matrix.T, "cpu")
+    assert (_bits(reference.matrix.numpy()) == 0).all()
+    slots, krylov, _ = _systems([1.0] * 2, [0] * 2)
+    slots.phase.fill_(READY)
+    rows = plain(krylov.current).shape[1]
+    free = np.append(np.arange(150), np.full(rows - 150, -1)).astype(np.int32)
+    force = wp.array(rng.standard_normal((2, 50, 3)), dtype=wp.vec3d, device="cpu")
+    volume = wp.zeros((2, 0), dtype=wp.float64, device="cpu")
+    wp.launch(
+        begin_vectors, (2, rows // 4), inputs=[slots, wp.array(free, device="cpu"), force, volume, krylov], device="cpu"
+    )
+    first = plain(krylov.current).numpy().copy()
+    plain(krylov.product).assign(rng.standard_normal((2, rows)).astype(np.float32))
+    wp.launch_tiled(arnoldi(rows), dim=[2], inputs=[krylov], block_dim=block_size(rows), device="cpu")
+    second = plain(krylov.current).numpy()
+    for vector, k in ((first, 0), (second, 1)):
+        exact = krylov.basis.numpy()[:, k].reshape(2, rows)
+        assert (_bits(vector) == 0).all()
+        assert (_bits(exact) != 0).mean() > 0.8 * 150 / rows
+        np.testing.assert_allclose(vector, exact, rtol=1 / 2048)
+
+
 @pytest.mark.cuda
 @pytest.mark.parametrize("batch", [5, 16, 256, 2048])
-@pytest.mark.parametrize("rows", [128, 1792])
+@pytest.mark.parametrize("rows", [128, 1792, 10752])
 def test_dense_operations_on_a_gpu(rows: int, batch: int) -> None:
-    """Factors are rounded to 11 bits: 5e-4 each of terms that add up at random."""
+    """Of numbers in TF32 products are exact and only sums round."""
+    # Fails with factors that are not rounded before (3e-4).
     if not wp.is_cuda_available():
         pytest.skip("no CUDA device")
     rng = np.random.default_rng(0)
     a, x = (rng.standard_normal(shape).astype(np.float32) for shape in ((rows, rows), (batch, rows)))
     a += a.T
     left, right, product = (wp.array(v, dtype=wp.float32, device="cuda") for v in (a, x, np.zeros_like(x)))
+    for factor in (left, right):
+        wp.launch(round_matrix, factor.shape, inputs=[factor], device="cuda")
+    a, x = left.numpy(), right.numpy()
     turned = wp.zeros((rows, batch), dtype=wp.float32, device="cuda")
     operations = dense("cuda")
     operations.product(left, right, product, wp.ones(batch, dtype=wp.int32, device="cuda"))
     operations.transpose(right, turned)
     assert (turned.numpy() == x.T).all()
-    true = x.astype(np.float64) @ a.astype(np.float64)
-    assert (np.linalg.norm(product.numpy() - true, axis=1) < 2e-3 * np.linalg.norm(true, axis=1)).all()
+    some = slice(0, 64)
+    true = x[some].astype(np.float64) @ a.astype(np.float64)
+    off = np.linalg.norm(product.numpy()[some] - true, axis=1) / np.linalg.norm(true, axis=1)
+    print(rows, batch, off.max())
+    assert (off < 1e-5).all()
+
+
+@pytest.mark.cuda
+def test_the_inverse_of_a_gpu() -> None:
+    """A symmetric indefinite matrix, as that of displacements and pressures is."""
+    if not wp.is_cuda_available():
+        pytest.skip("no CUDA device")
+    rng = np.random.default_rng(4)
+    turn = np.linalg.qr(rng.standard_normal((700, 700)))[0]
+    matrix = turn @ np.diag(np.geomspace(1e-3, 1e3, 700) * np.where(np.arange(700) % 3, 1, -1)) @ turn.T
+    matrix = (matrix + matrix.T) / 2
+    found, known = inverse(matrix, "cuda"), np.linalg.inv(matrix)
+    # Condition 1e6, and 1e-16 of each entry.
+    assert np.abs(found - known).max() < 1e-9 * np.abs(known).max()
+    np.testing.assert_allclose(found @ matrix, np.eye(700), atol=1e-8)

@@ -1,21 +1,16 @@
 """Dense matrix operations of a batch: a product and a transpose, by cuBLAS on an NVIDIA GPU and by NumPy elsewhere.
 
-cuBLAS comes with the CUDA builds of torch (package nvidia-cublas) or with the CUDA toolkit; it is called through ctypes
-on Warp's stream. Nothing of torch is imported. float32 in and out; on a GPU the factors of a product are rounded to
-TF32 (10 bits), sums are float32.
+float32 in and out, sums are float32. A GPU takes the factors of a product as TF32, so callers round them to that before
+(`synth.simulate.batched.tf32`).
 """
 
 import ctypes
-import ctypes.util
-import importlib.util
-from functools import cache
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 import warp as wp
 
-from synth.errors import InputError
+from synth.simulate.batched.nvidia import call
 
 WORKSPACE = 32 << 20
 """Bytes given to cuBLAS, so that it allocates none of its own: NVIDIA's recommendation for Hopper."""
@@ -27,7 +22,10 @@ class Dense(Protocol):
     """What a device offers; all arrays float32, row by row."""
 
     def product(self, a: wp.array, x: wp.array, c: wp.array, wanted: wp.array) -> None:
-        """Give c = x A for symmetric A (n, n) and x, c (b, n), at least in rows where wanted (b,) is 1."""
+        """Give c = x A for symmetric A (n, n) and x, c (b, n), at least in rows where wanted (b,) is 1.
+
+        Numbers of A and x that TF32 does not have are rounded on a GPU and not elsewhere.
+        """
 
     def transpose(self, x: wp.array, c: wp.array) -> None:
         """Give c (n, m) = x^T for x (m, n)."""
@@ -56,39 +54,15 @@ class Host:
         c.numpy()[...] = x.numpy().T
 
 
-@cache
-def _library() -> ctypes.CDLL:
-    """The newest cuBLAS of this Python environment, else the system's.
-
-    Raises:
-        InputError: there is none.
-    """
-    found: list[str] = []
-    spec = importlib.util.find_spec("nvidia")
-    for folder in (spec.submodule_search_locations or []) if spec else []:
-        found += sorted(map(str, Path(folder).glob("**/libcublas.so.*")), reverse=True)
-    named = ctypes.util.find_library("cublas")
-    for name in [*found, *([named] if named else [])]:
-        try:
-            return ctypes.CDLL(name)
-        except OSError:
-            continue
-    raise InputError(
-        "the batched solver on CUDA needs cuBLAS, and none was found: install a CUDA build of torch or the package "
-        "nvidia-cublas, or simulate with --device cpu"
-    )
-
-
 class Cublas:
     """See Dense. Queued on Warp's present stream; may be captured in a graph."""
 
     def __init__(self, device: str) -> None:
         self._device = wp.get_device(device)
-        self._blas = _library()
         self._handle = ctypes.c_void_p()
         self._workspace = wp.empty(WORKSPACE, dtype=wp.uint8, device=device)
         with wp.ScopedDevice(self._device):
-            self._check(self._blas.cublasCreate_v2(ctypes.byref(self._handle)))
+            call("cublas", "cublasCreate_v2", ctypes.byref(self._handle))
         self._one, self._zero = ctypes.c_float(1.0), ctypes.c_float(0.0)
 
     def product(self, a: wp.array, x: wp.array, c: wp.array, wanted: wp.array) -> None:
@@ -97,12 +71,10 @@ class Cublas:
         self._join()
         # cuBLAS counts by columns: what it sees is C^T = A^T X^T. Summation runs along memory in both factors, the
         # only order that Hopper's TF32 instructions take.
-        self._check(
-            self._blas.cublasGemmEx(
-                self._handle, _TURNED, _PLAIN, n, b, n, ctypes.byref(self._one),
-                ctypes.c_void_p(a.ptr), _REAL, n, ctypes.c_void_p(x.ptr), _REAL, n, ctypes.byref(self._zero),
-                ctypes.c_void_p(c.ptr), _REAL, n, _TF32, _DEFAULT,
-            )
+        call(
+            "cublas", "cublasGemmEx", self._handle, _TURNED, _PLAIN, n, b, n, ctypes.byref(self._one),
+            ctypes.c_void_p(a.ptr), _REAL, n, ctypes.c_void_p(x.ptr), _REAL, n, ctypes.byref(self._zero),
+            ctypes.c_void_p(c.ptr), _REAL, n, _TF32, _DEFAULT,
         )  # fmt: skip
 
     def transpose(self, x: wp.array, c: wp.array) -> None:
@@ -110,21 +82,12 @@ class Cublas:
         m, n = x.shape
         self._join()
         given, found = ctypes.c_void_p(x.ptr), ctypes.c_void_p(c.ptr)
-        self._check(
-            self._blas.cublasSgeam(
-                self._handle, _TURNED, _PLAIN, m, n, ctypes.byref(self._one), given, n,
-                ctypes.byref(self._zero), found, m, found, m,
-            )
+        call(
+            "cublas", "cublasSgeam", self._handle, _TURNED, _PLAIN, m, n, ctypes.byref(self._one), given, n,
+            ctypes.byref(self._zero), found, m, found, m,
         )  # fmt: skip
 
     def _join(self) -> None:
-        pointer = ctypes.c_void_p
-        self._check(self._blas.cublasSetStream_v2(self._handle, pointer(self._device.stream.cuda_stream)))
-        self._check(
-            self._blas.cublasSetWorkspace_v2(self._handle, pointer(self._workspace.ptr), ctypes.c_size_t(WORKSPACE))
-        )
-
-    @staticmethod
-    def _check(status: int) -> None:
-        if status != 0:
-            raise RuntimeError(f"cuBLAS reported status {status}")
+        stream, workspace = (ctypes.c_void_p(p) for p in (self._device.stream.cuda_stream, self._workspace.ptr))
+        call("cublas", "cublasSetStream_v2", self._handle, stream)
+        call("cublas", "cublasSetWorkspace_v2", self._handle, workspace, ctypes.c_size_t(WORKSPACE))

@@ -20,6 +20,7 @@ from functools import cache
 import warp as wp
 
 from synth.simulate.batched.slots import CARRY, CARRY_READY, LINEAR, LOST, READY, SEARCH, START, Settings, Slots
+from synth.simulate.batched.tf32 import rounded_four
 from synth.simulate.linear import GMRES_LIMIT, GMRES_TOLERANCE
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -48,7 +49,8 @@ class Krylov:
         k: (B,) iterations done.
         size: (B,) norm of the right side; goal: of the residual, relative to it.
         basis: (B, LIMIT + 1, rows / 4); corrections: (B, LIMIT, rows / 4), the preconditioned basis.
-        current: (B, rows / 4) the last basis vector; preconditioned: K_0^{-1} times it; corrected: the same, (rows, B).
+        current: (B, rows / 4) the last basis vector, in TF32; preconditioned: K_0^{-1} times it.
+        corrected: the same, (rows, B).
         image: (rows, B) the tangent times corrected; product: the same, (B, rows / 4).
         triangle: (B, LIMIT, LIMIT) rotated Hessenberg matrices by columns.
         cosine, sine: (B, LIMIT); residual: (B, LIMIT + 1) of the rotated right side.
@@ -135,7 +137,7 @@ def begin_vectors(
                 value = -volume[s, unknown - moves] / size
             found[k] = wp.float32(value)
     krylov.basis[s, 0, i] = found
-    krylov.current[s, i] = found
+    krylov.current[s, i] = rounded_four(found)
 
 
 @wp.func
@@ -215,7 +217,7 @@ def arnoldi(rows: int) -> wp.Kernel:
         wp.tile_store(krylov.corrections[s, k], z, bounds_check=False)
         v = w * scale
         wp.tile_store(krylov.basis[s, k + 1], v, bounds_check=False)
-        wp.tile_store(krylov.current[s], v, bounds_check=False)
+        wp.tile_store(krylov.current[s], wp.tile_map(rounded_four, v), bounds_check=False)
         if lane == 0:
             length = wp.sqrt(above * above + below * below)
             cosine = wp.float32(1.0)

@@ -47,7 +47,7 @@ def simulate_many(
         The number of a scene and its trajectory, in the order in which they end.
 
     Raises:
-        InputError: scenes that do not share a pad; an indenter that cannot be built; CUDA without cuBLAS.
+        InputError: scenes that do not share a pad; an indenter that cannot be built; CUDA without cuBLAS or cuSOLVER.
         ValueError: not as many sets of frames as scenes.
     """
     if not scenes:
