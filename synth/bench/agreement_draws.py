@@ -13,13 +13,15 @@ from synth.sampling import draw, pairs_of
 from synth.scene import Scene
 from synth.simulate import Trajectory
 from synth.simulate.batched.many import job_of, run_jobs
-from synth.simulate.batched.pad import prepare
+from synth.simulate.batched.pad import Pad, prepare
 from synth.simulate.driver import Driver
 from synth.simulate.shared import shared_mesh
 from synth.simulate.solve import check_shared
 from synth.template import Template
 
 LARGEST_BATCH = 256
+_PAD: list[Pad] = []
+"""Of this process."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +77,10 @@ def together(drawn: Sequence[Drawn], device: str, driver: Driver, noise: float =
         Each one's trajectory, or why its indenter cannot be built.
     """
     first = drawn[0]
-    pad = prepare(first.scene, first.mesh, device, Noisy(noise) if noise else None)
+    return _run(drawn, prepare(first.scene, first.mesh, device, Noisy(noise) if noise else None), driver)
+
+
+def _run(drawn: Sequence[Drawn], pad: Pad, driver: Driver) -> list[Trajectory | str]:
     jobs, which = [], []
     found: dict[int, Trajectory | str] = {}
     for n, one in enumerate(drawn):
@@ -86,18 +91,25 @@ def together(drawn: Sequence[Drawn], device: str, driver: Driver, noise: float =
             continue
         which.append(n)
     frames = [drawn[n].frames for n in which]
-    for k, trajectory in run_jobs(jobs, pad, first.scene.numerics, frames, LARGEST_BATCH, driver):
+    for k, trajectory in run_jobs(jobs, pad, drawn[0].scene.numerics, frames, LARGEST_BATCH, driver):
         found[which[k]] = trajectory
     return [found[n] for n in range(len(drawn))]
 
 
 def one_by_one(drawn: Sequence[Drawn], driver: Driver, processes: int) -> list[Trajectory | str]:
     """Each draw in a batch of its own on the CPU, in so many processes; what is returned as of `together`."""
+    begin = (drawn[0].scene, drawn[0].mesh)
     if processes == 1:
+        _begin(*begin)
         return [_alone(one, driver) for one in drawn]
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(processes, get_context("spawn"), _begin, begin) as pool:
         return list(pool.map(_alone, drawn, [driver] * len(drawn)))
 
 
+def _begin(scene: Scene, mesh: PadMesh) -> None:
+    """Prepare the pad of a process, once for all its draws."""
+    _PAD[:] = [prepare(scene, mesh, "cpu")]
+
+
 def _alone(one: Drawn, driver: Driver) -> Trajectory | str:
-    return together([one], "cpu", driver)[0]
+    return _run([one], _PAD[0], driver)[0]
