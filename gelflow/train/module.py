@@ -152,13 +152,14 @@ class FlowModule(L.LightningModule):
         return torch.cat([image1, image2]), torch.cat([image2, image1])
 
     def _judged(self, flows: list[Tensor], image1: Tensor, image2: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """The self-supervised loss of flows of `_directions`, with a second pass where lambda_ar asks for one."""
+        """The self-supervised loss of flows of `_directions`, with a second pass where lambda_ar asks for one now."""
         config, visible = self.config.loss, None
-        if config.occlusion == "forward_backward":
+        trusted = self.step >= config.second_stage * self.config.steps
+        if config.occlusion == "forward_backward" and trusted:
             there, back = flows[0].chunk(2)
             visible = visible_both_ways(flows[0], torch.cat([back, there]))
         loss, parts = self_supervised_loss(flows, image1, image2, config, visible)
-        if config.lambda_ar > 0:
+        if config.lambda_ar > 0 and trusted:
             # Fixed by (seed, step), so that a resumed run shows the same.
             random = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
             first, second, target, pixels = transformed_pair(image1, image2, flows[0].detach(), random)

@@ -12,8 +12,10 @@ from waves import Shifts
 
 from gelflow.config import TrainConfig
 from gelflow.data import open_pairs
-from gelflow.train import train
+from gelflow.models import GelFlow
+from gelflow.train import module, train
 from gelflow.train.checkpoint import load_weights
+from gelflow.train.module import FlowModule
 from gelflow.train.state import load_state
 
 SMALL = {
@@ -60,6 +62,22 @@ def test_a_resumed_run_with_everything_on_ends_with_the_same_weights(pairs: Shif
     resumed = train(small(steps=4, **options), pairs, None, tmp_path / "cut", resume=True)
     first, second = (load_weights(result.weights).state_dict() for result in (whole, resumed))
     assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+@pytest.mark.parametrize(("step", "late"), [(0, False), (4, False), (5, True), (9, True)])
+def test_losses_that_trust_the_flow_wait_for_their_stage(
+    step: int, late: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else every pixel of a new network is judged hidden, and its flow grows without end."""
+    # Fails with either of the two from the start.
+    asked: list[bool] = []
+    monkeypatch.setattr(FlowModule, "step", step)
+    monkeypatch.setattr(module, "visible_both_ways", lambda *flows: asked.append(True))
+    loss = {"lambda_s": [1.0, 1.0, 1.0], "occlusion": "forward_backward", "lambda_ar": 0.01, "second_stage": 0.5}
+    trained = FlowModule(small(steps=10, loss=loss), GelFlow(small().model))
+    images = torch.rand(2, 1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    parts = trained._self_supervised(*images)[1]
+    assert (asked == [True], "analogy" in parts) == (late, late)
 
 
 def test_bfloat16_trains_and_keeps_float32_weights(pairs: Shifts, tmp_path: Path) -> None:

@@ -158,7 +158,7 @@ def test_a_preconditioner_takes_tf32_from_the_first_vector_on() -> None:
 @pytest.mark.parametrize("batch", [5, 16, 256, 2048])
 @pytest.mark.parametrize("rows", [128, 1792, 10752])
 def test_dense_operations_on_a_gpu(rows: int, batch: int) -> None:
-    """Of numbers in TF32 products are exact and only sums round."""
+    """Products of numbers in TF32 are exact; what an H200 cuts off its sums is 3.2e-9 of them for each term."""
     # Fails with factors that are not rounded before (3e-4).
     if not wp.is_cuda_available():
         pytest.skip("no CUDA device")
@@ -177,8 +177,7 @@ def test_dense_operations_on_a_gpu(rows: int, batch: int) -> None:
     some = slice(0, 64)
     true = x[some].astype(np.float64) @ a.astype(np.float64)
     off = np.linalg.norm(product.numpy()[some] - true, axis=1) / np.linalg.norm(true, axis=1)
-    print(rows, batch, off.max())
-    assert (off < 1e-5).all()
+    assert (off < 4e-9 * rows).all()
 
 
 @pytest.mark.cuda
