@@ -43,10 +43,17 @@ presses="python -m synth.bench.batched --across 16 12 --through 2 --growth 2 --r
     part presses.jsonl $presses --batch 1024 --seconds 16
 }
 for each in ${SHARDS:-4:3 2:7}; do part "shards_${each%:*}.log" shards "${each%:*}" "${each#*:}"; done
-for forcing in 0.03 1e-3; do
-    part "agreement_$forcing.json" python -m synth.bench.agreement --trajectories 256 --processes "${PROCESSES:-16}" --forcing "$forcing"
+agreement="python -m synth.bench.agreement --processes ${PROCESSES:-16}"
+# shellcheck disable=SC2086 # several words
+for tolerance in 1e-6 1e-8; do
+    for mesh in 6x4x2:256 10x8x2:128 16x12x2:64; do
+        cells=${mesh%:*}
+        part "agreement_${cells}_$tolerance.json" $agreement --cells $(echo "$cells" | tr x ' ') --trajectories "${mesh#*:}" \
+            --set numerics.tolerance=$tolerance
+    done
 done
-part agreement_failing.json python -m synth.bench.agreement --trajectories 64 --processes "${PROCESSES:-16}" --forcing 0.03 \
+# shellcheck disable=SC2086 # several words
+part agreement_failing.json $agreement --trajectories 64 \
     --set motion.depth_mm=2.6 --set contact.friction=1.2 --set motion.twist_deg=40
 part cuda_tests.log python -m pytest -m cuda
 R="--device cuda --methods none --weights best --registration none --registration motion --registration brightness"
