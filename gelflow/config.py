@@ -140,8 +140,8 @@ class LossConfig(_Frozen):
     flow. Takes a second pass of the network. ARFlow: 0.01."""
     second_stage: float = Field(default=0.0, ge=0, lt=1)
     """Share of the steps after which `occlusion` and `lambda_ar` begin. Both trust the network's own flow: a new one's
-    does not close there and back, so that no pixel counts, and what it should see of transformed images grows with what
-    it saw. ARFlow has them in later stages, too. 0: from the start, for a network that has learnt before."""
+    hardly closes there and back, and what it should see of transformed images grows with what it saw. ARFlow has them
+    in later stages, too. 0: from the start, for a network that has learnt before."""
     lambda_dc: float = Field(default=75.0, ge=0)
     """Weight of the regulariser."""
     lambda_theta: float = Field(default=0.01, ge=0)

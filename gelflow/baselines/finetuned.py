@@ -12,7 +12,6 @@ or those of `--ft-config`. Nothing else of a training carries over, whatever its
   motion would leave a crop;
 - the rate is constant, so that a longer optimisation goes on with a shorter one; the peak of a falling rate is too much
   for that and is lowered to `RATE`;
-- no loss waits for a second stage: the network has learnt;
 - the weights themselves are kept, not their moving average, which few steps hardly move;
 - what belongs to the machine of the training: its devices and processes, compilation.
 
@@ -64,7 +63,6 @@ def fine_tuning_settings(method: Learned, steps: int, config: str | None, pairs:
         if len(chosen.loss.lambda_s) != method.trained.levels - 1:
             raise InputError(f"--ft-config {config}: its losses are for another number of scales than {method.path}")
     fixed: dict[str, Any] = {
-        "loss": values["loss"] | {"second_stage": 0.0},
         "model": method.trained.model_dump(),
         "supervision": "self",
         "image_size": method.size or method.model.image_size,

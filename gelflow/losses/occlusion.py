@@ -1,7 +1,9 @@
 """Pixels whose point is seen in both images, judged by the flows there and back (Meister, Hur and Roth 2018, eq. 3).
 
 Kept where ``|f(x) + b(x + f(x))|^2 <= 0.01 (|f(x)|^2 + |b(x + f(x))|^2) + 0.5 px^2``: a share of the motion and a
-constant, so that neither small errors of large motions nor the noise of small ones throw pixels out.
+constant, so that neither small errors of large motions nor the noise of small ones throw pixels out. Where hardly a
+pixel of a pair would be left, the flow is wrong and not the scene hidden: all of them count then. A loss over none has
+no gradient that could lead back.
 """
 
 import torch
@@ -10,10 +12,14 @@ from gelflow.arrays import Flow, Mask
 from gelflow.ops.warp import inside, warp
 
 RELATIVE, ABSOLUTE_PX2 = 0.01, 0.5
+LEAST = 0.1
+"""Share of a pair's pixels that must be left."""
 
 
 def visible_both_ways(forward: Flow, backward: Flow) -> Mask:
     """1 where the flow there and back closes, else 0; also 0 where it leaves the image. Without gradient.
+
+    Pairs with less than a share of LEAST such pixels have 1 wherever the flow does not leave the image.
 
     Args:
         forward: (B, 2, H, W), px.
@@ -23,4 +29,6 @@ def visible_both_ways(forward: Flow, backward: Flow) -> Mask:
         back = warp(backward, forward)
         closure = (forward + back).square().sum(dim=1, keepdim=True)
         motion = forward.square().sum(dim=1, keepdim=True) + back.square().sum(dim=1, keepdim=True)
-        return inside(forward) * (closure <= RELATIVE * motion + ABSOLUTE_PX2).to(forward.dtype)
+        closed = closure <= RELATIVE * motion + ABSOLUTE_PX2
+        believed = closed.float().mean(dim=(1, 2, 3), keepdim=True) >= LEAST
+        return inside(forward) * (closed | ~believed).to(forward.dtype)

@@ -13,7 +13,7 @@ from gelflow.losses.census import census_loss
 from gelflow.losses.occlusion import visible_both_ways
 from gelflow.losses.smoothness import second_order_loss
 from gelflow.ops.pyramid import flow_pyramid
-from gelflow.ops.warp import warp
+from gelflow.ops.warp import inside, warp
 from gelflow.overrides import train_config
 
 
@@ -76,6 +76,17 @@ def test_occlusion_keeps_what_closes() -> None:
     backward[..., 20:30] += 1.5  # a strip that goes elsewhere: 1.5^2 > 0.5 + 1 % of the motion
     hidden = (1.4 * (x - 30) + 30 > 21.5) & (1.4 * (x - 30) + 30 < 28.5) & stays
     assert not visible_both_ways(forward, backward)[0, 0][hidden].any()
+
+
+def test_a_flow_that_closes_nowhere_hides_nothing() -> None:
+    """Else a loss over no pixel would leave a new network where it is. The second pair closes on a fifth."""
+    # Fails with the share taken over the batch.
+    forward, backward = torch.full((2, 2, 10, 20), 1.5), torch.full((2, 2, 10, 20), 1.5)
+    backward[1, :, :4] = -1.5
+    seen = visible_both_ways(forward, backward)
+    stays = inside(forward)
+    assert torch.equal(seen[0], stays[0])
+    assert 0 < seen[1].mean() < 0.3
 
 
 def test_a_mask_removes_pixels_from_the_photometric_loss() -> None:

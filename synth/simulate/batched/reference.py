@@ -33,6 +33,7 @@ def inverse(matrix: FloatArray, device: str) -> FloatArray:
 
     Raises:
         InputError: CUDA without cuSOLVER.
+        numpy.linalg.LinAlgError: singular.
     """
     where = wp.get_device(device)
     return _inverse_by_cusolver(matrix, where) if where.is_cuda else np.asarray(np.linalg.inv(matrix), np.float64)
