@@ -154,7 +154,7 @@ class FlowModule(L.LightningModule):
     def _judged(self, flows: list[Tensor], image1: Tensor, image2: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """The self-supervised loss of flows of `_directions`, with a second pass where lambda_ar asks for one now."""
         config, visible = self.config.loss, None
-        trusted = self.step >= config.second_stage * self.config.steps
+        trusted = not config.second_stage or self.step >= config.second_stage * self.config.steps
         if config.occlusion == "forward_backward" and trusted:
             there, back = flows[0].chunk(2)
             visible = visible_both_ways(flows[0], torch.cat([back, there]))
