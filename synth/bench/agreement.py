@@ -4,7 +4,7 @@
 
 prints one JSON line: how many draws end alike (status and reason), and for the complete ones how far apart the two are,
 relative displacement and traction of the states that samples show, and the exact flow from rest to the last state in
-pixels. With --device cpu --noise 3e-4 the device is the CPU with a preconditioner that is off by as much at random
+pixels. With --device cpu --noise 3e-5 the device is the CPU with a preconditioner that is off by as much at random
 (`synth.bench.agreement_noise`), without --noise it is the CPU, and all distances are 0. --loose 1e-3 leads the way as
 loosely as the solver for one sample does, --forcing 0.03 solves linear systems as roughly as presses per second were
 measured with.
@@ -129,7 +129,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if given.trajectories < 1 or given.processes < 1:
             raise InputError("--trajectories and --processes: ask for at least 1")
         if given.device == "cuda" and not wp.is_cuda_available():
-            raise InputError("--device cuda: there is no NVIDIA GPU; try --device cpu --noise 3e-4")
+            raise InputError("--device cuda: there is no NVIDIA GPU; try --device cpu --noise 3e-5")
         cells = f"numerics.cells={given.cells}"
         template = load_scene(given.scene, ['numerics.solver="batched"', cells, *given.set])
         drawn = drawn_of(template, given.trajectories, given.seed)
