@@ -1,8 +1,8 @@
 """Numbers as a GPU's matrix product takes them: TF32, with 8 bits for the exponent and 10 after the point.
 
 What goes into the preconditioner is rounded before, by the same kernels on every device. An H200 then finds nothing to
-round, the products of two such numbers are exact in single precision, and only the order of sums is left between it and
-a CPU.
+round in its factors, the products of two such numbers are exact in single precision, and only their sums are left
+between it and a CPU.
 """
 
 # Kernels are written in Warp's own language; their annotations only look like Python's.
