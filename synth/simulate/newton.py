@@ -72,6 +72,7 @@ def solve(
     active: BoolArray,
     tolerance: FloatArray,
     limit: int = MAX_ITERATIONS,
+    reach_mm: FloatArray | float = np.inf,
 ) -> Solution:
     """Bring the active samples into balance.
 
@@ -82,6 +83,7 @@ def solve(
         active: (B,) bool.
         tolerance: (B,) of `relative_residual`.
         limit: most iterations.
+        reach_mm: (B,) farthest that a node may go from the first iterate; a sample that goes farther has not converged.
     """
     state, balance = start, system.balance(start, indenters, active)
     running = active & (balance.smallest_jacobian > 0)
@@ -102,6 +104,7 @@ def solve(
         running &= np.isfinite(step.u).all(axis=(1, 2))
         state, balance, running = _line_search(system, state, balance, step, indenters, running)
         iterations[running] += 1
+        running &= np.linalg.norm(state.u - start.u, axis=2).max(axis=1) <= reach_mm
     return Solution(state, balance, converged, iterations, relative_residual(balance))
 
 

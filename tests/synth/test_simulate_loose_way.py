@@ -85,8 +85,8 @@ class Losing:
         monkeypatch.setattr(stepping, "PENETRATION", penetration)
         monkeypatch.setattr(stepping, "solve", self)
 
-    def __call__(self, system: Any, start: Any, indenters: Any, active: Any, tolerance: Any, *limit: int) -> Solution:
-        polishes = limit == (stepping.MAX_ITERATIONS,) and active[0] and tolerance[0] == self._tolerance
+    def __call__(self, system: Any, start: Any, indenters: Any, active: Any, tolerance: Any, *limit: Any) -> Solution:
+        polishes = limit[:1] == (stepping.MAX_ITERATIONS,) and active[0] and tolerance[0] == self._tolerance
         if not polishes or self.lost == self._most:
             return solve(system, start, indenters, active, tolerance, *limit)
         self.lost += 1

@@ -41,3 +41,17 @@ def test_a_balanced_start_costs_one_iteration_and_no_force_costs_none() -> None:
     assert solve(body, first.state, ball, ALL, EXACT).iterations[0] == 1
     away = indenters(scene(motion={"depth_mm": -1.0}), 0.0)
     assert solve(body, body.zero(), away, ALL, EXACT).iterations[0] == 0
+
+
+def test_a_sample_that_goes_too_far_has_not_converged() -> None:
+    """And ends there; the other one does not know of it."""
+    # Fails with a reach that both share, and with one that is left out.
+    both, exact = np.ones(2, dtype=bool), np.full(2, 1e-9)
+    body, ball = system(MESH, 0.49, batch=2), indenters(scene(), PRESSED, batch=2)
+    free = solve(body, body.zero(), ball, both, exact)
+    moved = float(np.linalg.norm(free.state.u, axis=2).max())
+    body.begin()
+    found = solve(body, body.zero(), ball, both, exact, reach_mm=np.array([0.5 * moved, 4 * moved]))
+    assert found.converged.tolist() == [False, True]
+    assert found.iterations[0] < found.iterations[1] == free.iterations[1]
+    assert (found.state.u[1] == free.state.u[1]).all()

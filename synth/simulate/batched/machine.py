@@ -138,7 +138,7 @@ class Machine:
         found = (at.force, at.gap, at.tangential, at.traction)
         law = (self._faces, at.indenters, at.contact, self.penalty)
         self._launch(contact_residual, at.points[:2], f.trial_u, mask, *law, *found)
-        self._launch_blocks(sums.norms, sums.BLOCK, mask, *residual, self._rows.node_row, s)
+        self._launch_blocks(sums.norms, sums.BLOCK, mask, *residual, self._rows.node_row, f, s)
         self._launch(judge, self.batch, s, self.settings)
         self._launch(moves.move, self._each, s, 0, f)
 

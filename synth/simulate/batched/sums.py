@@ -5,7 +5,8 @@
 
 import warp as wp
 
-from synth.simulate.batched.slots import Slots
+from synth.simulate.batched.fields import Fields
+from synth.simulate.batched.slots import PASS, Slots
 from synth.simulate.contact import Faces, Indenters, position
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -25,15 +26,20 @@ def norms(
     volume: wp.array2d(dtype=wp.float64),
     jacobian: wp.array2d(dtype=wp.float64),
     node_row: wp.array(dtype=wp.int32),
+    fields: Fields,
     slots: Slots,
 ):
-    """One block per slot: the trial's norms of the free residual and of all forces, and its smallest det F."""
+    """One block per slot: the trial's norms (free residual, all forces), smallest det F, how far it went in a pass."""
     s, lane = wp.tid()
     if mask[s] == 0:
         return
     free = wp.float64(0.0)
     whole = wp.float64(0.0)
     smallest = wp.float64(1.0e30)
+    farthest = wp.float64(0.0)
+    if slots.stage[s] == PASS:
+        for i in range(lane, force.shape[1], wp.block_dim()):
+            farthest = wp.max(farthest, wp.length_sq(fields.trial_u[s, i] - fields.recorded_u[s, i]))
     for i in range(lane, force.shape[1], wp.block_dim()):
         square = wp.length_sq(force[s, i])
         whole += square
@@ -46,10 +52,12 @@ def norms(
     free = wp.tile_extract(wp.tile_sum(wp.tile(free)), 0)
     whole = wp.tile_extract(wp.tile_sum(wp.tile(whole)), 0)
     smallest = wp.tile_extract(wp.tile_min(wp.tile(smallest)), 0)
+    farthest = wp.tile_extract(wp.tile_max(wp.tile(farthest)), 0)
     if lane == 0:
         slots.trial_norm[s] = wp.sqrt(free)
         slots.trial_force[s] = wp.sqrt(whole)
         slots.trial_jacobian[s] = smallest
+        slots.trial_moved[s] = wp.sqrt(farthest)
 
 
 @wp.kernel

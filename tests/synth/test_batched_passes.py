@@ -1,0 +1,78 @@
+"""Passes at recorded states that wander off: the solver for one sample and the batched one give them up alike."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from pads import brick, scene
+
+from synth.scene import Scene
+from synth.simulate import simulate, stepping
+from synth.simulate.batched import slots as phases
+from synth.simulate.batched.many import jobs_of
+from synth.simulate.batched.pad import prepare
+from synth.simulate.batched.run import Run
+from synth.simulate.driver import Driver
+
+STRICT = Driver(loose=0.0, forcing=1e-3)
+BOX = {"shape": "box", "size_mm": [3.0, 2.5, 4.0], "fillet_mm": 0.6, "rotation_deg": [0, 0, 20]}
+ROD = {"shape": "cylinder", "radius_mm": 1.5, "length_mm": 4.0, "fillet_mm": 0.3}
+
+
+def sliding(body: dict[str, Any]) -> Scene:
+    """On its end. A pass at the last state wanders."""
+    motion = {"depth_mm": 0.6, "shear_mm": [0.5, 0.6], "twist_deg": 10.0, "steps": 3, "position_mm": [0.4, 0.3]}
+    return scene(indenter=body, friction=0.6, motion=motion, numerics={"element": "p2p1"})
+
+
+def test_a_pass_that_goes_too_far_is_given_up() -> None:
+    """As soon as it does; what is taken has stayed within reach, and the other passes take penetration away."""
+    # Fails with `too_far` left out of `judge`, with the distance from another place than the last solution, and with a
+    # reach that is not renewed for each pass.
+    posed = sliding(BOX)
+    pad = prepare(posed, brick(counts=(4, 4, 2)), "cpu")
+    run = Run(jobs_of([posed], pad), pad, posed.numerics, STRICT, None, 1)
+    machine = run.machine
+    slots, fields = machine.slots, machine._at.fields
+    lost, solved = [], []
+
+    def look(part: str, kernel: str) -> None:
+        if kernel != "judge" or slots.stage.numpy()[0] != phases.PASS:
+            return
+        phase, reach = slots.phase.numpy()[0], slots.reach.numpy()[0]
+        moved = np.linalg.norm(fields.trial_u.numpy()[0] - fields.recorded_u.numpy()[0], axis=1).max()
+        if phase in (phases.READY, phases.SOLVED, phases.LOST):
+            assert slots.trial_moved.numpy()[0] == pytest.approx(moved, abs=1e-15)
+        if phase in (phases.READY, phases.SOLVED):
+            assert moved <= reach
+            assert reach == pytest.approx(stepping.REACH * slots.deepest.numpy()[0], rel=1e-12)
+        if phase == phases.SOLVED:
+            solved.append(moved)
+        if phase == phases.LOST:
+            lost.append((slots.iteration.numpy()[0], moved / reach))
+
+    machine.watch = look
+    ((_, result),) = run
+    assert result.status == "complete"
+    assert any(iteration < STRICT.correction_iterations and share > 1 for iteration, share in lost)
+    assert solved
+    assert result.states[-1].max_penetration_mm < max(solved)
+
+
+def test_so_does_the_solver_for_one_sample(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Fails without a reach in `_augmented`.
+    solve, given = stepping.solve, []
+
+    def watched(system: Any, start: Any, *others: Any) -> Any:
+        found = solve(system, start, *others)
+        if len(others) == 5:  # with a limit of iterations and a reach
+            moved = np.linalg.norm(found.state.u - start.u, axis=2).max()
+            given.append((bool(found.converged[0]), int(found.iterations[0]), float(moved / np.max(others[4]))))
+        return found
+
+    monkeypatch.setattr(stepping, "solve", watched)
+    result = simulate(sliding(ROD), brick(counts=(5, 5, 2)), driver=STRICT)
+    assert result.status == "complete"
+    passes = [(converged, iterations, share) for converged, iterations, share in given if np.isfinite(share) and share]
+    assert all(share <= 1 for converged, _, share in passes if converged)
+    assert any(iterations < STRICT.correction_iterations and share > 1 for _, iterations, share in passes)
