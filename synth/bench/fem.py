@@ -23,7 +23,7 @@ from synth.simulate.newton import MAX_ITERATIONS
 
 Say = Callable[[str], None]
 PATIENT = Driver(correction_iterations=MAX_ITERATIONS)
-"""Of the references, whose corrections of penetration must not be dropped."""
+"""Of the references, whose corrections of penetration are not to be dropped; one that wanders is, all the same."""
 LARGEST_PENETRATION_MM = 0.01
 """A reference above it is not used. Corrected states have 0.005 mm; without, it was 0.06 mm and the force 4 % low."""
 

@@ -51,6 +51,11 @@ class Path:
         """Z of the undeformed face at motion.position_mm."""
         return float(face_height(np.array([self.motion.position_mm]), self.dome_radius_mm)[0])
 
+    def is_over(self, size_mm: tuple[float, float, float]) -> bool:
+        """Whether the body's lowest point, a ring's rim for a torus, comes down on a pad's contact face."""
+        rim = float(self.body.shape[1]) if self.body.kind == KINDS["torus"] else 0.0
+        return bool(np.all(np.abs(self.motion.position_mm) + rim < np.array(size_mm[:2]) / 2))
+
     @cached_property
     def touch_mm(self) -> float:
         """Depth at which the body first touches on its way straight down; if the press ends before that, its depth.

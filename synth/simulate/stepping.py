@@ -16,15 +16,13 @@ import numpy as np
 
 from synth.arrays import BoolArray, FloatArray
 from synth.scene import Numerics
-from synth.simulate.distance import KINDS
 from synth.simulate.driver import STANDARD, Driver
 from synth.simulate.memory import kept_contact, restore_contact
 from synth.simulate.newton import MAX_ITERATIONS, NOTHING, Solution, relative_residual, solve
 from synth.simulate.path import Path, Pose
-from synth.simulate.space import Space
 from synth.simulate.system import System
 from synth.simulate.tables import pack_indenters
-from synth.simulate.trajectory import State, Trajectory
+from synth.simulate.trajectory import State, Trajectory, ended, no_balance, no_contact
 from synth.simulate.unknowns import Unknowns
 
 SHORTEST_STEP = 1 / 128
@@ -52,9 +50,9 @@ PENETRATION = 2e-3
 """Passes end when no contact point is deeper inside the indenter than this share of the press depth."""
 REACH = 3.0
 """A pass fails that moves a node, in any iteration, farther than so many times the deepest penetration. It takes
-penetration and elastic slip away; most move nodes by 0.5 to 1.4 times as much, balls by up to 2.5 times on the way. At
-edges that slip Newton's method can wander by ten times as much and come to rest in another balance, or not within its
-iterations, as rounding decides (docs/reports/batched_fem.md, Rounding)."""
+penetration and elastic slip away; most move nodes by 0.5 to 1.4 times as much, a twisted ball by more than twice on the
+way. At edges that slip Newton's method can wander by up to eight times as much and come to rest in another balance, or
+not within its iterations, as rounding decides (docs/reports/batched_fem.md, Rounding)."""
 
 
 @dataclass
@@ -119,7 +117,7 @@ class Stepper:
         while not all(sample.finished for sample in self.samples):
             self._advance(np.array([not sample.finished for sample in self.samples]))
         seconds = (time.perf_counter() - started) / len(self.samples)
-        return [_trajectory(sample, seconds, self.system.space) for sample in self.samples]
+        return [ended(tuple(each.states), each.reason, seconds, self.system.space) for each in self.samples]
 
     def _start(self) -> None:
         """The undeformed states; a path that never touches stays in them and needs no solve."""
@@ -184,24 +182,16 @@ class Stepper:
 
         Ends them, saying so.
         """
+        size = self.system.space.mesh.size_mm
         ending = np.array(
-            [t == s.path.press_mm and self._is_over_pad(s.path) for s, t in zip(self.samples, targets, strict=True)]
+            [t == s.path.press_mm and s.path.is_over(size) for s, t in zip(self.samples, targets, strict=True)]
         )
         through = recording & ending
         if through.any():
             through &= self.system.forces(state)[0][:, 2] <= NOTHING
         for s in map(int, np.flatnonzero(through)):
-            self.samples[s].reason = (
-                f"pressed {targets[s]:.3g} mm deep, the indenter touches no contact point that bears it: it is too "
-                "small for the mesh or for the steps; lower numerics.target_error_px or edge_length_mm, or max_step_mm"
-            )
+            self.samples[s].reason = no_contact(targets[s])
         return through
-
-    def _is_over_pad(self, path: Path) -> bool:
-        """Whether the body's lowest point, a ring's rim for a torus, comes down on the contact face."""
-        rim = float(path.body.shape[1]) if path.body.kind == KINDS["torus"] else 0.0
-        half = np.array(self.system.space.mesh.size_mm[:2]) / 2
-        return bool(np.all(np.abs(path.motion.position_mm) + rim < half))
 
     def _place(self, at: Sequence[float]) -> None:
         poses = [sample.path.pose(s) for sample, s in zip(self.samples, at, strict=True)]
@@ -343,19 +333,7 @@ class Stepper:
             sample.step = (target - sample.at) / 2
             sample.previous = None
             if sample.step < SHORTEST_STEP * longest:
-                pose = sample.path.pose(sample.at)
-                sample.reason = (
-                    f"Newton's method found no balance {target - sample.at:.2g} mm beyond "
-                    f"depth {pose.depth_mm:.3g} mm, shear {np.hypot(*pose.shear_mm):.3g} mm, "
-                    f"twist {pose.twist_deg:.3g} deg"
-                )
-
-
-def _trajectory(sample: _Sample, seconds: float, space: Space) -> Trajectory:
-    states = tuple(sample.states)
-    if not sample.reason:
-        return Trajectory(states, "complete", "", seconds, space)
-    return Trajectory(states, "partial" if len(states) > 1 else "failed", sample.reason, seconds, space)
+                sample.reason = no_balance(target - sample.at, sample.path.pose(sample.at))
 
 
 def _triple(values: FloatArray) -> tuple[float, float, float]:

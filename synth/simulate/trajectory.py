@@ -3,7 +3,10 @@
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
+
 from synth.arrays import FloatArray
+from synth.simulate.path import Pose
 from synth.simulate.space import Space
 
 
@@ -65,3 +68,25 @@ class Trajectory:
     reason: str
     seconds: float
     space: Space
+
+
+def ended(states: tuple[State, ...], reason: str, seconds: float, space: Space) -> Trajectory:
+    """A trajectory that ended for a reason, or without one at its end."""
+    status: Literal["complete", "partial", "failed"] = "partial" if len(states) > 1 else "failed"
+    return Trajectory(states, status if reason else "complete", reason, seconds, space)
+
+
+def no_contact(depth_mm: float) -> str:
+    """Why a trajectory ends whose indenter, at the end of its press, bears on nothing."""
+    return (
+        f"pressed {depth_mm:.3g} mm deep, the indenter touches no contact point that bears it: it is too "
+        "small for the mesh or for the steps; lower numerics.target_error_px or edge_length_mm, or max_step_mm"
+    )
+
+
+def no_balance(beyond_mm: float, pose: Pose) -> str:
+    """Why a trajectory ends so far before a place that Newton's method does not reach."""
+    return (
+        f"Newton's method found no balance {beyond_mm:.2g} mm beyond depth {pose.depth_mm:.3g} mm, "
+        f"shear {np.hypot(*pose.shear_mm):.3g} mm, twist {pose.twist_deg:.3g} deg"
+    )

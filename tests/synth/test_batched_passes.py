@@ -27,27 +27,30 @@ def sliding(body: dict[str, Any]) -> Scene:
 
 def test_a_pass_that_goes_too_far_is_given_up() -> None:
     """As soon as it does; what is taken has stayed within reach, and the other passes take penetration away."""
-    # Fails with `too_far` left out of `judge`, with the distance from another place than the last solution, and with a
-    # reach that is not renewed for each pass.
+    # Fails with `too_far` left out of `judge`, with the distance from another place than the last solution, with a
+    # reach that is not renewed for each pass, and with CLOSER = 1.
     posed = sliding(BOX)
     pad = prepare(posed, brick(counts=(4, 4, 2)), "cpu")
     run = Run(jobs_of([posed], pad), pad, posed.numerics, STRICT, None, 1)
     machine = run.machine
     slots, fields = machine.slots, machine._at.fields
-    lost, solved = [], []
+    lost, solved, depths = [], 0, {}
 
     def look(part: str, kernel: str) -> None:
+        nonlocal solved
         if kernel != "judge" or slots.stage.numpy()[0] != phases.PASS:
             return
-        phase, reach = slots.phase.numpy()[0], slots.reach.numpy()[0]
+        phase, reach = slots.phase.numpy()[0], slots.most_moved.numpy()[0]
         moved = np.linalg.norm(fields.trial_u.numpy()[0] - fields.recorded_u.numpy()[0], axis=1).max()
         if phase in (phases.READY, phases.SOLVED, phases.LOST):
             assert slots.trial_moved.numpy()[0] == pytest.approx(moved, abs=1e-15)
         if phase in (phases.READY, phases.SOLVED):
             assert moved <= reach
             assert reach == pytest.approx(stepping.REACH * slots.deepest.numpy()[0], rel=1e-12)
+            depths.setdefault(slots.target.numpy()[0], slots.deepest.numpy()[0])
         if phase == phases.SOLVED:
-            solved.append(moved)
+            solved += 1
+            assert slots.relative.numpy()[0] <= 0.1 * posed.numerics.tolerance
         if phase == phases.LOST:
             lost.append((slots.iteration.numpy()[0], moved / reach))
 
@@ -55,8 +58,9 @@ def test_a_pass_that_goes_too_far_is_given_up() -> None:
     ((_, result),) = run
     assert result.status == "complete"
     assert any(iteration < STRICT.correction_iterations and share > 1 for iteration, share in lost)
-    assert solved
-    assert result.states[-1].max_penetration_mm < max(solved)
+    assert solved >= len(depths) == 3
+    for state, before in zip(result.states[1:], depths.values(), strict=True):
+        assert state.max_penetration_mm < 0.5 * before
 
 
 def test_so_does_the_solver_for_one_sample(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -64,9 +64,11 @@ ENOUGH = wp.constant(wp.float64(stepping.ENOUGH))
 PENETRATION = wp.constant(wp.float64(stepping.PENETRATION))
 REACH = wp.constant(wp.float64(stepping.REACH))
 CLOSER = wp.constant(wp.float64(0.1))
-"""Tolerance of a pass over that of the way. Passes find what is recorded, and where most of a contact slips a residual
+"""Tolerance of a pass over the full one. Passes find what is recorded, and where most of a contact slips a residual
 of 1e-6 can be 1e-4 in displacement: two devices that end one iteration apart then differ by as much. 0.1 costs a press
 0.7 % more cycles, 0.01 costs 2.5 % (eight balls, 8 x 6 x 2 elements)."""
+TIGHTEST = wp.constant(wp.float64(1.0e-12))
+"""Of a pass; rounding alone leaves some 1e-13."""
 DECREASE = wp.constant(wp.float64(1.0e-4))
 LATE = wp.constant(5)
 HOPELESS = wp.constant(wp.float64(0.5))
@@ -107,7 +109,7 @@ def judge(slots: Slots, settings: Settings):
             return
         slots.move[s] = TAKE
         slots.iteration[s] = slots.iteration[s] + 1
-    too_far = slots.stage[s] == PASS and slots.trial_moved[s] > slots.reach[s]
+    too_far = slots.stage[s] == PASS and slots.trial_moved[s] > slots.most_moved[s]
     slots.norm[s] = norm
     slots.relative[s] = relative
     slots.jacobian[s] = slots.trial_jacobian[s]
@@ -213,9 +215,9 @@ def choose_pass(slots: Slots, jobs: Jobs, settings: Settings):
     else:
         slots.share_now[s] = slots.share[s]
         slots.stage[s] = PASS
-        slots.reach[s] = REACH * slots.deepest[s]
+        slots.most_moved[s] = REACH * slots.deepest[s]
         slots.limit[s] = settings.correction_limit
-        slots.tolerance[s] = CLOSER * settings.tolerance
+        slots.tolerance[s] = wp.max(CLOSER * settings.tolerance, TIGHTEST)
         if slots.done[s] + slots.share[s] < ENOUGH:
             slots.tolerance[s] = wp.max(settings.loose, slots.tolerance[s])
     slots.iteration[s] = 0

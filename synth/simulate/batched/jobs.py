@@ -9,11 +9,12 @@ import warp as wp
 from synth.arrays import FloatArray
 from synth.simulate.batched.slots import COMPLETE, NO_BALANCE, Jobs
 from synth.simulate.batched.sums import SCALARS
-from synth.simulate.distance import KINDS, shape_vector
+from synth.simulate.distance import shape_vector
 from synth.simulate.path import Path
 from synth.simulate.space import Space
 from synth.simulate.tables import warp_array
-from synth.simulate.trajectory import State, Trajectory
+from synth.simulate.trajectory import State, Trajectory, no_balance, no_contact
+from synth.simulate.trajectory import ended as ended_trajectory
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ def job_tables(
     table.press = warp_array(np.array([path.press_mm for path in paths]), wp.float64, d)
     deepest = [max(float(path.corners[:, 0].max()), 0.1) for path in paths]
     table.deepest = warp_array(np.array(deepest), wp.float64, d)
-    table.over_pad = warp_array(np.array([_is_over_pad(path, size_mm) for path in paths]), wp.int32, d)
+    table.over_pad = warp_array(np.array([path.is_over(size_mm) for path in paths]), wp.int32, d)
     table.position = warp_array(np.array([path.motion.position_mm for path in paths], dtype=np.float64), wp.vec2d, d)
     table.reach = warp_array(np.array([path.body.reach_mm - path.face_mm for path in paths]), wp.float64, d)
     table.rotation = warp_array(np.array([path.body.rotation for path in paths]), wp.mat33d, d)
@@ -107,12 +108,6 @@ def _stacked(arrays: Sequence[np.ndarray]) -> np.ndarray:
     return stacked
 
 
-def _is_over_pad(path: Path, size_mm: tuple[float, float, float]) -> bool:
-    """Whether the body's lowest point, a ring's rim for a torus, comes down on the contact face."""
-    rim = float(path.body.shape[1]) if path.body.kind == KINDS["torus"] else 0.0
-    return bool(np.all(np.abs(path.motion.position_mm) + rim < np.array(size_mm[:2]) / 2))
-
-
 def untouched(job: Job, space: Space) -> Trajectory:
     """Of an indenter that stays off: the gel stays as it is."""
     lengths = [0.0, *map(float, job.path.records())]
@@ -127,25 +122,15 @@ def trajectory(job: Job, records: FloatArray, ended: Ended, seconds: float, spac
     states = [untouched(job, space).states[0]]
     for length, record in zip(job.path.records(), records, strict=False):
         states.append(_state(job, float(length), record, space))
-    if ended.reason == COMPLETE:
-        return Trajectory(tuple(states), "complete", "", seconds, space)
-    reason = _reason(job, ended)
-    return Trajectory(tuple(states), "partial" if len(states) > 1 else "failed", reason, seconds, space)
+    return ended_trajectory(tuple(states), _reason(job, ended), seconds, space)
 
 
 def _reason(job: Job, ended: Ended) -> str:
-    """In the words of `synth.simulate.stepping`."""
-    if ended.reason != NO_BALANCE:
-        return (
-            f"pressed {ended.target:.3g} mm deep, the indenter touches no contact point that bears it: it is too "
-            "small for the mesh or for the steps; lower numerics.target_error_px or edge_length_mm, or max_step_mm"
-        )
-    pose = job.path.pose(ended.at)
-    return (
-        f"Newton's method found no balance {ended.target - ended.at:.2g} mm beyond "
-        f"depth {pose.depth_mm:.3g} mm, shear {np.hypot(*pose.shear_mm):.3g} mm, "
-        f"twist {pose.twist_deg:.3g} deg"
-    )
+    if ended.reason == COMPLETE:
+        return ""
+    if ended.reason == NO_BALANCE:
+        return no_balance(ended.target - ended.at, job.path.pose(ended.at))
+    return no_contact(ended.target)
 
 
 def _state(job: Job, length: float, record: FloatArray, space: Space) -> State:

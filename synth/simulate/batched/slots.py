@@ -72,7 +72,7 @@ class Slots:
         norm, relative, jacobian: of the iterate: norm of the free residual, the same relative to the forces, smallest
             det F.
         trial_norm, trial_force, trial_jacobian: of the trial; trial_moved: of a pass, farthest that a node has gone
-            from the solution before it, mm; reach: how far it may.
+            from the solution before it, mm; most_moved: how far it may.
         failures, done, share: of augmented-Lagrangian passes: those that failed, the shares of the others together, and
             the share of the next; share_now: of the one that begins.
         keep: whether contact's memory is put aside in this cycle; kept: whether it is put aside; anchor: whether points
@@ -106,7 +106,7 @@ class Slots:
     trial_force: wp.array(dtype=wp.float64)
     trial_jacobian: wp.array(dtype=wp.float64)
     trial_moved: wp.array(dtype=wp.float64)
-    reach: wp.array(dtype=wp.float64)
+    most_moved: wp.array(dtype=wp.float64)
     failures: wp.array(dtype=wp.int32)
     done: wp.array(dtype=wp.float64)
     share: wp.array(dtype=wp.float64)
