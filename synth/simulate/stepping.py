@@ -22,7 +22,7 @@ from synth.simulate.newton import MAX_ITERATIONS, NOTHING, Solution, relative_re
 from synth.simulate.path import Path, Pose
 from synth.simulate.system import System
 from synth.simulate.tables import pack_indenters
-from synth.simulate.trajectory import State, Trajectory, ended, no_balance, no_contact
+from synth.simulate.trajectory import State, Trajectory, no_balance, no_contact, trajectory_of
 from synth.simulate.unknowns import Unknowns
 
 SHORTEST_STEP = 1 / 128
@@ -117,7 +117,7 @@ class Stepper:
         while not all(sample.finished for sample in self.samples):
             self._advance(np.array([not sample.finished for sample in self.samples]))
         seconds = (time.perf_counter() - started) / len(self.samples)
-        return [ended(tuple(each.states), each.reason, seconds, self.system.space) for each in self.samples]
+        return [trajectory_of(tuple(each.states), each.reason, seconds, self.system.space) for each in self.samples]
 
     def _start(self) -> None:
         """The undeformed states; a path that never touches stays in them and needs no solve."""

@@ -70,7 +70,7 @@ class Trajectory:
     space: Space
 
 
-def ended(states: tuple[State, ...], reason: str, seconds: float, space: Space) -> Trajectory:
+def trajectory_of(states: tuple[State, ...], reason: str, seconds: float, space: Space) -> Trajectory:
     """A trajectory that ended for a reason, or without one at its end."""
     status: Literal["complete", "partial", "failed"] = "partial" if len(states) > 1 else "failed"
     return Trajectory(states, status if reason else "complete", reason, seconds, space)

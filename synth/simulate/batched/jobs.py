@@ -13,8 +13,7 @@ from synth.simulate.distance import shape_vector
 from synth.simulate.path import Path
 from synth.simulate.space import Space
 from synth.simulate.tables import warp_array
-from synth.simulate.trajectory import State, Trajectory, no_balance, no_contact
-from synth.simulate.trajectory import ended as ended_trajectory
+from synth.simulate.trajectory import State, Trajectory, no_balance, no_contact, trajectory_of
 
 
 @dataclass(frozen=True)
@@ -122,7 +121,7 @@ def trajectory(job: Job, records: FloatArray, ended: Ended, seconds: float, spac
     states = [untouched(job, space).states[0]]
     for length, record in zip(job.path.records(), records, strict=False):
         states.append(_state(job, float(length), record, space))
-    return ended_trajectory(tuple(states), _reason(job, ended), seconds, space)
+    return trajectory_of(tuple(states), _reason(job, ended), seconds, space)
 
 
 def _reason(job: Job, ended: Ended) -> str:
