@@ -33,7 +33,15 @@ Out = Annotated[Path, Parameter(help="Folder for the results.")]
 Validation = Annotated[list[Path] | None, Parameter(help="Folders of pairs to validate on.")]
 Config = Annotated[
     str | None,
-    Parameter(help="Settings: best, real, paper, selfflow, arflow, or a TOML file. Default: best; for finetune, real."),
+    Parameter(
+        help="Settings: best, real, bare, paper, selfflow, arflow, or a TOML file. Default: best; for finetune, real."
+    ),
+]
+ShippedOrFile = Annotated[
+    Path | None,
+    Parameter(
+        help="File of weights, or the name of shipped ones: best, digit (bare gels of that scene). Default: best."
+    ),
 ]
 Steps = Annotated[int | None, Parameter(help="Optimiser steps.")]
 Resume = Annotated[bool, Parameter(negative=(), help="Go on with the run that --out holds.")]
@@ -45,7 +53,7 @@ Registration = Annotated[
     Registered | None,
     Parameter(
         help="Correct the network's flow on the images: to follow the gel's motion, or to bring image 2 as close to "
-        "image 1 as can be, shading included. Default: as the weights' training asked for; the shipped ones: motion."
+        "image 1 as can be, shading included. Default: as the weights' training asked for; best: motion."
     ),
 ]
 TrainDevice = Annotated[Device | None, Parameter(help="Where to train; auto: a CUDA device where there is one.")]
@@ -77,7 +85,7 @@ def finetune(
     /,
     *,
     out: Out,
-    weights: Annotated[Path | None, Parameter(help="File of weights to start from; default: the shipped ones.")] = None,
+    weights: ShippedOrFile = None,
     validation: Validation = None,
     config: Config = None,
     assignments: Assignments = None,
@@ -98,7 +106,7 @@ def evaluate(
     data: Paths,
     /,
     *,
-    weights: Annotated[Path | None, Parameter(help="File of weights; default: the shipped ones.")] = None,
+    weights: ShippedOrFile = None,
     registration: Registration = None,
     size: Size = None,
     device: OnDevice = "auto",
@@ -127,8 +135,9 @@ def compare(
     weights: Annotated[
         list[str] | None,
         Parameter(
-            help="FILE or LABEL=FILE of a network: GelFlow (.safetensors; best: ours) or RAFT (.pth); repeatable. "
-            "Labels that differ after # alone (best#0, best#1) are seeds: one row, mean and standard deviation."
+            help="FILE or LABEL=FILE of a network: GelFlow (.safetensors; best, digit: ours) or RAFT (.pth); "
+            "repeatable. Labels that differ after # alone (best#0, best#1) are seeds: one row, mean and standard "
+            "deviation."
         ),
     ] = None,
     registration: Annotated[
@@ -171,7 +180,7 @@ def predict(
     /,
     *,
     out: Out,
-    weights: Annotated[Path | None, Parameter(help="File of weights of a network; default: the shipped ones.")] = None,
+    weights: ShippedOrFile = None,
     method: Annotated[
         str | None,
         Parameter(
@@ -196,7 +205,7 @@ def predict(
 
 @app.command
 def export(
-    weights: Annotated[Path, Parameter(help="File of weights of a network, or best for the shipped ones.")],
+    weights: Annotated[Path, Parameter(help="File of weights, or the name of shipped ones: best, digit.")],
     /,
     *,
     out: Annotated[Path, Parameter(help="File to write, ending in .onnx.")],

@@ -12,7 +12,7 @@ from typing import Any
 from gelflow.config import TrainConfig, validated
 from gelflow.errors import InputError
 
-PRESETS = ("best", "real", "paper", "selfflow", "arflow")
+PRESETS = ("best", "real", "bare", "paper", "selfflow", "arflow")
 """Names of the configurations that come with the package."""
 
 

@@ -3,7 +3,7 @@
 from importlib.resources import files
 from pathlib import Path
 
-SHIPPED = ("best",)
+SHIPPED = ("best", "digit")
 
 
 def weights_file(given: Path | None) -> Path:

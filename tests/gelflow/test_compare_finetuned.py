@@ -38,7 +38,7 @@ def network(path: Path, model: ModelConfig, train: TrainConfig, size: tuple[int,
     return path
 
 
-@pytest.mark.parametrize("preset", ["best", "real", "paper", "selfflow"])
+@pytest.mark.parametrize("preset", ["best", "real", "bare", "paper", "selfflow"])
 def test_whatever_the_preset_the_pairs_are_seen_as_they_are_and_without_truth(preset: str, tmp_path: Path) -> None:
     """Fails with any one of the fixed settings left out that this preset sets otherwise."""
     recorded = train_config(preset)

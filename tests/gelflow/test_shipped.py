@@ -8,11 +8,12 @@ import torch
 from waves import press_flow
 
 from gelflow.cli import app
-from gelflow.config import REGISTRATIONS, ModelConfig
+from gelflow.config import REGISTRATIONS, ModelConfig, TrainConfig, validated
 from gelflow.errors import InputError
 from gelflow.estimate import estimate_flow
 from gelflow.files.image import write_png
-from gelflow.shipped import weights_file
+from gelflow.overrides import train_config
+from gelflow.shipped import SHIPPED, weights_file
 from gelflow.train.checkpoint import load_weights, read_metadata
 
 
@@ -27,7 +28,23 @@ def test_names_and_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         load_weights(weights_file(Path("worst")))
 
 
-def test_the_card_describes_the_file() -> None:
+def test_all_of_them_are_small_and_load() -> None:
+    assert sum(weights_file(Path(name)).stat().st_size for name in SHIPPED) < 15e6
+    for name in SHIPPED:
+        load_weights(weights_file(Path(name)))
+
+
+def test_the_card_describes_digit() -> None:
+    path = weights_file(Path("digit"))
+    trained = validated(TrainConfig, json.loads(read_metadata(path)["train"]), "digit")
+    bare = train_config("bare")
+    assert trained.model == bare.model
+    for name in ("supervision", "steps", "batch_size", "learning_rate", "warmup_steps", "ema_decay", "flip", "motion"):
+        assert getattr(trained, name) == getattr(bare, name), name
+    assert f"{trained.steps} steps" in path.with_name("README.md").read_text(encoding="utf-8")
+
+
+def test_the_card_describes_best() -> None:
     path = weights_file(None)
     card = path.with_name("README.md").read_text(encoding="utf-8")
     metadata = read_metadata(path)

@@ -5,8 +5,9 @@ import sys
 
 import pytest
 
-from gelflow.config import LossConfig, ModelConfig, TrainConfig, validated
+from gelflow.config import REGISTRATIONS, LossConfig, ModelConfig, TrainConfig, validated
 from gelflow.errors import InputError
+from gelflow.overrides import train_config
 
 
 def test_defaults_are_the_readings_of_the_paper() -> None:
@@ -27,6 +28,7 @@ def test_defaults_are_the_readings_of_the_paper() -> None:
         ({"loss": {"alpha": 2}}, r"loss.alpha: .*less than or equal to 1 \(given: 2\)"),
         ({"loss": {"alpha": "high"}}, "loss.alpha: .*number.*high"),
         ({"model": {"estimator": "both"}}, "model.estimator: .*'per_scale' or 'shared'.*both"),
+        ({"model": {"registration": "movement"}}, "model.registration: .*none, motion, brightness"),
         ({"model": {"levels": 4, "finest_scale": 3}}, "finest_scale = 3 must be below the coarsest scale 3"),
         ({"model": {"levels": 6}}, "loss.lambda_s has 7 numbers; model.levels asks for 5"),
         ({"loss": {"lambda_s": [0.0] * 7}}, "at least one of them above 0"),
@@ -47,6 +49,14 @@ def test_wrong_values_are_named_with_what_is_allowed(values: dict, words: str) -
 def test_a_configuration_survives_json() -> None:
     config = TrainConfig(image_size=(64, 80), loss=LossConfig(weight="floor"))
     assert validated(TrainConfig, config.model_dump(mode="json"), "json") == config
+
+
+def test_registration_has_names() -> None:
+    """Fails with names merged into the settings of the weights that a fine-tuning starts from."""
+    start = {"model": ModelConfig(registration=REGISTRATIONS["brightness"]).model_dump()}
+    for name, meant in REGISTRATIONS.items():
+        assert validated(ModelConfig, {"registration": name}, "test").registration == meant
+        assert train_config(None, [f"model.registration={name}"], start=start).model.registration == meant
 
 
 def test_importing_the_package_and_the_settings_loads_nothing_heavy() -> None:

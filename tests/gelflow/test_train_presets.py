@@ -57,6 +57,18 @@ def test_best_trains_on_the_exact_flow() -> None:
     assert best.ema_decay > 0
 
 
+def test_bare_does_nothing_to_pairs_that_a_sensor_could_not() -> None:
+    bare, best = train_config("bare"), train_config("best")
+    assert (bare.supervision, bare.motion, bare.flip, bare.color_jitter, bare.crop_size) == (
+        "flow",
+        None,
+        False,
+        0,
+        None,
+    )
+    assert bare.model == best.model.model_copy(update={"registration": None})
+
+
 @pytest.mark.parametrize("name", PRESETS)
 def test_every_preset_trains(name: str, tmp_path: Path) -> None:
     torch.set_num_threads(1)
@@ -73,6 +85,6 @@ def test_assignments_and_files_still_work(tmp_path: Path) -> None:
     assert train_config(path, ["loss.lambda_df=0.5"]).loss.lambda_df == 0.5
     assert train_config(path).steps == 7
     with pytest.raises(
-        InputError, match=r"papier: neither a configuration file nor a preset; presets are best, real, paper"
+        InputError, match=r"papier: neither a configuration file nor a preset; presets are best, real, bare, paper"
     ):
         train_config("papier")
