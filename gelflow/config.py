@@ -8,7 +8,7 @@ that they belong to; scale s has 1/2^s of the image's resolution.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeGuard, TypeVar, get_args
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
@@ -67,7 +67,7 @@ def _named_registration(value: Any) -> Any:
     if not isinstance(value, str):
         return value
     if value not in REGISTRATIONS:
-        raise ValueError(f"a name is one of {', '.join(REGISTRATIONS)}")
+        raise ValueError(f"{value!r} is no registration; names are {', '.join(REGISTRATIONS)}")
     return REGISTRATIONS[value]
 
 
@@ -324,10 +324,15 @@ def validated(kind: type[Config], values: Mapping[str, Any], source: str) -> Con
         raise InputError(f"{source}: " + "; ".join(lines)) from error
 
 
+def _is_table(annotation: Any) -> TypeGuard[type[BaseModel]]:
+    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
+
+
 def _fields_at(kind: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
     for name in location:
         annotation = kind.model_fields[str(name)].annotation
-        if not (isinstance(annotation, type) and issubclass(annotation, BaseModel)):
+        tables = [part for part in (annotation, *get_args(annotation)) if _is_table(part)]
+        if not tables:
             return []
-        kind = annotation
+        kind = tables[0]
     return list(kind.model_fields)

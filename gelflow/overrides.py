@@ -9,7 +9,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from gelflow.config import TrainConfig, validated
+from gelflow.config import REGISTRATIONS, TrainConfig, validated
 from gelflow.errors import InputError
 
 PRESETS = ("best", "real", "bare", "paper", "selfflow", "arflow")
@@ -37,9 +37,11 @@ def train_config(
     sources = []
     if path is not None:
         _merge(values, _read(path))
+        _spell_out(values)
         sources.append(str(path))
     for assignment in assignments:
         _assign(values, assignment)
+        _spell_out(values)
     if assignments:
         sources.append("--set")
     given = {name: value for name, value in (options or {}).items() if value is not None}
@@ -69,6 +71,15 @@ def _merge(values: dict[str, Any], new: Mapping[str, Any]) -> None:
             _merge(values[name], value)
         else:
             values[name] = value
+
+
+def _spell_out(values: dict[str, Any]) -> None:
+    """Puts what a registration's name stands for in its place, so that what follows can change single fields of it."""
+    model = values.get("model")
+    name = model.get("registration") if isinstance(model, dict) else None
+    if isinstance(name, str) and name in REGISTRATIONS:
+        meant = REGISTRATIONS[name]
+        values["model"] = {**values["model"], "registration": None if meant is None else meant.model_dump()}
 
 
 def _assign(values: dict[str, Any], assignment: str) -> None:

@@ -13,6 +13,6 @@ def weights_file(given: Path | None) -> Path:
         given: A file, or the name of shipped weights where there is no such file; None: the default, "best".
     """
     name = "best" if given is None else str(given)
-    if name in SHIPPED and not Path(name).exists():
+    if name in SHIPPED and not Path(name).is_file():
         return Path(str(files("gelflow"))) / "weights" / f"{name}.safetensors"
     return Path(name)

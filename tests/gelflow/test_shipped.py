@@ -34,14 +34,22 @@ def test_all_of_them_are_small_and_load() -> None:
         load_weights(weights_file(Path(name)))
 
 
+def test_a_folder_of_that_name_is_not_in_the_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`generate --scene digit --out digit` makes one."""
+    (tmp_path / "digit").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert weights_file(Path("digit")).suffix == ".safetensors"
+
+
 def test_the_card_describes_digit() -> None:
     path = weights_file(Path("digit"))
     trained = validated(TrainConfig, json.loads(read_metadata(path)["train"]), "digit")
     bare = train_config("bare")
-    assert trained.model == bare.model
-    for name in ("supervision", "steps", "batch_size", "learning_rate", "warmup_steps", "ema_decay", "flip", "motion"):
-        assert getattr(trained, name) == getattr(bare, name), name
-    assert f"{trained.steps} steps" in path.with_name("README.md").read_text(encoding="utf-8")
+    assert trained.loss.flow_s == bare.loss.flow_s  # of the losses, all that training by exact flow uses
+    machine = {"precision", "device", "workers", "loss"}
+    assert trained.model_dump(exclude=machine) == bare.model_dump(exclude=machine)
+    card = path.with_name("README.md").read_text(encoding="utf-8").split("## digit")[1]
+    assert f"{trained.steps} steps" in card
 
 
 def test_the_card_describes_best() -> None:

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from gelflow.config import REGISTRATIONS, LossConfig, ModelConfig, TrainConfig, validated
+from gelflow.config import REGISTRATIONS, LossConfig, ModelConfig, RegistrationConfig, TrainConfig, validated
 from gelflow.errors import InputError
 from gelflow.overrides import train_config
 
@@ -28,7 +28,11 @@ def test_defaults_are_the_readings_of_the_paper() -> None:
         ({"loss": {"alpha": 2}}, r"loss.alpha: .*less than or equal to 1 \(given: 2\)"),
         ({"loss": {"alpha": "high"}}, "loss.alpha: .*number.*high"),
         ({"model": {"estimator": "both"}}, "model.estimator: .*'per_scale' or 'shared'.*both"),
-        ({"model": {"registration": "movement"}}, "model.registration: .*none, motion, brightness"),
+        (
+            {"model": {"registration": "movement"}},
+            "registration: 'movement' is no registration; names are none, ",
+        ),
+        ({"model": {"registration": {"prior": 1}}}, "model.registration.prior: .*allowed: windows_px, "),
         ({"model": {"levels": 4, "finest_scale": 3}}, "finest_scale = 3 must be below the coarsest scale 3"),
         ({"model": {"levels": 6}}, "loss.lambda_s has 7 numbers; model.levels asks for 5"),
         ({"loss": {"lambda_s": [0.0] * 7}}, "at least one of them above 0"),
@@ -57,6 +61,14 @@ def test_registration_has_names() -> None:
     for name, meant in REGISTRATIONS.items():
         assert validated(ModelConfig, {"registration": name}, "test").registration == meant
         assert train_config(None, [f"model.registration={name}"], start=start).model.registration == meant
+
+
+@pytest.mark.parametrize("preset", ["best", "real", "bare"])
+def test_a_field_changes_a_registration_that_has_a_name(preset: str) -> None:
+    """Fails with names left as they are until all settings have been merged."""
+    for start in (None, {"model": ModelConfig(registration=REGISTRATIONS["brightness"]).model_dump()}):
+        config = train_config(preset, ["model.registration.prior_px=0.5"], start=start)
+        assert config.model.registration == RegistrationConfig(prior_px=0.5)
 
 
 def test_importing_the_package_and_the_settings_loads_nothing_heavy() -> None:

@@ -18,12 +18,11 @@ from synth.simulate import Trajectory
 from synth.simulate.batched import simulate_many
 from synth.simulate.batched.folding import find_folding, fold_product
 from synth.simulate.batched.krylov import padded
-from synth.simulate.batched.many import jobs_of
+from synth.simulate.batched.many import DRIVER, jobs_of
 from synth.simulate.batched.numbering import number_rows
 from synth.simulate.batched.pad import prepare
 from synth.simulate.batched.product import STORED_YEOH, bulk_product, contact_product, store, store_contact
 from synth.simulate.contact import contact_stiffness
-from synth.simulate.driver import Driver
 from synth.simulate.element import Element
 from synth.simulate.indenter import rigid_body
 from synth.simulate.material import pad_material, uniform
@@ -38,7 +37,6 @@ BOX = {"shape": "box", "size_mm": [3.0, 2.5, 4.0], "fillet_mm": 0.6, "rotation_d
 WIRE = {"shape": "torus", "radius_mm": 1.5, "tube_mm": 0.3}
 MESH = brick(counts=(4, 4, 2))
 TOLERANCE = 1e-9
-STRICT = Driver(loose=0.0, forcing=1e-3)
 AGREEMENT = 1e-6
 """Of displacements, relative. Newton's method to 1e-9 leaves some 1e-10 (5e-11 was seen); with the scene's 1e-6 and a
 loose way there it would be 1e-6."""
@@ -68,12 +66,12 @@ def alone(posed: Scene, mesh: PadMesh, folder: FilePath | None = None) -> Trajec
     space = function_space(mesh, ELEMENT[posed.numerics.element]())
     body = System(space, pad_material(posed.sensor.gel, mesh), penalty=posed.numerics.penalty)
     path = Path(posed.motion, rigid_body(posed.contact.indenter, folder, mesh.spacing_mm / (2 * space.element.order)))
-    return Stepper(body, [path], [posed.contact.friction], posed.numerics, [0.2], STRICT).run()[0]
+    return Stepper(body, [path], [posed.contact.friction], posed.numerics, [0.2], DRIVER).run()[0]
 
 
 def together(scenes: list[Scene], mesh: PadMesh, batch: int, folder: FilePath | None = None) -> list[Trajectory]:
     """In the order of the scenes."""
-    found = dict(simulate_many(scenes, mesh, folder, "cpu", batch=batch, driver=STRICT))
+    found = dict(simulate_many(scenes, mesh, folder, "cpu", batch=batch))
     assert sorted(found) == list(range(len(scenes)))
     return [found[i] for i in range(len(scenes))]
 
@@ -241,6 +239,6 @@ def test_on_a_gpu_the_same_as_on_the_cpu() -> None:
     if not wp.is_cuda_available():
         pytest.skip("no CUDA device")
     scenes = draws("p2p1")
-    on_gpu = dict(simulate_many(scenes, MESH, device="cuda", batch=3, driver=STRICT))
+    on_gpu = dict(simulate_many(scenes, MESH, device="cuda", batch=3))
     for i, result in enumerate(together(scenes, MESH, 3)):
         assert apart(result, on_gpu[i]) < AGREEMENT

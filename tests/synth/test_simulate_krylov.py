@@ -23,12 +23,18 @@ from synth.simulate.batched.krylov import (
     solution,
 )
 from synth.simulate.batched.reference import Reference, inverse
-from synth.simulate.batched.slots import READY, Settings, Slots
+from synth.simulate.batched.slots import CARRY_READY, READY, Settings, Slots
 from synth.simulate.batched.tf32 import round_matrix
 from synth.simulate.driver import STANDARD
 
 
-def _systems(relative: list[float], iteration: list[int], device: str = "cpu") -> tuple[Slots, Krylov, Settings]:
+def _systems(
+    relative: list[float],
+    iteration: list[int],
+    device: str = "cpu",
+    forcing: float = STANDARD.forcing,
+    phase: int = READY,
+) -> tuple[Slots, Krylov, Settings]:
     """Slots that are ready for a linear solve, its right side of norm 1, the one before of norm 20."""
     rows, batch = padded(150), len(relative)
     slots, krylov, settings = Slots(), Krylov(), Settings()
@@ -41,13 +47,13 @@ def _systems(relative: list[float], iteration: list[int], device: str = "cpu") -
                 name,
                 wp.zeros(sizes[name] if struct is krylov else batch, dtype=variable.type.dtype, device=device),
             )
-    slots.phase.fill_(READY)
+    slots.phase.fill_(phase)
     slots.norm.fill_(1.0)
     krylov.size.fill_(20.0)
     slots.tolerance.fill_(1e-4)
     slots.relative.assign(np.array(relative))
     slots.iteration.assign(np.array(iteration, dtype=np.int32))
-    settings.forcing = STANDARD.forcing
+    settings.forcing = forcing
     wp.launch(begin, batch, inputs=[slots, settings, krylov], device=device)
     return slots, krylov, settings
 
@@ -57,6 +63,10 @@ def test_linear_solves_are_as_exact_as_newton_needs() -> None:
     # Fails without the share of what is left.
     krylov = _systems([1.0, 1.0, 5e-3, 2e-4], [0, 1, 1, 1])[1]
     np.testing.assert_allclose(krylov.goal.numpy(), [0.03, 0.00225, 0.006, 0.03], rtol=1e-6)
+    # Fails with 1e-3 as the least whatever is asked for. The predictor at a turn has no Newton iteration before it.
+    for phase in (READY, CARRY_READY):
+        assert np.all(_systems([1.0, 5e-3], [0, 1], "cpu", 1e-5, phase)[1].goal.numpy() == np.float32(1e-5))
+    assert _systems([1.0], [0], phase=CARRY_READY)[1].goal.numpy() == np.float32(1e-3)
 
 
 @pytest.mark.parametrize(("device", "batch"), [("cpu", 3), pytest.param("cuda", 600, marks=pytest.mark.cuda)])

@@ -30,7 +30,8 @@ LIMIT = wp.constant(GMRES_LIMIT)
 NONE = wp.constant(wp.float32(0.0))
 UNIT = wp.constant(wp.float32(1.0))
 TIGHTEST = wp.constant(wp.float64(GMRES_TOLERANCE))
-"""Relative residual that ends a linear solve, at least; `Settings.forcing` at most."""
+"""Smallest goal of a linear solve (relative residual). `Settings.forcing` is the largest; where that is smaller still,
+it is the goal of every solve."""
 SHARE, ENOUGH = wp.constant(wp.float64(0.9)), wp.constant(wp.float64(0.3))
 HELD = 84
 """Numbers of a vector that one thread holds, at most: two vectors and what else there is fit its 255 registers."""
@@ -150,15 +151,16 @@ def _goal(slots: Slots, settings: Settings, s: int, before: wp.float64) -> wp.fl
     before: norm of the last solve's right side. With these bounds their safeguard, which looks at the last goal, has
     nothing to do.
     """
-    if slots.phase[s] == CARRY_READY:
-        return TIGHTEST
     loosest = wp.float64(settings.forcing)
+    tightest = wp.min(TIGHTEST, loosest)
+    if slots.phase[s] == CARRY_READY:
+        return tightest
     goal = loosest
     if slots.iteration[s] > 0:
         fallen = slots.norm[s] / before
         goal = SHARE * fallen * fallen
     goal = wp.max(goal, ENOUGH * slots.tolerance[s] / slots.relative[s])
-    return wp.max(wp.min(goal, loosest), TIGHTEST)
+    return wp.max(wp.min(goal, loosest), tightest)
 
 
 @wp.kernel
