@@ -62,15 +62,6 @@ REGISTRATIONS: dict[Registration, RegistrationConfig | None] = {
 """Nothing, what measures the gel's motion best, and what brings image 2 closest to image 1."""
 
 
-def _named_registration(value: Any) -> Any:
-    """What a name of `REGISTRATIONS` stands for; anything else as it is."""
-    if not isinstance(value, str):
-        return value
-    if value not in REGISTRATIONS:
-        raise ValueError(f"{value!r} is no registration; names are {', '.join(REGISTRATIONS)}")
-    return REGISTRATIONS[value]
-
-
 class ModelConfig(_Frozen):
     """The network: what its weights depend on, and how its flow is refined. Stored with the weights."""
 
@@ -102,10 +93,10 @@ class ModelConfig(_Frozen):
     or at full resolution. Not in the paper, whose finest flow is an enlargement of V2."""
     refine_iterations: int = Field(default=3, ge=1, le=16)
     """Times that the refinement head, with the same weights, corrects the flow."""
-    registration: Annotated[RegistrationConfig | None, BeforeValidator(_named_registration)] = None
+    registration: RegistrationConfig | None = None
     """Correction of the network's flow on the images where it is used (validation, evaluation, prediction; neither the
-    training steps nor the exported network); a name of `REGISTRATIONS` or a table. Takes no part in the weights: a
-    fine-tuning may change it. Not in the paper."""
+    training steps nor the exported network); in a configuration, a name of `REGISTRATIONS` or a table. Takes no part in
+    the weights: a fine-tuning may change it. Not in the paper."""
 
     @model_validator(mode="after")
     def _decodes_something(self) -> ModelConfig:

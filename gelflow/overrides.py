@@ -74,12 +74,18 @@ def _merge(values: dict[str, Any], new: Mapping[str, Any]) -> None:
 
 
 def _spell_out(values: dict[str, Any]) -> None:
-    """Puts what a registration's name stands for in its place, so that what follows can change single fields of it."""
+    """Puts what a registration's name stands for in its place, so that what follows can change single fields of it.
+
+    Raises:
+        InputError: there is no such registration.
+    """
     model = values.get("model")
-    name = model.get("registration") if isinstance(model, dict) else None
-    if isinstance(name, str) and name in REGISTRATIONS:
-        meant = REGISTRATIONS[name]
-        values["model"] = {**values["model"], "registration": None if meant is None else meant.model_dump()}
+    if not isinstance(model, dict) or not isinstance(name := model.get("registration"), str):
+        return
+    if name not in REGISTRATIONS:
+        raise InputError(f"model.registration: {name!r} is no registration; names are {', '.join(REGISTRATIONS)}")
+    meant = REGISTRATIONS[name]
+    model["registration"] = None if meant is None else meant.model_dump()
 
 
 def _assign(values: dict[str, Any], assignment: str) -> None:

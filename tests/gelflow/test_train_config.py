@@ -28,10 +28,6 @@ def test_defaults_are_the_readings_of_the_paper() -> None:
         ({"loss": {"alpha": 2}}, r"loss.alpha: .*less than or equal to 1 \(given: 2\)"),
         ({"loss": {"alpha": "high"}}, "loss.alpha: .*number.*high"),
         ({"model": {"estimator": "both"}}, "model.estimator: .*'per_scale' or 'shared'.*both"),
-        (
-            {"model": {"registration": "movement"}},
-            "registration: 'movement' is no registration; names are none, ",
-        ),
         ({"model": {"registration": {"prior": 1}}}, "model.registration.prior: .*allowed: windows_px, "),
         ({"model": {"levels": 4, "finest_scale": 3}}, "finest_scale = 3 must be below the coarsest scale 3"),
         ({"model": {"levels": 6}}, "loss.lambda_s has 7 numbers; model.levels asks for 5"),
@@ -59,8 +55,9 @@ def test_registration_has_names() -> None:
     """Fails with names merged into the settings of the weights that a fine-tuning starts from."""
     start = {"model": ModelConfig(registration=REGISTRATIONS["brightness"]).model_dump()}
     for name, meant in REGISTRATIONS.items():
-        assert validated(ModelConfig, {"registration": name}, "test").registration == meant
         assert train_config(None, [f"model.registration={name}"], start=start).model.registration == meant
+    with pytest.raises(InputError, match="'movement' is no registration; names are none, motion, brightness"):
+        train_config("best", ["model.registration=movement"])
 
 
 @pytest.mark.parametrize("preset", ["best", "real", "bare"])
