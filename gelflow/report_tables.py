@@ -11,7 +11,7 @@ from gelflow.comparison import Comparison
 from gelflow.evaluate import MethodScore, PairScore, summarise
 from gelflow.seeds import Group, group_name, grouped
 from gelflow.speed import Speed
-from gelflow.strata import NO_PATTERN, Stratum, merged
+from gelflow.strata import Stratum, merged, without_pattern
 
 MOST_PAIRS_IN_A_TABLE = 12
 """Above this many pairs, tables show means only; CSV and JSON always have every pair."""
@@ -138,7 +138,7 @@ def tables(comparison: Comparison) -> list[tuple[str, Table]]:
 
 def with_pattern(comparison: Comparison) -> tuple[list[Group], int]:
     """Means over the pairs of gels with a pattern, and their number; over all pairs if no gel has one."""
-    scores = [score for score in comparison.scores if not (score.scene or "").endswith(f", {NO_PATTERN}")]
+    scores = [score for score in comparison.scores if not without_pattern(score.scene)]
     scores = scores or list(comparison.scores)
     return _ordered(summarise(scores)), len({score.pair for score in scores})
 

@@ -62,14 +62,18 @@ def pair_strata(
     """
     motion = np.hypot(truth[..., 0], truth[..., 1])[compared]
     chosen = error[compared]
-    pattern = None if scene is None else scene.rpartition(", ")[2]
-    apart = BARE if pattern == NO_PATTERN else ""
+    apart = BARE if without_pattern(scene) else ""
     strata = _binned(MOTION + apart, MOTION_PX, motion, chosen)
     if contact is not None and contact.any() and not contact.all():
         strata += _binned(EDGE + apart, EDGE_PX, signed_distance(contact)[compared], chosen)
-    if scene is not None and pattern is not None:
-        strata += [_stratum(PATTERN, pattern, chosen), _stratum(SCENE, scene, chosen)]
+    if scene is not None:
+        strata += [_stratum(PATTERN, scene.rpartition(", ")[2], chosen), _stratum(SCENE, scene, chosen)]
     return tuple(strata)
+
+
+def without_pattern(scene: str | None) -> bool:
+    """Whether a pair's "scene, kind of pattern" says that its gel has none."""
+    return scene is not None and scene.rpartition(", ")[2] == NO_PATTERN
 
 
 def signed_distance(region: MaskArray) -> NDArray[np.float64]:

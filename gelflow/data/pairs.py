@@ -4,6 +4,7 @@ A sample is a dictionary:
 
     image1, image2  (3, H, W) float32, RGB in [0, 1]
     name            str, unique within the data set
+    bare            bool, whether the pair is synthetic and its gel has no pattern
     flow            (2, H, W) float32, U right and V down in px, I1(x) = I2(x + flow(x)); NaN where no gel is seen
     visible         (1, H, W) float32, 1 where the point of the pixel is seen in image 2, else 0
 
@@ -27,6 +28,7 @@ from gelflow.errors import InputError
 from gelflow.files.exr import Direction, FlowField, read_flow
 from gelflow.files.image import read_pair
 from gelflow.raster import ImageArray, MarkerArray
+from gelflow.strata import without_pattern
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,7 @@ class PairRecord:
     scene: str | None = None
 
 
-class PairDataset(Dataset[dict[str, Tensor | str]]):
+class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
     """Image pairs that are read from disk when they are asked for.
 
     Args:
@@ -113,17 +115,18 @@ class PairDataset(Dataset[dict[str, Tensor | str]]):
         markers = read_markers(record.markers)
         return markers[:, [2, 3, 0, 1]] if record.exchanged else markers
 
-    def __getitem__(self, index: int) -> dict[str, Tensor | str]:
+    def __getitem__(self, index: int) -> dict[str, Tensor | str | bool]:
         """The sample described at the top of this module.
 
         Raises:
             InputError: A file of the pair is missing or damaged, or the sizes differ.
         """
         image1, image2 = self.images(index)
-        sample: dict[str, Tensor | str] = {
+        sample: dict[str, Tensor | str | bool] = {
             "image1": _channels_first(image1),
             "image2": _channels_first(image2),
             "name": self.records[index].name,
+            "bare": without_pattern(self.records[index].scene),
         }
         if self.has_flow:
             truth = self.truth(index)

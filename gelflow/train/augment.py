@@ -1,5 +1,8 @@
 """Augmentation of whole batches, on whatever device they are: motion, flips, colours.
 
+Bare gels are left as they are: what is read from them is shading, and it is where the lights are that gives slopes
+their colours. Moved, flipped or in other colours they would be pictures of no sensor.
+
 Each pair has its own random numbers. They are drawn on the CPU and travel in one copy that nobody waits for, so that a
 GPU need not finish a step before the CPU prepares the next.
 """
@@ -14,12 +17,16 @@ from numpy.typing import NDArray
 from gelflow.config import TrainConfig
 from gelflow.train.motion import drawn_motion, moved_flow, moved_images
 
+UNCHANGED = np.array([1, 0, 0, 1, 1, 0, 0, 1, 0, 0, 1, 1, 1, 1, 1], np.float32)
+"""The numbers of `_drawn` that change nothing."""
+
 
 def augmented(batch: dict[str, Any], config: TrainConfig, randoms: Sequence[np.random.Generator]) -> dict[str, Any]:
     """The batch after the augmentation that the configuration asks for.
 
     Args:
-        batch: image1, image2 (B, 3, H, W); perhaps flow (B, 2, H, W) px, NaN where unknown.
+        batch: image1, image2 (B, 3, H, W); bare, whose gels have no pattern; perhaps flow (B, 2, H, W) px, NaN where
+            unknown.
         config: Its `motion`, `flip` and `color_jitter` count.
         randoms: A source of random numbers for each pair.
 
@@ -27,7 +34,8 @@ def augmented(batch: dict[str, Any], config: TrainConfig, randoms: Sequence[np.r
         A new batch; what is not named above is passed on.
     """
     new = dict(batch)
-    numbers = torch.from_numpy(np.stack([_drawn(config, random) for random in randoms]))
+    drawn = [UNCHANGED if bare else _drawn(config, random) for bare, random in zip(batch["bare"], randoms, strict=True)]
+    numbers = torch.from_numpy(np.stack(drawn))
     numbers = numbers.to(batch["image1"], non_blocking=True)
     if config.motion is not None:
         matrices, inverses, shifts = numbers[:, :4].view(-1, 2, 2), numbers[:, 4:8].view(-1, 2, 2), numbers[:, 8:10]

@@ -19,7 +19,8 @@ from gelflow.estimate import resize_flow, resize_images
 from gelflow.train.augment import augmented
 
 Sample = dict[str, Any]
-"""image1, image2: (3, H, W) float32 in [0, 1]; name; perhaps flow: (2, H, W) float32, px, NaN where no gel is seen."""
+"""image1, image2: (3, H, W) float32 in [0, 1]; name; perhaps bare: whether the gel has no pattern; perhaps flow:
+(2, H, W) float32, px, NaN where no gel is seen."""
 
 ORDER, AUGMENTATION = 0, 1
 """What a random stream is for: second word of its seed, after the run's."""
@@ -121,7 +122,7 @@ def checked(sample: Sample, supervised: bool = False) -> Sample:
     if sample["image1"].shape != sample["image2"].shape:
         sizes = [tuple(sample[key].shape[1:]) for key in ("image1", "image2")]
         raise InputError(f"pair {name}: its images have different sizes, {sizes[0]} and {sizes[1]}")
-    kept = {key: sample[key] for key in ("image1", "image2")} | {"name": name}
+    kept = {key: sample[key] for key in ("image1", "image2", "bare") if key in sample} | {"name": name}
     flow = sample.get("flow")
     if flow is not None:
         if flow.shape[1:] != sample["image1"].shape[1:]:
@@ -190,4 +191,5 @@ def collate(samples: list[Sample]) -> Sample:
     keys = ["image1", "image2"] + (["flow"] if all("flow" in sample for sample in samples) else [])
     batch: Sample = {key: torch.stack([sample[key] for sample in samples]) for key in keys}
     batch["name"] = [sample["name"] for sample in samples]
+    batch["bare"] = [bool(sample.get("bare")) for sample in samples]
     return batch

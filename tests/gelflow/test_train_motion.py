@@ -18,7 +18,7 @@ def sample() -> dict:
     flow = torch.stack([0.04 * (y - 48) + 2, -0.03 * (x - 56) - 1])
     image1, image2 = (wave_image(a, b, 3, 12, 30).float() for a, b in ((x + flow[0], y + flow[1]), (x, y)))
     flow[:, :4, :4] = torch.nan
-    return {"image1": image1, "image2": image2, "flow": flow.float(), "name": "one"}
+    return {"image1": image1, "image2": image2, "flow": flow.float(), "name": "one", "bare": False}
 
 
 def moved(before: dict, motion: MotionConfig, seed: int) -> dict:
@@ -49,6 +49,19 @@ def test_no_motion_leaves_everything_as_it_is() -> None:
     # Sampling positions are rounded to 1e-7 of 112 px, the waves' slope is below 0.1 per px.
     torch.testing.assert_close(after["image2"], before["image2"], rtol=0, atol=1e-5)
     torch.testing.assert_close(after["flow"], before["flow"], rtol=0, atol=1e-5, equal_nan=True)
+
+
+def test_a_bare_gel_stays_as_it_is_beside_others() -> None:
+    """Fails with any of motion, flips and colours drawn for it."""
+    bare, dotted = sample() | {"bare": True}, sample()
+    config = TrainConfig(motion=MotionConfig(), flip=True, color_jitter=0.2)
+    for seed in range(4):
+        randoms = [np.random.default_rng(number) for number in (seed, seed + 10)]
+        after = augmented(collate([bare, dotted]), config, randoms)
+        for key in ("image1", "image2", "flow"):
+            # As without motion, above.
+            torch.testing.assert_close(after[key][0], bare[key], rtol=0, atol=1e-5, equal_nan=True)
+            assert not torch.allclose(after[key][1], dotted[key], atol=0.01, equal_nan=True)
 
 
 def test_training_draws_it_where_the_configuration_asks_for_it() -> None:
