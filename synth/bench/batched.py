@@ -46,6 +46,7 @@ def measure(
     forcing: float = DRIVER.forcing,
     inner: int = INNER,
     loose: float = DRIVER.loose,
+    closer: float = DRIVER.closer,
     step_mm: float | None = None,
     seed: int = 0,
     radii_mm: Sequence[float] = RADII_MM,
@@ -62,6 +63,7 @@ def measure(
         forcing: relative residual that ends a linear solve, at most.
         inner: Krylov iterations of a cycle.
         loose: tolerance of Newton's method on the way to a recorded state.
+        closer: tolerance of corrections over the scenes'.
         step_mm: longest load step; default the scenes'.
         seed: of the draws.
         radii_mm: of the balls, smallest and largest.
@@ -70,7 +72,7 @@ def measure(
     draws = [ball_scene(rng, depth_mm, drag_mm, steps, radii_mm) for _ in range(max(DRAWS, batch))]
     began = time.perf_counter()
     order = cycle(range(len(draws)))
-    driver = replace(DRIVER, forcing=forcing, loose=loose)
+    driver = replace(DRIVER, forcing=forcing, loose=loose, closer=closer)
     numerics = draws[0].numerics.model_copy(update={} if step_mm is None else {"max_step_mm": step_mm})
     run = Run(jobs_of(draws, pad), pad, numerics, driver, None, batch, order, inner)
     for _ in range(2):  # with all slots empty: compiles the kernels and captures the graph
@@ -163,6 +165,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--steps", type=int, default=1, help="recorded states")
     parser.add_argument("--forcing", type=float, default=DRIVER.forcing, help="of linear solves: relative residual")
     parser.add_argument("--loose", type=float, default=DRIVER.loose, help="Newton's tolerance on the way")
+    parser.add_argument("--closer", type=float, default=DRIVER.closer, help="tolerance of corrections over the scene's")
     parser.add_argument("--step", type=float, help="mm; longest load step, default as in scenes")
     parser.add_argument("--inner", type=int, default=INNER, help="Krylov iterations of a cycle")
     parser.add_argument("--radii", type=float, nargs=2, default=list(RADII_MM), help="mm; of the balls")
@@ -180,7 +183,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     prepared = round(time.perf_counter() - began, 2)
     for batch in given.batch:
         path = (given.depth, given.drag, given.steps)
-        way = (given.forcing, given.inner, given.loose, given.step)
+        way = (given.forcing, given.inner, given.loose, given.closer, given.step)
         found = measure(pad, batch, given.seconds, *path, *way, radii_mm=given.radii)
         kernels = found["profile"].pop("kernels")
         print(json.dumps({**vars(given), **found, "prepare_s": prepared}), flush=True)

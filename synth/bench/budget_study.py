@@ -58,8 +58,8 @@ class Reference:
             power 1.6 of their size: a quarter of the chosen mesh's error is left.
         beside: elements beside it, along x and along y; three and two on the ladder.
         step_mm: longest load step.
-        correction_iterations: of Newton's method in one augmented-Lagrangian pass; with a draw's fewer, some passes
-            are dropped.
+        correction_iterations: of Newton's method in one augmented-Lagrangian pass, more near balance; with a draw's
+            fewer, some passes are dropped.
     """
 
     across: int = 18

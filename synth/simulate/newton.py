@@ -21,7 +21,9 @@ LOOSE = 1e-5
 """A tolerance above it is reached with rough directions."""
 NEAR = 1e-2
 """Relative residual below which a smaller tolerance is approached with exact directions: the last iterations then
-surpass it by as much as ever. Above, changes of the contact set count for more than 1 % of a direction."""
+surpass it by as much as ever. Above, changes of the contact set count for more than 1 % of a direction. Below it, a
+solve may also take up to twice its iterations: whether the last of them just met the tolerance, rounding would decide,
+and a pass that is given up leads to another balance."""
 SHORTEST = 1 / 1024
 """Shortest step of the line search."""
 NOTHING = 1e-6
@@ -82,21 +84,23 @@ def solve(
         indenters: where they are.
         active: (B,) bool.
         tolerance: (B,) of `relative_residual`.
-        limit: most iterations.
+        limit: most iterations; twice as many where the balance is near.
         reach_mm: (B,) farthest that a node may go from the first iterate; a sample that goes farther has not converged.
     """
     state, balance = start, system.balance(start, indenters, active)
     running = active & (balance.smallest_jacobian > 0)
     converged = np.zeros_like(active)
     iterations = np.zeros(len(active), dtype=int)
-    for iteration in range(limit + 1):
+    for iteration in range(2 * limit + 1):
         relative = relative_residual(balance)
         done = running & (relative <= tolerance) & ((iterations > 0) | (relative == 0))
         converged |= done
         running &= ~done & np.isfinite(relative)
         if iteration >= 5:
             running &= relative < 0.5
-        if iteration == limit or not running.any():
+        if iteration >= limit:
+            running &= relative <= NEAR
+        if iteration == 2 * limit or not running.any():
             break
         tangent = system.tangent(state, indenters, running)
         rough = (iteration < PATIENCE) & ((tolerance > LOOSE) | (relative > NEAR))

@@ -28,7 +28,7 @@ def sliding(body: dict[str, Any]) -> Scene:
 def test_a_pass_that_goes_too_far_is_given_up() -> None:
     """As soon as it does; what is taken has stayed within reach, and the other passes take penetration away."""
     # Fails with `too_far` left out of `judge`, with the distance from another place than the last solution, with a
-    # reach that is not renewed for each pass, and with CLOSER = 1.
+    # reach that is not renewed for each pass, and with closer = 1.
     posed = sliding(BOX)
     pad = prepare(posed, brick(counts=(4, 4, 2)), "cpu")
     run = Run(jobs_of([posed], pad), pad, posed.numerics, STRICT, None, 1)

@@ -77,7 +77,7 @@ def test_multipliers_are_updated_from_tight_states(monkeypatch: pytest.MonkeyPat
 
 
 class Losing:
-    """Newton's method for the stepper, which ends `most` polishes of the first sample after three iterations."""
+    """Newton's method for the stepper, which ends `most` polishes of the first sample after three to six iterations."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, most: int, polish: str = "before the passes") -> None:
         self.lost, self._most = 0, most

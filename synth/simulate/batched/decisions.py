@@ -1,7 +1,7 @@
 """What happens next to a slot, as Warp kernels of one thread a slot.
 
 The rules are those of `synth.simulate.newton` and `synth.simulate.stepping`, whose constants they use; what differs
-is that each slot follows them at its own pace, that passes are solved to CLOSER of the full tolerance, and that where
+is that each slot follows them at its own pace, that passes are solved to a share of the full tolerance, and that where
 the way is loose the full tolerance holds for what is recorded only. A step that ends at a recorded state, and every
 pass but the last, is then solved as loosely as the way is: what they find is changed by the next pass. A state without
 passes, or whose passes end early, because they fail or nothing is deep any more, is brought to the full tolerance
@@ -63,16 +63,13 @@ FAILURES = wp.constant(stepping.FAILURES)
 ENOUGH = wp.constant(wp.float64(stepping.ENOUGH))
 PENETRATION = wp.constant(wp.float64(stepping.PENETRATION))
 REACH = wp.constant(wp.float64(stepping.REACH))
-CLOSER = wp.constant(wp.float64(0.1))
-"""Tolerance of a pass over the full one. Passes find what is recorded, and where most of a contact slips a residual
-of 1e-6 can be 1e-4 in displacement: two devices that end one iteration apart then differ by as much. 0.1 costs a press
-0.7 % more cycles, 0.01 costs 2.5 % (eight balls, 8 x 6 x 2 elements)."""
 TIGHTEST = wp.constant(wp.float64(1.0e-12))
 """Of a pass; rounding alone leaves some 1e-13."""
 DECREASE = wp.constant(wp.float64(1.0e-4))
 LATE = wp.constant(5)
 HOPELESS = wp.constant(wp.float64(0.5))
 """Newton's method ends after LATE iterations where the relative residual is still so large."""
+NEAR = wp.constant(wp.float64(newton.NEAR))
 
 
 @wp.kernel
@@ -114,13 +111,15 @@ def judge(slots: Slots, settings: Settings):
     slots.relative[s] = relative
     slots.jacobian[s] = slots.trial_jacobian[s]
     iteration = slots.iteration[s]
+    limit = slots.limit[s]
+    spent = iteration == 2 * limit or (iteration >= limit and relative > NEAR)
     if phase == REPAIR:
         slots.phase[s] = PASSING
     elif too_far:
         slots.phase[s] = LOST
     elif relative <= slots.tolerance[s] and (iteration > 0 or relative == ZERO):
         slots.phase[s] = SOLVED
-    elif (not wp.isfinite(relative)) or (iteration >= LATE and relative >= HOPELESS) or iteration == slots.limit[s]:
+    elif (not wp.isfinite(relative)) or (iteration >= LATE and relative >= HOPELESS) or spent:
         slots.phase[s] = LOST
     else:
         slots.phase[s] = READY
@@ -217,7 +216,7 @@ def choose_pass(slots: Slots, jobs: Jobs, settings: Settings):
         slots.stage[s] = PASS
         slots.most_moved[s] = REACH * slots.deepest[s]
         slots.limit[s] = settings.correction_limit
-        slots.tolerance[s] = wp.max(CLOSER * settings.tolerance, TIGHTEST)
+        slots.tolerance[s] = wp.max(settings.closer * settings.tolerance, TIGHTEST)
         if slots.done[s] + slots.share[s] < ENOUGH:
             slots.tolerance[s] = wp.max(settings.loose, slots.tolerance[s])
     slots.iteration[s] = 0

@@ -63,7 +63,7 @@ class Run:
         settings = phases.Settings()
         settings.tolerance, settings.loose = numerics.tolerance, driver.loose
         settings.longest, settings.extrapolate = numerics.max_step_mm, int(driver.extrapolate)
-        settings.forcing = driver.forcing
+        settings.forcing, settings.closer = driver.forcing, driver.closer
         settings.limit, settings.correction_limit = MAX_ITERATIONS, driver.correction_iterations
         records = max(len(job.path.records()) for job in jobs)
         self.machine = Machine(pad, batch, records, grid, settings, numerics.penalty, inner)

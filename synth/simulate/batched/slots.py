@@ -159,6 +159,7 @@ class Settings:
 
     tolerance: wp.float64
     loose: wp.float64
+    closer: wp.float64
     longest: wp.float64
     limit: int
     correction_limit: int
