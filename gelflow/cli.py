@@ -39,9 +39,7 @@ Config = Annotated[
 ]
 ShippedOrFile = Annotated[
     Path | None,
-    Parameter(
-        help="File of weights, or the name of shipped ones: best, digit (bare gels of that scene). Default: best."
-    ),
+    Parameter(help="File of weights; default: those that come with the package, best."),
 ]
 Steps = Annotated[int | None, Parameter(help="Optimiser steps.")]
 Resume = Annotated[bool, Parameter(negative=(), help="Go on with the run that --out holds.")]
@@ -135,7 +133,7 @@ def compare(
     weights: Annotated[
         list[str] | None,
         Parameter(
-            help="FILE or LABEL=FILE of a network: GelFlow (.safetensors; best, digit: ours) or RAFT (.pth); "
+            help="FILE or LABEL=FILE of a network: GelFlow (.safetensors; best: ours) or RAFT (.pth); "
             "repeatable. Labels that differ after # alone (best#0, best#1) are seeds: one row, mean and standard "
             "deviation."
         ),
@@ -205,7 +203,7 @@ def predict(
 
 @app.command
 def export(
-    weights: Annotated[Path, Parameter(help="File of weights, or the name of shipped ones: best, digit.")],
+    weights: Annotated[Path, Parameter(help="File of weights; best: those that come with the package.")],
     /,
     *,
     out: Annotated[Path, Parameter(help="File to write, ending in .onnx.")],

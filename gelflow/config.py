@@ -36,8 +36,11 @@ class RegistrationConfig(_Frozen):
     background_px: float | None = Field(default=4.0, gt=0)
     """The residual counts without its mean under a Gaussian of this standard deviation, px: shading does not move with
     the gel. None: as it is, flow that explains shading, too."""
+    noise: float = Field(default=0.04, gt=0)
+    """Standard deviation that the residual has at least in each colour, of a white of 1: the camera's noise, and what
+    shading changes. The larger, the more texture a window needs before it outweighs the network."""
     propagation_px: tuple[Annotated[int, Field(ge=1)], ...] = ()
-    """Distances of the neighbours whose flow is tried before the first stage, under its window; none: no such step."""
+    """Distances of the neighbours whose flow is tried before each stage, under its window; none: no such step."""
 
     @model_validator(mode="after")
     def _has_stages(self) -> RegistrationConfig:
@@ -56,7 +59,7 @@ REGISTRATIONS: dict[Registration, RegistrationConfig | None] = {
     "motion": RegistrationConfig(),
     "brightness": RegistrationConfig(
         windows_px=(12.0, 6.0, 3.0, 1.0), smoothing_px=(4.0, 2.0, 1.0, 0.0), iterations=4, prior_px=1.0,
-        background_px=None, propagation_px=(8, 16, 32),
+        background_px=None, noise=0.01, propagation_px=(8, 16, 32),
     ),
 }  # fmt: skip
 """Nothing, what measures the gel's motion best, and what brings image 2 closest to image 1."""
@@ -220,12 +223,13 @@ class TrainConfig(_Frozen):
     """Rows and columns of a random crop taken after resizing, for training only; None: the whole image. Cuts the time
     of a step without changing the scale of the pattern."""
     flip: bool = True
-    """Random horizontal and vertical flips. The paper is silent on augmentation."""
+    """Random horizontal and vertical flips, but for bare gels. The paper is silent on augmentation."""
     color_jitter: float = Field(default=0.0, ge=0, le=0.5)
-    """Standard deviation of the logarithm of a random gain per colour channel, common to both images of a pair."""
+    """Standard deviation of the logarithm of a random gain per colour channel, common to both images of a pair; bare
+    gels keep their colours."""
     motion: MotionConfig | None = None
-    """Motion added to each pair, for a network that meets larger motions than its training pairs show; None: none (the
-    paper is silent)."""
+    """Motion added to each pair but those of bare gels, for a network that meets larger motions than its training pairs
+    show; None: none (the paper is silent)."""
     batch_size: int = Field(default=4, ge=1)
     """Pairs per step and device. Paper: 4."""
     steps: int = Field(default=66_400, ge=1)

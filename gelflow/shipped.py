@@ -3,16 +3,15 @@
 from importlib.resources import files
 from pathlib import Path
 
-SHIPPED = ("best", "digit")
+SHIPPED = "best"
 
 
 def weights_file(given: Path | None) -> Path:
     """The file of weights that is meant.
 
     Args:
-        given: A file, or the name of shipped weights where there is no such file; None: the default, "best".
+        given: A file; "best", where there is no such file, and None: those that come with the package.
     """
-    name = "best" if given is None else str(given)
-    if name in SHIPPED and not Path(name).is_file():
-        return Path(str(files("gelflow"))) / "weights" / f"{name}.safetensors"
-    return Path(name)
+    if given is None or (str(given) == SHIPPED and not given.is_file()):
+        return Path(str(files("gelflow"))) / "weights" / f"{SHIPPED}.safetensors"
+    return given

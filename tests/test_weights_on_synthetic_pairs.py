@@ -1,4 +1,4 @@
-"""The shipped weights on pairs that synth simulates and renders: what each was trained for, it finds."""
+"""The shipped weights on pairs that synth simulates and renders, with a pattern and without."""
 
 from pathlib import Path
 
@@ -14,10 +14,10 @@ from synth.template import load_scene
 QUICK = ["sampling.pairs_per_trajectory=3", "numerics.target_error_px=2.0", "outputs.backward=false"]
 
 
-@pytest.mark.parametrize(("weights", "scene", "share"), [("digit", "digit", 0.5), ("best", "gelsight_mini", 0.2)])
-def test_they_find_what_moved(weights: str, scene: str, share: float, tmp_path: Path) -> None:
-    """Endpoint error as a share of the motion: 0.26 and 0.05. Fails with `best` on `digit`: 1.25."""
+@pytest.mark.parametrize(("scene", "share"), [("digit", 0.5), ("gelsight_mini", 0.2)])
+def test_they_find_what_moved(scene: str, share: float, tmp_path: Path) -> None:
+    """Endpoint error as a share of the motion: 0.28 and 0.05. Fails with weights that saw little of `digit`: 1.25."""
     generate(load_scene(scene, QUICK), 6, tmp_path / "pairs", seed=4)
     pairs = open_pairs(tmp_path / "pairs")
-    scores = evaluate(Learned(weights_file(Path(weights)), device="cpu"), pairs)
+    scores = evaluate(Learned(weights_file(None), device="cpu"), pairs)
     assert sum(score.endpoint_error_px for score in scores) < share * sum(score.motion_px for score in scores)

@@ -44,7 +44,7 @@ def propagated(
         second: Image 2, the same shape.
         window: w.
         distances: Of the neighbours, px, each in eight directions.
-        noise: Standard deviation of a camera's noise; where the residual is below twice that, the flow stays.
+        noise: Standard deviation of the residual that is believed; where it is below twice that, the flow stays.
 
     Returns:
         Same shape; every vector is one of `flow`.

@@ -6,14 +6,14 @@ network is wrong by some ``p`` px:
 
     sum_y w(y - x) |F2(y + U + d) - F1(y)|^2 / s^2 + |d|^2 / p^2  ->  min,
 
-``s^2`` the variance of the residual in the window, at least that of a camera's noise. Where the window holds no
-texture, the flow remains the network's. F are the colours; with `background_px`, the residual is taken without its mean
-over a neighbourhood of that width, so that shading, which does not move with the gel, does not count. Without, and with
-a wide ``p``, the images' difference is what is minimised, whatever it comes from: a high PSNR, and a flow that follows
-shading.
+``s^2`` the variance of the residual in the window and, added to it, that of `noise`: the camera's, and what shading
+changes. Where the window holds no texture, the flow remains the network's. F are the colours; with `background_px`, the
+residual is taken without its mean over a neighbourhood of that width, so that shading, which does not move with the
+gel, does not count. Without, and with a wide ``p``, the images' difference is what is minimised, whatever it comes
+from: a high PSNR, and a flow that follows shading.
 
 It stays in the basin that it starts in: dots that the network took for their neighbours stay so. With `propagation_px`,
-neighbours' flows are tried first (`gelflow.models.propagation`).
+each stage tries neighbours' flows first (`gelflow.models.propagation`).
 
 Lucas and Kanade 1981, with a prior (Simoncelli, Adelson and Heeger, "Probability distributions of optical flow", 1991);
 smoothing the field between the steps: Thirion's demons, 1998.
@@ -29,8 +29,6 @@ from gelflow.ops.gaussian import Smoother, WindowSums
 from gelflow.ops.spline import SplineImage
 from gelflow.ops.warp import inside, positions
 
-NOISE = 0.01
-"""Standard deviation of a camera's noise in each colour, of a white of 1: the least residual that is believed."""
 LARGEST_STEP_PX = 1.0
 """Limit on a Gauss-Newton step of each component."""
 TINY = 1e-6
@@ -53,16 +51,15 @@ def registered(flow: Flow, image1: Images, image2: Images, config: RegistrationC
         flow, first, second = flow.float(), image1.float(), SplineImage(image2.float())
         width = config.background_px
         background = None if width is None else WindowSums(*size, width, flow)
-        if config.propagation_px:
-            window = WindowSums(*size, config.windows_px[0], flow)
-            flow = propagated(flow, first, second, window, config.propagation_px, NOISE)
         for window_px, smoothing_px in zip(config.windows_px, config.smoothing_px, strict=True):
             window = WindowSums(*size, window_px, flow)
+            if config.propagation_px:
+                flow = propagated(flow, first, second, window, config.propagation_px, config.noise)
             start = Smoother(*size, smoothing_px, flow)(flow)
             flow = start
             for _ in range(config.iterations):
-                residual, across, down, counts = _evidence(flow, first, second, background)
-                step = _posterior(residual, across, down, counts, flow - start, window, config.prior_px)
+                evidence = _evidence(flow, first, second, background)
+                step = _posterior(*evidence, flow - start, window, config.prior_px, config.noise)
                 flow = flow + step.clamp(-LARGEST_STEP_PX, LARGEST_STEP_PX)
     return flow
 
@@ -82,13 +79,20 @@ def _evidence(
 
 
 def _posterior(
-    residual: Features, across: Features, down: Features, counts: Tensor, so_far: Flow, window: WindowSums, prior: float
+    residual: Features,
+    across: Features,
+    down: Features,
+    counts: Tensor,
+    so_far: Flow,
+    window: WindowSums,
+    prior: float,
+    noise: float,
 ) -> Flow:
     """The Gauss-Newton step (B, 2, H, W): the solution of a system of two equations at each pixel."""
     products = ((across, across), (across, down), (down, down), (across, residual), (down, residual), (residual,) * 2)
     moments = torch.cat([*((one * other).sum(dim=1, keepdim=True) for one, other in products), counts], dim=1)
     xx, xy, yy, xr, yr, rr, pixels = window(moments).split(1, dim=1)
-    variance = rr / (residual.shape[1] * pixels).clamp(min=TINY) + NOISE**2
+    variance = rr / (residual.shape[1] * pixels).clamp(min=TINY) + noise**2
     weight = variance / prior**2
     xx, yy = xx + weight, yy + weight
     u, v = (-torch.cat([xr, yr], dim=1) - weight * so_far).split(1, dim=1)

@@ -1,7 +1,7 @@
 """Augmentation of whole batches, on whatever device they are: motion, flips, colours.
 
-Bare gels are left as they are: what is read from them is shading, and it is where the lights are that gives slopes
-their colours. Moved, flipped or in other colours they would be pictures of no sensor.
+Synthetic pairs of bare gels are neither moved nor flipped nor recoloured: what is read from them is shading, and it is
+where the lights are that gives slopes their colours. Changed so they would be pictures of no sensor.
 
 Each pair has its own random numbers. They are drawn on the CPU and travel in one copy that nobody waits for, so that a
 GPU need not finish a step before the CPU prepares the next.
