@@ -41,6 +41,8 @@ class RegistrationConfig(_Frozen):
     shading changes. The larger, the more texture a window needs before it outweighs the network."""
     propagation_px: tuple[Annotated[int, Field(ge=1)], ...] = ()
     """Distances of the neighbours whose flow is tried before each stage, under its window; none: no such step."""
+    after: RegistrationConfig | None = None
+    """Registration that comes before the stages. Its flow stays where it leaves a residual below its `noise`."""
 
     @model_validator(mode="after")
     def _has_stages(self) -> RegistrationConfig:
@@ -59,10 +61,10 @@ REGISTRATIONS: dict[Registration, RegistrationConfig | None] = {
     "motion": RegistrationConfig(),
     "brightness": RegistrationConfig(
         windows_px=(12.0, 6.0, 3.0, 1.0), smoothing_px=(4.0, 2.0, 1.0, 0.0), iterations=4, prior_px=1.0,
-        background_px=None, noise=0.01, propagation_px=(8, 16, 32),
+        background_px=None, noise=0.01, propagation_px=(8, 16, 32), after=RegistrationConfig(),
     ),
 }  # fmt: skip
-"""Nothing, what measures the gel's motion best, and what brings image 2 closest to image 1."""
+"""Nothing; what measures the gel's motion best; that, and where it leaves much, what brings the images closest."""
 
 
 class ModelConfig(_Frozen):

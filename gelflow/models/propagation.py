@@ -22,7 +22,7 @@ from torch.nn.functional import pad
 from gelflow.arrays import Flow, Images
 from gelflow.ops.gaussian import WindowSums
 from gelflow.ops.spline import SplineImage
-from gelflow.ops.warp import inside, positions
+from gelflow.ops.warp import inside_at, positions
 
 DIRECTIONS = ((-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (1, 1), (-1, 1), (1, -1))
 ROUNDS = 2
@@ -53,8 +53,9 @@ def propagated(
 
     def residual(candidate: Flow) -> Tensor:
         """E, (B, 1, H, W); infinite where too little of the window is in the image."""
-        counts = inside(candidate)
-        squares = counts * (second.at(*positions(candidate)) - first).square().mean(dim=1, keepdim=True)
+        places = positions(candidate)
+        counts = inside_at(places)
+        squares = counts * (second.at(places) - first).square().mean(dim=1, keepdim=True)
         weighed, weight = window(torch.cat([squares, counts], dim=1)).split(1, dim=1)
         return torch.where(weight > SHARE_INSIDE * whole, weighed / weight, torch.inf)
 

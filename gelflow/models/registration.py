@@ -13,7 +13,9 @@ gel, does not count. Without, and with a wide ``p``, the images' difference is w
 from: a high PSNR, and a flow that follows shading.
 
 It stays in the basin that it starts in: dots that the network took for their neighbours stay so. With `propagation_px`,
-each stage tries neighbours' flows first (`gelflow.models.propagation`).
+each stage tries neighbours' flows first (`gelflow.models.propagation`). With `after`, another registration comes before
+all stages, and its flow stays wherever what it leaves between the images is below its `noise`: so registration for
+brightness keeps the motion of whatever motion explains.
 
 Lucas and Kanade 1981, with a prior (Simoncelli, Adelson and Heeger, "Probability distributions of optical flow", 1991);
 smoothing the field between the steps: Thirion's demons, 1998.
@@ -27,11 +29,13 @@ from gelflow.config import RegistrationConfig
 from gelflow.models.propagation import propagated
 from gelflow.ops.gaussian import Smoother, WindowSums
 from gelflow.ops.spline import SplineImage
-from gelflow.ops.warp import inside, positions
+from gelflow.ops.warp import inside_at, positions
 
 LARGEST_STEP_PX = 1.0
 """Limit on a Gauss-Newton step of each component."""
 TINY = 1e-6
+EXPLAINED_PX, EDGE_PX = 6.0, 2.0
+"""Standard deviations of the window that judges a flow which came first, and of that which joins it to the rest."""
 
 
 def registered(flow: Flow, image1: Images, image2: Images, config: RegistrationConfig) -> Flow:
@@ -49,6 +53,9 @@ def registered(flow: Flow, image1: Images, image2: Images, config: RegistrationC
     size = (flow.shape[-2], flow.shape[-1])
     with torch.no_grad(), torch.autocast(flow.device.type, enabled=False):
         flow, first, second = flow.float(), image1.float(), SplineImage(image2.float())
+        settled = flow
+        if config.after is not None:
+            settled = flow = registered(flow, image1, image2, config.after)
         width = config.background_px
         background = None if width is None else WindowSums(*size, width, flow)
         for window_px, smoothing_px in zip(config.windows_px, config.smoothing_px, strict=True):
@@ -61,18 +68,34 @@ def registered(flow: Flow, image1: Images, image2: Images, config: RegistrationC
                 evidence = _evidence(flow, first, second, background)
                 step = _posterior(*evidence, flow - start, window, config.prior_px, config.noise)
                 flow = flow + step.clamp(-LARGEST_STEP_PX, LARGEST_STEP_PX)
+        if config.after is not None:
+            flow = torch.lerp(settled, flow, _unexplained(settled, first, second, config.after.noise))
     return flow
+
+
+def _unexplained(flow: Flow, first: Images, second: SplineImage, noise: float) -> Tensor:
+    """1 where a flow leaves more than noise between the images, 0 where not, between them at an edge; (B, 1, H, W).
+
+    A flow that leaves the image is judged by what `SplineImage` goes on with there.
+    """
+    size = (flow.shape[-2], flow.shape[-1])
+    squares = (second.at(positions(flow)) - first).square().mean(dim=1, keepdim=True)
+    window, edge = WindowSums(*size, EXPLAINED_PX, flow), WindowSums(*size, EDGE_PX, flow)
+    all_of_it = torch.ones_like(squares)
+    left = (window(squares) > noise**2 * window(all_of_it)).float()
+    return edge(left) / edge(all_of_it)
 
 
 def _evidence(
     flow: Flow, first: Images, second: SplineImage, background: WindowSums | None
 ) -> tuple[Features, Features, Features, Tensor]:
     """Residual and its derivatives along x and y, (B, C, H, W); 1 where the flow stays in the image and they count."""
-    counts = inside(flow)
-    moved = second.at(*positions(flow))
+    places = positions(flow)
+    counts, moved = inside_at(places), second.at(places)
     residual = counts * (moved - first)
     if background is not None:
-        residual = counts * (residual - background(residual) / background(counts).clamp(min=TINY))
+        mean, weight = background(torch.cat([residual, counts], dim=1)).split([residual.shape[1], 1], dim=1)
+        residual = counts * (residual - mean / weight.clamp(min=TINY))
     # The mean of both images' gradients converges from further away than either alone.
     across, down = torch.gradient((moved + first) / 2, dim=(-1, -2))
     return residual, counts * across, counts * down, counts
@@ -89,9 +112,11 @@ def _posterior(
     noise: float,
 ) -> Flow:
     """The Gauss-Newton step (B, 2, H, W): the solution of a system of two equations at each pixel."""
-    products = ((across, across), (across, down), (down, down), (across, residual), (down, residual), (residual,) * 2)
-    moments = torch.cat([*((one * other).sum(dim=1, keepdim=True) for one, other in products), counts], dim=1)
-    xx, xy, yy, xr, yr, rr, pixels = window(moments).split(1, dim=1)
+    three = torch.stack([across, down, residual], dim=1)
+    products = torch.cat(
+        [across.unsqueeze(1) * three, down.unsqueeze(1) * three[:, 1:], residual.square().unsqueeze(1)], dim=1
+    )
+    xx, xy, xr, yy, yr, rr, pixels = window(torch.cat([products.sum(dim=2), counts], dim=1)).split(1, dim=1)
     variance = rr / (residual.shape[1] * pixels).clamp(min=TINY) + noise**2
     weight = variance / prior**2
     xx, yy = xx + weight, yy + weight

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gelflow.arrays import Features
+from gelflow.ops.kept import kept
 
 
 class WindowSums:
@@ -23,9 +24,7 @@ class WindowSums:
     """
 
     def __init__(self, rows: int, columns: int, deviation: float, like: Tensor) -> None:
-        self._y, self._x = (
-            _window(pixels, 0, deviation, math.ceil(3 * deviation), like).to(like) for pixels in (rows, columns)
-        )
+        self._y, self._x = (_sums(pixels, deviation, like.dtype, like.device) for pixels in (rows, columns))
 
     def __call__(self, field: Features) -> Features:
         """The sums of each channel of (B, C, H, W), same shape."""
@@ -46,28 +45,26 @@ class Smoother:
     """
 
     def __init__(self, rows: int, columns: int, deviation: float, like: Tensor) -> None:
-        self._y, self._x = (_mean(pixels, deviation, like).to(like) for pixels in (rows, columns))
+        self._y, self._x = (_mean(pixels, deviation, like.dtype, like.device) for pixels in (rows, columns))
 
     def __call__(self, field: Features) -> Features:
         """The means of each channel of (B, C, H, W), same shape."""
         return self._y @ field @ self._x.T
 
 
-def _window(pixels: int, beyond: int, deviation: float, reach: int, like: Tensor) -> Tensor:
-    """exp(-d² / 2 s²) of the distance d of pixels and positions up to `beyond` outside, (n, n + 2 beyond), float64."""
-    place = torch.arange(-beyond, pixels + beyond, device=like.device)
-    distance = place[beyond : beyond + pixels].view(-1, 1) - place.view(1, -1)
-    weight = torch.exp(-torch.arange(pixels + 2 * beyond, device=like.device).double().square() / (2 * deviation**2))
-    weight[reach + 1 :] = 0.0
-    return weight[distance.abs()]
+@kept
+def _sums(pixels: int, deviation: float, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Matrix (n, n) of the sums along one axis."""
+    return _window(pixels, 0, deviation, math.ceil(3 * deviation)).to(device, dtype)
 
 
-def _mean(pixels: int, deviation: float, like: Tensor) -> Tensor:
-    """Matrix (n, n) of the mean along one axis, float64."""
+@kept
+def _mean(pixels: int, deviation: float, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Matrix (n, n) of the mean along one axis."""
     if deviation == 0:
-        return torch.eye(pixels, dtype=torch.float64, device=like.device)
+        return torch.eye(pixels, dtype=dtype, device=device)
     beyond = min(math.ceil(3 * deviation), pixels - 1)
-    weight = _window(pixels, beyond, deviation, beyond, like)
+    weight = _window(pixels, beyond, deviation, beyond)
     before, matrix, after = (weight / weight.sum(dim=1, keepdim=True)).split([beyond, pixels, beyond], dim=1)
     # F(-k) = 2 F(0) - F(k), and the same at the other end.
     matrix = matrix.clone()
@@ -75,4 +72,13 @@ def _mean(pixels: int, deviation: float, like: Tensor) -> Tensor:
     matrix[:, -1] += 2 * after.sum(dim=1)
     matrix[:, 1 : beyond + 1] -= before.flip(1)
     matrix[:, -beyond - 1 : -1] -= after.flip(1)
-    return matrix
+    return matrix.to(device, dtype)
+
+
+def _window(pixels: int, beyond: int, deviation: float, reach: int) -> Tensor:
+    """exp(-d² / 2 s²) of the distance d of pixels and positions up to `beyond` outside, (n, n + 2 beyond), float64."""
+    place = torch.arange(-beyond, pixels + beyond)
+    distance = place[beyond : beyond + pixels].view(-1, 1) - place.view(1, -1)
+    weight = torch.exp(-torch.arange(pixels + 2 * beyond).double().square() / (2 * deviation**2))
+    weight[reach + 1 :] = 0.0
+    return weight[distance.abs()]

@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gelflow.arrays import Features
+from gelflow.ops.kept import kept
 
 MARGIN = 2
 """Coefficients beyond each border: a cubic B-spline reaches two px."""
@@ -33,52 +34,65 @@ class SplineImage:
     def __init__(self, image: Features) -> None:
         height, width = image.shape[-2:]
         with torch.autocast(image.device.type, enabled=False):  # bfloat16 keeps three digits
-            coefficients = _prefilter(height, image) @ image @ _prefilter(width, image).T
+            rows, columns = (_prefilter(pixels, image.dtype, image.device) for pixels in (height, width))
+            coefficients = rows @ image @ columns.T
         self._coefficients = F.pad(coefficients, (MARGIN,) * 4, mode="reflect")
         self._size = (height, width)
 
-    def at(self, x: Tensor, y: Tensor) -> Features:
+    def at(self, places: Tensor) -> Features:
         """The image at places in it; outside, the nearest value of its border.
 
         Args:
-            x: (B, H', W'), finite, px from the centre of the first pixel.
-            y: The same shape.
+            places: (B, 2, H', W'), x and y, finite, px from the centre of the first pixel.
 
         Returns:
             (B, C, H', W').
         """
         height, width = self._size
-        across, down = _linear_taps(x.clamp(0, width - 1)), _linear_taps(y.clamp(0, height - 1))
-        samples = [((u * v).unsqueeze(1), self._bilinear(left, top)) for u, left in across for v, top in down]
-        return torch.stack([share * value for share, value in samples]).sum(dim=0)
+        x, y = places[:, 0].clamp(0, width - 1), places[:, 1].clamp(0, height - 1)
+        weights, taps = _linear_taps(torch.stack([x, y], dim=1))
+        shares = weights[:, :, 1].unsqueeze(2) * weights[:, :, 0].unsqueeze(1)
+        sampled = self._bilinear(taps[:, :, 0], taps[:, :, 1])
+        return (sampled * shares.flatten(1, 2).unsqueeze(1)).sum(dim=2)
 
     def _bilinear(self, x: Tensor, y: Tensor) -> Features:
+        """At all pairs of two x and two y of each place, both (B, 2, H', W'): (B, C, 4, H', W'), y by y."""
         height, width = self._coefficients.shape[-2:]
-        grid = torch.stack([(2 * (x + MARGIN) + 1) / width - 1, (2 * (y + MARGIN) + 1) / height - 1], dim=-1)
-        return F.grid_sample(self._coefficients, grid, mode="bilinear", align_corners=False)
+        batch, _, rows, columns = x.shape
+        across = (2 / width) * x + ((2 * MARGIN + 1) / width - 1)
+        down = (2 / height) * y + ((2 * MARGIN + 1) / height - 1)
+        all_pairs = (batch, 2, 2, rows, columns)
+        grid = torch.stack([across.unsqueeze(1).expand(all_pairs), down.unsqueeze(2).expand(all_pairs)], dim=-1)
+        sampled: Tensor = F.grid_sample(
+            self._coefficients, grid.view(batch, 4 * rows, columns, 2), mode="bilinear", align_corners=False
+        )
+        return sampled.unflatten(2, (4, rows))
 
 
-def _prefilter(pixels: int, like: Tensor) -> Tensor:
+@kept
+def _prefilter(pixels: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Matrix (n, n) from samples to the coefficients of the spline through them.
 
     Beyond the border lies the image mirrored, and so on with a period of P = 2 n - 2: a pixel counts at all distances
     ``d - m P``, together ``(z^d + z^(P - d)) / (1 - z^P)``, and once more for its mirror image.
     """
     period = 2 * pixels - 2
-    distance = torch.arange(period + 1, dtype=torch.float64, device=like.device)
+    distance = torch.arange(period + 1, dtype=torch.float64)
     response = math.sqrt(3) * (POLE**distance + POLE ** (period - distance)) / (1 - POLE**period)
-    place = torch.arange(pixels, device=like.device)
+    place = torch.arange(pixels)
     direct = response[(place.view(-1, 1) - place).abs()]
     mirrored = response[place.view(-1, 1) + place]
     mirrored = torch.where((place == 0) | (place == pixels - 1), 0.0, mirrored)
-    return (direct + mirrored).to(like)
+    return (direct + mirrored).to(device, dtype)
 
 
-def _linear_taps(place: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Weights and places of two linear interpolations that add up to the four weights of the B-spline."""
-    first = place.floor()
-    t = place - first
-    before, here = (1 - t) ** 3 / 6, (4 - 6 * t**2 + 3 * t**3) / 6
-    after, last = (4 - 6 * (1 - t) ** 2 + 3 * (1 - t) ** 3) / 6, t**3 / 6
-    left, right = before + here, after + last
-    return [(left, first - 1 + here / left), (right, first + 1 + last / right)]
+def _linear_taps(places: Tensor) -> tuple[Tensor, Tensor]:
+    """Weights and places, each (B, 2, ...), of two linear interpolations that make the four weights of the B-spline."""
+    first = places.floor()
+    t = places - first
+    square = t * t
+    # Six times the weights at first - 1 and first together, of `first` alone, and at first + 2.
+    left, here, last = ((2 * t - 3) * t - 3) * t + 5, (3 * t - 6) * square + 4, square * t
+    right = 6 - left
+    taps = torch.stack([first - 1 + here / left, first + 1 + last / right], dim=1)
+    return torch.stack([left, right], dim=1) / 6, taps

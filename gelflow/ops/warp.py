@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gelflow.arrays import Features, Flow, Mask
+from gelflow.ops.kept import kept
 from gelflow.ops.spline import SplineImage
 
 
@@ -23,10 +24,17 @@ def pixel_indices(flow: Flow) -> tuple[Tensor, Tensor]:
     return columns, rows
 
 
-def positions(flow: Flow) -> tuple[Tensor, Tensor]:
-    """Columns and rows x + flow(x) that each pixel is found at, (B, H, W) px from the centre of the first pixel."""
-    columns, rows = pixel_indices(flow)
-    return columns + flow[:, 0], rows + flow[:, 1]
+def positions(flow: Flow) -> Tensor:
+    """Where each pixel is found: column and row x + flow(x), (B, 2, H, W) px from the centre of the first pixel."""
+    height, width = flow.shape[-2:]
+    return flow + _pixels(height, width, flow.dtype, flow.device)
+
+
+@kept
+def _pixels(height: int, width: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Column and row of each pixel, (2, H, W)."""
+    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    return torch.stack([columns, rows]).to(device, dtype)
 
 
 def warp(image: Features, flow: Flow, mode: Literal["bilinear", "spline"] = "bilinear") -> Features:
@@ -44,13 +52,13 @@ def warp(image: Features, flow: Flow, mode: Literal["bilinear", "spline"] = "bil
         (B, C, H, W), dtype of the flow.
     """
     height, width = flow.shape[-2:]
-    x, y = positions(flow)
+    x, y = positions(flow).unbind(dim=1)
     finite = torch.isfinite(x) & torch.isfinite(y)
     # Far outside, the border is the border.
     x = torch.where(finite, x, 0.0).clamp(-width, 2 * width)
     y = torch.where(finite, y, 0.0).clamp(-height, 2 * height)
     if mode == "spline":
-        sampled = SplineImage(image.to(flow.dtype)).at(x, y)
+        sampled = SplineImage(image.to(flow.dtype)).at(torch.stack([x, y], dim=1))
     else:
         grid = torch.stack([(2 * x + 1) / width - 1, (2 * y + 1) / height - 1], dim=-1)
         sampled = F.grid_sample(image.to(flow.dtype), grid, padding_mode="border", align_corners=False)
@@ -62,6 +70,11 @@ def inside(flow: Flow) -> Mask:
 
     A flow of zero keeps every pixel, the border included. The mask carries no gradient.
     """
-    height, width = flow.shape[-2:]
-    x, y = positions(flow.detach())
-    return ((x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)).to(flow.dtype).unsqueeze(1)
+    return inside_at(positions(flow.detach()))
+
+
+def inside_at(places: Tensor) -> Mask:
+    """The same of the places themselves, (B, 2, H, W), of an image of H x W: (B, 1, H, W)."""
+    height, width = places.shape[-2:]
+    x, y = places.unbind(dim=1)
+    return ((x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)).to(places.dtype).unsqueeze(1)

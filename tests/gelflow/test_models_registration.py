@@ -14,6 +14,7 @@ from gelflow.errors import InputError
 from gelflow.estimate import estimate_flow
 from gelflow.models import GelFlow
 from gelflow.models.registration import registered
+from gelflow.ops.warp import warp
 from gelflow.overrides import train_config
 from gelflow.train import train
 from gelflow.train.checkpoint import load_weights, save_weights
@@ -99,6 +100,26 @@ def test_shading_is_ignored_unless_brightness_is_asked_for() -> None:
     # Under the background's 4 px a shade of 15 px keeps (4 / 15)² = 7 % of its curvature.
     assert motion < 0.1
     assert brightness > 4 * motion
+
+
+def test_what_came_first_stays_where_it_explains_the_images() -> None:
+    """A shade in one place. Fails without `after`, with the two flows exchanged, and with the noise not squared."""
+    image1, image2, truth = pair()
+    x, y = grid(HEIGHT, WIDTH)
+    distance = torch.from_numpy(np.hypot(x - 56, y - 48))
+    lit = image2 + 0.2 * torch.exp(-(distance**2) / (2 * 8**2)).float()
+    assert BRIGHTNESS is not None
+    motion = registered(truth, image1, lit, MOTION)
+    found = registered(truth, image1, lit, BRIGHTNESS)
+    # The shade is at 0.001 from 26 px on; the window's three standard deviations and the edge's reach 24 px further.
+    assert torch.equal(found[..., distance > 50], motion[..., distance > 50])
+    assert error(registered(truth, image1, lit, BRIGHTNESS.model_copy(update={"after": None})), motion) > 0.01
+
+    def left(flow: Tensor) -> Tensor:
+        return (warp(lit, flow, "spline") - image1).square().mean(dim=1)[0]
+
+    within = distance < 10
+    assert left(found)[within].mean() < 0.7 * left(motion)[within].mean()
 
 
 def test_a_change_of_shading_alone_hardly_moves_the_flow() -> None:

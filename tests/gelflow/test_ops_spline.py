@@ -17,7 +17,7 @@ def test_it_is_scipys_cubic_spline() -> None:
     flow = 6 * torch.rand(1, 2, 17, 23, generator=GENERATOR, dtype=torch.float64) - 3
     rows, columns = np.mgrid[:17, :23].astype(float)
     places = [np.clip(rows + flow[0, 1].numpy(), 0, 16), np.clip(columns + flow[0, 0].numpy(), 0, 22)]
-    found = SplineImage(image).at(*positions(flow))[0].numpy()
+    found = SplineImage(image).at(positions(flow))[0].numpy()
     for channel in range(2):
         expected = map_coordinates(image[0, channel].numpy(), places, order=3, mode="mirror")
         np.testing.assert_allclose(found[channel], expected, rtol=0, atol=1e-12)
@@ -27,7 +27,7 @@ def test_no_flow_gives_the_image_and_the_border_goes_on_outside() -> None:
     image = torch.rand(2, 3, 9, 8, generator=GENERATOR)
     still = torch.zeros(2, 2, 9, 8)
     # float32: a matrix of condition 3 and its inverse.
-    torch.testing.assert_close(warp(image, still, "spline"), image, rtol=0, atol=2e-6)
+    torch.testing.assert_close(warp(image, still, "spline"), image, rtol=0, atol=4e-6)
     far = warp(image, still + 100, "spline")
     torch.testing.assert_close(far, image[..., -1:, -1:].expand_as(image), rtol=0, atol=2e-6)
 
@@ -37,7 +37,7 @@ def test_lowered_precision_does_not_reach_it() -> None:
     image = torch.rand(1, 3, 12, 10, generator=GENERATOR)
     with torch.autocast("cpu", torch.bfloat16):
         found = warp(image, torch.zeros(1, 2, 12, 10), "spline")
-    torch.testing.assert_close(found, image, rtol=0, atol=2e-6)
+    torch.testing.assert_close(found, image, rtol=0, atol=4e-6)
 
 
 def test_small_shifts_are_seen_at_their_size() -> None:

@@ -1,0 +1,28 @@
+"""Tensors that depend on an image's sides alone: made once, kept for the life of the process.
+
+Making them takes a GPU as many launches as what they are for. None is ever given up: a recorded CUDA graph goes on
+reading them where they lie. They are as many as there are sides of images, some hundred kB each.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import ParamSpec
+
+import torch
+from torch import Tensor
+
+P = ParamSpec("P")
+
+
+def kept(make: Callable[P, Tensor]) -> Callable[P, Tensor]:
+    """A function whose tensors are made once for each set of its (hashable) arguments. They must not be changed."""
+    made = functools.cache(make)
+
+    @functools.wraps(make)
+    def tensor(*args: P.args, **kwargs: P.kwargs) -> Tensor:
+        if torch.compiler.is_compiling() or torch.onnx.is_in_onnx_export():
+            return make(*args, **kwargs)  # a tensor of the tracer's must not be kept
+        with torch.inference_mode(False), torch.no_grad():  # one of inference mode could not take part in training
+            return made(*args, **kwargs)  # type: ignore[arg-type]  # hashable, as asked for
+
+    return tensor
