@@ -46,12 +46,13 @@ Resume = Annotated[bool, Parameter(negative=(), help="Go on with the run that --
 OnDevice = Annotated[
     Device, Parameter(help="Where networks and registration run; auto: a CUDA device where there is one.")
 ]
-Registered = Literal["none", "motion", "brightness"]
+Registered = Literal["none", "motion", "both", "brightness"]
 Registration = Annotated[
     Registered | None,
     Parameter(
         help="Correct the network's flow on the images: to follow the gel's motion, or to bring image 2 as close to "
-        "image 1 as can be, shading included. Default: as the weights' training asked for; best: motion."
+        "image 1 as can be, shading included, or both: this where motion alone leaves much. Default: as the weights' "
+        "training asked for; best: motion."
     ),
 ]
 TrainDevice = Annotated[Device | None, Parameter(help="Where to train; auto: a CUDA device where there is one.")]
@@ -126,8 +127,8 @@ def compare(
         str,
         Parameter(
             help="Methods, separated by commas; an empty text for none. Beside the default ones, which are the "
-            "paper's: dis-motion and dis-brightness (DIS medium, then registration), exact (the exact flow of "
-            "synthetic pairs), al-dic (pyALDIC)."
+            "paper's: dis-motion, dis-both, dis-brightness (DIS medium, then registration), exact (the exact flow "
+            "of synthetic pairs), al-dic (pyALDIC)."
         ),
     ] = "none,lucas-kanade,farneback,dis-ultrafast,dis-fast,dis-medium,tvl1",
     weights: Annotated[
@@ -142,7 +143,7 @@ def compare(
         list[Registered] | None,
         Parameter(
             help="Registration of GelFlow networks, see predict; repeatable, a row of each, whose name ends with "
-            "+motion or +brightness. Default: as the weights' training asked for."
+            "+motion, +both or +brightness. Default: as the weights' training asked for."
         ),
     ] = None,
     ft: Annotated[
@@ -183,7 +184,7 @@ def predict(
         str | None,
         Parameter(
             help="Instead: lucas-kanade, farneback, dis-ultrafast, dis-fast, dis-medium, tvl1, dis-motion, "
-            "dis-brightness, al-dic."
+            "dis-both, dis-brightness, al-dic."
         ),
     ] = None,
     registration: Registration = None,

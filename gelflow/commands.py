@@ -119,7 +119,9 @@ def run_compare(
     steps, config = fine_tuning
     own = [network for network in networks if isinstance(network, Learned)]
     if registrations and not own:
-        raise InputError("--registration: needs --weights of GelFlow; of DIS there are dis-motion and dis-brightness")
+        raise InputError(
+            "--registration: needs --weights of GelFlow; of DIS there are dis-motion, dis-both, dis-brightness"
+        )
     dataset = open_all(data)
     dataset = PairDataset(dataset.source, dataset.records[::every])
     if steps > 0:
@@ -187,7 +189,8 @@ def run_predict(
     if method is not None and weights is None:
         if registration is not None:
             raise InputError(
-                "--registration: is for --weights of GelFlow; of DIS there are --method dis-motion and dis-brightness"
+                "--registration: is for --weights of GelFlow; "
+                "of DIS there are --method dis-motion, dis-both, dis-brightness"
             )
         estimator = named_methods([method], device)[0]
     elif method is None:

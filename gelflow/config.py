@@ -54,17 +54,21 @@ class RegistrationConfig(_Frozen):
         return self
 
 
-Registration = Literal["none", "motion", "brightness"]
+Registration = Literal["none", "motion", "both", "brightness"]
+
+_BRIGHTNESS = RegistrationConfig(
+    windows_px=(12.0, 6.0, 3.0, 1.0), smoothing_px=(4.0, 2.0, 1.0, 0.0), iterations=4, prior_px=1.0,
+    background_px=None, noise=0.01, propagation_px=(8, 16, 32),
+)  # fmt: skip
 
 REGISTRATIONS: dict[Registration, RegistrationConfig | None] = {
     "none": None,
     "motion": RegistrationConfig(),
-    "brightness": RegistrationConfig(
-        windows_px=(12.0, 6.0, 3.0, 1.0), smoothing_px=(4.0, 2.0, 1.0, 0.0), iterations=4, prior_px=1.0,
-        background_px=None, noise=0.01, propagation_px=(8, 16, 32), after=RegistrationConfig(),
-    ),
-}  # fmt: skip
-"""Nothing; what measures the gel's motion best; that, and where it leaves much, what brings the images closest."""
+    "both": _BRIGHTNESS.model_copy(update={"after": RegistrationConfig()}),
+    "brightness": _BRIGHTNESS,
+}
+"""Nothing; what measures the gel's motion best; that, and brightness where it leaves much; what brings image 2 closest
+to image 1."""
 
 
 class ModelConfig(_Frozen):

@@ -15,7 +15,7 @@ from: a high PSNR, and a flow that follows shading.
 It stays in the basin that it starts in: dots that the network took for their neighbours stay so. With `propagation_px`,
 each stage tries neighbours' flows first (`gelflow.models.propagation`). With `after`, another registration comes before
 all stages, and its flow stays wherever what it leaves between the images is below its `noise`: so registration for
-brightness keeps the motion of whatever motion explains.
+both keeps the motion of whatever motion explains, and follows brightness elsewhere.
 
 Lucas and Kanade 1981, with a prior (Simoncelli, Adelson and Heeger, "Probability distributions of optical flow", 1991);
 smoothing the field between the steps: Thirion's demons, 1998.

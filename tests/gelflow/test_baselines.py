@@ -32,6 +32,7 @@ TOLERANCE = {
     "dis-medium": 2 / 16,
     "tvl1": 2 / 16,
     "dis-motion": 1 / 16,
+    "dis-both": 1 / 16,
     "dis-brightness": 1 / 16,
 }
 
@@ -78,7 +79,7 @@ def test_works_on_the_smallest_allowed_images(name: str) -> None:
     assert named_methods([name])[0].flow(image, image).shape == (16, 16, 2)
 
 
-@pytest.mark.parametrize("aim", ["motion", "brightness"])
+@pytest.mark.parametrize("aim", ["motion", "both", "brightness"])
 def test_a_registered_dis_is_dis_medium_registered(aim: Registration) -> None:
     """Fails with the images exchanged before the registration, and with the aims exchanged."""
     images = moved(72, 96, 0, 0), moved(72, 96, *SHIFT)

@@ -166,7 +166,7 @@ def test_what_has_none_is_refused(plain: Path, tmp_path: Path, capsys: pytest.Ca
     assert "dis-brightness" in fails(capsys, "compare", folder, "--methods", "none", *tail)
     out = ("--out", tmp_path / "out")
     assert "dis-brightness" in fails(capsys, "predict", folder, *out, "--method", "dis-medium", *tail)
-    assert "registration" in fails(capsys, "evaluate", folder, "--weights", plain, "--registration", "both")
+    assert "registration" in fails(capsys, "evaluate", folder, "--weights", plain, "--registration", "shading")
     assert not (tmp_path / "out").exists()
 
 

@@ -20,7 +20,7 @@ from gelflow.train import train
 from gelflow.train.checkpoint import load_weights, save_weights
 
 HEIGHT, WIDTH = 96, 112
-MOTION, BRIGHTNESS = RegistrationConfig(), REGISTRATIONS["brightness"]
+MOTION, BOTH, BRIGHTNESS = RegistrationConfig(), REGISTRATIONS["both"], REGISTRATIONS["brightness"]
 
 
 def pair(size: float = 1.0) -> tuple[Tensor, Tensor, Tensor]:
@@ -109,11 +109,12 @@ def test_what_came_first_stays_where_it_explains_the_images() -> None:
     distance = torch.from_numpy(np.hypot(x - 56, y - 48))
     lit = image2 + 0.2 * torch.exp(-(distance**2) / (2 * 8**2)).float()
     assert BRIGHTNESS is not None
+    assert BOTH is not None
     motion = registered(truth, image1, lit, MOTION)
-    found = registered(truth, image1, lit, BRIGHTNESS)
+    found = registered(truth, image1, lit, BOTH)
     # The shade is at 0.001 from 26 px on; the window's three standard deviations and the edge's reach 24 px further.
     assert torch.equal(found[..., distance > 50], motion[..., distance > 50])
-    assert error(registered(truth, image1, lit, BRIGHTNESS.model_copy(update={"after": None})), motion) > 0.01
+    assert error(registered(truth, image1, lit, BRIGHTNESS), motion) > 0.01
 
     def left(flow: Tensor) -> Tensor:
         return (warp(lit, flow, "spline") - image1).square().mean(dim=1)[0]

@@ -56,7 +56,7 @@ def test_registration_has_names() -> None:
     start = {"model": ModelConfig(registration=REGISTRATIONS["brightness"]).model_dump()}
     for name, meant in REGISTRATIONS.items():
         assert train_config(None, [f"model.registration={name}"], start=start).model.registration == meant
-    with pytest.raises(InputError, match="'movement' is no registration; names are none, motion, brightness"):
+    with pytest.raises(InputError, match="'movement' is no registration; names are none, motion, both, brightness"):
         train_config("best", ["model.registration=movement"])
 
 

@@ -73,7 +73,7 @@ def test_recorded_passes_in_bfloat16_follow_the_weights() -> None:
                 parameter.mul_(1.3)
 
 
-@pytest.mark.parametrize("aim", ["none", "motion", "brightness"])
+@pytest.mark.parametrize("aim", ["none", "motion", "both", "brightness"])
 def test_a_network_in_use_is_recorded_for_each_shape(aim: Registration) -> None:
     torch.manual_seed(0)
     model = GelFlow(SMALL.model_copy(update={"registration": REGISTRATIONS[aim]})).cuda().eval()
@@ -88,7 +88,7 @@ def test_a_network_in_use_is_recorded_for_each_shape(aim: Registration) -> None:
         torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.parametrize("aim", ["motion", "brightness"])
+@pytest.mark.parametrize("aim", ["motion", "both", "brightness"])
 def test_registration_is_that_of_the_cpu(aim: Registration) -> None:
     settings = REGISTRATIONS[aim]
     assert settings is not None
