@@ -1,7 +1,8 @@
 """Does the true flow score best? `python docs/loss_order.py data/test/* --every 5`
 
-For each configuration and each scale alone: the share of pairs whose true flow has a lower loss than no flow, than
-0.9 and than 1.1 times itself. Pixels that see no gel get no flow; nothing else is hidden from the losses.
+For each configuration and each scale alone: the number of pairs whose true flow has a lower loss than no flow, than
+0.9 and than 1.1 times itself, and what those that fail where the configuration judges move by. Pixels that see no gel
+get no flow; nothing else is hidden from the losses.
 
 The true flow of a coarse scale is its mean over blocks where the loss judges it on images that are means over the same
 blocks. Where the loss enlarges it and judges it on the images themselves (`compare_at` = "image"), it is the coarse
@@ -59,7 +60,10 @@ def fitted(flow: Tensor, known: Tensor, start: Tensor, scale: int) -> Tensor:
 
 
 def wins(dataset: PairDataset, preset: str) -> torch.Tensor:
-    """(scales, 3): share of pairs whose true flow beats itself times each factor."""
+    """(scales, 3): number of pairs whose true flow beats itself times each factor.
+
+    Prints each pair that fails at a scale which the preset judges.
+    """
     loss = train_config(preset).loss
     scales = len(loss.lambda_s)
     counts = torch.zeros(scales, len(FACTORS))
@@ -76,8 +80,14 @@ def wins(dataset: PairDataset, preset: str) -> torch.Tensor:
                 update={"lambda_s": tuple(float(s == scale) for s in range(scales)), "smoothness_s": None}
             )
             values = [self_supervised_loss([f * v for v in flows], image1, image2, alone)[0] for f in (1.0, *FACTORS)]
-            counts[scale] += torch.stack([values[0] < value for value in values[1:]])
-    return counts / len(dataset)
+            won = torch.stack([values[0] < value for value in values[1:]])
+            counts[scale] += won
+            if loss.lambda_s[scale] and not won.all():
+                better = [factor for factor, one in zip(FACTORS, won, strict=True) if not one]
+                motion = (flow.norm(dim=1, keepdim=True) * known).sum() / known.sum()
+                record = dataset.records[index]
+                print(f"{preset}, s = {scale}: {record.name}, {record.scene}: {motion:.2f} px, {better} fit better")
+    return counts
 
 
 def main() -> None:
@@ -91,13 +101,10 @@ def main() -> None:
     torch.set_grad_enabled(False)
     dataset = open_all(arguments.datasets)
     dataset = PairDataset(dataset.source, dataset.records[:: arguments.every])
-    shares = {preset: wins(dataset, preset) for preset in arguments.presets.split(",")}
-    scales = max(len(share) for share in shares.values())
-    rows = [
-        [preset, *(" / ".join(f"{100 * one:.0f}" for one in line) for line in share)]
-        for preset, share in shares.items()
-    ]
-    print(f"{len(dataset)} pairs; % whose true flow beats no flow / 0.9 times / 1.1 times itself")
+    counts = {preset: wins(dataset, preset) for preset in arguments.presets.split(",")}
+    scales = max(len(count) for count in counts.values())
+    rows = [[preset, *(" / ".join(f"{one:.0f}" for one in line) for line in count)] for preset, count in counts.items()]
+    print(f"{len(dataset)} pairs; those whose true flow beats no flow / 0.9 times / 1.1 times itself")
     print(markdown((["losses", *(f"s = {scale}" for scale in range(scales))], rows)))
 
 

@@ -1,4 +1,4 @@
-"""What each setting of registration does: `python docs/registration_settings.py DATA [DATA ...] [--aim brightness]`
+"""What each setting of registration does: `python docs/registration_settings.py DATA [DATA ...] [--aim both]`
 
 The shipped network's flow, alone and registered with one setting changed at a time. On data sets of synth: the mean
 endpoint error, by kind of pattern. On real pairs: PSNR and SSIM of image 2 moved back. DATA must serve nothing else;
@@ -32,6 +32,7 @@ CHANGES: dict[str, dict[str, tuple[object, ...]]] = {
         "smoothing_px": ((8.0, 3.0, 2.0), (4.0, 2.0, 1.0), (8.0, 4.0, 3.0)),
         "iterations": (1, 2, 4),
     },
+    "both": {"after": tuple(RegistrationConfig(noise=noise) for noise in (0.02, 0.03, 0.035, 0.045, 0.05, 0.06, 0.08))},
     "brightness": {
         "propagation_px": ((), (8,), (8, 16, 32), (4, 8, 16, 32)),
         "noise": (0.005, 0.01, 0.02, 0.04),
@@ -51,7 +52,8 @@ def variants(aim: str) -> dict[str, RegistrationConfig | None]:
     for name, values in CHANGES[aim].items():
         for value in values:
             if value != getattr(usual, name):
-                found[f"{name} = {value}"] = usual.model_copy(update={name: value})
+                shown = f"noise = {value.noise}" if isinstance(value, RegistrationConfig) else value
+                found[f"{name} = {shown}"] = usual.model_copy(update={name: value})
     return found
 
 
