@@ -72,6 +72,8 @@ class Keeper(L.Callback):
         if self.stop or step % self.config.save_every == 0 or step == self.config.steps:
             self._save(trainer, flow_module)
         if self.stop:
+            if not self.validates:
+                self._keep_weights(trainer, flow_module)
             raise Stopped
 
     def on_validation_start(self, *_: Any) -> None:
@@ -88,15 +90,16 @@ class Keeper(L.Callback):
             raise InputError("validation: no pair has a finite result; look at the validation pairs")
         if self.score is None or score < self.score:
             self.score = score
-            if trainer.is_global_zero:
-                save_weights(
-                    self.out / WEIGHTS, flow_module.evaluated, **weights_metadata(self.config, flow_module.step)
-                )
+            self._keep_weights(trainer, flow_module)
         self._save(trainer, flow_module)
         if trainer.is_global_zero:
             print(f"step {flow_module.step}: {describe(self.metrics)}", file=sys.stderr)
         if self.stop:
             raise Stopped
+
+    def _keep_weights(self, trainer: L.Trainer, module: FlowModule) -> None:
+        if trainer.is_global_zero:
+            save_weights(self.out / WEIGHTS, module.evaluated, **weights_metadata(self.config, module.step))
 
     def _check(self, module: FlowModule) -> None:
         if not torch.isfinite(module.last_loss):

@@ -188,6 +188,8 @@ def _fit(module: FlowModule, keeper: Keeper, data: "_Data", device: str) -> None
             message = (
                 f"stopped; step {saved} of {config.steps} is saved in {out}; go on with the same command and --resume"
             )
+            if (weights := out / WEIGHTS).exists():
+                message += f", or use the weights so far, {weights}"
             raise KeyboardInterrupt(message) from None
 
 

@@ -74,11 +74,16 @@ def test_a_run_interrupted_by_ctrl_c_ends_with_the_same_weights(
     validation = pairs if validates else None
     whole = train(config, pairs, validation, tmp_path / "whole")
     before = signal.getsignal(signal.SIGINT)  # ignored, where pytest runs in the background
-    with pytest.raises(KeyboardInterrupt, match=r"step 5 of 7 is saved.*--resume"):
+    with pytest.raises(KeyboardInterrupt, match=r"step 5 of 7 is saved.*--resume, or use the weights so far"):
         train(config, CtrlC(pairs, 1 + 2 * 4 + 1), validation, tmp_path / "cut")  # one to check, then two a step
     assert "stopping after this step" in capsys.readouterr().err
     assert signal.getsignal(signal.SIGINT) is before
-    assert load_state(tmp_path / "cut").step == 5
+    state = load_state(tmp_path / "cut")
+    assert state.step == 5
+    so_far = tmp_path / "cut" / "weights.safetensors"
+    assert read_metadata(so_far)["step"] == ("3" if validates else "5")
+    if not validates:
+        assert all(torch.equal(tensor, state.model[name]) for name, tensor in weights_of(so_far).items())
     resumed = train(config, pairs, validation, tmp_path / "cut", resume=True)
     first, second = weights_of(whole.weights), weights_of(resumed.weights)
     assert all(torch.equal(first[name], second[name]) for name in first)
