@@ -53,7 +53,7 @@ done
 part agreement_failing.json $agreement --trajectories 64 \
     --set motion.depth_mm=2.6 --set contact.friction=1.2 --set motion.twist_deg=40
 part cuda_tests.log python -m pytest -m cuda
-R="--device cuda --methods none --weights best --registration none --registration motion --registration brightness"
+R="--device cuda --methods none --weights best --registration none --registration motion --registration both --registration brightness"
 # shellcheck disable=SC2086 # several words
 [ -z "$real" ] || for batch in 1 16; do part "times_$batch.log" python -m gelflow compare "$real" $R --batch "$batch" --out "$out/times_$batch"; done
 # shellcheck disable=SC2086 # several words
