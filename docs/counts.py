@@ -31,6 +31,12 @@ def count(rows: list[Row], wanted: Callable[[float], bool]) -> str:
     return str(sum(map(wanted, errors))) if errors else "–"
 
 
+def worst(rows: list[Row]) -> str:
+    """The largest mean error."""
+    errors = [float(row["endpoint_error_px"]) for row in rows if row["endpoint_error_px"]]
+    return f"{max(errors):.4f}" if errors else "–"
+
+
 def beaten(best: list[Row], rows: list[Row], column: str) -> str:
     """Pairs of both on which `best` is better, of how many."""
     other = {(row["scene"], row["pair"]): row[column] for row in rows}
@@ -56,12 +62,24 @@ def main() -> None:
     if given.method not in methods:
         parser.error(f"{given.scores} has no {given.method!r}; it has {', '.join(map(repr, methods))}")
     better = [f"{given.method} better in {what}" for what in ("PSNR", "SSIM", "mean px", "median px")]
-    head = ["method", "pairs", "PSNR dB", "SSIM", "mean px", "at most 0.1 px", "above 1 px", "worst px", *better]
+    head = [
+        "method",
+        "pairs",
+        "PSNR dB",
+        "SSIM",
+        "mean px",
+        "median px",
+        "at most 0.1 px",
+        "above 1 px",
+        "worst px",
+        *better,
+    ]
     table = [
         [
-            method, str(len(rows)), mean(rows, "psnr_db", 2), mean(rows, "ssim", 4), mean(rows, "endpoint_error_px", 4),
+            method, str(len(rows)), mean(rows, "psnr_db", 2), mean(rows, "ssim", 4),
+            mean(rows, "endpoint_error_px", 4), mean(rows, "median_error_px", 4),
             count(rows, lambda px: px <= 0.1), count(rows, lambda px: px > 1.0),
-            max((row["endpoint_error_px"][:6] for row in rows), key=lambda px: float(px or 0)) or "–",
+            worst(rows),
             *(beaten(methods[given.method], rows, column) for column in COLUMNS),
         ]
         for method, rows in methods.items()

@@ -52,8 +52,8 @@ def variants(aim: str) -> dict[str, RegistrationConfig | None]:
     for name, values in CHANGES[aim].items():
         for value in values:
             if value != getattr(usual, name):
-                shown = f"noise = {value.noise}" if isinstance(value, RegistrationConfig) else value
-                found[f"{name} = {shown}"] = usual.model_copy(update={name: value})
+                label = f"after.noise = {value.noise}" if isinstance(value, RegistrationConfig) else f"{name} = {value}"
+                found[label] = usual.model_copy(update={name: value})
     return found
 
 

@@ -42,7 +42,8 @@ class RegistrationConfig(_Frozen):
     propagation_px: tuple[Annotated[int, Field(ge=1)], ...] = ()
     """Distances of the neighbours whose flow is tried before each stage, under its window; none: no such step."""
     after: RegistrationConfig | None = None
-    """Registration that comes before the stages. Its flow stays where it leaves a residual below its `noise`."""
+    """Registration that comes before the stages. Its flow stays where it leaves a residual below its `noise`. Setting
+    one of its fields switches it on."""
 
     @model_validator(mode="after")
     def _has_stages(self) -> RegistrationConfig:

@@ -55,7 +55,7 @@ class Smoother:
 @kept
 def _sums(pixels: int, deviation: float, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Matrix (n, n) of the sums along one axis."""
-    return _window(pixels, 0, deviation, math.ceil(3 * deviation)).to(device, dtype)
+    return _window(pixels, 0, deviation, math.ceil(3 * deviation), device).to(dtype)
 
 
 @kept
@@ -64,7 +64,7 @@ def _mean(pixels: int, deviation: float, dtype: torch.dtype, device: torch.devic
     if deviation == 0:
         return torch.eye(pixels, dtype=dtype, device=device)
     beyond = min(math.ceil(3 * deviation), pixels - 1)
-    weight = _window(pixels, beyond, deviation, beyond)
+    weight = _window(pixels, beyond, deviation, beyond, device)
     before, matrix, after = (weight / weight.sum(dim=1, keepdim=True)).split([beyond, pixels, beyond], dim=1)
     # F(-k) = 2 F(0) - F(k), and the same at the other end.
     matrix = matrix.clone()
@@ -72,13 +72,13 @@ def _mean(pixels: int, deviation: float, dtype: torch.dtype, device: torch.devic
     matrix[:, -1] += 2 * after.sum(dim=1)
     matrix[:, 1 : beyond + 1] -= before.flip(1)
     matrix[:, -beyond - 1 : -1] -= after.flip(1)
-    return matrix.to(device, dtype)
+    return matrix.to(dtype)
 
 
-def _window(pixels: int, beyond: int, deviation: float, reach: int) -> Tensor:
+def _window(pixels: int, beyond: int, deviation: float, reach: int, device: torch.device) -> Tensor:
     """exp(-d² / 2 s²) of the distance d of pixels and positions up to `beyond` outside, (n, n + 2 beyond), float64."""
-    place = torch.arange(-beyond, pixels + beyond)
+    place = torch.arange(-beyond, pixels + beyond, device=device)
     distance = place[beyond : beyond + pixels].view(-1, 1) - place.view(1, -1)
-    weight = torch.exp(-torch.arange(pixels + 2 * beyond).double().square() / (2 * deviation**2))
+    weight = torch.exp(-torch.arange(pixels + 2 * beyond, device=device).double().square() / (2 * deviation**2))
     weight[reach + 1 :] = 0.0
     return weight[distance.abs()]

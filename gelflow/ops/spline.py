@@ -77,13 +77,13 @@ def _prefilter(pixels: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     ``d - m P``, together ``(z^d + z^(P - d)) / (1 - z^P)``, and once more for its mirror image.
     """
     period = 2 * pixels - 2
-    distance = torch.arange(period + 1, dtype=torch.float64)
+    distance = torch.arange(period + 1, dtype=torch.float64, device=device)
     response = math.sqrt(3) * (POLE**distance + POLE ** (period - distance)) / (1 - POLE**period)
-    place = torch.arange(pixels)
+    place = torch.arange(pixels, device=device)
     direct = response[(place.view(-1, 1) - place).abs()]
     mirrored = response[place.view(-1, 1) + place]
     mirrored = torch.where((place == 0) | (place == pixels - 1), 0.0, mirrored)
-    return (direct + mirrored).to(device, dtype)
+    return (direct + mirrored).to(dtype)
 
 
 def _linear_taps(places: Tensor) -> tuple[Tensor, Tensor]:

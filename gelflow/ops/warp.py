@@ -33,8 +33,9 @@ def positions(flow: Flow) -> Tensor:
 @kept
 def _pixels(height: int, width: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Column and row of each pixel, (2, H, W)."""
-    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
-    return torch.stack([columns, rows]).to(device, dtype)
+    sides = (torch.arange(side, dtype=dtype, device=device) for side in (height, width))
+    rows, columns = torch.meshgrid(*sides, indexing="ij")
+    return torch.stack([columns, rows])
 
 
 def warp(image: Features, flow: Flow, mode: Literal["bilinear", "spline"] = "bilinear") -> Features:

@@ -26,7 +26,7 @@ def test_it_is_scipys_cubic_spline() -> None:
 def test_no_flow_gives_the_image_and_the_border_goes_on_outside() -> None:
     image = torch.rand(2, 3, 9, 8, generator=GENERATOR)
     still = torch.zeros(2, 2, 9, 8)
-    # float32: a matrix of condition 3 and its inverse.
+    # float32: a matrix of condition 3 and its inverse, and places in an image of a few px.
     torch.testing.assert_close(warp(image, still, "spline"), image, rtol=0, atol=4e-6)
     far = warp(image, still + 100, "spline")
     torch.testing.assert_close(far, image[..., -1:, -1:].expand_as(image), rtol=0, atol=2e-6)
