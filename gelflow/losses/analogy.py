@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from gelflow.arrays import Flow, Images, Mask, Scalar
-from gelflow.ops.warp import inside, pixel_indices, warp
+from gelflow.ops.warp import from_centre, inside, warp
 
 ROTATION, ENLARGEMENT, SHIFT, GAIN, NOISE = 0.2, 1.5, 0.02, 0.2, 0.02
 EPSILON, EXPONENT = 0.01, 0.4
@@ -52,12 +52,9 @@ def transformed_pair(
 
 def displacement(like: Flow, matrix: Tensor, shift: Tensor) -> Flow:
     """Where each pixel x' of the transformed image comes from, less x': (B, 2, H, W) px."""
-    height, width = like.shape[-2:]
-    columns, rows = pixel_indices(like)
-    x, y = columns - (width - 1) / 2, rows - (height - 1) / 2
-    both = torch.stack([x.expand(1, height, width), y.expand(1, height, width)], dim=1)
-    moved = torch.einsum("ij,bjhw->bihw", matrix, both) + shift.view(1, 2, 1, 1)
-    return (moved - both).expand(like.shape[0], -1, -1, -1).contiguous()
+    place = from_centre(like)
+    moved = torch.einsum("ij,jhw->ihw", matrix, place) + shift.view(2, 1, 1)
+    return (moved - place).expand(like.shape[0], -1, -1, -1).contiguous()
 
 
 def analogy_loss(flow: Flow, target: Flow, pixels: Mask) -> Scalar:

@@ -16,26 +16,29 @@ from gelflow.ops.kept import kept
 from gelflow.ops.spline import SplineImage
 
 
-def pixel_indices(flow: Flow) -> tuple[Tensor, Tensor]:
-    """Columns (1, 1, W) and rows (1, H, 1) of a flow's pixels, in its dtype, on its device."""
-    height, width = flow.shape[-2:]
-    columns = torch.arange(width, dtype=flow.dtype, device=flow.device).view(1, 1, width)
-    rows = torch.arange(height, dtype=flow.dtype, device=flow.device).view(1, height, 1)
-    return columns, rows
+def pixel_indices(like: Tensor) -> Tensor:
+    """Column and row of each pixel of a (..., H, W): (2, H, W), in its dtype, on its device, not to be changed."""
+    height, width = like.shape[-2:]
+    return _pixel_indices(height, width, like.dtype, like.device)
+
+
+@kept
+def _pixel_indices(height: int, width: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    sides = (torch.arange(side, dtype=dtype, device=device) for side in (height, width))
+    rows, columns = torch.meshgrid(*sides, indexing="ij")
+    return torch.stack([columns, rows])
+
+
+def from_centre(like: Tensor) -> Tensor:
+    """The same from the image's centre."""
+    height, width = like.shape[-2:]
+    columns, rows = pixel_indices(like)
+    return torch.stack([columns - (width - 1) / 2, rows - (height - 1) / 2])
 
 
 def positions(flow: Flow) -> Tensor:
     """Where each pixel is found: column and row x + flow(x), (B, 2, H, W) px from the centre of the first pixel."""
-    height, width = flow.shape[-2:]
-    return flow + _pixels(height, width, flow.dtype, flow.device)
-
-
-@kept
-def _pixels(height: int, width: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Column and row of each pixel, (2, H, W)."""
-    sides = (torch.arange(side, dtype=dtype, device=device) for side in (height, width))
-    rows, columns = torch.meshgrid(*sides, indexing="ij")
-    return torch.stack([columns, rows])
+    return flow + pixel_indices(flow)
 
 
 def warp(image: Features, flow: Flow, mode: Literal["bilinear", "spline"] = "bilinear") -> Features:

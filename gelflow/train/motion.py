@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gelflow.arrays import Flow, Images
 from gelflow.config import MotionConfig
-from gelflow.ops.warp import pixel_indices, warp
+from gelflow.ops.warp import from_centre, warp
 
 
 def drawn_motion(config: MotionConfig, random: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -31,20 +31,12 @@ def drawn_motion(config: MotionConfig, random: np.random.Generator) -> tuple[NDA
 
 def moved_images(images: Images, matrices: Tensor, shifts: Tensor) -> Images:
     """Second images (B, C, H, W) read at A(y); M is (B, 2, 2), t is (B, 2) in px."""
-    place = _from_centre(images)
+    place = from_centre(images)
     more = torch.einsum("bij,jhw->bihw", matrices, place) - place + shifts[:, :, None, None]
     return warp(images, more, "spline").clamp(0, 1)
 
 
 def moved_flow(flow: Flow, inverses: Tensor, shifts: Tensor) -> Flow:
     """V' of flows V (B, 2, H, W), px; NaN stays NaN. M^-1 is (B, 2, 2), t is (B, 2) in px."""
-    place = _from_centre(flow)
+    place = from_centre(flow)
     return torch.einsum("bij,bjhw->bihw", inverses, place + flow - shifts[:, :, None, None]) - place
-
-
-def _from_centre(field: Tensor) -> Tensor:
-    """Each pixel's place x - c, (2, H, W) px."""
-    columns, rows = pixel_indices(field)
-    height, width = field.shape[-2:]
-    x, y = columns[0] - (width - 1) / 2, rows[0] - (height - 1) / 2
-    return torch.stack([x.expand(height, width), y.expand(height, width)])

@@ -9,15 +9,15 @@ What it cannot do: learn here; it runs published weights, for comparison. Memory
 of pixels: a pair of 640 x 480 px holds 4800^2 correlations and their pyramid, 120 MB.
 """
 
-import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from gelflow.arrays import Features, Flow, Images
+from gelflow.arrays import Flow, Images
 from gelflow.models.gelflow import check_shapes
 from gelflow.models.raft.correlation import LEVELS, correlation_pyramid, lookup
 from gelflow.models.raft.encoder import BottleneckUnit, RaftEncoder, ResidualUnit, batch_norm, instance_norm, no_norm
 from gelflow.models.raft.update import LARGE, SMALL, UpdateBlock
+from gelflow.ops.warp import pixel_indices
 
 STRIDE = 8
 """Resolution of the image over that of the features."""
@@ -69,7 +69,7 @@ class RAFT(nn.Module):
         pyramid = correlation_pyramid(features1, features2)
         hidden, context = self.cnet(first).split([self.sizes.hidden, self.sizes.context], dim=1)
         hidden, context = hidden.tanh(), context.relu()
-        start = pixel_indices(features1)
+        start = pixel_indices(features1).expand(len(features1), -1, -1, -1)
         position, weights = start, None
         for _ in range(self.iterations):
             position = position.detach()
@@ -84,15 +84,6 @@ def _padding(height: int, width: int) -> tuple[int, int, int, int]:
     """Columns left and right, rows above and below, that make both sides multiples of `STRIDE`."""
     across, down = -width % STRIDE, -height % STRIDE
     return across // 2, across - across // 2, down // 2, down - down // 2
-
-
-def pixel_indices(features: Features) -> Flow:
-    """Column and row of each pixel, (B, 2, H, W), counted from 0."""
-    batch, _, height, width = features.shape
-    rows, columns = torch.meshgrid(
-        torch.arange(height, device=features.device), torch.arange(width, device=features.device), indexing="ij"
-    )
-    return torch.stack([columns, rows]).to(features.dtype).expand(batch, -1, -1, -1)
 
 
 def enlarge_bilinear(flow: Flow) -> Flow:
