@@ -29,9 +29,9 @@ CHANGES: dict[str, dict[str, tuple[object, ...]]] = {
         "prior_px": (0.1, 0.2, 0.4),
         "background_px": (2.0, 4.0, 8.0, None),
         "windows_px": ((12.0, 8.0, 5.0), (12.0, 8.0, 3.0), (16.0, 8.0, 4.0), (8.0, 5.0, 3.0)),
-        "smoothing_px": ((8.0, 3.0, 2.0), (4.0, 2.0, 1.0), (8.0, 4.0, 3.0)),
+        "smoothing_px": ((6.0, 2.0, 1.0), (8.0, 3.0, 2.0), (4.0, 2.0, 1.0), (2.0, 2.0, 1.0)),
         "iterations": (1, 2, 4),
-        "propagation_px": ((8, 16, 32), (16, 32)),
+        "propagation_px": ((), (16, 32), (4, 8, 16, 32)),
     },
     "both": {"after": tuple(RegistrationConfig(noise=noise) for noise in (0.02, 0.03, 0.035, 0.045, 0.05, 0.06, 0.08))},
     "brightness": {

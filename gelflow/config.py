@@ -27,7 +27,7 @@ class RegistrationConfig(_Frozen):
 
     windows_px: tuple[float, ...] = (12.0, 8.0, 5.0)
     """Standard deviation of the Gaussian window of each stage, px of the images that the network sees."""
-    smoothing_px: tuple[float, ...] = (8.0, 3.0, 2.0)
+    smoothing_px: tuple[float, ...] = (6.0, 2.0, 1.0)
     """Standard deviation of the Gaussian that smooths the flow before each stage, px; 0: none."""
     iterations: int = Field(default=2, ge=1, le=100)
     """Gauss-Newton steps of each stage."""
@@ -39,7 +39,7 @@ class RegistrationConfig(_Frozen):
     noise: float = Field(default=0.04, gt=0)
     """Standard deviation that the residual has at least in each colour, of a white of 1: the camera's noise, and what
     shading changes. The larger, the more texture a window needs before it outweighs the network."""
-    propagation_px: tuple[Annotated[int, Field(ge=1)], ...] = ()
+    propagation_px: tuple[Annotated[int, Field(ge=1)], ...] = (4, 8, 16, 32)
     """Distances of the neighbours whose flow is tried before each stage, under its window; none: no such step."""
     after: RegistrationConfig | None = None
     """Registration that comes before the stages. Its flow stays where it leaves a residual below its `noise`. Setting
@@ -59,7 +59,7 @@ Registration = Literal["none", "motion", "both", "brightness"]
 
 _BRIGHTNESS = RegistrationConfig(
     windows_px=(12.0, 6.0, 3.0, 1.0), smoothing_px=(4.0, 2.0, 1.0, 0.0), iterations=4, prior_px=1.0,
-    background_px=None, noise=0.01, propagation_px=(8, 16, 32),
+    background_px=None, noise=0.01,
 )  # fmt: skip
 
 REGISTRATIONS: dict[Registration, RegistrationConfig | None] = {

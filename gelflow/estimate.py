@@ -3,34 +3,13 @@
 from collections.abc import Callable
 
 import torch
-import torch.nn.functional as F
-from torch import Tensor
 
 from gelflow.arrays import Flow, Images
 from gelflow.config import MINIMUM_SIDE
 from gelflow.errors import InputError
 from gelflow.models import GelFlow
 from gelflow.models.gelflow import check_shapes
-
-
-def resize_images(images: Images, size: tuple[int, int]) -> Images:
-    """Images of another size: bilinear between pixel centres, low-pass filtered first where they shrink."""
-    if images.shape[-2:] == torch.Size(size):
-        return images
-    resized: Tensor = F.interpolate(images, size=size, mode="bilinear", align_corners=False, antialias=True)
-    return resized
-
-
-def resize_flow(flow: Flow, size: tuple[int, int]) -> Flow:
-    """A flow for images of another size: bilinear between pixel centres, U and V each scaled with its own side.
-
-    A pixel that touches a NaN of the given flow becomes NaN.
-    """
-    height, width = flow.shape[-2:]
-    if (height, width) == size:
-        return flow
-    resized: Tensor = F.interpolate(flow, size=size, mode="bilinear", align_corners=False)
-    return resized * flow.new_tensor([size[1] / width, size[0] / height]).view(1, 2, 1, 1)
+from gelflow.ops.resize import resize_flow, resize_images
 
 
 def estimate_flow(

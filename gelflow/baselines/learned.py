@@ -134,7 +134,7 @@ class PublishedRaft:
         """See `Method.flow`."""
         import torch
 
-        from gelflow.estimate import resize_flow, resize_images
+        from gelflow.ops.resize import resize_flow, resize_images
 
         check_images(image1, image2)
         native = (image1.shape[0], image1.shape[1])

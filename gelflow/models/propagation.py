@@ -4,15 +4,21 @@ Gauss-Newton steps find the minimum that they start near. A network that loses a
 none of its steps leads back, while the flow of the gel beside the patch would. So each pixel is offered the
 flow of its neighbours at some distances, and takes the one that lessens its windowed residual most,
 
-    E(x) = sum_y w(y - x) c(y) |F2(y + V(y)) - F1(y)|^2 / sum_y w(y - x) c(y)
+    E(x) = sum_y w(y - x) c(y) |F2(y + V(y)) - F1(y) - m(x)|^2 / sum_y w(y - x) c(y)
 
-if by enough (c is 1 where the flow stays in the image). The flow of a whole patch can spread that way, a distance at a
-time; nothing is searched for, so that a pattern's period offers nothing that is not some neighbour's flow already. A
-window that the flow takes out of the image has no residual, and takes a neighbour's flow that keeps it inside.
+if by enough (c is 1 where the flow stays in the image). A gel's flow is smooth, and light on it does not move with it:
+what a neighbour offers is its flow extrapolated by its slope, and m is the residual's mean in the window. A
+flow that shall follow brightness has no such slope: it is offered as it is, and m is zero. Windows are wide and smooth,
+so that images and flow are reduced until a pixel is a third of the window's deviation.
 
-After the propagation of PatchMatch (Barnes et al. 2009), without its random search.
+Nothing is searched for, so that a pattern's period offers nothing that is not some neighbour's flow already. A window
+that the flow takes out of the image has no residual, and takes a neighbour's flow that keeps it inside.
+
+After the propagation of PatchMatch (Barnes et al. 2009), without its random search; slanted as in PatchMatch Stereo
+(Bleyer, Rhemann and Rother 2011).
 """
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -20,60 +26,93 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from gelflow.arrays import Flow, Images
-from gelflow.ops.gaussian import WindowSums
-from gelflow.ops.spline import SplineImage
-from gelflow.ops.warp import inside_at, positions
+from gelflow.ops.gaussian import Smoother, WindowSums
+from gelflow.ops.resize import resize_flow, resize_images
+from gelflow.ops.warp import inside, warp
 
 DIRECTIONS = ((-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (1, 1), (-1, 1), (1, -1))
-ROUNDS = 2
-"""In each, a pixel is offered what its neighbours had at the end of the round before."""
-ENOUGH = 0.8
+ENOUGH, ENOUGH_OF_GEL = 0.85, 0.6
 """A neighbour's flow is taken where it leaves less than this share of the residual."""
+PIXELS_A_WINDOW = 3
+"""That a window's standard deviation has at most, in the reduced images."""
+SLOPES_PX = 2.0
+"""Standard deviation of the Gaussian under which a flow is smoothed before it is extrapolated, reduced px."""
 SHARE_INSIDE = 0.3
 """Of a window's weight: with less of it in the image, flows are not compared."""
 
 
 def propagated(
-    flow: Flow, first: Images, second: SplineImage, window: WindowSums, distances: Sequence[int], noise: float
+    flow: Flow,
+    image1: Images,
+    image2: Images,
+    window_px: float,
+    distances: Sequence[int],
+    noise: float,
+    of_gel: bool,
 ) -> Flow:
     """The flow, with what its neighbours know.
 
     Args:
         flow: (B, 2, H, W), px.
-        first: (B, C, H, W), image 1.
-        second: Image 2, the same shape.
-        window: w.
+        image1: (B, C, H, W).
+        image2: The same shape.
+        window_px: Standard deviation of w.
         distances: Of the neighbours, px, each in eight directions.
         noise: Standard deviation of the residual that is believed; where it is below twice that, the flow stays.
+        of_gel: The flow is that of a gel, in whatever light; else it follows brightness.
 
     Returns:
-        Same shape; every vector is one of `flow`.
+        Same shape.
     """
-    whole = window(torch.ones_like(flow[:, :1]))
+    height, width = flow.shape[-2:]
+    pixel = math.ceil(window_px / PIXELS_A_WINDOW)
+    size = (math.ceil(height / pixel), math.ceil(width / pixel))
+    start, first, second = resize_flow(flow, size), resize_images(image1, size), resize_images(image2, size)
+    known = _with_slopes(start) if of_gel else start
+    window = WindowSums(*size, window_px / pixel, flow)
+    whole = window(torch.ones_like(start[:1, :1]))
 
-    def residual(candidate: Flow) -> Tensor:
-        """E, (B, 1, H, W); infinite where too little of the window is in the image."""
-        places = positions(candidate)
-        counts = inside_at(places)
-        squares = counts * (second.at(places) - first).square().mean(dim=1, keepdim=True)
-        weighed, weight = window(torch.cat([squares, counts], dim=1)).split(1, dim=1)
-        return torch.where(weight > SHARE_INSIDE * whole, weighed / weight, torch.inf)
+    def residuals(candidates: Tensor) -> Tensor:
+        """E of (N, B, 2, H, W): (N, B, 1, H, W); infinite where too little of the window is in the image."""
+        flows = candidates.flatten(0, 1)
+        images1, images2 = (image.repeat(len(candidates), 1, 1, 1) for image in (first, second))
+        counts = inside(flows)
+        left = counts * (warp(images2, flows) - images1)
+        squares = left.square().mean(dim=1, keepdim=True)
+        sums = window(torch.cat([counts, squares, left] if of_gel else [counts, squares], dim=1))
+        weight = sums[:, :1]
+        moments = sums[:, 1:] / weight
+        spread = moments[:, :1] - moments[:, 1:].square().mean(dim=1, keepdim=True) if of_gel else moments
+        return torch.where(weight > SHARE_INSIDE * whole, spread, torch.inf).unflatten(0, (len(candidates), -1))
 
-    for _ in range(ROUNDS):
-        now = residual(flow)
-        best, least = flow, ENOUGH * now
-        for distance in distances:
-            for right, down in DIRECTIONS:
-                offered = _neighbours(flow, distance * right, distance * down)
-                left = residual(offered)
-                best, least = torch.where(left < least, offered, best), torch.minimum(left, least)
-        flow = torch.where(now > (2 * noise) ** 2, best, flow)
-    return flow
+    def offered(right: int, down: int) -> Flow:
+        """What the neighbour at x + (right, down) takes the flow at x to be."""
+        there, *slopes = _neighbours(known, right, down).split(2, dim=1)
+        return there - right * slopes[0] - down * slopes[1] if slopes else there
+
+    now = residuals(start.unsqueeze(0))[0]
+    best, least = start, (ENOUGH_OF_GEL if of_gel else ENOUGH) * now
+    steps = [max(1, round(distance / pixel)) for distance in distances]
+    places = [(step * right, step * down) for step in steps for right, down in DIRECTIONS]
+    # Launches are what takes time on a GPU, all neighbours together are too much for a processor's cache.
+    at_once = len(places) if flow.is_cuda else 1
+    for i in range(0, len(places), at_once):
+        offers = torch.stack([offered(*place) for place in places[i : i + at_once]])
+        left, which = residuals(offers).min(dim=0)
+        found = offers.gather(0, which.expand_as(start).unsqueeze(0))[0]
+        best, least = torch.where(left < least, found, best), torch.minimum(left, least)
+    return flow + resize_flow(torch.where(now > (2 * noise) ** 2, best - start, 0.0), (height, width))
 
 
-def _neighbours(flow: Flow, right: int, down: int) -> Flow:
-    """The flow at x + (right, down), at the border that of the pixel nearest to it."""
+def _with_slopes(flow: Flow) -> Tensor:
+    """The flow, smoothed, and its derivatives along x and y: (B, 6, H, W)."""
+    smooth = Smoother(flow.shape[-2], flow.shape[-1], SLOPES_PX, flow)(flow)
+    return torch.cat([smooth, *torch.gradient(smooth, dim=(-1, -2))], dim=1)
+
+
+def _neighbours(field: Tensor, right: int, down: int) -> Tensor:
+    """A field (B, C, H, W) at x + (right, down), at the border that of the pixel nearest to it."""
     margin = max(abs(right), abs(down))
-    rows, columns = flow.shape[-2:]
-    padded = pad(flow, (margin,) * 4, mode="replicate")
+    rows, columns = field.shape[-2:]
+    padded = pad(field, (margin,) * 4, mode="replicate")
     return padded[..., margin + down : margin + down + rows, margin + right : margin + right + columns]

@@ -12,10 +12,10 @@ residual is taken without its mean over a neighbourhood of that width, so that s
 gel, does not count. Without, and with a wide ``p``, the images' difference is what is minimised, whatever it comes
 from: a high PSNR, and a flow that follows shading.
 
-It stays in the basin that it starts in: dots that the network took for their neighbours stay so. With `propagation_px`,
-each stage tries neighbours' flows first (`gelflow.models.propagation`). With `after`, another registration comes before
-all stages, and its flow stays wherever what it leaves between the images is below its `noise`: so registration for
-both keeps the motion of whatever motion explains, and follows brightness elsewhere.
+It stays in the basin that it starts in, so that with `propagation_px` each stage tries neighbours' flows first
+(`gelflow.models.propagation`); dots that a whole neighbourhood took for the next ones stay so. With `after`, another
+registration comes before all stages, and its flow stays wherever what it leaves between the images is below its
+`noise`: so registration for both keeps the motion of whatever motion explains, and follows brightness elsewhere.
 
 Lucas and Kanade 1981, with a prior (Simoncelli, Adelson and Heeger, "Probability distributions of optical flow", 1991);
 smoothing the field between the steps: Thirion's demons, 1998.
@@ -52,16 +52,18 @@ def registered(flow: Flow, image1: Images, image2: Images, config: RegistrationC
     """
     size = (flow.shape[-2], flow.shape[-1])
     with torch.no_grad(), torch.autocast(flow.device.type, enabled=False):
-        flow, first, second = flow.float(), image1.float(), SplineImage(image2.float())
+        flow, first, image2 = flow.float(), image1.float(), image2.float()
+        second = SplineImage(image2)
         settled = flow
         if config.after is not None:
-            settled = flow = registered(flow, image1, image2, config.after)
+            settled = flow = registered(flow, first, image2, config.after)
         width = config.background_px
         background = None if width is None else WindowSums(*size, width, flow)
         for window_px, smoothing_px in zip(config.windows_px, config.smoothing_px, strict=True):
             window = WindowSums(*size, window_px, flow)
             if config.propagation_px:
-                flow = propagated(flow, first, second, window, config.propagation_px, config.noise)
+                fit = (window_px, config.propagation_px, config.noise, background is not None)
+                flow = propagated(flow, first, image2, *fit)
             start = Smoother(*size, smoothing_px, flow)(flow)
             flow = start
             for _ in range(config.iterations):

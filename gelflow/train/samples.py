@@ -15,7 +15,7 @@ from torch.utils.data import Dataset, Sampler
 
 from gelflow.config import MINIMUM_SIDE, TrainConfig
 from gelflow.errors import InputError
-from gelflow.estimate import resize_flow, resize_images
+from gelflow.ops.resize import resize_flow, resize_images
 from gelflow.train.augment import augmented
 
 Sample = dict[str, Any]

@@ -102,6 +102,27 @@ def test_shading_is_ignored_unless_brightness_is_asked_for() -> None:
     assert brightness > 4 * motion
 
 
+def test_a_lost_patch_is_found_again() -> None:
+    """Fails without propagation (0.6 px)."""
+    image1, image2, truth = pair()
+    lost = truth.clone()
+    lost[..., 40:60, 60:80] += 14.0
+    assert error(registered(lost, image1, image2, MOTION), truth) < 0.1
+
+
+def test_flow_that_finds_the_same_brightness_elsewhere_does_not_spread() -> None:
+    """Other light on a faint texture, and at the left a flow that leads to where image 2 is as bright as image 1.
+
+    Fails with propagation that follows brightness (17 px).
+    """
+    image1, image2, truth = pair()
+    ramp = torch.linspace(0, 0.64, WIDTH)
+    dim, lit = 0.25 * image1 + ramp, 0.25 * image2 + ramp + 0.64 / (WIDTH - 1) * 18
+    lost = truth.clone()
+    lost[..., :24] = torch.tensor([-18.0, 0.0]).view(2, 1, 1)
+    assert error(registered(lost, dim, lit, MOTION)[..., 60:], truth[..., 60:]) < 0.1
+
+
 def test_what_came_first_stays_where_it_explains_the_images() -> None:
     """A shade in one place, a broken pixel in another.
 
