@@ -32,6 +32,9 @@ from synth.plan import Plan, check_buildable, plan
 from synth.render.variant import Device, Variant
 from synth.template import load_scene
 
+_NO_LIMIT = 10_000
+"""Characters: wider than any table."""
+
 
 def run_generate(
     scene: str,
@@ -119,8 +122,8 @@ def run_inspect(path: Path, png: Path | None, html: Path | None, limit: int, as_
     if as_json:
         print(json.dumps(inspection.as_dict()))
     else:
-        console = Console()
-        for table in tables(inspection):
+        console = _console()
+        for table in tables(inspection, console.width):
             console.print(table)
     if png is not None:
         write_sheet(inspection, png)
@@ -141,7 +144,7 @@ def run_verify(path: Path, as_json: bool) -> int:
     if as_json:
         print(json.dumps(report.record()))
     else:
-        Console().print(report.table())
+        _console().print(report.table())
     return 0 if report.ok else 1
 
 
@@ -165,7 +168,7 @@ def _show_plan(planned: Plan, n: int, as_json: bool) -> int:
     console = Console()
     table = Table("feature", "runs", "because", title=f"{planned.scene} with {planned.variant}", title_justify="left")
     for decision in planned.decisions:
-        table.add_row(decision.feature, "yes" if decision.runs else "left out", decision.reason)
+        table.add_row(decision.feature, "yes" if decision.runs else "left out", Text(decision.reason))
     console.print(table)
     seconds = sum(planned.seconds_per_pair.values())
     stages = ", ".join(f"{stage} {value:.2f} s" for stage, value in planned.seconds_per_pair.items())
@@ -211,6 +214,14 @@ def _show_summary(summary: Summary, variant: Variant) -> None:
             f"synth: {len(summary.given_up)} samples could not be made, see {summary.directory}/failures.jsonl",
             file=sys.stderr,
         )
+
+
+def _console() -> Console:
+    """Stdout; tables keep their natural width where it is no terminal."""
+    console = Console()
+    if not console.is_terminal:
+        console.width = _NO_LIMIT
+    return console
 
 
 def _say(console: Console, text: str) -> None:

@@ -82,17 +82,17 @@ class Report:
     def table(self) -> "Table":
         """A row for each check with its worst figure over the samples; failures are named below in a row each."""
         from rich.table import Table
+        from rich.text import Text
 
-        table = Table(
-            title=f"{self.path}: {len(self.samples)} samples", caption=self._caption(), caption_justify="left"
-        )
+        title = Text(f"{self.path}: {len(self.samples)} samples", style="table.title")
+        table = Table(title=title, caption=self._caption(), caption_justify="left")
         for column, justify in (("check", "left"), ("worst", "right"), ("tolerance", "right"), ("sample", "right")):
             table.add_column(column, justify=justify)  # type: ignore[arg-type]
         table.add_column("")
         for rows in self._by_name().values():
             applied = [(index, check) for index, check in rows if check.figure is not None]
             if not applied:
-                table.add_row(rows[0][1].name, "-", "", "", rows[0][1].detail)
+                table.add_row(rows[0][1].name, "-", "", "", Text(rows[0][1].detail))
                 continue
             index, worst = max(
                 applied, key=lambda row: (not row[1].passed, (row[1].figure or 0) / (row[1].tolerance or 1))
@@ -104,9 +104,8 @@ class Report:
         for sample in self.samples:
             for check in sample.checks:
                 if not check.passed:
-                    table.add_row(
-                        f"[red]{check.name}", _number(check.figure, check.unit), "", str(sample.index), check.detail
-                    )
+                    name, detail = Text(check.name, style="red"), Text(check.detail)
+                    table.add_row(name, _number(check.figure, check.unit), "", str(sample.index), detail)
         return table
 
     def _by_name(self) -> dict[str, list[tuple[int, Check]]]:

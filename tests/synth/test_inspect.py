@@ -1,8 +1,10 @@
 """Inspection of flows that are known, and what its pictures and pages must contain."""
 
 import dataclasses
+import io
 import json
 import re
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 from rich.console import Console
 from samples import HEIGHT, WIDTH, job, translation_sample
 
+from synth.commands import run_inspect
 from synth.dataset.exr import write_flow
 from synth.dataset.writer import DatasetWriter
 from synth.errors import InputError
@@ -110,6 +113,37 @@ def test_tables_and_json(dataset):
     assert "000002" in text
     assert "1.35" in text  # |(1.25, -0.5)| = 1.346 px
     assert "simulate 3.3 s" in text
+
+
+def _printed(inspection, width):
+    console = Console(width=width, file=io.StringIO())
+    for table in tables(inspection, width):
+        console.print(table)
+    return console.file.getvalue()
+
+
+@pytest.mark.parametrize("width", [40, 80, 400])
+def test_no_figure_is_cut_on_a_narrow_terminal(dataset, width):
+    inspection = inspect(dataset)
+    shown = _printed(inspection, width)
+    assert "…" not in shown
+    assert shown.count("000001 │") == len(tables(inspection, width)) - 1 == {40: 5, 80: 2, 400: 1}[width]
+    for figure in ("1.35", "95.83 %", "32x24", "0.2"):
+        assert f" {figure} " in shown
+
+
+def test_brackets_in_paths_are_no_markup(dataset):
+    for name in ("q[/b]", "[x]", "a:b:c"):
+        assert name in _printed(dataclasses.replace(inspect(dataset, limit=1), path=Path(name)), 80)
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_tables_keep_their_width_where_stdout_is_no_terminal(dataset, capsys, monkeypatch, terminal):
+    monkeypatch.setenv("COLUMNS", "80")
+    if terminal:
+        monkeypatch.setenv("FORCE_COLOR", "1")
+    assert run_inspect(dataset, None, None, 100, False) == 0
+    assert capsys.readouterr().out.count("000001") == (2 if terminal else 1)
 
 
 def test_limit_is_told(dataset):

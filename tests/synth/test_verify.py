@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -249,9 +250,10 @@ def test_report():
     bad, unknown, skipped = replace(good, figure=3.0), replace(good, figure=float("nan")), replace(good, figure=None)
     assert [c.passed for c in (good, bad, unknown, skipped)] == [True, False, False, True]
     assert not Report("x", ()).ok
-    report = Report("x", (SampleReport(0, (good,)), SampleReport(4, (bad,))))
+    bad = replace(bad, detail="p[/b]")
+    report = Report(Path("q[/b][x]"), (SampleReport(0, (good, replace(skipped, name="b"))), SampleReport(4, (bad,))))
     assert not report.ok
     text = io.StringIO()
     Console(width=120, file=text).print(report.table())
-    assert "FAILED" in text.getvalue()
-    assert "samples 4" in text.getvalue()
+    for shown in ("FAILED", "samples 4", "q[/b][x]: 2 samples", "p[/b]"):
+        assert shown in text.getvalue()
