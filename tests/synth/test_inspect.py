@@ -178,6 +178,15 @@ def test_gel_out_of_sight(tmp_path):
         assert inspection.numbers[0]["forward"]["max_px"] == {"nowhere": None, "still": 0.0}[name]
 
 
+def test_files_of_different_sizes_cannot_be_inspected(tmp_path):
+    with DatasetWriter(tmp_path / "d", job(1)) as writer:
+        writer.write(translation_sample())
+    image = tmp_path / "d/samples/000000/image2.png"
+    cv2.imwrite(str(image), cv2.imread(str(image))[:-1])
+    with pytest.raises(InputError, match=r"image1\.png is .*, image2\.png .*, flow\.exr .*; they must agree"):
+        inspect(tmp_path / "d")
+
+
 def test_what_cannot_be_inspected(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         inspect(tmp_path / "none")
