@@ -5,8 +5,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from synth.dataset.jsontext import jsonable
+
 if TYPE_CHECKING:
     from rich.table import Table
+
+_AGREED = (
+    "all samples agree with the independent derivation of flow and visibility; "
+    "values of other channels are not derived again"
+)
 
 
 @dataclass(frozen=True)
@@ -58,7 +65,7 @@ class Report:
         return bool(self.samples) and all(sample.ok for sample in self.samples)
 
     def record(self) -> dict[str, Any]:
-        """JSON-able: path, ok, and for each sample its checks."""
+        """JSON-able: path, ok, and for each sample its checks; a figure that is not finite becomes None."""
         samples = [
             {
                 "index": sample.index,
@@ -77,7 +84,7 @@ class Report:
             }
             for sample in self.samples
         ]
-        return {"path": str(self.path), "ok": self.ok, "samples": samples}
+        return {"path": str(self.path), "ok": self.ok, "samples": jsonable(samples)}
 
     def table(self) -> "Table":
         """A row for each check with its worst figure over the samples; failures are named below in a row each."""
@@ -119,7 +126,7 @@ class Report:
         if not self.samples:
             return "no finished sample to verify"
         failed = [sample.index for sample in self.samples if not sample.ok]
-        return f"failed: samples {_list(failed)}" if failed else "all samples agree with the independent derivation"
+        return f"failed: samples {_list(failed)}" if failed else _AGREED
 
 
 def _number(value: float | None, unit: str) -> str:
