@@ -217,6 +217,18 @@ def test_photometry_tells_the_right_flow_from_wrong_ones(sample):
         assert not check.passed, (name, check)
 
 
+def test_photometry_does_not_apply_where_shading_changes_within_its_filters():
+    """A small image of a strong twist: the right flow leaves 0.4 px, which tells nothing of the flow."""
+    small = scene(width=64, height=48, fx=70.0, fy=70.4, cx=31.7, cy=24.2)
+    drawn = make_sample(small, pressed(0, (0, 0)), pressed(1.8, (1.6, -1.0), 0.6))
+    y, x = np.mgrid[:48, :64]
+    shade = 0.85 + 0.1 * np.sin(2 * np.pi * (x + y) / 12)
+    image2 = np.rint(drawn.image2 * shade ** (1 / small.sensor.camera.gamma)).astype(np.uint8)
+    check = check_photometry(small.sensor, drawn.image1, image2, drawn.flow.forward, drawn.flow.forward_visible)
+    assert check.figure is None
+    assert "textured blocks the motion bends too fast" in check.detail
+
+
 def test_dataset_on_disk(tmp_path, sample):
     path = tmp_path / "data"
     with DatasetWriter(path, Job(SCENE.model_dump(mode="json"), "double", "0", seed=0, n=2)) as writer:
