@@ -2,23 +2,11 @@
 
 import json
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    Task,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Table
 from rich.text import Text
 
@@ -26,11 +14,16 @@ from synth.dataset.export import ExportFormat, export
 from synth.dataset.output import output_of
 from synth.dataset.shard import Shard
 from synth.dataset.summary import shares
+from synth.errors import InputError
 from synth.generate import Scheduling, Summary, job_variant
 from synth.generate import generate as generate_samples
 from synth.plan import Plan, check_buildable, plan
+from synth.progress import duration, progress
 from synth.render.variant import Device, Variant
 from synth.template import load_scene
+
+_NO_LIMIT = 10_000
+"""Characters: wider than any table."""
 
 
 def run_generate(
@@ -54,7 +47,7 @@ def run_generate(
     if dry_run:
         return _show_plan(plan(template, variant), n, as_json)
     _say_hint(variant)
-    with _progress(f"{template.name}: pairs", n) as advance:
+    with progress(f"{template.name}: pairs", n) as advance:
         summary = generate_samples(template, n, output_of(out), seed, variant, scheduling, advance)
     if as_json:
         print(json.dumps({"directory": str(summary.directory), **summary.record()}))
@@ -85,8 +78,13 @@ def run_simulate(scene: str, out: Path, seed: int, index: int, assignments: Sequ
     drawn = draw(template, seed, index)
     with storage_errors(out):
         out.mkdir(parents=True, exist_ok=True)  # before minutes of work, not after
-    resolution = resolution_of(drawn, template.source.parent)
-    trajectory = simulate(drawn, resolution.mesh, template.source.parent)
+    folder = template.source.parent
+    try:
+        with progress("simulate: percent of the way", 100) as advance:
+            mesh = resolution_of(drawn, folder).mesh
+            trajectory = simulate(drawn, mesh, folder, on_way=lambda share: advance(int(100 * share), 100))
+    except InputError as error:
+        raise InputError(f"{template.source}: {error}") from error
     record = write_trajectory(out, drawn, trajectory)
     if as_json:
         print(json.dumps(record))
@@ -119,8 +117,8 @@ def run_inspect(path: Path, png: Path | None, html: Path | None, limit: int, as_
     if as_json:
         print(json.dumps(inspection.as_dict()))
     else:
-        console = Console()
-        for table in tables(inspection):
+        console = _console()
+        for table in tables(inspection, console.width):
             console.print(table)
     if png is not None:
         write_sheet(inspection, png)
@@ -136,18 +134,18 @@ def run_verify(path: Path, as_json: bool) -> int:
 
     count = len(read_dataset(path).samples)
     done = iter(range(1, count + 1))
-    with _progress("verify: samples", count) as advance:
+    with progress("verify: samples", count) as advance:
         report = verify_dataset(path, on_sample=lambda _: advance(next(done), count))
     if as_json:
         print(json.dumps(report.record()))
     else:
-        Console().print(report.table())
+        _console().print(report.table())
     return 0 if report.ok else 1
 
 
 def run_export(path: Path, format: ExportFormat, out: Path, camera: str) -> int:
     """See `synth.cli.export`."""
-    with _progress("export: samples", None) as advance:
+    with progress("export: samples") as advance:
         count = export(path, format, out, advance, camera)
     _say(Console(), f"{count} samples written to {out}")
     return 0
@@ -165,7 +163,7 @@ def _show_plan(planned: Plan, n: int, as_json: bool) -> int:
     console = Console()
     table = Table("feature", "runs", "because", title=f"{planned.scene} with {planned.variant}", title_justify="left")
     for decision in planned.decisions:
-        table.add_row(decision.feature, "yes" if decision.runs else "left out", decision.reason)
+        table.add_row(decision.feature, "yes" if decision.runs else "left out", Text(decision.reason))
     console.print(table)
     seconds = sum(planned.seconds_per_pair.values())
     stages = ", ".join(f"{stage} {value:.2f} s" for stage, value in planned.seconds_per_pair.items())
@@ -174,7 +172,7 @@ def _show_plan(planned: Plan, n: int, as_json: bool) -> int:
         f"mesh: {planned.resolution}, about {planned.nodes} displacement nodes\n"
         + _error_line(planned)
         + f"predicted per pair: {stages}; {planned.bytes_per_pair / 1e6:.2f} MB\n"
-        f"predicted for {n} pairs: {_duration(n * seconds)} on one core, {n * planned.bytes_per_pair / 1e9:.2f} GB\n"
+        f"predicted for {n} pairs: {duration(n * seconds)} on one core, {n * planned.bytes_per_pair / 1e9:.2f} GB\n"
         "times are predicted within a factor of three",
     )
     return 0
@@ -197,7 +195,7 @@ def _show_summary(summary: Summary, variant: Variant) -> None:
     rate = f", {summary.samples_per_second:.2f} pairs/s" if summary.made else ""
     _say(
         console,
-        f"{summary.made} pairs made ({summary.found} were there) in {_duration(summary.seconds)}{rate} "
+        f"{summary.made} pairs made ({summary.found} were there) in {duration(summary.seconds)}{rate} "
         f"with {variant.name}: {summary.directory}" + (f", shard {summary.shard}" if summary.shard else ""),
     )
     if stages:
@@ -213,37 +211,14 @@ def _show_summary(summary: Summary, variant: Variant) -> None:
         )
 
 
+def _console() -> Console:
+    """Stdout; tables keep their natural width where it is no terminal."""
+    console = Console()
+    if not console.is_terminal:
+        console.width = _NO_LIMIT
+    return console
+
+
 def _say(console: Console, text: str) -> None:
     """Plain text: square brackets in a path are no markup."""
     console.print(text, markup=False, highlight=False, soft_wrap=True)
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 90:
-        return f"{seconds:.1f} s"
-    return f"{seconds / 60:.1f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
-
-
-class _Rate(ProgressColumn):
-    """Items per second, or seconds per item where that is slow."""
-
-    def render(self, task: Task) -> Text:
-        speed = task.finished_speed or task.speed
-        if not speed:
-            return Text("")
-        return Text(f"{speed:.1f}/s" if speed >= 1 else f"{1 / speed:.1f} s each", style="cyan")
-
-
-@contextmanager
-def _progress(label: str, total: int | None) -> Iterator[Any]:
-    """A bar on stderr with rate and estimate; a plain line per item where stderr is no terminal would only be noise."""
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(), TimeElapsedColumn(),
-               TimeRemainingColumn())  # fmt: skip
-    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
-        task = bar.add_task(label, total=total)
-
-        def advance(done: int, total: int) -> None:
-            bar.update(task, completed=done, total=total)
-
-        yield advance

@@ -3,7 +3,7 @@
 import math
 from typing import Annotated, Literal, TypeVar
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from synth.arrays import FloatArray
 from synth.scene_indenters import NonNegative, Part, Positive
@@ -61,6 +61,13 @@ class Gel(Part):
         if radius is None:
             return 0.0
         return float(dome_height(square, radius)) if square < radius**2 else self.size_mm[2]
+
+    @field_validator("shape", mode="before")
+    @classmethod
+    def _made_here(cls, shape: object) -> object:
+        if shape == "file":
+            raise ValueError("gels are a 'box' or a 'dome'; meshes of pads from files are not supported")
+        return shape
 
     @model_validator(mode="after")
     def _layered(self) -> "Gel":

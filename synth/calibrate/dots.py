@@ -8,6 +8,8 @@ from synth.arrays import BoolArray, FloatArray, Pixels
 from synth.errors import InputError
 
 _FEWEST = 9
+SMALLEST_PX = 1.0
+"""Radius of dots whose edge can be told from the blur, which `synth.calibrate.profile` at first takes for 1 px."""
 _CLEAREST = 0.75
 """A dot's middle is at least so much darker than the coating around: ratio of linear brightness."""
 
@@ -37,7 +39,7 @@ def find_dots(linear: FloatArray, pitch_px: float) -> FoundDots:
         pitch_px: about how far dots are apart.
 
     Raises:
-        InputError: fewer than nine whole dots.
+        InputError: fewer than nine whole dots, or dots of about a pixel.
     """
     import cv2
 
@@ -56,6 +58,7 @@ def find_dots(linear: FloatArray, pitch_px: float) -> FoundDots:
         raise _too_few(0, pitch_px)
     typical = float(np.median(area[large]))
     radius = float(np.sqrt(typical / np.pi))
+    check_size(radius)
     margin = max(2, round(0.45 * radius))
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
     covered = cv2.dilate((np.isin(labels, 1 + np.flatnonzero(area > 0.05 * typical))).astype(np.uint8), kernel) > 0
@@ -67,6 +70,19 @@ def find_dots(linear: FloatArray, pitch_px: float) -> FoundDots:
         raise _too_few(len(found), pitch_px)
     centres, radii = (np.array(part) for part in zip(*found, strict=True))
     return FoundDots(centres, radii, linear / around, covered)
+
+
+def check_size(radius_px: float) -> None:
+    """Refuses dots that are too small to be measured.
+
+    Raises:
+        InputError: they are.
+    """
+    if not radius_px > SMALLEST_PX:
+        raise InputError(
+            f"the dots found in the frame have a radius of {radius_px:.2g} px, needed is more than {SMALLEST_PX:g} px; "
+            "give larger frames"
+        )
 
 
 def _around(linear: FloatArray, covered: BoolArray, sigma: float) -> FloatArray:

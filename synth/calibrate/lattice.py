@@ -27,7 +27,7 @@ class LatticeFit:
     """Layout and camera.
 
     Attributes:
-        pattern: with spacing, rotation, offset and jitter as found.
+        pattern: with spacing, rotation, offset and jitter as found; its radius has grown with the spacing.
         camera: with focal lengths, principal point, tilt and k1 as found.
         residual_px: (n, 2) found minus predicted centres.
         index: (n, 2) column and row of each found dot in the grid.
@@ -70,6 +70,7 @@ def fit_lattice(sensor: Sensor, pattern: Dots, centres: Pixels, spacing_mm: floa
         distortion = (camera.distortion[0] + _K1 * float(p[10]), *camera.distortion[1:])
         layout = {
             "spacing_mm": (columns, columns * float(np.exp(p[1]))),
+            "radius_mm": pattern.radius_mm * columns / pattern.spacing_mm[0],
             "rotation_deg": float(np.degrees(p[2])),
             "offset_mm": (float(p[3]), float(p[4])),
         }

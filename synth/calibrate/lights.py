@@ -218,10 +218,10 @@ def fit_powers(basis: FloatArray, target: Target, shines: BoolArray) -> tuple[Fl
 
     powers, errors = np.zeros((len(basis), 3)), np.zeros((len(basis), 3))
     for channel in range(3):
-        lights = np.flatnonzero(shines[:, channel] & (basis[:, :, channel] > 0).any(axis=1))
+        weight = target.slope[:, channel]
+        lights = np.flatnonzero(shines[:, channel] & (basis[:, :, channel] * weight > 0).any(axis=1))
         if not len(lights):
             continue
-        weight = target.slope[:, channel]
         matrix = (basis[lights, :, channel] * weight).T
         scale = np.linalg.norm(matrix, axis=0)
         triangle, right = _reduced(matrix / scale, target.signal[:, channel] * weight)

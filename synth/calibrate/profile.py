@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from synth.arrays import FloatArray
-from synth.calibrate.dots import FoundDots
+from synth.calibrate.dots import SMALLEST_PX, FoundDots, check_size
 
 _BIN_PX = 0.25
 
@@ -36,11 +36,16 @@ class DotProfile:
 
 
 def fit_profile(dots: FoundDots) -> DotProfile:
-    """Fit the model to the median profile of all dots, each dot scaled to the common radius first."""
+    """Fit the model to the median profile of all dots, each dot scaled to the common radius first.
+
+    Raises:
+        InputError: the dots are too small to have an edge.
+    """
     from scipy.optimize import least_squares
     from scipy.stats import ncx2
 
     common = float(np.median(dots.radii))
+    check_size(common)
     distance, values = _samples(dots, common)
     edges = np.arange(0, 2 * common, _BIN_PX)
     bins = np.digitize(distance, edges) - 1
@@ -53,7 +58,7 @@ def fit_profile(dots: FoundDots) -> DotProfile:
         radius, spread, dark, bright = p
         return np.asarray(bright + (dark - bright) * ncx2.cdf((radius / spread) ** 2, 2, (r / spread) ** 2))
 
-    start = [common, 1.0, float(grey[0]), 1.0]
+    start = [common, SMALLEST_PX, float(np.clip(grey[0], 0, 1)), 1.0]
     found = least_squares(
         lambda p: model(p) - grey, start, bounds=([0.3 * common, 0.2, 0, 0.5], [2 * common, common, 1, 1.5])
     )

@@ -6,10 +6,17 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from synth.errors import InputError
 
+if TYPE_CHECKING:
+    from synth.scene import Sensor
+
 SCENE, PICTURE, NUMBERS = "scene.toml", "calibration.png", "calibration.json"
+_WHAT_FRAMES = "they must be pictures of this kind of sensor with its gel undeformed"
+_SPACINGS = 4.0
+"""Most that a spacing may differ from the preset's, as a factor: further off, a lens is not like the preset's."""
 
 
 def run_calibrate(
@@ -65,6 +72,8 @@ def run_calibrate(
     with storage_errors(out):
         out.mkdir(parents=True, exist_ok=True)  # before minutes of work, not after
     start = start_sensor(template, given.size)
+    if spacing_mm is not None:
+        _check_spacing(spacing_mm, start, scene)
     print("synth: fitting the sensor to the frames", file=sys.stderr, flush=True)
     fit = fit_sensor(start, given, variant, spacing_mm, steps)
     rendered = render_undeformed(fit.sensor, render_settings(template), variant)
@@ -75,7 +84,11 @@ def run_calibrate(
         )
     content = fitted_content(template, fit, os.path.relpath(template.source.parent.resolve(), out.resolve()))
     file = out / SCENE
-    checked_template(content, file)
+    try:
+        checked_template(content, file)
+    except InputError as error:
+        problem = str(error).replace(f"{file}: ", "")
+        raise InputError(f"the frames do not fit --scene {scene}: they give {problem}; {_WHAT_FRAMES}") from error
     record = numbers(template.name, frames, fit, start, rows, given, time.perf_counter() - started)
     comment = f"Fitted by `synth calibrate --scene {scene}` to {len(frames)} frame(s); numbers in {NUMBERS}."
     replace_file(file, toml_text(content, comment).encode())
@@ -83,3 +96,18 @@ def run_calibrate(
     replace_file(out / NUMBERS, (json.dumps(record, indent=1) + "\n").encode())
     print(json.dumps(record) if as_json else "\n".join([*summary(record), f"written: {file}"]))
     return 0
+
+
+def _check_spacing(spacing_mm: float, start: "Sensor", scene: str) -> None:
+    """Refuses what the dots' columns of this kind of sensor cannot be apart."""
+    from synth.scene import Dots
+
+    given = f"--spacing-mm = {spacing_mm:g}"
+    if not isinstance(start.pattern, Dots):
+        raise InputError(f"{given}: --scene {scene} has no dots; leave it out")
+    usual = start.pattern.spacing_mm[0]
+    if not usual / _SPACINGS <= spacing_mm <= usual * _SPACINGS:
+        raise InputError(
+            f"{given}: must be from {usual / _SPACINGS:.3g} to {usual * _SPACINGS:.3g} mm, the dots of --scene {scene} "
+            f"being {usual:.3g} mm apart; take a preset that is more like your sensor, or change it with --set"
+        )

@@ -61,7 +61,7 @@ def fit_sensor(start: Sensor, frames: Frames, variant: Variant, spacing_mm: floa
         steps: most steps for the lights' geometry.
 
     Raises:
-        InputError: no dots, or no grid, where the preset has some.
+        InputError: no dots, or no grid, where the preset has some; nothing that tells of the lights; overexposure.
     """
     gamma = start.camera.gamma
     linear = frames.encoded**gamma
@@ -74,6 +74,8 @@ def fit_sensor(start: Sensor, frames: Frames, variant: Variant, spacing_mm: floa
         bare = ~dots.covered
         sensor = start.model_copy(update=_look(start, lattice, profile))
     pixels = _spread(bare & _sees_gel(sensor))
+    if not len(pixels):
+        raise InputError("no pixel between the dots sees the gel of the preset; check its sensor.gel and sensor.camera")
     at = (pixels[:, 1].astype(int), pixels[:, 0].astype(int))
     smooth = _smoothed(frames.encoded, bare)[at]
     gel = FlatGel(sensor, pixels, variant)
@@ -124,6 +126,11 @@ def _target(encoded: FloatArray, camera: Camera, pixels: Pixels) -> Target:
     level = np.clip(encoded, _DARKEST, 1)
     slope = level ** (1 - camera.gamma) / camera.gamma
     slope[(encoded > _BRIGHTEST) | (encoded < _DARKEST)] = 0
+    for name, channel in zip(("red", "green", "blue"), encoded.T, strict=True):
+        if (channel > _BRIGHTEST).all():
+            raise InputError(
+                f"the frames are overexposed: all of the coating is at the top of the range in {name}; take darker ones"
+            )
     x, y = np.abs(pixels - [camera.cx, camera.cy]).T
     corner = max(abs(camera.cx), abs(camera.width - camera.cx)) ** 2
     corner += max(abs(camera.cy), abs(camera.height - camera.cy)) ** 2

@@ -3,7 +3,7 @@
 Channels (of two directions, both read `I1(x) = I2(x + forward(x))`, `I2(x) = I1(x + backward(x))`):
 
     forward.U forward.V forward.visible   backward.U backward.V backward.visible
-    and by name whatever FlowField.extras holds: depth1.Z normal1.X displacement.X traction.X contact.Y ...
+    and by name whatever FlowField.extras holds: see `synth.dataset.exr_channels`
     R G B    the same numbers as forward.U forward.V forward.visible once more
 
 U is right, V is down, px at the pixel's centre (c + 0.5, r + 0.5); NaN where the pixel sees no gel. R, G, B are there
@@ -19,9 +19,12 @@ import contextlib
 import io
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from synth.dataset.exr_channels import meanings
 from synth.dataset.exr_layout import check_whole
 from synth.errors import InputError
 from synth.flow.field import FlowArray, FlowField
@@ -35,7 +38,7 @@ CONVENTIONS = {
     "flow.nan": "the pixel sees no gel",
     "flow.aliases": "R = forward.U, G = forward.V, B = forward.visible",
 }
-"""Header attributes of every file."""
+"""Header attributes of every file; those of optional channels come beside them (`synth.dataset.exr_channels`)."""
 
 _PARTS = ("U", "V", "visible")
 
@@ -55,7 +58,8 @@ def write_flow(path: Path, flow: FlowField, attributes: Mapping[str, str | int])
 
     planes = channels_of(flow)
     planes |= {alias: planes[name] for alias, name in ALIASES.items()}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **CONVENTIONS, **attributes}
+    told = {**CONVENTIONS, **meanings(planes), **attributes}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **told}
     try:
         OpenEXR.File(header, planes).write(str(path))
     except RuntimeError as error:  # How the library reports a failing disk.
@@ -118,14 +122,20 @@ def read_channels(path: Path) -> tuple[dict[str, FlowArray], dict[str, str | int
     Raises:
         InputError: The file is missing, no OpenEXR image, truncated or damaged, or its channels differ in size.
     """
+    planes, header = read_stored(path)
+    return {name: plane.astype(np.float32) for name, plane in planes.items()}, header
+
+
+def read_stored(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str | int]]:
+    """As `read_channels`, with the channels in the type in which they are stored: float32, float16 or uint32."""
     import OpenEXR
 
     check_whole(path)
     try:
         # The library prints remarks about a damaged file to standard output before it raises.
         with contextlib.redirect_stdout(io.StringIO()), OpenEXR.File(str(path), separate_channels=True) as file:
-            header = file.header()
-            planes = {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
+            header = dict(file.header())  # the library empties its own on closing
+            planes = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
     except (RuntimeError, ValueError, OSError, TypeError) as error:
         raise InputError(f"{path}: the OpenEXR image cannot be decoded ({error}); the file is damaged") from error
     shapes = {plane.shape for plane in planes.values()}

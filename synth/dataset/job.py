@@ -19,6 +19,8 @@ _CONVENTIONS = {
     "units": "mm, N, MPa, degrees; flow in px",
     "images": "RGB or grey PNG, full scale 255 or 65535; image 1 is frames[0], image 2 is frames[1]",
     "force_n": "of the indenter on the gel, in each of the two frames; a press gives a positive z",
+    "torque_nmm": "of the indenter on the gel about the frame's origin, N mm, in each of the two frames; a positive z "
+    "turns +x toward +y",
     **CONVENTIONS,
 }
 

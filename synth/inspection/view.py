@@ -19,8 +19,9 @@ import numpy as np
 
 from synth.arrays import BoolArray, FloatArray
 from synth.dataset.exr import flow_of, read_channels
-from synth.dataset.images import Raster, read_png
+from synth.dataset.images import Raster
 from synth.dataset.jsontext import read_document
+from synth.dataset.reader import read_pair
 from synth.flow.field import FlowField
 from synth.inspection.interpolation import sample_at
 
@@ -95,18 +96,13 @@ def view_sample(folder: Path) -> View:
     """Of a sample's folder, or of a further camera's folder therein.
 
     Raises:
-        InputError: A file is missing or damaged.
+        InputError: A file is missing or damaged, or they do not fit each other.
     """
     is_further = not (folder / META_FILE).exists() and (folder.parent / META_FILE).exists()
     meta = read_document((folder.parent if is_further else folder) / META_FILE)
-    channels, _ = read_channels(folder / "flow.exr")
-    return View(
-        name=f"{folder.parent.name}/{folder.name}" if is_further else folder.name,
-        flow=flow_of(folder / "flow.exr", channels),
-        image1=read_png(folder / "image1.png"),
-        image2=read_png(folder / "image2.png"),
-        meta=meta,
-    )
+    pair = read_pair(folder)
+    name = f"{folder.parent.name}/{folder.name}" if is_further else folder.name
+    return View(name, pair.flow, image1=pair.image1, image2=pair.image2, meta=meta)
 
 
 def view_flow(path: Path) -> View:

@@ -4,6 +4,10 @@ Frame of an indenter: its own +z points at the gel. Balls, bars, blocks and ring
 cone at the centre of its rounded tip, a mesh at the centre of its bounding box.
 """
 
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -125,6 +129,19 @@ def _require(holds: bool, indenter: Indenter, field: str, allowed: str) -> None:
         )
 
 
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Without VTK's log and warnings, which tell of addresses and reference counts."""
+    disabled = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(disabled)
+
+
 def _distance_grid(indenter: MeshIndenter, folder: Path) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Corner of the grid (3,), vertices (n, 3) about the box's centre, B-spline coefficients (i, j, k)."""
     import pyvista as pv
@@ -134,12 +151,17 @@ def _distance_grid(indenter: MeshIndenter, folder: Path) -> tuple[FloatArray, Fl
     if not path.is_file():
         raise InputError(f"contact.indenter.file = {indenter.file!r}: there is no file {path}")
     try:
-        surface = pv.read(path).extract_surface(algorithm=None).triangulate().clean()
+        with _silence():
+            surface = pv.read(path).extract_surface(algorithm=None).triangulate().clean()
     except (ValueError, OSError, AttributeError) as error:
         raise InputError(
             f"contact.indenter.file = {indenter.file!r}: pyvista cannot read it as a surface ({error})"
         ) from error
-    if surface.n_cells == 0 or surface.n_open_edges > 0:
+    if surface.n_cells == 0:
+        raise InputError(
+            f"contact.indenter.file = {indenter.file!r}: cannot be read as a surface; the file is damaged or empty"
+        )
+    if surface.n_open_edges > 0:
         raise InputError(
             f"contact.indenter.file = {indenter.file!r}: the surface must be closed; "
             f"it has {surface.n_cells} triangles and {surface.n_open_edges} open edges"

@@ -26,6 +26,7 @@ def simulate(
     device: str = "cpu",
     frames: frozenset[int] | None = None,
     driver: Driver = STANDARD,
+    on_way: Callable[[float], None] | None = None,
 ) -> Trajectory:
     """Press, shear and twist one scene's indenter into its pad.
 
@@ -38,11 +39,12 @@ def simulate(
             penalty's penetration and the way's tolerance; those that are wanted are the same to the bit, unless one of
             them misses the full tolerance and its step is halved.
         driver: of Newton's method.
+        on_way: told after each step what share of the way is done.
 
     Raises:
         InputError: the indenter cannot be built.
     """
-    return simulate_batch([scene], mesh, folder, device, frames, driver)[0]
+    return stepper_of([scene], mesh, folder, device, frames, driver).run(on_way)[0]
 
 
 def simulate_batch(

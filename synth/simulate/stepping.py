@@ -9,7 +9,7 @@ have to become shorter than SHORTEST_STEP ends at its last good state.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -110,12 +110,14 @@ class Stepper:
         self.state = system.zero()
         self.previous = system.zero()
 
-    def run(self) -> list[Trajectory]:
-        """Follow every path to its end or to its last good state."""
+    def run(self, on_way: Callable[[float], None] | None = None) -> list[Trajectory]:
+        """Follow every path to its end or to its last good state; `on_way` is told what share all have done."""
         started = time.perf_counter()
         self._start()
         while not all(sample.finished for sample in self.samples):
             self._advance(np.array([not sample.finished for sample in self.samples]))
+            if on_way is not None:
+                on_way(min(sample.at / float(sample.waypoints[-1]) for sample in self.samples))
         seconds = (time.perf_counter() - started) / len(self.samples)
         return [trajectory_of(tuple(each.states), each.reason, seconds, self.system.space) for each in self.samples]
 

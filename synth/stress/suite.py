@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -38,18 +39,17 @@ def run_stress(out: Path, only: Sequence[str] | None, workers: int, as_json: boo
         InputError: unknown case; the expectations or the storage are not usable.
     """
     from rich.console import Console
-    from rich.progress import Progress
 
+    from synth.progress import progress
     from synth.stress.report import outcome_table, record, remarks, summary, write_report
     from synth.stress.sheet import write_sheet
 
     expectations = load_expectations(scenes / "expected.toml")
     runs = selected(all_runs(expectations, (scenes / "base.toml").resolve()), only)
-    console = Console(stderr=True)
     started = time.perf_counter()
-    with Progress(console=console, disable=not console.is_terminal, transient=True) as bar:
-        task = bar.add_task("stress: cases", total=len(runs))
-        results = all_results(runs, out, workers, lambda _: bar.advance(task))
+    done = count(1)
+    with progress("stress: cases", len(runs)) as advance:
+        results = all_results(runs, out, workers, lambda _: advance(next(done), len(runs)))
     verdicts = [judged(result, comparable(result, results)) for result in results]
     seconds = time.perf_counter() - started
     write_report(out, verdicts, expectations, only, seconds)

@@ -1,4 +1,9 @@
-"""Verification of samples and datasets: all checks together."""
+"""Verification of samples and datasets: all checks together.
+
+The flow and its visibility are derived again at every pixel, in each direction. Of optional channels (depth, normal,
+displacement, traction, contact) it is checked that they are there (`synth.verify.files`); their values are not derived
+again.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -9,6 +14,7 @@ from synth.errors import InputError
 from synth.scene import Scene, Sensor
 from synth.verify.camera import ForwardCamera
 from synth.verify.dome import check_dome
+from synth.verify.files import flow_file_problems
 from synth.verify.motion import check_motion
 from synth.verify.photometry import check_photometry
 from synth.verify.report import Check, Report, SampleReport
@@ -54,7 +60,7 @@ def verify_sample(index: int, scene: Scene, sample: SampleData, problems: Sequen
         index: its number.
         scene: the draw it was made from.
         sample: its images, flow, surface and displacements.
-        problems: what is wrong with its files (from `Dataset.check_hashes`).
+        problems: what is wrong with its files (from `Dataset.check_hashes` and `flow_file_problems`).
     """
     checks = [_files(problems)]
     for name, sensor in scene.sensor.views.items():
@@ -92,10 +98,12 @@ def _view_checks(sensor: Sensor, backward: bool, sample: SampleData) -> list[Che
 def _verify_files(dataset: Dataset, index: int) -> SampleReport:
     problems = dataset.check_hashes(index)
     try:
-        return verify_sample(index, dataset.scene_of(index), dataset.read(index), problems)
+        scene, sample = dataset.scene_of(index), dataset.read(index)
+        problems += flow_file_problems(dataset.folder(index), scene, sample.meta)
+        return verify_sample(index, scene, sample, problems)
     except InputError as error:
         return SampleReport(index, (_files([*problems, str(error)]),))
 
 
 def _files(problems: Sequence[str]) -> Check:
-    return Check("files", float(len(problems)), 0, "problems", "; ".join(problems) or "as the manifest says")
+    return Check("files", float(len(problems)), 0, "problems", "; ".join(problems) or "as manifest and scene say")

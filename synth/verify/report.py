@@ -5,8 +5,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from synth.dataset.jsontext import jsonable
+
 if TYPE_CHECKING:
     from rich.table import Table
+
+_AGREED = (
+    "all samples agree with the independent derivation of flow and visibility; "
+    "values of other channels are not derived again"
+)
 
 
 @dataclass(frozen=True)
@@ -58,7 +65,7 @@ class Report:
         return bool(self.samples) and all(sample.ok for sample in self.samples)
 
     def record(self) -> dict[str, Any]:
-        """JSON-able: path, ok, and for each sample its checks."""
+        """JSON-able: path, ok, and for each sample its checks; a figure that is not finite becomes None."""
         samples = [
             {
                 "index": sample.index,
@@ -77,22 +84,22 @@ class Report:
             }
             for sample in self.samples
         ]
-        return {"path": str(self.path), "ok": self.ok, "samples": samples}
+        return {"path": str(self.path), "ok": self.ok, "samples": jsonable(samples)}
 
     def table(self) -> "Table":
         """A row for each check with its worst figure over the samples; failures are named below in a row each."""
         from rich.table import Table
+        from rich.text import Text
 
-        table = Table(
-            title=f"{self.path}: {len(self.samples)} samples", caption=self._caption(), caption_justify="left"
-        )
+        title = Text(f"{self.path}: {len(self.samples)} samples", style="table.title")
+        table = Table(title=title, caption=self._caption(), caption_justify="left")
         for column, justify in (("check", "left"), ("worst", "right"), ("tolerance", "right"), ("sample", "right")):
             table.add_column(column, justify=justify)  # type: ignore[arg-type]
         table.add_column("")
         for rows in self._by_name().values():
             applied = [(index, check) for index, check in rows if check.figure is not None]
             if not applied:
-                table.add_row(rows[0][1].name, "-", "", "", rows[0][1].detail)
+                table.add_row(rows[0][1].name, "-", "", "", Text(rows[0][1].detail))
                 continue
             index, worst = max(
                 applied, key=lambda row: (not row[1].passed, (row[1].figure or 0) / (row[1].tolerance or 1))
@@ -104,9 +111,8 @@ class Report:
         for sample in self.samples:
             for check in sample.checks:
                 if not check.passed:
-                    table.add_row(
-                        f"[red]{check.name}", _number(check.figure, check.unit), "", str(sample.index), check.detail
-                    )
+                    name, detail = Text(check.name, style="red"), Text(check.detail)
+                    table.add_row(name, _number(check.figure, check.unit), "", str(sample.index), detail)
         return table
 
     def _by_name(self) -> dict[str, list[tuple[int, Check]]]:
@@ -120,7 +126,7 @@ class Report:
         if not self.samples:
             return "no finished sample to verify"
         failed = [sample.index for sample in self.samples if not sample.ok]
-        return f"failed: samples {_list(failed)}" if failed else "all samples agree with the independent derivation"
+        return f"failed: samples {_list(failed)}" if failed else _AGREED
 
 
 def _number(value: float | None, unit: str) -> str:

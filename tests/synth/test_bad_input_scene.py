@@ -45,6 +45,11 @@ def _refusal(source: Path | str, *overrides: str) -> str:
         ("sensor.gel.size_mm=[8, 6, 2, 1]", "sensor.gel.size_mm = [8, 6, 2, 1]: must have at most 3 entries, not 4"),
         ("sensor.gel=3", "sensor.gel = 3: must be a table"),
         ("sensor.lights=[]", "sensor.lights = []: must have at least 1 entry, not 0"),
+        ("sensor.gel.shape=bowl", "sensor.gel.shape = 'bowl': must be 'box' or 'dome'"),
+        (
+            "sensor.gel.shape=file",
+            "sensor.gel.shape = 'file': gels are a 'box' or a 'dome'; meshes of pads from files are not supported",
+        ),
         ("name=two words", "name = 'two words': "),
         ("contact.indenter.shape=ball", "contact.indenter.shape = 'ball': allowed are 'sphere', 'cylinder', 'box'"),
         ("contact.indenter={ radius_mm = 1 }", "contact.indenter: lacks the key 'shape'"),

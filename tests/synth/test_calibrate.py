@@ -16,6 +16,7 @@ from synth.calibrate.frames import Frames, read_frames
 from synth.calibrate.irradiance import FlatGel, LightGeometry
 from synth.calibrate.lattice import lattice_index, pattern_points
 from synth.calibrate.noise import fit_noise
+from synth.calibrate.profile import fit_profile
 from synth.calibrate.sensor_fit import SensorFit, fit_sensor
 from synth.calibrate.toml_text import toml_text
 from synth.cli import main
@@ -254,6 +255,44 @@ def test_a_frame_without_dots_and_dots_without_a_grid_are_refused() -> None:
         find_dots(np.full((120, 160, 3), 0.3), 15.0)
     with pytest.raises(InputError, match="grid"):
         lattice_index(np.random.default_rng(0).uniform(0, 100, (12, 2)))
+
+
+@pytest.mark.parametrize("spacing", ["-3", "nan", "0", "0.1", "100", "inf"])
+def test_a_spacing_that_no_dots_have_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], spacing: str
+) -> None:
+    cv2.imwrite(str(tmp_path / "frame.png"), np.zeros((24, 32, 3), dtype=np.uint8))
+    command = ["calibrate", "--frames", str(tmp_path / "frame.png"), "--out", str(tmp_path / "out")]
+    assert main([*command, f"--spacing-mm={spacing}"]) == 2
+    assert f"--spacing-mm = {spacing}: must be from 0.458 to 7.32 mm" in capsys.readouterr().err
+    assert main([*command, "--scene", "digit", "--spacing-mm=1"]) == 2
+    assert "has no dots" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("radius", [0.5, 0.9])
+def test_dots_of_a_pixel_are_refused(radius: float) -> None:
+    y, x = np.mgrid[:48, :64] + 0.5
+    away = np.hypot(*((part + 2) % 5 - 2.5 for part in (x, y)))
+    frame = np.repeat(0.5 * np.clip(away - radius + 0.5, 0.1, 1)[..., None], 3, axis=2)
+    with pytest.raises(InputError, match=r"radius of .* px, needed is more than 1 px"):
+        fit_profile(find_dots(frame, 5.0))
+
+
+@needs_llvm
+@pytest.mark.parametrize(
+    ("level", "message"),
+    [(0, "are the frames black"), (255, "overexposed"), (None, "they give sensor.camera.shot_noise = ")],
+)
+def test_frames_that_tell_nothing_of_the_lights_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], level: int | None, message: str
+) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (60, 80, 3))
+    cv2.imwrite(str(tmp_path / "frame.png"), (noise if level is None else np.full((60, 80, 3), level)).astype(np.uint8))
+    command = ["calibrate", "--scene", "digit", "--steps", "0", "--out", str(tmp_path / "out")]
+    assert main([*command, "--set", "render.samples_per_pixel=1", "--frames", str(tmp_path / "frame.png")]) == 2
+    said = capsys.readouterr().err
+    assert message in said
+    assert "scene.toml" not in said
 
 
 def test_a_preset_that_calibration_does_not_know_is_refused(tmp_path: Path) -> None:

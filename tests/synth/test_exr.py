@@ -10,8 +10,10 @@ import pytest
 from samples import translation_sample
 
 from synth.dataset.exr import channels_of, read_channels, read_flow, write_flow
+from synth.dataset.exr_channels import OPTIONAL
 from synth.errors import InputError
 from synth.flow.field import FlowField
+from synth.scene import Outputs
 
 FLOW = translation_sample(5).flow
 ATTRIBUTES: dict[str, str | int] = {"scene.hash": "abc", "seed": str(2**63), "index": 5}
@@ -52,7 +54,18 @@ def test_file_as_the_library_sees_it(path):
         assert "I1(x) = I2(x + forward(x))" in header["flow.directions"]
         assert "(c + 0.5, r + 0.5)" in header["flow.pixelCentre"]
         assert header["flow.units"] == "px"
+        assert [key for key in header if key.startswith("channels.")] == ["channels.contact"]
         assert (header["scene.hash"], header["seed"], header["index"]) == ("abc", str(2**63), 5)
+
+
+def test_header_tells_what_the_optional_channels_are(tmp_path):
+    extras = {name: FLOW.forward_visible for part in OPTIONAL.values() for name in part.names}
+    write_flow(tmp_path / "f.exr", FlowField(FLOW.forward, FLOW.forward_visible, extras=extras), {})
+    header = read_channels(tmp_path / "f.exr")[1]
+    assert {key for key in header if key.startswith("channels.")} == {f"channels.{key}" for key in OPTIONAL}
+    assert set(OPTIONAL) == set(Outputs.model_fields) - {"backward"}
+    assert "MPa" in header["channels.traction"]
+    assert "per undeformed area" in header["channels.traction"]
 
 
 def test_bytes_are_the_same_for_the_same_field(path, tmp_path):

@@ -344,12 +344,17 @@ def spoilt(kind: str, folder: Path) -> str:
 
 
 @pytest.mark.parametrize(("kind", "words"), [
-    ("missing", "no file"), ("open", "closed"), ("garbage", "surface"), ("empty", "surface"), ("fine", "cell_mm"),
+    ("missing", "no file"), ("open", "closed"), ("garbage", "cannot be read as a surface"),
+    ("empty", "cannot be read as a surface"), ("fine", "cell_mm"),
 ])  # fmt: skip
-def test_unusable_mesh_is_named(tmp_path: Path, kind: str, words: str) -> None:
+def test_unusable_mesh_is_named(
+    tmp_path: Path, kind: str, words: str, caplog: pytest.LogCaptureFixture, recwarn: pytest.WarningsRecorder
+) -> None:
     indenter = MeshIndenter(shape="mesh", file=spoilt(kind, tmp_path), cell_mm=0.1)
     with pytest.raises(InputError, match=words) as error:
         rigid_body(indenter, tmp_path)
+    assert not caplog.records
+    assert not recwarn.list
     assert indenter.file in str(error.value) or kind == "fine"
 
 

@@ -1,8 +1,10 @@
 """Inspection of flows that are known, and what its pictures and pages must contain."""
 
 import dataclasses
+import io
 import json
 import re
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,6 +12,7 @@ import pytest
 from rich.console import Console
 from samples import HEIGHT, WIDTH, job, translation_sample
 
+from synth.commands import run_inspect
 from synth.dataset.exr import write_flow
 from synth.dataset.writer import DatasetWriter
 from synth.errors import InputError
@@ -112,6 +115,37 @@ def test_tables_and_json(dataset):
     assert "simulate 3.3 s" in text
 
 
+def _printed(inspection, width):
+    console = Console(width=width, file=io.StringIO())
+    for table in tables(inspection, width):
+        console.print(table)
+    return console.file.getvalue()
+
+
+@pytest.mark.parametrize("width", [40, 80, 400])
+def test_no_figure_is_cut_on_a_narrow_terminal(dataset, width):
+    inspection = inspect(dataset)
+    shown = _printed(inspection, width)
+    assert "…" not in shown
+    assert shown.count("000001 │") == len(tables(inspection, width)) - 1 == {40: 5, 80: 2, 400: 1}[width]
+    for figure in ("1.35", "95.83 %", "32x24", "0.2"):
+        assert f" {figure} " in shown
+
+
+def test_brackets_in_paths_are_no_markup(dataset):
+    for name in ("q[/b]", "[x]", "a:b:c"):
+        assert name in _printed(dataclasses.replace(inspect(dataset, limit=1), path=Path(name)), 80)
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_tables_keep_their_width_where_stdout_is_no_terminal(dataset, capsys, monkeypatch, terminal):
+    monkeypatch.setenv("COLUMNS", "80")
+    if terminal:
+        monkeypatch.setenv("FORCE_COLOR", "1")
+    assert run_inspect(dataset, None, None, 100, False) == 0
+    assert capsys.readouterr().out.count("000001") == (2 if terminal else 1)
+
+
 def test_limit_is_told(dataset):
     inspection = inspect(dataset, limit=2)
     assert [numbers["name"] for numbers in inspection.numbers] == ["000000", "000002"]
@@ -142,6 +176,15 @@ def test_gel_out_of_sight(tmp_path):
         write_sheet(inspection, tmp_path / "s.png")
         write_html(inspection, tmp_path / "s.html")
         assert inspection.numbers[0]["forward"]["max_px"] == {"nowhere": None, "still": 0.0}[name]
+
+
+def test_files_of_different_sizes_cannot_be_inspected(tmp_path):
+    with DatasetWriter(tmp_path / "d", job(1)) as writer:
+        writer.write(translation_sample())
+    image = tmp_path / "d/samples/000000/image2.png"
+    cv2.imwrite(str(image), cv2.imread(str(image))[:-1])
+    with pytest.raises(InputError, match=r"image1\.png is .*, image2\.png .*, flow\.exr .*; they must agree"):
+        inspect(tmp_path / "d")
 
 
 def test_what_cannot_be_inspected(tmp_path):

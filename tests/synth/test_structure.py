@@ -36,6 +36,7 @@ STAGES = (
     "synth.processes",
     "synth.ray_pool",
     "synth.generate",
+    "synth.progress",
     "synth.calibrate",
     "synth.bench",
     "synth.stress",

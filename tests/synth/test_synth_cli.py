@@ -263,6 +263,21 @@ def test_simulate_prints_a_table_and_redraws_the_same(capsys, tiny: Path, tmp_pa
     assert "complete" in out
 
 
+def test_simulate_names_the_scene_file(capsys, tiny: Path, tmp_path: Path) -> None:
+    (tmp_path / "damaged.stl").write_bytes(b"")
+    indenter = "contact.indenter={ shape = 'mesh', file = 'damaged.stl' }"
+    status = main(["simulate", "--scene", str(tiny), "--out", str(tmp_path / "s"), "--set", indenter])
+    assert _complaint(capsys, status).startswith(f"{tiny}: contact.indenter.file = 'damaged.stl': cannot be read")
+
+
+def test_simulate_says_how_far_it_is(capsys, tiny: Path, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("synth.progress.LINE_S", 0.0)
+    assert main(["simulate", "--scene", str(tiny), "--out", str(tmp_path / "s")]) == 0
+    lines = [line for line in capsys.readouterr().err.splitlines() if "percent of the way" in line]
+    assert lines
+    assert all(line.startswith("synth: simulate: percent of the way: ") for line in lines)
+
+
 def test_simulate_into_a_file_is_refused_before_the_work(capsys, tiny: Path) -> None:
     assert "cannot be written" in _complaint(capsys, main(["simulate", "--scene", str(tiny), "--out", str(tiny)]))
 

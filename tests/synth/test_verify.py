@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,15 +13,17 @@ from kinematic_double import LENS, OBLIQUE, STRAIGHT, optics, pixel_centres, sen
 from rich.console import Console
 from verified_sample import HEIGHT, WIDTH, as_sample, make_sample, pressed, scene
 
-from synth.dataset.exr import write_flow
+from synth.dataset.exr import read_stored, write_flow
 from synth.dataset.job import Job
 from synth.dataset.reader import SampleData
 from synth.dataset.writer import DatasetWriter
 from synth.errors import InputError
 from synth.flow.exact import exact_flow
 from synth.flow.field import FlowField
+from synth.scene import Outputs
 from synth.verify import Check, Report, SampleReport, verify_dataset, verify_sample
 from synth.verify.camera import ForwardCamera
+from synth.verify.files import flow_file_problems
 from synth.verify.motion import check_motion
 from synth.verify.photometry import NAME as PHOTOMETRY
 from synth.verify.photometry import check_photometry
@@ -214,6 +217,18 @@ def test_photometry_tells_the_right_flow_from_wrong_ones(sample):
         assert not check.passed, (name, check)
 
 
+def test_photometry_does_not_apply_where_shading_changes_within_its_filters():
+    """A small image of a strong twist: the right flow leaves 0.4 px, which tells nothing of the flow."""
+    small = scene(width=64, height=48, fx=70.0, fy=70.4, cx=31.7, cy=24.2)
+    drawn = make_sample(small, pressed(0, (0, 0)), pressed(1.8, (1.6, -1.0), 0.6))
+    y, x = np.mgrid[:48, :64]
+    shade = 0.85 + 0.1 * np.sin(2 * np.pi * (x + y) / 12)
+    image2 = np.rint(drawn.image2 * shade ** (1 / small.sensor.camera.gamma)).astype(np.uint8)
+    check = check_photometry(small.sensor, drawn.image1, image2, drawn.flow.forward, drawn.flow.forward_visible)
+    assert check.figure is None
+    assert "textured blocks the motion bends too fast" in check.detail
+
+
 def test_dataset_on_disk(tmp_path, sample):
     path = tmp_path / "data"
     with DatasetWriter(path, Job(SCENE.model_dump(mode="json"), "double", "0", seed=0, n=2)) as writer:
@@ -234,7 +249,8 @@ def test_dataset_on_disk(tmp_path, sample):
     assert not damaged.ok
     failed = {check.name: check.detail for check in damaged.samples[0].checks if not check.passed}
     assert set(failed) == {"files", "forward flow", "forward closure"}
-    assert "flow.exr" in failed["files"]
+    assert "flow.exr: sha256" in failed["files"]
+    assert "flow.exr: its header has seed = None, meta.json 0" in failed["files"]
     assert "row 70, column 90" in failed["forward flow"]
     assert not damaged.samples[1].ok
     assert "truncated" in damaged.samples[1].checks[0].detail
@@ -244,14 +260,48 @@ def test_dataset_on_disk(tmp_path, sample):
         verify_dataset(tmp_path)
 
 
+def _file_problems(folder, scene, **changes):
+    """Of a flow.exr with header, channels or meta.json changed."""
+    import OpenEXR
+
+    rng = np.random.default_rng(0)
+    forward, visible = rng.random((3, 4, 2), np.float32), rng.random((3, 4), np.float32)
+    forward[0, 0] = np.nan
+    flow = FlowField(forward, visible, extras=changes.get("extras", {}))
+    meta = {"scene_hash": "abc", "seed": 2**40, "index": 3}
+    write_flow(folder / "flow.exr", flow, {"scene.hash": "abc", "seed": str(2**40), "index": 3})
+    if "planes" in changes:
+        planes, header = read_stored(folder / "flow.exr")
+        OpenEXR.File(header, planes | changes["planes"]).write(str(folder / "flow.exr"))
+    return flow_file_problems(folder, scene, meta | changes.get("meta", {}))
+
+
+def test_channels_and_headers_of_the_flow_file(tmp_path):
+    plain = SCENE.model_copy(update={"outputs": Outputs(backward=False)})
+    rich = SCENE.model_copy(update={"outputs": Outputs(backward=False, depth=True, contact=True)})
+    whole = {name: np.zeros((3, 4), np.float32) for name in ("depth1.Z", "depth2.Z", "contact.Y")}
+    assert _file_problems(tmp_path, plain) == []
+    assert _file_problems(tmp_path, rich, extras=whole) == []
+    assert _file_problems(tmp_path, rich) == [f"flow.exr: lacks the channel {name}" for name in whole]
+    half = {"depth2.Z": whole["depth2.Z"].astype(np.float16)}
+    assert _file_problems(tmp_path, rich, extras=whole, planes=half) == ["flow.exr: depth2.Z is float16, not float32"]
+    assert _file_problems(tmp_path, plain, planes={"G": whole["depth1.Z"]}) == ["flow.exr: G is not forward.V"]
+    for key, header in (("seed", "seed"), ("index", "index"), ("scene_hash", "scene.hash")):
+        assert _file_problems(tmp_path, plain, meta={key: 9})[0].startswith(f"flow.exr: its header has {header} = ")
+
+
 def test_report():
     good = Check("a", 1.0, 2.0, "px")
     bad, unknown, skipped = replace(good, figure=3.0), replace(good, figure=float("nan")), replace(good, figure=None)
     assert [c.passed for c in (good, bad, unknown, skipped)] == [True, False, False, True]
     assert not Report("x", ()).ok
-    report = Report("x", (SampleReport(0, (good,)), SampleReport(4, (bad,))))
+    bad = replace(bad, detail="p[/b]")
+    report = Report(Path("q[/b][x]"), (SampleReport(0, (good, replace(skipped, name="b"))), SampleReport(4, (bad,))))
     assert not report.ok
     text = io.StringIO()
     Console(width=120, file=text).print(report.table())
-    assert "FAILED" in text.getvalue()
-    assert "samples 4" in text.getvalue()
+    for shown in ("FAILED", "samples 4", "q[/b][x]: 2 samples", "p[/b]"):
+        assert shown in text.getvalue()
+    report = Report(Path("x"), (SampleReport(0, (replace(good, figure=float("inf")), unknown)),))
+    checks = json.loads(json.dumps(report.record(), allow_nan=False))["samples"][0]["checks"]
+    assert [check["figure"] for check in checks] == [None, None]
