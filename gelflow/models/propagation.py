@@ -27,6 +27,7 @@ from torch.nn.functional import pad
 
 from gelflow.arrays import Flow, Images
 from gelflow.ops.gaussian import Smoother, WindowSums
+from gelflow.ops.kept import kept
 from gelflow.ops.resize import resize_flow, resize_images
 from gelflow.ops.warp import inside, warp
 
@@ -68,7 +69,6 @@ def propagated(
     pixel = math.ceil(window_px / PIXELS_A_WINDOW)
     size = (math.ceil(height / pixel), math.ceil(width / pixel))
     start, first, second = resize_flow(flow, size), resize_images(image1, size), resize_images(image2, size)
-    known = _with_slopes(start) if of_gel else start
     window = WindowSums(*size, window_px / pixel, flow)
     whole = window(torch.ones_like(start[:1, :1]))
 
@@ -85,34 +85,52 @@ def propagated(
         spread = moments[:, :1] - moments[:, 1:].square().mean(dim=1, keepdim=True) if of_gel else moments
         return torch.where(weight > SHARE_INSIDE * whole, spread, torch.inf).unflatten(0, (len(candidates), -1))
 
-    def offered(right: int, down: int) -> Flow:
-        """What the neighbour at x + (right, down) takes the flow at x to be."""
-        there, *slopes = _neighbours(known, right, down).split(2, dim=1)
-        return there - right * slopes[0] - down * slopes[1] if slopes else there
-
     now = residuals(start.unsqueeze(0))[0]
     best, least = start, (ENOUGH_OF_GEL if of_gel else ENOUGH) * now
     steps = [max(1, round(distance / pixel)) for distance in distances]
+    offered = _Offers(start, max(steps), extrapolate=of_gel)
     places = [(step * right, step * down) for step in steps for right, down in DIRECTIONS]
     # Launches are what takes time on a GPU, all neighbours together are too much for a processor's cache.
     at_once = len(places) if flow.is_cuda else 1
     for i in range(0, len(places), at_once):
-        offers = torch.stack([offered(*place) for place in places[i : i + at_once]])
+        offers = offered(places[i : i + at_once])
         left, which = residuals(offers).min(dim=0)
         found = offers.gather(0, which.expand_as(start).unsqueeze(0))[0]
         best, least = torch.where(left < least, found, best), torch.minimum(left, least)
     return flow + resize_flow(torch.where(now > (2 * noise) ** 2, best - start, 0.0), (height, width))
 
 
-def _with_slopes(flow: Flow) -> Tensor:
-    """The flow, smoothed, and its derivatives along x and y: (B, 6, H, W)."""
-    smooth = Smoother(flow.shape[-2], flow.shape[-1], SLOPES_PX, flow)(flow)
-    return torch.cat([smooth, *torch.gradient(smooth, dim=(-1, -2))], dim=1)
+class _Offers:
+    """What the flow at a place is by its neighbours.
+
+    Args:
+        flow: (B, 2, H, W).
+        reach: Largest step to a neighbour along an axis; beyond the border, the border's pixels go on.
+        extrapolate: By the slope of the flow, smoothed.
+    """
+
+    def __init__(self, flow: Flow, reach: int, extrapolate: bool) -> None:
+        self._size, self._reach, self._extrapolate = (flow.shape[-2], flow.shape[-1]), reach, extrapolate
+        if extrapolate:
+            flow = Smoother(*self._size, SLOPES_PX, flow)(flow)
+            flow = torch.cat([flow, *torch.gradient(flow, dim=(-1, -2))], dim=1)
+        self._padded = pad(flow, (reach,) * 4, mode="replicate")
+
+    def __call__(self, places: Sequence[tuple[int, int]]) -> Tensor:
+        """The offers of the neighbours at steps (right, down): (N, B, 2, H, W)."""
+        rows, columns = self._size
+        near = torch.stack([
+            self._padded[..., self._reach + down :, self._reach + right :][..., :rows, :columns]
+            for right, down in places
+        ])  # fmt: skip
+        if not self._extrapolate:
+            return near
+        there, across, along = near.split(2, dim=2)
+        right, down = _steps(tuple(places), near.dtype, near.device)
+        return there - right * across - down * along
 
 
-def _neighbours(field: Tensor, right: int, down: int) -> Tensor:
-    """A field (B, C, H, W) at x + (right, down), at the border that of the pixel nearest to it."""
-    margin = max(abs(right), abs(down))
-    rows, columns = field.shape[-2:]
-    padded = pad(field, (margin,) * 4, mode="replicate")
-    return padded[..., margin + down : margin + down + rows, margin + right : margin + right + columns]
+@kept
+def _steps(places: tuple[tuple[int, int], ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """(2, N, 1, 1, 1, 1)."""
+    return torch.tensor(places, dtype=dtype, device=device).T.reshape(2, -1, 1, 1, 1, 1)
