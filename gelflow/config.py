@@ -254,7 +254,7 @@ class TrainConfig(_Frozen):
     validate_every: int = Field(default=500, ge=1)
     """Steps between validations."""
     save_every: int = Field(default=500, ge=1)
-    """Steps between saves of the whole state; it is also saved at the end and on Ctrl-C."""
+    """Steps between saves of the whole state; it is also saved at the end and on Ctrl-C or SIGTERM."""
     workers: int = Field(default=0, ge=0)
     """Processes that load data; 0: in the training process."""
     seed: int = Field(default=0, ge=0)

@@ -1,4 +1,7 @@
-"""What happens around the steps of a run: saving, choosing the best weights, showing progress, stopping on Ctrl-C."""
+"""What happens around the steps of a run: saving, choosing the best weights, showing progress, stopping when asked to.
+
+Ctrl-C (SIGINT) and SIGTERM (a time limit, `docker stop`) ask alike.
+"""
 
 import signal
 import sys
@@ -6,7 +9,6 @@ import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import lightning as L
@@ -47,6 +49,18 @@ class Keeper(L.Callback):
         self.stop = False
         self.advance: Advance | None = None
         self.throughput = Throughput()
+
+    def ask_to_stop(self, *_: Any) -> None:
+        """A signal's handler: the first asks to stop after the step, the second stops at once."""
+        if self.stop:
+            raise Stopped
+        self.stop = True
+        print("stopping after this step (Ctrl-C once more: at once, back to the last save)", file=sys.stderr)
+
+    def on_train_start(self, *_: Any) -> None:
+        """Takes SIGTERM from Lightning, whose own handler, just set, would end the process with status 0."""
+        if _in_main_thread():
+            signal.signal(signal.SIGTERM, self.ask_to_stop)  # Lightning restores the one before its own at the end
 
     def validates_at(self, step: int) -> bool:
         """Whether a validation follows this step."""
@@ -147,19 +161,23 @@ def _brief(metrics: Mapping[str, float]) -> str:
 
 @contextmanager
 def stopping(keeper: Keeper) -> Iterator[None]:
-    """While the block runs, the first Ctrl-C asks the keeper to stop after the step; the second stops at once."""
-    if threading.current_thread() is not threading.main_thread():
+    """While the block runs, Ctrl-C asks the keeper to stop. See `Keeper.on_train_start` for SIGTERM."""
+    if not _in_main_thread():
         yield
         return
-
-    def ask(_: int, __: FrameType | None) -> None:
-        if keeper.stop:
-            raise Stopped
-        keeper.stop = True
-        print("stopping after this step (Ctrl-C once more: at once, back to the last save)", file=sys.stderr)
-
-    former = signal.signal(signal.SIGINT, ask)
+    former = signal.signal(signal.SIGINT, keeper.ask_to_stop)
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, former)
+
+
+def ignore_stopping(_: int) -> None:
+    """For processes that load data: they end with the run, which handles the signals that ask it to stop."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+
+
+def _in_main_thread() -> bool:
+    """Whether signals may be handled here."""
+    return threading.current_thread() is threading.main_thread()

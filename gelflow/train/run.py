@@ -25,7 +25,7 @@ from gelflow.errors import InputError
 from gelflow.models import GelFlow
 from gelflow.terminal import progress
 from gelflow.train.checkpoint import load_weights, save_weights
-from gelflow.train.keeper import Keeper, Stopped, describe, stopping, weights_metadata
+from gelflow.train.keeper import Keeper, Stopped, describe, ignore_stopping, stopping, weights_metadata
 from gelflow.train.module import FlowModule
 from gelflow.train.resident import ResidentPairs, resident
 from gelflow.train.samples import CheckedPairs, StepSampler, TrainingBatches, TrainingSamples, checked, collate
@@ -86,7 +86,7 @@ def train(
 
     Raises:
         InputError: Settings, data, folder or weights that cannot be used; a loss that is no longer finite.
-        KeyboardInterrupt: Ctrl-C; the state has been saved, the message says how to go on.
+        KeyboardInterrupt: Ctrl-C or SIGTERM; the state has been saved, the message says how to go on.
         OSError: The disk is full or the folder cannot be written to.
     """
     pairs, validation_pairs = _length(train_set), 0 if validation_set is None else _length(validation_set)
@@ -216,7 +216,13 @@ class _Data(L.LightningDataModule):
         sampler = StepSampler(len(self.train_set), config, start, stop, trainer.global_rank, trainer.world_size)
         samples = TrainingSamples(self.train_set, config)
         workers = 0 if isinstance(self.train_set, ResidentPairs) else config.workers
-        return DataLoader(samples, batch_sampler=sampler, num_workers=workers, collate_fn=TrainingBatches(config))
+        return DataLoader(
+            samples,
+            batch_sampler=sampler,
+            num_workers=workers,
+            collate_fn=TrainingBatches(config),
+            worker_init_fn=ignore_stopping,
+        )
 
     def _cache(self) -> None:
         """Puts the training pairs on the device, once, where the configuration and the memory allow it."""
@@ -239,7 +245,12 @@ class _Data(L.LightningDataModule):
         trainer = self.module.trainer
         mine = range(trainer.global_rank, _length(self.validation_set), trainer.world_size)
         return DataLoader(
-            self.validation_set, batch_size=1, sampler=mine, num_workers=self.config.workers, collate_fn=_one_pair
+            self.validation_set,
+            batch_size=1,
+            sampler=mine,
+            num_workers=self.config.workers,
+            collate_fn=_one_pair,
+            worker_init_fn=ignore_stopping,
         )
 
 

@@ -3,7 +3,7 @@
 run.json             the configuration and what it was given, written when the run starts
 state.ckpt           network, optimiser, step and best score so far: everything a resumed run needs
 weights.safetensors  the best weights on the validation pairs so far; without such pairs, the last, at the end
-                     or where Ctrl-C stopped the run
+                     or where Ctrl-C or SIGTERM stopped the run
 logs/                TensorBoard and CSV, a subfolder per session
 """
 

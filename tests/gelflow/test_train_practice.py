@@ -1,8 +1,11 @@
 """Practice: moving average, both directions and analogy resume bit by bit; bf16; compile; two processes; speed."""
 
 import csv
+import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -124,6 +127,28 @@ def test_two_processes_end_as_one_with_twice_the_batch(tmp_path: Path) -> None:
     differences = torch.cat([(first[name] - second[name]).abs().flatten() for name in first])
     assert (differences < 1e-6).float().mean() > 0.99
     assert differences.max() < 6.1e-4  # three steps, each to the other side
+
+
+def test_sigterm_stops_a_run_as_ctrl_c_does(tmp_path: Path) -> None:
+    """Sent to all its processes, as SLURM does: fails with Lightning's handler, and with workers that it ends."""
+    folder, out = write_folder(tmp_path / "data", {"a": (1.0, 0.5)}, (64, 64)), tmp_path / "run"
+    settings = tmp_path / "settings.toml"
+    settings.write_text("steps = 100_000\nbatch_size = 1\nsave_every = 1\nworkers = 1\n[model]\nlevels = 4\n"
+                        "projected_channels = 8\n[loss]\nlambda_s = [1.0, 1.0, 1.0]\n")  # fmt: skip
+    command = [sys.executable, "-m", "gelflow", "train", str(folder), "--out", str(out), "--device", "cpu",
+               "--config", str(settings)]  # fmt: skip
+    run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    try:
+        while not (out / "state.ckpt").exists() and run.poll() is None:
+            time.sleep(0.05)
+        os.killpg(run.pid, signal.SIGTERM)
+        text = run.communicate(timeout=60)[1]
+    finally:
+        run.kill()
+    assert run.returncode == 130, text
+    assert text.count("stopping after this step") == 1
+    assert f"stopped; step {load_state(out).step} of 100000 is saved" in text
+    assert (out / "weights.safetensors").exists()
 
 
 def test_speed_and_memory_are_reported(pairs: Shifts, tmp_path: Path) -> None:
