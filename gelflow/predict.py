@@ -63,7 +63,10 @@ def predict_pair(method: Method, path1: Path, path2: Path, out: Path) -> Predict
     stem1, stem2 = path1.stem, path2.stem
     common = stem1.removesuffix("_1")
     name = common if stem1 == f"{common}_1" and stem2 == f"{common}_2" else f"{stem1}_to_{stem2}"
-    flow, motion = _estimate(method, image1, image2, 1)
+    try:
+        flow, motion = _estimate(method, image1, image2, 1)
+    except InputError as error:
+        raise InputError(f"{path1} and {path2}, {method.name}: {error}") from error
     files = [out / f"{name}{suffix}" for suffix in (".exr", ".flo", ".png")]
     write_flow(files[0], flow)
     write_flo(files[1], flow)

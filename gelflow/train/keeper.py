@@ -62,12 +62,16 @@ class Keeper(L.Callback):
         if _in_main_thread():
             signal.signal(signal.SIGTERM, self.ask_to_stop)  # Lightning restores the one before its own at the end
 
+    def on_sanity_check_start(self, *_: Any) -> None:
+        """The same: a resumed run may begin with the validation that is due."""
+        self.on_train_start()
+
     def validates_at(self, step: int) -> bool:
         """Whether a validation follows this step."""
         return self.validates and (step % self.config.validate_every == 0 or step == self.config.steps)
 
     def on_train_batch_end(self, trainer: L.Trainer, module: L.LightningModule, *_: Any) -> None:
-        """Shows progress; saves where it is due and no validation follows, which saves itself."""
+        """Shows progress; saves where it is due, and before a validation; stops where that was asked for."""
         flow_module = _ours(module)
         step = flow_module.step
         self.throughput.add(self.config.batch_size * trainer.world_size)
@@ -81,10 +85,9 @@ class Keeper(L.Callback):
                 item += "" if rate is None else f", {rate:.3g} pairs/s"
                 done = step - flow_module.start
                 self.advance(done, self.config.steps - flow_module.start, f"{item}{_brief(self.metrics)}")
-        if self.validates_at(step):
-            return
-        if self.stop or step % self.config.save_every == 0 or step == self.config.steps:
-            self._save(trainer, flow_module)
+        validation_due = self.validates_at(step)
+        if self.stop or validation_due or step % self.config.save_every == 0 or step == self.config.steps:
+            self._save(trainer, flow_module, validation_due)
         if self.stop:
             if not self.validates:
                 self._keep_weights(trainer, flow_module)
@@ -108,8 +111,6 @@ class Keeper(L.Callback):
         self._save(trainer, flow_module)
         if trainer.is_global_zero:
             print(f"step {flow_module.step}: {describe(self.metrics)}", file=sys.stderr)
-        if self.stop:
-            raise Stopped
 
     def _keep_weights(self, trainer: L.Trainer, module: FlowModule) -> None:
         if trainer.is_global_zero:
@@ -122,13 +123,14 @@ class Keeper(L.Callback):
                 f"({self.config.learning_rate:g}) or set gradient_clip (now {self.config.gradient_clip})"
             )
 
-    def _save(self, trainer: L.Trainer, module: FlowModule) -> None:
+    def _save(self, trainer: L.Trainer, module: FlowModule, validation_due: bool = False) -> None:
         self._check(module)
         if trainer.is_global_zero:
             optimiser = trainer.optimizers[0].state_dict()
             average = None if module.average is None else module.average.state_dict()
             model, metrics = module.model.state_dict(), dict(self.metrics)
-            save_state(self.out, State(module.step, model, optimiser, self.score, metrics, average))
+            state = State(module.step, model, optimiser, self.score, metrics, average, validation_due)
+            save_state(self.out, state)
 
 
 def _ours(module: L.LightningModule) -> FlowModule:

@@ -26,7 +26,7 @@ from gelflow.models import GelFlow
 from gelflow.terminal import progress
 from gelflow.train.checkpoint import load_weights, save_weights
 from gelflow.train.keeper import Keeper, Stopped, describe, ignore_stopping, stopping, weights_metadata
-from gelflow.train.module import FlowModule
+from gelflow.train.module import FlowModule, check_side
 from gelflow.train.resident import ResidentPairs, resident
 from gelflow.train.samples import CheckedPairs, StepSampler, TrainingBatches, TrainingSamples, checked, collate
 from gelflow.train.state import STATE, WEIGHTS, load_state, open_run
@@ -95,6 +95,8 @@ def train(
     device = _device(config)
     model = _initial_network(config, initial)
     checked(train_set[0], supervised=config.supervision == "flow")
+    if validation_set is not None:
+        check_side(_one_pair([validation_set[0]]), config)
     first = _is_first_process()
     if first:
         state = open_run(out, config, pairs, validation_pairs, initial, resume)
@@ -107,8 +109,9 @@ def train(
     else:
         module = FlowModule(config, model, state.step, state.optimiser, state.average)
     keeper = Keeper(config, out, validation_pairs > 0, state.score if state else None, state.metrics if state else {})
-    if module.start < config.steps:
-        _fit(module, keeper, _Data(config, train_set, validation_set, module), device)
+    validation_due = state is not None and state.validation_due
+    if module.start < config.steps or validation_due:
+        _fit(module, keeper, _Data(config, train_set, validation_set, module), device, validation_due)
     weights = out / WEIGHTS
     if validation_set is None and first:
         save_weights(weights, module.evaluated.cpu(), **weights_metadata(config, config.steps))
@@ -153,8 +156,12 @@ def _initial_network(config: TrainConfig, initial: Path | None) -> GelFlow:
     return model.train()
 
 
-def _fit(module: FlowModule, keeper: Keeper, data: "_Data", device: str) -> None:
-    """Runs the remaining steps; a stop by the user becomes a KeyboardInterrupt that says how to go on."""
+def _fit(module: FlowModule, keeper: Keeper, data: "_Data", device: str, validation_due: bool) -> None:
+    """Validates first where that is due, then runs the remaining steps.
+
+    Raises:
+        KeyboardInterrupt: Somebody asked to stop; the message says how to go on.
+    """
     config, out = keeper.config, keeper.out
     session = f"from_step_{module.start:06d}"
     with ExitStack() as stack:
@@ -175,7 +182,7 @@ def _fit(module: FlowModule, keeper: Keeper, data: "_Data", device: str) -> None
             enable_checkpointing=False,
             enable_progress_bar=False,
             enable_model_summary=False,
-            num_sanity_val_steps=0,
+            num_sanity_val_steps=-1 if validation_due else 0,  # all pairs, before the first step
             use_distributed_sampler=False,
             reload_dataloaders_every_n_epochs=1,
         )

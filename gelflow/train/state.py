@@ -38,6 +38,7 @@ class State:
         score: Best validation score so far (lower is better), or None.
         metrics: Results of the last validation.
         average: State dictionary of the weights' moving average, where there is one.
+        validation_due: Whether the validation that follows the step is still to come.
     """
 
     step: int
@@ -46,6 +47,7 @@ class State:
     score: float | None
     metrics: dict[str, float]
     average: dict[str, Any] | None = None
+    validation_due: bool = False
 
 
 def save_state(out: Path, state: State) -> None:

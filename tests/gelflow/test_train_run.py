@@ -112,6 +112,36 @@ def test_a_run_killed_between_saves_goes_back_to_the_last_one_and_ends_the_same(
     assert all(torch.equal(first[name], second[name]) for name in first)
 
 
+@pytest.mark.parametrize("steps", [4, 2])
+def test_a_run_whose_validation_failed_is_saved_and_validates_when_resumed(
+    pairs: Shifts, tmp_path: Path, steps: int
+) -> None:
+    """Fails without a save before the validation, and with a resumed run that leaves out what is due."""
+
+    class OneSmall(CtrlC):
+        def __getitem__(self, index: int) -> dict:
+            sample = self.pairs[index]
+            if index == self.left:
+                sample |= {key: sample[key][..., :63, :] for key in ("image1", "image2", "flow")}
+            return sample
+
+    config = small(steps=steps, validate_every=2)
+    whole = train(config, pairs, pairs, tmp_path / "whole")
+    with pytest.raises(InputError, match=r"validation pair shift_0: 63x64 px, but each side must be at least 64 px"):
+        train(config, pairs, OneSmall(pairs, 0), tmp_path / "refused")
+    assert not (tmp_path / "refused").exists()
+    with pytest.raises(InputError, match=r"validation pair shift_1: 63x64 px"):
+        train(config, pairs, OneSmall(pairs, 1), tmp_path / "cut")
+    assert load_state(tmp_path / "cut").step == 2
+    resumed = train(config, pairs, pairs, tmp_path / "cut", resume=True)
+    assert (resumed.best, resumed.metrics) == (whole.best, whole.metrics)
+    first, second = weights_of(whole.weights), weights_of(resumed.weights)
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    validated = [row for log in (tmp_path / "cut").glob("logs/csv/*/metrics.csv")
+                 for row in csv.DictReader(log.open()) if row.get("validation/psnr_db")]  # fmt: skip
+    assert sorted(row["step"] for row in validated) == [str(step) for step in range(2, steps + 1, 2)]
+
+
 def test_the_folder_of_a_run_holds_logs_weights_and_settings(pairs: Shifts, tmp_path: Path) -> None:
     config = small(steps=20, validate_every=10)
     result = train(config, pairs, pairs, tmp_path)
