@@ -276,7 +276,9 @@ class TrainConfig(_Frozen):
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to train; auto: a CUDA device where there is one."""
     devices: int = Field(default=1, ge=1)
-    """Number of devices (on a CPU: processes) on this machine; each takes batch_size pairs a step."""
+    """Number of devices (on a CPU: processes) on each machine; each takes batch_size pairs a step."""
+    nodes: int = Field(default=1, ge=1)
+    """Number of machines that train together; the same command is started on each, see Lightning's `num_nodes`."""
 
     @model_validator(mode="after")
     def _fits_together(self) -> TrainConfig:

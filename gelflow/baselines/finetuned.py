@@ -76,6 +76,7 @@ def fine_tuning_settings(method: Learned, steps: int, config: str | None, pairs:
         "batch_size": min(values["batch_size"], pairs),
         "device": method.device,
         "devices": 1,
+        "nodes": 1,
     }
     if values.get("schedule") == "one_cycle":
         fixed["learning_rate"] = min(values["learning_rate"], RATE)

@@ -97,8 +97,7 @@ def train(
     checked(train_set[0], supervised=config.supervision == "flow")
     if validation_set is not None:
         check_side(_one_pair([validation_set[0]]), config)
-    first = _is_first_process()
-    if first:
+    if _is_first_process():
         state = open_run(out, config, pairs, validation_pairs, initial, resume)
     else:
         state = load_state(out) if resume else None
@@ -113,7 +112,7 @@ def train(
     if module.start < config.steps or validation_due:
         _fit(module, keeper, _Data(config, train_set, validation_set, module), device, validation_due)
     weights = out / WEIGHTS
-    if validation_set is None and first:
+    if validation_set is None and _is_first_process():
         save_weights(weights, module.evaluated.cpu(), **weights_metadata(config, config.steps))
     rate = keeper.throughput.pairs_per_second
     return TrainResult(weights, config.steps, keeper.metrics, keeper.score, rate, peak_memory_mib())
@@ -169,7 +168,8 @@ def _fit(module: FlowModule, keeper: Keeper, data: "_Data", device: str, validat
         trainer = L.Trainer(
             accelerator="gpu" if device == "cuda" else "cpu",
             devices=config.devices,
-            strategy="ddp" if config.devices > 1 else "auto",
+            num_nodes=config.nodes,
+            strategy="ddp" if config.devices * config.nodes > 1 else "auto",
             precision="bf16-mixed" if config.precision == "bf16" else "32-true",
             max_steps=config.steps - module.start,
             max_epochs=-1,

@@ -3,6 +3,7 @@
 import csv
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -106,7 +107,8 @@ def test_a_compiled_network_is_asked_for_and_keeps_its_names(
 
 
 @pytest.mark.slow
-def test_two_processes_end_as_one_with_twice_the_batch(tmp_path: Path) -> None:
+@pytest.mark.parametrize("option", ["--devices", "--nodes"])
+def test_two_processes_end_as_one_with_twice_the_batch(tmp_path: Path, option: str) -> None:
     """Gradients are averaged over processes, so that 2 x 1 pairs are 1 x 2 pairs.
 
     Fails with both processes given the same pairs.
@@ -115,12 +117,18 @@ def test_two_processes_end_as_one_with_twice_the_batch(tmp_path: Path) -> None:
     options = {"steps": 3, "learning_rate": 1e-4, "loss": SMALL["loss"] | {"mask_outside": False}}
     one = train(small(batch_size=2, **options), open_pairs(folder), None, tmp_path / "one").weights
     settings = tmp_path / "settings.toml"
-    settings.write_text("steps = 3\nbatch_size = 1\ndevices = 2\n[model]\nlevels = 4\nprojected_channels = 8\n"
+    settings.write_text("steps = 3\nbatch_size = 1\n[model]\nlevels = 4\nprojected_channels = 8\n"
                         "[loss]\nlambda_s = [1.0, 1.0, 1.0]\nmask_outside = false\n")  # fmt: skip
     command = [sys.executable, "-m", "gelflow", "train", str(folder), "--out", str(tmp_path / "two"), "--device", "cpu",
-               "--config", str(settings)]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
-    assert done.returncode == 0, done.stderr
+               "--config", str(settings), option, "2"]  # fmt: skip
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        environment = os.environ | {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1])}
+    machines = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                                 env=environment | {"NODE_RANK": str(rank)})
+                for rank in range(2 if option == "--nodes" else 1)]  # fmt: skip
+    texts = [machine.communicate(timeout=240) for machine in machines]
+    assert [machine.returncode for machine in machines] == [0] * len(machines), texts
     first, second = (load_weights(path).state_dict() for path in (one, tmp_path / "two" / "weights.safetensors"))
     # The same gradients up to float32 rounding. Adam's first steps are the sign of the gradient times 1e-4, so that a
     # gradient near zero may turn: all but a few weights must agree to a hundredth of a step.
