@@ -12,6 +12,8 @@ A sample is a dictionary:
 throughout, so that samples of both kinds fit into one batch.
 """
 
+import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -42,6 +44,7 @@ class PairRecord:
         markers: CSV file with tracked dots (columns x1, y1, x2, y2 in px), or None.
         exchanged: The images have been exchanged: the exact flow is the file's `backward`.
         scene: Scene and kind of pattern of a synthetic pair, or None.
+        origin: Hash of its data set's scene, and its seed; or None.
     """
 
     name: str
@@ -51,6 +54,7 @@ class PairRecord:
     markers: Path | None = None
     exchanged: bool = False
     scene: str | None = None
+    origin: str | None = None
 
 
 class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
@@ -78,6 +82,12 @@ class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
     def names(self) -> list[str]:
         """Names of the pairs, in order."""
         return [record.name for record in self.records]
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of what tells data sets apart without reading an image: names, scenes and origins of the pairs."""
+        known = [(record.name, record.scene, record.origin) for record in self.records]
+        return hashlib.sha256(json.dumps(known).encode()).hexdigest()
 
     def images(self, index: int) -> tuple[ImageArray, ImageArray]:
         """Both images of a pair, (H, W, 3) float32 in [0, 1].

@@ -98,7 +98,13 @@ def train(
     if validation_set is not None:
         check_side(_one_pair([validation_set[0]]), config)
     if _is_first_process():
-        state = open_run(out, config, pairs, validation_pairs, initial, resume)
+        data = {
+            "pairs": pairs,
+            "digest": getattr(train_set, "digest", None),
+            "validation_pairs": validation_pairs,
+            "validation_digest": getattr(validation_set, "digest", None),
+        }
+        state = open_run(out, config, data, initial, resume)
     else:
         state = load_state(out) if resume else None
     if state is not None:

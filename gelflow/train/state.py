@@ -9,6 +9,7 @@ logs/                TensorBoard and CSV, a subfolder per session
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -76,15 +77,15 @@ def load_state(out: Path) -> State:
 
 
 def open_run(
-    out: Path, config: TrainConfig, pairs: int, validation_pairs: int, initial: Path | None, resume: bool
+    out: Path, config: TrainConfig, data: Mapping[str, int | str | None], initial: Path | None, resume: bool
 ) -> State | None:
     """Claims the folder for a new run, or checks that it holds this very run.
 
     Args:
         out: The folder; made where it is missing.
         config: The run's settings.
-        pairs: Training pairs.
-        validation_pairs: Validation pairs, 0 without.
+        data: What is known of the data sets: `pairs` and `validation_pairs` (0 without), their numbers, and the
+            `digest` and `validation_digest` (None where a data set has none).
         initial: Weights that the run starts from.
         resume: Go on with the run in the folder.
 
@@ -96,8 +97,7 @@ def open_run(
     """
     record = {
         "gelflow": __version__,
-        "pairs": pairs,
-        "validation_pairs": validation_pairs,
+        **data,
         "initial_sha256": None if initial is None else hashlib.sha256(initial.read_bytes()).hexdigest(),
         "config": config.model_dump(mode="json"),
     }
@@ -114,6 +114,11 @@ def open_run(
         f"{name}: {former.get(name)!r} there, {record[name]!r} now"
         for name in ("pairs", "validation_pairs", "initial_sha256")
         if former.get(name) != record[name]
+    ]
+    differences += [
+        f"the {words} have other names, scenes or seeds there"
+        for name, words in (("digest", "training pairs"), ("validation_digest", "validation pairs"))
+        if None not in (former.get(name), record[name]) and former[name] != record[name]
     ]
     before = validated(TrainConfig, former.get("config", {}), str(out / RUN))
     differences += _differences(before, config)

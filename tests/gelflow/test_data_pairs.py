@@ -98,6 +98,16 @@ def test_broken_synthetic_data_set_is_named(tmp_path: Path, file: str, content: 
         open_pairs(folder)
 
 
+def test_digest_tells_synthetic_data_sets_apart_by_scene_and_seed(tmp_path: Path) -> None:
+    folder = write_synthetic(tmp_path, [(1, 0)])
+    digests = [open_pairs(folder).digest]
+    for origin in ({"scene_hash": "a", "seed": 1}, {"scene_hash": "a", "seed": 2}, {"scene_hash": "b", "seed": 2}):
+        (folder / "dataset.json").write_text(json.dumps({"schema_version": 1} | origin))
+        digests.append(open_pairs(folder).digest)
+    assert len(set(digests)) == 4
+    assert open_pairs(folder).digest == digests[-1]
+
+
 def test_flow_of_another_size_is_named(tmp_path: Path) -> None:
     folder = write_synthetic(tmp_path, [(1, 0)])
     write_flow(folder / "samples" / "000000" / "flow.exr", np.zeros((10, 10, 2), np.float32))

@@ -9,10 +9,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from textures import write_folder
 from torch.utils.data import Dataset
 from waves import Shifts
 
 from gelflow.config import ModelConfig, TrainConfig
+from gelflow.data import open_pairs
 from gelflow.errors import InputError
 from gelflow.estimate import estimate_flow
 from gelflow.train import train
@@ -218,6 +220,22 @@ def test_folders_of_other_runs_are_refused(pairs: Shifts, tmp_path: Path) -> Non
     (tmp_path / "run" / "state.ckpt").write_bytes(b"PK damaged")
     with pytest.raises(InputError, match=r"state\.ckpt: damaged"):
         train(small(steps=4), pairs, None, tmp_path / "run", resume=True)
+
+
+def test_a_run_is_not_resumed_with_other_pairs(tmp_path: Path) -> None:
+    """But a run whose record is older than the digests and than `nodes` is."""
+    data, other = (
+        open_pairs(write_folder(tmp_path / names, dict.fromkeys(names, (1.0, 0.0)))) for names in ("ab", "ac")
+    )
+    run = tmp_path / "run"
+    train(small(steps=1), data, data, run)
+    for pairs, validation, words in ((other, data, "training"), (data, other, "validation")):
+        with pytest.raises(InputError, match=f"the {words} pairs have other names, scenes or seeds there"):
+            train(small(steps=2), pairs, validation, run, resume=True)
+    record = json.loads((run / "run.json").read_text())
+    del record["digest"], record["validation_digest"], record["config"]["nodes"]
+    (run / "run.json").write_text(json.dumps(record))
+    assert train(small(steps=2), other, data, run, resume=True).steps == 2
 
 
 def test_settings_that_the_data_or_the_machine_cannot_serve(pairs: Shifts, tmp_path: Path) -> None:
