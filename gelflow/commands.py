@@ -249,7 +249,8 @@ def run_pairs(inputs: Sequence[str], out: Path, config: ChoiceConfig, as_json: b
 
 def _show_pairs(result: PairSet, out: Path, as_json: bool) -> None:
     motions = sorted(pair.motion_px for pair in result.pairs)
-    deciles = [round(value, 1) for value in quantiles(motions, n=10)] if len(motions) > 1 else motions
+    deciles = quantiles(motions, n=10, method="inclusive") if len(motions) > 1 else motions
+    deciles = [round(value, 1) for value in deciles]
     empty = sum(report.chosen == 0 for report in result.sources.values())
     if as_json:
         answer = {

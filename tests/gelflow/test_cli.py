@@ -128,6 +128,9 @@ def test_pairs_exit_statuses(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     answer = json.loads(capsys.readouterr().out)
     assert answer["recordings"] == 1
     assert answer["pairs"] >= 2
+    motions = [pair["motion_px"] for pair in json.loads((tmp_path / "a" / "pairs.json").read_text())["pairs"]]
+    deciles = answer["motion_deciles_px"]
+    assert round(min(motions), 1) <= deciles[0] <= deciles[-1] <= round(max(motions), 1)
     assert main(["pairs", str(good), str(bad), "--out", str(tmp_path / "b")]) == 1
     captured = capsys.readouterr()
     assert "bad.avi" in captured.err
