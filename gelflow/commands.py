@@ -112,8 +112,9 @@ def run_compare(
     """
     if add and out is None:
         raise InputError("--add: give the folder of the earlier comparison as --out")
-    if every < 1:
-        raise InputError(f"--every {every}: a number from 1 on is needed")
+    for option, given, least in (("--every", every, 1), ("--batch", batch, 0), ("--ft", fine_tuning[0], 0)):
+        if given < least:
+            raise InputError(f"{option} {given}: a number from {least} on is needed")
     chosen = named_methods([name.strip() for name in methods.split(",") if name.strip()], device)
     networks = [network for given in weights for network in _labelled(given, registrations, size, device)]
     steps, config = fine_tuning

@@ -257,7 +257,7 @@ class TrainConfig(_Frozen):
     """Steps between saves of the whole state; it is also saved at the end and on Ctrl-C or SIGTERM."""
     workers: int = Field(default=0, ge=0)
     """Processes that load data; 0: in the training process."""
-    seed: int = Field(default=0, ge=0)
+    seed: int = Field(default=0, ge=0, lt=2**32)
     """Seed of the initial weights, of the order of the pairs and of the augmentation."""
     precision: Annotated[Literal["32", "bf16"], BeforeValidator(str)] = "32"
     """float32, or bfloat16 for the convolutions; flows and losses are float32 in both."""

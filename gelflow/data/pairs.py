@@ -203,15 +203,18 @@ def read_markers(path: Path) -> MarkerArray:
     if not path.is_file():
         raise InputError(f"{path}: there is no such file")
     rows: list[list[float]] = []
-    with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        if not set(columns) <= set(reader.fieldnames or ()):
-            raise InputError(f"{path}: needs the columns x1,y1,x2,y2; it has: {','.join(reader.fieldnames or ())}")
-        for row in reader:
-            try:
-                rows.append([float(row[name]) for name in columns])
-            except (TypeError, ValueError) as error:
-                raise InputError(f"{path}, line {reader.line_num}: four numbers are needed") from error
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:  # with or without a byte order mark
+            reader = csv.DictReader(file)
+            if not set(columns) <= set(reader.fieldnames or ()):
+                raise InputError(f"{path}: needs the columns x1,y1,x2,y2; it has: {','.join(reader.fieldnames or ())}")
+            for row in reader:
+                try:
+                    rows.append([float(row[name]) for name in columns])
+                except (TypeError, ValueError) as error:
+                    raise InputError(f"{path}, line {reader.line_num}: four numbers are needed") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: not a CSV file in UTF-8 ({error})") from error
     markers = np.array(rows, np.float64).reshape(-1, 4)
     if not len(markers) or not np.isfinite(markers).all():
         raise InputError(f"{path}: holds no marker, or one that is not finite")
