@@ -7,12 +7,9 @@ that they belong to; scale s has 1/2^s of the image's resolution.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any, Literal, TypeGuard, TypeVar, get_args
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
-
-from gelflow.errors import InputError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 MINIMUM_SIDE = 64
 """Images with a side below this many px have no coarsest scale worth decoding."""
@@ -297,46 +294,3 @@ class TrainConfig(_Frozen):
 
 def _exceeds(inner: tuple[int, int], outer: tuple[int, int]) -> bool:
     return inner[0] > outer[0] or inner[1] > outer[1]
-
-
-Config = TypeVar("Config", bound=_Frozen)
-
-
-def validated(kind: type[Config], values: Mapping[str, Any], source: str) -> Config:
-    """Builds a configuration from plain values.
-
-    Args:
-        kind: `ModelConfig`, `LossConfig` or `TrainConfig`.
-        values: Field names and values, nested as the configuration is.
-        source: What the values come from (a path, an option), for the message.
-
-    Raises:
-        InputError: A field that does not exist, has the wrong type or lies outside its range; one line per field.
-    """
-    try:
-        return kind.model_validate(dict(values))
-    except ValidationError as error:
-        lines = []
-        for item in error.errors():
-            field = ".".join(str(part) for part in item["loc"]) or "(whole configuration)"
-            given = "" if item["type"] in ("value_error", "missing") else f" (given: {item['input']!r})"
-            if item["type"] == "extra_forbidden":
-                allowed = _fields_at(kind, item["loc"][:-1])
-                lines.append(f"{field}: there is no such setting; allowed: {', '.join(allowed)}")
-            else:
-                lines.append(f"{field}: {item['msg'].removeprefix('Value error, ')}{given}")
-        raise InputError(f"{source}: " + "; ".join(lines)) from error
-
-
-def _is_table(annotation: Any) -> TypeGuard[type[BaseModel]]:
-    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
-
-
-def _fields_at(kind: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
-    for name in location:
-        annotation = kind.model_fields[str(name)].annotation
-        tables = [part for part in (annotation, *get_args(annotation)) if _is_table(part)]
-        if not tables:
-            return []
-        kind = tables[0]
-    return list(kind.model_fields)

@@ -13,10 +13,11 @@ from safetensors.torch import save
 from torch import Tensor
 
 from gelflow import __version__
-from gelflow.config import ModelConfig, validated
+from gelflow.config import ModelConfig
 from gelflow.errors import InputError
 from gelflow.files.atomic import replacing
 from gelflow.models import GelFlow
+from gelflow.schema_errors import validated
 
 FORMAT = "gelflow"
 RETRAIN = "give a file that `python -m gelflow train` wrote (weights.safetensors)"

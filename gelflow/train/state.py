@@ -17,10 +17,11 @@ from typing import Any
 import torch
 
 from gelflow import __version__
-from gelflow.config import TrainConfig, validated
+from gelflow.config import TrainConfig
 from gelflow.errors import InputError
 from gelflow.files.atomic import replacing, write_text
 from gelflow.files.tensors import Unreadable, load_tensors
+from gelflow.schema_errors import validated
 
 RUN, STATE, WEIGHTS = "run.json", "state.ckpt", "weights.safetensors"
 
