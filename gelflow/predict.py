@@ -2,6 +2,7 @@
 
 import csv
 import os
+import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -82,7 +83,7 @@ def predict_video(
     every: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> Prediction:
-    """Writes flow/000001.exr ... (numbered by frame), motion.csv and overlay.mp4; replaces older ones.
+    """Writes flow/000001.exr ... (numbered by frame), motion.csv and overlay.mp4 in place of all older ones.
 
     Args:
         method: Estimates the flow.
@@ -106,6 +107,8 @@ def predict_video(
             flow, motion = _estimate(method, _as_float(image1), _as_float(image2), index)
         except InputError as error:
             raise InputError(f"{path}, frame {index}, {method.name}: {error}") from error
+        if not files:
+            _remove_numbered(out / "flow", ".exr")
         files.append(out / "flow" / f"{index:06d}.exr")
         write_flow(files[-1], flow)
         motions.append(motion)
@@ -195,9 +198,17 @@ def _write_overlay(pictures: Iterator[Bytes3], out: Path, frames_per_second: flo
 
 
 def _write_sequence(first: Bytes3, rest: Iterator[Bytes3], folder: Path) -> list[Path]:
+    _remove_numbered(folder, ".png")
     files = [folder / "000000.png"]
     write_png(files[0], first)
     for number, picture in enumerate(rest, start=1):
         files.append(folder / f"{number:06d}.png")
         write_png(files[-1], picture)
     return files
+
+
+def _remove_numbered(folder: Path, suffix: str) -> None:
+    """Removes what an earlier run wrote, which may have had other frames: files named by six digits or more."""
+    for path in folder.glob(f"*{suffix}"):
+        if re.fullmatch(r"[0-9]{6,}", path.stem):
+            path.unlink()
