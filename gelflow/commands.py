@@ -68,12 +68,14 @@ def run_train(
     """`train`, and `finetune` where weights are given."""
     from gelflow.train import train
     from gelflow.train.checkpoint import load_weights
+    from gelflow.train.keeper import is_first_process
 
     start = {} if weights is None else {"model": load_weights(weights).config.model_dump()}
     settings = train_config(config, assignments, options, start)
     validation_set = open_all(validation) if validation else None
     result = train(settings, open_all(data), validation_set, out, initial=weights, resume=resume)
-    print(result)
+    if is_first_process():
+        print(result)
     return 0
 
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import lightning as L
 import torch
+from lightning.pytorch.utilities import rank_zero_only
 
 from gelflow.config import TrainConfig
 from gelflow.errors import InputError
@@ -55,16 +56,13 @@ class Keeper(L.Callback):
         if self.stop:
             raise Stopped
         self.stop = True
-        print("stopping after this step (Ctrl-C once more: at once, back to the last save)", file=sys.stderr)
+        if is_first_process():
+            print("stopping after this step (Ctrl-C once more: at once, back to the last save)", file=sys.stderr)
 
     def on_train_start(self, *_: Any) -> None:
         """Takes SIGTERM from Lightning, whose own handler, just set, would end the process with status 0."""
         if _in_main_thread():
             signal.signal(signal.SIGTERM, self.ask_to_stop)  # Lightning restores the one before its own at the end
-
-    def on_sanity_check_start(self, *_: Any) -> None:
-        """The same: a resumed run may begin with the validation that is due."""
-        self.on_train_start()
 
     def validates_at(self, step: int) -> bool:
         """Whether a validation follows this step."""
@@ -85,12 +83,14 @@ class Keeper(L.Callback):
                 item += "" if rate is None else f", {rate:.3g} pairs/s"
                 done = step - flow_module.start
                 self.advance(done, self.config.steps - flow_module.start, f"{item}{_brief(self.metrics)}")
+        stop = trainer.strategy.reduce_boolean_decision(self.stop, all=False)  # whichever process was asked to
         validation_due = self.validates_at(step)
-        if self.stop or validation_due or step % self.config.save_every == 0 or step == self.config.steps:
+        if stop or validation_due or step % self.config.save_every == 0 or step == self.config.steps:
             self._save(trainer, flow_module, validation_due)
-        if self.stop:
+        if stop:
             if not self.validates:
                 self._keep_weights(trainer, flow_module)
+            trainer.strategy.barrier()  # no process leaves before the first has written the files
             raise Stopped
 
     def on_validation_start(self, *_: Any) -> None:
@@ -178,6 +178,11 @@ def ignore_stopping(_: int) -> None:
     """For processes that load data: they end with the run, which handles the signals that ask it to stop."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
+
+
+def is_first_process() -> bool:
+    """Whether this is the process that writes files and messages, among those of all devices and machines."""
+    return not getattr(rank_zero_only, "rank", 0)
 
 
 def _in_main_thread() -> bool:

@@ -17,7 +17,7 @@ from typing import Any
 import lightning as L
 import torch
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
-from lightning.pytorch.utilities import rank_zero_only
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 from torch.utils.data import DataLoader, Dataset
 
 from gelflow.config import TrainConfig
@@ -25,7 +25,15 @@ from gelflow.errors import InputError
 from gelflow.models import GelFlow
 from gelflow.terminal import progress
 from gelflow.train.checkpoint import load_weights, save_weights
-from gelflow.train.keeper import Keeper, Stopped, describe, ignore_stopping, stopping, weights_metadata
+from gelflow.train.keeper import (
+    Keeper,
+    Stopped,
+    describe,
+    ignore_stopping,
+    is_first_process,
+    stopping,
+    weights_metadata,
+)
 from gelflow.train.module import FlowModule, check_side
 from gelflow.train.resident import ResidentPairs, resident
 from gelflow.train.samples import CheckedPairs, StepSampler, TrainingBatches, TrainingSamples, checked, collate
@@ -97,7 +105,7 @@ def train(
     checked(train_set[0], supervised=config.supervision == "flow")
     if validation_set is not None:
         check_side(_one_pair([validation_set[0]]), config)
-    if _is_first_process():
+    if is_first_process():
         data = {
             "pairs": pairs,
             "digest": getattr(train_set, "digest", None),
@@ -118,7 +126,7 @@ def train(
     if module.start < config.steps or validation_due:
         _fit(module, keeper, _Data(config, train_set, validation_set, module), device, validation_due)
     weights = out / WEIGHTS
-    if validation_set is None and _is_first_process():
+    if validation_set is None and is_first_process():
         save_weights(weights, module.evaluated.cpu(), **weights_metadata(config, config.steps))
     rate = keeper.throughput.pairs_per_second
     return TrainResult(weights, config.steps, keeper.metrics, keeper.score, rate, peak_memory_mib())
@@ -126,10 +134,6 @@ def train(
 
 def _length(data: Dataset[Any]) -> int:
     return len(data)  # type: ignore[arg-type]  # Dataset itself declares no __len__
-
-
-def _is_first_process() -> bool:
-    return not getattr(rank_zero_only, "rank", 0)
 
 
 def _device(config: TrainConfig) -> str:
@@ -196,14 +200,20 @@ def _fit(module: FlowModule, keeper: Keeper, data: "_Data", device: str, validat
         stack.enter_context(stopping(keeper))
         try:
             trainer.fit(module, datamodule=data)
-        except Stopped:
-            saved = load_state(out).step if (out / STATE).exists() else 0
-            message = (
-                f"stopped; step {saved} of {config.steps} is saved in {out}; go on with the same command and --resume"
-            )
-            if (weights := out / WEIGHTS).exists():
-                message += f", or use the weights so far, {weights}"
-            raise KeyboardInterrupt(message) from None
+        except (Stopped, SIGTERMException):  # Lightning raises the latter for a signal before the first step
+            if not trainer.is_global_zero:
+                sys.exit()  # message and exit status are the first process's
+            raise KeyboardInterrupt(_how_to_go_on(config, out)) from None
+
+
+def _how_to_go_on(config: TrainConfig, out: Path) -> str:
+    if not (out / STATE).exists():
+        return "stopped; nothing has been saved yet: start again with the same command"
+    saved = load_state(out).step
+    message = f"stopped; step {saved} of {config.steps} is saved in {out}; go on with the same command and --resume"
+    if (weights := out / WEIGHTS).exists():
+        message += f", or use the weights so far, {weights}"
+    return message
 
 
 class _Data(L.LightningDataModule):

@@ -1,5 +1,6 @@
 """Practice: moving average, both directions and analogy resume bit by bit; bf16; compile; two processes; speed."""
 
+import contextlib
 import csv
 import os
 import signal
@@ -7,6 +8,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -129,6 +131,7 @@ def test_two_processes_end_as_one_with_twice_the_batch(tmp_path: Path, option: s
                 for rank in range(2 if option == "--nodes" else 1)]  # fmt: skip
     texts = [machine.communicate(timeout=240) for machine in machines]
     assert [machine.returncode for machine in machines] == [0] * len(machines), texts
+    assert sum(printed.count("weights.safetensors") for printed, _ in texts) == 1
     first, second = (load_weights(path).state_dict() for path in (one, tmp_path / "two" / "weights.safetensors"))
     # The same gradients up to float32 rounding. Adam's first steps are the sign of the gradient times 1e-4, so that a
     # gradient near zero may turn: all but a few weights must agree to a hundredth of a step.
@@ -137,24 +140,37 @@ def test_two_processes_end_as_one_with_twice_the_batch(tmp_path: Path, option: s
     assert differences.max() < 6.1e-4  # three steps, each to the other side
 
 
-def test_sigterm_stops_a_run_as_ctrl_c_does(tmp_path: Path) -> None:
-    """Sent to all its processes, as SLURM does: fails with Lightning's handler, and with workers that it ends."""
+@pytest.mark.parametrize(
+    ("send", "devices"),
+    [
+        (os.killpg, 1),
+        pytest.param(os.kill, 2, marks=pytest.mark.slow),
+        pytest.param(os.killpg, 2, marks=pytest.mark.slow),
+    ],
+)
+def test_sigterm_stops_a_run_as_ctrl_c_does(tmp_path: Path, send: Callable[[int, int], None], devices: int) -> None:
+    """Sent to all its processes, as SLURM does, or to the first, as `timeout` does.
+
+    Fails with Lightning's handler, with workers that the signal ends, and where processes do not stop together.
+    """
     folder, out = write_folder(tmp_path / "data", {"a": (1.0, 0.5)}, (64, 64)), tmp_path / "run"
     settings = tmp_path / "settings.toml"
     settings.write_text("steps = 100_000\nbatch_size = 1\nsave_every = 1\nworkers = 1\n[model]\nlevels = 4\n"
                         "projected_channels = 8\n[loss]\nlambda_s = [1.0, 1.0, 1.0]\n")  # fmt: skip
     command = [sys.executable, "-m", "gelflow", "train", str(folder), "--out", str(out), "--device", "cpu",
-               "--config", str(settings)]  # fmt: skip
+               "--config", str(settings), "--devices", str(devices)]  # fmt: skip
     run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
     try:
         while not (out / "state.ckpt").exists() and run.poll() is None:
             time.sleep(0.05)
-        os.killpg(run.pid, signal.SIGTERM)
+        send(run.pid, signal.SIGTERM)
         text = run.communicate(timeout=60)[1]
     finally:
-        run.kill()
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(run.pid, signal.SIGKILL)
     assert run.returncode == 130, text
     assert text.count("stopping after this step") == 1
+    assert text.count("stopped; step") == 1
     assert f"stopped; step {load_state(out).step} of 100000 is saved" in text
     assert (out / "weights.safetensors").exists()
 

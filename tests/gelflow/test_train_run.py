@@ -96,6 +96,22 @@ def test_a_run_interrupted_by_ctrl_c_ends_with_the_same_weights(
     assert bool(resumed.metrics) == validates
 
 
+def test_a_run_stopped_before_its_first_save_says_so(tmp_path: Path) -> None:
+    """By SIGTERM while Lightning opens the data, before the keeper handles signals, which ends the first step."""
+
+    class Counted(Shifts):
+        counts = 0
+
+        def __len__(self) -> int:
+            self.counts += 1
+            if self.counts == 2:  # once to look at the data set, then for the loader
+                os.kill(os.getpid(), signal.SIGTERM)
+            return super().__len__()
+
+    with pytest.raises(KeyboardInterrupt, match="stopped; nothing has been saved yet: start again"):
+        train(small(steps=3), Counted(2, 64, 1.0, seed=3), None, tmp_path)
+
+
 def test_a_run_killed_between_saves_goes_back_to_the_last_one_and_ends_the_same(pairs: Shifts, tmp_path: Path) -> None:
     class Killed(CtrlC):
         def __getitem__(self, index: int) -> dict:
