@@ -56,6 +56,17 @@ Registration = Annotated[
     ),
 ]
 TrainDevice = Annotated[Device | None, Parameter(help="Where to train; auto: a CUDA device where there is one.")]
+Devices = Annotated[
+    int | None,
+    Parameter(help="Devices (on a CPU: processes) of each machine; each takes batch_size pairs a step."),
+]
+Nodes = Annotated[
+    int | None,
+    Parameter(
+        help="Machines, which share --out. Start the same command on each: by srun, by torchrun, or by hand with "
+        "MASTER_ADDR, MASTER_PORT and NODE_RANK set."
+    ),
+]
 
 
 @app.command
@@ -69,12 +80,14 @@ def train(
     assignments: Assignments = None,
     steps: Steps = None,
     device: TrainDevice = None,
+    devices: Devices = None,
+    nodes: Nodes = None,
     resume: Resume = False,
 ) -> int:
     """Trains a network on image pairs."""
     from gelflow.commands import run_train
 
-    options = {"steps": steps, "device": device}
+    options = {"steps": steps, "device": device, "devices": devices, "nodes": nodes}
     return run_train(data, validation or [], out, config or "best", assignments or [], options, resume, None)
 
 
@@ -90,13 +103,16 @@ def finetune(
     assignments: Assignments = None,
     steps: Steps = None,
     device: TrainDevice = None,
+    devices: Devices = None,
+    nodes: Nodes = None,
     resume: Resume = False,
 ) -> int:
     """Trains on, from given weights, whose architecture is kept."""
     from gelflow.commands import run_train
     from gelflow.shipped import weights_file
 
-    options, start = {"steps": steps, "device": device}, weights_file(weights)
+    options = {"steps": steps, "device": device, "devices": devices, "nodes": nodes}
+    start = weights_file(weights)
     return run_train(data, validation or [], out, config or "real", assignments or [], options, resume, start)
 
 

@@ -68,12 +68,14 @@ def run_train(
     """`train`, and `finetune` where weights are given."""
     from gelflow.train import train
     from gelflow.train.checkpoint import load_weights
+    from gelflow.train.keeper import is_first_process
 
     start = {} if weights is None else {"model": load_weights(weights).config.model_dump()}
     settings = train_config(config, assignments, options, start)
     validation_set = open_all(validation) if validation else None
     result = train(settings, open_all(data), validation_set, out, initial=weights, resume=resume)
-    print(result)
+    if is_first_process():
+        print(result)
     return 0
 
 
@@ -112,8 +114,9 @@ def run_compare(
     """
     if add and out is None:
         raise InputError("--add: give the folder of the earlier comparison as --out")
-    if every < 1:
-        raise InputError(f"--every {every}: a number from 1 on is needed")
+    for option, given, least in (("--every", every, 1), ("--batch", batch, 0), ("--ft", fine_tuning[0], 0)):
+        if given < least:
+            raise InputError(f"{option} {given}: a number from {least} on is needed")
     chosen = named_methods([name.strip() for name in methods.split(",") if name.strip()], device)
     networks = [network for given in weights for network in _labelled(given, registrations, size, device)]
     steps, config = fine_tuning
@@ -249,7 +252,8 @@ def run_pairs(inputs: Sequence[str], out: Path, config: ChoiceConfig, as_json: b
 
 def _show_pairs(result: PairSet, out: Path, as_json: bool) -> None:
     motions = sorted(pair.motion_px for pair in result.pairs)
-    deciles = [round(value, 1) for value in quantiles(motions, n=10)] if len(motions) > 1 else motions
+    deciles = quantiles(motions, n=10, method="inclusive") if len(motions) > 1 else motions
+    deciles = [round(value, 1) for value in deciles]
     empty = sum(report.chosen == 0 for report in result.sources.values())
     if as_json:
         answer = {

@@ -7,12 +7,9 @@ that they belong to; scale s has 1/2^s of the image's resolution.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any, Literal, TypeGuard, TypeVar, get_args
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
-
-from gelflow.errors import InputError
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 MINIMUM_SIDE = 64
 """Images with a side below this many px have no coarsest scale worth decoding."""
@@ -254,10 +251,10 @@ class TrainConfig(_Frozen):
     validate_every: int = Field(default=500, ge=1)
     """Steps between validations."""
     save_every: int = Field(default=500, ge=1)
-    """Steps between saves of the whole state; it is also saved at the end and on Ctrl-C."""
+    """Steps between saves of the whole state; it is also saved at the end and on Ctrl-C or SIGTERM."""
     workers: int = Field(default=0, ge=0)
     """Processes that load data; 0: in the training process."""
-    seed: int = Field(default=0, ge=0)
+    seed: int = Field(default=0, ge=0, lt=2**32)
     """Seed of the initial weights, of the order of the pairs and of the augmentation."""
     precision: Annotated[Literal["32", "bf16"], BeforeValidator(str)] = "32"
     """float32, or bfloat16 for the convolutions; flows and losses are float32 in both."""
@@ -276,7 +273,9 @@ class TrainConfig(_Frozen):
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to train; auto: a CUDA device where there is one."""
     devices: int = Field(default=1, ge=1)
-    """Number of devices (on a CPU: processes) on this machine; each takes batch_size pairs a step."""
+    """Number of devices (on a CPU: processes) on each machine; each takes batch_size pairs a step."""
+    nodes: int = Field(default=1, ge=1)
+    """Number of machines that train together; the same command is started on each, see Lightning's `num_nodes`."""
 
     @model_validator(mode="after")
     def _fits_together(self) -> TrainConfig:
@@ -295,46 +294,3 @@ class TrainConfig(_Frozen):
 
 def _exceeds(inner: tuple[int, int], outer: tuple[int, int]) -> bool:
     return inner[0] > outer[0] or inner[1] > outer[1]
-
-
-Config = TypeVar("Config", bound=_Frozen)
-
-
-def validated(kind: type[Config], values: Mapping[str, Any], source: str) -> Config:
-    """Builds a configuration from plain values.
-
-    Args:
-        kind: `ModelConfig`, `LossConfig` or `TrainConfig`.
-        values: Field names and values, nested as the configuration is.
-        source: What the values come from (a path, an option), for the message.
-
-    Raises:
-        InputError: A field that does not exist, has the wrong type or lies outside its range; one line per field.
-    """
-    try:
-        return kind.model_validate(dict(values))
-    except ValidationError as error:
-        lines = []
-        for item in error.errors():
-            field = ".".join(str(part) for part in item["loc"]) or "(whole configuration)"
-            given = "" if item["type"] in ("value_error", "missing") else f" (given: {item['input']!r})"
-            if item["type"] == "extra_forbidden":
-                allowed = _fields_at(kind, item["loc"][:-1])
-                lines.append(f"{field}: there is no such setting; allowed: {', '.join(allowed)}")
-            else:
-                lines.append(f"{field}: {item['msg'].removeprefix('Value error, ')}{given}")
-        raise InputError(f"{source}: " + "; ".join(lines)) from error
-
-
-def _is_table(annotation: Any) -> TypeGuard[type[BaseModel]]:
-    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
-
-
-def _fields_at(kind: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
-    for name in location:
-        annotation = kind.model_fields[str(name)].annotation
-        tables = [part for part in (annotation, *get_args(annotation)) if _is_table(part)]
-        if not tables:
-            return []
-        kind = tables[0]
-    return list(kind.model_fields)

@@ -9,8 +9,9 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from gelflow.config import REGISTRATIONS, TrainConfig, validated
+from gelflow.config import REGISTRATIONS, TrainConfig
 from gelflow.errors import InputError
+from gelflow.schema_errors import validated
 
 PRESETS = ("best", "real", "bare", "paper", "selfflow", "arflow")
 """Names of the configurations that come with the package."""

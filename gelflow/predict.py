@@ -2,6 +2,7 @@
 
 import csv
 import os
+import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -63,7 +64,10 @@ def predict_pair(method: Method, path1: Path, path2: Path, out: Path) -> Predict
     stem1, stem2 = path1.stem, path2.stem
     common = stem1.removesuffix("_1")
     name = common if stem1 == f"{common}_1" and stem2 == f"{common}_2" else f"{stem1}_to_{stem2}"
-    flow, motion = _estimate(method, image1, image2, 1)
+    try:
+        flow, motion = _estimate(method, image1, image2, 1)
+    except InputError as error:
+        raise InputError(f"{path1} and {path2}, {method.name}: {error}") from error
     files = [out / f"{name}{suffix}" for suffix in (".exr", ".flo", ".png")]
     write_flow(files[0], flow)
     write_flo(files[1], flow)
@@ -79,7 +83,7 @@ def predict_video(
     every: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> Prediction:
-    """Writes flow/000001.exr ... (numbered by frame), motion.csv and overlay.mp4; replaces older ones.
+    """Writes flow/000001.exr ... (numbered by frame), motion.csv and overlay.mp4 in place of all older ones.
 
     Args:
         method: Estimates the flow.
@@ -103,6 +107,8 @@ def predict_video(
             flow, motion = _estimate(method, _as_float(image1), _as_float(image2), index)
         except InputError as error:
             raise InputError(f"{path}, frame {index}, {method.name}: {error}") from error
+        if not files:
+            _remove_numbered(out / "flow", ".exr")
         files.append(out / "flow" / f"{index:06d}.exr")
         write_flow(files[-1], flow)
         motions.append(motion)
@@ -192,9 +198,17 @@ def _write_overlay(pictures: Iterator[Bytes3], out: Path, frames_per_second: flo
 
 
 def _write_sequence(first: Bytes3, rest: Iterator[Bytes3], folder: Path) -> list[Path]:
+    _remove_numbered(folder, ".png")
     files = [folder / "000000.png"]
     write_png(files[0], first)
     for number, picture in enumerate(rest, start=1):
         files.append(folder / f"{number:06d}.png")
         write_png(files[-1], picture)
     return files
+
+
+def _remove_numbered(folder: Path, suffix: str) -> None:
+    """Removes what an earlier run wrote, which may have had other frames: files named by six digits or more."""
+    for path in folder.glob(f"*{suffix}"):
+        if re.fullmatch(r"[0-9]{6,}", path.stem):
+            path.unlink()

@@ -24,10 +24,11 @@ from pathlib import Path
 from typing import Any
 
 from gelflow.baselines.learned import Learned
-from gelflow.config import TrainConfig, validated
+from gelflow.config import TrainConfig
 from gelflow.data.pairs import PairDataset
 from gelflow.errors import InputError
 from gelflow.overrides import train_config
+from gelflow.schema_errors import validated
 
 SUFFIX = "+ft"
 """At the end of the name of every method of this kind."""
@@ -76,6 +77,7 @@ def fine_tuning_settings(method: Learned, steps: int, config: str | None, pairs:
         "batch_size": min(values["batch_size"], pairs),
         "device": method.device,
         "devices": 1,
+        "nodes": 1,
     }
     if values.get("schedule") == "one_cycle":
         fixed["learning_rate"] = min(values["learning_rate"], RATE)

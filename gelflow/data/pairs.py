@@ -12,6 +12,8 @@ A sample is a dictionary:
 throughout, so that samples of both kinds fit into one batch.
 """
 
+import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -42,6 +44,7 @@ class PairRecord:
         markers: CSV file with tracked dots (columns x1, y1, x2, y2 in px), or None.
         exchanged: The images have been exchanged: the exact flow is the file's `backward`.
         scene: Scene and kind of pattern of a synthetic pair, or None.
+        origin: Hash of its data set's scene, and its seed; or None.
     """
 
     name: str
@@ -51,6 +54,7 @@ class PairRecord:
     markers: Path | None = None
     exchanged: bool = False
     scene: str | None = None
+    origin: str | None = None
 
 
 class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
@@ -78,6 +82,12 @@ class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
     def names(self) -> list[str]:
         """Names of the pairs, in order."""
         return [record.name for record in self.records]
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of what tells data sets apart without reading an image: names, scenes and origins of the pairs."""
+        known = [(record.name, record.scene, record.origin) for record in self.records]
+        return hashlib.sha256(json.dumps(known).encode()).hexdigest()
 
     def images(self, index: int) -> tuple[ImageArray, ImageArray]:
         """Both images of a pair, (H, W, 3) float32 in [0, 1].
@@ -193,15 +203,18 @@ def read_markers(path: Path) -> MarkerArray:
     if not path.is_file():
         raise InputError(f"{path}: there is no such file")
     rows: list[list[float]] = []
-    with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        if not set(columns) <= set(reader.fieldnames or ()):
-            raise InputError(f"{path}: needs the columns x1,y1,x2,y2; it has: {','.join(reader.fieldnames or ())}")
-        for row in reader:
-            try:
-                rows.append([float(row[name]) for name in columns])
-            except (TypeError, ValueError) as error:
-                raise InputError(f"{path}, line {reader.line_num}: four numbers are needed") from error
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:  # with or without a byte order mark
+            reader = csv.DictReader(file)
+            if not set(columns) <= set(reader.fieldnames or ()):
+                raise InputError(f"{path}: needs the columns x1,y1,x2,y2; it has: {','.join(reader.fieldnames or ())}")
+            for row in reader:
+                try:
+                    rows.append([float(row[name]) for name in columns])
+                except (TypeError, ValueError) as error:
+                    raise InputError(f"{path}, line {reader.line_num}: four numbers are needed") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: not a CSV file in UTF-8 ({error})") from error
     markers = np.array(rows, np.float64).reshape(-1, 4)
     if not len(markers) or not np.isfinite(markers).all():
         raise InputError(f"{path}: holds no marker, or one that is not finite")

@@ -20,9 +20,11 @@ import json
 import tarfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from gelflow.data.member import FlowMembers, Member
 from gelflow.data.pairs import PairRecord
+from gelflow.data.synthetic import origin
 from gelflow.errors import InputError
 
 SUFFIX = ".tar"
@@ -104,15 +106,17 @@ def _record(shard: Path, key: str, members: dict[str, Member]) -> PairRecord:
         raise InputError(f"{shard}: sample {key} lacks {' and '.join(missing)}; allowed are shards of "
                          "`python -m synth export --format webdataset`; export it again")  # fmt: skip
     flow = FlowMembers(members["forward.npy"], members["forward_visible.npy"], *map(members.get, _BACKWARD))
-    scene = _scene(members["json"])
-    return PairRecord(key, members["image1.png"], members["image2.png"], flow, scene=scene)
-
-
-def _scene(meta: Member) -> str | None:
-    """Scene and kind of pattern, as `gelflow.data.synthetic` names them."""
-    text = meta.read_bytes()
     try:
-        scene = json.loads(text)["scene"]
-        return f"{scene['name']}, {scene['sensor']['pattern']['kind']}"
-    except (KeyError, TypeError, ValueError):
-        return None  # written by another program
+        meta = json.loads(members["json"].read_bytes())
+    except ValueError:
+        meta = None  # written by another program
+    images = (members["image1.png"], members["image2.png"])
+    return PairRecord(key, *images, flow, scene=_scene(meta), origin=origin(meta))
+
+
+def _scene(meta: Any) -> str | None:
+    """Scene and kind of pattern, as `gelflow.data.synthetic` names them."""
+    try:
+        return f"{meta['scene']['name']}, {meta['scene']['sensor']['pattern']['kind']}"
+    except (KeyError, TypeError):
+        return None

@@ -36,7 +36,8 @@ def synthetic_records(folder: Path) -> list[PairRecord]:
         name = f"{index:06d}"
         sample = folder / "samples" / name
         scene = _scene(header, sample / "meta.json")
-        record = PairRecord(name, sample / "image1.png", sample / "image2.png", sample / "flow.exr", scene=scene)
+        images = (sample / "image1.png", sample / "image2.png")
+        record = PairRecord(name, *images, sample / "flow.exr", scene=scene, origin=origin(header))
         for path in (record.image1, record.image2, sample / "flow.exr"):
             if not path.is_file():
                 raise InputError(
@@ -47,6 +48,14 @@ def synthetic_records(folder: Path) -> list[PairRecord]:
     if not records:
         raise InputError(f"{folder / 'manifest.jsonl'}: lists no finished sample; let synth generate finish first")
     return records
+
+
+def origin(description: Any) -> str | None:
+    """Hash of the scene and seed, "f2b4b82f24b5428b, 77", in dataset.json or meta.json; None where they are missing."""
+    try:
+        return f"{description['scene_hash']}, {description['seed']}"
+    except (KeyError, TypeError):
+        return None
 
 
 def _scene(header: dict[str, Any], meta: Path) -> str | None:

@@ -13,10 +13,11 @@ from safetensors.torch import save
 from torch import Tensor
 
 from gelflow import __version__
-from gelflow.config import ModelConfig, validated
+from gelflow.config import ModelConfig
 from gelflow.errors import InputError
 from gelflow.files.atomic import replacing
 from gelflow.models import GelFlow
+from gelflow.schema_errors import validated
 
 FORMAT = "gelflow"
 RETRAIN = "give a file that `python -m gelflow train` wrote (weights.safetensors)"
@@ -75,10 +76,12 @@ def load_weights(path: Path, device: str = "cpu") -> GelFlow:
         raise InputError(f"{path}: its metadata do not describe a network ({error!r}); {RETRAIN}") from error
     if not isinstance(values, dict):
         raise InputError(f"{path}: its metadata do not describe a network (given: {values!r}); {RETRAIN}")
+    if not (size is None or (isinstance(size, list) and [type(side) for side in size] == [int, int])):
+        raise InputError(f"{path}: image_size in its metadata must be null or [rows, columns], not {size!r}; {RETRAIN}")
     model = GelFlow(validated(ModelConfig, values, f"{path}, architecture in its metadata"))
     _check_tensors(path, tensors, model)
     model.load_state_dict(tensors)
-    model.image_size = None if size is None else (int(size[0]), int(size[1]))
+    model.image_size = None if size is None else (size[0], size[1])
     return model.to(device).eval()
 
 

@@ -1,4 +1,7 @@
-"""What happens around the steps of a run: saving, choosing the best weights, showing progress, stopping on Ctrl-C."""
+"""What happens around the steps of a run: saving, choosing the best weights, showing progress, stopping when asked to.
+
+Ctrl-C (SIGINT) and SIGTERM (a time limit, `docker stop`) ask alike.
+"""
 
 import signal
 import sys
@@ -6,11 +9,11 @@ import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import lightning as L
 import torch
+from lightning.pytorch.utilities import rank_zero_only
 
 from gelflow.config import TrainConfig
 from gelflow.errors import InputError
@@ -48,12 +51,25 @@ class Keeper(L.Callback):
         self.advance: Advance | None = None
         self.throughput = Throughput()
 
+    def ask_to_stop(self, *_: Any) -> None:
+        """A signal's handler: the first asks to stop after the step, the second stops at once."""
+        if self.stop:
+            raise Stopped
+        self.stop = True
+        if is_first_process():
+            print("stopping after this step (Ctrl-C once more: at once, back to the last save)", file=sys.stderr)
+
+    def on_train_start(self, *_: Any) -> None:
+        """Takes SIGTERM from Lightning, whose own handler, just set, would end the process with status 0."""
+        if _in_main_thread():
+            signal.signal(signal.SIGTERM, self.ask_to_stop)  # Lightning restores the one before its own at the end
+
     def validates_at(self, step: int) -> bool:
         """Whether a validation follows this step."""
         return self.validates and (step % self.config.validate_every == 0 or step == self.config.steps)
 
     def on_train_batch_end(self, trainer: L.Trainer, module: L.LightningModule, *_: Any) -> None:
-        """Shows progress; saves where it is due and no validation follows, which saves itself."""
+        """Shows progress; saves where it is due, and before a validation; stops where that was asked for."""
         flow_module = _ours(module)
         step = flow_module.step
         self.throughput.add(self.config.batch_size * trainer.world_size)
@@ -67,13 +83,14 @@ class Keeper(L.Callback):
                 item += "" if rate is None else f", {rate:.3g} pairs/s"
                 done = step - flow_module.start
                 self.advance(done, self.config.steps - flow_module.start, f"{item}{_brief(self.metrics)}")
-        if self.validates_at(step):
-            return
-        if self.stop or step % self.config.save_every == 0 or step == self.config.steps:
-            self._save(trainer, flow_module)
-        if self.stop:
+        stop = trainer.strategy.reduce_boolean_decision(self.stop, all=False)  # whichever process was asked to
+        validation_due = self.validates_at(step)
+        if stop or validation_due or step % self.config.save_every == 0 or step == self.config.steps:
+            self._save(trainer, flow_module, validation_due)
+        if stop:
             if not self.validates:
                 self._keep_weights(trainer, flow_module)
+            trainer.strategy.barrier()  # no process leaves before the first has written the files
             raise Stopped
 
     def on_validation_start(self, *_: Any) -> None:
@@ -94,8 +111,6 @@ class Keeper(L.Callback):
         self._save(trainer, flow_module)
         if trainer.is_global_zero:
             print(f"step {flow_module.step}: {describe(self.metrics)}", file=sys.stderr)
-        if self.stop:
-            raise Stopped
 
     def _keep_weights(self, trainer: L.Trainer, module: FlowModule) -> None:
         if trainer.is_global_zero:
@@ -108,13 +123,14 @@ class Keeper(L.Callback):
                 f"({self.config.learning_rate:g}) or set gradient_clip (now {self.config.gradient_clip})"
             )
 
-    def _save(self, trainer: L.Trainer, module: FlowModule) -> None:
+    def _save(self, trainer: L.Trainer, module: FlowModule, validation_due: bool = False) -> None:
         self._check(module)
         if trainer.is_global_zero:
             optimiser = trainer.optimizers[0].state_dict()
             average = None if module.average is None else module.average.state_dict()
             model, metrics = module.model.state_dict(), dict(self.metrics)
-            save_state(self.out, State(module.step, model, optimiser, self.score, metrics, average))
+            state = State(module.step, model, optimiser, self.score, metrics, average, validation_due)
+            save_state(self.out, state)
 
 
 def _ours(module: L.LightningModule) -> FlowModule:
@@ -147,19 +163,28 @@ def _brief(metrics: Mapping[str, float]) -> str:
 
 @contextmanager
 def stopping(keeper: Keeper) -> Iterator[None]:
-    """While the block runs, the first Ctrl-C asks the keeper to stop after the step; the second stops at once."""
-    if threading.current_thread() is not threading.main_thread():
+    """While the block runs, Ctrl-C asks the keeper to stop. See `Keeper.on_train_start` for SIGTERM."""
+    if not _in_main_thread():
         yield
         return
-
-    def ask(_: int, __: FrameType | None) -> None:
-        if keeper.stop:
-            raise Stopped
-        keeper.stop = True
-        print("stopping after this step (Ctrl-C once more: at once, back to the last save)", file=sys.stderr)
-
-    former = signal.signal(signal.SIGINT, ask)
+    former = signal.signal(signal.SIGINT, keeper.ask_to_stop)
     try:
         yield
     finally:
         signal.signal(signal.SIGINT, former)
+
+
+def ignore_stopping(_: int) -> None:
+    """For processes that load data: they end with the run, which handles the signals that ask it to stop."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+
+
+def is_first_process() -> bool:
+    """Whether this is the process that writes files and messages, among those of all devices and machines."""
+    return not getattr(rank_zero_only, "rank", 0)
+
+
+def _in_main_thread() -> bool:
+    """Whether signals may be handled here."""
+    return threading.current_thread() is threading.main_thread()

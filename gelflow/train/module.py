@@ -15,7 +15,8 @@ from torch.optim import Adam
 from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
-from gelflow.config import TrainConfig
+from gelflow.config import MINIMUM_SIDE, TrainConfig
+from gelflow.errors import InputError
 from gelflow.estimate import estimate_flow
 from gelflow.losses import flow_loss, self_supervised_loss
 from gelflow.losses.analogy import analogy_loss, transformed_pair
@@ -186,6 +187,7 @@ class FlowModule(L.LightningModule):
 
     def validation_step(self, batch: dict[str, Any], _: int) -> None:
         """Adds one pair's metrics, in px of its own images."""
+        check_side(batch, self.config)
         flow = estimate_flow(self.evaluated, batch["image1"], batch["image2"], self.config.image_size)
         for name, value in validation_metrics(batch, flow, self.config).items():
             if torch.isfinite(value):
@@ -218,6 +220,18 @@ METRICS = (
     "photometric_loss",
 )
 """Results of a validation: mean over the pairs that have them."""
+
+
+def check_side(batch: dict[str, Any], config: TrainConfig) -> None:
+    """Refuses a validation pair, as a batch of one, that is too small for the network.
+
+    Raises:
+        InputError: A side is too short; the message names the pair.
+    """
+    rows, columns = batch["image1"].shape[-2:]
+    if config.image_size is None and min(rows, columns) < MINIMUM_SIDE:
+        raise InputError(f"validation pair {batch['name'][0]}: {rows}x{columns} px, but each side must be at least "
+                         f"{MINIMUM_SIDE} px; set image_size to enlarge the images")  # fmt: skip
 
 
 def validation_metrics(batch: dict[str, Any], flow: Tensor, config: TrainConfig) -> dict[str, Tensor]:

@@ -17,7 +17,7 @@ from typing import Any
 import lightning as L
 import torch
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
-from lightning.pytorch.utilities import rank_zero_only
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 from torch.utils.data import DataLoader, Dataset
 
 from gelflow.config import TrainConfig
@@ -25,8 +25,16 @@ from gelflow.errors import InputError
 from gelflow.models import GelFlow
 from gelflow.terminal import progress
 from gelflow.train.checkpoint import load_weights, save_weights
-from gelflow.train.keeper import Keeper, Stopped, describe, stopping, weights_metadata
-from gelflow.train.module import FlowModule
+from gelflow.train.keeper import (
+    Keeper,
+    Stopped,
+    describe,
+    ignore_stopping,
+    is_first_process,
+    stopping,
+    weights_metadata,
+)
+from gelflow.train.module import FlowModule, check_side
 from gelflow.train.resident import ResidentPairs, resident
 from gelflow.train.samples import CheckedPairs, StepSampler, TrainingBatches, TrainingSamples, checked, collate
 from gelflow.train.state import STATE, WEIGHTS, load_state, open_run
@@ -86,7 +94,7 @@ def train(
 
     Raises:
         InputError: Settings, data, folder or weights that cannot be used; a loss that is no longer finite.
-        KeyboardInterrupt: Ctrl-C; the state has been saved, the message says how to go on.
+        KeyboardInterrupt: Ctrl-C or SIGTERM; the state has been saved, the message says how to go on.
         OSError: The disk is full or the folder cannot be written to.
     """
     pairs, validation_pairs = _length(train_set), 0 if validation_set is None else _length(validation_set)
@@ -95,9 +103,16 @@ def train(
     device = _device(config)
     model = _initial_network(config, initial)
     checked(train_set[0], supervised=config.supervision == "flow")
-    first = _is_first_process()
-    if first:
-        state = open_run(out, config, pairs, validation_pairs, initial, resume)
+    if validation_set is not None:
+        check_side(_one_pair([validation_set[0]]), config)
+    if is_first_process():
+        data = {
+            "pairs": pairs,
+            "digest": getattr(train_set, "digest", None),
+            "validation_pairs": validation_pairs,
+            "validation_digest": getattr(validation_set, "digest", None),
+        }
+        state = open_run(out, config, data, initial, resume)
     else:
         state = load_state(out) if resume else None
     if state is not None:
@@ -107,10 +122,11 @@ def train(
     else:
         module = FlowModule(config, model, state.step, state.optimiser, state.average)
     keeper = Keeper(config, out, validation_pairs > 0, state.score if state else None, state.metrics if state else {})
-    if module.start < config.steps:
-        _fit(module, keeper, _Data(config, train_set, validation_set, module), device)
+    validation_due = state is not None and state.validation_due
+    if module.start < config.steps or validation_due:
+        _fit(module, keeper, _Data(config, train_set, validation_set, module), device, validation_due)
     weights = out / WEIGHTS
-    if validation_set is None and first:
+    if validation_set is None and is_first_process():
         save_weights(weights, module.evaluated.cpu(), **weights_metadata(config, config.steps))
     rate = keeper.throughput.pairs_per_second
     return TrainResult(weights, config.steps, keeper.metrics, keeper.score, rate, peak_memory_mib())
@@ -118,10 +134,6 @@ def train(
 
 def _length(data: Dataset[Any]) -> int:
     return len(data)  # type: ignore[arg-type]  # Dataset itself declares no __len__
-
-
-def _is_first_process() -> bool:
-    return not getattr(rank_zero_only, "rank", 0)
 
 
 def _device(config: TrainConfig) -> str:
@@ -153,8 +165,12 @@ def _initial_network(config: TrainConfig, initial: Path | None) -> GelFlow:
     return model.train()
 
 
-def _fit(module: FlowModule, keeper: Keeper, data: "_Data", device: str) -> None:
-    """Runs the remaining steps; a stop by the user becomes a KeyboardInterrupt that says how to go on."""
+def _fit(module: FlowModule, keeper: Keeper, data: "_Data", device: str, validation_due: bool) -> None:
+    """Validates first where that is due, then runs the remaining steps.
+
+    Raises:
+        KeyboardInterrupt: Somebody asked to stop; the message says how to go on.
+    """
     config, out = keeper.config, keeper.out
     session = f"from_step_{module.start:06d}"
     with ExitStack() as stack:
@@ -162,7 +178,8 @@ def _fit(module: FlowModule, keeper: Keeper, data: "_Data", device: str) -> None
         trainer = L.Trainer(
             accelerator="gpu" if device == "cuda" else "cpu",
             devices=config.devices,
-            strategy="ddp" if config.devices > 1 else "auto",
+            num_nodes=config.nodes,
+            strategy="ddp" if config.devices * config.nodes > 1 else "auto",
             precision="bf16-mixed" if config.precision == "bf16" else "32-true",
             max_steps=config.steps - module.start,
             max_epochs=-1,
@@ -175,7 +192,7 @@ def _fit(module: FlowModule, keeper: Keeper, data: "_Data", device: str) -> None
             enable_checkpointing=False,
             enable_progress_bar=False,
             enable_model_summary=False,
-            num_sanity_val_steps=0,
+            num_sanity_val_steps=-1 if validation_due else 0,  # all pairs, before the first step
             use_distributed_sampler=False,
             reload_dataloaders_every_n_epochs=1,
         )
@@ -183,14 +200,20 @@ def _fit(module: FlowModule, keeper: Keeper, data: "_Data", device: str) -> None
         stack.enter_context(stopping(keeper))
         try:
             trainer.fit(module, datamodule=data)
-        except Stopped:
-            saved = load_state(out).step if (out / STATE).exists() else 0
-            message = (
-                f"stopped; step {saved} of {config.steps} is saved in {out}; go on with the same command and --resume"
-            )
-            if (weights := out / WEIGHTS).exists():
-                message += f", or use the weights so far, {weights}"
-            raise KeyboardInterrupt(message) from None
+        except (Stopped, SIGTERMException):  # Lightning raises the latter for a signal before the first step
+            if not trainer.is_global_zero:
+                sys.exit()  # message and exit status are the first process's
+            raise KeyboardInterrupt(_how_to_go_on(config, out)) from None
+
+
+def _how_to_go_on(config: TrainConfig, out: Path) -> str:
+    if not (out / STATE).exists():
+        return "stopped; nothing has been saved yet: start again with the same command"
+    saved = load_state(out).step
+    message = f"stopped; step {saved} of {config.steps} is saved in {out}; go on with the same command and --resume"
+    if (weights := out / WEIGHTS).exists():
+        message += f", or use the weights so far, {weights}"
+    return message
 
 
 class _Data(L.LightningDataModule):
@@ -216,7 +239,13 @@ class _Data(L.LightningDataModule):
         sampler = StepSampler(len(self.train_set), config, start, stop, trainer.global_rank, trainer.world_size)
         samples = TrainingSamples(self.train_set, config)
         workers = 0 if isinstance(self.train_set, ResidentPairs) else config.workers
-        return DataLoader(samples, batch_sampler=sampler, num_workers=workers, collate_fn=TrainingBatches(config))
+        return DataLoader(
+            samples,
+            batch_sampler=sampler,
+            num_workers=workers,
+            collate_fn=TrainingBatches(config),
+            worker_init_fn=ignore_stopping,
+        )
 
     def _cache(self) -> None:
         """Puts the training pairs on the device, once, where the configuration and the memory allow it."""
@@ -239,7 +268,12 @@ class _Data(L.LightningDataModule):
         trainer = self.module.trainer
         mine = range(trainer.global_rank, _length(self.validation_set), trainer.world_size)
         return DataLoader(
-            self.validation_set, batch_size=1, sampler=mine, num_workers=self.config.workers, collate_fn=_one_pair
+            self.validation_set,
+            batch_size=1,
+            sampler=mine,
+            num_workers=self.config.workers,
+            collate_fn=_one_pair,
+            worker_init_fn=ignore_stopping,
         )
 
 

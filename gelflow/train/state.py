@@ -3,12 +3,13 @@
 run.json             the configuration and what it was given, written when the run starts
 state.ckpt           network, optimiser, step and best score so far: everything a resumed run needs
 weights.safetensors  the best weights on the validation pairs so far; without such pairs, the last, at the end
-                     or where Ctrl-C stopped the run
+                     or where Ctrl-C or SIGTERM stopped the run
 logs/                TensorBoard and CSV, a subfolder per session
 """
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,11 @@ from typing import Any
 import torch
 
 from gelflow import __version__
-from gelflow.config import TrainConfig, validated
+from gelflow.config import TrainConfig
 from gelflow.errors import InputError
 from gelflow.files.atomic import replacing, write_text
 from gelflow.files.tensors import Unreadable, load_tensors
+from gelflow.schema_errors import validated
 
 RUN, STATE, WEIGHTS = "run.json", "state.ckpt", "weights.safetensors"
 
@@ -38,6 +40,7 @@ class State:
         score: Best validation score so far (lower is better), or None.
         metrics: Results of the last validation.
         average: State dictionary of the weights' moving average, where there is one.
+        validation_due: Whether the validation that follows the step is still to come.
     """
 
     step: int
@@ -46,6 +49,7 @@ class State:
     score: float | None
     metrics: dict[str, float]
     average: dict[str, Any] | None = None
+    validation_due: bool = False
 
 
 def save_state(out: Path, state: State) -> None:
@@ -74,15 +78,15 @@ def load_state(out: Path) -> State:
 
 
 def open_run(
-    out: Path, config: TrainConfig, pairs: int, validation_pairs: int, initial: Path | None, resume: bool
+    out: Path, config: TrainConfig, data: Mapping[str, int | str | None], initial: Path | None, resume: bool
 ) -> State | None:
     """Claims the folder for a new run, or checks that it holds this very run.
 
     Args:
         out: The folder; made where it is missing.
         config: The run's settings.
-        pairs: Training pairs.
-        validation_pairs: Validation pairs, 0 without.
+        data: What is known of the data sets: `pairs` and `validation_pairs` (0 without), their numbers, and the
+            `digest` and `validation_digest` (None where a data set has none).
         initial: Weights that the run starts from.
         resume: Go on with the run in the folder.
 
@@ -94,8 +98,7 @@ def open_run(
     """
     record = {
         "gelflow": __version__,
-        "pairs": pairs,
-        "validation_pairs": validation_pairs,
+        **data,
         "initial_sha256": None if initial is None else hashlib.sha256(initial.read_bytes()).hexdigest(),
         "config": config.model_dump(mode="json"),
     }
@@ -112,6 +115,11 @@ def open_run(
         f"{name}: {former.get(name)!r} there, {record[name]!r} now"
         for name in ("pairs", "validation_pairs", "initial_sha256")
         if former.get(name) != record[name]
+    ]
+    differences += [
+        f"the {words} have other names, scenes or seeds there"
+        for name, words in (("digest", "training pairs"), ("validation_digest", "validation pairs"))
+        if None not in (former.get(name), record[name]) and former[name] != record[name]
     ]
     before = validated(TrainConfig, former.get("config", {}), str(out / RUN))
     differences += _differences(before, config)

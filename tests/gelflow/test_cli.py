@@ -62,6 +62,9 @@ def test_module_runs_and_passes_the_status_on() -> None:
         (["compare", ".", "--weights", "best=none.safetensors"], "none.safetensors"),
         (["compare", ".", "--weights", "x", "--size", "big"], "--size big"),
         (["compare", ".", "--methods", "none,none"], "twice"),
+        (["compare", ".", "--batch", "-1"], "--batch -1: a number from 0"),
+        (["compare", ".", "--ft", "-3"], "--ft -3: a number from 0"),
+        (["train", ".", "--out", "o", "--set", "seed=99999999999999999999999"], "seed: "),
         (["train", ".", "--out", "o", "--set", "loss"], "KEY=VALUE"),
         (["train", ".", "--out", "o", "--set", "loss.wings=2"], "loss.wings"),
         (["train", ".", "--out", "o", "--steps", "0"], "steps"),
@@ -128,6 +131,9 @@ def test_pairs_exit_statuses(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     answer = json.loads(capsys.readouterr().out)
     assert answer["recordings"] == 1
     assert answer["pairs"] >= 2
+    motions = [pair["motion_px"] for pair in json.loads((tmp_path / "a" / "pairs.json").read_text())["pairs"]]
+    deciles = answer["motion_deciles_px"]
+    assert round(min(motions), 1) <= deciles[0] <= deciles[-1] <= round(max(motions), 1)
     assert main(["pairs", str(good), str(bad), "--out", str(tmp_path / "b")]) == 1
     captured = capsys.readouterr()
     assert "bad.avi" in captured.err

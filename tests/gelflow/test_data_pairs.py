@@ -9,6 +9,7 @@ import torch
 from textures import as_bytes, moved, write_folder, write_synthetic
 
 from gelflow.data import join, open_pairs
+from gelflow.data.pairs import read_markers
 from gelflow.errors import InputError
 from gelflow.files.exr import read_channels, write_flow
 
@@ -98,6 +99,16 @@ def test_broken_synthetic_data_set_is_named(tmp_path: Path, file: str, content: 
         open_pairs(folder)
 
 
+def test_digest_tells_synthetic_data_sets_apart_by_scene_and_seed(tmp_path: Path) -> None:
+    folder = write_synthetic(tmp_path, [(1, 0)])
+    digests = [open_pairs(folder).digest]
+    for origin in ({"scene_hash": "a", "seed": 1}, {"scene_hash": "a", "seed": 2}, {"scene_hash": "b", "seed": 2}):
+        (folder / "dataset.json").write_text(json.dumps({"schema_version": 1} | origin))
+        digests.append(open_pairs(folder).digest)
+    assert len(set(digests)) == 4
+    assert open_pairs(folder).digest == digests[-1]
+
+
 def test_flow_of_another_size_is_named(tmp_path: Path) -> None:
     folder = write_synthetic(tmp_path, [(1, 0)])
     write_flow(folder / "samples" / "000000" / "flow.exr", np.zeros((10, 10, 2), np.float32))
@@ -117,12 +128,25 @@ def test_plain_folder_with_markers(tmp_path: Path) -> None:
     assert dataset.truth(0) is None
 
 
+def test_markers_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
+    (tmp_path / "markers.csv").write_text("x1,y1,x2,y2\n1,2,3,4\n", encoding="utf-8-sig")
+    assert read_markers(tmp_path / "markers.csv").tolist() == [[1, 2, 3, 4]]
+
+
 @pytest.mark.parametrize(
-    "text", ["x1,y1,x2\n1,2,3\n", "x1,y1,x2,y2\n1,2,3,dot\n", "x1,y1,x2,y2\n", "x1,y1,x2,y2\n1,2,3\n"]
+    "text",
+    [
+        "x1,y1,x2\n1,2,3\n",
+        "x1,y1,x2,y2\n1,2,3,dot\n",
+        "x1,y1,x2,y2\n",
+        "x1,y1,x2,y2\n1,2,3\n",
+        "x1,y1,x2,y2,müde\n1,2,3,4,5\n",  # in Latin-1, see below
+        f"x1,y1,x2,y2\n1,2,3,{'4' * 200_000}\n",  # the csv module's limit is 131,072
+    ],
 )
 def test_broken_markers_are_named(tmp_path: Path, text: str) -> None:
     folder = write_folder(tmp_path, {"a": (1, 0)})
-    (folder / "a_markers.csv").write_text(text)
+    (folder / "a_markers.csv").write_text(text, encoding="latin-1")
     with pytest.raises(InputError, match=r"a_markers\.csv"):
         open_pairs(folder).markers(0)
 

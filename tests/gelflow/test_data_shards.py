@@ -164,6 +164,7 @@ def test_training_from_shards_gives_the_weights_of_the_data_set(both: tuple[Path
         TrainConfig.model_validate({**values, "model": model, "supervision": "flow", "steps": n}) for n in (2, 4)
     )
     data, shards = (open_pairs(path) for path in both)
+    assert data.digest == shards.digest
     first = train(whole, data, data, tmp_path / "data")
     train(short, shards, shards, tmp_path / "shards")
     second = train(whole, shards, shards, tmp_path / "shards", resume=True)

@@ -60,6 +60,19 @@ def test_folder_of_frames_is_a_video(tmp_path: Path) -> None:
     assert len(predict_video(FARNEBACK, tmp_path / "in", tmp_path / "out").motions) == 2
 
 
+def test_flow_files_of_an_earlier_run_go_and_others_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cv2.VideoWriter, "isOpened", lambda _: False)  # pictures in place of a video
+    for number in range(5):
+        save(tmp_path / "in" / f"{number}.png", moved(48, 48, number, 0))
+    out = tmp_path / "out"
+    assert len(predict_video(FARNEBACK, tmp_path / "in", out).motions) == 4
+    others = [out / "flow" / "12.exr", out / "flow" / "000001.txt", out / "overlay" / "notes.png"]
+    for other in others:
+        other.touch()
+    second = predict_video(FARNEBACK, tmp_path / "in", out, every=3)
+    assert {path for path in out.rglob("*") if path.is_file()} == {*second.files, *others}
+
+
 def test_progress_reaches_its_total(tmp_path: Path) -> None:
     write_video(tmp_path / "a.avi", [as_bytes(moved(48, 64, shift, 0)) for shift in range(5)])
     calls: list[tuple[int, int]] = []

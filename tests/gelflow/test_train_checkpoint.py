@@ -87,6 +87,12 @@ def test_metadata_that_do_not_fit(saved: Path, tmp_path: Path, model: str, words
         load_weights(rewritten(saved, tmp_path / "wrong.safetensors", model=model))
 
 
+@pytest.mark.parametrize("size", ["5", "[]", '"x"', "[64]", "[64, 80.5]", "[true, 64]"])
+def test_a_size_that_is_none(saved: Path, tmp_path: Path, size: str) -> None:
+    with pytest.raises(InputError, match="image_size in its metadata must be null or"):
+        load_weights(rewritten(saved, tmp_path / "wrong.safetensors", image_size=size))
+
+
 def test_weights_that_are_not_finite(saved: Path, tmp_path: Path) -> None:
     tensors = load_file(saved)
     next(iter(tensors.values())).view(-1)[0] = torch.nan

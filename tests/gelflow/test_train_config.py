@@ -1,13 +1,15 @@
 """Settings: the paper's values, refusals that name the field, imports that stay light."""
 
+import datetime
 import subprocess
 import sys
 
 import pytest
 
-from gelflow.config import REGISTRATIONS, LossConfig, ModelConfig, RegistrationConfig, TrainConfig, validated
+from gelflow.config import REGISTRATIONS, LossConfig, ModelConfig, RegistrationConfig, TrainConfig
 from gelflow.errors import InputError
 from gelflow.overrides import train_config
+from gelflow.schema_errors import validated
 
 
 def test_defaults_are_the_readings_of_the_paper() -> None:
@@ -37,6 +39,15 @@ def test_defaults_are_the_readings_of_the_paper() -> None:
         ({"steps": 10, "warmup_steps": 10}, "warmup_steps = 10 must be below steps = 10"),
         ({"steps": 0}, "steps: .*greater than or equal to 1"),
         ({"learning_rate": float("nan")}, "learning_rate"),
+        ({"batch_size": True}, "batch_size: .*integer .*True"),
+        ({"batch_size": 2.5}, "batch_size: .*integer .*2.5"),
+        ({"batch_size": "2"}, "batch_size: .*integer .*'2'"),
+        ({"loss": {"alpha": True}}, "loss.alpha: .*number .*True"),
+        ({"loss": {"lambda_dc": "5"}}, "loss.lambda_dc: .*number .*'5'"),
+        ({"loss": {"lambda_s": [True] * 7}}, "loss.lambda_s.0: .*number .*True"),
+        ({"flip": "no"}, "flip: .*boolean .*no"),
+        ({"flip": 1}, "flip: .*boolean .*1"),
+        ({"seed": datetime.date(2000, 1, 1)}, "seed: .*integer .*2000-01-01"),
     ],
 )
 def test_wrong_values_are_named_with_what_is_allowed(values: dict, words: str) -> None:
@@ -44,6 +55,14 @@ def test_wrong_values_are_named_with_what_is_allowed(values: dict, words: str) -
         validated(TrainConfig, values, "run.toml")
     assert str(error.value).startswith("run.toml: ")
     assert "\n" not in str(error.value)
+
+
+def test_numbers_and_lists_serve_where_they_mean_the_same() -> None:
+    values = {"steps": 1e3, "learning_rate": 1, "precision": 32, "image_size": [64.0, 80], "gradient_clip": 1e30}
+    config = train_config(None, [f"{name}={value}" for name, value in values.items()])
+    assert (config.steps, config.learning_rate, config.precision) == (1000, 1, "32")
+    assert (config.image_size, config.gradient_clip) == ((64, 80), 1e30)
+    assert [type(value) for value in (config.steps, config.learning_rate, config.gradient_clip)] == [int, float, float]
 
 
 def test_a_configuration_survives_json() -> None:

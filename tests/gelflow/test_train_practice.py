@@ -1,8 +1,14 @@
 """Practice: moving average, both directions and analogy resume bit by bit; bf16; compile; two processes; speed."""
 
+import contextlib
 import csv
+import os
+import signal
+import socket
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -103,7 +109,8 @@ def test_a_compiled_network_is_asked_for_and_keeps_its_names(
 
 
 @pytest.mark.slow
-def test_two_processes_end_as_one_with_twice_the_batch(tmp_path: Path) -> None:
+@pytest.mark.parametrize("option", ["--devices", "--nodes"])
+def test_two_processes_end_as_one_with_twice_the_batch(tmp_path: Path, option: str) -> None:
     """Gradients are averaged over processes, so that 2 x 1 pairs are 1 x 2 pairs.
 
     Fails with both processes given the same pairs.
@@ -112,18 +119,60 @@ def test_two_processes_end_as_one_with_twice_the_batch(tmp_path: Path) -> None:
     options = {"steps": 3, "learning_rate": 1e-4, "loss": SMALL["loss"] | {"mask_outside": False}}
     one = train(small(batch_size=2, **options), open_pairs(folder), None, tmp_path / "one").weights
     settings = tmp_path / "settings.toml"
-    settings.write_text("steps = 3\nbatch_size = 1\ndevices = 2\n[model]\nlevels = 4\nprojected_channels = 8\n"
+    settings.write_text("steps = 3\nbatch_size = 1\n[model]\nlevels = 4\nprojected_channels = 8\n"
                         "[loss]\nlambda_s = [1.0, 1.0, 1.0]\nmask_outside = false\n")  # fmt: skip
     command = [sys.executable, "-m", "gelflow", "train", str(folder), "--out", str(tmp_path / "two"), "--device", "cpu",
-               "--config", str(settings)]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
-    assert done.returncode == 0, done.stderr
+               "--config", str(settings), option, "2"]  # fmt: skip
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        environment = os.environ | {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1])}
+    machines = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                                 env=environment | {"NODE_RANK": str(rank)})
+                for rank in range(2 if option == "--nodes" else 1)]  # fmt: skip
+    texts = [machine.communicate(timeout=240) for machine in machines]
+    assert [machine.returncode for machine in machines] == [0] * len(machines), texts
+    assert sum(printed.count("weights.safetensors") for printed, _ in texts) == 1
     first, second = (load_weights(path).state_dict() for path in (one, tmp_path / "two" / "weights.safetensors"))
     # The same gradients up to float32 rounding. Adam's first steps are the sign of the gradient times 1e-4, so that a
     # gradient near zero may turn: all but a few weights must agree to a hundredth of a step.
     differences = torch.cat([(first[name] - second[name]).abs().flatten() for name in first])
     assert (differences < 1e-6).float().mean() > 0.99
     assert differences.max() < 6.1e-4  # three steps, each to the other side
+
+
+@pytest.mark.parametrize(
+    ("send", "devices"),
+    [
+        (os.killpg, 1),
+        pytest.param(os.kill, 2, marks=pytest.mark.slow),
+        pytest.param(os.killpg, 2, marks=pytest.mark.slow),
+    ],
+)
+def test_sigterm_stops_a_run_as_ctrl_c_does(tmp_path: Path, send: Callable[[int, int], None], devices: int) -> None:
+    """Sent to all its processes, as SLURM does, or to the first, as `timeout` does.
+
+    Fails with Lightning's handler, with workers that the signal ends, and where processes do not stop together.
+    """
+    folder, out = write_folder(tmp_path / "data", {"a": (1.0, 0.5)}, (64, 64)), tmp_path / "run"
+    settings = tmp_path / "settings.toml"
+    settings.write_text("steps = 100_000\nbatch_size = 1\nsave_every = 1\nworkers = 1\n[model]\nlevels = 4\n"
+                        "projected_channels = 8\n[loss]\nlambda_s = [1.0, 1.0, 1.0]\n")  # fmt: skip
+    command = [sys.executable, "-m", "gelflow", "train", str(folder), "--out", str(out), "--device", "cpu",
+               "--config", str(settings), "--devices", str(devices)]  # fmt: skip
+    run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    try:
+        while not (out / "state.ckpt").exists() and run.poll() is None:
+            time.sleep(0.05)
+        send(run.pid, signal.SIGTERM)
+        text = run.communicate(timeout=60)[1]
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(run.pid, signal.SIGKILL)
+    assert run.returncode == 130, text
+    assert text.count("stopping after this step") == 1
+    assert text.count("stopped; step") == 1
+    assert f"stopped; step {load_state(out).step} of 100000 is saved" in text
+    assert (out / "weights.safetensors").exists()
 
 
 def test_speed_and_memory_are_reported(pairs: Shifts, tmp_path: Path) -> None:

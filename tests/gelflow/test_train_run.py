@@ -9,10 +9,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from textures import write_folder
 from torch.utils.data import Dataset
 from waves import Shifts
 
 from gelflow.config import ModelConfig, TrainConfig
+from gelflow.data import open_pairs
 from gelflow.errors import InputError
 from gelflow.estimate import estimate_flow
 from gelflow.train import train
@@ -94,6 +96,22 @@ def test_a_run_interrupted_by_ctrl_c_ends_with_the_same_weights(
     assert bool(resumed.metrics) == validates
 
 
+def test_a_run_stopped_before_its_first_save_says_so(tmp_path: Path) -> None:
+    """By SIGTERM while Lightning opens the data, before the keeper handles signals, which ends the first step."""
+
+    class Counted(Shifts):
+        counts = 0
+
+        def __len__(self) -> int:
+            self.counts += 1
+            if self.counts == 2:  # once to look at the data set, then for the loader
+                os.kill(os.getpid(), signal.SIGTERM)
+            return super().__len__()
+
+    with pytest.raises(KeyboardInterrupt, match="stopped; nothing has been saved yet: start again"):
+        train(small(steps=3), Counted(2, 64, 1.0, seed=3), None, tmp_path)
+
+
 def test_a_run_killed_between_saves_goes_back_to_the_last_one_and_ends_the_same(pairs: Shifts, tmp_path: Path) -> None:
     class Killed(CtrlC):
         def __getitem__(self, index: int) -> dict:
@@ -110,6 +128,36 @@ def test_a_run_killed_between_saves_goes_back_to_the_last_one_and_ends_the_same(
     resumed = train(config, pairs, None, tmp_path / "cut", resume=True)
     first, second = weights_of(whole.weights), weights_of(resumed.weights)
     assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+@pytest.mark.parametrize("steps", [4, 2])
+def test_a_run_whose_validation_failed_is_saved_and_validates_when_resumed(
+    pairs: Shifts, tmp_path: Path, steps: int
+) -> None:
+    """Fails without a save before the validation, and with a resumed run that leaves out what is due."""
+
+    class OneSmall(CtrlC):
+        def __getitem__(self, index: int) -> dict:
+            sample = self.pairs[index]
+            if index == self.left:
+                sample |= {key: sample[key][..., :63, :] for key in ("image1", "image2", "flow")}
+            return sample
+
+    config = small(steps=steps, validate_every=2)
+    whole = train(config, pairs, pairs, tmp_path / "whole")
+    with pytest.raises(InputError, match=r"validation pair shift_0: 63x64 px, but each side must be at least 64 px"):
+        train(config, pairs, OneSmall(pairs, 0), tmp_path / "refused")
+    assert not (tmp_path / "refused").exists()
+    with pytest.raises(InputError, match=r"validation pair shift_1: 63x64 px"):
+        train(config, pairs, OneSmall(pairs, 1), tmp_path / "cut")
+    assert load_state(tmp_path / "cut").step == 2
+    resumed = train(config, pairs, pairs, tmp_path / "cut", resume=True)
+    assert (resumed.best, resumed.metrics) == (whole.best, whole.metrics)
+    first, second = weights_of(whole.weights), weights_of(resumed.weights)
+    assert all(torch.equal(first[name], second[name]) for name in first)
+    validated = [row for log in (tmp_path / "cut").glob("logs/csv/*/metrics.csv")
+                 for row in csv.DictReader(log.open()) if row.get("validation/psnr_db")]  # fmt: skip
+    assert sorted(row["step"] for row in validated) == [str(step) for step in range(2, steps + 1, 2)]
 
 
 def test_the_folder_of_a_run_holds_logs_weights_and_settings(pairs: Shifts, tmp_path: Path) -> None:
@@ -188,6 +236,22 @@ def test_folders_of_other_runs_are_refused(pairs: Shifts, tmp_path: Path) -> Non
     (tmp_path / "run" / "state.ckpt").write_bytes(b"PK damaged")
     with pytest.raises(InputError, match=r"state\.ckpt: damaged"):
         train(small(steps=4), pairs, None, tmp_path / "run", resume=True)
+
+
+def test_a_run_is_not_resumed_with_other_pairs(tmp_path: Path) -> None:
+    """But a run whose record is older than the digests and than `nodes` is."""
+    data, other = (
+        open_pairs(write_folder(tmp_path / names, dict.fromkeys(names, (1.0, 0.0)))) for names in ("ab", "ac")
+    )
+    run = tmp_path / "run"
+    train(small(steps=1), data, data, run)
+    for pairs, validation, words in ((other, data, "training"), (data, other, "validation")):
+        with pytest.raises(InputError, match=f"the {words} pairs have other names, scenes or seeds there"):
+            train(small(steps=2), pairs, validation, run, resume=True)
+    record = json.loads((run / "run.json").read_text())
+    del record["digest"], record["validation_digest"], record["config"]["nodes"]
+    (run / "run.json").write_text(json.dumps(record))
+    assert train(small(steps=2), other, data, run, resume=True).steps == 2
 
 
 def test_settings_that_the_data_or_the_machine_cannot_serve(pairs: Shifts, tmp_path: Path) -> None:
