@@ -174,12 +174,6 @@ def stopping(keeper: Keeper) -> Iterator[None]:
         signal.signal(signal.SIGINT, former)
 
 
-def ignore_stopping(_: int) -> None:
-    """For processes that load data: they end with the run, which handles the signals that ask it to stop."""
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
-
-
 def is_first_process() -> bool:
     """Whether this is the process that writes files and messages, among those of all devices and machines."""
     return not getattr(rank_zero_only, "rank", 0)

@@ -29,11 +29,11 @@ from gelflow.train.keeper import (
     Keeper,
     Stopped,
     describe,
-    ignore_stopping,
     is_first_process,
     stopping,
     weights_metadata,
 )
+from gelflow.train.loading import end_with_run
 from gelflow.train.module import FlowModule, check_side
 from gelflow.train.resident import ResidentPairs, resident
 from gelflow.train.samples import CheckedPairs, StepSampler, TrainingBatches, TrainingSamples, checked, collate
@@ -169,6 +169,7 @@ def _fit(module: FlowModule, keeper: Keeper, data: "_Data", device: str, validat
     """Validates first where that is due, then runs the remaining steps.
 
     Raises:
+        InputError: A pair cannot be used.
         KeyboardInterrupt: Somebody asked to stop; the message says how to go on.
     """
     config, out = keeper.config, keeper.out
@@ -204,6 +205,8 @@ def _fit(module: FlowModule, keeper: Keeper, data: "_Data", device: str, validat
             if not trainer.is_global_zero:
                 sys.exit()  # message and exit status are the first process's
             raise KeyboardInterrupt(_how_to_go_on(config, out)) from None
+        except InputError as error:  # of a process that loads data it comes with a traceback in its text
+            raise InputError(str(error).rpartition(f"{InputError.__name__}: ")[2].strip()) from error
 
 
 def _how_to_go_on(config: TrainConfig, out: Path) -> str:
@@ -244,7 +247,7 @@ class _Data(L.LightningDataModule):
             batch_sampler=sampler,
             num_workers=workers,
             collate_fn=TrainingBatches(config),
-            worker_init_fn=ignore_stopping,
+            worker_init_fn=end_with_run,
         )
 
     def _cache(self) -> None:
@@ -273,7 +276,7 @@ class _Data(L.LightningDataModule):
             sampler=mine,
             num_workers=self.config.workers,
             collate_fn=_one_pair,
-            worker_init_fn=ignore_stopping,
+            worker_init_fn=end_with_run,
         )
 
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import multiprocessing
 import os
 import signal
 from collections.abc import Iterator
@@ -128,6 +129,27 @@ def test_a_run_killed_between_saves_goes_back_to_the_last_one_and_ends_the_same(
     resumed = train(config, pairs, None, tmp_path / "cut", resume=True)
     first, second = weights_of(whole.weights), weights_of(resumed.weights)
     assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_a_pair_that_a_loading_process_cannot_use_is_named_and_the_process_ends(pairs: Shifts, tmp_path: Path) -> None:
+    """Fails with torch's traceback in the message, and with processes that ignore SIGTERM: Python waits for them."""
+
+    class Broken(CtrlC):
+        def __getitem__(self, index: int) -> dict:
+            self.left -= 1
+            if self.left == 0:
+                raise InputError("pair 3: damaged")
+            return self.pairs[index]
+
+    with pytest.raises(InputError, match=r"^pair 3: damaged$") as caught:
+        train(small(steps=6, workers=1), Broken(pairs, 3), None, tmp_path)
+    assert caught.traceback  # which holds the loader, as a command's does until it has printed the message
+    processes = multiprocessing.active_children()
+    assert processes
+    for process in processes:
+        process.terminate()
+        process.join(10)
+        assert process.exitcode == 0
 
 
 @pytest.mark.parametrize("steps", [4, 2])
