@@ -61,8 +61,11 @@ class CtrlC(Dataset):
     def __getitem__(self, index: int) -> dict:
         self.left -= 1
         if self.left == 0:
-            os.kill(os.getpid(), signal.SIGINT)
+            self.happens()
         return self.pairs[index]
+
+    def happens(self) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
 
 
 def weights_of(path: Path) -> dict[str, torch.Tensor]:
@@ -115,11 +118,8 @@ def test_a_run_stopped_before_its_first_save_says_so(tmp_path: Path) -> None:
 
 def test_a_run_killed_between_saves_goes_back_to_the_last_one_and_ends_the_same(pairs: Shifts, tmp_path: Path) -> None:
     class Killed(CtrlC):
-        def __getitem__(self, index: int) -> dict:
-            self.left -= 1
-            if self.left == 0:
-                raise RuntimeError("power cut")
-            return self.pairs[index]
+        def happens(self) -> None:
+            raise RuntimeError("power cut")
 
     config = small(steps=6, save_every=2)
     whole = train(config, pairs, None, tmp_path / "whole")
@@ -135,11 +135,8 @@ def test_a_pair_that_a_loading_process_cannot_use_is_named_and_the_process_ends(
     """Fails with torch's traceback in the message, and with processes that ignore SIGTERM: Python waits for them."""
 
     class Broken(CtrlC):
-        def __getitem__(self, index: int) -> dict:
-            self.left -= 1
-            if self.left == 0:
-                raise InputError("pair 3: damaged")
-            return self.pairs[index]
+        def happens(self) -> None:
+            raise InputError("pair 3: damaged")
 
     with pytest.raises(InputError, match=r"^pair 3: damaged$") as caught:
         train(small(steps=6, workers=1), Broken(pairs, 3), None, tmp_path)
