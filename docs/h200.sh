@@ -35,12 +35,12 @@ shards() { # processes, workers: 1,000 pairs; a line a second: seconds, pairs th
     rm -rf "$data"
 }
 
-presses="python -m synth.bench.batched --across 16 12 --through 2 --growth 2 --radii 3 6 --step 0.334 --closer 0.1"
+presses="python -m synth.bench.batched --across 16 12 --through 2 --growth 2.5 --radii 3 6 --step 0.334 --closer 0.1"
 # shellcheck disable=SC2086 # several words
 {
-    part presses_fast.jsonl $presses --forcing 0.03 --loose 1e-2 --batch 2048 2048 2048 1024 1024 1024 --seconds 10
-    part presses_tight.jsonl $presses --forcing 0.03 --batch 1024 2048 --seconds 16
-    part presses.jsonl $presses --batch 1024 --seconds 16
+    part presses_fast.jsonl $presses --forcing 0.03 --loose 1e-2 --batch 2048 2048 1024 --seconds 36
+    part presses_tight.jsonl $presses --forcing 0.03 --batch 1024 2048 --seconds 36
+    part presses.jsonl $presses --batch 1024 --seconds 36
 }
 for each in ${SHARDS:-4:3 2:7}; do part "shards_${each%:*}.log" shards "${each%:*}" "${each#*:}"; done
 agreement="python -m synth.bench.agreement --processes ${PROCESSES:-16}"

@@ -11,6 +11,7 @@ tenth more would lie nearer.
 """
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -59,12 +60,12 @@ def fitted(flow: Tensor, known: Tensor, start: Tensor, scale: int) -> Tensor:
     return found
 
 
-def wins(dataset: PairDataset, preset: str) -> torch.Tensor:
+def wins(dataset: PairDataset, preset: str, assignments: Sequence[str]) -> torch.Tensor:
     """(scales, 3): number of pairs whose true flow beats itself times each factor.
 
     Prints each pair that fails at a scale which the preset judges.
     """
-    loss = train_config(preset).loss
+    loss = train_config(preset, assignments).loss
     scales = len(loss.lambda_s)
     counts = torch.zeros(scales, len(FACTORS))
     for index in range(len(dataset)):
@@ -96,12 +97,13 @@ def main() -> None:
     parser.add_argument("datasets", nargs="+", type=Path)
     parser.add_argument("--every", type=int, default=1)
     parser.add_argument("--presets", default="paper,selfflow,best,real")
+    parser.add_argument("--set", action="append", default=[], help="of the presets, such as loss.alpha=0.85")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     torch.set_grad_enabled(False)
     dataset = open_all(arguments.datasets)
     dataset = PairDataset(dataset.source, dataset.records[:: arguments.every])
-    counts = {preset: wins(dataset, preset) for preset in arguments.presets.split(",")}
+    counts = {preset: wins(dataset, preset, arguments.set) for preset in arguments.presets.split(",")}
     scales = max(len(count) for count in counts.values())
     rows = [[preset, *(" / ".join(f"{one:.0f}" for one in line) for line in count)] for preset, count in counts.items()]
     print(f"{len(dataset)} pairs; those whose true flow beats no flow / 0.9 times / 1.1 times itself")

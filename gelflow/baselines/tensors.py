@@ -34,4 +34,5 @@ def as_tensor(image: ImageArray, device: str) -> Any:
 
 def as_array(flow: Any) -> FlowArray:
     """The first flow of a tensor (B, 2, H, W) as (H, W, 2) float32; waits for the device."""
-    return np.ascontiguousarray(np.moveaxis(flow[0].float().cpu().numpy(), 0, -1))
+    array: FlowArray = flow[0].permute(1, 2, 0).float().contiguous().cpu().numpy()
+    return array
