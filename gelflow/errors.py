@@ -7,3 +7,7 @@ class InputError(ValueError):
     The message says what was given, where, what is allowed and what to do. The command line prints it without a
     traceback and exits with status 2.
     """
+
+
+class NothingFoundError(InputError):
+    """A method that follows single points found none in a pair; `evaluate` scores it as no motion there."""

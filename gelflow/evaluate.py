@@ -12,7 +12,7 @@ import numpy as np
 from gelflow.baselines.exact import ExactFlow
 from gelflow.baselines.method import Method
 from gelflow.data.pairs import PairDataset
-from gelflow.errors import InputError
+from gelflow.errors import InputError, NothingFoundError
 from gelflow.hardware import hardware
 from gelflow.metrics import endpoint_error, flow_errors, image_similarity, marker_distance
 from gelflow.strata import Stratum, pair_strata
@@ -81,7 +81,9 @@ class MethodScore:
 
 
 def score_pair(method: Method, dataset: PairDataset, index: int) -> PairScore:
-    """Runs a method on one pair and scores it.
+    """Runs a method on one pair and scores it; where it finds nothing to follow, it is scored as no motion.
+
+    To leave it out there would make a method that gives up look better than one that tries.
 
     Raises:
         InputError: The pair cannot be read, or the method cannot work on it; the message names the pair.
@@ -92,6 +94,8 @@ def score_pair(method: Method, dataset: PairDataset, index: int) -> PairScore:
     started, busy = time.perf_counter(), time.process_time()
     try:
         flow = method.of(truth) if isinstance(method, ExactFlow) else method.flow(image1, image2)
+    except NothingFoundError:
+        flow = np.zeros((*image1.shape[:2], 2), np.float32)
     except InputError as error:
         raise InputError(f"{dataset.source}, pair {name}, {method.name}: {error}") from error
     seconds, processor_seconds = time.perf_counter() - started, time.process_time() - busy

@@ -11,7 +11,7 @@ import numpy as np
 
 from gelflow.baselines.method import check_images
 from gelflow.baselines.scattered import dense_flow
-from gelflow.errors import InputError
+from gelflow.errors import NothingFoundError
 from gelflow.files.image import to_grey
 from gelflow.raster import FlowArray, ImageArray
 
@@ -31,7 +31,8 @@ class LucasKanade:
         """See `Method.flow`.
 
         Raises:
-            InputError: Nothing can be tracked: no corner, or none that is found again.
+            NothingFoundError: Nothing can be tracked: no corner, or none that is found again.
+            InputError: See `check_images`.
         """
         import cv2
 
@@ -39,7 +40,7 @@ class LucasKanade:
         first, second = to_grey(image1), to_grey(image2)
         start = cv2.goodFeaturesToTrack(first, CORNERS, QUALITY, DISTANCE_PX)
         if start is None:
-            raise InputError("image 1 has no corner that Lucas-Kanade could track; leave this method out")
+            raise NothingFoundError("image 1 has no corner that Lucas-Kanade could track; leave this method out")
         options = {
             "winSize": (WINDOW_PX, WINDOW_PX),
             "maxLevel": OCTAVES,
@@ -50,7 +51,7 @@ class LucasKanade:
         closure = np.linalg.norm(back - start, axis=-1).ravel()
         kept = (found.ravel() > 0) & (found_back.ravel() > 0) & (closure < CLOSURE_PX)
         if not kept.any():
-            raise InputError("Lucas-Kanade found none of image 1's corners in image 2; leave this method out")
+            raise NothingFoundError("Lucas-Kanade found none of image 1's corners in image 2; leave this method out")
         points = start.reshape(-1, 2)[kept].astype(np.float64)
         motion = there.reshape(-1, 2)[kept].astype(np.float64) - points
         return dense_flow(points, motion, *first.shape)

@@ -2,12 +2,13 @@
 
 import csv
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
-from textures import write_folder, write_synthetic
+from textures import save, write_folder, write_synthetic
 
 from gelflow.baselines import named_methods
 from gelflow.compare import compare
@@ -119,6 +120,16 @@ def test_broken_pair_is_named(tmp_path: Path) -> None:
     (folder / "b_2.png").write_bytes(b"broken")
     with pytest.raises(InputError, match=r"b_2\.png"):
         compare(named_methods(["none"]), open_pairs(folder))
+
+
+def test_a_pair_where_nothing_can_be_followed_is_scored_as_no_motion(tmp_path: Path) -> None:
+    """Not left out: the other pairs' mean would flatter the method. Fails if the first pair's flow is used again."""
+    folder = write_folder(tmp_path, {"a": (2, 0), "b": (2, 0)})
+    for number in (1, 2):
+        save(folder / f"b_{number}.png", np.full((64, 80, 3), 0.5, np.float32))
+    tracked, none = compare(named_methods(["lucas-kanade", "none"]), open_pairs(folder)).scores[1::2]
+    assert (tracked.method, tracked.pair, tracked.ssim) == ("Lucas-Kanade", "b", none.ssim)
+    assert math.isinf(tracked.psnr_db)
 
 
 def test_the_exact_flow_is_a_row_on_synthetic_pairs_only(tmp_path: Path) -> None:
