@@ -78,8 +78,9 @@ class Learned:
         self.path = path
         self.device = chosen_device(device)
         self.registration = registration
-        # Convolutions prefer their colours together: pairs one at a time take a seventh less time on either device.
-        self.model: Any = load_weights(path, self.device).to(memory_format=torch.channels_last)
+        self.model: Any = load_weights(path, self.device)
+        # Convolutions prefer a pixel's channels side by side: a seventh less time for pairs one at a time.
+        self.model.to(memory_format=torch.channels_last)
         self.trained = self.model.config
         if registration is not None:
             settings = {"registration": REGISTRATIONS[registration]}
