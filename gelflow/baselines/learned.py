@@ -80,7 +80,7 @@ class Learned:
         self.registration = registration
         self.model: Any = load_weights(path, self.device)
         # Convolutions prefer a pixel's channels side by side: a seventh less time for pairs one at a time.
-        self.model.to(memory_format=torch.channels_last)
+        self.model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # not in torch's stubs
         self.trained = self.model.config
         if registration is not None:
             settings = {"registration": REGISTRATIONS[registration]}
