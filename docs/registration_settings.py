@@ -35,7 +35,7 @@ CHANGES: dict[str, dict[str, tuple[object, ...]]] = {
     },
     "both": {"after": tuple(RegistrationConfig(noise=noise) for noise in (0.02, 0.03, 0.035, 0.045, 0.05, 0.06, 0.08))},
     "brightness": {
-        "propagation_px": ((), (8,), (8, 16, 32), (4, 8, 16, 32)),
+        "propagation_px": ((), (4, 8), (4, 8, 16, 32), (4, 8, 16, 32, 64), (4, 8, 16, 32, 64, 128)),
         "noise": (0.005, 0.01, 0.02, 0.04),
         "prior_px": (0.5, 1.0, 2.0),
         "windows_px": ((12.0, 6.0, 3.0, 1.0), (12.0, 6.0, 3.0, 2.0), (16.0, 8.0, 4.0, 1.0)),

@@ -56,7 +56,7 @@ Registration = Literal["none", "motion", "both", "brightness"]
 
 _BRIGHTNESS = RegistrationConfig(
     windows_px=(12.0, 6.0, 3.0, 1.0), smoothing_px=(4.0, 2.0, 1.0, 0.0), iterations=4, prior_px=1.0,
-    background_px=None, noise=0.01,
+    background_px=None, noise=0.01, propagation_px=(4, 8, 16, 32, 64, 128),
 )  # fmt: skip
 
 REGISTRATIONS: dict[Registration, RegistrationConfig | None] = {
