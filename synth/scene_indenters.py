@@ -2,7 +2,7 @@
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 Positive = Annotated[float, Field(gt=0)]
@@ -66,14 +66,26 @@ class Torus(Posed):
     tube_mm: Annotated[float, Field(ge=0.05, le=100)]
 
 
-class MeshIndenter(Posed):
-    """Closed triangle surface from any file that pyvista reads (STL, PLY, OBJ, VTP), in mm after scaling."""
+class MeshIndenter(Part):
+    """Triangle surface from any file that pyvista reads (STL, PLY, OBJ, OFF, VTP), in mm after scaling."""
 
     shape: Literal["mesh"]
     file: str
     scale: Positive = 1.0
-    cell_mm: Annotated[float, Field(ge=0.01, le=10)] = 0.1
-    """Spacing of the grid on which its signed distance is sampled."""
+    size_mm: Positive | None = None
+    """Longest edge of the bounding box before it is turned; in place of `scale`."""
+    rotation_deg: Vector3 | Literal["any"] = (0.0, 0.0, 0.0)
+    """As of the other shapes; "any" draws an orientation, all alike likely."""
+    fillet_mm: Annotated[float, Field(ge=0, le=100)] | None = None
+    """Radius to which edges and notches are rounded; default what the gel's mesh resolves, and never less."""
+    cell_mm: Annotated[float, Field(ge=0.01, le=10)] | None = None
+    """Spacing of the grid on which its signed distance is sampled; default a third of the radius."""
+
+    @model_validator(mode="after")
+    def _one_size(self) -> "MeshIndenter":
+        if self.size_mm is not None and self.scale != 1.0:
+            raise ValueError("scale and size_mm both say how large it is: give one of them")
+        return self
 
 
 Indenter = Annotated[Sphere | Cylinder | Box | Cone | Torus | MeshIndenter, Field(discriminator="shape")]

@@ -4,10 +4,6 @@ Frame of an indenter: its own +z points at the gel. Balls, bars, blocks and ring
 cone at the centre of its rounded tip, a mesh at the centre of its bounding box.
 """
 
-import logging
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,14 +11,36 @@ import numpy as np
 
 from synth.arrays import FloatArray
 from synth.errors import InputError
-from synth.scene_indenters import Box, Cone, Cylinder, Indenter, MeshIndenter, Sphere, Torus
+from synth.scene_indenters import Box, Cone, Cylinder, Indenter, MeshIndenter, Sphere, Torus, Vector3
 from synth.simulate.distance import KINDS, SHAPE_LENGTH
+from synth.simulate.object_grid import Grid, rounded
+from synth.simulate.object_surface import Triangles, object_triangles
 
 BLUNT_MM = 1.0
 """Smallest radius at which the contact stiffness of `numerics.penalty` is enough."""
 SHARPEST = 4.0
 LARGEST_GRID = 4_000_000
-"""Cells of a mesh indenter's distance grid (32 MB)."""
+"""Points of a mesh's distance grid (32 MB)."""
+USUAL_GRID = 500_000
+"""Points that a grid has at most by default."""
+CELLS_PER_RADIUS = 3.0
+"""Spacings of the grid to the radius of the edges."""
+
+
+@dataclass(frozen=True)
+class Touchable:
+    """The part of a body that a gel can touch.
+
+    Attributes:
+        radius_mm: distance from the body's axis along z, through its origin.
+        height_mm: distance in z from its lowest point, the one that is nearest to the gel.
+    """
+
+    radius_mm: float = np.inf
+    height_mm: float = np.inf
+
+
+EVERYTHING = Touchable()
 
 
 @dataclass(frozen=True)
@@ -66,22 +84,28 @@ def rotation_about(axis: int, angle: float) -> FloatArray:
     return matrix
 
 
-def rigid_body(indenter: Indenter, folder: Path | None = None, resolution_mm: float = 0.0) -> RigidBody:
+def rigid_body(
+    indenter: Indenter,
+    folder: Path | None = None,
+    resolution_mm: float = 0.0,
+    touchable: Touchable = EVERYTHING,
+) -> RigidBody:
     """Pack an indenter.
 
     Args:
         indenter: from the scene.
         resolution_mm: smallest radius that the gel's mesh resolves; sharper edges and tips are rounded to it.
         folder: what a mesh indenter's relative file name is relative to.
+        touchable: the part of it that matters; what a mesh has beyond is left out.
 
     Raises:
         InputError: a fillet or tube too large for its shape; a mesh file that is missing, open or too fine for a grid.
     """
-    turns = [rotation_about(axis, np.radians(angle)) for axis, angle in enumerate(indenter.rotation_deg)]
-    rotation = turns[2] @ turns[1] @ turns[0]
+    if isinstance(indenter, MeshIndenter):
+        return _object(indenter, folder or Path(), resolution_mm, touchable)
+    rotation = turned_by(indenter.rotation_deg)
     up = rotation.T @ np.array([0.0, 0.0, 1.0])
     radial, axial = float(np.hypot(up[0], up[1])), float(up[2])
-    coefficients = np.zeros((1, 1, 1))
     match indenter:
         case Sphere(radius_mm=radius):
             lengths, reach, sharpest = [0.0, radius], radius, radius
@@ -107,13 +131,9 @@ def rigid_body(indenter: Indenter, folder: Path | None = None, resolution_mm: fl
         case Torus(radius_mm=radius, tube_mm=tube):
             _require(tube < radius, indenter, "tube_mm", f"less than radius_mm = {radius}")
             lengths, reach, sharpest = [tube, radius], radius * radial + tube, tube
-        case MeshIndenter():
-            corner, vertices, coefficients = _distance_grid(indenter, folder or Path())
-            lengths = [0.0, *corner, indenter.cell_mm, *coefficients.shape]
-            reach, sharpest = float((vertices @ up).max()), indenter.cell_mm
     shape = np.zeros(SHAPE_LENGTH)
     shape[: len(lengths)] = lengths
-    return RigidBody(KINDS[indenter.shape], shape, rotation, reach, coefficients, sharpest)
+    return RigidBody(KINDS[indenter.shape], shape, rotation, reach, np.zeros((1, 1, 1)), sharpest)
 
 
 def _rounded(fillet: float, resolution: float, half_thickness: float) -> float:
@@ -129,58 +149,50 @@ def _require(holds: bool, indenter: Indenter, field: str, allowed: str) -> None:
         )
 
 
-@contextmanager
-def _silence() -> Iterator[None]:
-    """Without VTK's log and warnings, which tell of addresses and reference counts."""
-    disabled = logging.root.manager.disable
-    logging.disable(logging.CRITICAL)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logging.disable(disabled)
-
-
-def _distance_grid(indenter: MeshIndenter, folder: Path) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Corner of the grid (3,), vertices (n, 3) about the box's centre, B-spline coefficients (i, j, k)."""
-    import pyvista as pv
+def _object(indenter: MeshIndenter, folder: Path, resolution_mm: float, touchable: Touchable) -> RigidBody:
+    """A triangle mesh. It is turned before it is sampled, so that the grid holds the part that touches alone."""
     from scipy.ndimage import spline_filter
 
-    path = Path(indenter.file) if Path(indenter.file).is_absolute() else folder / indenter.file
-    if not path.is_file():
-        raise InputError(f"contact.indenter.file = {indenter.file!r}: there is no file {path}")
-    try:
-        with _silence():
-            surface = pv.read(path).extract_surface(algorithm=None).triangulate().clean()
-    except (ValueError, OSError, AttributeError) as error:
-        raise InputError(
-            f"contact.indenter.file = {indenter.file!r}: pyvista cannot read it as a surface ({error})"
-        ) from error
-    if surface.n_cells == 0:
-        raise InputError(
-            f"contact.indenter.file = {indenter.file!r}: cannot be read as a surface; the file is damaged or empty"
-        )
-    if surface.n_open_edges > 0:
-        raise InputError(
-            f"contact.indenter.file = {indenter.file!r}: the surface must be closed; "
-            f"it has {surface.n_cells} triangles and {surface.n_open_edges} open edges"
-        )
-    surface.points = np.asarray(surface.points, dtype=np.float64) * indenter.scale
-    surface.points -= (surface.points.min(axis=0) + surface.points.max(axis=0)) / 2
-    # The sign of the distance follows the triangles' orientation, which files get wrong.
-    surface = surface.compute_normals(auto_orient_normals=True, consistent_normals=True, split_vertices=False)
-    vertices = np.asarray(surface.points, dtype=np.float64)
-    pad = 4 * indenter.cell_mm
-    corner = vertices.min(axis=0) - pad
-    counts = np.ceil((vertices.max(axis=0) + pad - corner) / indenter.cell_mm).astype(int) + 1
+    surface = object_triangles(indenter, folder)
+    turned = Triangles(surface.points @ turned_by(indenter.rotation_deg).T, surface.faces, surface.closed)
+    radius = max(indenter.fillet_mm or 0.0, resolution_mm)
+    lowest = turned.points.max(axis=0)[2]
+    low, high = turned.points.min(axis=0), turned.points.max(axis=0)
+    low = np.maximum(low, [-touchable.radius_mm, -touchable.radius_mm, lowest - touchable.height_mm])
+    high = np.minimum(high, [touchable.radius_mm, touchable.radius_mm, np.inf])
+    spacing = indenter.cell_mm or _spacing(radius, high - low)
+    margin = radius + 4 * spacing
+    counts = np.ceil((high - low + 2 * margin) / spacing).astype(int) + 1
     if counts.prod() > LARGEST_GRID:
         raise InputError(
-            f"contact.indenter.cell_mm = {indenter.cell_mm}: a {vertices.max(axis=0) - vertices.min(axis=0)} mm mesh "
-            f"needs {counts.prod()} grid points, more than {LARGEST_GRID}; use a larger cell_mm or cut away what never "
-            "touches"
+            f"contact.indenter.cell_mm = {spacing:g}: {indenter.file} needs {counts.prod()} grid points, more than "
+            f"{LARGEST_GRID}; use a larger cell_mm"
         )
-    grid = pv.ImageData(dimensions=counts, spacing=(indenter.cell_mm,) * 3, origin=corner)
-    distance = grid.compute_implicit_distance(surface)["implicit_distance"]
-    values = np.asarray(distance, dtype=np.float64).reshape(tuple(counts), order="F")
-    return corner, vertices, np.asarray(spline_filter(values, order=3, mode="mirror"), dtype=np.float64)
+    solid = Grid(low - margin, spacing, np.zeros(counts))
+    solid = solid.holding(solid.distance(turned, signed=True))
+    if radius > 0:
+        solid = rounded(solid, radius)
+    surface_left = solid.contour(0.0).points
+    if len(surface_left) == 0:
+        raise InputError(
+            f"contact.indenter.file = {indenter.file!r}: it encloses no volume that the grid's {spacing:.2g} mm resolve "
+            "(a single sheet?); give it a thickness"
+        )
+    shape = np.zeros(SHAPE_LENGTH)
+    shape[:8] = [0.0, *solid.corner, spacing, *counts]
+    coefficients = np.asarray(spline_filter(solid.values, order=3, mode="mirror"), dtype=np.float64)
+    reach = float(surface_left[:, 2].max())
+    return RigidBody(KINDS["mesh"], shape, np.eye(3), reach, coefficients, max(radius, spacing))
+
+
+def _spacing(radius_mm: float, extent_mm: FloatArray) -> float:
+    """Spacing of a grid over an extent (3,): a share of the radius, coarser where that were too many points."""
+    wanted = radius_mm * CELLS_PER_RADIUS**-1 if radius_mm > 0 else float(extent_mm.max()) / 80
+    affordable = float((np.prod(extent_mm + 2 * radius_mm + 8 * wanted) / USUAL_GRID) ** (1 / 3))
+    return max(wanted, affordable)
+
+
+def turned_by(rotation_deg: Vector3) -> FloatArray:
+    """(3, 3) rotation by angles about x, then y, then z."""
+    turns = [rotation_about(axis, np.radians(angle)) for axis, angle in enumerate(rotation_deg)]
+    return turns[2] @ turns[1] @ turns[0]

@@ -11,18 +11,21 @@ does.
 
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path as FilePath
 
 import numpy as np
 
 from synth.arrays import FloatArray
 from synth.mesh.pad import face_height
-from synth.scene import Motion
+from synth.scene import Motion, Scene
 from synth.simulate.distance import KINDS
-from synth.simulate.indenter import RigidBody, rotation_about
+from synth.simulate.indenter import RigidBody, Touchable, rigid_body, rotation_about
 from synth.simulate.measure import Distance
 
 TWIST_ARM_MM = 3.0
 """Lever that turns a twist angle into a path length: about a contact's radius."""
+BULGE, SLACK_MM = 1.5, 1.0
+"""Gel beside a contact rises toward the body: no higher than this share of the depth, and so much."""
 TOUCH_MM = 1e-6
 """The path starts so far off the gel, at most."""
 
@@ -152,3 +155,22 @@ class Path:
     def turns_between(self, before: float, now: float) -> bool:
         """Whether the way turns after `before` and not after `now`, so that extrapolation across is meaningless."""
         return bool(np.any((self.ends > before) & (self.ends <= now)))
+
+
+def path_of(scene: Scene, folder: FilePath | None = None, resolution_mm: float = 0.0) -> Path:
+    """The way of a scene's indenter.
+
+    Args:
+        scene: fully drawn.
+        folder: what a mesh indenter's file name is relative to.
+        resolution_mm: smallest radius that the gel's mesh resolves, see `rigid_body`.
+
+    Raises:
+        InputError: the indenter cannot be built.
+    """
+    motion, gel = scene.motion, scene.sensor.gel
+    poses = [motion, *motion.then]
+    aside = max(float(np.hypot(*np.add(motion.position_mm, pose.shear_mm))) for pose in poses)
+    deepest = max(pose.depth_mm for pose in poses) + gel.face_mm(*motion.position_mm)
+    touchable = Touchable(float(np.hypot(*gel.size_mm[:2])) / 2 + aside, BULGE * max(deepest, 0.0) + SLACK_MM)
+    return Path(motion, rigid_body(scene.contact.indenter, folder, resolution_mm, touchable), gel.dome_radius_mm)

@@ -21,8 +21,7 @@ from synth.optics import Optics
 from synth.scene import Gel, Scene
 from synth.simulate.error_model import face_error
 from synth.simulate.footprint import footprint
-from synth.simulate.indenter import rigid_body
-from synth.simulate.path import Path
+from synth.simulate.path import path_of
 
 LADDER = (4, 6, 8, 10, 12, 14, 16)
 """Elements across the contact to choose from."""
@@ -215,8 +214,7 @@ def resolve(scene: Scene, folder: FilePath | None = None, mesh_folders: Sequence
     if numerics.edge_length_mm is not None:
         mesh = pad_mesh(gel, numerics, mesh_folders)
         return Resolution(mesh, 0, 0, numerics.edge_length_mm, float("nan"))
-    path = Path(scene.motion, rigid_body(scene.contact.indenter, folder), gel.dome_radius_mm)
-    focus = footprint(path, gel.size_mm, MARGIN)
+    focus = footprint(path_of(scene, folder), gel.size_mm, MARGIN)
     target = numerics.target_error_px or DEFAULT_TARGET_PX
     for fineness in ladder(gel, focus):
         mesh, fine = graded_mesh(gel, focus, *fineness)

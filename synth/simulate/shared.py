@@ -16,8 +16,7 @@ import numpy as np
 from synth.mesh import Counts, Focus, PadMesh, domed, graded_box, pad_mesh
 from synth.scene import Gel, Numerics, Scene
 from synth.simulate.footprint import footprint
-from synth.simulate.indenter import rigid_body
-from synth.simulate.path import Path
+from synth.simulate.path import path_of
 from synth.simulate.resolution import (
     MARGIN,
     Resolution,
@@ -106,8 +105,7 @@ def accuracy(scene: Scene, folder: FilePath | None = None) -> Accuracy:
     gel, numerics = scene.sensor.gel, scene.numerics
     if numerics.edge_length_mm is not None:
         return Accuracy(0, float("nan"))
-    path = Path(scene.motion, rigid_body(scene.contact.indenter, folder), gel.dome_radius_mm)
-    focus = footprint(path, gel.size_mm, MARGIN)
+    focus = footprint(path_of(scene, folder), gel.size_mm, MARGIN)
     error = predicted_error_px(scene, focus, spacing_mm(gel, numerics))
     return Accuracy(int(2 * min(focus.half_mm) / _width(gel.size_mm, numerics.cells)), error)
 

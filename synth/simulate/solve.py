@@ -8,9 +8,8 @@ from synth.mesh import PadMesh, check_mesh
 from synth.scene import Gel, Scene
 from synth.simulate.driver import STANDARD, Driver
 from synth.simulate.element import Element, p1p1, p2p1
-from synth.simulate.indenter import rigid_body
 from synth.simulate.material import pad_material
-from synth.simulate.path import Path
+from synth.simulate.path import path_of
 from synth.simulate.space import function_space
 from synth.simulate.stepping import Stepper
 from synth.simulate.system import System
@@ -83,8 +82,7 @@ def stepper_of(
         keep=driver.keep_factors,
     )
     resolved = mesh.spacing_mm / (2 * space.element.order)
-    bodies = [rigid_body(scene.contact.indenter, folder, resolved) for scene in scenes]
-    paths = [Path(scene.motion, body, mesh.dome_radius_mm) for scene, body in zip(scenes, bodies, strict=True)]
+    paths = [path_of(scene, folder, resolved) for scene in scenes]
     moduli = [scene.sensor.gel.youngs_modulus_kpa / 1000 for scene in scenes]
     friction = [scene.contact.friction for scene in scenes]
     return Stepper(system, paths, friction, first.numerics, moduli, driver, frames)

@@ -20,6 +20,7 @@ from synth.simulate.driver import STANDARD, Driver
 from synth.simulate.memory import kept_contact, restore_contact
 from synth.simulate.newton import MAX_ITERATIONS, NOTHING, Solution, relative_residual, solve
 from synth.simulate.path import Path, Pose
+from synth.simulate.relaxation import relax
 from synth.simulate.system import System
 from synth.simulate.tables import pack_indenters
 from synth.simulate.trajectory import State, Trajectory, no_balance, no_contact, trajectory_of
@@ -30,6 +31,8 @@ SHORTEST_STEP = 1 / 128
 EASY = 7
 """A step that took at most so many iterations is followed by a longer one."""
 GROWTH = 1.5
+RELAXED = 1 / 4
+"""A step that fails is relaxed (`synth.simulate.relaxation`) when it is at most this share of max_step_mm."""
 STUCK = 1e6
 """Coefficient of friction at which nothing slides."""
 NUDGE = 1e-3
@@ -161,8 +164,12 @@ class Stepper:
         tight = np.array([t in s.waypoints and t not in s.recorded for s, t in zip(self.samples, targets, strict=True)])
         tolerance = np.where(tight, self.numerics.tolerance, self._loose())
         solution = solve(self.system, self._predicted(targets, active), self.indenters, active, tolerance)
-        for s in map(int, np.flatnonzero(active)):
-            self.samples[s].iterations += int(solution.iterations[s])
+        self._count(solution, active)
+        short = np.array(targets) - [sample.at for sample in self.samples] <= RELAXED * self.numerics.max_step_mm
+        relaxed = active & ~solution.converged & short
+        if relaxed.any():
+            solution = relax(self.system, self.state, self.indenters, relaxed, tolerance).where(relaxed, solution)
+            self._count(solution, relaxed)
         good = solution.converged & active
         recording = good & np.array([t in sample.recorded for sample, t in zip(self.samples, targets, strict=True)])
         recording &= ~self._slipped_through(recording, targets, solution.state)
@@ -173,7 +180,12 @@ class Stepper:
         # After the record, whose passes must still see how far points slipped in this step.
         self.system.settle(self.state, self.indenters, good)
         for s in map(int, np.flatnonzero(active)):
-            self._control(self.samples[s], targets[s], bool(good[s]), int(solution.iterations[s]))
+            self._control(self.samples[s], targets[s], bool(good[s]), int(solution.iterations[s]), bool(relaxed[s]))
+
+    def _count(self, solution: Solution, active: BoolArray) -> None:
+        """Add the iterations of a solve to the active samples'."""
+        for s in map(int, np.flatnonzero(active)):
+            self.samples[s].iterations += int(solution.iterations[s])
 
     def _loose(self) -> float:
         """Tolerance on the way."""
@@ -279,8 +291,7 @@ class Stepper:
     ) -> Solution:
         """From a solution on, its iterations counted."""
         better = solve(self.system, solution.state, self.indenters, active, tolerance, limit, reach_mm)
-        for s in map(int, np.flatnonzero(active)):
-            self.samples[s].iterations += int(better.iterations[s])
+        self._count(better, active)
         return better
 
     def _record(self, step: Solution, recording: BoolArray, targets: Sequence[float]) -> BoolArray:
@@ -321,12 +332,12 @@ class Stepper:
         self.system.balance(step.state, self.indenters, recording)
         return ~lost
 
-    def _control(self, sample: _Sample, target: float, good: bool, iterations: int) -> None:
-        """Longer steps after easy ones; half the step after a failure, and the end below the shortest."""
+    def _control(self, sample: _Sample, target: float, good: bool, iterations: int, relaxed: bool) -> None:
+        """No extrapolation across a relaxed step, which may have jumped. Longer steps after easy ones; half the step after a failure, and the end below the shortest."""
         longest = self.numerics.max_step_mm
         if good:
             taken = target - sample.at
-            sample.previous, sample.at = sample.at if self.driver.extrapolate else None, target
+            sample.previous, sample.at = sample.at if self.driver.extrapolate and not relaxed else None, target
             if target == sample.waypoints[sample.next]:
                 sample.next += 1
             if iterations <= EASY:

@@ -56,6 +56,7 @@ def bulk_tangent(
     active: wp.array(dtype=wp.int32),
     bulk: Bulk,
     laplace: wp.array2d(dtype=wp.float64),
+    viscosity: wp.array(dtype=wp.float64),
     factor: wp.array3d(dtype=wp.vec4d),
     pushed: wp.array4d(dtype=wp.vec3d),
     drift: wp.array4d(dtype=wp.vec3d),
@@ -65,7 +66,8 @@ def bulk_tangent(
     """One thread per (sample, element): the blocks K_ab of pairs a <= b of displacement nodes.
 
     Adds them to the entries slot[e, pair, 3 i + j] of the sparse values; entries of held unknowns and below the
-    diagonal share one slot past the end. laplace: (m, pairs) of `synth.simulate.tables.laplace_table`.
+    diagonal share one slot past the end. laplace: (m, pairs) of `synth.simulate.tables.laplace_table`; so many times
+    it is added again as the sample's viscosity (B,) says, see `synth.simulate.relaxation`.
     """
     s, e = wp.tid()
     if active[s] == 0:
@@ -95,7 +97,7 @@ def bulk_tangent(
                 for j in range(3):
                     entry = block[i, j]
                     if i == j:
-                        entry += isotropic
+                        entry += isotropic + viscosity[s] * laplace[e, k]
                     wp.atomic_add(values, s, slot[e, k, 3 * i + j], entry)
             k += 1
 
@@ -141,3 +143,23 @@ def pressure_tangent(
             wp.atomic_add(values, s, pressure_slot[e, c, d], entry)
             if c != d:
                 wp.atomic_add(values, s, pressure_slot[e, d, c], entry)
+
+
+@wp.kernel
+def viscous_force(
+    step: wp.array2d(dtype=wp.vec3d),
+    viscosity: wp.array(dtype=wp.float64),
+    bulk: Bulk,
+    force: wp.array2d(dtype=wp.vec3d),
+):
+    """One thread per (sample, element): adds θ L δ for displacements δ (B, n)."""
+    s, e = wp.tid()
+    if viscosity[s] == wp.float64(0.0):
+        return
+    for q in range(bulk.weight.shape[1]):
+        slope = wp.mat33d()
+        for a in range(bulk.nodes.shape[1]):
+            slope += wp.outer(step[s, bulk.nodes[e, a]], bulk.gradient[e, q, a])
+        stress = (viscosity[s] * bulk.shear[e] * bulk.weight[e, q]) * slope
+        for a in range(bulk.nodes.shape[1]):
+            wp.atomic_add(force, s, bulk.nodes[e, a], stress * bulk.gradient[e, q, a])

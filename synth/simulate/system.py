@@ -19,7 +19,7 @@ from synth.simulate.material import Material
 from synth.simulate.multipliers import augment, settle
 from synth.simulate.pattern import pattern_of
 from synth.simulate.space import Space
-from synth.simulate.stiffness import bulk_tangent, linearise, pressure_tangent
+from synth.simulate.stiffness import bulk_tangent, linearise, pressure_tangent, viscous_force
 from synth.simulate.tables import bulk_tables, face_tables, fold_tables, laplace_table, warp_array
 from synth.simulate.unknowns import Balance, Tangent, Unknowns
 from synth.surface import broken_linear_face
@@ -144,8 +144,11 @@ class System:
         # Indexing columns leaves them strided, and sums over a row would then depend on the size of the batch.
         return Balance(np.ascontiguousarray(full[:, self.free]), reaction, jacobian.numpy().min(axis=1))
 
-    def tangent(self, state: Unknowns, indenters: Indenters, active: np.ndarray) -> Tangent:
-        """Derivative of the free residual of the active samples."""
+    def tangent(
+        self, state: Unknowns, indenters: Indenters, active: np.ndarray, viscosity: FloatArray | None = None
+    ) -> Tangent:
+        """Derivative of the free residual of the active samples, plus viscosity (B,) times `viscous_force`'s."""
+        thick = np.zeros(self.batch) if viscosity is None else viscosity
         u, p, mask = self._device_state(state, active)
         elements, d = (self.batch, len(self.space.nodes)), self.device
         linearised = [self._factor, self._held, self._pushed, self._drift]
@@ -154,7 +157,16 @@ class System:
         wp.launch(
             bulk_tangent,
             elements,
-            inputs=[mask, self._bulk, self._laplace, self._factor, self._pushed, self._drift, self._block_slot],
+            inputs=[
+                mask,
+                self._bulk,
+                self._laplace,
+                warp_array(thick, wp.float64, d),
+                self._factor,
+                self._pushed,
+                self._drift,
+                self._block_slot,
+            ],
             outputs=[self._values],
             device=d,
         )
@@ -185,6 +197,15 @@ class System:
         )
         values = self._values.numpy()[:, :-1]
         return Tangent(values, tuple(self._unsymmetric(s) for s in range(self.batch)))
+
+    def viscous_force(self, step: Unknowns, viscosity: FloatArray) -> FloatArray:
+        """(B, k) force on the free unknowns of a step against viscosities (B,), see `synth.simulate.relaxation`."""
+        force = wp.zeros((self.batch, len(self.space.points)), dtype=wp.vec3d, device=self.device)
+        moved, thick = warp_array(step.u, wp.vec3d, self.device), warp_array(viscosity, wp.float64, self.device)
+        elements = (self.batch, len(self.space.nodes))
+        wp.launch(viscous_force, elements, inputs=[moved, thick, self._bulk], outputs=[force], device=self.device)
+        full = np.concatenate([force.numpy().reshape(self.batch, -1), np.zeros_like(step.p)], axis=1)
+        return np.ascontiguousarray(full[:, self.free])
 
     def _unsymmetric(self, sample: int) -> Any:
         """The remainder of one sample's friction as a sparse matrix, or None where there is none."""

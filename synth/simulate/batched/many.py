@@ -10,8 +10,7 @@ from synth.simulate.batched.jobs import Job, untouched
 from synth.simulate.batched.pad import Pad, prepare
 from synth.simulate.batched.run import Run
 from synth.simulate.driver import STANDARD, Driver
-from synth.simulate.indenter import rigid_body
-from synth.simulate.path import Path
+from synth.simulate.path import path_of
 from synth.simulate.solve import check_shared
 from synth.simulate.trajectory import Trajectory
 
@@ -103,6 +102,5 @@ def job_of(scene: Scene, pad: Pad, folder: FilePath | None = None) -> Job:
     Raises:
         InputError: the indenter cannot be built.
     """
-    gel = scene.sensor.gel
-    body = rigid_body(scene.contact.indenter, folder, pad.mesh.spacing_mm / (2 * pad.space.element.order))
-    return Job(Path(scene.motion, body, gel.dome_radius_mm), scene.contact.friction, gel.youngs_modulus_kpa / 1000)
+    path = path_of(scene, folder, pad.mesh.spacing_mm / (2 * pad.space.element.order))
+    return Job(path, scene.contact.friction, scene.sensor.gel.youngs_modulus_kpa / 1000)

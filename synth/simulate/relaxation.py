@@ -1,0 +1,74 @@
+r"""Equilibrium by relaxation, where Newton's method does not find it: pseudo-transient continuation.
+
+Past a limit point (a corner that slips from one place of the gel to the next) the nearest equilibrium is not where
+Newton's method looks, and the residual rises on the way to it. A gel with a viscosity of its own moves there by itself:
+
+.. math::  θ L \dot u + r(u) = 0, \qquad L_{ab} = \int μ \, g_a \cdot g_b \, I
+
+is followed by implicit steps of one linearisation each, (K + θ L) δ = -r, with θ (one over the step in time) chosen so
+that the residual with the viscous force, r(u + δ) + θ L δ, which is zero for a linear r, is at most MAX_ERROR of r(u).
+As the gel comes to rest θ falls to zero and the steps become Newton's (Kelley & Keyes, SIAM J. Numer. Anal. 35, 1998).
+The pressure has no viscosity, so that the volume is kept throughout. Nothing here asks the residual to fall.
+"""
+
+import numpy as np
+
+from synth.arrays import BoolArray, FloatArray
+from synth.simulate.contact import Indenters
+from synth.simulate.newton import Solution, relative_residual
+from synth.simulate.system import System
+from synth.simulate.unknowns import Unknowns
+
+MAX_STEPS = 300
+FIRST_VISCOSITY = 1.0
+"""θ of the first step: the viscous stress of a step is then the elastic one of its strain."""
+LEAST_VISCOSITY = 1e-3
+"""A smaller θ is none."""
+MOST_VISCOSITY = 1e3
+"""At this θ a step that errs too much is halved instead."""
+MAX_ERROR, AIM = 0.5, 0.2
+"""Largest error of a step that is taken, and what the next θ aims at."""
+FALL, RISE = 0.1, 6.0
+"""Largest change of θ from one step to the next, down and up."""
+
+
+def relax(
+    system: System,
+    start: Unknowns,
+    indenters: Indenters,
+    active: BoolArray,
+    tolerance: FloatArray,
+) -> Solution:
+    """Let the active samples come to rest; arguments and result as of `synth.simulate.newton.solve`."""
+    state, balance = start, system.balance(start, indenters, active)
+    running = active & (balance.smallest_jacobian > 0)
+    converged = np.zeros_like(active)
+    iterations = np.zeros(len(active), dtype=int)
+    viscosity, share = np.full(len(active), FIRST_VISCOSITY), np.ones(len(active))
+    for _ in range(MAX_STEPS):
+        if not running.any():
+            break
+        tangent = system.tangent(state, indenters, running, viscosity)
+        step = system.newton_step(tangent, balance.free, running)
+        trial = state.plus(step, np.where(running, share, 0.0))
+        after = system.balance(trial, indenters, running)
+        iterations[running] += 1
+        expected = (1 - share)[:, None] * balance.free - system.viscous_force(step, share * viscosity)
+        error = np.linalg.norm(after.free - expected, axis=1)
+        error /= np.maximum(np.linalg.norm(balance.free, axis=1), np.finfo(float).tiny)
+        error[~(after.smallest_jacobian > 0) | ~np.isfinite(error)] = np.inf
+        good = running & (error <= MAX_ERROR)
+        state, balance = trial.where(good, state), after.where(good, balance)
+        share = np.where(good, 1.0, np.where(viscosity < MOST_VISCOSITY, share, share / 2))
+        viscosity = next_viscosity(viscosity, error)
+        converged |= good & (relative_residual(balance) <= tolerance)
+        running &= ~converged
+    return Solution(state, balance, converged, iterations, relative_residual(balance))
+
+
+def next_viscosity(viscosity: FloatArray, error: FloatArray) -> FloatArray:
+    """θ (B,) after steps of these errors (B,)."""
+    taken = viscosity * np.clip(error / AIM, FALL, RISE)
+    taken[taken < LEAST_VISCOSITY] = 0.0
+    refused = np.maximum(viscosity * np.clip(error / AIM, 2.0, RISE), LEAST_VISCOSITY)
+    return np.asarray(np.where(error <= MAX_ERROR, taken, np.minimum(refused, MOST_VISCOSITY)))
