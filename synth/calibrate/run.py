@@ -60,7 +60,7 @@ def run_calibrate(
     started = time.perf_counter()
     template = load_scene(scene, assignments)
     if template.corners[0].sensor.gel.shape == "dome":
-        raise InputError(f"{template.source}: sensor.gel.shape: calibrate fits flat gels only, this one is a dome")
+        raise InputError(f"{template.label}: sensor.gel.shape: calibrate fits flat gels only, this one is a dome")
     variant = choose_variant("auto")
     if not variant.is_vectorised:
         raise InputError(f"calibration differentiates the rendering, which needs LLVM or an NVIDIA GPU: {LLVM_HINT}")

@@ -67,6 +67,7 @@ def test_module_runs_and_passes_the_status_on() -> None:
         (["train", ".", "--out", "o", "--set", "seed=99999999999999999999999"], "seed: "),
         (["train", ".", "--out", "o", "--set", "loss"], "KEY=VALUE"),
         (["train", ".", "--out", "o", "--set", "loss.wings=2"], "loss.wings"),
+        (["train", ".", "--out", "o", "--set", "steps=2", "--set", "steps=3"], "steps undoes the earlier steps"),
         (["train", ".", "--out", "o", "--steps", "0"], "steps"),
         (["train", ".", "--out", "o", "--config", "none.toml"], "none.toml"),
         (["train", ".", "--out", "o"], "no image pairs"),
