@@ -20,7 +20,7 @@ from synth.generate import generate as generate_samples
 from synth.plan import Plan, check_buildable, plan
 from synth.progress import duration, progress
 from synth.render.variant import Device, Variant
-from synth.template import load_scene
+from synth.template import Template, load_scene
 
 _NO_LIMIT = 10_000
 """Characters: wider than any table."""
@@ -41,7 +41,7 @@ def run_generate(
 ) -> int:
     """See `synth.cli.generate`."""
     scheduling = Scheduling(workers, ray, Shard.parse(shard) if shard else None)
-    template = load_scene(scene, assignments)
+    template = _loaded(scene, assignments)
     variant = job_variant(template, device)
     check_buildable(template, variant)
     if dry_run:
@@ -58,7 +58,7 @@ def run_generate(
 
 def run_plan(scene: str, n: int, assignments: Sequence[str], device: Device, as_json: bool) -> int:
     """See `synth.cli.plan`."""
-    template = load_scene(scene, assignments)
+    template = _loaded(scene, assignments)
     variant = job_variant(template, device)
     check_buildable(template, variant)
     if not as_json:
@@ -74,7 +74,7 @@ def run_simulate(scene: str, out: Path, seed: int, index: int, assignments: Sequ
     from synth.simulate.files import write_trajectory
     from synth.simulate.shared import resolution_of
 
-    template = load_scene(scene, assignments)
+    template = _loaded(scene, assignments)
     drawn = draw(template, seed, index)
     with storage_errors(out):
         out.mkdir(parents=True, exist_ok=True)  # before minutes of work, not after
@@ -84,7 +84,7 @@ def run_simulate(scene: str, out: Path, seed: int, index: int, assignments: Sequ
             mesh = resolution_of(drawn, folder).mesh
             trajectory = simulate(drawn, mesh, folder, on_way=lambda share: advance(int(100 * share), 100))
     except InputError as error:
-        raise InputError(f"{template.source}: {error}") from error
+        raise InputError(f"{template.label}: {error}") from error
     record = write_trajectory(out, drawn, trajectory)
     if as_json:
         print(json.dumps(record))
@@ -149,6 +149,14 @@ def run_export(path: Path, format: ExportFormat, out: Path, camera: str) -> int:
         count = export(path, format, out, advance, camera)
     _say(Console(), f"{count} samples written to {out}")
     return 0
+
+
+def _loaded(scene: str, assignments: Sequence[str]) -> Template:
+    """The scene; what is unusual in it is told on stderr."""
+    template = load_scene(scene, assignments)
+    for warning in dict.fromkeys(line for corner in template.corners for line in corner.warnings):
+        print(f"synth: warning: {template.label}: {warning}", file=sys.stderr)
+    return template
 
 
 def _say_hint(variant: Variant) -> None:
