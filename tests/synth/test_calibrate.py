@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import ExifTags, Image
 from render_scenes import small_sensor
 
 from synth.arrays import FloatArray
@@ -248,6 +249,14 @@ def test_frames_that_do_not_belong_together_are_refused(tmp_path: Path) -> None:
     ]:
         with pytest.raises(InputError, match=message):
             read_frames([tmp_path / f"{name}.png" for name in names])
+
+
+def test_a_photograph_is_turned_as_its_exif_says(tmp_path: Path) -> None:
+    stored = np.random.default_rng(0).integers(0, 256, (6, 8, 3), np.uint8)
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6  # to be turned by a quarter, clockwise
+    Image.fromarray(stored).save(tmp_path / "a.png", exif=exif)
+    np.testing.assert_allclose(255 * read_frames([tmp_path / "a.png"]).single, np.rot90(stored, -1), atol=1e-9)
 
 
 def test_a_frame_without_dots_and_dots_without_a_grid_are_refused() -> None:
