@@ -61,6 +61,7 @@ def test_module_runs_and_passes_the_status_on() -> None:
         (["evaluate", ".", "--weights", "none.safetensors"], "none.safetensors"),
         (["compare", ".", "--weights", "best=none.safetensors"], "none.safetensors"),
         (["compare", ".", "--weights", "x", "--size", "big"], "--size big"),
+        (["predict", ".", "--out", "o", "--size", "100000x100000"], "at most 16777216 px are allowed"),
         (["compare", ".", "--methods", "none,none"], "twice"),
         (["compare", ".", "--batch", "-1"], "--batch -1: a number from 0"),
         (["compare", ".", "--ft", "-3"], "--ft -3: a number from 0"),
