@@ -68,12 +68,15 @@ def run_plan(scene: str, n: int, assignments: Sequence[str], device: Device, as_
 
 def run_simulate(scene: str, out: Path, seed: int, index: int, assignments: Sequence[str], as_json: bool) -> int:
     """See `synth.cli.simulate`."""
-    from synth.dataset.storage import storage_errors
+    from synth.dataset.storage import refuse_foreign, storage_errors
     from synth.sampling import draw
     from synth.simulate import simulate
     from synth.simulate.files import write_trajectory
     from synth.simulate.shared import resolution_of
 
+    refuse_foreign(out / "trajectory.json", b'"scene": {')
+    for surface in out.glob("state_*.vtu"):
+        refuse_foreign(surface, b'Name="mesh"')
     template = _loaded(scene, assignments)
     drawn = draw(template, seed, index)
     with storage_errors(out):
@@ -111,8 +114,12 @@ def run_simulate(scene: str, out: Path, seed: int, index: int, assignments: Sequ
 
 def run_inspect(path: Path, png: Path | None, html: Path | None, limit: int, as_json: bool) -> int:
     """See `synth.cli.inspect`."""
-    from synth.inspection import inspect, tables, write_html, write_sheet
+    from synth.dataset.storage import refuse_foreign
+    from synth.inspection import PAGE_MARK, SHEET_MARK, inspect, tables, write_html, write_sheet
 
+    for file, mark in ((png, SHEET_MARK), (html, PAGE_MARK)):
+        if file is not None:
+            refuse_foreign(file, mark.encode())
     inspection = inspect(path, limit)
     if as_json:
         print(json.dumps(inspection.as_dict()))

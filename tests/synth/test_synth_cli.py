@@ -249,7 +249,7 @@ def test_simulate_writes_the_trajectory_of_the_contract(capsys, tiny: Path, tmp_
 
     out = tmp_path / "s"
     out.mkdir()
-    (out / "state_009.vtu").write_text("of an earlier run")
+    (out / "state_009.vtu").write_text('Name="mesh"')  # of an earlier run
     assert main(["simulate", "--scene", str(tiny), "--out", str(out), "--index", "1", "--json"]) == 0
     record = json.loads((out / "trajectory.json").read_text())
     assert record == json.loads(capsys.readouterr().out)
@@ -321,6 +321,50 @@ def test_a_simulation_that_ends_early_is_written_and_has_status_1(capsys, tiny: 
     assert record["status"] == "partial"
     assert "Newton" in record["reason"]
     assert len(record["steps"]) == len(list((tmp_path / "s").glob("*.vtu"))) < 3
+
+
+@pytest.mark.parametrize("name", ["dataset.json", "samples/000000/image1.png", "mine.html"])
+@pytest.mark.parametrize("option", ["--png", "--html"])
+def test_inspect_replaces_its_own_files_and_no_other(capsys, tmp_path: Path, name: str, option: str) -> None:
+    data = tmp_path / "d"
+    shutil.copytree(reference(), data)
+    (data / "mine.html").write_text("<!DOCTYPE html><title>mine</title>")
+    before = fingerprint(data)
+    said = _complaint(capsys, main(["inspect", str(data), option, str(data / name)]))
+    assert said.startswith(f"{data / name}: exists and does not come from this command")
+    assert fingerprint(data) == before
+    for _ in range(2):
+        assert main(["inspect", str(data / "samples" / "000000"), option, str(tmp_path / "own")]) == 0
+
+
+@pytest.mark.parametrize("name", ["trajectory.json", "state_000.vtu"])
+def test_simulate_replaces_its_own_files_and_no_other(capsys, tiny: Path, tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("another's")
+    said = _complaint(capsys, main(["simulate", "--scene", str(tiny), "--out", str(tmp_path)]))
+    assert said.startswith(f"{tmp_path / name}: exists and does not come from this command")
+    assert (tmp_path / name).read_text() == "another's"
+    for _ in range(2):
+        assert main(["simulate", "--scene", str(tiny), "--out", str(tmp_path / "own")]) == 0
+
+
+@pytest.mark.parametrize(
+    ("command", "name"),
+    [
+        (["bench", "fem", "--quick"], "fem.md"),
+        (["bench", "flow"], "flow.png"),
+        (["bench", "light"], "light.md"),
+        (["bench", "scale"], "scale.csv"),
+        (["bench", "budget"], "budget.png"),
+        (["bench", "render"], "render.csv"),
+        (["stress"], "stress.json"),
+    ],
+)
+def test_reports_do_not_replace_anothers_files(capsys, tmp_path: Path, command: list[str], name: str) -> None:
+    (tmp_path / name).write_text("another's")
+    said = _complaint(capsys, main([*command, "--out", str(tmp_path)]))
+    assert said.startswith(f"{tmp_path / name}: exists and does not come from this command")
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_text() == "another's"
 
 
 def test_inspect_verify_and_export_take_a_dataset(capsys, tmp_path: Path) -> None:
