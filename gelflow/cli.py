@@ -224,7 +224,7 @@ def predict(
     device: OnDevice = "auto",
     as_json: AsJson = False,
 ) -> int:
-    """Flow of a pair of images or of a video, to EXR, .flo and pictures."""
+    """Flow of a pair of images, to EXR, .flo and a picture, or of a video, to EXR, motion.csv and a video."""
     from gelflow.commands import run_predict
 
     return run_predict(inputs, out, weights, method, registration, reference, every, size, device, as_json)
