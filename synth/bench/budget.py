@@ -66,8 +66,8 @@ def run_budget(
     templates = tuple(load_scene(scene) for scene in scenes or shipped_scenes())
     command = f"python -m synth bench budget --draws {draws} --seed {seed} --reference {reference}"
     command += "".join(f" --scene {shlex.quote(Path(scene).name)}" for scene in scenes)
-    report_folder(out, "budget")
     study = Study(templates, seed, draws, finer, Reference(reference))
+    report_folder(out, "budget")
     return study_budget(study, out, command, workers, deadline, as_json)
 
 
