@@ -7,7 +7,7 @@ import sys
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from cyclopts import App, CycloptsError, Parameter
 
@@ -22,13 +22,25 @@ app = App(
     suppress_keyboard_interrupt=False,
 )
 
+
+def kept(_: Any, given: Sequence[str] | None) -> None:
+    """Validator: no assignment is undone by a later one."""
+    keys = [text.partition("=")[0].strip() for text in given or ()]
+    for number, key in enumerate(keys):
+        for earlier in keys[:number]:
+            if earlier == key or earlier.startswith(f"{key}."):
+                raise ValueError(f"{key} undoes the earlier {earlier}; give each key once, a table before its fields")
+
+
 Device = Literal["auto", "cpu", "cuda"]
 Paths = Annotated[
     list[Path], Parameter(help="Folders of pairs: of synth or its *.tar shards, of `pairs`, or NAME_1.png, NAME_2.png.")
 ]
 AsJson = Annotated[bool, Parameter("--json", negative=(), help="Print the answer as JSON on stdout.")]
 Size = Annotated[str | None, Parameter(help="ROWSxCOLUMNS at which the network works; default: as in training.")]
-Assignments = Annotated[list[str] | None, Parameter("--set", help="KEY=VALUE, such as loss.lambda_dc=10; repeatable.")]
+Assignments = Annotated[
+    list[str] | None, Parameter("--set", validator=kept, help="KEY=VALUE, such as loss.lambda_dc=10; repeatable.")
+]
 Out = Annotated[Path, Parameter(help="Folder for the results.")]
 Validation = Annotated[list[Path] | None, Parameter(help="Folders of pairs to validate on.")]
 Config = Annotated[
@@ -212,7 +224,7 @@ def predict(
     device: OnDevice = "auto",
     as_json: AsJson = False,
 ) -> int:
-    """Flow of a pair of images or of a video, to EXR, .flo and pictures."""
+    """Flow of a pair of images, to EXR, .flo and a picture, or of a video, to EXR, motion.csv and a video."""
     from gelflow.commands import run_predict
 
     return run_predict(inputs, out, weights, method, registration, reference, every, size, device, as_json)

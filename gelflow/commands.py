@@ -31,6 +31,9 @@ from gelflow.report_tables import tables
 from gelflow.shipped import weights_file
 from gelflow.terminal import progress, show_table
 
+MAXIMUM_PIXELS = 4096 * 4096
+"""At which a network may be asked to work; it takes some 0.6 kB of memory for each."""
+
 
 def open_all(paths: Sequence[Path]) -> PairDataset:
     """Several folders of pairs as one data set.
@@ -45,13 +48,17 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
     """ROWSxCOLUMNS as numbers.
 
     Raises:
-        InputError: The text is something else.
+        InputError: The text is something else, or a size beyond `MAXIMUM_PIXELS`.
     """
     if text is None:
         return None
     rows, _, columns = text.lower().partition("x")
     if not (rows.isdigit() and columns.isdigit()):
         raise InputError(f"--size {text}: ROWSxCOLUMNS is needed, for instance --size 512x640")
+    if int(rows) * int(columns) > MAXIMUM_PIXELS:
+        raise InputError(
+            f"--size {text}: at most {MAXIMUM_PIXELS} px are allowed, such as 4096x4096, which takes 10 GB of memory"
+        )
     return int(rows), int(columns)
 
 

@@ -16,9 +16,10 @@ from typing import Any
 
 from gelflow.config import MINIMUM_SIDE
 from gelflow.errors import InputError
-from gelflow.files.atomic import replacing
+from gelflow.files.atomic import refuse_foreign, replacing
 
 OPSET = 18
+PRODUCER = "gelflow"
 NEEDED = ("onnx", "onnxscript")
 
 
@@ -34,7 +35,8 @@ def export_onnx(weights: Path, out: Path, size: tuple[int, int] | None = None) -
         The size that the file works at.
 
     Raises:
-        InputError: A package is missing, no size is known, a side is below 64 px, or the weights cannot be used.
+        InputError: A package is missing, no size is known, a side is below 64 px, the weights cannot be used, or `out`
+            is a file from elsewhere.
         OSError: The file cannot be written.
     """
     missing = [name for name in NEEDED if find_spec(name) is None]
@@ -42,6 +44,7 @@ def export_onnx(weights: Path, out: Path, size: tuple[int, int] | None = None) -
         raise InputError(f"export needs the package {' and '.join(missing)}; pip install {' '.join(NEEDED)}")
     if out.suffix != ".onnx":
         raise InputError(f"--out {out}: a file ending in .onnx is needed")
+    refuse_foreign(out, PRODUCER.encode())
     import torch
 
     from gelflow.train.checkpoint import load_weights
@@ -58,6 +61,7 @@ def export_onnx(weights: Path, out: Path, size: tuple[int, int] | None = None) -
             _finest(model), example, input_names=["image1", "image2"], output_names=["flow"],
             opset_version=OPSET, dynamo=True, verbose=False,
         )  # fmt: skip
+        program.model.producer_name = PRODUCER
         program.save(str(temporary), external_data=False)
     return chosen
 

@@ -5,7 +5,7 @@ import os
 import re
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, fields
 from itertools import chain
 from pathlib import Path
 from typing import Literal
@@ -14,12 +14,12 @@ import numpy as np
 
 from gelflow.baselines.method import Method
 from gelflow.errors import InputError
-from gelflow.files.atomic import replacing
-from gelflow.files.exr import read_flow, write_flow
+from gelflow.files.atomic import refuse_foreign, replacing
+from gelflow.files.exr import DIRECTIONS, read_flow, write_flow
 from gelflow.files.flo import write_flo
 from gelflow.files.image import read_pair, write_png
 from gelflow.files.quiet import quiet
-from gelflow.files.video import describe, frames
+from gelflow.files.video import describe, frame_file, frames, image_files
 from gelflow.raster import Bytes3, FlowArray, ImageArray
 from gelflow.viz import draw_overlay, round_up, write_flow_picture
 
@@ -32,11 +32,13 @@ class Motion:
 
     Attributes:
         frame: Index of the second image in its video; 1 for a pair.
+        file: Name of the second image, or of the video.
         mean_px, p95_px, p99_px: Mean and percentiles of the flow's length, px.
         seconds: Run time of the method.
     """
 
     frame: int
+    file: str
     mean_px: float
     p95_px: float
     p99_px: float
@@ -52,23 +54,24 @@ class Prediction:
 
 
 def predict_pair(method: Method, path1: Path, path2: Path, out: Path) -> Prediction:
-    """Writes NAME.exr, NAME.flo and NAME.png, the flow from the first image to the second; replaces older ones.
+    """Writes NAME.exr, NAME.flo and NAME.png, the flow from the first image to the second; replaces an earlier run's.
 
     NAME is what the two file names have in front of _1 and _2, else FIRST_to_SECOND.
 
     Raises:
-        InputError: An image cannot be read or the two do not fit.
+        InputError: An image cannot be read, the two do not fit, or files of these names are somebody else's.
         OSError: A file cannot be written.
     """
     image1, image2 = read_pair(path1, path2)
     stem1, stem2 = path1.stem, path2.stem
     common = stem1.removesuffix("_1")
     name = common if stem1 == f"{common}_1" and stem2 == f"{common}_2" else f"{stem1}_to_{stem2}"
+    files = [out / f"{name}{suffix}" for suffix in (".exr", ".flo", ".png")]
+    refuse_foreign(files[0], DIRECTIONS.encode(), *files[1:])
     try:
-        flow, motion = _estimate(method, image1, image2, 1)
+        flow, motion = _estimate(method, image1, image2, 1, path2.name)
     except InputError as error:
         raise InputError(f"{path1} and {path2}, {method.name}: {error}") from error
-    files = [out / f"{name}{suffix}" for suffix in (".exr", ".flo", ".png")]
     write_flow(files[0], flow)
     write_flo(files[1], flow)
     write_flow_picture(files[2], image1, image2, flow, f"{name} ({method.name})")
@@ -83,7 +86,7 @@ def predict_video(
     every: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> Prediction:
-    """Writes flow/000001.exr ... (numbered by frame), motion.csv and overlay.mp4 in place of all older ones.
+    """Writes flow/000001.exr ... (numbered by frame), motion.csv and overlay.mp4 in place of an earlier run's.
 
     Args:
         method: Estimates the flow.
@@ -94,19 +97,26 @@ def predict_video(
         progress: Called with the number of frames done and to be done; each frame counts twice, flow and overlay.
 
     Raises:
-        InputError: The video does not open, fewer than two frames decode, or a frame cannot be used.
+        InputError: The video does not open, fewer than two frames decode, a frame cannot be used, or files of these
+            names are somebody else's.
         OSError: A file cannot be written.
     """
     if every < 1:
         raise InputError(f"every = {every}: at least 1 is needed")
     total = 2 * max(0, -(-describe(path).frames // every) - 1)
+    table = out / "motion.csv"
+    refuse_foreign(table, b"mean_px,p95_px", out / "overlay.mp4", *_numbered(out / "overlay", ".png"))
+    for earlier in _numbered(out / "flow", ".exr"):
+        refuse_foreign(earlier, DIRECTIONS.encode())
+    sources = dict(enumerate(image_files(path))) if path.is_dir() else {}
     files: list[Path] = []
     motions: list[Motion] = []
     for index, image1, image2 in _frame_pairs(path, every, reference):
+        source = sources.get(index, path)
         try:
-            flow, motion = _estimate(method, _as_float(image1), _as_float(image2), index)
+            flow, motion = _estimate(method, _as_float(image1), _as_float(image2), index, source.name)
         except InputError as error:
-            raise InputError(f"{path}, frame {index}, {method.name}: {error}") from error
+            raise InputError(f"{source}, frame {index}, {method.name}: {error}") from error
         if not files:
             _remove_numbered(out / "flow", ".exr")
         files.append(out / "flow" / f"{index:06d}.exr")
@@ -116,24 +126,25 @@ def predict_video(
             progress(len(motions), total)
     if not motions:
         raise InputError(f"{path}: fewer than two frames decode; a flow needs two")
-    table = out / "motion.csv"
     with replacing(table) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(["frame", "mean_px", "p95_px", "p99_px", "seconds"])
-        writer.writerows([m.frame, m.mean_px, m.p95_px, m.p99_px, m.seconds] for m in motions)
+        writer.writerow([column.name for column in fields(Motion)])
+        writer.writerows(astuple(motion) for motion in motions)
     scale = round_up(max(motion.p99_px for motion in motions))
     pictures = _overlays(path, every, reference, out / "flow", scale, len(motions), total, progress)
     overlay = _write_overlay(pictures, out, describe(path).frames_per_second / every)
     return Prediction([*files, table, *overlay], motions)
 
 
-def _estimate(method: Method, image1: ImageArray, image2: ImageArray, frame: int) -> tuple[FlowArray, Motion]:
+def _estimate(
+    method: Method, image1: ImageArray, image2: ImageArray, frame: int, file: str
+) -> tuple[FlowArray, Motion]:
     started = time.perf_counter()
     flow = method.flow(image1, image2)
     seconds = time.perf_counter() - started
     length = np.hypot(flow[..., 0], flow[..., 1])
     p95, p99 = (float(value) for value in np.nanpercentile(length, (95, 99)))
-    return flow, Motion(frame, float(np.nanmean(length)), p95, p99, seconds)
+    return flow, Motion(frame, file, float(np.nanmean(length)), p95, p99, seconds)
 
 
 def _as_float(frame: Bytes3) -> ImageArray:
@@ -145,10 +156,10 @@ def _frame_pairs(path: Path, every: int, reference: Reference) -> Iterator[tuple
     before: Bytes3 | None = None
     for index, frame in frames(path, every):
         if frame is None:
-            raise InputError(f"{path}: image number {index} of the folder cannot be read (truncated or damaged)")
+            raise InputError(f"{frame_file(path, index)}: cannot be read (truncated or damaged)")
         if before is not None:
             if frame.shape != before.shape:
-                raise InputError(f"{path}: frame {index} has another size than the frame before it")
+                raise InputError(f"{frame_file(path, index)}, frame {index}: has another size than the frame before it")
             yield index, before, frame
         if before is None or reference == "previous":
             before = frame
@@ -209,6 +220,9 @@ def _write_sequence(first: Bytes3, rest: Iterator[Bytes3], folder: Path) -> list
 
 def _remove_numbered(folder: Path, suffix: str) -> None:
     """Removes what an earlier run wrote, which may have had other frames: files named by six digits or more."""
-    for path in folder.glob(f"*{suffix}"):
-        if re.fullmatch(r"[0-9]{6,}", path.stem):
-            path.unlink()
+    for path in _numbered(folder, suffix):
+        path.unlink()
+
+
+def _numbered(folder: Path, suffix: str) -> list[Path]:
+    return [path for path in folder.glob(f"*{suffix}") if re.fullmatch(r"[0-9]{6,}", path.stem)]

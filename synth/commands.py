@@ -20,7 +20,7 @@ from synth.generate import generate as generate_samples
 from synth.plan import Plan, check_buildable, plan
 from synth.progress import duration, progress
 from synth.render.variant import Device, Variant
-from synth.template import load_scene
+from synth.template import Template, load_scene
 
 _NO_LIMIT = 10_000
 """Characters: wider than any table."""
@@ -41,7 +41,7 @@ def run_generate(
 ) -> int:
     """See `synth.cli.generate`."""
     scheduling = Scheduling(workers, ray, Shard.parse(shard) if shard else None)
-    template = load_scene(scene, assignments)
+    template = _loaded(scene, assignments)
     variant = job_variant(template, device)
     check_buildable(template, variant)
     if dry_run:
@@ -58,7 +58,7 @@ def run_generate(
 
 def run_plan(scene: str, n: int, assignments: Sequence[str], device: Device, as_json: bool) -> int:
     """See `synth.cli.plan`."""
-    template = load_scene(scene, assignments)
+    template = _loaded(scene, assignments)
     variant = job_variant(template, device)
     check_buildable(template, variant)
     if not as_json:
@@ -68,13 +68,16 @@ def run_plan(scene: str, n: int, assignments: Sequence[str], device: Device, as_
 
 def run_simulate(scene: str, out: Path, seed: int, index: int, assignments: Sequence[str], as_json: bool) -> int:
     """See `synth.cli.simulate`."""
-    from synth.dataset.storage import storage_errors
+    from synth.dataset.storage import refuse_foreign, storage_errors
     from synth.sampling import draw
     from synth.simulate import simulate
     from synth.simulate.files import write_trajectory
     from synth.simulate.shared import resolution_of
 
-    template = load_scene(scene, assignments)
+    refuse_foreign(out / "trajectory.json", b'"scene": {')
+    for surface in out.glob("state_*.vtu"):
+        refuse_foreign(surface, b'Name="mesh"')
+    template = _loaded(scene, assignments)
     drawn = draw(template, seed, index)
     with storage_errors(out):
         out.mkdir(parents=True, exist_ok=True)  # before minutes of work, not after
@@ -84,7 +87,7 @@ def run_simulate(scene: str, out: Path, seed: int, index: int, assignments: Sequ
             mesh = resolution_of(drawn, folder).mesh
             trajectory = simulate(drawn, mesh, folder, on_way=lambda share: advance(int(100 * share), 100))
     except InputError as error:
-        raise InputError(f"{template.source}: {error}") from error
+        raise InputError(f"{template.label}: {error}") from error
     record = write_trajectory(out, drawn, trajectory)
     if as_json:
         print(json.dumps(record))
@@ -111,8 +114,12 @@ def run_simulate(scene: str, out: Path, seed: int, index: int, assignments: Sequ
 
 def run_inspect(path: Path, png: Path | None, html: Path | None, limit: int, as_json: bool) -> int:
     """See `synth.cli.inspect`."""
-    from synth.inspection import inspect, tables, write_html, write_sheet
+    from synth.dataset.storage import refuse_foreign
+    from synth.inspection import PAGE_MARK, SHEET_MARK, inspect, tables, write_html, write_sheet
 
+    for file, mark in ((png, SHEET_MARK), (html, PAGE_MARK)):
+        if file is not None:
+            refuse_foreign(file, mark.encode())
     inspection = inspect(path, limit)
     if as_json:
         print(json.dumps(inspection.as_dict()))
@@ -149,6 +156,14 @@ def run_export(path: Path, format: ExportFormat, out: Path, camera: str) -> int:
         count = export(path, format, out, advance, camera)
     _say(Console(), f"{count} samples written to {out}")
     return 0
+
+
+def _loaded(scene: str, assignments: Sequence[str]) -> Template:
+    """The scene; what is unusual in it is told on stderr."""
+    template = load_scene(scene, assignments)
+    for warning in dict.fromkeys(line for corner in template.corners for line in corner.warnings):
+        print(f"synth: warning: {template.label}: {warning}", file=sys.stderr)
+    return template
 
 
 def _say_hint(variant: Variant) -> None:

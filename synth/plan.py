@@ -17,7 +17,7 @@ from synth.render.pattern import check_pattern, is_grey
 from synth.render.separated_light import check_light
 from synth.render.thin_lens import ThinLens
 from synth.render.variant import Variant
-from synth.sampling import draw
+from synth.sampling import check_pairs, draw
 from synth.scene import Scene
 from synth.simulate.indenter import rigid_body
 from synth.simulate.material import DISPLACEMENT_ONLY_BELOW
@@ -111,7 +111,7 @@ def check_buildable(template: Template, variant: Variant) -> None:
     Raises:
         InputError: at a corner of the distributions, an indenter whose parts do not fit or whose file is no closed
             surface, a light in the camera's view, a lens or a kind of light that this variant or coating cannot have,
-            or a pattern that no pixel could show or whose file is no picture.
+            a pattern that no pixel could show or whose file is no picture, or more pairs than a trajectory has.
     """
     try:
         for sensor in dict.fromkeys(view for corner in template.corners for view in corner.sensor.views.values()):
@@ -125,8 +125,10 @@ def check_buildable(template: Template, variant: Variant) -> None:
                 check_light(sensor.coating)
         for indenter in dict.fromkeys(corner.contact.indenter for corner in template.corners):
             rigid_body(indenter, template.source.parent)
+        for corner in template.corners:
+            check_pairs(corner)
     except InputError as error:
-        raise InputError(f"{template.source}: {error}") from error
+        raise InputError(f"{template.label}: {error}") from error
 
 
 def plan(template: Template, variant: Variant) -> Plan:
@@ -185,7 +187,7 @@ def _meshes(template: Template) -> _Meshes:
         except InputError:  # an impossible draw: generate redraws it
             continue
     if not found:
-        raise InputError(f"{template.source}: none of {DRAWS} draws is possible; try `simulate` to see why")
+        raise InputError(f"{template.label}: none of {DRAWS} draws is possible; try `simulate` to see why")
     across = [resolution.across for _, resolution in found]
     errors = [resolution.error_px for _, resolution in found]
     spacings = [resolution.spacing_mm for _, resolution in found]

@@ -100,16 +100,29 @@ def draw(template: Template, seed: int, trajectory: int, attempt: int = 0, senso
 def pairs_of(template: Template, seed: int, trajectory: int, steps: int) -> list[Pair]:
     """All samples of a trajectory with that many recorded states.
 
-    The first shows the undeformed gel and the last state; the others are drawn from all other pairs i < j. Where a
-    scene asks for more samples than there are pairs, they come again, each time with noise of its own.
+    The first shows the undeformed gel and the last state; the others are drawn from all other pairs i < j.
     """
-    sampling = _sampling(template)
-    count = sampling.pairs_per_trajectory
+    count = _sampling(template).pairs_per_trajectory
     others = [(i, j) for i in range(steps) for j in range(i + 1, steps + 1) if (i, j) != (0, steps)]
     rng = stream(template, seed, "pairs", trajectory)
     frames = [(0, steps), *(others[k] for k in rng.permutation(len(others)))]
     sensor = sensor_of(template, trajectory)
-    return [Pair(trajectory * count + k, trajectory, sensor, frames[k % len(frames)]) for k in range(count)]
+    return [Pair(trajectory * count + k, trajectory, sensor, frames[k]) for k in range(count)]
+
+
+def check_pairs(scene: Scene) -> None:
+    """Sees that a trajectory has as many different pairs as it is to give.
+
+    Raises:
+        InputError: it has fewer.
+    """
+    asked, steps = scene.sampling.pairs_per_trajectory, scene.motion.steps
+    most = steps * (steps + 1) // 2
+    if asked > most:
+        raise InputError(
+            f"sampling.pairs_per_trajectory = {asked}: motion.steps = {steps} gives {steps + 1} states, which make "
+            f"{most} different pairs; give at most {most}, or more steps"
+        )
 
 
 def _chooser(rng: np.random.Generator) -> Chooser:

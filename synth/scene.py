@@ -6,6 +6,7 @@ field's name. Frame: origin at the centre of the undeformed contact surface, +z 
 camera, +x right and +y down in the image (a left-handed triple, see docs/decisions.md).
 """
 
+from itertools import pairwise
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -150,6 +151,18 @@ class Motion(Part):
     then: tuple[Pose, ...] = ()
     """Poses to which the indenter moves next, one after another: a reversed shear, a release."""
 
+    @property
+    def poses(self) -> dict[str, "Motion | Pose"]:
+        """The end of press and shear, and each pose after it, by its name in a scene file."""
+        return {"motion": self, **{f"motion.then[{i}]": pose for i, pose in enumerate(self.then)}}
+
+    @property
+    def moves(self) -> int:
+        """How many legs the way has: press, shear with twist, and one to each pose that differs from the one before."""
+        stops = [(min(self.depth_mm, 0.0), (0.0, 0.0), 0.0), (self.depth_mm, (0.0, 0.0), 0.0)]
+        stops += [(pose.depth_mm, pose.shear_mm, pose.twist_deg) for pose in self.poses.values()]
+        return sum(start != end for start, end in pairwise(stops))
+
 
 class Render(Part):
     """Path tracing."""
@@ -242,20 +255,20 @@ class Scene(Part):
                 raise ValueError(
                     f"motion.position_mm {axis} = {x} puts the indenter beside the pad (|{axis}| <= {half})"
                 )
-        legs: dict[str, Motion | Pose] = {"motion": motion}
-        legs.update({f"motion.then[{i}]": pose for i, pose in enumerate(motion.then)})
-        for name, pose in legs.items():
+        for name, pose in motion.poses.items():
             if pose.depth_mm > deepest:
                 raise ValueError(
                     f"{name}.depth_mm = {pose.depth_mm} is more than 85 % of the gel's thickness ({size[2]} mm); "
                     f"at most {deepest:.3g}"
                 )
-            for axis, s in zip("xy", pose.shear_mm, strict=True):
-                if abs(s) > 2 * size[2]:
-                    raise ValueError(
-                        f"{name}.shear_mm {axis} = {s} is more than twice the gel's thickness ({size[2]} mm): "
-                        "check its unit"
-                    )
+            for axis, s, side in zip("xy", pose.shear_mm, size[:2], strict=True):
+                if abs(s) > side:
+                    raise ValueError(f"{name}.shear_mm {axis} = {s} is longer than the pad ({side} mm): check its unit")
+        if motion.then and motion.steps < motion.moves:
+            raise ValueError(
+                f"motion.steps = {motion.steps} cannot record every pose of motion.then: there are {motion.moves} "
+                f"moves, press and shear among them, and each needs a step; at least {motion.moves}"
+            )
         if self.numerics.edge_length_mm is not None and self.sensor.gel.layers:
             raise ValueError(
                 "numerics.edge_length_mm: fTetWild's meshes have no layers; leave it out for a layered gel"
@@ -266,3 +279,17 @@ class Scene(Part):
                 f"numerics.edge_length_mm = {edge} must lie between {min(size) / 60:.3g} and {min(size)} for this pad"
             )
         return self
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is possible but unusual."""
+        found = []
+        x, y, thickness = self.sensor.gel.size_mm
+        for name, pose in self.motion.poses.items():
+            given = f"{name}.shear_mm = {list(pose.shear_mm)}"
+            if max(map(abs, pose.shear_mm)) > 2 * thickness:
+                found.append(f"{given} is more than twice the gel's thickness ({thickness} mm)")
+            ends = zip(self.motion.position_mm, pose.shear_mm, (x / 2, y / 2), strict=True)
+            if any(abs(start + s) > half for start, s, half in ends):
+                found.append(f"{given} takes the indenter's centre off the pad")
+        return found

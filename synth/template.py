@@ -9,6 +9,7 @@ lower and upper end of all its distributions and for every choice, so that a mis
 
 import hashlib
 import json
+import os
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -38,15 +39,22 @@ class Template:
     Attributes:
         content: the parsed TOML after overrides.
         source: the file, for messages and as the place that meshes and bitmaps are relative to.
+        changed: keys that overrides gave values.
     """
 
     content: dict[str, Any]
     source: Path
+    changed: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
         """The scene's name."""
         return str(self.content["name"])
+
+    @property
+    def label(self) -> str:
+        """Where the content comes from, for messages."""
+        return f"{self.source} with --set {', '.join(self.changed)}" if self.changed else str(self.source)
 
     @cached_property
     def hash(self) -> str:
@@ -66,7 +74,7 @@ class Template:
         """
         turns = range(_options(self.content))
         contents = [_corner(self.content, high, turn) for turn in turns for high in (False, True)]
-        return tuple(dict.fromkeys(validated(content, str(self.source), Scene) for content in contents))
+        return tuple(dict.fromkeys(validated(content, self.label, Scene) for content in contents))
 
     def distributions(self) -> list[tuple[str, Any, str]]:
         """Kind, arguments and path of every distribution, nested ones after their choice."""
@@ -85,7 +93,8 @@ def load_scene(name_or_path: str | Path, overrides: Sequence[str] = ()) -> Templ
 
     Args:
         name_or_path: "gelsight_mini" or "my/sensor.toml".
-        overrides: "key.path=value" with a TOML value; list entries by number ("sensor.lights.0.power=2").
+        overrides: "key.path=value" with a TOML value; list entries by number ("sensor.lights.0.power=2"). Files are
+            relative to the working directory, not to the scene.
 
     Raises:
         InputError: no such scene, wrong TOML, unknown keys, impossible values.
@@ -99,27 +108,29 @@ def load_scene(name_or_path: str | Path, overrides: Sequence[str] = ()) -> Templ
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     for override in overrides:
         _apply(content, override)
-    return checked_template(json.loads(json.dumps(content, default=str)), path)  # TOML's dates become text
+    changed = tuple(override.partition("=")[0].strip() for override in overrides)
+    return checked_template(json.loads(json.dumps(content, default=str)), path, changed)  # TOML's dates become text
 
 
-def checked_template(content: dict[str, Any], source: Path) -> Template:
+def checked_template(content: dict[str, Any], source: Path, changed: tuple[str, ...] = ()) -> Template:
     """A template whose distributions, corners and mesh files have been checked.
 
     Args:
         content: JSON-able.
         source: see `Template`.
+        changed: see `Template`.
 
     Raises:
         InputError: what is wrong, where.
     """
-    template = Template(content, source)
+    template = Template(content, source, changed)
     for kind, arguments, where in template.distributions():
         problem = _distribution_problem(kind, arguments, where)
         if problem:
-            raise InputError(f"{source}: {where}: {problem}")
+            raise InputError(f"{template.label}: {where}: {problem}")
     for key, file in template._files():
         if not file.is_file():
-            raise InputError(f"{source}: {key}: there is no file {file}")
+            raise InputError(f"{template.label}: {key}: there is no file {file}")
     return template
 
 
@@ -183,11 +194,20 @@ def _apply(content: dict[str, Any], override: str) -> None:
         if not isinstance(target, list | dict):
             raise InputError(f"--set {override!r}: {step!r} lies inside a value that is not a table")
         if depth == len(steps) - 1:
-            target[place] = value
+            target[place] = _absolute(value, step)
         elif isinstance(target, dict):
             target = target.setdefault(step, {})
         else:
             target = target[place]
+
+
+def _absolute(value: Any, key: str) -> Any:
+    """A value under a key with the names of files in it made absolute."""
+    if isinstance(value, dict):
+        return {name: _absolute(inner, key if key == "file" else name) for name, inner in value.items()}
+    if isinstance(value, list):
+        return [_absolute(inner, key) for inner in value]
+    return os.path.abspath(value) if key == "file" and isinstance(value, str) else value
 
 
 def _is_distribution(value: Any) -> bool:

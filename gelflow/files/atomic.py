@@ -1,9 +1,17 @@
-"""Writing a file as a whole or not at all: into a temporary file beside it, which is then renamed."""
+"""Writing a file as a whole or not at all: into a temporary file beside it, which is then renamed.
+
+Files of the same name that an earlier run wrote are replaced; those of somebody else are not (`refuse_foreign`).
+"""
 
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from gelflow.errors import InputError
+
+HEAD = 4096
+"""Bytes at the beginning of a file among which its mark stands."""
 
 
 @contextmanager
@@ -33,3 +41,24 @@ def write_text(path: Path, text: str) -> None:
     """Writes UTF-8 text to `path`, as a whole or not at all."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def refuse_foreign(path: Path, mark: bytes, *beside: Path) -> None:
+    """Sees that files which are about to be replaced come from an earlier run.
+
+    Args:
+        path: A file, with `mark` near its beginning if it is ours.
+        mark: Bytes.
+        beside: Files without a mark, which are ours where `path` is there.
+
+    Raises:
+        InputError: One of them is somebody else's.
+    """
+    if path.is_file():
+        with path.open("rb") as file:
+            beside = () if mark in file.read(HEAD) else (path,)
+    for other in beside:
+        if other.exists():
+            raise InputError(
+                f"{other}: exists and does not come from this command; move it away, or give another --out"
+            )

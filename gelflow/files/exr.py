@@ -19,6 +19,8 @@ from gelflow.files.atomic import replacing
 from gelflow.files.quiet import quiet
 from gelflow.raster import FlowArray, MaskArray
 
+DIRECTIONS = "U right, V down; I1(x) = I2(x + forward(x))"
+"""In the header of each flow that is written here, and in those words nowhere else."""
 Direction = Literal["forward", "backward"]
 
 
@@ -92,7 +94,7 @@ def write_flow(path: Path, forward: FlowArray, visible: MaskArray | None = None)
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
         "flow.units": "px",
-        "flow.directions": "U right, V down; I1(x) = I2(x + forward(x))",
+        "flow.directions": DIRECTIONS,
         "flow.pixelCentre": "pixel (c, r) has its centre at (c + 0.5, r + 0.5); the flow belongs to the centre",
     }
     with replacing(path) as temporary:

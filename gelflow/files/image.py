@@ -1,6 +1,7 @@
 """Images: PNG (8 or 16 bit, grey or colour, with or without alpha) and 8-bit JPEG, BMP or TIFF.
 
-In memory an image is (H, W, 3) float32, RGB in [0, 1]: a grey image has three equal channels, alpha is dropped.
+In memory an image is (H, W, 3) float32, RGB in [0, 1]: a grey image has three equal channels, alpha is dropped, and a
+photograph is turned as its EXIF data say.
 """
 
 import zlib
@@ -71,16 +72,13 @@ def read_image(path: Path) -> ImageArray:
     else:
         _check_other(path)
     with quiet():
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     if pixels is None:
         raise InputError(f"{path}: the image does not decode")
     if pixels.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{path}: {pixels.dtype} pixels; allowed: 8 or 16 bits per channel")
     largest = np.iinfo(pixels.dtype).max
-    if pixels.ndim == 2:
-        pixels = pixels[..., None]
-    colour = pixels[..., 2::-1] if pixels.shape[2] >= 3 else np.repeat(pixels[..., :1], 3, axis=2)
-    return np.ascontiguousarray(colour, np.float32) / np.float32(largest)
+    return np.ascontiguousarray(pixels[..., ::-1], np.float32) / np.float32(largest)
 
 
 def read_pair(path1: Path, path2: Path) -> tuple[ImageArray, ImageArray]:

@@ -96,6 +96,11 @@ def frames(path: Path, every: int = 1) -> Iterator[tuple[int, Bytes3 | None]]:
         capture.release()
 
 
+def frame_file(path: Path, index: int) -> Path:
+    """The file that holds a frame: one of a folder's images, or the video."""
+    return image_files(path)[index] if path.is_dir() else path
+
+
 def _image_or_none(path: Path) -> Bytes3 | None:
     try:
         return to_bytes(read_image(path))

@@ -19,7 +19,7 @@ import torch
 from gelflow import __version__
 from gelflow.config import TrainConfig
 from gelflow.errors import InputError
-from gelflow.files.atomic import replacing, write_text
+from gelflow.files.atomic import refuse_foreign, replacing, write_text
 from gelflow.files.tensors import Unreadable, load_tensors
 from gelflow.schema_errors import validated
 
@@ -94,7 +94,8 @@ def open_run(
         The state to resume from; None for a new run.
 
     Raises:
-        InputError: A folder that holds a run although resume is False; none, or another one, although it is True.
+        InputError: A folder that holds a run, or a `RUN` from elsewhere, although resume is False; none, or another
+            run, although it is True.
     """
     record = {
         "gelflow": __version__,
@@ -107,6 +108,7 @@ def open_run(
             raise InputError(f"{out}: a file is in the way; give a folder")
         if (out / STATE).exists() or (out / WEIGHTS).exists():
             raise InputError(f"{out}: holds a run already; add --resume to go on with it, or give another folder")
+        refuse_foreign(out / RUN, b'"gelflow"')
         write_text(out / RUN, json.dumps(record, indent=2) + "\n")
         return None
     state = load_state(out)

@@ -53,6 +53,7 @@ def run_budget(
         InputError: a scene is wrong or has no budget, the directory holds another study, the storage refuses.
     """
     from synth.bench.budget_study import Reference, Study
+    from synth.dataset.storage import report_folder
     from synth.simulate.resolution import LADDER
     from synth.template import load_scene, shipped_scenes
 
@@ -66,6 +67,7 @@ def run_budget(
     command = f"python -m synth bench budget --draws {draws} --seed {seed} --reference {reference}"
     command += "".join(f" --scene {shlex.quote(Path(scene).name)}" for scene in scenes)
     study = Study(templates, seed, draws, finer, Reference(reference))
+    report_folder(out, "budget")
     return study_budget(study, out, command, workers, deadline, as_json)
 
 

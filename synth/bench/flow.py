@@ -30,13 +30,12 @@ def run_flow(scenes: Sequence[str], out: Path, seed: int, as_json: bool) -> int:
     from synth.bench.flow_report import Results, report, summary, table
     from synth.bench.render_subject import press
     from synth.dataset.jsontext import to_line
-    from synth.dataset.storage import replace_file, storage_errors
+    from synth.dataset.storage import replace_file, report_folder
     from synth.errors import InputError
     from synth.template import load_scene
 
     began = time.perf_counter()
-    with storage_errors(out):
-        out.mkdir(parents=True, exist_ok=True)  # before minutes of work, not after
+    report_folder(out, "flow")
     scenes = scenes or SCENES
     templates = [load_scene(scene) for scene in scenes]
     names = [template.name for template in templates]

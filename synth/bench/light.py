@@ -36,14 +36,13 @@ def run_light(
     from synth.bench.light_measure import SEPARATED_SAMPLES, Row, compare
     from synth.bench.render_subject import press
     from synth.dataset.jsontext import to_line
-    from synth.dataset.storage import replace_file, storage_errors
+    from synth.dataset.storage import replace_file, report_folder
     from synth.errors import InputError
     from synth.generate import job_variant
     from synth.template import load_scene
 
     began = time.perf_counter()
-    with storage_errors(out):
-        out.mkdir(parents=True, exist_ok=True)
+    report_folder(out, "light")
     rows: list[Row] = []
     flows: list[FlowRow] = []
     refused: list[str] = []

@@ -45,14 +45,16 @@ def run_render(
     """
     from synth.bench.render_picture import plots
     from synth.bench.render_report import report, summary
-    from synth.bench.render_rows import cell_row, choice_row, effect_record
+    from synth.bench.render_rows import AUTO_FILE, FLOW_FILE, IMAGE_FILE, cell_row, choice_row, effect_record
     from synth.dataset.jsontext import to_line
-    from synth.dataset.storage import replace_file, storage_errors
+    from synth.dataset.storage import refuse_foreign, replace_file, storage_errors
 
     if seeds < 3:
         raise InputError(f"--seeds {seeds}: the jackknife needs at least 3")
     with storage_errors(out):
         out.mkdir(parents=True, exist_ok=True)  # before minutes of work, not after
+    others = [out / name for name in (FLOW_FILE, AUTO_FILE, "render.png", "render.md")]
+    refuse_foreign(out / IMAGE_FILE, b"variant,window,", *others)
     results = _measure(scene, out, _size(size) if size else None, reference, seeds, seed, device)
     command = f"python -m synth bench render --scene {shlex.quote(Path(scene).name)} --out DIR"
     command += f" --size {size}" * (size is not None) + f" --reference {reference} --seeds {seeds}"

@@ -30,12 +30,11 @@ def run_bench(what: str, out: Path, quick: bool, as_json: bool, processes: int =
     from synth.bench import suite
     from synth.bench.fem import measure
     from synth.bench.report import record, summary, write_results
-    from synth.dataset.storage import storage_errors
+    from synth.dataset.storage import report_folder
     from synth.simulate.resolution import scale_px_per_mm
     from synth.template import load_scene
 
-    with storage_errors(out):
-        out.mkdir(parents=True, exist_ok=True)  # before minutes of work, not after
+    report_folder(out, "fem")
     scale = scale_px_per_mm(load_scene("gelsight_mini", []).corners[0])
     results = measure(
         suite.quick() if quick else suite.whole(),

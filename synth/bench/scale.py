@@ -3,6 +3,7 @@
 import re
 import shlex
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -49,17 +50,17 @@ def run_scale(
     from synth.bench.scale_measure import Cell, measure
     from synth.bench.scale_report import record, summary, write_report
     from synth.dataset.jsontext import to_line
-    from synth.dataset.storage import storage_errors
+    from synth.dataset.storage import report_folder
 
     settings = _settings(scene, assignments, sizes, workers)
-    with storage_errors(out):
-        out.mkdir(parents=True, exist_ok=True)
+    report_folder(out, "scale")
     deadline = None if minutes is None else time.monotonic() + 60 * minutes
     cells: list[Cell] = []
     for setting in settings:
         if cells and deadline is not None and time.monotonic() > deadline:
             break
-        cells.append(measure(scene, assignments, setting, n, device, seed, out / "scale-run"))
+        folder = Path(tempfile.mkdtemp(prefix="scale-run-", dir=out))
+        cells.append(measure(scene, assignments, setting, n, device, seed, folder))
         cell = cells[-1]
         print(
             f"synth: {setting.width} x {setting.height}, {setting.by}: {cell.pairs} pairs in "

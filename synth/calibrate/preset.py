@@ -31,19 +31,17 @@ def start_sensor(template: Template, size: tuple[int, int]) -> Sensor:
         InputError: a pattern, mirror or further camera that calibration does not know.
     """
     content = copy.deepcopy(replaced(template.content["sensor"], middle))
-    sensor = validated(content, str(template.source), Sensor, "sensor")
+    sensor = validated(content, template.label, Sensor, "sensor")
     if not isinstance(sensor.pattern, Dots | NoPattern):
         raise InputError(
-            f"{template.source}: sensor.pattern.kind = {sensor.pattern.kind!r}: calibration needs a pattern that "
+            f"{template.label}: sensor.pattern.kind = {sensor.pattern.kind!r}: calibration needs a pattern that "
             "leaves smooth coating to see the lights by; allowed are 'dots' and 'none'"
         )
     if sensor.mirrors or sensor.further_cameras:
-        raise InputError(
-            f"{template.source}: calibration knows one camera without mirrors; take them out of the preset"
-        )
+        raise InputError(f"{template.label}: calibration knows one camera without mirrors; take them out of the preset")
     if sensor.camera.aperture_mm:
         raise InputError(
-            f"{template.source}: sensor.camera.aperture_mm = {sensor.camera.aperture_mm}: calibration fits one blur "
+            f"{template.label}: sensor.camera.aperture_mm = {sensor.camera.aperture_mm}: calibration fits one blur "
             "for the whole image; take the aperture out of the preset"
         )
     camera, (width, height) = sensor.camera, size
@@ -62,4 +60,4 @@ def start_sensor(template: Template, size: tuple[int, int]) -> Sensor:
 
 def render_settings(template: Template) -> Render:
     """The preset's render settings at the middle of their distributions."""
-    return validated(replaced(template.content.get("render", {}), middle), str(template.source), Render, "render")
+    return validated(replaced(template.content.get("render", {}), middle), template.label, Render, "render")

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from synth.scene import Sensor
 
 SCENE, PICTURE, NUMBERS = "scene.toml", "calibration.png", "calibration.json"
+MARK = "Fitted by `synth calibrate"
+"""How the scene that is written begins."""
 _WHAT_FRAMES = "they must be pictures of this kind of sensor with its gel undeformed"
 _SPACINGS = 4.0
 """Most that a spacing may differ from the preset's, as a factor: further off, a lens is not like the preset's."""
@@ -53,14 +55,17 @@ def run_calibrate(
     from synth.calibrate.report import fitted_content, numbers, summary
     from synth.calibrate.sensor_fit import bare_pixels, fit_sensor
     from synth.calibrate.toml_text import toml_text
-    from synth.dataset.storage import replace_file, storage_errors
+    from synth.dataset.storage import refuse_foreign, replace_file, storage_errors
     from synth.render.variant import LLVM_HINT, choose_variant
     from synth.template import checked_template, load_scene
 
     started = time.perf_counter()
     template = load_scene(scene, assignments)
     if template.corners[0].sensor.gel.shape == "dome":
-        raise InputError(f"{template.source}: sensor.gel.shape: calibrate fits flat gels only, this one is a dome")
+        raise InputError(f"{template.label}: sensor.gel.shape: calibrate fits flat gels only, this one is a dome")
+    refuse_foreign(out / SCENE, MARK.encode(), out / PICTURE, out / NUMBERS)
+    if (out / SCENE).resolve() == template.source.resolve():
+        raise InputError(f"--out {out}: its {SCENE} is what --scene starts from and would be lost; give another --out")
     variant = choose_variant("auto")
     if not variant.is_vectorised:
         raise InputError(f"calibration differentiates the rendering, which needs LLVM or an NVIDIA GPU: {LLVM_HINT}")
@@ -90,7 +95,7 @@ def run_calibrate(
         problem = str(error).replace(f"{file}: ", "")
         raise InputError(f"the frames do not fit --scene {scene}: they give {problem}; {_WHAT_FRAMES}") from error
     record = numbers(template.name, frames, fit, start, rows, given, time.perf_counter() - started)
-    comment = f"Fitted by `synth calibrate --scene {scene}` to {len(frames)} frame(s); numbers in {NUMBERS}."
+    comment = f"{MARK} --scene {scene}` to {len(frames)} frame(s); numbers in {NUMBERS}."
     replace_file(file, toml_text(content, comment).encode())
     replace_file(out / PICTURE, picture(rows))
     replace_file(out / NUMBERS, (json.dumps(record, indent=1) + "\n").encode())

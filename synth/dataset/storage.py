@@ -2,6 +2,8 @@
 
 New content goes to a neighbour with a hidden name, is flushed to the disk (fsync), and takes its place by one rename;
 the folder is then flushed, too, because a rename lives in the folder.
+
+Files of the same name that an earlier run wrote are replaced; those of somebody else are not (`refuse_foreign`).
 """
 
 import contextlib
@@ -16,6 +18,9 @@ from synth.errors import InputError
 
 PARTIAL = ".partial-"
 """In the hidden name of anything unfinished: `.NAME.partial-PID-TOKEN`."""
+
+HEAD = 4096
+"""Bytes at the beginning of a file among which its mark stands."""
 
 _OLD = ".old"
 
@@ -77,6 +82,39 @@ def replace_file(path: Path, content: bytes) -> None:
         except BaseException:
             partial.unlink(missing_ok=True)
             raise
+
+
+def refuse_foreign(path: Path, mark: bytes, *beside: Path) -> None:
+    """Sees that files which are about to be replaced come from an earlier run.
+
+    Args:
+        path: a file, with `mark` near its beginning if it is ours.
+        mark: bytes.
+        beside: files without a mark, which are ours where `path` is there.
+
+    Raises:
+        InputError: one of them is somebody else's.
+    """
+    if path.is_file():
+        with path.open("rb") as file:
+            beside = () if mark in file.read(HEAD) else (path,)
+    for other in beside:
+        if other.exists():
+            raise InputError(
+                f"{other}: exists and does not come from this command; move it away, or give another place"
+            )
+
+
+def report_folder(out: Path, name: str) -> None:
+    """Makes the directory of a benchmark's NAME.md, NAME.csv and NAME.png, before minutes of work and not after.
+
+    Raises:
+        InputError: one of them is there and not from an earlier run, or the storage refuses.
+    """
+    with storage_errors(out):
+        out.mkdir(parents=True, exist_ok=True)
+    others = [out / f"{name}{suffix}" for suffix in (".csv", ".png")]
+    refuse_foreign(out / f"{name}.md", f"synth bench {name}".encode(), *others)
 
 
 def install_folder(partial: Path, final: Path) -> None:

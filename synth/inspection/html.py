@@ -19,6 +19,8 @@ from synth.inspection.text import facts, percent, short
 from synth.inspection.view import View
 from synth.inspection.wheel import flow_colours, robust_scale, wheel_legend
 
+PAGE_MARK = "<title>synth: "
+"""In each page's head."""
 PICTURED = 24
 """Samples (and cameras) of a dataset that are shown with pictures, evenly spaced."""
 
@@ -52,9 +54,9 @@ def write_html(inspection: Inspection, html: Path | str) -> None:
         InputError: A sample's file has gone or is damaged, or the storage refuses.
     """
     body = _dataset_body(inspection) if inspection.kind == "dataset" else _view_body(inspection)
-    title = escape(f"synth: {inspection.title}")
+    title = escape(inspection.title)
     page = (
-        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
+        f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">{PAGE_MARK}{title}</title>'
         f'<meta name="viewport" content="width=device-width"><style>{_STYLE}</style></head>\n<body>\n{body}\n'
         f'<p class="note">{_NOTE}</p>\n</body></html>\n'
     )

@@ -4,13 +4,13 @@ Everything is drawn into one axes whose unit is an inch, with the origin in the 
 dataset's 72 pictures would take several times as long.
 """
 
+import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from synth.dataset.images import encode_png
 from synth.dataset.storage import replace_file
 from synth.inspection.inspection import Inspection
 from synth.inspection.panels import CLOSURE_MAP, CLOSURE_RANGE_PX, Panel, panels_of
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+SHEET_MARK = "synth inspect"
+"""Software in each sheet's header."""
 ROWS = 8
 """Rows on the sheet of a dataset, evenly spaced."""
 _DPI = 100
@@ -55,8 +57,9 @@ def write_sheet(inspection: Inspection, png: Path | str) -> None:
         _draw_dataset(figure, inspection)
     else:
         _draw_view(figure, inspection)
-    canvas.draw()
-    replace_file(Path(png), encode_png(np.asarray(canvas.buffer_rgba())[..., :3]))
+    buffer = io.BytesIO()
+    canvas.print_png(buffer, metadata={"Software": SHEET_MARK})
+    replace_file(Path(png), buffer.getvalue())
 
 
 def _draw_view(figure: "Figure", inspection: Inspection) -> None:

@@ -39,6 +39,8 @@ def read_picture(pattern: Bitmap, folder: Path) -> Image:
         raise InputError(f"sensor.pattern.file: {path} cannot be read: {error.strerror or error}") from error
     try:
         stored = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        if stored is not None and stored.shape[2:] != (4,):  # no opacity: turned as EXIF says, three channels
+            stored = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     except cv2.error:  # an empty file, or one of absurd size
         stored = None
     if stored is None or stored.dtype not in (np.uint8, np.uint16):
@@ -46,8 +48,6 @@ def read_picture(pattern: Bitmap, folder: Path) -> Image:
             f"sensor.pattern.file: {path} is no whole picture of 8 or 16 bits that OpenCV can read; save it as PNG"
         )
     values = stored.astype(np.float32) / np.iinfo(stored.dtype).max
-    if values.ndim == 2:
-        values = np.repeat(values[:, :, None], 3, axis=2)
     opacity = values[:, :, 3:] if values.shape[2] == 4 else np.ones((*values.shape[:2], 1), np.float32)
     return np.concatenate([_linear(values[:, :, 2::-1]) * opacity, opacity], axis=2)
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from synth.dataset.storage import storage_errors
+from synth.dataset.storage import refuse_foreign, storage_errors
 from synth.stress.cases import EXTREME, Run, all_runs, compared, load_expectations, selected
 from synth.stress.check import Result, judged
 
@@ -44,6 +44,8 @@ def run_stress(out: Path, only: Sequence[str] | None, workers: int, as_json: boo
     from synth.stress.report import outcome_table, record, remarks, summary, write_report
     from synth.stress.sheet import write_sheet
 
+    others = [out / f"stress.{suffix}" for suffix in ("csv", "json", "png")]
+    refuse_foreign(out / "stress.md", b"synth stress", *others)
     expectations = load_expectations(scenes / "expected.toml")
     runs = selected(all_runs(expectations, (scenes / "base.toml").resolve()), only)
     started = time.perf_counter()
@@ -106,6 +108,7 @@ def result_of(run: Run, folder: Path, meshes: Path, worker: Sequence[str] = WORK
     """
     with storage_errors(folder):
         if folder.exists():
+            refuse_foreign(folder / "run.json", b'"element"', *folder.iterdir())
             shutil.rmtree(folder)
         folder.mkdir(parents=True)
         told = {"element": run.element, "budget_s": run.budget_s, "base": str(run.base)}

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import ExifTags, Image, ImageOps
 from textures import as_bytes, moved, save
 
 from gelflow.errors import InputError
@@ -133,6 +134,21 @@ def test_grey_has_three_equal_channels_and_alpha_is_dropped(tmp_path: Path) -> N
     assert (grey == grey[..., :1]).all()
     assert cv2.imwrite(str(tmp_path / "alpha.png"), np.dstack([rgb[..., ::-1], rgb[..., 0]]))
     np.testing.assert_array_equal(np.rint(read_image(tmp_path / "alpha.png") * 255), rgb)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_photograph_is_turned_as_its_exif_says(tmp_path: Path, orientation: int) -> None:
+    """Fails with cv2.IMREAD_UNCHANGED, which takes the pixels as they are stored."""
+    stored = Image.fromarray(as_bytes(moved(24, 40, 0, 0)))
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = orientation
+    stored.save(tmp_path / "a.png", exif=exif)
+    turned = np.asarray(ImageOps.exif_transpose(Image.open(tmp_path / "a.png")))
+    np.testing.assert_array_equal(as_bytes(read_image(tmp_path / "a.png")), turned)
+    stored.save(tmp_path / "a.jpg", exif=exif, quality=95)
+    turned = np.asarray(ImageOps.exif_transpose(Image.open(tmp_path / "a.jpg")))
+    # Two decoders of one JPEG file: they differ in how they enlarge its colours.
+    np.testing.assert_allclose(read_image(tmp_path / "a.jpg") * 255, turned, atol=8)
 
 
 def test_pair_of_two_sizes_and_one_pixel_images_are_refused(tmp_path: Path) -> None:

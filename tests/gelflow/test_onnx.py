@@ -38,7 +38,8 @@ def test_the_exported_network_gives_the_same_flow(weights: Path, tmp_path: Path)
     runtime = pytest.importorskip("onnxruntime", reason="onnxruntime is not installed")
     pytest.importorskip("onnxscript", reason="onnxscript is not installed")
     out = tmp_path / "new" / "flow.onnx"
-    assert main(["export", str(weights), "--out", str(out), "--size", "67x74"]) == 0
+    for _ in range(2):  # the second time in place of the first file
+        assert main(["export", str(weights), "--out", str(out), "--size", "67x74"]) == 0
     images = torch.rand(2, 1, 3, 67, 74).unbind()
     session = runtime.InferenceSession(str(out))
     (flow,) = session.run(["flow"], {f"image{k + 1}": image.numpy() for k, image in enumerate(images)})
@@ -67,6 +68,16 @@ def test_mistakes_are_one_line(weights: Path, tail: list[str], word: str, capsys
     assert word in captured
     assert captured.count("\n") == 1
     assert not Path("x.onnx").exists()
+
+
+def test_a_file_from_elsewhere_is_not_replaced(weights: Path, capsys: pytest.CaptureFixture[str],
+                                               monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
+    monkeypatch.setattr("gelflow.export.find_spec", lambda name: name)
+    out = weights.with_name("other.onnx")
+    out.write_text("another's")
+    assert main(["export", str(weights), "--out", str(out), "--size", "64x64"]) == 2
+    assert "other.onnx: exists and does not come from this command" in capsys.readouterr().err
+    assert out.read_text() == "another's"
 
 
 def test_a_missing_package_is_named(weights: Path, capsys: pytest.CaptureFixture[str],

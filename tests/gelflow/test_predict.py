@@ -73,6 +73,37 @@ def test_flow_files_of_an_earlier_run_go_and_others_stay(tmp_path: Path, monkeyp
     assert {path for path in out.rglob("*") if path.is_file()} == {*second.files, *others}
 
 
+def test_rows_name_the_frames_files(tmp_path: Path) -> None:
+    for name in ("b10", "b9", "a"):
+        save(tmp_path / "in" / f"{name}.png", moved(48, 48, len(name), 0))
+    predict_video(FARNEBACK, tmp_path / "in", tmp_path / "out")
+    with (tmp_path / "out" / "motion.csv").open(newline="") as file:
+        assert [row["file"] for row in csv.DictReader(file)] == ["b9.png", "b10.png"]
+
+
+@pytest.mark.parametrize("name", ["a.exr", "a.flo", "a.png"])
+def test_a_pairs_results_replace_those_of_an_earlier_run_and_nothing_else(tmp_path: Path, name: str) -> None:
+    folder = write_folder(tmp_path / "in", {"a": (1.5, -0.5)})
+    images = (folder / "a_1.png", folder / "a_2.png")
+    (folder / name).write_text("another's")
+    with pytest.raises(InputError, match=rf"{name}: exists and does not come from"):
+        predict_pair(FARNEBACK, *images, folder)
+    assert (folder / name).read_text() == "another's"
+    for _ in range(2):
+        predict_pair(FARNEBACK, *images, tmp_path / "out")
+
+
+@pytest.mark.parametrize("name", ["flow/000007.exr", "motion.csv", "overlay.mp4", "overlay/000000.png"])
+def test_a_videos_results_do_not_replace_anothers_files(tmp_path: Path, name: str) -> None:
+    write_video(tmp_path / "a.avi", [as_bytes(moved(48, 64, shift, 0)) for shift in range(2)])
+    other = tmp_path / name
+    other.parent.mkdir(exist_ok=True)
+    other.write_text("another's")
+    with pytest.raises(InputError, match=rf"{name}: exists and does not come from"):
+        predict_video(FARNEBACK, tmp_path / "a.avi", tmp_path)
+    assert other.read_text() == "another's"
+
+
 def test_progress_reaches_its_total(tmp_path: Path) -> None:
     write_video(tmp_path / "a.avi", [as_bytes(moved(48, 64, shift, 0)) for shift in range(5)])
     calls: list[tuple[int, int]] = []
@@ -84,7 +115,7 @@ def test_inputs_that_cannot_be_used_are_named(tmp_path: Path) -> None:
     write_video(tmp_path / "one.avi", [as_bytes(moved(48, 64, 0, 0))])
     save(tmp_path / "in" / "0.png", moved(48, 48, 0, 0))
     (tmp_path / "in" / "1.png").write_bytes(b"broken")
-    for name, word in (("one.avi", "fewer than two"), ("none.avi", "none.avi"), ("in", "image number 1")):
+    for name, word in (("one.avi", "fewer than two"), ("none.avi", "none.avi"), ("in", r"1\.png: cannot be read")):
         with pytest.raises(InputError, match=word):
             predict_video(FARNEBACK, tmp_path / name, tmp_path / "out")
     with pytest.raises(InputError, match="every"):

@@ -257,6 +257,13 @@ def test_folders_of_other_runs_are_refused(pairs: Shifts, tmp_path: Path) -> Non
         train(small(steps=4), pairs, None, tmp_path / "run", resume=True)
 
 
+def test_anothers_record_is_not_replaced(pairs: Shifts, tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text("{}")
+    with pytest.raises(InputError, match=r"run\.json: exists and does not come from"):
+        train(small(steps=1), pairs, None, tmp_path)
+    assert (tmp_path / "run.json").read_text() == "{}"
+
+
 def test_a_run_is_not_resumed_with_other_pairs(tmp_path: Path) -> None:
     """But a run whose record is older than the digests and than `nodes` is."""
     data, other = (

@@ -58,7 +58,7 @@ def _refusal(source: Path | str, *overrides: str) -> str:
 )
 def test_keys_and_types(tiny: Path, override: str, message: str) -> None:
     found = _refusal(tiny, override)
-    assert found.startswith(f"{tiny}: {message}")
+    assert found.startswith(f"{tiny} with --set {override.partition('=')[0]}: {message}")
     assert "\n" not in found
 
 
@@ -71,7 +71,15 @@ def test_keys_and_types(tiny: Path, override: str, message: str) -> None:
         ("motion.depth_mm=2.4", "motion.depth_mm = 2.4 is more than 85 % of the gel's thickness (2.5 mm)"),
         ("motion.depth_mm={ uniform = [0.1, 2.4] }", "motion.depth_mm = 2.4 is more than 85 %"),
         ("motion.position_mm=[4.1, 0]", "motion.position_mm x = 4.1 puts the indenter beside the pad (|x| <= 4.0)"),
-        ("motion.shear_mm=[0, 6]", "motion.shear_mm y = 6.0 is more than twice the gel's thickness"),
+        ("motion.shear_mm=[0, 6.1]", "motion.shear_mm y = 6.1 is longer than the pad (6.0 mm): check its unit"),
+        (
+            "motion.then=[{ depth_mm = 0.2, shear_mm = [-8.1, 0.0] }]",
+            "motion.then[0].shear_mm x = -8.1 is longer than the pad (8.0 mm)",
+        ),
+        (
+            "motion.then=[{ depth_mm = 0.0 }]",
+            "motion.steps = 2 cannot record every pose of motion.then: there are 3 moves",
+        ),
         ("sensor.camera.position_mm=[0, 0, 2]", "sensor: camera.position_mm z = 2.0 lies inside the sensor"),
         ("sensor.camera.look_at_mm=[0, 0, 30]", "sensor: camera.look_at_mm must lie on the gel's side of the camera"),
         (
@@ -84,7 +92,7 @@ def test_keys_and_types(tiny: Path, override: str, message: str) -> None:
     ],
 )
 def test_impossible_physics(tiny: Path, override: str, message: str) -> None:
-    assert _refusal(tiny, override).startswith(f"{tiny}: {message}")
+    assert _refusal(tiny, override).startswith(f"{tiny} with --set {override.partition('=')[0]}: {message}")
 
 
 @pytest.mark.parametrize(
@@ -126,7 +134,7 @@ def test_impossible_physics(tiny: Path, override: str, message: str) -> None:
 )
 def test_distributions(tiny: Path, override: str, message: str) -> None:
     found = _refusal(tiny, override)
-    assert found.startswith(f"{tiny}: {message}")
+    assert found.startswith(f"{tiny} with --set {override.partition('=')[0]}: {message}")
     assert "\n" not in found
 
 
@@ -154,7 +162,7 @@ def test_overrides(tiny: Path, override: str, message: str) -> None:
 def test_every_problem_is_told_once_on_a_line_of_its_own(tiny: Path) -> None:
     lines = _refusal(tiny, "motion.dept_mm=1", "contact.friction=-1", "sensor.gel.poisson_ratio=1").splitlines()
     assert len(lines) == 3
-    assert all(line.startswith(f"{tiny}: ") for line in lines)
+    assert all(line.startswith(f"{tiny} with --set motion.dept_mm, contact.friction, ") for line in lines)
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import ExifTags, Image
 from render_scenes import small_sensor
 
 from synth.arrays import FloatArray
@@ -17,6 +18,7 @@ from synth.calibrate.irradiance import FlatGel, LightGeometry
 from synth.calibrate.lattice import lattice_index, pattern_points
 from synth.calibrate.noise import fit_noise
 from synth.calibrate.profile import fit_profile
+from synth.calibrate.run import MARK
 from synth.calibrate.sensor_fit import SensorFit, fit_sensor
 from synth.calibrate.toml_text import toml_text
 from synth.cli import main
@@ -195,7 +197,9 @@ def test_the_command_writes_a_scene_that_loads_and_generates(tmp_path: Path, cap
         cv2.imwrite(str(path), np.round(255 * _frame(_truth(_start())))[:, :, ::-1])
     out = tmp_path / "mine"
     command = ["calibrate", "--scene", str(preset), "--frames", str(frame), "--judge", str(other), "--out", str(out)]
-    assert main([*command, "--steps", "6", "--json"]) == 0
+    assert main([*command, "--steps", "0", "--json"]) == 0
+    capsys.readouterr()
+    assert main([*command, "--steps", "6", "--json"]) == 0  # in place of the first
     record = json.loads(capsys.readouterr().out)
     assert record == json.loads((out / "calibration.json").read_text())
     assert set(record["differences"]) == {"frames", "not fitted: other.png"}
@@ -250,6 +254,14 @@ def test_frames_that_do_not_belong_together_are_refused(tmp_path: Path) -> None:
             read_frames([tmp_path / f"{name}.png" for name in names])
 
 
+def test_a_photograph_is_turned_as_its_exif_says(tmp_path: Path) -> None:
+    stored = np.random.default_rng(0).integers(0, 256, (6, 8, 3), np.uint8)
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6  # to be turned by a quarter, clockwise
+    Image.fromarray(stored).save(tmp_path / "a.png", exif=exif)
+    np.testing.assert_allclose(255 * read_frames([tmp_path / "a.png"]).single, np.rot90(stored, -1), atol=1e-9)
+
+
 def test_a_frame_without_dots_and_dots_without_a_grid_are_refused() -> None:
     with pytest.raises(InputError, match="0 whole dark dots"):
         find_dots(np.full((120, 160, 3), 0.3), 15.0)
@@ -293,6 +305,24 @@ def test_frames_that_tell_nothing_of_the_lights_are_refused(
     said = capsys.readouterr().err
     assert message in said
     assert "scene.toml" not in said
+
+
+@pytest.mark.parametrize(
+    ("first", "message"),
+    [("", r"scene.toml: exists and does not come from"), (f"# {MARK} before`.\n", "is what --scene starts from")],
+    ids=["another's", "a calibration's"],
+)
+def test_calibration_replaces_neither_anothers_scene_nor_its_own_start(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], first: str, message: str
+) -> None:
+    scene = tmp_path / "scene.toml"
+    scene.write_text(first + toml_text(_preset()))
+    before = scene.read_bytes()
+    cv2.imwrite(str(tmp_path / "frame.png"), np.zeros((24, 32, 3), dtype=np.uint8))
+    frames = ["--frames", str(tmp_path / "frame.png")]
+    assert main(["calibrate", *frames, "--scene", str(scene), "--out", str(tmp_path)]) == 2
+    assert message in capsys.readouterr().err
+    assert scene.read_bytes() == before
 
 
 def test_a_preset_that_calibration_does_not_know_is_refused(tmp_path: Path) -> None:

@@ -6,11 +6,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import ExifTags
 from PIL import Image as Pillow
 from render_scenes import small_sensor
 
 from synth.arrays import FloatArray
 from synth.errors import InputError
+from synth.render.bitmap import read_picture
 from synth.render.pattern import albedo, check_pattern, is_grey
 from synth.scene import Coating, Sensor
 from synth.scene_pattern import Bitmap
@@ -116,6 +118,20 @@ def test_grey_with_alpha_and_palettes_are_read(tmp_path: Path) -> None:
     opaque = textures["grey.tiff"][int(3.5 / 6 * ROWS), int(4.5 / 8 * COLUMNS)]
     # Half a texel of 42 off the pixel's middle.
     assert texel == pytest.approx(1 - opacity * (1 - opaque), abs=0.03)
+
+
+def test_a_photograph_is_turned_as_its_exif_says(tmp_path: Path) -> None:
+    """Fails with cv2.IMREAD_UNCHANGED alone, which takes the pixels as they are stored."""
+    stored = np.random.default_rng(0).integers(0, 256, (6, 8, 3), np.uint8)
+    exif = Pillow.Exif()
+    exif[ExifTags.Base.Orientation] = 6  # to be turned by a quarter, clockwise
+    Pillow.fromarray(stored).save(tmp_path / "photograph.png", exif=exif)
+    Pillow.fromarray(np.rot90(stored, -1)).save(tmp_path / "turned.png")
+    turned, plain = (
+        read_picture(Bitmap(kind="bitmap", file=name, width_mm=12), tmp_path)
+        for name in ("photograph.png", "turned.png")
+    )
+    np.testing.assert_array_equal(turned, plain)
 
 
 def _tiff_of_floats() -> bytes:

@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from tiny_scene import own_cache, write_tiny
+from tiny_scene import TEXT, own_cache, write_tiny
 
 from synth.dataset.reader import read_dataset
 from synth.errors import InputError
@@ -17,9 +17,17 @@ from synth.template import load_scene
 BITMAP = 'sensor.pattern={ kind = "bitmap", file = "art/mine.png", width_mm = 8 }'
 
 
+DOTS = TEXT[TEXT.index('kind = "dots"') : TEXT.index("[sensor.camera]")]
+HALF = np.where(np.arange(80) < 40, 0, 255).astype(np.uint8)[None].repeat(60, axis=0)
+"""The left half is black."""
+
+
 @pytest.fixture
-def scene(tmp_path: Path) -> Path:
+def scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The user is in its folder."""
+    own_cache(monkeypatch)
     (tmp_path / "art").mkdir()
+    monkeypatch.chdir(tmp_path)
     return write_tiny(tmp_path)
 
 
@@ -27,18 +35,25 @@ def _draw(scene: Path, picture: np.ndarray) -> None:
     assert cv2.imwrite(str(scene.parent / "art" / "mine.png"), picture)
 
 
-def test_the_picture_lies_beside_the_scene_file(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _is_half_black(scene: Path, *overrides: str) -> bool:
+    generate(load_scene(scene, [*overrides, "sensor.camera.read_noise=0"]), 1, scene.parent / "out")
+    image = read_dataset(scene.parent / "out").read(0).image1
+    return bool(image[:, 2:14].max() < 10 and image[:, 18:30].mean() > 50)
+
+
+def test_the_picture_lies_beside_the_scene_file(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Fails with the file looked for in the current directory."""
-    own_cache(monkeypatch)
-    (tmp_path / "elsewhere").mkdir()
-    monkeypatch.chdir(tmp_path / "elsewhere")
-    picture = np.full((60, 80), 255, np.uint8)
-    picture[:, :40] = 0  # the left half is black
-    _draw(scene, picture)
-    generate(load_scene(scene, [BITMAP, "sensor.camera.read_noise=0"]), 1, tmp_path / "out")
-    image = read_dataset(tmp_path / "out").read(0).image1
-    assert image[:, 2:14].max() < 10
-    assert image[:, 18:30].mean() > 50
+    monkeypatch.chdir("/")
+    _draw(scene, HALF)
+    bitmap = TEXT.replace(DOTS, 'kind = "bitmap"\nfile = "art/mine.png"\nwidth_mm = 8\n')
+    assert _is_half_black(write_tiny(scene.parent, bitmap))
+
+
+def test_a_picture_given_by_set_lies_where_the_user_is(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fails with the file looked for beside the scene."""
+    _draw(scene, HALF)
+    monkeypatch.chdir(scene.parent / "art")
+    assert _is_half_black(scene, BITMAP.replace("art/", ""))
 
 
 def test_another_picture_is_another_scene(scene: Path) -> None:
@@ -52,7 +67,9 @@ def test_another_picture_is_another_scene(scene: Path) -> None:
 def test_a_missing_picture_is_told_when_the_scene_is_loaded(scene: Path) -> None:
     with pytest.raises(InputError) as caught:
         load_scene(scene, [BITMAP])
-    assert str(caught.value) == f"{scene}: sensor.pattern.file: there is no file {scene.parent / 'art/mine.png'}"
+    assert str(caught.value) == (
+        f"{scene} with --set sensor.pattern: sensor.pattern.file: there is no file {scene.parent / 'art/mine.png'}"
+    )
 
 
 @pytest.mark.parametrize(
@@ -66,4 +83,4 @@ def test_what_cannot_be_painted_is_refused_before_the_job(scene: Path, override:
     (scene.parent / "art" / "mine.png").write_text("no picture")
     with pytest.raises(InputError, match=message) as caught:
         check_buildable(load_scene(scene, [override]), choose_variant("cpu"))
-    assert str(caught.value).startswith(f"{scene}: sensor.pattern.")
+    assert str(caught.value).startswith(f"{scene} with --set {override.partition('=')[0]}: sensor.pattern.")

@@ -157,12 +157,14 @@ def _write_stl(path: Path, *, closed: bool) -> None:
         (["sensor.lights.3.aim_mm=[0.0, -2.9, 2.0]"], LLVM, "aims at itself"),
         (["sensor.camera.distortion=[0.1, 0, 0, 0, 0]"], SCALAR, "LLVM 16"),
         (["sensor.camera.fy=83"], SCALAR, "LLVM 16"),
+        (["sampling.pairs_per_trajectory=4"], LLVM, r"pairs_per_trajectory = 4: .* at most 3"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:The VTK reader")
 def test_what_cannot_be_built_is_refused_with_the_file_and_the_field(
-    tiny: Path, overrides: list[str], variant: Variant, message: str
+    tiny: Path, overrides: list[str], variant: Variant, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.chdir(tiny.parent)
     _write_stl(tiny.parent / "open.stl", closed=False)
     _write_stl(tiny.parent / "closed.stl", closed=True)
     (tiny.parent / "text.stl").write_text("this is no surface")
@@ -171,8 +173,9 @@ def test_what_cannot_be_built_is_refused_with_the_file_and_the_field(
     assert str(caught.value).startswith(str(tiny))
 
 
-def test_a_closed_surface_can_be_built(tiny: Path) -> None:
+def test_a_closed_surface_can_be_built(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It is refused once a triangle is missing, and not before."""
+    monkeypatch.chdir(tiny.parent)
     for closed in (True, False):
         _write_stl(tiny.parent / "solid.stl", closed=closed)
         template = load_scene(tiny, ['contact.indenter={ shape = "mesh", file = "solid.stl" }'])

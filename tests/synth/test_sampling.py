@@ -9,7 +9,7 @@ from scipy import stats
 from tiny_scene import TEXT, write_tiny
 
 from synth.errors import InputError
-from synth.sampling import MAX_DRAWS, draw, draw_sensor, pairs_of, stream
+from synth.sampling import MAX_DRAWS, check_pairs, draw, draw_sensor, pairs_of, stream
 from synth.scene import Scene
 from synth.template import Template, load_scene, shipped_scenes
 
@@ -160,12 +160,10 @@ def test_pairs_are_numbered_distinct_and_begin_with_the_whole_motion(tiny: Path,
         assert found == pairs_of(template, 0, trajectory, steps)
 
 
-def test_pairs_come_again_where_there_are_too_few(tiny: Path) -> None:
-    template = load_scene(tiny, ["sampling.pairs_per_trajectory=5"])
-    frames = [pair.frames for pair in pairs_of(template, 0, 0, 2)]
-    assert frames[:3] == [(0, 2), *frames[1:3]]
-    assert sorted(frames[:3]) == [(0, 1), (0, 2), (1, 2)]
-    assert frames[3:] == frames[:2]
+def test_more_pairs_than_a_trajectory_has_are_refused(tiny: Path) -> None:
+    check_pairs(load_scene(tiny, ["sampling.pairs_per_trajectory=3"]).corners[0])  # three states: 01, 02, 12
+    with pytest.raises(InputError, match=r"^sampling\.pairs_per_trajectory = 4: motion\.steps = 2 .* at most 3"):
+        check_pairs(load_scene(tiny, ["sampling.pairs_per_trajectory=4"]).corners[0])
 
 
 @pytest.mark.parametrize("name", shipped_scenes())

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from pads import SPHERE, scene
 
+from synth.scene import Motion
 from synth.simulate.indenter import rigid_body, rotation_about
 from synth.simulate.path import TWIST_ARM_MM, Path
 
 
 def path(indenter: dict | None = None, **motion: Any) -> Path:
-    posed = scene(motion=motion, indenter=indenter or SPHERE)
-    return Path(posed.motion, rigid_body(posed.contact.indenter))
+    posed = scene(indenter=indenter or SPHERE)
+    return Path(Motion.model_validate(motion), rigid_body(posed.contact.indenter))
 
 
 def test_lowest_point_follows_the_depth() -> None:

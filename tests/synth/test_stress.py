@@ -207,11 +207,19 @@ def test_processes_are_watched(tmp_path: Path, script: str, budget: float, outco
     """Fails without the timeout (by taking a minute), with the folder not emptied, or without the exit status."""
     asked = replace(run(), budget_s=budget)
     (tmp_path / "case").mkdir()
+    (tmp_path / "case" / "run.json").write_text('{"element": "p1p1"}')
     (tmp_path / "case" / "result.json").write_text("{}")  # of an earlier run: must not count
     found = result_of(asked, tmp_path / "case", tmp_path, (sys.executable, "-c", script))
     assert (found.outcome, found.wall_s < 25) == (outcome, True)
     assert message in found.message
     assert not judged(found, {}).ok
+
+
+def test_a_folder_from_elsewhere_is_not_emptied(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"notes\.txt: exists and does not come from"):
+        result_of(run(), tmp_path, tmp_path)
+    assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
 COARSE = """

@@ -76,6 +76,11 @@ def test_help_of_a_command_lists_its_options(capsys, command: str, options: list
         (["generate", "--device", "tpu"], "tpu"),
         (["generate", "--scene", "gelsight_mni"], "there is no scene 'gelsight_mni'"),
         (["generate", "--set", "motion"], "--set 'motion': give key=value"),
+        (
+            ["plan", "--set", "motion.steps=3", "--set", "motion.steps=4"],
+            "motion.steps undoes the earlier motion.steps",
+        ),
+        (["plan", "--set", "motion.steps=3", "--set", "motion={}"], "motion undoes the earlier motion.steps"),
         (["generate", "--set", "motion.dept_mm=1"], "motion.dept_mm: unknown key; did you mean 'depth_mm'?"),
         (["generate", "--set", "sensor.gel.poisson_ratio=0.51"], "must be less than or equal to 0.5"),
         (["generate", "--set", "sensor.lights.0.position_mm=[0, 0, 3]"], "between the camera and the gel"),
@@ -135,6 +140,22 @@ def test_plan_explains_and_predicts(capsys, tiny: Path) -> None:
     answer = json.loads(capsys.readouterr().out)
     assert answer["n"] == 100
     assert {"feature", "runs", "reason"} == set(answer["decisions"][0])
+
+
+@pytest.mark.parametrize(
+    ("width", "warning"),
+    [
+        (25.0, "motion.shear_mm = [10.0, 0.0] is more than twice the gel's thickness (2.5 mm)"),
+        (16.0, "motion.shear_mm = [10.0, 0.0] takes the indenter's centre off the pad"),
+    ],
+)
+def test_a_long_slide_is_warned_of_and_done(capsys, tiny: Path, width: float, warning: str) -> None:
+    """It is unusual, not impossible; what JSON is asked for stays JSON."""
+    slide = ["--set", f"sensor.gel.size_mm=[{width}, 6.0, 2.5]", "--set", "motion.shear_mm=[10.0, 0.0]"]
+    assert main(["plan", "--scene", str(tiny), "--json", *slide]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out)["scene"] == "tiny"
+    assert err.splitlines()[-1] == (f"synth: warning: {tiny} with --set sensor.gel.size_mm, motion.shear_mm: {warning}")
 
 
 def test_a_dry_run_writes_nothing(capsys, tiny: Path, tmp_path: Path) -> None:
@@ -228,7 +249,7 @@ def test_simulate_writes_the_trajectory_of_the_contract(capsys, tiny: Path, tmp_
 
     out = tmp_path / "s"
     out.mkdir()
-    (out / "state_009.vtu").write_text("of an earlier run")
+    (out / "state_009.vtu").write_text('Name="mesh"')  # of an earlier run
     assert main(["simulate", "--scene", str(tiny), "--out", str(out), "--index", "1", "--json"]) == 0
     record = json.loads((out / "trajectory.json").read_text())
     assert record == json.loads(capsys.readouterr().out)
@@ -264,10 +285,13 @@ def test_simulate_prints_a_table_and_redraws_the_same(capsys, tiny: Path, tmp_pa
 
 
 def test_simulate_names_the_scene_file(capsys, tiny: Path, tmp_path: Path) -> None:
-    (tmp_path / "damaged.stl").write_bytes(b"")
-    indenter = "contact.indenter={ shape = 'mesh', file = 'damaged.stl' }"
+    damaged = tmp_path / "damaged.stl"
+    damaged.write_bytes(b"")
+    indenter = f"contact.indenter={{ shape = 'mesh', file = '{damaged}' }}"
     status = main(["simulate", "--scene", str(tiny), "--out", str(tmp_path / "s"), "--set", indenter])
-    assert _complaint(capsys, status).startswith(f"{tiny}: contact.indenter.file = 'damaged.stl': cannot be read")
+    assert _complaint(capsys, status).startswith(
+        f"{tiny} with --set contact.indenter: contact.indenter.file = '{damaged}': cannot be read"
+    )
 
 
 def test_simulate_says_how_far_it_is(capsys, tiny: Path, tmp_path: Path, monkeypatch) -> None:
@@ -297,6 +321,50 @@ def test_a_simulation_that_ends_early_is_written_and_has_status_1(capsys, tiny: 
     assert record["status"] == "partial"
     assert "Newton" in record["reason"]
     assert len(record["steps"]) == len(list((tmp_path / "s").glob("*.vtu"))) < 3
+
+
+@pytest.mark.parametrize("name", ["dataset.json", "samples/000000/image1.png", "mine.html"])
+@pytest.mark.parametrize("option", ["--png", "--html"])
+def test_inspect_replaces_its_own_files_and_no_other(capsys, tmp_path: Path, name: str, option: str) -> None:
+    data = tmp_path / "d"
+    shutil.copytree(reference(), data)
+    (data / "mine.html").write_text("<!DOCTYPE html><title>mine</title>")
+    before = fingerprint(data)
+    said = _complaint(capsys, main(["inspect", str(data), option, str(data / name)]))
+    assert said.startswith(f"{data / name}: exists and does not come from this command")
+    assert fingerprint(data) == before
+    for _ in range(2):
+        assert main(["inspect", str(data / "samples" / "000000"), option, str(tmp_path / "own")]) == 0
+
+
+@pytest.mark.parametrize("name", ["trajectory.json", "state_000.vtu"])
+def test_simulate_replaces_its_own_files_and_no_other(capsys, tiny: Path, tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_text("another's")
+    said = _complaint(capsys, main(["simulate", "--scene", str(tiny), "--out", str(tmp_path)]))
+    assert said.startswith(f"{tmp_path / name}: exists and does not come from this command")
+    assert (tmp_path / name).read_text() == "another's"
+    for _ in range(2):
+        assert main(["simulate", "--scene", str(tiny), "--out", str(tmp_path / "own")]) == 0
+
+
+@pytest.mark.parametrize(
+    ("command", "name"),
+    [
+        (["bench", "fem", "--quick"], "fem.md"),
+        (["bench", "flow"], "flow.png"),
+        (["bench", "light"], "light.md"),
+        (["bench", "scale"], "scale.csv"),
+        (["bench", "budget"], "budget.png"),
+        (["bench", "render"], "render.csv"),
+        (["stress"], "stress.json"),
+    ],
+)
+def test_reports_do_not_replace_anothers_files(capsys, tmp_path: Path, command: list[str], name: str) -> None:
+    (tmp_path / name).write_text("another's")
+    said = _complaint(capsys, main([*command, "--out", str(tmp_path)]))
+    assert said.startswith(f"{tmp_path / name}: exists and does not come from this command")
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_text() == "another's"
 
 
 def test_inspect_verify_and_export_take_a_dataset(capsys, tmp_path: Path) -> None:

@@ -109,8 +109,9 @@ def test_hash_is_of_the_content_not_of_its_layout(tmp_path: Path, tiny: Path) ->
     assert pickle.loads(pickle.dumps(template)).hash == template.hash
 
 
-def test_hash_covers_the_files_of_mesh_indenters(tiny: Path) -> None:
+def test_hash_covers_the_files_of_mesh_indenters(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A dataset must not go on with another object under the same file name."""
+    monkeypatch.chdir(tiny.parent)
     override = 'contact.indenter={ shape = "mesh", file = { choice = ["a.stl", "b.stl"] } }'
     (tiny.parent / "a.stl").write_text("first")
     with pytest.raises(InputError, match=r"there is no file .*b\.stl"):
