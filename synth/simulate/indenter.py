@@ -21,9 +21,9 @@ BLUNT_MM = 1.0
 SHARPEST = 4.0
 LARGEST_GRID = 4_000_000
 """Points of a mesh's distance grid (32 MB)."""
-USUAL_GRID = 500_000
+USUAL_GRID = 250_000
 """Points that a grid has at most by default."""
-CELLS_PER_RADIUS = 3.0
+CELLS_PER_RADIUS = 2.5
 """Spacings of the grid to the radius of the edges."""
 
 
@@ -169,7 +169,7 @@ def _object(indenter: MeshIndenter, folder: Path, resolution_mm: float, touchabl
             f"{LARGEST_GRID}; use a larger cell_mm"
         )
     solid = Grid(low - margin, spacing, np.zeros(counts))
-    solid = solid.holding(solid.distance(turned, signed=True))
+    solid = solid.holding(solid.signed_distance(turned))
     if radius > 0:
         solid = rounded(solid, radius)
     surface_left = solid.contour(0.0).points

@@ -53,8 +53,8 @@ def relax(
         trial = state.plus(step, np.where(running, share, 0.0))
         after = system.balance(trial, indenters, running)
         iterations[running] += 1
-        expected = (1 - share)[:, None] * balance.free - system.viscous_force(step, share * viscosity)
-        error = np.linalg.norm(after.free - expected, axis=1)
+        error = after.free - (1 - share)[:, None] * balance.free
+        error = np.linalg.norm(error + system.viscous_force(state, trial, running, viscosity), axis=1)
         error /= np.maximum(np.linalg.norm(balance.free, axis=1), np.finfo(float).tiny)
         error[~(after.smallest_jacobian > 0) | ~np.isfinite(error)] = np.inf
         good = running & (error <= MAX_ERROR)

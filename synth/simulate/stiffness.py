@@ -147,19 +147,22 @@ def pressure_tangent(
 
 @wp.kernel
 def viscous_force(
-    step: wp.array2d(dtype=wp.vec3d),
+    active: wp.array(dtype=wp.int32),
+    before: wp.array2d(dtype=wp.vec3d),
+    after: wp.array2d(dtype=wp.vec3d),
     viscosity: wp.array(dtype=wp.float64),
     bulk: Bulk,
     force: wp.array2d(dtype=wp.vec3d),
 ):
-    """One thread per (sample, element): adds θ L δ for displacements δ (B, n)."""
+    """One thread per (sample, element): adds θ L δ, with δ what the displacement (B, n) has changed by."""
     s, e = wp.tid()
-    if viscosity[s] == wp.float64(0.0):
+    if active[s] == 0 or viscosity[s] == wp.float64(0.0):
         return
     for q in range(bulk.weight.shape[1]):
         slope = wp.mat33d()
         for a in range(bulk.nodes.shape[1]):
-            slope += wp.outer(step[s, bulk.nodes[e, a]], bulk.gradient[e, q, a])
+            node = bulk.nodes[e, a]
+            slope += wp.outer(after[s, node] - before[s, node], bulk.gradient[e, q, a])
         stress = (viscosity[s] * bulk.shear[e] * bulk.weight[e, q]) * slope
         for a in range(bulk.nodes.shape[1]):
             wp.atomic_add(force, s, bulk.nodes[e, a], stress * bulk.gradient[e, q, a])

@@ -198,13 +198,14 @@ class System:
         values = self._values.numpy()[:, :-1]
         return Tangent(values, tuple(self._unsymmetric(s) for s in range(self.batch)))
 
-    def viscous_force(self, step: Unknowns, viscosity: FloatArray) -> FloatArray:
-        """(B, k) force on the free unknowns of a step against viscosities (B,), see `synth.simulate.relaxation`."""
+    def viscous_force(self, before: Unknowns, after: Unknowns, active: np.ndarray, viscosity: FloatArray) -> FloatArray:
+        """(B, k) force on the free unknowns against a step with viscosities (B,), see `synth.simulate.relaxation`."""
         force = wp.zeros((self.batch, len(self.space.points)), dtype=wp.vec3d, device=self.device)
-        moved, thick = warp_array(step.u, wp.vec3d, self.device), warp_array(viscosity, wp.float64, self.device)
+        (old, _, mask), (new, _, _) = self._device_state(before, active), self._device_state(after, active)
+        inputs = [mask, old, new, warp_array(viscosity, wp.float64, self.device), self._bulk]
         elements = (self.batch, len(self.space.nodes))
-        wp.launch(viscous_force, elements, inputs=[moved, thick, self._bulk], outputs=[force], device=self.device)
-        full = np.concatenate([force.numpy().reshape(self.batch, -1), np.zeros_like(step.p)], axis=1)
+        wp.launch(viscous_force, elements, inputs=inputs, outputs=[force], device=self.device)
+        full = np.concatenate([force.numpy().reshape(self.batch, -1), np.zeros_like(before.p)], axis=1)
         return np.ascontiguousarray(full[:, self.free])
 
     def _unsymmetric(self, sample: int) -> Any:

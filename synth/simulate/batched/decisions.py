@@ -14,7 +14,7 @@ the loose state, so that it does not depend on which states are corrected.
 
 import warp as wp
 
-from synth.simulate import newton, stepping
+from synth.simulate import newton, relaxation, stepping
 from synth.simulate.batched.slots import (
     ACCEPT,
     ADVANCE,
@@ -35,6 +35,8 @@ from synth.simulate.batched.slots import (
     POLISH,
     READY,
     RECORD,
+    RELAXED,
+    RELAXING,
     REPAIR,
     REVERT,
     SEARCH,
@@ -70,6 +72,44 @@ LATE = wp.constant(5)
 HOPELESS = wp.constant(wp.float64(0.5))
 """Newton's method ends after LATE iterations where the relative residual is still so large."""
 NEAR = wp.constant(wp.float64(newton.NEAR))
+SHORT = wp.constant(wp.float64(stepping.RELAXED))
+MAX_STEPS = wp.constant(relaxation.MAX_STEPS)
+FIRST_VISCOSITY = wp.constant(wp.float64(relaxation.FIRST_VISCOSITY))
+LEAST_VISCOSITY = wp.constant(wp.float64(relaxation.LEAST_VISCOSITY))
+MOST_VISCOSITY = wp.constant(wp.float64(relaxation.MOST_VISCOSITY))
+MAX_ERROR, AIM = wp.constant(wp.float64(relaxation.MAX_ERROR)), wp.constant(wp.float64(relaxation.AIM))
+FALL, RISE = wp.constant(wp.float64(relaxation.FALL)), wp.constant(wp.float64(relaxation.RISE))
+
+
+@wp.func
+def _next_viscosity(viscosity: wp.float64, error: wp.float64) -> wp.float64:
+    """`synth.simulate.relaxation.next_viscosity`."""
+    if error <= MAX_ERROR:
+        taken = viscosity * wp.clamp(error / AIM, FALL, RISE)
+        if taken < LEAST_VISCOSITY:
+            return ZERO
+        return taken
+    refused = wp.max(viscosity * wp.clamp(error / AIM, wp.float64(2.0), RISE), LEAST_VISCOSITY)
+    return wp.min(refused, MOST_VISCOSITY)
+
+
+@wp.func
+def _judge_relaxation(slots: Slots, s: int, valid: bool):
+    """A step of a relaxation is taken where it errs little; else the next is shorter, from where this began."""
+    error = wp.float64(1.0e30)
+    if valid and wp.isfinite(slots.trial_error[s]):
+        error = slots.trial_error[s]
+    slots.iteration[s] = slots.iteration[s] + 1
+    if error <= MAX_ERROR:
+        slots.move[s] = TAKE
+        slots.share[s] = ONE
+    else:
+        if slots.viscosity[s] >= MOST_VISCOSITY:
+            slots.share[s] = wp.float64(0.5) * slots.share[s]
+        slots.phase[s] = START
+        if slots.iteration[s] >= MAX_STEPS:
+            slots.phase[s] = LOST
+    slots.viscosity[s] = _next_viscosity(slots.viscosity[s], error)
 
 
 @wp.kernel
@@ -97,7 +137,11 @@ def judge(slots: Slots, settings: Settings):
         else:
             slots.phase[s] = LOST
         return
-    if phase == SEARCH:
+    if phase == SEARCH and slots.relaxing[s] == RELAXING:
+        _judge_relaxation(slots, s, valid)
+        if slots.phase[s] != SEARCH:
+            return
+    elif phase == SEARCH:
         scale = slots.scale[s]
         if not (valid and (norm <= slots.norm[s] * (ONE - DECREASE * scale) or scale < INDIFFERENT)):
             slots.scale[s] = wp.float64(0.5) * scale
@@ -113,13 +157,17 @@ def judge(slots: Slots, settings: Settings):
     iteration = slots.iteration[s]
     limit = slots.limit[s]
     spent = iteration == 2 * limit or (iteration >= limit and relative > NEAR)
+    hopeless = iteration >= LATE and relative >= HOPELESS
+    if slots.relaxing[s] == RELAXING:
+        spent = iteration >= MAX_STEPS
+        hopeless = False
     if phase == REPAIR:
         slots.phase[s] = PASSING
     elif too_far:
         slots.phase[s] = LOST
     elif relative <= slots.tolerance[s] and (iteration > 0 or relative == ZERO):
         slots.phase[s] = SOLVED
-    elif (not wp.isfinite(relative)) or (iteration >= LATE and relative >= HOPELESS) or spent:
+    elif (not wp.isfinite(relative)) or hopeless or spent:
         slots.phase[s] = LOST
     else:
         slots.phase[s] = READY
@@ -146,6 +194,19 @@ def conclude(slots: Slots, jobs: Jobs, settings: Settings):
             slots.phase[s] = REPAIR
         return
     polish = slots.stage[s] == POLISH
+    step = slots.target[s] - slots.at[s]
+    if phase == LOST and slots.relaxing[s] == 0 and not polish and step <= SHORT * settings.longest:
+        slots.relaxing[s] = RELAXING
+        slots.viscosity[s] = FIRST_VISCOSITY
+        slots.share[s] = ONE
+        slots.iteration[s] = 0
+        slots.predicted[s] = 0
+        slots.move[s] = FALL_BACK
+        slots.phase[s] = START
+        return
+    slots.viscosity[s] = ZERO
+    if slots.relaxing[s] == RELAXING:
+        slots.relaxing[s] = RELAXED
     if phase == LOST:
         slots.step[s] = wp.float64(0.5) * (slots.target[s] - slots.at[s])
         slots.has_previous[s] = 0
@@ -258,6 +319,8 @@ def control(slots: Slots, jobs: Jobs, settings: Settings):
         taken = target - slots.at[s]
         slots.previous[s] = slots.at[s]
         slots.has_previous[s] = settings.extrapolate
+        if slots.relaxing[s] == RELAXED:
+            slots.has_previous[s] = 0
         slots.at[s] = target
         if target == jobs.waypoints[j, slots.next[s]]:
             slots.next[s] = slots.next[s] + 1
@@ -282,6 +345,7 @@ def control(slots: Slots, jobs: Jobs, settings: Settings):
         slots.stage[s] = STEP
         slots.iteration[s] = 0
         slots.limit[s] = settings.limit
+        slots.relaxing[s] = 0
         slots.ratio[s] = ZERO
         slots.predicted[s] = 0
         slots.move[s] = FALL_BACK

@@ -5,7 +5,7 @@
 
 import warp as wp
 
-from synth.simulate.batched.slots import ACCEPT, FALL_BACK, FRESH, REVERT, SEARCH, TAKE, UNDO, Slots
+from synth.simulate.batched.slots import ACCEPT, FALL_BACK, FRESH, RELAXING, REVERT, SEARCH, TAKE, UNDO, Slots
 from synth.simulate.contact import FAR, ContactState
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -59,9 +59,10 @@ def attempt(
     pressure_row: wp.array(dtype=wp.int32),
     fields: Fields,
     force: wp.array2d(dtype=wp.vec3d),
+    viscous: wp.array2d(dtype=wp.vec3d),
     volume: wp.array2d(dtype=wp.float64),
 ):
-    """One thread per (slot, node and then pressure): the trial, and zeros for its residual.
+    """One thread per (slot, node and then pressure): the trial, and zeros for its residual and viscous force.
 
     step: (B, rows); node_row: first row of a node's displacement or -1 where it is held.
     """
@@ -71,6 +72,8 @@ def attempt(
     scale = wp.float64(0.0)
     if slots.phase[s] == SEARCH:
         scale = slots.scale[s]
+        if slots.relaxing[s] == RELAXING:
+            scale = slots.share[s]
     count = fields.state_u.shape[1]
     if i < count:
         u = fields.iterate_u[s, i]
@@ -80,6 +83,7 @@ def attempt(
             u += scale * move
         fields.trial_u[s, i] = u
         force[s, i] = wp.vec3d()
+        viscous[s, i] = wp.vec3d()
     else:
         k = i - count
         p = fields.iterate_p[s, k]

@@ -32,6 +32,7 @@ from synth.simulate.bulk import bulk_residual
 from synth.simulate.contact import contact_residual, contact_stiffness
 from synth.simulate.fold import fold_residual
 from synth.simulate.multipliers import augment, settle
+from synth.simulate.stiffness import viscous_force
 from synth.simulate.tables import bulk_tables, face_tables, fold_tables
 
 INNER = 8
@@ -80,6 +81,7 @@ class Machine:
         self._at = Storage(space, mixed, yeoh, rows, batch, records, grid, device)
         self.slots, self.krylov = self._at.slots, self._at.krylov
         self._vectors = (batch, rows // 4)
+        self._right = gmres.plain(self.krylov.basis)
         self._each = (batch, len(space.points) + self._at.volume.shape[1])
         self.watch: Callable[[str, str], None] = lambda part, kernel: None
         """Called after each launch with the part of the cycle and the kernel's name, for profiles."""
@@ -130,7 +132,7 @@ class Machine:
         self._place(jobs)
         self._select(phases.FRESH, phases.START, phases.SEARCH, phases.REPAIR, phases.NUDGED)
         where = (self._rows.node_row, self._rows.pressure_row)
-        self._launch(moves.attempt, self._each, s, mask, at.step, *where, f, at.force, at.volume)
+        self._launch(moves.attempt, self._each, s, mask, at.step, *where, f, at.force, at.viscous, at.volume)
         residual = (at.force, at.volume, at.jacobian)
         self._launch(bulk_residual, elements, f.trial_u, f.trial_p, mask, self._bulk, *residual)
         if self._lattice is not None:
@@ -139,6 +141,9 @@ class Machine:
         law = (self._faces, at.indenters, at.contact, self.penalty)
         self._launch(contact_residual, at.points[:2], f.trial_u, mask, *law, *found)
         self._launch_blocks(sums.norms, sums.BLOCK, mask, *residual, self._rows.node_row, f, s)
+        self._launch(viscous_force, elements, mask, f.iterate_u, f.trial_u, s.viscosity, self._bulk, at.viscous)
+        moved = (at.force, at.viscous, at.volume, *where, self._right)
+        self._launch_blocks(sums.relaxation_errors, sums.BLOCK, mask, *moved, s)
         self._launch(judge, self.batch, s, self.settings)
         self._launch(moves.move, self._each, s, 0, f)
 
@@ -201,7 +206,7 @@ class Machine:
         self._place(jobs)
         self._select(phases.READY, phases.CARRY_READY)
         elements = (len(self.pad.space.nodes), self.batch)
-        self._launch(store, elements, mask, f.iterate_u, f.iterate_p, self._bulk, at.stored)
+        self._launch(store, elements, mask, f.iterate_u, f.iterate_p, self._bulk, self.slots.viscosity, at.stored)
         if self._lattice is not None:
             self._launch(find_folding, elements, mask, f.iterate_u, self._lattice, at.folding)
         law = (self._faces, at.indenters, at.contact, self.penalty)

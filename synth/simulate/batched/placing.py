@@ -90,6 +90,8 @@ def refill(
     slots.keep[s] = 0
     slots.kept[s] = 0
     slots.records[s] = 0
+    slots.relaxing[s] = 0
+    slots.viscosity[s] = wp.float64(0.0)
     indenters.kind[s] = jobs.kind[j]
     indenters.shape[s] = shapes[j]
     indenters.sharpness[s] = jobs.sharpness[j]

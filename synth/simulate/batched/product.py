@@ -61,9 +61,10 @@ def store(
     u: wp.array2d(dtype=wp.vec3d),
     p: wp.array2d(dtype=wp.float64),
     bulk: Bulk,
+    viscosity: wp.array(dtype=wp.float64),
     stored: wp.array4d(dtype=wp.float32),
 ):
-    """One thread per (element, slot): (m, nq, STORED, B)."""
+    """One thread per (element, slot): (m, nq, STORED, B). A viscosity θ adds θ μ to the 2W' beside G alone."""
     e, s = wp.tid()
     if mask[s] == 0:
         return
@@ -80,7 +81,7 @@ def store(
         for i in range(3):
             for j in range(3):
                 stored[e, q, 3 * i + j, s] = wp.float32(Fit[i, j])
-        stored[e, q, 9, s] = wp.float32(w * slope[0])
+        stored[e, q, 9, s] = wp.float32(w * (slope[0] + viscosity[s] * bulk.shear[e]))
         stored[e, q, 10, s] = wp.float32(w * (slope[0] - PJ))
         stored[e, q, 11, s] = wp.float32(w * (PJ + dilation[1] * J * J))
         if bulk.mixed == 1:

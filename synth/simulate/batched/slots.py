@@ -48,6 +48,7 @@ BACK = wp.constant(19)
 
 STEP, PASS, POLISH = wp.constant(0), wp.constant(1), wp.constant(2)
 """What Newton's method is solving: a load step, a pass at a recorded state, or that state to the full tolerance."""
+RELAXING, RELAXED = wp.constant(1), wp.constant(2)
 COMPLETE, NO_BALANCE, NO_CONTACT = wp.constant(0), wp.constant(1), wp.constant(2)
 """Why a trajectory ended."""
 TAKE, FALL_BACK, UNDO, ACCEPT = wp.constant(1), wp.constant(2), wp.constant(3), wp.constant(4)
@@ -73,8 +74,10 @@ class Slots:
             det F.
         trial_norm, trial_force, trial_jacobian: of the trial; trial_moved: of a pass, farthest that a node has gone
             from the solution before it, mm; most_moved: how far it may.
+        relaxing: RELAXING while a step is relaxed (`synth.simulate.relaxation`), RELAXED when it was; viscosity: θ of
+            the relaxation, else 0; trial_error: of its step, in units of the residual before.
         failures, done, share: of augmented-Lagrangian passes: those that failed, the shares of the others together, and
-            the share of the next; share_now: of the one that begins.
+            the share of the next; share_now: of the one that begins. While relaxing, share is that of a step.
         keep: whether contact's memory is put aside in this cycle; kept: whether it is put aside; anchor: whether points
             that have come to touch are anchored for passes.
         deepest: penetration at the last evaluation, mm.
@@ -107,6 +110,9 @@ class Slots:
     trial_jacobian: wp.array(dtype=wp.float64)
     trial_moved: wp.array(dtype=wp.float64)
     most_moved: wp.array(dtype=wp.float64)
+    relaxing: wp.array(dtype=wp.int32)
+    viscosity: wp.array(dtype=wp.float64)
+    trial_error: wp.array(dtype=wp.float64)
     failures: wp.array(dtype=wp.int32)
     done: wp.array(dtype=wp.float64)
     share: wp.array(dtype=wp.float64)

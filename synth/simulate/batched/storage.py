@@ -61,6 +61,7 @@ class Storage:
         self.contact: ContactState = _filled(ContactState, lambda _: self.points, device)
         self.kept: Kept = _filled(Kept, lambda _: self.points, device)
         self.force, self.volume = zeros((batch, nodes), wp.vec3d), zeros((batch, pressures), wp.float64)
+        self.viscous = zeros((batch, nodes), wp.vec3d)
         self.jacobian = zeros((batch, elements), wp.float64)
         self.gap, self.tangential = zeros(self.points, wp.float64), zeros(self.points, wp.vec3d)
         self.traction = zeros(self.points, wp.vec3d)

@@ -6,7 +6,7 @@
 import warp as wp
 
 from synth.simulate.batched.fields import Fields
-from synth.simulate.batched.slots import PASS, Slots
+from synth.simulate.batched.slots import PASS, RELAXING, Slots
 from synth.simulate.contact import Faces, Indenters, position
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -58,6 +58,39 @@ def norms(
         slots.trial_force[s] = wp.sqrt(whole)
         slots.trial_jacobian[s] = smallest
         slots.trial_moved[s] = wp.sqrt(farthest)
+
+
+@wp.kernel
+def relaxation_errors(
+    mask: wp.array(dtype=wp.int32),
+    force: wp.array2d(dtype=wp.vec3d),
+    viscous: wp.array2d(dtype=wp.vec3d),
+    volume: wp.array2d(dtype=wp.float64),
+    node_row: wp.array(dtype=wp.int32),
+    pressure_row: wp.array(dtype=wp.int32),
+    right: wp.array2d(dtype=wp.float32),
+    slots: Slots,
+):
+    """One block per slot: the norm of r(u + t δ) - (1 - t) r(u) + t θ L δ over that of r(u), where a slot relaxes.
+
+    right: (B, at least rows), first -r(u) over its norm, the linear solve's right side.
+    """
+    s, lane = wp.tid()
+    if mask[s] == 0 or slots.relaxing[s] != RELAXING:
+        return
+    left = (wp.float64(1.0) - slots.share[s]) * slots.norm[s]
+    total = wp.float64(0.0)
+    for i in range(lane, force.shape[1], wp.block_dim()):
+        row = node_row[i]
+        if row >= 0:
+            before = wp.vec3d(wp.float64(right[s, row]), wp.float64(right[s, row + 1]), wp.float64(right[s, row + 2]))
+            total += wp.length_sq(force[s, i] + viscous[s, i] + left * before)
+    for i in range(lane, volume.shape[1], wp.block_dim()):
+        rest = volume[s, i] + left * wp.float64(right[s, pressure_row[i]])
+        total += rest * rest
+    total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
+    if lane == 0:
+        slots.trial_error[s] = wp.sqrt(total) / slots.norm[s]
 
 
 @wp.kernel
