@@ -19,8 +19,10 @@ from synth.render.thin_lens import ThinLens
 from synth.render.variant import Variant
 from synth.sampling import check_pairs, draw
 from synth.scene import Scene
+from synth.scene_indenters import MeshIndenter
 from synth.simulate.indenter import rigid_body
 from synth.simulate.material import DISPLACEMENT_ONLY_BELOW
+from synth.simulate.object_surface import object_triangles
 from synth.simulate.path import TWIST_ARM_MM
 from synth.simulate.resolution import DEFAULT_TARGET_PX, Resolution
 from synth.simulate.shared import resolution_of
@@ -109,9 +111,9 @@ def check_buildable(template: Template, variant: Variant) -> None:
     """Build what fits the schema and may still be impossible, so that a job does not find out after its first hour.
 
     Raises:
-        InputError: at a corner of the distributions, an indenter whose parts do not fit or whose file is no closed
-            surface, a light in the camera's view, a lens or a kind of light that this variant or coating cannot have,
-            a pattern that no pixel could show or whose file is no picture, or more pairs than a trajectory has.
+        InputError: at a corner of the distributions, an indenter whose parts do not fit or whose file is no surface,
+            a light in the camera's view, a lens or a kind of light that this variant or coating cannot have, a pattern
+            that no pixel could show or whose file is no picture, or more pairs than a trajectory has.
     """
     try:
         for sensor in dict.fromkeys(view for corner in template.corners for view in corner.sensor.views.values()):
@@ -124,7 +126,10 @@ def check_buildable(template: Template, variant: Variant) -> None:
             if template.corners[0].render.light == "separated":
                 check_light(sensor.coating)
         for indenter in dict.fromkeys(corner.contact.indenter for corner in template.corners):
-            rigid_body(indenter, template.source.parent)
+            if isinstance(indenter, MeshIndenter):
+                object_triangles(indenter, template.source.parent)
+            else:
+                rigid_body(indenter)
         for corner in template.corners:
             check_pairs(corner)
     except InputError as error:

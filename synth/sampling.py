@@ -92,8 +92,11 @@ def draw(template: Template, seed: int, trajectory: int, attempt: int = 0, senso
     sensor = sensor or draw_sensor(template, seed, sensor_of(template, trajectory))
     if sensor.content is None:
         raise InputError(sensor.rejected[-1])
-    choose = _chooser(stream(template, seed, "contact", trajectory, attempt))
-    own = {part: replaced(template.content[part], choose) for part in _parts(template, of_trajectory=True)}
+    rng = stream(template, seed, "contact", trajectory, attempt)
+    own = {part: replaced(template.content[part], _chooser(rng)) for part in _parts(template, of_trajectory=True)}
+    indenter = own["contact"]["indenter"]
+    if indenter.get("rotation_deg") == "any":
+        indenter["rotation_deg"] = _orientation(rng)
     return validated({**sensor.content, **own}, str(template.source), Scene)
 
 
@@ -140,6 +143,15 @@ def _chooser(rng: np.random.Generator) -> Chooser:
                 return arguments[int(rng.integers(len(arguments)))]
 
     return choose
+
+
+def _orientation(rng: np.random.Generator) -> list[float]:
+    """Angles about x, then y, then z (degrees) of a rotation from the uniform distribution on SO(3).
+
+    Its density is proportional to the cosine of the angle about y, which lies between -90 and 90 degrees.
+    """
+    x, z = rng.uniform(-180, 180, 2)
+    return [float(x), float(np.degrees(np.arcsin(rng.uniform(-1, 1)))), float(z)]
 
 
 def _parts(template: Template, *, of_trajectory: bool) -> list[str]:

@@ -67,10 +67,11 @@ class Torus(Posed):
 
 
 class MeshIndenter(Part):
-    """Triangle surface from any file that pyvista reads (STL, PLY, OBJ, OFF, VTP), in mm after scaling."""
+    """Triangle surface from any file that pyvista reads (STL, PLY, OBJ, VTP), in mm after scaling."""
 
     shape: Literal["mesh"]
     file: str
+    """Relative to the scene's file. In a scene file also a pattern, such as "objects/*.stl": one match is drawn."""
     scale: Positive = 1.0
     size_mm: Positive | None = None
     """Longest edge of the bounding box before it is turned; in place of `scale`."""

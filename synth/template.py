@@ -2,9 +2,10 @@
 
     { uniform = [a, b] }   { normal = [mean, sd] }   { log_uniform = [a, b] }   { choice = [...] }
 
-`choice` may hold whole tables (indenters, say) with distributions inside. A file is checked when it is loaded: at the
-lower and upper end of all its distributions and for every choice, so that a mistake shows before any work is done. A
-`normal` is checked at its mean: a draw from its tails that breaks the schema is drawn again (`synth.sampling`).
+`choice` may hold whole tables (indenters, say) with distributions inside. A `file` with wildcards, "objects/*.stl", is
+a choice of the files that match. A scene is checked when it is loaded: at the lower and upper end of all its
+distributions and for every choice, so that a mistake shows before any work is done. A `normal` is checked at its mean:
+a draw from its tails that breaks the schema is drawn again (`synth.sampling`).
 """
 
 import hashlib
@@ -13,7 +14,8 @@ import os
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
+from glob import glob
 from pathlib import Path
 from typing import Any
 
@@ -109,7 +111,8 @@ def load_scene(name_or_path: str | Path, overrides: Sequence[str] = ()) -> Templ
     for override in overrides:
         _apply(content, override)
     changed = tuple(override.partition("=")[0].strip() for override in overrides)
-    return checked_template(json.loads(json.dumps(content, default=str)), path, changed)  # TOML's dates become text
+    content = json.loads(json.dumps(content, default=str))  # TOML's dates become text
+    return checked_template(with_files(content, partial(_matching, path.parent)), path, changed)
 
 
 def checked_template(content: dict[str, Any], source: Path, changed: tuple[str, ...] = ()) -> Template:
@@ -155,6 +158,15 @@ def replaced(value: Any, choose: Chooser) -> Any:
     return value
 
 
+def with_files(value: Any, change: Callable[[str], Any], key: str = "") -> Any:
+    """A part of a template, the one under `key`, with every name of a file in it replaced by what `change` returns."""
+    if isinstance(value, dict):
+        return {name: with_files(inner, change, key if key == "file" else name) for name, inner in value.items()}
+    if isinstance(value, list):
+        return [with_files(inner, change, key) for inner in value]
+    return change(value) if key == "file" and isinstance(value, str) else value
+
+
 def _find(name_or_path: str | Path) -> Path:
     path = Path(name_or_path)
     if path.is_file():
@@ -194,20 +206,17 @@ def _apply(content: dict[str, Any], override: str) -> None:
         if not isinstance(target, list | dict):
             raise InputError(f"--set {override!r}: {step!r} lies inside a value that is not a table")
         if depth == len(steps) - 1:
-            target[place] = _absolute(value, step)
+            target[place] = with_files(value, os.path.abspath, step)
         elif isinstance(target, dict):
             target = target.setdefault(step, {})
         else:
             target = target[place]
 
 
-def _absolute(value: Any, key: str) -> Any:
-    """A value under a key with the names of files in it made absolute."""
-    if isinstance(value, dict):
-        return {name: _absolute(inner, key if key == "file" else name) for name, inner in value.items()}
-    if isinstance(value, list):
-        return [_absolute(inner, key) for inner in value]
-    return os.path.abspath(value) if key == "file" and isinstance(value, str) else value
+def _matching(folder: Path, name: str) -> Any:
+    """The name of a file in a folder, or a choice of the files that match it."""
+    found = [] if (folder / name).is_file() else sorted(glob(name, root_dir=folder, recursive=True))
+    return {"choice": found} if found else name
 
 
 def _is_distribution(value: Any) -> bool:

@@ -10,7 +10,7 @@ from synth.calibrate.comparison import Comparison
 from synth.calibrate.frames import Frames
 from synth.calibrate.sensor_fit import SensorFit
 from synth.scene import Dots, Sensor
-from synth.template import Template
+from synth.template import Template, with_files
 
 
 def fitted_content(template: Template, fit: SensorFit, folder: str) -> dict[str, Any]:
@@ -25,21 +25,12 @@ def fitted_content(template: Template, fit: SensorFit, folder: str) -> dict[str,
     given = template.content["sensor"]
     # What no undeformed frame tells keeps the preset's distributions: the pad's mechanics.
     sensor["gel"] = given["gel"]
-    content = {key: _relocated(value, folder) for key, value in template.content.items() if key != "sensor"}
+    content = with_files(template.content, lambda name: str(Path(folder) / name))
+    del content["sensor"]
     content["name"] = f"{template.name}_calibrated"
     content["description"] = f"{template.content.get('description', template.name)} Calibrated."
     ordered: dict[str, Any] = {key: content.pop(key) for key in ("name", "description", "references") if key in content}
     return {**ordered, "sensor": {key: value for key, value in sensor.items() if value not in ((), [])}, **content}
-
-
-def _relocated(value: Any, folder: str) -> Any:
-    """Relative paths of indenters' files, as seen from the fitted scene."""
-    if isinstance(value, dict):
-        return {
-            key: str(Path(folder) / inner) if key == "file" and isinstance(inner, str) else _relocated(inner, folder)
-            for key, inner in value.items()
-        }
-    return [_relocated(inner, folder) for inner in value] if isinstance(value, list) else value
 
 
 def numbers(

@@ -290,7 +290,7 @@ def test_simulate_names_the_scene_file(capsys, tiny: Path, tmp_path: Path) -> No
     indenter = f"contact.indenter={{ shape = 'mesh', file = '{damaged}' }}"
     status = main(["simulate", "--scene", str(tiny), "--out", str(tmp_path / "s"), "--set", indenter])
     assert _complaint(capsys, status).startswith(
-        f"{tiny} with --set contact.indenter: contact.indenter.file = '{damaged}': cannot be read"
+        f"{tiny} with --set contact.indenter: contact.indenter.file = '{damaged}': it cannot be read"
     )
 
 

@@ -17,7 +17,7 @@ def tiny(tmp_path: Path) -> Path:
 
 def test_shipped_scenes_are_known_by_name() -> None:
     flat = "deltact digit fingervision gelsight gelsight_fingertip gelsight_mini gelslim gelstereo omnitact soft_bubble"
-    assert shipped_scenes() == sorted([*flat.split(), "densetact", "tac3d"])
+    assert shipped_scenes() == sorted([*flat.split(), "densetact", "objects", "tac3d"])
     assert load_scene("gelsight_mini").source == SCENES / "gelsight_mini.toml"
 
 
