@@ -4,7 +4,7 @@ Frame of an indenter: its own +z points at the gel. Balls, bars, blocks and ring
 cone at the centre of its rounded tip, a mesh at the centre of its bounding box.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from synth.errors import InputError
 from synth.scene_indenters import Box, Cone, Cylinder, Indenter, MeshIndenter, Sphere, Torus, Vector3
 from synth.simulate.distance import KINDS, SHAPE_LENGTH
 from synth.simulate.object_grid import Grid, rounded
-from synth.simulate.object_surface import Triangles, object_triangles
+from synth.simulate.object_surface import object_triangles
 
 BLUNT_MM = 1.0
 """Smallest radius at which the contact stiffness of `numerics.penalty` is enough."""
@@ -99,7 +99,8 @@ def rigid_body(
         touchable: the part of it that matters; what a mesh has beyond is left out.
 
     Raises:
-        InputError: a fillet or tube too large for its shape; a mesh file that is missing, open or too fine for a grid.
+        InputError: a fillet or tube too large for its shape; a mesh file that is missing, no solid or too
+            fine for a grid.
     """
     if isinstance(indenter, MeshIndenter):
         return _object(indenter, folder or Path(), resolution_mm, touchable)
@@ -154,7 +155,9 @@ def _object(indenter: MeshIndenter, folder: Path, resolution_mm: float, touchabl
     from scipy.ndimage import spline_filter
 
     surface = object_triangles(indenter, folder)
-    turned = Triangles(surface.points @ turned_by(indenter.rotation_deg).T, surface.faces, surface.closed)
+    if indenter.rotation_deg == "any":
+        raise InputError('contact.indenter.rotation_deg = "any": draw a scene first; a body has three angles')
+    turned = replace(surface, points=np.asarray(surface.points @ turned_by(indenter.rotation_deg).T))
     radius = max(indenter.fillet_mm or 0.0, resolution_mm)
     lowest = turned.points.max(axis=0)[2]
     low, high = turned.points.min(axis=0), turned.points.max(axis=0)
@@ -175,8 +178,8 @@ def _object(indenter: MeshIndenter, folder: Path, resolution_mm: float, touchabl
     surface_left = solid.contour(0.0).points
     if len(surface_left) == 0:
         raise InputError(
-            f"contact.indenter.file = {indenter.file!r}: it encloses no volume that the grid's {spacing:.2g} mm resolve "
-            "(a single sheet?); give it a thickness"
+            f"contact.indenter.file = {indenter.file!r}: it encloses no volume that a grid of {spacing:.2g} mm "
+            "resolves; a single sheet needs a thickness"
         )
     shape = np.zeros(SHAPE_LENGTH)
     shape[:8] = [0.0, *solid.corner, spacing, *counts]
@@ -187,7 +190,7 @@ def _object(indenter: MeshIndenter, folder: Path, resolution_mm: float, touchabl
 
 def _spacing(radius_mm: float, extent_mm: FloatArray) -> float:
     """Spacing of a grid over an extent (3,): a share of the radius, coarser where that were too many points."""
-    wanted = radius_mm * CELLS_PER_RADIUS**-1 if radius_mm > 0 else float(extent_mm.max()) / 80
+    wanted = radius_mm / CELLS_PER_RADIUS if radius_mm > 0 else float(extent_mm.max()) / 80
     affordable = float((np.prod(extent_mm + 2 * radius_mm + 8 * wanted) / USUAL_GRID) ** (1 / 3))
     return max(wanted, affordable)
 

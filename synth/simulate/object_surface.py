@@ -35,8 +35,8 @@ class Triangles:
 def object_triangles(indenter: MeshIndenter, folder: Path) -> Triangles:
     """An object's surface in mm, not turned, its bounding box centred on the origin.
 
-    Files have right-handed axes; the scene's are left-handed, because y points down in the image. So y changes its sign:
-    a letter can be read in the picture, a screw keeps its hand.
+    Files have right-handed axes; the scene's are left-handed, because y points down in the image. So y changes its
+    sign: a letter can be read in the picture, a screw keeps its hand.
 
     Args:
         indenter: from the scene.
@@ -58,8 +58,8 @@ def object_triangles(indenter: MeshIndenter, folder: Path) -> Triangles:
     scale = indenter.size_mm / longest if indenter.size_mm is not None else indenter.scale
     if not SHORTEST_MM <= scale * longest <= LONGEST_MM:
         raise InputError(
-            f"contact.indenter.scale = {scale:g}: {indenter.file} is then {scale * longest:.3g} mm long. Is it in metres "
-            "(scale = 1000) or inches (scale = 25.4)? size_mm gives its longest edge instead"
+            f"contact.indenter.scale = {scale:g}: {indenter.file} is then {scale * longest:.3g} mm long. Is it in "
+            "metres (scale = 1000) or inches (scale = 25.4)? size_mm gives its longest edge instead"
         )
     centre = (surface.points.min(axis=0) + surface.points.max(axis=0)) / 2
     return Triangles(scale * (surface.points - centre) * [1, -1, 1], surface.faces[:, ::-1], surface.closed)

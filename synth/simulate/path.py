@@ -18,6 +18,7 @@ import numpy as np
 from synth.arrays import FloatArray
 from synth.mesh.pad import face_height
 from synth.scene import Motion, Scene
+from synth.scene import Pose as PoseOfScene
 from synth.simulate.distance import KINDS
 from synth.simulate.indenter import RigidBody, Touchable, rigid_body, rotation_about
 from synth.simulate.measure import Distance
@@ -169,7 +170,7 @@ def path_of(scene: Scene, folder: FilePath | None = None, resolution_mm: float =
         InputError: the indenter cannot be built.
     """
     motion, gel = scene.motion, scene.sensor.gel
-    poses = [motion, *motion.then]
+    poses: list[Motion | PoseOfScene] = [motion, *motion.then]
     aside = max(float(np.hypot(*np.add(motion.position_mm, pose.shear_mm))) for pose in poses)
     deepest = max(pose.depth_mm for pose in poses) + gel.face_mm(*motion.position_mm)
     touchable = Touchable(float(np.hypot(*gel.size_mm[:2])) / 2 + aside, BULGE * max(deepest, 0.0) + SLACK_MM)

@@ -142,20 +142,8 @@ class Stepper:
     def _rest(self, pose: Pose) -> State:
         nodes, contact = len(self.system.space.points), len(self.system.space.surface_nodes)
         zero = (0.0, 0.0, 0.0)
-        return State(
-            pose.depth_mm,
-            pose.shear_mm,
-            pose.twist_deg,
-            np.zeros((nodes, 3)),
-            np.zeros((contact, 3)),
-            zero,
-            zero,
-            0,
-            0.0,
-            1.0,
-            0.0,
-            0.0,
-        )
+        fields = np.zeros((nodes, 3)), np.zeros((contact, 3))
+        return State(pose.depth_mm, pose.shear_mm, pose.twist_deg, *fields, zero, zero, 0, 0.0, 1.0, 0.0, 0.0)
 
     def _advance(self, active: BoolArray) -> None:
         """One step of every active sample."""
@@ -333,7 +321,10 @@ class Stepper:
         return ~lost
 
     def _control(self, sample: _Sample, target: float, good: bool, iterations: int, relaxed: bool) -> None:
-        """No extrapolation across a relaxed step, which may have jumped. Longer steps after easy ones; half the step after a failure, and the end below the shortest."""
+        """Longer steps after easy ones; half the step after a failure, and the end below the shortest.
+
+        Nothing is extrapolated across a relaxed step, which may have jumped.
+        """
         longest = self.numerics.max_step_mm
         if good:
             taken = target - sample.at

@@ -317,7 +317,7 @@ def test_mesh_scale_and_turn(tmp_path: Path) -> None:
     lying = MeshIndenter(shape="mesh", file="block.stl", scale=2.0, cell_mm=0.1, rotation_deg=(90.0, 0.0, 0.0))
     body = rigid_body(lying, tmp_path)
     assert body.reach_mm == pytest.approx(2.0)  # y is up: half of twice 2 mm
-    distance, _, _ = measure(body, np.array([[1.1, 0.0, 0.0], [0.0, 2.1, 0.0], [0.0, 0.0, 3.1], [0.7, 0.0, 0.0]]))
+    distance, _, _ = measure(body, np.array([[1.1, 0.0, 0.0], [0.0, 3.1, 0.0], [0.0, 0.0, 2.1], [0.7, 0.0, 0.0]]))
     # Away from edges the distance is linear and the spline exact, but for the filter's tail from the edges.
     np.testing.assert_allclose(distance, [0.1, 0.1, 0.1, -0.3], atol=1e-3)
 
@@ -332,8 +332,10 @@ def spoilt(kind: str, folder: Path) -> str:
 
     path = folder / f"{kind}.stl"
     match kind:
-        case "open":
-            pv.Icosphere(radius=1.0).clip("z").extract_surface(algorithm=None).save(path)
+        case "sheet":
+            pv.Plane(i_size=2.0, j_size=2.0).triangulate().save(path)
+        case "metres":
+            pv.Icosphere(radius=0.01).save(path)
         case "garbage":
             path.write_bytes(b"solid nothing\n" + bytes(range(256)))
         case "empty":
@@ -344,7 +346,7 @@ def spoilt(kind: str, folder: Path) -> str:
 
 
 @pytest.mark.parametrize(("kind", "words"), [
-    ("missing", "no file"), ("open", "closed"), ("garbage", "cannot be read as a surface"),
+    ("missing", "no file"), ("sheet", "single sheet"), ("metres", "metres"), ("garbage", "cannot be read as a surface"),
     ("empty", "cannot be read as a surface"), ("fine", "cell_mm"),
 ])  # fmt: skip
 def test_unusable_mesh_is_named(
