@@ -13,7 +13,7 @@ from synth.arrays import FloatArray
 from synth.errors import InputError
 from synth.scene_indenters import Box, Cone, Cylinder, Indenter, MeshIndenter, Sphere, Torus, Vector3
 from synth.simulate.distance import KINDS, SHAPE_LENGTH
-from synth.simulate.object_grid import Grid, rounded
+from synth.simulate.object_grid import Grid
 from synth.simulate.object_surface import object_triangles
 
 BLUNT_MM = 1.0
@@ -23,7 +23,7 @@ LARGEST_GRID = 4_000_000
 """Points of a mesh's distance grid (32 MB)."""
 USUAL_GRID = 250_000
 """Points that a grid has at most by default."""
-CELLS_PER_RADIUS = 2.5
+CELLS_PER_RADIUS = 3.0
 """Spacings of the grid to the radius of the edges."""
 
 
@@ -171,20 +171,20 @@ def _object(indenter: MeshIndenter, folder: Path, resolution_mm: float, touchabl
             f"contact.indenter.cell_mm = {spacing:g}: {indenter.file} needs {counts.prod()} grid points, more than "
             f"{LARGEST_GRID}; use a larger cell_mm"
         )
-    solid = Grid(low - margin, spacing, np.zeros(counts))
-    solid = solid.holding(solid.signed_distance(turned))
+    grid = Grid(low - margin, spacing, (int(counts[0]), int(counts[1]), int(counts[2])))
+    values = grid.signed_distance(turned)
     if radius > 0:
-        solid = rounded(solid, radius)
-    surface_left = solid.contour(0.0).points
-    if len(surface_left) == 0:
+        values = grid.rounded(values, turned, radius)
+    if not (values < 0).any():
         raise InputError(
             f"contact.indenter.file = {indenter.file!r}: it encloses no volume that a grid of {spacing:.2g} mm "
             "resolves; a single sheet needs a thickness"
         )
     shape = np.zeros(SHAPE_LENGTH)
-    shape[:8] = [0.0, *solid.corner, spacing, *counts]
-    coefficients = np.asarray(spline_filter(solid.values, order=3, mode="mirror"), dtype=np.float64)
-    reach = float(surface_left[:, 2].max())
+    shape[:8] = [0.0, *grid.corner, spacing, *counts]
+    coefficients = np.asarray(spline_filter(values, order=3, mode="mirror"), dtype=np.float64)
+    near = values < radius + spacing
+    reach = float((grid.points(near)[:, 2] - values[near]).max())  # of a solid's balls and of those beside it
     return RigidBody(KINDS["mesh"], shape, np.eye(3), reach, coefficients, max(radius, spacing))
 
 
