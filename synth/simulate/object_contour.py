@@ -60,8 +60,8 @@ def sharp_contour(values: FloatArray, corner: FloatArray, spacing: float, planes
 
 def _crossings(inside: BoolArray) -> tuple[np.ndarray, np.ndarray]:
     """Lower ends (n, 3) and axes (n,) of the grid's edges that the contour crosses."""
-    places = [np.argwhere(np.diff(inside, axis=axis)) for axis in range(3)]
-    return np.concatenate(places).astype(np.int64), np.repeat(np.arange(3), [len(part) for part in places])
+    places: list[np.ndarray] = [np.argwhere(np.diff(inside, axis=axis)) for axis in range(3)]
+    return np.concatenate(places), np.repeat(np.arange(3), [len(part) for part in places])
 
 
 def _cells_around(places: np.ndarray, axes: np.ndarray) -> np.ndarray:
@@ -78,7 +78,7 @@ def _nearest_to_planes(points: Points, normals: Points, cell: np.ndarray, count:
     def total(values: FloatArray) -> FloatArray:
         columns = values.reshape(len(values), -1).T
         sums = np.column_stack([np.bincount(cell, weights=column, minlength=count) for column in columns])
-        return sums.reshape(count, *values.shape[1:])
+        return np.asarray(sums, dtype=np.float64).reshape(count, *values.shape[1:])
 
     mean = total(points) / size[:, None]
     offset = np.einsum("na,na->n", normals, points - mean[cell])

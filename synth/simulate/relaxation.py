@@ -15,7 +15,7 @@ import numpy as np
 
 from synth.arrays import BoolArray, FloatArray
 from synth.simulate.contact import Indenters
-from synth.simulate.newton import Solution, relative_residual
+from synth.simulate.newton import Solution, nodal_force, relative_residual
 from synth.simulate.system import System
 from synth.simulate.unknowns import Unknowns
 
@@ -26,8 +26,11 @@ LEAST_VISCOSITY = 1e-3
 """A smaller θ is none."""
 MOST_VISCOSITY = 1e3
 """At this θ a step that errs too much is halved instead."""
+LEAST_SHARE = 1 / 256
 MAX_ERROR, AIM = 0.5, 0.2
 """Largest error of a step that is taken, and what the next θ aims at."""
+LEAST_BORNE = 0.25
+"""A relaxation fails that leaves less than this share of the forces: the body has slipped between contact points."""
 FALL, RISE = 0.1, 6.0
 """Largest change of θ from one step to the next, down and up."""
 
@@ -42,6 +45,7 @@ def relax(
     """Let the active samples come to rest; arguments and result as of `synth.simulate.newton.solve`."""
     state, balance = start, system.balance(start, indenters, active)
     running = active & (balance.smallest_jacobian > 0)
+    borne = LEAST_BORNE * nodal_force(balance)
     converged = np.zeros_like(active)
     iterations = np.zeros(len(active), dtype=int)
     viscosity, share = np.full(len(active), FIRST_VISCOSITY), np.ones(len(active))
@@ -61,7 +65,8 @@ def relax(
         state, balance = trial.where(good, state), after.where(good, balance)
         share = np.where(good, 1.0, np.where(viscosity < MOST_VISCOSITY, share, share / 2))
         viscosity = next_viscosity(viscosity, error)
-        converged |= good & (relative_residual(balance) <= tolerance)
+        running &= ~(good & (nodal_force(balance) < borne)) & (share >= LEAST_SHARE)
+        converged |= running & good & (relative_residual(balance) <= tolerance)
         running &= ~converged
     return Solution(state, balance, converged, iterations, relative_residual(balance))
 

@@ -24,9 +24,8 @@ from synth.simulate.batched.pad import prepare
 from synth.simulate.batched.product import STORED_YEOH, bulk_product, contact_product, store, store_contact
 from synth.simulate.contact import contact_stiffness
 from synth.simulate.element import Element
-from synth.simulate.indenter import rigid_body
 from synth.simulate.material import pad_material, uniform
-from synth.simulate.path import Path
+from synth.simulate.path import path_of
 from synth.simulate.space import function_space
 from synth.simulate.stepping import Stepper
 from synth.simulate.system import System, Unknowns
@@ -65,7 +64,7 @@ def alone(posed: Scene, mesh: PadMesh, folder: FilePath | None = None) -> Trajec
     """As `simulate`, every step to the scene's tolerance."""
     space = function_space(mesh, ELEMENT[posed.numerics.element]())
     body = System(space, pad_material(posed.sensor.gel, mesh), penalty=posed.numerics.penalty)
-    path = Path(posed.motion, rigid_body(posed.contact.indenter, folder, mesh.spacing_mm / (2 * space.element.order)))
+    path = path_of(posed, folder, mesh.spacing_mm / (2 * space.element.order))
     return Stepper(body, [path], [posed.contact.friction], posed.numerics, [0.2], DRIVER).run()[0]
 
 
@@ -173,7 +172,8 @@ def test_the_product_is_the_tangent_times_the_vector(
     body.anchor(zero, bodies, active)
     u = np.where(space.held, 0.0, 0.05 * rng.standard_normal(zero.u.shape))
     state = Unknowns(u, rng.uniform(-4.0, 0.0, zero.p.shape))
-    tangent = dense(body, body.tangent(state, bodies, active))
+    viscosity = np.array([0.7])
+    tangent = dense(body, body.tangent(state, bodies, active, viscosity))
 
     rows = padded(len(body.free))
     tables, faces = bulk_tables(space, uniform(len(mesh.tets), poisson_ratio, stiffening), body.mixed, "cpu"), None
@@ -185,7 +185,8 @@ def test_the_product_is_the_tangent_times_the_vector(
     x[: len(body.free), 0] = rng.standard_normal(len(body.free))
     vector, image = warp_array(x, wp.float32, "cpu"), wp.zeros((rows, 1), dtype=wp.float32, device="cpu")
     displacement, pressure = warp_array(state.u, wp.vec3d, "cpu"), warp_array(state.p, wp.float64, "cpu")
-    wp.launch(store, (len(mesh.tets), 1), inputs=[mask, displacement, pressure, tables], outputs=[stored], device="cpu")
+    inputs = [mask, displacement, pressure, tables, warp_array(viscosity, wp.float64, "cpu")]
+    wp.launch(store, (len(mesh.tets), 1), inputs=inputs, outputs=[stored], device="cpu")
     kernel = bulk_product(space.nodes.shape[1], body.mixed, space.element.stabilisation > 0, any(stiffening))
     inputs = [mask, numbering.single, stored, vector]
     wp.launch(kernel, (len(mesh.tets), 1), inputs=inputs, outputs=[image], device="cpu")

@@ -77,6 +77,8 @@ MAX_STEPS = wp.constant(relaxation.MAX_STEPS)
 FIRST_VISCOSITY = wp.constant(wp.float64(relaxation.FIRST_VISCOSITY))
 LEAST_VISCOSITY = wp.constant(wp.float64(relaxation.LEAST_VISCOSITY))
 MOST_VISCOSITY = wp.constant(wp.float64(relaxation.MOST_VISCOSITY))
+LEAST_SHARE = wp.constant(wp.float64(relaxation.LEAST_SHARE))
+LEAST_BORNE = wp.constant(wp.float64(relaxation.LEAST_BORNE))
 MAX_ERROR, AIM = wp.constant(wp.float64(relaxation.MAX_ERROR)), wp.constant(wp.float64(relaxation.AIM))
 FALL, RISE = wp.constant(wp.float64(relaxation.FALL)), wp.constant(wp.float64(relaxation.RISE))
 
@@ -107,8 +109,10 @@ def _judge_relaxation(slots: Slots, s: int, valid: bool):
         if slots.viscosity[s] >= MOST_VISCOSITY:
             slots.share[s] = wp.float64(0.5) * slots.share[s]
         slots.phase[s] = START
-        if slots.iteration[s] >= MAX_STEPS:
+        if slots.iteration[s] >= MAX_STEPS or slots.share[s] < LEAST_SHARE:
             slots.phase[s] = LOST
+    if slots.phase[s] == SEARCH and slots.trial_force[s] < slots.borne[s]:
+        slots.phase[s] = LOST
     slots.viscosity[s] = _next_viscosity(slots.viscosity[s], error)
 
 
@@ -137,6 +141,8 @@ def judge(slots: Slots, settings: Settings):
         else:
             slots.phase[s] = LOST
         return
+    if phase == START and slots.relaxing[s] == RELAXING and slots.iteration[s] == 0:
+        slots.borne[s] = LEAST_BORNE * slots.trial_force[s]
     if phase == SEARCH and slots.relaxing[s] == RELAXING:
         _judge_relaxation(slots, s, valid)
         if slots.phase[s] != SEARCH:
