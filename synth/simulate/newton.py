@@ -63,12 +63,8 @@ class Solution:
 
 def relative_residual(balance: Balance) -> FloatArray:
     """(B,) norm of the free residual over the norm of all nodal forces, which counts as NOTHING at least."""
-    return np.asarray(np.linalg.norm(balance.free, axis=1) / np.maximum(nodal_force(balance), NOTHING))
-
-
-def nodal_force(balance: Balance) -> FloatArray:
-    """(B,) norm of all nodal forces, those on held nodes included, E mm²."""
-    return np.asarray(np.linalg.norm(balance.reaction.reshape(len(balance.free), -1), axis=1))
+    force = np.linalg.norm(balance.reaction.reshape(len(balance.free), -1), axis=1)
+    return np.asarray(np.linalg.norm(balance.free, axis=1) / np.maximum(force, NOTHING))
 
 
 def solve(

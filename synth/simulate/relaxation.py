@@ -15,9 +15,9 @@ import numpy as np
 
 from synth.arrays import BoolArray, FloatArray
 from synth.simulate.contact import Indenters
-from synth.simulate.newton import Solution, nodal_force, relative_residual
+from synth.simulate.newton import Solution, relative_residual
 from synth.simulate.system import System
-from synth.simulate.unknowns import Unknowns
+from synth.simulate.unknowns import Balance, Unknowns
 
 MAX_STEPS = 300
 FIRST_VISCOSITY = 1.0
@@ -30,7 +30,7 @@ LEAST_SHARE = 1 / 256
 MAX_ERROR, AIM = 0.5, 0.2
 """Largest error of a step that is taken, and what the next θ aims at."""
 LEAST_BORNE = 0.25
-"""A relaxation fails that leaves less than this share of the forces: the body has slipped between contact points."""
+"""A relaxation fails that leaves less than this share of the reaction: the body has slipped between contact points."""
 FALL, RISE = 0.1, 6.0
 """Largest change of θ from one step to the next, down and up."""
 
@@ -45,7 +45,7 @@ def relax(
     """Let the active samples come to rest; arguments and result as of `synth.simulate.newton.solve`."""
     state, balance = start, system.balance(start, indenters, active)
     running = active & (balance.smallest_jacobian > 0)
-    borne = LEAST_BORNE * nodal_force(balance)
+    borne = LEAST_BORNE * _reaction(system, balance)
     converged = np.zeros_like(active)
     iterations = np.zeros(len(active), dtype=int)
     viscosity, share = np.full(len(active), FIRST_VISCOSITY), np.ones(len(active))
@@ -65,10 +65,15 @@ def relax(
         state, balance = trial.where(good, state), after.where(good, balance)
         share = np.where(good, 1.0, np.where(viscosity < MOST_VISCOSITY, share, share / 2))
         viscosity = next_viscosity(viscosity, error)
-        running &= ~(good & (nodal_force(balance) < borne)) & (share >= LEAST_SHARE)
+        running &= ~(good & (_reaction(system, balance) < borne)) & (share >= LEAST_SHARE)
         converged |= running & good & (relative_residual(balance) <= tolerance)
         running &= ~converged
     return Solution(state, balance, converged, iterations, relative_residual(balance))
+
+
+def _reaction(system: System, balance: Balance) -> FloatArray:
+    """(B,) norm of the forces on held nodes, E mm²: what the gel bears, wherever the indenter is by now."""
+    return np.asarray(np.linalg.norm(balance.reaction[:, system.space.held.any(axis=1)], axis=(1, 2)))
 
 
 def next_viscosity(viscosity: FloatArray, error: FloatArray) -> FloatArray:

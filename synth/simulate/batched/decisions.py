@@ -111,7 +111,7 @@ def _judge_relaxation(slots: Slots, s: int, valid: bool):
         slots.phase[s] = START
         if slots.iteration[s] >= MAX_STEPS or slots.share[s] < LEAST_SHARE:
             slots.phase[s] = LOST
-    if slots.phase[s] == SEARCH and slots.trial_force[s] < slots.borne[s]:
+    if slots.phase[s] == SEARCH and slots.trial_borne[s] < slots.borne[s]:
         slots.phase[s] = LOST
     slots.viscosity[s] = _next_viscosity(slots.viscosity[s], error)
 
@@ -142,7 +142,7 @@ def judge(slots: Slots, settings: Settings):
             slots.phase[s] = LOST
         return
     if phase == START and slots.relaxing[s] == RELAXING and slots.iteration[s] == 0:
-        slots.borne[s] = LEAST_BORNE * slots.trial_force[s]
+        slots.borne[s] = LEAST_BORNE * slots.trial_borne[s]
     if phase == SEARCH and slots.relaxing[s] == RELAXING:
         _judge_relaxation(slots, s, valid)
         if slots.phase[s] != SEARCH:

@@ -75,8 +75,8 @@ class Slots:
         trial_norm, trial_force, trial_jacobian: of the trial; trial_moved: of a pass, farthest that a node has gone
             from the solution before it, mm; most_moved: how far it may.
         relaxing: RELAXING while a step is relaxed (`synth.simulate.relaxation`), RELAXED when it was; viscosity: θ of
-            the relaxation, else 0; trial_error: of its step, in units of the residual before; borne: norm of all nodal
-            forces that it must leave.
+            the relaxation, else 0; trial_error: of its step, in units of the residual before; trial_borne, borne: norm
+            of the forces on held nodes, and what it must leave of that.
         failures, done, share: of augmented-Lagrangian passes: those that failed, the shares of the others together, and
             the share of the next; share_now: of the one that begins. While relaxing, share is that of a step.
         keep: whether contact's memory is put aside in this cycle; kept: whether it is put aside; anchor: whether points
@@ -114,6 +114,7 @@ class Slots:
     relaxing: wp.array(dtype=wp.int32)
     viscosity: wp.array(dtype=wp.float64)
     trial_error: wp.array(dtype=wp.float64)
+    trial_borne: wp.array(dtype=wp.float64)
     borne: wp.array(dtype=wp.float64)
     failures: wp.array(dtype=wp.int32)
     done: wp.array(dtype=wp.float64)

@@ -71,13 +71,15 @@ def relaxation_errors(
     right: wp.array2d(dtype=wp.float32),
     slots: Slots,
 ):
-    """One block per slot: the norm of r(u + t δ) - (1 - t) r(u) + t θ L δ over that of r(u), where a slot relaxes.
+    """One block per slot: the norm of r(u + t δ) - (1 - t) r(u) + t θ L δ over that of r(u), and what held
+    nodes bear, where a slot relaxes.
 
     right: (B, at least rows), first -r(u) over its norm, the linear solve's right side.
     """
     s, lane = wp.tid()
     if mask[s] == 0 or slots.relaxing[s] != RELAXING:
         return
+    borne = wp.float64(0.0)
     left = (wp.float64(1.0) - slots.share[s]) * slots.norm[s]
     total = wp.float64(0.0)
     for i in range(lane, force.shape[1], wp.block_dim()):
@@ -85,11 +87,15 @@ def relaxation_errors(
         if row >= 0:
             before = wp.vec3d(wp.float64(right[s, row]), wp.float64(right[s, row + 1]), wp.float64(right[s, row + 2]))
             total += wp.length_sq(force[s, i] + viscous[s, i] + left * before)
+        else:
+            borne += wp.length_sq(force[s, i])
     for i in range(lane, volume.shape[1], wp.block_dim()):
         rest = volume[s, i] + left * wp.float64(right[s, pressure_row[i]])
         total += rest * rest
     total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
+    borne = wp.tile_extract(wp.tile_sum(wp.tile(borne)), 0)
     if lane == 0:
+        slots.trial_borne[s] = wp.sqrt(borne)
         slots.trial_error[s] = wp.sqrt(total) / slots.norm[s]
 
 
