@@ -14,7 +14,8 @@ the loose state, so that it does not depend on which states are corrected.
 
 import warp as wp
 
-from synth.simulate import newton, relaxation, stepping
+from synth.simulate import newton, stepping
+from synth.simulate.batched.relaxing import FIRST_VISCOSITY, LEAST_BORNE, MAX_STEPS, judge_relaxation
 from synth.simulate.batched.slots import (
     ACCEPT,
     ADVANCE,
@@ -73,47 +74,6 @@ HOPELESS = wp.constant(wp.float64(0.5))
 """Newton's method ends after LATE iterations where the relative residual is still so large."""
 NEAR = wp.constant(wp.float64(newton.NEAR))
 SHORT = wp.constant(wp.float64(stepping.RELAXED))
-MAX_STEPS = wp.constant(relaxation.MAX_STEPS)
-FIRST_VISCOSITY = wp.constant(wp.float64(relaxation.FIRST_VISCOSITY))
-LEAST_VISCOSITY = wp.constant(wp.float64(relaxation.LEAST_VISCOSITY))
-MOST_VISCOSITY = wp.constant(wp.float64(relaxation.MOST_VISCOSITY))
-LEAST_SHARE = wp.constant(wp.float64(relaxation.LEAST_SHARE))
-LEAST_BORNE = wp.constant(wp.float64(relaxation.LEAST_BORNE))
-MAX_ERROR, AIM = wp.constant(wp.float64(relaxation.MAX_ERROR)), wp.constant(wp.float64(relaxation.AIM))
-FALL, RISE = wp.constant(wp.float64(relaxation.FALL)), wp.constant(wp.float64(relaxation.RISE))
-
-
-@wp.func
-def _next_viscosity(viscosity: wp.float64, error: wp.float64) -> wp.float64:
-    """`synth.simulate.relaxation.next_viscosity`."""
-    if error <= MAX_ERROR:
-        taken = viscosity * wp.clamp(error / AIM, FALL, RISE)
-        if taken < LEAST_VISCOSITY:
-            return ZERO
-        return taken
-    refused = wp.max(viscosity * wp.clamp(error / AIM, wp.float64(2.0), RISE), LEAST_VISCOSITY)
-    return wp.min(refused, MOST_VISCOSITY)
-
-
-@wp.func
-def _judge_relaxation(slots: Slots, s: int, valid: bool):
-    """A step of a relaxation is taken where it errs little; else the next is shorter, from where this began."""
-    error = wp.float64(1.0e30)
-    if valid and wp.isfinite(slots.trial_error[s]):
-        error = slots.trial_error[s]
-    slots.iteration[s] = slots.iteration[s] + 1
-    if error <= MAX_ERROR:
-        slots.move[s] = TAKE
-        slots.share[s] = ONE
-    else:
-        if slots.viscosity[s] >= MOST_VISCOSITY:
-            slots.share[s] = wp.float64(0.5) * slots.share[s]
-        slots.phase[s] = START
-        if slots.iteration[s] >= MAX_STEPS or slots.share[s] < LEAST_SHARE:
-            slots.phase[s] = LOST
-    if slots.phase[s] == SEARCH and slots.trial_borne[s] < slots.borne[s]:
-        slots.phase[s] = LOST
-    slots.viscosity[s] = _next_viscosity(slots.viscosity[s], error)
 
 
 @wp.kernel
@@ -144,7 +104,7 @@ def judge(slots: Slots, settings: Settings):
     if phase == START and slots.relaxing[s] == RELAXING and slots.iteration[s] == 0:
         slots.borne[s] = LEAST_BORNE * slots.trial_borne[s]
     if phase == SEARCH and slots.relaxing[s] == RELAXING:
-        _judge_relaxation(slots, s, valid)
+        judge_relaxation(slots, s, valid)
         if slots.phase[s] != SEARCH:
             return
     elif phase == SEARCH:
