@@ -20,7 +20,7 @@ from synth.render.variant import Variant
 from synth.sampling import check_pairs, draw
 from synth.scene import Scene
 from synth.scene_indenters import MeshIndenter
-from synth.simulate.indenter import rigid_body
+from synth.simulate.indenter import object_radius, rigid_body
 from synth.simulate.material import DISPLACEMENT_ONLY_BELOW
 from synth.simulate.object_surface import object_triangles
 from synth.simulate.path import TWIST_ARM_MM
@@ -199,10 +199,22 @@ def _meshes(template: Template) -> _Meshes:
     text = f"{min(across)} to {max(across)} elements across the contact, {min(spacings):.2g} to {max(spacings):.2g} mm"
     if numerics.solver == "batched":
         text = " x ".join(map(str, numerics.cells)) + f" elements for all draws of a pad, {text}"
+    radii = [_edge_radius(drawn, resolution) for drawn, resolution in found]
+    rounded = [radius for radius in radii if radius is not None]
+    if rounded:
+        text += f", edges of objects rounded to {min(rounded):.2g} to {max(rounded):.2g} mm"
     order = 1 if numerics.element == "p1p1" else VERTICES_TO_P2
     draws = tuple((drawn, round(order * len(resolution.mesh.points))) for drawn, resolution in found)
     target = numerics.target_error_px or DEFAULT_TARGET_PX
     return _Meshes(draws, text, (float(np.median(errors)), max(errors)), target)
+
+
+def _edge_radius(scene: Scene, resolution: Resolution) -> float | None:
+    """Of a mesh indenter's edges, mm."""
+    indenter, order = scene.contact.indenter, 1 if scene.numerics.element == "p1p1" else 2
+    if not isinstance(indenter, MeshIndenter):
+        return None
+    return object_radius(indenter, resolution.mesh.spacing_mm / (2 * order))
 
 
 def _tetwild_nodes(scene: Scene) -> int:

@@ -41,6 +41,7 @@ class Developed:
         states, frames: by frame number, all that the pairs show.
         mesh: its hash.
         element: its name.
+        edge_radius_mm: of a mesh indenter's edges, else None.
         accuracy: of the mesh for this draw; None where it is left to whoever finishes the samples.
         failures: draws that failed before this one.
         seconds: wall time of the stages so far, per pair.
@@ -54,6 +55,7 @@ class Developed:
     frames: Mapping[int, Frame]
     mesh: str
     element: str
+    edge_radius_mm: float | None
     accuracy: Accuracy | None
     failures: tuple[Failure, ...]
     seconds: Mapping[str, float]
@@ -83,12 +85,14 @@ def finish(place: Workplace, developed: Developed) -> Outcome:
 
 def _diagnostics(developed: Developed, folder: Path) -> dict[str, Any]:
     """What is said of the mesh."""
+    rounded = {} if developed.edge_radius_mm is None else {"edge_radius_mm": round(developed.edge_radius_mm, 4)}
     found = developed.accuracy or accuracy(developed.scene, folder)
     return {
         "mesh": developed.mesh,
         "element": developed.element,
         "elements_across_contact": found.across,
         "predicted_error_px": None if np.isnan(found.error_px) else round(found.error_px, 4),
+        **rounded,
     }
 
 

@@ -12,8 +12,10 @@ from synth.produce.finishing import Developed, finish
 from synth.produce.records import Outcome, Workplace
 from synth.produce.studio import Studio
 from synth.sampling import draw_sensor, sensor_of
+from synth.scene_indenters import MeshIndenter
 from synth.simulate import Trajectory, simulate
 from synth.simulate.batched.pad import Pad
+from synth.simulate.indenter import object_radius
 from synth.simulate.shared import Accuracy
 
 
@@ -69,7 +71,8 @@ def develop(studio: Studio, solved: Solved, texture: Future[Image] | None = None
     surface = studio.surface_of(drawn.scene, solved.space)
     displacements = {frame: state.displacement for frame, state in solved.states.items()}
     frames = studio.frames(drawn.scene, drawn.trajectory, drawn.sensor, surface, displacements, texture)
-    count = len(drawn.pairs)
+    count, indenter = len(drawn.pairs), drawn.scene.contact.indenter
+    rounded = object_radius(indenter, solved.space.resolution_mm) if isinstance(indenter, MeshIndenter) else None
     return Developed(
         trajectory=drawn.trajectory,
         scene=drawn.scene,
@@ -79,6 +82,7 @@ def develop(studio: Studio, solved: Solved, texture: Future[Image] | None = None
         frames=frames,
         mesh=drawn.mesh.hash,
         element=solved.space.element.name,
+        edge_radius_mm=rounded,
         accuracy=None if drawn.resolution is None else Accuracy.of(drawn.resolution),
         failures=solved.failures,
         seconds={"simulate": solved.seconds / count, "render": (time.perf_counter() - started) / count},

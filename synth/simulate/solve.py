@@ -81,8 +81,7 @@ def stepper_of(
         single=driver.single_precision,
         keep=driver.keep_factors,
     )
-    resolved = mesh.spacing_mm / (2 * space.element.order)
-    paths = [path_of(scene, folder, resolved) for scene in scenes]
+    paths = [path_of(scene, folder, space.resolution_mm) for scene in scenes]
     moduli = [scene.sensor.gel.youngs_modulus_kpa / 1000 for scene in scenes]
     friction = [scene.contact.friction for scene in scenes]
     return Stepper(system, paths, friction, first.numerics, moduli, driver, frames)

@@ -102,5 +102,5 @@ def job_of(scene: Scene, pad: Pad, folder: FilePath | None = None) -> Job:
     Raises:
         InputError: the indenter cannot be built.
     """
-    path = path_of(scene, folder, pad.mesh.spacing_mm / (2 * pad.space.element.order))
+    path = path_of(scene, folder, pad.space.resolution_mm)
     return Job(path, scene.contact.friction, scene.sensor.gel.youngs_modulus_kpa / 1000)
