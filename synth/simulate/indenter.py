@@ -32,6 +32,8 @@ LARGEST_GRID = 4_000_000
 """Points of a mesh's distance grid (32 MB)."""
 USUAL_GRID = 250_000
 """Points that a grid has at most by default."""
+MOST_MISSING = 1 / 3
+"""Largest share of a closed surface that is made up where a file has holes: half a sphere lacks a quarter."""
 CELLS_PER_RADIUS = 3.0
 """Spacings of the grid to the radius of the edges."""
 
@@ -183,6 +185,12 @@ def _object(indenter: MeshIndenter, folder: Path, resolution_mm: float, touchabl
         )
     grid = Grid(low - margin, spacing, (int(counts[0]), int(counts[1]), int(counts[2])))
     values = grid.signed_distance(turned)
+    missing = 0.0 if turned.closed else grid.missing(values)
+    if missing > MOST_MISSING:
+        raise InputError(
+            f"contact.indenter.file = {indenter.file!r}: it is an open sheet, {missing:.0%} of a closed surface would "
+            "have to be made up; give it a thickness"
+        )
     if radius > 0:
         values = grid.rounded(values, turned, radius)
     if not (values < 0).any():

@@ -31,6 +31,10 @@ BAND = 2.0
 LOST = 1.25
 """What an opening by r leaves out farther than this times r is a thin part or a sharp tip. A right-angled edge loses
 0.41 r, its corner 0.73 r, a tetrahedron's edge 0.73 r and its corner 2 r."""
+TWICE = 1.5
+"""A winding number above this is that of a place within two shells."""
+TOUCHING_MM = 1e-4
+"""Points that are nearer to a surface have its normal for the gradient of their distance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,15 +61,35 @@ class Grid:
 
         A closed surface lies between two neighbouring samples of different sign: winding numbers, which take ten times
         as long as distances, are then found near it alone, and the signs of others are those next to them toward +z.
+        Where shells overlap, faces of one lie within another: distances are then those from a contour around all.
         """
         nearest, everywhere = Nearest(surface, winding=True), np.ones(self.counts, dtype=bool)
         away = self.distance(nearest, everywhere)
         known = away < 2 * self.spacing if surface.closed else everywhere
         sign = np.ones((*self.counts[:2], self.counts[2] + 1))  # beyond the last sample is outside
-        sign[:, :, :-1][known] = nearest.signs(self.points(known))
+        near = self.points(known)
+        sign[:, :, :-1][known] = nearest.signs(near)
         above = np.where(known, np.arange(self.counts[2]), self.counts[2])
         above = np.minimum.accumulate(above[:, :, ::-1], axis=2)[:, :, ::-1]
-        return np.asarray(away * np.take_along_axis(sign, above, axis=2))
+        values = np.asarray(away * np.take_along_axis(sign, above, axis=2))
+        if (nearest.signs(near, TWICE) > 0).all():
+            return values
+        outer = sharp_contour(values, self.corner, self.spacing, nearest.depth)
+        return np.where(values < 0, -1.0, 1.0) * self.distance(Nearest(outer), everywhere)
+
+    def missing(self, values: FloatArray) -> float:
+        """The share of the boundary of what is inside that is far from the surface: where holes were closed.
+
+        Args:
+            values: samples of the signed distance. Across a surface two neighbours are at most a spacing apart.
+        """
+        crossings = holes = 0
+        for axis, count in enumerate(self.counts):
+            here, there = (np.take(values, range(k, count - 1 + k), axis) for k in (0, 1))
+            crossing = (here < 0) != (there < 0)
+            crossings += int(crossing.sum())
+            holes += int((crossing & (np.abs(here) + np.abs(there) > 2 * self.spacing)).sum())
+        return holes / max(crossings, 1)
 
     def rounded(self, values: FloatArray, surface: Triangles, radius_mm: float) -> FloatArray:
         """A solid's signed distance after its edges and notches are rounded; see the module's docstring.
@@ -103,10 +127,8 @@ class Grid:
 
             def inner(points: Points, radius: float = radius_mm) -> tuple[FloatArray, Points]:
                 """The signed distance of points inside plus the radius, and its gradient."""
-                nearest, normal = surface(points)
-                away = np.linalg.norm(nearest - points, axis=1)
-                toward = (nearest - points) / np.maximum(away, 1e-9)[:, None]
-                return radius - away, np.where(away[:, None] < 1e-3 * self.spacing, normal, toward)
+                depth, gradient = surface.depth(points)
+                return radius + depth, gradient
 
             core = np.where(near, values + radius_mm, np.maximum(values + radius_mm, self.spacing))
             contour = sharp_contour(core, self.corner, self.spacing, inner)
@@ -143,10 +165,17 @@ class Nearest:
         wp.launch(_nearest, len(points), inputs=inputs, outputs=[found, normal], device="cpu")
         return found.numpy().astype(np.float64), normal.numpy().astype(np.float64)
 
-    def signs(self, points: Points) -> FloatArray:
-        """-1 for points (n, 3) inside, where the winding number is above one half, else 1."""
+    def depth(self, points: Points) -> tuple[FloatArray, Points]:
+        """The signed distance of points (n, 3) that are inside, and its gradient."""
+        nearest, normal = self(points)
+        away = np.linalg.norm(nearest - points, axis=1)
+        toward = (nearest - points) / np.maximum(away, TOUCHING_MM)[:, None]
+        return -away, np.where(away[:, None] < TOUCHING_MM, normal, toward)
+
+    def signs(self, points: Points, least: float = 0.5) -> FloatArray:
+        """-1 for points (n, 3) inside, where the winding number is above the least, else 1."""
         found = wp.empty(len(points), dtype=wp.float32, device="cpu")
-        inputs = [self._mesh.id, wp.array(points.astype(np.float32), dtype=wp.vec3, device="cpu")]
+        inputs = [self._mesh.id, wp.array(points.astype(np.float32), dtype=wp.vec3, device="cpu"), least]
         wp.launch(_signs, len(points), inputs=inputs, outputs=[found], device="cpu")
         return found.numpy().astype(np.float64)
 
@@ -165,6 +194,6 @@ def _nearest(
 
 
 @wp.kernel
-def _signs(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), found: wp.array(dtype=wp.float32)):
+def _signs(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), least: float, found: wp.array(dtype=wp.float32)):
     i = wp.tid()
-    found[i] = wp.mesh_query_point_sign_winding_number(mesh, points[i], FARTHEST).sign
+    found[i] = wp.mesh_query_point_sign_winding_number(mesh, points[i], FARTHEST, 2.0, least).sign

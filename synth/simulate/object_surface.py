@@ -85,11 +85,11 @@ def _read(path: Path, changed_ns: int) -> Triangles:
         shells = surface.connectivity("all").cell_data["RegionId"]
     points = np.asarray(surface.points, dtype=np.float64)
     faces = np.array(surface.faces.reshape(-1, 4)[:, 1:], dtype=np.int64)
-    for shell in range(int(shells.max()) + 1):
-        part = shells == shell
-        corners = points[faces[part]] - points[faces[part]].mean(axis=(0, 1))
-        if np.linalg.det(corners).sum() < 0:
-            faces[part] = faces[part][:, ::-1]
+    corners, sizes = points[faces], np.bincount(shells)
+    centres = np.stack([np.bincount(shells, corners[:, :, k].mean(axis=1)) / sizes for k in range(3)], axis=-1)
+    volumes = np.bincount(shells, np.linalg.det(corners - centres[shells][:, None]))
+    inverted = volumes[shells] < 0
+    faces[inverted] = faces[inverted][:, ::-1]
     return Triangles(points, faces, surface.n_open_edges == 0)
 
 
