@@ -16,6 +16,8 @@ FLAT = 0.05
 """Directions in which the planes' normals vary less, as a share of the largest eigenvalue, do not place a vertex."""
 OUTSIDE = 1.0
 """Cells that a vertex may lie outside its own: there are tips that cross no edge of the cell that they end in."""
+FAR_MM = 1e3
+"""Samples are cut off here: those of a function that is known near its contour alone are infinite."""
 Planes = Callable[[Points], tuple[FloatArray, Points]]
 """Values (n,) mm and unit gradients (n, 3) of a distance function at points (n, 3)."""
 
@@ -38,7 +40,7 @@ def sharp_contour(values: FloatArray, corner: FloatArray, spacing: float, planes
     if len(places) == 0:
         return Triangles(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64), True)
     along = np.eye(3, dtype=np.int64)[axes]
-    here, there = values[tuple(places.T)], values[tuple((places + along).T)]
+    here, there = (np.clip(values[tuple(at.T)], -FAR_MM, FAR_MM) for at in (places, places + along))
     points = corner + spacing * (places + (here / (here - there))[:, None] * along)
     value, normal = planes(points)
     smooth = np.abs(value) < spacing
