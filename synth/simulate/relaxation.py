@@ -20,6 +20,7 @@ from synth.simulate.system import System
 from synth.simulate.unknowns import Balance, Unknowns
 
 MAX_STEPS = 300
+"""See docs/reports/objects.md: with 100 a fifteenth of the presses of objects ended early, with 1000 time is lost."""
 FIRST_VISCOSITY = 1.0
 """θ of the first step: the viscous stress of a step is then the elastic one of its strain."""
 LEAST_VISCOSITY = 1e-3

@@ -7,7 +7,10 @@ import pytest
 from scipy import stats
 from tiny_scene import write_tiny
 
+from synth.dataset.reader import read_dataset
 from synth.errors import InputError
+from synth.generate import generate, job_variant
+from synth.plan import plan
 from synth.sampling import draw, draw_sensor
 from synth.scene_indenters import MeshIndenter
 from synth.simulate.indenter import turned_by
@@ -103,3 +106,11 @@ def test_scene_draws_every_object_upright_and_in_any_orientation() -> None:
     upright = np.mean([indenter.rotation_deg[:2] == (0.0, 0.0) for indenter in indenters])
     assert upright == pytest.approx(0.5, abs=5 * 0.5 / np.sqrt(400))  # five standard deviations
     assert indenters == drawn_indenters(load_scene("objects"), 400)
+
+
+def test_plan_and_samples_tell_how_edges_are_rounded(tiny: Path, tmp_path: Path) -> None:
+    body = f'{{ shape = "mesh", file = "{SCENES / "objects" / "washer.stl"}", size_mm = 4.0, fillet_mm = 0.9 }}'
+    template = load_scene(tiny, [f"contact.indenter={body}", "numerics={ target_error_px = 3.0 }"])
+    assert "edges of objects rounded to 0.9 to 0.9 mm" in plan(template, job_variant(template, "cpu")).resolution
+    generate(template, 1, tmp_path / "data")
+    assert read_dataset(tmp_path / "data").entry(0).diagnostics["edge_radius_mm"] == 0.9
