@@ -54,9 +54,9 @@ def measure(path: Path, cases: Iterable[Row], one: Callable[[Row], Row | list[Ro
     found: dict[tuple[str, ...], list[Row]] = {}
     for row in rows:
         found.setdefault(_key(row, keys), []).append(row)
-    missing = [case for case in wanted if _key(case, keys) not in found]
+    missing = list({_key(case, keys): case for case in wanted if _key(case, keys) not in found}.values())
     if len(missing) < len(wanted):
-        print(f"{path}: {len(wanted) - len(missing)} of {len(wanted)} cases are there already", file=sys.stderr)
+        print(f"{path}: {len(missing)} of {len(wanted)} cases are still to be measured", file=sys.stderr)
 
     def add(case: Row, columns: Row | list[Row]) -> None:
         new = [{**case, **each} for each in (columns if isinstance(columns, list) else [columns])]
