@@ -2,7 +2,7 @@
 # Most measurements of docs/reports/h200.md on one GPU: sh docs/h200.sh OUT [PAIRS [REAL]]
 #
 # PAIRS is a folder of folders of pairs (docs/test_set.sh), REAL one of real pairs: for the times of `compare`, left out without them.
-# Each part writes its JSON, log or table into OUT; a part that OUT holds is not run again. CORES (default 0-15) are
+# Each part writes its log or table into OUT; a part that OUT holds is not run again. CORES (default 0-15) are
 # the cores that generate may use, SHARDS (default "4:3 2:7") processes on the GPU and workers of each; the data go to /dev/shm.
 set -eu
 out=$1 pairs=${2:-} real=${3:-}
@@ -35,22 +35,22 @@ shards() { # processes, workers: 1,000 pairs; a line a second: seconds, pairs th
     rm -rf "$data"
 }
 
-presses="python -m synth.bench.batched --across 16 12 --through 2 --growth 2.5 --radii 3 6 --step 0.334 --closer 0.1"
+presses="python -m benchmarks batched --cells 16 12 2 --growth 2.5 --radii 3 6 --step 0.334 --closer 0.1 --out $out"
 # shellcheck disable=SC2086 # several words
 {
-    part presses_fast.jsonl $presses --forcing 0.03 --loose 1e-2 --batch 2048 2048 1024 --seconds 36
-    part presses_tight.jsonl $presses --forcing 0.03 --batch 1024 2048 --seconds 36
-    part presses.jsonl $presses --batch 1024 --seconds 36
+    part presses_fast.log $presses --forcing 0.03 --loose 1e-2 --batch 1024 2048 --runs 2
+    part presses_tight.log $presses --forcing 0.03 --batch 1024 2048
+    part presses.log $presses --batch 1024
 }
 for each in ${SHARDS:-4:3 2:7}; do part "shards_${each%:*}.log" shards "${each%:*}" "${each#*:}"; done
-agreement="python -m synth.bench.agreement --processes ${PROCESSES:-16}"
+agreement="python -m benchmarks agreement --processes ${PROCESSES:-16} --out $out"
 # shellcheck disable=SC2086 # several words
 for mesh in 6x4x2:256 10x8x2:128 16x12x2:64; do
     cells=${mesh%:*}
-    part "agreement_$cells.json" $agreement --cells $(echo "$cells" | tr x ' ') --trajectories "${mesh#*:}"
+    part "agreement_$cells.log" $agreement --cells $(echo "$cells" | tr x ' ') --trajectories "${mesh#*:}"
 done
 # shellcheck disable=SC2086 # several words
-part agreement_failing.json $agreement --trajectories 64 \
+part agreement_failing.log $agreement --trajectories 64 \
     --set motion.depth_mm=2.6 --set contact.friction=1.2 --set motion.twist_deg=40
 part cuda_tests.log python -m pytest -m cuda
 R="--device cuda --methods none --weights best --registration none --registration motion --registration both --registration brightness"

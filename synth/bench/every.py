@@ -22,9 +22,8 @@ class Bench:
     arguments: tuple[str, ...] = ()
 
 
-BENCHES = (Bench("flow", 2), Bench("light", 2), Bench("scale", 5), Bench("render", 9), Bench("fem", 45))
+BENCHES = (Bench("flow", 2), Bench("light", 2), Bench("scale", 5), Bench("render", 9))
 """The shortest first."""
-LEFT_OUT = {"budget": "hours for each scene; it can be interrupted and goes on"}
 
 
 def run_all(out: Path, as_json: bool) -> int:
@@ -47,8 +46,6 @@ def run_all(out: Path, as_json: bool) -> int:
         out.mkdir(parents=True, exist_ok=True)
     parts = ", ".join(f"{bench.name} {bench.minutes:g} min" for bench in BENCHES)
     _say(f"{parts}: {sum(bench.minutes for bench in BENCHES):g} min on two idle cores")
-    for name, reason in LEFT_OUT.items():
-        _say(f"left out: {name} ({reason}): python -m synth bench {name}")
     answer = {}
     for number, bench in enumerate(BENCHES, 1):
         _say(f"bench {bench.name} ({number} of {len(BENCHES)})")

@@ -182,7 +182,6 @@ def test_bench_all_goes_on(tmp_path: Path, capfd: pytest.CaptureFixture[str], mo
     assert {name: one["status"] for name, one in answer.items()} == {"light": 2, "flow": 0}
     assert (out / "flow" / "flow.md").exists()
     assert "light 3 min, flow 0.5 min: 3.5 min" in said.err
-    assert "python -m synth bench budget" in said.err
     assert "there is no scene 'no_such'" in said.err
     monkeypatch.setattr(every, "BENCHES", ())
     assert main(["bench", "all", "--out", str(out)]) == 0
@@ -190,7 +189,7 @@ def test_bench_all_goes_on(tmp_path: Path, capfd: pytest.CaptureFixture[str], mo
 
 def test_bench_all_knows_every_benchmark() -> None:
     names = {name for name in bench if not name.startswith("-")}
-    assert {one.name for one in every.BENCHES} | set(every.LEFT_OUT) | {"all"} == names
+    assert {one.name for one in every.BENCHES} | {"all"} == names
 
 
 def test_bench_light_has_a_scene_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,112 @@
+"""The benchmarks' table: a repeated run measures only what is missing, and a killed one leaves whole rows."""
+
+import math
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks.__main__ import QUESTIONS, main
+from benchmarks.rows import Row, machine, measure, plot, read, show, write
+
+CASES = [{"mesh": name, "cells": cells, "step_mm": None} for name in ("fine", "1e-3") for cells in (1, 2)]
+"""One name reads like a number, and a key without a value is a key too."""
+
+
+def square(case: Row) -> Row:
+    """A measurement."""
+    return {"square": case["cells"] ** 2, "root": math.sqrt(case["cells"])}
+
+
+def no_measurement(case: Row) -> Row:
+    """A case that should not be measured."""
+    raise AssertionError(case)
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_only_missing_cases_are_measured(tmp_path: Path, workers: int) -> None:
+    path = tmp_path / "out" / "rows.csv"
+    first = measure(path, CASES[:2], square)
+    rows = measure(path, CASES, square, workers)
+    assert rows[:2] == first
+    assert [(row["cells"], row["square"]) for row in rows] == [(1, 1), (2, 4), (1, 1), (2, 4)]
+    again = measure(path, CASES[::-1], no_measurement)
+    assert [row["root"] for row in again] == [row["root"] for row in rows[::-1]], "floats come back bit for bit"
+    assert measure(path, CASES[:1], no_measurement)[0]["square"] == 1
+    assert len(read(path)) == 4, "rows that are not asked for stay"
+    assert measure(path, [], square) == []
+    twice = measure(path, [{**CASES[0], "cells": 3}] * 2, square)
+    assert [row["square"] for row in twice] == [9, 9]
+    assert len(read(path)) == 5, "a case that is asked for twice is measured once"
+
+
+def test_a_case_may_have_several_rows(tmp_path: Path) -> None:
+    several = [{"state": state, "root": state**0.5} for state in (1, 2)]
+    rows = measure(tmp_path / "rows.csv", CASES[:1], lambda case: several)
+    assert rows == [{**CASES[0], **row} for row in several]
+    assert measure(tmp_path / "rows.csv", CASES[:1], no_measurement) == rows
+
+
+def test_a_killed_run_leaves_whole_rows(tmp_path: Path) -> None:
+    """Killed while the file is being written: no half row is taken for a case."""
+    path = tmp_path / "rows.csv"
+    program = f"""
+import os, signal
+from pathlib import Path
+from benchmarks import rows
+real = rows.csv.DictWriter.writerows
+def killed(self, some):
+    real(self, some)
+    if len(some) == 3:
+        self.writer.writerow(["fi"])
+        os.kill(os.getpid(), signal.SIGKILL)
+rows.csv.DictWriter.writerows = killed
+cases = {CASES!r}
+rows.measure(Path({str(path)!r}), cases, lambda case: {{"square": case["cells"] ** 2, "root": case["cells"] ** 0.5}})
+"""
+    paths = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    assert subprocess.run([sys.executable, "-c", program], env=paths, capture_output=True).returncode == -signal.SIGKILL
+    assert len(read(path)) == 2
+    measured: list[Row] = []
+    rows = measure(path, CASES, lambda case: measured.append(case) or square(case))  # type: ignore[func-returns-value]
+    assert measured == CASES[2:]
+    assert [row["square"] for row in read(path)] == [row["square"] for row in rows] == [1, 4, 1, 4]
+
+
+def test_values_come_back(tmp_path: Path) -> None:
+    rows = [{"a": 1, "b": 0.1, "c": True, "d": "x, y"}, {"a": -2, "e": False, "f": 'say "no"'}]
+    write(tmp_path / "rows.csv", rows)
+    assert read(tmp_path / "rows.csv") == rows
+    assert read(tmp_path / "none.csv") == []
+    write(tmp_path / "rows.csv", [{"a": math.nan, "b": None}])
+    assert math.isnan(read(tmp_path / "rows.csv")[0]["a"])
+
+
+def test_table_and_plot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = [{"case": "held", "s": 1.23456, "error": 0.5, "mesh": "fine"}, {"case": "held", "s": math.nan, "mesh": None}]
+    show(rows, ["mesh", "s"], "Held")
+    shown = capsys.readouterr().out
+    assert "Held" in shown
+    assert [line.split() for line in shown.strip().splitlines()[-2:]] == [
+        ["|", "fine", "|", "1.235", "|"],
+        ["|", "-", "|", "-", "|"],
+    ]
+    for panel in ("", "case"):
+        plot(tmp_path / "plots" / f"{panel}.png", rows, "s", "error", "mesh", panel)
+    plot(tmp_path / "plots" / "nothing.png", [], "s", "error", "mesh")
+    assert all(path.stat().st_size > 1000 for path in (tmp_path / "plots").iterdir())
+    assert "cores" in machine()
+
+
+def test_names_and_wrong_input(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        main(["--help"])
+    assert left.value.code == 0
+    told = capsys.readouterr().out
+    assert all(name in told for name in QUESTIONS)
+    with pytest.raises(SystemExit) as left:
+        main(["nothing"])
+    assert left.value.code == 2
