@@ -347,11 +347,7 @@ def test_simulate_replaces_its_own_files_and_no_other(capsys, tiny: Path, tmp_pa
     ("command", "name"),
     [
         (["bench", "fem", "--quick"], "fem.md"),
-        (["bench", "flow"], "flow.png"),
-        (["bench", "light"], "light.md"),
-        (["bench", "scale"], "scale.csv"),
         (["bench", "budget"], "budget.png"),
-        (["bench", "render"], "render.csv"),
         (["stress"], "stress.json"),
     ],
 )
