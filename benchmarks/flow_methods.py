@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.pressed_gel import View, resized, without_window
+from benchmarks.pressed_gel import View, main_camera, without_window
 from synth.arrays import BoolArray, FloatArray, Pixels, Points
 from synth.flow.exact import exact_flow
 from synth.flow.field import FlowArray
@@ -57,7 +57,7 @@ def sparse(view: View, step: int) -> Generator:
 
     camera = view.sensor.camera
     size = camera.width, camera.height
-    small = resized(view.sensor, (max(16, camera.width // step), max(16, camera.height // step)))
+    small = main_camera(view.sensor, 1 / step)
     scale = np.array(size) / (small.camera.width, small.camera.height)
     coarse = traced(view, sensor=small)
 

@@ -20,7 +20,7 @@ from gelflow.baselines.registry import named_methods
 from synth.arrays import Image
 from synth.cli_options import DEFAULT_SCENE
 from synth.generate import job_variant
-from synth.render.renderer import Renderer
+from synth.render.renderer import Renderer, full_grid
 from synth.render.variant import Variant
 from synth.scene import Render
 from synth.template import load_scene
@@ -53,7 +53,8 @@ def main(argv: list[str]) -> int:
             pressed.view(SCALE), job_variant(template, given.device), pressed.scene.render, given.reference
         )
         own = pressed.scene.render.samples_per_pixel
-        lights = [("path_traced", PATH_TRACED_SAMPLES if own == "auto" else own)]
+        count = sum(light.power > 0 for light in pressed.scene.sensor.lights)
+        lights = [("path_traced", full_grid(PATH_TRACED_SAMPLES if own == "auto" else own, count))]
         lights += [("separated", n) for n in SEPARATED_SAMPLES]
         settings = [{**common, "light": light, "samples": n} for light, n in lights]
         cases = [{**setting, "state": state} for setting in settings for state in STATES]

@@ -55,9 +55,7 @@ class Press:
 
     def view(self, scale: float = 1.0) -> View:
         """The press in the scene's main camera, whose image is `scale` times as large in each direction."""
-        camera = self.scene.sensor.camera
-        size = (max(16, round(scale * camera.width)), max(16, round(scale * camera.height)))
-        sensor = resized(self.scene.sensor.model_copy(update={"further_cameras": ()}), size)
+        sensor = main_camera(self.scene.sensor, scale)
         texture = albedo(sensor, stream(self.template, self.seed, "pattern", 0), self.template.source.parent)
         return View(sensor, texture, self.surface, self.pressed)
 
@@ -90,15 +88,16 @@ def without_window(sensor: Sensor) -> Sensor:
     return sensor.model_copy(update={"window": sensor.window.model_copy(update={"refractive_index": 1.0})})
 
 
-def resized(sensor: Sensor, size: tuple[int, int]) -> Sensor:
-    """A sensor whose main camera has an image of another size (width, height); the field of view stays.
+def main_camera(sensor: Sensor, scale: float) -> Sensor:
+    """A sensor with its main camera only, whose image is `scale` times as large in each direction; same field of view.
 
     Raises:
         InputError: The schema does not allow the size.
     """
-    content = sensor.model_dump()
+    content = sensor.model_dump() | {"further_cameras": ()}
     camera = content["camera"]
-    for new, side, axis in zip(size, ("width", "height"), "xy", strict=True):
-        scale = new / camera[side]
-        camera |= {side: new, f"f{axis}": camera[f"f{axis}"] * scale, f"c{axis}": camera[f"c{axis}"] * scale}
-    return validated(content, f"an image of {size[0]} x {size[1]} px", Sensor, "sensor")
+    for side, axis in (("width", "x"), ("height", "y")):
+        size = max(16, round(scale * camera[side]))
+        factor = size / camera[side]
+        camera |= {side: size, f"f{axis}": camera[f"f{axis}"] * factor, f"c{axis}": camera[f"c{axis}"] * factor}
+    return validated(content, f"an image scaled by {scale:g}", Sensor, "sensor")

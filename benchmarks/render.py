@@ -8,15 +8,16 @@ left.
 Formulas: benchmarks/image_error.py, benchmarks/flow_change.py. Levels are of 255.
 """
 
+from argparse import Namespace
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 
 from benchmarks.flow_change import Images, Truth, changes
 from benchmarks.image_error import LEVELS, Halves, camera_noise, errors, reference_noise, rendered
-from benchmarks.pressed_gel import View, press, resized, without_window
+from benchmarks.pressed_gel import Press, main_camera, press, without_window
 from benchmarks.rows import Row, arguments, machine, measure, plot, show
 from gelflow.baselines.registry import named_methods
 from synth.cli_options import DEFAULT_SCENE
@@ -67,41 +68,118 @@ def settings(names: Sequence[str], lights: int, own_depth: int, reference: int) 
     return [dict(zip(("variant", "window", "max_depth", "samples"), one, strict=True)) for one in dict.fromkeys(found)]
 
 
-def image_row(view: View, setting: Row, variant: Variant, reference: Halves, seed: int) -> Row:
-    """Errors and time of the pressed gel's image with one of `settings`."""
-    if not setting["window"]:
-        view = replace(view, sensor=without_window(view.sensor))
-    renderer = view.renderer(variant, _path_traced(setting["samples"], setting["max_depth"]))
-    images, times = rendered(renderer, view.pressed, range(seed, seed + REPEATS))
-    return {**times, **errors(images, reference, view.sensor.camera)}
-
-
 def others(images: Images) -> list[list[np.ndarray]]:
     """For each image the mean of the others of its state: the same image with less noise, and independent of it."""
-    sums = [np.sum(state, axis=0, dtype=np.float64) for state in images]
-    return [
-        [((total - one) / (len(state) - 1)).astype(np.float32) for one in state]
-        for total, state in zip(sums, images, strict=True)
-    ]
+    return [[np.mean([*state[:k], *state[k + 1 :]], axis=0) for k in range(len(state))] for state in images]
 
 
-def auto_row(template: Template, seed: int, number: int, scale: float, variant: Variant) -> Row:
+@dataclass(frozen=True, eq=False)
+class Job:
+    """What one run is about."""
+
+    given: Namespace
+    template: Template
+    press: Press
+    fastest: Variant
+
+    @property
+    def common(self) -> Row:
+        """Columns of all tables."""
+        return {"scene": self.given.scene, "seed": self.given.seed, "scale": self.given.scale}
+
+    @property
+    def lights(self) -> int:
+        """Lights that shine; samples of path tracing are a multiple of their number."""
+        return sum(light.power > 0 for light in self.press.scene.sensor.lights)
+
+    @property
+    def own_depth(self) -> int:
+        """The scene's path depth."""
+        return self.press.scene.render.max_depth
+
+
+def image_table(job: Job) -> None:
+    """Error against time."""
+    known = variants(job.given.device, job.fastest.is_mono)
+    columns = settings(list(known), job.lights, job.own_depth, job.given.reference)
+    view = job.press.view(job.given.scale)
+    camera = view.sensor.camera
+
+    @cache
+    def reference() -> Halves:
+        half = _path_traced((job.given.reference + 1) // 2, max(DEEPEST, job.own_depth))
+        renderer = view.renderer(job.fastest, half)
+        return renderer.radiance(view.pressed, 1), renderer.radiance(view.pressed, 2)
+
+    def image(case: Row) -> Row:
+        seen = view if case["window"] else replace(view, sensor=without_window(view.sensor))
+        renderer = seen.renderer(known[case["variant"]], _path_traced(case["samples"], case["max_depth"]))
+        # Seeds of its own for every image: two with the same number of samples would start with the same rays.
+        seed = 1000 * (1 + columns.index({name: case[name] for name in columns[0]}))
+        images, times = rendered(renderer, view.pressed, range(seed, seed + REPEATS))
+        row = {**times, **errors(images, reference(), camera)}
+        row["reference_noise"] = reference_noise(reference(), camera)
+        return {**row, "camera_noise": camera_noise(reference()[0], camera)}
+
+    cases = [{**job.common, "reference": job.given.reference, **setting} for setting in columns]
+    rows = measure(job.given.out / "render.csv", cases, image)
+    timed = "seconds" if job.fastest.name.startswith("cuda") else "processor_s"
+    shown = ["rmse", "noise", "systematic", "systematic_limit", "bias_percent", "bias_se_percent", "camera_noise"]
+    show(rows, [*columns[0], timed, *shown], "Error of the image, levels of 255")
+    lines = [{**row, "line": f"{row['variant']}, depth {row['max_depth']}"} for row in rows if row["window"]]
+    plot(job.given.out / "render.png", lines, x=timed, y="rmse", group="line")
+
+
+def flow_table(job: Job) -> None:
+    """What DIS makes of render noise, on the scene's own image size."""
+    view, seeds = job.press.view(), job.given.seeds
+    samples = list(dict.fromkeys(full_grid(n, job.lights) for n in FLOW_SAMPLES))
+    channels = 1 if job.fastest.is_mono else 3  # a grey camera has one noise, not the mean of three
+
+    @cache
+    def images(samples: int) -> Images:
+        renderer, first = view.renderer(job.fastest, _path_traced(samples, job.own_depth)), 10**6 + 2 * seeds * samples
+        return [
+            [renderer.radiance(state, first + seeds * side + k)[:, :, :channels] for k in range(seeds)]
+            for side, state in enumerate(view.states)
+        ]
+
+    def flow(case: Row) -> Row:
+        quiet = {} if case["camera_noise"] else {"read_noise": 0.0, "shot_noise": 0.0}
+        camera, (method,) = view.sensor.camera.model_copy(update=quiet), named_methods(["dis-medium"])
+        return changes(images(case["samples"]), others(images(samples[-1])), camera, Truth.of(view), method)
+
+    settings = [{"samples": n, "camera_noise": noise} for n in samples for noise in (False, True)]
+    cases = [{**job.common, "seeds": seeds, **setting} for setting in settings]
+    rows = measure(job.given.out / "render_flow.csv", cases, flow)
+    shown = [f"{of}{what}" for of in ("", "median_") for what in ("error_px", "change_px", "change_se_px")]
+    show(rows, ["camera_noise", "samples", *shown, "difference_px"], "Flow of DIS, px")
+    plot(job.given.out / "render_flow.png", rows, x="samples", y="difference_px", group="camera_noise")
+
+
+def auto_row(job: Job, number: int) -> Row:
     """What "auto" picks for one of a scene's sensors, undeformed, and what it and the scene's own samples leave."""
+    template, seed = job.template, job.given.seed
     scene = draw(template, seed, number * template.corners[0].sampling.trajectories_per_sensor)
-    camera = scene.sensor.camera
-    size = (round(scale * camera.width), round(scale * camera.height))
-    sensor = resized(scene.sensor.model_copy(update={"further_cameras": ()}), size)
+    sensor = main_camera(scene.sensor, job.given.scale)
     texture = albedo(sensor, stream(template, seed, "pattern", number), template.source.parent)
     surface = rest_surface(sensor.gel)
     row: Row = {}
     for name, samples in (("auto", "auto"), ("scene", scene.render.samples_per_pixel)):
         render = scene.render.model_copy(update={"samples_per_pixel": samples})
-        renderer = Renderer(sensor, render, surface, texture, variant)
+        renderer = Renderer(sensor, render, surface, texture, job.fastest)
         images, times = rendered(renderer, surface.material, (501, 502))  # other seeds than the pilots of "auto"
         noise = LEVELS * render_noise(images[0], images[1], sensor.camera)
         row |= {f"{name}_samples": renderer.samples_per_pixel, f"{name}_seconds": times["seconds"]}
         row |= {f"{name}_noise": noise, f"{name}_share": noise / camera_noise(images[0], sensor.camera)}
     return row
+
+
+def auto_table(job: Job) -> None:
+    """What "auto" picks."""
+    cases = [{**job.common, "sensor": number} for number in range(SENSORS)]
+    rows = measure(job.given.out / "render_auto.csv", cases, lambda case: auto_row(job, case["sensor"]))
+    show(rows, ["sensor", *(name for name in rows[0] if "_" in name)], 'Samples per pixel, "auto" and the scene\'s')
 
 
 def main(argv: list[str]) -> int:
@@ -117,71 +195,11 @@ def main(argv: list[str]) -> int:
     if given.seeds < 3:
         raise InputError(f"--seeds {given.seeds}: the standard error of the flow's change needs at least 3")
     template = load_scene(given.scene, ['render.light="path_traced"'])  # benchmarks/light.py has the other kind
-    fastest = job_variant(template, given.device)
-    known = variants(given.device, fastest.is_mono)
-    pressed = press(template, given.seed)
-    view, full, own_depth = pressed.view(given.scale), pressed.view(), pressed.scene.render.max_depth
-    lights = sum(light.power > 0 for light in view.sensor.lights)
-    common = {"scene": given.scene, "seed": given.seed, "scale": given.scale}
-
-    @cache
-    def reference() -> Halves:
-        half = _path_traced((given.reference + 1) // 2, max(DEEPEST, own_depth))
-        renderer = view.renderer(fastest, half)
-        return renderer.radiance(view.pressed, 1), renderer.radiance(view.pressed, 2)
-
-    columns = settings(list(known), lights, own_depth, given.reference)
-    # Seeds of its own for every image: two with the same number of samples would start with the same rays.
-    seeds = {tuple(setting.values()): 1000 * number for number, setting in enumerate(columns, 1)}
-
-    def image(case: Row) -> Row:
-        setting = {name: case[name] for name in columns[0]}
-        row = image_row(view, setting, known[case["variant"]], reference(), seeds[tuple(setting.values())])
-        camera = camera_noise(reference()[0], view.sensor.camera)
-        return {**row, "reference_noise": reference_noise(reference(), view.sensor.camera), "camera_noise": camera}
-
-    images = [{**common, "reference": given.reference, **setting} for setting in columns]
-    rows = measure(given.out / "render.csv", images, image)
-
-    flow_samples = list(dict.fromkeys(full_grid(n, lights) for n in FLOW_SAMPLES))
-    channels = 1 if fastest.is_mono else 3  # a grey camera has one noise, not the mean of three
-
-    @cache
-    def pictures(samples: int) -> Images:
-        renderer, first = full.renderer(fastest, _path_traced(samples, own_depth)), 10**6 + 2 * given.seeds * samples
-        return [
-            [renderer.radiance(state, first + given.seeds * side + k)[:, :, :channels] for k in range(given.seeds)]
-            for side, state in enumerate(full.states)
-        ]
-
-    def flow(case: Row) -> Row:
-        quiet = {} if case["camera_noise"] else {"read_noise": 0.0, "shot_noise": 0.0}
-        camera, (method,) = full.sensor.camera.model_copy(update=quiet), named_methods(["dis-medium"])
-        return changes(pictures(case["samples"]), others(pictures(flow_samples[-1])), camera, Truth.of(full), method)
-
-    pairs = [
-        {**common, "seeds": given.seeds, "samples": n, "camera_noise": noise}
-        for n in flow_samples
-        for noise in (False, True)
-    ]
-    flows = measure(given.out / "render_flow.csv", pairs, flow)
-    sensors = [{**common, "sensor": number} for number in range(SENSORS)]
-    autos = measure(
-        given.out / "render_auto.csv",
-        sensors,
-        lambda case: auto_row(template, given.seed, case["sensor"], given.scale, fastest),
-    )
-
+    job = Job(given, template, press(template, given.seed), job_variant(template, given.device))
     print(machine())
-    timed = "seconds" if fastest.name.startswith("cuda") else "processor_s"
-    shown = ["rmse", "noise", "systematic", "systematic_limit", "bias_percent", "bias_se_percent"]
-    show(rows, [*columns[0], timed, *shown, "camera_noise"], "Error of the image, levels of 255")
-    changed = [f"{of}{what}" for of in ("", "median_") for what in ("error_px", "change_px", "change_se_px")]
-    show(flows, ["camera_noise", "samples", *changed, "difference_px"], "Flow of DIS, px")
-    show(autos, ["sensor", *(name for name in autos[0] if "_" in name)], 'Samples per pixel, "auto" and the scene\'s')
-    lines = [{**row, "line": f"{row['variant']}, depth {row['max_depth']}"} for row in rows if row["window"]]
-    plot(given.out / "render.png", lines, x=timed, y="rmse", group="line")
-    plot(given.out / "render_flow.png", flows, x="samples", y="difference_px", group="camera_noise")
+    image_table(job)
+    flow_table(job)
+    auto_table(job)
     return 0
 
 

@@ -8,7 +8,7 @@ from render_scenes import flat_surface, plain, small_sensor
 
 from benchmarks.flow import derived, method_row
 from benchmarks.flow_methods import METHODS, SHIPPED, fitted_pinhole, is_inside
-from benchmarks.pressed_gel import View, resized
+from benchmarks.pressed_gel import View, main_camera
 from benchmarks.rows import Row
 from synth.render.camera_image import expected_signal
 
@@ -100,7 +100,7 @@ def test_occlusion() -> None:
 def test_another_size_keeps_what_the_camera_sees() -> None:
     """The mean signal stays: the same field of view, exposure and vignetting."""
     sensor = small_sensor(1.45, vignetting=0.5)
-    small = resized(sensor, (40, 30))
+    small = main_camera(sensor, 0.5)
     signals = [expected_signal(np.ones((c.height, c.width, 3), np.float32), c) for c in (sensor.camera, small.camera)]
     # The vignette is quadratic; its mean over pixels of twice the width differs by (1/80)² / 4 of 1/2 at most.
     assert signals[0].mean() == pytest.approx(signals[1].mean(), abs=1e-4)
