@@ -2,9 +2,9 @@
 
 A run first makes one trajectory per worker, in which every process imports, compiles and reads ("startup_s", counted in
 nothing else), then 2 n pairs. Instances of a scene come in a fixed order, so that the moment at which n of these are
-there is the time of a run of n: "growth" is time(2 n) / time(n), and "draws_growth" the same of the work that the
+there is the time of a run of n: "growth" is time(2 n) / time(n), and "work_growth" the same of the work that the
 stages' own clocks counted, which differs from 2 as the random instances of the two halves do. Workers have one core
-each; without workers one process renders on all cores. "other_s" is drawing, meshing and scheduling.
+each; without workers one process renders on all cores. "other_s" is sampling the scene, meshing and scheduling.
 """
 
 import json
@@ -84,7 +84,7 @@ def rates(times: dict[int, float], entries: Sequence[dict[str, Any]], warm: int,
         "seconds": seconds,
         "pairs_per_second": (end - begin) / seconds,
         "growth": 2 * (seconds / (end - begin)) / (first / (half - begin)),
-        "draws_growth": 2 * sum(stages.values()) / sum(per_pair(half).values()),
+        "work_growth": 2 * sum(stages.values()) / sum(per_pair(half).values()),
         **{f"{stage}_s": value for stage, value in stages.items()},
         "other_s": max(0.0, seconds / (end - begin) - sum(stages.values())),  # of one worker; several overlap
     }
@@ -122,7 +122,7 @@ def main(argv: list[str]) -> int:
     rows = measure(given.out / "scale.csv", cases, one)
     print(machine())
     times = [f"{stage}_s" for stage in (*STAGES, "other")]
-    shown = ["width", "height", "workers", "pairs", "startup_s", "pairs_per_second", "growth", "draws_growth"]
+    shown = ["width", "height", "workers", "pairs", "startup_s", "pairs_per_second", "growth", "work_growth"]
     show(rows, [*shown, *times], "Pairs per second, and seconds per pair of the stages, all workers together")
     best = max(rows, key=lambda row: (row["width"] * row["height"], row["pairs_per_second"]))
     larger = [

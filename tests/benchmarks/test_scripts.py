@@ -114,7 +114,7 @@ def test_rates_of_a_made_up_run() -> None:
     found = rates(times, entries, 2, 4)
     assert (found["startup_s"], found["pairs"], found["seconds"], found["pairs_per_second"]) == (7.0, 8, 4.0, 2.0)
     assert found["growth"] == pytest.approx(1.6)
-    assert found["draws_growth"] == pytest.approx(2 * 0.49 / 0.59)
+    assert found["work_growth"] == pytest.approx(2 * 0.49 / 0.59)
     assert found["simulate_s"] == pytest.approx(0.3)
     assert found["other_s"] == pytest.approx(0.01)  # 0.5 s a pair less the stages' 0.49
 
