@@ -32,15 +32,16 @@ def arguments(name: str, question: str | None) -> argparse.ArgumentParser:
     return parser
 
 
-def measure(path: Path, cases: Iterable[Row], one: Callable[[Row], Row], workers: int = 1) -> list[Row]:
-    """Measure the cases that a CSV file has no row of, and add a row for each as soon as it is there.
+def measure(path: Path, cases: Iterable[Row], one: Callable[[Row], Row | list[Row]], workers: int = 1) -> list[Row]:
+    """Measure the cases that a CSV file has no row of, and add what was found as soon as it is there.
 
     The file is replaced as a whole after every case, so that a run that is killed leaves only whole rows.
 
     Args:
         path: the CSV file; its directory is made. Rows of cases that are not asked for stay in it.
         cases: what to measure, all with the same columns.
-        one: measures a case: takes it, returns the columns found. Runs in another process if there are workers.
+        one: measures a case: takes it, returns the columns found, or a list of such if the case has several rows.
+            With workers it runs in another process.
         workers: how many cases are measured at once; 1 measures in this process, which timings ask for.
 
     Returns:
@@ -49,16 +50,21 @@ def measure(path: Path, cases: Iterable[Row], one: Callable[[Row], Row], workers
     wanted = list(cases)
     rows = read(path)
     keys = list(wanted[0]) if wanted else []
-    found = {_key(row, keys): row for row in rows}
+    found: dict[tuple[str, ...], list[Row]] = {}
+    for row in rows:
+        found.setdefault(_key(row, keys), []).append(row)
     missing = [case for case in wanted if _key(case, keys) not in found]
     if len(missing) < len(wanted):
         print(f"{path}: {len(wanted) - len(missing)} of {len(wanted)} cases are there already", file=sys.stderr)
 
-    def add(case: Row, columns: Row) -> None:
-        found[_key(case, keys)] = row = {**case, **columns}
-        rows.append(row)
+    def add(case: Row, columns: Row | list[Row]) -> None:
+        new = [{**case, **each} for each in (columns if isinstance(columns, list) else [columns])]
+        found[_key(case, keys)] = new
+        rows.extend(new)
         write(path, rows)
-        print(" ".join(f"{name}={_written(value)}" for name, value in row.items()), file=sys.stderr, flush=True)
+        for row in new:
+            told = (f"{name}={_written(value)}" for name, value in row.items() if value is not None)
+            print(" ".join(told), file=sys.stderr, flush=True)
 
     if workers > 1:
         with ProcessPoolExecutor(workers, get_context("spawn")) as pool:  # Warp and Mitsuba do not survive a fork
@@ -68,7 +74,7 @@ def measure(path: Path, cases: Iterable[Row], one: Callable[[Row], Row], workers
     else:
         for case in missing:
             add(case, one(case))
-    return [{**found[_key(case, keys)], **case} for case in wanted]
+    return [{**row, **case} for case in wanted for row in found[_key(case, keys)]]
 
 
 def read(path: Path) -> list[Row]:
@@ -102,10 +108,10 @@ def show(rows: Iterable[Row], columns: Sequence[str], title: str = "") -> None:
     Console(width=None if sys.stdout.isatty() else 200).print(table)
 
 
-def plot(path: Path, rows: Sequence[Row], x: str, y: str, group: str, panel: str = "") -> None:
+def plot(path: Path, rows: Sequence[Row], x: str, y: str, group: str, panel: str = "", style: str = "o-") -> None:
     """Draw y against x, both logarithmic, a line for each value of `group` and a picture for each value of `panel`.
 
-    Rows without a positive number in both columns are left out.
+    `style` is Matplotlib's, "o" for points without lines. Rows without a positive number in both columns are left out.
     """
     from matplotlib.figure import Figure
 
@@ -116,7 +122,7 @@ def plot(path: Path, rows: Sequence[Row], x: str, y: str, group: str, panel: str
         inside = [row for row in seen if row.get(panel) == value]
         for name in dict.fromkeys(row.get(group) for row in inside):
             line = sorted((row for row in inside if row.get(group) == name), key=lambda row: row[x])
-            axes.loglog([row[x] for row in line], [row[y] for row in line], "o-", label=str(name))
+            axes.loglog([row[x] for row in line], [row[y] for row in line], style, label=str(name))
         axes.set(xlabel=x, ylabel=y, title=None if value is None else str(value))
         axes.grid(which="both", alpha=0.3)
         if inside:
