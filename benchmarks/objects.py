@@ -1,23 +1,18 @@
 """Do objects as files have them press the gel, and how deep do they sink in?
 
-    python -m benchmarks.objects parts/*.stl --draws 5 --out objects.csv
+    python -m benchmarks objects parts/*.stl --draws 5 --workers 8
 
 Each file is pressed, sheared and twisted as the default scene draws it, in a random orientation, its longest edge
-8 mm. A ball on the same mesh and the same way gives the time to compare with.
+8 mm. A ball on the same mesh, moved in the same way, gives the time to compare with.
 """
 
-import argparse
-import csv
-import os
-import sys
 import time
-from concurrent.futures import ProcessPoolExecutor
-from itertools import product
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from benchmarks.rows import Row, arguments, measure, show
 from synth.cli_options import DEFAULT_SCENE
 from synth.errors import InputError
 from synth.mesh import PadMesh
@@ -44,19 +39,18 @@ def timed(scene: Scene, mesh: PadMesh) -> tuple[Trajectory, float]:
     return simulate(scene, mesh), time.perf_counter() - started
 
 
-def press(job: tuple[Path, int]) -> dict[str, Any]:
+def press(case: Row) -> Row:
     """One row of the table."""
-    path, seed = job
-    row: dict[str, Any] = {"file": path.name, "seed": seed}
+    seed = case["seed"]
     try:
-        scene = scene_of(f'{{ shape = "mesh", file = "{path}", size_mm = {SIZE_MM}, rotation_deg = "any" }}', seed)
+        file = f'shape = "mesh", file = "{case["file"]}", size_mm = {SIZE_MM}, rotation_deg = "any"'
+        scene = scene_of(f"{{ {file} }}", seed)
         mesh = resolution_of(scene).mesh
         result, seconds = timed(scene, mesh)
     except InputError as error:
-        return {**row, "status": "refused", "reason": str(error)}
+        return {"status": "refused", "reason": str(error)}
     pressed = result.states[1:]
     return {
-        **row,
         "status": result.status,
         "reason": result.reason,
         "seconds": round(seconds, 2),
@@ -66,36 +60,29 @@ def press(job: tuple[Path, int]) -> dict[str, Any]:
     }
 
 
-def summary(rows: list[dict[str, Any]]) -> str:
+def summary(rows: Sequence[Row]) -> Row:
     """What the rows say."""
     tried = [row for row in rows if row["status"] != "refused"]
     done = [row for row in tried if row["status"] == "complete"]
-    text = f"{len(rows) - len(tried)} refused; of {len(tried)} others {len(done)} complete"
+    found: Row = {"refused": len(rows) - len(tried), "pressed": len(tried), "complete": len(done)}
     if done:
         deep, slow = (np.array([row[name] for row in done]) for name in ("penetration", "times_a_ball"))
-        text += f"; median {np.median(slow):.1f} times a ball's time; sunk in by at most {DEEP:.0%}: "
-        text += f"{np.mean(deep <= DEEP):.0%}, median {np.median(deep):.1%}, at most {deep.max():.1%}"
-    return text
+        found |= {"times a ball's time, median": float(np.median(slow)), "sunk in, median": f"{np.median(deep):.1%}"}
+        found |= {"largest": f"{deep.max():.1%}", f"at most {DEEP:.0%}": f"{np.mean(deep <= DEEP):.0%}"}
+    return found
 
 
-def main() -> int:
+def main(argv: list[str]) -> int:
     """Run the command line."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.objects", description=__doc__)
+    parser = arguments("objects", __doc__)
     parser.add_argument("files", nargs="+", type=Path)
-    parser.add_argument("--draws", type=int, default=5)
-    parser.add_argument("--workers", type=int, default=os.cpu_count())
-    parser.add_argument("--out", type=Path, default=Path("objects.csv"))
-    given = parser.parse_args()
-    jobs = list(product([path.resolve() for path in given.files], range(given.draws)))
-    with ProcessPoolExecutor(given.workers) as pool:
-        rows = list(pool.map(press, jobs))
-    with given.out.open("w", newline="") as file:
-        writer = csv.DictWriter(file, sorted({name for row in rows for name in row}))
-        writer.writeheader()
-        writer.writerows(rows)
-    print(summary(rows))
+    parser.add_argument("--draws", type=int, default=5, help="orientations of each file; default: 5")
+    parser.add_argument("--workers", type=int, default=1, help="presses at once")
+    given = parser.parse_args(argv)
+    cases = [{"file": str(path.resolve()), "seed": seed} for path in given.files for seed in range(given.draws)]
+    rows = measure(given.out / "objects.csv", cases, press, given.workers)
+    unlucky = [row for row in rows if row["status"] != "complete"]
+    show(unlucky, ["file", "seed", "status", "reason"], "Presses that did not complete")
+    found = summary(rows)
+    show([found], list(found))
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,0 +1,268 @@
+"""How many presses a second does the batched solver make, where does the time go, and how wrong are its surfaces?
+
+    python -m benchmarks batched --batch 512 2048 --seconds 36        on a GPU
+    python -m benchmarks batched --errors 12 --device cpu             surface errors instead
+
+A press is a ball of 2 to 6 mm radius (--radii) at a random place of a pad of 20 x 15 x 4 mm, pressed to half its
+thickness with friction, and one state recorded. Trajectories that end make room for others, as in `synth generate`, and
+the rate is counted from when as many have ended as run at once; results travel to the host within that time. With
+--errors N the first N presses are compared with a mesh refined around each: relative L2 error of the contact face's
+displacement, and of the force. That is done by the solver for one sample, which gives what the batched one does.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache, partial
+from itertools import cycle, pairwise
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from benchmarks.press import PAD_MM, ball_scene, face_displacement, face_grid
+from benchmarks.rows import Row, arguments, machine, measure, show
+from synth.errors import InputError
+from synth.mesh import Counts, Focus, PadMesh, graded_box
+from synth.scene import Scene
+from synth.simulate import simulate
+from synth.simulate.batched.gemm import dense
+from synth.simulate.batched.krylov import RUNNING, WAITING
+from synth.simulate.batched.machine import INNER
+from synth.simulate.batched.many import DRIVER, jobs_of
+from synth.simulate.batched.pad import Pad, prepare
+from synth.simulate.batched.run import Run
+from synth.simulate.resolution import graded_mesh
+
+PLACES_MM = (6.0, 4.0)
+"""Half width of the rectangle that the balls' centres are drawn from."""
+DRAWS = 2048
+"""Different presses; they are gone through again and again, so that drawing them takes no part of the time."""
+PROFILED_CYCLES = 20
+POINTS = face_grid(PAD_MM, (81, 61))
+
+
+def random_ball(rng: np.random.Generator, case: Row) -> Scene:
+    """A ball at a random place, with friction, that is dragged in a random direction once it is down."""
+    angle = rng.uniform(0, 2 * np.pi)
+    radius, friction = float(rng.uniform(case["smallest_mm"], case["largest_mm"])), float(rng.uniform(0.3, 1.0))
+    place = [float(rng.uniform(-half, half)) for half in PLACES_MM]
+    drag = [float(case["drag_mm"] * np.cos(angle)), float(case["drag_mm"] * np.sin(angle))]
+    motion = {"depth_mm": case["depth_mm"], "shear_mm": drag, "position_mm": place, "steps": case["steps"]}
+    scene = ball_scene(radius, friction, motion)
+    step = {} if case["step_mm"] is None else {"max_step_mm": case["step_mm"]}
+    return scene.model_copy(update={"numerics": scene.numerics.model_copy(update=step)})
+
+
+def nth_ball(number: int, case: Row) -> Scene:
+    """One of the balls that every measurement begins with."""
+    rng = np.random.default_rng(0)
+    return [random_ball(rng, case) for _ in range(number + 1)][-1]
+
+
+def mesh_of(case: Row) -> PadMesh:
+    """A mesh for presses anywhere: even along x and y, with elements that grow through the thickness."""
+    x, y, z = map(int, case["cells"].split("x"))
+    counts = Counts((x - 2, y - 2), (1, 1), z, growth=case["growth"])
+    return graded_box(PAD_MM, Focus((0.0, 0.0), (PAD_MM[0] / 2, PAD_MM[1] / 2)), counts)
+
+
+@cache
+def pad_of(cells: str, growth: float, device: str) -> Pad:
+    """The pad, prepared once for all rates."""
+    mesh = mesh_of({"cells": cells, "growth": growth})
+    return prepare(ball_scene(4.0, 0.5, {"depth_mm": 1.0}), mesh, device)
+
+
+def rate(case: Row, device: str) -> Row:
+    """Presses per second, and what a cycle's time goes into: `ms_*` of each part, `krylov_busy` the share of the places
+    for Krylov iterations that are used.
+    """
+    pad = pad_of(case["cells"], case["growth"], device)
+    rng = np.random.default_rng(0)
+    scenes = [random_ball(rng, case) for _ in range(max(DRAWS, case["batch"]))]
+    driver = replace(DRIVER, forcing=case["forcing"], loose=case["loose"], closer=case["closer"])
+    order = cycle(range(len(scenes)))
+    run = Run(jobs_of(scenes, pad), pad, scenes[0].numerics, driver, None, case["batch"], order, case["inner"])
+    for _ in range(2):  # with all slots empty: compiles the kernels and captures the graph
+        run.advance()
+    began = time.perf_counter()
+    ends: list[float] = []
+    complete = iterations = 0
+    for _, result in run:
+        ends.append(time.perf_counter() - began)
+        complete += result.status == "complete"
+        iterations += sum(state.newton_iterations for state in result.states)
+        if ends[-1] > case["seconds"]:
+            break
+    return {
+        "unknowns": len(pad.free),
+        "presses": len(ends),
+        "complete": complete,
+        "presses_per_s": round(steady(ends, case["batch"]), 2),
+        "newton_per_press": round(iterations / len(ends), 2),
+        "ms_per_cycle": round(1e3 * ends[-1] / run.cycles, 3),
+        **profile(run, device),
+    }
+
+
+def steady(ends: Sequence[float], batch: int) -> float:
+    """Presses per second from the end of the first batch on, or of half of a run that was too short for that."""
+    first = min(batch, len(ends) // 2)
+    return (len(ends) - first) / (ends[-1] - ends[first - 1]) if first else len(ends) / ends[-1]
+
+
+def profile(run: Run, device: str) -> Row:
+    """What PROFILED_CYCLES cycles spend on each part of the solver, ms a cycle."""
+    krylov = run.machine.krylov
+    clock = Events(device) if wp.get_device(device).is_cuda else Clock()
+    parts: dict[str, float] = {}
+    used = 0
+    for _ in range(PROFILED_CYCLES):
+        before = np.where(krylov.running.numpy() == RUNNING, krylov.k.numpy(), 0)
+        clock.start()
+        run.machine.watch = clock.mark
+        run.machine.cycle(run.table)
+        run.machine.watch = lambda part, kernel: None
+        for part, ms in clock.stop():
+            parts[part] = parts.get(part, 0.0) + ms / PROFILED_CYCLES
+        used += int(np.where(krylov.running.numpy() != WAITING, krylov.k.numpy() - before, 0).sum())
+    busy = used / (PROFILED_CYCLES * run.machine.inner * run.machine.batch)
+    return {"krylov_busy": round(busy, 3), **{f"ms_{part}": round(ms, 4) for part, ms in parts.items()}}
+
+
+class Clock:
+    """Times between marks on the CPU, where a launch ends when the kernel does."""
+
+    def start(self) -> None:
+        """Begin."""
+        self._marks: list[tuple[str, Any]] = [("", self._now())]
+
+    def mark(self, part: str, kernel: str) -> None:
+        """Note that a kernel of a part ran, or was queued, since the last mark."""
+        self._marks.append((part, self._now()))
+
+    def stop(self) -> list[tuple[str, float]]:
+        """Part and ms of each mark."""
+        return [(part, self._between(last, this)) for (_, last), (part, this) in pairwise(self._marks)]
+
+    def _now(self) -> Any:
+        return time.perf_counter()
+
+    def _between(self, last: Any, this: Any) -> float:
+        return 1e3 * float(this - last)
+
+
+class Events(Clock):
+    """The same on CUDA, by events in the stream.
+
+    The GPU is kept busy by other work until the host has queued the whole cycle, so that no time between two events is
+    the host's.
+    """
+
+    AHEAD_MS, SIZE = 40.0, 4096
+
+    def __init__(self, device: str) -> None:
+        self._device = wp.get_device(device)
+        self._dense = dense(device)
+        matrix = (self.SIZE, self.SIZE)
+        self._a, self._b, self._c = (wp.zeros(matrix, dtype=wp.float32, device=device) for _ in range(3))
+        self._all = wp.ones(self.SIZE, dtype=wp.int32, device=device)
+        self._times = 1
+        for _ in range(2):  # the first takes longer
+            first = self._now()
+            self._be_busy()
+            last = self._now()
+            wp.synchronize_device(self._device)
+        self._times = 1 + int(self.AHEAD_MS / self._between(first, last))
+
+    def start(self) -> None:
+        """Begin."""
+        self._be_busy()
+        super().start()
+
+    def stop(self) -> list[tuple[str, float]]:
+        """Part and ms of each mark."""
+        wp.synchronize_device(self._device)
+        return super().stop()
+
+    def _now(self) -> Any:
+        return self._device.stream.record_event(wp.Event(self._device, enable_timing=True))
+
+    def _between(self, last: Any, this: Any) -> float:
+        return float(wp.get_event_elapsed_time(last, this))
+
+    def _be_busy(self) -> None:
+        for _ in range(self._times):
+            self._dense.product(self._a, self._b, self._c, self._all)
+
+
+def reference_mesh(scene: Scene, across: int) -> PadMesh:
+    """A mesh with so many elements across the square that holds a ball's contact."""
+    radius, depth = scene.contact.indenter.model_dump()["radius_mm"], scene.motion.depth_mm
+    reach = float(np.sqrt(max(2 * radius * depth - depth**2, 0.9 * radius**2)))
+    x, y = scene.motion.position_mm
+    return graded_mesh(scene.sensor.gel, Focus((x, y), (reach, reach)), across)[0]
+
+
+def surface_error(case: Row) -> Row:
+    """The error of one press on the case's mesh; the reference takes the scenes' own load steps."""
+    scene, plain = (nth_ball(case["press"], {**case, "step_mm": step}) for step in (case["step_mm"], None))
+    found = simulate(scene, mesh_of(case), driver=replace(DRIVER, loose=case["loose"]))
+    truth = simulate(plain, reference_mesh(scene, case["reference_across"]))
+    row: Row = {
+        "radius_mm": round(scene.contact.indenter.model_dump()["radius_mm"], 3),
+        "status": found.status,
+        "reference_status": truth.status,
+    }
+    if found.status == truth.status == "complete":
+        last = len(truth.states) - 1
+        u, r = (face_displacement(each, POINTS, [last]) for each in (found, truth))
+        row["surface_error_percent"] = 100 * float(np.linalg.norm(u - r) / np.linalg.norm(r))
+        row["force_error_percent"] = 100 * float(found.states[-1].force_n[2] / truth.states[-1].force_n[2] - 1)
+    return row
+
+
+def main(argv: list[str]) -> int:
+    """Run the command line; 1 if a press of --errors did not complete."""
+    parser = arguments("batched", __doc__)
+    parser.add_argument("--device", default="cuda", help="default: cuda")
+    parser.add_argument("--batch", type=int, nargs="+", default=[512], help="presses at once; default: 512")
+    parser.add_argument("--runs", type=int, default=1, help="of each batch size")
+    parser.add_argument("--seconds", type=float, default=36.0, help="of each run; default: 36")
+    parser.add_argument("--cells", type=int, nargs=3, default=[16, 12, 2], help="elements along x, y and z")
+    parser.add_argument("--growth", type=float, default=2.5, help="of elements through the thickness")
+    parser.add_argument("--depth", type=float, default=2.0, help="mm")
+    parser.add_argument("--drag", type=float, default=0.0, help="mm")
+    parser.add_argument("--steps", type=int, default=1, help="recorded states")
+    parser.add_argument("--radii", type=float, nargs=2, default=[2.0, 6.0], help="mm; of the balls")
+    parser.add_argument("--forcing", type=float, default=DRIVER.forcing, help="relative residual of linear solves")
+    parser.add_argument("--loose", type=float, default=DRIVER.loose, help="tolerance of intermediate steps")
+    parser.add_argument("--closer", type=float, default=DRIVER.closer, help="tolerance of corrections over the scene's")
+    parser.add_argument("--step", type=float, help="mm; longest load step, default as in scenes")
+    parser.add_argument("--inner", type=int, default=INNER, help="Krylov iterations of a cycle")
+    parser.add_argument("--errors", type=int, metavar="N", help="instead: surface errors of the first N presses")
+    parser.add_argument("--across", type=int, default=10, help="elements across a contact in the reference")
+    given = parser.parse_args(argv)
+    if any(cells % 2 or cells < 4 for cells in given.cells[:2]):
+        raise InputError(f"--cells {given.cells}: along x and y give even numbers of at least 4")
+    press = {"cells": "x".join(map(str, given.cells)), "growth": given.growth, "depth_mm": given.depth}
+    press |= {"drag_mm": given.drag, "steps": given.steps, "step_mm": given.step, "loose": given.loose}
+    press |= {"smallest_mm": given.radii[0], "largest_mm": given.radii[1]}
+    print(machine())
+    if given.errors is not None:
+        cases = [{**press, "reference_across": given.across, "press": number} for number in range(given.errors)]
+        rows = measure(given.out / "batched_errors.csv", cases, surface_error)
+        show(rows, ["press", "radius_mm", "surface_error_percent", "force_error_percent", "status"], press["cells"])
+        return 0 if all("surface_error_percent" in row for row in rows) else 1
+    name = wp.get_device(given.device).name
+    press |= {"forcing": given.forcing, "closer": given.closer, "inner": given.inner, "seconds": given.seconds}
+    cases = [
+        {"processor": name, **press, "batch": batch, "run": run} for batch in given.batch for run in range(given.runs)
+    ]
+    rows = measure(given.out / "batched.csv", cases, partial(rate, device=given.device))
+    columns = ["batch", "run", "presses_per_s", "newton_per_press", "ms_per_cycle", "presses", "complete"]
+    show(rows, columns, f"{name}, {press['cells']} cells")
+    parts = [key for key in rows[0] if key.startswith("ms_") and key != "ms_per_cycle"]
+    show(rows, ["batch", "run", *parts, "krylov_busy"], "ms a cycle, by part")
+    return 0
