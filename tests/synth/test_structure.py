@@ -38,12 +38,10 @@ STAGES = (
     "synth.generate",
     "synth.progress",
     "synth.calibrate",
-    "synth.bench",
     "synth.stress",
     "synth.doctor",
     "synth.commands",
     "synth.cli_options",
-    "synth.cli_bench",
     "synth.cli",
     "synth.__main__",
 )

@@ -1,0 +1,41 @@
+"""Options of the solver that no scene has: each does what it is there for."""
+
+from dataclasses import replace
+
+import numpy as np
+from pads import brick, scene
+
+from synth.simulate import simulate
+from synth.simulate.driver import STANDARD, Driver
+from synth.simulate.solve import stepper_of
+
+MESH = brick()
+PLAIN = Driver(loose=0.0, extrapolate=False, single_precision=False, keep_factors=False)
+
+
+def test_loose_and_extrapolated_steps_save_iterations() -> None:
+    """Fails with the options not handed on by `simulate`, and with either without effect."""
+    posed = scene(friction=0.0, motion={"depth_mm": 0.6, "steps": 1}, numerics={"max_step_mm": 0.1})
+    exact = replace(STANDARD, keep_factors=False)  # rough directions save time, not iterations
+    counts = []
+    for driver in (exact, replace(exact, loose=0.0), replace(exact, extrapolate=False), PLAIN):
+        found = simulate(posed, MESH, driver=driver)
+        assert found.status == "complete"
+        counts.append(sum(state.newton_iterations for state in found.states))
+    standard, tight, unpredicted, plain = counts
+    assert standard < min(tight, unpredicted)
+    assert max(tight, unpredicted) < plain
+
+
+def test_double_factor_solves_to_double_precision() -> None:
+    """Fails with single left out of `direct_factor`'s arguments: 1e-6."""
+    stepper = stepper_of([scene(numerics={"element": "p2p1"})], MESH, driver=PLAIN)
+    system, active = stepper.system, np.ones(1, dtype=bool)
+    tangent = system.tangent(system.zero(), stepper.indenters, active)
+    right = np.random.default_rng(0).standard_normal((1, len(system.free)))
+    step = system.newton_step(tangent, right, active)
+    solution = np.concatenate([step.u[0].ravel(), step.p[0]])[system.free]
+    upper = system.matrix(tangent.values[0])
+    left = upper @ solution + upper.T @ solution - upper.diagonal() * solution + right[0]
+    # A backward stable solve leaves some 1e-16 of |K| |x|, which at a Poisson ratio of 0.4999 is 1e4 times |r|.
+    assert np.linalg.norm(left) < 1e-10 * np.linalg.norm(right)
