@@ -7,7 +7,8 @@ import argparse
 import sys
 from importlib import import_module
 
-from synth.errors import InputError
+import gelflow.errors
+import synth.errors
 
 QUESTIONS = {
     "fem": "displacement's and force's error against run time, by mesh, element and solver options",
@@ -19,6 +20,10 @@ QUESTIONS = {
     "light": "separated light against path tracing",
     "flow": "the flow's error against its run time",
     "scale": "pairs a second, and where the time goes",
+    "synthetic_set": "makes the synthetic test set of the report on gelflow",
+    "counts": "on how many pairs of a comparison is one method better than the others?",
+    "loss_order": "does the true flow have the lowest self-supervised loss?",
+    "pictures": "draws the README's pictures of data",
 }
 
 
@@ -31,14 +36,14 @@ def main(argv: list[str]) -> int:
     Returns:
         0, 1 if a check of the script failed, 2 for wrong input.
     """
-    lines = "\n".join(f"  {name:<10} {question}" for name, question in QUESTIONS.items())
+    lines = "\n".join(f"  {name:<13} {question}" for name, question in QUESTIONS.items())
     style = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser("python -m benchmarks", epilog=f"names:\n{lines}", formatter_class=style)
     parser.add_argument("name", choices=QUESTIONS, metavar="NAME")
     name = parser.parse_args(argv[:1]).name
     try:
         return int(import_module(f"benchmarks.{name}").main(argv[1:]))
-    except InputError as error:
+    except (synth.errors.InputError, gelflow.errors.InputError) as error:
         print(f"benchmarks: {error}", file=sys.stderr)
         return 2
 

@@ -1,4 +1,4 @@
-"""The command line: `python -m synth generate|plan|simulate|bench|stress|calibrate|inspect|verify|export|doctor`.
+"""The command line: `python -m synth generate|plan|simulate|stress|calibrate|inspect|verify|export|doctor`.
 
 Exit status: 0 done, 1 done with failed samples or a failed check, 2 wrong input, 130 interrupted. Nothing heavy is
 imported before a command runs.
@@ -13,7 +13,6 @@ from typing import Annotated, Literal
 from cyclopts import App, CycloptsError, Parameter
 
 from synth import __version__
-from synth.cli_bench import bench
 from synth.cli_options import DEFAULT_SCENE, AsJson, Assignments, Dataset, Device, SceneName, whole
 from synth.errors import InputError
 
@@ -95,9 +94,6 @@ def simulate(
     from synth.commands import run_simulate
 
     return run_simulate(scene, out, seed, index, assignments or [], as_json)
-
-
-app.command(bench)
 
 
 @app.command

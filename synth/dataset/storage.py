@@ -105,18 +105,6 @@ def refuse_foreign(path: Path, mark: bytes, *beside: Path) -> None:
             )
 
 
-def report_folder(out: Path, name: str) -> None:
-    """Makes the directory of a benchmark's NAME.md, NAME.csv and NAME.png, before minutes of work and not after.
-
-    Raises:
-        InputError: one of them is there and not from an earlier run, or the storage refuses.
-    """
-    with storage_errors(out):
-        out.mkdir(parents=True, exist_ok=True)
-    others = [out / f"{name}{suffix}" for suffix in (".csv", ".png")]
-    refuse_foreign(out / f"{name}.md", f"synth bench {name}".encode(), *others)
-
-
 def install_folder(partial: Path, final: Path) -> None:
     """Renames a finished folder into place and flushes it; an older folder of that name gives way.
 

@@ -1,4 +1,4 @@
-"""How Newton's method is led along a path: what `synth bench fem` varies and no scene needs to."""
+"""How Newton's method is led along a path: what `python -m benchmarks fem` varies and no scene needs to."""
 
 from dataclasses import dataclass
 

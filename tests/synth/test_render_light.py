@@ -1,16 +1,12 @@
 """Separated light: closed form against sums over the light, pictures against path tracing, what is refused."""
 
-import json
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 from render_scenes import flat_surface, plain, small_sensor
-from tiny_scene import TEXT, own_cache, write_tiny
 
 from synth.arrays import FloatArray, Image
-from synth.cli import main
 from synth.errors import InputError
 from synth.render.gel_mesh import MIRROR
 from synth.render.lights import light_axes
@@ -156,24 +152,3 @@ def test_scalar_variants_path_trace() -> None:
         for light in ("separated", "path_traced")
     ]
     np.testing.assert_array_equal(*images)
-
-
-@needs_llvm
-def test_bench_light(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """The tiny scene with a camera so noisy that any light is within a quarter of it, and one whose coating shines."""
-    own_cache(monkeypatch)
-    noisy = TEXT.replace("read_noise = 0.002", "read_noise = 0.1")
-    (tmp_path / "shining").mkdir()
-    matt = write_tiny(tmp_path, noisy)
-    shining = write_tiny(tmp_path / "shining", noisy + "\n[sensor.coating]\nroughness = 0.5\n")
-    out = tmp_path / "out"
-    command = ["bench", "light", str(matt), str(shining), "--out", str(out), "--device", "cpu", "--reference", "64"]
-    assert main([*command, "--json"]) == 0
-    answer = json.loads(capsys.readouterr().out)
-    # Two states by path tracing and three numbers of samples; two methods on these and on the reference's halves.
-    assert [row["light"] for row in answer["rows"]] == 2 * ["path_traced"] + 6 * ["separated"]
-    assert len(answer["flow"]) == 2 * 5
-    assert all(row["processor_s"] > 0 for row in answer["rows"])
-    text = (out / "light.md").read_text()
-    assert "## Refused" in text
-    assert "needs a matt coating" in text

@@ -38,12 +38,10 @@ STAGES = (
     "synth.generate",
     "synth.progress",
     "synth.calibrate",
-    "synth.bench",
     "synth.stress",
     "synth.doctor",
     "synth.commands",
     "synth.cli_options",
-    "synth.cli_bench",
     "synth.cli",
     "synth.__main__",
 )
@@ -132,8 +130,8 @@ def f():
 @pytest.mark.parametrize(
     ("modules", "forbidden"),
     [
-        (SYNTH, {"gelflow", "torch", "lightning", "torchmetrics"}),
-        (GELFLOW, {"synth", "warp", "mitsuba", "drjit", "pytetwild", "pypardiso", "pyvista"}),
+        (SYNTH, {"gelflow", "benchmarks", "torch", "lightning", "torchmetrics"}),
+        (GELFLOW, {"synth", "benchmarks", "warp", "mitsuba", "drjit", "pytetwild", "pypardiso", "pyvista"}),
     ],
     ids=["synth", "gelflow"],
 )
@@ -189,7 +187,7 @@ def test_simulate_loads_no_renderer(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_files_stay_short() -> None:
     long = [
         f"{path.relative_to(ROOT)}: {count} lines"
-        for package in ("synth", "gelflow")
+        for package in ("synth", "gelflow", "benchmarks")
         for path in sorted((ROOT / package).rglob("*.py"))
         if (count := len(path.read_text(encoding="utf-8").splitlines())) > 350
     ]

@@ -1,0 +1,75 @@
+"""Draws the README's pictures of data: `gallery` from datasets of synth, `bare_gel` with what flow methods find.
+
+gallery: of each data set, as ordered, the first sample's second image and its flow in colour; data/gallery/NAME is made
+by `python -m synth generate --scene NAME --n 2 --out data/gallery/NAME`. bare_gel: a row for each of the given pairs of
+one data set: image 1, image 2, the exact flow, the shipped network's and Farnebäck's, in the colours of its largest
+motion.
+"""
+
+from argparse import ArgumentParser
+from pathlib import Path
+
+import numpy as np
+
+
+def gallery(folders: list[Path], out: Path) -> None:
+    """A panel for each data set, three in a row."""
+    from matplotlib.figure import Figure
+
+    from synth.dataset.reader import read_dataset
+    from synth.inspection.panels import image_picture
+    from synth.inspection.wheel import flow_colours, robust_scale
+
+    rows = -(-len(folders) // 3)
+    figure = Figure(figsize=(3 * 4.3, rows * 1.8), dpi=100)
+    axes = figure.subplots(rows, 3, squeeze=False).ravel()
+    for axis in axes:
+        axis.set_axis_off()
+    for axis, folder in zip(axes, folders, strict=False):
+        dataset = read_dataset(folder)
+        sample = dataset.read(dataset.samples[0])
+        scale = robust_scale(sample.flow.forward)
+        axis.imshow(np.hstack([image_picture(sample.image2), flow_colours(sample.flow.forward, scale)]))
+        axis.set_title(f"{dataset.info['scene']['name']}: image 2, flow to {scale:.3g} px", fontsize=8, pad=2)
+    figure.tight_layout(pad=0.3)
+    figure.savefig(out, pil_kwargs={"quality": 88})
+
+
+def bare_gel(folder: Path, pairs: list[int], out: Path) -> None:
+    """Two images and three flows of each pair."""
+    from PIL import Image
+
+    from gelflow.baselines.learned import open_network
+    from gelflow.baselines.registry import named_methods
+    from gelflow.commands import open_all
+    from gelflow.errors import InputError
+    from gelflow.files.image import to_bytes
+    from gelflow.shipped import weights_file
+    from gelflow.viz import flow_to_colour
+
+    dataset = open_all([folder])
+    methods = [open_network(weights_file(None), device="cpu"), *named_methods(["farneback"])]
+    rows = []
+    for number in pairs:
+        images, truth = dataset.images(number), dataset.truth(number)
+        if truth is None:
+            raise InputError(f"{folder}: pair {number} has no exact flow")
+        flows = [truth.flow, *(method.flow(*images) for method in methods)]
+        scale = float(np.nanmax(np.linalg.norm(truth.flow, axis=-1)))
+        rows.append(np.hstack([*map(to_bytes, images), *(flow_to_colour(flow, scale) for flow in flows)]))
+    Image.fromarray(np.vstack(rows)).save(out, quality=88)
+
+
+def main(argv: list[str]) -> int:
+    """Draw one of them."""
+    parser = ArgumentParser("python -m benchmarks pictures", description=__doc__)
+    parser.add_argument("picture", choices=("gallery", "bare_gel"))
+    parser.add_argument("datasets", nargs="+", type=Path)
+    parser.add_argument("--pairs", type=int, nargs="+", default=[2, 10, 14, 16], help="of bare_gel")
+    parser.add_argument("--out", type=Path, required=True, help="JPEG file")
+    given = parser.parse_args(argv)
+    if given.picture == "gallery":
+        gallery(given.datasets, given.out)
+    else:
+        bare_gel(given.datasets[0], given.pairs, given.out)
+    return 0

@@ -1,0 +1,146 @@
+"""Whole runs of render, light, flow and scale on the tiny scene, and what they refuse. No test asserts a time."""
+
+from pathlib import Path
+
+import pytest
+from tiny_scene import TEXT, own_cache, write_tiny
+
+from benchmarks.__main__ import main
+from benchmarks.render import DEEPEST, settings
+from benchmarks.rows import Row, read
+from benchmarks.scale import at_size, rates
+from synth.render.variant import choose_variant
+
+needs_llvm = pytest.mark.skipif(not choose_variant("cpu").is_vectorised, reason="no LLVM of version 16 or newer here")
+NOISY = TEXT.replace("read_noise = 0.002", "read_noise = 0.1")
+"""A camera so noisy that "auto" needs few samples, and that any light is within a quarter of its noise."""
+
+
+@pytest.fixture(autouse=True)
+def _cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One mesh for all runs: the mesher is random."""
+    own_cache(monkeypatch)
+
+
+def again(command: list[str], out: Path, *tables: str) -> list[list[Row]]:
+    """The tables of a run, which the same command repeated does not measure again."""
+    assert main([*command, "--out", str(out)]) == 0
+    before = [(out / table).read_bytes() for table in tables]
+    assert main([*command, "--out", str(out)]) == 0
+    assert [(out / table).read_bytes() for table in tables] == before
+    return [read(out / table) for table in tables]
+
+
+@needs_llvm
+def test_render(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene, out = write_tiny(tmp_path, NOISY), tmp_path / "out"
+    command = ["render", "--scene", str(scene), "--device", "cpu", "--reference", "240", "--seeds", "3", "--scale", "1"]
+    images, flows, autos = again(command, out, "render.csv", "render_flow.csv", "render_auto.csv")
+    assert {row["variant"] for row in images} == {"llvm_ad_rgb", "scalar_rgb"}
+    # Without a window the radiance is not divided by n² = 2.1: another image by far.
+    assert all((row["rmse"] > 20) != row["window"] for row in images)
+    assert all(row["seconds"] > 0 and row["processor_s"] > 0 for row in images)
+    # A reference of the same number of samples would have 10 % of the camera's noise.
+    assert all(row["reference_noise"] < row["noise"] < row["camera_noise"] for row in images)
+    full = [row for row in images if row["window"] and row["max_depth"] == DEEPEST]
+    assert all(abs(row["bias_percent"]) < 4 * row["bias_se_percent"] for row in full)
+    assert all(row["auto_share"] < 0.2575 for row in autos)  # a quarter, and 3 % for the noise's own uncertainty
+    assert all(row["scene_samples"] == 15 for row in autos)  # 4 are asked for; three for each of five lights
+    by_samples = {(row["samples"], row["camera_noise"]): row for row in flows}
+    assert len(by_samples) == len(flows) == 8  # 15, 20, 80 and 195 samples, noise off and on
+    # More render noise moves the measured flow farther from that without; a factor of 10 in samples.
+    assert by_samples[15, False]["difference_px"] > by_samples[195, False]["difference_px"]
+    assert "llvm_ad_rgb" in capsys.readouterr().out
+    assert all((out / f"{name}.png").read_bytes().startswith(b"\x89PNG") for name in ("render", "render_flow"))
+
+
+def test_settings_of_images_differ_and_keep_below_the_reference() -> None:
+    found = settings(["fast", "slow"], 2, 4, 1200)
+    assert len(found) == len({tuple(row.values()) for row in found})
+    assert max(row["samples"] for row in found) <= 200
+    assert {row["max_depth"] for row in found} == {2, 3, 4, 6, DEEPEST}
+    assert {row["variant"] for row in found if not row["window"]} == {"fast", "slow"}
+    assert all(row["samples"] % 2 == 0 for row in found)  # a multiple of the lights, as it is really taken
+
+
+@needs_llvm
+def test_light(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["light", str(write_tiny(tmp_path, NOISY)), "--device", "cpu", "--reference", "64"]
+    images, flows = again(command, tmp_path / "out", "light.csv", "light_flow.csv")
+    # Two states by path tracing and three numbers of samples; two methods on these and on the reference's halves.
+    assert [row["light"] for row in images] == 2 * ["path_traced"] + 6 * ["separated"]
+    assert len(flows) == 2 * 5
+    assert all(row["share"] <= 0.25 for row in images)
+    noise = {(row["light"], row["samples"], row["state"]): row["noise"] for row in images}
+    assert noise["separated", 9, "pressed"] < noise["path_traced", 15, "pressed"]
+    assert "path_tracing_s" in capsys.readouterr().out
+    (tmp_path / "shining").mkdir()
+    shining = write_tiny(tmp_path / "shining", NOISY + "\n[sensor.coating]\nroughness = 0.5\n")
+    assert main(["light", str(shining), "--device", "cpu", "--out", str(tmp_path / "other")]) == 2
+    assert "needs a matt coating" in capsys.readouterr().err
+
+
+def test_flow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, out = str(write_tiny(tmp_path)), tmp_path / "out"
+    (rows,) = again(["flow", scene, scene], out, "flow.csv")
+    assert len(rows) == len({row["method"] for row in rows})  # a scene counts once
+    assert rows[0]["max_px"] < 1e-5  # float32 flow of a few px
+    assert all(row["ms"] > 0 for row in rows)
+    assert (out / "flow.png").read_bytes().startswith(b"\x89PNG")
+    monkeypatch.setattr("benchmarks.flow.FLOW_TOLERANCE_PX", 0.0)
+    assert main(["flow", scene, "--out", str(out)]) == 1
+
+
+def test_scale(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """No touch: no solve, all else real."""
+    command = ["scale", "--scene", str(write_tiny(tmp_path)), "--n", "4", "--size", "32x24", "--workers", "1"]
+    ((alone, row),) = again([*command, "--set", "motion.depth_mm=-1.0"], tmp_path / "out", "scale.csv")
+    assert (alone["workers"], alone["pairs"], row["workers"], row["pairs"]) == (0, 8, 1, 8)
+    assert row["pairs_per_second"] == row["pairs"] / row["seconds"]
+    for one in (alone, row):  # one process: stages are parts of the whole
+        work = sum(one[f"{stage}_s"] for stage in ("simulate", "render", "flow", "write"))
+        assert 0 < work <= one["seconds"] / one["pairs"]
+    # Of the same pairs, less digits of seconds.
+    assert row["bytes_per_pair"] == pytest.approx(alone["bytes_per_pair"], rel=0.01)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["scale.csv", "scale.png"]
+    assert "Extrapolated from 32 x 24 px" in capsys.readouterr().out
+
+
+def test_rates_of_a_made_up_run() -> None:
+    """8 pairs in 4 s after 7 s of start-up, of which the first 4 took 2.5 s, as their presses cost more."""
+    times = {2: 7.0, 6: 9.5, 10: 11.0}
+    seconds = {"render": 0.1, "flow": 0.05, "write": 0.04}
+    entries = [{"index": k, "seconds": {"simulate": 0.4 if k < 6 else 0.2, **seconds}} for k in range(10)]
+    found = rates(times, entries, 2, 4)
+    assert (found["startup_s"], found["pairs"], found["seconds"], found["pairs_per_second"]) == (7.0, 8, 4.0, 2.0)
+    assert found["growth"] == pytest.approx(1.6)
+    assert found["work_growth"] == pytest.approx(2 * 0.49 / 0.59)
+    assert found["simulate_s"] == pytest.approx(0.3)
+    assert found["other_s"] == pytest.approx(0.01)  # 0.5 s a pair less the stages' 0.49
+
+
+def test_another_size_keeps_the_field_of_view(tmp_path: Path) -> None:
+    scene = str(write_tiny(tmp_path))
+    before, after = (
+        at_size(scene, ["sensor.camera.cy=9.0"], *size).corners[0].sensor.camera for size in ((32, 24), (64, 36))
+    )
+    assert (after.width, after.height) == (64, 36)
+    # Half the image over the focal length is the tangent of half the angle; written with 6 decimals.
+    assert after.width / after.fx == pytest.approx(before.width / before.fx, rel=1e-7)
+    assert after.height / after.fy == pytest.approx(before.height / before.fy, rel=1e-7)
+    assert after.cy / after.height == pytest.approx(9 / 24, rel=1e-7)  # of the scene that was changed
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        (["scale", "--size", "640"], "--size 640: give WIDTHxHEIGHT"),
+        (["scale", "--workers", "-1"], "--workers: give whole numbers from 1 on"),
+        (["scale", "--set", "motion.dept_mm=1"], "motion.dept_mm: unknown key"),
+        (["render", "--seeds", "2"], "--seeds 2: the standard error of the flow's change needs at least 3"),
+        (["render", "--scene", "nowhere"], "nowhere"),
+    ],
+)
+def test_wrong_arguments(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: list[str], message: str) -> None:
+    assert main([*command, "--out", str(tmp_path / "out")]) == 2
+    assert message in capsys.readouterr().err
