@@ -12,10 +12,10 @@ from PIL import Image
 
 from gelflow.baselines.learned import open_network
 from gelflow.baselines.registry import named_methods
-from gelflow.commands import open_all
+from gelflow.data import open_all
 from gelflow.files.image import to_bytes
-from gelflow.shipped import weights_file
-from gelflow.viz import flow_to_colour
+from gelflow.models.weights import weights_file
+from gelflow.predict.pictures import flow_to_colour
 
 
 def main() -> None:

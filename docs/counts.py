@@ -10,9 +10,9 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from gelflow.comparison import read_comparison
-from gelflow.evaluate import PairScore, summarise
-from gelflow.report import markdown
+from gelflow.compare.comparison import read_comparison
+from gelflow.compare.report import markdown
+from gelflow.compare.scores import PairScore, summarise
 
 BETTER = {"PSNR": "psnr_db", "SSIM": "ssim", "mean px": "endpoint_error_px", "median px": "median_error_px"}
 

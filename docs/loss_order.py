@@ -17,12 +17,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gelflow.commands import open_all
-from gelflow.data import PairDataset
+from gelflow.compare.report import markdown
+from gelflow.config.sources import train_config
+from gelflow.data import PairDataset, open_all
 from gelflow.losses import self_supervised_loss
 from gelflow.ops.pyramid import enlarge_flow, flow_pyramid
-from gelflow.overrides import train_config
-from gelflow.report import markdown
 
 FACTORS = (0.0, 0.9, 1.1)
 ITERATIONS, ENOUGH = 60, 1e-10

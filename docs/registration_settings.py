@@ -12,16 +12,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gelflow.commands import open_all
+from gelflow.compare.metrics import flow_errors, image_similarity
+from gelflow.compare.report import markdown
 from gelflow.config import REGISTRATIONS, RegistrationConfig
-from gelflow.data import PairDataset
-from gelflow.estimate import estimate_flow
-from gelflow.metrics import flow_errors, image_similarity
+from gelflow.data import PairDataset, open_all
+from gelflow.data.pairs import without_pattern
+from gelflow.models.estimate import estimate_flow
 from gelflow.models.registration import registered
-from gelflow.report import markdown
-from gelflow.shipped import weights_file
-from gelflow.strata import without_pattern
-from gelflow.train.checkpoint import load_weights
+from gelflow.models.weights import load_weights, weights_file
 
 CHANGES: dict[str, dict[str, tuple[object, ...]]] = {
     "motion": {

@@ -6,10 +6,10 @@ import pytest
 from torch import Tensor
 
 from gelflow.config import LossConfig
+from gelflow.config.sources import train_config
 from gelflow.data.open import open_pairs
 from gelflow.losses import self_supervised_loss
 from gelflow.ops.pyramid import flow_pyramid
-from gelflow.overrides import train_config
 from synth.generate import generate
 from synth.template import load_scene
 

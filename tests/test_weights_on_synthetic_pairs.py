@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from gelflow.baselines.learned import Learned
+from gelflow.compare.scores import evaluate
 from gelflow.data.open import open_pairs
-from gelflow.evaluate import evaluate
-from gelflow.shipped import weights_file
+from gelflow.models.weights import weights_file
 from synth.generate import generate
 from synth.template import load_scene
 

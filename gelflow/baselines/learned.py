@@ -4,14 +4,15 @@ import re
 from pathlib import Path
 from typing import Any
 
+from gelflow.arrays import FlowArray, ImageArray
 from gelflow.baselines.method import check_images
-from gelflow.baselines.tensors import as_array, as_tensor, chosen_device
+from gelflow.baselines.tensors import as_array, as_tensor
 from gelflow.config import REGISTRATIONS, Registration, RegistrationConfig
 from gelflow.errors import InputError
-from gelflow.raster import FlowArray, ImageArray
+from gelflow.hardware import chosen_device
 
 _END = re.compile(r"((?:#\d+)?(?:\+ft)?)$")
-"""The number of a seed and the mark of fine-tuning, which names end with (see `gelflow.seeds`)."""
+"""The number of a seed and the mark of fine-tuning, which names end with (see `gelflow.compare.seeds`)."""
 
 
 def open_network(
@@ -73,7 +74,7 @@ class Learned:
         import torch
 
         from gelflow.models.recorded import RecordedNetwork
-        from gelflow.train.checkpoint import load_weights
+        from gelflow.models.weights import load_weights
 
         self.path = path
         self.device = chosen_device(device)
@@ -93,7 +94,7 @@ class Learned:
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
         """See `Method.flow`."""
-        from gelflow.estimate import estimate_flow
+        from gelflow.models.estimate import estimate_flow
 
         check_images(image1, image2)
         tensors = [as_tensor(image, self.device) for image in (image1, image2)]

@@ -6,10 +6,11 @@ to the best classical method.
 
 from dataclasses import dataclass
 
+from gelflow.arrays import FlowArray, ImageArray
 from gelflow.baselines.classical import DIS
-from gelflow.baselines.tensors import as_array, as_tensor, chosen_device
+from gelflow.baselines.tensors import as_array, as_tensor
 from gelflow.config import RegistrationConfig
-from gelflow.raster import FlowArray, ImageArray
+from gelflow.hardware import chosen_device
 
 
 @dataclass(frozen=True)

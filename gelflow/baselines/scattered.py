@@ -8,7 +8,7 @@ than four points, or all of them on a line, there are no triangles: the nearest 
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.raster import FlowArray
+from gelflow.arrays import FlowArray
 
 
 def dense_flow(points: NDArray[np.float64], motion: NDArray[np.float64], height: int, width: int) -> FlowArray:

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.raster import Bytes3, FlowArray, Grey8
+from gelflow.arrays import Bytes3, FlowArray, Grey8
 
 WORKING_SIDE = 160
 """Longer side, in px, of the reduced image on which motion is measured."""

@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from gelflow.arrays import Bytes3
 from gelflow.data.choose import ChoiceConfig, Choices, choose_pairs
 from gelflow.data.pairset import FILE, ChosenPair, PairSet, SourceReport, read_pair_set, write_pair_set
 from gelflow.errors import InputError
 from gelflow.files.image import MINIMUM_SIDE, write_png
 from gelflow.files.video import SUFFIXES, describe, frames, image_files
-from gelflow.raster import Bytes3
 
 Progress = Callable[[int, int, str, SourceReport | str], None]
 """Called after each recording: done, total, its name, and its report or why it failed."""

@@ -1,9 +1,10 @@
 """Opening whatever holds pairs: a data set of synth or its shards, a pair set of `gelflow pairs`, a plain folder."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from gelflow.data.folder import folder_records, is_pair_folder
-from gelflow.data.pairs import PairDataset
+from gelflow.data.pairs import PairDataset, join
 from gelflow.data.pairset import FILE as PAIR_SET_FILE
 from gelflow.data.pairset import pair_set_records
 from gelflow.data.shards import shard_files, shard_records
@@ -41,3 +42,8 @@ def open_pairs(path: Path | str) -> PairDataset:
         f"{folder}: the folder {content}; allowed: a data set of synth (dataset.json), a pair set of "
         "`python -m gelflow pairs` (pairs.json), shards (*.tar), or files NAME_1.png and NAME_2.png"
     )
+
+
+def open_all(paths: Sequence[Path]) -> PairDataset:
+    """Several folders of pairs as one data set; see `open_pairs` and `join`."""
+    return join([open_pairs(path) for path in paths])

@@ -25,12 +25,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from gelflow.arrays import ImageArray, MarkerArray
 from gelflow.data.member import FlowMembers, Member
 from gelflow.errors import InputError
 from gelflow.files.exr import Direction, FlowField, read_flow
 from gelflow.files.image import read_pair
-from gelflow.raster import ImageArray, MarkerArray
-from gelflow.strata import without_pattern
 
 
 @dataclass(frozen=True)
@@ -55,6 +54,11 @@ class PairRecord:
     exchanged: bool = False
     scene: str | None = None
     origin: str | None = None
+
+
+def without_pattern(scene: str | None) -> bool:
+    """Whether a pair's "scene, kind of pattern" says that its gel has none."""
+    return scene is not None and scene.rpartition(", ")[2] == "none"
 
 
 class PairDataset(Dataset[dict[str, Tensor | str | bool]]):

@@ -14,10 +14,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.arrays import FlowArray, MaskArray
 from gelflow.errors import InputError
 from gelflow.files.atomic import replacing
 from gelflow.files.quiet import quiet
-from gelflow.raster import FlowArray, MaskArray
 
 DIRECTIONS = "U right, V down; I1(x) = I2(x + forward(x))"
 """In the header of each flow that is written here, and in those words nowhere else."""

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from gelflow.arrays import FlowArray
 from gelflow.errors import InputError
 from gelflow.files.atomic import replacing
-from gelflow.raster import FlowArray
 
 MAGIC = np.float32(202021.25)
 UNKNOWN = np.float32(1e10)

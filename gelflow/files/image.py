@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from gelflow.arrays import Bytes3, FlowArray, Grey8, ImageArray
 from gelflow.errors import InputError
 from gelflow.files.atomic import replacing
 from gelflow.files.quiet import quiet
-from gelflow.raster import Bytes3, FlowArray, Grey8, ImageArray
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"})
 MINIMUM_SIDE = 16

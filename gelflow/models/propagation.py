@@ -26,8 +26,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from gelflow.arrays import Flow, Images
+from gelflow.ops.cached import cached
 from gelflow.ops.gaussian import Smoother, WindowSums
-from gelflow.ops.kept import kept
 from gelflow.ops.resize import resize_flow, resize_images
 from gelflow.ops.warp import inside, warp
 
@@ -130,7 +130,7 @@ class _Offers:
         return there - right * across - down * along
 
 
-@kept
+@cached
 def _steps(places: tuple[tuple[int, int], ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     """(2, N, 1, 1, 1, 1)."""
     return torch.tensor(places, dtype=dtype, device=device).T.reshape(2, -1, 1, 1, 1, 1)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gelflow.arrays import Features
-from gelflow.ops.kept import kept
+from gelflow.ops.cached import cached
 
 
 class WindowSums:
@@ -52,13 +52,13 @@ class Smoother:
         return self._y @ field @ self._x.T
 
 
-@kept
+@cached
 def _sums(pixels: int, deviation: float, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Matrix (n, n) of the sums along one axis."""
     return _window(pixels, 0, deviation, math.ceil(3 * deviation), device).to(dtype)
 
 
-@kept
+@cached
 def _mean(pixels: int, deviation: float, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Matrix (n, n) of the mean along one axis."""
     if deviation == 0:

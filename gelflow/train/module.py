@@ -17,12 +17,12 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from gelflow.config import MINIMUM_SIDE, TrainConfig
 from gelflow.errors import InputError
-from gelflow.estimate import estimate_flow
 from gelflow.losses import flow_loss, self_supervised_loss
-from gelflow.losses.analogy import analogy_loss, transformed_pair
+from gelflow.losses.augmentation_consistency import analogy_loss, transformed_pair
 from gelflow.losses.occlusion import visible_both_ways
 from gelflow.losses.photometric import photometric_loss
 from gelflow.models import GelFlow
+from gelflow.models.estimate import estimate_flow
 from gelflow.ops.warp import inside, warp
 from gelflow.train.graph import GraphedNetwork
 

@@ -23,9 +23,9 @@ from torch.utils.data import DataLoader, Dataset
 from gelflow.config import TrainConfig
 from gelflow.errors import InputError
 from gelflow.models import GelFlow
+from gelflow.models.weights import load_weights, save_weights
 from gelflow.terminal import progress
-from gelflow.train.checkpoint import load_weights, save_weights
-from gelflow.train.keeper import (
+from gelflow.train.callback import (
     Keeper,
     Stopped,
     describe,

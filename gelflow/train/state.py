@@ -18,10 +18,10 @@ import torch
 
 from gelflow import __version__
 from gelflow.config import TrainConfig
+from gelflow.config.validation import validated
 from gelflow.errors import InputError
 from gelflow.files.atomic import refuse_foreign, replacing, write_text
 from gelflow.files.tensors import Unreadable, load_tensors
-from gelflow.schema_errors import validated
 
 RUN, STATE, WEIGHTS = "run.json", "state.ckpt", "weights.safetensors"
 

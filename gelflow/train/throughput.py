@@ -4,7 +4,7 @@ import time
 
 import torch
 
-from gelflow.speed import process_peak
+from gelflow.hardware import process_memory
 
 
 class Throughput:
@@ -44,5 +44,5 @@ def peak_memory_mib() -> float | None:
     """The most memory that torch held on the CUDA device, or on a CPU the process; MiB, None where it is not known."""
     if torch.cuda.is_available() and torch.cuda.is_initialized():
         return torch.cuda.max_memory_allocated() / 2**20
-    peak = process_peak()
+    peak = process_memory(peak=True)
     return None if peak is None else peak / 2**20

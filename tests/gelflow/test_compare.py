@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from textures import save, write_folder, write_synthetic
 
+from gelflow.arrays import FlowArray, ImageArray
 from gelflow.baselines import named_methods
-from gelflow.compare import compare
+from gelflow.compare.report import markdown
+from gelflow.compare.run import compare
+from gelflow.compare.scores import evaluate, summarise
+from gelflow.compare.seeds import grouped
+from gelflow.compare.tables import pair_table, summary_table
 from gelflow.data import open_pairs
 from gelflow.errors import InputError
-from gelflow.evaluate import evaluate, summarise
-from gelflow.raster import FlowArray, ImageArray
-from gelflow.report import markdown
-from gelflow.report_tables import pair_table, summary_table
-from gelflow.seeds import grouped
 
 
 @dataclass(frozen=True)

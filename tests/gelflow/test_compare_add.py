@@ -11,13 +11,13 @@ import pytest
 from test_compare import Constant
 from textures import write_folder, write_synthetic
 
+from gelflow.arrays import FlowArray, ImageArray
 from gelflow.cli import main
-from gelflow.compare import compare
-from gelflow.comparison import read_comparison
+from gelflow.compare.comparison import read_comparison
+from gelflow.compare.run import compare
+from gelflow.compare.scores import score_pair
 from gelflow.data import join, open_pairs
 from gelflow.errors import InputError
-from gelflow.evaluate import score_pair
-from gelflow.raster import FlowArray, ImageArray
 
 SHIFTS = [(3.0, 4.0), (0.0, 0.5), (1.0, 0.0), (2.0, 0.0)]
 

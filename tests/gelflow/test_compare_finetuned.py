@@ -9,14 +9,14 @@ import torch
 from safetensors.torch import load_file
 from textures import write_folder, write_synthetic
 
-from gelflow.baselines.finetuned import fine_tuned, fine_tuning_settings
 from gelflow.baselines.learned import Learned
 from gelflow.config import ModelConfig, MotionConfig, RegistrationConfig, TrainConfig
+from gelflow.config.sources import train_config
 from gelflow.data import PairDataset, join, open_pairs
 from gelflow.errors import InputError
 from gelflow.models import GelFlow
-from gelflow.overrides import train_config
-from gelflow.train.checkpoint import read_metadata, save_weights
+from gelflow.models.weights import read_metadata, save_weights
+from gelflow.train.test_time import fine_tuned, fine_tuning_settings
 
 SMALL = ModelConfig(levels=4, projected_channels=8)
 UNSUITABLE: dict[str, Any] = {

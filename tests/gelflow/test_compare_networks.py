@@ -11,16 +11,16 @@ from safetensors.torch import load_file
 from textures import write_folder
 from waves import Shifts
 
+from gelflow.arrays import FlowArray, ImageArray
 from gelflow.cli import main
+from gelflow.compare.plots import pareto_front
+from gelflow.compare.scores import evaluate
+from gelflow.compare.speed import network_speed
 from gelflow.config import TrainConfig
 from gelflow.data import open_pairs
-from gelflow.evaluate import evaluate
 from gelflow.models.raft import RAFT
-from gelflow.raster import FlowArray, ImageArray
-from gelflow.report_plots import pareto_front
-from gelflow.speed import network_speed
+from gelflow.models.weights import read_metadata
 from gelflow.train import train
-from gelflow.train.checkpoint import read_metadata
 
 
 @pytest.fixture(scope="module")

@@ -7,12 +7,12 @@ import pytest
 from test_compare import Constant
 from textures import write_folder, write_synthetic
 
-from gelflow.compare import compare
+from gelflow.compare.report import latex
+from gelflow.compare.run import compare
+from gelflow.compare.scores import evaluate, summarise
+from gelflow.compare.seeds import group_name, grouped
+from gelflow.compare.tables import pair_table, strata_table, summary_table, tables
 from gelflow.data import open_pairs
-from gelflow.evaluate import evaluate, summarise
-from gelflow.report import latex
-from gelflow.report_tables import pair_table, strata_table, summary_table, tables
-from gelflow.seeds import group_name, grouped
 
 
 def test_the_seed_is_a_number_at_the_end() -> None:

@@ -10,12 +10,12 @@ import pytest
 from PIL import ExifTags, Image, ImageOps
 from textures import as_bytes, moved, save
 
+from gelflow.arrays import FlowArray
 from gelflow.errors import InputError
 from gelflow.files.atomic import replacing
 from gelflow.files.exr import read_channels, read_flow, write_flow
 from gelflow.files.flo import read_flo, write_flo
 from gelflow.files.image import read_image, read_pair, write_png
-from gelflow.raster import FlowArray
 
 
 def some_flow() -> FlowArray:

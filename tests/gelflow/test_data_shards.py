@@ -18,8 +18,8 @@ from gelflow.cli import main
 from gelflow.config import TrainConfig
 from gelflow.data import PairDataset, open_pairs
 from gelflow.errors import InputError
+from gelflow.models.weights import load_weights
 from gelflow.train import train
-from gelflow.train.checkpoint import load_weights
 from synth.dataset import export as exporting
 from synth.dataset.job import Job
 from synth.dataset.sample import Sample

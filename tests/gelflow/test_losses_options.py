@@ -7,14 +7,14 @@ from torch.autograd import gradcheck
 from waves import moved_pair, pixel_centres, press_flow
 
 from gelflow.config import LossConfig
+from gelflow.config.sources import train_config
 from gelflow.losses import self_supervised_loss
-from gelflow.losses.analogy import analogy_loss, transformed_pair
+from gelflow.losses.augmentation_consistency import analogy_loss, transformed_pair
 from gelflow.losses.census import census_loss
 from gelflow.losses.occlusion import visible_both_ways
 from gelflow.losses.smoothness import second_order_loss
 from gelflow.ops.pyramid import flow_pyramid
 from gelflow.ops.warp import inside, warp
-from gelflow.overrides import train_config
 
 
 def random(seed: int) -> torch.Generator:

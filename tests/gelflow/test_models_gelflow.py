@@ -5,8 +5,8 @@ import torch
 
 from gelflow.config import ModelConfig
 from gelflow.errors import InputError
-from gelflow.estimate import estimate_flow
 from gelflow.models import GelFlow
+from gelflow.models.estimate import estimate_flow
 from gelflow.models.gelflow import normalised
 from gelflow.ops.resize import resize_flow
 

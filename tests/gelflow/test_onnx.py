@@ -11,8 +11,8 @@ import torch
 from gelflow.cli import main
 from gelflow.config import ModelConfig
 from gelflow.models import GelFlow
+from gelflow.models.weights import load_weights, save_weights
 from gelflow.ops.correlation import _unfolded, local_correlation
-from gelflow.train.checkpoint import load_weights, save_weights
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def test_the_exported_network_gives_the_same_flow(weights: Path, tmp_path: Path)
 )
 def test_mistakes_are_one_line(weights: Path, tail: list[str], word: str, capsys: pytest.CaptureFixture[str],
                                monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
-    monkeypatch.setattr("gelflow.export.find_spec", lambda name: name)
+    monkeypatch.setattr("gelflow.models.onnx.find_spec", lambda name: name)
     monkeypatch.chdir(weights.parent)
     assert main(["export", weights.name, *tail]) == 2
     captured = capsys.readouterr().err
@@ -72,7 +72,7 @@ def test_mistakes_are_one_line(weights: Path, tail: list[str], word: str, capsys
 
 def test_a_file_from_elsewhere_is_not_replaced(weights: Path, capsys: pytest.CaptureFixture[str],
                                                monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
-    monkeypatch.setattr("gelflow.export.find_spec", lambda name: name)
+    monkeypatch.setattr("gelflow.models.onnx.find_spec", lambda name: name)
     out = weights.with_name("other.onnx")
     out.write_text("another's")
     assert main(["export", str(weights), "--out", str(out), "--size", "64x64"]) == 2
@@ -82,7 +82,7 @@ def test_a_file_from_elsewhere_is_not_replaced(weights: Path, capsys: pytest.Cap
 
 def test_a_missing_package_is_named(weights: Path, capsys: pytest.CaptureFixture[str],
                                     monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
-    monkeypatch.setattr("gelflow.export.find_spec", lambda name: None)
+    monkeypatch.setattr("gelflow.models.onnx.find_spec", lambda name: None)
     assert main(["export", str(weights), "--out", "x.onnx"]) == 2
     assert "pip install onnx onnxscript" in capsys.readouterr().err
 

@@ -13,8 +13,8 @@ from gelflow.baselines import named_methods
 from gelflow.errors import InputError
 from gelflow.files.exr import read_flow
 from gelflow.files.flo import read_flo
-from gelflow.predict import predict_pair, predict_video
-from gelflow.viz import UNKNOWN_COLOUR, arrow_factor, draw_overlay, flow_to_colour, robust_scale
+from gelflow.predict.pictures import UNKNOWN_COLOUR, arrow_factor, draw_overlay, flow_to_colour, robust_scale
+from gelflow.predict.prediction import predict_pair, predict_video
 
 FARNEBACK = named_methods(["farneback"])[0]
 

@@ -18,7 +18,7 @@ from gelflow.config import ModelConfig
 from gelflow.errors import InputError
 from gelflow.models import GelFlow
 from gelflow.models.raft import RAFT
-from gelflow.train.checkpoint import read_metadata, save_weights
+from gelflow.models.weights import read_metadata, save_weights
 
 
 class Evil:

@@ -10,10 +10,9 @@ from waves import press_flow
 from gelflow.cli import app
 from gelflow.config import REGISTRATIONS, ModelConfig
 from gelflow.errors import InputError
-from gelflow.estimate import estimate_flow
 from gelflow.files.image import write_png
-from gelflow.shipped import weights_file
-from gelflow.train.checkpoint import load_weights, read_metadata
+from gelflow.models.estimate import estimate_flow
+from gelflow.models.weights import load_weights, read_metadata, weights_file
 
 
 def test_names_and_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

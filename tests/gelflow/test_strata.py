@@ -11,11 +11,11 @@ import pytest
 from test_compare import Constant
 from textures import write_synthetic
 
-from gelflow.compare import compare
+from gelflow.compare.run import compare
+from gelflow.compare.scores import evaluate
+from gelflow.compare.strata import EDGE, MOTION, PATTERN, SCENE, merged, pair_strata, signed_distance
+from gelflow.compare.tables import strata_table, tables
 from gelflow.data import PairDataset, open_pairs
-from gelflow.evaluate import evaluate
-from gelflow.report_tables import strata_table, tables
-from gelflow.strata import EDGE, MOTION, PATTERN, SCENE, merged, pair_strata, signed_distance
 
 
 def test_distance_is_signed_and_measured_from_the_edge_between_pixels() -> None:

@@ -7,9 +7,9 @@ import sys
 import pytest
 
 from gelflow.config import REGISTRATIONS, LossConfig, ModelConfig, RegistrationConfig, TrainConfig
+from gelflow.config.sources import train_config
+from gelflow.config.validation import validated
 from gelflow.errors import InputError
-from gelflow.overrides import train_config
-from gelflow.schema_errors import validated
 
 
 def test_defaults_are_the_readings_of_the_paper() -> None:

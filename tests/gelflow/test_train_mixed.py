@@ -8,10 +8,10 @@ from torch.utils.data import ConcatDataset
 from waves import Shifts
 
 from gelflow.config import LossConfig, ModelConfig, TrainConfig
+from gelflow.config.sources import train_config
 from gelflow.errors import InputError
 from gelflow.losses import flow_loss, self_supervised_loss
 from gelflow.models import GelFlow
-from gelflow.overrides import train_config
 from gelflow.train import train
 from gelflow.train.module import FlowModule
 from gelflow.train.samples import checked, collate

@@ -6,8 +6,8 @@ import torch
 from waves import Shifts, pixel_centres, wave_image
 
 from gelflow.config import MotionConfig, TrainConfig
+from gelflow.config.sources import train_config
 from gelflow.ops.warp import warp
-from gelflow.overrides import train_config
 from gelflow.train.augment import augmented
 from gelflow.train.samples import TrainingBatches, TrainingSamples, collate
 

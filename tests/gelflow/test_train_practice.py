@@ -19,8 +19,8 @@ from waves import Shifts
 from gelflow.config import TrainConfig
 from gelflow.data import open_pairs
 from gelflow.models import GelFlow
+from gelflow.models.weights import load_weights
 from gelflow.train import module, train
-from gelflow.train.checkpoint import load_weights
 from gelflow.train.module import FlowModule
 from gelflow.train.state import load_state
 

@@ -9,8 +9,8 @@ import torch
 from waves import Shifts
 
 from gelflow.config import TrainConfig
+from gelflow.config.sources import PRESETS, train_config
 from gelflow.errors import InputError
-from gelflow.overrides import PRESETS, train_config
 from gelflow.train import train
 
 TINY = ["steps=2", "warmup_steps=0", "batch_size=2", "image_size=[64, 64]", "crop_size=[64, 64]", "device=cpu"]

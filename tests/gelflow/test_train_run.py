@@ -17,9 +17,9 @@ from waves import Shifts
 from gelflow.config import ModelConfig, TrainConfig
 from gelflow.data import open_pairs
 from gelflow.errors import InputError
-from gelflow.estimate import estimate_flow
+from gelflow.models.estimate import estimate_flow
+from gelflow.models.weights import load_weights, read_metadata
 from gelflow.train import train
-from gelflow.train.checkpoint import load_weights, read_metadata
 from gelflow.train.module import learning_rate_factor
 from gelflow.train.state import load_state
 

@@ -5,11 +5,11 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from gelflow.comparison import Comparison
-from gelflow.evaluate import PairScore
+from gelflow.compare.comparison import Comparison
+from gelflow.compare.plots import plot_means, plot_strata, plot_work_precision
+from gelflow.compare.scores import PairScore
+from gelflow.compare.tables import Table, tables, with_pattern
 from gelflow.files.atomic import replacing, write_text
-from gelflow.report_plots import plot_means, plot_strata, plot_work_precision
-from gelflow.report_tables import Table, tables, with_pattern
 
 SCORES = "scores.json"
 FILES = ("scores.csv", "strata.csv", SCORES, "table.md", "table.tex", "table.png", "work_precision.png", "strata.png")

@@ -11,10 +11,10 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from gelflow.compare.scores import PairScore, summarise
+from gelflow.compare.speed import Speed
+from gelflow.compare.strata import Stratum, merged
 from gelflow.errors import InputError
-from gelflow.evaluate import PairScore, summarise
-from gelflow.speed import Speed
-from gelflow.strata import Stratum, merged
 
 _ERRORS = ("endpoint_error_px", "median_error_px")
 

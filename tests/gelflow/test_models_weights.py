@@ -10,7 +10,7 @@ from safetensors.torch import load_file, save_file
 from gelflow.config import ModelConfig
 from gelflow.errors import InputError
 from gelflow.models import GelFlow
-from gelflow.train.checkpoint import load_weights, read_metadata, save_weights
+from gelflow.models.weights import load_weights, read_metadata, save_weights
 
 SMALL = ModelConfig(levels=4, estimator="shared")
 

@@ -47,7 +47,7 @@ def export_onnx(weights: Path, out: Path, size: tuple[int, int] | None = None) -
     refuse_foreign(out, PRODUCER.encode())
     import torch
 
-    from gelflow.train.checkpoint import load_weights
+    from gelflow.models.weights import load_weights
 
     model = load_weights(weights)
     chosen = size or model.image_size

@@ -12,6 +12,7 @@ from typing import Literal
 
 import numpy as np
 
+from gelflow.arrays import Bytes3, FlowArray, ImageArray
 from gelflow.baselines.method import Method
 from gelflow.errors import InputError
 from gelflow.files.atomic import refuse_foreign, replacing
@@ -20,8 +21,7 @@ from gelflow.files.flo import write_flo
 from gelflow.files.image import read_pair, write_png
 from gelflow.files.quiet import quiet
 from gelflow.files.video import describe, frame_file, frames, image_files
-from gelflow.raster import Bytes3, FlowArray, ImageArray
-from gelflow.viz import draw_overlay, round_up, write_flow_picture
+from gelflow.predict.pictures import draw_overlay, round_up, write_flow_picture
 
 Reference = Literal["first", "previous"]
 

@@ -1,17 +1,19 @@
 """The tables of a comparison.
 
 Methods that were optimised on the very pairs ("+ft") come last and, in the table of means, apart. Trainings that
-differ in their seed alone are one row (see `gelflow.seeds`): mean ± standard deviation, pooled pixels in the strata.
+differ in their seed alone are one row (see `gelflow.compare.seeds`): mean ± standard deviation, pooled pixels in
+the strata.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from statistics import fmean
 
-from gelflow.comparison import Comparison
-from gelflow.evaluate import MethodScore, PairScore, summarise
-from gelflow.seeds import Group, group_name, grouped
-from gelflow.speed import Speed
-from gelflow.strata import Stratum, merged, without_pattern
+from gelflow.compare.comparison import Comparison
+from gelflow.compare.scores import MethodScore, PairScore, summarise
+from gelflow.compare.seeds import Group, group_name, grouped
+from gelflow.compare.speed import Speed
+from gelflow.compare.strata import Stratum, merged
+from gelflow.data.pairs import without_pattern
 
 MOST_PAIRS_IN_A_TABLE = 12
 """Above this many pairs, tables show means only; CSV and JSON always have every pair."""

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean, stdev
 
-from gelflow.evaluate import MethodScore
+from gelflow.compare.scores import MethodScore
 
 FINE_TUNED = "+ft"
 """End of the names of methods that were optimised on the very pairs that they are scored on."""

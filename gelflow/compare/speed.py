@@ -13,17 +13,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gelflow.hardware import hardware
+from gelflow.hardware import hardware, process_memory
 
-CLEAR_PEAK, STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")
+CLEAR_PEAK = Path("/proc/self/clear_refs")
 
 
 @dataclass(frozen=True)
 class Speed:
-    """What was measured.
+    """Throughput and memory of a network's forward pass.
 
     Attributes:
-        pairs_per_second: Throughput, both images of a pair counted as one.
+        pairs_per_second: Both images of a pair counted as one.
         memory_mib: Peak memory of a batch, MiB; None where it cannot be measured.
         batch: Pairs in a batch.
         size: Rows and columns of the images.
@@ -54,30 +54,28 @@ def network_speed(
 
     random = torch.Generator().manual_seed(0)
     images = [torch.rand(batch, 3, *size, generator=random).to(device) for _ in range(2)]
-    cuda = device == "cuda"
+    synchronise = torch.cuda.synchronize if device == "cuda" else lambda: None
     seconds = []
     with torch.no_grad():
-        start = _start_memory(cuda)
+        start = _start_memory(device)
         for _ in range(warmup):
             model(*images)
         for _ in range(repeats):
-            if cuda:
-                torch.cuda.synchronize()
+            synchronise()
             started = time.perf_counter()
             model(*images)
-            if cuda:
-                torch.cuda.synchronize()
+            synchronise()
             seconds.append(time.perf_counter() - started)
-    peak = _peak_memory(cuda)
+    peak = float(torch.cuda.max_memory_allocated()) if device == "cuda" else process_memory(peak=True)
     memory = None if peak is None or start is None else max(0.0, (peak - start) / 2**20)
     return Speed(batch / statistics.median(seconds), memory, batch, size, hardware(device))
 
 
-def _start_memory(cuda: bool) -> float | None:
-    """Bytes held now, and the peak forgotten."""
+def _start_memory(device: str) -> float | None:
+    """Bytes held now; the peak is forgotten."""
     import torch
 
-    if cuda:
+    if device == "cuda":
         torch.cuda.reset_peak_memory_stats()
         return float(torch.cuda.memory_allocated())
     try:
@@ -86,25 +84,4 @@ def _start_memory(cuda: bool) -> float | None:
         CLEAR_PEAK.write_text("5", encoding="ascii")  # Linux: forget the peak of the resident memory
     except OSError:
         return None
-    return _status("VmRSS")
-
-
-def _peak_memory(cuda: bool) -> float | None:
-    import torch
-
-    return float(torch.cuda.max_memory_allocated()) if cuda else process_peak()
-
-
-def process_peak() -> float | None:
-    """Peak of this process's resident memory in bytes (Linux), or None."""
-    return _status("VmHWM")
-
-
-def _status(field: str) -> float | None:
-    """A size from the process's status, bytes; None where there is no such file (other than Linux)."""
-    try:
-        lines = STATUS.read_text(encoding="ascii").splitlines()
-    except OSError:
-        return None
-    found = [float(line.split()[1]) * 1024 for line in lines if line.startswith(f"{field}:")]
-    return found[0] if found else None
+    return process_memory(peak=False)

@@ -25,10 +25,10 @@ from typing import Any
 
 from gelflow.baselines.learned import Learned
 from gelflow.config import TrainConfig
+from gelflow.config.sources import train_config
+from gelflow.config.validation import validated
 from gelflow.data.pairs import PairDataset
 from gelflow.errors import InputError
-from gelflow.overrides import train_config
-from gelflow.schema_errors import validated
 
 SUFFIX = "+ft"
 """At the end of the name of every method of this kind."""
@@ -51,7 +51,7 @@ def fine_tuning_settings(method: Learned, steps: int, config: str | None, pairs:
     Raises:
         InputError: The weights carry no settings, or `config` cannot be used.
     """
-    from gelflow.train.checkpoint import read_metadata
+    from gelflow.models.weights import read_metadata
 
     if config is None:
         text = read_metadata(method.path).get("train")

@@ -11,11 +11,11 @@ import numpy as np
 
 from gelflow.baselines.exact import ExactFlow
 from gelflow.baselines.method import Method
+from gelflow.compare.metrics import endpoint_error, flow_errors, image_similarity, marker_distance
+from gelflow.compare.strata import Stratum, pair_strata
 from gelflow.data.pairs import PairDataset
 from gelflow.errors import InputError, NothingFoundError
 from gelflow.hardware import hardware
-from gelflow.metrics import endpoint_error, flow_errors, image_similarity, marker_distance
-from gelflow.strata import Stratum, pair_strata
 
 
 @dataclass(frozen=True)

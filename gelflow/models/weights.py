@@ -5,6 +5,7 @@ Metadata (all texts): `format` = "gelflow", `version` of gelflow, `model` (the `
 """
 
 import json
+from importlib.resources import files
 from pathlib import Path
 
 import torch
@@ -14,13 +15,22 @@ from torch import Tensor
 
 from gelflow import __version__
 from gelflow.config import ModelConfig
+from gelflow.config.validation import validated
 from gelflow.errors import InputError
 from gelflow.files.atomic import replacing
 from gelflow.models import GelFlow
-from gelflow.schema_errors import validated
 
+SHIPPED = "best"
+"""Name of the weights that come with the package; `gelflow/weights/README.md` says what they were trained on."""
 FORMAT = "gelflow"
 RETRAIN = "give a file that `python -m gelflow train` wrote (weights.safetensors)"
+
+
+def weights_file(given: Path | None) -> Path:
+    """The given file of weights; for None, and for "best" where no file is called so, the one in the package."""
+    if given is None or (str(given) == SHIPPED and not given.is_file()):
+        return Path(str(files("gelflow"))) / "weights" / f"{SHIPPED}.safetensors"
+    return given
 
 
 def save_weights(path: Path, model: GelFlow, **metadata: str) -> None:

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.arrays import Bytes3, FlowArray, ImageArray
 from gelflow.files.atomic import replacing
 from gelflow.files.image import to_bytes
-from gelflow.metrics import warp_image
-from gelflow.raster import Bytes3, FlowArray, ImageArray
+from gelflow.ops.warp import warp_image
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

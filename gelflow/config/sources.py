@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from gelflow.config import REGISTRATIONS, TrainConfig
+from gelflow.config.validation import validated
 from gelflow.errors import InputError
-from gelflow.schema_errors import validated
 
 PRESETS = ("best", "real", "bare", "paper", "selfflow", "arflow")
 """Names of the configurations that come with the package."""

@@ -6,9 +6,9 @@ from itertools import cycle
 from pathlib import Path
 from typing import Any
 
+from gelflow.compare.seeds import Group, group_name
+from gelflow.compare.strata import EDGE, MOTION, PATTERN, Stratum, merged
 from gelflow.files.atomic import replacing
-from gelflow.seeds import Group, group_name
-from gelflow.strata import EDGE, MOTION, PATTERN, Stratum, merged
 
 UNTIMED = ("no motion", "exact flow")
 """What takes no time worth drawing."""

@@ -16,9 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.arrays import Bytes3, FlowArray, Grey8, ImageArray, MarkerArray, MaskArray
 from gelflow.errors import InputError
 from gelflow.files.image import to_bytes, to_grey
-from gelflow.raster import Bytes3, FlowArray, Grey8, ImageArray, MarkerArray, MaskArray
+from gelflow.ops.warp import warp_image
 
 
 @dataclass(frozen=True)
@@ -68,23 +69,6 @@ def flow_errors(flow: FlowArray, truth: FlowArray, visible: MaskArray) -> FlowEr
         outliers_01px=float(np.mean(~(error <= 0.1))),
         pixels=int(error.size),
     )
-
-
-def warp_image(image2: ImageArray, flow: FlowArray) -> ImageArray:
-    """Image 2 brought to image 1: image2(x + flow(x)), bilinear, the border repeated outside; NaN where the flow is.
-
-    SciPy, not OpenCV: before version 5, `cv2.remap` rounds positions to 1/32 px.
-    """
-    from scipy.ndimage import map_coordinates
-
-    rows, columns = np.indices(flow.shape[:2], dtype=np.float64)
-    position = np.stack([rows + flow[..., 1], columns + flow[..., 0]])
-    unknown = np.isnan(position).any(axis=0)
-    position[:, unknown] = 0.0
-    channels = [map_coordinates(image2[..., c], position, order=1, mode="nearest") for c in range(image2.shape[2])]
-    warped = np.stack(channels, axis=-1).astype(np.float32)
-    warped[unknown] = np.nan
-    return warped
 
 
 def psnr(image: Bytes3, other: Bytes3) -> float:

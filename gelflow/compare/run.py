@@ -5,12 +5,12 @@ from pathlib import Path
 
 from gelflow.baselines.learned import Learned, PublishedRaft
 from gelflow.baselines.method import Method
-from gelflow.comparison import Comparison, read_comparison
+from gelflow.compare.comparison import Comparison, read_comparison
+from gelflow.compare.report import SCORES, write_report
+from gelflow.compare.scores import PairScore, evaluate
+from gelflow.compare.speed import Speed, network_speed
 from gelflow.data.pairs import PairDataset
 from gelflow.errors import InputError
-from gelflow.evaluate import PairScore, evaluate
-from gelflow.report import SCORES, write_report
-from gelflow.speed import Speed, network_speed
 
 SAME_MOTION_PX = 0.01
 """Pairs of one name whose true motions differ by no more than this in the mean are the same pair. The same scene and
@@ -30,7 +30,7 @@ def compare(
     Args:
         methods: At least one, with names that differ.
         dataset: The pairs.
-        out: Folder for the files of `gelflow.report.FILES`; written anew after each method, so that an interruption
+        out: Folder for the report, written anew after each method, so that an interruption
             loses one method at most.
         progress: Called after each pair.
         batch: Pairs at once where the speed of networks is measured; 0: it is not.

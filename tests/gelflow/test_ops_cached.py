@@ -2,13 +2,13 @@
 
 import torch
 
-from gelflow.ops.kept import kept
+from gelflow.ops.cached import cached
 
 
 def test_one_tensor_for_each_set_of_arguments() -> None:
     made: list[int] = []
 
-    @kept
+    @cached
     def ones(pixels: int, dtype: torch.dtype) -> torch.Tensor:
         made.append(pixels)
         return torch.ones(pixels, dtype=dtype)
@@ -21,7 +21,7 @@ def test_one_tensor_for_each_set_of_arguments() -> None:
 def test_a_tensor_made_in_inference_mode_takes_part_in_training() -> None:
     """Fails without leaving inference mode: autograd refuses to save what was made there."""
 
-    @kept
+    @cached
     def twos(pixels: int) -> torch.Tensor:
         return torch.full((pixels,), 2.0)
 

@@ -15,12 +15,12 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.raster import FlowArray, MaskArray
+from gelflow.arrays import FlowArray, MaskArray
+from gelflow.data.pairs import without_pattern
 
 MOTION_PX = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, np.inf)
 EDGE_PX = (-np.inf, -16.0, -4.0, 0.0, 4.0, 16.0, 64.0, np.inf)
 MOTION, EDGE, PATTERN, SCENE = "motion", "distance to contact edge", "pattern", "scene and pattern"
-NO_PATTERN = "none"
 BARE = ", bare gel"
 """End of the kinds of bins of gels without a pattern."""
 
@@ -69,11 +69,6 @@ def pair_strata(
     if scene is not None:
         strata += [_stratum(PATTERN, scene.rpartition(", ")[2], chosen), _stratum(SCENE, scene, chosen)]
     return tuple(strata)
-
-
-def without_pattern(scene: str | None) -> bool:
-    """Whether a pair's "scene, kind of pattern" says that its gel has none."""
-    return scene is not None and scene.rpartition(", ")[2] == NO_PATTERN
 
 
 def signed_distance(region: MaskArray) -> NDArray[np.float64]:

@@ -17,8 +17,8 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from gelflow.config import TrainConfig
 from gelflow.errors import InputError
+from gelflow.models.weights import save_weights
 from gelflow.terminal import Advance
-from gelflow.train.checkpoint import save_weights
 from gelflow.train.module import LOG_EVERY, FlowModule
 from gelflow.train.state import WEIGHTS, State, save_state
 from gelflow.train.throughput import Throughput, peak_memory_mib
