@@ -18,7 +18,7 @@ variants='paper
 no_lffm model.lffm=false
 no_decomposition loss.lambda_dc=0
 no_deformation loss.lambda_df=0
-no_regulariser loss.smoothness=none
+no_regulariser loss.lambda_dc=0 loss.lambda_df=0
 uniform_weight loss.weight=floor loss.weight_floor=1.0
 finest_scale_only loss.lambda_s=[1.0,0,0,0,0,0,0]
 edge_aware_weight loss.weight=edge_aware

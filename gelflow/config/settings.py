@@ -95,9 +95,9 @@ class ModelConfig(_Frozen):
     """Factor on the dot products before the softmax: 1/sqrt(C), or 1 as published. Unscaled products of long feature
     vectors turn the softmax into a selection of the centre, and the module into the identity."""
 
-    refine: Literal["none", "half", "full"] = "none"
+    refine: Literal["none", "half"] = "none"
     """A refinement head after the last decoded flow: local correlation of fine features around the flow so far, at half
-    or at full resolution. Not in the paper, whose finest flow is an enlargement of V2."""
+    of the resolution. Not in the paper, whose finest flow is an enlargement of V2."""
     refine_iterations: int = Field(default=3, ge=1, le=16)
     """Times that the refinement head, with the same weights, corrects the flow."""
     registration: RegistrationConfig | None = None
@@ -119,32 +119,24 @@ class LossConfig(_Frozen):
 
     alpha: float = Field(default=0.85, ge=0, le=1)
     """Share of SSIM in the photometric loss; the rest is the absolute difference."""
-    lambda_ph: float = Field(default=1.0, ge=0)
-    """Weight of the photometric loss."""
-    lambda_census: float = Field(default=0.0, ge=0)
-    """Weight of the ternary census loss (Meister, Hur and Roth 2018) beside it: indifferent to brightness."""
     warping: Literal["bilinear", "spline"] = "bilinear"
     """Interpolation of the second image in the loss. The paper names none; bilinear blurs, most at half a px."""
     compare_at: Literal["scale", "image"] = "scale"
     """Where each scale's flow is judged: on the images of its own scale (the paper), whose pattern is averaged away at
     coarse scales, or, enlarged, on the images themselves."""
     occlusion: Literal["none", "forward_backward"] = "none"
-    """Pixels that do not count in the photometric loss beside those outside: none (the paper is silent), or those whose
-    flow there and back does not close within a tolerance (Meister et al.). The latter estimates both directions and
-    trains on both, which takes twice the time."""
-    mask_outside: bool = True
-    """Pixels whose flow leaves the image do not count in the photometric loss. The paper is silent on occlusion; the
-    second image holds no evidence for them."""
-    smoothness: Literal["helmholtz", "first_order", "second_order", "none"] = "helmholtz"
+    """Pixels that do not count in the photometric loss beside those whose flow leaves the image, for which the second
+    image holds no evidence: none (the paper is silent), or those whose flow there and back does not close within a
+    tolerance (Meister et al.). The latter estimates both directions and trains on both, which takes twice the time."""
+    smoothness: Literal["helmholtz", "first_order", "second_order"] = "helmholtz"
     """Regulariser with weight lambda_dc: the paper's decomposition loss, or the edge-aware first-order smoothness of
-    SelfFlow (the paper's comparison), or ARFlow's of second order, or none. The deformation loss goes with the first
-    only."""
+    SelfFlow (the paper's comparison), or ARFlow's of second order. The deformation loss goes with the first only."""
     smoothness_s: tuple[float, ...] | None = None
     """Weight of the regulariser at each scale, finest first, in place of lambda_s; None: lambda_s (the paper). ARFlow:
     1 at s = 0 only."""
     lambda_ar: float = Field(default=0.0, ge=0)
-    """Weight of ARFlow's augmentation as regularisation: on transformed images the network should see the transformed
-    flow. Takes a second pass of the network. ARFlow: 0.01."""
+    """Weight of ARFlow's augmentation consistency: on transformed images the network should see the transformed flow.
+    Takes a second pass of the network. ARFlow: 0.01."""
     second_stage: float = Field(default=0.0, ge=0, lt=1)
     """Share of the steps after which `occlusion` and `lambda_ar` begin. Both trust the network's own flow: a new one's
     hardly closes there and back, and what it should see of transformed images grows with what it saw. ARFlow has them
@@ -182,8 +174,6 @@ class LossConfig(_Frozen):
     def _some_scale_counts(self) -> LossConfig:
         if any(value < 0 for value in self.lambda_s) or not any(value > 0 for value in self.lambda_s):
             raise ValueError(f"lambda_s = {list(self.lambda_s)} must be numbers >= 0, at least one of them above 0")
-        if self.lambda_ph == 0 and self.lambda_census == 0:
-            raise ValueError("lambda_ph and lambda_census are both 0: nothing would compare the images")
         for name, weights in (("smoothness_s", self.smoothness_s), ("flow_s", self.flow_s)):
             if weights is None:
                 continue
@@ -261,11 +251,8 @@ class TrainConfig(_Frozen):
     ema_decay: float = Field(default=0.0, ge=0, lt=1)
     """Validate and keep an exponential moving average of the weights, decay per step (0.999 is usual); 0: the weights
     themselves (the paper is silent)."""
-    compile: bool = False
-    """Compile the network with torch.compile: minutes at the start; then faster steps on a GPU than launched singly,
-    slower ones than with `cuda_graph`."""
     cuda_graph: bool = True
-    """On a CUDA device, record the network's two passes at the first step and replay them, unless `compile` is set."""
+    """On a CUDA device, record the network's two passes at the first step and replay them."""
     cache: bool = True
     """On a CUDA device, decode all pairs at the start (by `workers`) and keep them there, if they take no more than
     half of its free memory: a pair of 320 x 240 px with its flow takes 1 MiB. Otherwise the files of a pair are decoded

@@ -10,6 +10,11 @@ from gelflow.errors import InputError
 
 Config = TypeVar("Config", bound=BaseModel)
 
+RETIRED: Mapping[str, tuple[Any, ...]] = {
+    "loss.lambda_ph": (1,), "loss.lambda_census": (0,), "loss.mask_outside": (True,), "compile": (False, True),
+}  # fmt: skip
+"""Settings of earlier versions, which weights and runs record, with the values that mean what every run does now."""
+
 
 def validated(kind: type[Config], values: Mapping[str, Any], source: str) -> Config:
     """Builds a configuration from plain values.
@@ -40,10 +45,14 @@ def validated(kind: type[Config], values: Mapping[str, Any], source: str) -> Con
         raise InputError(f"{source}: " + "; ".join(lines)) from error
 
 
-def _whole(value: Any) -> Any:
-    """The value with floats such as 1e3 as whole numbers, which fields of either kind take."""
+def _whole(value: Any, place: str = "") -> Any:
+    """The value without `RETIRED`, and with floats such as 1e3 as whole numbers, which fields of either kind take."""
     if isinstance(value, Mapping):
-        return {name: _whole(part) for name, part in value.items()}
+        return {
+            name: _whole(part, f"{place}{name}.")
+            for name, part in value.items()
+            if part not in RETIRED.get(f"{place}{name}", ())
+        }
     if isinstance(value, (list, tuple)):
         return [_whole(part) for part in value]
     return int(value) if isinstance(value, float) and value.is_integer() else value

@@ -1,4 +1,4 @@
-"""Augmentation as regularisation (ARFlow, Liu et al. 2020): what the network sees should not depend on how it is shown.
+"""Augmentation consistency (ARFlow, Liu et al. 2020): the flow of a pair should not depend on how the pair is shown.
 
 The images of a pair are transformed alike and the flow that the network found on the originals is transformed with
 them; on the transformed images it should find that flow: ``L_ar = mean over valid pixels of (|V' - V*| + 0.01)^0.4``.
@@ -23,7 +23,7 @@ EPSILON, EXPONENT = 0.01, 0.4
 def transformed_pair(
     image1: Images, image2: Images, flow: Flow, random: torch.Generator
 ) -> tuple[Images, Images, Flow, Mask]:
-    """A pair shown in another way, with its flow.
+    """A pair under a random transformation, with the flow that belongs to it.
 
     Args:
         image1: (B, 3, H, W) in [0, 1].
@@ -57,7 +57,7 @@ def displacement(like: Flow, matrix: Tensor, shift: Tensor) -> Flow:
     return (moved - place).expand(like.shape[0], -1, -1, -1).contiguous()
 
 
-def analogy_loss(flow: Flow, target: Flow, pixels: Mask) -> Scalar:
+def consistency_loss(flow: Flow, target: Flow, pixels: Mask) -> Scalar:
     """L_ar of the flow found on the transformed images against the transformed flow, both (B, 2, H, W) px."""
     distance = (flow - target).abs().sum(dim=1, keepdim=True)
     return (((distance + EPSILON) ** EXPONENT) * pixels).sum() / pixels.sum().clamp(min=1)

@@ -49,10 +49,7 @@ class GelFlow(nn.Module):
         self.estimators = nn.ModuleList(Estimator(costs + config.projected_channels + 2) for _ in range(networks))
         self.contexts = nn.ModuleList(ContextNetwork() for _ in range(networks))
         self.fusion = LocalFlowFusion(config.lffm_region, config.lffm_scale) if config.lffm else None
-        self.refined_scale = {"none": None, "half": 1, "full": 0}[config.refine]
-        self.refinement = None
-        if self.refined_scale is not None:
-            self.refinement = RefinementHead(self.refined_scale, config.refine_iterations)
+        self.refinement = RefinementHead(config.refine_iterations) if config.refine == "half" else None
 
     def forward(self, image1: Images, image2: Images) -> list[Flow]:
         """Estimates the flow.
@@ -69,8 +66,7 @@ class GelFlow(nn.Module):
         """
         check_shapes(image1, image2)
         batch, _, height, width = image1.shape
-        images = torch.cat([image1, image2])
-        features = self.encoder(images)
+        features = self.encoder(torch.cat([image1, image2]))
         flow: Flow | None = None
         decoded: dict[int, Flow] = {}
         for scale in range(self.config.levels - 1, self.config.finest_scale - 1, -1):
@@ -86,8 +82,8 @@ class GelFlow(nn.Module):
         for scale in range(finest - 1, -1, -1):
             size = (-(-height // 2**scale), -(-width // 2**scale))
             decoded[scale] = enlarge_flow(decoded[finest], finest - scale, size)
-            if self.refinement is not None and scale == self.refined_scale:
-                decoded[scale] = self.refinement(decoded[scale], images, features[0])
+            if self.refinement is not None and scale == 1:
+                decoded[scale] = self.refinement(decoded[scale], features[0])
                 finest = scale
         return [decoded[scale] for scale in range(self.config.levels - 1)]
 

@@ -18,7 +18,7 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from gelflow.config import MINIMUM_SIDE, TrainConfig
 from gelflow.errors import InputError
 from gelflow.losses import flow_loss, self_supervised_loss
-from gelflow.losses.augmentation_consistency import analogy_loss, transformed_pair
+from gelflow.losses.augmentation_consistency import consistency_loss, transformed_pair
 from gelflow.losses.occlusion import visible_both_ways
 from gelflow.losses.photometric import photometric_loss
 from gelflow.models import GelFlow
@@ -72,7 +72,7 @@ class FlowModule(L.LightningModule):
             if average is not None:
                 self.average.load_state_dict(average)
         # In a tuple, because a submodule's parameters would count twice: they are the model's own.
-        self._network: tuple[Any] = (torch.compile(model) if config.compile else model,)
+        self._network: tuple[Any] = (model,)
         self.start = start
         self.optimiser_state = optimiser
         self.metrics: dict[str, float] = {}
@@ -81,12 +81,12 @@ class FlowModule(L.LightningModule):
 
     @property
     def network(self) -> Any:
-        """The network as it is called once a step: compiled or recorded where the configuration asks for it."""
+        """The network as it is called once a step: recorded where the configuration asks for it."""
         return self._network[0]
 
     def on_fit_start(self) -> None:
         """Prepares for the device."""
-        if self.config.cuda_graph and self.device.type == "cuda" and not self.config.compile:
+        if self.config.cuda_graph and self.device.type == "cuda":
             self._network = (GraphedNetwork(self.model),)
 
     @property
@@ -165,8 +165,8 @@ class FlowModule(L.LightningModule):
             random = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
             first, second, target, pixels = transformed_pair(image1, image2, flows[0].detach(), random)
             # Not `network`, which a step may call only once.
-            analogy = config.lambda_ar * analogy_loss(self.model(first, second)[0], target, pixels)
-            loss, parts = loss + analogy, parts | {"analogy": analogy.detach()}
+            consistency = config.lambda_ar * consistency_loss(self.model(first, second)[0], target, pixels)
+            loss, parts = loss + consistency, parts | {"consistency": consistency.detach()}
         return loss, parts
 
     def optimizer_step(self, *arguments: Any, **options: Any) -> None:
@@ -251,7 +251,7 @@ def validation_metrics(batch: dict[str, Any], flow: Tensor, config: TrainConfig)
     metrics = {
         "psnr_db": _psnr(image1, image2, flow),
         "no_motion_psnr_db": _psnr(image1, image2, still),
-        "photometric_loss": photometric_loss(image1, image2, flow, config.loss.alpha, config.loss.mask_outside),
+        "photometric_loss": photometric_loss(image1, image2, flow, config.loss.alpha),
     }
     if "flow" in batch:
         truth = batch["flow"]

@@ -13,7 +13,7 @@ or those of `--ft-config`. Nothing else of a training carries over, whatever its
 - the rate is constant, so that a longer optimisation goes on with a shorter one; the peak of a falling rate is too much
   for that and is lowered to `RATE`;
 - the weights themselves are kept, not their moving average, which few steps hardly move;
-- what belongs to the machine of the training: its devices and processes, compilation.
+- what belongs to the machine of the training: its devices and processes.
 
 Registration has no part in the training steps. The copy keeps what its weights had, and is used with what was asked of
 the network that it came from.
@@ -57,7 +57,7 @@ def fine_tuning_settings(method: Learned, steps: int, config: str | None, pairs:
         text = read_metadata(method.path).get("train")
         if text is None:
             raise InputError(f"{method.path}: its metadata lack the settings of its training; give --ft-config")
-        values = json.loads(text) | {"batch_size": BATCH, "compile": False, "workers": 0}
+        values = json.loads(text) | {"batch_size": BATCH, "workers": 0}
     else:
         chosen = train_config(config)
         values = chosen.model_dump(mode="json")

@@ -23,7 +23,7 @@ UNSUITABLE: dict[str, Any] = {
     "loss": {"lambda_s": [1.0, 1.0, 0.5], "alpha": 0.5},
     "supervision": "mixed", "mixed_self": 3.0, "motion": MotionConfig(), "color_jitter": 0.2, "crop_size": (64, 64),
     "ema_decay": 0.999, "schedule": "one_cycle", "warmup_steps": 100, "learning_rate": 4e-4, "batch_size": 16,
-    "gradient_clip": 1.0, "flip": False, "seed": 5, "compile": True, "devices": 2, "workers": 3, "device": "cuda",
+    "gradient_clip": 1.0, "flip": False, "seed": 5, "devices": 2, "workers": 3, "device": "cuda",
 }  # fmt: skip
 """A training that nothing of may carry over but losses, clipping, flips, weight decay and seed."""
 
@@ -62,7 +62,7 @@ def test_whatever_the_preset_the_pairs_are_seen_as_they_are_and_without_truth(pr
 
 
 def test_nothing_else_of_the_training_carries_over(tmp_path: Path) -> None:
-    """Fails with the machine's settings (devices, compile, workers) left as recorded."""
+    """Fails with the machine's settings (devices, workers) left as recorded."""
     recorded = TrainConfig.model_validate({"model": SMALL} | UNSUITABLE)
     method = Learned(network(tmp_path / "w.safetensors", SMALL, recorded), device="cpu")
     settings = fine_tuning_settings(method, 12, None, pairs=3)

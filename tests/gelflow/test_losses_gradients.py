@@ -8,15 +8,13 @@ from gelflow.config import LossConfig
 from gelflow.losses import self_supervised_loss
 from gelflow.losses.endpoint import endpoint_loss
 
-ALONE = {"alpha": 0.5, "smoothness": "none"}
-REGULARISER = {"lambda_ph": 1e-6, "alpha": 0.0, "lambda_dc": 3.0, "lambda_df": 0.0}
+ALONE = {"alpha": 0.5, "lambda_dc": 0.0, "lambda_df": 0.0}
+REGULARISER = {"alpha": 0.0, "lambda_dc": 3.0, "lambda_df": 0.0}
 TERMS = {
-    "absolute difference": {"smoothness": "none", "alpha": 0.0},
-    "structural similarity": {"smoothness": "none", "alpha": 1.0},
-    "outside counts": {**ALONE, "mask_outside": False},
+    "absolute difference": {**ALONE, "alpha": 0.0},
+    "structural similarity": {**ALONE, "alpha": 1.0},
     "spline": {**ALONE, "warping": "spline"},
     "on the images": {**ALONE, "compare_at": "image"},
-    "census": {"smoothness": "none", "lambda_ph": 0.0, "lambda_census": 1.0},
     "decomposition": REGULARISER,
     "decomposition, in px": {**REGULARISER, "flow_normalisation": "none"},
     "edge-aware weight": {**REGULARISER, "weight": "edge_aware"},
@@ -41,7 +39,7 @@ def test_the_gradient_is_that_of_finite_differences(term: str, masked: bool) -> 
         for size in ((9, 10), (5, 5))
     ]
     visible = None
-    if masked:  # whole windows of 7 x 7 px (census) must be left
+    if masked:
         visible = torch.ones(1, 1, 9, 10, dtype=torch.float64)
         visible[..., :2], visible[..., 8, :] = 0.0, 0.0
     config = LossConfig(lambda_s=(1.0, 0.5), **TERMS[term])

@@ -16,7 +16,7 @@ CONFIGS = [
     LossConfig(smoothness="first_order"),
     LossConfig(ratio="det", weight="edge_aware"),
     LossConfig(weight="floor"),
-    LossConfig(smoothness="none"),
+    LossConfig(lambda_dc=0, lambda_df=0),
 ]
 
 

@@ -7,31 +7,29 @@ from gelflow.config import ModelConfig
 from gelflow.models import GelFlow
 
 
-@pytest.mark.parametrize("refine", ["half", "full"])
-def test_it_corrects_its_scale_and_all_finer_ones(refine: str) -> None:
+def test_it_corrects_its_scale_and_the_finer_one() -> None:
     """Fails with the finer scales enlarged from the unrefined flow."""
     torch.manual_seed(0)
-    network = GelFlow(ModelConfig(levels=4, refine=refine, refine_iterations=2))
+    network = GelFlow(ModelConfig(levels=4, refine="half", refine_iterations=2))
     images = torch.rand(2, 1, 3, 66, 71).unbind()
     flows = network(*images)
     assert [tuple(flow.shape[2:]) for flow in flows] == [(66, 71), (33, 36), (17, 18)]
-    scale = {"half": 1, "full": 0}[refine]
     before = [flow.detach().clone() for flow in flows]
     with torch.no_grad():
         network.refinement.head.bias += torch.tensor([0.5, 0.0])
         after = network(*images)
     assert torch.equal(after[2], before[2])
-    assert bool((after[1] != before[1]).any()) == (scale == 1)
-    # Two corrections of about 0.5 px at the head's scale, doubled once more where it is enlarged.
+    assert (after[1] != before[1]).any()
+    # Two corrections of about 0.5 px at the head's scale, doubled where it is enlarged.
     change = (after[0] - before[0])[:, 0].mean()
-    assert change == pytest.approx(1.0 * 2**scale, rel=0.1)
+    assert change == pytest.approx(2.0, rel=0.1)
 
 
 def test_its_weights_have_a_gradient() -> None:
-    network = GelFlow(ModelConfig(levels=4, refine="full", refine_iterations=1))
+    network = GelFlow(ModelConfig(levels=4, refine="half", refine_iterations=1))
     sum(flow.square().mean() for flow in network(*torch.rand(2, 1, 3, 64, 64).unbind())).backward()
     assert all(p.grad is not None and torch.isfinite(p.grad).all() for p in network.refinement.parameters())
-    assert network.refinement.features[0][0].weight.grad.any()
+    assert network.refinement.layers[0][0].weight.grad.any()
 
 
 def test_half_resolution_that_is_decoded_already_is_refused() -> None:

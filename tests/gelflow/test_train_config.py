@@ -70,6 +70,14 @@ def test_a_configuration_survives_json() -> None:
     assert validated(TrainConfig, config.model_dump(mode="json"), "json") == config
 
 
+def test_what_earlier_versions_recorded_is_read_where_it_means_the_same() -> None:
+    """Settings that are gone are read with the value that every run has now, and refused with another."""
+    loss = {"lambda_ph": 1.0, "lambda_census": 0.0, "mask_outside": True}
+    assert validated(TrainConfig, {"loss": loss, "compile": True}, "weights") == TrainConfig()
+    with pytest.raises(InputError, match=r"loss\.lambda_census: there is no such setting"):
+        validated(TrainConfig, {"loss": {"lambda_census": 0.1}}, "weights")
+
+
 def test_registration_has_names() -> None:
     """Fails with names merged into the settings of the weights that a fine-tuning starts from."""
     start = {"model": ModelConfig(registration=REGISTRATIONS["brightness"]).model_dump()}
