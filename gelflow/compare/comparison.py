@@ -48,22 +48,16 @@ class Comparison:
     def without(self, methods: Iterable[str]) -> "Comparison":
         """The same without some methods."""
         gone = set(methods)
-        return Comparison(
-            self.data,
-            tuple(score for score in self.scores if score.method not in gone),
-            {name: bins for name, bins in self.strata.items() if name not in gone},
-            {name: speed for name, speed in self.speeds.items() if name not in gone},
-        )
+        scores = tuple(score for score in self.scores if score.method not in gone)
+        strata = {name: bins for name, bins in self.strata.items() if name not in gone}
+        return Comparison(self.data, scores, strata, {k: v for k, v in self.speeds.items() if k not in gone})
 
     def with_method(self, scores: Sequence[PairScore], speed: Speed | None) -> "Comparison":
         """The same with one method more, given by its scores on all pairs."""
         name = scores[0].method
-        return Comparison(
-            self.data,
-            (*self.scores, *scores),
-            {**self.strata, name: merged(one for score in scores for one in score.strata)},
-            {**self.speeds, name: speed} if speed else self.speeds,
-        )
+        strata = {**self.strata, name: merged(one for score in scores for one in score.strata)}
+        speeds = {**self.speeds, name: speed} if speed else self.speeds
+        return Comparison(self.data, (*self.scores, *scores), strata, speeds)
 
     def to_json(self) -> str:
         """As JSON; numbers that are not finite (PSNR of equal images, errors of an estimate with gaps) become null."""

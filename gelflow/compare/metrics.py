@@ -8,7 +8,8 @@ With a flow V from image 1 to image 2 and the exact flow W, over the n pixels th
                      mean over the whole image, mirrored at its border
     marker distance  median of |(x1, y1) + V(x1, y1) - (x2, y2)|
 
-PSNR and SSIM are those of the GelFlow paper (n = 8 bit); they judge where image 2 can be put, not where the gel went.
+PSNR and SSIM are those of the GelFlow paper (n = 8 bit); they tell how well image 2 can be brought to image 1, not
+where the gel went.
 """
 
 from dataclasses import dataclass

@@ -6,8 +6,8 @@ from itertools import cycle
 from pathlib import Path
 from typing import Any
 
-from gelflow.compare.seeds import Group, group_name
-from gelflow.compare.strata import EDGE, MOTION, PATTERN, Stratum, merged
+from gelflow.compare.seeds import Group
+from gelflow.compare.strata import EDGE, MOTION, PATTERN, Stratum, pooled
 from gelflow.files.atomic import replacing
 
 UNTIMED = ("no motion", "exact flow")
@@ -106,10 +106,7 @@ def plot_strata(path: Path, strata: Mapping[str, Sequence[Stratum]]) -> None:
         path: The PNG.
         strata: Bins by method; trainings with different seeds are pooled.
     """
-    pooled: dict[str, list[Stratum]] = {}
-    for method, bins in strata.items():
-        pooled.setdefault(group_name(method), []).extend(bins)
-    by_method = {name: merged(bins) for name, bins in pooled.items()}
+    by_method = pooled(strata)
     present = {one.kind for bins in by_method.values() for one in bins}
     kinds = [kind for kind in (MOTION, EDGE, PATTERN) if kind in present]
     looks = _looks(list(by_method))

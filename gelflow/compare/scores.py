@@ -1,24 +1,32 @@
-"""Scoring a method on image pairs."""
+"""Scores of methods: of one pair, and means over pairs."""
 
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from statistics import fmean, median
+from statistics import median
+from typing import Any
 
 import numpy as np
 
+from gelflow.arrays import FlowArray
 from gelflow.baselines.exact import ExactFlow
 from gelflow.baselines.method import Method
 from gelflow.compare.metrics import endpoint_error, flow_errors, image_similarity, marker_distance
 from gelflow.compare.strata import Stratum, pair_strata
 from gelflow.data.pairs import PairDataset
 from gelflow.errors import InputError, NothingFoundError
+from gelflow.files.exr import FlowField
 from gelflow.hardware import hardware
 
+MEASURES = (
+    "psnr_db", "ssim", "endpoint_error_px", "median_error_px", "outliers_1px", "outliers_01px", "marker_distance_px",
+)  # fmt: skip
+"""Fields of a score that are averaged over pairs."""
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, kw_only=True)
 class PairScore:
     """How one method did on one pair; None where the pair has no exact flow, scene or markers.
 
@@ -43,12 +51,12 @@ class PairScore:
     scene: str | None
     psnr_db: float
     ssim: float
-    endpoint_error_px: float | None
-    median_error_px: float | None
-    outliers_1px: float | None
-    outliers_01px: float | None
-    marker_distance_px: float | None
-    motion_px: float | None
+    endpoint_error_px: float | None = None
+    median_error_px: float | None = None
+    outliers_1px: float | None = None
+    outliers_01px: float | None = None
+    marker_distance_px: float | None = None
+    motion_px: float | None = None
     seconds: float
     processor_seconds: float
     device: str
@@ -56,7 +64,7 @@ class PairScore:
     strata: tuple[Stratum, ...] = ()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MethodScore:
     """Means over pairs, pair by pair with equal weight; times are medians. None where no pair has the number."""
 
@@ -88,7 +96,7 @@ def score_pair(method: Method, dataset: PairDataset, index: int) -> PairScore:
     Raises:
         InputError: The pair cannot be read, or the method cannot work on it; the message names the pair.
     """
-    name = dataset.records[index].name
+    record = dataset.records[index]
     image1, image2 = dataset.images(index)
     truth, markers = dataset.truth(index), dataset.markers(index)
     started, busy = time.perf_counter(), time.process_time()
@@ -97,39 +105,42 @@ def score_pair(method: Method, dataset: PairDataset, index: int) -> PairScore:
     except NothingFoundError:
         flow = np.zeros((*image1.shape[:2], 2), np.float32)
     except InputError as error:
-        raise InputError(f"{dataset.source}, pair {name}, {method.name}: {error}") from error
+        raise InputError(f"{dataset.source}, pair {record.name}, {method.name}: {error}") from error
     seconds, processor_seconds = time.perf_counter() - started, time.process_time() - busy
-    similarity = image_similarity(image1, image2, flow)
+    psnr_db, ssim = image_similarity(image1, image2, flow)
     try:
-        errors = flow_errors(flow, truth.flow, truth.visible) if truth else None
+        errors = {} if truth is None else _errors(flow, truth, record.scene)
     except InputError as error:
-        raise InputError(f"{dataset.records[index].flow}: {error}") from error
-    strata: tuple[Stratum, ...] = ()
-    motion = None
-    if truth is not None:
-        compared = np.logical_and(truth.visible, np.isfinite(truth.flow).all(axis=-1))
-        away = endpoint_error(flow, truth.flow)
-        strata = pair_strata(away, truth.flow, compared, truth.contact, dataset.records[index].scene)
-        motion = float(np.hypot(truth.flow[..., 0], truth.flow[..., 1])[compared].mean(dtype=np.float64))
+        raise InputError(f"{record.flow}: {error}") from error
     device = str(getattr(method, "device", "cpu"))
     return PairScore(
         method=method.name,
-        pair=name,
-        scene=dataset.records[index].scene,
-        psnr_db=similarity[0],
-        ssim=similarity[1],
-        endpoint_error_px=errors.mean_px if errors else None,
-        median_error_px=errors.median_px if errors else None,
-        outliers_1px=errors.outliers_1px if errors else None,
-        outliers_01px=errors.outliers_01px if errors else None,
-        marker_distance_px=marker_distance(flow, markers) if markers is not None else None,
-        motion_px=motion,
+        pair=record.name,
+        scene=record.scene,
+        psnr_db=psnr_db,
+        ssim=ssim,
+        marker_distance_px=None if markers is None else marker_distance(flow, markers),
         seconds=seconds,
         processor_seconds=processor_seconds,
         device=hardware(device),
         on_gpu=device == "cuda",
-        strata=strata,
+        **errors,
     )
+
+
+def _errors(flow: FlowArray, truth: FlowField, scene: str | None) -> dict[str, Any]:
+    """The fields of a score that need the exact flow."""
+    errors = flow_errors(flow, truth.flow, truth.visible)
+    compared = np.logical_and(truth.visible, np.isfinite(truth.flow).all(axis=-1))
+    motion = np.hypot(truth.flow[..., 0], truth.flow[..., 1])[compared]
+    return {
+        "endpoint_error_px": errors.mean_px,
+        "median_error_px": errors.median_px,
+        "outliers_1px": errors.outliers_1px,
+        "outliers_01px": errors.outliers_01px,
+        "motion_px": float(motion.mean(dtype=np.float64)),
+        "strata": pair_strata(endpoint_error(flow, truth.flow), truth.flow, compared, truth.contact, scene),
+    }
 
 
 def evaluate(
@@ -154,28 +165,15 @@ def evaluate(
 
 def summarise(scores: Sequence[PairScore]) -> list[MethodScore]:
     """Means per method, in the order in which the methods appear."""
-    names = dict.fromkeys(score.method for score in scores)
-    return [_mean_score(name, [score for score in scores if score.method == name]) for name in names]
+    means = []
+    for name in dict.fromkeys(score.method for score in scores):
+        own = [score for score in scores if score.method == name]
+        values: dict[str, Any] = {field: _mean([getattr(score, field) for score in own]) for field in MEASURES}
+        values |= {field: median(getattr(score, field) for score in own) for field in ("seconds", "processor_seconds")}
+        means.append(MethodScore(method=name, pairs=len(own), device=own[0].device, on_gpu=own[0].on_gpu, **values))
+    return means
 
 
-def _mean_score(name: str, scores: Sequence[PairScore]) -> MethodScore:
-    return MethodScore(
-        method=name,
-        pairs=len(scores),
-        psnr_db=fmean(s.psnr_db for s in scores),
-        ssim=fmean(s.ssim for s in scores),
-        endpoint_error_px=_mean(s.endpoint_error_px for s in scores),
-        median_error_px=_mean(s.median_error_px for s in scores),
-        outliers_1px=_mean(s.outliers_1px for s in scores),
-        outliers_01px=_mean(s.outliers_01px for s in scores),
-        marker_distance_px=_mean(s.marker_distance_px for s in scores),
-        seconds=median(s.seconds for s in scores),
-        processor_seconds=median(s.processor_seconds for s in scores),
-        device=scores[0].device,
-        on_gpu=scores[0].on_gpu,
-    )
-
-
-def _mean(values: Iterable[float | None]) -> float | None:
+def _mean(values: Sequence[float | None]) -> float | None:
     present = [value for value in values if value is not None]
     return math.fsum(present) / len(present) if present else None

@@ -8,8 +8,10 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean, stdev
+from typing import TYPE_CHECKING
 
-from gelflow.compare.scores import MethodScore
+if TYPE_CHECKING:
+    from gelflow.compare.scores import MethodScore
 
 FINE_TUNED = "+ft"
 """End of the names of methods that were optimised on the very pairs that they are scored on."""
@@ -27,7 +29,7 @@ class Group:
     """Scores of one training, or of several with different seeds."""
 
     name: str
-    members: tuple[MethodScore, ...]
+    members: "tuple[MethodScore, ...]"
 
     @property
     def label(self) -> str:
@@ -55,7 +57,7 @@ class Group:
         return None if len(values) < 2 or any(value is None for value in values) else stdev(values)
 
 
-def grouped(means: Sequence[MethodScore]) -> list[Group]:
+def grouped(means: "Sequence[MethodScore]") -> list[Group]:
     """Groups in the order in which their first members appear."""
     names = dict.fromkeys(group_name(score.method) for score in means)
     return [Group(name, tuple(s for s in means if group_name(s.method) == name)) for name in names]

@@ -8,14 +8,15 @@ bins. Between pictures of a gel without a pattern nothing but shading can be fol
 motion: such pairs have bins of motion and distance of their own, lest they hide all others.
 """
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import astuple, dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.arrays import FlowArray, MaskArray
+from gelflow.compare.seeds import group_name
 from gelflow.data.pairs import without_pattern
 
 MOTION_PX = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, np.inf)
@@ -111,16 +112,18 @@ def merged(strata: Iterable[Stratum]) -> list[Stratum]:
     for one in strata:
         so_far = sums.get((one.kind, one.bin))
         if so_far is not None:
-            one = Stratum(
-                one.kind,
-                one.bin,
-                one.pixels + so_far.pixels,
-                one.error_px + so_far.error_px,
-                one.above_1px + so_far.above_1px,
-                one.above_01px + so_far.above_01px,
-            )
+            added = [now + before for now, before in zip(astuple(one)[2:], astuple(so_far)[2:], strict=True)]
+            one = Stratum(one.kind, one.bin, *added)
         sums[one.kind, one.bin] = one
     return sorted(sums.values(), key=_order)
+
+
+def pooled(strata: Mapping[str, Sequence[Stratum]]) -> dict[str, list[Stratum]]:
+    """Bins by method with those of trainings that differ in their seed alone added up, under one name."""
+    bins: dict[str, list[Stratum]] = {}
+    for method, own in strata.items():
+        bins.setdefault(group_name(method), []).extend(own)
+    return {name: merged(own) for name, own in bins.items()}
 
 
 def _order(stratum: Stratum) -> tuple[int, int, str]:

@@ -12,7 +12,7 @@ from gelflow.compare.comparison import Comparison
 from gelflow.compare.scores import MethodScore, PairScore, summarise
 from gelflow.compare.seeds import Group, group_name, grouped
 from gelflow.compare.speed import Speed
-from gelflow.compare.strata import Stratum, merged
+from gelflow.compare.strata import Stratum, pooled
 from gelflow.data.pairs import without_pattern
 
 MOST_PAIRS_IN_A_TABLE = 12
@@ -48,10 +48,7 @@ def summary_table(groups: Sequence[Group]) -> Table:
         ("core ms", "processor_seconds", 1000, 1),
     ]
     header = ["method", *(column[0] for column in columns), "on"]
-    rows = []
-    for group in groups:
-        cells = [_scaled(group, *column[1:]) for column in columns]
-        rows.append([group.label, *cells, group.device])
+    rows = [[group.label, *(_scaled(group, *column[1:]) for column in columns), group.device] for group in groups]
     kept = [k for k in range(len(header)) if any(row[k] != NONE for row in rows)]
     if len({row[-1] for row in rows}) < 2:
         kept = [k for k in kept if k < len(header) - 1]
@@ -89,10 +86,7 @@ def pair_table(scores: Sequence[PairScore], cell: Callable[[PairScore], tuple[fl
 
 def strata_table(strata: Mapping[str, Sequence[Stratum]]) -> Table:
     """Mean endpoint error in px, a row per bin, a column per method; every pixel of a bin counts the same."""
-    pooled: dict[str, list[Stratum]] = {}
-    for method, bins in strata.items():
-        pooled.setdefault(group_name(method), []).extend(bins)
-    by_method = {name: merged(bins) for name, bins in pooled.items()}
+    by_method = pooled(strata)
     cells = {(name, s.kind, s.bin): s.error_px / s.pixels for name, bins in by_method.items() for s in bins}
     sizes = {(s.kind, s.bin): s.pixels for s in next(iter(strata.values()), [])}
     rows = [

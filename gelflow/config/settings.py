@@ -122,8 +122,8 @@ class LossConfig(_Frozen):
     warping: Literal["bilinear", "spline"] = "bilinear"
     """Interpolation of the second image in the loss. The paper names none; bilinear blurs, most at half a px."""
     compare_at: Literal["scale", "image"] = "scale"
-    """Where each scale's flow is judged: on the images of its own scale (the paper), whose pattern is averaged away at
-    coarse scales, or, enlarged, on the images themselves."""
+    """Where each scale's flow is compared: on the images of its own scale (the paper), whose pattern is averaged away
+    at coarse scales, or, enlarged, on the images themselves."""
     occlusion: Literal["none", "forward_backward"] = "none"
     """Pixels that do not count in the photometric loss beside those whose flow leaves the image, for which the second
     image holds no evidence: none (the paper is silent), or those whose flow there and back does not close within a
@@ -168,7 +168,7 @@ class LossConfig(_Frozen):
     not computed."""
     flow_s: tuple[float, ...] | None = None
     """Weight of each scale in training on the exact flow, finest first, errors in px of the scale; None: lambda_s.
-    Coarse scales that no image can judge are told their flow here."""
+    Coarse scales, at which images hold no pattern, learn their flow here."""
 
     @model_validator(mode="after")
     def _some_scale_counts(self) -> LossConfig:

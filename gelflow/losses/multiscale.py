@@ -1,8 +1,8 @@
 """Losses summed over scales (paper, eq. 11): ``L = sum_s lambda_s (L_ph + lambda_dc L_dc + lambda_df L_df)``.
 
 The images of scale s are means over 2^s x 2^s blocks. Flows are in px of their scale, so a gradient of the flow means
-the same at every scale. With `compare_at` = "image" every scale's flow is enlarged and judged on the images themselves:
-averaged images hold no pattern at coarse scales, so that there the published loss prefers too little motion.
+the same at every scale. With `compare_at` = "image" every scale's flow is enlarged and compared on the images
+themselves: averaged images hold no pattern at coarse scales, where the published loss prefers too little motion.
 """
 
 import torch

@@ -14,9 +14,8 @@ from torch import Tensor, nn
 from gelflow.arrays import Features, Flow, Images
 from gelflow.config import MINIMUM_SIDE, ModelConfig
 from gelflow.errors import InputError
-from gelflow.models.context import ContextNetwork
 from gelflow.models.encoder import CHANNELS, Encoder
-from gelflow.models.estimator import Estimator
+from gelflow.models.estimator import ContextNetwork, Estimator
 from gelflow.models.layers import SLOPE
 from gelflow.models.lffm import LocalFlowFusion
 from gelflow.models.refinement import RefinementHead

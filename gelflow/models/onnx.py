@@ -6,10 +6,6 @@
 Needs the packages onnx and onnxscript to write. The size is fixed because warping and pyramids depend on it.
 """
 
-import logging
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -17,6 +13,7 @@ from typing import Any
 from gelflow.config import MINIMUM_SIDE
 from gelflow.errors import InputError
 from gelflow.files.atomic import refuse_foreign, replacing
+from gelflow.files.quiet import quiet_logger
 
 OPSET = 18
 PRODUCER = "gelflow"
@@ -56,7 +53,7 @@ def export_onnx(weights: Path, out: Path, size: tuple[int, int] | None = None) -
     if min(chosen) < MINIMUM_SIDE:
         raise InputError(f"--size {chosen[0]}x{chosen[1]}: each side must be at least {MINIMUM_SIDE} px")
     example = tuple(torch.zeros(1, 3, *chosen) for _ in range(2))
-    with _quiet(), replacing(out) as temporary, torch.no_grad():
+    with quiet_logger("torch.onnx"), replacing(out) as temporary, torch.no_grad():
         program: Any = torch.onnx.export(
             _finest(model), example, input_names=["image1", "image2"], output_names=["flow"],
             opset_version=OPSET, dynamo=True, verbose=False,
@@ -64,20 +61,6 @@ def export_onnx(weights: Path, out: Path, size: tuple[int, int] | None = None) -
         program.model.producer_name = PRODUCER
         program.save(str(temporary), external_data=False)
     return chosen
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keeps the exporter's notes on itself off the terminal."""
-    logger = logging.getLogger("torch.onnx")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        logger.setLevel(level)
 
 
 def _finest(model: Any) -> Any:

@@ -27,15 +27,15 @@ from torch import Tensor
 from gelflow.arrays import Features, Flow, Images
 from gelflow.config import RegistrationConfig
 from gelflow.models.propagation import propagated
-from gelflow.ops.gaussian import Smoother, WindowSums
+from gelflow.ops.gaussian import SeparableFilter, smoother, window_sums
 from gelflow.ops.spline import SplineImage
 from gelflow.ops.warp import inside_at, positions
 
-LARGEST_STEP_PX = 1.0
+MAX_STEP_PX = 1.0
 """Limit on a Gauss-Newton step of each component."""
 TINY = 1e-6
-EXPLAINED_PX, EDGE_PX = 6.0, 2.0
-"""Standard deviations of the window that judges a flow which came first, and of that which joins it to the rest."""
+RESIDUAL_WINDOW_PX, BLENDING_PX = 6.0, 2.0
+"""Standard deviations of the window of the residual that decides between two flows, and of the blending at its edge."""
 
 
 def registered(flow: Flow, image1: Images, image2: Images, config: RegistrationConfig) -> Flow:
@@ -54,42 +54,42 @@ def registered(flow: Flow, image1: Images, image2: Images, config: RegistrationC
     with torch.no_grad(), torch.autocast(flow.device.type, enabled=False):
         flow, first, image2 = flow.float(), image1.float(), image2.float()
         second = SplineImage(image2)
-        settled = flow
+        former = flow
         if config.after is not None:
-            settled = flow = registered(flow, first, image2, config.after)
+            former = flow = registered(flow, first, image2, config.after)
         width = config.background_px
-        background = None if width is None else WindowSums(*size, width, flow)
+        background = None if width is None else window_sums(*size, width, flow)
         for window_px, smoothing_px in zip(config.windows_px, config.smoothing_px, strict=True):
-            window = WindowSums(*size, window_px, flow)
+            window = window_sums(*size, window_px, flow)
             if config.propagation_px:
                 fit = (window_px, config.propagation_px, config.noise, background is not None)
                 flow = propagated(flow, first, image2, *fit)
-            start = Smoother(*size, smoothing_px, flow)(flow)
+            start = smoother(*size, smoothing_px, flow)(flow)
             flow = start
             for _ in range(config.iterations):
                 evidence = _evidence(flow, first, second, background)
                 step = _posterior(*evidence, flow - start, window, config.prior_px, config.noise)
-                flow = flow + step.clamp(-LARGEST_STEP_PX, LARGEST_STEP_PX)
+                flow = flow + step.clamp(-MAX_STEP_PX, MAX_STEP_PX)
         if config.after is not None:
-            flow = torch.lerp(settled, flow, _unexplained(settled, first, second, config.after.noise))
+            flow = torch.lerp(former, flow, _unexplained(former, first, second, config.after.noise))
     return flow
 
 
 def _unexplained(flow: Flow, first: Images, second: SplineImage, noise: float) -> Tensor:
     """1 where a flow leaves more than noise between the images, 0 where not, between them at an edge; (B, 1, H, W).
 
-    A flow that leaves the image is judged by what `SplineImage` goes on with there.
+    Where a flow leaves the image, the border counts that `SplineImage` repeats there.
     """
     size = (flow.shape[-2], flow.shape[-1])
     squares = (second.at(positions(flow)) - first).square().mean(dim=1, keepdim=True)
-    window, edge = WindowSums(*size, EXPLAINED_PX, flow), WindowSums(*size, EDGE_PX, flow)
+    window, edge = window_sums(*size, RESIDUAL_WINDOW_PX, flow), window_sums(*size, BLENDING_PX, flow)
     all_of_it = torch.ones_like(squares)
     left = (window(squares) > noise**2 * window(all_of_it)).float()
     return edge(left) / edge(all_of_it)
 
 
 def _evidence(
-    flow: Flow, first: Images, second: SplineImage, background: WindowSums | None
+    flow: Flow, first: Images, second: SplineImage, background: SeparableFilter | None
 ) -> tuple[Features, Features, Features, Tensor]:
     """Residual and its derivatives along x and y, (B, C, H, W); 1 where the flow stays in the image and they count."""
     places = positions(flow)
@@ -109,7 +109,7 @@ def _posterior(
     down: Features,
     counts: Tensor,
     so_far: Flow,
-    window: WindowSums,
+    window: SeparableFilter,
     prior: float,
     noise: float,
 ) -> Flow:

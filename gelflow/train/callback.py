@@ -28,7 +28,7 @@ class Stopped(Exception):
     """The user asked to stop; the state is saved up to the step in the folder."""
 
 
-class Keeper(L.Callback):
+class CheckpointCallback(L.Callback):
     """Saves the state, keeps the best weights, reports progress; stops between two steps when asked to.
 
     Args:
@@ -135,7 +135,7 @@ class Keeper(L.Callback):
 
 def _ours(module: L.LightningModule) -> FlowModule:
     if not isinstance(module, FlowModule):
-        raise TypeError(f"Keeper works with FlowModule, not {type(module).__name__}")
+        raise TypeError(f"CheckpointCallback works with FlowModule, not {type(module).__name__}")
     return module
 
 
@@ -162,12 +162,12 @@ def _brief(metrics: Mapping[str, float]) -> str:
 
 
 @contextmanager
-def stopping(keeper: Keeper) -> Iterator[None]:
-    """While the block runs, Ctrl-C asks the keeper to stop. See `Keeper.on_train_start` for SIGTERM."""
+def stopping(callback: CheckpointCallback) -> Iterator[None]:
+    """While the block runs, Ctrl-C asks the callback to stop. See `CheckpointCallback.on_train_start` for SIGTERM."""
     if not _in_main_thread():
         yield
         return
-    former = signal.signal(signal.SIGINT, keeper.ask_to_stop)
+    former = signal.signal(signal.SIGINT, callback.ask_to_stop)
     try:
         yield
     finally:

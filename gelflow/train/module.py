@@ -19,7 +19,7 @@ from gelflow.config import MINIMUM_SIDE, TrainConfig
 from gelflow.errors import InputError
 from gelflow.losses import flow_loss, self_supervised_loss
 from gelflow.losses.augmentation_consistency import consistency_loss, transformed_pair
-from gelflow.losses.occlusion import visible_both_ways
+from gelflow.losses.occlusion import visible_in_both_images
 from gelflow.losses.photometric import photometric_loss
 from gelflow.models import GelFlow
 from gelflow.models.estimate import estimate_flow
@@ -158,7 +158,7 @@ class FlowModule(L.LightningModule):
         trusted = not config.second_stage or self.step >= config.second_stage * self.config.steps
         if config.occlusion == "forward_backward" and trusted:
             there, back = flows[0].chunk(2)
-            visible = visible_both_ways(flows[0], torch.cat([back, there]))
+            visible = visible_in_both_images(flows[0], torch.cat([back, there]))
         loss, parts = self_supervised_loss(flows, image1, image2, config, visible)
         if config.lambda_ar > 0 and trusted:
             # Fixed by (seed, step), so that a resumed run shows the same.

@@ -24,14 +24,13 @@ from pathlib import Path
 from typing import Any
 
 from gelflow.baselines.learned import Learned
+from gelflow.compare.seeds import FINE_TUNED
 from gelflow.config import TrainConfig
 from gelflow.config.sources import train_config
 from gelflow.config.validation import validated
 from gelflow.data.pairs import PairDataset
 from gelflow.errors import InputError
 
-SUFFIX = "+ft"
-"""At the end of the name of every method of this kind."""
 BATCH = 4
 """Pairs in a batch, the paper's, so that 1600 steps on 8 pairs are its 800 epochs for every network."""
 RATE = 1e-4
@@ -112,4 +111,4 @@ def fine_tuned(method: Learned, dataset: PairDataset, out: Path, steps: int, con
         raise InputError(f"--ft {steps}: the pairs have {given} px, a batch needs one size; give --size ROWSxCOLUMNS")
     resume = (out / STATE).is_file()
     result = train(settings, dataset, None, out, initial=method.path, resume=resume)
-    return Learned(result.weights, f"{method.name}{SUFFIX}", method.size, method.device, method.registration)
+    return Learned(result.weights, f"{method.name}{FINE_TUNED}", method.size, method.device, method.registration)

@@ -10,7 +10,7 @@ from gelflow.config import LossConfig
 from gelflow.config.sources import train_config
 from gelflow.losses import self_supervised_loss
 from gelflow.losses.augmentation_consistency import consistency_loss, transformed_pair
-from gelflow.losses.occlusion import visible_both_ways
+from gelflow.losses.occlusion import visible_in_both_images
 from gelflow.losses.smoothness import second_order_loss
 from gelflow.ops.pyramid import flow_pyramid
 from gelflow.ops.warp import inside, warp
@@ -48,12 +48,12 @@ def test_occlusion_keeps_what_closes() -> None:
     # A stretch about the middle: forward x' = 1.4 x, backward exactly its inverse, so that x + forward closes.
     forward = torch.stack([0.4 * (x - 30), 0.4 * (y - 20)])[None]
     backward = torch.stack([(1 / 1.4 - 1) * (x - 30), (1 / 1.4 - 1) * (y - 20)])[None]
-    seen = visible_both_ways(forward, backward)
+    seen = visible_in_both_images(forward, backward)
     stays = ((1.4 * (x - 30)).abs() <= 29.5) & ((1.4 * (y - 20)).abs() <= 19.5)
     assert torch.equal(seen[0, 0] > 0, stays)
     backward[..., 20:30] += 1.5  # a strip that goes elsewhere: 1.5^2 > 0.5 + 1 % of the motion
     hidden = (1.4 * (x - 30) + 30 > 21.5) & (1.4 * (x - 30) + 30 < 28.5) & stays
-    assert not visible_both_ways(forward, backward)[0, 0][hidden].any()
+    assert not visible_in_both_images(forward, backward)[0, 0][hidden].any()
 
 
 def test_a_flow_that_closes_nowhere_hides_nothing() -> None:
@@ -61,7 +61,7 @@ def test_a_flow_that_closes_nowhere_hides_nothing() -> None:
     # Fails with the share taken over the batch.
     forward, backward = torch.full((2, 2, 10, 20), 1.5), torch.full((2, 2, 10, 20), 1.5)
     backward[1, :, :4] = -1.5
-    seen = visible_both_ways(forward, backward)
+    seen = visible_in_both_images(forward, backward)
     stays = inside(forward)
     assert torch.equal(seen[0], stays[0])
     assert 0 < seen[1].mean() < 0.3

@@ -78,7 +78,7 @@ def test_losses_that_trust_the_flow_wait_for_their_stage(
     # Fails with either of the two from the start.
     asked: list[bool] = []
     monkeypatch.setattr(FlowModule, "step", step)
-    monkeypatch.setattr(module, "visible_both_ways", lambda *flows: asked.append(True))
+    monkeypatch.setattr(module, "visible_in_both_images", lambda *flows: asked.append(True))
     loss = {"lambda_s": [1.0, 1.0, 1.0], "occlusion": "forward_backward", "lambda_ar": 0.01, "second_stage": 0.5}
     trained = FlowModule(small(steps=10, loss=loss), GelFlow(small().model))
     images = torch.rand(2, 1, 3, 64, 64, generator=torch.Generator().manual_seed(0))

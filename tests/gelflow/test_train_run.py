@@ -101,7 +101,7 @@ def test_a_run_interrupted_by_ctrl_c_ends_with_the_same_weights(
 
 
 def test_a_run_stopped_before_its_first_save_says_so(tmp_path: Path) -> None:
-    """By SIGTERM while Lightning opens the data, before the keeper handles signals, which ends the first step."""
+    """By SIGTERM while Lightning opens the data, before the callback handles signals, which ends the first step."""
 
     class Counted(Shifts):
         counts = 0
