@@ -103,12 +103,7 @@ class Learned:
     def forward(self, image1: Any, image2: Any) -> Any:
         """What `flow` costs beside reading and resizing: the network and, where it is on, the registration.
 
-        Args:
-            image1: Tensor (B, 3, H, W) in [0, 1] on the network's device.
-            image2: The same shape.
-
-        Returns:
-            (B, 2, H, W), px.
+        The images are tensors (B, 3, H, W) in [0, 1] on the network's device, the flow is (B, 2, H, W) px.
         """
         return self.network(image1, image2)
 

@@ -20,10 +20,7 @@ MARKERS = "osD^vPX"
 def plot_means(path: Path, groups: Sequence[Group], note: str) -> None:
     """Writes a PNG with a panel per measure, a row per method; bars are standard deviations over seeds.
 
-    Args:
-        path: The PNG.
-        groups: The methods.
-        note: What the means are over.
+    The note says what the means are over.
     """
     candidates: list[tuple[str, str, float, bool]] = [
         ("PSNR (dB), more is better", "psnr_db", 1, False),
@@ -63,13 +60,10 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
 def plot_work_precision(path: Path, groups: Sequence[Group], note: str) -> None:
     """Writes a PNG with quality against run time: endpoint error where it is known, and PSNR.
 
+    Methods of `UNTIMED` are left out. The note says what the times were measured on.
+
     Methods that no other beats in both are joined; those that were fine-tuned on the very pairs are hollow and not
     part of the front. A black edge means that it ran on a GPU.
-
-    Args:
-        path: The PNG.
-        groups: The methods; those of `UNTIMED` are left out.
-        note: What the times were measured on.
     """
     shown = [group for group in groups if group.name not in UNTIMED]
     candidates = [("mean endpoint error (px)", "endpoint_error_px", 1.0), ("PSNR (dB)", "psnr_db", -1.0)]
@@ -100,12 +94,7 @@ def plot_work_precision(path: Path, groups: Sequence[Group], note: str) -> None:
 
 
 def plot_strata(path: Path, strata: Mapping[str, Sequence[Stratum]]) -> None:
-    """Writes a PNG with the mean endpoint error by true motion, by distance to the contact's edge and by pattern.
-
-    Args:
-        path: The PNG.
-        strata: Bins by method; trainings with different seeds are pooled.
-    """
+    """Writes a PNG with the mean endpoint error by true motion, by distance to the contact's edge and by pattern."""
     by_method = pooled(strata)
     present = {one.kind for bins in by_method.values() for one in bins}
     kinds = [kind for kind in (MOTION, EDGE, PATTERN) if kind in present]

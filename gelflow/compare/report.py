@@ -39,10 +39,6 @@ def latex(title: str, table: Table) -> str:
 def write_report(out: Path, comparison: Comparison) -> None:
     """Writes `FILES` into a folder, each as a whole.
 
-    Args:
-        out: The folder; made if missing.
-        comparison: Of at least one method.
-
     Raises:
         OSError: A file cannot be written.
     """

@@ -42,13 +42,7 @@ def network_speed(
 ) -> Speed:
     """Measures a network's forward pass.
 
-    Args:
-        model: Takes two image batches (B, 3, H, W) on `device`.
-        size: Rows and columns.
-        batch: Pairs at once.
-        device: "cpu" or "cuda".
-        warmup: Passes before the measurement.
-        repeats: Passes that are measured.
+    The network takes two image batches (B, 3, H, W) on the device; `repeats` passes are measured after `warmup` passes.
     """
     import torch
 

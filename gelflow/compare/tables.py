@@ -63,13 +63,8 @@ def _scaled(group: Group, field: str, factor: float, digits: int) -> str:
 def pair_table(scores: Sequence[PairScore], cell: Callable[[PairScore], tuple[float, ...] | None], form: str) -> Table:
     """A row per method and a column per pair, as in the paper; the mean over seeds.
 
-    Args:
-        scores: Of all methods on all pairs.
-        cell: The numbers of a cell; None where the pair has none.
-        form: How to write them, such as "{:.2f} / {:.3f}".
-
-    Returns:
-        Pairs for which no method has numbers are left out.
+    `cell` gives the numbers of a cell, None where the pair has none; `form` is how to write them, "{:.2f} / {:.3f}".
+    Pairs for which no method has numbers are left out.
     """
     found: dict[tuple[str, str], list[tuple[float, ...]]] = {}
     for score in scores:

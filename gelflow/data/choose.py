@@ -121,10 +121,7 @@ def length(flow: FlowArray) -> NDArray[np.float32]:
 def choose_pairs(frames: Sequence[Bytes3], config: ChoiceConfig, generator: np.random.Generator) -> Choices:
     """Chooses pairs from the frames of one recording.
 
-    Args:
-        frames: (H, W, 3) uint8 of one size, in order of time.
-        config: Limits and numbers.
-        generator: Source of the random order; which of a pair's frames comes first is random, too.
+    Frames are of one size, in order of time; which of a pair's frames comes first is random, too.
 
     Returns:
         At most `config.per_source` pairs. The same frames, settings and generator state give the same pairs.

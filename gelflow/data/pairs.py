@@ -64,9 +64,7 @@ def without_pattern(scene: str | None) -> bool:
 class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
     """Image pairs that are read from disk when they are asked for.
 
-    Args:
-        source: The folder or folders they come from, for messages.
-        records: At least one.
+    At least one; `source` is where they come from, for messages.
 
     Raises:
         InputError: There is no pair.

@@ -25,11 +25,8 @@ def transformed_pair(
 ) -> tuple[Images, Images, Flow, Mask]:
     """A pair under a random transformation, with the flow that belongs to it.
 
-    Args:
-        image1: (B, 3, H, W) in [0, 1].
-        image2: The same shape.
-        flow: (B, 2, H, W) px; its gradient is not followed.
-        random: On the CPU; the same transformation for all pairs of the batch. Noise is drawn on the images' device.
+    The transformation is the same for all pairs of the batch; `random` is a generator on the CPU. No gradient is
+    followed through the flow.
 
     Returns:
         Both images, the flow that belongs to them, and a mask of the pixels where it is known.

@@ -78,10 +78,7 @@ def _regulariser(flow: Flow, image: Images, config: LossConfig, side: int) -> tu
 def flow_loss(flows: list[Flow], truth: Flow, config: LossConfig) -> tuple[Scalar, dict[str, Tensor]]:
     """The endpoint loss at all scales, for training on the exact flow.
 
-    Args:
-        flows: As for `self_supervised_loss`.
-        truth: (B, 2, H, W), px; NaN where the pixel sees no gel.
-        config: Only `flow_s`, or `lambda_s` in its absence, matters.
+    Scales have the weights `flow_s`, or `lambda_s` in its absence; flows are as for `self_supervised_loss`.
 
     Returns:
         The loss, and its part "endpoint": the loss of the finest scale alone, px, detached.

@@ -20,10 +20,6 @@ def visible_in_both_images(forward: Flow, backward: Flow) -> Mask:
     """1 where the flow there and back closes, else 0; also 0 where it leaves the image. Without gradient.
 
     Pairs with less than `MIN_VISIBLE_SHARE` of such pixels have 1 wherever the flow does not leave the image.
-
-    Args:
-        forward: (B, 2, H, W), px.
-        backward: The same with the images exchanged.
     """
     with torch.no_grad():
         back = warp(backward, forward)

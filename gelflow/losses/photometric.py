@@ -18,15 +18,7 @@ C2 = 0.03**2
 
 
 def structural_similarity(first: Images, second: Images) -> Tensor:
-    """SSIM (Wang et al. 2004) of each pixel's 3x3 window, in [-1, 1].
-
-    Args:
-        first: (B, C, H, W) in [0, 1].
-        second: The same shape.
-
-    Returns:
-        (B, C, H, W).
-    """
+    """SSIM (Wang et al. 2004) of each pixel's 3x3 window, in [-1, 1]."""
 
     def mean(values: Tensor) -> Tensor:
         return F.avg_pool2d(values, 3, stride=1, padding=1, count_include_pad=False)
@@ -42,12 +34,6 @@ def structural_similarity(first: Images, second: Images) -> Tensor:
 def photometric_loss(image1: Images, image2: Images, flow: Flow, alpha: float = 0.85) -> Scalar:
     """The photometric loss at one scale.
 
-    Args:
-        image1: (B, 3, H, W) in [0, 1], of this scale.
-        image2: The same shape.
-        flow: (B, 2, H, W), px of this scale.
-        alpha: Share of SSIM.
-
     Returns:
         A scalar >= 0; 0 where the flow maps image 2 onto image 1, and where it takes every pixel out of the image.
     """
@@ -57,11 +43,7 @@ def photometric_loss(image1: Images, image2: Images, flow: Flow, alpha: float = 
 def appearance_loss(image1: Images, warped: Images, pixels: Mask, alpha: float) -> Scalar:
     """The photometric loss of an image that has been warped already.
 
-    Args:
-        image1: (B, 3, H, W) in [0, 1].
-        warped: Image 2 brought to image 1, the same shape.
-        pixels: (B, 1, H, W), 1 where the warped image is worth comparing.
-        alpha: Share of SSIM.
+    The mask is 1 where the warped image is worth comparing; `alpha` is the share of SSIM.
     """
     dissimilarity = (1 - structural_similarity(image1.to(warped.dtype), warped)) / 2
     difference = (warped - image1).abs()

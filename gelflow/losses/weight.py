@@ -16,12 +16,6 @@ from gelflow.ops.gradients import forward_differences
 def regulariser_weight(image: Images, kind: str, beta: float, floor: float) -> Mask:
     """The weight on the (H-1) x (W-1) pixels that have a right and a lower neighbour.
 
-    Args:
-        image: Image 1 of this scale, (B, 3, H, W) in [0, 1].
-        kind: "anti_edge", "edge_aware" or "floor".
-        beta: Steepness.
-        floor: Smallest weight for "floor".
-
     Returns:
         (B, 1, H-1, W-1) in [0, 1].
     """

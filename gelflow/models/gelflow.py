@@ -28,9 +28,6 @@ from gelflow.ops.warp import warp
 class GelFlow(nn.Module):
     """Flow from image 1 to image 2 at all scales.
 
-    Args:
-        config: The architecture.
-
     Attributes:
         config: The architecture.
         image_size: Rows and columns of the images that it was trained on, where they were resized; else None.

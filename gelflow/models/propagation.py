@@ -106,10 +106,8 @@ def propagated(
 class _Proposals:
     """Flows that neighbours propose to each pixel.
 
-    Args:
-        flow: (B, 2, H, W).
-        reach: Largest step to a neighbour along an axis; beyond the border, the border's pixels go on.
-        extrapolate: By the slope of the flow, smoothed.
+    Beyond the border, its pixels go on; `reach` is the largest step along an axis. Where extrapolated, by the slope of
+    the smoothed flow.
     """
 
     def __init__(self, flow: Flow, reach: int, extrapolate: bool) -> None:

@@ -20,11 +20,7 @@ CHANNELS_WITHIN = 48
 
 
 class RefinementHead(nn.Module):
-    """The head.
-
-    Args:
-        iterations: Corrections.
-    """
+    """Corrections of the flow at half of the resolution, a number of times with the same weights."""
 
     def __init__(self, iterations: int) -> None:
         super().__init__()
@@ -39,12 +35,7 @@ class RefinementHead(nn.Module):
     def forward(self, flow: Flow, encoded: Features) -> Flow:
         """Corrects a flow.
 
-        Args:
-            flow: (B, 2, H, W), px of the scale s = 1.
-            encoded: The encoder's features of both images at that scale, (2 B, C, H, W).
-
-        Returns:
-            The corrected flow, same shape, float32.
+        Flow and features, those of both images (2 B, C, H, W), are of the scale s = 1.
         """
         # Unit length: a correlation near one says "here", whatever the contrast.
         first, second = F.normalize(encoded.float(), dim=1).split(flow.shape[0])

@@ -41,12 +41,6 @@ RESIDUAL_WINDOW_PX, BLENDING_PX = 6.0, 2.0
 def registered(flow: Flow, image1: Images, image2: Images, config: RegistrationConfig) -> Flow:
     """Corrects a flow.
 
-    Args:
-        flow: (B, 2, H, W), px.
-        image1: (B, C, H, W) in [0, 1], on the same device.
-        image2: The same shape.
-        config: Windows and weights.
-
     Returns:
         The corrected flow, same shape, float32, without gradient. Each pair of a batch is treated on its own.
     """

@@ -36,10 +36,7 @@ def weights_file(given: Path | None) -> Path:
 def save_weights(path: Path, model: GelFlow, **metadata: str) -> None:
     """Writes a network's weights, as a whole or not at all.
 
-    Args:
-        path: File to write; folders are made.
-        model: The network.
-        metadata: Further texts to keep with the weights.
+    `metadata` are further texts to store with them. Folders are made.
 
     Raises:
         OSError: The disk is full or the folder cannot be written to.
@@ -66,14 +63,7 @@ def read_metadata(path: Path) -> dict[str, str]:
 
 
 def load_weights(path: Path, device: str = "cpu") -> GelFlow:
-    """Builds the network that a file describes and gives it the file's weights.
-
-    Args:
-        path: A file that `save_weights` wrote.
-        device: Where the network is put.
-
-    Returns:
-        The network, in evaluation mode, float32.
+    """Builds the network that a file describes, with the file's weights, in evaluation mode.
 
     Raises:
         InputError: No such file, not a safetensors file, damaged, or weights of another model.

@@ -62,11 +62,6 @@ def _windows(height: int, width: int, radius: int) -> list[tuple[slice, slice]]:
 def local_correlation(first: Features, second: Features, radius: int) -> Tensor:
     """Mean over channels of the products of each pixel's features with those of its neighbours in the other image.
 
-    Args:
-        first: (B, C, H, W).
-        second: (B, C, H, W), same dtype.
-        radius: r, px.
-
     Returns:
         (B, (2 r + 1)^2, H, W). Differentiable once.
     """

@@ -27,11 +27,7 @@ class SeparableFilter(NamedTuple):
 def window_sums(rows: int, columns: int, deviation: float, like: Tensor) -> SeparableFilter:
     """Sums under a Gaussian of height one around each pixel; nothing is added where the window leaves the image.
 
-    Args:
-        rows: Of the fields.
-        columns: Of the fields.
-        deviation: Standard deviation of the Gaussian, px.
-        like: Gives dtype and device.
+    `deviation` is the Gaussian's standard deviation in px; `like` gives dtype and device.
     """
     return SeparableFilter(*(_sums(pixels, deviation, like.dtype, like.device) for pixels in (rows, columns)))
 

@@ -27,8 +27,7 @@ POLE = math.sqrt(3) - 2
 class SplineImage:
     """An image that can be sampled anywhere.
 
-    Args:
-        image: (B, C, H, W), sides of at least 3 px.
+    Its sides are at least 3 px long.
     """
 
     def __init__(self, image: Features) -> None:

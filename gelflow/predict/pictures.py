@@ -36,15 +36,7 @@ def colour_wheel() -> NDArray[np.float64]:
 
 
 def flow_to_colour(flow: FlowArray, scale_px: float) -> Bytes3:
-    """Colours of a flow: white where it is zero, full colour at `scale_px`, darker beyond, grey where it is NaN.
-
-    Args:
-        flow: (H, W, 2) px.
-        scale_px: Length that is drawn in full colour, > 0.
-
-    Returns:
-        (H, W, 3) uint8 RGB.
-    """
+    """Colours of a flow: white where it is zero, full colour at `scale_px`, darker beyond, grey where it is NaN."""
     wheel = colour_wheel()
     unknown = ~np.isfinite(flow).all(axis=-1)
     u, v = (np.where(unknown, 0.0, flow[..., k]) / scale_px for k in (0, 1))
@@ -86,13 +78,10 @@ def legend(side: int) -> Bytes3:
 def draw_overlay(frame: Bytes3, flow: FlowArray, scale_px: float) -> Bytes3:
     """A frame of an overlay video: arrows on the frame at the left, colours with their legend at the right.
 
+    The flow leads from the reference to this frame; `scale_px` is the length in full colour, the same for all frames.
+
     An arrow starts where the gel was in the reference frame and ends where it is in this frame. Arrows are as long as
     the motion; where the scale is below 3 px they are enlarged, by a factor that is written on the frame.
-
-    Args:
-        frame: The current frame, (H, W, 3) uint8.
-        flow: From the reference to this frame, (H, W, 2) px.
-        scale_px: Length in full colour, the same for all frames of a video.
 
     Returns:
         uint8 RGB, twice as wide as the frame, enlarged to at least 480 rows, both sides even (as video encoders ask).

@@ -31,12 +31,7 @@ class Stopped(Exception):
 class CheckpointCallback(L.Callback):
     """Saves the state, keeps the best weights, reports progress; stops between two steps when asked to.
 
-    Args:
-        config: The run.
-        out: Its folder.
-        validates: Whether there are validation pairs.
-        score: Best score so far, of a resumed run.
-        metrics: Results of the last validation of a resumed run.
+    `score` and `metrics` are the best score and the last results of a resumed run.
     """
 
     def __init__(

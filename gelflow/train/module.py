@@ -237,11 +237,6 @@ def check_side(batch: dict[str, Any], config: TrainConfig) -> None:
 def validation_metrics(batch: dict[str, Any], flow: Tensor, config: TrainConfig) -> dict[str, Tensor]:
     """How good the flow of one pair is: against the truth where there is one, and by the warped image.
 
-    Args:
-        batch: One pair as a batch of one.
-        flow: (1, 2, H, W), px of its images.
-        config: For the photometric loss.
-
     Returns:
         Scalars by the names in `METRICS`; endpoint errors only where a flow is known. PSNR is that of floats over the
         pixels that stay inside the image, not the 8-bit one of the comparison tables.

@@ -54,12 +54,7 @@ class StepSampler(Sampler[list[tuple[int, int]]]):
 
 
 class CheckedPairs(Dataset[Sample]):
-    """Pairs with what training needs of them, see `checked`; a pair that cannot be used is refused.
-
-    Args:
-        pairs: Map-style, with a length.
-        supervised: Whether every pair must have an exact flow.
-    """
+    """Pairs with what training needs of them, see `checked`; a pair that cannot be used is refused."""
 
     def __init__(self, pairs: Dataset[Any], supervised: bool) -> None:
         self.pairs = pairs

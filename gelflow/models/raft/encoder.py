@@ -78,11 +78,7 @@ def _shortcut(inputs: int, outputs: int, stride: int, norm: Norm) -> nn.Module:
 class RaftEncoder(nn.Module):
     """Features of images at an eighth of their resolution.
 
-    Args:
-        stages: Channels of the three stages.
-        outputs: Channels of the result.
-        unit: Kind of residual unit.
-        norm: Kind of normalisation.
+    `stages` are the channels of its three stages.
     """
 
     def __init__(

@@ -26,9 +26,7 @@ STRIDE = 8
 class RAFT(nn.Module):
     """Flow from image 1 to image 2.
 
-    Args:
-        large: The network of 5.3 million weights, or the small one of 1.0 million.
-        iterations: Recurrent updates.
+    The large one has 5.3 million weights, the small one 1.0 million; `iterations` is the number of recurrent updates.
     """
 
     def __init__(self, *, large: bool, iterations: int = 20) -> None:
@@ -95,12 +93,7 @@ def enlarge_bilinear(flow: Flow) -> Flow:
 def enlarge_convex(flow: Flow, weights: Tensor) -> Flow:
     """The flow at full resolution, each pixel a mean of its 3x3 coarse neighbours with its own weights.
 
-    Args:
-        flow: (B, 2, H, W).
-        weights: (B, 9 64, H, W), logarithms of the weights: neighbour, then row and column within the 8x8 block.
-
-    Returns:
-        (B, 2, 8 H, 8 W).
+    The weights (B, 9 64, H, W) are logarithms: neighbour, then row and column within the 8x8 block.
     """
     batch, _, height, width = flow.shape
     shares = weights.view(batch, 1, 9, STRIDE, STRIDE, height, width).softmax(dim=2)

@@ -31,17 +31,9 @@ def looks_like_raft(path: Path) -> bool:
 
 
 def load_raft(path: Path, device: str = "cpu", iterations: int = 20) -> RAFT:
-    """Builds the network that a file's shapes describe and gives it the file's weights.
+    """Builds the network that a file's shapes describe, with the file's weights, in evaluation mode.
 
     Only tensors are read: a file with anything else in it is refused before any of it runs.
-
-    Args:
-        path: A state dictionary saved by `torch.save`.
-        device: Where the network is put.
-        iterations: Recurrent updates.
-
-    Returns:
-        The network, in evaluation mode, float32.
 
     Raises:
         InputError: No such file, damaged, one that would run code, or not RAFT's weights.
