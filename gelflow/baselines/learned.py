@@ -22,14 +22,7 @@ def open_network(
     device: str = "auto",
     registration: Registration | None = None,
 ) -> "Learned | PublishedRaft":
-    """The network that a file of weights belongs to: GelFlow (.safetensors) or RAFT (.pth).
-
-    Args:
-        path: Weights.
-        name: Name in tables; None: the name of the file's folder and file.
-        size: Rows and columns at which the network works; None: those of its training, or of the images.
-        device: "auto" (a CUDA device where there is one), "cpu" or "cuda".
-        registration: See `Learned`.
+    """The network that a file of weights belongs to: GelFlow (.safetensors) or RAFT (.pth); see `Learned`.
 
     Raises:
         InputError: The file is missing, damaged or of another network, the device is not there, or `registration` is
@@ -84,8 +77,7 @@ class Learned:
         self.model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # not in torch's stubs
         self.trained = self.model.config
         if registration is not None:
-            settings = {"registration": REGISTRATIONS[registration]}
-            self.model.config = self.trained.model_copy(update=settings)
+            self.model.config = self.trained.model_copy(update={"registration": REGISTRATIONS[registration]})
         self.network = RecordedNetwork(self.model)
         self.label = name or "/".join(path.with_suffix("").parts[-2:])
         added = _suffix(self.model.config.registration)

@@ -132,7 +132,7 @@ def _networks(
 def _score(
     dataset: PairDataset, methods: Sequence[Method], out: Path | None, as_json: bool, batch: int, add: bool = False
 ) -> None:
-    from gelflow.compare.report import FILES, devices
+    from gelflow.compare.report import FILES
     from gelflow.compare.run import compare
     from gelflow.compare.tables import tables
     from gelflow.terminal import progress, show_table
@@ -149,7 +149,7 @@ def _score(
     if as_json:
         print(result.to_json())
         return
-    print(f"{', '.join(result.data)}; times on {devices(result)}")
+    print(f"{', '.join(result.data)}; times on {result.devices}")
     for title, table in tables(result):
         show_table(title, *table)
     if out is not None:

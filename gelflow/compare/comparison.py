@@ -45,6 +45,11 @@ class Comparison:
         """Names of the methods, in order."""
         return list(dict.fromkeys(score.method for score in self.scores))
 
+    @property
+    def devices(self) -> str:
+        """What the methods ran on."""
+        return " and ".join(dict.fromkeys(score.device for score in self.scores))
+
     def without(self, methods: Iterable[str]) -> "Comparison":
         """The same without some methods."""
         gone = set(methods)

@@ -46,25 +46,20 @@ def write_report(out: Path, comparison: Comparison) -> None:
     _write_csv(out / "scores.csv", names, [[getattr(score, name) for name in names] for score in comparison.scores])
     write_text(out / SCORES, comparison.to_json() + "\n")
     found = tables(comparison)
-    parts = [f"Pairs of {', '.join(comparison.data)}; times on {devices(comparison)}.\n"]
+    parts = [f"Pairs of {', '.join(comparison.data)}; times on {comparison.devices}.\n"]
     parts += [f"{title}\n\n{markdown(table)}" for title, table in found]
     write_text(out / "table.md", "\n".join(parts))
     write_text(out / "table.tex", "\n".join(latex(title, table) for title, table in found))
     groups, pairs = with_pattern(comparison)
     note = f"{pairs} pairs" if pairs == len(comparison.pairs) else f"{pairs} pairs of gels with a pattern"
     plot_means(out / "table.png", groups, note)
-    plot_work_precision(out / "work_precision.png", groups, f"{note}; {devices(comparison)}")
+    plot_work_precision(out / "work_precision.png", groups, f"{note}; {comparison.devices}")
     if any(comparison.strata.values()):
         rows = [[name, s.kind, s.bin, s.pixels, s.error_px / s.pixels, s.above_1px / s.pixels, s.above_01px / s.pixels]
                 for name, bins in comparison.strata.items() for s in bins]  # fmt: skip
         header = ["method", "kind", "bin", "pixels", "endpoint_error_px", "outliers_1px", "outliers_01px"]
         _write_csv(out / "strata.csv", header, rows)
         plot_strata(out / "strata.png", comparison.strata)
-
-
-def devices(comparison: Comparison) -> str:
-    """What the methods ran on."""
-    return " and ".join(dict.fromkeys(score.device for score in comparison.scores))
 
 
 def _write_csv(path: Path, header: list[str], rows: list[list[Any]]) -> None:

@@ -13,8 +13,7 @@ from gelflow.data.pairs import PairDataset
 from gelflow.errors import InputError
 
 SAME_MOTION_PX = 0.01
-"""Pairs of one name whose true motions differ by no more than this in the mean are the same pair. The same scene and
-seed give the same motion within 0.001 px on every device."""
+"""Pairs of one name are the same pair if their true motions differ by no more than this in the mean."""
 
 
 def compare(

@@ -81,12 +81,11 @@ class ModelConfig(_Frozen):
     projected_channels: int = Field(default=32, ge=8, le=128)
     """Channels to which each scale's features are projected by 1x1 convolutions (ARFlow: 32)."""
     estimator: Literal["per_scale", "shared"] = "per_scale"
-    """A flow estimator and context network for each scale (PWC-Net; 9.3 million weights) or one for all (ARFlow's
-    PWC-lite; 3.3 million). The paper names both ancestors and does not say. The time of a step is the same, but the
-    shared one needs two to three times as many steps to start to follow the motion."""
+    """A flow estimator and context network for each scale (PWC-Net) or one for all (ARFlow's PWC-lite), which has a
+    third of the weights and takes more steps to follow the motion. The paper names both ancestors and does not say."""
     normalise_features: bool = True
     """Bring both images' features to mean 0 and variance 1 (jointly, per scale and sample) before they are correlated
-    (UFlow). The paper is silent; without it a network trained from scratch found no motion within 1000 steps."""
+    (UFlow). The paper is silent; without it training from scratch hardly finds motion."""
     lffm: bool = True
     """The local flow fusion module; False for the ablation."""
     lffm_region: Literal[3, 5] = 3
@@ -138,9 +137,8 @@ class LossConfig(_Frozen):
     """Weight of ARFlow's augmentation consistency: on transformed images the network should see the transformed flow.
     Takes a second pass of the network. ARFlow: 0.01."""
     second_stage: float = Field(default=0.0, ge=0, lt=1)
-    """Share of the steps after which `occlusion` and `lambda_ar` begin. Both trust the network's own flow: a new one's
-    hardly closes there and back, and what it should see of transformed images grows with what it saw. ARFlow has them
-    in later stages, too. 0: from the start, for a network that has learnt before."""
+    """Share of the steps after which `occlusion` and `lambda_ar` begin, which rely on the network's own flow. 0: from
+    the start, for a network that has learnt before. ARFlow has them in later stages, too."""
     lambda_dc: float = Field(default=75.0, ge=0)
     """Weight of the regulariser."""
     lambda_theta: float = Field(default=0.01, ge=0)
@@ -149,13 +147,12 @@ class LossConfig(_Frozen):
     """Weight of the rotation within the decomposition loss."""
     flow_normalisation: Literal["min_side", "none"] = "min_side"
     """Divide the flow by the shorter side of the image (scale 0, in px, for all scales alike, as ARFlow does) before
-    the regulariser. Without it, lambda_dc = 75 makes the true flow of a 4 px press score ten times worse than no flow,
-    and training collapses to no flow."""
+    the regulariser. Without it, lambda_dc = 75 makes training collapse to no flow."""
     lambda_df: float = Field(default=0.01, ge=0)
     """Weight of the deformation loss."""
     ratio: Literal["product", "det"] = "product"
-    """Area ratio in the deformation loss: R_x R_y as published (a rotation by 0.1 rad gives 0.990), or the determinant
-    of the deformation gradient (1 for every rotation, up to the flow's discretisation)."""
+    """Area ratio in the deformation loss: R_x R_y as published, which rotations change, or the determinant of the
+    deformation gradient, which they do not."""
     beta: float = Field(default=10.0, ge=0)
     """Steepness of the weight in the image gradient."""
     weight: Literal["anti_edge", "edge_aware", "floor"] = "anti_edge"
@@ -187,7 +184,7 @@ class LossConfig(_Frozen):
 
 
 class MotionConfig(_Frozen):
-    """Motion added to training pairs by moving image 2, see `gelflow.train.motion`.
+    """Motion added to training pairs by moving image 2, see `gelflow.train.augment`.
 
     Uniform up to these limits, times a common factor that is uniform between 0 and 1.
     """
@@ -209,8 +206,8 @@ class TrainConfig(_Frozen):
     """Train on the images alone (the paper), or on the exact flow by the multi-scale endpoint loss, or on whichever a
     pair has: exact flow where it is known, the images alone where it is not (synthetic and real pairs side by side)."""
     mixed_self: float = Field(default=10.0, gt=0)
-    """Weight of the self-supervised loss beside the endpoint loss under supervision = "mixed". The photometric loss
-    changes by about 0.1 per px of error, the endpoint loss by 1."""
+    """Weight of the self-supervised loss, which changes less with a px of error, beside the endpoint loss under
+    supervision = "mixed"."""
     image_size: tuple[int, int] | None = None
     """Rows and columns to which images are resized before the network (the paper: 512, 640); None: as they are."""
     crop_size: tuple[int, int] | None = None
@@ -255,8 +252,7 @@ class TrainConfig(_Frozen):
     """On a CUDA device, record the network's two passes at the first step and replay them."""
     cache: bool = True
     """On a CUDA device, decode all pairs at the start (by `workers`) and keep them there, if they take no more than
-    half of its free memory: a pair of 320 x 240 px with its flow takes 1 MiB. Otherwise the files of a pair are decoded
-    anew whenever a step asks for it."""
+    half of its free memory. Otherwise the files of a pair are decoded anew whenever a step asks for it."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to train; auto: a CUDA device where there is one."""
     devices: int = Field(default=1, ge=1)

@@ -25,8 +25,8 @@ WORKING_SIDE = 160
 BLANK_STANDARD_DEVIATION = 3.0
 """Grey levels of 255; frames with less contrast show nothing to track."""
 EXPOSURE_CHANGE = 0.2
-"""Largest relative deviation of a channel's mean from its median over the recording. GelSight Mini recordings stay
-within 0.15 during contact; their exposure ramps reach 0.3."""
+"""Largest relative deviation of a channel's mean from its median over the recording: above what contact changes, below
+exposure ramps."""
 MOTION_PERCENTILE = 95.0
 
 

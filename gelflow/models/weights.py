@@ -8,7 +8,6 @@ import json
 from importlib.resources import files
 from pathlib import Path
 
-import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
@@ -18,6 +17,7 @@ from gelflow.config import ModelConfig
 from gelflow.config.validation import validated
 from gelflow.errors import InputError
 from gelflow.files.atomic import replacing
+from gelflow.files.tensors import misfit
 from gelflow.models import GelFlow
 
 SHIPPED = "best"
@@ -79,7 +79,8 @@ def load_weights(path: Path, device: str = "cpu") -> GelFlow:
     if not (size is None or (isinstance(size, list) and [type(side) for side in size] == [int, int])):
         raise InputError(f"{path}: image_size in its metadata must be null or [rows, columns], not {size!r}; {RETRAIN}")
     model = GelFlow(validated(ModelConfig, values, f"{path}, architecture in its metadata"))
-    _check_tensors(path, tensors, model)
+    if problem := misfit(tensors, model):
+        raise InputError(f"{path}: its weights do not fit its architecture: {problem}; {RETRAIN}")
     model.load_state_dict(tensors)
     model.image_size = None if size is None else (size[0], size[1])
     return model.to(device).eval()
@@ -100,17 +101,3 @@ def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
     if metadata.get("format") != FORMAT:
         raise InputError(f"{path}: a safetensors file, but not weights of GelFlow (its metadata lack it); {RETRAIN}")
     return metadata, tensors
-
-
-def _check_tensors(path: Path, tensors: dict[str, Tensor], model: GelFlow) -> None:
-    expected = model.state_dict()
-    wrong = [f"{name} is missing" for name in expected if name not in tensors]
-    wrong += [f"{name} is unknown" for name in tensors if name not in expected]
-    for name, value in tensors.items():
-        if name in expected and value.shape != expected[name].shape:
-            wrong.append(f"{name} has shape {tuple(value.shape)}, not {tuple(expected[name].shape)}")
-        elif not torch.isfinite(value).all():
-            wrong.append(f"{name} holds values that are not finite")
-    if wrong:
-        more = f" and {len(wrong) - 3} more" if len(wrong) > 3 else ""
-        raise InputError(f"{path}: its weights do not fit its architecture: {'; '.join(wrong[:3])}{more}; {RETRAIN}")

@@ -5,17 +5,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
-from safetensors.torch import load_file
 from textures import write_folder, write_synthetic
+from waves import random_weights, same_weights
 
 from gelflow.baselines.learned import Learned
 from gelflow.config import ModelConfig, MotionConfig, RegistrationConfig, TrainConfig
 from gelflow.config.sources import train_config
 from gelflow.data import PairDataset, join, open_pairs
 from gelflow.errors import InputError
-from gelflow.models import GelFlow
-from gelflow.models.weights import read_metadata, save_weights
+from gelflow.models.weights import read_metadata
 from gelflow.train.test_time import fine_tuned, fine_tuning_settings
 
 SMALL = ModelConfig(levels=4, projected_channels=8)
@@ -28,16 +26,6 @@ UNSUITABLE: dict[str, Any] = {
 """A training that nothing of may carry over but losses, clipping, flips, weight decay and seed."""
 
 
-def network(path: Path, model: ModelConfig, train: TrainConfig, size: tuple[int, int] | None = None) -> Path:
-    """Random weights with the record of a training."""
-    torch.set_num_threads(1)
-    torch.manual_seed(0)
-    net = GelFlow(model)
-    net.image_size = size
-    save_weights(path, net, train=train.model_dump_json(), step="7")
-    return path
-
-
 @pytest.mark.parametrize("preset", ["best", "real", "bare", "paper", "selfflow"])
 def test_whatever_the_preset_the_pairs_are_seen_as_they_are_and_without_truth(preset: str, tmp_path: Path) -> None:
     """Fails with any one of the fixed settings left out that this preset sets otherwise."""
@@ -45,7 +33,7 @@ def test_whatever_the_preset_the_pairs_are_seen_as_they_are_and_without_truth(pr
     levels = recorded.model.levels
     model = ModelConfig(levels=levels, projected_channels=8, estimator="shared", registration=RegistrationConfig())
     rate = min(recorded.learning_rate, 1e-4) if recorded.schedule == "one_cycle" else recorded.learning_rate
-    method = Learned(network(tmp_path / "w.safetensors", model, recorded, recorded.image_size), device="cpu")
+    method = Learned(random_weights(tmp_path / "w.safetensors", model, recorded, recorded.image_size), device="cpu")
     for config in (None, preset):
         settings = fine_tuning_settings(method, 1600, config, pairs=8)
         assert settings.supervision == "self"
@@ -64,7 +52,7 @@ def test_whatever_the_preset_the_pairs_are_seen_as_they_are_and_without_truth(pr
 def test_nothing_else_of_the_training_carries_over(tmp_path: Path) -> None:
     """Fails with the machine's settings (devices, workers) left as recorded."""
     recorded = TrainConfig.model_validate({"model": SMALL} | UNSUITABLE)
-    method = Learned(network(tmp_path / "w.safetensors", SMALL, recorded), device="cpu")
+    method = Learned(random_weights(tmp_path / "w.safetensors", SMALL, recorded), device="cpu")
     settings = fine_tuning_settings(method, 12, None, pairs=3)
     expected = TrainConfig(
         model=SMALL, loss=recorded.loss, supervision="self", mixed_self=3.0, batch_size=3, steps=12, learning_rate=1e-4,
@@ -76,7 +64,7 @@ def test_nothing_else_of_the_training_carries_over(tmp_path: Path) -> None:
 def test_a_constant_rate_and_the_size_of_use_are_kept(tmp_path: Path) -> None:
     """Fails with the size of the training where --size gives another: the pairs would be scored at a size not seen."""
     recorded = TrainConfig.model_validate({"model": SMALL} | UNSUITABLE | {"schedule": "constant", "warmup_steps": 0})
-    path = network(tmp_path / "w.safetensors", SMALL, recorded, (96, 128))
+    path = random_weights(tmp_path / "w.safetensors", SMALL, recorded, (96, 128))
     settings = fine_tuning_settings(Learned(path, size=(64, 80), device="cpu"), 12, None, pairs=3)
     assert settings.learning_rate == 4e-4
     assert settings.image_size == (64, 80)
@@ -89,13 +77,11 @@ def test_exact_flow_is_not_looked_at(tmp_path: Path) -> None:
     plain = open_pairs(write_folder(tmp_path / "plain", {"a": shifts[0], "b": shifts[1]}))
     exact = open_pairs(write_synthetic(tmp_path / "exact", shifts))
     recorded = TrainConfig.model_validate({"model": SMALL} | UNSUITABLE)
-    method = Learned(network(tmp_path / "w.safetensors", SMALL, recorded), "net", device="cpu")
+    method = Learned(random_weights(tmp_path / "w.safetensors", SMALL, recorded), "net", device="cpu")
     runs = [fine_tuned(method, dataset, tmp_path / f"run{k}", 3) for k, dataset in enumerate((plain, exact))]
     assert [run.name for run in runs] == ["net+ft"] * 2
-    first, second = (load_file(run.path) for run in runs)
-    assert all(torch.equal(first[name], second[name]) for name in first)
-    before = load_file(method.path)
-    assert any(not torch.equal(first[name], before[name]) for name in first)
+    assert same_weights(runs[0].path, runs[1].path)
+    assert not same_weights(runs[0].path, method.path)
     recorded_now = json.loads(read_metadata(runs[0].path)["train"])
     assert (recorded_now["supervision"], recorded_now["steps"]) == ("self", 3)
 
@@ -104,7 +90,7 @@ def test_pairs_of_several_sizes_need_one(tmp_path: Path) -> None:
     folders = [write_folder(tmp_path / f"{k}", {"a": (1, 0)}, size) for k, size in enumerate([(64, 80), (72, 80)])]
     dataset: PairDataset = join([open_pairs(folder) for folder in folders])
     recorded = TrainConfig.model_validate({"model": SMALL} | UNSUITABLE)
-    path = network(tmp_path / "w.safetensors", SMALL, recorded)
+    path = random_weights(tmp_path / "w.safetensors", SMALL, recorded)
     with pytest.raises(InputError, match="64x80, 72x80 px, a batch needs one size; give --size"):
         fine_tuned(Learned(path, device="cpu"), dataset, tmp_path / "run", 1)
     assert fine_tuned(Learned(path, size=(64, 80), device="cpu"), dataset, tmp_path / "run", 1).path.is_file()

@@ -9,14 +9,13 @@ import pytest
 import torch
 from safetensors.torch import load_file
 from textures import write_folder
-from waves import Shifts
+from waves import Shifts, small
 
 from gelflow.arrays import FlowArray, ImageArray
 from gelflow.cli import main
 from gelflow.compare.plots import pareto_front
 from gelflow.compare.scores import evaluate
 from gelflow.compare.speed import network_speed
-from gelflow.config import TrainConfig
 from gelflow.data import open_pairs
 from gelflow.models.raft import RAFT
 from gelflow.models.weights import read_metadata
@@ -26,11 +25,7 @@ from gelflow.train import train
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A GelFlow network after one step."""
-    torch.set_num_threads(1)
-    config = TrainConfig.model_validate(
-        {"model": {"levels": 4, "projected_channels": 8}, "loss": {"lambda_s": [1.0, 1.0, 1.0]}, "steps": 1,
-         "batch_size": 1, "device": "cpu"}
-    )  # fmt: skip
+    config = small(steps=1, batch_size=1, learning_rate=1e-4)
     return train(config, Shifts(1, 64, 1.0, seed=1), None, tmp_path_factory.mktemp("run")).weights
 
 

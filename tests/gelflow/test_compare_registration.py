@@ -10,6 +10,7 @@ import pytest
 import torch
 from test_cli import fails
 from textures import write_folder
+from waves import random_weights, small
 
 import gelflow.compare.run
 import gelflow.models.gelflow
@@ -18,13 +19,12 @@ from gelflow.cli import main
 from gelflow.compare.run import compare
 from gelflow.compare.scores import evaluate
 from gelflow.compare.speed import Speed
-from gelflow.config import REGISTRATIONS, ModelConfig, Registration, RegistrationConfig, TrainConfig
+from gelflow.config import REGISTRATIONS, ModelConfig, Registration, RegistrationConfig
 from gelflow.data import open_pairs
 from gelflow.files.exr import read_flow
-from gelflow.models import GelFlow
 from gelflow.models.raft import RAFT
 from gelflow.models.registration import registered
-from gelflow.models.weights import read_metadata, save_weights
+from gelflow.models.weights import read_metadata
 
 OWN = RegistrationConfig(windows_px=(8,), smoothing_px=(4,))
 
@@ -35,13 +35,8 @@ BRIGHTNESS = REGISTRATIONS["brightness"]
 
 
 def network(path: Path, registration: RegistrationConfig | None) -> Path:
-    """Random weights of a small network, as a training leaves them."""
-    torch.set_num_threads(1)
-    torch.manual_seed(0)
     model = ModelConfig(levels=4, projected_channels=8, registration=registration)
-    config = TrainConfig.model_validate({"model": model, "loss": {"lambda_s": [1.0, 1.0, 1.0]}})
-    save_weights(path, GelFlow(model), train=config.model_dump_json(), step="0")
-    return path
+    return random_weights(path, model, small(model=model))
 
 
 @pytest.fixture(scope="module")

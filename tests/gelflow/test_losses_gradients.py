@@ -23,6 +23,7 @@ TERMS = {
     "deformation, determinant": {**REGULARISER, "lambda_dc": 0.0, "lambda_df": 3.0, "ratio": "det"},
     "first order": {**REGULARISER, "smoothness": "first_order"},
     "second order": {**REGULARISER, "smoothness": "second_order"},
+    "second order, its own weights": {**REGULARISER, "smoothness": "second_order", "smoothness_s": (0.0, 2.0)},
 }
 
 

@@ -116,16 +116,12 @@ def test_the_flow_loss_is_zero_for_the_truth_at_all_scales_and_grows_with_the_er
     assert flow_loss([0.9 * field for field in filled], truth, config)[0] > 0
 
 
-def test_gradients_agree_with_finite_differences() -> None:
+def test_the_flow_loss_has_the_gradient_of_finite_differences() -> None:
     random = torch.Generator().manual_seed(3)
-    images = torch.rand(2, 1, 3, 8, 8, generator=random, dtype=torch.float64)
     flows = [
         (0.1 + 0.8 * torch.rand(1, 2, 8 >> s, 8 >> s, generator=random, dtype=torch.float64)).requires_grad_()
         for s in range(3)
     ]
     truth = torch.randn(1, 2, 8, 8, generator=random, dtype=torch.float64)
     truth[..., 3] = torch.nan
-    for options in ({}, {"smoothness": "first_order"}, {"ratio": "det", "weight": "edge_aware", "lambda_df": 3.0}):
-        config = LossConfig(lambda_s=(1.0, 0.5, 2.0), **options)
-        assert gradcheck(lambda *f, c=config: self_supervised_loss(list(f), *images, c)[0], flows)
     assert gradcheck(lambda *f: flow_loss(list(f), truth, LossConfig(lambda_s=(1.0, 0.5, 2.0)))[0], flows)

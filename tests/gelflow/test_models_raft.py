@@ -1,6 +1,5 @@
 """RAFT: published names and shapes, published weights where they lie beside the repository, padding, lookup."""
 
-import pickle
 from pathlib import Path
 
 import pytest
@@ -196,39 +195,16 @@ def test_published_small_weights_see_shifts_and_no_motion() -> None:
         assert error.mean() < (0.1 if (u, v) == (0, 0) else 0.3), (u, v, error.mean())
 
 
-class Evil:
-    """Pickled, it would make a file when it is loaded."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple:
-        return (Path.touch, (self.path,))
-
-
-@pytest.mark.parametrize("kind", ["text", "truncated", "pickle", "evil", "list", "other", "missing key", "nan"])
-def test_files_that_are_not_raft_are_refused_without_running_them(kind: str, tmp_path: Path) -> None:
-    path, trace = tmp_path / "weights.pth", tmp_path / "ran"
+@pytest.mark.parametrize("kind", ["list", "other", "missing key"])
+def test_files_of_other_tensors_are_refused(kind: str, tmp_path: Path) -> None:
+    """Those that are damaged or hold code: test_robustness."""
     tensors = {f"module.{name}": torch.zeros(shape) for name, shape in published_names(False).items()}
-    torch.save(tensors, path)
-    if kind == "text":
-        path.write_text("not weights")
-    elif kind == "truncated":
-        path.write_bytes(path.read_bytes()[:100_000])
-    elif kind == "pickle":
-        path.write_bytes(pickle.dumps({"a": Evil(trace)}))
-    elif kind == "evil":
-        torch.save({"a": Evil(trace)}, path)
-    elif kind == "list":
-        torch.save([1, 2], path)
-    elif kind == "other":
-        torch.save({"layer.weight": torch.zeros(3)}, path)
-    elif kind == "missing key":
-        torch.save({name: value for name, value in tensors.items() if "convf1" not in name}, path)
-    else:
-        tensors["module.fnet.conv1.bias"][3] = torch.nan
-        torch.save(tensors, path)
+    contents = {
+        "list": [1, 2],
+        "other": {"layer.weight": torch.zeros(3)},
+        "missing key": {name: value for name, value in tensors.items() if "convf1" not in name},
+    }
+    torch.save(contents[kind], tmp_path / "weights.pth")
     with pytest.raises(InputError, match=r"weights\.pth: ") as error:
-        load_raft(path)
+        load_raft(tmp_path / "weights.pth")
     assert "\n" not in str(error.value)
-    assert not trace.exists()

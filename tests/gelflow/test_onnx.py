@@ -1,7 +1,5 @@
 """ONNX: the exported network answers as the network itself does; refusals."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -85,8 +83,3 @@ def test_a_missing_package_is_named(weights: Path, capsys: pytest.CaptureFixture
     monkeypatch.setattr("gelflow.models.onnx.find_spec", lambda name: None)
     assert main(["export", str(weights), "--out", "x.onnx"]) == 2
     assert "pip install onnx onnxscript" in capsys.readouterr().err
-
-
-def test_help_lists_the_command() -> None:
-    done = subprocess.run([sys.executable, "-m", "gelflow", "--help"], capture_output=True, text=True, check=True)
-    assert "export" in done.stdout

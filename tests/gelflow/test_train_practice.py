@@ -14,27 +14,14 @@ from pathlib import Path
 import pytest
 import torch
 from textures import write_folder, write_synthetic
-from waves import Shifts
+from waves import Shifts, same_weights, small
 
-from gelflow.config import TrainConfig
 from gelflow.data import open_pairs
 from gelflow.models import GelFlow
 from gelflow.models.weights import load_weights
 from gelflow.train import module, train
 from gelflow.train.module import FlowModule
 from gelflow.train.state import load_state
-
-SMALL = {
-    "model": {"levels": 4, "projected_channels": 8},
-    "loss": {"lambda_s": [1.0, 1.0, 1.0]},
-    "batch_size": 2,
-    "learning_rate": 1e-3,
-    "device": "cpu",
-}
-
-
-def small(**values: object) -> TrainConfig:
-    return TrainConfig.model_validate(SMALL | values)
 
 
 @pytest.fixture(scope="module")
@@ -66,8 +53,7 @@ def test_a_resumed_run_with_everything_on_ends_with_the_same_weights(pairs: Shif
     whole = train(small(steps=4, **options), pairs, None, tmp_path / "whole")
     train(small(steps=2, **options), pairs, None, tmp_path / "cut")
     resumed = train(small(steps=4, **options), pairs, None, tmp_path / "cut", resume=True)
-    first, second = (load_weights(result.weights).state_dict() for result in (whole, resumed))
-    assert all(torch.equal(first[name], second[name]) for name in first)
+    assert same_weights(whole.weights, resumed.weights)
 
 
 @pytest.mark.parametrize(("step", "late"), [(0, False), (4, False), (5, True), (9, True)])

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from gelflow.arrays import Flow, Images
 from gelflow.models.gelflow import check_shapes
 from gelflow.models.raft.correlation import LEVELS, correlation_pyramid, lookup
-from gelflow.models.raft.encoder import BottleneckUnit, RaftEncoder, ResidualUnit, batch_norm, instance_norm, no_norm
+from gelflow.models.raft.encoder import RaftEncoder
 from gelflow.models.raft.update import LARGE, SMALL, UpdateBlock
 from gelflow.ops.warp import pixel_indices
 
@@ -34,10 +34,10 @@ class RAFT(nn.Module):
         self.sizes = LARGE if large else SMALL
         self.large = large
         self.iterations = iterations
-        stages, unit = self.sizes.stages, ResidualUnit if large else BottleneckUnit
-        self.fnet = RaftEncoder(stages, self.sizes.features, unit, instance_norm)
-        outputs = self.sizes.hidden + self.sizes.context
-        self.cnet = RaftEncoder(stages, outputs, unit, batch_norm if large else no_norm)
+        stages, outputs = self.sizes.stages, self.sizes.hidden + self.sizes.context
+        self.fnet = RaftEncoder(stages, self.sizes.features, nn.InstanceNorm2d, bottleneck=not large)
+        norm = nn.BatchNorm2d if large else lambda _: nn.Sequential()
+        self.cnet = RaftEncoder(stages, outputs, norm, bottleneck=not large)
         costs = LEVELS * (2 * self.sizes.radius + 1) ** 2
         self.update_block = UpdateBlock(self.sizes, costs, large=large)
 
