@@ -11,7 +11,7 @@ from gelflow.compare.strata import EDGE, MOTION, PATTERN, Stratum, pooled
 from gelflow.files.atomic import replacing
 
 UNTIMED = ("no motion", "exact flow")
-"""What takes no time worth drawing."""
+"""Methods that take no time worth drawing."""
 BLUE, RED = "#4477aa", "#cc6677"
 COLOURS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb", "#000000")
 MARKERS = "osD^vPX"

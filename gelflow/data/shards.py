@@ -19,11 +19,10 @@ import json
 import tarfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from gelflow.data.member import FlowMembers, Member
 from gelflow.data.pairs import PairRecord
-from gelflow.data.synthetic import origin
+from gelflow.data.synthetic import origin, scene_and_pattern
 from gelflow.errors import InputError
 
 SUFFIX = ".tar"
@@ -110,12 +109,4 @@ def _record(shard: Path, key: str, members: dict[str, Member]) -> PairRecord:
     except ValueError:
         meta = None  # written by another program
     images = (members["image1.png"], members["image2.png"])
-    return PairRecord(key, *images, flow, scene=_scene(meta), origin=origin(meta))
-
-
-def _scene(meta: Any) -> str | None:
-    """Scene and kind of pattern, as `gelflow.data.synthetic` names them."""
-    try:
-        return f"{meta['scene']['name']}, {meta['scene']['sensor']['pattern']['kind']}"
-    except (KeyError, TypeError):
-        return None
+    return PairRecord(key, *images, flow, scene=scene_and_pattern(meta), origin=origin(meta))

@@ -114,11 +114,13 @@ def predict_video(
     for index, image1, image2 in _frame_pairs(path, every, reference):
         source = sources.get(index, path)
         try:
-            flow, motion = _estimate(method, _as_float(image1), _as_float(image2), index, source.name)
+            first, second = (image.astype(np.float32) / np.float32(255) for image in (image1, image2))
+            flow, motion = _estimate(method, first, second, index, source.name)
         except InputError as error:
             raise InputError(f"{source}, frame {index}, {method.name}: {error}") from error
         if not files:
-            _remove_numbered(out / "flow", ".exr")
+            for earlier in _numbered(out / "flow", ".exr"):
+                earlier.unlink()
         files.append(out / "flow" / f"{index:06d}.exr")
         write_flow(files[-1], flow)
         motions.append(motion)
@@ -131,8 +133,14 @@ def predict_video(
         writer.writerow([column.name for column in fields(Motion)])
         writer.writerows(astuple(motion) for motion in motions)
     scale = round_up(max(motion.p99_px for motion in motions))
-    pictures = _overlays(path, every, reference, out / "flow", scale, len(motions), total, progress)
-    overlay = _write_overlay(pictures, out, describe(path).frames_per_second / every)
+
+    def overlays() -> Iterator[Bytes3]:
+        for count, (index, _, frame) in enumerate(_frame_pairs(path, every, reference), start=len(motions) + 1):
+            yield draw_overlay(frame, read_flow(out / "flow" / f"{index:06d}.exr").flow, scale)
+            if progress:
+                progress(count, total)
+
+    overlay = _write_overlay(overlays(), out, describe(path).frames_per_second / every)
     return Prediction([*files, table, *overlay], motions)
 
 
@@ -147,10 +155,6 @@ def _estimate(
     return flow, Motion(frame, file, float(np.nanmean(length)), p95, p99, seconds)
 
 
-def _as_float(frame: Bytes3) -> ImageArray:
-    return frame.astype(np.float32) / np.float32(255)
-
-
 def _frame_pairs(path: Path, every: int, reference: Reference) -> Iterator[tuple[int, Bytes3, Bytes3]]:
     """(index of the second frame, reference frame, second frame)."""
     before: Bytes3 | None = None
@@ -163,22 +167,6 @@ def _frame_pairs(path: Path, every: int, reference: Reference) -> Iterator[tuple
             yield index, before, frame
         if before is None or reference == "previous":
             before = frame
-
-
-def _overlays(
-    path: Path,
-    every: int,
-    reference: Reference,
-    folder: Path,
-    scale: float,
-    done: int,
-    total: int,
-    progress: Callable[[int, int], None] | None,
-) -> Iterator[Bytes3]:
-    for count, (index, _, frame) in enumerate(_frame_pairs(path, every, reference), start=1):
-        yield draw_overlay(frame, read_flow(folder / f"{index:06d}.exr").flow, scale)
-        if progress:
-            progress(done + count, total)
 
 
 def _write_overlay(pictures: Iterator[Bytes3], out: Path, frames_per_second: float) -> list[Path]:
@@ -209,7 +197,8 @@ def _write_overlay(pictures: Iterator[Bytes3], out: Path, frames_per_second: flo
 
 
 def _write_sequence(first: Bytes3, rest: Iterator[Bytes3], folder: Path) -> list[Path]:
-    _remove_numbered(folder, ".png")
+    for earlier in _numbered(folder, ".png"):
+        earlier.unlink()
     files = [folder / "000000.png"]
     write_png(files[0], first)
     for number, picture in enumerate(rest, start=1):
@@ -218,11 +207,6 @@ def _write_sequence(first: Bytes3, rest: Iterator[Bytes3], folder: Path) -> list
     return files
 
 
-def _remove_numbered(folder: Path, suffix: str) -> None:
-    """Removes what an earlier run wrote, which may have had other frames: files named by six digits or more."""
-    for path in _numbered(folder, suffix):
-        path.unlink()
-
-
 def _numbered(folder: Path, suffix: str) -> list[Path]:
+    """What an earlier run wrote, which may have had other frames: files named by six digits or more."""
     return [path for path in folder.glob(f"*{suffix}") if re.fullmatch(r"[0-9]{6,}", path.stem)]

@@ -28,6 +28,8 @@ from gelflow.train.graph import GraphedNetwork
 
 LOG_EVERY = 10
 """Steps between entries in the logs."""
+METRICS = ("endpoint_error_px", "no_motion_endpoint_error_px", "psnr_db", "no_motion_psnr_db", "photometric_loss")
+"""Results of a validation: mean over the pairs that have them."""
 
 
 def learning_rate_factor(config: TrainConfig, step: int) -> float:
@@ -41,14 +43,7 @@ def learning_rate_factor(config: TrainConfig, step: int) -> float:
 
 
 class FlowModule(L.LightningModule):
-    """Training of one network.
-
-    Args:
-        config: The run.
-        model: The network, at the state it starts from.
-        start: Steps that were done before.
-        optimiser: State of the optimiser after those steps, or None.
-        average: State of the weights' moving average after those steps, or None.
+    """Training of one network, from the state that it has after `start` steps, with optimiser and moving average.
 
     Attributes:
         metrics: Results of the last validation, see `validation_metrics`.
@@ -137,14 +132,14 @@ class FlowModule(L.LightningModule):
             loss = loss + share * supervised
         if not bool(known.all()):
             others = ~known.repeat(image1.shape[0] // pairs)
-            alone, more = self._judged([flow[others] for flow in flows], image1[others], image2[others])
+            alone, more = self._loss_of_images([flow[others] for flow in flows], image1[others], image2[others])
             loss, parts = loss + (1 - share) * self.config.mixed_self * alone, parts | more
         return loss, parts
 
     def _self_supervised(self, image1: Tensor, image2: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss without truth."""
         image1, image2 = self._directions(image1, image2)
-        return self._judged(self.network(image1, image2), image1, image2)
+        return self._loss_of_images(self.network(image1, image2), image1, image2)
 
     def _directions(self, image1: Tensor, image2: Tensor) -> tuple[Tensor, Tensor]:
         """The pairs, and after them the same with their images exchanged where occlusion asks for both directions."""
@@ -152,15 +147,15 @@ class FlowModule(L.LightningModule):
             return image1, image2
         return torch.cat([image1, image2]), torch.cat([image2, image1])
 
-    def _judged(self, flows: list[Tensor], image1: Tensor, image2: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+    def _loss_of_images(self, flows: list[Tensor], image1: Tensor, image2: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """The self-supervised loss of flows of `_directions`, with a second pass where lambda_ar asks for one now."""
         config, visible = self.config.loss, None
-        trusted = not config.second_stage or self.step >= config.second_stage * self.config.steps
-        if config.occlusion == "forward_backward" and trusted:
+        begun = not config.second_stage or self.step >= config.second_stage * self.config.steps
+        if config.occlusion == "forward_backward" and begun:
             there, back = flows[0].chunk(2)
             visible = visible_in_both_images(flows[0], torch.cat([back, there]))
         loss, parts = self_supervised_loss(flows, image1, image2, config, visible)
-        if config.lambda_ar > 0 and trusted:
+        if config.lambda_ar > 0 and begun:
             # Fixed by (seed, step), so that a resumed run shows the same.
             random = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
             first, second, target, pixels = transformed_pair(image1, image2, flows[0].detach(), random)
@@ -210,16 +205,6 @@ class FlowModule(L.LightningModule):
         """Puts values into all logs."""
         for logger in self.loggers:
             logger.log_metrics(values, step)
-
-
-METRICS = (
-    "endpoint_error_px",
-    "no_motion_endpoint_error_px",
-    "psnr_db",
-    "no_motion_psnr_db",
-    "photometric_loss",
-)
-"""Results of a validation: mean over the pairs that have them."""
 
 
 def check_side(batch: dict[str, Any], config: TrainConfig) -> None:

@@ -82,13 +82,8 @@ def open_run(
 ) -> State | None:
     """Claims the folder for a new run, or checks that it holds this very run.
 
-    Args:
-        out: The folder; made where it is missing.
-        config: The run's settings.
-        data: What is known of the data sets: `pairs` and `validation_pairs` (0 without), their numbers, and the
-            `digest` and `validation_digest` (None where a data set has none).
-        initial: Weights that the run starts from.
-        resume: Go on with the run in the folder.
+    `data` is what is known of the data sets: `pairs` and `validation_pairs` (0 without), their numbers, and `digest`
+    and `validation_digest` (None where a data set has none). `initial` are the weights that the run starts from.
 
     Returns:
         The state to resume from; None for a new run.
