@@ -29,8 +29,7 @@ class RunOptions:
     steps: Annotated[int | None, Parameter(help="Optimiser steps.")] = None
     device: Annotated[Device | None, Parameter(help="Where to train; auto: a CUDA device where there is one.")] = None
     devices: Annotated[
-        int | None,
-        Parameter(help="Devices (on a CPU: processes) of each machine; each takes batch_size pairs a step."),
+        int | None, Parameter(help="Devices (on a CPU: processes) of each machine; each takes batch_size pairs a step.")
     ] = None
     nodes: Annotated[
         int | None,

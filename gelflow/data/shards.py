@@ -47,13 +47,13 @@ def shard_records(shards: list[Path]) -> list[PairRecord]:
         InputError: A shard is unreadable, truncated or damaged, a sample lacks a member, or a key occurs twice.
     """
     records: list[PairRecord] = []
-    homes: dict[str, Path] = {}
+    shard_of: dict[str, Path] = {}
     for shard in shards:
         for key, members in _samples(shard).items():
-            if key in homes:
-                raise InputError(f"{shard}: sample {key} is in {homes[key]}, too; open shards of different data sets "
-                                 "from different folders")  # fmt: skip
-            homes[key] = shard
+            if key in shard_of:
+                raise InputError(f"{shard}: sample {key} is in {shard_of[key]}, too; open shards of different data "
+                                 "sets from different folders")  # fmt: skip
+            shard_of[key] = shard
             records.append(_record(shard, key, members))
     return records
 

@@ -1,9 +1,9 @@
 """Pixels whose point is seen in both images, by the flows there and back (Meister, Hur and Roth 2018, eq. 3).
 
-Kept where ``|f(x) + b(x + f(x))|^2 <= 0.01 (|f(x)|^2 + |b(x + f(x))|^2) + 0.5 px^2``: a share of the motion and a
-constant, so that neither small errors of large motions nor the noise of small ones throw pixels out. Where hardly a
-pixel of a pair would be left, the flow is wrong and not the scene hidden: all of them count then. A loss over none has
-no gradient that could lead back.
+A pixel counts where ``|f(x) + b(x + f(x))|^2 <= 0.01 (|f(x)|^2 + |b(x + f(x))|^2) + 0.5 px^2``: a share of the motion
+and a constant, so that neither small errors of large motions nor the noise of small ones exclude pixels. Where hardly
+a pixel of a pair would be left, the flow is wrong and not the scene hidden, and all pixels count: a loss over none has
+no gradient.
 """
 
 import torch

@@ -1,4 +1,4 @@
-"""Flow between images of any size by a trained network: resize, estimate, bring the flow back."""
+"""Flow between images of any size by a trained network: resize, estimate, resize the flow back."""
 
 from collections.abc import Callable
 

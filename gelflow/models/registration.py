@@ -12,10 +12,11 @@ residual is taken without its mean over a neighbourhood of that width, so that s
 gel, does not count. Without, and with a wide ``p``, the images' difference is what is minimised, whatever it comes
 from: a high PSNR, and a flow that follows shading.
 
-It stays in the basin that it starts in, so that with `propagation_px` each stage tries neighbours' flows first
-(`gelflow.models.propagation`); dots that a whole neighbourhood took for the next ones stay so. With `after`, another
-registration comes before all stages, and its flow stays wherever what it leaves between the images is below its
-`noise`: so registration for both keeps the motion of whatever motion explains, and follows brightness elsewhere.
+Gauss-Newton steps stay in the basin that they start in. With `propagation_px` each stage therefore tries neighbours'
+flows first (`gelflow.models.propagation`); where a whole neighbourhood mistook dots for the next ones, that does not
+help. With `after`, another registration comes before all stages. Its flow stays wherever the residual that it leaves is
+below its `noise`. So registration for both keeps the motion where motion explains the images, and follows brightness
+elsewhere.
 
 Lucas and Kanade 1981, with a prior (Simoncelli, Adelson and Heeger, "Probability distributions of optical flow", 1991);
 smoothing the field between the steps: Thirion's demons, 1998.

@@ -8,8 +8,8 @@ are not: angles and shifts should stay small beside the motion of the recordings
 Synthetic pairs of bare gels are neither moved nor flipped nor recoloured: what is read from them is shading, and it is
 where the lights are that gives slopes their colours. Changed so they would be pictures of no sensor.
 
-Each pair has its own random numbers. They are drawn on the CPU and travel in one copy that nobody waits for, so that a
-GPU need not finish a step before the CPU prepares the next.
+Each pair has its own random numbers. They are sampled on the CPU and copied asynchronously, so that a GPU need not
+finish a step before the CPU prepares the next.
 """
 
 import math
@@ -26,7 +26,7 @@ from gelflow.config import MotionConfig, TrainConfig
 from gelflow.ops.warp import from_centre, warp
 
 UNCHANGED = np.array([1, 0, 0, 1, 1, 0, 0, 1, 0, 0, 1, 1, 1, 1, 1], np.float32)
-"""The numbers of `_drawn` that change nothing."""
+"""The numbers of `_sampled` that change nothing."""
 
 
 def augmented(batch: dict[str, Any], config: TrainConfig, randoms: Sequence[np.random.Generator]) -> dict[str, Any]:
@@ -42,8 +42,10 @@ def augmented(batch: dict[str, Any], config: TrainConfig, randoms: Sequence[np.r
         A new batch; what is not named above is passed on.
     """
     new = dict(batch)
-    drawn = [UNCHANGED if bare else _drawn(config, random) for bare, random in zip(batch["bare"], randoms, strict=True)]
-    numbers = torch.from_numpy(np.stack(drawn))
+    sampled = [
+        UNCHANGED if bare else _sampled(config, random) for bare, random in zip(batch["bare"], randoms, strict=True)
+    ]
+    numbers = torch.from_numpy(np.stack(sampled))
     numbers = numbers.to(batch["image1"], non_blocking=True)
     if config.motion is not None:
         matrices, inverses, shifts = numbers[:, :4].view(-1, 2, 2), numbers[:, 4:8].view(-1, 2, 2), numbers[:, 8:10]
@@ -65,17 +67,17 @@ def augmented(batch: dict[str, Any], config: TrainConfig, randoms: Sequence[np.r
     return new
 
 
-def _drawn(config: TrainConfig, random: np.random.Generator) -> NDArray[np.float32]:
+def _sampled(config: TrainConfig, random: np.random.Generator) -> NDArray[np.float32]:
     """M, M^-1, t of the motion, -1 for a flip along x and y, gain of each colour: 15 numbers."""
     matrix, shift = np.eye(2), np.zeros(2)
     if config.motion is not None:
-        matrix, shift = drawn_motion(config.motion, random)
+        matrix, shift = random_motion(config.motion, random)
     flips = np.where(random.random(2) < 0.5, -1.0, 1.0)
     gain = np.exp(random.normal(0, config.color_jitter, 3))
     return np.concatenate([matrix.ravel(), np.linalg.inv(matrix).ravel(), shift, flips, gain]).astype(np.float32)
 
 
-def drawn_motion(config: MotionConfig, random: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def random_motion(config: MotionConfig, random: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """M (2, 2) and t (2,) in px of a random motion; five numbers are taken."""
     # The common factor makes small additions as frequent as large ones, in all of them at once.
     shift_x, shift_y, angle, zoom = random.random() * random.uniform(-1, 1, 4)

@@ -148,14 +148,14 @@ class FlowModule(L.LightningModule):
         return torch.cat([image1, image2]), torch.cat([image2, image1])
 
     def _loss_of_images(self, flows: list[Tensor], image1: Tensor, image2: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """The self-supervised loss of flows of `_directions`, with a second pass where lambda_ar asks for one now."""
+        """The self-supervised loss of flows of `_directions`, with a second pass where lambda_ar asks for one."""
         config, visible = self.config.loss, None
-        begun = not config.second_stage or self.step >= config.second_stage * self.config.steps
-        if config.occlusion == "forward_backward" and begun:
+        in_stage = not config.second_stage or self.step >= config.second_stage * self.config.steps
+        if config.occlusion == "forward_backward" and in_stage:
             there, back = flows[0].chunk(2)
             visible = visible_in_both_images(flows[0], torch.cat([back, there]))
         loss, parts = self_supervised_loss(flows, image1, image2, config, visible)
-        if config.lambda_ar > 0 and begun:
+        if config.lambda_ar > 0 and in_stage:
             # Fixed by (seed, step), so that a resumed run shows the same.
             random = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
             first, second, target, pixels = transformed_pair(image1, image2, flows[0].detach(), random)

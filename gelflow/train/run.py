@@ -24,14 +24,7 @@ from gelflow.hardware import chosen_device
 from gelflow.models import GelFlow
 from gelflow.models.weights import load_weights, save_weights
 from gelflow.terminal import progress
-from gelflow.train.callback import (
-    CheckpointCallback,
-    Stopped,
-    describe,
-    is_first_process,
-    stopping,
-    weights_metadata,
-)
+from gelflow.train.callback import CheckpointCallback, Stopped, describe, is_first_process, stopping, weights_metadata
 from gelflow.train.loading import end_with_run
 from gelflow.train.module import FlowModule, check_side
 from gelflow.train.resident import ResidentPairs, resident

@@ -1,8 +1,8 @@
 """Test-time optimisation, the paper's "+ft": a network trained on, without truth, on the very pairs it is scored on.
 
-Not comparable with methods that see each pair once: tables list it apart. The paper fine-tunes "for an additional 800
-epochs using the validation dataset" and says no more, so everything else is as in its training: the self-supervised
-losses, whole images at the network's size, batches of 4, a constant rate.
+It cannot be compared with methods that see each pair once; tables list it apart. The paper fine-tunes "for an
+additional 800 epochs using the validation dataset" and says no more, so everything else is as in its training: the
+self-supervised losses, whole images at the network's size, batches of 4, a constant rate.
 
 Losses, gradient clipping, flips, weight decay and seed are those that the network's training recorded with its weights,
 or those of `--ft-config`. Nothing else of a training carries over, whatever its preset:
@@ -38,14 +38,10 @@ RATE = 1e-4
 
 
 def fine_tuning_settings(method: Learned, steps: int, config: str | None, pairs: int) -> TrainConfig:
-    """The settings of a test-time optimisation.
+    """The settings of a test-time optimisation; batches are not larger than the number of pairs.
 
-    Args:
-        method: The network.
-        steps: Optimiser steps. The paper's 800 epochs of 8 pairs in batches of 4 are 1600.
-        config: Preset or TOML file, whose batch size holds in place of `BATCH`; None: the settings that the weights
-            were trained with.
-        pairs: Number of pairs; batches are not larger.
+    `config` is a preset or TOML file, whose batch size holds in place of `BATCH`; None: the settings that the weights
+    were trained with. The paper's 800 epochs of 8 pairs in batches of 4 are 1600 steps.
 
     Raises:
         InputError: The weights carry no settings, or `config` cannot be used.
@@ -84,18 +80,10 @@ def fine_tuning_settings(method: Learned, steps: int, config: str | None, pairs:
 
 
 def fine_tuned(method: Learned, dataset: PairDataset, out: Path, steps: int, config: str | None = None) -> Learned:
-    """Trains a copy of a network on the pairs of a comparison.
+    """Trains a copy of a network on the pairs of a comparison; its name ends with "+ft".
 
-    Args:
-        method: The network; stays as it is.
-        dataset: The pairs.
-        out: Folder for the run; a run of the same settings that it holds is gone on with, or used if it is finished.
-            It is the same run however the flow is registered.
-        steps: Optimiser steps.
-        config: See `fine_tuning_settings`.
-
-    Returns:
-        The fine-tuned network, its name with "+ft".
+    A run of the same settings in the folder `out` is resumed, or used if it is finished. It is the same run however the
+    flow is registered. For `config` see `fine_tuning_settings`.
 
     Raises:
         InputError: The pairs differ in size and the network has none of its own; see also `fine_tuning_settings` and

@@ -71,8 +71,7 @@ def _exr(path: Path) -> None:
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.7, 0.99])
 @pytest.mark.parametrize(
-    ("name", "write", "read"),
-    [("a.png", _png, read_image), ("a.jpg", _jpg, read_image), ("a.exr", _exr, read_flow)],
+    ("name", "write", "read"), [("a.png", _png, read_image), ("a.jpg", _jpg, read_image), ("a.exr", _exr, read_flow)]
 )
 def test_truncated_file_is_named(
     tmp_path: Path,

@@ -16,10 +16,7 @@ from gelflow.ops.correlation import local_correlation
 from gelflow.train import train
 from gelflow.train.graph import GraphedNetwork
 
-pytestmark = [
-    pytest.mark.cuda,
-    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
-]
+pytestmark = [pytest.mark.cuda, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")]
 
 SMALL = ModelConfig(levels=5, estimator="shared", refine="half")
 
