@@ -14,13 +14,7 @@ from gelflow.config import RegistrationConfig
 
 @dataclass(frozen=True)
 class RegisteredDIS:
-    """DIS medium on the processor, then registration at the images' own size.
-
-    Attributes:
-        aim: What the settings are for, as the table shall name it.
-        settings: Of the registration.
-        device: Where the registration runs, "cpu" or "cuda".
-    """
+    """DIS medium on the processor, then registration, on a device, at the images' own size."""
 
     aim: str
     settings: RegistrationConfig

@@ -25,13 +25,7 @@ from gelflow.ops.warp import warp_image
 
 @dataclass(frozen=True)
 class FlowErrors:
-    """Endpoint errors of one pair.
-
-    Attributes:
-        mean_px, median_px: Endpoint error, px.
-        outliers_1px, outliers_01px: Share of the pixels with an error above 1 px and 0.1 px, in [0, 1].
-        pixels: Number of pixels that were compared.
-    """
+    """Endpoint errors of one pair; outliers are shares, in [0, 1], of the pixels that were compared."""
 
     mean_px: float
     median_px: float

@@ -20,15 +20,7 @@ CLEAR_PEAK = Path("/proc/self/clear_refs")
 
 @dataclass(frozen=True)
 class Speed:
-    """Throughput and memory of a network's forward pass.
-
-    Attributes:
-        pairs_per_second: Both images of a pair counted as one.
-        memory_mib: Peak memory of a batch, MiB; None where it cannot be measured.
-        batch: Pairs in a batch.
-        size: Rows and columns of the images.
-        device: Name of the processor or CUDA device.
-    """
+    """Throughput and memory (None where unknown) of a network's forward pass over a batch of pairs of one size."""
 
     pairs_per_second: float
     memory_mib: float | None

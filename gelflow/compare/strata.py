@@ -28,14 +28,7 @@ BARE = ", bare gel"
 
 @dataclass(frozen=True)
 class Stratum:
-    """Sums over the pixels of one bin.
-
-    Attributes:
-        kind, bin: What was sorted by, and which part of it.
-        pixels: Compared pixels.
-        error_px: Sum of their endpoint errors.
-        above_1px, above_01px: How many err by more than 1 px and 0.1 px.
-    """
+    """Sums over the pixels of one bin: their number, their errors, and how many err by more than 1 px and 0.1 px."""
 
     kind: str
     bin: str
@@ -54,12 +47,8 @@ def pair_strata(
 ) -> tuple[Stratum, ...]:
     """The bins of one pair that hold pixels.
 
-    Args:
-        error: Endpoint error (H, W) px.
-        truth: True flow (H, W, 2) px.
-        compared: (H, W), where the two were compared.
-        contact: (H, W), where the gel touches the indenter in the second state, at pixels of image 1; or None.
-        scene: Scene and kind of pattern, "gelsight_mini, dots", or None.
+    `error` is the endpoint error (H, W) in px, `compared` where it counts, `contact` where the gel touches the indenter
+    in the second state, at pixels of image 1, and `scene` scene and kind of pattern, "gelsight_mini, dots".
     """
     motion = np.hypot(truth[..., 0], truth[..., 1])[compared]
     chosen = error[compared]

@@ -32,15 +32,10 @@ MOTION_PERCENTILE = 95.0
 
 @dataclass(frozen=True)
 class ChoiceConfig:
-    """What makes a pair worth taking.
+    """What makes a pair worth taking; lengths are px of the recording.
 
-    Attributes:
-        per_source: Most pairs taken from one recording.
-        minimum_motion_px, maximum_motion_px: Limits of the motion, px of the recording.
-        minimum_difference_px: Least difference between the flows of two pairs of one recording, px.
-        frames: Most frames of a recording that are looked at, evenly spaced.
-        tries: Most pairs of a recording that are tried.
-        seed: Seed of the random order; each recording has its own generator from the seed and its name.
+    At most `frames` frames of a recording, evenly spaced, are looked at, `tries` pairs tried and `per_source` taken, in
+    a random order that depends on the seed and the recording's name.
     """
 
     per_source: int = 10

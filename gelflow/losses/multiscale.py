@@ -10,12 +10,11 @@ from torch import Tensor
 
 from gelflow.arrays import Flow, Images, Mask, Scalar
 from gelflow.config import LossConfig
-from gelflow.losses.decomposition import decomposition_loss
+from gelflow.losses.decomposition import decomposition_loss, regulariser_weight
 from gelflow.losses.deformation import deformation_loss
 from gelflow.losses.endpoint import endpoint_loss
 from gelflow.losses.photometric import appearance_loss
 from gelflow.losses.smoothness import first_order_loss, second_order_loss
-from gelflow.losses.weight import regulariser_weight
 from gelflow.ops.pyramid import enlarge_flow, flow_pyramid, image_pyramid
 from gelflow.ops.warp import inside, warp
 

@@ -28,14 +28,7 @@ Reference = Literal["first", "previous"]
 
 @dataclass(frozen=True)
 class Motion:
-    """What was found between two images.
-
-    Attributes:
-        frame: Index of the second image in its video; 1 for a pair.
-        file: Name of the second image, or of the video.
-        mean_px, p95_px, p99_px: Mean and percentiles of the flow's length, px.
-        seconds: Run time of the method.
-    """
+    """Length of the flow, its mean and percentiles, to a frame of a video (1 for a pair), and the method's run time."""
 
     frame: int
     file: str

@@ -37,13 +37,9 @@ from gelflow.train.throughput import peak_memory_mib
 class TrainResult:
     """What a run ended with.
 
-    Attributes:
-        weights: File of the best weights on the validation pairs; without such pairs, of the last.
-        steps: Optimiser steps done.
-        metrics: Results of the last validation (`gelflow.train.module.METRICS`); empty without validation pairs.
-        best: Best validation score: endpoint error in px where the flow is known, else photometric loss; else None.
-        pairs_per_second: Of this session after its first step, validation left out; None if it did fewer than two.
-        memory_mib: Peak memory of the device (on a CPU: of the process), MiB; None where it is not known.
+    `weights` are the best on the validation pairs, without such pairs the last; `metrics` those of the last validation
+    (`gelflow.train.module.METRICS`); `best` the best validation score: endpoint error in px where the flow is known,
+    else photometric loss. Speed (of this session, validation left out) and peak memory are None where unknown.
     """
 
     weights: Path

@@ -33,14 +33,8 @@ FREE = ("steps", "validate_every", "save_every", "workers", "device")
 class State:
     """Everything that a run resumes from.
 
-    Attributes:
-        step: Optimiser steps done.
-        model: The network's state dictionary.
-        optimiser: The optimiser's state dictionary, or None at step 0.
-        score: Best validation score so far (lower is better), or None.
-        metrics: Results of the last validation.
-        average: State dictionary of the weights' moving average, where there is one.
-        validation_due: Whether the validation that follows the step is still to come.
+    `model`, `optimiser` and `average` (of the weights) are state dictionaries; `score` is the best validation score so
+    far, lower is better; `validation_due` says that the validation that follows the step is still to come.
     """
 
     step: int

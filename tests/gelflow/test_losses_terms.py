@@ -10,12 +10,11 @@ from waves import moved_pair, pixel_centres, press_flow
 
 from gelflow.config import LossConfig
 from gelflow.losses import self_supervised_loss
-from gelflow.losses.decomposition import decomposition_loss
+from gelflow.losses.decomposition import decomposition_loss, regulariser_weight
 from gelflow.losses.deformation import area_ratio, deformation_loss
 from gelflow.losses.endpoint import endpoint_loss
 from gelflow.losses.photometric import C1, C2, appearance_loss, photometric_loss, structural_similarity
 from gelflow.losses.smoothness import first_order_loss
-from gelflow.losses.weight import regulariser_weight
 from gelflow.ops.pyramid import flow_pyramid, image_pyramid
 from gelflow.ops.warp import warp
 
