@@ -50,14 +50,12 @@ def published_names(large: bool) -> dict[str, tuple[int, ...]]:
         inputs = stages[0]
         for stage, channels in enumerate(stages, start=1):
             for unit in (0, 1):
-                at = f"{net}.layer{stage}.{unit}"
-                if large:
-                    conv(f"{at}.conv1", channels, inputs, 3)
-                    conv(f"{at}.conv2", channels, channels, 3)
-                else:
-                    conv(f"{at}.conv1", channels // 4, inputs, 1)
-                    conv(f"{at}.conv2", channels // 4, channels // 4, 3)
-                    conv(f"{at}.conv3", channels, channels // 4, 1)
+                at, inner = f"{net}.layer{stage}.{unit}", channels // 4
+                kernels = [(channels, inputs, 3), (channels, channels, 3)]
+                if not large:
+                    kernels = [(inner, inputs, 1), (inner, inner, 3), (channels, inner, 1)]
+                for number, kernel in enumerate(kernels, start=1):
+                    conv(f"{at}.conv{number}", *kernel)
                 norm(f"{at}.norm1", channels, batch)
                 norm(f"{at}.norm2", channels, batch)
                 if unit == 0 and stage > 1:
@@ -66,25 +64,21 @@ def published_names(large: bool) -> dict[str, tuple[int, ...]]:
                     norm(f"{at}.norm3", channels, batch)  # the same tensors again
                 inputs = channels
         conv(f"{net}.conv2", outputs, stages[2], 1)
-    block = "update_block"
-    conv(f"{block}.encoder.convc1", 256 if large else 96, 4 * (81 if large else 49), 1)
+    encoder, hidden, head = "update_block.encoder", 128 if large else 96, 256 if large else 128
+    kernels = [("convc1", 96, 196, 1), ("convf1", 64, 2, 7), ("convf2", 32, 64, 3), ("conv", 80, 128, 3)]
     if large:
-        conv(f"{block}.encoder.convc2", 192, 256, 3)
-    conv(f"{block}.encoder.convf1", 128 if large else 64, 2, 7)
-    conv(f"{block}.encoder.convf2", 64 if large else 32, 128 if large else 64, 3)
-    conv(f"{block}.encoder.conv", 126 if large else 80, 256 if large else 128, 3)
-    hidden, inputs = (128, 128 + 128 + 128) if large else (96, 96 + 64 + 82)
+        kernels = [("convc1", 256, 324, 1), ("convc2", 192, 256, 3), ("convf1", 128, 2, 7), ("convf2", 64, 128, 3),
+                   ("conv", 126, 256, 3)]  # fmt: skip
+    for name, *kernel in kernels:
+        conv(f"{encoder}.{name}", *kernel)
     for gate in "zrq":
-        if large:
-            conv(f"{block}.gru.conv{gate}1", hidden, inputs, 1, 5)
-            conv(f"{block}.gru.conv{gate}2", hidden, inputs, 5, 1)
-        else:
-            conv(f"{block}.gru.conv{gate}", hidden, inputs, 3)
-    conv(f"{block}.flow_head.conv1", 256 if large else 128, hidden, 3)
-    conv(f"{block}.flow_head.conv2", 2, 256 if large else 128, 3)
+        for suffix, sides in {"1": (1, 5), "2": (5, 1)}.items() if large else {"": (3, 3)}.items():
+            conv(f"update_block.gru.conv{gate}{suffix}", hidden, 384 if large else 242, *sides)
+    conv("update_block.flow_head.conv1", head, hidden, 3)
+    conv("update_block.flow_head.conv2", 2, head, 3)
     if large:
-        conv(f"{block}.mask.0", 256, 128, 3)
-        conv(f"{block}.mask.2", 576, 256, 1)
+        conv("update_block.mask.0", 256, 128, 3)
+        conv("update_block.mask.2", 576, 256, 1)
     return shapes
 
 
