@@ -1,10 +1,13 @@
-"""Names of the arrays that gelflow's functions exchange: tensors whose alias states shape, dtype and unit.
+"""Names of the arrays that gelflow's functions exchange; each alias states shape, dtype and unit.
 
-B: batch, C: channels, H and W: rows and columns of the image or of the scale in question.
+Inside the network data are tensors with channels first: B pairs of a batch, C channels, H rows and W columns of the
+image or of the scale in question. Around it they are NumPy rasters with channels last.
 """
 
 from typing import Annotated
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 Images = Annotated[Tensor, "(B, 3, H, W) float32 in [0, 1]"]
@@ -12,3 +15,10 @@ Features = Annotated[Tensor, "(B, C, H, W) float32"]
 Flow = Annotated[Tensor, "(B, 2, H, W) float32, (U, V) in px of this scale; NaN in a true flow where no gel is seen"]
 Mask = Annotated[Tensor, "(B, 1, H, W) float32, 1 where the pixel counts and 0 where it does not"]
 Scalar = Annotated[Tensor, "() float32"]
+
+ImageArray = Annotated[NDArray[np.float32], "(H, W, 3) float32, RGB in [0, 1]"]
+Bytes3 = Annotated[NDArray[np.uint8], "(H, W, 3) uint8, RGB"]
+Grey8 = Annotated[NDArray[np.uint8], "(H, W) uint8"]
+FlowArray = Annotated[NDArray[np.float32], "(H, W, 2) float32, (U right, V down) in px; NaN where no gel is seen"]
+MaskArray = Annotated[NDArray[np.bool_], "(H, W) bool"]
+MarkerArray = Annotated[NDArray[np.float64], "(N, 4) float64: x1, y1, x2, y2 in px"]

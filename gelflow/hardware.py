@@ -1,31 +1,50 @@
-"""What times were measured on, in words."""
+"""The machine: which device a computation runs on, what it is called, and how much memory the process has held."""
 
 import os
 import platform
 from pathlib import Path
 
-CPU_INFO = Path("/proc/cpuinfo")
+from gelflow.errors import InputError
+
+CPU_INFO, PROCESS_STATUS = Path("/proc/cpuinfo"), Path("/proc/self/status")
+
+
+def chosen_device(device: str) -> str:
+    """The device, "cpu" or "cuda", that an option stands for; "auto" is a CUDA device where there is one.
+
+    Raises:
+        InputError: A CUDA device is asked for and there is none.
+    """
+    import torch
+
+    available = torch.cuda.is_available()
+    if device == "cuda" and not available:
+        raise InputError("--device cuda: no CUDA device was found; use --device cpu")
+    return ("cuda" if available else "cpu") if device == "auto" else device
 
 
 def hardware(device: str) -> str:
-    """A device's name for tables: of the processor and its usable cores, or of the CUDA device.
-
-    Args:
-        device: "cpu" or "cuda".
-    """
+    """Name of a device, "cpu" or "cuda", for tables: processor and usable cores, or CUDA device."""
     if device == "cuda":
         import torch
 
         return torch.cuda.get_device_name()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return f"{_processor()}, {cores} {'core' if cores == 1 else 'cores'}"
+    # Linux tells the processor's model; elsewhere its architecture has to do.
+    model = _entry(CPU_INFO, "model name") or platform.machine()
+    return f"{model}, {cores} {'core' if cores == 1 else 'cores'}"
 
 
-def _processor() -> str:
-    """Model of the processor where Linux tells it, else its architecture."""
+def process_memory(peak: bool) -> float | None:
+    """This process's resident memory in bytes, at its peak or now; None on systems other than Linux."""
+    entry = _entry(PROCESS_STATUS, "VmHWM" if peak else "VmRSS")
+    return None if entry is None else float(entry.split()[0]) * 1024
+
+
+def _entry(path: Path, field: str) -> str | None:
+    """What follows the first `field:` of a file under /proc; None where it is not there."""
     try:
-        lines = CPU_INFO.read_text(encoding="utf-8").splitlines()
+        lines = path.read_text(encoding="utf-8").splitlines()
     except OSError:
-        lines = []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.machine()
+        return None
+    return next((line.partition(":")[2].strip() for line in lines if line.partition(":")[0].strip() == field), None)

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from gelflow.arrays import FlowArray, ImageArray
 from gelflow.baselines.method import check_images
 from gelflow.baselines.scattered import dense_flow
 from gelflow.errors import InputError
-from gelflow.raster import FlowArray, ImageArray
 
 INSTALL = "pip install --no-deps al-dic && pip install numba imageio"
 LUMA = np.array([0.299, 0.587, 0.114])

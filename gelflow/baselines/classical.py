@@ -11,10 +11,10 @@ from typing import Literal
 
 import numpy as np
 
+from gelflow.arrays import FlowArray, ImageArray
 from gelflow.baselines.method import check_images
 from gelflow.errors import InputError
 from gelflow.files.image import to_grey
-from gelflow.raster import FlowArray, ImageArray
 
 
 @dataclass(frozen=True)

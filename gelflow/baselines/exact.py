@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gelflow.arrays import FlowArray, ImageArray
 from gelflow.errors import InputError
 from gelflow.files.exr import FlowField
-from gelflow.raster import FlowArray, ImageArray
 
 
 @dataclass(frozen=True)

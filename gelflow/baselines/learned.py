@@ -4,14 +4,15 @@ import re
 from pathlib import Path
 from typing import Any
 
+from gelflow.arrays import FlowArray, ImageArray
 from gelflow.baselines.method import check_images
-from gelflow.baselines.tensors import as_array, as_tensor, chosen_device
+from gelflow.baselines.tensors import as_array, as_tensor
 from gelflow.config import REGISTRATIONS, Registration, RegistrationConfig
 from gelflow.errors import InputError
-from gelflow.raster import FlowArray, ImageArray
+from gelflow.hardware import chosen_device
 
 _END = re.compile(r"((?:#\d+)?(?:\+ft)?)$")
-"""The number of a seed and the mark of fine-tuning, which names end with (see `gelflow.seeds`)."""
+"""The number of a seed and the mark of fine-tuning, which names end with (see `gelflow.compare.seeds`)."""
 
 
 def open_network(
@@ -21,14 +22,7 @@ def open_network(
     device: str = "auto",
     registration: Registration | None = None,
 ) -> "Learned | PublishedRaft":
-    """The network that a file of weights belongs to: GelFlow (.safetensors) or RAFT (.pth).
-
-    Args:
-        path: Weights.
-        name: Name in tables; None: the name of the file's folder and file.
-        size: Rows and columns at which the network works; None: those of its training, or of the images.
-        device: "auto" (a CUDA device where there is one), "cpu" or "cuda".
-        registration: See `Learned`.
+    """The network that a file of weights belongs to: GelFlow (.safetensors) or RAFT (.pth); see `Learned`.
 
     Raises:
         InputError: The file is missing, damaged or of another network, the device is not there, or `registration` is
@@ -73,7 +67,7 @@ class Learned:
         import torch
 
         from gelflow.models.recorded import RecordedNetwork
-        from gelflow.train.checkpoint import load_weights
+        from gelflow.models.weights import load_weights
 
         self.path = path
         self.device = chosen_device(device)
@@ -83,8 +77,7 @@ class Learned:
         self.model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # not in torch's stubs
         self.trained = self.model.config
         if registration is not None:
-            settings = {"registration": REGISTRATIONS[registration]}
-            self.model.config = self.trained.model_copy(update=settings)
+            self.model.config = self.trained.model_copy(update={"registration": REGISTRATIONS[registration]})
         self.network = RecordedNetwork(self.model)
         self.label = name or "/".join(path.with_suffix("").parts[-2:])
         added = _suffix(self.model.config.registration)
@@ -93,7 +86,7 @@ class Learned:
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
         """See `Method.flow`."""
-        from gelflow.estimate import estimate_flow
+        from gelflow.models.estimate import estimate_flow
 
         check_images(image1, image2)
         tensors = [as_tensor(image, self.device) for image in (image1, image2)]
@@ -102,12 +95,7 @@ class Learned:
     def forward(self, image1: Any, image2: Any) -> Any:
         """What `flow` costs beside reading and resizing: the network and, where it is on, the registration.
 
-        Args:
-            image1: Tensor (B, 3, H, W) in [0, 1] on the network's device.
-            image2: The same shape.
-
-        Returns:
-            (B, 2, H, W), px.
+        The images are tensors (B, 3, H, W) in [0, 1] on the network's device, the flow is (B, 2, H, W) px.
         """
         return self.network(image1, image2)
 

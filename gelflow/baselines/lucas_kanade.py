@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gelflow.arrays import FlowArray, ImageArray
 from gelflow.baselines.method import check_images
 from gelflow.baselines.scattered import dense_flow
 from gelflow.errors import NothingFoundError
 from gelflow.files.image import to_grey
-from gelflow.raster import FlowArray, ImageArray
 
 CORNERS, QUALITY, DISTANCE_PX = 2000, 0.01, 5.0
 WINDOW_PX, OCTAVES = 21, 4

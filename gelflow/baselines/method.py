@@ -4,9 +4,9 @@ from typing import Protocol
 
 import numpy as np
 
+from gelflow.arrays import FlowArray, ImageArray
 from gelflow.errors import InputError
 from gelflow.files.image import MINIMUM_SIDE
-from gelflow.raster import FlowArray, ImageArray
 
 
 class Method(Protocol):

@@ -1,33 +1,24 @@
 """DIS medium, registered (`gelflow.models.registration`). Not one of the paper's methods.
 
-Registration learns nothing and starts from any flow, so what it adds to a network has to be held against what it adds
-to the best classical method.
+Registration learns nothing and starts from any flow. What it adds to a network has to be compared with what it adds to
+the best classical method.
 """
 
 from dataclasses import dataclass
 
+from gelflow.arrays import FlowArray, ImageArray
 from gelflow.baselines.classical import DIS
-from gelflow.baselines.tensors import as_array, as_tensor, chosen_device
+from gelflow.baselines.tensors import as_array, as_tensor
 from gelflow.config import RegistrationConfig
-from gelflow.raster import FlowArray, ImageArray
 
 
 @dataclass(frozen=True)
 class RegisteredDIS:
-    """DIS medium on the processor, then registration at the images' own size.
-
-    Attributes:
-        aim: What the settings are for, as the table shall name it.
-        settings: Of the registration.
-        device: Where the registration runs: "auto", "cpu" or "cuda".
-    """
+    """DIS medium on the processor, then registration, on a device, at the images' own size."""
 
     aim: str
     settings: RegistrationConfig
     device: str = "cpu"
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "device", chosen_device(self.device))
 
     @property
     def name(self) -> str:

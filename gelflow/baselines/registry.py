@@ -10,6 +10,7 @@ from gelflow.baselines.method import Method
 from gelflow.baselines.registered import RegisteredDIS
 from gelflow.config import REGISTRATIONS
 from gelflow.errors import InputError
+from gelflow.hardware import chosen_device
 
 CLASSICAL: dict[str, Callable[[], Method]] = {
     "none": NoMotion,
@@ -47,4 +48,6 @@ def named_methods(names: Sequence[str], device: str = "cpu") -> list[Method]:
         if list(names).count(name) > 1:
             raise InputError(f"the method {name!r} is given twice")
     plain = CLASSICAL | BESIDE
-    return [plain[name]() if name in plain else RegisteredDIS(*REGISTERED[name], device) for name in names]
+    return [
+        plain[name]() if name in plain else RegisteredDIS(*REGISTERED[name], chosen_device(device)) for name in names
+    ]

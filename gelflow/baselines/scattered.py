@@ -8,17 +8,13 @@ than four points, or all of them on a line, there are no triangles: the nearest 
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.raster import FlowArray
+from gelflow.arrays import FlowArray
 
 
 def dense_flow(points: NDArray[np.float64], motion: NDArray[np.float64], height: int, width: int) -> FlowArray:
     """Interpolates motions to every pixel.
 
-    Args:
-        points: (N, 2) columns and rows as pixel indices; N >= 1.
-        motion: (N, 2) px.
-        height: Rows of the image.
-        width: Its columns.
+    Points are (N, 2) columns and rows as pixel indices, N >= 1, their motions (N, 2) px.
 
     Returns:
         (height, width, 2) float32 px, finite everywhere.

@@ -4,25 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from gelflow.errors import InputError
-from gelflow.raster import FlowArray, ImageArray
-
-
-def chosen_device(device: str) -> str:
-    """The device that an option stands for.
-
-    Args:
-        device: "auto" (a CUDA device where there is one), "cpu" or "cuda".
-
-    Raises:
-        InputError: A CUDA device is asked for and there is none.
-    """
-    import torch
-
-    available = torch.cuda.is_available()
-    if device == "cuda" and not available:
-        raise InputError("--device cuda: no CUDA device was found; use --device cpu")
-    return ("cuda" if available else "cpu") if device == "auto" else device
+from gelflow.arrays import FlowArray, ImageArray
 
 
 def as_tensor(image: ImageArray, device: str) -> Any:

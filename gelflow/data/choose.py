@@ -18,29 +18,24 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.raster import Bytes3, FlowArray, Grey8
+from gelflow.arrays import Bytes3, FlowArray, Grey8
 
 WORKING_SIDE = 160
 """Longer side, in px, of the reduced image on which motion is measured."""
 BLANK_STANDARD_DEVIATION = 3.0
 """Grey levels of 255; frames with less contrast show nothing to track."""
 EXPOSURE_CHANGE = 0.2
-"""Largest relative deviation of a channel's mean from its median over the recording. GelSight Mini recordings stay
-within 0.15 during contact; their exposure ramps reach 0.3."""
+"""Largest relative deviation of a channel's mean from its median over the recording: above what contact changes, below
+exposure ramps."""
 MOTION_PERCENTILE = 95.0
 
 
 @dataclass(frozen=True)
 class ChoiceConfig:
-    """What makes a pair worth taking.
+    """What makes a pair worth taking; lengths are px of the recording.
 
-    Attributes:
-        per_source: Most pairs taken from one recording.
-        minimum_motion_px, maximum_motion_px: Limits of the motion, px of the recording.
-        minimum_difference_px: Least difference between the flows of two pairs of one recording, px.
-        frames: Most frames of a recording that are looked at, evenly spaced.
-        tries: Most pairs of a recording that are tried.
-        seed: Seed of the random order; each recording has its own generator from the seed and its name.
+    At most `frames` frames of a recording, evenly spaced, are looked at, `tries` pairs tried and `per_source` taken, in
+    a random order that depends on the seed and the recording's name.
     """
 
     per_source: int = 10
@@ -121,10 +116,7 @@ def length(flow: FlowArray) -> NDArray[np.float32]:
 def choose_pairs(frames: Sequence[Bytes3], config: ChoiceConfig, generator: np.random.Generator) -> Choices:
     """Chooses pairs from the frames of one recording.
 
-    Args:
-        frames: (H, W, 3) uint8 of one size, in order of time.
-        config: Limits and numbers.
-        generator: Source of the random order; which of a pair's frames comes first is random, too.
+    Frames are of one size, in order of time; which of a pair's frames comes first is random, too.
 
     Returns:
         At most `config.per_source` pairs. The same frames, settings and generator state give the same pairs.

@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from gelflow.arrays import Bytes3
 from gelflow.data.choose import ChoiceConfig, Choices, choose_pairs
 from gelflow.data.pairset import FILE, ChosenPair, PairSet, SourceReport, read_pair_set, write_pair_set
 from gelflow.errors import InputError
 from gelflow.files.image import MINIMUM_SIDE, write_png
 from gelflow.files.video import SUFFIXES, describe, frames, image_files
-from gelflow.raster import Bytes3
 
 Progress = Callable[[int, int, str, SourceReport | str], None]
 """Called after each recording: done, total, its name, and its report or why it failed."""
@@ -79,14 +79,7 @@ def _recordings_at(path: Path) -> list[Path]:
 def extract_pairs(inputs: Sequence[str], out: Path, config: ChoiceConfig, progress: Progress | None = None) -> PairSet:
     """Chooses pairs from recordings and writes them as a pair set; goes on where the same job was interrupted.
 
-    Args:
-        inputs: Files, folders and glob patterns.
-        out: Folder of the pair set; new, empty, or with part of the same job.
-        config: What makes a pair worth taking.
-        progress: Called after each recording.
-
-    Returns:
-        The finished pair set. Recordings that cannot be read are in `failures`.
+    Recordings that cannot be read are in its `failures`.
 
     Raises:
         InputError: Nothing to read, a value out of range, or `out` holds something else than this job.
@@ -94,10 +87,7 @@ def extract_pairs(inputs: Sequence[str], out: Path, config: ChoiceConfig, progre
     """
     _check(config)
     recordings = find_recordings(inputs)
-    job = {
-        "sources": {recording.name: _size(recording.path) for recording in recordings},
-        "settings": asdict(config),
-    }
+    job = {"sources": {one.name: _size(one.path) for one in recordings}, "settings": asdict(config)}
     content = _opened(out, job)
     for done, recording in enumerate(recordings, start=1):
         if recording.name in content.sources or recording.name in content.failures:
@@ -128,10 +118,8 @@ def _check(config: ChoiceConfig) -> None:
     if config.frames < 2:
         raise InputError(f"frames = {config.frames}: at least 2 frames of a recording are needed for a pair")
     if not 0 <= config.minimum_motion_px <= config.maximum_motion_px:
-        raise InputError(
-            f"motion from {config.minimum_motion_px:g} to {config.maximum_motion_px:g} px: "
-            "the limits must be at least 0, the lower one first"
-        )
+        raise InputError(f"motion from {config.minimum_motion_px:g} to {config.maximum_motion_px:g} px: the limits "
+                         "must be at least 0, the lower one first")  # fmt: skip
 
 
 def _size(path: Path) -> int:
@@ -147,20 +135,17 @@ def _opened(out: Path, job: dict[str, Any]) -> PairSet:
         raise InputError(f"{out}: exists and holds other things; give an empty or a new folder as --out")
     content = read_pair_set(out)
     if content.job != job:
-        raise InputError(
-            f"{out}: holds the pairs of another job: {'; '.join(_differences(content.job, job))}; "
-            "give another --out, or remove this folder"
-        )
+        raise InputError(f"{out}: holds the pairs of another job: {'; '.join(_differences(content.job, job))}; give "
+                         "another --out, or remove this folder")  # fmt: skip
     return content
 
 
 def _differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
     """What differs between two jobs, in words."""
-    differences = []
     old, new = there.get("settings", {}), here["settings"]
-    for name in sorted(old.keys() | new.keys()):
-        if old.get(name) != new.get(name):
-            differences.append(f"{name} is {old.get(name)} there and {new.get(name)} here")
+    names = sorted(old.keys() | new.keys())
+    differences = [f"{name} is {old.get(name)} there and {new.get(name)} here" for name in names
+                   if old.get(name) != new.get(name)]  # fmt: skip
     before, now = there.get("sources", {}), here["sources"]
     for label, names in (
         ("only there", sorted(before.keys() - now.keys())),

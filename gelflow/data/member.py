@@ -24,13 +24,7 @@ _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 @dataclass(frozen=True, slots=True)
 class Member:
-    """One file in a shard; it offers what readers of images ask of a path.
-
-    Attributes:
-        shard: The tar file.
-        name: Name of the member.
-        offset, size: Where its content lies, bytes.
-    """
+    """One file in a shard, which readers of images can use like a path; its content lies at `offset`, in bytes."""
 
     shard: Path
     name: str

@@ -1,9 +1,9 @@
 """Opening whatever holds pairs: a data set of synth or its shards, a pair set of `gelflow pairs`, a plain folder."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
-from gelflow.data.folder import folder_records, is_pair_folder
-from gelflow.data.pairs import PairDataset
+from gelflow.data.pairs import PairDataset, PairRecord, join
 from gelflow.data.pairset import FILE as PAIR_SET_FILE
 from gelflow.data.pairset import pair_set_records
 from gelflow.data.shards import shard_files, shard_records
@@ -32,8 +32,8 @@ def open_pairs(path: Path | str) -> PairDataset:
         return PairDataset(str(folder), pair_set_records(folder))
     if is_synthetic(folder):
         return PairDataset(str(folder), synthetic_records(folder))
-    if is_pair_folder(folder):
-        return PairDataset(str(folder), folder_records(folder))
+    if records := _folder_records(folder):
+        return PairDataset(str(folder), records)
     if shards := shard_files(folder):
         return PairDataset(str(folder), shard_records(shards))
     content = "is empty" if not any(folder.iterdir()) else "holds no image pairs"
@@ -41,3 +41,26 @@ def open_pairs(path: Path | str) -> PairDataset:
         f"{folder}: the folder {content}; allowed: a data set of synth (dataset.json), a pair set of "
         "`python -m gelflow pairs` (pairs.json), shards (*.tar), or files NAME_1.png and NAME_2.png"
     )
+
+
+def open_all(paths: Sequence[Path]) -> PairDataset:
+    """Several folders of pairs as one data set; see `open_pairs` and `join`."""
+    return join([open_pairs(path) for path in paths])
+
+
+def _folder_records(folder: Path) -> list[PairRecord]:
+    """The pairs NAME_1.png and NAME_2.png of a folder, by name, with NAME_markers.csv where dots were tracked.
+
+    Raises:
+        InputError: One of the two images of a pair is missing.
+    """
+    stems = {path.name[: -len("_1.png")] for path in (*folder.glob("*_1.png"), *folder.glob("*_2.png"))}
+    records = []
+    for name in sorted(stems):
+        image1, image2 = folder / f"{name}_1.png", folder / f"{name}_2.png"
+        for path, other in ((image1, image2), (image2, image1)):
+            if not path.is_file():
+                raise InputError(f"{path}: the file is missing; {other.name} needs it to be a pair")
+        markers = folder / f"{name}_markers.csv"
+        records.append(PairRecord(name, image1, image2, markers=markers if markers.is_file() else None))
+    return records

@@ -25,12 +25,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from gelflow.arrays import ImageArray, MarkerArray
 from gelflow.data.member import FlowMembers, Member
 from gelflow.errors import InputError
 from gelflow.files.exr import Direction, FlowField, read_flow
 from gelflow.files.image import read_pair
-from gelflow.raster import ImageArray, MarkerArray
-from gelflow.strata import without_pattern
 
 
 @dataclass(frozen=True)
@@ -57,12 +56,15 @@ class PairRecord:
     origin: str | None = None
 
 
+def without_pattern(scene: str | None) -> bool:
+    """Whether a pair's "scene, kind of pattern" says that its gel has none."""
+    return scene is not None and scene.rpartition(", ")[2] == "none"
+
+
 class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
     """Image pairs that are read from disk when they are asked for.
 
-    Args:
-        source: The folder or folders they come from, for messages.
-        records: At least one.
+    At least one; `source` is where they come from, for messages.
 
     Raises:
         InputError: There is no pair.
@@ -131,27 +133,23 @@ class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
         Raises:
             InputError: A file of the pair is missing or damaged, or the sizes differ.
         """
-        image1, image2 = self.images(index)
+        record = self.records[index]
+        images = self.images(index)
+        size = images[0].shape[:2]
+        image1, image2 = (_channels_first(image) for image in images)
         sample: dict[str, Tensor | str | bool] = {
-            "image1": _channels_first(image1),
-            "image2": _channels_first(image2),
-            "name": self.records[index].name,
-            "bare": without_pattern(self.records[index].scene),
-        }
-        if self.has_flow:
-            truth = self.truth(index)
-            if truth is None:
-                sample["flow"] = torch.full((2, *image1.shape[:2]), torch.nan)
-                sample["visible"] = torch.zeros((1, *image1.shape[:2]))
-            else:
-                if truth.flow.shape[:2] != image1.shape[:2]:
-                    raise InputError(
-                        f"{self.records[index].flow}: the flow has {truth.flow.shape[1]} x {truth.flow.shape[0]} px, "
-                        f"the images have {image1.shape[1]} x {image1.shape[0]} px"
-                    )
-                sample["flow"] = _channels_first(truth.flow)
-                sample["visible"] = torch.from_numpy(truth.visible[None].astype(np.float32))
-        return sample
+            "image1": image1, "image2": image2, "name": record.name, "bare": without_pattern(record.scene)
+        }  # fmt: skip
+        if not self.has_flow:
+            return sample
+        truth = self.truth(index)
+        if truth is None:
+            return sample | {"flow": torch.full((2, *size), torch.nan), "visible": torch.zeros((1, *size))}
+        if truth.flow.shape[:2] != size:
+            raise InputError(f"{record.flow}: the flow has {truth.flow.shape[1]} x {truth.flow.shape[0]} px, "
+                             f"the images have {size[1]} x {size[0]} px")  # fmt: skip
+        visible = torch.from_numpy(truth.visible[None].astype(np.float32))
+        return sample | {"flow": _channels_first(truth.flow), "visible": visible}
 
     def both_directions(self) -> "PairDataset":
         """Each pair, and after it the same pair with its images exchanged and its backward flow."""

@@ -30,23 +30,20 @@ def synthetic_records(folder: Path) -> list[PairRecord]:
         InputError: dataset.json or the manifest is missing or damaged, comes from a newer format, lists no sample, or
             lists a file that is not there.
     """
-    header = _read_header(folder / "dataset.json")
+    header, manifest = _read_header(folder / "dataset.json"), folder / "manifest.jsonl"
     records = []
-    for index in sorted(_indices(folder / "manifest.jsonl")):
+    for index in sorted(_indices(manifest)):
         name = f"{index:06d}"
         sample = folder / "samples" / name
-        scene = _scene(header, sample / "meta.json")
-        images = (sample / "image1.png", sample / "image2.png")
-        record = PairRecord(name, *images, sample / "flow.exr", scene=scene, origin=origin(header))
-        for path in (record.image1, record.image2, sample / "flow.exr"):
+        files = sample / "image1.png", sample / "image2.png", sample / "flow.exr"
+        for path in files:
             if not path.is_file():
-                raise InputError(
-                    f"{path}: the file is missing although {folder / 'manifest.jsonl'} lists sample {index}; "
-                    "make the data set again, or remove that line"
-                )
-        records.append(record)
+                raise InputError(f"{path}: the file is missing although {manifest} lists sample {index}; make the data "
+                                 "set again, or remove that line")  # fmt: skip
+        scene = scene_and_pattern(header, sample / "meta.json")
+        records.append(PairRecord(name, *files, scene=scene, origin=origin(header)))
     if not records:
-        raise InputError(f"{folder / 'manifest.jsonl'}: lists no finished sample; let synth generate finish first")
+        raise InputError(f"{manifest}: lists no finished sample; let synth generate finish first")
     return records
 
 
@@ -58,12 +55,12 @@ def origin(description: Any) -> str | None:
         return None
 
 
-def _scene(header: dict[str, Any], meta: Path) -> str | None:
-    """Scene and kind of pattern, "gelsight_mini, dots"; where either is drawn, that of the sample's own scene."""
+def scene_and_pattern(header: Any, meta: Path | None = None) -> str | None:
+    """Scene and kind of pattern, "gelsight_mini, dots"; where the latter is random, that of the sample's `meta`."""
     try:
         scene = header["scene"]
         kind = scene["sensor"]["pattern"].get("kind")
-        if not isinstance(kind, str):
+        if not isinstance(kind, str) and meta is not None:
             kind = json.loads(meta.read_text(encoding="utf-8"))["scene"]["sensor"]["pattern"]["kind"]
         return f"{scene['name']}, {kind}"
     except (KeyError, TypeError, AttributeError, OSError, ValueError):

@@ -14,10 +14,10 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gelflow.arrays import FlowArray, MaskArray
 from gelflow.errors import InputError
 from gelflow.files.atomic import replacing
 from gelflow.files.quiet import quiet
-from gelflow.raster import FlowArray, MaskArray
 
 DIRECTIONS = "U right, V down; I1(x) = I2(x + forward(x))"
 """In the header of each flow that is written here, and in those words nowhere else."""
@@ -77,10 +77,7 @@ def read_flow(path: Path, direction: Direction = "forward") -> FlowField:
 def write_flow(path: Path, forward: FlowArray, visible: MaskArray | None = None) -> None:
     """Writes a forward flow, and where it is visible if that is known; replaces the file as a whole.
 
-    Args:
-        path: The file, ending in .exr.
-        forward: (H, W, 2) px.
-        visible: (H, W) bool; None leaves the channel out (an estimate does not know it).
+    Without `visible` that channel is left out: an estimate does not know it.
 
     Raises:
         OSError: The file cannot be written.

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gelflow.errors import InputError
+from gelflow.arrays import FlowArray
 from gelflow.files.atomic import replacing
-from gelflow.raster import FlowArray
 
 MAGIC = np.float32(202021.25)
 UNKNOWN = np.float32(1e10)
@@ -26,22 +25,3 @@ def write_flo(path: Path, flow: FlowArray) -> None:
     data = np.where(np.isnan(flow), UNKNOWN, flow).astype("<f4")
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(MAGIC.astype("<f4").tobytes() + np.array([width, height], "<i4").tobytes() + data.tobytes())
-
-
-def read_flo(path: Path) -> FlowArray:
-    """Reads a flow (H, W, 2) float32 in px, NaN where it is unknown.
-
-    Raises:
-        InputError: The file is missing, is no .flo file, or is cut short.
-    """
-    if not path.is_file():
-        raise InputError(f"{path}: there is no such file")
-    data = path.read_bytes()
-    if len(data) < 12 or np.frombuffer(data, "<f4", 1)[0] != MAGIC:
-        raise InputError(f"{path}: not a .flo file (it does not begin with the number 202021.25)")
-    width, height = (int(n) for n in np.frombuffer(data, "<i4", 2, offset=4))
-    if min(width, height) < 1 or len(data) != 12 + 8 * width * height:
-        raise InputError(f"{path}: {len(data)} bytes do not hold the flow of {width} x {height} px that it announces")
-    flow = np.frombuffer(data, "<f4", offset=12).reshape(height, width, 2).astype(np.float32)
-    flow[np.abs(flow) > 1e9] = np.nan
-    return flow

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from gelflow.arrays import Bytes3, Grey8, ImageArray
 from gelflow.errors import InputError
 from gelflow.files.atomic import replacing
 from gelflow.files.quiet import quiet
-from gelflow.raster import Bytes3, FlowArray, Grey8, ImageArray
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"})
 MINIMUM_SIDE = 16
@@ -88,20 +88,13 @@ def read_pair(path1: Path, path2: Path) -> tuple[ImageArray, ImageArray]:
         InputError: One of them cannot be read, is smaller than `MINIMUM_SIDE`, or their sizes differ.
     """
     image1, image2 = read_image(path1), read_image(path2)
-    for path, image in ((path1, image1), (path2, image2)):
+    size1, size2 = (f"{image.shape[1]} x {image.shape[0]} px" for image in (image1, image2))
+    for path, image, size in ((path1, image1, size1), (path2, image2, size2)):
         if min(image.shape[:2]) < MINIMUM_SIDE:
-            raise InputError(
-                f"{path}: {_size(image)} px are too few for optical flow; each side needs at least {MINIMUM_SIDE} px"
-            )
+            raise InputError(f"{path}: {size} are too few for optical flow; each side needs {MINIMUM_SIDE} px or more")
     if image1.shape != image2.shape:
-        raise InputError(
-            f"{path1} has {_size(image1)} px, {path2} has {_size(image2)} px; both images of a pair need one size"
-        )
+        raise InputError(f"{path1} has {size1}, {path2} has {size2}; both images of a pair need one size")
     return image1, image2
-
-
-def _size(image: ImageArray | FlowArray) -> str:
-    return f"{image.shape[1]} x {image.shape[0]}"
 
 
 def to_bytes(image: ImageArray) -> Bytes3:

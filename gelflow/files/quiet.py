@@ -1,12 +1,14 @@
-"""Keeping C libraries from writing to the terminal.
+"""Keeping libraries from writing to the terminal.
 
 libpng, FFmpeg and OpenEXR print their complaints about a broken file straight to the process's output, some of them
 many times. gelflow says once, in its own words, which file is broken; what the library printed is dropped.
 """
 
 import io
+import logging
 import os
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 
@@ -32,3 +34,17 @@ def quiet() -> Iterator[None]:
         os.dup2(saved[1], 2)
         for descriptor in (*saved, null):
             os.close(descriptor)
+
+
+@contextmanager
+def quiet_logger(name: str, module: str = "") -> Iterator[None]:
+    """Drops a logger's messages below errors, and the warnings of modules that match a pattern (all, without one)."""
+    logger = logging.getLogger(name)
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", module=module)
+            yield
+    finally:
+        logger.setLevel(level)

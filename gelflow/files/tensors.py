@@ -1,11 +1,15 @@
-"""Files that `torch.save` wrote, read without ever running code in them."""
+"""Tensors from files: what `torch.save` wrote, read without running code in it, and whether tensors fit a network."""
 
 import struct
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from zipfile import BadZipFile
+
+if TYPE_CHECKING:
+    from torch import Tensor, nn
 
 DAMAGE = (
     UnpicklingError, RuntimeError, EOFError, LookupError, TypeError, ValueError, AttributeError, AssertionError,
@@ -36,3 +40,17 @@ def load_tensors(path: Path) -> Any:
     except DAMAGE as error:
         lines = str(error).splitlines()
         raise Unreadable(lines[0] if lines else type(error).__name__) from error
+
+
+def misfit(tensors: "Mapping[str, Tensor]", model: "nn.Module") -> str:
+    """What keeps tensors from being a network's weights, three problems at most; an empty text where they fit."""
+    expected = model.state_dict()
+    wrong = [f"{name} is missing" for name in expected if name not in tensors]
+    wrong += [f"{name} is unknown" for name in tensors if name not in expected]
+    for name, value in tensors.items():
+        if name in expected and value.shape != expected[name].shape:
+            wrong.append(f"{name} has shape {tuple(value.shape)}, not {tuple(expected[name].shape)}")
+        elif value.is_floating_point() and not value.isfinite().all():
+            wrong.append(f"{name} holds values that are not finite")
+    more = f" and {len(wrong) - 3} more" if len(wrong) > 3 else ""
+    return "; ".join(wrong[:3]) + more

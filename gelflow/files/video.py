@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gelflow.arrays import Bytes3
 from gelflow.errors import InputError
 from gelflow.files.image import SUFFIXES as IMAGE_SUFFIXES
 from gelflow.files.image import read_image, to_bytes
 from gelflow.files.quiet import quiet
-from gelflow.raster import Bytes3
 
 SUFFIXES = frozenset({".avi", ".mp4", ".m4v", ".mov", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv"})
 

@@ -2,11 +2,19 @@
 
 ``L_dc = w ( |e_xx| + |e_yy| + lambda_theta 2 |e_xy| + lambda_zeta 2 |omega| )`` with the linear distortion rates
 ``e_xx = u_x``, ``e_yy = v_y``, the shear distortion rate ``e_xy = (u_y + v_x) / 2``, the rotation
-``omega = (v_x - u_y) / 2`` and the weight w of `gelflow.losses.weight`. Forward differences, as in eq. 2; mean over
+``omega = (v_x - u_y) / 2`` and a weight w from the gradient of image 1. Forward differences, as in eq. 2; mean over
 the pixels that have a right and a lower neighbour. Zero for every translation.
+
+The weight, from ``||grad I||_1 = |I_x| + |I_y|`` as a mean over colours of an image in [0, 1], is one of
+
+- anti_edge (paper, eq. 6): ``1 - exp(-beta ||grad I||_1)``: strong on edges, none where there is no texture.
+- edge_aware: ``exp(-beta ||grad I||_1)``: the usual opposite.
+- floor: anti_edge, raised to at least `floor`, so that untextured gel is regularised too.
 """
 
-from gelflow.arrays import Flow, Mask, Scalar
+import torch
+
+from gelflow.arrays import Flow, Images, Mask, Scalar
 from gelflow.ops.gradients import forward_differences
 
 
@@ -30,3 +38,16 @@ def decomposition_loss(flow: Flow, weight: Mask, lambda_theta: float = 0.01, lam
     linear = u_x.abs() + v_y.abs()
     shear, rotation = (u_y + v_x).abs(), (v_x - u_y).abs()
     return (weight * (linear + lambda_theta * shear + lambda_zeta * rotation)).mean()
+
+
+def regulariser_weight(image: Images, kind: str, beta: float, floor: float) -> Mask:
+    """The weight on the (H-1) x (W-1) pixels that have a right and a lower neighbour.
+
+    Returns:
+        (B, 1, H-1, W-1) in [0, 1].
+    """
+    across, down = forward_differences(image)
+    fading = torch.exp(-beta * (across.abs() + down.abs()).mean(dim=1, keepdim=True))
+    if kind == "edge_aware":
+        return fading
+    return 1 - fading if kind == "anti_edge" else (1 - fading).clamp(min=floor)

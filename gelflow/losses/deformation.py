@@ -15,10 +15,6 @@ from gelflow.ops.gradients import forward_differences, window_slopes
 def area_ratio(flow: Flow, ratio: str = "product") -> Tensor:
     """R at the pixels that have all eight neighbours.
 
-    Args:
-        flow: (B, 2, H, W), px of this scale.
-        ratio: "product" or "det".
-
     Returns:
         (B, 1, H-2, W-2), without unit; 1 where nothing is stretched.
     """

@@ -15,10 +15,6 @@ SOFTNESS_PX = 0.01
 def endpoint_loss(flow: Flow, truth: Flow) -> Scalar:
     """Mean softened distance of a flow from the truth at one scale.
 
-    Args:
-        flow: (B, 2, H, W), px of this scale.
-        truth: The same shape; NaN where unknown.
-
     Returns:
         A scalar >= 0, px; 0 where nothing is known.
     """

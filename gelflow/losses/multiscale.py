@@ -1,8 +1,8 @@
 """Losses summed over scales (paper, eq. 11): ``L = sum_s lambda_s (L_ph + lambda_dc L_dc + lambda_df L_df)``.
 
 The images of scale s are means over 2^s x 2^s blocks. Flows are in px of their scale, so a gradient of the flow means
-the same at every scale. With `compare_at` = "image" every scale's flow is enlarged and judged on the images themselves:
-averaged images hold no pattern at coarse scales, so that there the published loss prefers too little motion.
+the same at every scale. With `compare_at` = "image" every scale's flow is enlarged and compared on the images
+themselves: averaged images hold no pattern at coarse scales, where the published loss prefers too little motion.
 """
 
 import torch
@@ -10,13 +10,11 @@ from torch import Tensor
 
 from gelflow.arrays import Flow, Images, Mask, Scalar
 from gelflow.config import LossConfig
-from gelflow.losses.census import census_loss
-from gelflow.losses.decomposition import decomposition_loss
+from gelflow.losses.decomposition import decomposition_loss, regulariser_weight
 from gelflow.losses.deformation import deformation_loss
 from gelflow.losses.endpoint import endpoint_loss
 from gelflow.losses.photometric import appearance_loss
 from gelflow.losses.smoothness import first_order_loss, second_order_loss
-from gelflow.losses.weight import regulariser_weight
 from gelflow.ops.pyramid import enlarge_flow, flow_pyramid, image_pyramid
 from gelflow.ops.warp import inside, warp
 
@@ -49,7 +47,7 @@ def self_supervised_loss(
             flow = enlarge_flow(flow, scale, (image1.shape[-2], image1.shape[-1]))
         if share > 0:
             mask = None if seen is None else seen[place]
-            loss = _appearance(first[place], second[place], flow, config, mask)
+            loss = _photometric(first[place], second[place], flow, config, mask)
             parts["photometric"] = parts["photometric"] + share * loss
         if smooth_share > 0:
             smooth, deformed = _regulariser(flow, first[place], config, side)
@@ -58,28 +56,18 @@ def self_supervised_loss(
     return torch.stack(list(parts.values())).sum(), {name: value.detach() for name, value in parts.items()}
 
 
-def _appearance(image1: Images, image2: Images, flow: Flow, config: LossConfig, visible: Mask | None) -> Scalar:
-    """Weighted photometric and census loss of one flow on images of its size."""
-    warped = warp(image2, flow, config.warping)
-    pixels = inside(flow) if config.mask_outside else None
-    if visible is not None:
-        pixels = visible if pixels is None else pixels * visible
-    loss = warped.new_zeros(())
-    if config.lambda_ph > 0:
-        loss = loss + config.lambda_ph * appearance_loss(image1, warped, pixels, config.alpha)
-    if config.lambda_census > 0:
-        loss = loss + config.lambda_census * census_loss(image1, warped, pixels)
-    return loss
+def _photometric(image1: Images, image2: Images, flow: Flow, config: LossConfig, visible: Mask | None) -> Scalar:
+    """Photometric loss of one flow on images of its size."""
+    pixels = inside(flow) if visible is None else inside(flow) * visible
+    return appearance_loss(image1, warp(image2, flow, config.warping), pixels, config.alpha)
 
 
 def _regulariser(flow: Flow, image: Images, config: LossConfig, side: int) -> tuple[Scalar, Scalar]:
     """Weighted smoothness and deformation loss of one flow on image 1 of its size."""
     zero = flow.new_zeros(())
-    if config.smoothness in ("first_order", "second_order"):
+    if config.smoothness != "helmholtz":
         loss = first_order_loss if config.smoothness == "first_order" else second_order_loss
         return config.lambda_dc * loss(flow / side, image, config.beta), zero
-    if config.smoothness == "none":
-        return zero, zero
     weight = regulariser_weight(image, config.weight, config.beta, config.weight_floor)
     smooth = decomposition_loss(flow / side, weight, config.lambda_theta, config.lambda_zeta)
     deformed = config.lambda_df * deformation_loss(flow, weight, config.ratio) if config.lambda_df > 0 else zero
@@ -89,10 +77,7 @@ def _regulariser(flow: Flow, image: Images, config: LossConfig, side: int) -> tu
 def flow_loss(flows: list[Flow], truth: Flow, config: LossConfig) -> tuple[Scalar, dict[str, Tensor]]:
     """The endpoint loss at all scales, for training on the exact flow.
 
-    Args:
-        flows: As for `self_supervised_loss`.
-        truth: (B, 2, H, W), px; NaN where the pixel sees no gel.
-        config: Only `flow_s`, or `lambda_s` in its absence, matters.
+    Scales have the weights `flow_s`, or `lambda_s` in its absence; flows are as for `self_supervised_loss`.
 
     Returns:
         The loss, and its part "endpoint": the loss of the finest scale alone, px, detached.

@@ -3,8 +3,8 @@
 ``L_ph = alpha (1 - SSIM) / 2 + (1 - alpha) |I~1 - I1|``, averaged over colours and pixels.
 
 SSIM is taken over 3x3 windows with equal weights, C1 = 0.01^2, C2 = 0.03^2, for images in [0, 1]; at the border the
-window is what of it lies inside the image. The paper is silent on pixels that leave the image: with the mask, their
-absolute difference does not count, nor does the SSIM of any window that holds one of them.
+window is what of it lies inside the image. The paper is silent on pixels that leave the image: here, their absolute
+difference does not count, nor does the SSIM of any window that holds one of them.
 """
 
 import torch.nn.functional as F
@@ -18,15 +18,7 @@ C2 = 0.03**2
 
 
 def structural_similarity(first: Images, second: Images) -> Tensor:
-    """SSIM (Wang et al. 2004) of each pixel's 3x3 window, in [-1, 1].
-
-    Args:
-        first: (B, C, H, W) in [0, 1].
-        second: The same shape.
-
-    Returns:
-        (B, C, H, W).
-    """
+    """SSIM (Wang et al. 2004) of each pixel's 3x3 window, in [-1, 1]."""
 
     def mean(values: Tensor) -> Tensor:
         return F.avg_pool2d(values, 3, stride=1, padding=1, count_include_pad=False)
@@ -39,37 +31,22 @@ def structural_similarity(first: Images, second: Images) -> Tensor:
     return luminance * (2 * covariance + C2) / (variance1 + variance2 + C2)
 
 
-def photometric_loss(
-    image1: Images, image2: Images, flow: Flow, alpha: float = 0.85, mask_outside: bool = True
-) -> Scalar:
+def photometric_loss(image1: Images, image2: Images, flow: Flow, alpha: float = 0.85) -> Scalar:
     """The photometric loss at one scale.
 
-    Args:
-        image1: (B, 3, H, W) in [0, 1], of this scale.
-        image2: The same shape.
-        flow: (B, 2, H, W), px of this scale.
-        alpha: Share of SSIM.
-        mask_outside: Leave out the pixels that the flow takes out of the image.
-
     Returns:
-        A scalar >= 0; 0 where the flow maps image 2 onto image 1. Where no pixel stays inside: 0.
+        A scalar >= 0; 0 where the flow maps image 2 onto image 1, and where it takes every pixel out of the image.
     """
-    return appearance_loss(image1, warp(image2, flow), inside(flow) if mask_outside else None, alpha)
+    return appearance_loss(image1, warp(image2, flow), inside(flow), alpha)
 
 
-def appearance_loss(image1: Images, warped: Images, pixels: Mask | None, alpha: float) -> Scalar:
+def appearance_loss(image1: Images, warped: Images, pixels: Mask, alpha: float) -> Scalar:
     """The photometric loss of an image that has been warped already.
 
-    Args:
-        image1: (B, 3, H, W) in [0, 1].
-        warped: Image 2 brought to image 1, the same shape.
-        pixels: (B, 1, H, W), 1 where the warped image is worth comparing; None: everywhere.
-        alpha: Share of SSIM.
+    The mask is 1 where the warped image is worth comparing; `alpha` is the share of SSIM.
     """
     dissimilarity = (1 - structural_similarity(image1.to(warped.dtype), warped)) / 2
     difference = (warped - image1).abs()
-    if pixels is None:
-        return alpha * dissimilarity.mean() + (1 - alpha) * difference.mean()
     windows = -F.max_pool2d(-pixels, 3, stride=1, padding=1)
     return alpha * _masked_mean(dissimilarity, windows) + (1 - alpha) * _masked_mean(difference, pixels)
 

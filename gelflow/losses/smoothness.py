@@ -14,10 +14,7 @@ from gelflow.ops.gradients import forward_differences
 def first_order_loss(flow: Flow, image: Images, beta: float = 10.0) -> Scalar:
     """The smoothness loss at one scale.
 
-    Args:
-        flow: (B, 2, H, W), in px or divided by the image's shorter side.
-        image: Image 1 of this scale, (B, 3, H, W) in [0, 1].
-        beta: Steepness of the weight in the image gradient.
+    The flow is in px or divided by the image's shorter side; `beta` is the weight's steepness in the image gradient.
 
     Returns:
         A scalar >= 0, the mean over the pixels that have a right and a lower neighbour and over both directions; 0 for

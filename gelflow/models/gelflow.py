@@ -14,9 +14,8 @@ from torch import Tensor, nn
 from gelflow.arrays import Features, Flow, Images
 from gelflow.config import MINIMUM_SIDE, ModelConfig
 from gelflow.errors import InputError
-from gelflow.models.context import ContextNetwork
 from gelflow.models.encoder import CHANNELS, Encoder
-from gelflow.models.estimator import Estimator
+from gelflow.models.estimator import ContextNetwork, Estimator
 from gelflow.models.layers import SLOPE
 from gelflow.models.lffm import LocalFlowFusion
 from gelflow.models.refinement import RefinementHead
@@ -28,9 +27,6 @@ from gelflow.ops.warp import warp
 
 class GelFlow(nn.Module):
     """Flow from image 1 to image 2 at all scales.
-
-    Args:
-        config: The architecture.
 
     Attributes:
         config: The architecture.
@@ -49,10 +45,7 @@ class GelFlow(nn.Module):
         self.estimators = nn.ModuleList(Estimator(costs + config.projected_channels + 2) for _ in range(networks))
         self.contexts = nn.ModuleList(ContextNetwork() for _ in range(networks))
         self.fusion = LocalFlowFusion(config.lffm_region, config.lffm_scale) if config.lffm else None
-        self.refined_scale = {"none": None, "half": 1, "full": 0}[config.refine]
-        self.refinement = None
-        if self.refined_scale is not None:
-            self.refinement = RefinementHead(self.refined_scale, config.refine_iterations)
+        self.refinement = RefinementHead(config.refine_iterations) if config.refine == "half" else None
 
     def forward(self, image1: Images, image2: Images) -> list[Flow]:
         """Estimates the flow.
@@ -69,8 +62,7 @@ class GelFlow(nn.Module):
         """
         check_shapes(image1, image2)
         batch, _, height, width = image1.shape
-        images = torch.cat([image1, image2])
-        features = self.encoder(images)
+        features = self.encoder(torch.cat([image1, image2]))
         flow: Flow | None = None
         decoded: dict[int, Flow] = {}
         for scale in range(self.config.levels - 1, self.config.finest_scale - 1, -1):
@@ -86,8 +78,8 @@ class GelFlow(nn.Module):
         for scale in range(finest - 1, -1, -1):
             size = (-(-height // 2**scale), -(-width // 2**scale))
             decoded[scale] = enlarge_flow(decoded[finest], finest - scale, size)
-            if self.refinement is not None and scale == self.refined_scale:
-                decoded[scale] = self.refinement(decoded[scale], images, features[0])
+            if self.refinement is not None and scale == 1:
+                decoded[scale] = self.refinement(decoded[scale], features[0])
                 finest = scale
         return [decoded[scale] for scale in range(self.config.levels - 1)]
 

@@ -18,12 +18,7 @@ from gelflow.ops.correlation import local_correlation
 
 
 class LocalFlowFusion(nn.Module):
-    """The module; it has no parameters.
-
-    Args:
-        region: Side of the window, odd, px.
-        scale: "inverse_sqrt" or "none", see `gelflow.config.ModelConfig.lffm_scale`.
-    """
+    """The module; it has no parameters."""
 
     def __init__(self, region: int, scale: str) -> None:
         super().__init__()

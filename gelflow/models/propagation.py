@@ -1,17 +1,18 @@
-"""Propagation: where a flow does not bring the images together, the flow of a place nearby that does.
+"""Propagation: a pixel whose flow does not bring the images together takes the flow of a neighbour that does.
 
 Gauss-Newton steps find the minimum that they start near. A network that loses a dot leaves a patch of flow from which
-none of its steps leads back, while the flow of the gel beside the patch would. So each pixel is offered the
-flow of its neighbours at some distances, and takes the one that lessens its windowed residual most,
+none of its steps leads back, while the flow of the gel beside the patch would. So the flows of neighbours at some
+distances are proposed to each pixel, and it takes the one with the least windowed residual,
 
-    E(x) = sum_y w(y - x) c(y) |F2(y + V(y)) - F1(y) - m(x)|^2 / sum_y w(y - x) c(y)
+    E(x) = sum_y w(y - x) c(y) |F2(y + V(y)) - F1(y) - m(x)|^2 / sum_y w(y - x) c(y),
 
-if by enough (c is 1 where the flow stays in the image). A gel's flow is smooth, and light on it does not move with it:
-what a neighbour offers is its flow extrapolated by its slope, and m is the residual's mean in the window. A
-flow that shall follow brightness has no such slope: it is offered as it is, and m is zero. Windows are wide and smooth,
-so that images and flow are reduced until a pixel is a third of the window's deviation.
+if that is below a share of its own (c is 1 where the flow stays in the image). Where shading is ignored, a proposal is
+the neighbour's flow extrapolated by its slope, because a gel's flow is smooth, and m is the residual's mean in the
+window, because light on a gel does not move with it. Where flow follows brightness, it is proposed as it is, and m is
+zero. Windows are wide and smooth, so that images and flow are reduced until a pixel is a third of the window's
+deviation.
 
-Nothing is searched for, so that a pattern's period offers nothing that is not some neighbour's flow already. A window
+Nothing is searched for, so that a pattern's period proposes nothing that is not some neighbour's flow already. A window
 that the flow takes out of the image has no residual, and takes a neighbour's flow that keeps it inside.
 
 After the propagation of PatchMatch (Barnes et al. 2009), without its random search; slanted as in PatchMatch Stereo
@@ -26,20 +27,20 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from gelflow.arrays import Flow, Images
-from gelflow.ops.gaussian import Smoother, WindowSums
-from gelflow.ops.kept import kept
+from gelflow.ops.cached import cached
+from gelflow.ops.gaussian import smoother, window_sums
 from gelflow.ops.resize import resize_flow, resize_images
 from gelflow.ops.warp import inside, warp
 
 DIRECTIONS = ((-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (1, 1), (-1, 1), (1, -1))
-ENOUGH, ENOUGH_OF_GEL = 0.85, 0.6
-"""A neighbour's flow is taken where it leaves less than this share of the residual."""
-PIXELS_A_WINDOW = 3
-"""That a window's standard deviation has at most, in the reduced images."""
-SLOPES_PX = 2.0
+MAX_RESIDUAL_RATIO, MAX_RESIDUAL_RATIO_WITHOUT_SHADING = 0.85, 0.6
+"""A proposal is taken if its residual is below this share of the pixel's own."""
+PIXELS_PER_DEVIATION = 3
+"""Largest standard deviation of a window in the reduced images, px."""
+SLOPE_WINDOW_PX = 2.0
 """Standard deviation of the Gaussian under which a flow is smoothed before it is extrapolated, reduced px."""
-SHARE_INSIDE = 0.3
-"""Of a window's weight: with less of it in the image, flows are not compared."""
+MIN_SHARE_INSIDE = 0.3
+"""Share of a window's weight that must lie in the image for its residual to count."""
 
 
 def propagated(
@@ -49,9 +50,9 @@ def propagated(
     window_px: float,
     distances: Sequence[int],
     noise: float,
-    of_gel: bool,
+    ignore_shading: bool,
 ) -> Flow:
-    """The flow, with what its neighbours know.
+    """The flow after each pixel has had the choice among its neighbours' flows.
 
     Args:
         flow: (B, 2, H, W), px.
@@ -59,17 +60,17 @@ def propagated(
         image2: The same shape.
         window_px: Standard deviation of w.
         distances: Of the neighbours, px, each in eight directions.
-        noise: Standard deviation of the residual that is believed; where it is below twice that, the flow stays.
-        of_gel: The flow is that of a gel, in whatever light; else it follows brightness.
+        noise: Standard deviation of the images' noise; where the residual is below twice that, the flow stays.
+        ignore_shading: The flow is that of a gel, in whatever light; else it follows brightness.
 
     Returns:
         Same shape.
     """
     height, width = flow.shape[-2:]
-    pixel = math.ceil(window_px / PIXELS_A_WINDOW)
+    pixel = math.ceil(window_px / PIXELS_PER_DEVIATION)
     size = (math.ceil(height / pixel), math.ceil(width / pixel))
     start, first, second = resize_flow(flow, size), resize_images(image1, size), resize_images(image2, size)
-    window = WindowSums(*size, window_px / pixel, flow)
+    window = window_sums(*size, window_px / pixel, flow)
     whole = window(torch.ones_like(start[:1, :1]))
 
     def residuals(candidates: Tensor) -> Tensor:
@@ -79,45 +80,45 @@ def propagated(
         counts = inside(flows)
         left = counts * (warp(images2, flows) - images1)
         squares = left.square().mean(dim=1, keepdim=True)
-        sums = window(torch.cat([counts, squares, left] if of_gel else [counts, squares], dim=1))
+        sums = window(torch.cat([counts, squares, left] if ignore_shading else [counts, squares], dim=1))
         weight = sums[:, :1]
         moments = sums[:, 1:] / weight
-        spread = moments[:, :1] - moments[:, 1:].square().mean(dim=1, keepdim=True) if of_gel else moments
-        return torch.where(weight > SHARE_INSIDE * whole, spread, torch.inf).unflatten(0, (len(candidates), -1))
+        spread = moments
+        if ignore_shading:
+            spread = moments[:, :1] - moments[:, 1:].square().mean(dim=1, keepdim=True)
+        return torch.where(weight > MIN_SHARE_INSIDE * whole, spread, torch.inf).unflatten(0, (len(candidates), -1))
 
     now = residuals(start.unsqueeze(0))[0]
-    best, least = start, (ENOUGH_OF_GEL if of_gel else ENOUGH) * now
+    best, least = start, (MAX_RESIDUAL_RATIO_WITHOUT_SHADING if ignore_shading else MAX_RESIDUAL_RATIO) * now
     steps = [max(1, round(distance / pixel)) for distance in distances]
-    offered = _Offers(start, max(steps), extrapolate=of_gel)
+    proposals = _Proposals(start, max(steps), extrapolate=ignore_shading)
     places = [(step * right, step * down) for step in steps for right, down in DIRECTIONS]
     # Launches are what takes time on a GPU, all neighbours together are too much for a processor's cache.
     at_once = len(places) if flow.is_cuda else 1
     for i in range(0, len(places), at_once):
-        offers = offered(places[i : i + at_once])
-        left, which = residuals(offers).min(dim=0)
-        found = offers.gather(0, which.expand_as(start).unsqueeze(0))[0]
+        proposed = proposals(places[i : i + at_once])
+        left, which = residuals(proposed).min(dim=0)
+        found = proposed.gather(0, which.expand_as(start).unsqueeze(0))[0]
         best, least = torch.where(left < least, found, best), torch.minimum(left, least)
     return flow + resize_flow(torch.where(now > (2 * noise) ** 2, best - start, 0.0), (height, width))
 
 
-class _Offers:
-    """What the flow at a place is by its neighbours.
+class _Proposals:
+    """Flows that neighbours propose to each pixel.
 
-    Args:
-        flow: (B, 2, H, W).
-        reach: Largest step to a neighbour along an axis; beyond the border, the border's pixels go on.
-        extrapolate: By the slope of the flow, smoothed.
+    Beyond the border, its pixels go on; `reach` is the largest step along an axis. Where extrapolated, by the slope of
+    the smoothed flow.
     """
 
     def __init__(self, flow: Flow, reach: int, extrapolate: bool) -> None:
         self._size, self._reach, self._extrapolate = (flow.shape[-2], flow.shape[-1]), reach, extrapolate
         if extrapolate:
-            flow = Smoother(*self._size, SLOPES_PX, flow)(flow)
+            flow = smoother(*self._size, SLOPE_WINDOW_PX, flow)(flow)
             flow = torch.cat([flow, *torch.gradient(flow, dim=(-1, -2))], dim=1)
         self._padded = pad(flow, (reach,) * 4, mode="replicate")
 
     def __call__(self, places: Sequence[tuple[int, int]]) -> Tensor:
-        """The offers of the neighbours at steps (right, down): (N, B, 2, H, W)."""
+        """The proposals of the neighbours at steps (right, down): (N, B, 2, H, W)."""
         rows, columns = self._size
         near = torch.stack([
             self._padded[..., self._reach + down :, self._reach + right :][..., :rows, :columns]
@@ -130,7 +131,7 @@ class _Offers:
         return there - right * across - down * along
 
 
-@kept
+@cached
 def _steps(places: tuple[tuple[int, int], ...], dtype: torch.dtype, device: torch.device) -> Tensor:
     """(2, N, 1, 1, 1, 1)."""
     return torch.tensor(places, dtype=dtype, device=device).T.reshape(2, -1, 1, 1, 1, 1)

@@ -13,11 +13,10 @@ from gelflow.models.gelflow import GelFlow
 class RecordedNetwork:
     """A network whose pass over CUDA images is recorded when a shape comes a second time, and replayed from then on.
 
+    The network has to be in evaluation mode when it is called.
+
     Without gradient; on a CPU, and for images of ever other shapes, the network as it is. Its weights may change in
     place, not move.
-
-    Args:
-        model: The network, in evaluation mode when it is called.
     """
 
     def __init__(self, model: GelFlow) -> None:

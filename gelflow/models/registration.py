@@ -12,10 +12,11 @@ residual is taken without its mean over a neighbourhood of that width, so that s
 gel, does not count. Without, and with a wide ``p``, the images' difference is what is minimised, whatever it comes
 from: a high PSNR, and a flow that follows shading.
 
-It stays in the basin that it starts in, so that with `propagation_px` each stage tries neighbours' flows first
-(`gelflow.models.propagation`); dots that a whole neighbourhood took for the next ones stay so. With `after`, another
-registration comes before all stages, and its flow stays wherever what it leaves between the images is below its
-`noise`: so registration for both keeps the motion of whatever motion explains, and follows brightness elsewhere.
+Gauss-Newton steps stay in the basin that they start in. With `propagation_px` each stage therefore tries neighbours'
+flows first (`gelflow.models.propagation`); where a whole neighbourhood mistook dots for the next ones, that does not
+help. With `after`, another registration comes before all stages. Its flow stays wherever the residual that it leaves is
+below its `noise`. So registration for both keeps the motion where motion explains the images, and follows brightness
+elsewhere.
 
 Lucas and Kanade 1981, with a prior (Simoncelli, Adelson and Heeger, "Probability distributions of optical flow", 1991);
 smoothing the field between the steps: Thirion's demons, 1998.
@@ -27,25 +28,19 @@ from torch import Tensor
 from gelflow.arrays import Features, Flow, Images
 from gelflow.config import RegistrationConfig
 from gelflow.models.propagation import propagated
-from gelflow.ops.gaussian import Smoother, WindowSums
+from gelflow.ops.gaussian import SeparableFilter, smoother, window_sums
 from gelflow.ops.spline import SplineImage
 from gelflow.ops.warp import inside_at, positions
 
-LARGEST_STEP_PX = 1.0
+MAX_STEP_PX = 1.0
 """Limit on a Gauss-Newton step of each component."""
 TINY = 1e-6
-EXPLAINED_PX, EDGE_PX = 6.0, 2.0
-"""Standard deviations of the window that judges a flow which came first, and of that which joins it to the rest."""
+RESIDUAL_WINDOW_PX, BLENDING_PX = 6.0, 2.0
+"""Standard deviations of the window of the residual that decides between two flows, and of the blending at its edge."""
 
 
 def registered(flow: Flow, image1: Images, image2: Images, config: RegistrationConfig) -> Flow:
     """Corrects a flow.
-
-    Args:
-        flow: (B, 2, H, W), px.
-        image1: (B, C, H, W) in [0, 1], on the same device.
-        image2: The same shape.
-        config: Windows and weights.
 
     Returns:
         The corrected flow, same shape, float32, without gradient. Each pair of a batch is treated on its own.
@@ -54,42 +49,42 @@ def registered(flow: Flow, image1: Images, image2: Images, config: RegistrationC
     with torch.no_grad(), torch.autocast(flow.device.type, enabled=False):
         flow, first, image2 = flow.float(), image1.float(), image2.float()
         second = SplineImage(image2)
-        settled = flow
+        former = flow
         if config.after is not None:
-            settled = flow = registered(flow, first, image2, config.after)
+            former = flow = registered(flow, first, image2, config.after)
         width = config.background_px
-        background = None if width is None else WindowSums(*size, width, flow)
+        background = None if width is None else window_sums(*size, width, flow)
         for window_px, smoothing_px in zip(config.windows_px, config.smoothing_px, strict=True):
-            window = WindowSums(*size, window_px, flow)
+            window = window_sums(*size, window_px, flow)
             if config.propagation_px:
                 fit = (window_px, config.propagation_px, config.noise, background is not None)
                 flow = propagated(flow, first, image2, *fit)
-            start = Smoother(*size, smoothing_px, flow)(flow)
+            start = smoother(*size, smoothing_px, flow)(flow)
             flow = start
             for _ in range(config.iterations):
                 evidence = _evidence(flow, first, second, background)
                 step = _posterior(*evidence, flow - start, window, config.prior_px, config.noise)
-                flow = flow + step.clamp(-LARGEST_STEP_PX, LARGEST_STEP_PX)
+                flow = flow + step.clamp(-MAX_STEP_PX, MAX_STEP_PX)
         if config.after is not None:
-            flow = torch.lerp(settled, flow, _unexplained(settled, first, second, config.after.noise))
+            flow = torch.lerp(former, flow, _unexplained(former, first, second, config.after.noise))
     return flow
 
 
 def _unexplained(flow: Flow, first: Images, second: SplineImage, noise: float) -> Tensor:
     """1 where a flow leaves more than noise between the images, 0 where not, between them at an edge; (B, 1, H, W).
 
-    A flow that leaves the image is judged by what `SplineImage` goes on with there.
+    Where a flow leaves the image, the border counts that `SplineImage` repeats there.
     """
     size = (flow.shape[-2], flow.shape[-1])
     squares = (second.at(positions(flow)) - first).square().mean(dim=1, keepdim=True)
-    window, edge = WindowSums(*size, EXPLAINED_PX, flow), WindowSums(*size, EDGE_PX, flow)
+    window, edge = window_sums(*size, RESIDUAL_WINDOW_PX, flow), window_sums(*size, BLENDING_PX, flow)
     all_of_it = torch.ones_like(squares)
     left = (window(squares) > noise**2 * window(all_of_it)).float()
     return edge(left) / edge(all_of_it)
 
 
 def _evidence(
-    flow: Flow, first: Images, second: SplineImage, background: WindowSums | None
+    flow: Flow, first: Images, second: SplineImage, background: SeparableFilter | None
 ) -> tuple[Features, Features, Features, Tensor]:
     """Residual and its derivatives along x and y, (B, C, H, W); 1 where the flow stays in the image and they count."""
     places = positions(flow)
@@ -109,7 +104,7 @@ def _posterior(
     down: Features,
     counts: Tensor,
     so_far: Flow,
-    window: WindowSums,
+    window: SeparableFilter,
     prior: float,
     noise: float,
 ) -> Flow:

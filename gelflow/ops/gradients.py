@@ -10,9 +10,6 @@ from torch import Tensor
 def forward_differences(field: Tensor) -> tuple[Tensor, Tensor]:
     """Differences to the right and to the lower neighbour.
 
-    Args:
-        field: (..., H, W).
-
     Returns:
         d/dx and d/dy, each (..., H-1, W-1), per px; empty where a side is 1.
     """
@@ -22,9 +19,6 @@ def forward_differences(field: Tensor) -> tuple[Tensor, Tensor]:
 
 def window_slopes(field: Tensor) -> tuple[Tensor, Tensor]:
     """Slopes of the plane that fits each 3x3 window best in least squares: Prewitt / 6. Exact for an affine field.
-
-    Args:
-        field: (..., H, W).
 
     Returns:
         d/dx and d/dy, each (..., H-2, W-2), per px; empty where a side is below 3.

@@ -50,13 +50,7 @@ def flow_pyramid(flow: Flow, scales: int) -> list[Flow]:
 def enlarge_flow(flow: Flow, octaves: int, size: tuple[int, int]) -> Flow:
     """A flow brought to a finer scale: bilinear between pixel centres, values times 2^octaves, cropped to size.
 
-    Args:
-        flow: (B, 2, h, w), px of its scale.
-        octaves: How many scales finer.
-        size: Rows and columns of the finer scale, at most 2^octaves (h, w).
-
-    Returns:
-        (B, 2, *size), px of the finer scale.
+    The finer scale has at most 2^octaves times the rows and columns.
     """
     factor = 2**octaves
     finer: Tensor = F.interpolate(flow, scale_factor=float(factor), mode="bilinear", align_corners=False)

@@ -16,7 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gelflow.arrays import Features
-from gelflow.ops.kept import kept
+from gelflow.ops.cached import cached
 
 MARGIN = 2
 """Coefficients beyond each border: a cubic B-spline reaches two px."""
@@ -27,8 +27,7 @@ POLE = math.sqrt(3) - 2
 class SplineImage:
     """An image that can be sampled anywhere.
 
-    Args:
-        image: (B, C, H, W), sides of at least 3 px.
+    Its sides are at least 3 px long.
     """
 
     def __init__(self, image: Features) -> None:
@@ -69,7 +68,7 @@ class SplineImage:
         return sampled.unflatten(2, (4, rows))
 
 
-@kept
+@cached
 def _prefilter(pixels: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Matrix (n, n) from samples to the coefficients of the spline through them.
 

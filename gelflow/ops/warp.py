@@ -7,12 +7,13 @@ way with ``align_corners=False``: its coordinate -1 is the image's left edge (0 
 
 from typing import Literal
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gelflow.arrays import Features, Flow, Mask
-from gelflow.ops.kept import kept
+from gelflow.arrays import Features, Flow, FlowArray, ImageArray, Mask
+from gelflow.ops.cached import cached
 from gelflow.ops.spline import SplineImage
 
 
@@ -22,7 +23,7 @@ def pixel_indices(like: Tensor) -> Tensor:
     return _pixel_indices(height, width, like.dtype, like.device)
 
 
-@kept
+@cached
 def _pixel_indices(height: int, width: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     sides = (torch.arange(side, dtype=dtype, device=device) for side in (height, width))
     rows, columns = torch.meshgrid(*sides, indexing="ij")
@@ -67,6 +68,23 @@ def warp(image: Features, flow: Flow, mode: Literal["bilinear", "spline"] = "bil
         grid = torch.stack([(2 * x + 1) / width - 1, (2 * y + 1) / height - 1], dim=-1)
         sampled = F.grid_sample(image.to(flow.dtype), grid, padding_mode="border", align_corners=False)
     return sampled.masked_fill(~finite.unsqueeze(1), torch.nan)
+
+
+def warp_image(image2: ImageArray, flow: FlowArray) -> ImageArray:
+    """A raster at x + flow(x), bilinear in float64, the border repeated outside; NaN where the flow is.
+
+    SciPy, not OpenCV: before version 5, `cv2.remap` rounds positions to 1/32 px.
+    """
+    from scipy.ndimage import map_coordinates
+
+    rows, columns = np.indices(flow.shape[:2], dtype=np.float64)
+    position = np.stack([rows + flow[..., 1], columns + flow[..., 0]])
+    unknown = np.isnan(position).any(axis=0)
+    position[:, unknown] = 0.0
+    channels = [map_coordinates(image2[..., c], position, order=1, mode="nearest") for c in range(image2.shape[2])]
+    warped = np.stack(channels, axis=-1).astype(np.float32)
+    warped[unknown] = np.nan
+    return warped
 
 
 def inside(flow: Flow) -> Mask:

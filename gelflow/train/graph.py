@@ -17,9 +17,6 @@ class GraphedNetwork:
     """A network in training whose passes over CUDA batches are replayed from a graph.
 
     Recorded at the first call, for its shape; batches of another shape take the network as it is.
-
-    Args:
-        model: The network, in training mode.
     """
 
     def __init__(self, model: GelFlow) -> None:

@@ -17,17 +17,19 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from gelflow.config import MINIMUM_SIDE, TrainConfig
 from gelflow.errors import InputError
-from gelflow.estimate import estimate_flow
 from gelflow.losses import flow_loss, self_supervised_loss
-from gelflow.losses.analogy import analogy_loss, transformed_pair
-from gelflow.losses.occlusion import visible_both_ways
+from gelflow.losses.augmentation_consistency import consistency_loss, transformed_pair
+from gelflow.losses.occlusion import visible_in_both_images
 from gelflow.losses.photometric import photometric_loss
 from gelflow.models import GelFlow
+from gelflow.models.estimate import estimate_flow
 from gelflow.ops.warp import inside, warp
 from gelflow.train.graph import GraphedNetwork
 
 LOG_EVERY = 10
 """Steps between entries in the logs."""
+METRICS = ("endpoint_error_px", "no_motion_endpoint_error_px", "psnr_db", "no_motion_psnr_db", "photometric_loss")
+"""Results of a validation: mean over the pairs that have them."""
 
 
 def learning_rate_factor(config: TrainConfig, step: int) -> float:
@@ -41,14 +43,7 @@ def learning_rate_factor(config: TrainConfig, step: int) -> float:
 
 
 class FlowModule(L.LightningModule):
-    """Training of one network.
-
-    Args:
-        config: The run.
-        model: The network, at the state it starts from.
-        start: Steps that were done before.
-        optimiser: State of the optimiser after those steps, or None.
-        average: State of the weights' moving average after those steps, or None.
+    """Training of one network, from the state that it has after `start` steps, with optimiser and moving average.
 
     Attributes:
         metrics: Results of the last validation, see `validation_metrics`.
@@ -72,7 +67,7 @@ class FlowModule(L.LightningModule):
             if average is not None:
                 self.average.load_state_dict(average)
         # In a tuple, because a submodule's parameters would count twice: they are the model's own.
-        self._network: tuple[Any] = (torch.compile(model) if config.compile else model,)
+        self._network: tuple[Any] = (model,)
         self.start = start
         self.optimiser_state = optimiser
         self.metrics: dict[str, float] = {}
@@ -81,12 +76,12 @@ class FlowModule(L.LightningModule):
 
     @property
     def network(self) -> Any:
-        """The network as it is called once a step: compiled or recorded where the configuration asks for it."""
+        """The network as it is called once a step: recorded where the configuration asks for it."""
         return self._network[0]
 
     def on_fit_start(self) -> None:
         """Prepares for the device."""
-        if self.config.cuda_graph and self.device.type == "cuda" and not self.config.compile:
+        if self.config.cuda_graph and self.device.type == "cuda":
             self._network = (GraphedNetwork(self.model),)
 
     @property
@@ -137,14 +132,14 @@ class FlowModule(L.LightningModule):
             loss = loss + share * supervised
         if not bool(known.all()):
             others = ~known.repeat(image1.shape[0] // pairs)
-            alone, more = self._judged([flow[others] for flow in flows], image1[others], image2[others])
+            alone, more = self._loss_of_images([flow[others] for flow in flows], image1[others], image2[others])
             loss, parts = loss + (1 - share) * self.config.mixed_self * alone, parts | more
         return loss, parts
 
     def _self_supervised(self, image1: Tensor, image2: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss without truth."""
         image1, image2 = self._directions(image1, image2)
-        return self._judged(self.network(image1, image2), image1, image2)
+        return self._loss_of_images(self.network(image1, image2), image1, image2)
 
     def _directions(self, image1: Tensor, image2: Tensor) -> tuple[Tensor, Tensor]:
         """The pairs, and after them the same with their images exchanged where occlusion asks for both directions."""
@@ -152,21 +147,21 @@ class FlowModule(L.LightningModule):
             return image1, image2
         return torch.cat([image1, image2]), torch.cat([image2, image1])
 
-    def _judged(self, flows: list[Tensor], image1: Tensor, image2: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """The self-supervised loss of flows of `_directions`, with a second pass where lambda_ar asks for one now."""
+    def _loss_of_images(self, flows: list[Tensor], image1: Tensor, image2: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """The self-supervised loss of flows of `_directions`, with a second pass where lambda_ar asks for one."""
         config, visible = self.config.loss, None
-        trusted = not config.second_stage or self.step >= config.second_stage * self.config.steps
-        if config.occlusion == "forward_backward" and trusted:
+        in_stage = not config.second_stage or self.step >= config.second_stage * self.config.steps
+        if config.occlusion == "forward_backward" and in_stage:
             there, back = flows[0].chunk(2)
-            visible = visible_both_ways(flows[0], torch.cat([back, there]))
+            visible = visible_in_both_images(flows[0], torch.cat([back, there]))
         loss, parts = self_supervised_loss(flows, image1, image2, config, visible)
-        if config.lambda_ar > 0 and trusted:
+        if config.lambda_ar > 0 and in_stage:
             # Fixed by (seed, step), so that a resumed run shows the same.
             random = torch.Generator().manual_seed(self.config.seed * 1_000_003 + self.step)
             first, second, target, pixels = transformed_pair(image1, image2, flows[0].detach(), random)
             # Not `network`, which a step may call only once.
-            analogy = config.lambda_ar * analogy_loss(self.model(first, second)[0], target, pixels)
-            loss, parts = loss + analogy, parts | {"analogy": analogy.detach()}
+            consistency = config.lambda_ar * consistency_loss(self.model(first, second)[0], target, pixels)
+            loss, parts = loss + consistency, parts | {"consistency": consistency.detach()}
         return loss, parts
 
     def optimizer_step(self, *arguments: Any, **options: Any) -> None:
@@ -212,16 +207,6 @@ class FlowModule(L.LightningModule):
             logger.log_metrics(values, step)
 
 
-METRICS = (
-    "endpoint_error_px",
-    "no_motion_endpoint_error_px",
-    "psnr_db",
-    "no_motion_psnr_db",
-    "photometric_loss",
-)
-"""Results of a validation: mean over the pairs that have them."""
-
-
 def check_side(batch: dict[str, Any], config: TrainConfig) -> None:
     """Refuses a validation pair, as a batch of one, that is too small for the network.
 
@@ -237,11 +222,6 @@ def check_side(batch: dict[str, Any], config: TrainConfig) -> None:
 def validation_metrics(batch: dict[str, Any], flow: Tensor, config: TrainConfig) -> dict[str, Tensor]:
     """How good the flow of one pair is: against the truth where there is one, and by the warped image.
 
-    Args:
-        batch: One pair as a batch of one.
-        flow: (1, 2, H, W), px of its images.
-        config: For the photometric loss.
-
     Returns:
         Scalars by the names in `METRICS`; endpoint errors only where a flow is known. PSNR is that of floats over the
         pixels that stay inside the image, not the 8-bit one of the comparison tables.
@@ -251,7 +231,7 @@ def validation_metrics(batch: dict[str, Any], flow: Tensor, config: TrainConfig)
     metrics = {
         "psnr_db": _psnr(image1, image2, flow),
         "no_motion_psnr_db": _psnr(image1, image2, still),
-        "photometric_loss": photometric_loss(image1, image2, flow, config.loss.alpha, config.loss.mask_outside),
+        "photometric_loss": photometric_loss(image1, image2, flow, config.loss.alpha),
     }
     if "flow" in batch:
         truth = batch["flow"]

@@ -5,11 +5,8 @@ run, so that a resumed run validates where an uninterrupted one does. On a CPU, 
 end with the same weights, bit by bit.
 """
 
-import logging
 import sys
-import warnings
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,22 +19,17 @@ from torch.utils.data import DataLoader, Dataset
 
 from gelflow.config import TrainConfig
 from gelflow.errors import InputError
+from gelflow.files.quiet import quiet_logger
+from gelflow.hardware import chosen_device
 from gelflow.models import GelFlow
+from gelflow.models.weights import load_weights, save_weights
 from gelflow.terminal import progress
-from gelflow.train.checkpoint import load_weights, save_weights
-from gelflow.train.keeper import (
-    Keeper,
-    Stopped,
-    describe,
-    is_first_process,
-    stopping,
-    weights_metadata,
-)
+from gelflow.train.callback import CheckpointCallback, Stopped, describe, is_first_process, stopping, weights_metadata
 from gelflow.train.loading import end_with_run
 from gelflow.train.module import FlowModule, check_side
 from gelflow.train.resident import ResidentPairs, resident
 from gelflow.train.samples import CheckedPairs, StepSampler, TrainingBatches, TrainingSamples, checked, collate
-from gelflow.train.state import STATE, WEIGHTS, load_state, open_run
+from gelflow.train.state import STATE, WEIGHTS, State, load_state, open_run
 from gelflow.train.throughput import peak_memory_mib
 
 
@@ -45,13 +37,9 @@ from gelflow.train.throughput import peak_memory_mib
 class TrainResult:
     """What a run ended with.
 
-    Attributes:
-        weights: File of the best weights on the validation pairs; without such pairs, of the last.
-        steps: Optimiser steps done.
-        metrics: Results of the last validation (`gelflow.train.module.METRICS`); empty without validation pairs.
-        best: Best validation score: endpoint error in px where the flow is known, else photometric loss; else None.
-        pairs_per_second: Of this session after its first step, validation left out; None if it did fewer than two.
-        memory_mib: Peak memory of the device (on a CPU: of the process), MiB; None where it is not known.
+    `weights` are the best on the validation pairs, without such pairs the last; `metrics` those of the last validation
+    (`gelflow.train.module.METRICS`); `best` the best validation score: endpoint error in px where the flow is known,
+    else photometric loss. Speed (of this session, validation left out) and peak memory are None where unknown.
     """
 
     weights: Path
@@ -106,30 +94,23 @@ def train(
     if validation_set is not None:
         check_side(_one_pair([validation_set[0]]), config)
     if is_first_process():
-        data = {
-            "pairs": pairs,
-            "digest": getattr(train_set, "digest", None),
-            "validation_pairs": validation_pairs,
-            "validation_digest": getattr(validation_set, "digest", None),
-        }
+        data = {"pairs": pairs, "digest": getattr(train_set, "digest", None), "validation_pairs": validation_pairs,
+                "validation_digest": getattr(validation_set, "digest", None)}  # fmt: skip
         state = open_run(out, config, data, initial, resume)
     else:
         state = load_state(out) if resume else None
-    if state is not None:
-        model.load_state_dict(state.model)
     if state is None:
-        module = FlowModule(config, model)
-    else:
-        module = FlowModule(config, model, state.step, state.optimiser, state.average)
-    keeper = Keeper(config, out, validation_pairs > 0, state.score if state else None, state.metrics if state else {})
-    validation_due = state is not None and state.validation_due
-    if module.start < config.steps or validation_due:
-        _fit(module, keeper, _Data(config, train_set, validation_set, module), device, validation_due)
+        state = State(0, model.state_dict(), None, None, {})
+    model.load_state_dict(state.model)
+    module = FlowModule(config, model, state.step, state.optimiser, state.average)
+    callback = CheckpointCallback(config, out, validation_pairs > 0, state.score, state.metrics)
+    if module.start < config.steps or state.validation_due:
+        _fit(module, callback, _Data(config, train_set, validation_set, module), device, state.validation_due)
     weights = out / WEIGHTS
     if validation_set is None and is_first_process():
         save_weights(weights, module.evaluated.cpu(), **weights_metadata(config, config.steps))
-    rate = keeper.throughput.pairs_per_second
-    return TrainResult(weights, config.steps, keeper.metrics, keeper.score, rate, peak_memory_mib())
+    rate = callback.throughput.pairs_per_second
+    return TrainResult(weights, config.steps, callback.metrics, callback.score, rate, peak_memory_mib())
 
 
 def _length(data: Dataset[Any]) -> int:
@@ -137,10 +118,7 @@ def _length(data: Dataset[Any]) -> int:
 
 
 def _device(config: TrainConfig) -> str:
-    available = torch.cuda.is_available()
-    if config.device == "cuda" and not available:
-        raise InputError("device = cuda: no CUDA device was found; use device = cpu")
-    device = ("cuda" if available else "cpu") if config.device == "auto" else config.device
+    device = chosen_device(config.device)
     if device == "cuda" and config.devices > torch.cuda.device_count():
         raise InputError(f"devices = {config.devices}: this machine has {torch.cuda.device_count()} CUDA devices")
     return device
@@ -157,25 +135,23 @@ def _initial_network(config: TrainConfig, initial: Path | None) -> GelFlow:
         model.config = model.config.model_copy(update={"registration": config.model.registration})
         if model.config != config.model:
             theirs, ours = model.config.model_dump(), config.model.model_dump()
-            names = [
-                f"{name}: {theirs[name]!r} there, {ours[name]!r} here" for name in ours if theirs[name] != ours[name]
-            ]
+            names = [f"{key}: {theirs[key]!r} there, {ours[key]!r} here" for key in ours if theirs[key] != ours[key]]
             raise InputError(f"{initial}: its architecture is not that of the run ({'; '.join(names)})")
     model.image_size = config.image_size
     return model.train()
 
 
-def _fit(module: FlowModule, keeper: Keeper, data: "_Data", device: str, validation_due: bool) -> None:
+def _fit(module: FlowModule, callback: CheckpointCallback, data: "_Data", device: str, validation_due: bool) -> None:
     """Validates first where that is due, then runs the remaining steps.
 
     Raises:
         InputError: A pair cannot be used.
         KeyboardInterrupt: Somebody asked to stop; the message says how to go on.
     """
-    config, out = keeper.config, keeper.out
+    config, out = callback.config, callback.out
     session = f"from_step_{module.start:06d}"
     with ExitStack() as stack:
-        stack.enter_context(_quiet())
+        stack.enter_context(quiet_logger("lightning.pytorch", r"lightning\..*"))  # notes on hardware, workers, products
         trainer = L.Trainer(
             accelerator="gpu" if device == "cuda" else "cpu",
             devices=config.devices,
@@ -189,7 +165,7 @@ def _fit(module: FlowModule, keeper: Keeper, data: "_Data", device: str, validat
                 TensorBoardLogger(out / "logs", name="tensorboard", version=session),
                 CSVLogger(out / "logs", name="csv", version=session),
             ],
-            callbacks=[keeper],
+            callbacks=[callback],
             enable_checkpointing=False,
             enable_progress_bar=False,
             enable_model_summary=False,
@@ -197,8 +173,8 @@ def _fit(module: FlowModule, keeper: Keeper, data: "_Data", device: str, validat
             use_distributed_sampler=False,
             reload_dataloaders_every_n_epochs=1,
         )
-        keeper.advance = stack.enter_context(progress("training", shown=trainer.is_global_zero))
-        stack.enter_context(stopping(keeper))
+        callback.advance = stack.enter_context(progress("training", shown=trainer.is_global_zero))
+        stack.enter_context(stopping(callback))
         try:
             trainer.fit(module, datamodule=data)
         except (Stopped, SIGTERMException):  # Lightning raises the latter for a signal before the first step
@@ -242,13 +218,8 @@ class _Data(L.LightningDataModule):
         sampler = StepSampler(len(self.train_set), config, start, stop, trainer.global_rank, trainer.world_size)
         samples = TrainingSamples(self.train_set, config)
         workers = 0 if isinstance(self.train_set, ResidentPairs) else config.workers
-        return DataLoader(
-            samples,
-            batch_sampler=sampler,
-            num_workers=workers,
-            collate_fn=TrainingBatches(config),
-            worker_init_fn=end_with_run,
-        )
+        return DataLoader(samples, batch_sampler=sampler, num_workers=workers, collate_fn=TrainingBatches(config),
+                          worker_init_fn=end_with_run)  # fmt: skip
 
     def _cache(self) -> None:
         """Puts the training pairs on the device, once, where the configuration and the memory allow it."""
@@ -270,29 +241,9 @@ class _Data(L.LightningDataModule):
             return []
         trainer = self.module.trainer
         mine = range(trainer.global_rank, _length(self.validation_set), trainer.world_size)
-        return DataLoader(
-            self.validation_set,
-            batch_size=1,
-            sampler=mine,
-            num_workers=self.config.workers,
-            collate_fn=_one_pair,
-            worker_init_fn=end_with_run,
-        )
+        return DataLoader(self.validation_set, batch_size=1, sampler=mine, num_workers=self.config.workers,
+                          collate_fn=_one_pair, worker_init_fn=end_with_run)  # fmt: skip
 
 
 def _one_pair(samples: list[dict[str, Any]]) -> dict[str, Any]:
     return collate([checked(sample) for sample in samples])
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keeps Lightning's notes on hardware, workers and products off the terminal; warnings of torch stay."""
-    logger = logging.getLogger("lightning.pytorch")
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", module=r"lightning\..*")
-            yield
-    finally:
-        logger.setLevel(level)

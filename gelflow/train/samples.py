@@ -54,12 +54,7 @@ class StepSampler(Sampler[list[tuple[int, int]]]):
 
 
 class CheckedPairs(Dataset[Sample]):
-    """Pairs with what training needs of them, see `checked`; a pair that cannot be used is refused.
-
-    Args:
-        pairs: Map-style, with a length.
-        supervised: Whether every pair must have an exact flow.
-    """
+    """Pairs with what training needs of them, see `checked`; a pair that cannot be used is refused."""
 
     def __init__(self, pairs: Dataset[Any], supervised: bool) -> None:
         self.pairs = pairs
@@ -146,17 +141,17 @@ def resized(sample: Sample, size: tuple[int, int]) -> Sample:
 def cropped(sample: Sample, config: TrainConfig, random: np.random.Generator) -> Sample:
     """A random crop of the configuration's size, if it has one.
 
-    Images that are judged by their flow and are smaller than the crop are continued beyond their border by its colours,
-    with no flow there, so that data sets of several sensors can be trained on together.
+    Images whose flow is known and that are smaller than the crop are continued beyond their border by its colours, with
+    no flow there, so that data sets of several sensors can be trained on together.
 
     Raises:
-        InputError: The crop does not fit into images that are judged on themselves.
+        InputError: The crop does not fit into images without a flow.
     """
     if config.crop_size is None:
         return sample
     rows, columns = config.crop_size
     height, width = sample["image1"].shape[-2:]
-    if (rows > height or columns > width) and not _judged_by_flow(sample, config):
+    if (rows > height or columns > width) and not _supervised(sample, config):
         raise InputError(f"pair {sample['name']}: crop_size {rows}x{columns} does not fit into its {height}x{width} px")
     down, right = max(rows - height, 0), max(columns - width, 0)
     above, before = random.integers(down + 1), random.integers(right + 1)
@@ -172,7 +167,7 @@ def cropped(sample: Sample, config: TrainConfig, random: np.random.Generator) ->
     return new
 
 
-def _judged_by_flow(sample: Sample, config: TrainConfig) -> bool:
+def _supervised(sample: Sample, config: TrainConfig) -> bool:
     if config.supervision == "mixed":
         return "flow" in sample and bool(torch.isfinite(sample["flow"]).any())
     return config.supervision == "flow"

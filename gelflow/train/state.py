@@ -18,10 +18,10 @@ import torch
 
 from gelflow import __version__
 from gelflow.config import TrainConfig
+from gelflow.config.validation import validated
 from gelflow.errors import InputError
 from gelflow.files.atomic import refuse_foreign, replacing, write_text
 from gelflow.files.tensors import Unreadable, load_tensors
-from gelflow.schema_errors import validated
 
 RUN, STATE, WEIGHTS = "run.json", "state.ckpt", "weights.safetensors"
 
@@ -33,14 +33,8 @@ FREE = ("steps", "validate_every", "save_every", "workers", "device")
 class State:
     """Everything that a run resumes from.
 
-    Attributes:
-        step: Optimiser steps done.
-        model: The network's state dictionary.
-        optimiser: The optimiser's state dictionary, or None at step 0.
-        score: Best validation score so far (lower is better), or None.
-        metrics: Results of the last validation.
-        average: State dictionary of the weights' moving average, where there is one.
-        validation_due: Whether the validation that follows the step is still to come.
+    `model`, `optimiser` and `average` (of the weights) are state dictionaries; `score` is the best validation score so
+    far, lower is better; `validation_due` says that the validation that follows the step is still to come.
     """
 
     step: int
@@ -82,13 +76,8 @@ def open_run(
 ) -> State | None:
     """Claims the folder for a new run, or checks that it holds this very run.
 
-    Args:
-        out: The folder; made where it is missing.
-        config: The run's settings.
-        data: What is known of the data sets: `pairs` and `validation_pairs` (0 without), their numbers, and the
-            `digest` and `validation_digest` (None where a data set has none).
-        initial: Weights that the run starts from.
-        resume: Go on with the run in the folder.
+    `data` is what is known of the data sets: `pairs` and `validation_pairs` (0 without), their numbers, and `digest`
+    and `validation_digest` (None where a data set has none). `initial` are the weights that the run starts from.
 
     Returns:
         The state to resume from; None for a new run.

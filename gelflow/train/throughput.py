@@ -4,7 +4,7 @@ import time
 
 import torch
 
-from gelflow.speed import process_peak
+from gelflow.hardware import process_memory
 
 
 class Throughput:
@@ -13,7 +13,7 @@ class Throughput:
     def __init__(self) -> None:
         self._pairs = 0
         self._started: float | None = None
-        self._paused: float | None = None
+        self._paused = 0.0
 
     def add(self, pairs: int) -> None:
         """Counts the pairs of a step that has ended."""
@@ -28,21 +28,18 @@ class Throughput:
 
     def resume(self) -> None:
         """Lets the clock run on."""
-        if self._paused is not None and self._started is not None:
+        if self._started is not None:
             self._started += time.perf_counter() - self._paused
-        self._paused = None
 
     @property
     def pairs_per_second(self) -> float | None:
         """Since the first step; None before the second has ended."""
-        if self._started is None or self._pairs == 0:
-            return None
-        return self._pairs / (time.perf_counter() - self._started)
+        return self._pairs / (time.perf_counter() - self._started) if self._started and self._pairs else None
 
 
 def peak_memory_mib() -> float | None:
     """The most memory that torch held on the CUDA device, or on a CPU the process; MiB, None where it is not known."""
     if torch.cuda.is_available() and torch.cuda.is_initialized():
         return torch.cuda.max_memory_allocated() / 2**20
-    peak = process_peak()
+    peak = process_memory(peak=True)
     return None if peak is None else peak / 2**20

@@ -7,6 +7,7 @@ import pytest
 import torch
 from textures import moved
 
+from gelflow.arrays import ImageArray
 from gelflow.baselines import CLASSICAL, named_methods
 from gelflow.baselines.aldic import ALDIC, INSTALL
 from gelflow.baselines.registry import REGISTERED
@@ -14,7 +15,6 @@ from gelflow.baselines.scattered import dense_flow
 from gelflow.config import REGISTRATIONS, Registration
 from gelflow.errors import InputError
 from gelflow.models.registration import registered
-from gelflow.raster import ImageArray
 
 SHIFT = (0.7, -0.4)
 

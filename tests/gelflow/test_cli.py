@@ -76,11 +76,7 @@ def test_module_runs_and_passes_the_status_on() -> None:
     ],
 )
 def test_mistake_is_one_line_and_status_2(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    arguments: list[str],
-    word: str,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], word: str
 ) -> None:
     (tmp_path / "notes.txt").touch()
     monkeypatch.chdir(tmp_path)

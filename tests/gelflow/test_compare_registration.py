@@ -10,21 +10,21 @@ import pytest
 import torch
 from test_cli import fails
 from textures import write_folder
+from waves import random_weights, small
 
-import gelflow.compare
+import gelflow.compare.run
 import gelflow.models.gelflow
 from gelflow.baselines.learned import Learned
 from gelflow.cli import main
-from gelflow.compare import compare
-from gelflow.config import REGISTRATIONS, ModelConfig, Registration, RegistrationConfig, TrainConfig
+from gelflow.compare.run import compare
+from gelflow.compare.scores import evaluate
+from gelflow.compare.speed import Speed
+from gelflow.config import REGISTRATIONS, ModelConfig, Registration, RegistrationConfig
 from gelflow.data import open_pairs
-from gelflow.evaluate import evaluate
 from gelflow.files.exr import read_flow
-from gelflow.models import GelFlow
 from gelflow.models.raft import RAFT
 from gelflow.models.registration import registered
-from gelflow.speed import Speed
-from gelflow.train.checkpoint import read_metadata, save_weights
+from gelflow.models.weights import read_metadata
 
 OWN = RegistrationConfig(windows_px=(8,), smoothing_px=(4,))
 
@@ -35,13 +35,8 @@ BRIGHTNESS = REGISTRATIONS["brightness"]
 
 
 def network(path: Path, registration: RegistrationConfig | None) -> Path:
-    """Random weights of a small network, as a training leaves them."""
-    torch.set_num_threads(1)
-    torch.manual_seed(0)
     model = ModelConfig(levels=4, projected_channels=8, registration=registration)
-    config = TrainConfig.model_validate({"model": model, "loss": {"lambda_s": [1.0, 1.0, 1.0]}})
-    save_weights(path, GelFlow(model), train=config.model_dump_json(), step="0")
-    return path
+    return random_weights(path, model, small(model=model))
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +115,7 @@ def test_the_speed_of_the_network_alone_includes_it(own: Path, tmp_path: Path, m
             measured.append(passes(*images)[0].numpy())
         return Speed(1.0, None, 1, (64, 80), "here")
 
-    monkeypatch.setattr(gelflow.compare, "network_speed", kept)
+    monkeypatch.setattr(gelflow.compare.run, "network_speed", kept)
     method = Learned(own, "net", device="cpu")
     compare([method], dataset)
     np.testing.assert_array_equal(np.moveaxis(measured[0], 0, -1), method.flow(*dataset.images(0)))

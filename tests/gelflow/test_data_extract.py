@@ -21,7 +21,9 @@ def recording(shifts: list[float], seed: int = 0) -> list[Frame]:
     return [as_bytes(moved(96, 128, shift, 0, seed)) for shift in shifts]
 
 
-def two_videos(folder: Path) -> Path:
+@pytest.fixture
+def videos(tmp_path: Path) -> Path:
+    folder = tmp_path / "videos"
     folder.mkdir()
     write_video(folder / "a.avi", recording([0, 0.2, 3, 6, 9, 9.1], seed=1))
     write_video(folder / "b.avi", recording([0, 5, 0, 4, 8, 2], seed=2))
@@ -32,9 +34,8 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-def test_chosen_motion_is_the_true_one_and_within_the_limits(tmp_path: Path) -> None:
+def test_chosen_motion_is_the_true_one_and_within_the_limits(tmp_path: Path, videos: Path) -> None:
     shifts = {"a": [0, 0.2, 3, 6, 9, 9.1], "b": [0, 5, 0, 4, 8, 2]}
-    videos = two_videos(tmp_path / "videos")
     result = extract_pairs([str(videos)], tmp_path / "out", ChoiceConfig(per_source=4, maximum_motion_px=7))
     assert {pair.source for pair in result.pairs} == {"a", "b"}
     for pair in result.pairs:
@@ -46,8 +47,7 @@ def test_chosen_motion_is_the_true_one_and_within_the_limits(tmp_path: Path) -> 
         assert 2 <= pair.motion_px <= 7
 
 
-def test_pair_set_can_be_opened_and_holds_the_frames(tmp_path: Path) -> None:
-    videos = two_videos(tmp_path / "videos")
+def test_pair_set_can_be_opened_and_holds_the_frames(tmp_path: Path, videos: Path) -> None:
     result = extract_pairs([str(videos / "a.avi")], tmp_path / "out", ChoiceConfig(per_source=2))
     dataset = open_pairs(tmp_path / "out")
     assert dataset.names == [pair.name for pair in result.pairs]
@@ -57,8 +57,7 @@ def test_pair_set_can_be_opened_and_holds_the_frames(tmp_path: Path) -> None:
     assert np.abs(image1 - expected).mean() < 5 / 255
 
 
-def test_same_seed_gives_the_same_bytes_and_another_seed_another_choice(tmp_path: Path) -> None:
-    videos = two_videos(tmp_path / "videos")
+def test_same_seed_gives_the_same_bytes_and_another_seed_another_choice(tmp_path: Path, videos: Path) -> None:
     for out in ("one", "two"):
         extract_pairs([str(videos)], tmp_path / out, ChoiceConfig(per_source=2))
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
@@ -69,15 +68,13 @@ def test_same_seed_gives_the_same_bytes_and_another_seed_another_choice(tmp_path
     assert len(seeds) > 1
 
 
-def test_a_recording_gives_the_same_pairs_alone_and_among_others(tmp_path: Path) -> None:
-    videos = two_videos(tmp_path / "videos")
+def test_a_recording_gives_the_same_pairs_alone_and_among_others(tmp_path: Path, videos: Path) -> None:
     both = extract_pairs([str(videos)], tmp_path / "both", ChoiceConfig(per_source=3))
     alone = extract_pairs([str(videos / "b.avi")], tmp_path / "alone", ChoiceConfig(per_source=3))
     assert [pair for pair in both.pairs if pair.source == "b"] == list(alone.pairs)
 
 
-def test_interrupted_job_goes_on_and_ends_with_the_same_bytes(tmp_path: Path) -> None:
-    videos = two_videos(tmp_path / "videos")
+def test_interrupted_job_goes_on_and_ends_with_the_same_bytes(tmp_path: Path, videos: Path) -> None:
     extract_pairs([str(videos)], tmp_path / "whole", ChoiceConfig())
 
     def interrupt(done: int, total: int, name: str, outcome: object) -> None:
@@ -92,16 +89,14 @@ def test_interrupted_job_goes_on_and_ends_with_the_same_bytes(tmp_path: Path) ->
     assert contents(tmp_path / "cut") == contents(tmp_path / "whole")
 
 
-def test_running_a_finished_job_again_changes_nothing(tmp_path: Path) -> None:
-    videos = two_videos(tmp_path / "videos")
+def test_running_a_finished_job_again_changes_nothing(tmp_path: Path, videos: Path) -> None:
     extract_pairs([str(videos)], tmp_path / "out", ChoiceConfig())
     before = {p: p.stat().st_mtime_ns for p in (tmp_path / "out").rglob("*")}
     extract_pairs([str(videos)], tmp_path / "out", ChoiceConfig())
     assert {p: p.stat().st_mtime_ns for p in (tmp_path / "out").rglob("*")} == before
 
 
-def test_folder_of_another_job_is_refused_with_the_difference(tmp_path: Path) -> None:
-    videos = two_videos(tmp_path / "videos")
+def test_folder_of_another_job_is_refused_with_the_difference(tmp_path: Path, videos: Path) -> None:
     extract_pairs([str(videos)], tmp_path / "out", ChoiceConfig())
     with pytest.raises(InputError, match=r"seed is 0 there and 7 here"):
         extract_pairs([str(videos)], tmp_path / "out", ChoiceConfig(seed=7))
@@ -111,8 +106,9 @@ def test_folder_of_another_job_is_refused_with_the_difference(tmp_path: Path) ->
         extract_pairs([str(videos)], videos, ChoiceConfig())
 
 
-def test_undecodable_video_is_counted_the_others_are_used(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    videos = two_videos(tmp_path / "videos")
+def test_undecodable_video_is_counted_the_others_are_used(
+    tmp_path: Path, videos: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     (videos / "broken.avi").write_bytes(b"RIFF" + b"junk" * 500)
     (videos / "empty.mp4").touch()
     result = extract_pairs([str(videos)], tmp_path / "out", ChoiceConfig())
@@ -170,8 +166,7 @@ def test_unrelated_frames_are_seldom_a_pair() -> None:
     assert choices.rejected["unreliable"] >= 12
 
 
-def test_inputs_are_found_by_file_folder_and_pattern(tmp_path: Path) -> None:
-    videos = two_videos(tmp_path / "videos")
+def test_inputs_are_found_by_file_folder_and_pattern(tmp_path: Path, videos: Path) -> None:
     expected = [("a", videos / "a.avi"), ("b", videos / "b.avi")]
     for inputs in ([str(videos)], [f"{videos}/*.avi"], [str(videos / "b.avi"), str(videos / "a.avi")]):
         assert [(r.name, r.path) for r in find_recordings(inputs)] == expected
@@ -188,9 +183,9 @@ def test_inputs_that_hold_nothing_are_named(tmp_path: Path) -> None:
     "config",
     [ChoiceConfig(per_source=0), ChoiceConfig(frames=1), ChoiceConfig(tries=0), ChoiceConfig(minimum_motion_px=99)],
 )
-def test_settings_out_of_range_are_refused(tmp_path: Path, config: ChoiceConfig) -> None:
+def test_settings_out_of_range_are_refused(tmp_path: Path, videos: Path, config: ChoiceConfig) -> None:
     with pytest.raises(InputError):
-        extract_pairs([str(two_videos(tmp_path / "v"))], tmp_path / "out", config)
+        extract_pairs([str(videos)], tmp_path / "out", config)
     assert not (tmp_path / "out").exists()
 
 

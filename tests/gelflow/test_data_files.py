@@ -10,12 +10,12 @@ import pytest
 from PIL import ExifTags, Image, ImageOps
 from textures import as_bytes, moved, save
 
+from gelflow.arrays import FlowArray
 from gelflow.errors import InputError
 from gelflow.files.atomic import replacing
 from gelflow.files.exr import read_channels, read_flow, write_flow
-from gelflow.files.flo import read_flo, write_flo
+from gelflow.files.flo import write_flo
 from gelflow.files.image import read_image, read_pair, write_png
-from gelflow.raster import FlowArray
 
 
 def some_flow() -> FlowArray:
@@ -24,9 +24,10 @@ def some_flow() -> FlowArray:
     return flow
 
 
-def test_flo_round_trip_keeps_every_bit_and_nan(tmp_path: Path) -> None:
+def test_flo_is_read_by_opencv_with_every_bit(tmp_path: Path) -> None:
     write_flo(tmp_path / "a.flo", some_flow())
-    np.testing.assert_array_equal(read_flo(tmp_path / "a.flo"), some_flow())
+    found = cv2.readOpticalFlow(str(tmp_path / "a.flo"))
+    np.testing.assert_array_equal(np.where(found > 1e9, np.nan, found), some_flow())
 
 
 def test_flo_is_middleburys_layout(tmp_path: Path) -> None:
@@ -68,14 +69,9 @@ def _exr(path: Path) -> None:
     write_flow(path, some_flow())
 
 
-def _flo(path: Path) -> None:
-    write_flo(path, some_flow())
-
-
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.7, 0.99])
 @pytest.mark.parametrize(
-    ("name", "write", "read"),
-    [("a.png", _png, read_image), ("a.jpg", _jpg, read_image), ("a.exr", _exr, read_flow), ("a.flo", _flo, read_flo)],
+    ("name", "write", "read"), [("a.png", _png, read_image), ("a.jpg", _jpg, read_image), ("a.exr", _exr, read_flow)]
 )
 def test_truncated_file_is_named(
     tmp_path: Path,
@@ -95,9 +91,7 @@ def test_truncated_file_is_named(
     assert capfd.readouterr() == ("", "")  # the libraries below keep quiet
 
 
-@pytest.mark.parametrize(
-    ("name", "write", "read"), [("a.png", _png, read_image), ("a.exr", _exr, read_flow), ("a.flo", _flo, read_flo)]
-)
+@pytest.mark.parametrize(("name", "write", "read"), [("a.png", _png, read_image), ("a.exr", _exr, read_flow)])
 def test_missing_and_foreign_files_are_named(
     tmp_path: Path, name: str, write: Callable[[Path], None], read: Callable[[Path], object]
 ) -> None:

@@ -12,34 +12,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from textures import as_bytes, moved
+from synth_samples import synth_sample, write_dataset
+from waves import same_weights, small
 
 from gelflow.cli import main
-from gelflow.config import TrainConfig
 from gelflow.data import PairDataset, open_pairs
 from gelflow.errors import InputError
 from gelflow.train import train
-from gelflow.train.checkpoint import load_weights
 from synth.dataset import export as exporting
-from synth.dataset.job import Job
 from synth.dataset.sample import Sample
-from synth.dataset.writer import DatasetWriter
-from synth.flow.field import FlowField
-from synth.scene import Scene
-from synth.surface import ContactFaces, GelSurface
 
-SIDE = 64
-SCENE = {
-    "name": "shards",
-    "sensor": {
-        "gel": {"size_mm": [4.0, 4.0, 1.0], "youngs_modulus_kpa": 100.0},
-        "pattern": {"kind": "none"},
-        "lights": [{"position_mm": [0.0, 0.0, 0.5], "size_mm": [1.0, 1.0], "color": [1.0, 1.0, 1.0], "power": 1.0}],
-        "camera": {"width": SIDE, "height": SIDE, "fx": 80, "fy": 80, "cx": 32, "cy": 32, "position_mm": [0, 0, 20]},
-    },
-    "contact": {"indenter": {"shape": "sphere", "radius_mm": 1.0}},
-    "motion": {"depth_mm": 0.1},
-}
 INDICES = (0, 1, 999999, 1000000)
 """With a gap, and with the last key before the first in the order of texts."""
 SETTINGS = """batch_size = 2
@@ -53,35 +35,9 @@ lambda_s = [1.0, 1.0, 1.0]
 """
 
 
-def sample(index: int, dtype: type = np.uint8, backward: bool = True) -> Sample:
-    """Waves that move, and random flow and visibility beside them: an exchange of any two arrays shows."""
-    rng = np.random.default_rng(index)
-    images: list[np.ndarray] = [as_bytes(moved(SIDE, SIDE, k * 1.5, -k, seed=index)).astype(dtype) for k in (0, 1)]
-    flows = rng.normal(0, 2, (2, SIDE, SIDE, 2)).astype(np.float32)
-    seen = (rng.random((2, SIDE, SIDE)) < 0.7).astype(np.float32)
-    flows[:, :4, :9], seen[:, :4, :9] = np.nan, 0
-    nodes = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float64)
-    field = FlowField(flows[0], seen[0], flows[1], seen[1]) if backward else FlowField(flows[0], seen[0])
-    return Sample(
-        index=index,
-        trajectory=0,
-        frames=(0, 1),
-        seed=1,
-        image1=images[0],
-        image2=images[1],
-        flow=field,
-        scene=Scene.model_validate(SCENE),
-        surface=GelSurface(ContactFaces(nodes, np.array([[0, 2, 1]], np.int32))),
-        displacement1=np.zeros((3, 3)),
-        displacement2=np.zeros((3, 3)),
-    )
-
-
 def write_both(parent: Path, samples: list[Sample]) -> tuple[Path, Path]:
     """A data set, and its shards of two samples each."""
-    with DatasetWriter(parent / "data", Job(scene=SCENE, scene_name="shards", scene_hash="0", seed=1, n=9)) as writer:
-        for one in samples:
-            writer.write(one)
+    write_dataset(parent / "data", samples)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(exporting, "SAMPLES_PER_SHARD", 2)
         exporting.export(parent / "data", "webdataset", parent / "shards")
@@ -91,7 +47,7 @@ def write_both(parent: Path, samples: list[Sample]) -> tuple[Path, Path]:
 @pytest.fixture(scope="module")
 def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     torch.set_num_threads(1)
-    return write_both(tmp_path_factory.mktemp("shards"), [sample(index) for index in INDICES])
+    return write_both(tmp_path_factory.mktemp("shards"), [synth_sample(index) for index in INDICES])
 
 
 @pytest.fixture
@@ -113,11 +69,13 @@ def all_bits(dataset: PairDataset) -> list[dict[str, tuple[object, ...]]]:
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_shards_give_the_bits_of_the_data_set(tmp_path: Path, dtype: type) -> None:
     """Fails with the order of keys as texts, visibility left out, and U and V exchanged."""
-    data, shards = (open_pairs(path) for path in write_both(tmp_path, [sample(index, dtype) for index in INDICES]))
+    data, shards = (
+        open_pairs(path) for path in write_both(tmp_path, [synth_sample(index, dtype) for index in INDICES])
+    )
     assert len(list((tmp_path / "shards").glob("*.tar"))) == 2
     assert shards.names == data.names == [f"{index:06d}" for index in INDICES]
     assert [record.scene for record in shards.records] == [record.scene for record in data.records]
-    assert shards.records[0].scene == "shards, none"
+    assert shards.records[0].scene == "toy, none"
     assert set(shards[0]) == {"image1", "image2", "name", "bare", "flow", "visible"}
     assert shards[0]["bare"] is True
     assert all_bits(shards) == all_bits(data)
@@ -130,7 +88,9 @@ def test_backward_flow_is_that_of_the_data_set(both: tuple[Path, Path]) -> None:
 
 
 def test_without_a_backward_flow_the_forward_one_is_read(tmp_path: Path) -> None:
-    data, shards = (open_pairs(path).both_directions() for path in write_both(tmp_path, [sample(0, backward=False)]))
+    data, shards = (
+        open_pairs(path).both_directions() for path in write_both(tmp_path, [synth_sample(0, backward=False)])
+    )
     assert bits(shards[0]) == bits(data[0])
     with pytest.raises(InputError, match=r"000000\.forward\.npy.*no backward flow"):
         shards[1]
@@ -156,25 +116,17 @@ def test_training_from_shards_gives_the_weights_of_the_data_set(both: tuple[Path
 
     Fails with the shards in reverse order.
     """
-    model = {"levels": 4, "projected_channels": 8}
     # Validated after two steps in both runs, so that both choose their best weights among the same.
-    values = {"batch_size": 2, "learning_rate": 1e-3, "device": "cpu", "validate_every": 2,
-              "loss": {"lambda_s": [1.0, 1.0, 1.0]}}  # fmt: skip
-    short, whole = (
-        TrainConfig.model_validate({**values, "model": model, "supervision": "flow", "steps": n}) for n in (2, 4)
-    )
+    short, whole = (small(supervision="flow", validate_every=2, steps=steps) for steps in (2, 4))
     data, shards = (open_pairs(path) for path in both)
     assert data.digest == shards.digest
     first = train(whole, data, data, tmp_path / "data")
     train(short, shards, shards, tmp_path / "shards")
     second = train(whole, shards, shards, tmp_path / "shards", resume=True)
-    weights, same = (load_weights(result.weights).state_dict() for result in (first, second))
-    assert all(torch.equal(weights[name], same[name]) for name in weights)
+    assert same_weights(first.weights, second.weights)
     assert first.metrics == second.metrics
     start = train(whole.model_copy(update={"steps": 1}), data, None, tmp_path / "one")
-    assert any(
-        not torch.equal(value, weights[name]) for name, value in load_weights(start.weights).state_dict().items()
-    )
+    assert not same_weights(start.weights, first.weights)
 
 
 def test_commands_take_shards(both: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -204,52 +156,31 @@ def offsets(shard: Path) -> list[tarfile.TarInfo]:
         return archive.getmembers()
 
 
-def _inside_a_member(shard: Path) -> bytes:
-    return shard.read_bytes()[: offsets(shard)[-2].offset_data + 100]
+def cut(place: Callable[[list[tarfile.TarInfo]], int]) -> Callable[[Path], bytes]:
+    """The shard up to a place that depends on where its members lie."""
+    return lambda shard: shard.read_bytes()[: place(offsets(shard))]
 
 
-def _inside_a_header(shard: Path) -> bytes:
-    return shard.read_bytes()[: offsets(shard)[-1].offset + 100]
-
-
-def _between_members(shard: Path) -> bytes:
-    return shard.read_bytes()[: offsets(shard)[-1].offset]
-
-
-def _between_samples(shard: Path) -> bytes:
-    return shard.read_bytes()[: offsets(shard)[7].offset]
-
-
-def _in_the_last_padding(shard: Path) -> bytes:
-    last = offsets(shard)[-1]
-    return shard.read_bytes()[: last.offset_data + last.size]
-
-
-def _header_flipped(shard: Path) -> bytes:
+def header_flipped(shard: Path) -> bytes:
     data = bytearray(shard.read_bytes())
     data[offsets(shard)[7].offset + 3] ^= 1
     return bytes(data)
 
 
-def _zipped(shard: Path) -> bytes:
-    return gzip.compress(shard.read_bytes())
+DAMAGE = {
+    "inside a member": cut(lambda members: members[-2].offset_data + 100),
+    "inside a header": cut(lambda members: members[-1].offset + 100),
+    "between members": cut(lambda members: members[-1].offset),
+    "between samples": cut(lambda members: members[7].offset),
+    "in the last padding": cut(lambda members: members[-1].offset_data + members[-1].size),
+    "header flipped": header_flipped,
+    "zipped": lambda shard: gzip.compress(shard.read_bytes()),
+    "text": lambda shard: b"not a tar file " * 100,
+    "nothing": lambda shard: b"",
+}
 
 
-def _text(shard: Path) -> bytes:
-    return b"not a tar file " * 100
-
-
-def _nothing(shard: Path) -> bytes:
-    return b""
-
-
-DAMAGE = [
-    _inside_a_member, _inside_a_header, _between_members, _between_samples, _in_the_last_padding, _header_flipped,
-    _zipped, _text, _nothing,
-]  # fmt: skip
-
-
-@pytest.mark.parametrize("damage", DAMAGE)
+@pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE.keys())
 def test_truncated_and_damaged_shards_are_named(shard: Path, damage: Callable[[Path], bytes]) -> None:
     """Fails without the look at the end of the tar: tarfile then gives the samples before a damaged header as all."""
     assert len(open_pairs(shard)) == 2

@@ -1,22 +1,27 @@
-"""The sum over scales, the endpoint loss, and their configuration."""
+"""The sum over scales, the endpoint loss, and what `best` and ARFlow's configuration add to them."""
 
 import pytest
 import torch
 from torch import Tensor
 from torch.autograd import gradcheck
-from waves import moved_pair, press_flow
+from waves import moved_pair, pixel_centres, press_flow
 
 from gelflow.config import LossConfig
+from gelflow.config.sources import train_config
 from gelflow.losses import flow_loss, self_supervised_loss
+from gelflow.losses.augmentation_consistency import consistency_loss, transformed_pair
 from gelflow.losses.endpoint import SOFTNESS_PX, endpoint_loss
+from gelflow.losses.occlusion import visible_in_both_images
+from gelflow.losses.smoothness import second_order_loss
 from gelflow.ops.pyramid import flow_pyramid
+from gelflow.ops.warp import inside, warp
 
 CONFIGS = [
     LossConfig(),
     LossConfig(smoothness="first_order"),
     LossConfig(ratio="det", weight="edge_aware"),
     LossConfig(weight="floor"),
-    LossConfig(smoothness="none"),
+    LossConfig(lambda_dc=0, lambda_df=0),
 ]
 
 
@@ -116,16 +121,131 @@ def test_the_flow_loss_is_zero_for_the_truth_at_all_scales_and_grows_with_the_er
     assert flow_loss([0.9 * field for field in filled], truth, config)[0] > 0
 
 
-def test_gradients_agree_with_finite_differences() -> None:
+def test_the_flow_loss_has_the_gradient_of_finite_differences() -> None:
     random = torch.Generator().manual_seed(3)
-    images = torch.rand(2, 1, 3, 8, 8, generator=random, dtype=torch.float64)
     flows = [
         (0.1 + 0.8 * torch.rand(1, 2, 8 >> s, 8 >> s, generator=random, dtype=torch.float64)).requires_grad_()
         for s in range(3)
     ]
     truth = torch.randn(1, 2, 8, 8, generator=random, dtype=torch.float64)
     truth[..., 3] = torch.nan
-    for options in ({}, {"smoothness": "first_order"}, {"ratio": "det", "weight": "edge_aware", "lambda_df": 3.0}):
-        config = LossConfig(lambda_s=(1.0, 0.5, 2.0), **options)
-        assert gradcheck(lambda *f, c=config: self_supervised_loss(list(f), *images, c)[0], flows)
     assert gradcheck(lambda *f: flow_loss(list(f), truth, LossConfig(lambda_s=(1.0, 0.5, 2.0)))[0], flows)
+
+
+def random(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_second_order_is_zero_for_affine_flows_and_known_for_a_parabola() -> None:
+    x, y = pixel_centres(10, 12)
+    image = torch.zeros(1, 3, 10, 12, dtype=torch.float64)
+    affine = torch.stack([0.3 * x - 0.2 * y + 1, 0.1 * x + 0.4 * y])[None]
+    assert second_order_loss(affine, image) < 1e-13  # differences of numbers up to 5
+    bent = torch.stack([0.05 * x**2, 0.1 * y**2])[None]
+    # u_xx = 0.1, v_yy = 0.2, each counted once, halved
+    assert second_order_loss(bent, image).item() == pytest.approx(0.15, abs=1e-12)
+    assert second_order_loss(bent[..., :2, :], image[..., :2, :]) == 0
+
+
+def test_spline_warping_is_exact_at_pixels_and_blurs_less_between() -> None:
+    flow = torch.full((1, 2, 40, 48), 0.5, dtype=torch.float64)
+    image1, image2 = (image[None] for image in moved_pair(flow[0], seed=6, shortest=6, longest=18))
+    inner = (..., slice(4, -4), slice(4, -4))
+    errors = [(warp(image2, flow, mode) - image1)[inner].abs().mean().item() for mode in ("bilinear", "spline")]
+    # At half a px along one axis a wave of length L is multiplied by c(1), c(n) = cos(n pi / L), bilinearly, and by
+    # (23 c(1) + c(3)) / (16 + 8 c(2)) by splines: for L = 6, 12, 18 off by .134, .034, .015 against .004, 2e-4, 4e-5.
+    assert errors[1] < errors[0] / 20
+    assert torch.allclose(warp(image2, 0 * flow, "spline"), image2, atol=1e-12)
+
+
+def test_occlusion_keeps_what_closes() -> None:
+    """Fails with the backward flow read at x in place of x + forward(x)."""
+    x, y = pixel_centres(40, 60)
+    # A stretch about the middle: forward x' = 1.4 x, backward exactly its inverse, so that x + forward closes.
+    forward = torch.stack([0.4 * (x - 30), 0.4 * (y - 20)])[None]
+    backward = torch.stack([(1 / 1.4 - 1) * (x - 30), (1 / 1.4 - 1) * (y - 20)])[None]
+    seen = visible_in_both_images(forward, backward)
+    stays = ((1.4 * (x - 30)).abs() <= 29.5) & ((1.4 * (y - 20)).abs() <= 19.5)
+    assert torch.equal(seen[0, 0] > 0, stays)
+    backward[..., 20:30] += 1.5  # a strip that goes elsewhere: 1.5^2 > 0.5 + 1 % of the motion
+    hidden = (1.4 * (x - 30) + 30 > 21.5) & (1.4 * (x - 30) + 30 < 28.5) & stays
+    assert not visible_in_both_images(forward, backward)[0, 0][hidden].any()
+
+
+def test_a_flow_that_closes_nowhere_hides_nothing() -> None:
+    """Else a loss over no pixel would leave a new network where it is. The second pair closes on a fifth."""
+    # Fails with the share taken over the batch.
+    forward, backward = torch.full((2, 2, 10, 20), 1.5), torch.full((2, 2, 10, 20), 1.5)
+    backward[1, :, :4] = -1.5
+    seen = visible_in_both_images(forward, backward)
+    stays = inside(forward)
+    assert torch.equal(seen[0], stays[0])
+    assert 0 < seen[1].mean() < 0.3
+
+
+def test_a_mask_removes_pixels_from_the_photometric_loss() -> None:
+    images = torch.rand(2, 1, 3, 64, 64, generator=random(3)).unbind()
+    flows = flow_pyramid(torch.zeros(1, 2, 64, 64), 3)
+    config = LossConfig(lambda_s=(1, 1, 1), lambda_dc=0, lambda_df=0, alpha=0)
+    broken = images[0].clone()
+    broken[..., 32:, :] = images[1][..., 32:, :]
+    mask = torch.ones(1, 1, 64, 64)
+    mask[..., :32, :] = 0
+    assert self_supervised_loss(flows, broken, images[1], config)[0] > 0.1
+    assert self_supervised_loss(flows, broken, images[1], config, mask)[0] == 0
+
+
+def test_the_transformed_pair_moves_as_its_flow_says() -> None:
+    """Fails with the flow not turned by the inverse of the transformation."""
+    flow = press_flow(120, 160, 3.0)[None]
+    image1, image2 = (image[None] for image in moved_pair(flow[0], seed=8, shortest=24, longest=60))
+    for seed in (1, 2, 3):
+        first, second, turned, pixels = transformed_pair(image1, image2, flow, random(seed))
+        mask = -torch.nn.functional.max_pool2d(-pixels, 9, stride=1, padding=4)
+
+        def error(field: Tensor, mask: Tensor = mask, first: Tensor = first, second: Tensor = second) -> float:
+            return (((warp(second, field) - first).abs()) * mask).sum().item() / mask.sum().item()
+
+        # Both images carry noise of 0.02: a mean difference of 0.02 * sqrt(2) * sqrt(2/pi) = 0.0226 per colour, three
+        # of them; interpolation adds less than a tenth.
+        assert error(turned) < 1.1 * 3 * 0.0226
+        assert error(turned) < min(error(0.8 * turned), error(1.2 * turned), error(flow.to(turned)))
+        assert consistency_loss(turned, turned, pixels) == pytest.approx(0.01**0.4)
+
+
+def test_the_transformation_follows_the_generator() -> None:
+    flow, images = torch.rand(1, 2, 64, 64), torch.rand(2, 1, 3, 64, 64).unbind()
+    one, again, other = (transformed_pair(*images, flow, random(seed))[0] for seed in (4, 4, 5))
+    assert torch.equal(one, again)
+    assert not torch.equal(one, other)
+
+
+def test_best_judges_every_scale_so_that_the_true_flow_wins() -> None:
+    """At each scale that `best` judges, the truth beats no flow and 0.9 and 1.1 times itself.
+
+    The published loss does not: from s = 3 on it prefers less motion (the second assertion). Fails with
+    compare_at = "scale" in the preset.
+    """
+    flow = press_flow(240, 320, 8.0)[None]
+    image1, image2 = (image[None] for image in moved_pair(flow[0], seed=5))
+    flows = flow_pyramid(flow, 7)
+    best, paper = train_config("best").loss, train_config("paper").loss
+
+    def losses(config: LossConfig, scale: int) -> list[float]:
+        alone = config.model_copy(update={"lambda_s": tuple(float(s == scale) for s in range(7))})
+        return [self_supervised_loss([f * v for v in flows], image1, image2, alone)[0].item() for f in (1, 0, 0.9, 1.1)]
+
+    judged = [scale for scale, weight in enumerate(best.lambda_s) if weight > 0]
+    assert judged == [0, 3, 4]
+    for scale in judged:
+        truth, *others = losses(best, scale)
+        assert truth < min(others)
+    truth, _, less, _ = losses(paper, 4)
+    assert less < truth
+
+
+def test_the_consistency_loss_has_the_gradient_of_its_formula() -> None:
+    target = torch.rand(1, 2, 5, 6, generator=random(7), dtype=torch.float64)
+    flow = (target + 0.2 + torch.rand(1, 2, 5, 6, generator=random(8), dtype=torch.float64)).requires_grad_()
+    pixels = (torch.rand(1, 1, 5, 6, generator=random(9)) > 0.3).double()
+    assert gradcheck(lambda f: consistency_loss(f, target, pixels), (flow,))

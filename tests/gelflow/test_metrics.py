@@ -7,10 +7,7 @@ import pytest
 from textures import REAL, as_bytes, moved
 
 from gelflow.baselines.classical import DIS
-from gelflow.data import open_pairs
-from gelflow.errors import InputError
-from gelflow.evaluate import score_pair
-from gelflow.metrics import (
+from gelflow.compare.metrics import (
     endpoint_error,
     flow_errors,
     image_similarity,
@@ -20,6 +17,9 @@ from gelflow.metrics import (
     ssim_map,
     warp_image,
 )
+from gelflow.compare.scores import score_pair
+from gelflow.data import open_pairs
+from gelflow.errors import InputError
 
 
 def test_endpoint_error_is_the_length_of_the_difference() -> None:

@@ -23,20 +23,20 @@ def moved_texture() -> tuple[Tensor, Tensor, Tensor]:
 
 def spread(flow: Tensor, *distances: int) -> Tensor:
     image1, image2, _ = moved_texture()
-    return propagated(flow, image1, image2, 3.0, distances, NOISE, of_gel=False)
+    return propagated(flow, image1, image2, 3.0, distances, NOISE, ignore_shading=False)
 
 
-@pytest.mark.parametrize("of_gel", [False, True])
-def test_noise_moves_nothing(of_gel: bool) -> None:
+@pytest.mark.parametrize("ignore_shading", [False, True])
+def test_noise_moves_nothing(ignore_shading: bool) -> None:
     """Two grey images with a camera's noise: all flows are alike. Fails with residuals of noise compared."""
     grey = torch.full((1, 3, HEIGHT, WIDTH), 0.5)
     noise = NOISE * torch.randn(grey.shape, generator=torch.Generator().manual_seed(0))
     flow = torch.randn((1, 2, HEIGHT, WIDTH), generator=torch.Generator().manual_seed(1))
-    assert torch.equal(propagated(flow, grey, grey + noise, 3.0, (8, 16), NOISE, of_gel), flow)
+    assert torch.equal(propagated(flow, grey, grey + noise, 3.0, (8, 16), NOISE, ignore_shading), flow)
 
 
 def test_without_a_match_flows_stay() -> None:
-    """Images that have nothing to do with each other. Fails with any lesser residual taken (ENOUGH = 1).
+    """Images that have nothing to do with each other. Fails with any lesser residual taken (MAX_RESIDUAL_RATIO = 1).
 
     A residual is the mean of some 3 x 113 squares, so that two of them differ by 7 % or so, rarely by a sixth.
     """
@@ -44,7 +44,7 @@ def test_without_a_match_flows_stay() -> None:
     other = torch.rand(image1.shape, generator=torch.Generator().manual_seed(0))
     flow = torch.zeros((1, 2, HEIGHT, WIDTH))
     flow[..., 64:] = 5.0
-    found = propagated(flow, image1, other, 3.0, (8, 16), NOISE, of_gel=False)
+    found = propagated(flow, image1, other, 3.0, (8, 16), NOISE, ignore_shading=False)
     assert (found != flow).float().mean() < 0.03
 
 
@@ -71,7 +71,7 @@ def test_a_gels_flow_is_extrapolated() -> None:
     truth = torch.from_numpy(np.stack([u, np.zeros_like(u)])).float()[None]
     flow = truth.clone()
     flow[..., 58:70] += WRONG
-    found = propagated(flow, image1, image2, 12.0, (32,), NOISE, of_gel=True)
+    found = propagated(flow, image1, image2, 12.0, (32,), NOISE, ignore_shading=True)
     error = (found - truth).norm(dim=1)
     assert error[..., 62:66].max() < 0.3  # the edges are interpolated over four px
     assert max(error[..., 40:52].max(), error[..., 76:88].max()) < 1e-5
@@ -87,7 +87,9 @@ def test_light_is_ignored_or_followed() -> None:
     ramp = torch.linspace(0, 1, WIDTH).expand(1, 3, HEIGHT, WIDTH)
     flow[..., :32] = torch.tensor([-24.0, 0.0]).view(2, 1, 1)
     grey1, grey2 = 0.1 * image1 + 0.4 * ramp, 0.1 * image2 + 0.4 * ramp + 0.075
-    motion, brightness = (propagated(flow, grey1, grey2, 3.0, (8, 16, 32), NOISE, of_gel) for of_gel in (True, False))
+    motion, brightness = (
+        propagated(flow, grey1, grey2, 3.0, (8, 16, 32), NOISE, ignore_shading) for ignore_shading in (True, False)
+    )
     assert torch.equal(motion[..., 48:], flow[..., 48:])
     assert (brightness[..., 48:] != flow[..., 48:]).float().mean() > 0.1
 

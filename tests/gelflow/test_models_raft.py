@@ -1,6 +1,5 @@
 """RAFT: published names and shapes, published weights where they lie beside the repository, padding, lookup."""
 
-import pickle
 from pathlib import Path
 
 import pytest
@@ -51,14 +50,12 @@ def published_names(large: bool) -> dict[str, tuple[int, ...]]:
         inputs = stages[0]
         for stage, channels in enumerate(stages, start=1):
             for unit in (0, 1):
-                at = f"{net}.layer{stage}.{unit}"
-                if large:
-                    conv(f"{at}.conv1", channels, inputs, 3)
-                    conv(f"{at}.conv2", channels, channels, 3)
-                else:
-                    conv(f"{at}.conv1", channels // 4, inputs, 1)
-                    conv(f"{at}.conv2", channels // 4, channels // 4, 3)
-                    conv(f"{at}.conv3", channels, channels // 4, 1)
+                at, inner = f"{net}.layer{stage}.{unit}", channels // 4
+                kernels = [(channels, inputs, 3), (channels, channels, 3)]
+                if not large:
+                    kernels = [(inner, inputs, 1), (inner, inner, 3), (channels, inner, 1)]
+                for number, kernel in enumerate(kernels, start=1):
+                    conv(f"{at}.conv{number}", *kernel)
                 norm(f"{at}.norm1", channels, batch)
                 norm(f"{at}.norm2", channels, batch)
                 if unit == 0 and stage > 1:
@@ -67,25 +64,21 @@ def published_names(large: bool) -> dict[str, tuple[int, ...]]:
                     norm(f"{at}.norm3", channels, batch)  # the same tensors again
                 inputs = channels
         conv(f"{net}.conv2", outputs, stages[2], 1)
-    block = "update_block"
-    conv(f"{block}.encoder.convc1", 256 if large else 96, 4 * (81 if large else 49), 1)
+    encoder, hidden, head = "update_block.encoder", 128 if large else 96, 256 if large else 128
+    kernels = [("convc1", 96, 196, 1), ("convf1", 64, 2, 7), ("convf2", 32, 64, 3), ("conv", 80, 128, 3)]
     if large:
-        conv(f"{block}.encoder.convc2", 192, 256, 3)
-    conv(f"{block}.encoder.convf1", 128 if large else 64, 2, 7)
-    conv(f"{block}.encoder.convf2", 64 if large else 32, 128 if large else 64, 3)
-    conv(f"{block}.encoder.conv", 126 if large else 80, 256 if large else 128, 3)
-    hidden, inputs = (128, 128 + 128 + 128) if large else (96, 96 + 64 + 82)
+        kernels = [("convc1", 256, 324, 1), ("convc2", 192, 256, 3), ("convf1", 128, 2, 7), ("convf2", 64, 128, 3),
+                   ("conv", 126, 256, 3)]  # fmt: skip
+    for name, *kernel in kernels:
+        conv(f"{encoder}.{name}", *kernel)
     for gate in "zrq":
-        if large:
-            conv(f"{block}.gru.conv{gate}1", hidden, inputs, 1, 5)
-            conv(f"{block}.gru.conv{gate}2", hidden, inputs, 5, 1)
-        else:
-            conv(f"{block}.gru.conv{gate}", hidden, inputs, 3)
-    conv(f"{block}.flow_head.conv1", 256 if large else 128, hidden, 3)
-    conv(f"{block}.flow_head.conv2", 2, 256 if large else 128, 3)
+        for suffix, sides in {"1": (1, 5), "2": (5, 1)}.items() if large else {"": (3, 3)}.items():
+            conv(f"update_block.gru.conv{gate}{suffix}", hidden, 384 if large else 242, *sides)
+    conv("update_block.flow_head.conv1", head, hidden, 3)
+    conv("update_block.flow_head.conv2", 2, head, 3)
     if large:
-        conv(f"{block}.mask.0", 256, 128, 3)
-        conv(f"{block}.mask.2", 576, 256, 1)
+        conv("update_block.mask.0", 256, 128, 3)
+        conv("update_block.mask.2", 576, 256, 1)
     return shapes
 
 
@@ -196,39 +189,16 @@ def test_published_small_weights_see_shifts_and_no_motion() -> None:
         assert error.mean() < (0.1 if (u, v) == (0, 0) else 0.3), (u, v, error.mean())
 
 
-class Evil:
-    """Pickled, it would make a file when it is loaded."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __reduce__(self) -> tuple:
-        return (Path.touch, (self.path,))
-
-
-@pytest.mark.parametrize("kind", ["text", "truncated", "pickle", "evil", "list", "other", "missing key", "nan"])
-def test_files_that_are_not_raft_are_refused_without_running_them(kind: str, tmp_path: Path) -> None:
-    path, trace = tmp_path / "weights.pth", tmp_path / "ran"
+@pytest.mark.parametrize("kind", ["list", "other", "missing key"])
+def test_files_of_other_tensors_are_refused(kind: str, tmp_path: Path) -> None:
+    """Those that are damaged or hold code: test_robustness."""
     tensors = {f"module.{name}": torch.zeros(shape) for name, shape in published_names(False).items()}
-    torch.save(tensors, path)
-    if kind == "text":
-        path.write_text("not weights")
-    elif kind == "truncated":
-        path.write_bytes(path.read_bytes()[:100_000])
-    elif kind == "pickle":
-        path.write_bytes(pickle.dumps({"a": Evil(trace)}))
-    elif kind == "evil":
-        torch.save({"a": Evil(trace)}, path)
-    elif kind == "list":
-        torch.save([1, 2], path)
-    elif kind == "other":
-        torch.save({"layer.weight": torch.zeros(3)}, path)
-    elif kind == "missing key":
-        torch.save({name: value for name, value in tensors.items() if "convf1" not in name}, path)
-    else:
-        tensors["module.fnet.conv1.bias"][3] = torch.nan
-        torch.save(tensors, path)
+    contents = {
+        "list": [1, 2],
+        "other": {"layer.weight": torch.zeros(3)},
+        "missing key": {name: value for name, value in tensors.items() if "convf1" not in name},
+    }
+    torch.save(contents[kind], tmp_path / "weights.pth")
     with pytest.raises(InputError, match=r"weights\.pth: ") as error:
-        load_raft(path)
+        load_raft(tmp_path / "weights.pth")
     assert "\n" not in str(error.value)
-    assert not trace.exists()

@@ -10,14 +10,14 @@ from torch import Tensor
 from waves import Shifts
 
 from gelflow.config import REGISTRATIONS, ModelConfig, RegistrationConfig, TrainConfig
+from gelflow.config.sources import train_config
 from gelflow.errors import InputError
-from gelflow.estimate import estimate_flow
 from gelflow.models import GelFlow
+from gelflow.models.estimate import estimate_flow
 from gelflow.models.registration import registered
+from gelflow.models.weights import load_weights, save_weights
 from gelflow.ops.warp import warp
-from gelflow.overrides import train_config
 from gelflow.train import train
-from gelflow.train.checkpoint import load_weights, save_weights
 
 HEIGHT, WIDTH = 96, 112
 MOTION, BOTH, BRIGHTNESS = RegistrationConfig(), REGISTRATIONS["both"], REGISTRATIONS["brightness"]

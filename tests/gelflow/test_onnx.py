@@ -1,7 +1,5 @@
 """ONNX: the exported network answers as the network itself does; refusals."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +9,8 @@ import torch
 from gelflow.cli import main
 from gelflow.config import ModelConfig
 from gelflow.models import GelFlow
+from gelflow.models.weights import load_weights, save_weights
 from gelflow.ops.correlation import _unfolded, local_correlation
-from gelflow.train.checkpoint import load_weights, save_weights
 
 
 @pytest.fixture
@@ -61,7 +59,7 @@ def test_the_exported_network_gives_the_same_flow(weights: Path, tmp_path: Path)
 )
 def test_mistakes_are_one_line(weights: Path, tail: list[str], word: str, capsys: pytest.CaptureFixture[str],
                                monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
-    monkeypatch.setattr("gelflow.export.find_spec", lambda name: name)
+    monkeypatch.setattr("gelflow.models.onnx.find_spec", lambda name: name)
     monkeypatch.chdir(weights.parent)
     assert main(["export", weights.name, *tail]) == 2
     captured = capsys.readouterr().err
@@ -72,7 +70,7 @@ def test_mistakes_are_one_line(weights: Path, tail: list[str], word: str, capsys
 
 def test_a_file_from_elsewhere_is_not_replaced(weights: Path, capsys: pytest.CaptureFixture[str],
                                                monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
-    monkeypatch.setattr("gelflow.export.find_spec", lambda name: name)
+    monkeypatch.setattr("gelflow.models.onnx.find_spec", lambda name: name)
     out = weights.with_name("other.onnx")
     out.write_text("another's")
     assert main(["export", str(weights), "--out", str(out), "--size", "64x64"]) == 2
@@ -82,11 +80,6 @@ def test_a_file_from_elsewhere_is_not_replaced(weights: Path, capsys: pytest.Cap
 
 def test_a_missing_package_is_named(weights: Path, capsys: pytest.CaptureFixture[str],
                                     monkeypatch: pytest.MonkeyPatch) -> None:  # fmt: skip
-    monkeypatch.setattr("gelflow.export.find_spec", lambda name: None)
+    monkeypatch.setattr("gelflow.models.onnx.find_spec", lambda name: None)
     assert main(["export", str(weights), "--out", "x.onnx"]) == 2
     assert "pip install onnx onnxscript" in capsys.readouterr().err
-
-
-def test_help_lists_the_command() -> None:
-    done = subprocess.run([sys.executable, "-m", "gelflow", "--help"], capture_output=True, text=True, check=True)
-    assert "export" in done.stdout

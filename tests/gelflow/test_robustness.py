@@ -11,14 +11,14 @@ import torch
 from safetensors.torch import load_file, save_file
 from test_cli import fails
 from textures import as_bytes, moved, save, write_folder
+from waves import random_weights
 
 from gelflow.baselines.learned import open_network
 from gelflow.cli import main
 from gelflow.config import ModelConfig
 from gelflow.errors import InputError
-from gelflow.models import GelFlow
 from gelflow.models.raft import RAFT
-from gelflow.train.checkpoint import read_metadata, save_weights
+from gelflow.models.weights import read_metadata
 
 
 class Evil:
@@ -35,8 +35,7 @@ class Evil:
 def networks(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Weights of GelFlow and of RAFT, as they are at the start of a training."""
     folder = tmp_path_factory.mktemp("networks")
-    torch.manual_seed(0)
-    save_weights(folder / "gelflow.safetensors", GelFlow(ModelConfig(levels=4, projected_channels=8)))
+    random_weights(folder / "gelflow.safetensors", ModelConfig(levels=4, projected_channels=8))
     torch.save(RAFT(large=False, iterations=1).state_dict(), folder / "raft.pth")
     return folder / "gelflow.safetensors", folder / "raft.pth"
 
@@ -84,7 +83,9 @@ def test_damaged_weights_are_named_and_never_run(
         commands += [["finetune", folder, "--weights", bad, "--out", tmp_path / "run"],
                      ["export", bad, "--out", tmp_path / "x.onnx", "--size", "64x64"]]  # fmt: skip
     for command in commands:
-        assert bad.name in fails(capsys, *command) or command[0] == "export"
+        message = fails(capsys, *command)
+        assert bad.name in message or command[0] == "export"
+        assert kind != "NaN" or command[0] == "export" or "not finite" in message
     assert not trace.exists()
     assert not (tmp_path / "run").exists()
 

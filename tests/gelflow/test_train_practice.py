@@ -1,4 +1,4 @@
-"""Practice: moving average, both directions and analogy resume bit by bit; bf16; compile; two processes; speed."""
+"""Practice: moving average, both directions, mixed pairs, bf16, two processes, signals, speed."""
 
 import contextlib
 import csv
@@ -13,28 +13,21 @@ from pathlib import Path
 
 import pytest
 import torch
-from textures import write_folder
-from waves import Shifts
+from textures import write_folder, write_synthetic
+from torch.utils.data import ConcatDataset
+from waves import Shifts, same_weights, small
 
-from gelflow.config import TrainConfig
+from gelflow.config import LossConfig, ModelConfig, TrainConfig
+from gelflow.config.sources import train_config
 from gelflow.data import open_pairs
+from gelflow.errors import InputError
+from gelflow.losses import flow_loss, self_supervised_loss
 from gelflow.models import GelFlow
+from gelflow.models.weights import load_weights
 from gelflow.train import module, train
-from gelflow.train.checkpoint import load_weights
 from gelflow.train.module import FlowModule
+from gelflow.train.samples import checked, collate
 from gelflow.train.state import load_state
-
-SMALL = {
-    "model": {"levels": 4, "projected_channels": 8},
-    "loss": {"lambda_s": [1.0, 1.0, 1.0]},
-    "batch_size": 2,
-    "learning_rate": 1e-3,
-    "device": "cpu",
-}
-
-
-def small(**values: object) -> TrainConfig:
-    return TrainConfig.model_validate(SMALL | values)
 
 
 @pytest.fixture(scope="module")
@@ -60,14 +53,13 @@ def test_the_average_follows_the_weights_and_is_what_is_kept(pairs: Shifts, tmp_
 
 
 def test_a_resumed_run_with_everything_on_ends_with_the_same_weights(pairs: Shifts, tmp_path: Path) -> None:
-    """Fails with the average left out of the saved state, and with an unseeded analogy."""
-    loss = {"lambda_s": [1.0, 1.0, 1.0], "occlusion": "forward_backward", "lambda_ar": 0.01, "lambda_census": 0.1}
+    """Fails with the average left out of the saved state, and with an unseeded transformation."""
+    loss = {"lambda_s": [1.0, 1.0, 1.0], "occlusion": "forward_backward", "lambda_ar": 0.01}
     options = {"loss": loss, "ema_decay": 0.9}
     whole = train(small(steps=4, **options), pairs, None, tmp_path / "whole")
     train(small(steps=2, **options), pairs, None, tmp_path / "cut")
     resumed = train(small(steps=4, **options), pairs, None, tmp_path / "cut", resume=True)
-    first, second = (load_weights(result.weights).state_dict() for result in (whole, resumed))
-    assert all(torch.equal(first[name], second[name]) for name in first)
+    assert same_weights(whole.weights, resumed.weights)
 
 
 @pytest.mark.parametrize(("step", "late"), [(0, False), (4, False), (5, True), (9, True)])
@@ -78,12 +70,12 @@ def test_losses_that_trust_the_flow_wait_for_their_stage(
     # Fails with either of the two from the start.
     asked: list[bool] = []
     monkeypatch.setattr(FlowModule, "step", step)
-    monkeypatch.setattr(module, "visible_both_ways", lambda *flows: asked.append(True))
+    monkeypatch.setattr(module, "visible_in_both_images", lambda *flows: asked.append(True))
     loss = {"lambda_s": [1.0, 1.0, 1.0], "occlusion": "forward_backward", "lambda_ar": 0.01, "second_stage": 0.5}
     trained = FlowModule(small(steps=10, loss=loss), GelFlow(small().model))
     images = torch.rand(2, 1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
     parts = trained._self_supervised(*images)[1]
-    assert (asked == [True], "analogy" in parts) == (late, late)
+    assert (asked == [True], "consistency" in parts) == (late, late)
 
 
 def test_bfloat16_trains_and_keeps_float32_weights(pairs: Shifts, tmp_path: Path) -> None:
@@ -93,34 +85,18 @@ def test_bfloat16_trains_and_keeps_float32_weights(pairs: Shifts, tmp_path: Path
 
 
 @pytest.mark.slow
-def test_a_compiled_network_is_asked_for_and_keeps_its_names(
-    pairs: Shifts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """With the compiler's own backend for tests: the graph is captured and run as it is, nothing is built."""
-    compiled = torch.compile
-    monkeypatch.setattr(torch, "compile", lambda model: compiled(model, backend="eager"))
-    options = {"steps": 2, "model": SMALL["model"] | {"correlation_radius": 1, "lffm": False, "finest_scale": 2}}
-    plain = train(small(**options), pairs, None, tmp_path / "plain")
-    fast = train(small(compile=True, **options), pairs, None, tmp_path / "compiled")
-    first, second = (load_weights(result.weights).state_dict() for result in (plain, fast))
-    assert first.keys() == second.keys()
-    # The same operations: differences can only come from their order. Two Adam steps of 1e-3 change a weight by 2e-3.
-    assert max((first[name] - second[name]).abs().max().item() for name in first) < 2e-4
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("option", ["--devices", "--nodes"])
 def test_two_processes_end_as_one_with_twice_the_batch(tmp_path: Path, option: str) -> None:
     """Gradients are averaged over processes, so that 2 x 1 pairs are 1 x 2 pairs.
 
     Fails with both processes given the same pairs.
     """
-    folder = write_folder(tmp_path / "data", dict.fromkeys("abcd", (1.0, 0.5)), (64, 64))
-    options = {"steps": 3, "learning_rate": 1e-4, "loss": SMALL["loss"] | {"mask_outside": False}}
+    folder = write_synthetic(tmp_path / "data", [(1.0, 0.5)] * 4, (64, 64))
+    options = {"steps": 3, "learning_rate": 1e-4, "supervision": "flow"}
     one = train(small(batch_size=2, **options), open_pairs(folder), None, tmp_path / "one").weights
     settings = tmp_path / "settings.toml"
-    settings.write_text("steps = 3\nbatch_size = 1\n[model]\nlevels = 4\nprojected_channels = 8\n"
-                        "[loss]\nlambda_s = [1.0, 1.0, 1.0]\nmask_outside = false\n")  # fmt: skip
+    settings.write_text("steps = 3\nbatch_size = 1\nsupervision = 'flow'\n[model]\nlevels = 4\nprojected_channels = 8\n"
+                        "[loss]\nlambda_s = [1.0, 1.0, 1.0]\n")  # fmt: skip
     command = [sys.executable, "-m", "gelflow", "train", str(folder), "--out", str(tmp_path / "two"), "--device", "cpu",
                "--config", str(settings), option, "2"]  # fmt: skip
     with socket.socket() as free:
@@ -185,3 +161,64 @@ def test_speed_and_memory_are_reported(pairs: Shifts, tmp_path: Path) -> None:
     if result.memory_mib is not None:  # Linux
         assert "peak memory" in str(result)
         assert result.memory_mib > 100  # torch alone
+
+
+LOSS = LossConfig(lambda_s=(1, 1, 1))
+CONFIG = TrainConfig(model=ModelConfig(levels=4), loss=LOSS, supervision="mixed", mixed_self=3.0, device="cpu")
+
+
+def flow_module() -> FlowModule:
+    torch.manual_seed(0)
+    return FlowModule(CONFIG, GelFlow(CONFIG.model))
+
+
+def test_each_pair_counts_by_what_is_known_of_it() -> None:
+    """Fails with the self-supervised loss over the whole batch, and with its weight left out."""
+    samples = [checked(sample) for sample in Shifts(3, 64, 2.0, seed=4)]
+    samples[1]["flow"] = torch.full((2, 64, 64), torch.nan)
+    samples[2]["flow"][:, :5] = torch.nan  # known in part: supervised
+    batch = collate(samples)
+    trained = flow_module()
+    loss, parts = trained._mixed(batch["image1"], batch["image2"], batch["flow"])
+    known, unknown = [0, 2], [1]
+    network = trained.model
+    supervised, _ = flow_loss(network(batch["image1"][known], batch["image2"][known]), batch["flow"][known], LOSS)
+    pair = batch["image1"][unknown], batch["image2"][unknown]
+    alone, _ = self_supervised_loss(network(*pair), *pair, LOSS)
+    torch.testing.assert_close(loss, 2 / 3 * supervised + 3.0 / 3 * alone)
+    assert set(parts) == {"endpoint", "photometric", "smoothness", "deformation"}
+
+
+def test_batches_of_one_kind_are_that_kind() -> None:
+    samples = [checked(sample) for sample in Shifts(2, 64, 2.0, seed=4)]
+    batch, trained = collate(samples), flow_module()
+    images = batch["image1"], batch["image2"]
+    labelled, parts = trained._mixed(*images, batch["flow"])
+    torch.testing.assert_close(labelled, flow_loss(trained.model(*images), batch["flow"], LOSS)[0])
+    assert set(parts) == {"endpoint"}
+    unlabelled, _ = trained._mixed(*images, None)
+    torch.testing.assert_close(unlabelled, 3.0 * self_supervised_loss(trained.model(*images), *images, LOSS)[0])
+
+
+def test_a_run_on_both_kinds_trains(tmp_path: Path) -> None:
+    torch.set_num_threads(1)
+    bare = Shifts(2, 64, 1.0, seed=6)
+    for sample in bare.samples:
+        sample["flow"] = torch.full((2, 64, 64), torch.nan)
+    both = ConcatDataset([bare, Shifts(2, 64, 1.0, seed=5)])  # the first pair has no flow: not refused
+    config = CONFIG.model_copy(update={"steps": 2, "batch_size": 2})
+    result = train(config, both, None, tmp_path)
+    assert result.weights.is_file()
+
+
+def test_scales_have_weights_of_their_own_under_supervision() -> None:
+    """Fails with `lambda_s` used although `flow_s` is given."""
+    flows = [torch.rand(1, 2, 64 >> s, 64 >> s) for s in range(3)]
+    truth = torch.zeros(1, 2, 64, 64)
+    only_coarse = LossConfig(lambda_s=(1, 0, 0), flow_s=(0, 0, 2))
+    expected = flow_loss(flows, truth, LossConfig(lambda_s=(0, 0, 2)))[0]
+    torch.testing.assert_close(flow_loss(flows, truth, only_coarse)[0], expected)
+    torch.testing.assert_close(flow_loss(flows, truth, LossConfig(lambda_s=(0, 0, 2), flow_s=None))[0], expected)
+    for wrong, words in (("[1, 1]", "flow_s has 2 numbers, lambda_s 7"), ("[0, 0, 0, 0, 0, 0, 0]", "flow_s is 0")):
+        with pytest.raises(InputError, match=words):
+            train_config(None, [f"loss.flow_s={wrong}"])

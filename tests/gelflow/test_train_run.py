@@ -5,43 +5,22 @@ import json
 import multiprocessing
 import os
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
 from textures import write_folder
 from torch.utils.data import Dataset
-from waves import Shifts
+from waves import Shifts, same_weights, small, weights_of
 
 from gelflow.config import ModelConfig, TrainConfig
 from gelflow.data import open_pairs
 from gelflow.errors import InputError
-from gelflow.estimate import estimate_flow
+from gelflow.models.estimate import estimate_flow
+from gelflow.models.weights import load_weights, read_metadata
 from gelflow.train import train
-from gelflow.train.checkpoint import load_weights, read_metadata
 from gelflow.train.module import learning_rate_factor
 from gelflow.train.state import load_state
-
-SMALL = {
-    "model": {"levels": 4, "projected_channels": 8},
-    "loss": {"lambda_s": [1.0, 1.0, 1.0]},
-    "batch_size": 2,
-    "learning_rate": 1e-3,
-    "device": "cpu",
-}
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    former = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(former)
-
-
-def small(**values: object) -> TrainConfig:
-    return TrainConfig.model_validate(SMALL | values)
 
 
 @pytest.fixture(scope="module")
@@ -68,10 +47,6 @@ class CtrlC(Dataset):
         os.kill(os.getpid(), signal.SIGINT)
 
 
-def weights_of(path: Path) -> dict[str, torch.Tensor]:
-    return load_weights(path).state_dict()
-
-
 @pytest.mark.parametrize("validates", [True, False])
 def test_a_run_interrupted_by_ctrl_c_ends_with_the_same_weights(
     pairs: Shifts, tmp_path: Path, validates: bool, capsys: pytest.CaptureFixture[str]
@@ -91,8 +66,7 @@ def test_a_run_interrupted_by_ctrl_c_ends_with_the_same_weights(
     if not validates:
         assert all(torch.equal(tensor, state.model[name]) for name, tensor in weights_of(so_far).items())
     resumed = train(config, pairs, validation, tmp_path / "cut", resume=True)
-    first, second = weights_of(whole.weights), weights_of(resumed.weights)
-    assert all(torch.equal(first[name], second[name]) for name in first)
+    assert same_weights(whole.weights, resumed.weights)
     states = [load_state(tmp_path / name) for name in ("whole", "cut")]
     assert states[0].step == states[1].step == 7
     assert all(torch.equal(states[0].model[name], states[1].model[name]) for name in states[0].model)
@@ -101,7 +75,7 @@ def test_a_run_interrupted_by_ctrl_c_ends_with_the_same_weights(
 
 
 def test_a_run_stopped_before_its_first_save_says_so(tmp_path: Path) -> None:
-    """By SIGTERM while Lightning opens the data, before the keeper handles signals, which ends the first step."""
+    """By SIGTERM while Lightning opens the data, before the callback handles signals, which ends the first step."""
 
     class Counted(Shifts):
         counts = 0
@@ -127,8 +101,7 @@ def test_a_run_killed_between_saves_goes_back_to_the_last_one_and_ends_the_same(
         train(config, Killed(pairs, 1 + 2 * 5), None, tmp_path / "cut")
     assert load_state(tmp_path / "cut").step == 4
     resumed = train(config, pairs, None, tmp_path / "cut", resume=True)
-    first, second = weights_of(whole.weights), weights_of(resumed.weights)
-    assert all(torch.equal(first[name], second[name]) for name in first)
+    assert same_weights(whole.weights, resumed.weights)
 
 
 def test_a_pair_that_a_loading_process_cannot_use_is_named_and_the_process_ends(pairs: Shifts, tmp_path: Path) -> None:
@@ -172,8 +145,7 @@ def test_a_run_whose_validation_failed_is_saved_and_validates_when_resumed(
     assert load_state(tmp_path / "cut").step == 2
     resumed = train(config, pairs, pairs, tmp_path / "cut", resume=True)
     assert (resumed.best, resumed.metrics) == (whole.best, whole.metrics)
-    first, second = weights_of(whole.weights), weights_of(resumed.weights)
-    assert all(torch.equal(first[name], second[name]) for name in first)
+    assert same_weights(whole.weights, resumed.weights)
     validated = [row for log in (tmp_path / "cut").glob("logs/csv/*/metrics.csv")
                  for row in csv.DictReader(log.open()) if row.get("validation/psnr_db")]  # fmt: skip
     assert sorted(row["step"] for row in validated) == [str(step) for step in range(2, steps + 1, 2)]

@@ -1,10 +1,15 @@
 """Torch images whose motion is known in closed form: plane waves evaluated at moved positions, nothing resampled."""
 
 import math
+from pathlib import Path
 
 import torch
 from torch import Tensor
 from torch.utils.data import Dataset
+
+from gelflow.config import ModelConfig, TrainConfig
+from gelflow.models import GelFlow
+from gelflow.models.weights import load_weights, save_weights
 
 
 def pixel_centres(height: int, width: int) -> tuple[Tensor, Tensor]:
@@ -63,3 +68,40 @@ class Shifts(Dataset):
 
     def __getitem__(self, index: int) -> dict:
         return dict(self.samples[index])
+
+
+SMALL = {
+    "model": {"levels": 4, "projected_channels": 8},
+    "loss": {"lambda_s": [1.0, 1.0, 1.0]},
+    "batch_size": 2,
+    "learning_rate": 1e-3,
+    "device": "cpu",
+}
+
+
+def small(**values: object) -> TrainConfig:
+    """Settings of a run of a small network on a CPU, on one thread, so that it ends the same on every machine."""
+    torch.set_num_threads(1)
+    return TrainConfig.model_validate(SMALL | values)
+
+
+def weights_of(path: Path) -> dict[str, Tensor]:
+    return load_weights(path).state_dict()
+
+
+def same_weights(first: Path, second: Path) -> bool:
+    """Whether two files hold the same weights, bit by bit."""
+    one, two = weights_of(first), weights_of(second)
+    return one.keys() == two.keys() and all(torch.equal(one[name], two[name]) for name in one)
+
+
+def random_weights(
+    path: Path, model: ModelConfig, train: TrainConfig | None = None, size: tuple[int, int] | None = None
+) -> Path:
+    """Weights as a new network has them, with the record of a training."""
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    network = GelFlow(model)
+    network.image_size = size
+    save_weights(path, network, step="7", **({} if train is None else {"train": train.model_dump_json()}))
+    return path

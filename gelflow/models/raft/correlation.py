@@ -24,9 +24,7 @@ LEVELS = 4
 def correlation_pyramid(first: Features, second: Features) -> list[Tensor]:
     """All-pairs correlation at `LEVELS` resolutions of the second image.
 
-    Args:
-        first: (B, C, H, W).
-        second: The same shape; H and W at least 8, so that every level has a pixel.
+    H and W are at least 8, so that every level has a pixel.
 
     Returns:
         For each level k, (B H W, 1, H // 2^k, W // 2^k).

@@ -13,92 +13,51 @@ from torch import Tensor, nn
 from gelflow.arrays import Features, Images
 
 Norm = Callable[[int], nn.Module]
-
-
-def instance_norm(channels: int) -> nn.Module:
-    """Each channel of each sample to mean 0 and variance 1; no parameters."""
-    return nn.InstanceNorm2d(channels)
-
-
-def batch_norm(channels: int) -> nn.Module:
-    """With the statistics that come with the weights."""
-    return nn.BatchNorm2d(channels)
-
-
-def no_norm(_: int) -> nn.Module:
-    """The identity."""
-    return nn.Sequential()
+"""Normalisation of so many channels: over each channel of a sample, by the weights' own statistics, or none."""
 
 
 class ResidualUnit(nn.Module):
-    """Two 3x3 convolutions beside a shortcut."""
+    """Two 3x3 convolutions, or a 3x3 one of a quarter of the channels between two of 1x1, beside a shortcut."""
 
-    def __init__(self, inputs: int, outputs: int, stride: int, norm: Norm) -> None:
-        super().__init__()
-        self.conv1 = nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1)
-        self.conv2 = nn.Conv2d(outputs, outputs, 3, padding=1)
-        self.norm1, self.norm2 = norm(outputs), norm(outputs)
-        self.downsample = _shortcut(inputs, outputs, stride, norm)
-
-    def forward(self, state: Features) -> Tensor:
-        """Features (B, outputs, H / stride, W / stride)."""
-        change = self.norm1(self.conv1(state)).relu()
-        change = self.norm2(self.conv2(change)).relu()
-        shortcut: Tensor = self.downsample(state)
-        return (shortcut + change).relu()
-
-
-class BottleneckUnit(nn.Module):
-    """A 3x3 convolution of a quarter of the channels between two 1x1 convolutions, beside a shortcut."""
-
-    def __init__(self, inputs: int, outputs: int, stride: int, norm: Norm) -> None:
+    def __init__(self, inputs: int, outputs: int, stride: int, norm: Norm, bottleneck: bool) -> None:
         super().__init__()
         inner = outputs // 4
-        self.conv1 = nn.Conv2d(inputs, inner, 1)
-        self.conv2 = nn.Conv2d(inner, inner, 3, stride=stride, padding=1)
-        self.conv3 = nn.Conv2d(inner, outputs, 1)
-        self.norm1, self.norm2, self.norm3 = norm(inner), norm(inner), norm(outputs)
-        self.downsample = _shortcut(inputs, outputs, stride, norm)
+        layers = [(inputs, outputs, 3, stride), (outputs, outputs, 3, 1)]  # channels in and out, kernel, stride
+        if bottleneck:
+            layers = [(inputs, inner, 1, 1), (inner, inner, 3, stride), (inner, outputs, 1, 1)]
+        self.depth = len(layers)
+        for number, (before, after, side, step) in enumerate(layers, start=1):
+            self.add_module(f"conv{number}", nn.Conv2d(before, after, side, stride=step, padding=side // 2))
+            self.add_module(f"norm{number}", norm(after))
+        self.downsample = nn.Sequential()
+        if stride > 1:
+            self.downsample = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride=stride), norm(outputs))
 
     def forward(self, state: Features) -> Tensor:
         """Features (B, outputs, H / stride, W / stride)."""
-        change = self.norm1(self.conv1(state)).relu()
-        change = self.norm2(self.conv2(change)).relu()
-        change = self.norm3(self.conv3(change)).relu()
+        change = state
+        for number in range(1, self.depth + 1):
+            change = self.get_submodule(f"norm{number}")(self.get_submodule(f"conv{number}")(change)).relu()
         shortcut: Tensor = self.downsample(state)
         return (shortcut + change).relu()
-
-
-def _shortcut(inputs: int, outputs: int, stride: int, norm: Norm) -> nn.Module:
-    if stride == 1:
-        return nn.Sequential()
-    return nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride=stride), norm(outputs))
 
 
 class RaftEncoder(nn.Module):
-    """Features of images at an eighth of their resolution.
+    """Features of images at an eighth of their resolution; `stages` are the channels of its three stages."""
 
-    Args:
-        stages: Channels of the three stages.
-        outputs: Channels of the result.
-        unit: Kind of residual unit.
-        norm: Kind of normalisation.
-    """
-
-    def __init__(
-        self,
-        stages: tuple[int, int, int],
-        outputs: int,
-        unit: type[ResidualUnit] | type[BottleneckUnit],
-        norm: Norm,
-    ) -> None:
+    def __init__(self, stages: tuple[int, int, int], outputs: int, norm: Norm, bottleneck: bool) -> None:
         super().__init__()
+
+        def stage(inputs: int, channels: int, stride: int) -> nn.Module:
+            first = ResidualUnit(inputs, channels, stride, norm, bottleneck)
+            return nn.Sequential(first, ResidualUnit(channels, channels, 1, norm, bottleneck))
+
         first, second, third = stages
         self.conv1 = nn.Conv2d(3, first, 7, stride=2, padding=3)
         self.norm1 = norm(first)
-        self.layer1 = nn.Sequential(unit(first, first, 1, norm), unit(first, first, 1, norm))
-        self.layer2 = nn.Sequential(unit(first, second, 2, norm), unit(second, second, 1, norm))
-        self.layer3 = nn.Sequential(unit(second, third, 2, norm), unit(third, third, 1, norm))
+        self.layer1 = stage(first, first, 1)
+        self.layer2 = stage(first, second, 2)
+        self.layer3 = stage(second, third, 2)
         self.conv2 = nn.Conv2d(third, outputs, 1)
 
     def forward(self, images: Images) -> Features:

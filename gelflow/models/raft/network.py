@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from gelflow.arrays import Flow, Images
 from gelflow.models.gelflow import check_shapes
 from gelflow.models.raft.correlation import LEVELS, correlation_pyramid, lookup
-from gelflow.models.raft.encoder import BottleneckUnit, RaftEncoder, ResidualUnit, batch_norm, instance_norm, no_norm
+from gelflow.models.raft.encoder import RaftEncoder
 from gelflow.models.raft.update import LARGE, SMALL, UpdateBlock
 from gelflow.ops.warp import pixel_indices
 
@@ -26,9 +26,7 @@ STRIDE = 8
 class RAFT(nn.Module):
     """Flow from image 1 to image 2.
 
-    Args:
-        large: The network of 5.3 million weights, or the small one of 1.0 million.
-        iterations: Recurrent updates.
+    The large one has 5.3 million weights, the small one 1.0 million; `iterations` is the number of recurrent updates.
     """
 
     def __init__(self, *, large: bool, iterations: int = 20) -> None:
@@ -36,10 +34,10 @@ class RAFT(nn.Module):
         self.sizes = LARGE if large else SMALL
         self.large = large
         self.iterations = iterations
-        stages, unit = self.sizes.stages, ResidualUnit if large else BottleneckUnit
-        self.fnet = RaftEncoder(stages, self.sizes.features, unit, instance_norm)
-        outputs = self.sizes.hidden + self.sizes.context
-        self.cnet = RaftEncoder(stages, outputs, unit, batch_norm if large else no_norm)
+        stages, outputs = self.sizes.stages, self.sizes.hidden + self.sizes.context
+        self.fnet = RaftEncoder(stages, self.sizes.features, nn.InstanceNorm2d, bottleneck=not large)
+        norm = nn.BatchNorm2d if large else lambda _: nn.Sequential()
+        self.cnet = RaftEncoder(stages, outputs, norm, bottleneck=not large)
         costs = LEVELS * (2 * self.sizes.radius + 1) ** 2
         self.update_block = UpdateBlock(self.sizes, costs, large=large)
 
@@ -95,12 +93,7 @@ def enlarge_bilinear(flow: Flow) -> Flow:
 def enlarge_convex(flow: Flow, weights: Tensor) -> Flow:
     """The flow at full resolution, each pixel a mean of its 3x3 coarse neighbours with its own weights.
 
-    Args:
-        flow: (B, 2, H, W).
-        weights: (B, 9 64, H, W), logarithms of the weights: neighbour, then row and column within the 8x8 block.
-
-    Returns:
-        (B, 2, 8 H, 8 W).
+    The weights (B, 9 64, H, W) are logarithms: neighbour, then row and column within the 8x8 block.
     """
     batch, _, height, width = flow.shape
     shares = weights.view(batch, 1, 9, STRIDE, STRIDE, height, width).softmax(dim=2)

@@ -62,43 +62,25 @@ class MotionEncoder(nn.Module):
 
 
 class GatedUnit(nn.Module):
-    """Convolutional gated recurrent unit with 3x3 convolutions (small network)."""
+    """Convolutional gated recurrent unit: 3x3 convolutions (small network), or a row of five pixels, then a column."""
 
-    def __init__(self, hidden: int, inputs: int) -> None:
+    def __init__(self, hidden: int, inputs: int, *, separable: bool) -> None:
         super().__init__()
-        self.convz = nn.Conv2d(hidden + inputs, hidden, 3, padding=1)
-        self.convr = nn.Conv2d(hidden + inputs, hidden, 3, padding=1)
-        self.convq = nn.Conv2d(hidden + inputs, hidden, 3, padding=1)
-
-    def forward(self, hidden: Features, inputs: Features) -> Tensor:
-        """The next hidden state."""
-        return _gated(hidden, inputs, self.convz, self.convr, self.convq)
-
-
-class SeparableGatedUnit(nn.Module):
-    """The same with a row of five pixels, then with a column of five (large network)."""
-
-    def __init__(self, hidden: int, inputs: int) -> None:
-        super().__init__()
-        for number, size in ((1, (1, 5)), (2, (5, 1))):
-            padding = (size[0] // 2, size[1] // 2)
+        self.passes = {"1": (1, 5), "2": (5, 1)} if separable else {"": (3, 3)}
+        for suffix, size in self.passes.items():
             for gate in "zrq":
-                layer = nn.Conv2d(hidden + inputs, hidden, size, padding=padding)
-                self.add_module(f"conv{gate}{number}", layer)
+                layer = nn.Conv2d(hidden + inputs, hidden, size, padding=(size[0] // 2, size[1] // 2))
+                self.add_module(f"conv{gate}{suffix}", layer)
 
     def forward(self, hidden: Features, inputs: Features) -> Tensor:
         """The next hidden state."""
-        for number in (1, 2):
-            gates = [self.get_submodule(f"conv{gate}{number}") for gate in "zrq"]
-            hidden = _gated(hidden, inputs, *gates)
+        for suffix in self.passes:
+            update, reset, candidate = (self.get_submodule(f"conv{gate}{suffix}") for gate in "zrq")
+            both = torch.cat([hidden, inputs], dim=1)
+            share = torch.sigmoid(update(both))
+            remembered = torch.sigmoid(reset(both)) * hidden
+            hidden = (1 - share) * hidden + share * torch.tanh(candidate(torch.cat([remembered, inputs], dim=1)))
         return hidden
-
-
-def _gated(hidden: Tensor, inputs: Tensor, update: nn.Module, reset: nn.Module, candidate: nn.Module) -> Tensor:
-    both = torch.cat([hidden, inputs], dim=1)
-    share = torch.sigmoid(update(both))
-    kept = torch.sigmoid(reset(both)) * hidden
-    return (1 - share) * hidden + share * torch.tanh(candidate(torch.cat([kept, inputs], dim=1)))
 
 
 class FlowHead(nn.Module):
@@ -122,7 +104,7 @@ class UpdateBlock(nn.Module):
         super().__init__()
         inputs = sizes.context + sizes.evidence + 2
         self.encoder = MotionEncoder(sizes, costs)
-        self.gru = (SeparableGatedUnit if large else GatedUnit)(sizes.hidden, inputs)
+        self.gru = GatedUnit(sizes.hidden, inputs, separable=large)
         self.flow_head = FlowHead(sizes.hidden, sizes.head)
         self.mask = None
         if large:

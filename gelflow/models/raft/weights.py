@@ -18,30 +18,19 @@ import torch
 from torch import Tensor
 
 from gelflow.errors import InputError
-from gelflow.files.tensors import Unreadable, load_tensors
+from gelflow.files.tensors import Unreadable, load_tensors, misfit
 from gelflow.models.raft.network import RAFT
-
-SUFFIXES = (".pth", ".pt")
-"""Of files that are taken for RAFT's."""
 
 
 def looks_like_raft(path: Path) -> bool:
     """Whether a file of weights is, by its name, one of RAFT's and not of gelflow's own (.safetensors)."""
-    return path.suffix.lower() in SUFFIXES
+    return path.suffix.lower() in (".pth", ".pt")
 
 
 def load_raft(path: Path, device: str = "cpu", iterations: int = 20) -> RAFT:
-    """Builds the network that a file's shapes describe and gives it the file's weights.
+    """Builds the network that a file's shapes describe, with the file's weights, in evaluation mode.
 
     Only tensors are read: a file with anything else in it is refused before any of it runs.
-
-    Args:
-        path: A state dictionary saved by `torch.save`.
-        device: Where the network is put.
-        iterations: Recurrent updates.
-
-    Returns:
-        The network, in evaluation mode, float32.
 
     Raises:
         InputError: No such file, damaged, one that would run code, or not RAFT's weights.
@@ -54,21 +43,8 @@ def load_raft(path: Path, device: str = "cpu", iterations: int = 20) -> RAFT:
             "size); give a state dictionary of princeton-vl/RAFT"
         )
     model = RAFT(large=last.shape[0] == 256, iterations=iterations)
-    expected = model.state_dict()
-    wrong = [f"{name} is missing" for name in expected if name not in tensors]
-    wrong += [f"{name} is unknown" for name in tensors if name not in expected]
-    wrong += [
-        f"{name} has shape {tuple(value.shape)}, not {tuple(expected[name].shape)}"
-        for name, value in tensors.items()
-        if name in expected and value.shape != expected[name].shape
-    ]
-    wrong += [f"{name} holds values that are not finite" for name, value in tensors.items()
-              if value.is_floating_point() and not torch.isfinite(value).all()]  # fmt: skip
-    if wrong:
-        more = f" and {len(wrong) - 3} more" if len(wrong) > 3 else ""
-        raise InputError(
-            f"{path}: does not fit RAFT {'large' if model.large else 'small'}: {'; '.join(wrong[:3])}{more}"
-        )
+    if problem := misfit(tensors, model):
+        raise InputError(f"{path}: does not fit RAFT {'large' if model.large else 'small'}: {problem}")
     model.load_state_dict(tensors)
     return model.to(device).eval()
 
@@ -80,15 +56,15 @@ def renamed(tensors: Mapping[str, Tensor], path: Path) -> dict[str, Tensor]:
         InputError: A tensor that is stored twice differs from its copy.
     """
     plain = {name.removeprefix("module."): value for name, value in tensors.items()}
-    kept = {}
+    own = {}
     for name, value in plain.items():
         match = re.fullmatch(r"(.*layer\d\.\d)\.norm[34]\.(\w+)", name)
         copy = f"{match[1]}.downsample.1.{match[2]}" if match else ""
         if copy not in plain:
-            kept[name] = value
+            own[name] = value
         elif not torch.equal(value, plain[copy]):
             raise InputError(f"{path}: {name} and {copy} must be one tensor, but differ")
-    return kept
+    return own
 
 
 def _read(path: Path) -> dict[str, Tensor]:

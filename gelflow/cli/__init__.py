@@ -1,0 +1,48 @@
+"""The command line: `python -m gelflow train|finetune|evaluate|compare|predict|export|pairs`.
+
+Exit status: 0 done, 1 done in part, 2 wrong input, 130 interrupted. Nothing heavy is imported before a command runs.
+"""
+
+import sys
+import traceback
+from collections.abc import Sequence
+
+from cyclopts import App, CycloptsError
+
+from gelflow import __version__
+from gelflow.cli.prediction import export, predict
+from gelflow.cli.recordings import pairs
+from gelflow.cli.scoring import compare, evaluate
+from gelflow.cli.training import finetune, train
+from gelflow.errors import InputError
+
+app = App(
+    name="gelflow",
+    version=__version__,
+    help="Learned optical flow for vision-based tactile sensors.\n\nWith --debug, a mistake shows its traceback.",
+    result_action="return_value",
+    suppress_keyboard_interrupt=False,
+)
+for command in (train, finetune, evaluate, compare, predict, export, pairs):
+    app.command(command)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs a command and returns the exit status. A mistake is one line on stderr, or a traceback with --debug."""
+    tokens = list(sys.argv[1:] if arguments is None else arguments)
+    debug = "--debug" in tokens
+    tokens = [token for token in tokens if token != "--debug"]
+    try:
+        status = app(tokens, exit_on_error=False, print_error=False)
+    except (InputError, CycloptsError, OSError, KeyboardInterrupt) as error:
+        if debug:
+            traceback.print_exc()
+        print(f"gelflow: {_one_line(error)}", file=sys.stderr)
+        return 130 if isinstance(error, KeyboardInterrupt) else 2
+    return status if isinstance(status, int) else 0
+
+
+def _one_line(error: BaseException) -> str:
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return " ".join(str(error).split()) or "interrupted; what is finished has been kept"

@@ -1,0 +1,62 @@
+"""Options that several commands share."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from cyclopts import Parameter
+
+from gelflow.errors import InputError
+
+MAXIMUM_PIXELS = 4096 * 4096
+"""Largest size at which a network may be asked to work; it takes some 0.6 kB of memory for each pixel."""
+
+Paths = Annotated[
+    list[Path], Parameter(help="Folders of pairs: of synth or its *.tar shards, of `pairs`, or NAME_1.png, NAME_2.png.")
+]
+AsJson = Annotated[bool, Parameter("--json", negative=(), help="Print the answer as JSON on stdout.")]
+Size = Annotated[str | None, Parameter(help="ROWSxCOLUMNS at which the network works; default: as in training.")]
+Out = Annotated[Path, Parameter(help="Folder for the results.")]
+ShippedOrFile = Annotated[
+    Path | None, Parameter(help="File of weights; default: those that come with the package, best.")
+]
+Device = Literal["auto", "cpu", "cuda"]
+OnDevice = Annotated[
+    Device, Parameter(help="Where networks and registration run; auto: a CUDA device where there is one.")
+]
+Registered = Literal["none", "motion", "both", "brightness"]
+Registration = Annotated[
+    Registered | None,
+    Parameter(
+        help="Correct the network's flow on the images: to follow the gel's motion, or to bring image 2 as close to "
+        "image 1 as can be, shading included, or both: this where motion alone leaves much. Default: as the weights' "
+        "training asked for; best: motion."
+    ),
+]
+
+
+def each_key_once(_: Any, given: Sequence[str] | None) -> None:
+    """Refuses a --set that a later one would undo: the same key again, or the table that holds it."""
+    keys = [text.partition("=")[0].strip() for text in given or ()]
+    for number, key in enumerate(keys):
+        for earlier in keys[:number]:
+            if earlier == key or earlier.startswith(f"{key}."):
+                raise ValueError(f"{key} undoes the earlier {earlier}; give each key once, a table before its fields")
+
+
+def parse_size(text: str | None) -> tuple[int, int] | None:
+    """ROWSxCOLUMNS as numbers.
+
+    Raises:
+        InputError: The text is something else, or a size beyond `MAXIMUM_PIXELS`.
+    """
+    if text is None:
+        return None
+    rows, _, columns = text.lower().partition("x")
+    if not (rows.isdigit() and columns.isdigit()):
+        raise InputError(f"--size {text}: ROWSxCOLUMNS is needed, for instance --size 512x640")
+    if int(rows) * int(columns) > MAXIMUM_PIXELS:
+        raise InputError(
+            f"--size {text}: at most {MAXIMUM_PIXELS} px are allowed, such as 4096x4096, which takes 10 GB of memory"
+        )
+    return int(rows), int(columns)

@@ -1,0 +1,100 @@
+"""The commands `predict` and `export`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from cyclopts import Parameter
+
+from gelflow.cli.options import AsJson, OnDevice, Out, Registration, ShippedOrFile, Size, parse_size
+from gelflow.errors import InputError
+
+if TYPE_CHECKING:
+    from gelflow.baselines import Method
+    from gelflow.predict.prediction import Prediction
+
+
+def predict(
+    inputs: Annotated[list[Path], Parameter(help="Two images, or one video or folder of frames.")],
+    /,
+    *,
+    out: Out,
+    weights: ShippedOrFile = None,
+    method: Annotated[
+        str | None,
+        Parameter(
+            help="Instead: lucas-kanade, farneback, dis-ultrafast, dis-fast, dis-medium, tvl1, dis-motion, "
+            "dis-both, dis-brightness, al-dic."
+        ),
+    ] = None,
+    registration: Registration = None,
+    reference: Annotated[
+        Literal["first", "previous"], Parameter(help="Of a video: flow from its first frame, or from the one before.")
+    ] = "first",
+    every: Annotated[int, Parameter(help="Of a video: take every n-th frame.")] = 1,
+    size: Size = None,
+    device: OnDevice = "auto",
+    as_json: AsJson = False,
+) -> int:
+    """Flow of a pair of images, to EXR, .flo and a picture, or of a video, to EXR, motion.csv and a video."""
+    from gelflow.baselines import named_methods
+    from gelflow.baselines.learned import open_network
+    from gelflow.models.weights import weights_file
+    from gelflow.predict.prediction import predict_pair, predict_video
+    from gelflow.terminal import progress
+
+    if len(inputs) not in (1, 2):
+        raise InputError(f"{len(inputs)} inputs given; allowed: two images, or one video or folder of frames")
+    for path in inputs:
+        if not path.exists():
+            raise InputError(f"{path}: there is no such file or folder")
+    estimator: Method
+    if method is None:
+        estimator = open_network(weights_file(weights), None, parse_size(size), device, registration)
+    elif weights is not None:
+        raise InputError("give either --weights FILE (of a network) or --method NAME (a classical one)")
+    elif registration is not None:
+        raise InputError(
+            "--registration: is for --weights of GelFlow; "
+            "of DIS there are --method dis-motion, dis-both, dis-brightness"
+        )
+    else:
+        estimator = named_methods([method], device)[0]
+    if len(inputs) == 2:
+        result = predict_pair(estimator, inputs[0], inputs[1], out)
+    else:
+        with progress("frames, then overlay", not as_json) as advance:
+            result = predict_video(estimator, inputs[0], out, reference, every, lambda n, total: advance(n, total, ""))
+    _show(result, estimator.name, as_json)
+    return 0
+
+
+def _show(result: Prediction, name: str, as_json: bool) -> None:
+    if as_json:
+        motions = [asdict(motion) for motion in result.motions]
+        print(json.dumps({"files": [str(file) for file in result.files], "motions": motions}))
+        return
+    largest = max(result.motions, key=lambda motion: motion.p95_px)
+    where = f" in frame {largest.frame}, the one with most motion," if len(result.motions) > 1 else ""
+    print(f"{name}:{where} mean motion {largest.mean_px:.3g} px, 95th percentile {largest.p95_px:.3g} px")
+    shown = result.files if len(result.files) <= 6 else [result.files[0], "...", *result.files[-3:]]
+    print(f"written: {', '.join(str(file) for file in shown)}")
+
+
+def export(
+    weights: Annotated[Path, Parameter(help="File of weights; best: those that come with the package.")],
+    /,
+    *,
+    out: Annotated[Path, Parameter(help="File to write, ending in .onnx.")],
+    size: Annotated[str | None, Parameter(help="ROWSxCOLUMNS of the images; default: as in training.")] = None,
+) -> int:
+    """Writes a network as ONNX: image1, image2 in, flow out, at one size."""
+    from gelflow.models.onnx import export_onnx
+    from gelflow.models.weights import weights_file
+
+    rows, columns = export_onnx(weights_file(weights), out, parse_size(size))
+    print(f"written: {out} (image1, image2: 1x3x{rows}x{columns} in [0, 1]; flow: 1x2x{rows}x{columns} in px)")
+    return 0

@@ -1,0 +1,156 @@
+"""The commands `evaluate` and `compare`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from gelflow.cli.options import AsJson, OnDevice, Paths, Registered, Registration, ShippedOrFile, Size, parse_size
+from gelflow.errors import InputError
+
+if TYPE_CHECKING:
+    from gelflow.baselines import Method
+    from gelflow.baselines.learned import Learned, PublishedRaft
+    from gelflow.compare.scores import PairScore
+    from gelflow.data import PairDataset
+
+
+def evaluate(
+    data: Paths,
+    /,
+    *,
+    weights: ShippedOrFile = None,
+    registration: Registration = None,
+    size: Size = None,
+    device: OnDevice = "auto",
+    as_json: AsJson = False,
+) -> int:
+    """Scores one file of weights on image pairs."""
+    from gelflow.baselines.learned import open_network
+    from gelflow.data import open_all
+    from gelflow.models.weights import weights_file
+
+    network = open_network(weights_file(weights), None, parse_size(size), device, registration)
+    _score(open_all(data), [network], None, as_json, 1)
+    return 0
+
+
+def compare(
+    data: Paths,
+    /,
+    *,
+    out: Annotated[Path | None, Parameter(help="Folder for tables, plots and all numbers.")] = None,
+    methods: Annotated[
+        str,
+        Parameter(
+            help="Methods, separated by commas; an empty text for none. Beside the default ones, which are the "
+            "paper's: dis-motion, dis-both, dis-brightness (DIS medium, then registration), exact (the exact flow "
+            "of synthetic pairs), al-dic (pyALDIC)."
+        ),
+    ] = "none,lucas-kanade,farneback,dis-ultrafast,dis-fast,dis-medium,tvl1",
+    weights: Annotated[
+        list[str] | None,
+        Parameter(
+            help="FILE or LABEL=FILE of a network: GelFlow (.safetensors; best: ours) or RAFT (.pth); "
+            "repeatable. Labels that differ after # alone (best#0, best#1) are seeds: one row, mean and standard "
+            "deviation."
+        ),
+    ] = None,
+    registration: Annotated[
+        list[Registered] | None,
+        Parameter(
+            help="Registration of GelFlow networks, see predict; repeatable, a row of each, whose name ends with "
+            "+motion, +both or +brightness. Default: as the weights' training asked for."
+        ),
+    ] = None,
+    ft: Annotated[
+        int, Parameter(help="Steps of test-time optimisation of each GelFlow network on these pairs, reported apart.")
+    ] = 0,
+    ft_config: Annotated[
+        str | None,
+        Parameter(
+            help="A preset or TOML file with its losses, learning rate, batch and flips; default: those of the "
+            "network's own training, in batches of 4. What it takes of neither: gelflow/train/test_time.py."
+        ),
+    ] = None,
+    batch: Annotated[int, Parameter(help="Pairs at once where networks' speed and memory are measured; 0: not.")] = 1,
+    every: Annotated[int, Parameter(help="Take every n-th pair only, for methods that are slow.")] = 1,
+    add: Annotated[
+        bool, Parameter(negative=(), help="Keep the methods that --out holds already; pairs are known by their names.")
+    ] = False,
+    size: Size = None,
+    device: OnDevice = "auto",
+    as_json: AsJson = False,
+) -> int:
+    """Scores several methods on the same image pairs."""
+    from gelflow.baselines import named_methods
+    from gelflow.baselines.learned import Learned
+    from gelflow.data import PairDataset, open_all
+
+    if add and out is None:
+        raise InputError("--add: give the folder of the earlier comparison as --out")
+    for option, given, least in (("--every", every, 1), ("--batch", batch, 0), ("--ft", ft, 0)):
+        if given < least:
+            raise InputError(f"{option} {given}: a number from {least} on is needed")
+    chosen = named_methods([name.strip() for name in methods.split(",") if name.strip()], device)
+    networks = [network for given in weights or () for network in _networks(given, registration, size, device)]
+    own = [network for network in networks if isinstance(network, Learned)]
+    if registration and not own:
+        raise InputError(
+            "--registration: needs --weights of GelFlow; of DIS there are dis-motion, dis-both, dis-brightness"
+        )
+    dataset = open_all(data)
+    dataset = PairDataset(dataset.source, dataset.records[::every])
+    if ft > 0:
+        from gelflow.train.test_time import fine_tuned
+
+        if out is None or not own:
+            raise InputError(f"--ft {ft}: needs --weights of GelFlow, and --out beside which their copies are kept")
+        folder = out.with_name(f"{out.name}_ft")
+        networks += [fine_tuned(one, dataset, folder / one.label.replace("/", "_"), ft, ft_config) for one in own]
+    _score(dataset, [*chosen, *networks], out, as_json, batch, add)
+    return 0
+
+
+def _networks(
+    given: str, registrations: Sequence[Registered] | None, size: str | None, device: str
+) -> list[Learned | PublishedRaft]:
+    """The rows of one --weights: of GelFlow one for each --registration, of RAFT, which it does not concern, one."""
+    from gelflow.baselines.learned import open_network
+    from gelflow.models.raft import looks_like_raft
+    from gelflow.models.weights import weights_file
+
+    label, equals, file = given.partition("=")
+    path, name = weights_file(Path(file if equals else given)), label if equals else None
+    choices = (None,) if not registrations or looks_like_raft(path) else tuple(registrations)
+    return [open_network(path, name, parse_size(size), device, choice) for choice in choices]
+
+
+def _score(
+    dataset: PairDataset, methods: Sequence[Method], out: Path | None, as_json: bool, batch: int, add: bool = False
+) -> None:
+    from gelflow.compare.report import FILES
+    from gelflow.compare.run import compare
+    from gelflow.compare.tables import tables
+    from gelflow.terminal import progress, show_table
+
+    done = 0
+    with progress("pairs", not as_json) as advance:
+
+        def step(score: PairScore) -> None:
+            nonlocal done
+            done += 1
+            advance(done, len(dataset) * len(methods), f"{score.method}, {score.pair}")
+
+        result = compare(methods, dataset, out, step, batch, add)
+    if as_json:
+        print(result.to_json())
+        return
+    print(f"{', '.join(result.data)}; times on {result.devices}")
+    for title, table in tables(result):
+        show_table(title, *table)
+    if out is not None:
+        print(f"written: {', '.join(str(out / name) for name in FILES if (out / name).is_file())}")

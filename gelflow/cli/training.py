@@ -1,0 +1,73 @@
+"""The commands `train` and `finetune`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from gelflow.cli.options import Device, Out, Paths, ShippedOrFile, each_key_once
+
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class RunOptions:
+    """What the two commands have in common."""
+
+    validation: Annotated[list[Path] | None, Parameter(help="Folders of pairs to validate on.")] = None
+    config: Annotated[
+        str | None,
+        Parameter(
+            help="Settings: best, real, bare, paper, selfflow, arflow, or a TOML file. Default: best; for finetune, "
+            "real."
+        ),
+    ] = None
+    assignments: Annotated[
+        list[str] | None,
+        Parameter("--set", validator=each_key_once, help="KEY=VALUE, such as loss.lambda_dc=10; repeatable."),
+    ] = None
+    steps: Annotated[int | None, Parameter(help="Optimiser steps.")] = None
+    device: Annotated[Device | None, Parameter(help="Where to train; auto: a CUDA device where there is one.")] = None
+    devices: Annotated[
+        int | None, Parameter(help="Devices (on a CPU: processes) of each machine; each takes batch_size pairs a step.")
+    ] = None
+    nodes: Annotated[
+        int | None,
+        Parameter(
+            help="Machines, which share --out. Start the same command on each: by srun, by torchrun, or by hand with "
+            "MASTER_ADDR, MASTER_PORT and NODE_RANK set."
+        ),
+    ] = None
+    resume: Annotated[bool, Parameter(negative=(), help="Go on with the run that --out holds.")] = False
+
+
+DEFAULTS = RunOptions()
+
+
+def train(data: Paths, /, *, out: Out, options: RunOptions = DEFAULTS) -> int:
+    """Trains a network on image pairs."""
+    return _train(data, out, options, options.config or "best", None)
+
+
+def finetune(data: Paths, /, *, out: Out, weights: ShippedOrFile = None, options: RunOptions = DEFAULTS) -> int:
+    """Trains on, from given weights, whose architecture is kept."""
+    from gelflow.models.weights import weights_file
+
+    return _train(data, out, options, options.config or "real", weights_file(weights))
+
+
+def _train(data: list[Path], out: Path, options: RunOptions, config: str, initial: Path | None) -> int:
+    from gelflow.config.sources import train_config
+    from gelflow.data import open_all
+    from gelflow.models.weights import load_weights
+    from gelflow.train import train
+    from gelflow.train.callback import is_first_process
+
+    start = {} if initial is None else {"model": load_weights(initial).config.model_dump()}
+    given = {name: getattr(options, name) for name in ("steps", "device", "devices", "nodes")}
+    settings = train_config(config, options.assignments or [], given, start)
+    validation_set = open_all(options.validation) if options.validation else None
+    result = train(settings, open_all(data), validation_set, out, initial=initial, resume=options.resume)
+    if is_first_process():
+        print(result)
+    return 0

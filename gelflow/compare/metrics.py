@@ -1,0 +1,116 @@
+"""How good a flow is: against an exact flow, against tracked dots, and by the images themselves.
+
+With a flow V from image 1 to image 2 and the exact flow W, over the n pixels that see gel and are visible in both:
+
+    endpoint error   e(x) = |V(x) - W(x)|;  mean, median, and the share of pixels with e > 1 px and e > 0.1 px
+    PSNR             10 log10(255^2 / MSE(I1, I1~)),  I1~(x) = I2(x + V(x)), 8 bit, all pixels and channels
+    SSIM             Wang et al. 2004: Gaussian window 11 x 11, sigma 1.5, K1 = .01, K2 = .03, of the 8-bit luma,
+                     mean over the whole image, mirrored at its border
+    marker distance  median of |(x1, y1) + V(x1, y1) - (x2, y2)|
+
+PSNR and SSIM are those of the GelFlow paper (n = 8 bit); they tell how well image 2 can be brought to image 1, not
+where the gel went.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.arrays import Bytes3, FlowArray, Grey8, ImageArray, MarkerArray, MaskArray
+from gelflow.errors import InputError
+from gelflow.files.image import to_bytes, to_grey
+from gelflow.ops.warp import warp_image
+
+
+@dataclass(frozen=True)
+class FlowErrors:
+    """Endpoint errors of one pair; outliers are shares, in [0, 1], of the pixels that were compared."""
+
+    mean_px: float
+    median_px: float
+    outliers_1px: float
+    outliers_01px: float
+    pixels: int
+
+
+def endpoint_error(flow: FlowArray, truth: FlowArray) -> NDArray[np.float64]:
+    """|flow - truth| at each pixel, (H, W) float64 in px; NaN where either is."""
+    difference = flow.astype(np.float64) - truth
+    return np.hypot(difference[..., 0], difference[..., 1])
+
+
+def flow_errors(flow: FlowArray, truth: FlowArray, visible: MaskArray) -> FlowErrors:
+    """Endpoint error and outlier rates over the pixels where the truth is finite and visible.
+
+    Args:
+        flow: Estimate, (H, W, 2) px. A NaN in it is an outlier at both limits and makes mean and median NaN.
+        truth: Exact flow, (H, W, 2) px, NaN where no gel is seen.
+        visible: (H, W) bool.
+
+    Raises:
+        InputError: The shapes differ, or no pixel can be compared.
+    """
+    if flow.shape != truth.shape or visible.shape != truth.shape[:2]:
+        raise InputError(f"flow {flow.shape}, exact flow {truth.shape} and visibility {visible.shape} do not fit")
+    compared = np.logical_and(visible, np.isfinite(truth).all(axis=-1))
+    if not compared.any():
+        raise InputError("the exact flow has no visible pixel that sees gel; nothing can be compared")
+    error = endpoint_error(flow, truth)[compared]
+    return FlowErrors(
+        mean_px=float(error.mean()),
+        median_px=float(np.median(error)),
+        outliers_1px=float(np.mean(~(error <= 1.0))),
+        outliers_01px=float(np.mean(~(error <= 0.1))),
+        pixels=int(error.size),
+    )
+
+
+def psnr(image: Bytes3, other: Bytes3) -> float:
+    """Peak signal-to-noise ratio (dB) of two 8-bit images over all pixels and channels; infinite if they are equal."""
+    mean_square = float(np.mean((image.astype(np.float64) - other) ** 2))
+    return float("inf") if mean_square == 0 else 10.0 * float(np.log10(255.0**2 / mean_square))
+
+
+def ssim(grey: Grey8, other: Grey8) -> float:
+    """Structural similarity of two grey 8-bit images (H, W): the mean of `ssim_map`."""
+    return float(np.mean(ssim_map(grey, other)))
+
+
+def ssim_map(grey: Grey8, other: Grey8) -> NDArray[np.float64]:
+    """Structural similarity at each pixel of two grey 8-bit images, (H, W), as stated at the top of this module."""
+    import cv2
+
+    def blurred(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(cv2.GaussianBlur(values, (11, 11), 1.5, borderType=cv2.BORDER_REFLECT_101))
+
+    x, y = grey.astype(np.float64), other.astype(np.float64)
+    c1, c2 = (0.01 * 255.0) ** 2, (0.03 * 255.0) ** 2
+    mean_x, mean_y = blurred(x), blurred(y)
+    variance_x, variance_y = blurred(x * x) - mean_x**2, blurred(y * y) - mean_y**2
+    covariance = blurred(x * y) - mean_x * mean_y
+    numerator = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
+    denominator = (mean_x**2 + mean_y**2 + c1) * (variance_x + variance_y + c2)
+    return np.asarray(numerator / denominator)
+
+
+def image_similarity(image1: ImageArray, image2: ImageArray, flow: FlowArray) -> tuple[float, float]:
+    """PSNR in dB and SSIM of image 1 and image 2 warped by the flow, both rounded to 8 bit.
+
+    Where the flow is NaN the warped image is black.
+    """
+    warped = np.nan_to_num(warp_image(image2, flow))
+    return psnr(to_bytes(image1), to_bytes(warped)), ssim(to_grey(image1), to_grey(warped))
+
+
+def marker_distance(flow: FlowArray, markers: MarkerArray) -> float:
+    """Median distance in px between dots moved by the flow and the same dots tracked in image 2.
+
+    The flow is read bilinearly at (x1, y1), in OpenCV's coordinates: (0, 0) is the centre of the first pixel.
+    """
+    from scipy.ndimage import map_coordinates
+
+    start, end = markers[:, :2], markers[:, 2:]
+    position = start[:, ::-1].T
+    moved = [map_coordinates(flow[..., k].astype(np.float64), position, order=1, mode="nearest") for k in (0, 1)]
+    return float(np.median(np.hypot(*(start + np.stack(moved, axis=1) - end).T)))

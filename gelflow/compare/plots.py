@@ -1,0 +1,157 @@
+"""Pictures of a comparison: measures side by side, quality against run time with its Pareto front, errors by place."""
+
+import math
+from collections.abc import Mapping, Sequence
+from itertools import cycle
+from pathlib import Path
+from typing import Any
+
+from gelflow.compare.seeds import Group
+from gelflow.compare.strata import EDGE, MOTION, PATTERN, Stratum, pooled
+from gelflow.files.atomic import replacing
+
+UNTIMED = ("no motion", "exact flow")
+"""Methods that take no time worth drawing."""
+BLUE, RED = "#4477aa", "#cc6677"
+COLOURS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb", "#000000")
+MARKERS = "osD^vPX"
+
+
+def plot_means(path: Path, groups: Sequence[Group], note: str) -> None:
+    """Writes a PNG with a panel per measure, a row per method; bars are standard deviations over seeds.
+
+    The note says what the means are over.
+    """
+    candidates: list[tuple[str, str, float, bool]] = [
+        ("PSNR (dB), more is better", "psnr_db", 1, False),
+        ("SSIM, more is better", "ssim", 1, False),
+        ("endpoint error (px), less is better", "endpoint_error_px", 1, True),
+        ("ms per pair (CPU: of one core)", "cost_seconds", 1000, True),
+    ]
+    panels = [panel for panel in candidates if any(group.mean(panel[1]) is not None for group in groups)]
+    figure, axes = _figure(len(panels), 3.2 * len(panels) + 1.5, 0.45 * len(groups) + 1.3, sharey=True)
+    for axis, (label, field, factor, logarithmic) in zip(axes, panels, strict=True):
+        axis.set_xscale("log" if logarithmic else "linear")
+        for place, group in enumerate(groups):
+            value, spread = group.mean(field), group.spread(field)
+            if value is None or not math.isfinite(value) or (logarithmic and value <= 0):
+                continue
+            bar = None if spread is None else factor * spread
+            axis.errorbar(factor * value, place, xerr=bar, fmt="o", color=BLUE, capsize=3)
+            text = f"{factor * value:.4g}" if factor * value < 1000 else f"{factor * value:.0f}"
+            axis.annotate(text, (factor * value, place), (0, 6), textcoords="offset points", ha="center", fontsize=8)
+        axis.margins(x=0.2)
+        axis.set_title(label, fontsize=9)
+        axis.xaxis.set_minor_formatter("")
+    axes[0].set_yticks(range(len(groups)), [group.label for group in groups])
+    axes[0].set_ylim(len(groups) - 0.4, -0.8)
+    _save(figure, path, f"means over {note}")
+
+
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Indices of the points that no other beats in both coordinates (less is better), by the first coordinate."""
+    front: list[int] = []
+    for index in sorted(range(len(points)), key=lambda i: points[i]):
+        if not front or points[index][1] < points[front[-1]][1]:
+            front.append(index)
+    return front
+
+
+def plot_work_precision(path: Path, groups: Sequence[Group], note: str) -> None:
+    """Writes a PNG with quality against run time: endpoint error where it is known, and PSNR.
+
+    Methods of `UNTIMED` are left out. The note says what the times were measured on.
+
+    Methods that no other beats in both are joined; those that were fine-tuned on the very pairs are hollow and not
+    part of the front. A black edge means that it ran on a GPU.
+    """
+    shown = [group for group in groups if group.name not in UNTIMED]
+    candidates = [("mean endpoint error (px)", "endpoint_error_px", 1.0), ("PSNR (dB)", "psnr_db", -1.0)]
+    panels = [panel for panel in candidates if any(_finite(group.mean(panel[1])) for group in shown)]
+    looks = _looks([group.name for group in groups])
+    figure, axes = _figure(max(1, len(panels)), 4.6 * max(1, len(panels)) + 2.2, 4.2)
+    for axis, (label, field, sign) in zip(axes, panels, strict=False):
+        known = [(g, 1000 * (g.mean("cost_seconds") or 0.0), g.mean(field) or 0.0) for g in shown
+                 if _finite(g.mean(field))]  # fmt: skip
+        plain = [(x, y) for group, x, y in known if not group.fine_tuned]
+        joined = [plain[i] for i in pareto_front([(x, sign * y) for x, y in plain])]
+        if joined:
+            axis.plot(*zip(*joined, strict=True), "-", color=RED, linewidth=1, label="Pareto front")
+        for group, x, y in known:
+            colour, marker = looks[group.name]
+            face = "white" if group.fine_tuned else colour
+            edge = "black" if any(one.on_gpu for one in group.members) else colour
+            axis.plot(x, y, marker=marker, markersize=7, color=colour, markerfacecolor=face, markeredgecolor=edge,
+                      linestyle="none", label=group.label)  # fmt: skip
+        axis.set_xscale("log")
+        if sign > 0 and all(y > 0 for _, _, y in known):
+            axis.set_yscale("log")
+        axis.set_xlabel("ms per pair (CPU: of one core)")
+        axis.set_ylabel(label)
+        axis.margins(x=0.1, y=0.1)
+    _legend(axes[-1])
+    _save(figure, path, note)
+
+
+def plot_strata(path: Path, strata: Mapping[str, Sequence[Stratum]]) -> None:
+    """Writes a PNG with the mean endpoint error by true motion, by distance to the contact's edge and by pattern."""
+    by_method = pooled(strata)
+    present = {one.kind for bins in by_method.values() for one in bins}
+    kinds = [kind for kind in (MOTION, EDGE, PATTERN) if kind in present]
+    looks = _looks(list(by_method))
+    figure, axes = _figure(len(kinds), 5.0 * len(kinds) + 1.5, 4.4)
+    for axis, kind in zip(axes, kinds, strict=True):
+        names = [one.bin for one in next(iter(by_method.values())) if one.kind == kind]
+        for method, bins in by_method.items():
+            colour, marker = looks[method]
+            values = {one.bin: one.error_px / one.pixels for one in bins if one.kind == kind}
+            drawn = [(k, values[name]) for k, name in enumerate(names) if values.get(name, 0) > 0]
+            if drawn:
+                line = "none" if kind == PATTERN else "-"
+                look = {"marker": marker, "markersize": 4, "linewidth": 1, "linestyle": line}
+                axis.plot(*zip(*drawn, strict=True), color=colour, label=method, **look)
+        axis.set_yscale("log")
+        axis.set_xticks(range(len(names)), [name.removesuffix(" px") for name in names], rotation=30, ha="right")
+        axis.set_xlabel(kind if kind == PATTERN else f"{kind} (px)", fontsize=9)
+    axes[0].set_ylabel("mean endpoint error (px)")
+    _legend(axes[-1])
+    _save(figure, path, "")
+
+
+def _finite(value: float | None) -> bool:
+    return value is not None and math.isfinite(value)
+
+
+def _looks(names: Sequence[str]) -> dict[str, tuple[str, str]]:
+    """Colour and marker of each method, the same in every panel; 56 differ."""
+    return dict(zip(names, zip(cycle(COLOURS), cycle(MARKERS), strict=False), strict=False))
+
+
+def _legend(axis: Any) -> None:
+    if any(axis.get_legend_handles_labels()[0]):
+        axis.legend(fontsize=7.5, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+
+
+def _figure(panels: int, width: float, height: float, sharey: bool = False) -> tuple[Any, Any]:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(1, panels, sharey=sharey, squeeze=False)[0]
+
+
+def _save(figure: Any, path: Path, title: str) -> None:
+    for axis in figure.axes:
+        axis.tick_params(labelsize=8, which="both")
+        axis.grid(color="0.9", which="major")
+        if axis.get_yscale() == "log":
+            axis.yaxis.set_major_formatter("{x:g}")
+            low, high = axis.get_ylim()
+            shown = "25" if high > 20 * low else "234568"
+            axis.yaxis.set_minor_formatter(lambda y, _, shown=shown: f"{y:g}" if f"{y:e}"[0] in shown else "")
+        axis.set_axisbelow(True)
+        axis.spines[["top", "right"]].set_visible(False)
+    figure.suptitle(title, fontsize=9)
+    with replacing(path) as temporary:
+        figure.savefig(temporary, format="png")

@@ -1,0 +1,179 @@
+"""Scores of methods: of one pair, and means over pairs."""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from gelflow.arrays import FlowArray
+from gelflow.baselines.exact import ExactFlow
+from gelflow.baselines.method import Method
+from gelflow.compare.metrics import endpoint_error, flow_errors, image_similarity, marker_distance
+from gelflow.compare.strata import Stratum, pair_strata
+from gelflow.data.pairs import PairDataset
+from gelflow.errors import InputError, NothingFoundError
+from gelflow.files.exr import FlowField
+from gelflow.hardware import hardware
+
+MEASURES = (
+    "psnr_db", "ssim", "endpoint_error_px", "median_error_px", "outliers_1px", "outliers_01px", "marker_distance_px",
+)  # fmt: skip
+"""Fields of a score that are averaged over pairs."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairScore:
+    """How one method did on one pair; None where the pair has no exact flow, scene or markers.
+
+    Attributes:
+        method, pair: Their names.
+        scene: Scene and kind of pattern of a synthetic pair, "gelsight_mini, dots".
+        psnr_db, ssim: Of image 1 and image 2 warped by the flow.
+        endpoint_error_px, median_error_px: Mean and median endpoint error.
+        outliers_1px, outliers_01px: Share of pixels with an endpoint error above 1 px and 0.1 px.
+        marker_distance_px: Median distance to tracked dots.
+        motion_px: Mean length of the true motion over the compared pixels.
+        seconds: Run time of the method, images in memory to flow in memory.
+        processor_seconds: Time of all its threads on the processor meanwhile; unlike `seconds` it does not grow with
+            what else the machine does.
+        device: What the method ran on.
+        on_gpu: Whether that was a CUDA device.
+        strata: Its endpoint errors sorted by what they may depend on.
+    """
+
+    method: str
+    pair: str
+    scene: str | None
+    psnr_db: float
+    ssim: float
+    endpoint_error_px: float | None = None
+    median_error_px: float | None = None
+    outliers_1px: float | None = None
+    outliers_01px: float | None = None
+    marker_distance_px: float | None = None
+    motion_px: float | None = None
+    seconds: float
+    processor_seconds: float
+    device: str
+    on_gpu: bool
+    strata: tuple[Stratum, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class MethodScore:
+    """Means over pairs, pair by pair with equal weight; times are medians. None where no pair has the number."""
+
+    method: str
+    pairs: int
+    psnr_db: float
+    ssim: float
+    endpoint_error_px: float | None
+    median_error_px: float | None
+    outliers_1px: float | None
+    outliers_01px: float | None
+    marker_distance_px: float | None
+    seconds: float
+    processor_seconds: float
+    device: str
+    on_gpu: bool
+
+    @property
+    def cost_seconds(self) -> float:
+        """What a pair costs: time on a GPU as it passes, on a processor that of one core, whatever else it does."""
+        return self.seconds if self.on_gpu else self.processor_seconds
+
+
+def score_pair(method: Method, dataset: PairDataset, index: int) -> PairScore:
+    """Runs a method on one pair and scores it; where it finds nothing to follow, it is scored as no motion.
+
+    To leave it out there would make a method that gives up look better than one that tries.
+
+    Raises:
+        InputError: The pair cannot be read, or the method cannot work on it; the message names the pair.
+    """
+    record = dataset.records[index]
+    image1, image2 = dataset.images(index)
+    truth, markers = dataset.truth(index), dataset.markers(index)
+    started, busy = time.perf_counter(), time.process_time()
+    try:
+        flow = method.of(truth) if isinstance(method, ExactFlow) else method.flow(image1, image2)
+    except NothingFoundError:
+        flow = np.zeros((*image1.shape[:2], 2), np.float32)
+    except InputError as error:
+        raise InputError(f"{dataset.source}, pair {record.name}, {method.name}: {error}") from error
+    seconds, processor_seconds = time.perf_counter() - started, time.process_time() - busy
+    psnr_db, ssim = image_similarity(image1, image2, flow)
+    try:
+        errors = {} if truth is None else _errors(flow, truth, record.scene)
+    except InputError as error:
+        raise InputError(f"{record.flow}: {error}") from error
+    device = str(getattr(method, "device", "cpu"))
+    return PairScore(
+        method=method.name,
+        pair=record.name,
+        scene=record.scene,
+        psnr_db=psnr_db,
+        ssim=ssim,
+        marker_distance_px=None if markers is None else marker_distance(flow, markers),
+        seconds=seconds,
+        processor_seconds=processor_seconds,
+        device=hardware(device),
+        on_gpu=device == "cuda",
+        **errors,
+    )
+
+
+def _errors(flow: FlowArray, truth: FlowField, scene: str | None) -> dict[str, Any]:
+    """The fields of a score that need the exact flow."""
+    errors = flow_errors(flow, truth.flow, truth.visible)
+    compared = np.logical_and(truth.visible, np.isfinite(truth.flow).all(axis=-1))
+    motion = np.hypot(truth.flow[..., 0], truth.flow[..., 1])[compared]
+    return {
+        "endpoint_error_px": errors.mean_px,
+        "median_error_px": errors.median_px,
+        "outliers_1px": errors.outliers_1px,
+        "outliers_01px": errors.outliers_01px,
+        "motion_px": float(motion.mean(dtype=np.float64)),
+        "strata": pair_strata(endpoint_error(flow, truth.flow), truth.flow, compared, truth.contact, scene),
+    }
+
+
+def evaluate(
+    method: Method, dataset: PairDataset, progress: Callable[[PairScore], None] | None = None
+) -> list[PairScore]:
+    """Scores a method on all pairs, in order; `progress` is called after each.
+
+    The first pair is estimated once before, untimed: libraries and devices take longer the first time.
+
+    Raises:
+        InputError: A pair cannot be read, or the method cannot work on it.
+    """
+    scores = []
+    with suppress(InputError):  # is raised again, with the pair's name, when the pair is scored
+        method.flow(*dataset.images(0))
+    for index in range(len(dataset)):
+        scores.append(score_pair(method, dataset, index))
+        if progress:
+            progress(scores[-1])
+    return scores
+
+
+def summarise(scores: Sequence[PairScore]) -> list[MethodScore]:
+    """Means per method, in the order in which the methods appear."""
+    means = []
+    for name in dict.fromkeys(score.method for score in scores):
+        own = [score for score in scores if score.method == name]
+        values: dict[str, Any] = {field: _mean([getattr(score, field) for score in own]) for field in MEASURES}
+        values |= {field: median(getattr(score, field) for score in own) for field in ("seconds", "processor_seconds")}
+        means.append(MethodScore(method=name, pairs=len(own), device=own[0].device, on_gpu=own[0].on_gpu, **values))
+    return means
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    present = [value for value in values if value is not None]
+    return math.fsum(present) / len(present) if present else None

@@ -1,0 +1,110 @@
+"""A training configuration from a preset or TOML file, `--set` assignments and options, the later ones winning.
+
+Presets are TOML files in `gelflow/presets`; the comment at the head of each says what it is and where it comes from.
+"""
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from gelflow.config import REGISTRATIONS, TrainConfig
+from gelflow.config.validation import validated
+from gelflow.errors import InputError
+
+PRESETS = ("best", "real", "bare", "paper", "selfflow", "arflow")
+"""Names of the configurations that come with the package."""
+
+
+def train_config(
+    path: Path | str | None = None,
+    assignments: Sequence[str] = (),
+    options: Mapping[str, Any] | None = None,
+    start: Mapping[str, Any] | None = None,
+) -> TrainConfig:
+    """Puts a configuration together and validates it once.
+
+    Args:
+        path: A preset's name, or a TOML file with the fields of `TrainConfig`; tables [model] and [loss].
+        assignments: `key=value`, key with dots (`loss.lambda_dc=10`), value in TOML; a value that is no TOML is text.
+        options: Top-level fields given by options of their own; None values are left out.
+        start: Fields that stand before the file is read.
+
+    Raises:
+        InputError: The file cannot be read, an assignment is malformed, or a field does not exist or is out of range.
+    """
+    values: dict[str, Any] = {name: dict(v) if isinstance(v, Mapping) else v for name, v in (start or {}).items()}
+    sources = []
+    if path is not None:
+        _merge(values, _read(path))
+        _spell_out(values)
+        sources.append(str(path))
+    for assignment in assignments:
+        _assign(values, assignment)
+        _spell_out(values)
+    if assignments:
+        sources.append("--set")
+    given = {name: value for name, value in (options or {}).items() if value is not None}
+    values |= given
+    sources += [f"--{name}" for name in given]
+    return validated(TrainConfig, values, " with ".join(sources) or "default configuration")
+
+
+def _read(path: Path | str) -> dict[str, Any]:
+    try:
+        if str(path) in PRESETS:
+            text = files("gelflow").joinpath("presets", f"{path}.toml").read_text(encoding="utf-8")
+        else:
+            text = Path(path).read_text(encoding="utf-8")
+        return tomllib.loads(text)
+    except FileNotFoundError as error:
+        raise InputError(
+            f"{path}: neither a configuration file nor a preset; presets are {', '.join(PRESETS)}"
+        ) from error
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as a TOML configuration: {error}") from error
+
+
+def _merge(values: dict[str, Any], new: Mapping[str, Any]) -> None:
+    for name, value in new.items():
+        if isinstance(value, dict) and isinstance(values.get(name), dict):
+            _merge(values[name], value)
+        else:
+            values[name] = value
+
+
+def _spell_out(values: dict[str, Any]) -> None:
+    """Puts what a registration's name stands for in its place, so that what follows can change single fields of it.
+
+    Raises:
+        InputError: there is no such registration.
+    """
+    model = values.get("model")
+    if not isinstance(model, dict) or not isinstance(name := model.get("registration"), str):
+        return
+    if name not in REGISTRATIONS:
+        raise InputError(f"model.registration: {name!r} is no registration; names are {', '.join(REGISTRATIONS)}")
+    meant = REGISTRATIONS[name]
+    model["registration"] = None if meant is None else meant.model_dump()
+
+
+def _assign(values: dict[str, Any], assignment: str) -> None:
+    key, equals, text = assignment.partition("=")
+    names = key.strip().split(".")
+    if not equals or not all(names):
+        raise InputError(f"--set {assignment}: KEY=VALUE is needed, for instance --set loss.lambda_dc=10")
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text
+    table = values
+    for name in names[:-1]:
+        if (
+            table.get(name) is None
+        ):  # a part that is switched off, such as model.registration, is switched on by its fields
+            table[name] = {}
+        table = table[name]
+        if not isinstance(table, dict):
+            raise InputError(f"--set {assignment}: {name} is a value, not a table")
+    table[names[-1]] = value

@@ -1,0 +1,57 @@
+"""Flow between images of any size by a trained network: resize, estimate, resize the flow back."""
+
+from collections.abc import Callable
+
+import torch
+
+from gelflow.arrays import Flow, Images
+from gelflow.config import MINIMUM_SIDE
+from gelflow.errors import InputError
+from gelflow.models import GelFlow
+from gelflow.models.gelflow import check_shapes
+from gelflow.ops.resize import resize_flow, resize_images
+
+
+def estimate_flow(
+    model: GelFlow,
+    image1: Images,
+    image2: Images,
+    size: tuple[int, int] | None = None,
+    flow: Callable[[Images, Images], Flow] | None = None,
+) -> Flow:
+    """The flow from image 1 to image 2: ``I1(x) = I2(x + V(x))``.
+
+    Args:
+        model: The network; used on the device that it is on, in evaluation mode, and left as it was.
+        image1: (B, 3, H, W) float32 in [0, 1].
+        image2: The same shape.
+        size: Rows and columns at which the network works; None: those to which its training images were resized
+            (`GelFlow.image_size`), or those of the given images where they were not.
+        flow: What to call in place of `GelFlow.flow`, such as a `RecordedNetwork` of the model.
+
+    Returns:
+        (B, 2, H, W) float32, px of the given images, on their device, without gradient.
+
+    Raises:
+        InputError: Shapes that differ, sides below 64 px where no size is given, other than three colours, values that
+            are not finite.
+    """
+    size = size or model.image_size
+    if size is not None and min(size) < MINIMUM_SIDE:
+        raise InputError(f"size {size[0]}x{size[1]}: each side must be at least {MINIMUM_SIDE} px")
+    if size is None or image1.shape != image2.shape or image1.ndim != 4 or image1.shape[1] != 3:
+        check_shapes(image1, image2)
+    for name, image in (("image 1", image1), ("image 2", image2)):
+        if not torch.isfinite(image).all():
+            raise InputError(f"{name} holds NaN or infinite values; images must be finite, in [0, 1]")
+    device = next(model.parameters()).device
+    native = (image1.shape[-2], image1.shape[-1])
+    inputs = [resize_images(image.to(device, torch.float32), size or native) for image in (image1, image2)]
+    was_training = model.training
+    model.eval()
+    try:
+        with torch.no_grad():
+            found = resize_flow((flow or model.flow)(*inputs), native)
+    finally:
+        model.train(was_training)
+    return found.to(image1.device)

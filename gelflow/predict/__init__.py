@@ -1,0 +1,1 @@
+"""Estimating the flow of image files and videos, and drawing it."""

@@ -1,0 +1,205 @@
+"""Flow of a pair of images or of a video, written as EXR, Middlebury .flo and pictures."""
+
+import csv
+import os
+import re
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import astuple, dataclass, fields
+from itertools import chain
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from gelflow.arrays import Bytes3, FlowArray, ImageArray
+from gelflow.baselines.method import Method
+from gelflow.errors import InputError
+from gelflow.files.atomic import refuse_foreign, replacing
+from gelflow.files.exr import DIRECTIONS, read_flow, write_flow
+from gelflow.files.flo import write_flo
+from gelflow.files.image import read_pair, write_png
+from gelflow.files.quiet import quiet
+from gelflow.files.video import describe, frame_file, frames, image_files
+from gelflow.predict.pictures import draw_overlay, round_up, write_flow_picture
+
+Reference = Literal["first", "previous"]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Length of the flow, its mean and percentiles, to a frame of a video (1 for a pair), and the method's run time."""
+
+    frame: int
+    file: str
+    mean_px: float
+    p95_px: float
+    p99_px: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """What `predict` did: the files it wrote, in order, and the motion of each pair of frames."""
+
+    files: list[Path]
+    motions: list[Motion]
+
+
+def predict_pair(method: Method, path1: Path, path2: Path, out: Path) -> Prediction:
+    """Writes NAME.exr, NAME.flo and NAME.png, the flow from the first image to the second; replaces an earlier run's.
+
+    NAME is what the two file names have in front of _1 and _2, else FIRST_to_SECOND.
+
+    Raises:
+        InputError: An image cannot be read, the two do not fit, or files of these names are somebody else's.
+        OSError: A file cannot be written.
+    """
+    image1, image2 = read_pair(path1, path2)
+    stem1, stem2 = path1.stem, path2.stem
+    common = stem1.removesuffix("_1")
+    name = common if stem1 == f"{common}_1" and stem2 == f"{common}_2" else f"{stem1}_to_{stem2}"
+    files = [out / f"{name}{suffix}" for suffix in (".exr", ".flo", ".png")]
+    refuse_foreign(files[0], DIRECTIONS.encode(), *files[1:])
+    try:
+        flow, motion = _estimate(method, image1, image2, 1, path2.name)
+    except InputError as error:
+        raise InputError(f"{path1} and {path2}, {method.name}: {error}") from error
+    write_flow(files[0], flow)
+    write_flo(files[1], flow)
+    write_flow_picture(files[2], image1, image2, flow, f"{name} ({method.name})")
+    return Prediction(files, [motion])
+
+
+def predict_video(
+    method: Method,
+    path: Path,
+    out: Path,
+    reference: Reference = "first",
+    every: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> Prediction:
+    """Writes flow/000001.exr ... (numbered by frame), motion.csv and overlay.mp4 in place of an earlier run's.
+
+    Args:
+        method: Estimates the flow.
+        path: A video file, or a folder of images in the natural order of their names.
+        out: Folder for the results.
+        reference: Flow from the first frame to each frame, or from each frame's predecessor to it.
+        every: Take every n-th frame only.
+        progress: Called with the number of frames done and to be done; each frame counts twice, flow and overlay.
+
+    Raises:
+        InputError: The video does not open, fewer than two frames decode, a frame cannot be used, or files of these
+            names are somebody else's.
+        OSError: A file cannot be written.
+    """
+    if every < 1:
+        raise InputError(f"every = {every}: at least 1 is needed")
+    total = 2 * max(0, -(-describe(path).frames // every) - 1)
+    table = out / "motion.csv"
+    refuse_foreign(table, b"mean_px,p95_px", out / "overlay.mp4", *_numbered(out / "overlay", ".png"))
+    for earlier in _numbered(out / "flow", ".exr"):
+        refuse_foreign(earlier, DIRECTIONS.encode())
+    sources = dict(enumerate(image_files(path))) if path.is_dir() else {}
+    files: list[Path] = []
+    motions: list[Motion] = []
+    for index, image1, image2 in _frame_pairs(path, every, reference):
+        source = sources.get(index, path)
+        try:
+            first, second = (image.astype(np.float32) / np.float32(255) for image in (image1, image2))
+            flow, motion = _estimate(method, first, second, index, source.name)
+        except InputError as error:
+            raise InputError(f"{source}, frame {index}, {method.name}: {error}") from error
+        if not files:
+            for earlier in _numbered(out / "flow", ".exr"):
+                earlier.unlink()
+        files.append(out / "flow" / f"{index:06d}.exr")
+        write_flow(files[-1], flow)
+        motions.append(motion)
+        if progress:
+            progress(len(motions), total)
+    if not motions:
+        raise InputError(f"{path}: fewer than two frames decode; a flow needs two")
+    with replacing(table) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow([column.name for column in fields(Motion)])
+        writer.writerows(astuple(motion) for motion in motions)
+    scale = round_up(max(motion.p99_px for motion in motions))
+
+    def overlays() -> Iterator[Bytes3]:
+        for count, (index, _, frame) in enumerate(_frame_pairs(path, every, reference), start=len(motions) + 1):
+            yield draw_overlay(frame, read_flow(out / "flow" / f"{index:06d}.exr").flow, scale)
+            if progress:
+                progress(count, total)
+
+    overlay = _write_overlay(overlays(), out, describe(path).frames_per_second / every)
+    return Prediction([*files, table, *overlay], motions)
+
+
+def _estimate(
+    method: Method, image1: ImageArray, image2: ImageArray, frame: int, file: str
+) -> tuple[FlowArray, Motion]:
+    started = time.perf_counter()
+    flow = method.flow(image1, image2)
+    seconds = time.perf_counter() - started
+    length = np.hypot(flow[..., 0], flow[..., 1])
+    p95, p99 = (float(value) for value in np.nanpercentile(length, (95, 99)))
+    return flow, Motion(frame, file, float(np.nanmean(length)), p95, p99, seconds)
+
+
+def _frame_pairs(path: Path, every: int, reference: Reference) -> Iterator[tuple[int, Bytes3, Bytes3]]:
+    """(index of the second frame, reference frame, second frame)."""
+    before: Bytes3 | None = None
+    for index, frame in frames(path, every):
+        if frame is None:
+            raise InputError(f"{frame_file(path, index)}: cannot be read (truncated or damaged)")
+        if before is not None:
+            if frame.shape != before.shape:
+                raise InputError(f"{frame_file(path, index)}, frame {index}: has another size than the frame before it")
+            yield index, before, frame
+        if before is None or reference == "previous":
+            before = frame
+
+
+def _write_overlay(pictures: Iterator[Bytes3], out: Path, frames_per_second: float) -> list[Path]:
+    """Writes overlay.mp4, or overlay/000000.png ... where OpenCV has no encoder for it."""
+    import cv2
+
+    first = next(pictures)
+    video, temporary = out / "overlay.mp4", out / ".overlay.part.mp4"
+    try:
+        with quiet():
+            rate, size = max(frames_per_second, 1.0), (first.shape[1], first.shape[0])
+            writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
+        if not writer.isOpened():
+            return _write_sequence(first, pictures, out / "overlay")
+        count = 0
+        for picture in chain([first], pictures):
+            writer.write(np.ascontiguousarray(picture[..., ::-1]))
+            count += 1
+        with quiet():
+            writer.release()
+        # OpenCV does not report a failed write (a full disk): count what arrived.
+        if not temporary.is_file() or describe(temporary).frames != count:
+            raise OSError(f"cannot write {video}: the encoder did not take all {count} frames (is the disk full?)")
+        os.replace(temporary, video)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return [video]
+
+
+def _write_sequence(first: Bytes3, rest: Iterator[Bytes3], folder: Path) -> list[Path]:
+    for earlier in _numbered(folder, ".png"):
+        earlier.unlink()
+    files = [folder / "000000.png"]
+    write_png(files[0], first)
+    for number, picture in enumerate(rest, start=1):
+        files.append(folder / f"{number:06d}.png")
+        write_png(files[-1], picture)
+    return files
+
+
+def _numbered(folder: Path, suffix: str) -> list[Path]:
+    """What an earlier run wrote, which may have had other frames: files named by six digits or more."""
+    return [path for path in folder.glob(f"*{suffix}") if re.fullmatch(r"[0-9]{6,}", path.stem)]

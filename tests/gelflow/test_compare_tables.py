@@ -1,0 +1,186 @@
+"""Tables and bins of a comparison: seeds as one row, LaTeX, errors by motion, place and scene."""
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+from test_compare import Constant
+from textures import write_folder, write_synthetic
+
+from gelflow.compare.report import latex
+from gelflow.compare.run import compare
+from gelflow.compare.scores import evaluate, summarise
+from gelflow.compare.seeds import group_name, grouped
+from gelflow.compare.strata import EDGE, MOTION, PATTERN, SCENE, merged, pair_strata, signed_distance
+from gelflow.compare.tables import pair_table, strata_table, summary_table, tables
+from gelflow.data import PairDataset, open_pairs
+
+
+def test_the_seed_is_a_number_at_the_end() -> None:
+    names = ["best#0", "best#12+ft", "best", "C# code", "a#1b", "x#2#3"]
+    assert [group_name(name) for name in names] == ["best", "best+ft", "best", "C# code", "a#1b", "x#2"]
+
+
+def test_seeds_become_mean_and_standard_deviation(tmp_path: Path) -> None:
+    """Fails with the population's standard deviation (n in place of n - 1)."""
+    dataset = open_pairs(write_synthetic(tmp_path, [(1.0, 0.0), (2.0, 0.0)]))
+    methods = [Constant("net#0", 0, 0), Constant("other", 5, 0), Constant("net#1", 0.5, 0), Constant("net#2", 1, 0)]
+    scores = [score for method in methods for score in evaluate(method, dataset)]
+    groups = grouped(summarise(scores))
+    assert [group.label for group in groups] == ["net (3 seeds)", "other"]
+    # errors of the seeds: (1 + 2) / 2, (0.5 + 1.5) / 2, (0 + 1) / 2
+    assert groups[0].mean("endpoint_error_px") == pytest.approx(1.0)
+    assert groups[0].spread("endpoint_error_px") == pytest.approx(0.5)
+    assert groups[1].spread("endpoint_error_px") is None
+    header, rows = summary_table(groups)
+    column = header.index("EPE px")
+    assert [row[column] for row in rows] == ["1.000 ± 0.500", "3.500"]
+    table = pair_table(scores, lambda s: (s.endpoint_error_px or 0.0,), "{:.2f}")
+    assert table == (["method", "000000", "000001"],
+                     [["net (3 seeds)", "0.50", "1.50"], ["other", "4.00", "3.00"]])  # fmt: skip
+
+
+def test_bins_of_seeds_are_pooled(tmp_path: Path) -> None:
+    dataset = open_pairs(write_synthetic(tmp_path, [(1.0, 0.0)]))
+    result = compare([Constant("net#0", 0, 0), Constant("net#1", 0.5, 0)], dataset)
+    header, rows = strata_table(result.strata)
+    assert header == ["where", "pixels", "net"]
+    assert rows == [["motion: 1 to 2 px", "4096", "0.750"]]
+
+
+def test_fine_tuned_methods_come_apart_and_devices_are_named_where_they_differ(tmp_path: Path) -> None:
+    dataset = open_pairs(write_folder(tmp_path, {"a": (1, 0)}))
+    result = compare([Constant("net#0+ft", 1, 0), Constant("net", 0, 0)], dataset)
+    named = [[row[0] for row in rows] for _, (_, rows) in tables(result)]
+    assert named == [["net"], ["net+ft"], ["net", "net+ft"]]
+    elsewhere = replace(result.scores[1], method="net, GPU", device="NVIDIA H200", on_gpu=True)
+    header, rows = summary_table(grouped(summarise([result.scores[1], elsewhere])))
+    assert header[-1] == "on"
+    assert rows[1][-1] == "NVIDIA H200"
+
+
+def test_a_gpu_is_charged_time_as_it_passes_and_a_processor_that_of_a_core(tmp_path: Path) -> None:
+    (score,) = evaluate(Constant("net", 0, 0), open_pairs(write_folder(tmp_path, {"a": (1, 0)})))
+    here = replace(score, seconds=2.0, processor_seconds=0.5)
+    there = replace(here, method="there", on_gpu=True)
+    assert [one.cost_seconds for one in summarise([here, there])] == [0.5, 2.0]
+
+
+def test_latex_escapes_what_it_must() -> None:
+    text = latex("Errors of 50 % & more", (["method", "> 1 px %"], [["a_b (3 seeds)", "1.0 ± 0.5"]]))
+    assert r"\caption{Errors of 50 \% \& more}" in text
+    assert r"method & $>$ 1 px \% \\" in text
+    assert r"a\_b (3 seeds) & 1.0 $\pm$ 0.5 \\" in text
+    assert text.count(r"\begin") == text.count(r"\end") == 2
+
+
+def test_distance_is_signed_and_measured_from_the_edge_between_pixels() -> None:
+    """Fails with the sign exchanged and without the half pixel."""
+    region = np.zeros((5, 12), bool)
+    region[:, :4] = True
+    np.testing.assert_array_equal(signed_distance(region)[2], [-3.5, -2.5, -1.5, -0.5, *np.arange(0.5, 8)])
+
+
+def test_bins_hold_every_compared_pixel_once() -> None:
+    generator = np.random.default_rng(0)
+    truth = generator.normal(0, 6, (20, 30, 2)).astype(np.float32)
+    error = generator.exponential(0.4, (20, 30))
+    compared = generator.random((20, 30)) < 0.8
+    contact = np.zeros((20, 30), bool)
+    contact[5:15, 8:20] = True
+    strata = pair_strata(error, truth, compared, contact, "gelsight, speckle")
+    for kind in (MOTION, EDGE, PATTERN, SCENE):
+        mine = [stratum for stratum in strata if stratum.kind == kind]
+        assert sum(s.pixels for s in mine) == compared.sum()
+        assert sum(s.error_px for s in mine) == pytest.approx(error[compared].sum(), rel=1e-12)
+        assert sum(s.above_1px for s in mine) == (error[compared] > 1).sum()
+        assert sum(s.above_01px for s in mine) == (error[compared] > 0.1).sum()
+    length = np.hypot(*np.moveaxis(truth, -1, 0))
+    (bin_,) = (s for s in strata if s.bin == "2 to 4 px")
+    assert bin_.error_px == pytest.approx(error[compared & (length >= 2) & (length < 4)].sum(), rel=1e-12)
+
+
+def test_pairs_add_up_pixel_by_pixel_in_the_order_of_the_bins() -> None:
+    one = pair_strata(np.full((2, 3), 0.5), np.full((2, 3, 2), 0.1, np.float32), np.ones((2, 3), bool))
+    two = pair_strata(np.full((4, 3), 2.0), np.full((4, 3, 2), 9.0, np.float32), np.ones((4, 3), bool))
+    both = merged([*two, *one, *one])
+    assert [(s.bin, s.pixels, s.error_px, s.above_1px) for s in both] == [
+        ("0 to 0.5 px", 12, 6.0, 0),
+        ("8 to 16 px", 12, 24.0, 12),
+    ]
+
+
+def test_no_contact_or_contact_everywhere_gives_no_distances() -> None:
+    error, truth, compared = np.ones((4, 4)), np.ones((4, 4, 2), np.float32), np.ones((4, 4), bool)
+    for contact in (None, np.zeros((4, 4), bool), np.ones((4, 4), bool)):
+        assert {s.kind for s in pair_strata(error, truth, compared, contact)} == {MOTION}
+
+
+DRAWN_KIND = {"kind": {"choice": ["dots", "speckle"]}}
+DRAWN_PATTERN = {"choice": [{"kind": "dots", "radius_mm": 0.2}, {"kind": "speckle"}]}
+
+
+def with_contact(folder: Path, pattern: dict) -> Path:
+    """A data set as synth writes it, with a contact in the left half and with patterns that differ by sample."""
+    write_synthetic(folder, [(3.0, 0.0), (0.0, 0.25)])
+    scene = {"name": "toy", "sensor": {"pattern": pattern}}
+    (folder / "dataset.json").write_text(json.dumps({"schema_version": 1, "scene": scene}))
+    for index, kind in enumerate(["dots", "speckle"]):
+        sample = folder / "samples" / f"{index:06d}"
+        meta = {"scene": {"name": "toy", "sensor": {"pattern": {"kind": kind}}}}
+        (sample / "meta.json").write_text(json.dumps(meta))
+        with OpenEXR.File(str(sample / "flow.exr"), separate_channels=True) as file:
+            channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+        channels["contact.Y"] = np.zeros_like(channels["forward.U"])
+        channels["contact.Y"][:, :40] = 1.0
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        OpenEXR.File(header, channels).write(str(sample / "flow.exr"))
+    return folder
+
+
+@pytest.mark.parametrize("pattern", [DRAWN_KIND, DRAWN_PATTERN], ids=["kind", "pattern"])
+def test_a_data_set_with_contact_and_patterns_is_sorted(pattern: dict, tmp_path: Path) -> None:
+    """Fails, where the whole pattern is drawn, with the kind looked up in the header alone."""
+    dataset = open_pairs(with_contact(tmp_path / "data", pattern))
+    result = compare([Constant("zero", 0, 0), Constant("right", 3, 0)], dataset, tmp_path / "out")
+    header, rows = strata_table(result.strata)
+    assert header == ["where", "pixels", "zero", "right"]
+    cells = {row[0]: row[1:] for row in rows}
+    # 64 rows; columns 8 to 71 are known and visible
+    assert cells["motion: 2 to 4 px"] == ["4096", "3.000", "0.000"]
+    assert cells["motion: 0 to 0.5 px"] == ["4096", "0.250", f"{np.hypot(3, 0.25):.3f}"]
+    assert cells["scene and pattern: toy, dots"][1] == cells["pattern: dots"][1] == "3.000"
+    assert cells["scene and pattern: toy, speckle"][1] == "0.250"
+    # columns 36 to 39 are within 4 px of the edge at 40, on its inner side, in both samples
+    assert cells["distance to contact edge: -4 to 0 px"] == [str(2 * 64 * 4), "1.625", f"{np.hypot(3, 0.25) / 2:.3f}"]
+    with (tmp_path / "out" / "strata.csv").open(newline="") as file:
+        table = {(row["method"], row["bin"]): row for row in csv.DictReader(file)}
+    assert float(table["zero", "2 to 4 px"]["outliers_1px"]) == 1.0
+    assert float(table["zero", "0 to 0.5 px"]["outliers_1px"]) == 0.0
+    assert float(table["zero", "0 to 0.5 px"]["outliers_01px"]) == 1.0
+
+
+def test_data_without_them_have_no_such_rows(tmp_path: Path) -> None:
+    scores = evaluate(Constant("zero", 0, 0), open_pairs(write_synthetic(tmp_path, [(1.0, 0.0)])))
+    assert {stratum.kind for stratum in scores[0].strata} == {MOTION}
+
+
+def test_bare_gels_are_left_out_of_a_second_table_of_means(tmp_path: Path) -> None:
+    """Nothing can be followed on a gel without a pattern, whose errors would hide all others."""
+    dataset = open_pairs(with_contact(tmp_path, DRAWN_KIND))  # a pair moves by 3 px, the other by 0.25 px
+    first = dataset.records[0]
+    bare = PairDataset(dataset.source, [replace(first, scene="toy, none"), *dataset.records[1:]])
+    result = compare([Constant("zero", 0, 0)], bare)
+    found = {title: rows for title, (_, rows) in tables(result) if title.startswith("Means")}
+    assert [rows[0][3] for rows in found.values()] == ["1.625", "0.250"]
+    assert "the 1 pairs of gels with a pattern" in list(found)[1]
+    cells = {row[0]: row[2] for row in strata_table(result.strata)[1]}
+    assert cells["motion, bare gel: 2 to 4 px"] == "3.000"
+    assert cells["distance to contact edge, bare gel: -4 to 0 px"] == "3.000"
+    assert cells["distance to contact edge: -4 to 0 px"] == cells["motion: 0 to 0.5 px"] == "0.250"
+    assert "motion: 2 to 4 px" not in cells
+    assert len([title for title, _ in tables(compare([Constant("zero", 0, 0)], dataset)) if "Means" in title]) == 1
