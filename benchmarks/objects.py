@@ -21,11 +21,11 @@ import numpy as np
 from synth.cli_options import DEFAULT_SCENE
 from synth.errors import InputError
 from synth.mesh import PadMesh
-from synth.sampling import draw
 from synth.scene import Scene
+from synth.scene.sampling import draw
+from synth.scene.template import load_scene
 from synth.simulate import Trajectory, simulate
 from synth.simulate.shared import resolution_of
-from synth.template import load_scene
 
 SIZE_MM = 8.0
 BALL = '{ shape = "sphere", radius_mm = 4.0 }'

@@ -15,12 +15,12 @@ from synth.dataset.output import output_of
 from synth.dataset.shard import Shard
 from synth.dataset.summary import shares
 from synth.errors import InputError
-from synth.generate import Scheduling, Summary, job_variant
-from synth.generate import generate as generate_samples
-from synth.plan import Plan, check_buildable, plan
+from synth.pipeline.generate import Scheduling, Summary, job_variant
+from synth.pipeline.generate import generate as generate_samples
+from synth.planning import Plan, check_buildable, plan
 from synth.progress import duration, progress
 from synth.render.variant import Device, Variant
-from synth.template import Template, load_scene
+from synth.scene.template import Template, load_scene
 
 _NO_LIMIT = 10_000
 """Characters: wider than any table."""
@@ -69,7 +69,7 @@ def run_plan(scene: str, n: int, assignments: Sequence[str], device: Device, as_
 def run_simulate(scene: str, out: Path, seed: int, index: int, assignments: Sequence[str], as_json: bool) -> int:
     """See `synth.cli.simulate`."""
     from synth.dataset.storage import refuse_foreign, storage_errors
-    from synth.sampling import draw
+    from synth.scene.sampling import draw
     from synth.simulate import simulate
     from synth.simulate.files import write_trajectory
     from synth.simulate.shared import resolution_of

@@ -8,8 +8,8 @@ from gelflow.baselines.learned import Learned
 from gelflow.data.open import open_pairs
 from gelflow.evaluate import evaluate
 from gelflow.shipped import weights_file
-from synth.generate import generate
-from synth.template import load_scene
+from synth.pipeline.generate import generate
+from synth.scene.template import load_scene
 
 QUICK = ["sampling.pairs_per_trajectory=3", "numerics.target_error_px=2.0", "outputs.backward=false"]
 

@@ -26,10 +26,10 @@ from synth.bench.agreement_draws import Drawn, drawn_of, one_by_one, together
 from synth.errors import InputError
 from synth.flow.exact import exact_flow
 from synth.optics import Optics
+from synth.scene.template import load_scene
 from synth.simulate import Trajectory
 from synth.simulate.batched.many import DRIVER
 from synth.surface import GelSurface
-from synth.template import load_scene
 
 WANTED = 1e-6
 """Relative distance of displacements that two devices may have."""

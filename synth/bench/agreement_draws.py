@@ -9,15 +9,15 @@ from pathlib import Path
 from synth.bench.agreement_noise import Noisy
 from synth.errors import InputError
 from synth.mesh import PadMesh
-from synth.sampling import draw, pairs_of
 from synth.scene import Scene
+from synth.scene.sampling import draw, pairs_of
+from synth.scene.template import Template
 from synth.simulate import Trajectory
 from synth.simulate.batched.many import job_of, run_jobs
 from synth.simulate.batched.pad import Pad, prepare
 from synth.simulate.driver import Driver
 from synth.simulate.shared import shared_mesh
 from synth.simulate.solve import check_shared
-from synth.template import Template
 
 LARGEST_BATCH = 256
 _PAD: list[Pad] = []

@@ -54,8 +54,8 @@ def run_budget(
     """
     from synth.bench.budget_study import Reference, Study
     from synth.dataset.storage import report_folder
+    from synth.scene.template import load_scene, shipped_scenes
     from synth.simulate.resolution import LADDER
-    from synth.template import load_scene, shipped_scenes
 
     finer = tuple(across for across in LADDER if across < reference)
     if len(finer) < 2:

@@ -1,4 +1,4 @@
-"""Presses spread over worker processes of one thread each; as `synth.processes` does for samples."""
+"""Presses spread over worker processes of one thread each; as `synth.pipeline.worker_pool` does for samples."""
 
 import threading
 from collections.abc import Generator
@@ -11,8 +11,8 @@ from synth.bench.budget_press import Pressed, press
 from synth.bench.budget_schedule import Schedule
 from synth.bench.budget_study import Job, Study
 from synth.errors import InputError
-from synth.processes import interrupts_blocked, leave_with_driver
-from synth.processes.threads import one_thread_each
+from synth.pipeline.threads import one_thread_each
+from synth.pipeline.worker_pool import interrupts_blocked, leave_with_driver
 
 
 def presses(study: Study, schedule: Schedule, workers: int, machine: str) -> Generator[Pressed, None, None]:

@@ -17,9 +17,10 @@ from typing import Any
 
 from synth.errors import InputError
 from synth.mesh import Counts, Focus, PadMesh, domed, graded_box
-from synth.plan import ITERATIONS_PER_RECORD, ITERATIONS_PER_STEP, SOLVE_GROWTH
-from synth.sampling import MAX_DRAWS, draw, draw_sensor, pairs_of, sensor_of
+from synth.planning.plan import ITERATIONS_PER_RECORD, ITERATIONS_PER_STEP, SOLVE_GROWTH
 from synth.scene import Gel, Scene
+from synth.scene.sampling import MAX_DRAWS, draw, draw_sensor, pairs_of, sensor_of
+from synth.scene.template import Template
 from synth.simulate.footprint import footprint
 from synth.simulate.indenter import rigid_body
 from synth.simulate.newton import MAX_ITERATIONS
@@ -38,7 +39,6 @@ from synth.simulate.resolution import (
     predicted_error_px,
     resolve,
 )
-from synth.template import Template
 
 BEYOND = 3
 """Rungs that are run above the chosen one."""

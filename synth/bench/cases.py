@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from synth.mesh import Focus
-from synth.scene import Gel, Motion, Pose
-from synth.scene_indenters import Sphere
+from synth.scene import Gel, Motion, Pose, Sphere
 from synth.simulate.footprint import footprint
 from synth.simulate.indenter import rigid_body
 from synth.simulate.path import Path

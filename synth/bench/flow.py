@@ -32,7 +32,7 @@ def run_flow(scenes: Sequence[str], out: Path, seed: int, as_json: bool) -> int:
     from synth.dataset.jsontext import to_line
     from synth.dataset.storage import replace_file, report_folder
     from synth.errors import InputError
-    from synth.template import load_scene
+    from synth.scene.template import load_scene
 
     began = time.perf_counter()
     report_folder(out, "flow")

@@ -38,8 +38,8 @@ def run_light(
     from synth.dataset.jsontext import to_line
     from synth.dataset.storage import replace_file, report_folder
     from synth.errors import InputError
-    from synth.generate import job_variant
-    from synth.template import load_scene
+    from synth.pipeline.generate import job_variant
+    from synth.scene.template import load_scene
 
     began = time.perf_counter()
     report_folder(out, "light")

@@ -14,9 +14,9 @@ from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
 from synth.render.sample_count import MOST, SHARE, render_noise
 from synth.render.variant import Variant
-from synth.sampling import draw, stream
 from synth.scene import Render
-from synth.template import Template
+from synth.scene.sampling import draw, stream
+from synth.scene.template import Template
 
 SENSORS = 3
 TOLERANCE = 0.03

@@ -31,8 +31,8 @@ def run_bench(what: str, out: Path, quick: bool, as_json: bool, processes: int =
     from synth.bench.fem import measure
     from synth.bench.report import record, summary, write_results
     from synth.dataset.storage import report_folder
+    from synth.scene.template import load_scene
     from synth.simulate.resolution import scale_px_per_mm
-    from synth.template import load_scene
 
     report_folder(out, "fem")
     scale = scale_px_per_mm(load_scene("gelsight_mini", []).corners[0])

@@ -79,8 +79,8 @@ def run_scale(
 
 def _settings(scene: str, assignments: Sequence[str], sizes: Sequence[str], workers: Sequence[int]) -> "list[Setting]":
     from synth.bench.scale_measure import Setting
-    from synth.processes import cores
-    from synth.template import load_scene
+    from synth.pipeline.threads import cores
+    from synth.scene.template import load_scene
 
     camera = load_scene(scene, assignments).corners[0].sensor.camera
     pixels = [_size(size) for size in sizes] or [(camera.width // 2, camera.height // 2), (camera.width, camera.height)]

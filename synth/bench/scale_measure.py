@@ -28,14 +28,14 @@ from synth.arrays import FloatArray
 from synth.dataset.joining import MANIFEST_FILE
 from synth.dataset.reader import Dataset, read_dataset
 from synth.dataset.storage import flush
-from synth.generate import Scheduling, generate, job_variant
 from synth.mesh import rest_surface
-from synth.processes.threads import render_on_one_core
+from synth.pipeline.generate import Scheduling, generate, job_variant
+from synth.pipeline.threads import render_on_one_core
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
 from synth.render.variant import Device, Variant
-from synth.sampling import sensor_of, stream
-from synth.template import Template, load_scene
+from synth.scene.sampling import sensor_of, stream
+from synth.scene.template import Template, load_scene
 
 REPEATS = 5
 """Of the measurement of the limit of writing; the median counts."""

@@ -14,7 +14,7 @@ from synth.bench.machine import processor
 from synth.bench.scale_measure import Cell
 from synth.dataset.sample import SAMPLE_FILES
 from synth.dataset.storage import replace_file
-from synth.processes import cores
+from synth.pipeline.threads import cores
 from synth.simulate.linear import has_pardiso
 
 JOBS = (5_000, 500_000, 50_000_000)

@@ -17,12 +17,12 @@ from synth.errors import InputError
 from synth.mesh import PadMesh
 from synth.mesh.tetrahedralise import shape_quality
 from synth.scene import Scene
+from synth.scene.template import load_scene
 from synth.simulate import Trajectory, simulate
 from synth.simulate.driver import Driver
 from synth.simulate.resolution import resolve
 from synth.stress.cases import Case, Run
 from synth.stress.inputs import altered_mesh, write_surface
-from synth.template import load_scene
 
 
 def main(arguments: Sequence[str]) -> int:

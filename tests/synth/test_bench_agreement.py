@@ -14,9 +14,9 @@ import warp as wp
 from synth.bench.agreement import WANTED, compare, main
 from synth.bench.agreement_draws import drawn_of, together
 from synth.bench.agreement_noise import Noisy
+from synth.scene.template import load_scene
 from synth.simulate import Trajectory
 from synth.simulate.batched.many import DRIVER
-from synth.template import load_scene
 
 TINY = ["numerics.element=p1p1", "sensor.camera.width=32", "sensor.camera.height=24", "motion.steps=2"]
 SMALL = ["--device", "cpu", "--cells", "6", "4", "2", "--trajectories", "4"]

@@ -24,10 +24,10 @@ from synth.bench.budget_store import Store
 from synth.bench.budget_study import REFERENCE, Job, Reference, Study, drawn, jobs
 from synth.cli import main
 from synth.errors import InputError
-from synth.sampling import draw, pairs_of
+from synth.scene.sampling import draw, pairs_of
+from synth.scene.template import load_scene
 from synth.simulate import simulate
 from synth.simulate.resolution import LADDER, Fineness, Resolution, ladder, resolve
-from synth.template import load_scene
 
 ROOT = Path(__file__).parents[2]
 TARGET = 0.0065
@@ -285,7 +285,7 @@ assert main(["bench", "budget", "--scene", scene, "--draws", "1", "--out", out, 
 from synth.bench import budget_press, budget_study
 from synth.bench.budget import study_budget
 from synth.bench.budget_study import Reference, Study
-from synth.template import load_scene
+from synth.scene.template import load_scene
 study_budget(Study((load_scene(scene),), 2, 1, (4,), Reference(across=6)), Path(out) / "small", "c")
 """
 

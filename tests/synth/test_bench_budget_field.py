@@ -7,9 +7,9 @@ import pytest
 from tiny_scene import TEXT, write_tiny
 
 from synth.bench.budget_field import LEAST_SEEN, picture_errors, places
-from synth.sampling import draw
+from synth.scene.sampling import draw
+from synth.scene.template import load_scene
 from synth.simulate.resolution import scale_px_per_mm
-from synth.template import load_scene
 
 
 def test_errors_of_known_fields(tmp_path: Path) -> None:

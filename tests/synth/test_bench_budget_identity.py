@@ -10,7 +10,7 @@ from tiny_scene import TEXT, write_tiny
 
 from synth.bench import budget_study
 from synth.bench.budget_study import REFERENCE, Reference, Study, drawn
-from synth.template import load_scene
+from synth.scene.template import load_scene
 
 ROOT = Path(__file__).parents[2]
 

@@ -21,19 +21,20 @@ from tiny_scene import TEXT, fingerprint, own_cache, write_tiny
 
 from synth.dataset.shard import Shard
 from synth.errors import InputError
-from synth.generate import Scheduling, generate, job_variant, make_job
-from synth.plan import plan
-from synth.processes.ahead import ahead
-from synth.produce import Failure, Outcome, Producer, Task, Workplace, in_batches
-from synth.produce.batches import by_sensor
-from synth.produce.drawing import Draws, Solved
+from synth.pipeline.attempts import Draws, Solved
+from synth.pipeline.batched_simulation import by_sensor, in_batches
+from synth.pipeline.generate import Scheduling, generate, job_variant, make_job
+from synth.pipeline.prefetch import ahead
+from synth.pipeline.producer import Producer
+from synth.pipeline.records import Failure, Outcome, Task, Workplace
+from synth.planning import plan
 from synth.render.variant import Variant
-from synth.sampling import MAX_DRAWS, draw, draw_sensor, sensor_of
 from synth.scene import Gel, Numerics, Scene
+from synth.scene.sampling import MAX_DRAWS, draw, draw_sensor, sensor_of
+from synth.scene.template import Template, load_scene
 from synth.simulate import simulate
 from synth.simulate.batched import simulate_many
 from synth.simulate.shared import accuracy, resolution_of, shared_mesh, spacing_mm
-from synth.template import Template, load_scene
 
 SPHERE = 'shape = "sphere"\nradius_mm = { uniform = [1.5, 2.5] }'
 CHOICE = """choice = [

@@ -8,11 +8,11 @@ import pytest
 from tiny_scene import write_tiny
 
 from synth.errors import InputError
-from synth.generate import job_variant
 from synth.mesh import pad_mesh
-from synth.plan import check_buildable, plan
+from synth.pipeline.generate import job_variant
+from synth.planning import check_buildable, plan
 from synth.render.variant import Variant
-from synth.template import load_scene, shipped_scenes
+from synth.scene.template import load_scene, shipped_scenes
 
 LLVM, MONO, SCALAR = Variant("llvm_ad_rgb", ""), Variant("llvm_ad_mono", ""), Variant("scalar_rgb", "")
 

@@ -7,11 +7,12 @@ from pathlib import Path
 import pytest
 from tiny_scene import fingerprint, own_cache, reference, write_tiny
 
-from synth.generate import Scheduling, generate, job_variant, make_job
-from synth.processes import outcomes_of_processes, pool
-from synth.processes.threads import THREADS
-from synth.produce import Task, Workplace
-from synth.template import load_scene
+from synth.pipeline import worker_pool as pool
+from synth.pipeline.generate import Scheduling, generate, job_variant, make_job
+from synth.pipeline.records import Task, Workplace
+from synth.pipeline.threads import THREADS
+from synth.pipeline.worker_pool import outcomes_of_processes
+from synth.scene.template import load_scene
 
 
 @pytest.fixture(autouse=True)

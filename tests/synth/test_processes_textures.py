@@ -11,12 +11,13 @@ from processes_of import HAS_PROC, workers_of
 from tiny_scene import TEXT, own_cache, write_tiny
 
 from synth.arrays import Image
-from synth.generate import job_variant, make_job
-from synth.processes import outcomes_of_batches, textures
-from synth.processes.threads import THREADS, one_thread_each
-from synth.produce import Workplace
+from synth.pipeline import textures
+from synth.pipeline.generate import job_variant, make_job
+from synth.pipeline.overlapped import outcomes_of_batches
+from synth.pipeline.records import Workplace
+from synth.pipeline.threads import THREADS, one_thread_each
 from synth.scene import Sensor
-from synth.template import load_scene
+from synth.scene.template import load_scene
 
 
 @pytest.fixture

@@ -9,12 +9,12 @@ from tiny_scene import write_tiny
 
 from synth.dataset.reader import read_dataset
 from synth.errors import InputError
-from synth.generate import generate, job_variant
-from synth.plan import plan
-from synth.sampling import draw, draw_sensor
-from synth.scene_indenters import MeshIndenter
+from synth.pipeline.generate import generate, job_variant
+from synth.planning import plan
+from synth.scene import MeshIndenter
+from synth.scene.sampling import draw, draw_sensor
+from synth.scene.template import SCENES, Template, load_scene, with_files
 from synth.simulate.indenter import turned_by
-from synth.template import SCENES, Template, load_scene, with_files
 
 ANY = 'contact.indenter={ shape = "mesh", file = "objects/*.stl", rotation_deg = "any" }'
 

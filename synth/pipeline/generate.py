@@ -1,9 +1,9 @@
 """Scheduling: which trajectories are still to do, who does them, and what happened.
 
-In this process by default, which renders on all cores; with workers, in processes of one core each (`synth.processes`);
-with Ray, on a cluster (`synth.ray_pool`); or one shard of the job, beside others. With the batched solver this process
-simulates and renders, and the workers do the rest. The driver alone writes manifest and failures; samples' folders are
-written where they are made. The same command goes on where it stopped.
+In this process by default, which renders on all cores; with workers, in processes of one core each (`worker_pool`);
+with Ray, on a cluster (`ray_pool`); or one shard of the job, beside others. With the batched solver this process
+simulates and renders, and the workers do the rest (`overlapped`). The driver alone writes manifest and failures;
+samples' folders are written where they are made. The same command goes on where it stopped.
 """
 
 import re
@@ -25,15 +25,18 @@ from synth.dataset.writer import DatasetWriter
 from synth.errors import InputError
 from synth.mesh import mesh_key, pad_mesh
 from synth.mesh.cache import user_cache
-from synth.plan import check_buildable
-from synth.processes import cores, outcomes_of_batches, outcomes_of_processes
-from synth.produce import Outcome, Producer, Task, Workplace
-from synth.ray_pool import outcomes_of_ray
+from synth.pipeline.overlapped import outcomes_of_batches
+from synth.pipeline.producer import Producer
+from synth.pipeline.ray_pool import outcomes_of_ray
+from synth.pipeline.records import Outcome, Task, Workplace
+from synth.pipeline.threads import cores
+from synth.pipeline.worker_pool import outcomes_of_processes
+from synth.planning import check_buildable
 from synth.render.pattern import is_grey
 from synth.render.variant import Device, Variant, choose_variant
-from synth.sampling import draw_sensor, sensor_of
 from synth.scene import Gel
-from synth.template import Template
+from synth.scene.sampling import draw_sensor, sensor_of
+from synth.scene.template import Template
 
 PACKAGES = ("mitsuba", "drjit", "warp-lang", "pytetwild", "pypardiso", "numpy", "scipy", "OpenEXR")
 

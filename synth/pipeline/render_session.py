@@ -10,11 +10,11 @@ from dataclasses import dataclass
 
 from synth.arrays import FloatArray, Image
 from synth.mesh import rest_surface
-from synth.produce.records import Workplace
+from synth.pipeline.records import Workplace
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
-from synth.sampling import stream
 from synth.scene import Scene, Sensor
+from synth.scene.sampling import stream
 from synth.simulate.space import Space
 from synth.surface import GelSurface
 

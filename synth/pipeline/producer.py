@@ -6,13 +6,13 @@ from concurrent.futures import Future
 
 from synth.arrays import Image
 from synth.errors import InputError
-from synth.produce.batches import Pads, simulated_alone
-from synth.produce.drawing import Drawn, Draws, Solved
-from synth.produce.finishing import Developed, finish
-from synth.produce.records import Outcome, Workplace
-from synth.produce.studio import Studio
-from synth.sampling import draw_sensor, sensor_of
-from synth.scene_indenters import MeshIndenter
+from synth.pipeline.attempts import Drawn, Draws, Solved
+from synth.pipeline.batched_simulation import Pads, simulated_alone
+from synth.pipeline.finishing import Developed, finish
+from synth.pipeline.records import Outcome, Workplace
+from synth.pipeline.render_session import Studio
+from synth.scene import MeshIndenter
+from synth.scene.sampling import draw_sensor, sensor_of
 from synth.simulate import Trajectory, simulate
 from synth.simulate.batched.pad import Pad
 from synth.simulate.indenter import object_radius

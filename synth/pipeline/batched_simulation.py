@@ -14,15 +14,15 @@ from dataclasses import dataclass
 from itertools import islice
 
 from synth.errors import InputError
-from synth.produce.drawing import Drawn, Draws, Solved
-from synth.produce.records import Outcome, Task, Workplace
-from synth.sampling import SensorDraw, draw_sensor, sensor_of
+from synth.pipeline.attempts import Drawn, Draws, Solved
+from synth.pipeline.records import Outcome, Task, Workplace
 from synth.scene import Gel
+from synth.scene.sampling import SensorDraw, draw_sensor, sensor_of
+from synth.scene.template import Template
 from synth.simulate import Trajectory
 from synth.simulate.batched.jobs import Job
 from synth.simulate.batched.many import job_of, run_jobs
 from synth.simulate.batched.pad import Pad, prepare
-from synth.template import Template
 
 BATCH = {True: 256, False: 8}
 """Trajectories at once, with a GPU and without."""

@@ -2,7 +2,7 @@
 
 A task is one trajectory: it depends on (scene, seed, trajectory) alone and shares nothing with others but the output,
 where its samples appear whole or not at all. So Ray may repeat it when a worker or a machine is lost, and even have it
-done twice at once. The driver records what comes back, as with worker processes (`synth.processes`); a lost driver
+done twice at once. The driver records what comes back, as with worker processes (`worker_pool`); a lost driver
 loses the tasks under way, and the same command goes on.
 
 Every machine needs this package installed and must see the output: a directory on a shared file system, or a URL.
@@ -17,8 +17,9 @@ from contextlib import contextmanager
 from typing import Any
 
 from synth.errors import InputError
-from synth.processes.threads import render_on_one_core
-from synth.produce import Outcome, Producer, Task, Workplace
+from synth.pipeline.producer import Producer
+from synth.pipeline.records import Outcome, Task, Workplace
+from synth.pipeline.threads import render_on_one_core
 
 LOCAL = "local"
 """The address that means: a cluster of worker processes on this machine, for as long as the command runs."""

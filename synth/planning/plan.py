@@ -17,16 +17,15 @@ from synth.render.pattern import check_pattern, is_grey
 from synth.render.separated_light import check_light
 from synth.render.thin_lens import ThinLens
 from synth.render.variant import Variant
-from synth.sampling import check_pairs, draw
-from synth.scene import Scene
-from synth.scene_indenters import MeshIndenter
+from synth.scene import MeshIndenter, Scene
+from synth.scene.sampling import check_pairs, draw
+from synth.scene.template import Template
 from synth.simulate.indenter import object_radius, rigid_body
 from synth.simulate.material import DISPLACEMENT_ONLY_BELOW
 from synth.simulate.object_surface import object_triangles
 from synth.simulate.path import TWIST_ARM_MM
 from synth.simulate.resolution import DEFAULT_TARGET_PX, Resolution
 from synth.simulate.shared import resolution_of
-from synth.template import Template
 
 DRAWS = 12
 """Draws of the scene whose meshes are chosen to predict error and time."""

@@ -15,11 +15,14 @@ from contextlib import closing
 from functools import partial
 
 from synth.arrays import Image
-from synth.processes.ahead import ahead
-from synth.processes.pool import Maker, spread
-from synth.processes.textures import Textures
-from synth.produce import Developed, Outcome, Studio, Task, Workplace, develop, finish, in_batches
-from synth.produce.batches import Result
+from synth.pipeline.batched_simulation import Result, in_batches
+from synth.pipeline.finishing import Developed, finish
+from synth.pipeline.prefetch import ahead
+from synth.pipeline.producer import develop
+from synth.pipeline.records import Outcome, Task, Workplace
+from synth.pipeline.render_session import Studio
+from synth.pipeline.textures import Textures
+from synth.pipeline.worker_pool import Maker, spread
 
 AHEAD = 256
 """Simulated trajectories that wait to be rendered, at most: some hundred kilobytes each."""

@@ -15,8 +15,8 @@ from synth.errors import InputError
 from synth.render.lights import check_view
 from synth.render.thin_lens import ThinLens
 from synth.scene import Render, Sampling, Scene, Sensor
-from synth.schema_errors import validated
-from synth.template import Chooser, Template, replaced
+from synth.scene.template import Chooser, Template, replaced
+from synth.scene.validation import validated
 
 TRAJECTORY_PARTS = ("contact", "motion")
 """Drawn anew for every trajectory; everything else belongs to the sensor."""

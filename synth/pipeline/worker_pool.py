@@ -26,8 +26,9 @@ from multiprocessing.connection import Connection
 from typing import Any, TypeAlias, TypeVar
 
 from synth.errors import InputError
-from synth.processes.threads import one_thread_each, render_on_one_core
-from synth.produce import Outcome, Producer, Task, Workplace
+from synth.pipeline.producer import Producer
+from synth.pipeline.records import Outcome, Task, Workplace
+from synth.pipeline.threads import one_thread_each, render_on_one_core
 
 Item = TypeVar("Item")
 Maker: TypeAlias = Callable[[Item], Outcome]

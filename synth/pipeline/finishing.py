@@ -20,11 +20,11 @@ from synth.flow.exact import exact_flow
 from synth.flow.field import FlowField
 from synth.flow.view import View
 from synth.optics import Optics
-from synth.produce.records import FaceState, Failure, Outcome, Workplace
-from synth.produce.studio import Frame
+from synth.pipeline.records import FaceState, Failure, Outcome, Workplace
+from synth.pipeline.render_session import Frame
 from synth.render.camera_image import camera_image
-from synth.sampling import Pair, stream
 from synth.scene import Camera, Scene
+from synth.scene.sampling import Pair, stream
 from synth.simulate.shared import Accuracy, accuracy
 from synth.surface import GelSurface
 

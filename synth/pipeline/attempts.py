@@ -7,9 +7,9 @@ from pathlib import Path
 from synth.dataset.output import mesh_folder
 from synth.errors import InputError
 from synth.mesh import PadMesh
-from synth.produce.records import FaceState, Failure, Outcome, Task, Workplace
-from synth.sampling import MAX_DRAWS, Pair, SensorDraw, draw, pairs_of
+from synth.pipeline.records import FaceState, Failure, Outcome, Task, Workplace
 from synth.scene import Scene
+from synth.scene.sampling import MAX_DRAWS, Pair, SensorDraw, draw, pairs_of
 from synth.simulate import Trajectory
 from synth.simulate.resolution import Resolution, resolve
 from synth.simulate.shared import shared_mesh

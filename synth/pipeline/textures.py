@@ -5,8 +5,8 @@ from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 
 from synth.arrays import Image
-from synth.produce import Workplace
-from synth.produce.studio import paint
+from synth.pipeline.records import Workplace
+from synth.pipeline.render_session import paint
 from synth.scene import Sensor
 
 TEXTURES = 8

@@ -9,9 +9,9 @@ from synth.dataset.job import Job
 from synth.dataset.output import Output
 from synth.dataset.sample import ManifestEntry
 from synth.render.variant import Variant
+from synth.scene.template import Template
 from synth.simulate import State
 from synth.simulate.space import Space
-from synth.template import Template
 
 Task = tuple[int, tuple[int, ...]]
 """A trajectory and its samples that are wanted."""

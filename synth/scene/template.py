@@ -5,7 +5,7 @@
 `choice` may hold whole tables (indenters, say) with distributions inside. A `file` with wildcards, "objects/*.stl", is
 a choice of the files that match. A scene is checked when it is loaded: at the lower and upper end of all its
 distributions and for every choice, so that a mistake shows before any work is done. A `normal` is checked at its mean:
-a draw from its tails that breaks the schema is drawn again (`synth.sampling`).
+a draw from its tails that breaks the schema is drawn again (`synth.scene.sampling`).
 """
 
 import hashlib
@@ -20,12 +20,10 @@ from pathlib import Path
 from typing import Any
 
 from synth.errors import InputError
-from synth.scene import Scene
-from synth.scene_indenters import MeshIndenter
-from synth.scene_pattern import Bitmap
-from synth.schema_errors import DISTRIBUTIONS, validated
+from synth.scene import Bitmap, MeshIndenter, Scene
+from synth.scene.validation import DISTRIBUTIONS, validated
 
-SCENES = Path(__file__).resolve().parent.parent / "scenes"
+SCENES = Path(__file__).resolve().parents[2] / "scenes"
 """The shipped scene files."""
 FIXED = ("name", "description", "references", "numerics", "outputs", "sampling")
 """Parts that all samples of a dataset share."""
