@@ -25,7 +25,7 @@ from synth.scene import Scene
 from synth.scene.sampling import draw
 from synth.scene.template import load_scene
 from synth.simulate import Trajectory, simulate
-from synth.simulate.shared import resolution_of
+from synth.simulate.mesh_rule import MeshRule
 
 SIZE_MM = 8.0
 BALL = '{ shape = "sphere", radius_mm = 4.0 }'
@@ -50,7 +50,7 @@ def press(job: tuple[Path, int]) -> dict[str, Any]:
     row: dict[str, Any] = {"file": path.name, "seed": seed}
     try:
         scene = scene_of(f'{{ shape = "mesh", file = "{path}", size_mm = {SIZE_MM}, rotation_deg = "any" }}', seed)
-        mesh = resolution_of(scene).mesh
+        mesh = MeshRule.of(scene.numerics).resolution(scene).mesh
         result, seconds = timed(scene, mesh)
     except InputError as error:
         return {**row, "status": "refused", "reason": str(error)}

@@ -12,7 +12,7 @@ from synth.bench.budget_schedule import Schedule
 from synth.bench.budget_study import Job, Study
 from synth.errors import InputError
 from synth.pipeline.threads import one_thread_each
-from synth.pipeline.worker_pool import interrupts_blocked, leave_with_driver
+from synth.pipeline.worker_pool import exit_with_parent, interrupts_blocked
 
 
 def presses(study: Study, schedule: Schedule, workers: int, machine: str) -> Generator[Pressed, None, None]:
@@ -64,7 +64,7 @@ _task: tuple[Study, str] | None = None
 
 def _begin(study: Study, machine: str, leash: Connection) -> None:
     global _task
-    threading.Thread(target=leave_with_driver, args=(leash,), daemon=True).start()
+    threading.Thread(target=exit_with_parent, args=(leash,), daemon=True).start()
     _task = study, machine
 
 

@@ -18,7 +18,7 @@ from synth.bench.budget_trust import trust
 from synth.bench.budget_verdict import LARGEST_RATIO, Rung, Verdict
 from synth.bench.press import REPEATS, SHORT_S
 from synth.dataset.storage import replace_file
-from synth.planning.plan import SOLVE_GROWTH
+from synth.planning.prediction import SOLVE_GROWTH
 
 NOT_COVERED = (
     "The model itself: the reference solves the same equations with the same contact law. The verification tests "

@@ -17,16 +17,16 @@ from typing import Any
 
 from synth.errors import InputError
 from synth.mesh import Counts, Focus, PadMesh, domed, graded_box
-from synth.planning.plan import ITERATIONS_PER_RECORD, ITERATIONS_PER_STEP, SOLVE_GROWTH
+from synth.planning.prediction import ITERATIONS_PER_RECORD, ITERATIONS_PER_STEP, SOLVE_GROWTH
 from synth.scene import Gel, Scene
 from synth.scene.sampling import MAX_DRAWS, draw, draw_sensor, pairs_of, sensor_of
 from synth.scene.template import Template
 from synth.simulate.footprint import footprint
 from synth.simulate.indenter import rigid_body
+from synth.simulate.mesh_rule import MeshRule
 from synth.simulate.newton import MAX_ITERATIONS
 from synth.simulate.path import Path as IndenterPath
 from synth.simulate.resolution import (
-    DEFAULT_TARGET_PX,
     LADDER,
     MARGIN,
     STEEPEST_DEPTH,
@@ -37,7 +37,6 @@ from synth.simulate.resolution import (
     ladder,
     lateral_spacing,
     predicted_error_px,
-    resolve,
 )
 
 BEYOND = 3
@@ -148,10 +147,11 @@ def drawn(template: Template, seed: int, index: int) -> Drawn:
         InputError: none of its attempts can be used.
     """
     sensor, refused = draw_sensor(template, seed, sensor_of(template, index)), ""
+    rule = MeshRule.of(template.numerics)
     for attempt in range(MAX_DRAWS):
         try:
             scene = draw(template, seed, index, attempt, sensor)
-            chosen = resolve(scene, template.source.parent)
+            chosen = rule.resolution(scene, template.source.parent)
             body = rigid_body(scene.contact.indenter, template.source.parent)
         except InputError as error:
             refused = str(error)
@@ -159,8 +159,7 @@ def drawn(template: Template, seed: int, index: int) -> Drawn:
         gel = scene.sensor.gel
         focus = footprint(IndenterPath(scene.motion, body, gel.dome_radius_mm), gel.size_mm, MARGIN)
         frames = frozenset(k for pair in pairs_of(template, seed, index, scene.motion.steps) for k in pair.frames)
-        target = scene.numerics.target_error_px or DEFAULT_TARGET_PX
-        return Drawn(template, index, attempt, scene, focus, frames, chosen, target)
+        return Drawn(template, index, attempt, scene, focus, frames, chosen, rule.target_error_px)
     raise InputError(f"{template.name}, draw {index}: none of {MAX_DRAWS} attempts can be used: {refused}")
 
 

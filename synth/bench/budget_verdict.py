@@ -17,7 +17,7 @@ from functools import cached_property
 
 from synth.bench.budget_press import Measurement
 from synth.bench.report import RATE
-from synth.planning.plan import SOLVE_GROWTH
+from synth.planning.prediction import SOLVE_GROWTH
 
 LARGEST_RATIO = 2.0
 """Of the chosen mesh's cost over that of the cheapest rung within the budget."""

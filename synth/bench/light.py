@@ -38,7 +38,7 @@ def run_light(
     from synth.dataset.jsontext import to_line
     from synth.dataset.storage import replace_file, report_folder
     from synth.errors import InputError
-    from synth.pipeline.generate import job_variant
+    from synth.planning import job_variant
     from synth.scene.template import load_scene
 
     began = time.perf_counter()

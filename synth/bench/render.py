@@ -93,7 +93,7 @@ def _measure(
     from synth.bench.render_measure import measure, reference, settings, start_up, variants
     from synth.bench.render_rows import AUTO_FILE, FLOW_FILE, IMAGE_FILE, cell_row, choice_row, effect_rows, write_rows
     from synth.bench.render_subject import press
-    from synth.pipeline.generate import job_variant
+    from synth.planning import job_variant
     from synth.scene.template import load_scene
 
     began = time.perf_counter()

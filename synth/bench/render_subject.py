@@ -13,7 +13,7 @@ from synth.scene.sampling import MAX_DRAWS, draw, stream
 from synth.scene.template import Template
 from synth.scene.validation import validated
 from synth.simulate import simulate
-from synth.simulate.resolution import resolve
+from synth.simulate.mesh_rule import MeshRule
 from synth.surface import GelSurface
 
 
@@ -83,7 +83,7 @@ def press(template: Template, seed: int, size: tuple[int, int] | None) -> Subjec
             sensor = alone(scene.sensor)
             camera = sensor.camera
             small = resized(sensor, size or (max(16, camera.width // 2), max(16, camera.height // 2)))
-            mesh = resolve(scene, template.source.parent).mesh
+            mesh = MeshRule.of(scene.numerics).resolution(scene, template.source.parent).mesh
             steps = scene.motion.steps
             result = simulate(scene, mesh, template.source.parent, frames=frozenset({0, steps}))
         except InputError as error:

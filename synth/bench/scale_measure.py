@@ -29,8 +29,9 @@ from synth.dataset.joining import MANIFEST_FILE
 from synth.dataset.reader import Dataset, read_dataset
 from synth.dataset.storage import flush
 from synth.mesh import rest_surface
-from synth.pipeline.generate import Scheduling, generate, job_variant
+from synth.pipeline.generate import Scheduling, generate
 from synth.pipeline.threads import render_on_one_core
+from synth.planning import job_variant
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
 from synth.render.variant import Device, Variant

@@ -1,16 +1,20 @@
-"""What the makers of samples are given, and what they give back."""
+"""What those who make samples are given, and what they hand on and give back."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from synth.arrays import FloatArray
 from synth.dataset.job import Job
-from synth.dataset.output import Output
+from synth.dataset.output import Output, mesh_folder
 from synth.dataset.sample import ManifestEntry
-from synth.render.variant import Variant
-from synth.scene.template import Template
+from synth.planning import Plan
+from synth.scene import Scene
+from synth.scene.sampling import Pair, stream
 from synth.simulate import State
+from synth.simulate.shared import Accuracy
 from synth.simulate.space import Space
 
 Task = tuple[int, tuple[int, ...]]
@@ -18,46 +22,38 @@ Task = tuple[int, tuple[int, ...]]
 
 
 @dataclass(frozen=True)
-class Workplace:
+class JobContext:
     """What every task of a job shares; picklable.
 
     Attributes:
-        template: the scene.
+        plan: of the scene.
         job: what the dataset was asked for.
         out: of the dataset.
-        variant: that renders.
         cache: where meshes are kept beside the dataset.
     """
 
-    template: Template
+    plan: Plan
     job: Job
     out: Output
-    variant: Variant
     cache: Path
 
     @property
-    def needs_meshes(self) -> bool:
-        """Whether pads are meshed by fTetWild, which is random, so that all must use the same mesh."""
-        return self.template.corners[0].numerics.edge_length_mm is not None
+    def mesh_folders(self) -> tuple[Path, Path] | None:
+        """Where fTetWild's meshes are kept; it is random, so that all must use the same ones. None for other meshes."""
+        return (mesh_folder(self.out), self.cache) if self.plan.mesh.kind == "tetwild" else None
 
-    @property
-    def is_batched(self) -> bool:
-        """Whether trajectories are simulated many at once."""
-        return self.template.corners[0].numerics.solver == "batched"
-
-    @property
-    def has_gpu(self) -> bool:
-        """Whether the renderer, and with it the batched solver, runs on a GPU."""
-        return self.variant.name.startswith("cuda")
+    def stream(self, purpose: str, *numbers: int) -> np.random.Generator:
+        """The job's random stream of one purpose."""
+        return stream(self.plan.template, self.job.seed, purpose, *numbers)
 
 
 @dataclass(frozen=True)
 class Failure:
-    """A draw that gave no trajectory.
+    """A random instance that gave no trajectory.
 
     Attributes:
         index: of the trajectory's first sample.
-        draw: 0 for the trajectory's first failed draw, and so on.
+        draw: 0 for the trajectory's first failure, and so on.
         stage: "sensor", "draw" or "simulate".
         reason: for the user.
         last_good_state: of a simulation.
@@ -72,7 +68,7 @@ class Failure:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a task did: manifest lines of the samples on disk, failed draws, and samples given up."""
+    """What a task did: manifest lines of the samples on disk, failed instances, and samples given up."""
 
     entries: tuple[ManifestEntry, ...]
     failures: tuple[Failure, ...]
@@ -101,3 +97,39 @@ class FaceState:
         """The part of a state that lies on the contact face."""
         displacement = state.displacement[space.surface_nodes]
         return FaceState(displacement, state.traction, state.force_n, state.torque_nmm, state.summary())
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedTrajectory:
+    """A simulated trajectory, less what no sample shows; picklable.
+
+    Attributes:
+        number: of the trajectory.
+        scene: fully drawn.
+        pairs: the samples that are wanted.
+        states: by number, those that the samples show.
+        mesh: what is said of the mesh: hash and element.
+        edge_radius_mm: of a mesh indenter, else None.
+        accuracy: of the mesh; None where it is left to whoever finishes the samples.
+        failures: instances that failed before.
+        seconds: of the simulation.
+    """
+
+    number: int
+    scene: Scene
+    pairs: tuple[Pair, ...]
+    states: dict[int, FaceState]
+    mesh: dict[str, Any]
+    edge_radius_mm: float | None
+    accuracy: Accuracy | None
+    failures: tuple[Failure, ...]
+    seconds: float
+
+    @property
+    def sensor(self) -> int:
+        """Number of its sensor."""
+        return self.pairs[0].sensor
+
+
+Simulated = tuple[SimulatedTrajectory, Space]
+"""With the space that its states' numbers are nodes of."""

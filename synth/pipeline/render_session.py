@@ -1,20 +1,20 @@
-"""Radiance of a trajectory's frames: one renderer, kept until another sensor is wanted.
+"""Radiance of trajectories' frames: one renderer, kept until another sensor is wanted.
 
 Nothing here depends on which other trajectories were rendered before: renderer and undeformed frame are a pure function
 of (scene, seed, sensor), and every frame has a seed of its own.
 """
 
+import time
 from collections.abc import Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
 
 from synth.arrays import FloatArray, Image
 from synth.mesh import rest_surface
-from synth.pipeline.records import Workplace
+from synth.pipeline.records import JobContext, SimulatedTrajectory
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
-from synth.scene import Scene, Sensor
-from synth.scene.sampling import stream
+from synth.scene import Gel, Scene, Sensor
 from synth.simulate.space import Space
 from synth.surface import GelSurface
 
@@ -33,7 +33,24 @@ class Frame:
 
 
 @dataclass(frozen=True, eq=False)
-class _Finger:
+class RenderedTrajectory:
+    """A trajectory whose frames are rendered; picklable.
+
+    Attributes:
+        simulated: the trajectory.
+        surface: what was rendered.
+        frames: by number, all that the wanted samples show.
+        seconds: of rendering.
+    """
+
+    simulated: SimulatedTrajectory
+    surface: GelSurface
+    frames: Mapping[int, Frame]
+    seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class SensorRenderer:
     """What all trajectories of one sensor share.
 
     Attributes:
@@ -47,72 +64,64 @@ class _Finger:
     rest: dict[str, Image] | None
 
 
-class Studio:
+class RenderSession:
     """Renders trajectories; keeps the last sensor's renderer and the last mesh's surface."""
 
-    def __init__(self, place: Workplace) -> None:
+    def __init__(self, context: JobContext) -> None:
         """Nothing is loaded before the first frame."""
-        self._place = place
-        self._finger: _Finger | None = None
+        self._context = context
+        self._sensor: SensorRenderer | None = None
         self._surface: tuple[Space, GelSurface] | None = None
 
-    def surface_of(self, scene: Scene, space: Space) -> GelSurface:
+    def render_frames(
+        self, simulated: SimulatedTrajectory, space: Space, texture: Future[Image] | None = None
+    ) -> RenderedTrajectory:
+        """Render the frames of a trajectory that its wanted samples show.
+
+        Args:
+            simulated: the trajectory.
+            space: of its states.
+            texture: its sensor's, where it is being painted already.
+        """
+        started = time.perf_counter()
+        surface = self._surface_of(space, simulated.scene.sensor.gel)
+        sensor = self._prepared(simulated.scene, simulated.sensor, texture)
+        frames: dict[int, Frame] = {}
+        for number, state in sorted(simulated.states.items()):
+            if number == 0 and sensor.rest is not None:
+                frames[0] = Frame(surface.material, sensor.rest)
+                continue
+            positions = surface.positions(state.displacement)
+            sensor.renderer.take(surface)
+            seed = self._seed("frame", simulated.number, number)
+            frames[number] = Frame(positions, sensor.renderer.radiances(positions, seed))
+        return RenderedTrajectory(simulated, surface, frames, time.perf_counter() - started)
+
+    def _surface_of(self, space: Space, gel: Gel) -> GelSurface:
         """The surface that is rendered for a mesh."""
         if self._surface is None or self._surface[0] is not space:
-            parts = SUBDIVISIONS[space.element.order] * (FINER_DOME if scene.sensor.gel.dome_radius_mm else 1)
+            parts = SUBDIVISIONS[space.element.order] * (FINER_DOME if gel.dome_radius_mm else 1)
             self._surface = space, GelSurface(space.surface, parts)
         return self._surface[1]
 
-    def frames(
-        self,
-        scene: Scene,
-        trajectory: int,
-        sensor: int,
-        surface: GelSurface,
-        displacements: Mapping[int, FloatArray],
-        texture: Future[Image] | None = None,
-    ) -> dict[int, Frame]:
-        """Frames of a trajectory by their number.
-
-        Args:
-            scene: its draw.
-            trajectory: its number.
-            sensor: its sensor's number.
-            surface: from `surface_of`.
-            displacements: (s, 3) mm at the surface's nodes, by number of the frame.
-            texture: the sensor's, where it is being painted already; needed when the sensor changes.
-        """
-        finger = self._prepared(scene, sensor, texture)
-        found: dict[int, Frame] = {}
-        for frame in sorted(displacements):
-            if frame == 0 and finger.rest is not None:
-                found[0] = Frame(surface.material, finger.rest)
-                continue
-            positions = surface.positions(displacements[frame])
-            finger.renderer.take(surface)
-            seed = self._seed("frame", trajectory, frame)
-            found[frame] = Frame(positions, finger.renderer.radiances(positions, seed))
-        return found
-
-    def _prepared(self, scene: Scene, sensor: int, texture: Future[Image] | None) -> _Finger:
+    def _prepared(self, scene: Scene, number: int, texture: Future[Image] | None) -> SensorRenderer:
         """Renderer and undeformed frame of a sensor, kept until another one is wanted."""
-        if self._finger is None or self._finger.sensor != sensor:
-            variant = self._place.variant
+        if self._sensor is None or self._sensor.sensor != number:
+            variant = self._context.plan.variant
             variant.load()
             surface = rest_surface(scene.sensor.gel)
-            painted = paint(self._place, sensor, scene.sensor) if texture is None else texture.result()
+            painted = paint(self._context, number, scene.sensor) if texture is None else texture.result()
             renderer = Renderer(scene.sensor, scene.render, surface, painted, variant)
             rest = None
             if scene.sensor.gel.dome_radius_mm is None:
-                rest = renderer.radiances(surface.material, self._seed("rest", sensor))
-            self._finger = _Finger(sensor, renderer, rest)
-        return self._finger
+                rest = renderer.radiances(surface.material, self._seed("rest", number))
+            self._sensor = SensorRenderer(number, renderer, rest)
+        return self._sensor
 
     def _seed(self, purpose: str, *numbers: int) -> int:
-        return int(stream(self._place.template, self._place.job.seed, f"render {purpose}", *numbers).integers(2**31))
+        return int(self._context.stream(f"render {purpose}", *numbers).integers(2**31))
 
 
-def paint(place: Workplace, sensor: int, scene: Sensor) -> Image:
-    """A sensor's texture."""
-    rng = stream(place.template, place.job.seed, "pattern", sensor)
-    return albedo(scene, rng, place.template.source.parent)
+def paint(context: JobContext, number: int, sensor: Sensor) -> Image:
+    """The texture of a sensor, by its number."""
+    return albedo(sensor, context.stream("pattern", number), context.plan.template.folder)

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from synth.errors import InputError
-from synth.scene import Bitmap, MeshIndenter, Scene
+from synth.scene import Bitmap, MeshIndenter, Numerics, Outputs, Sampling, Scene
 from synth.scene.validation import DISTRIBUTIONS, validated
 
 SCENES = Path(__file__).resolve().parents[2] / "scenes"
@@ -76,6 +76,26 @@ class Template:
         contents = [_corner(self.content, high, turn) for turn in turns for high in (False, True)]
         return tuple(dict.fromkeys(validated(content, self.label, Scene) for content in contents))
 
+    @property
+    def folder(self) -> Path:
+        """What the files that the scene names are relative to."""
+        return self.source.parent
+
+    @property
+    def numerics(self) -> Numerics:
+        """The same for all samples, as are outputs and sampling."""
+        return self.corners[0].numerics
+
+    @property
+    def outputs(self) -> Outputs:
+        """The channels of flow.exr."""
+        return self.corners[0].outputs
+
+    @property
+    def sampling(self) -> Sampling:
+        """Samples of a trajectory, trajectories of a sensor."""
+        return self.corners[0].sampling
+
     def distributions(self) -> list[tuple[str, Any, str]]:
         """Kind, arguments and path of every distribution, nested ones after their choice."""
         return list(_distributions(self.content, ""))
@@ -85,7 +105,7 @@ class Template:
         parts: list[tuple[str, Any]] = [("contact.indenter", corner.contact.indenter) for corner in self.corners]
         parts += [("sensor.pattern", corner.sensor.pattern) for corner in self.corners]
         names = sorted({(f"{key}.file", part.file) for key, part in parts if isinstance(part, MeshIndenter | Bitmap)})
-        return [(key, self.source.parent / name) for key, name in names]
+        return [(key, self.folder / name) for key, name in names]
 
 
 def load_scene(name_or_path: str | Path, overrides: Sequence[str] = ()) -> Template:

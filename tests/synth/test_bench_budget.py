@@ -27,7 +27,8 @@ from synth.errors import InputError
 from synth.scene.sampling import draw, pairs_of
 from synth.scene.template import load_scene
 from synth.simulate import simulate
-from synth.simulate.resolution import LADDER, Fineness, Resolution, ladder, resolve
+from synth.simulate.mesh_rule import MeshRule
+from synth.simulate.resolution import LADDER, Fineness, Resolution, ladder
 
 ROOT = Path(__file__).parents[2]
 TARGET = 0.0065
@@ -62,7 +63,9 @@ def test_a_draw_is_that_of_generate(study: Study) -> None:
     template = study.templates[0]
     one = drawn(template, 2, 1)
     assert one.scene == draw(template, 2, 1)
-    assert one.chosen.mesh.hash == resolve(one.scene, template.source.parent).mesh.hash
+    assert (
+        one.chosen.mesh.hash == MeshRule.of(one.scene.numerics).resolution(one.scene, template.source.parent).mesh.hash
+    )
     frames = {k for pair in pairs_of(template, 2, 1, one.scene.motion.steps) for k in pair.frames}
     assert one.frames == frames
     assert one.judged == sorted(frames - {0})

@@ -11,7 +11,7 @@ from synth.bench.budget_schedule import OVERHEAD_S, Schedule
 from synth.bench.budget_study import REFERENCE, Job
 from synth.bench.budget_tally import tally
 from synth.bench.budget_verdict import Rung, Verdict
-from synth.planning.plan import SOLVE_GROWTH
+from synth.planning.prediction import SOLVE_GROWTH
 
 
 def measured(
