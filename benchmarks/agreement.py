@@ -27,7 +27,7 @@ from synth.errors import InputError
 from synth.flow.exact import exact_flow
 from synth.mesh import PadMesh
 from synth.optics import Optics
-from synth.sampling import draw, pairs_of
+from synth.scene.sampling import draw, pairs_of
 from synth.scene import Scene
 from synth.simulate import Trajectory
 from synth.simulate.batched.gemm import Host
@@ -37,7 +37,7 @@ from synth.simulate.driver import Driver
 from synth.simulate.shared import shared_mesh
 from synth.simulate.solve import check_shared
 from synth.surface import GelSurface
-from synth.template import Template, load_scene
+from synth.scene.template import Template, load_scene
 
 WANTED = 1e-6
 """Relative distance of displacements that two devices may have."""

@@ -34,8 +34,8 @@ from synth.errors import InputError
 from synth.mesh import Counts, Focus, PadMesh, domed, face_height, graded_box
 from synth.optics import Optics
 from synth.optics.camera import Paths
-from synth.plan import SOLVE_GROWTH
-from synth.sampling import MAX_DRAWS, draw, draw_sensor, pairs_of, sensor_of
+from synth.planning.prediction import SOLVE_GROWTH
+from synth.scene.sampling import MAX_DRAWS, draw, draw_sensor, pairs_of, sensor_of
 from synth.scene import Gel, Scene
 from synth.simulate import Trajectory, simulate
 from synth.simulate.driver import Driver
@@ -55,7 +55,7 @@ from synth.simulate.resolution import (
     predicted_error_px,
     resolve,
 )
-from synth.template import Template, load_scene, shipped_scenes
+from synth.scene.template import Template, load_scene, shipped_scenes
 
 FINER, BESIDE, STEP_MM = 2.4, (4, 3), 0.125
 """Of the reference: how many times smaller its elements are, elements beside the contact, longest load step."""

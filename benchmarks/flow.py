@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.flow_methods import METHODS, SHIPPED, Motion
 from benchmarks.pressed_gel import View, press
 from benchmarks.rows import Row, arguments, machine, measure, plot, show
-from synth.template import load_scene
+from synth.scene.template import load_scene
 from synth.verify.camera import ForwardCamera
 from synth.verify.motion import FLOW_TOLERANCE_PX, derive
 from synth.verify.sheet import Sheet

@@ -19,11 +19,11 @@ from benchmarks.rows import Row, arguments, machine, measure, plot, show
 from gelflow.baselines.registry import named_methods
 from synth.arrays import Image
 from synth.cli_options import DEFAULT_SCENE
-from synth.generate import job_variant
+from synth.pipeline.generate import job_variant
 from synth.render.renderer import Renderer, full_grid
 from synth.render.variant import Variant
 from synth.scene import Render
-from synth.template import load_scene
+from synth.scene.template import load_scene
 
 STATES = ("undeformed", "pressed")
 SEPARATED_SAMPLES = (9, 16, 36)

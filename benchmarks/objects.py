@@ -16,11 +16,11 @@ from benchmarks.rows import Row, arguments, measure, show
 from synth.cli_options import DEFAULT_SCENE
 from synth.errors import InputError
 from synth.mesh import PadMesh
-from synth.sampling import draw
 from synth.scene import Scene
+from synth.scene.sampling import draw
+from synth.scene.template import load_scene
 from synth.simulate import Trajectory, simulate
-from synth.simulate.shared import resolution_of
-from synth.template import load_scene
+from synth.simulate.mesh_rule import MeshRule
 
 SIZE_MM = 8.0
 BALL = '{ shape = "sphere", radius_mm = 4.0 }'
@@ -45,7 +45,7 @@ def press(case: Row) -> Row:
     try:
         file = f'shape = "mesh", file = "{case["file"]}", size_mm = {SIZE_MM}, rotation_deg = "any"'
         scene = scene_of(f"{{ {file} }}", seed)
-        mesh = resolution_of(scene).mesh
+        mesh = MeshRule.of(scene.numerics).resolution(scene).mesh
         result, seconds = timed(scene, mesh)
     except InputError as error:
         return {"status": "refused", "reason": str(error)}

@@ -8,13 +8,13 @@ from synth.produce import FINER_DOME, SUBDIVISIONS
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
 from synth.render.variant import Variant
-from synth.sampling import MAX_DRAWS, draw, stream
+from synth.scene.sampling import MAX_DRAWS, draw, stream
 from synth.scene import Render, Scene, Sensor
-from synth.schema_errors import validated
+from synth.scene.validation import validated
 from synth.simulate import simulate
 from synth.simulate.resolution import resolve
 from synth.surface import GelSurface
-from synth.template import Template
+from synth.scene.template import Template
 
 
 @dataclass(frozen=True, eq=False)

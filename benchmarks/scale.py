@@ -18,9 +18,9 @@ from benchmarks.rows import Row, arguments, machine, measure, plot, show
 from synth.cli_options import DEFAULT_SCENE
 from synth.dataset.joining import MANIFEST_FILE
 from synth.errors import InputError
-from synth.generate import Scheduling, generate, job_variant
+from synth.pipeline.generate import Scheduling, generate, job_variant
 from synth.processes import cores
-from synth.template import Template, load_scene
+from synth.scene.template import Template, load_scene
 
 JOBS = (5_000, 500_000, 50_000_000)
 """Numbers of pairs whose time and storage are extrapolated."""

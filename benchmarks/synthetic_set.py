@@ -9,7 +9,7 @@ from pathlib import Path
 
 from benchmarks.rows import arguments
 from synth.cli import main as synth
-from synth.template import shipped_scenes
+from synth.scene.template import shipped_scenes
 
 CHANGES = (
     "sampling.pairs_per_trajectory=4", "sampling.trajectories_per_sensor=1", "numerics.target_error_px=1.0",

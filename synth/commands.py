@@ -15,12 +15,12 @@ from synth.dataset.output import output_of
 from synth.dataset.shard import Shard
 from synth.dataset.summary import shares
 from synth.errors import InputError
-from synth.generate import Scheduling, Summary, job_variant
-from synth.generate import generate as generate_samples
-from synth.plan import Plan, check_buildable, plan
+from synth.pipeline.generate import Scheduling, Summary
+from synth.pipeline.generate import generate as generate_samples
+from synth.planning import Plan, Prediction, job_variant, plan, predict
 from synth.progress import duration, progress
 from synth.render.variant import Device, Variant
-from synth.template import Template, load_scene
+from synth.scene.template import Template, load_scene
 
 _NO_LIMIT = 10_000
 """Characters: wider than any table."""
@@ -43,7 +43,6 @@ def run_generate(
     scheduling = Scheduling(workers, ray, Shard.parse(shard) if shard else None)
     template = _loaded(scene, assignments)
     variant = job_variant(template, device)
-    check_buildable(template, variant)
     if dry_run:
         return _show_plan(plan(template, variant), n, as_json)
     _say_hint(variant)
@@ -59,20 +58,19 @@ def run_generate(
 def run_plan(scene: str, n: int, assignments: Sequence[str], device: Device, as_json: bool) -> int:
     """See `synth.cli.plan`."""
     template = _loaded(scene, assignments)
-    variant = job_variant(template, device)
-    check_buildable(template, variant)
+    planned = plan(template, job_variant(template, device))
     if not as_json:
-        _say_hint(variant)
-    return _show_plan(plan(template, variant), n, as_json)
+        _say_hint(planned.variant)
+    return _show_plan(planned, n, as_json)
 
 
 def run_simulate(scene: str, out: Path, seed: int, index: int, assignments: Sequence[str], as_json: bool) -> int:
     """See `synth.cli.simulate`."""
     from synth.dataset.storage import refuse_foreign, storage_errors
-    from synth.sampling import draw
-    from synth.simulate import simulate
+    from synth.scene.sampling import draw
     from synth.simulate.files import write_trajectory
-    from synth.simulate.shared import resolution_of
+    from synth.simulate.mesh_rule import MeshRule
+    from synth.simulate.solve import simulate_press
 
     refuse_foreign(out / "trajectory.json", b'"scene": {')
     for surface in out.glob("state_*.vtu"):
@@ -81,11 +79,10 @@ def run_simulate(scene: str, out: Path, seed: int, index: int, assignments: Sequ
     drawn = draw(template, seed, index)
     with storage_errors(out):
         out.mkdir(parents=True, exist_ok=True)  # before minutes of work, not after
-    folder = template.source.parent
     try:
         with progress("simulate: percent of the way", 100) as advance:
-            mesh = resolution_of(drawn, folder).mesh
-            trajectory = simulate(drawn, mesh, folder, on_way=lambda share: advance(int(100 * share), 100))
+            press = MeshRule.of(template.numerics).press(drawn, template.folder)
+            trajectory = simulate_press(press, on_way=lambda share: advance(int(100 * share), 100))
     except InputError as error:
         raise InputError(f"{template.label}: {error}") from error
     record = write_trajectory(out, drawn, trajectory)
@@ -172,36 +169,38 @@ def _say_hint(variant: Variant) -> None:
 
 
 def _show_plan(planned: Plan, n: int, as_json: bool) -> int:
+    predicted = predict(planned)
     if as_json:
-        print(json.dumps({**planned.record(), "n": n}))
+        print(json.dumps({**planned.record(), **predicted.record(), "n": n}))
         return 0
     console = Console()
-    table = Table("feature", "runs", "because", title=f"{planned.scene} with {planned.variant}", title_justify="left")
+    title = f"{planned.template.name} with {planned.variant.name}"
+    table = Table("feature", "runs", "because", title=title, title_justify="left")
     for decision in planned.decisions:
         table.add_row(decision.feature, "yes" if decision.runs else "left out", Text(decision.reason))
     console.print(table)
-    seconds = sum(planned.seconds_per_pair.values())
-    stages = ", ".join(f"{stage} {value:.2f} s" for stage, value in planned.seconds_per_pair.items())
+    seconds = sum(predicted.seconds_per_pair.values())
+    stages = ", ".join(f"{stage} {value:.2f} s" for stage, value in predicted.seconds_per_pair.items())
     _say(
         console,
-        f"mesh: {planned.resolution}, about {planned.nodes} displacement nodes\n"
-        + _error_line(planned)
-        + f"predicted per pair: {stages}; {planned.bytes_per_pair / 1e6:.2f} MB\n"
-        f"predicted for {n} pairs: {duration(n * seconds)} on one core, {n * planned.bytes_per_pair / 1e9:.2f} GB\n"
+        f"mesh: {predicted.resolution}, about {predicted.nodes} displacement nodes\n"
+        + _error_line(predicted)
+        + f"predicted per pair: {stages}; {predicted.bytes_per_pair / 1e6:.2f} MB\n"
+        f"predicted for {n} pairs: {duration(n * seconds)} on one core, {n * predicted.bytes_per_pair / 1e9:.2f} GB\n"
         "times are predicted within a factor of three",
     )
     return 0
 
 
-def _error_line(planned: Plan) -> str:
+def _error_line(predicted: Prediction) -> str:
     """What the plan says of the simulation's discretisation error."""
-    if np.isnan(planned.target_error_px):
+    if predicted.error_px is None or predicted.target_error_px is None:
         return "with an edge length given, the simulation's discretisation error is not predicted\n"
-    median, largest = planned.error_px
+    median, largest = predicted.error_px
     line = f"predicted error of the flow from the simulation: {median:.2g} px (median), {largest:.2g} px (largest)"
-    if largest > planned.target_error_px:
-        return f"{line}; for some draws the mesh does not reach the target of {planned.target_error_px:g} px\n"
-    return f"{line}; target {planned.target_error_px:g} px\n"
+    if largest > predicted.target_error_px:
+        return f"{line}; for some draws the mesh does not reach the target of {predicted.target_error_px:g} px\n"
+    return f"{line}; target {predicted.target_error_px:g} px\n"
 
 
 def _show_summary(summary: Summary, variant: Variant) -> None:

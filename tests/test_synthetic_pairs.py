@@ -13,8 +13,8 @@ from gelflow.data.open import open_pairs
 from gelflow.losses import self_supervised_loss
 from gelflow.models.weights import weights_file
 from gelflow.ops.pyramid import flow_pyramid
-from synth.generate import generate
-from synth.template import load_scene
+from synth.pipeline.generate import generate
+from synth.scene.template import load_scene
 
 SCENE = """
 name = "toy"

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from synth.arrays import BoolArray, FloatArray
-from synth.produce import flat_surface
+from synth.mesh import flat_surface
 from synth.render.camera_image import expected_signal
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from synth.arrays import FloatArray, Pixels
 from synth.errors import InputError
 from synth.optics import Optics
-from synth.scene import Camera, Dots, Sensor
-from synth.scene_indenters import Part
+from synth.scene import Camera, Dots, Part, Sensor
 
 _Part = TypeVar("_Part", bound=Part)
 _FEWEST = 9

@@ -16,7 +16,7 @@ _FEWEST = 100
 
 
 def fit_noise(encoded: FloatArray, bare: BoolArray, gamma: float, step: float) -> tuple[float, float]:
-    """Read and shot noise of `synth.scene_camera.Camera`.
+    """Read and shot noise of `synth.scene.Camera`.
 
     Args:
         encoded: (H, W, 3) one frame in [0, 1].

@@ -7,8 +7,8 @@ import numpy as np
 
 from synth.errors import InputError
 from synth.scene import Dots, NoPattern, Render, Sensor
-from synth.schema_errors import validated
-from synth.template import Template, replaced
+from synth.scene.template import Template, replaced
+from synth.scene.validation import validated
 
 
 def middle(kind: str, arguments: list[Any]) -> Any:

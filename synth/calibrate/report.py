@@ -10,7 +10,7 @@ from synth.calibrate.comparison import Comparison
 from synth.calibrate.frames import Frames
 from synth.calibrate.sensor_fit import SensorFit
 from synth.scene import Dots, Sensor
-from synth.template import Template, with_files
+from synth.scene.template import Template, with_files
 
 
 def fitted_content(template: Template, fit: SensorFit, folder: str) -> dict[str, Any]:

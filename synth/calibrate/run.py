@@ -57,7 +57,7 @@ def run_calibrate(
     from synth.calibrate.toml_text import toml_text
     from synth.dataset.storage import refuse_foreign, replace_file, storage_errors
     from synth.render.variant import LLVM_HINT, choose_variant
-    from synth.template import checked_template, load_scene
+    from synth.scene.template import checked_template, load_scene
 
     started = time.perf_counter()
     template = load_scene(scene, assignments)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from synth.arrays import BoolArray, FloatArray, Points, Tets, Triangles
 from synth.errors import InputError
-from synth.scene_gel import dome_height
+from synth.scene.gel import dome_height
 from synth.surface import ContactFaces
 
 _FACES_OF_TET = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])  # normals point out of a positive tetrahedron

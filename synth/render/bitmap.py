@@ -14,7 +14,7 @@ import numpy as np
 
 from synth.arrays import FloatArray, Image
 from synth.errors import InputError
-from synth.scene_pattern import Bitmap
+from synth.scene import Bitmap
 
 
 def read_picture(pattern: Bitmap, folder: Path) -> Image:

@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from synth.arrays import FloatArray
-from synth.scene_pattern import Dots, Speckle
+from synth.scene import Dots, Speckle
 
 
 def dots_coverage(pattern: Dots, x: FloatArray, y: FloatArray, rng: np.random.Generator) -> FloatArray:

@@ -23,8 +23,7 @@ from synth.errors import InputError
 from synth.optics import Optics
 from synth.render.bitmap import laid_over, read_picture
 from synth.render.marks import dots_coverage, speckle_coverage
-from synth.scene import Sensor
-from synth.scene_pattern import Bitmap, Dots, NoPattern, Pattern, RandomColor, Speckle
+from synth.scene import Bitmap, Dots, NoPattern, Pattern, RandomColor, Sensor, Speckle
 
 TEXELS_PER_PIXEL = 4
 """Texels per image pixel and axis on the undeformed contact face: bilinear lookup stays below the pixel's own blur."""

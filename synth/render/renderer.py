@@ -26,7 +26,7 @@ from synth.render.gel_mesh import GelMesh
 from synth.render.lights import check_view, emitters
 from synth.render.pattern import is_grey
 from synth.render.sample_count import PILOT, needed_samples
-from synth.render.separated_light import SeparatedLight, check_light
+from synth.render.separated_light import SeparatedLight, is_separated
 from synth.render.thin_lens import ThinLens
 from synth.render.variant import Variant
 from synth.scene import Coating, Render, Sensor
@@ -65,10 +65,8 @@ class Renderer:
         for name, view in self._views.items():
             if name:
                 _check_further(name, view)
-        if render.light == "separated":
-            check_light(sensor.coating)
-        is_separated = render.light == "separated" and variant.is_vectorised  # every light at every sample
-        self._lit = 1 if is_separated else sum(light.power > 0 for light in sensor.lights)
+        separated = is_separated(render, sensor.coating, variant)  # every light at every sample
+        self._lit = 1 if separated else sum(light.power > 0 for light in sensor.lights)
         wanted = render.samples_per_pixel
         self._samples = full_grid(PILOT if wanted == "auto" else wanted, self._lit)
         self._mesh = GelMesh(surface, sensor.gel.size_mm[:2])
@@ -83,7 +81,7 @@ class Renderer:
         if variant.is_vectorised:
             self._share_kernels()
         shared = (self._scene, gel, self._parameters, render.max_depth, variant.is_mono, mi)
-        self._light = SeparatedLight(sensor, *shared) if is_separated else None
+        self._light = SeparatedLight(sensor, *shared) if separated else None
         # A path through Mitsuba's window is one interaction longer than one that starts inside.
         depth = render.max_depth + (1 if not variant.is_vectorised and refracts else 0)
         self._integrator = mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": True})

@@ -29,7 +29,8 @@ from synth.arrays import BoolArray, Image
 from synth.errors import InputError
 from synth.render.gel_mesh import GelMesh
 from synth.render.polygon_light import PolygonLight
-from synth.scene import Coating, Sensor
+from synth.render.variant import Variant
+from synth.scene import Coating, Render, Sensor
 
 PILOTS = 16
 """Rays from each face to each light, and to the gel."""
@@ -41,18 +42,21 @@ _SHIFT = (0.7548776662466927, 0.5698402909980532)
 """Of one light's shadow rays against the one before's: R2 sequence (Roberts 2018), on a torus to keep the strata."""
 
 
-def check_light(coating: Coating) -> None:
-    """Find out whether light on a coating can be separated.
+def is_separated(render: Render, coating: Coating, variant: Variant) -> bool:
+    """Whether light is separated or path traced: decided here alone. Scalar variants path-trace.
 
     Raises:
-        InputError: it shines.
+        InputError: separated light is asked for, and the coating shines.
     """
+    if render.light != "separated":
+        return False
     if not coating.is_matt:
         raise InputError(
             f'render.light = "separated" needs a matt coating (roughness = 1, metallic = 0), but this sensor\'s has '
             f"roughness = {coating.roughness:g} and metallic = {coating.metallic:g}: what shines depends on the view; "
             'set render.light to "path_traced"'
         )
+    return variant.is_vectorised
 
 
 @dataclass(frozen=True, eq=False)

@@ -68,6 +68,11 @@ class Variant:
         return not self.name.startswith("scalar")
 
     @property
+    def is_on_gpu(self) -> bool:
+        """Whether it renders on a GPU."""
+        return self.name.startswith("cuda")
+
+    @property
     def is_mono(self) -> bool:
         """Whether one channel stands for all three."""
         return "_mono" in self.name

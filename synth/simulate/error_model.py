@@ -19,8 +19,7 @@ The powers were set by hand near those of free fits, which predict other draws h
 import numpy as np
 
 from synth.mesh import Focus
-from synth.scene import Scene
-from synth.scene_indenters import Box, Cone, Cylinder, Indenter, MeshIndenter, Sphere, Torus
+from synth.scene import Box, Cone, Cylinder, Indenter, MeshIndenter, Scene, Sphere, Torus
 
 RATE = 1.6
 """Power of the spacing: fitted to the rungs of each draw it is 1.60."""

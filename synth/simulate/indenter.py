@@ -11,7 +11,7 @@ import numpy as np
 
 from synth.arrays import FloatArray
 from synth.errors import InputError
-from synth.scene_indenters import Box, Cone, Cylinder, Indenter, MeshIndenter, Sphere, Torus, Vector3
+from synth.scene import Box, Cone, Cylinder, Indenter, MeshIndenter, Sphere, Torus, Vector3
 from synth.simulate.distance import KINDS, SHAPE_LENGTH
 from synth.simulate.object_grid import Grid
 from synth.simulate.object_surface import object_triangles

@@ -17,7 +17,7 @@ import numpy as np
 
 from synth.arrays import FloatArray
 from synth.errors import InputError
-from synth.scene_indenters import MeshIndenter
+from synth.scene import MeshIndenter
 
 SHORTEST_MM, LONGEST_MM = 0.5, 1000.0
 """Longest edges beyond which a file is taken to be in another unit."""

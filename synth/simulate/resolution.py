@@ -1,7 +1,6 @@
 """Which mesh a draw is simulated on: as fine under its contact as its error budget asks for.
 
-With `numerics.edge_length_mm` the mesh is fTetWild's, everywhere as fine as that says, the same for all draws of a pad.
-Otherwise it is structured and graded around where the draw's indenter will touch: `across` elements across the contact,
+The mesh is structured and graded around where the draw's indenter will touch: `across` elements across the contact,
 as many through the thickness as keep elements under the contact about as high as wide. It is the cheapest mesh whose
 predicted error is within the budget; the prediction (`synth.simulate.error_model`) was calibrated, and is tested,
 against much finer solutions (docs/reports/budget.md).
@@ -14,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from synth.mesh import Counts, Focus, PadMesh, domed, graded_box, pad_mesh
+from synth.mesh import Counts, Focus, PadMesh, domed, graded_box
 from synth.mesh.graded import spacing
 from synth.mesh.pad import face_height
 from synth.optics import Optics
@@ -146,7 +145,6 @@ def depth_growth(through: int, height: float) -> float:
     return high
 
 
-DEFAULT_TARGET_PX = 0.5
 _FACE, _ZONE = (41, 33), (9, 9)
 """Points along x and y at which it is looked up what the camera sees, of the contact face and of the zone."""
 _LEAST_SEEN = 0.1
@@ -193,26 +191,22 @@ def scale_px_per_mm(scene: Scene) -> float:
     return float(np.sqrt(abs(u[0] * v[1] - u[1] * v[0])))
 
 
-def resolve(scene: Scene, folder: FilePath | None = None, mesh_folders: Sequence[FilePath] | None = None) -> Resolution:
-    """The mesh of a draw.
+def resolve(scene: Scene, folder: FilePath | None, target_error_px: float) -> Resolution:
+    """The cheapest graded mesh of a draw whose predicted error is within a target, else the finest.
 
     Args:
         scene: fully drawn.
         folder: what a mesh indenter's file name is relative to.
-        mesh_folders: where fTetWild's meshes are kept.
+        target_error_px: root-mean-square error of the flow over the contact face.
 
     Raises:
         InputError: the indenter or the mesh cannot be built.
     """
-    gel, numerics = scene.sensor.gel, scene.numerics
-    if numerics.edge_length_mm is not None:
-        mesh = pad_mesh(gel, numerics, mesh_folders)
-        return Resolution(mesh, 0, 0, numerics.edge_length_mm, float("nan"))
+    gel = scene.sensor.gel
     focus = footprint(path_of(scene, folder), gel.size_mm, MARGIN)
-    target = numerics.target_error_px or DEFAULT_TARGET_PX
     for fineness in ladder(gel, focus):
         mesh, fine = graded_mesh(gel, focus, *fineness)
         error = predicted_error_px(scene, focus, fine)
-        if error <= target:
+        if error <= target_error_px:
             break
     return Resolution(mesh, *fineness, fine, error)

@@ -22,7 +22,6 @@ from synth.simulate.resolution import (
     Resolution,
     depth_growth,
     predicted_error_px,
-    resolve,
 )
 
 
@@ -108,16 +107,3 @@ def accuracy(scene: Scene, folder: FilePath | None = None) -> Accuracy:
     focus = footprint(path_of(scene, folder), gel.size_mm, MARGIN)
     error = predicted_error_px(scene, focus, spacing_mm(gel, numerics))
     return Accuracy(int(2 * min(focus.half_mm) / _width(gel.size_mm, numerics.cells)), error)
-
-
-def resolution_of(
-    scene: Scene, folder: FilePath | None = None, mesh_folders: Sequence[FilePath] | None = None
-) -> Resolution:
-    """The mesh of a draw, made for it or shared, as `numerics.solver` says; arguments and errors as of `resolve`."""
-    gel, numerics = scene.sensor.gel, scene.numerics
-    if numerics.solver == "single" or numerics.edge_length_mm is not None:
-        return resolve(scene, folder, mesh_folders)
-    found = accuracy(scene, folder)
-    return Resolution(
-        shared_mesh(gel, numerics), found.across, numerics.cells[2], spacing_mm(gel, numerics), found.error_px
-    )

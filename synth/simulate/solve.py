@@ -7,15 +7,12 @@ from synth.errors import InputError
 from synth.mesh import PadMesh, check_mesh
 from synth.scene import Gel, Scene
 from synth.simulate.driver import STANDARD, Driver
-from synth.simulate.element import Element, p1p1, p2p1
 from synth.simulate.material import pad_material
-from synth.simulate.path import path_of
+from synth.simulate.press import ELEMENTS, Press
 from synth.simulate.space import function_space
 from synth.simulate.stepping import Stepper
 from synth.simulate.system import System
 from synth.simulate.trajectory import Trajectory
-
-ELEMENTS: dict[str, Callable[[], Element]] = {"auto": p2p1, "p1p1": p1p1, "p2p1": p2p1}
 
 
 def simulate(
@@ -25,25 +22,41 @@ def simulate(
     device: str = "cpu",
     frames: frozenset[int] | None = None,
     driver: Driver = STANDARD,
-    on_way: Callable[[float], None] | None = None,
 ) -> Trajectory:
-    """Press, shear and twist one scene's indenter into its pad.
+    """Press, shear and twist one scene's indenter into its pad, on a given mesh.
 
     Args:
         scene: fully drawn.
         mesh: of scene.sensor.gel.
         folder: what a mesh indenter's file name is relative to.
         device: Warp device.
-        frames: numbers of the states that are wanted, default all. The others are part of the trajectory, but keep the
-            penalty's penetration and the way's tolerance; those that are wanted are the same to the bit, unless one of
-            them misses the full tolerance and its step is halved.
+        frames: see `simulate_press`.
         driver: of Newton's method.
-        on_way: told after each step what share of the way is done.
 
     Raises:
         InputError: the indenter cannot be built.
     """
-    return stepper_of([scene], mesh, folder, device, frames, driver).run(on_way)[0]
+    return stepper_of([scene], mesh, folder, device, frames, driver).run()[0]
+
+
+def simulate_press(
+    press: Press,
+    frames: frozenset[int] | None = None,
+    on_way: Callable[[float], None] | None = None,
+) -> Trajectory:
+    """Simulate one press on the processor.
+
+    Args:
+        press: scene, mesh and load path.
+        frames: numbers of the states that are wanted, default all. The others are part of the trajectory, but keep the
+            penalty's penetration and the way's tolerance; those that are wanted are the same to the bit, unless one of
+            them misses the full tolerance and its step is halved.
+        on_way: told after each step what share of the way is done.
+
+    Raises:
+        InputError: no element can be built on the mesh.
+    """
+    return _stepper([press], "cpu", frames, STANDARD).run(on_way)[0]
 
 
 def simulate_batch(
@@ -67,24 +80,26 @@ def stepper_of(
     driver: Driver = STANDARD,
 ) -> Stepper:
     """What `simulate_batch` runs, at the start of the scenes' paths; arguments and errors as there."""
-    first = scenes[0]
+    return _stepper([Press.of(scene, mesh, folder) for scene in scenes], device, frames, driver)
+
+
+def _stepper(presses: Sequence[Press], device: str, frames: frozenset[int] | None, driver: Driver) -> Stepper:
+    first, mesh, scenes = presses[0].scene, presses[0].mesh, [press.scene for press in presses]
     check_shared(scenes, mesh)
     check_mesh(mesh)
-    gel = first.sensor.gel
     space = function_space(mesh, ELEMENTS[first.numerics.element]())
     system = System(
         space,
-        pad_material(gel, mesh),
+        pad_material(first.sensor.gel, mesh),
         batch=len(scenes),
         penalty=first.numerics.penalty,
         device=device,
         single=driver.single_precision,
         keep=driver.keep_factors,
     )
-    paths = [path_of(scene, folder, space.resolution_mm) for scene in scenes]
     moduli = [scene.sensor.gel.youngs_modulus_kpa / 1000 for scene in scenes]
     friction = [scene.contact.friction for scene in scenes]
-    return Stepper(system, paths, friction, first.numerics, moduli, driver, frames)
+    return Stepper(system, [press.path for press in presses], friction, first.numerics, moduli, driver, frames)
 
 
 def check_shared(scenes: Sequence[Scene], mesh: PadMesh) -> None:

@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError, model_validator
 
 from synth.errors import InputError
 from synth.scene import Part
-from synth.template import SCENES
+from synth.scene.template import SCENES
 
 EXTREME = SCENES / "extreme"
 """Folder of the base scene and the expectations."""

@@ -17,12 +17,12 @@ from synth.errors import InputError
 from synth.mesh import PadMesh
 from synth.mesh.tetrahedralise import shape_quality
 from synth.scene import Scene
+from synth.scene.template import load_scene
 from synth.simulate import Trajectory, simulate
 from synth.simulate.driver import Driver
-from synth.simulate.resolution import resolve
+from synth.simulate.mesh_rule import MeshRule
 from synth.stress.cases import Case, Run
 from synth.stress.inputs import altered_mesh, write_surface
-from synth.template import load_scene
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -52,7 +52,7 @@ def simulated(run: Run, folder: Path, meshes: Path) -> tuple[Scene, PadMesh, Tra
         assignments = [*assignments, f"contact.indenter={{ shape = 'mesh', file = '{file}' }}"]
     template = load_scene(run.base, assignments)
     scene = template.corners[0]  # no distributions: all corners are the same
-    mesh = resolve(scene, folder, [meshes]).mesh
+    mesh = MeshRule.of(scene.numerics).resolution(scene, folder, [meshes]).mesh
     if run.case.mesh != "as made":
         mesh = altered_mesh(mesh, run.case.mesh)
     driver = Driver(single_precision=run.case.factor == "single")

@@ -6,7 +6,7 @@ import pytest
 from tiny_scene import TEXT, write_tiny
 
 from synth.errors import InputError
-from synth.template import load_scene, shipped_scenes
+from synth.scene.template import load_scene, shipped_scenes
 
 
 @pytest.fixture

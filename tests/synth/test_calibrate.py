@@ -23,14 +23,14 @@ from synth.calibrate.sensor_fit import SensorFit, fit_sensor
 from synth.calibrate.toml_text import toml_text
 from synth.cli import main
 from synth.errors import InputError
+from synth.mesh import flat_surface
 from synth.optics import Optics
-from synth.produce import flat_surface
 from synth.render.camera_image import camera_image
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
 from synth.render.variant import choose_variant
 from synth.scene import Camera, Coating, Dots, Light, Render, Sensor
-from synth.template import load_scene
+from synth.scene.template import load_scene
 
 FAST = choose_variant("cpu")
 needs_llvm = pytest.mark.skipif(not FAST.is_vectorised, reason="no LLVM of version 16 or newer here")

@@ -15,13 +15,13 @@ from synth.dataset.exr import read_flow, write_flow
 from synth.dataset.reader import read_dataset
 from synth.errors import InputError
 from synth.flow.field import FlowField
-from synth.generate import generate
 from synth.inspection import inspect, tables, write_html, write_sheet
 from synth.optics import Optics
+from synth.pipeline.generate import generate
 from synth.render.renderer import Renderer
 from synth.render.variant import Variant, choose_variant
 from synth.scene import FurtherCamera, Mirror, Render, Sensor
-from synth.template import load_scene
+from synth.scene.template import load_scene
 from synth.verify import verify_dataset
 
 LEFT = """

@@ -8,9 +8,9 @@ import pytest
 from synth.dataset.reader import read_dataset
 from synth.errors import InputError
 from synth.flow.trace import trace
-from synth.generate import Scheduling, generate
+from synth.pipeline.generate import Scheduling, generate
 from synth.render.variant import Variant, choose_variant
-from synth.template import load_scene
+from synth.scene.template import load_scene
 from synth.verify import verify_dataset
 
 TINY = [

@@ -13,8 +13,8 @@ from tiny_scene import TEXT, own_cache, write_tiny
 from synth.arrays import FloatArray, Image, Points
 from synth.errors import InputError
 from synth.flow.exact import exact_flow
-from synth.generate import generate
 from synth.optics import Optics
+from synth.pipeline.generate import generate
 from synth.render.camera_rays import CameraRays
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
@@ -22,7 +22,7 @@ from synth.render.sample_count import camera_noise, render_noise
 from synth.render.thin_lens import ThinLens
 from synth.render.variant import Variant, choose_variant
 from synth.scene import Camera, Dots, FurtherCamera, Light, Mirror, Render, Sensor
-from synth.template import load_scene
+from synth.scene.template import load_scene
 from synth.verify import verify_dataset
 
 FAST = choose_variant("cpu")

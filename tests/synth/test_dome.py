@@ -18,8 +18,7 @@ from synth.flow.trace import trace
 from synth.mesh import Counts, Focus, PadMesh, domed, graded_box, rest_surface
 from synth.mesh.cache import pad_mesh
 from synth.optics import Optics
-from synth.scene import Camera, Gel, Light, Motion, NoPattern, Numerics, Scene, Sensor, Window
-from synth.scene_indenters import Box, Sphere, Torus
+from synth.scene import Box, Camera, Gel, Light, Motion, NoPattern, Numerics, Scene, Sensor, Sphere, Torus, Window
 from synth.simulate.element import p1p1, p2p1
 from synth.simulate.footprint import footprint
 from synth.simulate.indenter import rigid_body

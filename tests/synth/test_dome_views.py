@@ -16,16 +16,16 @@ from tiny_scene import own_cache
 from synth.arrays import FloatArray, Points
 from synth.dataset.reader import read_dataset
 from synth.flow.exact import exact_flow
-from synth.generate import generate
 from synth.mesh import rest_surface
 from synth.optics import Optics
+from synth.pipeline.generate import generate
 from synth.render.lights import check_view, light_axes
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
 from synth.render.variant import choose_variant
-from synth.sampling import draw
 from synth.scene import Dots, Gel, Sensor, Window
-from synth.template import SCENES, load_scene
+from synth.scene.sampling import draw
+from synth.scene.template import SCENES, load_scene
 from synth.verify import verify_dataset
 from synth.verify.camera import ForwardCamera
 from synth.verify.motion import check_motion
@@ -173,7 +173,7 @@ def _pixels_per_mm(sensor: Sensor) -> float:
 def test_densetact_generates_and_verifies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Small, coarse and noisy, but all of the chain.
 
-    Fails with `flat_surface` for the undeformed picture in `synth.produce`: image 1 is then that of another gel (1.3 px
+    Fails with `flat_surface` for the undeformed picture (`RenderSession`): image 1 is then that of another gel (1.3 px
     in the photometry); and with `domed` left out of `graded_mesh`.
     """
     own_cache(monkeypatch)

@@ -12,8 +12,7 @@ import pytest
 import pyvista as pv
 
 from synth.mesh import Focus
-from synth.scene import Motion, Pose
-from synth.scene_indenters import Box, Cone, Cylinder, Indenter, MeshIndenter, Sphere, Torus
+from synth.scene import Box, Cone, Cylinder, Indenter, MeshIndenter, Motion, Pose, Sphere, Torus
 from synth.simulate.footprint import FINEST_MM, RESOLUTION, UNTOUCHED, footprint
 from synth.simulate.indenter import rigid_body
 from synth.simulate.path import Path

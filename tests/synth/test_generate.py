@@ -14,9 +14,10 @@ from tiny_scene import fingerprint, own_cache, reference, write_tiny
 from synth.dataset.reader import read_dataset
 from synth.dataset.shard import Shard
 from synth.errors import InputError
-from synth.generate import Scheduling, generate, job_variant
-from synth.sampling import draw
-from synth.template import Template, load_scene
+from synth.pipeline.generate import Scheduling, generate
+from synth.planning import job_variant
+from synth.scene.sampling import draw
+from synth.scene.template import Template, load_scene
 from synth.verify import verify_dataset
 
 

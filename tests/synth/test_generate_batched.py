@@ -21,19 +21,21 @@ from tiny_scene import TEXT, fingerprint, own_cache, write_tiny
 
 from synth.dataset.shard import Shard
 from synth.errors import InputError
-from synth.generate import Scheduling, generate, job_variant, make_job
-from synth.plan import plan
-from synth.processes.ahead import ahead
-from synth.produce import Failure, Outcome, Producer, Task, Workplace, in_batches
-from synth.produce.batches import by_sensor
-from synth.produce.drawing import Draws, Solved
+from synth.pipeline.attempts import Attempts
+from synth.pipeline.batched_simulation import Result, by_sensor, in_batches
+from synth.pipeline.generate import Scheduling, generate, make_job
+from synth.pipeline.prefetch import prefetched
+from synth.pipeline.producer import Producer
+from synth.pipeline.records import Failure, JobContext, Outcome, SimulatedTrajectory, Task
+from synth.planning import job_variant, plan, predict
 from synth.render.variant import Variant
-from synth.sampling import MAX_DRAWS, draw, draw_sensor, sensor_of
 from synth.scene import Gel, Numerics, Scene
-from synth.simulate import simulate
+from synth.scene.sampling import MAX_DRAWS, draw, draw_sensor, sensor_of
+from synth.scene.template import Template, load_scene
 from synth.simulate.batched import simulate_many
-from synth.simulate.shared import accuracy, resolution_of, shared_mesh, spacing_mm
-from synth.template import Template, load_scene
+from synth.simulate.mesh_rule import MeshRule
+from synth.simulate.shared import accuracy, shared_mesh, spacing_mm
+from synth.simulate.solve import simulate_press
 
 SPHERE = 'shape = "sphere"\nradius_mm = { uniform = [1.5, 2.5] }'
 CHOICE = """choice = [
@@ -72,9 +74,9 @@ def whole(template: Template, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def place(template: Template, tmp_path_factory: pytest.TempPathFactory) -> Workplace:
-    variant, out = job_variant(template, "cpu"), tmp_path_factory.mktemp("place")
-    return Workplace(template, make_job(template, SAMPLES, SEED, variant), out, variant, out / "cache")
+def context(template: Template, tmp_path_factory: pytest.TempPathFactory) -> JobContext:
+    planned, out = plan(template, job_variant(template, "cpu")), tmp_path_factory.mktemp("context")
+    return JobContext(planned, make_job(planned, SAMPLES, SEED), out, out / "cache")
 
 
 def _tasks(numbers: Iterable[int]) -> Iterator[Task]:
@@ -109,10 +111,10 @@ def test_killed_with_workers_and_gone_on_with_alone(template: Template, whole: P
     assert fingerprint(out) == fingerprint(whole)
 
 
-def test_one_trajectory_alone_is_the_same(place: Workplace, whole: Path) -> None:
+def test_one_trajectory_alone_is_the_same(context: JobContext, whole: Path) -> None:
     """As a task of a cluster. Its second draw can be used."""
     # Fails with the single solver in `Producer`.
-    outcome = Producer(place).produce(4, (8, 9))
+    outcome = Producer(context).produce(4, (8, 9))
     assert [failure.stage for failure in outcome.failures] == ["simulate"]
     for entry in outcome.entries:
         for name, digest in entry.sha256.items():
@@ -137,17 +139,16 @@ docs/reports/batched_fem.md saw 4e-9 to 3e-5; here
 6e-5 was seen once and 3e-7 else. States that are not corrected are off by 0.07 to 0.16."""
 
 
-def test_a_batch_agrees_with_the_single_solver(place: Workplace) -> None:
+def test_a_batch_agrees_with_the_single_solver(context: JobContext) -> None:
     """On the same meshes: the same draws fail for the same reasons, and what is left is the same motion."""
     # Fails with the first trajectory's frames for all, and with one `pad_key` for all.
-    results = {_trajectory(result): result for result in in_batches(place, _tasks(range(5)), 4)}
+    results = {found.number: found for found in map(_trajectory, in_batches(context, _tasks(range(5)), 4))}
     assert sorted(results) == list(range(5))
     for task in _tasks(range(5)):
-        draws = Draws(place, task, draw_sensor(place.template, SEED, sensor_of(place.template, task[0])))
-        alone = _alone(place, draws)
+        template = context.plan.template
+        alone = _alone(Attempts(context, task, draw_sensor(template, SEED, sensor_of(template, task[0]))))
         together = results[task[0]]
-        assert isinstance(together, Solved)
-        assert (together.drawn.scene, together.drawn.frames) == (alone.drawn.scene, alone.drawn.frames)
+        assert together.scene == alone.scene
         assert [_said(failure) for failure in together.failures] == [_said(failure) for failure in alone.failures]
         assert together.states.keys() == alone.states.keys()
         for number, state in alone.states.items():
@@ -161,28 +162,24 @@ def _said(failure: Failure) -> tuple[object, ...]:
     return failure.index, failure.draw, failure.stage, failure.reason
 
 
-def _trajectory(result: Solved | Outcome) -> int:
-    assert isinstance(result, Solved)
-    return result.drawn.trajectory
+def _trajectory(result: Result) -> SimulatedTrajectory:
+    assert not isinstance(result, Outcome)
+    return result[0]
 
 
-def _alone(place: Workplace, draws: Draws) -> Solved:
+def _alone(attempts: Attempts) -> SimulatedTrajectory:
     """By the single solver, as `Producer` does it."""
-    while (drawn := draws.next()) is not None:
-        try:
-            result = simulate(drawn.scene, drawn.mesh, frames=drawn.frames)
-        except InputError as error:
-            draws.fail("simulate", str(error))
-            continue
-        if draws.accepts(result):
-            return Solved.of(draws, drawn, result)
+    while (attempt := attempts.next()) is not None:
+        simulated = attempts.simulated(attempt, simulate_press(attempt.press, attempt.frames))
+        if simulated is not None:
+            return simulated[0]
     raise AssertionError("no draw could be used")
 
 
-def test_a_trajectory_whose_every_draw_fails_is_given_up(place: Workplace) -> None:
+def test_a_trajectory_whose_every_draw_fails_is_given_up(context: JobContext) -> None:
     needle = 'contact.indenter={shape = "sphere", radius_mm = 0.06}'
-    template = load_scene(place.template.source, [needle, "motion.position_mm=[0.3, 0.2]"])
-    (result,) = in_batches(replace(place, template=template), _tasks([0]), 2)
+    planned = plan(load_scene(context.plan.template.source, [needle, "motion.position_mm=[0.3, 0.2]"]))
+    (result,) = in_batches(replace(context, plan=planned), _tasks([0]), 2)
     assert isinstance(result, Outcome)
     assert (result.given_up, len(result.failures)) == ((0, 1), MAX_DRAWS)
 
@@ -212,7 +209,7 @@ def test_the_trajectories_of_a_sensor_come_together(template: Template, ends: li
 
 
 def test_a_sensor_of_many_trajectories_does_not_wait_for_all(template: Template) -> None:
-    # Fails without ENOUGH: then 20 wait for the last one.
+    # Fails without MIN_PER_SENSOR: then 20 wait for the last one.
     one = load_scene(template.source, ["sampling.trajectories_per_sensor=1000"])
     assert _order(one, range(20)) == list(range(20))
 
@@ -231,7 +228,7 @@ def test_items_made_ahead_come_in_order_and_errors_with_them() -> None:
         yield from range(5)
         raise InputError("no more")
 
-    with ahead(failing(), 2) as items:
+    with prefetched(failing(), 2) as items:
         assert [next(items) for _ in range(5)] == list(range(5))
         with pytest.raises(InputError, match="no more"):
             next(items)
@@ -247,7 +244,7 @@ def test_no_more_are_made_than_there_is_room_for() -> None:
             yield number
 
     before = threading.active_count()
-    with ahead(counting(), 3) as items:
+    with prefetched(counting(), 3) as items:
         assert next(items) == 0
         time.sleep(0.3)
         assert len(made) <= 5  # one taken, three in line, one in hand
@@ -273,7 +270,7 @@ def test_the_shared_mesh_is_even_and_as_high_as_wide() -> None:
 
 
 def test_the_predicted_error_falls_with_the_spacing(template: Template) -> None:
-    """By the model's exponent of 1.6, at equal proportions of the elements; and `resolution_of` says the same."""
+    """By the model's exponent of 1.6, at equal proportions of the elements; and the rule says the same."""
     # Fails with a spacing that is not the mesh's.
     drawn = draw(template, SEED, 0)
     fine = drawn.model_copy(update={"numerics": drawn.numerics.model_copy(update={"cells": (16, 12, 2)})})
@@ -283,7 +280,7 @@ def test_the_predicted_error_falls_with_the_spacing(template: Template) -> None:
     # Coordinates are multiples of 2e-10 mm.
     assert coarse.error_px / better.error_px == pytest.approx(ratio**1.6, rel=1e-8)
     assert better.across > coarse.across >= 0
-    found = resolution_of(fine)
+    found = MeshRule.of(fine.numerics).resolution(fine)
     assert (found.across, found.error_px, found.through) == (better.across, better.error_px, 2)
     assert len(found.mesh.tets) == 6 * 16 * 12 * 2
 
@@ -295,7 +292,7 @@ def _spacing_of(drawn: Scene) -> float:
     return float(np.sqrt(wide * max(wide, z[1] - z[0])))
 
 
-def test_the_diagnostics_tell_of_the_shared_mesh(place: Workplace, whole: Path) -> None:
+def test_the_diagnostics_tell_of_the_shared_mesh(context: JobContext, whole: Path) -> None:
     entries = [json.loads(line) for line in (whole / "manifest.jsonl").read_text().splitlines()]
     assert len({entry["diagnostics"]["mesh"] for entry in entries}) == 2  # of two pads
     first = entries[0]["diagnostics"]
@@ -309,7 +306,7 @@ def test_plan_says_what_is_batched(template: Template) -> None:
     batched = next(decision for decision in planned.decisions if decision.feature == "batched simulation")
     assert batched.runs
     assert "sensor.gel.size_mm[2]" in batched.reason
-    assert planned.resolution.startswith("6 x 4 x 2 elements for all draws of a pad")
+    assert predict(planned).resolution.startswith("6 x 4 x 2 elements for all draws of a pad")
     alike = load_scene(template.source, ["sensor.gel.size_mm=[8.0, 6.0, 2.5]"])
     assert "another" not in plan(alike, Variant("cuda_ad_rgb", "")).decisions[0].reason
 

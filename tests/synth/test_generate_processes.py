@@ -25,8 +25,8 @@ from processes_of import (
 from tiny_scene import fingerprint, own_cache, reference, write_tiny
 
 from synth.cli import main
-from synth.generate import generate
-from synth.template import load_scene
+from synth.pipeline.generate import generate
+from synth.scene.template import load_scene
 
 needs_proc = pytest.mark.skipif(not HAS_PROC, reason="finds child processes in Linux's /proc")
 

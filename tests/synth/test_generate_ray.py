@@ -9,8 +9,8 @@ from processes_of import HAS_PROC, PATIENCE_S, lines, start, wait_for, workers_o
 from tiny_scene import fingerprint, own_cache, reference, write_tiny
 
 from synth.errors import InputError
-from synth.generate import Scheduling, generate
-from synth.template import load_scene
+from synth.pipeline.generate import Scheduling, generate
+from synth.scene.template import load_scene
 
 pytest.importorskip("ray", reason="Ray is not installed: pip install -e '.[cluster]'")
 

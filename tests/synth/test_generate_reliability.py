@@ -16,8 +16,8 @@ from tiny_scene import fingerprint, own_cache, reference, write_tiny
 from synth.cli import main
 from synth.dataset import storage
 from synth.errors import InputError
-from synth.generate import generate
-from synth.template import load_scene
+from synth.pipeline.generate import generate
+from synth.scene.template import load_scene
 
 
 @pytest.fixture(autouse=True)

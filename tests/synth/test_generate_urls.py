@@ -16,8 +16,8 @@ from synth.dataset.shard import Shard
 from synth.dataset.url_store import UrlStore
 from synth.dataset.url_writer import UrlWriter, put_sample
 from synth.errors import InputError
-from synth.generate import Scheduling, generate
-from synth.template import load_scene
+from synth.pipeline.generate import Scheduling, generate
+from synth.scene.template import load_scene
 
 
 @pytest.fixture(autouse=True)

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from synth.arrays import FloatArray
 from synth.errors import InputError
-from synth.scene_indenters import Box, Cone, Cylinder, Indenter, MeshIndenter, Sphere, Torus
+from synth.scene import Box, Cone, Cylinder, Indenter, MeshIndenter, Sphere, Torus
 from synth.simulate.distance import normal_derivative, shape_vector, signed_distance
 from synth.simulate.indenter import RigidBody, rigid_body, rotation_about
 

@@ -8,7 +8,7 @@ import pyvista as pv
 
 from synth.arrays import FloatArray
 from synth.errors import InputError
-from synth.scene_indenters import Box, MeshIndenter
+from synth.scene import Box, MeshIndenter
 from synth.simulate.indenter import EVERYTHING, OBJECT_RADIUS, RigidBody, Touchable, object_radius, rigid_body
 from synth.simulate.measure import Distance
 

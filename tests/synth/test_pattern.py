@@ -6,8 +6,7 @@ from render_scenes import small_sensor
 
 from synth.render.marks import dots_coverage
 from synth.render.pattern import albedo, is_grey, pixels_per_mm
-from synth.scene import Dots, Light, NoPattern, RandomColor, Speckle
-from synth.scene_camera import FurtherCamera, Mirror
+from synth.scene import Dots, FurtherCamera, Light, Mirror, NoPattern, RandomColor, Speckle
 
 
 def _texel_mm(sensor, texture):

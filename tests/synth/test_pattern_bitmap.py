@@ -14,8 +14,7 @@ from synth.arrays import FloatArray
 from synth.errors import InputError
 from synth.render.bitmap import read_picture
 from synth.render.pattern import albedo, check_pattern, is_grey
-from synth.scene import Coating, Sensor
-from synth.scene_pattern import Bitmap
+from synth.scene import Bitmap, Coating, Sensor
 
 ROWS, COLUMNS = 252, 336
 """Texels of the pad of 12 x 9 mm at 7 px per mm."""

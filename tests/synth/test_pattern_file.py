@@ -9,10 +9,10 @@ from tiny_scene import TEXT, own_cache, write_tiny
 
 from synth.dataset.reader import read_dataset
 from synth.errors import InputError
-from synth.generate import generate
-from synth.plan import check_buildable
+from synth.pipeline.generate import generate
+from synth.planning import check_buildable
 from synth.render.variant import choose_variant
-from synth.template import load_scene
+from synth.scene.template import load_scene
 
 BITMAP = 'sensor.pattern={ kind = "bitmap", file = "art/mine.png", width_mm = 8 }'
 

@@ -11,13 +11,12 @@ from tiny_scene import own_cache, write_tiny
 from synth.arrays import Image
 from synth.dataset.reader import read_dataset
 from synth.flow.field import FlowField
-from synth.generate import generate
+from synth.pipeline.generate import generate
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
 from synth.render.variant import Variant, choose_variant
-from synth.scene import Coating, Light, Render, Sensor
-from synth.scene_pattern import Dots, NoPattern, Speckle
-from synth.template import load_scene
+from synth.scene import Coating, Dots, Light, NoPattern, Render, Sensor, Speckle
+from synth.scene.template import load_scene
 
 FAST = choose_variant("cpu")
 VARIANTS = [Variant("scalar_rgb", "test"), *([FAST] if FAST.is_vectorised else [])]

@@ -11,8 +11,7 @@ from render_scenes import small_sensor
 from synth.arrays import FloatArray
 from synth.errors import InputError
 from synth.render.pattern import albedo, check_pattern
-from synth.scene import Coating, Sensor
-from synth.scene_pattern import Dots, Pattern, RandomColor, Speckle
+from synth.scene import Coating, Dots, Pattern, RandomColor, Sensor, Speckle
 
 WHITE = Coating(reflectance=(1, 1, 1))
 

@@ -8,11 +8,10 @@ import pytest
 from tiny_scene import write_tiny
 
 from synth.errors import InputError
-from synth.generate import job_variant
 from synth.mesh import pad_mesh
-from synth.plan import check_buildable, plan
+from synth.planning import check_buildable, job_variant, plan, predict
 from synth.render.variant import Variant
-from synth.template import load_scene, shipped_scenes
+from synth.scene.template import load_scene, shipped_scenes
 
 LLVM, MONO, SCALAR = Variant("llvm_ad_rgb", ""), Variant("llvm_ad_mono", ""), Variant("scalar_rgb", "")
 
@@ -91,13 +90,16 @@ def test_one_channel_is_rendered_only_where_every_draw_is_grey(tiny: Path, overr
     assert variant.is_mono == (grey and variant.is_vectorised)
 
 
+TEN_TIMES = {"width": 320, "height": 240, "fx": 820.0, "fy": 820.0, "cx": 160.0, "cy": 120.0}
+
+
 def test_predictions_scale_with_what_they_are_of(tiny: Path) -> None:
-    def predicted(*overrides: str) -> tuple[dict[str, float], int]:
-        found = plan(load_scene(tiny, overrides), LLVM)
+    def predicted(*overrides: str, variant: Variant = LLVM) -> tuple[dict[str, float], int]:
+        found = predict(plan(load_scene(tiny, overrides), variant))
         return found.seconds_per_pair, found.bytes_per_pair
 
     seconds, size = predicted()
-    large, large_size = predicted("sensor.camera.width=320", "sensor.camera.height=240")
+    large, large_size = predicted(*(f"sensor.camera.{key}={value}" for key, value in TEN_TIMES.items()))
     assert large_size == pytest.approx(100 * size, rel=1e-3)  # rounded to bytes
     assert large["flow"] == pytest.approx(100 * seconds["flow"], rel=0.4)  # rounded to ms, of some 2 ms
     fine, _ = predicted("render.samples_per_pixel=4000")
@@ -105,7 +107,7 @@ def test_predictions_scale_with_what_they_are_of(tiny: Path) -> None:
     deep, _ = predicted("motion.depth_mm=2.0")
     assert deep["simulate"] > 1.5 * seconds["simulate"]  # 2.1 mm of path for 0.2 mm, and at least 1.5 steps a record
     assert predicted("motion.depth_mm=-1")[0]["simulate"] == 0
-    assert plan(load_scene(tiny), SCALAR).seconds_per_pair["render"] > seconds["render"]
+    assert predicted(variant=SCALAR)[0]["render"] > seconds["render"]
 
 
 def test_the_number_of_nodes_is_about_the_meshs(tiny: Path, tmp_path: Path) -> None:
@@ -113,19 +115,19 @@ def test_the_number_of_nodes_is_about_the_meshs(tiny: Path, tmp_path: Path) -> N
     scene = template.corners[0]
     mesh = pad_mesh(scene.sensor.gel, scene.numerics, [tmp_path / "meshes"])
     # The fit is 12 % off here and the mesher is random; promised is a factor of three in times, as nodes^1.6.
-    assert plan(template, LLVM).nodes == pytest.approx(len(mesh.points), rel=0.3)
+    assert predict(plan(template, LLVM)).nodes == pytest.approx(len(mesh.points), rel=0.3)
 
 
 @pytest.mark.parametrize("name", shipped_scenes())
 def test_shipped_scenes_are_planned_and_buildable(name: str) -> None:
     template = load_scene(name)
-    check_buildable(template, LLVM)
     if any(c.sensor.mirrors or c.sensor.camera.lens != "pinhole" for c in template.corners):
         with pytest.raises(InputError, match="needs LLVM"):
             check_buildable(template, SCALAR)
     else:
         check_buildable(template, SCALAR)
-    record = json.loads(json.dumps(plan(template, LLVM).record()))
+    planned = plan(template, LLVM)
+    record = json.loads(json.dumps({**planned.record(), **predict(planned).record()}))
     assert record["scene"] == name
     assert record["nodes"] > 1000
     assert all(seconds > 0 for seconds in record["seconds_per_pair"].values())

@@ -7,11 +7,13 @@ from pathlib import Path
 import pytest
 from tiny_scene import fingerprint, own_cache, reference, write_tiny
 
-from synth.generate import Scheduling, generate, job_variant, make_job
-from synth.processes import outcomes_of_processes, pool
-from synth.processes.threads import THREADS
-from synth.produce import Task, Workplace
-from synth.template import load_scene
+from synth.pipeline import worker_pool as pool
+from synth.pipeline.generate import Scheduling, generate, make_job
+from synth.pipeline.records import JobContext, Task
+from synth.pipeline.threads import THREADS
+from synth.pipeline.worker_pool import outcomes_of_processes
+from synth.planning import job_variant, plan
+from synth.scene.template import load_scene
 
 
 @pytest.fixture(autouse=True)
@@ -28,9 +30,9 @@ def test_workers_change_no_bit(tmp_path: Path, workers: int) -> None:
     assert fingerprint(out) == fingerprint(reference())
 
 
-def _threads(place: Workplace) -> Callable[[Task], tuple[int, ...]]:
+def _threads(context: JobContext) -> Callable[[Task], tuple[int, ...]]:
     """In a worker that is ready for trajectories: its process, and the threads of renderer, OpenCV and the rest."""
-    pool._trajectory_maker(place)
+    pool._trajectory_maker(context)
     import cv2
     import drjit
 
@@ -46,9 +48,9 @@ def test_a_worker_is_a_process_that_takes_one_core(
         monkeypatch.setenv(name, "2")
     monkeypatch.setattr(pool, "_trajectory_maker", _threads)
     template = load_scene(write_tiny(tmp_path))
-    variant = job_variant(template, "cpu")
-    place = Workplace(template, make_job(template, 8, 0, variant), tmp_path / "d", variant, tmp_path / "cache")
-    found = list(outcomes_of_processes(place, ((k, (2 * k, 2 * k + 1)) for k in range(4)), workers))
+    planned = plan(template, job_variant(template, "cpu"))
+    context = JobContext(planned, make_job(planned, 8, 0), tmp_path / "d", tmp_path / "cache")
+    found = list(outcomes_of_processes(context, ((k, (2 * k, 2 * k + 1)) for k in range(4)), workers))
     assert len(found) == 4
     assert os.getpid() not in {process for process, *_ in found}
     assert {tuple(threads) for _, *threads in found} == {(1,) * (2 + len(THREADS))}

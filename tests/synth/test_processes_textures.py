@@ -11,29 +11,31 @@ from processes_of import HAS_PROC, workers_of
 from tiny_scene import TEXT, own_cache, write_tiny
 
 from synth.arrays import Image
-from synth.generate import job_variant, make_job
-from synth.processes import outcomes_of_batches, textures
-from synth.processes.threads import THREADS, one_thread_each
-from synth.produce import Workplace
+from synth.pipeline import textures
+from synth.pipeline.generate import make_job
+from synth.pipeline.overlapped import outcomes_of_batches
+from synth.pipeline.records import JobContext
+from synth.pipeline.threads import THREADS, one_thread_each
+from synth.planning import job_variant, plan
 from synth.scene import Sensor
-from synth.template import load_scene
+from synth.scene.template import load_scene
 
 
 @pytest.fixture
-def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Workplace:
+def context(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> JobContext:
     own_cache(monkeypatch)
     text = TEXT.replace("edge_length_mm = 1.25", 'solver = "batched"\ncells = [4, 4, 2]')
     template = load_scene(write_tiny(tmp_path, text))
-    variant = job_variant(template, "cpu")
-    return Workplace(template, make_job(template, 2, 0, variant), tmp_path / "d", variant, tmp_path / "cache")
+    planned = plan(template, job_variant(template, "cpu"))
+    return JobContext(planned, make_job(planned, 2, 0), tmp_path / "d", tmp_path / "cache")
 
 
-def test_textures_are_painted_in_order_and_few_at_a_time(place: Workplace, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_textures_are_painted_in_order_and_few_at_a_time(context: JobContext, monkeypatch: pytest.MonkeyPatch) -> None:
     # Fails with the last texture asked for painted first, and without regard to room.
     begun: list[int] = []
     lock = threading.Lock()
 
-    def painted(_: Workplace, sensor: int, scene: Sensor) -> Image:
+    def painted(_: JobContext, sensor: int, scene: Sensor) -> Image:
         with lock:
             begun.append(sensor)
         if sensor == 5:
@@ -41,15 +43,15 @@ def test_textures_are_painted_in_order_and_few_at_a_time(place: Workplace, monke
         return np.full((1, 1, 3), sensor, dtype=np.float32)
 
     monkeypatch.setattr(textures, "paint", painted)
-    scene = place.template.corners[0].sensor
-    with ThreadPoolExecutor(1) as painters:
-        ahead = textures.Textures(place, painters, room=2)
-        asked = [ahead.ask(sensor, scene) for sensor in range(6)]
+    scene = context.plan.template.corners[0].sensor
+    with ThreadPoolExecutor(1) as threads:
+        early = textures.Textures(context, threads, room=2)
+        asked = [early.request(sensor, scene) for sensor in range(6)]
         for sensor, texture in enumerate(asked[:5]):
             assert texture.result(10)[0, 0, 0] == sensor
             assert begun == list(range(len(begun)))
             assert len(begun) <= sensor + 2
-            ahead.used()
+            early.release()
         with pytest.raises(MemoryError, match="sensor 5"):
             asked[5].result(10)
 
@@ -66,14 +68,14 @@ def test_one_thread_each_leaves_the_environment_as_it_was(monkeypatch: pytest.Mo
 
 @pytest.mark.skipif(not HAS_PROC, reason="reads child processes' environment in Linux's /proc")
 def test_finishing_workers_use_one_thread_each(
-    place: Workplace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    context: JobContext, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Fifteen of them beside a solver would fight for the cores."""
     # Fails with workers that are started as this process is.
     for name in THREADS:
         monkeypatch.setenv(name, "7")
     (tmp_path / "d" / "samples").mkdir(parents=True)
-    outcomes = outcomes_of_batches(place, iter([(0, (0, 1))]), 2, 1)
+    outcomes = outcomes_of_batches(context, iter([(0, (0, 1))]), 2, 1)
     assert len(next(outcomes).entries) == 2
     workers = workers_of(os.getpid())
     assert workers

@@ -13,9 +13,10 @@ from synth.simulate import simulate
 from synth.simulate.error_model import RATE, face_error
 from synth.simulate.footprint import footprint
 from synth.simulate.indenter import rigid_body
+from synth.simulate.mesh_rule import MeshRule
 from synth.simulate.path import Path
 from synth.simulate.probe import probe
-from synth.simulate.resolution import LADDER, MARGIN, graded_mesh, predicted_error_px, resolve, scale_px_per_mm
+from synth.simulate.resolution import LADDER, MARGIN, Resolution, graded_mesh, predicted_error_px, scale_px_per_mm
 
 SIZE = (16.0, 12.0, 4.0)
 BALL = {"shape": "sphere", "radius_mm": 4.0}
@@ -27,6 +28,10 @@ def drawn(indenter: dict[str, Any], target: float | None = None, **motion: Any) 
     numerics = {"element": "auto", "edge_length_mm": None, "target_error_px": target}
     moves = {"depth_mm": 0.8, "shear_mm": [0.4, 0.2], "steps": 2, **motion}
     return scene(SIZE, indenter=indenter, friction=0.5, motion=moves, numerics=numerics)
+
+
+def resolve(draw: Scene) -> Resolution:
+    return MeshRule.of(draw.numerics).resolution(draw)
 
 
 def test_a_tighter_budget_takes_a_finer_mesh() -> None:

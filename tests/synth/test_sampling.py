@@ -9,9 +9,9 @@ from scipy import stats
 from tiny_scene import TEXT, write_tiny
 
 from synth.errors import InputError
-from synth.sampling import MAX_DRAWS, check_pairs, draw, draw_sensor, pairs_of, stream
 from synth.scene import Scene
-from synth.template import Template, load_scene, shipped_scenes
+from synth.scene.sampling import MAX_DRAWS, check_pairs, draw, draw_sensor, pairs_of, stream
+from synth.scene.template import Template, load_scene, shipped_scenes
 
 COUNT = 200
 SURE = 1e-4

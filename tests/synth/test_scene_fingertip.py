@@ -5,8 +5,8 @@ import numpy as np
 from synth.optics import Optics
 from synth.render.lights import check_view
 from synth.render.pattern import albedo
-from synth.sampling import draw
-from synth.template import SCENES, load_scene
+from synth.scene.sampling import draw
+from synth.scene.template import SCENES, load_scene
 
 
 def test_every_draw_sees_gel_and_no_light_and_has_two_layers() -> None:

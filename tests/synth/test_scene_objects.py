@@ -9,12 +9,12 @@ from tiny_scene import write_tiny
 
 from synth.dataset.reader import read_dataset
 from synth.errors import InputError
-from synth.generate import generate, job_variant
-from synth.plan import plan
-from synth.sampling import draw, draw_sensor
-from synth.scene_indenters import MeshIndenter
+from synth.pipeline.generate import generate
+from synth.planning import job_variant, plan, predict
+from synth.scene import MeshIndenter
+from synth.scene.sampling import draw, draw_sensor
+from synth.scene.template import SCENES, Template, load_scene, with_files
 from synth.simulate.indenter import turned_by
-from synth.template import SCENES, Template, load_scene, with_files
 
 ANY = 'contact.indenter={ shape = "mesh", file = "objects/*.stl", rotation_deg = "any" }'
 
@@ -111,6 +111,13 @@ def test_scene_draws_every_object_upright_and_in_any_orientation() -> None:
 def test_plan_and_samples_tell_how_edges_are_rounded(tiny: Path, tmp_path: Path) -> None:
     body = f'{{ shape = "mesh", file = "{SCENES / "objects" / "washer.stl"}", size_mm = 4.0, fillet_mm = 0.9 }}'
     template = load_scene(tiny, [f"contact.indenter={body}", "numerics={ target_error_px = 3.0 }"])
-    assert "edges of objects rounded to 0.9 to 0.9 mm" in plan(template, job_variant(template, "cpu")).resolution
+    predicted = predict(plan(template, job_variant(template, "cpu")))
+    assert "edges of objects rounded to 0.9 to 0.9 mm" in predicted.resolution
+    # A mesh takes several times a ball's iterations.
+    ball = load_scene(
+        tiny, ['contact.indenter={ shape = "sphere", radius_mm = 2.0 }', "numerics={ target_error_px = 3.0 }"]
+    )
+    alike = predict(plan(ball, job_variant(ball, "cpu")))
+    assert predicted.seconds_per_pair["simulate"] > 3 * alike.seconds_per_pair["simulate"]
     generate(template, 1, tmp_path / "data")
     assert read_dataset(tmp_path / "data").entry(0).diagnostics["edge_radius_mm"] == 0.9

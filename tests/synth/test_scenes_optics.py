@@ -8,9 +8,9 @@ import pytest
 
 from synth.optics import Optics
 from synth.render.lights import check_view
-from synth.sampling import draw
 from synth.scene import Scene, Sensor
-from synth.template import SCENES, load_scene
+from synth.scene.sampling import draw
+from synth.scene.template import SCENES, load_scene
 
 NAMES = ["gelslim", "gelstereo", "tac3d", "fingervision", "digit", "omnitact", "soft_bubble"]
 CAMERAS = {"gelstereo": ["right"], "omnitact": ["east", "west", "south", "north"]}

@@ -17,6 +17,7 @@ from pads import brick
 from synth.errors import InputError
 from synth.mesh.pad import signed_volumes
 from synth.mesh.tetrahedralise import shape_quality
+from synth.scene.template import load_scene
 from synth.simulate.element import p2p1
 from synth.simulate.space import function_space
 from synth.stress.cases import (
@@ -33,7 +34,6 @@ from synth.stress.cases import (
 from synth.stress.check import GAUSS, Result, faults, judged, measured, smallest_jacobian
 from synth.stress.inputs import altered_mesh, write_surface
 from synth.stress.suite import result_of, run_stress
-from synth.template import load_scene
 
 MESH = brick()
 STRETCH = np.diag([0.9, 0.95, 1.1])

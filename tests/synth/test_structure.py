@@ -14,28 +14,19 @@ STAGES = (
     "synth.errors",
     "synth.arrays",
     "synth.dataset.storage",  # how a file gets to the disk as a whole; knows nothing of datasets
-    "synth.scene_indenters",
-    "synth.scene_camera",
-    "synth.scene_pattern",
-    "synth.scene_gel",
     "synth.scene",
-    "synth.schema_errors",
-    "synth.template",
     "synth.surface",
     "synth.optics",
     "synth.mesh",
     "synth.simulate",
     "synth.render",
-    "synth.sampling",
+    "synth.scene.sampling",  # draws again what could not be rendered
     "synth.flow",
     "synth.dataset",
     "synth.verify",
     "synth.inspection",
-    "synth.plan",
-    "synth.produce",
-    "synth.processes",
-    "synth.ray_pool",
-    "synth.generate",
+    "synth.planning",
+    "synth.pipeline",
     "synth.progress",
     "synth.calibrate",
     "synth.stress",
@@ -113,16 +104,16 @@ def test_the_finder_of_imports_sees_every_form() -> None:
     """A test of the test: one that finds nothing would pass always."""
     source = """
 import synth.cli
-from synth import generate
+from synth import arrays
 from synth.commands import run_plan as r
 def f():
-    from . import plan
+    from . import planning
     from .mesh.pad import PadMesh
     if True:
         import torch.nn as nn
 """
     found = _imports("synth.errors", ast.parse(source), False)
-    assert {"synth.cli", "synth.generate", "synth.commands", "synth.plan", "synth.mesh.pad", "torch.nn"} <= found
+    assert {"synth.cli", "synth.arrays", "synth.commands", "synth.planning", "synth.mesh.pad", "torch.nn"} <= found
     assert "synth.simulate.path" in _imports("synth.simulate", ast.parse("from .path import Path"), True)
     assert _stage("synth.dataset.storage") < _stage("synth.simulate.files") < _stage("synth.dataset.writer")
 

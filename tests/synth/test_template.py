@@ -7,7 +7,7 @@ import pytest
 from tiny_scene import CONTACT, TEXT, write_tiny
 
 from synth.errors import InputError
-from synth.template import SCENES, checked_template, load_scene, replaced, shipped_scenes
+from synth.scene.template import SCENES, checked_template, load_scene, replaced, shipped_scenes
 
 
 @pytest.fixture

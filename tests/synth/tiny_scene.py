@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from synth.generate import generate
-from synth.template import load_scene
+from synth.pipeline.generate import generate
+from synth.scene.template import load_scene
 
 SENSOR = """
 name = "tiny"

@@ -11,6 +11,7 @@ from synth.simulate.batched.slots import COMPLETE, NO_BALANCE, Jobs
 from synth.simulate.batched.sums import SCALARS
 from synth.simulate.distance import shape_vector
 from synth.simulate.path import Path
+from synth.simulate.press import Press
 from synth.simulate.space import Space
 from synth.simulate.tables import warp_array
 from synth.simulate.trajectory import State, Trajectory, no_balance, no_contact, trajectory_of
@@ -23,6 +24,11 @@ class Job:
     path: Path
     friction: float
     modulus_mpa: float
+
+    @classmethod
+    def of(cls, press: Press) -> "Job":
+        """The job of a press."""
+        return cls(press.path, press.scene.contact.friction, press.scene.sensor.gel.youngs_modulus_kpa / 1000)
 
     @property
     def touches(self) -> bool:

@@ -10,7 +10,7 @@ from synth.simulate.batched.jobs import Job, untouched
 from synth.simulate.batched.pad import Pad, prepare
 from synth.simulate.batched.run import Run
 from synth.simulate.driver import STANDARD, Driver
-from synth.simulate.path import path_of
+from synth.simulate.press import Press
 from synth.simulate.solve import check_shared
 from synth.simulate.trajectory import Trajectory
 
@@ -102,5 +102,4 @@ def job_of(scene: Scene, pad: Pad, folder: FilePath | None = None) -> Job:
     Raises:
         InputError: the indenter cannot be built.
     """
-    path = path_of(scene, folder, pad.space.resolution_mm)
-    return Job(path, scene.contact.friction, scene.sensor.gel.youngs_modulus_kpa / 1000)
+    return Job.of(Press.of(scene, pad.mesh, folder))

@@ -1,12 +1,11 @@
 """Scheduling: which trajectories are still to do, who does them, and what happened.
 
-In this process by default, which renders on all cores; with workers, in processes of one core each (`synth.processes`);
-with Ray, on a cluster (`synth.ray_pool`); or one shard of the job, beside others. With the batched solver this process
-simulates and renders, and the workers do the rest. The driver alone writes manifest and failures; samples' folders are
-written where they are made. The same command goes on where it stopped.
+In this process by default, which renders on all cores; with workers, in processes of one core each (`worker_pool`);
+with Ray, on a cluster (`ray_pool`); or one shard of the job, beside others. With the batched solver this process
+simulates and renders, and the workers do the rest (`overlapped`). The driver alone writes manifest and failures;
+samples' folders are written where they are made. The same command goes on where it stopped.
 """
 
-import re
 import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
@@ -25,15 +24,17 @@ from synth.dataset.writer import DatasetWriter
 from synth.errors import InputError
 from synth.mesh import mesh_key, pad_mesh
 from synth.mesh.cache import user_cache
-from synth.plan import check_buildable
-from synth.processes import cores, outcomes_of_batches, outcomes_of_processes
-from synth.produce import Outcome, Producer, Task, Workplace
-from synth.ray_pool import outcomes_of_ray
-from synth.render.pattern import is_grey
-from synth.render.variant import Device, Variant, choose_variant
-from synth.sampling import draw_sensor, sensor_of
+from synth.pipeline.overlapped import outcomes_of_batches
+from synth.pipeline.producer import Producer
+from synth.pipeline.ray_pool import outcomes_of_ray
+from synth.pipeline.records import JobContext, Outcome, Task
+from synth.pipeline.threads import cores
+from synth.pipeline.worker_pool import outcomes_of_processes
+from synth.planning import Plan, plan
+from synth.render.variant import Variant
 from synth.scene import Gel
-from synth.template import Template
+from synth.scene.sampling import draw_sensor, sensor_of
+from synth.scene.template import Template
 
 PACKAGES = ("mitsuba", "drjit", "warp-lang", "pytetwild", "pypardiso", "numpy", "scipy", "OpenEXR")
 
@@ -121,18 +122,7 @@ Progress = Callable[[int, int], None]
 """Called with samples done and samples asked for."""
 
 
-def job_variant(template: Template, device: Device) -> Variant:
-    """What renders a job: one channel where every draw of it is grey.
-
-    Raises:
-        InputError: the device is not there.
-    """
-    # Corners that are grey say nothing of the draws between them where a single channel is drawn.
-    drawn = any(re.search(r"\.(color|reflectance)\[\d\]$|\.saturation$", at) for _, _, at in template.distributions())
-    return choose_variant(device, grey=not drawn and all(is_grey(scene.sensor) for scene in template.corners))
-
-
-def make_job(template: Template, n: int, seed: int, variant: Variant) -> Job:
+def make_job(plan: Plan, n: int, seed: int) -> Job:
     """The record of what is asked for.
 
     Raises:
@@ -143,13 +133,13 @@ def make_job(template: Template, n: int, seed: int, variant: Variant) -> Job:
     if seed < 0:
         raise InputError(f"--seed = {seed}: must not be negative")
     return Job(
-        scene=template.content,
-        scene_name=template.name,
-        scene_hash=template.hash,
+        scene=plan.template.content,
+        scene_name=plan.template.name,
+        scene_hash=plan.template.hash,
         seed=seed,
         n=n,
         software={"gelflow-synth": __version__, **_versions()},
-        device={"variant": variant.name},
+        device={"variant": plan.variant.name},
     )
 
 
@@ -179,19 +169,18 @@ def generate(
     started = time.perf_counter()
     scheduling, out = scheduling or Scheduling(), output_of(out)
     _check(scheduling, out)
-    variant = variant or job_variant(template, "auto")
-    job = make_job(template, n, seed, variant)
-    check_buildable(template, variant)
-    count = template.corners[0].sampling.pairs_per_trajectory
+    planned = plan(template, variant)
+    job = make_job(planned, n, seed)
+    count = template.sampling.pairs_per_trajectory
     with open_writer(out, job, scheduling.shard, count) as writer:
-        place = Workplace(template, job, out, variant, user_cache())
+        context = JobContext(planned, job, out, user_cache())
         finished = writer.finished
         shard = scheduling.shard or Shard(0, 1)
         asked = sum(shard.makes(i // count) for i in range(n))
         found = sum(i < n and shard.makes(i // count) for i in finished)
         summary = Summary(out, str(shard) if scheduling.shard else None, asked, found)
-        tasks = _tasks(place, writer, n, finished, shard)
-        with closing(_outcomes(place, tasks, scheduling)) as outcomes:
+        tasks = _tasks(context, writer, n, finished, shard)
+        with closing(_outcomes(context, tasks, scheduling)) as outcomes:
             for outcome in outcomes:
                 for failure in outcome.failures:
                     writer.fail(failure.index, failure.draw, failure.stage, failure.reason, failure.last_good_state)
@@ -216,57 +205,57 @@ def _check(scheduling: Scheduling, out: Output) -> None:
 
 
 def _tasks(
-    place: Workplace, writer: DatasetWriter | UrlWriter, n: int, finished: set[int], shard: Shard
+    context: JobContext, writer: DatasetWriter | UrlWriter, n: int, finished: set[int], shard: Shard
 ) -> Iterator[Task]:
     """Trajectories with samples to make. Their meshes are made here: the mesher is random, so one process does it.
 
     Raises:
         InputError: a mesh cannot be made or kept.
     """
-    template = place.template
-    count = template.corners[0].sampling.pairs_per_trajectory
+    template = context.plan.template
+    count = template.sampling.pairs_per_trajectory
     meshed = None
     for trajectory in range(shard.number, (n + count - 1) // count, shard.count):
         wanted = tuple(i for i in range(trajectory * count, min(n, (trajectory + 1) * count)) if i not in finished)
         if not wanted:
             continue
         sensor = sensor_of(template, trajectory)
-        if sensor != meshed and place.needs_meshes:
-            drawn = draw_sensor(template, place.job.seed, sensor)
+        if sensor != meshed and context.mesh_folders:
+            drawn = draw_sensor(template, context.job.seed, sensor)
             if drawn.content is not None:
-                _keep_mesh(place, writer, Gel.model_validate(drawn.content["sensor"]["gel"]))
+                _keep_mesh(context, writer, Gel.model_validate(drawn.content["sensor"]["gel"]))
             meshed = sensor
         yield trajectory, wanted
 
 
-def _keep_mesh(place: Workplace, writer: DatasetWriter | UrlWriter, gel: Gel) -> None:
+def _keep_mesh(context: JobContext, writer: DatasetWriter | UrlWriter, gel: Gel) -> None:
     """Have the dataset hold a pad's fTetWild mesh: without, every trajectory would make another one."""
-    numerics = place.template.corners[0].numerics
+    numerics = context.plan.template.numerics
     with writer.making_meshes() as folder:
-        pad_mesh(gel, numerics, (folder, place.cache))
+        pad_mesh(gel, numerics, (folder, context.cache))
         kept = folder / f"{mesh_key(gel, numerics)}.npz"
         if not kept.is_file():
             raise InputError(f"{kept}: the mesh cannot be written; put this right and give the same command again")
 
 
-def _outcomes(place: Workplace, tasks: Iterator[Task], scheduling: Scheduling) -> Generator[Outcome, None, None]:
+def _outcomes(context: JobContext, tasks: Iterator[Task], scheduling: Scheduling) -> Generator[Outcome, None, None]:
     if scheduling.ray is not None:
-        yield from outcomes_of_ray(place, tasks, scheduling.ray, scheduling.workers)
+        yield from outcomes_of_ray(context, tasks, scheduling.ray, scheduling.workers)
         return
-    if place.is_batched:
-        yield from outcomes_of_batches(place, tasks, _finishers(place, scheduling), scheduling.batch)
+    if context.plan.is_batched:
+        yield from outcomes_of_batches(context, tasks, _finishers(context, scheduling), scheduling.batch)
         return
     if scheduling.workers is not None:
-        yield from outcomes_of_processes(place, tasks, scheduling.workers)
+        yield from outcomes_of_processes(context, tasks, scheduling.workers)
         return
-    producer = Producer(place)
+    producer = Producer(context)
     for trajectory, wanted in tasks:
         yield producer.produce(trajectory, wanted)
 
 
-def _finishers(place: Workplace, scheduling: Scheduling) -> int:
+def _finishers(context: JobContext, scheduling: Scheduling) -> int:
     """Worker processes beside the one that simulates and renders; 1 for none."""
-    if scheduling.workers is not None or not place.has_gpu or not is_shared(place.out):
+    if scheduling.workers is not None or not context.plan.variant.is_on_gpu or not is_shared(context.out):
         return scheduling.workers or 1
     return max(1, cores() - 1)
 

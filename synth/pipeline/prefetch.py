@@ -1,17 +1,17 @@
-"""An iterator that runs in a thread of its own, some items ahead of whoever takes them."""
+"""Prefetching: an iterator that runs in a thread of its own, some items ahead of whoever takes them."""
 
-import queue
 import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from queue import Full, Queue
 from typing import Generic, TypeVar
 
 Item = TypeVar("Item")
 
-LOOK_S = 0.1
+POLL_S = 0.1
 """Seconds after which a thread that waits for room looks whether it is still wanted."""
-PATIENCE_S = 10.0
+JOIN_S = 10.0
 """For its last item, when it is no longer wanted."""
 
 
@@ -23,7 +23,7 @@ class _End:
 
 
 @contextmanager
-def ahead(items: Iterable[Item], limit: int) -> Iterator[Iterator[Item]]:
+def prefetched(items: Iterable[Item], limit: int) -> Iterator[Iterator[Item]]:
     """Take items from an iterator that runs in another thread; what it raises is raised here.
 
     Args:
@@ -33,21 +33,21 @@ def ahead(items: Iterable[Item], limit: int) -> Iterator[Iterator[Item]]:
     Yields:
         The items in their order. On leaving, the thread is told to stop after the item that it is making.
     """
-    running = _Running(items, queue.Queue(limit), threading.Event())
-    thread = threading.Thread(target=running.run, daemon=True)
+    prefetcher = _Prefetcher(items, Queue(limit), threading.Event())
+    thread = threading.Thread(target=prefetcher.run, daemon=True)
     thread.start()
     try:
-        yield running.taken()
+        yield prefetcher.items_in_order()
     finally:
-        running.unwanted.set()
-        thread.join(PATIENCE_S)
+        prefetcher.cancelled.set()
+        thread.join(JOIN_S)
 
 
 @dataclass(frozen=True)
-class _Running(Generic[Item]):
+class _Prefetcher(Generic[Item]):
     items: Iterable[Item]
-    line: "queue.Queue[Item | _End]"
-    unwanted: threading.Event
+    queue: "Queue[Item | _End]"
+    cancelled: threading.Event
 
     def run(self) -> None:
         error: BaseException | None = None
@@ -60,17 +60,17 @@ class _Running(Generic[Item]):
         self._put(_End(error))
 
     def _put(self, item: Item | _End) -> bool:
-        while not self.unwanted.is_set():
+        while not self.cancelled.is_set():
             try:
-                self.line.put(item, timeout=LOOK_S)
-            except queue.Full:
+                self.queue.put(item, timeout=POLL_S)
+            except Full:
                 continue
             return True
         return False
 
-    def taken(self) -> Iterator[Item]:
+    def items_in_order(self) -> Iterator[Item]:
         while True:
-            item = self.line.get()
+            item = self.queue.get()
             if isinstance(item, _End):
                 if item.error is not None:
                     raise item.error

@@ -5,7 +5,7 @@
 `choice` may hold whole tables (indenters, say) with distributions inside. A `file` with wildcards, "objects/*.stl", is
 a choice of the files that match. A scene is checked when it is loaded: at the lower and upper end of all its
 distributions and for every choice, so that a mistake shows before any work is done. A `normal` is checked at its mean:
-a draw from its tails that breaks the schema is drawn again (`synth.sampling`).
+a draw from its tails that breaks the schema is drawn again (`synth.scene.sampling`).
 """
 
 import hashlib
@@ -20,12 +20,10 @@ from pathlib import Path
 from typing import Any
 
 from synth.errors import InputError
-from synth.scene import Scene
-from synth.scene_indenters import MeshIndenter
-from synth.scene_pattern import Bitmap
-from synth.schema_errors import DISTRIBUTIONS, validated
+from synth.scene import Bitmap, MeshIndenter, Numerics, Outputs, Sampling, Scene
+from synth.scene.validation import DISTRIBUTIONS, validated
 
-SCENES = Path(__file__).resolve().parent.parent / "scenes"
+SCENES = Path(__file__).resolve().parents[2] / "scenes"
 """The shipped scene files."""
 FIXED = ("name", "description", "references", "numerics", "outputs", "sampling")
 """Parts that all samples of a dataset share."""
@@ -78,6 +76,26 @@ class Template:
         contents = [_corner(self.content, high, turn) for turn in turns for high in (False, True)]
         return tuple(dict.fromkeys(validated(content, self.label, Scene) for content in contents))
 
+    @property
+    def folder(self) -> Path:
+        """What the files that the scene names are relative to."""
+        return self.source.parent
+
+    @property
+    def numerics(self) -> Numerics:
+        """The same for all samples, as are outputs and sampling."""
+        return self.corners[0].numerics
+
+    @property
+    def outputs(self) -> Outputs:
+        """The channels of flow.exr."""
+        return self.corners[0].outputs
+
+    @property
+    def sampling(self) -> Sampling:
+        """Samples of a trajectory, trajectories of a sensor."""
+        return self.corners[0].sampling
+
     def distributions(self) -> list[tuple[str, Any, str]]:
         """Kind, arguments and path of every distribution, nested ones after their choice."""
         return list(_distributions(self.content, ""))
@@ -87,7 +105,7 @@ class Template:
         parts: list[tuple[str, Any]] = [("contact.indenter", corner.contact.indenter) for corner in self.corners]
         parts += [("sensor.pattern", corner.sensor.pattern) for corner in self.corners]
         names = sorted({(f"{key}.file", part.file) for key, part in parts if isinstance(part, MeshIndenter | Bitmap)})
-        return [(key, self.source.parent / name) for key, name in names]
+        return [(key, self.folder / name) for key, name in names]
 
 
 def load_scene(name_or_path: str | Path, overrides: Sequence[str] = ()) -> Template:

@@ -5,8 +5,8 @@ from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 
 from synth.arrays import Image
-from synth.produce import Workplace
-from synth.produce.studio import paint
+from synth.pipeline.records import JobContext
+from synth.pipeline.render_session import paint
 from synth.scene import Sensor
 
 TEXTURES = 8
@@ -17,26 +17,26 @@ class Textures:
     """Textures of a job's sensors.
 
     Args:
-        place: of the job.
-        painters: threads that paint.
+        context: of the job.
+        threads: that paint.
         room: textures at a time.
     """
 
-    def __init__(self, place: Workplace, painters: ThreadPoolExecutor, room: int = TEXTURES) -> None:
-        self._place, self._painters, self._room = place, painters, room
+    def __init__(self, context: JobContext, threads: ThreadPoolExecutor, room: int = TEXTURES) -> None:
+        self._context, self._threads, self._room = context, threads, room
         self._wanted: deque[tuple[Future[Image], int, Sensor]] = deque()
         self._lock = threading.Lock()
 
-    def ask(self, sensor: int, scene: Sensor) -> "Future[Image]":
-        """A sensor's texture, begun when there is room; in any thread."""
+    def request(self, number: int, sensor: Sensor) -> "Future[Image]":
+        """The texture of a sensor, by its number, begun when there is room; in any thread."""
         texture: Future[Image] = Future()
         with self._lock:
-            self._wanted.append((texture, sensor, scene))
+            self._wanted.append((texture, number, sensor))
             self._begin()
         return texture
 
-    def used(self) -> None:
-        """A texture that was asked for is no longer kept: there is room for another one; in any thread."""
+    def release(self) -> None:
+        """A texture that was requested is no longer held: there is room for another one; in any thread."""
         with self._lock:
             self._room += 1
             self._begin()
@@ -44,10 +44,10 @@ class Textures:
     def _begin(self) -> None:
         while self._room and self._wanted:
             self._room -= 1
-            self._painters.submit(self._paint, *self._wanted.popleft())
+            self._threads.submit(self._paint, *self._wanted.popleft())
 
-    def _paint(self, texture: "Future[Image]", sensor: int, scene: Sensor) -> None:
+    def _paint(self, texture: "Future[Image]", number: int, sensor: Sensor) -> None:
         try:
-            texture.set_result(paint(self._place, sensor, scene))
+            texture.set_result(paint(self._context, number, sensor))
         except BaseException as error:  # whatever it is, it belongs to the thread that renders
             texture.set_exception(error)

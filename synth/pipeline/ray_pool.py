@@ -2,7 +2,7 @@
 
 A task is one trajectory: it depends on (scene, seed, trajectory) alone and shares nothing with others but the output,
 where its samples appear whole or not at all. So Ray may repeat it when a worker or a machine is lost, and even have it
-done twice at once. The driver records what comes back, as with worker processes (`synth.processes`); a lost driver
+done twice at once. The driver records what comes back, as with worker processes (`worker_pool`); a lost driver
 loses the tasks under way, and the same command goes on.
 
 Every machine needs this package installed and must see the output: a directory on a shared file system, or a URL.
@@ -17,8 +17,9 @@ from contextlib import contextmanager
 from typing import Any
 
 from synth.errors import InputError
-from synth.processes.threads import render_on_one_core
-from synth.produce import Outcome, Producer, Task, Workplace
+from synth.pipeline.producer import Producer
+from synth.pipeline.records import JobContext, Outcome, Task
+from synth.pipeline.threads import render_on_one_core
 
 LOCAL = "local"
 """The address that means: a cluster of worker processes on this machine, for as long as the command runs."""
@@ -33,12 +34,12 @@ GPU_SHARE = 0.25
 
 
 def outcomes_of_ray(
-    place: Workplace, tasks: Iterator[Task], address: str, workers: int | None = None
+    context: JobContext, tasks: Iterator[Task], address: str, workers: int | None = None
 ) -> Generator[Outcome, None, None]:
     """Outcomes in the order in which they are ready; at most two tasks per processor core are waiting at any time.
 
     Args:
-        place: of the job.
+        context: of the job.
         tasks: to do.
         address: of the cluster, as `ray.init` takes it, or "local".
         workers: tasks at once; default as many as the cluster has cores.
@@ -48,12 +49,12 @@ def outcomes_of_ray(
             refuses, or a task's worker was lost again and again.
     """
     ray = _ray()
-    gpus = GPU_SHARE if place.variant.name.startswith("cuda") else 0
+    gpus = GPU_SHARE if context.plan.variant.is_on_gpu else 0
     with _cluster(ray, address, workers):
         if gpus and not ray.cluster_resources().get("GPU"):
             raise InputError(f"--ray {address}: the cluster has no GPU; give --device cpu, or add one")
         work = ray.remote(max_retries=MAX_RETRIES, num_cpus=1, num_gpus=gpus)(_work)
-        shared, token = ray.put(place), uuid.uuid4().hex
+        shared, token = ray.put(context), uuid.uuid4().hex
         under_way: dict[Any, Task] = {}
         while True:
             most = workers or 2 * max(1, int(ray.cluster_resources().get("CPU", 1)))
@@ -126,9 +127,9 @@ _producer: tuple[str, Producer] | None = None
 """A worker process's producer and the run that it belongs to: Ray gives a worker many tasks."""
 
 
-def _work(place: Workplace, token: str, trajectory: int, wanted: tuple[int, ...]) -> Outcome:
+def _work(context: JobContext, token: str, trajectory: int, wanted: tuple[int, ...]) -> Outcome:
     global _producer
     if _producer is None or _producer[0] != token:
-        render_on_one_core(place.variant)  # Ray itself keeps linear algebra to a task's one core
-        _producer = token, Producer(place)
+        render_on_one_core(context.plan.variant)  # Ray itself keeps linear algebra to a task's one core
+        _producer = token, Producer(context)
     return _producer[1].produce(trajectory, wanted)

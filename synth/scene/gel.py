@@ -6,7 +6,7 @@ from typing import Annotated, Literal, TypeVar
 from pydantic import Field, field_validator, model_validator
 
 from synth.arrays import FloatArray
-from synth.scene_indenters import NonNegative, Part, Positive
+from synth.scene.part import NonNegative, Part, Positive
 
 THINNEST = 0.3
 """A domed pad keeps at least this share of its thickness at the corners. Elements there are flattened to that share of

@@ -3,9 +3,9 @@
 A worker takes one core: one thread in every library. As many workers as a job has cores fill them, however many the
 machine has.
 
-Workers live and die with the driver: each holds the reading end of a pipe that the driver alone can write to, and
-leaves when it closes, which the system does when the driver is killed. Ctrl-C reaches all processes of a terminal at
-once; the workers are started with it blocked, and the driver, which gets it, closes the pipe.
+Workers live and die with the driver: each holds the reading end of a parent-death pipe, which the driver alone can
+write to, and leaves when it closes, which the system does when the driver is killed. Ctrl-C reaches all processes of a
+terminal at once; the workers are started with it blocked, and the driver, which gets it, closes the pipe.
 
 A worker that dies (killed, out of memory) takes the pool with it. What was under way goes to a new pool: an item may be
 done twice, with the same result.
@@ -26,8 +26,9 @@ from multiprocessing.connection import Connection
 from typing import Any, TypeAlias, TypeVar
 
 from synth.errors import InputError
-from synth.processes.threads import one_thread_each, render_on_one_core
-from synth.produce import Outcome, Producer, Task, Workplace
+from synth.pipeline.producer import Producer
+from synth.pipeline.records import JobContext, Outcome, Task
+from synth.pipeline.threads import one_thread_each, render_on_one_core
 
 Item = TypeVar("Item")
 Maker: TypeAlias = Callable[[Item], Outcome]
@@ -37,14 +38,14 @@ MAX_DEATHS = 3
 """Pools that may break one after the other without a finished task between them."""
 
 
-def outcomes_of_processes(place: Workplace, tasks: Iterator[Task], workers: int) -> Generator[Outcome, None, None]:
+def outcomes_of_processes(context: JobContext, tasks: Iterator[Task], workers: int) -> Generator[Outcome, None, None]:
     """Outcomes of whole trajectories, each made by one worker on one core; see `spread`."""
-    yield from spread(place, _trajectory_maker, tasks, workers, _trajectory)
+    yield from spread(context, _trajectory_maker, tasks, workers, _trajectory)
 
 
 def spread(
-    place: Workplace,
-    make: Callable[[Workplace], Maker[Item]],
+    context: JobContext,
+    make: Callable[[JobContext], Maker[Item]],
     items: Iterator[Item],
     workers: int,
     number: Callable[[Item], int],
@@ -52,7 +53,7 @@ def spread(
     """Outcomes in the order in which they are ready; at most two items per worker are waiting at any time.
 
     Args:
-        place: of the job.
+        context: of the job.
         make: gives, in each worker process, what makes an outcome of an item, and keeps a renderer to one core; like
             the items it is picklable.
         items: to do.
@@ -66,7 +67,7 @@ def spread(
     deaths = 0
     while True:
         try:
-            for outcome in _outcomes_of_pool(place, make, items, again, workers):
+            for outcome in _outcomes_of_pool(context, make, items, again, workers):
                 deaths = 0
                 yield outcome
             return
@@ -83,18 +84,18 @@ def spread(
 
 
 def _outcomes_of_pool(
-    place: Workplace,
-    make: Callable[[Workplace], Maker[Item]],
+    context: JobContext,
+    make: Callable[[JobContext], Maker[Item]],
     items: Iterator[Item],
     again: deque[Item],
     workers: int,
 ) -> Generator[Outcome, None, None]:
     """Outcomes of `again`, then of `items`; when the pool breaks, `again` holds what it had not finished."""
-    context = get_context("spawn")  # Dr.Jit and Warp do not survive a fork
-    leash, held = context.Pipe(duplex=False)
+    spawn = get_context("spawn")  # Dr.Jit and Warp do not survive a fork
+    parent_death, parents_end = spawn.Pipe(duplex=False)
     under_way: dict[Future[Outcome], Item] = {}
-    pool = ProcessPoolExecutor(workers, context, _begin, (place, make, leash))
-    with leash, held, one_thread_each(), pool:
+    pool = ProcessPoolExecutor(workers, spawn, _begin, (context, make, parent_death))
+    with parent_death, parents_end, one_thread_each(), pool:
         try:
             while True:
                 room = len(under_way) < 2 * workers
@@ -118,7 +119,7 @@ def _outcomes_of_pool(
             again.extend(under_way.values())
             raise
         except BaseException:
-            held.close()
+            parents_end.close()
             raise
 
 
@@ -132,10 +133,10 @@ def interrupts_blocked() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def leave_with_driver(leash: Connection) -> None:
+def exit_with_parent(parent_death: Connection) -> None:
     """End this process, whatever it is doing, when the driver lets go of the pipe; unfinished samples stay hidden."""
     with contextlib.suppress(EOFError, OSError):
-        leash.recv_bytes()
+        parent_death.recv_bytes()
     os._exit(1)
 
 
@@ -143,10 +144,10 @@ _maker: Maker[Any] | None = None
 """What a worker process does, set when the process starts."""
 
 
-def _begin(place: Workplace, make: Callable[[Workplace], Maker[Any]], leash: Connection) -> None:
+def _begin(context: JobContext, make: Callable[[JobContext], Maker[Any]], parent_death: Connection) -> None:
     global _maker
-    threading.Thread(target=leave_with_driver, args=(leash,), daemon=True).start()
-    _maker = make(place)
+    threading.Thread(target=exit_with_parent, args=(parent_death,), daemon=True).start()
+    _maker = make(context)
 
 
 def _work(item: Any) -> Outcome:
@@ -155,9 +156,9 @@ def _work(item: Any) -> Outcome:
     return _maker(item)
 
 
-def _trajectory_maker(place: Workplace) -> Maker[Task]:
-    render_on_one_core(place.variant)
-    producer = Producer(place)
+def _trajectory_maker(context: JobContext) -> Maker[Task]:
+    render_on_one_core(context.plan.variant)
+    producer = Producer(context)
     return lambda task: producer.produce(*task)
 
 

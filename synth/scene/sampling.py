@@ -14,9 +14,9 @@ import numpy as np
 from synth.errors import InputError
 from synth.render.lights import check_view
 from synth.render.thin_lens import ThinLens
-from synth.scene import Render, Sampling, Scene, Sensor
-from synth.schema_errors import validated
-from synth.template import Chooser, Template, replaced
+from synth.scene import Render, Scene, Sensor
+from synth.scene.template import Chooser, Template, replaced
+from synth.scene.validation import validated
 
 TRAJECTORY_PARTS = ("contact", "motion")
 """Drawn anew for every trajectory; everything else belongs to the sensor."""
@@ -55,7 +55,7 @@ def stream(template: Template, seed: int, purpose: str, *numbers: int) -> np.ran
 
 def sensor_of(template: Template, trajectory: int) -> int:
     """Number of the sensor that a trajectory belongs to."""
-    return trajectory // _sampling(template).trajectories_per_sensor
+    return trajectory // template.sampling.trajectories_per_sensor
 
 
 def draw_sensor(template: Template, seed: int, sensor: int) -> SensorDraw:
@@ -105,7 +105,7 @@ def pairs_of(template: Template, seed: int, trajectory: int, steps: int) -> list
 
     The first shows the undeformed gel and the last state; the others are drawn from all other pairs i < j.
     """
-    count = _sampling(template).pairs_per_trajectory
+    count = template.sampling.pairs_per_trajectory
     others = [(i, j) for i in range(steps) for j in range(i + 1, steps + 1) if (i, j) != (0, steps)]
     rng = stream(template, seed, "pairs", trajectory)
     frames = [(0, steps), *(others[k] for k in rng.permutation(len(others)))]
@@ -157,7 +157,3 @@ def _orientation(rng: np.random.Generator) -> list[float]:
 def _parts(template: Template, *, of_trajectory: bool) -> list[str]:
     """Names of the template's parts of one level, in an order that the file's does not enter."""
     return sorted(part for part in template.content if (part in TRAJECTORY_PARTS) == of_trajectory)
-
-
-def _sampling(template: Template) -> Sampling:
-    return template.corners[0].sampling

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from synth.scene_indenters import Color, Fraction, NonNegative, Part, Positive, Vector2
+from synth.scene.part import Color, Fraction, NonNegative, Part, Positive, Vector2
 
 
 class NoPattern(Part):

@@ -1,21 +1,10 @@
-"""The part of a scene's schema that is the indenters, and what all parts share."""
+"""The part of a scene's schema that is the indenters."""
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
-Fraction = Annotated[float, Field(ge=0, le=1)]
-Positive = Annotated[float, Field(gt=0)]
-NonNegative = Annotated[float, Field(ge=0)]
-Vector2 = tuple[float, float]
-Vector3 = tuple[float, float, float]
-Color = tuple[Fraction, Fraction, Fraction]
-
-
-class Part(BaseModel):
-    """Base of every part of a scene: frozen, closed to unknown keys, finite numbers only."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+from synth.scene.part import Part, Positive, Vector3
 
 
 class Posed(Part):

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from synth.scene_indenters import Fraction, NonNegative, Part, Positive, Vector3
+from synth.scene.part import Fraction, NonNegative, Part, Positive, Vector3
 
 COEFFICIENTS = {"pinhole": "k1, k2, p1, p2, k3", "fisheye": "k1, k2, k3, k4"}
 """Names of a lens's distortion coefficients, as OpenCV orders them."""

@@ -1,0 +1,88 @@
+"""The random instances of one trajectory, one after the other, until one of them can be used."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from synth.errors import InputError
+from synth.pipeline.records import FaceState, Failure, JobContext, Outcome, Simulated, SimulatedTrajectory, Task
+from synth.scene.sampling import MAX_DRAWS, Pair, SensorDraw, draw, pairs_of
+from synth.simulate import Trajectory
+from synth.simulate.press import Press, edge_radius_mm
+
+
+@dataclass(frozen=True, eq=False)
+class Attempt:
+    """One instance, to be simulated.
+
+    Attributes:
+        press: scene, mesh, body and load path.
+        pairs: the samples that are wanted.
+        frames: numbers of the states that any sample of the trajectory shows, wanted or not: a state's bits must not
+            depend on which samples are still to be made.
+    """
+
+    press: Press
+    pairs: tuple[Pair, ...]
+    frames: frozenset[int]
+
+
+class Attempts:
+    """See the module's docstring; keeps the record of instances that failed."""
+
+    def __init__(self, context: JobContext, task: Task, sensor: SensorDraw) -> None:
+        """Begin with the first instance; `sensor` is that of the trajectory."""
+        self.trajectory, self.wanted = task
+        self._context, self._sensor, self._count = context, sensor, 0
+        self._first = self.trajectory * context.plan.template.sampling.pairs_per_trajectory
+        self.failures: list[Failure] = []
+        for reason in sensor.rejected:
+            self.fail("sensor", reason)
+
+    def next(self) -> Attempt | None:
+        """The next instance that keeps the schema and whose mesh and body can be built; None when there are no more."""
+        plan, seed = self._context.plan, self._context.job.seed
+        while self._sensor.content is not None and self._count < MAX_DRAWS:
+            self._count += 1
+            stage = "draw"
+            try:
+                scene = draw(plan.template, seed, self.trajectory, self._count - 1, self._sensor)
+                stage = "simulate"
+                press = plan.press(scene, self._context.mesh_folders)
+            except InputError as error:
+                self.fail(stage, str(error))
+                continue
+            every = pairs_of(plan.template, seed, self.trajectory, scene.motion.steps)
+            pairs = tuple(pair for pair in every if pair.index in self.wanted)
+            return Attempt(press, pairs, frozenset(frame for pair in every for frame in pair.frames))
+        return None
+
+    def simulated(self, attempt: Attempt, result: Trajectory) -> Simulated | None:
+        """What is handed on of an instance's trajectory; None if it cannot be used, which is put on record."""
+        if result.status != "complete":
+            self._record("simulate", result.reason, result.states[-1].summary())
+            return None
+        press, space = attempt.press, result.space
+        shown = sorted({frame for pair in attempt.pairs for frame in pair.frames})
+        trajectory = SimulatedTrajectory(
+            self.trajectory,
+            press.scene,
+            attempt.pairs,
+            {frame: FaceState.of(result.states[frame], space) for frame in shown},
+            {"mesh": press.mesh.hash, "element": space.element.name},
+            edge_radius_mm(press.scene, press.mesh),
+            press.accuracy,
+            tuple(self.failures),
+            result.seconds,
+        )
+        return trajectory, space
+
+    def fail(self, stage: str, reason: str) -> None:
+        """Put an instance on record that did not get as far as a simulation."""
+        self._record(stage, reason, None)
+
+    def given_up(self) -> Outcome:
+        """What is reported when no instance is left."""
+        return Outcome((), tuple(self.failures), tuple(self.wanted))
+
+    def _record(self, stage: str, reason: str, last_good_state: dict[str, Any] | None) -> None:
+        self.failures.append(Failure(self._first, len(self.failures), stage, reason, last_good_state))

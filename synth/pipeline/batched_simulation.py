@@ -1,0 +1,154 @@
+"""Trajectories simulated many at once.
+
+Tasks are taken some chunks ahead, drawn, sorted by their pads, and run through the lanes of `synth.simulate.batched`;
+an instance that fails is followed by its trajectory's next one in the next chunk. What a trajectory comes out as does
+not depend on which others ran beside it.
+
+The trajectories of one sensor are handed on one after the other, whenever they end: a sensor's renderer is worth as
+much as some ten frames. Those that wait for one of their sensor's are a few hundred kilobytes each.
+"""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from itertools import islice
+
+from synth.pipeline.attempts import Attempt, Attempts
+from synth.pipeline.records import JobContext, Outcome, Simulated, Task
+from synth.scene import Gel
+from synth.scene.sampling import SensorDraw, draw_sensor, sensor_of
+from synth.scene.template import Template
+from synth.simulate import Trajectory
+from synth.simulate.batched.jobs import Job
+from synth.simulate.batched.many import run_jobs
+from synth.simulate.batched.pad import Pad, prepare
+from synth.simulate.press import Press
+
+BATCH = {"cuda": 256, "cpu": 8}
+"""Trajectories at once."""
+CHUNK = 4
+"""Trajectories of a chunk in batches: its last ones run beside empty lanes. The first chunk is one batch: nothing
+can be rendered while it is drawn."""
+MIN_PER_SENSOR = 16
+"""Trajectories that are worth a change of the sensor."""
+
+Result = Simulated | Outcome
+"""A simulated trajectory, or the record of one whose every instance failed."""
+
+
+class Pads:
+    """The pad that was used last: mesh, tables and preconditioner, which take seconds to prepare."""
+
+    def __init__(self, context: JobContext) -> None:
+        """Nothing is prepared before the first press."""
+        self._device = context.plan.solver_device
+        self._cached: tuple[Gel, Pad] | None = None
+
+    def of(self, press: Press) -> Pad:
+        """The pad of a press.
+
+        Raises:
+            InputError: a mesh that no element can be built on, or CUDA without cuBLAS or cuSOLVER.
+        """
+        key = pad_key(press)
+        if self._cached is None or self._cached[0] != key:
+            self._cached = None  # gives its memory back first
+            self._cached = key, prepare(press.scene, press.mesh, self._device)
+        return self._cached[1]
+
+
+def simulate_alone(attempt: Attempt, pad: Pad) -> Trajectory:
+    """A batch of one press."""
+    numerics = attempt.press.scene.numerics
+    ((_, result),) = run_jobs([Job.of(attempt.press)], pad, numerics, [attempt.frames], 1)
+    return result
+
+
+def pad_key(press: Press) -> Gel:
+    """What presses that may run together have in common, and with it the mesh. Without layers stiffness only scales."""
+    gel = press.scene.sensor.gel
+    return gel if gel.layers else gel.model_copy(update={"youngs_modulus_kpa": 1.0})
+
+
+def in_batches(context: JobContext, tasks: Iterator[Task], batch: int | None = None) -> Iterator[Result]:
+    """Simulate tasks; each comes out once, in no particular order but with a sensor's trajectories together.
+
+    Args:
+        context: of the job.
+        tasks: to do, in the order of their trajectories.
+        batch: most trajectories at a time; changes no bit of what comes out.
+
+    Raises:
+        InputError: the storage refuses, or CUDA without cuBLAS or cuSOLVER.
+    """
+    simulation = _Simulation(context, tasks, batch or BATCH[context.plan.solver_device])
+    return by_sensor(context.plan.template, simulation, simulation.open)
+
+
+class _Simulation:
+    """An iterator over (trajectory, its result) as they end; `open` counts those of each sensor that are under way."""
+
+    def __init__(self, context: JobContext, tasks: Iterator[Task], batch: int) -> None:
+        self._context, self._tasks, self._batch = context, tasks, batch
+        self._pads = Pads(context)
+        self._sensor: tuple[int, SensorDraw] | None = None
+        self.open: Counter[int] = Counter()
+
+    def __iter__(self) -> Iterator[tuple[int, Result]]:
+        again: list[Attempts] = []
+        most = self._batch
+        while chunk := [*again, *self._begun(most - len(again))]:
+            again, most = [], CHUNK * self._batch
+            ready: dict[Gel, list[tuple[Attempts, Attempt]]] = {}
+            for attempts in chunk:
+                attempt = attempts.next()
+                if attempt is None:
+                    yield attempts.trajectory, attempts.given_up()
+                else:
+                    ready.setdefault(pad_key(attempt.press), []).append((attempts, attempt))
+            while ready:
+                for attempts, attempt, result in self._run(ready.pop(next(iter(ready)))):
+                    simulated = attempts.simulated(attempt, result)
+                    if simulated is None:
+                        again.append(attempts)
+                    else:
+                        yield attempts.trajectory, simulated
+
+    def _begun(self, most: int) -> list[Attempts]:
+        """New trajectories."""
+        begun = []
+        for task in islice(self._tasks, most):
+            template = self._context.plan.template
+            sensor = sensor_of(template, task[0])
+            if self._sensor is None or self._sensor[0] != sensor:
+                self._sensor = sensor, draw_sensor(template, self._context.job.seed, sensor)
+            self.open[sensor] += 1
+            begun.append(Attempts(self._context, task, self._sensor[1]))
+        return begun
+
+    def _run(self, members: list[tuple[Attempts, Attempt]]) -> Iterator[tuple[Attempts, Attempt, Trajectory]]:
+        """Trajectories of one pad as they end."""
+        first = members[0][1].press
+        jobs = [Job.of(attempt.press) for _, attempt in members]
+        frames = [attempt.frames for _, attempt in members]
+        for number, result in run_jobs(jobs, self._pads.of(first), first.scene.numerics, frames, self._batch):
+            yield *members[number], result
+
+
+def by_sensor(template: Template, ended: Iterable[tuple[int, Result]], open: Counter[int]) -> Iterator[Result]:
+    """Results of one sensor together: at once after one of the same, else when enough or all of them are there.
+
+    Args:
+        template: the scene.
+        ended: trajectories and their results as they end.
+        open: how many of each sensor are still to come; is counted down.
+    """
+    waiting: dict[int, list[Result]] = {}
+    present: int | None = None
+    for trajectory, result in ended:
+        sensor = sensor_of(template, trajectory)
+        open[sensor] -= 1
+        mine = waiting.setdefault(sensor, [])
+        mine.append(result)
+        if sensor == present or len(mine) >= MIN_PER_SENSOR or open[sensor] == 0:
+            present = sensor
+            yield from waiting.pop(sensor)

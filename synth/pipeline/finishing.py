@@ -1,0 +1,129 @@
+"""From a trajectory's rendered frames to its samples on disk: exact flow, the cameras' noise, encoding, writing.
+
+All of it is the processor's work, and none of it needs the renderer: it may be done in another process than the one
+that has the GPU.
+"""
+
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from synth.arrays import Image
+from synth.dataset.images import Raster
+from synth.dataset.output import write_sample
+from synth.dataset.sample import CameraPair, Sample
+from synth.flow.exact import exact_flow
+from synth.flow.field import FlowField
+from synth.flow.view import View
+from synth.optics import Optics
+from synth.pipeline.records import FaceState, JobContext, Outcome, SimulatedTrajectory
+from synth.pipeline.render_session import Frame, RenderedTrajectory
+from synth.render.camera_image import camera_image
+from synth.scene import Camera, Outputs
+from synth.scene.sampling import Pair
+from synth.simulate.shared import accuracy
+
+
+def finish(context: JobContext, rendered: RenderedTrajectory) -> Outcome:
+    """Write a trajectory's samples.
+
+    Raises:
+        InputError: the storage refuses.
+    """
+    simulated = rendered.simulated
+    diagnostics = _diagnostics(context, simulated)
+    views = {
+        name: View(rendered.surface, Optics.of(sensor), sensor.camera.width, sensor.camera.height)
+        for name, sensor in simulated.scene.sensor.views.items()
+    }
+    count, entries = len(simulated.pairs), []
+    shared = {"simulate": simulated.seconds / count, "render": rendered.seconds / count}
+    for pair in simulated.pairs:
+        started = time.perf_counter()
+        sample = _sample(context, rendered, pair, diagnostics, views)
+        traced = time.perf_counter()
+        entry = write_sample(context.out, sample, context.job)
+        seconds = {**shared, "flow": traced - started, "write": time.perf_counter() - traced}
+        entries.append(replace(entry, seconds={stage: round(value, 4) for stage, value in seconds.items()}))
+    return Outcome(tuple(entries), simulated.failures, ())
+
+
+def _diagnostics(context: JobContext, simulated: SimulatedTrajectory) -> dict[str, Any]:
+    """What is said of the mesh."""
+    found = simulated.accuracy or accuracy(simulated.scene, context.plan.template.folder)
+    error = None if np.isnan(found.error_px) else round(found.error_px, 4)
+    radius = simulated.edge_radius_mm
+    rounded = {} if radius is None else {"edge_radius_mm": round(radius, 4)}
+    return {**simulated.mesh, "elements_across_contact": found.across, "predicted_error_px": error, **rounded}
+
+
+def _sample(
+    context: JobContext,
+    rendered: RenderedTrajectory,
+    pair: Pair,
+    diagnostics: Mapping[str, Any],
+    views: Mapping[str, View],
+) -> Sample:
+    """`views` are the trajectory's cameras by name."""
+    scene, states = rendered.simulated.scene, rendered.simulated.states
+    first, second = (states[frame] for frame in pair.frames)
+    frames = [rendered.frames[frame] for frame in pair.frames]
+    cameras = {}
+    for k, (name, sensor) in enumerate(scene.sensor.views.items()):
+        own = (k,) if k else ()  # of each further camera's noise
+        images = [
+            expose(context, sensor.camera, frame.radiance[name], (pair.index, number, *own))
+            for number, frame in enumerate(frames)
+        ]
+        cameras[name] = CameraPair(images[0], images[1], _flow(scene.outputs, views[name], frames, second))
+    main = cameras.pop("")
+    return Sample(
+        index=pair.index,
+        trajectory=pair.trajectory,
+        frames=pair.frames,
+        seed=context.job.seed,
+        image1=main.image1,
+        image2=main.image2,
+        flow=main.flow,
+        scene=scene,
+        surface=rendered.surface,
+        displacement1=first.displacement,
+        displacement2=second.displacement,
+        diagnostics={"solver": [first.summary, second.summary], **diagnostics},
+        force_n=np.array([first.force_n, second.force_n]),
+        torque_nmm=np.array([first.torque_nmm, second.torque_nmm]),
+        further=cameras,
+    )
+
+
+def expose(context: JobContext, camera: Camera, radiance: Image, numbers: tuple[int, ...]) -> Raster:
+    """What a camera makes of a frame, with noise of its own for every image; grey where the variant is."""
+    rng = context.stream("noise", *numbers)
+    if context.plan.variant.is_mono:
+        return camera_image(radiance[:, :, :1], camera, rng)[:, :, 0]
+    return camera_image(radiance, camera, rng)
+
+
+def _flow(outputs: Outputs, view: View, frames: list[Frame], pressed: FaceState) -> FlowField:
+    """The exact flow between two frames, with what else the outputs ask for; `pressed` is the second state."""
+    surface = view.surface
+    traction = surface.interpolate_linear(pressed.traction) if outputs.traction else None
+    touching = (np.linalg.norm(pressed.traction, axis=1, keepdims=True) > 0).astype(np.float64)
+    return exact_flow(
+        surface,
+        frames[0].positions,
+        frames[1].positions,
+        view.optics,
+        view.width,
+        view.height,
+        backward=outputs.backward,
+        depth=outputs.depth,
+        normal=outputs.normal,
+        displacement=outputs.displacement,
+        traction=traction,
+        contact=surface.interpolate_linear(touching)[:, 0] if outputs.contact else None,
+        view=view,
+    )

@@ -1,0 +1,97 @@
+"""Batched simulation beside rendering beside writing.
+
+    solver's thread -> a few simulated trajectories -> this thread: rendering -> worker processes: flow, noise, files
+
+Simulation and rendering share this process's GPU, each on a stream of its own, and nothing else uses it. Textures are
+painted in further threads as soon as their sensor's turn is near. Every queue between two stages has room for a fixed
+number of trajectories: whoever is ahead waits, so that memory does not grow with the number of samples. The solver's is
+long enough that rendering goes on while the next chunk is drawn. A killed run loses what is in the queues; failed
+instances and samples come out the same the next time.
+"""
+
+from collections.abc import Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
+from functools import partial
+
+from synth.arrays import Image
+from synth.pipeline.batched_simulation import Result, in_batches
+from synth.pipeline.finishing import finish
+from synth.pipeline.prefetch import prefetched
+from synth.pipeline.records import JobContext, Outcome, Task
+from synth.pipeline.render_session import RenderedTrajectory, RenderSession
+from synth.pipeline.textures import Textures
+from synth.pipeline.worker_pool import Maker, spread
+
+PREFETCHED = 256
+"""Simulated trajectories that wait to be rendered, at most: some hundred kilobytes each."""
+TEXTURE_THREADS = 6
+
+Rendered = RenderedTrajectory | Outcome
+
+
+def outcomes_of_batches(
+    context: JobContext, tasks: Iterator[Task], workers: int, batch: int | None
+) -> Generator[Outcome, None, None]:
+    """Outcomes in the order in which they are ready.
+
+    Args:
+        context: of the job.
+        tasks: to do; they are taken in the solver's thread.
+        workers: processes for flow, noise and files; 1: this one does everything, one thing after another.
+        batch: most trajectories simulated at a time; None for what suits the device.
+
+    Raises:
+        InputError: the storage refuses, CUDA without cuBLAS or cuSOLVER, or worker processes die again and again.
+    """
+    session, results = RenderSession(context), in_batches(context, tasks, batch)
+    if workers == 1:
+        for result in results:
+            yield result if isinstance(result, Outcome) else finish(context, session.render_frames(*result))
+        return
+    pairs = context.plan.template.sampling.pairs_per_trajectory
+
+    def number(item: Rendered) -> int:
+        return item.given_up[0] // pairs if isinstance(item, Outcome) else item.simulated.number
+
+    with ThreadPoolExecutor(TEXTURE_THREADS) as threads:
+        textures = Textures(context, threads)
+        try:
+            requested = _with_textures(results, textures)
+            with prefetched(requested, PREFETCHED) as ready, closing(_rendered(session, ready, textures)) as items:
+                yield from spread(context, _finisher, items, workers, number)
+        finally:
+            threads.shutdown(wait=False, cancel_futures=True)
+
+
+def _with_textures(results: Iterable[Result], textures: Textures) -> Iterator[tuple[Result, Future[Image] | None]]:
+    """Results, each with the texture of its sensor where that is another one than the last result's."""
+    last: int | None = None
+    for result in results:
+        if isinstance(result, Outcome):
+            yield result, None
+            continue
+        trajectory, _ = result
+        is_new, last = trajectory.sensor != last, trajectory.sensor
+        yield result, textures.request(trajectory.sensor, trajectory.scene.sensor) if is_new else None
+
+
+def _rendered(
+    session: RenderSession, ready: Iterable[tuple[Result, Future[Image] | None]], textures: Textures
+) -> Generator[Rendered, None, None]:
+    """In this thread: Mitsuba has one variant a process and Dr.Jit one stream a thread."""
+    for result, texture in ready:
+        rendered = result if isinstance(result, Outcome) else session.render_frames(*result, texture)
+        if texture is not None:
+            textures.release()
+        del result, texture  # the texture is the renderer's own now
+        yield rendered
+
+
+def _finisher(context: JobContext) -> Maker[Rendered]:
+    """In a worker process."""
+    return partial(_finished, context)
+
+
+def _finished(context: JobContext, item: Rendered) -> Outcome:
+    return item if isinstance(item, Outcome) else finish(context, item)

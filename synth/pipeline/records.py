@@ -1,0 +1,135 @@
+"""What those who make samples are given, and what they hand on and give back."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from synth.arrays import FloatArray
+from synth.dataset.job import Job
+from synth.dataset.output import Output, mesh_folder
+from synth.dataset.sample import ManifestEntry
+from synth.planning import Plan
+from synth.scene import Scene
+from synth.scene.sampling import Pair, stream
+from synth.simulate import State
+from synth.simulate.shared import Accuracy
+from synth.simulate.space import Space
+
+Task = tuple[int, tuple[int, ...]]
+"""A trajectory and its samples that are wanted."""
+
+
+@dataclass(frozen=True)
+class JobContext:
+    """What every task of a job shares; picklable.
+
+    Attributes:
+        plan: of the scene.
+        job: what the dataset was asked for.
+        out: of the dataset.
+        cache: where meshes are kept beside the dataset.
+    """
+
+    plan: Plan
+    job: Job
+    out: Output
+    cache: Path
+
+    @property
+    def mesh_folders(self) -> tuple[Path, Path] | None:
+        """Where fTetWild's meshes are kept; it is random, so that all must use the same ones. None for other meshes."""
+        return (mesh_folder(self.out), self.cache) if self.plan.mesh.kind == "tetwild" else None
+
+    def stream(self, purpose: str, *numbers: int) -> np.random.Generator:
+        """The job's random stream of one purpose."""
+        return stream(self.plan.template, self.job.seed, purpose, *numbers)
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A random instance that gave no trajectory.
+
+    Attributes:
+        index: of the trajectory's first sample.
+        draw: 0 for the trajectory's first failure, and so on.
+        stage: "sensor", "draw" or "simulate".
+        reason: for the user.
+        last_good_state: of a simulation.
+    """
+
+    index: int
+    draw: int
+    stage: str
+    reason: str
+    last_good_state: dict[str, Any] | None
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a task did: manifest lines of the samples on disk, failed instances, and samples given up."""
+
+    entries: tuple[ManifestEntry, ...]
+    failures: tuple[Failure, ...]
+    given_up: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class FaceState:
+    """What pictures and flow need of a simulated state, at the nodes of the contact face.
+
+    Attributes:
+        displacement: (s, 3) float64 mm.
+        traction: (s, 3) float64 MPa.
+        force_n, torque_nmm: of the indenter on the gel.
+        summary: the state's numbers, for the diagnostics.
+    """
+
+    displacement: FloatArray
+    traction: FloatArray
+    force_n: tuple[float, float, float]
+    torque_nmm: tuple[float, float, float]
+    summary: dict[str, Any]
+
+    @staticmethod
+    def of(state: State, space: Space) -> "FaceState":
+        """The part of a state that lies on the contact face."""
+        displacement = state.displacement[space.surface_nodes]
+        return FaceState(displacement, state.traction, state.force_n, state.torque_nmm, state.summary())
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedTrajectory:
+    """A simulated trajectory, less what no sample shows; picklable.
+
+    Attributes:
+        number: of the trajectory.
+        scene: fully drawn.
+        pairs: the samples that are wanted.
+        states: by number, those that the samples show.
+        mesh: what is said of the mesh: hash and element.
+        edge_radius_mm: of a mesh indenter, else None.
+        accuracy: of the mesh; None where it is left to whoever finishes the samples.
+        failures: instances that failed before.
+        seconds: of the simulation.
+    """
+
+    number: int
+    scene: Scene
+    pairs: tuple[Pair, ...]
+    states: dict[int, FaceState]
+    mesh: dict[str, Any]
+    edge_radius_mm: float | None
+    accuracy: Accuracy | None
+    failures: tuple[Failure, ...]
+    seconds: float
+
+    @property
+    def sensor(self) -> int:
+        """Number of its sensor."""
+        return self.pairs[0].sensor
+
+
+Simulated = tuple[SimulatedTrajectory, Space]
+"""With the space that its states' numbers are nodes of."""

@@ -1,0 +1,127 @@
+"""Radiance of trajectories' frames: one renderer, kept until another sensor is wanted.
+
+Nothing here depends on which other trajectories were rendered before: renderer and undeformed frame are a pure function
+of (scene, seed, sensor), and every frame has a seed of its own.
+"""
+
+import time
+from collections.abc import Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass
+
+from synth.arrays import FloatArray, Image
+from synth.mesh import rest_surface
+from synth.pipeline.records import JobContext, SimulatedTrajectory
+from synth.render.pattern import albedo
+from synth.render.renderer import Renderer
+from synth.scene import Gel, Scene, Sensor
+from synth.simulate.space import Space
+from synth.surface import GelSurface
+
+SUBDIVISIONS = {1: 4, 2: 3}
+"""Parts of a contact face's edge in the rendered surface, by the element's order."""
+FINER_DOME = 2
+"""Factor on that for domes, which are curved away from the contact, too, where faces are large."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A rendered state: vertex positions (v, 3) mm, and radiance by camera ("" is the main one)."""
+
+    positions: FloatArray
+    radiance: dict[str, Image]
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedTrajectory:
+    """A trajectory whose frames are rendered; picklable.
+
+    Attributes:
+        simulated: the trajectory.
+        surface: what was rendered.
+        frames: by number, all that the wanted samples show.
+        seconds: of rendering.
+    """
+
+    simulated: SimulatedTrajectory
+    surface: GelSurface
+    frames: Mapping[int, Frame]
+    seconds: float
+
+
+@dataclass(frozen=True, eq=False)
+class SensorRenderer:
+    """What all trajectories of one sensor share.
+
+    Attributes:
+        sensor: its number.
+        renderer: of all its cameras.
+        rest: radiance of the undeformed gel, by camera; None for a dome, whose triangles are each trajectory's.
+    """
+
+    sensor: int
+    renderer: Renderer
+    rest: dict[str, Image] | None
+
+
+class RenderSession:
+    """Renders trajectories; keeps the last sensor's renderer and the last mesh's surface."""
+
+    def __init__(self, context: JobContext) -> None:
+        """Nothing is loaded before the first frame."""
+        self._context = context
+        self._sensor: SensorRenderer | None = None
+        self._surface: tuple[Space, GelSurface] | None = None
+
+    def render_frames(
+        self, simulated: SimulatedTrajectory, space: Space, texture: Future[Image] | None = None
+    ) -> RenderedTrajectory:
+        """Render the frames of a trajectory that its wanted samples show.
+
+        Args:
+            simulated: the trajectory.
+            space: of its states.
+            texture: its sensor's, where it is being painted already.
+        """
+        started = time.perf_counter()
+        surface = self._surface_of(space, simulated.scene.sensor.gel)
+        sensor = self._prepared(simulated.scene, simulated.sensor, texture)
+        frames: dict[int, Frame] = {}
+        for number, state in sorted(simulated.states.items()):
+            if number == 0 and sensor.rest is not None:
+                frames[0] = Frame(surface.material, sensor.rest)
+                continue
+            positions = surface.positions(state.displacement)
+            sensor.renderer.take(surface)
+            seed = self._seed("frame", simulated.number, number)
+            frames[number] = Frame(positions, sensor.renderer.radiances(positions, seed))
+        return RenderedTrajectory(simulated, surface, frames, time.perf_counter() - started)
+
+    def _surface_of(self, space: Space, gel: Gel) -> GelSurface:
+        """The surface that is rendered for a mesh."""
+        if self._surface is None or self._surface[0] is not space:
+            parts = SUBDIVISIONS[space.element.order] * (FINER_DOME if gel.dome_radius_mm else 1)
+            self._surface = space, GelSurface(space.surface, parts)
+        return self._surface[1]
+
+    def _prepared(self, scene: Scene, number: int, texture: Future[Image] | None) -> SensorRenderer:
+        """Renderer and undeformed frame of a sensor, kept until another one is wanted."""
+        if self._sensor is None or self._sensor.sensor != number:
+            variant = self._context.plan.variant
+            variant.load()
+            surface = rest_surface(scene.sensor.gel)
+            painted = paint(self._context, number, scene.sensor) if texture is None else texture.result()
+            renderer = Renderer(scene.sensor, scene.render, surface, painted, variant)
+            rest = None
+            if scene.sensor.gel.dome_radius_mm is None:
+                rest = renderer.radiances(surface.material, self._seed("rest", number))
+            self._sensor = SensorRenderer(number, renderer, rest)
+        return self._sensor
+
+    def _seed(self, purpose: str, *numbers: int) -> int:
+        return int(self._context.stream(f"render {purpose}", *numbers).integers(2**31))
+
+
+def paint(context: JobContext, number: int, sensor: Sensor) -> Image:
+    """The texture of a sensor, by its number."""
+    return albedo(sensor, context.stream("pattern", number), context.plan.template.folder)

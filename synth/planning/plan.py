@@ -1,0 +1,85 @@
+"""What a scene needs, decided once; what comes later is handed the plan and asks nothing again."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from synth.planning.check import check_buildable
+from synth.planning.decision import Decision, decisions
+from synth.render.pattern import is_grey
+from synth.render.variant import Device, Variant, choose_variant
+from synth.scene import Scene
+from synth.scene.template import Template
+from synth.simulate.mesh_rule import MeshRule
+from synth.simulate.press import Press
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What runs, for all samples of a scene; picklable.
+
+    Attributes:
+        template: the scene with its distributions; `template.outputs` and `template.sampling` are the same for all.
+        variant: that renders.
+        is_batched: whether trajectories are simulated many at once, on one mesh for all of a pad.
+        mesh: how the meshes of the trajectories are chosen.
+        decisions: feature by feature, with reasons; light and lens among them are each sensor's own.
+    """
+
+    template: Template
+    variant: Variant
+    is_batched: bool
+    mesh: MeshRule
+    decisions: tuple[Decision, ...]
+
+    @property
+    def solver_device(self) -> Literal["cuda", "cpu"]:
+        """Where the batched solver runs: beside the renderer."""
+        return "cuda" if self.variant.is_on_gpu else "cpu"
+
+    def press(self, scene: Scene, mesh_folders: Sequence[Path] | None) -> Press:
+        """What is simulated of one random instance of the scene.
+
+        Args:
+            scene: fully drawn.
+            mesh_folders: where fTetWild's meshes are kept.
+
+        Raises:
+            InputError: the indenter or the mesh cannot be built.
+        """
+        return self.mesh.press(scene, self.template.folder, mesh_folders)
+
+    def record(self) -> dict[str, Any]:
+        """JSON-able."""
+        named = {"scene": self.template.name, "variant": self.variant.name}
+        return {**named, "decisions": [vars(decision) for decision in self.decisions]}
+
+
+def plan(template: Template, variant: Variant | None = None) -> Plan:
+    """Decide what runs.
+
+    Args:
+        template: the scene.
+        variant: that renders; default the fastest here that the scene needs.
+
+    Raises:
+        InputError: what the scene asks for cannot be built, see `check_buildable`.
+    """
+    variant = variant or job_variant(template, "auto")
+    check_buildable(template, variant)
+    is_batched = template.numerics.solver == "batched"
+    found = decisions(template, variant, is_batched)
+    return Plan(template, variant, is_batched, MeshRule.of(template.numerics), found)
+
+
+def job_variant(template: Template, device: Device) -> Variant:
+    """What renders a job: one channel where every draw of it is grey.
+
+    Raises:
+        InputError: the device is not there.
+    """
+    # Corners that are grey say nothing of the draws between them where a single channel is drawn.
+    drawn = any(re.search(r"\.(color|reflectance)\[\d\]$|\.saturation$", at) for _, _, at in template.distributions())
+    return choose_variant(device, grey=not drawn and all(is_grey(scene.sensor) for scene in template.corners))

@@ -1,0 +1,169 @@
+"""What a plan will cost, and how exact its simulation will be: predicted from the meshes of some random instances.
+
+The costs are predictions from constants measured on one core of a 2-core x86-64 server; other machines differ by a
+factor of two or three either way. Errors are predictions of `synth.simulate.resolution`. Choosing the meshes takes
+seconds, so that `generate`, which needs none of this, does not ask for it.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from synth.errors import InputError
+from synth.planning.plan import Plan
+from synth.scene import MeshIndenter, Scene
+from synth.scene.sampling import draw
+from synth.simulate.path import TWIST_ARM_MM
+from synth.simulate.press import edge_radius_mm
+from synth.simulate.resolution import Resolution
+
+INSTANCES = 12
+"""Trajectories whose meshes are chosen to predict error and time."""
+NODES_PER_VOLUME, NODES_PER_AREA, FEWEST_NODES = 0.72, 0.25, 300
+"""Mesh vertices per cube and per square of the contact face's edge length, for fTetWild's meshes."""
+VERTICES_TO_P2 = 7.0
+"""Displacement nodes of P2 elements per vertex of the mesh."""
+SOLVE_SECONDS = 0.06
+"""One Newton iteration (assembly, factorisation, solution) without friction, with SOLVE_NODES displacement nodes; from
+24 pairs of `gelsight_mini`, 2.36 s a pair on one core."""
+SOLVE_NODES = 5000
+SOLVE_GROWTH = 1.25
+"""Exponent of a solve's time in the nodes, fitted to 2,079 to 9,044 of them."""
+FRICTION = 1.5
+"""Time of an iteration with friction over one without."""
+ITERATIONS_PER_STEP, ITERATIONS_PER_RECORD = 4.5, 7.0
+MESH_INDENTER = 7.0
+"""Time of a press by a mesh indenter over a ball's: its edges take more iterations (docs/reports/objects.md)."""
+BATCHED_SECONDS = {"cuda": 5.5e-5, "cpu": 0.8}
+"""One Newton iteration of one trajectory by the batched solver, with BATCHED_NODES displacement nodes; on a GPU among
+hundreds of trajectories (docs/reports/h200.md)."""
+BATCHED_NODES = 3500
+BATCHED_GROWTH = 1.6
+"""Exponent of that in the number of nodes: the preconditioner is a dense matrix, the rest is linear."""
+AUTO_SAMPLES = 64
+"""What samples_per_pixel = "auto" counts for, before a sensor has been measured."""
+SECONDS_PER_MILLION_SAMPLES = {"llvm": 0.4, "scalar": 1.0, "cuda": 0.002}
+"""Path-traced camera samples of one frame."""
+FLOW_SECONDS_PER_MEGAPIXEL = 1.0
+BYTES_PER_PIXEL_OF_FLOW = 14.0
+BYTES_PER_PIXEL_OF_IMAGE = 1.4
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Predictions for one plan.
+
+    Attributes:
+        resolution: how fine the meshes are, in words.
+        error_px: error of the flow from the simulation: median and largest of INSTANCES trajectories; None where the
+            mesh is given by an edge length, for which nothing is predicted.
+        target_error_px: what was asked for; None with an edge length.
+        nodes: displacement nodes, mean of the trajectories.
+        seconds_per_pair: by stage, on one core.
+        bytes_per_pair: size on disk.
+    """
+
+    resolution: str
+    error_px: tuple[float, float] | None
+    target_error_px: float | None
+    nodes: int
+    seconds_per_pair: dict[str, float]
+    bytes_per_pair: int
+
+    def record(self) -> dict[str, Any]:
+        """JSON-able."""
+        return {**vars(self), "error_px": None if self.error_px is None else list(self.error_px)}
+
+
+def predict(plan: Plan) -> Prediction:
+    """Choose the meshes of the first trajectories, as `generate` will, and predict from them.
+
+    Raises:
+        InputError: no trajectory can be drawn and meshed.
+    """
+    template, variant, pairs = plan.template, plan.variant, plan.template.sampling.pairs_per_trajectory
+    scene = template.corners[0]
+    cameras = [view.camera for view in scene.sensor.views.values()]
+    meshes = _tetwild_meshes(plan) if plan.mesh.kind == "tetwild" else _meshes(plan)
+    simulate = float(np.mean([_simulation_seconds(drawn, nodes, plan) for drawn, nodes in meshes.presses]))
+    pixels = sum(camera.width * camera.height for camera in cameras)
+    samples = AUTO_SAMPLES if scene.render.samples_per_pixel == "auto" else scene.render.samples_per_pixel
+    frame = pixels * samples / 1e6 * SECONDS_PER_MILLION_SAMPLES[variant.name.split("_")[0]]
+    directions = 2 if plan.template.outputs.backward else 1
+    return Prediction(
+        resolution=meshes.resolution,
+        error_px=meshes.error_px,
+        target_error_px=None if meshes.error_px is None else plan.mesh.target_error_px,
+        nodes=round(float(np.mean([nodes for _, nodes in meshes.presses]))),
+        seconds_per_pair={
+            "simulate": round(simulate / pairs, 3),
+            "render": round(frame * (1 + 1 / pairs), 3),
+            "flow": round(directions * pixels / 1e6 * FLOW_SECONDS_PER_MEGAPIXEL, 3),
+        },
+        bytes_per_pair=round(pixels * (BYTES_PER_PIXEL_OF_FLOW * directions / 2 + 2 * BYTES_PER_PIXEL_OF_IMAGE)),
+    )
+
+
+@dataclass(frozen=True)
+class _Meshes:
+    """Some random instances with their displacement nodes, and what Prediction says of their meshes."""
+
+    presses: tuple[tuple[Scene, int], ...]
+    resolution: str
+    error_px: tuple[float, float] | None
+
+
+def _meshes(plan: Plan) -> _Meshes:
+    """Of the first INSTANCES trajectories."""
+    template, found = plan.template, list[tuple[Scene, Resolution]]()
+    for trajectory in range(INSTANCES):
+        try:
+            drawn = draw(template, 0, trajectory)
+            found.append((drawn, plan.mesh.resolution(drawn, template.folder)))
+        except InputError:  # an impossible draw: generate redraws it
+            continue
+    if not found:
+        raise InputError(f"{template.label}: none of {INSTANCES} draws is possible; try `simulate` to see why")
+    across = [resolution.across for _, resolution in found]
+    errors = [resolution.error_px for _, resolution in found]
+    spacings = [resolution.spacing_mm for _, resolution in found]
+    text = f"{min(across)} to {max(across)} elements across the contact, {min(spacings):.2g} to {max(spacings):.2g} mm"
+    if plan.mesh.kind == "even":
+        text = " x ".join(map(str, template.numerics.cells)) + f" elements for all draws of a pad, {text}"
+    radii = [edge_radius_mm(drawn, resolution.mesh) for drawn, resolution in found]
+    rounded = [radius for radius in radii if radius is not None]
+    if rounded:
+        text += f", edges of objects rounded to {min(rounded):.2g} to {max(rounded):.2g} mm"
+    presses = tuple((drawn, round(_order(drawn) * len(resolution.mesh.points))) for drawn, resolution in found)
+    return _Meshes(presses, text, (float(np.median(errors)), max(errors)))
+
+
+def _tetwild_meshes(plan: Plan) -> _Meshes:
+    """Of the corners, without meshing; fTetWild takes long."""
+    edge_mm, first = plan.template.numerics.edge_length_mm or 1.0, plan.template.corners[0]
+    x, y, z = (length / edge_mm for length in first.sensor.gel.size_mm)
+    vertices = NODES_PER_VOLUME * x * y * z + NODES_PER_AREA * 2 * (x * y + y * z + z * x)
+    nodes = max(FEWEST_NODES, round(_order(first) * vertices))
+    text = f"fTetWild meshes with edges of {edge_mm:g} mm at the contact face"
+    return _Meshes(tuple((corner, nodes) for corner in plan.template.corners), text, None)
+
+
+def _order(scene: Scene) -> float:
+    """Displacement nodes per vertex of the mesh."""
+    return 1 if scene.numerics.element == "p1p1" else VERTICES_TO_P2
+
+
+def _simulation_seconds(scene: Scene, nodes: int, plan: Plan) -> float:
+    motion = scene.motion
+    if motion.depth_mm <= 0 and not motion.then:
+        return 0.0
+    drag = abs(motion.shear_mm[0]) + abs(motion.shear_mm[1]) + abs(motion.twist_deg) * 0.01745 * TWIST_ARM_MM
+    steps = max((motion.depth_mm + drag) / scene.numerics.max_step_mm, motion.steps)
+    iterations = ITERATIONS_PER_STEP * steps + ITERATIONS_PER_RECORD * motion.steps
+    if isinstance(scene.contact.indenter, MeshIndenter):
+        iterations *= MESH_INDENTER
+    if plan.is_batched:
+        return iterations * BATCHED_SECONDS[plan.solver_device] * (nodes / BATCHED_NODES) ** BATCHED_GROWTH
+    friction = FRICTION if scene.contact.friction > 0 else 1.0
+    return iterations * SOLVE_SECONDS * friction * (nodes / SOLVE_NODES) ** SOLVE_GROWTH

@@ -1,0 +1,107 @@
+"""The schema of a scene: one sensor, one contact, one motion, every number fixed.
+
+A scene file may hold distributions in place of numbers (`synth.scene.template`); drawing from them
+(`synth.scene.sampling`) gives a `Scene` of this schema. Lengths are mm, angles degrees, stiffness kPa, image quantities
+px; the unit is in the field's name. Frame: origin at the centre of the undeformed contact surface, +z from there
+through the gel toward the camera, +x right and +y down in the image (a left-handed triple, see docs/decisions.md).
+"""
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from synth.scene.indenter import Indenter
+from synth.scene.motion import Motion
+from synth.scene.numerics import Numerics, Render
+from synth.scene.part import Part
+from synth.scene.sensor import Sensor
+
+
+class Contact(Part):
+    """A rigid indenter and Coulomb friction."""
+
+    indenter: Indenter
+    friction: Annotated[float, Field(ge=0, le=10)] = 0.5
+
+
+class Outputs(Part):
+    """Optional channels of flow.exr."""
+
+    backward: bool = True
+    depth: bool = False
+    normal: bool = False
+    displacement: bool = False
+    traction: bool = False
+    contact: bool = False
+
+
+class Sampling(Part):
+    """How draws are shared: samples of one trajectory, trajectories of one sensor."""
+
+    pairs_per_trajectory: Annotated[int, Field(ge=1, le=1000)] = 2
+    trajectories_per_sensor: Annotated[int, Field(ge=1, le=100000)] = 2
+
+
+class Scene(Part):
+    """One fully determined scene."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_\-]+$")]
+    description: str = ""
+    references: tuple[str, ...] = ()
+    sensor: Sensor
+    contact: Contact
+    motion: Motion
+    render: Render = Render()
+    numerics: Numerics = Numerics()
+    outputs: Outputs = Outputs()
+    sampling: Sampling = Sampling()
+
+    @model_validator(mode="after")
+    def _plausible(self) -> "Scene":
+        size, motion = self.sensor.gel.size_mm, self.motion
+        deepest = 0.85 * (size[2] - self.sensor.gel.face_mm(*motion.position_mm))
+        if motion.depth_mm < -50:
+            raise ValueError(f"motion.depth_mm = {motion.depth_mm} leaves the indenter farther than 50 mm off the gel")
+        for axis, x, half in zip("xy", motion.position_mm, (size[0] / 2, size[1] / 2), strict=True):
+            if abs(x) > half:
+                raise ValueError(
+                    f"motion.position_mm {axis} = {x} puts the indenter beside the pad (|{axis}| <= {half})"
+                )
+        for name, pose in motion.poses.items():
+            if pose.depth_mm > deepest:
+                raise ValueError(
+                    f"{name}.depth_mm = {pose.depth_mm} is more than 85 % of the gel's thickness ({size[2]} mm); "
+                    f"at most {deepest:.3g}"
+                )
+            for axis, s, side in zip("xy", pose.shear_mm, size[:2], strict=True):
+                if abs(s) > side:
+                    raise ValueError(f"{name}.shear_mm {axis} = {s} is longer than the pad ({side} mm): check its unit")
+        if motion.then and motion.steps < motion.moves:
+            raise ValueError(
+                f"motion.steps = {motion.steps} cannot record every pose of motion.then: there are {motion.moves} "
+                f"moves, press and shear among them, and each needs a step; at least {motion.moves}"
+            )
+        if self.numerics.edge_length_mm is not None and self.sensor.gel.layers:
+            raise ValueError(
+                "numerics.edge_length_mm: fTetWild's meshes have no layers; leave it out for a layered gel"
+            )
+        edge = self.numerics.edge_length_mm
+        if edge is not None and not min(size) / 60 <= edge <= min(size):
+            raise ValueError(
+                f"numerics.edge_length_mm = {edge} must lie between {min(size) / 60:.3g} and {min(size)} for this pad"
+            )
+        return self
+
+    @property
+    def warnings(self) -> list[str]:
+        """What is possible but unusual."""
+        found = []
+        x, y, thickness = self.sensor.gel.size_mm
+        for name, pose in self.motion.poses.items():
+            given = f"{name}.shear_mm = {list(pose.shear_mm)}"
+            if max(map(abs, pose.shear_mm)) > 2 * thickness:
+                found.append(f"{given} is more than twice the gel's thickness ({thickness} mm)")
+            ends = zip(self.motion.position_mm, pose.shear_mm, (x / 2, y / 2), strict=True)
+            if any(abs(start + s) > half for start, s, half in ends):
+                found.append(f"{given} takes the indenter's centre off the pad")
+        return found

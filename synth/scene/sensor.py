@@ -1,0 +1,109 @@
+"""The part of a scene's schema that is the sensor: window, coating and lights around gel, pattern and cameras."""
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from synth.scene.camera import Camera, FurtherCamera, Mirror
+from synth.scene.gel import Gel
+from synth.scene.part import Color, Fraction, NonNegative, Part, Positive, Vector3
+from synth.scene.pattern import Pattern
+
+
+class Window(Part):
+    """Rigid clear support between gel and camera, index-matched to the gel; flat, from z = gel thickness on.
+
+    Its outer face refracts; light that it reflects back into the body is left out.
+    """
+
+    refractive_index: Annotated[float, Field(ge=1, le=2.5)] = 1.45
+    thickness_mm: Annotated[float, Field(ge=0, le=100)] = 5.0
+
+
+class Coating(Part):
+    """Opaque layer that carries the pattern. roughness 1 and metallic 0 is Lambertian, else Disney principled."""
+
+    reflectance: Color = (0.6, 0.6, 0.6)
+    roughness: Annotated[float, Field(ge=0.05, le=1)] = 1.0
+    metallic: Fraction = 0.0
+
+    @property
+    def is_matt(self) -> bool:
+        """Whether it is Lambertian."""
+        return self.roughness == 1 and self.metallic == 0
+
+
+class Light(Part):
+    """A rectangular LED inside the index-matched body, radiating as a Lambertian area toward aim_mm.
+
+    Lights are real obstacles: they must stay out of the camera's view, and one may shade another.
+    """
+
+    position_mm: Vector3
+    aim_mm: Vector3 = (0.0, 0.0, 0.0)
+    size_mm: tuple[Positive, Positive]
+    """Along the contact face, and at right angles to that and to the aim."""
+    color: Color
+    power: NonNegative
+    """Radiant power, in units in which exposure 1 maps a radiance of 1 to full scale."""
+
+
+class Sensor(Part):
+    """Everything that belongs to the finger."""
+
+    gel: Gel
+    window: Window = Window()
+    coating: Coating = Coating()
+    pattern: Pattern
+    lights: tuple[Light, ...] = Field(min_length=1)
+    camera: Camera
+    further_cameras: tuple[FurtherCamera, ...] = ()
+    mirrors: tuple[Mirror, ...] = ()
+    """Between cameras and window. They take no part in the lighting: a mirror neither shades nor lights the gel."""
+
+    @property
+    def views(self) -> dict[str, "Sensor"]:
+        """The sensor as each camera sees it: the main camera's under "", the others' by their names."""
+        others = {camera.name: self.model_copy(update={"camera": camera}) for camera in self.further_cameras}
+        return {"": self, **others}
+
+    @model_validator(mode="after")
+    def _arranged(self) -> "Sensor":
+        thickness = self.gel.size_mm[2]
+        outside = thickness + self.window.thickness_mm
+        cameras: dict[str, Camera] = {"camera": self.camera}
+        cameras.update({f"further_cameras[{i}]": camera for i, camera in enumerate(self.further_cameras)})
+        for where, camera in cameras.items():
+            if camera.position_mm[2] <= outside:
+                raise ValueError(
+                    f"{where}.position_mm z = {camera.position_mm[2]} lies inside the sensor; "
+                    f"it must be beyond the window, z > {outside} (gel {thickness} + window {self.window.thickness_mm})"
+                )
+            if camera.lowest_mm <= outside:
+                raise ValueError(
+                    f"{where}.aperture_mm = {camera.aperture_mm}: the tilted pupil reaches down to z = "
+                    f"{camera.lowest_mm:.4g}, into the window; it must stay above z = {outside}"
+                )
+            if camera.look_at_mm[2] >= camera.position_mm[2] and not self.mirrors:
+                raise ValueError(
+                    f"{where}.look_at_mm must lie on the gel's side of the camera (smaller z); only a mirror could "
+                    "turn its view back"
+                )
+        names = [camera.name for camera in self.further_cameras]
+        if len(set(names)) < len(names):
+            raise ValueError(f"further_cameras: names must differ, they are {', '.join(names)}")
+        for i, mirror in enumerate(self.mirrors):
+            if mirror.lowest_mm <= outside:
+                raise ValueError(
+                    f"mirrors[{i}] reaches down to z = {mirror.lowest_mm:.4g}; mirrors stand in air, beyond the "
+                    f"window: z > {outside}"
+                )
+        for i, light in enumerate(self.lights):
+            if not 0 < light.position_mm[2] < outside:
+                raise ValueError(
+                    f"lights[{i}].position_mm z = {light.position_mm[2]} must lie inside the gel and window, "
+                    f"0 < z < {outside}"
+                )
+            if light.position_mm[2] <= self.gel.face_mm(*light.position_mm[:2]):
+                raise ValueError(f"lights[{i}].position_mm lies outside the domed gel")
+        return self

@@ -1,0 +1,73 @@
+"""How the meshes of a scene's trajectories are chosen: the rule is decided here, once, from the scene's numerics."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+from typing import Literal
+
+from synth.mesh import pad_mesh
+from synth.scene import Numerics, Scene
+from synth.simulate.press import Press
+from synth.simulate.resolution import Resolution, resolve
+from synth.simulate.shared import Accuracy, accuracy, shared_mesh, spacing_mm
+
+DEFAULT_TARGET_PX = 0.5
+
+
+@dataclass(frozen=True)
+class MeshRule:
+    """See the module's docstring.
+
+    Attributes:
+        kind: "graded": around each contact, as fine as the target asks for; "even": `numerics.cells`, the same for all
+            trajectories of a pad; "tetwild": `numerics.edge_length_mm`, also the same for all.
+        target_error_px: root-mean-square error of the flow that the simulation may leave; NaN for "tetwild", for which
+            nothing is predicted.
+    """
+
+    kind: Literal["graded", "even", "tetwild"]
+    target_error_px: float
+
+    @classmethod
+    def of(cls, numerics: Numerics) -> "MeshRule":
+        """The rule of a scene."""
+        if numerics.edge_length_mm is not None:
+            return cls("tetwild", float("nan"))
+        return cls("even" if numerics.solver == "batched" else "graded", numerics.target_error_px or DEFAULT_TARGET_PX)
+
+    def resolution(
+        self, scene: Scene, folder: FilePath | None = None, mesh_folders: Sequence[FilePath] | None = None
+    ) -> Resolution:
+        """The mesh of a scene, and what it is predicted to give.
+
+        Args:
+            scene: fully drawn.
+            folder: what a mesh indenter's file name is relative to.
+            mesh_folders: where fTetWild's meshes are kept.
+
+        Raises:
+            InputError: the indenter or the mesh cannot be built.
+        """
+        gel, numerics = scene.sensor.gel, scene.numerics
+        match self.kind:
+            case "graded":
+                return resolve(scene, folder, self.target_error_px)
+            case "even":
+                found = accuracy(scene, folder)
+                mesh, spacing = shared_mesh(gel, numerics), spacing_mm(gel, numerics)
+                return Resolution(mesh, found.across, numerics.cells[2], spacing, found.error_px)
+            case "tetwild":
+                mesh = pad_mesh(gel, numerics, mesh_folders)
+                return Resolution(mesh, 0, 0, numerics.edge_length_mm or 0.0, float("nan"))
+
+    def press(
+        self, scene: Scene, folder: FilePath | None = None, mesh_folders: Sequence[FilePath] | None = None
+    ) -> Press:
+        """Mesh, body and load path of a scene; arguments and errors as of `resolution`.
+
+        The accuracy of a shared mesh is left out: whoever finishes the samples predicts it, beside the simulation.
+        """
+        if self.kind == "graded":
+            found = self.resolution(scene, folder)
+            return Press.of(scene, found.mesh, folder, Accuracy.of(found))
+        return Press.of(scene, shared_mesh(scene.sensor.gel, scene.numerics, mesh_folders), folder)
