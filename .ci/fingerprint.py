@@ -93,8 +93,8 @@ def measured(folder: Path) -> dict[str, Any]:
     found["trajectory"] = hashlib.sha256(json.dumps(steps).encode()).hexdigest()[:16]
     out = folder / "trained"
     found["seconds"]["train"] = run(
-        "-m", "gelflow", "train", folder / "resumed", "--validation", folder / "resumed", "--config",
-        ROOT / "docs/short_run.toml", "--steps", 4, "--set", "warmup_steps=1", "--set", "crop_size=[64, 64]", "--out", out,
+        "-m", "gelflow", "train", folder / "resumed", "--validation", folder / "resumed", "--out", out, "--steps", 4,
+        "--config", ROOT / "docs/short_run.toml", "--set", "warmup_steps=1", "--set", "crop_size=[64, 64]",
     )  # fmt: skip
     found["weights"] = hashes(out, "weights.safetensors")
     return found

@@ -27,8 +27,9 @@ from synth.errors import InputError
 from synth.flow.exact import exact_flow
 from synth.mesh import PadMesh
 from synth.optics import Optics
-from synth.scene.sampling import draw, pairs_of
 from synth.scene import Scene
+from synth.scene.sampling import draw, pairs_of
+from synth.scene.template import Template, load_scene
 from synth.simulate import Trajectory
 from synth.simulate.batched.gemm import Host
 from synth.simulate.batched.many import DRIVER, job_of, run_jobs
@@ -37,7 +38,6 @@ from synth.simulate.driver import Driver
 from synth.simulate.shared import shared_mesh
 from synth.simulate.solve import check_shared
 from synth.surface import GelSurface
-from synth.scene.template import Template, load_scene
 
 WANTED = 1e-6
 """Relative distance of displacements that two devices may have."""

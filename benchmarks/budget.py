@@ -35,15 +35,16 @@ from synth.mesh import Counts, Focus, PadMesh, domed, face_height, graded_box
 from synth.optics import Optics
 from synth.optics.camera import Paths
 from synth.planning.prediction import SOLVE_GROWTH
-from synth.scene.sampling import MAX_DRAWS, draw, draw_sensor, pairs_of, sensor_of
 from synth.scene import Gel, Scene
+from synth.scene.sampling import MAX_DRAWS, draw, draw_sensor, pairs_of, sensor_of
+from synth.scene.template import Template, load_scene, shipped_scenes
 from synth.simulate import Trajectory, simulate
 from synth.simulate.driver import Driver
 from synth.simulate.footprint import footprint
+from synth.simulate.mesh_rule import MeshRule
 from synth.simulate.newton import MAX_ITERATIONS
 from synth.simulate.path import path_of
 from synth.simulate.resolution import (
-    DEFAULT_TARGET_PX,
     LADDER,
     MARGIN,
     STEEPEST_DEPTH,
@@ -53,9 +54,7 @@ from synth.simulate.resolution import (
     ladder,
     lateral_spacing,
     predicted_error_px,
-    resolve,
 )
-from synth.scene.template import Template, load_scene, shipped_scenes
 
 FINER, BESIDE, STEP_MM = 2.4, (4, 3), 0.125
 """Of the reference: how many times smaller its elements are, elements beside the contact, longest load step."""
@@ -112,7 +111,7 @@ def drawn(template: Template, seed: int, index: int) -> Scene:
     for attempt in range(MAX_DRAWS):
         try:
             scene = draw(template, seed, index, attempt, sensor)
-            resolve(scene, template.source.parent)
+            MeshRule.of(scene.numerics).resolution(scene, template.source.parent)
         except InputError as error:
             refused = str(error)
         else:
@@ -163,7 +162,8 @@ def press_draw(case: Row, assignments: list[str], most: int, tried: tuple[int, .
     pairs = pairs_of(template, case["seed"], case["draw"], scene.motion.steps)
     frames = frozenset(frame for pair in pairs for frame in pair.frames)
     shown, points = sorted(frames - {0}), places(scene)
-    chosen = resolve(scene, folder)
+    rule = MeshRule.of(scene.numerics)
+    chosen = rule.resolution(scene, folder)
     mesh, finest, fine = reference_mesh(gel, zone, chosen.spacing_mm, most)
     step = min(STEP_MM, scene.numerics.max_step_mm)
     closer = scene.model_copy(update={"numerics": scene.numerics.model_copy(update={"max_step_mm": step})})
@@ -171,7 +171,7 @@ def press_draw(case: Row, assignments: list[str], most: int, tried: tuple[int, .
     about: dict[str, Any] = {
         "indenter": scene.contact.indenter.shape,
         "depth_mm": round(scene.motion.depth_mm, 3),
-        "target_px": scene.numerics.target_error_px or DEFAULT_TARGET_PX,
+        "target_px": rule.target_error_px,
     }
     own = Fineness(chosen.across, chosen.through)
     meshes = [each for each in ladder(gel, zone, tried) if each.across < finest]

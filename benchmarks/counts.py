@@ -11,9 +11,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from benchmarks.rows import Row, show
-from gelflow.comparison import read_comparison
+from gelflow.compare.comparison import read_comparison
+from gelflow.compare.scores import PairScore, summarise
 from gelflow.errors import InputError
-from gelflow.evaluate import PairScore, summarise
 
 BETTER = {"PSNR": "psnr_db", "SSIM": "ssim", "mean px": "endpoint_error_px", "median px": "median_error_px"}
 

@@ -19,7 +19,7 @@ from benchmarks.rows import Row, arguments, machine, measure, plot, show
 from gelflow.baselines.registry import named_methods
 from synth.arrays import Image
 from synth.cli_options import DEFAULT_SCENE
-from synth.pipeline.generate import job_variant
+from synth.planning import job_variant
 from synth.render.renderer import Renderer, full_grid
 from synth.render.variant import Variant
 from synth.scene import Render

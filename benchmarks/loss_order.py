@@ -14,12 +14,12 @@ import torch
 from torch import Tensor
 
 from benchmarks.rows import Row, show
-from gelflow.commands import open_all
 from gelflow.config import LossConfig
+from gelflow.config.sources import train_config
 from gelflow.data import PairDataset
+from gelflow.data.open import open_all
 from gelflow.losses import self_supervised_loss
 from gelflow.ops.pyramid import enlarge_flow, flow_pyramid
-from gelflow.overrides import train_config
 
 FACTORS = (0.0, 0.9, 1.1)
 MAX_ITERATIONS, TOLERANCE = 60, 1e-10

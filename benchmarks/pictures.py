@@ -41,11 +41,11 @@ def bare_gel(folder: Path, pairs: list[int], out: Path) -> None:
 
     from gelflow.baselines.learned import open_network
     from gelflow.baselines.registry import named_methods
-    from gelflow.commands import open_all
+    from gelflow.data.open import open_all
     from gelflow.errors import InputError
     from gelflow.files.image import to_bytes
-    from gelflow.shipped import weights_file
-    from gelflow.viz import flow_to_colour
+    from gelflow.models.weights import weights_file
+    from gelflow.predict.pictures import flow_to_colour
 
     dataset = open_all([folder])
     methods = [open_network(weights_file(None), device="cpu"), *named_methods(["farneback"])]

@@ -4,17 +4,17 @@ from dataclasses import dataclass
 
 from synth.arrays import Image, Points
 from synth.errors import InputError
-from synth.produce import FINER_DOME, SUBDIVISIONS
+from synth.pipeline.render_session import FINER_DOME, SUBDIVISIONS
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
 from synth.render.variant import Variant
-from synth.scene.sampling import MAX_DRAWS, draw, stream
 from synth.scene import Render, Scene, Sensor
+from synth.scene.sampling import MAX_DRAWS, draw, stream
+from synth.scene.template import Template
 from synth.scene.validation import validated
 from synth.simulate import simulate
-from synth.simulate.resolution import resolve
+from synth.simulate.mesh_rule import MeshRule
 from synth.surface import GelSurface
-from synth.scene.template import Template
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +70,8 @@ def press(template: Template, seed: int) -> Press:
     for attempt in range(MAX_DRAWS):
         try:
             scene = draw(template, seed, 0, attempt)
-            result = simulate(scene, resolve(scene, folder).mesh, folder, frames=frozenset({0, scene.motion.steps}))
+            mesh = MeshRule.of(scene.numerics).resolution(scene, folder).mesh
+            result = simulate(scene, mesh, folder, frames=frozenset({0, scene.motion.steps}))
         except InputError as error:
             reason = str(error)
             continue

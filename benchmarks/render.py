@@ -22,14 +22,14 @@ from benchmarks.rows import Row, arguments, machine, measure, plot, show
 from gelflow.baselines.registry import named_methods
 from synth.cli_options import DEFAULT_SCENE
 from synth.errors import InputError
-from synth.pipeline.generate import job_variant
 from synth.mesh import rest_surface
+from synth.planning import job_variant
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer, full_grid
 from synth.render.sample_count import render_noise
 from synth.render.variant import Device, Variant, choose_variant, cpu_variant, llvm_version
-from synth.scene.sampling import draw, stream
 from synth.scene import Render
+from synth.scene.sampling import draw, stream
 from synth.scene.template import Template, load_scene
 
 SAMPLES = (1, 4, 16, 36, 64, 144, 256, 576, 1024)

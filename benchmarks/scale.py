@@ -18,8 +18,10 @@ from benchmarks.rows import Row, arguments, machine, measure, plot, show
 from synth.cli_options import DEFAULT_SCENE
 from synth.dataset.joining import MANIFEST_FILE
 from synth.errors import InputError
-from synth.pipeline.generate import Scheduling, generate, job_variant
-from synth.processes import cores
+from synth.pipeline.generate import Scheduling, generate
+from synth.pipeline.threads import cores
+from synth.planning import job_variant
+from synth.render.variant import Device
 from synth.scene.template import Template, load_scene
 
 JOBS = (5_000, 500_000, 50_000_000)
@@ -43,7 +45,7 @@ def at_size(scene: str, assignments: Sequence[str], width: int, height: int) -> 
     return load_scene(scene, [*changes, *(f"sensor.camera.{name}={value:.6f}" for name, value in changed.items())])
 
 
-def run(template: Template, n: int, workers: int | None, device: str, seed: int, folder: Path) -> Row:
+def run(template: Template, n: int, workers: int | None, device: Device, seed: int, folder: Path) -> Row:
     """Make 2 n pairs in an empty folder, and say how long they took."""
     warm = (workers or 1) * template.corners[0].sampling.pairs_per_trajectory
     times: dict[int, float] = {}
@@ -52,7 +54,7 @@ def run(template: Template, n: int, workers: int | None, device: str, seed: int,
     def note(done: int, _: int) -> None:
         times[done] = time.perf_counter() - started
 
-    variant = job_variant(template, device)  # type: ignore[arg-type]  # one of argparse's choices
+    variant = job_variant(template, device)
     generate(template, warm + 2 * n, folder, seed, variant, Scheduling(workers), note)
     files = [file for file in folder.rglob("*") if file.is_file() and file.parent.name != "meshes"]
     entries = [json.loads(line) for line in (folder / MANIFEST_FILE).read_bytes().splitlines()]

@@ -13,12 +13,11 @@ import warp as wp
 from benchmarks.__main__ import main
 from benchmarks.agreement import WANTED, Noisy, compare, drawn_of, one_by_one, summary, together
 from benchmarks.rows import Row, read
-from synth.scene import Scene
-from synth.scene import MeshIndenter
+from synth.scene import MeshIndenter, Scene
+from synth.scene.template import load_scene
 from synth.simulate import Trajectory
 from synth.simulate.batched.many import DRIVER
 from synth.simulate.batched.pad import prepare
-from synth.scene.template import load_scene
 
 TINY = ["numerics.element=p1p1", "sensor.camera.width=32", "sensor.camera.height=24", "motion.steps=2"]
 

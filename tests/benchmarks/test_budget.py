@@ -22,11 +22,11 @@ from benchmarks.press import face_displacement
 from benchmarks.rows import Row, read
 from synth.errors import InputError
 from synth.scene.sampling import draw, pairs_of
+from synth.scene.template import load_scene
 from synth.simulate import simulate
 from synth.simulate.footprint import footprint
 from synth.simulate.path import path_of
 from synth.simulate.resolution import MARGIN, graded_mesh, resolve, scale_px_per_mm
-from synth.scene.template import load_scene
 
 TINY = """
 name = "tiny"
