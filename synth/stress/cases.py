@@ -78,7 +78,6 @@ class Expectations(Part):
 
     elements: tuple[str, ...] = Field(min_length=1)
     budget_s: Annotated[float, Field(gt=0)]
-    not_covered: tuple[str, ...]
     case: tuple[Case, ...] = Field(min_length=1)
 
     @model_validator(mode="after")
