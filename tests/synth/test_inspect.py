@@ -17,9 +17,9 @@ from synth.dataset.exr import write_flow
 from synth.dataset.writer import DatasetWriter
 from synth.errors import InputError
 from synth.inspection import inspect, tables, write_html, write_sheet
-from synth.inspection.arrows import arrows_of
 from synth.inspection.inspection import evenly_spaced
 from synth.inspection.interpolation import sample_at
+from synth.inspection.panels import arrows_of
 from synth.inspection.view import View
 from synth.inspection.wheel import NO_GEL, flow_colours, robust_scale, wheel_legend
 
