@@ -132,8 +132,7 @@ def lattice_index(centres: Pixels) -> tuple[NDArray[np.int64], NDArray[np.int64]
 
 def _start(sensor: Sensor, centres: Pixels, index: NDArray[np.int64], spacing_mm: float | None) -> FloatArray:
     """First guess from the points at which the preset's camera sees the dots."""
-    origins, directions = Optics.of(sensor).rays(centres)
-    points = (origins - directions * (origins[:, 2:] / directions[:, 2:]))[:, :2]
+    points = Optics.of(sensor).look(centres).on_flat_face[:, :2]
     if not np.isfinite(points).all():
         raise InputError("the preset's camera does not see the gel where the frame shows dots; check sensor.camera")
     design = np.column_stack([index, np.ones(len(index))])

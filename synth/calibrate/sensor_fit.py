@@ -156,10 +156,9 @@ def _spread(usable: BoolArray) -> Pixels:
 def _sees_gel(sensor: Sensor) -> BoolArray:
     """(H, W): whether a pixel sees the undeformed contact face."""
     camera = sensor.camera
-    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    origins, directions = Optics.of(sensor).rays(np.column_stack([columns.ravel(), rows.ravel()]))
+    optics = Optics.of(sensor)
     with np.errstate(invalid="ignore"):
-        hit = (origins - directions * (origins[:, 2:] / directions[:, 2:]))[:, :2]
+        hit = optics.look(optics.centres).on_flat_face[:, :2]
         inside = np.all(np.abs(hit) < np.array(sensor.gel.size_mm[:2]) / 2, axis=1)
     return np.asarray(inside.reshape(camera.height, camera.width))
 
@@ -175,8 +174,7 @@ def _bounds(sensor: Sensor) -> Bounds:
     """Each light stays near its place, in the body, and on its side of what the camera sees of the contact face."""
     camera = sensor.camera
     u, v = np.meshgrid(np.linspace(0, camera.width, 5), np.linspace(0, camera.height, 5))
-    origins, directions = Optics.of(sensor).rays(np.column_stack([u.ravel(), v.ravel()]))
-    seen = (origins - directions * (origins[:, 2:] / directions[:, 2:]))[:, :2]
+    seen = Optics.of(sensor).look(np.column_stack([u.ravel(), v.ravel()])).on_flat_face[:, :2]
     geometry = _geometry(sensor.lights)
     centre = geometry.centre
     low, high = centre - _REACH_MM, centre + _REACH_MM

@@ -53,11 +53,10 @@ class View:
         """(f, 3) int32 of the surface."""
         return self.surface.triangles
 
-    @cached_property
+    @property
     def centres(self) -> Pixels:
         """(n, 2) of all pixels, row by row."""
-        row, column = np.mgrid[: self.height, : self.width]
-        return np.column_stack([column.ravel() + 0.5, row.ravel() + 0.5])
+        return self.optics.centres
 
     @cached_property
     def own(self) -> Rays:

@@ -72,7 +72,9 @@ def panels_of(view: View, numbers: Mapping[str, Any]) -> list[Panel]:
     panels.append(Panel(f"visible in image 2: {seen} (red: hidden or outside)", _visibility(view)))
     if view.closure is not None:
         closure = numbers["closure"]
-        caption = f"closure: median {short(closure['median_px'])}, max {short(closure['max_px'])} px"
+        low, high = CLOSURE_RANGE_PX
+        found = f"median {short(closure['median_px'])}, max {short(closure['max_px'])} px"
+        caption = f"closure ({low:g} to {high:g} px, logarithmic): {found}"
         panels.append(Panel(caption, _closure(view.closure)))
     if view.differences is not None:
         limit = _limit(view.differences[0])
