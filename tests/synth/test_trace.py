@@ -1,4 +1,4 @@
-"""Ray tracing: nearest hits, watertight edges, independence of order, and the batch axis."""
+"""Ray tracing: nearest hits, watertight edges, and independence of order."""
 
 import numpy as np
 from kinematic_double import sheet
@@ -80,18 +80,6 @@ def test_order_of_triangles_does_not_matter():
     np.testing.assert_array_equal(np.append(order, -1)[shuffled.triangle], plain.triangle)
     np.testing.assert_array_equal(shuffled.distance, plain.distance)
     np.testing.assert_array_equal(shuffled.barycentric, plain.barycentric)
-
-
-def test_batch_equals_single_states():
-    states = [_rough()[0], _rough()[0] * 0.8, _rough()[0] + (1, 0, 0.5)]
-    triangles = _rough()[1]
-    rays = [_through(RNG.uniform((-6, -5, 0), (6, 5, 0), (300, 3))) for _ in states]
-    batch = trace(np.stack(states), triangles, np.stack([r[0] for r in rays]), np.stack([r[1] for r in rays]))
-    for i, (state, (origins, directions)) in enumerate(zip(states, rays, strict=True)):
-        single = trace(state, triangles, origins, directions)
-        np.testing.assert_array_equal(batch.triangle[i], single.triangle)
-        # The batch shares one grid, which changes no arithmetic of the intersection itself.
-        np.testing.assert_array_equal(batch.distance[i], single.distance)
 
 
 def test_missing_and_behind():
