@@ -12,10 +12,10 @@ from PIL import ExifTags, Image
 from render_scenes import small_sensor
 
 from synth.arrays import FloatArray
+from synth.calibrate.dot_grid import grid_index, pattern_points
 from synth.calibrate.dots import find_dots
 from synth.calibrate.frames import Frames, read_frames
 from synth.calibrate.irradiance import FlatGel, LightGeometry
-from synth.calibrate.lattice import lattice_index, pattern_points
 from synth.calibrate.noise import fit_noise
 from synth.calibrate.profile import fit_profile
 from synth.calibrate.run import MARK
@@ -75,7 +75,7 @@ def _frame(sensor: Sensor) -> FloatArray:
 
 
 def _frames(image: FloatArray) -> Frames:
-    return Frames(image, image, 1, 1 / 255)
+    return Frames(image, image, 1 / 255)
 
 
 @pytest.fixture(scope="module")
@@ -266,7 +266,7 @@ def test_a_frame_without_dots_and_dots_without_a_grid_are_refused() -> None:
     with pytest.raises(InputError, match="0 whole dark dots"):
         find_dots(np.full((120, 160, 3), 0.3), 15.0)
     with pytest.raises(InputError, match="grid"):
-        lattice_index(np.random.default_rng(0).uniform(0, 100, (12, 2)))
+        grid_index(np.random.default_rng(0).uniform(0, 100, (12, 2)))
 
 
 @pytest.mark.parametrize("spacing", ["-3", "nan", "0", "0.1", "100", "inf"])

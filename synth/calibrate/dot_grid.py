@@ -23,7 +23,7 @@ _DOT_PX = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class LatticeFit:
+class DotGridFit:
     """Layout and camera.
 
     Attributes:
@@ -41,7 +41,7 @@ class LatticeFit:
     used: NDArray[np.int64]
 
 
-def fit_lattice(sensor: Sensor, pattern: Dots, centres: Pixels, spacing_mm: float | None) -> LatticeFit:
+def fit_dot_grid(sensor: Sensor, pattern: Dots, centres: Pixels, spacing_mm: float | None) -> DotGridFit:
     """Fit the grid, and the camera as far as the grid tells.
 
     A flat grid fixes the ratio of spacing and focal length alone. So either the spacing is known and the focal lengths
@@ -59,7 +59,7 @@ def fit_lattice(sensor: Sensor, pattern: Dots, centres: Pixels, spacing_mm: floa
     """
     from scipy.optimize import least_squares
 
-    used, index = lattice_index(centres)
+    used, index = grid_index(centres)
     start = _start(sensor, centres[used], index, spacing_mm)
     camera = sensor.camera
     distorts = camera.lens == "pinhole"
@@ -95,10 +95,10 @@ def fit_lattice(sensor: Sensor, pattern: Dots, centres: Pixels, spacing_mm: floa
     scale = float(np.mean(np.linalg.norm(np.diff(_corner(sensor, layout, fitted), axis=0), axis=1) / layout.spacing_mm))
     jitter = 1.4826 * float(np.median(np.abs(residual))) / scale
     layout = _near_centre(layout.model_copy(update={"jitter_mm": round(jitter, 4)}))
-    return LatticeFit(_rounded(layout), _rounded(fitted), residual, index, used)
+    return DotGridFit(_rounded(layout), _rounded(fitted), residual, index, used)
 
 
-def lattice_index(centres: Pixels) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def grid_index(centres: Pixels) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Dots of a grid whose rows are within 40 degrees of horizontal: which (k,), and their column and row (k, 2).
 
     Raises:
