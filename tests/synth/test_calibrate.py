@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
-from render_scenes import small_sensor
+from render_scenes import FAST, needs_llvm, small_sensor
 
 from synth.arrays import FloatArray
 from synth.calibrate.dot_grid import grid_index, pattern_points
@@ -28,12 +28,9 @@ from synth.produce import flat_surface
 from synth.render.camera_image import camera_image
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
-from synth.render.variant import choose_variant
 from synth.scene import Camera, Coating, Dots, Light, Render, Sensor
 from synth.template import load_scene
 
-FAST = choose_variant("cpu")
-needs_llvm = pytest.mark.skipif(not FAST.is_vectorised, reason="no LLVM of version 16 or newer here")
 CLIPS = Path(__file__).parents[3] / "shared/real/gelsight_mini/clips"
 POWERS = np.array([[420.0, 80, 30], [60, 390, 90], [45, 120, 510]])
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from kinematic_double import FISHEYE, HEIGHT, LENS, OBLIQUE, SIDES, WIDTH, rigid, rotation
 from kinematic_double import sensor as flat_sensor
-from render_scenes import plain, small_sensor
+from render_scenes import FAST, needs_llvm, plain, small_sensor
 from test_dot_centres import LIGHTS, RENDER, _centroid, _slope
 from tiny_scene import own_cache
 
@@ -22,7 +22,6 @@ from synth.optics import Optics
 from synth.render.lights import check_view, light_axes
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
-from synth.render.variant import choose_variant
 from synth.sampling import draw
 from synth.scene import Dots, Gel, Sensor, Window
 from synth.template import SCENES, load_scene
@@ -31,8 +30,6 @@ from synth.verify.camera import ForwardCamera
 from synth.verify.motion import check_motion
 from synth.verify.sheet import Sheet
 
-FAST = choose_variant("cpu")
-needs_llvm = pytest.mark.skipif(not FAST.is_vectorised, reason="no LLVM of version 16 or newer here")
 DOME = Gel(shape="dome", size_mm=(20, 15, 8), youngs_modulus_kpa=200, dome_radius_mm=17.0)
 """Slopes up to 47 degrees; 2.5 mm are left at its corners."""
 VIEWS = {

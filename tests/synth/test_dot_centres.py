@@ -7,18 +7,15 @@ without dots, which holds nothing of light and lens but rendering noise.
 import numpy as np
 import pytest
 from kinematic_double import rigid, rotation, sheet
-from render_scenes import plain, small_sensor
+from render_scenes import FAST, needs_llvm, plain, small_sensor
 
 from synth.arrays import FloatArray, Image, Points
 from synth.flow.exact import exact_flow
 from synth.optics import Optics
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
-from synth.render.variant import choose_variant
 from synth.scene import Dots, Light, Mirror, Render, Sensor
 
-FAST = choose_variant("cpu")
-needs_llvm = pytest.mark.skipif(not FAST.is_vectorised, reason="no LLVM of version 16 or newer here")
 RENDER = Render(samples_per_pixel=256, max_depth=2)
 SURFACE = sheet(24, 18, 12.0, 9.0, 2)
 REACH = 6

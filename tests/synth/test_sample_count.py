@@ -2,16 +2,12 @@
 
 import numpy as np
 import pytest
-from render_scenes import flat_surface, plain, small_sensor
+from render_scenes import FAST, flat_surface, needs_llvm, plain, small_sensor
 
 from synth.render.camera_image import camera_image
 from synth.render.renderer import Renderer, full_grid
 from synth.render.sample_count import camera_noise, needed_samples, render_noise
-from synth.render.variant import choose_variant
 from synth.scene import Light, Render, Sensor
-
-FAST = choose_variant("cpu")
-needs_llvm = pytest.mark.skipif(not FAST.is_vectorised, reason="no LLVM of version 16 or newer here")
 
 
 def _lit_from_two_sides(shot_noise: float) -> Sensor:
