@@ -58,7 +58,7 @@ def exact_flow(
         contact: (v,) 0 or 1 at the vertices; gives contact.Y, 1 where the linear interpolation is at least one half, at
             the pixels of image 1.
         device: Warp device of the tracing.
-        view: of this surface, camera and size, kept from another pair: saves what both have in common.
+        view: of this surface, camera and size, cached from another pair: saves what both have in common.
 
     Returns:
         The flow, float32. Beside pixels that see no gel, NaN marks the rare material point that has no image at all

@@ -47,8 +47,8 @@ def trace(positions: Points, triangles: Triangles, origins: Points, directions: 
     corners = on_device(triangles, np.int32, wp.int32, device)
     cells = _grid_around(positions, len(triangles))
     bins = _bin(cells, vertices, corners, device)
-    starts, ways = (on_device(array, np.float64, wp.vec3d, device) for array in (origins, directions))
-    inputs = [cells, vertices, corners, *bins, starts, ways]
+    rays_given = [on_device(array, np.float64, wp.vec3d, device) for array in (origins, directions)]
+    inputs = [cells, vertices, corners, *bins, *rays_given]
     wp.launch(_nearest_hit, dim=rays, inputs=inputs, outputs=outputs, device=device)
     return Hits(*(array.numpy() for array in outputs))
 

@@ -1,7 +1,7 @@
 """The gel's surface in the renderer's frame.
 
 The scene's axes are a left-handed triple (+x right, +y down, +z toward the viewer); Mitsuba's are right-handed. So y is
-mirrored on the way in, for geometry, lights and camera alike, and nothing needs mirroring on the way out.
+mirrored in what Mitsuba gets, for geometry, lights and camera alike, and nothing needs mirroring in what it returns.
 """
 
 from dataclasses import dataclass

@@ -100,7 +100,7 @@ def result_of(run: Run, folder: Path, meshes: Path, worker: Sequence[str] = WORK
     Args:
         run: what to run.
         folder: emptied, then holds run.json, log.txt and what the process writes.
-        meshes: where meshes are kept.
+        meshes: where meshes are cached.
         worker: the command; folder and meshes are appended.
     """
     with storage_errors(folder):
@@ -108,9 +108,9 @@ def result_of(run: Run, folder: Path, meshes: Path, worker: Sequence[str] = WORK
             refuse_foreign(folder / "run.json", b'"element"', *folder.iterdir())
             shutil.rmtree(folder)
         folder.mkdir(parents=True)
-        told = {"element": run.element, "budget_s": run.budget_s, "base": str(run.base)}
-        told["case"] = run.case.model_dump(mode="json", by_alias=True)
-        (folder / "run.json").write_text(json.dumps(told), encoding="utf-8")
+        task = {"element": run.element, "budget_s": run.budget_s, "base": str(run.base)}
+        task["case"] = run.case.model_dump(mode="json", by_alias=True)
+        (folder / "run.json").write_text(json.dumps(task), encoding="utf-8")
     started, status = time.perf_counter(), None
     with (folder / "log.txt").open("wb") as log, contextlib.suppress(subprocess.TimeoutExpired):
         command = [*worker, str(folder), str(meshes)]

@@ -96,6 +96,6 @@ class Sheet:
         query, triangle, weights = layer.found(queries)
         if self.camera.plates:
             points = np.einsum("ni,nic->nc", weights, self.positions[self.triangles[triangle]])
-            kept = self.camera.reaches(points, layer.path)
-            query, triangle, weights = query[kept], triangle[kept], weights[kept]
+            free = self.camera.reaches(points, layer.path)
+            query, triangle, weights = query[free], triangle[free], weights[free]
         return query, triangle, weights, np.full(len(query), layer.path)
