@@ -13,15 +13,12 @@ from render_scenes import needs_llvm
 from tiny_scene import own_cache
 from verified_sample import motion_checks
 
-from synth.arrays import FloatArray, Points
+from synth.arrays import FloatArray
 from synth.dataset.reader import read_dataset
 from synth.generate import generate
 from synth.mesh import rest_surface
-from synth.optics import Optics
-from synth.render.lights import check_view, light_axes
-from synth.sampling import draw
 from synth.scene import Gel, Sensor, Window
-from synth.template import SCENES, load_scene
+from synth.template import load_scene
 from synth.verify import verify_dataset
 
 DOME = Gel(shape="dome", size_mm=(20, 15, 8), youngs_modulus_kpa=200, dome_radius_mm=17.0)
@@ -56,46 +53,6 @@ def test_flow_is_the_independent_projections(view: str) -> None:
 
 
 NAME = "densetact"
-
-
-def _face(origins: Points, directions: Points, radius: float) -> Points:
-    """Where rays from above meet the dome last."""
-    arm = origins - (0.0, 0.0, radius)
-    b = (directions * arm).sum(1)
-    return np.asarray(origins + (-b + np.sqrt(b**2 - (arm**2).sum(1) + radius**2))[:, None] * directions)
-
-
-def test_every_pixel_of_densetact_sees_gel_and_no_light() -> None:
-    """Also when the gel is sheared as far as it may be; lights stand in the gel or window, above the domed face."""
-    template = load_scene(NAME)
-    for trajectory in range(0, 16, 2):
-        scene = draw(template, 3, trajectory)
-        sensor, gel = scene.sensor, scene.sensor.gel
-        assert gel.dome_radius_mm is not None
-        check_view(sensor)
-        width, height = Optics.of(sensor).size
-        places = np.stack(np.meshgrid(np.linspace(0, width, 25), np.linspace(0, height, 25)), axis=-1).reshape(-1, 2)
-        hits = _face(*Optics.of(sensor).rays(places), gel.dome_radius_mm)
-        assert np.all(np.abs(hits[:, :2]) + np.abs(scene.motion.shear_mm) < np.array(gel.size_mm[:2]) / 2)
-        for light in sensor.lights:
-            first, second, _ = light_axes(light)
-            corners = [
-                np.array(light.position_mm) + u * light.size_mm[0] / 2 * first + v * light.size_mm[1] / 2 * second
-                for u in (-1, 1) for v in (-1, 1)
-            ]  # fmt: skip
-            for x, y, z in corners:
-                assert gel.dome_radius_mm - np.sqrt(gel.dome_radius_mm**2 - x * x - y * y) < z
-                assert z < gel.size_mm[2] + sensor.window.thickness_mm
-        assert 0.5 < 0.1 * _pixels_per_mm(sensor) < 2.0
-    assert len(scene.references) >= 2
-    text = (Path(SCENES) / f"{NAME}.toml").read_text()
-    assert "# Simplified:" in text
-    assert "assumed" in text
-
-
-def _pixels_per_mm(sensor: Sensor) -> float:
-    pair = Optics.of(sensor).project(np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]))
-    return float(np.linalg.norm(pair[1] - pair[0])) / 0.1
 
 
 @needs_llvm
