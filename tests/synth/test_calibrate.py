@@ -266,18 +266,6 @@ def test_a_frame_without_dots_and_dots_without_a_grid_are_refused() -> None:
         grid_index(np.random.default_rng(0).uniform(0, 100, (12, 2)))
 
 
-@pytest.mark.parametrize("spacing", ["-3", "nan", "0", "0.1", "100", "inf"])
-def test_a_spacing_that_no_dots_have_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], spacing: str
-) -> None:
-    cv2.imwrite(str(tmp_path / "frame.png"), np.zeros((24, 32, 3), dtype=np.uint8))
-    command = ["calibrate", "--frames", str(tmp_path / "frame.png"), "--out", str(tmp_path / "out")]
-    assert main([*command, f"--spacing-mm={spacing}"]) == 2
-    assert f"--spacing-mm = {spacing}: must be from 0.458 to 7.32 mm" in capsys.readouterr().err
-    assert main([*command, "--scene", "digit", "--spacing-mm=1"]) == 2
-    assert "has no dots" in capsys.readouterr().err
-
-
 @pytest.mark.parametrize("radius", [0.5, 0.9])
 def test_dots_of_a_pixel_are_refused(radius: float) -> None:
     y, x = np.mgrid[:48, :64] + 0.5
@@ -285,23 +273,6 @@ def test_dots_of_a_pixel_are_refused(radius: float) -> None:
     frame = np.repeat(0.5 * np.clip(away - radius + 0.5, 0.1, 1)[..., None], 3, axis=2)
     with pytest.raises(InputError, match=r"radius of .* px, needed is more than 1 px"):
         fit_profile(find_dots(frame, 5.0))
-
-
-@needs_llvm
-@pytest.mark.parametrize(
-    ("level", "message"),
-    [(0, "are the frames black"), (255, "overexposed"), (None, "they give sensor.camera.shot_noise = ")],
-)
-def test_frames_that_tell_nothing_of_the_lights_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], level: int | None, message: str
-) -> None:
-    noise = np.random.default_rng(0).integers(0, 256, (60, 80, 3))
-    cv2.imwrite(str(tmp_path / "frame.png"), (noise if level is None else np.full((60, 80, 3), level)).astype(np.uint8))
-    command = ["calibrate", "--scene", "digit", "--steps", "0", "--out", str(tmp_path / "out")]
-    assert main([*command, "--set", "render.samples_per_pixel=1", "--frames", str(tmp_path / "frame.png")]) == 2
-    said = capsys.readouterr().err
-    assert message in said
-    assert "scene.toml" not in said
 
 
 @pytest.mark.parametrize(
@@ -315,18 +286,48 @@ def test_calibration_replaces_neither_anothers_scene_nor_its_own_start(
     scene = tmp_path / "scene.toml"
     scene.write_text(first + toml_text(_preset()))
     before = scene.read_bytes()
-    cv2.imwrite(str(tmp_path / "frame.png"), np.zeros((24, 32, 3), dtype=np.uint8))
-    frames = ["--frames", str(tmp_path / "frame.png")]
-    assert main(["calibrate", *frames, "--scene", str(scene), "--out", str(tmp_path)]) == 2
-    assert message in capsys.readouterr().err
+    assert message in _said(tmp_path, capsys, "--scene", str(scene))
     assert scene.read_bytes() == before
 
 
-def test_a_preset_that_calibration_does_not_know_is_refused(tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "frame.png"), np.zeros((24, 32, 3), dtype=np.uint8))
-    command = ["calibrate", "--frames", str(tmp_path / "frame.png"), "--out", str(tmp_path / "out"), "--scene"]
-    assert main([*command, "deltact"]) == 2
-    assert main([*command, "gelslim"]) == 2
+def _said(folder: Path, capsys: pytest.CaptureFixture[str], *options: str, frame: FloatArray | None = None) -> str:
+    """What the command says when it refuses a frame, by default a black one."""
+    image = np.zeros((24, 32, 3)) if frame is None else frame
+    cv2.imwrite(str(folder / "frame.png"), image.astype(np.uint8))
+    assert main(["calibrate", "--frames", str(folder / "frame.png"), "--out", str(folder), *options]) == 2
+    return capsys.readouterr().err
+
+
+@pytest.mark.parametrize("spacing", ["-3", "nan", "0", "0.1", "100", "inf"])
+def test_a_spacing_that_no_dots_have_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], spacing: str
+) -> None:
+    said = _said(tmp_path, capsys, f"--spacing-mm={spacing}")
+    assert f"--spacing-mm = {spacing}: must be from 0.458 to 7.32 mm" in said
+    assert "has no dots" in _said(tmp_path, capsys, "--scene", "digit", "--spacing-mm=1")
+
+
+@needs_llvm
+@pytest.mark.parametrize(
+    ("level", "message"),
+    [(0, "are the frames black"), (255, "overexposed"), (None, "they give sensor.camera.shot_noise = ")],
+)
+def test_frames_that_tell_nothing_of_the_lights_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], level: int | None, message: str
+) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (60, 80, 3))
+    frame = noise if level is None else np.full((60, 80, 3), level)
+    options = ["--scene", "digit", "--steps", "0", "--set", "render.samples_per_pixel=1"]
+    said = _said(tmp_path, capsys, *options, frame=frame)
+    assert message in said
+    assert "scene.toml" not in said
+
+
+@pytest.mark.parametrize(("preset", "message"), [("deltact", "sensor.pattern.kind"), ("gelslim", "without mirrors")])
+def test_a_preset_that_calibration_does_not_know_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], preset: str, message: str
+) -> None:
+    assert message in _said(tmp_path, capsys, "--scene", preset)
 
 
 def test_noise_is_measured_through_the_response() -> None:
