@@ -99,7 +99,7 @@ def simulate(
 @app.command
 def stress(
     *,
-    out: Annotated[Path, Parameter(help="Directory for the table, the pictures and the report.")] = Path("data/stress"),
+    out: Annotated[Path, Parameter(help="Directory for the table and a folder per case.")] = Path("data/stress"),
     only: Annotated[list[str] | None, Parameter(help="Names or patterns of cases; repeatable.")] = None,
     workers: Annotated[int, Parameter(converter=whole(1), help="Cases that run at once.")] = 1,
     as_json: AsJson = False,

@@ -216,3 +216,19 @@ def _recovered_gradients(coarse: ContactFaces) -> list[Any]:
     return [
         to_node @ sp.csr_matrix((hat[:, :, axis].ravel(), (rows, faces.ravel())), shape=(k, n)) for axis in range(3)
     ]
+
+
+def vertex_normals(positions: Points, triangles: Triangles) -> Points:
+    """Unit normals at vertices: the mean of the adjoining triangles' normals, weighted by area, as rendered.
+
+    Args:
+        positions: (v, 3) float64 mm.
+        triangles: (f, 3) int32; a vertex of none gets zeros.
+
+    Returns:
+        (v, 3) float64, on the side to which the triangles are oriented (right-hand rule on the components).
+    """
+    a, b, c = (positions[corner] for corner in triangles.T)
+    weighted = np.repeat(np.cross(b - a, c - a), 3, axis=0)
+    total = np.column_stack([np.bincount(triangles.ravel(), w, len(positions)) for w in weighted.T])
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-300)

@@ -10,6 +10,7 @@ from synth.mesh import flat_surface
 from synth.render.camera_image import expected_signal
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
+from synth.render.sample_count import encoded
 from synth.render.variant import Variant
 from synth.scene import Dots, Render, Sensor
 
@@ -35,13 +36,14 @@ class Comparison:
         """Mean absolute and signed differences per channel, levels of 255."""
         difference = 255 * (self.rendered - self.frame)
         bare = difference[self.outside]
-        return {
-            "mean_absolute_outside_dots": [round(float(x), 3) for x in np.abs(bare).mean(axis=0)],
-            "bias_outside_dots": [round(float(x), 3) for x in bare.mean(axis=0)],
-            "p95_outside_dots": [round(float(x), 3) for x in np.percentile(np.abs(bare), 95, axis=0)],
-            "mean_absolute": [round(float(x), 3) for x in np.abs(difference).mean(axis=(0, 1))],
-            "pixels_outside_dots": int(self.outside.sum()),
+        found = {
+            "mean_absolute_outside_dots": np.abs(bare).mean(axis=0),
+            "bias_outside_dots": bare.mean(axis=0),
+            "p95_outside_dots": np.percentile(np.abs(bare), 95, axis=0),
+            "mean_absolute": np.abs(difference).mean(axis=(0, 1)),
         }
+        rounded = {name: [round(float(x), 3) for x in values] for name, values in found.items()}
+        return rounded | {"pixels_outside_dots": int(self.outside.sum())}
 
 
 def render_undeformed(sensor: Sensor, render: Render, variant: Variant) -> FloatArray:
@@ -55,8 +57,7 @@ def render_undeformed(sensor: Sensor, render: Render, variant: Variant) -> Float
         plain = sensor.model_copy(update={"pattern": even})
     surface = flat_surface(sensor.gel.size_mm)
     renderer = Renderer(sensor, render, surface, albedo(plain, np.random.default_rng(0)), variant)
-    signal = expected_signal(renderer.radiance(surface.material, 0), sensor.camera)
-    return np.asarray(np.clip(signal, 0, 1) ** (1 / sensor.camera.gamma))
+    return encoded(expected_signal(renderer.radiance(surface.material, 0), sensor.camera), sensor.camera)
 
 
 def compare(frame: FloatArray, rendered: FloatArray, bare: BoolArray, sensor: Sensor) -> Comparison:

@@ -20,13 +20,11 @@ class Frames:
     Attributes:
         encoded: (H, W, 3) float64 RGB in [0, 1], the mean of all frames.
         single: (H, W, 3) the first of them, with all of its noise.
-        count: number of frames.
         step: of one level of quantisation, full scale 1.
     """
 
     encoded: FloatArray
     single: FloatArray
-    count: int
     step: float
 
     @property
@@ -67,7 +65,7 @@ def read_frames(paths: Sequence[Path]) -> Frames:
                 f"{path}: differs from {paths[0]} by {difference:.1f} of 255 on average (allowed are {_SAME:g}); "
                 "all frames must show the same undeformed gel"
             )
-    return Frames(np.mean(images, axis=0), images[0], len(images), max(steps))
+    return Frames(np.mean(images, axis=0), images[0], max(steps))
 
 
 def _size(image: FloatArray) -> str:

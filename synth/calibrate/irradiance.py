@@ -19,6 +19,7 @@ import numpy as np
 
 from synth.arrays import FloatArray, Pixels
 from synth.render.camera_rays import CameraRays
+from synth.render.coating import coat
 from synth.render.gel_mesh import MIRROR
 from synth.render.variant import Variant
 from synth.scene import Sensor
@@ -62,13 +63,8 @@ class FlatGel:
         ray, self._weight, _ = CameraRays(sensor, mi).sample(index, mi.Point2f(0.5))
         self._point = ray.o - ray.d * (ray.o.z / ray.d.z)
         self._toward = -ray.d
-        coating = sensor.coating
-        reflectance = {"type": "rgb", "value": list(coating.reflectance)}
-        bsdf: dict[str, Any] = {"type": "diffuse", "reflectance": reflectance}
-        if coating.roughness < 1 or coating.metallic > 0:
-            shine = {"roughness": coating.roughness, "metallic": coating.metallic}
-            bsdf = {"type": "principled", "base_color": reflectance, **shine}
-        self._bsdf = mi.load_dict(bsdf)
+        color = {"type": "rgb", "value": list(sensor.coating.reflectance)}
+        self._bsdf = mi.load_dict(coat(sensor.coating, color))
 
     def contributions(self, lights: LightGeometry) -> FloatArray:
         """E (m, n, 3) float64: radiance per channel and unit of power, on the camera's side of the window."""
@@ -104,13 +100,13 @@ class FlatGel:
         import drjit as dr
 
         mi = self._mi
-        centre, direction, size = lights.centre[i] * MIRROR, lights.direction[i] * MIRROR, lights.size[i]
-        # Opaque numbers stay out of the compiled code: other geometry, same kernel.
-        return (
-            mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in centre)),
-            mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in direction)),
-            mi.Vector2f(*(dr.opaque(mi.Float, float(x)) for x in size)),
-        )
+
+        def opaque(kind: Any, values: FloatArray) -> Any:
+            """Opaque numbers stay out of the compiled code: other geometry, same kernel."""
+            return kind(*(dr.opaque(mi.Float, float(x)) for x in values))
+
+        centre, direction = (opaque(mi.Vector3f, part[i] * MIRROR) for part in (lights.centre, lights.direction))
+        return centre, direction, opaque(mi.Vector2f, lights.size[i])
 
     def _arms(self, centre: Any, direction: Any, size: Any) -> tuple[Any, Any, Any, int]:
         """Vectors from the points to the light's cells, point by point; the points; the light's normal; cells."""

@@ -123,7 +123,7 @@ class _Problem:
         unit = start.direction / np.linalg.norm(start.direction, axis=1, keepdims=True)
         self._start = replace(start, direction=unit)
         self._gel, self._target, self._shines, self._vignetting = gel, target, shines, vignetting
-        self._kept: tuple[FloatArray, tuple[FloatArray, FloatArray, LightGeometry]] | None = None
+        self._cached: tuple[FloatArray, tuple[FloatArray, FloatArray, LightGeometry]] | None = None
         self._lights = len(start.centre)
         self.size = 8 * self._lights + 1
         self._factor = float(np.sqrt(INDEPENDENT / target.signal.size)) / RESIDUAL
@@ -181,13 +181,13 @@ class _Problem:
         return LightFit(geometry, powers, errors, self._loss(theta), float(np.sqrt(np.mean(miss**2))), steps)
 
     def _solved(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, LightGeometry]:
-        """Signals (m, n, 3) under lights of power 1, the best powers (m, 3), and the geometry; kept for one theta."""
-        if self._kept is None or not np.array_equal(self._kept[0], theta):
+        """Signals (m, n, 3) under lights of power 1, the best powers (m, 3), and the geometry; cached for one theta."""
+        if self._cached is None or not np.array_equal(self._cached[0], theta):
             geometry = self.geometry(theta)
             gain = self._target.gain * self._vignette(theta)
             basis = self._gel.contributions(geometry) * gain[None, :, None]
-            self._kept = (theta.copy(), (basis, fit_powers(basis, self._target, self._shines)[0], geometry))
-        return self._kept[1]
+            self._cached = (theta.copy(), (basis, fit_powers(basis, self._target, self._shines)[0], geometry))
+        return self._cached[1]
 
     def _loss(self, theta: FloatArray) -> float:
         """The vignetting: relative loss in the corner."""

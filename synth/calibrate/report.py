@@ -55,21 +55,31 @@ def numbers(
         "lights": _lights(fit, start),
         "camera": {
             key: getattr(camera, key)
-            for key in ("fx", "fy", "cx", "cy", "look_at_mm", "distortion", "blur_px", "vignetting")
-        }
-        | {"read_noise": camera.read_noise, "shot_noise": camera.shot_noise},
+            for key in (
+                "fx",
+                "fy",
+                "cx",
+                "cy",
+                "look_at_mm",
+                "distortion",
+                "blur_px",
+                "vignetting",
+                "read_noise",
+                "shot_noise",
+            )
+        },
         "coating": {
             "reflectance": list(fit.sensor.coating.reflectance),
             "note": "held at the preset's: an undeformed frame tells its product with the lights' powers alone",
         },
     }
     pattern = fit.sensor.pattern
-    if isinstance(pattern, Dots) and fit.lattice is not None:
-        miss = fit.lattice.residual_px
+    if isinstance(pattern, Dots) and fit.grid is not None:
+        miss = fit.grid.residual_px
         record["pattern"] = pattern.model_dump(mode="json")
         record["dots"] = {
             "found": 0 if fit.dots is None else len(fit.dots.centres),
-            "in_grid": len(fit.lattice.used),
+            "in_grid": len(fit.grid.used),
             "off_grid_px_rms": round(float(np.sqrt(np.mean(miss**2))), 4),
             "off_grid_px_max": round(float(np.hypot(*miss.T).max()), 4),
         }

@@ -6,10 +6,10 @@ from typing import Any
 import numpy as np
 
 from synth.arrays import BoolArray, FloatArray, Pixels
+from synth.calibrate.dot_grid import DotGridFit, fit_dot_grid
 from synth.calibrate.dots import FoundDots, find_dots
 from synth.calibrate.frames import Frames
 from synth.calibrate.irradiance import FlatGel, LightGeometry
-from synth.calibrate.lattice import LatticeFit, fit_lattice
 from synth.calibrate.lights import Bounds, LightFit, Target, fit_lights
 from synth.calibrate.noise import fit_noise
 from synth.calibrate.profile import DotProfile, blur_of, fit_profile
@@ -38,14 +38,14 @@ class SensorFit:
     Attributes:
         sensor: all of it.
         lights: powers and geometry.
-        dots, lattice, profile: None for a bare coating.
+        dots, grid, profile: None for a bare coating.
         bare: (H, W) pixels that show nothing but coating.
     """
 
     sensor: Sensor
     lights: LightFit
     dots: FoundDots | None
-    lattice: LatticeFit | None
+    grid: DotGridFit | None
     profile: DotProfile | None
     bare: BoolArray
 
@@ -65,14 +65,14 @@ def fit_sensor(start: Sensor, frames: Frames, variant: Variant, spacing_mm: floa
     """
     gamma = start.camera.gamma
     linear = frames.encoded**gamma
-    sensor, dots, lattice, profile = start, None, None, None
+    sensor, dots, grid, profile = start, None, None, None
     bare = np.ones(linear.shape[:2], dtype=bool)
     if isinstance(start.pattern, Dots):
         dots = find_dots(linear, start.pattern.spacing_mm[0] * pixels_per_mm(start))
-        lattice = fit_lattice(start, start.pattern, dots.centres, spacing_mm)
+        grid = fit_dot_grid(start, start.pattern, dots.centres, spacing_mm)
         profile = fit_profile(dots)
         bare = ~dots.covered
-        sensor = start.model_copy(update=_look(start, lattice, profile))
+        sensor = start.model_copy(update=_look(start, grid, profile))
     pixels = _spread(bare & _sees_gel(sensor))
     if not len(pixels):
         raise InputError("no pixel between the dots sees the gel of the preset; check its sensor.gel and sensor.camera")
@@ -94,7 +94,7 @@ def fit_sensor(start: Sensor, frames: Frames, variant: Variant, spacing_mm: floa
         raise InputError("no light of the preset explains any of the frames' brightness; are the frames black?")
     lights = tuple(_shining(_placed(sensor.lights[i], fit.geometry, i), fit.powers[i]) for i in lit)
     sensor = sensor.model_copy(update={"camera": camera, "lights": lights})
-    return SensorFit(sensor, fit, dots, lattice, profile, bare)
+    return SensorFit(sensor, fit, dots, grid, profile, bare)
 
 
 def bare_pixels(frames: Frames, sensor: Sensor) -> BoolArray:
@@ -105,12 +105,12 @@ def bare_pixels(frames: Frames, sensor: Sensor) -> BoolArray:
     return ~find_dots(frames.encoded**sensor.camera.gamma, pitch).covered
 
 
-def _look(start: Sensor, lattice: LatticeFit, profile: DotProfile) -> dict[str, Any]:
+def _look(start: Sensor, grid: DotGridFit, profile: DotProfile) -> dict[str, Any]:
     """Pattern and camera with what the dots told."""
-    scale = pixels_per_mm(start.model_copy(update={"camera": lattice.camera}))
-    softness = lattice.pattern.softness_mm
+    scale = pixels_per_mm(start.model_copy(update={"camera": grid.camera}))
+    softness = grid.pattern.softness_mm
     coating = np.array(start.coating.reflectance)
-    pattern = lattice.pattern.model_copy(
+    pattern = grid.pattern.model_copy(
         update={
             "radius_mm": round(profile.radius_px / scale, 4),
             "radius_jitter": round(min(profile.radius_jitter, 1.0), 4),
@@ -118,7 +118,7 @@ def _look(start: Sensor, lattice: LatticeFit, profile: DotProfile) -> dict[str, 
         }
     )
     blur = {"blur_px": round(blur_of(profile, softness * scale), 3)}
-    return {"pattern": pattern, "camera": lattice.camera.model_copy(update=blur)}
+    return {"pattern": pattern, "camera": grid.camera.model_copy(update=blur)}
 
 
 def _target(encoded: FloatArray, camera: Camera, pixels: Pixels) -> Target:
@@ -156,10 +156,9 @@ def _spread(usable: BoolArray) -> Pixels:
 def _sees_gel(sensor: Sensor) -> BoolArray:
     """(H, W): whether a pixel sees the undeformed contact face."""
     camera = sensor.camera
-    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    origins, directions = Optics.of(sensor).rays(np.column_stack([columns.ravel(), rows.ravel()]))
+    optics = Optics.of(sensor)
     with np.errstate(invalid="ignore"):
-        hit = (origins - directions * (origins[:, 2:] / directions[:, 2:]))[:, :2]
+        hit = optics.look(optics.centres).on_flat_face[:, :2]
         inside = np.all(np.abs(hit) < np.array(sensor.gel.size_mm[:2]) / 2, axis=1)
     return np.asarray(inside.reshape(camera.height, camera.width))
 
@@ -175,8 +174,7 @@ def _bounds(sensor: Sensor) -> Bounds:
     """Each light stays near its place, in the body, and on its side of what the camera sees of the contact face."""
     camera = sensor.camera
     u, v = np.meshgrid(np.linspace(0, camera.width, 5), np.linspace(0, camera.height, 5))
-    origins, directions = Optics.of(sensor).rays(np.column_stack([u.ravel(), v.ravel()]))
-    seen = (origins - directions * (origins[:, 2:] / directions[:, 2:]))[:, :2]
+    seen = Optics.of(sensor).look(np.column_stack([u.ravel(), v.ravel()])).on_flat_face[:, :2]
     geometry = _geometry(sensor.lights)
     centre = geometry.centre
     low, high = centre - _REACH_MM, centre + _REACH_MM

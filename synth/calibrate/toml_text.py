@@ -14,39 +14,31 @@ def toml_text(content: dict[str, Any], comment: str = "") -> str:
         content: JSON-able, without null.
         comment: lines to put in front.
     """
-    head = "".join(f"# {line}".rstrip() + "\n" for line in comment.splitlines())
-    lines: list[str] = []
+    lines = [f"# {line}".rstrip() for line in comment.splitlines()]
     _table(content, "", lines)
-    return head + "\n".join(lines).strip("\n") + "\n"
+    return "\n".join(lines) + "\n"
 
 
 def _table(table: dict[str, Any], path: str, lines: list[str]) -> None:
     """Plain values first: what follows a sub-table's header would belong to it."""
-    plain = {key: value for key, value in table.items() if not _is_table(value) and not _is_list_of_tables(value)}
-    for key, value in plain.items():
-        lines.append(f"{_key(key)} = {_inline(value)}")
+    headed = {}
     for key, value in table.items():
+        if _is_table(value) or (isinstance(value, list) and value and all(map(_is_table, value))):
+            headed[key] = value
+        else:
+            lines.append(f"{_key(key)} = {_inline(value)}")
+    for key, value in headed.items():
         name = f"{path}.{_key(key)}" if path else _key(key)
-        if _is_table(value):
-            lines += ["", f"[{name}]"]
-            _table(value, name, lines)
-        elif _is_list_of_tables(value):
-            for entry in value:
-                lines += ["", f"[[{name}]]"]
-                _table(entry, name, lines)
+        for entry in value if isinstance(value, list) else [value]:
+            lines += ["", f"[[{name}]]" if isinstance(value, list) else f"[{name}]"]
+            _table(entry, name, lines)
 
 
 def _is_table(value: Any) -> bool:
     """A table that gets a header of its own; distributions and empty tables stay inline."""
-    return isinstance(value, dict) and len(value) > 0 and not (len(value) == 1 and _is_short(value))
-
-
-def _is_short(value: dict[str, Any]) -> bool:
-    return all(isinstance(inner, list) for inner in value.values())
-
-
-def _is_list_of_tables(value: Any) -> bool:
-    return isinstance(value, list) and len(value) > 0 and all(_is_table(entry) for entry in value)
+    if not isinstance(value, dict) or not value:
+        return False
+    return len(value) > 1 or not isinstance(next(iter(value.values())), list)
 
 
 def _key(key: str) -> str:
@@ -54,14 +46,10 @@ def _key(key: str) -> str:
 
 
 def _inline(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, int):
-        return str(value)
-    if isinstance(value, float):
-        return repr(value)  # the shortest text that reads back as the same number
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
     if isinstance(value, list | tuple):
         return "[" + ", ".join(_inline(inner) for inner in value) + "]"
-    return "{ " + ", ".join(f"{_key(key)} = {_inline(inner)}" for key, inner in value.items()) + " }"
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{_key(key)} = {_inline(inner)}" for key, inner in value.items()) + " }"
+    if isinstance(value, float):
+        return repr(value)  # the shortest text that reads back as the same number
+    return json.dumps(value, ensure_ascii=False)

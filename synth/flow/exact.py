@@ -15,10 +15,9 @@ import numpy as np
 from synth.arrays import FloatArray, Points
 from synth.errors import InputError
 from synth.flow.field import FlowArray, FlowField
-from synth.flow.normals import vertex_normals
 from synth.flow.view import View
 from synth.optics import Optics
-from synth.surface import GelSurface
+from synth.surface import GelSurface, vertex_normals
 
 
 def exact_flow(
@@ -59,7 +58,7 @@ def exact_flow(
         contact: (v,) 0 or 1 at the vertices; gives contact.Y, 1 where the linear interpolation is at least one half, at
             the pixels of image 1.
         device: Warp device of the tracing.
-        view: of this surface, camera and size, kept from another pair: saves what both have in common.
+        view: of this surface, camera and size, cached from another pair: saves what both have in common.
 
     Returns:
         The flow, float32. Beside pixels that see no gel, NaN marks the rare material point that has no image at all
@@ -83,14 +82,14 @@ def exact_flow(
     forward, forward_visible = view.motion(hits1, positions2)
     extras: dict[str, FlowArray] = {}
     hits2 = view.first_hits(positions2) if backward or depth or normal else None
-    if depth and hits2 is not None:
+    if hits2 is not None:
         for number, hits, positions in (("1", hits1, positions1), ("2", hits2, positions2)):
-            depths = optics.depth(hits.interpolate(triangles, positions), view.own.path)
-            extras[f"depth{number}.Z"] = view.image(depths)
-    if normal and hits2 is not None:
-        for number, hits, positions in (("1", hits1, positions1), ("2", hits2, positions2)):
-            smooth = hits.interpolate(triangles, -vertex_normals(positions, triangles))
-            extras |= view.vector(f"normal{number}", smooth / np.linalg.norm(smooth, axis=1, keepdims=True))
+            if depth:
+                depths = optics.depth(hits.interpolate(triangles, positions), view.own.path)
+                extras[f"depth{number}.Z"] = view.image(depths)
+            if normal:
+                smooth = hits.interpolate(triangles, -vertex_normals(positions, triangles))
+                extras |= view.vector(f"normal{number}", smooth / np.linalg.norm(smooth, axis=1, keepdims=True))
     if displacement:
         extras |= view.vector("displacement", hits1.interpolate(triangles, positions2 - positions1))
     if traction is not None:

@@ -1,6 +1,7 @@
 """Where rays meet a triangle surface, and values at the vertices interpolated there, by a Warp kernel on the CPU."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -17,9 +18,9 @@ class Hits:
     """Nearest hits, one for each ray.
 
     Attributes:
-        triangle: (..., n) int32, -1 where the ray hits nothing.
-        barycentric: (..., n, 3) float64 weights of the triangle's vertices; NaN where nothing is hit.
-        distance: (..., n) float64 mm along the unit direction; infinite where nothing is hit.
+        triangle: (n,) int32, -1 where the ray hits nothing.
+        barycentric: (n, 3) float64 weights of the triangle's vertices; NaN where nothing is hit.
+        distance: (n,) float64 mm along the unit direction; infinite where nothing is hit.
     """
 
     triangle: NDArray[np.int32]
@@ -27,18 +28,23 @@ class Hits:
     distance: FloatArray
 
     def interpolate(self, triangles: Triangles, values: FloatArray) -> FloatArray:
-        """Values (n, c) at the hits from values (v, c) at the vertices; NaN where nothing is hit. Not for batches."""
+        """Values (n, c) at the hits from values (v, c) at the vertices; NaN where nothing is hit."""
         rays = len(self.triangle)
         found = wp.empty((rays, values.shape[1]), dtype=wp.float64, device="cpu")
-        weights = wp.array(np.ascontiguousarray(self.barycentric), dtype=wp.vec3d, device="cpu", copy=False)
-        inputs = [
-            wp.array(np.ascontiguousarray(self.triangle), dtype=wp.int32, device="cpu", copy=False),
-            weights,
-            wp.array(np.ascontiguousarray(triangles, dtype=np.int32), dtype=wp.int32, device="cpu", copy=False),
-            wp.array(np.ascontiguousarray(values, dtype=np.float64), dtype=wp.float64, device="cpu", copy=False),
-        ]
+        given = (
+            (self.triangle, np.int32, wp.int32),
+            (self.barycentric, np.float64, wp.vec3d),
+            (triangles, np.int32, wp.int32),
+            (values, np.float64, wp.float64),
+        )
+        inputs = [on_device(array, kind, element, "cpu") for array, kind, element in given]
         wp.launch(_interpolate, dim=rays, inputs=inputs, outputs=[found], device="cpu")
         return np.asarray(found.numpy())
+
+
+def on_device(array: Any, kind: type, element: Any, device: str) -> Any:
+    """A Warp array; on the CPU it is the caller's own memory, which kernels only read."""
+    return wp.array(np.ascontiguousarray(array, dtype=kind), dtype=element, device=device, copy=False)
 
 
 @wp.kernel

@@ -1,7 +1,7 @@
 """One camera that looks at the states of one surface: what does not change between them, and what a state has shown.
 
-Kept are the rays of the pixel centres, and the last few states' first hits: a trajectory's pairs share their states,
-and each state of a pair is needed both ways.
+Cached are the rays of the pixel centres, and the last few states' first hits: a trajectory's pairs share their states,
+and each state of a pair is needed in both directions.
 """
 
 from collections import deque
@@ -26,8 +26,8 @@ Projection and its inverse agree to about 1e-12 px, so the ray of a point's own 
 and meets its own surface within 1e-12 mm / sin(grazing angle): below the tolerance for every angle above 1e-6 rad.
 Parts of the surface less than 1e-6 mm apart touch.
 """
-_KEPT = 3
-"""States whose first hits are kept: 12 MB each at 640 x 480."""
+_CACHED_STATES = 3
+"""States whose first hits are cached: those of a pair, and the undeformed one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,11 +53,10 @@ class View:
         """(f, 3) int32 of the surface."""
         return self.surface.triangles
 
-    @cached_property
+    @property
     def centres(self) -> Pixels:
         """(n, 2) of all pixels, row by row."""
-        row, column = np.mgrid[: self.height, : self.width]
-        return np.column_stack([column.ravel() + 0.5, row.ravel() + 0.5])
+        return self.optics.centres
 
     @cached_property
     def own(self) -> Rays:
@@ -76,7 +75,7 @@ class View:
 
     @cached_property
     def _seen(self) -> "deque[tuple[Points, Hits]]":
-        return deque(maxlen=_KEPT)
+        return deque(maxlen=_CACHED_STATES)
 
     def first_hits(self, positions: Points) -> Hits:
         """What the pixel centres see of a state (v, 3) mm; the array must not be changed afterwards."""

@@ -11,11 +11,9 @@ from numpy.typing import NDArray
 
 from synth.dataset.images import encode_png
 from synth.dataset.storage import replace_file
-from synth.inspection.arrows import Arrows
 from synth.inspection.inspection import Inspection
-from synth.inspection.panels import CLOSURE_RANGE_PX, Panel, image_picture, panels_of
-from synth.inspection.table import about_rows
-from synth.inspection.text import facts, percent, short
+from synth.inspection.panels import CLOSURE_RANGE_PX, Arrows, Panel, image_picture, panels_of
+from synth.inspection.text import COLUMNS, about_rows, facts
 from synth.inspection.view import View
 from synth.inspection.wheel import flow_colours, robust_scale, wheel_legend
 
@@ -75,9 +73,8 @@ _NOTE = (
 def _view_body(inspection: Inspection) -> str:
     parts = [f"<h1>{escape(str(inspection.path))}</h1>"]
     for number, numbers in enumerate(inspection.numbers):
-        if number:
-            parts.append(f"<h2>{escape(numbers['name'])}</h2>")
-        parts += [_facts(facts(numbers)), _pictures(inspection.view(number), numbers)]
+        heading = f"<h2>{escape(numbers['name'])}</h2>" if number else ""
+        parts += [heading, _facts(facts(numbers)), _pictures(inspection.view(number), numbers)]
     return "\n".join(parts)
 
 
@@ -94,44 +91,22 @@ def _dataset_body(inspection: Inspection) -> str:
                 f'<h2 id="s{name}">Sample {name}</h2>\n{_pictures(view, numbers)}\n'
                 f"<details><summary>all numbers</summary>{_facts(facts(numbers))}</details>"
             )
-    heads = "".join(f"<th>{head}</th>" for head in _HEADS)
-    note = (
-        ""
-        if len(pictured) == len(rows)
-        else f'<p class="note">{len(pictured)} of {len(rows)} samples have pictures.</p>'
-    )
+    heads = [*(name.replace("-\n", "") for name, _ in COLUMNS), "image 1", "image 2", "forward flow"]
+    some = f'<p class="note">{len(pictured)} of {len(rows)} samples have pictures.</p>'
+    table = f'<table class="rows">{_cells("th", heads)}\n{"".join(rows)}</table>'
     return (
-        f"<h1>{escape(str(inspection.path))}</h1>\n{_facts(about_rows(inspection))}\n<h2>Samples</h2>\n{note}"
-        f'<div class="scroll"><table class="rows"><tr>{heads}</tr>\n{"".join(rows)}</table></div>\n{"".join(sections)}'
+        f"<h1>{escape(str(inspection.path))}</h1>\n{_facts(about_rows(inspection))}\n<h2>Samples</h2>\n"
+        f'{some if len(pictured) < len(rows) else ""}<div class="scroll">{table}</div>\n{"".join(sections)}'
     )
-
-
-_HEADS = (
-    "sample", "image 1", "image 2", "forward flow", "frames", "flow median", "95 %", "max", "no gel", "visible",
-    "closure 95 %", "difference", "warped", "depth", "force z", "converged",
-)  # fmt: skip
 
 
 def _row(numbers: dict[str, Any], view: View | None) -> str:
-    motion, difference = numbers["forward"], numbers["difference"]
-    solver = numbers["solver"][-1] if numbers["solver"] else {}
-    name = escape(numbers["name"])
-    cells = [f'<a href="#s{name}">{name}</a>' if view is not None else name, *_thumbnails(view)]
-    cells += [
-        "–".join(str(frame) for frame in numbers["frames"]),
-        short(motion["median_px"], "px"),
-        short(motion["p95_px"], "px"),
-        short(motion["max_px"], "px"),
-        percent(motion["nan_share"]),
-        percent(motion["visible_share"]),
-        short((numbers["closure"] or {}).get("p95_px"), "px"),
-        percent(difference["before_rmse"]),
-        percent(difference["after_rmse"]),
-        short(solver.get("depth_mm"), "mm"),
-        short(float(numbers["force_n"][1][2]), "N"),
-        short(solver.get("converged")),
-    ]
-    return "<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>\n"
+    name, *cells = (escape(text(numbers)) for _, text in COLUMNS)
+    return _cells("td", [f'<a href="#s{name}">{name}</a>' if view is not None else name, *cells, *_thumbnails(view)])
+
+
+def _cells(tag: str, cells: list[str]) -> str:
+    return "<tr>" + "".join(f"<{tag}>{cell}</{tag}>" for cell in cells) + "</tr>\n"
 
 
 def _thumbnails(view: View | None) -> list[str]:
@@ -155,7 +130,7 @@ def _pictures(view: View, numbers: dict[str, Any]) -> str:
 
 def _figure(panel: Panel) -> str:
     caption = escape(panel.caption)
-    wheel = _wheel() if panel.scale == "wheel" else ""
+    wheel = _wheel() if panel.has_wheel else ""
     arrows = "" if panel.arrows is None else _arrows(panel.arrows, panel.picture.shape[1], panel.picture.shape[0])
     image = f'<img class="picture" alt="{caption}" src="{_inline(panel.picture)}">'
     return f'<figure><div class="frame">{image}{arrows}{wheel}</div><figcaption>{caption}</figcaption></figure>\n'

@@ -45,26 +45,23 @@ def numbers_of(view: View) -> dict[str, Any]:
 def _motion(flow: FlowArray, visible: BoolArray, visible_known: bool) -> dict[str, float | None]:
     length = np.hypot(flow[..., 0].astype(np.float64), flow[..., 1].astype(np.float64))
     gel = np.isfinite(length)
-    found = length[gel]
-    if not found.size:
-        return dict.fromkeys(("min_px", "median_px", "p95_px", "max_px", "visible_share"), None) | {"nan_share": 1.0}
-    low, median, high, top = np.percentile(found, [0, 50, 95, 100])
-    return {
-        "min_px": float(low),
-        "median_px": float(median),
-        "p95_px": float(high),
-        "max_px": float(top),
-        "nan_share": float(1 - gel.mean()),
-        "visible_share": float(visible[gel].mean()) if visible_known else None,
-    }
+    share = float(visible[gel].mean()) if visible_known and gel.any() else None
+    found = _percentiles(length[gel], min_px=0, median_px=50, p95_px=95, max_px=100)
+    return {**found, "nan_share": float(1 - gel.mean()), "visible_share": share}
 
 
 def _spread(values: FloatArray) -> dict[str, float | int | None]:
     found = values[np.isfinite(values)]
-    if not found.size:
-        return {"median_px": None, "p95_px": None, "max_px": None, "pixels": 0}
-    median, high, top = np.percentile(found, [50, 95, 100])
-    return {"median_px": float(median), "p95_px": float(high), "max_px": float(top), "pixels": int(found.size)}
+    return {**_percentiles(found, median_px=50, p95_px=95, max_px=100), "pixels": int(found.size)}
+
+
+def _percentiles(values: FloatArray, **percents: int) -> dict[str, float | None]:
+    """By the names of the percents; None of no values."""
+    if not values.size:
+        return dict.fromkeys(percents)
+    return {
+        name: float(value) for name, value in zip(percents, np.percentile(values, [*percents.values()]), strict=True)
+    }
 
 
 def _difference(view: View) -> dict[str, float | None] | None:

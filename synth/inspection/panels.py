@@ -2,24 +2,34 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from synth.arrays import FloatArray
+from synth.arrays import FloatArray, Pixels
 from synth.dataset.images import Raster
-from synth.inspection.arrows import Arrows, arrows_of
 from synth.inspection.text import percent, short
 from synth.inspection.view import View
 from synth.inspection.wheel import NO_GEL, Rgb, flow_colours, robust_scale
 
-Scale = Literal["wheel", "closure"]
-
 CLOSURE_RANGE_PX = (1e-5, 1.0)
 """Of the logarithmic scale, the same everywhere, so that pictures can be compared."""
-CLOSURE_MAP = "viridis"
-_DIFFERENCE_MAP = "RdBu_r"
 _VISIBLE, _HIDDEN = (245, 245, 245), (200, 60, 50)
+
+
+@dataclass(frozen=True)
+class Arrows:
+    """A thinned flow to draw over an image, magnified so that small flows can be seen.
+
+    Attributes:
+        start: (n, 2) px.
+        tip: (n, 2) px, start + magnification * flow.
+        magnification: how many times longer than the flow the arrows are.
+    """
+
+    start: Pixels
+    tip: Pixels
+    magnification: float
 
 
 @dataclass(frozen=True)
@@ -27,17 +37,15 @@ class Panel:
     """One picture.
 
     Attributes:
-        name: the same for the same picture of every view.
         caption: what is seen, with its numbers.
         picture: (H, W, 3) uint8.
-        scale: what explains its colours, if anything does.
+        has_wheel: whether the colour wheel explains its colours.
         arrows: drawn over it.
     """
 
-    name: str
     caption: str
     picture: Rgb
-    scale: Scale | None = None
+    has_wheel: bool = False
     arrows: Arrows | None = None
 
 
@@ -50,33 +58,46 @@ def panels_of(view: View, numbers: Mapping[str, Any]) -> list[Panel]:
     """
     panels = []
     if view.image1 is not None and view.image2 is not None:
-        for name, image in (("image 1", view.image1), ("image 2", view.image2)):
-            panels.append(Panel(name, name, image_picture(image)))
-    panels.append(_arrows(view))
+        panels += [Panel("image 1", image_picture(view.image1)), Panel("image 2", image_picture(view.image2))]
+    background = np.full((*view.size, 3), 235, np.uint8) if view.image1 is None else image_picture(view.image1)
+    arrows, paled = arrows_of(view), (0.55 * background + 0.45 * 255).astype(np.uint8)
+    panels.append(Panel(f"forward flow, arrows {arrows.magnification:g} times as long", paled, arrows=arrows))
     for name, flow in (("forward", view.flow.forward), ("backward", view.flow.backward)):
         if flow is not None:
             scale = robust_scale(flow)
-            colours = flow_colours(flow, scale)
-            panels.append(Panel(name, f"{name} flow; the wheel's rim is {scale:.3g} px", colours, "wheel"))
+            caption = f"{name} flow; the wheel's rim is {scale:.3g} px"
+            panels.append(Panel(caption, flow_colours(flow, scale), has_wheel=True))
     share = numbers["forward"]["visible_share"]
     seen = percent(share) if view.visible_known else "not given"
-    panels.append(Panel("visible", f"visible in image 2: {seen} (red: hidden or outside)", _visibility(view)))
+    panels.append(Panel(f"visible in image 2: {seen} (red: hidden or outside)", _visibility(view)))
     if view.closure is not None:
         closure = numbers["closure"]
-        caption = f"closure: median {short(closure['median_px'])}, max {short(closure['max_px'])} px"
-        panels.append(Panel("closure", caption, _closure(view.closure), "closure"))
+        low, high = CLOSURE_RANGE_PX
+        found = f"median {short(closure['median_px'])}, max {short(closure['max_px'])} px"
+        caption = f"closure ({low:g} to {high:g} px, logarithmic): {found}"
+        panels.append(Panel(caption, _closure(view.closure)))
     if view.differences is not None:
         limit = _limit(view.differences[0])
-        for name, title, key, values in zip(
-            ("before", "after"),
-            ("image 2 − image 1", "warped image 2 − image 1"),
-            ("before_rmse", "after_rmse"),
-            view.differences,
-            strict=True,
-        ):
+        titles = (("image 2 − image 1", "before_rmse"), ("warped image 2 − image 1", "after_rmse"))
+        for (title, key), values in zip(titles, view.differences, strict=True):
             caption = f"{title} (±{100 * limit:.2g} %): RMS {percent(numbers['difference'][key])}"
-            panels.append(Panel(name, caption, _difference(values, limit)))
+            # The mean over the channels: blue below 0, red above, to +-limit.
+            panels.append(Panel(caption, _mapped("RdBu_r", 0.5 + 0.5 * values.mean(axis=-1) / limit)))
     return panels
+
+
+def arrows_of(view: View, across: int = 18) -> Arrows:
+    """About `across` arrows in a row; all but the longest 1 % are at most 1.6 times as long as their spacing."""
+    height, width = view.size
+    spacing = max(1, round(width / across))
+    columns, rows = np.meshgrid(np.arange(spacing // 2, width, spacing), np.arange(spacing // 2, height, spacing))
+    flow = view.flow.forward[rows.ravel(), columns.ravel()].astype(np.float64)
+    known = np.isfinite(flow).all(axis=-1)
+    start = np.column_stack([columns.ravel(), rows.ravel()])[known].astype(np.float64) + 0.5
+    wanted = 1.6 * spacing / robust_scale(view.flow.forward)
+    unit = 10.0 ** np.floor(np.log10(wanted))
+    magnification = float(unit * next(step for step in (7, 5, 3, 2, 1) if step <= wanted / unit * (1 + 1e-9)))
+    return Arrows(start, start + magnification * flow[known], magnification)
 
 
 def image_picture(image: Raster) -> Rgb:
@@ -91,14 +112,6 @@ def _limit(before: FloatArray) -> float:
     return (float(np.percentile(found, 99)) if found.size else 0.0) or 1.0
 
 
-def _arrows(view: View) -> Panel:
-    """Image 1, paled, under arrows."""
-    background = np.full((*view.size, 3), 235, np.uint8) if view.image1 is None else image_picture(view.image1)
-    paled = (0.55 * background + 0.45 * 255).astype(np.uint8)
-    arrows = arrows_of(view)
-    return Panel("arrows", f"forward flow, arrows {arrows.magnification:g} times as long", paled, arrows=arrows)
-
-
 def _visibility(view: View) -> Rgb:
     picture = np.where(view.visible[..., None], np.array(_VISIBLE, np.uint8), np.array(_HIDDEN, np.uint8))
     return np.where(view.gel[..., None], picture, np.array(NO_GEL, np.uint8))
@@ -108,12 +121,7 @@ def _closure(error: FloatArray) -> Rgb:
     """Logarithmic over `CLOSURE_RANGE_PX`."""
     low, high = np.log10(CLOSURE_RANGE_PX)
     shown = np.log10(np.clip(error, *CLOSURE_RANGE_PX))
-    return _mapped(CLOSURE_MAP, (shown - low) / (high - low))
-
-
-def _difference(difference: FloatArray, limit: float) -> Rgb:
-    """The mean over the channels: blue below 0, red above, to +-limit."""
-    return _mapped(_DIFFERENCE_MAP, 0.5 + 0.5 * difference.mean(axis=-1) / limit)
+    return _mapped("viridis", (shown - low) / (high - low))
 
 
 def _mapped(name: str, share: FloatArray) -> Rgb:

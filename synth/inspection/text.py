@@ -1,7 +1,9 @@
-"""Numbers as short text, the same in table, sheet and page."""
+"""Numbers as short text, and the rows and columns that table, sheet and page show."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
+
+from synth.inspection.inspection import Inspection
 
 NONE = "–"
 
@@ -28,7 +30,8 @@ def vector(values: Sequence[float] | None, unit: str = "") -> str:
 
 def facts(numbers: Mapping[str, Any]) -> list[tuple[str, str]]:
     """(name, value) of all that `numbers_of` found."""
-    rows = [("size", f"{numbers['width']} x {numbers['height']} px" + _bits(numbers))]
+    bits = "" if numbers["bits"] is None else f", {numbers['bits']} bits"
+    rows = [("size", f"{numbers['width']} x {numbers['height']} px{bits}")]
     if numbers["frames"] is not None and numbers["trajectory"] is not None:
         frames = numbers["frames"]
         rows.append(
@@ -60,10 +63,6 @@ def facts(numbers: Mapping[str, Any]) -> list[tuple[str, str]]:
     return rows
 
 
-def _bits(numbers: Mapping[str, Any]) -> str:
-    return "" if numbers["bits"] is None else f", {numbers['bits']} bits"
-
-
 def _states(numbers: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Forces and solver diagnostics, both frames in one value."""
     rows = []
@@ -82,3 +81,42 @@ _SOLVER = (
     "depth_mm", "shear_mm", "twist_deg", "converged", "newton_iterations", "residual", "min_jacobian",
     "max_penetration_mm",
 )  # fmt: skip
+
+
+def about_rows(inspection: Inspection) -> list[tuple[str, str]]:
+    """A dataset's facts as (name, value)."""
+    about = inspection.about
+    seconds = ", ".join(f"{stage} {value:.3g} s" for stage, value in about["seconds"].items())
+    shown = "" if about["inspected"] == about["finished"] else f" ({about['inspected']} of them looked at)"
+    return [
+        ("scene, seed", f"{about['scene']}, {about['seed']}"),
+        ("finished samples", f"{about['finished']} of {about['n']}{shown}"),
+        ("failed draws", str(about["failed_draws"])),
+        ("device", ", ".join(f"{key} {value}" for key, value in about["device"].items()) or "not recorded"),
+        ("software", ", ".join(f"{key} {value}" for key, value in about["software"].items()) or "not recorded"),
+        ("time", seconds or "not recorded"),
+    ]
+
+
+def _solver(numbers: dict[str, Any]) -> dict[str, Any]:
+    """The record of the second frame."""
+    return numbers["solver"][-1] if numbers["solver"] else {}
+
+
+COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
+    ("sample", lambda n: n["name"]),
+    ("size\npx", lambda n: f"{n['width']}x{n['height']}"),
+    ("frames", lambda n: "-".join(str(frame) for frame in n["frames"])),
+    ("depth\nmm", lambda n: short(_solver(n).get("depth_mm"))),
+    ("Fz\nN", lambda n: short(float(n["force_n"][1][2]))),
+    ("flow\nmedian, px", lambda n: short(n["forward"]["median_px"])),
+    ("flow\n95 %, px", lambda n: short(n["forward"]["p95_px"])),
+    ("flow\nmax, px", lambda n: short(n["forward"]["max_px"])),
+    ("no gel", lambda n: percent(n["forward"]["nan_share"])),
+    ("visible", lambda n: percent(n["forward"]["visible_share"])),
+    ("closure\n95 %, px", lambda n: short((n["closure"] or {}).get("p95_px"))),
+    ("difference\nbefore", lambda n: percent(n["difference"]["before_rmse"])),
+    ("difference\nwarped", lambda n: percent(n["difference"]["after_rmse"])),
+    ("con-\nverged", lambda n: short(_solver(n).get("converged"))),
+)
+"""Of a dataset's samples: heading, and the cell from a sample's numbers."""

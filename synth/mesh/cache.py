@@ -1,4 +1,4 @@
-"""Meshes are kept by content: made once per pad and edge length, then read. A dome's is its box's, bulged when read.
+"""Meshes are cached by content: made once per pad and edge length, then read. A dome's is its box's, bulged when read.
 
 fTetWild is not deterministic, so the cache is also what makes a dataset reproducible: a dataset directory keeps the
 meshes it used and a later run on it reads those first.
@@ -40,7 +40,7 @@ def mesh_key(gel: Gel, numerics: Numerics) -> str:
 
 
 def user_cache() -> Path:
-    """Where meshes are kept between runs: $XDG_CACHE_HOME or ~/.cache."""
+    """Where meshes are cached between runs: $XDG_CACHE_HOME or ~/.cache."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gelflow-synth" / "meshes"
 
 
@@ -72,7 +72,7 @@ def pad_mesh(gel: Gel, numerics: Numerics, folders: Sequence[Path] | None = None
 
 
 def _read(path: Path, gel: Gel) -> PadMesh | None:
-    """A kept mesh, or None where there is none or the file is damaged (it is then made again)."""
+    """A cached mesh, or None where there is none or the file is damaged (it is then made again)."""
     try:
         with np.load(path) as data:
             return PadMesh(data["points"], data["tets"], gel.size_mm)
@@ -81,7 +81,7 @@ def _read(path: Path, gel: Gel) -> PadMesh | None:
 
 
 def _write(path: Path, mesh: PadMesh) -> None:
-    """Keep a mesh, whole or not at all. A folder that cannot be written keeps none: the mesh itself is not at stake."""
+    """Store a mesh, whole or not at all. A folder that cannot be written gets none: the mesh itself is not at stake."""
     aside = path.with_name(f".{path.name}.{os.getpid()}")
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)

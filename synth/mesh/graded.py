@@ -200,10 +200,10 @@ def kuhn_tets(nx: int, ny: int, nz: int) -> Tets:
     mirrored = odd.sum(axis=(1, 2)) % 2 == 1
     tets = []
     for order in permutations(range(3)):
-        way = np.zeros((4, 3), dtype=int)
+        steps = np.zeros((4, 3), dtype=int)
         for step, axis in enumerate(order):
-            way[step + 1 :, axis] = 1
-        corners = cells + np.where(odd, 1 - way, way)
+            steps[step + 1 :, axis] = 1
+        corners = cells + np.where(odd, 1 - steps, steps)
         tet = (corners[..., 0] * (ny + 1) + corners[..., 1]) * (nz + 1) + corners[..., 2]
         # An odd permutation of the axes turns the tetrahedron over, and so does each mirroring of the cell.
         turned = mirrored ^ (sum(a > b for a, b in zip(order, order[1:] + order[:1], strict=True)) == 2)

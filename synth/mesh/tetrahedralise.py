@@ -1,7 +1,7 @@
 """Tetrahedral mesh of a box of gel by fTetWild (Hu et al., ACM TOG 2020; pytetwild), small elements at the contact.
 
 What fTetWild leaves to do: its flat faces are up to epsilon off, so boundary vertices are snapped to the planes of the
-box; its orientation is negative; and it is not deterministic, so a mesh is made once and kept (`synth.mesh.cache`).
+box; its orientation is negative; and it is not deterministic, so a mesh is made once and cached (`synth.mesh.cache`).
 """
 
 import contextlib
@@ -91,7 +91,7 @@ def _ftetwild(size: tuple[float, float, float], background: Background) -> tuple
     quads = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5))
     faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))], dtype=np.int32)
     # fTetWild leaves a __tracked_surface.stl in the working directory.
-    with _interrupts_kept(), tempfile.TemporaryDirectory() as scratch, contextlib.chdir(scratch):
+    with _python_interrupts(), tempfile.TemporaryDirectory() as scratch, contextlib.chdir(scratch):
         points, tets = pytetwild.tetrahedralize(
             corners,
             faces,
@@ -105,7 +105,7 @@ def _ftetwild(size: tuple[float, float, float], background: Background) -> tuple
 
 
 @contextlib.contextmanager
-def _interrupts_kept() -> Iterator[None]:
+def _python_interrupts() -> Iterator[None]:
     """Python's Ctrl-C again: fTetWild's library sets the system's default, which ends the process without a word."""
     before = signal.getsignal(signal.SIGINT)
     try:

@@ -37,6 +37,11 @@ class Rays:
     directions: Points
     path: Paths
 
+    @property
+    def on_flat_face(self) -> Points:
+        """(n, 3) mm where the rays meet the undeformed contact face of a flat gel, z = 0, or its continuation."""
+        return np.asarray(self.origins - self.directions * (self.origins[:, 2:] / self.directions[:, 2:]))
+
 
 @dataclass(frozen=True, eq=False)
 class Optics:
@@ -81,6 +86,12 @@ class Optics:
     def face_z(self) -> float:
         """Z of the window's outer face, mm."""
         return self.window.face_z
+
+    @cached_property
+    def centres(self) -> Pixels:
+        """(n, 2) centres of all pixels, row by row."""
+        row, column = np.mgrid[: self.size[1], : self.size[0]]
+        return np.column_stack([column.ravel() + 0.5, row.ravel() + 0.5])
 
     @cached_property
     def poses(self) -> tuple[Pose, ...]:

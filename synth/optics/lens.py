@@ -2,6 +2,8 @@
 
 from typing import Protocol
 
+import numpy as np
+
 from synth.arrays import FloatArray, Pixels, Points
 from synth.optics.lens_fisheye import FisheyeLens
 from synth.optics.lens_pinhole import PinholeLens
@@ -29,4 +31,4 @@ class Lens(Protocol):
 def lens_of(camera: Camera) -> PinholeLens | FisheyeLens:
     """The lens of a camera."""
     kind = FisheyeLens if camera.lens == "fisheye" else PinholeLens
-    return kind.of(camera)
+    return kind(np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy]), camera.distortion)

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from synth.arrays import FloatArray, Pixels, Points
-from synth.scene import Camera
+from synth.optics.lens_pinhole import smallest_positive_root
 
 _STEPS = 60
 """Bisection alone would reach float64's resolution of an angle below pi / 2 in 53."""
@@ -35,11 +35,6 @@ class FisheyeLens:
     focal: FloatArray
     centre: FloatArray
     distortion: tuple[float, ...]
-
-    @staticmethod
-    def of(camera: Camera) -> "FisheyeLens":
-        """The lens of a camera."""
-        return FisheyeLens(np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy]), camera.distortion)
 
     def project(self, local: Points) -> Pixels:
         """Pixels (n, 2) of directions (n, 3) in the camera's frame; NaN beyond the lens's field."""
@@ -63,10 +58,8 @@ class FisheyeLens:
     def field_limit(self) -> float:
         """Angle to the axis, radians, below which the lens model is one-to-one: at most pi / 2."""
         k1, k2, k3, k4 = self.distortion
-        roots = np.roots([9 * k4, 7 * k3, 5 * k2, 3 * k1, 1.0])  # derivative of θ_d, in θ²
-        real = roots[np.abs(roots.imag) <= 1e-9 * np.abs(roots)].real
-        positive = real[real > 0]
-        return min(np.pi / 2, float(np.sqrt(positive.min()))) if len(positive) else np.pi / 2
+        first = smallest_positive_root([9 * k4, 7 * k3, 5 * k2, 3 * k1, 1.0])  # derivative of θ_d, in θ²
+        return min(np.pi / 2, float(np.sqrt(first)))
 
     def _distorted(self, angle: FloatArray) -> FloatArray:
         k1, k2, k3, k4 = self.distortion

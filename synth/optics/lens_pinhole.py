@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from synth.arrays import BoolArray, FloatArray, Pixels, Points
-from synth.scene import Camera
 
 _RELATIVE_STEP = 1e-9
 """Newton's error after a relative step s is of order s²; below 1e-9 the next iterate is exact to rounding."""
@@ -30,11 +29,6 @@ class PinholeLens:
     centre: FloatArray
     distortion: tuple[float, ...]
 
-    @staticmethod
-    def of(camera: Camera) -> "PinholeLens":
-        """The lens of a camera."""
-        return PinholeLens(np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy]), camera.distortion)
-
     def project(self, local: Points) -> Pixels:
         """Pixels (n, 2) of directions (n, 3) in the camera's frame; NaN behind it or beyond the lens's field."""
         depth = local[:, 2]
@@ -53,10 +47,7 @@ class PinholeLens:
     def field_limit(self) -> float:
         """Square of the undistorted radius (dimensionless) up to which the lens model is one-to-one."""
         k1, k2, _, _, k3 = self.distortion
-        roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])  # d/dr of r (1 + k1 r² + k2 r⁴ + k3 r⁶), in r²
-        real = roots[np.abs(roots.imag) <= 1e-9 * np.abs(roots)].real
-        positive = real[real > 0]
-        return float(positive.min()) if len(positive) else np.inf
+        return smallest_positive_root([7 * k3, 5 * k2, 3 * k1, 1.0])  # d/dr of r (1 + k1 r² + k2 r⁴ + k3 r⁶), in r²
 
     def _distort(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         if not any(self.distortion):
@@ -118,3 +109,10 @@ class PinholeLens:
         xx, xy, yy = self._distortion_jacobian(x, y)
         inside = (x * x + y * y < self.field_limit) & (xx * yy - xy * xy > 0) & (xx + yy > 0)
         return inside & (error <= 1e-12 * (1 + np.hypot(x, y)))
+
+
+def smallest_positive_root(coefficients: list[float]) -> float:
+    """Of a polynomial, its highest power first; infinite where it has none."""
+    roots = np.roots(coefficients)
+    real = roots[np.abs(roots.imag) <= 1e-9 * np.abs(roots)].real
+    return float(real[real > 0].min(initial=np.inf))

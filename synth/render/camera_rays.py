@@ -239,8 +239,7 @@ def _centres(optics: Optics, camera: Camera) -> FloatArray:
 
     (H·W, 2) or (H·W, 3) float64, NaN where the lens does not look.
     """
-    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    local = optics.lens.directions(np.column_stack([columns.ravel(), rows.ravel()]))
+    local = optics.lens.directions(optics.centres)
     if camera.lens == "fisheye":
         return np.column_stack([local[:, :2], np.arctan2(np.hypot(local[:, 0], local[:, 1]), local[:, 2])])
     return local[:, :2] / local[:, 2:]

@@ -30,22 +30,23 @@ def reflection(mi: Any, coating: Coating, texture: Image, is_mono: bool) -> Any:
     """
     colors = texture[:, :, :3].mean(axis=2, keepdims=True) if is_mono else texture[:, :, :3]
     if texture.shape[2] == 3:
-        return mi.load_dict({"type": "twosided", "bsdf": _coat(mi, coating, colors)})
+        return mi.load_dict({"type": "twosided", "bsdf": coat(coating, _map(mi, colors))})
     bare = np.broadcast_to(np.array(coating.reflectance, dtype=np.float32), (2, 2, 3))[:, :, : colors.shape[2]]
     layers = {
         "type": "blendbsdf",
         "weight": _map(mi, texture[:, :, 3:]),
-        "coating": _coat(mi, coating, bare),
+        "coating": coat(coating, _map(mi, bare)),
         "marks": {"type": "diffuse", "reflectance": _map(mi, colors)},
     }
     return mi.load_dict({"type": "twosided", "bsdf": layers})
 
 
-def _coat(mi: Any, coating: Coating, colors: Image) -> dict[str, Any]:
+def coat(coating: Coating, color: dict[str, Any]) -> dict[str, Any]:
+    """Mitsuba's description of a coating alone, one-sided, with a colour or texture of reflectance."""
     if coating.is_matt:
-        return {"type": "diffuse", "reflectance": _map(mi, colors)}
+        return {"type": "diffuse", "reflectance": color}
     shine = {"roughness": coating.roughness, "metallic": coating.metallic}
-    return {"type": "principled", "base_color": _map(mi, colors), **shine}
+    return {"type": "principled", "base_color": color, **shine}
 
 
 def _map(mi: Any, values: Image) -> dict[str, Any]:

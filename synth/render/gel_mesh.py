@@ -1,17 +1,16 @@
 """The gel's surface in the renderer's frame.
 
 The scene's axes are a left-handed triple (+x right, +y down, +z toward the viewer); Mitsuba's are right-handed. So y is
-mirrored on the way in, for geometry, lights and camera alike, and nothing needs mirroring on the way out.
+mirrored in what Mitsuba gets, for geometry, lights and camera alike, and nothing needs mirroring in what it returns.
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.arrays import FloatArray, Points
-from synth.surface import GelSurface
+from synth.arrays import Points
+from synth.surface import GelSurface, vertex_normals
 
 MIRROR = np.array([1.0, -1.0, 1.0])
 """Componentwise factor from the scene's frame to the renderer's and back."""
@@ -49,19 +48,6 @@ class GelMesh:
 
         Mitsuba's own sums are atomic, so their rounding depends on the number of threads; this one's does not.
         """
-        a, b, c = (positions[corner] for corner in self.surface.triangles.T)
-        normals = self._incidence @ np.cross(b - a, c - a)
-        normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
-        # Components of a cross product of mirrored vectors: the mirrored components, negated.  The faces are turned
+        # Components of a cross product of mirrored vectors are the mirrored components, negated. The faces are turned
         # over as well, which negates once more.
-        return (normals * MIRROR).astype(np.float32).ravel()
-
-    @cached_property
-    def _incidence(self) -> FloatArray:
-        """Sparse (v, f) matrix of ones where a triangle touches a vertex."""
-        import scipy.sparse as sp
-
-        triangles = self.surface.triangles
-        columns = np.repeat(np.arange(len(triangles)), 3)
-        ones = np.ones(triangles.size)
-        return sp.csr_matrix((ones, (triangles.ravel(), columns)), shape=(len(self.surface.material), len(triangles)))
+        return (vertex_normals(positions, self.surface.triangles) * MIRROR).astype(np.float32).ravel()

@@ -53,7 +53,7 @@ def speckle_coverage(pattern: Speckle, x: FloatArray, y: FloatArray, rng: np.ran
     """Gaussian-filtered white noise, cut at the level that leaves `coverage` of the area above it.
 
     By Rice's formula a line crosses the level u (in standard deviations) exp(-u²/2) / (pi sqrt(2) sigma) times per
-    length, sigma being the filter's. With sigma = grain_mm / 4 and u = 0 its mean way through a grain is
+    length, sigma being the filter's. With sigma = grain_mm / 4 and u = 0 its mean chord through a grain is
     pi sqrt(2) sigma = 1.11 grain_mm.
 
     Args:

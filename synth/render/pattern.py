@@ -11,9 +11,6 @@ texture is laid on along z; its resolution is that at the apex.
 """
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import singledispatch
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +28,7 @@ _STEP_MM = 0.01
 MAX_TEXELS = 3072
 """Per axis; a finer pattern than this would not fit on many GPUs."""
 _STRIP = 32
-"""Rows of the texture that are worked on at a time."""
+"""Rows of the texture that are worked on at a time, so that they stay in the cache."""
 
 
 def albedo(sensor: Sensor, rng: np.random.Generator, folder: Path | None = None) -> Image:
@@ -52,47 +49,41 @@ def albedo(sensor: Sensor, rng: np.random.Generator, folder: Path | None = None)
     x, y = _texels(sensor)
     _check_detail(sensor.pattern, max(x[1] - x[0], y[1] - y[0]))
     coating = np.array(sensor.coating.reflectance)
-    canvas = _Canvas(x, y, coating, rng, folder or Path())
-    if not isinstance(sensor.pattern, Dots | Speckle | Bitmap):
-        return _stored(_paint(sensor.pattern, canvas))
-    colors, coverage = _mark(sensor.pattern, canvas)
-    if sensor.pattern.layer == "above_coating" and not sensor.coating.is_matt:
-        return _layered(colors, coverage)
+    match sensor.pattern:
+        case Dots() as pattern:
+            colors, coverage = np.array(pattern.reflectance), dots_coverage(pattern, x, y, rng)
+        case Speckle() as pattern:
+            colors, coverage = np.array(pattern.reflectance), speckle_coverage(pattern, x, y, rng)
+        case Bitmap() as pattern:
+            colors, coverage = laid_over(pattern, read_picture(pattern, folder or Path()), x, y)
+            colors = colors * coating
+        case RandomColor() as pattern:
+            return _clipped(_random_colors(pattern, x, y, rng) * coating)
+        case _:
+            return _clipped(np.broadcast_to(coating, (len(y), len(x), 3)))
+    if pattern.layer == "above_coating" and not sensor.coating.is_matt:
+        whole = np.broadcast_to(colors, (*coverage.shape, 3))
+        return np.concatenate([_clipped(whole), _clipped(coverage)[:, :, None]], axis=2)
     return _blended(coating, colors, coverage)
 
 
-def _stored(painted: FloatArray) -> Image:
-    """Values (rows, columns, 3) limited to [0, 1], as float32; like what follows in strips, which stay in the cache."""
-    texture: Image = np.empty(painted.shape, dtype=np.float32)
-    for strip in _strips(len(painted)):
-        texture[strip] = np.clip(painted[strip], 0, 1)
-    return texture
-
-
-def _layered(colors: FloatArray, coverage: FloatArray) -> Image:
-    """Marks' reflectance, (3,) or (rows, columns, 3), and coverage (rows, columns) side by side."""
-    texture: Image = np.empty((*coverage.shape, 4), dtype=np.float32)
-    whole = np.broadcast_to(colors, (*coverage.shape, 3))
-    for strip in _strips(len(coverage)):
-        texture[strip, :, :3] = np.clip(whole[strip], 0, 1)
-        texture[strip, :, 3] = np.clip(coverage[strip], 0, 1)
-    return texture
+def _clipped(values: FloatArray) -> Image:
+    """Values limited to [0, 1], as float32."""
+    texture: Image = np.empty(values.shape, dtype=np.float32)
+    return np.clip(values, 0, 1, out=texture, casting="unsafe")
 
 
 def _blended(coating: FloatArray, colors: FloatArray, coverage: FloatArray) -> Image:
     """The coating with marks over it: coating + coverage · (colors - coating), computed where anything is covered."""
     texture: Image = np.empty((*coverage.shape, 3), dtype=np.float32)
     texture[:] = np.clip(coating, 0, 1)
-    for strip in _strips(len(coverage)):
+    for first in range(0, len(coverage), _STRIP):
+        strip = slice(first, first + _STRIP)
         covered = np.flatnonzero(coverage[strip])
         share = coverage[strip].reshape(-1)[covered]
         mark = colors if colors.ndim == 1 else colors[strip].reshape(-1, 3)[covered]
         texture[strip].reshape(-1, 3)[covered] = np.clip(coating + share[:, None] * (mark - coating), 0, 1)
     return texture
-
-
-def _strips(rows: int) -> Iterator[slice]:
-    return (slice(first, first + _STRIP) for first in range(0, rows, _STRIP))
 
 
 def check_pattern(sensor: Sensor, folder: Path) -> None:
@@ -125,15 +116,10 @@ def _check_detail(pattern: Pattern, texel_mm: float) -> None:
     Raises:
         InputError: a spacing, cell or grain below one texel.
     """
-    match pattern:
-        case Dots(spacing_mm=spacing):
-            field, detail = "spacing_mm", min(spacing)
-        case RandomColor(cell_mm=cell):
-            field, detail = "cell_mm", cell
-        case Speckle(grain_mm=grain):
-            field, detail = "grain_mm", grain
-        case _:
-            return
+    field = {"dots": "spacing_mm", "random_color": "cell_mm", "speckle": "grain_mm"}.get(pattern.kind)
+    if field is None:
+        return
+    detail = float(np.min(getattr(pattern, field)))
     if detail < texel_mm:
         raise InputError(
             f"sensor.pattern.{field} = {detail}: far finer than this camera's pixels on the gel; "
@@ -162,7 +148,7 @@ def _scale(optics: Optics, sensor: Sensor) -> float:
         edges = (np.linspace(0, side, 13) for side in (sensor.camera.width, sensor.camera.height))
         pixels = np.column_stack([axis.ravel() for axis in np.meshgrid(*edges)])
     rays = optics.look(pixels)
-    points = rays.origins - rays.directions * (rays.origins[:, 2:] / rays.directions[:, 2:])
+    points = rays.on_flat_face
     with np.errstate(invalid="ignore"):
         seen = np.all(np.abs(points[:, :2]) <= np.array(sensor.gel.size_mm[:2]) / 2, axis=1)
     if not seen.any():
@@ -188,57 +174,13 @@ def is_grey(sensor: Sensor) -> bool:
     return all(color[0] == color[1] == color[2] for color in colors)
 
 
-@dataclass(frozen=True, eq=False)
-class _Canvas:
-    """What a pattern is painted on: texel centres x (columns,) and y (rows,) in mm, and the bare coating (3,)."""
+def _random_colors(pattern: RandomColor, x: FloatArray, y: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """(rows, columns, 3) square cells of random hue and value, each hue at least 1/8 turn from its neighbours'.
 
-    x: FloatArray
-    y: FloatArray
-    coating: FloatArray
-    rng: np.random.Generator
-    folder: Path
-
-
-@singledispatch
-def _mark(pattern: object, canvas: _Canvas) -> tuple[FloatArray, FloatArray]:
-    """Reflectance of the marks, (3,) or (rows, columns, 3), and the share that they cover, (rows, columns)."""
-    raise TypeError(f"no way to mark {type(pattern).__name__}")
-
-
-@_mark.register
-def _dots(pattern: Dots, canvas: _Canvas) -> tuple[FloatArray, FloatArray]:
-    return np.array(pattern.reflectance), dots_coverage(pattern, canvas.x, canvas.y, canvas.rng)
-
-
-@_mark.register
-def _speckle(pattern: Speckle, canvas: _Canvas) -> tuple[FloatArray, FloatArray]:
-    return np.array(pattern.reflectance), speckle_coverage(pattern, canvas.x, canvas.y, canvas.rng)
-
-
-@_mark.register
-def _bitmap(pattern: Bitmap, canvas: _Canvas) -> tuple[FloatArray, FloatArray]:
-    colors, coverage = laid_over(pattern, read_picture(pattern, canvas.folder), canvas.x, canvas.y)
-    return colors * canvas.coating, coverage
-
-
-@singledispatch
-def _paint(pattern: object, canvas: _Canvas) -> FloatArray:
-    """(rows, columns, 3) reflectance of a pattern that covers everything."""
-    raise TypeError(f"no way to paint {type(pattern).__name__}")
-
-
-@_paint.register
-def _bare(pattern: NoPattern, canvas: _Canvas) -> FloatArray:
-    return np.broadcast_to(canvas.coating, (len(canvas.y), len(canvas.x), 3))
-
-
-@_paint.register
-def _random_color(pattern: RandomColor, canvas: _Canvas) -> FloatArray:
-    """Square cells of random hue and value, each hue at least 1/8 turn from its left and upper neighbours'.
-
-    The coating's reflectance scales the colours, so that a white cell reflects what the bare coating would.
+    Of neighbours the left and the upper one count. The coating's reflectance scales the colours, so that a white cell
+    reflects what the bare coating would.
     """
-    x, y, rng, cell = canvas.x, canvas.y, canvas.rng, pattern.cell_mm
+    cell = pattern.cell_mm
     columns = math.ceil((x[-1] - x[0]) / cell) + 2
     rows = math.ceil((y[-1] - y[0]) / cell) + 2
     hue = rng.random((rows, columns))
@@ -256,7 +198,7 @@ def _random_color(pattern: RandomColor, canvas: _Canvas) -> FloatArray:
     offset = rng.random(2) * cell
     horizontal = _blend_matrix(x, x[0] - offset[0], cell, columns, pattern.softness_mm)
     vertical = _blend_matrix(y, y[0] - offset[1], cell, rows, pattern.softness_mm)
-    return np.einsum("yr,rxk->yxk", vertical, np.einsum("xc,rck->rxk", horizontal, colors)) * canvas.coating
+    return np.einsum("yr,rxk->yxk", vertical, np.einsum("xc,rck->rxk", horizontal, colors))
 
 
 def _hue_distance(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -74,9 +74,9 @@ class PolygonLight:
         import drjit as dr
 
         place = self._corner + self._sides[0] * offset.x + self._sides[1] * offset.y
-        way = place - point
-        square = dr.squared_norm(way)
-        cosines = dr.maximum(dr.dot(way, normal), 0) * dr.maximum(-dr.dot(way, self._front), 0)
+        arm = place - point
+        square = dr.squared_norm(arm)
+        cosines = dr.maximum(dr.dot(arm, normal), 0) * dr.maximum(-dr.dot(arm, self._front), 0)
         return self._mi.Point3f(place), cosines * self._area / dr.square(square)
 
     def _risen(self, rays: list[Any], heights: list[Any], normal: Any) -> Any:

@@ -5,9 +5,8 @@ the opaque coating and never part of it. For a frame only vertex positions and n
 are several sets of rays in that one scene.
 
 What it leaves out: light that the window's faces reflect back onto the gel, and light that the pad's sides reflect. The
-window's share is smooth, but not small: 3 to 22 % of the mean, most of it totally reflected. It comes on specular paths
-from small LEDs, which path tracing finds only by chance and then as bright specks: at 576 samples a pixel it raises the
-noise from 0.4 % to 6 % (deltact) and from 0.6 % to 110 % (the red LEDs of gelsight_mini). See docs/decisions.md.
+window's share is smooth, but not small; it comes on specular paths from small LEDs, which path tracing finds only by
+chance and then as bright specks (docs/decisions.md).
 
 Pixels are box-filtered. In vectorised variants the samples of one pixel are neighbours in the wavefront and are summed
 in a fixed order, not by atomic adds: the same seed gives the same bits with any number of threads.
@@ -33,7 +32,7 @@ from synth.scene import Coating, Render, Sensor
 from synth.surface import GelSurface
 
 _MAX_WAVEFRONT = 2**22
-"""Samples traced at once: 50 MB of results. A constant, because the split into passes decides the random numbers."""
+"""Samples traced at once. A constant, because the split into passes decides the random numbers."""
 
 _PILOT_SEEDS = (1, 2)
 
@@ -67,8 +66,6 @@ class Renderer:
                 _check_further(name, view)
         separated = is_separated(render, sensor.coating, variant)  # every light at every sample
         self._lit = 1 if separated else sum(light.power > 0 for light in sensor.lights)
-        wanted = render.samples_per_pixel
-        self._samples = full_grid(PILOT if wanted == "auto" else wanted, self._lit)
         self._mesh = GelMesh(surface, sensor.gel.size_mm[:2])
         mi = variant.load()
         gel = self._build_gel(mi, sensor.coating, albedo)
@@ -85,19 +82,16 @@ class Renderer:
         # A path through Mitsuba's window is one interaction longer than one that starts inside.
         depth = render.max_depth + (1 if not variant.is_vectorised and refracts else 0)
         self._integrator = mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": True})
-        self._sampler = mi.load_dict({"type": "multijitter", "sample_count": self._samples})
         if variant.is_vectorised:
             self._rays = {name: CameraRays(view, mi) for name, view in self._views.items()}
-        else:
-            self._sensors = {name: self._build_pinhole(mi, view) for name, view in self._views.items()}
-        if wanted == "auto":
-            self._choose_samples(mi, surface)
+        wanted = render.samples_per_pixel
+        self._set_samples(mi, PILOT if wanted == "auto" else wanted)
+        if wanted == "auto":  # fixed seeds, so that a sensor always gets the same number
+            first, second = (self.radiance(surface.material, seed) for seed in _PILOT_SEEDS)
+            self._set_samples(mi, needed_samples(first, second, self._views[""].camera, self._samples))
 
-    def _choose_samples(self, mi: Any, surface: GelSurface) -> None:
-        """From two pilots of the undeformed gel; fixed seeds, so that a sensor always gets the same number."""
-        first, second = (self.radiance(surface.material, seed) for seed in _PILOT_SEEDS)
-        needed = needed_samples(first, second, self._views[""].camera, self._samples)
-        self._samples = full_grid(needed, self._lit)
+    def _set_samples(self, mi: Any, wanted: int) -> None:
+        self._samples = full_grid(wanted, self._lit)
         self._sampler = mi.load_dict({"type": "multijitter", "sample_count": self._samples})
         if not self._variant.is_vectorised:
             self._sensors = {name: self._build_pinhole(mi, view) for name, view in self._views.items()}
@@ -253,7 +247,7 @@ def full_grid(samples: int, lights: int) -> int:
     """Samples per pixel rounded up to a full grid of nearly equal sides, and to a multiple of the number of lights.
 
     Multi-jittered sampling needs the grid. The multiple gives every light the same share of a pixel's samples, which
-    halves the noise (measured with three lights: 6 % at 35 samples, 3 % at 36).
+    about halves the noise.
     """
     while True:
         side = math.isqrt(samples)

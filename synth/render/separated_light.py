@@ -156,7 +156,7 @@ class SeparatedLight:
         return [color[channel] for channel in range(self._channels)]
 
     def _pilots(self, faces: int, seed: int) -> NDArray[np.uint32]:
-        """(faces, lights + 1) counts of a face's pilots that were blocked on their way to a light, or met the gel."""
+        """(faces, lights + 1) counts of a face's pilots that were blocked before a light, or met the gel."""
         import drjit as dr
 
         mi = self._mi
@@ -196,14 +196,14 @@ class SeparatedLight:
             ray, hit, active = self._onward(at, normal, dr.gather(mi.Point2f, sampler.next_2d(), start), True)
             offset = dr.gather(mi.Point2f, sampler.next_2d(), start)
             dr.eval(ray, hit, active, offset, start, share)  # at once: each gather alone would trace everything anew
-            kept = dr.compress(active)  # few paths meet the gel: only these go on
-            if dr.width(kept) == 0:
+            onward = dr.compress(active)  # few paths meet the gel: only these go on
+            if dr.width(onward) == 0:
                 break
-            ray, hit, offset, start = (dr.gather(type(x), x, kept) for x in (ray, hit, offset, start))
+            ray, hit, offset, start = (dr.gather(type(x), x, onward) for x in (ray, hit, offset, start))
             at = hit.compute_surface_interaction(ray)
             normal = -mi.Vector3f(at.sh_frame.n)
             albedo = self._albedo(at, mi.Bool(True))
-            share = [dr.gather(mi.Float, s, kept) * a for s, a in zip(share, albedo, strict=True)]
+            share = [dr.gather(mi.Float, s, onward) * a for s, a in zip(share, albedo, strict=True)]
             light = self._direct(at, normal, hit.prim_index, offset, mi.Bool(True))
             for sum_, s, e in zip(total, share, light, strict=True):
                 dr.scatter_add(sum_, s * e, start)

@@ -78,7 +78,6 @@ class Expectations(Part):
 
     elements: tuple[str, ...] = Field(min_length=1)
     budget_s: Annotated[float, Field(gt=0)]
-    not_covered: tuple[str, ...]
     case: tuple[Case, ...] = Field(min_length=1)
 
     @model_validator(mode="after")
@@ -88,9 +87,9 @@ class Expectations(Part):
             if names.count(name) > 1:
                 raise ValueError(f"there are two cases {name!r}")
         for case in self.case:
-            for told in (case, case.deviation):
-                if told and told.compare and told.compare.with_case not in names:
-                    raise ValueError(f"case {case.name!r} compares with {told.compare.with_case!r}, which is none")
+            for entry in (case, case.deviation):
+                if entry and entry.compare and entry.compare.with_case not in names:
+                    raise ValueError(f"case {case.name!r} compares with {entry.compare.with_case!r}, which is none")
         return self
 
 
@@ -173,8 +172,8 @@ def selected(runs: Sequence[Run], patterns: Sequence[str] | None) -> list[Run]:
 
 def compared(run: Run, runs: Sequence[Run]) -> list[Run]:
     """The runs that a run is compared with: the same element's, or the only one there is."""
-    told = [run.case.compare, run.case.deviation.compare if run.case.deviation else None]
-    names = {comparison.with_case for comparison in told if comparison}
+    comparisons = [run.case.compare, run.case.deviation.compare if run.case.deviation else None]
+    names = {comparison.with_case for comparison in comparisons if comparison}
     return [
         other
         for other in runs

@@ -76,7 +76,7 @@ class Verdict:
         return "OTHERWISE" if self.broken else "explained" if self.deviates else "as expected"
 
 
-def judged(result: Result, others: Mapping[str, Result]) -> Verdict:
+def evaluate(result: Result, others: Mapping[str, Result]) -> Verdict:
     """Check a result.
 
     Args:
@@ -173,7 +173,7 @@ def measured(result: Result) -> dict[str, float]:
     last = states[-1]
     force, side = last["force_n"], float(np.hypot(*last["force_n"][:2]))
     found = {
-        "states": float(len(states) - 1),
+        "states": len(states) - 1,
         "depth_mm": last["depth_mm"],
         "shear_x_mm": last["shear_mm"][0],
         "shear_y_mm": last["shear_mm"][1],
@@ -183,21 +183,19 @@ def measured(result: Result) -> dict[str, float]:
         "force_z_n": force[2],
         "side_ratio": side / abs(force[2]) if force[2] else 0.0,  # sideways over normal force
         "torque_z_nmm": last["torque_nmm"][2],
-        "displacement_mm": float(np.linalg.norm(result.arrays["displacement"][-1], axis=1).max()),
+        "displacement_mm": np.linalg.norm(result.arrays["displacement"][-1], axis=1).max(),
         "penetration_mm": max(state["max_penetration_mm"] for state in states),
         "min_jacobian": min(state["min_jacobian"] for state in states),
-        "corner_jacobian": min(_corner_jacobian(result, moved) for moved in result.arrays["displacement"]),
+        "corner_jacobian": min(
+            smallest_jacobian(result.arrays["points"], result.arrays["nodes"], moved, np.eye(4))
+            for moved in result.arrays["displacement"]
+        ),
         "residual": max(state["residual"] for state in states),
-        "iterations": float(sum(state["newton_iterations"] for state in states)),
+        "iterations": sum(state["newton_iterations"] for state in states),
     }
     if "slip_ratio" in last:
         found["slip_ratio"] = last["slip_ratio"]
     return {name: float(value) for name, value in found.items()}
-
-
-def _corner_jacobian(result: Result, displacement: FloatArray) -> float:
-    """Smallest det F of a state at the vertices of the elements."""
-    return smallest_jacobian(result.arrays["points"], result.arrays["nodes"], displacement, np.eye(4))
 
 
 def differences(

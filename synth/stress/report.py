@@ -1,20 +1,16 @@
-"""The suite's results as a table, CSV, JSON and Markdown."""
+"""The suite's results as a table, CSV and JSON."""
 
 import csv
 import io
 import json
-import os
 import platform
-import shlex
 from collections.abc import Sequence
 from importlib.metadata import version
-from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from synth import __version__
 from synth.dataset.storage import replace_file
-from synth.stress.cases import Expectation, Expectations
 from synth.stress.check import Verdict
 
 if TYPE_CHECKING:
@@ -57,14 +53,13 @@ def record(verdicts: Sequence[Verdict], seconds: float) -> dict[str, Any]:
     return {
         "ok": all(verdict.ok for verdict in verdicts),
         "seconds": round(seconds, 1),
-        "software": software(),
+        "software": {
+            "synth": __version__,
+            "python": platform.python_version(),
+            **{name: version(name) for name in PACKAGES},
+        },
         "cases": [row(verdict) for verdict in verdicts],
     }
-
-
-def software() -> dict[str, str]:
-    """Versions that results may depend on."""
-    return {"synth": __version__, "python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
 
 
 def summary(verdicts: Sequence[Verdict], seconds: float) -> str:
@@ -95,41 +90,26 @@ def remarks(verdicts: Sequence[Verdict]) -> list[str]:
     return [f"{v.result.run.name}: {v.word}: {_remark(v)}" for v in verdicts if v.word != "as expected"]
 
 
-def write_report(
-    out: Path, verdicts: Sequence[Verdict], expectations: Expectations, only: Sequence[str] | None, seconds: float
-) -> None:
-    """Write stress.csv, stress.json and stress.md.
+def write_report(out: Path, verdicts: Sequence[Verdict], found: dict[str, Any]) -> None:
+    """Write stress.csv and stress.json, the latter from `record`.
 
     Raises:
         InputError: the storage refuses.
     """
-    replace_file(out / "stress.csv", _csv(verdicts).encode("utf-8"))
-    replace_file(out / "stress.json", json.dumps(record(verdicts, seconds), indent=1).encode("utf-8"))
-    replace_file(out / "stress.md", _markdown(out, verdicts, expectations, only, seconds).encode("utf-8"))
-
-
-def _csv(verdicts: Sequence[Verdict]) -> str:
     text = io.StringIO()
     writer = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     for verdict in verdicts:
-        joined = {k: "; ".join(v) if isinstance(v, list) else v for k, v in row(verdict).items()}
-        writer.writerow(joined)
-    return text.getvalue()
+        writer.writerow({k: "; ".join(v) if isinstance(v, list) else v for k, v in row(verdict).items()})
+    replace_file(out / "stress.csv", text.getvalue().encode("utf-8"))
+    replace_file(out / "stress.json", json.dumps(found, indent=1).encode("utf-8"))
 
 
 def _numbers(verdict: Verdict) -> list[str]:
-    """Force, penetration, det F, iterations and seconds as they stand in a table."""
+    """Force, penetration, det F, iterations and seconds as they stand in the table; blanks without a state."""
+    forms = {"force_z_n": ".4g", "penetration_mm": ".2g", "min_jacobian": ".3f", "iterations": ".0f"}
     found = verdict.measured
-    shown = []
-    if found:
-        shown = [
-            f"{found['force_z_n']:.4g}",
-            f"{found['penetration_mm']:.2g}",
-            f"{found['min_jacobian']:.3f}",
-            f"{found['iterations']:.0f}",
-        ]
-    return [*(shown or ["", "", "", ""]), f"{verdict.result.wall_s:.1f}"]
+    return [*(f"{found[key]:{form}}" if found else "" for key, form in forms.items()), f"{verdict.result.wall_s:.1f}"]
 
 
 def _remark(verdict: Verdict) -> str:
@@ -138,63 +118,3 @@ def _remark(verdict: Verdict) -> str:
     if verdict.broken:
         return "; ".join(verdict.broken)
     return deviation.because if deviation and verdict.deviates else verdict.result.message
-
-
-def _markdown(
-    out: Path, verdicts: Sequence[Verdict], expectations: Expectations, only: Sequence[str] | None, seconds: float
-) -> str:
-    command = shlex.join(["python", "-m", "synth", "stress", *(x for name in only or () for x in ("--only", name))])
-    packages = ", ".join(f"{name} {number}" for name, number in software().items())
-    lines = [
-        "# Stiff and extreme cases",
-        "",
-        f"Made by `{command} --out DIR` ({packages}; {os.cpu_count()} cores). {summary(verdicts, seconds)}.",
-        "",
-        "Each run is the scene `scenes/extreme/base.toml` with the changes that `scenes/extreme/expected.toml` lists "
-        "beside the outcome, written down before the case was first run. It has a process and a time budget of its "
-        "own, and is judged from what it left: it must have ended by itself and without a traceback, with a reason "
-        "where it is not "
-        "complete; every recorded state must be finite, converged to its tolerance, and have det F > 0, also when "
-        "computed again from the stored displacements.",
-        "",
-        "![Contact surfaces after the last recorded state](stress.png)",
-    ]
-    for group, members in groupby(verdicts, key=lambda verdict: verdict.result.run.case.group):
-        lines += ["", f"## {group[0].upper()}{group[1:]}", ""]
-        lines += ["| case | expected | ended | N | penetration, mm | det F | iter. | s |", "|---" * 8 + "|"]
-        told: list[str] = []
-        listed = list(members)
-        for verdict in listed:
-            case = verdict.result.run.case
-            ended = verdict.result.outcome + ("" if verdict.word == "as expected" else f" (**{verdict.word}**)")
-            cells = (f"`{verdict.result.run.name}`", _expected(case), ended, *_numbers(verdict))
-            lines.append(f"| {' | '.join(cells)} |")
-        for name in dict.fromkeys(verdict.result.run.case.name for verdict in listed):
-            told += _told([verdict for verdict in listed if verdict.result.run.case.name == name])
-        lines += ["", *told]
-    lines += ["", "## What is not covered", "", *(f"- {text}" for text in expectations.not_covered), ""]
-    return "\n".join(lines)
-
-
-def _expected(case: Expectation) -> str:
-    """Outcome and figures of an entry in a few words."""
-    parts = [" or ".join(case.outcome)]
-    parts += [f"{name} {low:g}..{high:g}" for name, (low, high) in case.bounds.items()]
-    if case.compare is not None:
-        same = "" if case.compare.displacement is None else f"displacement within {case.compare.displacement:g}"
-        ratio = "" if case.compare.force_ratio is None else "force x {:.6g}..{:.6g}".format(*case.compare.force_ratio)
-        parts.append(f"of `{case.compare.with_case}`: {', '.join(filter(None, (same, ratio)))}")
-    return "; ".join(parts)
-
-
-def _told(verdicts: Sequence[Verdict]) -> list[str]:
-    """One case in sentences: why it is there, what was changed, and what it said."""
-    case = verdicts[0].result.run.case
-    changed = [f"`--set '{text}'`" for text in case.set]
-    changed += [f"mesh: {case.mesh}"] if case.mesh != "as made" else []
-    changed += [f"indenter file: {case.surface}"] if case.surface else []
-    lines = [f"- **{case.name}**: {case.why}.{' ' if changed else ''}{', '.join(changed)}"]
-    for verdict in verdicts:
-        if remark := _remark(verdict):
-            lines.append(f"  - {verdict.result.run.element}, {verdict.word}: {remark}".replace("\n", " / "))
-    return lines

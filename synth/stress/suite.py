@@ -1,4 +1,4 @@
-"""Running the cases: each in a process that is killed when its budget is spent, then judged from what it left."""
+"""Running the cases: each in a process that is killed when its budget is spent, then evaluated from what it left."""
 
 import contextlib
 import json
@@ -16,14 +16,14 @@ import numpy as np
 
 from synth.dataset.storage import refuse_foreign, storage_errors
 from synth.stress.cases import EXTREME, Run, all_runs, compared, load_expectations, selected
-from synth.stress.check import Result, judged
+from synth.stress.check import Result, evaluate
 
 Report = Callable[[Result], None]
 WORKER = (sys.executable, "-m", "synth.stress.worker")
 
 
 def run_stress(out: Path, only: Sequence[str] | None, workers: int, as_json: bool, scenes: Path = EXTREME) -> int:
-    """Run the cases and write stress.csv, stress.json, stress.md and stress.png.
+    """Run the cases and write stress.csv and stress.json.
 
     Args:
         out: directory for these, for the meshes, and for a folder per run.
@@ -42,26 +42,23 @@ def run_stress(out: Path, only: Sequence[str] | None, workers: int, as_json: boo
 
     from synth.progress import progress
     from synth.stress.report import outcome_table, record, remarks, summary, write_report
-    from synth.stress.sheet import write_sheet
 
-    others = [out / f"stress.{suffix}" for suffix in ("csv", "json", "png")]
-    refuse_foreign(out / "stress.md", b"synth stress", *others)
+    refuse_foreign(out / "stress.json", b'"software"', out / "stress.csv")
     expectations = load_expectations(scenes / "expected.toml")
     runs = selected(all_runs(expectations, (scenes / "base.toml").resolve()), only)
     started = time.perf_counter()
     done = count(1)
     with progress("stress: cases", len(runs)) as advance:
         results = all_results(runs, out, workers, lambda _: advance(next(done), len(runs)))
-    verdicts = [judged(result, comparable(result, results)) for result in results]
-    seconds = time.perf_counter() - started
-    write_report(out, verdicts, expectations, only, seconds)
-    write_sheet(verdicts, out / "stress.png")
+    verdicts = [evaluate(result, comparable(result, results)) for result in results]
+    found = record(verdicts, time.perf_counter() - started)
+    write_report(out, verdicts, found)
     if as_json:
-        print(json.dumps(record(verdicts, seconds)))
+        print(json.dumps(found))
     else:
         shown = Console()
         shown.print(outcome_table(verdicts))
-        for line in ["", *remarks(verdicts), f"{summary(verdicts, seconds)}: {out / 'stress.md'}"]:
+        for line in ["", *remarks(verdicts), f"{summary(verdicts, found['seconds'])}: {out / 'stress.json'}"]:
             shown.print(line, markup=False, highlight=False, soft_wrap=True)
     return 0 if all(verdict.ok for verdict in verdicts) else 1
 
@@ -103,7 +100,7 @@ def result_of(run: Run, folder: Path, meshes: Path, worker: Sequence[str] = WORK
     Args:
         run: what to run.
         folder: emptied, then holds run.json, log.txt and what the process writes.
-        meshes: where meshes are kept.
+        meshes: where meshes are cached.
         worker: the command; folder and meshes are appended.
     """
     with storage_errors(folder):
@@ -111,9 +108,9 @@ def result_of(run: Run, folder: Path, meshes: Path, worker: Sequence[str] = WORK
             refuse_foreign(folder / "run.json", b'"element"', *folder.iterdir())
             shutil.rmtree(folder)
         folder.mkdir(parents=True)
-        told = {"element": run.element, "budget_s": run.budget_s, "base": str(run.base)}
-        told["case"] = run.case.model_dump(mode="json", by_alias=True)
-        (folder / "run.json").write_text(json.dumps(told), encoding="utf-8")
+        task = {"element": run.element, "budget_s": run.budget_s, "base": str(run.base)}
+        task["case"] = run.case.model_dump(mode="json", by_alias=True)
+        (folder / "run.json").write_text(json.dumps(task), encoding="utf-8")
     started, status = time.perf_counter(), None
     with (folder / "log.txt").open("wb") as log, contextlib.suppress(subprocess.TimeoutExpired):
         command = [*worker, str(folder), str(meshes)]

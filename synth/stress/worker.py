@@ -68,8 +68,6 @@ def saved(scene: Scene, mesh: PadMesh, trajectory: Trajectory, folder: Path) -> 
         traction=np.array([state.traction for state in trajectory.states]),
         points=space.points,
         nodes=space.nodes,
-        surface_nodes=space.surface_nodes,
-        surface_faces=space.surface.faces,
     )
     return {
         "outcome": trajectory.status,

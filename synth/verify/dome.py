@@ -1,6 +1,6 @@
 r"""Is the undeformed face of a domed gel the sphere that the scene says? By rays that meet it in closed form.
 
-From where the light of a pixel leaves the body (`ForwardCamera.entrances`) its way back is a straight line e + t w,
+From where the light of a pixel leaves the body (`ForwardCamera.entrances`) it is followed back along the line e + t w,
 which meets the sphere of radius R about c = (0, 0, R) last, at the face, where
 
 .. math::  t = -b + \sqrt{b^2 - |e - c|^2 + R^2}, \qquad b = w \cdot (e - c).
@@ -52,12 +52,12 @@ def check_dome(camera: ForwardCamera, surface: GelSurface, radius_mm: float, ima
         at = path == number
         start[at] = camera.entrances(found[at], number)
     reach = np.linalg.norm(found - start, axis=1)
-    way = (found - start) / reach[:, None]
+    direction = (found - start) / reach[:, None]
     arm = start - (0.0, 0.0, radius_mm)
-    b = (way * arm).sum(axis=1)
+    b = (direction * arm).sum(axis=1)
     with np.errstate(invalid="ignore"):
         t = -b + np.sqrt(b**2 - (arm**2).sum(axis=1) + radius_mm**2)
-    cosine = ((arm + t[:, None] * way) * way).sum(axis=1) / radius_mm
+    cosine = ((arm + t[:, None] * direction) * direction).sum(axis=1) / radius_mm
     corners = surface.material[surface.triangles[seen.triangle[on_gel]]]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     bound = _sinking(surface, longest, np.hypot(found[:, 0], found[:, 1]), radius_mm) / cosine + LEAST_MM

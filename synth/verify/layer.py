@@ -117,8 +117,8 @@ class Layer:
             weights = (
                 np.column_stack([_cross(c - b, q - b), _cross(a - c, q - c), _cross(b - a, q - a)]) / area[:, None]
             )
-            kept = (weights >= -self._reach[triangle] - 1e-6).all(1)
-        return query[kept], triangle[kept], weights[kept]
+            near = (weights >= -self._reach[triangle] - 1e-6).all(1)
+        return query[near], triangle[near], weights[near]
 
     def _solve(
         self, queries: Pixels, triangle: NDArray[np.intp], weights: FloatArray

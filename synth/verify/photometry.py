@@ -27,14 +27,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.arrays import BoolArray, FloatArray
+from synth.dataset.images import Raster
 from synth.flow.field import FlowArray
 from synth.scene import Camera, NoPattern, Sensor
 from synth.verify.report import Check
 
 NAME = "image 2 warped to image 1"
 ALLOWANCE_PX = 0.15
-"""For what is not the sensor's noise. Simulated presses under the shipped scenes leave
-0.03 to 0.07 px; their flow reversed or its U and V exchanged leave 0.3 px and more, unless it is small."""
+"""For what is not the sensor's noise: shading, rendering noise and interpolation."""
 _NOISE_FACTOR = 1.5
 """The median of 60 values scatters by 15 % of itself: three standard deviations."""
 _FEWEST = 60
@@ -44,14 +44,12 @@ _SMOOTHING_PX = 1.0
 _SHADING_PX = 3.0
 _BENT_PX = 0.1
 _MOST_BENT = 0.5
-"""The check applies if at most this share of the textured blocks bends so. In the shipped scenes, at their sizes, it is
-0.42 and less; where it was more, in images of 64 x 48 px, right flows left up to 0.5 px."""
+"""The check applies if at most this share of the textured blocks bends so."""
 _TEXTURE_IN_NOISE = 6.0
 """A pixel is textured if moving by 1 px changes it by more than so many standard deviations of the difference..."""
 _TEXTURE_IN_EDGES = 0.25
 """... and by more than this share of what the pattern's strongest edges change, relative to the brightness around."""
 
-Raster = NDArray[np.uint8] | NDArray[np.uint16]
 Textured = tuple[FloatArray, FloatArray, NDArray[np.intp], NDArray[np.intp]]
 
 
@@ -66,7 +64,7 @@ def check_photometry(sensor: Sensor, image1: Raster, image2: Raster, flow: FlowA
         visible: (H, W).
     """
     if isinstance(sensor.pattern, NoPattern):
-        return Check(NAME, None, ALLOWANCE_PX, "px", "not applicable: the coating is bare")
+        return _not_applicable(ALLOWANCE_PX, "the coating is bare")
     usable = _usable(flow, visible)
     side = min(usable.shape) // _BLOCKS
     pairs = _channels(image1, image2)
@@ -76,13 +74,11 @@ def check_photometry(sensor: Sensor, image1: Raster, image2: Raster, flow: FlowA
     )
     common = sorted(moved.keys() & still.keys(), key=lambda block: -still[block][0])
     if not common:
-        return Check(
-            NAME, None, ALLOWANCE_PX, "px", "not applicable: no block has enough texture that stands out of the noise"
-        )
+        return _not_applicable(ALLOWANCE_PX, "no block has enough texture that stands out of the noise")
     bent = len(_bent_blocks(flow, usable, side) & set(common))
     if bent > _MOST_BENT * len(common):
         found = f"in {bent} of {len(common)} textured blocks the motion bends too fast for the image's resolution"
-        return Check(NAME, None, ALLOWANCE_PX, "px", f"not applicable: {found}")
+        return _not_applicable(ALLOWANCE_PX, found)
     most = common[: max(1, len(common) // 4)]
     figure, noise, unmoved = (
         float(np.median([column[b][i] for b in most])) for column, i in ((moved, 0), (moved, 1), (still, 0))
@@ -90,8 +86,12 @@ def check_photometry(sensor: Sensor, image1: Raster, image2: Raster, flow: FlowA
     detail = f"{len(most)} of {len(common)} textured blocks; without motion {unmoved:.2g} px"
     tolerance = ALLOWANCE_PX + _NOISE_FACTOR * 0.6745 * noise
     if figure > tolerance and unmoved < 2 * tolerance:
-        return Check(NAME, None, tolerance, "px", f"not applicable: too little motion to tell ({detail})")
+        return _not_applicable(tolerance, f"too little motion to tell ({detail})")
     return Check(NAME, figure, tolerance, "px", detail)
+
+
+def _not_applicable(tolerance: float, why: str) -> Check:
+    return Check(NAME, None, tolerance, "px", f"not applicable: {why}")
 
 
 def _bent_blocks(flow: FlowArray, usable: BoolArray, side: int) -> set[tuple[int, int]]:

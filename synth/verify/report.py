@@ -1,6 +1,5 @@
 """What verification found: every figure beside its tolerance."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -66,23 +65,10 @@ class Report:
 
     def record(self) -> dict[str, Any]:
         """JSON-able: path, ok, and for each sample its checks; a figure that is not finite becomes None."""
+        keys = ("name", "figure", "tolerance", "unit", "passed", "detail")
         samples = [
-            {
-                "index": sample.index,
-                "ok": sample.ok,
-                "checks": [
-                    {
-                        "name": c.name,
-                        "figure": c.figure,
-                        "tolerance": c.tolerance,
-                        "unit": c.unit,
-                        "passed": c.passed,
-                        "detail": c.detail,
-                    }
-                    for c in sample.checks
-                ],
-            }
-            for sample in self.samples
+            {"index": one.index, "ok": one.ok, "checks": [{key: getattr(c, key) for key in keys} for c in one.checks]}
+            for one in self.samples
         ]
         return {"path": str(self.path), "ok": self.ok, "samples": jsonable(samples)}
 
@@ -91,48 +77,36 @@ class Report:
         from rich.table import Table
         from rich.text import Text
 
+        if not self.samples:
+            caption = "no finished sample to verify"
+        else:
+            failed = [str(sample.index) for sample in self.samples if not sample.ok]
+            more = f" and {len(failed) - 10} more" if len(failed) > 10 else ""
+            caption = f"failed: samples {', '.join(failed[:10])}{more}" if failed else _AGREED
         title = Text(f"{self.path}: {len(self.samples)} samples", style="table.title")
-        table = Table(title=title, caption=self._caption(), caption_justify="left")
+        table = Table(title=title, caption=caption, caption_justify="left")
         for column, justify in (("check", "left"), ("worst", "right"), ("tolerance", "right"), ("sample", "right")):
             table.add_column(column, justify=justify)  # type: ignore[arg-type]
         table.add_column("")
-        for rows in self._by_name().values():
-            applied = [(index, check) for index, check in rows if check.figure is not None]
-            if not applied:
-                table.add_row(rows[0][1].name, "-", "", "", Text(rows[0][1].detail))
-                continue
+        every = [(sample.index, check) for sample in self.samples for check in sample.checks]
+        for name in dict.fromkeys(check.name for _, check in every):
+            rows = [(index, check) for index, check in every if check.name == name]
+            # The worst is one that failed, or the one nearest to its tolerance; a check may not apply anywhere.
             index, worst = max(
-                applied, key=lambda row: (not row[1].passed, (row[1].figure or 0) / (row[1].tolerance or 1))
+                rows,
+                key=lambda row: (
+                    not row[1].passed,
+                    -1 if (f := row[1].figure) is None else f / (row[1].tolerance or 1),
+                ),
             )
+            if worst.figure is None:
+                table.add_row(name, "-", "", "", Text(rows[0][1].detail))
+                continue
             verdict = "[green]passed" if worst.passed else "[red]FAILED"
-            table.add_row(
-                worst.name, _number(worst.figure, worst.unit), _number(worst.tolerance, worst.unit), str(index), verdict
-            )
-        for sample in self.samples:
-            for check in sample.checks:
-                if not check.passed:
-                    name, detail = Text(check.name, style="red"), Text(check.detail)
-                    table.add_row(name, _number(check.figure, check.unit), "", str(sample.index), detail)
+            figures = (f"{value:.3g} {worst.unit}" for value in (worst.figure, worst.tolerance))
+            table.add_row(name, *figures, str(index), verdict)
+        for index, check in every:
+            if not check.passed:
+                shown = Text(check.name, style="red")
+                table.add_row(shown, f"{check.figure:.3g} {check.unit}", "", str(index), Text(check.detail))
         return table
-
-    def _by_name(self) -> dict[str, list[tuple[int, Check]]]:
-        rows: dict[str, list[tuple[int, Check]]] = {}
-        for sample in self.samples:
-            for check in sample.checks:
-                rows.setdefault(check.name, []).append((sample.index, check))
-        return rows
-
-    def _caption(self) -> str:
-        if not self.samples:
-            return "no finished sample to verify"
-        failed = [sample.index for sample in self.samples if not sample.ok]
-        return f"failed: samples {_list(failed)}" if failed else _AGREED
-
-
-def _number(value: float | None, unit: str) -> str:
-    return "-" if value is None else f"{value:.3g} {unit}"
-
-
-def _list(indices: Sequence[int]) -> str:
-    shown = ", ".join(str(i) for i in indices[:10])
-    return shown + (f" and {len(indices) - 10} more" if len(indices) > 10 else "")

@@ -61,13 +61,10 @@ class Sheet:
         z = np.einsum("ni,ni->n", weights, self.positions[self.triangles[triangle], 2])
         order = np.lexsort((triangle, -z, query))
         query, first = np.unique(query[order], return_index=True)
-        best = order[first]
-        count = len(queries)
-        seen = Seen(
-            np.full(count, -1), np.full((count, 3), np.nan), np.full(count, -np.inf), np.zeros(count, dtype=np.intp)
-        )
-        seen.triangle[query], seen.weights[query], seen.z[query] = triangle[best], weights[best], z[best]
-        seen.path[query] = path[best]
+        best, n = order[first], len(queries)
+        seen = Seen(np.full(n, -1), np.full((n, 3), np.nan), np.full(n, -np.inf), np.zeros(n, dtype=np.intp))
+        for field, values in ((seen.triangle, triangle), (seen.weights, weights), (seen.z, z), (seen.path, path)):
+            field[query] = values[best]
         return seen
 
     def pixels(self, points: Points, path: NDArray[np.intp]) -> Pixels:
@@ -99,6 +96,6 @@ class Sheet:
         query, triangle, weights = layer.found(queries)
         if self.camera.plates:
             points = np.einsum("ni,nic->nc", weights, self.positions[self.triangles[triangle]])
-            kept = self.camera.reaches(points, layer.path)
-            query, triangle, weights = query[kept], triangle[kept], weights[kept]
+            free = self.camera.reaches(points, layer.path)
+            query, triangle, weights = query[free], triangle[free], weights[free]
         return query, triangle, weights, np.full(len(query), layer.path)

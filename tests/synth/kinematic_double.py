@@ -67,5 +67,11 @@ def rigid(matrix: FloatArray, shift: tuple[float, float, float]) -> Callable[[Po
     return lambda points: points @ matrix.T + np.array(shift)
 
 
+def dented(points: Points, depth: float, shear: tuple[float, float] = (0.0, 0.0)) -> Points:
+    """With a dent of some 3 mm radius beside the middle, carried along."""
+    dent = np.exp(-((points[:, :2] - (0.4, -0.3)) ** 2).sum(1) / 9.0)
+    return points + np.outer(dent, [*shear, depth])
+
+
 def pixel_centres(width: int = WIDTH, height: int = HEIGHT) -> FloatArray:
     return np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1)

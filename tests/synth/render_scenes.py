@@ -1,11 +1,20 @@
 """Small sensors for the tests of rendering: a flat pad, one light, and every number known."""
 
-import numpy as np
+from collections.abc import Callable
 
-from synth.arrays import Image
+import numpy as np
+import pytest
+
+from synth.arrays import Image, Points
+from synth.render.renderer import Renderer
+from synth.render.variant import Variant, choose_variant
 from synth.scene import Camera, Coating, Gel, Light, NoPattern, Pattern, Render, Sensor, Window
 from synth.surface import ContactFaces, GelSurface
 
+FAST = choose_variant("cpu")
+SCALAR = Variant("scalar_rgb", "test")
+VARIANTS = [FAST, SCALAR] if FAST.is_vectorised else [SCALAR]
+needs_llvm = pytest.mark.skipif(not FAST.is_vectorised, reason="no LLVM of version 16 or newer here")
 DIRECT = Render(samples_per_pixel=36, max_depth=2)
 
 
@@ -43,6 +52,32 @@ def flat_surface(sensor: Sensor, cells: int = 12) -> GelSurface:
 def plain(value: float = 0.6) -> Image:
     """A texture of one reflectance."""
     return np.full((4, 4, 3), value, dtype=np.float32)
+
+
+def rendered(
+    sensor: Sensor,
+    texture: Image | None = None,
+    render: Render = DIRECT,
+    variant: Variant = FAST,
+    seed: int = 0,
+    positions: Points | None = None,
+    cells: int = 12,
+) -> Image:
+    """The radiance of the sensor's gel, flat unless positions of its surface's vertices are given."""
+    surface = flat_surface(sensor, cells)
+    renderer = Renderer(sensor, render, surface, plain() if texture is None else texture, variant)
+    return renderer.radiance(surface.material if positions is None else positions, seed)
+
+
+def kernels_compiled(frame: Callable[[], object]) -> int:
+    """How many kernels Dr.Jit compiles for what is rendered in `frame`; needs `JitFlag.KernelHistory`."""
+    import drjit as dr
+
+    dr.kernel_history_clear()
+    frame()
+    kernels = [kernel for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT]
+    assert kernels
+    return sum(not kernel["cache_hit"] for kernel in kernels)
 
 
 def refracted_pixel(sensor: Sensor, x: float, y: float) -> tuple[float, float]:

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
-from render_scenes import small_sensor
+from render_scenes import FAST, needs_llvm, small_sensor
 
 from synth.arrays import FloatArray
+from synth.calibrate.dot_grid import grid_index, pattern_points
 from synth.calibrate.dots import find_dots
 from synth.calibrate.frames import Frames, read_frames
 from synth.calibrate.irradiance import FlatGel, LightGeometry
-from synth.calibrate.lattice import lattice_index, pattern_points
 from synth.calibrate.noise import fit_noise
 from synth.calibrate.profile import fit_profile
 from synth.calibrate.run import MARK
@@ -28,12 +28,9 @@ from synth.optics import Optics
 from synth.render.camera_image import camera_image
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
-from synth.render.variant import choose_variant
 from synth.scene import Camera, Coating, Dots, Light, Render, Sensor
 from synth.scene.template import load_scene
 
-FAST = choose_variant("cpu")
-needs_llvm = pytest.mark.skipif(not FAST.is_vectorised, reason="no LLVM of version 16 or newer here")
 CLIPS = Path(__file__).parents[3] / "shared/real/gelsight_mini/clips"
 POWERS = np.array([[420.0, 80, 30], [60, 390, 90], [45, 120, 510]])
 
@@ -75,7 +72,7 @@ def _frame(sensor: Sensor) -> FloatArray:
 
 
 def _frames(image: FloatArray) -> Frames:
-    return Frames(image, image, 1, 1 / 255)
+    return Frames(image, image, 1 / 255)
 
 
 @pytest.fixture(scope="module")
@@ -266,19 +263,7 @@ def test_a_frame_without_dots_and_dots_without_a_grid_are_refused() -> None:
     with pytest.raises(InputError, match="0 whole dark dots"):
         find_dots(np.full((120, 160, 3), 0.3), 15.0)
     with pytest.raises(InputError, match="grid"):
-        lattice_index(np.random.default_rng(0).uniform(0, 100, (12, 2)))
-
-
-@pytest.mark.parametrize("spacing", ["-3", "nan", "0", "0.1", "100", "inf"])
-def test_a_spacing_that_no_dots_have_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], spacing: str
-) -> None:
-    cv2.imwrite(str(tmp_path / "frame.png"), np.zeros((24, 32, 3), dtype=np.uint8))
-    command = ["calibrate", "--frames", str(tmp_path / "frame.png"), "--out", str(tmp_path / "out")]
-    assert main([*command, f"--spacing-mm={spacing}"]) == 2
-    assert f"--spacing-mm = {spacing}: must be from 0.458 to 7.32 mm" in capsys.readouterr().err
-    assert main([*command, "--scene", "digit", "--spacing-mm=1"]) == 2
-    assert "has no dots" in capsys.readouterr().err
+        grid_index(np.random.default_rng(0).uniform(0, 100, (12, 2)))
 
 
 @pytest.mark.parametrize("radius", [0.5, 0.9])
@@ -288,23 +273,6 @@ def test_dots_of_a_pixel_are_refused(radius: float) -> None:
     frame = np.repeat(0.5 * np.clip(away - radius + 0.5, 0.1, 1)[..., None], 3, axis=2)
     with pytest.raises(InputError, match=r"radius of .* px, needed is more than 1 px"):
         fit_profile(find_dots(frame, 5.0))
-
-
-@needs_llvm
-@pytest.mark.parametrize(
-    ("level", "message"),
-    [(0, "are the frames black"), (255, "overexposed"), (None, "they give sensor.camera.shot_noise = ")],
-)
-def test_frames_that_tell_nothing_of_the_lights_are_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], level: int | None, message: str
-) -> None:
-    noise = np.random.default_rng(0).integers(0, 256, (60, 80, 3))
-    cv2.imwrite(str(tmp_path / "frame.png"), (noise if level is None else np.full((60, 80, 3), level)).astype(np.uint8))
-    command = ["calibrate", "--scene", "digit", "--steps", "0", "--out", str(tmp_path / "out")]
-    assert main([*command, "--set", "render.samples_per_pixel=1", "--frames", str(tmp_path / "frame.png")]) == 2
-    said = capsys.readouterr().err
-    assert message in said
-    assert "scene.toml" not in said
 
 
 @pytest.mark.parametrize(
@@ -318,18 +286,48 @@ def test_calibration_replaces_neither_anothers_scene_nor_its_own_start(
     scene = tmp_path / "scene.toml"
     scene.write_text(first + toml_text(_preset()))
     before = scene.read_bytes()
-    cv2.imwrite(str(tmp_path / "frame.png"), np.zeros((24, 32, 3), dtype=np.uint8))
-    frames = ["--frames", str(tmp_path / "frame.png")]
-    assert main(["calibrate", *frames, "--scene", str(scene), "--out", str(tmp_path)]) == 2
-    assert message in capsys.readouterr().err
+    assert message in _said(tmp_path, capsys, "--scene", str(scene))
     assert scene.read_bytes() == before
 
 
-def test_a_preset_that_calibration_does_not_know_is_refused(tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "frame.png"), np.zeros((24, 32, 3), dtype=np.uint8))
-    command = ["calibrate", "--frames", str(tmp_path / "frame.png"), "--out", str(tmp_path / "out"), "--scene"]
-    assert main([*command, "deltact"]) == 2
-    assert main([*command, "gelslim"]) == 2
+def _said(folder: Path, capsys: pytest.CaptureFixture[str], *options: str, frame: FloatArray | None = None) -> str:
+    """What the command says when it refuses a frame, by default a black one."""
+    image = np.zeros((24, 32, 3)) if frame is None else frame
+    cv2.imwrite(str(folder / "frame.png"), image.astype(np.uint8))
+    assert main(["calibrate", "--frames", str(folder / "frame.png"), "--out", str(folder), *options]) == 2
+    return capsys.readouterr().err
+
+
+@pytest.mark.parametrize("spacing", ["-3", "nan", "0", "0.1", "100", "inf"])
+def test_a_spacing_that_no_dots_have_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], spacing: str
+) -> None:
+    said = _said(tmp_path, capsys, f"--spacing-mm={spacing}")
+    assert f"--spacing-mm = {spacing}: must be from 0.458 to 7.32 mm" in said
+    assert "has no dots" in _said(tmp_path, capsys, "--scene", "digit", "--spacing-mm=1")
+
+
+@needs_llvm
+@pytest.mark.parametrize(
+    ("level", "message"),
+    [(0, "are the frames black"), (255, "overexposed"), (None, "they give sensor.camera.shot_noise = ")],
+)
+def test_frames_that_tell_nothing_of_the_lights_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], level: int | None, message: str
+) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (60, 80, 3))
+    frame = noise if level is None else np.full((60, 80, 3), level)
+    options = ["--scene", "digit", "--steps", "0", "--set", "render.samples_per_pixel=1"]
+    said = _said(tmp_path, capsys, *options, frame=frame)
+    assert message in said
+    assert "scene.toml" not in said
+
+
+@pytest.mark.parametrize(("preset", "message"), [("deltact", "sensor.pattern.kind"), ("gelslim", "without mirrors")])
+def test_a_preset_that_calibration_does_not_know_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], preset: str, message: str
+) -> None:
+    assert message in _said(tmp_path, capsys, "--scene", preset)
 
 
 def test_noise_is_measured_through_the_response() -> None:

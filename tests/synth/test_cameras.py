@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from render_scenes import flat_surface, plain, small_sensor
+from render_scenes import FAST, SCALAR, flat_surface, plain, rendered, small_sensor
 from tiny_scene import CONTACT, LIGHTS, SENSOR, fingerprint, own_cache, write_tiny
 
 from synth.dataset.export import export
@@ -19,7 +19,6 @@ from synth.inspection import inspect, tables, write_html, write_sheet
 from synth.optics import Optics
 from synth.pipeline.generate import generate
 from synth.render.renderer import Renderer
-from synth.render.variant import Variant, choose_variant
 from synth.scene import FurtherCamera, Mirror, Render, Sensor
 from synth.scene.template import load_scene
 from synth.verify import verify_dataset
@@ -41,7 +40,6 @@ OTHER = {
     "name": "other", "width": 48, "height": 40, "fx": 120.0, "fy": 120.0, "cx": 24.0, "cy": 20.0,
     "position_mm": (2.0, 0.0, 19.0),
 }  # fmt: skip
-FAST = choose_variant("cpu")
 
 
 @pytest.fixture(scope="module")
@@ -171,7 +169,7 @@ def test_a_further_camera_changes_no_bit_of_the_main_one():
 def test_lights_in_a_further_cameras_view_are_refused():
     sensor = _with_other(fx=40.0, fy=40.0)
     with pytest.raises(InputError, match=r"further_cameras 'other': sensor.lights\[0\].*between the camera"):
-        Renderer(sensor, Render(samples_per_pixel=4), flat_surface(sensor), plain(), FAST)
+        rendered(sensor)
 
 
 @pytest.mark.parametrize("kind", ["mirror", "fisheye"])
@@ -182,7 +180,7 @@ def test_scalar_variants_say_what_they_need(kind):
         mirror = Mirror(position_mm=(3.0, 0.0, 12.0), normal=(-1, 0, 0), size_mm=(4.0, 4.0))
         sensor = sensor.model_copy(update={"mirrors": (mirror,)})
     with pytest.raises(InputError, match="needs LLVM 16 or newer"):
-        Renderer(sensor, Render(samples_per_pixel=4), flat_surface(sensor), plain(), Variant("scalar_rgb", "test"))
+        rendered(sensor, variant=SCALAR)
 
 
 def test_names_of_cameras_differ():

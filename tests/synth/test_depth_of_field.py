@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from kinematic_double import rigid, rotation
-from render_scenes import flat_surface, plain, small_sensor
+from render_scenes import FAST, SCALAR, flat_surface, kernels_compiled, needs_llvm, plain, rendered, small_sensor
 from tiny_scene import TEXT, own_cache, write_tiny
 
 from synth.arrays import FloatArray, Image, Points
@@ -20,13 +20,10 @@ from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
 from synth.render.sample_count import camera_noise, render_noise
 from synth.render.thin_lens import ThinLens
-from synth.render.variant import Variant, choose_variant
 from synth.scene import Camera, Dots, FurtherCamera, Light, Mirror, Render, Sensor
 from synth.scene.template import load_scene
 from synth.verify import verify_dataset
 
-FAST = choose_variant("cpu")
-needs_llvm = pytest.mark.skipif(not FAST.is_vectorised, reason="no LLVM of version 16 or newer here")
 SEEDS = range(8)
 ROWS, COLUMNS = np.mgrid[0:60, 0:80] + 0.5
 SINGLE = Dots(kind="dots", spacing_mm=(30, 30), radius_mm=0.4, softness_mm=0.1, offset_mm=(0.3, 0.1))
@@ -305,13 +302,7 @@ def test_nothing_is_compiled_for_another_aperture_or_focus() -> None:
 
     def compiled(**camera: Any) -> int:
         sensor = small_sensor(1.45, **camera)
-        surface = flat_surface(sensor)
-        renderer = Renderer(sensor, Render(samples_per_pixel=16, max_depth=2), surface, plain(), FAST)
-        dr.kernel_history_clear()
-        renderer.radiance(surface.material, 1)
-        kernels = [kernel for kernel in dr.kernel_history() if kernel["type"] == dr.KernelType.JIT]
-        assert kernels
-        return sum(not kernel["cache_hit"] for kernel in kernels)
+        return kernels_compiled(lambda: rendered(sensor, render=Render(samples_per_pixel=16, max_depth=2), seed=1))
 
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         compiled(aperture_mm=1.0, focus_mm=20.0)
@@ -369,10 +360,10 @@ def test_an_axis_that_does_not_reach_the_window_has_no_focus() -> None:
     main = small_sensor(1.45, position_mm=(2.0, -0.1, 20.0), look_at_mm=(2.0, -0.1, 0.0))
     sensor = main.model_copy(update={"further_cameras": (blind,), "mirrors": (back,)})
     with pytest.raises(InputError, match=r"further_cameras 'blind'.*focus_mm"):
-        Renderer(sensor, Render(), flat_surface(sensor), plain(), FAST)
+        rendered(sensor)
 
 
 def test_scalar_variants_refuse_an_aperture() -> None:
     sensor = small_sensor(aperture_mm=APERTURE, focus_mm=20.0)
     with pytest.raises(InputError, match=r"aperture_mm.*LLVM"):
-        Renderer(sensor, Render(), flat_surface(sensor), plain(), Variant("scalar_rgb", "test"))
+        rendered(sensor, variant=SCALAR)

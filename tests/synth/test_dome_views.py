@@ -7,32 +7,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kinematic_double import FISHEYE, HEIGHT, LENS, OBLIQUE, SIDES, WIDTH, rigid, rotation
+from kinematic_double import FISHEYE, LENS, OBLIQUE, SIDES, dented
 from kinematic_double import sensor as flat_sensor
-from render_scenes import plain, small_sensor
-from test_dot_centres import LIGHTS, RENDER, _centroid, _slope
+from render_scenes import needs_llvm
 from tiny_scene import own_cache
+from verified_sample import motion_checks
 
-from synth.arrays import FloatArray, Points
+from synth.arrays import FloatArray
 from synth.dataset.reader import read_dataset
-from synth.flow.exact import exact_flow
 from synth.mesh import rest_surface
-from synth.optics import Optics
 from synth.pipeline.generate import generate
-from synth.render.lights import check_view, light_axes
-from synth.render.pattern import albedo
-from synth.render.renderer import Renderer
-from synth.render.variant import choose_variant
-from synth.scene import Dots, Gel, Sensor, Window
-from synth.scene.sampling import draw
-from synth.scene.template import SCENES, load_scene
+from synth.scene import Gel, Sensor, Window
+from synth.scene.template import load_scene
 from synth.verify import verify_dataset
-from synth.verify.camera import ForwardCamera
-from synth.verify.motion import check_motion
-from synth.verify.sheet import Sheet
 
-FAST = choose_variant("cpu")
-needs_llvm = pytest.mark.skipif(not FAST.is_vectorised, reason="no LLVM of version 16 or newer here")
 DOME = Gel(shape="dome", size_mm=(20, 15, 8), youngs_modulus_kpa=200, dome_radius_mm=17.0)
 """Slopes up to 47 degrees; 2.5 mm are left at its corners."""
 VIEWS = {
@@ -50,123 +38,21 @@ def _sensor(view: dict) -> Sensor:
     )
 
 
-def _dented(x: Points, depth: float, shear: tuple[float, float]) -> Points:
-    dent = np.exp(-((x[:, :2] - (0.4, -0.3)) ** 2).sum(1) / 9.0)
-    return x + np.outer(dent, [*shear, depth])
-
-
 @pytest.mark.parametrize("view", VIEWS)
 def test_flow_is_the_independent_projections(view: str) -> None:
     """Fails with rays that enter at z = 0 in place of the slab's top, or leave at its top, in `synth.flow.trace`."""
     sensor, surface = _sensor(VIEWS[view]), rest_surface(DOME)
-    optics, camera = Optics.of(sensor), ForwardCamera.of(sensor)
-    for first in (surface.material, _dented(surface.material, 0.3, (0, 0))):
-        second = _dented(surface.material, 1.1, (0.8, -0.5))
-        flow = exact_flow(surface, first, second, optics, WIDTH, HEIGHT)
-        near, far = (Sheet(camera, surface.triangles, state, WIDTH, HEIGHT) for state in (first, second))
-        checks = check_motion("forward", near, far, flow.forward, flow.forward_visible)
-        checks += check_motion("backward", far, near, flow.backward, flow.backward_visible)
+    for first in (surface.material, dented(surface.material, 0.3)):
+        flow, checks = motion_checks(sensor, surface, first, dented(surface.material, 1.1, (0.8, -0.5)))
         assert np.nanmax(np.linalg.norm(flow.forward, axis=2)) > 1.5
         assert np.isfinite(flow.forward[..., 0]).mean() > 0.45  # by mirrors some pixels look beside the pad
-        for check in checks:
+        for name, check in checks.items():
             assert check.passed, check
-            if check.name.endswith(("flow", "closure")):
+            if name.endswith(("flow", "closure")):
                 assert check.figure < 2e-6  # float32 of motions below 16 px; the promise is 1e-3
 
 
-def _dotted(**camera: object) -> Sensor:
-    pattern = Dots(kind="dots", spacing_mm=(2.0, 2.0), radius_mm=0.3, softness_mm=0.1)
-    made = small_sensor(1.41, pattern, LIGHTS, **{"width": 100, "height": 76, "cx": 52.0, "cy": 37.0, **camera})
-    gel = Gel(shape="dome", size_mm=(14.0, 11.0, 5.0), youngs_modulus_kpa=200, dome_radius_mm=14.0)
-    return made.model_copy(update={"gel": gel})
-
-
-PICTURES = {
-    "pinhole": _dotted(distortion=(-0.2, 0.05, 1e-3, -2e-3, 0.0), fx=130.0, fy=130.0),
-    "close fisheye": _dotted(
-        lens="fisheye", distortion=(0.02, -0.01, 0.0, 0.0), fx=72.0, fy=72.0, position_mm=(0.2, -0.1, 13.0)
-    ),
-}
-
-
-@needs_llvm
-@pytest.mark.parametrize("view", PICTURES)
-def test_dot_centres_on_a_dome_move_as_the_flow_says(view: str) -> None:
-    """Fails with z left out of `GelMesh.positions`: dots move otherwise by 0.05 and 0.07 px in the mean."""
-    sensor = PICTURES[view]
-    surface, camera, optics = rest_surface(sensor.gel), sensor.camera, Optics.of(sensor)
-    x = surface.material
-    states = x, rigid(rotation("z", 2.0), (0.0, 0.1, 0.0))(_dented(x, 0.7, (0.5, -0.3)))
-    flow = exact_flow(surface, *states, optics, camera.width, camera.height)
-    dotted = Renderer(sensor, RENDER, surface, albedo(sensor, np.random.default_rng(1)), FAST)
-    bare = Renderer(sensor, RENDER, surface, plain(), FAST)
-    darkness = []
-    for state in states:
-        ratio = dotted.radiance(state, 3)[..., 0] / np.maximum(bare.radiance(state, 3)[..., 0], 1e-9)
-        darkness.append(np.where(ratio < 0.98, 1.0 - ratio, 0.0).astype(np.float64))
-    grid = np.array([(i, j) for i in np.arange(-6, 6.1, 2) for j in np.arange(-4, 4.1, 2)])
-    height = 14 - np.sqrt(14**2 - (grid**2).sum(1))
-    errors, misplaced = [], []
-    for place in optics.project(np.column_stack([grid, height])):
-        before = _centroid(darkness[0], place)
-        if before is None:
-            continue
-        column, row = (int(v) for v in before)
-        motion = flow.forward[row, column] + _slope(flow.forward, row, column) @ (before - (column + 0.5, row + 0.5))
-        after = _centroid(darkness[1], before + motion)
-        if after is not None and flow.forward_visible[row, column] == 1:
-            errors.append(after - before - motion)
-            misplaced.append(before - place)
-    found = np.linalg.norm(errors, axis=1)
-    assert len(found) >= 10
-    assert np.nanmax(np.linalg.norm(flow.forward, axis=2)) > 2
-    # As on the flat pad: 256 samples a pixel and the uneven stretch of a dot over itself are worth 0.01 px each; seen
-    # aslant, the near and the far half of a dot of 2.5 px differ by some 2 % in size: another 0.02 px of its place.
-    assert found.mean() < 0.05, found
-    assert np.linalg.norm(misplaced, axis=1).mean() < 0.05, misplaced
-
-
 NAME = "densetact"
-
-
-def _face(origins: Points, directions: Points, radius: float) -> Points:
-    """Where rays from above meet the dome last."""
-    arm = origins - (0.0, 0.0, radius)
-    b = (directions * arm).sum(1)
-    return np.asarray(origins + (-b + np.sqrt(b**2 - (arm**2).sum(1) + radius**2))[:, None] * directions)
-
-
-def test_every_pixel_of_densetact_sees_gel_and_no_light() -> None:
-    """Also when the gel is sheared as far as it may be; lights stand in the gel or window, above the domed face."""
-    template = load_scene(NAME)
-    for trajectory in range(0, 16, 2):
-        scene = draw(template, 3, trajectory)
-        sensor, gel = scene.sensor, scene.sensor.gel
-        assert gel.dome_radius_mm is not None
-        check_view(sensor)
-        width, height = Optics.of(sensor).size
-        places = np.stack(np.meshgrid(np.linspace(0, width, 25), np.linspace(0, height, 25)), axis=-1).reshape(-1, 2)
-        hits = _face(*Optics.of(sensor).rays(places), gel.dome_radius_mm)
-        assert np.all(np.abs(hits[:, :2]) + np.abs(scene.motion.shear_mm) < np.array(gel.size_mm[:2]) / 2)
-        for light in sensor.lights:
-            first, second, _ = light_axes(light)
-            corners = [
-                np.array(light.position_mm) + u * light.size_mm[0] / 2 * first + v * light.size_mm[1] / 2 * second
-                for u in (-1, 1) for v in (-1, 1)
-            ]  # fmt: skip
-            for x, y, z in corners:
-                assert gel.dome_radius_mm - np.sqrt(gel.dome_radius_mm**2 - x * x - y * y) < z
-                assert z < gel.size_mm[2] + sensor.window.thickness_mm
-        assert 0.5 < 0.1 * _pixels_per_mm(sensor) < 2.0
-    assert len(scene.references) >= 2
-    text = (Path(SCENES) / f"{NAME}.toml").read_text()
-    assert "# Simplified:" in text
-    assert "assumed" in text
-
-
-def _pixels_per_mm(sensor: Sensor) -> float:
-    pair = Optics.of(sensor).project(np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]))
-    return float(np.linalg.norm(pair[1] - pair[0])) / 0.1
 
 
 @needs_llvm

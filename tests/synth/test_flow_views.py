@@ -11,16 +11,16 @@ from kinematic_double import (
     PERISCOPE,
     SIDES,
     WIDTH,
+    dented,
     optics,
     pixel_centres,
     sensor,
     sheet,
 )
+from verified_sample import motion_checks, sheets
 
 from synth.flow.exact import exact_flow
-from synth.verify.camera import ForwardCamera
 from synth.verify.motion import check_motion
-from synth.verify.sheet import Sheet
 
 VIEWS = {
     "window": {"index": 1.45, "distortion": LENS, **OBLIQUE},
@@ -32,21 +32,6 @@ VIEWS = {
 }
 
 
-def _dented(surface, depth, shear):
-    x = surface.material
-    dent = np.exp(-((x[:, :2] - (0.4, -0.3)) ** 2).sum(1) / 9.0)
-    return x + np.outer(dent, [*shear, depth])
-
-
-def _checks(view, surface, state1, state2):
-    flow = exact_flow(surface, state1, state2, optics(**view), WIDTH, HEIGHT)
-    camera = ForwardCamera.of(sensor(**view))
-    near, far = (Sheet(camera, surface.triangles, state, WIDTH, HEIGHT) for state in (state1, state2))
-    checks = check_motion("forward", near, far, flow.forward, flow.forward_visible)
-    checks += check_motion("backward", far, near, flow.backward, flow.backward_visible)
-    return flow, {check.name: check for check in checks}
-
-
 @pytest.mark.parametrize("view", VIEWS)
 def test_flow_is_the_independent_projections(view):
     """Reflected points, Fermat's principle and OpenCV's lenses against virtual cameras, Snell's law and own lenses.
@@ -55,7 +40,9 @@ def test_flow_is_the_independent_projections(view):
     of k2 changed in `FisheyeLens._distorted`: the fisheye views, by 7e-4 and 0.24 px.
     """
     surface = sheet(30, 22, 20.0, 15.0, 2)
-    flow, checks = _checks(VIEWS[view], surface, _dented(surface, 0.3, (0, 0)), _dented(surface, 1.1, (0.8, -0.5)))
+    flow, checks = motion_checks(
+        sensor(**VIEWS[view]), surface, dented(surface.material, 0.3), dented(surface.material, 1.1, (0.8, -0.5))
+    )
     assert np.nanmax(np.linalg.norm(flow.forward, axis=2)) > 1.5
     for name, check in checks.items():
         assert check.passed, check
@@ -80,7 +67,7 @@ def test_folds_in_mirrors_are_hidden_rightly(view):
     folded[over, 0] = 3 - (x[over] - 3) * 3 / 7
     folded[over, 2] = np.minimum((x[over] - 3) * 4, 1.0)
     folded[:, 1] += 0.3
-    flow, checks = _checks(VIEWS[view], surface, surface.material, folded)
+    flow, checks = motion_checks(sensor(**VIEWS[view]), surface, surface.material, folded)
     assert all(check.passed for check in checks.values()), [check for check in checks.values() if not check.passed]
     hidden = (flow.forward_visible == 0) & np.isfinite(flow.forward[..., 0])
     path = optics(**VIEWS[view]).look(pixel_centres().reshape(-1, 2)).path.reshape(HEIGHT, WIDTH)
@@ -119,10 +106,9 @@ def test_verify_finds_a_pixel_that_leaves_its_mirror():
     surface = sheet(30, 22, 20.0, 15.0, 2)
     states = surface.material, surface.material + np.array([0.5, 0.2, 0.0])
     view = VIEWS["mirrors"]
-    flow, checks = _checks(view, surface, *states)
+    flow, checks = motion_checks(sensor(**view), surface, *states)
     assert all(check.passed for check in checks.values())
-    camera = ForwardCamera.of(sensor(**view))
-    near, far = (Sheet(camera, surface.triangles, state, WIDTH, HEIGHT) for state in states)
+    near, far = sheets(sensor(**view), surface, *states)
     path = optics(**view).look(pixel_centres().reshape(-1, 2)).path.reshape(HEIGHT, WIDTH)
     end = pixel_centres() + flow.forward
     inner = (end > 0.1).all(2) & (end < (WIDTH - 0.1, HEIGHT - 0.1)).all(2)

@@ -17,9 +17,9 @@ from synth.dataset.exr import write_flow
 from synth.dataset.writer import DatasetWriter
 from synth.errors import InputError
 from synth.inspection import inspect, tables, write_html, write_sheet
-from synth.inspection.arrows import arrows_of
 from synth.inspection.inspection import evenly_spaced
 from synth.inspection.interpolation import sample_at
+from synth.inspection.panels import arrows_of
 from synth.inspection.view import View
 from synth.inspection.wheel import NO_GEL, flow_colours, robust_scale, wheel_legend
 
@@ -163,19 +163,16 @@ def test_empty_dataset(tmp_path):
     assert len(tables(inspection)) == 2
 
 
-def test_gel_out_of_sight(tmp_path):
-    """No pixel sees the gel, nothing moves, nothing is visible: numbers say so and pictures are drawn."""
+@pytest.mark.parametrize(("name", "value", "most"), [("nowhere", np.nan, None), ("still", 0.0, 0.0)])
+def test_gel_out_of_sight_or_at_rest(tmp_path, name, value, most):
+    """No pixel sees the gel, or nothing moves: numbers say so and pictures are drawn."""
     flow = translation_sample().flow
-    nowhere = dataclasses.replace(
-        flow, forward=np.full_like(flow.forward, np.nan), forward_visible=np.zeros_like(flow.forward_visible)
-    )
-    still = dataclasses.replace(flow, forward=np.zeros_like(flow.forward), backward=np.zeros_like(flow.forward))
-    for name, field in (("nowhere", nowhere), ("still", still)):
-        write_flow(tmp_path / f"{name}.exr", field, {})
-        inspection = inspect(tmp_path / f"{name}.exr")
-        write_sheet(inspection, tmp_path / "s.png")
-        write_html(inspection, tmp_path / "s.html")
-        assert inspection.numbers[0]["forward"]["max_px"] == {"nowhere": None, "still": 0.0}[name]
+    constant, visible = np.full_like(flow.forward, value), np.full_like(flow.forward_visible, most is not None)
+    write_flow(tmp_path / f"{name}.exr", dataclasses.replace(flow, forward=constant, forward_visible=visible), {})
+    inspection = inspect(tmp_path / f"{name}.exr")
+    write_sheet(inspection, tmp_path / "s.png")
+    write_html(inspection, tmp_path / "s.html")
+    assert inspection.numbers[0]["forward"]["max_px"] == most
 
 
 def test_files_of_different_sizes_cannot_be_inspected(tmp_path):

@@ -1,16 +1,20 @@
-"""A pad's mesh: what the mesher's output is made into, and what the later stages rely on."""
+"""A pad's mesh: what the mesher's output is made into, what later stages rely on, what is refused, what is cached."""
 
 import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from pads import brick
+from pads import brick, crooked
 
-from synth.mesh import PadMesh
+import synth.mesh.cache as cache
+from synth.errors import InputError
+from synth.mesh import PadMesh, check_mesh, default_edge_length, mesh_key, pad_mesh
 from synth.mesh.pad import boundary_faces, signed_volumes
 from synth.mesh.sizing import GRADING
 from synth.mesh.tetrahedralise import WORST_SHAPE, _fault, _repair, shape_quality, tetrahedralise_box
+from synth.scene import Gel, Layer, Numerics
 
 SIZE = (7.0, 5.0, 2.5)
 EDGE = 0.6
@@ -148,3 +152,142 @@ def test_hash_names_the_content(pad: PadMesh) -> None:
     moved[0, 0] = np.nextafter(moved[0, 0], 9.0)
     turned[0] = turned[0][[1, 2, 0, 3]]
     assert len({pad.hash, replace(pad, points=moved).hash, replace(pad, tets=turned).hash}) == 3
+
+
+SOUND = brick((4.0, 3.0, 2.0), (2, 2, 2))
+
+
+def moved(corner: int, place: np.ndarray) -> PadMesh:
+    """The mesh with one corner of its first tetrahedron somewhere else."""
+    points = SOUND.points.copy()
+    points[SOUND.tets[0, corner]] = place
+    return replace(SOUND, points=points)
+
+
+def test_a_sound_mesh_passes_and_so_does_a_sliver() -> None:
+    check_mesh(SOUND)
+    others = SOUND.points[SOUND.tets[0, :3]]
+    top = SOUND.points[SOUND.tets[0, 3]]
+    sliver = moved(3, others.mean(axis=0) + 1e-3 * (top - others.mean(axis=0)))
+    assert 0 < sliver.volumes[0] < 2e-3 * SOUND.volumes[0]
+    check_mesh(PadMesh(sliver.points[sliver.tets[0]], np.array([[0, 1, 2, 3]]), SOUND.size_mm))  # others may turn over
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_flat_is_refused_whatever_the_rounding(seed: int) -> None:
+    """The volume then is 0 or some 1e-17 of either sign. Fails with 0 as the least share."""
+    rng = np.random.default_rng(seed)
+    corners = rng.normal(size=(3, 3))
+    alone = PadMesh(np.vstack([corners, rng.dirichlet(np.ones(3)) @ corners]), np.array([[0, 1, 2, 3]]), SOUND.size_mm)
+    with pytest.raises(InputError, match="must be > 0"):
+        check_mesh(alone)
+
+
+def test_inside_out_one_point_not_finite_and_loose() -> None:
+    """Fails with any of the checks left out."""
+    flipped = SOUND.tets.copy()
+    flipped[5] = flipped[5][[1, 0, 2, 3]]
+    one = SOUND.points.copy()
+    one[SOUND.tets[0]] = one[SOUND.tets[0, 0]]
+    lost = np.concatenate([SOUND.points, [[0.0, 0.0, 1.0]]])
+    for mesh, message in (
+        (replace(SOUND, tets=flipped), "tetrahedron 5 of the mesh has a volume of -"),
+        (replace(SOUND, points=one), "volume of 0 mm"),
+        (moved(0, np.array([np.nan, 0.0, 0.0])), "not finite"),
+        (replace(SOUND, points=lost), f"node {len(SOUND.points)} of the mesh belongs to no tetrahedron"),
+    ):
+        with pytest.raises(InputError, match=message):
+            check_mesh(mesh)
+
+
+GEL = Gel(size_mm=(4.0, 4.0, 3.0), youngs_modulus_kpa=200.0)
+NUMERICS = Numerics(edge_length_mm=1.5)
+
+
+@pytest.fixture
+def made(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """A fast mesher that, like the real one, never makes the same mesh twice; its calls are counted."""
+    calls: list[float] = []
+
+    def counted(size: tuple[float, float, float], edge: float) -> PadMesh:
+        calls.append(edge)
+        return crooked(size, seed=len(calls))
+
+    monkeypatch.setattr(cache, "tetrahedralise_box", counted)
+    return calls
+
+
+def test_made_once_and_read_bitwise(tmp_path: Path, made: list[float]) -> None:
+    first = pad_mesh(GEL, NUMERICS, [tmp_path])
+    again = pad_mesh(GEL, NUMERICS, [tmp_path])
+    assert made == [1.5]
+    assert (again.points == first.points).all()
+    assert (again.tets == first.tets).all()
+    assert again.tets.dtype == np.int32
+    assert again.hash == first.hash
+    assert [path.name for path in tmp_path.iterdir()] == [f"{mesh_key(GEL, NUMERICS)}.npz"]  # nothing left aside
+
+
+@pytest.mark.parametrize("damage", ["empty", "cut", "flipped", "text", "no tets"])
+def test_damaged_file_is_made_again(tmp_path: Path, made: list[float], damage: str) -> None:
+    pad_mesh(GEL, NUMERICS, [tmp_path])
+    path = tmp_path / f"{mesh_key(GEL, NUMERICS)}.npz"
+    content = path.read_bytes()
+    if damage == "no tets":
+        np.savez(path, points=np.zeros((4, 3)))
+    else:
+        middle = len(content) // 2
+        path.write_bytes(
+            {
+                "empty": b"",
+                "cut": content[:middle],
+                "flipped": content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :],
+                "text": b"not a mesh",
+            }[damage]
+        )
+    mesh = pad_mesh(GEL, NUMERICS, [tmp_path])
+    assert len(made) == 2
+    assert pad_mesh(GEL, NUMERICS, [tmp_path]).hash == mesh.hash
+    assert len(made) == 2
+
+
+def test_every_folder_gets_the_mesh_of_the_first_that_has_it(tmp_path: Path, made: list[float]) -> None:
+    dataset, user, other = tmp_path / "dataset", tmp_path / "user", tmp_path / "other"
+    kept = pad_mesh(GEL, NUMERICS, [dataset])
+    pad_mesh(GEL, NUMERICS, [user])
+    assert len(made) == 2
+    assert pad_mesh(GEL, NUMERICS, [dataset, user, other]).hash == kept.hash
+    assert pad_mesh(GEL, NUMERICS, [other]).hash == kept.hash
+    assert len(made) == 2
+
+
+def test_user_cache_follows_xdg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, made: list[float]) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert cache.user_cache() == tmp_path / "gelflow-synth" / "meshes"
+    mesh = pad_mesh(GEL, NUMERICS)
+    assert (cache.user_cache() / f"{mesh_key(GEL, NUMERICS)}.npz").is_file()
+    assert pad_mesh(GEL, NUMERICS).hash == mesh.hash
+    assert len(made) == 1
+
+
+def test_key_depends_on_what_the_mesh_depends_on_only() -> None:
+    key = mesh_key(GEL, NUMERICS)
+    assert mesh_key(GEL.model_copy(update={"size_mm": (4.0, 4.0, 3.1)}), NUMERICS) != key
+    assert mesh_key(GEL, Numerics(edge_length_mm=1.4)) != key
+    assert mesh_key(GEL.model_copy(update={"youngs_modulus_kpa": 7.0, "poisson_ratio": 0.3}), NUMERICS) == key
+    assert mesh_key(GEL, Numerics(edge_length_mm=1.5, tolerance=1e-4)) == key
+    assert mesh_key(GEL, Numerics()) == mesh_key(GEL, Numerics(edge_length_mm=default_edge_length(GEL)))
+
+
+def test_layered_pad_is_refused(tmp_path: Path, made: list[float]) -> None:
+    """Every tetrahedron would count as the first layer."""
+    layered = GEL.model_copy(update={"layers": (Layer(thickness_mm=0.1, youngs_modulus_kpa=900.0),)})
+    with pytest.raises(InputError, match="cannot follow layers"):
+        pad_mesh(layered, NUMERICS, [tmp_path])
+    assert made == []
+
+
+@pytest.mark.parametrize(("thickness", "edge"), [(2.0, 0.4), (4.0, 0.8), (8.0, 1.0)])
+def test_default_edge_length(thickness: float, edge: float) -> None:
+    gel = GEL.model_copy(update={"size_mm": (20.0, 20.0, thickness)})
+    assert default_edge_length(gel) == pytest.approx(edge)

@@ -1,24 +1,49 @@
-"""The camera against OpenCV's lens, Snell's law in angles, and its own inverse."""
+"""The camera against OpenCV's lenses, Snell's law and the law of reflection in angles, and its own inverse."""
 
 import cv2
 import numpy as np
 import pytest
-from kinematic_double import LENS, OBLIQUE, STRAIGHT, optics, sensor
+from kinematic_double import (
+    FISHEYE,
+    HEIGHT,
+    LENS,
+    LEVEL,
+    OBLIQUE,
+    PERISCOPE,
+    SIDES,
+    STRAIGHT,
+    WIDTH,
+    optics,
+    pixel_centres,
+    sensor,
+)
 from scipy.optimize import brentq
 
 from synth.errors import InputError
 from synth.optics import Optics
+from synth.optics.lens_fisheye import FisheyeLens
 
 RNG = np.random.default_rng(3)
 POINTS = RNG.uniform((-7, -5, 0), (7, 5, 4), (200, 3))
 PIXELS = RNG.uniform((-3, -3), (67, 51), (300, 2))
 
 
+LENSES = {
+    "pinhole": {},
+    "distorted": {"distortion": LENS},
+    "pincushion": {"distortion": (0.3, 0.0, 0.0, 0.0, 0.0)},
+    "equidistant": {**FISHEYE, "distortion": (0.0,) * 4},
+    "fisheye": FISHEYE,
+    "barrel fisheye": {**FISHEYE, "distortion": (-0.2, 0.03, 0.0, 0.0)},
+}
+
+
 @pytest.mark.parametrize("index", [1.0, 1.41, 2.2])
 @pytest.mark.parametrize("view", [STRAIGHT, OBLIQUE])
-@pytest.mark.parametrize("lens", [(0.0,) * 5, LENS, (0.3, 0.0, 0.0, 0.0, 0.0)])
+@pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
 def test_project_inverts_rays(index, view, lens):
-    camera = optics(index=index, distortion=lens, **view)
+    """Fails with the sign of k2 changed in `FisheyeLens._distorted`: it then turns back inside the field it claims."""
+    camera = optics(index=index, **view, **lens)
     origins, directions = camera.rays(PIXELS)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-14)
     start = 0.0 if index > 1 else 14.0  # from the camera's position, stay inside the sensor
@@ -100,3 +125,169 @@ def test_nan_where_no_image_or_ray_exists():
 def test_rejects_a_view_along_x():
     with pytest.raises(InputError, match="looks along x"):
         Optics.of(sensor(position_mm=(0.0, 0.0, 10.0), look_at_mm=(1e8, 0.0, 9.0)))
+
+
+def _fisheye(*distortion: float) -> FisheyeLens:
+    return FisheyeLens(np.array([50.0, 52.0]), np.array([31.7, 24.4]), distortion)
+
+
+def test_fisheye_is_opencvs():
+    lens = _fisheye(0.05, -0.02, 0.004, -0.001)
+    angle, around = RNG.uniform(0, 1.5, 400), RNG.uniform(0, 2 * np.pi, 400)
+    local = np.column_stack([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)])
+    matrix = np.array([[50.0, 0, 31.7], [0, 52.0, 24.4], [0, 0, 1]])
+    coefficients = np.array(lens.distortion)
+    expected = cv2.fisheye.projectPoints(local[:, None], np.zeros(3), np.zeros(3), matrix, coefficients)[0][:, 0]
+    # At 1.5 rad OpenCV divides by z = 0.07 and takes the arctangent: 14 times the rounding of 100 px.
+    np.testing.assert_allclose(lens.project(local), expected, atol=1e-11)
+    np.testing.assert_allclose(lens.directions(expected), local, atol=1e-12)
+
+
+def test_without_coefficients_pixels_are_angles():
+    angle = np.array([0.0, 0.3, 1.0, 1.57])
+    local = np.column_stack([np.sin(angle), 0 * angle, np.cos(angle)])
+    np.testing.assert_allclose(_fisheye(0.0, 0.0, 0.0, 0.0).project(local)[:, 0], 31.7 + 50 * angle, atol=1e-12)
+
+
+def test_field_ends_where_the_radius_turns_back_or_at_a_right_angle():
+    lens = _fisheye(-0.25, 0.0, 0.0, 0.0)  # 1 - 0.75 θ² = 0 at θ = 1.1547, radius 2/3 of that
+    assert lens.field_limit == pytest.approx(np.sqrt(4 / 3), rel=1e-12)
+    edge = 31.7 + 50 * 2 / 3 * lens.field_limit
+    found = lens.directions(np.array([[edge - 1e-3, 24.4], [edge + 1e-3, 24.4]]))
+    np.testing.assert_array_equal(np.isnan(found[:, 0]), [False, True])
+    for angle, is_lost in ((1.15, False), (1.16, True)):
+        assert np.isnan(lens.project(np.array([[np.sin(angle), 0.0, np.cos(angle)]]))).all() == is_lost
+    behind = np.array([[1.0, 0.0, -1e-9], [1.0, 0.0, 1e-3]])
+    np.testing.assert_array_equal(np.isnan(_fisheye(0.0, 0.0, 0.0, 0.0).project(behind)).all(1), [True, False])
+
+
+CENTRES = pixel_centres().reshape(-1, 2)
+VIEWS = {
+    "sides": {"mirrors": SIDES, "distortion": LENS, "fx": 40.0, "fy": 41.0},
+    "periscope": {"mirrors": PERISCOPE, **LEVEL},
+    "fisheye": {"mirrors": SIDES, **FISHEYE, "fx": 35.0, "fy": 35.0},
+}
+PATHS = {"sides": {0, 1, 2}, "periscope": {0, 1}, "fisheye": {0, 1, 2}}
+
+
+@pytest.mark.parametrize("index", [1.0, 1.45])
+@pytest.mark.parametrize("view", VIEWS)
+def test_project_inverts_rays_on_each_path(view, index):
+    camera = optics(index=index, **VIEWS[view])
+    rays = camera.look(CENTRES)
+    assert set(rays.path) - {-1} == PATHS[view]
+    seen = rays.path >= 0
+    for height in (0.0, 3.9):
+        points = rays.origins + rays.directions * ((height - rays.origins[:, 2:]) / rays.directions[:, 2:])
+        # Rounding: some 1e-15 relative at 100 px, a few tens of operations.
+        np.testing.assert_allclose(camera.project(points[seen], rays.path[seen]), CENTRES[seen], atol=1e-10)
+    assert np.isnan(camera.project(np.zeros((2, 3)), -1)).all()
+
+
+@pytest.mark.parametrize("view", ["sides", "periscope"])
+def test_light_is_reflected_at_equal_angles_and_bends_at_the_face(view):
+    """From the ray inside the body back through Snell's law to the mirror, and from there to the pinhole.
+
+    Fails with the factor 2 of `FlatMirror.turned` changed to 1.99.
+    """
+    camera = optics(index=1.45, **VIEWS[view])
+    rays = camera.look(CENTRES)
+    for k, given in enumerate(VIEWS[view]["mirrors"], 1):
+        own = rays.path == k
+        across = rays.directions[own, :2] * 1.45
+        air = np.column_stack([across, -np.sqrt(1 - (across**2).sum(1))])
+        normal = np.array(given["normal"]) / np.linalg.norm(given["normal"])
+        back = ((np.array(given["position_mm"]) - rays.origins[own]) @ normal) / (-air @ normal)
+        place = rays.origins[own] - back[:, None] * air
+        assert (back > 0).all()
+        assert (place[:, 2] > 9.0).all()  # above the face
+        arriving = place - camera.pose.position
+        arriving /= np.linalg.norm(arriving, axis=1, keepdims=True)
+        np.testing.assert_allclose(arriving @ normal, -air @ normal, atol=1e-12)  # equal angles ...
+        tangent = np.eye(3) - np.outer(normal, normal)
+        np.testing.assert_allclose(arriving @ tangent, air @ tangent, atol=1e-12)  # ... in one plane
+
+
+def test_a_mirror_at_45_degrees_in_numbers():
+    """Camera at (0, -16, 15) looks along +y; the mirror at y = -2 turns the axis straight down: 14 + 15 mm to z = 0."""
+    mirror = {"position_mm": (0.0, -2.0, 15.0), "normal": (0.0, -1.0, -1.0), "size_mm": (30.0, 16.0)}
+    camera = optics(mirrors=(mirror,), position_mm=(0.0, -16.0, 15.0), look_at_mm=(0.0, 0.0, 15.0))
+    points = np.array([[0.0, -2.0, 0.0], [1.0, -2.0, 0.0], [0.0, -1.0, 0.0]])
+    pixels = camera.project(points, 1)
+    np.testing.assert_allclose(pixels[0], (31.7, 24.4), atol=1e-12)
+    np.testing.assert_allclose(pixels[1] - pixels[0], (70 / 29, 0.0), atol=1e-12)
+    # The image's down is the scene's +z before the mirror and, turned by it, +y: away from the camera.
+    np.testing.assert_allclose(np.abs(pixels[2] - pixels[0]), (0.0, 71 / 29), atol=1e-12)
+    np.testing.assert_allclose(camera.depth(points, 1), 29.0, atol=1e-12)
+    np.testing.assert_allclose(camera.project(points), pixels, atol=0)  # by default the path that sees them
+
+
+def test_a_mirror_ends_at_the_image_of_its_rectangle():
+    """Its corners are seen straight in air; OpenCV projects them, and a convex polygon holds the mirror's pixels."""
+    camera = optics(index=1.45, mirrors=SIDES, fx=40.0, fy=41.0)
+    path = camera.look(CENTRES).path
+    matrix = np.array([[40.0, 0, 31.7], [0, 41.0, 24.4], [0, 0, 1]])
+    handed = np.array([1.0, 1.0, -1.0])  # OpenCV's world is right-handed
+    axes = np.array([camera.pose.right, camera.pose.down, camera.pose.forward]) * handed
+    shift = -axes @ (camera.pose.position * handed)
+    for k, mirror in enumerate(camera.mirrors, 1):
+        signs = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+        corners = (mirror.centre + (signs * mirror.half) @ mirror.axes) * handed
+        image = cv2.projectPoints(corners, cv2.Rodrigues(axes)[0], shift, matrix, np.zeros(5))[0].astype(np.float32)
+        inside = [cv2.pointPolygonTest(image, (float(x), float(y)), True) for x, y in CENTRES]
+        clear = np.abs(inside) > 1e-3  # float32 polygons
+        assert clear.sum() > WIDTH * HEIGHT - 10
+        np.testing.assert_array_equal((path == k)[clear], np.array(inside)[clear] > 0)
+
+
+def test_points_behind_a_mirror_have_no_image_by_default():
+    """Lights are looked for with it: one that a mirror hides stands in no view.
+
+    Fails with the last condition of `Optics.project` left out.
+    """
+    upright = {"position_mm": (4.0, 0.0, 12.0), "normal": (-1.0, 0.0, 0.0), "size_mm": (40.0, 4.0)}
+    camera = optics(mirrors=(upright,), position_mm=(0.0, 0.0, 20.0), look_at_mm=(0.0, 0.0, 0.0), cx=10.0)
+    points = np.array([[9.0, 0.0, 2.0], [2.0, 0.0, 2.0], [-9.0, 0.0, 2.0]])
+    straight = camera.project(points, 0)
+    assert (straight[:2] > 0).all()  # 10 + 70 * 9 / 18 = 45 px, where the mirror is
+    assert (straight[:2] < WIDTH).all()
+    seen = camera.project(points)
+    assert np.isnan(seen[0]).all()
+    np.testing.assert_array_equal(seen[1], straight[1])
+    np.testing.assert_array_equal(seen[2], straight[2])  # outside the image: where it would be
+
+
+def test_backs_and_second_reflections_show_nothing():
+    """Fails with backs let through in `first_met`, and with its second loop left out."""
+    turned = {**SIDES[0], "normal": (1.0, 0.0, 0.25), "rotation_deg": -4.0}
+    plain, back = (optics(index=1.45, mirrors=(m,), fx=40.0, fy=41.0).look(CENTRES) for m in (SIDES[0], turned))
+    np.testing.assert_array_equal(back.path, np.where(plain.path == 1, -1, plain.path))
+    assert np.isnan(back.directions[plain.path == 1]).all()
+    # A strip that lies 1.2 mm above the face, where light comes down from the first mirror.
+    facing = {"position_mm": (4.6, -0.5, 10.2), "normal": (0.0, 0.0, 1.0), "size_mm": (0.5, 30.0)}
+    both = optics(index=1.45, mirrors=(SIDES[0], facing), fx=40.0, fy=41.0).look(CENTRES)
+    lost = (plain.path == 1) & (both.path == -1)
+    assert lost.sum() > 20
+    # It would have met the face below the strip, half of 0.5 mm and 1.2 mm times a slope of up to 0.4 to either side.
+    assert np.abs(plain.origins[lost, 0] - 4.6).max() < 0.25 + 1.2 * 0.4
+    assert set(both.path[plain.path == 0]) == {0, -1}  # seen straight, the strip mirrors the dark above it
+
+
+def test_a_camera_without_mirrors_has_one_path():
+    path = optics(index=1.45, distortion=(-0.3, 0.0, 0.0, 0.0, 0.0), fx=30.0, fy=30.0).look(CENTRES).path
+    assert set(path) == {0, -1}  # -1 beyond the lens's field
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"mirrors": ({**SIDES[0], "normal": (0, 0, 0)},)}, "normal is zero"),
+        ({"mirrors": ({**SIDES[0], "position_mm": (6.0, 0.0, 12.0)},)}, "reaches down to z"),
+        ({"look_at_mm": (0.0, 0.0, 30.0)}, "only a mirror could turn its view back"),
+        ({"lens": "fisheye"}, "needs distortion = \\[k1, k2, k3, k4\\]"),
+        ({"distortion": (0.1, 0.0)}, "distortion has 2 numbers; a pinhole lens needs"),
+    ],
+)
+def test_impossible_optics_are_named(changes, words):
+    with pytest.raises(ValueError, match=words):
+        sensor(index=1.45, **changes)

@@ -5,7 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from render_scenes import flat_surface, small_sensor
+from render_scenes import FAST, VARIANTS, needs_llvm, rendered, small_sensor
 from tiny_scene import own_cache, write_tiny
 
 from synth.arrays import Image
@@ -13,16 +13,11 @@ from synth.dataset.reader import read_dataset
 from synth.flow.field import FlowField
 from synth.pipeline.generate import generate
 from synth.render.pattern import albedo
-from synth.render.renderer import Renderer
-from synth.render.variant import Variant, choose_variant
-from synth.scene import Coating, Dots, Light, NoPattern, Render, Sensor, Speckle
+from synth.render.variant import Variant
+from synth.scene import Coating, Dots, Light, NoPattern, Sensor, Speckle
 from synth.scene.template import load_scene
 
-FAST = choose_variant("cpu")
-VARIANTS = [Variant("scalar_rgb", "test"), *([FAST] if FAST.is_vectorised else [])]
-needs_llvm = pytest.mark.skipif(not FAST.is_vectorised, reason="no LLVM of version 16 or newer here")
 SHINING = Coating(reflectance=(0.6, 0.55, 0.5), roughness=0.3, metallic=0.9)
-RENDER = Render(samples_per_pixel=36, max_depth=2)
 LAMP = Light(position_mm=(5.0, 0.0, 5.5), aim_mm=(2.0, 0.0, 0.0), size_mm=(1.0, 1.0), color=(1, 0.9, 0.8), power=100)
 """The mirror image of it in the flat face is seen about 4 mm right of the middle."""
 INK = (0.05, 0.06, 0.08)
@@ -34,9 +29,8 @@ def _sensor(layer: str, coating: Coating = SHINING) -> Sensor:
 
 
 def _render(sensor: Sensor, texture: Image | None = None, variant: Variant = FAST) -> Image:
-    surface = flat_surface(sensor)
     texture = albedo(sensor, np.random.default_rng(0)) if texture is None else texture
-    return Renderer(sensor, RENDER, surface, texture, variant).radiance(surface.material, 1)
+    return rendered(sensor, texture, variant=variant, seed=1)
 
 
 def _bare(coating: Coating, variant: Variant) -> Image:

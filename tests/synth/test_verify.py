@@ -9,16 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kinematic_double import LENS, OBLIQUE, STRAIGHT, optics, pixel_centres, sensor, sheet
+from kinematic_double import LENS, OBLIQUE, STRAIGHT, optics, sensor, sheet
 from rich.console import Console
-from verified_sample import HEIGHT, WIDTH, as_sample, make_sample, pressed, scene
+from verified_sample import HEIGHT, WIDTH, as_sample, make_sample, motion_checks, pressed, scene, sheets
 
 from synth.dataset.exr import read_stored, write_flow
 from synth.dataset.job import Job
 from synth.dataset.reader import SampleData
 from synth.dataset.writer import DatasetWriter
 from synth.errors import InputError
-from synth.flow.exact import exact_flow
 from synth.flow.field import FlowField
 from synth.scene import Outputs
 from synth.verify import Check, Report, SampleReport, verify_dataset, verify_sample
@@ -27,7 +26,6 @@ from synth.verify.files import flow_file_problems
 from synth.verify.motion import check_motion
 from synth.verify.photometry import NAME as PHOTOMETRY
 from synth.verify.photometry import check_photometry
-from synth.verify.sheet import Sheet
 
 SCENE = scene()
 
@@ -46,11 +44,9 @@ def _failed(flow: FlowField, sample: SampleData) -> set[str]:
 
 def _failed_motion(name: str, sample: SampleData, **changes: np.ndarray) -> set[str]:
     """The same for one direction alone."""
-    flow, camera = sample.flow, ForwardCamera.of(SCENE.sensor)
-    states = [
-        Sheet(camera, sample.surface.triangles, sample.surface.positions(u), WIDTH, HEIGHT)
-        for u in (sample.displacement1, sample.displacement2)
-    ]
+    flow, surface = sample.flow, sample.surface
+    moved = (surface.positions(u) for u in (sample.displacement1, sample.displacement2))
+    states = sheets(SCENE.sensor, surface, *moved)
     fields = {"flow": getattr(flow, name), "visible": getattr(flow, f"{name}_visible"), **changes}
     checks = check_motion(name, *(states if name == "forward" else states[::-1]), fields["flow"], fields["visible"])
     return {check.name for check in checks if not check.passed}
@@ -152,18 +148,13 @@ def test_folds_pass_and_their_visibility_is_checked(index):
     folded, over = surface.material.copy(), x > 2
     folded[over, 0] = 2 - (x[over] - 2) / 3
     folded[over, 2] = np.minimum((x[over] - 2) * 4, 1.0)
-    camera = ForwardCamera.of(sensor(index=index))
-    width, height = pixel_centres().shape[1::-1]
-    near, far = (Sheet(camera, surface.triangles, p, width, height) for p in (surface.material, folded))
-    flow = exact_flow(surface, surface.material, folded, optics(index=index), width, height)
-    for check in check_motion("forward", near, far, flow.forward, flow.forward_visible):
-        assert check.passed, check
-    for check in check_motion("backward", far, near, flow.backward, flow.backward_visible):
-        assert check.passed, check
+    flow, found = motion_checks(sensor(index=index), surface, surface.material, folded)
+    assert all(check.passed for check in found.values()), found
     hidden = np.argwhere((flow.forward_visible == 0) & np.isfinite(flow.forward[..., 0]))
     assert len(hidden) > 50
     wrong = flow.forward_visible.copy()
     wrong[tuple(hidden[len(hidden) // 2])] = 1
+    near, far = sheets(sensor(index=index), surface, surface.material, folded)
     checks = {check.name: check for check in check_motion("forward", near, far, flow.forward, wrong)}
     assert not checks["forward visibility"].passed
 
@@ -173,21 +164,15 @@ def test_crumpled_surfaces_pass(seed):
     """Far beyond what a gel does: dozens of folds that pass through each other, seen from aslant."""
     rng = np.random.default_rng(seed)
     surface = sheet(30, 22, 20.0, 15.0, 2)
-    size = pixel_centres().shape[1::-1]
-    camera = {"index": 1.45, "distortion": LENS, **OBLIQUE}
 
     def crumpled():
         waves = [rng.normal(size=(2, 3)) for _ in range(6)]
         phase = [np.sin(2 * surface.material[:, :2] @ k[0, :2] + 6 * k[0, 2])[:, None] * k[1] for k in waves]
         return surface.material + (0, 0, 2) + 0.2 * sum(phase)
 
-    states = [crumpled(), crumpled()]
-    flow = exact_flow(surface, *states, optics(**camera), *size)
+    flow, checks = motion_checks(sensor(index=1.45, distortion=LENS, **OBLIQUE), surface, crumpled(), crumpled())
     assert 0.1 < flow.forward_visible.mean() < 0.9
-    sheets = [Sheet(ForwardCamera.of(sensor(**camera)), surface.triangles, p, *size) for p in states]
-    checks = check_motion("forward", *sheets, flow.forward, flow.forward_visible)
-    checks += check_motion("backward", *sheets[::-1], flow.backward, flow.backward_visible)
-    assert all(check.passed for check in checks), [check for check in checks if not check.passed]
+    assert all(check.passed for check in checks.values()), checks
 
 
 @pytest.mark.parametrize("pattern", ["dots", "bare"])

@@ -7,10 +7,15 @@ from synth.arrays import FloatArray, Points
 from synth.dataset.reader import SampleData
 from synth.dataset.sample import Sample
 from synth.flow.exact import exact_flow
+from synth.flow.field import FlowField
 from synth.flow.trace import trace
 from synth.optics import Optics
-from synth.scene import Scene
+from synth.scene import Scene, Sensor
 from synth.surface import GelSurface
+from synth.verify.camera import ForwardCamera
+from synth.verify.motion import check_motion
+from synth.verify.report import Check
+from synth.verify.sheet import Sheet
 
 WIDTH, HEIGHT = 160, 120
 NOISE = 0.004
@@ -56,21 +61,27 @@ def make_sample(drawn: Scene, displacement1: FloatArray, displacement2: FloatArr
     return SampleData(images[0], images[1], flow, SURFACE, displacement1, displacement2, {})
 
 
+def sheets(sensor: Sensor, surface: GelSurface, *states: Points) -> list[Sheet]:
+    """States of a surface as verification looks at them."""
+    camera = ForwardCamera.of(sensor)
+    return [Sheet(camera, surface.triangles, state, sensor.camera.width, sensor.camera.height) for state in states]
+
+
+def motion_checks(
+    sensor: Sensor, surface: GelSurface, first: Points, second: Points
+) -> tuple[FlowField, dict[str, Check]]:
+    """The exact flow between two states, both ways, and the checks of it by name."""
+    flow = exact_flow(surface, first, second, Optics.of(sensor), sensor.camera.width, sensor.camera.height)
+    near, far = sheets(sensor, surface, first, second)
+    checks = check_motion("forward", near, far, flow.forward, flow.forward_visible)
+    checks += check_motion("backward", far, near, flow.backward, flow.backward_visible)
+    return flow, {check.name: check for check in checks}
+
+
 def as_sample(index: int, drawn: Scene, data: SampleData) -> Sample:
     """What the dataset's writer takes."""
-    return Sample(
-        index,
-        0,
-        (0, 1),
-        0,
-        data.image1,
-        data.image2,
-        data.flow,
-        drawn,
-        data.surface,
-        data.displacement1,
-        data.displacement2,
-    )
+    fields = (data.image1, data.image2, data.flow, drawn, data.surface, data.displacement1, data.displacement2)
+    return Sample(index, 0, (0, 1), 0, *fields)
 
 
 def _paint(

@@ -22,7 +22,7 @@ _DOT_PX = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class LatticeFit:
+class DotGridFit:
     """Layout and camera.
 
     Attributes:
@@ -40,7 +40,7 @@ class LatticeFit:
     used: NDArray[np.int64]
 
 
-def fit_lattice(sensor: Sensor, pattern: Dots, centres: Pixels, spacing_mm: float | None) -> LatticeFit:
+def fit_dot_grid(sensor: Sensor, pattern: Dots, centres: Pixels, spacing_mm: float | None) -> DotGridFit:
     """Fit the grid, and the camera as far as the grid tells.
 
     A flat grid fixes the ratio of spacing and focal length alone. So either the spacing is known and the focal lengths
@@ -58,7 +58,7 @@ def fit_lattice(sensor: Sensor, pattern: Dots, centres: Pixels, spacing_mm: floa
     """
     from scipy.optimize import least_squares
 
-    used, index = lattice_index(centres)
+    used, index = grid_index(centres)
     start = _start(sensor, centres[used], index, spacing_mm)
     camera = sensor.camera
     distorts = camera.lens == "pinhole"
@@ -94,10 +94,10 @@ def fit_lattice(sensor: Sensor, pattern: Dots, centres: Pixels, spacing_mm: floa
     scale = float(np.mean(np.linalg.norm(np.diff(_corner(sensor, layout, fitted), axis=0), axis=1) / layout.spacing_mm))
     jitter = 1.4826 * float(np.median(np.abs(residual))) / scale
     layout = _near_centre(layout.model_copy(update={"jitter_mm": round(jitter, 4)}))
-    return LatticeFit(_rounded(layout), _rounded(fitted), residual, index, used)
+    return DotGridFit(_rounded(layout), _rounded(fitted), residual, index, used)
 
 
-def lattice_index(centres: Pixels) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def grid_index(centres: Pixels) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Dots of a grid whose rows are within 40 degrees of horizontal: which (k,), and their column and row (k, 2).
 
     Raises:
@@ -131,8 +131,7 @@ def lattice_index(centres: Pixels) -> tuple[NDArray[np.int64], NDArray[np.int64]
 
 def _start(sensor: Sensor, centres: Pixels, index: NDArray[np.int64], spacing_mm: float | None) -> FloatArray:
     """First guess from the points at which the preset's camera sees the dots."""
-    origins, directions = Optics.of(sensor).rays(centres)
-    points = (origins - directions * (origins[:, 2:] / directions[:, 2:]))[:, :2]
+    points = Optics.of(sensor).look(centres).on_flat_face[:, :2]
     if not np.isfinite(points).all():
         raise InputError("the preset's camera does not see the gel where the frame shows dots; check sensor.camera")
     design = np.column_stack([index, np.ones(len(index))])
