@@ -19,7 +19,7 @@ from synth.bench.budget_field import read_field, write_field
 from synth.bench.budget_press import Measurement, Pressed
 from synth.bench.budget_study import REFERENCE, Drawn, Job, Study
 from synth.dataset.jsontext import read_document, to_document
-from synth.dataset.lines import append_line, read_line, rewrite_lines, scan_lines
+from synth.dataset.lines import append_line, merge_lines, read_line, scan_lines
 from synth.dataset.lock import DirectoryLock
 from synth.dataset.storage import remove_partials, replace_file, storage_errors
 from synth.errors import InputError
@@ -83,9 +83,8 @@ class Store:
         with storage_errors(self._directory):
             remove_partials(self._directory)
             remove_partials(self._directory / FIELDS)
+        merge_lines(self._lines, _key)  # cuts off what a killed run left of a line
         table = scan_lines(self._lines, _key)
-        if self._lines.exists() and self._lines.stat().st_size > table.end:
-            rewrite_lines(self._lines, table.places.values())  # cut off what a killed run left of a line
         found = (_measurement(read_line(self._lines, place)) for place in table.places.values())
         return {measurement.job: measurement for measurement in found}
 

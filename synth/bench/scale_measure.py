@@ -25,8 +25,8 @@ from statistics import median
 from typing import Any
 
 from synth.arrays import FloatArray
-from synth.dataset.joining import MANIFEST_FILE
 from synth.dataset.reader import Dataset, read_dataset
+from synth.dataset.sample import MANIFEST_FILE
 from synth.dataset.storage import flush
 from synth.generate import Scheduling, generate, job_variant
 from synth.mesh import rest_surface

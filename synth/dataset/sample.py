@@ -13,6 +13,8 @@ from synth.scene import Scene
 from synth.surface import GelSurface
 
 SAMPLES_FOLDER = "samples"
+MANIFEST_FILE = "manifest.jsonl"
+FAILURES_FILE = "failures.jsonl"
 VIEW_FILES = ("image1.png", "image2.png", "flow.exr")
 """Of each camera: the main camera's in the sample's folder, another's in a folder of its name therein."""
 SAMPLE_FILES = (*VIEW_FILES, "meta.json", "surface.npz")
@@ -130,6 +132,16 @@ class ManifestEntry:
     def record(self) -> dict[str, Any]:
         """The line's JSON object."""
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
+
+
+def manifest_key(record: dict[str, Any]) -> int:
+    """Index of a line of the manifest; KeyError or TypeError where it is not one."""
+    return ManifestEntry.from_record(record).index
+
+
+def failure_key(record: dict[str, Any]) -> tuple[int, int]:
+    """Index and draw of a line of the failures; KeyError or TypeError where it is not one."""
+    return int(record["index"]), int(record["draw"])
 
 
 def largest_motion(flow: FlowField) -> float | None:

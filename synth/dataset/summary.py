@@ -12,10 +12,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from synth.dataset.job import read_job_record
-from synth.dataset.joining import FAILURES_FILE, MANIFEST_FILE
 from synth.dataset.jsontext import to_document
-from synth.dataset.storage import replace_file
+from synth.dataset.sample import FAILURES_FILE, MANIFEST_FILE
 
 SUMMARY_FILE = "summary.json"
 
@@ -55,16 +53,6 @@ def summary_document(folder: Path, run: Mapping[str, Any], asked_for: int) -> by
     counted = totals(_lines(folder / MANIFEST_FILE), _lines(folder / FAILURES_FILE))
     ordered = {"samples": counted.pop("samples"), "asked_for": asked_for, **counted, "last_run": run}
     return to_document(ordered).encode("utf-8")
-
-
-def write_summary(directory: Path, run: Mapping[str, Any]) -> None:
-    """Writes DIR/summary.json.
-
-    Raises:
-        InputError: The storage refuses.
-    """
-    asked_for = int(read_job_record(directory)["n"])
-    replace_file(directory / SUMMARY_FILE, summary_document(directory, run, asked_for))
 
 
 def _lines(path: Path) -> Iterator[dict[str, Any]]:

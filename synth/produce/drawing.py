@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from synth.dataset.output import mesh_folder
+from synth.dataset.meshes import mesh_folder
 from synth.errors import InputError
 from synth.mesh import PadMesh
 from synth.produce.records import FaceState, Failure, Outcome, Task, Workplace

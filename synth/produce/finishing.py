@@ -14,8 +14,8 @@ import numpy as np
 
 from synth.arrays import Image
 from synth.dataset.images import Raster
-from synth.dataset.output import write_sample
 from synth.dataset.sample import CameraPair, Sample
+from synth.dataset.sample_files import write_sample_files
 from synth.flow.exact import exact_flow
 from synth.flow.field import FlowField
 from synth.flow.view import View
@@ -77,7 +77,7 @@ def finish(place: Workplace, developed: Developed) -> Outcome:
         started = time.perf_counter()
         sample = _sample(place, developed, pair, diagnostics, looks)
         traced = time.perf_counter()
-        entry = write_sample(place.out, sample, place.job)
+        entry = write_sample_files(place.out, sample, place.job)
         seconds = {**developed.seconds, "flow": traced - started, "write": time.perf_counter() - traced}
         entries.append(replace(entry, seconds={stage: round(value, 4) for stage, value in seconds.items()}))
     return Outcome(tuple(entries), developed.failures, ())

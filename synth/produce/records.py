@@ -6,8 +6,8 @@ from typing import Any
 
 from synth.arrays import FloatArray
 from synth.dataset.job import Job
-from synth.dataset.output import Output
 from synth.dataset.sample import ManifestEntry
+from synth.dataset.store import Output
 from synth.render.variant import Variant
 from synth.simulate import State
 from synth.simulate.space import Space
