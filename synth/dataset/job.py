@@ -94,10 +94,19 @@ def check_record(record: dict[str, Any], where: str) -> dict[str, Any]:
 def refuse_another_job(job: Job, record: Mapping[str, Any], where: str) -> None:
     """Compares a job with the dataset.json of a place.
 
+    The scene (by its digest), the seed and the device make a job: each changes pixels, the device by its own rounding
+    and sequence of random numbers. n does not, since a sample does not depend on it. Versions of software are recorded,
+    not compared.
+
     Raises:
         InputError: They differ; the message says in what.
     """
-    different = differences(job, record)
+    different = []
+    if job.scene_hash != record["scene_hash"]:
+        changed = _changed(jsonable(record["scene"]), jsonable(job.scene), "scene")
+        different += changed or _changed(record["scene_hash"], job.scene_hash, "scene_hash")
+    different += _changed(record["seed"], job.seed, "seed")
+    different += _changed(record.get("device", {}), jsonable(job.device), "device")
     if different:
         listed = "".join(f"\n  {line}" for line in different[:20])
         more = f"\n  and {len(different) - 20} more" if len(different) > 20 else ""
@@ -105,23 +114,6 @@ def refuse_another_job(job: Job, record: Mapping[str, Any], where: str) -> None:
             f"{where}: holds another job; it differs in{listed}{more}\n"
             "give another --out, or the options of that job to go on with it"
         )
-
-
-def differences(job: Job, record: Mapping[str, Any]) -> list[str]:
-    """What makes `job` another job than the one in a dataset.json, one line each; empty: the same job.
-
-    The scene (by its digest), the seed and the device make a job: each changes pixels, the device by its own rounding
-    and sequence of random numbers. n does not, since a sample does not depend on it. Versions of software are recorded,
-    not compared.
-    """
-    lines = []
-    if job.scene_hash != record["scene_hash"]:
-        changed = _changed(jsonable(record["scene"]), jsonable(job.scene), "scene")
-        lines += changed or [f"scene_hash: {record['scene_hash']} there, {job.scene_hash} now"]
-    if job.seed != record["seed"]:
-        lines.append(f"seed: {record['seed']} there, {job.seed} now")
-    lines += _changed(record.get("device", {}), jsonable(job.device), "device")
-    return lines
 
 
 def continued(job: Job, record: Mapping[str, Any]) -> dict[str, Any]:

@@ -27,12 +27,10 @@ class LineTable(Generic[Key]):
 
     Attributes:
         places: key -> (offset, length) in bytes, of the last line with that key; in the file's order of first keys.
-        end: bytes up to the end of the last intact line.
         tidy: the file holds the intact lines in the order of their keys, each once, and nothing else.
     """
 
     places: dict[Key, tuple[int, int]]
-    end: int
     tidy: bool
 
 
@@ -47,29 +45,28 @@ def scan_lines(path: Path, key: Callable[[dict[str, Any]], Key]) -> LineTable[Ke
         InputError: The file cannot be read, or a line other than the last is damaged.
     """
     places: dict[Key, tuple[int, int]] = {}
-    end, lines, torn, ordered, previous = 0, 0, False, True, None
+    end, torn, tidy, previous = 0, False, True, None
     try:
         with path.open("rb") as file:
-            for line in file:
+            for number, line in enumerate(file):
                 if torn:
                     raise InputError(
-                        f"{path}: line {lines + 1} is damaged; delete that line "
+                        f"{path}: line {number} is damaged; delete that line "
                         "(what it stood for is then made again) and try again"
                     )
                 found = _key_of(line, key)
-                if found is None:
-                    torn = True
+                torn = found is None
+                if torn:
                     continue
-                ordered = ordered and (previous is None or previous < found)
+                tidy = tidy and (previous is None or previous < found)
                 previous = found
                 places[found] = (end, len(line))
                 end += len(line)
-                lines += 1
     except FileNotFoundError:
-        return LineTable({}, 0, True)
+        return LineTable({}, True)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    return LineTable(places, end, ordered and not torn)
+    return LineTable(places, tidy and not torn)
 
 
 def _key_of(line: bytes, key: Callable[[dict[str, Any]], Key]) -> Any:

@@ -48,8 +48,8 @@ class DirectoryLock:
         Raises:
             InputError: Another process writes it, or the file system offers no locks.
         """
-        if not self._take(WHOLE, fcntl.LOCK_EX | fcntl.LOCK_NB):
-            raise self._held(WHOLE, "another process", "is writing this dataset")
+        if not self._take(WHOLE):
+            raise self._held(WHOLE, "is writing this dataset")
         self._sign(WHOLE, _signature())
 
     @contextlib.contextmanager
@@ -68,7 +68,7 @@ class DirectoryLock:
             yield True
             return
         with self.setup():
-            alone = self._take(WHOLE, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            alone = self._take(WHOLE)
             if not alone:
                 self._take_shard(shard)  # before anything is touched
             yield alone
@@ -87,7 +87,7 @@ class DirectoryLock:
             return
         with self.setup():
             self._let_go(WHOLE)
-            alone = self._take(WHOLE, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            alone = self._take(WHOLE)
             yield alone
             if alone:
                 self._let_go(WHOLE)
@@ -114,13 +114,14 @@ class DirectoryLock:
     def _take_shard(self, shard: Shard) -> None:
         """One shard, and a part in the dataset; also where WHOLE was held alone before."""
         if not self._take(WHOLE, fcntl.LOCK_SH | fcntl.LOCK_NB):
-            raise self._held(WHOLE, "another process", "is writing this dataset, without --shard")
-        if not self._take(_FIRST_SHARD + shard.number, fcntl.LOCK_EX | fcntl.LOCK_NB):
-            raise self._held(_FIRST_SHARD + shard.number, "another process", f"is making shard {shard}")
+            raise self._held(WHOLE, "is writing this dataset, without --shard")
+        own = _FIRST_SHARD + shard.number
+        if not self._take(own):
+            raise self._held(own, f"is making shard {shard}")
         self._sign(WHOLE, "shards")
-        self._sign(_FIRST_SHARD + shard.number, _signature())
+        self._sign(own, _signature())
 
-    def _take(self, place: int, how: int) -> bool:
+    def _take(self, place: int, how: int = fcntl.LOCK_EX | fcntl.LOCK_NB) -> bool:
         try:
             fcntl.lockf(self._descriptor, how, 1, place * _ROOM)
         except OSError as error:
@@ -138,10 +139,12 @@ class DirectoryLock:
         with contextlib.suppress(OSError):  # It only serves messages; a full disk must not matter here.
             os.pwrite(self._descriptor, f"{text}\n".encode("ascii", "replace")[:_ROOM].ljust(_ROOM), place * _ROOM)
 
-    def _held(self, place: int, who: str, does: str) -> InputError:
+    def _held(self, place: int, does: str) -> InputError:
         holder = os.pread(self._descriptor, _ROOM, place * _ROOM).decode("ascii", "replace").strip(" \n\0")
-        named = f"{who} ({holder})" if holder else who
-        return InputError(f"{self._directory}: {named} {does}; wait for it to end, or give another --out")
+        named = f" ({holder})" if holder else ""
+        return InputError(
+            f"{self._directory}: another process{named} {does}; wait for it to end, or give another --out"
+        )
 
 
 def _signature() -> str:

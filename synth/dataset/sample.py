@@ -116,18 +116,9 @@ class ManifestEntry:
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> "ManifestEntry":
         """From the line's JSON object; KeyError or TypeError where it is not one of a sample."""
-        return cls(
-            index=int(record["index"]),
-            trajectory=int(record["trajectory"]),
-            frames=(int(record["frames"][0]), int(record["frames"][1])),
-            seed=int(record["seed"]),
-            sha256=dict(record["sha256"]),
-            seconds=dict(record["seconds"]),
-            diagnostics=dict(record["diagnostics"]),
-            force_n=tuple(tuple(row) for row in record["force_n"]),
-            torque_nmm=tuple(tuple(row) for row in record["torque_nmm"]),
-            max_flow_px=record["max_flow_px"],
-        )
+        values = {name: record[name] for name in cls.__dataclass_fields__}
+        rows = {name: tuple(map(tuple, record[name])) for name in ("force_n", "torque_nmm")}
+        return cls(**{**values, **rows, "index": int(record["index"]), "frames": tuple(record["frames"])})
 
     def record(self) -> dict[str, Any]:
         """The line's JSON object."""
