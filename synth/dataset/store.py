@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlparse
 
-from synth.dataset.storage import replace_file, storage_errors
+from synth.dataset.storage import replace_file
 from synth.errors import InputError
 
 Output = Path | str
@@ -66,12 +66,6 @@ class Store:
             raise InputError(f"--out {self.out}: {error}") from error
         return system, root.rstrip("/")
 
-    def create(self) -> None:
-        """Makes the directory; an object store needs none."""
-        if self.directory is not None:
-            with storage_errors(self.directory):
-                self.directory.mkdir(parents=True, exist_ok=True)
-
     def read(self, name: str) -> bytes | None:
         """The content; None where there is nothing of that name."""
         system, root = self._place
@@ -84,16 +78,19 @@ class Store:
         if self.directory is not None:
             replace_file(self.directory / name, content)
             return
+        system, root = self._place
         with self._errors(name):
-            self._target(name).pipe_file(f"{self._place[1]}/{name}", content)
+            self._make_folder(f"{root}/{name}")
+            system.pipe_file(f"{root}/{name}", content)
 
     def put(self, path: Path, name: str) -> None:
         """Copies a local file, or the files of a local folder, to objects."""
-        _, root = self._place
+        system, root = self._place
         with self._errors(name):
             for file in sorted(file for file in (path, *path.rglob("*")) if file.is_file()):
-                target = f"{name}/{file.relative_to(path).as_posix()}".removesuffix("/.")
-                self._target(target).put_file(str(file), f"{root}/{target}")
+                target = f"{root}/{name}/{file.relative_to(path).as_posix()}".removesuffix("/.")
+                self._make_folder(target)
+                system.put_file(str(file), target)
 
     def get(self, name: str, path: Path) -> bool:
         """Copies an object to a local file; False where there is none."""
@@ -125,19 +122,15 @@ class Store:
             with self._errors(name), contextlib.suppress(FileNotFoundError):
                 system.rm_file(f"{root}/{name}")
 
-    def _target(self, name: str) -> Any:
-        """The file system, with the folder of an object where it has folders."""
-        system, root = self._place
-        system.makedirs(f"{root}/{name}".rpartition("/")[0], exist_ok=True)
-        return system
+    def _make_folder(self, target: str) -> None:
+        """The folder of an object, where the store has folders."""
+        self._place[0].makedirs(target.rpartition("/")[0], exist_ok=True)
 
     @contextlib.contextmanager
     def _errors(self, name: str) -> Iterator[None]:
         """Every driver of fsspec has errors of its own, besides OSError: at this border all become one message."""
         try:
             yield
-        except (InputError, FileNotFoundError):
-            raise
         except Exception as error:
             raise InputError(
                 f"{self.out}/{name}: the storage refuses: {type(error).__name__}: {error}; what was finished before is "

@@ -89,7 +89,6 @@ class DatasetWriter:
         self._directory = self._store.directory
         self._run: Mapping[str, Any] | None = None
         self._check_place()
-        self._store.create()
         self._closing = contextlib.ExitStack()
         self._lock: DirectoryLock | Lease
         if self._directory is None:
@@ -97,6 +96,8 @@ class DatasetWriter:
             self._lock = Lease(self._store)
         else:
             self._whole = self._directory
+            with storage_errors(self._directory):
+                self._directory.mkdir(parents=True, exist_ok=True)
             self._lock = DirectoryLock(self._directory)
         self._closing.callback(self._lock.release)
         self._own = self._whole

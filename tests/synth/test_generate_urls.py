@@ -12,6 +12,7 @@ from samples import job, translation_sample
 from tiny_scene import fingerprint, own_cache, reference, write_tiny
 
 from synth.dataset.lease import EXPIRES_S
+from synth.dataset.meshes import mesh_folder
 from synth.dataset.sample_files import write_sample_files
 from synth.dataset.shard import Shard
 from synth.dataset.store import Store
@@ -110,6 +111,29 @@ def test_who_is_refused(url: str) -> None:
     Store(url).delete(["dataset.json"])
     with pytest.raises(InputError, match=r"holds .* but no dataset"):
         DatasetWriter(url, job())
+
+
+def test_meshes_are_put_under_the_url_but_not_by_a_shard(url: str) -> None:
+    """Fails with the check of shards left out: two shards would each put another mesh."""
+    with DatasetWriter(url, job(), Shard(0, 2)) as writer:
+        with pytest.raises(InputError, match="shards need the mesh to be there"), writer.making_meshes() as folder:
+            (folder / "shard.npz").write_bytes(b"mesh")
+        (folder / "shard.npz").unlink()
+    with DatasetWriter(url, job()) as writer, writer.making_meshes() as folder:
+        (folder / "plain.npz").write_bytes(b"mesh")
+    assert Store(url).names("meshes") == ["plain.npz"]
+    (folder / "plain.npz").unlink()
+    assert (mesh_folder(url) / "plain.npz").read_bytes() == b"mesh"  # fetched by another process
+
+
+@pytest.mark.parametrize("place", ["url", "tmp_path"])
+def test_a_sample_whose_files_are_elsewhere_is_refused(place: str, request: pytest.FixtureRequest) -> None:
+    out = request.getfixturevalue(place)
+    elsewhere = write_sample_files(request.getfixturevalue("tmp_path") / "elsewhere", translation_sample(1), job())
+    with DatasetWriter(out if place == "url" else out / "d", job()) as writer:
+        with pytest.raises(InputError, match=r"samples/000001: the sample's files are not there"):
+            writer.record(elsewhere)
+        assert writer.finished == set()
 
 
 @pytest.mark.parametrize(
