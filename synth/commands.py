@@ -11,8 +11,8 @@ from rich.table import Table
 from rich.text import Text
 
 from synth.dataset.export import ExportFormat, export
-from synth.dataset.output import output_of
 from synth.dataset.shard import Shard
+from synth.dataset.store import output_of
 from synth.dataset.summary import shares
 from synth.errors import InputError
 from synth.pipeline.generate import Scheduling, Summary

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from synth.dataset.exr import CONVENTIONS
-from synth.dataset.jsontext import jsonable, read_document, to_document
+from synth.dataset.jsontext import jsonable, read_document
 from synth.errors import InputError
 
 SCHEMA_VERSION = 1
@@ -61,10 +61,6 @@ class Job:
             "scene": self.scene,
         }
 
-    def document(self) -> bytes:
-        """dataset.json."""
-        return to_document(self.record()).encode("utf-8")
-
 
 def read_job_record(directory: Path) -> dict[str, Any]:
     """The content of DIR/dataset.json.
@@ -75,19 +71,16 @@ def read_job_record(directory: Path) -> dict[str, Any]:
     path = directory / DATASET_FILE
     if not path.is_file():
         raise InputError(f"{directory}: not a dataset: it has no {DATASET_FILE}")
-    record = read_document(path)
-    check_record(record, str(path))
-    return record
+    return check_record(read_document(path), str(path))
 
 
-def check_record(record: Any, where: str) -> None:
-    """Refuses what is not the content of a dataset.json of this version.
+def check_record(record: dict[str, Any], where: str) -> dict[str, Any]:
+    """The content of a dataset.json, if it is of this version; `where` is for messages.
 
     Raises:
         InputError: Something is missing, or it is of another version of the format.
     """
-    keys = ("schema_version", "scene_hash", "seed", "n", "scene")
-    missing = [key for key in keys if not isinstance(record, Mapping) or key not in record]
+    missing = [key for key in ("schema_version", "scene_hash", "seed", "n", "scene") if key not in record]
     if missing:
         raise InputError(f"{where}: lacks {', '.join(missing)}; the file is damaged or not of a dataset")
     if record["schema_version"] != SCHEMA_VERSION:
@@ -95,15 +88,25 @@ def check_record(record: Any, where: str) -> None:
             f"{where}: written in version {record['schema_version']} of the format; "
             f"this program reads version {SCHEMA_VERSION}"
         )
+    return record
 
 
 def refuse_another_job(job: Job, record: Mapping[str, Any], where: str) -> None:
     """Compares a job with the dataset.json of a place.
 
+    The scene (by its digest), the seed and the device make a job: each changes pixels, the device by its own rounding
+    and sequence of random numbers. n does not, since a sample does not depend on it. Versions of software are recorded,
+    not compared.
+
     Raises:
         InputError: They differ; the message says in what.
     """
-    different = differences(job, record)
+    different = []
+    if job.scene_hash != record["scene_hash"]:
+        changed = _changed(jsonable(record["scene"]), jsonable(job.scene), "scene")
+        different += changed or _changed(record["scene_hash"], job.scene_hash, "scene_hash")
+    different += _changed(record["seed"], job.seed, "seed")
+    different += _changed(record.get("device", {}), jsonable(job.device), "device")
     if different:
         listed = "".join(f"\n  {line}" for line in different[:20])
         more = f"\n  and {len(different) - 20} more" if len(different) > 20 else ""
@@ -111,23 +114,6 @@ def refuse_another_job(job: Job, record: Mapping[str, Any], where: str) -> None:
             f"{where}: holds another job; it differs in{listed}{more}\n"
             "give another --out, or the options of that job to go on with it"
         )
-
-
-def differences(job: Job, record: Mapping[str, Any]) -> list[str]:
-    """What makes `job` another job than the one in a dataset.json, one line each; empty: the same job.
-
-    The scene (by its digest), the seed and the device make a job: each changes pixels, the device by its own rounding
-    and sequence of random numbers. n does not, since a sample does not depend on it. Versions of software are recorded,
-    not compared.
-    """
-    lines = []
-    if job.scene_hash != record["scene_hash"]:
-        changed = _changed(jsonable(record["scene"]), jsonable(job.scene), "scene")
-        lines += changed or [f"scene_hash: {record['scene_hash']} there, {job.scene_hash} now"]
-    if job.seed != record["seed"]:
-        lines.append(f"seed: {record['seed']} there, {job.seed} now")
-    lines += _changed(record.get("device", {}), jsonable(job.device), "device")
-    return lines
 
 
 def continued(job: Job, record: Mapping[str, Any]) -> dict[str, Any]:

@@ -63,11 +63,21 @@ def read_document(path: Path) -> dict[str, Any]:
         InputError: The file is missing, unreadable, or holds no JSON object.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        return parse_document(path.read_bytes(), str(path))
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def parse_document(content: bytes, where: str) -> dict[str, Any]:
+    """The object in the content of a .json file; `where` is for messages.
+
+    Raises:
+        InputError: It holds no JSON object.
+    """
+    try:
+        parsed = json.loads(content)
     except ValueError as error:
-        raise InputError(f"{path}: not valid JSON ({error}); the file is damaged") from error
-    if not isinstance(content, dict):
-        raise InputError(f"{path}: holds a JSON {type(content).__name__}, not an object; the file is damaged")
-    return content
+        raise InputError(f"{where}: not valid JSON ({error}); the file is damaged") from error
+    if not isinstance(parsed, dict):
+        raise InputError(f"{where}: holds a JSON {type(parsed).__name__}, not an object; the file is damaged")
+    return parsed

@@ -5,43 +5,64 @@ second may both believe to hold it; as samples depend on (scene, seed, index) al
 twice, and no sample is spoilt.
 """
 
+import contextlib
 import json
 import os
 import socket
 import threading
 import time
+from collections.abc import Iterator
 
 from synth.dataset.shard import Shard
-from synth.dataset.url_store import UrlStore
+from synth.dataset.store import Store
 from synth.errors import InputError
 
 RENEWED_S, EXPIRES_S = 20.0, 90.0
-_FOLDER = "leases"
+LEASES_FOLDER = "leases"
 
 
 class Lease:
-    """Held from creation until `release` or, for others to see, some time after the process was killed."""
+    """As `synth.dataset.lock.DirectoryLock`: held from `join` until `release` or the end of the process.
 
-    def __init__(self, store: UrlStore, shard: Shard | None) -> None:
-        """Takes the place of a plain run, or of one shard.
+    Nobody knows to be the last here, so that shards leave it to a plain run to put the dataset together.
+    """
+
+    def __init__(self, store: Store) -> None:
+        """Holds nothing yet."""
+        self._store, self._name = store, ""
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._keep, daemon=True)
+
+    @contextlib.contextmanager
+    def join(self, shard: Shard | None) -> Iterator[bool]:
+        """Takes the place of a plain run, or of one shard; yields whether it is a plain run's.
 
         Raises:
             InputError: another process writes there, or the storage refuses.
         """
-        self._store = store
-        self._name = f"{_FOLDER}/{shard.name if shard else 'whole'}.json"
-        for name in store.names(_FOLDER):
+        own = f"{shard.name if shard else 'whole'}.json"
+        for name in self._store.names(LEASES_FOLDER):
             # A plain run tolerates nobody; a shard tolerates other shards of the same job.
-            if shard is None or name in (f"{shard.name}.json", "whole.json"):
-                self._refuse_if_alive(f"{_FOLDER}/{name}")
-        self._ended = threading.Event()
+            if shard is None or name in (own, "whole.json"):
+                self._refuse_if_alive(f"{LEASES_FOLDER}/{name}")
+        self._name = f"{LEASES_FOLDER}/{own}"
         self._renew()
-        self._thread = threading.Thread(target=self._keep, daemon=True)
         self._thread.start()
+        yield shard is None
+
+    @contextlib.contextmanager
+    def leave(self, shard: Shard | None) -> Iterator[bool]:
+        """Yields whether this is a plain run."""
+        yield shard is None
+
+    @contextlib.contextmanager
+    def setup(self) -> Iterator[None]:
+        """Nothing is held: whatever is made within may be made twice."""
+        yield
 
     def release(self) -> None:
-        """Lets others write; harmless when repeated."""
-        if self._ended.is_set():
+        """Lets others write; harmless when repeated, and where nothing was taken."""
+        if self._ended.is_set() or self._thread.ident is None:
             return
         self._ended.set()
         self._thread.join()
@@ -57,7 +78,7 @@ class Lease:
         if age > EXPIRES_S or (host == socket.gethostname() and not _runs(pid)):
             return
         raise InputError(
-            f"{self._store.url}: another process (pid {pid} on {host}) is writing this dataset, last heard of "
+            f"{self._store.out}: another process (pid {pid} on {host}) is writing this dataset, last heard of "
             f"{age:.0f} s ago; wait for it to end (if it was killed, {EXPIRES_S:.0f} s), or give another --out"
         )
 

@@ -7,16 +7,18 @@ killed in between leaves at most one torn line, the last, which a writer cuts of
 import errno
 import json
 import os
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any, BinaryIO, Generic, TypeVar
 
 from synth.dataset.jsontext import to_line
-from synth.dataset.storage import flush, partial_name, storage_errors
+from synth.dataset.storage import replacing, storage_errors
 from synth.errors import InputError
 
-Key = TypeVar("Key", bound=Hashable)
+Key = TypeVar("Key", bound=Any)
+"""Hashable, and ordered."""
 
 
 @dataclass(frozen=True)
@@ -25,12 +27,10 @@ class LineTable(Generic[Key]):
 
     Attributes:
         places: key -> (offset, length) in bytes, of the last line with that key; in the file's order of first keys.
-        end: bytes up to the end of the last intact line.
         tidy: the file holds the intact lines in the order of their keys, each once, and nothing else.
     """
 
     places: dict[Key, tuple[int, int]]
-    end: int
     tidy: bool
 
 
@@ -45,29 +45,28 @@ def scan_lines(path: Path, key: Callable[[dict[str, Any]], Key]) -> LineTable[Ke
         InputError: The file cannot be read, or a line other than the last is damaged.
     """
     places: dict[Key, tuple[int, int]] = {}
-    end, lines, torn, ordered, previous = 0, 0, False, True, None
+    end, torn, tidy, previous = 0, False, True, None
     try:
         with path.open("rb") as file:
-            for line in file:
+            for number, line in enumerate(file):
                 if torn:
                     raise InputError(
-                        f"{path}: line {lines + 1} is damaged; delete that line "
+                        f"{path}: line {number} is damaged; delete that line "
                         "(what it stood for is then made again) and try again"
                     )
                 found = _key_of(line, key)
-                if found is None:
-                    torn = True
+                torn = found is None
+                if torn:
                     continue
-                ordered = ordered and (previous is None or previous < found)
+                tidy = tidy and (previous is None or previous < found)
                 previous = found
                 places[found] = (end, len(line))
                 end += len(line)
-                lines += 1
     except FileNotFoundError:
-        return LineTable({}, 0, True)
+        return LineTable({}, True)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    return LineTable(places, end, ordered and not torn)
+    return LineTable(places, tidy and not torn)
 
 
 def _key_of(line: bytes, key: Callable[[dict[str, Any]], Key]) -> Any:
@@ -120,55 +119,39 @@ def append_line(path: Path, record: object) -> None:
             os.close(descriptor)
 
 
-def join_lines(path: Path, others: Iterable[Path], key: Callable[[dict[str, Any]], Any]) -> None:
-    """Adds the intact lines of other files to a file; whole or not at all, a piece at a time.
+def merge_lines(
+    path: Path,
+    key: Callable[[dict[str, Any]], Key],
+    others: Sequence[Path] = (),
+    keep: Callable[[Key], bool] = lambda key: True,
+) -> set[Key]:
+    """Gives a file its own intact lines and those of other files, in the order of their keys; whole or not at all.
+
+    Args:
+        path: the file; made where it is missing.
+        key: as of `scan_lines`; of several lines with one key the last counts.
+        others: more lines; files that are missing are as empty.
+        keep: false for the keys whose lines to leave out.
+
+    Returns:
+        The keys of the file's lines.
 
     Raises:
         InputError: A file is damaged, or the storage refuses; the file is as before.
     """
-    partial = partial_name(path)
-    path.touch()
-    sources = [(source, scan_lines(source, key).end) for source in (path, *others)]
-    with storage_errors(path):
-        try:
-            with partial.open("wb") as joined:
-                for source, end in sources:
-                    _copy(source, end, joined)
-            flush(partial)
-            os.replace(partial, path)
-            flush(path.parent)
-        except BaseException:
-            partial.unlink(missing_ok=True)
-            raise
+    tables = {source: scan_lines(source, key) for source in (path, *others)}
+    every = {found: (source, place) for source, table in tables.items() for found, place in table.places.items()}
+    places = {found: where for found, where in every.items() if keep(found)}
+    if others or not tables[path].tidy or len(places) < len(every) or not path.exists():
+        with replacing(path) as merged:
+            for _, lines in groupby((places[found] for found in sorted(places)), key=lambda where: where[0]):
+                _copy(list(lines), merged)
+    return set(places)
 
 
-def _copy(source: Path, size: int, target: BinaryIO) -> None:
-    """The first `size` bytes of a file that may be missing where there are none."""
-    if size == 0:
-        return
-    with source.open("rb") as file:
-        while size > 0 and (piece := file.read(min(size, 1 << 20))):
-            target.write(piece)
-            size -= len(piece)
-
-
-def rewrite_lines(path: Path, places: Iterable[tuple[int, int]]) -> None:
-    """Gives the file these of its lines, in this order, and no others; whole or not at all, a line at a time.
-
-    Raises:
-        InputError: The storage refuses; the file is as before.
-    """
-    partial = partial_name(path)
-    with storage_errors(path):
-        path.touch()
-        try:
-            with path.open("rb") as old, partial.open("wb") as new:
-                for offset, length in places:
-                    old.seek(offset)
-                    new.write(old.read(length))
-            flush(partial)
-            os.replace(partial, path)
-            flush(path.parent)
-        except BaseException:
-            partial.unlink(missing_ok=True)
-            raise
+def _copy(lines: Sequence[tuple[Path, tuple[int, int]]], target: BinaryIO) -> None:
+    """Lines of one file."""
+    with lines[0][0].open("rb") as file:
+        for _, (offset, length) in lines:
+            file.seek(offset)
+            target.write(file.read(length))

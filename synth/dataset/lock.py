@@ -48,34 +48,49 @@ class DirectoryLock:
         Raises:
             InputError: Another process writes it, or the file system offers no locks.
         """
-        if not self.try_alone():
-            raise self._held(WHOLE, "another process", "is writing this dataset")
+        if not self._take(WHOLE):
+            raise self._held(WHOLE, "is writing this dataset")
         self._sign(WHOLE, _signature())
 
-    def take_shard(self, shard: Shard) -> None:
-        """One shard, and a part in the dataset; within `setup`, and whether or not `try_alone` succeeded before.
+    @contextlib.contextmanager
+    def join(self, shard: Shard | None) -> Iterator[bool]:
+        """Takes the dataset alone, or a shard beside others; within, no other shard comes or goes.
+
+        Yields:
+            Whether nobody else is writing, so that the files of all may be put in order.
 
         Raises:
-            InputError: A plain run writes the dataset, or another process this shard.
+            InputError: A plain run writes the dataset, or another process this shard, or any where `shard` is None; or
+                the file system offers no locks.
         """
-        if not self._take(WHOLE, fcntl.LOCK_SH | fcntl.LOCK_NB):
-            raise self._held(WHOLE, "another process", "is writing this dataset, without --shard")
-        if not self._take(_FIRST_SHARD + shard.number, fcntl.LOCK_EX | fcntl.LOCK_NB):
-            raise self._held(_FIRST_SHARD + shard.number, "another process", f"is making shard {shard}")
-        self._sign(WHOLE, "shards")
-        self._sign(_FIRST_SHARD + shard.number, _signature())
+        if shard is None:
+            self.take_whole()
+            yield True
+            return
+        with self.setup():
+            alone = self._take(WHOLE)
+            if not alone:
+                self._take_shard(shard)  # before anything is touched
+            yield alone
+            if alone:
+                self._take_shard(shard)
 
-    def try_alone(self) -> bool:
-        """Hold WHOLE alone if nobody else holds a part of it.
+    @contextlib.contextmanager
+    def leave(self, shard: Shard | None) -> Iterator[bool]:
+        """Ends a shard's part in the dataset; within, no other shard comes or goes.
 
-        Raises:
-            InputError: The file system offers no locks.
+        Yields:
+            Whether nobody else is writing: always for a plain run, which keeps the dataset until `release`.
         """
-        return self._take(WHOLE, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-    def leave(self) -> None:
-        """Let go of this process's part of WHOLE."""
-        fcntl.lockf(self._descriptor, fcntl.LOCK_UN, 1, WHOLE * _ROOM)
+        if shard is None:
+            yield True
+            return
+        with self.setup():
+            self._let_go(WHOLE)
+            alone = self._take(WHOLE)
+            yield alone
+            if alone:
+                self._let_go(WHOLE)
 
     @contextlib.contextmanager
     def setup(self) -> Iterator[None]:
@@ -88,7 +103,7 @@ class DirectoryLock:
         try:
             yield
         finally:
-            fcntl.lockf(self._descriptor, fcntl.LOCK_UN, 1, SETUP * _ROOM)
+            self._let_go(SETUP)
 
     def release(self) -> None:
         """Lets go of everything; harmless when repeated."""
@@ -96,7 +111,17 @@ class DirectoryLock:
             os.close(self._descriptor)
             self._descriptor = -1
 
-    def _take(self, place: int, how: int) -> bool:
+    def _take_shard(self, shard: Shard) -> None:
+        """One shard, and a part in the dataset; also where WHOLE was held alone before."""
+        if not self._take(WHOLE, fcntl.LOCK_SH | fcntl.LOCK_NB):
+            raise self._held(WHOLE, "is writing this dataset, without --shard")
+        own = _FIRST_SHARD + shard.number
+        if not self._take(own):
+            raise self._held(own, f"is making shard {shard}")
+        self._sign(WHOLE, "shards")
+        self._sign(own, _signature())
+
+    def _take(self, place: int, how: int = fcntl.LOCK_EX | fcntl.LOCK_NB) -> bool:
         try:
             fcntl.lockf(self._descriptor, how, 1, place * _ROOM)
         except OSError as error:
@@ -107,14 +132,19 @@ class DirectoryLock:
             ) from error
         return True
 
+    def _let_go(self, place: int) -> None:
+        fcntl.lockf(self._descriptor, fcntl.LOCK_UN, 1, place * _ROOM)
+
     def _sign(self, place: int, text: str) -> None:
         with contextlib.suppress(OSError):  # It only serves messages; a full disk must not matter here.
             os.pwrite(self._descriptor, f"{text}\n".encode("ascii", "replace")[:_ROOM].ljust(_ROOM), place * _ROOM)
 
-    def _held(self, place: int, who: str, does: str) -> InputError:
+    def _held(self, place: int, does: str) -> InputError:
         holder = os.pread(self._descriptor, _ROOM, place * _ROOM).decode("ascii", "replace").strip(" \n\0")
-        named = f"{who} ({holder})" if holder else who
-        return InputError(f"{self._directory}: {named} {does}; wait for it to end, or give another --out")
+        named = f" ({holder})" if holder else ""
+        return InputError(
+            f"{self._directory}: another process{named} {does}; wait for it to end, or give another --out"
+        )
 
 
 def _signature() -> str:

@@ -13,11 +13,20 @@ from synth.arrays import FloatArray
 from synth.dataset.exr import read_flow
 from synth.dataset.images import Raster, read_png
 from synth.dataset.job import read_job_record
-from synth.dataset.joining import FAILURES_FILE, MANIFEST_FILE, failure_key, manifest_key
 from synth.dataset.jsontext import read_document
 from synth.dataset.lines import LineTable, read_line, scan_lines
 from synth.dataset.npz import read_npz
-from synth.dataset.sample import SAMPLES_FOLDER, CameraPair, ManifestEntry, further_cameras, sample_name
+from synth.dataset.sample import (
+    FAILURES_FILE,
+    MANIFEST_FILE,
+    SAMPLES_FOLDER,
+    CameraPair,
+    ManifestEntry,
+    failure_key,
+    further_cameras,
+    manifest_key,
+    sample_name,
+)
 from synth.errors import InputError
 from synth.flow.field import FlowField
 from synth.scene import Scene

@@ -13,6 +13,8 @@ from synth.scene import Scene
 from synth.surface import GelSurface
 
 SAMPLES_FOLDER = "samples"
+MANIFEST_FILE = "manifest.jsonl"
+FAILURES_FILE = "failures.jsonl"
 VIEW_FILES = ("image1.png", "image2.png", "flow.exr")
 """Of each camera: the main camera's in the sample's folder, another's in a folder of its name therein."""
 SAMPLE_FILES = (*VIEW_FILES, "meta.json", "surface.npz")
@@ -114,22 +116,23 @@ class ManifestEntry:
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> "ManifestEntry":
         """From the line's JSON object; KeyError or TypeError where it is not one of a sample."""
-        return cls(
-            index=int(record["index"]),
-            trajectory=int(record["trajectory"]),
-            frames=(int(record["frames"][0]), int(record["frames"][1])),
-            seed=int(record["seed"]),
-            sha256=dict(record["sha256"]),
-            seconds=dict(record["seconds"]),
-            diagnostics=dict(record["diagnostics"]),
-            force_n=tuple(tuple(row) for row in record["force_n"]),
-            torque_nmm=tuple(tuple(row) for row in record["torque_nmm"]),
-            max_flow_px=record["max_flow_px"],
-        )
+        values = {name: record[name] for name in cls.__dataclass_fields__}
+        rows = {name: tuple(map(tuple, record[name])) for name in ("force_n", "torque_nmm")}
+        return cls(**{**values, **rows, "index": int(record["index"]), "frames": tuple(record["frames"])})
 
     def record(self) -> dict[str, Any]:
         """The line's JSON object."""
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
+
+
+def manifest_key(record: dict[str, Any]) -> int:
+    """Index of a line of the manifest; KeyError or TypeError where it is not one."""
+    return ManifestEntry.from_record(record).index
+
+
+def failure_key(record: dict[str, Any]) -> tuple[int, int]:
+    """Index and draw of a line of the failures; KeyError or TypeError where it is not one."""
+    return int(record["index"]), int(record["draw"])
 
 
 def largest_motion(flow: FlowField) -> float | None:

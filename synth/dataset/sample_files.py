@@ -1,7 +1,8 @@
-"""A sample's folder: written aside, flushed, renamed into place. Any process may do it; nothing else is touched."""
+"""A sample's files, written as a whole. Any process may do it; nothing else of the dataset is touched."""
 
 import hashlib
 import shutil
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -14,15 +15,17 @@ from synth.dataset.jsontext import jsonable, to_document
 from synth.dataset.npz import encode_npz
 from synth.dataset.sample import SAMPLES_FOLDER, CameraPair, ManifestEntry, Sample, largest_motion, sample_name
 from synth.dataset.storage import install_folder, partial_name, storage_errors
+from synth.dataset.store import Output, Store
 
 
-def write_sample_files(directory: Path, sample: Sample, job: Job) -> ManifestEntry:
-    """Writes DIR/samples/NNNNNN whole or not at all; equal samples give equal bytes (times are only in the entry).
+def write_sample_files(out: Output, sample: Sample, job: Job) -> ManifestEntry:
+    """Writes samples/NNNNNN, in a directory whole or not at all; equal samples give equal bytes (without times).
 
     An older folder of that number is replaced: without a line in the manifest it counts as unfinished.
 
     Args:
-        directory: the dataset, opened by a `DatasetWriter` of some process.
+        out: the dataset, opened by a `DatasetWriter` of some process. Under a URL the files are made in a folder of
+            this machine's temporary space and copied.
         sample: what to write.
         job: for the header of flow.exr.
 
@@ -32,7 +35,17 @@ def write_sample_files(directory: Path, sample: Sample, job: Job) -> ManifestEnt
     Raises:
         InputError: The storage refuses (disk full, no permission).
     """
-    final = directory / SAMPLES_FOLDER / sample_name(sample.index)
+    if isinstance(out, Path):
+        return _write_folder(out / SAMPLES_FOLDER / sample_name(sample.index), sample, job)
+    name = f"{SAMPLES_FOLDER}/{sample_name(sample.index)}"
+    with tempfile.TemporaryDirectory(prefix="synth-") as temporary:
+        entry = _write_folder(Path(temporary) / name, sample, job)
+        Store(out).put(Path(temporary) / name, name)
+    return entry
+
+
+def _write_folder(final: Path, sample: Sample, job: Job) -> ManifestEntry:
+    """The sample's folder, written aside, flushed and renamed into place."""
     partial = partial_name(final)
     files = {"meta.json": to_document(_meta(sample, job)).encode("utf-8"), "surface.npz": _surface(sample)}
     views = {"": CameraPair(sample.image1, sample.image2, sample.flow), **sample.further}

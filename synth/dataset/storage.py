@@ -13,6 +13,7 @@ import shutil
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 from synth.errors import InputError
 
@@ -66,22 +67,34 @@ def flush(path: Path) -> None:
         os.close(descriptor)
 
 
-def replace_file(path: Path, content: bytes) -> None:
-    """Gives a file new content as a whole.
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[BinaryIO]:
+    """A file for the new content of `path`, which takes its place when all is written and flushed.
 
     Raises:
-        InputError: The storage refuses; the old content is still there.
+        InputError: The storage refuses; the old content is still there, as after any other error.
     """
     partial = partial_name(path)
     with storage_errors(path):
         try:
-            partial.write_bytes(content)
+            with partial.open("wb") as file:
+                yield file
             flush(partial)
             os.replace(partial, path)
             flush(path.parent)
         except BaseException:
             partial.unlink(missing_ok=True)
             raise
+
+
+def replace_file(path: Path, content: bytes) -> None:
+    """Gives a file new content as a whole.
+
+    Raises:
+        InputError: The storage refuses; the old content is still there.
+    """
+    with replacing(path) as file:
+        file.write(content)
 
 
 def refuse_foreign(path: Path, mark: bytes, *beside: Path) -> None:

@@ -1,21 +1,17 @@
 """summary.json: what a dataset took, and what its last run did.
 
-The totals are counted from manifest and failures, so that they hold whatever was interrupted in between:
-
-    {"samples", "asked_for", "seconds_per_stage", "share_per_stage", "failed_draws", "failures_by_reason", "last_run"}
+The totals are counted from manifest and failures, so that they hold whatever was interrupted in between.
 """
 
 import json
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from synth.dataset.job import read_job_record
-from synth.dataset.joining import FAILURES_FILE, MANIFEST_FILE
 from synth.dataset.jsontext import to_document
-from synth.dataset.storage import replace_file
+from synth.dataset.sample import FAILURES_FILE, MANIFEST_FILE
 
 SUMMARY_FILE = "summary.json"
 
@@ -32,39 +28,25 @@ def shares(seconds: Mapping[str, float]) -> dict[str, float]:
     return {stage: round(value / total, 4) for stage, value in seconds.items()} if total > 0 else {}
 
 
-def totals(entries: Iterable[Mapping[str, Any]], failures: Iterable[Mapping[str, Any]]) -> dict[str, Any]:
-    """Counts over lines of manifest and failures."""
+def summary_document(folder: Path, run: Mapping[str, Any], asked_for: int) -> bytes:
+    """The file's content, from a folder that holds sorted manifest and failures."""
     seconds: Counter[str] = Counter()
     samples = 0
-    for entry in entries:
+    for entry in _lines(folder / MANIFEST_FILE):
         samples += 1
         for stage, value in entry["seconds"].items():
             seconds[stage] += value
-    reasons = Counter(reason_group(failure["stage"], failure["reason"]) for failure in failures)
-    return {
+    reasons = Counter(reason_group(failure["stage"], failure["reason"]) for failure in _lines(folder / FAILURES_FILE))
+    content = {
         "samples": samples,
+        "asked_for": asked_for,
         "seconds_per_stage": {stage: round(value, 3) for stage, value in seconds.items()},
         "share_per_stage": shares(seconds),
         "failed_draws": reasons.total(),
         "failures_by_reason": dict(sorted(reasons.items(), key=lambda item: (-item[1], item[0]))),
+        "last_run": run,
     }
-
-
-def summary_document(folder: Path, run: Mapping[str, Any], asked_for: int) -> bytes:
-    """The file's content, from a folder that holds sorted manifest and failures."""
-    counted = totals(_lines(folder / MANIFEST_FILE), _lines(folder / FAILURES_FILE))
-    ordered = {"samples": counted.pop("samples"), "asked_for": asked_for, **counted, "last_run": run}
-    return to_document(ordered).encode("utf-8")
-
-
-def write_summary(directory: Path, run: Mapping[str, Any]) -> None:
-    """Writes DIR/summary.json.
-
-    Raises:
-        InputError: The storage refuses.
-    """
-    asked_for = int(read_job_record(directory)["n"])
-    replace_file(directory / SUMMARY_FILE, summary_document(directory, run, asked_for))
+    return to_document(content).encode("utf-8")
 
 
 def _lines(path: Path) -> Iterator[dict[str, Any]]:

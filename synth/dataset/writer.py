@@ -1,4 +1,4 @@
-"""A dataset directory while it is being written, possibly in several goes.
+"""A dataset while it is being written, possibly in several goes: in a directory or under a URL, whole or a shard of it.
 
     DIR/dataset.json      the job
     DIR/manifest.jsonl    a line per finished sample
@@ -7,102 +7,143 @@
                           its name with its own image1.png image2.png flow.exr
     DIR/summary.json      what it took
     DIR/meshes/           of pads with an even edge length
-    DIR/.lock             held by the process that writes
-    DIR/shards/           lines of shards that run, or that were stopped: see `synth.dataset.shard_writer`
+    DIR/.lock             held by the processes that write; under a URL notes in leases/
+    DIR/shards/i-of-N/    lines of shards that run, or that were stopped
+    URL/journal/          the lines of any run under a URL, each in an object of its own, as nothing can be appended
 
-A sample is finished when its folder is whole and its line is in the manifest, written in this order. Whatever a killed
-run leaves (a torn line, a hidden partial folder, a folder without a line) is put right on the next opening. `finalise`
-sorts both files, so that they do not depend on the number of workers or on interruptions; only `seconds` does.
+A sample is finished when its files are whole and its line is on record, written in this order. Whatever a killed run
+leaves (a torn line, a hidden partial folder, a folder without a line) is put right on the next opening. A run that ends
+merges all lines into manifest and failures, sorted, so that they do not depend on the number of workers or on
+interruptions; only `seconds` does. In a directory shards do so, too: whichever is alone, the first to come or the last
+to leave. Under a URL none knows to be the last, and a plain run does it.
 """
 
 import contextlib
+import json
+import shutil
+import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 
-from synth.dataset.finalising import Finalising
-from synth.dataset.job import DATASET_FILE, Job, continued, read_job_record, refuse_another_job
-from synth.dataset.joining import FAILURES_FILE, MANIFEST_FILE, failure_key, join_shards, manifest_key
-from synth.dataset.jsontext import to_document
-from synth.dataset.lines import append_line, rewrite_lines, scan_lines
+from synth.dataset.job import DATASET_FILE, Job, check_record, continued, refuse_another_job
+from synth.dataset.jsontext import parse_document, to_document, to_line
+from synth.dataset.lease import LEASES_FOLDER, Lease
+from synth.dataset.lines import append_line, merge_lines, scan_lines
 from synth.dataset.lock import LOCK_FILE, DirectoryLock
+from synth.dataset.meshes import MESHES_FOLDER, mesh_folder
 from synth.dataset.sample import (
+    FAILURES_FILE,
+    MANIFEST_FILE,
     SAMPLE_FILES,
     SAMPLES_FOLDER,
     VIEW_FILES,
     ManifestEntry,
     Sample,
+    failure_key,
     further_cameras,
+    manifest_key,
     sample_name,
 )
 from synth.dataset.sample_files import write_sample_files
-from synth.dataset.storage import PARTIAL, remove_partials, replace_file, storage_errors
-from synth.dataset.summary import write_summary
+from synth.dataset.shard import Shard
+from synth.dataset.storage import PARTIAL, remove_partials, storage_errors
+from synth.dataset.store import Store
+from synth.dataset.summary import SUMMARY_FILE, summary_document
 from synth.errors import InputError
 
-MESHES_FOLDER = "meshes"
+SHARDS_FOLDER = "shards"
+JOURNAL_FOLDER = "journal"
+
+_Known = tuple[set[int], set[tuple[int, int]]]
+"""Indices of finished samples; index and draw of failures."""
 
 
-class DatasetWriter(Finalising):
-    """Writes one job's samples; one process holds it, workers call `write_sample_files` and hand back the entry."""
+class DatasetWriter:
+    """Writes one job's samples; one process holds it, workers call `write_sample_files` and hand back the entry.
 
-    def __init__(self, directory: Path | str, job: Job) -> None:
-        """Creates the directory, or goes on with the job that it holds.
+    For `with`, which finalises, unless an error is on its way that this might hide, and closes.
+    """
+
+    _whole: Path
+    """The folder of this machine with the lines of all: the dataset's, or a temporary copy of what is under the URL."""
+    _own: Path
+    """The folder that takes this process's lines: the same, or a shard's."""
+
+    def __init__(self, out: Path | str, job: Job, shard: Shard | None = None, pairs_per_trajectory: int = 1) -> None:
+        """Creates the dataset, or goes on with the job that is there.
 
         Args:
-            directory: empty, missing, or a dataset of the same job (n may differ).
-            job: what to write.
+            out: a directory or a URL: empty, missing, or a dataset of the same job (n may differ).
+            job: what to write; the same for all shards.
+            shard: the part of the job that this process makes; None for all of it.
+            pairs_per_trajectory: samples i, i + 1, ... of that number belong to a trajectory, and so to one shard.
 
         Raises:
-            InputError: The directory holds another job (the message lists what differs) or something else, another
-                process is writing it, its manifest is damaged, or the storage refuses.
+            InputError: The place holds another job (the message lists what differs) or something else, another process
+                is writing it or this shard, it is being made in another number of shards, its manifest is damaged, or
+                the storage refuses.
         """
-        self.directory = Path(directory)
-        self.job = job
-        self._home = self.directory
+        self._store, self.job, self._shard, self._pairs = Store(out), job, shard, pairs_per_trajectory
+        self._directory = self._store.directory
         self._run: Mapping[str, Any] | None = None
-        _check_place(self.directory)
-        with storage_errors(self.directory):
-            self.directory.mkdir(parents=True, exist_ok=True)
-        self._lock = DirectoryLock(self.directory)
+        self._check_place()
+        self._closing = contextlib.ExitStack()
+        self._lock: DirectoryLock | Lease
+        if self._directory is None:
+            self._whole = Path(self._closing.enter_context(tempfile.TemporaryDirectory(prefix="synth-")))
+            self._lock = Lease(self._store)
+        else:
+            self._whole = self._directory
+            with storage_errors(self._directory):
+                self._directory.mkdir(parents=True, exist_ok=True)
+            self._lock = DirectoryLock(self._directory)
+        self._closing.callback(self._lock.release)
+        self._own = self._whole
         try:
-            self._finished, self._failed = self._open()
+            with self._lock.join(shard) as alone:
+                self._adopt_job()
+                if self._directory is None:
+                    self._fetch_lines()
+                if alone or self._directory is None:
+                    self._finished, self._failed = self._merge()
+                if shard is not None and self._directory is not None:
+                    self._finished, self._failed = self._begin_shard(self._directory, shard)
         except BaseException:
-            self._lock.release()
+            self.close()
             raise
 
     @property
     def finished(self) -> set[int]:
-        """Indices of the samples that are whole and in the manifest."""
+        """Indices of the samples that are whole and on record; of a shard in a directory only its own."""
         return set(self._finished)
 
-    @property
-    def failed(self) -> set[tuple[int, int]]:
-        """(index, draw) of the failures on record."""
-        return set(self._failed)
-
     def write(self, sample: Sample) -> ManifestEntry:
-        """Writes a sample's folder and its line in the manifest.
+        """Writes a sample's files and its line.
 
         Raises:
             InputError: The storage refuses; the sample counts as unfinished.
         """
-        entry = write_sample_files(self.directory, sample, self.job)
+        entry = write_sample_files(self._store.out, sample, self.job)
         self.record(entry)
         return entry
 
     def record(self, entry: ManifestEntry) -> None:
-        """Appends the line of a sample whose folder `write_sample_files` has written; again for a known one: nothing.
+        """Appends the line of a sample whose files `write_sample_files` has written; again for a known one: nothing.
 
         Raises:
-            InputError: The storage refuses, or the folder is not there.
+            InputError: The storage refuses, or the files are not there.
         """
         if entry.index in self._finished:
             return
+        name = sample_name(entry.index)
         if not self._is_whole(entry.index):
-            folder = self.directory / SAMPLES_FOLDER / sample_name(entry.index)
-            raise InputError(f"{folder}: the sample's files are not there; was it written to another place?")
-        append_line(self._home / MANIFEST_FILE, entry.record())
+            raise InputError(
+                f"{self._store.out}/{SAMPLES_FOLDER}/{name}: the sample's files are not there; were they written to "
+                "another place, or to storage that is not shared?"
+            )
+        self._append(MANIFEST_FILE, name, entry.record())
         self._finished.add(entry.index)
 
     def fail(self, index: int, draw: int, stage: str, reason: str, last_good_state: Any = None) -> None:
@@ -121,90 +162,163 @@ class DatasetWriter(Finalising):
         if (index, draw) in self._failed:
             return
         record = {"index": index, "draw": draw, "stage": stage, "reason": reason, "last_good_state": last_good_state}
-        append_line(self._home / FAILURES_FILE, record)
+        self._append(FAILURES_FILE, f"{sample_name(index)}-{draw}", record)
         self._failed.add((index, draw))
 
     @contextlib.contextmanager
     def making_meshes(self) -> Iterator[Path]:
-        """The folder of meshes that all who write this dataset share; within, nobody else makes one."""
+        """The folder of meshes that all who write this dataset share; within, nobody else makes one in a directory.
+
+        Raises:
+            InputError: A mesh was made in a shard under a URL: another shard might have made another one.
+        """
         with self._lock.setup():
-            yield self.directory / MESHES_FOLDER
+            folder = mesh_folder(self._store.out)
+            before = set(folder.glob("*"))
+            yield folder
+            made = set(folder.glob("*")) - before
+        if self._directory is not None or not made:
+            return
+        if self._shard is not None:
+            raise InputError(
+                f"{self._store.out}: shards need the mesh to be there: give the command with --n 1, without --shard, "
+                "first"
+            )
+        for path in made:
+            self._store.put(path, f"{MESHES_FOLDER}/{path.name}")
 
     def note_run(self, run: Mapping[str, Any]) -> None:
         """What `finalise` writes to summary.json about this run, beside the totals of the dataset."""
         self._run = run
 
     def finalise(self) -> None:
-        """Sorts manifest and failures by index, writes the summary; called on leaving a `with` block, too.
+        """Merges the lines of all into manifest and failures, writes the summary; in a shard only the last to leave.
 
         Raises:
-            InputError: The storage refuses; the files are as before.
+            InputError: The storage refuses; nothing is lost.
         """
-        self._tidy()
-        if self._run is not None:
-            write_summary(self.directory, self._run)
+        with self._lock.leave(self._shard) as alone:
+            if not alone:
+                return
+            self._merge()
+            if self._directory is None:
+                for name in (MANIFEST_FILE, FAILURES_FILE):
+                    self._store.put(self._whole / name, name)
+            if self._run is not None:
+                asked_for = int((self._record() or self.job.record())["n"])
+                self._store.write(SUMMARY_FILE, summary_document(self._whole, self._run, asked_for))
+            if self._directory is None:
+                self._store.delete(f"{JOURNAL_FOLDER}/{name}" for name in self._store.names(JOURNAL_FOLDER))
 
     def close(self) -> None:
         """Lets other processes write; harmless when repeated."""
-        self._lock.release()
+        self._closing.close()
 
-    def _open(self) -> tuple[set[int], set[tuple[int, int]]]:
-        """Take the dataset for this process; what is finished and what has failed."""
-        self._lock.take_whole()
-        self._adopt_job()
-        return self._tidy()
+    def __enter__(self) -> Self:
+        """For `with`."""
+        return self
 
-    def _tidy(self) -> tuple[set[int], set[tuple[int, int]]]:
-        """Put right what interrupted runs left, take in what shards made; nobody else may be writing."""
-        with storage_errors(self.directory):
-            (self.directory / SAMPLES_FOLDER).mkdir(exist_ok=True)
-            remove_partials(self.directory)
-            remove_partials(self.directory / SAMPLES_FOLDER)
-        join_shards(self.directory)
-        return self._repair_manifest(), self._repair_failures()
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Finalise and close."""
+        try:
+            if error is None or isinstance(error, KeyboardInterrupt):
+                self.finalise()
+        finally:
+            self.close()
+
+    def _check_place(self) -> None:
+        """Refuses a file, and a folder with something else in it, before anything in it is touched."""
+        if self._directory is not None and self._directory.exists() and not self._directory.is_dir():
+            raise InputError(f"{self._directory}: is a file; --out needs a directory")
+        ours = (LOCK_FILE, LEASES_FOLDER)
+        strange = [name for name in self._store.names() if name not in ours and PARTIAL not in name]
+        if strange and not self._store.exists(DATASET_FILE):
+            listed = ", ".join(strange[:5]) + (", ..." if len(strange) > 5 else "")
+            raise InputError(f"{self._store.out}: not a dataset: holds {listed} but no dataset; give another --out")
+
+    def _record(self) -> dict[str, Any] | None:
+        """The content of dataset.json; None where there is none."""
+        content, where = self._store.read(DATASET_FILE), f"{self._store.out}/{DATASET_FILE}"
+        return None if content is None else check_record(parse_document(content, where), where)
 
     def _adopt_job(self) -> None:
-        path = self.directory / DATASET_FILE
-        if not path.exists():
-            replace_file(path, self.job.document())
-            return
-        record = read_job_record(self.directory)
-        refuse_another_job(self.job, record, str(self.directory))
-        content = continued(self.job, record)
+        record = self._record()
+        if record is not None:
+            refuse_another_job(self.job, record, str(self._store.out))
+        content = self.job.record() if record is None else continued(self.job, record)
         if content != record:
-            replace_file(path, to_document(content).encode("utf-8"))
+            self._store.write(DATASET_FILE, to_document(content).encode("utf-8"))
 
-    def _repair_manifest(self) -> set[int]:
-        path = self.directory / MANIFEST_FILE
-        table = scan_lines(path, manifest_key)
-        whole = {index: place for index, place in table.places.items() if self._is_whole(index)}
-        if not table.tidy or len(whole) < len(table.places) or not path.exists():
-            rewrite_lines(path, [whole[index] for index in sorted(whole)])
-        return set(whole)
+    def _append(self, file: str, name: str, record: Mapping[str, Any]) -> None:
+        """Adds a line to this process's file; under a URL that is a copy, and an object of this name is what counts."""
+        if self._directory is None:
+            self._store.write(f"{JOURNAL_FOLDER}/{name}.json", to_line(record).encode("utf-8"))
+        append_line(self._own / file, record)
 
-    def _repair_failures(self) -> set[tuple[int, int]]:
-        path = self.directory / FAILURES_FILE
-        table = scan_lines(path, failure_key)
-        if not table.tidy or not path.exists():
-            rewrite_lines(path, [table.places[key] for key in sorted(table.places)])
-        return set(table.places)
+    def _fetch_lines(self) -> None:
+        """Copies manifest, failures and journal from the URL to `_whole`."""
+        for name in (MANIFEST_FILE, FAILURES_FILE):
+            self._store.get(name, self._whole / name)
+        for name in self._store.names(JOURNAL_FOLDER):
+            line = json.loads(self._store.read(f"{JOURNAL_FOLDER}/{name}") or b"null")
+            if line is not None:
+                append_line(self._whole / (FAILURES_FILE if "draw" in line else MANIFEST_FILE), line)
+
+    def _merge(self) -> _Known:
+        """Puts right what interrupted runs left, takes in what shards made; nobody else may be writing `_whole`.
+
+        The lines of shards are merged before their folder is removed: a stop in between leaves lines twice, which count
+        once.
+        """
+        shards = self._whole / SHARDS_FOLDER
+        if self._directory is not None:
+            with storage_errors(self._directory):
+                (self._directory / SAMPLES_FOLDER).mkdir(exist_ok=True)
+                remove_partials(self._directory)
+                remove_partials(self._directory / SAMPLES_FOLDER)
+        homes = sorted(shards.glob("*-of-*"))
+        finished = merge_lines(
+            self._whole / MANIFEST_FILE,
+            manifest_key,
+            [home / MANIFEST_FILE for home in homes],
+            keep=lambda index: self._directory is None or self._is_whole(index),
+        )
+        failed = merge_lines(self._whole / FAILURES_FILE, failure_key, [home / FAILURES_FILE for home in homes])
+        if shards.is_dir():
+            with storage_errors(shards):
+                shutil.rmtree(shards)
+        return finished, failed
+
+    def _begin_shard(self, directory: Path, shard: Shard) -> _Known:
+        """Makes DIR/shards/i-of-N/, or puts right what this shard's killed process left in it."""
+        folder = directory / SHARDS_FOLDER
+        self._own = folder / shard.name
+        with storage_errors(self._own):
+            (directory / SAMPLES_FOLDER).mkdir(exist_ok=True)
+            others = [home.name for home in folder.iterdir()] if folder.is_dir() else []
+            strange = [name for name in others if not name.endswith(f"-of-{shard.count}")]
+            if strange:
+                raise InputError(
+                    f"{directory}: is being made in another number of shards ({strange[0]}); wait for these to end"
+                )
+            self._own.mkdir(parents=True, exist_ok=True)
+            remove_partials(self._own)
+            remove_partials(directory / SAMPLES_FOLDER, lambda name: name.isdecimal() and self._makes(int(name)))
+        recorded = {*scan_lines(self._whole / MANIFEST_FILE, manifest_key).places}
+        recorded |= merge_lines(self._own / MANIFEST_FILE, manifest_key)
+        failed = {*scan_lines(self._whole / FAILURES_FILE, failure_key).places}
+        failed |= merge_lines(self._own / FAILURES_FILE, failure_key)
+        return {index for index in recorded if self._makes(index) and self._is_whole(index)}, failed
+
+    def _makes(self, index: int) -> bool:
+        return self._shard is None or self._shard.makes(index // self._pairs)
 
     def _is_whole(self, index: int) -> bool:
-        folder = self.directory / SAMPLES_FOLDER / sample_name(index)
+        """Whether a sample's files are there; under a URL its last one."""
+        if self._directory is None:
+            return self._store.exists(f"{SAMPLES_FOLDER}/{sample_name(index)}/meta.json")
+        folder = self._directory / SAMPLES_FOLDER / sample_name(index)
         names = [f"{camera}/{name}" for camera in further_cameras(self.job.scene) for name in VIEW_FILES]
         return all((folder / name).is_file() for name in (*SAMPLE_FILES, *names))
-
-
-def _check_place(directory: Path) -> None:
-    """Refuses a file, and a folder with something else in it, before anything in it is touched."""
-    if directory.exists() and not directory.is_dir():
-        raise InputError(f"{directory}: is a file; --out needs a directory")
-    if not directory.is_dir() or (directory / DATASET_FILE).exists():
-        return
-    with storage_errors(directory):
-        strange = sorted(
-            entry.name for entry in directory.iterdir() if entry.name != LOCK_FILE and PARTIAL not in entry.name
-        )
-    if strange and DATASET_FILE not in strange:  # it may have come meanwhile, from another shard
-        listed = ", ".join(strange[:5]) + (", ..." if len(strange) > 5 else "")
-        raise InputError(f"{directory}: is not empty and not a dataset (it holds {listed}); give another --out")

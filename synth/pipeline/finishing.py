@@ -13,8 +13,8 @@ import numpy as np
 
 from synth.arrays import Image
 from synth.dataset.images import Raster
-from synth.dataset.output import write_sample
 from synth.dataset.sample import CameraPair, Sample
+from synth.dataset.sample_files import write_sample_files
 from synth.flow.exact import exact_flow
 from synth.flow.field import FlowField
 from synth.flow.view import View
@@ -45,7 +45,7 @@ def finish(context: JobContext, rendered: RenderedTrajectory) -> Outcome:
         started = time.perf_counter()
         sample = _sample(context, rendered, pair, diagnostics, views)
         traced = time.perf_counter()
-        entry = write_sample(context.out, sample, context.job)
+        entry = write_sample_files(context.out, sample, context.job)
         seconds = {**shared, "flow": traced - started, "write": time.perf_counter() - traced}
         entries.append(replace(entry, seconds={stage: round(value, 4) for stage, value in seconds.items()}))
     return Outcome(tuple(entries), simulated.failures, ())

@@ -16,10 +16,9 @@ from typing import Any
 
 from synth import __version__
 from synth.dataset.job import Job
-from synth.dataset.output import Output, is_shared, open_writer, output_of
 from synth.dataset.shard import Shard
+from synth.dataset.store import Output, is_shared, output_of
 from synth.dataset.summary import reason_group, shares
-from synth.dataset.url_writer import UrlWriter
 from synth.dataset.writer import DatasetWriter
 from synth.errors import InputError
 from synth.mesh import mesh_key, pad_mesh
@@ -172,7 +171,7 @@ def generate(
     planned = plan(template, variant)
     job = make_job(planned, n, seed)
     count = template.sampling.pairs_per_trajectory
-    with open_writer(out, job, scheduling.shard, count) as writer:
+    with DatasetWriter(out, job, scheduling.shard, count) as writer:
         context = JobContext(planned, job, out, user_cache())
         finished = writer.finished
         shard = scheduling.shard or Shard(0, 1)
@@ -204,9 +203,7 @@ def _check(scheduling: Scheduling, out: Output) -> None:
         raise InputError(f"--out {out}: is seen by one process only; leave out --workers and --ray, or give another")
 
 
-def _tasks(
-    context: JobContext, writer: DatasetWriter | UrlWriter, n: int, finished: set[int], shard: Shard
-) -> Iterator[Task]:
+def _tasks(context: JobContext, writer: DatasetWriter, n: int, finished: set[int], shard: Shard) -> Iterator[Task]:
     """Trajectories with samples to make. Their meshes are made here: the mesher is random, so one process does it.
 
     Raises:
@@ -228,7 +225,7 @@ def _tasks(
         yield trajectory, wanted
 
 
-def _keep_mesh(context: JobContext, writer: DatasetWriter | UrlWriter, gel: Gel) -> None:
+def _keep_mesh(context: JobContext, writer: DatasetWriter, gel: Gel) -> None:
     """Have the dataset hold a pad's fTetWild mesh: without, every trajectory would make another one."""
     numerics = context.plan.template.numerics
     with writer.making_meshes() as folder:

@@ -8,8 +8,9 @@ import numpy as np
 
 from synth.arrays import FloatArray
 from synth.dataset.job import Job
-from synth.dataset.output import Output, mesh_folder
+from synth.dataset.meshes import mesh_folder
 from synth.dataset.sample import ManifestEntry
+from synth.dataset.store import Output
 from synth.planning import Plan
 from synth.scene import Scene
 from synth.scene.sampling import Pair, stream

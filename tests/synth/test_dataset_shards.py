@@ -13,7 +13,6 @@ from samples import job, translation_sample, tree
 from synth.cli import main
 from synth.dataset.reader import read_dataset
 from synth.dataset.shard import Shard
-from synth.dataset.shard_writer import ShardWriter
 from synth.dataset.writer import DatasetWriter
 from synth.errors import InputError
 
@@ -49,9 +48,9 @@ from pathlib import Path
 sys.path[:0] = sys.argv[4:]
 from samples import job, translation_sample
 from synth.dataset.shard import Shard
-from synth.dataset.shard_writer import ShardWriter
+from synth.dataset.writer import DatasetWriter
 shard = Shard.parse(sys.argv[2])
-with ShardWriter(Path(sys.argv[1]), job(6), shard, 2) as writer:
+with DatasetWriter(Path(sys.argv[1]), job(6), shard, 2) as writer:
     for index in sys.argv[3].split():
         writer.write(translation_sample(int(index)))
     print("held", flush=True)
@@ -78,12 +77,12 @@ def test_one_after_the_other(tmp_path: Path) -> None:
     """Fails with `_tidy` left out of `finalise`: the lines stay in shards/."""
     expected = _in_one_go(tmp_path / "one")
     for shard, own in (("1/2", [2, 3]), ("0/2", [0, 1, 4, 5])):
-        with ShardWriter(tmp_path / "d", job(N), Shard.parse(shard), PAIRS) as writer:
+        with DatasetWriter(tmp_path / "d", job(N), Shard.parse(shard), PAIRS) as writer:
             assert writer.finished == set()
             _make(writer, own)
         assert not (tmp_path / "d" / "shards").exists()  # a whole dataset at any time that nobody writes
     assert _comparable(tmp_path / "d") == expected
-    with ShardWriter(tmp_path / "d", job(N), Shard(0, 2), PAIRS) as writer:
+    with DatasetWriter(tmp_path / "d", job(N), Shard(0, 2), PAIRS) as writer:
         assert writer.finished == {0, 1, 4, 5}
 
 
@@ -91,7 +90,7 @@ def test_the_last_to_leave_joins(tmp_path: Path) -> None:
     """Fails with joining by everyone who leaves: what the other has half written is removed under it."""
     expected = _in_one_go(tmp_path / "one")
     with _elsewhere(tmp_path / "d", "0/2", "0 1 4") as other:
-        with ShardWriter(tmp_path / "d", job(N), Shard(1, 2), PAIRS) as writer:
+        with DatasetWriter(tmp_path / "d", job(N), Shard(1, 2), PAIRS) as writer:
             stale = tmp_path / "d" / "samples" / ".000000.partial-1"  # of the other: it may be writing it
             own = tmp_path / "d" / "samples" / ".000002.partial-1"
             stale.mkdir()
@@ -99,14 +98,14 @@ def test_the_last_to_leave_joins(tmp_path: Path) -> None:
         assert stale.exists()
         own.mkdir()
         assert read_dataset(tmp_path / "d").samples == []  # not yet: the other runs
-        with ShardWriter(tmp_path / "d", job(N), Shard(1, 2), PAIRS) as writer:
+        with DatasetWriter(tmp_path / "d", job(N), Shard(1, 2), PAIRS) as writer:
             assert writer.finished == {2, 3}
             assert not own.exists()
         stale.rmdir()
         other.communicate("go\n")
         assert other.returncode == 0
     assert read_dataset(tmp_path / "d").samples == [0, 1, 2, 3, 4]
-    with ShardWriter(tmp_path / "d", job(N), Shard(0, 2), PAIRS) as writer:
+    with DatasetWriter(tmp_path / "d", job(N), Shard(0, 2), PAIRS) as writer:
         assert writer.finished == {0, 1, 4}
         _make(writer, [5])
         writer.fail(4, 0, "simulate", "Newton failed")
@@ -137,14 +136,14 @@ def test_who_is_refused_beside_a_shard(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=r"another process \(shards\) is writing this dataset"):
             DatasetWriter(directory, job(N))
         with pytest.raises(InputError, match=rf"another process \(pid {other.pid} on .*\) is making shard 0/2"):
-            ShardWriter(directory, job(N), Shard(0, 2), PAIRS)
+            DatasetWriter(directory, job(N), Shard(0, 2), PAIRS)
         with pytest.raises(InputError, match=r"is being made in another number of shards \(0-of-2\)"):
-            ShardWriter(directory, job(N), Shard(1, 3), PAIRS)
+            DatasetWriter(directory, job(N), Shard(1, 3), PAIRS)
         with pytest.raises(InputError, match="seed: 7 there, 8 now"):
-            ShardWriter(directory, job(N, seed=8), Shard(1, 2), PAIRS)
+            DatasetWriter(directory, job(N, seed=8), Shard(1, 2), PAIRS)
         assert tree(directory) == before
-        ShardWriter(directory, job(N), Shard(1, 2), PAIRS).close()
-    ShardWriter(directory, job(N), Shard(1, 3), PAIRS).close()  # once the others have ended
+        DatasetWriter(directory, job(N), Shard(1, 2), PAIRS).close()
+    DatasetWriter(directory, job(N), Shard(1, 3), PAIRS).close()  # once the others have ended
 
 
 def test_a_wrong_shard_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

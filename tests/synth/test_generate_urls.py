@@ -12,9 +12,11 @@ from samples import job, translation_sample
 from tiny_scene import fingerprint, own_cache, reference, write_tiny
 
 from synth.dataset.lease import EXPIRES_S
+from synth.dataset.meshes import mesh_folder
+from synth.dataset.sample_files import write_sample_files
 from synth.dataset.shard import Shard
-from synth.dataset.url_store import UrlStore
-from synth.dataset.url_writer import UrlWriter, put_sample
+from synth.dataset.store import Store
+from synth.dataset.writer import DatasetWriter
 from synth.errors import InputError
 from synth.pipeline.generate import Scheduling, generate
 from synth.scene.template import load_scene
@@ -67,25 +69,25 @@ def test_a_file_url_is_a_directory(tmp_path: Path) -> None:
     assert (tmp_path / "with space" / ".lock").exists()
 
 
-def _stop(writer: UrlWriter) -> None:
+def _stop(writer: DatasetWriter) -> None:
     """What is left of a killed run: nothing finalised. Its lease is this process's, which lives; so remove it."""
     writer.close()
 
 
 def test_a_stopped_run_leaves_a_journal_that_the_next_one_reads(url: str) -> None:
-    writer = UrlWriter(url, job(3))
-    writer.record(put_sample(url, translation_sample(2), job()))
+    writer = DatasetWriter(url, job(3))
+    writer.record(write_sample_files(url, translation_sample(2), job()))
     writer.fail(1, 0, "simulate", "Newton failed")
-    put_sample(url, translation_sample(0), job())  # without its line: does not count
+    write_sample_files(url, translation_sample(0), job())  # without its line: does not count
     _stop(writer)
-    store = UrlStore(url)
+    store = Store(url)
     assert store.names("journal") == ["000001-0.json", "000002.json"]
     assert store.read("manifest.jsonl") is None
-    with UrlWriter(url, job(3)) as again:
+    with DatasetWriter(url, job(3)) as again:
         assert again.finished == {2}
         again.fail(1, 0, "simulate", "Newton failed")  # known
         for index in (1, 0):
-            again.record(put_sample(url, translation_sample(index), job()))
+            again.record(write_sample_files(url, translation_sample(index), job()))
     assert store.names("journal") == []
     manifest = (store.read("manifest.jsonl") or b"").splitlines()
     assert [json.loads(line)["index"] for line in manifest] == [0, 1, 2]
@@ -94,21 +96,44 @@ def test_a_stopped_run_leaves_a_journal_that_the_next_one_reads(url: str) -> Non
 
 def test_who_is_refused(url: str) -> None:
     """Fails with the lease's check left out."""
-    with UrlWriter(url, job()):
+    with DatasetWriter(url, job()):
         with pytest.raises(InputError, match=rf"another process \(pid {os.getpid()} on .*\) is writing"):
-            UrlWriter(url, job())
+            DatasetWriter(url, job())
         with pytest.raises(InputError, match="another process"):
-            UrlWriter(url, job(), Shard(0, 2))
-    with UrlWriter(url, job(), Shard(0, 2)), UrlWriter(url, job(), Shard(1, 2)):
+            DatasetWriter(url, job(), Shard(0, 2))
+    with DatasetWriter(url, job(), Shard(0, 2)), DatasetWriter(url, job(), Shard(1, 2)):
         with pytest.raises(InputError, match="another process"):
-            UrlWriter(url, job(), Shard(1, 2))
+            DatasetWriter(url, job(), Shard(1, 2))
         with pytest.raises(InputError, match="another process"):
-            UrlWriter(url, job())
+            DatasetWriter(url, job())
     with pytest.raises(InputError, match="seed: 7 there, 8 now"):
-        UrlWriter(url, job(seed=8))
-    UrlStore(url).delete(["dataset.json"])
+        DatasetWriter(url, job(seed=8))
+    Store(url).delete(["dataset.json"])
     with pytest.raises(InputError, match=r"holds .* but no dataset"):
-        UrlWriter(url, job())
+        DatasetWriter(url, job())
+
+
+def test_meshes_are_put_under_the_url_but_not_by_a_shard(url: str) -> None:
+    """Fails with the check of shards left out: two shards would each put another mesh."""
+    with DatasetWriter(url, job(), Shard(0, 2)) as writer:
+        with pytest.raises(InputError, match="shards need the mesh to be there"), writer.making_meshes() as folder:
+            (folder / "shard.npz").write_bytes(b"mesh")
+        (folder / "shard.npz").unlink()
+    with DatasetWriter(url, job()) as writer, writer.making_meshes() as folder:
+        (folder / "plain.npz").write_bytes(b"mesh")
+    assert Store(url).names("meshes") == ["plain.npz"]
+    (folder / "plain.npz").unlink()
+    assert (mesh_folder(url) / "plain.npz").read_bytes() == b"mesh"  # fetched by another process
+
+
+@pytest.mark.parametrize("place", ["url", "tmp_path"])
+def test_a_sample_whose_files_are_elsewhere_is_refused(place: str, request: pytest.FixtureRequest) -> None:
+    out = request.getfixturevalue(place)
+    elsewhere = write_sample_files(request.getfixturevalue("tmp_path") / "elsewhere", translation_sample(1), job())
+    with DatasetWriter(out if place == "url" else out / "d", job()) as writer:
+        with pytest.raises(InputError, match=r"samples/000001: the sample's files are not there"):
+            writer.record(elsewhere)
+        assert writer.finished == set()
 
 
 @pytest.mark.parametrize(
@@ -120,10 +145,10 @@ def test_who_is_refused(url: str) -> None:
     ids=["expired", "dead"],
 )
 def test_a_killed_run_holds_nothing_for_long(url: str, note: dict[str, object]) -> None:
-    UrlWriter(url, job()).close()
-    UrlStore(url).write("leases/whole.json", json.dumps(note).encode())
-    with UrlWriter(url, job()):
-        held = UrlStore(url).read("leases/whole.json")
+    DatasetWriter(url, job()).close()
+    Store(url).write("leases/whole.json", json.dumps(note).encode())
+    with DatasetWriter(url, job()):
+        held = Store(url).read("leases/whole.json")
         assert held is not None
         assert json.loads(held)["pid"] == os.getpid()  # taken over; fails with an InputError where it is not
 
