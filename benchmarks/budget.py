@@ -143,14 +143,13 @@ def reference_mesh(gel: Gel, zone: Focus, chosen_mm: float, most: int) -> tuple[
     return domed(box, gel.dome_radius_mm), across, fine
 
 
-def press_draw(case: Row, assignments: list[str], most: int, tried: tuple[int, ...] = LADDER) -> list[Row]:
+def press_draw(case: Row, assignments: list[str], most: int) -> list[Row]:
     """A row for the reference, and one for each mesh of a draw, coarsest first.
 
     Args:
         case: scene, seed and draw.
         assignments: `--set` of the command.
         most: elements across the contact in the reference, at most.
-        tried: numbers of elements across the contact.
     """
     template = load_scene(case["scene"], assignments)
     try:
@@ -174,7 +173,7 @@ def press_draw(case: Row, assignments: list[str], most: int, tried: tuple[int, .
         "target_px": rule.target_error_px,
     }
     own = Fineness(chosen.across, chosen.through)
-    meshes = [each for each in ladder(gel, zone, tried) if each.across < finest]
+    meshes = [each for each in ladder(gel, zone) if each.across < finest]
     meshes = meshes[: meshes.index(own) + BEYOND + 1] if own in meshes else [*meshes, own]
     try:
         truth = simulate(closer, mesh, folder, frames=frames, driver=driver)
