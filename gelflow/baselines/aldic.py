@@ -23,7 +23,7 @@ from gelflow.errors import InputError
 INSTALL = "pip install --no-deps al-dic && pip install numba imageio"
 LUMA = np.array([0.299, 0.587, 0.114])
 MINIMUM_SIDE = 64
-"""Smaller images hold too few windows."""
+"""Shortest side of an image, px, that holds enough windows."""
 
 
 @dataclass(frozen=True)

@@ -24,14 +24,14 @@ class NoMotion:
     name: str = "no motion"
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
-        """Zero everywhere."""
+        """A flow of zero everywhere."""
         check_images(image1, image2)
         return np.zeros((*image1.shape[:2], 2), np.float32)
 
 
 @dataclass(frozen=True)
 class Farneback:
-    """Polynomial expansion."""
+    """Farnebäck's polynomial expansion."""
 
     name: str = "Farnebäck"
 

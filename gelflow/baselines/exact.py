@@ -15,7 +15,7 @@ from gelflow.files.exr import FlowField
 
 @dataclass(frozen=True)
 class ExactFlow:
-    """Knows the answer; only for pairs that carry it."""
+    """Takes the flow from the data set; only for pairs that carry it."""
 
     name: str = "exact flow"
 

@@ -23,7 +23,7 @@ CLOSURE_PX = 0.5
 
 @dataclass(frozen=True)
 class LucasKanade:
-    """Corners tracked and interpolated."""
+    """Tracks corners and interpolates their motion."""
 
     name: str = "Lucas-Kanade"
 

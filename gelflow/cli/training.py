@@ -12,7 +12,7 @@ from gelflow.cli.options import Device, Out, Paths, ShippedOrFile, each_key_once
 @Parameter(name="*")
 @dataclass(frozen=True)
 class RunOptions:
-    """What the two commands have in common."""
+    """Options that `train` and `finetune` have in common."""
 
     validation: Annotated[list[Path] | None, Parameter(help="Folders of pairs to validate on.")] = None
     config: Annotated[

@@ -47,18 +47,18 @@ class Comparison:
 
     @property
     def devices(self) -> str:
-        """What the methods ran on."""
+        """Names of the devices that the methods ran on."""
         return " and ".join(dict.fromkeys(score.device for score in self.scores))
 
     def without(self, methods: Iterable[str]) -> "Comparison":
-        """The same without some methods."""
+        """The comparison without some methods."""
         gone = set(methods)
         scores = tuple(score for score in self.scores if score.method not in gone)
         strata = {name: bins for name, bins in self.strata.items() if name not in gone}
         return Comparison(self.data, scores, strata, {k: v for k, v in self.speeds.items() if k not in gone})
 
     def with_method(self, scores: Sequence[PairScore], speed: Speed | None) -> "Comparison":
-        """The same with one method more, given by its scores on all pairs."""
+        """The comparison with one method more, given by its scores on all pairs."""
         name = scores[0].method
         strata = {**self.strata, name: merged(one for score in scores for one in score.strata)}
         speeds = {**self.speeds, name: speed} if speed else self.speeds

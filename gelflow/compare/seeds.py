@@ -20,7 +20,7 @@ _SEED = re.compile(r"#\d+(?=$|\+ft$)")
 
 
 def group_name(method: str) -> str:
-    """The name without the number of the seed."""
+    """A method's name without the number of its seed."""
     return _SEED.sub("", method)
 
 
@@ -33,7 +33,7 @@ class Group:
 
     @property
     def label(self) -> str:
-        """Name for tables."""
+        """Name of the group in tables."""
         return self.name if len(self.members) == 1 else f"{self.name} ({len(self.members)} seeds)"
 
     @property

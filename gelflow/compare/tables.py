@@ -92,7 +92,7 @@ def strata_table(strata: Mapping[str, Sequence[Stratum]]) -> Table:
 
 
 def speed_table(speeds: Mapping[str, Speed]) -> Table:
-    """A row per network."""
+    """Speed and memory, a row per network."""
     header = ["network", "device", "pairs at once", "size", "pairs/s", "peak memory MiB"]
     rows = [
         [name, s.device, str(s.batch), f"{s.size[0]}x{s.size[1]}", f"{s.pairs_per_second:.2f}", number(s.memory_mib, 0)]

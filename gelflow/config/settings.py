@@ -65,8 +65,8 @@ REGISTRATIONS: dict[Registration, RegistrationConfig | None] = {
     "both": _BRIGHTNESS.model_copy(update={"after": RegistrationConfig()}),
     "brightness": _BRIGHTNESS,
 }
-"""Nothing; what measures the gel's motion best; that, and brightness where it leaves much; what brings image 2 closest
-to image 1."""
+"""Registration by the names of the command line: none; for the gel's motion; for both, that is for brightness where
+motion leaves a large residual; for brightness, which brings image 2 closest to image 1."""
 
 
 class ModelConfig(_Frozen):

@@ -20,7 +20,7 @@ from gelflow.files.atomic import replacing
 from gelflow.files.quiet import quiet
 
 DIRECTIONS = "U right, V down; I1(x) = I2(x + forward(x))"
-"""In the header of each flow that is written here, and in those words nowhere else."""
+"""Text in the header of every flow that gelflow writes, by which its files are known."""
 Direction = Literal["forward", "backward"]
 
 

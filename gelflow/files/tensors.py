@@ -15,7 +15,7 @@ DAMAGE = (
     UnpicklingError, RuntimeError, EOFError, LookupError, TypeError, ValueError, AttributeError, AssertionError,
     ArithmeticError, OSError, struct.error, BadZipFile,
 )  # fmt: skip
-"""What torch's restricted reader raises at bytes that are something else: it interprets them until it stumbles."""
+"""Exceptions of torch's restricted reader at bytes that are no tensors; it interprets them as far as it can."""
 
 
 class Unreadable(Exception):

@@ -18,7 +18,7 @@ from gelflow.ops.correlation import local_correlation
 
 
 class LocalFlowFusion(nn.Module):
-    """The module; it has no parameters."""
+    """Local flow fusion over a square window; the module has no parameters."""
 
     def __init__(self, region: int, scale: str) -> None:
         super().__init__()

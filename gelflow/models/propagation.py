@@ -133,5 +133,5 @@ class _Proposals:
 
 @cached
 def _steps(places: tuple[tuple[int, int], ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """(2, N, 1, 1, 1, 1)."""
+    """The steps as a tensor (2, N, 1, 1, 1, 1) that broadcasts over proposals."""
     return torch.tensor(places, dtype=dtype, device=device).T.reshape(2, -1, 1, 1, 1, 1)

@@ -28,7 +28,7 @@ class RecordedNetwork:
 
     @torch.no_grad()
     def __call__(self, image1: Images, image2: Images) -> Flow:
-        """As `GelFlow.flow`."""
+        """Estimates the flow; arguments and exceptions as for `GelFlow.flow`."""
         if not image1.is_cuda or image1.shape != image2.shape or image1.shape != self._shape:
             self._shape, self._graph = image1.shape, None
             return self.model.flow(image1, image2)

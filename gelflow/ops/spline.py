@@ -21,7 +21,7 @@ from gelflow.ops.cached import cached
 MARGIN = 2
 """Coefficients beyond each border: a cubic B-spline reaches two px."""
 POLE = math.sqrt(3) - 2
-"""Of the filter from samples to coefficients, whose response to one pixel is sqrt(3) POLE^|distance|."""
+"""Pole of the filter from samples to coefficients, whose response to one pixel is sqrt(3) POLE^|distance|."""
 
 
 class SplineImage:

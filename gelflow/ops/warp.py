@@ -31,7 +31,7 @@ def _pixel_indices(height: int, width: int, dtype: torch.dtype, device: torch.de
 
 
 def from_centre(like: Tensor) -> Tensor:
-    """The same from the image's centre."""
+    """Column and row of each pixel of a (..., H, W), from the image's centre: (2, H, W) px."""
     height, width = like.shape[-2:]
     columns, rows = pixel_indices(like)
     return torch.stack([columns - (width - 1) / 2, rows - (height - 1) / 2])
@@ -96,7 +96,7 @@ def inside(flow: Flow) -> Mask:
 
 
 def inside_at(places: Tensor) -> Mask:
-    """The same of the places themselves, (B, 2, H, W), of an image of H x W: (B, 1, H, W)."""
+    """1 where places (B, 2, H, W), column and row, lie between the pixel centres of an image of H x W; else 0."""
     height, width = places.shape[-2:]
     x, y = places.unbind(dim=1)
     return ((x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)).to(places.dtype).unsqueeze(1)

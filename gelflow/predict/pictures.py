@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 UNKNOWN_COLOUR = (70, 70, 70)
-"""Of pixels without flow."""
+"""Colour (R, G, B) of pixels without flow."""
 _SEGMENTS = (15, 6, 4, 11, 13, 6)
 """Steps from red to yellow, yellow to green, green to cyan, cyan to blue, blue to magenta, magenta to red."""
 

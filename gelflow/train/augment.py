@@ -26,7 +26,7 @@ from gelflow.config import MotionConfig, TrainConfig
 from gelflow.ops.warp import from_centre, warp
 
 UNCHANGED = np.array([1, 0, 0, 1, 1, 0, 0, 1, 0, 0, 1, 1, 1, 1, 1], np.float32)
-"""The numbers of `_sampled` that change nothing."""
+"""Random numbers, in the order of `_sampled`, that leave a pair as it is."""
 
 
 def augmented(batch: dict[str, Any], config: TrainConfig, randoms: Sequence[np.random.Generator]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import threading
 
 
 def end_with_run(_: int) -> None:
-    """For `worker_init_fn` of a DataLoader."""
+    """Prepares a loading process: ignores Ctrl-C, and ends at the run's SIGTERM alone. For `worker_init_fn`."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})  # else it ends this process whoever sends it
     threading.Thread(target=_wait_for, args=(os.getppid(),), daemon=True).start()

@@ -80,7 +80,7 @@ class FlowModule(L.LightningModule):
         return self._network[0]
 
     def on_fit_start(self) -> None:
-        """Prepares for the device."""
+        """Records the network's passes on a CUDA device, where the configuration asks for it."""
         if self.config.cuda_graph and self.device.type == "cuda":
             self._network = (GraphedNetwork(self.model),)
 
@@ -137,7 +137,7 @@ class FlowModule(L.LightningModule):
         return loss, parts
 
     def _self_supervised(self, image1: Tensor, image2: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """The loss without truth."""
+        """The loss of pairs without an exact flow."""
         image1, image2 = self._directions(image1, image2)
         return self._loss_of_images(self.network(image1, image2), image1, image2)
 

@@ -13,7 +13,7 @@ from torch.utils.data import DataLoader, Dataset
 from gelflow.train.samples import CheckedPairs, Sample
 
 SHARE_OF_MEMORY = 0.5
-"""Of the device's free memory, so much at most is taken by pairs."""
+"""Largest share of the device's free memory that pairs may take."""
 
 
 class ResidentPairs(Dataset[Sample]):

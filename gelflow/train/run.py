@@ -50,7 +50,7 @@ class TrainResult:
     memory_mib: float | None = None
 
     def __str__(self) -> str:
-        """The result in a line."""
+        """One line with steps, last results, speed, memory and the file of weights."""
         speed = "" if self.pairs_per_second is None else f"{self.pairs_per_second:.3g} pairs/s"
         memory = "" if self.memory_mib is None else f"peak memory {self.memory_mib:.0f} MiB"
         texts = (f"{self.steps} steps", describe(self.metrics), speed, memory, f"{self.weights}")

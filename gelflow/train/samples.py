@@ -23,7 +23,7 @@ Sample = dict[str, Any]
 (2, H, W) float32, px, NaN where no gel is seen."""
 
 ORDER, AUGMENTATION = 0, 1
-"""What a random stream is for: second word of its seed, after the run's."""
+"""Purpose of a random stream: the second word of its seed, after the run's."""
 
 
 class StepSampler(Sampler[list[tuple[int, int]]]):
@@ -97,7 +97,7 @@ class TrainingBatches:
         self.config = config
 
     def __call__(self, drawn: Sequence[tuple[Sample, np.random.Generator]]) -> Sample:
-        """See `collate` and `augmented`."""
+        """Collates samples and augments the batch, each pair by its own source of random numbers."""
         return augmented(collate([sample for sample, _ in drawn]), self.config, [random for _, random in drawn])
 
 

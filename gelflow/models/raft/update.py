@@ -92,7 +92,7 @@ class FlowHead(nn.Module):
         self.conv2 = nn.Conv2d(inner, 2, 3, padding=1)
 
     def forward(self, hidden: Features) -> Tensor:
-        """(B, 2, H, W)."""
+        """Change of the flow, (B, 2, H, W) px."""
         change: Tensor = self.conv2(self.conv1(hidden).relu())
         return change
 
