@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_scene import write_tiny
 
 import synth
 from synth.dataset.reader import read_dataset
@@ -18,11 +17,6 @@ from synth.scene.template import load_scene, shipped_scenes
 from synth.simulate.mesh_rule import DEFAULT_TARGET_PX, MeshRule
 
 LLVM, MONO, SCALAR = Variant("llvm_ad_rgb", ""), Variant("llvm_ad_mono", ""), Variant("scalar_rgb", "")
-
-
-@pytest.fixture
-def tiny(tmp_path: Path) -> Path:
-    return write_tiny(tmp_path)
 
 
 def test_the_public_interface_plans_a_scene(tiny: Path) -> None:
