@@ -5,7 +5,7 @@ from typing import Any
 
 from synth.errors import InputError
 from synth.pipeline.records import FaceState, Failure, JobContext, Outcome, Simulated, SimulatedTrajectory, Task
-from synth.scene.sampling import MAX_DRAWS, Pair, SensorDraw, draw, pairs_of
+from synth.scene.sampling import MAX_DRAWS, Pair, SensorInstance, draw, pairs_of
 from synth.simulate import Trajectory
 from synth.simulate.press import Press, edge_radius_mm
 
@@ -29,7 +29,7 @@ class Attempt:
 class Attempts:
     """See the module's docstring; keeps the record of instances that failed."""
 
-    def __init__(self, context: JobContext, task: Task, sensor: SensorDraw) -> None:
+    def __init__(self, context: JobContext, task: Task, sensor: SensorInstance) -> None:
         """Begin with the first instance; `sensor` is that of the trajectory."""
         self.trajectory, self.wanted = task
         self._context, self._sensor, self._count = context, sensor, 0

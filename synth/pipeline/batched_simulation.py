@@ -15,7 +15,7 @@ from itertools import islice
 from synth.pipeline.attempts import Attempt, Attempts
 from synth.pipeline.records import JobContext, Outcome, Simulated, Task
 from synth.scene import Gel
-from synth.scene.sampling import SensorDraw, draw_sensor, sensor_of
+from synth.scene.sampling import SensorInstance, draw_sensor, sensor_of
 from synth.scene.template import Template
 from synth.simulate import Trajectory
 from synth.simulate.batched.jobs import Job
@@ -90,7 +90,7 @@ class _Simulation:
     def __init__(self, context: JobContext, tasks: Iterator[Task], batch: int) -> None:
         self._context, self._tasks, self._batch = context, tasks, batch
         self._pads = Pads(context)
-        self._sensor: tuple[int, SensorDraw] | None = None
+        self._sensor: tuple[int, SensorInstance] | None = None
         self.open: Counter[int] = Counter()
 
     def __iter__(self) -> Iterator[tuple[int, Result]]:

@@ -25,7 +25,7 @@ MAX_DRAWS = 10
 
 
 @dataclass(frozen=True)
-class SensorDraw:
+class SensorInstance:
     """The parts of a scene that all trajectories of one sensor share.
 
     Attributes:
@@ -58,7 +58,7 @@ def sensor_of(template: Template, trajectory: int) -> int:
     return trajectory // template.sampling.trajectories_per_sensor
 
 
-def draw_sensor(template: Template, seed: int, sensor: int) -> SensorDraw:
+def draw_sensor(template: Template, seed: int, sensor: int) -> SensorInstance:
     """The first draw of a sensor that fits the schema and keeps its lights out of the camera's view."""
     rejected: list[str] = []
     for attempt in range(MAX_DRAWS):
@@ -72,11 +72,13 @@ def draw_sensor(template: Template, seed: int, sensor: int) -> SensorDraw:
         except InputError as error:
             rejected.append(str(error))
             continue
-        return SensorDraw(content, tuple(rejected))
-    return SensorDraw(None, tuple(rejected))
+        return SensorInstance(content, tuple(rejected))
+    return SensorInstance(None, tuple(rejected))
 
 
-def draw(template: Template, seed: int, trajectory: int, attempt: int = 0, sensor: SensorDraw | None = None) -> Scene:
+def draw(
+    template: Template, seed: int, trajectory: int, attempt: int = 0, sensor: SensorInstance | None = None
+) -> Scene:
     """The scene of one trajectory.
 
     Args:

@@ -108,12 +108,12 @@ class Template:
         return [(key, self.folder / name) for key, name in names]
 
 
-def load_scene(name_or_path: str | Path, overrides: Sequence[str] = ()) -> Template:
+def load_scene(name_or_path: str | Path, set: Sequence[str] = ()) -> Template:
     """Load a shipped scene by its name or any scene by its path.
 
     Args:
         name_or_path: "gelsight_mini" or "my/sensor.toml".
-        overrides: "key.path=value" with a TOML value; list entries by number ("sensor.lights.0.power=2"). Files are
+        set: "key.path=value" with a TOML value; list entries by number ("sensor.lights.0.power=2"). Files are
             relative to the working directory, not to the scene.
 
     Raises:
@@ -126,9 +126,9 @@ def load_scene(name_or_path: str | Path, overrides: Sequence[str] = ()) -> Templ
         raise InputError(f"{path}: not valid TOML: {error}") from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    for override in overrides:
+    for override in set:
         _apply(content, override)
-    changed = tuple(override.partition("=")[0].strip() for override in overrides)
+    changed = tuple(override.partition("=")[0].strip() for override in set)
     content = json.loads(json.dumps(content, default=str))  # TOML's dates become text
     return checked_template(with_files(content, partial(_matching, path.parent)), path, changed)
 

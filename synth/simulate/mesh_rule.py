@@ -65,9 +65,9 @@ class MeshRule:
     ) -> Press:
         """Mesh, body and load path of a scene; arguments and errors as of `resolution`.
 
-        The accuracy of a shared mesh is left out: whoever finishes the samples predicts it, beside the simulation.
+        The accuracy of an even mesh is left out: whoever finishes the samples predicts it, beside the simulation.
         """
-        if self.kind == "graded":
-            found = self.resolution(scene, folder)
-            return Press.of(scene, found.mesh, folder, Accuracy.of(found))
-        return Press.of(scene, shared_mesh(scene.sensor.gel, scene.numerics, mesh_folders), folder)
+        if self.kind == "even":
+            return Press.of(scene, shared_mesh(scene.sensor.gel, scene.numerics), folder)
+        found = self.resolution(scene, folder, mesh_folders)
+        return Press.of(scene, found.mesh, folder, Accuracy.of(found))

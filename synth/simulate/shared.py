@@ -1,19 +1,18 @@
 """The mesh that all draws of a pad share where they are simulated many at once, and what it is expected to cost.
 
 One mesh serves every draw of a batch, wherever its indenter touches: it is even along x and y, `numerics.cells` says
-how fine, and graded through the thickness so that elements at the contact face are about as high as wide. Or it is
-fTetWild's, with `numerics.edge_length_mm`. Each draw has a predicted error of its own, by
-`synth.simulate.error_model`, which was fitted to meshes graded around the contact: here it extrapolates.
+how fine, and graded through the thickness so that elements at the contact face are about as high as wide. Each draw has
+a predicted error of its own, by `synth.simulate.error_model`, which was fitted to meshes graded around the contact:
+here it extrapolates.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path as FilePath
 
 import numpy as np
 
-from synth.mesh import Counts, Focus, PadMesh, domed, graded_box, pad_mesh
+from synth.mesh import Counts, Focus, PadMesh, domed, graded_box
 from synth.scene import Gel, Numerics, Scene
 from synth.simulate.footprint import footprint
 from synth.simulate.path import path_of
@@ -44,19 +43,8 @@ class Accuracy:
         return Accuracy(resolution.across, resolution.error_px)
 
 
-def shared_mesh(gel: Gel, numerics: Numerics, mesh_folders: Sequence[FilePath] | None = None) -> PadMesh:
-    """The mesh of all draws of a pad.
-
-    Args:
-        gel: the pad; its Young's modulus does not enter.
-        numerics: `edge_length_mm` or `cells` are used.
-        mesh_folders: where fTetWild's meshes are kept.
-
-    Raises:
-        InputError: the mesh cannot be made.
-    """
-    if numerics.edge_length_mm is not None:
-        return pad_mesh(gel, numerics, mesh_folders)
+def shared_mesh(gel: Gel, numerics: Numerics) -> PadMesh:
+    """The mesh of all draws of a pad; its Young's modulus does not enter."""
     layers = tuple(layer.thickness_mm for layer in gel.layers)
     return _even_mesh(gel.size_mm, gel.dome_radius_mm, layers, numerics.cells)
 
@@ -102,8 +90,6 @@ def accuracy(scene: Scene, folder: FilePath | None = None) -> Accuracy:
         InputError: the indenter cannot be built.
     """
     gel, numerics = scene.sensor.gel, scene.numerics
-    if numerics.edge_length_mm is not None:
-        return Accuracy(0, float("nan"))
     focus = footprint(path_of(scene, folder), gel.size_mm, MARGIN)
     error = predicted_error_px(scene, focus, spacing_mm(gel, numerics))
     return Accuracy(int(2 * min(focus.half_mm) / _width(gel.size_mm, numerics.cells)), error)

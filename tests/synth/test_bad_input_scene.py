@@ -9,11 +9,6 @@ from synth.errors import InputError
 from synth.scene.template import load_scene, shipped_scenes
 
 
-@pytest.fixture
-def tiny(tmp_path: Path) -> Path:
-    return write_tiny(tmp_path)
-
-
 def _refusal(source: Path | str, *overrides: str) -> str:
     with pytest.raises(InputError) as caught:
         load_scene(source, overrides)

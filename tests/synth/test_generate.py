@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_scene import fingerprint, own_cache, reference, write_tiny
+from tiny_scene import fingerprint, reference
 
 from synth.dataset.reader import read_dataset
 from synth.dataset.shard import Shard
@@ -20,16 +20,7 @@ from synth.scene.sampling import draw
 from synth.scene.template import Template, load_scene
 from synth.verify import verify_dataset
 
-
-@pytest.fixture(autouse=True)
-def _cache(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One mesh for all runs: the mesher is random."""
-    own_cache(monkeypatch)
-
-
-@pytest.fixture
-def tiny(tmp_path: Path) -> Path:
-    return write_tiny(tmp_path)
+pytestmark = pytest.mark.usefixtures("one_cache")
 
 
 def test_the_dataset_is_what_was_asked_for_and_verifies() -> None:

@@ -17,17 +17,17 @@ import numpy as np
 import pytest
 from pads import brick, gentle
 from processes_of import HAS_PROC, alive, descendants, lines, start, wait_for
-from tiny_scene import TEXT, fingerprint, own_cache, write_tiny
+from tiny_scene import TEXT, fingerprint, job_context, write_tiny
 
 from synth.dataset.shard import Shard
 from synth.errors import InputError
 from synth.pipeline.attempts import Attempts
 from synth.pipeline.batched_simulation import Result, by_sensor, in_batches
-from synth.pipeline.generate import Scheduling, generate, make_job
+from synth.pipeline.generate import Scheduling, generate
 from synth.pipeline.prefetch import prefetched
 from synth.pipeline.producer import Producer
 from synth.pipeline.records import Failure, JobContext, Outcome, SimulatedTrajectory, Task
-from synth.planning import job_variant, plan, predict
+from synth.planning import plan, predict
 from synth.render.variant import Variant
 from synth.scene import Gel, Numerics, Scene
 from synth.scene.sampling import MAX_DRAWS, draw, draw_sensor, sensor_of
@@ -54,9 +54,7 @@ SAMPLES, SEED = 10, 10
 """Five trajectories of three sensors and two pads; draws of every kind fail."""
 
 
-@pytest.fixture(autouse=True)
-def _cache(monkeypatch: pytest.MonkeyPatch) -> None:
-    own_cache(monkeypatch)
+pytestmark = pytest.mark.usefixtures("one_cache")
 
 
 @pytest.fixture(scope="module")
@@ -75,8 +73,7 @@ def whole(template: Template, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def context(template: Template, tmp_path_factory: pytest.TempPathFactory) -> JobContext:
-    planned, out = plan(template, job_variant(template, "cpu")), tmp_path_factory.mktemp("context")
-    return JobContext(planned, make_job(planned, SAMPLES, SEED), out, out / "cache")
+    return job_context(template, SAMPLES, tmp_path_factory.mktemp("context"), SEED)
 
 
 def _tasks(numbers: Iterable[int]) -> Iterator[Task]:

@@ -22,7 +22,7 @@ from processes_of import (
     wait_for,
     workers_of,
 )
-from tiny_scene import fingerprint, own_cache, reference, write_tiny
+from tiny_scene import fingerprint, reference, write_tiny
 
 from synth.cli import main
 from synth.pipeline.generate import generate
@@ -31,10 +31,7 @@ from synth.scene.template import load_scene
 needs_proc = pytest.mark.skipif(not HAS_PROC, reason="finds child processes in Linux's /proc")
 
 
-@pytest.fixture(autouse=True)
-def _cache(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One mesh for all runs: the mesher is random."""
-    own_cache(monkeypatch)
+pytestmark = pytest.mark.usefixtures("one_cache")
 
 
 @pytest.fixture(autouse=True)

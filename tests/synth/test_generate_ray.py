@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from processes_of import HAS_PROC, PATIENCE_S, lines, start, wait_for, workers_of
-from tiny_scene import fingerprint, own_cache, reference, write_tiny
+from tiny_scene import fingerprint, reference, write_tiny
 
 from synth.errors import InputError
 from synth.pipeline.generate import Scheduling, generate
@@ -15,10 +15,7 @@ from synth.scene.template import load_scene
 pytest.importorskip("ray", reason="Ray is not installed: pip install -e '.[cluster]'")
 
 
-@pytest.fixture(autouse=True)
-def _cache(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One mesh for all runs: the mesher is random."""
-    own_cache(monkeypatch)
+pytestmark = pytest.mark.usefixtures("one_cache")
 
 
 @pytest.mark.slow

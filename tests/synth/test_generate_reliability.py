@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from processes_of import PATIENCE_S, ROOT, lines, own_words, start, wait_for
-from tiny_scene import fingerprint, own_cache, reference, write_tiny
+from tiny_scene import fingerprint, reference, write_tiny
 
 from synth.cli import main
 from synth.dataset import storage
@@ -19,11 +19,7 @@ from synth.errors import InputError
 from synth.pipeline.generate import generate
 from synth.scene.template import load_scene
 
-
-@pytest.fixture(autouse=True)
-def _cache(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One mesh for all runs: the mesher is random."""
-    own_cache(monkeypatch)
+pytestmark = pytest.mark.usefixtures("one_cache")
 
 
 def test_killed_while_it_writes_a_sample_and_a_second_process(

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from samples import job, translation_sample
-from tiny_scene import fingerprint, own_cache, reference, write_tiny
+from tiny_scene import fingerprint, reference, write_tiny
 
 from synth.dataset.lease import EXPIRES_S
 from synth.dataset.meshes import mesh_folder
@@ -21,11 +21,7 @@ from synth.errors import InputError
 from synth.pipeline.generate import Scheduling, generate
 from synth.scene.template import load_scene
 
-
-@pytest.fixture(autouse=True)
-def _cache(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One mesh for all runs: the mesher is random."""
-    own_cache(monkeypatch)
+pytestmark = pytest.mark.usefixtures("one_cache")
 
 
 @pytest.fixture

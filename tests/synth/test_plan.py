@@ -5,20 +5,42 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_scene import write_tiny
 
+import synth
+from synth.dataset.reader import read_dataset
 from synth.errors import InputError
 from synth.mesh import pad_mesh
+from synth.pipeline.generate import generate
 from synth.planning import check_buildable, job_variant, plan, predict
 from synth.render.variant import Variant
 from synth.scene.template import load_scene, shipped_scenes
+from synth.simulate.mesh_rule import DEFAULT_TARGET_PX, MeshRule
 
 LLVM, MONO, SCALAR = Variant("llvm_ad_rgb", ""), Variant("llvm_ad_mono", ""), Variant("scalar_rgb", "")
 
 
-@pytest.fixture
-def tiny(tmp_path: Path) -> Path:
-    return write_tiny(tmp_path)
+def test_the_public_interface_plans_a_scene(tiny: Path) -> None:
+    """`synth.pipeline.generate` and `synth.read_dataset` are those that other tests call by their modules."""
+    planned = synth.plan(synth.load_scene(tiny, set=["numerics={ target_error_px = 2.0 }"]))
+    assert planned.mesh == MeshRule("graded", 2.0)
+    assert (synth.pipeline.generate, synth.read_dataset) == (generate, read_dataset)
+    with pytest.raises(AttributeError, match="no attribute 'plans'"):
+        synth.plans  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    ("numerics", "rule"),
+    [
+        ("{}", MeshRule("graded", DEFAULT_TARGET_PX)),
+        ('{ solver = "batched", target_error_px = 0.7 }', MeshRule("even", 0.7)),
+    ],
+)
+def test_the_mesh_rule_is_decided_with_its_target(tiny: Path, numerics: str, rule: MeshRule) -> None:
+    planned = plan(load_scene(tiny, [f"numerics={numerics}"]), LLVM)
+    assert (planned.mesh, planned.is_batched) == (rule, rule.kind == "even")
+    wild = plan(load_scene(tiny), LLVM).mesh
+    assert wild.kind == "tetwild"
+    assert np.isnan(wild.target_error_px)
 
 
 def _decided(tiny: Path, *overrides: str, variant: Variant = LLVM) -> dict[str, tuple[bool, str]]:

@@ -5,21 +5,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from tiny_scene import fingerprint, own_cache, reference, write_tiny
+from tiny_scene import fingerprint, job_context, reference, write_tiny
 
 from synth.pipeline import worker_pool as pool
-from synth.pipeline.generate import Scheduling, generate, make_job
+from synth.pipeline.generate import Scheduling, generate
 from synth.pipeline.records import JobContext, Task
 from synth.pipeline.threads import THREADS
 from synth.pipeline.worker_pool import outcomes_of_processes
-from synth.planning import job_variant, plan
 from synth.scene.template import load_scene
 
-
-@pytest.fixture(autouse=True)
-def _cache(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One mesh for all runs: the mesher is random."""
-    own_cache(monkeypatch)
+pytestmark = pytest.mark.usefixtures("one_cache")
 
 
 @pytest.mark.parametrize("workers", [1, 2])
@@ -47,9 +42,7 @@ def test_a_worker_is_a_process_that_takes_one_core(
     for name in THREADS:
         monkeypatch.setenv(name, "2")
     monkeypatch.setattr(pool, "_trajectory_maker", _threads)
-    template = load_scene(write_tiny(tmp_path))
-    planned = plan(template, job_variant(template, "cpu"))
-    context = JobContext(planned, make_job(planned, 8, 0), tmp_path / "d", tmp_path / "cache")
+    context = job_context(load_scene(write_tiny(tmp_path)), 8, tmp_path / "d")
     found = list(outcomes_of_processes(context, ((k, (2 * k, 2 * k + 1)) for k in range(4)), workers))
     assert len(found) == 4
     assert os.getpid() not in {process for process, *_ in found}

@@ -8,15 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from processes_of import HAS_PROC, workers_of
-from tiny_scene import TEXT, own_cache, write_tiny
+from tiny_scene import TEXT, job_context, own_cache, write_tiny
 
 from synth.arrays import Image
 from synth.pipeline import textures
-from synth.pipeline.generate import make_job
 from synth.pipeline.overlapped import outcomes_of_batches
 from synth.pipeline.records import JobContext
 from synth.pipeline.threads import THREADS, one_thread_each
-from synth.planning import job_variant, plan
 from synth.scene import Sensor
 from synth.scene.template import load_scene
 
@@ -25,9 +23,7 @@ from synth.scene.template import load_scene
 def context(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> JobContext:
     own_cache(monkeypatch)
     text = TEXT.replace("edge_length_mm = 1.25", 'solver = "batched"\ncells = [4, 4, 2]')
-    template = load_scene(write_tiny(tmp_path, text))
-    planned = plan(template, job_variant(template, "cpu"))
-    return JobContext(planned, make_job(planned, 2, 0), tmp_path / "d", tmp_path / "cache")
+    return job_context(load_scene(write_tiny(tmp_path, text)), 2, tmp_path / "d")
 
 
 def test_textures_are_painted_in_order_and_few_at_a_time(context: JobContext, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy import stats
-from tiny_scene import TEXT, write_tiny
+from tiny_scene import TEXT
 
 from synth.errors import InputError
 from synth.scene import Scene
@@ -16,11 +16,6 @@ from synth.scene.template import Template, load_scene, shipped_scenes
 COUNT = 200
 SURE = 1e-4
 """Probability at which a test of the right distribution would fail; with fixed seeds it fails always or never."""
-
-
-@pytest.fixture
-def tiny(tmp_path: Path) -> Path:
-    return write_tiny(tmp_path)
 
 
 def _draws(template: Template, seed: int = 3) -> list[Scene]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_scene import fingerprint, own_cache, reference, write_tiny
+from tiny_scene import fingerprint, reference
 
 from synth.cli import main
 
@@ -16,15 +16,7 @@ ROOT = Path(__file__).parents[2]
 COMMANDS = ["generate", "plan", "simulate", "inspect", "verify", "export", "doctor"]
 
 
-@pytest.fixture(autouse=True)
-def _cache(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One mesh for all runs: the mesher is random."""
-    own_cache(monkeypatch)
-
-
-@pytest.fixture
-def tiny(tmp_path: Path) -> Path:
-    return write_tiny(tmp_path)
+pytestmark = pytest.mark.usefixtures("one_cache")
 
 
 def _complaint(capsys: pytest.CaptureFixture[str], status: int, expected: int = 2) -> str:

@@ -4,15 +4,10 @@ import pickle
 from pathlib import Path
 
 import pytest
-from tiny_scene import CONTACT, TEXT, write_tiny
+from tiny_scene import CONTACT, TEXT
 
 from synth.errors import InputError
 from synth.scene.template import SCENES, checked_template, load_scene, replaced, shipped_scenes
-
-
-@pytest.fixture
-def tiny(tmp_path: Path) -> Path:
-    return write_tiny(tmp_path)
 
 
 def test_shipped_scenes_are_known_by_name() -> None:

@@ -12,8 +12,10 @@ from typing import Any
 
 import pytest
 
-from synth.pipeline.generate import generate
-from synth.scene.template import load_scene
+from synth.pipeline.generate import generate, make_job
+from synth.pipeline.records import JobContext
+from synth.planning import job_variant, plan
+from synth.scene.template import Template, load_scene
 
 SENSOR = """
 name = "tiny"
@@ -131,3 +133,9 @@ def reference() -> Path:
     out = _home() / "reference"
     generate(load_scene(write_tiny(_home())), 5, out)
     return out
+
+
+def job_context(template: Template, n: int, out: Path, seed: int = 0) -> JobContext:
+    """Of a job on the processor."""
+    planned = plan(template, job_variant(template, "cpu"))
+    return JobContext(planned, make_job(planned, n, seed), out, out / "cache")
