@@ -47,6 +47,7 @@ from synth.simulate.resolution import (
     LADDER,
     MARGIN,
     STEEPEST_DEPTH,
+    Fineness,
     depth_growth,
     graded_mesh,
     ladder,
@@ -143,14 +144,13 @@ def reference_mesh(gel: Gel, zone: Focus, chosen_mm: float, most: int) -> tuple[
     return domed(box, gel.dome_radius_mm), across, fine
 
 
-def press_draw(case: Row, assignments: list[str], most: int, tried: tuple[int, ...] = LADDER) -> list[Row]:
+def press_draw(case: Row, assignments: list[str], most: int) -> list[Row]:
     """A row for the reference, and one for each mesh of a draw, coarsest first.
 
     Args:
         case: scene, seed and draw.
         assignments: `--set` of the command.
         most: elements across the contact in the reference, at most.
-        tried: numbers of elements across the contact.
     """
     template = load_scene(case["scene"], assignments)
     try:
@@ -172,17 +172,17 @@ def press_draw(case: Row, assignments: list[str], most: int, tried: tuple[int, .
         "depth_mm": round(scene.motion.depth_mm, 3),
         "target_px": scene.numerics.target_error_px or DEFAULT_TARGET_PX,
     }
-    own = (chosen.across, chosen.through)
-    meshes = [tuple(each) for each in ladder(gel, zone, tried) if each.across < finest]
+    own = Fineness(chosen.across, chosen.through)
+    meshes = [each for each in ladder(gel, zone) if each.across < finest]
     meshes = meshes[: meshes.index(own) + BEYOND + 1] if own in meshes else [*meshes, own]
     try:
         truth = simulate(closer, mesh, folder, frames=frames, driver=driver)
         field = face_displacement(truth, points, shown) if truth.status == "complete" else None
         rows = [{**about, "mesh": "reference", "chosen": False, **_outcome(truth, shown), "spacing_mm": fine}]
-        for across, through in meshes:
-            mesh, spacing_mm = graded_mesh(gel, zone, across, through)
+        for fineness in meshes:
+            mesh, spacing_mm = graded_mesh(gel, zone, *fineness)
             found, seconds = timed(partial(simulate, scene, mesh, folder, frames=frames))
-            row = {**about, "mesh": f"{across}x{through}", "chosen": (across, through) == own, **_outcome(found, shown)}
+            row = {**about, "mesh": str(fineness), "chosen": fineness == own, **_outcome(found, shown)}
             row |= {"seconds": round(seconds, 3), "unknowns": 3 * len(found.space.points), "spacing_mm": spacing_mm}
             row["predicted_px"] = predicted_error_px(scene, zone, spacing_mm)
             if field is not None and found.status == "complete":
@@ -264,7 +264,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--reference", type=int, default=18, help="elements across a contact in it, at most")
     parser.add_argument("--workers", type=int, default=1, help="draws at once")
     given = parser.parse_args(argv)
-    names = shipped_scenes() if given.all else given.scene or [DEFAULT_SCENE]
+    names = shipped_scenes() if given.all else list(dict.fromkeys(given.scene or [DEFAULT_SCENE]))
     cases = []
     for name in names:
         template = load_scene(name, given.set)

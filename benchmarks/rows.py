@@ -16,7 +16,8 @@ import platform
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from importlib.metadata import version
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -53,9 +54,9 @@ def measure(path: Path, cases: Iterable[Row], one: Callable[[Row], Row | list[Ro
     found: dict[tuple[str, ...], list[Row]] = {}
     for row in rows:
         found.setdefault(_key(row, keys), []).append(row)
-    missing = [case for case in wanted if _key(case, keys) not in found]
+    missing = list({_key(case, keys): case for case in wanted if _key(case, keys) not in found}.values())
     if len(missing) < len(wanted):
-        print(f"{path}: {len(wanted) - len(missing)} of {len(wanted)} cases are there already", file=sys.stderr)
+        print(f"{path}: {len(missing)} of {len(wanted)} cases are still to be measured", file=sys.stderr)
 
     def add(case: Row, columns: Row | list[Row]) -> None:
         new = [{**case, **each} for each in (columns if isinstance(columns, list) else [columns])]
@@ -139,7 +140,10 @@ def machine() -> str:
     parts = [models[0] if models else platform.processor() or platform.machine(), f"{os.cpu_count()} cores"]
     if hasattr(os, "getloadavg"):
         parts.append(f"load {os.getloadavg()[2]:.1f} over the last 15 minutes")
-    return ", ".join(parts + [f"{name} {version(name)}" for name in ("gelflow-synth", "numpy", "warp-lang", "mitsuba")])
+    for name in ("gelflow-synth", "numpy", "warp-lang", "mitsuba"):
+        with suppress(PackageNotFoundError):  # a checkout on a machine that simulates only
+            parts.append(f"{name} {version(name)}")
+    return ", ".join(parts)
 
 
 def _key(row: Row, keys: Sequence[str]) -> tuple[str, ...]:

@@ -64,12 +64,6 @@ class Fineness(NamedTuple):
     def __str__(self) -> str:
         return f"{self.across}x{self.through}"
 
-    @classmethod
-    def of(cls, text: str) -> "Fineness":
-        """From what `str` gives."""
-        across, through = map(int, text.split("x"))
-        return cls(across, through)
-
 
 def ladder(gel: Gel, focus: Focus, across: Sequence[int] = LADDER) -> list[Fineness]:
     """Meshes worth having for a zone, cheapest first; each is finer than all that cost less.

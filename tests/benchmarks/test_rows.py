@@ -38,6 +38,16 @@ def test_only_missing_cases_are_measured(tmp_path: Path, workers: int) -> None:
     assert measure(path, CASES[:1], no_measurement)[0]["square"] == 1
     assert len(read(path)) == 4, "rows that are not asked for stay"
     assert measure(path, [], square) == []
+    twice = measure(path, [{**CASES[0], "cells": 3}] * 2, square)
+    assert [row["square"] for row in twice] == [9, 9]
+    assert len(read(path)) == 5, "a case that is asked for twice is measured once"
+
+
+def test_a_case_may_have_several_rows(tmp_path: Path) -> None:
+    several = [{"state": state, "root": state**0.5} for state in (1, 2)]
+    rows = measure(tmp_path / "rows.csv", CASES[:1], lambda case: several)
+    assert rows == [{**CASES[0], **row} for row in several]
+    assert measure(tmp_path / "rows.csv", CASES[:1], no_measurement) == rows
 
 
 def test_a_killed_run_leaves_whole_rows(tmp_path: Path) -> None:
