@@ -20,7 +20,7 @@ def whole(at_least: int) -> Callable[[Any, Sequence[Token]], int]:
     return convert
 
 
-def kept(_: Any, given: Sequence[str] | None) -> None:
+def each_key_once(_: Any, given: Sequence[str] | None) -> None:
     """Validator: no assignment is undone by a later one."""
     keys = [text.partition("=")[0].strip() for text in given or ()]
     for number, key in enumerate(keys):
@@ -32,7 +32,9 @@ def kept(_: Any, given: Sequence[str] | None) -> None:
 SceneName = Annotated[str, Parameter(name="--scene", help="A shipped scene's name or a TOML file.")]
 Assignments = Annotated[
     list[str] | None,
-    Parameter("--set", validator=kept, help="KEY=VALUE with a TOML value, such as motion.depth_mm=1.2; repeatable."),
+    Parameter(
+        "--set", validator=each_key_once, help="KEY=VALUE with a TOML value, such as motion.depth_mm=1.2; repeatable."
+    ),
 ]
 Device = Annotated[Literal["auto", "cpu", "cuda"], Parameter(help="Where to render; auto: a GPU with OptiX if any.")]
 AsJson = Annotated[bool, Parameter("--json", negative=(), help="Print the answer as JSON on stdout.")]

@@ -76,16 +76,16 @@ def run_simulate(scene: str, out: Path, seed: int, index: int, assignments: Sequ
     for surface in out.glob("state_*.vtu"):
         refuse_foreign(surface, b'Name="mesh"')
     template = _loaded(scene, assignments)
-    drawn = draw(template, seed, index)
+    instance = draw(template, seed, index)
     with storage_errors(out):
         out.mkdir(parents=True, exist_ok=True)  # before minutes of work, not after
     try:
         with progress("simulate: percent of the way", 100) as advance:
-            press = MeshRule.of(template.numerics).press(drawn, template.folder)
+            press = MeshRule.of(template.numerics).press(instance, template.folder)
             trajectory = simulate_press(press, on_way=lambda share: advance(int(100 * share), 100))
     except InputError as error:
         raise InputError(f"{template.label}: {error}") from error
-    record = write_trajectory(out, drawn, trajectory)
+    record = write_trajectory(out, instance, trajectory)
     if as_json:
         print(json.dumps(record))
     else:

@@ -1,6 +1,6 @@
 """Who does what where: from a plan to a dataset, in this process, worker processes, a Ray cluster or shards.
 
-    attempts             the draws of a trajectory until one can be used
+    attempts             the random instances of a trajectory until one can be used
     batched_simulation   many trajectories simulated at once
     render_session       radiance of their frames
     finishing            flow, the cameras' noise, encoding, writing

@@ -218,21 +218,21 @@ def _tasks(context: JobContext, writer: DatasetWriter, n: int, finished: set[int
             continue
         sensor = sensor_of(template, trajectory)
         if sensor != meshed and context.mesh_folders:
-            drawn = draw_sensor(template, context.job.seed, sensor)
-            if drawn.content is not None:
-                _keep_mesh(context, writer, Gel.model_validate(drawn.content["sensor"]["gel"]))
+            instance = draw_sensor(template, context.job.seed, sensor)
+            if instance.content is not None:
+                _store_mesh(context, writer, Gel.model_validate(instance.content["sensor"]["gel"]))
             meshed = sensor
         yield trajectory, wanted
 
 
-def _keep_mesh(context: JobContext, writer: DatasetWriter, gel: Gel) -> None:
+def _store_mesh(context: JobContext, writer: DatasetWriter, gel: Gel) -> None:
     """Have the dataset hold a pad's fTetWild mesh: without, every trajectory would make another one."""
     numerics = context.plan.template.numerics
     with writer.making_meshes() as folder:
         pad_mesh(gel, numerics, (folder, context.cache))
-        kept = folder / f"{mesh_key(gel, numerics)}.npz"
-        if not kept.is_file():
-            raise InputError(f"{kept}: the mesh cannot be written; put this right and give the same command again")
+        stored = folder / f"{mesh_key(gel, numerics)}.npz"
+        if not stored.is_file():
+            raise InputError(f"{stored}: the mesh cannot be written; put this right and give the same command again")
 
 
 def _outcomes(context: JobContext, tasks: Iterator[Task], scheduling: Scheduling) -> Generator[Outcome, None, None]:

@@ -25,11 +25,10 @@ NODES_PER_VOLUME, NODES_PER_AREA, FEWEST_NODES = 0.72, 0.25, 300
 VERTICES_TO_P2 = 7.0
 """Displacement nodes of P2 elements per vertex of the mesh."""
 SOLVE_SECONDS = 0.06
-"""One Newton iteration (assembly, factorisation, solution) without friction, with SOLVE_NODES displacement nodes; from
-24 pairs of `gelsight_mini`, 2.36 s a pair on one core."""
+"""One Newton iteration (assembly, factorisation, solution) without friction, with SOLVE_NODES displacement nodes."""
 SOLVE_NODES = 5000
 SOLVE_GROWTH = 1.25
-"""Exponent of a solve's time in the nodes, fitted to 2,079 to 9,044 of them."""
+"""Exponent of a solve's time in the nodes."""
 FRICTION = 1.5
 """Time of an iteration with friction over one without."""
 ITERATIONS_PER_STEP, ITERATIONS_PER_RECORD = 4.5, 7.0
@@ -83,12 +82,12 @@ def predict(plan: Plan) -> Prediction:
         InputError: no trajectory can be drawn and meshed.
     """
     template, variant, pairs = plan.template, plan.variant, plan.template.sampling.pairs_per_trajectory
-    scene = template.corners[0]
-    cameras = [view.camera for view in scene.sensor.views.values()]
+    corner = template.corners[0]
+    cameras = [view.camera for view in corner.sensor.views.values()]
     meshes = _tetwild_meshes(plan) if plan.mesh.kind == "tetwild" else _meshes(plan)
-    simulate = float(np.mean([_simulation_seconds(drawn, nodes, plan) for drawn, nodes in meshes.presses]))
+    simulate = float(np.mean([_simulation_seconds(scene, nodes, plan) for scene, nodes in meshes.presses]))
     pixels = sum(camera.width * camera.height for camera in cameras)
-    samples = AUTO_SAMPLES if scene.render.samples_per_pixel == "auto" else scene.render.samples_per_pixel
+    samples = AUTO_SAMPLES if corner.render.samples_per_pixel == "auto" else corner.render.samples_per_pixel
     frame = pixels * samples / 1e6 * SECONDS_PER_MILLION_SAMPLES[variant.name.split("_")[0]]
     directions = 2 if plan.template.outputs.backward else 1
     return Prediction(
@@ -116,11 +115,12 @@ class _Meshes:
 
 def _meshes(plan: Plan) -> _Meshes:
     """Of the first INSTANCES trajectories."""
-    template, found = plan.template, list[tuple[Scene, Resolution]]()
+    template = plan.template
+    found: list[tuple[Scene, Resolution]] = []
     for trajectory in range(INSTANCES):
         try:
-            drawn = draw(template, 0, trajectory)
-            found.append((drawn, plan.mesh.resolution(drawn, template.folder)))
+            scene = draw(template, 0, trajectory)
+            found.append((scene, plan.mesh.resolution(scene, template.folder)))
         except InputError:  # an impossible draw: generate redraws it
             continue
     if not found:
@@ -131,11 +131,11 @@ def _meshes(plan: Plan) -> _Meshes:
     text = f"{min(across)} to {max(across)} elements across the contact, {min(spacings):.2g} to {max(spacings):.2g} mm"
     if plan.mesh.kind == "even":
         text = " x ".join(map(str, template.numerics.cells)) + f" elements for all draws of a pad, {text}"
-    radii = [edge_radius_mm(drawn, resolution.mesh) for drawn, resolution in found]
+    radii = [edge_radius_mm(scene, resolution.mesh) for scene, resolution in found]
     rounded = [radius for radius in radii if radius is not None]
     if rounded:
         text += f", edges of objects rounded to {min(rounded):.2g} to {max(rounded):.2g} mm"
-    presses = tuple((drawn, round(_order(drawn) * len(resolution.mesh.points))) for drawn, resolution in found)
+    presses = tuple((scene, round(_order(scene) * len(resolution.mesh.points))) for scene, resolution in found)
     return _Meshes(presses, text, (float(np.median(errors)), max(errors)))
 
 

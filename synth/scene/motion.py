@@ -37,7 +37,7 @@ class Motion(Part):
 
     @property
     def moves(self) -> int:
-        """How many legs the way has: press, shear with twist, and one to each pose that differs from the one before."""
+        """Legs of the load path: press, shear with twist, and one to each pose that differs from the one before."""
         stops = [(min(self.depth_mm, 0.0), (0.0, 0.0), 0.0), (self.depth_mm, (0.0, 0.0), 0.0)]
         stops += [(pose.depth_mm, pose.shear_mm, pose.twist_deg) for pose in self.poses.values()]
         return sum(start != end for start, end in pairwise(stops))

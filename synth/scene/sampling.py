@@ -1,4 +1,4 @@
-"""One concrete draw: what sample i shows depends on (scene, seed, i) alone.
+"""Random instances of a scene: what sample i shows depends on (scene, seed, i) alone.
 
 Sample i belongs to trajectory i // pairs_per_trajectory, and a trajectory to a sensor in the same way. Each level has
 its own random streams, seeded by the scene's hash, the job's seed, the level's name, its number and the attempt: a draw
@@ -30,7 +30,7 @@ class SensorInstance:
 
     Attributes:
         content: parts by name; None where no draw can be used.
-        rejected: why earlier draws, or all of them, could not be used.
+        rejected: why earlier instances, or all of them, could not be used.
     """
 
     content: dict[str, Any] | None
@@ -85,7 +85,7 @@ def draw(
         template: the scene file.
         seed: of the job.
         trajectory: its number.
-        attempt: 0, or how many draws of contact and motion were of no use.
+        attempt: 0, or how many instances of contact and motion were of no use.
         sensor: the draw of the trajectory's sensor, where the caller has it.
 
     Raises:

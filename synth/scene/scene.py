@@ -36,7 +36,7 @@ class Outputs(Part):
 
 
 class Sampling(Part):
-    """How draws are shared: samples of one trajectory, trajectories of one sensor."""
+    """How random instances are shared: samples of one trajectory, trajectories of one sensor."""
 
     pairs_per_trajectory: Annotated[int, Field(ge=1, le=1000)] = 2
     trajectories_per_sensor: Annotated[int, Field(ge=1, le=100000)] = 2

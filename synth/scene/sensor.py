@@ -49,7 +49,7 @@ class Light(Part):
 
 
 class Sensor(Part):
-    """Everything that belongs to the finger."""
+    """Everything but contact and motion: gel, optics and light."""
 
     gel: Gel
     window: Window = Window()
