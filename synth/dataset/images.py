@@ -1,6 +1,5 @@
 """Images as PNG: RGB or grey, 8 or 16 bits, the same bytes for the same pixels (no time stamps, fixed compression)."""
 
-import struct
 import zlib
 from pathlib import Path
 from typing import TypeAlias
@@ -69,18 +68,14 @@ def _check_chunks(path: Path, data: bytes) -> None:
         raise InputError(f"{path}: not a PNG file")
     place, kind = len(_SIGNATURE), b""
     while kind != b"IEND":
-        if place + 12 > len(data):
-            raise InputError(
-                f"{path}: the PNG file ends after {len(data)} bytes, before its image does; it is truncated"
-            )
-        (length,) = struct.unpack_from(">I", data, place)
+        length = int.from_bytes(data[place : place + 4], "big")
         body = data[place + 4 : place + 8 + length]
         stored = data[place + 8 + length : place + 12 + length]
         if len(stored) < 4:
             raise InputError(
                 f"{path}: the PNG file ends after {len(data)} bytes, before its image does; it is truncated"
             )
-        if zlib.crc32(body) != struct.unpack(">I", stored)[0]:
+        if zlib.crc32(body) != int.from_bytes(stored, "big"):
             raise InputError(f"{path}: the checksum of the PNG chunk at byte {place} is wrong; the file is damaged")
         kind = body[:4]
         place += 12 + length

@@ -15,9 +15,10 @@ def mesh_folder(out: Output) -> Path:
     Raises:
         InputError: The storage refuses.
     """
-    if isinstance(out, Path):
-        return out / MESHES_FOLDER
-    folder, store = Path(_temporary_folder(out).name), Store(out)
+    store = Store(out)
+    if store.directory is not None:
+        return store.directory / MESHES_FOLDER
+    folder = Path(_temporary_folder(str(store.out)).name)
     for name in store.names(MESHES_FOLDER):
         if not (folder / name).exists():
             store.get(f"{MESHES_FOLDER}/{name}", folder / name)

@@ -129,15 +129,15 @@ class Dataset:
         Raises:
             InputError: There is no such sample.
         """
-        folder, problems = self.folder(index), []
+        problems = []
         for name, expected in self.entry(index).sha256.items():
+            path = self.folder(index) / name
             try:
-                found = hashlib.sha256((folder / name).read_bytes()).hexdigest()
+                found = hashlib.sha256(path.read_bytes()).hexdigest()
+                if found != expected:
+                    problems.append(f"{path}: sha256 is {found[:16]}..., the manifest says {expected[:16]}...")
             except OSError as error:
-                problems.append(f"{folder / name}: cannot be read: {error.strerror or error}")
-                continue
-            if found != expected:
-                problems.append(f"{folder / name}: sha256 is {found[:16]}..., the manifest says {expected[:16]}...")
+                problems.append(f"{path}: cannot be read: {error.strerror or error}")
         return problems
 
 

@@ -35,12 +35,12 @@ def write_sample_files(out: Output, sample: Sample, job: Job) -> ManifestEntry:
     Raises:
         InputError: The storage refuses (disk full, no permission).
     """
-    if isinstance(out, Path):
-        return _write_folder(out / SAMPLES_FOLDER / sample_name(sample.index), sample, job)
-    name = f"{SAMPLES_FOLDER}/{sample_name(sample.index)}"
+    store, name = Store(out), f"{SAMPLES_FOLDER}/{sample_name(sample.index)}"
+    if store.directory is not None:
+        return _write_folder(store.directory / name, sample, job)
     with tempfile.TemporaryDirectory(prefix="synth-") as temporary:
         entry = _write_folder(Path(temporary) / name, sample, job)
-        Store(out).put(Path(temporary) / name, name)
+        store.put(Path(temporary) / name, name)
     return entry
 
 

@@ -92,13 +92,12 @@ class Store:
                 self._make_folder(target)
                 system.put_file(str(file), target)
 
-    def get(self, name: str, path: Path) -> bool:
-        """Copies an object to a local file; False where there is none."""
+    def get(self, name: str, path: Path) -> None:
+        """Copies an object to a local file; nothing where there is none."""
         system, root = self._place
         with self._errors(name):
-            if found := bool(system.exists(f"{root}/{name}")):
+            if system.exists(f"{root}/{name}"):
                 system.get_file(f"{root}/{name}", str(path))
-            return found
 
     def exists(self, name: str) -> bool:
         """Whether there is something of that name."""

@@ -236,7 +236,9 @@ class DatasetWriter:
         strange = [name for name in self._store.names() if name not in ours and PARTIAL not in name]
         if strange and not self._store.exists(DATASET_FILE):
             listed = ", ".join(strange[:5]) + (", ..." if len(strange) > 5 else "")
-            raise InputError(f"{self._store.out}: not a dataset: holds {listed} but no dataset; give another --out")
+            raise InputError(
+                f"{self._store.out}: not a dataset: holds {listed} but no {DATASET_FILE}; give another --out"
+            )
 
     def _record(self) -> dict[str, Any] | None:
         """The content of dataset.json; None where there is none."""

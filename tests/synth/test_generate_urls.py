@@ -65,17 +65,12 @@ def test_a_file_url_is_a_directory(tmp_path: Path) -> None:
     assert (tmp_path / "with space" / ".lock").exists()
 
 
-def _stop(writer: DatasetWriter) -> None:
-    """What is left of a killed run: nothing finalised. Its lease is this process's, which lives; so remove it."""
-    writer.close()
-
-
 def test_a_stopped_run_leaves_a_journal_that_the_next_one_reads(url: str) -> None:
     writer = DatasetWriter(url, job(3))
     writer.record(write_sample_files(url, translation_sample(2), job()))
     writer.fail(1, 0, "simulate", "Newton failed")
     write_sample_files(url, translation_sample(0), job())  # without its line: does not count
-    _stop(writer)
+    writer.close()  # as a killed run, nothing finalised; but its lease is this process's, which lives
     store = Store(url)
     assert store.names("journal") == ["000001-0.json", "000002.json"]
     assert store.read("manifest.jsonl") is None
