@@ -15,7 +15,6 @@ lens distortion, fisheye, mirror or aperture.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -46,7 +45,7 @@ class CameraRays:
         pose = optics.pose
         axes = (pose.right, pose.down, pose.forward, pose.position)
         self._right, self._down, self._forward, self._position = (self._vector(axis) for axis in axes)
-        self._mirrors = [_Mirror.of(mirror, self._vector, mi, dr) for mirror in optics.mirrors]
+        self._mirrors = [_Mirror(mirror, self._vector, mi, dr) for mirror in optics.mirrors]
         self._refracts = optics.index != 1
         self._index = dr.opaque(mi.Float, optics.index)
         self._face = dr.opaque(mi.Float, optics.face_z)
@@ -169,20 +168,13 @@ class CameraRays:
         return u, v
 
 
-@dataclass(frozen=True, eq=False)
 class _Mirror:
     """A mirror of `synth.optics.mirror` in the renderer's frame, opaque to Dr.Jit."""
 
-    centre: Any
-    axes: tuple[Any, Any]
-    normal: Any
-    half: tuple[Any, Any]
-
-    @staticmethod
-    def of(mirror: FlatMirror, vector: Callable[[FloatArray], Any], mi: Any, dr: Any) -> "_Mirror":
-        width, height = (dr.opaque(mi.Float, value) for value in mirror.half)
-        axes = (vector(mirror.axes[0]), vector(mirror.axes[1]))
-        return _Mirror(vector(mirror.centre), axes, vector(mirror.normal), (width, height))
+    def __init__(self, mirror: FlatMirror, vector: Callable[[FloatArray], Any], mi: Any, dr: Any) -> None:
+        self.centre, self.normal = vector(mirror.centre), vector(mirror.normal)
+        self.axes = [vector(axis) for axis in mirror.axes]
+        self.half = [dr.opaque(mi.Float, value) for value in mirror.half]
 
     def met(self, origin: Any, direction: Any) -> tuple[Any, Any]:
         """How far rays go to the mirror, infinite where they miss it, and whether they meet its front."""

@@ -67,6 +67,15 @@ def rigid(matrix: FloatArray, shift: tuple[float, float, float]) -> Callable[[Po
     return lambda points: points @ matrix.T + np.array(shift)
 
 
+def folded(points: Points, crease: float = 2.0, shrink: float = 1 / 3) -> Points:
+    """What lies right of x = crease folded over it, shrunk along x, up to 1 mm above the rest."""
+    found, over = points.copy(), points[:, 0] > crease
+    beyond = points[over, 0] - crease
+    found[over, 0] = crease - beyond * shrink
+    found[over, 2] = np.minimum(beyond * 4, 1.0)
+    return found
+
+
 def dented(points: Points, depth: float, shear: tuple[float, float] = (0.0, 0.0)) -> Points:
     """With a dent of some 3 mm radius beside the middle, carried along."""
     dent = np.exp(-((points[:, :2] - (0.4, -0.3)) ** 2).sum(1) / 9.0)

@@ -302,7 +302,9 @@ def test_nothing_is_compiled_for_another_aperture_or_focus() -> None:
 
     def compiled(**camera: Any) -> int:
         sensor = small_sensor(1.45, **camera)
-        return kernels_compiled(lambda: rendered(sensor, render=Render(samples_per_pixel=16, max_depth=2), seed=1))
+        surface = flat_surface(sensor)
+        renderer = Renderer(sensor, Render(samples_per_pixel=16, max_depth=2), surface, plain(), FAST)
+        return kernels_compiled(lambda: renderer.radiance(surface.material, 1))
 
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         compiled(aperture_mm=1.0, focus_mm=20.0)

@@ -2,7 +2,19 @@
 
 import numpy as np
 import pytest
-from kinematic_double import HEIGHT, LENS, OBLIQUE, STRAIGHT, WIDTH, optics, pixel_centres, rigid, rotation, sheet
+from kinematic_double import (
+    HEIGHT,
+    LENS,
+    OBLIQUE,
+    STRAIGHT,
+    WIDTH,
+    folded,
+    optics,
+    pixel_centres,
+    rigid,
+    rotation,
+    sheet,
+)
 from scipy.optimize import brentq
 
 from synth.errors import InputError
@@ -109,15 +121,9 @@ def test_pixels_beside_the_gel_are_nan():
 def test_a_fold_hides_what_lies_under_it(index):
     """The sheet's right half folds over at x = 2: it then covers 0 < x < 2 from a height of 1 mm."""
     surface = sheet(160, 40, 16.0, 12.0)
-    x = surface.material[:, 0]
-    folded = surface.material.copy()
-    over = x > 2
-    folded[over, 0] = 2 - (x[over] - 2) / 3
-    folded[over, 2] = np.minimum((x[over] - 2) * 4, 1.0)
     camera = optics(index=index)
-    flow = exact_flow(surface, surface.material, folded, camera, WIDTH, HEIGHT)
-    origins, directions = camera.rays(pixel_centres().reshape(-1, 2))
-    at = (origins - directions * (origins[:, 2:] / directions[:, 2:])).reshape(HEIGHT, WIDTH, 3)
+    flow = exact_flow(surface, surface.material, folded(surface.material), camera, WIDTH, HEIGHT)
+    at = camera.look(camera.centres).on_flat_face.reshape(HEIGHT, WIDTH, 3)
     on_gel = (abs(at[..., 0]) < 8) & (abs(at[..., 1]) < 6)
     # The flap's far edge, at 2 - 6/3 = 0 and 1 mm up, hides points right of where the ray over it meets z = 0; its
     # crease at x = 2 stays put, so points left of the edge's shadow are seen and flat points right of it hidden.
@@ -151,8 +157,7 @@ def test_extra_channels():
     )  # fmt: skip
     assert flow.backward is None
     assert flow.backward_visible is None
-    origins, directions = camera.rays(pixel_centres().reshape(-1, 2))
-    at = origins - directions * (origins[:, 2:] / directions[:, 2:])
+    at = camera.look(camera.centres).on_flat_face
 
     def channels(name):
         return np.stack([flow.extras[f"{name}.{axis}"] for axis in "XYZ"], axis=-1).reshape(-1, 3)

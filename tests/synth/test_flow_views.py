@@ -12,6 +12,7 @@ from kinematic_double import (
     SIDES,
     WIDTH,
     dented,
+    folded,
     optics,
     pixel_centres,
     sensor,
@@ -61,13 +62,8 @@ def test_folds_in_mirrors_are_hidden_rightly(view):
     with `reached_by` left out of `derive`: the derivation calls them visible.
     """
     surface = sheet(40, 24, 20.0, 15.0, 2)
-    x = surface.material[:, 0]
-    folded = surface.material.copy()
-    over = x > 3
-    folded[over, 0] = 3 - (x[over] - 3) * 3 / 7
-    folded[over, 2] = np.minimum((x[over] - 3) * 4, 1.0)
-    folded[:, 1] += 0.3
-    flow, checks = motion_checks(sensor(**VIEWS[view]), surface, surface.material, folded)
+    over = folded(surface.material, 3.0, 3 / 7) + np.array([0.0, 0.3, 0.0])
+    flow, checks = motion_checks(sensor(**VIEWS[view]), surface, surface.material, over)
     assert all(check.passed for check in checks.values()), [check for check in checks.values() if not check.passed]
     hidden = (flow.forward_visible == 0) & np.isfinite(flow.forward[..., 0])
     path = optics(**VIEWS[view]).look(pixel_centres().reshape(-1, 2)).path.reshape(HEIGHT, WIDTH)

@@ -257,24 +257,25 @@ def test_a_small_suite_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[
     scenes.mkdir()
     (scenes / "base.toml").write_text((EXTREME / "base.toml").read_text())
     (scenes / "expected.toml").write_text(SUITE)
-    assert run_stress(out, None, 2, True, scenes) == 1
-    report = json.loads(capsys.readouterr().out)
+    assert run_stress(out, None, 2, False, scenes) == 1
+    shown = capsys.readouterr().out
+    report = json.loads((out / "stress.json").read_text())
     assert [(case["case"], case["outcome"], case["ok"]) for case in report["cases"]] == [
         ("soft", "complete", True),
         ("hard", "complete", False),
         ("hopeless", "refused", True),
     ]
-    hard = report["cases"][1]
-    assert len(hard["broken"]) == 1  # the displacement is the same; only the force is not
-    assert "is 10 of soft's, not within [1, 1.1]" in hard["broken"][0]
-    assert json.loads((out / "stress.json").read_text()) == report
+    (broken,) = report["cases"][1]["broken"]  # the displacement is the same; only the force is not
+    assert "is 10 of soft's, not within [1, 1.1]" in broken
+    assert f"hard-p1p1: OTHERWISE: {broken}" in shown
     rows = list(csv.DictReader((out / "stress.csv").read_text().splitlines()))
     assert [row["verdict"] for row in rows] == ["as expected", "OTHERWISE", "as expected"]
     assert str(tmp_path) not in (out / "stress.json").read_text()  # it is read elsewhere
-    # Only what is asked for, with what it is compared with.
-    assert run_stress(out, ["hard"], 1, False, scenes) == 1
-    assert "soft-p1p1" in capsys.readouterr().out
-    assert run_stress(out, ["wrong"], 1, False, scenes) == 0
+    # Only what is asked for, in place of the first.
+    assert run_stress(out, ["wrong"], 1, True, scenes) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert [case["case"] for case in report["cases"]] == ["hopeless"]
+    assert json.loads((out / "stress.json").read_text()) == report
     with pytest.raises(InputError, match=r"no case or group of that name; cases are soft, hard, hopeless"):
         run_stress(out, ["nothing"], 1, False, scenes)
 

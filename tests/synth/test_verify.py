@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kinematic_double import LENS, OBLIQUE, STRAIGHT, optics, sensor, sheet
+from kinematic_double import LENS, OBLIQUE, STRAIGHT, folded, optics, sensor, sheet
 from rich.console import Console
 from verified_sample import HEIGHT, WIDTH, as_sample, make_sample, motion_checks, pressed, scene, sheets
 
@@ -144,17 +144,14 @@ def test_missing_backward_flow_and_wrong_size_are_found(sample):
 def test_folds_pass_and_their_visibility_is_checked(index):
     """The sheet's right half folded over itself: silhouettes, hidden points, steep flanks."""
     surface = sheet(80, 20, 16.0, 12.0)
-    x = surface.material[:, 0]
-    folded, over = surface.material.copy(), x > 2
-    folded[over, 0] = 2 - (x[over] - 2) / 3
-    folded[over, 2] = np.minimum((x[over] - 2) * 4, 1.0)
-    flow, found = motion_checks(sensor(index=index), surface, surface.material, folded)
+    states = surface.material, folded(surface.material)
+    flow, found = motion_checks(sensor(index=index), surface, *states)
     assert all(check.passed for check in found.values()), found
     hidden = np.argwhere((flow.forward_visible == 0) & np.isfinite(flow.forward[..., 0]))
     assert len(hidden) > 50
     wrong = flow.forward_visible.copy()
     wrong[tuple(hidden[len(hidden) // 2])] = 1
-    near, far = sheets(sensor(index=index), surface, surface.material, folded)
+    near, far = sheets(sensor(index=index), surface, *states)
     checks = {check.name: check for check in check_motion("forward", near, far, flow.forward, wrong)}
     assert not checks["forward visibility"].passed
 
