@@ -20,10 +20,10 @@ LLVM, MONO, SCALAR = Variant("llvm_ad_rgb", ""), Variant("llvm_ad_mono", ""), Va
 
 
 def test_the_public_interface_plans_a_scene(tiny: Path) -> None:
-    """`synth.pipeline.generate` and `synth.read_dataset` are those that other tests call by their modules."""
+    """`synth.generate` and `synth.read_dataset` are those that other tests call by their modules."""
     planned = synth.plan(synth.load_scene(tiny, set=["numerics={ target_error_px = 2.0 }"]))
     assert planned.mesh == MeshRule("graded", 2.0)
-    assert (synth.pipeline.generate, synth.read_dataset) == (generate, read_dataset)
+    assert (synth.generate, synth.read_dataset) == (generate, read_dataset)
     with pytest.raises(AttributeError, match="no attribute 'plans'"):
         synth.plans  # noqa: B018
 
