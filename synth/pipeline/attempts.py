@@ -38,10 +38,18 @@ class Attempts:
         for reason in sensor.rejected:
             self.fail("sensor", reason)
 
-    def next(self) -> Attempt | None:
-        """The next instance that keeps the schema and whose mesh and body can be built; None when there are no more."""
+    @property
+    def is_exhausted(self) -> bool:
+        """Whether no instance is left."""
+        return self._sensor.content is None or self._count >= MAX_DRAWS
+
+    def next(self, retry: bool = True) -> Attempt | None:
+        """The next instance that keeps the schema and whose mesh and body can be built; None when there are no more.
+
+        Without `retry` also None after an instance whose mesh or body cannot be built.
+        """
         plan, seed = self._context.plan, self._context.job.seed
-        while self._sensor.content is not None and self._count < MAX_DRAWS:
+        while not self.is_exhausted:
             self._count += 1
             stage = "draw"
             try:
@@ -50,6 +58,8 @@ class Attempts:
                 press = plan.press(scene, self._context.mesh_folders)
             except InputError as error:
                 self.fail(stage, str(error))
+                if stage == "simulate" and not retry:
+                    return None
                 continue
             every = pairs_of(plan.template, seed, self.trajectory, scene.motion.steps)
             pairs = tuple(pair for pair in every if pair.index in self.wanted)

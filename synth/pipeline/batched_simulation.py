@@ -100,11 +100,13 @@ class _Simulation:
             again, most = [], CHUNK * self._batch
             ready: dict[Gel, list[tuple[Attempts, Attempt]]] = {}
             for attempts in chunk:
-                attempt = attempts.next()
-                if attempt is None:
+                attempt = attempts.next(retry=False)
+                if attempt is not None:
+                    ready.setdefault(pad_key(attempt.press), []).append((attempts, attempt))
+                elif attempts.is_exhausted:
                     yield attempts.trajectory, attempts.given_up()
                 else:
-                    ready.setdefault(pad_key(attempt.press), []).append((attempts, attempt))
+                    again.append(attempts)
             while ready:
                 for attempts, attempt, result in self._run(ready.pop(next(iter(ready)))):
                     simulated = attempts.simulated(attempt, result)
