@@ -18,9 +18,9 @@ from synth.scene import Gel
 from synth.scene.sampling import SensorInstance, draw_sensor, sensor_of
 from synth.scene.template import Template
 from synth.simulate import Trajectory
-from synth.simulate.batched.jobs import Job
 from synth.simulate.batched.many import run_jobs
 from synth.simulate.batched.pad import Pad, prepare
+from synth.simulate.batched.presses import Job
 from synth.simulate.press import Press
 
 BATCH = {"cuda": 256, "cpu": 8}

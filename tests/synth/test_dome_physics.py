@@ -109,7 +109,7 @@ def test_mesh_and_scene_must_be_of_one_dome() -> None:
 
 
 def test_many_at_once_press_the_dome_as_one_does() -> None:
-    """Fails with `face_mm` left out of `synth.simulate.batched.jobs`: the indenter stays 0.36 mm higher."""
+    """Fails with `face_mm` left out of `synth.simulate.batched.presses`: the indenter stays 0.36 mm higher."""
     drawn = scene(8.0, (8.0, 6.0, 4.0), BALL, position_mm=(2.0, -1.2), depth_mm=0.3, steps=2, friction=0.4)
     drawn = drawn.model_copy(update={"numerics": Numerics(element="p1p1", tolerance=1e-9)})
     mesh = domed(brick(counts=(4, 4, 2)), 8.0)

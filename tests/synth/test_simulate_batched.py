@@ -16,12 +16,12 @@ from synth.mesh import PadMesh
 from synth.scene import Scene
 from synth.simulate import Trajectory
 from synth.simulate.batched import simulate_many
-from synth.simulate.batched.folding import find_folding, fold_product
+from synth.simulate.batched.inversion_barrier import barrier_product, find_inverting
 from synth.simulate.batched.krylov import padded
 from synth.simulate.batched.many import DRIVER, jobs_of
-from synth.simulate.batched.numbering import number_rows
 from synth.simulate.batched.pad import prepare
-from synth.simulate.batched.product import STORED_YEOH, bulk_product, contact_product, store, store_contact
+from synth.simulate.batched.product import STORED_YEOH, bulk_product, contact_product, store_bulk, store_contact
+from synth.simulate.batched.unknown_rows import number_rows
 from synth.simulate.contact import contact_stiffness
 from synth.simulate.element import Element
 from synth.simulate.material import pad_material, uniform
@@ -29,7 +29,7 @@ from synth.simulate.path import path_of
 from synth.simulate.space import function_space
 from synth.simulate.stepping import Stepper
 from synth.simulate.system import System, Unknowns
-from synth.simulate.tables import bulk_tables, face_tables, fold_tables, warp_array
+from synth.simulate.tables import barrier_tables, bulk_tables, face_tables, warp_array
 
 BAR = {"shape": "cylinder", "radius_mm": 1.5, "length_mm": 4.0, "fillet_mm": 0.6, "rotation_deg": [90, 0, 30]}
 BOX = {"shape": "box", "size_mm": [3.0, 2.5, 4.0], "fillet_mm": 0.6, "rotation_deg": [0, 0, 20]}
@@ -98,8 +98,8 @@ def test_many_at_once_agree_with_one_by_one(element: str) -> None:
 
 
 def test_company_and_order_change_no_bit() -> None:
-    """Slots are refilled, and what ran in one before leaves no trace."""
-    # Fails with a state that is not cleared when a slot is filled again.
+    """Lanes are refilled, and what ran in one before leaves no trace."""
+    # Fails with a state that is not cleared when a lane is filled again.
     scenes = draws("p1p1")
     given = together(scenes, MESH, 3)
     order = [6, 2, 7, 0, 3, 1, 5, 4]
@@ -109,7 +109,7 @@ def test_company_and_order_change_no_bit() -> None:
 
 def test_a_lost_sample_does_not_spoil_the_others() -> None:
     """A ring of thin wire pressed through four fifths of a pad whose faces are three times as wide as the wire."""
-    # Fails with a trial that asks slot 0 for its phase.
+    # Fails with a trial that asks lane 0 for its phase.
     numerics = {"edge_length_mm": 0.1, "max_step_mm": 0.5}
     lost = scene(indenter=WIRE, friction=0.2, motion={"depth_mm": 3.3, "steps": 8}, numerics=numerics)
     good = scene(friction=0.4, motion={"depth_mm": 0.4}, numerics=numerics)
@@ -131,8 +131,8 @@ def test_an_indenter_that_finds_no_point_is_told_apart() -> None:
 
 
 def test_mesh_indenters_of_unequal_grids(tmp_path: FilePath) -> None:
-    """They touch at once, by the error of their grids, so that a slot that remembers another trajectory would show."""
-    # Fails with the first grid in every slot, or with anchors that are not forgotten when a slot is filled again.
+    """They touch at once, by the error of their grids, so that a lane that remembers another trajectory would show."""
+    # Fails with the first grid in every lane, or with anchors that are not forgotten when a lane is filled again.
     import pyvista as pv
 
     pv.Icosphere(radius=2.5, nsub=3).save(tmp_path / "large.stl")
@@ -159,7 +159,7 @@ def test_mesh_indenters_of_unequal_grids(tmp_path: FilePath) -> None:
 def test_the_product_is_the_tangent_times_the_vector(
     element: str, poisson_ratio: float, stiffening: tuple[float, float]
 ) -> None:
-    """At a random state: contact that sticks and slips, pressures that hold dilation, elements near folding."""
+    """At a random state: contact that sticks and slips, pressures that hold dilation, elements near inverting."""
     # Fails without the unsymmetric remainder, the mean pressure's part of the coupling, or t² in the fold's barrier.
     rng = np.random.default_rng(1)
     mesh = brick((4.0, 3.0, 2.0), (3, 2, 2))
@@ -186,18 +186,18 @@ def test_the_product_is_the_tangent_times_the_vector(
     vector, image = warp_array(x, wp.float32, "cpu"), wp.zeros((rows, 1), dtype=wp.float32, device="cpu")
     displacement, pressure = warp_array(state.u, wp.vec3d, "cpu"), warp_array(state.p, wp.float64, "cpu")
     inputs = [mask, displacement, pressure, tables, warp_array(viscosity, wp.float64, "cpu")]
-    wp.launch(store, (len(mesh.tets), 1), inputs=inputs, outputs=[stored], device="cpu")
+    wp.launch(store_bulk, (len(mesh.tets), 1), inputs=inputs, outputs=[stored], device="cpu")
     kernel = bulk_product(space.nodes.shape[1], body.mixed, space.element.stabilisation > 0, any(stiffening))
     inputs = [mask, numbering.single, stored, vector]
     wp.launch(kernel, (len(mesh.tets), 1), inputs=inputs, outputs=[image], device="cpu")
-    lattice = fold_tables(space, uniform(len(mesh.tets), poisson_ratio), "cpu")
-    if lattice is not None:
-        folding = wp.zeros((len(mesh.tets), 1), dtype=wp.int32, device="cpu")
-        inputs = [mask, displacement, lattice]
-        wp.launch(find_folding, (len(mesh.tets), 1), inputs=inputs, outputs=[folding], device="cpu")
-        assert folding.numpy().any()
-        inputs = [mask, folding, displacement, lattice, numbering.single.row, vector]
-        wp.launch(fold_product, (len(mesh.tets), 1), inputs=inputs, outputs=[image], device="cpu")
+    barrier = barrier_tables(space, uniform(len(mesh.tets), poisson_ratio), "cpu")
+    if barrier is not None:
+        inverting = wp.zeros((len(mesh.tets), 1), dtype=wp.int32, device="cpu")
+        inputs = [mask, displacement, barrier]
+        wp.launch(find_inverting, (len(mesh.tets), 1), inputs=inputs, outputs=[inverting], device="cpu")
+        assert inverting.numpy().any()
+        inputs = [mask, inverting, displacement, barrier, numbering.single.row, vector]
+        wp.launch(barrier_product, (len(mesh.tets), 1), inputs=inputs, outputs=[image], device="cpu")
     touching = wp.zeros(points[:2], dtype=wp.int32, device="cpu")
     touched = wp.zeros(points[:2], dtype=wp.int32, device="cpu")
     symmetric, remainder = (wp.zeros(points, dtype=wp.mat33d, device="cpu") for _ in range(2))

@@ -1,11 +1,21 @@
-"""Moves of the slots' fields between state, iterate and trial, and of what contact remembers, as Warp kernels."""
+"""Moves of the lanes' fields between state, iterate and trial, and of what contact remembers, as Warp kernels."""
 
 # Kernels are written in Warp's own language; their annotations only look like Python's.
 # mypy: disable-error-code="valid-type, no-untyped-def"
 
 import warp as wp
 
-from synth.simulate.batched.slots import ACCEPT, FALL_BACK, FRESH, RELAXING, REVERT, SEARCH, TAKE, UNDO, Slots
+from synth.simulate.batched.lanes import (
+    ACCEPT,
+    FRESH,
+    RELAXING,
+    RESET,
+    RESTORE_RECORDED,
+    ROLL_BACK,
+    SEARCH,
+    TAKE_TRIAL,
+    Lanes,
+)
 from synth.simulate.contact import FAR, ContactState
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -34,10 +44,10 @@ class Fields:
 
 
 @wp.kernel
-def clear(slots: Slots, fields: Fields):
-    """One thread per (slot, node and then pressure): the undeformed state in fresh slots."""
+def clear_fields(lanes: Lanes, fields: Fields):
+    """One thread per (lane, node and then pressure): the undeformed state in fresh lanes."""
     s, i = wp.tid()
-    if slots.phase[s] != FRESH:
+    if lanes.phase[s] != FRESH:
         return
     count = fields.state_u.shape[1]
     if i < count:
@@ -51,8 +61,8 @@ def clear(slots: Slots, fields: Fields):
 
 
 @wp.kernel
-def attempt(
-    slots: Slots,
+def compute_trial(
+    lanes: Lanes,
     mask: wp.array(dtype=wp.int32),
     step: wp.array2d(dtype=wp.float32),
     node_row: wp.array(dtype=wp.int32),
@@ -62,7 +72,7 @@ def attempt(
     viscous: wp.array2d(dtype=wp.vec3d),
     volume: wp.array2d(dtype=wp.float64),
 ):
-    """One thread per (slot, node and then pressure): the trial, and zeros for its residual and viscous force.
+    """One thread per (lane, node and then pressure): the trial, and zeros for its residual and viscous force.
 
     step: (B, rows); node_row: first row of a node's displacement or -1 where it is held.
     """
@@ -70,10 +80,10 @@ def attempt(
     if mask[s] == 0:
         return
     scale = wp.float64(0.0)
-    if slots.phase[s] == SEARCH:
-        scale = slots.scale[s]
-        if slots.relaxing[s] == RELAXING:
-            scale = slots.share[s]
+    if lanes.phase[s] == SEARCH:
+        scale = lanes.scale[s]
+        if lanes.relaxing[s] == RELAXING:
+            scale = lanes.share[s]
     count = fields.state_u.shape[1]
     if i < count:
         u = fields.iterate_u[s, i]
@@ -94,7 +104,7 @@ def attempt(
 
 
 @wp.kernel
-def carry(
+def apply_predictor(
     begun: wp.array(dtype=wp.int32),
     share: wp.float64,
     step: wp.array2d(dtype=wp.float32),
@@ -102,7 +112,7 @@ def carry(
     pressure_row: wp.array(dtype=wp.int32),
     fields: Fields,
 ):
-    """One thread per (slot, node and then pressure): the state carried along with the indenter, 1/share times step."""
+    """One thread per (lane, node and then pressure): the state carried along with the indenter, 1/share times step."""
     s, i = wp.tid()
     if begun[s] == 0:
         return
@@ -121,31 +131,31 @@ def carry(
 
 
 @wp.kernel
-def move(slots: Slots, touched: int, fields: Fields):
-    """One thread per (slot, node and then pressure): what `slots.move` says.
+def move_fields(lanes: Lanes, touched: int, fields: Fields):
+    """One thread per (lane, node and then pressure): what `lanes.move` says.
 
     A solution at a recorded state is put aside, in case a later pass fails: in phases of the set `touched`.
     """
     s, i = wp.tid()
     count = fields.state_u.shape[1]
-    kind = slots.move[s]
-    keep = (touched >> slots.phase[s]) & 1
+    kind = lanes.move[s]
+    keep = (touched >> lanes.phase[s]) & 1
     if kind == 0 and keep == 0:
         return
     if i < count:
         x = fields.iterate_u[s, i]
-        if kind == TAKE:
+        if kind == TAKE_TRIAL:
             x = fields.trial_u[s, i]
-        elif kind == UNDO:
+        elif kind == RESTORE_RECORDED:
             x = fields.recorded_u[s, i]
-        elif kind == FALL_BACK:
+        elif kind == RESET:
             x = fields.state_u[s, i]
-            if slots.predicted[s] == 1:
-                x += slots.ratio[s] * (x - fields.previous_u[s, i])
+            if lanes.predicted[s] == 1:
+                x += lanes.ratio[s] * (x - fields.previous_u[s, i])
         elif kind == ACCEPT:
             fields.previous_u[s, i] = fields.state_u[s, i]
             fields.state_u[s, i] = x
-        elif kind == REVERT:
+        elif kind == ROLL_BACK:
             x = fields.previous_u[s, i]
             fields.state_u[s, i] = x
         fields.iterate_u[s, i] = x
@@ -154,18 +164,18 @@ def move(slots: Slots, touched: int, fields: Fields):
     else:
         k = i - count
         p = fields.iterate_p[s, k]
-        if kind == TAKE:
+        if kind == TAKE_TRIAL:
             p = fields.trial_p[s, k]
-        elif kind == UNDO:
+        elif kind == RESTORE_RECORDED:
             p = fields.recorded_p[s, k]
-        elif kind == FALL_BACK:
+        elif kind == RESET:
             p = fields.state_p[s, k]
-            if slots.predicted[s] == 1:
-                p += slots.ratio[s] * (p - fields.previous_p[s, k])
+            if lanes.predicted[s] == 1:
+                p += lanes.ratio[s] * (p - fields.previous_p[s, k])
         elif kind == ACCEPT:
             fields.previous_p[s, k] = fields.state_p[s, k]
             fields.state_p[s, k] = p
-        elif kind == REVERT:
+        elif kind == ROLL_BACK:
             p = fields.previous_p[s, k]
             fields.state_p[s, k] = p
         fields.iterate_p[s, k] = p
@@ -174,10 +184,10 @@ def move(slots: Slots, touched: int, fields: Fields):
 
 
 @wp.kernel
-def forget(slots: Slots, contact: ContactState):
-    """One thread per (slot, face, point): nothing touched before in a fresh slot, not even what touches at once."""
+def clear_contact(lanes: Lanes, contact: ContactState):
+    """One thread per (lane, face, point): nothing touched before in a fresh lane, not even what touches at once."""
     s, f, q = wp.tid()
-    if slots.phase[s] != FRESH:
+    if lanes.phase[s] != FRESH:
         return
     contact.normal[s, f, q] = wp.float64(0.0)
     contact.tangent[s, f, q] = wp.vec3d()
@@ -186,7 +196,7 @@ def forget(slots: Slots, contact: ContactState):
 
 
 @wp.struct
-class Kept:
+class SavedContact:
     """What a recorded state changes of contact and gets back: see `synth.simulate.contact`, (B, f, nq)."""
 
     normal: wp.array3d(dtype=wp.float64)
@@ -198,14 +208,14 @@ class Kept:
 
 
 @wp.kernel
-def keep(
+def save_contact(
     mask: wp.array(dtype=wp.int32),
     contact: ContactState,
     gap: wp.array3d(dtype=wp.float64),
     tangential: wp.array3d(dtype=wp.vec3d),
-    kept: Kept,
+    kept: SavedContact,
 ):
-    """One thread per (slot, face, point): put contact's memory and the last evaluation aside."""
+    """One thread per (lane, face, point): put contact's memory and the last evaluation aside."""
     s, f, q = wp.tid()
     if mask[s] == 0:
         return
@@ -218,17 +228,17 @@ def keep(
 
 
 @wp.kernel
-def recall(
+def restore_contact(
     mask: wp.array(dtype=wp.int32),
-    slots: Slots,
-    kept: Kept,
+    lanes: Lanes,
+    kept: SavedContact,
     contact: ContactState,
     gap: wp.array3d(dtype=wp.float64),
     tangential: wp.array3d(dtype=wp.vec3d),
 ):
-    """One thread per (slot, face, point): put it back, where it was put aside."""
+    """One thread per (lane, face, point): put it back, where it was put aside."""
     s, f, q = wp.tid()
-    if mask[s] == 0 or slots.kept[s] == 0:
+    if mask[s] == 0 or lanes.kept[s] == 0:
         return
     contact.normal[s, f, q] = kept.normal[s, f, q]
     contact.tangent[s, f, q] = kept.tangent[s, f, q]
@@ -239,30 +249,30 @@ def recall(
 
 
 @wp.kernel
-def remember_multipliers(
-    slots: Slots,
+def save_multipliers(
+    lanes: Lanes,
     contact: ContactState,
     normal: wp.array3d(dtype=wp.float64),
     tangent: wp.array3d(dtype=wp.vec3d),
 ):
-    """One thread per (slot, face, point): before a pass begins."""
+    """One thread per (lane, face, point): before a pass begins."""
     s, f, q = wp.tid()
-    if slots.share_now[s] == wp.float64(0.0):
+    if lanes.new_share[s] == wp.float64(0.0):
         return
     normal[s, f, q] = contact.normal[s, f, q]
     tangent[s, f, q] = contact.tangent[s, f, q]
 
 
 @wp.kernel
-def undo_multipliers(
-    slots: Slots,
+def restore_multipliers(
+    lanes: Lanes,
     normal: wp.array3d(dtype=wp.float64),
     tangent: wp.array3d(dtype=wp.vec3d),
     contact: ContactState,
 ):
-    """One thread per (slot, face, point): after a pass failed."""
+    """One thread per (lane, face, point): after a pass failed."""
     s, f, q = wp.tid()
-    if slots.move[s] != UNDO:
+    if lanes.move[s] != RESTORE_RECORDED:
         return
     contact.normal[s, f, q] = normal[s, f, q]
     contact.tangent[s, f, q] = tangent[s, f, q]

@@ -6,8 +6,8 @@ from pathlib import Path as FilePath
 
 from synth.mesh import PadMesh
 from synth.scene import Numerics, Scene
-from synth.simulate.batched.jobs import Job, untouched
 from synth.simulate.batched.pad import Pad, prepare
+from synth.simulate.batched.presses import Job, untouched
 from synth.simulate.batched.run import Run
 from synth.simulate.driver import STANDARD, Driver
 from synth.simulate.press import Press

@@ -7,7 +7,7 @@ import numpy as np
 from synth.mesh import PadMesh, check_mesh
 from synth.scene import Scene
 from synth.simulate.batched.gemm import Dense
-from synth.simulate.batched.reference import Reference, inverse, stiffness
+from synth.simulate.batched.preconditioner import Preconditioner, inverse, stiffness
 from synth.simulate.contact import Indenters
 from synth.simulate.indenter import RigidBody
 from synth.simulate.material import Material, pad_material
@@ -29,7 +29,7 @@ class Pad:
     space: Space
     material: Material
     free: np.ndarray
-    reference: Reference
+    preconditioner: Preconditioner
     device: str
 
 
@@ -49,8 +49,8 @@ def prepare(scene: Scene, mesh: PadMesh, device: str, products: Dense | None = N
     material = pad_material(scene.sensor.gel, mesh)
     space = function_space(mesh, ELEMENTS[scene.numerics.element]())
     system = System(space, material)
-    reference = Reference(inverse(stiffness(system, _away(scene)), device), device, products)
-    return Pad(mesh, space, material, system.free, reference, device)
+    preconditioner = Preconditioner(inverse(stiffness(system, _away(scene)), device), device, products)
+    return Pad(mesh, space, material, system.free, preconditioner, device)
 
 
 def _away(scene: Scene) -> Indenters:

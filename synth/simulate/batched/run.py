@@ -1,4 +1,4 @@
-"""Many trajectories through the slots of one machine: what the host does."""
+"""Many trajectories through the lanes of one solver: what the host does."""
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -10,21 +10,21 @@ import warp as wp
 
 from synth.arrays import FloatArray
 from synth.scene import Numerics
-from synth.simulate.batched import slots as phases
-from synth.simulate.batched.jobs import Ended, Job, body_tables, job_tables, trajectory
-from synth.simulate.batched.machine import INNER, Machine
+from synth.simulate.batched import lanes as phases
 from synth.simulate.batched.pad import Pad
+from synth.simulate.batched.presses import Ended, Job, body_tables, job_tables, trajectory
+from synth.simulate.batched.solver import INNER_ITERATIONS, BatchedSolver
 from synth.simulate.driver import Driver
 from synth.simulate.newton import MAX_ITERATIONS
 from synth.simulate.trajectory import Trajectory
 
-LOOK = 2
-"""Cycles between looks at which slots have ended: a slot waits for half of them on average, some 1 % of its time."""
+CYCLES_PER_POLL = 2
+"""Cycles between looks at which lanes have ended: a lane waits for half of them on average, some 1 % of its time."""
 
 
 @dataclass(frozen=True)
 class Fetched:
-    """A trajectory as it left its slot: number of its job, records, how it ended, and its share of the time."""
+    """A trajectory as it left its lane: number of its job, records, how it ended, and its share of the time."""
 
     number: int
     records: FloatArray
@@ -41,7 +41,7 @@ class Run:
         numerics: of all of them.
         driver: how Newton's method is led.
         frames: numbers of the states that are corrected, of each job; default all.
-        batch: number of slots.
+        batch: number of lanes.
         order: numbers of the jobs in which they begin, default each once.
         inner: Krylov iterations of a cycle.
     """
@@ -55,7 +55,7 @@ class Run:
         frames: Sequence[frozenset[int]] | None,
         batch: int,
         order: Iterable[int] | None = None,
-        inner: int = INNER,
+        inner: int = INNER_ITERATIONS,
     ) -> None:
         self._jobs, self._pad = jobs, pad
         self.table = job_tables(jobs, pad.mesh.size_mm, frames, pad.device)
@@ -66,7 +66,7 @@ class Run:
         settings.forcing, settings.closer = driver.forcing, driver.closer
         settings.limit, settings.correction_limit = MAX_ITERATIONS, driver.correction_iterations
         records = max(len(job.path.records()) for job in jobs)
-        self.machine = Machine(pad, batch, records, grid, settings, numerics.penalty, inner)
+        self.solver = BatchedSolver(pad, batch, records, grid, settings, numerics.penalty, inner)
         self._order = range(len(jobs)) if order is None else order
         self._graph: Any = None
         self.cycles = 0
@@ -76,9 +76,9 @@ class Run:
         """Run all jobs.
 
         Results are made and handed over while the device works on the next cycles. When it waited for that, a cycle of
-        1,024 slots took 22.8 ms on an H200, of which its kernels took 19.4.
+        1,024 lanes took 22.8 ms on an H200, of which its kernels took 19.4.
         """
-        machine, batch = self.machine, self.machine.batch
+        solver, batch = self.solver, self.solver.batch
         working = np.full(batch, -1)
         begun = np.zeros(batch)
         waiting = iter(self._order)
@@ -86,15 +86,15 @@ class Run:
         fetched: list[Fetched] = []
         while True:
             assignment = np.full(batch, -1)
-            for slot in empty:
-                working[slot] = assignment[slot] = next(waiting, -2)
+            for lane in empty:
+                working[lane] = assignment[lane] = next(waiting, -2)
             began = time.perf_counter()
             begun[empty] = self._spent
             if len(empty):
-                machine.fill(assignment, self.table, self._shapes, self._grids)
+                solver.fill(assignment, self.table, self._shapes, self._grids)
             ongoing = bool((working >= 0).any())
             if ongoing:
-                for _ in range(LOOK):
+                for _ in range(CYCLES_PER_POLL):
                     self.advance()
             self._spent += time.perf_counter() - began  # without what whoever takes the results does meanwhile
             for one in fetched:
@@ -103,7 +103,7 @@ class Run:
             if not ongoing:
                 return
             began = time.perf_counter()
-            empty = np.flatnonzero(machine.slots.phase.numpy() == phases.ENDED)
+            empty = np.flatnonzero(solver.lanes.phase.numpy() == phases.ENDED)
             self._spent += time.perf_counter() - began
             fetched = self._fetch(empty, working, begun)
 
@@ -112,25 +112,25 @@ class Run:
         self.cycles += 1
         device = wp.get_device(self._pad.device)
         if not device.is_cuda or self.cycles == 1:
-            self.machine.cycle(self.table)
+            self.solver.cycle(self.table)
             return
         if self._graph is None:
             # Relaxed: the garbage collector may free a renderer's memory in this thread meanwhile.
             mode = wp.CaptureMode.RELAXED
             with wp.ScopedCapture(device=device, force_module_load=False, capture_mode=mode) as capture:
-                self.machine.cycle(self.table)
+                self.solver.cycle(self.table)
             self._graph = capture.graph
         wp.capture_launch(self._graph)
 
-    def _fetch(self, slots: np.ndarray, working: np.ndarray, begun: np.ndarray) -> list[Fetched]:
-        """What ended slots recorded, before they are filled again."""
-        if not len(slots):
+    def _fetch(self, lanes: np.ndarray, working: np.ndarray, begun: np.ndarray) -> list[Fetched]:
+        """What ended lanes recorded, before they are filled again."""
+        if not len(lanes):
             return []
-        state = self.machine.slots
+        state = self.solver.lanes
         count, reason, at, target = (array.numpy() for array in (state.records, state.reason, state.at, state.target))
         found = []
-        for s in map(int, slots):
+        for s in map(int, lanes):
             ended = Ended(int(reason[s]), float(at[s]), float(target[s]))
-            seconds = float(self._spent - begun[s]) / self.machine.batch
-            found.append(Fetched(int(working[s]), self.machine.record_of(s, int(count[s])), ended, seconds))
+            seconds = float(self._spent - begun[s]) / self.solver.batch
+            found.append(Fetched(int(working[s]), self.solver.record_of(s, int(count[s])), ended, seconds))
         return found

@@ -7,8 +7,8 @@ import numpy as np
 import warp as wp
 
 from synth.arrays import FloatArray
-from synth.simulate.batched.slots import COMPLETE, NO_BALANCE, Jobs
-from synth.simulate.batched.sums import SCALARS
+from synth.simulate.batched.lanes import COMPLETE, NO_EQUILIBRIUM, Presses
+from synth.simulate.batched.reductions import SCALARS
 from synth.simulate.distance import shape_vector
 from synth.simulate.path import Path
 from synth.simulate.press import Press
@@ -47,7 +47,7 @@ class Ended:
 
 def job_tables(
     jobs: Sequence[Job], size_mm: tuple[float, float, float], frames: Sequence[frozenset[int]] | None, d: str
-) -> Jobs:
+) -> Presses:
     """All jobs on device d. frames: numbers of each job's states that are to be corrected, default all."""
     paths = [job.path for job in jobs]
     corners, ends = _stacked([path.corners for path in paths]), _stacked([path.ends for path in paths])
@@ -57,14 +57,14 @@ def job_tables(
         kind = {float(r): 2 if wanted is None or k in wanted else 1 for k, r in enumerate(path.records(), 1)}
         kinds.append(np.array([kind.get(float(stop), 0) for stop in path.waypoints()]))
     grids = _grids(paths)[1]
-    table = Jobs()
+    table = Presses()
     table.corners = warp_array(corners, wp.vec4d, d)
     table.ends = warp_array(ends, wp.float64, d)
     table.legs = warp_array(np.array([len(path.ends) for path in paths]), wp.int32, d)
     table.waypoints = warp_array(_stacked([path.waypoints() for path in paths]), wp.float64, d)
     table.kind_of = warp_array(_stacked(kinds), wp.int32, d)
     table.stops = warp_array(np.array([len(path.waypoints()) for path in paths]), wp.int32, d)
-    table.press = warp_array(np.array([path.press_mm for path in paths]), wp.float64, d)
+    table.press_end = warp_array(np.array([path.press_mm for path in paths]), wp.float64, d)
     deepest = [max(float(path.corners[:, 0].max()), 0.1) for path in paths]
     table.deepest = warp_array(np.array(deepest), wp.float64, d)
     table.over_pad = warp_array(np.array([path.is_over(size_mm) for path in paths]), wp.int32, d)
@@ -123,7 +123,7 @@ def untouched(job: Job, space: Space) -> Trajectory:
 
 
 def trajectory(job: Job, records: FloatArray, ended: Ended, seconds: float, space: Space) -> Trajectory:
-    """From the records (r, ...) that a slot wrote, see `synth.simulate.batched.sums.write`."""
+    """From the records (r, ...) that a lane wrote, see `synth.simulate.batched.reductions.write`."""
     states = [untouched(job, space).states[0]]
     for length, record in zip(job.path.records(), records, strict=False):
         states.append(_state(job, float(length), record, space))
@@ -133,7 +133,7 @@ def trajectory(job: Job, records: FloatArray, ended: Ended, seconds: float, spac
 def _reason(job: Job, ended: Ended) -> str:
     if ended.reason == COMPLETE:
         return ""
-    if ended.reason == NO_BALANCE:
+    if ended.reason == NO_EQUILIBRIUM:
         return no_balance(ended.target - ended.at, job.path.pose(ended.at))
     return no_contact(ended.target)
 

@@ -1,6 +1,6 @@
-"""The arrays of a batch: what its slots are at, their fields, contact, and the linear solver's vectors.
+"""The arrays of a batch: what its lanes are at, their fields, contact, and the linear solver's vectors.
 
-At 512 slots of an 11,500-unknown P2/P1 mesh they take some 7 GB, most of it contact's memory and the Krylov basis.
+At 512 lanes of an 11,500-unknown P2/P1 mesh they take some 7 GB, most of it contact's memory and the Krylov basis.
 """
 
 from collections.abc import Callable
@@ -8,11 +8,11 @@ from typing import Any
 
 import warp as wp
 
-from synth.simulate.batched.fields import Fields, Kept
-from synth.simulate.batched.krylov import Krylov, plain, shapes
+from synth.simulate.batched.fields import Fields, SavedContact
+from synth.simulate.batched.krylov import Krylov, flat, shapes
+from synth.simulate.batched.lanes import Lanes
 from synth.simulate.batched.product import STORED, STORED_YEOH
-from synth.simulate.batched.slots import Slots
-from synth.simulate.batched.sums import SCALARS
+from synth.simulate.batched.reductions import SCALARS
 from synth.simulate.contact import ContactState, Indenters
 from synth.simulate.distance import shape_vector
 from synth.simulate.space import Space
@@ -26,8 +26,8 @@ def _filled(struct: Any, shape: Callable[[str], tuple[int, ...]], device: str) -
     return made
 
 
-class Storage:
-    """Arrays of b slots on a space, see the module's docstring; zeros.
+class BatchArrays:
+    """Arrays of b lanes on a space, see the module's docstring; zeros.
 
     Args:
         space: the pad's.
@@ -56,10 +56,10 @@ class Storage:
 
         nodes, pressures, elements = len(space.points), space.pressures if mixed else 0, len(space.nodes)
         self.points = (batch, len(space.faces), len(space.element.face_weights))
-        self.slots: Slots = _filled(Slots, lambda _: (batch,), device)
+        self.lanes: Lanes = _filled(Lanes, lambda _: (batch,), device)
         self.fields: Fields = _filled(Fields, lambda n: (batch, nodes if n.endswith("_u") else pressures), device)
         self.contact: ContactState = _filled(ContactState, lambda _: self.points, device)
-        self.kept: Kept = _filled(Kept, lambda _: self.points, device)
+        self.kept: SavedContact = _filled(SavedContact, lambda _: self.points, device)
         self.force, self.volume = zeros((batch, nodes), wp.vec3d), zeros((batch, pressures), wp.float64)
         self.viscous = zeros((batch, nodes), wp.vec3d)
         self.jacobian = zeros((batch, elements), wp.float64)
@@ -78,10 +78,10 @@ class Storage:
         self.mask, self.begun, self.assignment = (zeros(batch, wp.int32) for _ in range(3))
         stored = (elements, len(space.element.weights), STORED_YEOH if yeoh else STORED, batch)
         self.stored = zeros(stored, wp.float32)
-        self.folding = zeros((elements, batch), wp.int32)
+        self.inverting = zeros((elements, batch), wp.int32)
         self.touching, self.touched = zeros(self.points[:2], wp.int32), zeros(self.points[:2], wp.int32)
         self.symmetric, self.remainder = zeros(self.points, wp.mat33d), zeros(self.points, wp.mat33d)
         self.stored_contact = zeros(self.points, wp.mat33f)
         sizes = shapes(rows, batch)
         self.krylov: Krylov = _filled(Krylov, lambda name: sizes[name], device)
-        self.step = plain(self.krylov.step)
+        self.step = flat(self.krylov.step)
