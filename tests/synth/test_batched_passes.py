@@ -4,12 +4,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from batches import presses_of
 from pads import brick, scene
 
 from synth.scene import Scene
 from synth.simulate import simulate, stepping
 from synth.simulate.batched import lanes as phases
-from synth.simulate.batched.many import jobs_of
 from synth.simulate.batched.pad import prepare
 from synth.simulate.batched.run import Run
 from synth.simulate.driver import Driver
@@ -30,8 +30,8 @@ def test_a_pass_that_goes_too_far_is_given_up() -> None:
     # Fails with `too_far` left out of `evaluate_trial`, with the distance from another place than the last solution,
     # with a reach that is not renewed for each pass, and with closer = 1.
     posed = sliding(BOX)
-    pad = prepare(posed, brick(counts=(4, 4, 2)), "cpu")
-    run = Run(jobs_of([posed], pad), pad, posed.numerics, STRICT, None, 1)
+    mesh = brick(counts=(4, 4, 2))
+    run = Run(presses_of([posed], mesh), prepare(posed, mesh, "cpu"), None, 1, STRICT)
     solver = run.solver
     lanes, fields = solver.lanes, solver._arrays.fields
     lost, solved, depths = [], 0, {}

@@ -70,7 +70,7 @@ def test_linear_solves_are_as_exact_as_newton_needs() -> None:
 
 
 @pytest.mark.parametrize(("device", "batch"), [("cpu", 3), pytest.param("cuda", 600, marks=pytest.mark.cuda)])
-def test_every_slot_solves_its_own_system(device: str, batch: int) -> None:
+def test_every_lane_solves_its_own_system(device: str, batch: int) -> None:
     """Unsymmetric matrices of 150 unknowns, preconditioned, to goals of their own, together and alone."""
     # Fails with a rotation of the other sense, or with a solve that goes on after it is done; on a GPU with a tile for
     # the right side of the substitution.

@@ -12,7 +12,7 @@ Few elements come near inversion, so that only their flags are stored: the rest 
 
 import warp as wp
 
-from synth.simulate.batched.product import RUNNING
+from synth.simulate.batched.krylov import RUNNING
 from synth.simulate.inversion_barrier import ONSET_JACOBIAN, BarrierTables, corner_gradient, shape_gradient
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})

@@ -19,17 +19,8 @@ from functools import cache
 
 import warp as wp
 
-from synth.simulate.batched.lanes import (
-    FAILED,
-    LINEAR,
-    PREDICTOR_LINEAR,
-    PREDICTOR_READY,
-    READY,
-    SEARCH,
-    START,
-    Lanes,
-    Settings,
-)
+from synth.simulate.batched import lanes as phases
+from synth.simulate.batched.lanes import Lanes, Settings
 from synth.simulate.batched.tf32 import rounded_four
 from synth.simulate.linear import GMRES_LIMIT, GMRES_TOLERANCE
 
@@ -40,15 +31,13 @@ LIMIT = wp.constant(GMRES_LIMIT)
 ZERO = wp.constant(wp.float32(0.0))
 ONE = wp.constant(wp.float32(1.0))
 MIN_GOAL = wp.constant(wp.float64(GMRES_TOLERANCE))
-"""Smallest goal of a linear solve (relative residual). `Settings.forcing` is the largest; where that is smaller still,
-it is the goal of every solve."""
+"""Smallest goal of a linear solve, unless `Settings.forcing`, the largest, is smaller still."""
 REDUCTION_FACTOR, SAFETY_FACTOR = wp.constant(wp.float64(0.9)), wp.constant(wp.float64(0.3))
 MAX_PER_THREAD = 84
-"""Numbers of a vector that one thread holds, at most: two vectors and what else there is fit its 255 registers."""
+"""Numbers of a vector that one thread holds, at most, so that two vectors fit its 255 registers."""
 SMALLEST_BLOCK, LARGEST_BLOCK = 64, 512
 RESIDENT_THREADS = 256
-"""Threads that are to run side by side on a multiprocessor, which has 65,536 registers. So few keep its memory busy,
-because each asks for a whole vector's share before it waits."""
+"""Threads that are to run side by side on a multiprocessor: so few keep its memory busy, and each has its registers."""
 
 
 @wp.struct
@@ -114,7 +103,7 @@ def block_size(unknowns: int) -> int:
 def padded(unknowns: int) -> int:
     """Rows of a vector: as many fours for each thread of a block, so that none has to ask where the vector ends.
 
-    A multiple of 64, which matrix products on a GPU want, too: those of other sizes took three times as long.
+    A multiple of 64, which matrix products on a GPU want, too.
     """
     share = 4 * block_size(unknowns)
     return -(-unknowns // share) * share
@@ -133,7 +122,7 @@ def begin_vectors(
     free: (rows,) number of the unknown, displacements of all nodes first, or -1 for rows that fill up.
     """
     s, i = wp.tid()
-    if lanes.phase[s] != READY and lanes.phase[s] != PREDICTOR_READY:
+    if lanes.phase[s] != phases.READY and lanes.phase[s] != phases.PREDICTOR_READY:
         return
     size = lanes.norm[s]
     moves = 3 * force.shape[1]
@@ -155,15 +144,11 @@ def begin_vectors(
 def _goal(lanes: Lanes, settings: Settings, s: int, before: wp.float64) -> wp.float64:
     """The second choice of Eisenstat & Walker (SIAM J. Sci. Comput. 17, 1996), and no more than Newton's method needs.
 
-    Ten pressed balls (8 x 6 x 2 elements, friction) took 38.3, 39.2 and 38.8 Newton iterations each with 1e-3 in every
-    solve, 1e-2 in every solve, and these; and 1045, 794 and 705 Krylov iterations.
-
-    before: norm of the last solve's right side. With these bounds their safeguard, which looks at the last goal, has
-    nothing to do.
+    before: norm of the last solve's right side. With these bounds their safeguard has nothing to do.
     """
     loosest = wp.float64(settings.forcing)
     tightest = wp.min(MIN_GOAL, loosest)
-    if lanes.phase[s] == PREDICTOR_READY:
+    if lanes.phase[s] == phases.PREDICTOR_READY:
         return tightest
     goal = loosest
     if lanes.iteration[s] > 0:
@@ -178,14 +163,14 @@ def begin_solve(lanes: Lanes, settings: Settings, krylov: Krylov):
     """One thread per lane."""
     s = wp.tid()
     phase = lanes.phase[s]
-    if phase != READY and phase != PREDICTOR_READY:
+    if phase != phases.READY and phase != phases.PREDICTOR_READY:
         return
     krylov.goal[s] = wp.float32(_goal(lanes, settings, s, krylov.size[s]))
     krylov.size[s] = lanes.norm[s]
     krylov.k[s] = 0
-    lanes.phase[s] = LINEAR
-    if phase == PREDICTOR_READY:
-        lanes.phase[s] = PREDICTOR_LINEAR
+    lanes.phase[s] = phases.LINEAR
+    if phase == phases.PREDICTOR_READY:
+        lanes.phase[s] = phases.PREDICTOR_LINEAR
     krylov.residual[s, 0] = ONE
     krylov.running[s] = RUNNING
     if lanes.norm[s] == wp.float64(0.0):
@@ -255,9 +240,8 @@ def arnoldi(rows: int) -> wp.Kernel:
 def solution(rows: int) -> wp.Kernel:
     """The kernel that finds the solution where a solve is done, and the lane's next phase; one block per lane.
 
-    Each thread substitutes backwards by itself. Warp keeps a tile of which single numbers are extracted in shared
-    memory, and changing it does not wait for threads that have yet to read: on a GPU with several blocks on a
-    multiprocessor some read too late, and their rows of the solution lacked a part.
+    Each thread substitutes backwards by itself, since threads do not wait for each other to read a tile before it
+    changes in shared memory.
     """
     count = wp.constant(rows // 4)
     coefficients = wp.types.vector(length=GMRES_LIMIT, dtype=wp.float32)
@@ -292,16 +276,16 @@ def solution(rows: int) -> wp.Kernel:
         wp.tile_store(krylov.step[s], total * wp.float32(krylov.size[s]), bounds_check=False)
         if thread > 0:
             return
-        if lanes.phase[s] == PREDICTOR_LINEAR:
-            lanes.phase[s] = START
+        if lanes.phase[s] == phases.PREDICTOR_LINEAR:
+            lanes.phase[s] = phases.START
             if finite == 1:
                 lanes.predicted[s] = 1
                 begun[s] = 1
         elif finite == 1:
-            lanes.phase[s] = SEARCH
+            lanes.phase[s] = phases.SEARCH
             lanes.scale[s] = wp.float64(1.0)
         else:
-            lanes.phase[s] = FAILED
+            lanes.phase[s] = phases.FAILED
 
     return finish
 

@@ -25,34 +25,16 @@ a trajectory. These are the phases, in the order in which a load step passes thr
 
 import warp as wp
 
-IDLE = wp.constant(0)
-FRESH = wp.constant(1)
-FIRST = wp.constant(2)
-BEGIN = wp.constant(3)
-PREDICTOR = wp.constant(4)
-PREDICTOR_READY = wp.constant(5)
-PREDICTOR_LINEAR = wp.constant(6)
-START = wp.constant(7)
-READY = wp.constant(8)
-LINEAR = wp.constant(9)
-SEARCH = wp.constant(10)
-SOLVED = wp.constant(11)
-FAILED = wp.constant(12)
-AT_RECORD = wp.constant(13)
-CORRECTING = wp.constant(14)
-RESTORED = wp.constant(15)
-RECORD = wp.constant(16)
-ADVANCE = wp.constant(17)
-ENDED = wp.constant(18)
-ROLLED_BACK = wp.constant(19)
+from synth.simulate.distance import shape_vector
 
-STEP, CORRECTION, POLISH = wp.constant(0), wp.constant(1), wp.constant(2)
+IDLE, FRESH, FIRST, BEGIN, PREDICTOR, PREDICTOR_READY, PREDICTOR_LINEAR, START, READY, LINEAR = range(10)
+SEARCH, SOLVED, FAILED, AT_RECORD, CORRECTING, RESTORED, RECORD, ADVANCE, ENDED, ROLLED_BACK = range(10, 20)
+STEP, CORRECTION, POLISH = range(3)
 """What Newton's method is solving: a load step, a pass at a recorded state, or that state to the full tolerance."""
-RELAXING, RELAXED = wp.constant(1), wp.constant(2)
-COMPLETE, NO_EQUILIBRIUM, NO_CONTACT = wp.constant(0), wp.constant(1), wp.constant(2)
+RELAXING, RELAXED = 1, 2
+COMPLETE, NO_EQUILIBRIUM, NO_CONTACT = range(3)
 """Why a trajectory ended."""
-TAKE_TRIAL, RESET, RESTORE_RECORDED, ACCEPT = wp.constant(1), wp.constant(2), wp.constant(3), wp.constant(4)
-ROLL_BACK = wp.constant(5)
+TAKE_TRIAL, RESET, RESTORE_RECORDED, ACCEPT, ROLL_BACK = range(1, 6)
 """Moves of a lane's fields: trial to iterate; state to iterate; recorded solution to iterate; iterate to state; the
 state before the last to state."""
 
@@ -79,8 +61,8 @@ class Lanes:
         trial_held_force: norm of the forces on held nodes; held_force: the least that a relaxation must leave of it.
         failures, done, share: of augmented-Lagrangian passes: those that failed, the shares of the others together, and
             the share of the next; new_share: of the one that begins. While relaxing, share is that of a step.
-        keep: whether contact's memory is put aside in this cycle; kept: whether it is put aside; anchor: whether points
-            that have come to touch are anchored for passes.
+        save: whether contact's memory is saved in this cycle; anchor: whether points that have come to touch are
+            anchored for passes.
         deepest: penetration at the last evaluation, mm.
         records: states recorded; reason: why it ended.
     """
@@ -120,8 +102,7 @@ class Lanes:
     done: wp.array(dtype=wp.float64)
     share: wp.array(dtype=wp.float64)
     new_share: wp.array(dtype=wp.float64)
-    keep: wp.array(dtype=wp.int32)
-    kept: wp.array(dtype=wp.int32)
+    save: wp.array(dtype=wp.int32)
     anchor: wp.array(dtype=wp.int32)
     deepest: wp.array(dtype=wp.float64)
     records: wp.array(dtype=wp.int32)
@@ -130,7 +111,7 @@ class Lanes:
 
 @wp.struct
 class Presses:
-    """Every trajectory's way and body, (N, ...).
+    """Every press's load path and body, (N, ...).
 
     Attributes:
         corners, ends, legs: `Path.corners` (N, K, 4), `Path.ends` (N, K) and their number.
@@ -138,7 +119,8 @@ class Presses:
         press_end: path length of the press, mm; deepest: largest depth, at least 0.1 mm.
         over_pad: whether the body comes down on the contact face.
         position, reach, rotation: of the body, as `Path.pose` uses them.
-        kind, grid, friction, sharpness: as `synth.simulate.contact.Indenters`; grid: number of its distance grid.
+        kind, shape, friction, sharpness: as `synth.simulate.contact.Indenters`.
+        grid, grids: number of its distance grid among the different ones (g, cells).
     """
 
     corners: wp.array2d(dtype=wp.vec4d)
@@ -154,7 +136,9 @@ class Presses:
     reach: wp.array(dtype=wp.float64)
     rotation: wp.array(dtype=wp.mat33d)
     kind: wp.array(dtype=wp.int32)
+    shape: wp.array(dtype=shape_vector)
     grid: wp.array(dtype=wp.int32)
+    grids: wp.array2d(dtype=wp.float64)
     friction: wp.array(dtype=wp.float64)
     sharpness: wp.array(dtype=wp.float64)
 

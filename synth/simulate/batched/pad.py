@@ -23,18 +23,27 @@ AWAY_MM = 1e3
 
 @dataclass(frozen=True)
 class Pad:
-    """See the module's docstring; free: (k,) numbers of the unknowns that are not held, displacements first."""
+    """The pad of a batch; free: (k,) numbers of the unknowns that are not held, displacements first."""
 
-    mesh: PadMesh
     space: Space
     material: Material
     free: np.ndarray
     preconditioner: Preconditioner
     device: str
 
+    @property
+    def mixed(self) -> bool:
+        """Whether there is a pressure field."""
+        return self.material.mixed and self.space.element.has_pressure
+
+    @property
+    def yeoh(self) -> bool:
+        """Whether the material stiffens."""
+        return bool(self.material.yeoh.any())
+
 
 def prepare(scene: Scene, mesh: PadMesh, device: str, products: Dense | None = None) -> Pad:
-    """The pad of a scene, for all scenes of the same mesh, materials and element.
+    """Prepare the pad of a scene, for all scenes of the same mesh, materials and element.
 
     Args:
         scene: any of them.
@@ -50,7 +59,7 @@ def prepare(scene: Scene, mesh: PadMesh, device: str, products: Dense | None = N
     space = function_space(mesh, ELEMENTS[scene.numerics.element]())
     system = System(space, material)
     preconditioner = Preconditioner(inverse(stiffness(system, _away(scene)), device), device, products)
-    return Pad(mesh, space, material, system.free, preconditioner, device)
+    return Pad(space, material, system.free, preconditioner, device)
 
 
 def _away(scene: Scene) -> Indenters:

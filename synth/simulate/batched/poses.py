@@ -1,4 +1,4 @@
-"""Where each lane's indenter is, and which, as Warp kernels: `synth.simulate.path` on the device."""
+"""Pose and body of each lane's indenter, as Warp kernels: `synth.simulate.path` on the device."""
 
 # Kernels are written in Warp's own language; their annotations only look like Python's.
 # mypy: disable-error-code="valid-type, no-untyped-def"
@@ -8,7 +8,6 @@ import warp as wp
 from synth.simulate import stepping
 from synth.simulate.batched.lanes import FRESH, IDLE, PREDICTOR, PREDICTOR_READY, Lanes, Presses, Settings
 from synth.simulate.contact import Indenters
-from synth.simulate.distance import shape_vector
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
@@ -34,7 +33,7 @@ def _corner(presses: Presses, j: int, s: wp.float64) -> wp.vec4d:
 
 @wp.kernel
 def place_indenters(lanes: Lanes, presses: Presses, indenters: Indenters):
-    """Each lane's indenter at its target; on the way to a carried first iterate near its last state, and stuck."""
+    """Each lane's indenter at its target; for a predictor near its last state, where it does not slip."""
     i = wp.tid()
     phase = lanes.phase[i]
     if phase == IDLE:
@@ -66,7 +65,6 @@ def place_indenters(lanes: Lanes, presses: Presses, indenters: Indenters):
 def fill_lanes(
     assignment: wp.array(dtype=wp.int32),
     presses: Presses,
-    shapes: wp.array(dtype=shape_vector),
     settings: Settings,
     lanes: Lanes,
     indenters: Indenters,
@@ -87,25 +85,22 @@ def fill_lanes(
     lanes.step[s] = settings.longest
     lanes.has_previous[s] = 0
     lanes.total[s] = 0
-    lanes.keep[s] = 0
-    lanes.kept[s] = 0
+    lanes.save[s] = 0
     lanes.records[s] = 0
     lanes.relaxing[s] = 0
     lanes.viscosity[s] = wp.float64(0.0)
     indenters.kind[s] = presses.kind[j]
-    indenters.shape[s] = shapes[j]
+    indenters.shape[s] = presses.shape[j]
     indenters.sharpness[s] = presses.sharpness[j]
 
 
 @wp.kernel
-def copy_grids(
-    assignment: wp.array(dtype=wp.int32), presses: Presses, grids: wp.array2d(dtype=wp.float64), indenters: Indenters
-):
-    """The distance grids of mesh indenters that begin; grids: (g, cells) in the order of the lane's grid."""
+def copy_grids(assignment: wp.array(dtype=wp.int32), presses: Presses, indenters: Indenters):
+    """One thread per (lane, cell): the distance grids of mesh indenters that begin."""
     s, i = wp.tid()
     j = assignment[s]
     if j < 0:
         return
     y = indenters.coefficients.shape[2]
     z = indenters.coefficients.shape[3]
-    indenters.coefficients[s, i // (y * z), (i // z) % y, i % z] = grids[presses.grid[j], i]
+    indenters.coefficients[s, i // (y * z), (i // z) % y, i % z] = presses.grids[presses.grid[j], i]

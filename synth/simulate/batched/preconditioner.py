@@ -1,9 +1,8 @@
 """The preconditioner of a whole batch: the inverse of the undeformed pad's stiffness, as one dense matrix.
 
-All lanes share a mesh, so that K_0^{-1} times all their vectors is one matrix product (a loaded P2/P1 tangent needs
-8 to 40 iterations to 1e-3 with it). The inverse is found in double precision, on CUDA by cuSOLVER, and applied in TF32
-(`synth.simulate.batched.tf32`): a preconditioner that changes a little with its argument, which flexible GMRES allows
-for.
+All lanes share a mesh, so that K_0^{-1} times all their vectors is one matrix product. The inverse is found in double
+precision, on CUDA by cuSOLVER, and applied in TF32 (`synth.simulate.batched.tf32`): a preconditioner that changes a
+little with its argument, which flexible GMRES allows for.
 """
 
 import ctypes
@@ -76,17 +75,9 @@ class Preconditioner:
         filled[: len(inverse), : len(inverse)] = inverse
         self.matrix = wp.array(filled, dtype=wp.float32, device=device)
         wp.launch(round_matrix, self.matrix.shape, inputs=[self.matrix], device=device)
-        self._dense = products or dense(device)
+        self.dense = products or dense(device)
 
     def apply(self, krylov: Krylov) -> None:
         """`preconditioned` = K_0^{-1} `current`, at least where a solve is running."""
         given, found = flat(krylov.current), flat(krylov.preconditioned)
-        self._dense.product(self.matrix, given, found, krylov.running)
-
-    def transpose_corrected(self, krylov: Krylov) -> None:
-        """`corrected` = `preconditioned`, lanes next to each other."""
-        self._dense.transpose(flat(krylov.preconditioned), krylov.corrected)
-
-    def transpose_image(self, krylov: Krylov) -> None:
-        """`product` = `image`, rows next to each other."""
-        self._dense.transpose(krylov.image, flat(krylov.product))
+        self.dense.product(self.matrix, given, found, krylov.running)

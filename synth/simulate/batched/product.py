@@ -22,15 +22,14 @@ from functools import cache
 
 import warp as wp
 
+from synth.simulate.batched.krylov import RUNNING
 from synth.simulate.bulk import Bulk, _deformation_gradient, _dilation, _slopes
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
-RUNNING = wp.constant(1)
-"""State of a lane's linear solve in which it takes part in products."""
 BLOCK, RESIDENT_BLOCKS = 128, 4
-"""Threads of a block of `bulk_product`, and blocks that a multiprocessor is to run side by side. Left to itself the
-compiler takes 168 registers a thread, with which only half as many can wait for memory at a time."""
+"""Threads of a block of `bulk_product`, and blocks that a multiprocessor is to run side by side: the compiler takes
+fewer registers then, so that more threads wait for memory at a time."""
 STORED = 16
 """Numbers stored per quadrature point: F^{-T} (9), w 2W', w (2W' - P J), w (P J + γ J²), w J (1 - γ/λ), w J γ_c D,
 w (1 - γ/λ)/λ, w γ_c D/λ."""

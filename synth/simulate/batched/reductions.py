@@ -5,18 +5,33 @@
 
 import warp as wp
 
-from synth.simulate.batched.fields import Fields
+from synth.simulate.batched.fields import Fields, node_step
 from synth.simulate.batched.lanes import CORRECTION, RELAXING, Lanes
 from synth.simulate.contact import Faces, Indenters, position
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 BLOCK = 256
-"""Threads that sum a lane's residual. One thread that adds up what others found would take 0.1 ms for 200 numbers."""
+"""Threads that sum a lane's residual."""
 SLIPS = wp.constant(wp.float64(1.0 - 1.0e-6))
 """Share of the friction limit from which a point counts as slipping, as in `System.slip_ratio`."""
 SCALARS = 12
 """Numbers of a record before its fields: force (3), moment (3), touching and slipping area, then those of `write`."""
+
+
+@wp.struct
+class SurfaceTables:
+    """How points of the coated face give tractions to its nodes.
+
+    Attributes:
+        hat: (nq, ns) functions by which a face's points share in its nodes.
+        number: (f, ns) of a face's nodes among the surface's, -1 on other faces.
+        area: (s,) of the nodes, mm².
+    """
+
+    hat: wp.array2d(dtype=wp.float64)
+    number: wp.array2d(dtype=wp.int32)
+    area: wp.array(dtype=wp.float64)
 
 
 @wp.kernel
@@ -85,8 +100,7 @@ def relaxation_errors(
     for i in range(thread, force.shape[1], wp.block_dim()):
         row = node_row[i]
         if row >= 0:
-            before = wp.vec3d(wp.float64(right[s, row]), wp.float64(right[s, row + 1]), wp.float64(right[s, row + 2]))
-            total += wp.length_sq(force[s, i] + viscous[s, i] + left * before)
+            total += wp.length_sq(force[s, i] + viscous[s, i] + left * node_step(right, s, row))
         else:
             borne += wp.length_sq(force[s, i])
     for i in range(thread, volume.shape[1], wp.block_dim()):
@@ -202,26 +216,21 @@ def write_tractions(
     mask: wp.array(dtype=wp.int32),
     lanes: Lanes,
     faces: Faces,
-    hat: wp.array2d(dtype=wp.float64),
-    number: wp.array2d(dtype=wp.int32),
-    area: wp.array(dtype=wp.float64),
+    surface: SurfaceTables,
     traction: wp.array3d(dtype=wp.vec3d),
     nodes: int,
     records: wp.array3d(dtype=wp.float64),
 ):
-    """One thread per (lane, face): adds its share to the tractions at the surface's nodes, see `System.forces`.
-
-    hat: (nq, ns); number: (f, ns) of a face's nodes in the surface, -1 on other faces; area: (s,) of the nodes' hats.
-    """
+    """One thread per (lane, face): adds its share to the tractions at the surface's nodes, see `System.forces`."""
     s, f = wp.tid()
-    if mask[s] == 0 or number[f, 0] < 0:
+    if mask[s] == 0 or surface.number[f, 0] < 0:
         return
     r = lanes.records[s]
-    for a in range(number.shape[1]):
+    for a in range(surface.number.shape[1]):
         share = wp.vec3d()
-        for q in range(hat.shape[0]):
-            share += (faces.weight[f, q] * hat[q, a]) * traction[s, f, q]
-        node = number[f, a]
+        for q in range(surface.hat.shape[0]):
+            share += (faces.weight[f, q] * surface.hat[q, a]) * traction[s, f, q]
+        node = surface.number[f, a]
         if wp.length_sq(share) > wp.float64(0.0):
             for k in range(3):
-                wp.atomic_add(records, s, r, 12 + 3 * nodes + 3 * node + k, share[k] / area[node])
+                wp.atomic_add(records, s, r, 12 + 3 * nodes + 3 * node + k, share[k] / surface.area[node])

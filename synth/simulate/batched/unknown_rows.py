@@ -10,6 +10,7 @@ import warp as wp
 
 from synth.arrays import FloatArray
 from synth.simulate.batched.product import SingleTables
+from synth.simulate.batched.reductions import SurfaceTables
 from synth.simulate.bulk import Bulk
 from synth.simulate.space import Space
 from synth.simulate.tables import warp_array
@@ -66,30 +67,15 @@ def number_rows(space: Space, free: np.ndarray, rows: int, bulk: Bulk, device: s
     )
 
 
-@dataclass(frozen=True)
-class SurfaceTables:
-    """How points of the coated face give tractions to its nodes, as in `System.forces`; Warp arrays.
-
-    Attributes:
-        hat: (nq, ns) functions by which a face's points share in its nodes.
-        number: (f, ns) of a face's nodes among the surface's, -1 on other faces.
-        area: (s,) of the nodes, mm².
-    """
-
-    hat: wp.array
-    number: wp.array
-    area: wp.array
-
-
 def surface_tables(space: Space, weight: FloatArray, device: str) -> SurfaceTables:
-    """Tables for face weights (f, nq) in mm²."""
-    element = space.element
+    """How points of the coated face, of weights (f, nq) in mm², give tractions to its nodes, as in `System.forces`."""
+    element, coated, tables = space.element, space.coated, SurfaceTables()
     hat = element.face_shape if element.order == 1 else broken_linear_face(element.face_barycentric)
-    coated = space.coated
     number = np.full(space.faces.shape, -1, dtype=np.int32)
     number[coated] = np.searchsorted(space.surface_nodes, space.faces[coated])
     area = np.zeros(len(space.surface_nodes))
     np.add.at(area, number[coated], np.einsum("fq,qa->fa", weight[coated], hat))
-    return SurfaceTables(
-        warp_array(hat, wp.float64, device), warp_array(number, wp.int32, device), warp_array(area, wp.float64, device)
-    )
+    tables.hat = warp_array(hat, wp.float64, device)
+    tables.number = warp_array(number, wp.int32, device)
+    tables.area = warp_array(area, wp.float64, device)
+    return tables
