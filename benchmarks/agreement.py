@@ -32,9 +32,10 @@ from synth.scene.sampling import draw, pairs_of
 from synth.scene.template import Template, load_scene
 from synth.simulate import Trajectory
 from synth.simulate.batched.gemm import Host
-from synth.simulate.batched.many import DRIVER, job_of, run_jobs
 from synth.simulate.batched.pad import Pad, prepare
+from synth.simulate.batched.run import OPTIONS, simulate_presses
 from synth.simulate.driver import Driver
+from synth.simulate.press import Press
 from synth.simulate.shared import shared_mesh
 from synth.simulate.solve import check_shared
 from synth.surface import GelSurface
@@ -99,17 +100,17 @@ class Noisy(Host):
 
 def together(drawn: Sequence[Drawn], pad: Pad, driver: Driver) -> list[Trajectory | str]:
     """All draws in one batch: each one's trajectory, or why its indenter cannot be built."""
-    jobs, which = [], []
+    presses, which = [], []
     found: dict[int, Trajectory | str] = {}
     for n, one in enumerate(drawn):
         try:
-            jobs.append(job_of(one.scene, pad, one.folder))
+            presses.append(Press.of(one.scene, one.mesh, one.folder))
         except InputError as error:
             found[n] = str(error)
             continue
         which.append(n)
     frames = [drawn[n].frames for n in which]
-    for k, trajectory in run_jobs(jobs, pad, drawn[0].scene.numerics, frames, LARGEST_BATCH, driver):
+    for k, trajectory in simulate_presses(presses, pad, frames, LARGEST_BATCH, driver):
         found[which[k]] = trajectory
     return [found[n] for n in range(len(drawn))]
 
@@ -169,7 +170,7 @@ def last_flow(one: Drawn, trajectory: Trajectory) -> FloatArray:
 
 def run(case: Row, drawn: Sequence[Drawn], processes: int) -> list[Row]:
     """A row for each draw."""
-    driver = replace(DRIVER, loose=case["loose"], forcing=case["forcing"])
+    driver = replace(OPTIONS, loose=case["loose"], forcing=case["forcing"])
     noisy = Noisy(case["noise"]) if case["noise"] else None
     on_device = together(drawn, prepare(drawn[0].scene, drawn[0].mesh, case["device"], noisy), driver)
     return list(map(compare, drawn, on_device, one_by_one(drawn, driver, processes)))
@@ -203,8 +204,8 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--trajectories", type=int, default=16)
     parser.add_argument("--seed", type=int, default=5)
     parser.add_argument("--processes", type=int, default=1, help="on the CPU")
-    parser.add_argument("--loose", type=float, default=DRIVER.loose, help="tolerance of intermediate steps")
-    parser.add_argument("--forcing", type=float, default=DRIVER.forcing, help="relative residual of linear solves")
+    parser.add_argument("--loose", type=float, default=OPTIONS.loose, help="tolerance of intermediate steps")
+    parser.add_argument("--forcing", type=float, default=OPTIONS.forcing, help="relative residual of linear solves")
     given = parser.parse_args(argv)
     if given.noise and given.device != "cpu":
         raise InputError(f"--noise with --device {given.device}: a GPU has its own; use cpu")

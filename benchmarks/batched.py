@@ -28,10 +28,10 @@ from synth.scene import Scene
 from synth.simulate import simulate
 from synth.simulate.batched.gemm import dense
 from synth.simulate.batched.krylov import RUNNING, WAITING
-from synth.simulate.batched.machine import INNER
-from synth.simulate.batched.many import DRIVER, jobs_of
 from synth.simulate.batched.pad import Pad, prepare
-from synth.simulate.batched.run import Run
+from synth.simulate.batched.run import OPTIONS, Run
+from synth.simulate.batched.solver import INNER_ITERATIONS
+from synth.simulate.press import Press
 from synth.simulate.resolution import graded_mesh
 
 PLACES_MM = (6.0, 4.0)
@@ -81,10 +81,11 @@ def rate(case: Row, device: str) -> Row:
     pad = pad_of(case["cells"], case["growth"], device)
     rng = np.random.default_rng(0)
     scenes = [random_ball(rng, case) for _ in range(max(DRAWS, case["batch"]))]
-    driver = replace(DRIVER, forcing=case["forcing"], loose=case["loose"], closer=case["closer"])
+    options = replace(OPTIONS, forcing=case["forcing"], loose=case["loose"], closer=case["closer"])
     order = cycle(range(len(scenes)))
-    run = Run(jobs_of(scenes, pad), pad, scenes[0].numerics, driver, None, case["batch"], order, case["inner"])
-    for _ in range(2):  # with all slots empty: compiles the kernels and captures the graph
+    presses = [Press.of(scene, pad.space.mesh) for scene in scenes]
+    run = Run(presses, pad, None, case["batch"], options, order, case["inner"])
+    for _ in range(2):  # with all lanes empty: compiles the kernels and captures the graph
         run.advance()
     began = time.perf_counter()
     ends: list[float] = []
@@ -114,20 +115,20 @@ def steady(ends: Sequence[float], batch: int) -> float:
 
 def profile(run: Run, device: str) -> Row:
     """What PROFILED_CYCLES cycles spend on each part of the solver, ms a cycle."""
-    krylov = run.machine.krylov
+    krylov = run.solver.krylov
     clock = Events(device) if wp.get_device(device).is_cuda else Clock()
     parts: dict[str, float] = {}
     used = 0
     for _ in range(PROFILED_CYCLES):
         before = np.where(krylov.running.numpy() == RUNNING, krylov.k.numpy(), 0)
         clock.start()
-        run.machine.watch = clock.mark
-        run.machine.cycle(run.table)
-        run.machine.watch = lambda part, kernel: None
+        run.solver.watch = clock.mark
+        run.solver.cycle()
+        run.solver.watch = lambda part, kernel: None
         for part, ms in clock.stop():
             parts[part] = parts.get(part, 0.0) + ms / PROFILED_CYCLES
         used += int(np.where(krylov.running.numpy() != WAITING, krylov.k.numpy() - before, 0).sum())
-    busy = used / (PROFILED_CYCLES * run.machine.inner * run.machine.batch)
+    busy = used / (PROFILED_CYCLES * run.solver.inner * run.solver.batch)
     return {"krylov_busy": round(busy, 3), **{f"ms_{part}": round(ms, 4) for part, ms in parts.items()}}
 
 
@@ -208,7 +209,7 @@ def reference_mesh(scene: Scene, across: int) -> PadMesh:
 def surface_error(case: Row) -> Row:
     """The error of one press on the case's mesh; the reference takes the scenes' own load steps."""
     scene, plain = (nth_ball(case["press"], {**case, "step_mm": step}) for step in (case["step_mm"], None))
-    found = simulate(scene, mesh_of(case), driver=replace(DRIVER, loose=case["loose"]))
+    found = simulate(scene, mesh_of(case), driver=replace(OPTIONS, loose=case["loose"]))
     truth = simulate(plain, reference_mesh(scene, case["reference_across"]))
     row: Row = {
         "radius_mm": round(scene.contact.indenter.model_dump()["radius_mm"], 3),
@@ -236,11 +237,11 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--drag", type=float, default=0.0, help="mm")
     parser.add_argument("--steps", type=int, default=1, help="recorded states")
     parser.add_argument("--radii", type=float, nargs=2, default=[2.0, 6.0], help="mm; of the balls")
-    parser.add_argument("--forcing", type=float, default=DRIVER.forcing, help="relative residual of linear solves")
-    parser.add_argument("--loose", type=float, default=DRIVER.loose, help="tolerance of intermediate steps")
-    parser.add_argument("--closer", type=float, default=DRIVER.closer, help="tolerance of corrections over the scene's")
+    parser.add_argument("--forcing", type=float, default=OPTIONS.forcing, help="relative residual of linear solves")
+    parser.add_argument("--loose", type=float, default=OPTIONS.loose, help="tolerance of intermediate steps")
+    parser.add_argument("--closer", type=float, default=OPTIONS.closer, help="tolerance of passes over the scene's")
     parser.add_argument("--step", type=float, help="mm; longest load step, default as in scenes")
-    parser.add_argument("--inner", type=int, default=INNER, help="Krylov iterations of a cycle")
+    parser.add_argument("--inner", type=int, default=INNER_ITERATIONS, help="Krylov iterations of a cycle")
     parser.add_argument("--errors", type=int, metavar="N", help="instead: surface errors of the first N presses")
     parser.add_argument("--across", type=int, default=10, help="elements across a contact in the reference")
     given = parser.parse_args(argv)

@@ -18,8 +18,7 @@ from synth.scene import Gel
 from synth.scene.sampling import SensorInstance, draw_sensor, sensor_of
 from synth.scene.template import Template
 from synth.simulate import Trajectory
-from synth.simulate.batched.jobs import Job
-from synth.simulate.batched.many import run_jobs
+from synth.simulate.batched import simulate_presses
 from synth.simulate.batched.pad import Pad, prepare
 from synth.simulate.press import Press
 
@@ -58,8 +57,7 @@ class Pads:
 
 def simulate_alone(attempt: Attempt, pad: Pad) -> Trajectory:
     """A batch of one press."""
-    numerics = attempt.press.scene.numerics
-    ((_, result),) = run_jobs([Job.of(attempt.press)], pad, numerics, [attempt.frames], 1)
+    ((_, result),) = simulate_presses([attempt.press], pad, [attempt.frames])
     return result
 
 
@@ -129,10 +127,9 @@ class _Simulation:
 
     def _run(self, members: list[tuple[Attempts, Attempt]]) -> Iterator[tuple[Attempts, Attempt, Trajectory]]:
         """Trajectories of one pad as they end."""
-        first = members[0][1].press
-        jobs = [Job.of(attempt.press) for _, attempt in members]
+        presses = [attempt.press for _, attempt in members]
         frames = [attempt.frames for _, attempt in members]
-        for number, result in run_jobs(jobs, self._pads.of(first), first.scene.numerics, frames, self._batch):
+        for number, result in simulate_presses(presses, self._pads.of(presses[0]), frames, self._batch):
             yield *members[number], result
 
 

@@ -13,14 +13,14 @@ import warp as wp
 from synth.arrays import BoolArray, FloatArray
 from synth.simulate.bulk import bulk_residual
 from synth.simulate.contact import ContactState, Indenters, contact_residual, contact_stiffness, contact_tangent
-from synth.simulate.fold import fold_residual, fold_tangent
+from synth.simulate.inversion_barrier import barrier_residual, barrier_tangent
 from synth.simulate.linear import Directions
 from synth.simulate.material import Material
 from synth.simulate.multipliers import augment, settle
 from synth.simulate.pattern import pattern_of
 from synth.simulate.space import Space
 from synth.simulate.stiffness import bulk_tangent, linearise, pressure_tangent, viscous_force
-from synth.simulate.tables import bulk_tables, face_tables, fold_tables, laplace_table, warp_array
+from synth.simulate.tables import barrier_tables, bulk_tables, face_tables, laplace_table, warp_array
 from synth.simulate.unknowns import Balance, Tangent, Unknowns
 from synth.surface import broken_linear_face
 
@@ -57,7 +57,7 @@ class System:
         self._bulk = bulk_tables(space, material, self.mixed, device)
         self._laplace = laplace_table(space, material, self._pattern.element_pairs, device)
         self._faces = face_tables(space, device)
-        self._lattice = fold_tables(space, material, device)
+        self._lattice = barrier_tables(space, material, device)
         self._pairs = warp_array(self._pattern.element_pairs, wp.vec2i, device)
         self._face_pairs = warp_array(self._pattern.face_pairs, wp.vec2i, device)
         slots = (self._pattern.block_slot, self._pattern.coupling_slot, self._pattern.pressure_slot)
@@ -129,7 +129,7 @@ class System:
         )
         if self._lattice is not None:
             inputs, outputs = [u, mask, self._lattice], [force, jacobian]
-            wp.launch(fold_residual, (self.batch, count), inputs=inputs, outputs=outputs, device=self.device)
+            wp.launch(barrier_residual, (self.batch, count), inputs=inputs, outputs=outputs, device=self.device)
         wp.launch(
             contact_residual,
             self.gap.shape[:2],
@@ -172,7 +172,7 @@ class System:
         )
         if self._lattice is not None:
             inputs = [u, mask, self._lattice, self._pairs, self._block_slot]
-            wp.launch(fold_tangent, elements, inputs=inputs, outputs=[self._values], device=d)
+            wp.launch(barrier_tangent, elements, inputs=inputs, outputs=[self._values], device=d)
         if self.mixed:
             wp.launch(
                 pressure_tangent,

@@ -9,7 +9,7 @@ from synth.simulate.bulk import Bulk
 from synth.simulate.contact import Faces, Indenters
 from synth.simulate.distance import shape_vector
 from synth.simulate.element import EDGES, barycentric_gradients
-from synth.simulate.fold import LATTICE, Lattice
+from synth.simulate.inversion_barrier import SAMPLE_DEGREE, BarrierTables
 from synth.simulate.material import Material
 from synth.simulate.path import Path
 from synth.simulate.space import Space
@@ -52,8 +52,8 @@ def laplace_table(space: Space, material: Material, pairs: np.ndarray, d: str) -
     return warp_array(metric.reshape(len(metric), 16) @ form.T, wp.float64, d)
 
 
-def fold_tables(space: Space, material: Material, d: str) -> "Lattice | None":
-    """Where `synth.simulate.fold` looks, on Warp device d; None for linear elements, which cannot fold."""
+def barrier_tables(space: Space, material: Material, d: str) -> "BarrierTables | None":
+    """Where `synth.simulate.inversion_barrier` looks, on Warp device d; None for linear elements, which cannot fold."""
     if space.element.order == 1:
         return None
     share, along = np.zeros((4, 10)), np.full((4, 10), -1)
@@ -63,17 +63,17 @@ def fold_tables(space: Space, material: Material, d: str) -> "Lattice | None":
         for k, edge in enumerate(EDGES):
             if i in edge:
                 share[i, 4 + k], along[i, 4 + k] = 4.0, sum(edge) - i
-    n = LATTICE
+    n = SAMPLE_DEGREE
     steps = [(i, j, k) for i in range(n + 1) for j in range(n + 1 - i) for k in range(n + 1 - i - j)]
     at = np.array([(i, j, k, n - i - j - k) for i, j, k in steps]) / n
-    lattice = Lattice()
-    lattice.nodes = warp_array(space.nodes, wp.int32, d)
-    lattice.at = warp_array(at, wp.vec4d, d)
-    lattice.share = warp_array(share, wp.float64, d)
-    lattice.along = warp_array(along, wp.int32, d)
-    lattice.gradient = warp_array(barycentric_gradients(space.mesh.points, space.mesh.tets), wp.vec3d, d)
-    lattice.weight = warp_array(material.shear * space.mesh.volumes / len(at), wp.float64, d)
-    return lattice
+    barrier = BarrierTables()
+    barrier.nodes = warp_array(space.nodes, wp.int32, d)
+    barrier.at = warp_array(at, wp.vec4d, d)
+    barrier.share = warp_array(share, wp.float64, d)
+    barrier.along = warp_array(along, wp.int32, d)
+    barrier.gradient = warp_array(barycentric_gradients(space.mesh.points, space.mesh.tets), wp.vec3d, d)
+    barrier.weight = warp_array(material.shear * space.mesh.volumes / len(at), wp.float64, d)
+    return barrier
 
 
 def face_tables(space: Space, d: str) -> Faces:

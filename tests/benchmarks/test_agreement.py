@@ -16,8 +16,8 @@ from benchmarks.rows import Row, read
 from synth.scene import MeshIndenter, Scene
 from synth.scene.template import load_scene
 from synth.simulate import Trajectory
-from synth.simulate.batched.many import DRIVER
 from synth.simulate.batched.pad import prepare
+from synth.simulate.batched.run import OPTIONS
 
 TINY = ["numerics.element=p1p1", "sensor.camera.width=32", "sensor.camera.height=24", "motion.steps=2"]
 
@@ -47,7 +47,7 @@ def test_noise_has_the_size_that_was_asked_for() -> None:
 
 
 def test_the_cpu_agrees_with_itself(tmp_path: Path) -> None:
-    """A trajectory's bits depend neither on its neighbours nor on its slot."""
+    """A trajectory's bits depend neither on its neighbours nor on its lane."""
     # Fails with a device that has noise.
     found = run(tmp_path)
     assert (found["draws"], found["end alike"], found["complete"], found["within 1e-6"]) == (4, 4, 4, 4)
@@ -74,13 +74,13 @@ def test_outcomes_are_counted() -> None:
     # Fails with trajectories that are compared whatever their outcome.
     drawn = drawn_of(load_scene("gelsight_mini", ['numerics.solver="batched"', "numerics.cells=[4,4,1]", *TINY]), 3, 5)
     drawn[2] = replace(drawn[2], folder=Path("nowhere"), scene=_of_file(drawn[2].scene))
-    first = together(drawn, prepare(drawn[0].scene, drawn[0].mesh, "cpu"), DRIVER)
+    first = together(drawn, prepare(drawn[0].scene, drawn[0].mesh, "cpu"), OPTIONS)
     complete, other, unbuilt = first
     assert isinstance(complete, Trajectory)
     assert isinstance(other, Trajectory)
     assert complete.status == other.status == "complete"
     assert "nothing.stl" in str(unbuilt)
-    second = [replace(complete, status="partial", reason="lost"), *one_by_one(drawn[1:], DRIVER, 2)]
+    second = [replace(complete, status="partial", reason="lost"), *one_by_one(drawn[1:], OPTIONS, 2)]
     rows = list(map(compare, drawn, first, second))
     assert [(row["same"], row["status"], row["cpu_status"]) for row in rows] == [
         (False, "complete", "partial"),

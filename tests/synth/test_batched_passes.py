@@ -4,12 +4,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from batches import presses_of
 from pads import brick, scene
 
 from synth.scene import Scene
 from synth.simulate import simulate, stepping
-from synth.simulate.batched import slots as phases
-from synth.simulate.batched.many import jobs_of
+from synth.simulate.batched import lanes as phases
 from synth.simulate.batched.pad import prepare
 from synth.simulate.batched.run import Run
 from synth.simulate.driver import Driver
@@ -27,34 +27,34 @@ def sliding(body: dict[str, Any]) -> Scene:
 
 def test_a_pass_that_goes_too_far_is_given_up() -> None:
     """As soon as it does; what is taken has stayed within reach, and the other passes take penetration away."""
-    # Fails with `too_far` left out of `judge`, with the distance from another place than the last solution, with a
-    # reach that is not renewed for each pass, and with closer = 1.
+    # Fails with `too_far` left out of `evaluate_trial`, with the distance from another place than the last solution,
+    # with a reach that is not renewed for each pass, and with closer = 1.
     posed = sliding(BOX)
-    pad = prepare(posed, brick(counts=(4, 4, 2)), "cpu")
-    run = Run(jobs_of([posed], pad), pad, posed.numerics, STRICT, None, 1)
-    machine = run.machine
-    slots, fields = machine.slots, machine._at.fields
+    mesh = brick(counts=(4, 4, 2))
+    run = Run(presses_of([posed], mesh), prepare(posed, mesh, "cpu"), None, 1, STRICT)
+    solver = run.solver
+    lanes, fields = solver.lanes, solver._arrays.fields
     lost, solved, depths = [], 0, {}
 
     def look(part: str, kernel: str) -> None:
         nonlocal solved
-        if kernel != "judge" or slots.stage.numpy()[0] != phases.PASS:
+        if kernel != "evaluate_trial" or lanes.stage.numpy()[0] != phases.CORRECTION:
             return
-        phase, reach = slots.phase.numpy()[0], slots.most_moved.numpy()[0]
+        phase, reach = lanes.phase.numpy()[0], lanes.most_moved.numpy()[0]
         moved = np.linalg.norm(fields.trial_u.numpy()[0] - fields.recorded_u.numpy()[0], axis=1).max()
-        if phase in (phases.READY, phases.SOLVED, phases.LOST):
-            assert slots.trial_moved.numpy()[0] == pytest.approx(moved, abs=1e-15)
+        if phase in (phases.READY, phases.SOLVED, phases.FAILED):
+            assert lanes.trial_moved.numpy()[0] == pytest.approx(moved, abs=1e-15)
         if phase in (phases.READY, phases.SOLVED):
             assert moved <= reach
-            assert reach == pytest.approx(stepping.REACH * slots.deepest.numpy()[0], rel=1e-12)
-            depths.setdefault(slots.target.numpy()[0], slots.deepest.numpy()[0])
+            assert reach == pytest.approx(stepping.REACH * lanes.deepest.numpy()[0], rel=1e-12)
+            depths.setdefault(lanes.target.numpy()[0], lanes.deepest.numpy()[0])
         if phase == phases.SOLVED:
             solved += 1
-            assert slots.relative.numpy()[0] <= 0.1 * posed.numerics.tolerance
-        if phase == phases.LOST:
-            lost.append((slots.iteration.numpy()[0], moved / reach))
+            assert lanes.relative.numpy()[0] <= 0.1 * posed.numerics.tolerance
+        if phase == phases.FAILED:
+            lost.append((lanes.iteration.numpy()[0], moved / reach))
 
-    machine.watch = look
+    solver.watch = look
     ((_, result),) = run
     assert result.status == "complete"
     assert any(iteration < STRICT.correction_iterations and share > 1 for iteration, share in lost)

@@ -4,14 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from batches import presses_of, simulate_scenes
 from pads import SPHERE, brick, same, scene
 
 from synth.scene import Scene
 from synth.simulate import Trajectory
+from synth.simulate.batched import lanes as phases
 from synth.simulate.batched import run as running
-from synth.simulate.batched import simulate_many
-from synth.simulate.batched import slots as phases
-from synth.simulate.batched.many import jobs_of
 from synth.simulate.batched.pad import prepare
 from synth.simulate.driver import Driver
 
@@ -32,8 +31,7 @@ def pressed(penalty: float = 50.0, depth_mm: float = 0.6, steps: int = 2) -> Sce
 
 def led(posed: Scene, driver: Driver, frames: frozenset[int] | None = None) -> Trajectory:
     """The only one of its batch."""
-    ((_, result),) = simulate_many([posed], MESH, device="cpu", driver=driver, frames=frames)
-    return result
+    return simulate_scenes([posed], MESH, options=driver, frames=None if frames is None else [frames])[0]
 
 
 @pytest.mark.parametrize("penalty", [50.0, 3000.0])
@@ -66,9 +64,10 @@ def test_a_state_without_balance_to_the_full_tolerance_leaves_no_trace(monkeypat
     monkeypatch.setattr(running, "MAX_ITERATIONS", 1)
     posed = pressed(5000.0, depth_mm=0.2, steps=1)
     pad = prepare(posed, MESH, "cpu")
-    run = running.Run(jobs_of([posed], pad), pad, posed.numerics, Driver(loose=0.3), None, 1)
-    machine = run.machine
-    fields, contact, phase, stage = machine._at.fields, machine._at.contact, machine.slots.phase, machine.slots.stage
+    run = running.Run(presses_of([posed], MESH), pad, None, 1, Driver(loose=0.3))
+    solver = run.solver
+    fields, contact = solver._arrays.fields, solver._arrays.contact
+    phase, stage = solver.lanes.phase, solver.lanes.stage
     begun: list[np.ndarray] = []
     rejected: list[np.ndarray] = []
     changed: list[bool] = []
@@ -78,16 +77,16 @@ def test_a_state_without_balance_to_the_full_tolerance_leaves_no_trace(monkeypat
         return [array.numpy().copy() for array in arrays]
 
     def look(part: str, kernel: str) -> None:
-        if kernel == "control" and (phase.numpy()[0], stage.numpy()[0]) == (phases.START, phases.STEP):
+        if kernel == "choose_target" and (phase.numpy()[0], stage.numpy()[0]) == (phases.START, phases.STEP):
             begun[:] = memory()
-        elif kernel == "conclude" and phase.numpy()[0] == phases.BACK:
+        elif kernel == "finish_solve" and phase.numpy()[0] == phases.ROLLED_BACK:
             rejected[:] = memory()
-        elif kernel == "recorded" and rejected:
+        elif kernel == "finish_record" and rejected:
             changed.append(any((a != b).any() for a, b in zip(rejected, begun, strict=True)))
             assert all((a == b).all() for a, b in zip(memory(), begun, strict=True))
             rejected.clear()
 
-    machine.watch = look
+    solver.watch = look
     ((_, result),) = run
     assert changed
     assert all(changed)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from batches import simulate_scenes
 from bonded_layer import ball
 from pads import brick
 
@@ -14,7 +15,6 @@ from synth.errors import InputError
 from synth.mesh import Focus, domed
 from synth.scene import Numerics, Scene
 from synth.simulate import Trajectory, simulate
-from synth.simulate.batched import simulate_many
 from synth.simulate.resolution import graded_mesh
 
 BALL = {"shape": "sphere", "radius_mm": 3.0}
@@ -109,12 +109,12 @@ def test_mesh_and_scene_must_be_of_one_dome() -> None:
 
 
 def test_many_at_once_press_the_dome_as_one_does() -> None:
-    """Fails with `face_mm` left out of `synth.simulate.batched.jobs`: the indenter stays 0.36 mm higher."""
+    """Fails with `face_mm` left out of `synth.simulate.batched.presses`: the indenter stays 0.36 mm higher."""
     drawn = scene(8.0, (8.0, 6.0, 4.0), BALL, position_mm=(2.0, -1.2), depth_mm=0.3, steps=2, friction=0.4)
     drawn = drawn.model_copy(update={"numerics": Numerics(element="p1p1", tolerance=1e-9)})
     mesh = domed(brick(counts=(4, 4, 2)), 8.0)
     alone = simulate(drawn, mesh)
-    ((_, result),) = simulate_many([drawn], mesh, None, "cpu", batch=1)
+    (result,) = simulate_scenes([drawn], mesh)
     assert alone.status == result.status == "complete"
     assert len(alone.states) == len(result.states) == 3
     for one, other in zip(alone.states, result.states, strict=True):

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from batches import simulate_scenes
 from pads import brick, gentle
 from processes_of import HAS_PROC, alive, descendants, lines, start, wait_for
 from tiny_scene import TEXT, fingerprint, job_context, write_tiny
@@ -32,7 +33,6 @@ from synth.render.variant import Variant
 from synth.scene import Gel, Numerics, Scene
 from synth.scene.sampling import MAX_DRAWS, draw, draw_sensor, sensor_of
 from synth.scene.template import Template, load_scene
-from synth.simulate.batched import simulate_many
 from synth.simulate.mesh_rule import MeshRule
 from synth.simulate.shared import accuracy, shared_mesh, spacing_mm
 from synth.simulate.solve import simulate_press
@@ -186,14 +186,13 @@ def test_frames_of_each_job_are_its_own() -> None:
     # Fails with the first job's frames for all.
     scenes = [gentle(motion={"depth_mm": 0.4, "steps": 3}), gentle(motion={"depth_mm": 0.5, "steps": 3})]
     mesh, wanted = brick(counts=(4, 4, 2)), [frozenset({1}), frozenset({3})]
-    every = dict(simulate_many(scenes, mesh, device="cpu"))
-    some = dict(simulate_many(scenes, mesh, device="cpu", frames=wanted))
+    every, some = simulate_scenes(scenes, mesh), simulate_scenes(scenes, mesh, frames=wanted)
     for number, frames in enumerate(wanted):
         for k in (1, 2, 3):
             one, other = every[number].states[k], some[number].states[k]
             assert (one.displacement == other.displacement).all() == (k in frames)
-    with pytest.raises(ValueError, match="1 sets of frames for 2 jobs"):
-        list(simulate_many(scenes, mesh, device="cpu", frames=wanted[:1]))
+    with pytest.raises(ValueError, match="1 sets of frames for 2 presses"):
+        simulate_scenes(scenes, mesh, frames=wanted[:1])
 
 
 @pytest.mark.parametrize(

@@ -9,19 +9,20 @@ from typing import Any
 import numpy as np
 import pytest
 import warp as wp
+from batches import presses_of, simulate_scenes
 from pads import ELEMENT, MIXED, PUNCH, SPHERE, brick, dense, indenters, same, scene
 
 from synth.errors import InputError
 from synth.mesh import PadMesh
 from synth.scene import Scene
 from synth.simulate import Trajectory
-from synth.simulate.batched import simulate_many
-from synth.simulate.batched.folding import find_folding, fold_product
+from synth.simulate.batched import simulate_presses
+from synth.simulate.batched.inversion_barrier import barrier_product, find_inverting
 from synth.simulate.batched.krylov import padded
-from synth.simulate.batched.many import DRIVER, jobs_of
-from synth.simulate.batched.numbering import number_rows
 from synth.simulate.batched.pad import prepare
-from synth.simulate.batched.product import STORED_YEOH, bulk_product, contact_product, store, store_contact
+from synth.simulate.batched.product import STORED_YEOH, bulk_product, contact_product, store_bulk, store_contact
+from synth.simulate.batched.run import OPTIONS
+from synth.simulate.batched.unknown_rows import number_rows
 from synth.simulate.contact import contact_stiffness
 from synth.simulate.element import Element
 from synth.simulate.material import pad_material, uniform
@@ -29,7 +30,7 @@ from synth.simulate.path import path_of
 from synth.simulate.space import function_space
 from synth.simulate.stepping import Stepper
 from synth.simulate.system import System, Unknowns
-from synth.simulate.tables import bulk_tables, face_tables, fold_tables, warp_array
+from synth.simulate.tables import barrier_tables, bulk_tables, face_tables, warp_array
 
 BAR = {"shape": "cylinder", "radius_mm": 1.5, "length_mm": 4.0, "fillet_mm": 0.6, "rotation_deg": [90, 0, 30]}
 BOX = {"shape": "box", "size_mm": [3.0, 2.5, 4.0], "fillet_mm": 0.6, "rotation_deg": [0, 0, 20]}
@@ -65,14 +66,7 @@ def alone(posed: Scene, mesh: PadMesh, folder: FilePath | None = None) -> Trajec
     space = function_space(mesh, ELEMENT[posed.numerics.element]())
     body = System(space, pad_material(posed.sensor.gel, mesh), penalty=posed.numerics.penalty)
     path = path_of(posed, folder, mesh.spacing_mm / (2 * space.element.order))
-    return Stepper(body, [path], [posed.contact.friction], posed.numerics, [0.2], DRIVER).run()[0]
-
-
-def together(scenes: list[Scene], mesh: PadMesh, batch: int, folder: FilePath | None = None) -> list[Trajectory]:
-    """In the order of the scenes."""
-    found = dict(simulate_many(scenes, mesh, folder, "cpu", batch=batch))
-    assert sorted(found) == list(range(len(scenes)))
-    return [found[i] for i in range(len(scenes))]
+    return Stepper(body, [path], [posed.contact.friction], posed.numerics, [0.2], OPTIONS).run()[0]
 
 
 def apart(a: Trajectory, b: Trajectory) -> float:
@@ -93,30 +87,30 @@ def apart(a: Trajectory, b: Trajectory) -> float:
 def test_many_at_once_agree_with_one_by_one(element: str) -> None:
     # Fails with tangential multipliers that are not put back after a record.
     scenes = draws(element) if element == "p1p1" else [draws(element)[i] for i in (1, 3, 6)]
-    for posed, result in zip(scenes, together(scenes, MESH, 2), strict=True):
+    for posed, result in zip(scenes, simulate_scenes(scenes, MESH, batch=2), strict=True):
         assert apart(alone(posed, MESH), result) < AGREEMENT
 
 
 def test_company_and_order_change_no_bit() -> None:
-    """Slots are refilled, and what ran in one before leaves no trace."""
-    # Fails with a state that is not cleared when a slot is filled again.
+    """Lanes are refilled, and what ran in one before leaves no trace."""
+    # Fails with a state that is not cleared when a lane is filled again.
     scenes = draws("p1p1")
-    given = together(scenes, MESH, 3)
+    given = simulate_scenes(scenes, MESH, batch=3)
     order = [6, 2, 7, 0, 3, 1, 5, 4]
-    for i, result in zip(order, together([scenes[i] for i in order], MESH, 2), strict=True):
+    for i, result in zip(order, simulate_scenes([scenes[i] for i in order], MESH, batch=2), strict=True):
         assert same(result, given[i])
 
 
 def test_a_lost_sample_does_not_spoil_the_others() -> None:
     """A ring of thin wire pressed through four fifths of a pad whose faces are three times as wide as the wire."""
-    # Fails with a trial that asks slot 0 for its phase.
+    # Fails with a trial that asks lane 0 for its phase.
     numerics = {"edge_length_mm": 0.1, "max_step_mm": 0.5}
     lost = scene(indenter=WIRE, friction=0.2, motion={"depth_mm": 3.3, "steps": 8}, numerics=numerics)
     good = scene(friction=0.4, motion={"depth_mm": 0.4}, numerics=numerics)
-    first, second = together([lost, good], MESH, 2)
+    first, second = simulate_scenes([lost, good], MESH)
     for found in (first, alone(lost, MESH)):  # how far each gets on a hopeless way is chance
         assert (found.status, "no balance" in found.reason) == ("partial", True)
-    assert same(second, together([good], MESH, 1)[0])
+    assert same(second, simulate_scenes([good], MESH)[0])
 
 
 def test_an_indenter_that_finds_no_point_is_told_apart() -> None:
@@ -125,14 +119,14 @@ def test_an_indenter_that_finds_no_point_is_told_apart() -> None:
     needle = {"shape": "sphere", "radius_mm": 0.1}
     posed = scene(size, indenter=needle, motion={"depth_mm": 0.5, "steps": 2, "position_mm": (0.3, 0.2)})
     mesh = brick(size, (6, 5, 2))
-    one, other = alone(posed, mesh), together([posed], mesh, 1)[0]
+    one, other = alone(posed, mesh), simulate_scenes([posed], mesh)[0]
     assert "touches no contact point" in other.reason
     assert apart(one, other) < AGREEMENT
 
 
 def test_mesh_indenters_of_unequal_grids(tmp_path: FilePath) -> None:
-    """They touch at once, by the error of their grids, so that a slot that remembers another trajectory would show."""
-    # Fails with the first grid in every slot, or with anchors that are not forgotten when a slot is filled again.
+    """They touch at once, by the error of their grids, so that a lane that remembers another trajectory would show."""
+    # Fails with the first grid in every lane, or with anchors that are not forgotten when a lane is filled again.
     import pyvista as pv
 
     pv.Icosphere(radius=2.5, nsub=3).save(tmp_path / "large.stl")
@@ -146,7 +140,7 @@ def test_mesh_indenters_of_unequal_grids(tmp_path: FilePath) -> None:
         scene(indenter=body, friction=0.4, motion=motion, numerics={"tolerance": TOLERANCE})
         for body in (bodies[0], bodies[1], bodies[0])
     ]
-    found = together(scenes, MESH, 1, tmp_path)
+    found = simulate_scenes(scenes, MESH, tmp_path, batch=1)
     for posed, result in zip(scenes[:2], found, strict=False):
         assert apart(alone(posed, MESH, tmp_path), result) < AGREEMENT
     assert same(found[0], found[2])
@@ -159,7 +153,7 @@ def test_mesh_indenters_of_unequal_grids(tmp_path: FilePath) -> None:
 def test_the_product_is_the_tangent_times_the_vector(
     element: str, poisson_ratio: float, stiffening: tuple[float, float]
 ) -> None:
-    """At a random state: contact that sticks and slips, pressures that hold dilation, elements near folding."""
+    """At a random state: contact that sticks and slips, pressures that hold dilation, elements near inverting."""
     # Fails without the unsymmetric remainder, the mean pressure's part of the coupling, or t² in the fold's barrier.
     rng = np.random.default_rng(1)
     mesh = brick((4.0, 3.0, 2.0), (3, 2, 2))
@@ -186,18 +180,18 @@ def test_the_product_is_the_tangent_times_the_vector(
     vector, image = warp_array(x, wp.float32, "cpu"), wp.zeros((rows, 1), dtype=wp.float32, device="cpu")
     displacement, pressure = warp_array(state.u, wp.vec3d, "cpu"), warp_array(state.p, wp.float64, "cpu")
     inputs = [mask, displacement, pressure, tables, warp_array(viscosity, wp.float64, "cpu")]
-    wp.launch(store, (len(mesh.tets), 1), inputs=inputs, outputs=[stored], device="cpu")
+    wp.launch(store_bulk, (len(mesh.tets), 1), inputs=inputs, outputs=[stored], device="cpu")
     kernel = bulk_product(space.nodes.shape[1], body.mixed, space.element.stabilisation > 0, any(stiffening))
     inputs = [mask, numbering.single, stored, vector]
     wp.launch(kernel, (len(mesh.tets), 1), inputs=inputs, outputs=[image], device="cpu")
-    lattice = fold_tables(space, uniform(len(mesh.tets), poisson_ratio), "cpu")
-    if lattice is not None:
-        folding = wp.zeros((len(mesh.tets), 1), dtype=wp.int32, device="cpu")
-        inputs = [mask, displacement, lattice]
-        wp.launch(find_folding, (len(mesh.tets), 1), inputs=inputs, outputs=[folding], device="cpu")
-        assert folding.numpy().any()
-        inputs = [mask, folding, displacement, lattice, numbering.single.row, vector]
-        wp.launch(fold_product, (len(mesh.tets), 1), inputs=inputs, outputs=[image], device="cpu")
+    barrier = barrier_tables(space, uniform(len(mesh.tets), poisson_ratio), "cpu")
+    if barrier is not None:
+        inverting = wp.zeros((len(mesh.tets), 1), dtype=wp.int32, device="cpu")
+        inputs = [mask, displacement, barrier]
+        wp.launch(find_inverting, (len(mesh.tets), 1), inputs=inputs, outputs=[inverting], device="cpu")
+        assert inverting.numpy().any()
+        inputs = [mask, inverting, displacement, barrier, numbering.single.row, vector]
+        wp.launch(barrier_product, (len(mesh.tets), 1), inputs=inputs, outputs=[image], device="cpu")
     touching = wp.zeros(points[:2], dtype=wp.int32, device="cpu")
     touched = wp.zeros(points[:2], dtype=wp.int32, device="cpu")
     symmetric, remainder = (wp.zeros(points, dtype=wp.mat33d, device="cpu") for _ in range(2))
@@ -221,18 +215,17 @@ def _per_point(element: Element, count: int) -> tuple[int, int]:
 
 def test_scenes_must_share_the_pad() -> None:
     with pytest.raises(InputError, match=r"mm pad"):
-        list(simulate_many([scene((8.0, 6.0, 3.0))], MESH, device="cpu"))
+        simulate_scenes([scene((8.0, 6.0, 3.0))], MESH)
     with pytest.raises(InputError, match="must share the gel's materials and numerics"):
-        list(simulate_many([scene(), scene(numerics={"penalty": 20.0})], MESH, device="cpu"))
-    assert list(simulate_many([], MESH, device="cpu")) == []
+        simulate_scenes([scene(), scene(numerics={"penalty": 20.0})], MESH)
 
 
 def test_a_pad_serves_several_runs() -> None:
     posed = scene(friction=0.4, motion={"depth_mm": 0.2})
-    pad = prepare(posed, MESH, "cpu")
-    (_, one), (_, other) = (next(simulate_many([posed], MESH, device="cpu", pad=pad)) for _ in range(2))
+    pad, presses = prepare(posed, MESH, "cpu"), presses_of([posed], MESH)
+    (_, one), (_, other) = (next(simulate_presses(presses, pad)) for _ in range(2))
     assert same(one, other)
-    assert jobs_of([posed], pad)[0].modulus_mpa == 0.2
+    assert list(simulate_presses([], pad)) == []
 
 
 @pytest.mark.cuda
@@ -240,6 +233,6 @@ def test_on_a_gpu_the_same_as_on_the_cpu() -> None:
     if not wp.is_cuda_available():
         pytest.skip("no CUDA device")
     scenes = draws("p2p1")
-    on_gpu = dict(simulate_many(scenes, MESH, device="cuda", batch=3))
-    for i, result in enumerate(together(scenes, MESH, 3)):
-        assert apart(result, on_gpu[i]) < AGREEMENT
+    on_gpu = simulate_scenes(scenes, MESH, device="cuda", batch=3)
+    for result, other in zip(simulate_scenes(scenes, MESH, batch=3), on_gpu, strict=True):
+        assert apart(result, other) < AGREEMENT

@@ -14,16 +14,16 @@ from synth.simulate.batched.krylov import (
     RUNNING,
     Krylov,
     arnoldi,
-    begin,
+    begin_solve,
     begin_vectors,
     block_size,
+    flat,
     padded,
-    plain,
     shapes,
     solution,
 )
-from synth.simulate.batched.reference import Reference, inverse
-from synth.simulate.batched.slots import CARRY_READY, READY, Settings, Slots
+from synth.simulate.batched.lanes import PREDICTOR_READY, READY, Lanes, Settings
+from synth.simulate.batched.preconditioner import Preconditioner, inverse
 from synth.simulate.batched.tf32 import round_matrix
 from synth.simulate.driver import STANDARD
 
@@ -34,12 +34,12 @@ def _systems(
     device: str = "cpu",
     forcing: float = STANDARD.forcing,
     phase: int = READY,
-) -> tuple[Slots, Krylov, Settings]:
-    """Slots that are ready for a linear solve, its right side of norm 1, the one before of norm 20."""
+) -> tuple[Lanes, Krylov, Settings]:
+    """Lanes that are ready for a linear solve, its right side of norm 1, the one before of norm 20."""
     rows, batch = padded(150), len(relative)
-    slots, krylov, settings = Slots(), Krylov(), Settings()
+    lanes, krylov, settings = Lanes(), Krylov(), Settings()
     sizes = shapes(rows, batch)
-    structs: list[tuple[Any, Any]] = [(slots, Slots), (krylov, Krylov)]
+    structs: list[tuple[Any, Any]] = [(lanes, Lanes), (krylov, Krylov)]
     for struct, kind in structs:
         for name, variable in kind.vars.items():
             setattr(
@@ -47,15 +47,15 @@ def _systems(
                 name,
                 wp.zeros(sizes[name] if struct is krylov else batch, dtype=variable.type.dtype, device=device),
             )
-    slots.phase.fill_(phase)
-    slots.norm.fill_(1.0)
+    lanes.phase.fill_(phase)
+    lanes.norm.fill_(1.0)
     krylov.size.fill_(20.0)
-    slots.tolerance.fill_(1e-4)
-    slots.relative.assign(np.array(relative))
-    slots.iteration.assign(np.array(iteration, dtype=np.int32))
+    lanes.tolerance.fill_(1e-4)
+    lanes.relative.assign(np.array(relative))
+    lanes.iteration.assign(np.array(iteration, dtype=np.int32))
     settings.forcing = forcing
-    wp.launch(begin, batch, inputs=[slots, settings, krylov], device=device)
-    return slots, krylov, settings
+    wp.launch(begin_solve, batch, inputs=[lanes, settings, krylov], device=device)
+    return lanes, krylov, settings
 
 
 def test_linear_solves_are_as_exact_as_newton_needs() -> None:
@@ -64,13 +64,13 @@ def test_linear_solves_are_as_exact_as_newton_needs() -> None:
     krylov = _systems([1.0, 1.0, 5e-3, 2e-4], [0, 1, 1, 1])[1]
     np.testing.assert_allclose(krylov.goal.numpy(), [0.03, 0.00225, 0.006, 0.03], rtol=1e-6)
     # Fails with 1e-3 as the least whatever is asked for. The predictor at a turn has no Newton iteration before it.
-    for phase in (READY, CARRY_READY):
+    for phase in (READY, PREDICTOR_READY):
         assert np.all(_systems([1.0, 5e-3], [0, 1], "cpu", 1e-5, phase)[1].goal.numpy() == np.float32(1e-5))
-    assert _systems([1.0], [0], phase=CARRY_READY)[1].goal.numpy() == np.float32(1e-3)
+    assert _systems([1.0], [0], phase=PREDICTOR_READY)[1].goal.numpy() == np.float32(1e-3)
 
 
 @pytest.mark.parametrize(("device", "batch"), [("cpu", 3), pytest.param("cuda", 600, marks=pytest.mark.cuda)])
-def test_every_slot_solves_its_own_system(device: str, batch: int) -> None:
+def test_every_lane_solves_its_own_system(device: str, batch: int) -> None:
     """Unsymmetric matrices of 150 unknowns, preconditioned, to goals of their own, together and alone."""
     # Fails with a rotation of the other sense, or with a solve that goes on after it is done; on a GPU with a tile for
     # the right side of the substitution.
@@ -86,11 +86,11 @@ def test_every_slot_solves_its_own_system(device: str, batch: int) -> None:
     rights /= np.linalg.norm(rights, axis=1, keepdims=True)
 
     def solved(which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        slots, krylov, _ = _systems([1.0] * len(which), [0] * len(which), device)
+        lanes, krylov, _ = _systems([1.0] * len(which), [0] * len(which), device)
         krylov.goal.assign(goals[which])
-        first = np.zeros(plain(krylov.current).shape, dtype=np.float32)
+        first = np.zeros(flat(krylov.current).shape, dtype=np.float32)
         first[:, :size] = rights[which]
-        plain(krylov.current).assign(first)
+        flat(krylov.current).assign(first)
         basis = krylov.basis.numpy()
         basis[:, 0] = krylov.current.numpy()
         krylov.basis.assign(basis)
@@ -98,15 +98,15 @@ def test_every_slot_solves_its_own_system(device: str, batch: int) -> None:
         launch: dict[str, Any] = {"dim": [len(which)], "block_dim": block_size(rows), "device": device}
         while (krylov.running.numpy() == RUNNING).any():
             preconditioned, product = np.zeros_like(first), np.zeros_like(first)
-            preconditioned[:, :size] = plain(krylov.current).numpy()[:, :size] / scale
+            preconditioned[:, :size] = flat(krylov.current).numpy()[:, :size] / scale
             product[:, :size] = np.einsum("bij,bj->bi", matrices[which], preconditioned[:, :size])
-            plain(krylov.preconditioned).assign(preconditioned)
-            plain(krylov.product).assign(product)
+            flat(krylov.preconditioned).assign(preconditioned)
+            flat(krylov.product).assign(product)
             wp.launch_tiled(arnoldi(rows), inputs=[krylov], **launch)
         begun = wp.zeros(len(which), dtype=wp.int32, device=device)
-        wp.launch_tiled(solution(rows), inputs=[slots, krylov, begun], **launch)
+        wp.launch_tiled(solution(rows), inputs=[lanes, krylov, begun], **launch)
         count = krylov.k.numpy()
-        return plain(krylov.step).numpy(), np.abs(krylov.residual.numpy()[np.arange(len(which)), count])
+        return flat(krylov.step).numpy(), np.abs(krylov.residual.numpy()[np.arange(len(which)), count])
 
     together_found, left = solved(np.arange(batch))
     for i, found in enumerate(together_found):
@@ -142,21 +142,21 @@ def test_a_preconditioner_takes_tf32_from_the_first_vector_on() -> None:
     # Fails with a vector or a matrix that is not rounded, in each of the three places.
     rng = np.random.default_rng(3)
     matrix = rng.standard_normal((150, 150))
-    reference = Reference(matrix + matrix.T, "cpu")
+    reference = Preconditioner(matrix + matrix.T, "cpu")
     assert (_bits(reference.matrix.numpy()) == 0).all()
-    slots, krylov, _ = _systems([1.0] * 2, [0] * 2)
-    slots.phase.fill_(READY)
-    rows = plain(krylov.current).shape[1]
+    lanes, krylov, _ = _systems([1.0] * 2, [0] * 2)
+    lanes.phase.fill_(READY)
+    rows = flat(krylov.current).shape[1]
     free = np.append(np.arange(150), np.full(rows - 150, -1)).astype(np.int32)
     force = wp.array(rng.standard_normal((2, 50, 3)), dtype=wp.vec3d, device="cpu")
     volume = wp.zeros((2, 0), dtype=wp.float64, device="cpu")
     wp.launch(
-        begin_vectors, (2, rows // 4), inputs=[slots, wp.array(free, device="cpu"), force, volume, krylov], device="cpu"
+        begin_vectors, (2, rows // 4), inputs=[lanes, wp.array(free, device="cpu"), force, volume, krylov], device="cpu"
     )
-    first = plain(krylov.current).numpy().copy()
-    plain(krylov.product).assign(rng.standard_normal((2, rows)).astype(np.float32))
+    first = flat(krylov.current).numpy().copy()
+    flat(krylov.product).assign(rng.standard_normal((2, rows)).astype(np.float32))
     wp.launch_tiled(arnoldi(rows), dim=[2], inputs=[krylov], block_dim=block_size(rows), device="cpu")
-    second = plain(krylov.current).numpy()
+    second = flat(krylov.current).numpy()
     for vector, k in ((first, 0), (second, 1)):
         exact = krylov.basis.numpy()[:, k].reshape(2, rows)
         assert (_bits(vector) == 0).all()

@@ -1,5 +1,5 @@
-"""Simulation of many trajectories at once on one mesh, for GPUs: the same kernels, laws and rules as one by one."""
+"""Simulation of many presses at once on one mesh, for GPUs: the same laws and rules as for one press alone."""
 
-from synth.simulate.batched.many import simulate_many
+from synth.simulate.batched.run import simulate_presses
 
-__all__ = ["simulate_many"]
+__all__ = ["simulate_presses"]

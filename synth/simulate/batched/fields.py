@@ -1,11 +1,14 @@
-"""Moves of the slots' fields between state, iterate and trial, and of what contact remembers, as Warp kernels."""
+"""Moves of the lanes' fields between state, iterate and trial, and of contact's memory, as Warp kernels."""
 
 # Kernels are written in Warp's own language; their annotations only look like Python's.
 # mypy: disable-error-code="valid-type, no-untyped-def"
 
+from typing import Any
+
 import warp as wp
 
-from synth.simulate.batched.slots import ACCEPT, FALL_BACK, FRESH, RELAXING, REVERT, SEARCH, TAKE, UNDO, Slots
+from synth.simulate.batched import lanes as phases
+from synth.simulate.batched.lanes import Lanes
 from synth.simulate.contact import FAR, ContactState
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -34,10 +37,10 @@ class Fields:
 
 
 @wp.kernel
-def clear(slots: Slots, fields: Fields):
-    """One thread per (slot, node and then pressure): the undeformed state in fresh slots."""
+def clear_fields(lanes: Lanes, fields: Fields):
+    """One thread per (lane, node and then pressure): the undeformed state in fresh lanes."""
     s, i = wp.tid()
-    if slots.phase[s] != FRESH:
+    if lanes.phase[s] != phases.FRESH:
         return
     count = fields.state_u.shape[1]
     if i < count:
@@ -50,9 +53,15 @@ def clear(slots: Slots, fields: Fields):
         fields.iterate_p[s, i - count] = wp.float64(0.0)
 
 
+@wp.func
+def node_step(step: wp.array2d(dtype=wp.float32), s: int, row: int) -> wp.vec3d:
+    """A node's part of a step (B, rows), from its first row on."""
+    return wp.vec3d(wp.float64(step[s, row]), wp.float64(step[s, row + 1]), wp.float64(step[s, row + 2]))
+
+
 @wp.kernel
-def attempt(
-    slots: Slots,
+def compute_trial(
+    lanes: Lanes,
     mask: wp.array(dtype=wp.int32),
     step: wp.array2d(dtype=wp.float32),
     node_row: wp.array(dtype=wp.int32),
@@ -62,7 +71,7 @@ def attempt(
     viscous: wp.array2d(dtype=wp.vec3d),
     volume: wp.array2d(dtype=wp.float64),
 ):
-    """One thread per (slot, node and then pressure): the trial, and zeros for its residual and viscous force.
+    """One thread per (lane, node and then pressure): the trial, and zeros for its residual and viscous force.
 
     step: (B, rows); node_row: first row of a node's displacement or -1 where it is held.
     """
@@ -70,17 +79,16 @@ def attempt(
     if mask[s] == 0:
         return
     scale = wp.float64(0.0)
-    if slots.phase[s] == SEARCH:
-        scale = slots.scale[s]
-        if slots.relaxing[s] == RELAXING:
-            scale = slots.share[s]
+    if lanes.phase[s] == phases.SEARCH:
+        scale = lanes.scale[s]
+        if lanes.relaxing[s] == phases.RELAXING:
+            scale = lanes.share[s]
     count = fields.state_u.shape[1]
     if i < count:
         u = fields.iterate_u[s, i]
         row = node_row[i]
         if row >= 0 and scale != wp.float64(0.0):
-            move = wp.vec3d(wp.float64(step[s, row]), wp.float64(step[s, row + 1]), wp.float64(step[s, row + 2]))
-            u += scale * move
+            u += scale * node_step(step, s, row)
         fields.trial_u[s, i] = u
         force[s, i] = wp.vec3d()
         viscous[s, i] = wp.vec3d()
@@ -94,7 +102,7 @@ def attempt(
 
 
 @wp.kernel
-def carry(
+def apply_predictor(
     begun: wp.array(dtype=wp.int32),
     share: wp.float64,
     step: wp.array2d(dtype=wp.float32),
@@ -102,7 +110,7 @@ def carry(
     pressure_row: wp.array(dtype=wp.int32),
     fields: Fields,
 ):
-    """One thread per (slot, node and then pressure): the state carried along with the indenter, 1/share times step."""
+    """One thread per (lane, node and then pressure): the first iterate, the state and 1/share times step."""
     s, i = wp.tid()
     if begun[s] == 0:
         return
@@ -111,8 +119,7 @@ def carry(
         row = node_row[i]
         u = fields.state_u[s, i]
         if row >= 0:
-            move = wp.vec3d(wp.float64(step[s, row]), wp.float64(step[s, row + 1]), wp.float64(step[s, row + 2]))
-            u += (wp.float64(1.0) / share) * move
+            u += (wp.float64(1.0) / share) * node_step(step, s, row)
         fields.iterate_u[s, i] = u
     else:
         k = i - count
@@ -120,64 +127,61 @@ def carry(
         fields.iterate_p[s, k] = p
 
 
-@wp.kernel
-def move(slots: Slots, touched: int, fields: Fields):
-    """One thread per (slot, node and then pressure): what `slots.move` says.
+@wp.func
+def _move(
+    lanes: Lanes,
+    keep: int,
+    s: int,
+    i: int,
+    state: wp.array2d(dtype=Any),
+    previous: wp.array2d(dtype=Any),
+    iterate: wp.array2d(dtype=Any),
+    trial: wp.array2d(dtype=Any),
+    recorded: wp.array2d(dtype=Any),
+):
+    kind = lanes.move[s]
+    x = iterate[s, i]
+    if kind == phases.TAKE_TRIAL:
+        x = trial[s, i]
+    elif kind == phases.RESTORE_RECORDED:
+        x = recorded[s, i]
+    elif kind == phases.RESET:
+        x = state[s, i]
+        if lanes.predicted[s] == 1:
+            x += lanes.ratio[s] * (x - previous[s, i])
+    elif kind == phases.ACCEPT:
+        previous[s, i] = state[s, i]
+        state[s, i] = x
+    elif kind == phases.ROLL_BACK:
+        x = previous[s, i]
+        state[s, i] = x
+    iterate[s, i] = x
+    if keep == 1:
+        recorded[s, i] = x
 
-    A solution at a recorded state is put aside, in case a later pass fails: in phases of the set `touched`.
+
+@wp.kernel
+def move_fields(lanes: Lanes, solved: int, f: Fields):
+    """One thread per (lane, node and then pressure): what `lanes.move` says.
+
+    In phases of the set `solved` the solution at a recorded state is stored, in case a later pass fails.
     """
     s, i = wp.tid()
-    count = fields.state_u.shape[1]
-    kind = slots.move[s]
-    keep = (touched >> slots.phase[s]) & 1
-    if kind == 0 and keep == 0:
+    count = f.state_u.shape[1]
+    keep = (solved >> lanes.phase[s]) & 1
+    if lanes.move[s] == 0 and keep == 0:
         return
     if i < count:
-        x = fields.iterate_u[s, i]
-        if kind == TAKE:
-            x = fields.trial_u[s, i]
-        elif kind == UNDO:
-            x = fields.recorded_u[s, i]
-        elif kind == FALL_BACK:
-            x = fields.state_u[s, i]
-            if slots.predicted[s] == 1:
-                x += slots.ratio[s] * (x - fields.previous_u[s, i])
-        elif kind == ACCEPT:
-            fields.previous_u[s, i] = fields.state_u[s, i]
-            fields.state_u[s, i] = x
-        elif kind == REVERT:
-            x = fields.previous_u[s, i]
-            fields.state_u[s, i] = x
-        fields.iterate_u[s, i] = x
-        if keep == 1:
-            fields.recorded_u[s, i] = x
+        _move(lanes, keep, s, i, f.state_u, f.previous_u, f.iterate_u, f.trial_u, f.recorded_u)
     else:
-        k = i - count
-        p = fields.iterate_p[s, k]
-        if kind == TAKE:
-            p = fields.trial_p[s, k]
-        elif kind == UNDO:
-            p = fields.recorded_p[s, k]
-        elif kind == FALL_BACK:
-            p = fields.state_p[s, k]
-            if slots.predicted[s] == 1:
-                p += slots.ratio[s] * (p - fields.previous_p[s, k])
-        elif kind == ACCEPT:
-            fields.previous_p[s, k] = fields.state_p[s, k]
-            fields.state_p[s, k] = p
-        elif kind == REVERT:
-            p = fields.previous_p[s, k]
-            fields.state_p[s, k] = p
-        fields.iterate_p[s, k] = p
-        if keep == 1:
-            fields.recorded_p[s, k] = p
+        _move(lanes, keep, s, i - count, f.state_p, f.previous_p, f.iterate_p, f.trial_p, f.recorded_p)
 
 
 @wp.kernel
-def forget(slots: Slots, contact: ContactState):
-    """One thread per (slot, face, point): nothing touched before in a fresh slot, not even what touches at once."""
+def clear_contact(lanes: Lanes, contact: ContactState):
+    """One thread per (lane, face, point): nothing touched before in a fresh lane, not even what touches at once."""
     s, f, q = wp.tid()
-    if slots.phase[s] != FRESH:
+    if lanes.phase[s] != phases.FRESH:
         return
     contact.normal[s, f, q] = wp.float64(0.0)
     contact.tangent[s, f, q] = wp.vec3d()
@@ -186,8 +190,11 @@ def forget(slots: Slots, contact: ContactState):
 
 
 @wp.struct
-class Kept:
-    """What a recorded state changes of contact and gets back: see `synth.simulate.contact`, (B, f, nq)."""
+class ContactMemory:
+    """What corrections of a recorded state change of contact, (B, f, nq): see `synth.simulate.contact`.
+
+    gap, tangential: of the last evaluation; the others are arrays of `ContactState`.
+    """
 
     normal: wp.array3d(dtype=wp.float64)
     tangent: wp.array3d(dtype=wp.vec3d)
@@ -198,71 +205,44 @@ class Kept:
 
 
 @wp.kernel
-def keep(
-    mask: wp.array(dtype=wp.int32),
-    contact: ContactState,
-    gap: wp.array3d(dtype=wp.float64),
-    tangential: wp.array3d(dtype=wp.vec3d),
-    kept: Kept,
-):
-    """One thread per (slot, face, point): put contact's memory and the last evaluation aside."""
+def copy_memory(mask: wp.array(dtype=wp.int32), source: ContactMemory, target: ContactMemory):
+    """One thread per (lane, face, point): save contact's memory, or restore it."""
     s, f, q = wp.tid()
     if mask[s] == 0:
         return
-    kept.normal[s, f, q] = contact.normal[s, f, q]
-    kept.tangent[s, f, q] = contact.tangent[s, f, q]
-    kept.anchor[s, f, q] = contact.anchor[s, f, q]
-    kept.anchored[s, f, q] = contact.anchored[s, f, q]
-    kept.gap[s, f, q] = gap[s, f, q]
-    kept.tangential[s, f, q] = tangential[s, f, q]
+    target.normal[s, f, q] = source.normal[s, f, q]
+    target.tangent[s, f, q] = source.tangent[s, f, q]
+    target.anchor[s, f, q] = source.anchor[s, f, q]
+    target.anchored[s, f, q] = source.anchored[s, f, q]
+    target.gap[s, f, q] = source.gap[s, f, q]
+    target.tangential[s, f, q] = source.tangential[s, f, q]
 
 
 @wp.kernel
-def recall(
-    mask: wp.array(dtype=wp.int32),
-    slots: Slots,
-    kept: Kept,
-    contact: ContactState,
-    gap: wp.array3d(dtype=wp.float64),
-    tangential: wp.array3d(dtype=wp.vec3d),
-):
-    """One thread per (slot, face, point): put it back, where it was put aside."""
-    s, f, q = wp.tid()
-    if mask[s] == 0 or slots.kept[s] == 0:
-        return
-    contact.normal[s, f, q] = kept.normal[s, f, q]
-    contact.tangent[s, f, q] = kept.tangent[s, f, q]
-    contact.anchor[s, f, q] = kept.anchor[s, f, q]
-    contact.anchored[s, f, q] = kept.anchored[s, f, q]
-    gap[s, f, q] = kept.gap[s, f, q]
-    tangential[s, f, q] = kept.tangential[s, f, q]
-
-
-@wp.kernel
-def remember_multipliers(
-    slots: Slots,
+def save_multipliers(
+    lanes: Lanes,
     contact: ContactState,
     normal: wp.array3d(dtype=wp.float64),
     tangent: wp.array3d(dtype=wp.vec3d),
 ):
-    """One thread per (slot, face, point): before a pass begins."""
+    """One thread per (lane, face, point): before a pass begins."""
     s, f, q = wp.tid()
-    if slots.share_now[s] == wp.float64(0.0):
+    if lanes.new_share[s] == wp.float64(0.0):
         return
     normal[s, f, q] = contact.normal[s, f, q]
     tangent[s, f, q] = contact.tangent[s, f, q]
 
 
 @wp.kernel
-def undo_multipliers(
-    slots: Slots,
+def restore_multipliers(
+    lanes: Lanes,
     normal: wp.array3d(dtype=wp.float64),
     tangent: wp.array3d(dtype=wp.vec3d),
     contact: ContactState,
 ):
-    """One thread per (slot, face, point): after a pass failed."""
+    """One thread per (lane, face, point): after a pass failed."""
     s, f, q = wp.tid()
-    if slots.move[s] != UNDO:
+    if lanes.move[s] != phases.RESTORE_RECORDED:
         return
     contact.normal[s, f, q] = normal[s, f, q]
     contact.tangent[s, f, q] = tangent[s, f, q]

@@ -32,7 +32,7 @@ class Dense(Protocol):
 
 
 def dense(device: str) -> Dense:
-    """Of a Warp device.
+    """The operations of a Warp device.
 
     Raises:
         InputError: CUDA without cuBLAS.

@@ -1,15 +1,15 @@
 """Flexible GMRES without restart for many systems at once, each at its own iteration, as Warp kernels.
 
 Saad, SIAM J. Sci. Comput. 14, 1993; modified Gram-Schmidt and Givens rotations, in single precision: what is solved
-to a slot's goal is a correction, and Newton's residual is in double precision. A slot's solve begins when its matrix
-is ready, goes on through as many cycles as it takes, and ends when the next cycle finds it DONE; no slot waits for
+to a lane's goal is a correction, and Newton's residual is in double precision. A lane's solve begins when its matrix
+is ready, goes on through as many cycles as it takes, and ends when the next cycle finds it DONE; no lane waits for
 another.
 
-Memory decides the time, so one block of threads has a slot's vector in its registers and reads every basis vector once
-an iteration: vectors of a slot lie together, in fours, (B, ..., rows / 4), and each slot goes through as many as it
-has. The tangent's product wants slots next to each other, (rows, B); `synth.simulate.batched.gemm` turns its argument
-and its result. Sums are taken by a block in a fixed order, so that nothing here depends on other slots (what
-goes in does on a GPU: see `synth.simulate.batched.machine`).
+Memory decides the time, so one block of threads has a lane's vector in its registers and reads every basis vector once
+an iteration: vectors of a lane lie together, in fours, (B, ..., rows / 4), and each lane goes through as many as it
+has. The tangent's product wants lanes next to each other, (rows, B); `synth.simulate.batched.gemm` turns its argument
+and its result. Sums are taken by a block in a fixed order, so that nothing here depends on other lanes (what
+goes in does on a GPU: see `synth.simulate.batched.solver`).
 """
 
 # Kernels are written in Warp's own language; their annotations only look like Python's.
@@ -19,7 +19,8 @@ from functools import cache
 
 import warp as wp
 
-from synth.simulate.batched.slots import CARRY, CARRY_READY, LINEAR, LOST, READY, SEARCH, START, Settings, Slots
+from synth.simulate.batched import lanes as phases
+from synth.simulate.batched.lanes import Lanes, Settings
 from synth.simulate.batched.tf32 import rounded_four
 from synth.simulate.linear import GMRES_LIMIT, GMRES_TOLERANCE
 
@@ -27,23 +28,21 @@ wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 WAITING, RUNNING, DONE = wp.constant(0), wp.constant(1), wp.constant(2)
 LIMIT = wp.constant(GMRES_LIMIT)
-NONE = wp.constant(wp.float32(0.0))
-UNIT = wp.constant(wp.float32(1.0))
-TIGHTEST = wp.constant(wp.float64(GMRES_TOLERANCE))
-"""Smallest goal of a linear solve (relative residual). `Settings.forcing` is the largest; where that is smaller still,
-it is the goal of every solve."""
-SHARE, ENOUGH = wp.constant(wp.float64(0.9)), wp.constant(wp.float64(0.3))
-HELD = 84
-"""Numbers of a vector that one thread holds, at most: two vectors and what else there is fit its 255 registers."""
+ZERO = wp.constant(wp.float32(0.0))
+ONE = wp.constant(wp.float32(1.0))
+MIN_GOAL = wp.constant(wp.float64(GMRES_TOLERANCE))
+"""Smallest goal of a linear solve, unless `Settings.forcing`, the largest, is smaller still."""
+REDUCTION_FACTOR, SAFETY_FACTOR = wp.constant(wp.float64(0.9)), wp.constant(wp.float64(0.3))
+MAX_PER_THREAD = 84
+"""Numbers of a vector that one thread holds, at most, so that two vectors fit its 255 registers."""
 SMALLEST_BLOCK, LARGEST_BLOCK = 64, 512
-TOGETHER = 256
-"""Threads that are to run side by side on a multiprocessor, which has 65,536 registers. So few keep its memory busy,
-because each asks for a whole vector's share before it waits."""
+RESIDENT_THREADS = 256
+"""Threads that are to run side by side on a multiprocessor: so few keep its memory busy, and each has its registers."""
 
 
 @wp.struct
 class Krylov:
-    """One system a slot.
+    """One system a lane.
 
     Attributes:
         running: (B,) WAITING, RUNNING or DONE.
@@ -78,9 +77,9 @@ class Krylov:
 
 def shapes(rows: int, batch: int) -> dict[str, tuple[int, ...]]:
     """Of a Krylov's arrays, by name."""
-    slots, turned, each, limit = (batch,), (rows, batch), (batch, rows // 4), GMRES_LIMIT
+    lanes, turned, each, limit = (batch,), (rows, batch), (batch, rows // 4), GMRES_LIMIT
     return {
-        "running": slots, "k": slots, "size": slots, "goal": slots,
+        "running": lanes, "k": lanes, "size": lanes, "goal": lanes,
         "basis": (batch, limit + 1, rows // 4), "corrections": (batch, limit, rows // 4),
         "current": each, "preconditioned": each, "corrected": turned, "image": turned, "product": each,
         "triangle": (batch, limit, limit), "cosine": (batch, limit), "sine": (batch, limit),
@@ -88,15 +87,15 @@ def shapes(rows: int, batch: int) -> dict[str, tuple[int, ...]]:
     }  # fmt: skip
 
 
-def plain(vectors: wp.array) -> wp.array:
+def flat(vectors: wp.array) -> wp.array:
     """(B, rows) view of (B, rows / 4) vectors."""
     return vectors.view(wp.float32).reshape((vectors.shape[0], -1))
 
 
 def block_size(unknowns: int) -> int:
-    """Threads that share a vector: the smallest power of two with at most HELD numbers each."""
+    """Threads that share a vector: the smallest power of two with at most MAX_PER_THREAD numbers each."""
     block = SMALLEST_BLOCK
-    while block * HELD < unknowns and block < LARGEST_BLOCK:
+    while block * MAX_PER_THREAD < unknowns and block < LARGEST_BLOCK:
         block *= 2
     return block
 
@@ -104,7 +103,7 @@ def block_size(unknowns: int) -> int:
 def padded(unknowns: int) -> int:
     """Rows of a vector: as many fours for each thread of a block, so that none has to ask where the vector ends.
 
-    A multiple of 64, which matrix products on a GPU want, too: those of other sizes took three times as long.
+    A multiple of 64, which matrix products on a GPU want, too.
     """
     share = 4 * block_size(unknowns)
     return -(-unknowns // share) * share
@@ -112,20 +111,20 @@ def padded(unknowns: int) -> int:
 
 @wp.kernel
 def begin_vectors(
-    slots: Slots,
+    lanes: Lanes,
     free: wp.array(dtype=wp.int32),
     force: wp.array2d(dtype=wp.vec3d),
     volume: wp.array2d(dtype=wp.float64),
     krylov: Krylov,
 ):
-    """One thread per (slot, four rows): the first basis vector, minus the residual over its norm.
+    """One thread per (lane, four rows): the first basis vector, minus the residual over its norm.
 
     free: (rows,) number of the unknown, displacements of all nodes first, or -1 for rows that fill up.
     """
     s, i = wp.tid()
-    if slots.phase[s] != READY and slots.phase[s] != CARRY_READY:
+    if lanes.phase[s] != phases.READY and lanes.phase[s] != phases.PREDICTOR_READY:
         return
-    size = slots.norm[s]
+    size = lanes.norm[s]
     moves = 3 * force.shape[1]
     found = wp.vec4f()
     for k in range(4):
@@ -142,58 +141,54 @@ def begin_vectors(
 
 
 @wp.func
-def _goal(slots: Slots, settings: Settings, s: int, before: wp.float64) -> wp.float64:
+def _goal(lanes: Lanes, settings: Settings, s: int, before: wp.float64) -> wp.float64:
     """The second choice of Eisenstat & Walker (SIAM J. Sci. Comput. 17, 1996), and no more than Newton's method needs.
 
-    Ten pressed balls (8 x 6 x 2 elements, friction) took 38.3, 39.2 and 38.8 Newton iterations each with 1e-3 in every
-    solve, 1e-2 in every solve, and these; and 1045, 794 and 705 Krylov iterations.
-
-    before: norm of the last solve's right side. With these bounds their safeguard, which looks at the last goal, has
-    nothing to do.
+    before: norm of the last solve's right side. With these bounds their safeguard has nothing to do.
     """
     loosest = wp.float64(settings.forcing)
-    tightest = wp.min(TIGHTEST, loosest)
-    if slots.phase[s] == CARRY_READY:
+    tightest = wp.min(MIN_GOAL, loosest)
+    if lanes.phase[s] == phases.PREDICTOR_READY:
         return tightest
     goal = loosest
-    if slots.iteration[s] > 0:
-        fallen = slots.norm[s] / before
-        goal = SHARE * fallen * fallen
-    goal = wp.max(goal, ENOUGH * slots.tolerance[s] / slots.relative[s])
+    if lanes.iteration[s] > 0:
+        fallen = lanes.norm[s] / before
+        goal = REDUCTION_FACTOR * fallen * fallen
+    goal = wp.max(goal, SAFETY_FACTOR * lanes.tolerance[s] / lanes.relative[s])
     return wp.max(wp.min(goal, loosest), tightest)
 
 
 @wp.kernel
-def begin(slots: Slots, settings: Settings, krylov: Krylov):
-    """One thread per slot."""
+def begin_solve(lanes: Lanes, settings: Settings, krylov: Krylov):
+    """One thread per lane."""
     s = wp.tid()
-    phase = slots.phase[s]
-    if phase != READY and phase != CARRY_READY:
+    phase = lanes.phase[s]
+    if phase != phases.READY and phase != phases.PREDICTOR_READY:
         return
-    krylov.goal[s] = wp.float32(_goal(slots, settings, s, krylov.size[s]))
-    krylov.size[s] = slots.norm[s]
+    krylov.goal[s] = wp.float32(_goal(lanes, settings, s, krylov.size[s]))
+    krylov.size[s] = lanes.norm[s]
     krylov.k[s] = 0
-    slots.phase[s] = LINEAR
-    if phase == CARRY_READY:
-        slots.phase[s] = CARRY
-    krylov.residual[s, 0] = UNIT
+    lanes.phase[s] = phases.LINEAR
+    if phase == phases.PREDICTOR_READY:
+        lanes.phase[s] = phases.PREDICTOR_LINEAR
+    krylov.residual[s, 0] = ONE
     krylov.running[s] = RUNNING
-    if slots.norm[s] == wp.float64(0.0):
+    if lanes.norm[s] == wp.float64(0.0):
         krylov.running[s] = DONE
 
 
 @cache
 def arnoldi(rows: int) -> wp.Kernel:
-    """The kernel of an iteration from the product on; one block per slot, for vectors of so many rows.
+    """The kernel of an iteration from the product on; one block per lane, for vectors of so many rows.
 
     The new basis vector, the Givens rotation of its column of the Hessenberg matrix, and whether the solve ends.
     """
     count = wp.constant(rows // 4)
-    bounds = (block_size(rows), max(1, TOGETHER // block_size(rows)))
+    bounds = (block_size(rows), max(1, RESIDENT_THREADS // block_size(rows)))
 
     @wp.kernel(module="unique", enable_backward=False, launch_bounds=bounds)
     def iteration(krylov: Krylov):
-        s, lane = wp.tid()
+        s, thread = wp.tid()
         if krylov.running[s] != RUNNING:
             return
         k = krylov.k[s]
@@ -208,23 +203,23 @@ def arnoldi(rows: int) -> wp.Kernel:
             else:
                 cosine = krylov.cosine[s, j - 1]
                 sine = krylov.sine[s, j - 1]
-                if lane == 0:
+                if thread == 0:
                     krylov.triangle[s, k, j - 1] = cosine * above + sine * along
                 above = cosine * along - sine * above
         below = wp.sqrt(wp.tile_extract(wp.tile_dot(w, w), 0))
         scale = wp.float32(0.0)
-        if below > NONE:
-            scale = UNIT / below
+        if below > ZERO:
+            scale = ONE / below
         z = wp.tile_load(krylov.preconditioned[s], shape=count, bounds_check=False)
         wp.tile_store(krylov.corrections[s, k], z, bounds_check=False)
         v = w * scale
         wp.tile_store(krylov.basis[s, k + 1], v, bounds_check=False)
         wp.tile_store(krylov.current[s], wp.tile_map(rounded_four, v), bounds_check=False)
-        if lane == 0:
+        if thread == 0:
             length = wp.sqrt(above * above + below * below)
             cosine = wp.float32(1.0)
             sine = wp.float32(0.0)
-            if length > NONE:
+            if length > ZERO:
                 cosine = above / length
                 sine = below / length
             krylov.cosine[s, k] = cosine
@@ -234,7 +229,7 @@ def arnoldi(rows: int) -> wp.Kernel:
             krylov.residual[s, k] = cosine * left
             krylov.residual[s, k + 1] = -sine * left
             krylov.k[s] = k + 1
-            over = wp.abs(sine * left) < krylov.goal[s] or below == NONE or k + 1 == LIMIT
+            over = wp.abs(sine * left) < krylov.goal[s] or below == ZERO or k + 1 == LIMIT
             if over or not wp.isfinite(length):
                 krylov.running[s] = DONE
 
@@ -243,21 +238,20 @@ def arnoldi(rows: int) -> wp.Kernel:
 
 @cache
 def solution(rows: int) -> wp.Kernel:
-    """The kernel that finds the solution where a solve is done, and the slot's next phase; one block per slot.
+    """The kernel that finds the solution where a solve is done, and the lane's next phase; one block per lane.
 
-    Each thread substitutes backwards by itself. Warp keeps a tile of which single numbers are extracted in shared
-    memory, and changing it does not wait for threads that have yet to read: on a GPU with several blocks on a
-    multiprocessor some read too late, and their rows of the solution lacked a part.
+    Each thread substitutes backwards by itself, since threads do not wait for each other to read a tile before it
+    changes in shared memory.
     """
     count = wp.constant(rows // 4)
     coefficients = wp.types.vector(length=GMRES_LIMIT, dtype=wp.float32)
-    bounds = (block_size(rows), max(1, TOGETHER // block_size(rows)))
+    bounds = (block_size(rows), max(1, RESIDENT_THREADS // block_size(rows)))
 
     @wp.kernel(module="unique", enable_backward=False, launch_bounds=bounds)
-    def finish(slots: Slots, krylov: Krylov, begun: wp.array(dtype=wp.int32)):
+    def finish(lanes: Lanes, krylov: Krylov, begun: wp.array(dtype=wp.int32)):
         """begun: (B,) 1 where the solution is that of a carried first iterate."""
-        s, lane = wp.tid()
-        if lane == 0:
+        s, thread = wp.tid()
+        if thread == 0:
             begun[s] = 0
         if krylov.running[s] != DONE:
             return
@@ -270,8 +264,8 @@ def solution(rows: int) -> wp.Kernel:
         for back in range(k):
             j = k - 1 - back
             pivot = krylov.triangle[s, j, j]
-            weight = NONE
-            if pivot != NONE:
+            weight = ZERO
+            if pivot != ZERO:
                 weight = right[j] / pivot
             if not wp.isfinite(weight):
                 finite = wp.int32(0)
@@ -280,25 +274,25 @@ def solution(rows: int) -> wp.Kernel:
             z = wp.tile_load(krylov.corrections[s, j], shape=count, bounds_check=False)
             wp.tile_axpy(weight, z, total)
         wp.tile_store(krylov.step[s], total * wp.float32(krylov.size[s]), bounds_check=False)
-        if lane > 0:
+        if thread > 0:
             return
-        if slots.phase[s] == CARRY:
-            slots.phase[s] = START
+        if lanes.phase[s] == phases.PREDICTOR_LINEAR:
+            lanes.phase[s] = phases.START
             if finite == 1:
-                slots.predicted[s] = 1
+                lanes.predicted[s] = 1
                 begun[s] = 1
         elif finite == 1:
-            slots.phase[s] = SEARCH
-            slots.scale[s] = wp.float64(1.0)
+            lanes.phase[s] = phases.SEARCH
+            lanes.scale[s] = wp.float64(1.0)
         else:
-            slots.phase[s] = LOST
+            lanes.phase[s] = phases.FAILED
 
     return finish
 
 
 @wp.kernel
-def rest(krylov: Krylov):
-    """One thread per slot: a solution that was taken leaves the slot waiting."""
+def release(krylov: Krylov):
+    """One thread per lane: a solution that was taken leaves the lane waiting."""
     s = wp.tid()
     if krylov.running[s] == DONE:
         krylov.running[s] = WAITING

@@ -7,7 +7,7 @@ import numpy as np
 from synth.mesh import PadMesh, check_mesh
 from synth.scene import Scene
 from synth.simulate.batched.gemm import Dense
-from synth.simulate.batched.reference import Reference, inverse, stiffness
+from synth.simulate.batched.preconditioner import Preconditioner, inverse, stiffness
 from synth.simulate.contact import Indenters
 from synth.simulate.indenter import RigidBody
 from synth.simulate.material import Material, pad_material
@@ -23,18 +23,27 @@ AWAY_MM = 1e3
 
 @dataclass(frozen=True)
 class Pad:
-    """See the module's docstring; free: (k,) numbers of the unknowns that are not held, displacements first."""
+    """The pad of a batch; free: (k,) numbers of the unknowns that are not held, displacements first."""
 
-    mesh: PadMesh
     space: Space
     material: Material
     free: np.ndarray
-    reference: Reference
+    preconditioner: Preconditioner
     device: str
+
+    @property
+    def mixed(self) -> bool:
+        """Whether there is a pressure field."""
+        return self.material.mixed and self.space.element.has_pressure
+
+    @property
+    def yeoh(self) -> bool:
+        """Whether the material stiffens."""
+        return bool(self.material.yeoh.any())
 
 
 def prepare(scene: Scene, mesh: PadMesh, device: str, products: Dense | None = None) -> Pad:
-    """The pad of a scene, for all scenes of the same mesh, materials and element.
+    """Prepare the pad of a scene, for all scenes of the same mesh, materials and element.
 
     Args:
         scene: any of them.
@@ -49,8 +58,8 @@ def prepare(scene: Scene, mesh: PadMesh, device: str, products: Dense | None = N
     material = pad_material(scene.sensor.gel, mesh)
     space = function_space(mesh, ELEMENTS[scene.numerics.element]())
     system = System(space, material)
-    reference = Reference(inverse(stiffness(system, _away(scene)), device), device, products)
-    return Pad(mesh, space, material, system.free, reference, device)
+    preconditioner = Preconditioner(inverse(stiffness(system, _away(scene)), device), device, products)
+    return Pad(space, material, system.free, preconditioner, device)
 
 
 def _away(scene: Scene) -> Indenters:

@@ -11,7 +11,7 @@ functions of `synth.simulate.bulk` in double precision, and stored; so is contac
 with friction's unsymmetric part, by `contact_stiffness` itself.
 
 Vectors are (rows, B): all displacements of a free node in three rows, then the pressures, and neighbouring threads work
-on neighbouring slots of the same element, so that every access to them is one piece of memory. Elements add to a row in
+on neighbouring lanes of the same element, so that every access to them is one piece of memory. Elements add to a row in
 no particular order on a GPU: there the last bits differ from run to run, on a CPU they do not.
 """
 
@@ -22,15 +22,14 @@ from functools import cache
 
 import warp as wp
 
+from synth.simulate.batched.krylov import RUNNING
 from synth.simulate.bulk import Bulk, _deformation_gradient, _dilation, _slopes
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
-RUNNING = wp.constant(1)
-"""State of a slot's linear solve in which it takes part in products."""
-BLOCK, TOGETHER = 128, 4
-"""Threads of a block of `bulk_product`, and blocks that a multiprocessor is to run side by side. Left to itself the
-compiler takes 168 registers a thread, with which only half as many can wait for memory at a time."""
+BLOCK, RESIDENT_BLOCKS = 128, 4
+"""Threads of a block of `bulk_product`, and blocks that a multiprocessor is to run side by side: the compiler takes
+fewer registers then, so that more threads wait for memory at a time."""
 STORED = 16
 """Numbers stored per quadrature point: F^{-T} (9), w 2W', w (2W' - P J), w (P J + γ J²), w J (1 - γ/λ), w J γ_c D,
 w (1 - γ/λ)/λ, w γ_c D/λ."""
@@ -39,7 +38,7 @@ STORED_YEOH = 26
 
 
 @wp.struct
-class Single:
+class SingleTables:
     """Tables of the elements in single precision, and where their nodes are in a vector.
 
     Attributes:
@@ -56,7 +55,7 @@ class Single:
 
 
 @wp.kernel
-def store(
+def store_bulk(
     mask: wp.array(dtype=wp.int32),
     u: wp.array2d(dtype=wp.vec3d),
     p: wp.array2d(dtype=wp.float64),
@@ -64,7 +63,7 @@ def store(
     viscosity: wp.array(dtype=wp.float64),
     stored: wp.array4d(dtype=wp.float32),
 ):
-    """One thread per (element, slot): (m, nq, STORED, B). A viscosity θ adds θ μ to the 2W' beside G alone."""
+    """One thread per (element, lane): (m, nq, STORED, B). A viscosity θ adds θ μ to the 2W' beside G alone."""
     e, s = wp.tid()
     if mask[s] == 0:
         return
@@ -100,7 +99,7 @@ def store(
 
 @cache
 def bulk_product(nodes: int, mixed: bool, stabilised: bool, yeoh: bool) -> wp.Kernel:
-    """The kernel that adds the bulk's tangent times x to y; one thread per (element, slot).
+    """The kernel that adds the bulk's tangent times x to y; one thread per (element, lane).
 
     Args:
         nodes: displacement nodes of an element; known to the compiler, so that their values stay in registers.
@@ -111,10 +110,10 @@ def bulk_product(nodes: int, mixed: bool, stabilised: bool, yeoh: bool) -> wp.Ke
     count = wp.constant(nodes)
     nodal = wp.types.matrix(shape=(nodes, 3), dtype=wp.float32)
 
-    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(BLOCK, TOGETHER))
+    @wp.kernel(module="unique", enable_backward=False, launch_bounds=(BLOCK, RESIDENT_BLOCKS))
     def product(
         running: wp.array(dtype=wp.int32),
-        single: Single,
+        single: SingleTables,
         stored: wp.array4d(dtype=wp.float32),
         x: wp.array2d(dtype=wp.float32),
         y: wp.array2d(dtype=wp.float32),
@@ -201,7 +200,7 @@ def store_contact(
     stored: wp.array3d(dtype=wp.mat33f),
     touched: wp.array2d(dtype=wp.int32),
 ):
-    """One thread per (slot, face): w times the whole of -∂t/∂x at its points, where it touches."""
+    """One thread per (lane, face): w times the whole of -∂t/∂x at its points, where it touches."""
     s, f = wp.tid()
     if mask[s] == 0:
         return
@@ -214,7 +213,7 @@ def store_contact(
 
 @cache
 def contact_product(nodes: int) -> wp.Kernel:
-    """The kernel that adds contact's tangent times x to y; one thread per (slot, face of so many nodes)."""
+    """The kernel that adds contact's tangent times x to y; one thread per (lane, face of so many nodes)."""
     count = wp.constant(nodes)
     nodal = wp.types.matrix(shape=(nodes, 3), dtype=wp.float32)
 

@@ -1,136 +1,153 @@
-"""Many trajectories through the slots of one machine: what the host does."""
+"""Many presses through the lanes of one solver: the entry point, and what the host does."""
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import warp as wp
 
 from synth.arrays import FloatArray
-from synth.scene import Numerics
-from synth.simulate.batched import slots as phases
-from synth.simulate.batched.jobs import Ended, Job, body_tables, job_tables, trajectory
-from synth.simulate.batched.machine import INNER, Machine
+from synth.simulate.batched import lanes as phases
 from synth.simulate.batched.pad import Pad
-from synth.simulate.driver import Driver
+from synth.simulate.batched.presses import press_tables, trajectory, untouched
+from synth.simulate.batched.solver import INNER_ITERATIONS, BatchedSolver
+from synth.simulate.driver import STANDARD, Driver
 from synth.simulate.newton import MAX_ITERATIONS
+from synth.simulate.press import Press
+from synth.simulate.solve import check_shared
 from synth.simulate.trajectory import Trajectory
 
-LOOK = 2
-"""Cycles between looks at which slots have ended: a slot waits for half of them on average, some 1 % of its time."""
+MAX_BATCH = 512
+OPTIONS = replace(STANDARD, loose=0.0, forcing=1e-4, closer=1e-3)
+"""The scene's tolerance along the whole load path, because friction remembers the path; linear solves and corrections
+so tight that rounding hardly ever decides which equilibrium is found."""
+CYCLES_PER_POLL = 2
+"""Cycles between looks at which lanes have ended: a lane waits for half of them on average, some 1 % of its time."""
 
 
-@dataclass(frozen=True)
-class Fetched:
-    """A trajectory as it left its slot: number of its job, records, how it ended, and its share of the time."""
+def simulate_presses(
+    presses: Sequence[Press],
+    pad: Pad,
+    frames: Sequence[frozenset[int]] | None = None,
+    batch: int = MAX_BATCH,
+    options: Driver = OPTIONS,
+) -> Iterator[tuple[int, Trajectory]]:
+    """Simulate presses into pads of one mesh, each as if it were alone.
 
-    number: int
-    records: FloatArray
-    ended: Ended
-    seconds: float
+    Args:
+        presses: they share the gel's materials and the numerics.
+        pad: from `synth.simulate.batched.pad.prepare`.
+        frames: numbers of the states that are wanted, of each press; see `synth.simulate.simulate_press`.
+        batch: most trajectories at a time.
+        options: of Newton's method along the load paths.
+
+    Yields:
+        The number of a press and its trajectory, in the order in which they end.
+
+    Raises:
+        InputError: presses that do not share the pad.
+        ValueError: not as many sets of frames as presses.
+    """
+    if frames is not None and len(frames) != len(presses):
+        raise ValueError(f"{len(frames)} sets of frames for {len(presses)} presses")
+    if presses:
+        check_shared([press.scene for press in presses], pad.space.mesh)
+    touching = []
+    for number, press in enumerate(presses):
+        if press.path.may_touch:
+            touching.append(number)
+        else:
+            yield number, untouched(press, pad.space)
+    if touching:
+        theirs = None if frames is None else [frames[n] for n in touching]
+        run = Run([presses[n] for n in touching], pad, theirs, min(batch, len(touching)), options)
+        for number, result in run:
+            yield touching[number], result
 
 
 class Run:
-    """An iterator over (number of the job, trajectory) in the order in which they end.
+    """An iterator over (number of the press, trajectory) in the order in which they end.
 
     Args:
-        jobs: trajectories whose indenters touch.
-        pad: they run on.
-        numerics: of all of them.
-        driver: how Newton's method is led.
-        frames: numbers of the states that are corrected, of each job; default all.
-        batch: number of slots.
-        order: numbers of the jobs in which they begin, default each once.
+        presses: those whose indenters touch, with common numerics.
+        pad: theirs.
+        frames: numbers of the states that are corrected, of each press; default all.
+        batch: number of lanes.
+        options: of Newton's method along the load paths.
+        order: numbers of the presses in which they begin, default each once.
         inner: Krylov iterations of a cycle.
     """
 
     def __init__(
         self,
-        jobs: Sequence[Job],
+        presses: Sequence[Press],
         pad: Pad,
-        numerics: Numerics,
-        driver: Driver,
         frames: Sequence[frozenset[int]] | None,
         batch: int,
+        options: Driver,
         order: Iterable[int] | None = None,
-        inner: int = INNER,
+        inner: int = INNER_ITERATIONS,
     ) -> None:
-        self._jobs, self._pad = jobs, pad
-        self.table = job_tables(jobs, pad.mesh.size_mm, frames, pad.device)
-        self._shapes, self._grids, grid = body_tables(jobs, pad.device)
+        self._presses, self._pad, numerics = presses, pad, presses[0].scene.numerics
+        table, grid = press_tables(presses, frames, pad.device)
         settings = phases.Settings()
-        settings.tolerance, settings.loose = numerics.tolerance, driver.loose
-        settings.longest, settings.extrapolate = numerics.max_step_mm, int(driver.extrapolate)
-        settings.forcing, settings.closer = driver.forcing, driver.closer
-        settings.limit, settings.correction_limit = MAX_ITERATIONS, driver.correction_iterations
-        records = max(len(job.path.records()) for job in jobs)
-        self.machine = Machine(pad, batch, records, grid, settings, numerics.penalty, inner)
-        self._order = range(len(jobs)) if order is None else order
+        settings.tolerance, settings.loose = numerics.tolerance, options.loose
+        settings.longest, settings.extrapolate = numerics.max_step_mm, int(options.extrapolate)
+        settings.forcing, settings.closer = options.forcing, options.closer
+        settings.limit, settings.correction_limit = MAX_ITERATIONS, options.correction_iterations
+        records = max(len(press.path.records()) for press in presses)
+        self.solver = BatchedSolver(pad, table, batch, records, grid, settings, numerics.penalty, inner)
+        self._order = range(len(presses)) if order is None else order
         self._graph: Any = None
         self.cycles = 0
         self._spent = 0.0
 
     def __iter__(self) -> Iterator[tuple[int, Trajectory]]:
-        """Run all jobs.
-
-        Results are made and handed over while the device works on the next cycles. When it waited for that, a cycle of
-        1,024 slots took 22.8 ms on an H200, of which its kernels took 19.4.
-        """
-        machine, batch = self.machine, self.machine.batch
+        """Run all presses. Results are made and handed over while the device works on the next cycles."""
+        batch = self.solver.batch
         working = np.full(batch, -1)
         begun = np.zeros(batch)
         waiting = iter(self._order)
         empty = np.arange(batch)
-        fetched: list[Fetched] = []
+        fetched: list[tuple[int, FloatArray, tuple[int, float, float], float]] = []
         while True:
             assignment = np.full(batch, -1)
-            for slot in empty:
-                working[slot] = assignment[slot] = next(waiting, -2)
+            for lane in empty:
+                working[lane] = assignment[lane] = next(waiting, -2)
             began = time.perf_counter()
             begun[empty] = self._spent
             if len(empty):
-                machine.fill(assignment, self.table, self._shapes, self._grids)
+                self.solver.fill(assignment)
             ongoing = bool((working >= 0).any())
             if ongoing:
-                for _ in range(LOOK):
+                for _ in range(CYCLES_PER_POLL):
                     self.advance()
             self._spent += time.perf_counter() - began  # without what whoever takes the results does meanwhile
-            for one in fetched:
-                result = trajectory(self._jobs[one.number], one.records, one.ended, one.seconds, self._pad.space)
-                yield one.number, result
+            for number, records, end, seconds in fetched:
+                yield number, trajectory(self._presses[number], records, end, seconds, self._pad.space)
             if not ongoing:
                 return
             began = time.perf_counter()
-            empty = np.flatnonzero(machine.slots.phase.numpy() == phases.ENDED)
+            empty = np.flatnonzero(self.solver.lanes.phase.numpy() == phases.ENDED)
             self._spent += time.perf_counter() - began
-            fetched = self._fetch(empty, working, begun)
+            fetched = [
+                (int(working[s]), records, end, float(self._spent - begun[s]) / batch)
+                for s, records, end in self.solver.ended(empty)
+            ]
 
     def advance(self) -> None:
         """One cycle; on CUDA a graph that is captured the second time, when all kernels are loaded."""
         self.cycles += 1
         device = wp.get_device(self._pad.device)
         if not device.is_cuda or self.cycles == 1:
-            self.machine.cycle(self.table)
+            self.solver.cycle()
             return
         if self._graph is None:
             # Relaxed: the garbage collector may free a renderer's memory in this thread meanwhile.
             mode = wp.CaptureMode.RELAXED
             with wp.ScopedCapture(device=device, force_module_load=False, capture_mode=mode) as capture:
-                self.machine.cycle(self.table)
+                self.solver.cycle()
             self._graph = capture.graph
         wp.capture_launch(self._graph)
-
-    def _fetch(self, slots: np.ndarray, working: np.ndarray, begun: np.ndarray) -> list[Fetched]:
-        """What ended slots recorded, before they are filled again."""
-        if not len(slots):
-            return []
-        state = self.machine.slots
-        count, reason, at, target = (array.numpy() for array in (state.records, state.reason, state.at, state.target))
-        found = []
-        for s in map(int, slots):
-            ended = Ended(int(reason[s]), float(at[s]), float(target[s]))
-            seconds = float(self._spent - begun[s]) / self.machine.batch
-            found.append(Fetched(int(working[s]), self.machine.record_of(s, int(count[s])), ended, seconds))
-        return found

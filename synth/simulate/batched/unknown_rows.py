@@ -9,7 +9,8 @@ import numpy as np
 import warp as wp
 
 from synth.arrays import FloatArray
-from synth.simulate.batched.product import Single
+from synth.simulate.batched.product import SingleTables
+from synth.simulate.batched.reductions import SurfaceTables
 from synth.simulate.bulk import Bulk
 from synth.simulate.space import Space
 from synth.simulate.tables import warp_array
@@ -17,7 +18,7 @@ from synth.surface import broken_linear_face
 
 
 @dataclass(frozen=True)
-class Numbering:
+class UnknownRows:
     """See the module's docstring; Warp arrays.
 
     Attributes:
@@ -32,10 +33,10 @@ class Numbering:
     pressure_row: wp.array
     face_row: wp.array
     face_shape: wp.array
-    single: Single
+    single: SingleTables
 
 
-def number_rows(space: Space, free: np.ndarray, rows: int, bulk: Bulk, device: str) -> Numbering:
+def number_rows(space: Space, free: np.ndarray, rows: int, bulk: Bulk, device: str) -> UnknownRows:
     """Number the free unknowns (k,), displacements first, of a space in vectors of so many rows.
 
     Raises:
@@ -49,14 +50,14 @@ def number_rows(space: Space, free: np.ndarray, rows: int, bulk: Bulk, device: s
         raise ValueError("a batch needs nodes that are held in all directions or in none")
     padded = np.full(rows, -1, dtype=np.int32)
     padded[: len(free)] = free
-    single = Single()
+    single = SingleTables()
     single.row = warp_array(moving[space.nodes, 0], wp.int32, device)
     empty = np.zeros((0, 4), dtype=np.int32)
     single.pressure_row = warp_array(pressure_row[space.pressure_nodes] if mixed else empty, wp.int32, device)
     single.gradient = warp_array(bulk.gradient.numpy().astype(np.float32), wp.vec3f, device)
     single.pressure_shape = warp_array(element.barycentric.astype(np.float32), wp.float32, device)
     single.stabilisation = warp_array(bulk.stabilisation.numpy().astype(np.float32), wp.float32, device)
-    return Numbering(
+    return UnknownRows(
         free=warp_array(padded, wp.int32, device),
         node_row=warp_array(moving[:, 0], wp.int32, device),
         pressure_row=warp_array(pressure_row, wp.int32, device),
@@ -66,30 +67,15 @@ def number_rows(space: Space, free: np.ndarray, rows: int, bulk: Bulk, device: s
     )
 
 
-@dataclass(frozen=True)
-class SurfaceTables:
-    """How points of the coated face give tractions to its nodes, as in `System.forces`; Warp arrays.
-
-    Attributes:
-        hat: (nq, ns) functions by which a face's points share in its nodes.
-        number: (f, ns) of a face's nodes among the surface's, -1 on other faces.
-        area: (s,) of the nodes, mm².
-    """
-
-    hat: wp.array
-    number: wp.array
-    area: wp.array
-
-
 def surface_tables(space: Space, weight: FloatArray, device: str) -> SurfaceTables:
-    """Tables for face weights (f, nq) in mm²."""
-    element = space.element
+    """How points of the coated face, of weights (f, nq) in mm², give tractions to its nodes, as in `System.forces`."""
+    element, coated, tables = space.element, space.coated, SurfaceTables()
     hat = element.face_shape if element.order == 1 else broken_linear_face(element.face_barycentric)
-    coated = space.coated
     number = np.full(space.faces.shape, -1, dtype=np.int32)
     number[coated] = np.searchsorted(space.surface_nodes, space.faces[coated])
     area = np.zeros(len(space.surface_nodes))
     np.add.at(area, number[coated], np.einsum("fq,qa->fa", weight[coated], hat))
-    return SurfaceTables(
-        warp_array(hat, wp.float64, device), warp_array(number, wp.int32, device), warp_array(area, wp.float64, device)
-    )
+    tables.hat = warp_array(hat, wp.float64, device)
+    tables.number = warp_array(number, wp.int32, device)
+    tables.area = warp_array(area, wp.float64, device)
+    return tables

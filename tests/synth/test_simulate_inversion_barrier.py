@@ -9,7 +9,7 @@ from synth.arrays import FloatArray
 from synth.mesh import Focus
 from synth.simulate import simulate
 from synth.simulate.element import p2p1
-from synth.simulate.fold import LATTICE, ONSET
+from synth.simulate.inversion_barrier import ONSET, SAMPLE_DEGREE
 from synth.simulate.material import uniform
 from synth.simulate.resolution import graded_mesh
 from synth.simulate.space import function_space
@@ -17,7 +17,7 @@ from synth.simulate.system import System, Unknowns
 
 MESH = crooked()
 _STEPS = [(i, j, k) for i in range(4) for j in range(4 - i) for k in range(4 - i - j)]
-CORNERS = np.array([(i, j, k, LATTICE - i - j - k) for i, j, k in _STEPS]) / LATTICE
+CORNERS = np.array([(i, j, k, SAMPLE_DEGREE - i - j - k) for i, j, k in _STEPS]) / SAMPLE_DEGREE
 """(20, 4) barycentric coordinates of the points at which folds are looked for."""
 
 
@@ -43,7 +43,7 @@ def lattice_jacobian(body: System, u: FloatArray) -> tuple[FloatArray, Integrals
 
 
 def barrier(body: System, u: FloatArray) -> float:
-    """The energy of `synth.simulate.fold`; mu = E / 3 at a Poisson ratio of 0.5."""
+    """The energy of `synth.simulate.inversion_barrier`; mu = E / 3 at a Poisson ratio of 0.5."""
     jacobian, points = lattice_jacobian(body, u)
     return float((points.volume * np.log(np.maximum(ONSET / jacobian, 1.0)) ** 3).sum() / 9)
 

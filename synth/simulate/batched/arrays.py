@@ -1,6 +1,6 @@
-"""The arrays of a batch: what its slots are at, their fields, contact, and the linear solver's vectors.
+"""The arrays of a batch: the state of its lanes, their fields, contact, and the linear solver's vectors.
 
-At 512 slots of an 11,500-unknown P2/P1 mesh they take some 7 GB, most of it contact's memory and the Krylov basis.
+At 512 lanes of an 11,500-unknown P2/P1 mesh they take some 7 GB, most of it contact's memory and the Krylov basis.
 """
 
 from collections.abc import Callable
@@ -8,14 +8,13 @@ from typing import Any
 
 import warp as wp
 
-from synth.simulate.batched.fields import Fields, Kept
-from synth.simulate.batched.krylov import Krylov, plain, shapes
+from synth.simulate.batched.fields import ContactMemory, Fields
+from synth.simulate.batched.krylov import Krylov, flat, shapes
+from synth.simulate.batched.lanes import Lanes
+from synth.simulate.batched.pad import Pad
 from synth.simulate.batched.product import STORED, STORED_YEOH
-from synth.simulate.batched.slots import Slots
-from synth.simulate.batched.sums import SCALARS
+from synth.simulate.batched.reductions import SCALARS
 from synth.simulate.contact import ContactState, Indenters
-from synth.simulate.distance import shape_vector
-from synth.simulate.space import Space
 
 
 def _filled(struct: Any, shape: Callable[[str], tuple[int, ...]], device: str) -> Any:
@@ -26,62 +25,50 @@ def _filled(struct: Any, shape: Callable[[str], tuple[int, ...]], device: str) -
     return made
 
 
-class Storage:
-    """Arrays of b slots on a space, see the module's docstring; zeros.
+class BatchArrays:
+    """Arrays of b lanes, see the module's docstring; zeros.
 
     Args:
-        space: the pad's.
-        mixed: whether there is a pressure field.
-        yeoh: whether the material stiffens.
-        rows: of the linear solver's vectors.
+        pad: what the lanes share.
         batch: b.
         records: most states that a trajectory records.
         grid: counts of the largest distance grid of the indenters.
-        device: Warp device.
     """
 
-    def __init__(
-        self,
-        space: Space,
-        mixed: bool,
-        yeoh: bool,
-        rows: int,
-        batch: int,
-        records: int,
-        grid: tuple[int, int, int],
-        device: str,
-    ) -> None:
+    def __init__(self, pad: Pad, batch: int, records: int, grid: tuple[int, int, int]) -> None:
+        space, device = pad.space, pad.device
+
         def zeros(shape: int | tuple[int, ...], dtype: Any) -> wp.array:
             return wp.zeros(shape, dtype=dtype, device=device)
 
-        nodes, pressures, elements = len(space.points), space.pressures if mixed else 0, len(space.nodes)
+        nodes, pressures, elements = len(space.points), space.pressures if pad.mixed else 0, len(space.nodes)
         self.points = (batch, len(space.faces), len(space.element.face_weights))
-        self.slots: Slots = _filled(Slots, lambda _: (batch,), device)
+        self.lanes: Lanes = _filled(Lanes, lambda _: (batch,), device)
         self.fields: Fields = _filled(Fields, lambda n: (batch, nodes if n.endswith("_u") else pressures), device)
         self.contact: ContactState = _filled(ContactState, lambda _: self.points, device)
-        self.kept: Kept = _filled(Kept, lambda _: self.points, device)
+        self.saved: ContactMemory = _filled(ContactMemory, lambda _: self.points, device)
         self.force, self.volume = zeros((batch, nodes), wp.vec3d), zeros((batch, pressures), wp.float64)
         self.viscous = zeros((batch, nodes), wp.vec3d)
         self.jacobian = zeros((batch, elements), wp.float64)
         self.gap, self.tangential = zeros(self.points, wp.float64), zeros(self.points, wp.vec3d)
+        self.memory = ContactMemory()
+        self.memory.gap, self.memory.tangential = self.gap, self.tangential
+        for name in ("normal", "tangent", "anchor", "anchored"):
+            setattr(self.memory, name, getattr(self.contact, name))
         self.traction = zeros(self.points, wp.vec3d)
         self.normal_before, self.tangent_before = zeros(self.points, wp.float64), zeros(self.points, wp.vec3d)
-        self.indenters = Indenters()
-        for name, dtype in (
-            ("kind", wp.int32), ("shape", shape_vector), ("centre", wp.vec3d), ("rotation", wp.mat33d),
-            ("friction", wp.float64), ("sharpness", wp.float64),
-        ):  # fmt: skip
-            setattr(self.indenters, name, zeros(batch, dtype))
-        self.indenters.coefficients = zeros((batch, *grid), wp.float64)
+        self.indenters: Indenters = _filled(
+            Indenters, lambda name: (batch, *grid) if name == "coefficients" else (batch,), device
+        )
         self.records = zeros((batch, records, SCALARS + 3 * nodes + 3 * len(space.surface_nodes)), wp.float64)
         self.sums = zeros((batch, 8), wp.float64)
         self.mask, self.begun, self.assignment = (zeros(batch, wp.int32) for _ in range(3))
-        stored = (elements, len(space.element.weights), STORED_YEOH if yeoh else STORED, batch)
+        stored = (elements, len(space.element.weights), STORED_YEOH if pad.yeoh else STORED, batch)
         self.stored = zeros(stored, wp.float32)
-        self.folding = zeros((elements, batch), wp.int32)
+        self.inverting = zeros((elements, batch), wp.int32)
         self.touching, self.touched = zeros(self.points[:2], wp.int32), zeros(self.points[:2], wp.int32)
         self.symmetric, self.remainder = zeros(self.points, wp.mat33d), zeros(self.points, wp.mat33d)
         self.stored_contact = zeros(self.points, wp.mat33f)
-        sizes = shapes(rows, batch)
+        sizes = shapes(pad.preconditioner.rows, batch)
         self.krylov: Krylov = _filled(Krylov, lambda name: sizes[name], device)
-        self.step = plain(self.krylov.step)
+        self.step = flat(self.krylov.step)

@@ -1,4 +1,4 @@
-"""Relaxation of a slot, as Warp functions: the rules and constants are those of `synth.simulate.relaxation`."""
+"""Relaxation of a lane, as Warp functions: the rules and constants are those of `synth.simulate.relaxation`."""
 
 # Kernels are written in Warp's own language; their annotations only look like Python's.
 # mypy: disable-error-code="valid-type, no-untyped-def"
@@ -6,7 +6,7 @@
 import warp as wp
 
 from synth.simulate import relaxation
-from synth.simulate.batched.slots import LOST, SEARCH, START, TAKE, Slots
+from synth.simulate.batched.lanes import FAILED, SEARCH, START, TAKE_TRIAL, Lanes
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
@@ -34,21 +34,21 @@ def next_viscosity(viscosity: wp.float64, error: wp.float64) -> wp.float64:
 
 
 @wp.func
-def judge_relaxation(slots: Slots, s: int, valid: bool):
+def evaluate_relaxation(lanes: Lanes, s: int, valid: bool):
     """A step of a relaxation is taken where it errs little; else the next is shorter, from where this began."""
     error = wp.float64(1.0e30)
-    if valid and wp.isfinite(slots.trial_error[s]):
-        error = slots.trial_error[s]
-    slots.iteration[s] = slots.iteration[s] + 1
+    if valid and wp.isfinite(lanes.trial_error[s]):
+        error = lanes.trial_error[s]
+    lanes.iteration[s] = lanes.iteration[s] + 1
     if error <= MAX_ERROR:
-        slots.move[s] = TAKE
-        slots.share[s] = ONE
+        lanes.move[s] = TAKE_TRIAL
+        lanes.share[s] = ONE
     else:
-        if slots.viscosity[s] >= MOST_VISCOSITY:
-            slots.share[s] = wp.float64(0.5) * slots.share[s]
-        slots.phase[s] = START
-        if slots.iteration[s] >= MAX_STEPS or slots.share[s] < LEAST_SHARE:
-            slots.phase[s] = LOST
-    if slots.phase[s] == SEARCH and slots.trial_borne[s] < slots.borne[s]:
-        slots.phase[s] = LOST
-    slots.viscosity[s] = next_viscosity(slots.viscosity[s], error)
+        if lanes.viscosity[s] >= MOST_VISCOSITY:
+            lanes.share[s] = wp.float64(0.5) * lanes.share[s]
+        lanes.phase[s] = START
+        if lanes.iteration[s] >= MAX_STEPS or lanes.share[s] < LEAST_SHARE:
+            lanes.phase[s] = FAILED
+    if lanes.phase[s] == SEARCH and lanes.trial_held_force[s] < lanes.held_force[s]:
+        lanes.phase[s] = FAILED
+    lanes.viscosity[s] = next_viscosity(lanes.viscosity[s], error)

@@ -1,8 +1,8 @@
-r"""Quadratic elements kept from folding: a barrier at points where the bulk is not integrated, as Warp kernels.
+r"""Quadratic elements kept from inverting: a barrier at points where the bulk is not integrated, as Warp kernels.
 
 The bulk sees det F at four points of a P2 element. Under an edge that the mesh does not resolve det F can be positive
-there and negative at a corner, so that the surface folds over. At the points of a lattice of degree LATTICE over the
-element (its corners, edges and faces among them) an energy per undeformed volume
+there and negative at a corner, so that the surface folds over. At sample points, a lattice of degree SAMPLE_DEGREE over
+the element (its corners, edges and faces among them), an energy per undeformed volume
 
 .. math::  ψ(J) = \frac{μ}{3} t^3,  \quad t = \max(0, \ln (J_0 / J)), \qquad
            J ψ' = -μ t^2, \quad J^2 ψ'' + J ψ' = 2 μ t
@@ -20,14 +20,15 @@ import warp as wp
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 ONSET = 0.4
-"""J_0. The bulk's points of deep draws come down to 0.15; 0.3 to 0.5 gave the same forces within 0.2 %."""
-LATTICE = 3
-_ONSET = wp.constant(wp.float64(ONSET))
+"""J_0: below what a resolved mesh reaches in ordinary presses; forces hardly depend on it."""
+SAMPLE_DEGREE = 3
+"""Degree of the lattice of sample points: 20 of them in an element."""
+ONSET_JACOBIAN = wp.constant(wp.float64(ONSET))
 
 
 @wp.struct
-class Lattice:
-    """Tables of a pad's quadratic elements.
+class BarrierTables:
+    """The quadratic elements of a pad and the sample points in them.
 
     Attributes:
         nodes: (m, 10).
@@ -47,32 +48,32 @@ class Lattice:
 
 
 @wp.func
-def _at_corner(lattice: Lattice, u: wp.array2d(dtype=wp.vec3d), s: int, e: int, i: int) -> wp.mat33d:
+def corner_gradient(barrier: BarrierTables, u: wp.array2d(dtype=wp.vec3d), s: int, e: int, i: int) -> wp.mat33d:
     """F at corner i. An edge from it to corner j has the slope 4 u_middle - 3 u_i - u_j per unit of coordinate j."""
     F = wp.identity(n=3, dtype=wp.float64)
-    own = u[s, lattice.nodes[e, i]]
+    own = u[s, barrier.nodes[e, i]]
     for a in range(4, 10):
-        j = lattice.along[i, a]
+        j = barrier.along[i, a]
         if j >= 0:
-            edge = wp.float64(4.0) * u[s, lattice.nodes[e, a]] - wp.float64(3.0) * own - u[s, lattice.nodes[e, j]]
-            F += wp.outer(edge, lattice.gradient[e, j])
+            edge = wp.float64(4.0) * u[s, barrier.nodes[e, a]] - wp.float64(3.0) * own - u[s, barrier.nodes[e, j]]
+            F += wp.outer(edge, barrier.gradient[e, j])
     return F
 
 
 @wp.func
-def _shape_gradient(lattice: Lattice, at: wp.vec4d, e: int, a: int) -> wp.vec3d:
+def shape_gradient(barrier: BarrierTables, at: wp.vec4d, e: int, a: int) -> wp.vec3d:
     g = wp.vec3d()
     for i in range(4):
-        if lattice.along[i, a] >= 0:
-            g += (at[i] * lattice.share[i, a]) * lattice.gradient[e, lattice.along[i, a]]
+        if barrier.along[i, a] >= 0:
+            g += (at[i] * barrier.share[i, a]) * barrier.gradient[e, barrier.along[i, a]]
     return g
 
 
 @wp.kernel
-def fold_residual(
+def barrier_residual(
     u: wp.array2d(dtype=wp.vec3d),
     active: wp.array(dtype=wp.int32),
-    lattice: Lattice,
+    barrier: BarrierTables,
     residual: wp.array2d(dtype=wp.vec3d),
     jacobian: wp.array2d(dtype=wp.float64),
 ):
@@ -80,30 +81,30 @@ def fold_residual(
     s, e = wp.tid()
     if active[s] == 0:
         return
-    F0 = _at_corner(lattice, u, s, e, 0)
-    F1 = _at_corner(lattice, u, s, e, 1)
-    F2 = _at_corner(lattice, u, s, e, 2)
-    F3 = _at_corner(lattice, u, s, e, 3)
+    F0 = corner_gradient(barrier, u, s, e, 0)
+    F1 = corner_gradient(barrier, u, s, e, 1)
+    F2 = corner_gradient(barrier, u, s, e, 2)
+    F3 = corner_gradient(barrier, u, s, e, 3)
     smallest = jacobian[s, e]
-    for p in range(lattice.at.shape[0]):
-        at = lattice.at[p]
+    for p in range(barrier.at.shape[0]):
+        at = barrier.at[p]
         F = at[0] * F0 + at[1] * F1 + at[2] * F2 + at[3] * F3
         J = wp.determinant(F)
         smallest = wp.min(smallest, J)
-        if wp.float64(0.0) < J and J < _ONSET:
-            t = wp.log(_ONSET / J)
-            pull = -lattice.weight[e] * t * t
+        if wp.float64(0.0) < J and J < ONSET_JACOBIAN:
+            t = wp.log(ONSET_JACOBIAN / J)
+            pull = -barrier.weight[e] * t * t
             Fit = wp.transpose(wp.inverse(F))
             for a in range(10):
-                wp.atomic_add(residual, s, lattice.nodes[e, a], pull * (Fit * _shape_gradient(lattice, at, e, a)))
+                wp.atomic_add(residual, s, barrier.nodes[e, a], pull * (Fit * shape_gradient(barrier, at, e, a)))
     jacobian[s, e] = smallest
 
 
 @wp.kernel
-def fold_tangent(
+def barrier_tangent(
     u: wp.array2d(dtype=wp.vec3d),
     active: wp.array(dtype=wp.int32),
-    lattice: Lattice,
+    barrier: BarrierTables,
     pairs: wp.array(dtype=wp.vec2i),
     slot: wp.array3d(dtype=wp.int32),
     values: wp.array2d(dtype=wp.float64),
@@ -112,22 +113,22 @@ def fold_tangent(
     s, e = wp.tid()
     if active[s] == 0:
         return
-    F0 = _at_corner(lattice, u, s, e, 0)
-    F1 = _at_corner(lattice, u, s, e, 1)
-    F2 = _at_corner(lattice, u, s, e, 2)
-    F3 = _at_corner(lattice, u, s, e, 3)
-    for p in range(lattice.at.shape[0]):
-        at = lattice.at[p]
+    F0 = corner_gradient(barrier, u, s, e, 0)
+    F1 = corner_gradient(barrier, u, s, e, 1)
+    F2 = corner_gradient(barrier, u, s, e, 2)
+    F3 = corner_gradient(barrier, u, s, e, 3)
+    for p in range(barrier.at.shape[0]):
+        at = barrier.at[p]
         F = at[0] * F0 + at[1] * F1 + at[2] * F2 + at[3] * F3
         J = wp.determinant(F)
-        if J < _ONSET:
-            t = wp.log(_ONSET / J)
-            along = wp.float64(2.0) * t * lattice.weight[e]
-            across = t * t * lattice.weight[e]
+        if J < ONSET_JACOBIAN:
+            t = wp.log(ONSET_JACOBIAN / J)
+            along = wp.float64(2.0) * t * barrier.weight[e]
+            across = t * t * barrier.weight[e]
             Fit = wp.transpose(wp.inverse(F))
             for k in range(pairs.shape[0]):
-                ha = Fit * _shape_gradient(lattice, at, e, pairs[k][0])
-                hb = Fit * _shape_gradient(lattice, at, e, pairs[k][1])
+                ha = Fit * shape_gradient(barrier, at, e, pairs[k][0])
+                hb = Fit * shape_gradient(barrier, at, e, pairs[k][1])
                 block = along * wp.outer(ha, hb) + across * wp.outer(hb, ha)
                 for i in range(3):
                     for j in range(3):

@@ -1,9 +1,8 @@
 """The preconditioner of a whole batch: the inverse of the undeformed pad's stiffness, as one dense matrix.
 
-All slots share a mesh, so that K_0^{-1} times all their vectors is one matrix product (a loaded P2/P1 tangent needs
-8 to 40 iterations to 1e-3 with it). The inverse is found in double precision, on CUDA by cuSOLVER, and applied in TF32
-(`synth.simulate.batched.tf32`): a preconditioner that changes a little with its argument, which flexible GMRES allows
-for.
+All lanes share a mesh, so that K_0^{-1} times all their vectors is one matrix product. The inverse is found in double
+precision, on CUDA by cuSOLVER, and applied in TF32 (`synth.simulate.batched.tf32`): a preconditioner that changes a
+little with its argument, which flexible GMRES allows for.
 """
 
 import ctypes
@@ -14,7 +13,7 @@ import warp as wp
 
 from synth.arrays import FloatArray
 from synth.simulate.batched.gemm import Dense, dense
-from synth.simulate.batched.krylov import Krylov, padded, plain
+from synth.simulate.batched.krylov import Krylov, flat, padded
 from synth.simulate.batched.nvidia import call
 from synth.simulate.batched.tf32 import round_matrix
 from synth.simulate.contact import Indenters
@@ -61,7 +60,7 @@ def _inverse_by_cusolver(matrix: FloatArray, device: wp.Device) -> FloatArray:
     return np.asarray(values)
 
 
-class Reference:
+class Preconditioner:
     """K_0^{-1} on a device, filled up with zeros to as many rows as the Krylov vectors have.
 
     Args:
@@ -76,17 +75,9 @@ class Reference:
         filled[: len(inverse), : len(inverse)] = inverse
         self.matrix = wp.array(filled, dtype=wp.float32, device=device)
         wp.launch(round_matrix, self.matrix.shape, inputs=[self.matrix], device=device)
-        self._dense = products or dense(device)
+        self.dense = products or dense(device)
 
-    def precondition(self, krylov: Krylov) -> None:
+    def apply(self, krylov: Krylov) -> None:
         """`preconditioned` = K_0^{-1} `current`, at least where a solve is running."""
-        given, found = plain(krylov.current), plain(krylov.preconditioned)
-        self._dense.product(self.matrix, given, found, krylov.running)
-
-    def turn_corrected(self, krylov: Krylov) -> None:
-        """`corrected` = `preconditioned`, slots next to each other."""
-        self._dense.transpose(plain(krylov.preconditioned), krylov.corrected)
-
-    def turn_image(self, krylov: Krylov) -> None:
-        """`product` = `image`, rows next to each other."""
-        self._dense.transpose(krylov.image, plain(krylov.product))
+        given, found = flat(krylov.current), flat(krylov.preconditioned)
+        self.dense.product(self.matrix, given, found, krylov.running)

@@ -1,63 +1,78 @@
-"""Sums over a slot's nodes and faces, as Warp kernels: norms of the residual, forces, and what a record holds."""
+"""Sums over a lane's nodes and faces, as Warp kernels: norms of the residual, forces, and what a record holds."""
 
 # Kernels are written in Warp's own language; their annotations only look like Python's.
 # mypy: disable-error-code="valid-type, no-untyped-def"
 
 import warp as wp
 
-from synth.simulate.batched.fields import Fields
-from synth.simulate.batched.slots import PASS, RELAXING, Slots
+from synth.simulate.batched.fields import Fields, node_step
+from synth.simulate.batched.lanes import CORRECTION, RELAXING, Lanes
 from synth.simulate.contact import Faces, Indenters, position
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 BLOCK = 256
-"""Threads that sum a slot's residual. One thread that adds up what others found would take 0.1 ms for 200 numbers."""
+"""Threads that sum a lane's residual."""
 SLIPS = wp.constant(wp.float64(1.0 - 1.0e-6))
 """Share of the friction limit from which a point counts as slipping, as in `System.slip_ratio`."""
 SCALARS = 12
 """Numbers of a record before its fields: force (3), moment (3), touching and slipping area, then those of `write`."""
 
 
+@wp.struct
+class SurfaceTables:
+    """How points of the coated face give tractions to its nodes.
+
+    Attributes:
+        hat: (nq, ns) functions by which a face's points share in its nodes.
+        number: (f, ns) of a face's nodes among the surface's, -1 on other faces.
+        area: (s,) of the nodes, mm².
+    """
+
+    hat: wp.array2d(dtype=wp.float64)
+    number: wp.array2d(dtype=wp.int32)
+    area: wp.array(dtype=wp.float64)
+
+
 @wp.kernel
-def norms(
+def residual_norms(
     mask: wp.array(dtype=wp.int32),
     force: wp.array2d(dtype=wp.vec3d),
     volume: wp.array2d(dtype=wp.float64),
     jacobian: wp.array2d(dtype=wp.float64),
     node_row: wp.array(dtype=wp.int32),
     fields: Fields,
-    slots: Slots,
+    lanes: Lanes,
 ):
-    """One block per slot: the trial's norms (free residual, all forces), smallest det F, how far it went in a pass."""
-    s, lane = wp.tid()
+    """One block per lane: the trial's norms (free residual, all forces), smallest det F, how far it went in a pass."""
+    s, thread = wp.tid()
     if mask[s] == 0:
         return
     free = wp.float64(0.0)
     whole = wp.float64(0.0)
     smallest = wp.float64(1.0e30)
     farthest = wp.float64(0.0)
-    if slots.stage[s] == PASS:
-        for i in range(lane, force.shape[1], wp.block_dim()):
+    if lanes.stage[s] == CORRECTION:
+        for i in range(thread, force.shape[1], wp.block_dim()):
             farthest = wp.max(farthest, wp.length_sq(fields.trial_u[s, i] - fields.recorded_u[s, i]))
-    for i in range(lane, force.shape[1], wp.block_dim()):
+    for i in range(thread, force.shape[1], wp.block_dim()):
         square = wp.length_sq(force[s, i])
         whole += square
         if node_row[i] >= 0:
             free += square
-    for i in range(lane, volume.shape[1], wp.block_dim()):
+    for i in range(thread, volume.shape[1], wp.block_dim()):
         free += volume[s, i] * volume[s, i]
-    for i in range(lane, jacobian.shape[1], wp.block_dim()):
+    for i in range(thread, jacobian.shape[1], wp.block_dim()):
         smallest = wp.min(smallest, jacobian[s, i])
     free = wp.tile_extract(wp.tile_sum(wp.tile(free)), 0)
     whole = wp.tile_extract(wp.tile_sum(wp.tile(whole)), 0)
     smallest = wp.tile_extract(wp.tile_min(wp.tile(smallest)), 0)
     farthest = wp.tile_extract(wp.tile_max(wp.tile(farthest)), 0)
-    if lane == 0:
-        slots.trial_norm[s] = wp.sqrt(free)
-        slots.trial_force[s] = wp.sqrt(whole)
-        slots.trial_jacobian[s] = smallest
-        slots.trial_moved[s] = wp.sqrt(farthest)
+    if thread == 0:
+        lanes.trial_norm[s] = wp.sqrt(free)
+        lanes.trial_force[s] = wp.sqrt(whole)
+        lanes.trial_jacobian[s] = smallest
+        lanes.trial_moved[s] = wp.sqrt(farthest)
 
 
 @wp.kernel
@@ -69,49 +84,48 @@ def relaxation_errors(
     node_row: wp.array(dtype=wp.int32),
     pressure_row: wp.array(dtype=wp.int32),
     right: wp.array2d(dtype=wp.float32),
-    slots: Slots,
+    lanes: Lanes,
 ):
-    """One block per slot: the norm of r(u + t δ) - (1 - t) r(u) + t θ L δ over that of r(u), and what held
-    nodes bear, where a slot relaxes.
+    """One block per lane: the norm of r(u + t δ) - (1 - t) r(u) + t θ L δ over that of r(u), and what held
+    nodes bear, where a lane relaxes.
 
     right: (B, at least rows), first -r(u) over its norm, the linear solve's right side.
     """
-    s, lane = wp.tid()
-    if mask[s] == 0 or slots.relaxing[s] != RELAXING:
+    s, thread = wp.tid()
+    if mask[s] == 0 or lanes.relaxing[s] != RELAXING:
         return
     borne = wp.float64(0.0)
-    left = (wp.float64(1.0) - slots.share[s]) * slots.norm[s]
+    left = (wp.float64(1.0) - lanes.share[s]) * lanes.norm[s]
     total = wp.float64(0.0)
-    for i in range(lane, force.shape[1], wp.block_dim()):
+    for i in range(thread, force.shape[1], wp.block_dim()):
         row = node_row[i]
         if row >= 0:
-            before = wp.vec3d(wp.float64(right[s, row]), wp.float64(right[s, row + 1]), wp.float64(right[s, row + 2]))
-            total += wp.length_sq(force[s, i] + viscous[s, i] + left * before)
+            total += wp.length_sq(force[s, i] + viscous[s, i] + left * node_step(right, s, row))
         else:
             borne += wp.length_sq(force[s, i])
-    for i in range(lane, volume.shape[1], wp.block_dim()):
+    for i in range(thread, volume.shape[1], wp.block_dim()):
         rest = volume[s, i] + left * wp.float64(right[s, pressure_row[i]])
         total += rest * rest
     total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
     borne = wp.tile_extract(wp.tile_sum(wp.tile(borne)), 0)
-    if lane == 0:
-        slots.trial_borne[s] = wp.sqrt(borne)
-        slots.trial_error[s] = wp.sqrt(total) / slots.norm[s]
+    if thread == 0:
+        lanes.trial_held_force[s] = wp.sqrt(borne)
+        lanes.trial_error[s] = wp.sqrt(total) / lanes.norm[s]
 
 
 @wp.kernel
-def blank(mask: wp.array(dtype=wp.int32), slots: Slots, values: wp.array2d(dtype=wp.float64)):
-    """One thread per (slot, number): zeros for the sums, and no penetration."""
+def clear_sums(mask: wp.array(dtype=wp.int32), lanes: Lanes, values: wp.array2d(dtype=wp.float64)):
+    """One thread per (lane, number): zeros for the sums, and no penetration."""
     s, i = wp.tid()
     if mask[s] == 0:
         return
     values[s, i] = wp.float64(0.0)
-    slots.deepest[s] = wp.float64(0.0)
+    lanes.deepest[s] = wp.float64(0.0)
 
 
 @wp.kernel
-def depths(mask: wp.array(dtype=wp.int32), gap: wp.array3d(dtype=wp.float64), slots: Slots):
-    """One thread per (slot, face): the largest penetration."""
+def penetrations(mask: wp.array(dtype=wp.int32), gap: wp.array3d(dtype=wp.float64), lanes: Lanes):
+    """One thread per (lane, face): the largest penetration."""
     s, f = wp.tid()
     if mask[s] == 0:
         return
@@ -119,11 +133,11 @@ def depths(mask: wp.array(dtype=wp.int32), gap: wp.array3d(dtype=wp.float64), sl
     for q in range(gap.shape[2]):
         deepest = wp.max(deepest, -gap[s, f, q])
     if deepest > wp.float64(0.0):
-        wp.atomic_max(slots.deepest, s, deepest)
+        wp.atomic_max(lanes.deepest, s, deepest)
 
 
 @wp.kernel
-def forces(
+def contact_forces(
     mask: wp.array(dtype=wp.int32),
     u: wp.array2d(dtype=wp.vec3d),
     faces: Faces,
@@ -132,7 +146,7 @@ def forces(
     tangential: wp.array3d(dtype=wp.vec3d),
     sums: wp.array2d(dtype=wp.float64),
 ):
-    """One thread per (slot, face): adds the indenter's force, moment about the origin, touching and slipping area."""
+    """One thread per (lane, face): adds the indenter's force, moment about the origin, touching and slipping area."""
     s, f = wp.tid()
     if mask[s] == 0:
         return
@@ -164,15 +178,15 @@ def forces(
 
 
 @wp.kernel
-def write(
+def write_record(
     mask: wp.array(dtype=wp.int32),
-    slots: Slots,
+    lanes: Lanes,
     u: wp.array2d(dtype=wp.vec3d),
     sums: wp.array2d(dtype=wp.float64),
     surface: int,
     records: wp.array3d(dtype=wp.float64),
 ):
-    """One thread per (slot, node): a record's scalars and displacement, and zeros for its tractions.
+    """One thread per (lane, node): a record's scalars and displacement, and zeros for its tractions.
 
     records: (B, R, SCALARS + 3 n + 3 surface): force, moment, areas, residual, smallest det F, penetration and Newton
     iterations, then the displacement of all nodes and the traction at the surface's nodes.
@@ -180,14 +194,14 @@ def write(
     s, i = wp.tid()
     if mask[s] == 0:
         return
-    r = slots.records[s]
+    r = lanes.records[s]
     if i == 0:
         for k in range(8):
             records[s, r, k] = sums[s, k]
-        records[s, r, 8] = slots.relative[s]
-        records[s, r, 9] = slots.jacobian[s]
-        records[s, r, 10] = slots.deepest[s]
-        records[s, r, 11] = wp.float64(slots.total[s])
+        records[s, r, 8] = lanes.relative[s]
+        records[s, r, 9] = lanes.jacobian[s]
+        records[s, r, 10] = lanes.deepest[s]
+        records[s, r, 11] = wp.float64(lanes.total[s])
     first = 12 + 3 * i
     for k in range(3):
         records[s, r, first + k] = u[s, i][k]
@@ -200,28 +214,23 @@ def write(
 @wp.kernel
 def write_tractions(
     mask: wp.array(dtype=wp.int32),
-    slots: Slots,
+    lanes: Lanes,
     faces: Faces,
-    hat: wp.array2d(dtype=wp.float64),
-    number: wp.array2d(dtype=wp.int32),
-    area: wp.array(dtype=wp.float64),
+    surface: SurfaceTables,
     traction: wp.array3d(dtype=wp.vec3d),
     nodes: int,
     records: wp.array3d(dtype=wp.float64),
 ):
-    """One thread per (slot, face): adds its share to the tractions at the surface's nodes, see `System.forces`.
-
-    hat: (nq, ns); number: (f, ns) of a face's nodes in the surface, -1 on other faces; area: (s,) of the nodes' hats.
-    """
+    """One thread per (lane, face): adds its share to the tractions at the surface's nodes, see `System.forces`."""
     s, f = wp.tid()
-    if mask[s] == 0 or number[f, 0] < 0:
+    if mask[s] == 0 or surface.number[f, 0] < 0:
         return
-    r = slots.records[s]
-    for a in range(number.shape[1]):
+    r = lanes.records[s]
+    for a in range(surface.number.shape[1]):
         share = wp.vec3d()
-        for q in range(hat.shape[0]):
-            share += (faces.weight[f, q] * hat[q, a]) * traction[s, f, q]
-        node = number[f, a]
+        for q in range(surface.hat.shape[0]):
+            share += (faces.weight[f, q] * surface.hat[q, a]) * traction[s, f, q]
+        node = surface.number[f, a]
         if wp.length_sq(share) > wp.float64(0.0):
             for k in range(3):
-                wp.atomic_add(records, s, r, 12 + 3 * nodes + 3 * node + k, share[k] / area[node])
+                wp.atomic_add(records, s, r, 12 + 3 * nodes + 3 * node + k, share[k] / surface.area[node])

@@ -1,0 +1,130 @@
+"""Presses as tables for the device, and trajectories from what their lanes recorded."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from synth.arrays import FloatArray
+from synth.simulate.batched.lanes import COMPLETE, NO_EQUILIBRIUM, Presses
+from synth.simulate.batched.reductions import SCALARS
+from synth.simulate.distance import shape_vector
+from synth.simulate.press import Press
+from synth.simulate.space import Space
+from synth.simulate.tables import warp_array
+from synth.simulate.trajectory import State, Trajectory, no_balance, no_contact, trajectory_of
+
+
+def press_tables(
+    presses: Sequence[Press], frames: Sequence[frozenset[int]] | None, d: str
+) -> tuple[Presses, tuple[int, int, int]]:
+    """All presses on Warp device d, and the counts of their largest distance grid.
+
+    Args:
+        presses: N of one pad.
+        frames: numbers of each press's states that are to be corrected, default all.
+        d: Warp device.
+    """
+    paths = [press.path for press in presses]
+    bodies = [path.body for path in paths]
+    kinds = []
+    for number, path in enumerate(paths):
+        wanted = None if frames is None else frames[number]
+        kind = {float(r): 2 if wanted is None or k in wanted else 1 for k, r in enumerate(path.records(), 1)}
+        kinds.append(np.array([kind.get(float(stop), 0) for stop in path.waypoints()]))
+    grids = {_grid_key(body.coefficients): body.coefficients for body in bodies}
+    numbers = {key: number for number, key in enumerate(grids)}
+    counts = tuple(int(n) for n in np.max([grid.shape for grid in grids.values()], axis=0))
+    padded = np.zeros((len(grids), *counts))
+    for room, grid in zip(padded, grids.values(), strict=True):
+        room[tuple(slice(0, n) for n in grid.shape)] = grid
+    size_mm = presses[0].mesh.size_mm
+    columns: dict[str, tuple[Sequence[object] | np.ndarray, type]] = {
+        "corners": (_stacked([path.corners for path in paths]), wp.vec4d),
+        "ends": (_stacked([path.ends for path in paths]), wp.float64),
+        "legs": ([len(path.ends) for path in paths], wp.int32),
+        "waypoints": (_stacked([path.waypoints() for path in paths]), wp.float64),
+        "kind_of": (_stacked(kinds), wp.int32),
+        "stops": ([len(path.waypoints()) for path in paths], wp.int32),
+        "press_end": ([path.press_mm for path in paths], wp.float64),
+        "deepest": ([max(float(path.corners[:, 0].max()), 0.1) for path in paths], wp.float64),
+        "over_pad": ([path.is_over(size_mm) for path in paths], wp.int32),
+        "position": (np.array([path.motion.position_mm for path in paths], dtype=np.float64), wp.vec2d),
+        "reach": ([path.body.reach_mm - path.face_mm for path in paths], wp.float64),
+        "rotation": ([body.rotation for body in bodies], wp.mat33d),
+        "kind": ([body.kind for body in bodies], wp.int32),
+        "shape": ([body.shape for body in bodies], shape_vector),
+        "grid": ([numbers[_grid_key(body.coefficients)] for body in bodies], wp.int32),
+        "grids": (padded.reshape(len(grids), -1), wp.float64),
+        "friction": (np.array([press.scene.contact.friction for press in presses], dtype=np.float64), wp.float64),
+        "sharpness": ([body.sharpness for body in bodies], wp.float64),
+    }
+    table = Presses()
+    for name, (values, dtype) in columns.items():
+        setattr(table, name, warp_array(np.array(values), dtype, d))
+    return table, (counts[0], counts[1], counts[2])
+
+
+def _grid_key(grid: FloatArray) -> tuple[bytes, tuple[int, ...]]:
+    return grid.tobytes(), grid.shape
+
+
+def _stacked(arrays: Sequence[np.ndarray]) -> np.ndarray:
+    """Arrays of unequal lengths, filled up with zeros."""
+    longest = max(len(array) for array in arrays)
+    stacked = np.zeros((len(arrays), longest, *arrays[0].shape[1:]), dtype=arrays[0].dtype)
+    for row, array in zip(stacked, arrays, strict=True):
+        row[: len(array)] = array
+    return stacked
+
+
+def untouched(press: Press, space: Space) -> Trajectory:
+    """The trajectory of an indenter that never touches: the gel stays as it is."""
+    rest = np.zeros(SCALARS + 3 * len(space.points) + 3 * len(space.surface_nodes))
+    rest[9] = 1.0
+    states = tuple(_state(press, length, rest, space) for length in (0.0, *map(float, press.path.records())))
+    return Trajectory(states, "complete", "", 0.0, space)
+
+
+def trajectory(
+    press: Press, records: FloatArray, ended: tuple[int, float, float], seconds: float, space: Space
+) -> Trajectory:
+    """The trajectory of a press.
+
+    Args:
+        press: that ran in a lane.
+        records: (r, ...) what the lane wrote, see `synth.simulate.batched.reductions.write_record`.
+        ended: code of the reason, path length reached, and where the next step would have led, mm.
+        seconds: its share of the run time.
+        space: of the pad.
+    """
+    states = [untouched(press, space).states[0]]
+    for length, record in zip(press.path.records(), records, strict=False):
+        states.append(_state(press, float(length), record, space))
+    code, reached, target = ended
+    reason = "" if code == COMPLETE else no_contact(target)
+    if code == NO_EQUILIBRIUM:
+        reason = no_balance(target - reached, press.path.pose(reached))
+    return trajectory_of(tuple(states), reason, seconds, space)
+
+
+def _state(press: Press, length: float, record: FloatArray, space: Space) -> State:
+    pose, modulus_mpa = press.path.pose(length), press.scene.sensor.gel.youngs_modulus_kpa / 1000
+    scalars, fields = record[:SCALARS].tolist(), record[SCALARS:]
+    end = 3 * len(space.points)
+    fx, fy, fz, mx, my, mz = (modulus_mpa * value for value in scalars[:6])
+    touching, slipping, residual, smallest, deepest, iterations = scalars[6:]
+    return State(
+        depth_mm=pose.depth_mm,
+        shear_mm=pose.shear_mm,
+        twist_deg=pose.twist_deg,
+        displacement=fields[:end].reshape(-1, 3).copy(),
+        traction=modulus_mpa * fields[end:].reshape(-1, 3),
+        force_n=(fx, fy, fz),
+        torque_nmm=(mx, my, mz),
+        newton_iterations=int(iterations),
+        residual=residual,
+        min_jacobian=smallest,
+        max_penetration_mm=deepest,
+        slip_ratio=slipping / touching if touching > 0 else 0.0,
+    )

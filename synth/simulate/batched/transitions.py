@@ -1,0 +1,289 @@
+"""What happens next to a lane, as Warp kernels of one thread a lane.
+
+The rules are those of `synth.simulate.newton` and `synth.simulate.stepping`, whose constants they use; what differs
+is that each lane follows them at its own pace, that passes are solved to a share of the full tolerance, and that where
+intermediate steps have a relaxed tolerance the full one holds for what is recorded only. A step that ends at a recorded
+state, and every pass but the last, then has the relaxed tolerance: what they find is changed by the next pass. A state
+without passes, or whose passes end early, because they fail or nothing is deep any more, is brought to the full
+tolerance before it is recorded (POLISH); where that fails, the step is halved as if it had not been taken. The load
+path goes on from the state before, so that it does not depend on which states are corrected.
+"""
+
+# Kernels are written in Warp's own language; their annotations only look like Python's.
+# mypy: disable-error-code="valid-type, no-untyped-def"
+
+import warp as wp
+
+from synth.simulate import newton, stepping
+from synth.simulate.batched import lanes as phases
+from synth.simulate.batched.lanes import Lanes, Presses, Settings
+from synth.simulate.batched.relaxation import FIRST_VISCOSITY, LEAST_BORNE, MAX_STEPS, evaluate_relaxation
+
+wp.set_module_options({"enable_backward": False, "fast_math": False})
+
+ZERO = wp.constant(wp.float64(0.0))
+ONE = wp.constant(wp.float64(1.0))
+NOTHING = wp.constant(wp.float64(newton.NOTHING))
+INDIFFERENT = wp.constant(wp.float64(newton.INDIFFERENT))
+SHORTEST = wp.constant(wp.float64(newton.SHORTEST))
+SHORTEST_STEP = wp.constant(wp.float64(stepping.SHORTEST_STEP))
+GROWTH = wp.constant(wp.float64(stepping.GROWTH))
+EASY = wp.constant(stepping.EASY)
+FAILURES = wp.constant(stepping.FAILURES)
+ENOUGH = wp.constant(wp.float64(stepping.ENOUGH))
+PENETRATION = wp.constant(wp.float64(stepping.PENETRATION))
+REACH = wp.constant(wp.float64(stepping.REACH))
+MIN_TOLERANCE = wp.constant(wp.float64(1.0e-12))
+"""Of a pass: somewhat more than rounding leaves."""
+SUFFICIENT_DECREASE = wp.constant(wp.float64(1.0e-4))
+STALL_ITERATIONS = wp.constant(5)
+STALLED_RESIDUAL = wp.constant(wp.float64(0.5))
+"""Newton's method ends after STALL_ITERATIONS iterations where the relative residual is still so large."""
+NEAR = wp.constant(wp.float64(newton.NEAR))
+SHORT = wp.constant(wp.float64(stepping.RELAXED))
+
+
+@wp.kernel
+def evaluate_trial(lanes: Lanes, settings: Settings):
+    """After an evaluation: is the trial taken, and is it the solution?"""
+    s = wp.tid()
+    phase = lanes.phase[s]
+    lanes.move[s] = 0
+    norm = lanes.trial_norm[s]
+    relative = norm / wp.max(lanes.trial_force[s], NOTHING)
+    valid = lanes.trial_jacobian[s] > ZERO
+    if phase == phases.FRESH:
+        lanes.phase[s] = phases.FIRST
+        return
+    if phase == phases.PREDICTOR:
+        lanes.norm[s] = norm
+        lanes.phase[s] = phases.PREDICTOR_READY
+        return
+    if phase != phases.START and phase != phases.SEARCH and phase != phases.RESTORED:
+        return
+    if phase == phases.START and not valid:
+        if lanes.predicted[s] == 1:
+            lanes.predicted[s] = 0
+            lanes.move[s] = phases.RESET
+        else:
+            lanes.phase[s] = phases.FAILED
+        return
+    if phase == phases.START and lanes.relaxing[s] == phases.RELAXING and lanes.iteration[s] == 0:
+        lanes.held_force[s] = LEAST_BORNE * lanes.trial_held_force[s]
+    if phase == phases.SEARCH and lanes.relaxing[s] == phases.RELAXING:
+        evaluate_relaxation(lanes, s, valid)
+        if lanes.phase[s] != phases.SEARCH:
+            return
+    elif phase == phases.SEARCH:
+        scale = lanes.scale[s]
+        if not (valid and (norm <= lanes.norm[s] * (ONE - SUFFICIENT_DECREASE * scale) or scale < INDIFFERENT)):
+            lanes.scale[s] = wp.float64(0.5) * scale
+            if lanes.scale[s] < SHORTEST:
+                lanes.phase[s] = phases.FAILED
+            return
+        lanes.move[s] = phases.TAKE_TRIAL
+        lanes.iteration[s] = lanes.iteration[s] + 1
+    too_far = lanes.stage[s] == phases.CORRECTION and lanes.trial_moved[s] > lanes.most_moved[s]
+    lanes.norm[s] = norm
+    lanes.relative[s] = relative
+    lanes.jacobian[s] = lanes.trial_jacobian[s]
+    iteration = lanes.iteration[s]
+    limit = lanes.limit[s]
+    spent = iteration == 2 * limit or (iteration >= limit and relative > NEAR)
+    stalled = iteration >= STALL_ITERATIONS and relative >= STALLED_RESIDUAL
+    if lanes.relaxing[s] == phases.RELAXING:
+        spent = iteration >= MAX_STEPS
+        stalled = False
+    if phase == phases.RESTORED:
+        lanes.phase[s] = phases.CORRECTING
+    elif too_far:
+        lanes.phase[s] = phases.FAILED
+    elif relative <= lanes.tolerance[s] and (iteration > 0 or relative == ZERO):
+        lanes.phase[s] = phases.SOLVED
+    elif (not wp.isfinite(relative)) or stalled or spent:
+        lanes.phase[s] = phases.FAILED
+    else:
+        lanes.phase[s] = phases.READY
+
+
+@wp.kernel
+def finish_solve(lanes: Lanes, presses: Presses, settings: Settings):
+    """After Newton's method: accept, halve, or end the step; count the pass or undo it."""
+    s = wp.tid()
+    phase = lanes.phase[s]
+    lanes.move[s] = 0
+    if phase != phases.SOLVED and phase != phases.FAILED:
+        return
+    lanes.total[s] = lanes.total[s] + lanes.iteration[s]
+    if lanes.stage[s] == phases.CORRECTION:
+        if phase == phases.SOLVED:
+            lanes.done[s] = lanes.done[s] + lanes.share[s]
+            lanes.share[s] = wp.min(ONE, wp.float64(2.0) * lanes.share[s])
+            lanes.phase[s] = phases.CORRECTING
+        else:
+            lanes.failures[s] = lanes.failures[s] + 1
+            lanes.share[s] = wp.float64(0.5) * lanes.share[s]
+            lanes.move[s] = phases.RESTORE_RECORDED
+            lanes.phase[s] = phases.RESTORED
+        return
+    polish = lanes.stage[s] == phases.POLISH
+    step = lanes.target[s] - lanes.at[s]
+    if phase == phases.FAILED and lanes.relaxing[s] == 0 and not polish and step <= SHORT * settings.longest:
+        lanes.relaxing[s] = phases.RELAXING
+        lanes.viscosity[s] = FIRST_VISCOSITY
+        lanes.share[s] = ONE
+        lanes.iteration[s] = 0
+        lanes.predicted[s] = 0
+        lanes.move[s] = phases.RESET
+        lanes.phase[s] = phases.START
+        return
+    lanes.viscosity[s] = ZERO
+    if lanes.relaxing[s] == phases.RELAXING:
+        lanes.relaxing[s] = phases.RELAXED
+    if phase == phases.FAILED:
+        lanes.step[s] = wp.float64(0.5) * (lanes.target[s] - lanes.at[s])
+        lanes.has_previous[s] = 0
+        lanes.phase[s] = phases.BEGIN
+        if polish:
+            lanes.move[s] = phases.ROLL_BACK
+            lanes.phase[s] = phases.ROLLED_BACK
+        if lanes.step[s] < SHORTEST_STEP * settings.longest:
+            lanes.reason[s] = phases.NO_EQUILIBRIUM
+            lanes.phase[s] = phases.ENDED
+        return
+    if polish:
+        lanes.phase[s] = phases.RECORD
+        return
+    lanes.step_iterations[s] = lanes.iteration[s]
+    lanes.move[s] = phases.ACCEPT
+    j = lanes.press[s]
+    stop = lanes.next[s]
+    lanes.phase[s] = phases.ADVANCE
+    if lanes.target[s] == presses.waypoints[j, stop] and presses.kind_of[j, stop] > 0:
+        lanes.phase[s] = phases.AT_RECORD
+
+
+@wp.kernel
+def check_contact(lanes: Lanes, presses: Presses, sums: wp.array2d(dtype=wp.float64)):
+    """At a recorded state: end where the indenter meets no resistance; else save contact's memory, to correct it."""
+    s = wp.tid()
+    lanes.save[s] = 0
+    lanes.anchor[s] = 0
+    if lanes.phase[s] != phases.AT_RECORD:
+        return
+    j = lanes.press[s]
+    if lanes.target[s] == presses.press_end[j] and presses.over_pad[j] == 1 and sums[s, 2] <= NOTHING:
+        lanes.reason[s] = phases.NO_CONTACT
+        lanes.phase[s] = phases.ENDED
+        return
+    lanes.save[s] = 1
+    lanes.failures[s] = 0
+    lanes.share[s] = ONE
+    lanes.done[s] = ZERO
+    lanes.phase[s] = phases.CORRECTING
+    if presses.kind_of[j, lanes.next[s]] == 2:
+        lanes.anchor[s] = 1
+
+
+@wp.kernel
+def choose_pass(lanes: Lanes, presses: Presses, settings: Settings):
+    """Another pass, the full tolerance, or the record."""
+    s = wp.tid()
+    lanes.new_share[s] = ZERO
+    if lanes.phase[s] != phases.CORRECTING:
+        return
+    j = lanes.press[s]
+    too_deep = lanes.deepest[s] > PENETRATION * presses.deepest[j]
+    over = lanes.failures[s] == FAILURES or lanes.done[s] >= ENOUGH or not too_deep
+    over = over or presses.kind_of[j, lanes.next[s]] == 1
+    if over and lanes.relative[s] <= settings.tolerance:
+        lanes.phase[s] = phases.RECORD
+        return
+    lanes.tolerance[s] = settings.tolerance
+    if over:
+        lanes.stage[s] = phases.POLISH
+        lanes.limit[s] = settings.limit
+    else:
+        lanes.new_share[s] = lanes.share[s]
+        lanes.stage[s] = phases.CORRECTION
+        lanes.most_moved[s] = REACH * lanes.deepest[s]
+        lanes.limit[s] = settings.correction_limit
+        lanes.tolerance[s] = wp.max(settings.closer * settings.tolerance, MIN_TOLERANCE)
+        if lanes.done[s] + lanes.share[s] < ENOUGH:
+            lanes.tolerance[s] = wp.max(settings.loose, lanes.tolerance[s])
+    lanes.iteration[s] = 0
+    lanes.predicted[s] = 0
+    lanes.phase[s] = phases.START
+
+
+@wp.kernel
+def finish_record(lanes: Lanes):
+    """After the record, or the way back."""
+    s = wp.tid()
+    if lanes.phase[s] == phases.ROLLED_BACK:
+        lanes.phase[s] = phases.BEGIN
+    if lanes.phase[s] == phases.RECORD:
+        lanes.records[s] = lanes.records[s] + 1
+        lanes.total[s] = 0
+        lanes.phase[s] = phases.ADVANCE
+
+
+@wp.func
+def _turns(presses: Presses, j: int, before: wp.float64, now: wp.float64) -> bool:
+    """`Path.turns_between`."""
+    turns = wp.int32(0)
+    for k in range(presses.legs[j]):
+        if presses.ends[j, k] > before and presses.ends[j, k] <= now:
+            turns = wp.int32(1)
+    return turns == 1
+
+
+@wp.kernel
+def choose_target(lanes: Lanes, presses: Presses, settings: Settings):
+    """After an accepted step its length and the next waypoint; then the next target and its first iterate's kind."""
+    s = wp.tid()
+    j = lanes.press[s]
+    lanes.move[s] = 0
+    phase = lanes.phase[s]
+    if phase == phases.ADVANCE:
+        target = lanes.target[s]
+        taken = target - lanes.at[s]
+        lanes.previous[s] = lanes.at[s]
+        lanes.has_previous[s] = settings.extrapolate
+        if lanes.relaxing[s] == phases.RELAXED:
+            lanes.has_previous[s] = 0
+        lanes.at[s] = target
+        if target == presses.waypoints[j, lanes.next[s]]:
+            lanes.next[s] = lanes.next[s] + 1
+        if lanes.step_iterations[s] <= EASY:
+            lanes.step[s] = wp.min(settings.longest, GROWTH * wp.max(taken, lanes.step[s] / GROWTH))
+        phase = phases.BEGIN
+        if lanes.next[s] == presses.stops[j]:
+            lanes.reason[s] = phases.COMPLETE
+            phase = phases.ENDED
+    elif phase == phases.FIRST:
+        phase = phases.BEGIN
+    if phase == phases.BEGIN:
+        at = lanes.at[s]
+        goal = presses.waypoints[j, lanes.next[s]]
+        parts = wp.ceil((goal - at) / lanes.step[s] - wp.float64(1.0e-9))
+        lanes.target[s] = goal
+        lanes.tolerance[s] = settings.tolerance
+        if parts > ONE:
+            lanes.target[s] = at + (goal - at) / parts
+        if parts > ONE or presses.kind_of[j, lanes.next[s]] > 0:
+            lanes.tolerance[s] = wp.max(settings.loose, settings.tolerance)
+        lanes.stage[s] = phases.STEP
+        lanes.iteration[s] = 0
+        lanes.limit[s] = settings.limit
+        lanes.relaxing[s] = 0
+        lanes.ratio[s] = ZERO
+        lanes.predicted[s] = 0
+        lanes.move[s] = phases.RESET
+        phase = phases.START
+        if lanes.has_previous[s] == 1 and not _turns(presses, j, lanes.previous[s], at):
+            lanes.ratio[s] = (lanes.target[s] - at) / (at - lanes.previous[s])
+            lanes.predicted[s] = 1
+        elif presses.friction[j] > ZERO and at > ZERO:
+            phase = phases.PREDICTOR
+    lanes.phase[s] = phase
