@@ -25,8 +25,9 @@ from synth.scene.sampling import draw, pairs_of
 from synth.scene.template import load_scene
 from synth.simulate import simulate
 from synth.simulate.footprint import footprint
+from synth.simulate.mesh_rule import MeshRule
 from synth.simulate.path import path_of
-from synth.simulate.resolution import MARGIN, graded_mesh, resolve, scale_px_per_mm
+from synth.simulate.resolution import MARGIN, graded_mesh, scale_px_per_mm
 
 TINY = """
 name = "tiny"
@@ -118,7 +119,8 @@ def test_reference_is_finer_every_way() -> None:
     for index in (3, 12):  # the smallest and the largest contact of the first twenty
         scene = drawn(template, 2, index)
         gel, folder = scene.sensor.gel, template.source.parent
-        zone, chosen_mm = footprint(path_of(scene, folder), gel.size_mm, MARGIN), resolve(scene, folder).spacing_mm
+        zone = footprint(path_of(scene, folder), gel.size_mm, MARGIN)
+        chosen_mm = MeshRule.of(scene.numerics).resolution(scene, folder).spacing_mm
         mesh, across, fine = reference_mesh(gel, zone, chosen_mm, 18)
         assert 2.4 * fine <= chosen_mm < 2.4 * fine * across / (across - 2)
         assert reference_mesh(gel, zone, chosen_mm, 8)[1] == 8
@@ -166,7 +168,7 @@ def test_the_command(tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[s
         assert 0 < errors[-1] < errors[0]
         (chosen,) = [row for row in others if row["chosen"]]
         scene = draw(template, 2, index)
-        best = resolve(scene, tiny.parent)
+        best = MeshRule.of(scene.numerics).resolution(scene, tiny.parent)
         assert chosen["mesh"] == f"{best.across}x{best.through}"
         assert chosen["predicted_px"] == pytest.approx(best.error_px)
         within += chosen["error_px"] <= 0.0065
