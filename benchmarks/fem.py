@@ -137,11 +137,10 @@ def stepper_of(scene: Scene, mesh: PadMesh, setting: Setting) -> Stepper:
     """A case at the start of its path, with elements and contact points that scenes do not offer, too."""
     numerics = scene.numerics.model_copy(update=setting.numerics)
     space = function_space(mesh, ELEMENTS[setting.element](setting.contact_split))
-    driver, modulus = setting.driver, scene.sensor.gel.youngs_modulus_kpa / 1000
-    material, single, keep = pad_material(scene.sensor.gel, mesh), driver.single_precision, driver.keep_factors
-    system = System(space, material, penalty=numerics.penalty, single=single, keep=keep)
+    gel, driver = scene.sensor.gel, setting.driver
+    system = System(space, pad_material(gel, mesh), numerics.penalty, driver=driver)
     path = path_of(scene, None, space.resolution_mm)
-    return Stepper(system, [path], [scene.contact.friction], numerics, [modulus], driver)
+    return Stepper(system, path, scene.contact.friction, numerics, gel.youngs_modulus_kpa / 1000, driver)
 
 
 def forces(trajectory: Trajectory, states: list[int]) -> np.ndarray:
@@ -173,7 +172,7 @@ def reference(case: str, across: int) -> Trajectory:
     """
     setting = Setting("reference", ("wide", across, 5), driver=Driver(correction_iterations=MAX_ITERATIONS))
     scene = CASES[case]
-    found = stepper_of(scene, mesh_of(setting.mesh, scene), setting).run()[0]
+    found = stepper_of(scene, mesh_of(setting.mesh, scene), setting).run()
     deepest = max(state.max_penetration_mm for state in found.states)
     if found.status != "complete" or deepest > LARGEST_PENETRATION_MM:
         raise RuntimeError(f"the reference of {case} is {found.status}, {deepest:.2g} mm in the ball")
@@ -193,7 +192,7 @@ def press(case: Row, settings: dict[tuple[str, str], Setting]) -> Row:
     truth = reference(case["case"], case["reference"])
     mesh = mesh_of(setting.mesh, scene)
     compile_kernels(setting.element, setting.contact_split)
-    found, seconds = timed(lambda: stepper_of(scene, mesh, setting).run()[0])
+    found, seconds = timed(lambda: stepper_of(scene, mesh, setting).run())
     complete = found.status == "complete"
     return {
         "status": found.status,

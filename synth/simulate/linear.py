@@ -53,21 +53,21 @@ def direct_factor(indptr: np.ndarray, indices: np.ndarray, single: bool = True) 
 
 
 class Directions:
-    """Solves the linear systems of one sample, one after another.
+    """Solves the linear systems of one press, one after another.
 
     Neighbouring tangents differ where contact changed. With the factor of an earlier one GMRES takes some 6 iterations
     to ROUGH_TOLERANCE; a factor of 7,000 to 14,000 unknowns costs as much as 10 to 15 of them.
 
     Args:
-        factor: of this sample's matrices; others may use it, too, and then this sample begins with a new one.
+        factor: of this press's matrices; others may use it, too, and then this press begins with a new one.
         keep: solve roughly where that is enough, with factors of earlier matrices.
     """
 
     def __init__(self, factor: Factor, keep: bool) -> None:
         self._factor, self._keep = factor, keep
-        self._own = -1  # number of the factor's matrix that was this sample's last
+        self._own = -1  # number of the factor's matrix that was this press's last
 
-    def begin(self) -> None:
+    def forget(self) -> None:
         """Start with a new factor: what is solved next has nothing to do with what was solved before."""
         self._own = -1
 
@@ -117,7 +117,7 @@ def gmres(
         y = matrix @ x + transposed @ x - diagonal * x
         return np.asarray(y if remainder is None else y + remainder @ x)
 
-    size = _norm(right)
+    size = norm(right)
     if size == 0:
         return np.zeros_like(right), 0, 0.0
     basis: list[FloatArray] = [right / size]
@@ -131,14 +131,14 @@ def gmres(
         if not np.isfinite(w).all():
             return np.full_like(right, np.nan), k, np.inf
         for i in range(k + 1):
-            hessenberg[i, k] = float(np.sum(w * basis[i]))  # np.sum: the same bits whatever the number of BLAS threads
+            hessenberg[i, k] = float(np.sum(w * basis[i]))  # as in `norm`
             w -= hessenberg[i, k] * basis[i]
-        hessenberg[k + 1, k] = _norm(w)
+        hessenberg[k + 1, k] = norm(w)
         small = hessenberg[: k + 2, : k + 1]
         first = np.zeros(k + 2)
         first[0] = size
         weights = np.asarray(np.linalg.lstsq(small, first, rcond=None)[0], dtype=np.float64)
-        left = _norm(small @ weights - first) / size
+        left = norm(small @ weights - first) / size
         if left < tolerance or hessenberg[k + 1, k] == 0:
             break
         basis.append(w / hessenberg[k + 1, k])
@@ -148,7 +148,8 @@ def gmres(
     return solution, len(corrections), left
 
 
-def _norm(x: FloatArray) -> float:
+def norm(x: FloatArray) -> float:
+    """Euclidean norm of all entries: the same bits whatever the number of BLAS threads."""
     return float(np.sqrt(np.sum(x * x)))
 
 
@@ -177,7 +178,7 @@ class PardisoFactor:
     """MKL Pardiso, symmetric indefinite (mtype -2), one thread: two presses side by side use two cores better.
 
     Matching and scaling are off: they would make the analysis, and so the last bits of every later solution, depend on
-    the values of the first matrix, that is on which sample of a batch came first.
+    the values of the first matrix, that is on which press came first.
     """
 
     ANALYSE, FACTORISE, SOLVE, RELEASE = 11, 22, 33, -1

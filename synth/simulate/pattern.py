@@ -51,7 +51,7 @@ class Pattern:
         self.face_pairs = _pairs(space.faces.shape[1])
         self.face_slot = self._blocks(faces, self.face_pairs)
         self.face_unknowns = faces.reshape(len(faces), -1)
-        self._factors: dict[tuple[bool, int], Factor] = {}
+        self._factors: dict[bool, Factor] = {}
         del self._keys
 
     @property
@@ -59,12 +59,11 @@ class Pattern:
         """Number of entries."""
         return len(self.indices)
 
-    def factor(self, single: bool = True, sample: int = 0) -> Factor:
-        """The factor of a sample of a batch, in single or double precision; analysed once."""
-        key = (single, sample)
-        if key not in self._factors:
-            self._factors[key] = direct_factor(self.indptr, self.indices, single)
-        return self._factors[key]
+    def factor(self, single: bool = True) -> Factor:
+        """A factor of this pattern, in single or double precision; analysed once."""
+        if single not in self._factors:
+            self._factors[single] = direct_factor(self.indptr, self.indices, single)
+        return self._factors[single]
 
     def _couple(self, moves: np.ndarray, pressures: np.ndarray | None) -> None:
         import scipy.sparse as sp

@@ -20,7 +20,7 @@ COARSE = {"max_step_mm": 0.5}
 @pytest.fixture(scope="module")
 def shallow() -> Trajectory:
     setting = Setting("", ("graded", 2), "P1/P1", numerics=COARSE)
-    return stepper_of(SHALLOW, mesh_of(setting.mesh, SHALLOW), setting).run()[0]
+    return stepper_of(SHALLOW, mesh_of(setting.mesh, SHALLOW), setting).run()
 
 
 def posed(trajectory: Trajectory, displacement: np.ndarray, force: tuple[float, float, float]) -> Trajectory:
@@ -63,7 +63,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     monkeypatch.setattr(fem, "settings_of", lambda every, across: {"shallow": ways})
     monkeypatch.setattr(fem, "reference", lambda case, across: reference)
     setting = Setting("", ("wide", 8, 2))
-    reference = stepper_of(SHALLOW, mesh_of(setting.mesh, SHALLOW), setting).run()[0]
+    reference = stepper_of(SHALLOW, mesh_of(setting.mesh, SHALLOW), setting).run()
     assert fem.main(["--out", str(tmp_path)]) == 0
     plain, coarse, fine = read(tmp_path / "fem.csv")
     assert {row["status"] for row in (plain, coarse, fine)} == {"complete"}
@@ -82,7 +82,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
 
 def test_references_that_are_none_are_refused(monkeypatch: pytest.MonkeyPatch, shallow: Trajectory) -> None:
     lost = replace(shallow, status="partial")
-    monkeypatch.setattr(fem, "stepper_of", lambda *_: type("Ended", (), {"run": lambda self: [lost]})())
+    monkeypatch.setattr(fem, "stepper_of", lambda *_: type("Ended", (), {"run": lambda self: lost})())
     with pytest.raises(RuntimeError, match="is partial"):
         fem.reference.__wrapped__("centred", 8)
 

@@ -65,7 +65,7 @@ def alone(posed: Scene, mesh: PadMesh, folder: FilePath | None = None) -> Trajec
     space = function_space(mesh, ELEMENT[posed.numerics.element]())
     body = System(space, pad_material(posed.sensor.gel, mesh), penalty=posed.numerics.penalty)
     path = path_of(posed, folder, mesh.spacing_mm / (2 * space.element.order))
-    return Stepper(body, [path], [posed.contact.friction], posed.numerics, [0.2], DRIVER).run()[0]
+    return Stepper(body, path, posed.contact.friction, posed.numerics, 0.2, DRIVER).run()
 
 
 def together(scenes: list[Scene], mesh: PadMesh, batch: int, folder: FilePath | None = None) -> list[Trajectory]:
@@ -166,14 +166,12 @@ def test_the_product_is_the_tangent_times_the_vector(
     space = function_space(mesh, ELEMENT[element]())
     body = System(space, uniform(len(mesh.tets), poisson_ratio, stiffening))
     bodies = indenters(scene(friction=0.3, motion={"depth_mm": 0.5, "shear_mm": [0.1, 0.0]}), 0.45)
-    active = np.ones(1, dtype=bool)
     zero = body.zero()
-    body.balance(zero, bodies, active)
-    body.anchor(zero, bodies, active)
+    body.residual(zero, bodies)
+    body.anchor(zero, bodies)
     u = np.where(space.held, 0.0, 0.05 * rng.standard_normal(zero.u.shape))
     state = Unknowns(u, rng.uniform(-4.0, 0.0, zero.p.shape))
-    viscosity = np.array([0.7])
-    tangent = dense(body, body.tangent(state, bodies, active, viscosity))
+    tangent = dense(body, body.tangent(state, bodies, 0.7))
 
     rows = padded(len(body.free))
     tables, faces = bulk_tables(space, uniform(len(mesh.tets), poisson_ratio, stiffening), body.mixed, "cpu"), None
@@ -184,8 +182,8 @@ def test_the_product_is_the_tangent_times_the_vector(
     x = np.zeros((rows, 1), dtype=np.float32)
     x[: len(body.free), 0] = rng.standard_normal(len(body.free))
     vector, image = warp_array(x, wp.float32, "cpu"), wp.zeros((rows, 1), dtype=wp.float32, device="cpu")
-    displacement, pressure = warp_array(state.u, wp.vec3d, "cpu"), warp_array(state.p, wp.float64, "cpu")
-    inputs = [mask, displacement, pressure, tables, warp_array(viscosity, wp.float64, "cpu")]
+    displacement, pressure = warp_array(state.u[None], wp.vec3d, "cpu"), warp_array(state.p[None], wp.float64, "cpu")
+    inputs = [mask, displacement, pressure, tables, warp_array(np.array([0.7]), wp.float64, "cpu")]
     wp.launch(store, (len(mesh.tets), 1), inputs=inputs, outputs=[stored], device="cpu")
     kernel = bulk_product(space.nodes.shape[1], body.mixed, space.element.stabilisation > 0, any(stiffening))
     inputs = [mask, numbering.single, stored, vector]
@@ -222,8 +220,14 @@ def _per_point(element: Element, count: int) -> tuple[int, int]:
 def test_scenes_must_share_the_pad() -> None:
     with pytest.raises(InputError, match=r"mm pad"):
         list(simulate_many([scene((8.0, 6.0, 3.0))], MESH, device="cpu"))
-    with pytest.raises(InputError, match="must share the gel's materials and numerics"):
-        list(simulate_many([scene(), scene(numerics={"penalty": 20.0})], MESH, device="cpu"))
+    different: list[dict] = [
+        {"gel": {"poisson_ratio": 0.45}},
+        {"gel": {"stiffening": [0.1, 0.0]}},
+        {"numerics": {"penalty": 20.0}},
+    ]
+    for parts in different:
+        with pytest.raises(InputError, match="must share the gel's materials and numerics"):
+            list(simulate_many([scene(), scene(**parts)], MESH, device="cpu"))
     assert list(simulate_many([], MESH, device="cpu")) == []
 
 

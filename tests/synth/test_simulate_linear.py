@@ -72,18 +72,8 @@ def test_factor_is_the_inverse(kind: Any) -> None:
 
 
 @each_factor
-def test_strided_right_side(kind: Any) -> None:
-    """A row of a batch may be strided."""
-    matrix, b = saddle(1), np.asfortranarray(np.stack([right_side(1), right_side(2)]))
-    factor = make(kind, matrix)
-    factor.factorise(matrix.data)
-    assert not b[1].flags.c_contiguous
-    assert (factor.apply(b[1]) == factor.apply(right_side(2))).all()
-
-
-@each_factor
 def test_answer_does_not_depend_on_what_was_solved_before(kind: Any) -> None:
-    """Else a sample's last bits would depend on its batch."""
+    """Else a press's last bits would depend on the presses before it."""
     # Fails with Pardiso's matching and scaling on: its analysis then uses the values of the first matrix.
     matrix, b = saddle(1), right_side(1)
     fresh, used = make(kind, matrix), make(kind, matrix)
@@ -191,14 +181,14 @@ def test_factor_is_kept_while_it_serves(monkeypatch: pytest.MonkeyPatch) -> None
     y = one.solve(far, None, b, rough=True)
     assert factor.made == 2
     assert np.linalg.norm(whole(far) @ y - b) < 1.001 * linear.ROUGH_TOLERANCE * np.linalg.norm(b)
-    # What another sample left in the factor would make the bits depend on the batch.
+    # What another press left in the factor would make the bits depend on it.
     alone = Directions(SuperLUFactor(first.indptr, first.indices), keep=True)
     Directions(factor, keep=True).solve(first, None, b)
     np.testing.assert_array_equal(one.solve(near, None, b, rough=True), alone.solve(near, None, b, rough=True))
 
 
 def test_factor_is_made_anew_where_told() -> None:
-    # Fails with `keep` or `rough` left out of the condition, and with `begin` doing nothing.
+    # Fails with `keep` or `rough` left out of the condition, and with `forget` doing nothing.
     matrix, b = saddle(1), right_side(1)
     factor = SuperLUFactor(matrix.indptr, matrix.indices)
     never = Directions(factor, keep=False)
@@ -209,7 +199,7 @@ def test_factor_is_made_anew_where_told() -> None:
     one.solve(matrix, None, b, rough=True)
     one.solve(matrix, None, b)
     assert factor.made == 4
-    one.begin()
+    one.forget()
     one.solve(matrix, None, b, rough=True)
     assert factor.made == 5
     one.solve(matrix, None, b, rough=True)

@@ -14,11 +14,12 @@ import synth.simulate.stepping as stepping
 from synth.scene import Scene
 from synth.simulate import Trajectory, simulate
 from synth.simulate.driver import STANDARD, Driver
-from synth.simulate.memory import kept_contact
+from synth.simulate.memory import saved_contact
 from synth.simulate.newton import Solution, relative_residual, solve
+from synth.simulate.press import Press
 from synth.simulate.solve import stepper_of
 from synth.simulate.stepping import Stepper
-from synth.simulate.unknowns import Balance
+from synth.simulate.unknowns import Residual
 
 MESH = brick(counts=(4, 4, 2))
 TOLERANCE = 1e-8
@@ -55,29 +56,29 @@ def test_wanted_states_meet_the_full_tolerance_and_others_the_ways() -> None:
 def test_multipliers_are_updated_from_tight_states(monkeypatch: pytest.MonkeyPatch) -> None:
     # Fails without the polish before the passes, with passes solved to the way's tolerance, and with multipliers not
     # put back, or the balance not evaluated anew, after a pass that failed.
-    stepper = stepper_of([pressed()], MESH, driver=replace(LOOSE, correction_iterations=2))
+    stepper = stepper_of(Press.of(pressed(), MESH), driver=replace(LOOSE, correction_iterations=2))
     body = stepper.system
-    balance, augment = body.balance, body.augment
-    latest: list[Balance] = []
+    residual, augment = body.residual, body.augment
+    latest: list[Residual] = []
     begun: list[float] = []
 
-    def watched(*given: Any) -> Balance:
-        latest[:] = [balance(*given)]
+    def watched(*given: Any) -> Residual:
+        latest[:] = [residual(*given)]
         return latest[0]
 
     def updated(*given: Any) -> None:
-        begun.append(float(relative_residual(latest[0])[0]))
+        begun.append(relative_residual(latest[0]))
         augment(*given)
 
-    monkeypatch.setattr(body, "balance", watched)
+    monkeypatch.setattr(body, "residual", watched)
     monkeypatch.setattr(body, "augment", updated)
-    assert max(residuals(stepper.run()[0])) <= TOLERANCE
+    assert max(residuals(stepper.run())) <= TOLERANCE
     assert len(begun) >= 4  # passes at both records
     assert max(begun) <= BETWEEN
 
 
 class Losing:
-    """Newton's method for the stepper, which ends `most` polishes of the first sample after three to six iterations."""
+    """Newton's method for the stepper, which ends `most` polishes after three to six iterations."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, most: int, polish: str = "before the passes") -> None:
         self.lost, self._most = 0, most
@@ -85,35 +86,34 @@ class Losing:
         monkeypatch.setattr(stepping, "PENETRATION", penetration)
         monkeypatch.setattr(stepping, "solve", self)
 
-    def __call__(self, system: Any, start: Any, indenters: Any, active: Any, tolerance: Any, *limit: Any) -> Solution:
-        polishes = limit[:1] == (stepping.MAX_ITERATIONS,) and active[0] and tolerance[0] == self._tolerance
+    def __call__(self, system: Any, start: Any, indenter: Any, tolerance: float, *limit: Any) -> Solution:
+        polishes = limit[:1] == (stepping.MAX_ITERATIONS,) and tolerance == self._tolerance
         if not polishes or self.lost == self._most:
-            return solve(system, start, indenters, active, tolerance, *limit)
+            return solve(system, start, indenter, tolerance, *limit)
         self.lost += 1
-        never = np.where(np.arange(len(active)) == 0, 0.0, tolerance)
-        return solve(system, start, indenters, active, never, 3)
+        return solve(system, start, indenter, 0.0, 3)
 
 
 def memory(stepper: Stepper) -> list[np.ndarray]:
-    """What the next step goes on from: the states, contact, and where each sample is."""
-    places = np.array([(sample.at, sample.next, len(sample.states)) for sample in stepper.samples])
-    return [stepper.state.u.copy(), stepper.state.p.copy(), *kept_contact(stepper.system.contact).values(), places]
+    """What the next step goes on from: the state, contact, and the place on the path."""
+    places = np.array([stepper.at, stepper.next, len(stepper.states)])
+    return [stepper.state.u.copy(), stepper.state.p.copy(), *saved_contact(stepper.system.contact).values(), places]
 
 
 def followed(stepper: Stepper, losing: Losing, monkeypatch: pytest.MonkeyPatch) -> tuple[Trajectory, int]:
-    """Of one sample: where it ends, and in how many steps; a step that loses its record must leave no trace."""
+    """Where a press ends, and in how many steps; a step that loses its record must leave no trace."""
     advance, steps = stepper._advance, [0]
 
-    def step(active: Any) -> None:
-        before, lost, length = memory(stepper), losing.lost, stepper.samples[0].target() - stepper.samples[0].at
-        advance(active)
+    def step() -> None:
+        before, lost, length = memory(stepper), losing.lost, stepper.target() - stepper.at
+        advance()
         steps[0] += 1
         if losing.lost > lost:
             assert all((a == b).all() for a, b in zip(memory(stepper), before, strict=True))
-            assert stepper.samples[0].step == length / 2
+            assert stepper.step == length / 2
 
     monkeypatch.setattr(stepper, "_advance", step)
-    return stepper.run()[0], steps[0]
+    return stepper.run(), steps[0]
 
 
 @each
@@ -121,7 +121,7 @@ def test_a_lost_record_leaves_no_trace_and_is_tried_again(monkeypatch: pytest.Mo
     # Fails with a state recorded that is not converged, with good steps that do not ask `_record`, with contact put
     # back or settled as if the step were good, and with self.state set before the record.
     losing = Losing(monkeypatch, most=1, polish=polish)
-    result, _ = followed(stepper_of([pressed()], MESH, driver=LOOSE), losing, monkeypatch)
+    result, _ = followed(stepper_of(Press.of(pressed(), MESH), driver=LOOSE), losing, monkeypatch)
     assert losing.lost == 1
     assert len(result.states) == 3
     assert max(residuals(result)) <= TOLERANCE
@@ -133,23 +133,12 @@ def test_a_record_that_is_always_lost_ends_the_way(monkeypatch: pytest.MonkeyPat
     # Fails with a lost record that counts as a good step: then it ends "complete", without the state.
     losing = Losing(monkeypatch, most=1000, polish=polish)
     posed = pressed(steps=1)
-    result, steps = followed(stepper_of([posed], MESH, driver=LOOSE), losing, monkeypatch)
+    result, steps = followed(stepper_of(Press.of(posed, MESH), driver=LOOSE), losing, monkeypatch)
     assert (result.status, "no balance" in result.reason, len(result.states)) == ("failed", True, 1)
     # The last step is shorter than max_step_mm / 64; each loss is followed by one good step of half its length.
     halvings = 1 + np.log2(1 / stepping.SHORTEST_STEP)
     assert losing.lost <= halvings
     assert steps <= 0.8 / posed.numerics.max_step_mm + 2 * halvings
-
-
-def test_a_lost_record_does_not_touch_the_batch(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Fails with all samples of the batch held back by one that is lost.
-    posed, other = pressed(), pressed(friction=0.3)
-    alone = stepper_of([other], MESH, driver=LOOSE).run()[0]
-    losing = Losing(monkeypatch, most=1)
-    first, second = stepper_of([posed, other], MESH, driver=LOOSE).run()
-    assert losing.lost == 1
-    assert max(residuals(first)) <= TOLERANCE
-    assert same(second, alone)
 
 
 def test_a_loose_way_ends_where_a_tight_one_does() -> None:

@@ -7,6 +7,7 @@ from pads import brick, scene
 
 from synth.simulate import simulate
 from synth.simulate.driver import STANDARD, Driver
+from synth.simulate.press import Press
 from synth.simulate.solve import stepper_of
 
 MESH = brick()
@@ -29,13 +30,13 @@ def test_loose_and_extrapolated_steps_save_iterations() -> None:
 
 def test_double_factor_solves_to_double_precision() -> None:
     """Fails with single left out of `direct_factor`'s arguments: 1e-6."""
-    stepper = stepper_of([scene(numerics={"element": "p2p1"})], MESH, driver=PLAIN)
-    system, active = stepper.system, np.ones(1, dtype=bool)
-    tangent = system.tangent(system.zero(), stepper.indenters, active)
-    right = np.random.default_rng(0).standard_normal((1, len(system.free)))
-    step = system.newton_step(tangent, right, active)
-    solution = np.concatenate([step.u[0].ravel(), step.p[0]])[system.free]
-    upper = system.matrix(tangent.values[0])
-    left = upper @ solution + upper.T @ solution - upper.diagonal() * solution + right[0]
+    stepper = stepper_of(Press.of(scene(numerics={"element": "p2p1"}), MESH), driver=PLAIN)
+    system = stepper.system
+    tangent = system.tangent(system.zero(), stepper.indenter)
+    right = np.random.default_rng(0).standard_normal(len(system.free))
+    step = system.newton_step(tangent, right)
+    solution = np.concatenate([step.u.ravel(), step.p])[system.free]
+    upper = system.matrix(tangent.values)
+    left = upper @ solution + upper.T @ solution - upper.diagonal() * solution + right
     # A backward stable solve leaves some 1e-16 of |K| |x|, which at a Poisson ratio of 0.4999 is 1e4 times |r|.
     assert np.linalg.norm(left) < 1e-10 * np.linalg.norm(right)

@@ -13,7 +13,9 @@ import synth.simulate.linear as linear
 import synth.simulate.pattern as pattern
 import synth.simulate.stepping as stepping
 from synth.arrays import FloatArray
+from synth.errors import InputError
 from synth.simulate import Trajectory, simulate
+from synth.simulate.solve import check_shared
 
 MESH = brick()
 TOLERANCE = 1e-6
@@ -56,16 +58,16 @@ def test_window_bears_what_the_indenter_does(friction: float, element: str) -> N
     Fails with the undeformed arm in `forces`, with contact not restored after a record, or its gap not evaluated anew.
     """
     stepper = run(gentle(friction=friction, numerics={"element": element}), MESH)
-    body, last = stepper.system, stepper.samples[0].at
+    body, last = stepper.system, stepper.at
     stepper._place([last])
-    balance = body.balance(stepper.state, stepper.indenters, np.array([True]))
-    force, moment, _ = (values[0] for values in body.forces(stepper.state))
-    held = balance.reaction[0] * body.space.held
+    balance = body.residual(stepper.state, stepper.indenter)
+    force, moment, _ = body.forces(stepper.state)
+    held = balance.reaction * body.space.held
     # What is left on the free nodes is the residual: 1e-6 of the forces' norm, on some 100 nodes and arms of 5 mm.
     scale = 10 * TOLERANCE * float(np.linalg.norm(balance.reaction))
     assert np.linalg.norm(force) > 1e3 * scale
     np.testing.assert_allclose(held.sum(axis=0), -force, atol=scale)
-    held_moment = np.cross(body.space.points + stepper.state.u[0], held).sum(axis=0)
+    held_moment = np.cross(body.space.points + stepper.state.u, held).sum(axis=0)
     np.testing.assert_allclose(held_moment, -moment, atol=5 * scale)
 
 
@@ -106,6 +108,23 @@ def test_youngs_modulus_scales_forces_only() -> None:
         np.testing.assert_allclose(t.torque_nmm, 1000 * np.array(s.torque_nmm), rtol=1e-14)
         np.testing.assert_allclose(t.traction, 1000 * s.traction, rtol=1e-14)
         assert (s.residual, s.newton_iterations) == (t.residual, t.newton_iterations)
+
+
+def test_layers_whose_moduli_differ_alike_deform_alike() -> None:
+    """Deformation depends on ratios of moduli only, so that such scenes may share a batch."""
+    # Fails with absolute moduli in `_elastic`.
+    film = {"thickness_mm": 1.0, "youngs_modulus_kpa": 600.0}
+    soft = gentle(gel={"layers": [film]})
+    hard = gentle(gel={"youngs_modulus_kpa": 400.0, "layers": [{**film, "youngs_modulus_kpa": 1200.0}]})
+    check_shared([soft, hard], MESH)
+    for s, t in zip(*(simulate(posed, MESH).states for posed in (soft, hard)), strict=True):
+        assert (s.displacement == t.displacement).all()
+        assert t.force_n == pytest.approx([2 * value for value in s.force_n], rel=1e-12)
+
+
+def test_the_mesh_must_be_of_the_scenes_pad() -> None:
+    with pytest.raises(InputError, match=r"the mesh is of a .* mm pad, the scene's is a"):
+        simulate(scene((8.0, 6.0, 3.0)), MESH)
 
 
 @each
@@ -161,7 +180,7 @@ def test_ball_over_the_edge_presses_the_side_too(element: str, counts: tuple[int
     motion = {"depth_mm": depth, "shear_mm": [0.8, 0.0], "position_mm": [edge, 0.0], "steps": 3}
     ball = {"shape": "sphere", "radius_mm": 2.0}
     stepper = run(scene(indenter=ball, motion=motion, numerics={"element": element}), brick(counts=counts))
-    body, last = stepper.system, stepper.samples[0].states[-1]
+    body, last = stepper.system, stepper.states[-1]
     space, weight = body.space, body._faces.weight.numpy()
     side = (space.points[space.faces][:, :, 0] == edge).all(axis=1)
     pushed = np.einsum("fq,fqc->c", weight[side], body.traction.numpy()[0, side])

@@ -65,7 +65,7 @@ def test_partial_slip_is_mindlins() -> None:
     )
     body = System(supported(mesh, p2p1(), wall_and_window), uniform(len(mesh.tets), 0.5))
     path = Path(posed.motion, rigid_body(posed.contact.indenter))
-    ended = Stepper(body, [path], [FRICTION], posed.numerics, [1.0]).run()[0]
+    ended = Stepper(body, path, FRICTION, posed.numerics, 1.0).run()
     assert (ended.status, ended.reason) == ("complete", "")
     slid = [state for state in ended.states if state.shear_mm[0] > 0]
     assert len(slid) == 3

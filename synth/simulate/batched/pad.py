@@ -15,7 +15,7 @@ from synth.simulate.path import Path
 from synth.simulate.solve import ELEMENTS
 from synth.simulate.space import Space, function_space
 from synth.simulate.system import System
-from synth.simulate.tables import pack_indenters
+from synth.simulate.tables import pack_indenter, place_indenter
 
 AWAY_MM = 1e3
 """Where an indenter touches nothing."""
@@ -57,8 +57,6 @@ def _away(scene: Scene) -> Indenters:
     """A ball that touches nothing."""
     ball = RigidBody(0, np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]), np.eye(3), 1.0, np.zeros((1, 1, 1)), 1.0)
     path = Path(scene.motion.model_copy(update={"depth_mm": -AWAY_MM}), ball)
-    packed = pack_indenters([path], [0.0], "cpu")
-    pose = path.pose(0.0)
-    packed.centre.assign(pose.centre[None])
-    packed.rotation.assign(pose.rotation[None])
+    packed = pack_indenter(path, 0.0)
+    place_indenter(packed, path.pose(0.0))
     return packed
