@@ -81,7 +81,7 @@ def rate(case: Row, device: str) -> Row:
     pad = pad_of(case["cells"], case["growth"], device)
     rng = np.random.default_rng(0)
     scenes = [random_ball(rng, case) for _ in range(max(DRAWS, case["batch"]))]
-    driver = replace(DRIVER, forcing=case["forcing"], loose=case["loose"], closer=case["closer"])
+    driver = replace(DRIVER, forcing=case["forcing"], relaxed_tolerance=case["loose"], closer=case["closer"])
     order = cycle(range(len(scenes)))
     run = Run(jobs_of(scenes, pad), pad, scenes[0].numerics, driver, None, case["batch"], order, case["inner"])
     for _ in range(2):  # with all slots empty: compiles the kernels and captures the graph
@@ -208,7 +208,7 @@ def reference_mesh(scene: Scene, across: int) -> PadMesh:
 def surface_error(case: Row) -> Row:
     """The error of one press on the case's mesh; the reference takes the scenes' own load steps."""
     scene, plain = (nth_ball(case["press"], {**case, "step_mm": step}) for step in (case["step_mm"], None))
-    found = simulate(scene, mesh_of(case), driver=replace(DRIVER, loose=case["loose"]))
+    found = simulate(scene, mesh_of(case), options=replace(DRIVER, relaxed_tolerance=case["loose"]))
     truth = simulate(plain, reference_mesh(scene, case["reference_across"]))
     row: Row = {
         "radius_mm": round(scene.contact.indenter.model_dump()["radius_mm"], 3),
@@ -237,7 +237,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--steps", type=int, default=1, help="recorded states")
     parser.add_argument("--radii", type=float, nargs=2, default=[2.0, 6.0], help="mm; of the balls")
     parser.add_argument("--forcing", type=float, default=DRIVER.forcing, help="relative residual of linear solves")
-    parser.add_argument("--loose", type=float, default=DRIVER.loose, help="tolerance of intermediate steps")
+    parser.add_argument("--loose", type=float, default=DRIVER.relaxed_tolerance, help="tolerance of intermediate steps")
     parser.add_argument("--closer", type=float, default=DRIVER.closer, help="tolerance of corrections over the scene's")
     parser.add_argument("--step", type=float, help="mm; longest load step, default as in scenes")
     parser.add_argument("--inner", type=int, default=INNER, help="Krylov iterations of a cycle")

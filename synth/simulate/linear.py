@@ -5,8 +5,8 @@ entries at touching faces only. S is factorised in single precision, which halve
 in double precision, preconditioned by the factor, takes away the rounding of the factor and R. Pardiso (through
 pypardiso's MKL) where there is one, else SuperLU in double precision. The pattern is analysed once per mesh.
 
-Where Newton's method can do with a rough direction, the factor of an earlier tangent is kept for as long as GMRES gets
-along with it (`Directions`).
+Where Newton's method can do with a rough direction, the factor of an earlier tangent is used for as long as GMRES gets
+along with it (`LinearSolver`).
 """
 
 import ctypes
@@ -25,7 +25,7 @@ GMRES_LIMIT = 40
 ROUGH_TOLERANCE = 0.03
 """Of the linear residual of a rough direction, with this tangent's factor or an earlier one's. Far from the solution it
 is the changes of the contact set that count."""
-KEPT_LIMIT = 12
+MAX_REUSE_ITERATIONS = 12
 """Iterations after which an earlier tangent's factor is given up."""
 
 
@@ -52,19 +52,19 @@ def direct_factor(indptr: np.ndarray, indices: np.ndarray, single: bool = True) 
     return SuperLUFactor(indptr, indices)
 
 
-class Directions:
+class LinearSolver:
     """Solves the linear systems of one press, one after another.
 
-    Neighbouring tangents differ where contact changed. With the factor of an earlier one GMRES takes some 6 iterations
-    to ROUGH_TOLERANCE; a factor of 7,000 to 14,000 unknowns costs as much as 10 to 15 of them.
+    Neighbouring tangents differ where contact changed: a few iterations of GMRES with the factor of an earlier one cost
+    less than a new factor.
 
     Args:
         factor: of this press's matrices; others may use it, too, and then this press begins with a new one.
-        keep: solve roughly where that is enough, with factors of earlier matrices.
+        reuse: solve roughly where that is enough, with factors of earlier matrices.
     """
 
-    def __init__(self, factor: Factor, keep: bool) -> None:
-        self._factor, self._keep = factor, keep
+    def __init__(self, factor: Factor, reuse: bool) -> None:
+        self._factor, self._reuse = factor, reuse
         self._own = -1  # number of the factor's matrix that was this press's last
 
     def forget(self) -> None:
@@ -77,10 +77,10 @@ class Directions:
         rough: to ROUGH_TOLERANCE, with the factor of an earlier matrix if it serves; else with this matrix's factor.
         """
         factor, tolerance = self._factor, GMRES_TOLERANCE
-        if self._keep and rough:
+        if self._reuse and rough:
             tolerance = ROUGH_TOLERANCE
             if factor.made == self._own:
-                solution, _, left = gmres(matrix, remainder, factor, right, tolerance, KEPT_LIMIT)
+                solution, _, left = gmres(matrix, remainder, factor, right, tolerance, MAX_REUSE_ITERATIONS)
                 if left < tolerance:
                     return solution
         if not factor.factorise(matrix.data):

@@ -14,25 +14,22 @@ from synth.simulate.system import System
 from synth.simulate.unknowns import Residual, Unknowns
 
 MAX_ITERATIONS = 20
-PATIENCE = 5
-"""Iterations that may take rough directions. Far from the solution, or where a nearly incompressible gel is sheared as
-a whole (Cook's membrane), directions that are 1 % off do not get there in MAX_ITERATIONS."""
-LOOSE = 1e-5
+MAX_ROUGH_ITERATIONS = 5
+"""After so many iterations directions are exact: far from the solution rough ones may not get there at all."""
+ROUGH_ABOVE = 1e-5
 """A tolerance above it is reached with rough directions."""
 NEAR = 1e-2
-"""Relative residual below which a smaller tolerance is approached with exact directions: the last iterations then
-surpass it by as much as ever. Above, changes of the contact set count for more than 1 % of a direction. Below it, a
-solve may also take up to twice its iterations: whether the last of them just met the tolerance, rounding would decide,
-and a pass that is given up leads to another balance."""
+"""Relative residual below which the equilibrium is near: directions are exact for a smaller tolerance, and a solve may
+take up to twice its iterations, so that rounding does not decide whether the last of them met the tolerance."""
 SHORTEST = 1 / 1024
 """Shortest step of the line search."""
-NOTHING = 1e-6
-"""Force in E mm² that is none: where the indenter has slid off, only rounding (about 1e-13) is left to compare with."""
+FORCE_FLOOR = 1e-6
+"""Force in E mm² that is none: where the indenter has slid off, only rounding is left to compare with."""
 INDIFFERENT = 0.3
 """Below this step length any valid state is taken: a kink of the contact set can make every step raise the residual."""
-LATE, HOPELESS = 5, 0.5
+STALL_ITERATIONS, STALLED_RESIDUAL = 5, 0.5
 """After so many iterations a solve ends whose relative residual is still so large."""
-DECREASE = 1e-4
+SUFFICIENT_DECREASE = 1e-4
 """Share of the predicted decrease of the residual that a step of the line search must reach (Armijo's condition)."""
 
 
@@ -54,8 +51,8 @@ class Solution:
 
 
 def relative_residual(residual: Residual) -> float:
-    """Norm of the free residual over the norm of all nodal forces, which counts as NOTHING at least."""
-    return norm(residual.free) / max(norm(residual.reaction), NOTHING)
+    """Norm of the free residual over the norm of all nodal forces, which counts as FORCE_FLOOR at least."""
+    return norm(residual.free) / max(norm(residual.reaction), FORCE_FLOOR)
 
 
 def solve(
@@ -82,10 +79,10 @@ def solve(
         relative = relative_residual(residual)
         if relative <= tolerance and (iterations > 0 or relative == 0):
             return Solution(state, residual, True, iterations)
-        hopeless = not np.isfinite(relative) or (iterations >= LATE and relative >= HOPELESS)
-        if hopeless or iterations == 2 * limit or (iterations >= limit and relative > NEAR):
+        stalled = not np.isfinite(relative) or (iterations >= STALL_ITERATIONS and relative >= STALLED_RESIDUAL)
+        if stalled or iterations == 2 * limit or (iterations >= limit and relative > NEAR):
             break
-        rough = iterations < PATIENCE and (tolerance > LOOSE or relative > NEAR)
+        rough = iterations < MAX_ROUGH_ITERATIONS and (tolerance > ROUGH_ABOVE or relative > NEAR)
         step = system.newton_step(system.tangent(state, indenter), residual.free, rough)
         found = _line_search(system, state, residual, step, indenter) if np.isfinite(step.u).all() else None
         if found is None:
@@ -105,7 +102,7 @@ def _line_search(
     while scale >= SHORTEST:
         trial = state.plus(step, scale)
         after = system.residual(trial, indenter)
-        falls = norm(after.free) <= before * (1 - DECREASE * scale)
+        falls = norm(after.free) <= before * (1 - SUFFICIENT_DECREASE * scale)
         if after.smallest_jacobian > 0 and (falls or scale < INDIFFERENT):
             return trial, after
         scale /= 2

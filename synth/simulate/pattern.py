@@ -1,7 +1,7 @@
 """The sparse pattern of a space's tangent, and where the entries of elements and faces go in it.
 
-It depends on topology and held nodes only. Meshes of one topology share it (`pattern_of` keeps the last ones), and with
-it the linear solver's symbolic analysis.
+It depends on topology and held nodes only. Meshes of one topology share it (`pattern_of` caches the last ones), and
+with it the linear solver's symbolic analysis.
 """
 
 import hashlib
@@ -97,10 +97,10 @@ def _pairs(count: int) -> np.ndarray:
     return np.array([(a, b) for a in range(count) for b in range(a, count)], dtype=np.int32)
 
 
-_KEPT: OrderedDict[str, Pattern] = OrderedDict()
-_MOST_KEPT = 8
-_MOST_ENTRIES = 4_000_000
-"""Of all that are kept, which bounds memory. The draws of `gelsight_mini` have six patterns, of 0.2 to 0.6 million."""
+_CACHED: OrderedDict[str, Pattern] = OrderedDict()
+_MAX_CACHED = 8
+_MAX_ENTRIES = 4_000_000
+"""Of all that are cached, which bounds memory."""
 
 
 def pattern_of(space: Space, mixed: bool) -> Pattern:
@@ -109,9 +109,9 @@ def pattern_of(space: Space, mixed: bool) -> Pattern:
     for array in (space.nodes, space.pressure_nodes, space.held, space.faces):
         digest.update(np.ascontiguousarray(array).tobytes())
     key = digest.hexdigest()
-    if key not in _KEPT:
-        _KEPT[key] = Pattern(space, mixed)
-        while len(_KEPT) > 1 and (len(_KEPT) > _MOST_KEPT or sum(p.size for p in _KEPT.values()) > _MOST_ENTRIES):
-            _KEPT.popitem(last=False)
-    _KEPT.move_to_end(key)
-    return _KEPT[key]
+    if key not in _CACHED:
+        _CACHED[key] = Pattern(space, mixed)
+        while len(_CACHED) > 1 and (len(_CACHED) > _MAX_CACHED or sum(p.size for p in _CACHED.values()) > _MAX_ENTRIES):
+            _CACHED.popitem(last=False)
+    _CACHED.move_to_end(key)
+    return _CACHED[key]

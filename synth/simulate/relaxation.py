@@ -1,7 +1,7 @@
 r"""Equilibrium by relaxation, where Newton's method does not find it: pseudo-transient continuation.
 
 Past a limit point (a corner that slips from one place of the gel to the next) the nearest equilibrium is not where
-Newton's method looks, and the residual rises on the way to it. A gel with a viscosity of its own moves there by itself:
+Newton's method looks, and the residual rises before it. A gel with a viscosity of its own moves there by itself:
 
 .. math::  θ L \dot u + r(u) = 0, \qquad L_{ab} = \int μ \, g_a \cdot g_b \, I
 
@@ -20,7 +20,7 @@ from synth.simulate.system import System
 from synth.simulate.unknowns import Residual, Unknowns
 
 MAX_STEPS = 300
-"""See docs/reports/objects.md: with 100 a fifteenth of the presses of objects ended early, with 1000 time is lost."""
+"""Presses of objects need some hundred; see docs/reports/objects.md."""
 FIRST_VISCOSITY = 1.0
 """θ of the first step: the viscous stress of a step is then the elastic one of its strain."""
 LEAST_VISCOSITY = 1e-3
@@ -30,7 +30,7 @@ MOST_VISCOSITY = 1e3
 LEAST_SHARE = 1 / 256
 MAX_ERROR, AIM = 0.5, 0.2
 """Largest error of a step that is taken, and what the next θ aims at."""
-LEAST_BORNE = 0.25
+MIN_REACTION_RATIO = 0.25
 """A relaxation fails that leaves less than this share of the reaction: the body has slipped between contact points."""
 FALL, RISE = 0.1, 6.0
 """Largest change of θ from one step to the next, down and up."""
@@ -39,7 +39,7 @@ FALL, RISE = 0.1, 6.0
 def relax(system: System, start: Unknowns, indenter: Indenters, tolerance: float) -> Solution:
     """Let a state come to rest; arguments and result as of `synth.simulate.newton.solve`."""
     state, residual = start, system.residual(start, indenter)
-    least = LEAST_BORNE * _reaction(system, residual)
+    least = MIN_REACTION_RATIO * _reaction(system, residual)
     viscosity, share, iterations = FIRST_VISCOSITY, 1.0, 0
     while residual.smallest_jacobian > 0 and iterations < MAX_STEPS and share >= LEAST_SHARE:
         step = system.newton_step(system.tangent(state, indenter, viscosity), residual.free)

@@ -8,7 +8,7 @@ against much finer solutions (docs/reports/budget.md).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +20,7 @@ from synth.optics import Optics
 from synth.scene import Gel, Scene
 from synth.simulate.error_model import face_error
 from synth.simulate.footprint import footprint
-from synth.simulate.path import path_of
+from synth.simulate.load_path import path_of
 
 LADDER = (4, 6, 8, 10, 12, 14, 16)
 """Elements across the contact to choose from."""
@@ -191,7 +191,7 @@ def scale_px_per_mm(scene: Scene) -> float:
     return float(np.sqrt(abs(u[0] * v[1] - u[1] * v[0])))
 
 
-def resolve(scene: Scene, folder: FilePath | None, target_error_px: float) -> Resolution:
+def resolve(scene: Scene, folder: Path | None, target_error_px: float) -> Resolution:
     """The cheapest graded mesh of a draw whose predicted error is within a target, else the finest.
 
     Args:

@@ -1,13 +1,13 @@
 """From a scene and a mesh to a trajectory: the stage's entry points."""
 
 from collections.abc import Callable, Sequence
-from pathlib import Path as FilePath
+from pathlib import Path
 
 from synth.errors import InputError
 from synth.mesh import PadMesh, check_mesh
 from synth.scene import Gel, Scene
-from synth.simulate.driver import STANDARD, Driver
 from synth.simulate.material import pad_material
+from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.press import ELEMENTS, Press
 from synth.simulate.space import function_space
 from synth.simulate.stepping import Stepper
@@ -18,9 +18,9 @@ from synth.simulate.trajectory import Trajectory
 def simulate(
     scene: Scene,
     mesh: PadMesh,
-    folder: FilePath | None = None,
+    folder: Path | None = None,
     frames: frozenset[int] | None = None,
-    driver: Driver = STANDARD,
+    options: SolverOptions = STANDARD,
 ) -> Trajectory:
     """Press, shear and twist one scene's indenter into its pad, on a given mesh.
 
@@ -29,12 +29,12 @@ def simulate(
         mesh: of scene.sensor.gel.
         folder: what a mesh indenter's file name is relative to.
         frames: see `simulate_press`.
-        driver: of Newton's method.
+        options: of Newton's method.
 
     Raises:
         InputError: the indenter cannot be built; the mesh is of another pad, or no element can be built on it.
     """
-    return stepper_of(Press.of(scene, mesh, folder), frames, driver).run()
+    return stepper_of(Press.of(scene, mesh, folder), frames, options).run()
 
 
 def simulate_press(
@@ -57,16 +57,16 @@ def simulate_press(
     return stepper_of(press, frames).run(on_progress)
 
 
-def stepper_of(press: Press, frames: frozenset[int] | None = None, driver: Driver = STANDARD) -> Stepper:
+def stepper_of(press: Press, frames: frozenset[int] | None = None, options: SolverOptions = STANDARD) -> Stepper:
     """A press at the start of its load path; arguments and errors as of `simulate_press`."""
     scene, mesh = press.scene, press.mesh
     gel, numerics = scene.sensor.gel, scene.numerics
     _check_pad(gel, mesh)
     check_mesh(mesh)
     space = function_space(mesh, ELEMENTS[numerics.element]())
-    system = System(space, pad_material(gel, mesh), numerics.penalty, driver=driver)
+    system = System(space, pad_material(gel, mesh), numerics.penalty, options=options)
     modulus_mpa = gel.youngs_modulus_kpa / 1000
-    return Stepper(system, press.path, scene.contact.friction, numerics, modulus_mpa, driver, frames)
+    return Stepper(system, press.path, scene.contact.friction, numerics, modulus_mpa, options, frames)
 
 
 def check_shared(scenes: Sequence[Scene], mesh: PadMesh) -> None:

@@ -1,11 +1,11 @@
 """Load stepping: move the indenter along its load path, recording converged states, halving steps that fail.
 
-Each step starts from a linear extrapolation of the last two states. On the way a loose tolerance is enough. At a state
+Each step starts from a linear extrapolation of the last two states; a relaxed tolerance is enough for it. At a state
 that is wanted augmented-Lagrangian passes take penetration and elastic slip away, and the full tolerance holds; what
-the passes begin from and what all but the last find needs less, because the next one changes it (MULTIPLIERS). All of
-this is for what is recorded only: the path goes on from the loose state before, because multipliers that stay behind on
-a moving contact upset Newton's method at sharp edges. An unconverged field is never recorded: a press whose step would
-have to become shorter than SHORTEST_STEP ends at its last good state.
+the passes begin from and what all but the last find needs less, because the next one changes it
+(MULTIPLIER_TOLERANCE). All of this is for what is recorded only: the path goes on from the intermediate state before,
+because multipliers that stay behind on a moving contact upset Newton's method at sharp edges. An unconverged field is
+never recorded: a press whose step would have to become shorter than SHORTEST_STEP ends at its last good state.
 """
 
 import time
@@ -15,46 +15,41 @@ import numpy as np
 
 from synth.arrays import FloatArray
 from synth.scene import Numerics
-from synth.simulate.driver import STANDARD, Driver
-from synth.simulate.memory import restore_contact, saved_contact
-from synth.simulate.newton import MAX_ITERATIONS, NOTHING, Solution, relative_residual, solve
-from synth.simulate.path import Path
+from synth.simulate.contact_history import restore_contact, saved_contact
+from synth.simulate.load_path import LoadPath
+from synth.simulate.newton import FORCE_FLOOR, MAX_ITERATIONS, Solution, relative_residual, solve
+from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.relaxation import relax
 from synth.simulate.system import System
 from synth.simulate.tables import pack_indenter, place_indenter
-from synth.simulate.trajectory import State, Trajectory, no_balance, no_contact, trajectory_of
+from synth.simulate.trajectory import State, Trajectory, no_contact, not_converged, trajectory_of
 from synth.simulate.unknowns import Unknowns
 
 SHORTEST_STEP = 1 / 128
 """Shortest step, as a share of max_step_mm."""
-EASY = 7
+MAX_ITERATIONS_TO_GROW = 7
 """A step that took at most so many iterations is followed by a longer one."""
 GROWTH = 1.5
-RELAXED = 1 / 4
+MAX_RELAXED_STEP = 1 / 4
 """A step that fails is relaxed (`synth.simulate.relaxation`) when it is at most this share of max_step_mm."""
-STUCK = 1e6
+STICK_FRICTION = 1e6
 """Coefficient of friction at which nothing slides."""
-NUDGE = 1e-3
-"""Share of a step over which the derivative along the path is taken."""
-ENOUGH = 2.0
-"""Whole updates of the multipliers at a recorded state, in all. On a face pressed on a curved body not every contact
-point can come to rest on the surface: a third still moves a sphere's force by 0.1 %, and at a punch's rim it makes the
-tractions uneven (P1/P1: a sliding punch's T / N off by 10 % with three, by 3 % with two)."""
+PATH_DERIVATIVE_STEP = 1e-3
+"""Share of a step over which the derivative along the load path is taken."""
+MAX_MULTIPLIER_UPDATES = 2.0
+"""Whole updates of the multipliers at a recorded state, in all. Not every contact point of a face on a curved body can
+come to rest on the surface, so that more updates make the tractions uneven."""
 FAILURES = 3
-"""Of attempts at them, after which the passes end. Where a whole update upsets Newton's method (a ball pressed in by
-60 %, blocks up to their edges) a part of it does not: halved after a failure and doubled after a success, updates took
-that ball's penetration from 0.14 to 0.006 mm, and its force from 8 % too little to what finer meshes have."""
-MULTIPLIERS = 20.0
-"""Tolerance of states that multipliers are updated from, over the full one. Two updates do not forget what they began
-with: from states as loose as the way (1e-3) the ends of two frictionless ways to one place differed by up to 6e-5 mm,
-so by less than 1e-5."""
+"""Of attempts at them, after which the passes end. Updates are halved after a failure and doubled after a success:
+where a whole one upsets Newton's method a part of it does not."""
+MULTIPLIER_TOLERANCE = 20.0
+"""Tolerance of states that multipliers are updated from, over the full one: two updates do not forget what they began
+with."""
 PENETRATION = 2e-3
 """Passes end when no contact point is deeper inside the indenter than this share of the press depth."""
-REACH = 3.0
-"""A pass fails that moves a node, in any iteration, farther than so many times the deepest penetration. It takes
-penetration and elastic slip away; most move nodes by 0.5 to 1.4 times as much, a twisted ball by more than twice on the
-way. At edges that slip Newton's method can wander by up to eight times as much and come to rest in another balance, or
-not within its iterations, as rounding decides (docs/reports/batched_fem.md, Rounding)."""
+MAX_CORRECTION_RATIO = 3.0
+"""A pass fails that moves a node, in any iteration, farther than so many times the deepest penetration, which is what
+it is to take away: at edges that slip Newton's method can wander off to another equilibrium."""
 
 
 class Stepper:
@@ -73,21 +68,21 @@ class Stepper:
     def __init__(
         self,
         system: System,
-        path: Path,
+        path: LoadPath,
         friction: float,
         numerics: Numerics,
         modulus_mpa: float,
-        driver: Driver = STANDARD,
+        options: SolverOptions = STANDARD,
         frames: frozenset[int] | None = None,
     ) -> None:
         """frames: numbers of the states that are wanted; the others are recorded as the path goes through them."""
-        self.system, self.path, self.numerics, self.driver = system, path, numerics, driver
+        self.system, self.path, self.numerics, self.options = system, path, numerics, options
         self._modulus, self._waypoints = modulus_mpa, path.waypoints().tolist()
         records = path.records().tolist()
         self._recorded = frozenset(records)
         self._corrected = frozenset(place for k, place in enumerate(records, 1) if frames is None or k in frames)
         self._rubs = friction > 0
-        self.indenter, self._sticking = pack_indenter(path, friction), pack_indenter(path, STUCK)
+        self.indenter, self._sticking = pack_indenter(path, friction), pack_indenter(path, STICK_FRICTION)
         self._sticking.centre, self._sticking.rotation = self.indenter.centre, self.indenter.rotation
         self.state = self._previous_state = system.zero()
         self.at, self.step, self.next = 0.0, numerics.max_step_mm, 0
@@ -98,7 +93,7 @@ class Stepper:
 
     @property
     def finished(self) -> bool:
-        """Whether the path has come to its end, or to the last good state."""
+        """Whether the load path has come to its end, or to the last good state."""
         return bool(self.reason) or self.next >= len(self._waypoints)
 
     def target(self) -> float:
@@ -108,7 +103,7 @@ class Stepper:
         return goal if count == 1 else self.at + (goal - self.at) / count
 
     def run(self, on_progress: Callable[[float], None] | None = None) -> Trajectory:
-        """Follow the path to its end or to its last good state; `on_progress` is told what share of it is done."""
+        """Follow the load path to its end or to its last good state; `on_progress` is told what share of it is done."""
         started = time.perf_counter()
         self._start()
         while not self.finished:
@@ -127,7 +122,7 @@ class Stepper:
         if not self.finished:
             self._place(0.0)
             self.system.residual(self.state, self.indenter)
-            self.system.settle(self.state, self.indenter)
+            self.system.update_contact_history(self.state, self.indenter)
 
     def _undeformed(self, place: float) -> State:
         pose = self.path.pose(place)
@@ -141,9 +136,9 @@ class Stepper:
         target = self.target()
         self._place(target)
         between = target in self._recorded or target not in self._waypoints
-        tolerance = self._loose() if between else self.numerics.tolerance
+        tolerance = self._relaxed_tolerance if between else self.numerics.tolerance
         solution = self._counted(solve(self.system, self._predicted(target), self.indenter, tolerance))
-        relaxed = not solution.converged and target - self.at <= RELAXED * self.numerics.max_step_mm
+        relaxed = not solution.converged and target - self.at <= MAX_RELAXED_STEP * self.numerics.max_step_mm
         if relaxed:
             solution = self._counted(relax(self.system, self.state, self.indenter, tolerance))
         good = solution.converged
@@ -152,7 +147,7 @@ class Stepper:
         if good:
             self._previous_state, self.state = self.state, solution.state
             # After the record, whose passes must still see how far points slipped in this step.
-            self.system.settle(self.state, self.indenter)
+            self.system.update_contact_history(self.state, self.indenter)
             self._lengthen(target, solution.iterations, relaxed)
         else:
             self._shorten(target)
@@ -162,9 +157,10 @@ class Stepper:
         self._iterations += solution.iterations
         return solution
 
-    def _loose(self) -> float:
-        """Tolerance on the way."""
-        return max(self.driver.loose, self.numerics.tolerance)
+    @property
+    def _relaxed_tolerance(self) -> float:
+        """Tolerance of intermediate steps."""
+        return max(self.options.relaxed_tolerance, self.numerics.tolerance)
 
     def _slipped_through(self, target: float, state: Unknowns) -> bool:
         """Whether the indenter, at the end of its press, bears on nothing: it passed between the contact points.
@@ -172,7 +168,7 @@ class Stepper:
         Ends the press, saying so.
         """
         pressed = target == self.path.press_mm and self.path.is_over(self.system.space.mesh.size_mm)
-        if not pressed or self.system.forces(state)[0][2] > NOTHING:
+        if not pressed or self.system.forces(state)[0][2] > FORCE_FLOOR:
             return False
         self.reason = no_contact(target)
         return True
@@ -181,50 +177,53 @@ class Stepper:
         place_indenter(self.indenter, self.path.pose(at))
 
     def _predicted(self, target: float) -> Unknowns:
-        """Linear extrapolation, or after a turn the gel carried along; the last state where det F would not be > 0."""
+        """First iterate: by extrapolation, after a turn by rigid motion; the last state if det F would not be > 0."""
         state, before = self.state, self._previous_state
         if self._previous is not None and not self.path.turns_between(self._previous, self.at):
             ratio = (target - self.at) / (self.at - self._previous)
             ahead = state.plus(Unknowns(state.u - before.u, state.p - before.p), ratio)
         elif self._rubs and self.at > 0:
-            ahead = self._carried(target)
+            ahead = self._rigid_motion(target)
         else:
             return state
         return ahead if self.system.residual(ahead, self.indenter).smallest_jacobian > 0 else state
 
-    def _carried(self, target: float) -> Unknowns:
-        """The last state moved with the indenter as if every touching point stuck to it, to first order.
+    def _rigid_motion(self, target: float) -> Unknowns:
+        """Rigid-motion predictor: the last state moved as if every touching point stuck to the indenter, linearised.
 
         From the last state itself a step of the indenter aside looks like sliding at every point, and in that regime
         Newton's method does not find the state where most points stick. The derivative along the path is taken over a
-        small share of the step: over the whole of it the trial tractions of stuck points would be beyond linear.
+        small share of the step: over the whole of it the trial tractions of sticking points would be beyond linear. The
+        residual of the state itself is subtracted: the division by that share would make it too large.
         """
         state, sticking = self.state, self._sticking
         self._place(self.at)
         tangent = self.system.tangent(state, sticking)
-        unbalanced = self.system.residual(state, sticking).free
-        self._place(self.at + NUDGE * (target - self.at))
-        moved = self.system.residual(state, sticking).free - unbalanced  # of a loose state 1 / NUDGE times too much
+        before = self.system.residual(state, sticking).free
+        self._place(self.at + PATH_DERIVATIVE_STEP * (target - self.at))
+        moved = self.system.residual(state, sticking).free - before
         step = self.system.newton_step(tangent, moved)
         self._place(target)
-        return state.plus(step, 1 / NUDGE) if np.isfinite(step.u).all() else state
+        return state.plus(step, 1 / PATH_DERIVATIVE_STEP) if np.isfinite(step.u).all() else state
 
     def _augmented(self, solution: Solution) -> Solution:
         """Passes of multiplier update and solve, by whole updates or as large a share of them as converges.
 
         The last of two whole updates is solved to the full tolerance; where the passes end before it, none is.
         """
-        between = min(self._loose(), MULTIPLIERS * self.numerics.tolerance)
+        between = min(self._relaxed_tolerance, MULTIPLIER_TOLERANCE * self.numerics.tolerance)
         shallow = PENETRATION * max(float(self.path.corners[:, 0].max()), 0.1)
         share, done, failures = 1.0, 0.0, 0
         if self.system.deepest() > shallow:
             solution = self._polished(solution, between)
-        while solution.converged and done < ENOUGH and failures < FAILURES and self.system.deepest() > shallow:
+        while solution.converged and self.system.deepest() > shallow:
+            if done >= MAX_MULTIPLIER_UPDATES or failures >= FAILURES:
+                break
             before = saved_contact(self.system.contact)
             self.system.augment(self.indenter, share)
-            tolerance = between if done + share < ENOUGH else self.numerics.tolerance
-            reach = REACH * self.system.deepest()
-            better = self._solved_again(solution, tolerance, self.driver.correction_iterations, reach)
+            tolerance = between if done + share < MAX_MULTIPLIER_UPDATES else self.numerics.tolerance
+            reach = MAX_CORRECTION_RATIO * self.system.deepest()
+            better = self._solved_again(solution, tolerance, self.options.correction_iterations, reach)
             if better.converged:
                 solution, done, share = better, done + share, min(1.0, 2 * share)
             else:
@@ -287,10 +286,10 @@ class Stepper:
         Nothing is extrapolated across a relaxed step, which may have jumped.
         """
         taken = target - self.at
-        self._previous, self.at = self.at if self.driver.extrapolate and not relaxed else None, target
+        self._previous, self.at = self.at if self.options.extrapolate and not relaxed else None, target
         if target == self._waypoints[self.next]:
             self.next += 1
-        if iterations <= EASY:
+        if iterations <= MAX_ITERATIONS_TO_GROW:
             self.step = min(self.numerics.max_step_mm, GROWTH * max(taken, self.step / GROWTH))
 
     def _shorten(self, target: float) -> None:
@@ -298,7 +297,7 @@ class Stepper:
         self.step = (target - self.at) / 2
         self._previous = None
         if self.step < SHORTEST_STEP * self.numerics.max_step_mm:
-            self.reason = no_balance(target - self.at, self.path.pose(self.at))
+            self.reason = not_converged(target - self.at, self.path.pose(self.at))
 
 
 def _triple(values: FloatArray) -> tuple[float, float, float]:

@@ -15,11 +15,11 @@ import warp as wp
 from synth.arrays import FloatArray
 from synth.simulate.bulk import bulk_residual
 from synth.simulate.contact import ContactState, Indenters, contact_residual, contact_stiffness, contact_tangent
-from synth.simulate.driver import STANDARD, Driver
 from synth.simulate.fold import fold_residual, fold_tangent
-from synth.simulate.linear import Directions
+from synth.simulate.linear import LinearSolver
 from synth.simulate.material import Material
-from synth.simulate.multipliers import augment, settle
+from synth.simulate.multipliers import augment, update_contact_history
+from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.pattern import pattern_of
 from synth.simulate.space import Space
 from synth.simulate.stiffness import bulk_tangent, linearise, pressure_tangent, viscous_force
@@ -36,7 +36,7 @@ class System:
         material: of its elements.
         penalty: contact stiffness, E per mm.
         load: (n, 3) dead nodal forces in E mm², or None.
-        driver: precision and use of the linear solver's factors.
+        options: precision and use of the linear solver's factors.
     """
 
     def __init__(
@@ -45,12 +45,12 @@ class System:
         material: Material,
         penalty: float = 50.0,
         load: FloatArray | None = None,
-        driver: Driver = STANDARD,
+        options: SolverOptions = STANDARD,
     ) -> None:
         self.space, self.penalty, self.load = space, penalty, load
         self.mixed = material.mixed and space.element.has_pressure
         self._pattern = pattern_of(space, self.mixed)
-        self._directions = Directions(self._pattern.factor(driver.single_precision), driver.keep_factors)
+        self._linear_solver = LinearSolver(self._pattern.factor(options.single_precision), options.reuse_factors)
         self._bulk = bulk_tables(space, material, self.mixed, "cpu")
         self._laplace = laplace_table(space, material, self._pattern.element_pairs)
         self._faces = face_tables(space, "cpu")
@@ -169,17 +169,17 @@ class System:
 
     def forget_factor(self) -> None:
         """Forget the factor of an earlier tangent, so that what follows depends on the state alone."""
-        self._directions.forget()
+        self._linear_solver.forget()
 
     def newton_step(self, tangent: Tangent, residual: FloatArray, rough: bool = False) -> Unknowns:
         """-K^-1 r for a residual r (k,) of the free unknowns; NaN where the matrix is singular.
 
-        rough: whether a rough direction is enough (`synth.simulate.linear.Directions`).
+        rough: whether a rough direction is enough (`synth.simulate.linear.LinearSolver`).
         """
         moves = 3 * len(self.space.points)
         full = np.zeros(moves + (self.space.pressures if self.mixed else 0))
         matrix = self.matrix(tangent.values)
-        full[self.free] = -self._directions.solve(matrix, tangent.remainder, residual, rough)
+        full[self.free] = -self._linear_solver.solve(matrix, tangent.remainder, residual, rough)
         return Unknowns(full[:moves].reshape(-1, 3), full[moves:])
 
     def augment(self, indenter: Indenters, share: float = 1.0) -> None:
@@ -189,16 +189,16 @@ class System:
 
     def anchor(self, state: Unknowns, indenter: Indenters) -> None:
         """Anchor the points that touch for the first time."""
-        self._settle(state, indenter, new_only=1)
+        self._update_contact_history(state, indenter, new_only=1)
 
-    def settle(self, state: Unknowns, indenter: Indenters) -> None:
+    def update_contact_history(self, state: Unknowns, indenter: Indenters) -> None:
         """Accept a step: friction's anchors follow."""
-        self._settle(state, indenter, new_only=0)
+        self._update_contact_history(state, indenter, new_only=0)
 
-    def _settle(self, state: Unknowns, indenter: Indenters, new_only: int) -> None:
+    def _update_contact_history(self, state: Unknowns, indenter: Indenters, new_only: int) -> None:
         at_last = [indenter, self.gap, self.tangential, self.penalty]
         u = _on_device(state)[0]
-        _launch(settle, self.gap.shape, u, self._active, self._faces, *at_last, new_only, self.contact)
+        _launch(update_contact_history, self.gap.shape, u, self._active, self._faces, *at_last, new_only, self.contact)
 
     def deepest(self) -> float:
         """Largest penetration at the last residual, mm."""

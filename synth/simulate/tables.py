@@ -8,8 +8,8 @@ from synth.simulate.contact import Faces, Indenters
 from synth.simulate.distance import shape_vector
 from synth.simulate.element import EDGES, barycentric_gradients
 from synth.simulate.fold import LATTICE, Lattice
+from synth.simulate.load_path import LoadPath, Pose
 from synth.simulate.material import Material
-from synth.simulate.path import Path, Pose
 from synth.simulate.space import Space
 
 
@@ -87,7 +87,7 @@ def face_tables(space: Space, d: str) -> Faces:
     return faces
 
 
-def pack_indenter(path: Path, friction: float) -> Indenters:
+def pack_indenter(path: LoadPath, friction: float) -> Indenters:
     """The body of a path, on the CPU; `place_indenter` says where it is."""
     body, packed = path.body, Indenters()
     packed.kind = warp_array(np.array([body.kind], dtype=np.int32), wp.int32, "cpu")

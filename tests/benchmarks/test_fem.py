@@ -59,7 +59,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     monkeypatch.setitem(fem.CASES, "shallow", SHALLOW)
     monkeypatch.setitem(fem.COUNTED, "shallow", [1])
     meshes = [Setting("graded P2/P1", ("graded", n, 2), numerics=COARSE) for n in (2, 4)]
-    ways = [Setting("plain solver", ("graded", 2, 2), numerics=COARSE, driver=PLAIN), *meshes]
+    ways = [Setting("plain solver", ("graded", 2, 2), numerics=COARSE, options=PLAIN), *meshes]
     monkeypatch.setattr(fem, "settings_of", lambda every, across: {"shallow": ways})
     monkeypatch.setattr(fem, "reference", lambda case, across: reference)
     setting = Setting("", ("wide", 8, 2))
@@ -110,7 +110,7 @@ def test_settings_are_well_formed() -> None:
     """Settings of a case differ in their keys; the plain solver comes first; the fine zone follows the ball."""
     for every in (False, True):
         for name, ways in settings_of(every, 12).items():
-            assert ways[0].driver == PLAIN
+            assert ways[0].options == PLAIN
             keys = [(way.family, way.case(name, 12)["mesh"]) for way in ways]
             assert len(set(keys)) == len(keys)
     uniform = mesh_of(("uniform", 6, 4, 2), CASES["centred"])

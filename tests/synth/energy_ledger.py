@@ -14,8 +14,8 @@ from synth.mesh import PadMesh
 from synth.scene import Scene
 from synth.simulate.contact import Indenters
 from synth.simulate.indenter import rigid_body
+from synth.simulate.load_path import LoadPath
 from synth.simulate.material import pad_material
-from synth.simulate.path import Path
 from synth.simulate.solve import ELEMENTS
 from synth.simulate.space import function_space
 from synth.simulate.stepping import Stepper
@@ -54,7 +54,7 @@ class Ledger(System):
 
     account: Account
 
-    def settle(self, state: Unknowns, indenter: Indenters) -> None:
+    def update_contact_history(self, state: Unknowns, indenter: Indenters) -> None:
         """As the solver's, with the bookkeeping around it."""
         centre, rotation = indenter.centre.numpy()[0].copy(), indenter.rotation.numpy()[0].copy()
         force, moment = self.forces(state)[:2]
@@ -62,7 +62,7 @@ class Ledger(System):
         now = Moment(centre, rotation, force, moment - np.cross(centre, force), along @ rotation)
         weight = self._faces.weight.numpy()
         anchor, anchored = self.contact.anchor.numpy()[0].copy(), self.contact.anchored.numpy()[0] == 1
-        super().settle(state, indenter)
+        super().update_contact_history(state, indenter)
         moved = self.contact.anchor.numpy()[0] - anchor
         moved[~(anchored & (self.contact.anchored.numpy()[0] == 1))] = 0.0
         account, before = self.account, self.account.last
@@ -85,7 +85,7 @@ def accounted(scene: Scene, mesh: PadMesh) -> Account:
     material = pad_material(gel, mesh)
     ledger = Ledger(function_space(mesh, ELEMENTS[numerics.element]()), material, penalty=numerics.penalty)
     ledger.account = Account()
-    path = Path(scene.motion, rigid_body(scene.contact.indenter))
+    path = LoadPath(scene.motion, rigid_body(scene.contact.indenter))
     stepper = Stepper(ledger, path, scene.contact.friction, numerics, gel.youngs_modulus_kpa / 1000)
     ended = stepper.run()
     assert (ended.status, ended.reason) == ("complete", "")

@@ -16,11 +16,11 @@ from synth.mesh.pad import signed_volumes
 from synth.scene import Scene
 from synth.simulate import Trajectory
 from synth.simulate.contact import Indenters
-from synth.simulate.driver import Driver
 from synth.simulate.element import Element, p1, p1p1, p2p1
 from synth.simulate.indenter import rigid_body
+from synth.simulate.load_path import LoadPath
 from synth.simulate.material import pad_material, uniform
-from synth.simulate.path import Path
+from synth.simulate.options import SolverOptions
 from synth.simulate.space import function_space
 from synth.simulate.stepping import Stepper
 from synth.simulate.system import System, Tangent
@@ -125,10 +125,10 @@ def run(posed: Scene, mesh: PadMesh) -> Stepper:
     name = "p2p1" if numerics.element == "auto" else numerics.element
     space = function_space(mesh, ELEMENT[name]())
     body = System(space, pad_material(gel, mesh), numerics.penalty)
-    path = Path(posed.motion, rigid_body(posed.contact.indenter, resolution_mm=0.5))
-    # Not loose on the way: the state in which the way ends is looked at, beside the recorded ones.
-    modulus_mpa, driver = gel.youngs_modulus_kpa / 1000, Driver(loose=0.0)
-    stepper = Stepper(body, path, posed.contact.friction, numerics, modulus_mpa, driver)
+    path = LoadPath(posed.motion, rigid_body(posed.contact.indenter, resolution_mm=0.5))
+    # The full tolerance for all steps: the state in which the path ends is looked at, beside the recorded ones.
+    modulus_mpa, options = gel.youngs_modulus_kpa / 1000, SolverOptions(relaxed_tolerance=0.0)
+    stepper = Stepper(body, path, posed.contact.friction, numerics, modulus_mpa, options)
     ended = stepper.run()
     assert (ended.status, ended.reason) == ("complete", "")
     return stepper
@@ -145,7 +145,7 @@ def dense(body: System, tangent: Tangent) -> FloatArray:
 
 def indenters(posed: Scene, at: float) -> Indenters:
     """The kernels' view of a scene's indenter at a path length (mm)."""
-    path = Path(posed.motion, rigid_body(posed.contact.indenter))
+    path = LoadPath(posed.motion, rigid_body(posed.contact.indenter))
     packed = pack_indenter(path, posed.contact.friction)
     place_indenter(packed, path.pose(at))
     return packed

@@ -47,7 +47,7 @@ def equilibrium(
     guess: Unknowns | None = None,
     tolerance: float = TIGHT,
 ) -> tuple[System, Unknowns, FloatArray]:
-    """Bring a body without contact into balance under prescribed displacements and dead loads, in equal steps.
+    """Find the equilibrium of a body without contact under prescribed displacements and dead loads, in equal steps.
 
     Args:
         space: whose held components move to `prescribed`.

@@ -12,9 +12,9 @@ from synth.simulate.batched import slots as phases
 from synth.simulate.batched.many import jobs_of
 from synth.simulate.batched.pad import prepare
 from synth.simulate.batched.run import Run
-from synth.simulate.driver import Driver
+from synth.simulate.options import SolverOptions
 
-STRICT = Driver(loose=0.0, forcing=1e-3)
+STRICT = SolverOptions(relaxed_tolerance=0.0, forcing=1e-3)
 BOX = {"shape": "box", "size_mm": [3.0, 2.5, 4.0], "fillet_mm": 0.6, "rotation_deg": [0, 0, 20]}
 ROD = {"shape": "cylinder", "radius_mm": 1.5, "length_mm": 4.0, "fillet_mm": 0.3}
 
@@ -46,7 +46,7 @@ def test_a_pass_that_goes_too_far_is_given_up() -> None:
             assert slots.trial_moved.numpy()[0] == pytest.approx(moved, abs=1e-15)
         if phase in (phases.READY, phases.SOLVED):
             assert moved <= reach
-            assert reach == pytest.approx(stepping.REACH * slots.deepest.numpy()[0], rel=1e-12)
+            assert reach == pytest.approx(stepping.MAX_CORRECTION_RATIO * slots.deepest.numpy()[0], rel=1e-12)
             depths.setdefault(slots.target.numpy()[0], slots.deepest.numpy()[0])
         if phase == phases.SOLVED:
             solved += 1
@@ -75,7 +75,7 @@ def test_so_does_the_solver_for_one_sample(monkeypatch: pytest.MonkeyPatch) -> N
         return found
 
     monkeypatch.setattr(stepping, "solve", watched)
-    result = simulate(sliding(ROD), brick(counts=(5, 5, 2)), driver=STRICT)
+    result = simulate(sliding(ROD), brick(counts=(5, 5, 2)), options=STRICT)
     assert result.status == "complete"
     passes = [(converged, iterations, share) for converged, iterations, share in given if np.isfinite(share) and share]
     assert all(share <= 1 for converged, _, share in passes if converged)

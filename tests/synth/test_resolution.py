@@ -13,8 +13,8 @@ from synth.simulate import simulate
 from synth.simulate.error_model import RATE, face_error
 from synth.simulate.footprint import footprint
 from synth.simulate.indenter import rigid_body
+from synth.simulate.load_path import LoadPath
 from synth.simulate.mesh_rule import MeshRule
-from synth.simulate.path import Path
 from synth.simulate.probe import probe
 from synth.simulate.resolution import LADDER, MARGIN, Resolution, graded_mesh, predicted_error_px, scale_px_per_mm
 
@@ -104,7 +104,7 @@ def test_an_error_is_a_length_in_the_units_of_the_press(body: str) -> None:
     """
     posed = drawn(BODIES[body])
     large = Scene.model_validate(enlarged(posed.model_dump(), 2.0))
-    focus = footprint(Path(posed.motion, rigid_body(posed.contact.indenter)), SIZE, MARGIN)
+    focus = footprint(LoadPath(posed.motion, rigid_body(posed.contact.indenter)), SIZE, MARGIN)
     twice = Focus(*((2 * pair[0], 2 * pair[1]) for pair in (focus.centre_mm, focus.half_mm)))
     # E has the dimension of an area; twist turns by the same angle.
     assert face_error(large, twice, 1.0) == pytest.approx(4 * face_error(posed, focus, 0.5), rel=1e-12)
@@ -141,7 +141,7 @@ def test_only_what_the_camera_sees_counts() -> None:
 def test_predicted_error_bounds_the_error_against_a_finer_mesh(indenter: dict[str, Any]) -> None:
     posed = drawn(indenter)
     gel = posed.sensor.gel
-    focus = footprint(Path(posed.motion, rigid_body(posed.contact.indenter)), gel.size_mm, MARGIN)
+    focus = footprint(LoadPath(posed.motion, rigid_body(posed.contact.indenter)), gel.size_mm, MARGIN)
     axes = [np.linspace(-0.5, 0.5, n) * length for n, length in ((41, SIZE[0]), (31, SIZE[1]))]
     places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     found = {}

@@ -17,7 +17,7 @@ from synth.simulate.space import function_space
 from synth.simulate.system import System, Unknowns
 
 MESH = crooked()
-LOOSE = replace(MESH, size_mm=(*MESH.size_mm[:2], 99.0))
+UNHELD = replace(MESH, size_mm=(*MESH.size_mm[:2], 99.0))
 """The same mesh with no node where the window would be: nothing is held."""
 GRADIENT = np.array([[0.06, 0.10, -0.04], [-0.03, 0.05, 0.08], [0.02, -0.06, -0.09]])
 """Of an affine displacement."""
@@ -50,7 +50,7 @@ class Case:
         return uniform(len(MESH.tets), self.nu, self.stiffening)
 
     def body(self, held: bool = True) -> System:
-        space = function_space(MESH if held else LOOSE, ELEMENT[self.element]())
+        space = function_space(MESH if held else UNHELD, ELEMENT[self.element]())
         body = System(space, self.material())
         body._lattice = None  # the barrier has a test of its own
         return body
@@ -71,11 +71,11 @@ def random_state(body: System, rng: np.random.Generator, size: float = 0.03) -> 
 
 def residual(body: System, state: Unknowns) -> FloatArray:
     """All rows, held ones too: 3 n forces, then the volume equations where there is a pressure field."""
-    balance = body.residual(state, far_away())
-    assert balance.smallest_jacobian > 0
+    found = body.residual(state, far_away())
+    assert found.smallest_jacobian > 0
     full = np.zeros(state.u.size + state.p.size)
-    full[body.free] = balance.free
-    full[: state.u.size] = balance.reaction.ravel()
+    full[body.free] = found.free
+    full[: state.u.size] = found.reaction.ravel()
     return full
 
 
@@ -220,10 +220,10 @@ def test_patch(case: Case) -> None:
     state.u[:] = exact + 0.02 * inside[:, None] * np.random.default_rng(7).standard_normal(exact.shape)
     unknown = np.flatnonzero(np.concatenate([np.repeat(inside, 3), np.ones(state.p.size, dtype=bool)]))
     for _ in range(12):
-        balance = body.residual(state, far_away())
+        found = body.residual(state, far_away())
         matrix = dense(body, body.tangent(state, far_away()))
         step = np.zeros(len(body.free))
-        step[unknown] = -np.linalg.solve(matrix[np.ix_(unknown, unknown)], balance.free[unknown])
+        step[unknown] = -np.linalg.solve(matrix[np.ix_(unknown, unknown)], found.free[unknown])
         state.u[:] += step[: state.u.size].reshape(-1, 3)
         state.p[:] += step[state.u.size :]
     # Newton ends at rounding: 1e-16 times a condition number of some 1e5 (bulk over shear modulus, and the mesh).
@@ -249,7 +249,7 @@ def test_stress_of_a_uniform_strain(case: Case) -> None:
     stress = mu * (1 + 2 * c2 * s + 3 * c3 * s**2) * (F - inverse) + p * J * inverse
     work = full[: rest.size].reshape(-1, 3).T @ rest  # one virtual affine displacement per component
     # Rounding of a bulk modulus of up to 2e3 times some 1e-15 of relative volume change.
-    np.testing.assert_allclose(work / LOOSE.volumes.sum(), stress, atol=1e-11)
+    np.testing.assert_allclose(work / UNHELD.volumes.sum(), stress, atol=1e-11)
     np.testing.assert_allclose(full[rest.size :], 0.0, atol=1e-14 * max(1.0, abs(p)))
 
 

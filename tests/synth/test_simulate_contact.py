@@ -157,7 +157,7 @@ def test_settling_keeps_the_tractions(multipliers: bool, fresh: float) -> None:
     assert {0, 1, 2} <= set(mode[was].ravel())
     assert fresh == 0 or {0, 1, 2} <= set(mode[~was].ravel())
     old = contact.anchor.numpy()[0].copy()
-    body.settle(made.state, made.indenters)
+    body.update_contact_history(made.state, made.indenters)
     moved = (contact.anchor.numpy()[0] != old).any(axis=-1)
     assert (moved[was] == (mode == 2)[was]).all()
     assert (made.anchored == (mode > 0)).all()
@@ -195,7 +195,7 @@ def test_new_contact_without_a_past_has_no_friction() -> None:
     normal, along = made.tractions
     assert normal.any()
     assert not along.any()
-    body.settle(made.state, made.indenters)
+    body.update_contact_history(made.state, made.indenters)
     touching = normal.any(axis=-1)
     assert (made.anchored == touching).all()
     np.testing.assert_allclose(contact.anchor.numpy()[0][touching], made.local[touching], atol=1e-14)
@@ -205,12 +205,12 @@ def test_new_contact_without_a_past_has_no_friction() -> None:
 
 
 def test_no_friction_no_state() -> None:
-    # Fails without the test of friction in `settle`.
+    # Fails without the test of friction in `update_contact_history`.
     made = touch(0.0, multipliers=False, fresh=1.0)
     contact = made.body.contact
     anchor = contact.anchor.numpy().copy()
     made.evaluate()
-    made.body.settle(made.state, made.indenters)
+    made.body.update_contact_history(made.state, made.indenters)
     assert not made.anchored.any()
     assert (contact.anchor.numpy() == anchor).all()
     assert not made.tractions[1].any()

@@ -13,7 +13,7 @@ from synth.arrays import FloatArray
 from synth.mesh import PadMesh
 from synth.scene import Motion, Scene
 from synth.simulate import State, simulate
-from synth.simulate.path import Path
+from synth.simulate.load_path import LoadPath
 from synth.simulate.stepping import Stepper
 from synth.simulate.unknowns import Unknowns
 
@@ -144,7 +144,7 @@ def test_slip_spreads_with_the_shear() -> None:
 @each
 def test_reversed_shear_reverses_the_force(element: str) -> None:
     """Full slide to one side and then to the other: mirror images, and work lost on the way."""
-    # Fails with anchors left behind by slipping points, and without the predictor that carries the gel along at turns.
+    # Fails with anchors left behind by slipping points, and without the rigid-motion predictor at turns.
     there, mu = 0.9, 0.3
     motion = {
         "depth_mm": 0.5,
@@ -169,28 +169,28 @@ def test_reversed_shear_reverses_the_force(element: str) -> None:
     assert result.states[left].slip_ratio > 0.9
 
 
-def test_the_predictor_at_a_turn_does_not_see_how_loose_the_state_is() -> None:
-    """What it adds is a derivative along the way: a small change of the state changes it little."""
-    # Fails with the residual of the state itself left in: the change then comes back 1 / NUDGE times.
+def test_the_predictor_at_a_turn_does_not_see_how_exact_the_state_is() -> None:
+    """What it adds is a derivative along the load path: a small change of the state changes it little."""
+    # Fails with the residual of the state itself left in: the change then comes back 1 / PATH_DERIVATIVE_STEP times.
     stepper = run(scene(friction=0.5, motion={"depth_mm": 0.6, "steps": 1}), MESH)
     body, state = stepper.system, stepper.state
     motion = {"depth_mm": 0.6, "shear_mm": [0.2, 0.0], "steps": 2}
-    stepper.path = Path(Motion.model_validate(motion), stepper.path.body)
+    stepper.path = LoadPath(Motion.model_validate(motion), stepper.path.body)
     stepper._place(stepper.at)
     change = 1e-4 * np.random.default_rng(0).standard_normal(state.u.shape) * ~body.space.held
     added = []
     for begun in (state, Unknowns(state.u + change, state.p)):
         stepper.state = begun
-        added.append(stepper._carried(stepper.at + 0.2).u - begun.u)
+        added.append(stepper._rigid_motion(stepper.at + 0.2).u - begun.u)
     size = np.linalg.norm(added[0])
-    assert size > 0.2  # it carries the contact along
+    assert size > 0.2  # it moves the contact
     # The tangent changes by the strain of the change, some 1e-3; a tenth leaves room for points that come and go.
     assert np.linalg.norm(added[1] - added[0]) < 0.1 * size
 
 
 @each
 def test_friction_converges_with_the_step(element: str) -> None:
-    """The way is remembered with an error that vanishes with the step."""
+    """The load path is remembered with an error that vanishes with the step."""
     # Fails with points that stick anchored anew at each step.
     motion = {"depth_mm": 0.6, "shear_mm": [0.1, 0.0], "steps": 2}
 

@@ -25,7 +25,7 @@ from synth.simulate.batched.krylov import (
 from synth.simulate.batched.reference import Reference, inverse
 from synth.simulate.batched.slots import CARRY_READY, READY, Settings, Slots
 from synth.simulate.batched.tf32 import round_matrix
-from synth.simulate.driver import STANDARD
+from synth.simulate.options import STANDARD
 
 
 def _systems(

@@ -22,7 +22,7 @@ def test_a_press_converges() -> None:
 
 
 def test_the_limit_is_kept_and_said() -> None:
-    """Far from balance. Fails with one iteration more than the limit, and with what is left counted as converged."""
+    """Far from equilibrium. Fails with an iteration more than the limit, and with what is left counted as converged."""
     body, ball = system(MESH, 0.49), indenters(scene(), PRESSED)
     needed = solve(body, body.zero(), ball, EXACT).iterations
     assert needed > 2
@@ -48,7 +48,7 @@ def test_a_solve_that_is_near_goes_on_beyond_the_limit_to_twice_its_iterations()
     assert needed < never.iterations <= 2 * needed
 
 
-def test_a_balanced_start_costs_one_iteration_and_no_force_costs_none() -> None:
+def test_a_start_in_equilibrium_costs_one_iteration_and_no_force_costs_none() -> None:
     """A start that happens to be within the tolerance is improved once. Fails with `iterations > 0` left out."""
     body, ball = system(MESH, 0.49), indenters(scene(), PRESSED)
     first = solve(body, body.zero(), ball, EXACT)

@@ -56,24 +56,24 @@ wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 ZERO = wp.constant(wp.float64(0.0))
 ONE = wp.constant(wp.float64(1.0))
-NOTHING = wp.constant(wp.float64(newton.NOTHING))
+NOTHING = wp.constant(wp.float64(newton.FORCE_FLOOR))
 INDIFFERENT = wp.constant(wp.float64(newton.INDIFFERENT))
 SHORTEST = wp.constant(wp.float64(newton.SHORTEST))
 SHORTEST_STEP = wp.constant(wp.float64(stepping.SHORTEST_STEP))
 GROWTH = wp.constant(wp.float64(stepping.GROWTH))
-EASY = wp.constant(stepping.EASY)
+EASY = wp.constant(stepping.MAX_ITERATIONS_TO_GROW)
 FAILURES = wp.constant(stepping.FAILURES)
-ENOUGH = wp.constant(wp.float64(stepping.ENOUGH))
+ENOUGH = wp.constant(wp.float64(stepping.MAX_MULTIPLIER_UPDATES))
 PENETRATION = wp.constant(wp.float64(stepping.PENETRATION))
-REACH = wp.constant(wp.float64(stepping.REACH))
+REACH = wp.constant(wp.float64(stepping.MAX_CORRECTION_RATIO))
 TIGHTEST = wp.constant(wp.float64(1.0e-12))
 """Of a pass; rounding alone leaves some 1e-13."""
-DECREASE = wp.constant(wp.float64(1.0e-4))
-LATE = wp.constant(5)
-HOPELESS = wp.constant(wp.float64(0.5))
+DECREASE = wp.constant(wp.float64(newton.SUFFICIENT_DECREASE))
+LATE = wp.constant(newton.STALL_ITERATIONS)
+HOPELESS = wp.constant(wp.float64(newton.STALLED_RESIDUAL))
 """Newton's method ends after LATE iterations where the relative residual is still so large."""
 NEAR = wp.constant(wp.float64(newton.NEAR))
-SHORT = wp.constant(wp.float64(stepping.RELAXED))
+SHORT = wp.constant(wp.float64(stepping.MAX_RELAXED_STEP))
 
 
 @wp.kernel

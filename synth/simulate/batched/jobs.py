@@ -10,18 +10,18 @@ from synth.arrays import FloatArray
 from synth.simulate.batched.slots import COMPLETE, NO_BALANCE, Jobs
 from synth.simulate.batched.sums import SCALARS
 from synth.simulate.distance import shape_vector
-from synth.simulate.path import Path
+from synth.simulate.load_path import LoadPath
 from synth.simulate.press import Press
 from synth.simulate.space import Space
 from synth.simulate.tables import warp_array
-from synth.simulate.trajectory import State, Trajectory, no_balance, no_contact, trajectory_of
+from synth.simulate.trajectory import State, Trajectory, no_contact, not_converged, trajectory_of
 
 
 @dataclass(frozen=True)
 class Job:
     """One trajectory: its way, its friction, and its gel's Young's modulus in MPa."""
 
-    path: Path
+    path: LoadPath
     friction: float
     modulus_mpa: float
 
@@ -89,7 +89,7 @@ def body_tables(jobs: Sequence[Job], d: str) -> tuple[wp.array, wp.array, tuple[
     return shapes, warp_array(padded.reshape(len(grids), -1), wp.float64, d), (counts[0], counts[1], counts[2])
 
 
-def _grids(paths: Sequence[Path]) -> tuple[list[FloatArray], list[int]]:
+def _grids(paths: Sequence[LoadPath]) -> tuple[list[FloatArray], list[int]]:
     """The different distance grids and the number of each path's."""
     numbers: dict[bytes, int] = {}
     grids: list[FloatArray] = []
@@ -134,7 +134,7 @@ def _reason(job: Job, ended: Ended) -> str:
     if ended.reason == COMPLETE:
         return ""
     if ended.reason == NO_BALANCE:
-        return no_balance(ended.target - ended.at, job.path.pose(ended.at))
+        return not_converged(ended.target - ended.at, job.path.pose(ended.at))
     return no_contact(ended.target)
 
 

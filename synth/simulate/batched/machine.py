@@ -31,7 +31,7 @@ from synth.simulate.batched.storage import Storage
 from synth.simulate.bulk import bulk_residual
 from synth.simulate.contact import contact_residual, contact_stiffness
 from synth.simulate.fold import fold_residual
-from synth.simulate.multipliers import augment, settle
+from synth.simulate.multipliers import augment, update_contact_history
 from synth.simulate.stiffness import viscous_force
 from synth.simulate.tables import bulk_tables, face_tables, fold_tables
 
@@ -184,8 +184,8 @@ class Machine:
 
     def _settle(self, mask: wp.array, new_only: int) -> None:
         at = self._at
-        found = (at.gap, at.tangential, self.penalty, new_only)
-        self._launch(settle, at.points, at.fields.state_u, mask, self._faces, at.indenters, *found, at.contact)
+        found = (self._faces, at.indenters, at.gap, at.tangential, self.penalty, new_only, at.contact)
+        self._launch(update_contact_history, at.points, at.fields.state_u, mask, *found)
 
     def _record(self) -> None:
         at = self._at

@@ -9,13 +9,13 @@ from synth.scene import Numerics, Scene
 from synth.simulate.batched.jobs import Job, untouched
 from synth.simulate.batched.pad import Pad, prepare
 from synth.simulate.batched.run import Run
-from synth.simulate.driver import STANDARD, Driver
+from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.press import Press
 from synth.simulate.solve import check_shared
 from synth.simulate.trajectory import Trajectory
 
 LARGEST_BATCH = 512
-DRIVER = replace(STANDARD, loose=0.0, forcing=1e-4, closer=1e-3)
+DRIVER = replace(STANDARD, relaxed_tolerance=0.0, forcing=1e-4, closer=1e-3)
 """The scene's tolerance all the way, because friction remembers the way, and Newton's own directions: with 1e-3
 rounding could still decide, in a draw of a hundred, whether a correction was taken back, and so which balance was
 found (docs/reports/batched_fem.md, Rounding). 11 to 13 % more cycles than with 1e-3. Corrections to a thousandth of the
@@ -29,7 +29,7 @@ def simulate_many(
     device: str = "cuda",
     frames: frozenset[int] | Sequence[frozenset[int]] | None = None,
     batch: int = LARGEST_BATCH,
-    driver: Driver = DRIVER,
+    driver: SolverOptions = DRIVER,
     pad: Pad | None = None,
 ) -> Iterator[tuple[int, Trajectory]]:
     """Press, shear and twist many scenes' indenters into pads of one mesh, each as if it were alone.
@@ -66,7 +66,7 @@ def run_jobs(
     numerics: Numerics,
     frames: Sequence[frozenset[int]] | None = None,
     batch: int = LARGEST_BATCH,
-    driver: Driver = DRIVER,
+    driver: SolverOptions = DRIVER,
 ) -> Iterator[tuple[int, Trajectory]]:
     """Run jobs of one pad; arguments, what is yielded and what is raised as of `simulate_many`.
 

@@ -14,8 +14,8 @@ from synth.simulate.batched import slots as phases
 from synth.simulate.batched.jobs import Ended, Job, body_tables, job_tables, trajectory
 from synth.simulate.batched.machine import INNER, Machine
 from synth.simulate.batched.pad import Pad
-from synth.simulate.driver import Driver
 from synth.simulate.newton import MAX_ITERATIONS
+from synth.simulate.options import SolverOptions
 from synth.simulate.trajectory import Trajectory
 
 LOOK = 2
@@ -51,7 +51,7 @@ class Run:
         jobs: Sequence[Job],
         pad: Pad,
         numerics: Numerics,
-        driver: Driver,
+        driver: SolverOptions,
         frames: Sequence[frozenset[int]] | None,
         batch: int,
         order: Iterable[int] | None = None,
@@ -61,7 +61,7 @@ class Run:
         self.table = job_tables(jobs, pad.mesh.size_mm, frames, pad.device)
         self._shapes, self._grids, grid = body_tables(jobs, pad.device)
         settings = phases.Settings()
-        settings.tolerance, settings.loose = numerics.tolerance, driver.loose
+        settings.tolerance, settings.loose = numerics.tolerance, driver.relaxed_tolerance
         settings.longest, settings.extrapolate = numerics.max_step_mm, int(driver.extrapolate)
         settings.forcing, settings.closer = driver.forcing, driver.closer
         settings.limit, settings.correction_limit = MAX_ITERATIONS, driver.correction_iterations

@@ -161,7 +161,7 @@ class Jobs:
 
 @wp.struct
 class Settings:
-    """Of all trajectories: `synth.scene.Numerics`, `synth.simulate.driver.Driver`, and limits of Newton's method.
+    """Of all trajectories: numerics of the scene, `synth.simulate.options.SolverOptions`, limits of Newton's method.
 
     forcing: of the linear residual, relative to the right side, at most; see `synth.simulate.batched.krylov`.
     """

@@ -1,4 +1,4 @@
-"""Contact states put aside and back, while a state is corrected that the load path does not go on from."""
+"""Saving and restoring contact's history, around a corrected state that the load path does not go on from."""
 
 import numpy as np
 
