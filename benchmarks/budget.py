@@ -45,14 +45,14 @@ from synth.simulate.mesh_rule import MeshRule
 from synth.simulate.newton import MAX_ITERATIONS
 from synth.simulate.options import SolverOptions
 from synth.simulate.resolution import (
-    LADDER,
+    ELEMENTS_ACROSS,
     MARGIN,
     STEEPEST_DEPTH,
     Fineness,
     depth_growth,
     graded_mesh,
-    ladder,
     lateral_spacing,
+    mesh_levels,
     predicted_error_px,
 )
 
@@ -132,7 +132,7 @@ def reference_mesh(gel: Gel, zone: Focus, chosen_mm: float, most: int) -> tuple[
     Returns:
         The mesh, elements across the contact, and their size in mm.
     """
-    for across in (*range(LADDER[1], most, 2), most):
+    for across in (*range(ELEMENTS_ACROSS[1], most, 2), most):
         fine = lateral_spacing(gel, zone, Counts((across, across), BESIDE))
         if FINER * fine <= chosen_mm:
             break
@@ -173,7 +173,7 @@ def press_draw(case: Row, assignments: list[str], most: int) -> list[Row]:
         "target_px": rule.target_error_px,
     }
     own = Fineness(chosen.across, chosen.through)
-    meshes = [each for each in ladder(gel, zone) if each.across < finest]
+    meshes = [each for each in mesh_levels(gel, zone) if each.across < finest]
     meshes = meshes[: meshes.index(own) + BEYOND + 1] if own in meshes else [*meshes, own]
     try:
         truth = simulate(closer, mesh, folder, frames=frames, options=options)

@@ -13,7 +13,7 @@ from synth.arrays import BoolArray, FloatArray, Points
 from synth.simulate.object_surface import Triangles
 
 FLAT = 0.05
-"""LinearSolver in which the planes' normals vary less, as a share of the largest eigenvalue, do not place a vertex."""
+"""Directions in which the planes' normals vary less, as a share of the largest eigenvalue, do not place a vertex."""
 OUTSIDE = 1.0
 """Cells that a vertex may lie outside its own: there are tips that cross no edge of the cell that they end in."""
 FAR_MM = 1e3

@@ -16,7 +16,14 @@ from synth.simulate.indenter import rigid_body
 from synth.simulate.load_path import LoadPath
 from synth.simulate.mesh_rule import MeshRule
 from synth.simulate.probe import probe
-from synth.simulate.resolution import LADDER, MARGIN, Resolution, graded_mesh, predicted_error_px, scale_px_per_mm
+from synth.simulate.resolution import (
+    ELEMENTS_ACROSS,
+    MARGIN,
+    Resolution,
+    graded_mesh,
+    predicted_error_px,
+    scale_px_per_mm,
+)
 
 SIZE = (16.0, 12.0, 4.0)
 BALL = {"shape": "sphere", "radius_mm": 4.0}
@@ -44,13 +51,13 @@ def test_a_tighter_budget_takes_a_finer_mesh() -> None:
 
 def test_a_budget_out_of_reach_takes_the_finest_and_says_so() -> None:
     hopeless = resolve(drawn(BLOCK, 1e-6))
-    assert hopeless.across == LADDER[-1]
+    assert hopeless.across == ELEMENTS_ACROSS[-1]
     assert hopeless.error_px > 1e-6
 
 
 def test_an_untouched_pad_takes_the_coarsest() -> None:
     away = resolve(drawn(BALL, 1e-6, depth_mm=-0.5))
-    assert (away.across, away.error_px) == (LADDER[0], 0.0)
+    assert (away.across, away.error_px) == (ELEMENTS_ACROSS[0], 0.0)
 
 
 def test_budget_and_edge_length_exclude_each_other() -> None:
