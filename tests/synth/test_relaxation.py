@@ -58,5 +58,5 @@ def test_viscosity_follows_the_error() -> None:
     same, less, least, more, most = (next_viscosity(1.0, error) for error in errors)
     assert same == pytest.approx(1.0)
     assert least < less < same < more <= most
-    assert next_viscosity(np.array([LEAST_VISCOSITY]), np.array([0.0]))[0] == 0.0
-    assert next_viscosity(np.array([MOST_VISCOSITY]), np.array([np.inf]))[0] == MOST_VISCOSITY
+    assert next_viscosity(LEAST_VISCOSITY, 0.0) == 0.0
+    assert next_viscosity(MOST_VISCOSITY, np.inf) == MOST_VISCOSITY
