@@ -34,7 +34,7 @@ from synth.simulate import Trajectory
 from synth.simulate.batched.gemm import Host
 from synth.simulate.batched.pad import Pad, prepare
 from synth.simulate.batched.run import OPTIONS, simulate_presses
-from synth.simulate.driver import Driver
+from synth.simulate.options import SolverOptions
 from synth.simulate.press import Press
 from synth.simulate.shared import shared_mesh
 from synth.simulate.solve import check_shared
@@ -98,7 +98,7 @@ class Noisy(Host):
             found[s] *= 1 + self._share * self._rng.standard_normal(found.shape[1], dtype=np.float32)
 
 
-def together(drawn: Sequence[Drawn], pad: Pad, driver: Driver) -> list[Trajectory | str]:
+def together(drawn: Sequence[Drawn], pad: Pad, driver: SolverOptions) -> list[Trajectory | str]:
     """All draws in one batch: each one's trajectory, or why its indenter cannot be built."""
     presses, which = [], []
     found: dict[int, Trajectory | str] = {}
@@ -115,7 +115,7 @@ def together(drawn: Sequence[Drawn], pad: Pad, driver: Driver) -> list[Trajector
     return [found[n] for n in range(len(drawn))]
 
 
-def one_by_one(drawn: Sequence[Drawn], driver: Driver, processes: int) -> list[Trajectory | str]:
+def one_by_one(drawn: Sequence[Drawn], driver: SolverOptions, processes: int) -> list[Trajectory | str]:
     """Each draw in a batch of its own on the CPU; what is returned as of `together`."""
     begin = (drawn[0].scene, drawn[0].mesh)
     if processes == 1:
@@ -130,7 +130,7 @@ def _begin(scene: Scene, mesh: PadMesh) -> None:
     _PAD[:] = [prepare(scene, mesh, "cpu")]
 
 
-def _alone(one: Drawn, driver: Driver) -> Trajectory | str:
+def _alone(one: Drawn, driver: SolverOptions) -> Trajectory | str:
     return together([one], _PAD[0], driver)[0]
 
 
@@ -170,7 +170,7 @@ def last_flow(one: Drawn, trajectory: Trajectory) -> FloatArray:
 
 def run(case: Row, drawn: Sequence[Drawn], processes: int) -> list[Row]:
     """A row for each draw."""
-    driver = replace(OPTIONS, loose=case["loose"], forcing=case["forcing"])
+    driver = replace(OPTIONS, relaxed_tolerance=case["loose"], forcing=case["forcing"])
     noisy = Noisy(case["noise"]) if case["noise"] else None
     on_device = together(drawn, prepare(drawn[0].scene, drawn[0].mesh, case["device"], noisy), driver)
     return list(map(compare, drawn, on_device, one_by_one(drawn, driver, processes)))
@@ -204,7 +204,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--trajectories", type=int, default=16)
     parser.add_argument("--seed", type=int, default=5)
     parser.add_argument("--processes", type=int, default=1, help="on the CPU")
-    parser.add_argument("--loose", type=float, default=OPTIONS.loose, help="tolerance of intermediate steps")
+    parser.add_argument("--loose", type=float, default=OPTIONS.relaxed_tolerance, help="of intermediate steps")
     parser.add_argument("--forcing", type=float, default=OPTIONS.forcing, help="relative residual of linear solves")
     given = parser.parse_args(argv)
     if given.noise and given.device != "cpu":

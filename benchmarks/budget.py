@@ -39,20 +39,20 @@ from synth.scene import Gel, Scene
 from synth.scene.sampling import MAX_DRAWS, draw, draw_sensor, pairs_of, sensor_of
 from synth.scene.template import Template, load_scene, shipped_scenes
 from synth.simulate import Trajectory, simulate
-from synth.simulate.driver import Driver
 from synth.simulate.footprint import footprint
+from synth.simulate.load_path import path_of
 from synth.simulate.mesh_rule import MeshRule
 from synth.simulate.newton import MAX_ITERATIONS
-from synth.simulate.path import path_of
+from synth.simulate.options import SolverOptions
 from synth.simulate.resolution import (
-    LADDER,
+    ELEMENTS_ACROSS,
     MARGIN,
     STEEPEST_DEPTH,
     Fineness,
     depth_growth,
     graded_mesh,
-    ladder,
     lateral_spacing,
+    mesh_levels,
     predicted_error_px,
 )
 
@@ -132,7 +132,7 @@ def reference_mesh(gel: Gel, zone: Focus, chosen_mm: float, most: int) -> tuple[
     Returns:
         The mesh, elements across the contact, and their size in mm.
     """
-    for across in (*range(LADDER[1], most, 2), most):
+    for across in (*range(ELEMENTS_ACROSS[1], most, 2), most):
         fine = lateral_spacing(gel, zone, Counts((across, across), BESIDE))
         if FINER * fine <= chosen_mm:
             break
@@ -166,17 +166,17 @@ def press_draw(case: Row, assignments: list[str], most: int) -> list[Row]:
     mesh, finest, fine = reference_mesh(gel, zone, chosen.spacing_mm, most)
     step = min(STEP_MM, scene.numerics.max_step_mm)
     closer = scene.model_copy(update={"numerics": scene.numerics.model_copy(update={"max_step_mm": step})})
-    driver = Driver(correction_iterations=MAX_ITERATIONS)
+    options = SolverOptions(correction_iterations=MAX_ITERATIONS)
     about: dict[str, Any] = {
         "indenter": scene.contact.indenter.shape,
         "depth_mm": round(scene.motion.depth_mm, 3),
         "target_px": rule.target_error_px,
     }
     own = Fineness(chosen.across, chosen.through)
-    meshes = [each for each in ladder(gel, zone) if each.across < finest]
+    meshes = [each for each in mesh_levels(gel, zone) if each.across < finest]
     meshes = meshes[: meshes.index(own) + BEYOND + 1] if own in meshes else [*meshes, own]
     try:
-        truth = simulate(closer, mesh, folder, frames=frames, driver=driver)
+        truth = simulate(closer, mesh, folder, frames=frames, options=options)
         field = face_displacement(truth, points, shown) if truth.status == "complete" else None
         rows = [{**about, "mesh": "reference", "chosen": False, **_outcome(truth, shown), "spacing_mm": fine}]
         for fineness in meshes:

@@ -36,12 +36,12 @@ from synth.mesh import Counts, Focus, PadMesh, graded_box
 from synth.mesh.tetrahedralise import tetrahedralise_box
 from synth.scene import Scene
 from synth.simulate import Trajectory
-from synth.simulate.driver import STANDARD, Driver
 from synth.simulate.element import Element, p1, p1p1, p2p1
 from synth.simulate.footprint import footprint
+from synth.simulate.load_path import path_of
 from synth.simulate.material import pad_material
 from synth.simulate.newton import MAX_ITERATIONS
-from synth.simulate.path import path_of
+from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.resolution import MARGIN, graded_mesh
 from synth.simulate.space import function_space
 from synth.simulate.stepping import Stepper
@@ -58,7 +58,7 @@ ELEMENTS: dict[str, Callable[[int], Element]] = {
     "P1": p1,
 }
 POINTS = face_grid(PAD_MM, (61, 46))
-PLAIN = Driver(loose=0.0, extrapolate=False, single_precision=False, keep_factors=False)
+PLAIN = SolverOptions(relaxed_tolerance=0.0, extrapolate=False, single_precision=False, reuse_factors=False)
 """What a textbook would do: every step from the last state to the full tolerance, every tangent factorised in double
 precision."""
 
@@ -95,7 +95,7 @@ class Setting:
         element: a name of ELEMENTS.
         contact_split: contact is integrated at 3 points on each of contact_split² parts of a face.
         numerics: what differs from a scene's defaults.
-        driver: options of Newton's method.
+        options: options of Newton's method.
     """
 
     family: str
@@ -103,7 +103,7 @@ class Setting:
     element: str = "P2/P1"
     contact_split: int = 3
     numerics: dict[str, float] = field(default_factory=dict)
-    driver: Driver = STANDARD
+    options: SolverOptions = STANDARD
 
     def case(self, name: str, across: int) -> Row:
         """The key columns of a case simulated in this way."""
@@ -137,11 +137,10 @@ def stepper_of(scene: Scene, mesh: PadMesh, setting: Setting) -> Stepper:
     """A case at the start of its path, with elements and contact points that scenes do not offer, too."""
     numerics = scene.numerics.model_copy(update=setting.numerics)
     space = function_space(mesh, ELEMENTS[setting.element](setting.contact_split))
-    driver, modulus = setting.driver, scene.sensor.gel.youngs_modulus_kpa / 1000
-    material, single, keep = pad_material(scene.sensor.gel, mesh), driver.single_precision, driver.keep_factors
-    system = System(space, material, penalty=numerics.penalty, single=single, keep=keep)
+    gel, options = scene.sensor.gel, setting.options
+    system = System(space, pad_material(gel, mesh), numerics.penalty, options=options)
     path = path_of(scene, None, space.resolution_mm)
-    return Stepper(system, [path], [scene.contact.friction], numerics, [modulus], driver)
+    return Stepper(system, path, scene.contact.friction, numerics, gel.youngs_modulus_kpa / 1000, options)
 
 
 def forces(trajectory: Trajectory, states: list[int]) -> np.ndarray:
@@ -171,9 +170,9 @@ def reference(case: str, across: int) -> Trajectory:
     Raises:
         RuntimeError: it is no reference, since it did not reach its end or was not corrected.
     """
-    setting = Setting("reference", ("wide", across, 5), driver=Driver(correction_iterations=MAX_ITERATIONS))
+    setting = Setting("reference", ("wide", across, 5), options=SolverOptions(correction_iterations=MAX_ITERATIONS))
     scene = CASES[case]
-    found = stepper_of(scene, mesh_of(setting.mesh, scene), setting).run()[0]
+    found = stepper_of(scene, mesh_of(setting.mesh, scene), setting).run()
     deepest = max(state.max_penetration_mm for state in found.states)
     if found.status != "complete" or deepest > LARGEST_PENETRATION_MM:
         raise RuntimeError(f"the reference of {case} is {found.status}, {deepest:.2g} mm in the ball")
@@ -193,7 +192,7 @@ def press(case: Row, settings: dict[tuple[str, str], Setting]) -> Row:
     truth = reference(case["case"], case["reference"])
     mesh = mesh_of(setting.mesh, scene)
     compile_kernels(setting.element, setting.contact_split)
-    found, seconds = timed(lambda: stepper_of(scene, mesh, setting).run()[0])
+    found, seconds = timed(lambda: stepper_of(scene, mesh, setting).run())
     complete = found.status == "complete"
     return {
         "status": found.status,
@@ -218,7 +217,7 @@ def settings_of(every: bool, across: int) -> dict[str, list[Setting]]:
         across: elements across the contact in the reference.
     """
     uniform = ("uniform", 20, 16, 4)
-    plain = Setting("plain solver", uniform, driver=PLAIN)
+    plain = Setting("plain solver", uniform, options=PLAIN)
     check = Setting("reference mesh", ("wide", across - 4, 5))
     base = Setting("graded P2/P1", ("graded", 8))
     if not every:
@@ -238,13 +237,13 @@ def settings_of(every: bool, across: int) -> dict[str, list[Setting]]:
     others += family("graded", "P1/P1", graded[2], graded[4]) + family("fTetWild", "P2/P1", *wild[:2])
     changed = [replace(base, family=f"steps of {step} mm", numerics={"max_step_mm": step}) for step in (0.125, 0.5)]
     changed += [replace(base, family="3 points a face", contact_split=1)]
-    changed += [replace(base, family="float64", driver=Driver(single_precision=False))]
-    changed += [replace(base, family="every tangent factorised", driver=Driver(keep_factors=False))]
+    changed += [replace(base, family="float64", options=SolverOptions(single_precision=False))]
+    changed += [replace(base, family="every tangent factorised", options=SolverOptions(reuse_factors=False))]
     stiff = [
         replace(base, family=f"penalty {value:g} E/mm", numerics={"penalty": value}) for value in (25.0, 100.0, 200.0)
     ]
     return {
-        "centred": [plain, *centred, check, *changed, *stiff, replace(base, family="plain solver", driver=PLAIN)],
+        "centred": [plain, *centred, check, *changed, *stiff, replace(base, family="plain solver", options=PLAIN)],
         "off-centre": [plain, *others, check],
         "sheared": [plain, *others, check, *changed],
     }

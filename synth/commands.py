@@ -82,7 +82,7 @@ def run_simulate(scene: str, out: Path, seed: int, index: int, assignments: Sequ
     try:
         with progress("simulate: percent of the way", 100) as advance:
             press = MeshRule.of(template.numerics).press(instance, template.folder)
-            trajectory = simulate_press(press, on_way=lambda share: advance(int(100 * share), 100))
+            trajectory = simulate_press(press, on_progress=lambda share: advance(int(100 * share), 100))
     except InputError as error:
         raise InputError(f"{template.label}: {error}") from error
     record = write_trajectory(out, instance, trajectory)

@@ -14,7 +14,7 @@ from synth.errors import InputError
 from synth.planning.plan import Plan
 from synth.scene import MeshIndenter, Scene
 from synth.scene.sampling import draw
-from synth.simulate.path import TWIST_ARM_MM
+from synth.simulate.load_path import TWIST_ARM_MM
 from synth.simulate.press import edge_radius_mm
 from synth.simulate.resolution import Resolution
 

@@ -4,7 +4,7 @@ import warp
 
 warp.config.log_level = warp.LOG_ERROR  # no banner, no compiler chatter in the user's output
 
-from synth.simulate.solve import simulate, simulate_batch  # noqa: E402
+from synth.simulate.solve import simulate  # noqa: E402
 from synth.simulate.trajectory import State, Trajectory  # noqa: E402
 
-__all__ = ["State", "Trajectory", "simulate", "simulate_batch"]
+__all__ = ["State", "Trajectory", "simulate"]

@@ -20,11 +20,8 @@ from synth.surface import quadratic_face
 EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
 
 CONTACT_SPLIT = 3
-"""Contact is integrated over each face split into so many parts an edge. With three points a face, an edge of the
-indenter that is sharper than an element made Newton's method chatter: of 8 presses and slides of a ball and a flat
-punch with P2 faces 5 completed with 3 points a face, 7 with 12, 8 with 27. A frictionless press alone takes a third
-fewer iterations with 3 points and has the same error."""
-
+"""Contact is integrated over each face split into so many parts an edge: with three points a face, an edge of the
+indenter that is sharper than an element makes Newton's method chatter."""
 
 P2_HOLD = 2.0
 """The second variation of D² in an unstable mode is about that of J, so that γ = |p| would balance it. P1 elements,

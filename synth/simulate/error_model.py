@@ -22,7 +22,7 @@ from synth.mesh import Focus
 from synth.scene import Box, Cone, Cylinder, Indenter, MeshIndenter, Scene, Sphere, Torus
 
 RATE = 1.6
-"""Power of the spacing: fitted to the rungs of each draw it is 1.60."""
+"""Power of the spacing h."""
 ERROR_SCALES = {
     "sphere": 0.065,
     "cone": 0.054,
@@ -33,11 +33,9 @@ ERROR_SCALES = {
     "mesh": 0.19,
 }
 """k of the error model; a bar is a cylinder that lies, a punch one that stands. "mesh" is the largest that the others
-have if their band is taken for as wide as a mesh's: 13 presses of objects, most with sharp edges, differed from
-solutions of half the spacing and half the radius by 0.4 to 0.9 of what it predicts."""
+have if their band is taken for as wide as a mesh's."""
 CERTAINTY = 1.1
-"""Factor on the model's mean. It weighs meshes too coarse against meshes too dear: at 1.1 about as many draws of the
-study of the error budget keep their target as take a mesh of at most twice the cheapest's time."""
+"""Factor on the model's mean. It weighs meshes too coarse against meshes too dear (docs/reports/budget.md)."""
 
 
 def face_error(scene: Scene, focus: Focus, spacing_mm: float) -> float:

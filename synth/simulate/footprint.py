@@ -3,7 +3,7 @@
 The overlap is the part of the undeformed gel that lies inside the indenter at a pose; its footprint is the smallest
 axis-parallel rectangle of the contact face over it. The true contact differs: gel bulges at the contact's rim
 and lifts with it, friction drags it along. `margin` is for that. A drag carries the gel it sticks to, so the gel that
-is touched is that under the press, and beyond it what the indenter reaches on its way.
+is touched is that under the press, and beyond it what the indenter reaches along its load path.
 
 The search halves cells of space (branch and bound) and leaves those that hold nothing of the body or could not make
 the rectangle larger, so that no part is missed however thin. With d and n the signed distance and its gradient at a
@@ -21,8 +21,8 @@ from synth.arrays import BoolArray, FloatArray, Points
 from synth.mesh.focus import Focus
 from synth.mesh.pad import face_height
 from synth.simulate.distance import KINDS
+from synth.simulate.load_path import LoadPath, Pose
 from synth.simulate.measure import Distance
-from synth.simulate.path import Path, Pose
 
 RESOLUTION = 2e-3
 """The rectangle falls short of the true one, on each side, by at most this fraction of its smaller width."""
@@ -36,11 +36,11 @@ _CELLS = (16, 16, 1)
 _CONVEX = tuple(KINDS[shape] for shape in ("sphere", "cylinder", "box", "cone"))
 
 
-def footprint(path: Path, size_mm: tuple[float, float, float], margin: float) -> Focus:
+def footprint(path: LoadPath, size_mm: tuple[float, float, float], margin: float) -> Focus:
     """The part of the contact face that a path's indenter overlaps.
 
     Args:
-        path: of the indenter; its end of press and its way from there count.
+        path: of the indenter; its end of press and the load path from there count.
         size_mm: of the pad.
         margin: the footprint of the press grows by this fraction of its half widths on every side; may be negative.
 
@@ -71,7 +71,7 @@ def footprint(path: Path, size_mm: tuple[float, float, float], margin: float) ->
     return Focus((float(centre[0]), float(centre[1])), (float(half[0]), float(half[1]))).clipped(size_mm)
 
 
-def _rectangle(path: Path, poses: Sequence[Pose], size_mm: tuple[float, float, float]) -> FloatArray | None:
+def _rectangle(path: LoadPath, poses: Sequence[Pose], size_mm: tuple[float, float, float]) -> FloatArray | None:
     """(2, 2) lower and upper x, y of the pad's overlap with a body at any of the poses; None where there is none."""
     body = path.body
     poses = [pose for pose in poses if pose.depth_mm + path.face_mm > 0]

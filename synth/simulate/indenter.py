@@ -22,12 +22,10 @@ SHARPEST = 4.0
 """Largest factor on the contact stiffness."""
 OBJECT_STIFFNESS = 4.0
 """A mesh's contact stiffness over that of analytic shapes of its radius. Its edges and corners bear on few contact
-points, which passes of the multipliers do not bring to rest: with the stiffness of analytic shapes 16 presses of eight
-objects sank in by 2.5 % of their depth in the median and 12 % at most, with this one by 0.8 % and 7 %."""
+points, which passes of the multipliers do not bring to rest."""
 OBJECT_RADIUS = 2.0
-"""A mesh's smallest radius over the smallest that the gel's mesh resolves: the distance of its contact points. At half
-of it the same presses took twice as long; against half the spacing and half the radius, forces of six of them then
-differed by 15 % on average instead of 21 %."""
+"""A mesh's smallest radius over the smallest that the gel's mesh resolves: the distance of its contact points.
+Half of it costs twice the time and gains little."""
 LARGEST_GRID = 4_000_000
 """Points of a mesh's distance grid (32 MB)."""
 USUAL_GRID = 250_000

@@ -5,8 +5,8 @@ entries at touching faces only. S is factorised in single precision, which halve
 in double precision, preconditioned by the factor, takes away the rounding of the factor and R. Pardiso (through
 pypardiso's MKL) where there is one, else SuperLU in double precision. The pattern is analysed once per mesh.
 
-Where Newton's method can do with a rough direction, the factor of an earlier tangent is kept for as long as GMRES gets
-along with it (`Directions`).
+Where Newton's method can do with a rough direction, the factor of an earlier tangent is used for as long as GMRES gets
+along with it (`LinearSolver`).
 """
 
 import ctypes
@@ -25,7 +25,7 @@ GMRES_LIMIT = 40
 ROUGH_TOLERANCE = 0.03
 """Of the linear residual of a rough direction, with this tangent's factor or an earlier one's. Far from the solution it
 is the changes of the contact set that count."""
-KEPT_LIMIT = 12
+MAX_REUSE_ITERATIONS = 12
 """Iterations after which an earlier tangent's factor is given up."""
 
 
@@ -52,22 +52,22 @@ def direct_factor(indptr: np.ndarray, indices: np.ndarray, single: bool = True) 
     return SuperLUFactor(indptr, indices)
 
 
-class Directions:
-    """Solves the linear systems of one sample, one after another.
+class LinearSolver:
+    """Solves the linear systems of one press, one after another.
 
-    Neighbouring tangents differ where contact changed. With the factor of an earlier one GMRES takes some 6 iterations
-    to ROUGH_TOLERANCE; a factor of 7,000 to 14,000 unknowns costs as much as 10 to 15 of them.
+    Neighbouring tangents differ where contact changed: a few iterations of GMRES with the factor of an earlier one cost
+    less than a new factor.
 
     Args:
-        factor: of this sample's matrices; others may use it, too, and then this sample begins with a new one.
-        keep: solve roughly where that is enough, with factors of earlier matrices.
+        factor: of this press's matrices; others may use it, too, and then this press begins with a new one.
+        reuse: solve roughly where that is enough, with factors of earlier matrices.
     """
 
-    def __init__(self, factor: Factor, keep: bool) -> None:
-        self._factor, self._keep = factor, keep
-        self._own = -1  # number of the factor's matrix that was this sample's last
+    def __init__(self, factor: Factor, reuse: bool) -> None:
+        self._factor, self._reuse = factor, reuse
+        self._own = -1  # number of the factor's matrix that was this press's last
 
-    def begin(self) -> None:
+    def forget(self) -> None:
         """Start with a new factor: what is solved next has nothing to do with what was solved before."""
         self._own = -1
 
@@ -77,10 +77,10 @@ class Directions:
         rough: to ROUGH_TOLERANCE, with the factor of an earlier matrix if it serves; else with this matrix's factor.
         """
         factor, tolerance = self._factor, GMRES_TOLERANCE
-        if self._keep and rough:
+        if self._reuse and rough:
             tolerance = ROUGH_TOLERANCE
             if factor.made == self._own:
-                solution, _, left = gmres(matrix, remainder, factor, right, tolerance, KEPT_LIMIT)
+                solution, _, left = gmres(matrix, remainder, factor, right, tolerance, MAX_REUSE_ITERATIONS)
                 if left < tolerance:
                     return solution
         if not factor.factorise(matrix.data):
@@ -117,7 +117,7 @@ def gmres(
         y = matrix @ x + transposed @ x - diagonal * x
         return np.asarray(y if remainder is None else y + remainder @ x)
 
-    size = _norm(right)
+    size = norm(right)
     if size == 0:
         return np.zeros_like(right), 0, 0.0
     basis: list[FloatArray] = [right / size]
@@ -131,14 +131,14 @@ def gmres(
         if not np.isfinite(w).all():
             return np.full_like(right, np.nan), k, np.inf
         for i in range(k + 1):
-            hessenberg[i, k] = float(np.sum(w * basis[i]))  # np.sum: the same bits whatever the number of BLAS threads
+            hessenberg[i, k] = float(np.sum(w * basis[i]))  # as in `norm`
             w -= hessenberg[i, k] * basis[i]
-        hessenberg[k + 1, k] = _norm(w)
+        hessenberg[k + 1, k] = norm(w)
         small = hessenberg[: k + 2, : k + 1]
         first = np.zeros(k + 2)
         first[0] = size
         weights = np.asarray(np.linalg.lstsq(small, first, rcond=None)[0], dtype=np.float64)
-        left = _norm(small @ weights - first) / size
+        left = norm(small @ weights - first) / size
         if left < tolerance or hessenberg[k + 1, k] == 0:
             break
         basis.append(w / hessenberg[k + 1, k])
@@ -148,7 +148,8 @@ def gmres(
     return solution, len(corrections), left
 
 
-def _norm(x: FloatArray) -> float:
+def norm(x: FloatArray) -> float:
+    """Euclidean norm of all entries: the same bits whatever the number of BLAS threads."""
     return float(np.sqrt(np.sum(x * x)))
 
 
@@ -177,7 +178,7 @@ class PardisoFactor:
     """MKL Pardiso, symmetric indefinite (mtype -2), one thread: two presses side by side use two cores better.
 
     Matching and scaling are off: they would make the analysis, and so the last bits of every later solution, depend on
-    the values of the first matrix, that is on which sample of a batch came first.
+    the values of the first matrix, that is on which press came first.
     """
 
     ANALYSE, FACTORISE, SOLVE, RELEASE = 11, 22, 33, -1

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Literal
 
 from synth.mesh import pad_mesh
@@ -36,7 +36,7 @@ class MeshRule:
         return cls("even" if numerics.solver == "batched" else "graded", numerics.target_error_px or DEFAULT_TARGET_PX)
 
     def resolution(
-        self, scene: Scene, folder: FilePath | None = None, mesh_folders: Sequence[FilePath] | None = None
+        self, scene: Scene, folder: Path | None = None, mesh_folders: Sequence[Path] | None = None
     ) -> Resolution:
         """The mesh of a scene, and what it is predicted to give.
 
@@ -60,9 +60,7 @@ class MeshRule:
                 mesh = pad_mesh(gel, numerics, mesh_folders)
                 return Resolution(mesh, 0, 0, numerics.edge_length_mm or 0.0, float("nan"))
 
-    def press(
-        self, scene: Scene, folder: FilePath | None = None, mesh_folders: Sequence[FilePath] | None = None
-    ) -> Press:
+    def press(self, scene: Scene, folder: Path | None = None, mesh_folders: Sequence[Path] | None = None) -> Press:
         """Mesh, body and load path of a scene; arguments and errors as of `resolution`.
 
         The accuracy of an even mesh is left out: whoever finishes the samples predicts it, beside the simulation.

@@ -1,4 +1,4 @@
-"""What contact remembers from one load step to the next, as Warp kernels: multipliers and friction's anchors.
+"""Contact's history from one load step to the next, as Warp kernels: multipliers and friction's anchors.
 
 The law is `synth.simulate.contact`'s.
 """
@@ -19,7 +19,7 @@ def augment(
     penalty: wp.float64,
     state: ContactState,
 ):
-    """Multipliers go a share (B,) of the way to the present traction.
+    """Multipliers move by a share (B,) of the difference to the present traction.
 
     The next solution then needs less penetration and elastic slip.
     """
@@ -36,7 +36,7 @@ def augment(
 
 
 @wp.kernel
-def settle(
+def update_contact_history(
     u: wp.array2d(dtype=wp.vec3d),
     active: wp.array(dtype=wp.int32),
     faces: Faces,

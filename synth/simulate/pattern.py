@@ -1,7 +1,7 @@
 """The sparse pattern of a space's tangent, and where the entries of elements and faces go in it.
 
-It depends on topology and held nodes only. Meshes of one topology share it (`pattern_of` keeps the last ones), and with
-it the linear solver's symbolic analysis.
+It depends on topology and held nodes only. Meshes of one topology share it (`pattern_of` caches the last ones), and
+with it the linear solver's symbolic analysis.
 """
 
 import hashlib
@@ -51,7 +51,7 @@ class Pattern:
         self.face_pairs = _pairs(space.faces.shape[1])
         self.face_slot = self._blocks(faces, self.face_pairs)
         self.face_unknowns = faces.reshape(len(faces), -1)
-        self._factors: dict[tuple[bool, int], Factor] = {}
+        self._factors: dict[bool, Factor] = {}
         del self._keys
 
     @property
@@ -59,12 +59,11 @@ class Pattern:
         """Number of entries."""
         return len(self.indices)
 
-    def factor(self, single: bool = True, sample: int = 0) -> Factor:
-        """The factor of a sample of a batch, in single or double precision; analysed once."""
-        key = (single, sample)
-        if key not in self._factors:
-            self._factors[key] = direct_factor(self.indptr, self.indices, single)
-        return self._factors[key]
+    def factor(self, single: bool = True) -> Factor:
+        """A factor of this pattern, in single or double precision; analysed once."""
+        if single not in self._factors:
+            self._factors[single] = direct_factor(self.indptr, self.indices, single)
+        return self._factors[single]
 
     def _couple(self, moves: np.ndarray, pressures: np.ndarray | None) -> None:
         import scipy.sparse as sp
@@ -98,10 +97,10 @@ def _pairs(count: int) -> np.ndarray:
     return np.array([(a, b) for a in range(count) for b in range(a, count)], dtype=np.int32)
 
 
-_KEPT: OrderedDict[str, Pattern] = OrderedDict()
-_MOST_KEPT = 8
-_MOST_ENTRIES = 4_000_000
-"""Of all that are kept, which bounds memory. The draws of `gelsight_mini` have six patterns, of 0.2 to 0.6 million."""
+_CACHED: OrderedDict[str, Pattern] = OrderedDict()
+_MAX_CACHED = 8
+_MAX_ENTRIES = 4_000_000
+"""Of all that are cached, which bounds memory."""
 
 
 def pattern_of(space: Space, mixed: bool) -> Pattern:
@@ -110,9 +109,9 @@ def pattern_of(space: Space, mixed: bool) -> Pattern:
     for array in (space.nodes, space.pressure_nodes, space.held, space.faces):
         digest.update(np.ascontiguousarray(array).tobytes())
     key = digest.hexdigest()
-    if key not in _KEPT:
-        _KEPT[key] = Pattern(space, mixed)
-        while len(_KEPT) > 1 and (len(_KEPT) > _MOST_KEPT or sum(p.size for p in _KEPT.values()) > _MOST_ENTRIES):
-            _KEPT.popitem(last=False)
-    _KEPT.move_to_end(key)
-    return _KEPT[key]
+    if key not in _CACHED:
+        _CACHED[key] = Pattern(space, mixed)
+        while len(_CACHED) > 1 and (len(_CACHED) > _MAX_CACHED or sum(p.size for p in _CACHED.values()) > _MAX_ENTRIES):
+            _CACHED.popitem(last=False)
+    _CACHED.move_to_end(key)
+    return _CACHED[key]

@@ -2,13 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path as FilePath
+from pathlib import Path
 
 from synth.mesh import PadMesh
 from synth.scene import MeshIndenter, Scene
 from synth.simulate.element import Element, p1p1, p2p1
 from synth.simulate.indenter import object_radius
-from synth.simulate.path import Path, path_of
+from synth.simulate.load_path import LoadPath, path_of
 from synth.simulate.shared import Accuracy
 
 ELEMENTS: dict[str, Callable[[], Element]] = {"auto": p2p1, "p1p1": p1p1, "p2p1": p2p1}
@@ -27,13 +27,11 @@ class Press:
 
     scene: Scene
     mesh: PadMesh
-    path: Path
+    path: LoadPath
     accuracy: Accuracy | None = None
 
     @classmethod
-    def of(
-        cls, scene: Scene, mesh: PadMesh, folder: FilePath | None = None, accuracy: Accuracy | None = None
-    ) -> "Press":
+    def of(cls, scene: Scene, mesh: PadMesh, folder: Path | None = None, accuracy: Accuracy | None = None) -> "Press":
         """Build the body and its path for a mesh.
 
         Args:

@@ -8,7 +8,7 @@ against much finer solutions (docs/reports/budget.md).
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -20,14 +20,14 @@ from synth.optics import Optics
 from synth.scene import Gel, Scene
 from synth.simulate.error_model import face_error
 from synth.simulate.footprint import footprint
-from synth.simulate.path import path_of
+from synth.simulate.load_path import path_of
 
-LADDER = (4, 6, 8, 10, 12, 14, 16)
+ELEMENTS_ACROSS = (4, 6, 8, 10, 12, 14, 16)
 """Elements across the contact to choose from."""
 TALLEST = 1.8
 """Largest height over width of the elements under the contact."""
 WORTHWHILE = 0.97
-"""A mesh of the ladder has elements of at most this share of the size of any that costs less."""
+"""A mesh level has elements of at most this share of the size of any that costs less."""
 MARGIN = -0.05
 """The zone ends a little inside the geometric footprint: the contact's rim then lies well within fine elements."""
 STEEPEST_DEPTH = 2.2
@@ -64,7 +64,7 @@ class Fineness(NamedTuple):
         return f"{self.across}x{self.through}"
 
 
-def ladder(gel: Gel, focus: Focus, across: Sequence[int] = LADDER) -> list[Fineness]:
+def mesh_levels(gel: Gel, focus: Focus, across: Sequence[int] = ELEMENTS_ACROSS) -> list[Fineness]:
     """Meshes worth having for a zone, cheapest first; each is finer than all that cost less.
 
     Args:
@@ -191,7 +191,7 @@ def scale_px_per_mm(scene: Scene) -> float:
     return float(np.sqrt(abs(u[0] * v[1] - u[1] * v[0])))
 
 
-def resolve(scene: Scene, folder: FilePath | None, target_error_px: float) -> Resolution:
+def resolve(scene: Scene, folder: Path | None, target_error_px: float) -> Resolution:
     """The cheapest graded mesh of a draw whose predicted error is within a target, else the finest.
 
     Args:
@@ -204,7 +204,7 @@ def resolve(scene: Scene, folder: FilePath | None, target_error_px: float) -> Re
     """
     gel = scene.sensor.gel
     focus = footprint(path_of(scene, folder), gel.size_mm, MARGIN)
-    for fineness in ladder(gel, focus):
+    for fineness in mesh_levels(gel, focus):
         mesh, fine = graded_mesh(gel, focus, *fineness)
         error = predicted_error_px(scene, focus, fine)
         if error <= target_error_px:

@@ -8,14 +8,14 @@ here it extrapolates.
 
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path as FilePath
+from pathlib import Path
 
 import numpy as np
 
 from synth.mesh import Counts, Focus, PadMesh, domed, graded_box
 from synth.scene import Gel, Numerics, Scene
 from synth.simulate.footprint import footprint
-from synth.simulate.path import path_of
+from synth.simulate.load_path import path_of
 from synth.simulate.resolution import (
     MARGIN,
     Resolution,
@@ -79,7 +79,7 @@ def spacing_mm(gel: Gel, numerics: Numerics) -> float:
     return float(np.sqrt(wide * max(wide, high)))
 
 
-def accuracy(scene: Scene, folder: FilePath | None = None) -> Accuracy:
+def accuracy(scene: Scene, folder: Path | None = None) -> Accuracy:
     """What the shared mesh gives for one draw.
 
     Args:

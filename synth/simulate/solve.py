@@ -1,13 +1,13 @@
-"""From scenes and a mesh to trajectories: the stage's entry points."""
+"""From a scene and a mesh to a trajectory: the stage's entry points."""
 
 from collections.abc import Callable, Sequence
-from pathlib import Path as FilePath
+from pathlib import Path
 
 from synth.errors import InputError
 from synth.mesh import PadMesh, check_mesh
 from synth.scene import Gel, Scene
-from synth.simulate.driver import STANDARD, Driver
 from synth.simulate.material import pad_material
+from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.press import ELEMENTS, Press
 from synth.simulate.space import function_space
 from synth.simulate.stepping import Stepper
@@ -18,10 +18,9 @@ from synth.simulate.trajectory import Trajectory
 def simulate(
     scene: Scene,
     mesh: PadMesh,
-    folder: FilePath | None = None,
-    device: str = "cpu",
+    folder: Path | None = None,
     frames: frozenset[int] | None = None,
-    driver: Driver = STANDARD,
+    options: SolverOptions = STANDARD,
 ) -> Trajectory:
     """Press, shear and twist one scene's indenter into its pad, on a given mesh.
 
@@ -29,77 +28,45 @@ def simulate(
         scene: fully drawn.
         mesh: of scene.sensor.gel.
         folder: what a mesh indenter's file name is relative to.
-        device: Warp device.
         frames: see `simulate_press`.
-        driver: of Newton's method.
+        options: of Newton's method.
 
     Raises:
-        InputError: the indenter cannot be built.
+        InputError: the indenter cannot be built; the mesh is of another pad, or no element can be built on it.
     """
-    return stepper_of([scene], mesh, folder, device, frames, driver).run()[0]
+    return stepper_of(Press.of(scene, mesh, folder), frames, options).run()
 
 
 def simulate_press(
     press: Press,
     frames: frozenset[int] | None = None,
-    on_way: Callable[[float], None] | None = None,
+    on_progress: Callable[[float], None] | None = None,
 ) -> Trajectory:
-    """Simulate one press on the processor.
+    """Simulate one press.
 
     Args:
         press: scene, mesh and load path.
         frames: numbers of the states that are wanted, default all. The others are part of the trajectory, but keep the
-            penalty's penetration and the way's tolerance; those that are wanted are the same to the bit, unless one of
-            them misses the full tolerance and its step is halved.
-        on_way: told after each step what share of the way is done.
+            penalty's penetration and the load path's relaxed tolerance; those that are wanted are the same to the bit,
+            unless one of them misses the full tolerance and its step is halved.
+        on_progress: told after each step what share of the load path is done.
 
     Raises:
-        InputError: no element can be built on the mesh.
+        InputError: the mesh is of another pad, or no element can be built on it.
     """
-    return _stepper([press], "cpu", frames, STANDARD).run(on_way)[0]
+    return stepper_of(press, frames).run(on_progress)
 
 
-def simulate_batch(
-    scenes: Sequence[Scene],
-    mesh: PadMesh,
-    folder: FilePath | None = None,
-    device: str = "cpu",
-    frames: frozenset[int] | None = None,
-    driver: Driver = STANDARD,
-) -> list[Trajectory]:
-    """Simulate scenes that share pad, materials and numerics side by side; each as if it were alone."""
-    return stepper_of(scenes, mesh, folder, device, frames, driver).run()
-
-
-def stepper_of(
-    scenes: Sequence[Scene],
-    mesh: PadMesh,
-    folder: FilePath | None = None,
-    device: str = "cpu",
-    frames: frozenset[int] | None = None,
-    driver: Driver = STANDARD,
-) -> Stepper:
-    """What `simulate_batch` runs, at the start of the scenes' paths; arguments and errors as there."""
-    return _stepper([Press.of(scene, mesh, folder) for scene in scenes], device, frames, driver)
-
-
-def _stepper(presses: Sequence[Press], device: str, frames: frozenset[int] | None, driver: Driver) -> Stepper:
-    first, mesh, scenes = presses[0].scene, presses[0].mesh, [press.scene for press in presses]
-    check_shared(scenes, mesh)
+def stepper_of(press: Press, frames: frozenset[int] | None = None, options: SolverOptions = STANDARD) -> Stepper:
+    """A press at the start of its load path; arguments and errors as of `simulate_press`."""
+    scene, mesh = press.scene, press.mesh
+    gel, numerics = scene.sensor.gel, scene.numerics
+    _check_pad(gel, mesh)
     check_mesh(mesh)
-    space = function_space(mesh, ELEMENTS[first.numerics.element]())
-    system = System(
-        space,
-        pad_material(first.sensor.gel, mesh),
-        batch=len(scenes),
-        penalty=first.numerics.penalty,
-        device=device,
-        single=driver.single_precision,
-        keep=driver.keep_factors,
-    )
-    moduli = [scene.sensor.gel.youngs_modulus_kpa / 1000 for scene in scenes]
-    friction = [scene.contact.friction for scene in scenes]
-    return Stepper(system, [press.path for press in presses], friction, first.numerics, moduli, driver, frames)
+    space = function_space(mesh, ELEMENTS[numerics.element]())
+    system = System(space, pad_material(gel, mesh), numerics.penalty, options=options)
+    modulus_mpa = gel.youngs_modulus_kpa / 1000
+    return Stepper(system, press.path, scene.contact.friction, numerics, modulus_mpa, options, frames)
 
 
 def check_shared(scenes: Sequence[Scene], mesh: PadMesh) -> None:
@@ -110,12 +77,15 @@ def check_shared(scenes: Sequence[Scene], mesh: PadMesh) -> None:
     """
     first = scenes[0]
     for scene in scenes:
-        gel = scene.sensor.gel
-        own, other = _pad(gel.size_mm, gel.dome_radius_mm), _pad(mesh.size_mm, mesh.dome_radius_mm)
-        if own != other:
-            raise InputError(f"the mesh is of a {other}, the scene's is a {own}")
-        if (_elastic(gel), scene.numerics) != (_elastic(first.sensor.gel), first.numerics):
+        _check_pad(scene.sensor.gel, mesh)
+        if (_elastic(scene.sensor.gel), scene.numerics) != (_elastic(first.sensor.gel), first.numerics):
             raise InputError("the scenes of a batch must share the gel's materials and numerics")
+
+
+def _check_pad(gel: Gel, mesh: PadMesh) -> None:
+    own, other = _pad(gel.size_mm, gel.dome_radius_mm), _pad(mesh.size_mm, mesh.dome_radius_mm)
+    if own != other:
+        raise InputError(f"the mesh is of a {other}, the scene's is a {own}")
 
 
 def _pad(size_mm: tuple[float, float, float], dome_radius_mm: float | None) -> str:

@@ -1,343 +1,303 @@
-"""Load stepping: move the indenters along their paths, recording converged states, halving steps that fail.
+"""Load stepping: move the indenter along its load path, recording converged states, halving steps that fail.
 
-Each step starts from a linear extrapolation of the last two states. On the way a loose tolerance is enough. At a state
+Each step starts from a linear extrapolation of the last two states; a relaxed tolerance is enough for it. At a state
 that is wanted augmented-Lagrangian passes take penetration and elastic slip away, and the full tolerance holds; what
-the passes begin from and what all but the last find needs less, because the next one changes it (MULTIPLIERS). All of
-this is for what is recorded only: the path goes on from the loose state before, because multipliers that stay behind on
-a moving contact upset Newton's method at sharp edges. An unconverged field is never recorded: a sample whose step would
-have to become shorter than SHORTEST_STEP ends at its last good state.
+the passes begin from and what all but the last find needs less, because the next one changes it
+(MULTIPLIER_TOLERANCE). All of this is for what is recorded only: the path goes on from the intermediate state before,
+because multipliers that stay behind on a moving contact upset Newton's method at sharp edges. An unconverged field is
+never recorded: a press whose step would have to become shorter than SHORTEST_STEP ends at its last good state.
 """
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable
 
 import numpy as np
 
-from synth.arrays import BoolArray, FloatArray
+from synth.arrays import FloatArray
 from synth.scene import Numerics
-from synth.simulate.driver import STANDARD, Driver
-from synth.simulate.memory import kept_contact, restore_contact
-from synth.simulate.newton import MAX_ITERATIONS, NOTHING, Solution, relative_residual, solve
-from synth.simulate.path import Path, Pose
+from synth.simulate.contact_history import restore_contact, saved_contact
+from synth.simulate.load_path import LoadPath
+from synth.simulate.newton import FORCE_FLOOR, MAX_ITERATIONS, Solution, relative_residual, solve
+from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.relaxation import relax
 from synth.simulate.system import System
-from synth.simulate.tables import pack_indenters
-from synth.simulate.trajectory import State, Trajectory, no_balance, no_contact, trajectory_of
+from synth.simulate.tables import pack_indenter, place_indenter
+from synth.simulate.trajectory import State, Trajectory, no_contact, not_converged, trajectory_of
 from synth.simulate.unknowns import Unknowns
 
 SHORTEST_STEP = 1 / 128
 """Shortest step, as a share of max_step_mm."""
-EASY = 7
+MAX_ITERATIONS_TO_GROW = 7
 """A step that took at most so many iterations is followed by a longer one."""
 GROWTH = 1.5
-RELAXED = 1 / 4
+MAX_RELAXED_STEP = 1 / 4
 """A step that fails is relaxed (`synth.simulate.relaxation`) when it is at most this share of max_step_mm."""
-STUCK = 1e6
+STICK_FRICTION = 1e6
 """Coefficient of friction at which nothing slides."""
-NUDGE = 1e-3
-"""Share of a step over which the derivative along the path is taken."""
-ENOUGH = 2.0
-"""Whole updates of the multipliers at a recorded state, in all. On a face pressed on a curved body not every contact
-point can come to rest on the surface: a third still moves a sphere's force by 0.1 %, and at a punch's rim it makes the
-tractions uneven (P1/P1: a sliding punch's T / N off by 10 % with three, by 3 % with two)."""
+PATH_DERIVATIVE_STEP = 1e-3
+"""Share of a step over which the derivative along the load path is taken."""
+MAX_MULTIPLIER_UPDATES = 2.0
+"""Whole updates of the multipliers at a recorded state, in all. Not every contact point of a face on a curved body can
+come to rest on the surface, so that more updates make the tractions uneven."""
 FAILURES = 3
-"""Of attempts at them, after which the passes end. Where a whole update upsets Newton's method (a ball pressed in by
-60 %, blocks up to their edges) a part of it does not: halved after a failure and doubled after a success, updates took
-that ball's penetration from 0.14 to 0.006 mm, and its force from 8 % too little to what finer meshes have."""
-MULTIPLIERS = 20.0
-"""Tolerance of states that multipliers are updated from, over the full one. Two updates do not forget what they began
-with: from states as loose as the way (1e-3) the ends of two frictionless ways to one place differed by up to 6e-5 mm,
-so by less than 1e-5."""
+"""Of attempts at them, after which the passes end. Updates are halved after a failure and doubled after a success:
+where a whole one upsets Newton's method a part of it does not."""
+MULTIPLIER_TOLERANCE = 20.0
+"""Tolerance of states that multipliers are updated from, over the full one: two updates do not forget what they began
+with."""
 PENETRATION = 2e-3
 """Passes end when no contact point is deeper inside the indenter than this share of the press depth."""
-REACH = 3.0
-"""A pass fails that moves a node, in any iteration, farther than so many times the deepest penetration. It takes
-penetration and elastic slip away; most move nodes by 0.5 to 1.4 times as much, a twisted ball by more than twice on the
-way. At edges that slip Newton's method can wander by up to eight times as much and come to rest in another balance, or
-not within its iterations, as rounding decides (docs/reports/batched_fem.md, Rounding)."""
-
-
-@dataclass
-class _Sample:
-    """Where one sample of the batch is."""
-
-    path: Path
-    waypoints: FloatArray
-    recorded: frozenset[float]
-    corrected: frozenset[float]
-    step: float
-    next: int = 0
-    at: float = 0.0
-    previous: float | None = None
-    iterations: int = 0
-    states: list[State] = field(default_factory=list)
-    reason: str = ""
-
-    @property
-    def finished(self) -> bool:
-        return bool(self.reason) or self.next >= len(self.waypoints)
-
-    def target(self) -> float:
-        """Next stop: equal steps of at most `step` to the next waypoint."""
-        goal = float(self.waypoints[self.next])
-        count = max(1, int(np.ceil((goal - self.at) / self.step - 1e-9)))
-        return goal if count == 1 else self.at + (goal - self.at) / count
+MAX_CORRECTION_RATIO = 3.0
+"""A pass fails that moves a node, in any iteration, farther than so many times the deepest penetration, which is what
+it is to take away: at edges that slip Newton's method can wander off to another equilibrium."""
 
 
 class Stepper:
-    """Runs a batch of paths over one pad."""
+    """Runs one press over a pad.
+
+    Attributes:
+        state: displacement and pressure at the last accepted step.
+        indenter: the body as the kernels take it, where it is.
+        at: path length (mm) of the last accepted step.
+        step: length (mm) of the next step at most.
+        next: number of the waypoint that comes next.
+        states: the recorded ones, the undeformed one first.
+        reason: why the press ended early, or nothing.
+    """
 
     def __init__(
         self,
         system: System,
-        paths: Sequence[Path],
-        friction: Sequence[float],
+        path: LoadPath,
+        friction: float,
         numerics: Numerics,
-        moduli_mpa: Sequence[float],
-        driver: Driver = STANDARD,
+        modulus_mpa: float,
+        options: SolverOptions = STANDARD,
         frames: frozenset[int] | None = None,
     ) -> None:
-        """frames: numbers of the states that are wanted; the others are recorded as the way goes through them."""
-        self.system, self.numerics, self.moduli, self.driver = system, numerics, moduli_mpa, driver
-        self.samples = []
-        for path in paths:
-            records = path.records()
-            wanted = records if frames is None else [record for k, record in enumerate(records, 1) if k in frames]
-            recorded, corrected = (frozenset(map(float, places)) for places in (records, wanted))
-            self.samples.append(_Sample(path, path.waypoints(), recorded, corrected, numerics.max_step_mm))
-        self.rubs = np.array(friction) > 0
-        self.indenters = pack_indenters(paths, friction, system.device)
-        self.stuck = pack_indenters(paths, [STUCK] * len(paths), system.device)
-        self.stuck.centre, self.stuck.rotation = self.indenters.centre, self.indenters.rotation
-        self.state = system.zero()
-        self.previous = system.zero()
+        """frames: numbers of the states that are wanted; the others are recorded as the path goes through them."""
+        self.system, self.path, self.numerics, self.options = system, path, numerics, options
+        self._modulus, self._waypoints = modulus_mpa, path.waypoints().tolist()
+        records = path.records().tolist()
+        self._recorded = frozenset(records)
+        self._corrected = frozenset(place for k, place in enumerate(records, 1) if frames is None or k in frames)
+        self._rubs = friction > 0
+        self.indenter, self._sticking = pack_indenter(path, friction), pack_indenter(path, STICK_FRICTION)
+        self._sticking.centre, self._sticking.rotation = self.indenter.centre, self.indenter.rotation
+        self.state = self._previous_state = system.zero()
+        self.at, self.step, self.next = 0.0, numerics.max_step_mm, 0
+        self._previous: float | None = None
+        self._iterations = 0
+        self.states: list[State] = []
+        self.reason = ""
 
-    def run(self, on_way: Callable[[float], None] | None = None) -> list[Trajectory]:
-        """Follow every path to its end or to its last good state; `on_way` is told what share all have done."""
+    @property
+    def finished(self) -> bool:
+        """Whether the load path has come to its end, or to the last good state."""
+        return bool(self.reason) or self.next >= len(self._waypoints)
+
+    def target(self) -> float:
+        """Path length of the next step's end: equal steps of at most `step` to the next waypoint."""
+        goal = float(self._waypoints[self.next])
+        count = max(1, int(np.ceil((goal - self.at) / self.step - 1e-9)))
+        return goal if count == 1 else self.at + (goal - self.at) / count
+
+    def run(self, on_progress: Callable[[float], None] | None = None) -> Trajectory:
+        """Follow the load path to its end or to its last good state; `on_progress` is told what share of it is done."""
         started = time.perf_counter()
         self._start()
-        while not all(sample.finished for sample in self.samples):
-            self._advance(np.array([not sample.finished for sample in self.samples]))
-            if on_way is not None:
-                on_way(min(sample.at / float(sample.waypoints[-1]) for sample in self.samples))
-        seconds = (time.perf_counter() - started) / len(self.samples)
-        return [trajectory_of(tuple(each.states), each.reason, seconds, self.system.space) for each in self.samples]
+        while not self.finished:
+            self._advance()
+            if on_progress is not None:
+                on_progress(self.at / self._waypoints[-1])
+        return trajectory_of(tuple(self.states), self.reason, time.perf_counter() - started, self.system.space)
 
     def _start(self) -> None:
-        """The undeformed states; a path that never touches stays in them and needs no solve."""
-        self.system.begin()
-        for sample in self.samples:
-            sample.states = [self._rest(sample.path.pose(0.0))]
-            if not sample.path.may_touch:
-                for record in sample.path.records():
-                    sample.states.append(self._rest(sample.path.pose(float(record))))
-                sample.next = len(sample.waypoints)
-        running = np.array([not sample.finished for sample in self.samples])
-        if running.any():
-            self._place([0.0] * len(self.samples))
-            self.system.balance(self.state, self.indenters, running)
-            self.system.settle(self.state, self.indenters, running)
+        """The undeformed state; a path that never touches stays in it and needs no solve."""
+        self.system.forget_factor()
+        self.states = [self._undeformed(0.0)]
+        if not self.path.may_touch:
+            self.states += [self._undeformed(place) for place in self.path.records()]
+            self.next = len(self._waypoints)
+        if not self.finished:
+            self._place(0.0)
+            self.system.residual(self.state, self.indenter)
+            self.system.update_contact_history(self.state, self.indenter)
 
-    def _rest(self, pose: Pose) -> State:
+    def _undeformed(self, place: float) -> State:
+        pose = self.path.pose(place)
         nodes, contact = len(self.system.space.points), len(self.system.space.surface_nodes)
         zero = (0.0, 0.0, 0.0)
         fields = np.zeros((nodes, 3)), np.zeros((contact, 3))
         return State(pose.depth_mm, pose.shear_mm, pose.twist_deg, *fields, zero, zero, 0, 0.0, 1.0, 0.0, 0.0)
 
-    def _advance(self, active: BoolArray) -> None:
-        """One step of every active sample."""
-        targets = [sample.target() if active[s] else sample.at for s, sample in enumerate(self.samples)]
-        self._place(targets)
-        tight = np.array([t in s.waypoints and t not in s.recorded for s, t in zip(self.samples, targets, strict=True)])
-        tolerance = np.where(tight, self.numerics.tolerance, self._loose())
-        solution = solve(self.system, self._predicted(targets, active), self.indenters, active, tolerance)
-        self._count(solution, active)
-        short = np.array(targets) - [sample.at for sample in self.samples] <= RELAXED * self.numerics.max_step_mm
-        relaxed = active & ~solution.converged & short
-        if relaxed.any():
-            solution = relax(self.system, self.state, self.indenters, relaxed, tolerance).where(relaxed, solution)
-            self._count(solution, relaxed)
-        good = solution.converged & active
-        recording = good & np.array([t in sample.recorded for sample, t in zip(self.samples, targets, strict=True)])
-        recording &= ~self._slipped_through(recording, targets, solution.state)
-        if recording.any():
-            good &= self._record(solution, recording, targets)
-        self.previous = self.state.where(good, self.previous)
-        self.state = solution.state.where(good, self.state)
-        # After the record, whose passes must still see how far points slipped in this step.
-        self.system.settle(self.state, self.indenters, good)
-        for s in map(int, np.flatnonzero(active)):
-            self._control(self.samples[s], targets[s], bool(good[s]), int(solution.iterations[s]), bool(relaxed[s]))
+    def _advance(self) -> None:
+        """One step."""
+        target = self.target()
+        self._place(target)
+        between = target in self._recorded or target not in self._waypoints
+        tolerance = self._relaxed_tolerance if between else self.numerics.tolerance
+        solution = self._counted(solve(self.system, self._predicted(target), self.indenter, tolerance))
+        relaxed = not solution.converged and target - self.at <= MAX_RELAXED_STEP * self.numerics.max_step_mm
+        if relaxed:
+            solution = self._counted(relax(self.system, self.state, self.indenter, tolerance))
+        good = solution.converged
+        if good and target in self._recorded and not self._slipped_through(target, solution.state):
+            good = self._record(solution, target)
+        if good:
+            self._previous_state, self.state = self.state, solution.state
+            # After the record, whose passes must still see how far points slipped in this step.
+            self.system.update_contact_history(self.state, self.indenter)
+            self._lengthen(target, solution.iterations, relaxed)
+        else:
+            self._shorten(target)
 
-    def _count(self, solution: Solution, active: BoolArray) -> None:
-        """Add the iterations of a solve to the active samples'."""
-        for s in map(int, np.flatnonzero(active)):
-            self.samples[s].iterations += int(solution.iterations[s])
+    def _counted(self, solution: Solution) -> Solution:
+        """A solution, its iterations added to those since the last recorded state."""
+        self._iterations += solution.iterations
+        return solution
 
-    def _loose(self) -> float:
-        """Tolerance on the way."""
-        return max(self.driver.loose, self.numerics.tolerance)
+    @property
+    def _relaxed_tolerance(self) -> float:
+        """Tolerance of intermediate steps."""
+        return max(self.options.relaxed_tolerance, self.numerics.tolerance)
 
-    def _slipped_through(self, recording: BoolArray, targets: Sequence[float], state: Unknowns) -> BoolArray:
-        """Samples whose indenter, at the end of its press, bears on nothing: it passed between the contact points.
+    def _slipped_through(self, target: float, state: Unknowns) -> bool:
+        """Whether the indenter, at the end of its press, bears on nothing: it passed between the contact points.
 
-        Ends them, saying so.
+        Ends the press, saying so.
         """
-        size = self.system.space.mesh.size_mm
-        ending = np.array(
-            [t == s.path.press_mm and s.path.is_over(size) for s, t in zip(self.samples, targets, strict=True)]
-        )
-        through = recording & ending
-        if through.any():
-            through &= self.system.forces(state)[0][:, 2] <= NOTHING
-        for s in map(int, np.flatnonzero(through)):
-            self.samples[s].reason = no_contact(targets[s])
-        return through
+        pressed = target == self.path.press_mm and self.path.is_over(self.system.space.mesh.size_mm)
+        if not pressed or self.system.forces(state)[0][2] > FORCE_FLOOR:
+            return False
+        self.reason = no_contact(target)
+        return True
 
-    def _place(self, at: Sequence[float]) -> None:
-        poses = [sample.path.pose(s) for sample, s in zip(self.samples, at, strict=True)]
-        self.indenters.centre.assign(np.array([pose.centre for pose in poses]))
-        self.indenters.rotation.assign(np.array([pose.rotation for pose in poses]))
+    def _place(self, at: float) -> None:
+        place_indenter(self.indenter, self.path.pose(at))
 
-    def _predicted(self, targets: Sequence[float], active: BoolArray) -> Unknowns:
-        """Linear extrapolation, or after a turn the gel carried along; the last state where det F would not be > 0."""
-        ratio, turned = np.zeros(len(self.samples)), np.zeros(len(self.samples), dtype=bool)
-        for s in map(int, np.flatnonzero(active)):
-            sample = self.samples[s]
-            if sample.previous is not None and not sample.path.turns_between(sample.previous, sample.at):
-                ratio[s] = (targets[s] - sample.at) / (sample.at - sample.previous)
-            else:
-                turned[s] = self.rubs[s] and sample.at > 0
-        ahead = self.state.plus(Unknowns(self.state.u - self.previous.u, self.state.p - self.previous.p), ratio)
-        if turned.any():
-            ahead = self._carried(targets, turned).where(turned, ahead)
-        elif not ratio.any():
-            return self.state
-        valid = self.system.balance(ahead, self.indenters, active).smallest_jacobian > 0
-        return ahead.where(valid, self.state)
+    def _predicted(self, target: float) -> Unknowns:
+        """First iterate: by extrapolation, after a turn by rigid motion; the last state if det F would not be > 0."""
+        state, before = self.state, self._previous_state
+        if self._previous is not None and not self.path.turns_between(self._previous, self.at):
+            ratio = (target - self.at) / (self.at - self._previous)
+            ahead = state.plus(Unknowns(state.u - before.u, state.p - before.p), ratio)
+        elif self._rubs and self.at > 0:
+            ahead = self._rigid_motion(target)
+        else:
+            return state
+        return ahead if self.system.residual(ahead, self.indenter).smallest_jacobian > 0 else state
 
-    def _carried(self, targets: Sequence[float], active: BoolArray) -> Unknowns:
-        """The last state moved with the indenter as if every touching point stuck to it, to first order.
+    def _rigid_motion(self, target: float) -> Unknowns:
+        """Rigid-motion predictor: the last state moved as if every touching point stuck to the indenter, linearised.
 
         From the last state itself a step of the indenter aside looks like sliding at every point, and in that regime
         Newton's method does not find the state where most points stick. The derivative along the path is taken over a
-        small share of the step: over the whole of it the trial tractions of stuck points would be beyond linear.
+        small share of the step: over the whole of it the trial tractions of sticking points would be beyond linear. The
+        residual of the state itself is subtracted: the division by that share would make it too large.
         """
-        state, stuck, here = self.state, self.stuck, [sample.at for sample in self.samples]
-        self._place(here)
-        tangent = self.system.tangent(state, stuck, active)
-        unbalanced = self.system.balance(state, stuck, active).free
-        self._place([at + NUDGE * (target - at) for at, target in zip(here, targets, strict=True)])
-        moved = self.system.balance(state, stuck, active).free - unbalanced  # of a loose state 1 / NUDGE times too much
-        step = self.system.newton_step(tangent, moved, active)
-        self._place(targets)
-        return state.plus(step, np.where(active & np.isfinite(step.u).all(axis=(1, 2)), 1 / NUDGE, 0.0))
+        state, sticking = self.state, self._sticking
+        self._place(self.at)
+        tangent = self.system.tangent(state, sticking)
+        before = self.system.residual(state, sticking).free
+        self._place(self.at + PATH_DERIVATIVE_STEP * (target - self.at))
+        moved = self.system.residual(state, sticking).free - before
+        step = self.system.newton_step(tangent, moved)
+        self._place(target)
+        return state.plus(step, 1 / PATH_DERIVATIVE_STEP) if np.isfinite(step.u).all() else state
 
-    def _augmented(self, solution: Solution, wanted: BoolArray) -> Solution:
+    def _augmented(self, solution: Solution) -> Solution:
         """Passes of multiplier update and solve, by whole updates or as large a share of them as converges.
 
         The last of two whole updates is solved to the full tolerance; where the passes end before it, none is.
         """
-        between = min(self._loose(), MULTIPLIERS * self.numerics.tolerance)
-        count = len(wanted)
-        pending, share, done, failures = wanted.copy(), np.ones(count), np.zeros(count), np.zeros(count)
-        press = np.array([max(float(sample.path.corners[:, 0].max()), 0.1) for sample in self.samples])
-        solution = self._polished(solution, wanted & (self.system.deepest() > PENETRATION * press), between)
-        pending &= solution.converged
-        while (pending := pending & (self.system.deepest() > PENETRATION * press)).any():
-            before = kept_contact(self.system.contact)
-            self.system.augment(self.indenters, np.where(pending, share, 0.0))
-            tolerance = np.where(done + share < ENOUGH, between, self.numerics.tolerance)
-            reach = REACH * self.system.deepest()
-            better = self._solved_again(solution, pending, tolerance, self.driver.correction_iterations, reach)
-            converged, failed = pending & better.converged, pending & ~better.converged
-            if failed.any():
-                restore_contact(self.system.contact, before, failed)
-                self.system.balance(solution.state, self.indenters, failed)
-            done, failures = done + np.where(converged, share, 0.0), failures + failed
-            share = np.where(failed, share / 2, np.where(converged, np.minimum(1.0, 2 * share), share))
-            pending &= (done < ENOUGH) & (failures < FAILURES)
-            solution = better.where(converged, solution)
+        between = min(self._relaxed_tolerance, MULTIPLIER_TOLERANCE * self.numerics.tolerance)
+        shallow = PENETRATION * max(float(self.path.corners[:, 0].max()), 0.1)
+        share, done, failures = 1.0, 0.0, 0
+        if self.system.deepest() > shallow:
+            solution = self._polished(solution, between)
+        while solution.converged and self.system.deepest() > shallow:
+            if done >= MAX_MULTIPLIER_UPDATES or failures >= FAILURES:
+                break
+            before = saved_contact(self.system.contact)
+            self.system.augment(self.indenter, share)
+            tolerance = between if done + share < MAX_MULTIPLIER_UPDATES else self.numerics.tolerance
+            reach = MAX_CORRECTION_RATIO * self.system.deepest()
+            better = self._solved_again(solution, tolerance, self.options.correction_iterations, reach)
+            if better.converged:
+                solution, done, share = better, done + share, min(1.0, 2 * share)
+            else:
+                restore_contact(self.system.contact, before)
+                self.system.residual(solution.state, self.indenter)
+                failures, share = failures + 1, share / 2
         return solution
 
-    def _polished(self, solution: Solution, wanted: BoolArray, limit: float) -> Solution:
-        """The wanted samples brought to a tolerance where they are not there yet; see `converged`."""
-        rough = wanted & solution.converged & (relative_residual(solution.balance) > limit)
-        if not rough.any():
+    def _polished(self, solution: Solution, limit: float) -> Solution:
+        """A solution brought to a tolerance where it is not there yet; see `converged`."""
+        if not solution.converged or relative_residual(solution.residual) <= limit:
             return solution
-        better = self._solved_again(solution, rough, np.full(len(wanted), limit), MAX_ITERATIONS)
-        return better.where(rough, solution)
+        return self._solved_again(solution, limit, MAX_ITERATIONS)
 
-    def _solved_again(
-        self,
-        solution: Solution,
-        active: BoolArray,
-        tolerance: FloatArray,
-        limit: int,
-        reach_mm: FloatArray | float = np.inf,
-    ) -> Solution:
+    def _solved_again(self, solution: Solution, tolerance: float, limit: int, reach_mm: float = np.inf) -> Solution:
         """From a solution on, its iterations counted."""
-        better = solve(self.system, solution.state, self.indenters, active, tolerance, limit, reach_mm)
-        self._count(better, active)
-        return better
+        return self._counted(solve(self.system, solution.state, self.indenter, tolerance, limit, reach_mm))
 
-    def _record(self, step: Solution, recording: BoolArray, targets: Sequence[float]) -> BoolArray:
-        """Record the corrected states, then put contact back to where the path goes on.
+    def _record(self, step: Solution, target: float) -> bool:
+        """Record the corrected state, then put contact back to where the path goes on.
 
         Returns:
-            (B,) False where a corrected state does not reach the full tolerance: nothing is recorded there.
+            False where the corrected state does not reach the full tolerance: nothing is recorded.
         """
-        kept = kept_contact(self.system.contact)
-        wanted = recording & np.array([t in s.corrected for s, t in zip(self.samples, targets, strict=True)])
-        self.system.anchor(step.state, self.indenters, wanted)
-        solution = self._polished(self._augmented(step, wanted), wanted, self.numerics.tolerance)
-        lost = wanted & ~solution.converged
-        force, torque, traction = self.system.forces(solution.state)
-        residual, deepest = relative_residual(solution.balance), self.system.deepest()
-        slipping = self.system.slip_ratio(self.indenters)
-        for s in map(int, np.flatnonzero(recording & ~lost)):
-            sample, pose = self.samples[s], self.samples[s].path.pose(targets[s])
-            sample.states.append(
-                State(
-                    depth_mm=pose.depth_mm,
-                    shear_mm=pose.shear_mm,
-                    twist_deg=pose.twist_deg,
-                    displacement=solution.state.u[s].copy(),
-                    traction=self.moduli[s] * traction[s],
-                    force_n=_triple(self.moduli[s] * force[s]),
-                    torque_nmm=_triple(self.moduli[s] * torque[s]),
-                    newton_iterations=sample.iterations,
-                    residual=float(residual[s]),
-                    min_jacobian=float(solution.balance.smallest_jacobian[s]),
-                    max_penetration_mm=float(deepest[s]),
-                    slip_ratio=float(slipping[s]),
-                )
-            )
-            sample.iterations = 0
-        restore_contact(self.system.contact, kept, recording)
-        self.system.begin(recording)
-        self.system.balance(step.state, self.indenters, recording)
-        return ~lost
+        saved = saved_contact(self.system.contact)
+        solution = step
+        if target in self._corrected:
+            self.system.anchor(step.state, self.indenter)
+            solution = self._polished(self._augmented(step), self.numerics.tolerance)
+        if solution.converged:
+            self.states.append(self._recorded_state(solution, target))
+            self._iterations = 0
+        restore_contact(self.system.contact, saved)
+        self.system.forget_factor()
+        self.system.residual(step.state, self.indenter)
+        return solution.converged
 
-    def _control(self, sample: _Sample, target: float, good: bool, iterations: int, relaxed: bool) -> None:
-        """Longer steps after easy ones; half the step after a failure, and the end below the shortest.
+    def _recorded_state(self, solution: Solution, target: float) -> State:
+        """A solution that was just found, in the units of a trajectory."""
+        pose = self.path.pose(target)
+        force, torque, traction = (self._modulus * value for value in self.system.forces(solution.state))
+        return State(
+            depth_mm=pose.depth_mm,
+            shear_mm=pose.shear_mm,
+            twist_deg=pose.twist_deg,
+            displacement=solution.state.u,
+            traction=traction,
+            force_n=_triple(force),
+            torque_nmm=_triple(torque),
+            newton_iterations=self._iterations,
+            residual=relative_residual(solution.residual),
+            min_jacobian=solution.residual.smallest_jacobian,
+            max_penetration_mm=self.system.deepest(),
+            slip_ratio=self.system.slip_ratio(self.indenter),
+        )
+
+    def _lengthen(self, target: float, iterations: int, relaxed: bool) -> None:
+        """After a good step: go on from its end, by a longer one if it was easy.
 
         Nothing is extrapolated across a relaxed step, which may have jumped.
         """
-        longest = self.numerics.max_step_mm
-        if good:
-            taken = target - sample.at
-            sample.previous, sample.at = sample.at if self.driver.extrapolate and not relaxed else None, target
-            if target == sample.waypoints[sample.next]:
-                sample.next += 1
-            if iterations <= EASY:
-                sample.step = min(longest, GROWTH * max(taken, sample.step / GROWTH))
-        else:
-            sample.step = (target - sample.at) / 2
-            sample.previous = None
-            if sample.step < SHORTEST_STEP * longest:
-                sample.reason = no_balance(target - sample.at, sample.path.pose(sample.at))
+        taken = target - self.at
+        self._previous, self.at = self.at if self.options.extrapolate and not relaxed else None, target
+        if target == self._waypoints[self.next]:
+            self.next += 1
+        if iterations <= MAX_ITERATIONS_TO_GROW:
+            self.step = min(self.numerics.max_step_mm, GROWTH * max(taken, self.step / GROWTH))
+
+    def _shorten(self, target: float) -> None:
+        """After a failure: half the step, and the end below the shortest."""
+        self.step = (target - self.at) / 2
+        self._previous = None
+        if self.step < SHORTEST_STEP * self.numerics.max_step_mm:
+            self.reason = not_converged(target - self.at, self.path.pose(self.at))
 
 
 def _triple(values: FloatArray) -> tuple[float, float, float]:

@@ -1,6 +1,4 @@
-"""Constant arrays of a pad's elements and faces and of its indenters, as the kernels take them."""
-
-from collections.abc import Sequence
+"""Constant arrays of a pad's elements and faces and of its indenter, as the kernels take them."""
 
 import numpy as np
 import warp as wp
@@ -10,8 +8,8 @@ from synth.simulate.contact import Faces, Indenters
 from synth.simulate.distance import shape_vector
 from synth.simulate.element import EDGES, barycentric_gradients
 from synth.simulate.inversion_barrier import SAMPLE_DEGREE, BarrierTables
+from synth.simulate.load_path import LoadPath, Pose
 from synth.simulate.material import Material
-from synth.simulate.path import Path
 from synth.simulate.space import Space
 
 
@@ -42,14 +40,14 @@ def bulk_tables(space: Space, material: Material, mixed: bool, d: str) -> Bulk:
     return bulk
 
 
-def laplace_table(space: Space, material: Material, pairs: np.ndarray, d: str) -> wp.array:
+def laplace_table(space: Space, material: Material, pairs: np.ndarray) -> wp.array:
     """(m, np) integrals of μ g_a.g_b over the elements of a space, for pairs (np, 2) of local nodes."""
     mesh, element = space.mesh, space.element
     corner = barycentric_gradients(mesh.points, mesh.tets)
     metric = (material.shear * mesh.volumes)[:, None, None] * np.einsum("eci,edi->ecd", corner, corner)
     first, second = (element.derivative[:, pairs[:, i]] for i in range(2))
     form = np.einsum("q,qkc,qkd->kcd", element.weights, first, second).reshape(len(pairs), 16)
-    return warp_array(metric.reshape(len(metric), 16) @ form.T, wp.float64, d)
+    return warp_array(metric.reshape(len(metric), 16) @ form.T, wp.float64, "cpu")
 
 
 def barrier_tables(space: Space, material: Material, d: str) -> "BarrierTables | None":
@@ -89,20 +87,20 @@ def face_tables(space: Space, d: str) -> Faces:
     return faces
 
 
-def pack_indenters(paths: Sequence[Path], friction: Sequence[float], device: str) -> Indenters:
-    """The bodies of a batch of paths; where they are is set later."""
-    bodies = [path.body for path in paths]
-    largest = np.max([body.coefficients.shape for body in bodies], axis=0)
-    coefficients = np.zeros((len(bodies), *largest))
-    for s, body in enumerate(bodies):
-        i, j, k = body.coefficients.shape
-        coefficients[s, :i, :j, :k] = body.coefficients
-    packed = Indenters()
-    packed.kind = warp_array(np.array([body.kind for body in bodies], dtype=np.int32), wp.int32, device)
-    packed.shape = warp_array(np.array([body.shape for body in bodies]), shape_vector, device)
-    packed.coefficients = warp_array(coefficients, wp.float64, device)
-    packed.centre = wp.zeros(len(bodies), dtype=wp.vec3d, device=device)
-    packed.rotation = wp.zeros(len(bodies), dtype=wp.mat33d, device=device)
-    packed.friction = warp_array(np.array(friction, dtype=np.float64), wp.float64, device)
-    packed.sharpness = warp_array(np.array([body.sharpness for body in bodies]), wp.float64, device)
+def pack_indenter(path: LoadPath, friction: float) -> Indenters:
+    """The body of a path, on the CPU; `place_indenter` says where it is."""
+    body, packed = path.body, Indenters()
+    packed.kind = warp_array(np.array([body.kind], dtype=np.int32), wp.int32, "cpu")
+    packed.shape = warp_array(np.array([body.shape]), shape_vector, "cpu")
+    packed.coefficients = warp_array(body.coefficients[None], wp.float64, "cpu")
+    packed.centre = wp.zeros(1, dtype=wp.vec3d, device="cpu")
+    packed.rotation = wp.zeros(1, dtype=wp.mat33d, device="cpu")
+    packed.friction = warp_array(np.array([friction], dtype=np.float64), wp.float64, "cpu")
+    packed.sharpness = warp_array(np.array([body.sharpness]), wp.float64, "cpu")
     return packed
+
+
+def place_indenter(packed: Indenters, pose: Pose) -> None:
+    """Put a packed body where a pose says."""
+    packed.centre.assign(pose.centre[None])
+    packed.rotation.assign(pose.rotation[None])

@@ -6,7 +6,7 @@ from typing import Any, Literal
 import numpy as np
 
 from synth.arrays import FloatArray
-from synth.simulate.path import Pose
+from synth.simulate.load_path import Pose
 from synth.simulate.space import Space
 
 
@@ -84,9 +84,9 @@ def no_contact(depth_mm: float) -> str:
     )
 
 
-def no_balance(beyond_mm: float, pose: Pose) -> str:
+def not_converged(beyond_mm: float, pose: Pose) -> str:
     """Why a trajectory ends so far before a place that Newton's method does not reach."""
     return (
-        f"Newton's method found no balance {beyond_mm:.2g} mm beyond depth {pose.depth_mm:.3g} mm, "
+        f"Newton's method did not converge {beyond_mm:.2g} mm beyond depth {pose.depth_mm:.3g} mm, "
         f"shear {np.hypot(*pose.shear_mm):.3g} mm, twist {pose.twist_deg:.3g} deg"
     )

@@ -19,8 +19,8 @@ from synth.mesh.tetrahedralise import shape_quality
 from synth.scene import Scene
 from synth.scene.template import load_scene
 from synth.simulate import Trajectory, simulate
-from synth.simulate.driver import Driver
 from synth.simulate.mesh_rule import MeshRule
+from synth.simulate.options import SolverOptions
 from synth.stress.cases import Case, Run
 from synth.stress.inputs import altered_mesh, write_surface
 
@@ -55,8 +55,8 @@ def simulated(run: Run, folder: Path, meshes: Path) -> tuple[Scene, PadMesh, Tra
     mesh = MeshRule.of(scene.numerics).resolution(scene, folder, [meshes]).mesh
     if run.case.mesh != "as made":
         mesh = altered_mesh(mesh, run.case.mesh)
-    driver = Driver(single_precision=run.case.factor == "single")
-    return scene, mesh, simulate(scene, mesh, folder, driver=driver)
+    options = SolverOptions(single_precision=run.case.factor == "single")
+    return scene, mesh, simulate(scene, mesh, folder, options=options)
 
 
 def saved(scene: Scene, mesh: PadMesh, trajectory: Trajectory, folder: Path) -> dict[str, Any]:

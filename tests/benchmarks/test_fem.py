@@ -20,7 +20,7 @@ COARSE = {"max_step_mm": 0.5}
 @pytest.fixture(scope="module")
 def shallow() -> Trajectory:
     setting = Setting("", ("graded", 2), "P1/P1", numerics=COARSE)
-    return stepper_of(SHALLOW, mesh_of(setting.mesh, SHALLOW), setting).run()[0]
+    return stepper_of(SHALLOW, mesh_of(setting.mesh, SHALLOW), setting).run()
 
 
 def posed(trajectory: Trajectory, displacement: np.ndarray, force: tuple[float, float, float]) -> Trajectory:
@@ -59,11 +59,11 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
     monkeypatch.setitem(fem.CASES, "shallow", SHALLOW)
     monkeypatch.setitem(fem.COUNTED, "shallow", [1])
     meshes = [Setting("graded P2/P1", ("graded", n, 2), numerics=COARSE) for n in (2, 4)]
-    ways = [Setting("plain solver", ("graded", 2, 2), numerics=COARSE, driver=PLAIN), *meshes]
+    ways = [Setting("plain solver", ("graded", 2, 2), numerics=COARSE, options=PLAIN), *meshes]
     monkeypatch.setattr(fem, "settings_of", lambda every, across: {"shallow": ways})
     monkeypatch.setattr(fem, "reference", lambda case, across: reference)
     setting = Setting("", ("wide", 8, 2))
-    reference = stepper_of(SHALLOW, mesh_of(setting.mesh, SHALLOW), setting).run()[0]
+    reference = stepper_of(SHALLOW, mesh_of(setting.mesh, SHALLOW), setting).run()
     assert fem.main(["--out", str(tmp_path)]) == 0
     plain, coarse, fine = read(tmp_path / "fem.csv")
     assert {row["status"] for row in (plain, coarse, fine)} == {"complete"}
@@ -82,7 +82,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: py
 
 def test_references_that_are_none_are_refused(monkeypatch: pytest.MonkeyPatch, shallow: Trajectory) -> None:
     lost = replace(shallow, status="partial")
-    monkeypatch.setattr(fem, "stepper_of", lambda *_: type("Ended", (), {"run": lambda self: [lost]})())
+    monkeypatch.setattr(fem, "stepper_of", lambda *_: type("Ended", (), {"run": lambda self: lost})())
     with pytest.raises(RuntimeError, match="is partial"):
         fem.reference.__wrapped__("centred", 8)
 
@@ -110,7 +110,7 @@ def test_settings_are_well_formed() -> None:
     """Settings of a case differ in their keys; the plain solver comes first; the fine zone follows the ball."""
     for every in (False, True):
         for name, ways in settings_of(every, 12).items():
-            assert ways[0].driver == PLAIN
+            assert ways[0].options == PLAIN
             keys = [(way.family, way.case(name, 12)["mesh"]) for way in ways]
             assert len(set(keys)) == len(keys)
     uniform = mesh_of(("uniform", 6, 4, 2), CASES["centred"])

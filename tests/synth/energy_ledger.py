@@ -14,8 +14,8 @@ from synth.mesh import PadMesh
 from synth.scene import Scene
 from synth.simulate.contact import Indenters
 from synth.simulate.indenter import rigid_body
+from synth.simulate.load_path import LoadPath
 from synth.simulate.material import pad_material
-from synth.simulate.path import Path
 from synth.simulate.solve import ELEMENTS
 from synth.simulate.space import function_space
 from synth.simulate.stepping import Stepper
@@ -54,17 +54,15 @@ class Ledger(System):
 
     account: Account
 
-    def settle(self, state: Unknowns, indenters: Indenters, active: np.ndarray) -> None:
-        """As the solver's, with the bookkeeping around it; a step that failed is not entered."""
-        if not active[0]:
-            return
-        centre, rotation = indenters.centre.numpy()[0].copy(), indenters.rotation.numpy()[0].copy()
-        force, moment = (values[0] for values in self.forces(state)[:2])
+    def update_contact_history(self, state: Unknowns, indenter: Indenters) -> None:
+        """As the solver's, with the bookkeeping around it."""
+        centre, rotation = indenter.centre.numpy()[0].copy(), indenter.rotation.numpy()[0].copy()
+        force, moment = self.forces(state)[:2]
         along, whole = self.tangential.numpy()[0], self.traction.numpy()[0]
         now = Moment(centre, rotation, force, moment - np.cross(centre, force), along @ rotation)
         weight = self._faces.weight.numpy()
         anchor, anchored = self.contact.anchor.numpy()[0].copy(), self.contact.anchored.numpy()[0] == 1
-        super().settle(state, indenters, active)
+        super().update_contact_history(state, indenter)
         moved = self.contact.anchor.numpy()[0] - anchor
         moved[~(anchored & (self.contact.anchored.numpy()[0] == 1))] = 0.0
         account, before = self.account, self.account.last
@@ -87,9 +85,9 @@ def accounted(scene: Scene, mesh: PadMesh) -> Account:
     material = pad_material(gel, mesh)
     ledger = Ledger(function_space(mesh, ELEMENTS[numerics.element]()), material, penalty=numerics.penalty)
     ledger.account = Account()
-    path = Path(scene.motion, rigid_body(scene.contact.indenter))
-    stepper = Stepper(ledger, [path], [scene.contact.friction], numerics, [gel.youngs_modulus_kpa / 1000])
-    ended = stepper.run()[0]
+    path = LoadPath(scene.motion, rigid_body(scene.contact.indenter))
+    stepper = Stepper(ledger, path, scene.contact.friction, numerics, gel.youngs_modulus_kpa / 1000)
+    ended = stepper.run()
     assert (ended.status, ended.reason) == ("complete", "")
-    ledger.account.stored = own_integrals(ledger.space).energy(material, stepper.state.u[0], stepper.state.p[0])
+    ledger.account.stored = own_integrals(ledger.space).energy(material, stepper.state.u, stepper.state.p)
     return ledger.account

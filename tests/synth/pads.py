@@ -10,21 +10,21 @@ from typing import Any
 
 import numpy as np
 
-from synth.arrays import BoolArray, FloatArray
+from synth.arrays import FloatArray
 from synth.mesh import PadMesh
 from synth.mesh.pad import signed_volumes
 from synth.scene import Scene
 from synth.simulate import Trajectory
 from synth.simulate.contact import Indenters
-from synth.simulate.driver import Driver
 from synth.simulate.element import Element, p1, p1p1, p2p1
 from synth.simulate.indenter import rigid_body
+from synth.simulate.load_path import LoadPath
 from synth.simulate.material import pad_material, uniform
-from synth.simulate.path import Path
+from synth.simulate.options import SolverOptions
 from synth.simulate.space import function_space
 from synth.simulate.stepping import Stepper
 from synth.simulate.system import System, Tangent
-from synth.simulate.tables import pack_indenters
+from synth.simulate.tables import pack_indenter, place_indenter
 
 SIZE = (8.0, 6.0, 4.0)
 SPHERE = {"shape": "sphere", "radius_mm": 3.0}
@@ -113,12 +113,10 @@ def same(a: Trajectory, b: Trajectory) -> bool:
     )
 
 
-def system(
-    mesh: PadMesh, poisson_ratio: float, batch: int = 1, penalty: float = 50.0, element: Element | None = None
-) -> System:
+def system(mesh: PadMesh, poisson_ratio: float, penalty: float = 50.0, element: Element | None = None) -> System:
     """The discrete system of a pad of E = 1; P1/P1 unless said otherwise."""
     space = function_space(mesh, element or p1p1())
-    return System(space, uniform(len(mesh.tets), poisson_ratio), batch=batch, penalty=penalty)
+    return System(space, uniform(len(mesh.tets), poisson_ratio), penalty)
 
 
 def run(posed: Scene, mesh: PadMesh) -> Stepper:
@@ -126,40 +124,33 @@ def run(posed: Scene, mesh: PadMesh) -> Stepper:
     gel, numerics = posed.sensor.gel, posed.numerics
     name = "p2p1" if numerics.element == "auto" else numerics.element
     space = function_space(mesh, ELEMENT[name]())
-    body = System(space, pad_material(gel, mesh), penalty=numerics.penalty)
-    path = Path(posed.motion, rigid_body(posed.contact.indenter, resolution_mm=0.5))
-    # Not loose on the way: the state in which the way ends is looked at, beside the recorded ones.
-    moduli, driver = [gel.youngs_modulus_kpa / 1000], Driver(loose=0.0)
-    stepper = Stepper(body, [path], [posed.contact.friction], numerics, moduli, driver)
-    ended = stepper.run()[0]
+    body = System(space, pad_material(gel, mesh), numerics.penalty)
+    path = LoadPath(posed.motion, rigid_body(posed.contact.indenter, resolution_mm=0.5))
+    # The full tolerance for all steps: the state in which the path ends is looked at, beside the recorded ones.
+    modulus_mpa, options = gel.youngs_modulus_kpa / 1000, SolverOptions(relaxed_tolerance=0.0)
+    stepper = Stepper(body, path, posed.contact.friction, numerics, modulus_mpa, options)
+    ended = stepper.run()
     assert (ended.status, ended.reason) == ("complete", "")
     return stepper
 
 
-def dense(body: System, tangent: Tangent, sample: int = 0) -> FloatArray:
-    """(k, k) the whole derivative of one sample's free residual: symmetric part and remainder."""
-    upper = body.matrix(tangent.values[sample]).toarray()
+def dense(body: System, tangent: Tangent) -> FloatArray:
+    """(k, k) the whole derivative of the free residual: symmetric part and remainder."""
+    upper = body.matrix(tangent.values).toarray()
     assert not np.tril(upper, -1).any()
     whole = upper + np.triu(upper, 1).T
-    rest = tangent.remainder[sample]
+    rest = tangent.remainder
     return np.asarray(whole if rest is None else whole + rest.toarray())
 
 
-def indenters(posed: Scene, at: float, batch: int = 1) -> Indenters:
-    """The kernels' view of a scene's indenter at a path length (mm), the same for every sample of a batch."""
-    path = Path(posed.motion, rigid_body(posed.contact.indenter))
-    packed = pack_indenters([path] * batch, [posed.contact.friction] * batch, "cpu")
-    pose = path.pose(at)
-    packed.centre.assign(np.tile(pose.centre, (batch, 1)))
-    packed.rotation.assign(np.tile(pose.rotation, (batch, 1, 1)))
+def indenters(posed: Scene, at: float) -> Indenters:
+    """The kernels' view of a scene's indenter at a path length (mm)."""
+    path = LoadPath(posed.motion, rigid_body(posed.contact.indenter))
+    packed = pack_indenter(path, posed.contact.friction)
+    place_indenter(packed, path.pose(at))
     return packed
 
 
 def far_away() -> Indenters:
     """An indenter that touches nothing."""
     return indenters(scene(motion={"depth_mm": -40.0}), 0.0)
-
-
-def everything(system: System) -> BoolArray:
-    """(1,) all samples active."""
-    return np.ones(system.batch, dtype=bool)

@@ -14,11 +14,10 @@ from synth.arrays import BoolArray, FloatArray, Points
 from synth.mesh import PadMesh
 from synth.simulate.element import Element
 from synth.simulate.material import Material
-from synth.simulate.newton import solve
+from synth.simulate.newton import relative_residual, solve
 from synth.simulate.space import Space, function_space
 from synth.simulate.system import System, Unknowns
 
-ACTIVE = np.ones(1, dtype=bool)
 TIGHT = 1e-10
 """Tolerance of the relative residual: what is compared with closed forms should not show Newton's method."""
 
@@ -48,7 +47,7 @@ def equilibrium(
     guess: Unknowns | None = None,
     tolerance: float = TIGHT,
 ) -> tuple[System, Unknowns, FloatArray]:
-    """Bring a body without contact into balance under prescribed displacements and dead loads, in equal steps.
+    """Find the equilibrium of a body without contact under prescribed displacements and dead loads, in equal steps.
 
     Args:
         space: whose held components move to `prescribed`.
@@ -68,12 +67,12 @@ def equilibrium(
     before = state
     for k in range(1, steps + 1):
         body.load = None if load is None else load * (k / steps)
-        ahead = state.plus(Unknowns(state.u - before.u, state.p - before.p), np.ones(1))
+        ahead = state.plus(Unknowns(state.u - before.u, state.p - before.p), 1.0)
         start = Unknowns(np.where(space.held, goal * (k / steps), ahead.u), ahead.p)
-        solution = solve(body, start, far_away(), ACTIVE, np.array([tolerance]))
-        assert solution.converged[0], f"step {k} of {steps}: residual {solution.residual[0]:.1e}"
+        solution = solve(body, start, far_away(), tolerance)
+        assert solution.converged, f"step {k} of {steps}: residual {relative_residual(solution.residual):.1e}"
         before, state = state, solution.state
-    return body, state, body.balance(state, far_away(), ACTIVE).reaction[0]
+    return body, state, body.residual(state, far_away()).reaction
 
 
 def face_load(space: Space, on: Callable[[Points], BoolArray], traction: FloatArray) -> FloatArray:

@@ -7,14 +7,14 @@ circles, so that few elements resolve a round contact; forces of the whole layer
 import numpy as np
 from bonded_layer import ball
 from pads import indenters, scene
-from problems import ACTIVE, mapped, supported
+from problems import mapped, supported
 
 from synth.arrays import BoolArray, FloatArray, Points
 from synth.mesh import PadMesh
 from synth.simulate.contact import Indenters
 from synth.simulate.element import Element
 from synth.simulate.material import uniform
-from synth.simulate.newton import solve
+from synth.simulate.newton import relative_residual, solve
 from synth.simulate.system import System, Unknowns
 
 TOLERANCE = 1e-7
@@ -74,11 +74,11 @@ def press(quarter: System, indenter: Indenters, penalties: tuple[float, ...] = (
         if k < len(penalties):
             quarter.penalty = penalties[k]
         else:
-            quarter.augment(indenter, np.ones(1))
-        solution = solve(quarter, state, indenter, ACTIVE, np.array([TOLERANCE]))
-        assert solution.converged[0], f"solve {k}: residual {solution.residual[0]:.1e}"
+            quarter.augment(indenter)
+        solution = solve(quarter, state, indenter, TOLERANCE)
+        assert solution.converged, f"solve {k}: residual {relative_residual(solution.residual):.1e}"
         state = solution.state
-    return 4 * float(quarter.forces(state)[0][0, 2])
+    return 4 * float(quarter.forces(state)[0][2])
 
 
 def ball_ratio(

@@ -4,7 +4,7 @@ Each comment "fails with" names a change of `synth` that was tried.
 """
 
 import math
-from pathlib import Path as FilePath
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ from synth.scene import Box, Camera, Gel, Light, Motion, NoPattern, Numerics, Sc
 from synth.simulate.element import p1p1, p2p1
 from synth.simulate.footprint import footprint
 from synth.simulate.indenter import rigid_body
-from synth.simulate.path import Path
+from synth.simulate.load_path import LoadPath
 from synth.simulate.space import function_space
 from synth.surface import GelSurface
 from synth.verify.camera import ForwardCamera
@@ -97,7 +97,7 @@ def test_nodes_of_the_face_lie_on_the_sphere_and_the_others_where_the_map_says()
     assert domed(flat, None) is flat
 
 
-def test_ftetwild_meshes_are_bulged_or_refused(tmp_path: FilePath) -> None:
+def test_ftetwild_meshes_are_bulged_or_refused(tmp_path: Path) -> None:
     """Fails with `domed` left out of `pad_mesh`; and, the second, with its check of the volumes left out."""
     numerics = Numerics(edge_length_mm=2.0)
     mesh = pad_mesh(gel(), numerics, [tmp_path])
@@ -197,13 +197,15 @@ def test_verify_finds_a_dome_of_another_radius() -> None:
     assert not check_dome(camera, flat, RADIUS, sensor.camera).passed
 
 
-def path(indenter: object, position: tuple[float, float], depth: float, radius: float | None, **motion: object) -> Path:
+def path(
+    indenter: object, position: tuple[float, float], depth: float, radius: float | None, **motion: object
+) -> LoadPath:
     given = {"depth_mm": depth, "position_mm": position, **motion}
-    return Path(Motion.model_validate(given), rigid_body(indenter), radius)
+    return LoadPath(Motion.model_validate(given), rigid_body(indenter), radius)
 
 
 def test_depth_counts_from_the_face_below_the_position() -> None:
-    """Fails with `face_mm` left out of `Path._level`."""
+    """Fails with `face_mm` left out of `LoadPath._level`."""
     ball = Sphere(shape="sphere", radius_mm=3.0)
     way = path(ball, (3.0, -4.0), 0.7, RADIUS, shear_mm=(1.0, 0.5))
     lowest = [way.pose(s).centre[2] + 3.0 for s in (way.press_mm, way.length_mm)]
@@ -214,7 +216,7 @@ def test_depth_counts_from_the_face_below_the_position() -> None:
 
 
 def test_the_path_starts_where_the_body_first_touches() -> None:
-    """Fails with `touch_mm` = 0, and with `reach_mm` left out of `Path._level`."""
+    """Fails with `touch_mm` = 0, and with `reach_mm` left out of `LoadPath._level`."""
     p, r = 5.0, 3.0
     s = math.sqrt(RADIUS**2 - p**2)
     # Two balls touch where their centres are R + r apart: (R + r)² = p² + (s + r - t)².

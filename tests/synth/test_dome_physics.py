@@ -100,7 +100,7 @@ def test_pressed_beside_the_apex_the_plate_meets_the_apex() -> None:
 
 
 def test_mesh_and_scene_must_be_of_one_dome() -> None:
-    """Fails with dome_radius_mm left out of the comparison in `simulate_batch`."""
+    """Fails with dome_radius_mm left out of the comparison in `synth.simulate.solve`."""
     focus = Focus((0.0, 0.0), (1.0, 1.0))
     drawn = scene(20.0, (10.0, 8.0, 4.0), BALL, depth_mm=0.1)
     flat = scene(None, (10.0, 8.0, 4.0), BALL, depth_mm=0.1)

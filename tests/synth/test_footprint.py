@@ -5,7 +5,7 @@ It exceeds it only where that is below FINEST_MM and cells that may hold a part 
 2 FINEST_MM.
 """
 
-from pathlib import Path as FilePath
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,14 +15,14 @@ from synth.mesh import Focus
 from synth.scene import Box, Cone, Cylinder, Indenter, MeshIndenter, Motion, Pose, Sphere, Torus
 from synth.simulate.footprint import FINEST_MM, RESOLUTION, UNTOUCHED, footprint
 from synth.simulate.indenter import rigid_body
-from synth.simulate.path import Path
+from synth.simulate.load_path import LoadPath
 
 SIZE = (20.0, 15.0, 4.0)
 SPHERE = Sphere(shape="sphere", radius_mm=4.0)
 
 
-def print_of(indenter: Indenter, margin: float = 0.0, folder: FilePath | None = None, **motion: object) -> Focus:
-    return footprint(Path(Motion.model_validate(motion), rigid_body(indenter, folder)), SIZE, margin)
+def print_of(indenter: Indenter, margin: float = 0.0, folder: Path | None = None, **motion: object) -> Focus:
+    return footprint(LoadPath(Motion.model_validate(motion), rigid_body(indenter, folder)), SIZE, margin)
 
 
 def ends(focus: Focus) -> np.ndarray:
@@ -105,7 +105,7 @@ def test_cylinder_cone_and_torus() -> None:
     assert_covers(print_of(ring, depth_mm=0.3), *square(3.0 + np.sqrt(2 * 0.5 * 0.3 - 0.3**2)))
 
 
-def test_mesh(tmp_path: FilePath) -> None:
+def test_mesh(tmp_path: Path) -> None:
     pv.Cube(x_length=3.0, y_length=2.0, z_length=2.0).triangulate().save(tmp_path / "cube.stl")
     body = MeshIndenter(shape="mesh", file="cube.stl", cell_mm=0.1)
     # A cubic spline rounds an edge over about a cell.

@@ -13,10 +13,17 @@ from synth.simulate import simulate
 from synth.simulate.error_model import RATE, face_error
 from synth.simulate.footprint import footprint
 from synth.simulate.indenter import rigid_body
+from synth.simulate.load_path import LoadPath
 from synth.simulate.mesh_rule import MeshRule
-from synth.simulate.path import Path
 from synth.simulate.probe import probe
-from synth.simulate.resolution import LADDER, MARGIN, Resolution, graded_mesh, predicted_error_px, scale_px_per_mm
+from synth.simulate.resolution import (
+    ELEMENTS_ACROSS,
+    MARGIN,
+    Resolution,
+    graded_mesh,
+    predicted_error_px,
+    scale_px_per_mm,
+)
 
 SIZE = (16.0, 12.0, 4.0)
 BALL = {"shape": "sphere", "radius_mm": 4.0}
@@ -44,13 +51,13 @@ def test_a_tighter_budget_takes_a_finer_mesh() -> None:
 
 def test_a_budget_out_of_reach_takes_the_finest_and_says_so() -> None:
     hopeless = resolve(drawn(BLOCK, 1e-6))
-    assert hopeless.across == LADDER[-1]
+    assert hopeless.across == ELEMENTS_ACROSS[-1]
     assert hopeless.error_px > 1e-6
 
 
 def test_an_untouched_pad_takes_the_coarsest() -> None:
     away = resolve(drawn(BALL, 1e-6, depth_mm=-0.5))
-    assert (away.across, away.error_px) == (LADDER[0], 0.0)
+    assert (away.across, away.error_px) == (ELEMENTS_ACROSS[0], 0.0)
 
 
 def test_budget_and_edge_length_exclude_each_other() -> None:
@@ -104,7 +111,7 @@ def test_an_error_is_a_length_in_the_units_of_the_press(body: str) -> None:
     """
     posed = drawn(BODIES[body])
     large = Scene.model_validate(enlarged(posed.model_dump(), 2.0))
-    focus = footprint(Path(posed.motion, rigid_body(posed.contact.indenter)), SIZE, MARGIN)
+    focus = footprint(LoadPath(posed.motion, rigid_body(posed.contact.indenter)), SIZE, MARGIN)
     twice = Focus(*((2 * pair[0], 2 * pair[1]) for pair in (focus.centre_mm, focus.half_mm)))
     # E has the dimension of an area; twist turns by the same angle.
     assert face_error(large, twice, 1.0) == pytest.approx(4 * face_error(posed, focus, 0.5), rel=1e-12)
@@ -141,7 +148,7 @@ def test_only_what_the_camera_sees_counts() -> None:
 def test_predicted_error_bounds_the_error_against_a_finer_mesh(indenter: dict[str, Any]) -> None:
     posed = drawn(indenter)
     gel = posed.sensor.gel
-    focus = footprint(Path(posed.motion, rigid_body(posed.contact.indenter)), gel.size_mm, MARGIN)
+    focus = footprint(LoadPath(posed.motion, rigid_body(posed.contact.indenter)), gel.size_mm, MARGIN)
     axes = [np.linspace(-0.5, 0.5, n) * length for n, length in ((41, SIZE[0]), (31, SIZE[1]))]
     places = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     found = {}

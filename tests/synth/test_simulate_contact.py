@@ -5,7 +5,7 @@ Each comment "fails with" names a change of `synth.simulate.contact` that was tr
 
 import numpy as np
 import pytest
-from pads import MIXED, dense, everything
+from pads import MIXED, dense
 from touching import INDENTERS, MESH, PENALTY, RADIUS, SLIP, STICK, sphere_law, touch
 
 from synth.simulate.contact import FAR
@@ -55,17 +55,17 @@ def test_tangent_is_the_derivative_of_the_residual(friction: float, shape: str, 
     # without A - mean in the remainder, and with the remainder transposed.
     made = touch(friction, shape, fresh=fresh, element=element)
     body = made.body
-    tangent = body.tangent(made.state, made.indenters, everything(body))
-    assert (tangent.remainder[0] is None) == (friction == 0)
+    tangent = body.tangent(made.state, made.indenters)
+    assert (tangent.remainder is None) == (friction == 0)
     matrix = dense(body, tangent)
     rng = np.random.default_rng(3)
     for _ in range(3):
         direction = Unknowns(rng.standard_normal(made.state.u.shape), rng.standard_normal(made.state.p.shape))
-        direction.u[0, body.space.held] = 0.0
+        direction.u[body.space.held] = 0.0
         h = 1e-7
         ends, modes = [], []
         for step in (h, -h):
-            ends.append(made.evaluate(made.state.plus(direction, np.array([step]))))
+            ends.append(made.evaluate(made.state.plus(direction, step)))
             modes.append(made.mode)
         # Points within h of touching or slipping would make the difference quotient meaningless; there are none.
         assert (modes[0] == modes[1]).all()
@@ -82,8 +82,8 @@ def test_remainder_of_stick_is_antisymmetric(element: str) -> None:
     # Fails with A for A - mean in the remainder.
     made = touch(1e6, element=element)
     assert set(made.mode.ravel()) == {0, 1}
-    tangent = made.body.tangent(made.state, made.indenters, everything(made.body))
-    rest, upper = tangent.remainder[0].toarray(), made.body.matrix(tangent.values[0]).toarray()
+    tangent = made.body.tangent(made.state, made.indenters)
+    rest, upper = tangent.remainder.toarray(), made.body.matrix(tangent.values).toarray()
     np.testing.assert_allclose(rest, -rest.T, atol=1e-12 * np.abs(upper).max())
     # Tractions of about 1 on a curvature of 1 / 1.3, against the penalty of 7.
     assert 0 < np.abs(rest).max() < 0.5 * np.abs(upper).max()
@@ -95,11 +95,11 @@ def test_nodal_forces_and_moments_are_the_tractions(element: str) -> None:
     # Fails with the position of the undeformed points in `forces`, and with the sides' faces in the nodal mean.
     made = touch(0.7, element=element)
     body, space = made.body, made.body.space
-    reaction = body.balance(made.state, made.indenters, everything(body)).reaction[0]
-    force, moment, nodal = (values[0] for values in body.forces(made.state))
+    reaction = body.residual(made.state, made.indenters).reaction
+    force, moment, nodal = body.forces(made.state)
     # Inner forces sum to zero (test_simulate_bulk), so the whole sum is minus the contact's.
     np.testing.assert_allclose(reaction.sum(axis=0), -force, atol=1e-11)
-    np.testing.assert_allclose(np.cross(space.points + made.state.u[0], reaction).sum(axis=0), -moment, atol=1e-11)
+    np.testing.assert_allclose(np.cross(space.points + made.state.u, reaction).sum(axis=0), -moment, atol=1e-11)
     normal, along = sphere_law(made)
     weight = body._faces.weight.numpy()
     np.testing.assert_allclose(force, np.einsum("fq,fqc->c", weight, normal + along), rtol=1e-12)
@@ -128,8 +128,8 @@ def test_law_does_not_depend_on_the_frame(fresh: float) -> None:
     turn = np.array([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
     made.indenters.centre.assign((turn @ made.centre)[None])
     made.indenters.rotation.assign((turn @ made.rotation)[None])
-    turned = (MESH.points + made.state.u[0]) @ turn.T - MESH.points
-    made.evaluate(Unknowns(turned[None], made.state.p))
+    turned = (MESH.points + made.state.u) @ turn.T - MESH.points
+    made.evaluate(Unknowns(turned, made.state.p))
     np.testing.assert_allclose(made.body.traction.numpy()[0], before @ turn.T, atol=1e-13)
 
 
@@ -137,7 +137,7 @@ def test_augmenting_takes_the_present_traction() -> None:
     made = touch(0.7, multipliers=False)
     contact = made.body.contact
     normal, along = sphere_law(made)
-    made.body.augment(made.indenters, np.ones(made.body.batch))
+    made.body.augment(made.indenters)
     np.testing.assert_allclose(contact.normal.numpy()[0], np.linalg.norm(normal, axis=-1), atol=1e-13)
     np.testing.assert_allclose(contact.tangent.numpy()[0], along @ made.rotation, atol=1e-13)
     # Where the gap is closed exactly the traction then needs no penetration: t = lambda - eps g.
@@ -157,7 +157,7 @@ def test_settling_keeps_the_tractions(multipliers: bool, fresh: float) -> None:
     assert {0, 1, 2} <= set(mode[was].ravel())
     assert fresh == 0 or {0, 1, 2} <= set(mode[~was].ravel())
     old = contact.anchor.numpy()[0].copy()
-    body.settle(made.state, made.indenters, everything(body))
+    body.update_contact_history(made.state, made.indenters)
     moved = (contact.anchor.numpy()[0] != old).any(axis=-1)
     assert (moved[was] == (mode == 2)[was]).all()
     assert (made.anchored == (mode > 0)).all()
@@ -177,7 +177,7 @@ def test_new_contact_is_anchored_where_it_touched() -> None:
     place, gap = contact.place.numpy()[0].copy(), contact.gap.numpy()[0].copy()
     touching = made.mode > 0
     assert touching.any()
-    body.anchor(made.state, made.indenters, everything(body))
+    body.anchor(made.state, made.indenters)
     assert (made.anchored == touching).all()
     assert (contact.gap.numpy()[0] == gap).all()  # the step is not accepted yet
     now = np.linalg.norm(made.local, axis=-1) - RADIUS
@@ -195,7 +195,7 @@ def test_new_contact_without_a_past_has_no_friction() -> None:
     normal, along = made.tractions
     assert normal.any()
     assert not along.any()
-    body.settle(made.state, made.indenters, everything(body))
+    body.update_contact_history(made.state, made.indenters)
     touching = normal.any(axis=-1)
     assert (made.anchored == touching).all()
     np.testing.assert_allclose(contact.anchor.numpy()[0][touching], made.local[touching], atol=1e-14)
@@ -205,12 +205,12 @@ def test_new_contact_without_a_past_has_no_friction() -> None:
 
 
 def test_no_friction_no_state() -> None:
-    # Fails without the test of friction in `settle`.
+    # Fails without the test of friction in `update_contact_history`.
     made = touch(0.0, multipliers=False, fresh=1.0)
     contact = made.body.contact
     anchor = contact.anchor.numpy().copy()
     made.evaluate()
-    made.body.settle(made.state, made.indenters, everything(made.body))
+    made.body.update_contact_history(made.state, made.indenters)
     assert not made.anchored.any()
     assert (contact.anchor.numpy() == anchor).all()
     assert not made.tractions[1].any()
@@ -223,18 +223,18 @@ def test_slip_ratio_is_the_slipping_share_of_area(friction: float) -> None:
     made = touch(friction, fresh=0.5)
     weight, mode = made.body._faces.weight.numpy(), made.mode
     expected = weight[mode == 2].sum() / weight[mode > 0].sum()
-    assert made.body.slip_ratio(made.indenters)[0] == pytest.approx(expected, rel=1e-12)
+    assert made.body.slip_ratio(made.indenters) == pytest.approx(expected, rel=1e-12)
     assert {0.0: expected == 1, 0.7: 0 < expected < 1, STICK: expected < 0.1}.get(friction, expected > 0.8)
 
 
 def test_deepest_is_the_largest_penetration() -> None:
     made = touch(0.0)
     away = np.linalg.norm(made.points - made.centre, axis=-1)
-    assert made.body.deepest()[0] == pytest.approx(RADIUS - away.min(), abs=1e-14)
+    assert made.body.deepest() == pytest.approx(RADIUS - away.min(), abs=1e-14)
     made.indenters.centre.assign(np.array([[0.0, 0.0, -50.0]]))
     made.evaluate()
-    assert made.body.deepest()[0] == 0.0
-    assert made.body.slip_ratio(made.indenters)[0] == 0.0
+    assert made.body.deepest() == 0.0
+    assert made.body.slip_ratio(made.indenters) == 0.0
 
 
 @each
@@ -256,5 +256,5 @@ def test_sides_are_touched_like_the_face(element: str) -> None:
     distance = np.linalg.norm(away, axis=-1, keepdims=True)
     expected = PENALTY * np.maximum(RADIUS - distance, 0) * away / distance
     np.testing.assert_allclose(made.tractions[0], expected, atol=1e-13)
-    force = made.body.forces(made.state)[0][0]
+    force = made.body.forces(made.state)[0]
     assert force[0] < -10 * np.hypot(*force[1:])

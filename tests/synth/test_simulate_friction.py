@@ -13,7 +13,7 @@ from synth.arrays import FloatArray
 from synth.mesh import PadMesh
 from synth.scene import Motion, Scene
 from synth.simulate import State, simulate
-from synth.simulate.path import Path
+from synth.simulate.load_path import LoadPath
 from synth.simulate.stepping import Stepper
 from synth.simulate.unknowns import Unknowns
 
@@ -31,8 +31,8 @@ def ended(posed: Scene) -> State:
 def tractions(stepper: Stepper) -> tuple[FloatArray, FloatArray, FloatArray]:
     """At the end of the path: weights (f, q), normal and tangential tractions (f, q, 3)."""
     body = stepper.system
-    stepper._place([stepper.samples[0].at])
-    body.balance(stepper.state, stepper.indenters, np.array([True]))
+    stepper._place(stepper.at)
+    body.residual(stepper.state, stepper.indenter)
     along = body.tangential.numpy()[0]
     return body._faces.weight.numpy(), body.traction.numpy()[0] - along, along
 
@@ -43,7 +43,7 @@ def test_without_friction_nothing_pulls_sideways(element: str) -> None:
     numerics = {"element": element}
     stepper = run(gentle(friction=0.0, motion={**DRAG, "shear_mm": [0.0, 0.0]}, numerics=numerics), MESH)
     assert not stepper.system.tangential.numpy().any()
-    states = stepper.samples[0].states
+    states = stepper.states
     pressed, twisted = states[2], states[-1]
     assert (pressed.depth_mm, pressed.twist_deg) == (0.6, 0.0)
     centre = np.array([0.4, 0.2, 0.6 - 3.0])
@@ -102,7 +102,7 @@ def test_long_shear_slides_at_the_friction_coefficient(
     # Tractions are along the surface, which leans by up to a fifth: its cosine, and the pressure's vertical part.
     assert pull[0] / load[2] == pytest.approx(mu, rel=0.04)
     assert abs(pull[1]) < 0.01 * pull[0]
-    last = stepper.samples[0].states[-1]
+    last = stepper.states[-1]
     assert last.slip_ratio > 0.98
     # The recorded force has the pressure's sideways part, too.
     assert last.force_n[0] / last.force_n[2] == pytest.approx(mu + load[0] / load[2], rel=0.05)
@@ -114,7 +114,7 @@ def test_rough_contact_sticks(element: str) -> None:
     # Fails with old anchors renewed at each step.
     motion = {"depth_mm": 0.6, "shear_mm": [0.15, 0.0], "steps": 4}
     stepper = run(scene(friction=10.0, motion=motion, numerics={"element": element}), MESH)
-    states, space = stepper.samples[0].states, stepper.system.space
+    states, space = stepper.states, stepper.system.space
     for state in states:
         # By Cattaneo and Mindlin a rim of this share of the contact slips under T; one of 22 points may be in it.
         share = np.hypot(*state.force_n[:2]) / (10 * state.force_n[2]) if state.force_n[2] > 0 else 0.0
@@ -144,7 +144,7 @@ def test_slip_spreads_with_the_shear() -> None:
 @each
 def test_reversed_shear_reverses_the_force(element: str) -> None:
     """Full slide to one side and then to the other: mirror images, and work lost on the way."""
-    # Fails with anchors left behind by slipping points, and without the predictor that carries the gel along at turns.
+    # Fails with anchors left behind by slipping points, and without the rigid-motion predictor at turns.
     there, mu = 0.9, 0.3
     motion = {
         "depth_mm": 0.5,
@@ -169,29 +169,28 @@ def test_reversed_shear_reverses_the_force(element: str) -> None:
     assert result.states[left].slip_ratio > 0.9
 
 
-def test_the_predictor_at_a_turn_does_not_see_how_loose_the_state_is() -> None:
-    """What it adds is a derivative along the way: a small change of the state changes it little."""
-    # Fails with the residual of the state itself left in: the change then comes back 1 / NUDGE times.
+def test_the_predictor_at_a_turn_does_not_see_how_exact_the_state_is() -> None:
+    """What it adds is a derivative along the load path: a small change of the state changes it little."""
+    # Fails with the residual of the state itself left in: the change then comes back 1 / PATH_DERIVATIVE_STEP times.
     stepper = run(scene(friction=0.5, motion={"depth_mm": 0.6, "steps": 1}), MESH)
-    body, state, active = stepper.system, stepper.state, np.array([True])
+    body, state = stepper.system, stepper.state
     motion = {"depth_mm": 0.6, "shear_mm": [0.2, 0.0], "steps": 2}
-    stepper.samples[0].path = Path(Motion.model_validate(motion), stepper.samples[0].path.body)
-    targets = [stepper.samples[0].at + 0.2]
-    stepper._place([stepper.samples[0].at])
+    stepper.path = LoadPath(Motion.model_validate(motion), stepper.path.body)
+    stepper._place(stepper.at)
     change = 1e-4 * np.random.default_rng(0).standard_normal(state.u.shape) * ~body.space.held
     added = []
     for begun in (state, Unknowns(state.u + change, state.p)):
         stepper.state = begun
-        added.append(stepper._carried(targets, active).u - begun.u)
+        added.append(stepper._rigid_motion(stepper.at + 0.2).u - begun.u)
     size = np.linalg.norm(added[0])
-    assert size > 0.2  # it carries the contact along
+    assert size > 0.2  # it moves the contact
     # The tangent changes by the strain of the change, some 1e-3; a tenth leaves room for points that come and go.
     assert np.linalg.norm(added[1] - added[0]) < 0.1 * size
 
 
 @each
 def test_friction_converges_with_the_step(element: str) -> None:
-    """The way is remembered with an error that vanishes with the step."""
+    """The load path is remembered with an error that vanishes with the step."""
     # Fails with points that stick anchored anew at each step.
     motion = {"depth_mm": 0.6, "shear_mm": [0.1, 0.0], "steps": 2}
 

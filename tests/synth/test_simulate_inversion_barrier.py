@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from integrals import Integrals
-from pads import crooked, everything, far_away, scene
+from pads import crooked, far_away, scene
 
 from synth.arrays import FloatArray
 from synth.mesh import Focus
@@ -53,14 +53,14 @@ def state() -> Unknowns:
     """A valid state in which some points are below the onset."""
     body = pad()
     sizes = np.linspace(0.03, 0.2, 35)
-    valid = [size for size in sizes if lattice_jacobian(body, squeezed(body, size).u[0])[0].min() > 0.05]
+    valid = [size for size in sizes if lattice_jacobian(body, squeezed(body, size).u)[0].min() > 0.05]
     found = squeezed(body, valid[-1])
-    assert (lattice_jacobian(body, found.u[0])[0] < ONSET).sum() > 5
+    assert (lattice_jacobian(body, found.u)[0] < ONSET).sum() > 5
     return found
 
 
 def forces(body: System, state: Unknowns) -> FloatArray:
-    return body.balance(state, far_away(), everything(body)).reaction[0].copy()
+    return body.residual(state, far_away()).reaction.copy()
 
 
 def test_forces_are_the_energys_gradient(state: Unknowns) -> None:
@@ -69,9 +69,9 @@ def test_forces_are_the_energys_gradient(state: Unknowns) -> None:
     found = forces(body, state) - forces(bare, state)
     rng = np.random.default_rng(0)
     for _ in range(4):
-        way = rng.standard_normal(state.u[0].shape)
+        way = rng.standard_normal(state.u.shape)
         h = 1e-6
-        slope = (barrier(body, state.u[0] + h * way) - barrier(body, state.u[0] - h * way)) / (2 * h)
+        slope = (barrier(body, state.u + h * way) - barrier(body, state.u - h * way)) / (2 * h)
         # Third derivatives of t³ over J near 0.05 are some 1e4: h² of that, and rounding / h of 1e-10.
         assert (found * way).sum() == pytest.approx(slope, rel=1e-6, abs=1e-8)
 
@@ -79,17 +79,17 @@ def test_forces_are_the_energys_gradient(state: Unknowns) -> None:
 def test_tangent_is_the_forces_derivative(state: Unknowns) -> None:
     """Fails with 2 t + t² in place of 2 t, without the h_b h_a^T term."""
     body = pad()
-    tangent = body.tangent(state, far_away(), everything(body))
-    upper = body.matrix(tangent.values[0])
+    tangent = body.tangent(state, far_away())
+    upper = body.matrix(tangent.values)
     matrix = upper + upper.T
     matrix.setdiag(upper.diagonal())
     rng = np.random.default_rng(1)
-    full = np.zeros(state.u[0].size + state.p[0].size)
+    full = np.zeros(state.u.size + state.p.size)
     full[body.free] = rng.standard_normal(len(body.free))
-    moves = state.u[0].size
-    way = Unknowns(full[:moves].reshape(state.u.shape), full[moves:][None])
+    moves = state.u.size
+    way = Unknowns(full[:moves].reshape(state.u.shape), full[moves:])
     h = 1e-6
-    ends = [body.balance(state.plus(way, np.array([k * h])), far_away(), everything(body)).free[0] for k in (1, -1)]
+    ends = [body.residual(state.plus(way, k * h), far_away()).free for k in (1, -1)]
     expected = (ends[0] - ends[1]) / (2 * h)
     np.testing.assert_allclose(matrix @ full[body.free], expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
 
@@ -98,15 +98,15 @@ def test_nothing_is_added_where_nothing_folds() -> None:
     """To the bit. Fails with J < 1 in place of J < J_0."""
     body, bare = pad(), pad(guarded=False)
     gentle = squeezed(body, 0.01)
-    assert lattice_jacobian(body, gentle.u[0])[0].min() > ONSET
+    assert lattice_jacobian(body, gentle.u)[0].min() > ONSET
     np.testing.assert_array_equal(forces(body, gentle), forces(bare, gentle))
 
 
 def test_smallest_jacobian_looks_at_the_corners(state: Unknowns) -> None:
     """Fails without the lattice's minimum."""
     body = pad()
-    smallest = body.balance(state, far_away(), everything(body)).smallest_jacobian[0]
-    assert smallest <= lattice_jacobian(body, state.u[0])[0].min() + 1e-12
+    smallest = body.residual(state, far_away()).smallest_jacobian
+    assert smallest <= lattice_jacobian(body, state.u)[0].min() + 1e-12
 
 
 def test_no_fold_under_a_tip() -> None:

@@ -25,7 +25,7 @@ from synth.simulate.batched.krylov import (
 from synth.simulate.batched.lanes import PREDICTOR_READY, READY, Lanes, Settings
 from synth.simulate.batched.preconditioner import Preconditioner, inverse
 from synth.simulate.batched.tf32 import round_matrix
-from synth.simulate.driver import STANDARD
+from synth.simulate.options import STANDARD
 
 
 def _systems(

@@ -12,7 +12,7 @@ from scipy.sparse import csr_matrix, triu
 
 import synth.simulate.linear as linear
 from synth.arrays import FloatArray
-from synth.simulate.linear import Directions, Factor, PardisoFactor, SuperLUFactor, direct_factor, gmres, has_pardiso
+from synth.simulate.linear import Factor, LinearSolver, PardisoFactor, SuperLUFactor, direct_factor, gmres, has_pardiso
 
 SIZE = 120
 needs_mkl = pytest.mark.skipif(not has_pardiso(), reason="no MKL")
@@ -72,18 +72,8 @@ def test_factor_is_the_inverse(kind: Any) -> None:
 
 
 @each_factor
-def test_strided_right_side(kind: Any) -> None:
-    """A row of a batch may be strided."""
-    matrix, b = saddle(1), np.asfortranarray(np.stack([right_side(1), right_side(2)]))
-    factor = make(kind, matrix)
-    factor.factorise(matrix.data)
-    assert not b[1].flags.c_contiguous
-    assert (factor.apply(b[1]) == factor.apply(right_side(2))).all()
-
-
-@each_factor
 def test_answer_does_not_depend_on_what_was_solved_before(kind: Any) -> None:
-    """Else a sample's last bits would depend on its batch."""
+    """Else a press's last bits would depend on the presses before it."""
     # Fails with Pardiso's matching and scaling on: its analysis then uses the values of the first matrix.
     matrix, b = saddle(1), right_side(1)
     fresh, used = make(kind, matrix), make(kind, matrix)
@@ -175,12 +165,12 @@ def nearly(matrix: csr_matrix, rank: int) -> csr_matrix:
     return changed
 
 
-def test_factor_is_kept_while_it_serves(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fails with the limit of kept factors left at GMRES_LIMIT (the third is not made), or with `_own` not compared."""
-    monkeypatch.setattr(linear, "KEPT_LIMIT", 4)
+def test_factor_is_reused_while_it_serves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fails with MAX_REUSE_ITERATIONS not used (the third is not made), or with `_own` not compared."""
+    monkeypatch.setattr(linear, "MAX_REUSE_ITERATIONS", 4)
     first, b = saddle(1), right_side(1)
     factor = SuperLUFactor(first.indptr, first.indices)
-    one = Directions(factor, keep=True)
+    one = LinearSolver(factor, reuse=True)
     one.solve(first, None, b)
     near = nearly(first, 1)  # with the remainder of rank 2 GMRES ends after 4 iterations
     x = one.solve(near, remainder(2), b, rough=True)
@@ -191,25 +181,25 @@ def test_factor_is_kept_while_it_serves(monkeypatch: pytest.MonkeyPatch) -> None
     y = one.solve(far, None, b, rough=True)
     assert factor.made == 2
     assert np.linalg.norm(whole(far) @ y - b) < 1.001 * linear.ROUGH_TOLERANCE * np.linalg.norm(b)
-    # What another sample left in the factor would make the bits depend on the batch.
-    alone = Directions(SuperLUFactor(first.indptr, first.indices), keep=True)
-    Directions(factor, keep=True).solve(first, None, b)
+    # What another press left in the factor would make the bits depend on it.
+    alone = LinearSolver(SuperLUFactor(first.indptr, first.indices), reuse=True)
+    LinearSolver(factor, reuse=True).solve(first, None, b)
     np.testing.assert_array_equal(one.solve(near, None, b, rough=True), alone.solve(near, None, b, rough=True))
 
 
 def test_factor_is_made_anew_where_told() -> None:
-    # Fails with `keep` or `rough` left out of the condition, and with `begin` doing nothing.
+    # Fails with `reuse` or `rough` left out of the condition, and with `forget` doing nothing.
     matrix, b = saddle(1), right_side(1)
     factor = SuperLUFactor(matrix.indptr, matrix.indices)
-    never = Directions(factor, keep=False)
+    never = LinearSolver(factor, reuse=False)
     for _ in range(2):
         never.solve(matrix, None, b, rough=True)
     assert factor.made == 2
-    one = Directions(factor, keep=True)
+    one = LinearSolver(factor, reuse=True)
     one.solve(matrix, None, b, rough=True)
     one.solve(matrix, None, b)
     assert factor.made == 4
-    one.begin()
+    one.forget()
     one.solve(matrix, None, b, rough=True)
     assert factor.made == 5
     one.solve(matrix, None, b, rough=True)

@@ -5,7 +5,7 @@ Each comment "fails with" names a change of `synth.simulate.material` or `synth.
 
 import numpy as np
 import pytest
-from pads import ELEMENT, MIXED, brick, everything, far_away, scene
+from pads import ELEMENT, MIXED, brick, far_away, scene
 from problems import equilibrium, supported
 from scipy.optimize import brentq
 
@@ -101,11 +101,11 @@ def test_layers_in_series_share_the_stress_and_not_the_pressure(element: str) ->
     moved[:, 2] = np.where(z > INTERFACE, (1 - in_gel) * (SIZE[2] - z), push + (in_film - 1) * z)
     _, state, force = equilibrium(space, pad_material(gel_, mesh), moved, steps=3)
     # Newton stops at 1e-10 of the forces; a contrast of 1000 may enlarge that in the soft layer's displacement.
-    np.testing.assert_allclose(state.u[0], moved, atol=1e-7)
+    np.testing.assert_allclose(state.u, moved, atol=1e-7)
     for layer, stretch, nu, modulus in ((0, in_film, hard, 1000), (1, in_gel, soft, 1)):
         own = np.unique(space.pressure_nodes[mesh.layer == layer])
         pressure = modulus * lame_constants(nu)[1] * (stretch - 1)
-        np.testing.assert_allclose(state.p[0, own], pressure, rtol=1e-6)
+        np.testing.assert_allclose(state.p[own], pressure, rtol=1e-6)
     pushing = force[space.points[:, 2] == 0, 2].sum()
     assert pushing == pytest.approx(-oedometer_stress(in_gel, soft, 1) * SIZE[0] * SIZE[1], rel=1e-7)
 
@@ -122,13 +122,13 @@ def test_two_layers_of_one_material_are_one_but_for_the_pressure(element: str) -
     state = Unknowns(0.03 * rng.standard_normal(state.u.shape), rng.standard_normal(state.p.shape))
     shared = np.zeros(two.pressures, dtype=int)
     shared[two.pressure_nodes] = one.pressure_nodes
-    a = bodies[0].balance(state, far_away(), everything(bodies[0]))
-    b = bodies[1].balance(Unknowns(state.u, state.p[:, shared]), far_away(), everything(bodies[1]))
+    a = bodies[0].residual(state, far_away())
+    b = bodies[1].residual(Unknowns(state.u, state.p[shared]), far_away())
     scale = 1e-12 * np.abs(a.reaction).max()  # sums of some dozen rounded element forces, in another order
     np.testing.assert_allclose(b.reaction, a.reaction, atol=scale)
     volume: FloatArray = np.zeros(one.pressures)
-    np.add.at(volume, shared, b.free[0, -two.pressures :])
-    np.testing.assert_allclose(volume, a.free[0, -one.pressures :], atol=scale)
+    np.add.at(volume, shared, b.free[-two.pressures :])
+    np.testing.assert_allclose(volume, a.free[-one.pressures :], atol=scale)
 
 
 def press(element: str, mesh: PadMesh | None = None, size: tuple[float, float, float] = SIZE, **gel_: object) -> State:

@@ -20,7 +20,7 @@ MESH, OTHER = crooked(), crooked(seed=1)
 
 @pytest.fixture(autouse=True)
 def _empty(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pattern_module, "_KEPT", type(pattern_module._KEPT)())
+    monkeypatch.setattr(pattern_module, "_CACHED", type(pattern_module._CACHED)())
 
 
 @pytest.mark.parametrize("element", MIXED)
@@ -58,19 +58,19 @@ def test_only_the_last_few_are_kept() -> None:
     # Fails without popitem, or with the oldest kept: a job of many meshes would fill the memory.
     space = function_space(MESH, ELEMENT["p1p1"]())
     first = pattern_of(space, True)
-    most = pattern_module._MOST_KEPT
+    most = pattern_module._MAX_CACHED
     for k in range(most):
         held = space.held.copy()
         held[k] = ~held[k]
         pattern_of(replace(space, held=held), True)
-        assert len(pattern_module._KEPT) <= most
+        assert len(pattern_module._CACHED) <= most
     assert pattern_of(space, True) is not first
 
 
 def test_entries_are_bounded_too(monkeypatch: pytest.MonkeyPatch) -> None:
     """The last ones stay that are together within the bound, and the very last whatever its size."""
-    # Fails with the bound taken for one pattern's entries, with more than it kept, and without `len(_KEPT) > 1`, which
-    # forgets the pattern that was asked for.
+    # Fails with the bound taken for one pattern's entries, with more than it kept, and without `len(_CACHED) > 1`,
+    # which forgets the pattern that was asked for.
     space = function_space(MESH, ELEMENT["p1p1"]())
     large = function_space(MESH, ELEMENT["p2p1"]())
     spaces = []
@@ -79,14 +79,14 @@ def test_entries_are_bounded_too(monkeypatch: pytest.MonkeyPatch) -> None:
         held[k] = ~held[k]
         spaces.append(replace(space, held=held))
     sizes = [pattern_of(one, True).size for one in spaces]
-    assert len(pattern_module._KEPT) == 4
-    pattern_module._KEPT.clear()
-    monkeypatch.setattr(pattern_module, "_MOST_ENTRIES", sum(sizes[1:]))
+    assert len(pattern_module._CACHED) == 4
+    pattern_module._CACHED.clear()
+    monkeypatch.setattr(pattern_module, "_MAX_ENTRIES", sum(sizes[1:]))
     made = [pattern_of(one, True) for one in spaces]
-    assert list(pattern_module._KEPT.values()) == made[1:]
+    assert list(pattern_module._CACHED.values()) == made[1:]
     alone = pattern_of(large, True)
     assert alone.size > sum(sizes[1:])
-    assert list(pattern_module._KEPT.values()) == [alone]
+    assert list(pattern_module._CACHED.values()) == [alone]
     assert pattern_of(large, True) is alone
 
 

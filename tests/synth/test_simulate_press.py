@@ -1,4 +1,4 @@
-"""Whole trajectories: balance of forces, symmetry, scaling, independence of numerics, and honest failure.
+"""Whole trajectories: equilibrium of forces, symmetry, scaling, independence of numerics, and honest failure.
 
 Each comment "fails with" names a change of `synth.simulate` that was tried.
 """
@@ -13,7 +13,9 @@ import synth.simulate.linear as linear
 import synth.simulate.pattern as pattern
 import synth.simulate.stepping as stepping
 from synth.arrays import FloatArray
+from synth.errors import InputError
 from synth.simulate import Trajectory, simulate
+from synth.simulate.solve import check_shared
 
 MESH = brick()
 TOLERANCE = 1e-6
@@ -56,16 +58,16 @@ def test_window_bears_what_the_indenter_does(friction: float, element: str) -> N
     Fails with the undeformed arm in `forces`, with contact not restored after a record, or its gap not evaluated anew.
     """
     stepper = run(gentle(friction=friction, numerics={"element": element}), MESH)
-    body, last = stepper.system, stepper.samples[0].at
-    stepper._place([last])
-    balance = body.balance(stepper.state, stepper.indenters, np.array([True]))
-    force, moment, _ = (values[0] for values in body.forces(stepper.state))
-    held = balance.reaction[0] * body.space.held
+    body, last = stepper.system, stepper.at
+    stepper._place(last)
+    residual = body.residual(stepper.state, stepper.indenter)
+    force, moment, _ = body.forces(stepper.state)
+    held = residual.reaction * body.space.held
     # What is left on the free nodes is the residual: 1e-6 of the forces' norm, on some 100 nodes and arms of 5 mm.
-    scale = 10 * TOLERANCE * float(np.linalg.norm(balance.reaction))
+    scale = 10 * TOLERANCE * float(np.linalg.norm(residual.reaction))
     assert np.linalg.norm(force) > 1e3 * scale
     np.testing.assert_allclose(held.sum(axis=0), -force, atol=scale)
-    held_moment = np.cross(body.space.points + stepper.state.u[0], held).sum(axis=0)
+    held_moment = np.cross(body.space.points + stepper.state.u, held).sum(axis=0)
     np.testing.assert_allclose(held_moment, -moment, atol=5 * scale)
 
 
@@ -92,7 +94,7 @@ def test_mirrored_motion_gives_the_mirrored_state() -> None:
     # Fails with abs() around the twist in `pose`.
     motion = {**DRAG, "shear_mm": [-0.8, -0.3], "twist_deg": -10.0, "position_mm": [-0.4, 0.2]}
     one, other = dragged().states[-1], simulate(gentle(motion=motion), MESH).states[-1]
-    # Newton stops at 1e-6 on every step, and loosely (1e-3) between the records, whose errors friction remembers.
+    # Newton stops at 1e-6 on every step, and with 1e-3 between the records, whose errors friction remembers.
     np.testing.assert_allclose(other.force_n, np.array(one.force_n) * [-1, 1, 1], rtol=2e-3)
     np.testing.assert_allclose(other.torque_nmm, np.array(one.torque_nmm) * [1, -1, -1], rtol=2e-3, atol=1e-3)
 
@@ -106,6 +108,23 @@ def test_youngs_modulus_scales_forces_only() -> None:
         np.testing.assert_allclose(t.torque_nmm, 1000 * np.array(s.torque_nmm), rtol=1e-14)
         np.testing.assert_allclose(t.traction, 1000 * s.traction, rtol=1e-14)
         assert (s.residual, s.newton_iterations) == (t.residual, t.newton_iterations)
+
+
+def test_layers_whose_moduli_differ_alike_deform_alike() -> None:
+    """Deformation depends on ratios of moduli only, so that such scenes may share a batch."""
+    # Fails with absolute moduli in `_elastic`.
+    film = {"thickness_mm": 1.0, "youngs_modulus_kpa": 600.0}
+    soft = gentle(gel={"layers": [film]})
+    hard = gentle(gel={"youngs_modulus_kpa": 400.0, "layers": [{**film, "youngs_modulus_kpa": 1200.0}]})
+    check_shared([soft, hard], MESH)
+    for s, t in zip(*(simulate(posed, MESH).states for posed in (soft, hard)), strict=True):
+        assert (s.displacement == t.displacement).all()
+        assert t.force_n == pytest.approx([2 * value for value in s.force_n], rel=1e-12)
+
+
+def test_the_mesh_must_be_of_the_scenes_pad() -> None:
+    with pytest.raises(InputError, match=r"the mesh is of a .* mm pad, the scene's is a"):
+        simulate(scene((8.0, 6.0, 3.0)), MESH)
 
 
 @each
@@ -141,8 +160,8 @@ def test_body_beside_the_pad_touches_nothing() -> None:
 
 @each
 def test_slides_off_the_pad(element: str) -> None:
-    """Once the indenter has left, the gel springs back: only rounding is left, and that is balance enough."""
-    # Fails with the relative residual not floored by NOTHING.
+    """Once the indenter has left, the gel springs back: only rounding is left, which is equilibrium."""
+    # Fails with the relative residual not floored by FORCE_FLOOR.
     motion = {"depth_mm": 0.3, "shear_mm": [6.0, 0.0], "position_mm": [3.0, 0.0], "steps": 6}
     ball = {"shape": "sphere", "radius_mm": 2.0}
     posed = scene(indenter=ball, friction=0.1, motion=motion, numerics={"element": element})
@@ -156,12 +175,12 @@ def test_slides_off_the_pad(element: str) -> None:
 @pytest.mark.parametrize(("element", "counts"), [("p1p1", (8, 8, 6)), ("p2p1", (4, 4, 3))])
 def test_ball_over_the_edge_presses_the_side_too(element: str, counts: tuple[int, int, int]) -> None:
     """The gel bulges under a ball that hangs over the rim: the side touches it, and is pushed inward."""
-    # Fails with the touchable faces restricted to z = 0: the side goes into the ball, and no balance is found.
+    # Fails with the touchable faces restricted to z = 0: the side goes into the ball, and nothing converges.
     depth, edge = 1.0, MESH.size_mm[0] / 2
     motion = {"depth_mm": depth, "shear_mm": [0.8, 0.0], "position_mm": [edge, 0.0], "steps": 3}
     ball = {"shape": "sphere", "radius_mm": 2.0}
     stepper = run(scene(indenter=ball, motion=motion, numerics={"element": element}), brick(counts=counts))
-    body, last = stepper.system, stepper.samples[0].states[-1]
+    body, last = stepper.system, stepper.states[-1]
     space, weight = body.space, body._faces.weight.numpy()
     side = (space.points[space.faces][:, :, 0] == edge).all(axis=1)
     pushed = np.einsum("fq,fqc->c", weight[side], body.traction.numpy()[0, side])
@@ -172,7 +191,7 @@ def test_ball_over_the_edge_presses_the_side_too(element: str, counts: tuple[int
 
 @each
 def test_release_gives_the_undeformed_pad_back(element: str) -> None:
-    # Fails with contact not restored after a record, or without NOTHING.
+    # Fails with contact not restored after a record, or without FORCE_FLOOR.
     motion = {**DRAG, "then": [{"depth_mm": 0.0, "shear_mm": [0.8, -0.3], "twist_deg": 10.0}], "steps": 3}
     result = simulate(gentle(motion=motion, numerics={"element": element}), MESH)
     assert (result.status, len(result.states)) == ("complete", 4)
@@ -196,7 +215,7 @@ WIRE = scene(
 def test_hopeless_press_ends_honestly() -> None:
     result = simulate(WIRE, MESH)
     assert result.status == "partial"
-    assert "no balance" in result.reason
+    assert "did not converge" in result.reason
     assert 1 < len(result.states) < 9
     for state in result.states:
         assert state.residual <= TOLERANCE
@@ -223,17 +242,17 @@ class Broken:
 @pytest.mark.parametrize("how", ["refuses", "nan", "nonsense"])
 def test_a_solver_that_fails_is_a_failed_trajectory(monkeypatch: pytest.MonkeyPatch, how: str) -> None:
     # Fails with a sample whose step is NaN counted as converged.
-    monkeypatch.setattr(pattern, "_KEPT", type(pattern._KEPT)())
+    monkeypatch.setattr(pattern, "_CACHED", type(pattern._CACHED)())
     monkeypatch.setattr(pattern, "direct_factor", lambda *_: Broken(how))
     result = simulate(gentle(), MESH)
     assert result.status == "failed"
     assert len(result.states) == 1
-    assert "no balance" in result.reason
+    assert "did not converge" in result.reason
 
 
 @each
 def test_step_length_does_not_change_a_press_without_friction(element: str) -> None:
-    """Without friction the end does not remember the way."""
+    """Without friction the end does not remember the load path."""
     # Fails with Newton stopped at a residual of 0.3.
     motion = {"depth_mm": 0.8, "steps": 2}
     steps = (0.4, 0.25, 0.05)
@@ -245,9 +264,9 @@ def test_step_length_does_not_change_a_press_without_friction(element: str) -> N
         assert end.force_n[2] == pytest.approx(ends[0].force_n[2], rel=10 * TOLERANCE)
 
 
-def test_way_does_not_matter_without_friction() -> None:
+def test_load_path_does_not_matter_without_friction() -> None:
     """Straight down, or down elsewhere, across and back: the same end."""
-    # Fails with multipliers of a record left in place for the way on.
+    # Fails with multipliers of a record left in place for the next step.
     numerics = {"max_step_mm": 0.2}
     straight = simulate(scene(motion={"depth_mm": 0.6, "steps": 1}, numerics=numerics), MESH).states[-1]
     there = {"depth_mm": 0.4, "shear_mm": [0.7, 0.4], "twist_deg": 30.0, "steps": 4, "then": [{"depth_mm": 0.6}]}
@@ -280,9 +299,9 @@ def test_scipy_and_pardiso_agree(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.undo()
         fast = simulate(gentle(friction=friction), MESH).states[-1]
         monkeypatch.setattr(linear, "has_pardiso", lambda: False)
-        monkeypatch.setattr(pattern, "_KEPT", type(pattern._KEPT)())
+        monkeypatch.setattr(pattern, "_CACHED", type(pattern._CACHED)())
         slow = simulate(gentle(friction=friction), MESH).states[-1]
-        # Two solvers differ by rounding, which Newton's loose way stations (1e-3) may let grow to 1e-3 with friction,
+        # Two solvers differ by rounding, which Newton's intermediate steps (1e-3) may let grow to 1e-3 with friction,
         # which remembers, and to its tolerance without.
         close = 2e-3 if friction else 10 * TOLERANCE
         np.testing.assert_allclose(slow.force_n, fast.force_n, rtol=close, atol=1e-8)

@@ -51,7 +51,7 @@ def tip(element: Element, cells: int) -> float:
     assert load.sum(axis=0) == pytest.approx([0.0, 100.0 / YOUNG, 0.0])
     _, state, _ = equilibrium(space, uniform(len(mesh.tets), POISSON), load=load, steps=5, tolerance=1e-8)
     corner = np.flatnonzero(np.isclose(space.points, [48.0, 60.0, 0.0]).all(axis=1))
-    return float(state.u[0, corner[0], 1])
+    return float(state.u[corner[0], 1])
 
 
 @pytest.mark.parametrize(("element", "cells"), [(p2p1, 8), (p2p1, 16), (p1p1, 8), (p1p1, 16), (p1p1, 32), (p1, 16)])

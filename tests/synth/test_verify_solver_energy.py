@@ -78,8 +78,8 @@ def test_work_of_a_drag_without_friction_is_stored(element: str) -> None:
 )
 @pytest.mark.parametrize("element", MIXED)
 def test_work_is_stored_or_rubbed_away(element: str, motion: dict, friction: float, layers: bool) -> None:
-    # Fails with the sign of the anchor's correction in `settle` turned, and with slipping anchors moved to the point
-    # itself (the elastic slip is then forgotten at each step).
+    # Fails with the sign of the anchor's correction in `update_contact_history` turned, and with slipping anchors
+    # moved to the point itself (the elastic slip is then forgotten at each step).
     entry = account(element, 20, motion, friction, layers)
     assert entry.lost > 0.003 * entry.work
     # Second order, with 8 to 10 steps of 0.16 mm or 4 degrees a leg: measured 0.1 to 0.8 %.

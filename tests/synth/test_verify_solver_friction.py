@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from pads import MIXED, brick, run, scene
-from problems import ACTIVE
 
 from synth.arrays import FloatArray
 from synth.mesh import PadMesh
@@ -55,11 +54,11 @@ def touch(
     )
     stepper = run(posed, pad(layers))
     body, state = stepper.system, stepper.state
-    stepper._place([stepper.samples[0].at])
-    body.balance(state, stepper.indenters, ACTIVE)
+    stepper._place(stepper.at)
+    body.residual(state, stepper.indenter)
     whole, along = body.traction.numpy()[0], body.tangential.numpy()[0]
     on = whole.any(axis=-1)
-    nodes = (body.space.points + state.u[0])[body.space.faces]
+    nodes = (body.space.points + state.u)[body.space.faces]
     position = np.einsum("qa,fac->fqc", body.space.element.face_shape, nodes)
     return Touch(stepper, position[on], (whole - along)[on], along[on], body._faces.weight.numpy()[on])
 
@@ -78,7 +77,7 @@ def test_traction_stays_in_its_cone(element: str, friction: float, layers: bool)
     # The return map scales to the limit: a few roundings.
     assert (length <= friction * made.pressure * (1 + 1e-12)).all()
     np.testing.assert_allclose((made.normal * made.along).sum(axis=1), 0.0, atol=1e-12 * made.pressure.max() ** 2)
-    centre = made.stepper.indenters.centre.numpy()[0]
+    centre = made.stepper.indenter.centre.numpy()[0]
     assert ((made.position - centre) * made.normal > 0).any(axis=1).all()
     slip = length > friction * made.pressure * (1 - 1e-6)
     assert slip.any()
@@ -97,7 +96,7 @@ def test_sliding_punch_pulls_with_its_limit(element: str) -> None:
     # motion turns the slip sideways; and what touched in the last 0.1 mm of 1 mm may still stick.
     assert pull[:2] @ shear / np.linalg.norm(shear) == pytest.approx(friction * total, rel=0.03)
     assert abs(pull[0] * shear[1] - pull[1] * shear[0]) < 0.04 * np.linalg.norm(shear) * friction * total
-    assert made.stepper.samples[0].states[-1].slip_ratio > 0.95
+    assert made.stepper.states[-1].slip_ratio > 0.95
     assert load[2] > 0.9 * total
 
 

@@ -19,8 +19,8 @@ from synth.arrays import BoolArray, FloatArray, Points
 from synth.mesh import PadMesh
 from synth.simulate.element import p2p1
 from synth.simulate.indenter import rigid_body
+from synth.simulate.load_path import LoadPath
 from synth.simulate.material import uniform
-from synth.simulate.path import Path
 from synth.simulate.stepping import Stepper
 from synth.simulate.system import System
 
@@ -64,8 +64,8 @@ def test_partial_slip_is_mindlins() -> None:
         numerics={"max_step_mm": depth / 2},
     )
     body = System(supported(mesh, p2p1(), wall_and_window), uniform(len(mesh.tets), 0.5))
-    path = Path(posed.motion, rigid_body(posed.contact.indenter))
-    ended = Stepper(body, [path], [FRICTION], posed.numerics, [1.0]).run()[0]
+    path = LoadPath(posed.motion, rigid_body(posed.contact.indenter))
+    ended = Stepper(body, path, FRICTION, posed.numerics, 1.0).run()
     assert (ended.status, ended.reason) == ("complete", "")
     slid = [state for state in ended.states if state.shear_mm[0] > 0]
     assert len(slid) == 3

@@ -5,7 +5,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from pads import ELEMENT, crooked, everything, indenters, scene, system
+from pads import ELEMENT, crooked, indenters, scene, system
 
 from synth.arrays import BoolArray, FloatArray
 from synth.simulate.contact import Indenters
@@ -33,13 +33,13 @@ class Touch:
 
     def evaluate(self, state: Unknowns | None = None) -> FloatArray:
         """Free residual."""
-        return self.body.balance(state or self.state, self.indenters, everything(self.body)).free[0]
+        return self.body.residual(state or self.state, self.indenters).free
 
     @property
     def points(self) -> FloatArray:
         """(f, q, 3) positions of the contact points."""
         space = self.body.space
-        nodes = (space.points + self.state.u[0])[space.faces]
+        nodes = (space.points + self.state.u)[space.faces]
         return np.einsum("qa,fac->fqc", space.element.face_shape, nodes)
 
     @property
@@ -89,7 +89,7 @@ def touch(
     posed = scene(MESH.size_mm, indenter=INDENTERS[shape], motion={"depth_mm": 0.5})
     zero = body.zero()
     state = Unknowns(0.03 * rng.standard_normal(zero.u.shape), rng.standard_normal(zero.p.shape))
-    state.u[0, body.space.held] = 0.0
+    state.u[body.space.held] = 0.0
     made = Touch(body, state, indenters(posed, 0.5), friction)
     made.indenters.friction.assign(np.array([friction]))
     local, contact = made.local, body.contact

@@ -114,11 +114,11 @@ class Presses:
     """Every press's load path and body, (N, ...).
 
     Attributes:
-        corners, ends, legs: `Path.corners` (N, K, 4), `Path.ends` (N, K) and their number.
+        corners, ends, legs: `LoadPath.corners` (N, K, 4), `LoadPath.ends` (N, K) and their number.
         waypoints, kind_of, stops: (N, W) path lengths; 0 not recorded, 1 recorded, 2 corrected and recorded; number.
         press_end: path length of the press, mm; deepest: largest depth, at least 0.1 mm.
         over_pad: whether the body comes down on the contact face.
-        position, reach, rotation: of the body, as `Path.pose` uses them.
+        position, reach, rotation: of the body, as `LoadPath.pose` uses them.
         kind, shape, friction, sharpness: as `synth.simulate.contact.Indenters`.
         grid, grids: number of its distance grid among the different ones (g, cells).
     """
@@ -145,7 +145,7 @@ class Presses:
 
 @wp.struct
 class Settings:
-    """Of all trajectories: `synth.scene.Numerics`, `synth.simulate.driver.Driver`, and limits of Newton's method.
+    """Of all trajectories: numerics of the scene, `synth.simulate.options.SolverOptions`, limits of Newton's method.
 
     forcing: of the linear residual, relative to the right side, at most; see `synth.simulate.batched.krylov`.
     """

@@ -10,12 +10,12 @@ from synth.simulate.batched.gemm import Dense
 from synth.simulate.batched.preconditioner import Preconditioner, inverse, stiffness
 from synth.simulate.contact import Indenters
 from synth.simulate.indenter import RigidBody
+from synth.simulate.load_path import LoadPath
 from synth.simulate.material import Material, pad_material
-from synth.simulate.path import Path
 from synth.simulate.solve import ELEMENTS
 from synth.simulate.space import Space, function_space
 from synth.simulate.system import System
-from synth.simulate.tables import pack_indenters
+from synth.simulate.tables import pack_indenter, place_indenter
 
 AWAY_MM = 1e3
 """Where an indenter touches nothing."""
@@ -65,9 +65,7 @@ def prepare(scene: Scene, mesh: PadMesh, device: str, products: Dense | None = N
 def _away(scene: Scene) -> Indenters:
     """A ball that touches nothing."""
     ball = RigidBody(0, np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]), np.eye(3), 1.0, np.zeros((1, 1, 1)), 1.0)
-    path = Path(scene.motion.model_copy(update={"depth_mm": -AWAY_MM}), ball)
-    packed = pack_indenters([path], [0.0], "cpu")
-    pose = path.pose(0.0)
-    packed.centre.assign(pose.centre[None])
-    packed.rotation.assign(pose.rotation[None])
+    path = LoadPath(scene.motion.model_copy(update={"depth_mm": -AWAY_MM}), ball)
+    packed = pack_indenter(path, 0.0)
+    place_indenter(packed, path.pose(0.0))
     return packed

@@ -1,4 +1,4 @@
-"""Pose and body of each lane's indenter, as Warp kernels: `synth.simulate.path` on the device."""
+"""Pose and body of each lane's indenter, as Warp kernels: `synth.simulate.load_path` on the device."""
 
 # Kernels are written in Warp's own language; their annotations only look like Python's.
 # mypy: disable-error-code="valid-type, no-untyped-def"
@@ -11,8 +11,8 @@ from synth.simulate.contact import Indenters
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
-STUCK = wp.constant(wp.float64(stepping.STUCK))
-NUDGE = wp.constant(wp.float64(stepping.NUDGE))
+STUCK = wp.constant(wp.float64(stepping.STICK_FRICTION))
+NUDGE = wp.constant(wp.float64(stepping.PATH_DERIVATIVE_STEP))
 
 
 @wp.func

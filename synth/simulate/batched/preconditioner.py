@@ -22,7 +22,7 @@ from synth.simulate.system import System
 
 def stiffness(system: System, away: Indenters) -> FloatArray:
     """(k, k) the undeformed pad's tangent over the free unknowns; `away`: an indenter that touches nothing."""
-    values = system.tangent(system.zero(), away, np.ones(1, dtype=bool)).values[0]
+    values = system.tangent(system.zero(), away).values
     upper = system.matrix(np.asarray(values, dtype=np.float64))
     return np.asarray((upper + scipy.sparse.triu(upper, 1).T).toarray())
 

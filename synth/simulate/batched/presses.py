@@ -12,7 +12,7 @@ from synth.simulate.distance import shape_vector
 from synth.simulate.press import Press
 from synth.simulate.space import Space
 from synth.simulate.tables import warp_array
-from synth.simulate.trajectory import State, Trajectory, no_balance, no_contact, trajectory_of
+from synth.simulate.trajectory import State, Trajectory, no_contact, not_converged, trajectory_of
 
 
 def press_tables(
@@ -104,7 +104,7 @@ def trajectory(
     code, reached, target = ended
     reason = "" if code == COMPLETE else no_contact(target)
     if code == NO_EQUILIBRIUM:
-        reason = no_balance(target - reached, press.path.pose(reached))
+        reason = not_converged(target - reached, press.path.pose(reached))
     return trajectory_of(tuple(states), reason, seconds, space)
 
 

@@ -16,7 +16,7 @@ FIRST_VISCOSITY = wp.constant(wp.float64(relaxation.FIRST_VISCOSITY))
 LEAST_VISCOSITY = wp.constant(wp.float64(relaxation.LEAST_VISCOSITY))
 MOST_VISCOSITY = wp.constant(wp.float64(relaxation.MOST_VISCOSITY))
 LEAST_SHARE = wp.constant(wp.float64(relaxation.LEAST_SHARE))
-LEAST_BORNE = wp.constant(wp.float64(relaxation.LEAST_BORNE))
+LEAST_BORNE = wp.constant(wp.float64(relaxation.MIN_REACTION_RATIO))
 MAX_ERROR, AIM = wp.constant(wp.float64(relaxation.MAX_ERROR)), wp.constant(wp.float64(relaxation.AIM))
 FALL, RISE = wp.constant(wp.float64(relaxation.FALL)), wp.constant(wp.float64(relaxation.RISE))
 

@@ -13,14 +13,14 @@ from synth.simulate.batched import lanes as phases
 from synth.simulate.batched.pad import Pad
 from synth.simulate.batched.presses import press_tables, trajectory, untouched
 from synth.simulate.batched.solver import INNER_ITERATIONS, BatchedSolver
-from synth.simulate.driver import STANDARD, Driver
 from synth.simulate.newton import MAX_ITERATIONS
+from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.press import Press
 from synth.simulate.solve import check_shared
 from synth.simulate.trajectory import Trajectory
 
 MAX_BATCH = 512
-OPTIONS = replace(STANDARD, loose=0.0, forcing=1e-4, closer=1e-3)
+OPTIONS = replace(STANDARD, relaxed_tolerance=0.0, forcing=1e-4, closer=1e-3)
 """The scene's tolerance along the whole load path, because friction remembers the path; linear solves and corrections
 so tight that rounding hardly ever decides which equilibrium is found."""
 CYCLES_PER_POLL = 2
@@ -32,7 +32,7 @@ def simulate_presses(
     pad: Pad,
     frames: Sequence[frozenset[int]] | None = None,
     batch: int = MAX_BATCH,
-    options: Driver = OPTIONS,
+    options: SolverOptions = OPTIONS,
 ) -> Iterator[tuple[int, Trajectory]]:
     """Simulate presses into pads of one mesh, each as if it were alone.
 
@@ -86,14 +86,14 @@ class Run:
         pad: Pad,
         frames: Sequence[frozenset[int]] | None,
         batch: int,
-        options: Driver,
+        options: SolverOptions,
         order: Iterable[int] | None = None,
         inner: int = INNER_ITERATIONS,
     ) -> None:
         self._presses, self._pad, numerics = presses, pad, presses[0].scene.numerics
         table, grid = press_tables(presses, frames, pad.device)
         settings = phases.Settings()
-        settings.tolerance, settings.loose = numerics.tolerance, options.loose
+        settings.tolerance, settings.loose = numerics.tolerance, options.relaxed_tolerance
         settings.longest, settings.extrapolate = numerics.max_step_mm, int(options.extrapolate)
         settings.forcing, settings.closer = options.forcing, options.closer
         settings.limit, settings.correction_limit = MAX_ITERATIONS, options.correction_iterations

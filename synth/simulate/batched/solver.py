@@ -38,7 +38,7 @@ from synth.simulate.batched.unknown_rows import number_rows, surface_tables
 from synth.simulate.bulk import bulk_residual
 from synth.simulate.contact import contact_residual, contact_stiffness
 from synth.simulate.inversion_barrier import barrier_residual
-from synth.simulate.multipliers import augment, settle
+from synth.simulate.multipliers import augment, update_contact_history
 from synth.simulate.stiffness import viscous_force
 from synth.simulate.tables import barrier_tables, bulk_tables, face_tables
 
@@ -179,8 +179,8 @@ class BatchedSolver:
 
     def _settle(self, mask: wp.array, new_only: int) -> None:
         a = self._arrays
-        found = (a.gap, a.tangential, self.penalty, new_only)
-        self._launch(settle, a.points, a.fields.state_u, mask, self._faces, a.indenters, *found, a.contact)
+        found = (self._faces, a.indenters, a.gap, a.tangential, self.penalty, new_only, a.contact)
+        self._launch(update_contact_history, a.points, a.fields.state_u, mask, *found)
 
     def _record(self) -> None:
         a, s, u = self._arrays, self.lanes, self._arrays.fields.iterate_u

@@ -23,24 +23,23 @@ wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 ZERO = wp.constant(wp.float64(0.0))
 ONE = wp.constant(wp.float64(1.0))
-NOTHING = wp.constant(wp.float64(newton.NOTHING))
+NOTHING = wp.constant(wp.float64(newton.FORCE_FLOOR))
 INDIFFERENT = wp.constant(wp.float64(newton.INDIFFERENT))
 SHORTEST = wp.constant(wp.float64(newton.SHORTEST))
 SHORTEST_STEP = wp.constant(wp.float64(stepping.SHORTEST_STEP))
 GROWTH = wp.constant(wp.float64(stepping.GROWTH))
-EASY = wp.constant(stepping.EASY)
+EASY = wp.constant(stepping.MAX_ITERATIONS_TO_GROW)
 FAILURES = wp.constant(stepping.FAILURES)
-ENOUGH = wp.constant(wp.float64(stepping.ENOUGH))
+ENOUGH = wp.constant(wp.float64(stepping.MAX_MULTIPLIER_UPDATES))
 PENETRATION = wp.constant(wp.float64(stepping.PENETRATION))
-REACH = wp.constant(wp.float64(stepping.REACH))
+REACH = wp.constant(wp.float64(stepping.MAX_CORRECTION_RATIO))
 MIN_TOLERANCE = wp.constant(wp.float64(1.0e-12))
 """Of a pass: somewhat more than rounding leaves."""
-SUFFICIENT_DECREASE = wp.constant(wp.float64(1.0e-4))
-STALL_ITERATIONS = wp.constant(5)
-STALLED_RESIDUAL = wp.constant(wp.float64(0.5))
-"""Newton's method ends after STALL_ITERATIONS iterations where the relative residual is still so large."""
+SUFFICIENT_DECREASE = wp.constant(wp.float64(newton.SUFFICIENT_DECREASE))
+STALL_ITERATIONS = wp.constant(newton.STALL_ITERATIONS)
+STALLED_RESIDUAL = wp.constant(wp.float64(newton.STALLED_RESIDUAL))
 NEAR = wp.constant(wp.float64(newton.NEAR))
-SHORT = wp.constant(wp.float64(stepping.RELAXED))
+SHORT = wp.constant(wp.float64(stepping.MAX_RELAXED_STEP))
 
 
 @wp.kernel
@@ -230,7 +229,7 @@ def finish_record(lanes: Lanes):
 
 @wp.func
 def _turns(presses: Presses, j: int, before: wp.float64, now: wp.float64) -> bool:
-    """`Path.turns_between`."""
+    """`LoadPath.turns_between`."""
     turns = wp.int32(0)
     for k in range(presses.legs[j]):
         if presses.ends[j, k] > before and presses.ends[j, k] <= now:

@@ -1,4 +1,4 @@
-"""Where the indenter is along its way: down, then sideways and round at once, then from pose to pose.
+"""The indenter's load path: down, then sideways and round at once, then from pose to pose.
 
 The path parameter is a length in mm: the distance that the farthest touching point moves, leg by leg.
 
@@ -11,7 +11,7 @@ does.
 
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path as FilePath
+from pathlib import Path
 
 import numpy as np
 
@@ -43,8 +43,8 @@ class Pose:
 
 
 @dataclass(frozen=True)
-class Path:
-    """The way of one indenter over a pad whose face is flat or of the given radius."""
+class LoadPath:
+    """The load path of one indenter over a pad whose face is flat or of the given radius."""
 
     motion: Motion
     body: RigidBody
@@ -62,7 +62,7 @@ class Path:
 
     @cached_property
     def touch_mm(self) -> float:
-        """Depth at which the body first touches on its way straight down; if the press ends before that, its depth.
+        """Depth at which the body first touches when it comes straight down; if the press ends before that, its depth.
 
         The body touches the sphere where the sphere's centre is a radius away from it: found by halving. For meshes,
         whose distance is approximate so far away, the depth at which they are level with the apex.
@@ -123,7 +123,7 @@ class Path:
 
     @property
     def length_mm(self) -> float:
-        """Of the whole way."""
+        """Of the whole load path."""
         return float(self.ends[-1])
 
     def pose(self, s: float) -> Pose:
@@ -137,7 +137,7 @@ class Path:
         """(steps,) path lengths at which states are recorded: each leg in equal parts, its end among them.
 
         Steps are dealt to the legs by their lengths, one at least to each; with fewer steps than legs, or where
-        nothing moves, the whole way is cut in equal parts.
+        nothing moves, the whole path is cut in equal parts.
         """
         steps, lengths = self.motion.steps, np.diff(self.ends)
         if len(lengths) == 0 or steps < len(lengths):
@@ -149,17 +149,17 @@ class Path:
         return np.concatenate(parts)
 
     def waypoints(self) -> FloatArray:
-        """(k,) the records and the ends of the legs, where the way turns; rising, without the start."""
+        """(k,) the records and the ends of the legs, where the path turns; rising, without the start."""
         stops = np.unique(np.concatenate([self.records(), self.ends]))
         return stops[stops > 0]
 
     def turns_between(self, before: float, now: float) -> bool:
-        """Whether the way turns after `before` and not after `now`, so that extrapolation across is meaningless."""
+        """Whether the path turns after `before` and not after `now`, so that extrapolation across is meaningless."""
         return bool(np.any((self.ends > before) & (self.ends <= now)))
 
 
-def path_of(scene: Scene, folder: FilePath | None = None, resolution_mm: float = 0.0) -> Path:
-    """The way of a scene's indenter.
+def path_of(scene: Scene, folder: Path | None = None, resolution_mm: float = 0.0) -> LoadPath:
+    """The load path of a scene's indenter.
 
     Args:
         scene: fully drawn.
@@ -174,4 +174,4 @@ def path_of(scene: Scene, folder: FilePath | None = None, resolution_mm: float =
     aside = max(float(np.hypot(*np.add(motion.position_mm, pose.shear_mm))) for pose in poses)
     deepest = max(pose.depth_mm for pose in poses) + gel.face_mm(*motion.position_mm)
     touchable = Touchable(float(np.hypot(*gel.size_mm[:2])) / 2 + aside, BULGE * max(deepest, 0.0) + SLACK_MM)
-    return Path(motion, rigid_body(scene.contact.indenter, folder, resolution_mm, touchable), gel.dome_radius_mm)
+    return LoadPath(motion, rigid_body(scene.contact.indenter, folder, resolution_mm, touchable), gel.dome_radius_mm)

@@ -1,6 +1,6 @@
 """Poses along a path of several legs, and where states are recorded.
 
-Each comment "fails with" names a change of `synth.simulate.path` that was tried.
+Each comment "fails with" names a change of `synth.simulate.load_path` that was tried.
 """
 
 from typing import Any
@@ -11,12 +11,12 @@ from pads import SPHERE, scene
 
 from synth.scene import Motion
 from synth.simulate.indenter import rigid_body, rotation_about
-from synth.simulate.path import TWIST_ARM_MM, Path
+from synth.simulate.load_path import TWIST_ARM_MM, LoadPath
 
 
-def path(indenter: dict | None = None, **motion: Any) -> Path:
+def path(indenter: dict | None = None, **motion: Any) -> LoadPath:
     posed = scene(indenter=indenter or SPHERE)
-    return Path(Motion.model_validate(motion), rigid_body(posed.contact.indenter))
+    return LoadPath(Motion.model_validate(motion), rigid_body(posed.contact.indenter))
 
 
 def test_lowest_point_follows_the_depth() -> None:
