@@ -214,8 +214,14 @@ def _per_point(element: Element, count: int) -> tuple[int, int]:
 def test_scenes_must_share_the_pad() -> None:
     with pytest.raises(InputError, match=r"mm pad"):
         simulate_scenes([scene((8.0, 6.0, 3.0))], MESH)
-    with pytest.raises(InputError, match="must share the gel's materials and numerics"):
-        simulate_scenes([scene(), scene(numerics={"penalty": 20.0})], MESH)
+    different: list[dict[str, Any]] = [
+        {"gel": {"poisson_ratio": 0.45}},
+        {"gel": {"stiffening": [0.1, 0.0]}},
+        {"numerics": {"penalty": 20.0}},
+    ]
+    for parts in different:
+        with pytest.raises(InputError, match="must share the gel's materials and numerics"):
+            simulate_scenes([scene(), scene(**parts)], MESH)
 
 
 def test_a_pad_serves_several_runs() -> None:
