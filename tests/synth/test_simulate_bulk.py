@@ -52,7 +52,7 @@ class Case:
     def body(self, held: bool = True) -> System:
         space = function_space(MESH if held else UNHELD, ELEMENT[self.element]())
         body = System(space, self.material())
-        body._lattice = None  # the barrier has a test of its own
+        body._barrier = None  # the barrier has a test of its own
         return body
 
 

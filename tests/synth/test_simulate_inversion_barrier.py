@@ -25,7 +25,7 @@ def pad(guarded: bool = True) -> System:
     """Incompressible P2/P1, with or without the barrier."""
     body = System(function_space(MESH, p2p1()), uniform(len(MESH.tets), 0.5))
     if not guarded:
-        body._lattice = None
+        body._barrier = None
     return body
 
 

@@ -114,7 +114,7 @@ def f():
 """
     found = _imports("synth.errors", ast.parse(source), False)
     assert {"synth.cli", "synth.arrays", "synth.commands", "synth.planning", "synth.mesh.pad", "torch.nn"} <= found
-    assert "synth.simulate.load_path" in _imports("synth.simulate", ast.parse("from .path import Path"), True)
+    assert "synth.simulate.load_path" in _imports("synth.simulate", ast.parse("from .load_path import LoadPath"), True)
     assert _stage("synth.dataset.storage") < _stage("synth.simulate.files") < _stage("synth.dataset.writer")
 
 

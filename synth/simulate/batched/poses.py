@@ -11,8 +11,8 @@ from synth.simulate.contact import Indenters
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
-STUCK = wp.constant(wp.float64(stepping.STICK_FRICTION))
-NUDGE = wp.constant(wp.float64(stepping.PATH_DERIVATIVE_STEP))
+STICK_FRICTION = wp.constant(wp.float64(stepping.STICK_FRICTION))
+PATH_DERIVATIVE_STEP = wp.constant(wp.float64(stepping.PATH_DERIVATIVE_STEP))
 
 
 @wp.func
@@ -44,11 +44,11 @@ def place_indenters(lanes: Lanes, presses: Presses, indenters: Indenters):
     if phase == FRESH:
         at = wp.float64(0.0)
     if phase == PREDICTOR:
-        at = lanes.at[i] + NUDGE * (lanes.target[i] - lanes.at[i])
-        friction = STUCK
+        at = lanes.at[i] + PATH_DERIVATIVE_STEP * (lanes.target[i] - lanes.at[i])
+        friction = STICK_FRICTION
     if phase == PREDICTOR_READY:
         at = lanes.at[i]
-        friction = STUCK
+        friction = STICK_FRICTION
     pose = _corner(presses, j, at)
     place = presses.position[j]
     indenters.centre[i] = wp.vec3d(place[0] + pose[1], place[1] + pose[2], pose[0] - presses.reach[j])

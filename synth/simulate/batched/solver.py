@@ -24,7 +24,7 @@ from synth.simulate.batched import lanes as phases
 from synth.simulate.batched.arrays import BatchArrays
 from synth.simulate.batched.inversion_barrier import barrier_product, find_inverting
 from synth.simulate.batched.pad import Pad
-from synth.simulate.batched.poses import NUDGE, copy_grids, fill_lanes, place_indenters
+from synth.simulate.batched.poses import PATH_DERIVATIVE_STEP, copy_grids, fill_lanes, place_indenters
 from synth.simulate.batched.product import BLOCK, bulk_product, contact_product, store_bulk, store_contact
 from synth.simulate.batched.transitions import (
     check_contact,
@@ -122,7 +122,7 @@ class BatchedSolver:
         self._launch_blocks(self._solution, self._block, self.lanes, a.krylov, a.begun)
         self._launch(gmres.release, self.batch, a.krylov)
         where = (self._rows.node_row, self._rows.pressure_row, a.fields)
-        self._launch(fields.apply_predictor, self._value_dim, a.begun, NUDGE, a.step, *where)
+        self._launch(fields.apply_predictor, self._value_dim, a.begun, PATH_DERIVATIVE_STEP, a.step, *where)
 
     def _evaluate(self) -> None:
         """Evaluate the residuals of all lanes that wait for one, and what follows from them."""

@@ -23,23 +23,23 @@ wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 ZERO = wp.constant(wp.float64(0.0))
 ONE = wp.constant(wp.float64(1.0))
-NOTHING = wp.constant(wp.float64(newton.FORCE_FLOOR))
+FORCE_FLOOR = wp.constant(wp.float64(newton.FORCE_FLOOR))
 INDIFFERENT = wp.constant(wp.float64(newton.INDIFFERENT))
 SHORTEST = wp.constant(wp.float64(newton.SHORTEST))
 SHORTEST_STEP = wp.constant(wp.float64(stepping.SHORTEST_STEP))
 GROWTH = wp.constant(wp.float64(stepping.GROWTH))
-EASY = wp.constant(stepping.MAX_ITERATIONS_TO_GROW)
+MAX_ITERATIONS_TO_GROW = wp.constant(stepping.MAX_ITERATIONS_TO_GROW)
 FAILURES = wp.constant(stepping.FAILURES)
-ENOUGH = wp.constant(wp.float64(stepping.MAX_MULTIPLIER_UPDATES))
+MAX_MULTIPLIER_UPDATES = wp.constant(wp.float64(stepping.MAX_MULTIPLIER_UPDATES))
 PENETRATION = wp.constant(wp.float64(stepping.PENETRATION))
-REACH = wp.constant(wp.float64(stepping.MAX_CORRECTION_RATIO))
+MAX_CORRECTION_RATIO = wp.constant(wp.float64(stepping.MAX_CORRECTION_RATIO))
 MIN_TOLERANCE = wp.constant(wp.float64(1.0e-12))
 """Of a pass: somewhat more than rounding leaves."""
 SUFFICIENT_DECREASE = wp.constant(wp.float64(newton.SUFFICIENT_DECREASE))
 STALL_ITERATIONS = wp.constant(newton.STALL_ITERATIONS)
 STALLED_RESIDUAL = wp.constant(wp.float64(newton.STALLED_RESIDUAL))
 NEAR = wp.constant(wp.float64(newton.NEAR))
-SHORT = wp.constant(wp.float64(stepping.MAX_RELAXED_STEP))
+MAX_RELAXED_STEP = wp.constant(wp.float64(stepping.MAX_RELAXED_STEP))
 
 
 @wp.kernel
@@ -49,7 +49,7 @@ def evaluate_trial(lanes: Lanes, settings: Settings):
     phase = lanes.phase[s]
     lanes.move[s] = 0
     norm = lanes.trial_norm[s]
-    relative = norm / wp.max(lanes.trial_force[s], NOTHING)
+    relative = norm / wp.max(lanes.trial_force[s], FORCE_FLOOR)
     valid = lanes.trial_jacobian[s] > ZERO
     if phase == phases.FRESH:
         lanes.phase[s] = phases.FIRST
@@ -127,7 +127,7 @@ def finish_solve(lanes: Lanes, presses: Presses, settings: Settings):
         return
     polish = lanes.stage[s] == phases.POLISH
     step = lanes.target[s] - lanes.at[s]
-    if phase == phases.FAILED and lanes.relaxing[s] == 0 and not polish and step <= SHORT * settings.longest:
+    if phase == phases.FAILED and lanes.relaxing[s] == 0 and not polish and step <= MAX_RELAXED_STEP * settings.longest:
         lanes.relaxing[s] = phases.RELAXING
         lanes.viscosity[s] = FIRST_VISCOSITY
         lanes.share[s] = ONE
@@ -171,7 +171,7 @@ def check_contact(lanes: Lanes, presses: Presses, sums: wp.array2d(dtype=wp.floa
     if lanes.phase[s] != phases.AT_RECORD:
         return
     j = lanes.press[s]
-    if lanes.target[s] == presses.press_end[j] and presses.over_pad[j] == 1 and sums[s, 2] <= NOTHING:
+    if lanes.target[s] == presses.press_end[j] and presses.over_pad[j] == 1 and sums[s, 2] <= FORCE_FLOOR:
         lanes.reason[s] = phases.NO_CONTACT
         lanes.phase[s] = phases.ENDED
         return
@@ -193,7 +193,7 @@ def choose_pass(lanes: Lanes, presses: Presses, settings: Settings):
         return
     j = lanes.press[s]
     too_deep = lanes.deepest[s] > PENETRATION * presses.deepest[j]
-    over = lanes.failures[s] == FAILURES or lanes.done[s] >= ENOUGH or not too_deep
+    over = lanes.failures[s] == FAILURES or lanes.done[s] >= MAX_MULTIPLIER_UPDATES or not too_deep
     over = over or presses.kind_of[j, lanes.next[s]] == 1
     if over and lanes.relative[s] <= settings.tolerance:
         lanes.phase[s] = phases.RECORD
@@ -205,10 +205,10 @@ def choose_pass(lanes: Lanes, presses: Presses, settings: Settings):
     else:
         lanes.new_share[s] = lanes.share[s]
         lanes.stage[s] = phases.CORRECTION
-        lanes.most_moved[s] = REACH * lanes.deepest[s]
+        lanes.most_moved[s] = MAX_CORRECTION_RATIO * lanes.deepest[s]
         lanes.limit[s] = settings.correction_limit
         lanes.tolerance[s] = wp.max(settings.closer * settings.tolerance, MIN_TOLERANCE)
-        if lanes.done[s] + lanes.share[s] < ENOUGH:
+        if lanes.done[s] + lanes.share[s] < MAX_MULTIPLIER_UPDATES:
             lanes.tolerance[s] = wp.max(settings.loose, lanes.tolerance[s])
     lanes.iteration[s] = 0
     lanes.predicted[s] = 0
@@ -254,7 +254,7 @@ def choose_target(lanes: Lanes, presses: Presses, settings: Settings):
         lanes.at[s] = target
         if target == presses.waypoints[j, lanes.next[s]]:
             lanes.next[s] = lanes.next[s] + 1
-        if lanes.step_iterations[s] <= EASY:
+        if lanes.step_iterations[s] <= MAX_ITERATIONS_TO_GROW:
             lanes.step[s] = wp.min(settings.longest, GROWTH * wp.max(taken, lanes.step[s] / GROWTH))
         phase = phases.BEGIN
         if lanes.next[s] == presses.stops[j]:
