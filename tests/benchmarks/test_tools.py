@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from gelflow.evaluate import PairScore
+from gelflow.compare.scores import PairScore
 
 from benchmarks import synthetic_set
 from benchmarks.counts import counted

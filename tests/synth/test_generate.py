@@ -205,17 +205,20 @@ def test_a_simulation_that_fails_is_logged_with_its_last_good_state_and_redrawn(
     def is_wanted(seed: int) -> bool:
         return [draw(template, seed, 0, attempt).motion.shear_mm[0] for attempt in (0, 1)] == [4.9, 0.05]
 
-    seed = next(seed for seed in range(1000) if is_wanted(seed))
-    summary = generate(template, 1, tmp_path / "d", seed)
-    assert summary.made == 1
-    failures = read_dataset(tmp_path / "d").failures  # on some of the mesher's random meshes the press fails, too
+    for seed in [seed for seed in range(3000) if is_wanted(seed)][:5]:
+        out = tmp_path / str(seed)
+        summary = generate(template, 1, out, seed)
+        assert summary.made == 1
+        if summary.failed_draws:  # on some of the mesher's random meshes the press completes after all
+            break
+    failures = read_dataset(out).failures  # on others that of the second instance fails, too
     assert len(failures) == summary.failed_draws >= 1
     failure = failures[0]
     assert (failure["index"], failure["draw"], failure["stage"]) == (0, 0, "simulate")
     assert "Newton" in failure["reason"]
     assert failure["last_good_state"]["converged"]
     assert failure["last_good_state"]["shear_mm"][0] < 4.9
-    assert read_dataset(tmp_path / "d").scene_of(0).motion.shear_mm == (0.05, 0.0)
+    assert read_dataset(out).scene_of(0).motion.shear_mm == (0.05, 0.0)
 
 
 @pytest.mark.parametrize(
