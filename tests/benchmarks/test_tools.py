@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from gelflow.compare.scores import PairScore
 
 from benchmarks import synthetic_set
 from benchmarks.counts import counted
 from benchmarks.loss_order import fitted
+from gelflow.compare.scores import PairScore
 from gelflow.ops.pyramid import enlarge_flow
 
 
