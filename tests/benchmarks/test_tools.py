@@ -14,8 +14,9 @@ from gelflow.ops.pyramid import enlarge_flow
 
 def score(method: str, psnr_db: float, error_px: float | None) -> PairScore:
     """Of one pair; what counts is made up, the rest is nothing."""
-    errors = (error_px, error_px, None, None, None, None)
-    return PairScore(method, "pair", "gelsight, dots", psnr_db, psnr_db / 100, *errors, 0.0, 0.0, "cpu", False)
+    made_up = {"psnr_db": psnr_db, "ssim": psnr_db / 100, "endpoint_error_px": error_px, "median_error_px": error_px}
+    spent = {"seconds": 0.0, "processor_seconds": 0.0, "device": "cpu", "on_gpu": False}
+    return PairScore(method=method, pair="pair", scene="gelsight, dots", **made_up, **spent)
 
 
 def test_counts_of_made_up_scores() -> None:
