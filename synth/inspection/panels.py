@@ -74,7 +74,7 @@ def panels_of(view: View, numbers: Mapping[str, Any]) -> list[Panel]:
         closure = numbers["closure"]
         low, high = CLOSURE_RANGE_PX
         found = f"median {short(closure['median_px'])}, max {short(closure['max_px'])} px"
-        caption = f"closure ({low:g} to {high:g} px, logarithmic): {found}"
+        caption = f"closure, log {low:g} to {high:g} px: {found}"
         panels.append(Panel(caption, _closure(view.closure)))
     if view.differences is not None:
         limit = _limit(view.differences[0])
