@@ -36,7 +36,7 @@ MESH_INDENTER = 7.0
 """Time of a press by a mesh indenter over a ball's: its edges take more iterations (docs/reports/objects.md)."""
 BATCHED_SECONDS = {"cuda": 5.5e-5, "cpu": 0.8}
 """One Newton iteration of one trajectory by the batched solver, with BATCHED_NODES displacement nodes; on a GPU among
-hundreds of trajectories (docs/reports/h200.md)."""
+hundreds of trajectories (docs/reports/batched_fem.md)."""
 BATCHED_NODES = 3500
 BATCHED_GROWTH = 1.6
 """Exponent of that in the number of nodes: the preconditioner is a dense matrix, the rest is linear."""

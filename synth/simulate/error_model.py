@@ -35,7 +35,7 @@ ERROR_SCALES = {
 """k of the error model; a bar is a cylinder that lies, a punch one that stands. "mesh" is the largest that the others
 have if their band is taken for as wide as a mesh's."""
 CERTAINTY = 1.1
-"""Factor on the model's mean. It weighs meshes too coarse against meshes too dear (docs/reports/budget.md)."""
+"""Factor on the model's mean. It weighs meshes too coarse against meshes too dear (docs/decisions.md)."""
 
 
 def face_error(scene: Scene, focus: Focus, spacing_mm: float) -> float:

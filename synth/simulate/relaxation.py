@@ -20,7 +20,7 @@ from synth.simulate.system import System
 from synth.simulate.unknowns import Residual, Unknowns
 
 MAX_STEPS = 300
-"""Presses of objects need some hundred; see docs/reports/objects.md."""
+"""Presses of objects need some hundred; see docs/decisions.md."""
 FIRST_VISCOSITY = 1.0
 """θ of the first step: the viscous stress of a step is then the elastic one of its strain."""
 LEAST_VISCOSITY = 1e-3
