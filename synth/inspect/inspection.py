@@ -12,8 +12,8 @@ from synth.dataset.jsontext import read_document
 from synth.dataset.reader import read_dataset
 from synth.dataset.sample import further_cameras
 from synth.errors import InputError
-from synth.inspection.numbers import numbers_of
-from synth.inspection.view import META_FILE, View, view_flow, view_sample
+from synth.inspect.numbers import numbers_of
+from synth.inspect.view import META_FILE, View, view_flow, view_sample
 
 Kind = Literal["dataset", "sample", "flow"]
 Progress = Callable[[int, int], None]
@@ -32,7 +32,7 @@ class Inspection:
         about: facts of the whole: scene, seed, device ...; empty for a sample or flow file.
         places: folder or file of each view that was looked at; of a sample with further cameras first its own folder,
             then theirs.
-        numbers: of each of them, see `synth.inspection.numbers.numbers_of`.
+        numbers: of each of them, see `synth.inspect.numbers.numbers_of`.
         cameras: how many of the places belong to one sample.
     """
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from synth.inspection.inspection import Inspection
+from synth.inspect.inspection import Inspection
 
 NONE = "–"
 

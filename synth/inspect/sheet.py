@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from synth.dataset.storage import replace_file
-from synth.inspection.inspection import Inspection
-from synth.inspection.panels import Panel, panels_of
-from synth.inspection.text import facts
-from synth.inspection.wheel import wheel_legend
+from synth.inspect.inspection import Inspection
+from synth.inspect.panels import Panel, panels_of
+from synth.inspect.text import facts
+from synth.inspect.wheel import wheel_legend
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from synth.dataset.images import encode_png
 from synth.dataset.storage import replace_file
-from synth.inspection.inspection import Inspection
-from synth.inspection.panels import CLOSURE_RANGE_PX, Arrows, Panel, image_picture, panels_of
-from synth.inspection.text import COLUMNS, about_rows, facts
-from synth.inspection.view import View
-from synth.inspection.wheel import flow_colours, robust_scale, wheel_legend
+from synth.inspect.inspection import Inspection
+from synth.inspect.panels import CLOSURE_RANGE_PX, Arrows, Panel, image_picture, panels_of
+from synth.inspect.text import COLUMNS, about_rows, facts
+from synth.inspect.view import View
+from synth.inspect.wheel import flow_colours, robust_scale, wheel_legend
 
 PAGE_MARK = "<title>synth: "
 """In each page's head."""
