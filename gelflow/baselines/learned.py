@@ -85,7 +85,6 @@ class Learned:
         self.size = size
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
-        """See `Method.flow`."""
         from gelflow.models.estimate import estimate_flow
 
         check_images(image1, image2)
@@ -123,7 +122,6 @@ class PublishedRaft:
         self.size = size
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
-        """See `Method.flow`."""
         import torch
 
         from gelflow.ops.resize import resize_flow, resize_images
@@ -135,5 +133,4 @@ class PublishedRaft:
             return as_array(resize_flow(self.model(*tensors), native))
 
     def forward(self, image1: Any, image2: Any) -> Any:
-        """See `Learned.forward`."""
         return self.model(image1, image2)

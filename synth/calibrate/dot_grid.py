@@ -144,7 +144,6 @@ def _start(sensor: Sensor, centres: Pixels, index: NDArray[np.int64], spacing_mm
 
 
 def _predicted(sensor: Sensor, pattern: Dots, camera: Camera, index: NDArray[np.int64]) -> Pixels:
-    """Pixels (n, 2) of grid points."""
     view = sensor.model_copy(update={"camera": camera})
     return Optics.of(view).project(pattern_points(pattern, index))
 

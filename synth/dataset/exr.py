@@ -58,8 +58,8 @@ def write_flow(path: Path, flow: FlowField, attributes: Mapping[str, str | int])
 
     planes = channels_of(flow)
     planes |= {alias: planes[name] for alias, name in ALIASES.items()}
-    told = {**CONVENTIONS, **meanings(planes), **attributes}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **told}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header |= {**CONVENTIONS, **meanings(planes), **attributes}
     try:
         OpenEXR.File(header, planes).write(str(path))
     except RuntimeError as error:  # How the library reports a failing disk.

@@ -48,13 +48,12 @@ def _write_folder(final: Path, sample: Sample, job: Job) -> ManifestEntry:
     """The sample's folder, written aside, flushed and renamed into place."""
     partial = partial_name(final)
     files = {"meta.json": to_document(_meta(sample, job)).encode("utf-8"), "surface.npz": _surface(sample)}
-    views = {"": CameraPair(sample.image1, sample.image2, sample.flow), **sample.further}
     with storage_errors(final):
         try:
             partial.mkdir(parents=True)
             for name, content in files.items():
                 (partial / name).write_bytes(content)
-            for camera, pair in views.items():
+            for camera, pair in {"": sample, **sample.further}.items():
                 _write_view(partial / camera, pair, _attributes(sample, job, camera))
             written = sorted(file for file in partial.rglob("*") if file.is_file())
             sha256 = {
@@ -79,7 +78,6 @@ def _write_folder(final: Path, sample: Sample, job: Job) -> ManifestEntry:
 
 
 def _write_view(folder: Path, pair: CameraPair, attributes: Mapping[str, str | int]) -> None:
-    """Images and flow of one camera."""
     folder.mkdir(exist_ok=True)
     (folder / "image1.png").write_bytes(encode_png(pair.image1))
     (folder / "image2.png").write_bytes(encode_png(pair.image2))

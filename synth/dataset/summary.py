@@ -23,7 +23,6 @@ def reason_group(stage: str, reason: str) -> str:
 
 
 def shares(seconds: Mapping[str, float]) -> dict[str, float]:
-    """Each stage's part of the sum."""
     total = sum(seconds.values())
     return {stage: round(value / total, 4) for stage, value in seconds.items()} if total > 0 else {}
 

@@ -68,7 +68,6 @@ class _Cells:
 
 
 def _grid_around(positions: Points, triangles: int) -> Any:
-    """The grid of a surface with so many triangles."""
     cells = _Cells()
     low, high = positions.min(axis=0), positions.max(axis=0)
     extent = high - low
@@ -219,13 +218,7 @@ def _nearest_hit(
                     end = first[cell]
                 for k in range(first[cell], end):
                     t = members[k]
-                    hit = _intersect(
-                        o,
-                        d,
-                        vertices[corners[t, 0]],
-                        vertices[corners[t, 1]],
-                        vertices[corners[t, 2]],
-                    )
+                    hit = _intersect(o, d, vertices[corners[t, 0]], vertices[corners[t, 1]], vertices[corners[t, 2]])
                     if hit[0] >= wp.float64(0.0) and (hit[0] < nearest or (hit[0] == nearest and t < found)):
                         nearest, weights, found = hit[0], wp.vec3d(hit[1], hit[2], hit[3]), t
             if nearest <= exit:

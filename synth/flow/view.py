@@ -50,17 +50,14 @@ class View:
 
     @property
     def triangles(self) -> Triangles:
-        """(f, 3) int32 of the surface."""
         return self.surface.triangles
 
     @property
     def centres(self) -> Pixels:
-        """(n, 2) of all pixels, row by row."""
         return self.optics.centres
 
     @cached_property
     def own(self) -> Rays:
-        """The rays of the pixel centres."""
         return self.optics.look(self.centres)
 
     @cached_property

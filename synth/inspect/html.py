@@ -124,7 +124,6 @@ def _facts(rows: list[tuple[str, str]]) -> str:
 
 
 def _pictures(view: View, numbers: dict[str, Any]) -> str:
-    """Every picture that the view has."""
     return f'<div class="pictures">{"".join(_figure(panel) for panel in panels_of(view, numbers))}</div>'
 
 
@@ -150,7 +149,6 @@ def _arrows(arrows: Arrows, width: int, height: int) -> str:
 
 
 def _inline(picture: NDArray[np.uint8]) -> str:
-    """A data URL."""
     return f"data:image/png;base64,{base64.b64encode(encode_png(picture)).decode('ascii')}"
 
 

@@ -50,11 +50,9 @@ class Inspection:
 
     @property
     def title(self) -> str:
-        """For headings."""
         return self.path.resolve().name
 
     def as_dict(self) -> dict[str, Any]:
-        """For --json."""
         return {"kind": self.kind, "path": str(self.path), **self.about, "samples": list(self.numbers)}
 
     def view(self, number: int) -> View:

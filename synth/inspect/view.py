@@ -49,7 +49,6 @@ class View:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Height, width in px."""
         height, width = self.flow.forward.shape[:2]
         return height, width
 

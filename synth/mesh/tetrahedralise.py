@@ -24,10 +24,7 @@ WORST_SHAPE = 0.02
 
 
 def tetrahedralise_box(
-    size_mm: tuple[float, float, float],
-    edge_length_mm: float,
-    background: Background | None = None,
-    attempts: int = 3,
+    size_mm: tuple[float, float, float], edge_length_mm: float, background: Background | None = None, attempts: int = 3
 ) -> PadMesh:
     """Mesh a box whose tetrahedra have edges of edge_length_mm at the contact face, or as a background says.
 

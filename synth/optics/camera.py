@@ -84,7 +84,6 @@ class Optics:
 
     @property
     def face_z(self) -> float:
-        """Z of the window's outer face, mm."""
         return self.window.face_z
 
     @cached_property

@@ -86,7 +86,6 @@ class Summary:
     stages: dict[str, float] = field(default_factory=dict)
 
     def add(self, outcome: Outcome) -> None:
-        """Count what a task did."""
         self.made += len(outcome.entries)
         self.given_up = sorted([*self.given_up, *outcome.given_up])
         self.failed_draws += len(outcome.failures)
@@ -97,7 +96,6 @@ class Summary:
 
     @property
     def samples_per_second(self) -> float:
-        """Of this call, start-up included."""
         return self.made / self.seconds if self.seconds > 0 else 0.0
 
     def record(self) -> dict[str, Any]:

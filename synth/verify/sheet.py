@@ -31,7 +31,7 @@ class Seen:
     z: FloatArray
     path: NDArray[np.intp]
 
-    def carried(self, triangles: Triangles, positions: Points) -> Points:
+    def positions(self, triangles: Triangles, positions: Points) -> Points:
         """Where the points are when the surface's vertices are at `positions`: (n, 3), NaN where nothing is seen."""
         return np.einsum("ni,nic->nc", self.weights, positions[triangles[self.triangle]])
 
