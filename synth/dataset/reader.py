@@ -2,15 +2,16 @@
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
 
+from synth.arrays import FloatArray
 from synth.dataset.exr import read_flow
-from synth.dataset.images import read_png
+from synth.dataset.images import Raster, read_png
 from synth.dataset.job import read_job_record
 from synth.dataset.jsontext import read_document
 from synth.dataset.lines import LineTable, read_line, scan_lines
@@ -21,22 +22,29 @@ from synth.dataset.sample import (
     SAMPLES_FOLDER,
     CameraPair,
     ManifestEntry,
-    SampleGeometry,
     failure_key,
     further_cameras,
     manifest_key,
     sample_name,
 )
 from synth.errors import InputError
+from synth.flow.field import FlowField
 from synth.scene import Scene
 from synth.surface import ContactFaces, GelSurface
 
 
-@dataclass(frozen=True, kw_only=True)
-class SampleData(SampleGeometry):
-    """What a sample's folder holds; `meta` is meta.json."""
+@dataclass(frozen=True)
+class SampleData:
+    """What a sample's folder holds; see `synth.dataset.sample.Sample`. `meta` is meta.json."""
 
+    image1: Raster
+    image2: Raster
+    flow: FlowField
+    surface: GelSurface
+    displacement1: FloatArray
+    displacement2: FloatArray
     meta: Mapping[str, Any]
+    further: Mapping[str, CameraPair] = field(default_factory=dict)
 
     def seen_by(self, camera: str) -> "SampleData":
         """The same sample with the images and flow of one camera; "" is the main camera.
@@ -50,7 +58,7 @@ class SampleData(SampleGeometry):
             names = ", ".join(self.further) or "none"
             raise InputError(f"the sample has no camera {camera!r}; beside the main camera it has: {names}")
         pair = self.further[camera]
-        return replace(self, **vars(pair))
+        return replace(self, image1=pair.image1, image2=pair.image2, flow=pair.flow)
 
 
 @dataclass(frozen=True)
@@ -159,18 +167,19 @@ def read_sample(folder: Path) -> SampleData:
     pair = read_pair(folder)
     names = ("nodes", "faces", "subdivisions", "displacement1", "displacement2")
     arrays = read_npz(folder / "surface.npz", names)
-    surface = GelSurface(ContactFaces(arrays["nodes"], arrays["faces"].astype(np.int32)), int(arrays["subdivisions"]))
-    try:
-        return SampleData(
-            **vars(pair),
-            surface=surface,
-            displacement1=arrays["displacement1"],
-            displacement2=arrays["displacement2"],
-            meta=meta,
-            further={name: read_pair(folder / name) for name in further_cameras(meta.get("scene", {}))},
-        )
-    except ValueError as error:
-        raise InputError(f"{folder / 'surface.npz'}: {error}; the file is damaged") from error
+    nodes = arrays["nodes"]
+    if any(arrays[name].shape != nodes.shape for name in ("displacement1", "displacement2")):
+        raise InputError(f"{folder / 'surface.npz'}: nodes and displacements differ in shape; the file is damaged")
+    return SampleData(
+        image1=pair.image1,
+        image2=pair.image2,
+        flow=pair.flow,
+        surface=GelSurface(ContactFaces(nodes, arrays["faces"].astype(np.int32)), int(arrays["subdivisions"])),
+        displacement1=arrays["displacement1"],
+        displacement2=arrays["displacement2"],
+        meta=meta,
+        further={name: read_pair(folder / name) for name in further_cameras(meta.get("scene", {}))},
+    )
 
 
 def read_pair(folder: Path) -> CameraPair:
@@ -181,10 +190,12 @@ def read_pair(folder: Path) -> CameraPair:
     """
     image1, image2 = read_png(folder / "image1.png"), read_png(folder / "image2.png")
     flow = read_flow(folder / "flow.exr")
-    try:
-        return CameraPair(image1, image2, flow)
-    except ValueError as error:
-        raise InputError(f"{folder}: {error}; they must agree") from error
+    size = flow.forward.shape[:2]
+    if image1.shape[:2] != size or image2.shape != image1.shape:
+        raise InputError(
+            f"{folder}: image1.png is {image1.shape}, image2.png {image2.shape}, flow.exr {size}; they must agree"
+        )
+    return CameraPair(image1, image2, flow)
 
 
 def read_scene(folder: Path) -> Scene:

@@ -33,49 +33,21 @@ def further_cameras(scene: Mapping[str, Any]) -> list[str]:
 
 @dataclass(frozen=True)
 class CameraPair:
-    """What one camera contributes to a sample.
-
-    Attributes:
-        image1, image2: (H, W) grey or (H, W, 3) RGB, uint8 or uint16 (full scale 65535).
-        flow: (H, W) fields.
-    """
+    """What one camera contributes to a sample: fields as of `Sample`."""
 
     image1: Raster
     image2: Raster
     flow: FlowField
 
     def __post_init__(self) -> None:
+        """Refuses parts that do not fit each other (a programming error)."""
         size = self.flow.forward.shape[:2]
         if self.image1.shape[:2] != size or self.image2.shape != self.image1.shape:
             raise ValueError(f"images of {self.image1.shape} and {self.image2.shape} with a flow of {size}")
 
 
-@dataclass(frozen=True, kw_only=True)
-class SampleGeometry(CameraPair):
-    """What the main camera and the others saw, and of what.
-
-    Attributes:
-        surface: what was rendered and traced.
-        displacement1, displacement2: (n, 3) float64 mm of `surface.coarse.nodes`.
-        further: what the other cameras saw, by their names.
-    """
-
-    surface: GelSurface
-    displacement1: FloatArray
-    displacement2: FloatArray
-    further: Mapping[str, CameraPair] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        nodes = self.surface.coarse.nodes.shape
-        if self.displacement1.shape != nodes or self.displacement2.shape != nodes:
-            raise ValueError(
-                f"displacements of {self.displacement1.shape} and {self.displacement2.shape} at {nodes} nodes"
-            )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Sample(SampleGeometry):
+@dataclass(frozen=True)
+class Sample:
     """A finished sample, before it is written.
 
     Attributes:
@@ -83,22 +55,43 @@ class Sample(SampleGeometry):
         trajectory: number of the trajectory that its frames belong to.
         frames: (i, j), states of that trajectory shown in image 1 and image 2.
         seed: of the job.
+        image1, image2: (H, W) grey or (H, W, 3) RGB, uint8 or uint16 (full scale 65535), of the main camera.
+        flow: (H, W) fields.
         scene: the draw that was simulated and rendered.
+        surface: what was rendered and traced.
+        displacement1, displacement2: (n, 3) float64 mm of `surface.coarse.nodes`.
         diagnostics: JSON-able; "solver" is a list with a record for each of the two frames (depth_mm, shear_mm,
             twist_deg, converged, newton_iterations, residual, min_jacobian, max_penetration_mm).
         force_n, torque_nmm: (2, 3) of the indenter on the gel, per frame.
         seconds: stage -> wall time.
+        further: what the other cameras saw, by their names.
     """
 
     index: int
     trajectory: int
     frames: tuple[int, int]
     seed: int
+    image1: Raster
+    image2: Raster
+    flow: FlowField
     scene: Scene
+    surface: GelSurface
+    displacement1: FloatArray
+    displacement2: FloatArray
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
     force_n: FloatArray = field(default_factory=lambda: np.zeros((2, 3)))
     torque_nmm: FloatArray = field(default_factory=lambda: np.zeros((2, 3)))
     seconds: Mapping[str, float] = field(default_factory=dict)
+    further: Mapping[str, CameraPair] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuses parts that do not fit each other (a programming error)."""
+        CameraPair(self.image1, self.image2, self.flow)
+        nodes = self.surface.coarse.nodes.shape
+        if self.displacement1.shape != nodes or self.displacement2.shape != nodes:
+            raise ValueError(
+                f"displacements of {self.displacement1.shape} and {self.displacement2.shape} at {nodes} nodes"
+            )
 
 
 @dataclass(frozen=True)

@@ -48,12 +48,13 @@ def _write_folder(final: Path, sample: Sample, job: Job) -> ManifestEntry:
     """The sample's folder, written aside, flushed and renamed into place."""
     partial = partial_name(final)
     files = {"meta.json": to_document(_meta(sample, job)).encode("utf-8"), "surface.npz": _surface(sample)}
+    views = {"": CameraPair(sample.image1, sample.image2, sample.flow), **sample.further}
     with storage_errors(final):
         try:
             partial.mkdir(parents=True)
             for name, content in files.items():
                 (partial / name).write_bytes(content)
-            for camera, pair in {"": sample, **sample.further}.items():
+            for camera, pair in views.items():
                 _write_view(partial / camera, pair, _attributes(sample, job, camera))
             written = sorted(file for file in partial.rglob("*") if file.is_file())
             sha256 = {

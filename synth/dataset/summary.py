@@ -33,8 +33,7 @@ def summary_document(folder: Path, run: Mapping[str, Any], asked_for: int) -> by
     samples = 0
     for entry in _lines(folder / MANIFEST_FILE):
         samples += 1
-        for stage, value in entry["seconds"].items():
-            seconds[stage] += value
+        seconds.update(entry["seconds"])
     reasons = Counter(reason_group(failure["stage"], failure["reason"]) for failure in _lines(folder / FAILURES_FILE))
     content = {
         "samples": samples,

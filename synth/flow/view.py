@@ -39,14 +39,12 @@ class View:
         optics: the camera.
         width: columns of the image.
         height: rows of the image.
-        device: Warp device of the tracing.
     """
 
     surface: GelSurface
     optics: Optics
     width: int
     height: int
-    device: str = "cpu"
 
     @property
     def triangles(self) -> Triangles:
@@ -79,7 +77,7 @@ class View:
         for known, hits in self._seen:
             if known is positions:
                 return hits
-        hits = trace(positions, self.triangles, self.own.origins, self.own.directions, device=self.device)
+        hits = trace(positions, self.triangles, self.own.origins, self.own.directions)
         self._seen.append((positions, hits))
         return hits
 
@@ -112,7 +110,7 @@ class View:
         if len(points) == 0:
             return np.ones(0, dtype=bool)
         distance = np.linalg.norm(points - rays.origins, axis=1)
-        first = trace(positions, self.triangles, rays.origins, rays.directions, device=self.device).distance
+        first = trace(positions, self.triangles, rays.origins, rays.directions).distance
         return first >= distance - OCCLUSION_TOLERANCE_MM
 
     def image(self, values: FloatArray | BoolArray) -> FlowArray:

@@ -1,5 +1,6 @@
 """What `inspect` finds at a path."""
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -125,10 +126,9 @@ def _about(place: Path) -> tuple[dict[str, Any], list[Path]]:
     """Facts of a dataset, and its samples' folders."""
     dataset = read_dataset(place)
     info, indices = dataset.info, dataset.samples
-    seconds: dict[str, float] = {}
+    seconds: Counter[str] = Counter()
     for index in indices:
-        for stage, value in dataset.entry(index).seconds.items():
-            seconds[stage] = seconds.get(stage, 0.0) + value
+        seconds.update(dataset.entry(index).seconds)
     about = {
         "scene": info.get("scene_name"),
         "scene_hash": info["scene_hash"],

@@ -79,12 +79,13 @@ def _sample(
             for number, frame in enumerate(frames)
         )
         cameras[name] = CameraPair(image1, image2, _flow(scene.outputs, views[name], frames, second))
+    main = cameras.pop("")
     return Sample(
-        **vars(cameras.pop("")),
         index=pair.index,
         trajectory=pair.trajectory,
         frames=pair.frames,
         seed=context.job.seed,
+        **vars(main),
         scene=scene,
         surface=rendered.surface,
         displacement1=first.displacement,

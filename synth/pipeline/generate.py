@@ -83,7 +83,7 @@ class Summary:
     failed_draws: int = 0
     failures: Counter[str] = field(default_factory=Counter)
     seconds: float = 0.0
-    stages: dict[str, float] = field(default_factory=dict)
+    stages: Counter[str] = field(default_factory=Counter)
 
     def add(self, outcome: Outcome) -> None:
         self.made += len(outcome.entries)
@@ -91,8 +91,7 @@ class Summary:
         self.failed_draws += len(outcome.failures)
         self.failures.update(reason_group(failure.stage, failure.reason) for failure in outcome.failures)
         for entry in outcome.entries:
-            for stage, seconds in entry.seconds.items():
-                self.stages[stage] = self.stages.get(stage, 0.0) + seconds
+            self.stages.update(entry.seconds)
 
     @property
     def samples_per_second(self) -> float:

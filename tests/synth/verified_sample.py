@@ -58,8 +58,7 @@ def make_sample(drawn: Scene, displacement1: FloatArray, displacement2: FloatArr
     flow = exact_flow(SURFACE, *states, optics, camera.width, camera.height)
     rng = np.random.default_rng(seed)
     images = [_paint(SURFACE, positions, optics, drawn, rng) for positions in states]
-    moved = {"displacement1": displacement1, "displacement2": displacement2}
-    return SampleData(images[0], images[1], flow, surface=SURFACE, **moved, meta={})
+    return SampleData(images[0], images[1], flow, SURFACE, displacement1, displacement2, {})
 
 
 def sheets(sensor: Sensor, surface: GelSurface, *states: Points) -> list[Sheet]:
@@ -81,8 +80,8 @@ def motion_checks(
 
 def as_sample(index: int, drawn: Scene, data: SampleData) -> Sample:
     """What the dataset's writer takes."""
-    parts = {name: value for name, value in vars(data).items() if name != "meta"}
-    return Sample(**parts, index=index, trajectory=0, frames=(0, 1), seed=0, scene=drawn)
+    fields = (data.image1, data.image2, data.flow, drawn, data.surface, data.displacement1, data.displacement2)
+    return Sample(index, 0, (0, 1), 0, *fields)
 
 
 def _paint(
