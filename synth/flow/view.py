@@ -37,8 +37,7 @@ class View:
     Attributes:
         surface: its `triangles` are used.
         optics: the camera.
-        width: columns of the image.
-        height: rows of the image.
+        width, height: of the image, px.
     """
 
     surface: GelSurface

@@ -44,8 +44,7 @@ class Sheet:
         camera: the camera.
         triangles: (f, 3).
         positions: (v, 3) mm.
-        width: columns of the image.
-        height: its rows.
+        width, height: of the image, px.
     """
 
     camera: ForwardCamera
