@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.focused_mesh import around_focus
 from benchmarks.press import (
     PAD_MM,
     ball_scene,
@@ -128,7 +129,7 @@ def mesh_of(mesh: tuple[Any, ...], scene: Scene) -> PadMesh:
     if kind == "wide":
         return graded_box(PAD_MM, zone, Counts((sizes[0], sizes[0]), (4, 3), sizes[1], growth=1.5))
     if kind == "fTetWild":
-        return tetrahedralise_box(PAD_MM, sizes[0], focus=zone, coarse_mm=sizes[1])
+        return tetrahedralise_box(PAD_MM, sizes[0], around_focus(PAD_MM, sizes[0], zone, sizes[1]))
     whole = Focus((0.0, 0.0), (PAD_MM[0] / 2, PAD_MM[1] / 2))
     return graded_box(PAD_MM, whole, Counts((sizes[0] - 2, sizes[1] - 2), (1, 1), sizes[2], growth=1.0))
 

@@ -91,11 +91,11 @@ def vertices(view: View, corners: bool) -> Generator:
         chosen = KDTree(tracer.surface.material).query(coarse.nodes[np.unique(coarse.faces[:, :3])])[1]
 
     def one(near: Points, far: Points) -> Motion:
-        flow = np.full(tracer.centres.shape, np.nan)
+        flow = np.full(tracer.optics.centres.shape, np.nan)
         for path, at in _paths(tracer):
             here, there = (tracer.optics.project(state[chosen], path) for state in (near, far))
             known = np.isfinite(here + there).all(axis=1)
-            flow[at] = LinearNDInterpolator(here[known], (there - here)[known])(tracer.centres[at])
+            flow[at] = LinearNDInterpolator(here[known], (there - here)[known])(tracer.optics.centres[at])
         return _all_visible(tracer, flow)
 
     return lambda first, second: (one(first, second), one(second, first))
@@ -108,11 +108,11 @@ def affine(view: View) -> Generator:
     for path, at in _paths(tracer):
         known = at & np.isfinite(points[:, 0])
         across = np.column_stack([points[known, :2], np.ones(np.count_nonzero(known))])
-        maps[path] = np.linalg.lstsq(across, tracer.centres[known], rcond=None)[0][:2]
+        maps[path] = np.linalg.lstsq(across, tracer.optics.centres[known], rcond=None)[0][:2]
 
     def one(near: Points, far: Points) -> Motion:
-        moved = tracer.first_hits(near).interpolate(tracer.triangles, far - near)
-        flow = np.full(tracer.centres.shape, np.nan)
+        moved = tracer.first_hits(near).interpolate(tracer.surface.triangles, far - near)
+        flow = np.full(tracer.optics.centres.shape, np.nan)
         for path, at in _paths(tracer):
             flow[at] = moved[at, :2] @ maps[path]
         return _all_visible(tracer, flow)
@@ -125,7 +125,7 @@ def fitted_pinhole(view: View) -> Sensor:
     tracer, sensor = _tracer(view), without_window(view.sensor)
     camera = sensor.camera
     seen = Optics.of(sensor).project(_rest_points(tracer), tracer.own.path) - (camera.cx, camera.cy)
-    true = tracer.centres - (camera.cx, camera.cy)
+    true = tracer.optics.centres - (camera.cx, camera.cy)
     known = np.isfinite(seen).all(axis=1)
     ratio = float((seen[known] * true[known]).sum() / (seen[known] ** 2).sum())
     fitted = camera.model_copy(update={"fx": camera.fx * ratio, "fy": camera.fy * ratio})
@@ -159,14 +159,14 @@ def is_inside(flow: FloatArray | FlowArray) -> BoolArray:
 def _tracer(view: View, kind: type[Tracer] = Tracer, sensor: Sensor | None = None) -> Tracer:
     sensor = sensor or view.sensor
     tracer = kind(view.surface, Optics.of(sensor), sensor.camera.width, sensor.camera.height)
-    _ = tracer.own, tracer.centres  # belong to the camera
+    _ = tracer.own, tracer.optics.centres  # belong to the camera
     return tracer
 
 
 def _rest_points(tracer: Tracer) -> Points:
     """(n, 3) mm, where the pixels' rays meet the undeformed gel; NaN where they do not."""
     rest = tracer.surface.material
-    return tracer.first_hits(rest).interpolate(tracer.triangles, rest)
+    return tracer.first_hits(rest).interpolate(tracer.surface.triangles, rest)
 
 
 def _paths(tracer: Tracer) -> Iterator[tuple[int, BoolArray]]:

@@ -32,8 +32,7 @@ def generate(
     scene: SceneName = DEFAULT_SCENE,
     n: Annotated[int, Parameter(converter=whole(1), help="Samples in the dataset.")] = 8,
     out: Annotated[
-        str,
-        Parameter(help="Directory or fsspec URL of the dataset; one that holds part of the same job goes on."),
+        str, Parameter(help="Directory or fsspec URL of the dataset; one that holds part of the same job goes on.")
     ] = "data/demo",
     seed: Annotated[int, Parameter(converter=whole(0), help="Seed of everything random.")] = 0,
     assignments: Assignments = None,
@@ -154,7 +153,7 @@ def inspect(
 
 @app.command
 def verify(path: Dataset, /, *, as_json: AsJson = False) -> int:
-    """Derives the ground truth again by an independent way; exit status 1 if it disagrees."""
+    """Derives the ground truth again by an independent route; exit status 1 if it disagrees."""
     from synth.commands import run_verify
 
     return run_verify(path, as_json)

@@ -80,7 +80,7 @@ def run_simulate(scene: str, out: Path, seed: int, index: int, assignments: Sequ
     with storage_errors(out):
         out.mkdir(parents=True, exist_ok=True)  # before minutes of work, not after
     try:
-        with progress("simulate: percent of the way", 100) as advance:
+        with progress("simulate: percent of the load path", 100) as advance:
             press = MeshRule.of(template.numerics).press(instance, template.folder)
             trajectory = simulate_press(press, on_progress=lambda share: advance(int(100 * share), 100))
     except InputError as error:
@@ -112,7 +112,7 @@ def run_simulate(scene: str, out: Path, seed: int, index: int, assignments: Sequ
 def run_inspect(path: Path, png: Path | None, html: Path | None, limit: int, as_json: bool) -> int:
     """See `synth.cli.inspect`."""
     from synth.dataset.storage import refuse_foreign
-    from synth.inspection import PAGE_MARK, SHEET_MARK, inspect, tables, write_html, write_sheet
+    from synth.inspect import PAGE_MARK, SHEET_MARK, inspect, tables, write_html, write_sheet
 
     for file, mark in ((png, SHEET_MARK), (html, PAGE_MARK)):
         if file is not None:

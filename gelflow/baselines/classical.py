@@ -6,92 +6,72 @@
 - TV-L1, Zach, Pock and Bischof 2007: OpenCV's defaults (tau .25, lambda .15, theta .3, 5 scales, 5 warps).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from functools import partial
+from typing import Any, Literal
 
 import numpy as np
 
-from gelflow.arrays import FlowArray, ImageArray
+from gelflow.arrays import FlowArray, Grey8, ImageArray
 from gelflow.baselines.method import check_images
 from gelflow.errors import InputError
 from gelflow.files.image import to_grey
 
 
 @dataclass(frozen=True)
-class NoMotion:
-    """Says that nothing moved: what every method has to beat."""
+class Classical:
+    """A method that estimates the flow (H, W, 2) of two grey images."""
 
-    name: str = "no motion"
-
-    def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
-        """A flow of zero everywhere."""
-        check_images(image1, image2)
-        return np.zeros((*image1.shape[:2], 2), np.float32)
-
-
-@dataclass(frozen=True)
-class Farneback:
-    """Farnebäck's polynomial expansion."""
-
-    name: str = "Farnebäck"
+    name: str
+    estimate: Callable[[Grey8, Grey8], Any]
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
-        """See `Method.flow`."""
         import cv2
 
         check_images(image1, image2)
-        start = np.zeros((*image1.shape[:2], 2), np.float32)
-        return np.asarray(
-            cv2.calcOpticalFlowFarneback(
-                to_grey(image1), to_grey(image2), start,
-                pyr_scale=0.5, levels=5, winsize=15, iterations=5, poly_n=7, poly_sigma=1.5, flags=0,
-            )
-        )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class DIS:
-    """Dense inverse search with one of OpenCV's presets."""
-
-    preset: Literal["ultrafast", "fast", "medium"]
-
-    @property
-    def name(self) -> str:
-        """Name in tables."""
-        return f"DIS {self.preset}"
-
-    def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
-        """See `Method.flow`."""
-        import cv2
-
-        check_images(image1, image2)
-        preset = {
-            "ultrafast": cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST,
-            "fast": cv2.DISOPTICAL_FLOW_PRESET_FAST,
-            "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
-        }[self.preset]
         try:
-            return np.asarray(cv2.DISOpticalFlow.create(preset).calc(to_grey(image1), to_grey(image2), None))
+            return np.asarray(self.estimate(to_grey(image1), to_grey(image2)))
         except cv2.error as error:
             size = f"{image1.shape[1]} x {image1.shape[0]} px"
             raise InputError(f"{self.name} cannot work on images of {size}: {error.err}") from error
 
 
-@dataclass(frozen=True)
-class TVL1:
-    """Total variation and L1 data term (duality based)."""
+def dis(preset: Literal["ultrafast", "fast", "medium"]) -> Classical:
+    """Dense inverse search with one of OpenCV's presets."""
+    return Classical(f"DIS {preset}", partial(_dis, preset))
 
-    name: str = "TV-L1"
 
-    def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
-        """See `Method.flow`."""
-        import cv2
+def _still(grey1: Grey8, grey2: Grey8) -> FlowArray:
+    return np.zeros((*grey1.shape, 2), np.float32)
 
-        check_images(image1, image2)
-        if not hasattr(cv2, "optflow"):
-            raise InputError(
-                "TV-L1 needs opencv-contrib, and another OpenCV package hides it; "
-                "pip install --force-reinstall opencv-contrib-python-headless"
-            )
-        method = cv2.optflow.DualTVL1OpticalFlow.create()
-        return np.asarray(method.calc(to_grey(image1), to_grey(image2), None))
+
+def _farneback(grey1: Grey8, grey2: Grey8) -> Any:
+    import cv2
+
+    settings = {"pyr_scale": 0.5, "levels": 5, "winsize": 15, "iterations": 5, "poly_n": 7, "poly_sigma": 1.5}
+    return cv2.calcOpticalFlowFarneback(grey1, grey2, _still(grey1, grey2), **settings, flags=0)
+
+
+def _dis(preset: str, grey1: Grey8, grey2: Grey8) -> Any:
+    import cv2
+
+    number = getattr(cv2, f"DISOPTICAL_FLOW_PRESET_{preset.upper()}")
+    return cv2.DISOpticalFlow.create(number).calc(grey1, grey2, None)
+
+
+def _tvl1(grey1: Grey8, grey2: Grey8) -> Any:
+    import cv2
+
+    if not hasattr(cv2, "optflow"):
+        raise InputError(
+            "TV-L1 needs opencv-contrib, and another OpenCV package hides it; "
+            "pip install --force-reinstall opencv-contrib-python-headless"
+        )
+    return cv2.optflow.DualTVL1OpticalFlow.create().calc(grey1, grey2, None)
+
+
+NO_MOTION = Classical("no motion", _still)
+"""Says that nothing moved: what every method has to beat."""
+FARNEBACK = Classical("Farnebäck", _farneback)
+TVL1 = Classical("TV-L1", _tvl1)

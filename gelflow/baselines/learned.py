@@ -49,6 +49,7 @@ class Learned:
         registration: One of `gelflow.config.REGISTRATIONS`; None: what the weights' training asked for.
 
     Attributes:
+        forward: What `flow` costs beside reading and resizing, of tensors (B, 3, H, W) on the device.
         label: The name without what is added to it.
         trained: The architecture as the file has it, its own registration included.
 
@@ -78,26 +79,18 @@ class Learned:
         self.trained = self.model.config
         if registration is not None:
             self.model.config = self.trained.model_copy(update={"registration": REGISTRATIONS[registration]})
-        self.network = RecordedNetwork(self.model)
+        self.forward = RecordedNetwork(self.model)
         self.label = name or "/".join(path.with_suffix("").parts[-2:])
         added = _suffix(self.model.config.registration)
         self.name = self.label if added in self.label else _END.sub(rf"{added}\1", self.label, count=1)
         self.size = size
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
-        """See `Method.flow`."""
         from gelflow.models.estimate import estimate_flow
 
         check_images(image1, image2)
         tensors = [as_tensor(image, self.device) for image in (image1, image2)]
-        return as_array(estimate_flow(self.model, tensors[0], tensors[1], self.size, self.network))
-
-    def forward(self, image1: Any, image2: Any) -> Any:
-        """What `flow` costs beside reading and resizing: the network and, where it is on, the registration.
-
-        The images are tensors (B, 3, H, W) in [0, 1] on the network's device, the flow is (B, 2, H, W) px.
-        """
-        return self.network(image1, image2)
+        return as_array(estimate_flow(self.model, tensors[0], tensors[1], self.size, self.forward))
 
 
 def _suffix(settings: RegistrationConfig | None) -> str:
@@ -119,11 +112,11 @@ class PublishedRaft:
         self.path = path
         self.device = chosen_device(device)
         self.model: Any = load_raft(path, self.device)
+        self.forward = self.model
         self.name = name or f"RAFT {'large' if self.model.large else 'small'}"
         self.size = size
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
-        """See `Method.flow`."""
         import torch
 
         from gelflow.ops.resize import resize_flow, resize_images
@@ -133,7 +126,3 @@ class PublishedRaft:
         tensors = [resize_images(as_tensor(image, self.device), self.size or native) for image in (image1, image2)]
         with torch.no_grad():
             return as_array(resize_flow(self.model(*tensors), native))
-
-    def forward(self, image1: Any, image2: Any) -> Any:
-        """See `Learned.forward`."""
-        return self.model(image1, image2)

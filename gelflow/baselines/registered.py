@@ -7,7 +7,7 @@ the best classical method.
 from dataclasses import dataclass
 
 from gelflow.arrays import FlowArray, ImageArray
-from gelflow.baselines.classical import DIS
+from gelflow.baselines.classical import dis
 from gelflow.baselines.tensors import as_array, as_tensor
 from gelflow.config import RegistrationConfig
 
@@ -22,13 +22,11 @@ class RegisteredDIS:
 
     @property
     def name(self) -> str:
-        """Name in tables."""
         return f"DIS medium+{self.aim}"
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
-        """See `Method.flow`."""
         from gelflow.models.registration import registered
 
-        start = DIS("medium").flow(image1, image2)
+        start = dis("medium").flow(image1, image2)
         first, second = as_tensor(image1, self.device), as_tensor(image2, self.device)
         return as_array(registered(as_tensor(start, self.device), first, second, self.settings))

@@ -1,9 +1,9 @@
 """Methods by the names that the command line knows."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from gelflow.baselines.aldic import ALDIC
-from gelflow.baselines.classical import DIS, TVL1, Farneback, NoMotion
+from gelflow.baselines.classical import FARNEBACK, NO_MOTION, TVL1, dis
 from gelflow.baselines.exact import ExactFlow
 from gelflow.baselines.lucas_kanade import LucasKanade
 from gelflow.baselines.method import Method
@@ -12,18 +12,18 @@ from gelflow.config import REGISTRATIONS
 from gelflow.errors import InputError
 from gelflow.hardware import chosen_device
 
-CLASSICAL: dict[str, Callable[[], Method]] = {
-    "none": NoMotion,
-    "lucas-kanade": LucasKanade,
-    "farneback": Farneback,
-    "dis-ultrafast": lambda: DIS("ultrafast"),
-    "dis-fast": lambda: DIS("fast"),
-    "dis-medium": lambda: DIS("medium"),
+CLASSICAL: dict[str, Method] = {
+    "none": NO_MOTION,
+    "lucas-kanade": LucasKanade(),
+    "farneback": FARNEBACK,
+    "dis-ultrafast": dis("ultrafast"),
+    "dis-fast": dis("fast"),
+    "dis-medium": dis("medium"),
     "tvl1": TVL1,
 }
 """The paper's methods that need no training, and no motion."""
 
-BESIDE: dict[str, Callable[[], Method]] = {"exact": ExactFlow, "al-dic": ALDIC}
+BESIDE: dict[str, Method] = {"exact": ExactFlow(), "al-dic": ALDIC()}
 """Methods that the paper does not have: the answer itself, where the data have it, and pyALDIC, another package that
 is named where it is missing."""
 
@@ -48,6 +48,4 @@ def named_methods(names: Sequence[str], device: str = "cpu") -> list[Method]:
         if list(names).count(name) > 1:
             raise InputError(f"the method {name!r} is given twice")
     plain = CLASSICAL | BESIDE
-    return [
-        plain[name]() if name in plain else RegisteredDIS(*REGISTERED[name], chosen_device(device)) for name in names
-    ]
+    return [plain[name] if name in plain else RegisteredDIS(*REGISTERED[name], chosen_device(device)) for name in names]

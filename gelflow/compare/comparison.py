@@ -37,12 +37,10 @@ class Comparison:
 
     @property
     def pairs(self) -> list[str]:
-        """Names of the pairs, in order."""
         return list(dict.fromkeys(score.pair for score in self.scores))
 
     @property
     def methods(self) -> list[str]:
-        """Names of the methods, in order."""
         return list(dict.fromkeys(score.method for score in self.scores))
 
     @property

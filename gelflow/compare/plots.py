@@ -133,11 +133,9 @@ def _legend(axis: Any) -> None:
 
 
 def _figure(panels: int, width: float, height: float, sharey: bool = False) -> tuple[Any, Any]:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
     return figure, figure.subplots(1, panels, sharey=sharey, squeeze=False)[0]
 
 

@@ -33,7 +33,6 @@ class Group:
 
     @property
     def label(self) -> str:
-        """Name of the group in tables."""
         return self.name if len(self.members) == 1 else f"{self.name} ({len(self.members)} seeds)"
 
     @property

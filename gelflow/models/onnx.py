@@ -10,10 +10,16 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import torch
+from torch import nn
+
+from gelflow.arrays import Flow, Images
 from gelflow.config import MINIMUM_SIDE
 from gelflow.errors import InputError
 from gelflow.files.atomic import refuse_foreign, replacing
 from gelflow.files.quiet import quiet_logger
+from gelflow.models import GelFlow
+from gelflow.models.weights import load_weights
 
 OPSET = 18
 PRODUCER = "gelflow"
@@ -42,10 +48,6 @@ def export_onnx(weights: Path, out: Path, size: tuple[int, int] | None = None) -
     if out.suffix != ".onnx":
         raise InputError(f"--out {out}: a file ending in .onnx is needed")
     refuse_foreign(out, PRODUCER.encode())
-    import torch
-
-    from gelflow.models.weights import load_weights
-
     model = load_weights(weights)
     chosen = size or model.image_size
     if chosen is None:
@@ -55,7 +57,7 @@ def export_onnx(weights: Path, out: Path, size: tuple[int, int] | None = None) -
     example = tuple(torch.zeros(1, 3, *chosen) for _ in range(2))
     with quiet_logger("torch.onnx"), replacing(out) as temporary, torch.no_grad():
         program: Any = torch.onnx.export(
-            _finest(model), example, input_names=["image1", "image2"], output_names=["flow"],
+            _Finest(model).eval(), example, input_names=["image1", "image2"], output_names=["flow"],
             opset_version=OPSET, dynamo=True, verbose=False,
         )  # fmt: skip
         program.model.producer_name = PRODUCER
@@ -63,17 +65,13 @@ def export_onnx(weights: Path, out: Path, size: tuple[int, int] | None = None) -
     return chosen
 
 
-def _finest(model: Any) -> Any:
-    """The network with its finest flow as its only answer."""
-    import torch
+class _Finest(nn.Module):
+    """A network with its finest flow as its only answer."""
 
-    class Finest(torch.nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.model = model
+    def __init__(self, model: GelFlow) -> None:
+        super().__init__()
+        self.model = model
 
-        def forward(self, image1: torch.Tensor, image2: torch.Tensor) -> torch.Tensor:
-            flow: torch.Tensor = self.model(image1, image2)[0]
-            return flow
-
-    return Finest().eval()
+    def forward(self, image1: Images, image2: Images) -> Flow:
+        flow: Flow = self.model(image1, image2)[0]
+        return flow

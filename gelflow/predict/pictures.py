@@ -135,13 +135,11 @@ def write_flow_picture(path: Path, image1: ImageArray, image2: ImageArray, flow:
     Raises:
         OSError: The file cannot be written.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     scale = robust_scale(flow)
     height, width = flow.shape[:2]
     figure = Figure(figsize=(12, 12 / 3 * 2 * height / width + 1.1), dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(2, 3)
     before = np.abs(image1 - image2).mean(axis=-1)
     after = np.abs(image1 - warp_image(image2, flow)).mean(axis=-1)

@@ -29,14 +29,12 @@ class DotGridFit:
         pattern: with spacing, rotation, offset and jitter as found; its radius has grown with the spacing.
         camera: with focal lengths, principal point, tilt and k1 as found.
         residual_px: (n, 2) found minus predicted centres.
-        index: (n, 2) column and row of each found dot in the grid.
         used: (n,) indices of the found dots that are part of the grid.
     """
 
     pattern: Dots
     camera: Camera
     residual_px: Pixels
-    index: NDArray[np.int64]
     used: NDArray[np.int64]
 
 
@@ -94,7 +92,7 @@ def fit_dot_grid(sensor: Sensor, pattern: Dots, centres: Pixels, spacing_mm: flo
     scale = float(np.mean(np.linalg.norm(np.diff(_corner(sensor, layout, fitted), axis=0), axis=1) / layout.spacing_mm))
     jitter = 1.4826 * float(np.median(np.abs(residual))) / scale
     layout = _near_centre(layout.model_copy(update={"jitter_mm": round(jitter, 4)}))
-    return DotGridFit(_rounded(layout), _rounded(fitted), residual, index, used)
+    return DotGridFit(_rounded(layout), _rounded(fitted), residual, used)
 
 
 def grid_index(centres: Pixels) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -144,7 +142,6 @@ def _start(sensor: Sensor, centres: Pixels, index: NDArray[np.int64], spacing_mm
 
 
 def _predicted(sensor: Sensor, pattern: Dots, camera: Camera, index: NDArray[np.int64]) -> Pixels:
-    """Pixels (n, 2) of grid points."""
     view = sensor.model_copy(update={"camera": camera})
     return Optics.of(view).project(pattern_points(pattern, index))
 

@@ -29,7 +29,6 @@ class Frames:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height, px."""
         return self.encoded.shape[1], self.encoded.shape[0]
 
 

@@ -138,7 +138,6 @@ class _Problem:
         )
 
     def box(self, bounds: Bounds) -> tuple[FloatArray, FloatArray]:
-        """Bounds of theta."""
         wide = np.concatenate([np.full(3 * self._lights, 4.0), np.full(2 * self._lights, _SIZES)])
         low = (bounds.low - self._start.centre) / CENTRE_MM
         high = (bounds.high - self._start.centre) / CENTRE_MM
@@ -174,7 +173,6 @@ class _Problem:
         return np.vstack([*blocks, np.eye(self.size)])
 
     def result(self, theta: FloatArray, steps: int) -> LightFit:
-        """The fit at theta."""
         basis, powers, geometry = self._solved(theta)
         _, errors = fit_powers(basis, self._target, self._shines)
         miss = self._target.slope * (np.einsum("mpc,mc->pc", basis, powers) - self._target.signal)

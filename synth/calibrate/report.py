@@ -12,6 +12,9 @@ from synth.calibrate.sensor_fit import SensorFit
 from synth.scene import Dots, Sensor
 from synth.scene.template import Template, with_files
 
+_CAMERA = ("fx", "fy", "cx", "cy", "look_at_mm", "distortion", "blur_px", "vignetting", "read_noise", "shot_noise")
+"""Fields that are fitted."""
+
 
 def fitted_content(template: Template, fit: SensorFit, folder: str) -> dict[str, Any]:
     """The preset's content with the fitted sensor in place of its own; everything else keeps its distributions.
@@ -53,21 +56,7 @@ def numbers(
         "residual_of_the_lights": round(255 * fit.lights.residual, 3),
         "differences": {name: row.numbers() for name, row in rows.items()},
         "lights": _lights(fit, start),
-        "camera": {
-            key: getattr(camera, key)
-            for key in (
-                "fx",
-                "fy",
-                "cx",
-                "cy",
-                "look_at_mm",
-                "distortion",
-                "blur_px",
-                "vignetting",
-                "read_noise",
-                "shot_noise",
-            )
-        },
+        "camera": {key: getattr(camera, key) for key in _CAMERA},
         "coating": {
             "reflectance": list(fit.sensor.coating.reflectance),
             "note": "held at the preset's: an undeformed frame tells its product with the lights' powers alone",
@@ -105,7 +94,6 @@ def _lights(fit: SensorFit, start: Sensor) -> list[dict[str, Any]]:
 
 
 def summary(record: dict[str, Any]) -> list[str]:
-    """Lines for the terminal."""
     lines = [f"{record['preset']}: fitted in {record['seconds']} s, {record['steps']} steps of the lights' geometry"]
     for name, difference in record["differences"].items():
         errors = " ".join(f"{value:.2f}" for value in difference["mean_absolute_outside_dots"])

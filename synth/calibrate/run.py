@@ -49,12 +49,13 @@ def run_calibrate(
     Raises:
         InputError: frames, preset or storage are at fault, or this machine has no differentiable variant.
     """
+    import tomli_w
+
     from synth.calibrate.comparison import compare, picture, render_undeformed
     from synth.calibrate.frames import read_frames
     from synth.calibrate.preset import render_settings, start_sensor
     from synth.calibrate.report import fitted_content, numbers, summary
     from synth.calibrate.sensor_fit import bare_pixels, fit_sensor
-    from synth.calibrate.toml_text import toml_text
     from synth.dataset.storage import refuse_foreign, replace_file, storage_errors
     from synth.render.variant import LLVM_HINT, choose_variant
     from synth.scene.template import checked_template, load_scene
@@ -95,8 +96,8 @@ def run_calibrate(
         problem = str(error).replace(f"{file}: ", "")
         raise InputError(f"the frames do not fit --scene {scene}: they give {problem}; {_WHAT_FRAMES}") from error
     record = numbers(template.name, frames, fit, start, rows, given, time.perf_counter() - started)
-    comment = f"{MARK} --scene {scene}` to {len(frames)} frame(s); numbers in {NUMBERS}."
-    replace_file(file, toml_text(content, comment).encode())
+    comment = f"# {MARK} --scene {scene}` to {len(frames)} frame(s); numbers in {NUMBERS}.\n"
+    replace_file(file, (comment + tomli_w.dumps(content)).encode())
     replace_file(out / PICTURE, picture(rows))
     replace_file(out / NUMBERS, (json.dumps(record, indent=1) + "\n").encode())
     print(json.dumps(record) if as_json else "\n".join([*summary(record), f"written: {file}"]))

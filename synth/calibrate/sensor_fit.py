@@ -38,7 +38,7 @@ class SensorFit:
     Attributes:
         sensor: all of it.
         lights: powers and geometry.
-        dots, grid, profile: None for a bare coating.
+        dots, grid: None for a bare coating.
         bare: (H, W) pixels that show nothing but coating.
     """
 
@@ -46,7 +46,6 @@ class SensorFit:
     lights: LightFit
     dots: FoundDots | None
     grid: DotGridFit | None
-    profile: DotProfile | None
     bare: BoolArray
 
 
@@ -65,14 +64,13 @@ def fit_sensor(start: Sensor, frames: Frames, variant: Variant, spacing_mm: floa
     """
     gamma = start.camera.gamma
     linear = frames.encoded**gamma
-    sensor, dots, grid, profile = start, None, None, None
+    sensor, dots, grid = start, None, None
     bare = np.ones(linear.shape[:2], dtype=bool)
     if isinstance(start.pattern, Dots):
         dots = find_dots(linear, start.pattern.spacing_mm[0] * pixels_per_mm(start))
         grid = fit_dot_grid(start, start.pattern, dots.centres, spacing_mm)
-        profile = fit_profile(dots)
         bare = ~dots.covered
-        sensor = start.model_copy(update=_look(start, grid, profile))
+        sensor = start.model_copy(update=_look(start, grid, fit_profile(dots)))
     pixels = _spread(bare & _sees_gel(sensor))
     if not len(pixels):
         raise InputError("no pixel between the dots sees the gel of the preset; check its sensor.gel and sensor.camera")
@@ -94,7 +92,7 @@ def fit_sensor(start: Sensor, frames: Frames, variant: Variant, spacing_mm: floa
         raise InputError("no light of the preset explains any of the frames' brightness; are the frames black?")
     lights = tuple(_shining(_placed(sensor.lights[i], fit.geometry, i), fit.powers[i]) for i in lit)
     sensor = sensor.model_copy(update={"camera": camera, "lights": lights})
-    return SensorFit(sensor, fit, dots, grid, profile, bare)
+    return SensorFit(sensor, fit, dots, grid, bare)
 
 
 def bare_pixels(frames: Frames, sensor: Sensor) -> BoolArray:

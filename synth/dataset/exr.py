@@ -17,7 +17,8 @@ Reference: OpenEXR file layout, https://openexr.com/en/latest/OpenEXRFileLayout.
 
 import contextlib
 import io
-from collections.abc import Mapping
+import os
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.dataset.exr_channels import meanings
-from synth.dataset.exr_layout import check_whole
 from synth.errors import InputError
 from synth.flow.field import FlowArray, FlowField
 
@@ -58,8 +58,8 @@ def write_flow(path: Path, flow: FlowField, attributes: Mapping[str, str | int])
 
     planes = channels_of(flow)
     planes |= {alias: planes[name] for alias, name in ALIASES.items()}
-    told = {**CONVENTIONS, **meanings(planes), **attributes}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **told}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header |= {**CONVENTIONS, **meanings(planes), **attributes}
     try:
         OpenEXR.File(header, planes).write(str(path))
     except RuntimeError as error:  # How the library reports a failing disk.
@@ -126,18 +126,33 @@ def read_channels(path: Path) -> tuple[dict[str, FlowArray], dict[str, str | int
     return {name: plane.astype(np.float32) for name, plane in planes.items()}, header
 
 
+@contextlib.contextmanager
+def _silenced() -> Iterator[None]:
+    """Drops what the library prints of a damaged file, through Python and to the descriptors 1 and 2."""
+    saved, null = [os.dup(1), os.dup(2)], os.open(os.devnull, os.O_WRONLY)
+    try:
+        for place in (1, 2):
+            os.dup2(null, place)
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+            yield
+    finally:
+        for place, former in enumerate(saved, 1):
+            os.dup2(former, place)
+        for descriptor in (*saved, null):
+            os.close(descriptor)
+
+
 def read_stored(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str | int]]:
     """As `read_channels`, with the channels in the type in which they are stored: float32, float16 or uint32."""
     import OpenEXR
 
-    check_whole(path)
     try:
-        # The library prints remarks about a damaged file to standard output before it raises.
-        with contextlib.redirect_stdout(io.StringIO()), OpenEXR.File(str(path), separate_channels=True) as file:
+        path.open("rb").close()
+        with _silenced(), OpenEXR.File(str(path), separate_channels=True) as file:
             header = dict(file.header())  # the library empties its own on closing
             planes = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
     except (RuntimeError, ValueError, OSError, TypeError) as error:
-        raise InputError(f"{path}: the OpenEXR image cannot be decoded ({error}); the file is damaged") from error
+        raise InputError(f"{path}: cannot be decoded as OpenEXR ({error}); it is truncated or damaged") from error
     shapes = {plane.shape for plane in planes.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 2:
         raise InputError(f"{path}: its channels have the sizes {sorted(shapes)}; a flow file's are all height x width")

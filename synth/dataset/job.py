@@ -48,7 +48,6 @@ class Job:
     device: Mapping[str, str] = field(default_factory=dict)
 
     def record(self) -> dict[str, Any]:
-        """The content of dataset.json."""
         return {
             "schema_version": SCHEMA_VERSION,
             "scene_name": self.scene_name,

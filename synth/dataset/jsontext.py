@@ -5,14 +5,12 @@ not finite has no JSON form and becomes `null`.
 """
 
 import json
-import math
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel
+from pydantic_core import to_jsonable_python
 
 from synth.errors import InputError
 
@@ -25,22 +23,13 @@ def jsonable(value: object) -> Any:
     Raises:
         TypeError: Something that has no JSON form.
     """
-    if isinstance(value, BaseModel):
-        return jsonable(value.model_dump(mode="json"))
-    if isinstance(value, Mapping):
-        return {str(key): jsonable(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return jsonable(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [jsonable(item) for item in value]
-    if isinstance(value, np.generic):
-        return jsonable(value.item())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Path):
-        return str(value)
-    if value is None or isinstance(value, (str, bool, int)):
-        return value
+    return to_jsonable_python(value, by_alias=False, inf_nan_mode="null", fallback=_numpy)
+
+
+def _numpy(value: object) -> Any:
+    """What pydantic leaves to us."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
     raise TypeError(f"{type(value).__name__} has no JSON form")
 
 

@@ -28,10 +28,9 @@ class Lease:
     """
 
     def __init__(self, store: Store) -> None:
-        """Holds nothing yet."""
         self._store, self._name = store, ""
         self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._keep, daemon=True)
+        self._thread = threading.Thread(target=self._renew_until_released, daemon=True)
 
     @contextlib.contextmanager
     def join(self, shard: Shard | None) -> Iterator[bool]:
@@ -86,7 +85,7 @@ class Lease:
         note = {"pid": os.getpid(), "host": socket.gethostname(), "time": time.time()}
         self._store.write(self._name, json.dumps(note).encode())
 
-    def _keep(self) -> None:
+    def _renew_until_released(self) -> None:
         while not self._ended.wait(RENEWED_S):
             try:
                 self._renew()

@@ -150,7 +150,6 @@ def merge_lines(
 
 
 def _copy(lines: Sequence[tuple[Path, tuple[int, int]]], target: BinaryIO) -> None:
-    """Lines of one file."""
     with lines[0][0].open("rb") as file:
         for _, (offset, length) in lines:
             file.seek(offset)

@@ -42,16 +42,6 @@ class DirectoryLock:
         with storage_errors(self._path):
             self._descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o644)
 
-    def take_whole(self) -> None:
-        """The dataset alone.
-
-        Raises:
-            InputError: Another process writes it, or the file system offers no locks.
-        """
-        if not self._take(WHOLE):
-            raise self._held(WHOLE, "is writing this dataset")
-        self._sign(WHOLE, _signature())
-
     @contextlib.contextmanager
     def join(self, shard: Shard | None) -> Iterator[bool]:
         """Takes the dataset alone, or a shard beside others; within, no other shard comes or goes.
@@ -64,7 +54,9 @@ class DirectoryLock:
                 the file system offers no locks.
         """
         if shard is None:
-            self.take_whole()
+            if not self._take(WHOLE):
+                raise self._held(WHOLE, "is writing this dataset")
+            self._sign(WHOLE, _signature())
             yield True
             return
         with self.setup():

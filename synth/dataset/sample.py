@@ -121,7 +121,6 @@ class ManifestEntry:
         return cls(**{**values, **rows, "index": int(record["index"]), "frames": tuple(record["frames"])})
 
     def record(self) -> dict[str, Any]:
-        """The line's JSON object."""
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
 

@@ -79,7 +79,6 @@ def _write_folder(final: Path, sample: Sample, job: Job) -> ManifestEntry:
 
 
 def _write_view(folder: Path, pair: CameraPair, attributes: Mapping[str, str | int]) -> None:
-    """Images and flow of one camera."""
     folder.mkdir(exist_ok=True)
     (folder / "image1.png").write_bytes(encode_png(pair.image1))
     (folder / "image2.png").write_bytes(encode_png(pair.image2))

@@ -32,11 +32,9 @@ class Shard:
 
     @property
     def name(self) -> str:
-        """For file names."""
         return f"{self.number}-of-{self.count}"
 
     def __str__(self) -> str:
-        """As the user gave it."""
         return f"{self.number}/{self.count}"
 
     def makes(self, trajectory: int) -> bool:

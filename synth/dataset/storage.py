@@ -59,7 +59,6 @@ def remove_partials(directory: Path, of: Callable[[str], bool] = lambda name: Tr
 
 
 def flush(path: Path) -> None:
-    """Fsync of a file or a folder."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -43,7 +43,6 @@ class Store:
     """
 
     def __init__(self, out: Path | str) -> None:
-        """Touches nothing."""
         place = output_of(out)
         self.directory = place if isinstance(place, Path) else None
         self.out = place if isinstance(place, Path) else place.rstrip("/")

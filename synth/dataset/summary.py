@@ -23,7 +23,6 @@ def reason_group(stage: str, reason: str) -> str:
 
 
 def shares(seconds: Mapping[str, float]) -> dict[str, float]:
-    """Each stage's part of the sum."""
     total = sum(seconds.values())
     return {stage: round(value / total, 4) for stage, value in seconds.items()} if total > 0 else {}
 
@@ -34,8 +33,7 @@ def summary_document(folder: Path, run: Mapping[str, Any], asked_for: int) -> by
     samples = 0
     for entry in _lines(folder / MANIFEST_FILE):
         samples += 1
-        for stage, value in entry["seconds"].items():
-            seconds[stage] += value
+        seconds.update(entry["seconds"])
     reasons = Counter(reason_group(failure["stage"], failure["reason"]) for failure in _lines(folder / FAILURES_FILE))
     content = {
         "samples": samples,

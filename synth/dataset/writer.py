@@ -215,13 +215,11 @@ class DatasetWriter:
         self._closing.close()
 
     def __enter__(self) -> Self:
-        """For `with`."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Finalise and close."""
         try:
             if error is None or isinstance(error, KeyboardInterrupt):
                 self.finalise()

@@ -34,7 +34,6 @@ def exact_flow(
     displacement: bool = False,
     traction: FloatArray | None = None,
     contact: FloatArray | None = None,
-    device: str = "cpu",
     view: View | None = None,
 ) -> FlowField:
     """Exact flow between two states, and what else the surface knows at each pixel.
@@ -57,7 +56,6 @@ def exact_flow(
             pixels of image 1.
         contact: (v,) 0 or 1 at the vertices; gives contact.Y, 1 where the linear interpolation is at least one half, at
             the pixels of image 1.
-        device: Warp device of the tracing.
         view: of this surface, camera and size, cached from another pair: saves what both have in common.
 
     Returns:
@@ -75,7 +73,7 @@ def exact_flow(
     if contact is not None and contact.shape != (vertices,):
         raise InputError(f"contact has shape {contact.shape}; this surface needs ({vertices},), one value per vertex")
     if view is None:
-        view = View(surface, optics, width, height, device)
+        view = View(surface, optics, width, height)
     elif view.surface is not surface or view.optics is not optics or (view.width, view.height) != (width, height):
         raise ValueError("the view is of another surface, camera or size")
     hits1 = view.first_hits(positions1)

@@ -37,14 +37,14 @@ class Hits:
             (triangles, np.int32, wp.int32),
             (values, np.float64, wp.float64),
         )
-        inputs = [on_device(array, kind, element, "cpu") for array, kind, element in given]
+        inputs = [as_warp(array, kind, element) for array, kind, element in given]
         wp.launch(_interpolate, dim=rays, inputs=inputs, outputs=[found], device="cpu")
         return np.asarray(found.numpy())
 
 
-def on_device(array: Any, kind: type, element: Any, device: str) -> Any:
-    """A Warp array; on the CPU it is the caller's own memory, which kernels only read."""
-    return wp.array(np.ascontiguousarray(array, dtype=kind), dtype=element, device=device, copy=False)
+def as_warp(array: Any, kind: type, element: Any) -> Any:
+    """A Warp array in the caller's own memory, which kernels only read."""
+    return wp.array(np.ascontiguousarray(array, dtype=kind), dtype=element, device="cpu", copy=False)
 
 
 @wp.kernel

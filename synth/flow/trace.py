@@ -19,7 +19,7 @@ import numpy as np
 import warp as wp
 
 from synth.arrays import Points, Triangles
-from synth.flow.hits import Hits, on_device
+from synth.flow.hits import Hits, as_warp
 
 wp.config.log_level = wp.LOG_WARNING
 wp.set_module_options({"enable_backward": False})
@@ -28,7 +28,7 @@ _TRIANGLES_PER_CELL = 0.25
 """Cells are as large as so many triangles are on average. It changes the time and no bit of a result."""
 
 
-def trace(positions: Points, triangles: Triangles, origins: Points, directions: Points, device: str = "cpu") -> Hits:
+def trace(positions: Points, triangles: Triangles, origins: Points, directions: Points) -> Hits:
     """Find where rays first meet a surface.
 
     Args:
@@ -36,20 +36,19 @@ def trace(positions: Points, triangles: Triangles, origins: Points, directions: 
         triangles: (f, 3) int32 into `positions`.
         origins: (n, 3) float64 mm; NaN for rays that do not exist.
         directions: (n, 3) unit, with a negative z: rays go toward the contact surface.
-        device: Warp device.
 
     Returns:
         Hits of the n rays. They start at their origin: what lies behind it is not hit.
     """
     rays = len(origins)
-    outputs = [wp.empty(rays, dtype=kind, device=device) for kind in (wp.int32, wp.vec3d, wp.float64)]
-    vertices = on_device(positions, np.float64, wp.vec3d, device)
-    corners = on_device(triangles, np.int32, wp.int32, device)
+    outputs = [wp.empty(rays, dtype=kind, device="cpu") for kind in (wp.int32, wp.vec3d, wp.float64)]
+    vertices = as_warp(positions, np.float64, wp.vec3d)
+    corners = as_warp(triangles, np.int32, wp.int32)
     cells = _grid_around(positions, len(triangles))
-    bins = _bin(cells, vertices, corners, device)
-    rays_given = [on_device(array, np.float64, wp.vec3d, device) for array in (origins, directions)]
+    bins = _bin(cells, vertices, corners)
+    rays_given = [as_warp(array, np.float64, wp.vec3d) for array in (origins, directions)]
     inputs = [cells, vertices, corners, *bins, *rays_given]
-    wp.launch(_nearest_hit, dim=rays, inputs=inputs, outputs=outputs, device=device)
+    wp.launch(_nearest_hit, dim=rays, inputs=inputs, outputs=outputs, device="cpu")
     return Hits(*(array.numpy() for array in outputs))
 
 
@@ -68,7 +67,6 @@ class _Cells:
 
 
 def _grid_around(positions: Points, triangles: int) -> Any:
-    """The grid of a surface with so many triangles."""
     cells = _Cells()
     low, high = positions.min(axis=0), positions.max(axis=0)
     extent = high - low
@@ -81,18 +79,18 @@ def _grid_around(positions: Points, triangles: int) -> Any:
     return cells
 
 
-def _bin(cells: Any, vertices: Any, corners: Any, device: str) -> tuple[Any, Any, Any]:
+def _bin(cells: Any, vertices: Any, corners: Any) -> tuple[Any, Any, Any]:
     """Triangles of each cell: starts of the cells' lists (one more than cells), the lists, and their tops."""
     number = cells.rows * cells.columns
-    count = wp.zeros(number + 1, dtype=wp.int32, device=device)
-    ceiling = wp.full(number, -np.inf, dtype=wp.float64, device=device)
+    count = wp.zeros(number + 1, dtype=wp.int32, device="cpu")
+    ceiling = wp.full(number, -np.inf, dtype=wp.float64, device="cpu")
     inputs, triangles = [cells, vertices, corners], corners.shape[0]
-    wp.launch(_count, dim=triangles, inputs=inputs, outputs=[count, ceiling], device=device)
+    wp.launch(_count, dim=triangles, inputs=inputs, outputs=[count, ceiling], device="cpu")
     first = wp.empty_like(count)
     wp.utils.array_scan(count, first, inclusive=False)
-    members = wp.empty(int(first.numpy()[-1]), dtype=wp.int32, device=device)
+    members = wp.empty(int(first.numpy()[-1]), dtype=wp.int32, device="cpu")
     taken = wp.clone(first)
-    wp.launch(_fill, dim=triangles, inputs=inputs, outputs=[taken, members], device=device)
+    wp.launch(_fill, dim=triangles, inputs=inputs, outputs=[taken, members], device="cpu")
     return first, members, ceiling
 
 
@@ -194,10 +192,8 @@ def _nearest_hit(
         enter = wp.max((cells.top - o[2]) / d[2], wp.float64(0.0))
         leave = (cells.bottom - o[2]) / d[2]
         p = o + enter * d
-        column, row = (
-            wp.int32(wp.floor((p[0] - cells.x) / cells.size)),
-            wp.int32(wp.floor((p[1] - cells.y) / cells.size)),
-        )
+        column = wp.int32(wp.floor((p[0] - cells.x) / cells.size))
+        row = wp.int32(wp.floor((p[1] - cells.y) / cells.size))
         step_x, step_y = wp.int32(1), wp.int32(1)
         if d[0] < wp.float64(0.0):
             step_x = wp.int32(-1)
@@ -219,13 +215,7 @@ def _nearest_hit(
                     end = first[cell]
                 for k in range(first[cell], end):
                     t = members[k]
-                    hit = _intersect(
-                        o,
-                        d,
-                        vertices[corners[t, 0]],
-                        vertices[corners[t, 1]],
-                        vertices[corners[t, 2]],
-                    )
+                    hit = _intersect(o, d, vertices[corners[t, 0]], vertices[corners[t, 1]], vertices[corners[t, 2]])
                     if hit[0] >= wp.float64(0.0) and (hit[0] < nearest or (hit[0] == nearest and t < found)):
                         nearest, weights, found = hit[0], wp.vec3d(hit[1], hit[2], hit[3]), t
             if nearest <= exit:

@@ -37,31 +37,17 @@ class View:
     Attributes:
         surface: its `triangles` are used.
         optics: the camera.
-        width: columns of the image.
-        height: rows of the image.
-        device: Warp device of the tracing.
+        width, height: of the image, px.
     """
 
     surface: GelSurface
     optics: Optics
     width: int
     height: int
-    device: str = "cpu"
-
-    @property
-    def triangles(self) -> Triangles:
-        """(f, 3) int32 of the surface."""
-        return self.surface.triangles
-
-    @property
-    def centres(self) -> Pixels:
-        """(n, 2) of all pixels, row by row."""
-        return self.optics.centres
 
     @cached_property
     def own(self) -> Rays:
-        """The rays of the pixel centres."""
-        return self.optics.look(self.centres)
+        return self.optics.look(self.optics.centres)
 
     @cached_property
     def _is_whole(self) -> bool:
@@ -71,7 +57,7 @@ class View:
 
     @cached_property
     def _boundary(self) -> Triangles:
-        return boundary_edges(self.triangles)
+        return boundary_edges(self.surface.triangles)
 
     @cached_property
     def _seen(self) -> "deque[tuple[Points, Hits]]":
@@ -82,13 +68,13 @@ class View:
         for known, hits in self._seen:
             if known is positions:
                 return hits
-        hits = trace(positions, self.triangles, self.own.origins, self.own.directions, device=self.device)
+        hits = trace(positions, self.surface.triangles, self.own.origins, self.own.directions)
         self._seen.append((positions, hits))
         return hits
 
     def motion(self, hits: Hits, target: Points) -> tuple[FlowArray, FlowArray]:
         """Flow (H, W, 2) and visibility (H, W) of the hits' material points when the surface moves to `target`."""
-        points = hits.interpolate(self.triangles, target)
+        points = hits.interpolate(self.surface.triangles, target)
         pixels = self.optics.project(points, self.own.path)
         x, y = pixels[:, 0], pixels[:, 1]
         with np.errstate(invalid="ignore"):
@@ -97,7 +83,7 @@ class View:
         rays = self.optics.look(pixels[doubtful])
         same = rays.path == self.own.path[doubtful]
         visible[doubtful] = same & self._is_unobstructed(points[doubtful], rays, target)
-        flow = (pixels - self.centres).astype(np.float32).reshape(self.height, self.width, 2)
+        flow = (pixels - self.optics.centres).astype(np.float32).reshape(self.height, self.width, 2)
         return flow, self.image(visible)
 
     def _may_be_hidden(self, pixels: Pixels, inside: BoolArray, target: Points) -> NDArray[np.intp]:
@@ -105,7 +91,7 @@ class View:
         at = np.flatnonzero(inside)
         if not self._is_whole:
             return at
-        overlap = may_overlap(target, self.triangles, self._boundary, self.optics, (self.width, self.height))
+        overlap = may_overlap(target, self.surface.triangles, self._boundary, self.optics, (self.width, self.height))
         if not overlap.any():
             return at[:0]
         column, row = pixels[at].astype(np.intp).T
@@ -115,7 +101,7 @@ class View:
         if len(points) == 0:
             return np.ones(0, dtype=bool)
         distance = np.linalg.norm(points - rays.origins, axis=1)
-        first = trace(positions, self.triangles, rays.origins, rays.directions, device=self.device).distance
+        first = trace(positions, self.surface.triangles, rays.origins, rays.directions).distance
         return first >= distance - OCCLUSION_TOLERANCE_MM
 
     def image(self, values: FloatArray | BoolArray) -> FlowArray:

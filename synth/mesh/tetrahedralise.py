@@ -14,45 +14,30 @@ import numpy as np
 
 from synth.arrays import Points, Tets
 from synth.errors import InputError
-from synth.mesh.focus import Focus
 from synth.mesh.pad import PadMesh, boundary_faces, signed_volumes
-from synth.mesh.sizing import Background, around_focus, through_thickness
+from synth.mesh.sizing import Background, through_thickness
 
 ENVELOPE = 1e-3
 """fTetWild's epsilon, relative to the bounding box's diagonal."""
-COARSENING = 4.0
-"""With a focus: largest edge length over the one in the focus, where none is given."""
 WORST_SHAPE = 0.02
 """Smallest accepted ratio of inscribed to circumscribed radius, times 3 (1 for a regular tetrahedron)."""
 
 
 def tetrahedralise_box(
-    size_mm: tuple[float, float, float],
-    edge_length_mm: float,
-    attempts: int = 3,
-    focus: Focus | None = None,
-    coarse_mm: float | None = None,
+    size_mm: tuple[float, float, float], edge_length_mm: float, background: Background | None = None, attempts: int = 3
 ) -> PadMesh:
-    """Mesh a box whose tetrahedra have edges of edge_length_mm at the contact face, or in a zone of it.
+    """Mesh a box whose tetrahedra have edges of edge_length_mm at the contact face, or as a background says.
 
     Args:
         size_mm: edge lengths of the box.
-        edge_length_mm: target edge length at z = 0 or, with a focus, in that zone of z = 0.
+        edge_length_mm: target edge length at z = 0.
+        background: target edge lengths everywhere; default GRADING times edge_length_mm at the window.
         attempts: the mesher is random; a mesh below WORST_SHAPE is made again so often.
-        focus: where edges are edge_length_mm long; they grow away from it. Without it they grow from the contact face
-            to GRADING times that at the window.
-        coarse_mm: with a focus, the largest target edge length; default 4 times edge_length_mm.
 
     Raises:
-        ValueError: coarse_mm without a focus, or below edge_length_mm.
         InputError: no attempt gave a valid mesh.
     """
-    if coarse_mm is not None and (focus is None or coarse_mm < edge_length_mm):
-        raise ValueError(f"coarse_mm = {coarse_mm} needs a focus, and at least edge_length_mm = {edge_length_mm}")
-    if focus is None:
-        background = through_thickness(size_mm, edge_length_mm)
-    else:
-        background = around_focus(size_mm, edge_length_mm, focus, coarse_mm or COARSENING * edge_length_mm)
+    background = background or through_thickness(size_mm, edge_length_mm)
     problem = ""
     for _ in range(attempts):
         points, tets = _ftetwild(size_mm, background)

@@ -77,16 +77,6 @@ class Optics:
             size=(camera.width, camera.height),
         )
 
-    @property
-    def index(self) -> float:
-        """Refractive index of gel and window."""
-        return self.window.index
-
-    @property
-    def face_z(self) -> float:
-        """Z of the window's outer face, mm."""
-        return self.window.face_z
-
     @cached_property
     def centres(self) -> Pixels:
         """(n, 2) centres of all pixels, row by row."""

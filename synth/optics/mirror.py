@@ -41,7 +41,6 @@ class FlatMirror:
 
     @staticmethod
     def of(mirror: Mirror) -> "FlatMirror":
-        """The mirror of a scene."""
         first, second, normal = (np.array(axis) for axis in mirror.axes)
         return FlatMirror(np.array(mirror.position_mm), np.stack([first, second]), normal, np.array(mirror.size_mm) / 2)
 
@@ -50,7 +49,6 @@ class FlatMirror:
         return np.asarray(vectors - 2 * (vectors @ self.normal)[..., None] * self.normal)
 
     def virtual(self, pose: Pose) -> Pose:
-        """The camera behind the mirror."""
         position = pose.position - 2 * ((pose.position - self.centre) @ self.normal) * self.normal
         return Pose(position, *(self.turned(axis) for axis in (pose.right, pose.down, pose.forward)))
 

@@ -1,13 +1,14 @@
 """The random instances of one trajectory, one after the other, until one of them can be used."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from synth.errors import InputError
-from synth.pipeline.records import FaceState, Failure, JobContext, Outcome, Simulated, SimulatedTrajectory, Task
+from synth.pipeline.records import Failure, JobContext, Outcome, Simulated, SimulatedTrajectory, Task
 from synth.scene.sampling import MAX_DRAWS, Pair, SensorInstance, draw, pairs_of
-from synth.simulate import Trajectory
+from synth.simulate import State, Trajectory
 from synth.simulate.press import Press, edge_radius_mm
+from synth.simulate.space import Space
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +41,6 @@ class Attempts:
 
     @property
     def is_exhausted(self) -> bool:
-        """Whether no instance is left."""
         return self._sensor.content is None or self._count >= MAX_DRAWS
 
     def next(self, retry: bool = True) -> Attempt | None:
@@ -69,7 +69,7 @@ class Attempts:
     def simulated(self, attempt: Attempt, result: Trajectory) -> Simulated | None:
         """What is handed on of an instance's trajectory; None if it cannot be used, which is put on record."""
         if result.status != "complete":
-            self._record("simulate", result.reason, result.states[-1].summary())
+            self.fail("simulate", result.reason, result.states[-1].summary())
             return None
         press, space = attempt.press, result.space
         shown = sorted({frame for pair in attempt.pairs for frame in pair.frames})
@@ -77,7 +77,7 @@ class Attempts:
             self.trajectory,
             press.scene,
             attempt.pairs,
-            {frame: FaceState.of(result.states[frame], space) for frame in shown},
+            {frame: _on_face(result.states[frame], space) for frame in shown},
             {"mesh": press.mesh.hash, "element": space.element.name},
             edge_radius_mm(press.scene, press.mesh),
             press.accuracy,
@@ -86,13 +86,15 @@ class Attempts:
         )
         return trajectory, space
 
-    def fail(self, stage: str, reason: str) -> None:
-        """Put an instance on record that did not get as far as a simulation."""
-        self._record(stage, reason, None)
+    def fail(self, stage: str, reason: str, last_good_state: dict[str, Any] | None = None) -> None:
+        """Put an instance on record that cannot be used."""
+        self.failures.append(Failure(self._first, len(self.failures), stage, reason, last_good_state))
 
     def given_up(self) -> Outcome:
         """What is reported when no instance is left."""
         return Outcome((), tuple(self.failures), tuple(self.wanted))
 
-    def _record(self, stage: str, reason: str, last_good_state: dict[str, Any] | None) -> None:
-        self.failures.append(Failure(self._first, len(self.failures), stage, reason, last_good_state))
+
+def _on_face(state: State, space: Space) -> State:
+    """The state with the displacement of the contact face alone."""
+    return replace(state, displacement=state.displacement[space.surface_nodes])

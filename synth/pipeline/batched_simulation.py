@@ -38,7 +38,6 @@ class Pads:
     """The pad that was used last: mesh, tables and preconditioner, which take seconds to prepare."""
 
     def __init__(self, context: JobContext) -> None:
-        """Nothing is prepared before the first press."""
         self._device = context.plan.solver_device
         self._cached: tuple[Gel, Pad] | None = None
 
@@ -53,12 +52,6 @@ class Pads:
             self._cached = None  # gives its memory back first
             self._cached = key, prepare(press.scene, press.mesh, self._device)
         return self._cached[1]
-
-
-def simulate_alone(attempt: Attempt, pad: Pad) -> Trajectory:
-    """A batch of one press."""
-    ((_, result),) = simulate_presses([attempt.press], pad, [attempt.frames])
-    return result
 
 
 def pad_key(press: Press) -> Gel:
@@ -114,7 +107,6 @@ class _Simulation:
                         yield attempts.trajectory, simulated
 
     def _begun(self, most: int) -> list[Attempts]:
-        """New trajectories."""
         begun = []
         for task in islice(self._tasks, most):
             template = self._context.plan.template
@@ -126,7 +118,6 @@ class _Simulation:
         return begun
 
     def _run(self, members: list[tuple[Attempts, Attempt]]) -> Iterator[tuple[Attempts, Attempt, Trajectory]]:
-        """Trajectories of one pad as they end."""
         presses = [attempt.press for _, attempt in members]
         frames = [attempt.frames for _, attempt in members]
         for number, result in simulate_presses(presses, self._pads.of(presses[0]), frames, self._batch):

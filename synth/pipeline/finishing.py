@@ -19,11 +19,12 @@ from synth.flow.exact import exact_flow
 from synth.flow.field import FlowField
 from synth.flow.view import View
 from synth.optics import Optics
-from synth.pipeline.records import FaceState, JobContext, Outcome, SimulatedTrajectory
+from synth.pipeline.records import JobContext, Outcome, SimulatedTrajectory
 from synth.pipeline.render_session import Frame, RenderedTrajectory
 from synth.render.camera_image import camera_image
 from synth.scene import Camera, Outputs
 from synth.scene.sampling import Pair
+from synth.simulate import State
 from synth.simulate.shared import accuracy
 
 
@@ -52,7 +53,6 @@ def finish(context: JobContext, rendered: RenderedTrajectory) -> Outcome:
 
 
 def _diagnostics(context: JobContext, simulated: SimulatedTrajectory) -> dict[str, Any]:
-    """What is said of the mesh."""
     found = simulated.accuracy or accuracy(simulated.scene, context.plan.template.folder)
     error = None if np.isnan(found.error_px) else round(found.error_px, 4)
     radius = simulated.edge_radius_mm
@@ -74,25 +74,23 @@ def _sample(
     cameras = {}
     for k, (name, sensor) in enumerate(scene.sensor.views.items()):
         own = (k,) if k else ()  # of each further camera's noise
-        images = [
+        image1, image2 = (
             expose(context, sensor.camera, frame.radiance[name], (pair.index, number, *own))
             for number, frame in enumerate(frames)
-        ]
-        cameras[name] = CameraPair(images[0], images[1], _flow(scene.outputs, views[name], frames, second))
+        )
+        cameras[name] = CameraPair(image1, image2, _flow(scene.outputs, views[name], frames, second))
     main = cameras.pop("")
     return Sample(
         index=pair.index,
         trajectory=pair.trajectory,
         frames=pair.frames,
         seed=context.job.seed,
-        image1=main.image1,
-        image2=main.image2,
-        flow=main.flow,
+        **vars(main),
         scene=scene,
         surface=rendered.surface,
         displacement1=first.displacement,
         displacement2=second.displacement,
-        diagnostics={"solver": [first.summary, second.summary], **diagnostics},
+        diagnostics={"solver": [first.summary(), second.summary()], **diagnostics},
         force_n=np.array([first.force_n, second.force_n]),
         torque_nmm=np.array([first.torque_nmm, second.torque_nmm]),
         further=cameras,
@@ -107,7 +105,7 @@ def expose(context: JobContext, camera: Camera, radiance: Image, numbers: tuple[
     return camera_image(radiance, camera, rng)
 
 
-def _flow(outputs: Outputs, view: View, frames: list[Frame], pressed: FaceState) -> FlowField:
+def _flow(outputs: Outputs, view: View, frames: list[Frame], pressed: State) -> FlowField:
     """The exact flow between two frames, with what else the outputs ask for; `pressed` is the second state."""
     surface = view.surface
     traction = surface.interpolate_linear(pressed.traction) if outputs.traction else None

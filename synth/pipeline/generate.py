@@ -83,21 +83,18 @@ class Summary:
     failed_draws: int = 0
     failures: Counter[str] = field(default_factory=Counter)
     seconds: float = 0.0
-    stages: dict[str, float] = field(default_factory=dict)
+    stages: Counter[str] = field(default_factory=Counter)
 
     def add(self, outcome: Outcome) -> None:
-        """Count what a task did."""
         self.made += len(outcome.entries)
         self.given_up = sorted([*self.given_up, *outcome.given_up])
         self.failed_draws += len(outcome.failures)
         self.failures.update(reason_group(failure.stage, failure.reason) for failure in outcome.failures)
         for entry in outcome.entries:
-            for stage, seconds in entry.seconds.items():
-                self.stages[stage] = self.stages.get(stage, 0.0) + seconds
+            self.stages.update(entry.seconds)
 
     @property
     def samples_per_second(self) -> float:
-        """Of this call, start-up included."""
         return self.made / self.seconds if self.seconds > 0 else 0.0
 
     def record(self) -> dict[str, Any]:

@@ -3,23 +3,15 @@
 import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from queue import Full, Queue
-from typing import Generic, TypeVar
+from typing import TypeVar
 
 Item = TypeVar("Item")
 
 POLL_S = 0.1
 """Seconds after which a thread that waits for room looks whether it is still wanted."""
 JOIN_S = 10.0
-"""For its last item, when it is no longer wanted."""
-
-
-@dataclass(frozen=True)
-class _End:
-    """The last thing in the queue: how the iterator ended."""
-
-    error: BaseException | None
+"""Seconds that the thread is given for its last item, when it is no longer wanted."""
 
 
 @contextmanager
@@ -33,46 +25,37 @@ def prefetched(items: Iterable[Item], limit: int) -> Iterator[Iterator[Item]]:
     Yields:
         The items in their order. On leaving, the thread is told to stop after the item that it is making.
     """
-    prefetcher = _Prefetcher(items, Queue(limit), threading.Event())
-    thread = threading.Thread(target=prefetcher.run, daemon=True)
-    thread.start()
-    try:
-        yield prefetcher.items_in_order()
-    finally:
-        prefetcher.cancelled.set()
-        thread.join(JOIN_S)
+    queue: Queue[tuple[Item] | BaseException | None] = Queue(limit)
+    cancelled = threading.Event()
 
-
-@dataclass(frozen=True)
-class _Prefetcher(Generic[Item]):
-    items: Iterable[Item]
-    queue: "Queue[Item | _End]"
-    cancelled: threading.Event
-
-    def run(self) -> None:
-        error: BaseException | None = None
-        try:
-            for item in self.items:
-                if not self._put(item):
-                    return
-        except BaseException as raised:  # whatever it is, it belongs to the thread that takes
-            error = raised
-        self._put(_End(error))
-
-    def _put(self, item: Item | _End) -> bool:
-        while not self.cancelled.is_set():
+    def put(entry: tuple[Item] | BaseException | None) -> None:
+        while not cancelled.is_set():
             try:
-                self.queue.put(item, timeout=POLL_S)
+                queue.put(entry, timeout=POLL_S)
             except Full:
                 continue
-            return True
-        return False
+            return
 
-    def items_in_order(self) -> Iterator[Item]:
-        while True:
-            item = self.queue.get()
-            if isinstance(item, _End):
-                if item.error is not None:
-                    raise item.error
-                return
-            yield item
+    def run() -> None:
+        try:
+            for item in items:
+                put((item,))
+                if cancelled.is_set():
+                    return
+        except BaseException as error:  # whatever it is, it belongs to the thread that takes
+            put(error)
+        put(None)
+
+    def in_order() -> Iterator[Item]:
+        while (entry := queue.get()) is not None:
+            if isinstance(entry, BaseException):
+                raise entry
+            yield entry[0]
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    try:
+        yield in_order()
+    finally:
+        cancelled.set()
+        thread.join(JOIN_S)

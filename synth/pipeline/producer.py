@@ -3,14 +3,13 @@
 from collections.abc import Sequence
 
 from synth.errors import InputError
-from synth.pipeline.attempts import Attempt, Attempts
-from synth.pipeline.batched_simulation import Pads, simulate_alone
+from synth.pipeline.attempts import Attempts
+from synth.pipeline.batched_simulation import Pads
 from synth.pipeline.finishing import finish
 from synth.pipeline.records import JobContext, Outcome
 from synth.pipeline.render_session import RenderSession
 from synth.scene.sampling import draw_sensor, sensor_of
-from synth.simulate import Trajectory
-from synth.simulate.batched.pad import Pad
+from synth.simulate.batched import simulate_presses
 from synth.simulate.solve import simulate_press
 
 
@@ -18,7 +17,6 @@ class Producer:
     """Makes trajectories' samples; keeps the last sensor's renderer."""
 
     def __init__(self, context: JobContext) -> None:
-        """Nothing is loaded before the first trajectory."""
         self._context = context
         self._session = RenderSession(context)
         self._pads = Pads(context)
@@ -40,14 +38,13 @@ class Producer:
             # What is wrong with a shared pad is wrong for all attempts.
             pad = self._pads.of(attempt.press) if self._context.plan.is_batched else None
             try:
-                result = _simulate(attempt, pad)
+                if pad is None:
+                    result = simulate_press(attempt.press, attempt.frames)
+                else:
+                    ((_, result),) = simulate_presses([attempt.press], pad, [attempt.frames])
             except InputError as error:
                 attempts.fail("simulate", str(error))
                 continue
             if (simulated := attempts.simulated(attempt, result)) is not None:
                 return finish(self._context, self._session.render_frames(*simulated))
         return attempts.given_up()
-
-
-def _simulate(attempt: Attempt, pad: Pad | None) -> Trajectory:
-    return simulate_press(attempt.press, attempt.frames) if pad is None else simulate_alone(attempt, pad)

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from synth.arrays import FloatArray
 from synth.dataset.job import Job
 from synth.dataset.meshes import mesh_folder
 from synth.dataset.sample import ManifestEntry
@@ -77,30 +76,6 @@ class Outcome:
 
 
 @dataclass(frozen=True, eq=False)
-class FaceState:
-    """What pictures and flow need of a simulated state, at the nodes of the contact face.
-
-    Attributes:
-        displacement: (s, 3) float64 mm.
-        traction: (s, 3) float64 MPa.
-        force_n, torque_nmm: of the indenter on the gel.
-        summary: the state's numbers, for the diagnostics.
-    """
-
-    displacement: FloatArray
-    traction: FloatArray
-    force_n: tuple[float, float, float]
-    torque_nmm: tuple[float, float, float]
-    summary: dict[str, Any]
-
-    @staticmethod
-    def of(state: State, space: Space) -> "FaceState":
-        """The part of a state that lies on the contact face."""
-        displacement = state.displacement[space.surface_nodes]
-        return FaceState(displacement, state.traction, state.force_n, state.torque_nmm, state.summary())
-
-
-@dataclass(frozen=True, eq=False)
 class SimulatedTrajectory:
     """A simulated trajectory, less what no sample shows; picklable.
 
@@ -108,7 +83,7 @@ class SimulatedTrajectory:
         number: of the trajectory.
         scene: fully drawn.
         pairs: the samples that are wanted.
-        states: by number, those that the samples show.
+        states: by number, those that the samples show; displacements are those of the contact face.
         mesh: what is said of the mesh: hash and element.
         edge_radius_mm: of a mesh indenter, else None.
         accuracy: of the mesh; None where it is left to whoever finishes the samples.
@@ -119,7 +94,7 @@ class SimulatedTrajectory:
     number: int
     scene: Scene
     pairs: tuple[Pair, ...]
-    states: dict[int, FaceState]
+    states: dict[int, State]
     mesh: dict[str, Any]
     edge_radius_mm: float | None
     accuracy: Accuracy | None
@@ -128,7 +103,6 @@ class SimulatedTrajectory:
 
     @property
     def sensor(self) -> int:
-        """Number of its sensor."""
         return self.pairs[0].sensor
 
 

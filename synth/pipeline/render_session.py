@@ -68,7 +68,6 @@ class RenderSession:
     """Renders trajectories; keeps the last sensor's renderer and the last mesh's surface."""
 
     def __init__(self, context: JobContext) -> None:
-        """Nothing is loaded before the first frame."""
         self._context = context
         self._sensor: SensorRenderer | None = None
         self._surface: tuple[Space, GelSurface] | None = None
@@ -98,7 +97,6 @@ class RenderSession:
         return RenderedTrajectory(simulated, surface, frames, time.perf_counter() - started)
 
     def _surface_of(self, space: Space, gel: Gel) -> GelSurface:
-        """The surface that is rendered for a mesh."""
         if self._surface is None or self._surface[0] is not space:
             parts = SUBDIVISIONS[space.element.order] * (FINER_DOME if gel.dome_radius_mm else 1)
             self._surface = space, GelSurface(space.surface, parts)

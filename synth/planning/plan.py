@@ -52,7 +52,6 @@ class Plan:
         return self.mesh.press(scene, self.template.folder, mesh_folders)
 
     def record(self) -> dict[str, Any]:
-        """JSON-able."""
         named = {"scene": self.template.name, "variant": self.variant.name}
         return {**named, "decisions": [vars(decision) for decision in self.decisions]}
 

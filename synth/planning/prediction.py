@@ -71,7 +71,6 @@ class Prediction:
     bytes_per_pair: int
 
     def record(self) -> dict[str, Any]:
-        """JSON-able."""
         return {**vars(self), "error_px": None if self.error_px is None else list(self.error_px)}
 
 

@@ -46,9 +46,9 @@ class CameraRays:
         axes = (pose.right, pose.down, pose.forward, pose.position)
         self._right, self._down, self._forward, self._position = (self._vector(axis) for axis in axes)
         self._mirrors = [_Mirror(mirror, self._vector, mi, dr) for mirror in optics.mirrors]
-        self._refracts = optics.index != 1
-        self._index = dr.opaque(mi.Float, optics.index)
-        self._face = dr.opaque(mi.Float, optics.face_z)
+        self._refracts = optics.window.index != 1
+        self._index = dr.opaque(mi.Float, optics.window.index)
+        self._face = dr.opaque(mi.Float, optics.window.face_z)
         self._is_fisheye = camera.lens == "fisheye"
         self._distortion = [dr.opaque(mi.Float, k) for k in camera.distortion] if any(camera.distortion) else None
         thin = ThinLens.of(sensor)

@@ -73,7 +73,7 @@ def check_view(sensor: Sensor) -> None:
         points = (
             np.array(light.position_mm) + np.outer(u * light.size_mm[0], first) + np.outer(v * light.size_mm[1], second)
         )
-        pixels = optics.project(points[(points[:, 2] > 0) & (points[:, 2] < optics.face_z)])
+        pixels = optics.project(points[(points[:, 2] > 0) & (points[:, 2] < optics.window.face_z)])
         inside = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(1)
         if inside.any():
             x, y = pixels[inside][0]

@@ -44,7 +44,7 @@ class Renderer:
     """The renderer of one sensor draw.
 
     Args:
-        sensor: the finger.
+        sensor: gel, coating, lights and cameras.
         render: samples and path length; `samples_per_pixel` is rounded up to the next full grid (see `full_grid`).
         surface: the contact surface whose positions `radiance` gets.
         albedo: (rows, columns, 3 or 4) float32 over the contact face, from `pattern.albedo`; must not be changed
@@ -98,7 +98,6 @@ class Renderer:
 
     @property
     def samples_per_pixel(self) -> int:
-        """Samples that are really taken."""
         return self._samples
 
     def take(self, surface: GelSurface) -> None:
@@ -144,8 +143,8 @@ class Renderer:
         number = list(self._views).index(name)
         if self._variant.is_vectorised:
             return self._trace(mi, name, seed, number)
-        folded = _fold(seed, 0, number)
-        image = mi.render(self._scene, sensor=self._sensors[name], integrator=self._integrator, seed=folded)
+        own = _mitsuba_seed(seed, 0, number)
+        image = mi.render(self._scene, sensor=self._sensors[name], integrator=self._integrator, seed=own)
         return np.array(image, dtype=np.float32)
 
     def _deform(self, positions: Points, seed: int) -> None:
@@ -160,7 +159,7 @@ class Renderer:
         if self._light is not None:
             camera = self._views[""].camera
             primary = camera.width * camera.height * self._samples
-            self._light.prepare(self._mesh, primary, _fold(seed, _LIGHT_PART, 0))
+            self._light.prepare(self._mesh, primary, _mitsuba_seed(seed, _LIGHT_PART, 0))
 
     def _share_kernels(self) -> None:
         """Keep the lights' places out of the compiled code, so that another draw of the sensor needs no compiler."""
@@ -178,7 +177,7 @@ class Renderer:
         pixels = camera.width * camera.height
         step = max(1, _MAX_WAVEFRONT // samples)
         parts = [
-            self._trace_pixels(mi, self._rays[name], first, min(step, pixels - first), _fold(seed, k, number))
+            self._trace_pixels(mi, self._rays[name], first, min(step, pixels - first), _mitsuba_seed(seed, k, number))
             for k, first in enumerate(range(0, pixels, step))
         ]
         # Read when all passes are queued: a GPU works on one while the next is being recorded.
@@ -287,7 +286,7 @@ def _check_further(name: str, view: Sensor) -> None:
         raise InputError(f"sensor.further_cameras {name!r}: {error}") from error
 
 
-def _fold(seed: int, part: int, camera: int) -> int:
+def _mitsuba_seed(seed: int, part: int, camera: int) -> int:
     """The 32-bit seed that Mitsuba takes, from a seed of any size and the numbers of a pass and of a camera."""
     numbers = [seed, part, camera] if camera else [seed, part]
     return int(np.random.SeedSequence(numbers).generate_state(1)[0])

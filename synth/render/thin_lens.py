@@ -66,11 +66,11 @@ class ThinLens:
         eye = optics.poses[axis.path[0]].position
         below = -float(axis.directions[0, 2])  # cos of the angle in the body
         # At index 1 rays start at the eye: there is no face, and all the distance is in air.
-        before = float(np.linalg.norm(axis.origins[0] - eye)) if optics.index != 1 else np.inf
+        before = float(np.linalg.norm(axis.origins[0] - eye)) if optics.window.index != 1 else np.inf
         within = camera.focus_mm - before
         if within <= 0:
             return ThinLens(radius, camera.focus_mm)
-        n = optics.index
+        n = optics.window.index
         above = float(np.sqrt(1 - n**2 * (1 - below**2)))  # Snell
         sagittal = before + within / n
         tangential = before + within / n * (above / below) ** 2

@@ -78,7 +78,6 @@ class Camera(Part):
 
     @property
     def lowest_mm(self) -> float:
-        """The smallest z of its pupil."""
         along = [at - eye for at, eye in zip(self.look_at_mm, self.position_mm, strict=True)]
         length = math.hypot(*along)
         level = math.hypot(along[0], along[1]) / length if length > 0 else 1.0
@@ -119,7 +118,6 @@ class Mirror(Part):
 
     @property
     def lowest_mm(self) -> float:
-        """The smallest z of its corners."""
         first, second, _ = self.axes
         return self.position_mm[2] - (abs(first[2]) * self.size_mm[0] + abs(second[2]) * self.size_mm[1]) / 2
 

@@ -131,8 +131,6 @@ def check_pairs(scene: Scene) -> None:
 
 
 def _chooser(rng: np.random.Generator) -> Chooser:
-    """Draws from distributions one after the other."""
-
     def choose(kind: str, arguments: list[Any]) -> Any:
         match kind:
             case "uniform":

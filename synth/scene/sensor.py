@@ -29,7 +29,6 @@ class Coating(Part):
 
     @property
     def is_matt(self) -> bool:
-        """Whether it is Lambertian."""
         return self.roughness == 1 and self.metallic == 0
 
 

@@ -48,7 +48,6 @@ class Template:
 
     @property
     def name(self) -> str:
-        """The scene's name."""
         return str(self.content["name"])
 
     @property
@@ -88,7 +87,6 @@ class Template:
 
     @property
     def outputs(self) -> Outputs:
-        """The channels of flow.exr."""
         return self.corners[0].outputs
 
     @property
@@ -200,7 +198,6 @@ def _find(name_or_path: str | Path) -> Path:
 
 
 def _apply(content: dict[str, Any], override: str) -> None:
-    """Set one value of the parsed TOML."""
     key, equals, text = override.partition("=")
     steps = key.strip().split(".")
     if not equals or not all(steps):

@@ -19,8 +19,8 @@ from synth.stress.cases import Comparison, Expectation, Run
 
 GAUSS = np.full((4, 4), (5 - np.sqrt(5)) / 20) + np.eye(4) / np.sqrt(5)
 """Barycentric coordinates at which a quadratic element is integrated; a linear one's det F is the same everywhere."""
-UNFOLDED = {"corner_jacobian": (0.0, np.inf)}
-"""Bounds of every run: a quadratic element can be folded at its corners although det F > 0 where it is integrated."""
+NOT_INVERTED = {"corner_jacobian": (0.0, np.inf)}
+"""Bounds of every run: a quadratic element can be inverted at its corners although det F > 0 where it is integrated."""
 
 
 @dataclass(frozen=True)
@@ -67,12 +67,10 @@ class Verdict:
 
     @property
     def ok(self) -> bool:
-        """As written down, or explained."""
         return not self.broken
 
     @property
     def word(self) -> str:
-        """For tables."""
         return "OTHERWISE" if self.broken else "explained" if self.deviates else "as expected"
 
 
@@ -95,7 +93,6 @@ def evaluate(result: Result, others: Mapping[str, Result]) -> Verdict:
 
 
 def faults(result: Result) -> list[str]:
-    """What no run may do."""
     if result.outcome == "hung":
         return [f"hung: killed after its budget of {result.run.budget_s:g} s"]
     if result.outcome == "crashed":
@@ -209,7 +206,7 @@ def differences(
         found.append(f"does not say {expected.says!r}: {result.message}")
     if result.outcome not in ("complete", "partial"):
         return found
-    for name, (low, high) in {**UNFOLDED, **expected.bounds}.items():
+    for name, (low, high) in {**NOT_INVERTED, **expected.bounds}.items():
         if name not in quantities:
             found.append(f"{name} is not measured; measured are {', '.join(quantities)}")
         elif not low <= quantities[name] <= high:

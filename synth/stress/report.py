@@ -24,7 +24,6 @@ COLUMNS = ("case", "element", "group", "outcome", "expected", "verdict", "wall_s
 
 
 def row(verdict: Verdict) -> dict[str, Any]:
-    """One run as plain values."""
     result, case = verdict.result, verdict.result.run.case
     return {
         "case": case.name,
@@ -63,7 +62,6 @@ def record(verdicts: Sequence[Verdict], seconds: float) -> dict[str, Any]:
 
 
 def summary(verdicts: Sequence[Verdict], seconds: float) -> str:
-    """One line."""
     count = {word: sum(verdict.word == word for verdict in verdicts) for word in ("explained", "OTHERWISE")}
     text = f"{len(verdicts)} runs in {seconds / 60:.1f} min: {len(verdicts) - sum(count.values())} as expected"
     return f"{text}, {count['explained']} otherwise with an explanation, {count['OTHERWISE']} otherwise"

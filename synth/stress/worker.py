@@ -26,7 +26,6 @@ from synth.stress.inputs import altered_mesh, write_surface
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Run what FOLDER/run.json says."""
     folder, meshes = Path(arguments[0]), Path(arguments[1])
     asked = json.loads((folder / "run.json").read_text(encoding="utf-8"))
     run = Run(Case.model_validate(asked["case"]), asked["element"], asked["budget_s"], Path(asked["base"]))

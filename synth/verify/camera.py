@@ -74,7 +74,6 @@ class ForwardCamera:
 
     @property
     def paths(self) -> range:
-        """The numbers of all paths."""
         return range(len(self.plates) + 1)
 
     def see(self, points: Points, path: int = 0) -> Pixels:

@@ -22,10 +22,7 @@ from synth.verify.sheet import Sheet
 
 
 def verify_dataset(
-    path: Path | str,
-    *,
-    samples: Sequence[int] | None = None,
-    on_sample: Callable[[SampleReport], None] | None = None,
+    path: Path | str, *, samples: Sequence[int] | None = None, on_sample: Callable[[SampleReport], None] | None = None
 ) -> Report:
     """Verifies a dataset directory.
 
@@ -74,7 +71,6 @@ def verify_sample(index: int, scene: Scene, sample: SampleData, problems: Sequen
 
 
 def _view_checks(sensor: Sensor, backward: bool, sample: SampleData) -> list[Check]:
-    """Checks of what one camera recorded."""
     camera, flow = sensor.camera, sample.flow
     forward = ForwardCamera.of(sensor)
     states = [

@@ -46,7 +46,7 @@ def check_dome(camera: ForwardCamera, surface: GelSurface, radius_mm: float, ima
     on_gel = np.flatnonzero(seen.triangle >= 0)
     if not len(on_gel):
         return Check(NAME, None, LEAST_MM, "mm", "no pixel sees the gel")
-    found, path = seen.carried(surface.triangles, surface.material)[on_gel], seen.path[on_gel]
+    found, path = seen.positions(surface.triangles, surface.material)[on_gel], seen.path[on_gel]
     start = np.zeros_like(found)
     for number in camera.paths:
         at = path == number
@@ -60,7 +60,7 @@ def check_dome(camera: ForwardCamera, surface: GelSurface, radius_mm: float, ima
     cosine = ((arm + t[:, None] * direction) * direction).sum(axis=1) / radius_mm
     corners = surface.material[surface.triangles[seen.triangle[on_gel]]]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-    bound = _sinking(surface, longest, np.hypot(found[:, 0], found[:, 1]), radius_mm) / cosine + LEAST_MM
+    bound = _deviation_bound(surface, longest, np.hypot(found[:, 0], found[:, 1]), radius_mm) / cosine + LEAST_MM
     off = np.where(np.isnan(t), np.inf, np.abs(t - reach))
     worst = int(np.argmax(off / bound))
     column, row = (int(v) for v in places[on_gel[worst]])
@@ -69,7 +69,7 @@ def check_dome(camera: ForwardCamera, surface: GelSurface, radius_mm: float, ima
     return Check(NAME, float(off[worst]), float(bound[worst]), "mm", detail)
 
 
-def _sinking(surface: GelSurface, longest: FloatArray, away: FloatArray, radius_mm: float) -> FloatArray:
+def _deviation_bound(surface: GelSurface, longest: FloatArray, away: FloatArray, radius_mm: float) -> FloatArray:
     """How far (n,) mm triangles with longest edges (n,) mm, (n,) mm away from the axis, may be off the sphere."""
     face = surface.subdivisions * longest
     if not surface.coarse.is_quadratic:

@@ -36,8 +36,7 @@ class Layer:
         path: by which the surface is seen.
         triangles: (f, 3).
         positions: (v, 3) mm.
-        width: columns of the image.
-        height: its rows.
+        width, height: of the image, px.
     """
 
     camera: ForwardCamera

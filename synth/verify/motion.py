@@ -88,11 +88,11 @@ def check_motion(name: str, near: Sheet, far: Sheet, flow: FlowArray, visible: F
         counted[turning[_turns_beside(far, derived, places, recorded_visible, turning)]] = False
     closure = np.where(counted & ~derived.touched, derived.closure, np.nan)
     open_ = np.flatnonzero(closure > CLOSURE_TOLERANCE_PX)
-    unsettled = open_[:0]
+    ambiguous = open_[:0]
     if len(open_) <= _MANY * len(places):
-        unsettled = open_[_is_unsettled(near, far, (places + recorded)[open_], closure[open_])]
-        closure[unsettled] = np.nan
-    excused = np.count_nonzero(~counted) + len(unsettled)
+        ambiguous = open_[_is_ambiguous(near, far, (places + recorded)[open_], closure[open_])]
+        closure[ambiguous] = np.nan
+    excused = np.count_nonzero(~counted) + len(ambiguous)
     note = f"; {excused} of {len(places)} at a silhouette or border excused" if excused else ""
     return [
         _worst(f"{name} flow", np.where(counted, unlike, np.nan), FLOW_TOLERANCE_PX, near.width, note),
@@ -105,7 +105,7 @@ def check_motion(name: str, near: Sheet, far: Sheet, flow: FlowArray, visible: F
 def derive(near: Sheet, far: Sheet, places: Pixels, recorded: FloatArray) -> Derived:
     """Derives the motion at places (n, 2) and follows the recorded one (n, 2) there and back."""
     seen = near.seen(places)
-    points = seen.carried(near.triangles, far.positions)
+    points = seen.positions(near.triangles, far.positions)
     flow = np.full(places.shape, np.nan)
     on_gel = seen.triangle >= 0
     flow[on_gel] = near.pixels(points[on_gel], seen.path[on_gel]) - places[on_gel]
@@ -136,7 +136,7 @@ def _back(near: Sheet, far: Sheet, ends: Pixels) -> tuple[Seen, Pixels]:
     seen = far.seen(ends)
     found = seen.triangle >= 0
     pixels = np.full(ends.shape, np.nan)
-    pixels[found] = near.pixels(seen.carried(far.triangles, near.positions)[found], seen.path[found])
+    pixels[found] = near.pixels(seen.positions(far.triangles, near.positions)[found], seen.path[found])
     return seen, pixels
 
 
@@ -188,7 +188,7 @@ def _turns_beside(far: Sheet, derived: Derived, places: Pixels, visible: FlowArr
     return agreed
 
 
-def _is_unsettled(near: Sheet, far: Sheet, ends: Pixels, closure: FloatArray) -> BoolArray:
+def _is_ambiguous(near: Sheet, far: Sheet, ends: Pixels, closure: FloatArray) -> BoolArray:
     """Whether a thousandth of a pixel at the flow's end moves the place it comes from by more than the closure."""
     origin = _back(near, far, ends)[1]
     moved = np.zeros(len(ends))

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from synth.arrays import BoolArray, FloatArray, Points
 from synth.scene import Mirror
@@ -31,8 +32,8 @@ class Plate:
         # The direction of the first side is a quarter turn from the normal's foot; a mirror that lies keeps x.
         heading = math.atan2(normal[0], -normal[1]) if level > 1e-9 else 0.0
         tilt = math.atan2(level, normal[2])
-        turned = flat @ _about_z(math.radians(mirror.rotation_deg)).T @ _about_x(tilt).T @ _about_z(heading).T
-        return Plate(turned + np.array(mirror.position_mm), normal)
+        turn = Rotation.from_euler("ZXZ", [heading, tilt, math.radians(mirror.rotation_deg)])
+        return Plate(turn.apply(flat) + np.array(mirror.position_mm), normal)
 
     def reflected(self, points: FloatArray) -> FloatArray:
         """Points (..., 3) on the other side of the mirror's plane: Householder's matrix about its first corner."""
@@ -59,13 +60,3 @@ class Plate:
             with np.errstate(invalid="ignore"):
                 within &= np.cross(following - corner, place - corner) @ self.normal >= 0
         return np.asarray(within)
-
-
-def _about_z(angle: float) -> FloatArray:
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-
-
-def _about_x(angle: float) -> FloatArray:
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[1, 0, 0], [0, c, -s], [0, s, c]])

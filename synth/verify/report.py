@@ -65,9 +65,8 @@ class Report:
 
     def record(self) -> dict[str, Any]:
         """JSON-able: path, ok, and for each sample its checks; a figure that is not finite becomes None."""
-        keys = ("name", "figure", "tolerance", "unit", "passed", "detail")
         samples = [
-            {"index": one.index, "ok": one.ok, "checks": [{key: getattr(c, key) for key in keys} for c in one.checks]}
+            {"index": one.index, "ok": one.ok, "checks": [vars(c) | {"passed": c.passed} for c in one.checks]}
             for one in self.samples
         ]
         return {"path": str(self.path), "ok": self.ok, "samples": jsonable(samples)}

@@ -31,7 +31,7 @@ class Seen:
     z: FloatArray
     path: NDArray[np.intp]
 
-    def carried(self, triangles: Triangles, positions: Points) -> Points:
+    def positions(self, triangles: Triangles, positions: Points) -> Points:
         """Where the points are when the surface's vertices are at `positions`: (n, 3), NaN where nothing is seen."""
         return np.einsum("ni,nic->nc", self.weights, positions[triangles[self.triangle]])
 
@@ -44,8 +44,7 @@ class Sheet:
         camera: the camera.
         triangles: (f, 3).
         positions: (v, 3) mm.
-        width: columns of the image.
-        height: its rows.
+        width, height: of the image, px.
     """
 
     camera: ForwardCamera

@@ -229,8 +229,8 @@ def _npy(array: np.ndarray) -> bytes:
 @pytest.mark.parametrize(
     ("suffix", "content", "words"),
     [
-        ("image2.png", lambda data: data[:300] + bytes([data[300] ^ 1]) + data[301:], "damaged PNG"),
-        ("image2.png", lambda data: data[:-20], "truncated PNG"),
+        ("image2.png", lambda data: data[:300] + bytes([data[300] ^ 1]) + data[301:], "damaged image .*checksum"),
+        ("image2.png", lambda data: data[:-20], "truncated or damaged image"),
         ("image2.png", lambda data: b"GIF" + data[3:], "not a PNG"),
         ("image2.png", lambda data: b"", "not a PNG"),
         ("forward.npy", lambda data: data[:-4], "header says"),

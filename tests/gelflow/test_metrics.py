@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from textures import REAL, as_bytes, moved
 
-from gelflow.baselines.classical import DIS
+from gelflow.baselines.classical import dis
 from gelflow.compare.metrics import (
     endpoint_error,
     flow_errors,
@@ -127,7 +127,7 @@ def test_marker_distance_of_a_constant_flow() -> None:
 def test_real_pair_has_the_published_numbers() -> None:
     """PSNR, SSIM and distance to dots that another script measured: 32.30 dB, .961 and .14 px, to their last digit."""
     dataset = open_pairs(REAL / "validation")
-    score = score_pair(DIS("medium"), dataset, dataset.names.index("gsmini_rubic_val"))
+    score = score_pair(dis("medium"), dataset, dataset.names.index("gsmini_rubic_val"))
     assert score.psnr_db == pytest.approx(32.30, abs=0.01)
     assert score.ssim == pytest.approx(0.961, abs=0.001)
     assert score.marker_distance_px == pytest.approx(0.14, abs=0.01)

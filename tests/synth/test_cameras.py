@@ -15,7 +15,7 @@ from synth.dataset.exr import read_flow, write_flow
 from synth.dataset.reader import read_dataset
 from synth.errors import InputError
 from synth.flow.field import FlowField
-from synth.inspection import inspect, tables, write_html, write_sheet
+from synth.inspect import inspect, tables, write_html, write_sheet
 from synth.optics import Optics
 from synth.pipeline.generate import generate
 from synth.render.renderer import Renderer

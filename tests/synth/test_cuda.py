@@ -7,7 +7,6 @@ import pytest
 
 from synth.dataset.reader import read_dataset
 from synth.errors import InputError
-from synth.flow.trace import trace
 from synth.pipeline.generate import Scheduling, generate
 from synth.render.variant import Variant, choose_variant
 from synth.scene.template import load_scene
@@ -66,22 +65,3 @@ def test_batched_on_a_gpu_with_workers_verifies_and_agrees_with_the_cpu(cuda: Va
         forward = on_gpu.read(index).flow.forward
         np.testing.assert_allclose(forward, on_cpu.read(index).flow.forward, atol=1e-3)
         assert np.isfinite(forward).any()
-
-
-@pytest.mark.cuda
-def test_tracing_agrees(cuda: Variant) -> None:
-    rng = np.random.default_rng(0)
-    grid = np.stack(np.meshgrid(np.linspace(-5, 5, 40), np.linspace(-4, 4, 30), indexing="ij"), axis=-1).reshape(-1, 2)
-    vertices = np.column_stack([grid, 0.3 * np.sin(grid[:, 0]) * np.cos(grid[:, 1])])
-    quad = np.arange(39 * 30).reshape(39, 30)[:, :-1].ravel()
-    triangles = np.concatenate(
-        [np.stack([quad, quad + 30, quad + 1], 1), np.stack([quad + 1, quad + 30, quad + 31], 1)]
-    )
-    origins = np.tile([0.0, 0.0, 20.0], (5000, 1))
-    targets = np.column_stack([rng.uniform(-4, 4, 5000), rng.uniform(-3, 3, 5000), np.zeros(5000)])
-    directions = (targets - origins) / np.linalg.norm(targets - origins, axis=1, keepdims=True)
-    cpu, gpu = (trace(vertices, triangles.astype(np.int32), origins, directions, device) for device in ("cpu", "cuda"))
-    np.testing.assert_array_equal(gpu.triangle, cpu.triangle)
-    np.testing.assert_allclose(
-        gpu.distance, cpu.distance, rtol=1e-12
-    )  # float64 on both; the order of one sum may differ

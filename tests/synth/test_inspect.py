@@ -16,12 +16,12 @@ from synth.commands import run_inspect
 from synth.dataset.exr import write_flow
 from synth.dataset.writer import DatasetWriter
 from synth.errors import InputError
-from synth.inspection import inspect, tables, write_html, write_sheet
-from synth.inspection.inspection import evenly_spaced
-from synth.inspection.interpolation import sample_at
-from synth.inspection.panels import arrows_of
-from synth.inspection.view import View
-from synth.inspection.wheel import NO_GEL, flow_colours, robust_scale, wheel_legend
+from synth.inspect import inspect, tables, write_html, write_sheet
+from synth.inspect.inspection import evenly_spaced
+from synth.inspect.interpolation import sample_at
+from synth.inspect.panels import arrows_of
+from synth.inspect.view import View
+from synth.inspect.wheel import NO_GEL, flow_colours, robust_scale, wheel_legend
 
 
 @pytest.fixture(scope="module")

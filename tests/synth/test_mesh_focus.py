@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
+from benchmarks.focused_mesh import SLOPE, around_focus
 from synth.arrays import FloatArray
 from synth.mesh import Focus, PadMesh
 from synth.mesh.pad import boundary_faces, signed_volumes
-from synth.mesh.sizing import GRADING, SLOPE, around_focus, through_thickness
+from synth.mesh.sizing import GRADING, through_thickness
 from synth.mesh.tetrahedralise import WORST_SHAPE, shape_quality, tetrahedralise_box
 
 SIZE = (12.0, 9.0, 3.0)
@@ -16,7 +17,7 @@ EDGE, COARSE = 0.6, 2.0
 
 @pytest.fixture(scope="module")
 def pad() -> PadMesh:
-    return tetrahedralise_box(SIZE, EDGE, focus=FOCUS, coarse_mm=COARSE)
+    return tetrahedralise_box(SIZE, EDGE, around_focus(SIZE, EDGE, FOCUS, COARSE))
 
 
 def distance_from_zone(points: FloatArray) -> FloatArray:
@@ -91,12 +92,6 @@ def test_without_a_focus_edges_grow_toward_the_window() -> None:
     assert volumes.min() > 0
     # 1.01 times the box along each axis.
     assert volumes.sum() == pytest.approx(1.01**3 * np.prod(SIZE), rel=1e-12)
-
-
-@pytest.mark.parametrize("wrong", [{"coarse_mm": 2.0}, {"coarse_mm": 0.5, "focus": FOCUS}])
-def test_coarse_edges_that_make_no_sense(wrong: dict) -> None:
-    with pytest.raises(ValueError, match="needs a focus"):
-        tetrahedralise_box(SIZE, EDGE, **wrong)
 
 
 def test_focus_is_clipped_to_the_pad() -> None:

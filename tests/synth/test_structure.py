@@ -24,7 +24,7 @@ STAGES = (
     "synth.flow",
     "synth.dataset",
     "synth.verify",
-    "synth.inspection",
+    "synth.inspect",
     "synth.planning",
     "synth.pipeline",
     "synth.progress",

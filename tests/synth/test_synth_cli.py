@@ -289,9 +289,9 @@ def test_simulate_names_the_scene_file(capsys, tiny: Path, tmp_path: Path) -> No
 def test_simulate_says_how_far_it_is(capsys, tiny: Path, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr("synth.progress.LINE_S", 0.0)
     assert main(["simulate", "--scene", str(tiny), "--out", str(tmp_path / "s")]) == 0
-    lines = [line for line in capsys.readouterr().err.splitlines() if "percent of the way" in line]
+    lines = [line for line in capsys.readouterr().err.splitlines() if "percent of the load path" in line]
     assert lines
-    assert all(line.startswith("synth: simulate: percent of the way: ") for line in lines)
+    assert all(line.startswith("synth: simulate: percent of the load path: ") for line in lines)
 
 
 def test_simulate_into_a_file_is_refused_before_the_work(capsys, tiny: Path) -> None:

@@ -73,7 +73,6 @@ class GatedUnit(nn.Module):
                 self.add_module(f"conv{gate}{suffix}", layer)
 
     def forward(self, hidden: Features, inputs: Features) -> Tensor:
-        """The next hidden state."""
         for suffix in self.passes:
             update, reset, candidate = (self.get_submodule(f"conv{gate}{suffix}") for gate in "zrq")
             both = torch.cat([hidden, inputs], dim=1)

@@ -8,9 +8,9 @@ import numpy as np
 
 from synth.arrays import FloatArray, Pixels
 from synth.dataset.images import Raster
-from synth.inspection.text import percent, short
-from synth.inspection.view import View
-from synth.inspection.wheel import NO_GEL, Rgb, flow_colours, robust_scale
+from synth.inspect.text import percent, short
+from synth.inspect.view import View
+from synth.inspect.wheel import NO_GEL, Rgb, flow_colours, robust_scale
 
 CLOSURE_RANGE_PX = (1e-5, 1.0)
 """Of the logarithmic scale, the same everywhere, so that pictures can be compared."""

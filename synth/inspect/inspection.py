@@ -1,5 +1,6 @@
 """What `inspect` finds at a path."""
 
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +13,8 @@ from synth.dataset.jsontext import read_document
 from synth.dataset.reader import read_dataset
 from synth.dataset.sample import further_cameras
 from synth.errors import InputError
-from synth.inspection.numbers import numbers_of
-from synth.inspection.view import META_FILE, View, view_flow, view_sample
+from synth.inspect.numbers import numbers_of
+from synth.inspect.view import META_FILE, View, view_flow, view_sample
 
 Kind = Literal["dataset", "sample", "flow"]
 Progress = Callable[[int, int], None]
@@ -32,7 +33,7 @@ class Inspection:
         about: facts of the whole: scene, seed, device ...; empty for a sample or flow file.
         places: folder or file of each view that was looked at; of a sample with further cameras first its own folder,
             then theirs.
-        numbers: of each of them, see `synth.inspection.numbers.numbers_of`.
+        numbers: of each of them, see `synth.inspect.numbers.numbers_of`.
         cameras: how many of the places belong to one sample.
     """
 
@@ -50,11 +51,9 @@ class Inspection:
 
     @property
     def title(self) -> str:
-        """For headings."""
         return self.path.resolve().name
 
     def as_dict(self) -> dict[str, Any]:
-        """For --json."""
         return {"kind": self.kind, "path": str(self.path), **self.about, "samples": list(self.numbers)}
 
     def view(self, number: int) -> View:
@@ -127,10 +126,9 @@ def _about(place: Path) -> tuple[dict[str, Any], list[Path]]:
     """Facts of a dataset, and its samples' folders."""
     dataset = read_dataset(place)
     info, indices = dataset.info, dataset.samples
-    seconds: dict[str, float] = {}
+    seconds: Counter[str] = Counter()
     for index in indices:
-        for stage, value in dataset.entry(index).seconds.items():
-            seconds[stage] = seconds.get(stage, 0.0) + value
+        seconds.update(dataset.entry(index).seconds)
     about = {
         "scene": info.get("scene_name"),
         "scene_hash": info["scene_hash"],

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from synth.inspection.inspection import Inspection
+from synth.inspect.inspection import Inspection
 
 NONE = "–"
 
@@ -19,7 +19,6 @@ def short(value: object, unit: str = "") -> str:
 
 
 def percent(share: float | None) -> str:
-    """A share as percent."""
     return NONE if share is None else f"{100 * share:.4g} %"
 
 
@@ -99,7 +98,6 @@ def about_rows(inspection: Inspection) -> list[tuple[str, str]]:
 
 
 def _solver(numbers: dict[str, Any]) -> dict[str, Any]:
-    """The record of the second frame."""
     return numbers["solver"][-1] if numbers["solver"] else {}
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from synth.arrays import BoolArray, FloatArray
 from synth.flow.field import FlowArray
-from synth.inspection.view import View
+from synth.inspect.view import View
 
 
 def numbers_of(view: View) -> dict[str, Any]:

@@ -4,8 +4,8 @@ from rich.cells import cell_len
 from rich.table import Table
 from rich.text import Text
 
-from synth.inspection.inspection import Inspection
-from synth.inspection.text import COLUMNS, about_rows, facts
+from synth.inspect.inspection import Inspection
+from synth.inspect.text import COLUMNS, about_rows, facts
 
 Column = tuple[str, list[str]]
 """Heading, and a cell for each sample."""

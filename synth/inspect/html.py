@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from synth.dataset.images import encode_png
 from synth.dataset.storage import replace_file
-from synth.inspection.inspection import Inspection
-from synth.inspection.panels import CLOSURE_RANGE_PX, Arrows, Panel, image_picture, panels_of
-from synth.inspection.text import COLUMNS, about_rows, facts
-from synth.inspection.view import View
-from synth.inspection.wheel import flow_colours, robust_scale, wheel_legend
+from synth.inspect.inspection import Inspection
+from synth.inspect.panels import CLOSURE_RANGE_PX, Arrows, Panel, image_picture, panels_of
+from synth.inspect.text import COLUMNS, about_rows, facts
+from synth.inspect.view import View
+from synth.inspect.wheel import flow_colours, robust_scale, wheel_legend
 
 PAGE_MARK = "<title>synth: "
 """In each page's head."""
@@ -124,7 +124,6 @@ def _facts(rows: list[tuple[str, str]]) -> str:
 
 
 def _pictures(view: View, numbers: dict[str, Any]) -> str:
-    """Every picture that the view has."""
     return f'<div class="pictures">{"".join(_figure(panel) for panel in panels_of(view, numbers))}</div>'
 
 
@@ -150,7 +149,6 @@ def _arrows(arrows: Arrows, width: int, height: int) -> str:
 
 
 def _inline(picture: NDArray[np.uint8]) -> str:
-    """A data URL."""
     return f"data:image/png;base64,{base64.b64encode(encode_png(picture)).decode('ascii')}"
 
 

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from synth.dataset.storage import replace_file
-from synth.inspection.inspection import Inspection
-from synth.inspection.panels import Panel, panels_of
-from synth.inspection.text import facts
-from synth.inspection.wheel import wheel_legend
+from synth.inspect.inspection import Inspection
+from synth.inspect.panels import Panel, panels_of
+from synth.inspect.text import facts
+from synth.inspect.wheel import wheel_legend
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,7 +33,6 @@ def write_sheet(inspection: Inspection, png: Path | str) -> None:
     Raises:
         InputError: A sample's file has gone or is damaged, or the storage refuses.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     is_dataset = inspection.kind == "dataset"
@@ -58,7 +57,6 @@ def write_sheet(inspection: Inspection, png: Path | str) -> None:
         about = inspection.about
         title += f": {about['finished']} of {about['n']} samples, scene {about['scene']}, seed {about['seed']}"
     figure = Figure(figsize=(max(8.0, right + beside), max(1.0, _TOP + sum(tall) + _MARGIN)), dpi=100)
-    canvas = FigureCanvasAgg(figure)
     axes = figure.add_axes((0, 0, 1, 1), xlim=(0, figure.get_figwidth()), ylim=(figure.get_figheight(), 0))
     axes.set_axis_off()
     axes.set_autoscale_on(False)
@@ -74,7 +72,7 @@ def write_sheet(inspection: Inspection, png: Path | str) -> None:
         axes.text(right, top + caption, "\n".join(lines), va="top", fontsize=9.5, linespacing=1.3)
         top += tallness
     buffer = io.BytesIO()
-    canvas.print_png(buffer, metadata={"Software": SHEET_MARK})
+    figure.savefig(buffer, format="png", metadata={"Software": SHEET_MARK})
     replace_file(Path(png), buffer.getvalue())
 
 

@@ -67,5 +67,4 @@ def robust_scale(flow: FlowArray) -> float:
 
 
 def _with_gaps(colour: Rgb, known: BoolArray) -> Rgb:
-    """Grey where nothing is known."""
     return np.where(known[..., None], colour, np.array(NO_GEL, np.uint8))

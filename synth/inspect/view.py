@@ -23,7 +23,7 @@ from synth.dataset.images import Raster
 from synth.dataset.jsontext import read_document
 from synth.dataset.reader import read_pair
 from synth.flow.field import FlowField
-from synth.inspection.interpolation import sample_at
+from synth.inspect.interpolation import sample_at
 
 META_FILE = "meta.json"
 
@@ -49,7 +49,6 @@ class View:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Height, width in px."""
         height, width = self.flow.forward.shape[:2]
         return height, width
 
