@@ -24,8 +24,8 @@ from synth.errors import InputError
 from synth.scene import Bitmap, MeshIndenter, Numerics, Outputs, Sampling, Scene
 from synth.scene.validation import DISTRIBUTIONS, validated
 
-_PACKAGE = Path(str(files("synth")))
-SCENES = next(filter(Path.is_dir, (_PACKAGE / "scenes", _PACKAGE.parent / "scenes")))
+_INSTALLED = Path(str(files("synth"))).resolve() / "scenes"
+SCENES = _INSTALLED if _INSTALLED.is_dir() else _INSTALLED.parents[1] / "scenes"
 """The shipped scene files: in the package where it is installed, beside it in a checkout."""
 FIXED = ("name", "description", "references", "numerics", "outputs", "sampling")
 """Parts that all samples of a dataset share."""
