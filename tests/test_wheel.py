@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 
 
 def run(folder: Path, *words: object) -> str:
-    """Run a command in a folder, without the checkout on its path; what it printed. Only the programs themselves may speak."""
+    """Run a command in a folder, without the checkout on its path; what it printed. Only the programs may speak."""
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     done = subprocess.run(
         list(map(str, words)), cwd=folder, env=environment, capture_output=True, text=True, check=False
