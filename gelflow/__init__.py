@@ -8,4 +8,9 @@ The centre of the pixel in column c and row r is at (c + 0.5, r + 0.5).
 Importing this package imports nothing heavy; import the module that you need.
 """
 
-__version__ = "0.1.0"
+from importlib.metadata import PackageNotFoundError, version
+
+try:
+    __version__ = version("gelflow-synth")
+except PackageNotFoundError:  # a checkout that is not installed
+    __version__ = "unknown"

@@ -4,9 +4,13 @@
 """
 
 from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-__version__ = "0.1.0"
+try:
+    __version__ = version("gelflow-synth")
+except PackageNotFoundError:  # a checkout that is not installed
+    __version__ = "unknown"
 
 _PUBLIC = {
     "load_scene": "synth.scene.template",

@@ -2,8 +2,9 @@
 
 Dr.Jit accepts LLVM 15 and then aborts the whole process on processors with AVX-512 ("Cannot select: fminimum"), so a
 library's version is read before Mitsuba may touch it. `LLVMGetVersion` exists in LLVM's C interface since release 16,
-which is also the first that works: a library without that symbol is too old. Newest names are tried first, and an old
-library is opened only where nothing newer was found.
+which is also the first that works: a library without that symbol is too old. The library of the Python package comes
+before the system's, so that environments installed alike render alike; of the system's the newest names are tried
+first, and an old library is opened only where nothing newer was found.
 """
 
 import ctypes
@@ -14,6 +15,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, files
 from pathlib import Path
 from types import ModuleType
 from typing import Literal
@@ -25,9 +27,12 @@ Version = tuple[int, int, int]
 
 MINIMUM_LLVM = 16
 """Oldest major version that Dr.Jit uses without aborting."""
+PACKAGE = "karellen-llvm-core"
+"""PyPI's package of LLVM's library; a dependency where it has wheels."""
 LLVM_HINT = (
-    "rendering is several times faster with LLVM 16 or newer: 'apt install libllvm19' (Debian, Ubuntu), "
-    "'dnf install llvm-libs' (Fedora), 'conda install -c conda-forge llvm' or 'brew install llvm' (macOS)"
+    f"rendering is several times faster with LLVM 16 or newer: 'pip install {PACKAGE}' (Linux on x86-64), 'apt install "
+    "libllvm19' (Debian, Ubuntu), 'dnf install llvm-libs' (Fedora), 'conda install -c conda-forge llvm' or 'brew "
+    "install llvm' (macOS)"
 )
 _PATTERNS = (
     "/usr/lib/*-linux-gnu/libLLVM*.so*",
@@ -83,6 +88,7 @@ class Variant:
         Mitsuba's active variant is global to a process: whoever uses Mitsuba calls this first.
         """
         if self.llvm is not None:
+            _opened(self.llvm)
             os.environ["DRJIT_LIBLLVM_PATH"] = str(self.llvm)  # Dr.Jit has no other way to be told
         import mitsuba as mi
 
@@ -126,15 +132,14 @@ def cpu_variant(candidates: Iterable[Path], version_of: Callable[[Path], Version
         version = version_of(path)
         if version is not None and version[0] >= MINIMUM_LLVM:
             number = ".".join(map(str, version))
-            return Variant(f"llvm_ad_{kind}", f"LLVM {number} was found ({path.name})", llvm=path)
+            return Variant(f"llvm_ad_{kind}", f"LLVM {number} was found ({path})", llvm=path)
         rejected.append(path.name)
     found = f"only too old or unusable ones were found ({', '.join(rejected)})" if rejected else "none was found"
     return Variant("scalar_rgb", f"no LLVM library of version {MINIMUM_LLVM} or newer: {found}", hint=LLVM_HINT)
 
 
 def llvm_candidates() -> list[Path]:
-    """LLVM libraries on this machine, each once, newest name first; the one in DRJIT_LIBLLVM_PATH before all others."""
-    named = os.environ.get("DRJIT_LIBLLVM_PATH")
+    """LLVM libraries here, each once: the one in DRJIT_LIBLLVM_PATH, the package's, others by newest name."""
     found = [path for pattern in _PATTERNS for path in Path("/").glob(pattern.lstrip("/"))]
     found += [
         path for pattern in ("libLLVM*.so*", "libLLVM*.dylib") for path in (Path(sys.prefix) / "lib").glob(pattern)
@@ -142,16 +147,15 @@ def llvm_candidates() -> list[Path]:
     found += Path(sys.prefix).glob("Library/bin/LLVM-C.dll")
     if os.name == "nt":
         found += Path(os.environ.get("PROGRAMFILES", "C:/Program Files")).glob("LLVM/bin/LLVM-C.dll")
-    unique = {path.resolve(): path.resolve() for path in found}
-    ordered = sorted(unique.values(), key=_name_version, reverse=True)
-    return [Path(named), *ordered] if named else ordered
+    newest_first = sorted({path.resolve() for path in found}, key=_name_version, reverse=True)
+    named = os.environ.get("DRJIT_LIBLLVM_PATH")
+    return list(dict.fromkeys([*([Path(named)] if named else []), *_packaged(), *newest_first]))
 
 
 def llvm_version(path: Path) -> Version | None:
     """Version that the library itself reports; None when it does not load or is older than 16 (see the module)."""
     try:
-        library = ctypes.CDLL(str(path))
-        get_version = library.LLVMGetVersion
+        get_version = _opened(path).LLVMGetVersion
     except (OSError, AttributeError):
         return None
     numbers = [ctypes.c_uint() for _ in range(3)]
@@ -185,6 +189,28 @@ def cuda_trouble(name: str) -> str | None:
         last = (probe.stderr.strip().splitlines() or [f"exit status {probe.returncode}"])[-1]
         return f"Mitsuba's {name} does not work: {last}"
     return None
+
+
+def _packaged() -> list[Path]:
+    """The library of the Python package, where that is installed."""
+    try:
+        listed = files(PACKAGE) or []
+    except PackageNotFoundError:
+        return []
+    found = (Path(str(file.locate())).resolve() for file in listed if file.name.startswith("libLLVM"))
+    return [path for path in found if path.is_file()]
+
+
+def _opened(path: Path) -> ctypes.CDLL:
+    """An LLVM library, loaded.
+
+    The package's has its C++ runtime in a folder beside it, without the links by which the loader would find it: Python
+    makes them at its next start, where it may write there. Libraries that are loaded already need not be found.
+    """
+    for name in ("libunwind", "libc++abi", "libc++"):
+        for runtime in path.parent.glob(f"*-linux-gnu/{name}.so.1.0"):
+            ctypes.CDLL(str(runtime))
+    return ctypes.CDLL(str(path))
 
 
 def _name_version(path: Path) -> tuple[int, ...]:

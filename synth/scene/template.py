@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from glob import glob
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,9 @@ from synth.errors import InputError
 from synth.scene import Bitmap, MeshIndenter, Numerics, Outputs, Sampling, Scene
 from synth.scene.validation import DISTRIBUTIONS, validated
 
-SCENES = Path(__file__).resolve().parents[2] / "scenes"
-"""The shipped scene files."""
+_INSTALLED = Path(str(files("synth"))).resolve() / "scenes"
+SCENES = _INSTALLED if _INSTALLED.is_dir() else _INSTALLED.parents[1] / "scenes"
+"""The shipped scene files: in the package where it is installed, beside it in a checkout."""
 FIXED = ("name", "description", "references", "numerics", "outputs", "sampling")
 """Parts that all samples of a dataset share."""
 

@@ -130,7 +130,7 @@ def load_expectations(path: Path) -> Expectations:
         content: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
         return Expectations.model_validate(content)
     except FileNotFoundError as error:
-        raise InputError(f"there is no file {path}; `synth stress` needs the checkout's scenes/extreme") from error
+        raise InputError(f"there is no file {path}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not valid TOML: {error}") from error
     except ValidationError as error:

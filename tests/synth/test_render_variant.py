@@ -1,6 +1,7 @@
 """The choice of a Mitsuba variant: faked libraries, and a real process that has none but an old one."""
 
 import ctypes.util
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -8,8 +9,10 @@ from pathlib import Path
 import pytest
 
 from synth.errors import InputError
+from synth.render import variant
 from synth.render.variant import (
     LLVM_HINT,
+    PACKAGE,
     Variant,
     choose_variant,
     cpu_variant,
@@ -33,9 +36,9 @@ VERSIONS = {OLD: (15, 0, 6), NEW: (19, 1, 7), Path("/lib/libLLVM.so.16"): (16, 0
     ],
 )
 def test_only_llvm_16_or_newer_is_taken(found: list[Path], name: str, llvm: Path | None) -> None:
-    variant = cpu_variant(found, VERSIONS.get, "rgb")
-    assert (variant.name, variant.llvm) == (name, llvm)
-    assert variant.hint == (LLVM_HINT if llvm is None else None)
+    chosen = cpu_variant(found, VERSIONS.get, "rgb")
+    assert (chosen.name, chosen.llvm) == (name, llvm)
+    assert chosen.hint == (LLVM_HINT if llvm is None else None)
 
 
 def test_grey_scenes_render_one_channel_where_mitsuba_can() -> None:
@@ -58,6 +61,56 @@ def test_versions_found_here_are_plausible() -> None:
         assert version is None or 16 <= version[0] < 100
 
 
+def test_the_users_library_comes_before_the_packages_and_that_before_the_systems(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    installed = tmp_path / "site" / f"{PACKAGE.replace('-', '_')}-19.1.7.dist-info"
+    installed.mkdir(parents=True)
+    (installed / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {PACKAGE}\nVersion: 19.1.7\n")
+    (installed / "RECORD").write_text("../lib/libLLVM.so.19.1,,\n../lib/libLTO.so.19.1,,\n../lib/libLLVM-gone.so,,\n")
+    paths = [tmp_path / folder / f"libLLVM.so.{number}" for folder, number in (("lib", "19.1"), ("system", "24.1"))]
+    for path in (*paths, paths[0].with_name("libLTO.so.19.1")):
+        path.parent.mkdir(exist_ok=True)
+        path.touch()
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    monkeypatch.setattr(variant, "_PATTERNS", (f"{tmp_path}/system/libLLVM*.so*",))
+    monkeypatch.setattr("sys.prefix", str(tmp_path / "empty"))
+    monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
+    assert llvm_candidates() == paths
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(OLD))
+    assert llvm_candidates() == [OLD, *paths]
+
+
+RENDER = """
+import sys
+from pathlib import Path
+from synth.render.variant import Variant, llvm_version
+
+library = Path(sys.argv[1])
+if sys.argv[2] == "choose":
+    assert llvm_version(library)[0] >= 16
+mi = Variant("llvm_ad_rgb", "", llvm=library).load()
+scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle"}})
+assert scene.ray_test(mi.Ray3f([0, 0, 1], [0, 0, -1]))[0]
+print("rendered")
+"""
+
+
+@pytest.mark.parametrize("process", ["choose", "worker"])
+def test_the_packages_library_renders_before_its_links_are_made(tmp_path: Path, process: str) -> None:
+    packaged = variant._packaged()
+    if not packaged:
+        pytest.skip(f"{PACKAGE} is not installed")
+    folder = tmp_path / "lib"
+    for path in (packaged[0], *packaged[0].parent.glob("*-linux-gnu/*.so.1.0")):
+        copy = folder / path.relative_to(packaged[0].parent)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, copy)
+    done = _python(RENDER, tmp_path, str(folder / packaged[0].name), process)
+    assert done.returncode == 0, done.stderr
+    assert "rendered" in done.stdout
+
+
 def test_cuda_is_refused_with_a_reason_where_there_is_none() -> None:
     trouble = cuda_trouble("cuda_ad_rgb")
     if trouble is None:
@@ -74,7 +127,7 @@ def test_vectorised_variants_are_known_by_name() -> None:
 OLD_ONLY = """
 import sys
 import synth.render.variant as variant
-variant._PATTERNS = (sys.argv[1],)
+variant._PATTERNS, variant.PACKAGE = (sys.argv[1],), "not-installed"
 variant.sys.prefix = "/nonexistent"
 chosen = variant.choose_variant("cpu")
 assert chosen.name == "scalar_rgb", chosen
@@ -84,6 +137,18 @@ scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle"}})
 assert scene.ray_test(mi.Ray3f([0, 0, 1], [0, 0, -1]))
 print("rendered")
 """
+
+
+def _python(code: str, home: Path, *arguments: str) -> "subprocess.CompletedProcess[str]":
+    """Run code in a process that knows this checkout and nothing of the environment."""
+    return subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        cwd=home,
+        env={"PATH": "/usr/bin", "PYTHONPATH": str(Path(__file__).parents[2]), "HOME": str(home)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
 
 
 def _old_libraries() -> list[Path]:
@@ -103,14 +168,6 @@ def test_process_with_nothing_but_an_old_library_renders(tmp_path: Path, real: b
         if target is None:
             pytest.skip("no C library found to stand in for an old LLVM")
     (tmp_path / "libLLVM-15.so.1").symlink_to(target)
-    root = Path(__file__).parents[2]
-    done = subprocess.run(
-        [sys.executable, "-c", OLD_ONLY, str(tmp_path / "libLLVM*.so*")],
-        cwd=root,
-        env={"PATH": "/usr/bin", "PYTHONPATH": str(root), "HOME": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = _python(OLD_ONLY, tmp_path, str(tmp_path / "libLLVM*.so*"))
     assert done.returncode == 0, done.stderr
     assert "rendered" in done.stdout
