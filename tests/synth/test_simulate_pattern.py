@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from layered_pad import layered
 from pads import ELEMENT, MIXED, crooked
 
 import synth.simulate.pattern as pattern_module
@@ -36,14 +37,12 @@ def test_same_topology_shares_the_pattern_and_its_factor(element: str) -> None:
 def test_what_differs_in_topology_does_not_share() -> None:
     # Fails with pressure_nodes, held or mixed left out of the key.
     space = function_space(MESH, ELEMENT["p1p1"]())
-    layer = (MESH.points[MESH.tets].mean(axis=1)[:, 2] > 1).astype(np.int32)
-    layered = function_space(PadMesh(MESH.points, MESH.tets, MESH.size_mm, layer), ELEMENT["p1p1"]())
     held = space.held.copy()
     held[0] = ~held[0]
     shuffled = MESH.tets[np.random.default_rng(0).permutation(len(MESH.tets))]
     others = [
         (space, False),
-        (layered, True),
+        (function_space(layered(MESH), ELEMENT["p1p1"]()), True),
         (replace(space, held=held), True),
         (function_space(PadMesh(MESH.points, shuffled, MESH.size_mm), ELEMENT["p1p1"]()), True),
         (function_space(MESH, ELEMENT["p2p1"]()), True),

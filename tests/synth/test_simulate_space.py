@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from layered_pad import layered
 from pads import ELEMENT, MIXED, brick, crooked
 
 from synth.arrays import FloatArray, Points
@@ -74,17 +75,15 @@ def test_coated_surface_is_the_face_at_z_0(element: str) -> None:
 def test_pressure_is_doubled_at_interfaces(element: str) -> None:
     # Fails with the layer left out of the pressure's numbering.
     mesh = brick((4.0, 4.0, 3.0), (2, 2, 3))
-    layer = np.minimum(mesh.points[mesh.tets].mean(axis=1)[:, 2].astype(np.int32), 1)  # the interface is at z = 1
-    plain, layered = space_of(element, mesh), space_of(element, PadMesh(mesh.points, mesh.tets, mesh.size_mm, layer))
+    plain, double = space_of(element, mesh), space_of(element, layered(mesh, interface=1.0))
     assert plain.pressures == len(mesh.points)
-    assert layered.pressures == len(mesh.points) + (mesh.points[:, 2] == 1).sum()
-    assert (layered.points == plain.points).all()
-    assert (layered.nodes == plain.nodes).all()
+    assert double.pressures == len(mesh.points) + (mesh.points[:, 2] == 1).sum()
+    assert (double.points == plain.points).all()
+    assert (double.nodes == plain.nodes).all()
     # No pressure unknown belongs to two layers or to two vertices.
-    owner = np.stack([np.repeat(layer, 4), mesh.tets.ravel()], axis=1)
-    pairs = np.unique(np.column_stack([layered.pressure_nodes.ravel(), owner]), axis=0)
-    assert len(pairs) == layered.pressures
-    assert (pairs[:, 0] == np.arange(layered.pressures)).all()
+    owner = np.stack([np.repeat(layered(mesh).layer, 4), mesh.tets.ravel()], axis=1)
+    pairs = np.unique(np.column_stack([double.pressure_nodes.ravel(), owner]), axis=0)
+    assert (pairs[:, 0] == np.arange(double.pressures)).all()
 
 
 def barycentric(count: int, corners: int) -> FloatArray:
