@@ -37,21 +37,16 @@ def test_uniform_log_uniform_and_normal_have_their_distribution(tiny: Path) -> N
 
 
 def test_choice_takes_numbers_words_and_tables_equally_often(tiny: Path) -> None:
-    sphere, torus = (
-        '{ shape = "sphere", radius_mm = { uniform = [1, 2] } }',
-        '{ shape = "torus", radius_mm = 1, tube_mm = 0.3 }',
-    )
-    template = load_scene(
-        tiny, [f"contact.indenter={{ choice = [{sphere}, {torus}] }}", "motion.steps={ choice = [2, 3, 5] }"]
-    )
-    scenes = _draws(template)
+    sphere = '{ shape = "sphere", radius_mm = { uniform = [1, 2] } }'
+    torus = '{ shape = "torus", radius_mm = 1, tube_mm = 0.3 }'
+    choices = [f"contact.indenter={{ choice = [{sphere}, {torus}] }}", "motion.steps={ choice = [2, 3, 5] }"]
+    scenes = _draws(load_scene(tiny, choices))
     for values in ([s.contact.indenter.shape for s in scenes], [s.motion.steps for s in scenes]):
         _, counts = np.unique(values, return_counts=True)
         assert stats.chisquare(counts).pvalue > SURE
     assert {s.motion.steps for s in scenes} == {2, 3, 5}
     radii = {s.contact.indenter.radius_mm for s in scenes if s.contact.indenter.shape == "sphere"}
-    assert min(radii) >= 1
-    assert max(radii) <= 2
+    assert 1 <= min(radii) <= max(radii) <= 2
     assert len(radii) > COUNT / 3  # drawn anew each time, not once
 
 
