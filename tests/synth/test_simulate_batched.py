@@ -107,8 +107,7 @@ def test_a_lost_sample_does_not_spoil_the_others() -> None:
     lost = scene(indenter=WIRE, friction=0.2, motion={"depth_mm": 3.3, "steps": 8}, numerics=numerics)
     good = scene(friction=0.4, motion={"depth_mm": 0.4}, numerics=numerics)
     first, second = simulate_scenes([lost, good], MESH)
-    for found in (first, alone(lost, MESH)):  # how far each gets on a hopeless way is chance
-        assert (found.status, "did not converge" in found.reason) == ("partial", True)
+    assert (first.status, "did not converge" in first.reason) == ("partial", True)
     assert same(second, simulate_scenes([good], MESH)[0])
 
 
@@ -130,15 +129,12 @@ def test_mesh_indenters_of_unequal_grids(tmp_path: Path) -> None:
 
     pv.Icosphere(radius=2.5, nsub=3).save(tmp_path / "large.stl")
     pv.Cube(x_length=2.0, y_length=1.5, z_length=1.0).triangulate().save(tmp_path / "small.stl")
+    motion, numerics = {"depth_mm": 0.3, "shear_mm": [0.1, 0.1], "steps": 2}, {"tolerance": TOLERANCE}
     bodies = [
-        {"shape": "mesh", "file": "small.stl", "cell_mm": 0.25},
-        {"shape": "mesh", "file": "large.stl", "cell_mm": 0.3},
+        {"shape": "mesh", "file": f"{name}.stl", "cell_mm": cell}
+        for name, cell in (("small", 0.25), ("large", 0.3), ("small", 0.25))
     ]
-    motion = {"depth_mm": 0.3, "shear_mm": [0.1, 0.1], "steps": 2}
-    scenes = [
-        scene(indenter=body, friction=0.4, motion=motion, numerics={"tolerance": TOLERANCE})
-        for body in (bodies[0], bodies[1], bodies[0])
-    ]
+    scenes = [scene(indenter=body, friction=0.4, motion=motion, numerics=numerics) for body in bodies]
     found = simulate_scenes(scenes, MESH, tmp_path, batch=1)
     for posed, result in zip(scenes[:2], found, strict=False):
         assert apart(alone(posed, MESH, tmp_path), result) < AGREEMENT

@@ -1,5 +1,7 @@
 """The barrier against folded P2 elements: gradient and Hessian, nothing where nothing folds, no fold under an edge."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 from integrals import Integrals
@@ -16,8 +18,8 @@ from synth.simulate.space import function_space
 from synth.simulate.system import System, Unknowns
 
 MESH = crooked()
-_STEPS = [(i, j, k) for i in range(4) for j in range(4 - i) for k in range(4 - i - j)]
-CORNERS = np.array([(i, j, k, SAMPLE_DEGREE - i - j - k) for i, j, k in _STEPS]) / SAMPLE_DEGREE
+_STEPS = [steps for steps in product(range(SAMPLE_DEGREE + 1), repeat=4) if sum(steps) == SAMPLE_DEGREE]
+CORNERS = np.array(_STEPS) / SAMPLE_DEGREE
 """(20, 4) barycentric coordinates of the points at which folds are looked for."""
 
 

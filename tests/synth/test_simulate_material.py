@@ -144,7 +144,6 @@ def test_stiff_film_spreads_the_press(element: str) -> None:
 
 @each
 def test_exactly_incompressible_is_the_limit(element: str) -> None:
-    """A Poisson ratio of 0.5 completes, and is what smaller ones tend to."""
     # Fails with lame_constants(0.5) giving 1e3.
     mesh = brick(SIZE, (4, 4, 3))
     forces = [press(element, mesh, poisson_ratio=nu).force_n[2] for nu in (0.49, 0.4999, 0.499999, 0.5)]

@@ -32,7 +32,6 @@ each = pytest.mark.parametrize("polish", list(POLISHES))
 
 
 def pressed(friction: float = 0.5, steps: int = 2) -> Scene:
-    """A ball that is pressed and dragged."""
     motion = {"depth_mm": 0.6, "shear_mm": [0.15, -0.05], "steps": steps}
     return scene(friction=friction, motion=motion, numerics={"tolerance": TOLERANCE})
 

@@ -7,6 +7,7 @@ import pytest
 from tiny_scene import CONTACT, TEXT
 
 from synth.errors import InputError
+from synth.scene.sampling import draw
 from synth.scene.template import SCENES, checked_template, load_scene, replaced, shipped_scenes
 
 
@@ -82,13 +83,16 @@ def test_replaced_asks_for_each_distribution_and_leaves_the_rest() -> None:
     assert asked == ["choice", "normal", "uniform"]  # by the keys' names, not by their order
 
 
-def test_hash_is_of_the_content_not_of_its_layout(tmp_path: Path, tiny: Path) -> None:
+def test_hash_and_draws_are_of_the_content_not_of_its_layout(tmp_path: Path, tiny: Path) -> None:
     template = load_scene(tiny)
     assert len(template.hash) == 16
     name, words = 'name = "tiny"\n', 'description = "words"\nreferences = ["a book"]\n'
     sensor = TEXT.removesuffix(CONTACT).replace(name, "")
     (tmp_path / "other.toml").write_text(words + name + CONTACT + sensor)
-    assert load_scene(tmp_path / "other.toml").hash == template.hash
+    other = load_scene(tmp_path / "other.toml")
+    assert other.hash == template.hash
+    one, same = draw(template, 3, 5), draw(other, 3, 5)
+    assert (one.sensor, one.contact, one.motion) == (same.sensor, same.contact, same.motion)
     assert load_scene(tiny, ["motion.steps=3"]).hash != template.hash
     assert load_scene(tiny, ["name=other"]).hash != template.hash
     assert pickle.loads(pickle.dumps(template)).hash == template.hash

@@ -18,15 +18,8 @@ from synth.simulate.space import Space
 
 E_MPA = 0.2
 DRAG = {"depth_mm": 0.8, "shear_mm": [0.5, -0.3], "twist_deg": 10.0, "position_mm": [0.4, 0.2], "steps": 3}
-BESIDE = {
-    "depth_mm": -0.1,
-    "position_mm": [4.0, 0.2],
-    "shear_mm": [3.1, 0.1],
-    "then": [
-        {"depth_mm": depth, "shear_mm": shear} for depth, shear in ((3, (3.1, 0.1)), (3, (2.5, 0.1)), (2.8, (2.5, 0.4)))
-    ],
-    "steps": 5,
-}
+LEGS = [{"depth_mm": z, "shear_mm": shear} for z, shear in ((3, (3.1, 0.1)), (3, (2.5, 0.1)), (2.8, (2.5, 0.4)))]
+BESIDE = {"depth_mm": -0.1, "position_mm": [4.0, 0.2], "shear_mm": [3.1, 0.1], "then": LEGS, "steps": 5}
 """Down beside the pad, into its side face, and along it."""
 
 
