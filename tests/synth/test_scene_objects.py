@@ -84,9 +84,8 @@ def test_all_orientations_are_alike_likely(tiny: Path) -> None:
     Such a coordinate is uniform on [-1, 1] (Archimedes). Angles about y drawn uniformly would give arcsine
     distributions, 0.11 away, and fail.
     """
-    rotations = np.array(
-        [turned_by(indenter.rotation_deg) for indenter in drawn_indenters(load_scene(tiny, [ANY]), 1000)]
-    )
+    indenters = drawn_indenters(load_scene(tiny, [ANY]), 1000)
+    rotations = np.array([turned_by(indenter.rotation_deg) for indenter in indenters])
     for entries in rotations.reshape(-1, 9).T:
         assert stats.kstest(entries, stats.uniform(-1, 2).cdf).pvalue > 1e-4
 
@@ -109,15 +108,12 @@ def test_scene_draws_every_object_upright_and_in_any_orientation() -> None:
 
 
 def test_plan_and_samples_tell_how_edges_are_rounded(tiny: Path, tmp_path: Path) -> None:
-    body = f'{{ shape = "mesh", file = "{SCENES / "objects" / "washer.stl"}", size_mm = 4.0, fillet_mm = 0.9 }}'
-    template = load_scene(tiny, [f"contact.indenter={body}", "numerics={ target_error_px = 3.0 }"])
-    predicted = predict(plan(template, job_variant(template, "cpu")))
-    assert "edges of objects rounded to 0.9 to 0.9 mm" in predicted.resolution
+    washer = f'{{ shape = "mesh", file = "{SCENES / "objects" / "washer.stl"}", size_mm = 4.0, fillet_mm = 0.9 }}'
+    bodies = washer, '{ shape = "sphere", radius_mm = 2.0 }'
+    scenes = [load_scene(tiny, [f"contact.indenter={b}", "numerics={ target_error_px = 3.0 }"]) for b in bodies]
+    mesh, ball = (predict(plan(template, job_variant(template, "cpu"))) for template in scenes)
+    assert "edges of objects rounded to 0.9 to 0.9 mm" in mesh.resolution
     # A mesh takes several times a ball's iterations.
-    ball = load_scene(
-        tiny, ['contact.indenter={ shape = "sphere", radius_mm = 2.0 }', "numerics={ target_error_px = 3.0 }"]
-    )
-    alike = predict(plan(ball, job_variant(ball, "cpu")))
-    assert predicted.seconds_per_pair["simulate"] > 3 * alike.seconds_per_pair["simulate"]
-    generate(template, 1, tmp_path / "data")
+    assert mesh.seconds_per_pair["simulate"] > 3 * ball.seconds_per_pair["simulate"]
+    generate(scenes[0], 1, tmp_path / "data")
     assert read_dataset(tmp_path / "data").entry(0).diagnostics["edge_radius_mm"] == 0.9

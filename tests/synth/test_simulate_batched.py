@@ -24,7 +24,6 @@ from synth.simulate.batched.product import STORED_YEOH, bulk_product, contact_pr
 from synth.simulate.batched.run import OPTIONS
 from synth.simulate.batched.unknown_rows import number_rows
 from synth.simulate.contact import contact_stiffness
-from synth.simulate.element import Element
 from synth.simulate.load_path import path_of
 from synth.simulate.material import pad_material, uniform
 from synth.simulate.space import function_space
@@ -108,8 +107,7 @@ def test_a_lost_sample_does_not_spoil_the_others() -> None:
     lost = scene(indenter=WIRE, friction=0.2, motion={"depth_mm": 3.3, "steps": 8}, numerics=numerics)
     good = scene(friction=0.4, motion={"depth_mm": 0.4}, numerics=numerics)
     first, second = simulate_scenes([lost, good], MESH)
-    for found in (first, alone(lost, MESH)):  # how far each gets on a hopeless way is chance
-        assert (found.status, "did not converge" in found.reason) == ("partial", True)
+    assert (first.status, "did not converge" in first.reason) == ("partial", True)
     assert same(second, simulate_scenes([good], MESH)[0])
 
 
@@ -120,7 +118,7 @@ def test_an_indenter_that_finds_no_point_is_told_apart() -> None:
     posed = scene(size, indenter=needle, motion={"depth_mm": 0.5, "steps": 2, "position_mm": (0.3, 0.2)})
     mesh = brick(size, (6, 5, 2))
     one, other = alone(posed, mesh), simulate_scenes([posed], mesh)[0]
-    assert "touches no contact point" in other.reason
+    assert (other.status, "touches no contact point" in other.reason) == ("partial", True)
     assert apart(one, other) < AGREEMENT
 
 
@@ -131,15 +129,12 @@ def test_mesh_indenters_of_unequal_grids(tmp_path: Path) -> None:
 
     pv.Icosphere(radius=2.5, nsub=3).save(tmp_path / "large.stl")
     pv.Cube(x_length=2.0, y_length=1.5, z_length=1.0).triangulate().save(tmp_path / "small.stl")
+    motion, numerics = {"depth_mm": 0.3, "shear_mm": [0.1, 0.1], "steps": 2}, {"tolerance": TOLERANCE}
     bodies = [
-        {"shape": "mesh", "file": "small.stl", "cell_mm": 0.25},
-        {"shape": "mesh", "file": "large.stl", "cell_mm": 0.3},
+        {"shape": "mesh", "file": f"{name}.stl", "cell_mm": cell}
+        for name, cell in (("small", 0.25), ("large", 0.3), ("small", 0.25))
     ]
-    motion = {"depth_mm": 0.3, "shear_mm": [0.1, 0.1], "steps": 2}
-    scenes = [
-        scene(indenter=body, friction=0.4, motion=motion, numerics={"tolerance": TOLERANCE})
-        for body in (bodies[0], bodies[1], bodies[0])
-    ]
+    scenes = [scene(indenter=body, friction=0.4, motion=motion, numerics=numerics) for body in bodies]
     found = simulate_scenes(scenes, MESH, tmp_path, batch=1)
     for posed, result in zip(scenes[:2], found, strict=False):
         assert apart(alone(posed, MESH, tmp_path), result) < AGREEMENT
@@ -158,7 +153,8 @@ def test_the_product_is_the_tangent_times_the_vector(
     rng = np.random.default_rng(1)
     mesh = brick((4.0, 3.0, 2.0), (3, 2, 2))
     space = function_space(mesh, ELEMENT[element]())
-    body = System(space, uniform(len(mesh.tets), poisson_ratio, stiffening))
+    material = uniform(len(mesh.tets), poisson_ratio, stiffening)
+    body = System(space, material)
     bodies = indenters(scene(friction=0.3, motion={"depth_mm": 0.5, "shear_mm": [0.1, 0.0]}), 0.45)
     zero = body.zero()
     body.residual(zero, bodies)
@@ -167,48 +163,46 @@ def test_the_product_is_the_tangent_times_the_vector(
     state = Unknowns(u, rng.uniform(-4.0, 0.0, zero.p.shape))
     tangent = dense(body, body.tangent(state, bodies, 0.7))
 
-    rows = padded(len(body.free))
-    tables, faces = bulk_tables(space, uniform(len(mesh.tets), poisson_ratio, stiffening), body.mixed, "cpu"), None
-    faces = face_tables(space, "cpu")
+    def given(array: np.ndarray, dtype: Any) -> wp.array:
+        return warp_array(array, dtype, "cpu")
+
+    def zeros(shape: tuple[int, ...], dtype: Any) -> wp.array:
+        return wp.zeros(shape, dtype=dtype, device="cpu")
+
+    def launch(kernel: Any, size: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> None:
+        wp.launch(kernel, size, inputs=inputs, outputs=outputs, device="cpu")
+
+    rows, elements, points = padded(len(body.free)), (len(mesh.tets), 1), body.gap.shape
+    tables, faces = bulk_tables(space, material, body.mixed, "cpu"), face_tables(space, "cpu")
     numbering = number_rows(space, body.free, rows, tables, "cpu")
-    mask, points = wp.ones(1, dtype=wp.int32, device="cpu"), body.gap.shape
-    stored = wp.zeros((*_per_point(space.element, len(mesh.tets)), STORED_YEOH, 1), dtype=wp.float32, device="cpu")
     x = np.zeros((rows, 1), dtype=np.float32)
     x[: len(body.free), 0] = rng.standard_normal(len(body.free))
-    vector, image = warp_array(x, wp.float32, "cpu"), wp.zeros((rows, 1), dtype=wp.float32, device="cpu")
-    displacement, pressure = warp_array(state.u[None], wp.vec3d, "cpu"), warp_array(state.p[None], wp.float64, "cpu")
-    inputs = [mask, displacement, pressure, tables, warp_array(np.array([0.7]), wp.float64, "cpu")]
-    wp.launch(store_bulk, (len(mesh.tets), 1), inputs=inputs, outputs=[stored], device="cpu")
+    vector, image = given(x, wp.float32), zeros((rows, 1), wp.float32)
+    mask, displacement = wp.ones(1, dtype=wp.int32, device="cpu"), given(state.u[None], wp.vec3d)
+    stored = zeros((len(mesh.tets), len(space.element.weights), STORED_YEOH, 1), wp.float32)
+    inputs = [mask, displacement, given(state.p[None], wp.float64), tables, given(np.array([0.7]), wp.float64)]
+    launch(store_bulk, elements, inputs, [stored])
     kernel = bulk_product(space.nodes.shape[1], body.mixed, space.element.stabilisation > 0, any(stiffening))
-    inputs = [mask, numbering.single, stored, vector]
-    wp.launch(kernel, (len(mesh.tets), 1), inputs=inputs, outputs=[image], device="cpu")
-    barrier = barrier_tables(space, uniform(len(mesh.tets), poisson_ratio), "cpu")
+    launch(kernel, elements, [mask, numbering.single, stored, vector], [image])
+    barrier = barrier_tables(space, material, "cpu")
     if barrier is not None:
-        inverting = wp.zeros((len(mesh.tets), 1), dtype=wp.int32, device="cpu")
-        inputs = [mask, displacement, barrier]
-        wp.launch(find_inverting, (len(mesh.tets), 1), inputs=inputs, outputs=[inverting], device="cpu")
+        inverting = zeros(elements, wp.int32)
+        launch(find_inverting, elements, [mask, displacement, barrier], [inverting])
         assert inverting.numpy().any()
         inputs = [mask, inverting, displacement, barrier, numbering.single.row, vector]
-        wp.launch(barrier_product, (len(mesh.tets), 1), inputs=inputs, outputs=[image], device="cpu")
-    touching = wp.zeros(points[:2], dtype=wp.int32, device="cpu")
-    touched = wp.zeros(points[:2], dtype=wp.int32, device="cpu")
-    symmetric, remainder = (wp.zeros(points, dtype=wp.mat33d, device="cpu") for _ in range(2))
-    contact = wp.zeros(points, dtype=wp.mat33f, device="cpu")
+        launch(barrier_product, elements, inputs, [image])
+    touching, touched = (zeros(points[:2], wp.int32) for _ in range(2))
+    symmetric, remainder = (zeros(points, wp.mat33d) for _ in range(2))
+    contact = zeros(points, wp.mat33f)
     inputs = [displacement, mask, faces, bodies, body.contact, body.penalty]
-    wp.launch(contact_stiffness, points[:2], inputs=inputs, outputs=[touching, symmetric, remainder], device="cpu")
+    launch(contact_stiffness, points[:2], inputs, [touching, symmetric, remainder])
     assert (touching.numpy() == 2).any()
-    inputs = [mask, touching, faces.weight, symmetric, remainder]
-    wp.launch(store_contact, points[:2], inputs=inputs, outputs=[contact, touched], device="cpu")
+    launch(store_contact, points[:2], [mask, touching, faces.weight, symmetric, remainder], [contact, touched])
     inputs = [mask, touched, numbering.face_row, numbering.face_shape, contact, vector]
-    kernel = contact_product(space.faces.shape[1])
-    wp.launch(kernel, points[:2], inputs=inputs, outputs=[image], device="cpu")
+    launch(contact_product(space.faces.shape[1]), points[:2], inputs, [image])
     expected = tangent @ x[: len(body.free), 0].astype(np.float64)
     # Sums of some 100 products rounded to 6e-8, of terms some times larger than the sum.
     assert np.linalg.norm(image.numpy()[: len(body.free), 0] - expected) < 2e-6 * np.linalg.norm(expected)
-
-
-def _per_point(element: Element, count: int) -> tuple[int, int]:
-    return count, len(element.weights)
 
 
 def test_scenes_must_share_the_pad() -> None:

@@ -119,20 +119,6 @@ def test_nodal_forces_and_moments_are_the_tractions(element: str) -> None:
     np.testing.assert_allclose(share @ nodal, on_face, atol=scale)
 
 
-@pytest.mark.parametrize("fresh", [0.0, 0.5])
-def test_law_does_not_depend_on_the_frame(fresh: float) -> None:
-    """Gel and indenter turned together about z: tractions turn with them, because anchors are the indenter's."""
-    # Fails with `rotation *` left out of _trial.
-    made = touch(0.7, fresh=fresh)
-    before = made.body.traction.numpy()[0].copy()
-    turn = np.array([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
-    made.indenters.centre.assign((turn @ made.centre)[None])
-    made.indenters.rotation.assign((turn @ made.rotation)[None])
-    turned = (MESH.points + made.state.u) @ turn.T - MESH.points
-    made.evaluate(Unknowns(turned, made.state.p))
-    np.testing.assert_allclose(made.body.traction.numpy()[0], before @ turn.T, atol=1e-13)
-
-
 def test_augmenting_takes_the_present_traction() -> None:
     made = touch(0.7, multipliers=False)
     contact = made.body.contact

@@ -1,15 +1,17 @@
-"""Friction along whole paths: drag, twist, sliding at the limit, reversal, and what the step length does.
+"""Friction along whole paths: Coulomb's cone, drag, twist, the sliding limits T = μN and M = μ ∫ p r, reversal, steps.
 
 Each comment "fails with" names a change of `synth.simulate` that was tried.
 """
 
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 import pytest
-from pads import DRAG, MIXED, PUNCH, SPHERE, brick, gentle, run, scene
+from layered_pad import FILM, pad
+from pads import DRAG, MIXED, PUNCH, SIZE, SPHERE, brick, gentle, run, scene
 
-from synth.arrays import FloatArray
+from synth.arrays import BoolArray, FloatArray
 from synth.mesh import PadMesh
 from synth.scene import Motion, Scene
 from synth.simulate import State, simulate
@@ -28,13 +30,35 @@ def ended(posed: Scene) -> State:
     return result.states[-1]
 
 
-def tractions(stepper: Stepper) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """At the end of the path: weights (f, q), normal and tangential tractions (f, q, 3)."""
-    body = stepper.system
+@dataclass(frozen=True)
+class Touch:
+    """The contact points (f, q) that touch at the end of a path: positions in mm, tractions (k, 3), areas (k,)."""
+
+    on: BoolArray
+    position: FloatArray
+    normal: FloatArray
+    along: FloatArray
+    area: FloatArray
+
+    @property
+    def pressure(self) -> FloatArray:
+        return np.asarray(np.linalg.norm(self.normal, axis=1))
+
+    @property
+    def friction(self) -> FloatArray:
+        """Size of the tangential traction."""
+        return np.asarray(np.linalg.norm(self.along, axis=1))
+
+
+def touch(stepper: Stepper) -> Touch:
+    body, state = stepper.system, stepper.state
     stepper._place(stepper.at)
-    body.residual(stepper.state, stepper.indenter)
-    along = body.tangential.numpy()[0]
-    return body._faces.weight.numpy(), body.traction.numpy()[0] - along, along
+    body.residual(state, stepper.indenter)
+    whole, along = body.traction.numpy()[0], body.tangential.numpy()[0]
+    on = whole.any(axis=-1)
+    nodes = (body.space.points + state.u)[body.space.faces]
+    position = np.einsum("qa,fac->fqc", body.space.element.face_shape, nodes)
+    return Touch(on, position[on], (whole - along)[on], along[on], body._faces.weight.numpy()[on])
 
 
 @each
@@ -78,11 +102,9 @@ def test_twist_turns_the_gel_along(twist: float, element: str) -> None:
     assert (turned * np.sign(twist) > 0).all()
 
 
-SLIDES = [(e, m, i, h) for e, m, i in (("p1p1", FINE, SPHERE), ("p1p1", FINE, PUNCH), ("p2p1", MESH, SPHERE)) for h in (
-    0.5, 0.1)] + [("p2p1", FINE, PUNCH, 0.5)]  # fmt: skip
-
-
-@pytest.mark.parametrize(("element", "mesh", "indenter", "step"), SLIDES)
+@pytest.mark.parametrize("step", [0.5, 0.1])
+@pytest.mark.parametrize("indenter", [SPHERE, PUNCH])
+@pytest.mark.parametrize(("element", "mesh"), [("p1p1", FINE), ("p2p1", MESH)])
 def test_long_shear_slides_at_the_friction_coefficient(
     element: str, mesh: PadMesh, indenter: dict, step: float
 ) -> None:
@@ -93,12 +115,11 @@ def test_long_shear_slides_at_the_friction_coefficient(
     motion = {"depth_mm": 0.5, "shear_mm": [3.0, 0.0], "position_mm": [-1.5, 0.0], "steps": 4}
     numerics = {"max_step_mm": step, "element": element}
     stepper = run(scene(indenter=indenter, friction=mu, motion=motion, numerics=numerics), mesh)
-    weight, normal, along = tractions(stepper)
-    pressure, length = np.linalg.norm(normal, axis=-1), np.linalg.norm(along, axis=-1)
-    assert (length <= mu * pressure * (1 + 1e-9)).all()
+    made = touch(stepper)
+    assert (made.friction <= mu * made.pressure * (1 + 1e-9)).all()
     # A point that came in at the leading edge may still stick: at most the area passed in the last step has.
-    assert (weight * length).sum() == pytest.approx(mu * (weight * pressure).sum(), rel=0.01)
-    pull, load = np.einsum("fq,fqc->c", weight, along), np.einsum("fq,fqc->c", weight, normal)
+    assert made.area @ made.friction == pytest.approx(mu * made.area @ made.pressure, rel=0.01)
+    pull, load = made.area @ made.along, made.area @ made.normal
     # Tractions are along the surface, which leans by up to a fifth: its cosine, and the pressure's vertical part.
     assert pull[0] / load[2] == pytest.approx(mu, rel=0.04)
     assert abs(pull[1]) < 0.01 * pull[0]
@@ -106,6 +127,43 @@ def test_long_shear_slides_at_the_friction_coefficient(
     assert last.slip_ratio > 0.98
     # The recorded force has the pressure's sideways part, too.
     assert last.force_n[0] / last.force_n[2] == pytest.approx(mu + load[0] / load[2], rel=0.05)
+
+
+@pytest.mark.parametrize("layers", [False, True])
+@pytest.mark.parametrize("friction", [0.1, 0.5, 2.0])
+@each
+def test_traction_stays_in_its_cone(element: str, friction: float, layers: bool) -> None:
+    """At every contact point after a press, a drag, a twist and back, at right angles to a pressure that pushes."""
+    # Fails with the limit 5 % too high, with the trial traction not projected on the surface, and with `rotation *`
+    # left out of _trial (no convergence).
+    motion = {"depth_mm": 0.8, "shear_mm": [0.6, -0.3], "twist_deg": 20.0, "position_mm": [0.4, 0.2], "steps": 3}
+    motion["then"] = [{"depth_mm": 0.6, "shear_mm": [0.2, 0.0], "twist_deg": 5.0}]
+    gel = {"poisson_ratio": 0.5, "layers": [FILM] if layers else []}
+    numerics = {"element": element, "max_step_mm": 0.25, "edge_length_mm": None}
+    stepper = run(scene(SIZE, gel=gel, friction=friction, motion=motion, numerics=numerics), pad(layers))
+    made = touch(stepper)
+    # The return map scales to the limit: a few roundings.
+    assert (made.friction <= friction * made.pressure * (1 + 1e-12)).all()
+    np.testing.assert_allclose((made.normal * made.along).sum(axis=1), 0.0, atol=1e-12 * made.pressure.max() ** 2)
+    assert ((made.position - stepper.indenter.centre.numpy()[0]) * made.normal > 0).any(axis=1).all()
+    slip = made.friction > friction * made.pressure * (1 - 1e-6)
+    assert slip.any()
+    assert friction < 2 or not slip.all()
+
+
+@each
+def test_spinning_punch_is_held_by_its_limit(element: str) -> None:
+    """Turned far, the tractions go round: M = μ ∫ p r dA about the axis, against the twist's pull, and no net force."""
+    # Fails with the limit 5 % too high, and with slipping anchors moved to the point itself.
+    friction, motion = 0.1, {"depth_mm": 0.6, "twist_deg": 60.0, "steps": 2}
+    numerics = {"element": element, "max_step_mm": 0.1}
+    gel = {"poisson_ratio": 0.5}
+    made = touch(run(scene(gel=gel, indenter=PUNCH, friction=friction, motion=motion, numerics=numerics), MESH))
+    x, y, _ = made.position.T
+    # A positive twist carries the gel from +x toward +y. Near the axis slip per degree is small, but so is r.
+    turning = made.area @ (x * made.along[:, 1] - y * made.along[:, 0])
+    assert turning == pytest.approx(friction * made.area @ (made.pressure * np.hypot(x, y)), rel=0.03)
+    assert np.linalg.norm((made.area @ made.along)[:2]) < 0.02 * friction * made.area @ made.pressure
 
 
 @each
@@ -119,10 +177,9 @@ def test_rough_contact_sticks(element: str) -> None:
         # By Cattaneo and Mindlin a rim of this share of the contact slips under T; one of 22 points may be in it.
         share = np.hypot(*state.force_n[:2]) / (10 * state.force_n[2]) if state.force_n[2] > 0 else 0.0
         assert state.slip_ratio <= 1 - (1 - share) ** (2 / 3) + 1 / 22 + 1e-9
-    _, normal, _ = tractions(stepper)
     pressed = next(state for state in states if state.depth_mm == 0.6)
     at_nodes = (states[-1].displacement - pressed.displacement)[space.faces]
-    moved = np.einsum("qa,fac->fqc", space.element.face_shape, at_nodes)[(normal != 0).any(axis=-1)]
+    moved = np.einsum("qa,fac->fqc", space.element.face_shape, at_nodes)[touch(stepper).on]
     assert len(moved) > 0
     done = states[-1].shear_mm[0] - pressed.shear_mm[0]
     assert done > 0.1
@@ -133,7 +190,7 @@ def test_rough_contact_sticks(element: str) -> None:
 def test_slip_spreads_with_the_shear() -> None:
     """From the rim of the contact inward, until all slips."""
     motion = {"depth_mm": 0.6, "shear_mm": [0.8, 0.0], "steps": 10}
-    result = simulate(scene(friction=0.5, motion=motion, numerics={"element": "p2p1"}), FINE)
+    result = simulate(scene(friction=0.5, motion=motion, numerics={"element": "p1p1"}), FINE)
     ratios = [state.slip_ratio for state in result.states if state.shear_mm[0] > 0]
     assert 0 < ratios[0] < 0.7  # the press alone leaves points near the rim at the limit
     assert ratios[-1] == 1.0
@@ -146,12 +203,8 @@ def test_reversed_shear_reverses_the_force(element: str) -> None:
     """Full slide to one side and then to the other: mirror images, and work lost on the way."""
     # Fails with anchors left behind by slipping points, and without the rigid-motion predictor at turns.
     there, mu = 0.9, 0.3
-    motion = {
-        "depth_mm": 0.5,
-        "shear_mm": [there, 0.0],
-        "steps": 13,
-        "then": [{"depth_mm": 0.5, "shear_mm": [-there, 0.0]}, {"depth_mm": 0.5, "shear_mm": [there, 0.0]}],
-    }
+    first_leg, *others = ({"depth_mm": 0.5, "shear_mm": [x, 0.0]} for x in (there, -there, there))
+    motion = {**first_leg, "steps": 13, "then": others}
     result = simulate(scene(friction=mu, motion=motion, numerics={"element": element}), MESH)
     assert (result.status, result.reason) == ("complete", "")
     x = np.array([state.shear_mm[0] for state in result.states])
@@ -190,7 +243,6 @@ def test_the_predictor_at_a_turn_does_not_see_how_exact_the_state_is() -> None:
 
 @each
 def test_friction_converges_with_the_step(element: str) -> None:
-    """The load path is remembered with an error that vanishes with the step."""
     # Fails with points that stick anchored anew at each step.
     motion = {"depth_mm": 0.6, "shear_mm": [0.1, 0.0], "steps": 2}
 

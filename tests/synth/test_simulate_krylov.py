@@ -39,14 +39,10 @@ def _systems(
     rows, batch = padded(150), len(relative)
     lanes, krylov, settings = Lanes(), Krylov(), Settings()
     sizes = shapes(rows, batch)
-    structs: list[tuple[Any, Any]] = [(lanes, Lanes), (krylov, Krylov)]
-    for struct, kind in structs:
+    for struct, kind in ((lanes, Lanes), (krylov, Krylov)):
         for name, variable in kind.vars.items():
-            setattr(
-                struct,
-                name,
-                wp.zeros(sizes[name] if struct is krylov else batch, dtype=variable.type.dtype, device=device),
-            )
+            shape = sizes[name] if struct is krylov else batch
+            setattr(struct, name, wp.zeros(shape, dtype=variable.type.dtype, device=device))
     lanes.phase.fill_(phase)
     lanes.norm.fill_(1.0)
     krylov.size.fill_(20.0)
@@ -150,9 +146,8 @@ def test_a_preconditioner_takes_tf32_from_the_first_vector_on() -> None:
     free = np.append(np.arange(150), np.full(rows - 150, -1)).astype(np.int32)
     force = wp.array(rng.standard_normal((2, 50, 3)), dtype=wp.vec3d, device="cpu")
     volume = wp.zeros((2, 0), dtype=wp.float64, device="cpu")
-    wp.launch(
-        begin_vectors, (2, rows // 4), inputs=[lanes, wp.array(free, device="cpu"), force, volume, krylov], device="cpu"
-    )
+    inputs = [lanes, wp.array(free, device="cpu"), force, volume, krylov]
+    wp.launch(begin_vectors, (2, rows // 4), inputs=inputs, device="cpu")
     first = flat(krylov.current).numpy().copy()
     flat(krylov.product).assign(rng.standard_normal((2, rows)).astype(np.float32))
     wp.launch_tiled(arnoldi(rows), dim=[2], inputs=[krylov], block_dim=block_size(rows), device="cpu")

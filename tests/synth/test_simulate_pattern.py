@@ -8,12 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from layered_pad import layered
 from pads import ELEMENT, MIXED, crooked
 
 import synth.simulate.pattern as pattern_module
 from synth.mesh import PadMesh
 from synth.simulate.pattern import pattern_of
-from synth.simulate.space import function_space
+from synth.simulate.space import Space, function_space
 
 MESH, OTHER = crooked(), crooked(seed=1)
 
@@ -21,6 +22,14 @@ MESH, OTHER = crooked(), crooked(seed=1)
 @pytest.fixture(autouse=True)
 def _empty(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(pattern_module, "_CACHED", type(pattern_module._CACHED)())
+
+
+def others_of(space: Space, count: int) -> list[Space]:
+    """Spaces that differ from one, and from each other, in a node that is held or not."""
+    held = [space.held.copy() for _ in range(count)]
+    for node, mask in enumerate(held):
+        mask[node] = ~mask[node]
+    return [replace(space, held=mask) for mask in held]
 
 
 @pytest.mark.parametrize("element", MIXED)
@@ -36,15 +45,11 @@ def test_same_topology_shares_the_pattern_and_its_factor(element: str) -> None:
 def test_what_differs_in_topology_does_not_share() -> None:
     # Fails with pressure_nodes, held or mixed left out of the key.
     space = function_space(MESH, ELEMENT["p1p1"]())
-    layer = (MESH.points[MESH.tets].mean(axis=1)[:, 2] > 1).astype(np.int32)
-    layered = function_space(PadMesh(MESH.points, MESH.tets, MESH.size_mm, layer), ELEMENT["p1p1"]())
-    held = space.held.copy()
-    held[0] = ~held[0]
     shuffled = MESH.tets[np.random.default_rng(0).permutation(len(MESH.tets))]
     others = [
         (space, False),
-        (layered, True),
-        (replace(space, held=held), True),
+        (function_space(layered(MESH), ELEMENT["p1p1"]()), True),
+        (others_of(space, 1)[0], True),
         (function_space(PadMesh(MESH.points, shuffled, MESH.size_mm), ELEMENT["p1p1"]()), True),
         (function_space(MESH, ELEMENT["p2p1"]()), True),
     ]
@@ -59,10 +64,8 @@ def test_only_the_last_few_are_kept() -> None:
     space = function_space(MESH, ELEMENT["p1p1"]())
     first = pattern_of(space, True)
     most = pattern_module._MAX_CACHED
-    for k in range(most):
-        held = space.held.copy()
-        held[k] = ~held[k]
-        pattern_of(replace(space, held=held), True)
+    for other in others_of(space, most):
+        pattern_of(other, True)
         assert len(pattern_module._CACHED) <= most
     assert pattern_of(space, True) is not first
 
@@ -73,11 +76,7 @@ def test_entries_are_bounded_too(monkeypatch: pytest.MonkeyPatch) -> None:
     # which forgets the pattern that was asked for.
     space = function_space(MESH, ELEMENT["p1p1"]())
     large = function_space(MESH, ELEMENT["p2p1"]())
-    spaces = []
-    for k in range(4):
-        held = space.held.copy()
-        held[k] = ~held[k]
-        spaces.append(replace(space, held=held))
+    spaces = others_of(space, 4)
     sizes = [pattern_of(one, True).size for one in spaces]
     assert len(pattern_module._CACHED) == 4
     pattern_module._CACHED.clear()

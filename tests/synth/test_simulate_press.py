@@ -7,7 +7,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from pads import DRAG, MIXED, PUNCH, SPHERE, brick, gentle, run, same, scene
+from pads import DRAG, MIXED, PUNCH, SPHERE, brick, gentle, same, scene
 
 import synth.simulate.linear as linear
 import synth.simulate.pattern as pattern
@@ -48,27 +48,6 @@ def test_records_what_was_asked(element: str) -> None:
         assert state.force_n[2] > 0  # a press pushes the gel toward the camera
         assert 0 <= state.max_penetration_mm < 0.1
         assert not state.displacement[result.space.held].any()
-
-
-@each
-@pytest.mark.parametrize("friction", [0.0, 0.4])
-def test_window_bears_what_the_indenter_does(friction: float, element: str) -> None:
-    """The bonded face's reaction balances the contact force and moment.
-
-    Fails with the undeformed arm in `forces`, with contact not restored after a record, or its gap not evaluated anew.
-    """
-    stepper = run(gentle(friction=friction, numerics={"element": element}), MESH)
-    body, last = stepper.system, stepper.at
-    stepper._place(last)
-    residual = body.residual(stepper.state, stepper.indenter)
-    force, moment, _ = body.forces(stepper.state)
-    held = residual.reaction * body.space.held
-    # What is left on the free nodes is the residual: 1e-6 of the forces' norm, on some 100 nodes and arms of 5 mm.
-    scale = 10 * TOLERANCE * float(np.linalg.norm(residual.reaction))
-    assert np.linalg.norm(force) > 1e3 * scale
-    np.testing.assert_allclose(held.sum(axis=0), -force, atol=scale)
-    held_moment = np.cross(body.space.points + stepper.state.u, held).sum(axis=0)
-    np.testing.assert_allclose(held_moment, -moment, atol=5 * scale)
 
 
 @each
@@ -127,13 +106,9 @@ def test_the_mesh_must_be_of_the_scenes_pad() -> None:
         simulate(scene((8.0, 6.0, 3.0)), MESH)
 
 
-@each
-def test_same_call_twice_is_bitwise_the_same(element: str) -> None:
-    assert same(simulate(gentle(numerics={"element": element}), MESH), dragged(element))
-
-
-def test_auto_is_quadratic() -> None:
-    assert same(simulate(gentle(numerics={"element": "auto"}), MESH), dragged("p2p1"))
+@pytest.mark.parametrize(("asked", "meant"), [("p1p1", "p1p1"), ("auto", "p2p1")])
+def test_a_second_call_is_bitwise_the_same_and_auto_is_quadratic(asked: str, meant: str) -> None:
+    assert same(simulate(gentle(numerics={"element": asked}), MESH), dragged(meant))
 
 
 def test_no_touch_needs_no_solve(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -170,23 +145,6 @@ def test_slides_off_the_pad(element: str) -> None:
     assert result.states[1].force_n[2] > 1e-3
     assert np.abs(result.states[-1].displacement).max() < 1e-9
     assert np.abs(result.states[-1].force_n).max() < 1e-9
-
-
-@pytest.mark.parametrize(("element", "counts"), [("p1p1", (8, 8, 6)), ("p2p1", (4, 4, 3))])
-def test_ball_over_the_edge_presses_the_side_too(element: str, counts: tuple[int, int, int]) -> None:
-    """The gel bulges under a ball that hangs over the rim: the side touches it, and is pushed inward."""
-    # Fails with the touchable faces restricted to z = 0: the side goes into the ball, and nothing converges.
-    depth, edge = 1.0, MESH.size_mm[0] / 2
-    motion = {"depth_mm": depth, "shear_mm": [0.8, 0.0], "position_mm": [edge, 0.0], "steps": 3}
-    ball = {"shape": "sphere", "radius_mm": 2.0}
-    stepper = run(scene(indenter=ball, motion=motion, numerics={"element": element}), brick(counts=counts))
-    body, last = stepper.system, stepper.states[-1]
-    space, weight = body.space, body._faces.weight.numpy()
-    side = (space.points[space.faces][:, :, 0] == edge).all(axis=1)
-    pushed = np.einsum("fq,fqc->c", weight[side], body.traction.numpy()[0, side])
-    assert pushed[0] < 0
-    assert last.force_n[0] < -0.3 * last.force_n[2]
-    assert last.max_penetration_mm < 0.03 * depth
 
 
 @each
@@ -244,7 +202,7 @@ def test_a_solver_that_fails_is_a_failed_trajectory(monkeypatch: pytest.MonkeyPa
     # Fails with a sample whose step is NaN counted as converged.
     monkeypatch.setattr(pattern, "_CACHED", type(pattern._CACHED)())
     monkeypatch.setattr(pattern, "direct_factor", lambda *_: Broken(how))
-    result = simulate(gentle(), MESH)
+    result = simulate(gentle(), brick(counts=(2, 2, 1)))
     assert result.status == "failed"
     assert len(result.states) == 1
     assert "did not converge" in result.reason
@@ -252,7 +210,6 @@ def test_a_solver_that_fails_is_a_failed_trajectory(monkeypatch: pytest.MonkeyPa
 
 @each
 def test_step_length_does_not_change_a_press_without_friction(element: str) -> None:
-    """Without friction the end does not remember the load path."""
     # Fails with Newton stopped at a residual of 0.3.
     motion = {"depth_mm": 0.8, "steps": 2}
     steps = (0.4, 0.25, 0.05)
@@ -262,17 +219,6 @@ def test_step_length_does_not_change_a_press_without_friction(element: str) -> N
     for end in ends[1:]:
         np.testing.assert_allclose(end.displacement, ends[0].displacement, atol=10 * TOLERANCE)
         assert end.force_n[2] == pytest.approx(ends[0].force_n[2], rel=10 * TOLERANCE)
-
-
-def test_load_path_does_not_matter_without_friction() -> None:
-    """Straight down, or down elsewhere, across and back: the same end."""
-    # Fails with multipliers of a record left in place for the next step.
-    numerics = {"max_step_mm": 0.2}
-    straight = simulate(scene(motion={"depth_mm": 0.6, "steps": 1}, numerics=numerics), MESH).states[-1]
-    there = {"depth_mm": 0.4, "shear_mm": [0.7, 0.4], "twist_deg": 30.0, "steps": 4, "then": [{"depth_mm": 0.6}]}
-    detour = simulate(scene(motion=there, numerics=numerics), MESH).states[-1]
-    np.testing.assert_allclose(detour.displacement, straight.displacement, atol=10 * TOLERANCE)
-    assert detour.force_n[2] == pytest.approx(straight.force_n[2], rel=10 * TOLERANCE)
 
 
 @each
@@ -306,16 +252,3 @@ def test_scipy_and_pardiso_agree(monkeypatch: pytest.MonkeyPatch) -> None:
         close = 2e-3 if friction else 10 * TOLERANCE
         np.testing.assert_allclose(slow.force_n, fast.force_n, rtol=close, atol=1e-8)
         np.testing.assert_allclose(slow.displacement, fast.displacement, atol=close)
-
-
-def test_a_body_that_passes_through_fails_with_a_reason() -> None:
-    """A needle between the contact points touches none of them; without the check it ended "complete" with no force."""
-    size = (8.0, 6.0, 2.5)
-    posed = scene(
-        size,
-        indenter={"shape": "sphere", "radius_mm": 0.1},
-        motion={"depth_mm": 0.5, "steps": 2, "position_mm": (0.3, 0.2)},
-    )
-    result = simulate(posed, brick(size, (6, 5, 2)))
-    assert result.status == "partial"  # what comes before the end of the press may touch nothing
-    assert "touches no contact point" in result.reason

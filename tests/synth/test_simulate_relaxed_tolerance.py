@@ -4,6 +4,7 @@ Each comment "fails with" names a change of `synth.simulate.stepping` that was t
 """
 
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,6 @@ each = pytest.mark.parametrize("polish", list(POLISHES))
 
 
 def pressed(friction: float = 0.5, steps: int = 2) -> Scene:
-    """A ball that is pressed and dragged."""
     motion = {"depth_mm": 0.6, "shear_mm": [0.15, -0.05], "steps": steps}
     return scene(friction=friction, motion=motion, numerics={"tolerance": TOLERANCE})
 
@@ -155,3 +155,18 @@ def test_relaxed_steps_end_where_tight_ones_do() -> None:
         most = STANDARD.relaxed_tolerance / 4
         assert np.linalg.norm(one.displacement - other.displacement) < most * np.linalg.norm(other.displacement)
         assert np.linalg.norm(np.subtract(one.force_n, other.force_n)) < most * np.linalg.norm(other.force_n)
+
+
+def test_relaxed_and_extrapolated_steps_save_iterations() -> None:
+    """Fails with the options not handed on by `simulate`, and with either without effect."""
+    posed = scene(friction=0.0, motion={"depth_mm": 0.6, "steps": 1}, numerics={"max_step_mm": 0.1})
+    exact = replace(STANDARD, reuse_factors=False)  # rough directions save time, not iterations
+    counts = []
+    for relaxed, extrapolate in product((exact.relaxed_tolerance, 0.0), (True, False)):
+        options = replace(exact, relaxed_tolerance=relaxed, extrapolate=extrapolate)
+        found = simulate(posed, MESH, options=options)
+        assert found.status == "complete"
+        counts.append(sum(state.newton_iterations for state in found.states))
+    standard, unpredicted, tight, plain = counts
+    assert standard < min(tight, unpredicted)
+    assert max(tight, unpredicted) < plain

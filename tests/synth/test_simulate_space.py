@@ -4,10 +4,11 @@ Each comment "fails with" names a change of `synth.simulate.space`, `synth.simul
 tried.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
+from layered_pad import layered
 from pads import ELEMENT, MIXED, brick, crooked
 
 from synth.arrays import FloatArray, Points
@@ -74,41 +75,33 @@ def test_coated_surface_is_the_face_at_z_0(element: str) -> None:
 def test_pressure_is_doubled_at_interfaces(element: str) -> None:
     # Fails with the layer left out of the pressure's numbering.
     mesh = brick((4.0, 4.0, 3.0), (2, 2, 3))
-    layer = np.minimum(mesh.points[mesh.tets].mean(axis=1)[:, 2].astype(np.int32), 1)  # the interface is at z = 1
-    plain, layered = space_of(element, mesh), space_of(element, PadMesh(mesh.points, mesh.tets, mesh.size_mm, layer))
+    plain, double = space_of(element, mesh), space_of(element, layered(mesh, interface=1.0))
     assert plain.pressures == len(mesh.points)
-    assert layered.pressures == len(mesh.points) + (mesh.points[:, 2] == 1).sum()
-    assert (layered.points == plain.points).all()
-    assert (layered.nodes == plain.nodes).all()
+    assert double.pressures == len(mesh.points) + (mesh.points[:, 2] == 1).sum()
+    assert (double.points == plain.points).all()
+    assert (double.nodes == plain.nodes).all()
     # No pressure unknown belongs to two layers or to two vertices.
-    owner = np.stack([np.repeat(layer, 4), mesh.tets.ravel()], axis=1)
-    pairs = np.unique(np.column_stack([layered.pressure_nodes.ravel(), owner]), axis=0)
-    assert len(pairs) == layered.pressures
-    assert (pairs[:, 0] == np.arange(layered.pressures)).all()
+    owner = np.stack([np.repeat(layered(mesh).layer, 4), mesh.tets.ravel()], axis=1)
+    pairs = np.unique(np.column_stack([double.pressure_nodes.ravel(), owner]), axis=0)
+    assert (pairs[:, 0] == np.arange(double.pressures)).all()
 
 
-def barycentric(count: int, corners: int) -> FloatArray:
-    return np.random.default_rng(0).dirichlet(np.ones(corners), count)
-
-
-@pytest.mark.parametrize("shape", [quadratic_face, broken_linear_face])
-def test_face_functions_are_a_partition_of_unity(shape: Callable[[FloatArray], FloatArray]) -> None:
+@pytest.mark.parametrize(
+    ("shape", "edges"), [(quadratic_face, FACE_EDGES), (broken_linear_face, FACE_EDGES), (quadratic_shape, EDGES)]
+)
+def test_shape_functions_are_a_partition_of_unity(
+    shape: Callable[[FloatArray], FloatArray], edges: Sequence[tuple[int, int]]
+) -> None:
     # Fails with 1 + 2 b for 1 - 2 b in the inner triangle, or 2 b - 1 not cut off at 0.
-    at = np.concatenate([barycentric(500, 3), np.eye(3), (np.eye(3) + np.roll(np.eye(3), 1, axis=1)) / 2])
+    corners = np.eye(1 + np.max(edges))
+    nodes = np.array([*corners, *(corners[[i, j]].mean(axis=0) for i, j in edges)])
+    at = np.concatenate([np.random.default_rng(0).dirichlet(np.ones(len(corners)), 500), nodes])
     values = shape(at)
     np.testing.assert_allclose(values.sum(axis=1), 1.0, atol=1e-14)
-    nodes = np.array([*np.eye(3), *(np.eye(3)[[i, j]].mean(axis=0) for i, j in FACE_EDGES)])
-    np.testing.assert_allclose(shape(nodes), np.eye(6), atol=1e-15)
+    np.testing.assert_allclose(values[500:], np.eye(len(nodes)), atol=1e-15)
     np.testing.assert_allclose(values @ nodes, at, atol=1e-14)  # affine fields are exact
     if shape is broken_linear_face:
         assert values.min() >= 0
-
-
-def test_tetrahedrons_functions_are_a_partition_of_unity() -> None:
-    at = barycentric(200, 4)
-    np.testing.assert_allclose(quadratic_shape(at).sum(axis=1), 1.0, atol=1e-14)
-    nodes = np.array([*np.eye(4), *(np.eye(4)[[i, j]].mean(axis=0) for i, j in EDGES)])
-    np.testing.assert_allclose(quadratic_shape(nodes), np.eye(10), atol=1e-15)
 
 
 def field(points: Points, degree: int) -> FloatArray:

@@ -4,41 +4,54 @@ import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from samples import tree
 from tiny_scene import fingerprint, reference
 
 from synth.cli import main
 
 ROOT = Path(__file__).parents[2]
-COMMANDS = ["generate", "plan", "simulate", "inspect", "verify", "export", "doctor"]
-
 
 pytestmark = pytest.mark.usefixtures("one_cache")
 
-
-def _complaint(capsys: pytest.CaptureFixture[str], status: int, expected: int = 2) -> str:
-    """The one thing that was said, on stderr, without a traceback."""
-    out, err = capsys.readouterr()
-    assert status == expected, err
-    assert out == ""
-    assert err.startswith("synth: ")
-    assert "Traceback" not in err
-    return err.removeprefix("synth: ").rstrip()
+Run = Callable[..., str]
 
 
-def test_help_lists_every_command(capsys) -> None:
-    assert main(["--help"]) == 0
-    out = capsys.readouterr().out
-    assert all(command in out for command in COMMANDS)
-    assert "--debug" in out
+@pytest.fixture
+def said(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run a command that must end with a status, 0 unless told: what it printed on stdout."""
+
+    def run(*arguments: object, status: int = 0) -> str:
+        assert main([str(argument) for argument in arguments]) == status
+        return capsys.readouterr().out
+
+    return run
+
+
+@pytest.fixture
+def complaint(capsys: pytest.CaptureFixture[str]) -> Run:
+    """Run a command that must end with status 2: the one thing that it said, on stderr, without a traceback."""
+
+    def run(*arguments: object) -> str:
+        status = main([str(argument) for argument in arguments])
+        out, err = capsys.readouterr()
+        assert status == 2, err
+        assert out == ""
+        assert err.startswith("synth: ")
+        assert "Traceback" not in err
+        return err.removeprefix("synth: ").rstrip()
+
+    return run
 
 
 @pytest.mark.parametrize(
-    ("command", "options"),
+    ("command", "words"),
     [
+        ("", ["generate", "plan", "simulate", "inspect", "verify", "export", "doctor", "--debug"]),
         ("generate", ["--scene", "--n", "--out", "--seed", "--set", "--device", "--workers", "--dry-run", "--json"]),
         ("plan", ["--scene", "--set", "--n", "--device", "--json"]),
         ("simulate", ["--scene", "--out", "--seed", "--set", "--json"]),
@@ -48,10 +61,9 @@ def test_help_lists_every_command(capsys) -> None:
         ("doctor", ["--json"]),
     ],
 )
-def test_help_of_a_command_lists_its_options(capsys, command: str, options: list[str]) -> None:
-    assert main([command, "--help"]) == 0
-    out = capsys.readouterr().out
-    assert [option for option in options if option not in out] == []
+def test_help_lists_commands_and_options(said: Run, command: str, words: list[str]) -> None:
+    out = said(*command.split(), "--help")
+    assert [word for word in words if word not in out] == []
 
 
 @pytest.mark.parametrize(
@@ -92,9 +104,9 @@ def test_help_of_a_command_lists_its_options(capsys, command: str, options: list
         (["export", ".", "--format", "flo", "--out", "x"], "not a dataset"),
     ],
 )
-def test_wrong_input_is_one_message_and_status_2(capsys, tmp_path, monkeypatch, arguments, message) -> None:
+def test_wrong_input_is_one_message_and_status_2(complaint: Run, tmp_path, monkeypatch, arguments, message) -> None:
     monkeypatch.chdir(tmp_path)
-    assert message in _complaint(capsys, main(arguments))
+    assert message in complaint(*arguments)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -116,22 +128,15 @@ def test_a_mistake_of_the_program_keeps_its_traceback(monkeypatch) -> None:
         main(["verify", "x"])
 
 
-def test_plan_explains_and_predicts(capsys, tiny: Path) -> None:
-    assert main(["plan", "--scene", str(tiny), "--set", "contact.friction=0", "--n", "100"]) == 0
-    out = capsys.readouterr().out
-    for words in (
-        "friction state",
-        "left out",
-        "contact.friction = 0",
-        "predicted per pair",
-        "for 100 pairs",
-        "factor of",
-    ):
+def test_plan_explains_and_predicts(said: Run, tiny: Path) -> None:
+    out = said("plan", "--scene", tiny, "--set", "contact.friction=0", "--n", "100")
+    for words in ("friction state", "left out", "contact.friction = 0", "predicted per pair", "for 100 pairs"):
         assert words in out
-    assert main(["plan", "--scene", str(tiny), "--json", "--n", "100"]) == 0
-    answer = json.loads(capsys.readouterr().out)
+    assert "factor of" in out
+    answer = json.loads(said("plan", "--scene", tiny, "--json", "--n", "100"))
     assert answer["n"] == 100
     assert {"feature", "runs", "reason"} == set(answer["decisions"][0])
+    assert json.loads(said("plan", "--json"))["scene"] == "gelsight_mini"  # by default
 
 
 @pytest.mark.parametrize(
@@ -150,58 +155,35 @@ def test_a_long_slide_is_warned_of_and_done(capsys, tiny: Path, width: float, wa
     assert err.splitlines()[-1] == (f"synth: warning: {tiny} with --set sensor.gel.size_mm, motion.shear_mm: {warning}")
 
 
-def test_a_dry_run_writes_nothing(capsys, tiny: Path, tmp_path: Path) -> None:
-    assert main(["generate", "--scene", str(tiny), "--out", str(tmp_path / "d"), "--dry-run", "--n", "3"]) == 0
-    assert "for 3 pairs" in capsys.readouterr().out
+def test_a_dry_run_writes_nothing(said: Run, tiny: Path, tmp_path: Path) -> None:
+    assert "for 3 pairs" in said("generate", "--scene", tiny, "--out", tmp_path / "d", "--dry-run", "--n", "3")
     assert list(tmp_path.iterdir()) == [tiny]
 
 
-def test_generate_says_what_it_did(capsys, tiny: Path, tmp_path: Path) -> None:
+def test_generate_says_what_it_did(said: Run, tiny: Path, tmp_path: Path) -> None:
     """In a folder whose name would be markup in a careless print."""
     out = tmp_path / "[bold] data [/x]"
-    command = ["generate", "--scene", str(tiny), "--out", str(out), "--n", "2"]
-    assert main(command) == 0
-    assert str(out) in capsys.readouterr().out
-    assert main([*command, "--json"]) == 0
-    answer = json.loads(capsys.readouterr().out)
+    command = ["generate", "--scene", tiny, "--out", out, "--n", "2"]
+    assert str(out) in said(*command)
+    answer = json.loads(said(*command, "--json"))
     assert (answer["made"], answer["found"], answer["given_up"]) == (0, 2, [])
-    for name in ("000000", "000001"):
-        found, expected = (fingerprint(d) for d in (out, reference()))
-        files = [file for file in expected if file.startswith(f"samples/{name}/")]
-        assert len(files) == 5
-        assert [found[file] for file in files] == [expected[file] for file in files]
+    found, expected = (fingerprint(d) for d in (out, reference()))
+    files = [file for file in expected if file.startswith(("samples/000000/", "samples/000001/"))]
+    assert len(files) == 2 * 5
+    assert [found[file] for file in files] == [expected[file] for file in files]
 
 
 def test_a_job_that_partly_fails_has_status_1(capsys, tiny: Path, tmp_path: Path) -> None:
     out = tmp_path / "d"
-    assert (
-        main(
-            [
-                "generate",
-                "--scene",
-                str(tiny),
-                "--out",
-                str(out),
-                "--n",
-                "1",
-                "--set",
-                "motion.depth_mm={normal=[0, 1e9]}",
-            ]
-        )
-        == 1
-    )
+    impossible = ["--set", "motion.depth_mm={normal=[0, 1e9]}"]
+    assert main(["generate", "--scene", str(tiny), "--out", str(out), "--n", "1", *impossible]) == 1
     said, err = capsys.readouterr()
     assert f"synth: 1 samples could not be made, see {out}/failures.jsonl" in err
     assert "10 draws failed" in said
 
 
-def test_the_default_scene_is_the_gelsight_mini(capsys) -> None:
-    assert main(["plan", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["scene"] == "gelsight_mini"
-
-
 @pytest.mark.parametrize("kind", ["file", "foreign", "another job", "below a file"])
-def test_places_that_cannot_take_the_dataset(capsys, tiny: Path, tmp_path: Path, kind: str) -> None:
+def test_places_that_cannot_take_the_dataset(complaint: Run, tiny: Path, tmp_path: Path, kind: str) -> None:
     out = tmp_path / "d"
     match kind:
         case "file":
@@ -214,20 +196,17 @@ def test_places_that_cannot_take_the_dataset(capsys, tiny: Path, tmp_path: Path,
         case _:
             (tmp_path / "file").write_text("mine")
             out = tmp_path / "file" / "d"
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file() and path.name != ".lock"}
-    said = _complaint(capsys, main(["generate", "--scene", str(tiny), "--out", str(out), "--seed", "5", "--n", "1"]))
-    assert str(out) in said
-    assert before == {
-        path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file() and path.name != ".lock"
-    }
-    if kind == "another job":
-        assert "seed: 0 there, 5 now" in said
+    before = tree(tmp_path)
+    message = complaint("generate", "--scene", tiny, "--out", out, "--seed", "5", "--n", "1")
+    assert str(out) in message
+    assert kind != "another job" or "seed: 0 there, 5 now" in message
+    assert before == tree(tmp_path)
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs a folder in which not even root may write")
-def test_a_folder_that_may_not_be_written(capsys, tiny: Path) -> None:
-    said = _complaint(capsys, main(["generate", "--scene", str(tiny), "--out", "/proc/synth", "--n", "1"]))
-    assert said.startswith("/proc/synth: cannot be written: ")
+def test_a_folder_that_may_not_be_written(complaint: Run, tiny: Path) -> None:
+    message = complaint("generate", "--scene", tiny, "--out", "/proc/synth", "--n", "1")
+    assert message.startswith("/proc/synth: cannot be written: ")
 
 
 STEP = {
@@ -236,15 +215,15 @@ STEP = {
 }  # fmt: skip
 
 
-def test_simulate_writes_the_trajectory_of_the_contract(capsys, tiny: Path, tmp_path: Path) -> None:
+def test_simulate_writes_the_trajectory_of_the_contract(said: Run, tiny: Path, tmp_path: Path) -> None:
     import pyvista as pv
 
     out = tmp_path / "s"
     out.mkdir()
     (out / "state_009.vtu").write_text('Name="mesh"')  # of an earlier run
-    assert main(["simulate", "--scene", str(tiny), "--out", str(out), "--index", "1", "--json"]) == 0
+    printed = said("simulate", "--scene", tiny, "--out", out, "--index", "1", "--json")
     record = json.loads((out / "trajectory.json").read_text())
-    assert record == json.loads(capsys.readouterr().out)
+    assert record == json.loads(printed)
     assert set(record) == {"scene", "steps", "status", "reason", "seconds"}
     assert record["status"] == "complete"
     assert record["seconds"] > 0
@@ -268,34 +247,29 @@ def test_simulate_writes_the_trajectory_of_the_contract(capsys, tiny: Path, tmp_
     np.testing.assert_allclose((areas[:, None] * mean).sum(0), last["force_n"], atol=2e-3 * last["force_n"][2])
 
 
-def test_simulate_prints_a_table_and_redraws_the_same(capsys, tiny: Path, tmp_path: Path) -> None:
-    assert main(["simulate", "--scene", str(tiny), "--out", str(tmp_path / "s"), "--set", "motion.depth_mm=-0.2"]) == 0
-    out = capsys.readouterr().out
-    assert "force" in out
-    assert "-0.200" in out
-    assert "complete" in out
+def test_simulate_prints_a_table_and_how_far_it_is(capsys, tiny: Path, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("synth.progress.LINE_S", 0.0)
+    motion = ["--set", "motion.depth_mm=0.2", "--set", "motion.steps=5"]
+    assert main(["simulate", "--scene", str(tiny), "--out", str(tmp_path / "s"), *motion]) == 0
+    out, err = capsys.readouterr()
+    for words in ("force", "0.200", "complete"):
+        assert words in out
+    lines = [line for line in err.splitlines() if "percent" in line]
+    assert " left" in lines[-1]  # from the second line on it knows how fast it is
+    assert all(line.startswith("synth: simulate: percent of the ") for line in lines)
 
 
-def test_simulate_names_the_scene_file(capsys, tiny: Path, tmp_path: Path) -> None:
+def test_simulate_names_the_scene_file(complaint: Run, tiny: Path, tmp_path: Path) -> None:
     damaged = tmp_path / "damaged.stl"
     damaged.write_bytes(b"")
     indenter = f"contact.indenter={{ shape = 'mesh', file = '{damaged}' }}"
-    status = main(["simulate", "--scene", str(tiny), "--out", str(tmp_path / "s"), "--set", indenter])
-    assert _complaint(capsys, status).startswith(
+    assert complaint("simulate", "--scene", tiny, "--out", tmp_path / "s", "--set", indenter).startswith(
         f"{tiny} with --set contact.indenter: contact.indenter.file = '{damaged}': it cannot be read"
     )
 
 
-def test_simulate_says_how_far_it_is(capsys, tiny: Path, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr("synth.progress.LINE_S", 0.0)
-    assert main(["simulate", "--scene", str(tiny), "--out", str(tmp_path / "s")]) == 0
-    lines = [line for line in capsys.readouterr().err.splitlines() if "percent of the load path" in line]
-    assert lines
-    assert all(line.startswith("synth: simulate: percent of the load path: ") for line in lines)
-
-
-def test_simulate_into_a_file_is_refused_before_the_work(capsys, tiny: Path) -> None:
-    assert "cannot be written" in _complaint(capsys, main(["simulate", "--scene", str(tiny), "--out", str(tiny)]))
+def test_simulate_into_a_file_is_refused_before_the_work(complaint: Run, tiny: Path) -> None:
+    assert "cannot be written" in complaint("simulate", "--scene", tiny, "--out", tiny)
 
 
 def test_a_simulation_that_ends_early_is_written_and_has_status_1(capsys, tiny: Path, tmp_path: Path) -> None:
@@ -313,71 +287,61 @@ def test_a_simulation_that_ends_early_is_written_and_has_status_1(capsys, tiny: 
 
 @pytest.mark.parametrize("name", ["dataset.json", "samples/000000/image1.png", "mine.html"])
 @pytest.mark.parametrize("option", ["--png", "--html"])
-def test_inspect_replaces_its_own_files_and_no_other(capsys, tmp_path: Path, name: str, option: str) -> None:
+def test_inspect_replaces_its_own_files_and_no_other(complaint: Run, tmp_path: Path, name: str, option: str) -> None:
     data = tmp_path / "d"
     shutil.copytree(reference(), data)
     (data / "mine.html").write_text("<!DOCTYPE html><title>mine</title>")
     before = fingerprint(data)
-    said = _complaint(capsys, main(["inspect", str(data), option, str(data / name)]))
-    assert said.startswith(f"{data / name}: exists and does not come from this command")
+    message = complaint("inspect", data, option, data / name)
+    assert message.startswith(f"{data / name}: exists and does not come from this command")
     assert fingerprint(data) == before
     for _ in range(2):
         assert main(["inspect", str(data / "samples" / "000000"), option, str(tmp_path / "own")]) == 0
 
 
-@pytest.mark.parametrize("name", ["trajectory.json", "state_000.vtu"])
-def test_simulate_replaces_its_own_files_and_no_other(capsys, tiny: Path, tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize("name", ["trajectory.json", "state_000.vtu", "stress.json"])
+def test_simulate_and_stress_replace_no_others_files(complaint: Run, tiny: Path, tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("another's")
-    said = _complaint(capsys, main(["simulate", "--scene", str(tiny), "--out", str(tmp_path)]))
-    assert said.startswith(f"{tmp_path / name}: exists and does not come from this command")
-    assert (tmp_path / name).read_text() == "another's"
+    before = tree(tmp_path)
+    command = ["stress"] if name == "stress.json" else ["simulate", "--scene", tiny]
+    message = complaint(*command, "--out", tmp_path)
+    assert message.startswith(f"{tmp_path / name}: exists and does not come from this command")
+    assert tree(tmp_path) == before
+
+
+def test_simulate_replaces_its_own_files(tiny: Path, tmp_path: Path) -> None:
     for _ in range(2):
         assert main(["simulate", "--scene", str(tiny), "--out", str(tmp_path / "own")]) == 0
 
 
-def test_stress_does_not_replace_anothers_files(capsys, tmp_path: Path) -> None:
-    (tmp_path / "stress.json").write_text("another's")
-    said = _complaint(capsys, main(["stress", "--out", str(tmp_path)]))
-    assert said.startswith(f"{tmp_path / 'stress.json'}: exists and does not come from this command")
-    assert [path.name for path in tmp_path.iterdir()] == ["stress.json"]
-    assert (tmp_path / "stress.json").read_text() == "another's"
-
-
-def test_inspect_verify_and_export_take_a_dataset(capsys, tmp_path: Path) -> None:
-    data = str(reference())
-    assert main(["inspect", data, "--png", str(tmp_path / "a.png"), "--html", str(tmp_path / "a.html")]) == 0
-    assert "tiny, 0" in capsys.readouterr().out
+def test_inspect_verify_and_export_take_a_dataset(said: Run, tmp_path: Path) -> None:
+    data = reference()
+    assert "tiny, 0" in said("inspect", data, "--png", tmp_path / "a.png", "--html", tmp_path / "a.html")
     assert (tmp_path / "a.png").stat().st_size > 10_000
     assert (tmp_path / "a.html").read_text().lstrip().lower().startswith("<!doctype html>")
-    assert main(["inspect", data, "--json"]) == 0
-    assert len(json.loads(capsys.readouterr().out)["samples"]) == 5
-    assert main(["verify", data, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["ok"]
-    assert main(["export", data, "--format", "npz", "--out", str(tmp_path / "npz")]) == 0
-    assert "5 samples written to" in capsys.readouterr().out
+    assert len(json.loads(said("inspect", data, "--json"))["samples"]) == 5
+    assert json.loads(said("verify", data, "--json"))["ok"]
+    assert "5 samples written to" in said("export", data, "--format", "npz", "--out", tmp_path / "npz")
     assert len(list((tmp_path / "npz").iterdir())) == 5
 
 
-def test_verify_has_status_1_where_a_file_was_changed(capsys, tmp_path: Path) -> None:
+def test_verify_has_status_1_where_a_file_was_changed(said: Run, tmp_path: Path) -> None:
     copy = tmp_path / "d"
     shutil.copytree(reference(), copy)
     with (copy / "samples" / "000001" / "flow.exr").open("r+b") as file:
         file.truncate(3000)
-    assert main(["verify", str(copy)]) == 1
-    assert "FAILED" in capsys.readouterr().out
+    assert "FAILED" in said("verify", copy, status=1)
 
 
-def test_doctor_tells_what_there_is(capsys) -> None:
-    assert main(["doctor", "--json"]) == 0
-    findings = {finding["what"]: finding for finding in json.loads(capsys.readouterr().out)}
+def test_doctor_tells_what_there_is(said: Run) -> None:
+    findings = {finding["what"]: finding for finding in json.loads(said("doctor", "--json"))}
     assert findings["machine"]["state"] == "ok"
     assert "Mitsuba" in findings["rendering on the CPU"]["detail"]
     assert findings["meshing"]["state"] == "ok"
-    assert main(["doctor"]) == 0
-    assert "Mitsuba" in capsys.readouterr().out
+    assert "Mitsuba" in said("doctor")
 
 
-def test_doctor_says_how_to_get_what_is_missing(capsys, monkeypatch) -> None:
+def test_doctor_says_how_to_get_what_is_missing(said: Run, monkeypatch) -> None:
     import synth.doctor
 
     def nothing(name: str) -> str:
@@ -385,8 +349,7 @@ def test_doctor_says_how_to_get_what_is_missing(capsys, monkeypatch) -> None:
 
     monkeypatch.setattr(synth.doctor, "version", nothing)
     monkeypatch.setattr("synth.simulate.linear.has_pardiso", lambda: False)
-    assert main(["doctor", "--json"]) == 1
-    findings = {finding["what"]: finding for finding in json.loads(capsys.readouterr().out)}
+    findings = {finding["what"]: finding for finding in json.loads(said("doctor", "--json", status=1))}
     assert findings["meshing"] == {"what": "meshing", "state": "missing", "detail": "pip install pytetwild"}
     assert "pip install pypardiso" in findings["linear solver"]["detail"]
 

@@ -7,6 +7,7 @@ import pytest
 from tiny_scene import CONTACT, TEXT
 
 from synth.errors import InputError
+from synth.scene.sampling import draw
 from synth.scene.template import SCENES, checked_template, load_scene, replaced, shipped_scenes
 
 
@@ -22,7 +23,7 @@ def test_a_folder_of_a_scenes_name_does_not_hide_the_scene(tmp_path, monkeypatch
     assert load_scene("gelsight_mini").name == "gelsight_mini"
 
 
-def test_overrides_set_tables_lists_and_words(tiny: Path) -> None:
+def test_overrides_set_tables_lists_and_words_and_the_last_wins(tiny: Path) -> None:
     template = load_scene(
         tiny,
         [
@@ -32,6 +33,8 @@ def test_overrides_set_tables_lists_and_words(tiny: Path) -> None:
             "outputs.depth=true",
             'contact.indenter={ shape = "torus", radius_mm = 1.0, tube_mm = 0.3 }',
             "sensor.camera.position_mm=[0, 0, 21.5]",
+            "motion.steps=3",
+            "motion.steps=4",
         ],
     )
     scene = template.corners[0]
@@ -39,10 +42,7 @@ def test_overrides_set_tables_lists_and_words(tiny: Path) -> None:
     assert scene.outputs.depth
     assert scene.contact.indenter.shape == "torus"
     assert scene.sensor.camera.position_mm == (0, 0, 21.5)
-
-
-def test_later_overrides_win(tiny: Path) -> None:
-    assert load_scene(tiny, ["motion.steps=3", "motion.steps=4"]).corners[0].motion.steps == 4
+    assert scene.motion.steps == 4
 
 
 def test_corners_are_the_ends_of_the_distributions(tiny: Path) -> None:
@@ -57,23 +57,18 @@ def test_corners_see_every_option_of_nested_choices(tiny: Path) -> None:
     sphere = '{ shape = "sphere", radius_mm = { choice = [0.5, { uniform = [1.0, 2.0] }, 3.0] } }'
     cone = '{ shape = "cone", half_angle_deg = { choice = [30, 60] } }'
     template = load_scene(tiny, [f"contact.indenter={{ choice = [{cone}, {sphere}] }}", "motion.steps={choice=[1, 2]}"])
-    seen = {
-        (indenter.shape, *indenter.model_dump().values()) for indenter in (c.contact.indenter for c in template.corners)
-    }
-    angles = {c.contact.indenter.half_angle_deg for c in template.corners if c.contact.indenter.shape == "cone"}
-    radii = {c.contact.indenter.radius_mm for c in template.corners if c.contact.indenter.shape == "sphere"}
-    assert angles == {30, 60}
-    assert radii == {0.5, 1.0, 2.0, 3.0}
-    assert {c.motion.steps for c in template.corners} == {1, 2}
-    assert len(seen) == 6
+    indenters = {corner.contact.indenter for corner in template.corners}
+    assert {body.half_angle_deg for body in indenters if body.shape == "cone"} == {30, 60}
+    assert {body.radius_mm for body in indenters if body.shape == "sphere"} == {0.5, 1.0, 2.0, 3.0}
+    assert {corner.motion.steps for corner in template.corners} == {1, 2}
+    assert len(indenters) == 6
 
 
 def test_a_wrong_option_of_a_nested_choice_is_found_when_the_file_is_loaded(tiny: Path) -> None:
+    torus = '{ shape = "torus", radius_mm = 1, tube_mm = 0.2 }'
     sphere = '{ shape = "sphere", radius_mm = { choice = [1.0, -2.0] } }'
     with pytest.raises(InputError, match=r"contact.indenter.radius_mm = -2.0: must be greater than or equal to 0.05"):
-        load_scene(
-            tiny, [f'contact.indenter={{ choice = [{sphere}, {{ shape = "torus", radius_mm = 1, tube_mm = 0.2 }}] }}']
-        )
+        load_scene(tiny, [f"contact.indenter={{ choice = [{sphere}, {torus}] }}"])
 
 
 def test_replaced_asks_for_each_distribution_and_leaves_the_rest() -> None:
@@ -88,17 +83,16 @@ def test_replaced_asks_for_each_distribution_and_leaves_the_rest() -> None:
     assert asked == ["choice", "normal", "uniform"]  # by the keys' names, not by their order
 
 
-def test_hash_is_of_the_content_not_of_its_layout(tmp_path: Path, tiny: Path) -> None:
+def test_hash_and_draws_are_of_the_content_not_of_its_layout(tmp_path: Path, tiny: Path) -> None:
     template = load_scene(tiny)
     assert len(template.hash) == 16
-    parts = TEXT.split("[contact]")
-    assert CONTACT.strip().startswith("[contact]")
-    (tmp_path / "other.toml").write_text(
-        'description = "words"\nreferences = ["a book"]\nname = "tiny"\n[contact]'
-        + parts[1]
-        + parts[0].replace('name = "tiny"', "")
-    )
-    assert load_scene(tmp_path / "other.toml").hash == template.hash
+    name, words = 'name = "tiny"\n', 'description = "words"\nreferences = ["a book"]\n'
+    sensor = TEXT.removesuffix(CONTACT).replace(name, "")
+    (tmp_path / "other.toml").write_text(words + name + CONTACT + sensor)
+    other = load_scene(tmp_path / "other.toml")
+    assert other.hash == template.hash
+    one, same = draw(template, 3, 5), draw(other, 3, 5)
+    assert (one.sensor, one.contact, one.motion) == (same.sensor, same.contact, same.motion)
     assert load_scene(tiny, ["motion.steps=3"]).hash != template.hash
     assert load_scene(tiny, ["name=other"]).hash != template.hash
     assert pickle.loads(pickle.dumps(template)).hash == template.hash

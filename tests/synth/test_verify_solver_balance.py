@@ -7,36 +7,20 @@ comment "fails with" names a change of `synth.simulate` that was tried.
 import numpy as np
 import pytest
 from integrals import own_integrals
-from pads import MIXED, brick, run, scene
+from layered_pad import FILM, pad
+from pads import MIXED, SIZE, run, scene
 
 from synth.arrays import FloatArray
-from synth.mesh import PadMesh
 from synth.scene import Scene
 from synth.simulate import simulate
 from synth.simulate.material import pad_material
 from synth.simulate.space import Space
 
-SIZE = (8.0, 6.0, 4.0)
 E_MPA = 0.2
 DRAG = {"depth_mm": 0.8, "shear_mm": [0.5, -0.3], "twist_deg": 10.0, "position_mm": [0.4, 0.2], "steps": 3}
-BESIDE = {
-    "depth_mm": -0.1,
-    "position_mm": [4.0, 0.2],
-    "shear_mm": [3.1, 0.1],
-    "then": [
-        {"depth_mm": depth, "shear_mm": shear} for depth, shear in ((3, (3.1, 0.1)), (3, (2.5, 0.1)), (2.8, (2.5, 0.4)))
-    ],
-    "steps": 5,
-}
+LEGS = [{"depth_mm": z, "shear_mm": shear} for z, shear in ((3, (3.1, 0.1)), (3, (2.5, 0.1)), (2.8, (2.5, 0.4)))]
+BESIDE = {"depth_mm": -0.1, "position_mm": [4.0, 0.2], "shear_mm": [3.1, 0.1], "then": LEGS, "steps": 5}
 """Down beside the pad, into its side face, and along it."""
-FILM = {"thickness_mm": 1.0, "youngs_modulus_kpa": 2000.0, "poisson_ratio": 0.499, "stiffening": (0.1, 0.02)}
-
-
-def pad(layers: bool) -> PadMesh:
-    """Plain, or with the first of four planes of cells for a film."""
-    plain = brick(SIZE, (4, 4, 4 if layers else 3))
-    depth = plain.points[plain.tets][:, :, 2].mean(axis=1)
-    return PadMesh(plain.points, plain.tets, SIZE, ((depth > 1.0) & layers).astype(np.int32))
 
 
 def case(element: str, nu: float, friction: float, motion: dict, layers: bool = False) -> Scene:

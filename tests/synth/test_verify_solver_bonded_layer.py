@@ -18,20 +18,16 @@ LINEAR = 0.005
 """Depth over thickness; finite strain changes the force by some 0.2 % there (see the vanishing depth below)."""
 
 
-@pytest.mark.parametrize(("radius", "nu"), [(20.0, 0.5), (80.0, 0.5), (320.0, 0.5), (80.0, 0.4999), (80.0, 0.3)])
+@pytest.mark.parametrize(
+    ("radius", "nu"), [(20.0, 0.5), (80.0, 0.5), (320.0, 0.5), (80.0, 0.4999), (80.0, 0.3), (80.0, 0.2), (80.0, 0.0)]
+)
 def test_ball_on_a_layer(radius: float, nu: float) -> None:
     """Contact radii of 0.4, 0.8 and 1.9 thicknesses, where an incompressible layer is 1.4 to 10 times a half space."""
     # Fails with λ = 30 for ∞ at nu = 0.5, with multipliers that are never updated (R = 320: 1.7 %), and with the shear
     # modulus of nu = 0.4 throughout.
-    # Four elements across the contact leave 0.1 to 1 %, falling with their size (next test).
-    assert ball_ratio(p2p1(), nu, radius, LINEAR, 4) == pytest.approx(1.0, abs=0.012)
-
-
-@pytest.mark.parametrize("nu", [0.0, 0.2])
-def test_ball_on_a_foam(nu: float) -> None:
-    """Displacement-only, where no pressure field is needed."""
-    # Fails with the shear modulus of nu = 0.4.
-    assert ball_ratio(p2p1(), nu, 80.0, LINEAR, 4) == pytest.approx(1.0, abs=0.015)
+    # Four elements across the contact leave 0.1 to 1 %, falling with their size (next test); of foams (nu < 0.3), which
+    # have no pressure field, half as much again.
+    assert ball_ratio(p2p1(), nu, radius, LINEAR, 4) == pytest.approx(1.0, abs=0.012 if nu >= 0.3 else 0.015)
 
 
 @pytest.mark.parametrize("nu", [0.2, 0.5])

@@ -9,28 +9,19 @@ Each comment "fails with" names a change of `synth.simulate` that was tried.
 import numpy as np
 import pytest
 from energy_ledger import Account, accounted
-from pads import MIXED, brick, scene
+from layered_pad import FILM, pad
+from pads import ELEMENT, MIXED, SIZE, scene
 
 from synth.mesh import PadMesh
-from synth.simulate.element import p1p1, p2p1
 
-SIZE = (8.0, 6.0, 4.0)
-FILM = {"thickness_mm": 1.0, "youngs_modulus_kpa": 2000.0, "poisson_ratio": 0.499, "stiffening": (0.1, 0.02)}
 PRESS = {"depth_mm": 0.8}
 DRAG = {"depth_mm": 0.8, "shear_mm": [1.2, 0.3]}
 TWIST = {"depth_mm": 0.8, "shear_mm": [0.3, 0.2], "twist_deg": 40.0}
 
 
-def pad(layers: bool) -> PadMesh:
-    """Plain, or with the first of four planes of cells for a film."""
-    plain = brick(SIZE, (4, 4, 4 if layers else 3))
-    depth = plain.points[plain.tets][:, :, 2].mean(axis=1)
-    return PadMesh(plain.points, plain.tets, SIZE, ((depth > 1.0) & layers).astype(np.int32))
-
-
 def landing(mesh: PadMesh, element: str) -> tuple[float, float]:
     """The contact point nearest to the pad's middle: there the ball touches from the start of its way."""
-    shape = (p1p1() if element == "p1p1" else p2p1()).face_barycentric
+    shape = ELEMENT[element]().face_barycentric
     points = np.einsum("qa,fac->fqc", shape, mesh.points[mesh.contact_nodes][mesh.contact_faces.faces]).reshape(-1, 3)
     x, y, _ = points[np.argmin(np.linalg.norm(points, axis=1))]
     return float(x), float(y)

@@ -10,13 +10,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from closed_forms import NEO_HOOKEAN, YEOH, Stiffening, piola, shear_traction, uniaxial
+from layered_pad import layered
 from pads import crooked
 from problems import equilibrium, face_load, supported
 
-from synth.arrays import BoolArray, Points
+from synth.arrays import BoolArray, FloatArray, Points
 from synth.mesh import PadMesh
 from synth.simulate.element import Element, p1p1, p2p1
 from synth.simulate.material import Material, uniform
+from synth.simulate.space import Space
 
 MESH = crooked()
 LENGTH, WIDTH, HEIGHT = MESH.size_mm
@@ -40,6 +42,17 @@ def plates(points: Points) -> BoolArray:
     return np.repeat(((points[:, 2] == 0) | (points[:, 2] == HEIGHT))[:, None], 3, axis=1)
 
 
+def check_bar(space: Space, material: Material, stretches: tuple[float, float], pull: float, steps: int) -> FloatArray:
+    """Draw a bar to its longitudinal and lateral stretch: uniform strain, a pulling force, and all nodal forces."""
+    stretch, lateral = stretches
+    corner = np.array([-LENGTH / 2, -WIDTH / 2, HEIGHT])
+    exact = (space.points - corner) * (np.array([stretch, lateral, lateral]) - 1)
+    _, state, force = equilibrium(space, material, exact, steps=steps)
+    np.testing.assert_allclose(state.u, exact, atol=CLOSE)
+    assert force[space.points[:, 0] == LENGTH / 2, 0].sum() == pytest.approx(pull, rel=CLOSE)
+    return force
+
+
 @pytest.mark.parametrize("element", ELEMENTS)
 @pytest.mark.parametrize("stiffening", [NEO_HOOKEAN, YEOH])
 @pytest.mark.parametrize("nu", RATIOS)
@@ -49,12 +62,8 @@ def test_uniaxial_stretch(stretch: float, nu: float, stiffening: Stiffening, ele
     # with the sign of p/λ turned in D, and with F g for F^-T g in the volumetric force.
     space = supported(MESH, element(), bar)
     lateral, stress = uniaxial(stretch, nu, stiffening)
-    corner = np.array([-LENGTH / 2, -WIDTH / 2, HEIGHT])
-    exact = (space.points - corner) * (np.array([stretch, lateral, lateral]) - 1)
-    _, state, force = equilibrium(space, uniform(len(MESH.tets), nu, stiffening), exact, steps=8)
-    np.testing.assert_allclose(state.u, exact, atol=CLOSE)
-    pull = force[space.points[:, 0] == LENGTH / 2, 0].sum()
-    assert pull == pytest.approx(stress * WIDTH * HEIGHT, rel=CLOSE)
+    material = uniform(len(MESH.tets), nu, stiffening)
+    force = check_bar(space, material, (stretch, lateral), stress * WIDTH * HEIGHT, steps=8)
     # The smooth walls feel nothing: lateral stress vanishes.
     np.testing.assert_allclose(force[:, 1:], 0.0, atol=CLOSE)
 
@@ -93,19 +102,13 @@ def test_layers_side_by_side_stretch_alike(element: Callable[[], Element]) -> No
     points = MESH.points.copy()
     middle = np.abs(points[:, 2] - HEIGHT / 2) < 0.4 * HEIGHT / 2
     points[middle, 2] = HEIGHT / 2  # a flat interface; the rest stays crooked
-    above = points[MESH.tets][:, :, 2].mean(axis=1) > HEIGHT / 2
-    mesh = PadMesh(points, MESH.tets, MESH.size_mm, above.astype(np.int32))
+    mesh = layered(PadMesh(points, MESH.tets, MESH.size_mm), HEIGHT / 2)
     assert mesh.volumes.min() > 0
-    soft = uniform(len(mesh.tets), nu)
+    soft, above = uniform(len(mesh.tets), nu), mesh.layer == 1
     shear = np.where(above, soft.shear, ratio * soft.shear)
     material = Material(shear, soft.lame, np.where(above[:, None], 0.0, YEOH), soft.mixed)
     space = supported(mesh, element(), bar)
-    corner = np.array([-LENGTH / 2, -WIDTH / 2, HEIGHT])
-    exact = (space.points - corner) * (np.array([stretch, lateral, lateral]) - 1)
-    _, state, force = equilibrium(space, material, exact, steps=4)
-    np.testing.assert_allclose(state.u, exact, atol=CLOSE)
-    pull = force[space.points[:, 0] == LENGTH / 2, 0].sum()
-    assert pull == pytest.approx((ratio * yeoh + neo_hookean) * WIDTH * HEIGHT / 2, rel=CLOSE)
+    check_bar(space, material, (stretch, lateral), (ratio * yeoh + neo_hookean) * WIDTH * HEIGHT / 2, steps=4)
 
 
 def test_closed_forms_agree_with_each_other() -> None:
