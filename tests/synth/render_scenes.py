@@ -19,10 +19,7 @@ DIRECT = Render(samples_per_pixel=36, max_depth=2)
 
 
 def small_sensor(
-    index: float = 1.0,
-    pattern: Pattern | None = None,
-    lights: tuple[Light, ...] | None = None,
-    **camera: object,
+    index: float = 1.0, pattern: Pattern | None = None, lights: tuple[Light, ...] | None = None, **camera: object
 ) -> Sensor:
     """A pad of 12 x 9 x 3 mm seen at about 8 px per mm from the height of 20 mm, slightly off its middle."""
     numbers: dict = {"width": 80, "height": 60, "fx": 140.0, "fy": 140.0, "cx": 42.5, "cy": 28.5}

@@ -43,11 +43,7 @@ def texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def translation_sample(
-    index: int = 0,
-    shift: tuple[float, float] = (1.25, -0.5),
-    *,
-    dtype: type = np.uint8,
-    grey: bool = False,
+    index: int = 0, shift: tuple[float, float] = (1.25, -0.5), *, dtype: type = np.uint8, grey: bool = False
 ) -> Sample:
     """The gel moves by `shift` px. The last two columns see no gel; what moves off the image is not visible."""
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]

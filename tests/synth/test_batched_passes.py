@@ -27,8 +27,6 @@ def sliding(body: dict[str, Any]) -> Scene:
 
 def test_a_pass_that_goes_too_far_is_given_up() -> None:
     """As soon as it does; what is taken has stayed within reach, and the other passes take penetration away."""
-    # Fails with `too_far` left out of `evaluate_trial`, with the distance from another place than the last solution,
-    # with a reach that is not renewed for each pass, and with closer = 1.
     posed = sliding(BOX)
     mesh = brick(counts=(4, 4, 2))
     run = Run(presses_of([posed], mesh), prepare(posed, mesh, "cpu"), None, 1, STRICT)
@@ -64,7 +62,6 @@ def test_a_pass_that_goes_too_far_is_given_up() -> None:
 
 
 def test_so_does_the_solver_for_one_sample(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Fails without a reach in `_augmented`.
     solve, given = stepping.solve, []
 
     def watched(system: Any, start: Any, *others: Any) -> Any:

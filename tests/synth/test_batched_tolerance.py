@@ -40,8 +40,6 @@ def led(posed: Scene, driver: SolverOptions, frames: frozenset[int] | None = Non
 @pytest.mark.parametrize("penalty", [50.0, 3000.0])
 def test_what_is_recorded_meets_the_full_tolerance(penalty: float) -> None:
     """After whole passes, and where none is needed, so that only a loose step came before."""
-    # Fails with a record at the end of the passes whatever the residual is (3,000), or with that and every pass loose
-    # (both).
     one, other = led(pressed(penalty), STRICT_WAY), led(pressed(penalty), LOOSE_WAY)
     assert one.status == other.status == "complete"
     assert sum(s.newton_iterations for s in other.states) < sum(s.newton_iterations for s in one.states)
@@ -54,7 +52,6 @@ def test_what_is_recorded_meets_the_full_tolerance(penalty: float) -> None:
 
 def test_states_that_are_not_corrected_meet_it_too() -> None:
     """And the way does not depend on which are: the corrected one is the same to the bit."""
-    # Fails with a record without corrections whatever the residual is.
     every, last = led(pressed(), LOOSE_WAY), led(pressed(), LOOSE_WAY, frozenset({2}))
     assert max(state.residual for state in last.states) <= TOLERANCE
     assert last.states[1].max_penetration_mm > every.states[1].max_penetration_mm
@@ -63,7 +60,6 @@ def test_states_that_are_not_corrected_meet_it_too() -> None:
 
 def test_a_state_without_balance_to_the_full_tolerance_leaves_no_trace(monkeypatch: pytest.MonkeyPatch) -> None:
     """One iteration suffices for the way, but not even two for what is to be recorded: back to where the step began."""
-    # Fails with a state that stays the rejected one, or with anchors that are not put back.
     monkeypatch.setattr(running, "MAX_ITERATIONS", 1)
     posed = pressed(5000.0, depth_mm=0.2, steps=1)
     pad = prepare(posed, MESH, "cpu")

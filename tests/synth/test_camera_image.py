@@ -70,7 +70,6 @@ def test_blur_is_a_normalised_gaussian() -> None:
 
 
 def test_a_grey_image_is_a_channel_of_a_grey_coloured_one() -> None:
-    """Fails without the reshape after the blur: OpenCV drops the axis of a single channel."""
     camera = _camera(blur_px=0.8, vignetting=0.3)
     ramp = np.linspace(0, 1, 150 * 200, dtype=np.float32).reshape(150, 200, 1)
     grey, colour = (expected_signal(image, camera) for image in (ramp, np.repeat(ramp, 3, axis=2)))
@@ -97,7 +96,6 @@ def _lit_from_two_sides(shot_noise: float) -> Sensor:
 @needs_llvm
 @pytest.mark.parametrize("shot_noise", [0.01, 0.02])
 def test_auto_keeps_render_noise_below_a_quarter_of_the_cameras(shot_noise: float) -> None:
-    """Fails with a SHARE of 1, and with the pilots' own number taken for the answer."""
     sensor = _lit_from_two_sides(shot_noise)
     surface = flat_surface(sensor)
     renderer = Renderer(sensor, Render(samples_per_pixel="auto", max_depth=2), surface, plain(), FAST)
@@ -130,7 +128,7 @@ def test_quantisation_is_noise_too() -> None:
 
 @pytest.mark.parametrize("level", [0.0, 0.002, 0.2])
 def test_the_cameras_noise_is_that_of_its_photographs(level: float) -> None:
-    """In the dark, too. Fails with the response's slope at the darkest grey in place of the quadrature."""
+    """In the dark, too."""
     camera = small_sensor(read_noise=0.004, shot_noise=0.01, bit_depth=16).camera
     radiance = np.full((60, 80, 3), level, dtype=np.float32)
     photograph = camera_image(radiance, camera, np.random.default_rng(0)) / 65535

@@ -92,7 +92,6 @@ def test_the_flow_is_each_cameras_own(dataset):
 
 
 def test_verify_checks_every_camera(dataset, tmp_path):
-    """Fails with `views` reduced to the main camera in `verify_sample`."""
     report = verify_dataset(dataset)
     assert report.ok, report.record()
     names = {check.name for check in report.samples[0].checks}

@@ -74,7 +74,6 @@ def _elsewhere(directory: Path, shard: str, indices: str) -> Iterator["subproces
 
 
 def test_one_after_the_other(tmp_path: Path) -> None:
-    """Fails with `_tidy` left out of `finalise`: the lines stay in shards/."""
     expected = _in_one_go(tmp_path / "one")
     for shard, own in (("1/2", [2, 3]), ("0/2", [0, 1, 4, 5])):
         with DatasetWriter(tmp_path / "d", job(N), Shard.parse(shard), PAIRS) as writer:
@@ -87,7 +86,6 @@ def test_one_after_the_other(tmp_path: Path) -> None:
 
 
 def test_the_last_to_leave_joins(tmp_path: Path) -> None:
-    """Fails with joining by everyone who leaves: what the other has half written is removed under it."""
     expected = _in_one_go(tmp_path / "one")
     with _elsewhere(tmp_path / "d", "0/2", "0 1 4") as other:
         with DatasetWriter(tmp_path / "d", job(N), Shard(1, 2), PAIRS) as writer:
@@ -129,7 +127,6 @@ def test_a_killed_shard_is_taken_in_by_whoever_is_next(tmp_path: Path) -> None:
 
 
 def test_who_is_refused_beside_a_shard(tmp_path: Path) -> None:
-    """Fails with a lock that all take alone (second shard refused) or all share (plain run let in)."""
     directory = tmp_path / "d"
     with _elsewhere(directory, "0/2", "0") as other:
         before = tree(directory)

@@ -1,7 +1,4 @@
-"""Domed gels: schema, mesh, undeformed face, the indenter's path and footprint, against closed forms.
-
-Each comment "fails with" names a change of `synth` that was tried.
-"""
+"""Domed gels: schema, mesh, undeformed face, the indenter's path and footprint, against closed forms."""
 
 import math
 from pathlib import Path
@@ -59,8 +56,6 @@ def volume_below_sphere(a: float, b: float, R: float) -> float:
 
 def test_mesh_fills_the_cap_at_second_order() -> None:
     """Chords of a convex face leave a little of the gel out, a quarter of it with elements half as long."""
-    # Fails with z + z_face in place of the map, and with face_height of 2 r² / (R + sqrt(R² - r²)): tetrahedra turn
-    # over.
     x, y, thickness = SIZE
     exact = x * y * thickness - (x * y * RADIUS - volume_below_sphere(x / 2, y / 2, RADIUS))
     lack = []
@@ -78,7 +73,6 @@ def test_mesh_fills_the_cap_at_second_order() -> None:
 
 
 def test_nodes_of_the_face_lie_on_the_sphere_and_the_others_where_the_map_says() -> None:
-    """Fails with points[:, 2] == 0 in place of PadMesh.on_face: one node is left of the face."""
     counts = Counts((6, 4), (3, 2), 3)
     flat = graded_box(SIZE, Focus((2.0, 1.0), (2.0, 2.0)), counts, (0.5,))
     mesh = domed(flat, RADIUS)
@@ -98,7 +92,6 @@ def test_nodes_of_the_face_lie_on_the_sphere_and_the_others_where_the_map_says()
 
 
 def test_ftetwild_meshes_are_bulged_or_refused(tmp_path: Path) -> None:
-    """Fails with `domed` left out of `pad_mesh`; and, the second, with its check of the volumes left out."""
     numerics = Numerics(edge_length_mm=2.0)
     mesh = pad_mesh(gel(), numerics, [tmp_path])
     again = pad_mesh(gel(), numerics, [tmp_path])
@@ -125,7 +118,6 @@ def test_ftetwild_meshes_are_bulged_or_refused(tmp_path: Path) -> None:
     ],
 )
 def test_a_dome_must_stay_clear_of_the_window(size: tuple[float, float, float], least: float) -> None:
-    """Fails with THINNEST left out of `deepest`, and with STEEPEST_DEG = 89."""
     assert gel(least * 1.001, size).dome_radius_mm == least * 1.001
     with pytest.raises(ValidationError, match=r"dome_radius_mm = .* at its corners, 10 mm .* use at least"):
         gel(least * 0.999, size)
@@ -151,7 +143,6 @@ def optics_of_a_fisheye() -> tuple[Sensor, Optics]:
 
 @pytest.mark.parametrize("parts", [3, 6])
 def test_rays_meet_the_undeformed_dome_where_they_meet_the_sphere(parts: int) -> None:
-    """Fails with the bulge left out of `GelSurface.material`: 0.025 mm off."""
     _, optics = optics_of_a_fisheye()
     counts = Counts((8, 8), (4, 4), 2)
     mesh = domed(graded_box(SIZE, Focus((0.0, 0.0), (4.0, 3.0)), counts), RADIUS)
@@ -183,7 +174,6 @@ def test_shape_of_the_surface_at_rest() -> None:
 
 
 def test_verify_finds_a_dome_of_another_radius() -> None:
-    """Fails with the smaller root of the sphere's equation in `check_dome`."""
     sensor, _ = optics_of_a_fisheye()
     camera = ForwardCamera.of(sensor)
     for element in (p1p1(), p2p1()):
@@ -205,7 +195,6 @@ def path(
 
 
 def test_depth_counts_from_the_face_below_the_position() -> None:
-    """Fails with `face_mm` left out of `LoadPath._level`."""
     ball = Sphere(shape="sphere", radius_mm=3.0)
     way = path(ball, (3.0, -4.0), 0.7, RADIUS, shear_mm=(1.0, 0.5))
     lowest = [way.pose(s).centre[2] + 3.0 for s in (way.press_mm, way.length_mm)]
@@ -216,7 +205,6 @@ def test_depth_counts_from_the_face_below_the_position() -> None:
 
 
 def test_the_path_starts_where_the_body_first_touches() -> None:
-    """Fails with `touch_mm` = 0, and with `reach_mm` left out of `LoadPath._level`."""
     p, r = 5.0, 3.0
     s = math.sqrt(RADIUS**2 - p**2)
     # Two balls touch where their centres are R + r apart: (R + r)² = p² + (s + r - t)².
@@ -239,7 +227,6 @@ def test_the_path_starts_where_the_body_first_touches() -> None:
 
 @pytest.mark.parametrize("depth", [0.05, 0.8])
 def test_footprint_is_the_lens_that_two_spheres_share(depth: float) -> None:
-    """Fails with the face's height left out of `_lack` (the overlap with the box is wider), or its slope."""
     r = 3.0
     way = path(Sphere(shape="sphere", radius_mm=r), (0.0, 0.0), depth, RADIUS)
     apart = RADIUS + r - depth
@@ -269,14 +256,13 @@ def test_a_dome_of_a_kilometre_has_the_flat_pads_footprint() -> None:
 
 
 def test_shape_and_radius_belong_together() -> None:
-    """Fails with either half of the comparison left out."""
     for radius, shape in ((None, "dome"), (RADIUS, "box")):
         with pytest.raises(ValidationError, match="belong together"):
             gel(radius, shape=shape)
 
 
 def test_lights_outside_the_dome_are_refused() -> None:
-    """0.1 mm behind the face at the apex is outside of the gel near a corner. Fails with the apex's height there."""
+    """0.1 mm behind the face at the apex is outside of the gel near a corner."""
     raw = scene(SIZE, gel={"shape": "dome", "dome_radius_mm": RADIUS}).model_dump()
     assert raw["sensor"]["lights"][0]["position_mm"] == (0.0, 0.0, 0.1)
     raw["sensor"]["lights"][0]["position_mm"] = (SIZE[0] / 2, SIZE[1] / 2, 0.1)

@@ -1,7 +1,4 @@
-"""Domed pads in the simulation: the limit of a flat pad, and a plate on a dome against linear layer theory.
-
-Each comment "fails with" names a change of `synth` that was tried.
-"""
+"""Domed pads in the simulation: the limit of a flat pad, and a plate on a dome against linear layer theory."""
 
 from typing import Any
 
@@ -40,7 +37,6 @@ def pressed(drawn: Scene, focus: Focus, across: int) -> Trajectory:
 
 
 def test_a_dome_of_a_kilometre_is_a_flat_pad() -> None:
-    """Fails with points[:, 2] == 0 for PadMesh.on_face: nothing of the face carries a traction."""
     size, motion = (10.0, 8.0, 4.0), {"position_mm": (0.8, -0.5), "depth_mm": 0.5}
     radius, focus = 1e6, Focus((0.8, -0.5), (1.0, 1.0))
     flat, dome = (pressed(scene(r, size, BALL, steps=1, **motion), focus, 4).states[-1] for r in (None, radius))
@@ -58,7 +54,6 @@ def test_a_plate_on_a_dome_follows_hertz_and_the_layer() -> None:
 
     Hertz's F = 4/3 E* √R δ^1.5 is its limit for thick pads; the integral equation holds for the pad's 12 mm.
     """
-    # Fails with the dome's mid-edge nodes left on the chords, in `synth.simulate.space`.
     radius, size = 24.0, (24.0, 24.0, 12.0)
     depths, forces = [0.04, 0.08], []
     contact, _ = ball(depths[-1], radius, size[2])
@@ -82,10 +77,7 @@ def test_a_plate_on_a_dome_follows_hertz_and_the_layer() -> None:
 
 
 def test_pressed_beside_the_apex_the_plate_meets_the_apex() -> None:
-    """A plate has no position: its force is that of the level it is at.
-
-    Fails with `face_mm` left out of `Path._level`: it ends 0.34 mm higher.
-    """
+    """A plate has no position: its force is that of the level it is at."""
     radius, size, focus = 24.0, (14.0, 14.0, 6.0), Focus((0.0, 0.0), (3.0, 3.0))
     level = 0.4
     force = []
@@ -100,7 +92,6 @@ def test_pressed_beside_the_apex_the_plate_meets_the_apex() -> None:
 
 
 def test_mesh_and_scene_must_be_of_one_dome() -> None:
-    """Fails with dome_radius_mm left out of the comparison in `synth.simulate.solve`."""
     focus = Focus((0.0, 0.0), (1.0, 1.0))
     drawn = scene(20.0, (10.0, 8.0, 4.0), BALL, depth_mm=0.1)
     flat = scene(None, (10.0, 8.0, 4.0), BALL, depth_mm=0.1)
@@ -109,7 +100,6 @@ def test_mesh_and_scene_must_be_of_one_dome() -> None:
 
 
 def test_many_at_once_press_the_dome_as_one_does() -> None:
-    """Fails with `face_mm` left out of `synth.simulate.batched.presses`: the indenter stays 0.36 mm higher."""
     drawn = scene(8.0, (8.0, 6.0, 4.0), BALL, position_mm=(2.0, -1.2), depth_mm=0.3, steps=2, friction=0.4)
     drawn = drawn.model_copy(update={"numerics": Numerics(element="p1p1", tolerance=1e-9)})
     mesh = domed(brick(counts=(4, 4, 2)), 8.0)

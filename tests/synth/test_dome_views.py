@@ -1,7 +1,4 @@
-"""Domed gels in the picture: flow, visibility and renderings of a curved face; the scene `densetact`, start to end.
-
-Each comment "fails with" names a change of `synth` that was tried.
-"""
+"""Domed gels in the picture: flow, visibility and renderings of a curved face; the scene `densetact`, start to end."""
 
 from pathlib import Path
 
@@ -40,7 +37,6 @@ def _sensor(view: dict) -> Sensor:
 
 @pytest.mark.parametrize("view", VIEWS)
 def test_flow_is_the_independent_projections(view: str) -> None:
-    """Fails with rays that enter at z = 0 in place of the slab's top, or leave at its top, in `synth.flow.trace`."""
     sensor, surface = _sensor(VIEWS[view]), rest_surface(DOME)
     for first in (surface.material, dented(surface.material, 0.3)):
         flow, checks = motion_checks(sensor, surface, first, dented(surface.material, 1.1, (0.8, -0.5)))
@@ -57,11 +53,7 @@ NAME = "densetact"
 
 @needs_llvm
 def test_densetact_generates_and_verifies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Small, coarse and noisy, but all of the chain.
-
-    Fails with `flat_surface` for the undeformed picture (`RenderSession`): image 1 is then that of another gel (1.3 px
-    in the photometry); and with `domed` left out of `graded_mesh`.
-    """
+    """Small, coarse and noisy, but all of the chain."""
     own_cache(monkeypatch)
     small = ["width=120", "height=120", "fx=75.0", "fy=75.0", "cx=60.0", "cy=60.0"]
     overrides = [f"sensor.camera.{setting}" for setting in small]

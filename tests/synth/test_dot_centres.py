@@ -82,10 +82,6 @@ def _centroid(darkness: FloatArray, near: FloatArray) -> FloatArray | None:
 @needs_llvm
 @pytest.mark.parametrize("view", VIEWS)
 def test_dot_centres_move_as_the_flow_says(view):
-    """Fails with `_reflect` left out of `CameraRays.sample`, and with 3 k1 for k1 in `_unbend`.
-
-    On domes with z left out of `GelMesh.positions`: dots move otherwise by 0.05 and 0.07 px in the mean.
-    """
     sensor = VIEWS[view]
     radius = sensor.gel.dome_radius_mm
     surface = SURFACE if radius is None else rest_surface(sensor.gel)

@@ -35,11 +35,7 @@ VIEWS = {
 
 @pytest.mark.parametrize("view", VIEWS)
 def test_flow_is_the_independent_projections(view):
-    """Reflected points, Fermat's principle and OpenCV's lenses against virtual cameras, Snell's law and own lenses.
-
-    Fails with `project` given path 0 for all pixels in `exact_flow`: every mirror view, by 30 px. Fails with the sign
-    of k2 changed in `FisheyeLens._distorted`: the fisheye views, by 7e-4 and 0.24 px.
-    """
+    """Reflected points, Fermat's principle and OpenCV's lenses against virtual cameras, Snell's law and own lenses."""
     surface = sheet(30, 22, 20.0, 15.0, 2)
     flow, checks = motion_checks(
         sensor(**VIEWS[view]), surface, dented(surface.material, 0.3), dented(surface.material, 1.1, (0.8, -0.5))
@@ -56,11 +52,7 @@ def test_flow_is_the_independent_projections(view):
 
 @pytest.mark.parametrize("view", ["mirrors", "fisheye and mirrors"])
 def test_folds_in_mirrors_are_hidden_rightly(view):
-    """The sheet folds over at x = 3 and covers 0 < x < 3 from 1 mm above, of which either mirror sees a part.
-
-    Fails with the comparison of paths left out of `View.motion`: pixels that left their mirror are called visible; and
-    with `reached_by` left out of `derive`: the derivation calls them visible.
-    """
+    """The sheet folds over at x = 3 and covers 0 < x < 3 from 1 mm above, of which either mirror sees a part."""
     surface = sheet(40, 24, 20.0, 15.0, 2)
     over = folded(surface.material, 3.0, 3 / 7) + np.array([0.0, 0.3, 0.0])
     flow, checks = motion_checks(sensor(**VIEWS[view]), surface, surface.material, over)
@@ -98,7 +90,6 @@ def test_motion_in_an_upright_mirror_in_numbers():
 
 
 def test_verify_finds_a_pixel_that_leaves_its_mirror():
-    """Fails with `reached_by` left out of `synth.verify.motion.derive`."""
     surface = sheet(30, 22, 20.0, 15.0, 2)
     states = surface.material, surface.material + np.array([0.5, 0.2, 0.0])
     view = VIEWS["mirrors"]

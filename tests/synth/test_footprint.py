@@ -1,4 +1,4 @@
-"""Footprints of indenters against closed forms. "Fails with" names a change that was tried.
+"""Footprints of indenters against closed forms.
 
 The rectangle may fall short of the true one on each side by RESOLUTION times its smaller width (`slack`), never more.
 It exceeds it only where that is below FINEST_MM and cells that may hold a part of the body are counted in: by a cell,
@@ -48,14 +48,12 @@ def square(half: float, x: float = 0.0, y: float = 0.0) -> tuple[tuple[float, fl
 
 @pytest.mark.parametrize("depth", [0.01, 0.5, 1.0, 2.0])
 def test_sphere(depth: float) -> None:
-    # Fails with only those cells halved whose centre is inside.
     radius = np.sqrt(2 * 4.0 * depth - depth**2)
     assert_covers(print_of(SPHERE, depth_mm=depth, position_mm=(1.0, -2.0)), *square(radius, 1.0, -2.0))
 
 
 def test_what_lies_inside_the_gel_counts_not_only_the_cut_at_its_face() -> None:
     """A needle's ball has passed the face: its cut there is a point, its overlap as wide as the ball."""
-    # Fails with only the plane z = 0 searched.
     ball = Sphere(shape="sphere", radius_mm=0.3)
     assert_covers(print_of(ball, depth_mm=0.6), *square(0.3))
 
@@ -74,7 +72,6 @@ def test_turned_box() -> None:
 
 
 def test_bar_that_lies_askew() -> None:
-    # Fails with the rotation transposed: the bar then lies along x.
     bar = Cylinder(shape="cylinder", radius_mm=2.0, length_mm=8.0, fillet_mm=0.1, rotation_deg=(0.0, 90.0, 30.0))
     cos, sin, half_width = np.cos(np.pi / 6), np.sin(np.pi / 6), np.sqrt(1.75)
     x, y = 4.0 * cos + half_width * sin, 4.0 * sin + half_width * cos
@@ -84,7 +81,6 @@ def test_bar_that_lies_askew() -> None:
 
 def test_tilted_box() -> None:
     """A roof: the block's edge along y goes first, the overlap is a triangle of 45 degree slopes."""
-    # Fails with the normal left in the body's frame: cells are then excluded that hold a part of it.
     box = Box(shape="box", size_mm=(4.0, 5.0, 4.0), fillet_mm=0.01, rotation_deg=(0.0, 45.0, 0.0))
     focus = print_of(box, depth_mm=1.0)
     # A rounded edge of radius r reaches r (sqrt 2 - 1) less far than the sharp one, which widens the cut by as much.
@@ -114,7 +110,6 @@ def test_mesh(tmp_path: Path) -> None:
 
 
 def test_shear_adds_what_the_indenter_reaches() -> None:
-    # Fails with the drag left out.
     radius = np.sqrt(7.0)
     focus = print_of(SPHERE, depth_mm=1.0, shear_mm=(2.0, -1.0))
     assert_covers(focus, (-radius, -radius - 1.0), (radius + 2.0, radius))
@@ -123,7 +118,7 @@ def test_shear_adds_what_the_indenter_reaches() -> None:
 def test_margin_enlarges_the_press_and_not_the_drag() -> None:
     radius = np.sqrt(7.0)
     focus = print_of(SPHERE, 0.2, depth_mm=1.0, shear_mm=(2.0, 0.0))
-    # Fails with the margin added to the drag, too. A margin carries the resolution along.
+    # A margin carries the resolution along.
     assert_covers(focus, (-1.2 * radius, -1.2 * radius), (radius + 2.0, 1.2 * radius), 1.2 * RESOLUTION * 2 * radius)
     smaller = print_of(SPHERE, -0.1, depth_mm=1.0)
     assert_covers(smaller, *square(0.9 * radius))
@@ -132,7 +127,6 @@ def test_margin_enlarges_the_press_and_not_the_drag() -> None:
 
 
 def test_twist_sweeps_the_corners() -> None:
-    # Fails with poses at the ends of the path only: the diagonal passes the axes on the way.
     box = Box(shape="box", size_mm=(6.0, 2.0, 3.0), fillet_mm=0.01)
     focus = print_of(box, depth_mm=0.5, twist_deg=90.0)
     # Poses 90 / 32 degrees apart come within 1.41 degrees of the diagonal, 3.0 mm cos-close: short by 3e-4 of it.
@@ -141,7 +135,6 @@ def test_twist_sweeps_the_corners() -> None:
 
 
 def test_later_poses_count() -> None:
-    # Fails with the path's end taken at the end of the first drag.
     then = (Pose(depth_mm=2.0, shear_mm=(-1.0, 0.0)), Pose(depth_mm=0.0))
     focus = print_of(SPHERE, depth_mm=1.0, shear_mm=(1.0, 0.0), then=then)
     deep = np.sqrt(12.0)
@@ -157,7 +150,6 @@ def test_no_touch_leaves_a_small_zone_where_the_indenter_is() -> None:
 
 
 def test_never_larger_than_the_pad() -> None:
-    # Fails with the result not clipped.
     plate = Box(shape="box", size_mm=(100.0, 100.0, 20.0), fillet_mm=0.2)
     assert_covers(print_of(plate, depth_mm=0.2), (-10.0, -7.5), (10.0, 7.5))
     assert print_of(plate, 0.5, depth_mm=0.2) == Focus((0.0, 0.0), (10.0, 7.5))
@@ -172,7 +164,6 @@ def test_never_larger_than_the_pad() -> None:
 ], ids=["plane-like", "ring", "ring on edge"])  # fmt: skip
 def test_the_slightest_touch_is_found(indenter: Indenter) -> None:
     """It ends, near the first point of contact; the search stops at FINEST_MM."""
-    # Fails with the ring's distance taken for convex, and with a FINEST_MM of 1e-5 in the search.
     focus = print_of(indenter, depth_mm=1e-6)
     curvature_radius = {500.0: 500.0}.get(getattr(indenter, "radius_mm", 0.0), 3.5)
     # Where the gap is below a cell's diagonal, nothing can be excluded: sqrt(2 R sqrt(3) FINEST_MM) from the contact.

@@ -63,7 +63,6 @@ def test_growing_in_steps_gives_the_same_files(tiny: Path, tmp_path: Path) -> No
 
 
 def test_three_shards_in_any_order_give_the_same_files(tiny: Path, tmp_path: Path) -> None:
-    """Fails with shards of blocks of trajectories (counts), or with another step through them (files are missing)."""
     template, out = load_scene(tiny), tmp_path / "d"
     done = [generate(template, 5, out, scheduling=Scheduling(shard=Shard(k, 3))) for k in (2, 0, 1)]
     assert [(s.shard, s.made, s.asked_for, s.found) for s in done] == [  # trajectories of samples 0 1 | 2 3 | 4

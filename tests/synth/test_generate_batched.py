@@ -1,7 +1,7 @@
 """Samples by the batched solver: the same whatever ran beside them, and the single solver's within its tolerance.
 
-The scene's draws fail in every way: bodies that cannot be built, bodies too thin for the mesh, and draws that break the
-schema; its sensors have two different pads. Comments "fails with" name changes that were tried.
+The scene's draws fail in every way: bodies that cannot be built, bodies too thin for the mesh, and draws that break
+the schema; its sensors have two different pads.
 """
 
 import hashlib
@@ -81,7 +81,6 @@ def _tasks(numbers: Iterable[int]) -> Iterator[Task]:
 
 
 def test_batch_and_shards_change_no_bit(template: Template, whole: Path, tmp_path: Path) -> None:
-    # Fails with the first trajectory's frames for all, and with a chunk's failed draws forgotten.
     out = tmp_path / "d"
     for number, batch in ((1, 1), (0, 3)):
         generate(template, SAMPLES, out, SEED, scheduling=Scheduling(batch=batch, shard=Shard(number, 2)))
@@ -91,7 +90,6 @@ def test_batch_and_shards_change_no_bit(template: Template, whole: Path, tmp_pat
 @pytest.mark.skipif(not HAS_PROC, reason="finds child processes in Linux's /proc")
 def test_killed_with_workers_and_gone_on_with_alone(template: Template, whole: Path, tmp_path: Path) -> None:
     """The driver with solver and renderer is killed; nobody is left behind, what is on record stays."""
-    # Fails with workers that do not watch their driver.
     out = tmp_path / "d"
     process = start(template.source, out, "--n", str(SAMPLES), "--seed", str(SEED), "--workers", "2")
     wait_for("the first sample", lambda: lines(out) > 0, process)
@@ -110,7 +108,6 @@ def test_killed_with_workers_and_gone_on_with_alone(template: Template, whole: P
 
 def test_one_trajectory_alone_is_the_same(context: JobContext, whole: Path) -> None:
     """As a task of a cluster. Its second draw can be used."""
-    # Fails with the single solver in `Producer`.
     outcome = Producer(context).produce(4, (8, 9))
     assert [failure.stage for failure in outcome.failures] == ["simulate"]
     for entry in outcome.entries:
@@ -138,7 +135,6 @@ docs/reports/batched_fem.md saw 4e-9 to 3e-5; here
 
 def test_a_batch_agrees_with_the_single_solver(context: JobContext) -> None:
     """On the same meshes: the same draws fail for the same reasons, and what is left is the same motion."""
-    # Fails with the first trajectory's frames for all, and with one `pad_key` for all.
     results = {found.number: found for found in map(_trajectory, in_batches(context, _tasks(range(5)), 4))}
     assert sorted(results) == list(range(5))
     for task in _tasks(range(5)):
@@ -183,7 +179,6 @@ def test_a_trajectory_whose_every_draw_fails_is_given_up(context: JobContext) ->
 
 def test_frames_of_each_job_are_its_own() -> None:
     """Those that are wanted are the same to the bit as when all are; others keep their penetration."""
-    # Fails with the first job's frames for all.
     scenes = [gentle(motion={"depth_mm": 0.4, "steps": 3}), gentle(motion={"depth_mm": 0.5, "steps": 3})]
     mesh, wanted = brick(counts=(4, 4, 2)), [frozenset({1}), frozenset({3})]
     every, some = simulate_scenes(scenes, mesh), simulate_scenes(scenes, mesh, frames=wanted)
@@ -200,12 +195,10 @@ def test_frames_of_each_job_are_its_own() -> None:
 )
 def test_the_trajectories_of_a_sensor_come_together(template: Template, ends: list[int], out: list[int]) -> None:
     """Two a sensor; handed on when the second has ended."""
-    # Fails with results handed on as they end.
     assert _order(template, ends) == out
 
 
 def test_a_sensor_of_many_trajectories_does_not_wait_for_all(template: Template) -> None:
-    # Fails without MIN_PER_SENSOR: then 20 wait for the last one.
     one = load_scene(template.source, ["sampling.trajectories_per_sensor=1000"])
     assert _order(one, range(20)) == list(range(20))
 
@@ -231,7 +224,6 @@ def test_items_made_ahead_come_in_order_and_errors_with_them() -> None:
 
 
 def test_no_more_are_made_than_there_is_room_for() -> None:
-    # Fails with an unlimited line, and with a thread that does not look whether it is still wanted.
     made: list[int] = []
 
     def counting() -> Iterator[int]:
@@ -253,7 +245,6 @@ GEL = Gel(size_mm=(20.0, 15.0, 4.0), youngs_modulus_kpa=200.0)
 
 def test_the_shared_mesh_is_even_and_as_high_as_wide() -> None:
     """Planes through the thickness: the first element is as high as the others are wide, as far as growth allows."""
-    # Fails with the growth of `Counts`.
     numerics = Numerics(solver="batched", cells=(16, 12, 2))
     mesh = shared_mesh(GEL, numerics)
     assert mesh is shared_mesh(GEL.model_copy(update={"youngs_modulus_kpa": 100.0}), numerics)
@@ -267,7 +258,6 @@ def test_the_shared_mesh_is_even_and_as_high_as_wide() -> None:
 
 def test_the_predicted_error_falls_with_the_spacing(template: Template) -> None:
     """By the model's exponent of 1.6, at equal proportions of the elements; and the rule says the same."""
-    # Fails with a spacing that is not the mesh's.
     drawn = draw(template, SEED, 0)
     fine = drawn.model_copy(update={"numerics": drawn.numerics.model_copy(update={"cells": (16, 12, 2)})})
     coarse, better = accuracy(drawn), accuracy(fine)

@@ -10,18 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
-from processes_of import (
-    HAS_PROC,
-    PATIENCE_S,
-    ROOT,
-    alive,
-    descendants,
-    lines,
-    own_words,
-    start,
-    wait_for,
-    workers_of,
-)
+from processes_of import HAS_PROC, PATIENCE_S, ROOT, alive, descendants, lines, own_words, start, wait_for, workers_of
 from tiny_scene import fingerprint, reference, write_tiny
 
 from synth.cli import main

@@ -21,7 +21,6 @@ pytestmark = pytest.mark.usefixtures("one_cache")
 @pytest.mark.slow
 @pytest.mark.skipif(not HAS_PROC, reason="finds child processes in Linux's /proc")
 def test_a_worker_killed_in_mid_task_changes_nothing(tmp_path: Path) -> None:
-    """Fails with max_retries=0: the run ends with 2 and 'its worker was lost'."""
     scene, out = write_tiny(tmp_path), tmp_path / "d"
     process = start(scene, out, "--n", "5", "--ray", "local", "--workers", "2")
     busy = b"ray::_work"  # an idle worker is called ray::IDLE

@@ -96,7 +96,7 @@ def _resident_mb() -> float:
 def test_a_soak_of_500_samples(tmp_path: Path) -> None:
     """Resident memory stays where it was after the first: 474.1 MB after 100, 474.3 MB after 500 were seen.
 
-    Single readings jump by 10 MB, the smallest of several by 2. Fails with the renderers of all sensors kept.
+    Single readings jump by 10 MB, the smallest of several by 2.
     """
     resident = {}
 
@@ -110,7 +110,6 @@ def test_a_soak_of_500_samples(tmp_path: Path) -> None:
 
 
 def test_what_python_holds_does_not_grow_with_n(tmp_path: Path) -> None:
-    # Fails with the states of all simulations kept.
     held = {}
 
     def look(done: int, _: int) -> None:

@@ -46,7 +46,6 @@ def _download(url: str, folder: Path) -> Path:
 
 
 def test_the_same_as_in_a_directory_in_shards_and_steps(url: str, tmp_path: Path) -> None:
-    """Fails with `_fetch_lines` left out: what is there is made again, and `found` is 0."""
     template = load_scene(write_tiny(tmp_path))
     assert generate(template, 1, url).made == 1
     shard = generate(template, 5, url, scheduling=Scheduling(shard=Shard(0, 2)))
@@ -86,7 +85,6 @@ def test_a_stopped_run_leaves_a_journal_that_the_next_one_reads(url: str) -> Non
 
 
 def test_who_is_refused(url: str) -> None:
-    """Fails with the lease's check left out."""
     with DatasetWriter(url, job()):
         with pytest.raises(InputError, match=rf"another process \(pid {os.getpid()} on .*\) is writing"):
             DatasetWriter(url, job())
@@ -105,7 +103,6 @@ def test_who_is_refused(url: str) -> None:
 
 
 def test_meshes_are_put_under_the_url_but_not_by_a_shard(url: str) -> None:
-    """Fails with the check of shards left out: two shards would each put another mesh."""
     with DatasetWriter(url, job(), Shard(0, 2)) as writer:
         with pytest.raises(InputError, match="shards need the mesh to be there"), writer.making_meshes() as folder:
             (folder / "shard.npz").write_bytes(b"mesh")

@@ -1,7 +1,4 @@
-"""Signed distance, normal and reach of every indenter, against points sampled on surfaces that are coded here anew.
-
-Each comment "fails with" names a change of `synth.simulate` that was tried.
-"""
+"""Signed distance, normal and reach of every indenter, against points sampled on surfaces that are coded here anew."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -156,7 +153,6 @@ def inside(indenter: Indenter, points: FloatArray) -> np.ndarray:
 
 @pytest.mark.parametrize("indenter", SHAPES, ids=lambda i: i.shape)
 def test_distance_against_sampled_surface(indenter: Indenter) -> None:
-    # Fails with the fillet left out of signed_distance, or a cone of half the angle.
     rng = np.random.default_rng(1)
     points = scattered(indenter, rng)
     distance, _, _ = measure(rigid_body(indenter), points)
@@ -172,7 +168,6 @@ def test_distance_against_sampled_surface(indenter: Indenter) -> None:
 
 @pytest.mark.parametrize("indenter", SHAPES, ids=lambda i: i.shape)
 def test_normal_is_the_gradient(indenter: Indenter) -> None:
-    # Fails with the sign of the gradient kept inside a cone.
     rng = np.random.default_rng(2)
     body, points = rigid_body(indenter), scattered(indenter, rng)
     _, normal, bending = measure(body, points)
@@ -211,8 +206,6 @@ def test_points_on_axes_have_a_unit_normal() -> None:
         points = np.array([[0, 0, z] for z in (-3.0, -0.5, 0.0, 0.5, 3.0)], dtype=float)
         distance, normal, _ = measure(rigid_body(indenter), points)
         assert np.isfinite(distance).all()
-        # Fails without the radial part in _revolve: inside a cone and in the middle of a ring the gradient points
-        # sideways.
         np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0, atol=1e-12)
 
 
@@ -222,7 +215,6 @@ TURNS = [(0.0, 0.0, 0.0), (90.0, 0.0, 0.0), (0.0, 90.0, 30.0), (20.0, -35.0, 50.
 @pytest.mark.parametrize("turn", TURNS)
 @pytest.mark.parametrize("indenter", SHAPES, ids=lambda i: i.shape)
 def test_reach_is_the_highest_point(indenter: Indenter, turn: tuple[float, float, float]) -> None:
-    # Fails with turns applied in another order, abs(axial) or max(0, ...) left out.
     turned = indenter.model_copy(update={"rotation_deg": turn})
     body = rigid_body(turned)
     x, y, z = (rotation_about(axis, np.radians(angle)) for axis, angle in enumerate(turn))
@@ -266,7 +258,6 @@ def ball(folder: Path, name: str = "ball.stl", flip: bool = False, centre: tuple
 
 @pytest.mark.parametrize("flip", [False, True])
 def test_mesh_of_a_sphere_is_the_sphere(tmp_path: Path, flip: bool) -> None:
-    # The flipped one fails without auto_orient_normals.
     ball(tmp_path, flip=flip, centre=(5.0, -2.0, 1.0))
     body = rigid_body(MeshIndenter(shape="mesh", file="ball.stl", cell_mm=0.15), tmp_path)
     points = scattered(SPHERE, np.random.default_rng(3))
@@ -300,7 +291,6 @@ def test_mesh_normal_is_the_gradient(tmp_path: Path) -> None:
 
 
 def test_grid_in_a_larger_batch_is_read_to_its_own_end(tmp_path: Path) -> None:
-    # Fails with the shape of `coefficients` for the grid's own counts in _grid.
     ball(tmp_path)
     body = rigid_body(MeshIndenter(shape="mesh", file="ball.stl", cell_mm=0.3), tmp_path)
     padded = replace(body, coefficients=np.pad(body.coefficients, ((0, 9), (0, 20), (0, 3))))
@@ -310,7 +300,6 @@ def test_grid_in_a_larger_batch_is_read_to_its_own_end(tmp_path: Path) -> None:
 
 
 def test_mesh_scale_and_turn(tmp_path: Path) -> None:
-    # Fails with order="C".
     import pyvista as pv
 
     pv.Cube(x_length=1.0, y_length=2.0, z_length=3.0).triangulate().save(tmp_path / "block.stl")

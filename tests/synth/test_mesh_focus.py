@@ -43,7 +43,7 @@ def test_edges_are_small_in_the_focus_only(pad: PadMesh) -> None:
     # fTetWild aims at edges of 4/5 to 4/3 of the target and is random: 20 meshes had means of 1.10 to 1.28 times EDGE
     # in the focus (mean 1.19, standard deviation 0.05), edges 1.6 to 2.3 times as long away from it, and 0.28 to 0.38
     # of the triangles that an evenly fine face would have; one more, on a loaded machine, 1.36 times EDGE. The limits
-    # lie 6 deviations away. Fails without bg_values (2.8 times EDGE everywhere).
+    # lie 6 deviations away.
     assert 0.8 * EDGE < edges[away == 0].mean() < 1.5 * EDGE
     assert edges[away > 2.5].mean() > 1.25 * edges[away == 0].mean()
     assert len(corners) < 0.5 * SIZE[0] * SIZE[1] / (np.sqrt(3) / 4 * EDGE**2)
@@ -65,7 +65,6 @@ def test_background_grows_smoothly_from_the_focus(focus: Focus) -> None:
     # The distance from a convex set has slope 1, and moving the outermost points outward lengthens edges.
     assert (np.abs(field.values[edge[:, 0]] - field.values[edge[:, 1]]) <= SLOPE * length + 1e-12).all()
     # The field is linear between planes of the grid: it is EDGE throughout the focus if its ends are planes.
-    # Fails with the ends left out of the grid.
     points = np.clip(field.points, [-6, -4.5, 0], [6, 4.5, 3])
     inside = points[:, 2] == 0
     for axis in (0, 1):

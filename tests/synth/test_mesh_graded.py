@@ -1,4 +1,4 @@
-"""Graded meshes: what the solver relies on wherever the focus lies. "Fails with" names a change that was tried."""
+"""Graded meshes: what the solver relies on wherever the focus lies."""
 
 import hashlib
 
@@ -45,7 +45,6 @@ def mirrored(mesh: PadMesh, axis: int) -> FloatArray:
 @pytest.mark.parametrize("focus", FOCI.values(), ids=FOCI)
 def test_fills_the_box_with_one_topology(focus: Focus, layers: tuple[float, ...]) -> None:
     mesh = graded_box(SIZE, focus, COUNTS, layers)
-    # Fails with the odd permutations left unturned in kuhn_tets.
     assert mesh.volumes.min() > 0
     # Sums of 3000 volumes round to some 1e-15 relative.
     assert mesh.volumes.sum() == pytest.approx(np.prod(SIZE), rel=1e-12)
@@ -58,13 +57,12 @@ def test_fills_the_box_with_one_topology(focus: Focus, layers: tuple[float, ...]
 
 @pytest.mark.parametrize("focus", FOCI.values(), ids=FOCI)
 def test_shapes_stay_bounded(focus: Focus) -> None:
-    # What fTetWild's meshes must meet, too. Fails with FINEST = 0: 2.5^13 between the two ends of "beyond the edge".
+    # What fTetWild's meshes must meet, too.
     mesh = graded_box(SIZE, focus, COUNTS)
     assert shape_quality(mesh.points, mesh.tets).min() > WORST_SHAPE
 
 
 def test_neighbours_share_whole_faces() -> None:
-    # Fails with cells mirrored in x where they are odd in y: diagonals of common faces then cross.
     mesh = graded_box(SIZE, CENTRED, COUNTS)
     nx, ny, nz = COUNTS.cells(0), COUNTS.cells(1), COUNTS.through
     assert len(mesh.points) == (nx + 1) * (ny + 1) * (nz + 1)
@@ -74,18 +72,15 @@ def test_neighbours_share_whole_faces() -> None:
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_centred_focus_gives_its_own_mirror_image(axis: int) -> None:
-    # Fails with every cell cut alike (none odd).
     mesh = graded_box(SIZE, CENTRED, COUNTS)
     image = mirrored(mesh, axis)[mesh.tets]
     assert {frozenset(tet) for tet in image.tolist()} == {frozenset(tet) for tet in mesh.tets.tolist()}
 
 
 def test_mirrored_focus_gives_the_mirrored_planes_to_the_bit() -> None:
-    # Fails with low + right_of_low * fine in the focus and coordinates not rounded to GRAIN_MM.
     for low, high in random_spans(200, 20.0):
         planes = lateral_planes(20.0, (low, high), COUNTS, 0)
         assert (lateral_planes(20.0, (-high, -low), COUNTS, 0) == -planes[::-1]).all()
-        # Fails without that rounding alone.
         assert (planes / GRAIN_MM % 1 == 0).all()
 
 
@@ -95,8 +90,6 @@ def test_centred_spacing_is_even_then_geometric() -> None:
     # Two coordinates rounded to GRAIN_MM.
     np.testing.assert_allclose(step[3:11], 6.6 / 8, atol=2 * GRAIN_MM)
     np.testing.assert_allclose(planes[[3, 11]], [-3.3, 3.3], atol=2 * GRAIN_MM)
-    # Fails with q left out of _elements and _reach alike: they grow from f on.
-    # f q + f q^2 + f q^3 = 6.7 mm for the prototype's mesh: q solves the cubic, its one positive root.
     ratio = max(root.real for root in np.roots([1, 1, 1, -6.7 / 0.825]) if abs(root.imag) < 1e-9)
     np.testing.assert_allclose(step[11:], 0.825 * ratio ** np.arange(1, 4), atol=4 * GRAIN_MM)
 
@@ -113,7 +106,6 @@ def largest_ratio(q: float) -> float:
 
 @pytest.mark.parametrize("counts", [COUNTS, Counts(across=(12, 4), outer=(5, 3))], ids=["usual", "other"])
 def test_spacing_is_even_in_the_focus_and_grows_by_a_bounded_ratio(counts: Counts) -> None:
-    # Fails with q left out of _elements, and with STEEPEST ignored.
     assert largest_ratio(STEEPEST) < 1.1 * STEEPEST  # as the constant's docstring says
     wide = 0
     for low, high in random_spans(300, 15.0):
@@ -158,7 +150,6 @@ def test_planes_move_continuously_with_the_focus() -> None:
 
 @pytest.mark.parametrize("layers", LAYERS.values(), ids=LAYERS)
 def test_layers_are_bounded_by_planes(layers: tuple[float, ...]) -> None:
-    # Fails with the interface's plane left where the grading puts it.
     counts = Counts(through=3, film=2)
     mesh = graded_box(SIZE, CENTRED, counts, layers)
     faces = np.concatenate([[0.0], np.cumsum(layers), [SIZE[2]]])
@@ -195,7 +186,6 @@ def test_touchable_is_all_but_the_window() -> None:
     np.testing.assert_allclose(area.sum(axis=0), [0, 0, -300.0], atol=1e-10)
     centre = (a + b + c) / 3
     assert (np.einsum("ij,ij->i", area, centre - [0, 0, 2.0]) > 0).all()
-    # Fails with any() in place of all(): the rim of bonded nodes would take faces of the sides away.
     assert mesh.touchable.dtype == np.int32
     assert not mesh.bonded[mesh.touchable].all(axis=1).any()
 

@@ -50,7 +50,6 @@ def test_fills_the_box(pad: PadMesh) -> None:
 
 
 def test_faces_are_exactly_flat(pad: PadMesh) -> None:
-    # Fails without the snapping in _repair: fTetWild leaves boundary vertices up to epsilon off.
     low, high = np.array([-SIZE[0] / 2, -SIZE[1] / 2, 0.0]), np.array([SIZE[0] / 2, SIZE[1] / 2, SIZE[2]])
     corners = pad.points[boundary_faces(pad.tets)]
     on_a_plane = (corners == low).all(axis=1) | (corners == high).all(axis=1)
@@ -98,7 +97,7 @@ def test_edge_lengths_are_graded(pad: PadMesh) -> None:
         count = (pad.points[faces][:, :, 2] == level).all(axis=1).sum()
         return float(np.sqrt(4 / np.sqrt(3) * SIZE[0] * SIZE[1] / count))
 
-    # fTetWild splits edges longer than 4/3 of the target and collapses those shorter than 4/5. Fails without bg_values.
+    # fTetWild splits edges longer than 4/3 of the target and collapses those shorter than 4/5.
     assert 4 / 5 * EDGE < edge(0.0) < 4 / 3 * EDGE
     assert 1.2 * edge(0.0) < edge(SIZE[2]) < 4 / 3 * GRADING * EDGE
 
@@ -175,7 +174,7 @@ def test_a_sound_mesh_passes_and_so_does_a_sliver() -> None:
 
 @pytest.mark.parametrize("seed", range(12))
 def test_flat_is_refused_whatever_the_rounding(seed: int) -> None:
-    """The volume then is 0 or some 1e-17 of either sign. Fails with 0 as the least share."""
+    """The volume then is 0 or some 1e-17 of either sign."""
     rng = np.random.default_rng(seed)
     corners = rng.normal(size=(3, 3))
     alone = PadMesh(np.vstack([corners, rng.dirichlet(np.ones(3)) @ corners]), np.array([[0, 1, 2, 3]]), SOUND.size_mm)
@@ -184,7 +183,6 @@ def test_flat_is_refused_whatever_the_rounding(seed: int) -> None:
 
 
 def test_inside_out_one_point_not_finite_and_loose() -> None:
-    """Fails with any of the checks left out."""
     flipped = SOUND.tets.copy()
     flipped[5] = flipped[5][[1, 0, 2, 3]]
     one = SOUND.points.copy()

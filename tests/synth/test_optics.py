@@ -42,7 +42,6 @@ LENSES = {
 @pytest.mark.parametrize("view", [STRAIGHT, OBLIQUE])
 @pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
 def test_project_inverts_rays(index, view, lens):
-    """Fails with the sign of k2 changed in `FisheyeLens._distorted`: it then turns back inside the field it claims."""
     camera = optics(index=index, **view, **lens)
     origins, directions = camera.rays(PIXELS)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-14)
@@ -186,10 +185,7 @@ def test_project_inverts_rays_on_each_path(view, index):
 
 @pytest.mark.parametrize("view", ["sides", "periscope"])
 def test_light_is_reflected_at_equal_angles_and_bends_at_the_face(view):
-    """From the ray inside the body back through Snell's law to the mirror, and from there to the pinhole.
-
-    Fails with the factor 2 of `FlatMirror.turned` changed to 1.99.
-    """
+    """From the ray inside the body back through Snell's law to the mirror, and from there to the pinhole."""
     camera = optics(index=1.45, **VIEWS[view])
     rays = camera.look(CENTRES)
     for k, given in enumerate(VIEWS[view]["mirrors"], 1):
@@ -241,10 +237,7 @@ def test_a_mirror_ends_at_the_image_of_its_rectangle():
 
 
 def test_points_behind_a_mirror_have_no_image_by_default():
-    """Lights are looked for with it: one that a mirror hides stands in no view.
-
-    Fails with the last condition of `Optics.project` left out.
-    """
+    """Lights are looked for with it: one that a mirror hides stands in no view."""
     upright = {"position_mm": (4.0, 0.0, 12.0), "normal": (-1.0, 0.0, 0.0), "size_mm": (40.0, 4.0)}
     camera = optics(mirrors=(upright,), position_mm=(0.0, 0.0, 20.0), look_at_mm=(0.0, 0.0, 0.0), cx=10.0)
     points = np.array([[9.0, 0.0, 2.0], [2.0, 0.0, 2.0], [-9.0, 0.0, 2.0]])
@@ -258,7 +251,6 @@ def test_points_behind_a_mirror_have_no_image_by_default():
 
 
 def test_backs_and_second_reflections_show_nothing():
-    """Fails with backs let through in `first_met`, and with its second loop left out."""
     turned = {**SIDES[0], "normal": (1.0, 0.0, 0.25), "rotation_deg": -4.0}
     plain, back = (optics(index=1.45, mirrors=(m,), fx=40.0, fy=41.0).look(CENTRES) for m in (SIDES[0], turned))
     np.testing.assert_array_equal(back.path, np.where(plain.path == 1, -1, plain.path))

@@ -45,7 +45,6 @@ def test_dot_lies_where_the_scene_says_and_has_its_area() -> None:
 
 
 def test_strips_blend_as_the_whole_to_the_bit() -> None:
-    """Fails with the last, shorter strip left out, and with rows of a strip's coverage taken for the next one's."""
     dots = Dots(kind="dots", spacing_mm=(1.3, 1.1), radius_mm=0.4, softness_mm=0.3, reflectance=(0.1, 0.2, 0.9))
     sensor, texture, x, y = _painted(dots, seed=3, white=False)
     assert len(y) % 32
@@ -107,7 +106,6 @@ def test_grey_is_what_has_no_color_anywhere() -> None:
 
 
 def test_texture_is_as_fine_as_the_finest_view_sees_it() -> None:
-    """Fails with the main camera's height for its distance: gelslim's goes by a mirror, and gave 4 times too fine."""
     sensor = small_sensor(position_mm=(0.0, 0.0, 20.0), look_at_mm=(0.0, 0.0, 0.0))
     near = FurtherCamera(**(sensor.camera.model_dump() | {"name": "near", "position_mm": (0.0, 0.0, 14.0)}))
     both = sensor.model_copy(update={"further_cameras": (near,)})
@@ -138,7 +136,6 @@ def _grid(**changes: object) -> Dots:
 
 @pytest.mark.parametrize("shape", ["round", "diamond"])
 def test_dots_cover_their_area_and_sit_on_the_grid(shape: str) -> None:
-    """Fails with a diamond's edge measured along the grid instead of across it, and with sx and sy swapped."""
     pattern = _grid(shape=shape, softness_mm=0.1, spacing_mm=(1.5, 1.125), offset_mm=(0.75, 0.5625))
     _, texture, x, y = _painted(pattern)
     dark = 1 - texture[:, :, 0]
@@ -155,7 +152,6 @@ def test_dots_cover_their_area_and_sit_on_the_grid(shape: str) -> None:
 
 
 def test_diamonds_that_touch_make_a_checkerboard_turned_with_the_grid() -> None:
-    """Fails with the diamond's axes along the image's instead of the grid's."""
     pattern = _grid(shape="diamond", radius_mm=0.75, rotation_deg=25.0, offset_mm=(0.3, 0.2), softness_mm=0.0)
     _, texture, x, y = _painted(pattern)
     assert (1 - texture).mean() == pytest.approx(0.5, abs=0.01)  # cells cut by the pad's border: ± 1 of 96, halved
@@ -170,7 +166,6 @@ def test_diamonds_that_touch_make_a_checkerboard_turned_with_the_grid() -> None:
 
 
 def test_jitter_moves_and_sizes_dots_by_what_is_asked() -> None:
-    """Fails with jitter halved, with one random number for both directions, and without radius_jitter."""
     pattern = _grid(spacing_mm=(0.75, 0.75), offset_mm=(0.375, 0.375), radius_mm=0.15, jitter_mm=0.04,
                     radius_jitter=0.1, softness_mm=0.0)  # fmt: skip
     _, texture, x, y = _painted(pattern, seed=4, fx=280.0, fy=280.0)
@@ -189,7 +184,6 @@ def test_jitter_moves_and_sizes_dots_by_what_is_asked() -> None:
 
 
 def test_neighbouring_random_colors_differ_in_hue_and_fill_the_circle() -> None:
-    """Fails without redrawing of hues that clash: a quarter of the pairs are then alike."""
     _, texture, x, y = _painted(RandomColor(kind="random_color", cell_mm=0.5, saturation=1.0, softness_mm=0.0), seed=2)
     cells = [
         _middles(np.abs(np.diff(texture, axis=axis)).sum(axis=(1 - axis, 2)), place) for axis, place in ((1, x), (0, y))
@@ -217,10 +211,7 @@ def _middles(steps: FloatArray, place: FloatArray) -> list[int]:
 
 @pytest.mark.parametrize("grain", [0.4, 0.8])
 def test_speckle_has_the_grain_that_is_asked(grain: float) -> None:
-    """Rice's formula for filtered noise: 4 / (pi sqrt(2) grain) crossings per mm at half coverage.
-
-    Fails with grain / 3 for grain / 4 in the filter.
-    """
+    """Rice's formula for filtered noise: 4 / (pi sqrt(2) grain) crossings per mm at half coverage."""
     _, texture, _, _ = _painted(Speckle(kind="speckle", grain_mm=grain, coverage=0.5, reflectance=(0, 0, 0)), seed=7)
     dark = texture[:, :, 0] < 0.5
     across, down = (np.count_nonzero(np.diff(dark, axis=axis)) / dark.shape[1 - axis] for axis in (1, 0))

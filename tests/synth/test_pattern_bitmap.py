@@ -47,7 +47,6 @@ def _encoded(linear: FloatArray) -> FloatArray:
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
 @pytest.mark.parametrize("channels", [1, 3])
 def test_values_come_back(tmp_path: Path, kind: type, channels: int) -> None:
-    """Fails with gamma 2.2 for sRGB (by 0.03), with BGR for RGB, and turned upside down."""
     full = np.iinfo(kind).max
     stored = np.random.default_rng(1).integers(0, full + 1, (ROWS, COLUMNS, channels)).astype(kind)
     texture = _laid(tmp_path, stored)
@@ -57,7 +56,6 @@ def test_values_come_back(tmp_path: Path, kind: type, channels: int) -> None:
 
 
 def test_a_coarse_picture_is_placed_and_turned_about_its_middle(tmp_path: Path) -> None:
-    """Fails with the rotation's sign turned, offset_mm subtracted, and the height taken from the pad's shape."""
     stored = np.full((30, 40), 255, np.uint8)
     stored[4:6, 28:30] = (
         0  # its middle lies 9 px right of and 10 px above the picture's: 1.8 and -2 mm at 0.2 mm per px
@@ -73,7 +71,6 @@ def test_a_coarse_picture_is_placed_and_turned_about_its_middle(tmp_path: Path) 
 
 
 def test_white_transparent_and_beside_it_is_the_bare_coating(tmp_path: Path) -> None:
-    """Fails with alpha ignored, and with colours of transparent pixels blended into their neighbours'."""
     coating = (0.6, 0.5, 0.4)
     stored = np.full((100, 100, 4), 255, np.uint8)
     stored[:50, :, :3], stored[:50, :50, 3] = 0, 0  # upper half black, its left quarter transparent
@@ -95,7 +92,7 @@ def test_white_transparent_and_beside_it_is_the_bare_coating(tmp_path: Path) -> 
 
 
 def test_fine_stripes_become_their_mean(tmp_path: Path) -> None:
-    """Stripes of 0.6 texels a period. Fails without the area's average, and with sRGB values averaged, not light."""
+    """Stripes of 0.6 texels a period."""
     columns = round(COLUMNS / 0.3)  # one dark and one bright column a period
     stored = np.zeros((600, columns), np.uint8)
     stored[:, ::2] = 255
@@ -126,7 +123,6 @@ def test_grey_with_alpha_and_palettes_are_read(tmp_path: Path) -> None:
 
 
 def test_a_photograph_is_turned_as_its_exif_says(tmp_path: Path) -> None:
-    """Fails with cv2.IMREAD_UNCHANGED alone, which takes the pixels as they are stored."""
     stored = np.random.default_rng(0).integers(0, 256, (6, 8, 3), np.uint8)
     exif = Pillow.Exif()
     exif[ExifTags.Base.Orientation] = 6  # to be turned by a quarter, clockwise
@@ -208,7 +204,6 @@ def _is_half_black(scene: Path, *overrides: str) -> bool:
 
 
 def test_the_picture_lies_beside_the_scene_file(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fails with the file looked for in the current directory."""
     monkeypatch.chdir("/")
     _draw(scene, HALF)
     bitmap = TEXT.replace(DOTS, 'kind = "bitmap"\nfile = "art/mine.png"\nwidth_mm = 8\n')
@@ -216,7 +211,6 @@ def test_the_picture_lies_beside_the_scene_file(scene: Path, monkeypatch: pytest
 
 
 def test_a_picture_given_by_set_lies_where_the_user_is(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fails with the file looked for beside the scene."""
     _draw(scene, HALF)
     monkeypatch.chdir(scene.parent / "art")
     assert _is_half_black(scene, BITMAP.replace("art/", ""))

@@ -51,7 +51,6 @@ def _inside_and_outside(sensor: Sensor) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("variant", VARIANTS, ids=lambda variant: variant.name)
 def test_each_layer_reflects_as_itself(variant: Variant) -> None:
-    """Fails with the two layers exchanged in the blend, and with marks that shine as the coating does."""
     image = _render(_sensor("above_coating"), variant=variant)
     inside, outside = _inside_and_outside(_sensor("above_coating"))
     assert inside.sum() > 200
@@ -68,7 +67,6 @@ def test_each_layer_reflects_as_itself(variant: Variant) -> None:
 
 
 def test_matt_dots_lack_the_highlight() -> None:
-    """Fails with layer ignored: dots in the coating shine with it."""
     inside, _ = _inside_and_outside(_sensor("above_coating"))
     highlight = _bare(SHINING, FAST)[:, :, 1] / _bare(Coating(reflectance=SHINING.reflectance), FAST)[:, :, 1]
     shines = inside & (highlight > 0.8 * highlight.max())
@@ -118,10 +116,7 @@ PATTERNS = [
 
 
 def test_flow_does_not_depend_on_the_pattern(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every channel of flow.exr has the same bits under a bitmap on matt and dots on shining coating.
-
-    Fails with image 1's positions moved by 1e-7 mm where the pattern is a bitmap.
-    """
+    """Every channel of flow.exr has the same bits under a bitmap on matt and dots on shining coating."""
     own_cache(monkeypatch)
     picture = tmp_path / "mine.png"
     cv2.imwrite(str(picture), np.random.default_rng(0).integers(0, 256, (20, 20, 3), np.uint8))

@@ -117,7 +117,7 @@ def test_same_seed_same_bits_and_other_seed_other_noise(variant: Variant) -> Non
 
 @pytest.mark.parametrize("variant", VARIANTS, **names)
 def test_another_surface_is_rendered_as_by_a_renderer_of_its_own(variant: Variant) -> None:
-    """Finer, then coarser. Fails with the texture coordinates of the one before; scalar variants once stopped here."""
+    """Finer, then coarser."""
     sensor = small_sensor(1.45, _dots())
     texture, surfaces = albedo(sensor, np.random.default_rng(0)), [flat_surface(sensor, n) for n in (4, 9, 2)]
     renderer = Renderer(sensor, DIRECT, surfaces[0], texture, variant)
@@ -286,7 +286,6 @@ def test_irradiance_under_a_large_light_has_its_closed_form() -> None:
 
     F = [a/√(1+a²) atan(b/√(1+a²)) + b/√(1+b²) atan(a/√(1+b²))] / 2π for a rectangle with a corner right above the
     point, sides a·h and b·h (Howell's catalogue, B-4); other places by adding and subtracting such rectangles.
-    Fails with the power not divided by the light's area, and with 2 % more of it.
     """
     light = Light(position_mm=(5.0, 0.0, 3.0), aim_mm=(5.0, 0.0, 0.0), size_mm=(4.0, 6.0), color=(1, 1, 1), power=300)
     sensor = small_sensor(
@@ -305,7 +304,7 @@ def test_irradiance_beside_a_disc_light_has_its_closed_form() -> None:
     """A disc of radiance L and radius R parallel to the face, its centre h above and a beside the point: E = π L F.
 
     F = [1 - (h² + a² - R²) / √((h² + a² + R²)² - 4 R² a²)] / 2 (Howell's catalogue, B-13). The disc is made of 36
-    strips of one radiance. Fails with the power not divided by the light's area, and with 2 % more of it.
+    strips of one radiance.
     """
     count, height, reach, beside = 36, 3.0, 3.0, 5.5
     foot = np.array([-1.5, -0.1])

@@ -40,10 +40,7 @@ def measured() -> dict[tuple[int, int], dict[str, float]]:
 
 @needs_llvm
 def test_noise_falls_as_the_root_of_samples() -> None:
-    """Independent samples: -1/2. Stratified ones are never worse, and fall faster by what they resolve of it.
-
-    Fails with variances in place of their roots (-1.1), and with the same seed for all repeats (no noise at all).
-    """
+    """Independent samples: -1/2. Stratified ones are never worse, and fall faster by what they resolve of it."""
     counts = (16, 64, 256)
     slope = np.polyfit(np.log(counts), np.log([measured()[DEEPEST, n]["noise"] for n in counts]), 1)[0]
     # 1200 pixels, blurred: some 1200 / (4 pi 0.8²) = 150 independent values and 2 degrees of freedom each: noise within
@@ -54,10 +51,7 @@ def test_noise_falls_as_the_root_of_samples() -> None:
 
 @needs_llvm
 def test_full_paths_have_no_bias_and_cut_ones_are_seen() -> None:
-    """A path of 2 is direct light only; here it lacks 1.2 % of the light.
-
-    Fails with DEEPEST = 2: the reference then lacks it, too.
-    """
+    """A path of 2 is direct light only; here it lacks 1.2 % of the light."""
     for n in (16, 64, 256):
         found = measured()[DEEPEST, n]
         assert abs(found["bias_percent"]) < 4 * found["bias_se_percent"]

@@ -35,10 +35,7 @@ def _summed(light: Light, point: FloatArray, normal: FloatArray) -> float:
 
 @needs_llvm
 def test_closed_form_is_the_sum_over_the_light() -> None:
-    """Lights whole, cut by the horizon, and seen from behind.
-
-    Fails without the edge along the horizon, without the cut, and with the light shining backward, too.
-    """
+    """Lights whole, cut by the horizon, and seen from behind."""
     mi = FAST.load()
     light = Light(position_mm=(4.0, 1.0, 2.0), aim_mm=(0.0, 0.0, 1.0), size_mm=(5, 2), color=(1, 1, 1), power=1)
     rng = np.random.default_rng(0)
@@ -78,10 +75,7 @@ def _blocks(pictures: FloatArray) -> tuple[FloatArray, FloatArray]:
 @needs_llvm
 @pytest.mark.parametrize("depth", [2, 3])
 def test_expectation_is_path_tracings(depth: int) -> None:
-    """Block by block: the bump's flanks, its shadows, its rim and the plain.
-
-    Fails without what is blocked, with twice that, and with bounced light left out or doubled.
-    """
+    """Block by block: the bump's flanks, its shadows, its rim and the plain."""
     (found, error), (truth, own) = (
         _blocks(_pictures(*one, depth)) for one in (("separated", 16), ("path_traced", 576))
     )
@@ -95,10 +89,7 @@ def test_expectation_is_path_tracings(depth: int) -> None:
 
 @needs_llvm
 def test_second_bounce_is_path_tracings() -> None:
-    """What one bounce more adds, 0.05 % of the picture; the same seeds make it known to some per cent.
-
-    Fails with one bounce less at every depth: it adds the first bounce instead.
-    """
+    """What one bounce more adds, 0.05 % of the picture; the same seeds make it known to some per cent."""
     added = []
     for setting in (("separated", 16), ("path_traced", 576)):
         more = (_pictures(*setting, 4) - _pictures(*setting, 3)).mean(axis=(1, 2))
@@ -143,7 +134,6 @@ def test_what_shines_is_refused() -> None:
 
 
 def test_scalar_variants_path_trace() -> None:
-    """Fails with `variant.is_vectorised` left out of the renderer's choice."""
     scalar = Variant("scalar_rgb", "cpu")
     sensor = small_sensor(1.0, None, LIGHTS)
     surface = flat_surface(sensor)

@@ -105,10 +105,7 @@ def _times(value: Any, factor: float) -> Any:
 
 @pytest.mark.parametrize("body", BODIES)
 def test_an_error_is_a_length_in_the_units_of_the_press(body: str) -> None:
-    """Everything twice as large, the mesh too: displacements err by twice as much, over four times the area.
-
-    Fails with any of the lengths left out of the model, or with another power.
-    """
+    """Everything twice as large, the mesh too: displacements err by twice as much, over four times the area."""
     posed = drawn(BODIES[body])
     large = Scene.model_validate(enlarged(posed.model_dump(), 2.0))
     focus = footprint(LoadPath(posed.motion, rigid_body(posed.contact.indenter)), SIZE, MARGIN)
@@ -119,7 +116,6 @@ def test_an_error_is_a_length_in_the_units_of_the_press(body: str) -> None:
 
 
 def test_without_friction_nothing_drags() -> None:
-    """Fails with the drag not weighed by friction."""
     focus = Focus((0.0, 0.0), (1.0, 1.0))
     still, dragged = drawn(BALL, shear_mm=[0.0, 0.0]), drawn(BALL)
     assert face_error(dragged, focus, 0.5) > face_error(still, focus, 0.5)
@@ -129,7 +125,7 @@ def test_without_friction_nothing_drags() -> None:
 
 
 def test_only_what_the_camera_sees_counts() -> None:
-    """A contact half outside the picture errs by half as much squared. Fails with the share of the zone left out."""
+    """A contact half outside the picture errs by half as much squared."""
     wide = drawn(BALL)
     half = 4.0  # of the seen part along x, mm
     camera = wide.sensor.camera
@@ -161,5 +157,4 @@ def test_predicted_error_bounds_the_error_against_a_finer_mesh(indenter: dict[st
     predicted = face_error(posed, focus, found[4][0]) / np.sqrt(SIZE[0] * SIZE[1])
     # The model's scatter is 0.22 of the logarithm, two of which are 1.55 times the mean or 1.41 times what is
     # predicted; 8 elements across err by about a third of 4 (h^1.6), in which the difference may be off the true error.
-    # Fails with the scale of a cone for the block.
     assert 0.4 * predicted < error < 1.4 * predicted
