@@ -1,9 +1,11 @@
 """Watching and waiting for the command's processes, in tests that kill them; Linux's /proc."""
 
+import contextlib
+import resource
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
@@ -65,6 +67,20 @@ def workers_of(pid: int, name: bytes = b"spawn_main") -> list[int]:
             return b""
 
     return [child for child in descendants(pid) if name in command(child)]
+
+
+@contextlib.contextmanager
+def largest_file(count: int) -> Iterator[None]:
+    """Let no file become larger than so many bytes: a write beyond that fails as on a full disk, at the same place.
+
+    Held no longer than the call it is for: pytest's own output may go to a file.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (count, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def own_words(stderr: str) -> list[str]:

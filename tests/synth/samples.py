@@ -4,7 +4,11 @@ A patterned plane z = 0 seen from straight above at `scale` px per mm: a shift o
 U = scale * s, V = 0. The texture is a sum of cosines, so both images are exact.
 """
 
+import contextlib
 import hashlib
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -99,6 +103,36 @@ def job(n: int = 3, *, seed: int = 7, **changes: object) -> Job:
         software={"synth": "0.1.0"},
         device={"device": "cpu", "variant": "scalar_rgb"},
     )
+
+
+HOLD = """
+import sys
+sys.path[:0] = sys.argv[4:]
+from samples import job, translation_sample
+from synth.dataset.shard import Shard
+from synth.dataset.writer import DatasetWriter
+shard = Shard.parse(sys.argv[2]) if sys.argv[2] else None
+with DatasetWriter(sys.argv[1], job(6), shard, 2) as writer:
+    for index in sys.argv[3].split():
+        writer.write(translation_sample(int(index)))
+    print("held", flush=True)
+    sys.stdin.readline()
+"""
+
+
+@contextlib.contextmanager
+def writing_elsewhere(directory: Path, shard: str = "", indices: Sequence[int] = ()) -> Iterator[subprocess.Popen[str]]:
+    """Another process that has made samples of a shard and goes on to hold it until it reads a line or is killed."""
+    paths = [str(Path(__file__).parent), str(Path(__file__).parents[2])]
+    command = [sys.executable, "-c", HOLD, str(directory), shard, " ".join(map(str, indices)), *paths]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "held\n"
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
 
 
 def tree(directory: Path) -> dict[str, bytes]:

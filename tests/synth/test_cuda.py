@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from kinematic_double import sheet
 
 from synth.dataset.reader import read_dataset
 from synth.errors import InputError
@@ -13,18 +14,10 @@ from synth.render.variant import Variant, choose_variant
 from synth.scene.template import load_scene
 from synth.verify import verify_dataset
 
+CAMERA = {"width": 64, "height": 48, "fx": 90.0, "fy": 90.0, "cx": 32.0, "cy": 24.0}
 TINY = [
-    "sensor.camera.width=64",
-    "sensor.camera.height=48",
-    "sensor.camera.fx=90.0",
-    "sensor.camera.fy=90.0",
-    "sensor.camera.cx=32.0",
-    "sensor.camera.cy=24.0",
-    "render.samples_per_pixel=144",
-    "motion.steps=2",
-    "motion.depth_mm=0.5",
-    "motion.shear_mm=[0.2, 0.1]",
-    "numerics.target_error_px=5.0",
+    *(f"sensor.camera.{name}={value}" for name, value in CAMERA.items()),
+    *("render.samples_per_pixel=144", "motion.steps=2", "motion.depth_mm=0.5", "motion.shear_mm=[0.2, 0.1]"),
     'contact.indenter={shape="sphere", radius_mm=4.0}',
 ]
 
@@ -39,7 +32,7 @@ def cuda() -> Variant:
 
 @pytest.mark.cuda
 def test_generated_on_a_gpu_verifies_and_agrees_with_the_cpu(cuda: Variant, tmp_path: Path) -> None:
-    template = load_scene("gelsight_mini", TINY)
+    template = load_scene("gelsight_mini", [*TINY, "numerics.target_error_px=5.0"])
     generate(template, 2, tmp_path / "cuda", variant=cuda)
     generate(template, 2, tmp_path / "cpu", variant=choose_variant("cpu"))
     assert verify_dataset(tmp_path / "cuda").ok
@@ -55,8 +48,7 @@ def test_generated_on_a_gpu_verifies_and_agrees_with_the_cpu(cuda: Variant, tmp_
 @pytest.mark.cuda
 def test_batched_on_a_gpu_with_workers_verifies_and_agrees_with_the_cpu(cuda: Variant, tmp_path: Path) -> None:
     """The whole way: solver's thread, renderer, worker processes; on the CPU one thing after another."""
-    shared = [change for change in TINY if "target_error_px" not in change]
-    template = load_scene("gelsight_mini", [*shared, 'numerics.solver="batched"', "numerics.cells=[6, 4, 2]"])
+    template = load_scene("gelsight_mini", [*TINY, 'numerics.solver="batched"', "numerics.cells=[6, 4, 2]"])
     generate(template, 6, tmp_path / "cuda", variant=cuda, scheduling=Scheduling(workers=2))
     generate(template, 6, tmp_path / "cpu", variant=choose_variant("cpu"), scheduling=Scheduling(workers=1))
     assert verify_dataset(tmp_path / "cuda").ok
@@ -70,18 +62,13 @@ def test_batched_on_a_gpu_with_workers_verifies_and_agrees_with_the_cpu(cuda: Va
 
 @pytest.mark.cuda
 def test_tracing_agrees(cuda: Variant) -> None:
-    rng = np.random.default_rng(0)
-    grid = np.stack(np.meshgrid(np.linspace(-5, 5, 40), np.linspace(-4, 4, 30), indexing="ij"), axis=-1).reshape(-1, 2)
-    vertices = np.column_stack([grid, 0.3 * np.sin(grid[:, 0]) * np.cos(grid[:, 1])])
-    quad = np.arange(39 * 30).reshape(39, 30)[:, :-1].ravel()
-    triangles = np.concatenate(
-        [np.stack([quad, quad + 30, quad + 1], 1), np.stack([quad + 1, quad + 30, quad + 31], 1)]
-    )
+    rng, surface = np.random.default_rng(0), sheet(40, 30, 10.0, 8.0)
+    vertices = surface.material.copy()
+    vertices[:, 2] = 0.3 * np.sin(vertices[:, 0]) * np.cos(vertices[:, 1])
     origins = np.tile([0.0, 0.0, 20.0], (5000, 1))
     targets = np.column_stack([rng.uniform(-4, 4, 5000), rng.uniform(-3, 3, 5000), np.zeros(5000)])
     directions = (targets - origins) / np.linalg.norm(targets - origins, axis=1, keepdims=True)
-    cpu, gpu = (trace(vertices, triangles.astype(np.int32), origins, directions, device) for device in ("cpu", "cuda"))
+    cpu, gpu = (trace(vertices, surface.triangles, origins, directions, device) for device in ("cpu", "cuda"))
     np.testing.assert_array_equal(gpu.triangle, cpu.triangle)
-    np.testing.assert_allclose(
-        gpu.distance, cpu.distance, rtol=1e-12
-    )  # float64 on both; the order of one sum may differ
+    # float64 on both; the order of one sum may differ.
+    np.testing.assert_allclose(gpu.distance, cpu.distance, rtol=1e-12)

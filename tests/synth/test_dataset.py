@@ -3,15 +3,15 @@
 import errno
 import json
 import os
-import subprocess
-import sys
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 import pytest
-from samples import job, translation_sample, tree
+from processes_of import largest_file
+from samples import job, translation_sample, tree, writing_elsewhere
 
 from synth.dataset import lines, sample_files
 from synth.dataset.reader import read_dataset
@@ -43,19 +43,15 @@ def test_round_trip(tmp_path, dtype, grey):
     for name in ("image1", "image2", "displacement1", "displacement2"):
         np.testing.assert_array_equal(getattr(data, name), getattr(sample, name), strict=True)
     np.testing.assert_array_equal(data.flow.backward, sample.flow.backward, strict=True)
-    np.testing.assert_array_equal(
-        data.surface.positions(data.displacement2), sample.surface.positions(sample.displacement2), strict=True
-    )
+    moved = (one.surface.positions(one.displacement2) for one in (data, sample))
+    np.testing.assert_array_equal(*moved, strict=True)
     entry = dataset.entry(2)
-    assert entry.max_flow_px == np.hypot(1.25, 0.5)
-    assert entry.force_n[1] == (0.1, 0.0, 1.5)
-    assert entry.frames == (0, 3)
+    assert (entry.max_flow_px, entry.force_n[1], entry.frames) == (np.hypot(1.25, 0.5), (0.1, 0.0, 1.5), (0, 3))
     assert entry.diagnostics["solver"][1]["depth_mm"] == 0.2
     assert set(entry.sha256) == {"image1.png", "image2.png", "flow.exr", "meta.json", "surface.npz"}
     assert dataset.check_hashes(2) == []
-    assert data.meta["image"] == {
-        "width": 32, "height": 24, "channels": 1 if grey else 3, "bits": 8 * np.dtype(dtype).itemsize,
-    }  # fmt: skip
+    bits, channels = 8 * np.dtype(dtype).itemsize, 1 if grey else 3
+    assert data.meta["image"] == {"width": 32, "height": 24, "channels": channels, "bits": bits}
 
 
 def test_dataset_json_holds_the_job(tmp_path):
@@ -144,8 +140,6 @@ def test_another_job_is_refused_and_named(tmp_path, other, named):
 
 
 def test_another_variant_is_another_job_other_software_is_recorded(tmp_path):
-    from dataclasses import replace
-
     _write_all(tmp_path / "d")
     with pytest.raises(InputError, match=r"device\.variant: scalar_rgb there, llvm_ad_rgb now"):
         DatasetWriter(tmp_path / "d", replace(job(), device={"device": "cpu", "variant": "llvm_ad_rgb"}))
@@ -156,40 +150,25 @@ def test_another_variant_is_another_job_other_software_is_recorded(tmp_path):
     assert info["continued_with"] == [{"synth": "0.2.0"}]
 
 
-def test_strange_directories_are_left_alone(tmp_path):
-    (tmp_path / "thesis").mkdir()
-    (tmp_path / "thesis" / "chapter.tex").write_text("x")
+def test_strange_places_are_left_alone(tmp_path):
+    chapter = tmp_path / "thesis" / "chapter.tex"
+    chapter.parent.mkdir()
+    chapter.write_text("x")
     with pytest.raises(InputError, match=r"not a dataset.*chapter\.tex"):
-        DatasetWriter(tmp_path / "thesis", job())
-    assert [file.name for file in (tmp_path / "thesis").iterdir()] == ["chapter.tex"]
+        DatasetWriter(chapter.parent, job())
+    assert list(chapter.parent.iterdir()) == [chapter]
     with pytest.raises(InputError, match="is a file"):
-        DatasetWriter(tmp_path / "thesis" / "chapter.tex", job())
+        DatasetWriter(chapter, job())
+    with pytest.raises(InputError, match=r"/proc/synth.*cannot be written"):
+        DatasetWriter("/proc/synth", job())
     (tmp_path / "empty").mkdir()
     DatasetWriter(tmp_path / "empty", job()).close()
 
 
-HOLD = """
-import sys, time
-from pathlib import Path
-sys.path[:0] = sys.argv[2:]
-from samples import job
-from synth.dataset.writer import DatasetWriter
-writer = DatasetWriter(Path(sys.argv[1]), job())
-print("held", flush=True)
-time.sleep(60)
-"""
-
-
 def test_second_process_is_told_and_a_killed_one_lets_go(tmp_path):
-    paths = [str(Path(__file__).parent), str(Path(__file__).parents[2])]
-    holder = subprocess.Popen([sys.executable, "-c", HOLD, tmp_path / "d", *paths], stdout=subprocess.PIPE, text=True)
-    try:
-        assert holder.stdout.readline() == "held\n"
-        with pytest.raises(InputError, match=rf"another process \(pid {holder.pid} on .*\) is writing"):
-            DatasetWriter(tmp_path / "d", job())
-    finally:
-        holder.kill()
-        holder.wait()
+    refusal = r"another process \(pid {} on .*\) is writing"
+    with writing_elsewhere(tmp_path / "d") as holder, pytest.raises(InputError, match=refusal.format(holder.pid)):
+        DatasetWriter(tmp_path / "d", job())
     DatasetWriter(tmp_path / "d", job()).close()
 
 
@@ -229,44 +208,23 @@ def test_full_disk_in_the_manifest(tmp_path, monkeypatch, call):
         assert writer.finished == {0}
 
 
-@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="needs POSIX")
 def test_file_size_limit_of_the_system(tmp_path):
     """A real refusal by the kernel (RLIMIT_FSIZE stands in for a full disk), while OpenEXR is writing."""
-    code = (
-        "import resource, signal, sys; sys.path[:0] = sys.argv[2:]\n"
-        "from samples import job, translation_sample\n"
-        "from synth.dataset.writer import DatasetWriter\n"
-        "from synth.errors import InputError\n"
-        "writer = DatasetWriter(sys.argv[1], job())\n"
-        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (600, 600))\n"
-        "try:\n    writer.write(translation_sample(0))\n"
-        "except InputError as error:\n    print(error)\n"
-    )
-    paths = [str(Path(__file__).parent), str(Path(__file__).parents[2])]
-    done = subprocess.run(
-        [sys.executable, "-c", code, tmp_path / "d", *paths], capture_output=True, text=True, check=True
-    )
-    assert "000000: cannot be written" in done.stdout
+    writer = DatasetWriter(tmp_path / "d", job())
+    with largest_file(600), pytest.raises(InputError, match=r"000000: cannot be written"):
+        writer.write(translation_sample(0))
     assert list((tmp_path / "d" / "samples").iterdir()) == []
-
-
-def test_read_only_place(tmp_path):
-    with pytest.raises(InputError, match=r"/proc/synth.*cannot be written"):
-        DatasetWriter("/proc/synth", job())
 
 
 def test_tampering_is_found(tmp_path):
     _write_all(tmp_path / "d")
     dataset, folder = read_dataset(tmp_path / "d"), tmp_path / "d" / "samples" / "000001"
-    data = bytearray((folder / "flow.exr").read_bytes())
-    data[-1] ^= 1
-    (folder / "flow.exr").write_bytes(bytes(data))
+    data = (folder / "flow.exr").read_bytes()
+    (folder / "flow.exr").write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
     (folder / "image2.png").unlink()
-    problems = dataset.check_hashes(1)
-    assert len(problems) == 2
-    assert "flow.exr: sha256 is" in problems[0]
-    assert "image2.png: cannot be read" in problems[1]
+    changed, lost = dataset.check_hashes(1)
+    assert "flow.exr: sha256 is" in changed
+    assert "image2.png: cannot be read" in lost
     assert dataset.check_hashes(0) == []
 
 
@@ -284,11 +242,12 @@ def test_unreadable_datasets_are_named(tmp_path):
         ("samples/000000/surface.npz", lambda data: data[:-40], r"000000/surface\.npz"),
         ("samples/000000/meta.json", lambda data: data[:-40], r"000000/meta\.json.*not valid JSON"),
     ):
-        whole = (tmp_path / "d" / name).read_bytes()
-        (tmp_path / "d" / name).write_bytes(damage(whole))
+        file = tmp_path / "d" / name
+        whole = file.read_bytes()
+        file.write_bytes(damage(whole))
         with pytest.raises(InputError, match=message):
             read_dataset(tmp_path / "d").read(0)
-        (tmp_path / "d" / name).write_bytes(whole)
+        file.write_bytes(whole)
     info = tmp_path / "d" / "dataset.json"
     info.write_text(info.read_text().replace('"schema_version": 1', '"schema_version": 9'))
     with pytest.raises(InputError, match="version 9 of the format"):

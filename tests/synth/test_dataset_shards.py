@@ -1,14 +1,11 @@
 """Shards of one job side by side in one directory: the dataset of one go, whoever comes, leaves or is killed."""
 
-import contextlib
 import json
-import subprocess
-import sys
-from collections.abc import Iterator
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
-from samples import job, translation_sample, tree
+from samples import job, translation_sample, tree, writing_elsewhere
 
 from synth.cli import main
 from synth.dataset.reader import read_dataset
@@ -29,48 +26,15 @@ def _comparable(directory: Path) -> dict[str, object]:
 
 def _in_one_go(directory: Path) -> dict[str, object]:
     with DatasetWriter(directory, job(N)) as writer:
-        for index in range(N):
-            writer.write(translation_sample(index))
-        writer.fail(4, 0, "simulate", "Newton failed")
+        _make(writer, range(N))
     return _comparable(directory)
 
 
-def _make(writer: DatasetWriter, indices: list[int]) -> None:
+def _make(writer: DatasetWriter, indices: Iterable[int]) -> None:
     for index in indices:
         writer.write(translation_sample(index))
         if index == 4:
             writer.fail(4, 0, "simulate", "Newton failed")
-
-
-HOLD = """
-import sys
-from pathlib import Path
-sys.path[:0] = sys.argv[4:]
-from samples import job, translation_sample
-from synth.dataset.shard import Shard
-from synth.dataset.writer import DatasetWriter
-shard = Shard.parse(sys.argv[2])
-with DatasetWriter(Path(sys.argv[1]), job(6), shard, 2) as writer:
-    for index in sys.argv[3].split():
-        writer.write(translation_sample(int(index)))
-    print("held", flush=True)
-    sys.stdin.readline()
-"""
-
-
-@contextlib.contextmanager
-def _elsewhere(directory: Path, shard: str, indices: str) -> Iterator["subprocess.Popen[str]"]:
-    """Another process that has made samples of a shard and goes on to hold it until it reads a line or is killed."""
-    paths = [str(Path(__file__).parent), str(Path(__file__).parents[2])]
-    command = [sys.executable, "-c", HOLD, str(directory), shard, indices, *paths]
-    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-    try:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "held\n"
-        yield process
-    finally:
-        process.kill()
-        process.communicate()
 
 
 def test_one_after_the_other(tmp_path: Path) -> None:
@@ -87,7 +51,7 @@ def test_one_after_the_other(tmp_path: Path) -> None:
 
 def test_the_last_to_leave_joins(tmp_path: Path) -> None:
     expected = _in_one_go(tmp_path / "one")
-    with _elsewhere(tmp_path / "d", "0/2", "0 1 4") as other:
+    with writing_elsewhere(tmp_path / "d", "0/2", [0, 1, 4]) as other:
         with DatasetWriter(tmp_path / "d", job(N), Shard(1, 2), PAIRS) as writer:
             stale = tmp_path / "d" / "samples" / ".000000.partial-1"  # of the other: it may be writing it
             own = tmp_path / "d" / "samples" / ".000002.partial-1"
@@ -113,7 +77,7 @@ def test_the_last_to_leave_joins(tmp_path: Path) -> None:
 def test_a_killed_shard_is_taken_in_by_whoever_is_next(tmp_path: Path) -> None:
     """Its lines, also when the last one is torn; a stop in the middle of joining counts no line twice."""
     expected = _in_one_go(tmp_path / "one")
-    with _elsewhere(tmp_path / "d", "0/2", "0 1"):
+    with writing_elsewhere(tmp_path / "d", "0/2", [0, 1]):
         pass
     home = tmp_path / "d" / "shards" / "0-of-2"
     lines = (home / "manifest.jsonl").read_bytes()
@@ -128,16 +92,16 @@ def test_a_killed_shard_is_taken_in_by_whoever_is_next(tmp_path: Path) -> None:
 
 def test_who_is_refused_beside_a_shard(tmp_path: Path) -> None:
     directory = tmp_path / "d"
-    with _elsewhere(directory, "0/2", "0") as other:
+    with writing_elsewhere(directory, "0/2", [0]) as other:
         before = tree(directory)
-        with pytest.raises(InputError, match=r"another process \(shards\) is writing this dataset"):
-            DatasetWriter(directory, job(N))
-        with pytest.raises(InputError, match=rf"another process \(pid {other.pid} on .*\) is making shard 0/2"):
-            DatasetWriter(directory, job(N), Shard(0, 2), PAIRS)
-        with pytest.raises(InputError, match=r"is being made in another number of shards \(0-of-2\)"):
-            DatasetWriter(directory, job(N), Shard(1, 3), PAIRS)
-        with pytest.raises(InputError, match="seed: 7 there, 8 now"):
-            DatasetWriter(directory, job(N, seed=8), Shard(1, 2), PAIRS)
+        for asked, shard, message in (
+            (job(N), None, r"another process \(shards\) is writing this dataset"),
+            (job(N), Shard(0, 2), rf"another process \(pid {other.pid} on .*\) is making shard 0/2"),
+            (job(N), Shard(1, 3), r"is being made in another number of shards \(0-of-2\)"),
+            (job(N, seed=8), Shard(1, 2), "seed: 7 there, 8 now"),
+        ):
+            with pytest.raises(InputError, match=message):
+                DatasetWriter(directory, asked, shard, PAIRS)
         assert tree(directory) == before
         DatasetWriter(directory, job(N), Shard(1, 2), PAIRS).close()
     DatasetWriter(directory, job(N), Shard(1, 3), PAIRS).close()  # once the others have ended

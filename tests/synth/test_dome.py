@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from kinematic_double import pixel_centres
+from kinematic_double import sensor as flat_sensor
 from pads import scene
 from pydantic import ValidationError
 
@@ -15,7 +16,7 @@ from synth.flow.trace import trace
 from synth.mesh import Counts, Focus, PadMesh, domed, graded_box, rest_surface
 from synth.mesh.cache import pad_mesh
 from synth.optics import Optics
-from synth.scene import Box, Camera, Gel, Light, Motion, NoPattern, Numerics, Scene, Sensor, Sphere, Torus, Window
+from synth.scene import Box, Gel, Motion, Numerics, Scene, Sensor, Sphere, Torus, Window
 from synth.simulate.element import p1p1, p2p1
 from synth.simulate.footprint import footprint
 from synth.simulate.indenter import rigid_body
@@ -26,6 +27,7 @@ from synth.verify.camera import ForwardCamera
 from synth.verify.dome import check_dome
 
 SIZE, RADIUS = (16.0, 12.0, 8.0), 13.0
+BALL = Sphere(shape="sphere", radius_mm=3.0)
 PLATE = Box(shape="box", size_mm=(60.0, 60.0, 20.0), fillet_mm=0.5)
 
 
@@ -40,25 +42,22 @@ def sphere_z(places: FloatArray, radius: float = RADIUS) -> FloatArray:
     return radius - np.sqrt(radius**2 - places[:, 0] ** 2 - places[:, 1] ** 2)
 
 
-def volume_below_sphere(a: float, b: float, R: float) -> float:
-    r"""∫∫ √(R² - x² - y²) over |x| < a, |y| < b, from its antiderivative, with s = √(R² - a² - b²).
+def cap_volume() -> float:
+    r"""Volume mm³ of the gel of SIZE and RADIUS: below the window, above ∫∫ R - √(R² - x² - y²) over |x| < a, |y| < b.
 
-    4 [ abs/3 + a (3R² - a²)/6 · atan(b/s) + b (3R² - b²)/6 · atan(a/s) - R³/3 · atan(ab/Rs) ]
+    With s = √(R² - a² - b²) the integral of the root is
+    4 [ abs/3 + a (3R² - a²)/6 · atan(b/s) + b (3R² - b²)/6 · atan(a/s) - R³/3 · atan(ab/Rs) ].
     """
+    a, b, R = SIZE[0] / 2, SIZE[1] / 2, RADIUS
     s = math.sqrt(R * R - a * a - b * b)
-    return 4 * (
-        a * b * s / 3
-        + a * (3 * R * R - a * a) / 6 * math.atan(b / s)
-        + b * (3 * R * R - b * b) / 6 * math.atan(a / s)
-        - R**3 / 3 * math.atan(a * b / (R * s))
-    )
+    root = a * b * s / 3 - R**3 / 3 * math.atan(a * b / (R * s))
+    root += a * (3 * R * R - a * a) / 6 * math.atan(b / s) + b * (3 * R * R - b * b) / 6 * math.atan(a / s)
+    return 4 * (a * b * (SIZE[2] - R) + root)
 
 
 def test_mesh_fills_the_cap_at_second_order() -> None:
     """Chords of a convex face leave a little of the gel out, a quarter of it with elements half as long."""
-    x, y, thickness = SIZE
-    exact = x * y * thickness - (x * y * RADIUS - volume_below_sphere(x / 2, y / 2, RADIUS))
-    lack = []
+    exact, lack = cap_volume(), []
     for cells in (2, 4, 8):
         counts = Counts((2 * cells, 2 * cells), (cells, cells), cells)
         mesh = domed(graded_box(SIZE, Focus((1.0, -0.5), (4.0, 3.0)), counts), RADIUS)
@@ -98,26 +97,18 @@ def test_ftetwild_meshes_are_bulged_or_refused(tmp_path: Path) -> None:
     np.testing.assert_array_equal(mesh.points, again.points)
     assert len(list(tmp_path.iterdir())) == 1  # the box is kept, for any dome
     np.testing.assert_allclose(mesh.points[mesh.on_face, 2], sphere_z(mesh.points[mesh.on_face]), atol=1e-13)
-    x, y, thickness = SIZE
-    exact = x * y * thickness - (x * y * RADIUS - volume_below_sphere(x / 2, y / 2, RADIUS))
     # Chords of edges l take the mean of r_1 r_2 / 2R, about l² / 12R, off the height: here 2 % of 4.5 mm at most.
-    assert mesh.volumes.sum() == pytest.approx(exact, rel=0.02)
+    assert mesh.volumes.sum() == pytest.approx(cap_volume(), rel=0.02)
     # A low tetrahedron around the apex: its three outer corners rise by 5² / 2R = 0.63 mm, past the inner one.
     points = np.array([[5.0, 0, 0], [-2.5, 4.33, 0], [-2.5, -4.33, 0], [0, 0, 0.05]])
     with pytest.raises(InputError, match=r"turns over.*dome_radius_mm = 20"):
         domed(PadMesh(points, np.array([[0, 1, 2, 3]], dtype=np.int32), (10.0, 10.0, 5.0)), 20.0)
 
 
-@pytest.mark.parametrize(
-    ("size", "least"),
-    [
-        # 70 % of 4 mm at 10 mm from the apex: (10² + 2.8²) / 5.6
-        ((16.0, 12.0, 4.0), (100 + 2.8**2) / 5.6),
-        # thick: the slope of 60 degrees decides, 10 / sin 60°
-        ((16.0, 12.0, 20.0), 10 / math.sin(math.radians(60))),
-    ],
-)
-def test_a_dome_must_stay_clear_of_the_window(size: tuple[float, float, float], least: float) -> None:
+@pytest.mark.parametrize(("thickness", "least"), [(4.0, (100 + 2.8**2) / 5.6), (20.0, 10 / math.sin(math.radians(60)))])
+def test_a_dome_must_stay_clear_of_the_window(thickness: float, least: float) -> None:
+    """At 10 mm from the apex at most 70 % of 4 mm are left out; of a thick pad the slope of 60 degrees decides."""
+    size = (16.0, 12.0, thickness)
     assert gel(least * 1.001, size).dome_radius_mm == least * 1.001
     with pytest.raises(ValidationError, match=r"dome_radius_mm = .* at its corners, 10 mm .* use at least"):
         gel(least * 0.999, size)
@@ -127,17 +118,11 @@ def test_a_dome_must_stay_clear_of_the_window(size: tuple[float, float, float], 
 
 def optics_of_a_fisheye() -> tuple[Sensor, Optics]:
     """A 64 x 48 px fisheye behind a window, whose corners see almost the pad's corners."""
-    camera = Camera(
-        width=64, height=48, fx=44.0, fy=44.0, cx=32.3, cy=24.1, position_mm=(0.2, -0.1, 14.0), lens="fisheye",
-        distortion=(0.02, -0.01, 0.002, 0.0),
-    )  # fmt: skip
-    sensor = Sensor(
-        gel=gel(),
-        window=Window(refractive_index=1.41, thickness_mm=2),
-        pattern=NoPattern(kind="none"),
-        lights=(Light(position_mm=(7, 0, 9), size_mm=(1, 1), color=(1, 1, 1), power=1),),
-        camera=camera,
-    )
+    lens = {"lens": "fisheye", "distortion": (0.02, -0.01, 0.002, 0.0), "fx": 44.0, "fy": 44.0, "cx": 32.3, "cy": 24.1}
+    flat = flat_sensor(**lens, position_mm=(0.2, -0.1, 14.0), look_at_mm=(0.0, 0.0, 0.0))
+    window = Window(refractive_index=1.41, thickness_mm=2)
+    light = flat.lights[0].model_copy(update={"position_mm": (7.0, 0.0, 9.0)})
+    sensor = flat.model_copy(update={"gel": gel(), "window": window, "lights": (light,)})
     return sensor, Optics.of(sensor)
 
 
@@ -195,12 +180,11 @@ def path(
 
 
 def test_depth_counts_from_the_face_below_the_position() -> None:
-    ball = Sphere(shape="sphere", radius_mm=3.0)
-    way = path(ball, (3.0, -4.0), 0.7, RADIUS, shear_mm=(1.0, 0.5))
+    way = path(BALL, (3.0, -4.0), 0.7, RADIUS, shear_mm=(1.0, 0.5))
     lowest = [way.pose(s).centre[2] + 3.0 for s in (way.press_mm, way.length_mm)]
     assert lowest == pytest.approx([0.7 + 13 - 12] * 2, abs=1e-12)  # 5 mm from the apex of R = 13: √(169 - 25) = 12
     assert way.pose(way.length_mm).centre[:2] == pytest.approx([4.0, -3.5])
-    flat = path(ball, (3.0, -4.0), 0.7, None)
+    flat = path(BALL, (3.0, -4.0), 0.7, None)
     assert (flat.touch_mm, flat.face_mm, flat.press_mm) == (0.0, 0.0, 0.7)
 
 
@@ -208,7 +192,7 @@ def test_the_path_starts_where_the_body_first_touches() -> None:
     p, r = 5.0, 3.0
     s = math.sqrt(RADIUS**2 - p**2)
     # Two balls touch where their centres are R + r apart: (R + r)² = p² + (s + r - t)².
-    beside = path(Sphere(shape="sphere", radius_mm=r), (3.0, -4.0), 0.7, RADIUS)
+    beside = path(BALL, (3.0, -4.0), 0.7, RADIUS)
     assert beside.touch_mm == pytest.approx(s + r - math.sqrt((RADIUS + r) ** 2 - p**2), abs=2e-6)
     assert beside.touch_mm < -0.05
     assert beside.pose(0.0).depth_mm == beside.touch_mm
@@ -228,14 +212,14 @@ def test_the_path_starts_where_the_body_first_touches() -> None:
 @pytest.mark.parametrize("depth", [0.05, 0.8])
 def test_footprint_is_the_lens_that_two_spheres_share(depth: float) -> None:
     r = 3.0
-    way = path(Sphere(shape="sphere", radius_mm=r), (0.0, 0.0), depth, RADIUS)
+    way = path(BALL, (0.0, 0.0), depth, RADIUS)
     apart = RADIUS + r - depth
     half = math.sqrt(r**2 - ((apart**2 + r**2 - RADIUS**2) / (2 * apart)) ** 2)
     found = footprint(way, SIZE, 0.0)
     # RESOLUTION: 0.2 % of the smaller width on each side.
     assert found.half_mm == pytest.approx((half, half), rel=4.1e-3)
     assert found.centre_mm == pytest.approx((0, 0), abs=4.1e-3 * half)
-    box = footprint(path(Sphere(shape="sphere", radius_mm=r), (0.0, 0.0), depth, None), SIZE, 0.0)
+    box = footprint(path(BALL, (0.0, 0.0), depth, None), SIZE, 0.0)
     assert box.half_mm[0] > 1.05 * half
     # A plate cuts the dome in a circle.
     plate = footprint(path(PLATE, (2.0, 0.0), depth, RADIUS), SIZE, 0.0)
@@ -255,14 +239,11 @@ def test_a_dome_of_a_kilometre_has_the_flat_pads_footprint() -> None:
     assert dome.centre_mm == pytest.approx(flat.centre_mm, abs=0.02)
 
 
-def test_shape_and_radius_belong_together() -> None:
+def test_shape_without_radius_and_lights_outside_the_dome_are_refused() -> None:
+    """0.1 mm behind the face at the apex is outside of the gel near a corner."""
     for radius, shape in ((None, "dome"), (RADIUS, "box")):
         with pytest.raises(ValidationError, match="belong together"):
             gel(radius, shape=shape)
-
-
-def test_lights_outside_the_dome_are_refused() -> None:
-    """0.1 mm behind the face at the apex is outside of the gel near a corner."""
     raw = scene(SIZE, gel={"shape": "dome", "dome_radius_mm": RADIUS}).model_dump()
     assert raw["sensor"]["lights"][0]["position_mm"] == (0.0, 0.0, 0.1)
     raw["sensor"]["lights"][0]["position_mm"] = (SIZE[0] / 2, SIZE[1] / 2, 0.1)

@@ -103,9 +103,8 @@ def test_dot_centres_move_as_the_flow_says(view):
             column, row = (int(v) for v in before)
             if (path[row - REACH : row + REACH + 1, column - REACH : column + REACH + 1] != k).any():
                 continue  # beside the mirror's edge
-            motion = flow.forward[row, column] + _slope(flow.forward, row, column) @ (
-                before - (column + 0.5, row + 0.5)
-            )
+            aside = before - (column + 0.5, row + 0.5)
+            motion = flow.forward[row, column] + _slope(flow.forward, row, column) @ aside
             after = _centroid(second, before + motion)
             if after is not None and flow.forward_visible[row, column] == 1:
                 errors.append(after - before - motion)

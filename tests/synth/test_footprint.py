@@ -17,6 +17,7 @@ from synth.simulate.footprint import FINEST_MM, RESOLUTION, UNTOUCHED, footprint
 from synth.simulate.indenter import rigid_body
 from synth.simulate.load_path import LoadPath
 
+Pair = tuple[float, float]
 SIZE = (20.0, 15.0, 4.0)
 SPHERE = Sphere(shape="sphere", radius_mm=4.0)
 
@@ -31,9 +32,7 @@ def ends(focus: Focus) -> np.ndarray:
     return np.concatenate([centre - half, centre + half])
 
 
-def assert_covers(
-    focus: Focus, low: tuple[float, float], high: tuple[float, float], slack: float | None = None
-) -> None:
+def assert_covers(focus: Focus, low: Pair, high: Pair, slack: float | None = None) -> None:
     """The rectangle from low to high to within the resolution."""
     short = np.concatenate([ends(focus)[:2] - low, high - ends(focus)[2:]])
     allowed = RESOLUTION * np.subtract(high, low).min() if slack is None else slack
@@ -42,7 +41,7 @@ def assert_covers(
     assert (short <= allowed).all()
 
 
-def square(half: float, x: float = 0.0, y: float = 0.0) -> tuple[tuple[float, float], tuple[float, float]]:
+def square(half: float, x: float = 0.0, y: float = 0.0) -> tuple[Pair, Pair]:
     return (x - half, y - half), (x + half, y + half)
 
 
@@ -52,28 +51,21 @@ def test_sphere(depth: float) -> None:
     assert_covers(print_of(SPHERE, depth_mm=depth, position_mm=(1.0, -2.0)), *square(radius, 1.0, -2.0))
 
 
-def test_what_lies_inside_the_gel_counts_not_only_the_cut_at_its_face() -> None:
+def test_what_lies_inside_the_gel_counts_and_thin_bodies_are_not_missed() -> None:
     """A needle's ball has passed the face: its cut there is a point, its overlap as wide as the ball."""
-    ball = Sphere(shape="sphere", radius_mm=0.3)
+    ball, needle = (Sphere(shape="sphere", radius_mm=radius) for radius in (0.3, 0.05))
     assert_covers(print_of(ball, depth_mm=0.6), *square(0.3))
-
-
-def test_thin_body_is_not_missed() -> None:
-    needle = Sphere(shape="sphere", radius_mm=0.05)
     assert_covers(print_of(needle, depth_mm=0.05, position_mm=(7.123, 3.21)), *square(0.05, 7.123, 3.21))
 
 
-def test_turned_box() -> None:
+def test_turned_box_and_bar_that_lies_askew() -> None:
     box = Box(shape="box", size_mm=(6.0, 2.0, 3.0), fillet_mm=0.2, rotation_deg=(0.0, 0.0, 30.0))
     # The core, 2.8 and 0.8 mm to either side, turned by 30 degrees and grown by the fillet, deeper than which it sits.
     cos, sin = np.cos(np.pi / 6), np.sin(np.pi / 6)
     x, y = 2.8 * cos + 0.8 * sin + 0.2, 2.8 * sin + 0.8 * cos + 0.2
     assert_covers(print_of(box, depth_mm=0.5), (-x, -y), (x, y))
-
-
-def test_bar_that_lies_askew() -> None:
     bar = Cylinder(shape="cylinder", radius_mm=2.0, length_mm=8.0, fillet_mm=0.1, rotation_deg=(0.0, 90.0, 30.0))
-    cos, sin, half_width = np.cos(np.pi / 6), np.sin(np.pi / 6), np.sqrt(1.75)
+    half_width = np.sqrt(1.75)
     x, y = 4.0 * cos + half_width * sin, 4.0 * sin + half_width * cos
     # The fillet takes at most its radius off the length of the cut's corners.
     assert_covers(print_of(bar, depth_mm=0.5), (-x, -y), (x, y), 0.1 * cos + 2 * RESOLUTION * y)
@@ -109,14 +101,10 @@ def test_mesh(tmp_path: Path) -> None:
     np.testing.assert_allclose(ends(focus), [-1.5, 0.0, 1.5, 2.0], atol=0.1)
 
 
-def test_shear_adds_what_the_indenter_reaches() -> None:
+def test_shear_adds_what_the_indenter_reaches_and_the_margin_enlarges_the_press_alone() -> None:
     radius = np.sqrt(7.0)
-    focus = print_of(SPHERE, depth_mm=1.0, shear_mm=(2.0, -1.0))
-    assert_covers(focus, (-radius, -radius - 1.0), (radius + 2.0, radius))
-
-
-def test_margin_enlarges_the_press_and_not_the_drag() -> None:
-    radius = np.sqrt(7.0)
+    dragged = print_of(SPHERE, depth_mm=1.0, shear_mm=(2.0, -1.0))
+    assert_covers(dragged, (-radius, -radius - 1.0), (radius + 2.0, radius))
     focus = print_of(SPHERE, 0.2, depth_mm=1.0, shear_mm=(2.0, 0.0))
     # A margin carries the resolution along.
     assert_covers(focus, (-1.2 * radius, -1.2 * radius), (radius + 2.0, 1.2 * radius), 1.2 * RESOLUTION * 2 * radius)
@@ -165,7 +153,7 @@ def test_never_larger_than_the_pad() -> None:
 def test_the_slightest_touch_is_found(indenter: Indenter) -> None:
     """It ends, near the first point of contact; the search stops at FINEST_MM."""
     focus = print_of(indenter, depth_mm=1e-6)
-    curvature_radius = {500.0: 500.0}.get(getattr(indenter, "radius_mm", 0.0), 3.5)
+    curvature_radius = 500.0 if indenter.shape == "sphere" else 3.5
     # Where the gap is below a cell's diagonal, nothing can be excluded: sqrt(2 R sqrt(3) FINEST_MM) from the contact.
     rim = 3.0 if indenter.shape == "torus" and indenter.rotation_deg == (0.0, 0.0, 0.0) else 0.0
     reach = rim + np.sqrt(2 * curvature_radius * np.sqrt(3) * FINEST_MM)
