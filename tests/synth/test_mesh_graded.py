@@ -32,18 +32,9 @@ def random_spans(count: int, length: float) -> list[tuple[float, float]]:
     return [(float(min(pair)), float(max(pair))) for pair in draws]
 
 
-def mirrored(mesh: PadMesh, axis: int) -> FloatArray:
-    """(n,) for each node, the node at its mirror image."""
-    image = mesh.points.copy()
-    image[:, axis] *= -1
-    image[image == 0] = 0.0  # -0.0 sorts like 0.0 but is another number to a dictionary
-    place = {tuple(point): i for i, point in enumerate(mesh.points + 0.0)}
-    return np.array([place[tuple(point)] for point in image + 0.0])
-
-
 @pytest.mark.parametrize("layers", LAYERS.values(), ids=LAYERS)
 @pytest.mark.parametrize("focus", FOCI.values(), ids=FOCI)
-def test_fills_the_box_with_one_topology(focus: Focus, layers: tuple[float, ...]) -> None:
+def test_fills_the_box_with_one_topology_and_bounded_shapes(focus: Focus, layers: tuple[float, ...]) -> None:
     mesh = graded_box(SIZE, focus, COUNTS, layers)
     assert mesh.volumes.min() > 0
     # Sums of 3000 volumes round to some 1e-15 relative.
@@ -51,30 +42,29 @@ def test_fills_the_box_with_one_topology(focus: Focus, layers: tuple[float, ...]
     assert mesh.tets is graded_box(SIZE, CENTRED, COUNTS, layers).tets
     assert (mesh.points.min(axis=0) == [-10.0, -7.5, 0.0]).all()
     assert (mesh.points.max(axis=0) == [10.0, 7.5, 4.0]).all()
-    again = graded_box(SIZE, focus, COUNTS, layers)
-    assert again.hash == mesh.hash
-
-
-@pytest.mark.parametrize("focus", FOCI.values(), ids=FOCI)
-def test_shapes_stay_bounded(focus: Focus) -> None:
-    # What fTetWild's meshes must meet, too.
-    mesh = graded_box(SIZE, focus, COUNTS)
-    assert shape_quality(mesh.points, mesh.tets).min() > WORST_SHAPE
+    assert graded_box(SIZE, focus, COUNTS, layers).hash == mesh.hash
+    if not layers:  # what fTetWild's meshes must meet, too
+        assert shape_quality(mesh.points, mesh.tets).min() > WORST_SHAPE
 
 
 def test_neighbours_share_whole_faces() -> None:
     mesh = graded_box(SIZE, CENTRED, COUNTS)
     nx, ny, nz = COUNTS.cells(0), COUNTS.cells(1), COUNTS.through
+    assert kuhn_tets(nx, ny, nz) is mesh.tets  # made once
+    assert not mesh.tets.flags.writeable
     assert len(mesh.points) == (nx + 1) * (ny + 1) * (nz + 1)
     assert len(boundary_faces(mesh.tets)) == 4 * (nx * ny + ny * nz + nx * nz)
     assert len(mesh.contact_faces.faces) == 2 * nx * ny
 
 
-@pytest.mark.parametrize("axis", [0, 1])
-def test_centred_focus_gives_its_own_mirror_image(axis: int) -> None:
+def test_centred_focus_gives_its_own_mirror_image() -> None:
     mesh = graded_box(SIZE, CENTRED, COUNTS)
-    image = mirrored(mesh, axis)[mesh.tets]
-    assert {frozenset(tet) for tet in image.tolist()} == {frozenset(tet) for tet in mesh.tets.tolist()}
+    place = {tuple(point): i for i, point in enumerate(mesh.points)}
+    for axis in (0, 1):
+        image = mesh.points.copy()
+        image[:, axis] *= -1
+        turned = np.array([place[tuple(point)] for point in image])[mesh.tets]
+        assert {frozenset(tet) for tet in turned.tolist()} == {frozenset(tet) for tet in mesh.tets.tolist()}
 
 
 def test_mirrored_focus_gives_the_mirrored_planes_to_the_bit() -> None:
@@ -163,18 +153,21 @@ def test_layers_are_bounded_by_planes(layers: tuple[float, ...]) -> None:
     for k in range(len(layers) + 1):
         between = ((planes > faces[k]) & (planes <= faces[k + 1])).sum()
         assert between >= (counts.film if layers else counts.through)
-        assert mesh.volumes[mesh.layer == k].sum() == pytest.approx(
-            SIZE[0] * SIZE[1] * (faces[k + 1] - faces[k]), rel=1e-12
-        )
-    assert np.diff(planes).max() <= np.diff(np.unique(graded_box(SIZE, CENTRED, counts).points[:, 2])).max() + 1e-9
+        volume = SIZE[0] * SIZE[1] * (faces[k + 1] - faces[k])
+        assert mesh.volumes[mesh.layer == k].sum() == pytest.approx(volume, rel=1e-12)
+    assert np.diff(planes).max() <= _depth_steps(counts).max() + 1e-9
+
+
+def _depth_steps(counts: Counts) -> FloatArray:
+    """Distances of the planes through the thickness."""
+    return np.diff(np.unique(graded_box(SIZE, CENTRED, counts).points[:, 2]))
 
 
 def test_depth_is_graded_from_the_contact_face() -> None:
-    step = np.diff(np.unique(graded_box(SIZE, CENTRED, Counts(through=4, growth=1.5)).points[:, 2]))
     # h (1 + 1.5 + 2.25 + 3.375) = 4 mm.
-    np.testing.assert_allclose(step, 4 / 8.125 * 1.5 ** np.arange(4), atol=2 * GRAIN_MM)
-    even = np.diff(np.unique(graded_box(SIZE, CENTRED, Counts(through=4, growth=1.0)).points[:, 2]))
-    np.testing.assert_allclose(even, 1.0, atol=2 * GRAIN_MM)
+    steps = _depth_steps(Counts(through=4, growth=1.5))
+    np.testing.assert_allclose(steps, 4 / 8.125 * 1.5 ** np.arange(4), atol=2 * GRAIN_MM)
+    np.testing.assert_allclose(_depth_steps(Counts(through=4, growth=1.0)), 1.0, atol=2 * GRAIN_MM)
 
 
 def test_touchable_is_all_but_the_window() -> None:
@@ -201,20 +194,11 @@ def test_hash_knows_layers_only_where_there_are_several() -> None:
         PadMesh(mesh.points, mesh.tets, SIZE, np.zeros(3, dtype=np.int32))
 
 
-def test_topology_is_made_once() -> None:
-    assert kuhn_tets(3, 2, 2) is kuhn_tets(3, 2, 2)
-    assert not kuhn_tets(3, 2, 2).flags.writeable
-
-
-@pytest.mark.parametrize("wrong", [
-    {"across": (7, 8)}, {"across": (0, 8)}, {"outer": (3, 0)}, {"through": 0}, {"film": 0}, {"growth": 0.9},
-])  # fmt: skip
-def test_counts_that_give_no_mesh(wrong: dict) -> None:
-    with pytest.raises(ValueError, match="across must be even"):
-        Counts(**wrong)
-
-
-@pytest.mark.parametrize("layers", [(0.0,), (-1.0, 2.0), (4.0,), (3.0, 2.0)])
-def test_layers_that_do_not_fit(layers: tuple[float, ...]) -> None:
-    with pytest.raises(ValueError, match="must be positive and thinner"):
-        graded_box(SIZE, CENTRED, COUNTS, layers)
+def test_counts_and_layers_that_give_no_mesh() -> None:
+    even, positive = {"across": (7, 8)}, {"across": (0, 8)}
+    for wrong in (even, positive, {"outer": (3, 0)}, {"through": 0}, {"film": 0}, {"growth": 0.9}):
+        with pytest.raises(ValueError, match="across must be even"):
+            Counts(**wrong)
+    for layers in ((0.0,), (-1.0, 2.0), (4.0,), (3.0, 2.0)):
+        with pytest.raises(ValueError, match="must be positive and thinner"):
+            graded_box(SIZE, CENTRED, COUNTS, layers)

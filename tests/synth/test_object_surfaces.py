@@ -35,6 +35,12 @@ def around(half: tuple[float, float, float]) -> FloatArray:
     return np.random.default_rng(7).uniform(-1, 1, (4000, 3)) * (np.array(half) + 2 * CELL)
 
 
+def assert_equal_near(found: FloatArray, exact: FloatArray, near: float, error: float) -> None:
+    """Distances agree at the places that are less than `near` from the surface."""
+    close = np.abs(exact) < near
+    np.testing.assert_allclose(found[close], exact[close], atol=error)
+
+
 def parts(kind: str) -> tuple[FloatArray, np.ndarray]:
     """The block's points and faces with one thing wrong."""
     points, faces = np.asarray(CUBE.points, dtype=float), np.asarray(CUBE.regular_faces)
@@ -46,9 +52,8 @@ def parts(kind: str) -> tuple[FloatArray, np.ndarray]:
         case "doubled":
             faces = np.concatenate([faces, faces[:6], faces[6:, ::-1]])
         case "two shells":  # the left and the right part, 1 mm of them in common
-            left, right = points.copy(), points.copy()
-            left[:, 0] = np.where(points[:, 0] > 0, 0.5, -2.0)
-            right[:, 0] = np.where(points[:, 0] > 0, 2.0, -0.5)
+            sides = np.where(points[:, :1] > 0, [0.5, 2.0], [-2.0, -0.5])
+            left, right = (np.column_stack([side, points[:, 1:]]) for side in sides.T)
             points, faces = np.concatenate([left, right]), np.concatenate([faces, faces[:, ::-1] + len(points)])
         case "unjoined":
             points, faces = points[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
@@ -57,12 +62,9 @@ def parts(kind: str) -> tuple[FloatArray, np.ndarray]:
 
 @pytest.mark.parametrize("kind", ["inverted", "one face inverted", "doubled", "two shells", "unjoined"])
 def test_meshes_with_faults_are_the_same_body(tmp_path: Path, kind: str) -> None:
-    body = body_of(saved(tmp_path, *parts(kind)), fillet_mm=0.3)
-    whole = body_of(saved(tmp_path, *parts("")), fillet_mm=0.3)
+    body, whole = (body_of(saved(tmp_path, *parts(one)), fillet_mm=0.3) for one in (kind, ""))
     places = around((2.0, 1.5, 1.0))
-    found, exact = distances(body, places), distances(whole, places)
-    near = np.abs(exact) < 0.25
-    np.testing.assert_allclose(found[near], exact[near], atol=0.01)
+    assert_equal_near(distances(body, places), distances(whole, places), 0.25, 0.01)
 
 
 def test_a_hole_is_closed(tmp_path: Path) -> None:
@@ -74,9 +76,8 @@ def test_a_hole_is_closed(tmp_path: Path) -> None:
 
 
 def test_more_hole_than_surface_is_refused(tmp_path: Path) -> None:
-    cap = (
-        pv.Sphere(radius=4.0).clip("z", origin=(0, 0, 3.0), invert=False).extract_surface(algorithm=None).triangulate()
-    )
+    rest = pv.Sphere(radius=4.0).clip("z", origin=(0, 0, 3.0), invert=False)
+    cap = rest.extract_surface(algorithm=None).triangulate()
     with pytest.raises(InputError, match="open sheet"):
         body_of(saved(tmp_path, cap.points, cap.regular_faces))
 
@@ -99,9 +100,7 @@ def test_many_triangles(tmp_path: Path) -> None:
     assert ball.n_cells > 200_000
     body = body_of(saved(tmp_path, ball.points, ball.regular_faces))
     places = around((1.5, 1.5, 1.5))
-    exact = np.linalg.norm(places, axis=1) - 2.0
-    near = np.abs(exact) < 0.25
-    np.testing.assert_allclose(distances(body, places)[near], exact[near], atol=1e-3)
+    assert_equal_near(distances(body, places), np.linalg.norm(places, axis=1) - 2.0, 0.25, 1e-3)
 
 
 def test_edges_are_rounded_as_those_of_a_block(tmp_path: Path) -> None:
@@ -110,19 +109,23 @@ def test_edges_are_rounded_as_those_of_a_block(tmp_path: Path) -> None:
     block = rigid_body(Box(shape="box", size_mm=(4.0, 3.0, 2.0), fillet_mm=fillet))
     places = around((2.0, 1.5, 1.0))
     found, exact = distances(body, places), distances(block, places)
-    near = np.abs(exact) < 0.2
     # A B-spline of a distance whose second derivative jumps errs by some 1 % of the spacing there.
-    np.testing.assert_allclose(found[near], exact[near], atol=0.01)
-    assert np.sqrt(np.mean((found - exact)[near] ** 2)) < 2e-3
+    assert_equal_near(found, exact, 0.2, 0.01)
+    assert np.sqrt(np.mean((found - exact)[np.abs(exact) < 0.2] ** 2)) < 2e-3
+
+
+def joined(*pieces: pv.PolyData) -> tuple[FloatArray, np.ndarray]:
+    """Points and faces of all."""
+    starts = np.cumsum([0, *(len(piece.points) for piece in pieces)])
+    faces = [piece.regular_faces + start for piece, start in zip(pieces, starts, strict=False)]
+    return np.concatenate([piece.points for piece in pieces]), np.concatenate(faces)
 
 
 def test_a_thin_part_is_kept(tmp_path: Path) -> None:
     """A plate thinner than two radii keeps its thickness, a blade on it its height."""
     plate = pv.Cube(x_length=6.0, y_length=6.0, z_length=0.5).triangulate()
     blade = pv.Cube(x_length=4.0, y_length=0.3, z_length=2.0, center=(0.0, 0.0, 1.0)).triangulate()
-    points = np.concatenate([plate.points, blade.points])
-    faces = np.concatenate([plate.regular_faces, blade.regular_faces + len(plate.points)])
-    body = body_of(saved(tmp_path, points, faces), fillet_mm=0.6)
+    body = body_of(saved(tmp_path, *joined(plate, blade)), fillet_mm=0.6)
     height = 2.25 / 2
     assert body.reach_mm == pytest.approx(height, abs=0.1)
     inside = np.array([[2.0, 2.0, -height + 0.25], [0.0, 0.0, height - 0.3], [1.5, 0.0, height - 0.5]])
@@ -134,11 +137,7 @@ def test_a_thin_part_is_kept(tmp_path: Path) -> None:
 def test_a_notch_narrower_than_the_edges_is_filled(tmp_path: Path) -> None:
     boxes = [pv.Cube(x_length=2.0, y_length=3.0, z_length=2.0, center=(x, 0.0, 0.0)).triangulate() for x in (-1.1, 1.1)]
     base = pv.Cube(x_length=4.2, y_length=3.0, z_length=1.0, center=(0.0, 0.0, -0.9)).triangulate()
-    pieces = [*boxes, base]
-    starts = np.cumsum([0, *(len(piece.points) for piece in pieces)])
-    points = np.concatenate([piece.points for piece in pieces])
-    faces = np.concatenate([piece.regular_faces + start for piece, start in zip(pieces, starts, strict=False)])
-    path = saved(tmp_path, points, faces)
+    path = saved(tmp_path, *joined(*boxes, base))
     within = np.array([[0.0, 0.0, 0.5]])
     assert distances(body_of(path), within)[0] > 0
     assert distances(body_of(path, fillet_mm=0.6), within)[0] < 0
@@ -150,8 +149,7 @@ def test_what_cannot_touch_has_no_grid(tmp_path: Path) -> None:
     assert part.coefficients.shape[2] < whole.coefficients.shape[2] - 10
     assert part.reach_mm == pytest.approx(whole.reach_mm, abs=1e-6)
     top = around((2.0, 1.5, 0.1)) + np.array([0.0, 0.0, 0.9])
-    near = np.abs(distances(whole, top)) < 0.2
-    np.testing.assert_allclose(distances(part, top)[near], distances(whole, top)[near], atol=0.01)
+    assert_equal_near(distances(part, top), distances(whole, top), 0.2, 0.01)
 
 
 def test_the_radius_is_the_stated_one_or_what_the_gel_can_follow() -> None:

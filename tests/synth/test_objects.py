@@ -20,16 +20,13 @@ MOST_BYTES = 1_000_000
 each_file = pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
 
 
-def make(folder: Path) -> Path:
-    """Run the script as its docstring says."""
-    subprocess.run([sys.executable, FOLDER / "make.py", folder], check=True)
-    return folder
-
-
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with the objects made anew."""
-    return make(tmp_path_factory.mktemp("made"))
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two folders with the objects made anew, by the script as its docstring says."""
+    folders = tmp_path_factory.mktemp("made"), tmp_path_factory.mktemp("again")
+    for folder in folders:
+        subprocess.run([sys.executable, FOLDER / "make.py", folder], check=True)
+    return folders
 
 
 def corners_of(file: Path) -> FloatArray:
@@ -50,55 +47,40 @@ def areas(corners: FloatArray) -> FloatArray:
 
 
 @each_file
-def test_surface_is_closed_and_manifold(file: Path) -> None:
-    surface = pv.read(file).clean()
-    assert surface.n_open_edges == 0
-    assert surface.is_manifold
-
-
-@each_file
-def test_every_shell_is_oriented_outward(file: Path) -> None:
+def test_surface_is_closed_and_every_shell_is_oriented_outward(file: Path) -> None:
     """In a consistently oriented closed surface each directed edge occurs once, and its reverse once."""
-    corners = corners_of(file)
+    surface, corners = pv.read(file).clean(), corners_of(file)
+    assert surface.is_manifold
+    assert surface.n_open_edges == 0
     _, vertex = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
     triangles = vertex.reshape(-1, 3)
     edges = np.vstack([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     assert len(np.unique(edges, axis=0)) == len(edges)
     assert {tuple(edge) for edge in edges} == {tuple(edge) for edge in edges[:, ::-1]}
-    assert pv.read(file).clean().split_bodies().n_blocks == 1, "with more shells, look at the volume of each"
+    assert surface.split_bodies().n_blocks == 1, "with more shells, look at the volume of each"
     assert volume(corners) > 0
 
 
 @each_file
-def test_no_triangle_is_degenerate(file: Path) -> None:
+def test_no_triangle_is_degenerate_and_the_size_is_5_to_30_mm(file: Path) -> None:
     corners = corners_of(file)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     assert (2 * areas(corners) / longest).min() > SMALLEST_HEIGHT
+    assert 5 <= np.ptp(corners.reshape(-1, 3), axis=0).max() <= 30
 
 
-@each_file
-def test_longest_edge_is_5_to_30_mm(file: Path) -> None:
-    assert 5 <= np.ptp(corners_of(file).reshape(-1, 3), axis=0).max() <= 30
-
-
-def test_files_are_small_together() -> None:
+def test_files_are_small_together_and_the_script_makes_them_and_no_others_by_the_byte(made: tuple[Path, Path]) -> None:
     assert sum(file.stat().st_size for file in FILES) <= MOST_BYTES
-
-
-def test_script_makes_the_shipped_files_and_no_others(made: Path) -> None:
     assert len(FILES) >= 20
-    assert {file.name for file in made.iterdir()} == {file.name for file in FILES}
+    first, again = ({file.name: file.read_bytes() for file in folder.iterdir()} for folder in made)
+    assert first.keys() == {file.name for file in FILES}
+    assert first == again
 
 
 @each_file
-def test_script_makes_the_shipped_shape(file: Path, made: Path) -> None:
-    shipped, again = corners_of(file), corners_of(made / file.name)
+def test_script_makes_the_shipped_shape(file: Path, made: tuple[Path, Path]) -> None:
+    shipped, again = corners_of(file), corners_of(made[0] / file.name)
     for extreme in (np.min, np.max):
         np.testing.assert_allclose(extreme(again, axis=(0, 1)), extreme(shipped, axis=(0, 1)), atol=SIMPLIFICATION)
     # A surface that moves by a distance changes the volume by at most that distance times its area.
     assert volume(again) == pytest.approx(volume(shipped), abs=SIMPLIFICATION * areas(shipped).sum())
-
-
-def test_two_runs_write_the_same_bytes(made: Path, tmp_path: Path) -> None:
-    for file in make(tmp_path).iterdir():
-        assert file.read_bytes() == (made / file.name).read_bytes(), file.name
