@@ -195,10 +195,10 @@ def test_hash_knows_layers_only_where_there_are_several() -> None:
 
 
 def test_counts_and_layers_that_give_no_mesh() -> None:
-    even, positive = {"across": (7, 8)}, {"across": (0, 8)}
-    for wrong in (even, positive, {"outer": (3, 0)}, {"through": 0}, {"film": 0}, {"growth": 0.9}):
+    wrong = {"across": [(7, 8), (0, 8)], "outer": [(3, 0)], "through": [0], "film": [0], "growth": [0.9]}
+    for name, value in ((name, value) for name, values in wrong.items() for value in values):
         with pytest.raises(ValueError, match="across must be even"):
-            Counts(**wrong)
+            Counts(**{name: value})
     for layers in ((0.0,), (-1.0, 2.0), (4.0,), (3.0, 2.0)):
         with pytest.raises(ValueError, match="must be positive and thinner"):
             graded_box(SIZE, CENTRED, COUNTS, layers)
