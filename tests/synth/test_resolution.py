@@ -1,11 +1,10 @@
 """Meshes chosen from an error budget, and the error model against finer solutions."""
 
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
-from pads import scene
+from pads import PUNCH, scene
 
 from synth.mesh import Focus
 from synth.scene import Scene
@@ -42,25 +41,18 @@ def resolve(draw: Scene) -> Resolution:
 
 
 def test_a_tighter_budget_takes_a_finer_mesh() -> None:
-    scale = scale_px_per_mm(drawn(BALL))
-    found = [resolve(drawn(BALL, target * scale)) for target in (0.05, 0.01, 0.005)]
-    assert [r.across for r in found] == sorted({r.across for r in found})
-    assert all(a.spacing_mm > b.spacing_mm for a, b in pairwise(found))
-    assert all(r.error_px <= target * scale for r, target in zip(found, (0.05, 0.01, 0.005), strict=True))
+    targets = scale_px_per_mm(drawn(BALL)) * np.array([0.05, 0.01, 0.005])
+    found = [resolve(drawn(BALL, target)) for target in targets]
+    assert (np.diff([r.across for r in found]) > 0).all()
+    assert (np.diff([r.spacing_mm for r in found]) < 0).all()
+    assert (np.array([r.error_px for r in found]) <= targets).all()
 
 
-def test_a_budget_out_of_reach_takes_the_finest_and_says_so() -> None:
-    hopeless = resolve(drawn(BLOCK, 1e-6))
+def test_a_budget_out_of_reach_takes_the_finest_and_an_untouched_pad_the_coarsest() -> None:
+    hopeless, away = resolve(drawn(BLOCK, 1e-6)), resolve(drawn(BALL, 1e-6, depth_mm=-0.5))
     assert hopeless.across == ELEMENTS_ACROSS[-1]
     assert hopeless.error_px > 1e-6
-
-
-def test_an_untouched_pad_takes_the_coarsest() -> None:
-    away = resolve(drawn(BALL, 1e-6, depth_mm=-0.5))
     assert (away.across, away.error_px) == (ELEMENTS_ACROSS[0], 0.0)
-
-
-def test_budget_and_edge_length_exclude_each_other() -> None:
     with pytest.raises(ValueError, match="give one of them"):
         scene(SIZE, numerics={"target_error_px": 0.5, "edge_length_mm": 1.0})
 
@@ -76,14 +68,8 @@ def test_elements_under_the_contact_are_about_as_high_as_wide(half: float) -> No
 BODIES = {
     "sphere": BALL,
     "cone": {"shape": "cone", "half_angle_deg": 50.0, "height_mm": 8.0, "fillet_mm": 0.5},
-    "bar": {
-        "shape": "cylinder",
-        "radius_mm": 2.0,
-        "length_mm": 6.0,
-        "fillet_mm": 0.5,
-        "rotation_deg": (90.0, 0.0, 30.0),
-    },
-    "punch": {"shape": "cylinder", "radius_mm": 2.0, "length_mm": 6.0, "fillet_mm": 0.5},
+    "bar": PUNCH | {"rotation_deg": (90.0, 0.0, 30.0)},
+    "punch": PUNCH,
     "box": BLOCK,
     "torus": {"shape": "torus", "radius_mm": 2.5, "tube_mm": 1.0},
 }
@@ -91,16 +77,14 @@ BODIES = {
 
 def enlarged(part: Any, factor: float) -> Any:
     """A scene's dictionary with all that is in mm that much larger."""
-    if isinstance(part, dict):
-        return {
-            key: _times(value, factor) if key.endswith("_mm") and value is not None else enlarged(value, factor)
-            for key, value in part.items()
-        }
-    return part
 
+    def times(value: Any) -> Any:
+        return type(value)(map(times, value)) if isinstance(value, (tuple, list)) else factor * value
 
-def _times(value: Any, factor: float) -> Any:
-    return type(value)(_times(v, factor) for v in value) if isinstance(value, (tuple, list)) else factor * value
+    if not isinstance(part, dict):
+        return part
+    lengths = {key: times(value) for key, value in part.items() if key.endswith("_mm") and value is not None}
+    return {key: enlarged(value, factor) for key, value in part.items()} | lengths
 
 
 @pytest.mark.parametrize("body", BODIES)
@@ -126,15 +110,13 @@ def test_without_friction_nothing_drags() -> None:
 
 def test_only_what_the_camera_sees_counts() -> None:
     """A contact half outside the picture errs by half as much squared."""
-    wide = drawn(BALL)
-    half = 4.0  # of the seen part along x, mm
+    wide, half = drawn(BALL), 4.0  # mm, of the seen part along x
     camera = wide.sensor.camera
     closer = camera.width / (2 * half) / scale_px_per_mm(wide)
     camera = camera.model_copy(update={"fx": closer * camera.fx, "fy": closer * camera.fy})
     posed = wide.model_copy(update={"sensor": wide.sensor.model_copy(update={"camera": camera})})
-    within, across, beyond = (
-        predicted_error_px(posed, Focus((x, 0.0), (0.9, 0.9)), 0.3) for x in (0.0, half, half + 1)
-    )
+    zones = (Focus((x, 0.0), (0.9, 0.9)) for x in (0.0, half, half + 1))
+    within, across, beyond = (predicted_error_px(posed, zone, 0.3) for zone in zones)
     # The zone is looked at in 9 columns, of which 4 or 5 are inside.
     assert across / within == pytest.approx(np.sqrt(0.5), rel=0.07)
     assert beyond / within == pytest.approx(np.sqrt(0.1))
