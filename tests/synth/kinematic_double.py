@@ -24,6 +24,7 @@ SIDES = (
 PERISCOPE = ({"position_mm": (0.0, -2.0, 16.0), "normal": (0.05, -1.0, -1.1), "size_mm": (16.0, 9.0)},)
 """One mirror at about 45 degrees, for a camera that looks along +y: LEVEL."""
 LEVEL = {"position_mm": (0.4, -16.0, 15.0), "look_at_mm": (0.0, -2.0, 15.5)}
+PERISCOPE_VIEW = {"mirrors": PERISCOPE, **LEVEL}
 
 
 def sensor(*, index: float = 1.0, mirrors: tuple[dict, ...] = (), **camera: object) -> Sensor:

@@ -58,9 +58,12 @@ def translation_sample(
         images = [np.ascontiguousarray(image[:, :, 0]) for image in images]
     gel = columns < WIDTH - 2
     forward = np.where(gel[..., None], np.array(shift), np.nan).astype(np.float32)
-    ahead = (x + shift[0] < WIDTH) & (x + shift[0] > 0) & (y + shift[1] < HEIGHT) & (y + shift[1] > 0) & gel
-    behind = (x - shift[0] < WIDTH) & (x - shift[0] > 0) & (y - shift[1] < HEIGHT) & (y - shift[1] > 0) & gel
-    surface = flat_surface()
+
+    def visible(k: int) -> np.ndarray:
+        u, v = x + k * shift[0], y + k * shift[1]
+        return ((u > 0) & (u < WIDTH) & (v > 0) & (v < HEIGHT) & gel).astype(np.float32)
+
+    contact, surface = np.where(gel, index, np.nan).astype(np.float32), flat_surface()
     rest = np.zeros_like(surface.coarse.nodes)
     solver = {
         "depth_mm": 0.1, "shear_mm": [0.0, 0.0], "twist_deg": 0.0, "converged": True, "newton_iterations": 4,
@@ -73,13 +76,7 @@ def translation_sample(
         seed=7,
         image1=images[0],
         image2=images[1],
-        flow=FlowField(
-            forward,
-            ahead.astype(np.float32),
-            -forward,
-            behind.astype(np.float32),
-            extras={"contact.Y": np.where(gel, index, np.nan).astype(np.float32)},
-        ),
+        flow=FlowField(forward, visible(1), -forward, visible(-1), extras={"contact.Y": contact}),
         scene=Scene.model_validate(SCENE),
         surface=surface,
         displacement1=rest,
@@ -94,15 +91,9 @@ def translation_sample(
 def job(n: int = 3, *, seed: int = 7, **changes: object) -> Job:
     """A job whose scene is `SCENE` with top-level keys changed."""
     scene = {**SCENE, **changes}
-    return Job(
-        scene=scene,
-        scene_name="flat",
-        scene_hash=hashlib.sha256(repr(scene).encode()).hexdigest()[:16],
-        seed=seed,
-        n=n,
-        software={"synth": "0.1.0"},
-        device={"device": "cpu", "variant": "scalar_rgb"},
-    )
+    scene_hash = hashlib.sha256(repr(scene).encode()).hexdigest()[:16]
+    software, device = {"synth": "0.1.0"}, {"device": "cpu", "variant": "scalar_rgb"}
+    return Job(scene, "flat", scene_hash, seed, n, software, device)
 
 
 HOLD = """

@@ -18,18 +18,12 @@ from synth.simulate.options import SolverOptions
 
 MESH = brick(counts=(4, 4, 2))
 TOLERANCE = 1e-8
-LOOSE = 1e-2
-STRICT_WAY, LOOSE_WAY = (
-    SolverOptions(relaxed_tolerance=0.0, forcing=1e-3),
-    SolverOptions(relaxed_tolerance=LOOSE, forcing=1e-3),
-)
+STRICT_WAY, LOOSE_WAY = (SolverOptions(relaxed_tolerance=loose, forcing=1e-3) for loose in (0.0, 1e-2))
 
 
 def pressed(penalty: float = 50.0, depth_mm: float = 0.6, steps: int = 2) -> Scene:
     """A ball that is pressed and dragged with friction. With a penalty of 3,000 nothing is deep enough to correct."""
-    motion = {"depth_mm": depth_mm, "shear_mm": [0.0, 0.0], "steps": steps}
-    if steps > 1:
-        motion["shear_mm"] = [0.15, -0.05]
+    motion = {"depth_mm": depth_mm, "shear_mm": [0.15, -0.05] if steps > 1 else [0.0, 0.0], "steps": steps}
     numerics = {"element": "p1p1", "tolerance": TOLERANCE, "penalty": penalty}
     return scene(indenter=SPHERE, friction=0.5, motion=motion, numerics=numerics)
 
@@ -69,9 +63,7 @@ def test_a_state_without_balance_to_the_full_tolerance_leaves_no_trace(monkeypat
     solver = run.solver
     fields, contact = solver._arrays.fields, solver._arrays.contact
     phase, stage = solver.lanes.phase, solver.lanes.stage
-    begun: list[np.ndarray] = []
-    rejected: list[np.ndarray] = []
-    changed: list[bool] = []
+    begun, rejected, changed = [], [], []
 
     def memory() -> list[np.ndarray]:
         arrays = (fields.state_u, fields.state_p, contact.anchored, contact.anchor, contact.normal, contact.tangent)
@@ -94,7 +86,6 @@ def test_a_state_without_balance_to_the_full_tolerance_leaves_no_trace(monkeypat
     assert (result.status, "did not converge" in result.reason, len(result.states)) == ("failed", True, 1)
 
 
-STRICT = SolverOptions(relaxed_tolerance=0.0, forcing=1e-3)
 BOX = {"shape": "box", "size_mm": [3.0, 2.5, 4.0], "fillet_mm": 0.6, "rotation_deg": [0, 0, 20]}
 ROD = {"shape": "cylinder", "radius_mm": 1.5, "length_mm": 4.0, "fillet_mm": 0.3}
 
@@ -109,7 +100,7 @@ def test_a_pass_that_goes_too_far_is_given_up() -> None:
     """As soon as it does; what is taken has stayed within reach, and the other passes take penetration away."""
     posed = sliding(BOX)
     mesh = brick(counts=(4, 4, 2))
-    run = Run(presses_of([posed], mesh), prepare(posed, mesh, "cpu"), None, 1, STRICT)
+    run = Run(presses_of([posed], mesh), prepare(posed, mesh, "cpu"), None, 1, STRICT_WAY)
     solver = run.solver
     lanes, fields = solver.lanes, solver._arrays.fields
     lost, solved, depths = [], 0, {}
@@ -135,7 +126,7 @@ def test_a_pass_that_goes_too_far_is_given_up() -> None:
     solver.watch = look
     ((_, result),) = run
     assert result.status == "complete"
-    assert any(iteration < STRICT.correction_iterations and share > 1 for iteration, share in lost)
+    assert any(iteration < STRICT_WAY.correction_iterations and share > 1 for iteration, share in lost)
     assert solved >= len(depths) == 3
     for state, before in zip(result.states[1:], depths.values(), strict=True):
         assert state.max_penetration_mm < 0.5 * before
@@ -152,8 +143,8 @@ def test_so_does_the_solver_for_one_sample(monkeypatch: pytest.MonkeyPatch) -> N
         return found
 
     monkeypatch.setattr(stepping, "solve", watched)
-    result = simulate(sliding(ROD), brick(counts=(5, 5, 2)), options=STRICT)
+    result = simulate(sliding(ROD), brick(counts=(5, 5, 2)), options=STRICT_WAY)
     assert result.status == "complete"
-    passes = [(converged, iterations, share) for converged, iterations, share in given if np.isfinite(share) and share]
+    passes = [one for one in given if np.isfinite(one[2]) and one[2]]
     assert all(share <= 1 for converged, _, share in passes if converged)
-    assert any(iterations < STRICT.correction_iterations and share > 1 for _, iterations, share in passes)
+    assert any(iterations < STRICT_WAY.correction_iterations and share > 1 for _, iterations, share in passes)

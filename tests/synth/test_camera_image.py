@@ -39,20 +39,16 @@ def test_deeper_images_fill_16_bits_in_steps_of_their_own(bits: int) -> None:
 
 
 @pytest.mark.parametrize("signal", [0.1, 0.4])
-def test_noise_has_the_photon_transfer_variance(signal: float) -> None:
+def test_noise_has_the_photon_transfer_variance_and_comes_from_the_generator_alone(signal: float) -> None:
     camera = _camera(gamma=1.0, bit_depth=16, read_noise=0.01, shot_noise=0.05)
-    image = camera_image(_flat(signal), camera, np.random.default_rng(0)) / 65535
+    first, again, other = (camera_image(_flat(signal), camera, np.random.default_rng(seed)) for seed in (0, 0, 1))
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+    image = first / 65535
     expected = 0.01**2 + 0.05**2 * signal
     # The variance of n = 90000 samples has the relative standard deviation sqrt(2 / n) = 0.5 %; four of those.
     assert image.var() == pytest.approx(expected, rel=0.02)
     assert image.mean() == pytest.approx(signal, abs=4 * np.sqrt(expected / image.size))
-
-
-def test_noise_comes_from_the_generator_alone() -> None:
-    camera = _camera(read_noise=0.02)
-    first, again, other = (camera_image(_flat(0.5), camera, np.random.default_rng(seed)) for seed in (1, 1, 2))
-    assert np.array_equal(first, again)
-    assert not np.array_equal(first, other)
 
 
 def test_blur_is_a_normalised_gaussian() -> None:
@@ -104,20 +100,17 @@ def test_auto_keeps_render_noise_below_a_quarter_of_the_cameras(shot_noise: floa
     assert again.samples_per_pixel == renderer.samples_per_pixel == full_grid(renderer.samples_per_pixel, 2)
 
 
-def test_number_follows_from_the_pilots_noise() -> None:
+def test_number_follows_from_the_pilots_noise_and_quantisation_is_noise_too() -> None:
     """White noise of standard deviation 0.01 on a signal of 0.25, gamma 1: n = 16 (0.01 / (0.25 · 0.02))² = 64."""
     camera = small_sensor(gamma=1.0, shot_noise=0.04, bit_depth=16).camera  # 0.04 · √0.25 = 0.02
     rng = np.random.default_rng(0)
     mean = np.full((60, 80, 3), 0.25, dtype=np.float32)
     first, second = (mean + np.float32(0.01) * rng.standard_normal(mean.shape, dtype=np.float32) for _ in "12")
     assert camera_noise(mean, camera) == pytest.approx(0.02, rel=1e-6)
+    quantised = camera.model_copy(update={"shot_noise": 0.0, "bit_depth": 8})
+    assert camera_noise(mean, quantised) == pytest.approx(1 / 255 / 12**0.5)
     # Two pictures of 14400 values: 2 % in the variance at three standard deviations, and 1 for rounding up.
     assert needed_samples(first, second, camera, 16) == pytest.approx(64, abs=3)
-
-
-def test_quantisation_is_noise_too() -> None:
-    camera = small_sensor(gamma=1.0, bit_depth=8).camera
-    assert camera_noise(np.full((60, 80, 3), 0.25, dtype=np.float32), camera) == pytest.approx(1 / 255 / 12**0.5)
 
 
 @pytest.mark.parametrize("level", [0.0, 0.002, 0.2])

@@ -145,22 +145,17 @@ def _with_other(**changes: object) -> Sensor:
 def test_a_further_camera_changes_no_bit_of_the_main_one():
     frames = []
     for sensor in (small_sensor(1.45), _with_other()):
-        surface = flat_surface(sensor)
-        renderer = Renderer(sensor, Render(samples_per_pixel=9, max_depth=2), surface, plain(), FAST)
-        frames.append(renderer.radiances(surface.material, 5))
+        surface, render = flat_surface(sensor), Render(samples_per_pixel=9, max_depth=2)
+        frames.append(Renderer(sensor, render, surface, plain(), FAST).radiances(surface.material, 5))
     assert [list(frame) for frame in frames] == [[""], ["", "other"]]
     np.testing.assert_array_equal(frames[0][""], frames[1][""])
     assert frames[1]["other"].shape == (40, 48, 3)
     assert frames[1]["other"].mean() > 0
 
 
-def test_lights_in_a_further_cameras_view_are_refused():
-    sensor = _with_other(fx=40.0, fy=40.0)
+def test_lights_in_a_further_cameras_view_and_what_scalar_variants_lack_are_refused():
     with pytest.raises(InputError, match=r"further_cameras 'other': sensor.lights\[0\].*between the camera"):
-        rendered(sensor)
-
-
-def test_scalar_variants_say_what_they_need():
+        rendered(_with_other(fx=40.0, fy=40.0))
     mirror = Mirror(position_mm=(3.0, 0.0, 12.0), normal=(-1, 0, 0), size_mm=(4.0, 4.0))
     mirrored = small_sensor(1.45).model_copy(update={"mirrors": (mirror,)})
     for sensor in (mirrored, small_sensor(1.45, lens="fisheye", distortion=(0.0, 0.0, 0.0, 0.0))):
@@ -168,13 +163,10 @@ def test_scalar_variants_say_what_they_need():
             rendered(sensor, variant=SCALAR)
 
 
-def test_names_of_cameras_differ():
+def test_names_of_cameras_differ_and_flow_fields_fit_their_images():
     sensor = json.loads(_with_other().model_dump_json())
     with pytest.raises(ValueError, match="names must differ"):
         Sensor.model_validate({**sensor, "further_cameras": 2 * sensor["further_cameras"]})
-
-
-def test_flow_fields_of_a_camera_fit_its_images():
     image = np.zeros((4, 5, 3), np.uint8)
     flow = FlowField(np.zeros((4, 6, 2), np.float32), np.zeros((4, 6), np.float32))
     with pytest.raises(ValueError, match="with a flow of"):

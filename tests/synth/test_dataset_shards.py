@@ -107,16 +107,13 @@ def test_who_is_refused_beside_a_shard(tmp_path: Path) -> None:
     DatasetWriter(directory, job(N), Shard(1, 3), PAIRS).close()  # once the others have ended
 
 
-def test_a_wrong_shard_on_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_shards_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for text in ("", "1", "2/2", "-1/2", "0/0", "1/x", "0.5/2", "a0/2"):
+        with pytest.raises(InputError, match=r"--shard .*: give i/N with 0 <= i < N"):
+            Shard.parse(text)
     assert main(["generate", "--out", str(tmp_path / "d"), "--shard", "2/2"]) == 2
     assert "--shard 2/2: give i/N with 0 <= i < N, such as 0/16; the last of 2 is 1/2" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize("text", ["", "1", "2/2", "-1/2", "0/0", "1/x", "0.5/2", "a0/2"])
-def test_wrong_shards(text: str) -> None:
-    with pytest.raises(InputError, match=r"--shard .*: give i/N with 0 <= i < N"):
-        Shard.parse(text)
 
 
 def test_shards_cover_each_trajectory_once() -> None:

@@ -1,6 +1,7 @@
 """Depth of field: blur circles against the thin lens's closed form, and a ground truth that does not know of them."""
 
 import functools
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -94,9 +95,7 @@ def test_focus_is_measured_by_the_mirror(focus: float) -> None:
     straight = small_sensor(1.45, SINGLE, fx=190.0, fy=190.0, aperture_mm=APERTURE, focus_mm=focus)
     place = {"position_mm": (0.0, 12.0, 16.0), "look_at_mm": (0.0, 0.0, 16.0)}
     sensor = straight.model_copy(update={"mirrors": (mirror,), "camera": straight.camera.model_copy(update=place)})
-    lens = ThinLens.of(sensor)
-    assert lens is not None
-    assert lens.distance_mm == pytest.approx(22 + (focus - 22) / 1.45, rel=1e-12)
+    assert ThinLens.of(sensor).distance_mm == pytest.approx(22 + (focus - 22) / 1.45, rel=1e-12)
     z, s = 22 + 6 / 1.45, 22 + (focus - 22) / 1.45
     expected = (APERTURE * 190 * (z - s) / (z * s)) ** 2 / 16
     found, error = _added_variance(sensor)
@@ -154,20 +153,15 @@ def test_an_oblique_axis_is_in_focus_where_its_rays_spread_least(index: float) -
     target = _point_of_the_axis(sensor.camera, index, 22.0)
     pupil, slopes = _slopes(sensor.camera, index, target, 0.1)
     best = -(pupil**2).sum() / (pupil * (slopes - slopes.mean(0))).sum()
-    lens = ThinLens.of(sensor)
-    assert lens is not None
-    assert lens.distance_mm == pytest.approx(best, rel=1e-4)  # paraxial: (0.1 / 20)² = 3e-5
+    assert ThinLens.of(sensor).distance_mm == pytest.approx(best, rel=1e-4)  # paraxial: (0.1 / 20)² = 3e-5
 
 
 @needs_llvm
 def test_an_oblique_camera_blurs_as_its_rays_say() -> None:
     """Second moments of where rays traced by Snell's law through the pupil put the dot's centre in the image."""
     sensor = small_sensor(1.45, aperture_mm=APERTURE, focus_mm=17.0, **OBLIQUE)
-    lens = ThinLens.of(sensor)
-    assert lens is not None
     pupil, slopes = _slopes(sensor.camera, 1.45, np.array([*SINGLE.offset_mm, 0.0]), APERTURE / 2)
-    spread = 140 * (slopes + pupil / lens.distance_mm)
-    expected = spread.var(0)
+    expected = (140 * (slopes + pupil / ThinLens.of(sensor).distance_mm)).var(0)
     found, error = _added_variance(sensor)
     # The dot's own extent, 0.2 mm (rms) on a face tilted by 32 degrees against defocus of 5 mm: (0.1 / 5)² < 1e-3.
     # Aberrations of the rim beyond those of the ring: u² = 2e-3 of the defocus.
@@ -210,16 +204,12 @@ def test_defocus_does_not_move_centroids() -> None:
         sharp, blurred = (_removed(sensor, state).mean(0) for sensor in (pinhole, lens))
         # The texture's dots: their centres in the moved state are an affine map of the grid.
         affine = np.linalg.lstsq(np.column_stack([rest[:, :2], np.ones(len(state))]), state, rcond=None)[0]
-        for x in np.arange(-2, 3) * 2.5 + 0.3:
-            for y in np.arange(-2, 3) * 2.0 + 0.1:
-                u, v = optics.project(np.array([[x, y, 1.0]]) @ affine)[0]
-                near = np.hypot(COLUMNS - u, ROWS - v) < 7.5
-                if 8 < u < 72 and 8 < v < 52:
-                    centres = [
-                        np.array([(f * places)[near].sum() / f[near].sum() for places in (COLUMNS, ROWS)])
-                        for f in (sharp, blurred)
-                    ]
-                    shifts.append(centres[1] - centres[0])
+        for x, y in product(np.arange(-2, 3) * 2.5 + 0.3, np.arange(-2, 3) * 2.0 + 0.1):
+            u, v = optics.project(np.array([[x, y, 1.0]]) @ affine)[0]
+            near = np.hypot(COLUMNS - u, ROWS - v) < 7.5
+            if 8 < u < 72 and 8 < v < 52:
+                weights = [frame[near] / frame[near].sum() for frame in (sharp, blurred)]
+                shifts.append([((weights[1] - weights[0]) * places[near]).sum() for places in (COLUMNS, ROWS)])
     assert len(shifts) >= 18
     # A dot takes some 1500 samples a frame, 12000 in 8. Pupil points move them by c / 4 = 0.8 px (rms) at most, which
     # at random would leave 0.8 / √12000 = 0.007 px a dot: four times that, and its 18th part's root for the mean.

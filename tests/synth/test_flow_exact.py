@@ -1,26 +1,9 @@
 """Exact flow and visibility: closed forms, folds and borders, and the independent camera of `verify`."""
 
+import kinematic_double as double
 import numpy as np
 import pytest
-from kinematic_double import (
-    FISHEYE,
-    HEIGHT,
-    LENS,
-    LEVEL,
-    OBLIQUE,
-    PERISCOPE,
-    SIDES,
-    STRAIGHT,
-    WIDTH,
-    dented,
-    folded,
-    optics,
-    pixel_centres,
-    rotation,
-    sensor,
-    sheet,
-)
-from kinematic_double import rigid as moved_by
+from kinematic_double import HEIGHT, WIDTH, dented, folded, optics, pixel_centres, rigid, rotation, sensor, sheet
 from scipy.optimize import brentq
 from verified_sample import motion_checks, sheets
 
@@ -30,12 +13,12 @@ from synth.mesh import rest_surface
 from synth.scene import Gel, Window
 from synth.verify.motion import check_motion
 
-REST = moved_by(np.eye(3), (0, 0, 0))
+REST = rigid(np.eye(3), (0, 0, 0))
 MOTIONS = {
-    "translation": moved_by(np.eye(3), (0.7, -0.4, 0.0)),
-    "lift": moved_by(np.eye(3), (0.1, 0.0, 1.5)),
-    "turn": moved_by(rotation("z", 7.0), (0.1, 0.2, 0.0)),
-    "tilt": moved_by(rotation("x", 5.0) @ rotation("y", -4.0), (0.0, 0.3, 0.6)),
+    "translation": rigid(np.eye(3), (0.7, -0.4, 0.0)),
+    "lift": rigid(np.eye(3), (0.1, 0.0, 1.5)),
+    "turn": rigid(rotation("z", 7.0), (0.1, 0.2, 0.0)),
+    "tilt": rigid(rotation("x", 5.0) @ rotation("y", -4.0), (0.0, 0.3, 0.6)),
 }
 ROUNDING = 1e-6
 """px; flow is stored as float32, whose spacing below 16 px is 1e-6. The double-precision error is near 1e-12."""
@@ -58,7 +41,7 @@ def _homography(camera, motion1, motion2):
     return plane_to_image(motion2) @ np.linalg.inv(plane_to_image(motion1))
 
 
-@pytest.mark.parametrize("view", [STRAIGHT, OBLIQUE])
+@pytest.mark.parametrize("view", [double.STRAIGHT, double.OBLIQUE])
 @pytest.mark.parametrize("first", ["rest", "tilt"])
 @pytest.mark.parametrize("second", MOTIONS)
 def test_pinhole_flow_is_the_planes_homography(view, first, second):
@@ -96,14 +79,14 @@ def test_window_flow_is_snells_law(index, second):
 def test_translation_in_numbers_and_no_motion_is_zero_flow_everywhere_visible():
     moved = _flow(optics(), REST, MOTIONS["translation"]).forward
     np.testing.assert_allclose(moved - (70 * 0.7 / 24, -71 * 0.4 / 24), 0, atol=ROUNDING)
-    flow = _flow(optics(index=1.45, distortion=LENS, **OBLIQUE), MOTIONS["tilt"], MOTIONS["tilt"])
+    flow = _flow(optics(index=1.45, distortion=double.LENS, **double.OBLIQUE), MOTIONS["tilt"], MOTIONS["tilt"])
     np.testing.assert_allclose(flow.forward, 0, atol=1e-10)
     np.testing.assert_array_equal(flow.forward_visible, 1)
 
 
 def test_visibility_ends_at_the_image_border():
     shift = 2.4
-    flow = _flow(optics(), REST, moved_by(np.eye(3), (shift * 24 / 70, 0, 0)))
+    flow = _flow(optics(), REST, rigid(np.eye(3), (shift * 24 / 70, 0, 0)))
     column = np.arange(WIDTH) + 0.5
     np.testing.assert_array_equal(flow.forward_visible, np.tile(column + shift < WIDTH, (HEIGHT, 1)))
     np.testing.assert_array_equal(flow.backward_visible, np.tile(column - shift >= 0, (HEIGHT, 1)))
@@ -112,7 +95,7 @@ def test_visibility_ends_at_the_image_border():
 
 def test_pixels_beside_the_gel_are_nan():
     surface = sheet(4, 4, 8.0, 6.0)
-    moved = moved_by(np.eye(3), (0.3, 0, 0))(surface.material)
+    moved = rigid(np.eye(3), (0.3, 0, 0))(surface.material)
     flow = exact_flow(surface, surface.material, moved, optics(), WIDTH, HEIGHT, depth=True, displacement=True)
     centre = pixel_centres()
     x, y = (centre[..., 0] - 31.7) / 70 * 24 + 1.0, (centre[..., 1] - 24.4) / 71 * 24 - 0.5
@@ -155,7 +138,7 @@ def test_extra_channels():
     tilt = rotation("x", 20.0)
     moved = surface.material @ tilt.T + (0, 0, 1.0)
     traction = np.column_stack([surface.material[:, 0], 2 * surface.material[:, 1], np.ones(len(surface.material))])
-    camera = optics(**OBLIQUE)
+    camera = optics(**double.OBLIQUE)
     flow = exact_flow(
         surface, surface.material, moved, camera, WIDTH, HEIGHT,
         backward=False, depth=True, normal=True, displacement=True,
@@ -188,12 +171,12 @@ def test_wrong_lengths_are_named():
 
 
 VIEWS = {
-    "window": {"index": 1.45, "distortion": LENS, **OBLIQUE},
-    "mirrors": {"index": 1.45, "mirrors": SIDES, "distortion": LENS, "fx": 40.0, "fy": 41.0},
-    "mirrors in air": {"mirrors": SIDES, "fx": 40.0, "fy": 41.0},
-    "periscope": {"index": 1.41, "mirrors": PERISCOPE, **LEVEL},
-    "fisheye": {"index": 1.45, **OBLIQUE, **FISHEYE},
-    "fisheye and mirrors": {"index": 1.45, "mirrors": SIDES, **FISHEYE, "fx": 35.0, "fy": 35.0},
+    "window": {"index": 1.45, "distortion": double.LENS, **double.OBLIQUE},
+    "mirrors": {"index": 1.45, "mirrors": double.SIDES, "distortion": double.LENS, "fx": 40.0, "fy": 41.0},
+    "mirrors in air": {"mirrors": double.SIDES, "fx": 40.0, "fy": 41.0},
+    "periscope": {"index": 1.41, **double.PERISCOPE_VIEW},
+    "fisheye": {"index": 1.45, **double.OBLIQUE, **double.FISHEYE},
+    "fisheye and mirrors": {"index": 1.45, "mirrors": double.SIDES, **double.FISHEYE, "fx": 35.0, "fy": 35.0},
 }
 
 
@@ -202,7 +185,7 @@ DOME = Gel(shape="dome", size_mm=(20, 15, 8), youngs_modulus_kpa=200, dome_radiu
 DOME_VIEWS = {
     "window": VIEWS["window"],
     "fisheye": VIEWS["fisheye"],
-    "close fisheye": {"index": 1.41, **FISHEYE, "fx": 34.0, "fy": 34.0, "position_mm": (0.3, -0.2, 12.0)},
+    "close fisheye": {"index": 1.41, **double.FISHEYE, "fx": 34.0, "fy": 34.0, "position_mm": (0.3, -0.2, 12.0)},
     "fisheye and mirrors": VIEWS["fisheye and mirrors"],
 }
 

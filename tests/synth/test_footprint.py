@@ -58,39 +58,41 @@ def test_what_lies_inside_the_gel_counts_and_thin_bodies_are_not_missed() -> Non
     assert_covers(print_of(needle, depth_mm=0.05, position_mm=(7.123, 3.21)), *square(0.05, 7.123, 3.21))
 
 
-def test_turned_box_and_bar_that_lies_askew() -> None:
-    box = Box(shape="box", size_mm=(6.0, 2.0, 3.0), fillet_mm=0.2, rotation_deg=(0.0, 0.0, 30.0))
-    # The core, 2.8 and 0.8 mm to either side, turned by 30 degrees and grown by the fillet, deeper than which it sits.
-    cos, sin = np.cos(np.pi / 6), np.sin(np.pi / 6)
-    x, y = 2.8 * cos + 0.8 * sin + 0.2, 2.8 * sin + 0.8 * cos + 0.2
-    assert_covers(print_of(box, depth_mm=0.5), (-x, -y), (x, y))
-    bar = Cylinder(shape="cylinder", radius_mm=2.0, length_mm=8.0, fillet_mm=0.1, rotation_deg=(0.0, 90.0, 30.0))
-    half_width = np.sqrt(1.75)
-    x, y = 4.0 * cos + half_width * sin, 4.0 * sin + half_width * cos
-    # The fillet takes at most its radius off the length of the cut's corners.
-    assert_covers(print_of(bar, depth_mm=0.5), (-x, -y), (x, y), 0.1 * cos + 2 * RESOLUTION * y)
+COS, SIN = np.cos(np.pi / 6), np.sin(np.pi / 6)
+CHORD = np.sqrt(1.75)
+"""Half width of a cylinder of 2 mm radius that lies 0.5 mm deep."""
+BAR = {"shape": "cylinder", "radius_mm": 2.0, "length_mm": 8.0, "fillet_mm": 0.1}
+# A cone's side touches the tip's ball: at depth d its radius is d tan + r (1/cos - tan). A rounded edge of radius r
+# reaches r (sqrt 2 - 1) less far than the sharp one, which widens a roof's cut, of 45 degree slopes, by as much.
+BODIES = {
+    "punch": (Cylinder(shape="cylinder", radius_mm=2.0, fillet_mm=0.2), 0.5, (2.0, 2.0)),
+    "bar": (Cylinder(**BAR, rotation_deg=(0.0, 90.0, 0.0)), 0.5, (4.0, CHORD)),
+    "askew bar": (Cylinder(**BAR, rotation_deg=(0.0, 90.0, 30.0)), 0.5, (4 * COS + CHORD * SIN, 4 * SIN + CHORD * COS)),
+    "turned box": (  # the core, 2.8 and 0.8 mm to either side, turned and grown by the fillet
+        Box(shape="box", size_mm=(6.0, 2.0, 3.0), fillet_mm=0.2, rotation_deg=(0.0, 0.0, 30.0)),
+        0.5,
+        (2.8 * COS + 0.8 * SIN + 0.2, 2.8 * SIN + 0.8 * COS + 0.2),
+    ),
+    "roof": (
+        Box(shape="box", size_mm=(4.0, 5.0, 4.0), fillet_mm=0.01, rotation_deg=(0.0, 45.0, 0.0)),
+        1.0,
+        (1.0 + 0.01 * (np.sqrt(2) - 1), 2.5),
+    ),
+    "cone": (
+        Cone(shape="cone", half_angle_deg=30.0, height_mm=10.0, fillet_mm=0.5),
+        2.0,
+        (2 * SIN / COS + 0.5 * (1 - SIN) / COS,) * 2,
+    ),
+    "ring": (Torus(shape="torus", radius_mm=3.0, tube_mm=0.5), 0.3, (3.0 + np.sqrt(2 * 0.5 * 0.3 - 0.3**2),) * 2),
+}
 
 
-def test_tilted_box() -> None:
-    """A roof: the block's edge along y goes first, the overlap is a triangle of 45 degree slopes."""
-    box = Box(shape="box", size_mm=(4.0, 5.0, 4.0), fillet_mm=0.01, rotation_deg=(0.0, 45.0, 0.0))
-    focus = print_of(box, depth_mm=1.0)
-    # A rounded edge of radius r reaches r (sqrt 2 - 1) less far than the sharp one, which widens the cut by as much.
-    x = 1.0 + 0.01 * (np.sqrt(2) - 1)
-    assert_covers(focus, (-x, -2.5), (x, 2.5))
-
-
-def test_cylinder_cone_and_torus() -> None:
-    punch = Cylinder(shape="cylinder", radius_mm=2.0, fillet_mm=0.2)
-    assert_covers(print_of(punch, depth_mm=0.5), *square(2.0))
-    bar = Cylinder(shape="cylinder", radius_mm=2.0, length_mm=8.0, fillet_mm=0.1, rotation_deg=(0.0, 90.0, 0.0))
-    assert_covers(print_of(bar, depth_mm=0.5), (-4.0, -np.sqrt(1.75)), (4.0, np.sqrt(1.75)))
-    cone = Cone(shape="cone", half_angle_deg=30.0, height_mm=10.0, fillet_mm=0.5)
-    # Its side is a straight line that touches the tip's ball: at depth d its radius is d tan + r (1/cos - tan).
-    radius = 2.0 * np.tan(np.pi / 6) + 0.5 * (1 / np.cos(np.pi / 6) - np.tan(np.pi / 6))
-    assert_covers(print_of(cone, depth_mm=2.0), *square(radius))
-    ring = Torus(shape="torus", radius_mm=3.0, tube_mm=0.5)
-    assert_covers(print_of(ring, depth_mm=0.3), *square(3.0 + np.sqrt(2 * 0.5 * 0.3 - 0.3**2)))
+@pytest.mark.parametrize("name", BODIES)
+def test_bodies(name: str) -> None:
+    indenter, depth, (x, y) = BODIES[name]
+    # The askew bar's fillet takes at most its radius off the length of the cut's corners.
+    slack = 0.1 * COS + 2 * RESOLUTION * y if name == "askew bar" else None
+    assert_covers(print_of(indenter, depth_mm=depth), (-x, -y), (x, y), slack)
 
 
 def test_mesh(tmp_path: Path) -> None:

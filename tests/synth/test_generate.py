@@ -109,8 +109,7 @@ def test_a_lost_folder_and_a_foreign_line_are_made_good(tiny: Path, tmp_path: Pa
 
 
 def test_progress_counts_up_to_n(tiny: Path, tmp_path: Path) -> None:
-    calls = []
-    template = load_scene(tiny, ["motion.depth_mm=-1"])  # no touch: fast
+    calls, template = [], load_scene(tiny, ["motion.depth_mm=-1"])  # no touch: fast
     summary = generate(template, 3, tmp_path / "d", progress=lambda done, total: calls.append((done, total)))
     assert calls == [(2, 3), (3, 3)]
     assert summary.seconds > sum(summary.stages.values()) > 0
@@ -265,7 +264,5 @@ def test_a_line_a_minute_where_stderr_is_no_terminal(
             advance(done, 12)
     out, err = capsys.readouterr()
     assert out == ""
-    said = err.splitlines()
-    assert len(said) == len(lines)
-    for line, start in zip(said, lines, strict=True):
+    for line, start in zip(err.splitlines(), lines, strict=True):
         assert line.startswith(f"synth: generate: pairs: {start}")

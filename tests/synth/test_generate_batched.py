@@ -4,8 +4,7 @@ The scene's draws fail in every way: bodies that cannot be built, bodies too thi
 the schema; its sensors have two different pads.
 """
 
-import hashlib
-import json
+import signal
 import threading
 import time
 from collections import Counter
@@ -17,7 +16,7 @@ import numpy as np
 import pytest
 from batches import simulate_scenes
 from pads import brick, gentle
-from processes_of import HAS_PROC, alive, descendants, lines, start, wait_for
+from processes_of import end_family, needs_proc, started
 from tiny_scene import TEXT, fingerprint, job_context, write_tiny
 
 from synth.dataset.reader import read_dataset
@@ -88,20 +87,14 @@ def test_batch_and_shards_change_no_bit(template: Template, whole: Path, tmp_pat
     assert fingerprint(out) == fingerprint(whole)
 
 
-@pytest.mark.skipif(not HAS_PROC, reason="finds child processes in Linux's /proc")
+@needs_proc
 def test_killed_with_workers_and_gone_on_with_alone(template: Template, whole: Path, tmp_path: Path) -> None:
     """The driver with solver and renderer is killed; nobody is left behind, what is on record stays."""
     out = tmp_path / "d"
-    process = start(template.source, out, "--n", str(SAMPLES), "--seed", str(SEED), "--workers", "2")
-    wait_for("the first sample", lambda: lines(out) > 0, process)
-    family = descendants(process.pid)
-    process.kill()
-    process.wait()
-    assert len(family) >= 2
+    process = started(template.source, out, "--n", str(SAMPLES), "--seed", str(SEED), "--workers", "2")
+    end_family(process, signal.SIGKILL)
     before = (out / "manifest.jsonl").read_text().splitlines()
     assert 0 < len(before) < SAMPLES
-    wait_for("the workers to leave with their driver", lambda: not alive(family))
-    process.communicate()
     generate(template, SAMPLES, out, SEED, scheduling=Scheduling(batch=2, workers=1))
     assert set(before) <= set((out / "manifest.jsonl").read_text().splitlines())
     assert fingerprint(out) == fingerprint(whole)
@@ -109,16 +102,13 @@ def test_killed_with_workers_and_gone_on_with_alone(template: Template, whole: P
 
 def test_one_trajectory_alone_is_the_same(context: JobContext, whole: Path) -> None:
     """As a task of a cluster. Its second draw can be used."""
-    outcome = Producer(context).produce(4, (8, 9))
+    outcome, dataset = Producer(context).produce(4, (8, 9)), read_dataset(whole)
     assert [failure.stage for failure in outcome.failures] == ["simulate"]
-    for entry in outcome.entries:
-        for name, digest in entry.sha256.items():
-            file = whole / "samples" / f"{entry.index:06d}" / name
-            assert hashlib.sha256(file.read_bytes()).hexdigest() == digest, name
+    assert [entry.sha256 for entry in outcome.entries] == [dataset.entry(index).sha256 for index in (8, 9)]
 
 
 def test_failed_draws_are_replaced(whole: Path) -> None:
-    failures = [json.loads(line) for line in (whole / "failures.jsonl").read_text().splitlines()]
+    failures = read_dataset(whole).failures
     kinds = Counter((failure["stage"], failure["last_good_state"] is None) for failure in failures)
     # Broken schema; a body that cannot be built; a body that finds no contact point, with the state before.
     assert set(kinds) == {("draw", True), ("simulate", True), ("simulate", False)}
@@ -181,10 +171,9 @@ def test_frames_of_each_job_are_its_own() -> None:
     scenes = [gentle(motion={"depth_mm": 0.4, "steps": 3}), gentle(motion={"depth_mm": 0.5, "steps": 3})]
     mesh, wanted = brick(counts=(4, 4, 2)), [frozenset({1}), frozenset({3})]
     every, some = simulate_scenes(scenes, mesh), simulate_scenes(scenes, mesh, frames=wanted)
-    for number, frames in enumerate(wanted):
+    for one, other, frames in zip(every, some, wanted, strict=True):
         for k in (1, 2, 3):
-            one, other = every[number].states[k], some[number].states[k]
-            assert (one.displacement == other.displacement).all() == (k in frames)
+            assert (one.states[k].displacement == other.states[k].displacement).all() == (k in frames)
     with pytest.raises(ValueError, match="1 sets of frames for 2 presses"):
         simulate_scenes(scenes, mesh, frames=wanted[:1])
 
@@ -268,10 +257,10 @@ def _spacing_of(drawn: Scene) -> float:
 
 
 def test_the_diagnostics_tell_of_the_shared_mesh(context: JobContext, whole: Path) -> None:
-    entries = [json.loads(line) for line in (whole / "manifest.jsonl").read_text().splitlines()]
-    assert len({entry["diagnostics"]["mesh"] for entry in entries}) == 2  # of two pads
-    first = entries[0]["diagnostics"]
-    scene = read_dataset(whole).scene_of(0)
+    dataset = read_dataset(whole)
+    told = [dataset.entry(index).diagnostics for index in range(SAMPLES)]
+    assert len({each["mesh"] for each in told}) == 2  # of two pads
+    first, scene = told[0], dataset.scene_of(0)
     assert first["mesh"] == shared_mesh(scene.sensor.gel, scene.numerics).hash
     assert first["predicted_error_px"] == round(accuracy(scene).error_px, 4)
 

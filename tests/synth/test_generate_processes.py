@@ -14,7 +14,7 @@ import tracemalloc
 from pathlib import Path
 
 import pytest
-from processes_of import HAS_PROC, PATIENCE_S, ROOT, alive, descendants, lines, own_words, start, wait_for, workers_of
+from processes_of import PATIENCE_S, end_family, lines, needs_proc, own_words, start, started, wait_for, workers_of
 from tiny_scene import fingerprint, reference
 
 from synth.cli import main
@@ -23,7 +23,7 @@ from synth.errors import InputError
 from synth.pipeline.generate import Scheduling, generate
 from synth.scene.template import load_scene
 
-needs_proc = pytest.mark.skipif(not HAS_PROC, reason="finds child processes in Linux's /proc")
+ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.usefixtures("one_cache")
 INTERRUPTED = "synth: interrupted; finished samples are kept: run the same command again to go on"
 
@@ -41,13 +41,6 @@ def out(tmp_path: Path) -> Path:
     return tmp_path / "d"
 
 
-def _started(scene: Path, out: Path, *options: str) -> "subprocess.Popen[str]":
-    """The command, once its first sample is on record."""
-    process = start(scene, out, *options)
-    wait_for("the first sample", lambda: lines(out) > 0, process)
-    return process
-
-
 def _assert_goes_on(scene: Path, out: Path) -> None:
     """After an interruption the job's first five samples come out as ever, and nothing torn is left."""
     assert lines(out) < 400
@@ -61,14 +54,10 @@ def _assert_goes_on(scene: Path, out: Path) -> None:
 
 @needs_proc
 def test_killed_with_two_workers_and_started_again(tiny: Path, out: Path) -> None:
-    process = _started(tiny, out, "--n", "5", "--workers", "2")
-    family = descendants(process.pid)
-    assert len(family) >= 2
-    process.kill()
-    process.communicate()
+    process = started(tiny, out, "--n", "5", "--workers", "2")
+    end_family(process, signal.SIGKILL)
     assert process.returncode == -signal.SIGKILL
     assert 0 < lines(out) < 5
-    wait_for("the workers to leave with their driver", lambda: not alive(family))
     again = start(tiny, out, "--n", "5", "--workers", "2")
     stdout, stderr = again.communicate(timeout=PATIENCE_S)
     assert again.returncode == 0, stderr
@@ -78,14 +67,10 @@ def test_killed_with_two_workers_and_started_again(tiny: Path, out: Path) -> Non
 
 @needs_proc
 def test_ctrl_c_with_workers_ends_with_130_one_line_and_no_orphans(tiny: Path, out: Path) -> None:
-    process = _started(tiny, out, "--n", "400", "--workers", "2")
-    family = descendants(process.pid)
-    assert len(family) >= 2
-    os.killpg(process.pid, signal.SIGINT)  # a terminal sends it to the whole group
-    _, stderr = process.communicate(timeout=PATIENCE_S)
+    process = started(tiny, out, "--n", "400", "--workers", "2")
+    stderr = end_family(process, signal.SIGINT)
     assert process.returncode == 130, stderr
     assert own_words(stderr) == [INTERRUPTED]
-    wait_for("the workers to leave", lambda: not alive(family))
     _assert_goes_on(tiny, out)
 
 
@@ -110,7 +95,7 @@ def test_ctrl_c_in_one_process_ends_with_130_and_one_line(tiny: Path, out: Path,
 @needs_proc
 def test_a_killed_worker_is_replaced(tiny: Path, out: Path) -> None:
     """One of two, in mid-task; the run goes on and ends with the files of an undisturbed one."""
-    process = _started(tiny, out, "--n", "5", "--workers", "2")
+    process = started(tiny, out, "--n", "5", "--workers", "2")
     os.kill(workers_of(process.pid)[0], signal.SIGKILL)
     _, stderr = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0, stderr
@@ -183,7 +168,7 @@ def test_killed_while_it_writes_a_sample_and_a_second_process(
     tiny: Path, out: Path, capsys: pytest.CaptureFixture
 ) -> None:
     """The second one is told; the first is killed the moment a half-written sample can be seen."""
-    process = _started(tiny, out, "--n", "400")
+    process = started(tiny, out, "--n", "400")
     assert main(["generate", "--scene", str(tiny), "--n", "400", "--out", str(out)]) == 2
     (words,) = own_words(capsys.readouterr().err)
     assert re.search(rf"another process \(pid {process.pid} on .*\) is writing this dataset", words)

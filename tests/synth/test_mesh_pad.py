@@ -41,16 +41,12 @@ def double_area(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.cross(b - a, c - a)
 
 
-def test_fills_the_box(pad: PadMesh) -> None:
+def test_fills_the_box_with_exactly_flat_faces(pad: PadMesh) -> None:
     assert pad.volumes.min() > 0
     # Sums of a few hundred volumes of about 0.1 mm^3 round to 1e-14 relative; 1e-12 leaves room.
     assert pad.volumes.sum() == pytest.approx(np.prod(SIZE), rel=1e-12)
     assert (np.unique(pad.tets) == np.arange(len(pad.points))).all()
-    assert pad.points.dtype == np.float64
-    assert pad.tets.dtype == np.int32
-
-
-def test_faces_are_exactly_flat(pad: PadMesh) -> None:
+    assert (pad.points.dtype, pad.tets.dtype) == (np.float64, np.int32)
     low, high = np.array(SIZE) * (-0.5, -0.5, 0), np.array(SIZE) * (0.5, 0.5, 1)
     corners = pad.points[boundary_faces(pad.tets)]
     assert ((corners == low).all(axis=1) | (corners == high).all(axis=1)).any(axis=1).all()

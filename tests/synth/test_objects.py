@@ -145,15 +145,12 @@ def test_meshes_with_faults_are_the_same_body(tmp_path: Path, kind: str) -> None
     assert_equal_near(distances(body, places), distances(whole, places), 0.25, 0.01)
 
 
-def test_a_hole_is_closed(tmp_path: Path) -> None:
+def test_a_hole_is_closed_but_more_hole_than_surface_is_refused(tmp_path: Path) -> None:
     ball = pv.Icosphere(radius=2.0, nsub=3)
     body = body_of(saved(tmp_path, ball.points, np.delete(ball.regular_faces, range(3), axis=0)))
     missing = np.asarray(ball.points)[ball.regular_faces[:3]].mean(axis=1) * [1, -1, 1]
     assert (np.abs(distances(body, missing)) < 2 * CELL).all()
     assert distances(body, np.array([[0.0, 0.0, 0.0]]))[0] < 0
-
-
-def test_more_hole_than_surface_is_refused(tmp_path: Path) -> None:
     rest = pv.Sphere(radius=4.0).clip("z", origin=(0, 0, 3.0), invert=False)
     cap = rest.extract_surface(algorithm=None).triangulate()
     with pytest.raises(InputError, match="open sheet"):

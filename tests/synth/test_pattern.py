@@ -12,19 +12,7 @@ from synth.arrays import FloatArray
 from synth.errors import InputError
 from synth.render.marks import dots_coverage
 from synth.render.pattern import albedo, check_pattern, is_grey, pixels_per_mm
-from synth.scene import (
-    Bitmap,
-    Coating,
-    Dots,
-    FurtherCamera,
-    Light,
-    Mirror,
-    NoPattern,
-    Pattern,
-    RandomColor,
-    Sensor,
-    Speckle,
-)
+from synth.scene import Bitmap, Coating, Dots, FurtherCamera, Light, Mirror, Pattern, RandomColor, Sensor, Speckle
 
 
 def _painted(
@@ -97,7 +85,7 @@ def test_pattern_comes_from_the_generator_alone(pattern) -> None:
 
 def test_grey_is_what_has_no_color_anywhere() -> None:
     for pattern, grey in (
-        (NoPattern(kind="none"), True),
+        (None, True),
         (RandomColor(kind="random_color", cell_mm=1, saturation=0), True),
         (RandomColor(kind="random_color", cell_mm=1), False),
         (Speckle(kind="speckle", grain_mm=1, reflectance=(0.1, 0.1, 0.2)), False),
@@ -144,10 +132,9 @@ def test_dots_cover_their_area_and_sit_on_the_grid(shape: str) -> None:
     area = np.pi * (0.4**2 + 0.1**2 / 12) if shape == "round" else 2 * 0.4**2 + 0.1**2 / 3
     # Texels of 0.036 mm sample a ramp of 0.1 mm, whose kinks leave errors of second order; seen: 3e-4 and 6e-4.
     assert dark.mean() == pytest.approx(area / (1.5 * 1.125), rel=2e-3)
-    for cx in (-5.25, -0.75, 3.75):
-        for cy in (-3.9375, 0.5625, 2.8125):
-            near = dark * (np.abs(x[None] - cx) < 0.75) * (np.abs(y[:, None] - cy) < 0.5625)
-            assert _centroid(near, x, y) == pytest.approx((cx, cy), abs=1.2e-3)  # a thirtieth of a texel
+    for cx, cy in itertools.product((-5.25, -0.75, 3.75), (-3.9375, 0.5625, 2.8125)):
+        near = dark * (np.abs(x[None] - cx) < 0.75) * (np.abs(y[:, None] - cy) < 0.5625)
+        assert _centroid(near, x, y) == pytest.approx((cx, cy), abs=1.2e-3)  # a thirtieth of a texel
 
 
 def test_diamonds_that_touch_make_a_checkerboard_turned_with_the_grid() -> None:
@@ -169,11 +156,10 @@ def test_jitter_moves_and_sizes_dots_by_what_is_asked() -> None:
                     radius_jitter=0.1, softness_mm=0.0)  # fmt: skip
     _, texture, x, y = _painted(pattern, seed=4, fx=280.0, fy=280.0)
     dark, moved, areas = 1 - texture[:, :, 0], [], []
-    for cx in np.arange(-5.625, 6, 0.75):
-        for cy in np.arange(-4.125, 4.5, 0.75):
-            near = dark * (np.abs(x[None] - cx) < 0.375) * (np.abs(y[:, None] - cy) < 0.375)
-            areas.append(near.sum())
-            moved.append(np.subtract(_centroid(near, x, y), (cx, cy)))
+    for cx, cy in itertools.product(np.arange(-5.625, 6, 0.75), np.arange(-4.125, 4.5, 0.75)):
+        near = dark * (np.abs(x[None] - cx) < 0.375) * (np.abs(y[:, None] - cy) < 0.375)
+        areas.append(near.sum())
+        moved.append(np.subtract(_centroid(near, x, y), (cx, cy)))
     dx, dy = np.array(moved).T
     # 192 dots: a standard deviation is known to 1 / sqrt(2 · 192) = 5 %; three of those. A correlation to 7 %.
     assert (dx.std(), dy.std()) == pytest.approx((0.04, 0.04), rel=0.15)

@@ -85,8 +85,7 @@ def test_white_transparent_and_beside_it_is_the_bare_coating(tmp_path: Path) -> 
     share = 128 / 255
     np.testing.assert_allclose(at(-1.5, 1.5), [0.6, 0.5 * (1 - share), 0.4 * (1 - share)], atol=1e-6)
     edge = texture[int(0.33 * ROWS) : int(0.36 * ROWS), COLUMNS // 4 + 3 : 3 * COLUMNS // 4 - 3]
-    assert edge.min() >= 0
-    assert edge.max() <= 0.6 + 1e-6  # no fringe brighter than coating or black
+    assert 0 <= edge.min() <= edge.max() <= 0.6 + 1e-6  # no fringe brighter than coating or black
 
 
 def test_fine_stripes_become_their_mean(tmp_path: Path) -> None:
@@ -124,9 +123,8 @@ def test_a_photograph_is_turned_as_its_exif_says(tmp_path: Path) -> None:
     exif[ExifTags.Base.Orientation] = 6  # to be turned by a quarter, clockwise
     Pillow.fromarray(stored).save(tmp_path / "photograph.png", exif=exif)
     Pillow.fromarray(np.rot90(stored, -1)).save(tmp_path / "turned.png")
-    files = ("photograph.png", "turned.png")
-    pictures = (read_picture(Bitmap(kind="bitmap", file=name, width_mm=12), tmp_path) for name in files)
-    np.testing.assert_array_equal(*pictures)
+    bitmaps = (Bitmap(kind="bitmap", file=name, width_mm=12) for name in ("photograph.png", "turned.png"))
+    np.testing.assert_array_equal(*(read_picture(bitmap, tmp_path) for bitmap in bitmaps))
 
 
 def _tiff_of_floats() -> bytes:
@@ -177,38 +175,33 @@ def _draw(scene: Path, picture: np.ndarray) -> None:
     assert cv2.imwrite(str(scene.parent / "art" / "mine.png"), picture)
 
 
-def _is_half_black(scene: Path, *overrides: str) -> bool:
-    generate(load_scene(scene, [*overrides, "sensor.camera.read_noise=0"]), 1, scene.parent / "out")
-    image = read_dataset(scene.parent / "out").read(0).image1
+def _is_half_black(scene: Path, out: str, *overrides: str) -> bool:
+    generate(load_scene(scene, [*overrides, "sensor.camera.read_noise=0"]), 1, scene.parent / out)
+    image = read_dataset(scene.parent / out).read(0).image1
     return bool(image[:, 2:14].max() < 10 and image[:, 18:30].mean() > 50)
 
 
-def test_the_picture_lies_beside_the_scene_file(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir("/")
-    _draw(scene, HALF)
-    bitmap = TEXT.replace(DOTS, 'kind = "bitmap"\nfile = "art/mine.png"\nwidth_mm = 8\n')
-    assert _is_half_black(write_tiny(scene.parent, bitmap))
-
-
-def test_a_picture_given_by_set_lies_where_the_user_is(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_picture_lies_beside_the_scene_file_or_given_by_set_where_the_user_is(
+    scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     _draw(scene, HALF)
     monkeypatch.chdir(scene.parent / "art")
-    assert _is_half_black(scene, BITMAP.replace("art/", ""))
+    assert _is_half_black(scene, "by_set", BITMAP.replace("art/", ""))
+    monkeypatch.chdir("/")
+    bitmap = TEXT.replace(DOTS, 'kind = "bitmap"\nfile = "art/mine.png"\nwidth_mm = 8\n')
+    assert _is_half_black(write_tiny(scene.parent, bitmap), "beside")
 
 
-def test_another_picture_is_another_scene(scene: Path) -> None:
+def test_a_missing_picture_is_told_and_another_one_is_another_scene(scene: Path) -> None:
+    place = f"{scene} with --set sensor.pattern: sensor.pattern.file"
+    with pytest.raises(InputError) as caught:
+        load_scene(scene, [BITMAP])
+    assert str(caught.value) == f"{place}: there is no file {scene.parent / 'art/mine.png'}"
     hashes = []
     for grey in (100, 100, 101):
         _draw(scene, np.full((4, 4), grey, np.uint8))
         hashes.append(load_scene(scene, [BITMAP]).hash)
     assert hashes[0] == hashes[1] != hashes[2]
-
-
-def test_a_missing_picture_is_told_when_the_scene_is_loaded(scene: Path) -> None:
-    place = f"{scene} with --set sensor.pattern: sensor.pattern.file"
-    with pytest.raises(InputError) as caught:
-        load_scene(scene, [BITMAP])
-    assert str(caught.value) == f"{place}: there is no file {scene.parent / 'art/mine.png'}"
 
 
 @pytest.mark.parametrize(

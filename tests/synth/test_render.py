@@ -9,19 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from render_scenes import (
-    DIRECT,
-    FAST,
-    SCALAR,
-    VARIANTS,
-    flat_surface,
-    kernels_compiled,
-    needs_llvm,
-    plain,
-    refracted_pixel,
-    rendered,
-    small_sensor,
-)
+import render_scenes
+from render_scenes import DIRECT, FAST, SCALAR, VARIANTS, flat_surface, needs_llvm, plain, rendered, small_sensor
 
 import synth.render.renderer as renderer_module
 from synth.errors import InputError
@@ -92,7 +81,7 @@ def _dot_errors(sensor, variant) -> np.ndarray:
     rows, columns = np.mgrid[0:60, 0:80] + 0.5
     errors = []
     for x, y in product(np.arange(-2, 3) * 2.5 + 0.3, np.arange(-2, 3) * 2.0 + 0.1):
-        u, v = refracted_pixel(sensor, x, y)
+        u, v = render_scenes.refracted_pixel(sensor, x, y)
         near = np.hypot(columns - u, rows - v) < 6.5
         if 7 < u < 73 and 7 < v < 53:
             total = darkness[near].sum()
@@ -167,7 +156,9 @@ def test_nothing_is_compiled_for_another_frame_or_another_draw_of_the_sensor() -
         surface = flat_surface(sensor)
         renderer = Renderer(sensor, DIRECT, surface, plain(), FAST)
         rise = np.array([0, 0, 0.01])
-        return [kernels_compiled(lambda k=k: renderer.radiance(surface.material + k * rise, k)) for k in seeds]
+        return [
+            render_scenes.kernels_compiled(lambda k=k: renderer.radiance(surface.material + k * rise, k)) for k in seeds
+        ]
 
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         compiled(small_sensor(1.45), [0, 1])
