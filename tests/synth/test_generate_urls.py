@@ -145,9 +145,10 @@ def test_storage_that_refuses_ends_with_one_message_and_goes_on(
 
 
 def test_places_that_cannot_be(tiny: Path) -> None:
-    seen_by_one = "is seen by one process only"
     for out, workers, message in (
-        ("nowhere://bucket/x", 2, "Protocol not known"), ("memory://x", 2, seen_by_one), ("memory://x", 1, seen_by_one)
-    ):  # fmt: skip
+        ("nowhere://bucket/x", 2, "Protocol not known"),
+        ("memory://x", 2, "is seen by one process only"),
+        ("memory://x", 1, "is seen by one process only"),
+    ):
         with pytest.raises(InputError, match=message):
             generate(load_scene(tiny), 1, out, scheduling=Scheduling(workers))

@@ -1,6 +1,6 @@
 """A pad's mesh: what the mesher's output is made into, what later stages rely on, what is refused, what is cached."""
 
-import os
+import contextlib
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -24,15 +24,11 @@ EDGE = 0.6
 @pytest.fixture(scope="module")
 def pad(tmp_path_factory: pytest.TempPathFactory) -> PadMesh:
     """A real mesh, made in an empty working directory."""
-    folder, before = tmp_path_factory.mktemp("cwd"), os.getcwd()
-    os.chdir(folder)
-    try:
+    folder = tmp_path_factory.mktemp("cwd")
+    with contextlib.chdir(folder):
         mesh = tetrahedralise_box(SIZE, EDGE)
-        # fTetWild drops a __tracked_surface.stl where it runs.
-        assert list(folder.iterdir()) == []
-        assert os.getcwd() == str(folder)
-    finally:
-        os.chdir(before)
+        assert Path.cwd() == folder
+    assert list(folder.iterdir()) == []  # fTetWild drops a __tracked_surface.stl where it runs
     return mesh
 
 
