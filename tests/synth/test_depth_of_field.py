@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+import render_scenes
 from kinematic_double import rigid, rotation
-from render_scenes import FAST, SCALAR, flat_surface, kernels_compiled, needs_llvm, plain, rendered, small_sensor
+from render_scenes import FAST, SCALAR, flat_surface, needs_llvm, plain, refracted_angle, rendered, small_sensor
 
 from synth.arrays import FloatArray, Image, Points
 from synth.errors import InputError
@@ -111,10 +112,7 @@ def _axis(camera: Camera) -> tuple[FloatArray, FloatArray]:
 
 
 def _slopes(camera: Camera, index: float, target: FloatArray, radius: float) -> tuple[FloatArray, FloatArray]:
-    """How a point below the face is seen from points of the pupil: these (n, 2) mm and the tangents (n, 2).
-
-    The refracted path is found by bisection of Snell's law, point by point; shares no code with synth.
-    """
+    """How a point below the face is seen from points of the pupil: these (n, 2) mm and the tangents (n, 2)."""
     eye, forward = _axis(camera)
     right = np.array([1.0, 0, 0]) - forward[0] * forward
     right /= np.linalg.norm(right)
@@ -126,12 +124,8 @@ def _slopes(camera: Camera, index: float, target: FloatArray, radius: float) -> 
     for u, v in pupil:
         start = eye + u * right + v * down
         across = target[:2] - start[:2]
-        distance, low, high = np.hypot(*across), 0.0, np.pi / 2
-        for _ in range(80):
-            angle = (low + high) / 2
-            within = np.arcsin(np.sin(angle) / index)
-            reached = (start[2] - FACE) * np.tan(angle) + (FACE - target[2]) * np.tan(within)
-            low, high = (angle, high) if reached < distance else (low, angle)
+        distance = np.hypot(*across)
+        angle = refracted_angle(start[2] - FACE, FACE - target[2], distance, index)
         ray = np.array([*(across / distance * np.sin(angle)), -np.cos(angle)])
         seen.append([ray @ right / (ray @ forward), ray @ down / (ray @ forward)])
     return pupil, np.array(seen)
@@ -272,7 +266,7 @@ def test_nothing_is_compiled_for_another_aperture_or_focus() -> None:
     def compiled(**camera: Any) -> int:
         sensor = small_sensor(1.45, **camera)
         renderer, rest = _renderer(sensor, plain()), flat_surface(sensor).material
-        return kernels_compiled(lambda: renderer.radiance(rest, 1))
+        return render_scenes.kernels_compiled(lambda: renderer.radiance(rest, 1))
 
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         compiled(aperture_mm=1.0, focus_mm=20.0)

@@ -88,7 +88,7 @@ BODIES = {
 
 
 @pytest.mark.parametrize("name", BODIES)
-def test_bodies(name: str) -> None:
+def test_footprint_is_the_overlap_in_closed_form(name: str) -> None:
     indenter, depth, (x, y) = BODIES[name]
     # The askew bar's fillet takes at most its radius off the length of the cut's corners.
     slack = 0.1 * COS + 2 * RESOLUTION * y if name == "askew bar" else None

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 from kinematic_double import FISHEYE, LENS, OBLIQUE, PERISCOPE_VIEW, SIDES, WIDTH, optics, pixel_centres, sensor
-from scipy.optimize import brentq
+from render_scenes import refracted_angle
 
 from synth.errors import InputError
 from synth.optics import Optics
@@ -55,16 +55,10 @@ def _by_opencv(camera, points, fx, fy, distortion):
 
 @pytest.mark.parametrize("index", [1.2, 1.45, 2.5])
 def test_refraction_is_snells_law_in_angles(index):
-    """Another formulation: root of the lateral run in the angle of incidence, by Brent's method."""
     camera = optics(index=index)
     for point, pixel in zip(POINTS, camera.project(POINTS), strict=True):
-        dx, dy, below = point[0] - 1.0, point[1] + 0.5, 9.0 - point[2]
-        distance = np.hypot(dx, dy)
-
-        def beyond(angle, below=below, distance=distance):
-            return 15.0 * np.tan(angle) + below * np.tan(np.arcsin(np.sin(angle) / index)) - distance
-
-        angle = brentq(beyond, 0, 1.5, xtol=1e-15, rtol=1e-15)
+        dx, dy = point[0] - 1.0, point[1] + 0.5
+        angle = refracted_angle(15.0, 9.0 - point[2], np.hypot(dx, dy), index)
         around = np.arctan2(dy, dx)
         expected = 70 * np.tan(angle) * np.cos(around) + 31.7, 71 * np.tan(angle) * np.sin(around) + 24.4
         np.testing.assert_allclose(pixel, expected, atol=1e-10)
