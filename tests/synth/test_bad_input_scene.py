@@ -136,9 +136,8 @@ def test_files(tmp_path: Path, content: str, message: str) -> None:
 
 
 def test_files_that_are_not_there_or_not_text(tmp_path: Path) -> None:
-    assert _refusal("gelsight_mni") == (
-        f"there is no scene 'gelsight_mni'; shipped: {', '.join(shipped_scenes())}; or give a .toml file"
-    )
+    shipped = ", ".join(shipped_scenes())
+    assert _refusal("gelsight_mni") == f"there is no scene 'gelsight_mni'; shipped: {shipped}; or give a .toml file"
     assert _refusal(tmp_path / "none.toml") == f"there is no scene file {tmp_path / 'none.toml'}"
     (tmp_path / "folder.toml").mkdir()
     assert "there is no scene file" in _refusal(tmp_path / "folder.toml")

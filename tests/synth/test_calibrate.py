@@ -263,9 +263,7 @@ def test_a_frame_without_dots_dots_without_a_grid_and_dots_of_a_pixel_are_refuse
     [("", r"scene.toml: exists and does not come from"), (f"# {MARK} before`.\n", "is what --scene starts from")],
     ids=["another's", "a calibration's"],
 )
-def test_calibration_replaces_neither_anothers_scene_nor_its_own_start(
-    tmp_path: Path, refusal: Callable[..., str], first: str, message: str
-) -> None:
+def test_calibration_replaces_no_other_scene(tmp_path: Path, refusal: Callable, first: str, message: str) -> None:
     scene = tmp_path / "scene.toml"
     scene.write_text(first + toml_text(_preset()))
     before = scene.read_bytes()

@@ -23,10 +23,8 @@ SURFACE = sheet(24, 18, 12.0, 9.0, 2)
 REACH = 6
 """px from a dot's centre within which its darkness is summed; dots have radii of 2 to 3 px."""
 MIRROR = Mirror(position_mm=(3.0, 0.0, 13.5), normal=(-1.0, 0.0, -0.12), size_mm=(14.0, 12.0))
-LIGHTS = tuple(
-    Light(position_mm=(x, y, 2.5), size_mm=(0.5, 0.5), color=(1, 1, 1), power=100)
-    for x, y in ((7.0, 7.0), (-7.0, 6.0), (-6.0, -7.0))
-)
+PLACES = ((7.0, 7.0, 2.5), (-7.0, 6.0, 2.5), (-6.0, -7.0, 2.5))
+LIGHTS = tuple(Light(position_mm=place, size_mm=(0.5, 0.5), color=(1, 1, 1), power=100) for place in PLACES)
 
 
 def _sensor(mirrors: tuple[Mirror, ...] = (), **camera: object) -> Sensor:
@@ -119,8 +117,7 @@ def test_dot_centres_move_as_the_flow_says(view):
     # far half of a dot differ by some 2 % in size: another 0.02 px of its place.
     assert found.mean() < 0.05, found
     assert np.linalg.norm(misplaced, axis=1).mean() < 0.05, misplaced
-    for k in set(by):
-        assert found[np.array(by) == k].mean() < 0.05
+    assert all(found[np.array(by) == k].mean() < 0.05 for k in set(by))
 
 
 def _slope(flow: FloatArray, row: int, column: int) -> FloatArray:

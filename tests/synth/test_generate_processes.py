@@ -164,9 +164,7 @@ def test_ctrl_c_still_reaches_python_after_meshing() -> None:
     assert done.stdout.endswith("interrupted\n")
 
 
-def test_killed_while_it_writes_a_sample_and_a_second_process(
-    tiny: Path, out: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_killed_within_a_sample_and_a_second_process(tiny: Path, out: Path, capsys: pytest.CaptureFixture) -> None:
     """The second one is told; the first is killed the moment a half-written sample can be seen."""
     process = started(tiny, out, "--n", "400")
     assert main(["generate", "--scene", str(tiny), "--n", "400", "--out", str(out)]) == 2
@@ -207,9 +205,8 @@ def test_a_full_disk_under_workers_ends_with_one_line(tiny: Path, out: Path) -> 
     generate(load_scene(tiny), 2, out)
     command = "ulimit -f 6; trap '' XFSZ; exec "
     command += f"{sys.executable} -m synth generate --scene {tiny} --out {out} --n 5 --workers 2"
-    done = subprocess.run(
-        ["bash", "-c", command], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False
-    )
+    limited = ["bash", "-c", command]
+    done = subprocess.run(limited, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert done.returncode == 2, done.stderr
     (words,) = own_words(done.stderr)
     assert re.search(r"samples/00000[234]: cannot be written: .*File too large", words)

@@ -31,11 +31,14 @@ def _sensor(pattern: Bitmap, coating: tuple[float, float, float] = (1.0, 1.0, 1.
     return small_sensor(pattern=pattern).model_copy(update={"coating": Coating(reflectance=coating)})
 
 
+def _bitmap(file: str, **where: object) -> Bitmap:
+    return Bitmap(**({"kind": "bitmap", "file": file, "width_mm": 12.0} | where))
+
+
 def _laid(folder: Path, stored: np.ndarray, coating=(1.0, 1.0, 1.0), **where: object) -> FloatArray:
     """The texture with a picture, given as OpenCV stores it: BGR."""
     assert cv2.imwrite(str(folder / "mine.png"), stored)
-    pattern = Bitmap(**({"kind": "bitmap", "file": "mine.png", "width_mm": 12.0} | where))
-    texture = albedo(_sensor(pattern, coating), np.random.default_rng(0), folder)
+    texture = albedo(_sensor(_bitmap("mine.png", **where), coating), np.random.default_rng(0), folder)
     assert texture.shape == (ROWS, COLUMNS, 3)
     return texture.astype(np.float64)
 
@@ -107,10 +110,8 @@ def test_grey_with_alpha_and_palettes_are_read(tmp_path: Path) -> None:
     Pillow.fromarray(values, "LA").save(tmp_path / "la.png")
     Pillow.fromarray(values[:, :, 0]).convert("P").save(tmp_path / "palette.png")
     Pillow.fromarray(values[:, :, 0]).save(tmp_path / "grey.tiff")
-    with_alpha, palette, grey = (
-        albedo(_sensor(Bitmap(kind="bitmap", file=name, width_mm=12)), np.random.default_rng(0), tmp_path)
-        for name in ("la.png", "palette.png", "grey.tiff")
-    )
+    sensors = (_sensor(_bitmap(name)) for name in ("la.png", "palette.png", "grey.tiff"))
+    with_alpha, palette, grey = (albedo(sensor, np.random.default_rng(0), tmp_path) for sensor in sensors)
     assert np.array_equal(palette, grey)
     opacity, place = values[3, 4, 1] / 255, (int(3.5 / 6 * ROWS), int(4.5 / 8 * COLUMNS))
     # Half a texel of 42 off the pixel's middle.
@@ -123,8 +124,8 @@ def test_a_photograph_is_turned_as_its_exif_says(tmp_path: Path) -> None:
     exif[ExifTags.Base.Orientation] = 6  # to be turned by a quarter, clockwise
     Pillow.fromarray(stored).save(tmp_path / "photograph.png", exif=exif)
     Pillow.fromarray(np.rot90(stored, -1)).save(tmp_path / "turned.png")
-    bitmaps = (Bitmap(kind="bitmap", file=name, width_mm=12) for name in ("photograph.png", "turned.png"))
-    np.testing.assert_array_equal(*(read_picture(bitmap, tmp_path) for bitmap in bitmaps))
+    pictures = (read_picture(_bitmap(name), tmp_path) for name in ("photograph.png", "turned.png"))
+    np.testing.assert_array_equal(*pictures)
 
 
 def _tiff_of_floats() -> bytes:
@@ -143,7 +144,7 @@ NO_PICTURES = {"missing": None, "empty": b"", "text": b"<svg/>", "truncated": _h
 
 @pytest.mark.parametrize("data", NO_PICTURES.values(), ids=NO_PICTURES)
 def test_what_is_no_picture_is_refused_in_one_line(tmp_path: Path, data: bytes | None) -> None:
-    path, sensor = tmp_path / "mine.png", _sensor(Bitmap(kind="bitmap", file="mine.png", width_mm=12))
+    path, sensor = tmp_path / "mine.png", _sensor(_bitmap("mine.png"))
     message = "cannot be read: No such file or directory" if data is None else "no whole picture of 8 or 16 bits"
     if data is not None:
         path.write_bytes(data)
@@ -181,9 +182,7 @@ def _is_half_black(scene: Path, out: str, *overrides: str) -> bool:
     return bool(image[:, 2:14].max() < 10 and image[:, 18:30].mean() > 50)
 
 
-def test_the_picture_lies_beside_the_scene_file_or_given_by_set_where_the_user_is(
-    scene: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_picture_lies_beside_the_scene_or_where_the_user_is(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     _draw(scene, HALF)
     monkeypatch.chdir(scene.parent / "art")
     assert _is_half_black(scene, "by_set", BITMAP.replace("art/", ""))

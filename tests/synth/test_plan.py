@@ -58,9 +58,7 @@ def _decided(tiny: Path, *overrides: str, variant: Variant = LLVM) -> dict[str, 
         ("optional channels", "outputs.depth=true", True),
     ],
 )
-def test_what_a_scene_needs_runs_and_the_rest_is_left_out_and_why(
-    tiny: Path, feature: str, override: str, needed: bool
-) -> None:
+def test_what_a_scene_does_not_need_is_left_out_and_why(tiny: Path, feature: str, override: str, needed: bool) -> None:
     assert _decided(tiny)[feature][0] != needed
     runs, reason = _decided(tiny, override)[feature]
     assert runs == needed

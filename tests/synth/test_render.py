@@ -251,11 +251,9 @@ def test_irradiance_under_a_large_light_has_its_closed_form() -> None:
     point, sides a·h and b·h (Howell's catalogue, B-4); other places by adding and subtracting such rectangles.
     """
     light = Light(position_mm=(5.0, 0.0, 3.0), aim_mm=(5.0, 0.0, 0.0), size_mm=(4.0, 6.0), color=(1, 1, 1), power=300)
-    sensor = small_sensor(
-        lights=(light,), fx=500.0, fy=500.0, position_mm=(-1.5, -0.1, 20.0), look_at_mm=(-1.5, -0.1, 0)
-    )
-    image = rendered(sensor)
-    foot = np.array(sensor.camera.position_mm[:2])  # seen at the principal point
+    foot = np.array([-1.5, -0.1])  # seen at the principal point
+    view = {"position_mm": (*foot, 20.0), "look_at_mm": (*foot, 0.0)}
+    image = rendered(small_sensor(lights=(light,), fx=500.0, fy=500.0, **view))
     factor = _view_factor(light, foot)
     # The formula itself, by 400 x 400 midpoints of cos² / (π r²).
     u = (np.arange(400) + 0.5) / 400 - 0.5
