@@ -178,7 +178,6 @@ VIEWS = {
     "fisheye and mirrors": {"index": 1.45, "mirrors": double.SIDES, **double.FISHEYE, "fx": 35.0, "fy": 35.0},
 }
 
-
 DOME = Gel(shape="dome", size_mm=(20, 15, 8), youngs_modulus_kpa=200, dome_radius_mm=17.0)
 """Slopes up to 47 degrees; 2.5 mm are left at its corners."""
 DOME_VIEWS = {

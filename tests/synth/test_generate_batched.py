@@ -53,7 +53,6 @@ BATCHED = (
 SAMPLES, SEED = 10, 10
 """Five trajectories of three sensors and two pads; draws of every kind fail."""
 
-
 pytestmark = pytest.mark.usefixtures("one_cache")
 
 

@@ -14,7 +14,6 @@ RNG = np.random.default_rng(3)
 POINTS = RNG.uniform((-7, -5, 0), (7, 5, 4), (200, 3))
 PIXELS = RNG.uniform((-3, -3), (67, 51), (300, 2))
 
-
 LENSES = {
     "pinhole": {},
     "distorted": {"distortion": LENS},

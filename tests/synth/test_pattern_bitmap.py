@@ -158,7 +158,6 @@ def test_what_is_no_picture_is_refused_in_one_line(tmp_path: Path, data: bytes |
 
 BITMAP = 'sensor.pattern={ kind = "bitmap", file = "art/mine.png", width_mm = 8 }'
 
-
 DOTS = TEXT[TEXT.index('kind = "dots"') : TEXT.index("[sensor.camera]")]
 HALF = np.where(np.arange(80) < 40, 0, 255).astype(np.uint8)[None].repeat(60, axis=0)
 """The left half is black."""
