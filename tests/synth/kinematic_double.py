@@ -14,7 +14,6 @@ LENS = (-0.25, 0.08, 1e-3, -2e-3, 0.01)
 STRAIGHT = {"position_mm": (1.0, -0.5, 24.0), "look_at_mm": (1.0, -0.5, 0.0)}
 OBLIQUE = {"position_mm": (3.0, -2.0, 22.0), "look_at_mm": (-0.5, 0.7, 0.0)}
 
-
 FISHEYE = {"lens": "fisheye", "distortion": (0.05, -0.02, 0.004, -0.001), "fx": 52.0, "fy": 53.0}
 SIDES = (
     {"position_mm": (6.0, -0.5, 16.0), "normal": (-1.0, 0.0, -0.25), "size_mm": (12.0, 8.0), "rotation_deg": 4.0},
@@ -24,6 +23,7 @@ SIDES = (
 PERISCOPE = ({"position_mm": (0.0, -2.0, 16.0), "normal": (0.05, -1.0, -1.1), "size_mm": (16.0, 9.0)},)
 """One mirror at about 45 degrees, for a camera that looks along +y: LEVEL."""
 LEVEL = {"position_mm": (0.4, -16.0, 15.0), "look_at_mm": (0.0, -2.0, 15.5)}
+PERISCOPE_VIEW = {"mirrors": PERISCOPE, **LEVEL}
 
 
 def sensor(*, index: float = 1.0, mirrors: tuple[dict, ...] = (), **camera: object) -> Sensor:

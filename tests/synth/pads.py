@@ -29,13 +29,8 @@ from synth.simulate.tables import pack_indenter, place_indenter
 SIZE = (8.0, 6.0, 4.0)
 SPHERE = {"shape": "sphere", "radius_mm": 3.0}
 PUNCH = {"shape": "cylinder", "radius_mm": 2.0, "length_mm": 6.0, "fillet_mm": 0.5}
-DRAG: dict[str, Any] = {
-    "depth_mm": 0.6,
-    "shear_mm": [0.8, -0.3],
-    "twist_deg": 10.0,
-    "position_mm": [0.4, 0.2],
-    "steps": 4,
-}
+DRAG: dict[str, Any] = {"depth_mm": 0.6, "shear_mm": [0.8, -0.3], "twist_deg": 10.0, "position_mm": [0.4, 0.2]}
+DRAG["steps"] = 4
 ELEMENT: dict[str, Callable[[], Element]] = {"p1": p1, "p1p1": p1p1, "p2p1": p2p1}
 MIXED = ["p1p1", "p2p1"]
 """Names of the elements that have a pressure field, to be a test's parameters."""
@@ -43,10 +38,7 @@ MIXED = ["p1p1", "p2p1"]
 
 def brick(size: tuple[float, float, float] = SIZE, counts: tuple[int, int, int] = (4, 4, 3)) -> PadMesh:
     """Box of counts cells, six tetrahedra each (Kuhn), every other cell mirrored; even counts give a symmetric mesh."""
-    axes = [
-        np.linspace(-size[0] / 2, size[0] / 2, counts[0] + 1),
-        np.linspace(-size[1] / 2, size[1] / 2, counts[1] + 1),
-    ]
+    axes = [np.linspace(-size[axis] / 2, size[axis] / 2, counts[axis] + 1) for axis in (0, 1)]
     axes.append(np.linspace(0.0, size[2], counts[2] + 1))
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     cell = np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), axis=-1).reshape(-1, 3)

@@ -1,14 +1,21 @@
 """Watching and waiting for the command's processes, in tests that kill them; Linux's /proc."""
 
+import contextlib
+import os
+import resource
+import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).parents[2]
 PATIENCE_S = 120.0
 HAS_PROC = Path("/proc/self/task").exists()
+needs_proc = pytest.mark.skipif(not HAS_PROC, reason="finds child processes in Linux's /proc")
 
 
 def start(scene: Path, out: Path | str, *options: str) -> "subprocess.Popen[str]":
@@ -16,6 +23,26 @@ def start(scene: Path, out: Path | str, *options: str) -> "subprocess.Popen[str]
     command = [sys.executable, "-m", "synth", "generate", "--scene", str(scene), "--out", str(out), *options]
     pipe = subprocess.PIPE
     return subprocess.Popen(command, cwd=ROOT, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
+
+
+def started(scene: Path, out: Path, *options: str) -> "subprocess.Popen[str]":
+    """The command, once its first sample is on record."""
+    process = start(scene, out, *options)
+    wait_for("the first sample", lambda: lines(out) > 0, process)
+    return process
+
+
+def end_family(process: "subprocess.Popen[str]", number: signal.Signals) -> str:
+    """Kill or interrupt a command that has at least two workers, which must leave with it; what it said on stderr."""
+    family = descendants(process.pid)
+    assert len(family) >= 2
+    if number == signal.SIGKILL:
+        process.kill()
+    else:
+        os.killpg(process.pid, number)  # a terminal sends it to the whole group
+    process.wait(PATIENCE_S)
+    wait_for("the workers to leave with their driver", lambda: not alive(family))
+    return process.communicate()[1]
 
 
 def lines(out: Path) -> int:
@@ -65,6 +92,20 @@ def workers_of(pid: int, name: bytes = b"spawn_main") -> list[int]:
             return b""
 
     return [child for child in descendants(pid) if name in command(child)]
+
+
+@contextlib.contextmanager
+def largest_file(count: int) -> Iterator[None]:
+    """Let no file become larger than so many bytes: a write beyond that fails as on a full disk, at the same place.
+
+    Held no longer than the call it is for: pytest's own output may go to a file.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (count, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def own_words(stderr: str) -> list[str]:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from synth.arrays import Image, Points
 from synth.render.renderer import Renderer
@@ -19,10 +20,7 @@ DIRECT = Render(samples_per_pixel=36, max_depth=2)
 
 
 def small_sensor(
-    index: float = 1.0,
-    pattern: Pattern | None = None,
-    lights: tuple[Light, ...] | None = None,
-    **camera: object,
+    index: float = 1.0, pattern: Pattern | None = None, lights: tuple[Light, ...] | None = None, **camera: object
 ) -> Sensor:
     """A pad of 12 x 9 x 3 mm seen at about 8 px per mm from the height of 20 mm, slightly off its middle."""
     numbers: dict = {"width": 80, "height": 60, "fx": 140.0, "fy": 140.0, "cx": 42.5, "cy": 28.5}
@@ -80,22 +78,26 @@ def kernels_compiled(frame: Callable[[], object]) -> int:
     return sum(not kernel["cache_hit"] for kernel in kernels)
 
 
-def refracted_pixel(sensor: Sensor, x: float, y: float) -> tuple[float, float]:
-    """Pixel of the point (x, y, 0) for a camera that looks straight down: Snell's law solved by bisection.
+def refracted_angle(above: float, below: float, distance: float, index: float) -> float:
+    """The angle a from the normal in air of a ray that Snell's law bends: a root, by Brent's method.
 
-    Written from R = h tan(a) + d tan(g), sin(a) = n sin(g), and OpenCV's distortion formula; shares no code with synth.
+    Of R = h tan(a) + d tan(g), sin(a) = n sin(g), with heights h above and d below the face; shares no code with synth.
     """
+
+    def beyond(angle: float) -> float:
+        return above * np.tan(angle) + below * np.tan(np.arcsin(np.sin(angle) / index)) - distance
+
+    return brentq(beyond, 0.0, np.pi / 2 - 1e-9, xtol=1e-15, rtol=1e-15)
+
+
+def refracted_pixel(sensor: Sensor, x: float, y: float) -> tuple[float, float]:
+    """Pixel of the point (x, y, 0) for a camera that looks straight down, by Snell's law and OpenCV's distortion."""
     camera, index = sensor.camera, sensor.window.refractive_index
     depth = sensor.gel.size_mm[2] + sensor.window.thickness_mm
     above = camera.position_mm[2] - depth
     dx, dy = x - camera.position_mm[0], y - camera.position_mm[1]
     distance = np.hypot(dx, dy)
-    low, high = 0.0, np.pi / 2 - 1e-9
-    for _ in range(80):
-        angle = (low + high) / 2
-        reached = above * np.tan(angle) + depth * np.tan(np.arcsin(np.sin(angle) / index))
-        low, high = (angle, high) if reached < distance else (low, angle)
-    scale = np.tan(angle) / distance if distance > 0 else 0.0
+    scale = np.tan(refracted_angle(above, depth, distance, index)) / distance if distance > 0 else 0.0
     u, v = dx * scale, dy * scale
     k1, k2, p1, p2, k3 = camera.distortion
     s = u * u + v * v

@@ -4,7 +4,11 @@ A patterned plane z = 0 seen from straight above at `scale` px per mm: a shift o
 U = scale * s, V = 0. The texture is a sum of cosines, so both images are exact.
 """
 
+import contextlib
 import hashlib
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -43,11 +47,7 @@ def texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def translation_sample(
-    index: int = 0,
-    shift: tuple[float, float] = (1.25, -0.5),
-    *,
-    dtype: type = np.uint8,
-    grey: bool = False,
+    index: int = 0, shift: tuple[float, float] = (1.25, -0.5), *, dtype: type = np.uint8, grey: bool = False
 ) -> Sample:
     """The gel moves by `shift` px. The last two columns see no gel; what moves off the image is not visible."""
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
@@ -58,9 +58,12 @@ def translation_sample(
         images = [np.ascontiguousarray(image[:, :, 0]) for image in images]
     gel = columns < WIDTH - 2
     forward = np.where(gel[..., None], np.array(shift), np.nan).astype(np.float32)
-    ahead = (x + shift[0] < WIDTH) & (x + shift[0] > 0) & (y + shift[1] < HEIGHT) & (y + shift[1] > 0) & gel
-    behind = (x - shift[0] < WIDTH) & (x - shift[0] > 0) & (y - shift[1] < HEIGHT) & (y - shift[1] > 0) & gel
-    surface = flat_surface()
+
+    def visible(k: int) -> np.ndarray:
+        u, v = x + k * shift[0], y + k * shift[1]
+        return ((u > 0) & (u < WIDTH) & (v > 0) & (v < HEIGHT) & gel).astype(np.float32)
+
+    contact, surface = np.where(gel, index, np.nan).astype(np.float32), flat_surface()
     rest = np.zeros_like(surface.coarse.nodes)
     solver = {
         "depth_mm": 0.1, "shear_mm": [0.0, 0.0], "twist_deg": 0.0, "converged": True, "newton_iterations": 4,
@@ -73,13 +76,7 @@ def translation_sample(
         seed=7,
         image1=images[0],
         image2=images[1],
-        flow=FlowField(
-            forward,
-            ahead.astype(np.float32),
-            -forward,
-            behind.astype(np.float32),
-            extras={"contact.Y": np.where(gel, index, np.nan).astype(np.float32)},
-        ),
+        flow=FlowField(forward, visible(1), -forward, visible(-1), extras={"contact.Y": contact}),
         scene=Scene.model_validate(SCENE),
         surface=surface,
         displacement1=rest,
@@ -94,15 +91,39 @@ def translation_sample(
 def job(n: int = 3, *, seed: int = 7, **changes: object) -> Job:
     """A job whose scene is `SCENE` with top-level keys changed."""
     scene = {**SCENE, **changes}
-    return Job(
-        scene=scene,
-        scene_name="flat",
-        scene_hash=hashlib.sha256(repr(scene).encode()).hexdigest()[:16],
-        seed=seed,
-        n=n,
-        software={"synth": "0.1.0"},
-        device={"device": "cpu", "variant": "scalar_rgb"},
-    )
+    scene_hash = hashlib.sha256(repr(scene).encode()).hexdigest()[:16]
+    software, device = {"synth": "0.1.0"}, {"device": "cpu", "variant": "scalar_rgb"}
+    return Job(scene, "flat", scene_hash, seed, n, software, device)
+
+
+HOLD = """
+import sys
+sys.path[:0] = sys.argv[4:]
+from samples import job, translation_sample
+from synth.dataset.shard import Shard
+from synth.dataset.writer import DatasetWriter
+shard = Shard.parse(sys.argv[2]) if sys.argv[2] else None
+with DatasetWriter(sys.argv[1], job(6), shard, 2) as writer:
+    for index in sys.argv[3].split():
+        writer.write(translation_sample(int(index)))
+    print("held", flush=True)
+    sys.stdin.readline()
+"""
+
+
+@contextlib.contextmanager
+def writing_elsewhere(directory: Path, shard: str = "", indices: Sequence[int] = ()) -> Iterator[subprocess.Popen[str]]:
+    """Another process that has made samples of a shard and goes on to hold it until it reads a line or is killed."""
+    paths = [str(Path(__file__).parent), str(Path(__file__).parents[2])]
+    command = [sys.executable, "-c", HOLD, str(directory), shard, " ".join(map(str, indices)), *paths]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "held\n"
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
 
 
 def tree(directory: Path) -> dict[str, bytes]:

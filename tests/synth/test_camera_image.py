@@ -20,43 +20,35 @@ def _camera(**fields):
     return small_sensor(**(SIZE | fields)).camera
 
 
-def test_noiseless_levels_follow_exposure_and_gamma() -> None:
-    image = camera_image(_flat(0.25), _camera(gamma=2.0, exposure=1.44), np.random.default_rng(0))
-    assert image.dtype == np.uint8
-    assert np.all(image == round(255 * (0.25 * 1.44) ** 0.5))
-
-
-def test_overexposure_clips() -> None:
-    assert np.all(camera_image(_flat(3.0), _camera(), np.random.default_rng(0)) == 255)
+def test_noiseless_levels_follow_exposure_and_gamma_and_clip() -> None:
+    camera = _camera(gamma=2.0, exposure=1.44)
+    lit, overexposed = (camera_image(_flat(value), camera, np.random.default_rng(0)) for value in (0.25, 3.0))
+    assert lit.dtype == np.uint8
+    assert np.all(lit == round(255 * (0.25 * 1.44) ** 0.5))
+    assert np.all(overexposed == 255)
 
 
 @pytest.mark.parametrize("bits", [10, 12, 14, 16])
 def test_deeper_images_fill_16_bits_in_steps_of_their_own(bits: int) -> None:
     ramp = np.linspace(0, 1, 150 * 200 * 3, dtype=np.float32).reshape(150, 200, 3)
     image = camera_image(ramp, _camera(gamma=1.0, bit_depth=bits), np.random.default_rng(0))
-    assert image.dtype == np.uint16
-    assert image.min() == 0
-    assert image.max() == 65535
+    assert (image.dtype, image.min(), image.max()) == (np.uint16, 0, 65535)
     levels = 2**bits - 1
     steps = image * (levels / 65535)
     assert np.abs(steps - np.round(steps)).max() <= 0.5 * levels / 65535 + 1e-9  # rounding to 16 bits
 
 
 @pytest.mark.parametrize("signal", [0.1, 0.4])
-def test_noise_has_the_photon_transfer_variance(signal: float) -> None:
+def test_noise_has_the_photon_transfer_variance_and_comes_from_the_generator_alone(signal: float) -> None:
     camera = _camera(gamma=1.0, bit_depth=16, read_noise=0.01, shot_noise=0.05)
-    image = camera_image(_flat(signal), camera, np.random.default_rng(0)) / 65535
+    first, again, other = (camera_image(_flat(signal), camera, np.random.default_rng(seed)) for seed in (0, 0, 1))
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+    image = first / 65535
     expected = 0.01**2 + 0.05**2 * signal
     # The variance of n = 90000 samples has the relative standard deviation sqrt(2 / n) = 0.5 %; four of those.
     assert image.var() == pytest.approx(expected, rel=0.02)
     assert image.mean() == pytest.approx(signal, abs=4 * np.sqrt(expected / image.size))
-
-
-def test_noise_comes_from_the_generator_alone() -> None:
-    camera = _camera(read_noise=0.02)
-    first, again, other = (camera_image(_flat(0.5), camera, np.random.default_rng(seed)) for seed in (1, 1, 2))
-    assert np.array_equal(first, again)
-    assert not np.array_equal(first, other)
 
 
 def test_blur_is_a_normalised_gaussian() -> None:
@@ -70,7 +62,6 @@ def test_blur_is_a_normalised_gaussian() -> None:
 
 
 def test_a_grey_image_is_a_channel_of_a_grey_coloured_one() -> None:
-    """Fails without the reshape after the blur: OpenCV drops the axis of a single channel."""
     camera = _camera(blur_px=0.8, vignetting=0.3)
     ramp = np.linspace(0, 1, 150 * 200, dtype=np.float32).reshape(150, 200, 1)
     grey, colour = (expected_signal(image, camera) for image in (ramp, np.repeat(ramp, 3, axis=2)))
@@ -97,40 +88,34 @@ def _lit_from_two_sides(shot_noise: float) -> Sensor:
 @needs_llvm
 @pytest.mark.parametrize("shot_noise", [0.01, 0.02])
 def test_auto_keeps_render_noise_below_a_quarter_of_the_cameras(shot_noise: float) -> None:
-    """Fails with a SHARE of 1, and with the pilots' own number taken for the answer."""
     sensor = _lit_from_two_sides(shot_noise)
-    surface = flat_surface(sensor)
-    renderer = Renderer(sensor, Render(samples_per_pixel="auto", max_depth=2), surface, plain(), FAST)
+    surface, render = flat_surface(sensor), Render(samples_per_pixel="auto", max_depth=2)
+    renderer, again = (Renderer(sensor, render, surface, plain(), FAST) for _ in "12")
     first, second = (renderer.radiance(surface.material, seed) for seed in (11, 12))
     share = render_noise(first, second, sensor.camera) / camera_noise(first, sensor.camera)
     # Noise of 14400 values is known within 1 %; the pilots' as well.
     assert share <= 0.25 * 1.03
     # Not wasteful: stratified noise falls as 1 / samples at best, so that a pilot of 16 asks for n / 16 times too many.
     assert share >= 0.25 / (renderer.samples_per_pixel / 16) ** 0.5 / 1.5 or renderer.samples_per_pixel == 16
-    again = Renderer(sensor, Render(samples_per_pixel="auto", max_depth=2), surface, plain(), FAST)
     assert again.samples_per_pixel == renderer.samples_per_pixel == full_grid(renderer.samples_per_pixel, 2)
 
 
-def test_number_follows_from_the_pilots_noise() -> None:
+def test_number_follows_from_the_pilots_noise_and_quantisation_is_noise_too() -> None:
     """White noise of standard deviation 0.01 on a signal of 0.25, gamma 1: n = 16 (0.01 / (0.25 · 0.02))² = 64."""
     camera = small_sensor(gamma=1.0, shot_noise=0.04, bit_depth=16).camera  # 0.04 · √0.25 = 0.02
     rng = np.random.default_rng(0)
-    first, second = (
-        np.float32(0.25) + np.float32(0.01) * rng.standard_normal((60, 80, 3), dtype=np.float32) for _ in "12"
-    )
-    assert camera_noise(np.full((60, 80, 3), 0.25, dtype=np.float32), camera) == pytest.approx(0.02, rel=1e-6)
+    mean = np.full((60, 80, 3), 0.25, dtype=np.float32)
+    first, second = (mean + np.float32(0.01) * rng.standard_normal(mean.shape, dtype=np.float32) for _ in "12")
+    assert camera_noise(mean, camera) == pytest.approx(0.02, rel=1e-6)
+    quantised = camera.model_copy(update={"shot_noise": 0.0, "bit_depth": 8})
+    assert camera_noise(mean, quantised) == pytest.approx(1 / 255 / 12**0.5)
     # Two pictures of 14400 values: 2 % in the variance at three standard deviations, and 1 for rounding up.
     assert needed_samples(first, second, camera, 16) == pytest.approx(64, abs=3)
 
 
-def test_quantisation_is_noise_too() -> None:
-    camera = small_sensor(gamma=1.0, bit_depth=8).camera
-    assert camera_noise(np.full((60, 80, 3), 0.25, dtype=np.float32), camera) == pytest.approx(1 / 255 / 12**0.5)
-
-
 @pytest.mark.parametrize("level", [0.0, 0.002, 0.2])
 def test_the_cameras_noise_is_that_of_its_photographs(level: float) -> None:
-    """In the dark, too. Fails with the response's slope at the darkest grey in place of the quadrature."""
+    """In the dark, too."""
     camera = small_sensor(read_noise=0.004, shot_noise=0.01, bit_depth=16).camera
     radiance = np.full((60, 80, 3), level, dtype=np.float32)
     photograph = camera_image(radiance, camera, np.random.default_rng(0)) / 65535

@@ -12,18 +12,10 @@ from synth.render.variant import Variant, choose_variant
 from synth.scene.template import load_scene
 from synth.verify import verify_dataset
 
+CAMERA = {"width": 64, "height": 48, "fx": 90.0, "fy": 90.0, "cx": 32.0, "cy": 24.0}
 TINY = [
-    "sensor.camera.width=64",
-    "sensor.camera.height=48",
-    "sensor.camera.fx=90.0",
-    "sensor.camera.fy=90.0",
-    "sensor.camera.cx=32.0",
-    "sensor.camera.cy=24.0",
-    "render.samples_per_pixel=144",
-    "motion.steps=2",
-    "motion.depth_mm=0.5",
-    "motion.shear_mm=[0.2, 0.1]",
-    "numerics.target_error_px=5.0",
+    *(f"sensor.camera.{name}={value}" for name, value in CAMERA.items()),
+    *("render.samples_per_pixel=144", "motion.steps=2", "motion.depth_mm=0.5", "motion.shear_mm=[0.2, 0.1]"),
     'contact.indenter={shape="sphere", radius_mm=4.0}',
 ]
 
@@ -38,7 +30,7 @@ def cuda() -> Variant:
 
 @pytest.mark.cuda
 def test_generated_on_a_gpu_verifies_and_agrees_with_the_cpu(cuda: Variant, tmp_path: Path) -> None:
-    template = load_scene("gelsight_mini", TINY)
+    template = load_scene("gelsight_mini", [*TINY, "numerics.target_error_px=5.0"])
     generate(template, 2, tmp_path / "cuda", variant=cuda)
     generate(template, 2, tmp_path / "cpu", variant=choose_variant("cpu"))
     assert verify_dataset(tmp_path / "cuda").ok
@@ -54,8 +46,7 @@ def test_generated_on_a_gpu_verifies_and_agrees_with_the_cpu(cuda: Variant, tmp_
 @pytest.mark.cuda
 def test_batched_on_a_gpu_with_workers_verifies_and_agrees_with_the_cpu(cuda: Variant, tmp_path: Path) -> None:
     """The whole way: solver's thread, renderer, worker processes; on the CPU one thing after another."""
-    shared = [change for change in TINY if "target_error_px" not in change]
-    template = load_scene("gelsight_mini", [*shared, 'numerics.solver="batched"', "numerics.cells=[6, 4, 2]"])
+    template = load_scene("gelsight_mini", [*TINY, 'numerics.solver="batched"', "numerics.cells=[6, 4, 2]"])
     generate(template, 6, tmp_path / "cuda", variant=cuda, scheduling=Scheduling(workers=2))
     generate(template, 6, tmp_path / "cpu", variant=choose_variant("cpu"), scheduling=Scheduling(workers=1))
     assert verify_dataset(tmp_path / "cuda").ok

@@ -1,21 +1,24 @@
-"""Writing a dataset in one go, in several, with workers, and into the wrong place."""
+"""Writing a dataset in one go, in several, with workers, in shards side by side, and into the wrong place."""
 
 import errno
 import json
 import os
-import subprocess
-import sys
+from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 import pytest
-from samples import job, translation_sample, tree
+from processes_of import largest_file
+from samples import job, translation_sample, tree, writing_elsewhere
 
+from synth.cli import main
 from synth.dataset import lines, sample_files
 from synth.dataset.reader import read_dataset
 from synth.dataset.sample_files import write_sample_files
+from synth.dataset.shard import Shard
 from synth.dataset.writer import DatasetWriter
 from synth.errors import InputError
 
@@ -26,7 +29,9 @@ def _write_all(directory: Path, order=(0, 1, 2), n: int = 3) -> None:
             writer.write(translation_sample(index))
 
 
-def _without_seconds(files: dict[str, bytes]) -> dict[str, object]:
+def _comparable(directory: Path) -> dict[str, object]:
+    """All that does not depend on the machine's load."""
+    files = {name: data for name, data in tree(directory).items() if name != "summary.json"}
     entries = [json.loads(line) for line in files["manifest.jsonl"].splitlines()]
     return {**files, "manifest.jsonl": [{**entry, "seconds": None} for entry in entries]}
 
@@ -43,28 +48,22 @@ def test_round_trip(tmp_path, dtype, grey):
     for name in ("image1", "image2", "displacement1", "displacement2"):
         np.testing.assert_array_equal(getattr(data, name), getattr(sample, name), strict=True)
     np.testing.assert_array_equal(data.flow.backward, sample.flow.backward, strict=True)
-    np.testing.assert_array_equal(
-        data.surface.positions(data.displacement2), sample.surface.positions(sample.displacement2), strict=True
-    )
+    moved = (one.surface.positions(one.displacement2) for one in (data, sample))
+    np.testing.assert_array_equal(*moved, strict=True)
     entry = dataset.entry(2)
-    assert entry.max_flow_px == np.hypot(1.25, 0.5)
-    assert entry.force_n[1] == (0.1, 0.0, 1.5)
-    assert entry.frames == (0, 3)
+    assert (entry.max_flow_px, entry.force_n[1], entry.frames) == (np.hypot(1.25, 0.5), (0.1, 0.0, 1.5), (0, 3))
     assert entry.diagnostics["solver"][1]["depth_mm"] == 0.2
     assert set(entry.sha256) == {"image1.png", "image2.png", "flow.exr", "meta.json", "surface.npz"}
     assert dataset.check_hashes(2) == []
-    assert data.meta["image"] == {
-        "width": 32, "height": 24, "channels": 1 if grey else 3, "bits": 8 * np.dtype(dtype).itemsize,
-    }  # fmt: skip
+    bits, channels = 8 * np.dtype(dtype).itemsize, 1 if grey else 3
+    assert data.meta["image"] == {"width": 32, "height": 24, "channels": channels, "bits": bits}
 
 
 def test_dataset_json_holds_the_job(tmp_path):
     _write_all(tmp_path / "d")
     info = json.loads((tmp_path / "d" / "dataset.json").read_text())
-    assert info["schema_version"] == 1
-    assert info["scene"]["name"] == "flat"
+    assert (info["schema_version"], info["scene"]["name"], info["device"]["variant"]) == (1, "flat", "scalar_rgb")
     assert (info["seed"], info["n"], info["software"]) == (7, 3, {"synth": "0.1.0"})
-    assert info["device"]["variant"] == "scalar_rgb"
     assert "I1(x) = I2(x + forward(x))" in info["conventions"]["flow.directions"]
 
 
@@ -90,7 +89,7 @@ def test_order_and_interruptions_leave_no_trace(tmp_path):
             writer.write(translation_sample(index))
     with DatasetWriter(tmp_path / "a", job()) as writer:
         writer.fail(1, 0, "simulate", "Newton failed")
-    a, b, c = (_without_seconds(tree(tmp_path / name)) for name in "abc")
+    a, b, c = (_comparable(tmp_path / name) for name in "abc")
     assert a == c
     assert {**a, "failures.jsonl": b""} == b
     assert len(read_dataset(tmp_path / "c").failures) == 1
@@ -105,10 +104,10 @@ def test_workers_write_and_the_driver_records(tmp_path):
         for future in futures:
             writer.record(future.result())
             writer.record(future.result())  # Told twice: recorded once.
-    assert _without_seconds(tree(tmp_path / "a")) == _without_seconds(tree(tmp_path / "b"))
+    assert _comparable(tmp_path / "a") == _comparable(tmp_path / "b")
 
 
-def test_lost_folder_is_made_again(tmp_path):
+def test_lost_folder_is_made_again_and_n_may_grow_and_shrink(tmp_path):
     _write_all(tmp_path / "d")
     before = tree(tmp_path / "d")
     (tmp_path / "d" / "samples" / "000001" / "flow.exr").unlink()
@@ -116,10 +115,6 @@ def test_lost_folder_is_made_again(tmp_path):
         assert writer.finished == {0, 2}
         writer.write(translation_sample(1))
     assert tree(tmp_path / "d") == before
-
-
-def test_n_may_grow_and_shrink(tmp_path):
-    _write_all(tmp_path / "d")
     for n, expected in ((5, 5), (2, 5)):
         with DatasetWriter(tmp_path / "d", job(n)) as writer:
             assert writer.finished == {0, 1, 2}
@@ -144,8 +139,6 @@ def test_another_job_is_refused_and_named(tmp_path, other, named):
 
 
 def test_another_variant_is_another_job_other_software_is_recorded(tmp_path):
-    from dataclasses import replace
-
     _write_all(tmp_path / "d")
     with pytest.raises(InputError, match=r"device\.variant: scalar_rgb there, llvm_ad_rgb now"):
         DatasetWriter(tmp_path / "d", replace(job(), device={"device": "cpu", "variant": "llvm_ad_rgb"}))
@@ -156,40 +149,25 @@ def test_another_variant_is_another_job_other_software_is_recorded(tmp_path):
     assert info["continued_with"] == [{"synth": "0.2.0"}]
 
 
-def test_strange_directories_are_left_alone(tmp_path):
-    (tmp_path / "thesis").mkdir()
-    (tmp_path / "thesis" / "chapter.tex").write_text("x")
+def test_strange_places_are_left_alone(tmp_path):
+    chapter = tmp_path / "thesis" / "chapter.tex"
+    chapter.parent.mkdir()
+    chapter.write_text("x")
     with pytest.raises(InputError, match=r"not a dataset.*chapter\.tex"):
-        DatasetWriter(tmp_path / "thesis", job())
-    assert [file.name for file in (tmp_path / "thesis").iterdir()] == ["chapter.tex"]
+        DatasetWriter(chapter.parent, job())
+    assert list(chapter.parent.iterdir()) == [chapter]
     with pytest.raises(InputError, match="is a file"):
-        DatasetWriter(tmp_path / "thesis" / "chapter.tex", job())
+        DatasetWriter(chapter, job())
+    with pytest.raises(InputError, match=r"/proc/synth.*cannot be written"):
+        DatasetWriter("/proc/synth", job())
     (tmp_path / "empty").mkdir()
     DatasetWriter(tmp_path / "empty", job()).close()
 
 
-HOLD = """
-import sys, time
-from pathlib import Path
-sys.path[:0] = sys.argv[2:]
-from samples import job
-from synth.dataset.writer import DatasetWriter
-writer = DatasetWriter(Path(sys.argv[1]), job())
-print("held", flush=True)
-time.sleep(60)
-"""
-
-
 def test_second_process_is_told_and_a_killed_one_lets_go(tmp_path):
-    paths = [str(Path(__file__).parent), str(Path(__file__).parents[2])]
-    holder = subprocess.Popen([sys.executable, "-c", HOLD, tmp_path / "d", *paths], stdout=subprocess.PIPE, text=True)
-    try:
-        assert holder.stdout.readline() == "held\n"
-        with pytest.raises(InputError, match=rf"another process \(pid {holder.pid} on .*\) is writing"):
-            DatasetWriter(tmp_path / "d", job())
-    finally:
-        holder.kill()
-        holder.wait()
+    refusal = r"another process \(pid {} on .*\) is writing"
+    with writing_elsewhere(tmp_path / "d") as holder, pytest.raises(InputError, match=refusal.format(holder.pid)):
+        DatasetWriter(tmp_path / "d", job())
     DatasetWriter(tmp_path / "d", job()).close()
 
 
@@ -229,44 +207,23 @@ def test_full_disk_in_the_manifest(tmp_path, monkeypatch, call):
         assert writer.finished == {0}
 
 
-@pytest.mark.skipif(not hasattr(os, "geteuid"), reason="needs POSIX")
 def test_file_size_limit_of_the_system(tmp_path):
     """A real refusal by the kernel (RLIMIT_FSIZE stands in for a full disk), while OpenEXR is writing."""
-    code = (
-        "import resource, signal, sys; sys.path[:0] = sys.argv[2:]\n"
-        "from samples import job, translation_sample\n"
-        "from synth.dataset.writer import DatasetWriter\n"
-        "from synth.errors import InputError\n"
-        "writer = DatasetWriter(sys.argv[1], job())\n"
-        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (600, 600))\n"
-        "try:\n    writer.write(translation_sample(0))\n"
-        "except InputError as error:\n    print(error)\n"
-    )
-    paths = [str(Path(__file__).parent), str(Path(__file__).parents[2])]
-    done = subprocess.run(
-        [sys.executable, "-c", code, tmp_path / "d", *paths], capture_output=True, text=True, check=True
-    )
-    assert "000000: cannot be written" in done.stdout
+    writer = DatasetWriter(tmp_path / "d", job())
+    with largest_file(600), pytest.raises(InputError, match=r"000000: cannot be written"):
+        writer.write(translation_sample(0))
     assert list((tmp_path / "d" / "samples").iterdir()) == []
-
-
-def test_read_only_place(tmp_path):
-    with pytest.raises(InputError, match=r"/proc/synth.*cannot be written"):
-        DatasetWriter("/proc/synth", job())
 
 
 def test_tampering_is_found(tmp_path):
     _write_all(tmp_path / "d")
     dataset, folder = read_dataset(tmp_path / "d"), tmp_path / "d" / "samples" / "000001"
-    data = bytearray((folder / "flow.exr").read_bytes())
-    data[-1] ^= 1
-    (folder / "flow.exr").write_bytes(bytes(data))
+    data = (folder / "flow.exr").read_bytes()
+    (folder / "flow.exr").write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
     (folder / "image2.png").unlink()
-    problems = dataset.check_hashes(1)
-    assert len(problems) == 2
-    assert "flow.exr: sha256 is" in problems[0]
-    assert "image2.png: cannot be read" in problems[1]
+    changed, lost = dataset.check_hashes(1)
+    assert "flow.exr: sha256 is" in changed
+    assert "image2.png: cannot be read" in lost
     assert dataset.check_hashes(0) == []
 
 
@@ -284,11 +241,12 @@ def test_unreadable_datasets_are_named(tmp_path):
         ("samples/000000/surface.npz", lambda data: data[:-40], r"000000/surface\.npz"),
         ("samples/000000/meta.json", lambda data: data[:-40], r"000000/meta\.json.*not valid JSON"),
     ):
-        whole = (tmp_path / "d" / name).read_bytes()
-        (tmp_path / "d" / name).write_bytes(damage(whole))
+        file = tmp_path / "d" / name
+        whole = file.read_bytes()
+        file.write_bytes(damage(whole))
         with pytest.raises(InputError, match=message):
             read_dataset(tmp_path / "d").read(0)
-        (tmp_path / "d" / name).write_bytes(whole)
+        file.write_bytes(whole)
     info = tmp_path / "d" / "dataset.json"
     info.write_text(info.read_text().replace('"schema_version": 1', '"schema_version": 9'))
     with pytest.raises(InputError, match="version 9 of the format"):
@@ -300,3 +258,106 @@ def test_a_reader_passes_over_a_line_being_written(tmp_path):
     with (tmp_path / "d" / "manifest.jsonl").open("a") as file:
         file.write('{"index": 3, "tra')
     assert read_dataset(tmp_path / "d").samples == [0, 1, 2]
+
+
+PAIRS = 2
+"""Samples 0 1 | 2 3 | 4 5: with two shards, 0 and 1 and 4 and 5 are of shard 0/2, 2 and 3 of shard 1/2."""
+N = 6
+
+
+def _in_one_go(directory: Path) -> dict[str, object]:
+    with DatasetWriter(directory, job(N)) as writer:
+        _make(writer, range(N))
+    return _comparable(directory)
+
+
+def _make(writer: DatasetWriter, indices: Iterable[int]) -> None:
+    for index in indices:
+        writer.write(translation_sample(index))
+        if index == 4:
+            writer.fail(4, 0, "simulate", "Newton failed")
+
+
+def test_one_after_the_other(tmp_path: Path) -> None:
+    expected = _in_one_go(tmp_path / "one")
+    for shard, own in (("1/2", [2, 3]), ("0/2", [0, 1, 4, 5])):
+        with DatasetWriter(tmp_path / "d", job(N), Shard.parse(shard), PAIRS) as writer:
+            assert writer.finished == set()
+            _make(writer, own)
+        assert not (tmp_path / "d" / "shards").exists()  # a whole dataset at any time that nobody writes
+    assert _comparable(tmp_path / "d") == expected
+    with DatasetWriter(tmp_path / "d", job(N), Shard(0, 2), PAIRS) as writer:
+        assert writer.finished == {0, 1, 4, 5}
+
+
+def test_the_last_to_leave_joins(tmp_path: Path) -> None:
+    expected = _in_one_go(tmp_path / "one")
+    with writing_elsewhere(tmp_path / "d", "0/2", [0, 1, 4]) as other:
+        with DatasetWriter(tmp_path / "d", job(N), Shard(1, 2), PAIRS) as writer:
+            stale = tmp_path / "d" / "samples" / ".000000.partial-1"  # of the other: it may be writing it
+            own = tmp_path / "d" / "samples" / ".000002.partial-1"
+            stale.mkdir()
+            _make(writer, [2, 3])
+        assert stale.exists()
+        own.mkdir()
+        assert read_dataset(tmp_path / "d").samples == []  # not yet: the other runs
+        with DatasetWriter(tmp_path / "d", job(N), Shard(1, 2), PAIRS) as writer:
+            assert writer.finished == {2, 3}
+            assert not own.exists()
+        stale.rmdir()
+        other.communicate("go\n")
+        assert other.returncode == 0
+    assert read_dataset(tmp_path / "d").samples == [0, 1, 2, 3, 4]
+    with DatasetWriter(tmp_path / "d", job(N), Shard(0, 2), PAIRS) as writer:
+        assert writer.finished == {0, 1, 4}
+        _make(writer, [5])
+        writer.fail(4, 0, "simulate", "Newton failed")
+    assert _comparable(tmp_path / "d") == expected
+
+
+def test_a_killed_shard_is_taken_in_by_whoever_is_next(tmp_path: Path) -> None:
+    """Its lines, also when the last one is torn; a stop in the middle of joining counts no line twice."""
+    expected = _in_one_go(tmp_path / "one")
+    with writing_elsewhere(tmp_path / "d", "0/2", [0, 1]):
+        pass
+    home = tmp_path / "d" / "shards" / "0-of-2"
+    lines = (home / "manifest.jsonl").read_bytes()
+    (tmp_path / "d" / "manifest.jsonl").write_bytes(lines)  # as a joining that was killed before it removed the folder
+    with (home / "manifest.jsonl").open("a") as file:
+        file.write('{"index": 4, "tra')
+    with DatasetWriter(tmp_path / "d", job(N)) as writer:
+        assert writer.finished == {0, 1}
+        _make(writer, [2, 3, 4, 5])
+    assert _comparable(tmp_path / "d") == expected
+
+
+def test_who_is_refused_beside_a_shard(tmp_path: Path) -> None:
+    directory = tmp_path / "d"
+    with writing_elsewhere(directory, "0/2", [0]) as other:
+        before = tree(directory)
+        for asked, shard, message in (
+            (job(N), None, r"another process \(shards\) is writing this dataset"),
+            (job(N), Shard(0, 2), rf"another process \(pid {other.pid} on .*\) is making shard 0/2"),
+            (job(N), Shard(1, 3), r"is being made in another number of shards \(0-of-2\)"),
+            (job(N, seed=8), Shard(1, 2), "seed: 7 there, 8 now"),
+        ):
+            with pytest.raises(InputError, match=message):
+                DatasetWriter(directory, asked, shard, PAIRS)
+        assert tree(directory) == before
+        DatasetWriter(directory, job(N), Shard(1, 2), PAIRS).close()
+    DatasetWriter(directory, job(N), Shard(1, 3), PAIRS).close()  # once the others have ended
+
+
+def test_wrong_shards_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for text in ("", "1", "2/2", "-1/2", "0/0", "1/x", "0.5/2", "a0/2"):
+        with pytest.raises(InputError, match=r"--shard .*: give i/N with 0 <= i < N"):
+            Shard.parse(text)
+    assert main(["generate", "--out", str(tmp_path / "d"), "--shard", "2/2"]) == 2
+    assert "--shard 2/2: give i/N with 0 <= i < N, such as 0/16; the last of 2 is 1/2" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_shards_cover_each_trajectory_once() -> None:
+    for count in (1, 2, 3, 7):
+        for trajectory in range(20):
+            assert sum(Shard(number, count).makes(trajectory) for number in range(count)) == 1

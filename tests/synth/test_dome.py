@@ -1,7 +1,4 @@
-"""Domed gels: schema, mesh, undeformed face, the indenter's path and footprint, against closed forms.
-
-Each comment "fails with" names a change of `synth` that was tried.
-"""
+"""Domed gels: schema, mesh, face, load path and footprint against closed forms; the scene `densetact` as a whole."""
 
 import math
 from pathlib import Path
@@ -9,26 +6,33 @@ from pathlib import Path
 import numpy as np
 import pytest
 from kinematic_double import pixel_centres
+from kinematic_double import sensor as flat_sensor
 from pads import scene
 from pydantic import ValidationError
+from render_scenes import needs_llvm
 
 from synth.arrays import FloatArray
+from synth.dataset.reader import read_dataset
 from synth.errors import InputError
 from synth.flow.trace import trace
 from synth.mesh import Counts, Focus, PadMesh, domed, graded_box, rest_surface
 from synth.mesh.cache import pad_mesh
 from synth.optics import Optics
-from synth.scene import Box, Camera, Gel, Light, Motion, NoPattern, Numerics, Scene, Sensor, Sphere, Torus, Window
+from synth.pipeline.generate import generate
+from synth.scene import Box, Gel, Motion, Numerics, Scene, Sensor, Sphere, Torus, Window
+from synth.scene.template import load_scene
 from synth.simulate.element import p1p1, p2p1
 from synth.simulate.footprint import footprint
 from synth.simulate.indenter import rigid_body
 from synth.simulate.load_path import LoadPath
 from synth.simulate.space import function_space
 from synth.surface import GelSurface
+from synth.verify import verify_dataset
 from synth.verify.camera import ForwardCamera
 from synth.verify.dome import check_dome
 
 SIZE, RADIUS = (16.0, 12.0, 8.0), 13.0
+BALL = Sphere(shape="sphere", radius_mm=3.0)
 PLATE = Box(shape="box", size_mm=(60.0, 60.0, 20.0), fillet_mm=0.5)
 
 
@@ -43,27 +47,22 @@ def sphere_z(places: FloatArray, radius: float = RADIUS) -> FloatArray:
     return radius - np.sqrt(radius**2 - places[:, 0] ** 2 - places[:, 1] ** 2)
 
 
-def volume_below_sphere(a: float, b: float, R: float) -> float:
-    r"""∫∫ √(R² - x² - y²) over |x| < a, |y| < b, from its antiderivative, with s = √(R² - a² - b²).
+def cap_volume() -> float:
+    r"""Volume mm³ of the gel of SIZE and RADIUS: below the window, above ∫∫ R - √(R² - x² - y²) over |x| < a, |y| < b.
 
-    4 [ abs/3 + a (3R² - a²)/6 · atan(b/s) + b (3R² - b²)/6 · atan(a/s) - R³/3 · atan(ab/Rs) ]
+    With s = √(R² - a² - b²) the integral of the root is
+    4 [ abs/3 + a (3R² - a²)/6 · atan(b/s) + b (3R² - b²)/6 · atan(a/s) - R³/3 · atan(ab/Rs) ].
     """
+    a, b, R = SIZE[0] / 2, SIZE[1] / 2, RADIUS
     s = math.sqrt(R * R - a * a - b * b)
-    return 4 * (
-        a * b * s / 3
-        + a * (3 * R * R - a * a) / 6 * math.atan(b / s)
-        + b * (3 * R * R - b * b) / 6 * math.atan(a / s)
-        - R**3 / 3 * math.atan(a * b / (R * s))
-    )
+    root = a * b * s / 3 - R**3 / 3 * math.atan(a * b / (R * s))
+    root += a * (3 * R * R - a * a) / 6 * math.atan(b / s) + b * (3 * R * R - b * b) / 6 * math.atan(a / s)
+    return 4 * (a * b * (SIZE[2] - R) + root)
 
 
 def test_mesh_fills_the_cap_at_second_order() -> None:
     """Chords of a convex face leave a little of the gel out, a quarter of it with elements half as long."""
-    # Fails with z + z_face in place of the map, and with face_height of 2 r² / (R + sqrt(R² - r²)): tetrahedra turn
-    # over.
-    x, y, thickness = SIZE
-    exact = x * y * thickness - (x * y * RADIUS - volume_below_sphere(x / 2, y / 2, RADIUS))
-    lack = []
+    exact, lack = cap_volume(), []
     for cells in (2, 4, 8):
         counts = Counts((2 * cells, 2 * cells), (cells, cells), cells)
         mesh = domed(graded_box(SIZE, Focus((1.0, -0.5), (4.0, 3.0)), counts), RADIUS)
@@ -78,7 +77,6 @@ def test_mesh_fills_the_cap_at_second_order() -> None:
 
 
 def test_nodes_of_the_face_lie_on_the_sphere_and_the_others_where_the_map_says() -> None:
-    """Fails with points[:, 2] == 0 in place of PadMesh.on_face: one node is left of the face."""
     counts = Counts((6, 4), (3, 2), 3)
     flat = graded_box(SIZE, Focus((2.0, 1.0), (2.0, 2.0)), counts, (0.5,))
     mesh = domed(flat, RADIUS)
@@ -98,34 +96,24 @@ def test_nodes_of_the_face_lie_on_the_sphere_and_the_others_where_the_map_says()
 
 
 def test_ftetwild_meshes_are_bulged_or_refused(tmp_path: Path) -> None:
-    """Fails with `domed` left out of `pad_mesh`; and, the second, with its check of the volumes left out."""
     numerics = Numerics(edge_length_mm=2.0)
     mesh = pad_mesh(gel(), numerics, [tmp_path])
     again = pad_mesh(gel(), numerics, [tmp_path])
     np.testing.assert_array_equal(mesh.points, again.points)
     assert len(list(tmp_path.iterdir())) == 1  # the box is kept, for any dome
     np.testing.assert_allclose(mesh.points[mesh.on_face, 2], sphere_z(mesh.points[mesh.on_face]), atol=1e-13)
-    x, y, thickness = SIZE
-    exact = x * y * thickness - (x * y * RADIUS - volume_below_sphere(x / 2, y / 2, RADIUS))
     # Chords of edges l take the mean of r_1 r_2 / 2R, about l² / 12R, off the height: here 2 % of 4.5 mm at most.
-    assert mesh.volumes.sum() == pytest.approx(exact, rel=0.02)
+    assert mesh.volumes.sum() == pytest.approx(cap_volume(), rel=0.02)
     # A low tetrahedron around the apex: its three outer corners rise by 5² / 2R = 0.63 mm, past the inner one.
     points = np.array([[5.0, 0, 0], [-2.5, 4.33, 0], [-2.5, -4.33, 0], [0, 0, 0.05]])
     with pytest.raises(InputError, match=r"turns over.*dome_radius_mm = 20"):
         domed(PadMesh(points, np.array([[0, 1, 2, 3]], dtype=np.int32), (10.0, 10.0, 5.0)), 20.0)
 
 
-@pytest.mark.parametrize(
-    ("size", "least"),
-    [
-        # 70 % of 4 mm at 10 mm from the apex: (10² + 2.8²) / 5.6
-        ((16.0, 12.0, 4.0), (100 + 2.8**2) / 5.6),
-        # thick: the slope of 60 degrees decides, 10 / sin 60°
-        ((16.0, 12.0, 20.0), 10 / math.sin(math.radians(60))),
-    ],
-)
-def test_a_dome_must_stay_clear_of_the_window(size: tuple[float, float, float], least: float) -> None:
-    """Fails with THINNEST left out of `deepest`, and with STEEPEST_DEG = 89."""
+@pytest.mark.parametrize(("thickness", "least"), [(4.0, (100 + 2.8**2) / 5.6), (20.0, 10 / math.sin(math.radians(60)))])
+def test_a_dome_must_stay_clear_of_the_window(thickness: float, least: float) -> None:
+    """At 10 mm from the apex at most 70 % of 4 mm are left out; of a thick pad the slope of 60 degrees decides."""
+    size = (16.0, 12.0, thickness)
     assert gel(least * 1.001, size).dome_radius_mm == least * 1.001
     with pytest.raises(ValidationError, match=r"dome_radius_mm = .* at its corners, 10 mm .* use at least"):
         gel(least * 0.999, size)
@@ -135,26 +123,18 @@ def test_a_dome_must_stay_clear_of_the_window(size: tuple[float, float, float], 
 
 def optics_of_a_fisheye() -> tuple[Sensor, Optics]:
     """A 64 x 48 px fisheye behind a window, whose corners see almost the pad's corners."""
-    camera = Camera(
-        width=64, height=48, fx=44.0, fy=44.0, cx=32.3, cy=24.1, position_mm=(0.2, -0.1, 14.0), lens="fisheye",
-        distortion=(0.02, -0.01, 0.002, 0.0),
-    )  # fmt: skip
-    sensor = Sensor(
-        gel=gel(),
-        window=Window(refractive_index=1.41, thickness_mm=2),
-        pattern=NoPattern(kind="none"),
-        lights=(Light(position_mm=(7, 0, 9), size_mm=(1, 1), color=(1, 1, 1), power=1),),
-        camera=camera,
-    )
+    lens = {"lens": "fisheye", "distortion": (0.02, -0.01, 0.002, 0.0), "fx": 44.0, "fy": 44.0, "cx": 32.3, "cy": 24.1}
+    flat = flat_sensor(**lens, position_mm=(0.2, -0.1, 14.0), look_at_mm=(0.0, 0.0, 0.0))
+    window = Window(refractive_index=1.41, thickness_mm=2)
+    light = flat.lights[0].model_copy(update={"position_mm": (7.0, 0.0, 9.0)})
+    sensor = flat.model_copy(update={"gel": gel(), "window": window, "lights": (light,)})
     return sensor, Optics.of(sensor)
 
 
 @pytest.mark.parametrize("parts", [3, 6])
 def test_rays_meet_the_undeformed_dome_where_they_meet_the_sphere(parts: int) -> None:
-    """Fails with the bulge left out of `GelSurface.material`: 0.025 mm off."""
     _, optics = optics_of_a_fisheye()
-    counts = Counts((8, 8), (4, 4), 2)
-    mesh = domed(graded_box(SIZE, Focus((0.0, 0.0), (4.0, 3.0)), counts), RADIUS)
+    mesh = domed(graded_box(SIZE, Focus((0.0, 0.0), (4.0, 3.0)), Counts((8, 8), (4, 4), 2)), RADIUS)
     surface = GelSurface(function_space(mesh, p2p1()).surface, parts)
     rays = optics.look(pixel_centres().reshape(-1, 2))
     hits = trace(surface.material, surface.triangles, rays.origins, rays.directions)
@@ -174,7 +154,7 @@ def test_shape_of_the_surface_at_rest() -> None:
     """Two triangles for a flat pad as before; a dome's has its corners on the sphere and normals out of the gel."""
     assert len(rest_surface(gel(None)).triangles) == 2
     surface = rest_surface(gel())
-    assert surface.material[:, :2].min(0) == pytest.approx([-8, -6])
+    assert np.ptp(surface.material[:, :2], axis=0) == pytest.approx([16, 12])
     assert surface.material[:, :2].max(0) == pytest.approx([8, 6])
     # As above, with faces of 0.94 mm and a third derivative of 0.128 / mm² in the corners.
     np.testing.assert_allclose(surface.material[:, 2], sphere_z(surface.material), atol=8.6e-4)
@@ -183,7 +163,6 @@ def test_shape_of_the_surface_at_rest() -> None:
 
 
 def test_verify_finds_a_dome_of_another_radius() -> None:
-    """Fails with the smaller root of the sphere's equation in `check_dome`."""
     sensor, _ = optics_of_a_fisheye()
     camera = ForwardCamera.of(sensor)
     for element in (p1p1(), p2p1()):
@@ -191,8 +170,7 @@ def test_verify_finds_a_dome_of_another_radius() -> None:
         surface = GelSurface(function_space(mesh, element).surface, 6)
         assert check_dome(camera, surface, RADIUS, sensor.camera).passed
         # 8 mm from the apex the faces of R = 13 and 12.5 mm are 0.15 mm apart; the triangles of 2 mm / 6 keep 1e-3.
-        off = check_dome(camera, surface, 12.5 if element.order == 2 else 11.0, sensor.camera)
-        assert not off.passed
+        assert not check_dome(camera, surface, 12.5 if element.order == 2 else 11.0, sensor.camera).passed
     flat = GelSurface(function_space(graded_box(SIZE, Focus((1, 0), (3, 3)), Counts()), p2p1()).surface, 6)
     assert not check_dome(camera, flat, RADIUS, sensor.camera).passed
 
@@ -205,22 +183,19 @@ def path(
 
 
 def test_depth_counts_from_the_face_below_the_position() -> None:
-    """Fails with `face_mm` left out of `LoadPath._level`."""
-    ball = Sphere(shape="sphere", radius_mm=3.0)
-    way = path(ball, (3.0, -4.0), 0.7, RADIUS, shear_mm=(1.0, 0.5))
+    way = path(BALL, (3.0, -4.0), 0.7, RADIUS, shear_mm=(1.0, 0.5))
     lowest = [way.pose(s).centre[2] + 3.0 for s in (way.press_mm, way.length_mm)]
     assert lowest == pytest.approx([0.7 + 13 - 12] * 2, abs=1e-12)  # 5 mm from the apex of R = 13: √(169 - 25) = 12
     assert way.pose(way.length_mm).centre[:2] == pytest.approx([4.0, -3.5])
-    flat = path(ball, (3.0, -4.0), 0.7, None)
+    flat = path(BALL, (3.0, -4.0), 0.7, None)
     assert (flat.touch_mm, flat.face_mm, flat.press_mm) == (0.0, 0.0, 0.7)
 
 
 def test_the_path_starts_where_the_body_first_touches() -> None:
-    """Fails with `touch_mm` = 0, and with `reach_mm` left out of `LoadPath._level`."""
     p, r = 5.0, 3.0
     s = math.sqrt(RADIUS**2 - p**2)
     # Two balls touch where their centres are R + r apart: (R + r)² = p² + (s + r - t)².
-    beside = path(Sphere(shape="sphere", radius_mm=r), (3.0, -4.0), 0.7, RADIUS)
+    beside = path(BALL, (3.0, -4.0), 0.7, RADIUS)
     assert beside.touch_mm == pytest.approx(s + r - math.sqrt((RADIUS + r) ** 2 - p**2), abs=2e-6)
     assert beside.touch_mm < -0.05
     assert beside.pose(0.0).depth_mm == beside.touch_mm
@@ -239,16 +214,15 @@ def test_the_path_starts_where_the_body_first_touches() -> None:
 
 @pytest.mark.parametrize("depth", [0.05, 0.8])
 def test_footprint_is_the_lens_that_two_spheres_share(depth: float) -> None:
-    """Fails with the face's height left out of `_lack` (the overlap with the box is wider), or its slope."""
     r = 3.0
-    way = path(Sphere(shape="sphere", radius_mm=r), (0.0, 0.0), depth, RADIUS)
+    way = path(BALL, (0.0, 0.0), depth, RADIUS)
     apart = RADIUS + r - depth
     half = math.sqrt(r**2 - ((apart**2 + r**2 - RADIUS**2) / (2 * apart)) ** 2)
     found = footprint(way, SIZE, 0.0)
     # RESOLUTION: 0.2 % of the smaller width on each side.
     assert found.half_mm == pytest.approx((half, half), rel=4.1e-3)
     assert found.centre_mm == pytest.approx((0, 0), abs=4.1e-3 * half)
-    box = footprint(path(Sphere(shape="sphere", radius_mm=r), (0.0, 0.0), depth, None), SIZE, 0.0)
+    box = footprint(path(BALL, (0.0, 0.0), depth, None), SIZE, 0.0)
     assert box.half_mm[0] > 1.05 * half
     # A plate cuts the dome in a circle.
     plate = footprint(path(PLATE, (2.0, 0.0), depth, RADIUS), SIZE, 0.0)
@@ -259,8 +233,7 @@ def test_footprint_is_the_lens_that_two_spheres_share(depth: float) -> None:
 
 
 def test_a_dome_of_a_kilometre_has_the_flat_pads_footprint() -> None:
-    ring = Torus(shape="torus", radius_mm=3.0, tube_mm=1.0)
-    motion = {"shear_mm": (0.5, -0.4), "twist_deg": 10.0}
+    ring, motion = Torus(shape="torus", radius_mm=3.0, tube_mm=1.0), {"shear_mm": (0.5, -0.4), "twist_deg": 10.0}
     flat, dome = (footprint(path(ring, (2.0, 1.0), 0.5, radius, **motion), SIZE, -0.05) for radius in (None, 1e6))
     # The face is r² / 2R = 5e-5 mm lower at the corners; where the ring's slope is 1 the overlap changes by as much,
     # and each rectangle is known to 0.2 % of its width of 8 mm.
@@ -268,17 +241,35 @@ def test_a_dome_of_a_kilometre_has_the_flat_pads_footprint() -> None:
     assert dome.centre_mm == pytest.approx(flat.centre_mm, abs=0.02)
 
 
-def test_shape_and_radius_belong_together() -> None:
-    """Fails with either half of the comparison left out."""
+def test_shape_without_radius_and_lights_outside_the_dome_are_refused() -> None:
+    """0.1 mm behind the face at the apex is outside of the gel near a corner."""
     for radius, shape in ((None, "dome"), (RADIUS, "box")):
         with pytest.raises(ValidationError, match="belong together"):
             gel(radius, shape=shape)
-
-
-def test_lights_outside_the_dome_are_refused() -> None:
-    """0.1 mm behind the face at the apex is outside of the gel near a corner. Fails with the apex's height there."""
     raw = scene(SIZE, gel={"shape": "dome", "dome_radius_mm": RADIUS}).model_dump()
     assert raw["sensor"]["lights"][0]["position_mm"] == (0.0, 0.0, 0.1)
     raw["sensor"]["lights"][0]["position_mm"] = (SIZE[0] / 2, SIZE[1] / 2, 0.1)
     with pytest.raises(ValidationError, match="outside the domed gel"):
         Scene.model_validate(raw)
+
+
+@needs_llvm
+@pytest.mark.usefixtures("one_cache")
+def test_densetact_generates_and_verifies(tmp_path: Path) -> None:
+    camera = {"width": 120, "height": 120, "fx": 75.0, "fy": 75.0, "cx": 60.0, "cy": 60.0}
+    overrides = [f"sensor.camera.{name}={value}" for name, value in camera.items()]
+    overrides += ["render.samples_per_pixel=16", "numerics.target_error_px=2.0", "motion.steps=2"]
+    overrides += ["contact.indenter={shape='sphere', radius_mm=5.0}", "motion.depth_mm=1.2", "motion.twist_deg=0.0"]
+    overrides += ["motion.position_mm=[2.0, -1.5]", "sampling.pairs_per_trajectory=1", "sensor.pattern.grain_mm=1.2"]
+    generate(load_scene("densetact", overrides), 1, tmp_path / "out")
+    report = verify_dataset(tmp_path / "out")
+    checks = {check.name: check for check in report.samples[0].checks}
+    assert report.ok, [check for check in checks.values() if not check.passed]
+    assert checks["undeformed dome against the sphere"].figure < 0.05
+    assert max(checks[f"{way} flow"].figure for way in ("forward", "backward")) < 1e-3
+    assert checks["image 2 warped to image 1"].figure is not None
+    data = read_dataset(tmp_path / "out").read(0)
+    assert np.nanmax(np.abs(data.flow.forward)) > 1
+    off = np.linalg.norm(data.surface.material - (0.0, 0.0, 23.0), axis=1) - 23.0
+    # Corners inside quadratic faces as wide as 6 mm: t h³ / (72 √3) with a third derivative t of 0.02 / mm².
+    assert np.abs(off).max() < 0.04

@@ -1,7 +1,4 @@
-"""Domed pads in the simulation: the limit of a flat pad, and a plate on a dome against linear layer theory.
-
-Each comment "fails with" names a change of `synth` that was tried.
-"""
+"""Domed pads in the simulation: the limit of a flat pad, and a plate on a dome against linear layer theory."""
 
 from typing import Any
 
@@ -10,6 +7,7 @@ import pytest
 from batches import simulate_scenes
 from bonded_layer import ball
 from pads import brick
+from pads import scene as pad_scene
 
 from synth.errors import InputError
 from synth.mesh import Focus, domed
@@ -22,15 +20,13 @@ PLATE = {"shape": "box", "size_mm": (60.0, 60.0, 20.0), "fillet_mm": 0.5}
 YOUNG_MPA = 0.2
 
 
-def scene(radius: float | None, size: tuple[float, float, float], indenter: dict[str, Any], **motion: Any) -> Scene:
-    gel: dict[str, Any] = {"size_mm": size, "youngs_modulus_kpa": 1e3 * YOUNG_MPA, "poisson_ratio": 0.5}
-    if radius is not None:
-        gel |= {"shape": "dome", "dome_radius_mm": radius}
-    light = {"position_mm": (0, 0, size[2] / 2), "size_mm": (1, 1), "color": (1, 1, 1), "power": 1}
-    camera = {"width": 64, "height": 48, "fx": 70, "fy": 70, "cx": 32, "cy": 24, "position_mm": (0, 0, 60)}
-    sensor = {"gel": gel, "pattern": {"kind": "none"}, "lights": [light], "camera": camera}
-    contact = {"indenter": indenter, "friction": motion.pop("friction", 0.0)}
-    return Scene.model_validate({"name": "dome", "sensor": sensor, "contact": contact, "motion": motion})
+def scene(
+    radius: float | None, size: tuple[float, float, float], indenter: dict[str, Any], friction: float = 0, **motion: Any
+) -> Scene:
+    gel = {"size_mm": size, "youngs_modulus_kpa": 1e3 * YOUNG_MPA, "poisson_ratio": 0.5, "dome_radius_mm": radius}
+    gel["shape"] = "box" if radius is None else "dome"
+    numerics = {"element": "auto", "edge_length_mm": None}
+    return pad_scene(size, gel=gel, indenter=indenter, friction=friction, motion=motion, numerics=numerics)
 
 
 def pressed(drawn: Scene, focus: Focus, across: int) -> Trajectory:
@@ -40,10 +36,9 @@ def pressed(drawn: Scene, focus: Focus, across: int) -> Trajectory:
 
 
 def test_a_dome_of_a_kilometre_is_a_flat_pad() -> None:
-    """Fails with points[:, 2] == 0 for PadMesh.on_face: nothing of the face carries a traction."""
-    size, motion = (10.0, 8.0, 4.0), {"position_mm": (0.8, -0.5), "depth_mm": 0.5}
-    radius, focus = 1e6, Focus((0.8, -0.5), (1.0, 1.0))
-    flat, dome = (pressed(scene(r, size, BALL, steps=1, **motion), focus, 4).states[-1] for r in (None, radius))
+    motion, focus = {"position_mm": (0.8, -0.5), "depth_mm": 0.5, "steps": 1}, Focus((0.8, -0.5), (1.0, 1.0))
+    drawn = (scene(radius, (10.0, 8.0, 4.0), BALL, **motion) for radius in (None, 1e6))
+    flat, dome = (pressed(one, focus, 4).states[-1] for one in drawn)
     # Two balls have the curvature 1/r + 1/R: by Hertz's law the force changes by r / 2R = 1.5e-6; the face at the
     # corners lies 41 mm² / 2R = 2e-5 mm, 5e-6 of the thickness, lower, and a layer's force answers the thickness with
     # an exponent of 2 at most; the place is on a slope of x / R = 1e-6. Newton leaves 1e-6 of the force.
@@ -58,7 +53,6 @@ def test_a_plate_on_a_dome_follows_hertz_and_the_layer() -> None:
 
     Hertz's F = 4/3 E* √R δ^1.5 is its limit for thick pads; the integral equation holds for the pad's 12 mm.
     """
-    # Fails with the dome's mid-edge nodes left on the chords, in `synth.simulate.space`.
     radius, size = 24.0, (24.0, 24.0, 12.0)
     depths, forces = [0.04, 0.08], []
     contact, _ = ball(depths[-1], radius, size[2])
@@ -82,10 +76,7 @@ def test_a_plate_on_a_dome_follows_hertz_and_the_layer() -> None:
 
 
 def test_pressed_beside_the_apex_the_plate_meets_the_apex() -> None:
-    """A plate has no position: its force is that of the level it is at.
-
-    Fails with `face_mm` left out of `Path._level`: it ends 0.34 mm higher.
-    """
+    """A plate has no position: its force is that of the level it is at."""
     radius, size, focus = 24.0, (14.0, 14.0, 6.0), Focus((0.0, 0.0), (3.0, 3.0))
     level = 0.4
     force = []
@@ -100,16 +91,12 @@ def test_pressed_beside_the_apex_the_plate_meets_the_apex() -> None:
 
 
 def test_mesh_and_scene_must_be_of_one_dome() -> None:
-    """Fails with dome_radius_mm left out of the comparison in `synth.simulate.solve`."""
-    focus = Focus((0.0, 0.0), (1.0, 1.0))
-    drawn = scene(20.0, (10.0, 8.0, 4.0), BALL, depth_mm=0.1)
-    flat = scene(None, (10.0, 8.0, 4.0), BALL, depth_mm=0.1)
+    flat, dome = (scene(radius, (10.0, 8.0, 4.0), BALL, depth_mm=0.1) for radius in (None, 20.0))
     with pytest.raises(InputError, match=r"the mesh is of a \([^)]*\) mm pad, the scene's .* of dome radius 20"):
-        simulate(drawn, graded_mesh(flat.sensor.gel, focus, 4)[0])
+        simulate(dome, graded_mesh(flat.sensor.gel, Focus((0.0, 0.0), (1.0, 1.0)), 4)[0])
 
 
 def test_many_at_once_press_the_dome_as_one_does() -> None:
-    """Fails with `face_mm` left out of `synth.simulate.batched.presses`: the indenter stays 0.36 mm higher."""
     drawn = scene(8.0, (8.0, 6.0, 4.0), BALL, position_mm=(2.0, -1.2), depth_mm=0.3, steps=2, friction=0.4)
     drawn = drawn.model_copy(update={"numerics": Numerics(element="p1p1", tolerance=1e-9)})
     mesh = domed(brick(counts=(4, 4, 2)), 8.0)

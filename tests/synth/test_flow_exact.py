@@ -1,24 +1,17 @@
-"""Exact flow of rigidly moved sheets against closed forms, of folds and borders against what must be seen."""
+"""Exact flow and visibility: closed forms, folds and borders, and the independent camera of `verify`."""
 
+import kinematic_double as double
 import numpy as np
 import pytest
-from kinematic_double import (
-    HEIGHT,
-    LENS,
-    OBLIQUE,
-    STRAIGHT,
-    WIDTH,
-    folded,
-    optics,
-    pixel_centres,
-    rigid,
-    rotation,
-    sheet,
-)
+from kinematic_double import HEIGHT, WIDTH, dented, folded, optics, pixel_centres, rigid, rotation, sensor, sheet
 from scipy.optimize import brentq
+from verified_sample import motion_checks, sheets
 
 from synth.errors import InputError
 from synth.flow.exact import exact_flow
+from synth.mesh import rest_surface
+from synth.scene import Gel, Window
+from synth.verify.motion import check_motion
 
 REST = rigid(np.eye(3), (0, 0, 0))
 MOTIONS = {
@@ -48,7 +41,7 @@ def _homography(camera, motion1, motion2):
     return plane_to_image(motion2) @ np.linalg.inv(plane_to_image(motion1))
 
 
-@pytest.mark.parametrize("view", [STRAIGHT, OBLIQUE])
+@pytest.mark.parametrize("view", [double.STRAIGHT, double.OBLIQUE])
 @pytest.mark.parametrize("first", ["rest", "tilt"])
 @pytest.mark.parametrize("second", MOTIONS)
 def test_pinhole_flow_is_the_planes_homography(view, first, second):
@@ -59,12 +52,6 @@ def test_pinhole_flow_is_the_planes_homography(view, first, second):
         homogeneous = np.dstack([pixel_centres(), np.ones((HEIGHT, WIDTH))]) @ _homography(camera, one, two).T
         expected = homogeneous[..., :2] / homogeneous[..., 2:] - pixel_centres()
         np.testing.assert_allclose(field, expected, atol=ROUNDING)
-
-
-def test_translation_in_numbers():
-    flow = _flow(optics(), REST, MOTIONS["translation"])
-    np.testing.assert_allclose(flow.forward[..., 0], 70 * 0.7 / 24, atol=ROUNDING)
-    np.testing.assert_allclose(flow.forward[..., 1], -71 * 0.4 / 24, atol=ROUNDING)
 
 
 @pytest.mark.parametrize("index", [1.41, 1.8])
@@ -89,8 +76,10 @@ def test_window_flow_is_snells_law(index, second):
         np.testing.assert_allclose(flow[row, column], expected, atol=ROUNDING)
 
 
-def test_no_motion_is_zero_flow_everywhere_visible():
-    flow = _flow(optics(index=1.45, distortion=LENS, **OBLIQUE), MOTIONS["tilt"], MOTIONS["tilt"])
+def test_translation_in_numbers_and_no_motion_is_zero_flow_everywhere_visible():
+    moved = _flow(optics(), REST, MOTIONS["translation"]).forward
+    np.testing.assert_allclose(moved - (70 * 0.7 / 24, -71 * 0.4 / 24), 0, atol=ROUNDING)
+    flow = _flow(optics(index=1.45, distortion=double.LENS, **double.OBLIQUE), MOTIONS["tilt"], MOTIONS["tilt"])
     np.testing.assert_allclose(flow.forward, 0, atol=1e-10)
     np.testing.assert_array_equal(flow.forward_visible, 1)
 
@@ -149,14 +138,13 @@ def test_extra_channels():
     tilt = rotation("x", 20.0)
     moved = surface.material @ tilt.T + (0, 0, 1.0)
     traction = np.column_stack([surface.material[:, 0], 2 * surface.material[:, 1], np.ones(len(surface.material))])
-    camera = optics(**OBLIQUE)
+    camera = optics(**double.OBLIQUE)
     flow = exact_flow(
         surface, surface.material, moved, camera, WIDTH, HEIGHT,
         backward=False, depth=True, normal=True, displacement=True,
         traction=traction, contact=surface.material[:, 0] > 0,
     )  # fmt: skip
-    assert flow.backward is None
-    assert flow.backward_visible is None
+    assert flow.backward is flow.backward_visible is None
     at = camera.look(camera.centres).on_flat_face
 
     def channels(name):
@@ -179,3 +167,112 @@ def test_wrong_lengths_are_named():
         exact_flow(surface, surface.material, surface.material[:-1], optics(), WIDTH, HEIGHT)
     with pytest.raises(InputError, match="contact has shape"):
         exact_flow(surface, surface.material, surface.material, optics(), WIDTH, HEIGHT, contact=np.ones(2))
+
+
+VIEWS = {
+    "window": {"index": 1.45, "distortion": double.LENS, **double.OBLIQUE},
+    "mirrors": {"index": 1.45, "mirrors": double.SIDES, "distortion": double.LENS, "fx": 40.0, "fy": 41.0},
+    "mirrors in air": {"mirrors": double.SIDES, "fx": 40.0, "fy": 41.0},
+    "periscope": {"index": 1.41, **double.PERISCOPE_VIEW},
+    "fisheye": {"index": 1.45, **double.OBLIQUE, **double.FISHEYE},
+    "fisheye and mirrors": {"index": 1.45, "mirrors": double.SIDES, **double.FISHEYE, "fx": 35.0, "fy": 35.0},
+}
+
+DOME = Gel(shape="dome", size_mm=(20, 15, 8), youngs_modulus_kpa=200, dome_radius_mm=17.0)
+"""Slopes up to 47 degrees; 2.5 mm are left at its corners."""
+DOME_VIEWS = {
+    "window": VIEWS["window"],
+    "fisheye": VIEWS["fisheye"],
+    "close fisheye": {"index": 1.41, **double.FISHEYE, "fx": 34.0, "fy": 34.0, "position_mm": (0.3, -0.2, 12.0)},
+    "fisheye and mirrors": VIEWS["fisheye and mirrors"],
+}
+
+
+def _paths(view):
+    """(HEIGHT, WIDTH) by which mirror each pixel looks."""
+    return optics(**VIEWS[view]).look(pixel_centres().reshape(-1, 2)).path.reshape(HEIGHT, WIDTH)
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_flow_is_the_independent_projections(view):
+    """Reflected points, Fermat's principle and OpenCV's lenses against virtual cameras, Snell's law and own lenses."""
+    surface = sheet(30, 22, 20.0, 15.0, 2)
+    states = dented(surface.material, 0.3), dented(surface.material, 1.1, (0.8, -0.5))
+    flow, checks = motion_checks(sensor(**VIEWS[view]), surface, *states)
+    assert np.nanmax(np.linalg.norm(flow.forward, axis=2)) > 1.5
+    for name, check in checks.items():
+        assert check.passed, check
+        if name.endswith(("flow", "closure")):
+            assert check.figure < 1e-6  # float32 of motions below 8 px; the promise is 1e-3
+    if "mirrors" in view:
+        assert all((flow.forward_visible[_paths(view) == k] == 1).sum() > 100 for k in (0, 1, 2))
+
+
+@pytest.mark.parametrize("view", DOME_VIEWS)
+def test_flow_of_a_dome_is_the_independent_projections(view):
+    """The pad of the other tests with a dome, its window's outer face where it was."""
+    window = Window(refractive_index=DOME_VIEWS[view]["index"], thickness_mm=1.0)
+    domed, surface = sensor(**DOME_VIEWS[view]).model_copy(update={"gel": DOME, "window": window}), rest_surface(DOME)
+    for first in (surface.material, dented(surface.material, 0.3)):
+        flow, checks = motion_checks(domed, surface, first, dented(surface.material, 1.1, (0.8, -0.5)))
+        assert np.nanmax(np.linalg.norm(flow.forward, axis=2)) > 1.5
+        assert np.isfinite(flow.forward[..., 0]).mean() > 0.45  # by mirrors some pixels look beside the pad
+        for name, check in checks.items():
+            assert check.passed, check
+            if name.endswith(("flow", "closure")):
+                assert check.figure < 2e-6  # float32 of motions below 16 px; the promise is 1e-3
+
+
+@pytest.mark.parametrize("view", ["mirrors", "fisheye and mirrors"])
+def test_folds_in_mirrors_are_hidden_rightly(view):
+    """The sheet folds over at x = 3 and covers 0 < x < 3 from 1 mm above, of which either mirror sees a part."""
+    surface = sheet(40, 24, 20.0, 15.0, 2)
+    over = folded(surface.material, 3.0, 3 / 7) + np.array([0.0, 0.3, 0.0])
+    flow, checks = motion_checks(sensor(**VIEWS[view]), surface, surface.material, over)
+    assert all(check.passed for check in checks.values()), [check for check in checks.values() if not check.passed]
+    hidden = (flow.forward_visible == 0) & np.isfinite(flow.forward[..., 0])
+    assert all(hidden[_paths(view) == k].sum() > 10 for k in (1, 2))
+
+
+def test_motion_in_an_upright_mirror_in_numbers():
+    """An upright mirror at x = 4 faces -x; the camera is at x = 0, its image at x = 8, both 20 mm above the sheet.
+
+    A shift of +0.5 mm in x is seen as 70 · 0.5 / 20 = 1.75 px to the right straight, and as much to the left in the
+    mirror. The mirror spans 10 < z < 14, i.e. from 4 / 10 to 4 / 6 of the focal length right of the principal point.
+    """
+    mirror = {"position_mm": (4.0, 0.0, 12.0), "normal": (-1.0, 0.0, 0.0), "size_mm": (40.0, 4.0)}
+    view = {"mirrors": (mirror,), "position_mm": (0.0, 0.0, 20.0), "look_at_mm": (0.0, 0.0, 0.0), "cx": 10.0}
+    surface = sheet(6, 6, 60.0, 60.0)
+    rest = surface.material
+    flow = exact_flow(surface, rest, rest + np.array([0.5, 0, 0]), optics(**view), WIDTH, HEIGHT)
+    centre = np.arange(WIDTH) + 0.5
+    begins, ends = 10 + 70 * 4 / 10, 10 + 70 * 4 / 6  # 38.0 and 56.7
+    inside = (centre > begins) & (centre < ends)
+    motion = np.where(inside, -1.75, 1.75)
+    # float32 of 1.75 is exact; rounding of 100 px in double precision.
+    np.testing.assert_allclose(flow.forward[..., 0], np.tile(motion, (HEIGHT, 1)), atol=1e-6)
+    np.testing.assert_allclose(flow.forward[..., 1], 0, atol=1e-6)
+    end = centre + motion
+    stays = np.where(inside, (end > begins) & (end < ends), ((end < begins) | (end > ends)) & (end < WIDTH))
+    np.testing.assert_array_equal(flow.forward_visible, np.tile(stays, (HEIGHT, 1)))
+    assert 0 < (~stays).sum() < 8
+    back = np.where(inside, (centre + 1.75 > begins) & (centre + 1.75 < ends), True)
+    assert (flow.backward_visible[:, inside] == back[inside]).all()
+
+
+def test_verify_finds_a_pixel_that_leaves_its_mirror():
+    surface = sheet(30, 22, 20.0, 15.0, 2)
+    states = surface.material, surface.material + np.array([0.5, 0.2, 0.0])
+    view = VIEWS["mirrors"]
+    flow, checks = motion_checks(sensor(**view), surface, *states)
+    assert all(check.passed for check in checks.values())
+    near, far = sheets(sensor(**view), surface, *states)
+    end = pixel_centres() + flow.forward
+    inner = (end > 0.1).all(2) & (end < (WIDTH - 0.1, HEIGHT - 0.1)).all(2)
+    left = np.argwhere((flow.forward_visible == 0) & (_paths("mirrors") > 0) & inner)
+    assert len(left) > 3
+    wrong = flow.forward_visible.copy()
+    wrong[tuple(left[0])] = 1
+    checks = {check.name: check for check in check_motion("forward", near, far, flow.forward, wrong)}
+    assert not checks["forward visibility"].passed
+    assert checks["forward flow"].passed

@@ -1,4 +1,4 @@
-"""Footprints of indenters against closed forms. "Fails with" names a change that was tried.
+"""Footprints of indenters against closed forms.
 
 The rectangle may fall short of the true one on each side by RESOLUTION times its smaller width (`slack`), never more.
 It exceeds it only where that is below FINEST_MM and cells that may hold a part of the body are counted in: by a cell,
@@ -17,6 +17,7 @@ from synth.simulate.footprint import FINEST_MM, RESOLUTION, UNTOUCHED, footprint
 from synth.simulate.indenter import rigid_body
 from synth.simulate.load_path import LoadPath
 
+Pair = tuple[float, float]
 SIZE = (20.0, 15.0, 4.0)
 SPHERE = Sphere(shape="sphere", radius_mm=4.0)
 
@@ -31,9 +32,7 @@ def ends(focus: Focus) -> np.ndarray:
     return np.concatenate([centre - half, centre + half])
 
 
-def assert_covers(
-    focus: Focus, low: tuple[float, float], high: tuple[float, float], slack: float | None = None
-) -> None:
+def assert_covers(focus: Focus, low: Pair, high: Pair, slack: float | None = None) -> None:
     """The rectangle from low to high to within the resolution."""
     short = np.concatenate([ends(focus)[:2] - low, high - ends(focus)[2:]])
     allowed = RESOLUTION * np.subtract(high, low).min() if slack is None else slack
@@ -42,67 +41,58 @@ def assert_covers(
     assert (short <= allowed).all()
 
 
-def square(half: float, x: float = 0.0, y: float = 0.0) -> tuple[tuple[float, float], tuple[float, float]]:
+def square(half: float, x: float = 0.0, y: float = 0.0) -> tuple[Pair, Pair]:
     return (x - half, y - half), (x + half, y + half)
 
 
 @pytest.mark.parametrize("depth", [0.01, 0.5, 1.0, 2.0])
 def test_sphere(depth: float) -> None:
-    # Fails with only those cells halved whose centre is inside.
     radius = np.sqrt(2 * 4.0 * depth - depth**2)
     assert_covers(print_of(SPHERE, depth_mm=depth, position_mm=(1.0, -2.0)), *square(radius, 1.0, -2.0))
 
 
-def test_what_lies_inside_the_gel_counts_not_only_the_cut_at_its_face() -> None:
+def test_what_lies_inside_the_gel_counts_and_thin_bodies_are_not_missed() -> None:
     """A needle's ball has passed the face: its cut there is a point, its overlap as wide as the ball."""
-    # Fails with only the plane z = 0 searched.
-    ball = Sphere(shape="sphere", radius_mm=0.3)
+    ball, needle = (Sphere(shape="sphere", radius_mm=radius) for radius in (0.3, 0.05))
     assert_covers(print_of(ball, depth_mm=0.6), *square(0.3))
-
-
-def test_thin_body_is_not_missed() -> None:
-    needle = Sphere(shape="sphere", radius_mm=0.05)
     assert_covers(print_of(needle, depth_mm=0.05, position_mm=(7.123, 3.21)), *square(0.05, 7.123, 3.21))
 
 
-def test_turned_box() -> None:
-    box = Box(shape="box", size_mm=(6.0, 2.0, 3.0), fillet_mm=0.2, rotation_deg=(0.0, 0.0, 30.0))
-    # The core, 2.8 and 0.8 mm to either side, turned by 30 degrees and grown by the fillet, deeper than which it sits.
-    cos, sin = np.cos(np.pi / 6), np.sin(np.pi / 6)
-    x, y = 2.8 * cos + 0.8 * sin + 0.2, 2.8 * sin + 0.8 * cos + 0.2
-    assert_covers(print_of(box, depth_mm=0.5), (-x, -y), (x, y))
+COS, SIN = np.cos(np.pi / 6), np.sin(np.pi / 6)
+CHORD = np.sqrt(1.75)
+"""Half width of a cylinder of 2 mm radius that lies 0.5 mm deep."""
+BAR = {"shape": "cylinder", "radius_mm": 2.0, "length_mm": 8.0, "fillet_mm": 0.1}
+# A cone's side touches the tip's ball: at depth d its radius is d tan + r (1/cos - tan). A rounded edge of radius r
+# reaches r (sqrt 2 - 1) less far than the sharp one, which widens a roof's cut, of 45 degree slopes, by as much.
+BODIES = {
+    "punch": (Cylinder(shape="cylinder", radius_mm=2.0, fillet_mm=0.2), 0.5, (2.0, 2.0)),
+    "bar": (Cylinder(**BAR, rotation_deg=(0.0, 90.0, 0.0)), 0.5, (4.0, CHORD)),
+    "askew bar": (Cylinder(**BAR, rotation_deg=(0.0, 90.0, 30.0)), 0.5, (4 * COS + CHORD * SIN, 4 * SIN + CHORD * COS)),
+    "turned box": (  # the core, 2.8 and 0.8 mm to either side, turned and grown by the fillet
+        Box(shape="box", size_mm=(6.0, 2.0, 3.0), fillet_mm=0.2, rotation_deg=(0.0, 0.0, 30.0)),
+        0.5,
+        (2.8 * COS + 0.8 * SIN + 0.2, 2.8 * SIN + 0.8 * COS + 0.2),
+    ),
+    "roof": (
+        Box(shape="box", size_mm=(4.0, 5.0, 4.0), fillet_mm=0.01, rotation_deg=(0.0, 45.0, 0.0)),
+        1.0,
+        (1.0 + 0.01 * (np.sqrt(2) - 1), 2.5),
+    ),
+    "cone": (
+        Cone(shape="cone", half_angle_deg=30.0, height_mm=10.0, fillet_mm=0.5),
+        2.0,
+        (2 * SIN / COS + 0.5 * (1 - SIN) / COS,) * 2,
+    ),
+    "ring": (Torus(shape="torus", radius_mm=3.0, tube_mm=0.5), 0.3, (3.0 + np.sqrt(2 * 0.5 * 0.3 - 0.3**2),) * 2),
+}
 
 
-def test_bar_that_lies_askew() -> None:
-    # Fails with the rotation transposed: the bar then lies along x.
-    bar = Cylinder(shape="cylinder", radius_mm=2.0, length_mm=8.0, fillet_mm=0.1, rotation_deg=(0.0, 90.0, 30.0))
-    cos, sin, half_width = np.cos(np.pi / 6), np.sin(np.pi / 6), np.sqrt(1.75)
-    x, y = 4.0 * cos + half_width * sin, 4.0 * sin + half_width * cos
-    # The fillet takes at most its radius off the length of the cut's corners.
-    assert_covers(print_of(bar, depth_mm=0.5), (-x, -y), (x, y), 0.1 * cos + 2 * RESOLUTION * y)
-
-
-def test_tilted_box() -> None:
-    """A roof: the block's edge along y goes first, the overlap is a triangle of 45 degree slopes."""
-    # Fails with the normal left in the body's frame: cells are then excluded that hold a part of it.
-    box = Box(shape="box", size_mm=(4.0, 5.0, 4.0), fillet_mm=0.01, rotation_deg=(0.0, 45.0, 0.0))
-    focus = print_of(box, depth_mm=1.0)
-    # A rounded edge of radius r reaches r (sqrt 2 - 1) less far than the sharp one, which widens the cut by as much.
-    x = 1.0 + 0.01 * (np.sqrt(2) - 1)
-    assert_covers(focus, (-x, -2.5), (x, 2.5))
-
-
-def test_cylinder_cone_and_torus() -> None:
-    punch = Cylinder(shape="cylinder", radius_mm=2.0, fillet_mm=0.2)
-    assert_covers(print_of(punch, depth_mm=0.5), *square(2.0))
-    bar = Cylinder(shape="cylinder", radius_mm=2.0, length_mm=8.0, fillet_mm=0.1, rotation_deg=(0.0, 90.0, 0.0))
-    assert_covers(print_of(bar, depth_mm=0.5), (-4.0, -np.sqrt(1.75)), (4.0, np.sqrt(1.75)))
-    cone = Cone(shape="cone", half_angle_deg=30.0, height_mm=10.0, fillet_mm=0.5)
-    # Its side is a straight line that touches the tip's ball: at depth d its radius is d tan + r (1/cos - tan).
-    radius = 2.0 * np.tan(np.pi / 6) + 0.5 * (1 / np.cos(np.pi / 6) - np.tan(np.pi / 6))
-    assert_covers(print_of(cone, depth_mm=2.0), *square(radius))
-    ring = Torus(shape="torus", radius_mm=3.0, tube_mm=0.5)
-    assert_covers(print_of(ring, depth_mm=0.3), *square(3.0 + np.sqrt(2 * 0.5 * 0.3 - 0.3**2)))
+@pytest.mark.parametrize("name", BODIES)
+def test_footprint_is_the_overlap_in_closed_form(name: str) -> None:
+    indenter, depth, (x, y) = BODIES[name]
+    # The askew bar's fillet takes at most its radius off the length of the cut's corners.
+    slack = 0.1 * COS + 2 * RESOLUTION * y if name == "askew bar" else None
+    assert_covers(print_of(indenter, depth_mm=depth), (-x, -y), (x, y), slack)
 
 
 def test_mesh(tmp_path: Path) -> None:
@@ -113,17 +103,12 @@ def test_mesh(tmp_path: Path) -> None:
     np.testing.assert_allclose(ends(focus), [-1.5, 0.0, 1.5, 2.0], atol=0.1)
 
 
-def test_shear_adds_what_the_indenter_reaches() -> None:
-    # Fails with the drag left out.
+def test_shear_adds_what_the_indenter_reaches_and_the_margin_enlarges_the_press_alone() -> None:
     radius = np.sqrt(7.0)
-    focus = print_of(SPHERE, depth_mm=1.0, shear_mm=(2.0, -1.0))
-    assert_covers(focus, (-radius, -radius - 1.0), (radius + 2.0, radius))
-
-
-def test_margin_enlarges_the_press_and_not_the_drag() -> None:
-    radius = np.sqrt(7.0)
+    dragged = print_of(SPHERE, depth_mm=1.0, shear_mm=(2.0, -1.0))
+    assert_covers(dragged, (-radius, -radius - 1.0), (radius + 2.0, radius))
     focus = print_of(SPHERE, 0.2, depth_mm=1.0, shear_mm=(2.0, 0.0))
-    # Fails with the margin added to the drag, too. A margin carries the resolution along.
+    # A margin carries the resolution along.
     assert_covers(focus, (-1.2 * radius, -1.2 * radius), (radius + 2.0, 1.2 * radius), 1.2 * RESOLUTION * 2 * radius)
     smaller = print_of(SPHERE, -0.1, depth_mm=1.0)
     assert_covers(smaller, *square(0.9 * radius))
@@ -132,7 +117,6 @@ def test_margin_enlarges_the_press_and_not_the_drag() -> None:
 
 
 def test_twist_sweeps_the_corners() -> None:
-    # Fails with poses at the ends of the path only: the diagonal passes the axes on the way.
     box = Box(shape="box", size_mm=(6.0, 2.0, 3.0), fillet_mm=0.01)
     focus = print_of(box, depth_mm=0.5, twist_deg=90.0)
     # Poses 90 / 32 degrees apart come within 1.41 degrees of the diagonal, 3.0 mm cos-close: short by 3e-4 of it.
@@ -141,7 +125,6 @@ def test_twist_sweeps_the_corners() -> None:
 
 
 def test_later_poses_count() -> None:
-    # Fails with the path's end taken at the end of the first drag.
     then = (Pose(depth_mm=2.0, shear_mm=(-1.0, 0.0)), Pose(depth_mm=0.0))
     focus = print_of(SPHERE, depth_mm=1.0, shear_mm=(1.0, 0.0), then=then)
     deep = np.sqrt(12.0)
@@ -157,7 +140,6 @@ def test_no_touch_leaves_a_small_zone_where_the_indenter_is() -> None:
 
 
 def test_never_larger_than_the_pad() -> None:
-    # Fails with the result not clipped.
     plate = Box(shape="box", size_mm=(100.0, 100.0, 20.0), fillet_mm=0.2)
     assert_covers(print_of(plate, depth_mm=0.2), (-10.0, -7.5), (10.0, 7.5))
     assert print_of(plate, 0.5, depth_mm=0.2) == Focus((0.0, 0.0), (10.0, 7.5))
@@ -172,9 +154,8 @@ def test_never_larger_than_the_pad() -> None:
 ], ids=["plane-like", "ring", "ring on edge"])  # fmt: skip
 def test_the_slightest_touch_is_found(indenter: Indenter) -> None:
     """It ends, near the first point of contact; the search stops at FINEST_MM."""
-    # Fails with the ring's distance taken for convex, and with a FINEST_MM of 1e-5 in the search.
     focus = print_of(indenter, depth_mm=1e-6)
-    curvature_radius = {500.0: 500.0}.get(getattr(indenter, "radius_mm", 0.0), 3.5)
+    curvature_radius = 500.0 if indenter.shape == "sphere" else 3.5
     # Where the gap is below a cell's diagonal, nothing can be excluded: sqrt(2 R sqrt(3) FINEST_MM) from the contact.
     rim = 3.0 if indenter.shape == "torus" and indenter.rotation_deg == (0.0, 0.0, 0.0) else 0.0
     reach = rim + np.sqrt(2 * curvature_radius * np.sqrt(3) * FINEST_MM)

@@ -1,14 +1,14 @@
 """The whole chain in one process: what lands on disk, going on, growing, and draws that fail."""
 
-import contextlib
 import json
-import resource
+import shutil
 import sys
-from collections.abc import Iterator
+from itertools import count, islice
 from pathlib import Path
 
 import numpy as np
 import pytest
+from processes_of import largest_file
 from tiny_scene import fingerprint, reference
 
 from synth.dataset.reader import read_dataset
@@ -16,6 +16,7 @@ from synth.dataset.shard import Shard
 from synth.errors import InputError
 from synth.pipeline.generate import Scheduling, generate
 from synth.planning import job_variant
+from synth.progress import progress
 from synth.scene.sampling import draw
 from synth.scene.template import Template, load_scene
 from synth.verify import verify_dataset
@@ -27,14 +28,12 @@ def test_the_dataset_is_what_was_asked_for_and_verifies() -> None:
     dataset = read_dataset(reference())
     assert dataset.samples == [0, 1, 2, 3, 4]  # of three trajectories of two: the last one is not finished
     assert [dataset.entry(i).trajectory for i in range(5)] == [0, 0, 1, 1, 2]
-    assert dataset.failures == []
-    assert dataset.info["n"] == 5
+    assert (dataset.failures, dataset.info["n"]) == ([], 5)
     assert set(dataset.info["software"]) >= {"gelflow-synth", "mitsuba", "warp-lang", "pytetwild"}
     for index in range(5):
         entry, sample = dataset.entry(index), dataset.read(index)
         assert entry.force_n[1][2] > 0  # a press
         assert set(entry.seconds) == {"simulate", "render", "flow", "write"}
-        assert entry.max_flow_px is not None
         assert entry.max_flow_px > 0.05  # 0.1 mm of depth or more at 4 px per mm
         assert sample.image1.shape == (24, 32, 3)
         assert sample.image1.std() > 5  # dots and lights are in it
@@ -63,14 +62,10 @@ def test_growing_in_steps_gives_the_same_files(tiny: Path, tmp_path: Path) -> No
 
 
 def test_three_shards_in_any_order_give_the_same_files(tiny: Path, tmp_path: Path) -> None:
-    """Fails with shards of blocks of trajectories (counts), or with another step through them (files are missing)."""
     template, out = load_scene(tiny), tmp_path / "d"
     done = [generate(template, 5, out, scheduling=Scheduling(shard=Shard(k, 3))) for k in (2, 0, 1)]
-    assert [(s.shard, s.made, s.asked_for, s.found) for s in done] == [  # trajectories of samples 0 1 | 2 3 | 4
-        ("2/3", 1, 1, 0),
-        ("0/3", 2, 2, 0),
-        ("1/3", 2, 2, 0),
-    ]
+    said = [(s.shard, s.made, s.asked_for, s.found) for s in done]
+    assert said == [("2/3", 1, 1, 0), ("0/3", 2, 2, 0), ("1/3", 2, 2, 0)]  # trajectories of samples 0 1 | 2 3 | 4
     assert fingerprint(out) == fingerprint(reference())
 
 
@@ -102,10 +97,7 @@ def test_the_summary_adds_up(tiny: Path, tmp_path: Path) -> None:
 
 def test_a_lost_folder_and_a_foreign_line_are_made_good(tiny: Path, tmp_path: Path) -> None:
     """Deleted files, a torn line and leftovers of a killed writer."""
-    import shutil
-
-    out = tmp_path / "mended"
-    shutil.copytree(reference(), out)
+    out = Path(shutil.copytree(reference(), tmp_path / "mended"))
     (out / "samples" / "000002" / "flow.exr").unlink()
     shutil.rmtree(out / "samples" / "000004")
     (out / "samples" / ".000003.partial-1").mkdir()
@@ -117,8 +109,7 @@ def test_a_lost_folder_and_a_foreign_line_are_made_good(tiny: Path, tmp_path: Pa
 
 
 def test_progress_counts_up_to_n(tiny: Path, tmp_path: Path) -> None:
-    calls = []
-    template = load_scene(tiny, ["motion.depth_mm=-1"])  # no touch: fast
+    calls, template = [], load_scene(tiny, ["motion.depth_mm=-1"])  # no touch: fast
     summary = generate(template, 3, tmp_path / "d", progress=lambda done, total: calls.append((done, total)))
     assert calls == [(2, 3), (3, 3)]
     assert summary.seconds > sum(summary.stages.values()) > 0
@@ -147,25 +138,18 @@ def test_a_directory_of_another_job_is_refused_and_left_alone(tiny: Path, change
     assert fingerprint(reference()) == before
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"n": 0}, "--n = 0"),
-        ({"n": 1, "seed": -1}, "--seed = -1"),
-        ({"n": 1, "scheduling": Scheduling(workers=0)}, "--workers = 0"),
-    ],
-)
-def test_wrong_numbers_write_nothing(tiny: Path, tmp_path: Path, arguments: dict, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        generate(load_scene(tiny), out=tmp_path / "d", **arguments)
-    assert not (tmp_path / "d").exists()
-
-
-def test_a_scene_that_cannot_be_built_writes_nothing(tiny: Path, tmp_path: Path) -> None:
-    template = load_scene(tiny, ['contact.indenter={ shape = "torus", radius_mm = 1, tube_mm = 2 }'])
-    with pytest.raises(InputError, match="tube_mm"):
-        generate(template, 1, tmp_path / "d")
-    assert not (tmp_path / "d").exists()
+def test_wrong_numbers_and_a_scene_that_cannot_be_built_write_nothing(tiny: Path, tmp_path: Path) -> None:
+    sound = load_scene(tiny)
+    torus = load_scene(tiny, ['contact.indenter={ shape = "torus", radius_mm = 1, tube_mm = 2 }'])
+    for template, n, seed, workers, message in (
+        (sound, 0, 0, 1, "--n = 0"),
+        (sound, 1, -1, 1, "--seed = -1"),
+        (sound, 1, 0, 0, "--workers = 0"),
+        (torus, 1, 0, 1, "tube_mm"),
+    ):
+        with pytest.raises(InputError, match=message):
+            generate(template, n, tmp_path / "d", seed, scheduling=Scheduling(workers=workers))
+        assert not (tmp_path / "d").exists()
 
 
 def _first_seed_whose_draws(template: Template, wanted: list[bool]) -> int:
@@ -205,7 +189,7 @@ def test_a_simulation_that_fails_is_logged_with_its_last_good_state_and_redrawn(
     def is_wanted(seed: int) -> bool:
         return [draw(template, seed, 0, attempt).motion.shear_mm[0] for attempt in (0, 1)] == [4.9, 0.05]
 
-    for seed in [seed for seed in range(3000) if is_wanted(seed)][:5]:
+    for seed in islice(filter(is_wanted, count()), 5):
         out = tmp_path / str(seed)
         summary = generate(template, 1, out, seed)
         assert summary.made == 1
@@ -239,23 +223,9 @@ def test_samples_whose_every_draw_fails_are_given_up(tiny: Path, tmp_path: Path,
         assert {f["stage"] for f in dataset.failures} == {stage}
 
 
-@contextlib.contextmanager
-def largest_file() -> Iterator[None]:
-    """No file may become larger than 6000 bytes: a write beyond that fails as on a full disk, at the same place.
-
-    Held no longer than the call it is for: pytest's own output may go to a file.
-    """
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (6000, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
 def test_a_mesh_that_cannot_be_kept_stops_the_job(tiny: Path, tmp_path: Path) -> None:
     """Without it every trajectory would be computed on a mesh of its own."""
-    with pytest.raises(InputError, match=r"meshes/\w+\.npz: the mesh cannot be written"), largest_file():
+    with pytest.raises(InputError, match=r"meshes/\w+\.npz: the mesh cannot be written"), largest_file(6000):
         generate(load_scene(tiny), 1, tmp_path / "d")
     assert list((tmp_path / "d" / "samples").iterdir()) == []
 
@@ -266,12 +236,33 @@ def test_a_full_disk_loses_nothing_and_tears_nothing(tiny: Path, tmp_path: Path)
     generate(template, 2, out)
     finished = fingerprint(out)
     refusal = r"cannot be written: .*File too large.*finished before is safe"
-    with pytest.raises(InputError, match=refusal), largest_file():
+    with pytest.raises(InputError, match=refusal), largest_file(6000):
         generate(template, 5, out)
-    now = fingerprint(out)
-    assert {k: v for k, v in now.items() if k != "dataset.json"} == {
-        k: v for k, v in finished.items() if k != "dataset.json"
-    }
+    assert {**fingerprint(out), "dataset.json": finished["dataset.json"]} == finished
     assert json.loads((out / "dataset.json").read_text())["n"] == 5
     generate(template, 5, out)
     assert fingerprint(out) == fingerprint(reference())
+
+
+@pytest.mark.parametrize(
+    ("pace", "lines"),
+    [
+        (10.0, ["8 of 12, 10.0 s each, about 40.0 s left"]),
+        (0.1, []),
+        (70.0, ["3 of 12", *(f"{done} of 12, 70.0 s each, about " for done in range(4, 12))]),
+    ],
+)
+def test_a_line_a_minute_where_stderr_is_no_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, pace: float, lines: list[str]
+) -> None:
+    """Two of twelve were there before; each of the others takes `pace` seconds."""
+    clock = [0.0]
+    monkeypatch.setattr("synth.progress.time.monotonic", lambda: clock[0])
+    with progress("generate: pairs", 12) as advance:
+        for done in range(3, 13):
+            clock[0] += pace
+            advance(done, 12)
+    out, err = capsys.readouterr()
+    assert out == ""
+    for line, start in zip(err.splitlines(), lines, strict=True):
+        assert line.startswith(f"synth: generate: pairs: {start}")

@@ -1,11 +1,10 @@
 """Samples by the batched solver: the same whatever ran beside them, and the single solver's within its tolerance.
 
-The scene's draws fail in every way: bodies that cannot be built, bodies too thin for the mesh, and draws that break the
-schema; its sensors have two different pads. Comments "fails with" name changes that were tried.
+The scene's draws fail in every way: bodies that cannot be built, bodies too thin for the mesh, and draws that break
+the schema; its sensors have two different pads.
 """
 
-import hashlib
-import json
+import signal
 import threading
 import time
 from collections import Counter
@@ -17,9 +16,10 @@ import numpy as np
 import pytest
 from batches import simulate_scenes
 from pads import brick, gentle
-from processes_of import HAS_PROC, alive, descendants, lines, start, wait_for
+from processes_of import end_family, needs_proc, started
 from tiny_scene import TEXT, fingerprint, job_context, write_tiny
 
+from synth.dataset.reader import read_dataset
 from synth.dataset.shard import Shard
 from synth.errors import InputError
 from synth.pipeline.attempts import Attempts
@@ -53,7 +53,6 @@ BATCHED = (
 SAMPLES, SEED = 10, 10
 """Five trajectories of three sensors and two pads; draws of every kind fail."""
 
-
 pytestmark = pytest.mark.usefixtures("one_cache")
 
 
@@ -81,28 +80,20 @@ def _tasks(numbers: Iterable[int]) -> Iterator[Task]:
 
 
 def test_batch_and_shards_change_no_bit(template: Template, whole: Path, tmp_path: Path) -> None:
-    # Fails with the first trajectory's frames for all, and with a chunk's failed draws forgotten.
     out = tmp_path / "d"
     for number, batch in ((1, 1), (0, 3)):
         generate(template, SAMPLES, out, SEED, scheduling=Scheduling(batch=batch, shard=Shard(number, 2)))
     assert fingerprint(out) == fingerprint(whole)
 
 
-@pytest.mark.skipif(not HAS_PROC, reason="finds child processes in Linux's /proc")
+@needs_proc
 def test_killed_with_workers_and_gone_on_with_alone(template: Template, whole: Path, tmp_path: Path) -> None:
     """The driver with solver and renderer is killed; nobody is left behind, what is on record stays."""
-    # Fails with workers that do not watch their driver.
     out = tmp_path / "d"
-    process = start(template.source, out, "--n", str(SAMPLES), "--seed", str(SEED), "--workers", "2")
-    wait_for("the first sample", lambda: lines(out) > 0, process)
-    family = descendants(process.pid)
-    process.kill()
-    process.wait()
-    assert len(family) >= 2
+    process = started(template.source, out, "--n", str(SAMPLES), "--seed", str(SEED), "--workers", "2")
+    end_family(process, signal.SIGKILL)
     before = (out / "manifest.jsonl").read_text().splitlines()
     assert 0 < len(before) < SAMPLES
-    wait_for("the workers to leave with their driver", lambda: not alive(family))
-    process.communicate()
     generate(template, SAMPLES, out, SEED, scheduling=Scheduling(batch=2, workers=1))
     assert set(before) <= set((out / "manifest.jsonl").read_text().splitlines())
     assert fingerprint(out) == fingerprint(whole)
@@ -110,35 +101,28 @@ def test_killed_with_workers_and_gone_on_with_alone(template: Template, whole: P
 
 def test_one_trajectory_alone_is_the_same(context: JobContext, whole: Path) -> None:
     """As a task of a cluster. Its second draw can be used."""
-    # Fails with the single solver in `Producer`.
-    outcome = Producer(context).produce(4, (8, 9))
+    outcome, dataset = Producer(context).produce(4, (8, 9)), read_dataset(whole)
     assert [failure.stage for failure in outcome.failures] == ["simulate"]
-    for entry in outcome.entries:
-        for name, digest in entry.sha256.items():
-            file = whole / "samples" / f"{entry.index:06d}" / name
-            assert hashlib.sha256(file.read_bytes()).hexdigest() == digest, name
+    assert [entry.sha256 for entry in outcome.entries] == [dataset.entry(index).sha256 for index in (8, 9)]
 
 
 def test_failed_draws_are_replaced(whole: Path) -> None:
-    failures = [json.loads(line) for line in (whole / "failures.jsonl").read_text().splitlines()]
+    failures = read_dataset(whole).failures
     kinds = Counter((failure["stage"], failure["last_good_state"] is None) for failure in failures)
     # Broken schema; a body that cannot be built; a body that finds no contact point, with the state before.
     assert set(kinds) == {("draw", True), ("simulate", True), ("simulate", False)}
     for first in {failure["index"] for failure in failures}:
-        assert [f["draw"] for f in failures if f["index"] == first] == list(
-            range(sum(f["index"] == first for f in failures))
-        )
+        draws = [failure["draw"] for failure in failures if failure["index"] == first]
+        assert draws == list(range(len(draws)))
 
 
 AGREEMENT = 2e-4
-"""Of displacements, relative. With tolerances of 1e-6 at recorded states and 1e-3 on the way, which friction remembers,
-docs/reports/batched_fem.md saw 4e-9 to 3e-5; here
-6e-5 was seen once and 3e-7 else. States that are not corrected are off by 0.07 to 0.16."""
+"""Of displacements, relative, at tolerances of 1e-6 at recorded states and 1e-3 between, which friction remembers: 6e-5
+at most was seen (docs/reports/batched_fem.md). States that are not corrected are off by 0.07 to 0.16."""
 
 
 def test_a_batch_agrees_with_the_single_solver(context: JobContext) -> None:
     """On the same meshes: the same draws fail for the same reasons, and what is left is the same motion."""
-    # Fails with the first trajectory's frames for all, and with one `pad_key` for all.
     results = {found.number: found for found in map(_trajectory, in_batches(context, _tasks(range(5)), 4))}
     assert sorted(results) == list(range(5))
     for task in _tasks(range(5)):
@@ -146,7 +130,7 @@ def test_a_batch_agrees_with_the_single_solver(context: JobContext) -> None:
         alone = _alone(Attempts(context, task, draw_sensor(template, SEED, sensor_of(template, task[0]))))
         together = results[task[0]]
         assert together.scene == alone.scene
-        assert [_said(failure) for failure in together.failures] == [_said(failure) for failure in alone.failures]
+        assert _said(together.failures) == _said(alone.failures)
         assert together.states.keys() == alone.states.keys()
         for number, state in alone.states.items():
             other = together.states[number]
@@ -155,8 +139,8 @@ def test_a_batch_agrees_with_the_single_solver(context: JobContext) -> None:
             np.testing.assert_allclose(other.force_n, state.force_n, rtol=0, atol=1e-3 * np.linalg.norm(state.force_n))
 
 
-def _said(failure: Failure) -> tuple[object, ...]:
-    return failure.index, failure.draw, failure.stage, failure.reason
+def _said(failures: Iterable[Failure]) -> list[tuple[object, ...]]:
+    return [(failure.index, failure.draw, failure.stage, failure.reason) for failure in failures]
 
 
 def _trajectory(result: Result) -> SimulatedTrajectory:
@@ -183,29 +167,20 @@ def test_a_trajectory_whose_every_draw_fails_is_given_up(context: JobContext) ->
 
 def test_frames_of_each_job_are_its_own() -> None:
     """Those that are wanted are the same to the bit as when all are; others keep their penetration."""
-    # Fails with the first job's frames for all.
     scenes = [gentle(motion={"depth_mm": 0.4, "steps": 3}), gentle(motion={"depth_mm": 0.5, "steps": 3})]
     mesh, wanted = brick(counts=(4, 4, 2)), [frozenset({1}), frozenset({3})]
     every, some = simulate_scenes(scenes, mesh), simulate_scenes(scenes, mesh, frames=wanted)
-    for number, frames in enumerate(wanted):
+    for one, other, frames in zip(every, some, wanted, strict=True):
         for k in (1, 2, 3):
-            one, other = every[number].states[k], some[number].states[k]
-            assert (one.displacement == other.displacement).all() == (k in frames)
+            assert (one.states[k].displacement == other.states[k].displacement).all() == (k in frames)
     with pytest.raises(ValueError, match="1 sets of frames for 2 presses"):
         simulate_scenes(scenes, mesh, frames=wanted[:1])
 
 
-@pytest.mark.parametrize(
-    ("ends", "out"), [([0, 2, 1, 3, 5, 4], [0, 1, 2, 3, 5, 4]), ([4, 5, 2, 0, 1, 3], [4, 5, 0, 1, 2, 3])]
-)
-def test_the_trajectories_of_a_sensor_come_together(template: Template, ends: list[int], out: list[int]) -> None:
+def test_the_trajectories_of_a_sensor_come_together_but_many_do_not_wait_for_all(template: Template) -> None:
     """Two a sensor; handed on when the second has ended."""
-    # Fails with results handed on as they end.
-    assert _order(template, ends) == out
-
-
-def test_a_sensor_of_many_trajectories_does_not_wait_for_all(template: Template) -> None:
-    # Fails without MIN_PER_SENSOR: then 20 wait for the last one.
+    assert _order(template, [0, 2, 1, 3, 5, 4]) == [0, 1, 2, 3, 5, 4]
+    assert _order(template, [4, 5, 2, 0, 1, 3]) == [4, 5, 0, 1, 2, 3]
     one = load_scene(template.source, ["sampling.trajectories_per_sensor=1000"])
     assert _order(one, range(20)) == list(range(20))
 
@@ -219,28 +194,22 @@ def _order(template: Template, ends: Iterable[int]) -> list[int]:
     return [result.given_up[0] for result in by_sensor(template, named, sensors) if isinstance(result, Outcome)]
 
 
-def test_items_made_ahead_come_in_order_and_errors_with_them() -> None:
-    def failing() -> Iterator[int]:
-        yield from range(5)
+def test_items_made_ahead_come_in_order_with_errors_and_no_more_than_there_is_room_for() -> None:
+    made: list[int] = []
+
+    def counting(count: int) -> Iterator[int]:
+        for number in range(count):
+            made.append(number)
+            yield number
         raise InputError("no more")
 
-    with prefetched(failing(), 2) as items:
+    with prefetched(counting(5), 2) as items:
         assert [next(items) for _ in range(5)] == list(range(5))
         with pytest.raises(InputError, match="no more"):
             next(items)
-
-
-def test_no_more_are_made_than_there_is_room_for() -> None:
-    # Fails with an unlimited line, and with a thread that does not look whether it is still wanted.
-    made: list[int] = []
-
-    def counting() -> Iterator[int]:
-        for number in range(100):
-            made.append(number)
-            yield number
-
+    made.clear()
     before = threading.active_count()
-    with prefetched(counting(), 3) as items:
+    with prefetched(counting(100), 3) as items:
         assert next(items) == 0
         time.sleep(0.3)
         assert len(made) <= 5  # one taken, three in line, one in hand
@@ -253,7 +222,6 @@ GEL = Gel(size_mm=(20.0, 15.0, 4.0), youngs_modulus_kpa=200.0)
 
 def test_the_shared_mesh_is_even_and_as_high_as_wide() -> None:
     """Planes through the thickness: the first element is as high as the others are wide, as far as growth allows."""
-    # Fails with the growth of `Counts`.
     numerics = Numerics(solver="batched", cells=(16, 12, 2))
     mesh = shared_mesh(GEL, numerics)
     assert mesh is shared_mesh(GEL.model_copy(update={"youngs_modulus_kpa": 100.0}), numerics)
@@ -267,7 +235,6 @@ def test_the_shared_mesh_is_even_and_as_high_as_wide() -> None:
 
 def test_the_predicted_error_falls_with_the_spacing(template: Template) -> None:
     """By the model's exponent of 1.6, at equal proportions of the elements; and the rule says the same."""
-    # Fails with a spacing that is not the mesh's.
     drawn = draw(template, SEED, 0)
     fine = drawn.model_copy(update={"numerics": drawn.numerics.model_copy(update={"cells": (16, 12, 2)})})
     coarse, better = accuracy(drawn), accuracy(fine)
@@ -289,10 +256,10 @@ def _spacing_of(drawn: Scene) -> float:
 
 
 def test_the_diagnostics_tell_of_the_shared_mesh(context: JobContext, whole: Path) -> None:
-    entries = [json.loads(line) for line in (whole / "manifest.jsonl").read_text().splitlines()]
-    assert len({entry["diagnostics"]["mesh"] for entry in entries}) == 2  # of two pads
-    first = entries[0]["diagnostics"]
-    scene = Scene.model_validate_json(json.dumps(json.loads((whole / "samples/000000/meta.json").read_text())["scene"]))
+    dataset = read_dataset(whole)
+    told = [dataset.entry(index).diagnostics for index in range(SAMPLES)]
+    assert len({each["mesh"] for each in told}) == 2  # of two pads
+    first, scene = told[0], dataset.scene_of(0)
     assert first["mesh"] == shared_mesh(scene.sensor.gel, scene.numerics).hash
     assert first["predicted_error_px"] == round(accuracy(scene).error_px, 4)
 
@@ -307,12 +274,9 @@ def test_plan_says_what_is_batched(template: Template) -> None:
     assert "another" not in plan(alike, Variant("cuda_ad_rgb", "")).decisions[0].reason
 
 
-@pytest.mark.parametrize("wrong", ["[5, 4, 2]", "[6, 2, 2]", "[6, 4, 0]", "[6, 4]"])
-def test_wrong_numbers_of_elements_are_refused(template: Template, wrong: str) -> None:
-    with pytest.raises(InputError, match=r"numerics\.cells"):
-        load_scene(template.source, [f"numerics.cells={wrong}"])
-
-
-def test_a_batch_of_none_is_refused(template: Template, tmp_path: Path) -> None:
+def test_wrong_numbers_of_elements_and_a_batch_of_none_are_refused(template: Template, tmp_path: Path) -> None:
+    for wrong in ("[5, 4, 2]", "[6, 2, 2]", "[6, 4, 0]", "[6, 4]"):
+        with pytest.raises(InputError, match=r"numerics\.cells"):
+            load_scene(template.source, [f"numerics.cells={wrong}"])
     with pytest.raises(InputError, match="batch = 0"):
         generate(template, 1, tmp_path / "d", scheduling=Scheduling(batch=0))

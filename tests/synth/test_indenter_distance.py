@@ -1,15 +1,12 @@
-"""Signed distance, normal and reach of every indenter, against points sampled on surfaces that are coded here anew.
+"""Signed distance, normal and reach of every indenter, against points sampled on surfaces that are coded here anew."""
 
-Each comment "fails with" names a change of `synth.simulate` that was tried.
-"""
-
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
+import pyvista as pv
 import warp as wp
 from scipy.spatial import cKDTree
 
@@ -49,13 +46,8 @@ def measure(body: RigidBody, points: FloatArray) -> tuple[FloatArray, FloatArray
     found, bending = wp.zeros(len(points), dtype=wp.vec4d), wp.zeros(len(points), dtype=wp.mat33d)
     shape = wp.array(body.shape[None], dtype=shape_vector)
     grid = wp.array(body.coefficients[None], dtype=wp.float64)
-    wp.launch(
-        evaluate,
-        len(points),
-        inputs=[body.kind, shape, grid, wp.array(points, dtype=wp.vec3d), 0],
-        outputs=[found, bending],
-        device="cpu",
-    )
+    inputs = [body.kind, shape, grid, wp.array(points, dtype=wp.vec3d), 0]
+    wp.launch(evaluate, len(points), inputs=inputs, outputs=[found, bending], device="cpu")
     values = found.numpy()
     return values[:, 3], values[:, :3], bending.numpy()
 
@@ -100,9 +92,7 @@ def surface(indenter: Indenter) -> FloatArray:
             low = -(height - 2 * f)
             base = -low * np.tan(np.radians(angle))
             flank = rounded([(0, low), (base, low), (0, 0)], f)
-            top = np.linspace(
-                np.radians(angle), np.pi / 2, int(2 * f / SPACING) + 9
-            )  # the rounded tip about the origin
+            top = np.linspace(np.radians(angle), np.pi / 2, int(2 * f / SPACING) + 9)  # the rounded tip
             tip = f * np.column_stack([np.cos(top), np.sin(top)])
             return revolved(np.concatenate([flank, tip]))
         case Torus(radius_mm=r, tube_mm=t):
@@ -156,7 +146,6 @@ def inside(indenter: Indenter, points: FloatArray) -> np.ndarray:
 
 @pytest.mark.parametrize("indenter", SHAPES, ids=lambda i: i.shape)
 def test_distance_against_sampled_surface(indenter: Indenter) -> None:
-    # Fails with the fillet left out of signed_distance, or a cone of half the angle.
     rng = np.random.default_rng(1)
     points = scattered(indenter, rng)
     distance, _, _ = measure(rigid_body(indenter), points)
@@ -172,7 +161,6 @@ def test_distance_against_sampled_surface(indenter: Indenter) -> None:
 
 @pytest.mark.parametrize("indenter", SHAPES, ids=lambda i: i.shape)
 def test_normal_is_the_gradient(indenter: Indenter) -> None:
-    # Fails with the sign of the gradient kept inside a cone.
     rng = np.random.default_rng(2)
     body, points = rigid_body(indenter), scattered(indenter, rng)
     _, normal, bending = measure(body, points)
@@ -193,17 +181,14 @@ def test_normal_is_the_gradient(indenter: Indenter) -> None:
     np.testing.assert_allclose(bending[smooth], turning[smooth], atol=1e-5 * (1 + np.abs(turning[smooth]).max()))
 
 
-@pytest.mark.parametrize(("point", "distance", "normal"), [
-    ((0.0, 0.0, 2.0), 0.5, (0, 0, 1)),
-    ((0.0, -1.0, 0.0), -0.5, (0, -1, 0)),
-])  # fmt: skip
-def test_sphere_by_hand(point: tuple, distance: float, normal: tuple) -> None:
-    found, direction, bending = measure(rigid_body(SPHERE), np.array([point]))
-    assert found[0] == pytest.approx(distance, abs=1e-14)
-    np.testing.assert_allclose(direction[0], normal, atol=1e-14)
+def test_sphere_by_hand() -> None:
+    normals, radii = np.array([[0.0, 0, 1], [0, -1, 0]]), np.array([2.0, 1.0])
+    found, direction, bending = measure(rigid_body(SPHERE), normals * radii[:, None])
+    np.testing.assert_allclose(found, radii - 1.5, atol=1e-14)
+    np.testing.assert_allclose(direction, normals, atol=1e-14)
     # The normal of a ball turns by (I - n n^T) / r; central differences of it are good to 1e-9.
-    r = float(np.linalg.norm(point))
-    np.testing.assert_allclose(bending[0], (np.eye(3) - np.outer(normal, normal)) / r, atol=1e-8)
+    turning = (np.eye(3) - np.einsum("ni,nj->nij", normals, normals)) / radii[:, None, None]
+    np.testing.assert_allclose(bending, turning, atol=1e-8)
 
 
 def test_points_on_axes_have_a_unit_normal() -> None:
@@ -211,8 +196,6 @@ def test_points_on_axes_have_a_unit_normal() -> None:
         points = np.array([[0, 0, z] for z in (-3.0, -0.5, 0.0, 0.5, 3.0)], dtype=float)
         distance, normal, _ = measure(rigid_body(indenter), points)
         assert np.isfinite(distance).all()
-        # Fails without the radial part in _revolve: inside a cone and in the middle of a ring the gradient points
-        # sideways.
         np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0, atol=1e-12)
 
 
@@ -222,23 +205,19 @@ TURNS = [(0.0, 0.0, 0.0), (90.0, 0.0, 0.0), (0.0, 90.0, 30.0), (20.0, -35.0, 50.
 @pytest.mark.parametrize("turn", TURNS)
 @pytest.mark.parametrize("indenter", SHAPES, ids=lambda i: i.shape)
 def test_reach_is_the_highest_point(indenter: Indenter, turn: tuple[float, float, float]) -> None:
-    # Fails with turns applied in another order, abs(axial) or max(0, ...) left out.
     turned = indenter.model_copy(update={"rotation_deg": turn})
     body = rigid_body(turned)
     x, y, z = (rotation_about(axis, np.radians(angle)) for axis, angle in enumerate(turn))
     world = surface(indenter) @ (z @ y @ x).T
     np.testing.assert_allclose(body.rotation, z @ y @ x, atol=1e-15)
-    # Of samples SPACING apart on a surface of radius 0.25 mm or more the highest is SPACING^2 / (2 * 0.25) too low at
-    # most.
-    assert world[:, 2].max() <= body.reach_mm + 1e-9
-    assert body.reach_mm <= world[:, 2].max() + SPACING**2 / 0.5
+    # Of samples SPACING apart on a surface of radius 0.25 mm or more the highest is SPACING^2 / (2 * 0.25) too low.
+    assert -1e-9 <= body.reach_mm - world[:, 2].max() <= SPACING**2 / 0.5
 
 
 def test_rotations_turn_the_next_axis_toward_the_one_after() -> None:
     for axis in range(3):
-        turn = rotation_about(axis, np.pi / 2)
-        following = np.eye(3)[(axis + 1) % 3]
-        np.testing.assert_allclose(turn @ following, np.eye(3)[(axis + 2) % 3], atol=1e-15)
+        following, last = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3]
+        np.testing.assert_allclose(rotation_about(axis, np.pi / 2) @ following, last, atol=1e-15)
 
 
 def test_edges_are_rounded_to_what_the_mesh_resolves() -> None:
@@ -254,21 +233,18 @@ def test_edges_are_rounded_to_what_the_mesh_resolves() -> None:
 # ------------------------------------------------------------------------------------------------------------ meshes
 
 
-def ball(folder: Path, name: str = "ball.stl", flip: bool = False, centre: tuple = (0.0, 0.0, 0.0)) -> Path:
-    import pyvista as pv
-
+def ball(folder: Path, cell_mm: float = 0.15, flip: bool = False, centre: tuple = (0.0, 0.0, 0.0)) -> RigidBody:
+    """The mesh of a sphere as SPHERE, by an absolute path, which needs no folder."""
     mesh = pv.Icosphere(radius=1.5, nsub=4, center=centre)
     if flip:
         mesh = pv.PolyData(np.asarray(mesh.points), np.insert(mesh.regular_faces[:, ::-1], 0, 3, axis=1))
-    mesh.save(folder / name)
-    return folder / name
+    mesh.save(folder / "ball.stl")
+    return rigid_body(MeshIndenter(shape="mesh", file=str(folder / "ball.stl"), cell_mm=cell_mm))
 
 
 @pytest.mark.parametrize("flip", [False, True])
 def test_mesh_of_a_sphere_is_the_sphere(tmp_path: Path, flip: bool) -> None:
-    # The flipped one fails without auto_orient_normals.
-    ball(tmp_path, flip=flip, centre=(5.0, -2.0, 1.0))
-    body = rigid_body(MeshIndenter(shape="mesh", file="ball.stl", cell_mm=0.15), tmp_path)
+    body = ball(tmp_path, flip=flip, centre=(5.0, -2.0, 1.0))
     points = scattered(SPHERE, np.random.default_rng(3))
     distance, normal, _ = measure(body, points)
     exact, radial, _ = measure(rigid_body(SPHERE), points)
@@ -285,24 +261,21 @@ def test_mesh_of_a_sphere_is_the_sphere(tmp_path: Path, flip: bool) -> None:
 
 
 def test_mesh_normal_is_the_gradient(tmp_path: Path) -> None:
-    ball(tmp_path)
-    body = rigid_body(MeshIndenter(shape="mesh", file="ball.stl", cell_mm=0.15), tmp_path)
+    body = ball(tmp_path)
     points = scattered(SPHERE, np.random.default_rng(4), 100)
     points = points[np.abs(measure(body, points)[0]) < 0.3]
     _, normal, _ = measure(body, points)
     h = 1e-5
-    slope = np.stack(
-        [(measure(body, points + h * e)[0] - measure(body, points - h * e)[0]) / (2 * h) for e in np.eye(3)], axis=1
-    )
+    rise = [measure(body, points + h * e)[0] - measure(body, points - h * e)[0] for e in np.eye(3)]
+    slope = np.stack(rise, axis=1) / (2 * h)
     # The normal is the spline's unit gradient; the gradient's own length is 1 to within the facets' angle, 0.035.
-    np.testing.assert_allclose(slope / np.linalg.norm(slope, axis=1, keepdims=True), normal, atol=1e-6)
-    np.testing.assert_allclose(np.linalg.norm(slope, axis=1), 1.0, atol=0.04)
+    length = np.linalg.norm(slope, axis=1, keepdims=True)
+    np.testing.assert_allclose(slope / length, normal, atol=1e-6)
+    np.testing.assert_allclose(length, 1.0, atol=0.04)
 
 
 def test_grid_in_a_larger_batch_is_read_to_its_own_end(tmp_path: Path) -> None:
-    # Fails with the shape of `coefficients` for the grid's own counts in _grid.
-    ball(tmp_path)
-    body = rigid_body(MeshIndenter(shape="mesh", file="ball.stl", cell_mm=0.3), tmp_path)
+    body = ball(tmp_path, cell_mm=0.3)
     padded = replace(body, coefficients=np.pad(body.coefficients, ((0, 9), (0, 20), (0, 3))))
     points = np.random.default_rng(5).uniform(-4.0, 4.0, (200, 3))
     for alone, together in zip(measure(body, points), measure(padded, points), strict=True):
@@ -310,9 +283,6 @@ def test_grid_in_a_larger_batch_is_read_to_its_own_end(tmp_path: Path) -> None:
 
 
 def test_mesh_scale_and_turn(tmp_path: Path) -> None:
-    # Fails with order="C".
-    import pyvista as pv
-
     pv.Cube(x_length=1.0, y_length=2.0, z_length=3.0).triangulate().save(tmp_path / "block.stl")
     lying = MeshIndenter(shape="mesh", file="block.stl", scale=2.0, cell_mm=0.1, rotation_deg=(90.0, 0.0, 0.0))
     body = rigid_body(lying, tmp_path)
@@ -322,53 +292,37 @@ def test_mesh_scale_and_turn(tmp_path: Path) -> None:
     np.testing.assert_allclose(distance, [0.1, 0.1, 0.1, -0.3], atol=1e-3)
 
 
-def test_absolute_path_needs_no_folder(tmp_path: Path) -> None:
-    path = ball(tmp_path)
-    assert rigid_body(MeshIndenter(shape="mesh", file=str(path), cell_mm=0.3)).reach_mm == pytest.approx(1.5, abs=0.01)
+UNUSABLE: dict[str, tuple[pv.PolyData | bytes | None, str]] = {
+    "missing": (None, "no file"),
+    "sheet": (pv.Plane(i_size=2.0, j_size=2.0).triangulate(), "single sheet"),
+    "metres": (pv.Icosphere(radius=0.01), "metres"),
+    "garbage": (b"solid nothing\n" + bytes(range(256)), "cannot be read as a surface"),
+    "empty": (b"", "cannot be read as a surface"),
+    "fine": (pv.Icosphere(radius=40.0), "cell_mm"),
+}
 
 
-def spoilt(kind: str, folder: Path) -> str:
-    import pyvista as pv
-
-    path = folder / f"{kind}.stl"
-    match kind:
-        case "sheet":
-            pv.Plane(i_size=2.0, j_size=2.0).triangulate().save(path)
-        case "metres":
-            pv.Icosphere(radius=0.01).save(path)
-        case "garbage":
-            path.write_bytes(b"solid nothing\n" + bytes(range(256)))
-        case "empty":
-            path.write_bytes(b"")
-        case "fine":
-            pv.Icosphere(radius=40.0).save(path)
-    return path.name
-
-
-@pytest.mark.parametrize(("kind", "words"), [
-    ("missing", "no file"), ("sheet", "single sheet"), ("metres", "metres"), ("garbage", "cannot be read as a surface"),
-    ("empty", "cannot be read as a surface"), ("fine", "cell_mm"),
-])  # fmt: skip
+@pytest.mark.parametrize("kind", UNUSABLE)
 def test_unusable_mesh_is_named(
-    tmp_path: Path, kind: str, words: str, caplog: pytest.LogCaptureFixture, recwarn: pytest.WarningsRecorder
+    tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture, recwarn: pytest.WarningsRecorder
 ) -> None:
-    indenter = MeshIndenter(shape="mesh", file=spoilt(kind, tmp_path), cell_mm=0.1)
+    content, words = UNUSABLE[kind]
+    path = tmp_path / f"{kind}.stl"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is not None:
+        content.save(path)
     with pytest.raises(InputError, match=words) as error:
-        rigid_body(indenter, tmp_path)
+        rigid_body(MeshIndenter(shape="mesh", file=path.name, cell_mm=0.1), tmp_path)
     assert not caplog.records
     assert not recwarn.list
-    assert indenter.file in str(error.value) or kind == "fine"
+    assert path.name in str(error.value) or kind == "fine"
 
 
-WRONG: list[tuple[Callable[[], Indenter], str]] = [
-    (lambda: CYLINDER.model_copy(update={"fillet_mm": 1.0}), "fillet_mm = 1.0"),
-    (lambda: BOX.model_copy(update={"fillet_mm": 0.8}), "fillet_mm = 0.8"),
-    (lambda: CONE.model_copy(update={"fillet_mm": 1.2}), "fillet_mm = 1.2"),
-    (lambda: TORUS.model_copy(update={"tube_mm": 1.6}), "tube_mm = 1.6"),
-]
-
-
-@pytest.mark.parametrize(("make", "words"), WRONG)
-def test_too_large_rounding_is_named(make: Callable[[], Indenter], words: str) -> None:
-    with pytest.raises(InputError, match=words):
-        rigid_body(make())
+@pytest.mark.parametrize(
+    ("indenter", "field", "value"),
+    [(CYLINDER, "fillet_mm", 1.0), (BOX, "fillet_mm", 0.8), (CONE, "fillet_mm", 1.2), (TORUS, "tube_mm", 1.6)],
+)
+def test_too_large_rounding_is_named(indenter: Indenter, field: str, value: float) -> None:
+    with pytest.raises(InputError, match=f"{field} = {value}"):
+        rigid_body(indenter.model_copy(update={field: value}))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import OpenEXR
 import pytest
 from rich.console import Console
 from samples import HEIGHT, WIDTH, job, translation_sample
@@ -62,19 +63,15 @@ def test_exchanged_directions_show_in_closure(tmp_path, dataset):
     write_flow(tmp_path / "wrong.exr", wrong, {})
     found = inspect(tmp_path / "wrong.exr").numbers[0]
     assert found["closure"]["median_px"] == pytest.approx(2 * np.hypot(1.25, 0.5))
-    assert found["difference"] is None
-    assert found["force_n"] is None
+    assert found["difference"] is found["force_n"] is None
 
 
 def test_flow_file_without_visibility(tmp_path):
     """An estimate does not know it; that is said, not made up."""
-    import OpenEXR
-
     flow = translation_sample().flow.forward
-    planes = {"forward.U": np.ascontiguousarray(flow[..., 0]), "forward.V": np.ascontiguousarray(flow[..., 1])}
-    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, planes).write(
-        str(tmp_path / "e.exr")
-    )
+    planes = {f"forward.{name}": np.ascontiguousarray(flow[..., k]) for k, name in enumerate("UV")}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, planes).write(str(tmp_path / "e.exr"))
     inspection = inspect(tmp_path / "e.exr")
     assert inspection.numbers[0]["forward"]["visible_share"] is None
     assert inspection.numbers[0]["backward"] is None
@@ -88,10 +85,8 @@ def test_dataset_page_is_self_contained(dataset, tmp_path):
     page = (tmp_path / "d.html").read_text(encoding="utf-8")
     assert not re.search(r'(src|href)="(?!data:image/png;base64,|#)', page)
     assert "<script" not in page
-    for name in ("000000", "000001", "000002"):
-        assert f'<h2 id="s{name}">' in page
-    assert page.count("<figure>") == 3 * 9
-    assert page.count("<svg ") == 3
+    counts = {f'<h2 id="s00000{index}">': 1 for index in range(3)} | {"<figure>": 3 * 9, "<svg ": 3}
+    assert {text: page.count(text) for text in counts} == counts
 
 
 @pytest.mark.parametrize("part", ["", "samples/000001", "samples/000001/flow.exr"])
@@ -106,13 +101,9 @@ def test_tables_and_json(dataset):
     inspection = inspect(dataset)
     record = json.loads(json.dumps(inspection.as_dict(), allow_nan=False))
     assert (record["kind"], record["finished"], record["failed_draws"], record["seed"]) == ("dataset", 3, 1, 7)
-    console = Console(width=200, record=True)
-    for table in tables(inspection):
-        console.print(table)
-    text = console.export_text()
-    assert "000002" in text
-    assert "1.35" in text  # |(1.25, -0.5)| = 1.346 px
-    assert "simulate 3.3 s" in text
+    text = _printed(inspection, 200)
+    for said in ("000002", "1.35", "simulate 3.3 s"):  # |(1.25, -0.5)| = 1.346 px
+        assert said in text
 
 
 def _printed(inspection, width):
@@ -123,18 +114,15 @@ def _printed(inspection, width):
 
 
 @pytest.mark.parametrize("width", [40, 80, 400])
-def test_no_figure_is_cut_on_a_narrow_terminal(dataset, width):
+def test_no_figure_is_cut_on_a_narrow_terminal_and_brackets_are_no_markup(dataset, width):
     inspection = inspect(dataset)
     shown = _printed(inspection, width)
     assert "…" not in shown
     assert shown.count("000001 │") == len(tables(inspection, width)) - 1 == {40: 5, 80: 2, 400: 1}[width]
     for figure in ("1.35", "95.83 %", "32x24", "0.2"):
         assert f" {figure} " in shown
-
-
-def test_brackets_in_paths_are_no_markup(dataset):
-    for name in ("q[/b]", "[x]", "a:b:c"):
-        assert name in _printed(dataclasses.replace(inspect(dataset, limit=1), path=Path(name)), 80)
+    for name in ("q[/b]", "[x]", "a:b:c"):  # no markup
+        assert name in _printed(dataclasses.replace(inspection, path=Path(name)), 80)
 
 
 @pytest.mark.parametrize("terminal", [False, True])
@@ -146,15 +134,11 @@ def test_tables_keep_their_width_where_stdout_is_no_terminal(dataset, capsys, mo
     assert capsys.readouterr().out.count("000001") == (2 if terminal else 1)
 
 
-def test_limit_is_told(dataset):
+def test_limit_is_told_and_an_empty_dataset_has_pages(dataset, tmp_path):
     inspection = inspect(dataset, limit=2)
     assert [numbers["name"] for numbers in inspection.numbers] == ["000000", "000002"]
     assert (inspection.about["finished"], inspection.about["inspected"]) == (3, 2)
-    assert evenly_spaced(0, 5) == []
-    assert evenly_spaced(100, 3) == [0, 50, 99]
-
-
-def test_empty_dataset(tmp_path):
+    assert (evenly_spaced(0, 5), evenly_spaced(100, 3)) == ([], [0, 50, 99])
     DatasetWriter(tmp_path / "d", job()).close()
     inspection = inspect(tmp_path / "d")
     assert inspection.as_dict()["samples"] == []
@@ -175,16 +159,13 @@ def test_gel_out_of_sight_or_at_rest(tmp_path, name, value, most):
     assert inspection.numbers[0]["forward"]["max_px"] == most
 
 
-def test_files_of_different_sizes_cannot_be_inspected(tmp_path):
+def test_what_cannot_be_inspected(tmp_path):
     with DatasetWriter(tmp_path / "d", job(1)) as writer:
         writer.write(translation_sample())
     image = tmp_path / "d/samples/000000/image2.png"
     cv2.imwrite(str(image), cv2.imread(str(image))[:-1])
     with pytest.raises(InputError, match=r"image1\.png is .*, image2\.png .*, flow\.exr .*; they must agree"):
         inspect(tmp_path / "d")
-
-
-def test_what_cannot_be_inspected(tmp_path):
     with pytest.raises(InputError, match="no such file"):
         inspect(tmp_path / "none")
     with pytest.raises(InputError, match=r"holds neither dataset\.json nor flow\.exr"):
@@ -197,21 +178,17 @@ def test_what_cannot_be_inspected(tmp_path):
         inspect(tmp_path)
 
 
-def test_interpolation_is_exact_to_second_degree():
-    rows, columns = np.mgrid[:12, :15] + 0.5
-    rng = np.random.default_rng(1)
-    x, y = rng.uniform(2.5, 12, 200), rng.uniform(2.5, 9, 200)
+def test_interpolation_is_exact_to_second_degree_and_of_third_order():
+    """Halving the spacing divides the error of a sine by 8 (Keys 1981)."""
 
     def quadratic(x, y):
         return 1 + 2 * x - y + 0.3 * x * x - 0.2 * x * y + 0.1 * y * y
 
+    rows, columns = np.mgrid[:12, :15] + 0.5
+    x, y = np.random.default_rng(1).uniform(2.5, (12, 9), (200, 2)).T
     found = sample_at(quadratic(columns, rows)[..., None], x, y)[:, 0]
     # Rounding only: values up to 50, a few eps each of 16 terms.
     np.testing.assert_allclose(found, quadratic(x, y), atol=1e-12)
-
-
-def test_interpolation_is_of_third_order():
-    """Halving the spacing divides the error of a sine by 8 (Keys 1981)."""
     errors = []
     for count in (16, 32, 64, 128):
         step = 2 * np.pi / count
@@ -219,8 +196,7 @@ def test_interpolation_is_of_third_order():
         values = np.tile(np.sin(grid), (8, 1))[..., None]
         x = np.linspace(2.1, 4.1, 300)
         errors.append(np.abs(sample_at(values, x / step, np.full(300, 4.5))[:, 0] - np.sin(x)).max())
-    rates = np.log2(np.array(errors[:-1]) / errors[1:])
-    assert (rates > 2.7).all()
+    assert (np.log2(np.array(errors[:-1]) / errors[1:]) > 2.7).all()
 
 
 def test_interpolation_at_borders_and_gaps():
@@ -236,18 +212,13 @@ def test_interpolation_at_borders_and_gaps():
 def test_colour_wheel():
     """Baker et al. 2011: right is red, down is yellow-ish, zero is white, beyond the rim is darker, NaN is grey."""
     flow = np.array([[[1, 0], [0, 0], [2, 0], [np.nan, 0], [0, 1], [-1, 0]]], np.float32)
-    right, none, beyond, gap, down, left = flow_colours(flow, 1.0)[0].astype(int)
-    assert right.tolist() == [255, 0, 0]
-    assert none.tolist() == [255, 255, 255]
-    assert beyond.tolist() == [191, 0, 0]
-    assert gap.tolist() == list(NO_GEL)
     # A quarter turn is 13.75 of 55 steps of the wheel, of which yellow is at 15: green 13.75 / 15.
-    assert down.tolist() == [255, round(255 * 13.75 / 15), 0]
     # Half a turn is 27.5, between cyan (25) and blue (36).
-    assert left.tolist() == [0, round(255 * (1 - 2.5 / 11)), 255]
+    down, left = [255, round(255 * 13.75 / 15), 0], [0, round(255 * (1 - 2.5 / 11)), 255]
+    expected = [[255, 0, 0], [255, 255, 255], [191, 0, 0], list(NO_GEL), down, left]
+    assert flow_colours(flow, 1.0)[0].tolist() == expected
     legend = wheel_legend(64)
-    assert legend[0, 0, 3] == 0
-    assert legend[32, 63, :3].tolist()[0] == 255
+    assert (legend[0, 0, 3], legend[32, 63, 0]) == (0, 255)
 
 
 @pytest.mark.parametrize("size", [1e-4, 0.013, 1.0, 37.0])
@@ -261,8 +232,7 @@ def test_scale_follows_small_flows_and_ignores_outliers(size):
 
 @pytest.mark.parametrize("size", [1e-3, 0.2, 30.0])
 def test_arrows_can_be_seen_at_any_flow(size):
-    field = translation_sample(shift=(size, 0.0)).flow
-    arrows = arrows_of(View("v", field), across=8)
+    arrows = arrows_of(View("v", translation_sample(shift=(size, 0.0)).flow), across=8)
     drawn = np.linalg.norm(arrows.tip - arrows.start, axis=1)
     # Spacing 4 px: at most 1.6 of it; steps 1 2 3 5 7 10 at least half of that, less 5 % for the scale's rounding.
     assert (drawn <= 1.6 * 4 + 1e-9).all()

@@ -1,4 +1,4 @@
-"""The shipped solids of scenes/objects: sound surfaces, small files, and the same as their script makes."""
+"""Objects: the shipped solids of scenes/objects, triangle meshes as files have them, and their edges after rounding."""
 
 import subprocess
 import sys
@@ -9,6 +9,10 @@ import pytest
 import pyvista as pv
 
 from synth.arrays import FloatArray
+from synth.errors import InputError
+from synth.scene import Box, MeshIndenter
+from synth.simulate.indenter import EVERYTHING, OBJECT_RADIUS, RigidBody, Touchable, object_radius, rigid_body
+from synth.simulate.measure import Distance
 
 FOLDER = Path(__file__).parents[2] / "scenes" / "objects"
 FILES = sorted(FOLDER.glob("*.stl"))
@@ -20,16 +24,13 @@ MOST_BYTES = 1_000_000
 each_file = pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
 
 
-def make(folder: Path) -> Path:
-    """Run the script as its docstring says."""
-    subprocess.run([sys.executable, FOLDER / "make.py", folder], check=True)
-    return folder
-
-
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with the objects made anew."""
-    return make(tmp_path_factory.mktemp("made"))
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two folders with the objects made anew, by the script as its docstring says."""
+    folders = tmp_path_factory.mktemp("made"), tmp_path_factory.mktemp("again")
+    for folder in folders:
+        subprocess.run([sys.executable, FOLDER / "make.py", folder], check=True)
+    return folders
 
 
 def corners_of(file: Path) -> FloatArray:
@@ -50,55 +51,183 @@ def areas(corners: FloatArray) -> FloatArray:
 
 
 @each_file
-def test_surface_is_closed_and_manifold(file: Path) -> None:
-    surface = pv.read(file).clean()
-    assert surface.n_open_edges == 0
-    assert surface.is_manifold
-
-
-@each_file
-def test_every_shell_is_oriented_outward(file: Path) -> None:
+def test_surface_is_closed_and_every_shell_is_oriented_outward(file: Path) -> None:
     """In a consistently oriented closed surface each directed edge occurs once, and its reverse once."""
-    corners = corners_of(file)
+    surface, corners = pv.read(file).clean(), corners_of(file)
+    assert surface.is_manifold
+    assert surface.n_open_edges == 0
     _, vertex = np.unique(corners.reshape(-1, 3), axis=0, return_inverse=True)
     triangles = vertex.reshape(-1, 3)
     edges = np.vstack([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     assert len(np.unique(edges, axis=0)) == len(edges)
     assert {tuple(edge) for edge in edges} == {tuple(edge) for edge in edges[:, ::-1]}
-    assert pv.read(file).clean().split_bodies().n_blocks == 1, "with more shells, look at the volume of each"
+    assert surface.split_bodies().n_blocks == 1, "with more shells, look at the volume of each"
     assert volume(corners) > 0
 
 
 @each_file
-def test_no_triangle_is_degenerate(file: Path) -> None:
+def test_no_triangle_is_degenerate_and_the_size_is_5_to_30_mm(file: Path) -> None:
     corners = corners_of(file)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     assert (2 * areas(corners) / longest).min() > SMALLEST_HEIGHT
+    assert 5 <= np.ptp(corners.reshape(-1, 3), axis=0).max() <= 30
 
 
-@each_file
-def test_longest_edge_is_5_to_30_mm(file: Path) -> None:
-    assert 5 <= np.ptp(corners_of(file).reshape(-1, 3), axis=0).max() <= 30
-
-
-def test_files_are_small_together() -> None:
+def test_files_are_small_together_and_the_script_makes_them_and_no_others_by_the_byte(made: tuple[Path, Path]) -> None:
     assert sum(file.stat().st_size for file in FILES) <= MOST_BYTES
-
-
-def test_script_makes_the_shipped_files_and_no_others(made: Path) -> None:
     assert len(FILES) >= 20
-    assert {file.name for file in made.iterdir()} == {file.name for file in FILES}
+    first, again = ({file.name: file.read_bytes() for file in folder.iterdir()} for folder in made)
+    assert first.keys() == {file.name for file in FILES}
+    assert first == again
 
 
 @each_file
-def test_script_makes_the_shipped_shape(file: Path, made: Path) -> None:
-    shipped, again = corners_of(file), corners_of(made / file.name)
+def test_script_makes_the_shipped_shape(file: Path, made: tuple[Path, Path]) -> None:
+    shipped, again = corners_of(file), corners_of(made[0] / file.name)
     for extreme in (np.min, np.max):
         np.testing.assert_allclose(extreme(again, axis=(0, 1)), extreme(shipped, axis=(0, 1)), atol=SIMPLIFICATION)
     # A surface that moves by a distance changes the volume by at most that distance times its area.
     assert volume(again) == pytest.approx(volume(shipped), abs=SIMPLIFICATION * areas(shipped).sum())
 
 
-def test_two_runs_write_the_same_bytes(made: Path, tmp_path: Path) -> None:
-    for file in make(tmp_path).iterdir():
-        assert file.read_bytes() == (made / file.name).read_bytes(), file.name
+CUBE = pv.Cube(x_length=4.0, y_length=3.0, z_length=2.0).triangulate().clean()
+CELL = 0.1
+
+
+def saved(folder: Path, points: FloatArray, faces: np.ndarray, name: str = "object.stl") -> Path:
+    pv.PolyData.from_regular_faces(np.asarray(points, dtype=float), faces).save(folder / name)
+    return folder / name
+
+
+def body_of(path: Path, fillet_mm: float | None = None, touchable: Touchable = EVERYTHING) -> RigidBody:
+    indenter = MeshIndenter(shape="mesh", file=path.name, cell_mm=CELL, fillet_mm=fillet_mm)
+    return rigid_body(indenter, path.parent, touchable=touchable)
+
+
+def distances(body: RigidBody, points: FloatArray) -> FloatArray:
+    return Distance(body, np.zeros((1, 3)), np.eye(3)[None])(points, np.zeros(len(points), dtype=np.int32))[1]
+
+
+def around(half: tuple[float, float, float]) -> FloatArray:
+    """(n, 3) places in a block's box and some cells beyond it."""
+    return np.random.default_rng(7).uniform(-1, 1, (4000, 3)) * (np.array(half) + 2 * CELL)
+
+
+def assert_equal_near(found: FloatArray, exact: FloatArray, near: float, error: float) -> None:
+    """Distances agree at the places that are less than `near` from the surface."""
+    close = np.abs(exact) < near
+    np.testing.assert_allclose(found[close], exact[close], atol=error)
+
+
+def parts(kind: str) -> tuple[FloatArray, np.ndarray]:
+    """The block's points and faces with one thing wrong."""
+    points, faces = np.asarray(CUBE.points, dtype=float), np.asarray(CUBE.regular_faces)
+    match kind:
+        case "inverted":
+            faces = faces[:, ::-1]
+        case "one face inverted":
+            faces = np.concatenate([faces[:1, ::-1], faces[1:]])
+        case "doubled":
+            faces = np.concatenate([faces, faces[:6], faces[6:, ::-1]])
+        case "two shells":  # the left and the right part, 1 mm of them in common
+            sides = np.where(points[:, :1] > 0, [0.5, 2.0], [-2.0, -0.5])
+            left, right = (np.column_stack([side, points[:, 1:]]) for side in sides.T)
+            points, faces = np.concatenate([left, right]), np.concatenate([faces, faces[:, ::-1] + len(points)])
+        case "unjoined":
+            points, faces = points[faces].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
+    return points, faces
+
+
+@pytest.mark.parametrize("kind", ["inverted", "one face inverted", "doubled", "two shells", "unjoined"])
+def test_meshes_with_faults_are_the_same_body(tmp_path: Path, kind: str) -> None:
+    body, whole = (body_of(saved(tmp_path, *parts(one)), fillet_mm=0.3) for one in (kind, ""))
+    places = around((2.0, 1.5, 1.0))
+    assert_equal_near(distances(body, places), distances(whole, places), 0.25, 0.01)
+
+
+def test_a_hole_is_closed_but_more_hole_than_surface_is_refused(tmp_path: Path) -> None:
+    ball = pv.Icosphere(radius=2.0, nsub=3)
+    body = body_of(saved(tmp_path, ball.points, np.delete(ball.regular_faces, range(3), axis=0)))
+    missing = np.asarray(ball.points)[ball.regular_faces[:3]].mean(axis=1) * [1, -1, 1]
+    assert (np.abs(distances(body, missing)) < 2 * CELL).all()
+    assert distances(body, np.array([[0.0, 0.0, 0.0]]))[0] < 0
+    rest = pv.Sphere(radius=4.0).clip("z", origin=(0, 0, 3.0), invert=False)
+    cap = rest.extract_surface(algorithm=None).triangulate()
+    with pytest.raises(InputError, match="open sheet"):
+        body_of(saved(tmp_path, cap.points, cap.regular_faces))
+
+
+@pytest.mark.parametrize("ending", ["stl", "obj", "ply", "off"])
+def test_formats(tmp_path: Path, ending: str) -> None:
+    path = tmp_path / f"block.{ending}"
+    points, faces = parts("")
+    if ending == "off":
+        rows = [" ".join(map(str, point)) for point in points] + [f"3 {a} {b} {c}" for a, b, c in faces]
+        path.write_text("\n".join(["OFF", f"{len(points)} {len(faces)} 0", *rows]) + "\n")
+    else:
+        saved(tmp_path, points, faces, path.name)
+    assert body_of(path).reach_mm == pytest.approx(1.0)
+
+
+def test_many_triangles(tmp_path: Path) -> None:
+    """Hundred thousands of triangles give the ball that they lie on."""
+    ball = pv.Sphere(radius=2.0, theta_resolution=400, phi_resolution=300)
+    assert ball.n_cells > 200_000
+    body = body_of(saved(tmp_path, ball.points, ball.regular_faces))
+    places = around((1.5, 1.5, 1.5))
+    assert_equal_near(distances(body, places), np.linalg.norm(places, axis=1) - 2.0, 0.25, 1e-3)
+
+
+def test_edges_are_rounded_as_those_of_a_block(tmp_path: Path) -> None:
+    fillet = 0.4
+    body = body_of(saved(tmp_path, *parts("")), fillet_mm=fillet)
+    block = rigid_body(Box(shape="box", size_mm=(4.0, 3.0, 2.0), fillet_mm=fillet))
+    places = around((2.0, 1.5, 1.0))
+    found, exact = distances(body, places), distances(block, places)
+    # A B-spline of a distance whose second derivative jumps errs by some 1 % of the spacing there.
+    assert_equal_near(found, exact, 0.2, 0.01)
+    assert np.sqrt(np.mean((found - exact)[np.abs(exact) < 0.2] ** 2)) < 2e-3
+
+
+def joined(*pieces: pv.PolyData) -> tuple[FloatArray, np.ndarray]:
+    """Points and faces of all."""
+    starts = np.cumsum([0, *(len(piece.points) for piece in pieces)])
+    faces = [piece.regular_faces + start for piece, start in zip(pieces, starts, strict=False)]
+    return np.concatenate([piece.points for piece in pieces]), np.concatenate(faces)
+
+
+def test_a_thin_part_is_kept(tmp_path: Path) -> None:
+    """A plate thinner than two radii keeps its thickness, a blade on it its height."""
+    plate = pv.Cube(x_length=6.0, y_length=6.0, z_length=0.5).triangulate()
+    blade = pv.Cube(x_length=4.0, y_length=0.3, z_length=2.0, center=(0.0, 0.0, 1.0)).triangulate()
+    body = body_of(saved(tmp_path, *joined(plate, blade)), fillet_mm=0.6)
+    height = 2.25 / 2
+    assert body.reach_mm == pytest.approx(height, abs=0.1)
+    inside = np.array([[2.0, 2.0, -height + 0.25], [0.0, 0.0, height - 0.3], [1.5, 0.0, height - 0.5]])
+    assert (distances(body, inside) < 0).all()
+    beside = np.array([[2.0, 2.0, -height + 0.7], [0.0, 0.4, height - 0.3]])
+    assert (distances(body, beside) > 0).all()
+
+
+def test_a_notch_narrower_than_the_edges_is_filled(tmp_path: Path) -> None:
+    boxes = [pv.Cube(x_length=2.0, y_length=3.0, z_length=2.0, center=(x, 0.0, 0.0)).triangulate() for x in (-1.1, 1.1)]
+    base = pv.Cube(x_length=4.2, y_length=3.0, z_length=1.0, center=(0.0, 0.0, -0.9)).triangulate()
+    path = saved(tmp_path, *joined(*boxes, base))
+    within = np.array([[0.0, 0.0, 0.5]])
+    assert distances(body_of(path), within)[0] > 0
+    assert distances(body_of(path, fillet_mm=0.6), within)[0] < 0
+
+
+def test_what_cannot_touch_has_no_grid(tmp_path: Path) -> None:
+    path = saved(tmp_path, *parts(""))
+    whole, part = body_of(path), body_of(path, touchable=Touchable(height_mm=0.5))
+    assert part.coefficients.shape[2] < whole.coefficients.shape[2] - 10
+    assert part.reach_mm == pytest.approx(whole.reach_mm, abs=1e-6)
+    top = around((2.0, 1.5, 0.1)) + np.array([0.0, 0.0, 0.9])
+    assert_equal_near(distances(part, top), distances(whole, top), 0.2, 0.01)
+
+
+def test_the_radius_is_the_stated_one_or_what_the_gel_can_follow() -> None:
+    stated = MeshIndenter(shape="mesh", file="object.stl", fillet_mm=0.5)
+    assert object_radius(stated, 0.1) == 0.5
+    assert object_radius(stated, 0.4) == OBJECT_RADIUS * 0.4

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import pyvista as pv
 
 import synth
 from synth.dataset.reader import read_dataset
@@ -13,7 +14,9 @@ from synth.mesh import pad_mesh
 from synth.pipeline.generate import generate
 from synth.planning import check_buildable, job_variant, plan, predict
 from synth.render.variant import Variant
+from synth.scene.sampling import draw
 from synth.scene.template import load_scene, shipped_scenes
+from synth.simulate.indenter import rigid_body
 from synth.simulate.mesh_rule import DEFAULT_TARGET_PX, MeshRule
 
 LLVM, MONO, SCALAR = Variant("llvm_ad_rgb", ""), Variant("llvm_ad_mono", ""), Variant("scalar_rgb", "")
@@ -28,16 +31,11 @@ def test_the_public_interface_plans_a_scene(tiny: Path) -> None:
         synth.plans  # noqa: B018
 
 
-@pytest.mark.parametrize(
-    ("numerics", "rule"),
-    [
-        ("{}", MeshRule("graded", DEFAULT_TARGET_PX)),
-        ('{ solver = "batched", target_error_px = 0.7 }', MeshRule("even", 0.7)),
-    ],
-)
-def test_the_mesh_rule_is_decided_with_its_target(tiny: Path, numerics: str, rule: MeshRule) -> None:
-    planned = plan(load_scene(tiny, [f"numerics={numerics}"]), LLVM)
-    assert (planned.mesh, planned.is_batched) == (rule, rule.kind == "even")
+def test_the_mesh_rule_is_decided_with_its_target(tiny: Path) -> None:
+    batched = 'numerics={ solver = "batched", target_error_px = 0.7 }'
+    graded, even = (plan(load_scene(tiny, [numerics]), LLVM) for numerics in ("numerics={}", batched))
+    assert (graded.mesh, graded.is_batched) == (MeshRule("graded", DEFAULT_TARGET_PX), False)
+    assert (even.mesh, even.is_batched) == (MeshRule("even", 0.7), True)
     wild = plan(load_scene(tiny), LLVM).mesh
     assert wild.kind == "tetwild"
     assert np.isnan(wild.target_error_px)
@@ -48,44 +46,35 @@ def _decided(tiny: Path, *overrides: str, variant: Variant = LLVM) -> dict[str, 
 
 
 @pytest.mark.parametrize(
-    ("feature", "override"),
+    ("feature", "override", "needed"),
     [
-        ("simulation", "motion.depth_mm={ uniform = [-0.3, 0.0] }"),
-        ("friction state", "contact.friction=0"),
-        ("pressure field", "sensor.gel.poisson_ratio=0.2"),
-        ("window refraction", "sensor.window.refractive_index=1"),
-        ("backward flow", "outputs.backward=false"),
+        ("simulation", "motion.depth_mm={ uniform = [-0.3, 0.0] }", False),
+        ("friction state", "contact.friction=0", False),
+        ("pressure field", "sensor.gel.poisson_ratio=0.2", False),
+        ("window refraction", "sensor.window.refractive_index=1", False),
+        ("backward flow", "outputs.backward=false", False),
+        ("lens distortion", "sensor.camera.distortion=[0.01, 0, 0, 0, 0]", True),
+        ("indirect light", "render.max_depth=3", True),
+        ("optional channels", "outputs.depth=true", True),
     ],
 )
-def test_what_a_scene_does_not_need_is_left_out_and_why(tiny: Path, feature: str, override: str) -> None:
-    assert _decided(tiny)[feature][0]
+def test_what_a_scene_does_not_need_is_left_out_and_why(tiny: Path, feature: str, override: str, needed: bool) -> None:
+    assert _decided(tiny)[feature][0] != needed
     runs, reason = _decided(tiny, override)[feature]
-    assert not runs
-    assert override.split("=")[0].split(".")[-1] in reason
-
-
-def test_what_a_scene_needs_runs(tiny: Path) -> None:
-    lens, deep = "sensor.camera.distortion=[0.01, 0, 0, 0, 0]", "render.max_depth=3"
-    for feature, override in (
-        ("lens distortion", lens),
-        ("indirect light", deep),
-        ("optional channels", "outputs.depth=true"),
-    ):
-        assert not _decided(tiny)[feature][0]
-        assert _decided(tiny, override)[feature][0]
+    assert runs == needed
+    assert needed or override.split("=")[0].split(".")[-1] in reason
 
 
 def test_one_draw_that_needs_a_feature_is_enough(tiny: Path) -> None:
-    decided = _decided(
-        tiny,
-        "contact.friction={ choice = [0, 0.5] }",
-        "sensor.gel.poisson_ratio={ choice = [0.2, 0.4999] }",
-        "sensor.window.refractive_index={ choice = [1, 1.4] }",
-        "render.max_depth={ choice = [2, 3] }",
-        "motion.depth_mm={ choice = [-0.1, 0.2] }",
-    )
-    for feature in ("friction state", "pressure field", "window refraction", "indirect light", "simulation"):
-        assert decided[feature][0], feature
+    needed_by_one = {
+        "friction state": "contact.friction={ choice = [0, 0.5] }",
+        "pressure field": "sensor.gel.poisson_ratio={ choice = [0.2, 0.4999] }",
+        "window refraction": "sensor.window.refractive_index={ choice = [1, 1.4] }",
+        "indirect light": "render.max_depth={ choice = [2, 3] }",
+        "simulation": "motion.depth_mm={ choice = [-0.1, 0.2] }",
+    }
+    decided = _decided(tiny, *needed_by_one.values())
+    assert all(decided[feature][0] for feature in needed_by_one)
     assert "0.2 to 0.4999" in decided["pressure field"][1]
 
 
@@ -98,11 +87,10 @@ GREY = [f"sensor.lights.{i}.color=[1, 1, 1]" for i in range(5)]
         ([], False),
         (GREY, True),
         ([*GREY, "sensor.coating.reflectance=[0.5, 0.5, 0.6]"], False),
-        # Grey at both ends, and coloured in between:
         (
-            [*GREY, "sensor.coating.reflectance=[{uniform=[0.5, 0.6]}, {uniform=[0.5, 0.6]}, {uniform=[0.5, 0.6]}]"],
+            [*GREY, f"sensor.coating.reflectance=[{', '.join(['{uniform=[0.5, 0.6]}'] * 3)}]"],
             False,
-        ),
+        ),  # grey at both ends
         ([*GREY, 'sensor.pattern={ kind = "random_color", cell_mm = 0.5, saturation = { normal = [0, 0.1] } }'], False),
         ([*GREY, 'sensor.pattern={ kind = "random_color", cell_mm = 0.5, saturation = 0 }'], True),
     ],
@@ -159,13 +147,7 @@ def _write_stl(path: Path, *, closed: bool) -> None:
     """A tetrahedron of 2 mm, or three of its four faces."""
     corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], float)
     faces = [(0, 1, 2), (0, 3, 1), (0, 2, 3), (1, 3, 2)][: 4 if closed else 3]
-    loops = "".join(
-        "facet normal 0 0 0\nouter loop\n"
-        + "".join(f"vertex {x} {y} {z}\n" for x, y, z in corners[list(face)])
-        + "endloop\nendfacet\n"
-        for face in faces
-    )
-    path.write_text(f"solid s\n{loops}endsolid s\n")
+    pv.PolyData.from_regular_faces(corners, faces).save(path)
 
 
 @pytest.mark.parametrize(
@@ -195,10 +177,13 @@ def test_what_cannot_be_built_is_refused_with_the_file_and_the_field(
 
 
 def test_a_folder_of_surfaces_can_be_built(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One of them has a hole."""
+    """Both are drawn, one of which has a hole; every instance has a body."""
     monkeypatch.chdir(tiny.parent)
     for closed in (True, False):
         _write_stl(tiny.parent / f"{closed}.stl", closed=closed)
-    check_buildable(
-        load_scene(tiny, ['contact.indenter={ shape = "mesh", file = "*.stl", rotation_deg = "any" }']), LLVM
-    )
+    template = load_scene(tiny, ['contact.indenter={ shape = "mesh", file = "*.stl", rotation_deg = "any" }'])
+    check_buildable(template, LLVM)
+    drawn = [draw(template, 0, trajectory).contact.indenter for trajectory in range(12)]
+    assert {Path(indenter.file).name for indenter in drawn} == {"True.stl", "False.stl"}
+    # A tetrahedron with corners √3 mm from the origin reaches between its inscribed and circumscribed radius.
+    assert all(1 / np.sqrt(3) <= rigid_body(indenter, tiny.parent).reach_mm <= np.sqrt(3) for indenter in drawn)

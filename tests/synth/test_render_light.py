@@ -1,25 +1,26 @@
-"""Separated light: closed form against sums over the light, pictures against path tracing, what is refused."""
+"""Separated light against closed forms and path tracing, whose own error falls with samples and path depth."""
 
+from collections.abc import Iterable
 from functools import cache
 
 import numpy as np
 import pytest
-from render_scenes import flat_surface, plain, small_sensor
+from render_scenes import FAST, SCALAR, flat_surface, needs_llvm, plain, rendered, small_sensor
 
+from benchmarks.image_error import errors
 from synth.arrays import FloatArray, Image
 from synth.errors import InputError
 from synth.render.gel_mesh import MIRROR
 from synth.render.lights import light_axes
 from synth.render.polygon_light import PolygonLight
 from synth.render.renderer import Renderer
-from synth.render.variant import Variant, choose_variant
-from synth.scene import Coating, Light, Render
-
-FAST = choose_variant("cpu")
-needs_llvm = pytest.mark.skipif(not FAST.is_vectorised, reason="no LLVM of version 16 or newer here")
+from synth.scene import Coating, Light, Render, Sensor
 
 LIGHTS = tuple(Light(position_mm=(x, 1.0, 3.0), size_mm=(3, 1), color=(1, 1, 1), power=400) for x in (-7.0, 7.0))
 BLOCK = 10
+DEEPEST = 8
+SENSOR = small_sensor(1.45, None, LIGHTS, width=40, height=30, fx=70.0, fy=70.0, cx=21.25, cy=14.25)
+BLURRED = SENSOR.model_copy(update={"camera": SENSOR.camera.model_copy(update={"blur_px": 0.8})})
 
 
 def _summed(light: Light, point: FloatArray, normal: FloatArray) -> float:
@@ -35,10 +36,7 @@ def _summed(light: Light, point: FloatArray, normal: FloatArray) -> float:
 
 @needs_llvm
 def test_closed_form_is_the_sum_over_the_light() -> None:
-    """Lights whole, cut by the horizon, and seen from behind.
-
-    Fails without the edge along the horizon, without the cut, and with the light shining backward, too.
-    """
+    """Lights whole, cut by the horizon, and seen from behind."""
     mi = FAST.load()
     light = Light(position_mm=(4.0, 1.0, 2.0), aim_mm=(0.0, 0.0, 1.0), size_mm=(5, 2), color=(1, 1, 1), power=1)
     rng = np.random.default_rng(0)
@@ -55,17 +53,31 @@ def test_closed_form_is_the_sum_over_the_light() -> None:
     np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-5)
 
 
-@cache
-def _pictures(light: str, samples: int, depth: int = 4, seeds: int = 6) -> FloatArray:
-    """(seeds, H, W) radiances of a bright gel with a steep bump, which shades the plain and lights it."""
-    numbers = {"width": 40, "height": 30, "fx": 70.0, "fy": 70.0, "cx": 21.25, "cy": 14.25}
-    sensor = small_sensor(1.45, None, LIGHTS, **numbers)
+def _radiances(sensor: Sensor, light: str, samples: int, depth: int, seeds: Iterable[int]) -> list[Image]:
+    """Pictures of a bright gel with a steep bump, which shades the plain and lights it."""
     surface = flat_surface(sensor, 24)
     pressed = surface.material.copy()
     pressed[:, 2] += 1.5 * np.exp(-(pressed[:, 0] ** 2 + pressed[:, 1] ** 2) / 1.2**2)
     render = Render.model_validate({"samples_per_pixel": samples, "max_depth": depth, "light": light})
     renderer = Renderer(sensor, render, surface, plain(0.8), FAST)
-    return np.stack([renderer.radiance(pressed, 100 + k)[:, :, 0] for k in range(seeds)]).astype(np.float64)
+    return [renderer.radiance(pressed, seed) for seed in seeds]
+
+
+@cache
+def _pictures(light: str, samples: int, depth: int = 4) -> FloatArray:
+    """(6, H, W) radiances of as many seeds."""
+    return np.stack(_radiances(SENSOR, light, samples, depth, range(100, 106)))[..., 0].astype(np.float64)
+
+
+@cache
+def _errors() -> dict[tuple[int, int], dict[str, float]]:
+    """Of path tracing by depth and samples, against a reference of the deepest paths."""
+    first, second = _radiances(BLURRED, "path_traced", 350, DEEPEST, (1, 2))
+    found = {}
+    for k, (depth, samples) in enumerate([(DEEPEST, 16), (DEEPEST, 64), (DEEPEST, 256), (2, 64)], 1):
+        images = _radiances(BLURRED, "path_traced", samples, depth, range(1000 * k, 1000 * k + 3))
+        found[depth, samples] = errors(images, (first, second), BLURRED.camera)
+    return found
 
 
 def _blocks(pictures: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -78,13 +90,9 @@ def _blocks(pictures: FloatArray) -> tuple[FloatArray, FloatArray]:
 @needs_llvm
 @pytest.mark.parametrize("depth", [2, 3])
 def test_expectation_is_path_tracings(depth: int) -> None:
-    """Block by block: the bump's flanks, its shadows, its rim and the plain.
-
-    Fails without what is blocked, with twice that, and with bounced light left out or doubled.
-    """
-    (found, error), (truth, own) = (
-        _blocks(_pictures(*one, depth)) for one in (("separated", 16), ("path_traced", 576))
-    )
+    """Block by block: the bump's flanks, its shadows, its rim and the plain."""
+    separated, path_traced = _pictures("separated", 16, depth), _pictures("path_traced", 576, depth)
+    (found, error), (truth, own) = _blocks(separated), _blocks(path_traced)
     # Five standard errors of some 10 degrees of freedom: one block in 2000. Projections keep each face's mean, so that
     # nothing systematic is left in a block but for faces across its edges: less than 0.1 %.
     limit = 5 * np.hypot(error, own) + 1e-3 * truth
@@ -95,10 +103,7 @@ def test_expectation_is_path_tracings(depth: int) -> None:
 
 @needs_llvm
 def test_second_bounce_is_path_tracings() -> None:
-    """What one bounce more adds, 0.05 % of the picture; the same seeds make it known to some per cent.
-
-    Fails with one bounce less at every depth: it adds the first bounce instead.
-    """
+    """What one bounce more adds, 0.05 % of the picture; the same seeds make it known to some per cent."""
     added = []
     for setting in (("separated", 16), ("path_traced", 576)):
         more = (_pictures(*setting, 4) - _pictures(*setting, 3)).mean(axis=(1, 2))
@@ -118,37 +123,40 @@ def test_fewer_samples_make_less_noise() -> None:
 @needs_llvm
 def test_flat_gel_has_no_noise_of_light() -> None:
     """Nothing blocked, nothing bounced: what remains is the pixel filter, where light varies by 5 % within a pixel."""
-    sensor = small_sensor(1.45, None, LIGHTS)
-    surface = flat_surface(sensor)
-    render = Render(samples_per_pixel=16, light="separated")
-    renderer = Renderer(sensor, render, surface, plain(), FAST)
-    first, second, same = (renderer.radiance(surface.material, seed) for seed in (1, 2, 1))
+    sensor, render = small_sensor(1.45, None, LIGHTS), Render(samples_per_pixel=16, light="separated")
+    first, second, same = (rendered(sensor, render=render, seed=seed) for seed in (1, 2, 1))
     np.testing.assert_array_equal(first, same)
     # Jittered in 4 x 4 cells: 0.05 / sqrt(12) / 4 / sqrt(16) = 0.1 % at most; the largest of 4800 is at 4 sigma.
     assert np.abs(first / second - 1).max() < 4 * 2**0.5 * 1e-3
 
 
-def _renderer(coating: Coating, variant: Variant) -> Renderer:
-    sensor = small_sensor(1.0, None, LIGHTS).model_copy(update={"coating": coating})
-    return Renderer(sensor, Render(light="separated"), flat_surface(sensor), _texture(), variant)
-
-
-def _texture() -> Image:
-    return plain()
-
-
-def test_what_shines_is_refused() -> None:
-    with pytest.raises(InputError, match=r'render.light = "separated" needs a matt coating .* roughness = 0.5'):
-        _renderer(Coating(roughness=0.5), FAST)
-
-
-def test_scalar_variants_path_trace() -> None:
-    """Fails with `variant.is_vectorised` left out of the renderer's choice."""
-    scalar = Variant("scalar_rgb", "cpu")
+def test_what_shines_is_refused_and_scalar_variants_path_trace() -> None:
     sensor = small_sensor(1.0, None, LIGHTS)
-    surface = flat_surface(sensor)
-    images = [
-        Renderer(sensor, Render(light=light), surface, _texture(), scalar).radiance(surface.material, 3)
-        for light in ("separated", "path_traced")
-    ]
+    shining = sensor.model_copy(update={"coating": Coating(roughness=0.5)})
+    with pytest.raises(InputError, match=r'render.light = "separated" needs a matt coating .* roughness = 0.5'):
+        rendered(shining, render=Render(light="separated"))
+    images = [rendered(sensor, render=Render(light=one), variant=SCALAR) for one in ("separated", "path_traced")]
     np.testing.assert_array_equal(*images)
+
+
+@needs_llvm
+def test_noise_falls_as_the_root_of_samples() -> None:
+    """Independent samples: -1/2. Stratified ones are never worse, and fall faster by what they resolve of it."""
+    counts = (16, 64, 256)
+    slope = np.polyfit(np.log(counts), np.log([_errors()[DEEPEST, n]["noise"] for n in counts]), 1)[0]
+    # 1200 pixels, blurred: some 1200 / (4 pi 0.8²) = 150 independent values and 2 degrees of freedom each: noise within
+    # 1 / sqrt(2 · 300) = 4 %, the slope over a factor of 16 within 0.04 sqrt(2) / ln 16 = 0.02; 4 times that above.
+    # Below: a jittered grid over an edge has variance n^-3/2 (Mitchell 1996), and paths are only partly stratified.
+    assert -0.75 < slope < -0.5 + 0.08
+
+
+@needs_llvm
+def test_full_paths_have_no_bias_and_cut_ones_are_seen() -> None:
+    """A path of 2 is direct light only; here it lacks 1.2 % of the light."""
+    for n in (16, 64, 256):
+        found = _errors()[DEEPEST, n]
+        assert abs(found["bias_percent"]) < 4 * found["bias_se_percent"]
+        assert found["systematic"] < 2 * found["systematic_limit"]  # the limit is two standard errors: four
+    cut = _errors()[2, 64]
+    assert cut["bias_percent"] < -10 * cut["bias_se_percent"]
+    assert cut["systematic"] > 3 * cut["systematic_limit"]
