@@ -10,11 +10,12 @@ import pytest
 from pads import brick, crooked
 
 import synth.mesh.cache as cache
+from benchmarks.focused_mesh import SLOPE, around_focus
 from synth.arrays import FloatArray
 from synth.errors import InputError
 from synth.mesh import Focus, PadMesh, check_mesh, default_edge_length, mesh_key, pad_mesh
 from synth.mesh.pad import boundary_faces, signed_volumes
-from synth.mesh.sizing import GRADING, SLOPE, around_focus, through_thickness
+from synth.mesh.sizing import GRADING, through_thickness
 from synth.mesh.tetrahedralise import WORST_SHAPE, _fault, _repair, shape_quality, tetrahedralise_box
 from synth.scene import Gel, Layer, Numerics
 
@@ -273,7 +274,7 @@ def distance_from_zone(points: FloatArray) -> FloatArray:
 
 
 def test_mesh_is_as_good_as_any_and_its_edges_are_small_in_the_focus_only() -> None:
-    pad = tetrahedralise_box(WIDE, EDGE, focus=FOCUS, coarse_mm=COARSE)
+    pad = tetrahedralise_box(WIDE, EDGE, around_focus(WIDE, EDGE, FOCUS, COARSE))
     assert pad.volumes.min() > 0
     # Sums of some 2000 volumes round to 1e-14 relative.
     assert pad.volumes.sum() == pytest.approx(np.prod(WIDE), rel=1e-12)
@@ -345,6 +346,3 @@ def test_what_is_no_focus_is_refused() -> None:
     for half in ((-0.1, 1.0), (np.nan, 1.0), (1.0, np.inf)):
         with pytest.raises(ValueError, match="half widths >= 0"):
             Focus((0.0, 0.0), half)
-    for wrong in ({"coarse_mm": 2.0}, {"coarse_mm": 0.5, "focus": FOCUS}):
-        with pytest.raises(ValueError, match="needs a focus"):
-            tetrahedralise_box(WIDE, EDGE, **wrong)

@@ -357,7 +357,7 @@ def test_doctor_says_how_to_get_what_is_missing(said: Run, monkeypatch) -> None:
 NO_LLVM = """
 import sys
 import synth.render.variant as variant
-variant._PATTERNS = (sys.argv[1],)
+variant._PATTERNS, variant._packaged = (sys.argv[1],), list
 variant.sys.prefix = "/nonexistent"
 from synth.cli import main
 sys.exit(main(["doctor", "--json"]))
