@@ -162,6 +162,9 @@ def generate(
         scheduling: who makes them; default this process.
         progress: told after each trajectory.
 
+    Returns:
+        What was made, found and given up, and the seconds of each stage.
+
     Raises:
         InputError: wrong arguments, a scene that cannot be built, a place of another job, storage that refuses.
     """

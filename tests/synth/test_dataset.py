@@ -43,6 +43,12 @@ def test_round_trip(tmp_path, dtype, grey):
     for name in ("image1", "image2", "displacement1", "displacement2"):
         np.testing.assert_array_equal(getattr(data, name), getattr(sample, name), strict=True)
     np.testing.assert_array_equal(data.flow.backward, sample.flow.backward, strict=True)
+    (iterated,) = dataset
+    assert len(dataset) == 1
+    assert iterated.images[1] is iterated.image2
+    for name in ("forward", "backward"):
+        np.testing.assert_array_equal(getattr(iterated, name), getattr(sample.flow, name), strict=True)
+    np.testing.assert_array_equal(iterated.visible, sample.flow.forward_visible, strict=True)
     np.testing.assert_array_equal(
         data.surface.positions(data.displacement2), sample.surface.positions(sample.displacement2), strict=True
     )
