@@ -1,6 +1,6 @@
 """Error of the simulated flow against run time: one press on ever finer meshes, compared with the finest.
 
-python examples/error_against_time.py --targets 4 2 1 0.5 0.25 --out data/error
+python examples/error_against_time.py --targets 0.4 0.2 0.1 0.05 --out data/error
 """
 
 from argparse import ArgumentParser
@@ -11,7 +11,7 @@ import numpy as np
 import synth
 
 parser = ArgumentParser(description=__doc__)
-parser.add_argument("--targets", type=float, nargs="+", default=[4.0, 2.0, 1.0, 0.5, 0.25], help="px, descending")
+parser.add_argument("--targets", type=float, nargs="+", default=[0.4, 0.2, 0.1, 0.05], help="px, descending")
 parser.add_argument("--out", type=Path, default=Path("data/error"))
 given = parser.parse_args()
 

@@ -72,6 +72,6 @@ def test_own_pattern(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_error_against_time(tmp_path: Path) -> None:
-    printed = run("error_against_time.py", "--targets", 8, 3, 1, "--out", tmp_path)
+    printed = run("error_against_time.py", "--targets", 0.4, 0.2, 0.1, "--out", tmp_path)
     errors = [float(line.split()[1]) for line in printed.splitlines()[1:]]
     assert errors[0] > errors[1] > errors[2] == 0.0
