@@ -3,13 +3,14 @@
 The public interface is `load_scene`, `plan`, `generate` and `read_dataset`; everything else may change without notice.
 Importing the package imports nothing heavy: each of the four is loaded when it is first asked for.
 
->>> import tempfile, synth
->>> scene = synth.load_scene("gelsight_mini", set=["numerics.target_error_px=2.5", "render.samples_per_pixel=4"])
->>> out = tempfile.mkdtemp()
->>> summary = synth.generate(scene, n=1, out=out, seed=0)
->>> for sample in synth.read_dataset(out):
-...     print(sample.images[0].shape, sample.forward.shape, sample.backward.shape, sample.visible.shape)
-(240, 320, 3) (240, 320, 2) (240, 320, 2) (240, 320)
+Examples:
+    >>> import tempfile, synth
+    >>> scene = synth.load_scene("gelsight_mini", set=["numerics.target_error_px=2.5", "render.samples_per_pixel=4"])
+    >>> out = tempfile.mkdtemp()
+    >>> summary = synth.generate(scene, n=1, out=out, seed=0)
+    >>> for sample in synth.read_dataset(out):
+    ...     print(sample.images[0].shape, sample.forward.shape, sample.backward.shape, sample.visible.shape)
+    (240, 320, 3) (240, 320, 2) (240, 320, 2) (240, 320)
 """
 
 from importlib import import_module

@@ -45,10 +45,11 @@ class FlowModel:
         Raises:
             InputError: Other kinds, shapes or values, or an array beside a tensor.
 
-        >>> import gelflow, numpy as np
-        >>> image1 = np.random.default_rng(0).integers(0, 256, (64, 80, 3), np.uint8)
-        >>> gelflow.load_model("best").flow(image1, np.roll(image1, 1, axis=1)).shape
-        (64, 80, 2)
+        Examples:
+            >>> import gelflow, numpy as np
+            >>> image1 = np.random.default_rng(0).integers(0, 256, (64, 80, 3), np.uint8)
+            >>> gelflow.load_model("best").flow(image1, np.roll(image1, 1, axis=1)).shape
+            (64, 80, 2)
         """
         if isinstance(image1, Tensor) and isinstance(image2, Tensor):
             if image1.ndim == image2.ndim == 3:

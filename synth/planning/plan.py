@@ -67,10 +67,11 @@ def plan(template: Template, variant: Variant | None = None) -> Plan:
     Raises:
         InputError: what the scene asks for cannot be built, see `check_buildable`.
 
-    >>> from synth import load_scene
-    >>> planned = plan(load_scene("gelsight_mini", set=["contact.friction=0.0"]))
-    >>> [decision.reason for decision in planned.decisions if decision.feature == "friction state"]
-    ['contact.friction = 0: half the matrix is enough']
+    Examples:
+        >>> from synth import load_scene
+        >>> planned = plan(load_scene("gelsight_mini", set=["contact.friction=0.0"]))
+        >>> [decision.reason for decision in planned.decisions if decision.feature == "friction state"]
+        ['contact.friction = 0: half the matrix is enough']
     """
     variant = variant or job_variant(template, "auto")
     check_buildable(template, variant)

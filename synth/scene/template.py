@@ -122,9 +122,10 @@ def load_scene(name_or_path: str | Path, set: Sequence[str] = ()) -> Template:
     Raises:
         InputError: no such scene, wrong TOML, unknown keys, impossible values.
 
-    >>> scene = load_scene("deltact", set=["motion.depth_mm=1.0"])
-    >>> scene.name, scene.content["motion"]["depth_mm"]
-    ('deltact', 1.0)
+    Examples:
+        >>> scene = load_scene("deltact", set=["motion.depth_mm=1.0"])
+        >>> scene.name, scene.content["motion"]["depth_mm"]
+        ('deltact', 1.0)
     """
     path = _find(name_or_path)
     try:
