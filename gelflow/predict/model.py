@@ -39,8 +39,8 @@ class FlowModel:
             image2: The same kind and shape.
 
         Returns:
-            Of arrays (H, W, 2) float32, of tensors (2, H, W) or (B, 2, H, W) float32 on their device, without
-            gradient: (U right, V down) in px, ``I1(x) = I2(x + flow(x))`` at pixel centres (c + 0.5, r + 0.5).
+            Flow in px, U right and V down, ``I1(x) = I2(x + flow(x))`` at pixel centres (c + 0.5, r + 0.5). Of arrays
+            (H, W, 2) float32; of tensors (2, H, W) or (B, 2, H, W) float32 on their device, without gradient.
 
         Raises:
             InputError: Other kinds, shapes or values, or an array beside a tensor.

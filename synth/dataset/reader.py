@@ -38,10 +38,12 @@ class SampleData:
     """One image pair of a dataset with its exact flow.
 
     Attributes:
-        image1, image2: (H, W) grey or (H, W, 3) RGB, uint8 or uint16.
+        image1: (H, W) grey or (H, W, 3) RGB, uint8 or uint16.
+        image2: the same kind and shape.
         flow: in both directions, and the optional channels.
         surface: the undeformed contact surface of the gel, mm.
-        displacement1, displacement2: of its nodes in the two states, (N, 3) float64, mm.
+        displacement1: of its nodes in the state of image 1, (N, 3) float64, mm.
+        displacement2: of its nodes in the state of image 2, (N, 3) float64, mm.
         meta: meta.json, with the drawn scene, forces in N and torques in N mm.
         further: images and flow of the scene's further cameras, by name.
     """
