@@ -12,16 +12,20 @@ from gelflow.errors import InputError
 
 
 def open_pairs(path: Path | str) -> PairDataset:
-    """Opens a folder of image pairs, recognised by what lies in it, or one shard.
+    """Opens a folder of image pairs or one shard; see `PairDataset`."""
+    return PairDataset(path)
+
+
+def pair_records(folder: Path) -> list[PairRecord]:
+    """The pairs of a folder, recognised by what lies in it, or of one shard.
 
     Args:
-        path: A data set of synth (dataset.json), a pair set (pairs.json), a folder of NAME_1.png and NAME_2.png, or a
-            folder of WebDataset shards (*.tar) or one of them.
+        folder: A data set of synth (dataset.json), a pair set (pairs.json), a folder of NAME_1.png and NAME_2.png, or
+            a folder of WebDataset shards (*.tar) or one of them.
 
     Raises:
         InputError: There is no such folder, it is none of these or empty, or it is damaged.
     """
-    folder = Path(path)
     if not folder.is_dir() and not shard_files(folder):
         if folder.exists():
             raise InputError(
@@ -29,13 +33,13 @@ def open_pairs(path: Path | str) -> PairDataset:
             )
         raise InputError(f"{folder}: there is no such folder; a folder with image pairs is needed")
     if (folder / PAIR_SET_FILE).is_file():
-        return PairDataset(str(folder), pair_set_records(folder))
+        return pair_set_records(folder)
     if is_synthetic(folder):
-        return PairDataset(str(folder), synthetic_records(folder))
+        return synthetic_records(folder)
     if records := _folder_records(folder):
-        return PairDataset(str(folder), records)
+        return records
     if shards := shard_files(folder):
-        return PairDataset(str(folder), shard_records(shards))
+        return shard_records(shards)
     content = "is empty" if not any(folder.iterdir()) else "holds no image pairs"
     raise InputError(
         f"{folder}: the folder {content}; allowed: a data set of synth (dataset.json), a pair set of "

@@ -62,18 +62,29 @@ def without_pattern(scene: str | None) -> bool:
 
 
 class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
-    """Image pairs that are read from disk when they are asked for.
+    """Image pairs that are read from disk when they are asked for; a map-style data set for a torch DataLoader.
 
-    At least one; `source` is where they come from, for messages.
+    `dataset[i]` is a dictionary of tensors and texts: `image1`, `image2` (3, H, W) float32, RGB in [0, 1]; `name`;
+    `bare`; and where the data have an exact flow `flow` (2, H, W) float32 px, (U right, V down), NaN where no gel is
+    seen, with `visible` (1, H, W) float32, 0 or 1.
+
+    Args:
+        source: A data set of synth, a pair set of `gelflow pairs`, a folder of NAME_1.png and NAME_2.png, or
+            WebDataset shards (*.tar): one of them or a folder.
+        records: The pairs, where they are known; `source` then only says in messages where they come from.
 
     Raises:
-        InputError: There is no pair.
+        InputError: There is no such folder, it is none of these, holds no pair, or is damaged.
     """
 
-    def __init__(self, source: str, records: Sequence[PairRecord]) -> None:
+    def __init__(self, source: str | Path, records: Sequence[PairRecord] | None = None) -> None:
+        if records is None:
+            from gelflow.data.open import pair_records
+
+            records = pair_records(Path(source))
         if not records:
             raise InputError(f"{source}: holds no image pair")
-        self.source = source
+        self.source = str(source)
         self.records = tuple(records)
         self.has_flow = any(record.flow is not None for record in self.records)
 

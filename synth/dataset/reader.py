@@ -1,7 +1,7 @@
 """Reading a dataset, a sample's folder, or a part of either; nothing is cached and nothing is written."""
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -28,14 +28,25 @@ from synth.dataset.sample import (
     sample_name,
 )
 from synth.errors import InputError
-from synth.flow.field import FlowField
+from synth.flow.field import FlowArray, FlowField
 from synth.scene import Scene
 from synth.surface import ContactFaces, GelSurface
 
 
 @dataclass(frozen=True)
 class SampleData:
-    """What a sample's folder holds; see `synth.dataset.sample.Sample`. `meta` is meta.json."""
+    """One image pair of a dataset with its exact flow.
+
+    Attributes:
+        image1: (H, W) grey or (H, W, 3) RGB, uint8 or uint16.
+        image2: the same kind and shape.
+        flow: in both directions, and the optional channels.
+        surface: the undeformed contact surface of the gel, mm.
+        displacement1: of its nodes in the state of image 1, (N, 3) float64, mm.
+        displacement2: of its nodes in the state of image 2, (N, 3) float64, mm.
+        meta: meta.json, with the drawn scene, forces in N and torques in N mm.
+        further: images and flow of the scene's further cameras, by name.
+    """
 
     image1: Raster
     image2: Raster
@@ -45,6 +56,26 @@ class SampleData:
     displacement2: FloatArray
     meta: Mapping[str, Any]
     further: Mapping[str, CameraPair] = field(default_factory=dict)
+
+    @property
+    def images(self) -> tuple[Raster, Raster]:
+        """Image 1 and image 2."""
+        return self.image1, self.image2
+
+    @property
+    def forward(self) -> FlowArray:
+        """Flow from image 1 to image 2, (H, W, 2) float32 px, U right, V down; NaN where no gel is seen."""
+        return self.flow.forward
+
+    @property
+    def backward(self) -> FlowArray | None:
+        """The same with the images exchanged; None where the scene did not ask for it."""
+        return self.flow.backward
+
+    @property
+    def visible(self) -> FlowArray:
+        """(H, W) float32, 1 where the material point of a pixel of image 1 is seen in image 2, else 0."""
+        return self.flow.forward_visible
 
     def seen_by(self, camera: str) -> "SampleData":
         """The same sample with the images and flow of one camera; "" is the main camera.
@@ -63,7 +94,7 @@ class SampleData:
 
 @dataclass(frozen=True)
 class Dataset:
-    """A dataset directory as it was when it was opened.
+    """A dataset directory as it was when it was opened; iterating reads its finished samples one by one.
 
     Attributes:
         path: the directory.
@@ -73,6 +104,14 @@ class Dataset:
     path: Path
     info: Mapping[str, Any]
     _table: LineTable[int]
+
+    def __len__(self) -> int:
+        """Number of finished samples."""
+        return len(self._table.places)
+
+    def __iter__(self) -> Iterator[SampleData]:
+        """The finished samples, by index; see `read`."""
+        return map(self.read, self.samples)
 
     @property
     def samples(self) -> list[int]:
@@ -142,7 +181,13 @@ class Dataset:
 
 
 def read_dataset(path: Path | str) -> Dataset:
-    """Opens a dataset directory, finished or not.
+    """Opens a dataset directory, finished or not, and writes nothing.
+
+    Args:
+        path: what was given to `generate` as `out`; a local directory.
+
+    Returns:
+        An iterable of `SampleData`, each read when its turn comes.
 
     Raises:
         InputError: Not a dataset, or its dataset.json or manifest is damaged.

@@ -140,7 +140,7 @@ def make_job(plan: Plan, n: int, seed: int) -> Job:
 
 
 def generate(
-    template: Template,
+    scene: Template,
     n: int,
     out: Output,
     seed: int = 0,
@@ -151,13 +151,16 @@ def generate(
     """Write samples 0 .. n - 1 of a scene, or one shard of them; those that are there already are kept.
 
     Args:
-        template: the scene.
-        n: samples in the dataset.
+        scene: of `load_scene`.
+        n: number of samples in the dataset, at least 1.
         out: the dataset's directory or fsspec URL.
-        seed: of everything random.
-        variant: that renders; default the fastest here.
-        scheduling: who makes them; default this process.
-        progress: told after each trajectory.
+        seed: of everything random, not negative.
+        variant: the renderer; by default the fastest here that the scene needs.
+        scheduling: processes, cluster or shard that make the samples; by default this process makes all of them.
+        progress: called after each trajectory with the number of samples done and of samples asked for.
+
+    Returns:
+        What was made, found and given up, and the seconds of each stage.
 
     Raises:
         InputError: wrong arguments, a scene that cannot be built, a place of another job, storage that refuses.
@@ -165,9 +168,9 @@ def generate(
     started = time.perf_counter()
     scheduling, out = scheduling or Scheduling(), output_of(out)
     _check(scheduling, out)
-    planned = plan(template, variant)
+    planned = plan(scene, variant)
     job = make_job(planned, n, seed)
-    count = template.sampling.pairs_per_trajectory
+    count = scene.sampling.pairs_per_trajectory
     with DatasetWriter(out, job, scheduling.shard, count) as writer:
         context = JobContext(planned, job, out, user_cache())
         finished = writer.finished

@@ -56,21 +56,30 @@ class Plan:
         return {**named, "decisions": [vars(decision) for decision in self.decisions]}
 
 
-def plan(template: Template, variant: Variant | None = None) -> Plan:
+def plan(scene: Template, variant: Variant | None = None) -> Plan:
     """Decide what runs.
 
     Args:
-        template: the scene.
-        variant: that renders; default the fastest here that the scene needs.
+        scene: of `load_scene`.
+        variant: the renderer; by default the fastest here that the scene needs.
+
+    Returns:
+        The decisions with their reasons.
 
     Raises:
         InputError: what the scene asks for cannot be built, see `check_buildable`.
+
+    Examples:
+        >>> from synth import load_scene
+        >>> planned = plan(load_scene("gelsight_mini", set=["contact.friction=0.0"]))
+        >>> [decision.reason for decision in planned.decisions if decision.feature == "friction state"]
+        ['contact.friction = 0: half the matrix is enough']
     """
-    variant = variant or job_variant(template, "auto")
-    check_buildable(template, variant)
-    is_batched = template.numerics.solver == "batched"
-    found = decisions(template, variant, is_batched)
-    return Plan(template, variant, is_batched, MeshRule.of(template.numerics), found)
+    variant = variant or job_variant(scene, "auto")
+    check_buildable(scene, variant)
+    is_batched = scene.numerics.solver == "batched"
+    found = decisions(scene, variant, is_batched)
+    return Plan(scene, variant, is_batched, MeshRule.of(scene.numerics), found)
 
 
 def job_variant(template: Template, device: Device) -> Variant:

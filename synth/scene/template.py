@@ -116,8 +116,16 @@ def load_scene(name_or_path: str | Path, set: Sequence[str] = ()) -> Template:
         set: "key.path=value" with a TOML value; list entries by number ("sensor.lights.0.power=2"). Files are
             relative to the working directory, not to the scene.
 
+    Returns:
+        The checked scene, whose numbers may still be distributions.
+
     Raises:
         InputError: no such scene, wrong TOML, unknown keys, impossible values.
+
+    Examples:
+        >>> scene = load_scene("deltact", set=["motion.depth_mm=1.0"])
+        >>> scene.name, scene.content["motion"]["depth_mm"]
+        ('deltact', 1.0)
     """
     path = _find(name_or_path)
     try:

@@ -50,6 +50,12 @@ def test_round_trip(tmp_path, dtype, grey):
     np.testing.assert_array_equal(data.flow.backward, sample.flow.backward, strict=True)
     moved = (one.surface.positions(one.displacement2) for one in (data, sample))
     np.testing.assert_array_equal(*moved, strict=True)
+    (iterated,) = dataset
+    assert len(dataset) == 1
+    assert iterated.images[1] is iterated.image2
+    for name in ("forward", "backward"):
+        np.testing.assert_array_equal(getattr(iterated, name), getattr(sample.flow, name), strict=True)
+    np.testing.assert_array_equal(iterated.visible, sample.flow.forward_visible, strict=True)
     entry = dataset.entry(2)
     assert (entry.max_flow_px, entry.force_n[1], entry.frames) == (np.hypot(1.25, 0.5), (0.1, 0.0, 1.5), (0, 3))
     assert entry.diagnostics["solver"][1]["depth_mm"] == 0.2

@@ -10,7 +10,7 @@ from tiny_scene import own_cache, write_tiny
 
 ROOT = Path(__file__).parents[2]
 STAGES = (
-    "synth",  # the package itself: its version
+    "synth",  # the package itself: its version, and where its public names are, which it loads when they are asked for
     "synth.errors",
     "synth.arrays",
     "synth.dataset.storage",  # how a file gets to the disk as a whole; knows nothing of datasets
@@ -96,7 +96,7 @@ def test_synth_imports_only_from_earlier_stages() -> None:
     wrong = [
         f"{name} imports {imported}, which comes later"
         for name, imported in _imports_of(SYNTH)
-        if imported in SYNTH and _stage(imported) > _stage(name)
+        if name != "synth" and imported in SYNTH and _stage(imported) > _stage(name)
     ]
     assert wrong == []
 

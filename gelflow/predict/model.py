@@ -1,0 +1,100 @@
+"""The network of the public Python interface: flow between two images, as arrays or as tensors."""
+
+from pathlib import Path
+from typing import overload
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gelflow.arrays import Bytes3, Flow, FlowArray, ImageArray, Images
+from gelflow.baselines.learned import Learned
+from gelflow.config import Registration
+from gelflow.errors import InputError
+from gelflow.models.estimate import estimate_flow
+from gelflow.models.weights import SHIPPED, weights_file
+
+
+class FlowModel:
+    """A trained GelFlow network; `load_model` makes one."""
+
+    def __init__(self, network: Learned) -> None:
+        self._network = network
+
+    @property
+    def device(self) -> str:
+        """Where it computes, "cpu" or "cuda"."""
+        return self._network.device
+
+    @overload
+    def flow(self, image1: ImageArray | Bytes3, image2: ImageArray | Bytes3) -> FlowArray: ...
+    @overload
+    def flow(self, image1: Images, image2: Images) -> Flow: ...
+    def flow(self, image1: ImageArray | Bytes3 | Images, image2: ImageArray | Bytes3 | Images) -> FlowArray | Flow:
+        """Estimates the motion from image 1 to image 2, at their own size.
+
+        Args:
+            image1: An RGB array (H, W, 3), uint8 or float in [0, 1]; or a tensor (3, H, W) or (B, 3, H, W) in [0, 1],
+                on any device. Each side has 64 px or more.
+            image2: The same kind and shape.
+
+        Returns:
+            Flow in px, U right and V down, ``I1(x) = I2(x + flow(x))`` at pixel centres (c + 0.5, r + 0.5). Of arrays
+            (H, W, 2) float32; of tensors (2, H, W) or (B, 2, H, W) float32 on their device, without gradient.
+
+        Raises:
+            InputError: Other kinds, shapes or values, or an array beside a tensor.
+
+        Examples:
+            >>> import gelflow, numpy as np
+            >>> image1 = np.random.default_rng(0).integers(0, 256, (64, 80, 3), np.uint8)
+            >>> gelflow.load_model("best").flow(image1, np.roll(image1, 1, axis=1)).shape
+            (64, 80, 2)
+        """
+        if isinstance(image1, Tensor) and isinstance(image2, Tensor):
+            if image1.ndim == image2.ndim == 3:
+                return self.flow(image1[None], image2[None])[0]
+            for name, image in (("image 1", image1), ("image 2", image2)):
+                _check_range(name, str(image.dtype), float(image.min()), float(image.max()))
+            return estimate_flow(self._network.model, image1, image2, self._network.size, self._network.network)
+        if isinstance(image1, np.ndarray) and isinstance(image2, np.ndarray):
+            return self._network.flow(_in_unit_range("image 1", image1), _in_unit_range("image 2", image2))
+        given = f"{type(image1).__name__} and {type(image2).__name__}"
+        raise InputError(f"images of {given}: two NumPy arrays or two torch tensors are needed")
+
+
+def load_model(
+    name_or_path: str | Path = SHIPPED,
+    device: str = "auto",
+    registration: Registration | None = None,
+    size: tuple[int, int] | None = None,
+) -> FlowModel:
+    """Loads a trained network.
+
+    Args:
+        name_or_path: "best", the weights that come with the package, or a file that `gelflow train` or `finetune`
+            wrote (weights.safetensors).
+        device: "cpu", "cuda", or "auto", a CUDA device where there is one.
+        registration: "none", "motion", "both" or "brightness": how the flow is corrected on the images; None: what the
+            weights ask for, which is "motion" for "best".
+        size: Rows and columns at which the network works; None: those of its training or of the images.
+
+    Raises:
+        InputError: No such file, a damaged one or another network's, or no such device.
+    """
+    return FlowModel(Learned(weights_file(Path(name_or_path)), None, size, device, registration))
+
+
+def _in_unit_range(name: str, image: NDArray[np.generic]) -> ImageArray:
+    if image.dtype == np.uint8:
+        return image.astype(np.float32) / np.float32(255)
+    if image.size:
+        _check_range(name, str(image.dtype), float(image.min()), float(image.max()))
+    return image.astype(np.float32)
+
+
+def _check_range(name: str, dtype: str, lowest: float, highest: float) -> None:
+    if lowest < 0.0 or highest > 1.0:
+        raise InputError(
+            f"{name} is {dtype} with values from {lowest:g} to {highest:g}; allowed: values in [0, 1], or a uint8 array"
+        )
