@@ -56,7 +56,7 @@ class FlowModel:
                 return self.flow(image1[None], image2[None])[0]
             for name, image in (("image 1", image1), ("image 2", image2)):
                 _check_range(name, str(image.dtype), float(image.min()), float(image.max()))
-            return estimate_flow(self._network.model, image1, image2, self._network.size, self._network.network)
+            return estimate_flow(self._network.model, image1, image2, self._network.size, self._network.forward)
         if isinstance(image1, np.ndarray) and isinstance(image2, np.ndarray):
             return self._network.flow(_in_unit_range("image 1", image1), _in_unit_range("image 2", image2))
         given = f"{type(image1).__name__} and {type(image2).__name__}"
