@@ -16,7 +16,7 @@ from typing import Any
 
 from benchmarks.rows import Row, arguments, machine, measure, plot, show
 from synth.cli_options import DEFAULT_SCENE
-from synth.dataset.sample import MANIFEST_FILE
+from synth.dataset.manifest import MANIFEST_FILE
 from synth.errors import InputError
 from synth.pipeline.generate import Scheduling, generate
 from synth.pipeline.threads import cores

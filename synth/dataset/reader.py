@@ -15,18 +15,9 @@ from synth.dataset.images import Raster, read_png
 from synth.dataset.job import read_job_record
 from synth.dataset.jsontext import read_document
 from synth.dataset.lines import LineTable, read_line, scan_lines
+from synth.dataset.manifest import FAILURES_FILE, MANIFEST_FILE, ManifestEntry, failure_key, manifest_key
 from synth.dataset.npz import read_npz
-from synth.dataset.sample import (
-    FAILURES_FILE,
-    MANIFEST_FILE,
-    SAMPLES_FOLDER,
-    CameraPair,
-    ManifestEntry,
-    failure_key,
-    further_cameras,
-    manifest_key,
-    sample_name,
-)
+from synth.dataset.sample import SAMPLES_FOLDER, CameraPair, further_cameras, sample_name
 from synth.errors import InputError
 from synth.flow.field import FlowArray, FlowField
 from synth.scene import Scene

@@ -12,8 +12,9 @@ from synth.dataset.exr import CONVENTIONS, write_flow
 from synth.dataset.images import encode_png
 from synth.dataset.job import Job
 from synth.dataset.jsontext import jsonable, to_document
+from synth.dataset.manifest import ManifestEntry
 from synth.dataset.npz import encode_npz
-from synth.dataset.sample import SAMPLES_FOLDER, CameraPair, ManifestEntry, Sample, largest_motion, sample_name
+from synth.dataset.sample import SAMPLES_FOLDER, CameraPair, Sample, largest_motion, sample_name
 from synth.dataset.storage import install_folder, partial_name, storage_errors
 from synth.dataset.store import Output, Store
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from synth.dataset.jsontext import to_document
-from synth.dataset.sample import FAILURES_FILE, MANIFEST_FILE
+from synth.dataset.manifest import FAILURES_FILE, MANIFEST_FILE
 
 SUMMARY_FILE = "summary.json"
 

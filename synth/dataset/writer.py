@@ -32,20 +32,9 @@ from synth.dataset.jsontext import parse_document, to_document, to_line
 from synth.dataset.lease import LEASES_FOLDER, Lease
 from synth.dataset.lines import append_line, merge_lines, scan_lines
 from synth.dataset.lock import LOCK_FILE, DirectoryLock
+from synth.dataset.manifest import FAILURES_FILE, MANIFEST_FILE, ManifestEntry, failure_key, manifest_key
 from synth.dataset.meshes import MESHES_FOLDER, mesh_folder
-from synth.dataset.sample import (
-    FAILURES_FILE,
-    MANIFEST_FILE,
-    SAMPLE_FILES,
-    SAMPLES_FOLDER,
-    VIEW_FILES,
-    ManifestEntry,
-    Sample,
-    failure_key,
-    further_cameras,
-    manifest_key,
-    sample_name,
-)
+from synth.dataset.sample import SAMPLE_FILES, SAMPLES_FOLDER, VIEW_FILES, Sample, further_cameras, sample_name
 from synth.dataset.sample_files import write_sample_files
 from synth.dataset.shard import Shard
 from synth.dataset.storage import PARTIAL, remove_partials, storage_errors

@@ -17,8 +17,8 @@ import numpy as np
 from synth.errors import InputError
 from synth.mesh.dome import domed
 from synth.mesh.pad import PadMesh
-from synth.mesh.sizing import GRADING
 from synth.mesh.tetrahedralise import ENVELOPE, tetrahedralise_box
+from synth.mesh.tetwild_sizing import GRADING
 from synth.scene import Gel, Numerics
 
 

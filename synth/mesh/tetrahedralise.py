@@ -15,7 +15,7 @@ import numpy as np
 from synth.arrays import Points, Tets
 from synth.errors import InputError
 from synth.mesh.pad import PadMesh, boundary_faces, signed_volumes
-from synth.mesh.sizing import Background, through_thickness
+from synth.mesh.tetwild_sizing import Background, through_thickness
 
 ENVELOPE = 1e-3
 """fTetWild's epsilon, relative to the bounding box's diagonal."""

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from synth.dataset.job import Job
+from synth.dataset.manifest import ManifestEntry
 from synth.dataset.meshes import mesh_folder
-from synth.dataset.sample import ManifestEntry
 from synth.dataset.store import Output
 from synth.planning import Plan
 from synth.scene import Scene

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from synth.planning.check import check_buildable
-from synth.planning.decision import Decision, decisions
+from synth.planning.reasons import Decision, decisions
 from synth.render.pattern import is_grey
 from synth.render.variant import Device, Variant, choose_variant
 from synth.scene import Scene
@@ -77,7 +77,7 @@ def plan(scene: Template, variant: Variant | None = None) -> Plan:
     """
     variant = variant or job_variant(scene, "auto")
     check_buildable(scene, variant)
-    is_batched = scene.numerics.solver == "batched"
+    is_batched = scene.numerics.is_batched
     found = decisions(scene, variant, is_batched)
     return Plan(scene, variant, is_batched, MeshRule.of(scene.numerics), found)
 

@@ -53,3 +53,8 @@ class Numerics(Part):
         if self.target_error_px is not None and self.edge_length_mm is not None:
             raise ValueError("target_error_px and edge_length_mm both fix the mesh: give one of them")
         return self
+
+    @property
+    def is_batched(self) -> bool:
+        """Whether many trajectories are simulated at once, on one mesh for all of a pad."""
+        return self.solver == "batched"

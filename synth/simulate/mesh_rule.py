@@ -33,7 +33,7 @@ class MeshRule:
         """The rule of a scene."""
         if numerics.edge_length_mm is not None:
             return cls("tetwild", float("nan"))
-        return cls("even" if numerics.solver == "batched" else "graded", numerics.target_error_px or DEFAULT_TARGET_PX)
+        return cls("even" if numerics.is_batched else "graded", numerics.target_error_px or DEFAULT_TARGET_PX)
 
     def resolution(
         self, scene: Scene, folder: Path | None = None, mesh_folders: Sequence[Path] | None = None
