@@ -154,7 +154,7 @@ def test_resident_pairs_are_those_of_the_files() -> None:
             return sample | {"image1": (255 * sample["image1"]).round() / 255}
 
     pairs = CheckedPairs(Bytes(3, 64, 1.0, seed=8), supervised=True)
-    kept = resident(pairs, torch.device("cpu"), 0, room=10**7)
+    kept = resident(pairs, torch.device("cpu"), room=10**7)
     assert kept is not None
     assert len(kept) == 3
     for index in range(3):
@@ -165,9 +165,9 @@ def test_resident_pairs_are_those_of_the_files() -> None:
         for key in ("image1", "image2", "flow"):
             assert torch.equal(sample[key], original[key])
     pixels = 64 * 64
-    assert resident(pairs, torch.device("cpu"), 0, room=3 * pixels * (3 + 12 + 8)) is not None
+    assert resident(pairs, torch.device("cpu"), room=3 * pixels * (3 + 12 + 8)) is not None
     # Fails with images that are always kept as float32, and without a limit.
-    assert resident(pairs, torch.device("cpu"), 0, room=3 * pixels * (3 + 12 + 8) - 1) is None
+    assert resident(pairs, torch.device("cpu"), room=3 * pixels * (3 + 12 + 8) - 1) is None
 
 
 def sample() -> dict:
