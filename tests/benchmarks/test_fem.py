@@ -30,7 +30,6 @@ def posed(trajectory: Trajectory, displacement: np.ndarray, force: tuple[float, 
 
 
 def test_errors_of_known_fields(shallow: Trajectory) -> None:
-    """Fails with the z component left in px, with the tangential error of lengths in place of vectors."""
     still = np.zeros_like(shallow.states[1].displacement)
     truth = posed(shallow, still + np.array([0, 0, 2.0]), (0.3, 0.4, 1.0))
     off = errors(posed(shallow, still + np.array([0.03, 0.04, 2.12]), (0.4, 0.3, 1.1)), truth, [1])
@@ -44,7 +43,7 @@ def test_errors_of_known_fields(shallow: Trajectory) -> None:
 
 
 def test_face_displacement_is_the_surface(shallow: Trajectory) -> None:
-    """A field linear in x and y is interpolated exactly, whichever the mesh. Fails with the grid's axes exchanged."""
+    """A field linear in x and y is interpolated exactly, whichever the mesh."""
     x, y, _ = shallow.space.points.T
     linear = posed(shallow, np.stack([x, y, 3 * x - y], axis=1), (0, 0, 1))
     points = face_grid(PAD_MM, (61, 46))
@@ -121,7 +120,6 @@ def test_settings_are_well_formed() -> None:
 
 
 def test_best_rows_and_speed_up() -> None:
-    """Fails with < replaced by > in `mark_best`, and with incomplete rows kept."""
     figures = [(10, 1), (1, 4), (2, 5), (4, 2), (0.5, None)]
     rows: list[Row] = [{"seconds": s, **({} if e is None else {"displacement_percent": e})} for s, e in figures]
     mark_best(rows)
@@ -130,7 +128,6 @@ def test_best_rows_and_speed_up() -> None:
 
 
 def test_short_presses_are_timed_three_times(monkeypatch: pytest.MonkeyPatch, shallow: Trajectory) -> None:
-    """Fails with the mean in place of the median."""
     for ends, median in (([0, 1.0, 1, 1.5, 2, 9], 1.0), ([0, 3.0], 3.0)):
         clock = iter(ends)
         monkeypatch.setattr("time.process_time", lambda clock=clock: next(clock))

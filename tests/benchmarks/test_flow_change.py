@@ -30,10 +30,7 @@ def flat(value: float, channels: int = 3) -> Image:
 
 @pytest.mark.parametrize("channels", [1, 3])
 def test_changes_of_a_known_method(channels: int) -> None:
-    """True motion 3 px; 4 px are measured on the clean pair and 4, 5, 3, 4 px on the four noisy pairs.
-
-    Fails with the compared images' errors not subtracted, and with first and second image exchanged.
-    """
+    """True motion 3 px; 4 px are measured on the clean pair and 4, 5, 3, 4 px on the four noisy pairs."""
     noisy = [[flat(v, channels) for v in state] for state in ((0.2, 0.1), (0.6, 0.5))]
     clean = [2 * [flat(v, channels)] for v in (0.2, 0.6)]
     counts = np.ones((60, 80), dtype=bool)
@@ -48,7 +45,6 @@ def test_changes_of_a_known_method(channels: int) -> None:
 
 
 def test_the_same_camera_noise_on_both_pairs() -> None:
-    """Fails with noise drawn anew for the images that are compared with."""
     camera = CAMERA.model_copy(update={"read_noise": 0.2})
     pictures = [[flat(0.5)], [flat(0.5)]]
     truth = Truth(np.zeros((60, 80, 2)), np.ones((60, 80), dtype=bool))
@@ -59,10 +55,7 @@ def test_the_same_camera_noise_on_both_pairs() -> None:
 
 
 def test_jackknife_of_a_sum() -> None:
-    """For values a_i + b_j it is exactly the standard error of the mean of a + b.
-
-    Fails with the factor S - 1 forgotten, and with rows alone left out (half of it).
-    """
+    """For values a_i + b_j it is exactly the standard error of the mean of a + b."""
     rng = np.random.default_rng(0)
     a, b = rng.standard_normal((2, 7))
     expected = np.std(a + b, ddof=1) / 7**0.5

@@ -20,7 +20,7 @@ def score(method: str, psnr_db: float, error_px: float | None) -> PairScore:
 
 
 def test_counts_of_made_up_scores() -> None:
-    """A higher PSNR is better and a smaller error; equal is not better. Fails with either sign exchanged."""
+    """A higher PSNR is better and a smaller error; equal is not better."""
     best = [score("a", 30, 0.05), score("a", 20, 0.3), score("a", 25, 1.5)]
     other = [score("b", 29, 0.05), score("b", 21, 0.4), score("b", 24, 1.6)]
     row = counted(best, other)

@@ -126,7 +126,7 @@ def test_broken_pair_is_named(tmp_path: Path) -> None:
 
 
 def test_a_pair_where_nothing_can_be_followed_is_scored_as_no_motion(tmp_path: Path) -> None:
-    """Not left out: the other pairs' mean would flatter the method. Fails if the first pair's flow is used again."""
+    """Not left out: the other pairs' mean would flatter the method."""
     folder = write_folder(tmp_path, {"a": (2, 0), "b": (2, 0)})
     for number in (1, 2):
         save(folder / f"b_{number}.png", np.full((64, 80, 3), 0.5, np.float32))
@@ -136,7 +136,6 @@ def test_a_pair_where_nothing_can_be_followed_is_scored_as_no_motion(tmp_path: P
 
 
 def test_the_exact_flow_is_a_row_on_synthetic_pairs_only(tmp_path: Path) -> None:
-    """Fails with the truth negated, and with its gaps left in: the strip without gel is black in the warped image."""
     dataset = open_pairs(write_synthetic(tmp_path / "exact", [(2.0, 1.0)]))
     (exact,) = evaluate(named_methods(["exact"])[0], dataset)
     (true,) = evaluate(Constant("true", 2, 1), dataset)
@@ -152,7 +151,6 @@ SHIFTS = [(3.0, 4.0), (0.0, 0.5), (1.0, 0.0), (2.0, 0.0)]
 
 
 def test_a_comparison_read_back_is_the_same(tmp_path: Path) -> None:
-    """Fails with the bins left out of the file."""
     dataset = open_pairs(write_synthetic(tmp_path / "data", SHIFTS))
     written = compare([Constant("zero", 0, 0), Constant("right", 3, 4)], dataset, tmp_path / "out")
     again = read_comparison(tmp_path / "out" / "scores.json")
@@ -196,7 +194,6 @@ def test_methods_are_added_and_scored_again(tmp_path: Path, capsys: pytest.Captu
 
 
 def test_a_moved_copy_of_the_data_is_the_same_data_and_other_pairs_are_not(tmp_path: Path) -> None:
-    """Fails without the check of the true motion: the last folder's pairs have the same names."""
     first = open_pairs(write_synthetic(tmp_path / "first", [(1.0, 0.0), (0.0, 2.0)]))
     moved = open_pairs(write_synthetic(tmp_path / "moved", [(1.0, 0.0), (0.0, 2.0)]))
     longer = open_pairs(write_synthetic(tmp_path / "longer", [(1.0, 0.0), (0.0, 2.0), (3.0, 0.0)]))
@@ -254,7 +251,6 @@ class Working:
 
 
 def test_processor_time_is_that_of_the_work(tmp_path: Path) -> None:
-    """Fails with perf_counter in place of process_time."""
     dataset = open_pairs(write_folder(tmp_path, {"a": (1, 0)}))
     waiting, busy = (score_pair(Working(kind), dataset, 0) for kind in (False, True))
     # Sleeping costs well under a ms a call; clocks tick at least every 10 ms.

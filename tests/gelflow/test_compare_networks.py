@@ -155,7 +155,6 @@ UNSUITABLE: dict[str, Any] = {
 
 @pytest.mark.parametrize("preset", ["best", "real", "bare", "paper", "selfflow"])
 def test_whatever_the_preset_the_pairs_are_seen_as_they_are_and_without_truth(preset: str, tmp_path: Path) -> None:
-    """Fails with any one of the fixed settings left out that this preset sets otherwise."""
     recorded = train_config(preset)
     levels = recorded.model.levels
     model = ModelConfig(levels=levels, projected_channels=8, estimator="shared", registration=RegistrationConfig())
@@ -177,7 +176,6 @@ def test_whatever_the_preset_the_pairs_are_seen_as_they_are_and_without_truth(pr
 
 
 def test_nothing_else_of_the_training_carries_over(tmp_path: Path) -> None:
-    """Fails with the machine's settings (devices, workers) left as recorded."""
     recorded = TrainConfig.model_validate({"model": SMALL} | UNSUITABLE)
     method = Learned(random_weights(tmp_path / "w.safetensors", SMALL, recorded), device="cpu")
     settings = fine_tuning_settings(method, 12, None, pairs=3)
@@ -189,7 +187,6 @@ def test_nothing_else_of_the_training_carries_over(tmp_path: Path) -> None:
 
 
 def test_a_constant_rate_and_the_size_of_use_are_kept(tmp_path: Path) -> None:
-    """Fails with the size of the training where --size gives another: the pairs would be scored at a size not seen."""
     recorded = TrainConfig.model_validate({"model": SMALL} | UNSUITABLE | {"schedule": "constant", "warmup_steps": 0})
     path = random_weights(tmp_path / "w.safetensors", SMALL, recorded, (96, 128))
     settings = fine_tuning_settings(Learned(path, size=(64, 80), device="cpu"), 12, None, pairs=3)
@@ -199,7 +196,6 @@ def test_a_constant_rate_and_the_size_of_use_are_kept(tmp_path: Path) -> None:
 
 
 def test_exact_flow_is_not_looked_at(tmp_path: Path) -> None:
-    """Fails with supervision = "flow" or "mixed" carried over: the same images with and without their exact flow."""
     shifts = [(1.5, 0.5), (-1.0, 0.0)]
     plain = open_pairs(write_folder(tmp_path / "plain", {"a": shifts[0], "b": shifts[1]}))
     exact = open_pairs(write_synthetic(tmp_path / "exact", shifts))

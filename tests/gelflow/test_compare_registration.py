@@ -50,7 +50,6 @@ def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_settings_are_the_weights_own_or_those_of_an_aim(plain: Path, own: Path) -> None:
-    """Fails with an aim's settings where none is asked for, and with "none" read as "as the weights say"."""
     motion, brightness = REGISTRATIONS["motion"], REGISTRATIONS["brightness"]
     expected: list[tuple[Path, Registration | None, RegistrationConfig | None, str]] = [
         (plain, None, None, ""), (plain, "none", None, ""), (plain, "motion", motion, "+motion"),
@@ -74,12 +73,10 @@ def test_the_settings_are_the_weights_own_or_those_of_an_aim(plain: Path, own: P
     ],
 )
 def test_the_name_says_so_and_stays_one_of_a_group_of_seeds(plain: Path, label: str, name: str) -> None:
-    """Fails with the suffix at the very end: seeds are no group then, and "+ft" is not seen."""
     assert Learned(plain, label, device="cpu", registration="motion").name == name
 
 
 def test_rows_without_and_with_stand_in_one_table(plain: Path, tmp_path: Path) -> None:
-    """Fails with the registration not handed on to `estimate_flow`."""
     folder, out = write_folder(tmp_path / "data", {"a": (1.0, -0.5)}), tmp_path / "out"
     arguments = ["compare", str(folder), "--methods", "none", "--weights", f"net={plain}", "--device", "cpu"]
     assert main([*arguments, *ROWS, "--ft", "2", "--batch", "0", "--out", str(out)]) == 0
@@ -99,13 +96,11 @@ def test_a_row_is_what_registration_makes_of_the_networks_flow(plain: Path, tmp_
     images = dataset.images(0)
     start, found = (Learned(plain, device="cpu", registration=choice).flow(*images) for choice in CHOICES)
     tensors = [torch.from_numpy(np.moveaxis(array, -1, 0).copy())[None] for array in (start, *images)]
-    assert BRIGHTNESS is not None
     again = registered(*tensors, BRIGHTNESS)[0].numpy()
     np.testing.assert_array_equal(np.moveaxis(found, -1, 0), again)
 
 
 def test_the_speed_of_the_network_alone_includes_it(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fails with the speed of the network's own forward pass, and with `Learned.forward` without the registration."""
     dataset = open_pairs(write_folder(tmp_path, {"a": (1.0, -0.5)}))
     images = [torch.from_numpy(np.moveaxis(image, -1, 0).copy())[None] for image in dataset.images(0)]
     measured = []
@@ -122,7 +117,6 @@ def test_the_speed_of_the_network_alone_includes_it(own: Path, tmp_path: Path, m
 
 
 def test_its_time_counts(plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fails with the second reading of the clock before the method's call."""
 
     def slow(*arguments: object) -> torch.Tensor:
         time.sleep(0.3)
@@ -135,7 +129,6 @@ def test_its_time_counts(plain: Path, tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_predict_and_evaluate_take_it(plain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Fails with the option not handed on by either command."""
     folder = write_folder(tmp_path / "data", {"a": (1.0, -0.5)})
     common = ["--weights", str(plain), "--device", "cpu", "--registration"]
     flows = []

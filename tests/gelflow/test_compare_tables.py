@@ -26,7 +26,6 @@ def test_the_seed_is_a_number_at_the_end() -> None:
 
 
 def test_seeds_become_mean_and_standard_deviation(tmp_path: Path) -> None:
-    """Fails with the population's standard deviation (n in place of n - 1)."""
     dataset = open_pairs(write_synthetic(tmp_path, [(1.0, 0.0), (2.0, 0.0)]))
     methods = [Constant("net#0", 0, 0), Constant("other", 5, 0), Constant("net#1", 0.5, 0), Constant("net#2", 1, 0)]
     scores = [score for method in methods for score in evaluate(method, dataset)]
@@ -79,7 +78,6 @@ def test_latex_escapes_what_it_must() -> None:
 
 
 def test_distance_is_signed_and_measured_from_the_edge_between_pixels() -> None:
-    """Fails with the sign exchanged and without the half pixel."""
     region = np.zeros((5, 12), bool)
     region[:, :4] = True
     np.testing.assert_array_equal(signed_distance(region)[2], [-3.5, -2.5, -1.5, -0.5, *np.arange(0.5, 8)])
@@ -144,7 +142,6 @@ def with_contact(folder: Path, pattern: dict) -> Path:
 
 @pytest.mark.parametrize("pattern", [DRAWN_KIND, DRAWN_PATTERN], ids=["kind", "pattern"])
 def test_a_data_set_with_contact_and_patterns_is_sorted(pattern: dict, tmp_path: Path) -> None:
-    """Fails, where the whole pattern is drawn, with the kind looked up in the header alone."""
     dataset = open_pairs(with_contact(tmp_path / "data", pattern))
     result = compare([Constant("zero", 0, 0), Constant("right", 3, 0)], dataset, tmp_path / "out")
     header, rows = strata_table(result.strata)

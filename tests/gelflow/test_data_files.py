@@ -132,7 +132,6 @@ def test_grey_has_three_equal_channels_and_alpha_is_dropped(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_a_photograph_is_turned_as_its_exif_says(tmp_path: Path, orientation: int) -> None:
-    """Fails with cv2.IMREAD_UNCHANGED, which takes the pixels as they are stored."""
     stored = Image.fromarray(as_bytes(moved(24, 40, 0, 0)))
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = orientation

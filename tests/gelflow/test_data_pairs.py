@@ -19,9 +19,6 @@ def test_synthetic_sample_has_images_flow_and_visibility(tmp_path: Path) -> None
     assert dataset.names == ["000000", "000001"]
     sample = dataset[0]
     image1, flow, visible = sample["image1"], sample["flow"], sample["visible"]
-    assert isinstance(image1, torch.Tensor)
-    assert isinstance(flow, torch.Tensor)
-    assert isinstance(visible, torch.Tensor)
     expected = np.moveaxis(as_bytes(moved(64, 80, 0, 0)), -1, 0) / np.float32(255)
     np.testing.assert_array_equal(image1.numpy(), expected.astype(np.float32))
     assert flow.shape == (2, 64, 80)
@@ -122,7 +119,6 @@ def test_plain_folder_with_markers(tmp_path: Path) -> None:
     dataset = open_pairs(folder)
     assert dataset.names == ["a", "b"]
     markers = dataset.markers(0)
-    assert markers is not None
     assert markers.tolist() == [[1, 2, 3, 4], [5, 6, 7, 8.5]]
     assert dataset.markers(1) is None
     assert dataset.truth(0) is None

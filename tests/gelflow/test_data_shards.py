@@ -68,7 +68,6 @@ def all_bits(dataset: PairDataset) -> list[dict[str, tuple[object, ...]]]:
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_shards_give_the_bits_of_the_data_set(tmp_path: Path, dtype: type) -> None:
-    """Fails with the order of keys as texts, visibility left out, and U and V exchanged."""
     data, shards = (
         open_pairs(path) for path in write_both(tmp_path, [synth_sample(index, dtype) for index in INDICES])
     )
@@ -82,7 +81,6 @@ def test_shards_give_the_bits_of_the_data_set(tmp_path: Path, dtype: type) -> No
 
 
 def test_backward_flow_is_that_of_the_data_set(both: tuple[Path, Path]) -> None:
-    """Fails with the forward flow, or its visibility, in the backward's place."""
     data, shards = (open_pairs(path).both_directions() for path in both)
     assert all_bits(shards) == all_bits(data)
 
@@ -112,10 +110,7 @@ def test_workers_and_copies_read_the_same(both: tuple[Path, Path]) -> None:
 
 
 def test_training_from_shards_gives_the_weights_of_the_data_set(both: tuple[Path, Path], tmp_path: Path) -> None:
-    """One run from the directory, and one from shards that is interrupted half way and resumed.
-
-    Fails with the shards in reverse order.
-    """
+    """One run from the directory, and one from shards that is interrupted half way and resumed."""
     # Validated after two steps in both runs, so that both choose their best weights among the same.
     short, whole = (small(supervision="flow", validate_every=2, steps=steps) for steps in (2, 4))
     data, shards = (open_pairs(path) for path in both)
@@ -182,7 +177,6 @@ DAMAGE = {
 
 @pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE.keys())
 def test_truncated_and_damaged_shards_are_named(shard: Path, damage: Callable[[Path], bytes]) -> None:
-    """Fails without the look at the end of the tar: tarfile then gives the samples before a damaged header as all."""
     assert len(open_pairs(shard)) == 2
     shard.write_bytes(damage(shard))
     for path in (shard, shard.parent):
@@ -211,7 +205,6 @@ def test_a_missing_member_is_named(shard: Path, suffix: str) -> None:
 
 
 def test_two_samples_of_one_key_are_named(shard: Path) -> None:
-    """Fails with the later of the two taken."""
     shutil.copy(shard, shard.with_name("other.tar"))
     with pytest.raises(InputError, match=r"shard-000000\.tar: sample 000000 is in .*other\.tar, too"):
         open_pairs(shard.parent)

@@ -159,7 +159,6 @@ def test_spline_warping_is_exact_at_pixels_and_blurs_less_between() -> None:
 
 
 def test_occlusion_keeps_what_closes() -> None:
-    """Fails with the backward flow read at x in place of x + forward(x)."""
     x, y = pixel_centres(40, 60)
     # A stretch about the middle: forward x' = 1.4 x, backward exactly its inverse, so that x + forward closes.
     forward = torch.stack([0.4 * (x - 30), 0.4 * (y - 20)])[None]
@@ -174,7 +173,6 @@ def test_occlusion_keeps_what_closes() -> None:
 
 def test_a_flow_that_closes_nowhere_hides_nothing() -> None:
     """Else a loss over no pixel would leave a new network where it is. The second pair closes on a fifth."""
-    # Fails with the share taken over the batch.
     forward, backward = torch.full((2, 2, 10, 20), 1.5), torch.full((2, 2, 10, 20), 1.5)
     backward[1, :, :4] = -1.5
     seen = visible_in_both_images(forward, backward)
@@ -196,7 +194,6 @@ def test_a_mask_removes_pixels_from_the_photometric_loss() -> None:
 
 
 def test_the_transformed_pair_moves_as_its_flow_says() -> None:
-    """Fails with the flow not turned by the inverse of the transformation."""
     flow = press_flow(120, 160, 3.0)[None]
     image1, image2 = (image[None] for image in moved_pair(flow[0], seed=8, shortest=24, longest=60))
     for seed in (1, 2, 3):
@@ -221,10 +218,8 @@ def test_the_transformation_follows_the_generator() -> None:
 
 
 def test_best_judges_every_scale_so_that_the_true_flow_wins() -> None:
-    """At each scale that `best` judges, the truth beats no flow and 0.9 and 1.1 times itself.
-
-    The published loss does not: from s = 3 on it prefers less motion (the second assertion). Fails with
-    compare_at = "scale" in the preset.
+    """At each scale that `best` judges, the truth beats no flow and 0.9 and 1.1 times itself. The published loss does
+    not: from s = 3 on it prefers less motion (the second assertion).
     """
     flow = press_flow(240, 320, 8.0)[None]
     image1, image2 = (image[None] for image in moved_pair(flow[0], seed=5))

@@ -169,7 +169,6 @@ TERMS = {
 @pytest.mark.parametrize("masked", [False, True], ids=["all pixels", "some hidden"])
 @pytest.mark.parametrize("term", list(TERMS))
 def test_the_gradient_is_that_of_finite_differences(term: str, masked: bool) -> None:
-    """Fails, where a term is detached, with an analytical gradient of zero."""
     random = torch.Generator().manual_seed(5)
     # Of little contrast, so that weights exp(-10 |grad I|) do not vanish.
     images = (0.4 + 0.2 * torch.rand(2, 1, 3, 9, 10, generator=random, dtype=torch.float64)).unbind()

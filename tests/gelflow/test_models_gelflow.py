@@ -196,7 +196,6 @@ def test_gradients_agree_with_finite_differences() -> None:
 
 
 def test_it_corrects_its_scale_and_the_finer_one() -> None:
-    """Fails with the finer scales enlarged from the unrefined flow."""
     torch.manual_seed(0)
     network = GelFlow(ModelConfig(levels=4, refine="half", refine_iterations=2))
     images = torch.rand(2, 1, 3, 66, 71).unbind()

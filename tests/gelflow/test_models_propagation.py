@@ -28,7 +28,7 @@ def spread(flow: Tensor, *distances: int) -> Tensor:
 
 @pytest.mark.parametrize("ignore_shading", [False, True])
 def test_noise_moves_nothing(ignore_shading: bool) -> None:
-    """Two grey images with a camera's noise: all flows are alike. Fails with residuals of noise compared."""
+    """Two grey images with a camera's noise: all flows are alike."""
     grey = torch.full((1, 3, HEIGHT, WIDTH), 0.5)
     noise = NOISE * torch.randn(grey.shape, generator=torch.Generator().manual_seed(0))
     flow = torch.randn((1, 2, HEIGHT, WIDTH), generator=torch.Generator().manual_seed(1))
@@ -36,9 +36,8 @@ def test_noise_moves_nothing(ignore_shading: bool) -> None:
 
 
 def test_without_a_match_flows_stay() -> None:
-    """Images that have nothing to do with each other. Fails with any lesser residual taken (MAX_RESIDUAL_RATIO = 1).
-
-    A residual is the mean of some 3 x 113 squares, so that two of them differ by 7 % or so, rarely by a sixth.
+    """Images that have nothing to do with each other. A residual is the mean of some 3 x 113 squares, so that two of
+    them differ by 7 % or so, rarely by a sixth.
     """
     image1, _, _ = moved_texture()
     other = torch.rand(image1.shape, generator=torch.Generator().manual_seed(0))
@@ -50,7 +49,6 @@ def test_without_a_match_flows_stay() -> None:
 
 @pytest.mark.parametrize("lost", [(slice(40, 56), slice(None)), (slice(None), slice(60, 76))], ids=["rows", "columns"])
 def test_a_lost_strip_takes_the_flow_beside_it(lost: tuple[slice, slice]) -> None:
-    """Fails with neighbours along one axis only, and with the worst of them taken."""
     _, _, truth = moved_texture()
     flow = truth.clone()
     flow[..., lost[0], lost[1]] = WRONG
@@ -58,11 +56,7 @@ def test_a_lost_strip_takes_the_flow_beside_it(lost: tuple[slice, slice]) -> Non
 
 
 def test_a_gels_flow_is_extrapolated() -> None:
-    """A stretched texture of which a strip of 12 px is lost, under a window that reduces images to a quarter.
-
-    Fails without slopes, or with their sign turned (a neighbour at 32 px moves by 3.2 px less or more), with distances
-    not reduced as the images are, and with a flow that is not.
-    """
+    """A stretched texture of which a strip of 12 px is lost, under a window that reduces images to a quarter."""
     x, y = grid(HEIGHT, WIDTH)
     u = 0.1 * (x - WIDTH / 2)
     image1, image2 = (
@@ -78,9 +72,8 @@ def test_a_gels_flow_is_extrapolated() -> None:
 
 
 def test_light_is_ignored_or_followed() -> None:
-    """A lamp that is switched on at the right. Fails with the mean left in the residual, and with it taken out always.
-
-    Beside it there is a flow that would find as bright a place, and no better a pattern.
+    """A lamp that is switched on at the right. Beside it there is a flow that would find as bright a place, and no
+    better a pattern.
     """
     image1, image2, truth = moved_texture()
     flow = truth.clone()
@@ -95,7 +88,6 @@ def test_light_is_ignored_or_followed() -> None:
 
 
 def test_nothing_that_was_not_there_is_found() -> None:
-    """Fails with any search, or any mean of flows."""
     _, _, truth = moved_texture()
     lost = torch.zeros_like(truth)
     lost[..., 64:] = 5.0

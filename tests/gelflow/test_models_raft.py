@@ -84,7 +84,6 @@ def published_names(large: bool) -> dict[str, tuple[int, ...]]:
 
 @pytest.mark.parametrize("large", [False, True])
 def test_a_published_state_dictionary_loads_strictly(large: bool, tmp_path: Path) -> None:
-    """Fails with `convc2` left out of the motion encoder, and with names that keep `module.`."""
     torch.manual_seed(1)
     tensors: dict[str, Tensor] = {}
     for name, shape in published_names(large).items():
@@ -110,7 +109,6 @@ def test_the_flow_has_the_images_size(large: bool, size: tuple[int, int]) -> Non
 
 
 def test_the_encoders_see_images_between_minus_one_and_one(small: RAFT) -> None:
-    """Fails with images handed on in [0, 1], which the published weights would hardly show."""
     seen: list[tuple[float, float]] = []
     handles = [net.register_forward_pre_hook(lambda _, inputs: seen.append((inputs[0].min(), inputs[0].max())))
                for net in (small.fnet, small.cnet)]  # fmt: skip
@@ -133,7 +131,7 @@ def test_pairs_of_a_batch_do_not_see_each_other(small: RAFT) -> None:
 
 
 def test_padding_does_not_shift_the_flow(small: RAFT) -> None:
-    """What is cut off is what was added. Fails with the crop taken from the corner in place of the padding's inside."""
+    """What is cut off is what was added."""
     inner = torch.rand(2, 1, 3, 76, 84).unbind()
     framed = [torch.nn.functional.pad(image, (2, 2, 2, 2), mode="replicate") for image in inner]
     with torch.no_grad():
@@ -142,7 +140,6 @@ def test_padding_does_not_shift_the_flow(small: RAFT) -> None:
 
 
 def test_the_lookup_reads_indices_and_orders_displacements_column_by_column() -> None:
-    """Fails with the half-pixel position (i + 1/2) / 2^k - 1/2, and with rows before columns."""
     features1, features2 = torch.rand(2, 1, 5, 16, 24, dtype=torch.float64)
     pyramid = correlation_pyramid(features1, features2)
     product = torch.einsum("bchw,bcij->bhwij", features1, features2) / 5**0.5
@@ -179,7 +176,6 @@ def test_enlarging_keeps_a_constant_and_multiplies_by_eight() -> None:
 
 @needs_weights
 def test_published_small_weights_see_shifts_and_no_motion() -> None:
-    """Fails with the two components of the flow exchanged."""
     network = load_raft(PUBLISHED)
     for u, v in ((0.0, 0.0), (1.5, -0.75), (3.3, 2.1), (6.0, -4.0)):
         with torch.no_grad():

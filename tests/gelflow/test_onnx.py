@@ -26,7 +26,7 @@ def weights(tmp_path: Path) -> Path:
 
 
 def test_both_forms_of_the_correlation_agree() -> None:
-    """The exported graph holds another form. Fails with `padding=radius` left out of it."""
+    """The exported graph holds another form."""
     first, second = torch.rand(2, 2, 5, 7, 9, dtype=torch.float64)
     torch.testing.assert_close(local_correlation(first, second, 3), _unfolded(first, second, 3), rtol=0, atol=1e-14)
 

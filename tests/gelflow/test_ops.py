@@ -98,7 +98,6 @@ GENERATOR = torch.Generator().manual_seed(0)
 
 
 def test_it_is_scipys_cubic_spline() -> None:
-    """Fails with x and y exchanged in the flow, and with the coefficients' margin left out of the sampled place."""
     image = torch.rand(1, 2, 17, 23, generator=GENERATOR, dtype=torch.float64)
     flow = 6 * torch.rand(1, 2, 17, 23, generator=GENERATOR, dtype=torch.float64) - 3
     rows, columns = np.mgrid[:17, :23].astype(float)
@@ -119,7 +118,6 @@ def test_no_flow_gives_the_image_and_the_border_goes_on_outside() -> None:
 
 
 def test_lowered_precision_does_not_reach_it() -> None:
-    """Fails with the products under autocast: three digits."""
     image = torch.rand(1, 3, 12, 10, generator=GENERATOR)
     with torch.autocast("cpu", torch.bfloat16):
         found = warp(image, torch.zeros(1, 2, 12, 10), "spline")
@@ -149,7 +147,6 @@ LIKE = torch.zeros((), dtype=torch.float64)
 
 
 def test_sums_are_those_of_a_convolution_with_zeros_beyond_the_border() -> None:
-    """Fails with the two axes exchanged, and with sums divided by the window's."""
     field = torch.rand(2, 3, 21, 34, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     found = window_sums(21, 34, 2.5, LIKE)(field).numpy()
     expected = field.numpy()
@@ -161,7 +158,6 @@ def test_sums_are_those_of_a_convolution_with_zeros_beyond_the_border() -> None:
 
 
 def test_smoothing_keeps_affine_fields_up_to_the_border() -> None:
-    """Fails with the border repeated, and with it mirrored, beyond the image."""
     y, x = torch.meshgrid(torch.arange(20.0).double(), torch.arange(30.0).double(), indexing="ij")
     field = torch.stack([3 + 0.2 * x - 0.1 * y, x * y])[None]
     # Both are affine along each axis. That of 8 px would reach beyond the other border.
@@ -316,7 +312,6 @@ def test_one_tensor_for_each_set_of_arguments() -> None:
 
 
 def test_a_tensor_made_in_inference_mode_takes_part_in_training() -> None:
-    """Fails without leaving inference mode: autograd refuses to save what was made there."""
 
     @cached
     def twos(pixels: int) -> torch.Tensor:
@@ -326,5 +321,4 @@ def test_a_tensor_made_in_inference_mode_takes_part_in_training() -> None:
         twos(3)
     x = torch.ones(3, requires_grad=True)
     (twos(3) * x).sum().backward()
-    assert x.grad is not None
     assert x.grad.tolist() == [2.0, 2.0, 2.0]

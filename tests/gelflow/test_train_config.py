@@ -85,7 +85,6 @@ def test_what_earlier_versions_recorded_is_read_where_it_means_the_same() -> Non
 
 
 def test_registration_has_names() -> None:
-    """Fails with names merged into the settings of the weights that a fine-tuning starts from."""
     start = {"model": ModelConfig(registration=REGISTRATIONS["brightness"]).model_dump()}
     for name, meant in REGISTRATIONS.items():
         assert train_config(None, [f"model.registration={name}"], start=start).model.registration == meant
@@ -95,7 +94,6 @@ def test_registration_has_names() -> None:
 
 @pytest.mark.parametrize("preset", ["best", "real", "bare"])
 def test_a_field_changes_a_registration_that_has_a_name(preset: str) -> None:
-    """Fails with names left as they are until all settings have been merged."""
     for start in (None, {"model": ModelConfig(registration=REGISTRATIONS["brightness"]).model_dump()}):
         config = train_config(preset, ["model.registration.prior_px=0.5"], start=start)
         assert config.model.registration == RegistrationConfig(prior_px=0.5)

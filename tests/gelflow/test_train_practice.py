@@ -37,12 +37,10 @@ def pairs() -> Shifts:
 
 
 def test_the_average_follows_the_weights_and_is_what_is_kept(pairs: Shifts, tmp_path: Path) -> None:
-    """Fails with the average moved before the optimiser's step."""
     kept = []
     for steps in (1, 2):
         result = train(small(steps=steps, ema_decay=0.75), pairs, None, tmp_path / str(steps))
         state = load_state(tmp_path / str(steps))
-        assert state.average is not None
         kept.append((state.model, state.average))
         loaded = load_weights(result.weights).state_dict()
         assert all(torch.equal(loaded[name], state.average[name]) for name in loaded)
@@ -53,7 +51,6 @@ def test_the_average_follows_the_weights_and_is_what_is_kept(pairs: Shifts, tmp_
 
 
 def test_a_resumed_run_with_everything_on_ends_with_the_same_weights(pairs: Shifts, tmp_path: Path) -> None:
-    """Fails with the average left out of the saved state, and with an unseeded transformation."""
     loss = {"lambda_s": [1.0, 1.0, 1.0], "occlusion": "forward_backward", "lambda_ar": 0.01}
     options = {"loss": loss, "ema_decay": 0.9}
     whole = train(small(steps=4, **options), pairs, None, tmp_path / "whole")
@@ -67,7 +64,6 @@ def test_losses_that_trust_the_flow_wait_for_their_stage(
     step: int, late: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Else every pixel of a new network is judged hidden, and its flow grows without end."""
-    # Fails with either of the two from the start.
     asked: list[bool] = []
     monkeypatch.setattr(FlowModule, "step", step)
     monkeypatch.setattr(module, "visible_in_both_images", lambda *flows: asked.append(True))
@@ -87,10 +83,7 @@ def test_bfloat16_trains_and_keeps_float32_weights(pairs: Shifts, tmp_path: Path
 @pytest.mark.slow
 @pytest.mark.parametrize("option", ["--devices", "--nodes"])
 def test_two_processes_end_as_one_with_twice_the_batch(tmp_path: Path, option: str) -> None:
-    """Gradients are averaged over processes, so that 2 x 1 pairs are 1 x 2 pairs.
-
-    Fails with both processes given the same pairs.
-    """
+    """Gradients are averaged over processes, so that 2 x 1 pairs are 1 x 2 pairs."""
     folder = write_synthetic(tmp_path / "data", [(1.0, 0.5)] * 4, (64, 64))
     options = {"steps": 3, "learning_rate": 1e-4, "supervision": "flow"}
     one = train(small(batch_size=2, **options), open_pairs(folder), None, tmp_path / "one").weights
@@ -125,10 +118,7 @@ def test_two_processes_end_as_one_with_twice_the_batch(tmp_path: Path, option: s
     ],
 )
 def test_sigterm_stops_a_run_as_ctrl_c_does(tmp_path: Path, send: Callable[[int, int], None], devices: int) -> None:
-    """Sent to all its processes, as SLURM does, or to the first, as `timeout` does.
-
-    Fails with Lightning's handler, with workers that the signal ends, and where processes do not stop together.
-    """
+    """Sent to all its processes, as SLURM does, or to the first, as `timeout` does."""
     folder, out = write_folder(tmp_path / "data", {"a": (1.0, 0.5)}, (64, 64)), tmp_path / "run"
     settings = tmp_path / "settings.toml"
     settings.write_text("steps = 100_000\nbatch_size = 1\nsave_every = 1\nworkers = 1\n[model]\nlevels = 4\n"
@@ -154,7 +144,6 @@ def test_sigterm_stops_a_run_as_ctrl_c_does(tmp_path: Path, send: Callable[[int,
 
 def test_speed_and_memory_are_reported(pairs: Shifts, tmp_path: Path) -> None:
     result = train(small(steps=10), pairs, None, tmp_path)
-    assert result.pairs_per_second is not None
     assert result.pairs_per_second > 0
     assert "pairs/s" in str(result)
     rows = list(csv.DictReader(next(tmp_path.glob("logs/csv/*/metrics.csv")).open()))
@@ -174,7 +163,6 @@ def flow_module() -> FlowModule:
 
 
 def test_each_pair_counts_by_what_is_known_of_it() -> None:
-    """Fails with the self-supervised loss over the whole batch, and with its weight left out."""
     samples = [checked(sample) for sample in Shifts(3, 64, 2.0, seed=4)]
     samples[1]["flow"] = torch.full((2, 64, 64), torch.nan)
     samples[2]["flow"][:, :5] = torch.nan  # known in part: supervised
@@ -213,7 +201,6 @@ def test_a_run_on_both_kinds_trains(tmp_path: Path) -> None:
 
 
 def test_scales_have_weights_of_their_own_under_supervision() -> None:
-    """Fails with `lambda_s` used although `flow_s` is given."""
     flows = [torch.rand(1, 2, 64 >> s, 64 >> s) for s in range(3)]
     truth = torch.zeros(1, 2, 64, 64)
     only_coarse = LossConfig(lambda_s=(1, 0, 0), flow_s=(0, 0, 2))

@@ -105,7 +105,6 @@ def test_a_run_killed_between_saves_goes_back_to_the_last_one_and_ends_the_same(
 
 
 def test_a_pair_that_a_loading_process_cannot_use_is_named_and_the_process_ends(pairs: Shifts, tmp_path: Path) -> None:
-    """Fails with torch's traceback in the message, and with processes that ignore SIGTERM: Python waits for them."""
 
     class Broken(CtrlC):
         def happens(self) -> None:
@@ -126,7 +125,6 @@ def test_a_pair_that_a_loading_process_cannot_use_is_named_and_the_process_ends(
 def test_a_run_whose_validation_failed_is_saved_and_validates_when_resumed(
     pairs: Shifts, tmp_path: Path, steps: int
 ) -> None:
-    """Fails without a save before the validation, and with a resumed run that leaves out what is due."""
 
     class OneSmall(CtrlC):
         def __getitem__(self, index: int) -> dict:
@@ -182,7 +180,6 @@ def test_without_truth_the_photometric_loss_chooses(tmp_path: Path) -> None:
     pairs = Shifts(2, 64, 1.0, seed=2, flow=False)
     result = train(small(steps=2, validate_every=1), pairs, pairs, tmp_path)
     assert set(result.metrics) == {"psnr_db", "no_motion_psnr_db", "photometric_loss"}
-    assert result.best is not None
     assert result.best <= result.metrics["photometric_loss"]
 
 
@@ -277,5 +274,4 @@ def test_training_learns_the_motion_of_a_few_pairs(supervision: str, tmp_path: P
         model={"levels": 4, "projected_channels": 16}, supervision=supervision, batch_size=4, steps=20, flip=False,
         schedule="one_cycle", warmup_steps=5, gradient_clip=1.0)  # fmt: skip
     result = train(config, pairs, pairs, tmp_path)
-    assert result.best is not None
     assert result.best < result.metrics["no_motion_endpoint_error_px"] / 3
