@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import torch
 from safetensors.torch import load_file
+from test_cli import fails
 from textures import write_folder, write_synthetic
 from waves import Shifts, random_weights, same_weights, small
 
@@ -20,7 +21,7 @@ from gelflow.compare.scores import evaluate
 from gelflow.compare.speed import network_speed
 from gelflow.config import ModelConfig, MotionConfig, RegistrationConfig, TrainConfig
 from gelflow.config.sources import train_config
-from gelflow.data import PairDataset, join, open_pairs
+from gelflow.data import join, open_pairs
 from gelflow.errors import InputError
 from gelflow.models.raft import RAFT
 from gelflow.models.weights import read_metadata
@@ -46,11 +47,9 @@ def raft(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_all_kinds_of_networks_share_one_table(
     weights: Path, raft: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = write_folder(tmp_path / "data", {"a": (1, 0), "b": (0, 1)})
-    out = tmp_path / "out"
-    arguments = ["compare", str(folder), "--methods", "none,lucas-kanade", "--weights", f"mine={weights}", "--weights",
-                 str(raft), "--ft", "2", "--device", "cpu", "--out", str(out)]  # fmt: skip
-    assert main(arguments) == 0
+    folder, out = write_folder(tmp_path / "data", {"a": (1, 0), "b": (0, 1)}), tmp_path / "out"
+    common = ["compare", str(folder), "--weights", f"mine={weights}", "--device", "cpu", "--out", str(out)]
+    assert main([*common, "--methods", "none,lucas-kanade", "--weights", str(raft), "--ft", "2"]) == 0
     text = capsys.readouterr().out
     names = ["no motion", "Lucas-Kanade", "mine", "RAFT small", "mine+ft"]
     assert all(name in text for name in names)
@@ -58,10 +57,8 @@ def test_all_kinds_of_networks_share_one_table(
         rows = list(csv.DictReader(file))
     assert list(dict.fromkeys(row["method"] for row in rows)) == names
     assert "strata" not in rows[0]
-    table = (out / "table.md").read_text()
-    apart = table.split("Fine-tuned on these very pairs")
-    assert "| mine+ft |" not in apart[0]
-    assert "| mine+ft |" in apart[1]
+    apart = (out / "table.md").read_text().split("Fine-tuned on these very pairs")
+    assert ["| mine+ft |" in part for part in apart[:2]] == [False, True]
     networks = json.loads((out / "scores.json").read_text())["networks"]
     assert set(networks) == {"mine", "RAFT small", "mine+ft"}
     assert all(one["pairs_per_second"] > 0 and one["size"] == [64, 80] for one in networks.values())
@@ -70,35 +67,28 @@ def test_all_kinds_of_networks_share_one_table(
     tuned = tmp_path / "out_ft" / "mine" / "weights.safetensors"
     assert read_metadata(tuned)["step"] == "2"
     before = load_file(tuned)
-    again = ["compare", str(folder), "--methods", "", "--weights", f"mine={weights}", "--batch", "0", "--device", "cpu",
-             "--out", str(out)]  # fmt: skip
-    assert main([*again, "--ft", "2"]) == 0
-    after = load_file(tuned)
-    assert all(torch.equal(before[name], after[name]) for name in before)
-    assert main([*again, "--ft", "3"]) == 0
+    assert main([*common, "--methods", "", "--batch", "0", "--ft", "2"]) == 0
+    torch.testing.assert_close(load_file(tuned), before, rtol=0, atol=0)
+    assert main([*common, "--methods", "", "--batch", "0", "--ft", "3"]) == 0
     assert read_metadata(tuned)["step"] == "3"
 
 
 def test_fine_tuning_needs_a_place_and_a_network(
     weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = write_folder(tmp_path / "data", {"a": (1, 0)})
-    assert main(["compare", str(folder), "--weights", str(weights), "--ft", "5"]) == 2
-    assert main(["compare", str(folder), "--ft", "5", "--out", str(tmp_path / "out")]) == 2
-    assert capsys.readouterr().err.count("--ft 5: needs --weights of GelFlow, and --out") == 2
-    tail = ["--ft", "5", "--ft-config", "paper", "--out", str(tmp_path / "out")]
-    assert main(["compare", str(folder), "--weights", str(weights), *tail]) == 2
-    assert "for another number of scales" in capsys.readouterr().err
+    command = ["compare", write_folder(tmp_path / "data", {"a": (1, 0)}), "--ft", "5"]
+    for given in (["--weights", weights], ["--out", tmp_path / "out"]):
+        assert "--ft 5: needs --weights of GelFlow, and --out" in fails(capsys, *command, *given)
+    tail = ["--weights", weights, "--ft-config", "paper", "--out", tmp_path / "out"]
+    assert "for another number of scales" in fails(capsys, *command, *tail)
 
 
 def test_fine_tuning_changes_the_copy_only_and_lowers_its_loss(
     weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = write_folder(tmp_path / "data", {"a": (1, 0)})
-    before = weights.read_bytes()
-    out = tmp_path / "out"
+    folder, before = write_folder(tmp_path / "data", {"a": (1, 0)}), weights.read_bytes()
     arguments = ["compare", str(folder), "--methods", "", "--weights", f"mine={weights}", "--batch", "0", "--json"]
-    assert main([*arguments, "--ft", "40", "--out", str(out)]) == 0
+    assert main([*arguments, "--ft", "40", "--out", str(tmp_path / "out")]) == 0
     assert weights.read_bytes() == before
     scores = {one["method"]: one for one in json.loads(capsys.readouterr().out)["methods"]}
     assert scores["mine+ft"]["psnr_db"] > scores["mine"]["psnr_db"]
@@ -153,67 +143,59 @@ UNSUITABLE: dict[str, Any] = {
 """A training that nothing of may carry over but losses, clipping, flips, weight decay and seed."""
 
 
+def unsuitable(path: Path, size: tuple[int, int] | None = None, **changes: object) -> Path:
+    """Weights that record such a training."""
+    return random_weights(path, SMALL, TrainConfig.model_validate({"model": SMALL} | UNSUITABLE | changes), size)
+
+
 @pytest.mark.parametrize("preset", ["best", "real", "bare", "paper", "selfflow"])
 def test_whatever_the_preset_the_pairs_are_seen_as_they_are_and_without_truth(preset: str, tmp_path: Path) -> None:
     recorded = train_config(preset)
-    levels = recorded.model.levels
-    model = ModelConfig(levels=levels, projected_channels=8, estimator="shared", registration=RegistrationConfig())
+    model = ModelConfig(levels=recorded.model.levels, projected_channels=8, estimator="shared",
+                        registration=RegistrationConfig())  # fmt: skip
     rate = min(recorded.learning_rate, 1e-4) if recorded.schedule == "one_cycle" else recorded.learning_rate
     method = Learned(random_weights(tmp_path / "w.safetensors", model, recorded, recorded.image_size), device="cpu")
     for config in (None, preset):
-        settings = fine_tuning_settings(method, 1600, config, pairs=8)
-        assert settings.supervision == "self"
-        assert settings.motion is None
-        assert settings.color_jitter == 0
-        assert settings.crop_size is None
-        assert settings.ema_decay == 0
-        assert (settings.schedule, settings.warmup_steps, settings.learning_rate) == ("constant", 0, rate)
-        assert settings.image_size == recorded.image_size
-        assert settings.loss == recorded.loss
-        assert settings.model == model  # its registration included
+        found = fine_tuning_settings(method, 1600, config, pairs=8)
+        assert (found.supervision, found.motion, found.color_jitter, found.crop_size) == ("self", None, 0, None)
+        assert (found.schedule, found.warmup_steps, found.learning_rate, found.ema_decay) == ("constant", 0, rate, 0)
+        assert (found.image_size, found.loss, found.model) == (recorded.image_size, recorded.loss, model)
         # From the weights the paper's batches of 4, so that 1600 steps are 800 epochs; a file's own, if pairs suffice.
-        assert settings.batch_size == (4 if config is None else min(recorded.batch_size, 8))
+        assert found.batch_size == (4 if config is None else min(recorded.batch_size, 8))
 
 
 def test_nothing_else_of_the_training_carries_over(tmp_path: Path) -> None:
-    recorded = TrainConfig.model_validate({"model": SMALL} | UNSUITABLE)
-    method = Learned(random_weights(tmp_path / "w.safetensors", SMALL, recorded), device="cpu")
-    settings = fine_tuning_settings(method, 12, None, pairs=3)
-    expected = TrainConfig(
-        model=SMALL, loss=recorded.loss, supervision="self", mixed_self=3.0, batch_size=3, steps=12, learning_rate=1e-4,
-        gradient_clip=1.0, flip=False, seed=5, device="cpu",
+    method = Learned(unsuitable(tmp_path / "w.safetensors"), device="cpu")
+    assert fine_tuning_settings(method, 12, None, pairs=3) == TrainConfig(
+        model=SMALL, loss=UNSUITABLE["loss"], supervision="self", mixed_self=3.0, batch_size=3, steps=12,
+        learning_rate=1e-4, gradient_clip=1.0, flip=False, seed=5, device="cpu",
     )  # fmt: skip
-    assert settings == expected
 
 
 def test_a_constant_rate_and_the_size_of_use_are_kept(tmp_path: Path) -> None:
-    recorded = TrainConfig.model_validate({"model": SMALL} | UNSUITABLE | {"schedule": "constant", "warmup_steps": 0})
-    path = random_weights(tmp_path / "w.safetensors", SMALL, recorded, (96, 128))
+    path = unsuitable(tmp_path / "w.safetensors", (96, 128), schedule="constant", warmup_steps=0)
     settings = fine_tuning_settings(Learned(path, size=(64, 80), device="cpu"), 12, None, pairs=3)
-    assert settings.learning_rate == 4e-4
-    assert settings.image_size == (64, 80)
+    assert (settings.learning_rate, settings.image_size) == (4e-4, (64, 80))
     assert fine_tuning_settings(Learned(path, device="cpu"), 12, None, pairs=3).image_size == (96, 128)
 
 
 def test_exact_flow_is_not_looked_at(tmp_path: Path) -> None:
+    """The same images with and without their exact flow."""
     shifts = [(1.5, 0.5), (-1.0, 0.0)]
     plain = open_pairs(write_folder(tmp_path / "plain", {"a": shifts[0], "b": shifts[1]}))
     exact = open_pairs(write_synthetic(tmp_path / "exact", shifts))
-    recorded = TrainConfig.model_validate({"model": SMALL} | UNSUITABLE)
-    method = Learned(random_weights(tmp_path / "w.safetensors", SMALL, recorded), "net", device="cpu")
+    method = Learned(unsuitable(tmp_path / "w.safetensors"), "net", device="cpu")
     runs = [fine_tuned(method, dataset, tmp_path / f"run{k}", 3) for k, dataset in enumerate((plain, exact))]
     assert [run.name for run in runs] == ["net+ft"] * 2
     assert same_weights(runs[0].path, runs[1].path)
     assert not same_weights(runs[0].path, method.path)
-    recorded_now = json.loads(read_metadata(runs[0].path)["train"])
-    assert (recorded_now["supervision"], recorded_now["steps"]) == ("self", 3)
+    recorded = json.loads(read_metadata(runs[0].path)["train"])
+    assert (recorded["supervision"], recorded["steps"]) == ("self", 3)
 
 
 def test_pairs_of_several_sizes_need_one(tmp_path: Path) -> None:
     folders = [write_folder(tmp_path / f"{k}", {"a": (1, 0)}, size) for k, size in enumerate([(64, 80), (72, 80)])]
-    dataset: PairDataset = join([open_pairs(folder) for folder in folders])
-    recorded = TrainConfig.model_validate({"model": SMALL} | UNSUITABLE)
-    path = random_weights(tmp_path / "w.safetensors", SMALL, recorded)
+    dataset, path = join([open_pairs(folder) for folder in folders]), unsuitable(tmp_path / "w.safetensors")
     with pytest.raises(InputError, match="64x80, 72x80 px, a batch needs one size; give --size"):
         fine_tuned(Learned(path, device="cpu"), dataset, tmp_path / "run", 1)
     assert fine_tuned(Learned(path, size=(64, 80), device="cpu"), dataset, tmp_path / "run", 1).path.is_file()
