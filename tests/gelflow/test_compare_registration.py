@@ -27,26 +27,30 @@ from gelflow.models.registration import registered
 from gelflow.models.weights import read_metadata
 
 OWN = RegistrationConfig(windows_px=(8,), smoothing_px=(4,))
-
-
 CHOICES: tuple[Registration, Registration] = ("none", "brightness")
 ROWS = [word for choice in CHOICES for word in ("--registration", choice)]
-BRIGHTNESS = REGISTRATIONS["brightness"]
 
 
-def network(path: Path, registration: RegistrationConfig | None) -> Path:
-    model = ModelConfig(levels=4, projected_channels=8, registration=registration)
-    return random_weights(path, model, small(model=model))
-
-
-@pytest.fixture(scope="module")
-def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return network(tmp_path_factory.mktemp("plain") / "weights.safetensors", None)
+def tensor(array: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(np.moveaxis(array, -1, 0).copy())[None]
 
 
 @pytest.fixture(scope="module")
-def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return network(tmp_path_factory.mktemp("own") / "weights.safetensors", OWN)
+def networks(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Weights without and with a registration of their own."""
+    models = [ModelConfig(levels=4, projected_channels=8, registration=config) for config in (None, OWN)]
+    folder = tmp_path_factory.mktemp("networks")
+    return [random_weights(folder / f"{k}.safetensors", model, small(model=model)) for k, model in enumerate(models)]
+
+
+@pytest.fixture
+def plain(networks: list[Path]) -> Path:
+    return networks[0]
+
+
+@pytest.fixture
+def own(networks: list[Path]) -> Path:
+    return networks[1]
 
 
 def test_the_settings_are_the_weights_own_or_those_of_an_aim(plain: Path, own: Path) -> None:
@@ -61,19 +65,11 @@ def test_the_settings_are_the_weights_own_or_those_of_an_aim(plain: Path, own: P
         assert method.name == f"net{added}"
 
 
-@pytest.mark.parametrize(
-    ("label", "name"),
-    [
-        ("net", "net+motion"),
-        ("net#2", "net+motion#2"),
-        ("net#2+ft", "net+motion#2+ft"),
-        ("net+ft", "net+motion+ft"),
-        ("net+motion", "net+motion"),
-        ("C# code", "C# code+motion"),
-    ],
-)
-def test_the_name_says_so_and_stays_one_of_a_group_of_seeds(plain: Path, label: str, name: str) -> None:
-    assert Learned(plain, label, device="cpu", registration="motion").name == name
+def test_the_name_says_so_and_stays_one_of_a_group_of_seeds(plain: Path) -> None:
+    names = {"net": "net+motion", "net#2": "net+motion#2", "net#2+ft": "net+motion#2+ft", "net+ft": "net+motion+ft",
+             "net+motion": "net+motion", "C# code": "C# code+motion"}  # fmt: skip
+    found = {label: Learned(plain, label, device="cpu", registration="motion").name for label in names}
+    assert found == names
 
 
 def test_rows_without_and_with_stand_in_one_table(plain: Path, tmp_path: Path) -> None:
@@ -82,7 +78,6 @@ def test_rows_without_and_with_stand_in_one_table(plain: Path, tmp_path: Path) -
     assert main([*arguments, *ROWS, "--ft", "2", "--batch", "0", "--out", str(out)]) == 0
     scores = {one["method"]: one for one in json.loads((out / "scores.json").read_text())["methods"]}
     assert list(scores) == ["no motion", "net", "net+brightness", "net+ft", "net+brightness+ft"]
-    # The untrained network says next to nothing; registration finds the shift of 1.1 px by itself.
     assert scores["net+brightness"]["psnr_db"] > scores["net"]["psnr_db"] + 6
     assert scores["net+brightness+ft"]["psnr_db"] > scores["net+ft"]["psnr_db"] + 6
     # One optimisation for both rows, whose copy keeps what the weights had: no registration.
@@ -92,22 +87,19 @@ def test_rows_without_and_with_stand_in_one_table(plain: Path, tmp_path: Path) -
 
 
 def test_a_row_is_what_registration_makes_of_the_networks_flow(plain: Path, tmp_path: Path) -> None:
-    dataset = open_pairs(write_folder(tmp_path, {"a": (1.0, -0.5)}))
-    images = dataset.images(0)
+    images = open_pairs(write_folder(tmp_path, {"a": (1.0, -0.5)})).images(0)
     start, found = (Learned(plain, device="cpu", registration=choice).flow(*images) for choice in CHOICES)
-    tensors = [torch.from_numpy(np.moveaxis(array, -1, 0).copy())[None] for array in (start, *images)]
-    again = registered(*tensors, BRIGHTNESS)[0].numpy()
+    again = registered(*map(tensor, (start, *images)), REGISTRATIONS["brightness"])[0].numpy()
     np.testing.assert_array_equal(np.moveaxis(found, -1, 0), again)
 
 
 def test_the_speed_of_the_network_alone_includes_it(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     dataset = open_pairs(write_folder(tmp_path, {"a": (1.0, -0.5)}))
-    images = [torch.from_numpy(np.moveaxis(image, -1, 0).copy())[None] for image in dataset.images(0)]
     measured = []
 
     def kept(passes: Callable[..., torch.Tensor], *_: object) -> Speed:
         with torch.no_grad():
-            measured.append(passes(*images)[0].numpy())
+            measured.append(passes(*map(tensor, dataset.images(0)))[0].numpy())
         return Speed(1.0, None, 1, (64, 80), "here")
 
     monkeypatch.setattr(gelflow.compare.run, "network_speed", kept)
@@ -144,27 +136,22 @@ def test_predict_and_evaluate_take_it(plain: Path, tmp_path: Path, capsys: pytes
     assert json.loads(capsys.readouterr().out)["methods"][0]["method"].endswith("+motion")
 
 
-def test_what_has_none_is_refused(plain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = write_folder(tmp_path / "data", {"a": (1, 0)})
-    raft = tmp_path / "small.pth"
+def test_raft_keeps_its_one_row_beside_them_and_registration_is_refused_where_there_is_none(
+    plain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, raft, out = write_folder(tmp_path / "data", {"a": (1, 0)}), tmp_path / "small.pth", tmp_path / "out"
     torch.save(RAFT(large=False).state_dict(), raft)
     tail = ("--device", "cpu", "--registration", "motion")
     assert "is RAFT" in fails(capsys, "evaluate", folder, "--weights", raft, *tail)
     assert "needs --weights of GelFlow" in fails(capsys, "compare", folder, "--weights", raft, *tail)
     assert "dis-brightness" in fails(capsys, "compare", folder, "--methods", "none", *tail)
-    out = ("--out", tmp_path / "out")
-    assert "dis-brightness" in fails(capsys, "predict", folder, *out, "--method", "dis-medium", *tail)
+    assert "dis-brightness" in fails(capsys, "predict", folder, "--out", out, "--method", "dis-medium", *tail)
     assert "registration" in fails(capsys, "evaluate", folder, "--weights", plain, "--registration", "shading")
-    assert not (tmp_path / "out").exists()
-
-
-def test_raft_keeps_its_one_row_beside_them(plain: Path, tmp_path: Path) -> None:
-    folder = write_folder(tmp_path / "data", {"a": (1, 0)})
-    torch.save(RAFT(large=False).state_dict(), tmp_path / "small.pth")
-    weights = ["--weights", f"net={plain}", "--weights", str(tmp_path / "small.pth"), *ROWS]
-    out = ["--out", str(tmp_path / "out"), "--batch", "0", "--device", "cpu"]
-    assert main(["compare", str(folder), "--methods", "", *weights, *out]) == 0
-    names = [one["method"] for one in json.loads((tmp_path / "out" / "scores.json").read_text())["methods"]]
+    assert not out.exists()
+    weights = ["--weights", f"net={plain}", "--weights", str(raft), *ROWS]
+    command = ["compare", str(folder), "--methods", "", "--out", str(out), "--batch", "0", "--device", "cpu"]
+    assert main([*command, *weights]) == 0
+    names = [one["method"] for one in json.loads((out / "scores.json").read_text())["methods"]]
     assert names == ["net", "net+brightness", "RAFT small"]
 
 
