@@ -23,6 +23,13 @@ def shallow() -> Trajectory:
     return stepper_of(SHALLOW, mesh_of(setting.mesh, SHALLOW), setting).run()
 
 
+@pytest.fixture
+def one_case(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The shallow press as a case of the benchmark, of which the last state counts."""
+    monkeypatch.setitem(fem.CASES, "shallow", SHALLOW)
+    monkeypatch.setitem(fem.COUNTED, "shallow", [1])
+
+
 def posed(trajectory: Trajectory, displacement: np.ndarray, force: tuple[float, float, float]) -> Trajectory:
     """A trajectory with another last state."""
     state = replace(trajectory.states[1], displacement=displacement, force_n=np.array(force))
@@ -53,26 +60,25 @@ def test_face_displacement_is_the_surface(shallow: Trajectory) -> None:
     np.testing.assert_allclose(found[:, 0].reshape(61, 46)[:, 0], np.linspace(-10, 10, 61), atol=1e-12)
 
 
-def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command(
+    one_case: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Errors fall with the elements as P2/P1's do, and the plain solver finds the same state on the same mesh."""
-    monkeypatch.setitem(fem.CASES, "shallow", SHALLOW)
-    monkeypatch.setitem(fem.COUNTED, "shallow", [1])
     meshes = [Setting("graded P2/P1", ("graded", n, 2), numerics=COARSE) for n in (2, 4)]
     ways = [Setting("plain solver", ("graded", 2, 2), numerics=COARSE, options=PLAIN), *meshes]
+    wide = Setting("", ("wide", 8, 2))
+    reference = stepper_of(SHALLOW, mesh_of(wide.mesh, SHALLOW), wide).run()
     monkeypatch.setattr(fem, "settings_of", lambda every, across: {"shallow": ways})
     monkeypatch.setattr(fem, "reference", lambda case, across: reference)
-    setting = Setting("", ("wide", 8, 2))
-    reference = stepper_of(SHALLOW, mesh_of(setting.mesh, SHALLOW), setting).run()
     assert fem.main(["--out", str(tmp_path)]) == 0
-    plain, coarse, fine = read(tmp_path / "fem.csv")
-    assert {row["status"] for row in (plain, coarse, fine)} == {"complete"}
-    assert min(row["seconds"] for row in (plain, coarse, fine)) > 0
+    rows = plain, coarse, fine = read(tmp_path / "fem.csv")
+    assert {row["status"] for row in rows} == {"complete"}
+    assert min(row["seconds"] for row in rows) > 0
     # The spacing halves, and the rate is about 1.6 (a factor of 3): half of the error must be gone.
-    assert fine["displacement_percent"] < coarse["displacement_percent"] / 2
-    assert fine["displacement_px"] < coarse["displacement_px"] / 2
+    assert all(fine[name] < coarse[name] / 2 for name in ("displacement_percent", "displacement_px"))
     # Both are within 1e-6 of equilibrium.
-    assert plain["displacement_percent"] == pytest.approx(coarse["displacement_percent"], rel=1e-3)
-    assert plain["force_percent"] == pytest.approx(coarse["force_percent"], rel=1e-3)
+    for name in ("displacement_percent", "force_percent"):
+        assert plain[name] == pytest.approx(coarse[name], rel=1e-3)
     assert (tmp_path / "fem.png").read_bytes().startswith(b"\x89PNG")
     assert "graded 4 2" in capsys.readouterr().out
     monkeypatch.setattr(fem, "press", lambda case, settings: pytest.fail(str(case)))  # all rows are there
@@ -86,16 +92,11 @@ def test_references_that_are_none_are_refused(monkeypatch: pytest.MonkeyPatch, s
         fem.reference.__wrapped__("centred", 8)
 
 
-def test_elements_and_contact_points(monkeypatch: pytest.MonkeyPatch, shallow: Trajectory) -> None:
+def test_elements_and_contact_points(one_case: None, monkeypatch: pytest.MonkeyPatch, shallow: Trajectory) -> None:
     """Linear displacements alone lock: at a Poisson ratio of 0.4999 the ball is pushed back much harder."""
-    monkeypatch.setitem(fem.CASES, "shallow", SHALLOW)
-    monkeypatch.setitem(fem.COUNTED, "shallow", [1])
     monkeypatch.setattr(fem, "reference", lambda case, across: shallow)
-    ways = [
-        Setting("same", ("graded", 2), "P1/P1", numerics=COARSE),
-        Setting("P1", ("graded", 2), "P1", numerics=COARSE),
-    ]
-    ways.append(replace(ways[0], family="3 points", contact_split=1))
+    plain = Setting("same", ("graded", 2), "P1/P1", numerics=COARSE)
+    ways = [plain, replace(plain, family="P1", element="P1"), replace(plain, family="3 points", contact_split=1)]
     cases = [way.case("shallow", 8) for way in ways]
     settings = {(case["family"], case["mesh"]): way for case, way in zip(cases, ways, strict=True)}
     same, locked, few = map(partial(press, settings=settings), cases)
