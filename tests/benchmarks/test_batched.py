@@ -19,8 +19,8 @@ CASE: Row = {**PRESS, "growth": 2.0, "loose": 0.0, "reference_across": 2, "press
 def test_presses_are_what_they_are_said_to_be(limits: tuple[float, float]) -> None:
     rng, case = np.random.default_rng(0), {**PRESS, "smallest_mm": limits[0], "largest_mm": limits[1], "drag_mm": 0.5}
     for scene in (random_ball(rng, case) for _ in range(20)):
-        assert limits[0] <= scene.contact.indenter.model_dump()["radius_mm"] <= limits[1]
-        assert all(abs(x) <= half for x, half in zip(scene.motion.position_mm, PLACES_MM, strict=True))
+        assert limits[0] <= scene.contact.indenter.radius_mm <= limits[1]
+        assert (np.abs(scene.motion.position_mm) <= PLACES_MM).all()
         assert np.hypot(*scene.motion.shear_mm) == pytest.approx(0.5)
 
 
