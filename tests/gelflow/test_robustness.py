@@ -1,6 +1,5 @@
 """What goes wrong at a user's desk, through the command line: one line that names the file or value, and status 2."""
 
-import json
 import pickle
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 from test_cli import fails
-from textures import as_bytes, moved, save, write_folder
+from textures import moved, save, write_folder
 from waves import random_weights
 
 from gelflow.baselines.learned import open_network
@@ -126,21 +125,3 @@ def test_images_that_cannot_be_used_are_named(
     ):  # fmt: skip
         with pytest.raises(InputError, match=word):
             method.flow(image1, image2)
-
-
-def test_a_grey_image_is_three_equal_channels(networks: tuple[Path, Path], tmp_path: Path,
-                                              capsys: pytest.CaptureFixture[str]) -> None:  # fmt: skip
-    """Grey PNGs are welcome everywhere: the answer is that of the same image stored in colour."""
-    for shift, name in ((0.0, "1"), (1.0, "2")):
-        grey = as_bytes(moved(64, 80, shift, 0))[..., 0]
-        for folder, pixels in (("grey", grey), ("colour", np.repeat(grey[..., None], 3, axis=2))):
-            (tmp_path / folder).mkdir(exist_ok=True)
-            assert cv2.imwrite(str(tmp_path / folder / f"a_{name}.png"), pixels)
-    answers = []
-    for folder in ("grey", "colour"):
-        command = ["compare", str(tmp_path / folder), "--methods", "farneback", "--weights", f"net={networks[0]}",
-                   "--batch", "0", "--device", "cpu", "--json"]  # fmt: skip
-        assert main(command) == 0
-        scores = json.loads(capsys.readouterr().out)["scores"]
-        answers.append([(score["method"], score["psnr_db"], score["ssim"]) for score in scores])
-    assert answers[0] == answers[1]
