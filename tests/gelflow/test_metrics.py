@@ -9,7 +9,6 @@ from textures import REAL, as_bytes, moved
 
 from gelflow.baselines.classical import DIS
 from gelflow.compare.metrics import (
-    endpoint_error,
     flow_errors,
     image_similarity,
     marker_distance,
@@ -21,11 +20,6 @@ from gelflow.compare.metrics import (
 from gelflow.compare.scores import score_pair
 from gelflow.data import open_pairs
 from gelflow.errors import InputError
-
-
-def test_endpoint_error_is_the_length_of_the_difference() -> None:
-    truth = np.full((4, 5, 2), (1.0, -2.0), np.float32)
-    np.testing.assert_array_equal(endpoint_error(truth + np.float32([3, 4]), truth), np.full((4, 5), 5.0))
 
 
 def test_flow_errors_counts_only_pixels_that_see_gel_and_are_visible() -> None:
