@@ -255,12 +255,14 @@ def test_the_name_says_so_and_stays_one_of_a_group_of_seeds(plain: Path) -> None
     assert found == names
 
 
-def test_rows_without_and_with_stand_in_one_table(plain: Path, tmp_path: Path) -> None:
+def test_rows_without_and_with_registration_stand_in_one_table_with_one_of_raft(
+    plain: Path, raft: Path, tmp_path: Path
+) -> None:
     folder, out = write_folder(tmp_path / "data", {"a": (1.0, -0.5)}), tmp_path / "out"
-    arguments = ["compare", str(folder), "--methods", "none", "--weights", f"net={plain}", "--device", "cpu"]
-    assert main([*arguments, *ROWS, "--ft", "2", "--batch", "0", "--out", str(out)]) == 0
+    arguments = ["compare", str(folder), "--methods", "none", "--weights", f"net={plain}", "--weights", str(raft)]
+    assert main([*arguments, *ROWS, "--device", "cpu", "--ft", "2", "--batch", "0", "--out", str(out)]) == 0
     scores = {one["method"]: one for one in json.loads((out / "scores.json").read_text())["methods"]}
-    assert list(scores) == ["no motion", "net", "net+brightness", "net+ft", "net+brightness+ft"]
+    assert list(scores) == ["no motion", "net", "net+brightness", "RAFT small", "net+ft", "net+brightness+ft"]
     assert scores["net+brightness"]["psnr_db"] > scores["net"]["psnr_db"] + 6
     assert scores["net+brightness+ft"]["psnr_db"] > scores["net+ft"]["psnr_db"] + 6
     # One optimisation for both rows, whose copy keeps what the weights had: no registration.
@@ -319,7 +321,7 @@ def test_predict_and_evaluate_take_it(plain: Path, tmp_path: Path, capsys: pytes
     assert json.loads(capsys.readouterr().out)["methods"][0]["method"].endswith("+motion")
 
 
-def test_raft_keeps_its_one_row_beside_them_and_registration_is_refused_where_there_is_none(
+def test_registration_is_refused_where_there_is_none(
     plain: Path, raft: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder, out = write_folder(tmp_path / "data", {"a": (1, 0)}), tmp_path / "out"
@@ -330,14 +332,3 @@ def test_raft_keeps_its_one_row_beside_them_and_registration_is_refused_where_th
     assert "dis-brightness" in fails(capsys, "predict", folder, "--out", out, "--method", "dis-medium", *tail)
     assert "registration" in fails(capsys, "evaluate", folder, "--weights", plain, "--registration", "shading")
     assert not out.exists()
-    command = ["compare", str(folder), "--methods", "", "--out", str(out), "--batch", "0", "--device", "cpu"]
-    assert main([*command, "--weights", f"net={plain}", "--weights", str(raft), *ROWS]) == 0
-    names = [one["method"] for one in json.loads((out / "scores.json").read_text())["methods"]]
-    assert names == ["net", "net+brightness", "RAFT small"]
-
-
-def test_a_comparison_can_be_added_to_by_name(plain: Path, tmp_path: Path) -> None:
-    dataset = open_pairs(write_folder(tmp_path / "data", {"a": (1, 0)}))
-    compare([Learned(plain, "net", device="cpu")], dataset, tmp_path / "out", batch=0)
-    both = compare([Learned(plain, "net", None, "cpu", "brightness")], dataset, tmp_path / "out", batch=0, add=True)
-    assert both.methods == ["net", "net+brightness"]
