@@ -30,14 +30,16 @@ class ResidentPairs(Dataset[Sample]):
         return {key: _unpacked(value) for key, value in self._samples[index].items()}
 
 
-def resident(pairs: CheckedPairs, device: torch.device, workers: int, room: int | None = None) -> ResidentPairs | None:
+def resident(
+    pairs: CheckedPairs, device: torch.device, *, room: int | None = None, **loading: Any
+) -> ResidentPairs | None:
     """Decodes all pairs and puts them on a device.
 
     Args:
         pairs: The pairs, as training needs them.
         device: Where to.
-        workers: Processes that decode; 0: this one.
         room: Bytes that they may take; None: half of what is free on the CUDA device.
+        loading: How the DataLoader that decodes them starts its processes; empty: this process decodes.
 
     Returns:
         The pairs, or None where they do not fit.
@@ -48,7 +50,7 @@ def resident(pairs: CheckedPairs, device: torch.device, workers: int, room: int 
     if room is None:
         room = int(SHARE_OF_MEMORY * torch.cuda.mem_get_info(device)[0])
     samples: list[Sample] = []
-    for sample in DataLoader(pairs, batch_size=None, num_workers=workers):
+    for sample in DataLoader(pairs, batch_size=None, **loading):
         packed = {key: _packed(value) for key, value in sample.items()}
         room -= sum(value.nbytes for value in packed.values() if isinstance(value, Tensor))
         if room < 0:

@@ -25,7 +25,7 @@ from gelflow.models import GelFlow
 from gelflow.models.weights import load_weights, save_weights
 from gelflow.terminal import progress
 from gelflow.train.callback import CheckpointCallback, Stopped, describe, is_first_process, stopping, weights_metadata
-from gelflow.train.loading import end_with_run
+from gelflow.train.loading import end_with_run, loading_context
 from gelflow.train.module import FlowModule, check_side
 from gelflow.train.resident import ResidentPairs, resident
 from gelflow.train.samples import CheckedPairs, StepSampler, TrainingBatches, TrainingSamples, checked, collate
@@ -206,6 +206,8 @@ class _Data(L.LightningDataModule):
         self.train_set: CheckedPairs | ResidentPairs = CheckedPairs(train_set, config.supervision == "flow")
         self.validation_set = validation_set
         self.module = module
+        self._loading: dict[str, Any] = {"num_workers": config.workers, "worker_init_fn": end_with_run,
+                                         "multiprocessing_context": loading_context(config)}  # fmt: skip
         self._tried_cache = False
 
     def train_dataloader(self) -> DataLoader[Any]:
@@ -217,9 +219,8 @@ class _Data(L.LightningDataModule):
             stop = min(stop, (start // config.validate_every + 1) * config.validate_every)
         sampler = StepSampler(len(self.train_set), config, start, stop, trainer.global_rank, trainer.world_size)
         samples = TrainingSamples(self.train_set, config)
-        workers = 0 if isinstance(self.train_set, ResidentPairs) else config.workers
-        return DataLoader(samples, batch_sampler=sampler, num_workers=workers, collate_fn=TrainingBatches(config),
-                          worker_init_fn=end_with_run)  # fmt: skip
+        loading = {} if isinstance(self.train_set, ResidentPairs) else self._loading
+        return DataLoader(samples, batch_sampler=sampler, collate_fn=TrainingBatches(config), **loading)
 
     def _cache(self) -> None:
         """Puts the training pairs on the device, once, where the configuration and the memory allow it."""
@@ -228,7 +229,7 @@ class _Data(L.LightningDataModule):
             return
         self._tried_cache = True
         if isinstance(self.train_set, CheckedPairs):
-            kept = resident(self.train_set, device, self.config.workers)
+            kept = resident(self.train_set, device, **self._loading)
             if kept is None:
                 print("the pairs take more than half of the device's free memory: read anew for every step",
                       file=sys.stderr)  # fmt: skip
@@ -241,8 +242,7 @@ class _Data(L.LightningDataModule):
             return []
         trainer = self.module.trainer
         mine = range(trainer.global_rank, _length(self.validation_set), trainer.world_size)
-        return DataLoader(self.validation_set, batch_size=1, sampler=mine, num_workers=self.config.workers,
-                          collate_fn=_one_pair, worker_init_fn=end_with_run)  # fmt: skip
+        return DataLoader(self.validation_set, batch_size=1, sampler=mine, collate_fn=_one_pair, **self._loading)
 
 
 def _one_pair(samples: list[dict[str, Any]]) -> dict[str, Any]:

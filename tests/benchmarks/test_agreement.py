@@ -1,7 +1,4 @@
-"""`benchmarks agreement`: the CPU against itself, plainly and with a GPU's rounding, and how outcomes are counted.
-
-Each comment "Fails with" names a change of `synth` that was tried.
-"""
+"""`benchmarks agreement`: the CPU against itself, plainly and with a GPU's rounding, and how outcomes are counted."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,9 +10,8 @@ import warp as wp
 from benchmarks.__main__ import main
 from benchmarks.agreement import WANTED, Noisy, compare, drawn_of, one_by_one, summary, together
 from benchmarks.rows import Row, read
-from synth.scene import MeshIndenter, Scene
+from synth.scene import MeshIndenter
 from synth.scene.template import load_scene
-from synth.simulate import Trajectory
 from synth.simulate.batched.pad import prepare
 from synth.simulate.batched.run import OPTIONS
 
@@ -32,7 +28,6 @@ def run(out: Path, *options: str) -> Row:
 
 
 def test_noise_has_the_size_that_was_asked_for() -> None:
-    # Fails with noise in rows that are not wanted, or with the same noise in every product.
     size, wanted = 400, wp.array([1, 0, 1], dtype=wp.int32, device="cpu")
     unit = wp.array(np.eye(size, dtype=np.float32), device="cpu")
     ones, noisy = wp.array(np.ones((3, size), dtype=np.float32), device="cpu"), Noisy(0.1)
@@ -48,7 +43,6 @@ def test_noise_has_the_size_that_was_asked_for() -> None:
 
 def test_the_cpu_agrees_with_itself(tmp_path: Path) -> None:
     """A trajectory's bits depend neither on its neighbours nor on its lane."""
-    # Fails with a device that has noise.
     found = run(tmp_path)
     assert (found["draws"], found["end alike"], found["complete"], found["within 1e-6"]) == (4, 4, 4, 4)
     assert found["displacement, largest"] == found["traction, largest"] == found["flow_px, largest"] == 0
@@ -59,7 +53,6 @@ def test_noise_in_the_directions_stays_within_what_is_wanted(tmp_path: Path) -> 
     """With the default options; loose intermediate steps let friction remember the noise, rougher directions leave
     more of it.
     """
-    # Fails with either as the default.
     ways: list[list[str]] = [[], ["--forcing", "0.03"], ["--loose", "1e-3"]]
     found, rough, loose = (run(tmp_path / str(n), "--noise", "3e-4", *way) for n, way in enumerate(ways))
     assert found["end alike"] == rough["end alike"] == loose["end alike"] == 4
@@ -71,32 +64,24 @@ def test_noise_in_the_directions_stays_within_what_is_wanted(tmp_path: Path) -> 
 
 
 def test_outcomes_are_counted() -> None:
-    # Fails with trajectories that are compared whatever their outcome.
     drawn = drawn_of(load_scene("gelsight_mini", ['numerics.solver="batched"', "numerics.cells=[4,4,1]", *TINY]), 3, 5)
-    drawn[2] = replace(drawn[2], folder=Path("nowhere"), scene=_of_file(drawn[2].scene))
+    missing = MeshIndenter(shape="mesh", file="nothing.stl", scale=1.0)
+    contact = drawn[2].scene.contact.model_copy(update={"indenter": missing})
+    scene = drawn[2].scene.model_copy(update={"contact": contact})
+    drawn[2] = replace(drawn[2], folder=Path("nowhere"), scene=scene)
     first = together(drawn, prepare(drawn[0].scene, drawn[0].mesh, "cpu"), OPTIONS)
     complete, other, unbuilt = first
-    assert isinstance(complete, Trajectory)
-    assert isinstance(other, Trajectory)
     assert complete.status == other.status == "complete"
     assert "nothing.stl" in str(unbuilt)
     second = [replace(complete, status="partial", reason="lost"), *one_by_one(drawn[1:], OPTIONS, 2)]
     rows = list(map(compare, drawn, first, second))
-    assert [(row["same"], row["status"], row["cpu_status"]) for row in rows] == [
-        (False, "complete", "partial"),
-        (True, "complete", "complete"),
-        (True, "unbuilt", "unbuilt"),
-    ]
+    assert [row["same"] for row in rows] == [False, True, True]
+    assert [row["status"] for row in rows] == ["complete", "complete", "unbuilt"]
+    assert [row["cpu_status"] for row in rows] == ["partial", "complete", "unbuilt"]
     assert rows[0]["cpu_reason"] == "lost"
     found = summary(rows)
     assert (found["draws"], found["end alike"], found["complete"]) == (3, 2, 1)
     assert summary(rows[:1])["displacement, largest"] is None
-
-
-def _of_file(scene: Scene) -> Scene:
-    """The scene with an indenter whose file is missing."""
-    indenter = MeshIndenter(shape="mesh", file="nothing.stl", scale=1.0)
-    return scene.model_copy(update={"contact": scene.contact.model_copy(update={"indenter": indenter})})
 
 
 @pytest.mark.parametrize(

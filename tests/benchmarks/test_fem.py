@@ -23,6 +23,13 @@ def shallow() -> Trajectory:
     return stepper_of(SHALLOW, mesh_of(setting.mesh, SHALLOW), setting).run()
 
 
+@pytest.fixture
+def one_case(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The shallow press as a case of the benchmark, of which the last state counts."""
+    monkeypatch.setitem(fem.CASES, "shallow", SHALLOW)
+    monkeypatch.setitem(fem.COUNTED, "shallow", [1])
+
+
 def posed(trajectory: Trajectory, displacement: np.ndarray, force: tuple[float, float, float]) -> Trajectory:
     """A trajectory with another last state."""
     state = replace(trajectory.states[1], displacement=displacement, force_n=np.array(force))
@@ -30,7 +37,6 @@ def posed(trajectory: Trajectory, displacement: np.ndarray, force: tuple[float, 
 
 
 def test_errors_of_known_fields(shallow: Trajectory) -> None:
-    """Fails with the z component left in px, with the tangential error of lengths in place of vectors."""
     still = np.zeros_like(shallow.states[1].displacement)
     truth = posed(shallow, still + np.array([0, 0, 2.0]), (0.3, 0.4, 1.0))
     off = errors(posed(shallow, still + np.array([0.03, 0.04, 2.12]), (0.4, 0.3, 1.1)), truth, [1])
@@ -44,7 +50,7 @@ def test_errors_of_known_fields(shallow: Trajectory) -> None:
 
 
 def test_face_displacement_is_the_surface(shallow: Trajectory) -> None:
-    """A field linear in x and y is interpolated exactly, whichever the mesh. Fails with the grid's axes exchanged."""
+    """A field linear in x and y is interpolated exactly, whichever the mesh."""
     x, y, _ = shallow.space.points.T
     linear = posed(shallow, np.stack([x, y, 3 * x - y], axis=1), (0, 0, 1))
     points = face_grid(PAD_MM, (61, 46))
@@ -54,26 +60,25 @@ def test_face_displacement_is_the_surface(shallow: Trajectory) -> None:
     np.testing.assert_allclose(found[:, 0].reshape(61, 46)[:, 0], np.linspace(-10, 10, 61), atol=1e-12)
 
 
-def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command(
+    one_case: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Errors fall with the elements as P2/P1's do, and the plain solver finds the same state on the same mesh."""
-    monkeypatch.setitem(fem.CASES, "shallow", SHALLOW)
-    monkeypatch.setitem(fem.COUNTED, "shallow", [1])
     meshes = [Setting("graded P2/P1", ("graded", n, 2), numerics=COARSE) for n in (2, 4)]
     ways = [Setting("plain solver", ("graded", 2, 2), numerics=COARSE, options=PLAIN), *meshes]
+    wide = Setting("", ("wide", 8, 2))
+    reference = stepper_of(SHALLOW, mesh_of(wide.mesh, SHALLOW), wide).run()
     monkeypatch.setattr(fem, "settings_of", lambda every, across: {"shallow": ways})
     monkeypatch.setattr(fem, "reference", lambda case, across: reference)
-    setting = Setting("", ("wide", 8, 2))
-    reference = stepper_of(SHALLOW, mesh_of(setting.mesh, SHALLOW), setting).run()
     assert fem.main(["--out", str(tmp_path)]) == 0
-    plain, coarse, fine = read(tmp_path / "fem.csv")
-    assert {row["status"] for row in (plain, coarse, fine)} == {"complete"}
-    assert min(row["seconds"] for row in (plain, coarse, fine)) > 0
+    rows = plain, coarse, fine = read(tmp_path / "fem.csv")
+    assert {row["status"] for row in rows} == {"complete"}
+    assert min(row["seconds"] for row in rows) > 0
     # The spacing halves, and the rate is about 1.6 (a factor of 3): half of the error must be gone.
-    assert fine["displacement_percent"] < coarse["displacement_percent"] / 2
-    assert fine["displacement_px"] < coarse["displacement_px"] / 2
+    assert all(fine[name] < coarse[name] / 2 for name in ("displacement_percent", "displacement_px"))
     # Both are within 1e-6 of equilibrium.
-    assert plain["displacement_percent"] == pytest.approx(coarse["displacement_percent"], rel=1e-3)
-    assert plain["force_percent"] == pytest.approx(coarse["force_percent"], rel=1e-3)
+    for name in ("displacement_percent", "force_percent"):
+        assert plain[name] == pytest.approx(coarse[name], rel=1e-3)
     assert (tmp_path / "fem.png").read_bytes().startswith(b"\x89PNG")
     assert "graded 4 2" in capsys.readouterr().out
     monkeypatch.setattr(fem, "press", lambda case, settings: pytest.fail(str(case)))  # all rows are there
@@ -87,16 +92,11 @@ def test_references_that_are_none_are_refused(monkeypatch: pytest.MonkeyPatch, s
         fem.reference.__wrapped__("centred", 8)
 
 
-def test_elements_and_contact_points(monkeypatch: pytest.MonkeyPatch, shallow: Trajectory) -> None:
+def test_elements_and_contact_points(one_case: None, monkeypatch: pytest.MonkeyPatch, shallow: Trajectory) -> None:
     """Linear displacements alone lock: at a Poisson ratio of 0.4999 the ball is pushed back much harder."""
-    monkeypatch.setitem(fem.CASES, "shallow", SHALLOW)
-    monkeypatch.setitem(fem.COUNTED, "shallow", [1])
     monkeypatch.setattr(fem, "reference", lambda case, across: shallow)
-    ways = [
-        Setting("same", ("graded", 2), "P1/P1", numerics=COARSE),
-        Setting("P1", ("graded", 2), "P1", numerics=COARSE),
-    ]
-    ways.append(replace(ways[0], family="3 points", contact_split=1))
+    plain = Setting("same", ("graded", 2), "P1/P1", numerics=COARSE)
+    ways = [plain, replace(plain, family="P1", element="P1"), replace(plain, family="3 points", contact_split=1)]
     cases = [way.case("shallow", 8) for way in ways]
     settings = {(case["family"], case["mesh"]): way for case, way in zip(cases, ways, strict=True)}
     same, locked, few = map(partial(press, settings=settings), cases)
@@ -121,7 +121,6 @@ def test_settings_are_well_formed() -> None:
 
 
 def test_best_rows_and_speed_up() -> None:
-    """Fails with < replaced by > in `mark_best`, and with incomplete rows kept."""
     figures = [(10, 1), (1, 4), (2, 5), (4, 2), (0.5, None)]
     rows: list[Row] = [{"seconds": s, **({} if e is None else {"displacement_percent": e})} for s, e in figures]
     mark_best(rows)
@@ -130,7 +129,6 @@ def test_best_rows_and_speed_up() -> None:
 
 
 def test_short_presses_are_timed_three_times(monkeypatch: pytest.MonkeyPatch, shallow: Trajectory) -> None:
-    """Fails with the mean in place of the median."""
     for ends, median in (([0, 1.0, 1, 1.5, 2, 9], 1.0), ([0, 3.0], 3.0)):
         clock = iter(ends)
         monkeypatch.setattr("time.process_time", lambda clock=clock: next(clock))

@@ -30,11 +30,7 @@ def measured(view: View) -> dict[str, Row]:
 
 
 def test_every_method_is_right_where_it_leaves_out_nothing() -> None:
-    """Without refraction, for motion along a flat face, flow is f t / Z everywhere and each simplification is exact.
-
-    Fails with the enlarged flow not scaled (error 2.3 px), and with the affine map's last row, the offset, in place of
-    its second (17 px).
-    """
+    """Without refraction, for motion along a flat face, flow is f t / Z everywhere and each simplification is exact."""
     view = moved(1.0, (0.47, -0.32, 0.0))  # its ends lie off the border
     expected = FOCAL * np.array([0.47, -0.32]) / 20.0
     # float64; the root search ends at 1e-6 of a triangle's weights at worst, here of 0.5 mm and 8 px/mm.
@@ -45,10 +41,7 @@ def test_every_method_is_right_where_it_leaves_out_nothing() -> None:
 
 
 def test_what_a_camera_without_perspective_misses() -> None:
-    """A gel that rises by 0.5 mm: no motion in x and y, so that the affine camera misses all of it.
-
-    Fails with the fitted matrix applied to z and y in place of x and y.
-    """
+    """A gel that rises by 0.5 mm: no motion in x and y, so that the affine camera misses all of it."""
     view = moved(1.0, (0.0, 0.0, 0.5))
     truth = derived(view)
     row = method_row(view, truth, "affine camera, fitted")
@@ -58,10 +51,8 @@ def test_what_a_camera_without_perspective_misses() -> None:
 
 
 def test_the_fitted_pinhole_is_the_paraxial_one() -> None:
-    """Apparent depth: 14 mm of air and 6 mm of gel at n = 1.45 look like 14 + 6 / 1.45.
-
-    Off the axis the last term, 23 % of the depth, differs by (1 - 1 / n²) tan² / 2: 0.7 % of the depth at the corners,
-    less in the mean. Fails with the ratio's inverse (0.907).
+    """Apparent depth: 14 mm of air and 6 mm of gel at n = 1.45 look like 14 + 6 / 1.45. Off the axis the last term, 23
+    % of the depth, differs by (1 - 1 / n²) tan² / 2: 0.7 % of the depth at the corners, less in the mean.
     """
     camera = fitted_pinhole(moved(1.45, (0, 0, 0))).camera
     assert camera.fx / FOCAL == pytest.approx(20 / (14 + 6 / 1.45), rel=0.007)
@@ -69,10 +60,7 @@ def test_the_fitted_pinhole_is_the_paraxial_one() -> None:
 
 
 def test_refraction_left_out() -> None:
-    """Seen straight from above a translation is scaled by the ratio of the apparent depths.
-
-    Fails with `without_window` left out of the method (no error).
-    """
+    """Seen straight from above a translation is scaled by the ratio of the apparent depths."""
     found = measured(moved(1.45, (0.5, 0.0, 0.0)))
     lost = 0.5 * FOCAL * (1 / (14 + 6 / 1.45) - 1 / 20)
     # The depth differs by 0.25 % in the mean (as above), its derivative by up to three times that: 0.033 of 4.4 px.
@@ -82,10 +70,7 @@ def test_refraction_left_out() -> None:
 
 
 def test_occlusion() -> None:
-    """A bump near the side of the image, so steep that it hides what lies behind it.
-
-    Fails with an overlap test that returns nothing (the shipped method then errs as the untested one does).
-    """
+    """A bump near the side of the image, so steep that it hides what lies behind it."""
     flat = moved(1.0, (0.0, 0.0, 0.0), 48)
     pressed = flat.pressed.copy()
     pressed[:, 2] += 2.5 * np.exp(-((pressed[:, 0] - 4.0) ** 2 + pressed[:, 1] ** 2) / 0.35**2)

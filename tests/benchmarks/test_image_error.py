@@ -1,10 +1,12 @@
-"""The statistics of image errors, on made-up images whose errors are known."""
+"""The statistics of render noise on made-up images: known errors of images, and what noise changes in a flow."""
 
 import numpy as np
 import pytest
 from render_scenes import small_sensor
 
+from benchmarks.flow_change import Truth, changes, jackknife
 from benchmarks.image_error import Halves, camera_noise, errors, reference_noise
+from benchmarks.render import others
 from synth.arrays import Image
 from synth.render import sample_count
 
@@ -25,10 +27,7 @@ def halves(deviation: float, seed: int) -> Halves:
 
 
 def test_errors_of_known_images() -> None:
-    """Noise 0.01 in the images, 0.008 in each half of the reference, an offset of 0.004, full scale 255 levels.
-
-    Fails with the reference's noise not subtracted (rmse 3.10), and with twice that subtracted (rmse 2.34).
-    """
+    """Noise 0.01 in the images, 0.008 in each half of the reference, an offset of 0.004, full scale 255 levels."""
     reference = halves(0.008, 1)
     found = errors(images(4, 0.01, 0.004), reference, LINEAR)
     # 14400 values: a standard deviation is known within 1 / sqrt(2 · 14400) = 0.6 %, here of several; 4 times that.
@@ -45,11 +44,7 @@ def test_errors_of_known_images() -> None:
 
 @pytest.mark.parametrize("blur_px", [0.0, 4.0])
 def test_standard_errors_hold_where_nothing_is_systematic(blur_px: float) -> None:
-    """Of 60 made-up settings without offset the scores must scatter as their standard errors say.
-
-    Fails with a standard error of the bias that forgets the reference's noise (scores of 1.53), and with the blur's
-    correlation of neighbouring pixels forgotten in the limit of the systematic error.
-    """
+    """Of 60 made-up settings without offset the scores must scatter as their standard errors say."""
     camera = LINEAR.model_copy(update={"blur_px": blur_px})
     found = [errors(images(3, 0.01, seed=k), halves(0.01, 1000 + k), camera) for k in range(60)]
     # A standard deviation of 60 scores: within 1 ± 4 / sqrt(120).
@@ -64,3 +59,58 @@ def test_measured_camera_noise_is_the_models() -> None:
     grey = np.full((60, 80, 3), 0.25, dtype=np.float32)
     # 14400 values: 0.6 %, 4 times.
     assert camera_noise(grey, camera) == pytest.approx(255 * sample_count.camera_noise(grey, camera), rel=0.024)
+
+
+CAMERA = small_sensor(read_noise=0.0, shot_noise=0.0, gamma=1.0).camera
+
+
+class Brightness:
+    """A method that takes the difference of the images' means, in tenths of the full scale, for motion along x."""
+
+    name = "brightness"
+
+    def flow(self, image1: Image, image2: Image) -> np.ndarray:
+        """See `gelflow.baselines.method.Method`."""
+        flow = np.zeros((*image1.shape[:2], 2), dtype=np.float32)
+        flow[..., 0] = 10 * (image2.mean() - image1.mean())
+        return flow
+
+
+def flat(value: float, channels: int = 3) -> Image:
+    """An image of one value."""
+    return np.full((60, 80, channels), value, dtype=np.float32)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_changes_of_a_known_method(channels: int) -> None:
+    """True motion 3 px; 4 px are measured on the clean pair and 4, 5, 3, 4 px on the four noisy pairs."""
+    noisy = [[flat(v, channels) for v in state] for state in ((0.2, 0.1), (0.6, 0.5))]
+    clean = [2 * [flat(v, channels)] for v in (0.2, 0.6)]
+    truth = Truth(np.broadcast_to([3.0, 0.0], (60, 80, 2)).astype(np.float64), np.ones((60, 80), dtype=bool))
+    found = changes(noisy, clean, CAMERA, truth, Brightness())
+    for prefix in ("", "median_"):
+        values = [found[f"{prefix}{name}_px"] for name in ("error", "change", "difference")]
+        # 8 bits: 10 / 255 / 2 px of rounding in each image.
+        assert values == pytest.approx([1.0, 0.0, 0.5], abs=0.04)
+    assert changes(noisy, noisy, CAMERA, truth, Brightness())["difference_px"] == 0
+
+
+def test_the_same_camera_noise_on_both_pairs() -> None:
+    camera = CAMERA.model_copy(update={"read_noise": 0.2})
+    pictures = [[flat(0.5)], [flat(0.5)]]
+    truth = Truth(np.zeros((60, 80, 2)), np.ones((60, 80), dtype=bool))
+    found = changes(pictures, pictures, camera, truth, Brightness())
+    assert found["difference_px"] == found["change_px"] == 0
+    assert found["error_px"] > 0
+    assert np.isnan(found["change_se_px"])  # one pair has no spread
+
+
+def test_jackknife_of_a_sum() -> None:
+    """For values a_i + b_j it is exactly the standard error of the mean of a + b."""
+    a, b = np.random.default_rng(0).standard_normal((2, 7))
+    assert jackknife(a[:, None] + b[None, :]) == pytest.approx(np.std(a + b, ddof=1) / 7**0.5, rel=1e-12)
+
+
+def test_an_image_is_not_compared_with_itself() -> None:
+    means = others([[flat(0.1), flat(0.2), flat(0.6)]])[0]
+    np.testing.assert_allclose([one[0, 0, 0] for one in means], [0.4, 0.35, 0.15], rtol=1e-6)

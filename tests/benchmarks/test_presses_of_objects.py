@@ -11,13 +11,12 @@ from benchmarks.rows import read
 
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    pv.Cube().triangulate().save(tmp_path / "cube.stl")
-    (tmp_path / "none.stl").write_text("solid")
     files = [str(tmp_path / name) for name in ("cube.stl", "none.stl")]
+    pv.Cube().triangulate().save(files[0])
+    Path(files[1]).write_text("solid")
     assert main(["objects", *files, "--draws", "1", "--out", str(tmp_path)]) == 0
-    cube, none = read(tmp_path / "objects.csv")
-    assert (cube["file"], none["file"]) == tuple(files)
-    assert (cube["status"], none["status"]) == ("complete", "refused")
+    rows = cube, none = read(tmp_path / "objects.csv")
+    assert [(row["file"], row["status"]) for row in rows] == list(zip(files, ("complete", "refused"), strict=True))
     assert cube["force_n"] > 0
     assert 0 <= cube["penetration"] < 0.2
     assert cube["times_a_ball"] > 0.2

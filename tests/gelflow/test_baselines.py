@@ -1,5 +1,6 @@
 """Classical methods on a motion that is known exactly."""
 
+import itertools
 from importlib.util import find_spec
 
 import numpy as np
@@ -7,7 +8,6 @@ import pytest
 import torch
 from textures import moved
 
-from gelflow.arrays import ImageArray
 from gelflow.baselines import CLASSICAL, named_methods
 from gelflow.baselines.aldic import ALDIC, INSTALL
 from gelflow.baselines.registry import REGISTERED
@@ -19,21 +19,12 @@ from gelflow.models.registration import registered
 SHIFT = (0.7, -0.4)
 
 
-# Median error in px: a matching error of a sixteenth of a px at the finest resolution that the method looks at. DIS
-# ultrafast and fast stop at a quarter of the resolution (OpenCV: finest scale 2), DIS medium at a half; Farnebäck and
-# TV-L1 end at full resolution, but TV-L1 is biased towards a flow without gradients: the same limit as DIS medium.
-# Lucas-Kanade iterates at full resolution until steps are below 0.001 px; what is left is the rounding to 8 bit.
-# Registration is to make of DIS medium's flow what Lucas-Kanade reaches.
+# Median error in px: a sixteenth of a px at the finest resolution that the method looks at. DIS ultrafast and fast stop
+# at a quarter of the resolution, DIS medium at a half; TV-L1 is biased towards a flow without gradients.
 TOLERANCE = {
-    "lucas-kanade": 1 / 16,
-    "farneback": 1 / 16,
-    "dis-ultrafast": 4 / 16,
-    "dis-fast": 4 / 16,
-    "dis-medium": 2 / 16,
-    "tvl1": 2 / 16,
-    "dis-motion": 1 / 16,
-    "dis-both": 1 / 16,
-    "dis-brightness": 1 / 16,
+    **dict.fromkeys(["lucas-kanade", "farneback", "dis-motion", "dis-both", "dis-brightness"], 1 / 16),
+    **dict.fromkeys(["dis-medium", "tvl1"], 2 / 16),
+    **dict.fromkeys(["dis-ultrafast", "dis-fast"], 4 / 16),
 }
 
 
@@ -41,57 +32,40 @@ TOLERANCE = {
 def test_recovers_a_sub_pixel_shift(name: str) -> None:
     (method,) = named_methods([name])
     flow = method.flow(moved(72, 96, 0, 0), moved(72, 96, *SHIFT))
-    assert flow.shape == (72, 96, 2)
-    assert flow.dtype == np.float32
-    error = np.hypot(flow[..., 0] - SHIFT[0], flow[..., 1] - SHIFT[1])[12:-12, 12:-12]
-    assert np.median(error) < TOLERANCE[name]
+    assert (flow.shape, flow.dtype) == ((72, 96, 2), np.float32)
+    assert np.median(np.hypot(*np.moveaxis(flow - np.float32(SHIFT), -1, 0))[12:-12, 12:-12]) < TOLERANCE[name]
 
 
-def test_no_motion_is_zero() -> None:
-    (method,) = named_methods(["none"])
-    assert not method.flow(moved(20, 30, 0, 0), moved(20, 30, 1, 1)).any()
-
-
-@pytest.mark.parametrize("name", [*CLASSICAL, *REGISTERED])
-@pytest.mark.parametrize(
-    ("image1", "image2", "word"),
-    [
-        (np.zeros((32, 32, 3), np.float32), np.zeros((32, 40, 3), np.float32), "shape"),
-        (np.zeros((32, 32), np.float32), np.zeros((32, 32), np.float32), "shape"),
-        (np.zeros((1, 1, 3), np.float32), np.zeros((1, 1, 3), np.float32), "16"),
-        (np.full((32, 32, 3), np.nan, np.float32), np.zeros((32, 32, 3), np.float32), "NaN"),
-    ],
-)
-def test_refuses_images_that_it_cannot_use(name: str, image1: ImageArray, image2: ImageArray, word: str) -> None:
-    with pytest.raises(InputError, match=word):
-        named_methods([name])[0].flow(image1, image2)
-
-
-@pytest.mark.parametrize("names", [["raft"], ["none", "none"]])
-def test_refuses_unknown_and_repeated_names(names: list[str]) -> None:
-    with pytest.raises(InputError, match=names[0]):
-        named_methods(names)
+def test_no_motion_is_zero_and_names_are_known_and_given_once() -> None:
+    assert not named_methods(["none"])[0].flow(moved(20, 30, 0, 0), moved(20, 30, 1, 1)).any()
+    for names in (["raft"], ["none", "none"]):
+        with pytest.raises(InputError, match=names[0]):
+            named_methods(names)
 
 
 @pytest.mark.parametrize("name", [*CLASSICAL, *REGISTERED])
-def test_works_on_the_smallest_allowed_images(name: str) -> None:
-    image = moved(16, 16, 0, 0)
-    assert named_methods([name])[0].flow(image, image).shape == (16, 16, 2)
+def test_images_from_16_px_on_serve_and_others_are_refused(name: str) -> None:
+    (method,) = named_methods([name])
+    image, good = moved(16, 16, 0, 0), np.zeros((32, 32, 3), np.float32)
+    assert method.flow(image, image).shape == (16, 16, 2)
+    for image1, image2, word in (
+        (good, good[:, :20], "shape"), (good[..., 0], good[..., 0], "shape"), (good[:1, :1], good[:1, :1], "16"),
+        (np.full_like(good, np.nan), good, "NaN"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=word):
+            method.flow(image1, image2)
 
 
-@pytest.mark.parametrize("aim", ["motion", "both", "brightness"])
-def test_a_registered_dis_is_dis_medium_registered(aim: Registration) -> None:
-    """Fails with the images exchanged before the registration, and with the aims exchanged: a shade parts them."""
+def test_a_registered_dis_is_dis_medium_registered() -> None:
     shade = np.zeros((72, 96, 1), np.float32)
-    shade[30:50, 40:60] = 0.2
+    shade[30:50, 40:60] = 0.2  # parts the aims
     images = moved(72, 96, 0, 0), moved(72, 96, *SHIFT) + shade
-    start, found = (method.flow(*images) for method in named_methods(["dis-medium", f"dis-{aim}"]))
+    aims: tuple[Registration, ...] = ("motion", "both", "brightness")
+    start, *found = (method.flow(*images) for method in named_methods(["dis-medium", *(f"dis-{aim}" for aim in aims)]))
     tensors = [torch.from_numpy(np.moveaxis(array, -1, 0).copy())[None] for array in (start, *images)]
-    settings = REGISTRATIONS[aim]
-    assert settings is not None
-    np.testing.assert_array_equal(np.moveaxis(found, -1, 0), registered(*tensors, settings)[0].numpy())
-    for other in {"motion", "both", "brightness"} - {aim}:
-        assert np.abs(named_methods([f"dis-{other}"])[0].flow(*images) - found).max() > 0.01
+    for aim, flow in zip(aims, found, strict=True):
+        np.testing.assert_array_equal(np.moveaxis(flow, -1, 0), registered(*tensors, REGISTRATIONS[aim])[0].numpy())
+    assert all(np.abs(one - other).max() > 0.01 for one, other in itertools.combinations(found, 2))
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
@@ -102,20 +76,17 @@ def test_registration_runs_where_it_is_asked_to() -> None:
 
 
 def test_interpolation_is_exact_for_affine_motion_inside_and_nearest_outside() -> None:
-    """Fails with columns and rows of the points exchanged."""
-    generator = np.random.default_rng(3)
-    points = generator.uniform([5, 5], [35, 25], (60, 2))
+    points = np.random.default_rng(3).uniform([5, 5], [35, 25], (60, 2))
     points[:4] = [(5, 5), (35, 5), (5, 25), (35, 25)]
-    motion = points @ np.array([[0.1, -0.05], [0.02, 0.2]]) + (1.0, -2.0)
-    flow = dense_flow(points, motion, 30, 40)
-    columns, rows = np.meshgrid(np.arange(40.0), np.arange(30.0))
-    true = np.stack([columns, rows], axis=-1) @ np.array([[0.1, -0.05], [0.02, 0.2]]) + (1.0, -2.0)
+
+    def motion(places: np.ndarray) -> np.ndarray:
+        return places @ np.array([[0.1, -0.05], [0.02, 0.2]]) + (1.0, -2.0)
+
+    flow = dense_flow(points, motion(points), 30, 40)
+    true = motion(np.stack(np.meshgrid(np.arange(40.0), np.arange(30.0)), axis=-1))
     # SciPy estimates the gradients iteratively, to 1e-6 of the values; float32 rounds 6e-7.
     np.testing.assert_allclose(flow[6:25, 6:35], true[6:25, 6:35], atol=2e-4)
-    np.testing.assert_allclose(flow[0, 0], motion[0], rtol=1e-6)
-
-
-def test_interpolation_of_few_points_is_the_nearest_one() -> None:
+    np.testing.assert_allclose(flow[0, 0], motion(points)[0], rtol=1e-6)
     assert (dense_flow(np.array([[3.0, 4.0]]), np.array([[1.0, 2.0]]), 8, 9) == (1.0, 2.0)).all()
     line = np.stack([np.arange(6.0), np.arange(6.0)], axis=1)
     assert dense_flow(line, line, 8, 9)[5, 5, 0] == 5.0

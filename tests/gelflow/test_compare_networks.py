@@ -1,28 +1,37 @@
-"""Networks in a comparison: RAFT and GelFlow beside each other, speed, fine-tuning on the pairs, the Pareto front."""
+"""Networks in a comparison: RAFT and GelFlow, speed, fine-tuning on the pairs, registration, the Pareto front."""
 
 import csv
 import json
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
+from test_cli import fails
 from textures import write_folder, write_synthetic
 from waves import Shifts, random_weights, same_weights, small
 
+import gelflow.compare.run
+import gelflow.models.gelflow
 from gelflow.arrays import FlowArray, ImageArray
 from gelflow.baselines.learned import Learned
 from gelflow.cli import main
 from gelflow.compare.plots import pareto_front
+from gelflow.compare.run import compare
 from gelflow.compare.scores import evaluate
-from gelflow.compare.speed import network_speed
-from gelflow.config import ModelConfig, MotionConfig, RegistrationConfig, TrainConfig
+from gelflow.compare.speed import Speed, network_speed
+from gelflow.config import REGISTRATIONS, ModelConfig, MotionConfig, Registration, RegistrationConfig, TrainConfig
 from gelflow.config.sources import train_config
-from gelflow.data import PairDataset, join, open_pairs
+from gelflow.data import join, open_pairs
 from gelflow.errors import InputError
+from gelflow.files.exr import read_flow
 from gelflow.models.raft import RAFT
+from gelflow.models.registration import registered
 from gelflow.models.weights import read_metadata
 from gelflow.train import train
 from gelflow.train.test_time import fine_tuned, fine_tuning_settings
@@ -46,11 +55,9 @@ def raft(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_all_kinds_of_networks_share_one_table(
     weights: Path, raft: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = write_folder(tmp_path / "data", {"a": (1, 0), "b": (0, 1)})
-    out = tmp_path / "out"
-    arguments = ["compare", str(folder), "--methods", "none,lucas-kanade", "--weights", f"mine={weights}", "--weights",
-                 str(raft), "--ft", "2", "--device", "cpu", "--out", str(out)]  # fmt: skip
-    assert main(arguments) == 0
+    folder, out = write_folder(tmp_path / "data", {"a": (1, 0), "b": (0, 1)}), tmp_path / "out"
+    common = ["compare", str(folder), "--weights", f"mine={weights}", "--device", "cpu", "--out", str(out)]
+    assert main([*common, "--methods", "none,lucas-kanade", "--weights", str(raft), "--ft", "2"]) == 0
     text = capsys.readouterr().out
     names = ["no motion", "Lucas-Kanade", "mine", "RAFT small", "mine+ft"]
     assert all(name in text for name in names)
@@ -58,10 +65,8 @@ def test_all_kinds_of_networks_share_one_table(
         rows = list(csv.DictReader(file))
     assert list(dict.fromkeys(row["method"] for row in rows)) == names
     assert "strata" not in rows[0]
-    table = (out / "table.md").read_text()
-    apart = table.split("Fine-tuned on these very pairs")
-    assert "| mine+ft |" not in apart[0]
-    assert "| mine+ft |" in apart[1]
+    apart = (out / "table.md").read_text().split("Fine-tuned on these very pairs")
+    assert ["| mine+ft |" in part for part in apart[:2]] == [False, True]
     networks = json.loads((out / "scores.json").read_text())["networks"]
     assert set(networks) == {"mine", "RAFT small", "mine+ft"}
     assert all(one["pairs_per_second"] > 0 and one["size"] == [64, 80] for one in networks.values())
@@ -70,35 +75,28 @@ def test_all_kinds_of_networks_share_one_table(
     tuned = tmp_path / "out_ft" / "mine" / "weights.safetensors"
     assert read_metadata(tuned)["step"] == "2"
     before = load_file(tuned)
-    again = ["compare", str(folder), "--methods", "", "--weights", f"mine={weights}", "--batch", "0", "--device", "cpu",
-             "--out", str(out)]  # fmt: skip
-    assert main([*again, "--ft", "2"]) == 0
-    after = load_file(tuned)
-    assert all(torch.equal(before[name], after[name]) for name in before)
-    assert main([*again, "--ft", "3"]) == 0
+    assert main([*common, "--methods", "", "--batch", "0", "--ft", "2"]) == 0
+    torch.testing.assert_close(load_file(tuned), before, rtol=0, atol=0)
+    assert main([*common, "--methods", "", "--batch", "0", "--ft", "3"]) == 0
     assert read_metadata(tuned)["step"] == "3"
 
 
 def test_fine_tuning_needs_a_place_and_a_network(
     weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = write_folder(tmp_path / "data", {"a": (1, 0)})
-    assert main(["compare", str(folder), "--weights", str(weights), "--ft", "5"]) == 2
-    assert main(["compare", str(folder), "--ft", "5", "--out", str(tmp_path / "out")]) == 2
-    assert capsys.readouterr().err.count("--ft 5: needs --weights of GelFlow, and --out") == 2
-    tail = ["--ft", "5", "--ft-config", "paper", "--out", str(tmp_path / "out")]
-    assert main(["compare", str(folder), "--weights", str(weights), *tail]) == 2
-    assert "for another number of scales" in capsys.readouterr().err
+    command = ["compare", write_folder(tmp_path / "data", {"a": (1, 0)}), "--ft", "5"]
+    for given in (["--weights", weights], ["--out", tmp_path / "out"]):
+        assert "--ft 5: needs --weights of GelFlow, and --out" in fails(capsys, *command, *given)
+    tail = ["--weights", weights, "--ft-config", "paper", "--out", tmp_path / "out"]
+    assert "for another number of scales" in fails(capsys, *command, *tail)
 
 
 def test_fine_tuning_changes_the_copy_only_and_lowers_its_loss(
     weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = write_folder(tmp_path / "data", {"a": (1, 0)})
-    before = weights.read_bytes()
-    out = tmp_path / "out"
+    folder, before = write_folder(tmp_path / "data", {"a": (1, 0)}), weights.read_bytes()
     arguments = ["compare", str(folder), "--methods", "", "--weights", f"mine={weights}", "--batch", "0", "--json"]
-    assert main([*arguments, "--ft", "40", "--out", str(out)]) == 0
+    assert main([*arguments, "--ft", "40", "--out", str(tmp_path / "out")]) == 0
     assert weights.read_bytes() == before
     scores = {one["method"]: one for one in json.loads(capsys.readouterr().out)["methods"]}
     assert scores["mine+ft"]["psnr_db"] > scores["mine"]["psnr_db"]
@@ -153,71 +151,184 @@ UNSUITABLE: dict[str, Any] = {
 """A training that nothing of may carry over but losses, clipping, flips, weight decay and seed."""
 
 
+def unsuitable(path: Path, size: tuple[int, int] | None = None, **changes: object) -> Path:
+    """Weights that record such a training."""
+    return random_weights(path, SMALL, TrainConfig.model_validate({"model": SMALL} | UNSUITABLE | changes), size)
+
+
 @pytest.mark.parametrize("preset", ["best", "real", "bare", "paper", "selfflow"])
 def test_whatever_the_preset_the_pairs_are_seen_as_they_are_and_without_truth(preset: str, tmp_path: Path) -> None:
-    """Fails with any one of the fixed settings left out that this preset sets otherwise."""
     recorded = train_config(preset)
-    levels = recorded.model.levels
-    model = ModelConfig(levels=levels, projected_channels=8, estimator="shared", registration=RegistrationConfig())
+    model = ModelConfig(levels=recorded.model.levels, projected_channels=8, estimator="shared",
+                        registration=RegistrationConfig())  # fmt: skip
     rate = min(recorded.learning_rate, 1e-4) if recorded.schedule == "one_cycle" else recorded.learning_rate
     method = Learned(random_weights(tmp_path / "w.safetensors", model, recorded, recorded.image_size), device="cpu")
     for config in (None, preset):
-        settings = fine_tuning_settings(method, 1600, config, pairs=8)
-        assert settings.supervision == "self"
-        assert settings.motion is None
-        assert settings.color_jitter == 0
-        assert settings.crop_size is None
-        assert settings.ema_decay == 0
-        assert (settings.schedule, settings.warmup_steps, settings.learning_rate) == ("constant", 0, rate)
-        assert settings.image_size == recorded.image_size
-        assert settings.loss == recorded.loss
-        assert settings.model == model  # its registration included
+        found = fine_tuning_settings(method, 1600, config, pairs=8)
+        assert (found.supervision, found.motion, found.color_jitter, found.crop_size) == ("self", None, 0, None)
+        assert (found.schedule, found.warmup_steps, found.learning_rate, found.ema_decay) == ("constant", 0, rate, 0)
+        assert (found.image_size, found.loss, found.model) == (recorded.image_size, recorded.loss, model)
         # From the weights the paper's batches of 4, so that 1600 steps are 800 epochs; a file's own, if pairs suffice.
-        assert settings.batch_size == (4 if config is None else min(recorded.batch_size, 8))
+        assert found.batch_size == (4 if config is None else min(recorded.batch_size, 8))
 
 
 def test_nothing_else_of_the_training_carries_over(tmp_path: Path) -> None:
-    """Fails with the machine's settings (devices, workers) left as recorded."""
-    recorded = TrainConfig.model_validate({"model": SMALL} | UNSUITABLE)
-    method = Learned(random_weights(tmp_path / "w.safetensors", SMALL, recorded), device="cpu")
-    settings = fine_tuning_settings(method, 12, None, pairs=3)
-    expected = TrainConfig(
-        model=SMALL, loss=recorded.loss, supervision="self", mixed_self=3.0, batch_size=3, steps=12, learning_rate=1e-4,
-        gradient_clip=1.0, flip=False, seed=5, device="cpu",
+    method = Learned(unsuitable(tmp_path / "w.safetensors"), device="cpu")
+    assert fine_tuning_settings(method, 12, None, pairs=3) == TrainConfig(
+        model=SMALL, loss=UNSUITABLE["loss"], supervision="self", mixed_self=3.0, batch_size=3, steps=12,
+        learning_rate=1e-4, gradient_clip=1.0, flip=False, seed=5, device="cpu",
     )  # fmt: skip
-    assert settings == expected
 
 
 def test_a_constant_rate_and_the_size_of_use_are_kept(tmp_path: Path) -> None:
-    """Fails with the size of the training where --size gives another: the pairs would be scored at a size not seen."""
-    recorded = TrainConfig.model_validate({"model": SMALL} | UNSUITABLE | {"schedule": "constant", "warmup_steps": 0})
-    path = random_weights(tmp_path / "w.safetensors", SMALL, recorded, (96, 128))
+    path = unsuitable(tmp_path / "w.safetensors", (96, 128), schedule="constant", warmup_steps=0)
     settings = fine_tuning_settings(Learned(path, size=(64, 80), device="cpu"), 12, None, pairs=3)
-    assert settings.learning_rate == 4e-4
-    assert settings.image_size == (64, 80)
+    assert (settings.learning_rate, settings.image_size) == (4e-4, (64, 80))
     assert fine_tuning_settings(Learned(path, device="cpu"), 12, None, pairs=3).image_size == (96, 128)
 
 
 def test_exact_flow_is_not_looked_at(tmp_path: Path) -> None:
-    """Fails with supervision = "flow" or "mixed" carried over: the same images with and without their exact flow."""
+    """The same images with and without their exact flow."""
     shifts = [(1.5, 0.5), (-1.0, 0.0)]
     plain = open_pairs(write_folder(tmp_path / "plain", {"a": shifts[0], "b": shifts[1]}))
     exact = open_pairs(write_synthetic(tmp_path / "exact", shifts))
-    recorded = TrainConfig.model_validate({"model": SMALL} | UNSUITABLE)
-    method = Learned(random_weights(tmp_path / "w.safetensors", SMALL, recorded), "net", device="cpu")
+    method = Learned(unsuitable(tmp_path / "w.safetensors"), "net", device="cpu")
     runs = [fine_tuned(method, dataset, tmp_path / f"run{k}", 3) for k, dataset in enumerate((plain, exact))]
     assert [run.name for run in runs] == ["net+ft"] * 2
     assert same_weights(runs[0].path, runs[1].path)
     assert not same_weights(runs[0].path, method.path)
-    recorded_now = json.loads(read_metadata(runs[0].path)["train"])
-    assert (recorded_now["supervision"], recorded_now["steps"]) == ("self", 3)
+    recorded = json.loads(read_metadata(runs[0].path)["train"])
+    assert (recorded["supervision"], recorded["steps"]) == ("self", 3)
 
 
 def test_pairs_of_several_sizes_need_one(tmp_path: Path) -> None:
     folders = [write_folder(tmp_path / f"{k}", {"a": (1, 0)}, size) for k, size in enumerate([(64, 80), (72, 80)])]
-    dataset: PairDataset = join([open_pairs(folder) for folder in folders])
-    recorded = TrainConfig.model_validate({"model": SMALL} | UNSUITABLE)
-    path = random_weights(tmp_path / "w.safetensors", SMALL, recorded)
+    dataset, path = join([open_pairs(folder) for folder in folders]), unsuitable(tmp_path / "w.safetensors")
     with pytest.raises(InputError, match="64x80, 72x80 px, a batch needs one size; give --size"):
         fine_tuned(Learned(path, device="cpu"), dataset, tmp_path / "run", 1)
     assert fine_tuned(Learned(path, size=(64, 80), device="cpu"), dataset, tmp_path / "run", 1).path.is_file()
+
+
+OWN = RegistrationConfig(windows_px=(8,), smoothing_px=(4,))
+CHOICES: tuple[Registration, Registration] = ("none", "brightness")
+ROWS = [word for choice in CHOICES for word in ("--registration", choice)]
+
+
+def tensor(array: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(np.moveaxis(array, -1, 0).copy())[None]
+
+
+@pytest.fixture(scope="module")
+def networks(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Weights without and with a registration of their own."""
+    models = [ModelConfig(levels=4, projected_channels=8, registration=config) for config in (None, OWN)]
+    folder = tmp_path_factory.mktemp("networks")
+    return [random_weights(folder / f"{k}.safetensors", model, small(model=model)) for k, model in enumerate(models)]
+
+
+@pytest.fixture
+def plain(networks: list[Path]) -> Path:
+    return networks[0]
+
+
+@pytest.fixture
+def own(networks: list[Path]) -> Path:
+    return networks[1]
+
+
+def test_the_settings_are_the_weights_own_or_those_of_an_aim(plain: Path, own: Path) -> None:
+    motion, brightness = REGISTRATIONS["motion"], REGISTRATIONS["brightness"]
+    expected: list[tuple[Path, Registration | None, RegistrationConfig | None, str]] = [
+        (plain, None, None, ""), (plain, "none", None, ""), (plain, "motion", motion, "+motion"),
+        (own, None, OWN, "+registration"), (own, "none", None, ""), (own, "brightness", brightness, "+brightness"),
+    ]  # fmt: skip
+    for path, choice, config, added in expected:
+        method = Learned(path, "net", device="cpu", registration=choice)
+        assert method.model.config.registration == config
+        assert method.name == f"net{added}"
+
+
+def test_the_name_says_so_and_stays_one_of_a_group_of_seeds(plain: Path) -> None:
+    names = {"net": "net+motion", "net#2": "net+motion#2", "net#2+ft": "net+motion#2+ft", "net+ft": "net+motion+ft",
+             "net+motion": "net+motion", "C# code": "C# code+motion"}  # fmt: skip
+    found = {label: Learned(plain, label, device="cpu", registration="motion").name for label in names}
+    assert found == names
+
+
+def test_rows_without_and_with_registration_stand_in_one_table_with_one_of_raft(
+    plain: Path, raft: Path, tmp_path: Path
+) -> None:
+    folder, out = write_folder(tmp_path / "data", {"a": (1.0, -0.5)}), tmp_path / "out"
+    arguments = ["compare", str(folder), "--methods", "none", "--weights", f"net={plain}", "--weights", str(raft)]
+    assert main([*arguments, *ROWS, "--device", "cpu", "--ft", "2", "--batch", "0", "--out", str(out)]) == 0
+    scores = {one["method"]: one for one in json.loads((out / "scores.json").read_text())["methods"]}
+    assert list(scores) == ["no motion", "net", "net+brightness", "RAFT small", "net+ft", "net+brightness+ft"]
+    assert scores["net+brightness"]["psnr_db"] > scores["net"]["psnr_db"] + 6
+    assert scores["net+brightness+ft"]["psnr_db"] > scores["net+ft"]["psnr_db"] + 6
+    # One optimisation for both rows, whose copy keeps what the weights had: no registration.
+    assert [path.name for path in (tmp_path / "out_ft").iterdir()] == ["net"]
+    model = json.loads(read_metadata(tmp_path / "out_ft" / "net" / "weights.safetensors")["model"])
+    assert model["registration"] is None
+
+
+def test_a_row_is_what_registration_makes_of_the_networks_flow(plain: Path, tmp_path: Path) -> None:
+    images = open_pairs(write_folder(tmp_path, {"a": (1.0, -0.5)})).images(0)
+    start, found = (Learned(plain, device="cpu", registration=choice).flow(*images) for choice in CHOICES)
+    again = registered(*map(tensor, (start, *images)), REGISTRATIONS["brightness"])[0].numpy()
+    np.testing.assert_array_equal(np.moveaxis(found, -1, 0), again)
+
+
+def test_the_speed_of_the_network_alone_includes_it(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    dataset = open_pairs(write_folder(tmp_path, {"a": (1.0, -0.5)}))
+    measured = []
+
+    def kept(passes: Callable[..., torch.Tensor], *_: object) -> Speed:
+        with torch.no_grad():
+            measured.append(passes(*map(tensor, dataset.images(0)))[0].numpy())
+        return Speed(1.0, None, 1, (64, 80), "here")
+
+    monkeypatch.setattr(gelflow.compare.run, "network_speed", kept)
+    method = Learned(own, "net", device="cpu")
+    compare([method], dataset)
+    np.testing.assert_array_equal(np.moveaxis(measured[0], 0, -1), method.flow(*dataset.images(0)))
+
+
+def test_its_time_counts(plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+
+    def slow(*arguments: object) -> torch.Tensor:
+        time.sleep(0.3)
+        return registered(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(gelflow.models.gelflow, "registered", slow)
+    dataset = open_pairs(write_folder(tmp_path, {"a": (1.0, -0.5)}))
+    (score,) = evaluate(Learned(plain, device="cpu", registration="motion"), dataset)
+    assert score.seconds >= 0.3
+
+
+def test_predict_and_evaluate_take_it(plain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_folder(tmp_path / "data", {"a": (1.0, -0.5)})
+    common = ["--weights", str(plain), "--device", "cpu", "--registration"]
+    flows = []
+    for choice in CHOICES:
+        out = tmp_path / choice
+        assert main(["predict", *(str(folder / f"a_{k}.png") for k in (1, 2)), "--out", str(out), *common, choice]) == 0
+        flows.append(read_flow(out / "a.exr").flow)
+        assert ("+brightness: mean motion" in capsys.readouterr().out) == (choice == "brightness")
+    # 1/8 px: the images are rounded to 8 bit, as in test_predict.
+    assert np.abs(np.median(flows[1], axis=(0, 1)) - (1.0, -0.5)).max() < 1 / 8
+    assert np.abs(np.median(flows[0], axis=(0, 1)) - (1.0, -0.5)).max() > 1 / 2
+    assert main(["evaluate", str(folder), *common, "motion", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["methods"][0]["method"].endswith("+motion")
+
+
+def test_registration_is_refused_where_there_is_none(
+    plain: Path, raft: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, out = write_folder(tmp_path / "data", {"a": (1, 0)}), tmp_path / "out"
+    tail = ("--device", "cpu", "--registration", "motion")
+    assert "is RAFT" in fails(capsys, "evaluate", folder, "--weights", raft, *tail)
+    assert "needs --weights of GelFlow" in fails(capsys, "compare", folder, "--weights", raft, *tail)
+    assert "dis-brightness" in fails(capsys, "compare", folder, "--methods", "none", *tail)
+    assert "dis-brightness" in fails(capsys, "predict", folder, "--out", out, "--method", "dis-medium", *tail)
+    assert "registration" in fails(capsys, "evaluate", folder, "--weights", plain, "--registration", "shading")
+    assert not out.exists()

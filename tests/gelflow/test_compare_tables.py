@@ -20,36 +20,26 @@ from gelflow.compare.tables import pair_table, strata_table, summary_table, tabl
 from gelflow.data import PairDataset, open_pairs
 
 
-def test_the_seed_is_a_number_at_the_end() -> None:
+def test_seeds_become_mean_and_standard_deviation(tmp_path: Path) -> None:
     names = ["best#0", "best#12+ft", "best", "C# code", "a#1b", "x#2#3"]
     assert [group_name(name) for name in names] == ["best", "best+ft", "best", "C# code", "a#1b", "x#2"]
-
-
-def test_seeds_become_mean_and_standard_deviation(tmp_path: Path) -> None:
-    """Fails with the population's standard deviation (n in place of n - 1)."""
     dataset = open_pairs(write_synthetic(tmp_path, [(1.0, 0.0), (2.0, 0.0)]))
     methods = [Constant("net#0", 0, 0), Constant("other", 5, 0), Constant("net#1", 0.5, 0), Constant("net#2", 1, 0)]
     scores = [score for method in methods for score in evaluate(method, dataset)]
     groups = grouped(summarise(scores))
     assert [group.label for group in groups] == ["net (3 seeds)", "other"]
     # errors of the seeds: (1 + 2) / 2, (0.5 + 1.5) / 2, (0 + 1) / 2
-    assert groups[0].mean("endpoint_error_px") == pytest.approx(1.0)
-    assert groups[0].spread("endpoint_error_px") == pytest.approx(0.5)
-    assert groups[1].spread("endpoint_error_px") is None
     header, rows = summary_table(groups)
-    column = header.index("EPE px")
-    assert [row[column] for row in rows] == ["1.000 ± 0.500", "3.500"]
-    table = pair_table(scores, lambda s: (s.endpoint_error_px or 0.0,), "{:.2f}")
-    assert table == (["method", "000000", "000001"],
-                     [["net (3 seeds)", "0.50", "1.50"], ["other", "4.00", "3.00"]])  # fmt: skip
+    assert [row[header.index("EPE px")] for row in rows] == ["1.000 ± 0.500", "3.500"]
+    assert groups[1].spread("endpoint_error_px") is None
+    assert pair_table(scores, lambda s: (s.endpoint_error_px,), "{:.2f}") == (
+        ["method", "000000", "000001"], [["net (3 seeds)", "0.50", "1.50"], ["other", "4.00", "3.00"]])  # fmt: skip
 
 
-def test_bins_of_seeds_are_pooled(tmp_path: Path) -> None:
+def test_bins_of_seeds_are_pooled_and_data_without_contact_have_bins_of_motion_alone(tmp_path: Path) -> None:
     dataset = open_pairs(write_synthetic(tmp_path, [(1.0, 0.0)]))
     result = compare([Constant("net#0", 0, 0), Constant("net#1", 0.5, 0)], dataset)
-    header, rows = strata_table(result.strata)
-    assert header == ["where", "pixels", "net"]
-    assert rows == [["motion: 1 to 2 px", "4096", "0.750"]]
+    assert strata_table(result.strata) == (["where", "pixels", "net"], [["motion: 1 to 2 px", "4096", "0.750"]])
 
 
 def test_fine_tuned_methods_come_apart_and_devices_are_named_where_they_differ(tmp_path: Path) -> None:
@@ -57,17 +47,13 @@ def test_fine_tuned_methods_come_apart_and_devices_are_named_where_they_differ(t
     result = compare([Constant("net#0+ft", 1, 0), Constant("net", 0, 0)], dataset)
     named = [[row[0] for row in rows] for _, (_, rows) in tables(result)]
     assert named == [["net"], ["net+ft"], ["net", "net+ft"]]
-    elsewhere = replace(result.scores[1], method="net, GPU", device="NVIDIA H200", on_gpu=True)
-    header, rows = summary_table(grouped(summarise([result.scores[1], elsewhere])))
-    assert header[-1] == "on"
-    assert rows[1][-1] == "NVIDIA H200"
-
-
-def test_a_gpu_is_charged_time_as_it_passes_and_a_processor_that_of_a_core(tmp_path: Path) -> None:
-    (score,) = evaluate(Constant("net", 0, 0), open_pairs(write_folder(tmp_path, {"a": (1, 0)})))
-    here = replace(score, seconds=2.0, processor_seconds=0.5)
-    there = replace(here, method="there", on_gpu=True)
-    assert [one.cost_seconds for one in summarise([here, there])] == [0.5, 2.0]
+    here = replace(result.scores[1], seconds=2.0, processor_seconds=0.5)
+    elsewhere = replace(here, method="net, GPU", device="NVIDIA H200", on_gpu=True)
+    means = summarise([here, elsewhere])
+    header, rows = summary_table(grouped(means))
+    assert (header[-1], rows[1][-1]) == ("on", "NVIDIA H200")
+    # A GPU is charged time as it passes, a processor that of a core.
+    assert [one.cost_seconds for one in means] == [0.5, 2.0]
 
 
 def test_latex_escapes_what_it_must() -> None:
@@ -79,7 +65,6 @@ def test_latex_escapes_what_it_must() -> None:
 
 
 def test_distance_is_signed_and_measured_from_the_edge_between_pixels() -> None:
-    """Fails with the sign exchanged and without the half pixel."""
     region = np.zeros((5, 12), bool)
     region[:, :4] = True
     np.testing.assert_array_equal(signed_distance(region)[2], [-3.5, -2.5, -1.5, -0.5, *np.arange(0.5, 8)])
@@ -88,20 +73,20 @@ def test_distance_is_signed_and_measured_from_the_edge_between_pixels() -> None:
 def test_bins_hold_every_compared_pixel_once() -> None:
     generator = np.random.default_rng(0)
     truth = generator.normal(0, 6, (20, 30, 2)).astype(np.float32)
-    error = generator.exponential(0.4, (20, 30))
-    compared = generator.random((20, 30)) < 0.8
+    error, compared = generator.exponential(0.4, (20, 30)), generator.random((20, 30)) < 0.8
     contact = np.zeros((20, 30), bool)
     contact[5:15, 8:20] = True
     strata = pair_strata(error, truth, compared, contact, "gelsight, speckle")
+    counted = error[compared]
     for kind in (MOTION, EDGE, PATTERN, SCENE):
-        mine = [stratum for stratum in strata if stratum.kind == kind]
-        assert sum(s.pixels for s in mine) == compared.sum()
-        assert sum(s.error_px for s in mine) == pytest.approx(error[compared].sum(), rel=1e-12)
-        assert sum(s.above_1px for s in mine) == (error[compared] > 1).sum()
-        assert sum(s.above_01px for s in mine) == (error[compared] > 0.1).sum()
+        mine = [(s.pixels, s.error_px, s.above_1px, s.above_01px) for s in strata if s.kind == kind]
+        expected = (counted.size, counted.sum(), (counted > 1).sum(), (counted > 0.1).sum())
+        np.testing.assert_allclose(np.sum(mine, axis=0), expected, rtol=1e-12)
     length = np.hypot(*np.moveaxis(truth, -1, 0))
     (bin_,) = (s for s in strata if s.bin == "2 to 4 px")
     assert bin_.error_px == pytest.approx(error[compared & (length >= 2) & (length < 4)].sum(), rel=1e-12)
+    for edgeless in (None, np.zeros((20, 30), bool), np.ones((20, 30), bool)):
+        assert {s.kind for s in pair_strata(error, truth, compared, edgeless)} == {MOTION}
 
 
 def test_pairs_add_up_pixel_by_pixel_in_the_order_of_the_bins() -> None:
@@ -112,12 +97,6 @@ def test_pairs_add_up_pixel_by_pixel_in_the_order_of_the_bins() -> None:
         ("0 to 0.5 px", 12, 6.0, 0),
         ("8 to 16 px", 12, 24.0, 12),
     ]
-
-
-def test_no_contact_or_contact_everywhere_gives_no_distances() -> None:
-    error, truth, compared = np.ones((4, 4)), np.ones((4, 4, 2), np.float32), np.ones((4, 4), bool)
-    for contact in (None, np.zeros((4, 4), bool), np.ones((4, 4), bool)):
-        assert {s.kind for s in pair_strata(error, truth, compared, contact)} == {MOTION}
 
 
 DRAWN_KIND = {"kind": {"choice": ["dots", "speckle"]}}
@@ -144,7 +123,6 @@ def with_contact(folder: Path, pattern: dict) -> Path:
 
 @pytest.mark.parametrize("pattern", [DRAWN_KIND, DRAWN_PATTERN], ids=["kind", "pattern"])
 def test_a_data_set_with_contact_and_patterns_is_sorted(pattern: dict, tmp_path: Path) -> None:
-    """Fails, where the whole pattern is drawn, with the kind looked up in the header alone."""
     dataset = open_pairs(with_contact(tmp_path / "data", pattern))
     result = compare([Constant("zero", 0, 0), Constant("right", 3, 0)], dataset, tmp_path / "out")
     header, rows = strata_table(result.strata)
@@ -162,11 +140,6 @@ def test_a_data_set_with_contact_and_patterns_is_sorted(pattern: dict, tmp_path:
     assert float(table["zero", "2 to 4 px"]["outliers_1px"]) == 1.0
     assert float(table["zero", "0 to 0.5 px"]["outliers_1px"]) == 0.0
     assert float(table["zero", "0 to 0.5 px"]["outliers_01px"]) == 1.0
-
-
-def test_data_without_them_have_no_such_rows(tmp_path: Path) -> None:
-    scores = evaluate(Constant("zero", 0, 0), open_pairs(write_synthetic(tmp_path, [(1.0, 0.0)])))
-    assert {stratum.kind for stratum in scores[0].strata} == {MOTION}
 
 
 def test_bare_gels_are_left_out_of_a_second_table_of_means(tmp_path: Path) -> None:

@@ -9,12 +9,15 @@ from numpy.typing import NDArray
 from textures import REAL, as_bytes, moved, save, write_video
 
 from gelflow.data import open_pairs
-from gelflow.data.choose import ChoiceConfig, choose_pairs, usable_frames
+from gelflow.data.choose import ChoiceConfig, Choices, choose_pairs, usable_frames
 from gelflow.data.extract import extract_pairs, find_recordings
 from gelflow.data.pairset import read_pair_set
 from gelflow.errors import InputError
 
 Frame = NDArray[np.uint8]
+
+
+SHIFTS = {"a": [0, 0.2, 3, 6, 9, 9.1], "b": [0, 5, 0, 4, 8, 2]}
 
 
 def recording(shifts: list[float], seed: int = 0) -> list[Frame]:
@@ -25,8 +28,8 @@ def recording(shifts: list[float], seed: int = 0) -> list[Frame]:
 def videos(tmp_path: Path) -> Path:
     folder = tmp_path / "videos"
     folder.mkdir()
-    write_video(folder / "a.avi", recording([0, 0.2, 3, 6, 9, 9.1], seed=1))
-    write_video(folder / "b.avi", recording([0, 5, 0, 4, 8, 2], seed=2))
+    for seed, (name, shifts) in enumerate(SHIFTS.items(), start=1):
+        write_video(folder / f"{name}.avi", recording(shifts, seed))
     return folder
 
 
@@ -35,75 +38,60 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def test_chosen_motion_is_the_true_one_and_within_the_limits(tmp_path: Path, videos: Path) -> None:
-    shifts = {"a": [0, 0.2, 3, 6, 9, 9.1], "b": [0, 5, 0, 4, 8, 2]}
     result = extract_pairs([str(videos)], tmp_path / "out", ChoiceConfig(per_source=4, maximum_motion_px=7))
     assert {pair.source for pair in result.pairs} == {"a", "b"}
     for pair in result.pairs:
-        i, j = pair.frames
-        true = abs(shifts[pair.source][j] - shifts[pair.source][i])
-        # A rigid shift; the cheap flow errs by up to 0.25 px on the reduced image (see test_baselines), here unreduced,
-        # and by more at the border, which the 95th percentile sees: 0.5 px.
-        assert pair.motion_px == pytest.approx(true, abs=0.5)
+        first, second = (SHIFTS[pair.source][k] for k in pair.frames)
+        # A rigid shift; the cheap flow errs by up to 0.25 px (see test_baselines), and by more at the border, which the
+        # 95th percentile sees: 0.5 px.
+        assert pair.motion_px == pytest.approx(abs(second - first), abs=0.5)
         assert 2 <= pair.motion_px <= 7
 
 
-def test_pair_set_can_be_opened_and_holds_the_frames(tmp_path: Path, videos: Path) -> None:
-    result = extract_pairs([str(videos / "a.avi")], tmp_path / "out", ChoiceConfig(per_source=2))
-    dataset = open_pairs(tmp_path / "out")
-    assert dataset.names == [pair.name for pair in result.pairs]
-    image1, _ = dataset.images(0)
-    expected = moved(96, 128, [0, 0.2, 3, 6, 9, 9.1][result.pairs[0].frames[0]], 0, 1)
+def test_pair_set_holds_the_frames_the_same_whether_the_recording_is_alone_or_not(tmp_path: Path, videos: Path) -> None:
+    both = extract_pairs([str(videos)], tmp_path / "both", ChoiceConfig(per_source=3))
+    alone = extract_pairs([str(videos / "b.avi")], tmp_path / "alone", ChoiceConfig(per_source=3))
+    assert [pair for pair in both.pairs if pair.source == "b"] == list(alone.pairs)
+    dataset = open_pairs(tmp_path / "alone")
+    assert dataset.names == [pair.name for pair in alone.pairs]
+    expected = moved(96, 128, SHIFTS["b"][alone.pairs[0].frames[0]], 0, 2)
     # Motion JPEG at OpenCV's quality of 95: a few grey levels of 255 on average.
-    assert np.abs(image1 - expected).mean() < 5 / 255
+    assert np.abs(dataset.images(0)[0] - expected).mean() < 5 / 255
 
 
 def test_same_seed_gives_the_same_bytes_and_another_seed_another_choice(tmp_path: Path, videos: Path) -> None:
     for out in ("one", "two"):
         extract_pairs([str(videos)], tmp_path / out, ChoiceConfig(per_source=2))
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
-    seeds = set()
-    for seed in range(1, 5):
-        result = extract_pairs([str(videos)], tmp_path / f"seed{seed}", ChoiceConfig(per_source=2, seed=seed))
-        seeds.add(tuple(pair.name for pair in result.pairs))
-    assert len(seeds) > 1
+    results = [extract_pairs([str(videos)], tmp_path / f"seed{seed}", ChoiceConfig(per_source=2, seed=seed))
+               for seed in range(1, 5)]  # fmt: skip
+    assert len({tuple(pair.name for pair in result.pairs) for result in results}) > 1
 
 
-def test_a_recording_gives_the_same_pairs_alone_and_among_others(tmp_path: Path, videos: Path) -> None:
-    both = extract_pairs([str(videos)], tmp_path / "both", ChoiceConfig(per_source=3))
-    alone = extract_pairs([str(videos / "b.avi")], tmp_path / "alone", ChoiceConfig(per_source=3))
-    assert [pair for pair in both.pairs if pair.source == "b"] == list(alone.pairs)
-
-
-def test_interrupted_job_goes_on_and_ends_with_the_same_bytes(tmp_path: Path, videos: Path) -> None:
-    extract_pairs([str(videos)], tmp_path / "whole", ChoiceConfig())
+def test_a_job_goes_on_where_it_was_interrupted_and_is_not_replaced_by_another(tmp_path: Path, videos: Path) -> None:
+    whole, cut = tmp_path / "whole", tmp_path / "cut"
+    extract_pairs([str(videos)], whole, ChoiceConfig())
 
     def interrupt(done: int, total: int, name: str, outcome: object) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        extract_pairs([str(videos)], tmp_path / "cut", ChoiceConfig(), interrupt)
-    assert list(read_pair_set(tmp_path / "cut").sources) == ["a"]
+        extract_pairs([str(videos)], cut, ChoiceConfig(), interrupt)
+    assert list(read_pair_set(cut).sources) == ["a"]
     with pytest.raises(InputError, match="interrupted"):
-        open_pairs(tmp_path / "cut")
-    extract_pairs([str(videos)], tmp_path / "cut", ChoiceConfig())
-    assert contents(tmp_path / "cut") == contents(tmp_path / "whole")
-
-
-def test_running_a_finished_job_again_changes_nothing(tmp_path: Path, videos: Path) -> None:
-    extract_pairs([str(videos)], tmp_path / "out", ChoiceConfig())
-    before = {p: p.stat().st_mtime_ns for p in (tmp_path / "out").rglob("*")}
-    extract_pairs([str(videos)], tmp_path / "out", ChoiceConfig())
-    assert {p: p.stat().st_mtime_ns for p in (tmp_path / "out").rglob("*")} == before
-
-
-def test_folder_of_another_job_is_refused_with_the_difference(tmp_path: Path, videos: Path) -> None:
-    extract_pairs([str(videos)], tmp_path / "out", ChoiceConfig())
-    with pytest.raises(InputError, match=r"seed is 0 there and 7 here"):
-        extract_pairs([str(videos)], tmp_path / "out", ChoiceConfig(seed=7))
-    with pytest.raises(InputError, match=r"only there: a"):
-        extract_pairs([str(videos / "b.avi")], tmp_path / "out", ChoiceConfig())
-    with pytest.raises(InputError, match="holds other things"):
-        extract_pairs([str(videos)], videos, ChoiceConfig())
+        open_pairs(cut)
+    extract_pairs([str(videos)], cut, ChoiceConfig())
+    assert contents(cut) == contents(whole)
+    before = {path: path.stat().st_mtime_ns for path in cut.rglob("*")}
+    extract_pairs([str(videos)], cut, ChoiceConfig())  # it is finished: nothing is written
+    for inputs, out, config, words in (
+        (videos, cut, ChoiceConfig(seed=7), r"seed is 0 there and 7 here"),
+        (videos / "b.avi", cut, ChoiceConfig(), r"only there: a"),
+        (videos, videos, ChoiceConfig(), "holds other things"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=words):
+            extract_pairs([str(inputs)], out, config)
+    assert {path: path.stat().st_mtime_ns for path in cut.rglob("*")} == before
 
 
 def test_undecodable_video_is_counted_the_others_are_used(
@@ -132,9 +120,8 @@ def test_image_folder_is_a_recording_in_natural_order_and_a_broken_image_is_coun
         save(tmp_path / "run" / f"frame{8 + number}.png", moved(96, 128, shift, 0))
     (tmp_path / "run" / "frame13.png").write_bytes(b"no image")
     result = extract_pairs([str(tmp_path)], tmp_path / "out", ChoiceConfig(per_source=20))
-    assert list(result.sources) == ["run"]
-    assert result.sources["run"].frames == 5
-    assert result.sources["run"].frames_rejected == {"undecodable": 1}
+    (report,) = result.sources.values()
+    assert (list(result.sources), report.frames, report.frames_rejected) == (["run"], 5, {"undecodable": 1})
     for pair in result.pairs:
         assert pair.motion_px == pytest.approx(3 * abs(pair.frames[0] - pair.frames[1]), abs=0.5)
 
@@ -142,50 +129,43 @@ def test_image_folder_is_a_recording_in_natural_order_and_a_broken_image_is_coun
 def test_blank_frames_and_exposure_ramps_are_put_aside() -> None:
     frames = recording([0, 3, 6, 9, 12])
     frames[1] = np.full_like(frames[1], 90)
-    ramp = frames[3].astype(float) * [1.0, 0.6, 0.6]  # a red picture: green and blue have not come up yet
-    frames[3] = ramp.astype(np.uint8)
-    usable, rejected = usable_frames(frames)
-    assert usable == [0, 2, 4]
-    assert rejected == {"blank": 1, "exposure": 1}
+    frames[3] = (frames[3] * np.array([1.0, 0.6, 0.6])).astype(np.uint8)  # green and blue have not come up yet
+    assert usable_frames(frames) == ([0, 2, 4], {"blank": 1, "exposure": 1})
 
 
-def test_still_recording_gives_no_pair_and_repeated_motion_only_one() -> None:
-    still = choose_pairs(recording([0, 0, 0.1, 0]), ChoiceConfig(), np.random.default_rng(0))
-    assert not still.pairs
-    assert set(still.rejected) == {"little motion"}
-    there_and_back = choose_pairs(recording([0, 4, 0, 4, 0, 4]), ChoiceConfig(), np.random.default_rng(0))
+def test_still_repeated_and_unrelated_frames_are_no_pairs() -> None:
+    def choose(frames: list[Frame]) -> Choices:
+        return choose_pairs(frames, ChoiceConfig(), np.random.default_rng(0))
+
+    still = choose(recording([0, 0, 0.1, 0]))
+    assert (list(still.pairs), set(still.rejected)) == ([], {"little motion"})
+    there_and_back = choose(recording([0, 4, 0, 4, 0, 4]))
     assert len(there_and_back.pairs) == 2  # one each way
     assert there_and_back.rejected["near duplicate"] >= 1
+    unrelated = choose([as_bytes(moved(96, 128, 0, 0, seed)) for seed in range(6)])
+    # The flow there and back closes by chance now and then: four out of five must be noticed.
+    assert unrelated.tried == 15
+    assert unrelated.rejected["unreliable"] >= 12
 
 
-def test_unrelated_frames_are_seldom_a_pair() -> None:
-    """The flow there and back closes by chance now and then: four out of five must be noticed."""
-    frames = [as_bytes(moved(96, 128, 0, 0, seed)) for seed in range(6)]
-    choices = choose_pairs(frames, ChoiceConfig(), np.random.default_rng(0))
-    assert choices.tried == 15
-    assert choices.rejected["unreliable"] >= 12
-
-
-def test_inputs_are_found_by_file_folder_and_pattern(tmp_path: Path, videos: Path) -> None:
+def test_inputs_are_found_by_file_folder_and_pattern_and_those_that_hold_nothing_are_named(
+    tmp_path: Path, videos: Path
+) -> None:
     expected = [("a", videos / "a.avi"), ("b", videos / "b.avi")]
     for inputs in ([str(videos)], [f"{videos}/*.avi"], [str(videos / "b.avi"), str(videos / "a.avi")]):
         assert [(r.name, r.path) for r in find_recordings(inputs)] == expected
-
-
-def test_inputs_that_hold_nothing_are_named(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").touch()
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    (empty / "notes.txt").touch()
     for given, word in (("nothing", "no file"), ("*.avi", "pattern"), ("notes.txt", "not a video"), ("", "neither")):
         with pytest.raises(InputError, match=word):
-            find_recordings([str(tmp_path / given)])
+            find_recordings([str(empty / given)])
 
 
-@pytest.mark.parametrize(
-    "config",
-    [ChoiceConfig(per_source=0), ChoiceConfig(frames=1), ChoiceConfig(tries=0), ChoiceConfig(minimum_motion_px=99)],
-)
-def test_settings_out_of_range_are_refused(tmp_path: Path, videos: Path, config: ChoiceConfig) -> None:
+@pytest.mark.parametrize("wrong", [{"per_source": 0}, {"frames": 1}, {"tries": 0}, {"minimum_motion_px": 99}])
+def test_settings_out_of_range_are_refused(tmp_path: Path, videos: Path, wrong: dict) -> None:
     with pytest.raises(InputError):
-        extract_pairs([str(videos)], tmp_path / "out", config)
+        extract_pairs([str(videos)], tmp_path / "out", ChoiceConfig(**wrong))
     assert not (tmp_path / "out").exists()
 
 

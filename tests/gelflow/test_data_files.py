@@ -1,7 +1,6 @@
 """Images and flow files: what is written comes back; what is broken is named."""
 
 import errno
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -24,18 +23,13 @@ def some_flow() -> FlowArray:
     return flow
 
 
-def test_flo_is_read_by_opencv_with_every_bit(tmp_path: Path) -> None:
+def test_flo_is_middleburys_layout_and_opencv_reads_every_bit(tmp_path: Path) -> None:
     write_flo(tmp_path / "a.flo", some_flow())
     found = cv2.readOpticalFlow(str(tmp_path / "a.flo"))
     np.testing.assert_array_equal(np.where(found > 1e9, np.nan, found), some_flow())
-
-
-def test_flo_is_middleburys_layout(tmp_path: Path) -> None:
-    flow = np.arange(12, dtype=np.float32).reshape(2, 3, 2)
-    write_flo(tmp_path / "a.flo", flow)
+    write_flo(tmp_path / "a.flo", np.arange(12, dtype=np.float32).reshape(2, 3, 2))
     data = (tmp_path / "a.flo").read_bytes()
-    assert data[:4] == b"PIEH"
-    assert np.frombuffer(data, "<i4", 2, 4).tolist() == [3, 2]
+    assert (data[:4], np.frombuffer(data, "<i4", 2, 4).tolist()) == (b"PIEH", [3, 2])
     assert np.frombuffer(data, "<f4", -1, 12).tolist() == list(range(12))
 
 
@@ -45,65 +39,36 @@ def test_exr_round_trip_keeps_every_bit_and_nan(tmp_path: Path) -> None:
     write_flow(tmp_path / "a.exr", some_flow(), visible)
     field = read_flow(tmp_path / "a.exr")
     np.testing.assert_array_equal(field.flow, some_flow())
-    assert not field.visible[2, 3]  # no gel there
-    assert not field.visible[5].any()
-    assert field.visible.sum() == 17 * 23 - 23 - 1
+    visible[2, 3] = False  # no gel there
+    np.testing.assert_array_equal(field.visible, visible)
     assert sorted(read_channels(tmp_path / "a.exr")) == ["forward.U", "forward.V", "forward.visible"]
-
-
-def test_exr_without_the_asked_direction_is_named(tmp_path: Path) -> None:
-    write_flow(tmp_path / "a.exr", some_flow())
     with pytest.raises(InputError, match=r"a\.exr.*backward\.U"):
         read_flow(tmp_path / "a.exr", "backward")
 
 
-def _png(path: Path) -> None:
-    save(path, moved(40, 50, 0, 0))
-
-
-def _jpg(path: Path) -> None:
-    assert cv2.imwrite(str(path), as_bytes(moved(40, 50, 0, 0)))
-
-
-def _exr(path: Path) -> None:
-    write_flow(path, some_flow())
-
-
-@pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.7, 0.99])
-@pytest.mark.parametrize(
-    ("name", "write", "read"), [("a.png", _png, read_image), ("a.jpg", _jpg, read_image), ("a.exr", _exr, read_flow)]
-)
-def test_truncated_file_is_named(
-    tmp_path: Path,
-    capfd: pytest.CaptureFixture[str],
-    name: str,
-    write: Callable[[Path], None],
-    read: Callable[[Path], object],
-    share: float,
+@pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.exr"])
+def test_truncated_missing_and_foreign_files_are_named(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str
 ) -> None:
     path = tmp_path / name
-    write(path)
-    read(path)
-    data = path.read_bytes()
-    path.write_bytes(data[: int(share * len(data))])
+    read = read_flow if path.suffix == ".exr" else read_image
     with pytest.raises(InputError, match=name):
         read(path)
+    if path.suffix == ".exr":
+        write_flow(path, some_flow())
+    else:
+        save(path, moved(40, 50, 0, 0))
+    read(path)
+    data = path.read_bytes()
+    for broken in (*(data[: int(share * len(data))] for share in (0, 0.02, 0.3, 0.7, 0.99)), b"something else" * 20):
+        path.write_bytes(broken)
+        with pytest.raises(InputError, match=name):
+            read(path)
     assert capfd.readouterr() == ("", "")  # the libraries below keep quiet
 
 
-@pytest.mark.parametrize(("name", "write", "read"), [("a.png", _png, read_image), ("a.exr", _exr, read_flow)])
-def test_missing_and_foreign_files_are_named(
-    tmp_path: Path, name: str, write: Callable[[Path], None], read: Callable[[Path], object]
-) -> None:
-    with pytest.raises(InputError, match=name):
-        read(tmp_path / name)
-    (tmp_path / name).write_bytes(b"something else entirely" * 20)
-    with pytest.raises(InputError, match=name):
-        read(tmp_path / name)
-
-
 def test_flipped_bit_in_a_png_is_noticed(tmp_path: Path) -> None:
-    _png(tmp_path / "a.png")
+    save(tmp_path / "a.png", moved(40, 50, 0, 0))
     data = bytearray((tmp_path / "a.png").read_bytes())
     data[len(data) // 2] ^= 1
     (tmp_path / "a.png").write_bytes(data)
@@ -120,45 +85,33 @@ def test_bit_depths_give_the_same_image(tmp_path: Path, dtype: type) -> None:
     np.testing.assert_allclose(read_image(tmp_path / "a.png"), image, atol=0.5001 / largest)
 
 
-def test_grey_has_three_equal_channels_and_alpha_is_dropped(tmp_path: Path) -> None:
+def test_grey_has_three_equal_channels_alpha_is_dropped_and_png_files_are_written(tmp_path: Path) -> None:
     rgb = as_bytes(moved(20, 30, 0, 0))
     assert cv2.imwrite(str(tmp_path / "grey.png"), rgb[..., 0])
-    grey = read_image(tmp_path / "grey.png")
-    assert grey.shape == (20, 30, 3)
-    assert (grey == grey[..., :1]).all()
     assert cv2.imwrite(str(tmp_path / "alpha.png"), np.dstack([rgb[..., ::-1], rgb[..., 0]]))
-    np.testing.assert_array_equal(np.rint(read_image(tmp_path / "alpha.png") * 255), rgb)
+    write_png(tmp_path / "new" / "a.png", rgb)
+    for name, expected in (("grey", np.dstack([rgb[..., 0]] * 3)), ("alpha", rgb), ("new/a", rgb)):
+        np.testing.assert_array_equal(np.rint(read_image(tmp_path / f"{name}.png") * 255), expected)
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
 def test_a_photograph_is_turned_as_its_exif_says(tmp_path: Path, orientation: int) -> None:
-    """Fails with cv2.IMREAD_UNCHANGED, which takes the pixels as they are stored."""
-    stored = Image.fromarray(as_bytes(moved(24, 40, 0, 0)))
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = orientation
-    stored.save(tmp_path / "a.png", exif=exif)
-    turned = np.asarray(ImageOps.exif_transpose(Image.open(tmp_path / "a.png")))
-    np.testing.assert_array_equal(as_bytes(read_image(tmp_path / "a.png")), turned)
-    stored.save(tmp_path / "a.jpg", exif=exif, quality=95)
-    turned = np.asarray(ImageOps.exif_transpose(Image.open(tmp_path / "a.jpg")))
-    # Two decoders of one JPEG file: they differ in how they enlarge its colours.
-    np.testing.assert_allclose(read_image(tmp_path / "a.jpg") * 255, turned, atol=8)
+    # Two decoders of one JPEG file differ in how they enlarge its colours.
+    for name, tolerance in (("a.png", 1e-3), ("a.jpg", 8)):
+        Image.fromarray(as_bytes(moved(24, 40, 0, 0))).save(tmp_path / name, exif=exif, quality=95)
+        turned = np.asarray(ImageOps.exif_transpose(Image.open(tmp_path / name)))
+        np.testing.assert_allclose(read_image(tmp_path / name) * 255, turned, rtol=0, atol=tolerance)
 
 
 def test_pair_of_two_sizes_and_one_pixel_images_are_refused(tmp_path: Path) -> None:
-    save(tmp_path / "a.png", moved(20, 30, 0, 0))
-    save(tmp_path / "b.png", moved(20, 31, 0, 0))
-    save(tmp_path / "c.png", moved(1, 1, 0, 0))
+    for name, size in (("a", (20, 30)), ("b", (20, 31)), ("c", (1, 1))):
+        save(tmp_path / f"{name}.png", moved(*size, 0, 0))
     with pytest.raises(InputError, match=r"30 x 20 px.*31 x 20 px"):
         read_pair(tmp_path / "a.png", tmp_path / "b.png")
     with pytest.raises(InputError, match=r"c\.png: 1 x 1 px"):
         read_pair(tmp_path / "c.png", tmp_path / "c.png")
-
-
-def test_write_png_round_trip(tmp_path: Path) -> None:
-    pixels = as_bytes(moved(20, 30, 0, 0))
-    write_png(tmp_path / "new" / "a.png", pixels)
-    np.testing.assert_array_equal(np.rint(read_image(tmp_path / "new" / "a.png") * 255), pixels)
 
 
 def test_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Opening data sets of every kind, whole and broken."""
+"""Opening data sets of every kind, whole and broken; those of synth as synth writes them."""
 
 import json
 from pathlib import Path
@@ -6,37 +6,46 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from textures import as_bytes, moved, write_folder, write_synthetic
+from synth_samples import synth_sample, write_dataset
+from textures import write_folder, write_synthetic
 
 from gelflow.data import join, open_pairs
-from gelflow.data.pairs import read_markers
 from gelflow.errors import InputError
-from gelflow.files.exr import read_channels, write_flow
+from gelflow.files.exr import write_flow
 
 
-def test_synthetic_sample_has_images_flow_and_visibility(tmp_path: Path) -> None:
-    dataset = open_pairs(write_synthetic(tmp_path, [(1.5, -0.5), (0.0, 2.0)]))
-    assert dataset.names == ["000000", "000001"]
-    sample = dataset[0]
-    image1, flow, visible = sample["image1"], sample["flow"], sample["visible"]
-    assert isinstance(image1, torch.Tensor)
-    assert isinstance(flow, torch.Tensor)
-    assert isinstance(visible, torch.Tensor)
-    expected = np.moveaxis(as_bytes(moved(64, 80, 0, 0)), -1, 0) / np.float32(255)
-    np.testing.assert_array_equal(image1.numpy(), expected.astype(np.float32))
-    assert flow.shape == (2, 64, 80)
-    assert flow.dtype == torch.float32
-    assert visible.shape == (1, 64, 80)
-    assert torch.isnan(flow[:, :, :8]).all()
-    assert (flow[0, :, 8:] == 1.5).all()
-    assert (flow[1, :, 8:] == -0.5).all()
-    assert (visible[0, :, 8:-8] == 1).all()
-    assert visible.sum() == 64 * 64
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_gelflow_reads_what_synth_writes(tmp_path: Path, dtype: type) -> None:
+    samples = [synth_sample(index, dtype) for index in (0, 2)]
+    pairs = open_pairs(write_dataset(tmp_path / "d", samples)).both_directions()
+    assert pairs.names[::2] == ["000000", "000002"]
+    assert len(set(pairs.names)) == len(pairs) == 4
+    for item, sample, back in zip(pairs, (s for s in samples for _ in range(2)), 2 * [False, True], strict=True):
+        images = [sample.image1, sample.image2][:: -1 if back else 1]
+        for name, image in zip(("image1", "image2"), images, strict=True):
+            # float32 in [0, 1]: rounded to at most 2^-24, by one division.
+            found = np.moveaxis(item[name].numpy(), 0, -1)
+            np.testing.assert_allclose(found, image / np.iinfo(dtype).max, atol=2.0**-23)
+        field = sample.flow
+        flow, visible = (field.backward, field.backward_visible) if back else (field.forward, field.forward_visible)
+        np.testing.assert_array_equal(np.moveaxis(item["flow"].numpy(), 0, -1), flow)
+        np.testing.assert_array_equal(item["visible"].numpy()[0], visible)
+        assert {item[key].dtype for key in ("image1", "image2", "flow", "visible")} == {torch.float32}
 
 
-def test_samples_of_both_kinds_fit_into_one_batch(tmp_path: Path) -> None:
+def test_unfinished_samples_do_not_count(tmp_path: Path) -> None:
+    """A run that was killed: a folder without a line, a hidden partial folder, a torn line."""
+    folder = write_dataset(tmp_path / "d", [synth_sample(1), synth_sample(3)])
+    (folder / "samples" / "000000").mkdir()
+    (folder / "samples" / ".000002.partial-1").mkdir()
+    lines = (folder / "manifest.jsonl").read_text().splitlines(keepends=True)
+    (folder / "manifest.jsonl").write_text(lines[1] + lines[0] + '{"index": 2, "traj')
+    assert open_pairs(folder).names == ["000001", "000003"]
+
+
+def test_samples_of_both_kinds_fit_into_one_batch_and_folders_of_one_name_are_numbered(tmp_path: Path) -> None:
     synthetic = open_pairs(write_synthetic(tmp_path / "s", [(1, 0)]))
-    plain = open_pairs(write_folder(tmp_path / "p", {"a": (0, 1)}))
+    plain, same = (open_pairs(write_folder(tmp_path / parent / "p", {"a": (0, 1)})) for parent in "xy")
     assert "flow" not in plain[0]
     both = join([synthetic, plain])
     assert both.names == ["s/000000", "p/a"]
@@ -44,34 +53,7 @@ def test_samples_of_both_kinds_fit_into_one_batch(tmp_path: Path) -> None:
     assert batch["flow"].shape == (2, 2, 64, 80)
     assert torch.isnan(batch["flow"][1]).all()
     assert not batch["visible"][1].any()
-
-
-def test_two_folders_of_one_name_keep_their_pairs_apart(tmp_path: Path) -> None:
-    folders = [write_folder(tmp_path / parent / "same", {"a": (0, 1)}) for parent in "xy"]
-    assert join([open_pairs(folder) for folder in folders]).names == ["same/a", "same-2/a"]
-
-
-def test_both_directions_exchanges_images_and_takes_the_backward_flow(tmp_path: Path) -> None:
-    import OpenEXR
-
-    folder = write_synthetic(tmp_path, [(1, 0)])
-    path = folder / "samples" / "000000" / "flow.exr"
-    planes = read_channels(path)
-    planes |= {f"backward.{c}": -planes[f"forward.{c}"] for c in "UV"}
-    planes["backward.visible"] = planes["forward.visible"]
-    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, planes).write(str(path))
-    forward, backward = (open_pairs(folder).both_directions()[k] for k in (0, 1))
-    assert torch.equal(forward["image1"], backward["image2"])
-    assert torch.equal(forward["image2"], backward["image1"])
-    assert torch.equal(forward["flow"][:, :, 8:], -backward["flow"][:, :, 8:])
-    assert forward["name"] != backward["name"]
-
-
-def test_unlisted_sample_and_cut_last_line_do_not_count(tmp_path: Path) -> None:
-    folder = write_synthetic(tmp_path, [(1, 0), (2, 0), (3, 0)])
-    lines = (folder / "manifest.jsonl").read_text().splitlines(keepends=True)
-    (folder / "manifest.jsonl").write_text(lines[2] + lines[0] + lines[1][:9])
-    assert open_pairs(folder).names == ["000000", "000002"]
+    assert join([plain, same]).names == ["p/a", "p-2/a"]
 
 
 @pytest.mark.parametrize(
@@ -116,21 +98,17 @@ def test_flow_of_another_size_is_named(tmp_path: Path) -> None:
         open_pairs(folder)[0]
 
 
-def test_plain_folder_with_markers(tmp_path: Path) -> None:
+def test_plain_folder_with_markers_and_half_a_pair(tmp_path: Path) -> None:
     folder = write_folder(tmp_path, {"b": (1, 0), "a": (0, 1)})
-    (folder / "a_markers.csv").write_text("x1,y1,x2,y2\n1,2,3,4\n5,6,7,8.5\n")
+    # Files of some programs begin with a byte-order mark.
+    (folder / "a_markers.csv").write_text("x1,y1,x2,y2\n1,2,3,4\n5,6,7,8.5\n", encoding="utf-8-sig")
     dataset = open_pairs(folder)
     assert dataset.names == ["a", "b"]
-    markers = dataset.markers(0)
-    assert markers is not None
-    assert markers.tolist() == [[1, 2, 3, 4], [5, 6, 7, 8.5]]
-    assert dataset.markers(1) is None
-    assert dataset.truth(0) is None
-
-
-def test_markers_may_begin_with_a_byte_order_mark(tmp_path: Path) -> None:
-    (tmp_path / "markers.csv").write_text("x1,y1,x2,y2\n1,2,3,4\n", encoding="utf-8-sig")
-    assert read_markers(tmp_path / "markers.csv").tolist() == [[1, 2, 3, 4]]
+    assert dataset.markers(0).tolist() == [[1, 2, 3, 4], [5, 6, 7, 8.5]]
+    assert dataset.markers(1) is dataset.truth(0) is None
+    (folder / "a_1.png").unlink()
+    with pytest.raises(InputError, match=r"a_1\.png"):
+        open_pairs(folder)
 
 
 @pytest.mark.parametrize(
@@ -151,29 +129,14 @@ def test_broken_markers_are_named(tmp_path: Path, text: str) -> None:
         open_pairs(folder).markers(0)
 
 
-def test_half_a_pair_is_named(tmp_path: Path) -> None:
-    folder = write_folder(tmp_path, {"a": (1, 0)})
-    (folder / "a_1.png").unlink()
-    with pytest.raises(InputError, match=r"a_1\.png"):
-        open_pairs(folder)
-
-
 def test_what_is_no_data_set_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such folder"):
-        open_pairs(tmp_path / "nothing")
-    with pytest.raises(InputError, match="empty"):
-        open_pairs(tmp_path)
-    (tmp_path / "notes.txt").write_text("x")
-    with pytest.raises(InputError, match="no image pairs"):
-        open_pairs(tmp_path)
-    with pytest.raises(InputError, match="is a file"):
-        open_pairs(tmp_path / "notes.txt")
-
-
-def test_unfinished_pair_set_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "pairs.json").write_text(json.dumps({"job": {}, "complete": False}))
-    with pytest.raises(InputError, match="interrupted"):
-        open_pairs(tmp_path)
-    (tmp_path / "pairs.json").write_text("{")
-    with pytest.raises(InputError, match=r"pairs\.json"):
-        open_pairs(tmp_path)
+    notes, empty, unfinished, broken = (tmp_path / name for name in ("notes/a.txt", "empty", "cut", "broken"))
+    for folder in (notes.parent, empty, unfinished, broken):
+        folder.mkdir()
+    notes.write_text("x")
+    (unfinished / "pairs.json").write_text(json.dumps({"job": {}, "complete": False}))
+    (broken / "pairs.json").write_text("{")
+    for path, word in ((tmp_path / "nothing", "no such folder"), (empty, "empty"), (notes.parent, "no image pairs"),
+                       (notes, "is a file"), (unfinished, "interrupted"), (broken, r"pairs\.json")):  # fmt: skip
+        with pytest.raises(InputError, match=word):
+            open_pairs(path)

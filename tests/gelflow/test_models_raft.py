@@ -1,5 +1,6 @@
 """RAFT: published names and shapes, published weights where they lie beside the repository, padding, lookup."""
 
+import itertools
 from pathlib import Path
 
 import pytest
@@ -34,8 +35,7 @@ def published_names(large: bool) -> dict[str, tuple[int, ...]]:
     shapes: dict[str, tuple[int, ...]] = {}
 
     def conv(name: str, outputs: int, inputs: int, rows: int, columns: int | None = None) -> None:
-        shapes[f"{name}.weight"] = (outputs, inputs, rows, columns or rows)
-        shapes[f"{name}.bias"] = (outputs,)
+        shapes.update({f"{name}.weight": (outputs, inputs, rows, columns or rows), f"{name}.bias": (outputs,)})
 
     def norm(name: str, channels: int, batch: bool) -> None:
         if batch:
@@ -44,25 +44,23 @@ def published_names(large: bool) -> dict[str, tuple[int, ...]]:
 
     stages = (64, 96, 128) if large else (32, 64, 96)
     for net, outputs in (("fnet", 256 if large else 128), ("cnet", 256 if large else 160)):
-        batch = large and net == "cnet"
-        conv(f"{net}.conv1", stages[0], 3, 7)
-        norm(f"{net}.norm1", stages[0], batch)
-        inputs = stages[0]
-        for stage, channels in enumerate(stages, start=1):
-            for unit in (0, 1):
-                at, inner = f"{net}.layer{stage}.{unit}", channels // 4
-                kernels = [(channels, inputs, 3), (channels, channels, 3)]
-                if not large:
-                    kernels = [(inner, inputs, 1), (inner, inner, 3), (channels, inner, 1)]
-                for number, kernel in enumerate(kernels, start=1):
-                    conv(f"{at}.conv{number}", *kernel)
-                norm(f"{at}.norm1", channels, batch)
-                norm(f"{at}.norm2", channels, batch)
-                if unit == 0 and stage > 1:
-                    conv(f"{at}.downsample.0", channels, inputs, 1)
-                    norm(f"{at}.downsample.1", channels, batch)
-                    norm(f"{at}.norm3", channels, batch)  # the same tensors again
-                inputs = channels
+        batch, inputs = large and net == "cnet", stages[0]
+        conv(f"{net}.conv1", inputs, 3, 7)
+        norm(f"{net}.norm1", inputs, batch)
+        for (stage, channels), unit in itertools.product(enumerate(stages, start=1), (0, 1)):
+            at, inner = f"{net}.layer{stage}.{unit}", channels // 4
+            kernels = [(channels, inputs, 3), (channels, channels, 3)]
+            if not large:
+                kernels = [(inner, inputs, 1), (inner, inner, 3), (channels, inner, 1)]
+            for number, kernel in enumerate(kernels, start=1):
+                conv(f"{at}.conv{number}", *kernel)
+            norms = ["norm1", "norm2"]
+            if unit == 0 and stage > 1:
+                conv(f"{at}.downsample.0", channels, inputs, 1)
+                norms += ["downsample.1", "norm3"]  # the same tensors twice
+            for name in norms:
+                norm(f"{at}.{name}", channels, batch)
+            inputs = channels
         conv(f"{net}.conv2", outputs, stages[2], 1)
     encoder, hidden, head = "update_block.encoder", 128 if large else 96, 256 if large else 128
     kernels = [("convc1", 96, 196, 1), ("convf1", 64, 2, 7), ("convf2", 32, 64, 3), ("conv", 80, 128, 3)]
@@ -71,9 +69,9 @@ def published_names(large: bool) -> dict[str, tuple[int, ...]]:
                    ("conv", 126, 256, 3)]  # fmt: skip
     for name, *kernel in kernels:
         conv(f"{encoder}.{name}", *kernel)
-    for gate in "zrq":
-        for suffix, sides in {"1": (1, 5), "2": (5, 1)}.items() if large else {"": (3, 3)}.items():
-            conv(f"update_block.gru.conv{gate}{suffix}", hidden, 384 if large else 242, *sides)
+    sides = {"1": (1, 5), "2": (5, 1)} if large else {"": (3, 3)}
+    for gate, suffix in itertools.product("zrq", sides):
+        conv(f"update_block.gru.conv{gate}{suffix}", hidden, 384 if large else 242, *sides[suffix])
     conv("update_block.flow_head.conv1", head, hidden, 3)
     conv("update_block.flow_head.conv2", 2, head, 3)
     if large:
@@ -84,7 +82,6 @@ def published_names(large: bool) -> dict[str, tuple[int, ...]]:
 
 @pytest.mark.parametrize("large", [False, True])
 def test_a_published_state_dictionary_loads_strictly(large: bool, tmp_path: Path) -> None:
-    """Fails with `convc2` left out of the motion encoder, and with names that keep `module.`."""
     torch.manual_seed(1)
     tensors: dict[str, Tensor] = {}
     for name, shape in published_names(large).items():
@@ -110,57 +107,45 @@ def test_the_flow_has_the_images_size(large: bool, size: tuple[int, int]) -> Non
 
 
 def test_the_encoders_see_images_between_minus_one_and_one(small: RAFT) -> None:
-    """Fails with images handed on in [0, 1], which the published weights would hardly show."""
     seen: list[tuple[float, float]] = []
-    handles = [net.register_forward_pre_hook(lambda _, inputs: seen.append((inputs[0].min(), inputs[0].max())))
-               for net in (small.fnet, small.cnet)]  # fmt: skip
     image = torch.zeros(1, 3, 64, 64)
     image[..., 32:] = 1
+    hooks = [net.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0].aminmax()))
+             for net in (small.fnet, small.cnet)]  # fmt: skip
     with torch.no_grad():
         small(image, image)
-    for handle in handles:
-        handle.remove()
+    for hook in hooks:
+        hook.remove()
     assert seen == [(-1, 1)] * 3
 
 
-def test_pairs_of_a_batch_do_not_see_each_other(small: RAFT) -> None:
-    images = torch.rand(2, 2, 3, 64, 72).unbind()
+def test_neither_pairs_of_a_batch_nor_padding_change_the_flow(small: RAFT) -> None:
+    batch = torch.rand(2, 2, 3, 76, 84).unbind()
+    alone = [image[1:] for image in batch]
+    # 76 x 84 is padded by 2 px on each side to 80 x 88, which is what `framed` is already.
+    framed = [torch.nn.functional.pad(image, (2, 2, 2, 2), mode="replicate") for image in alone]
     with torch.no_grad():
-        both = small(*images)
-        alone = small(*(image[1:] for image in images))
-    # The same sums in another order: float32 rounding (6e-8) through three updates and upsampling by 8, on 1 px.
-    torch.testing.assert_close(both[1:], alone, rtol=0, atol=1e-4)
-
-
-def test_padding_does_not_shift_the_flow(small: RAFT) -> None:
-    """What is cut off is what was added. Fails with the crop taken from the corner in place of the padding's inside."""
-    inner = torch.rand(2, 1, 3, 76, 84).unbind()
-    framed = [torch.nn.functional.pad(image, (2, 2, 2, 2), mode="replicate") for image in inner]
-    with torch.no_grad():
-        # 76 x 84 is padded by 2 px on each side to 80 x 88, which is what `framed` is already.
-        torch.testing.assert_close(small(*inner), small(*framed)[..., 2:-2, 2:-2], rtol=0, atol=1e-4)
+        flow = small(*alone)
+        # The same sums in another order: float32 rounding (6e-8) through three updates and upsampling by 8, on 1 px.
+        torch.testing.assert_close(small(*batch)[1:], flow, rtol=0, atol=1e-4)
+        torch.testing.assert_close(small(*framed)[..., 2:-2, 2:-2], flow, rtol=0, atol=1e-4)
 
 
 def test_the_lookup_reads_indices_and_orders_displacements_column_by_column() -> None:
-    """Fails with the half-pixel position (i + 1/2) / 2^k - 1/2, and with rows before columns."""
     features1, features2 = torch.rand(2, 1, 5, 16, 24, dtype=torch.float64)
     pyramid = correlation_pyramid(features1, features2)
     product = torch.einsum("bchw,bcij->bhwij", features1, features2) / 5**0.5
     assert [tuple(level.shape[2:]) for level in pyramid] == [(16, 24), (8, 12), (4, 6), (2, 3)]
-    row, column, radius = 6, 8, 1
-    position = torch.full((1, 2, 16, 24), 0.0, dtype=torch.float64)
-    position[0, 0], position[0, 1] = column + 0.0, row + 2.0
-    found = lookup(pyramid, position, radius)[0, :, row, column]
-    assert found.shape == (4 * 9,)
+    row, column = 6, 8
+    position = torch.tensor([column + 0.0, row + 2.0], dtype=torch.float64).view(1, 2, 1, 1).expand(1, 2, 16, 24)
+    found = lookup(pyramid, position, radius=1)[0, :, row, column].view(4, 3, 3)  # level, across, down
     at_pixel = product[0, row, column]
-    for across in (-1, 0, 1):
-        for down in (-1, 0, 1):
-            channel = (across + 1) * 3 + (down + 1)
-            # exact reads at integers: double precision
-            assert abs(found[channel] - at_pixel[row + 2 + down, column + across]) < 1e-12
-            # level 1: index 8 is read at 4, index 8 (row) at 4; each value is the mean of a 2x2 block
-            block = at_pixel[2 * (4 + down) : 2 * (4 + down) + 2, 2 * (4 + across) : 2 * (4 + across) + 2].mean()
-            assert abs(found[9 + channel] - block) < 1e-12
+    # exact reads at integers: double precision
+    fine = at_pixel[row + 1 : row + 4, column - 1 : column + 2].T
+    torch.testing.assert_close(found[0], fine, rtol=0, atol=1e-12)
+    # level 1: index 8 is read at 4, index 8 (row) at 4; each value is the mean of a 2x2 block
+    blocks = torch.nn.functional.avg_pool2d(at_pixel[None], 2)[0, 3:6, 3:6].T
+    torch.testing.assert_close(found[1], blocks, rtol=0, atol=1e-12)
 
 
 def test_enlarging_keeps_a_constant_and_multiplies_by_eight() -> None:
@@ -179,7 +164,6 @@ def test_enlarging_keeps_a_constant_and_multiplies_by_eight() -> None:
 
 @needs_weights
 def test_published_small_weights_see_shifts_and_no_motion() -> None:
-    """Fails with the two components of the flow exchanged."""
     network = load_raft(PUBLISHED)
     for u, v in ((0.0, 0.0), (1.5, -0.75), (3.3, 2.1), (6.0, -4.0)):
         with torch.no_grad():

@@ -2,6 +2,7 @@
 
 import colorsys
 import csv
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
@@ -18,6 +19,18 @@ from gelflow.predict.prediction import predict_pair, predict_video
 FARNEBACK = named_methods(["farneback"])[0]
 
 
+def video(path: Path, frames: int) -> Path:
+    """Frames of 48 x 64 px, each 1 px further to the right."""
+    write_video(path, [as_bytes(moved(48, 64, shift, 0)) for shift in range(frames)])
+    return path
+
+
+def frame_folder(folder: Path, names: Iterable[object]) -> Path:
+    for shift, name in enumerate(names):
+        save(folder / f"{name}.png", moved(48, 48, shift, 0))
+    return folder
+
+
 def test_pair_gives_one_flow_in_three_files(tmp_path: Path) -> None:
     folder = write_folder(tmp_path / "in", {"press": (1.5, -0.5)})
     result = predict_pair(FARNEBACK, folder / "press_1.png", folder / "press_2.png", tmp_path / "out")
@@ -31,53 +44,41 @@ def test_pair_gives_one_flow_in_three_files(tmp_path: Path) -> None:
 
 
 def test_names_without_a_number_are_joined(tmp_path: Path) -> None:
-    for name in ("before", "after"):
-        save(tmp_path / f"{name}.png", moved(32, 32, 0, 0))
-    result = predict_pair(FARNEBACK, tmp_path / "before.png", tmp_path / "after.png", tmp_path)
-    assert result.files[0].name == "before_to_after.exr"
+    images = [frame_folder(tmp_path, ["before", "after"]) / f"{name}.png" for name in ("before", "after")]
+    assert predict_pair(FARNEBACK, *images, tmp_path).files[0].name == "before_to_after.exr"
 
 
 @pytest.mark.parametrize(("reference", "expected"), [("first", [2.0, 4.0, 6.0]), ("previous", [2.0, 2.0, 2.0])])
 def test_video_against_its_first_or_previous_frame(tmp_path: Path, reference: str, expected: list[float]) -> None:
-    write_video(tmp_path / "a.avi", [as_bytes(moved(64, 96, shift, 0)) for shift in (0, 1, 2, 3, 4, 5, 6)])
-    result = predict_video(FARNEBACK, tmp_path / "a.avi", tmp_path / "out", reference, every=2)  # type: ignore[arg-type]
+    path, out, calls = video(tmp_path / "a.avi", 7), tmp_path / "out", []
+    result = predict_video(FARNEBACK, path, out, reference, 2, progress=lambda *done: calls.append(done))
     assert [motion.frame for motion in result.motions] == [2, 4, 6]
-    for motion, true in zip(result.motions, expected, strict=True):
-        flow = read_flow(tmp_path / "out" / "flow" / f"{motion.frame:06d}.exr").flow
-        # 1/16 px as above; Motion JPEG adds noise of a few grey levels: twice that.
-        assert np.median(flow[..., 0]) == pytest.approx(true, abs=1 / 8)
-    with (tmp_path / "out" / "motion.csv").open(newline="") as file:
+    flows = [read_flow(out / "flow" / f"{frame:06d}.exr").flow[..., 0] for frame in (2, 4, 6)]
+    # 1/16 px as above; Motion JPEG adds noise of a few grey levels: twice that.
+    np.testing.assert_allclose([np.median(flow) for flow in flows], expected, rtol=0, atol=1 / 8)
+    with (out / "motion.csv").open(newline="") as file:
         assert [int(row["frame"]) for row in csv.DictReader(file)] == [2, 4, 6]
-    capture = cv2.VideoCapture(str(tmp_path / "out" / "overlay.mp4"))
-    assert int(capture.get(cv2.CAP_PROP_FRAME_COUNT)) == 3
-    assert not list((tmp_path / "out").glob(".*"))
+    assert int(cv2.VideoCapture(str(out / "overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT)) == 3
+    assert not list(out.glob(".*"))
+    assert calls == [(n, 6) for n in range(1, 7)]
 
 
-def test_folder_of_frames_is_a_video(tmp_path: Path) -> None:
-    for number in range(3):
-        save(tmp_path / "in" / f"{number}.png", moved(48, 48, number, 0))
-    assert len(predict_video(FARNEBACK, tmp_path / "in", tmp_path / "out").motions) == 2
+def test_folder_of_frames_is_a_video_whose_rows_name_their_files(tmp_path: Path) -> None:
+    frames = frame_folder(tmp_path / "in", ["b10", "b9", "a"])
+    assert len(predict_video(FARNEBACK, frames, tmp_path / "out").motions) == 2
+    with (tmp_path / "out" / "motion.csv").open(newline="") as file:
+        assert [row["file"] for row in csv.DictReader(file)] == ["b9.png", "b10.png"]
 
 
 def test_flow_files_of_an_earlier_run_go_and_others_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cv2.VideoWriter, "isOpened", lambda _: False)  # pictures in place of a video
-    for number in range(5):
-        save(tmp_path / "in" / f"{number}.png", moved(48, 48, number, 0))
-    out = tmp_path / "out"
-    assert len(predict_video(FARNEBACK, tmp_path / "in", out).motions) == 4
+    frames, out = frame_folder(tmp_path / "in", range(5)), tmp_path / "out"
+    assert len(predict_video(FARNEBACK, frames, out).motions) == 4
     others = [out / "flow" / "12.exr", out / "flow" / "000001.txt", out / "overlay" / "notes.png"]
     for other in others:
         other.touch()
-    second = predict_video(FARNEBACK, tmp_path / "in", out, every=3)
+    second = predict_video(FARNEBACK, frames, out, every=3)
     assert {path for path in out.rglob("*") if path.is_file()} == {*second.files, *others}
-
-
-def test_rows_name_the_frames_files(tmp_path: Path) -> None:
-    for name in ("b10", "b9", "a"):
-        save(tmp_path / "in" / f"{name}.png", moved(48, 48, len(name), 0))
-    predict_video(FARNEBACK, tmp_path / "in", tmp_path / "out")
-    with (tmp_path / "out" / "motion.csv").open(newline="") as file:
-        assert [row["file"] for row in csv.DictReader(file)] == ["b9.png", "b10.png"]
 
 
 @pytest.mark.parametrize("name", ["a.exr", "a.flo", "a.png"])
@@ -94,31 +95,21 @@ def test_a_pairs_results_replace_those_of_an_earlier_run_and_nothing_else(tmp_pa
 
 @pytest.mark.parametrize("name", ["flow/000007.exr", "motion.csv", "overlay.mp4", "overlay/000000.png"])
 def test_a_videos_results_do_not_replace_anothers_files(tmp_path: Path, name: str) -> None:
-    write_video(tmp_path / "a.avi", [as_bytes(moved(48, 64, shift, 0)) for shift in range(2)])
     other = tmp_path / name
     other.parent.mkdir(exist_ok=True)
     other.write_text("another's")
     with pytest.raises(InputError, match=rf"{name}: exists and does not come from"):
-        predict_video(FARNEBACK, tmp_path / "a.avi", tmp_path)
+        predict_video(FARNEBACK, video(tmp_path / "a.avi", 2), tmp_path)
     assert other.read_text() == "another's"
 
 
-def test_progress_reaches_its_total(tmp_path: Path) -> None:
-    write_video(tmp_path / "a.avi", [as_bytes(moved(48, 64, shift, 0)) for shift in range(5)])
-    calls: list[tuple[int, int]] = []
-    predict_video(FARNEBACK, tmp_path / "a.avi", tmp_path / "out", progress=lambda n, total: calls.append((n, total)))
-    assert calls == [(n, 8) for n in range(1, 9)]
-
-
 def test_inputs_that_cannot_be_used_are_named(tmp_path: Path) -> None:
-    write_video(tmp_path / "one.avi", [as_bytes(moved(48, 64, 0, 0))])
-    save(tmp_path / "in" / "0.png", moved(48, 48, 0, 0))
-    (tmp_path / "in" / "1.png").write_bytes(b"broken")
-    for name, word in (("one.avi", "fewer than two"), ("none.avi", "none.avi"), ("in", r"1\.png: cannot be read")):
+    video(tmp_path / "one.avi", 1)
+    (frame_folder(tmp_path / "in", [0]) / "1.png").write_bytes(b"broken")
+    for name, every, word in (("one.avi", 1, "fewer than two"), ("none.avi", 1, "none.avi"),
+                              ("in", 1, r"1\.png: cannot be read"), ("one.avi", 0, "every")):  # fmt: skip
         with pytest.raises(InputError, match=word):
-            predict_video(FARNEBACK, tmp_path / name, tmp_path / "out")
-    with pytest.raises(InputError, match="every"):
-        predict_video(FARNEBACK, tmp_path / "one.avi", tmp_path / "out", every=0)
+            predict_video(FARNEBACK, tmp_path / name, tmp_path / "out", every=every)
 
 
 def test_colour_depends_on_direction_and_grows_with_length() -> None:
@@ -135,28 +126,21 @@ def test_colour_depends_on_direction_and_grows_with_length() -> None:
 
 
 @pytest.mark.parametrize("length", [0.013, 0.7, 42.0])
-def test_scale_makes_small_and_large_flow_look_alike(length: float) -> None:
+def test_scale_makes_small_and_large_flow_look_alike_and_is_one_for_none(length: float) -> None:
     flow = np.random.default_rng(0).uniform(-1, 1, (40, 50, 2)).astype(np.float32)
     flow *= length / np.hypot(flow[..., 0], flow[..., 1]).max()
     scale = robust_scale(flow)
     assert 0.7 * length < scale < 1.1 * length  # the 99th percentile, rounded up by a tenth at most
     assert scale * arrow_factor(scale) >= 3
     assert flow_to_colour(flow, scale).std() > 40
-
-
-def test_scale_of_no_flow_is_one() -> None:
-    assert robust_scale(np.zeros((4, 4, 2), np.float32)) == 1.0
-    assert robust_scale(np.full((4, 4, 2), np.nan, np.float32)) == 1.0
+    assert robust_scale(0 * flow) == robust_scale(np.nan * flow) == 1.0
 
 
 def test_overlay_has_even_sides_and_arrows_of_the_true_length() -> None:
-    frame = np.zeros((241, 321, 3), np.uint8)
-    flow = np.zeros((241, 321, 2), np.float32)
-    flow[..., 0] = 12.0
-    picture = draw_overlay(frame, flow, 12.0)
-    assert picture.shape[0] % 2 == 0
-    assert picture.shape[1] % 2 == 0
-    assert picture.shape[0] >= 480
-    left = picture[:, : picture.shape[1] // 2].max(axis=2) > 128
-    rows = np.flatnonzero(left.sum(axis=1) > left.shape[1] * 0.5)
-    assert len(rows)  # arrows of 12 px at a distance of 13 px fill most of their rows
+    flow = np.full((241, 321, 2), (12.0, 0.0), np.float32)
+    picture = draw_overlay(np.zeros((241, 321, 3), np.uint8), flow, 12.0)
+    height, width = picture.shape[:2]
+    assert (height % 2, width % 2) == (0, 0)
+    assert height >= 480
+    left = picture[:, : width // 2].max(axis=2) > 128
+    assert left.mean(axis=1).max() > 0.5  # arrows of 12 px at a distance of 13 px fill most of their rows

@@ -1,6 +1,7 @@
 """Settings: the paper's values, refusals that name the field, presets and that each trains."""
 
 import datetime
+import itertools
 import subprocess
 import sys
 import tomllib
@@ -66,61 +67,49 @@ def test_wrong_values_are_named_with_what_is_allowed(values: dict, words: str) -
 def test_numbers_and_lists_serve_where_they_mean_the_same() -> None:
     values = {"steps": 1e3, "learning_rate": 1, "precision": 32, "image_size": [64.0, 80], "gradient_clip": 1e30}
     config = train_config(None, [f"{name}={value}" for name, value in values.items()])
-    assert (config.steps, config.learning_rate, config.precision) == (1000, 1, "32")
-    assert (config.image_size, config.gradient_clip) == ((64, 80), 1e30)
-    assert [type(value) for value in (config.steps, config.learning_rate, config.gradient_clip)] == [int, float, float]
+    expected = {"steps": 1000, "learning_rate": 1.0, "precision": "32", "image_size": (64, 80), "gradient_clip": 1e30}
+    found = {name: getattr(config, name) for name in expected}
+    assert found == expected
+    assert list(map(type, found.values())) == list(map(type, expected.values()))
 
 
-def test_a_configuration_survives_json() -> None:
+def test_a_configuration_survives_json_and_earlier_records_are_read_where_they_mean_the_same() -> None:
+    """Settings that are gone are read with the value that every run has now, and refused with another."""
     config = TrainConfig(image_size=(64, 80), loss=LossConfig(weight="floor"))
     assert validated(TrainConfig, config.model_dump(mode="json"), "json") == config
-
-
-def test_what_earlier_versions_recorded_is_read_where_it_means_the_same() -> None:
-    """Settings that are gone are read with the value that every run has now, and refused with another."""
     loss = {"lambda_ph": 1.0, "lambda_census": 0.0, "mask_outside": True}
     assert validated(TrainConfig, {"loss": loss, "compile": True}, "weights") == TrainConfig()
     with pytest.raises(InputError, match=r"loss\.lambda_census: there is no such setting"):
         validated(TrainConfig, {"loss": {"lambda_census": 0.1}}, "weights")
 
 
-def test_registration_has_names() -> None:
-    """Fails with names merged into the settings of the weights that a fine-tuning starts from."""
+def test_registration_has_names_of_which_fields_can_be_changed() -> None:
     start = {"model": ModelConfig(registration=REGISTRATIONS["brightness"]).model_dump()}
     for name, meant in REGISTRATIONS.items():
         assert train_config(None, [f"model.registration={name}"], start=start).model.registration == meant
     with pytest.raises(InputError, match="'movement' is no registration; names are none, motion, both, brightness"):
         train_config("best", ["model.registration=movement"])
-
-
-@pytest.mark.parametrize("preset", ["best", "real", "bare"])
-def test_a_field_changes_a_registration_that_has_a_name(preset: str) -> None:
-    """Fails with names left as they are until all settings have been merged."""
-    for start in (None, {"model": ModelConfig(registration=REGISTRATIONS["brightness"]).model_dump()}):
-        config = train_config(preset, ["model.registration.prior_px=0.5"], start=start)
+    for preset, given in itertools.product(("best", "real", "bare"), (None, start)):
+        config = train_config(preset, ["model.registration.prior_px=0.5"], start=given)
         assert config.model.registration == RegistrationConfig(prior_px=0.5)
 
 
 def test_importing_the_package_and_the_settings_loads_nothing_heavy() -> None:
-    code = (
-        "import sys, gelflow, gelflow.config; print([m for m in ('torch', 'numpy', 'lightning') if m in sys.modules])"
-    )
+    code = "import sys, gelflow, gelflow.config; print({'torch', 'numpy', 'lightning'} & {*sys.modules})"
     answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert answer.stdout.strip() == "[]"
+    assert answer.stdout.strip() == "set()"
 
 
 TINY = ["steps=2", "warmup_steps=0", "batch_size=2", "image_size=[64, 64]", "crop_size=[64, 64]", "device=cpu"]
 
 
-def test_paper_states_the_defaults() -> None:
-    """Every default is the paper's reading, so the preset differs in nothing but the published image size."""
+def test_paper_states_the_defaults_and_writes_out_every_field_of_its_losses_and_network() -> None:
+    """Every default is the paper's reading, so the preset differs in nothing but the published image size. A default
+    that changes must not change the paper's configuration unseen.
+    """
     paper = train_config("paper")
     assert paper == TrainConfig(image_size=(512, 640))
     assert paper.steps == 200 * 1328 // 4  # 200 epochs of 1327 pairs in batches of 4, the last one filled up
-
-
-def test_paper_writes_out_every_field_of_its_losses_and_network() -> None:
-    """A default that changes must not change the paper's configuration unseen."""
     text = tomllib.loads(files("gelflow").joinpath("presets", "paper.toml").read_text(encoding="utf-8"))
     published = {
         "alpha",
@@ -137,24 +126,16 @@ def test_paper_writes_out_every_field_of_its_losses_and_network() -> None:
     assert {"levels", "lffm", "lffm_region", "finest_scale"} <= set(text["model"])
 
 
-def test_the_comparisons_differ_from_the_paper_in_what_they_say() -> None:
-    paper, selfflow, arflow = (train_config(name) for name in ("paper", "selfflow", "arflow"))
+def test_presets_say_what_they_differ_in() -> None:
+    paper, selfflow, arflow, best, bare = map(train_config, ("paper", "selfflow", "arflow", "best", "bare"))
     assert (selfflow.loss.smoothness, selfflow.model.lffm) == ("first_order", False)
     assert (arflow.loss.smoothness, arflow.loss.smoothness_s) == ("second_order", (1, 0, 0, 0, 0, 0))
     assert (arflow.model.estimator, arflow.model.levels, arflow.loss.lambda_dc) == ("shared", 7, 75)
-    for other in (selfflow, arflow):
-        assert (other.steps, other.batch_size, other.learning_rate, other.image_size) == (
-            paper.steps, paper.batch_size, paper.learning_rate, paper.image_size)  # fmt: skip
-
-
-def test_best_trains_on_the_exact_flow() -> None:
-    best = train_config("best")
+    shared = {"steps", "batch_size", "learning_rate", "image_size"}
+    assert all(preset.model_dump(include=shared) == paper.model_dump(include=shared) for preset in (selfflow, arflow))
     assert (best.supervision, best.loss.compare_at, best.loss.warping) == ("flow", "image", "spline")
     assert best.ema_decay > 0
-
-
-def test_bare_does_nothing_to_pairs_that_a_sensor_could_not() -> None:
-    bare, best = train_config("bare"), train_config("best")
+    # Nothing that a sensor could not do to pairs.
     assert (bare.supervision, bare.motion, bare.flip, bare.color_jitter, bare.crop_size) == (
         "flow",
         None,
@@ -175,12 +156,11 @@ def test_every_preset_trains(name: str, tmp_path: Path) -> None:
     assert result.weights.is_file()
 
 
-def test_assignments_and_files_still_work(tmp_path: Path) -> None:
+def test_settings_come_from_a_file_a_preset_and_assignments(tmp_path: Path) -> None:
     path = tmp_path / "own.toml"
     path.write_text("steps = 7\n[loss]\nlambda_dc = 3.0\n")
-    assert train_config(path, ["loss.lambda_df=0.5"]).loss.lambda_df == 0.5
-    assert train_config(path).steps == 7
-    with pytest.raises(
-        InputError, match=r"papier: neither a configuration file nor a preset; presets are best, real, bare, paper"
-    ):
+    config = train_config(path, ["loss.lambda_df=0.5"])
+    assert (config.steps, config.loss.lambda_dc, config.loss.lambda_df) == (7, 3, 0.5)
+    words = r"papier: neither a configuration file nor a preset; presets are best, real, bare, paper"
+    with pytest.raises(InputError, match=words):
         train_config("papier")

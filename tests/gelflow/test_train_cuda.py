@@ -50,7 +50,7 @@ def test_recorded_passes_are_the_networks_own() -> None:
         # float32 with sums in another order, TF32 in the convolutions of both.
         assert loss == pytest.approx(expected, rel=1e-3)
         assert (gradient - plain).norm() < 1e-2 * plain.norm()
-        with torch.no_grad():  # the recording reads the weights anew. Fails with a copy of the model recorded
+        with torch.no_grad():  # the recording reads the weights anew
             for parameter in model.parameters():
                 parameter.mul_(1.1)
     assert graphed(*images(9, 64))[0].shape == (2, 2, 64, 64)
@@ -75,7 +75,7 @@ def test_a_network_in_use_is_recorded_for_each_shape(aim: Registration) -> None:
     torch.manual_seed(0)
     model = GelFlow(SMALL.model_copy(update={"registration": REGISTRATIONS[aim]})).cuda().eval()
     recorded = RecordedNetwork(model)
-    # The second and third call with a shape replay. Fails with a flow that is not copied out of the recording.
+    # The second and third call with a shape replay.
     for seed, side in enumerate([96, 96, 96, 64, 96, 96]):
         pair = shifted(seed, side)
         found = recorded(*pair)
@@ -88,7 +88,6 @@ def test_a_network_in_use_is_recorded_for_each_shape(aim: Registration) -> None:
 @pytest.mark.parametrize("aim", ["motion", "both", "brightness"])
 def test_registration_is_that_of_the_cpu(aim: Registration) -> None:
     settings = REGISTRATIONS[aim]
-    assert settings is not None
     first, second = shifted(3)
     place = torch.arange(96.0, device="cuda") - 48
     # A shade, where both aims follow brightness.

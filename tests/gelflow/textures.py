@@ -15,8 +15,7 @@ REAL = Path(__file__).resolve().parents[2].parent / "shared" / "real" / "gelsigh
 
 def texture(x: NDArray[np.float64], y: NDArray[np.float64], seed: int = 0) -> NDArray[np.float32]:
     """Colour (..., 3) in [0, 1] at positions in px: 24 waves of 8 to 24 px with random direction, phase and colour."""
-    generator = np.random.default_rng(seed)
-    value = np.zeros((*x.shape, 3))
+    generator, value = np.random.default_rng(seed), np.zeros((*x.shape, 3))
     for _ in range(24):
         number, angle = 2 * np.pi / generator.uniform(8, 24), generator.uniform(0, np.pi)
         wave = np.sin(number * (np.cos(angle) * x + np.sin(angle) * y) + generator.uniform(0, 2 * np.pi))
@@ -66,17 +65,14 @@ def write_folder(folder: Path, shifts: dict[str, tuple[float, float]], size: tup
 
 def write_synthetic(folder: Path, shifts: list[tuple[float, float]], size: tuple[int, int] = (64, 80)) -> Path:
     """A data set as synth lays it out, with a strip without gel (NaN) and a strip that is not visible."""
-    lines = []
-    for index, (u, v) in enumerate(shifts):
+    for index, shift in enumerate(shifts):
         sample = folder / "samples" / f"{index:06d}"
         save(sample / "image1.png", moved(*size, 0, 0))
-        save(sample / "image2.png", moved(*size, u, v))
-        flow = np.full((*size, 2), (u, v), np.float32)
-        visible = np.ones(size, bool)
-        flow[:, :8], visible[:, :8] = np.nan, False
-        visible[:, -8:] = False
+        save(sample / "image2.png", moved(*size, *shift))
+        flow, visible = np.full((*size, 2), shift, np.float32), np.ones(size, bool)
+        flow[:, :8], visible[:, :8], visible[:, -8:] = np.nan, False, False
         write_flow(sample / "flow.exr", flow, visible)
-        lines.append(json.dumps({"index": index, "frames": [0, 1]}))
     (folder / "dataset.json").write_text(json.dumps({"schema_version": 1, "n": len(shifts)}))
-    (folder / "manifest.jsonl").write_text("".join(line + "\n" for line in lines))
+    lines = [json.dumps({"index": index, "frames": [0, 1]}) + "\n" for index in range(len(shifts))]
+    (folder / "manifest.jsonl").write_text("".join(lines))
     return folder
