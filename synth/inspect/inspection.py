@@ -57,11 +57,7 @@ class Inspection:
         return {"kind": self.kind, "path": str(self.path), **self.about, "samples": list(self.numbers)}
 
     def view(self, number: int) -> View:
-        """Reads a view again.
-
-        Raises:
-            InputError: A file has gone or is damaged.
-        """
+        """Reads a view again; InputError where a file has gone or is damaged."""
         return _look(self.kind, self.places[number])
 
 

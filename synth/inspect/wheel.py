@@ -26,12 +26,7 @@ _HUES = np.array([(1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 1, 1), (0, 0, 1), (1, 0, 
 
 
 def flow_colours(flow: FlowArray | FloatArray, scale: float) -> Rgb:
-    """Colours of a flow.
-
-    Args:
-        flow: (H, W, 2) px, NaN where there is none.
-        scale: px at full saturation, positive.
-    """
+    """Colours of a flow (H, W, 2) px, NaN where there is none; `scale` is the length at full saturation, px."""
     known = np.asarray(np.isfinite(flow).all(axis=-1))
     u, v = (np.where(known, flow[..., axis], 0.0).astype(np.float64) for axis in (0, 1))
     turn = np.arctan2(v, u) / (2 * np.pi) % 1.0
@@ -52,11 +47,7 @@ def wheel_legend(size: int) -> NDArray[np.uint8]:
 
 
 def robust_scale(flow: FlowArray) -> float:
-    """The 99th percentile of the length, rounded up to two digits; so a single outlier does not pale a small flow.
-
-    Returns:
-        px, positive; 1e-6 for no motion at all.
-    """
+    """The 99th percentile of the length, px, rounded up to two digits, at least 1e-6: no outlier pales a small flow."""
     length = np.hypot(flow[..., 0].astype(np.float64), flow[..., 1].astype(np.float64))
     finite = length[np.isfinite(length)]
     high = float(np.percentile(finite, 99)) if finite.size else 0.0

@@ -63,11 +63,7 @@ class Optics:
 
     @staticmethod
     def of(sensor: Sensor) -> "Optics":
-        """The optics of a sensor's main camera; `Sensor.views` gives the others.
-
-        Raises:
-            InputError: the view is along x.
-        """
+        """The optics of a sensor's main camera (`Sensor.views` gives the others); InputError for a view along x."""
         camera = sensor.camera
         return Optics(
             pose=Pose.of(camera),

@@ -34,14 +34,7 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class RenderedTrajectory:
-    """A trajectory whose frames are rendered; picklable.
-
-    Attributes:
-        simulated: the trajectory.
-        surface: what was rendered.
-        frames: by number, all that the wanted samples show.
-        seconds: of rendering.
-    """
+    """A trajectory, all frames that its wanted samples show, by number, and the seconds of rendering; picklable."""
 
     simulated: SimulatedTrajectory
     surface: GelSurface
@@ -51,12 +44,9 @@ class RenderedTrajectory:
 
 @dataclass(frozen=True, eq=False)
 class SensorRenderer:
-    """What all trajectories of one sensor share.
+    """What all trajectories of one sensor, by its number, share: the renderer of all its cameras, and the gel at rest.
 
-    Attributes:
-        sensor: its number.
-        renderer: of all its cameras.
-        rest: radiance of the undeformed gel, by camera; None for a dome, whose triangles are each trajectory's.
+    `rest` is the undeformed gel's radiance by camera; None for a dome, whose triangles are each trajectory's.
     """
 
     sensor: int
@@ -77,10 +67,7 @@ class RenderSession:
     ) -> RenderedTrajectory:
         """Render the frames of a trajectory that its wanted samples show.
 
-        Args:
-            simulated: the trajectory.
-            space: of its states.
-            texture: its sensor's, where it is being painted already.
+        The texture is that of its sensor, where it is being painted already.
         """
         started = time.perf_counter()
         surface = self._surface_of(space, simulated.scene.sensor.gel)

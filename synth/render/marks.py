@@ -14,14 +14,8 @@ from synth.scene import Dots, Speckle
 def dots_coverage(pattern: Dots, x: FloatArray, y: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Dots on a jittered grid; the share falls from 1 to 0 over `softness_mm` around their edges.
 
-    Args:
-        pattern: the grid.
-        x: (columns,) texel centres, mm; even.
-        y: (rows,) likewise.
-        rng: draws three normal numbers for every dot.
-
-    Returns:
-        (rows, columns) in [0, 1].
+    Takes texel centres x (columns,) and y (rows,) mm, both even; draws three normal numbers for every dot. Gives (rows,
+    columns) in [0, 1].
     """
     pitch = max(x[1] - x[0], y[1] - y[0])
     softness = max(pattern.softness_mm, pitch)
@@ -54,16 +48,7 @@ def speckle_coverage(pattern: Speckle, x: FloatArray, y: FloatArray, rng: np.ran
 
     By Rice's formula a line crosses the level u (in standard deviations) exp(-u²/2) / (pi sqrt(2) sigma) times per
     length, sigma being the filter's. With sigma = grain_mm / 4 and u = 0 its mean chord through a grain is
-    pi sqrt(2) sigma = 1.11 grain_mm.
-
-    Args:
-        pattern: size and share of the grains.
-        x: (columns,) texel centres, mm; even.
-        y: (rows,) likewise.
-        rng: draws the noise.
-
-    Returns:
-        (rows, columns) in [0, 1].
+    pi sqrt(2) sigma = 1.11 grain_mm. Arguments and result as of `dots_coverage`.
     """
     from scipy.ndimage import gaussian_filter
 
