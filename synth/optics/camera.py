@@ -123,11 +123,6 @@ class Optics:
             origins[at], directions[at] = self.window.enter(pose.position, onward)
         return Rays(origins, directions, np.where(np.isnan(directions[:, 0]), NOTHING, path))
 
-    def rays(self, pixels: Pixels) -> tuple[Points, Points]:
-        """Origins (n, 3) and directions (n, 3) of `look`."""
-        seen = self.look(pixels)
-        return seen.origins, seen.directions
-
     def depth(self, points: Points, path: Paths | int = DIRECT) -> FloatArray:
         """Distance (n,) mm of points (n, 3) mm along the viewing axis, folded at the path's mirror.
 
