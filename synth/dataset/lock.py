@@ -32,7 +32,7 @@ class DirectoryLock:
     """DIR/.lock, open until `release` or the end of the process."""
 
     def __init__(self, directory: Path) -> None:
-        """Opens the file; holds nothing yet."""
+        """Opens the file, where the storage does not refuse (InputError); holds nothing yet."""
         self._directory = directory
         self._path = directory / LOCK_FILE
         with storage_errors(self._path):

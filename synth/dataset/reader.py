@@ -115,7 +115,7 @@ class Dataset:
         return [read_line(path, table.places[key]) for key in sorted(table.places)]
 
     def folder(self, index: int) -> Path:
-        """DIR/samples/NNNNNN."""
+        """The sample's folder, DIR/samples/NNNNNN."""
         if index not in self._table.places:
             known = self.samples
             span = f"{known[0]} to {known[-1]} ({len(known)} of {self.info['n']})" if known else "none"

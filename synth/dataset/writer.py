@@ -128,7 +128,11 @@ class DatasetWriter:
         self._finished.add(entry.index)
 
     def fail(self, index: int, draw: int, stage: str, reason: str, last_good_state: Any = None) -> None:
-        """Records a draw that failed, once, also over several runs; `index` is the sample that it was to become."""
+        """Records a draw that failed, once, also over several runs.
+
+        `index` is the sample that it was to become, `draw` 0 for that sample's first draw, `stage` where it failed (say
+        "simulate"), and `last_good_state` JSON-able or None.
+        """
         if (index, draw) in self._failed:
             return
         record = {"index": index, "draw": draw, "stage": stage, "reason": reason, "last_good_state": last_good_state}
@@ -162,7 +166,10 @@ class DatasetWriter:
         self._run = run
 
     def finalise(self) -> None:
-        """Merges the lines of all into manifest and failures, writes the summary; in a shard only the last to leave."""
+        """Merges the lines of all into manifest and failures, writes the summary; in a shard only the last to leave.
+
+        Nothing is lost where the storage refuses (InputError).
+        """
         with self._lock.leave(self._shard) as alone:
             if not alone:
                 return

@@ -34,7 +34,10 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class RenderedTrajectory:
-    """A trajectory, all frames that its wanted samples show, by number, and the seconds of rendering; picklable."""
+    """A trajectory whose frames are rendered; picklable.
+
+    `frames` are all that the wanted samples show, by number; `seconds` are those of rendering.
+    """
 
     simulated: SimulatedTrajectory
     surface: GelSurface
@@ -44,7 +47,7 @@ class RenderedTrajectory:
 
 @dataclass(frozen=True, eq=False)
 class SensorRenderer:
-    """What all trajectories of one sensor, by its number, share: the renderer of all its cameras, and the gel at rest.
+    """What all trajectories of one sensor share: its number, the renderer of its cameras, and the gel at rest.
 
     `rest` is the undeformed gel's radiance by camera; None for a dome, whose triangles are each trajectory's.
     """

@@ -14,8 +14,14 @@ from synth.scene import Dots, Speckle
 def dots_coverage(pattern: Dots, x: FloatArray, y: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Dots on a jittered grid; the share falls from 1 to 0 over `softness_mm` around their edges.
 
-    Takes texel centres x (columns,) and y (rows,) mm, both even; draws three normal numbers for every dot. Gives (rows,
-    columns) in [0, 1].
+    Args:
+        pattern: the grid.
+        x: (columns,) texel centres, mm; even.
+        y: (rows,) likewise.
+        rng: draws three normal numbers for every dot.
+
+    Returns:
+        (rows, columns) in [0, 1].
     """
     pitch = max(x[1] - x[0], y[1] - y[0])
     softness = max(pattern.softness_mm, pitch)

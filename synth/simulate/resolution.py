@@ -94,8 +94,8 @@ def mesh_levels(gel: Gel, focus: Focus, across: Sequence[int] = ELEMENTS_ACROSS)
 def graded_mesh(gel: Gel, focus: Focus, across: int, through: int | None = None) -> tuple[PadMesh, float]:
     """The structured mesh of a pad with so many elements across a zone, and their size (see `_spacing`).
 
-    Their number across is even; through the thickness are as many as keep those under the zone no higher than wide,
-    unless it is given.
+    `across` is even; without `through`, as many elements go through the thickness as keep those under the zone no
+    higher than wide.
     """
     size = gel.size_mm
     wide = lateral_spacing(gel, focus, Counts((across, across), OUTER))

@@ -54,7 +54,15 @@ Textured = tuple[FloatArray, FloatArray, NDArray[np.intp], NDArray[np.intp]]
 
 
 def check_photometry(sensor: Sensor, image1: Raster, image2: Raster, flow: FlowArray, visible: FlowArray) -> Check:
-    """Compares the images, (H, W) or (H, W, 3), through the forward flow (H, W, 2) px where it is visible (H, W)."""
+    """Compares the images through the forward flow.
+
+    Args:
+        sensor: its camera's response and noise, and its pattern.
+        image1: (H, W) or (H, W, 3).
+        image2: the same.
+        flow: (H, W, 2) px, forward.
+        visible: (H, W).
+    """
     if isinstance(sensor.pattern, NoPattern):
         return _not_applicable(ALLOWANCE_PX, "the coating is bare")
     usable = _usable(flow, visible)

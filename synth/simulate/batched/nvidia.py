@@ -32,9 +32,12 @@ def library(name: str) -> ctypes.CDLL:
 
 
 def call(name: str, function: str, *arguments: Any) -> None:
-    """Call a function of a library, one that returns 0 if it succeeds (else RuntimeError), by its C name.
+    """Call a function of a library by its C name.
 
-    Arguments are pointers wrapped in ctypes' types, int for an int.
+    Arguments are pointers wrapped in ctypes' types, int for an int. The function returns 0 if it succeeds.
+
+    Raises:
+        RuntimeError: the function reported something else.
     """
     status = getattr(library(name), function)(*arguments)
     if status != 0:
