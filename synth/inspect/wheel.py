@@ -14,7 +14,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.arrays import BoolArray, FloatArray
+from synth.arrays import FloatArray
 from synth.flow.field import FlowArray
 
 Rgb: TypeAlias = NDArray[np.uint8]
@@ -33,7 +33,7 @@ def flow_colours(flow: FlowArray | FloatArray, scale: float) -> Rgb:
     hue = np.stack([np.interp(turn, _KNOTS, _HUES[:, channel]) for channel in range(3)], axis=-1)
     radius = (np.hypot(u, v) / scale)[..., None]
     colour = np.where(radius <= 1, 1 - radius * (1 - hue), 0.75 * hue)
-    return _with_gaps(np.rint(255 * colour).astype(np.uint8), known)
+    return np.where(known[..., None], np.rint(255 * colour).astype(np.uint8), np.array(NO_GEL, np.uint8))
 
 
 def wheel_legend(size: int) -> NDArray[np.uint8]:
@@ -55,7 +55,3 @@ def robust_scale(flow: FlowArray) -> float:
         return 1e-6
     unit = 10.0 ** (np.floor(np.log10(high)) - 1)
     return float(f"{np.ceil(round(high / unit, 6)) * unit:.3g}")
-
-
-def _with_gaps(colour: Rgb, known: BoolArray) -> Rgb:
-    return np.where(known[..., None], colour, np.array(NO_GEL, np.uint8))
