@@ -27,12 +27,7 @@ LINE_S = 60.0
 
 @contextmanager
 def progress(label: str, total: int | None = None) -> Iterator[Advance]:
-    """Shows progress while the block runs.
-
-    Args:
-        label: what is done, and the items' name.
-        total: items in all, where it is known from the start.
-    """
+    """Shows progress while the block runs; the label names what is done, `total` is known from the start or None."""
     console = Console(stderr=True)
     if not console.is_terminal:
         yield _lines(label)

@@ -20,19 +20,11 @@ class ExactFlow:
     name: str = "exact flow"
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
-        """Images alone do not tell.
-
-        Raises:
-            InputError: Always.
-        """
+        """Always raises InputError: images alone do not tell."""
         raise InputError("the exact flow cannot be estimated from images; it is a row of `compare` on synthetic pairs")
 
     def of(self, truth: FlowField | None) -> FlowArray:
-        """The true flow (H, W, 2) px, zero where no gel is seen.
-
-        Raises:
-            InputError: The pair has none.
-        """
+        """The true flow (H, W, 2) px, zero where no gel is seen; InputError where the pair has none."""
         if truth is None:
             raise InputError("the pair has no exact flow; leave the method exact out")
         return np.nan_to_num(truth.flow)

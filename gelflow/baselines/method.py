@@ -27,11 +27,7 @@ class Method(Protocol):
 
 
 def check_images(image1: ImageArray, image2: ImageArray) -> None:
-    """Refuses what no method can work on.
-
-    Raises:
-        InputError: The images differ in shape, are not (H, W, 3), are too small, or hold values that are not finite.
-    """
+    """Refuses images that differ in shape, are not (H, W, 3), are too small, or hold values that are not finite."""
     for name, image in (("image 1", image1), ("image 2", image2)):
         if image.ndim != 3 or image.shape[2] != 3:
             raise InputError(f"{name} has shape {image.shape}; (rows, columns, 3) is needed, a grey image repeated")

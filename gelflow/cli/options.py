@@ -45,11 +45,7 @@ def each_key_once(_: Any, given: Sequence[str] | None) -> None:
 
 
 def parse_size(text: str | None) -> tuple[int, int] | None:
-    """ROWSxCOLUMNS as numbers.
-
-    Raises:
-        InputError: The text is something else, or a size beyond `MAXIMUM_PIXELS`.
-    """
+    """ROWSxCOLUMNS as numbers; InputError for other text and for sizes beyond `MAXIMUM_PIXELS`."""
     if text is None:
         return None
     rows, _, columns = text.lower().partition("x")

@@ -63,11 +63,7 @@ class PairSet(_Record):
 
 
 def read_pair_set(folder: Path) -> PairSet:
-    """Reads pairs.json.
-
-    Raises:
-        InputError: It is missing, damaged or of a newer format.
-    """
+    """Reads pairs.json; InputError where it is missing, damaged or of a newer format."""
     path = folder / FILE
     try:
         content = PairSet.model_validate_json(path.read_text(encoding="utf-8"))
@@ -87,11 +83,7 @@ def write_pair_set(folder: Path, content: PairSet) -> None:
 
 
 def pair_set_records(folder: Path) -> list[PairRecord]:
-    """The pairs of a finished pair set, in the order in which they were chosen.
-
-    Raises:
-        InputError: pairs.json is damaged or the job was interrupted.
-    """
+    """The pairs of a finished pair set, in the order in which they were chosen; InputError where it is not finished."""
     content = read_pair_set(folder)
     if not content.complete:
         raise InputError(

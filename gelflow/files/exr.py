@@ -78,9 +78,6 @@ def write_flow(path: Path, forward: FlowArray, visible: MaskArray | None = None)
     """Writes a forward flow, and where it is visible if that is known; replaces the file as a whole.
 
     Without `visible` that channel is left out: an estimate does not know it.
-
-    Raises:
-        OSError: The file cannot be written.
     """
     import OpenEXR
 

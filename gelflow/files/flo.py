@@ -16,11 +16,7 @@ UNKNOWN = np.float32(1e10)
 
 
 def write_flo(path: Path, flow: FlowArray) -> None:
-    """Writes a flow (H, W, 2) in px; NaN becomes the format's unknown flow. Replaces the file as a whole.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Writes a flow (H, W, 2) in px; NaN becomes the format's unknown flow. Replaces the file as a whole."""
     height, width = flow.shape[:2]
     data = np.where(np.isnan(flow), UNKNOWN, flow).astype("<f4")
     with replacing(path) as temporary, temporary.open("wb") as file:

@@ -92,11 +92,7 @@ def to_grey(image: ImageArray) -> Grey8:
 
 
 def write_png(path: Path, pixels: Bytes3 | Grey8) -> None:
-    """Writes (H, W, 3) RGB or (H, W) grey uint8 as PNG; replaces the file as a whole.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Writes (H, W, 3) RGB or (H, W) grey uint8 as PNG; replaces the file as a whole."""
     import cv2
 
     bgr = pixels[..., ::-1] if pixels.ndim == 3 else pixels

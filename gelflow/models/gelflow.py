@@ -124,11 +124,7 @@ def normalised(first: Features, second: Features) -> tuple[Tensor, Tensor]:
 
 
 def check_shapes(image1: Images, image2: Images) -> None:
-    """Refuses images that the network cannot take.
-
-    Raises:
-        InputError: See `GelFlow.forward`.
-    """
+    """Refuses images that the network cannot take, as `GelFlow.forward` says."""
     if image1.shape != image2.shape:
         raise InputError(f"the two images differ in shape: {_size(image1)} and {_size(image2)}; give two of one size")
     if image1.ndim != 4 or image1.shape[1] != 3:

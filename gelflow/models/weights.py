@@ -37,9 +37,6 @@ def save_weights(path: Path, model: GelFlow, **metadata: str) -> None:
     """Writes a network's weights, as a whole or not at all.
 
     `metadata` are further texts to store with them. Folders are made.
-
-    Raises:
-        OSError: The disk is full or the folder cannot be written to.
     """
     texts = metadata | {
         "format": FORMAT,

@@ -208,11 +208,7 @@ class FlowModule(L.LightningModule):
 
 
 def check_side(batch: dict[str, Any], config: TrainConfig) -> None:
-    """Refuses a validation pair, as a batch of one, that is too small for the network.
-
-    Raises:
-        InputError: A side is too short; the message names the pair.
-    """
+    """Refuses a validation pair, as a batch of one, that is too small for the network; the message names the pair."""
     rows, columns = batch["image1"].shape[-2:]
     if config.image_size is None and min(rows, columns) < MINIMUM_SIDE:
         raise InputError(f"validation pair {batch['name'][0]}: {rows}x{columns} px, but each side must be at least "

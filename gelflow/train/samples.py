@@ -174,11 +174,7 @@ def _supervised(sample: Sample, config: TrainConfig) -> bool:
 
 
 def collate(samples: list[Sample]) -> Sample:
-    """A batch from samples of one size; the flow is kept where all of them have one.
-
-    Raises:
-        InputError: The samples differ in size.
-    """
+    """A batch from samples of one size; the flow is kept where all of them have one. InputError for several sizes."""
     sizes = {tuple(sample["image1"].shape[-2:]) for sample in samples}
     if len(sizes) > 1:
         names = ", ".join(str(sample["name"]) for sample in samples)

@@ -43,16 +43,10 @@ def fit_dot_grid(sensor: Sensor, pattern: Dots, centres: Pixels, spacing_mm: flo
 
     A flat grid fixes the ratio of spacing and focal length alone. So either the spacing is known and the focal lengths
     are found, or the camera's scale is taken from the preset and the spacing is found. Principal point, tilt and the
-    distortion k1 are weakly determined and held near the preset by a prior.
-
-    Args:
-        sensor: the preset, with the camera's width and height those of the frame.
-        pattern: the preset's.
-        centres: (n, 2) px.
-        spacing_mm: between columns, where it is known.
+    distortion k1 are weakly determined and held near the preset by a prior. The preset's camera has the frame's size.
 
     Raises:
-        InputError: the dots form no grid.
+        InputError: the dots, at `centres` (n, 2) px, form no grid.
     """
     from scipy.optimize import least_squares
 

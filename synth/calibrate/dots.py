@@ -73,11 +73,7 @@ def find_dots(linear: FloatArray, pitch_px: float) -> FoundDots:
 
 
 def check_size(radius_px: float) -> None:
-    """Refuses dots that are too small to be measured.
-
-    Raises:
-        InputError: they are.
-    """
+    """Refuses dots that are too small to be measured."""
     if not radius_px > SMALLEST_PX:
         raise InputError(
             f"the dots found in the frame have a radius of {radius_px:.2g} px, needed is more than {SMALLEST_PX:g} px; "

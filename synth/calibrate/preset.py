@@ -26,9 +26,7 @@ def start_sensor(template: Template, size: tuple[int, int]) -> Sensor:
     """The preset's sensor at the middle of its distributions, with a camera that makes frames of the given size.
 
     Focal lengths and principal point scale with the width; the principal point keeps its place relative to the middle.
-
-    Raises:
-        InputError: a pattern, mirror or further camera that calibration does not know.
+    A pattern, mirror, aperture or further camera that calibration does not know is an InputError.
     """
     content = copy.deepcopy(replaced(template.content["sensor"], middle))
     sensor = validated(content, template.label, Sensor, "sensor")

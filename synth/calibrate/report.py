@@ -19,10 +19,7 @@ _CAMERA = ("fx", "fy", "cx", "cy", "look_at_mm", "distortion", "blur_px", "vigne
 def fitted_content(template: Template, fit: SensorFit, folder: str) -> dict[str, Any]:
     """The preset's content with the fitted sensor in place of its own; everything else keeps its distributions.
 
-    Args:
-        template: the preset.
-        fit: what was found.
-        folder: of the preset, relative to where the fitted scene will lie; indenters' files are found through it.
+    `folder` is the preset's, relative to where the fitted scene will lie: indenters' files are found through it.
     """
     sensor = fit.sensor.model_dump(mode="json", exclude_none=True)
     given = template.content["sensor"]

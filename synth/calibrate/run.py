@@ -43,9 +43,6 @@ def run_calibrate(
         steps: most steps for the lights' geometry.
         as_json: print the numbers instead of a summary.
 
-    Returns:
-        0.
-
     Raises:
         InputError: frames, preset or storage are at fault, or this machine has no differentiable variant.
     """

@@ -35,11 +35,7 @@ _DARKEST, _BRIGHTEST = 2 / 255, 253 / 255
 class SensorFit:
     """The fitted sensor and how it was found.
 
-    Attributes:
-        sensor: all of it.
-        lights: powers and geometry.
-        dots, grid: None for a bare coating.
-        bare: (H, W) pixels that show nothing but coating.
+    `dots` and `grid` are None for a bare coating; `bare` (H, W) are the pixels that show nothing but coating.
     """
 
     sensor: Sensor
@@ -52,12 +48,8 @@ class SensorFit:
 def fit_sensor(start: Sensor, frames: Frames, variant: Variant, spacing_mm: float | None, steps: int) -> SensorFit:
     """Fit everything that undeformed frames tell.
 
-    Args:
-        start: the preset, its camera of the frames' size.
-        frames: of the user's sensor.
-        variant: a vectorised one.
-        spacing_mm: of the dots' columns, where known; without, the preset's field of view is trusted.
-        steps: most steps for the lights' geometry.
+    The preset's camera has the frames' size. Without the spacing of the dots' columns its field of view is trusted. The
+    lights' geometry takes at most `steps` steps. The variant is a vectorised one.
 
     Raises:
         InputError: no dots, or no grid, where the preset has some; nothing that tells of the lights; overexposure.

@@ -83,11 +83,7 @@ def channels_of(flow: FlowField) -> dict[str, FlowArray]:
 
 
 def read_flow(path: Path) -> FlowField:
-    """The flow field in a file.
-
-    Raises:
-        InputError: As `read_channels`, or a channel of the forward flow, or a part of the backward flow, is missing.
-    """
+    """The flow field in a file; InputError where it is damaged or a part of a flow is missing."""
     return flow_of(path, read_channels(path)[0])
 
 

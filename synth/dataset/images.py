@@ -17,14 +17,7 @@ _COMPRESSION = 4
 
 
 def encode_png(image: Raster) -> bytes:
-    """PNG file of an image.
-
-    Args:
-        image: (H, W) or (H, W, 3) RGB, uint8 or uint16.
-
-    Raises:
-        ValueError: Another shape or type.
-    """
+    """PNG file of an image, (H, W) or (H, W, 3) RGB, uint8 or uint16; ValueError for any other array."""
     import cv2
 
     if image.dtype not in (np.uint8, np.uint16) or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):

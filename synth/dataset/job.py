@@ -62,11 +62,7 @@ class Job:
 
 
 def read_job_record(directory: Path) -> dict[str, Any]:
-    """The content of DIR/dataset.json.
-
-    Raises:
-        InputError: Missing, damaged, or of another version of the format.
-    """
+    """The content of DIR/dataset.json; InputError where it is missing, damaged, or of another version of the format."""
     path = directory / DATASET_FILE
     if not path.is_file():
         raise InputError(f"{directory}: not a dataset: it has no {DATASET_FILE}")
@@ -74,11 +70,7 @@ def read_job_record(directory: Path) -> dict[str, Any]:
 
 
 def check_record(record: dict[str, Any], where: str) -> dict[str, Any]:
-    """The content of a dataset.json, if it is of this version; `where` is for messages.
-
-    Raises:
-        InputError: Something is missing, or it is of another version of the format.
-    """
+    """The content of a dataset.json, if it is complete and of this version; InputError if not, with `where` in it."""
     missing = [key for key in ("schema_version", "scene_hash", "seed", "n", "scene") if key not in record]
     if missing:
         raise InputError(f"{where}: lacks {', '.join(missing)}; the file is damaged or not of a dataset")

@@ -46,11 +46,7 @@ def to_document(value: object) -> str:
 
 
 def read_document(path: Path) -> dict[str, Any]:
-    """The object in a .json file.
-
-    Raises:
-        InputError: The file is missing, unreadable, or holds no JSON object.
-    """
+    """The object in a .json file; InputError where it is missing, unreadable, or holds no JSON object."""
     try:
         return parse_document(path.read_bytes(), str(path))
     except OSError as error:
@@ -58,11 +54,7 @@ def read_document(path: Path) -> dict[str, Any]:
 
 
 def parse_document(content: bytes, where: str) -> dict[str, Any]:
-    """The object in the content of a .json file; `where` is for messages.
-
-    Raises:
-        InputError: It holds no JSON object.
-    """
+    """The object in the content of a .json file; InputError where it holds none, with `where` in the message."""
     try:
         parsed = json.loads(content)
     except ValueError as error:

@@ -80,11 +80,7 @@ def _key_of(line: bytes, key: Callable[[dict[str, Any]], Key]) -> Any:
 
 
 def read_line(path: Path, place: tuple[int, int]) -> dict[str, Any]:
-    """The object in one line.
-
-    Raises:
-        InputError: The file cannot be read or has changed since it was scanned.
-    """
+    """The object in one line; InputError where the file cannot be read or has changed since it was scanned."""
     offset, length = place
     try:
         with path.open("rb") as file:
@@ -98,11 +94,7 @@ def read_line(path: Path, place: tuple[int, int]) -> dict[str, Any]:
 
 
 def append_line(path: Path, record: object) -> None:
-    """Adds a line in one write and flushes it; when the storage refuses, the file is as before.
-
-    Raises:
-        InputError: The storage refuses.
-    """
+    """Adds a line in one write and flushes it; when the storage refuses (InputError), the file is as before."""
     line = to_line(record).encode("utf-8")
     with storage_errors(path):
         descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)

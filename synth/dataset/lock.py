@@ -32,11 +32,7 @@ class DirectoryLock:
     """DIR/.lock, open until `release` or the end of the process."""
 
     def __init__(self, directory: Path) -> None:
-        """Opens the file; holds nothing yet.
-
-        Raises:
-            InputError: The storage refuses.
-        """
+        """Opens the file, where the storage does not refuse (InputError); holds nothing yet."""
         self._directory = directory
         self._path = directory / LOCK_FILE
         with storage_errors(self._path):
@@ -86,11 +82,7 @@ class DirectoryLock:
 
     @contextlib.contextmanager
     def setup(self) -> Iterator[None]:
-        """Alone among shards that come or go; waits for others.
-
-        Raises:
-            InputError: The file system offers no locks.
-        """
+        """Alone among shards that come or go; waits for others. InputError where the file system offers no locks."""
         self._take(SETUP, fcntl.LOCK_EX)
         try:
             yield

@@ -10,11 +10,7 @@ MESHES_FOLDER = "meshes"
 
 
 def mesh_folder(out: Output) -> Path:
-    """A folder of this machine that holds the dataset's meshes.
-
-    Raises:
-        InputError: The storage refuses.
-    """
+    """A folder of this machine that holds the dataset's meshes; InputError where the storage refuses."""
     store = Store(out)
     if store.directory is not None:
         return store.directory / MESHES_FOLDER

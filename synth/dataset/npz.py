@@ -31,11 +31,7 @@ def encode_npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
 
 
 def read_npz(path: Path, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-    """The arrays of these names.
-
-    Raises:
-        InputError: The file is missing, is no .npz, is truncated or damaged, or lacks a name.
-    """
+    """The arrays of these names; InputError where the file is missing, no .npz or damaged, or lacks a name."""
     try:
         with np.load(path, allow_pickle=False) as archive:
             present = list(archive.files)

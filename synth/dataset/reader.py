@@ -69,11 +69,7 @@ class SampleData:
         return self.flow.forward_visible
 
     def seen_by(self, camera: str) -> "SampleData":
-        """The same sample with the images and flow of one camera; "" is the main camera.
-
-        Raises:
-            InputError: there is no camera of that name.
-        """
+        """The sample with the images and flow of one camera, "" the main one; InputError for a name that it has not."""
         if not camera:
             return self
         if camera not in self.further:
@@ -86,6 +82,8 @@ class SampleData:
 @dataclass(frozen=True)
 class Dataset:
     """A dataset directory as it was when it was opened; iterating reads its finished samples one by one.
+
+    Methods raise InputError for a sample or camera that is not there, and for a file that is missing or damaged.
 
     Attributes:
         path: the directory.
@@ -117,11 +115,7 @@ class Dataset:
         return [read_line(path, table.places[key]) for key in sorted(table.places)]
 
     def folder(self, index: int) -> Path:
-        """DIR/samples/NNNNNN.
-
-        Raises:
-            InputError: There is no such sample.
-        """
+        """The sample's folder, DIR/samples/NNNNNN."""
         if index not in self._table.places:
             known = self.samples
             span = f"{known[0]} to {known[-1]} ({len(known)} of {self.info['n']})" if known else "none"
@@ -129,36 +123,20 @@ class Dataset:
         return self.path / SAMPLES_FOLDER / sample_name(index)
 
     def entry(self, index: int) -> ManifestEntry:
-        """The sample's line in the manifest.
-
-        Raises:
-            InputError: There is no such sample.
-        """
+        """The sample's line in the manifest."""
         self.folder(index)
         return ManifestEntry.from_record(read_line(self.path / MANIFEST_FILE, self._table.places[index]))
 
     def scene_of(self, index: int) -> Scene:
-        """The draw that the sample was made from.
-
-        Raises:
-            InputError: No such sample, or its meta.json is missing or damaged.
-        """
+        """The draw that the sample was made from."""
         return read_scene(self.folder(index))
 
     def read(self, index: int, camera: str = "") -> SampleData:
-        """The sample's files; image1, image2 and flow are those of the camera of that name, by default the main one.
-
-        Raises:
-            InputError: No such sample or camera, or a file is missing or damaged.
-        """
+        """The sample's files; image1, image2 and flow are those of the camera of that name, by default the main one."""
         return read_sample(self.folder(index)).seen_by(camera)
 
     def check_hashes(self, index: int) -> list[str]:
-        """One message for each file whose content is not what the manifest says, or that is missing; empty: all well.
-
-        Raises:
-            InputError: There is no such sample.
-        """
+        """One message for each file that is missing or whose content is not what the manifest says; empty: all well."""
         problems = []
         for name, expected in self.entry(index).sha256.items():
             path = self.folder(index) / name
@@ -194,11 +172,7 @@ def read_dataset(path: Path | str) -> Dataset:
 
 
 def read_sample(folder: Path) -> SampleData:
-    """The files of one sample's folder.
-
-    Raises:
-        InputError: A file is missing or damaged, or they do not fit each other.
-    """
+    """The files of one sample's folder; InputError where they are missing or damaged, or do not fit each other."""
     meta = read_document(folder / "meta.json")
     pair = read_pair(folder)
     names = ("nodes", "faces", "subdivisions", "displacement1", "displacement2")
@@ -219,11 +193,7 @@ def read_sample(folder: Path) -> SampleData:
 
 
 def read_pair(folder: Path) -> CameraPair:
-    """One camera's images and flow.
-
-    Raises:
-        InputError: A file is missing or damaged, or they do not fit each other.
-    """
+    """One camera's images and flow; InputError where they are missing or damaged, or do not fit each other."""
     image1, image2 = read_png(folder / "image1.png"), read_png(folder / "image2.png")
     flow = read_flow(folder / "flow.exr")
     size = flow.forward.shape[:2]
@@ -235,11 +205,7 @@ def read_pair(folder: Path) -> CameraPair:
 
 
 def read_scene(folder: Path) -> Scene:
-    """The drawn scene in a sample's meta.json.
-
-    Raises:
-        InputError: The file is missing or damaged, or of a scene that this version does not know.
-    """
+    """The drawn scene in a sample's meta.json; InputError where that is damaged, or of another version's schema."""
     path = folder / "meta.json"
     meta = read_document(path)
     try:

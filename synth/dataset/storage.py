@@ -87,11 +87,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 
 def replace_file(path: Path, content: bytes) -> None:
-    """Gives a file new content as a whole.
-
-    Raises:
-        InputError: The storage refuses; the old content is still there.
-    """
+    """Gives a file new content as a whole; where the storage refuses (InputError) the old content is still there."""
     with replacing(path) as file:
         file.write(content)
 
@@ -122,9 +118,6 @@ def install_folder(partial: Path, final: Path) -> None:
 
     Two processes may install the same name at once (a task that was given up for lost, and its repetition): the last
     one stays.
-
-    Raises:
-        OSError: The storage refuses.
     """
     for entry in partial.rglob("*"):  # files and folders
         flush(entry)

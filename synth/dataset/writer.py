@@ -109,21 +109,13 @@ class DatasetWriter:
         return set(self._finished)
 
     def write(self, sample: Sample) -> ManifestEntry:
-        """Writes a sample's files and its line.
-
-        Raises:
-            InputError: The storage refuses; the sample counts as unfinished.
-        """
+        """Writes a sample's files and its line; where the storage refuses the sample counts as unfinished."""
         entry = write_sample_files(self._store.out, sample, self.job)
         self.record(entry)
         return entry
 
     def record(self, entry: ManifestEntry) -> None:
-        """Appends the line of a sample whose files `write_sample_files` has written; again for a known one: nothing.
-
-        Raises:
-            InputError: The storage refuses, or the files are not there.
-        """
+        """Appends the line of a sample whose files are there (else InputError); again for a known one: nothing."""
         if entry.index in self._finished:
             return
         name = sample_name(entry.index)
@@ -138,15 +130,8 @@ class DatasetWriter:
     def fail(self, index: int, draw: int, stage: str, reason: str, last_good_state: Any = None) -> None:
         """Records a draw that failed, once, also over several runs.
 
-        Args:
-            index: the sample that it was to become.
-            draw: 0 for the first draw, 1 for the next.
-            stage: where it failed, e.g. "simulate".
-            reason: for the user.
-            last_good_state: JSON-able, or None.
-
-        Raises:
-            InputError: The storage refuses.
+        `index` is the sample that it was to become, `draw` 0 for that sample's first draw, `stage` where it failed (say
+        "simulate"), and `last_good_state` JSON-able or None.
         """
         if (index, draw) in self._failed:
             return
@@ -183,8 +168,7 @@ class DatasetWriter:
     def finalise(self) -> None:
         """Merges the lines of all into manifest and failures, writes the summary; in a shard only the last to leave.
 
-        Raises:
-            InputError: The storage refuses; nothing is lost.
+        Nothing is lost where the storage refuses (InputError).
         """
         with self._lock.leave(self._shard) as alone:
             if not alone:

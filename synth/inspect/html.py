@@ -46,11 +46,7 @@ p.note { color: #888; font-size: .85rem; max-width: 60rem; }
 
 
 def write_html(inspection: Inspection, html: Path | str) -> None:
-    """Writes the page; a file of that name is replaced.
-
-    Raises:
-        InputError: A sample's file has gone or is damaged, or the storage refuses.
-    """
+    """Writes the page; a file of that name is replaced. InputError where a sample has gone or the storage refuses."""
     body = _dataset_body(inspection) if inspection.kind == "dataset" else _view_body(inspection)
     title = escape(inspection.title)
     page = (

@@ -1,7 +1,7 @@
 """What `inspect` finds at a path."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -17,8 +17,6 @@ from synth.inspect.numbers import numbers_of
 from synth.inspect.view import META_FILE, View, view_flow, view_sample
 
 Kind = Literal["dataset", "sample", "flow"]
-Progress = Callable[[int, int], None]
-"""Called with (samples looked at, samples to look at)."""
 
 _ALLOWED = "a dataset, a sample's folder or an .exr file with a flow"
 
@@ -57,11 +55,7 @@ class Inspection:
         return {"kind": self.kind, "path": str(self.path), **self.about, "samples": list(self.numbers)}
 
     def view(self, number: int) -> View:
-        """Reads a view again.
-
-        Raises:
-            InputError: A file has gone or is damaged.
-        """
+        """Reads a view again; InputError where a file has gone or is damaged."""
         return _look(self.kind, self.places[number])
 
 
@@ -70,13 +64,12 @@ def evenly_spaced(total: int, count: int) -> list[int]:
     return sorted({int(i) for i in np.linspace(0, total - 1, min(count, total)).round()})
 
 
-def inspect(path: Path | str, limit: int = 100, progress: Progress | None = None) -> Inspection:
+def inspect(path: Path | str, limit: int = 100) -> Inspection:
     """Looks at a dataset, a sample's folder or one flow file.
 
     Args:
         path: what to look at.
         limit: of a dataset, look at no more than so many samples, evenly spaced; `about` says how many there are.
-        progress: told after each sample.
 
     Raises:
         InputError: Nothing that can be inspected, or a file is missing or damaged.
@@ -92,12 +85,8 @@ def inspect(path: Path | str, limit: int = 100, progress: Progress | None = None
         about["inspected"] = len(places)
     names = _further(places[0]) if places and kind != "flow" else []
     places = [folder / name for folder in places for name in ("", *names)]
-    numbers = []
-    for done, item in enumerate(places):
-        numbers.append(numbers_of(_look(kind, item)))
-        if progress is not None:
-            progress(done + 1, len(places))
-    return Inspection(kind, place, about, tuple(places), tuple(numbers), 1 + len(names))
+    numbers = tuple(numbers_of(_look(kind, item)) for item in places)
+    return Inspection(kind, place, about, tuple(places), numbers, 1 + len(names))
 
 
 def _further(folder: Path) -> list[str]:

@@ -50,12 +50,7 @@ class Panel:
 
 
 def panels_of(view: View, numbers: Mapping[str, Any]) -> list[Panel]:
-    """All pictures that there is something to show in.
-
-    Args:
-        view: what is shown.
-        numbers: `numbers_of(view)`, for the captions.
-    """
+    """All pictures that there is something to show in; `numbers` is `numbers_of(view)`, for the captions."""
     panels = []
     if view.image1 is not None and view.image2 is not None:
         panels += [Panel("image 1", image_picture(view.image1)), Panel("image 2", image_picture(view.image2))]

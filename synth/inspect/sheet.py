@@ -28,11 +28,7 @@ _TOP, _MARGIN, _GAP = 0.4, 0.25, 0.1
 
 
 def write_sheet(inspection: Inspection, png: Path | str) -> None:
-    """Draws the sheet; a file of that name is replaced.
-
-    Raises:
-        InputError: A sample's file has gone or is damaged, or the storage refuses.
-    """
+    """Draws the sheet; a file of that name is replaced. InputError where a sample has gone or the storage refuses."""
     from matplotlib.figure import Figure
 
     is_dataset = inspection.kind == "dataset"

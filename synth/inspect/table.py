@@ -14,9 +14,7 @@ Column = tuple[str, list[str]]
 def tables(inspection: Inspection, width: int | None = None) -> list[Table]:
     """For `rich.console.Console.print`: of a dataset its facts and a row per sample and camera, else all numbers.
 
-    Args:
-        inspection: what was found.
-        width: characters of the terminal: columns that do not fit follow in further tables. None for any number.
+    Columns that do not fit the terminal's width in characters, where one is given, follow in further tables.
     """
     if inspection.kind != "dataset":
         return [_pairs(str(place), facts(n)) for place, n in zip(inspection.places, inspection.numbers, strict=True)]

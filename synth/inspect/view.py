@@ -92,11 +92,7 @@ class View:
 
 
 def view_sample(folder: Path) -> View:
-    """Of a sample's folder, or of a further camera's folder therein.
-
-    Raises:
-        InputError: A file is missing or damaged, or they do not fit each other.
-    """
+    """Of a sample's folder, or of a further camera's folder therein; InputError where files are missing or damaged."""
     is_further = not (folder / META_FILE).exists() and (folder.parent / META_FILE).exists()
     meta = read_document((folder.parent if is_further else folder) / META_FILE)
     pair = read_pair(folder)
@@ -105,11 +101,7 @@ def view_sample(folder: Path) -> View:
 
 
 def view_flow(path: Path) -> View:
-    """Of a flow file, also one without visibility.
-
-    Raises:
-        InputError: The file is missing or damaged, or holds no flow.
-    """
+    """Of a flow file, also one without visibility; InputError where it is missing or damaged, or holds no flow."""
     channels, header = read_channels(path)
     known = "forward.visible" in channels
     for direction in ("forward", "backward"):

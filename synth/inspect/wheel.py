@@ -14,7 +14,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.arrays import BoolArray, FloatArray
+from synth.arrays import FloatArray
 from synth.flow.field import FlowArray
 
 Rgb: TypeAlias = NDArray[np.uint8]
@@ -26,19 +26,14 @@ _HUES = np.array([(1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 1, 1), (0, 0, 1), (1, 0, 
 
 
 def flow_colours(flow: FlowArray | FloatArray, scale: float) -> Rgb:
-    """Colours of a flow.
-
-    Args:
-        flow: (H, W, 2) px, NaN where there is none.
-        scale: px at full saturation, positive.
-    """
+    """Colours of a flow (H, W, 2) px, NaN where there is none; `scale` is the length at full saturation, px."""
     known = np.asarray(np.isfinite(flow).all(axis=-1))
     u, v = (np.where(known, flow[..., axis], 0.0).astype(np.float64) for axis in (0, 1))
     turn = np.arctan2(v, u) / (2 * np.pi) % 1.0
     hue = np.stack([np.interp(turn, _KNOTS, _HUES[:, channel]) for channel in range(3)], axis=-1)
     radius = (np.hypot(u, v) / scale)[..., None]
     colour = np.where(radius <= 1, 1 - radius * (1 - hue), 0.75 * hue)
-    return _with_gaps(np.rint(255 * colour).astype(np.uint8), known)
+    return np.where(known[..., None], np.rint(255 * colour).astype(np.uint8), np.array(NO_GEL, np.uint8))
 
 
 def wheel_legend(size: int) -> NDArray[np.uint8]:
@@ -52,11 +47,7 @@ def wheel_legend(size: int) -> NDArray[np.uint8]:
 
 
 def robust_scale(flow: FlowArray) -> float:
-    """The 99th percentile of the length, rounded up to two digits; so a single outlier does not pale a small flow.
-
-    Returns:
-        px, positive; 1e-6 for no motion at all.
-    """
+    """The 99th percentile of the length, px, rounded up to two digits, at least 1e-6: no outlier pales a small flow."""
     length = np.hypot(flow[..., 0].astype(np.float64), flow[..., 1].astype(np.float64))
     finite = length[np.isfinite(length)]
     high = float(np.percentile(finite, 99)) if finite.size else 0.0
@@ -64,7 +55,3 @@ def robust_scale(flow: FlowArray) -> float:
         return 1e-6
     unit = 10.0 ** (np.floor(np.log10(high)) - 1)
     return float(f"{np.ceil(round(high / unit, 6)) * unit:.3g}")
-
-
-def _with_gaps(colour: Rgb, known: BoolArray) -> Rgb:
-    return np.where(known[..., None], colour, np.array(NO_GEL, np.uint8))

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from synth.arrays import BoolArray, FloatArray, Points, Tets, Triangles
 from synth.errors import InputError
 from synth.scene.gel import dome_height
-from synth.surface import ContactFaces
 
 _FACES_OF_TET = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])  # normals point out of a positive tetrahedron
 
@@ -73,26 +72,10 @@ class PadMesh:
     @cached_property
     def spacing_mm(self) -> float:
         """Length of the contact face's short edges, their 10 % quantile: what the finest part resolves."""
-        faces = self._contact_triangles
+        faces = self._boundary
+        faces = faces[self.on_face[faces].all(axis=1)]
         edges = self.points[faces] - self.points[np.roll(faces, 1, axis=1)]
         return float(np.quantile(np.linalg.norm(edges, axis=2), 0.1))
-
-    @cached_property
-    def contact_nodes(self) -> np.ndarray:
-        """(s,) int: nodes of the contact face in the order of `contact_faces.nodes`."""
-        return np.unique(self._contact_triangles)
-
-    @cached_property
-    def contact_faces(self) -> ContactFaces:
-        """The faces of the contact surface, numbered within `contact_nodes`."""
-        nodes = self.contact_nodes
-        faces = np.searchsorted(nodes, self._contact_triangles).astype(np.int32)
-        return ContactFaces(self.points[nodes], faces)
-
-    @cached_property
-    def _contact_triangles(self) -> Triangles:
-        faces = self._boundary
-        return faces[self.on_face[faces].all(axis=1)]
 
     @cached_property
     def _boundary(self) -> Triangles:

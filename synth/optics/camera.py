@@ -63,11 +63,7 @@ class Optics:
 
     @staticmethod
     def of(sensor: Sensor) -> "Optics":
-        """The optics of a sensor's main camera; `Sensor.views` gives the others.
-
-        Raises:
-            InputError: the view is along x.
-        """
+        """The optics of a sensor's main camera (`Sensor.views` gives the others); InputError for a view along x."""
         camera = sensor.camera
         return Optics(
             pose=Pose.of(camera),
@@ -126,11 +122,6 @@ class Optics:
             onward = air[at] if number == DIRECT else self.mirrors[number - 1].turned(air[at])
             origins[at], directions[at] = self.window.enter(pose.position, onward)
         return Rays(origins, directions, np.where(np.isnan(directions[:, 0]), NOTHING, path))
-
-    def rays(self, pixels: Pixels) -> tuple[Points, Points]:
-        """Origins (n, 3) and directions (n, 3) of `look`."""
-        seen = self.look(pixels)
-        return seen.origins, seen.directions
 
     def depth(self, points: Points, path: Paths | int = DIRECT) -> FloatArray:
         """Distance (n,) mm of points (n, 3) mm along the viewing axis, folded at the path's mirror.

@@ -30,11 +30,7 @@ class Pose:
 
     @staticmethod
     def of(camera: Camera) -> "Pose":
-        """The place of a camera.
-
-        Raises:
-            InputError: the view is along x.
-        """
+        """The place of a camera; InputError for a view along x."""
         position = np.array(camera.position_mm, dtype=np.float64)
         forward = np.array(camera.look_at_mm, dtype=np.float64) - position
         length = float(np.linalg.norm(forward))

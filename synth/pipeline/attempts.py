@@ -13,13 +13,10 @@ from synth.simulate.space import Space
 
 @dataclass(frozen=True, eq=False)
 class Attempt:
-    """One instance, to be simulated.
+    """One instance, to be simulated: its press, and the samples (`pairs`) that are wanted of it.
 
-    Attributes:
-        press: scene, mesh, body and load path.
-        pairs: the samples that are wanted.
-        frames: numbers of the states that any sample of the trajectory shows, wanted or not: a state's bits must not
-            depend on which samples are still to be made.
+    `frames` are the states that any sample of the trajectory shows, wanted or not: a state's bits must not depend on
+    which samples are still to be made.
     """
 
     press: Press

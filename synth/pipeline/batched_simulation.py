@@ -63,10 +63,7 @@ def pad_key(press: Press) -> Gel:
 def in_batches(context: JobContext, tasks: Iterator[Task], batch: int | None = None) -> Iterator[Result]:
     """Simulate tasks; each comes out once, in no particular order but with a sensor's trajectories together.
 
-    Args:
-        context: of the job.
-        tasks: to do, in the order of their trajectories.
-        batch: most trajectories at a time; changes no bit of what comes out.
+    At most `batch` trajectories run at a time, which changes no bit of what comes out.
 
     Raises:
         InputError: the storage refuses, or CUDA without cuBLAS or cuSOLVER.
@@ -127,10 +124,7 @@ class _Simulation:
 def by_sensor(template: Template, ended: Iterable[tuple[int, Result]], open: Counter[int]) -> Iterator[Result]:
     """Results of one sensor together: at once after one of the same, else when enough or all of them are there.
 
-    Args:
-        template: the scene.
-        ended: trajectories and their results as they end.
-        open: how many of each sensor are still to come; is counted down.
+    `open` says how many of each sensor are still to come; it is counted down.
     """
     waiting: dict[int, list[Result]] = {}
     present: int | None = None

@@ -29,11 +29,7 @@ from synth.simulate.shared import accuracy
 
 
 def finish(context: JobContext, rendered: RenderedTrajectory) -> Outcome:
-    """Write a trajectory's samples.
-
-    Raises:
-        InputError: the storage refuses.
-    """
+    """Write a trajectory's samples; InputError where the storage refuses."""
     simulated = rendered.simulated
     diagnostics = _diagnostics(context, simulated)
     views = {

@@ -119,11 +119,7 @@ Progress = Callable[[int, int], None]
 
 
 def make_job(plan: Plan, n: int, seed: int) -> Job:
-    """The record of what is asked for.
-
-    Raises:
-        InputError: n < 1 or a negative seed.
-    """
+    """The record of what is asked for; InputError for n < 1 or a negative seed."""
     if n < 1:
         raise InputError(f"--n = {n}: ask for at least 1 sample")
     if seed < 0:

@@ -33,13 +33,10 @@ Rendered = RenderedTrajectory | Outcome
 def outcomes_of_batches(
     context: JobContext, tasks: Iterator[Task], workers: int, batch: int | None
 ) -> Generator[Outcome, None, None]:
-    """Outcomes in the order in which they are ready.
+    """Outcomes in the order in which they are ready; tasks are taken in the solver's thread.
 
-    Args:
-        context: of the job.
-        tasks: to do; they are taken in the solver's thread.
-        workers: processes for flow, noise and files; 1: this one does everything, one thing after another.
-        batch: most trajectories simulated at a time; None for what suits the device.
+    Flow, noise and files are made by so many worker processes; with 1 this process does everything, one thing after
+    another. At most `batch` trajectories are simulated at a time; None for what suits the device.
 
     Raises:
         InputError: the storage refuses, CUDA without cuBLAS or cuSOLVER, or worker processes die again and again.

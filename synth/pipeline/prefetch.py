@@ -16,14 +16,9 @@ JOIN_S = 10.0
 
 @contextmanager
 def prefetched(items: Iterable[Item], limit: int) -> Iterator[Iterator[Item]]:
-    """Take items from an iterator that runs in another thread; what it raises is raised here.
+    """Take items, in their order, from an iterator that runs in another thread; what it raises is raised here.
 
-    Args:
-        items: are made in the other thread.
-        limit: that wait to be taken; when there are so many, the other thread waits.
-
-    Yields:
-        The items in their order. On leaving, the thread is told to stop after the item that it is making.
+    When `limit` items wait to be taken, the other thread waits. On leaving, it is told to stop after its present item.
     """
     queue: Queue[tuple[Item] | BaseException | None] = Queue(limit)
     cancelled = threading.Event()

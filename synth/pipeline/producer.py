@@ -22,11 +22,7 @@ class Producer:
         self._pads = Pads(context)
 
     def produce(self, trajectory: int, wanted: Sequence[int]) -> Outcome:
-        """Write the wanted samples of a trajectory.
-
-        Args:
-            trajectory: its number.
-            wanted: indices of the samples that are not there yet.
+        """Write the samples of a trajectory that are wanted, since they are not there yet.
 
         Raises:
             InputError: the storage refuses, or the batched solver lacks something.

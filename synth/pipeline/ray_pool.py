@@ -38,11 +38,8 @@ def outcomes_of_ray(
 ) -> Generator[Outcome, None, None]:
     """Outcomes in the order in which they are ready; at most two tasks per processor core are waiting at any time.
 
-    Args:
-        context: of the job.
-        tasks: to do.
-        address: of the cluster, as `ray.init` takes it, or "local".
-        workers: tasks at once; default as many as the cluster has cores.
+    The address is as `ray.init` takes it, or "local"; `workers` limits the tasks at once, by default to the cluster's
+    cores.
 
     Raises:
         InputError: Ray is not installed, there is no such cluster, it has no GPU where one is needed, the storage

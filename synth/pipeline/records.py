@@ -23,14 +23,7 @@ Task = tuple[int, tuple[int, ...]]
 
 @dataclass(frozen=True)
 class JobContext:
-    """What every task of a job shares; picklable.
-
-    Attributes:
-        plan: of the scene.
-        job: what the dataset was asked for.
-        out: of the dataset.
-        cache: where meshes are kept beside the dataset.
-    """
+    """What every task of a job shares; picklable. `cache` is where meshes are kept beside the dataset."""
 
     plan: Plan
     job: Job

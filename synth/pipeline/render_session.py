@@ -36,11 +36,7 @@ class Frame:
 class RenderedTrajectory:
     """A trajectory whose frames are rendered; picklable.
 
-    Attributes:
-        simulated: the trajectory.
-        surface: what was rendered.
-        frames: by number, all that the wanted samples show.
-        seconds: of rendering.
+    `frames` are all that the wanted samples show, by number; `seconds` are those of rendering.
     """
 
     simulated: SimulatedTrajectory
@@ -51,12 +47,9 @@ class RenderedTrajectory:
 
 @dataclass(frozen=True, eq=False)
 class SensorRenderer:
-    """What all trajectories of one sensor share.
+    """What all trajectories of one sensor share: its number, the renderer of its cameras, and the gel at rest.
 
-    Attributes:
-        sensor: its number.
-        renderer: of all its cameras.
-        rest: radiance of the undeformed gel, by camera; None for a dome, whose triangles are each trajectory's.
+    `rest` is the undeformed gel's radiance by camera; None for a dome, whose triangles are each trajectory's.
     """
 
     sensor: int
@@ -77,10 +70,7 @@ class RenderSession:
     ) -> RenderedTrajectory:
         """Render the frames of a trajectory that its wanted samples show.
 
-        Args:
-            simulated: the trajectory.
-            space: of its states.
-            texture: its sensor's, where it is being painted already.
+        The texture is that of its sensor, where it is being painted already.
         """
         started = time.perf_counter()
         surface = self._surface_of(space, simulated.scene.sensor.gel)

@@ -14,13 +14,7 @@ TEXTURES = 8
 
 
 class Textures:
-    """Textures of a job's sensors.
-
-    Args:
-        context: of the job.
-        threads: that paint.
-        room: textures at a time.
-    """
+    """Textures of a job's sensors, painted by the given threads; so many at a time are painted or wait to be used."""
 
     def __init__(self, context: JobContext, threads: ThreadPoolExecutor, room: int = TEXTURES) -> None:
         self._context, self._threads, self._room = context, threads, room

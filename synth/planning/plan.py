@@ -40,11 +40,7 @@ class Plan:
         return "cuda" if self.variant.is_on_gpu else "cpu"
 
     def press(self, scene: Scene, mesh_folders: Sequence[Path] | None) -> Press:
-        """What is simulated of one random instance of the scene.
-
-        Args:
-            scene: fully drawn.
-            mesh_folders: where fTetWild's meshes are kept.
+        """What is simulated of one random instance of the scene; fTetWild's meshes are kept in `mesh_folders`.
 
         Raises:
             InputError: the indenter or the mesh cannot be built.
@@ -57,14 +53,11 @@ class Plan:
 
 
 def plan(scene: Template, variant: Variant | None = None) -> Plan:
-    """Decide what runs.
+    """Decide what runs, with reasons.
 
     Args:
         scene: of `load_scene`.
         variant: the renderer; by default the fastest here that the scene needs.
-
-    Returns:
-        The decisions with their reasons.
 
     Raises:
         InputError: what the scene asks for cannot be built, see `check_buildable`.
@@ -83,11 +76,7 @@ def plan(scene: Template, variant: Variant | None = None) -> Plan:
 
 
 def job_variant(template: Template, device: Device) -> Variant:
-    """What renders a job: one channel where every draw of it is grey.
-
-    Raises:
-        InputError: the device is not there.
-    """
+    """What renders a job: one channel where every draw of it is grey; InputError where the device is not there."""
     # Corners that are grey say nothing of the draws between them where a single channel is drawn.
     drawn = any(re.search(r"\.(color|reflectance)\[\d\]$|\.saturation$", at) for _, _, at in template.distributions())
     return choose_variant(device, grey=not drawn and all(is_grey(scene.sensor) for scene in template.corners))

@@ -75,11 +75,7 @@ class Prediction:
 
 
 def predict(plan: Plan) -> Prediction:
-    """Choose the meshes of the first trajectories, as `generate` will, and predict from them.
-
-    Raises:
-        InputError: no trajectory can be drawn and meshed.
-    """
+    """Choose the meshes of the first trajectories as `generate` will; InputError if none can be drawn and meshed."""
     template, variant, pairs = plan.template, plan.variant, plan.template.sampling.pairs_per_trajectory
     corner = template.corners[0]
     cameras = [view.camera for view in corner.sensor.views.values()]

@@ -18,11 +18,7 @@ from synth.scene import Bitmap
 
 
 def read_picture(pattern: Bitmap, folder: Path) -> Image:
-    """The picture in linear light.
-
-    Args:
-        pattern: names the file.
-        folder: that its name is relative to.
+    """The picture in linear light, from its file in a folder.
 
     Returns:
         (h, w, 4) float32 in [0, 1]: red, green, blue, each multiplied by the opacity, and the opacity.
@@ -53,13 +49,7 @@ def read_picture(pattern: Bitmap, folder: Path) -> Image:
 
 
 def laid_over(pattern: Bitmap, picture: Image, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """What the picture puts on the face.
-
-    Args:
-        pattern: where it lies.
-        picture: from `read_picture`.
-        x: (columns,) texel centres, mm; even.
-        y: (rows,) likewise.
+    """What a picture puts on the face, at texel centres x (columns,) and y (rows,) mm, both even.
 
     Returns:
         Colours (rows, columns, 3), linear, and the share of each texel that is painted (rows, columns). Where nothing

@@ -17,11 +17,7 @@ from synth.scene import Light, Sensor
 
 
 def emitters(sensor: Sensor, mi: Any) -> dict[str, Any]:
-    """Mitsuba's description of all lights that shine, in the renderer's frame.
-
-    Raises:
-        InputError: a light aims at itself or stands in the camera's view.
-    """
+    """Mitsuba's description of all lights that shine, in the renderer's frame, once they pass `check_view`."""
     check_view(sensor)
     shapes = {}
     for i, light in enumerate(sensor.lights):
@@ -60,11 +56,7 @@ def light_axes(light: Light) -> FloatArray:
 
 
 def check_view(sensor: Sensor) -> None:
-    """Refuse lights that the camera would see: they would hide gel that the flow says is visible.
-
-    Raises:
-        InputError: names the light and the pixel.
-    """
+    """Refuse lights that the camera would see: they would hide gel that the flow says is visible."""
     optics, camera = Optics.of(sensor), sensor.camera
     across = np.linspace(-0.5, 0.5, 33)
     u, v = (axis.ravel() for axis in np.meshgrid(across, across))

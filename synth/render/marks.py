@@ -54,16 +54,7 @@ def speckle_coverage(pattern: Speckle, x: FloatArray, y: FloatArray, rng: np.ran
 
     By Rice's formula a line crosses the level u (in standard deviations) exp(-u²/2) / (pi sqrt(2) sigma) times per
     length, sigma being the filter's. With sigma = grain_mm / 4 and u = 0 its mean chord through a grain is
-    pi sqrt(2) sigma = 1.11 grain_mm.
-
-    Args:
-        pattern: size and share of the grains.
-        x: (columns,) texel centres, mm; even.
-        y: (rows,) likewise.
-        rng: draws the noise.
-
-    Returns:
-        (rows, columns) in [0, 1].
+    pi sqrt(2) sigma = 1.11 grain_mm. Arguments and result as of `dots_coverage`.
     """
     from scipy.ndimage import gaussian_filter
 

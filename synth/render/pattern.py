@@ -87,11 +87,7 @@ def _blended(coating: FloatArray, colors: FloatArray, coverage: FloatArray) -> I
 
 
 def check_pattern(sensor: Sensor, folder: Path) -> None:
-    """Find out whether `albedo` could paint a sensor's pattern, without painting it.
-
-    Raises:
-        InputError: as `albedo`.
-    """
+    """Find out whether `albedo` could paint a sensor's pattern, without painting it; InputError where it could not."""
     if isinstance(sensor.pattern, Bitmap):
         read_picture(sensor.pattern, folder)
     if not isinstance(sensor.pattern, NoPattern):

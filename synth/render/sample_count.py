@@ -25,14 +25,7 @@ _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(15)
 
 
 def needed_samples(first: Image, second: Image, camera: Camera, samples: int) -> int:
-    """Samples per pixel after two pilots.
-
-    Args:
-        first: (H, W, 3) radiance of one pilot.
-        second: of the other, with another seed.
-        camera: that takes the pictures.
-        samples: per pixel of each pilot.
-    """
+    """Samples per pixel for a camera, from radiances (H, W, 3) of two pilots of `samples` each with different seeds."""
     noise, own = render_noise(first, second, camera), camera_noise(first, camera)
     wanted = samples * (noise / (SHARE * own)) ** 2 if own > 0 else float(MOST)
     return int(np.clip(math.ceil(wanted), samples, MOST))

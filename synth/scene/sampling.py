@@ -116,11 +116,7 @@ def pairs_of(template: Template, seed: int, trajectory: int, steps: int) -> list
 
 
 def check_pairs(scene: Scene) -> None:
-    """Sees that a trajectory has as many different pairs as it is to give.
-
-    Raises:
-        InputError: it has fewer.
-    """
+    """Refuse a trajectory that has fewer different pairs than it is to give."""
     asked, steps = scene.sampling.pairs_per_trajectory, scene.motion.steps
     most = steps * (steps + 1) // 2
     if asked > most:

@@ -142,16 +142,7 @@ def load_scene(name_or_path: str | Path, set: Sequence[str] = ()) -> Template:
 
 
 def checked_template(content: dict[str, Any], source: Path, changed: tuple[str, ...] = ()) -> Template:
-    """A template whose distributions, corners and mesh files have been checked.
-
-    Args:
-        content: JSON-able.
-        source: see `Template`.
-        changed: see `Template`.
-
-    Raises:
-        InputError: what is wrong, where.
-    """
+    """A template whose distributions, corners and mesh files have been checked; InputError says what is wrong."""
     template = Template(content, source, changed)
     for kind, arguments, where in template.distributions():
         problem = _distribution_problem(kind, arguments, where)

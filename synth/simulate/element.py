@@ -97,13 +97,6 @@ def p1(contact_split: int = CONTACT_SPLIT) -> Element:
     )  # fmt: skip
 
 
-def quadratic_shape(barycentric: FloatArray) -> FloatArray:
-    """(n, 10) quadratic shape functions at barycentric coordinates (n, 4)."""
-    corners = barycentric * (2 * barycentric - 1)
-    edges = [4 * barycentric[:, i] * barycentric[:, j] for i, j in EDGES]
-    return np.column_stack([corners, *edges])
-
-
 def _quadratic_derivative(barycentric: FloatArray) -> FloatArray:
     derivative = np.zeros((len(barycentric), 10, 4))
     for i in range(4):

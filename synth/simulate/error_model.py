@@ -39,12 +39,9 @@ CERTAINTY = 1.1
 
 
 def face_error(scene: Scene, focus: Focus, spacing_mm: float) -> float:
-    """E of the error model, mm²; 0 for an indenter that does not touch.
+    """E of the error model, mm², of a draw that touches at a focus; 0 for an indenter that does not touch.
 
-    Args:
-        scene: a draw.
-        focus: where it touches.
-        spacing_mm: size of the elements under the contact, as `synth.simulate.resolution` has it.
+    `spacing_mm` is the size of the elements under the contact, as `synth.simulate.resolution` has it.
     """
     motion, indenter = scene.motion, scene.contact.indenter
     poses = [(motion.depth_mm, motion.shear_mm, motion.twist_deg)]

@@ -16,13 +16,7 @@ def write_trajectory(directory: Path, scene: Scene, trajectory: Trajectory) -> d
     """Write DIR/trajectory.json and DIR/state_000.vtu and so on, in the place of an earlier trajectory's.
 
     The VTU files hold the deformed contact surface with the fields displacement (mm) and traction (MPa), and the mesh's
-    hash as the field datum "mesh".
-
-    Returns:
-        The JSON's content.
-
-    Raises:
-        InputError: the storage refuses.
+    hash as the field datum "mesh". Returns the JSON's content.
     """
     record = {
         "scene": scene.model_dump(mode="json"),

@@ -159,12 +159,9 @@ class LoadPath:
 
 
 def path_of(scene: Scene, folder: Path | None = None, resolution_mm: float = 0.0) -> LoadPath:
-    """The load path of a scene's indenter.
+    """The load path of a fully drawn scene's indenter, whose mesh file is relative to `folder`.
 
-    Args:
-        scene: fully drawn.
-        folder: what a mesh indenter's file name is relative to.
-        resolution_mm: smallest radius that the gel's mesh resolves, see `rigid_body`.
+    `resolution_mm` is the smallest radius that the gel's mesh resolves, see `rigid_body`.
 
     Raises:
         InputError: the indenter cannot be built.

@@ -38,15 +38,10 @@ class MeshRule:
     def resolution(
         self, scene: Scene, folder: Path | None = None, mesh_folders: Sequence[Path] | None = None
     ) -> Resolution:
-        """The mesh of a scene, and what it is predicted to give.
-
-        Args:
-            scene: fully drawn.
-            folder: what a mesh indenter's file name is relative to.
-            mesh_folders: where fTetWild's meshes are kept.
+        """The mesh of a fully drawn scene, and what it is predicted to give; fTetWild's are kept in `mesh_folders`.
 
         Raises:
-            InputError: the indenter or the mesh cannot be built.
+            InputError: the indenter, whose mesh file is relative to `folder`, or the mesh cannot be built.
         """
         gel, numerics = scene.sensor.gel, scene.numerics
         match self.kind:
@@ -61,7 +56,7 @@ class MeshRule:
                 return Resolution(mesh, 0, 0, numerics.edge_length_mm or 0.0, float("nan"))
 
     def press(self, scene: Scene, folder: Path | None = None, mesh_folders: Sequence[Path] | None = None) -> Press:
-        """Mesh, body and load path of a scene; arguments and errors as of `resolution`.
+        """Mesh, body and load path of a scene; arguments as of `resolution`.
 
         The accuracy of an even mesh is left out: whoever finishes the samples predicts it, beside the simulation.
         """

@@ -35,14 +35,7 @@ SUFFICIENT_DECREASE = 1e-4
 
 @dataclass(frozen=True)
 class Solution:
-    """Outcome of a solve.
-
-    Attributes:
-        state: the last iterate (meaningless where not converged).
-        residual: of that state.
-        converged: whether the tolerance was met.
-        iterations: that were taken.
-    """
+    """Outcome of a solve; `state` is the last iterate, which means nothing where it has not converged."""
 
     state: Unknowns
     residual: Residual

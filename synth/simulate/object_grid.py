@@ -80,8 +80,7 @@ class Grid:
     def missing(self, values: FloatArray) -> float:
         """The share of the boundary of what is inside that is far from the surface: where holes were closed.
 
-        Args:
-            values: samples of the signed distance. Across a surface two neighbours are at most a spacing apart.
+        Across a surface two neighbouring samples of the signed distance are at most a spacing apart.
         """
         crossings = holes = 0
         for axis, count in enumerate(self.counts):
@@ -92,13 +91,7 @@ class Grid:
         return holes / max(crossings, 1)
 
     def rounded(self, values: FloatArray, surface: Triangles, radius_mm: float) -> FloatArray:
-        """A solid's signed distance after its edges and notches are rounded; see the module's docstring.
-
-        Args:
-            values: samples of the solid's signed distance.
-            surface: of the solid.
-            radius_mm: of the edges.
-        """
+        """The signed distance of a solid after its edges and notches are rounded; see the module's docstring."""
         band = np.abs(values) < BAND * radius_mm + 2 * self.spacing
         cores, opened = self._opened(values, Nearest(surface), radius_mm, band)
 

@@ -33,14 +33,10 @@ class Triangles:
 
 
 def object_triangles(indenter: MeshIndenter, folder: Path) -> Triangles:
-    """An object's surface in mm, not turned, its bounding box centred on the origin.
+    """An object's surface in mm, not turned, its bounding box centred on the origin; its file is relative to `folder`.
 
     Files have right-handed axes; the scene's are left-handed, because y points down in the image. So y changes its
     sign: a letter can be read in the picture, a screw keeps its hand.
-
-    Args:
-        indenter: from the scene.
-        folder: what its file name is relative to.
 
     Raises:
         InputError: a file that is missing or no surface, or of a size that speaks for another unit.

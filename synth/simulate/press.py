@@ -32,17 +32,7 @@ class Press:
 
     @classmethod
     def of(cls, scene: Scene, mesh: PadMesh, folder: Path | None = None, accuracy: Accuracy | None = None) -> "Press":
-        """Build the body and its path for a mesh.
-
-        Args:
-            scene: fully drawn.
-            mesh: of its gel.
-            folder: what a mesh indenter's file name is relative to.
-            accuracy: of the mesh, where it is known.
-
-        Raises:
-            InputError: the indenter cannot be built.
-        """
+        """Build the body and its path for a mesh of the scene's gel; InputError where the indenter cannot be built."""
         return cls(scene, mesh, path_of(scene, folder, resolution_mm(scene, mesh)), accuracy)
 
 

@@ -16,11 +16,7 @@ OUTSIDE = 1e-6
 
 
 def probe(space: Space, points: FloatArray) -> Any:
-    """The sparse (k, n) matrix that takes nodal values of a space to their values at points of the contact face.
-
-    Args:
-        space: where the field lives.
-        points: (k, 2) x and y, mm, on the pad.
+    """The sparse (k, n) matrix from nodal values of a space to values at points (k, 2) mm of the contact face.
 
     Raises:
         InputError: a point beside the pad.

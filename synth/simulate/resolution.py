@@ -67,10 +67,7 @@ class Fineness(NamedTuple):
 def mesh_levels(gel: Gel, focus: Focus, across: Sequence[int] = ELEMENTS_ACROSS) -> list[Fineness]:
     """Meshes worth having for a zone, cheapest first; each is finer than all that cost less.
 
-    Args:
-        gel: the pad.
-        focus: the zone.
-        across: elements across it to choose from.
+    `across` are the numbers of elements across the zone to choose from.
     """
     size = gel.size_mm
     found = []
@@ -97,11 +94,8 @@ def mesh_levels(gel: Gel, focus: Focus, across: Sequence[int] = ELEMENTS_ACROSS)
 def graded_mesh(gel: Gel, focus: Focus, across: int, through: int | None = None) -> tuple[PadMesh, float]:
     """The structured mesh of a pad with so many elements across a zone, and their size (see `_spacing`).
 
-    Args:
-        gel: the pad.
-        focus: the zone.
-        across: elements across it, even.
-        through: elements through the thickness; None for as many as keep those under the zone no higher than wide.
+    `across` is even; without `through`, as many elements go through the thickness as keep those under the zone no
+    higher than wide.
     """
     size = gel.size_mm
     wide = lateral_spacing(gel, focus, Counts((across, across), OUTER))
@@ -156,13 +150,8 @@ def predicted_error_px(scene: Scene, focus: Focus, spacing_mm: float) -> float:
 
     .. math::  e = M E \sqrt{f / A}
 
-    with E the error of the face (`face_error`), M the magnification, A the seen area, and f the share of the zone that
-    is seen, which is that of E² that counts.
-
-    Args:
-        scene: a draw.
-        focus: where it touches.
-        spacing_mm: size of the elements under the contact.
+    with E the error of the face (`face_error`, also for the arguments), M the magnification, A the seen area, and f the
+    share of the zone that is seen, which is that of E² that counts.
     """
     size = scene.sensor.gel.size_mm[:2]
     face = _seen(scene, Focus((0.0, 0.0), (size[0] / 2, size[1] / 2)), _FACE) or 1.0  # where none is, all
@@ -192,15 +181,10 @@ def scale_px_per_mm(scene: Scene) -> float:
 
 
 def resolve(scene: Scene, folder: Path | None, target_error_px: float) -> Resolution:
-    """The cheapest graded mesh of a draw whose predicted error is within a target, else the finest.
-
-    Args:
-        scene: fully drawn.
-        folder: what a mesh indenter's file name is relative to.
-        target_error_px: root-mean-square error of the flow over the contact face.
+    """The cheapest graded mesh of a draw whose predicted error of the flow is within a target, else the finest.
 
     Raises:
-        InputError: the indenter or the mesh cannot be built.
+        InputError: the indenter, whose mesh file is relative to `folder`, or the mesh cannot be built.
     """
     gel = scene.sensor.gel
     focus = footprint(path_of(scene, folder), gel.size_mm, MARGIN)

@@ -80,15 +80,7 @@ def spacing_mm(gel: Gel, numerics: Numerics) -> float:
 
 
 def accuracy(scene: Scene, folder: Path | None = None) -> Accuracy:
-    """What the shared mesh gives for one draw.
-
-    Args:
-        scene: fully drawn.
-        folder: what a mesh indenter's file name is relative to.
-
-    Raises:
-        InputError: the indenter cannot be built.
-    """
+    """What the shared mesh gives for one draw; InputError where the indenter cannot be built."""
     gel, numerics = scene.sensor.gel, scene.numerics
     focus = footprint(path_of(scene, folder), gel.size_mm, MARGIN)
     error = predicted_error_px(scene, focus, spacing_mm(gel, numerics))

@@ -70,11 +70,7 @@ def stepper_of(press: Press, frames: frozenset[int] | None = None, options: Solv
 
 
 def check_shared(scenes: Sequence[Scene], mesh: PadMesh) -> None:
-    """Refuse scenes that are not of the mesh's pad, or differ in what a batch has in common.
-
-    Raises:
-        InputError: a scene's pad is not the mesh's, or its materials or numerics are not the first scene's.
-    """
+    """Refuse scenes that are not of the mesh's pad, or differ from the first in materials or numerics."""
     first = scenes[0]
     for scene in scenes:
         _check_pad(scene.sensor.gel, mesh)

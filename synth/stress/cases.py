@@ -95,14 +95,7 @@ class Expectations(Part):
 
 @dataclass(frozen=True)
 class Run:
-    """A case with one element: what one process does.
-
-    Attributes:
-        case: the entry.
-        element: numerics.element.
-        budget_s: wall time after which the process is killed.
-        base: the scene file that the case changes.
-    """
+    """A case with one element, as one process runs it on the base scene, for at most `budget_s` of wall time."""
 
     case: Case
     element: str
@@ -121,11 +114,7 @@ class Run:
 
 
 def load_expectations(path: Path) -> Expectations:
-    """Read the file.
-
-    Raises:
-        InputError: it is missing, not TOML, or breaks the schema above.
-    """
+    """Read the file; InputError where it is missing, not TOML, or breaks the schema above."""
     try:
         content: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
         return Expectations.model_validate(content)

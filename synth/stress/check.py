@@ -75,12 +75,7 @@ class Verdict:
 
 
 def evaluate(result: Result, others: Mapping[str, Result]) -> Verdict:
-    """Check a result.
-
-    Args:
-        result: the run's.
-        others: results of the runs with the same element by their case's name, for comparisons.
-    """
+    """Check a result; `others` are those with the same element by their case's name, for comparisons."""
     quantities = measured(result)
     always = faults(result)
     if always:

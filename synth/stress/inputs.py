@@ -24,7 +24,7 @@ ROUNDING = 1e-12
 def altered_mesh(mesh: PadMesh, variant: MeshVariant) -> PadMesh:
     """A pad's mesh with one thing wrong; may refuse (InputError) as any maker of a mesh may."""
     points, tets, size = mesh.points.copy(), mesh.tets.copy(), mesh.size_mm
-    largest = _largest(points, tets)
+    largest = int(np.argmax(signed_volumes(points, tets)))
     match variant:
         case "sliver":
             points = _flattened(points, tets, SLIVER)
@@ -42,10 +42,6 @@ def altered_mesh(mesh: PadMesh, variant: MeshVariant) -> PadMesh:
             size = (size[0] + 1.0, size[1], size[2])
             points[:, 0] *= size[0] / mesh.size_mm[0]
     return PadMesh(points, tets, size)
-
-
-def _largest(points: Points, tets: Tets) -> int:
-    return int(np.argmax(signed_volumes(points, tets)))
 
 
 def _flattened(points: Points, tets: Tets, share: float) -> Points:

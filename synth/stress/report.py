@@ -89,11 +89,7 @@ def remarks(verdicts: Sequence[Verdict]) -> list[str]:
 
 
 def write_report(out: Path, verdicts: Sequence[Verdict], found: dict[str, Any]) -> None:
-    """Write stress.csv and stress.json, the latter from `record`.
-
-    Raises:
-        InputError: the storage refuses.
-    """
+    """Write stress.csv and stress.json, the latter from `record`; InputError where the storage refuses."""
     text = io.StringIO()
     writer = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()

@@ -23,7 +23,7 @@ WORKER = (sys.executable, "-m", "synth.stress.worker")
 
 
 def run_stress(out: Path, only: Sequence[str] | None, workers: int, as_json: bool, scenes: Path = EXTREME) -> int:
-    """Run the cases and write stress.csv and stress.json.
+    """Run the cases of a folder of base.toml and expected.toml; write stress.csv and stress.json, or print the latter.
 
     Args:
         out: directory for these, for the meshes, and for a folder per run.
@@ -95,13 +95,9 @@ def all_results(runs: Sequence[Run], out: Path, workers: int, report: Report = l
 
 
 def result_of(run: Run, folder: Path, meshes: Path, worker: Sequence[str] = WORKER) -> Result:
-    """Run one case in a process of its own.
+    """Run one case in a process of its own: a command to which folder and the meshes' cache are appended.
 
-    Args:
-        run: what to run.
-        folder: emptied, then holds run.json, log.txt and what the process writes.
-        meshes: where meshes are cached.
-        worker: the command; folder and meshes are appended.
+    The folder is emptied, then holds run.json, log.txt and what the process writes.
     """
     with storage_errors(folder):
         if folder.exists():

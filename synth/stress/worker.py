@@ -39,11 +39,7 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def simulated(run: Run, folder: Path, meshes: Path) -> tuple[Scene, PadMesh, Trajectory]:
-    """Load, mesh and simulate a run's scene, as `synth simulate` does.
-
-    Raises:
-        InputError: one of the stages refuses.
-    """
+    """Load, mesh and simulate a run's scene, as `synth simulate` does; InputError where one of the stages refuses."""
     assignments = run.assignments
     if run.case.surface is not None:
         file = folder.resolve() / "indenter.ply"

@@ -51,13 +51,9 @@ def verify_dataset(
 
 
 def verify_sample(index: int, scene: Scene, sample: SampleData, problems: Sequence[str] = ()) -> SampleReport:
-    """Verifies one sample against its own geometry.
+    """Verifies one sample, made from a drawn scene, against its own geometry.
 
-    Args:
-        index: its number.
-        scene: the draw it was made from.
-        sample: its images, flow, surface and displacements.
-        problems: what is wrong with its files (from `Dataset.check_hashes` and `flow_file_problems`).
+    `problems` are what is wrong with its files (from `Dataset.check_hashes` and `flow_file_problems`).
     """
     checks = [_files(problems)]
     for name, sensor in scene.sensor.views.items():

@@ -32,14 +32,7 @@ LEAST_MM = 1e-6
 
 
 def check_dome(camera: ForwardCamera, surface: GelSurface, radius_mm: float, image: Camera) -> Check:
-    """Compares what pixels see of the undeformed surface with the sphere.
-
-    Args:
-        camera: the view.
-        surface: of a sample; its undeformed state.
-        radius_mm: of the dome.
-        image: the camera's description, for its size.
-    """
+    """Compares what pixels of an image see of a sample's undeformed surface with the sphere."""
     sheet = Sheet(camera, surface.triangles, surface.material, image.width, image.height)
     places = _grid(image.width, image.height)
     seen = sheet.seen(places)

@@ -15,12 +15,7 @@ _NAMED = {"scene.hash": "scene_hash", "seed": "seed", "index": "index"}
 
 
 def flow_file_problems(folder: Path, scene: Scene, meta: Mapping[str, Any]) -> list[str]:
-    """What is wrong with the channels and headers of a sample's flow.exr files, one message each.
-
-    Args:
-        folder: of the sample.
-        scene: the draw that it was made from.
-        meta: its meta.json.
+    """What is wrong with the channels and headers of the flow.exr files in a sample's folder, one message each.
 
     Raises:
         InputError: a file is missing or damaged.

@@ -29,14 +29,12 @@ _STARTS = np.array([(i, j, 3 - i - j) for i in range(4) for j in range(4 - i)]) 
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """One state of the surface as one path shows it.
+    """One state of the surface as one path of the camera shows it, in an image of so many px.
 
     Attributes:
-        camera: the camera.
         path: by which the surface is seen.
         triangles: (f, 3).
         positions: (v, 3) mm.
-        width, height: of the image, px.
     """
 
     camera: ForwardCamera

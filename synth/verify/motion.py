@@ -57,7 +57,7 @@ class Derived:
 
 
 def check_motion(name: str, near: Sheet, far: Sheet, flow: FlowArray, visible: FlowArray) -> list[Check]:
-    """Checks of the recorded motion from the state `near` to the state `far`.
+    """Checks of the recorded motion from the state `near` to the state `far`: flow, missing gel, visibility, closure.
 
     Args:
         name: "forward" or "backward".
@@ -65,9 +65,6 @@ def check_motion(name: str, near: Sheet, far: Sheet, flow: FlowArray, visible: F
         far: the state of the other image.
         flow: (H, W, 2) px as recorded.
         visible: (H, W) as recorded.
-
-    Returns:
-        Checks of the flow, the pixels without gel, the visibility and the closure.
     """
     size = (near.height, near.width)
     if flow.shape != (*size, 2) or visible.shape != size:

@@ -38,13 +38,11 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """One state of the surface before the camera.
+    """One state of the surface before the camera, whose image has so many px.
 
     Attributes:
-        camera: the camera.
         triangles: (f, 3).
         positions: (v, 3) mm.
-        width, height: of the image, px.
     """
 
     camera: ForwardCamera

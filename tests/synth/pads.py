@@ -12,7 +12,7 @@ import numpy as np
 
 from synth.arrays import FloatArray
 from synth.mesh import PadMesh
-from synth.mesh.pad import signed_volumes
+from synth.mesh.pad import boundary_faces, signed_volumes
 from synth.scene import Scene
 from synth.simulate import Trajectory
 from synth.simulate.contact import Indenters
@@ -25,6 +25,7 @@ from synth.simulate.space import function_space
 from synth.simulate.stepping import Stepper
 from synth.simulate.system import System, Tangent
 from synth.simulate.tables import pack_indenter, place_indenter
+from synth.surface import ContactFaces
 
 SIZE = (8.0, 6.0, 4.0)
 SPHERE = {"shape": "sphere", "radius_mm": 3.0}
@@ -34,6 +35,14 @@ DRAG["steps"] = 4
 ELEMENT: dict[str, Callable[[], Element]] = {"p1": p1, "p1p1": p1p1, "p2p1": p2p1}
 MIXED = ["p1p1", "p2p1"]
 """Names of the elements that have a pressure field, to be a test's parameters."""
+
+
+def contact_faces(mesh: PadMesh) -> ContactFaces:
+    """The contact surface of a mesh, its nodes in the mesh's order."""
+    faces = boundary_faces(mesh.tets)
+    faces = faces[mesh.on_face[faces].all(axis=1)]
+    nodes = np.unique(faces)
+    return ContactFaces(mesh.points[nodes], np.searchsorted(nodes, faces).astype(np.int32))
 
 
 def brick(size: tuple[float, float, float] = SIZE, counts: tuple[int, int, int] = (4, 4, 3)) -> PadMesh:

@@ -4,6 +4,7 @@ import hashlib
 
 import numpy as np
 import pytest
+from pads import contact_faces
 
 from synth.arrays import FloatArray
 from synth.mesh import Counts, Focus, PadMesh, graded_box
@@ -53,7 +54,7 @@ def test_neighbours_share_whole_faces() -> None:
     assert not mesh.tets.flags.writeable
     assert len(mesh.points) == (nx + 1) * (ny + 1) * (nz + 1)
     assert len(boundary_faces(mesh.tets)) == 4 * (nx * ny + ny * nz + nx * nz)
-    assert len(mesh.contact_faces.faces) == 2 * nx * ny
+    assert len(contact_faces(mesh).faces) == 2 * nx * ny
 
 
 def test_centred_focus_gives_its_own_mirror_image_and_a_mirrored_one_mirrored_planes() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pads import brick, crooked
+from pads import brick, contact_faces, crooked
 
 import synth.mesh.cache as cache
 from benchmarks.focused_mesh import SLOPE, around_focus
@@ -64,16 +64,16 @@ def test_boundary_is_closed_and_points_outward(pad: PadMesh) -> None:
 
 
 def test_contact_faces_and_bonded_nodes_are_those_of_gel_and_window(pad: PadMesh) -> None:
-    contact = pad.contact_faces
+    contact = contact_faces(pad)
     area = double_area(contact.nodes, contact.faces) / 2
-    assert (pad.contact_nodes == np.flatnonzero(pad.points[:, 2] == 0)).all()
-    assert (contact.nodes == pad.points[pad.contact_nodes]).all()
+    assert (pad.on_face == (pad.points[:, 2] == 0)).all()
+    assert (contact.nodes == pad.points[pad.on_face]).all()
     assert (area[:, :2] == 0).all()
     assert (area[:, 2] < 0).all()
     assert -area[:, 2].sum() == pytest.approx(SIZE[0] * SIZE[1], rel=1e-12)
     assert (np.unique(contact.faces) == np.arange(len(contact.nodes))).all()
     assert (pad.bonded == (pad.points[:, 2] == SIZE[2])).all()
-    assert 4 <= pad.bonded.sum() < len(pad.contact_nodes)  # coarser there than at the contact face
+    assert 4 <= pad.bonded.sum() < len(contact.nodes)  # coarser there than at the contact face
 
 
 def test_edge_lengths_are_graded(pad: PadMesh) -> None:
@@ -281,7 +281,7 @@ def test_mesh_is_as_good_as_any_and_its_edges_are_small_in_the_focus_only() -> N
     assert shape_quality(pad.points, pad.tets).min() >= WORST_SHAPE
     corners = pad.points[boundary_faces(pad.tets)]
     assert ((corners == LOW).all(axis=1) | (corners == HIGH).all(axis=1)).any(axis=1).all()
-    contact = pad.contact_faces
+    contact = contact_faces(pad)
     corners = contact.nodes[contact.faces]
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean(axis=1)
     away = distance_from_zone(corners.mean(axis=1))

@@ -29,7 +29,8 @@ LENSES = {
 @pytest.mark.parametrize("lens", LENSES.values(), ids=LENSES)
 def test_project_inverts_rays(index, view, lens):
     camera = optics(index=index, **view, **lens)
-    origins, directions = camera.rays(PIXELS)
+    seen = camera.look(PIXELS)
+    origins, directions = seen.origins, seen.directions
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-14)
     start = 0.0 if index > 1 else 14.0  # from the camera's position, stay inside the sensor
     for distance in (start, start + 2.5, start + 8.0):
@@ -78,7 +79,8 @@ def test_grazing_and_axial_points():
     pixels = camera.project(points)
     np.testing.assert_allclose(pixels[0], (31.7, 24.4), atol=1e-12)
     np.testing.assert_allclose(pixels[1, 0] - 31.7, 70e-9 / (15 + 9 / 1.5), rtol=1e-4)  # paraxial; 31.7 has 1e-14 left
-    origins, directions = camera.rays(pixels[2:])
+    seen = camera.look(pixels[2:])
+    origins, directions = seen.origins, seen.directions
     reach = (points[2:, 2] - origins[:, 2]) / directions[:, 2]
     lateral = (origins + reach[:, None] * directions)[:, :2]
     np.testing.assert_allclose(lateral, points[2:, :2], rtol=1e-9)
@@ -90,11 +92,11 @@ def test_nan_where_no_image_or_ray_exists():
     assert np.isnan(camera.project(np.array([above_the_window, beyond_the_lens_models_field]))).all()
     assert np.isnan(optics().project(np.array([[0.0, 0.0, 30.0]]))).all()  # behind the camera
     reach = 31.7 + 70 * np.array([0.70, 0.71])
-    origins, directions = camera.rays(np.column_stack([reach, [24.4, 24.4]]))
-    assert np.isfinite(origins[0]).all()
-    assert np.isnan([origins[1], directions[1]]).all()
+    seen = camera.look(np.column_stack([reach, [24.4, 24.4]]))
+    assert np.isfinite(seen.origins[0]).all()
+    assert np.isnan([seen.origins[1], seen.directions[1]]).all()
     level = optics(position_mm=(0, 0, 10), look_at_mm=(0.0, 30.0, 9.0))  # toward +y, so the image's down is +z
-    _, directions = level.rays(np.array([[31.7, 24.4], [31.7, 224.0]]))
+    directions = level.look(np.array([[31.7, 24.4], [31.7, 224.0]])).directions
     np.testing.assert_array_equal(np.isnan(directions).all(1), [False, True])
     with pytest.raises(InputError, match="looks along x"):
         Optics.of(sensor(position_mm=(0.0, 0.0, 10.0), look_at_mm=(1e8, 0.0, 9.0)))

@@ -5,13 +5,13 @@ Each comment "fails with" names a change of `synth.surface` that was tried.
 
 import numpy as np
 import pytest
-from pads import SIZE, brick, crooked
+from pads import SIZE, brick, contact_faces, crooked
 
 from synth.arrays import FloatArray, Points
 from synth.surface import ContactFaces, GelSurface
 
-CROOKED = crooked((3.0, 2.0, 2.0)).contact_faces
-REGULAR = brick(SIZE, (8, 6, 1)).contact_faces
+CROOKED = contact_faces(crooked((3.0, 2.0, 2.0)))
+REGULAR = contact_faces(brick(SIZE, (8, 6, 1)))
 SUBDIVISIONS = [1, 2, 3, 4, 5]
 
 
@@ -101,7 +101,7 @@ def test_smooth_fields_converge_at_third_order() -> None:
     """Halving the edges divides the error inside by 8, where linear interpolation divides it by 4."""
 
     def errors(cells: int) -> tuple[float, float]:
-        coarse = brick((4.0, 4.0, 1.0), (cells, cells, 1)).contact_faces
+        coarse = contact_faces(brick((4.0, 4.0, 1.0), (cells, cells, 1)))
         surface = GelSurface(coarse, 4)
         inside = (np.abs(surface.material[:, :2]) <= 1.0).all(axis=1)
         wanted, nodal = smooth(surface.material)[inside], smooth(coarse.nodes)

@@ -114,7 +114,8 @@ def _meetings(positions, triangles, camera):
 
     Volumes of tetrahedra say on which side of an edge a ray passes. Rays within 1e-6 of an edge alone get 1, too.
     """
-    origins, directions = camera.rays(pixel_centres().reshape(-1, 2))
+    seen = camera.look(pixel_centres().reshape(-1, 2))
+    origins, directions = seen.origins, seen.directions
     a, b, c = (positions[triangles[:, i]] for i in range(3))
     count = np.ones(len(origins), dtype=int)
     for n in range(0, len(origins), 3):

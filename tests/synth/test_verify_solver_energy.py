@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from energy_ledger import Account, accounted
 from layered_pad import FILM, pad
-from pads import ELEMENT, MIXED, SIZE, scene
+from pads import ELEMENT, MIXED, SIZE, contact_faces, scene
 
 from synth.mesh import PadMesh
 
@@ -22,7 +22,8 @@ TWIST = {"depth_mm": 0.8, "shear_mm": [0.3, 0.2], "twist_deg": 40.0}
 def landing(mesh: PadMesh, element: str) -> tuple[float, float]:
     """The contact point nearest to the pad's middle: there the ball touches from the start of its way."""
     shape = ELEMENT[element]().face_barycentric
-    points = np.einsum("qa,fac->fqc", shape, mesh.points[mesh.contact_nodes][mesh.contact_faces.faces]).reshape(-1, 3)
+    surface = contact_faces(mesh)
+    points = np.einsum("qa,fac->fqc", shape, surface.nodes[surface.faces]).reshape(-1, 3)
     x, y, _ = points[np.argmin(np.linalg.norm(points, axis=1))]
     return float(x), float(y)
 

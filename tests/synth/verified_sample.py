@@ -90,7 +90,8 @@ def _paint(
     """Waves in material coordinates under light that depends on place, 2 x 2 samples a pixel, with noise, 8 bit."""
     camera = drawn.sensor.camera
     row, column = np.mgrid[: 2 * camera.height, : 2 * camera.width]
-    hits = trace(positions, surface.triangles, *optics.rays(np.column_stack([column.ravel(), row.ravel()]) / 2 + 0.25))
+    rays = optics.look(np.column_stack([column.ravel(), row.ravel()]) / 2 + 0.25)
+    hits = trace(positions, surface.triangles, rays.origins, rays.directions)
     x, y, _ = hits.interpolate(surface.triangles, surface.material).T
     z = hits.interpolate(surface.triangles, positions)[:, 2]
     albedo = 0.45 + 0.2 * np.sin(4.1 * x + 1.3 * np.sin(1.7 * y)) + 0.2 * np.sin(4.3 * y + 1.5 * np.sin(1.1 * x))

@@ -50,11 +50,7 @@ def load_raft(path: Path, device: str = "cpu", iterations: int = 20) -> RAFT:
 
 
 def renamed(tensors: Mapping[str, Tensor], path: Path) -> dict[str, Tensor]:
-    """The tensors under this package's names, see the top of this module.
-
-    Raises:
-        InputError: A tensor that is stored twice differs from its copy.
-    """
+    """The tensors under this package's names; InputError where one that is stored twice differs from its copy."""
     plain = {name.removeprefix("module."): value for name, value in tensors.items()}
     own = {}
     for name, value in plain.items():

@@ -26,13 +26,9 @@ def _filled(struct: Any, shape: Callable[[str], tuple[int, ...]], device: str) -
 
 
 class BatchArrays:
-    """Arrays of b lanes, see the module's docstring; zeros.
+    """Arrays of zeros for so many lanes, see the module's docstring.
 
-    Args:
-        pad: what the lanes share.
-        batch: b.
-        records: most states that a trajectory records.
-        grid: counts of the largest distance grid of the indenters.
+    A trajectory records at most `records` states; the largest distance grid of the indenters has the counts `grid`.
     """
 
     def __init__(self, pad: Pad, batch: int, records: int, grid: tuple[int, int, int]) -> None:

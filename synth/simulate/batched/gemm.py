@@ -32,11 +32,7 @@ class Dense(Protocol):
 
 
 def dense(device: str) -> Dense:
-    """The operations of a Warp device.
-
-    Raises:
-        InputError: CUDA without cuBLAS.
-    """
+    """The operations of a Warp device; InputError for CUDA without cuBLAS."""
     return Cublas(device) if wp.get_device(device).is_cuda else Host()
 
 

@@ -19,14 +19,7 @@ NEEDS = {"cublas": ("cublasLt",), "cusolver": ("nvJitLink", "cusparse", "cublas"
 
 @cache
 def library(name: str) -> ctypes.CDLL:
-    """The newest of this Python environment, else the system's.
-
-    Args:
-        name: cublas or cusolver.
-
-    Raises:
-        InputError: there is none.
-    """
+    """The newest cublas or cusolver of this Python environment, else the system's; InputError where there is none."""
     for other in NEEDS[name]:
         _load(other)
     found = _load(name)
@@ -41,13 +34,9 @@ def library(name: str) -> ctypes.CDLL:
 def call(name: str, function: str, *arguments: Any) -> None:
     """Call a function of a library by its C name.
 
-    Args:
-        name: of the library.
-        function: one that returns 0 if it succeeds.
-        arguments: pointers wrapped in ctypes' types, int for an int.
+    Arguments are pointers wrapped in ctypes' types, int for an int. The function returns 0 if it succeeds.
 
     Raises:
-        InputError: as of `library`.
         RuntimeError: the function reported something else.
     """
     status = getattr(library(name), function)(*arguments)

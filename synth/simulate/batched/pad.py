@@ -45,11 +45,7 @@ class Pad:
 def prepare(scene: Scene, mesh: PadMesh, device: str, products: Dense | None = None) -> Pad:
     """Prepare the pad of a scene, for all scenes of the same mesh, materials and element.
 
-    Args:
-        scene: any of them.
-        mesh: of their pad.
-        device: Warp device.
-        products: by which the preconditioner is applied; default the device's own.
+    `products` apply the preconditioner; by default they are the Warp device's own.
 
     Raises:
         InputError: CUDA without cuBLAS or cuSOLVER.

@@ -61,13 +61,7 @@ def _inverse_by_cusolver(matrix: FloatArray, device: wp.Device) -> FloatArray:
 
 
 class Preconditioner:
-    """K_0^{-1} on a device, filled up with zeros to as many rows as the Krylov vectors have.
-
-    Args:
-        inverse: (k, k) float64, symmetric.
-        device: Warp device.
-        products: default the device's own.
-    """
+    """K_0^{-1} (k, k), float64, on a device, filled up with zeros to as many rows as the Krylov vectors have."""
 
     def __init__(self, inverse: FloatArray, device: str, products: Dense | None = None) -> None:
         self.rows = padded(len(inverse))

@@ -18,12 +18,9 @@ from synth.simulate.trajectory import State, Trajectory, no_contact, not_converg
 def press_tables(
     presses: Sequence[Press], frames: Sequence[frozenset[int]] | None, d: str
 ) -> tuple[Presses, tuple[int, int, int]]:
-    """All presses on Warp device d, and the counts of their largest distance grid.
+    """All presses, of one pad, on Warp device d, and the counts of their largest distance grid.
 
-    Args:
-        presses: N of one pad.
-        frames: numbers of each press's states that are to be corrected, default all.
-        d: Warp device.
+    `frames` are the numbers of each press's states that are to be corrected, by default all.
     """
     paths = [press.path for press in presses]
     bodies = [path.body for path in paths]
@@ -89,10 +86,10 @@ def untouched(press: Press, space: Space) -> Trajectory:
 def trajectory(
     press: Press, records: FloatArray, ended: tuple[int, float, float], seconds: float, space: Space
 ) -> Trajectory:
-    """The trajectory of a press.
+    """The trajectory of a press that ran in a lane.
 
     Args:
-        press: that ran in a lane.
+        press: that ran.
         records: (r, ...) what the lane wrote, see `synth.simulate.batched.reductions.write_record`.
         ended: code of the reason, path length reached, and where the next step would have led, mm.
         seconds: its share of the run time.
