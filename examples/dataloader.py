@@ -12,7 +12,7 @@ from torch.utils.data import DataLoader
 
 import gelflow
 
-# Shards, a dataset directory of synth and a pair set of `gelflow pairs` are opened alike, and read in any order.
+# A PairDataset reads shards, a dataset of synth, or a folder that `gelflow pairs` wrote; pairs come in any order.
 pairs = gelflow.PairDataset(sys.argv[1])
 loader = DataLoader(pairs, batch_size=2, shuffle=True, generator=torch.Generator().manual_seed(0))
 model = gelflow.load_model("best", device="cpu")

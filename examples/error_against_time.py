@@ -15,7 +15,7 @@ parser.add_argument("--targets", type=float, nargs="+", default=[0.4, 0.2, 0.1, 
 parser.add_argument("--out", type=Path, default=Path("data/error"))
 given = parser.parse_args()
 
-# Numbers in place of all distributions that the flow depends on: another target is another scene, with other draws.
+# Fixed numbers replace all distributions that the flow depends on: with another target, other values would be sampled.
 PRESS = [
     'contact.indenter={ shape = "sphere", radius_mm = 4.0 }', "contact.friction=0.6", "motion.depth_mm=1.0",
     "motion.position_mm=[0.0, 0.0]", "motion.shear_mm=[0.5, 0.0]", "motion.twist_deg=0.0", "render.samples_per_pixel=4",

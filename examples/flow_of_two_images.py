@@ -18,7 +18,7 @@ model = gelflow.load_model("best", device="cpu")
 flow = model.flow(image1, image2)  # (H, W, 2) float32 px: U to the right, V down
 back = model.flow(image2, image1)
 
-# %% A flow and the flow back should cancel; where they do not, trust neither.
+# %% The flow and the flow back should cancel; where they do not, trust neither.
 rows, columns = np.indices(flow.shape[:2])
 there_row = np.clip(np.rint(rows + flow[..., 1]).astype(int), 0, flow.shape[0] - 1)
 there_column = np.clip(np.rint(columns + flow[..., 0]).astype(int), 0, flow.shape[1] - 1)

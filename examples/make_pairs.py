@@ -18,9 +18,9 @@ given = parser.parse_args()
 
 scene = synth.load_scene("gelsight_mini", set=["motion.depth_mm={ uniform = [0.8, 1.5] }"])
 summary = synth.generate(scene, given.n, given.out, seed=0)
-print(f"{summary.made} pairs made, {summary.found} found, in {summary.seconds:.0f} s")
+print(f"{summary.made} pairs made, {summary.found} already there, in {summary.seconds:.0f} s")
 
-sample = next(iter(synth.read_dataset(given.out)))  # the first pair of a trajectory: undeformed gel and last state
+sample = next(iter(synth.read_dataset(given.out)))  # its first pair: the undeformed gel and the last state of a press
 image1, image2 = sample.images
 rows, columns = np.mgrid[6 : image1.shape[0] : 12, 6 : image1.shape[1] : 12]
 u, v = np.moveaxis(sample.forward[rows, columns], -1, 0)

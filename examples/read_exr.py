@@ -1,4 +1,4 @@
-"""Read a sample's flow with nothing but OpenEXR.
+"""Read the flow of a pair with OpenEXR alone.
 
 python -m synth generate --n 1 --out data/one
 python examples/read_exr.py data/one/samples/000000/flow.exr
@@ -17,7 +17,7 @@ for name in sorted(planes):
 for key in sorted(key for key in header if key.startswith("flow.")):
     print(f"{key}: {header[key]}")
 
-# A pixel in column c and row r of image 1, whose centre is at (c + 0.5, r + 0.5), moves to there plus (U, V).
+# The pixel in column c and row r has its centre at (c + 0.5, r + 0.5); what it shows moves by (U, V) to image 2.
 u, v, visible = (planes[f"forward.{part}"] for part in ("U", "V", "visible"))
 row, column = u.shape[0] // 2, u.shape[1] // 2
 print(f"the centre ({column + 0.5}, {row + 0.5}) of image 1 is at "
