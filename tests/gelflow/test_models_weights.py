@@ -114,7 +114,7 @@ def test_the_card_describes_best() -> None:
     card = path.with_name("README.md").read_text(encoding="utf-8")
     metadata = read_metadata(path)
     assert json.loads(metadata["train"])["supervision"] == "mixed"
-    assert f"then {metadata['step']} steps" in card
+    assert f"--steps {metadata['step']}\n" in card
     assert ModelConfig.model_validate_json(metadata["model"]).registration == REGISTRATIONS["motion"]
 
 
