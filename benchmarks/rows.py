@@ -142,9 +142,10 @@ def plot(path: Path, rows: Sequence[Row], x: str, y: str, group: str, panel: str
             (lines[name],) = axes.loglog([row[x] for row in line], [row[y] for row in line], style, label=name)
         axes.set(xlabel=LABELS.get(x, x), ylabel=LABELS.get(y, y), title=None if value is None else str(value))
         axes.grid(which="both", alpha=0.3)
-        axes.xaxis.set(
-            major_locator=LogLocator(subs=(1, 2, 5)), major_formatter="{x:g}", minor_formatter=NullFormatter()
-        )
+        if seen:  # Matplotlib places no marks on a logarithmic axis without values
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.xaxis.set_minor_formatter(NullFormatter())
     figure.legend(handles=lines.values(), fontsize="small", loc="outside right center")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=120)
