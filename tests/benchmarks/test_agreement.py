@@ -92,8 +92,6 @@ def test_outcomes_are_counted() -> None:
         (["--device", "cpu", "--set", "motion.depth_mm={normal=[0.2, 1e9]}"], "none of 16 draws"),
     ],
 )
-def test_what_cannot_be_compared(
-    options: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_compared(options: list[str], told: str, tmp_path: Path, capsys) -> None:
     assert main(["agreement", "--out", str(tmp_path), *options]) == 2
     assert told in capsys.readouterr().err

@@ -60,9 +60,7 @@ def test_face_displacement_is_the_surface(shallow: Trajectory) -> None:
     np.testing.assert_allclose(found[:, 0].reshape(61, 46)[:, 0], np.linspace(-10, 10, 61), atol=1e-12)
 
 
-def test_the_command(
-    one_case: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command(one_case: None, tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Errors fall with the elements as P2/P1's do, and the plain solver finds the same state on the same mesh."""
     meshes = [Setting("graded P2/P1", ("graded", n, 2), numerics=COARSE) for n in (2, 4)]
     ways = [Setting("plain solver", ("graded", 2, 2), numerics=COARSE, options=PLAIN), *meshes]

@@ -76,9 +76,7 @@ def test_the_module_passes_the_status_on_and_debug_shows_the_traceback(capsys: p
         (["finetune", ".", "--out", "o", "--weights", "none.safetensors"], "none.safetensors"),
     ],
 )
-def test_mistake_is_one_line_and_status_2(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: list[str], word: str
-) -> None:
+def test_mistake_is_one_line_and_status_2(tmp_path: Path, monkeypatch, capsys, arguments: list[str], word: str) -> None:
     (tmp_path / "notes.txt").touch()
     monkeypatch.chdir(tmp_path)
     assert word in fails(capsys, *arguments)

@@ -52,9 +52,7 @@ def raft(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_all_kinds_of_networks_share_one_table(
-    weights: Path, raft: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_all_kinds_of_networks_share_one_table(weights: Path, raft: Path, tmp_path: Path, capsys) -> None:
     folder, out = write_folder(tmp_path / "data", {"a": (1, 0), "b": (0, 1)}), tmp_path / "out"
     common = ["compare", str(folder), "--weights", f"mine={weights}", "--device", "cpu", "--out", str(out)]
     assert main([*common, "--methods", "none,lucas-kanade", "--weights", str(raft), "--ft", "2"]) == 0
@@ -81,9 +79,7 @@ def test_all_kinds_of_networks_share_one_table(
     assert read_metadata(tuned)["step"] == "3"
 
 
-def test_fine_tuning_needs_a_place_and_a_network(
-    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fine_tuning_needs_a_place_and_a_network(weights: Path, tmp_path: Path, capsys) -> None:
     command = ["compare", write_folder(tmp_path / "data", {"a": (1, 0)}), "--ft", "5"]
     for given in (["--weights", weights], ["--out", tmp_path / "out"]):
         assert "--ft 5: needs --weights of GelFlow, and --out" in fails(capsys, *command, *given)
@@ -91,9 +87,7 @@ def test_fine_tuning_needs_a_place_and_a_network(
     assert "for another number of scales" in fails(capsys, *command, *tail)
 
 
-def test_fine_tuning_changes_the_copy_only_and_lowers_its_loss(
-    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fine_tuning_changes_the_copy_only_and_lowers_its_loss(weights: Path, tmp_path: Path, capsys) -> None:
     folder, before = write_folder(tmp_path / "data", {"a": (1, 0)}), weights.read_bytes()
     arguments = ["compare", str(folder), "--methods", "", "--weights", f"mine={weights}", "--batch", "0", "--json"]
     assert main([*arguments, "--ft", "40", "--out", str(tmp_path / "out")]) == 0
@@ -255,9 +249,7 @@ def test_the_name_says_so_and_stays_one_of_a_group_of_seeds(plain: Path) -> None
     assert found == names
 
 
-def test_rows_without_and_with_registration_stand_in_one_table_with_one_of_raft(
-    plain: Path, raft: Path, tmp_path: Path
-) -> None:
+def test_rows_without_and_with_registration_stand_in_one_table_with_one_of_raft(plain, raft, tmp_path) -> None:
     folder, out = write_folder(tmp_path / "data", {"a": (1.0, -0.5)}), tmp_path / "out"
     arguments = ["compare", str(folder), "--methods", "none", "--weights", f"net={plain}", "--weights", str(raft)]
     assert main([*arguments, *ROWS, "--device", "cpu", "--ft", "2", "--batch", "0", "--out", str(out)]) == 0
@@ -321,9 +313,7 @@ def test_predict_and_evaluate_take_it(plain: Path, tmp_path: Path, capsys: pytes
     assert json.loads(capsys.readouterr().out)["methods"][0]["method"].endswith("+motion")
 
 
-def test_registration_is_refused_where_there_is_none(
-    plain: Path, raft: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_registration_is_refused_where_there_is_none(plain: Path, raft: Path, tmp_path: Path, capsys) -> None:
     folder, out = write_folder(tmp_path / "data", {"a": (1, 0)}), tmp_path / "out"
     tail = ("--device", "cpu", "--registration", "motion")
     assert "is RAFT" in fails(capsys, "evaluate", folder, "--weights", raft, *tail)

@@ -94,9 +94,7 @@ def test_a_job_goes_on_where_it_was_interrupted_and_is_not_replaced_by_another(t
     assert {path: path.stat().st_mtime_ns for path in cut.rglob("*")} == before
 
 
-def test_undecodable_video_is_counted_the_others_are_used(
-    tmp_path: Path, videos: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_undecodable_video_is_counted_the_others_are_used(tmp_path: Path, videos: Path, capfd) -> None:
     (videos / "broken.avi").write_bytes(b"RIFF" + b"junk" * 500)
     (videos / "empty.mp4").touch()
     result = extract_pairs([str(videos)], tmp_path / "out", ChoiceConfig())
@@ -148,9 +146,7 @@ def test_still_repeated_and_unrelated_frames_are_no_pairs() -> None:
     assert unrelated.rejected["unreliable"] >= 12
 
 
-def test_inputs_are_found_by_file_folder_and_pattern_and_those_that_hold_nothing_are_named(
-    tmp_path: Path, videos: Path
-) -> None:
+def test_inputs_are_found_by_file_folder_and_pattern_and_those_that_hold_nothing_are_named(tmp_path, videos) -> None:
     expected = [("a", videos / "a.avi"), ("b", videos / "b.avi")]
     for inputs in ([str(videos)], [f"{videos}/*.avi"], [str(videos / "b.avi"), str(videos / "a.avi")]):
         assert [(r.name, r.path) for r in find_recordings(inputs)] == expected

@@ -47,9 +47,7 @@ def test_exr_round_trip_keeps_every_bit_and_nan(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["a.png", "a.jpg", "a.exr"])
-def test_truncated_missing_and_foreign_files_are_named(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str
-) -> None:
+def test_truncated_missing_and_foreign_files_are_named(tmp_path: Path, capfd, name: str) -> None:
     path = tmp_path / name
     read = read_flow if path.suffix == ".exr" else read_image
     with pytest.raises(InputError, match=name):

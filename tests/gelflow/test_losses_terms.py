@@ -78,9 +78,7 @@ def affine_flow(matrix: list[list[float]], shift: tuple[float, float] = (1.5, -0
         ([[0.1, 0.3], [-0.05, 0.2]], (0.3, 0.25, 0.35)),
     ],
 )
-def test_decomposition_separates_stretch_shear_and_rotation_and_affine_flows_cost_no_deformation(
-    matrix: list, parts: tuple
-) -> None:
+def test_decomposition_separates_stretch_shear_and_rotation_and_affine_flows_cost_no_deformation(matrix, parts) -> None:
     flow = affine_flow(matrix)
     loss = decomposition_loss(flow, ONES, lambda_theta=10, lambda_zeta=100)
     # 100 times differences of numbers up to 5, in double precision

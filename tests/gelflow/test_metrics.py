@@ -8,15 +8,7 @@ from skimage.metrics import structural_similarity
 from textures import REAL, as_bytes, moved
 
 from gelflow.baselines.classical import dis
-from gelflow.compare.metrics import (
-    flow_errors,
-    image_similarity,
-    marker_distance,
-    psnr,
-    ssim,
-    ssim_map,
-    warp_image,
-)
+from gelflow.compare.metrics import flow_errors, image_similarity, marker_distance, psnr, ssim, ssim_map, warp_image
 from gelflow.compare.scores import score_pair
 from gelflow.data import open_pairs
 from gelflow.errors import InputError

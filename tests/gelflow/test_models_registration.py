@@ -213,9 +213,7 @@ def test_without_a_match_flows_stay() -> None:
 
 
 @pytest.mark.parametrize("lost", [(slice(40, 56), slice(None)), (slice(None), slice(60, 76))], ids=["rows", "columns"])
-def test_a_lost_strip_takes_the_flow_beside_it_and_nothing_that_was_not_there_is_found(
-    lost: tuple[slice, slice],
-) -> None:
+def test_a_lost_strip_takes_the_flow_beside_it_and_nothing_that_was_not_there_is_found(lost) -> None:
     _, _, truth = moved_texture()
     flow = truth.clone()
     flow[..., lost[0], lost[1]] = WRONG

@@ -187,9 +187,7 @@ def test_the_exported_network_gives_the_same_flow(weights: Path, tmp_path: Path)
         (["--out", "x.onnx", "--size", "64x64"], "pip install onnx onnxscript"),
     ],
 )
-def test_mistakes_are_one_line(
-    weights: Path, tail: list[str], word: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_mistakes_are_one_line(weights: Path, tail: list[str], word: str, capsys, monkeypatch) -> None:
     monkeypatch.setattr("gelflow.models.onnx.find_spec", lambda name: None if "pip" in word else name)
     monkeypatch.chdir(weights.parent)
     Path("other.onnx").write_text("another's")

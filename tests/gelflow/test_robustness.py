@@ -59,9 +59,7 @@ def damaged(kind: str, good: Path, path: Path, trace: Path) -> None:
 
 @pytest.mark.parametrize("number", [0, 1], ids=["gelflow", "raft"])
 @pytest.mark.parametrize("kind", ["truncated", "empty", "text", "code", "code in a torch file", "NaN"])
-def test_damaged_weights_are_named_and_never_run(
-    kind: str, number: int, networks: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_damaged_weights_are_named_and_never_run(kind, number, networks, tmp_path, capsys) -> None:
     good, trace, run = networks[number], tmp_path / "ran", tmp_path / "run"
     folder = write_folder(tmp_path / "data", {"a": (1, 0)})
     bad = tmp_path / f"bad{good.suffix}"
@@ -94,9 +92,7 @@ def test_a_state_to_resume_from_cannot_run_code(tmp_path: Path, capsys: pytest.C
 
 
 @pytest.mark.parametrize("number", [0, 1], ids=["gelflow", "raft"])
-def test_images_that_cannot_be_used_are_named(
-    number: int, networks: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_images_that_cannot_be_used_are_named(number: int, networks: tuple[Path, Path], tmp_path: Path, capsys) -> None:
     tail = ["--weights", networks[number], "--out", tmp_path / "out", "--device", "cpu"]
     for name, size in (("one", (1, 1)), ("small", (40, 80)), ("good", (64, 80)), ("wide", (64, 96))):
         save(tmp_path / f"{name}.png", moved(*size, 0, 0))

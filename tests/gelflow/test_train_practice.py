@@ -58,9 +58,7 @@ def test_a_resumed_run_with_everything_on_ends_with_the_same_weights(pairs: Shif
 
 
 @pytest.mark.parametrize(("step", "late"), [(0, False), (4, False), (5, True), (9, True)])
-def test_losses_that_trust_the_flow_wait_for_their_stage(
-    step: int, late: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_losses_that_trust_the_flow_wait_for_their_stage(step: int, late: bool, monkeypatch) -> None:
     """Else every pixel of a new network is judged hidden, and its flow grows without end."""
     asked: list[bool] = []
     monkeypatch.setattr(FlowModule, "step", step)

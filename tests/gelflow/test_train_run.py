@@ -49,9 +49,7 @@ class CtrlC(Dataset):
 
 
 @pytest.mark.parametrize("validates", [True, False])
-def test_a_run_interrupted_by_ctrl_c_ends_with_the_same_weights(
-    pairs: Shifts, tmp_path: Path, validates: bool, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_interrupted_by_ctrl_c_ends_with_the_same_weights(pairs, tmp_path, validates, capsys) -> None:
     config = small(steps=5, validate_every=2, save_every=2, schedule="one_cycle", warmup_steps=2)
     validation, cut = pairs if validates else None, tmp_path / "cut"
     whole = train(config, pairs, validation, tmp_path / "whole")
@@ -121,9 +119,7 @@ def test_a_pair_that_a_loading_process_cannot_use_is_named_and_the_process_ends(
 
 
 @pytest.mark.parametrize("steps", [4, 2])
-def test_a_run_whose_validation_failed_is_saved_and_validates_when_resumed(
-    pairs: Shifts, tmp_path: Path, steps: int
-) -> None:
+def test_a_run_whose_validation_failed_is_saved_and_validates_when_resumed(pairs: Shifts, tmp_path, steps: int) -> None:
     class OneSmall(CtrlC):
         def __getitem__(self, index: int) -> dict:
             sample = self.pairs[index]

@@ -252,9 +252,7 @@ def test_a_full_disk_loses_nothing_and_tears_nothing(tiny: Path, tmp_path: Path)
         (70.0, ["3 of 12", *(f"{done} of 12, 70.0 s each, about " for done in range(4, 12))]),
     ],
 )
-def test_a_line_a_minute_where_stderr_is_no_terminal(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, pace: float, lines: list[str]
-) -> None:
+def test_a_line_a_minute_where_stderr_is_no_terminal(capsys, monkeypatch, pace: float, lines: list[str]) -> None:
     """Two of twelve were there before; each of the others takes `pace` seconds."""
     clock = [0.0]
     monkeypatch.setattr("synth.progress.time.monotonic", lambda: clock[0])

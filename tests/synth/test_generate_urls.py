@@ -127,9 +127,7 @@ def test_a_killed_run_holds_nothing_for_long(url: str) -> None:
             assert json.loads(Store(url).read("leases/whole.json") or b"{}")["pid"] == os.getpid()
 
 
-def test_storage_that_refuses_ends_with_one_message_and_goes_on(
-    url: str, tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_storage_that_refuses_ends_with_one_message_and_goes_on(url: str, tiny: Path, tmp_path, monkeypatch) -> None:
     template = load_scene(tiny)
     generate(template, 2, url)
 

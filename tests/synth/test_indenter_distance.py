@@ -303,9 +303,7 @@ UNUSABLE: dict[str, tuple[pv.PolyData | bytes | None, str]] = {
 
 
 @pytest.mark.parametrize("kind", UNUSABLE)
-def test_unusable_mesh_is_named(
-    tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture, recwarn: pytest.WarningsRecorder
-) -> None:
+def test_unusable_mesh_is_named(tmp_path: Path, kind: str, caplog, recwarn: pytest.WarningsRecorder) -> None:
     content, words = UNUSABLE[kind]
     path = tmp_path / f"{kind}.stl"
     if isinstance(content, bytes):

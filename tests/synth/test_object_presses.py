@@ -39,9 +39,7 @@ def cube(**fields: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("turned", [(0.0, 0.0, 0.0), (20.0, 10.0, 30.0)])
-def test_a_cube_is_the_block_of_its_fillet(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, turned: tuple[float, float, float]
-) -> None:
+def test_a_cube_is_the_block_of_its_fillet(folder: Path, monkeypatch, turned: tuple[float, float, float]) -> None:
     monkeypatch.setattr(indenter, "OBJECT_STIFFNESS", 1.0)  # as that of the block
     fillet = 0.7  # more than what the mesh asks for, so that both keep it
     block = {"shape": "box", "size_mm": [EDGE, EDGE, EDGE], "fillet_mm": fillet, "rotation_deg": turned}

@@ -51,9 +51,7 @@ def test_library_without_the_version_function_counts_as_too_old(tmp_path: Path) 
     assert all(16 <= version[0] < 100 for version in versions)
 
 
-def test_the_users_library_comes_before_the_packages_and_that_before_the_systems(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_users_library_comes_before_the_packages_and_that_before_the_systems(tmp_path: Path, monkeypatch) -> None:
     installed = tmp_path / "site" / f"{PACKAGE.replace('-', '_')}-19.1.7.dist-info"
     installed.mkdir(parents=True)
     (installed / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {PACKAGE}\nVersion: 19.1.7\n")

@@ -46,10 +46,7 @@ def _on_face(rays: Rays, radius: float | None) -> Points:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_pixel_of_every_camera_sees_gel_and_no_light(name: str) -> None:
-    """Also when the gel is sheared as far as it may be: gel moves less than its indenter.
-
-    Fails with a light of gelsight_fingertip at x = 5 mm, and with its pad of 17 x 14 mm.
-    """
+    """Also when the gel is sheared as far as it may be: gel moves less than its indenter."""
     for scene in _draws(name, 30 if name in WIDE else 8):
         shear = np.abs(scene.motion.shear_mm)
         assert list(scene.sensor.views) == ["", *CAMERAS.get(name, [])]
@@ -123,7 +120,6 @@ def test_the_stereo_pair_sees_height() -> None:
 
 
 def test_markers_of_the_fingertip_lie_above_its_shining_coating() -> None:
-    """Fails with layer left out of the file."""
     sensor = _draws("gelsight_fingertip", 1)[0].sensor
     assert not sensor.coating.is_matt
     texture = albedo(sensor, np.random.default_rng(0))

@@ -1,7 +1,4 @@
-"""Friction along whole paths: Coulomb's cone, drag, twist, the sliding limits T = μN and M = μ ∫ p r, reversal, steps.
-
-Each comment "fails with" names a change of `synth.simulate` that was tried.
-"""
+"""Friction along whole paths: Coulomb's cone, drag, twist, the sliding limits T = μN and M = μ ∫ p r, reversal."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -12,7 +9,6 @@ from layered_pad import FILM, pad
 from pads import DRAG, MIXED, PUNCH, SIZE, SPHERE, brick, gentle, run, scene
 
 from synth.arrays import BoolArray, FloatArray
-from synth.mesh import PadMesh
 from synth.scene import Motion, Scene
 from synth.simulate import State, simulate
 from synth.simulate.load_path import LoadPath
@@ -81,7 +77,6 @@ def test_without_friction_nothing_pulls_sideways(element: str) -> None:
 @each
 @pytest.mark.parametrize("shear", [(0.4, 0.0), (0.0, -0.4)])
 def test_friction_drags_the_gel_along(shear: tuple[float, float], element: str) -> None:
-    # Fails with the sign of the trial traction turned.
     motion = {"depth_mm": 0.6, "shear_mm": shear, "steps": 3}
     force = ended(scene(friction=0.8, motion=motion, numerics={"element": element})).force_n
     assert np.dot(force[:2], shear) > 0.05 * force[2] * 0.4
@@ -105,12 +100,8 @@ def test_twist_turns_the_gel_along(twist: float, element: str) -> None:
 @pytest.mark.parametrize("step", [0.5, 0.1])
 @pytest.mark.parametrize("indenter", [SPHERE, PUNCH])
 @pytest.mark.parametrize(("element", "mesh"), [("p1p1", FINE), ("p2p1", MESH)])
-def test_long_shear_slides_at_the_friction_coefficient(
-    element: str, mesh: PadMesh, indenter: dict, step: float
-) -> None:
+def test_long_shear_slides_at_the_friction_coefficient(element, mesh, indenter, step) -> None:
     """Dragged far, every point slips at |t_T| = mu t_n, coarse steps or fine: also what touched in the last step."""
-    # Fails with the limit of _returned halved, without anchors, and without friction of points that touch for the first
-    # time.
     mu = 0.3
     motion = {"depth_mm": 0.5, "shear_mm": [3.0, 0.0], "position_mm": [-1.5, 0.0], "steps": 4}
     numerics = {"max_step_mm": step, "element": element}
@@ -134,8 +125,6 @@ def test_long_shear_slides_at_the_friction_coefficient(
 @each
 def test_traction_stays_in_its_cone(element: str, friction: float, layers: bool) -> None:
     """At every contact point after a press, a drag, a twist and back, at right angles to a pressure that pushes."""
-    # Fails with the limit 5 % too high, with the trial traction not projected on the surface, and with `rotation *`
-    # left out of _trial (no convergence).
     motion = {"depth_mm": 0.8, "shear_mm": [0.6, -0.3], "twist_deg": 20.0, "position_mm": [0.4, 0.2], "steps": 3}
     motion["then"] = [{"depth_mm": 0.6, "shear_mm": [0.2, 0.0], "twist_deg": 5.0}]
     gel = {"poisson_ratio": 0.5, "layers": [FILM] if layers else []}
@@ -154,7 +143,6 @@ def test_traction_stays_in_its_cone(element: str, friction: float, layers: bool)
 @each
 def test_spinning_punch_is_held_by_its_limit(element: str) -> None:
     """Turned far, the tractions go round: M = μ ∫ p r dA about the axis, against the twist's pull, and no net force."""
-    # Fails with the limit 5 % too high, and with slipping anchors moved to the point itself.
     friction, motion = 0.1, {"depth_mm": 0.6, "twist_deg": 60.0, "steps": 2}
     numerics = {"element": element, "max_step_mm": 0.1}
     gel = {"poisson_ratio": 0.5}
@@ -169,7 +157,6 @@ def test_spinning_punch_is_held_by_its_limit(element: str) -> None:
 @each
 def test_rough_contact_sticks(element: str) -> None:
     """Friction of 10: next to nothing slips, and the touching points go where the indenter goes."""
-    # Fails with old anchors renewed at each step.
     motion = {"depth_mm": 0.6, "shear_mm": [0.15, 0.0], "steps": 4}
     stepper = run(scene(friction=10.0, motion=motion, numerics={"element": element}), MESH)
     states, space = stepper.states, stepper.system.space
@@ -201,7 +188,6 @@ def test_slip_spreads_with_the_shear() -> None:
 @each
 def test_reversed_shear_reverses_the_force(element: str) -> None:
     """Full slide to one side and then to the other: mirror images, and work lost on the way."""
-    # Fails with anchors left behind by slipping points, and without the rigid-motion predictor at turns.
     there, mu = 0.9, 0.3
     first_leg, *others = ({"depth_mm": 0.5, "shear_mm": [x, 0.0]} for x in (there, -there, there))
     motion = {**first_leg, "steps": 13, "then": others}
@@ -224,7 +210,6 @@ def test_reversed_shear_reverses_the_force(element: str) -> None:
 
 def test_the_predictor_at_a_turn_does_not_see_how_exact_the_state_is() -> None:
     """What it adds is a derivative along the load path: a small change of the state changes it little."""
-    # Fails with the residual of the state itself left in: the change then comes back 1 / PATH_DERIVATIVE_STEP times.
     stepper = run(scene(friction=0.5, motion={"depth_mm": 0.6, "steps": 1}), MESH)
     body, state = stepper.system, stepper.state
     motion = {"depth_mm": 0.6, "shear_mm": [0.2, 0.0], "steps": 2}
@@ -243,7 +228,6 @@ def test_the_predictor_at_a_turn_does_not_see_how_exact_the_state_is() -> None:
 
 @each
 def test_friction_converges_with_the_step(element: str) -> None:
-    # Fails with points that stick anchored anew at each step.
     motion = {"depth_mm": 0.6, "shear_mm": [0.1, 0.0], "steps": 2}
 
     def pull(h: float) -> float:

@@ -66,7 +66,6 @@ def forces(body: System, state: Unknowns) -> FloatArray:
 
 
 def test_forces_are_the_energys_gradient(state: Unknowns) -> None:
-    """Fails with t in place of t², with the transposed shape gradient's share at corners 3 swapped for 4."""
     body, bare = pad(), pad(guarded=False)
     found = forces(body, state) - forces(bare, state)
     rng = np.random.default_rng(0)
@@ -79,7 +78,6 @@ def test_forces_are_the_energys_gradient(state: Unknowns) -> None:
 
 
 def test_tangent_is_the_forces_derivative(state: Unknowns) -> None:
-    """Fails with 2 t + t² in place of 2 t, without the h_b h_a^T term."""
     body = pad()
     tangent = body.tangent(state, far_away())
     full = np.zeros(state.u.size + state.p.size)
@@ -94,7 +92,7 @@ def test_tangent_is_the_forces_derivative(state: Unknowns) -> None:
 
 
 def test_nothing_is_added_where_nothing_folds() -> None:
-    """To the bit. Fails with J < 1 in place of J < J_0."""
+    """To the bit."""
     body, bare = pad(), pad(guarded=False)
     gentle = squeezed(body, 0.01)
     assert lattice_jacobian(body, gentle.u)[0].min() > ONSET
@@ -102,7 +100,6 @@ def test_nothing_is_added_where_nothing_folds() -> None:
 
 
 def test_smallest_jacobian_looks_at_the_corners(state: Unknowns) -> None:
-    """Fails without the lattice's minimum."""
     body = pad()
     smallest = body.residual(state, far_away()).smallest_jacobian
     assert smallest <= lattice_jacobian(body, state.u)[0].min() + 1e-12

@@ -1,7 +1,4 @@
-"""Direct factors and GMRES against dense solutions of saddle-point matrices; what makes their answers repeatable.
-
-Each comment "fails with" names a change of `synth.simulate.linear` that was tried.
-"""
+"""Direct factors and GMRES against dense solutions of saddle-point matrices; what makes their answers repeatable."""
 
 from functools import partial
 from types import SimpleNamespace
@@ -75,7 +72,6 @@ def test_factor_is_the_inverse(kind: Any) -> None:
 @each_factor
 def test_answer_does_not_depend_on_what_was_solved_before(kind: Any) -> None:
     """Else a press's last bits would depend on the presses before it."""
-    # Fails with Pardiso's matching and scaling on: its analysis then uses the values of the first matrix.
     matrix, b = saddle(1), right_side(1)
     fresh, used = make(kind, matrix), make(kind, matrix)
     fresh.factorise(matrix.data)
@@ -101,7 +97,6 @@ def test_matrix_without_inverse_gives_no_step_to_trust(kind: Any, values: float)
 @each_factor
 @pytest.mark.parametrize("rest", [None, remainder(12)], ids=["symmetric", "unsymmetric"])
 def test_gmres_solves_with_the_remainder(kind: Any, rest: csr_matrix | None) -> None:
-    # Fails with the remainder left out of the product, or the diagonal counted twice in it.
     matrix, b = saddle(1), right_side(1)
     full = whole(matrix) if rest is None else whole(matrix) + rest.toarray()
     factor = make(kind, matrix)
@@ -116,7 +111,6 @@ def test_gmres_solves_with_the_remainder(kind: Any, rest: csr_matrix | None) -> 
 
 def test_gmres_ends_after_the_remainders_rank() -> None:
     """(S + R) S^-1 is the identity but for a matrix of R's rank: one iteration more than that is enough."""
-    # Fails with `basis[i]` orthogonalised against the first vector only.
     matrix, b = saddle(1), right_side(1)
     factor = SuperLUFactor(matrix.indptr, matrix.indices)
     factor.factorise(matrix.data)
@@ -159,7 +153,6 @@ def nearly(matrix: csr_matrix, rank: int) -> csr_matrix:
 
 
 def test_factor_is_reused_while_it_serves(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fails with MAX_REUSE_ITERATIONS not used (the third is not made), or with `_own` not compared."""
     monkeypatch.setattr(linear, "MAX_REUSE_ITERATIONS", 4)
     first, b = saddle(1), right_side(1)
     factor = SuperLUFactor(first.indptr, first.indices)
@@ -181,7 +174,6 @@ def test_factor_is_reused_while_it_serves(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_factor_is_made_anew_where_told() -> None:
-    # Fails with `reuse` or `rough` left out of the condition, and with `forget` doing nothing.
     matrix, b = saddle(1), right_side(1)
     factor = SuperLUFactor(matrix.indptr, matrix.indices)
     never = LinearSolver(factor, reuse=False)

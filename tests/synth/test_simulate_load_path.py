@@ -1,7 +1,4 @@
-"""Poses along a path of several legs, and where states are recorded.
-
-Each comment "fails with" names a change of `synth.simulate.load_path` that was tried.
-"""
+"""Poses along a path of several legs, and where states are recorded."""
 
 from typing import Any
 
@@ -20,7 +17,6 @@ def path(indenter: dict | None = None, **motion: Any) -> LoadPath:
 
 
 def test_lowest_point_follows_the_depth() -> None:
-    # Fails with the reach left out.
     way = path(depth_mm=1.0, shear_mm=[0.5, -0.2], position_mm=[1.0, 2.0])
     for s in (0.0, 0.3, 1.0):
         pose = way.pose(s)
@@ -78,7 +74,6 @@ BACK_AND_OFF: dict[str, Any] = {
 
 
 def test_legs_follow_one_another() -> None:
-    # Fails with the legs of `then` relative to the shear before.
     way = path(**BACK_AND_OFF)
     np.testing.assert_allclose(way.ends, [0, 1, 1.6, 2.8, 3.8])
     for s, depth, x in ((1.6, 1.0, 0.6), (2.2, 1.0, 0.0), (2.8, 1.0, -0.6), (3.3, 0.5, -0.6), (3.8, 0.0, -0.6)):
@@ -102,7 +97,6 @@ def test_pose_that_repeats_is_no_leg() -> None:
 
 
 def test_records_are_dealt_by_length_and_every_leg_has_one_if_there_are_enough() -> None:
-    # Fails with the longest leg given all that is left.
     way = path(**BACK_AND_OFF, steps=8)  # legs of 1, 0.6, 1.2 and 1 mm
     np.testing.assert_allclose(way.records(), [0.5, 1.0, 1.3, 1.6, 2.2, 2.8, 3.3, 3.8])
     np.testing.assert_allclose(path(**BACK_AND_OFF, steps=5).records(), [1.0, 1.6, 2.2, 2.8, 3.8])
@@ -114,7 +108,6 @@ def test_records_are_dealt_by_length_and_every_leg_has_one_if_there_are_enough()
 
 
 def test_turns_are_seen() -> None:
-    # Fails with >= for >.
     way = path(**BACK_AND_OFF)
     assert way.turns_between(0.9, 1.0)  # the way turns at 1.0: what was learnt before does not hold after
     assert way.turns_between(1.5, 1.7)

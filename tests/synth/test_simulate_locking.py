@@ -35,8 +35,6 @@ def graded(counts: tuple[int, int, int]) -> PadMesh:
     ("element", "counts", "close"), [("p1p1", (20, 16, 5), 0.15), ("p2p1", (10, 8, 3), 0.03)], ids=["p1p1", "p2p1"]
 )
 def test_press_at_nu_04999_does_not_lock(element: str, counts: tuple[int, int, int], close: float) -> None:
-    # Fails displacement-only (DISPLACEMENT_ONLY_BELOW = 0.5: +43 % at 1.2 mm, +97 % at 2 mm) and with alpha = 0 (it
-    # does not converge).
     ball, motion = {"shape": "sphere", "radius_mm": 4.0}, {"depth_mm": 2.0, "steps": 5}
     gel, numerics = {"youngs_modulus_kpa": 200.0, "poisson_ratio": 0.4999}, {"element": element}
     result = simulate(scene(SIZE, gel=gel, indenter=ball, motion=motion, numerics=numerics), graded(counts))

@@ -1,7 +1,4 @@
-"""Materials: constants, layers with the jump of pressure between them, and exact incompressibility.
-
-Each comment "fails with" names a change of `synth.simulate.material` or `synth.simulate.space` that was tried.
-"""
+"""Materials: constants, layers with the jump of pressure between them, and exact incompressibility."""
 
 import numpy as np
 import pytest
@@ -42,7 +39,6 @@ def test_incompressible_gel_has_no_finite_lame_constant() -> None:
 
 
 def test_layers_are_relative_to_the_gel() -> None:
-    # Fails with the ratio of moduli inverted, or with the layers counted from the window.
     mesh = layered(brick(SIZE, (2, 2, 3)))
     made = pad_material(gel(layers=[FILM], poisson_ratio=0.5, stiffening=(0.2, 0.0)), mesh)
     film = mesh.layer == 0
@@ -75,7 +71,6 @@ def oedometer_stress(stretch: float, nu: float, modulus: float) -> float:
 @each
 def test_layers_in_series_share_the_stress_and_not_the_pressure(element: str) -> None:
     """Confined compression of two layers, moduli 1 : 1000: each strains uniformly; the pressure jumps between them."""
-    # Fails with pressure continuous across the interface (layer left out of pressure_nodes).
     push, soft, hard = 0.3, 0.4, 0.3
     mesh = layered(brick(SIZE, (2, 2, 3)))
     gel_ = gel(poisson_ratio=soft, layers=[{**FILM, "stiffening": (0, 0)}])
@@ -107,7 +102,6 @@ def test_layers_in_series_share_the_stress_and_not_the_pressure(element: str) ->
 @each
 def test_two_layers_of_one_material_are_one_but_for_the_pressure(element: str) -> None:
     """Where the pressure is the same on both sides of the interface, so are all forces."""
-    # Fails with the pressure block of the first layer left out.
     plain = brick(SIZE, (2, 2, 3))
     one, two = (function_space(mesh, ELEMENT[element]()) for mesh in (plain, layered(plain)))
     bodies = [System(space, uniform(len(plain.tets), 0.4999)) for space in (one, two)]
@@ -144,7 +138,6 @@ def test_stiff_film_spreads_the_press(element: str) -> None:
 
 @each
 def test_exactly_incompressible_is_the_limit(element: str) -> None:
-    # Fails with lame_constants(0.5) giving 1e3.
     mesh = brick(SIZE, (4, 4, 3))
     forces = [press(element, mesh, poisson_ratio=nu).force_n[2] for nu in (0.49, 0.4999, 0.499999, 0.5)]
     gaps = [abs(force / forces[-1] - 1) for force in forces[:-1]]

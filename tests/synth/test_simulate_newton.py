@@ -28,7 +28,6 @@ def press(body: System, tolerance: float = EXACT, **limits: float) -> Solution:
 
 
 def test_a_press_converges(body: System) -> None:
-    """Fails with a tolerance a thousand times larger."""
     found = press(body)
     assert found.converged
     assert 2 <= found.iterations <= 12
@@ -36,7 +35,7 @@ def test_a_press_converges(body: System) -> None:
 
 
 def test_the_limit_is_kept_and_said(body: System) -> None:
-    """Far from equilibrium. Fails with an iteration more than the limit, and with what is left counted as converged."""
+    """Far from equilibrium."""
     needed = press(body).iterations
     for limit in (1, needed):
         found = press(body, limit=limit)
@@ -46,7 +45,6 @@ def test_the_limit_is_kept_and_said(body: System) -> None:
 
 
 def test_a_solve_that_is_near_goes_on_beyond_the_limit_to_twice_its_iterations(body: System) -> None:
-    """Fails with the limit kept there, and without a second limit."""
     needed = press(body).iterations
     found = press(body, limit=needed - 1)
     assert (found.iterations, found.converged) == (needed, True)
@@ -56,7 +54,7 @@ def test_a_solve_that_is_near_goes_on_beyond_the_limit_to_twice_its_iterations(b
 
 
 def test_a_start_in_equilibrium_costs_one_iteration_and_no_force_costs_none(body: System) -> None:
-    """A start that happens to be within the tolerance is improved once. Fails with `iterations > 0` left out."""
+    """A start that happens to be within the tolerance is improved once."""
     first = press(body)
     assert solve(body, first.state, indenters(scene(), PRESSED), EXACT).iterations == 1
     away = indenters(scene(motion={"depth_mm": -1.0}), 0.0)
@@ -64,7 +62,7 @@ def test_a_start_in_equilibrium_costs_one_iteration_and_no_force_costs_none(body
 
 
 def test_a_solve_that_goes_too_far_has_not_converged(body: System) -> None:
-    """And ends there. Fails with a reach that is left out."""
+    """And ends there."""
     free = press(body)
     moved = float(np.linalg.norm(free.state.u, axis=1).max())
     for share in (0.5, 4.0):
@@ -75,7 +73,6 @@ def test_a_solve_that_goes_too_far_has_not_converged(body: System) -> None:
 
 
 def test_double_factor_solves_to_double_precision() -> None:
-    """Fails with single left out of `direct_factor`'s arguments: 1e-6."""
     options = SolverOptions(single_precision=False, reuse_factors=False)
     stepper = stepper_of(Press.of(scene(numerics={"element": "p2p1"}), MESH), options=options)
     body = stepper.system

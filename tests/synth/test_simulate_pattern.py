@@ -1,7 +1,6 @@
 """The sparse pattern of the tangent: shared by meshes of one topology, and by nothing else.
 
-Each comment "fails with" names a change of `synth.simulate.pattern` that was tried. That every entry lands where it
-belongs is in test_simulate_bulk (tangent against differences).
+That every entry lands where it belongs is in test_simulate_bulk (tangent against differences).
 """
 
 from dataclasses import replace
@@ -34,16 +33,14 @@ def others_of(space: Space, count: int) -> list[Space]:
 
 @pytest.mark.parametrize("element", MIXED)
 def test_same_topology_shares_the_pattern_and_its_factor(element: str) -> None:
-    # Fails with the coordinates in the key.
     assert not np.array_equal(MESH.points, OTHER.points)
     one, other = (pattern_of(function_space(mesh, ELEMENT[element]()), True) for mesh in (MESH, OTHER))
     assert one is other
     assert one.factor() is other.factor()
-    assert one.factor() is not one.factor(single=False)  # fails with one factor for both
+    assert one.factor() is not one.factor(single=False)
 
 
 def test_what_differs_in_topology_does_not_share() -> None:
-    # Fails with pressure_nodes, held or mixed left out of the key.
     space = function_space(MESH, ELEMENT["p1p1"]())
     shuffled = MESH.tets[np.random.default_rng(0).permutation(len(MESH.tets))]
     others = [
@@ -60,7 +57,6 @@ def test_what_differs_in_topology_does_not_share() -> None:
 
 
 def test_only_the_last_few_are_kept() -> None:
-    # Fails without popitem, or with the oldest kept: a job of many meshes would fill the memory.
     space = function_space(MESH, ELEMENT["p1p1"]())
     first = pattern_of(space, True)
     most = pattern_module._MAX_CACHED
@@ -72,8 +68,6 @@ def test_only_the_last_few_are_kept() -> None:
 
 def test_entries_are_bounded_too(monkeypatch: pytest.MonkeyPatch) -> None:
     """The last ones stay that are together within the bound, and the very last whatever its size."""
-    # Fails with the bound taken for one pattern's entries, with more than it kept, and without `len(_CACHED) > 1`,
-    # which forgets the pattern that was asked for.
     space = function_space(MESH, ELEMENT["p1p1"]())
     large = function_space(MESH, ELEMENT["p2p1"]())
     spaces = others_of(space, 4)

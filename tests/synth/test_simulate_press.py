@@ -1,7 +1,4 @@
-"""Whole trajectories: equilibrium of forces, symmetry, scaling, independence of numerics, and honest failure.
-
-Each comment "fails with" names a change of `synth.simulate` that was tried.
-"""
+"""Whole trajectories: equilibrium of forces, symmetry, scaling, independence of numerics, and honest failure."""
 
 from functools import cache
 
@@ -70,7 +67,6 @@ def test_centred_press_is_mirror_symmetric(indenter: dict, friction: float, elem
 
 
 def test_mirrored_motion_gives_the_mirrored_state() -> None:
-    # Fails with abs() around the twist in `pose`.
     motion = {**DRAG, "shear_mm": [-0.8, -0.3], "twist_deg": -10.0, "position_mm": [-0.4, 0.2]}
     one, other = dragged().states[-1], simulate(gentle(motion=motion), MESH).states[-1]
     # Newton stops at 1e-6 on every step, and with 1e-3 between the records, whose errors friction remembers.
@@ -79,7 +75,6 @@ def test_mirrored_motion_gives_the_mirrored_state() -> None:
 
 
 def test_youngs_modulus_scales_forces_only() -> None:
-    # Fails with the modulus left out of a record.
     hard = simulate(gentle(gel={"youngs_modulus_kpa": 200e3}), MESH)
     for s, t in zip(dragged().states, hard.states, strict=True):
         assert (s.displacement == t.displacement).all()
@@ -91,7 +86,6 @@ def test_youngs_modulus_scales_forces_only() -> None:
 
 def test_layers_whose_moduli_differ_alike_deform_alike() -> None:
     """Deformation depends on ratios of moduli only, so that such scenes may share a batch."""
-    # Fails with absolute moduli in `_elastic`.
     film = {"thickness_mm": 1.0, "youngs_modulus_kpa": 600.0}
     soft = gentle(gel={"layers": [film]})
     hard = gentle(gel={"youngs_modulus_kpa": 400.0, "layers": [{**film, "youngs_modulus_kpa": 1200.0}]})
@@ -136,7 +130,6 @@ def test_body_beside_the_pad_touches_nothing() -> None:
 @each
 def test_slides_off_the_pad(element: str) -> None:
     """Once the indenter has left, the gel springs back: only rounding is left, which is equilibrium."""
-    # Fails with the relative residual not floored by FORCE_FLOOR.
     motion = {"depth_mm": 0.3, "shear_mm": [6.0, 0.0], "position_mm": [3.0, 0.0], "steps": 6}
     ball = {"shape": "sphere", "radius_mm": 2.0}
     posed = scene(indenter=ball, friction=0.1, motion=motion, numerics={"element": element})
@@ -149,7 +142,6 @@ def test_slides_off_the_pad(element: str) -> None:
 
 @each
 def test_release_gives_the_undeformed_pad_back(element: str) -> None:
-    # Fails with contact not restored after a record, or without FORCE_FLOOR.
     motion = {**DRAG, "then": [{"depth_mm": 0.0, "shear_mm": [0.8, -0.3], "twist_deg": 10.0}], "steps": 3}
     result = simulate(gentle(motion=motion, numerics={"element": element}), MESH)
     assert (result.status, len(result.states)) == ("complete", 4)
@@ -199,7 +191,6 @@ class Broken:
 
 @pytest.mark.parametrize("how", ["refuses", "nan", "nonsense"])
 def test_a_solver_that_fails_is_a_failed_trajectory(monkeypatch: pytest.MonkeyPatch, how: str) -> None:
-    # Fails with a sample whose step is NaN counted as converged.
     monkeypatch.setattr(pattern, "_CACHED", type(pattern._CACHED)())
     monkeypatch.setattr(pattern, "direct_factor", lambda *_: Broken(how))
     result = simulate(gentle(), brick(counts=(2, 2, 1)))
@@ -210,7 +201,6 @@ def test_a_solver_that_fails_is_a_failed_trajectory(monkeypatch: pytest.MonkeyPa
 
 @each
 def test_step_length_does_not_change_a_press_without_friction(element: str) -> None:
-    # Fails with Newton stopped at a residual of 0.3.
     motion = {"depth_mm": 0.8, "steps": 2}
     steps = (0.4, 0.25, 0.05)
     ends = [

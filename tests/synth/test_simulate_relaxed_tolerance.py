@@ -1,7 +1,4 @@
-"""What the relaxed tolerance holds for and what not: states, multipliers, and records that do not come about.
-
-Each comment "fails with" names a change of `synth.simulate.stepping` that was tried.
-"""
+"""What the relaxed tolerance holds for and what not: states, multipliers, and records that do not come about."""
 
 from dataclasses import replace
 from itertools import product
@@ -43,8 +40,6 @@ def residuals(result: Trajectory) -> list[float]:
 
 def test_wanted_states_meet_the_full_tolerance_and_others_the_relaxed_one() -> None:
     """The last one, alone wanted, is the same to the bit."""
-    # Fails with all recorded states polished, with a relaxed tolerance of 0.3, and with the gaps of the
-    # corrected state left for what `update_contact_history` looks at.
     every, last = (simulate(pressed(steps=4), MESH, frames=f, options=RELAXED) for f in (None, frozenset({4})))
     assert max(residuals(every)) <= TOLERANCE
     *others, wanted = residuals(last)
@@ -54,8 +49,6 @@ def test_wanted_states_meet_the_full_tolerance_and_others_the_relaxed_one() -> N
 
 
 def test_multipliers_are_updated_from_tight_states(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Fails without the polish before the passes, with passes solved to the relaxed tolerance, and with multipliers not
-    # put back, or the residual not evaluated anew, after a pass that failed.
     stepper = stepper_of(Press.of(pressed(), MESH), options=replace(RELAXED, correction_iterations=2))
     body = stepper.system
     residual, augment = body.residual, body.augment
@@ -118,8 +111,6 @@ def followed(stepper: Stepper, losing: Losing, monkeypatch: pytest.MonkeyPatch) 
 
 @each
 def test_a_lost_record_leaves_no_trace_and_is_tried_again(monkeypatch: pytest.MonkeyPatch, polish: str) -> None:
-    # Fails with a state recorded that is not converged, with good steps that do not ask `_record`, with contact put
-    # back or settled as if the step were good, and with self.state set before the record.
     losing = Losing(monkeypatch, most=1, polish=polish)
     result, _ = followed(stepper_of(Press.of(pressed(), MESH), options=RELAXED), losing, monkeypatch)
     assert losing.lost == 1
@@ -130,7 +121,6 @@ def test_a_lost_record_leaves_no_trace_and_is_tried_again(monkeypatch: pytest.Mo
 @each
 def test_a_record_that_is_always_lost_ends_the_path(monkeypatch: pytest.MonkeyPatch, polish: str) -> None:
     """Each loss halves what is left of the path, so that SHORTEST_STEP is soon reached."""
-    # Fails with a lost record that counts as a good step: then it ends "complete", without the state.
     losing = Losing(monkeypatch, most=1000, polish=polish)
     posed = pressed(steps=1)
     result, steps = followed(stepper_of(Press.of(posed, MESH), options=RELAXED), losing, monkeypatch)
@@ -143,7 +133,6 @@ def test_a_record_that_is_always_lost_ends_the_path(monkeypatch: pytest.MonkeyPa
 
 def test_relaxed_steps_end_where_tight_ones_do() -> None:
     """With the standard options; friction remembers the load path, and so its error."""
-    # Fails with a relaxed tolerance of 1e-2.
     posed = gentle(friction=0.4)
     given = (STANDARD, SolverOptions(relaxed_tolerance=0.0))
     relaxed, tight = (simulate(posed, brick(), options=options) for options in given)
@@ -158,7 +147,6 @@ def test_relaxed_steps_end_where_tight_ones_do() -> None:
 
 
 def test_relaxed_and_extrapolated_steps_save_iterations() -> None:
-    """Fails with the options not handed on by `simulate`, and with either without effect."""
     posed = scene(friction=0.0, motion={"depth_mm": 0.6, "steps": 1}, numerics={"max_step_mm": 0.1})
     exact = replace(STANDARD, reuse_factors=False)  # rough directions save time, not iterations
     counts = []

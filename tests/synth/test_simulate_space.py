@@ -1,8 +1,4 @@
-"""Function spaces: where displacement and pressure live, what can touch; fields at points of the contact face.
-
-Each comment "fails with" names a change of `synth.simulate.space`, `synth.simulate.probe` or `synth.surface` that was
-tried.
-"""
+"""Function spaces: where displacement and pressure live, what can touch; fields at points of the contact face."""
 
 from collections.abc import Callable
 
@@ -28,7 +24,6 @@ def space_of(element: str, mesh: PadMesh = MESH) -> Space:
 
 
 def test_quadratic_nodes_lie_on_the_middles_of_edges() -> None:
-    # Fails with the order of the middles reversed, of the elements or of the faces.
     space = space_of("p2p1")
     assert len(np.unique(space.points.round(9), axis=0)) == len(space.points)  # an edge has one node
     for k, (i, j) in enumerate(EDGES):
@@ -41,7 +36,6 @@ def test_quadratic_nodes_lie_on_the_middles_of_edges() -> None:
 
 @each
 def test_bonded_face_is_held_and_no_other_node(element: str) -> None:
-    # Fails with `any` for `all` of an edge's ends.
     space = space_of(element)
     assert (space.held == (space.points[:, 2] == MESH.size_mm[2])[:, None]).all()
 
@@ -73,7 +67,6 @@ def test_coated_surface_is_the_face_at_z_0(element: str) -> None:
 
 @each
 def test_pressure_is_doubled_at_interfaces(element: str) -> None:
-    # Fails with the layer left out of the pressure's numbering.
     mesh = brick((4.0, 4.0, 3.0), (2, 2, 3))
     plain, double = space_of(element, mesh), space_of(element, layered(mesh, interface=1.0))
     assert plain.pressures == len(mesh.points)
@@ -88,7 +81,6 @@ def test_pressure_is_doubled_at_interfaces(element: str) -> None:
 
 @pytest.mark.parametrize("shape", [quadratic_face, broken_linear_face])
 def test_shape_functions_are_a_partition_of_unity(shape: Callable[[FloatArray], FloatArray]) -> None:
-    # Fails with 1 + 2 b for 1 - 2 b in the inner triangle, or 2 b - 1 not cut off at 0.
     corners = np.eye(3)
     nodes = np.array([*corners, *(corners[[i, j]].mean(axis=0) for i, j in FACE_EDGES)])
     at = np.concatenate([np.random.default_rng(0).dirichlet(np.ones(len(corners)), 500), nodes])
@@ -107,7 +99,6 @@ def field(points: Points, degree: int) -> FloatArray:
 
 @pytest.mark.parametrize(("element", "degree"), [("p1p1", 1), ("p2p1", 2)])
 def test_probe_reproduces_the_elements_polynomials(element: str, degree: int) -> None:
-    # Fails with linear shape functions on quadratic faces, or the second and third barycentric coordinate exchanged.
     space = space_of(element, crooked((6.0, 4.0, 2.0)))
     half = np.array(space.mesh.size_mm[:2]) / 2
     points = np.random.default_rng(2).uniform(-half, half, (300, 2))
@@ -126,6 +117,5 @@ def test_probe_at_nodes_takes_their_values(element: str) -> None:
 
 
 def test_probe_beside_the_pad_is_an_error() -> None:
-    # Fails with OUTSIDE = 1.
     with pytest.raises(InputError, match="no point of the contact face"):
         probe(space_of("p1p1"), np.array([[0.0, 0.0], [MESH.size_mm[0] / 2 + 0.01, 0.0]]))

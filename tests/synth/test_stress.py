@@ -1,7 +1,4 @@
-"""`synth stress`: the checker sees what is wrong, the processes are watched, and the shipped expectations make sense.
-
-Each comment "fails with" names a change of `synth.stress` that was tried.
-"""
+"""`synth stress`: its check sees what is wrong, the processes are watched, and shipped expectations make sense."""
 
 import csv
 import json
@@ -92,7 +89,6 @@ def test_a_sound_result_is_as_expected() -> None:
     ],
 )
 def test_no_result_may(wrong: dict[str, Any], message: str) -> None:
-    """Fails with a tenfold tolerance, without the stored det F, or without the look at the fields' numbers."""
     lenient = {"outcome": ["complete", "partial"], "deviation": {"outcome": ["complete", "partial"], "because": "b"}}
     verdict = evaluate(result(run(**lenient), **wrong), {})
     assert any(message in text for text in verdict.broken), verdict.broken
@@ -115,7 +111,6 @@ def test_no_result_may(wrong: dict[str, Any], message: str) -> None:
     ],
 )
 def test_expectations_are_compared(entry: dict[str, Any], ended: dict[str, Any], message: str) -> None:
-    """Fails with the upper bounds left out, or with the smallest difference in place of the largest."""
     verdict = evaluate(result(run(**entry), **ended), {"b": result()})
     assert any(message in text for text in verdict.broken), verdict.broken
 
@@ -133,10 +128,7 @@ def test_a_noted_deviation_is_accepted_only_as_it_is_noted() -> None:
 
 
 def test_jacobian_of_linear_and_quadratic_elements() -> None:
-    """An affine map has det F everywhere; u_x = c x^2 has 1 + 2 c x.
-
-    Fails with the midpoints' derivatives exchanged.
-    """
+    """An affine map has det F everywhere; u_x = c x^2 has 1 + 2 c x."""
     space = function_space(MESH, p2p1())
     places = np.concatenate([np.eye(4), GAUSS])
     for points, nodes in ((MESH.points, MESH.tets), (space.points, space.nodes)):
@@ -155,10 +147,7 @@ def test_jacobian_of_linear_and_quadratic_elements() -> None:
 
 
 def test_a_quadratic_element_folded_at_a_corner_is_held_against_any_state() -> None:
-    """1 + 2 c x changes sign between the corner at x = -4 and the nearest integration point at -3.72 (b = 0.138).
-
-    Fails with the last state's corners alone, or with the largest of the states.
-    """
+    """1 + 2 c x changes sign between the corner at x = -4 and the nearest integration point at -3.72 (b = 0.138)."""
     space = function_space(MESH, p2p1())
     square = np.zeros_like(space.points)
     square[:, 0] = space.points[:, 0] ** 2 / (2 * 3.85)
@@ -192,7 +181,6 @@ def test_measured_are_of_the_last_state_or_the_worst() -> None:
     ],
 )
 def test_processes_are_watched(tmp_path: Path, script: str, budget: float, outcome: str, message: str) -> None:
-    """Fails without the timeout (by taking a minute), with the folder not emptied, or without the exit status."""
     asked = replace(run(), budget_s=budget)
     (tmp_path / "case").mkdir()
     (tmp_path / "case" / "run.json").write_text('{"element": "p1p1"}')
@@ -242,7 +230,6 @@ set = ["sensor.gel.size_mm=[20000, 15000, 4000]"]
 
 
 def test_a_small_suite_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Fails with status 0 for any good case, with no partner for a comparison, or with folders left in messages."""
     scenes, out = tmp_path / "scenes", tmp_path / "out"
     scenes.mkdir()
     (scenes / "base.toml").write_text((EXTREME / "base.toml").read_text())

@@ -27,7 +27,6 @@ def context(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> JobContext:
 
 
 def test_textures_are_painted_in_order_and_few_at_a_time(context: JobContext, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Fails with the last texture asked for painted first, and without regard to room.
     begun: list[int] = []
     lock = threading.Lock()
 
@@ -53,7 +52,6 @@ def test_textures_are_painted_in_order_and_few_at_a_time(context: JobContext, mo
 
 
 def test_one_thread_each_leaves_the_environment_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Fails without the values of before.
     monkeypatch.setenv(THREADS[0], "3")
     monkeypatch.delenv(THREADS[1], raising=False)
     with one_thread_each():
@@ -63,11 +61,8 @@ def test_one_thread_each_leaves_the_environment_as_it_was(monkeypatch: pytest.Mo
 
 
 @pytest.mark.skipif(not HAS_PROC, reason="reads child processes' environment in Linux's /proc")
-def test_finishing_workers_use_one_thread_each(
-    context: JobContext, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_finishing_workers_use_one_thread_each(context: JobContext, tmp_path: Path, monkeypatch) -> None:
     """Fifteen of them beside a solver would fight for the cores."""
-    # Fails with workers that are started as this process is.
     for name in THREADS:
         monkeypatch.setenv(name, "7")
     (tmp_path / "d" / "samples").mkdir(parents=True)

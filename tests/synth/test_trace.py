@@ -129,7 +129,6 @@ def _meetings(positions, triangles, camera):
 @pytest.mark.parametrize("view", [{}, {"index": 1.45, "distortion": LENS}, {"index": 1.41, **OBLIQUE}, FISHEYE])
 @pytest.mark.parametrize("state", STATES)
 def test_every_ray_that_meets_the_surface_more_than_once_is_found(state: str, view: dict) -> None:
-    """Fails with every triangle taken to face the camera: the overhang's pixels are not found."""
     camera = optics(**view)
     triangles = SURFACE.triangles
     found = may_overlap(STATES[state], triangles, boundary_edges(triangles), camera, SIZE)
@@ -145,11 +144,7 @@ def test_every_ray_that_meets_the_surface_more_than_once_is_found(state: str, vi
 
 @pytest.mark.parametrize("size", [(40.0, 30.0), (3.0, 2.0)])
 def test_one_sheet_above_another(size: tuple[float, float]) -> None:
-    """Two pieces that both face the camera.
-
-    Fails with any winding number allowed: the large piece, whose edges are not seen. Fails with edges allowed in the
-    picture: the small one.
-    """
+    """Two pieces that both face the camera."""
     upper = sheet(24, 18, *size)
     lower, shift = SURFACE.material, np.array([4.0, 2.0, 1.0])
     positions = np.concatenate([lower, upper.material + (shift if size[0] < 10 else [0, 0, 1.0])])
@@ -168,7 +163,6 @@ def test_mirrors_are_always_looked_at() -> None:
 
 @pytest.mark.parametrize("view", [{}, {"mirrors": SIDES}, {"index": 1.45, "distortion": LENS}])
 def test_a_kept_view_gives_what_a_new_one_gives(view: dict) -> None:
-    """Fails with a state recognised by its shape: every pair gets the first one's hits."""
     camera, states = optics(**view), list(STATES.values())
     kept = View(SURFACE, camera, *SIZE)
     for i, j in ((0, 1), (1, 2), (2, 0), (0, 1), (2, 1)):
@@ -181,7 +175,6 @@ def test_a_kept_view_gives_what_a_new_one_gives(view: dict) -> None:
 
 
 def test_a_view_of_something_else_is_refused() -> None:
-    """Fails with any one of the four left out of the comparison."""
     camera = optics()
     view, same = View(SURFACE, camera, *SIZE), (SURFACE.material, SURFACE.material)
     twin = GelSurface(ContactFaces(SURFACE.coarse.nodes, SURFACE.coarse.faces), SURFACE.subdivisions)

@@ -1,7 +1,6 @@
 """What the indenter exerts, the window bears: forces and moments, with the stresses integrated in numpy.
 
-`integrals` finds stresses and nodal forces from displacements and pressures apart from the solver's kernels. Each
-comment "fails with" names a change of `synth.simulate` that was tried.
+`integrals` finds stresses and nodal forces from displacements and pressures apart from the solver's kernels.
 """
 
 import numpy as np
@@ -47,8 +46,6 @@ def check(space: Space, displacement: FloatArray, internal: FloatArray, force: F
 @pytest.mark.parametrize("element", MIXED)
 def test_recorded_displacement_and_force_belong_together(element: str, friction: float) -> None:
     """Of a foam, whose stress is the displacement's alone: what the user gets, with multipliers and all."""
-    # Fails with the force taken before the augmented-Lagrangian passes, with undeformed arms in `forces`, and with
-    # λ log J for λ (J - 1).
     posed, mesh = case(element, 0.2, friction, DRAG), pad(False)
     result = simulate(posed, mesh)
     assert result.status == "complete"
@@ -64,11 +61,8 @@ def test_recorded_displacement_and_force_belong_together(element: str, friction:
     [(0.4999, DRAG, 0.6, True), (0.5, DRAG, 0.0, True), (0.5, DRAG, 0.6, False), (0.4999, BESIDE, 0.6, False)],
 )
 @pytest.mark.parametrize("element", MIXED)
-def test_window_bears_what_the_indenter_does(
-    element: str, nu: float, motion: dict, friction: float, layers: bool
-) -> None:
+def test_window_bears_what_the_indenter_does(element, nu, motion, friction, layers) -> None:
     """With a pressure field, a stiff film, and from the side."""
-    # Fails with undeformed arms in `forces`, and with γ = |p| for 2 |p|.
     posed, mesh = case(element, nu, friction, motion, layers), pad(layers)
     stepper = run(posed, mesh)
     body, state = stepper.system, stepper.state

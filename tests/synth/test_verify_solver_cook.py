@@ -57,8 +57,6 @@ def tip(element: str, cells: int) -> float:
 
 @pytest.mark.parametrize(("element", "cells"), REFERENCE)
 def test_tip_moves_as_known(element: str, cells: int) -> None:
-    # Fails with alpha = 20 and alpha = 0 (P1/P1), with one quadrature point for four and with γ = 60 |p| (P2/P1), and
-    # with a pressure field in the P1 element (P1).
     known = REFERENCE[element, cells]
     # The other program cuts the cells along other diagonals, which moves a discretisation error by up to a fifth.
     assert tip(element, cells) == pytest.approx(known, abs=0.2 * (CONVERGED - known))
@@ -66,6 +64,5 @@ def test_tip_moves_as_known(element: str, cells: int) -> None:
 
 def test_mixed_elements_do_not_lock() -> None:
     """With a quarter of the nodes Taylor-Hood is nearer than P1/P1, and that nearer than displacements alone."""
-    # Fails with the pressure field left out of P1/P1, and with alpha = 0 or 20.
     error = [CONVERGED - tip(element, 8) for element in ("p2p1", "p1p1", "p1")]
     assert 0 < error[0] < 0.2 * error[1] < 0.2 * 0.5 * error[2]

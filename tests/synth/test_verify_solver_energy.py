@@ -3,7 +3,6 @@
 Without friction the solver's steps are equilibria of an energy, so that only the trapezoidal rule of the account stands
 between the two sides: an error that falls with the square of the step. Friction's return map ends each step on the
 cone; the account's mean of the tractions at both ends makes it second order, too, except at points that begin to slip.
-Each comment "fails with" names a change of `synth.simulate` that was tried.
 """
 
 import numpy as np
@@ -45,8 +44,6 @@ def account(
 @pytest.mark.parametrize(("layers", "nu"), [(False, 0.2), (False, 0.4999), (False, 0.5), (True, 0.4999), (True, 0.5)])
 @pytest.mark.parametrize("element", MIXED)
 def test_work_of_a_press_is_stored(element: str, layers: bool, nu: float) -> None:
-    # Fails with the pressure along z in place of the normal, with λ log J for λ (J - 1), and with the sign of γ_c D²/2
-    # in the volume equation turned.
     entry = account(element, 20, PRESS, layers=layers, nu=nu)
     # F grows as δ^q, q = 1.5 to 2 or more on a thin layer: the trapezoidal rule takes q (q + 1) / 12 n² too much work.
     assert entry.lost == 0
@@ -56,7 +53,6 @@ def test_work_of_a_press_is_stored(element: str, layers: bool, nu: float) -> Non
 @pytest.mark.parametrize("element", MIXED)
 def test_work_of_a_drag_without_friction_is_stored(element: str) -> None:
     """Across the elements' edges and back: the contact's points come and go, and no energy with them."""
-    # Fails with the sign of γ_c D²/2 in the volume equation turned.
     back = {**DRAG, "then": [{"depth_mm": 0.5, "shear_mm": [0.0, 0.0]}]}
     entry = account(element, 48, back)
     assert entry.lost == 0
@@ -70,8 +66,6 @@ def test_work_of_a_drag_without_friction_is_stored(element: str) -> None:
 )
 @pytest.mark.parametrize("element", MIXED)
 def test_work_is_stored_or_rubbed_away(element: str, motion: dict, friction: float, layers: bool) -> None:
-    # Fails with the sign of the anchor's correction in `update_contact_history` turned, and with slipping anchors
-    # moved to the point itself (the elastic slip is then forgotten at each step).
     entry = account(element, 20, motion, friction, layers)
     assert entry.lost > 0.003 * entry.work
     # Second order, with 8 to 10 steps of 0.16 mm or 4 degrees a leg: measured 0.1 to 0.8 %.
@@ -80,7 +74,6 @@ def test_work_is_stored_or_rubbed_away(element: str, motion: dict, friction: flo
 
 @pytest.mark.parametrize("motion", [DRAG, TWIST])
 def test_account_closes_with_the_square_of_the_step(motion: dict) -> None:
-    # Fails with slipping anchors moved to the point itself.
     coarse, fine = (account("p1p1", steps, motion, 0.5).missing for steps in (10, 40))
     # A quarter of the step, a sixteenth of the error; half of that for points that begin to slip within a step.
     assert abs(fine) < abs(coarse) / 8

@@ -2,7 +2,7 @@
 
 The bodies are irregular meshes, supported so that the strain is uniform; linear and quadratic elements both contain the
 exact solution, so that only Newton's tolerance (1e-10 of the forces, `problems.TIGHT`) and the conditioning separate
-them from it. Each comment "fails with" names a change of `synth.simulate` that was tried.
+them from it.
 """
 
 from collections.abc import Callable
@@ -58,8 +58,6 @@ def check_bar(space: Space, material: Material, stretches: tuple[float, float], 
 @pytest.mark.parametrize("nu", RATIOS)
 @pytest.mark.parametrize("stretch", [1.5, 0.7])
 def test_uniaxial_stretch(stretch: float, nu: float, stiffening: Stiffening, element: Callable[[], Element]) -> None:
-    # Fails with 1 - nu for 1 - 2 nu in λ, with 2 for the 3 of 3 c3 s², with c2 halved, with log(J) not doubled in s,
-    # with the sign of p/λ turned in D, and with F g for F^-T g in the volumetric force.
     space = supported(MESH, element(), bar)
     lateral, stress = uniaxial(stretch, nu, stiffening)
     material = uniform(len(MESH.tets), nu, stiffening)
@@ -73,8 +71,6 @@ def test_uniaxial_stretch(stretch: float, nu: float, stiffening: Stiffening, ele
 @pytest.mark.parametrize("nu", RATIOS)
 def test_simple_shear(nu: float, stiffening: Stiffening, element: Callable[[], Element]) -> None:
     """Between glued plates, with the shear traction of the closed form as a dead load on the ends: γ = 0.8."""
-    # Fails with 4 W'' = 0 (Newton then does not reach the tolerance), with c2 halved, with 2 for 3 c3, and with F g for
-    # F^-T g in the volumetric force.
     gamma, space = 0.8, supported(MESH, element(), plates)
     exact = np.zeros_like(space.points)
     exact[:, 0] = gamma * (space.points[:, 2] - HEIGHT)
@@ -95,7 +91,6 @@ def test_layers_side_by_side_stretch_alike(element: Callable[[], Element]) -> No
 
     The pressure jumps at the interface, which one that is continuous through the pad could not follow.
     """
-    # Fails with one pressure unknown per vertex in function_space, whatever the layer.
     stretch, nu, ratio = 1.3, 0.5, 30.0
     lateral, yeoh = uniaxial(stretch, nu, YEOH)
     _, neo_hookean = uniaxial(stretch, nu, NEO_HOOKEAN)
@@ -113,7 +108,6 @@ def test_layers_side_by_side_stretch_alike(element: Callable[[], Element]) -> No
 
 def test_closed_forms_agree_with_each_other() -> None:
     """The stress of a general strain, the textbook's bar and the shear stress come from different formulas."""
-    # Fails with 1 / stretch - 2 for 2 / stretch - 3 in the invariant of the bar, and with 2 c3 for 3 c3 in the shear.
     for nu in RATIOS:
         for stiffening in (NEO_HOOKEAN, YEOH):
             lateral, stress = uniaxial(1.4, nu, stiffening)

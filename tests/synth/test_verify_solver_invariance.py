@@ -1,7 +1,4 @@
-"""What must not depend on the axes, and without friction not on the way: whole trajectories of layered pads.
-
-Each comment "fails with" names a change of `synth.simulate` that was tried.
-"""
+"""What must not depend on the axes, and without friction not on the way: whole trajectories of layered pads."""
 
 import numpy as np
 import pytest
@@ -39,8 +36,6 @@ def test_turned_pad_and_motion_turn_the_answer(element: str) -> None:
     motion = {"depth_mm": 0.6, "shear_mm": [0.4, -0.2], "twist_deg": 15.0, "position_mm": [0.5, 0.3], "steps": 3}
     turned = {**motion, "shear_mm": [0.2, 0.4], "position_mm": [-0.3, 0.5]}
     mesh = pad(layers=True)
-    # Fails with F g stretched by 2 % along x, with h_a h_b^T for h_b h_a^T in the tangent, and with `rotation *` left
-    # out of _trial (the last two do not converge).
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     across = (SIZE[1], SIZE[0], SIZE[2])
     other = PadMesh(mesh.points @ turn.T, mesh.tets, across, mesh.layer)
@@ -64,7 +59,6 @@ def test_end_does_not_remember_the_way_without_friction(element: str, indenter: 
     end = {"depth_mm": 0.5, "shear_mm": [0.5, 0.2]}
     straight = {"depth_mm": 0.5, "position_mm": [0.4, 0.1], "steps": 1}
     detour = {"depth_mm": 0.9, "position_mm": [-0.1, -0.1], "shear_mm": [-0.3, 0.4], "steps": 3, "then": [end]}
-    # Fails with multipliers of a record left in place for the way on.
     mesh = pad(layers=True)
     a = complete(case(element, 0.0, straight, indenter=indenter), mesh).states[-1]
     b = complete(case(element, 0.0, detour, indenter=indenter), mesh).states[-1]

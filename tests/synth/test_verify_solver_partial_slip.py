@@ -50,7 +50,6 @@ def wall_and_window(points: Points) -> BoolArray:
 
 
 def test_partial_slip_is_mindlins() -> None:
-    # Fails with the limit 5 % too high.
     depth = CONTACT**2 / RADIUS
     radii = np.concatenate([np.linspace(0, 1.15 * CONTACT, 4), growing(1.15 * CONTACT, FAR, 3, 2.0)])
     mesh = half_disc(radii, np.concatenate([[0.0], growing(0.0, FAR, 4, 2.2)]))

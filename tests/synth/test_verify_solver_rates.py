@@ -47,10 +47,7 @@ def bent(X: Points, swelling: float) -> Exact:
     """
     A, B = 0.3, 0.2
     x = X[..., 0] + A * (1 - X[..., 2]) * np.sin(2 * X[..., 1])
-    first = gradient(
-        X,
-        {(0, 1): 2 * A * (1 - X[..., 2]) * np.cos(2 * X[..., 1]), (0, 2): -A * np.sin(2 * X[..., 1])},
-    )
+    first = gradient(X, {(0, 1): 2 * A * (1 - X[..., 2]) * np.cos(2 * X[..., 1]), (0, 2): -A * np.sin(2 * X[..., 1])})
     Z = X[..., 2]
     y = X[..., 1] + B * np.cos(2 * x) * np.sin(Z)
     second = gradient(X, {(1, 0): -2 * B * np.sin(2 * x) * np.sin(Z), (1, 2): B * np.cos(2 * x) * np.cos(Z)})
@@ -100,8 +97,6 @@ def errors(element: Element, nu: float, cells: int) -> FloatArray:
 @pytest.mark.parametrize("element", [p1p1, p2p1])
 def test_errors_fall_at_the_rate_of_theory(element: Callable[[], Element], nu: float) -> None:
     """Displacement-only at 0.2, compressible mixed at 0.4, exactly incompressible at 0.5; Yeoh's law."""
-    # Fails with alpha = 0 and 20 (P1/P1), with one quadrature point for four, with 2 L_j for 4 L_j in the derivative of
-    # the edges' functions, and with c2 and c3 exchanged (P2/P1).
     made = element()
     degree = made.order
     coarse, fine = (4, 8) if degree == 1 else (3, 6)

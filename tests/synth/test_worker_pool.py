@@ -35,10 +35,7 @@ def _threads(context: JobContext) -> Callable[[Task], tuple[int, ...]]:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_a_worker_is_a_process_that_takes_one_core(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, workers: int
-) -> None:
-    """Fails without `render_on_one_core` in the worker, and with workers that are started as this process is."""
+def test_a_worker_is_a_process_that_takes_one_core(tmp_path: Path, monkeypatch, workers: int) -> None:
     for name in THREADS:
         monkeypatch.setenv(name, "2")
     monkeypatch.setattr(pool, "_trajectory_maker", _threads)
