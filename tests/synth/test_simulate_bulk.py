@@ -19,8 +19,7 @@ from synth.simulate.tables import laplace_table
 MESH = crooked()
 UNHELD = replace(MESH, size_mm=(*MESH.size_mm[:2], 99.0))
 """The same mesh with no node where the window would be: nothing is held."""
-GRADIENT = np.array([[0.06, 0.10, -0.04], [-0.03, 0.05, 0.08], [0.02, -0.06, -0.09]])
-"""Of an affine displacement."""
+GRADIENT = np.array([[0.06, 0.10, -0.04], [-0.03, 0.05, 0.08], [0.02, -0.06, -0.09]])  # Of an affine displacement
 LAWS = {"hooke": (0.0, 0.0), "yeoh": (0.7, 0.4), "yeoh, c3 alone": (0.0, 0.4), "yeoh, c2 alone": (0.7, 0.0)}
 
 
@@ -130,20 +129,15 @@ def turn(rng: np.random.Generator) -> FloatArray:
 
 
 @few
-def test_rigid_motion_is_free_of_stress(case: Case) -> None:
+def test_rigid_motion_is_free_of_stress_and_inner_forces_turn_with_the_body_and_cancel(case: Case) -> None:
     rng = np.random.default_rng(4)
     body = case.body()
     for _ in range(3):
         u = body.space.points @ (turn(rng) - np.eye(3)).T + rng.standard_normal(3)
         # A dozen products of numbers of order 1, times a bulk modulus of 1e3 that sees det F - 1 = 1e-16.
         assert np.abs(residual(body, Unknowns(u, body.zero().p))).max() < 1e-12
-
-
-@few
-def test_forces_turn_with_the_body(case: Case) -> None:
-    """Frame indifference: x -> Q x + c turns the forces by Q and leaves the volume equations alone."""
+    # Frame indifference: x -> Q x + c turns the forces by Q and leaves the volume equations alone.
     rng = np.random.default_rng(5)
-    body = case.body()
     state, Q, rest = random_state(body, rng), turn(rng), body.space.points
     turned = (rest + state.u) @ Q.T + rng.standard_normal(3) - rest
     before, after = residual(body, state), residual(body, Unknowns(turned, state.p))
@@ -151,11 +145,6 @@ def test_forces_turn_with_the_body(case: Case) -> None:
     scale = 1e-12 * np.abs(before).max()  # rounding as above
     np.testing.assert_allclose(after[:n].reshape(-1, 3), before[:n].reshape(-1, 3) @ Q.T, atol=scale)
     np.testing.assert_allclose(after[n:], before[n:], atol=scale)
-
-
-@few
-def test_inner_forces_and_moments_cancel(case: Case) -> None:
-    body = case.body()
     state = random_state(body, np.random.default_rng(6))
     force = residual(body, state)[: state.u.size].reshape(-1, 3)
     scale = 1e-13 * np.abs(force).sum()  # a sum of some hundred rounded forces
@@ -164,7 +153,7 @@ def test_inner_forces_and_moments_cancel(case: Case) -> None:
 
 
 @compressible
-def test_patch(case: Case) -> None:
+def test_patch_and_stress_of_a_uniform_strain(case: Case) -> None:
     """Affine displacement on the boundary of an irregular mesh: affine inside, with the exact constant pressure.
 
     (At nu = 0.5 the pressure would be free by a constant.)
@@ -188,12 +177,7 @@ def test_patch(case: Case) -> None:
     # Newton ends at rounding: 1e-16 times a condition number of some 1e5 (bulk over shear modulus, and the mesh).
     np.testing.assert_allclose(state.u, exact, atol=1e-11)
     np.testing.assert_allclose(state.p, lame_modulus(case.nu) * (np.linalg.det(np.eye(3) + GRADIENT) - 1), rtol=1e-9)
-
-
-@compressible
-def test_stress_of_a_uniform_strain(case: Case) -> None:
-    """Nodal forces do the work of the closed form's stress P = 2 W' (F - F^-T) + lambda J (J - 1) F^-T."""
-    body = case.body(held=False)
+    # Nodal forces do the work of the closed form's stress P = 2 W' (F - F^-T) + lambda J (J - 1) F^-T.
     F = np.eye(3) + GRADIENT
     p, rest = lame_modulus(case.nu) * (np.linalg.det(F) - 1), body.space.points
     full = residual(body, Unknowns(rest @ GRADIENT.T, np.full_like(body.zero().p, p)))

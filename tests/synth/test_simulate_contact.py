@@ -109,7 +109,7 @@ def test_nodal_forces_and_moments_are_the_tractions(element: str) -> None:
     np.testing.assert_allclose(share @ nodal, on_face, atol=scale)
 
 
-def test_augmenting_takes_the_present_traction() -> None:
+def test_augmenting_takes_the_present_traction_and_deepest_is_the_largest_penetration() -> None:
     made = touch(0.7, multipliers=False)
     contact = made.body.contact
     normal, along = sphere_law(made)
@@ -119,6 +119,13 @@ def test_augmenting_takes_the_present_traction() -> None:
     # Where the gap is closed exactly the traction then needs no penetration: t = lambda - eps g.
     again, _ = sphere_law(made)
     np.testing.assert_allclose(np.linalg.norm(again, axis=-1), 2 * np.linalg.norm(normal, axis=-1), atol=1e-12)
+    made = touch(0.0)
+    away = np.linalg.norm(made.points - made.centre, axis=-1)
+    assert made.body.deepest() == pytest.approx(RADIUS - away.min(), abs=1e-14)
+    made.indenters.centre.assign(np.array([[0.0, 0.0, -50.0]]))
+    made.evaluate()
+    assert made.body.deepest() == 0.0
+    assert made.body.slip_ratio(made.indenters) == 0.0
 
 
 @pytest.mark.parametrize("fresh", [0.0, 0.5])
@@ -143,7 +150,7 @@ def test_settling_keeps_the_tractions(multipliers: bool, fresh: float) -> None:
     assert (contact.gap.numpy()[0] == body.gap.numpy()[0]).all()
 
 
-def test_new_contact_is_anchored_where_it_touched() -> None:
+def test_new_contact_is_anchored_where_it_touched_unless_without_past_or_friction() -> None:
     """A point that came through the surface in a straight line is anchored where it passed it, also before a pass."""
     made = touch(STICK, multipliers=False, fresh=1.0)
     body, contact = made.body, made.body.contact
@@ -157,10 +164,7 @@ def test_new_contact_is_anchored_where_it_touched() -> None:
     share = (gap / (gap - now))[..., None]
     expected = place + share * (made.local - place)
     np.testing.assert_allclose(contact.anchor.numpy()[0][touching], expected[touching], atol=1e-13)
-
-
-def test_new_contact_without_a_past_has_no_friction() -> None:
-    """Before the first step, and where a point was too far off to be looked at."""
+    # Before the first step, and where a point was too far off to be looked at.
     made = touch(0.7, multipliers=False, fresh=1.0)
     body, contact = made.body, made.body.contact
     contact.gap.fill_(FAR)
@@ -175,9 +179,6 @@ def test_new_contact_without_a_past_has_no_friction() -> None:
     made.evaluate()
     # Anchors are where the points are but for rounding, which the penalty multiplies.
     np.testing.assert_allclose(made.tractions[1], 0.0, atol=1e-13)
-
-
-def test_no_friction_no_state() -> None:
     made = touch(0.0, multipliers=False, fresh=1.0)
     contact = made.body.contact
     anchor = contact.anchor.numpy().copy()
@@ -196,16 +197,6 @@ def test_slip_ratio_is_the_slipping_share_of_area(friction: float) -> None:
     expected = weight[mode == 2].sum() / weight[mode > 0].sum()
     assert made.body.slip_ratio(made.indenters) == pytest.approx(expected, rel=1e-12)
     assert {0.0: expected == 1, 0.7: 0 < expected < 1, STICK: expected < 0.1}.get(friction, expected > 0.8)
-
-
-def test_deepest_is_the_largest_penetration() -> None:
-    made = touch(0.0)
-    away = np.linalg.norm(made.points - made.centre, axis=-1)
-    assert made.body.deepest() == pytest.approx(RADIUS - away.min(), abs=1e-14)
-    made.indenters.centre.assign(np.array([[0.0, 0.0, -50.0]]))
-    made.evaluate()
-    assert made.body.deepest() == 0.0
-    assert made.body.slip_ratio(made.indenters) == 0.0
 
 
 @each

@@ -109,7 +109,7 @@ def test_gmres_solves_with_the_remainder(kind: Any, rest: csr_matrix | None) -> 
     np.testing.assert_allclose(gmres(matrix, rest, factor, b, 1e-12)[0], exact, atol=1e-9 * np.abs(exact).max())
 
 
-def test_gmres_ends_after_the_remainders_rank() -> None:
+def test_gmres_ends_after_the_remainders_rank_at_its_limit_without_right_side_or_in_nan() -> None:
     """(S + R) S^-1 is the identity but for a matrix of R's rank: one iteration more than that is enough."""
     matrix, b = saddle(1), right_side(1)
     factor = SuperLUFactor(matrix.indptr, matrix.indices)
@@ -117,22 +117,13 @@ def test_gmres_ends_after_the_remainders_rank() -> None:
     for rank in (1, 5, 12):
         assert gmres(matrix, remainder(rank), factor, b, 1e-10)[1] <= rank + 1
     assert gmres(matrix, None, factor, b, 1e-10)[1] == 1
-
-
-def test_gmres_without_a_right_side() -> None:
     matrix = saddle(1)
     x, iterations, _ = gmres(matrix, remainder(5), SuperLUFactor(matrix.indptr, matrix.indices), np.zeros(SIZE))
     assert not x.any()
     assert iterations == 0
-
-
-def test_gmres_passes_nan_on() -> None:
     broken: Any = SimpleNamespace(apply=lambda right: np.full_like(right, np.nan))
     assert np.isnan(gmres(saddle(1), None, broken, right_side(1))[0]).all()
-
-
-def test_gmres_stops_at_its_limit() -> None:
-    """A remainder too large for so few iterations: the best direction so far, not an endless loop."""
+    # A remainder too large for so few iterations: the best direction so far, not an endless loop.
     matrix, rest, b = saddle(1), remainder(60, 50.0), right_side(1)
     factor = SuperLUFactor(matrix.indptr, matrix.indices)
     factor.factorise(matrix.data)
@@ -152,7 +143,7 @@ def nearly(matrix: csr_matrix, rank: int) -> csr_matrix:
     return changed
 
 
-def test_factor_is_reused_while_it_serves(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_factor_is_reused_while_it_serves_and_made_anew_where_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(linear, "MAX_REUSE_ITERATIONS", 4)
     first, b = saddle(1), right_side(1)
     factor = SuperLUFactor(first.indptr, first.indices)
@@ -171,9 +162,6 @@ def test_factor_is_reused_while_it_serves(monkeypatch: pytest.MonkeyPatch) -> No
     alone = LinearSolver(SuperLUFactor(first.indptr, first.indices), reuse=True)
     LinearSolver(factor, reuse=True).solve(first, None, b)
     np.testing.assert_array_equal(one.solve(near, None, b, rough=True), alone.solve(near, None, b, rough=True))
-
-
-def test_factor_is_made_anew_where_told() -> None:
     matrix, b = saddle(1), right_side(1)
     factor = SuperLUFactor(matrix.indptr, matrix.indices)
     never = LinearSolver(factor, reuse=False)

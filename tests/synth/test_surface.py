@@ -40,7 +40,7 @@ def test_refined_sheet_is_one_and_conforming(coarse: ContactFaces, n: int) -> No
 
 
 @pytest.mark.parametrize("n", SUBDIVISIONS)
-def test_triangles_keep_area_and_orientation(n: int) -> None:
+def test_triangles_keep_area_and_orientation_nodes_and_affine_fields_their_values(n: int) -> None:
     surface = GelSurface(CROOKED, n)
     area = normals(surface.material, surface.triangles) / 2
     assert (area[:, 2] < 0).all()
@@ -48,10 +48,6 @@ def test_triangles_keep_area_and_orientation(n: int) -> None:
     whole = np.repeat(normals(CROOKED.nodes, CROOKED.faces)[:, 2] / 2, n * n) / n**2
     # The n * n parts of a face follow each other and are equal, to rounding.
     np.testing.assert_allclose(area[:, 2], whole, rtol=1e-9)
-
-
-@pytest.mark.parametrize("n", SUBDIVISIONS)
-def test_nodes_are_interpolated_and_affine_fields_exact(n: int) -> None:
     surface, rng = GelSurface(CROOKED, n), np.random.default_rng(1)
     nodal = rng.standard_normal((len(CROOKED.nodes), 3))
     A, b = rng.standard_normal((3, 3)), rng.standard_normal(3)
@@ -90,7 +86,7 @@ def test_quadratic_fields_are_exact_inside_a_regular_mesh(n: int) -> None:
     assert linear[inside].max() > 0.2
 
 
-def test_smooth_fields_converge_at_third_order() -> None:
+def test_smooth_fields_converge_at_third_order_and_the_map_is_local() -> None:
     """Halving the edges divides the error inside by 8, where linear interpolation divides it by 4."""
 
     def errors(cells: int) -> tuple[float, float]:
@@ -107,9 +103,6 @@ def test_smooth_fields_converge_at_third_order() -> None:
     # The next term of the expansion is an edge length smaller, 0.25 of the leading one at worst: rates 3 and 2, -0.3.
     assert np.log2(coarse / fine) > 2.7
     assert 1.7 < np.log2(coarse_linear / fine_linear) < 2.3
-
-
-def test_the_map_is_linear_and_local() -> None:
     surface = GelSurface(CROOKED, 2)
     one = np.zeros((len(CROOKED.nodes), 1))
     node = int(np.argmin(np.linalg.norm(CROOKED.nodes, axis=1)))
