@@ -9,15 +9,17 @@ import cv2
 import numpy as np
 import pytest
 import tomli_w
+from numpy.typing import NDArray
 from PIL import ExifTags, Image
 from render_scenes import FAST, needs_llvm, small_sensor
 
 from synth.arrays import FloatArray
-from synth.calibrate.dot_grid import grid_index, pattern_points
+from synth.calibrate.dot_grid import fit_dot_grid, grid_index, pattern_points
 from synth.calibrate.dots import find_dots
 from synth.calibrate.frames import Frames, read_frames
 from synth.calibrate.irradiance import FlatGel, LightGeometry
 from synth.calibrate.noise import fit_noise
+from synth.calibrate.preset import start_sensor
 from synth.calibrate.profile import fit_profile
 from synth.calibrate.run import MARK
 from synth.calibrate.sensor_fit import SensorFit, fit_sensor
@@ -279,7 +281,7 @@ def refusal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[...,
 
 @pytest.mark.parametrize("spacing", ["-3", "nan", "0", "0.1", "100", "inf"])
 def test_a_spacing_that_no_dots_have_is_refused(refusal: Callable[..., str], spacing: str) -> None:
-    assert f"--spacing-mm = {spacing}: must be from 0.458 to 7.32 mm" in refusal(f"--spacing-mm={spacing}")
+    assert f"--spacing-mm = {spacing}: must be from 0.475 to 7.6 mm" in refusal(f"--spacing-mm={spacing}")
     assert "has no dots" in refusal("--scene", "digit", "--spacing-mm=1")
 
 
@@ -318,11 +320,28 @@ def test_noise_is_measured_through_the_response() -> None:
 def test_a_real_frame_that_was_not_fitted_is_met_within_8_levels(tmp_path: Path) -> None:
     """Undeformed gels after the object was lost; measured 3.9, 2.0 and 5.0 of 255."""
     for name, number in [("screw_driver_red__exp_num_2__camera_0", 344), ("avocado_real__exp_num_7__camera_0", 408)]:
-        clip = cv2.VideoCapture(os.fspath(CLIPS / f"{name}.avi"))
-        for _ in range(number + 1):
-            image = clip.read()[1]
-        cv2.imwrite(str(tmp_path / f"{number}.png"), image)
+        cv2.imwrite(str(tmp_path / f"{number}.png"), _real_frame(name, number))
     frames = ["--frames", str(tmp_path / "344.png"), "--judge", str(tmp_path / "408.png")]
     assert main(["calibrate", *frames, "--steps", "6", "--out", str(tmp_path / "out")]) == 0
     differences = json.loads((tmp_path / "out/calibration.json").read_text())["differences"]
     assert max(differences["not fitted: 408.png"]["mean_absolute_outside_dots"]) < 8
+
+
+@pytest.mark.skipif(not CLIPS.is_dir(), reason="the real recordings are not here")
+@pytest.mark.parametrize("name", ["cellotape__exp_num_3__camera_0", "screw_driver_blue_gray__exp_num_7__camera_2"])
+def test_real_dots_tell_the_lens_of_gelsight_mini(name: str) -> None:
+    """One frame overrules a preset without distortion; its k1 is the scene's within two of that one's deviations."""
+    shipped = start_sensor(load_scene("gelsight_mini"), (320, 240))
+    camera = shipped.camera.model_copy(update={"distortion": (0.0,) * 5})
+    plain = shipped.model_copy(update={"camera": camera})
+    dots = find_dots((_real_frame(name, 449) / 255.0) ** camera.gamma, 32.0)
+    found = fit_dot_grid(plain, plain.pattern, dots.centres, None)
+    assert found.camera.distortion[0] == pytest.approx(shipped.camera.distortion[0], abs=0.02)
+    assert np.sqrt((found.residual_px**2).sum(axis=1).mean()) < 0.6  # 1.2 without distortion
+
+
+def _real_frame(name: str, number: int) -> NDArray[np.uint8]:
+    clip = cv2.VideoCapture(os.fspath(CLIPS / f"{name}.avi"))
+    for _ in range(number + 1):
+        image = clip.read()[1]
+    return image
