@@ -4,9 +4,8 @@ One Mitsuba scene per sensor draw: the coated surface, the LEDs, and nothing out
 the opaque coating and never part of it. For a frame only vertex positions and normals are exchanged; several cameras
 are several sets of rays in that one scene.
 
-What it leaves out: light that the window's faces reflect back onto the gel, and light that the pad's sides reflect. The
-window's share is smooth, but not small; it comes on specular paths from small LEDs, which path tracing finds only by
-chance and then as bright specks (docs/decisions.md).
+Light that the window's outer face reflects back onto the gel comes from mirror images (`synth.render.window_images`);
+scalar variants, whose camera stands outside, leave it out. All leave out light that the pad's sides reflect.
 
 Pixels are box-filtered. In vectorised variants the samples of one pixel are neighbours in the wavefront and are summed
 in a fixed order, not by atomic adds: the same seed gives the same bits with any number of threads.

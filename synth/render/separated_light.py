@@ -2,7 +2,7 @@ r"""Light of a matt gel, each part sampled at its own rate: an alternative to pa
 
 A Lambertian surface's radiance is its albedo ρ times its irradiance E over π, and
 
-.. math::  E = \sum_l (E_l - B_l) + E_{bounced} .
+.. math::  E = \sum_l (E_l - B_l) + E_{bounced} + E_{returned} .
 
 - ρ is looked up, and the direct light E_l of light l is computed in closed form (`synth.render.polygon_light`), at
   every sample of every pixel: neither has any noise but the pixel filter's.
@@ -12,6 +12,9 @@ A Lambertian surface's radiance is its albedo ρ times its irradiance E over π,
 - E_bounced, light that the gel reflects onto itself, does not depend on the view. It is sampled at points of the gel's
   faces and projected (L²) onto functions that are linear on each face, or constant where few of the face's pilots saw
   gel: such faces get little, and its mean is less noisy than its slope. Where no pilot at all saw gel there is none.
+- The lights l include their mirror images behind the window (`synth.render.window_images`), which have no closed form.
+- E_returned, light that the gel sends to the window and gets back, is smooth. It is n · V with the normal n, and V is
+  fitted to sampled paths as polynomials of the place on the pad.
 
 What remains of systematic error: shadows that all pilot rays of a neighbourhood missed, and how bounced light departs
 from linear within one triangle; docs/reports/light.md measures both. Random numbers are the sampler's, sums are of
@@ -42,6 +45,8 @@ _STEP = 4
 """Bounced rays of a face are squares of its multiples: a sampler's size is compiled into the kernel."""
 _DEGREE = 4
 """Of the polynomials for light that comes back from the window: its path is longer than the pad is thick, so smooth."""
+_RETURNED = 2**17
+"""Paths by the window, to which they are fitted; more where there are many faces."""
 _SHIFT = (0.7548776662466927, 0.5698402909980532)
 """Of one light's shadow rays against the one before's: R2 sequence (Roberts 2018), on a torus to keep the strata."""
 
@@ -195,7 +200,7 @@ class SeparatedLight:
         import drjit as dr
 
         mi, faces = self._mi, len(often)
-        count = (_STEP * max(1, round(math.sqrt(rays / faces) / _STEP))) ** 2
+        count = _grid(rays, faces)
         sampler = self._sampler(count, faces, seed, 1)
         points = self._points(dr.arange(mi.UInt32, faces), count, sampler)
         values = _projected(self._bounces(points, sampler, False), points.weights, count, often)
@@ -205,8 +210,9 @@ class SeparatedLight:
         """Coefficients (channels of mi.Float) of what the gel sends to the window and gets back, in `_terms`."""
         import drjit as dr
 
-        sampler = self._sampler(PILOTS, faces, seed, 2)
-        points = self._points(dr.arange(self._mi.UInt32, faces), PILOTS, sampler)
+        count = _grid(_RETURNED, faces)
+        sampler = self._sampler(count, faces, seed, 2)
+        points = self._points(dr.arange(self._mi.UInt32, faces), count, sampler)
         values = self._bounces(points, sampler, True)
         terms = self._terms(points.at.p, points.normal)
         dr.eval(values, terms)
@@ -290,6 +296,11 @@ class SeparatedLight:
         at.n = mi.Normal3f(dr.normalize(dr.cross(b - a, c - a)))
         normal = sum(dr.gather(mi.Vector3f, normals, i) * w for i, w in zip(corners, weights, strict=True))
         return _Points(at, -dr.normalize(normal), weights)  # vertex normals point out of the gel
+
+
+def _grid(rays: int, faces: int) -> int:
+    """Rays of each face, of about so many in all."""
+    return (_STEP * max(1, round(math.sqrt(rays / faces) / _STEP))) ** 2
 
 
 def _projected(values: list[Any], weights: tuple[Any, Any, Any], count: int, is_linear: BoolArray) -> Image:

@@ -57,7 +57,7 @@ def test_images_behind_the_window_give_what_a_dielectric_interface_gives_by_chan
     found = np.stack([_by_chance(sensor, seed, 1.0) for seed in SEEDS])
     expected, error = found.mean(axis=0), found.std(axis=0, ddof=1).max() / np.sqrt(len(SEEDS))
     for light in ("path_traced", "separated"):
-        image = _blocks(rendered(sensor, render=Render(samples_per_pixel=256, max_depth=8, light=light)))
+        image = _blocks(rendered(sensor, render=Render(samples_per_pixel=256, max_depth=8, light=light), cells=1))
         assert image == pytest.approx(expected, abs=4 * error)
         assert image.mean() == pytest.approx(expected.mean(), rel=3e-3)
     # Fails without the images: they are a sixth of the light here.
