@@ -10,8 +10,8 @@ with the coating's BSDF f (Mitsuba's), θ at the face and θ' at the light. It i
 grid over the rectangle: no noise, and the same radiometry as the renderer's, with the shade that one light throws on
 another. The light's mirror image behind the window adds its own integral (`synth.render.window_images`), without shade;
 what the gel itself sends to the window and gets back is left out. Dr.Jit differentiates both with respect to the
-lights' centres, directions and sizes, shade and reflectance held. Mitsuba's path integrators would as well, with Monte
-Carlo noise in every step and for paths that an undeformed face has not.
+lights' centres, directions and sizes, the shade held. Mitsuba's path integrators would as well, with Monte Carlo noise
+in every step and for paths that an undeformed face has not.
 """
 
 from collections.abc import Callable
@@ -162,8 +162,8 @@ class FlatGel:
             return lit
         mi = self._mi
         flip, behind = mi.Vector3f(1, 1, -1), mi.Vector3f(0, 0, 2 * self._face)
-        kept = lambda away: dr.detach(reflectance(dr.abs(away.z), self._index, mi))  # noqa: E731
-        return lit + self._scattered(centre * flip + behind, direction * flip, size, kept)
+        image = (centre * flip + behind, direction * flip, size)
+        return lit + self._scattered(*image, lambda away: reflectance(dr.abs(away.z), self._index, mi))
 
     def _scattered(self, centre: Any, direction: Any, size: Any, share: Callable[[Any], Any]) -> Any:
         """Radiance (n,) as mi.Color3f under a rectangle of which a share arrives, by the directions to its cells."""

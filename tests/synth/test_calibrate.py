@@ -152,8 +152,10 @@ def test_contributions_are_what_the_renderer_renders(coating: dict[str, float]) 
 
 
 @needs_llvm
-def test_derivatives_agree_with_finite_differences() -> None:
-    sensor = _start()
+@pytest.mark.parametrize("index", [1.0, 1.41])
+def test_derivatives_agree_with_finite_differences(index: float) -> None:
+    start = _start()
+    sensor = start.model_copy(update={"window": start.window.model_copy(update={"refractive_index": index})})
     columns, rows = (axis.ravel() for axis in np.meshgrid(np.arange(2, 160, 16), np.arange(2, 120, 16)))
     gel, geometry = FlatGel(sensor, np.column_stack([columns, rows]) + 0.5, FAST), _geometry(sensor)
     exact = gel.derivatives(geometry)
@@ -167,7 +169,9 @@ def test_derivatives_agree_with_finite_differences() -> None:
             lit.append(gel.contributions(LightGeometry(**{**vars(geometry), name: moved})))
         difference = (lit[0] - lit[1]) / (2 * step)
         # Central differences err by step² / 6 times a third derivative of order E / (3 mm)³: 2e-5; float32 less.
-        assert exact[:, number] == pytest.approx(difference, abs=3e-3 * np.abs(exact).max())
+        error = np.abs(exact[:, number] - difference) / np.abs(exact).max()
+        # A window's reflectance rises with infinite slope at the critical angle, in one or two of a light's 24 cells.
+        assert (error if index == 1 else np.percentile(error, 80)).max() < 3e-3
 
 
 def _geometry(sensor: Sensor) -> LightGeometry:
