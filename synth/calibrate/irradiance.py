@@ -8,20 +8,25 @@ each light's rectangle and nothing else. For a light of power 1 and colour white
 
 with the coating's BSDF f (Mitsuba's), θ at the face and θ' at the light. It is evaluated by the midpoint rule on a
 grid over the rectangle: no noise, and the same radiometry as the renderer's, with the shade that one light throws on
-another. Dr.Jit differentiates it with respect to the lights' centres, directions and sizes, the shade held. Mitsuba's
-path integrators would as well, with Monte Carlo noise in every step and for paths that an undeformed face has not.
+another. The light's mirror image behind the window adds its own integral (`synth.render.window_images`), without shade;
+what the gel itself sends to the window and gets back is left out. Dr.Jit differentiates both with respect to the
+lights' centres, directions and sizes, the shade held. Mitsuba's path integrators would as well, with Monte Carlo noise
+in every step and for paths that an undeformed face has not.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from synth.arrays import FloatArray, Pixels
+from synth.optics import Optics
 from synth.render.camera_rays import CameraRays
 from synth.render.coating import coat
 from synth.render.gel_mesh import MIRROR
 from synth.render.variant import Variant
+from synth.render.window_images import reflectance
 from synth.scene import Sensor
 
 _CELLS = 24
@@ -63,6 +68,9 @@ class FlatGel:
         ray, self._weight, _ = CameraRays(sensor, mi).sample(index, mi.Point2f(0.5))
         self._point = ray.o - ray.d * (ray.o.z / ray.d.z)
         self._toward = -ray.d
+        window = Optics.of(sensor).window
+        self._reflects = window.index != 1
+        self._index, self._face = mi.Float(window.index), mi.Float(window.face_z)
         color = {"type": "rgb", "value": list(sensor.coating.reflectance)}
         self._bsdf = mi.load_dict(coat(sensor.coating, color))
 
@@ -146,7 +154,19 @@ class FlatGel:
         return lit
 
     def _lit(self, centre: Any, direction: Any, size: Any, unshaded: Any) -> Any:
-        """Radiance (n,) as mi.Color3f under a light of power 1."""
+        """Radiance (n,) as mi.Color3f under a light of power 1 and its image in the window."""
+        import drjit as dr
+
+        lit = self._scattered(centre, direction, size, lambda away: unshaded)
+        if not self._reflects:
+            return lit
+        mi = self._mi
+        flip, behind = mi.Vector3f(1, 1, -1), mi.Vector3f(0, 0, 2 * self._face)
+        image = (centre * flip + behind, direction * flip, size)
+        return lit + self._scattered(*image, lambda away: reflectance(dr.abs(away.z), self._index, mi))
+
+    def _scattered(self, centre: Any, direction: Any, size: Any, share: Callable[[Any], Any]) -> Any:
+        """Radiance (n,) as mi.Color3f under a rectangle of which a share arrives, by the directions to its cells."""
         import drjit as dr
 
         mi = self._mi
@@ -156,7 +176,7 @@ class FlatGel:
         interaction = dr.zeros(mi.SurfaceInteraction3f, self._count * cells)
         interaction.wi = dr.gather(mi.Vector3f, self._toward, pixel)
         scattered = self._bsdf.eval(mi.BSDFContext(), interaction, away)
-        cosine = dr.maximum(-dr.dot(away, facing), 0) * unshaded
+        cosine = dr.maximum(-dr.dot(away, facing), 0) * share(away)
         each = scattered * (cosine / (square * (dr.pi * cells)))
         return mi.Color3f(*(dr.block_sum(each[k], cells) * self._weight for k in range(3)))
 

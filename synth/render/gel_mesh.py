@@ -23,14 +23,17 @@ class GelMesh:
     Attributes:
         surface: the surface whose deformed positions are rendered.
         size_mm: width and height of the contact face, which the texture spans.
+        behind: z (mm) of the plane in which the arrays show the mirror image of the gel; None: they show the gel.
     """
 
     surface: GelSurface
     size_mm: tuple[float, float]
+    behind: float | None = None
 
     def faces(self) -> NDArray[np.uint32]:
-        """(3 f,) vertex indices; turned over, because mirroring y turns every triangle's normal."""
-        return np.ascontiguousarray(self.surface.triangles[:, ::-1]).astype(np.uint32).ravel()
+        """(3 f,) vertex indices; turned over, because mirroring y turns every triangle's normal (and z, back)."""
+        triangles = self.surface.triangles
+        return np.ascontiguousarray(triangles[:, ::-1] if self.behind is None else triangles).astype(np.uint32).ravel()
 
     def texture_coordinates(self) -> NDArray[np.float32]:
         """(2 v,) u along +x and v along +y, each 0..1 over the face; Mitsuba's v = 0 is a texture's first row."""
@@ -41,6 +44,8 @@ class GelMesh:
 
     def positions(self, positions: Points) -> NDArray[np.float32]:
         """(3 v,) in the renderer's frame, from positions (v, 3) float64 mm."""
+        if self.behind is not None:
+            positions = mirrored(positions, self.behind)
         return (positions * MIRROR).astype(np.float32).ravel()
 
     def normals(self, positions: Points) -> NDArray[np.float32]:
@@ -50,4 +55,12 @@ class GelMesh:
         """
         # Components of a cross product of mirrored vectors are the mirrored components, negated. The faces are turned
         # over as well, which negates once more.
-        return (vertex_normals(positions, self.surface.triangles) * MIRROR).astype(np.float32).ravel()
+        normals = vertex_normals(positions, self.surface.triangles)
+        if self.behind is not None:
+            normals = mirrored(normals, 0.0)
+        return (normals * MIRROR).astype(np.float32).ravel()
+
+
+def mirrored(vectors: Points, plane_z: float) -> Points:
+    """Positions (n, 3) mm mirrored in the plane z = plane_z; with 0, directions."""
+    return np.asarray(vectors * [1.0, 1.0, -1.0] + [0.0, 0.0, 2 * plane_z])

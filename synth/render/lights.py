@@ -16,11 +16,10 @@ from synth.render.gel_mesh import MIRROR
 from synth.scene import Light, Sensor
 
 
-def emitters(sensor: Sensor, mi: Any) -> dict[str, Any]:
-    """Mitsuba's description of all lights that shine, in the renderer's frame, once they pass `check_view`."""
-    check_view(sensor)
+def emitters(lights: tuple[Light, ...], mi: Any) -> dict[str, Any]:
+    """Mitsuba's description of all lights that shine, in the renderer's frame."""
     shapes = {}
-    for i, light in enumerate(sensor.lights):
+    for i, light in enumerate(lights):
         if light.power == 0:
             continue
         frame = np.eye(4)

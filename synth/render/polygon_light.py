@@ -19,10 +19,13 @@ from numpy.polynomial import Chebyshev, Polynomial
 from synth.arrays import FloatArray
 from synth.render.gel_mesh import MIRROR
 from synth.render.lights import light_axes
+from synth.render.window_images import reflectance
 from synth.scene import Light
 
 _DEGREE = 9
 """Of the polynomial: it errs by 2e-8, less than float32's rounding."""
+_STRATA = 4
+"""Points of a mirror image for each of a pixel's samples, spread along its first side."""
 
 
 class PolygonLight:
@@ -50,8 +53,11 @@ class PolygonLight:
         radiance = light.power / (np.pi * width * height) * np.array(light.color)
         self.radiance = [dr.opaque(mi.Float, float(value)) for value in radiance]
 
-    def whole(self, point: Any, normal: Any) -> Any:
-        """Irradiance per radiance (mi.Float) of surface points with unit normals where nothing stands in between."""
+    def whole(self, point: Any, normal: Any, offset: Any) -> Any:
+        """Irradiance per radiance (mi.Float) of surface points with unit normals where nothing stands in between.
+
+        `offset` (mi.Point2f in [0, 1)²) is for lights without a closed form.
+        """
         import drjit as dr
 
         rays = [dr.normalize(corner - point) for corner in self._corners]
@@ -99,6 +105,31 @@ class PolygonLight:
             setting, rising = dr.select(sets, at, setting), dr.select(rises, at, rising)
         total += dr.select(dr.squared_norm(setting) > 0, _edge(setting, rising, normal), 0)
         return 0.5 * dr.abs(total)
+
+
+class ImageLight(PolygonLight):
+    """A light's mirror image behind the window's outer face (`synth.render.window_images`).
+
+    What of it arrives depends on the angle at the face, so `whole` is no closed form but the mean over a few points.
+    """
+
+    def __init__(self, light: Light, index: float, mi: Any) -> None:
+        import drjit as dr
+
+        super().__init__(light, mi)
+        self._index = dr.opaque(mi.Float, index)
+
+    def whole(self, point: Any, normal: Any, offset: Any) -> Any:
+        parts = [
+            self.sample(point, normal, self._mi.Point2f((offset.x + k) / _STRATA, offset.y))[1] for k in range(_STRATA)
+        ]
+        return sum(parts) / _STRATA
+
+    def sample(self, point: Any, normal: Any, offset: Any) -> tuple[Any, Any]:
+        import drjit as dr
+
+        place, value = super().sample(point, normal, offset)
+        return place, value * reflectance(dr.abs(dr.normalize(place - point).z), self._index, self._mi)
 
 
 _CORNERS = ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))

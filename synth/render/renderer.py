@@ -4,9 +4,8 @@ One Mitsuba scene per sensor draw: the coated surface, the LEDs, and nothing out
 the opaque coating and never part of it. For a frame only vertex positions and normals are exchanged; several cameras
 are several sets of rays in that one scene.
 
-What it leaves out: light that the window's faces reflect back onto the gel, and light that the pad's sides reflect. The
-window's share is smooth, but not small; it comes on specular paths from small LEDs, which path tracing finds only by
-chance and then as bright specks (docs/decisions.md).
+Light that the window's outer face reflects back onto the gel comes from mirror images (`synth.render.window_images`);
+scalar variants, whose camera stands outside, leave it out. All leave out light that the pad's sides reflect.
 
 Pixels are box-filtered. In vectorised variants the samples of one pixel are neighbours in the wavefront and are summed
 in a fixed order, not by atomic adds: the same seed gives the same bits with any number of threads.
@@ -19,6 +18,7 @@ import numpy as np
 
 from synth.arrays import Image, Points
 from synth.errors import InputError
+from synth.optics import Optics
 from synth.render.camera_rays import CameraRays, pinhole
 from synth.render.coating import reflection
 from synth.render.gel_mesh import GelMesh
@@ -28,7 +28,8 @@ from synth.render.sample_count import PILOT, needed_samples
 from synth.render.separated_light import SeparatedLight, is_separated
 from synth.render.thin_lens import ThinLens
 from synth.render.variant import Variant
-from synth.scene import Coating, Render, Sensor
+from synth.render.window_images import image_lights, pane
+from synth.scene import Render, Sensor
 from synth.surface import GelSurface
 
 _MAX_WAVEFRONT = 2**22
@@ -65,23 +66,30 @@ class Renderer:
             if name:
                 _check_further(name, view)
         separated = is_separated(render, sensor.coating, variant)  # every light at every sample
-        self._lit = 1 if separated else sum(light.power > 0 for light in sensor.lights)
-        self._mesh = GelMesh(surface, sensor.gel.size_mm[:2])
         mi = variant.load()
-        gel = self._build_gel(mi, sensor.coating, albedo)
-        contents = {"type": "scene", "gel": gel, **emitters(sensor, mi)}
+        check_view(sensor)
         refracts = sensor.window.refractive_index != 1
-        if not variant.is_vectorised and refracts:
+        self._behind = Optics.of(sensor).window.face_z if refracts and variant.is_vectorised else None
+        lights = sensor.lights if self._behind is None else (*sensor.lights, *image_lights(sensor))
+        self._lit = 1 if separated else sum(light.power > 0 for light in lights)
+        self._set_meshes(surface, sensor.gel.size_mm[:2])
+        bsdf = reflection(mi, sensor.coating, albedo, variant.is_mono)
+        gels = {name: _gel(name, mesh, bsdf, mi) for name, mesh in self._meshes.items()}
+        contents = {"type": "scene", **gels, **emitters(lights, mi)}
+        if refracts and not variant.is_vectorised:
             contents["window"] = _window(sensor, mi)
+        elif refracts and not separated:
+            contents["window"] = pane(sensor, mi)
         self._scene = mi.load_dict(contents, optimize=False)
         self._parameters = mi.traverse(self._scene)
         if variant.is_vectorised:
             self._share_kernels()
-        shared = (self._scene, gel, self._parameters, render.max_depth, variant.is_mono, mi)
+        shared = (self._scene, gels, self._parameters, render.max_depth, variant.is_mono, mi)
         self._light = SeparatedLight(sensor, *shared) if separated else None
         # A path through Mitsuba's window is one interaction longer than one that starts inside.
         depth = render.max_depth + (1 if not variant.is_vectorised and refracts else 0)
-        self._integrator = mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": True})
+        kind = "path" if self._behind is None else "volpath"  # the latter sees lights through the pane
+        self._integrator = mi.load_dict({"type": kind, "max_depth": depth, "hide_emitters": True})
         if variant.is_vectorised:
             self._rays = {name: CameraRays(view, mi) for name, view in self._views.items()}
         wanted = render.samples_per_pixel
@@ -102,14 +110,21 @@ class Renderer:
 
     def take(self, surface: GelSurface) -> None:
         """Render this surface from now on: `radiance` gets the positions of its vertices."""
-        if surface is self._mesh.surface:
+        mesh = self._meshes["gel"]
+        if surface is mesh.surface:
             return
-        self._mesh = GelMesh(surface, self._mesh.size_mm)
-        self._replace("gel.faces", self._mesh.faces())
-        self._replace("gel.vertex_texcoords", self._mesh.texture_coordinates())
-        self._replace("gel.vertex_positions", self._mesh.positions(surface.material))
-        self._replace("gel.vertex_normals", self._mesh.normals(surface.material))
+        self._set_meshes(surface, mesh.size_mm)
+        for name, mesh in self._meshes.items():
+            self._replace(f"{name}.faces", mesh.faces())
+            self._replace(f"{name}.vertex_texcoords", mesh.texture_coordinates())
+            self._replace(f"{name}.vertex_positions", mesh.positions(surface.material))
+            self._replace(f"{name}.vertex_normals", mesh.normals(surface.material))
         self._parameters.update()
+
+    def _set_meshes(self, surface: GelSurface, size_mm: tuple[float, float]) -> None:
+        self._meshes = {"gel": GelMesh(surface, size_mm)}
+        if self._behind is not None:
+            self._meshes["image"] = GelMesh(surface, size_mm, self._behind)
 
     def _replace(self, key: str, values: Any) -> None:
         """Set an array of another length. Scalar variants compare old and new by elements, and stop at that."""
@@ -152,14 +167,16 @@ class Renderer:
 
         Normals go in a second update, since one of positions makes Mitsuba recompute normals.
         """
-        self._parameters["gel.vertex_positions"] = self._mesh.positions(positions)
+        for name, mesh in self._meshes.items():
+            self._parameters[f"{name}.vertex_positions"] = mesh.positions(positions)
         self._parameters.update()
-        self._parameters["gel.vertex_normals"] = self._mesh.normals(positions)
+        for name, mesh in self._meshes.items():
+            self._parameters[f"{name}.vertex_normals"] = mesh.normals(positions)
         self._parameters.update()
         if self._light is not None:
             camera = self._views[""].camera
             primary = camera.width * camera.height * self._samples
-            self._light.prepare(self._mesh, primary, _mitsuba_seed(seed, _LIGHT_PART, 0))
+            self._light.prepare(self._meshes["gel"], primary, _mitsuba_seed(seed, _LIGHT_PART, 0))
 
     def _share_kernels(self) -> None:
         """Keep the lights' places out of the compiled code, so that another draw of the sensor needs no compiler."""
@@ -206,26 +223,6 @@ class Renderer:
         dr.eval(channels)  # all at once: each sum alone would trace everything anew
         return [dr.block_sum(channel, self._samples) for channel in channels]
 
-    def _build_gel(self, mi: Any, coating: Coating, albedo: Image) -> Any:
-        """The mesh with its coating; smooth-shaded, seen from either side."""
-        properties = mi.Properties()
-        properties["bsdf"] = reflection(mi, coating, albedo, self._variant.is_mono)
-        surface, mesh = self._mesh.surface, self._mesh
-        shape = mi.Mesh(
-            "gel",
-            len(surface.material),
-            len(surface.triangles),
-            has_vertex_normals=True,
-            has_vertex_texcoords=True,
-            props=properties,
-        )
-        parameters = mi.traverse(shape)
-        parameters["faces"] = mesh.faces()
-        parameters["vertex_texcoords"] = mesh.texture_coordinates()
-        parameters["vertex_positions"] = mesh.positions(surface.material)
-        parameters.update()
-        return shape
-
     def _build_pinhole(self, mi: Any, sensor: Sensor) -> Any:
         camera = sensor.camera
         description = pinhole(sensor)
@@ -240,6 +237,27 @@ class Renderer:
         }
         description["sampler"] = self._sampler
         return mi.load_dict(description)
+
+
+def _gel(name: str, mesh: GelMesh, bsdf: Any, mi: Any) -> Any:
+    """The mesh with its coating; smooth-shaded, seen from either side."""
+    properties = mi.Properties()
+    properties["bsdf"] = bsdf
+    surface = mesh.surface
+    shape = mi.Mesh(
+        name,
+        len(surface.material),
+        len(surface.triangles),
+        has_vertex_normals=True,
+        has_vertex_texcoords=True,
+        props=properties,
+    )
+    parameters = mi.traverse(shape)
+    parameters["faces"] = mesh.faces()
+    parameters["vertex_texcoords"] = mesh.texture_coordinates()
+    parameters["vertex_positions"] = mesh.positions(surface.material)
+    parameters.update()
+    return shape
 
 
 def full_grid(samples: int, lights: int) -> int:

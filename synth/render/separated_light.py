@@ -2,7 +2,7 @@ r"""Light of a matt gel, each part sampled at its own rate: an alternative to pa
 
 A Lambertian surface's radiance is its albedo ρ times its irradiance E over π, and
 
-.. math::  E = \sum_l (E_l - B_l) + E_{bounced} .
+.. math::  E = \sum_l (E_l - B_l) + E_{bounced} + E_{returned} .
 
 - ρ is looked up, and the direct light E_l of light l is computed in closed form (`synth.render.polygon_light`), at
   every sample of every pixel: neither has any noise but the pixel filter's.
@@ -12,6 +12,9 @@ A Lambertian surface's radiance is its albedo ρ times its irradiance E over π,
 - E_bounced, light that the gel reflects onto itself, does not depend on the view. It is sampled at points of the gel's
   faces and projected (L²) onto functions that are linear on each face, or constant where few of the face's pilots saw
   gel: such faces get little, and its mean is less noisy than its slope. Where no pilot at all saw gel there is none.
+- The lights l include their mirror images behind the window (`synth.render.window_images`), which have no closed form.
+- E_returned, light that the gel sends to the window and gets back, is smooth. It is n · V with the normal n, and V is
+  fitted to sampled paths as polynomials of the place on the pad.
 
 What remains of systematic error: shadows that all pilot rays of a neighbourhood missed, and how bounced light departs
 from linear within one triangle; docs/reports/light.md measures both. Random numbers are the sampler's, sums are of
@@ -27,9 +30,11 @@ from numpy.typing import NDArray
 
 from synth.arrays import BoolArray, Image
 from synth.errors import InputError
+from synth.optics import Optics
 from synth.render.gel_mesh import GelMesh
-from synth.render.polygon_light import PolygonLight
+from synth.render.polygon_light import ImageLight, PolygonLight
 from synth.render.variant import Variant
+from synth.render.window_images import image_lights, reflectance
 from synth.scene import Coating, Render, Sensor
 
 PILOTS = 16
@@ -38,6 +43,10 @@ _MANY = 4
 """Of a face's pilots that saw gel, from which on its bounced light is linear."""
 _STEP = 4
 """Bounced rays of a face are squares of its multiples: a sampler's size is compiled into the kernel."""
+_DEGREE = 4
+"""Of the polynomials for light that comes back from the window: its path is longer than the pad is thick, so smooth."""
+_RETURNED = 2**17
+"""Paths by the window, to which they are fitted; more where there are many faces."""
 _SHIFT = (0.7548776662466927, 0.5698402909980532)
 """Of one light's shadow rays against the one before's: R2 sequence (Roberts 2018), on a torus to keep the strata."""
 
@@ -72,9 +81,9 @@ class SeparatedLight:
     """Light on one renderer's gel.
 
     Args:
-        sensor: its lights are used.
+        sensor: its lights and window are used.
         scene: Mitsuba's.
-        gel: the shape in it.
+        gels: the shapes in it: "gel", and "image" where the window reflects.
         parameters: the scene's, of which the gel's vertices are read.
         max_depth: longest path in surfaces and lights.
         is_mono: one channel is wanted.
@@ -82,12 +91,19 @@ class SeparatedLight:
     """
 
     def __init__(
-        self, sensor: Sensor, scene: Any, gel: Any, parameters: Any, max_depth: int, is_mono: bool, mi: Any
+        self, sensor: Sensor, scene: Any, gels: dict[str, Any], parameters: Any, max_depth: int, is_mono: bool, mi: Any
     ) -> None:
-        self._mi, self._scene, self._gel, self._parameters = mi, scene, gel, parameters
-        self._reflection = gel.bsdf()
+        import drjit as dr
+
+        self._mi, self._scene, self._parameters = mi, scene, parameters
+        self._gel, self._image = gels["gel"], gels.get("image")
+        self._reflection = self._gel.bsdf()
         self._depth, self._channels = max_depth, 1 if is_mono else 3
+        window = Optics.of(sensor).window
+        self._face, self._index = dr.opaque(mi.Float, window.face_z), dr.opaque(mi.Float, window.index)
         self._lights = [PolygonLight(light, mi) for light in sensor.lights if light.power > 0]
+        self._lights += [ImageLight(light, window.index, mi) for light in image_lights(sensor) if light.power > 0]
+        self._half = [dr.opaque(mi.Float, size / 2) for size in sensor.gel.size_mm[:2]]
 
     def prepare(self, mesh: GelMesh, primary: int, seed: int) -> None:
         """Pilots and bounced light for the gel as it lies now, for all cameras.
@@ -109,6 +125,7 @@ class SeparatedLight:
         self._any_bounce = self._depth > 2 and bool(met[:, -1].any())
         if self._any_bounce:
             self._gather(met[:, -1] >= _MANY, primary, seed)
+        self._returned = self._fit_returned(len(triangles), seed) if self._image and self._depth > 2 else None
 
     def radiance(self, ray: Any, sampler: Any, active: Any) -> tuple[list[Any], Any]:
         """Radiance (channels of mi.Float) along rays from the camera, and whether they meet the gel (mi.Bool)."""
@@ -125,6 +142,12 @@ class SeparatedLight:
             for channel, values in enumerate(self._bounced):
                 for value, weight in zip(values, weights, strict=True):
                     light[channel] += dr.gather(mi.Float, value, hit.prim_index, seen) * weight
+        if self._returned is not None:
+            terms = self._terms(at.p, normal)
+            for channel, values in enumerate(self._returned):
+                light[channel] += dr.maximum(
+                    sum(dr.gather(mi.Float, values, k) * term for k, term in enumerate(terms)), 0
+                )
         albedo = self._albedo(at, seen)
         return [dr.select(seen, a * e / dr.pi, 0) for a, e in zip(albedo, light, strict=True)], seen
 
@@ -138,7 +161,7 @@ class SeparatedLight:
             blocked = self._blocked(
                 light, number, at, normal, offset, active & dr.gather(mi.Bool, shaded, face, active)
             )
-            value = light.whole(at.p, normal) - blocked
+            value = light.whole(at.p, normal, offset) - blocked
             total = [dr.fma(value, color, sum_) for color, sum_ in zip(light.radiance, total, strict=False)]
         return total
 
@@ -167,7 +190,7 @@ class SeparatedLight:
             self._blocked(light, number, points.at, points.normal, offset, everywhere) > 0
             for number, light in enumerate(self._lights)
         ]
-        met.append(self._onward(points.at, points.normal, sampler.next_2d(), everywhere)[2])
+        met.append(self._onward(points.at, points.normal, sampler.next_2d(), everywhere)[2])  # the image is no bounce
         counts = [dr.select(one, mi.UInt32(1), 0) for one in met]
         dr.eval(counts)
         return np.stack([np.array(dr.block_sum(count, PILOTS)) for count in counts], axis=-1)
@@ -177,14 +200,35 @@ class SeparatedLight:
         import drjit as dr
 
         mi, faces = self._mi, len(often)
-        count = (_STEP * max(1, round(math.sqrt(rays / faces) / _STEP))) ** 2
+        count = _grid(rays, faces)
         sampler = self._sampler(count, faces, seed, 1)
         points = self._points(dr.arange(mi.UInt32, faces), count, sampler)
-        values = _projected(self._bounces(points, sampler), points.weights, count, often)
+        values = _projected(self._bounces(points, sampler, False), points.weights, count, often)
         self._bounced = [[mi.Float(np.ascontiguousarray(one)) for one in rows.T] for rows in values.swapaxes(0, 1)]
 
-    def _bounces(self, points: _Points, sampler: Any) -> list[Any]:
-        """Irradiance (channels) from the gel itself, one path from each point."""
+    def _fit_returned(self, faces: int, seed: int) -> list[Any]:
+        """Coefficients (channels of mi.Float) of what the gel sends to the window and gets back, in `_terms`."""
+        import drjit as dr
+
+        count = _grid(_RETURNED, faces)
+        sampler = self._sampler(count, faces, seed, 2)
+        points = self._points(dr.arange(self._mi.UInt32, faces), count, sampler)
+        values = self._bounces(points, sampler, True)
+        terms = self._terms(points.at.p, points.normal)
+        dr.eval(values, terms)
+        design = np.stack([np.array(term) for term in terms], axis=1).astype(np.float64)
+        right = np.stack([np.array(value) for value in values], axis=1).astype(np.float64)
+        found = np.linalg.lstsq(design.T @ design, design.T @ right, rcond=None)[0]
+        return [self._mi.Float(np.ascontiguousarray(column, dtype=np.float32)) for column in found.T]
+
+    def _terms(self, point: Any, normal: Any) -> list[Any]:
+        """Monomials of the place on the pad up to a degree, times each component of the normal."""
+        x, y = (coordinate / half for coordinate, half in zip((point.x, point.y), self._half, strict=True))
+        powers = [x**i * y**j for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
+        return [power * component for power in powers for component in (normal.x, normal.y, normal.z)]
+
+    def _bounces(self, points: _Points, sampler: Any, by_window: bool) -> list[Any]:
+        """Irradiance (channels) from the gel itself, one path from each point; its first step by the window, or not."""
         import drjit as dr
 
         mi = self._mi
@@ -192,30 +236,41 @@ class SeparatedLight:
         total = [dr.zeros(mi.Float, count) for _ in range(self._channels)]
         share = [dr.full(mi.Float, 1, count) for _ in range(self._channels)]
         start = dr.arange(mi.UInt32, count)
-        for _ in range(self._depth - 2):
-            ray, hit, active = self._onward(at, normal, dr.gather(mi.Point2f, sampler.next_2d(), start), True)
+        for step in range(self._depth - 2):
+            ray, hit, straight, mirrored = self._onward(
+                at, normal, dr.gather(mi.Point2f, sampler.next_2d(), start), True
+            )
+            active = straight | mirrored if step else mirrored if by_window else straight
             offset = dr.gather(mi.Point2f, sampler.next_2d(), start)
-            dr.eval(ray, hit, active, offset, start, share)  # at once: each gather alone would trace everything anew
+            dr.eval(ray, hit, active, mirrored, offset, start, share)  # each gather alone would trace everything anew
             onward = dr.compress(active)  # few paths meet the gel: only these go on
             if dr.width(onward) == 0:
                 break
-            ray, hit, offset, start = (dr.gather(type(x), x, onward) for x in (ray, hit, offset, start))
+            ray, hit, mirrored, offset, start = (
+                dr.gather(type(x), x, onward) for x in (ray, hit, mirrored, offset, start)
+            )
             at = hit.compute_surface_interaction(ray)
+            at.p.z = dr.select(mirrored, 2 * self._face - at.p.z, at.p.z)
+            at.n.z = dr.select(mirrored, -at.n.z, at.n.z)
             normal = -mi.Vector3f(at.sh_frame.n)
+            normal.z = dr.select(mirrored, -normal.z, normal.z)
+            kept = dr.select(mirrored, reflectance(dr.abs(ray.d.z), self._index, mi), 1)
             albedo = self._albedo(at, mi.Bool(True))
-            share = [dr.gather(mi.Float, s, onward) * a for s, a in zip(share, albedo, strict=True)]
+            share = [dr.gather(mi.Float, s, onward) * a * kept for s, a in zip(share, albedo, strict=True)]
             light = self._direct(at, normal, hit.prim_index, offset, mi.Bool(True))
             for sum_, s, e in zip(total, share, light, strict=True):
                 dr.scatter_add(sum_, s * e, start)
         return total
 
-    def _onward(self, at: Any, normal: Any, offset: Any, active: Any) -> tuple[Any, Any, Any]:
-        """Rays in the cosine's distribution, their next hits, and whether these are on the gel's lit side."""
+    def _onward(self, at: Any, normal: Any, offset: Any, active: Any) -> tuple[Any, Any, Any, Any]:
+        """Rays in the cosine's distribution, their next hits; whether these are on the lit side of gel, or image."""
         mi = self._mi
         ray = at.spawn_ray(mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(offset)))
         hit = self._scene.ray_intersect_preliminary(ray, active=active)
         nearest = hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
-        return ray, hit, nearest.is_valid() & (hit.shape == mi.ShapePtr(self._gel)) & (nearest.wi.z < 0)
+        lit = nearest.is_valid() & (nearest.wi.z < 0)
+        image = lit & (hit.shape == mi.ShapePtr(self._image)) if self._image else mi.Bool(False)
+        return ray, hit, lit & (hit.shape == mi.ShapePtr(self._gel)), image
 
     def _sampler(self, count: int, faces: int, seed: int, part: int) -> Any:
         sampler = self._mi.load_dict({"type": "multijitter", "sample_count": count})
@@ -241,6 +296,11 @@ class SeparatedLight:
         at.n = mi.Normal3f(dr.normalize(dr.cross(b - a, c - a)))
         normal = sum(dr.gather(mi.Vector3f, normals, i) * w for i, w in zip(corners, weights, strict=True))
         return _Points(at, -dr.normalize(normal), weights)  # vertex normals point out of the gel
+
+
+def _grid(rays: int, faces: int) -> int:
+    """Rays of each face, of about so many in all."""
+    return (_STEP * max(1, round(math.sqrt(rays / faces) / _STEP))) ** 2
 
 
 def _projected(values: list[Any], weights: tuple[Any, Any, Any], count: int, is_linear: BoolArray) -> Image:

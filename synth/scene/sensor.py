@@ -13,7 +13,7 @@ from synth.scene.pattern import Pattern
 class Window(Part):
     """Rigid clear support between gel and camera, index-matched to the gel; flat, from z = gel thickness on.
 
-    Its outer face refracts; light that it reflects back into the body is left out.
+    Its outer face refracts, and reflects light back onto the gel (but not in scalar variants).
     """
 
     refractive_index: Annotated[float, Field(ge=1, le=2.5)] = 1.45

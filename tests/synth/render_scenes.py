@@ -62,6 +62,17 @@ def rendered(
     return renderer.radiance(surface.material if positions is None else positions, seed)
 
 
+def internal_reflectance(cosine: float, index: float) -> float:
+    """Of a body of refractive index n for unpolarised light from inside (Fresnel), 1 beyond the critical angle."""
+    square = 1 - index**2 * (1 - cosine**2)
+    if square <= 0:
+        return 1.0
+    outside = np.sqrt(square)
+    across = (index * cosine - outside) / (index * cosine + outside)
+    along = (cosine - index * outside) / (cosine + index * outside)
+    return float(across**2 + along**2) / 2
+
+
 def kernels_compiled(frame: Callable[[], object]) -> int:
     """How many kernels Dr.Jit compiles for what is rendered in `frame`; needs `JitFlag.KernelHistory`."""
     import drjit as dr

@@ -9,15 +9,17 @@ import cv2
 import numpy as np
 import pytest
 import tomli_w
+from numpy.typing import NDArray
 from PIL import ExifTags, Image
 from render_scenes import FAST, needs_llvm, small_sensor
 
 from synth.arrays import FloatArray
-from synth.calibrate.dot_grid import grid_index, pattern_points
+from synth.calibrate.dot_grid import fit_dot_grid, grid_index, pattern_points
 from synth.calibrate.dots import find_dots
 from synth.calibrate.frames import Frames, read_frames
 from synth.calibrate.irradiance import FlatGel, LightGeometry
 from synth.calibrate.noise import fit_noise
+from synth.calibrate.preset import start_sensor
 from synth.calibrate.profile import fit_profile
 from synth.calibrate.run import MARK
 from synth.calibrate.sensor_fit import SensorFit, fit_sensor
@@ -150,8 +152,10 @@ def test_contributions_are_what_the_renderer_renders(coating: dict[str, float]) 
 
 
 @needs_llvm
-def test_derivatives_agree_with_finite_differences() -> None:
-    sensor = _start()
+@pytest.mark.parametrize("index", [1.0, 1.41])
+def test_derivatives_agree_with_finite_differences(index: float) -> None:
+    start = _start()
+    sensor = start.model_copy(update={"window": start.window.model_copy(update={"refractive_index": index})})
     columns, rows = (axis.ravel() for axis in np.meshgrid(np.arange(2, 160, 16), np.arange(2, 120, 16)))
     gel, geometry = FlatGel(sensor, np.column_stack([columns, rows]) + 0.5, FAST), _geometry(sensor)
     exact = gel.derivatives(geometry)
@@ -165,7 +169,9 @@ def test_derivatives_agree_with_finite_differences() -> None:
             lit.append(gel.contributions(LightGeometry(**{**vars(geometry), name: moved})))
         difference = (lit[0] - lit[1]) / (2 * step)
         # Central differences err by step² / 6 times a third derivative of order E / (3 mm)³: 2e-5; float32 less.
-        assert exact[:, number] == pytest.approx(difference, abs=3e-3 * np.abs(exact).max())
+        error = np.abs(exact[:, number] - difference) / np.abs(exact).max()
+        # A window's reflectance rises with infinite slope at the critical angle, in one or two of a light's 24 cells.
+        assert (error if index == 1 else np.percentile(error, 80)).max() < 3e-3
 
 
 def _geometry(sensor: Sensor) -> LightGeometry:
@@ -279,7 +285,7 @@ def refusal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[...,
 
 @pytest.mark.parametrize("spacing", ["-3", "nan", "0", "0.1", "100", "inf"])
 def test_a_spacing_that_no_dots_have_is_refused(refusal: Callable[..., str], spacing: str) -> None:
-    assert f"--spacing-mm = {spacing}: must be from 0.458 to 7.32 mm" in refusal(f"--spacing-mm={spacing}")
+    assert f"--spacing-mm = {spacing}: must be from 0.475 to 7.6 mm" in refusal(f"--spacing-mm={spacing}")
     assert "has no dots" in refusal("--scene", "digit", "--spacing-mm=1")
 
 
@@ -318,11 +324,28 @@ def test_noise_is_measured_through_the_response() -> None:
 def test_a_real_frame_that_was_not_fitted_is_met_within_8_levels(tmp_path: Path) -> None:
     """Undeformed gels after the object was lost; measured 3.9, 2.0 and 5.0 of 255."""
     for name, number in [("screw_driver_red__exp_num_2__camera_0", 344), ("avocado_real__exp_num_7__camera_0", 408)]:
-        clip = cv2.VideoCapture(os.fspath(CLIPS / f"{name}.avi"))
-        for _ in range(number + 1):
-            image = clip.read()[1]
-        cv2.imwrite(str(tmp_path / f"{number}.png"), image)
+        cv2.imwrite(str(tmp_path / f"{number}.png"), _real_frame(name, number))
     frames = ["--frames", str(tmp_path / "344.png"), "--judge", str(tmp_path / "408.png")]
     assert main(["calibrate", *frames, "--steps", "6", "--out", str(tmp_path / "out")]) == 0
     differences = json.loads((tmp_path / "out/calibration.json").read_text())["differences"]
     assert max(differences["not fitted: 408.png"]["mean_absolute_outside_dots"]) < 8
+
+
+@pytest.mark.skipif(not CLIPS.is_dir(), reason="the real recordings are not here")
+@pytest.mark.parametrize("name", ["cellotape__exp_num_3__camera_0", "screw_driver_blue_gray__exp_num_7__camera_2"])
+def test_real_dots_tell_the_lens_of_gelsight_mini(name: str) -> None:
+    """One frame overrules a preset without distortion; its k1 is the scene's within two of that one's deviations."""
+    shipped = start_sensor(load_scene("gelsight_mini"), (320, 240))
+    camera = shipped.camera.model_copy(update={"distortion": (0.0,) * 5})
+    plain = shipped.model_copy(update={"camera": camera})
+    dots = find_dots((_real_frame(name, 449) / 255.0) ** camera.gamma, 32.0)
+    found = fit_dot_grid(plain, plain.pattern, dots.centres, None)
+    assert found.camera.distortion[0] == pytest.approx(shipped.camera.distortion[0], abs=0.02)
+    assert np.sqrt((found.residual_px**2).sum(axis=1).mean()) < 0.6  # 1.2 without distortion
+
+
+def _real_frame(name: str, number: int) -> NDArray[np.uint8]:
+    clip = cv2.VideoCapture(os.fspath(CLIPS / f"{name}.avi"))
+    for _ in range(number + 1):
+        image = clip.read()[1]
+    return image

@@ -43,7 +43,7 @@ def test_closed_form_is_the_sum_over_the_light() -> None:
     assert (expected == 0).any()
     assert (expected > 0.1).any()
     place, normal = (mi.Vector3f(*(values * MIRROR).astype(np.float32).T) for values in (points, normals))
-    found = np.array(PolygonLight(light, mi).whole(mi.Point3f(place), mi.Normal3f(normal)))
+    found = np.array(PolygonLight(light, mi).whole(mi.Point3f(place), mi.Normal3f(normal), mi.Point2f(0.5)))
     # The midpoint rule errs by the second order of a patch's size over the distance, 5/400 and at least some 0.5 mm,
     # and where the horizon cuts patches by a part of one in 400 rows of the light, at grazing angle.
     np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-5)
@@ -94,10 +94,14 @@ def test_second_bounce_is_path_tracings_with_less_noise_and_none_on_flat_gel() -
     # At 16 samples less than half of what path tracing leaves at 36, edge of contact and shadows included.
     noise = [_pictures(*one).std(axis=0, ddof=1) for one in (("separated", 16), ("path_traced", 36))]
     assert np.sqrt((noise[0] ** 2).mean()) < 0.5 * np.sqrt((noise[1] ** 2).mean())
-    # Nothing blocked, nothing bounced: what remains is the pixel filter, where light varies by 5 % in a pixel.
-    sensor, render = small_sensor(1.45, None, LIGHTS), Render(samples_per_pixel=16, light="separated")
-    first, second, same = (rendered(sensor, render=render, seed=seed) for seed in (1, 2, 1))
+    # Nothing blocked, nothing bounced: what remains is the pixel filter, where light varies by 5 % in a pixel. A window
+    # adds the lights' images, whose light is sampled: 64 points a pixel, spread evenly.
+    render = Render(samples_per_pixel=16, light="separated")
+    window = small_sensor(1.45, None, LIGHTS)
+    first, second, same = (rendered(window, render=render, seed=seed) for seed in (1, 2, 1))
     np.testing.assert_array_equal(first, same)
+    assert np.sqrt(np.mean((first / second - 1) ** 2)) < 2**0.5 * 2e-3
+    first, second = (rendered(small_sensor(1.0, None, LIGHTS), render=render, seed=seed) for seed in (1, 2))
     # Jittered in 4 x 4 cells: 0.05 / sqrt(12) / 4 / sqrt(16) = 0.1 % at most; the largest of 4800 is at 4 sigma.
     assert np.abs(first / second - 1).max() < 4 * 2**0.5 * 1e-3
 
