@@ -183,11 +183,13 @@ def test_the_command_writes_a_scene_that_loads_and_generates(tmp_path: Path, cap
         cv2.imwrite(str(path), np.round(255 * _frame(_truth(_start())))[:, :, ::-1])
     out = tmp_path / "mine"
     command = ["calibrate", "--scene", str(preset), "--frames", str(frame), "--judge", str(other), "--out", str(out)]
-    assert main([*command, "--steps", "0", "--json"]) == 0
-    capsys.readouterr()
-    assert main([*command, "--steps", "6", "--json"]) == 0  # in place of the first
-    record = json.loads(capsys.readouterr().out)
-    assert record == json.loads((out / "calibration.json").read_text())
+    assert main([*command, "--steps", "0", "--json"]) == 1  # lights that stay where the preset has them do not fit
+    assert not json.loads(capsys.readouterr().out)["verdict"]["good"]
+    assert main([*command, "--steps", "6"]) == 0  # in place of the first
+    assert "verdict: good; residual" in capsys.readouterr().out
+    record = json.loads((out / "calibration.json").read_text())
+    assert record["verdict"]["good"]
+    assert record["verdict"]["reasons"] == []
     assert set(record["differences"]) == {"frames", "not fitted: other.png"}
     for difference in record["differences"].values():
         # The fit itself leaves below 0.5; rounding to 8 bits and the camera's noise of 1 level, 0.8 on average.
@@ -239,7 +241,7 @@ def test_a_photograph_is_turned_as_its_exif_says(tmp_path: Path) -> None:
 
 
 def test_a_frame_without_dots_dots_without_a_grid_and_dots_of_a_pixel_are_refused() -> None:
-    with pytest.raises(InputError, match="0 whole dark dots"):
+    with pytest.raises(InputError, match="0 whole dots"):
         find_dots(np.full((120, 160, 3), 0.3), 15.0)
     with pytest.raises(InputError, match="grid"):
         grid_index(np.random.default_rng(0).uniform(0, 100, (12, 2)))
