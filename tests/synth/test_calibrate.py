@@ -183,8 +183,9 @@ def test_the_command_writes_a_scene_that_loads_and_generates(tmp_path: Path, cap
         cv2.imwrite(str(path), np.round(255 * _frame(_truth(_start())))[:, :, ::-1])
     out = tmp_path / "mine"
     command = ["calibrate", "--scene", str(preset), "--frames", str(frame), "--judge", str(other), "--out", str(out)]
-    assert main([*command, "--steps", "0", "--json"]) == 1  # lights that stay where the preset has them do not fit
-    assert not json.loads(capsys.readouterr().out)["verdict"]["good"]
+    assert main([*command, "--steps", "0", "--json"]) == 0
+    record = json.loads(capsys.readouterr().out)
+    assert record == json.loads((out / "calibration.json").read_text())
     assert main([*command, "--steps", "6"]) == 0  # in place of the first
     assert "verdict: good; residual" in capsys.readouterr().out
     record = json.loads((out / "calibration.json").read_text())
@@ -317,14 +318,14 @@ def test_noise_is_measured_through_the_response() -> None:
 
 @needs_llvm
 @pytest.mark.skipif(not CLIPS.is_dir(), reason="the real recordings are not here")
-def test_a_real_frame_that_was_not_fitted_is_met_within_8_levels(tmp_path: Path) -> None:
-    """Undeformed gels after the object was lost; measured 3.9, 2.0 and 5.0 of 255."""
+def test_a_real_frame_that_was_not_fitted_is_met_within_4_levels(tmp_path: Path) -> None:
+    """Undeformed gels after the object was lost; measured 3.9, 2.1 and 4.0 of 255."""
     for name, number in [("screw_driver_red__exp_num_2__camera_0", 344), ("avocado_real__exp_num_7__camera_0", 408)]:
         clip = cv2.VideoCapture(os.fspath(CLIPS / f"{name}.avi"))
         for _ in range(number + 1):
             image = clip.read()[1]
         cv2.imwrite(str(tmp_path / f"{number}.png"), image)
     frames = ["--frames", str(tmp_path / "344.png"), "--judge", str(tmp_path / "408.png")]
-    assert main(["calibrate", *frames, "--steps", "6", "--out", str(tmp_path / "out")]) == 0
+    assert main(["calibrate", *frames, "--steps", "10", "--out", str(tmp_path / "out")]) == 0
     differences = json.loads((tmp_path / "out/calibration.json").read_text())["differences"]
-    assert max(differences["not fitted: 408.png"]["mean_absolute_outside_dots"]) < 8
+    assert max(differences["not fitted: 408.png"]["mean_absolute_outside_dots"]) <= 4
