@@ -30,12 +30,16 @@ class DotGridFit:
         camera: with focal lengths, principal point, tilt and k1 as found.
         residual_px: (n, 2) found minus predicted centres.
         used: (n,) indices of the found dots that are part of the grid.
+        index: (n, 2) their columns and rows.
+        pitch_px: mean distance of columns and of rows.
     """
 
     pattern: Dots
     camera: Camera
     residual_px: Pixels
     used: NDArray[np.int64]
+    index: NDArray[np.int64]
+    pitch_px: float
 
 
 def fit_dot_grid(sensor: Sensor, pattern: Dots, centres: Pixels, spacing_mm: float | None) -> DotGridFit:
@@ -83,10 +87,10 @@ def fit_dot_grid(sensor: Sensor, pattern: Dots, centres: Pixels, spacing_mm: flo
     found = least_squares(misfit, start, loss="soft_l1", f_scale=3.0, x_scale=np.maximum(np.abs(start), 0.05))
     layout, fitted = build(found.x)
     residual = centres[used] - _predicted(sensor, layout, fitted, index)
-    scale = float(np.mean(np.linalg.norm(np.diff(_corner(sensor, layout, fitted), axis=0), axis=1) / layout.spacing_mm))
-    jitter = 1.4826 * float(np.median(np.abs(residual))) / scale
+    arms = np.linalg.norm(np.diff(_corner(sensor, layout, fitted), axis=0), axis=1)
+    jitter = 1.4826 * float(np.median(np.abs(residual)) / np.mean(arms / layout.spacing_mm))
     layout = _near_centre(layout.model_copy(update={"jitter_mm": round(jitter, 4)}))
-    return DotGridFit(_rounded(layout), _rounded(fitted), residual, used)
+    return DotGridFit(_rounded(layout), _rounded(fitted), residual, used, index, float(arms.mean()))
 
 
 def grid_index(centres: Pixels) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -115,8 +119,10 @@ def grid_index(centres: Pixels) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
             if distance < 0.3 * np.linalg.norm(right) and other not in place:
                 place[int(other)] = (place[dot][0] + column, place[dot][1] + row)
                 waiting.append(int(other))
-    if len(place) < _FEWEST or len(set(place.values())) < len(place):
+    if len(place) < _FEWEST:
         raise InputError(f"only {len(place)} of {len(centres)} dots form a grid of rows and columns")
+    if len(set(place.values())) < len(place):
+        raise InputError("rows and columns of the dots run into each other: the gel is pressed; give frames at rest")
     used = np.array(sorted(place), dtype=np.int64)
     return used, np.array([place[int(k)] for k in used], dtype=np.int64)
 

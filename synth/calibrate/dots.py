@@ -1,4 +1,4 @@
-"""Dark dots of a frame: where they are, and the brightness of the coating around and beneath them."""
+"""Dots of a frame, darker or brighter than the coating: where they are, and the coating's brightness around them."""
 
 from dataclasses import dataclass
 
@@ -11,7 +11,7 @@ _FEWEST = 9
 SMALLEST_PX = 1.0
 """Radius of dots whose edge can be told from the blur, which `synth.calibrate.profile` at first takes for 1 px."""
 _CLEAREST = 0.75
-"""A dot's middle is at least so much darker than the coating around: ratio of linear brightness."""
+"""A dot's middle is at least so much darker than the coating around, or brighter: ratio of linear brightness."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,10 +19,10 @@ class FoundDots:
     """Dots that lie wholly in the image.
 
     Attributes:
-        centres: (n, 2) px, centroids of darkness.
-        radii: (n,) px, of disks of the same integrated darkness.
+        centres: (n, 2) px, centroids of contrast to the coating.
+        radii: (n,) px, of disks of the same integrated contrast.
         ratio: (H, W, 3) linear brightness over that of the coating around.
-        covered: (H, W) whether a pixel may hold some of a dot's darkness, at the image's border as well.
+        covered: (H, W) whether a pixel may hold some of a dot, at the image's border as well.
     """
 
     centres: Pixels
@@ -47,11 +47,12 @@ def find_dots(linear: FloatArray, pitch_px: float) -> FoundDots:
     window = 2 * int(pitch_px / 2) + 1
     coarse = cv2.medianBlur(np.round(255 * np.sqrt(np.clip(grey, 0, 1))).astype(np.uint8), window)
     ratio = grey / np.maximum((coarse / 255.0) ** 2, 1e-4)
-    depth = float(np.percentile(ratio, 1))
-    if depth > _CLEAREST:
+    dark, bright = np.percentile(ratio, [1, 99])
+    extreme = float(dark if dark * bright < 1 else np.median(ratio[ratio > np.sqrt(bright)]))  # of the marks
+    if _CLEAREST < extreme < 1 / _CLEAREST:
         raise _too_few(0, pitch_px)
-    threshold = (1 + depth) / 2
-    _, labels, table, _ = cv2.connectedComponentsWithStats((ratio < threshold).astype(np.uint8))
+    middle = ((1 - ratio) / (1 - extreme) > 0.5).astype(np.uint8)
+    _, labels, table, _ = cv2.connectedComponentsWithStats(middle)
     area = table[1:, cv2.CC_STAT_AREA].astype(np.float64)
     large = area > 0.3 * np.median(area[area > (0.1 * pitch_px) ** 2]) if (area > (0.1 * pitch_px) ** 2).any() else []
     if not np.any(large):
@@ -63,9 +64,10 @@ def find_dots(linear: FloatArray, pitch_px: float) -> FoundDots:
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
     covered = cv2.dilate((np.isin(labels, 1 + np.flatnonzero(area > 0.05 * typical))).astype(np.uint8), kernel) > 0
     around = np.maximum(_around(linear, covered, 0.35 * pitch_px), 1e-6)
-    bright = linear.sum(axis=2) / around.sum(axis=2)  # weighs channels by their light: a dark one's kinks count little
+    relative = linear.sum(axis=2) / around.sum(axis=2)  # weighs channels by their light
+    contrast = (1 - relative) / (1.0 if extreme < 1 else 1 - extreme)
     whole = [k for k in np.flatnonzero((area > 0.5 * typical) & (area < 2 * typical)) if _inside(table[k + 1], labels)]
-    found = [_measure(bright, labels == k + 1, radius) for k in whole]
+    found = [_measure(contrast, labels == k + 1, radius) for k in whole]
     if len(found) < _FEWEST:
         raise _too_few(len(found), pitch_px)
     centres, radii = (np.array(part) for part in zip(*found, strict=True))
@@ -112,25 +114,25 @@ def _inside(box: FloatArray, labels: FloatArray) -> bool:
     return bool(left > 1 and top > 1 and left + width < labels.shape[1] - 1 and top + height < labels.shape[0] - 1)
 
 
-def _measure(ratio: FloatArray, member: BoolArray, radius: float) -> tuple[FloatArray, float]:
-    """Centroid (2,) px of a dot's darkness, and the radius of the disk of its integrated darkness."""
+def _measure(contrast: FloatArray, member: BoolArray, radius: float) -> tuple[FloatArray, float]:
+    """Centroid (2,) px of a dot's contrast, and the radius of the disk of its integrated contrast."""
     rows, columns = np.nonzero(member)
     centre = np.array([columns.mean() + 0.5, rows.mean() + 0.5])
     reach = 1.5 * radius + 1.5
     top, left = (int(max(0, np.floor(c - reach))) for c in centre[::-1])
-    patch = ratio[top : int(centre[1] + reach) + 1, left : int(centre[0] + reach) + 1]
+    patch = contrast[top : int(centre[1] + reach) + 1, left : int(centre[0] + reach) + 1]
     y, x = np.mgrid[: patch.shape[0], : patch.shape[1]] + 0.5
     x, y = x + left, y + top
-    depth = 1 - float(np.median(ratio[member & (ratio < np.median(ratio[member]))]))
+    depth = float(np.median(contrast[member & (contrast > np.median(contrast[member]))]))
     for _ in range(3):
-        darkness = np.where(np.hypot(x - centre[0], y - centre[1]) < reach, np.clip(1 - patch, -0.1, 1), 0)
-        weight = np.where(darkness > 0.08 * depth, darkness, 0)  # what is fainter is noise of the coating
+        share = np.where(np.hypot(x - centre[0], y - centre[1]) < reach, np.clip(patch, -0.1, max(depth, 1)), 0)
+        weight = np.where(share > 0.08 * depth, share, 0)  # what is fainter is noise of the coating
         centre = np.array([(weight * x).sum(), (weight * y).sum()]) / weight.sum()
-    return centre, float(np.sqrt(max(darkness.sum(), 0.0) / depth / np.pi))
+    return centre, float(np.sqrt(max(share.sum(), 0.0) / depth / np.pi))
 
 
 def _too_few(count: int, pitch_px: float) -> InputError:
     return InputError(
-        f"{count} whole dark dots were found in the frame, at least {_FEWEST} are needed; dots were expected about "
+        f"{count} whole dots were found in the frame, at least {_FEWEST} are needed; dots were expected about "
         f"{pitch_px:.0f} px apart: check sensor.pattern.spacing_mm of the preset (--set), or take a preset without dots"
     )

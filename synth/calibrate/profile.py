@@ -1,4 +1,4 @@
-r"""What a dot's edge tells: its radius, its darkness and the blur of the lens.
+r"""What a dot's edge tells: its radius, its brightness and the blur of the lens.
 
 A disk of radius R seen through a Gaussian point spread σ covers at the distance r from its centre
 
@@ -55,19 +55,19 @@ def fit_profile(dots: FoundDots) -> DotProfile:
     grey = seen.mean(axis=1)
 
     def model(p: FloatArray) -> FloatArray:
-        radius, spread, dark, bright = p
-        return np.asarray(bright + (dark - bright) * ncx2.cdf((radius / spread) ** 2, 2, (r / spread) ** 2))
+        radius, spread, inside, outside = p
+        return np.asarray(outside + (inside - outside) * ncx2.cdf((radius / spread) ** 2, 2, (r / spread) ** 2))
 
-    start = [common, SMALLEST_PX, float(np.clip(grey[0], 0, 1)), 1.0]
+    start = [common, SMALLEST_PX, max(float(grey[0]), 0.0), 1.0]
     found = least_squares(
-        lambda p: model(p) - grey, start, bounds=([0.3 * common, 0.2, 0, 0.5], [2 * common, common, 1, 1.5])
+        lambda p: model(p) - grey, start, bounds=([0.3 * common, 0.2, 0, 0.5], [2 * common, common, np.inf, 1.5])
     )
     radius, spread = found.x[:2]
     share = ncx2.cdf((radius / spread) ** 2, 2, (r / spread) ** 2)
     # With radius and spread known, each channel's profile is linear in its brightness inside and outside.
     inside, outside = np.linalg.lstsq(np.column_stack([share, 1 - share]), seen, rcond=None)[0]
     scatter = 1.4826 * float(np.median(np.abs(dots.radii / common - 1)))
-    return DotProfile(float(radius), scatter, float(spread), np.clip(inside / outside, 0, 1))
+    return DotProfile(float(radius), scatter, float(spread), np.maximum(inside / outside, 0))
 
 
 def blur_of(profile: DotProfile, softness_px: float) -> float:

@@ -1,6 +1,7 @@
 """What calibration writes: the fitted scene's content and its numbers."""
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 from synth.calibrate.comparison import Comparison
 from synth.calibrate.frames import Frames
 from synth.calibrate.sensor_fit import SensorFit
+from synth.calibrate.verdict import Verdict
 from synth.scene import Dots, Sensor
 from synth.scene.template import Template, with_files
 
@@ -39,6 +41,7 @@ def numbers(
     fit: SensorFit,
     start: Sensor,
     rows: dict[str, Comparison],
+    verdict: Verdict,
     given: Frames,
     seconds: float,
 ) -> dict[str, Any]:
@@ -51,6 +54,7 @@ def numbers(
         "seconds": round(seconds, 1),
         "steps": fit.lights.steps,
         "residual_of_the_lights": round(255 * fit.lights.residual, 3),
+        "verdict": asdict(verdict),
         "differences": {name: row.numbers() for name, row in rows.items()},
         "lights": _lights(fit, start),
         "camera": {key: getattr(camera, key) for key in _CAMERA},

@@ -43,6 +43,9 @@ def run_calibrate(
         steps: most steps for the lights' geometry.
         as_json: print the numbers instead of a summary.
 
+    Returns:
+        0 if the fit is good, 1 if the verdict is that it is not.
+
     Raises:
         InputError: frames, preset or storage are at fault, or this machine has no differentiable variant.
     """
@@ -52,7 +55,8 @@ def run_calibrate(
     from synth.calibrate.frames import read_frames
     from synth.calibrate.preset import render_settings, start_sensor
     from synth.calibrate.report import fitted_content, numbers, summary
-    from synth.calibrate.sensor_fit import bare_pixels, fit_sensor
+    from synth.calibrate.sensor_fit import find_grid, fit_sensor
+    from synth.calibrate.verdict import verdict
     from synth.dataset.storage import refuse_foreign, replace_file, storage_errors
     from synth.render.variant import LLVM_HINT, choose_variant
     from synth.scene.template import checked_template, load_scene
@@ -80,11 +84,12 @@ def run_calibrate(
     print("synth: fitting the sensor to the frames", file=sys.stderr, flush=True)
     fit = fit_sensor(start, given, variant, spacing_mm, steps)
     rendered = render_undeformed(fit.sensor, render_settings(template), variant)
-    rows = {"frames": compare(given.encoded, rendered, fit.bare, fit.sensor)}
-    for name, other in others.items():
-        rows[f"not fitted: {Path(name).name}"] = compare(
-            other.encoded, rendered, bare_pixels(other, fit.sensor), fit.sensor
-        )
+    rows, grids = {"frames": compare(given.encoded, rendered, fit.bare, fit.sensor)}, {"frames": fit.grid}
+    for path, other in others.items():
+        name = f"not fitted: {Path(path).name}"
+        _, grids[name], bare = find_grid(fit.sensor, other.encoded**fit.sensor.camera.gamma, None)
+        rows[name] = compare(other.encoded, rendered, bare, fit.sensor)
+    found = verdict(rows, grids, fit.sensor, spacing_mm is not None)
     content = fitted_content(template, fit, os.path.relpath(template.source.parent.resolve(), out.resolve()))
     file = out / SCENE
     try:
@@ -92,13 +97,13 @@ def run_calibrate(
     except InputError as error:
         problem = str(error).replace(f"{file}: ", "")
         raise InputError(f"the frames do not fit --scene {scene}: they give {problem}; {_WHAT_FRAMES}") from error
-    record = numbers(template.name, frames, fit, start, rows, given, time.perf_counter() - started)
+    record = numbers(template.name, frames, fit, start, rows, found, given, time.perf_counter() - started)
     comment = f"# {MARK} --scene {scene}` to {len(frames)} frame(s); numbers in {NUMBERS}.\n"
     replace_file(file, (comment + tomli_w.dumps(content)).encode())
-    replace_file(out / PICTURE, picture(rows))
+    replace_file(out / PICTURE, picture(rows, found.lines()[0]))
     replace_file(out / NUMBERS, (json.dumps(record, indent=1) + "\n").encode())
-    print(json.dumps(record) if as_json else "\n".join([*summary(record), f"written: {file}"]))
-    return 0
+    print(json.dumps(record) if as_json else "\n".join([*summary(record), f"written: {file}", *found.lines()]))
+    return 0 if found.good else 1
 
 
 def _check_spacing(spacing_mm: float, start: "Sensor", scene: str) -> None:

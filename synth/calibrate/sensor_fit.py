@@ -56,12 +56,9 @@ def fit_sensor(start: Sensor, frames: Frames, variant: Variant, spacing_mm: floa
     """
     gamma = start.camera.gamma
     linear = frames.encoded**gamma
-    sensor, dots, grid = start, None, None
-    bare = np.ones(linear.shape[:2], dtype=bool)
-    if isinstance(start.pattern, Dots):
-        dots = find_dots(linear, start.pattern.spacing_mm[0] * pixels_per_mm(start))
-        grid = fit_dot_grid(start, start.pattern, dots.centres, spacing_mm)
-        bare = ~dots.covered
+    dots, grid, bare = find_grid(start, linear, spacing_mm)
+    sensor = start
+    if dots is not None and grid is not None:
         sensor = start.model_copy(update=_look(start, grid, fit_profile(dots)))
     pixels = _spread(bare & _sees_gel(sensor))
     if not len(pixels):
@@ -87,12 +84,14 @@ def fit_sensor(start: Sensor, frames: Frames, variant: Variant, spacing_mm: floa
     return SensorFit(sensor, fit, dots, grid, bare)
 
 
-def bare_pixels(frames: Frames, sensor: Sensor) -> BoolArray:
-    """(H, W): pixels of a frame that show nothing but coating."""
+def find_grid(
+    sensor: Sensor, linear: FloatArray, spacing_mm: float | None
+) -> tuple[FoundDots | None, DotGridFit | None, BoolArray]:
+    """Dots and grid of a linear frame (H, W, 3), None for a sensor without dots, and (H, W) its pixels beside dots."""
     if not isinstance(sensor.pattern, Dots):
-        return np.ones(frames.encoded.shape[:2], dtype=bool)
-    pitch = sensor.pattern.spacing_mm[0] * pixels_per_mm(sensor)
-    return ~find_dots(frames.encoded**sensor.camera.gamma, pitch).covered
+        return None, None, np.ones(linear.shape[:2], dtype=bool)
+    dots = find_dots(linear, sensor.pattern.spacing_mm[0] * pixels_per_mm(sensor))
+    return dots, fit_dot_grid(sensor, sensor.pattern, dots.centres, spacing_mm), ~dots.covered
 
 
 def _look(start: Sensor, grid: DotGridFit, profile: DotProfile) -> dict[str, Any]:

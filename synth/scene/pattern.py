@@ -71,7 +71,7 @@ class RandomColor(Part):
 
 
 class Speckle(Part):
-    """Random dark grains, as sprayed for digital image correlation."""
+    """Random grains, darker or brighter than the coating, as sprayed for digital image correlation."""
 
     kind: Literal["speckle"]
     grain_mm: Positive

@@ -190,10 +190,13 @@ def test_the_command_writes_a_scene_that_loads_and_generates(tmp_path: Path, cap
     out = tmp_path / "mine"
     command = ["calibrate", "--scene", str(preset), "--frames", str(frame), "--judge", str(other), "--out", str(out)]
     assert main([*command, "--steps", "0", "--json"]) == 0
-    capsys.readouterr()
-    assert main([*command, "--steps", "6", "--json"]) == 0  # in place of the first
     record = json.loads(capsys.readouterr().out)
     assert record == json.loads((out / "calibration.json").read_text())
+    assert main([*command, "--steps", "6"]) == 0  # in place of the first
+    assert "verdict: good; residual" in capsys.readouterr().out
+    record = json.loads((out / "calibration.json").read_text())
+    assert record["verdict"]["good"]
+    assert record["verdict"]["reasons"] == []
     assert set(record["differences"]) == {"frames", "not fitted: other.png"}
     for difference in record["differences"].values():
         # The fit itself leaves below 0.5; rounding to 8 bits and the camera's noise of 1 level, 0.8 on average.
@@ -245,7 +248,7 @@ def test_a_photograph_is_turned_as_its_exif_says(tmp_path: Path) -> None:
 
 
 def test_a_frame_without_dots_dots_without_a_grid_and_dots_of_a_pixel_are_refused() -> None:
-    with pytest.raises(InputError, match="0 whole dark dots"):
+    with pytest.raises(InputError, match="0 whole dots"):
         find_dots(np.full((120, 160, 3), 0.3), 15.0)
     with pytest.raises(InputError, match="grid"):
         grid_index(np.random.default_rng(0).uniform(0, 100, (12, 2)))
@@ -321,14 +324,14 @@ def test_noise_is_measured_through_the_response() -> None:
 
 @needs_llvm
 @pytest.mark.skipif(not CLIPS.is_dir(), reason="the real recordings are not here")
-def test_a_real_frame_that_was_not_fitted_is_met_within_8_levels(tmp_path: Path) -> None:
-    """Undeformed gels after the object was lost; measured 3.9, 2.0 and 5.0 of 255."""
+def test_a_real_frame_that_was_not_fitted_is_met_within_4_levels(tmp_path: Path) -> None:
+    """Undeformed gels after the object was lost; measured 3.9, 2.1 and 4.0 of 255."""
     for name, number in [("screw_driver_red__exp_num_2__camera_0", 344), ("avocado_real__exp_num_7__camera_0", 408)]:
         cv2.imwrite(str(tmp_path / f"{number}.png"), _real_frame(name, number))
     frames = ["--frames", str(tmp_path / "344.png"), "--judge", str(tmp_path / "408.png")]
-    assert main(["calibrate", *frames, "--steps", "6", "--out", str(tmp_path / "out")]) == 0
+    assert main(["calibrate", *frames, "--steps", "10", "--out", str(tmp_path / "out")]) == 0
     differences = json.loads((tmp_path / "out/calibration.json").read_text())["differences"]
-    assert max(differences["not fitted: 408.png"]["mean_absolute_outside_dots"]) < 8
+    assert max(differences["not fitted: 408.png"]["mean_absolute_outside_dots"]) <= 4
 
 
 @pytest.mark.skipif(not CLIPS.is_dir(), reason="the real recordings are not here")

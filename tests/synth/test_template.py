@@ -16,7 +16,7 @@ from synth.scene.template import SCENES, checked_template, load_scene, replaced,
 
 def test_shipped_scenes_are_known_by_name_and_a_template_needs_no_file(tmp_path, monkeypatch) -> None:
     flat = "deltact digit fingervision gelsight gelsight_fingertip gelsight_mini gelslim gelstereo omnitact soft_bubble"
-    assert shipped_scenes() == sorted([*flat.split(), "densetact", "objects", "tac3d"])
+    assert shipped_scenes() == sorted([*flat.split(), "densetact", "dmtac", "objects", "tac3d", "tac3d_single"])
     assert load_scene("gelsight_mini").source == SCENES / "gelsight_mini.toml"
     (tmp_path / "gelsight_mini").mkdir()
     monkeypatch.chdir(tmp_path)

@@ -1,0 +1,70 @@
+"""What a picture of a gel looks like in a few numbers, the same for photographs and for rendered frames.
+
+Pictures are (H, W, 3) RGB in levels of 255. Lengths are in px, levels encoded.
+"""
+
+import cv2
+import numpy as np
+
+from synth.arrays import FloatArray
+
+
+def bright_dots(image: FloatArray) -> dict[str, float]:
+    """Pitch and size of dots brighter than the coating, and the levels of both, of dots some 32 px apart.
+
+    Dots are what is above the middle between the coating's and the dots' levels in the green channel. Medians leave out
+    those that a contact squeezes.
+    """
+    green = cv2.GaussianBlur(image[:, :, 1], (0, 0), 1.0)
+    low, high = np.percentile(green, [50, 99])
+    dots = (green > (low + high) / 2).astype(np.uint8)
+    _, _, table, centres = cv2.connectedComponentsWithStats(dots)
+    left, top, width, height, area = table.T
+    whole = (left > 0) & (top > 0) & (left + width < image.shape[1]) & (top + height < image.shape[0]) & (area > 20)
+    whole[0] = False
+    arms = (centres[whole][:, None] - centres[whole][None]).reshape(-1, 2)
+    along, across = np.abs(arms).T
+    found = {
+        "pitch x": np.median(along[(across < 0.3 * along) & (along < 50)]),
+        "pitch y": np.median(across[(along < 0.3 * across) & (across < 42)]),
+        "width": np.median(width[whole]),
+        "height": np.median(height[whole]),
+    }
+    coating = cv2.dilate(dots, np.ones((7, 7), np.uint8)) == 0
+    inside = cv2.erode(dots, np.ones((3, 3), np.uint8)) > 0
+    for name, part in {"coating": coating, "dots": inside, "mean": np.ones_like(coating)}.items():
+        found |= {f"{name} {channel}": image[part, i].mean() for i, channel in enumerate(("red", "green", "blue"))}
+    return {name: float(value) for name, value in found.items()}
+
+
+def speckle(image: FloatArray) -> dict[str, float]:
+    """Distance, size, contrast and level of grey speckle away from where the picture is clipped to white.
+
+    pitch: wavelength at the mean of the power spectrum along both axes; size: where the autocorrelation falls to one
+    half; contrast: standard deviation over the mean. White: share of pixels within one level of the top.
+    """
+    grey = image.mean(axis=2)
+    clipped = cv2.GaussianBlur((grey > 240).astype(np.float64), (0, 0), 12) > 0.02
+    side, step = 96, 32
+    spectra, levels, contrasts = [], [], []
+    for top in range(0, grey.shape[0] - side + 1, step):
+        for left in range(0, grey.shape[1] - side + 1, step):
+            part = (slice(top, top + side), slice(left, left + side))
+            if clipped[part].any():
+                continue
+            tile = grey[part]
+            fine = tile - cv2.GaussianBlur(tile, (0, 0), 16)
+            levels.append(tile.mean())
+            contrasts.append(fine.std() / tile.mean())
+            taper = np.hanning(side)
+            spectra.append(np.abs(np.fft.fft2(fine * taper[:, None] * taper)) ** 2 / fine.var())
+    power = np.mean(spectra, axis=0)
+    frequency = np.hypot(np.fft.fftfreq(side)[:, None], np.fft.fftfreq(side))
+    near = np.fft.ifft2(power).real
+    near /= near[0, 0]
+    fall = (near[0, :20] + near[:20, 0]) / 2
+    half = int(np.argmax(fall < 0.5))
+    size = half - (0.5 - fall[half]) / (fall[half - 1] - fall[half])
+    found = {"pitch": (power.sum() / (power * frequency).sum()), "size": size, "contrast": np.mean(contrasts),
+             "level": np.mean(levels), "white": np.mean(grey >= 254)}  # fmt: skip
+    return {name: float(value) for name, value in found.items()}
