@@ -20,7 +20,8 @@ import numpy as np
 
 from synth.arrays import FloatArray, Points
 from synth.errors import InputError
-from synth.mesh.pad import PadMesh, face_height
+from synth.mesh.face import PadFace, face_height
+from synth.mesh.pad import PadMesh
 from synth.scene import Gel
 from synth.surface import FACE_EDGES, ContactFaces, GelSurface
 
@@ -38,7 +39,7 @@ def domed(mesh: PadMesh, dome_radius_mm: float | None) -> PadMesh:
         return mesh
     points = mesh.points.copy()
     points[:, 2] = _raised(points, mesh.size_mm[2], dome_radius_mm)
-    bulged = replace(mesh, points=points, dome_radius_mm=dome_radius_mm)
+    bulged = replace(mesh, points=points, face=PadFace(dome_radius_mm))
     if bulged.volumes.min() <= 0:
         raise InputError(
             f"a mesh of even edge length turns over where it is bulged to sensor.gel.dome_radius_mm = "

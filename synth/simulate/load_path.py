@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from synth.arrays import FloatArray
-from synth.mesh.pad import face_height
+from synth.mesh.face import face_height
 from synth.scene import Motion, Scene
 from synth.scene import Pose as PoseOfScene
 from synth.simulate.distance import KINDS
