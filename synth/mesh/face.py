@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from synth.arrays import BoolArray, FloatArray, Points
+from synth.mesh.capsule import CapsuleFace
 from synth.scene import Gel
 from synth.scene.gel import dome_height
 
@@ -57,6 +58,8 @@ FLAT_FACE = PadFace()
 
 def face_of(gel: Gel) -> Face:
     """The shape of a scene's gel."""
+    if gel.radius_mm is not None and gel.thickness_mm is not None:
+        return CapsuleFace(gel.radius_mm, gel.thickness_mm, gel.length_mm, gel.cut_end == "held")
     return PadFace(gel.dome_radius_mm)
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from synth.mesh import pad_mesh
+from synth.mesh import default_edge_length, pad_mesh
 from synth.scene import Numerics, Scene
 from synth.simulate.press import Press
 from synth.simulate.resolution import Resolution, resolve
@@ -19,7 +19,8 @@ class MeshRule:
     """See the module's docstring.
 
     Attributes:
-        kind: "graded": around each contact, as fine as the target asks for; "even": `numerics.cells`, the same for all
+        kind: how the meshes of boxes and domes are chosen; round gels always have one of fTetWild for all trajectories.
+            "graded": around each contact, as fine as the target asks for; "even": `numerics.cells`, the same for all
             trajectories of a pad; "tetwild": `numerics.edge_length_mm`, also the same for all.
         target_error_px: root-mean-square error of the flow that the simulation may leave; NaN for "tetwild", for which
             nothing is predicted.
@@ -44,7 +45,7 @@ class MeshRule:
             InputError: the indenter, whose mesh file is relative to `folder`, or the mesh cannot be built.
         """
         gel, numerics = scene.sensor.gel, scene.numerics
-        match self.kind:
+        match "tetwild" if gel.is_round else self.kind:
             case "graded":
                 return resolve(scene, folder, self.target_error_px)
             case "even":
@@ -53,14 +54,14 @@ class MeshRule:
                 return Resolution(mesh, found.across, numerics.cells[2], spacing, found.error_px)
             case "tetwild":
                 mesh = pad_mesh(gel, numerics, mesh_folders)
-                return Resolution(mesh, 0, 0, numerics.edge_length_mm or 0.0, float("nan"))
+                return Resolution(mesh, 0, 0, numerics.edge_length_mm or default_edge_length(gel), float("nan"))
 
     def press(self, scene: Scene, folder: Path | None = None, mesh_folders: Sequence[Path] | None = None) -> Press:
         """Mesh, body and load path of a scene; arguments as of `resolution`.
 
         The accuracy of an even mesh is left out: whoever finishes the samples predicts it, beside the simulation.
         """
-        if self.kind == "even":
+        if self.kind == "even" and not scene.sensor.gel.is_round:
             return Press.of(scene, shared_mesh(scene.sensor.gel, scene.numerics), folder)
         found = self.resolution(scene, folder, mesh_folders)
         return Press.of(scene, found.mesh, folder, Accuracy.of(found))
