@@ -45,7 +45,7 @@ def press(case: Row) -> Row:
     try:
         file = f'shape = "mesh", file = "{case["file"]}", size_mm = {SIZE_MM}, rotation_deg = "any"'
         scene = scene_of(f"{{ {file} }}", seed)
-        mesh = MeshRule.of(scene.numerics).resolution(scene).mesh
+        mesh = MeshRule.of(scene).resolution(scene).mesh
         result, seconds = timed(scene, mesh)
     except InputError as error:
         return {"status": "refused", "reason": str(error)}

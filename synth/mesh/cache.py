@@ -24,8 +24,9 @@ from synth.mesh.tetrahedralise import ENVELOPE, tetrahedralise, tetrahedralise_b
 from synth.mesh.tetwild_sizing import GRADING, even
 from synth.scene import Gel, Numerics
 
-SURFACE = 0.7
-"""Edges of the surface that fTetWild is given, over those that it is to make."""
+SURFACE, ROOM = 0.5, 1.5
+"""Edges of the surface that fTetWild is given, over those that it is to make, and its envelope over their chords'
+distance from a curved face."""
 CHORDS = 0.03
 """Share of a round gel's volume that flat faces may add or take away."""
 
@@ -91,9 +92,12 @@ def _made(gel: Gel, edge_mm: float) -> PadMesh:
     if not isinstance(face, CapsuleFace):
         return tetrahedralise_box(gel.size_mm, edge_mm)
     sides = (face.project_end, face.project_window, face.project)
-    surface = face.triangles(SURFACE * edge_mm)
+    # Edges of that length on the face, whose chords are off it by h² / 8 R, must fit the envelope.
+    off = ROOM * edge_mm**2 / (8 * face.radius_mm)
+    surface, triangles = face.triangles(SURFACE * edge_mm)
+    envelope = max(ENVELOPE, off / float(np.linalg.norm(np.ptp(surface, axis=0))))
     background = even(gel.size_mm, edge_mm)
-    points, tets = tetrahedralise(*surface, sides, background, face.volume_mm3, CHORDS)
+    points, tets = tetrahedralise(surface, triangles, sides, background, face.volume_mm3, CHORDS, envelope=envelope)
     return PadMesh(points, tets, gel.size_mm, face=face)
 
 

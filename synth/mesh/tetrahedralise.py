@@ -14,13 +14,15 @@ from functools import partial
 
 import numpy as np
 
-from synth.arrays import Points, Tets, Triangles
+from synth.arrays import FloatArray, Points, Tets, Triangles
 from synth.errors import InputError
 from synth.mesh.pad import PadMesh, boundary_faces, signed_volumes
 from synth.mesh.tetwild_sizing import Background, through_thickness
 
 ENVELOPE = 1e-3
-"""fTetWild's epsilon, relative to the bounding box's diagonal."""
+"""fTetWild's epsilon for flat faces, relative to the bounding box's diagonal."""
+ON_SIDE_MM = 1e-9
+"""Distance from a side at which a vertex lies on it."""
 WORST_SHAPE = 0.02
 """Smallest accepted ratio of inscribed to circumscribed radius, times 3 (1 for a regular tetrahedron)."""
 
@@ -44,9 +46,7 @@ def tetrahedralise_box(
         InputError: no attempt gave a valid mesh.
     """
     background = background or through_thickness(size_mm, edge_length_mm)
-    planes = [(axis, side * size_mm[axis] / 2) for axis in (0, 1) for side in (-1, 1)] + [(2, 0.0), (2, size_mm[2])]
-    sides = [partial(_onto_plane, axis=axis, value=value) for axis, value in planes]
-    points, tets = tetrahedralise(*_box(size_mm), sides, background, float(np.prod(size_mm)), 1e-9, attempts)
+    points, tets = tetrahedralise(*_box(size_mm), _sides(size_mm), background, float(np.prod(size_mm)), 1e-9, attempts)
     return PadMesh(points, tets, size_mm)
 
 
@@ -58,6 +58,7 @@ def tetrahedralise(
     volume_mm3: float,
     share: float,
     attempts: int = 3,
+    envelope: float = ENVELOPE,
 ) -> tuple[Points, Tets]:
     """Mesh what a closed surface encloses, with the vertices of its boundary moved onto the shape that it stands for.
 
@@ -69,6 +70,7 @@ def tetrahedralise(
         volume_mm3: of the shape.
         share: of the volume by which the mesh may differ from it.
         attempts: the mesher is random; a mesh below WORST_SHAPE is made again so often.
+        envelope: fTetWild's epsilon, relative to the bounding box's diagonal.
 
     Returns:
         Points (n, 3) mm and positively oriented tetrahedra (m, 4).
@@ -77,10 +79,10 @@ def tetrahedralise(
         InputError: no attempt gave a valid mesh.
     """
     problem = ""
-    tolerance = 2 * ENVELOPE * float(np.linalg.norm(np.ptp(corners, axis=0)))
+    tolerance = 2 * envelope * float(np.linalg.norm(np.ptp(corners, axis=0)))
     for _ in range(attempts):
-        points, tets = _repair(*_ftetwild(corners, faces, background), sides, tolerance)
-        problem = _fault(points, tets, volume_mm3, share)
+        points, tets = _repair(*_ftetwild(corners, faces, background, envelope), sides, tolerance)
+        problem = _fault(points, tets, sides, volume_mm3, share)
         if not problem:
             return points, tets
     edge_mm = float(background.values.min())
@@ -114,13 +116,18 @@ def _box(size: tuple[float, float, float]) -> tuple[Points, Triangles]:
     return corners, np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))], dtype=np.int32)
 
 
+def _sides(size: tuple[float, float, float]) -> list[Projection]:
+    planes = [(axis, side * size[axis] / 2) for axis in (0, 1) for side in (-1, 1)] + [(2, 0.0), (2, size[2])]
+    return [partial(_onto_plane, axis=axis, value=value) for axis, value in planes]
+
+
 def _onto_plane(points: Points, axis: int, value: float) -> Points:
     moved = points.copy()
     moved[:, axis] = value
     return moved
 
 
-def _ftetwild(corners: Points, faces: Triangles, background: Background) -> tuple[Points, Tets]:
+def _ftetwild(corners: Points, faces: Triangles, background: Background, envelope: float) -> tuple[Points, Tets]:
     import pytetwild
 
     # fTetWild leaves a __tracked_surface.stl in the working directory.
@@ -129,7 +136,7 @@ def _ftetwild(corners: Points, faces: Triangles, background: Background) -> tupl
             corners,
             faces,
             edge_length_abs=float(background.values.max()),
-            epsilon=ENVELOPE,
+            epsilon=envelope,
             bg_vertices=background.points,
             bg_tets=background.tets.copy(),  # read-only arrays are refused
             bg_values=background.values,
@@ -153,9 +160,8 @@ def _repair(points: Points, tets: Tets, sides: Sequence[Projection], tolerance: 
     used, renumbered = np.unique(tets, return_inverse=True)
     points, tets = points[used].copy(), renumbered.reshape(tets.shape).astype(np.int32)
     faces = boundary_faces(tets)
-    corners = points[faces].reshape(-1, 3)
     # The side of a boundary face is the one to which all three of its corners are near.
-    off = np.array([np.linalg.norm(corners - side(corners), axis=1).reshape(-1, 3).max(axis=1) for side in sides])
+    off = _distances(points, faces, sides)
     nearest = np.where(off.min(axis=0) <= tolerance, off.argmin(axis=0), -1)
     for number, side in enumerate(sides):
         nodes = np.unique(faces[nearest == number])
@@ -165,13 +171,22 @@ def _repair(points: Points, tets: Tets, sides: Sequence[Projection], tolerance: 
     return points, tets
 
 
-def _fault(points: Points, tets: Tets, volume_mm3: float, share: float) -> str:
+def _distances(points: Points, faces: Triangles, sides: Sequence[Projection]) -> FloatArray:
+    """(s, f) mm by which the farthest corners of faces are off each of the sides."""
+    corners = points[faces].reshape(-1, 3)
+    return np.array([np.linalg.norm(corners - side(corners), axis=1).reshape(-1, 3).max(axis=1) for side in sides])
+
+
+def _fault(points: Points, tets: Tets, sides: Sequence[Projection], volume_mm3: float, share: float) -> str:
     """What is wrong with a mesh, or an empty string."""
     volumes = signed_volumes(points, tets)
     if volumes.min() <= 0:
         return f"a tetrahedron has volume {volumes.min():.3g} mm^3"
     if abs(volumes.sum() / volume_mm3 - 1) > share:  # sums of some 1e4 volumes round to about 1e-13
         return f"the mesh fills {volumes.sum():.9g} of {volume_mm3:.9g} mm^3"
+    off = float(_distances(points, boundary_faces(tets), sides).min(axis=0).max())
+    if off > ON_SIDE_MM:
+        return f"a face of the boundary is {off:.3g} mm off the gel's shape"
     worst = float(shape_quality(points, tets).min())
     if worst < WORST_SHAPE:
         return f"worst tetrahedron has shape quality {worst:.3g} < {WORST_SHAPE}"

@@ -83,6 +83,11 @@ class Gel(Part):
         return self.shape == "capsule"
 
     @property
+    def is_flat(self) -> bool:
+        """Whether the contact face lies in z = 0."""
+        return self.shape == "box"
+
+    @property
     def depth_mm(self) -> float:
         """Thickness of the gel, of a domed pad that at the apex."""
         return self.thickness_mm or self.size_mm[2]

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from synth.mesh import default_edge_length, pad_mesh
-from synth.scene import Numerics, Scene
+from synth.scene import Scene
 from synth.simulate.press import Press
 from synth.simulate.resolution import Resolution, resolve
 from synth.simulate.shared import Accuracy, accuracy, shared_mesh, spacing_mm
@@ -19,9 +19,9 @@ class MeshRule:
     """See the module's docstring.
 
     Attributes:
-        kind: how the meshes of boxes and domes are chosen; round gels always have one of fTetWild for all trajectories.
-            "graded": around each contact, as fine as the target asks for; "even": `numerics.cells`, the same for all
-            trajectories of a pad; "tetwild": `numerics.edge_length_mm`, also the same for all.
+        kind: "graded": around each contact, as fine as the target asks for; "even": `numerics.cells`, the same for all
+            trajectories of a pad; "tetwild": by fTetWild, also the same for all: round gels, and others where
+            `numerics.edge_length_mm` is given.
         target_error_px: root-mean-square error of the flow that the simulation may leave; NaN for "tetwild", for which
             nothing is predicted.
     """
@@ -30,9 +30,10 @@ class MeshRule:
     target_error_px: float
 
     @classmethod
-    def of(cls, numerics: Numerics) -> "MeshRule":
+    def of(cls, scene: Scene) -> "MeshRule":
         """The rule of a scene."""
-        if numerics.edge_length_mm is not None:
+        numerics = scene.numerics
+        if numerics.edge_length_mm is not None or scene.sensor.gel.is_round:
             return cls("tetwild", float("nan"))
         return cls("even" if numerics.is_batched else "graded", numerics.target_error_px or DEFAULT_TARGET_PX)
 
@@ -45,7 +46,7 @@ class MeshRule:
             InputError: the indenter, whose mesh file is relative to `folder`, or the mesh cannot be built.
         """
         gel, numerics = scene.sensor.gel, scene.numerics
-        match "tetwild" if gel.is_round else self.kind:
+        match self.kind:
             case "graded":
                 return resolve(scene, folder, self.target_error_px)
             case "even":
@@ -61,7 +62,7 @@ class MeshRule:
 
         The accuracy of an even mesh is left out: whoever finishes the samples predicts it, beside the simulation.
         """
-        if self.kind == "even" and not scene.sensor.gel.is_round:
+        if self.kind == "even":
             return Press.of(scene, shared_mesh(scene.sensor.gel, scene.numerics), folder)
         found = self.resolution(scene, folder, mesh_folders)
         return Press.of(scene, found.mesh, folder, Accuracy.of(found))
