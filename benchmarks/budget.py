@@ -111,7 +111,7 @@ def drawn(template: Template, seed: int, index: int) -> Scene:
     for attempt in range(MAX_DRAWS):
         try:
             scene = draw(template, seed, index, attempt, sensor)
-            MeshRule.of(scene.numerics).resolution(scene, template.source.parent)
+            MeshRule.of(scene).resolution(scene, template.source.parent)
         except InputError as error:
             refused = str(error)
         else:
@@ -161,7 +161,7 @@ def press_draw(case: Row, assignments: list[str], most: int) -> list[Row]:
     pairs = pairs_of(template, case["seed"], case["draw"], scene.motion.steps)
     frames = frozenset(frame for pair in pairs for frame in pair.frames)
     shown, points = sorted(frames - {0}), places(scene)
-    rule = MeshRule.of(scene.numerics)
+    rule = MeshRule.of(scene)
     chosen = rule.resolution(scene, folder)
     mesh, finest, fine = reference_mesh(gel, zone, chosen.spacing_mm, most)
     step = min(STEP_MM, scene.numerics.max_step_mm)

@@ -54,7 +54,7 @@ def press(case: Row) -> Row:
     try:
         file = f'shape = "mesh", file = "{case["file"]}", size_mm = {SIZE_MM}, rotation_deg = "any"'
         scene = scene_of(f"{{ {file} }}", seed)
-        mesh = MeshRule.of(scene.numerics).resolution(scene).mesh
+        mesh = MeshRule.of(scene).resolution(scene).mesh
         result, seconds = timed(scene, mesh)
     except InputError as error:
         return {"status": "refused", "reason": str(error)}
@@ -75,7 +75,7 @@ def force(case: Row) -> Row:
     drawn = scene_of(f"{{ {file} }}", case["seed"])
     alone = drawn.motion.model_copy(update={"shear_mm": (0.0, 0.0), "twist_deg": 0.0, "steps": 1})
     scene = drawn.model_copy(update={"motion": alone})
-    coarse = MeshRule.of(scene.numerics).resolution(scene)
+    coarse = MeshRule.of(scene).resolution(scene)
     gel = scene.sensor.gel
     fine, spacing = graded_mesh(gel, footprint(path_of(scene), gel.size_mm, MARGIN), 2 * coarse.across)
     results = [simulate(scene, mesh) for mesh in (coarse.mesh, fine)]

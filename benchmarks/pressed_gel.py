@@ -70,7 +70,7 @@ def press(template: Template, seed: int) -> Press:
     for attempt in range(MAX_DRAWS):
         try:
             scene = draw(template, seed, 0, attempt)
-            mesh = MeshRule.of(scene.numerics).resolution(scene, folder).mesh
+            mesh = MeshRule.of(scene).resolution(scene, folder).mesh
             result = simulate(scene, mesh, folder, frames=frozenset({0, scene.motion.steps}))
         except InputError as error:
             reason = str(error)

@@ -81,7 +81,7 @@ def run_simulate(scene: str, out: Path, seed: int, index: int, assignments: Sequ
         out.mkdir(parents=True, exist_ok=True)  # before minutes of work, not after
     try:
         with progress("simulate: percent of the load path", 100) as advance:
-            press = MeshRule.of(template.numerics).press(instance, template.folder)
+            press = MeshRule.of(instance).press(instance, template.folder)
             trajectory = simulate_press(press, on_progress=lambda share: advance(int(100 * share), 100))
     except InputError as error:
         raise InputError(f"{template.label}: {error}") from error
@@ -195,7 +195,7 @@ def _show_plan(planned: Plan, n: int, as_json: bool) -> int:
 def _error_line(predicted: Prediction) -> str:
     """What the plan says of the simulation's discretisation error."""
     if predicted.error_px is None or predicted.target_error_px is None:
-        return "with an edge length given, the simulation's discretisation error is not predicted\n"
+        return "the simulation's discretisation error is not predicted for meshes of fTetWild\n"
     median, largest = predicted.error_px
     line = f"predicted error of the flow from the simulation: {median:.2g} px (median), {largest:.2g} px (largest)"
     if largest > predicted.target_error_px:

@@ -63,8 +63,11 @@ def run_calibrate(
 
     started = time.perf_counter()
     template = load_scene(scene, assignments)
-    if template.corners[0].sensor.gel.shape == "dome":
-        raise InputError(f"{template.label}: sensor.gel.shape: calibrate fits flat gels only, this one is a dome")
+    gel = template.corners[0].sensor.gel
+    if not gel.is_flat:
+        raise InputError(
+            f"{template.label}: sensor.gel.shape: calibrate fits flat gels only, this one is a {gel.shape}"
+        )
     refuse_foreign(out / SCENE, MARK.encode(), out / PICTURE, out / NUMBERS)
     if (out / SCENE).resolve() == template.source.resolve():
         raise InputError(f"--out {out}: its {SCENE} is what --scene starts from and would be lost; give another --out")

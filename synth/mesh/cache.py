@@ -9,33 +9,48 @@ import hashlib
 import json
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
 
 from synth.errors import InputError
+from synth.mesh.capsule import CapsuleFace
 from synth.mesh.dome import domed
+from synth.mesh.face import face_of
 from synth.mesh.pad import PadMesh
-from synth.mesh.tetrahedralise import ENVELOPE, tetrahedralise_box
-from synth.mesh.tetwild_sizing import GRADING
+from synth.mesh.tetrahedralise import ENVELOPE, tetrahedralise, tetrahedralise_box
+from synth.mesh.tetwild_sizing import GRADING, even
 from synth.scene import Gel, Numerics
+
+SURFACE, ROOM = 0.5, 1.5
+"""Edges of the surface that fTetWild is given, over those that it is to make, and its envelope over their chords'
+distance from a curved face."""
+CHORDS = 0.03
+"""Share of a round gel's volume that flat faces may add or take away."""
 
 
 def default_edge_length(gel: Gel) -> float:
-    """A fifth of the gel's thickness, at most 1 mm."""
+    """A fifth of the gel's thickness, at most 1 mm; of a capsule, whose one mesh serves all draws, four fifths of it
+    and at most a sixth of the radius.
+    """
+    if gel.is_round:
+        return min(0.8 * gel.depth_mm, gel.size_mm[0] / 12)
     return min(gel.size_mm[2] / 5, 1.0)
 
 
 def mesh_key(gel: Gel, numerics: Numerics) -> str:
     """Name of the mesh of a pad: everything that its making depends on."""
-    recipe = {
+    recipe: dict[str, object] = {
         "shape": gel.shape,
         "size_mm": gel.size_mm,
         "edge_length_mm": numerics.edge_length_mm or default_edge_length(gel),
         "grading": GRADING,
         "envelope": ENVELOPE,
     }
+    if gel.is_round:
+        recipe["thickness_mm"] = gel.thickness_mm
     return hashlib.sha256(json.dumps(recipe, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -64,18 +79,34 @@ def pad_mesh(gel: Gel, numerics: Numerics, folders: Sequence[Path] | None = None
     paths = [folder / f"{key}.npz" for folder in (folders if folders is not None else [user_cache()])]
     mesh = next((found for path in paths if (found := _read(path, gel)) is not None), None)
     if mesh is None:
-        mesh = tetrahedralise_box(gel.size_mm, numerics.edge_length_mm or default_edge_length(gel))
+        mesh = _made(gel, numerics.edge_length_mm or default_edge_length(gel))
     for path in paths:
         if _read(path, gel) is None:
             _write(path, mesh)
     return domed(mesh, gel.dome_radius_mm)
 
 
+def _made(gel: Gel, edge_mm: float) -> PadMesh:
+    """A new mesh; of a dome that of its box."""
+    face = face_of(gel)
+    if not isinstance(face, CapsuleFace):
+        return tetrahedralise_box(gel.size_mm, edge_mm)
+    sides = (face.project_end, face.project_window, face.project)
+    # Edges of that length on the face, whose chords are off it by h² / 8 R, must fit the envelope.
+    off = ROOM * edge_mm**2 / (8 * face.radius_mm)
+    surface, triangles = face.triangles(SURFACE * edge_mm)
+    envelope = max(ENVELOPE, off / float(np.linalg.norm(np.ptp(surface, axis=0))))
+    background = even(gel.size_mm, edge_mm)
+    points, tets = tetrahedralise(surface, triangles, sides, background, face.volume_mm3, CHORDS, envelope=envelope)
+    return PadMesh(points, tets, gel.size_mm, face=face)
+
+
 def _read(path: Path, gel: Gel) -> PadMesh | None:
     """A cached mesh, or None where there is none or the file is damaged (it is then made again)."""
     try:
         with np.load(path) as data:
-            return PadMesh(data["points"], data["tets"], gel.size_mm)
+            mesh = PadMesh(data["points"], data["tets"], gel.size_mm)
+            return replace(mesh, face=face_of(gel)) if gel.is_round else mesh
     except (OSError, EOFError, ValueError, KeyError, BadZipFile):
         return None
 

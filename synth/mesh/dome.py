@@ -20,12 +20,14 @@ import numpy as np
 
 from synth.arrays import FloatArray, Points
 from synth.errors import InputError
-from synth.mesh.pad import PadMesh, face_height
+from synth.mesh.capsule import CapsuleFace
+from synth.mesh.face import PadFace, face_height, face_of
+from synth.mesh.pad import PadMesh
 from synth.scene import Gel
 from synth.surface import FACE_EDGES, ContactFaces, GelSurface
 
 REST_CELLS = 24
-"""Squares of the undeformed face along its longer side."""
+"""Squares of the undeformed face along its longer side; of a capsule, edges along its diameter."""
 
 
 def domed(mesh: PadMesh, dome_radius_mm: float | None) -> PadMesh:
@@ -38,7 +40,7 @@ def domed(mesh: PadMesh, dome_radius_mm: float | None) -> PadMesh:
         return mesh
     points = mesh.points.copy()
     points[:, 2] = _raised(points, mesh.size_mm[2], dome_radius_mm)
-    bulged = replace(mesh, points=points, dome_radius_mm=dome_radius_mm)
+    bulged = replace(mesh, points=points, face=PadFace(dome_radius_mm))
     if bulged.volumes.min() <= 0:
         raise InputError(
             f"a mesh of even edge length turns over where it is bulged to sensor.gel.dome_radius_mm = "
@@ -62,7 +64,10 @@ def flat_surface(size_mm: tuple[float, float, float]) -> GelSurface:
 
 
 def rest_surface(gel: Gel) -> GelSurface:
-    """The undeformed contact face of a pad, whatever its mesh: two triangles, or a dome of quadratic ones."""
+    """The undeformed contact face of a gel, whatever its mesh: two triangles, or quadratic ones where it is curved."""
+    face = face_of(gel)
+    if isinstance(face, CapsuleFace):
+        return face.rest_surface(gel.size_mm[0] / REST_CELLS)
     if gel.dome_radius_mm is None:
         return flat_surface(gel.size_mm)
     x, y = gel.size_mm[0] / 2, gel.size_mm[1] / 2

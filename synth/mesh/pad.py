@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from synth.arrays import BoolArray, FloatArray, Points, Tets, Triangles
 from synth.errors import InputError
-from synth.scene.gel import dome_height
+from synth.mesh.face import FLAT_FACE, Face
 
 _FACES_OF_TET = np.array([(1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)])  # normals point out of a positive tetrahedron
 
@@ -19,17 +19,15 @@ FLAT = 1e-10
 
 @dataclass(frozen=True)
 class PadMesh:
-    """A box of gel: contact surface at z = 0, bonded to the window at z = size[2], centred in x and y.
-
-    The contact surface of a domed pad is part of a sphere that touches z = 0 at x = y = 0, see `synth.mesh.dome`.
+    """A gel, centred in x and y: a contact face that touches z = 0 at its lowest point, and a face on the window.
 
     Attributes:
         points: (n, 3) float64 mm.
         tets: (m, 4) int32; (b - a) x (c - a) . (d - a) > 0 by components.
-        size_mm: edge lengths of the box.
+        size_mm: edge lengths of the gel's bounding box.
         layer: (m,) int32, the layer of material that each tetrahedron lies in, counted from the contact face; left
             out, all lie in layer 0.
-        dome_radius_mm: of the contact face; None where it is flat. Its nodes lie on the sphere to the last bit.
+        face: the shape of the contact face.
 
     Raises:
         ValueError: `layer` is not one number per tetrahedron.
@@ -39,7 +37,7 @@ class PadMesh:
     tets: Tets
     size_mm: tuple[float, float, float]
     layer: NDArray[np.int32] = field(default_factory=lambda: np.zeros(0, dtype=np.int32))
-    dome_radius_mm: float | None = None
+    face: Face = FLAT_FACE
 
     def __post_init__(self) -> None:
         """Fill in the single layer."""
@@ -56,12 +54,12 @@ class PadMesh:
     @cached_property
     def bonded(self) -> BoolArray:
         """(n,) nodes glued to the window."""
-        return self.points[:, 2] == self.size_mm[2]
+        return self.face.bonded(self.points, self.size_mm)
 
     @cached_property
     def on_face(self) -> BoolArray:
         """(n,) nodes of the contact face."""
-        return self.points[:, 2] == face_height(self.points[:, :2], self.dome_radius_mm)
+        return self.face.holds(self.points)
 
     @cached_property
     def touchable(self) -> Triangles:
@@ -93,13 +91,6 @@ class PadMesh:
         if self.layer.any():
             digest.update(np.ascontiguousarray(self.layer, dtype="<i4").tobytes())
         return digest.hexdigest()
-
-
-def face_height(places: FloatArray, dome_radius_mm: float | None) -> FloatArray:
-    """Z (n,) mm of the undeformed contact face at places (n, 2) mm."""
-    if dome_radius_mm is None:
-        return np.zeros(len(places))
-    return np.asarray(dome_height((places**2).sum(axis=1), dome_radius_mm))
 
 
 def check_mesh(mesh: PadMesh) -> None:

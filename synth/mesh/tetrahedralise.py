@@ -1,26 +1,34 @@
-"""Tetrahedral mesh of a box of gel by fTetWild (Hu et al., ACM TOG 2020; pytetwild), small elements at the contact.
+"""Tetrahedral meshes by fTetWild (Hu et al., ACM TOG 2020; pytetwild).
 
-What fTetWild leaves to do: its flat faces are up to epsilon off, so boundary vertices are snapped to the planes of the
-box; its orientation is negative; and it is not deterministic, so a mesh is made once and cached (`synth.mesh.cache`).
+What fTetWild leaves to do: its faces are up to epsilon off, so boundary vertices are moved onto the shape that is
+meshed; its orientation is negative; and it is not deterministic, so a mesh is made once and cached
+(`synth.mesh.cache`).
 """
 
 import contextlib
 import signal
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
 import numpy as np
 
-from synth.arrays import Points, Tets
+from synth.arrays import FloatArray, Points, Tets, Triangles
 from synth.errors import InputError
 from synth.mesh.pad import PadMesh, boundary_faces, signed_volumes
 from synth.mesh.tetwild_sizing import Background, through_thickness
 
 ENVELOPE = 1e-3
-"""fTetWild's epsilon, relative to the bounding box's diagonal."""
+"""fTetWild's epsilon for flat faces, relative to the bounding box's diagonal."""
+ON_SIDE_MM = 1e-9
+"""Distance from a side at which a vertex lies on it."""
 WORST_SHAPE = 0.02
 """Smallest accepted ratio of inscribed to circumscribed radius, times 3 (1 for a regular tetrahedron)."""
+
+
+Projection = Callable[[Points], Points]
+"""Moves points (n, 3) onto a surface."""
 
 
 def tetrahedralise_box(
@@ -32,21 +40,54 @@ def tetrahedralise_box(
         size_mm: edge lengths of the box.
         edge_length_mm: target edge length at z = 0.
         background: target edge lengths everywhere; default GRADING times edge_length_mm at the window.
-        attempts: the mesher is random; a mesh below WORST_SHAPE is made again so often.
+        attempts: see `tetrahedralise`.
 
     Raises:
         InputError: no attempt gave a valid mesh.
     """
     background = background or through_thickness(size_mm, edge_length_mm)
+    points, tets = tetrahedralise(*_box(size_mm), _sides(size_mm), background, float(np.prod(size_mm)), 1e-9, attempts)
+    return PadMesh(points, tets, size_mm)
+
+
+def tetrahedralise(
+    corners: Points,
+    faces: Triangles,
+    sides: Sequence[Projection],
+    background: Background,
+    volume_mm3: float,
+    share: float,
+    attempts: int = 3,
+    envelope: float = ENVELOPE,
+) -> tuple[Points, Tets]:
+    """Mesh what a closed surface encloses, with the vertices of its boundary moved onto the shape that it stands for.
+
+    Args:
+        corners: (n, 3) mm of the surface.
+        faces: (m, 3) its triangles.
+        sides: the parts of the shape, each as the projection onto it; vertices of two are moved by both in this order.
+        background: target edge lengths.
+        volume_mm3: of the shape.
+        share: of the volume by which the mesh may differ from it.
+        attempts: the mesher is random; a mesh below WORST_SHAPE is made again so often.
+        envelope: fTetWild's epsilon, relative to the bounding box's diagonal.
+
+    Returns:
+        Points (n, 3) mm and positively oriented tetrahedra (m, 4).
+
+    Raises:
+        InputError: no attempt gave a valid mesh.
+    """
     problem = ""
+    tolerance = 2 * envelope * float(np.linalg.norm(np.ptp(corners, axis=0)))
     for _ in range(attempts):
-        points, tets = _ftetwild(size_mm, background)
-        points, tets = _repair(points, tets, size_mm)
-        problem = _fault(points, tets, size_mm)
+        points, tets = _repair(*_ftetwild(corners, faces, background, envelope), sides, tolerance)
+        problem = _fault(points, tets, sides, volume_mm3, share)
         if not problem:
-            return PadMesh(points, tets, size_mm)
+            return points, tets
+    edge_mm = float(background.values.min())
     raise InputError(
-        f"no valid mesh of a {size_mm} mm pad with edge length {edge_length_mm} mm in {attempts} attempts: {problem}; "
+        f"no valid mesh of the gel with edge length {edge_mm:.3g} mm in {attempts} attempts: {problem}; "
         "try another numerics.edge_length_mm"
     )
 
@@ -68,20 +109,34 @@ def shape_quality(points: Points, tets: Tets) -> np.ndarray:
     return np.asarray(108 * volume**2 / np.maximum(area * numerator, 1e-300))
 
 
-def _ftetwild(size: tuple[float, float, float], background: Background) -> tuple[Points, Tets]:
-    import pytetwild
-
+def _box(size: tuple[float, float, float]) -> tuple[Points, Triangles]:
     half = np.array([size[0] / 2, size[1] / 2])
     corners = np.array([(x, y, z) for z in (0.0, size[2]) for y in (-half[1], half[1]) for x in (-half[0], half[0])])
     quads = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5))
-    faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))], dtype=np.int32)
+    return corners, np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))], dtype=np.int32)
+
+
+def _sides(size: tuple[float, float, float]) -> list[Projection]:
+    planes = [(axis, side * size[axis] / 2) for axis in (0, 1) for side in (-1, 1)] + [(2, 0.0), (2, size[2])]
+    return [partial(_onto_plane, axis=axis, value=value) for axis, value in planes]
+
+
+def _onto_plane(points: Points, axis: int, value: float) -> Points:
+    moved = points.copy()
+    moved[:, axis] = value
+    return moved
+
+
+def _ftetwild(corners: Points, faces: Triangles, background: Background, envelope: float) -> tuple[Points, Tets]:
+    import pytetwild
+
     # fTetWild leaves a __tracked_surface.stl in the working directory.
     with _python_interrupts(), tempfile.TemporaryDirectory() as scratch, contextlib.chdir(scratch):
         points, tets = pytetwild.tetrahedralize(
             corners,
             faces,
             edge_length_abs=float(background.values.max()),
-            epsilon=ENVELOPE,
+            epsilon=envelope,
             bg_vertices=background.points,
             bg_tets=background.tets.copy(),  # read-only arrays are refused
             bg_values=background.values,
@@ -100,33 +155,38 @@ def _python_interrupts() -> Iterator[None]:
             signal.signal(signal.SIGINT, before)
 
 
-def _repair(points: Points, tets: Tets, size: tuple[float, float, float]) -> tuple[Points, Tets]:
-    """Snap boundary vertices to the box's planes, drop unused vertices, orient positively."""
+def _repair(points: Points, tets: Tets, sides: Sequence[Projection], tolerance: float) -> tuple[Points, Tets]:
+    """Move boundary vertices onto the shape's sides, drop unused vertices, orient positively."""
     used, renumbered = np.unique(tets, return_inverse=True)
     points, tets = points[used].copy(), renumbered.reshape(tets.shape).astype(np.int32)
-    planes = [(0, -size[0] / 2), (0, size[0] / 2), (1, -size[1] / 2), (1, size[1] / 2), (2, 0.0), (2, size[2])]
-    tolerance = 2 * ENVELOPE * float(np.linalg.norm(size))
-    for face in boundary_faces(tets):
-        corner = points[face]
-        # The plane of a boundary face is the one to which all three of its corners are near.
-        off = [np.abs(corner[:, axis] - value).max() for axis, value in planes]
-        nearest = int(np.argmin(off))
-        if off[nearest] <= tolerance:
-            axis, value = planes[nearest]
-            points[face, axis] = value
+    faces = boundary_faces(tets)
+    # The side of a boundary face is the one to which all three of its corners are near.
+    off = _distances(points, faces, sides)
+    nearest = np.where(off.min(axis=0) <= tolerance, off.argmin(axis=0), -1)
+    for number, side in enumerate(sides):
+        nodes = np.unique(faces[nearest == number])
+        points[nodes] = side(points[nodes])
     flipped = signed_volumes(points, tets) < 0
     tets[flipped] = tets[flipped][:, [0, 2, 1, 3]]
     return points, tets
 
 
-def _fault(points: Points, tets: Tets, size: tuple[float, float, float]) -> str:
+def _distances(points: Points, faces: Triangles, sides: Sequence[Projection]) -> FloatArray:
+    """(s, f) mm by which the farthest corners of faces are off each of the sides."""
+    corners = points[faces].reshape(-1, 3)
+    return np.array([np.linalg.norm(corners - side(corners), axis=1).reshape(-1, 3).max(axis=1) for side in sides])
+
+
+def _fault(points: Points, tets: Tets, sides: Sequence[Projection], volume_mm3: float, share: float) -> str:
     """What is wrong with a mesh, or an empty string."""
     volumes = signed_volumes(points, tets)
     if volumes.min() <= 0:
         return f"a tetrahedron has volume {volumes.min():.3g} mm^3"
-    box = float(np.prod(size))
-    if abs(volumes.sum() / box - 1) > 1e-9:  # sums of some 1e4 volumes round to about 1e-13
-        return f"the mesh fills {volumes.sum():.9g} of {box:.9g} mm^3"
+    if abs(volumes.sum() / volume_mm3 - 1) > share:  # sums of some 1e4 volumes round to about 1e-13
+        return f"the mesh fills {volumes.sum():.9g} of {volume_mm3:.9g} mm^3"
+    off = float(_distances(points, boundary_faces(tets), sides).min(axis=0).max())
+    if off > ON_SIDE_MM:
+        return f"a face of the boundary is {off:.3g} mm off the gel's shape"
     worst = float(shape_quality(points, tets).min())
     if worst < WORST_SHAPE:
         return f"worst tetrahedron has shape quality {worst:.3g} < {WORST_SHAPE}"

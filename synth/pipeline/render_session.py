@@ -21,7 +21,7 @@ from synth.surface import GelSurface
 SUBDIVISIONS = {1: 4, 2: 3}
 """Parts of a contact face's edge in the rendered surface, by the element's order."""
 FINER_DOME = 2
-"""Factor on that for domes, which are curved away from the contact, too, where faces are large."""
+"""Factor on that for domes and round gels, which are curved away from the contact, too, where faces are large."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class RenderedTrajectory:
 class SensorRenderer:
     """What all trajectories of one sensor share: its number, the renderer of its cameras, and the gel at rest.
 
-    `rest` is the undeformed gel's radiance by camera; None for a dome, whose triangles are each trajectory's.
+    `rest` is the undeformed gel's radiance by camera; None for a curved face, whose triangles are each trajectory's.
     """
 
     sensor: int
@@ -88,7 +88,7 @@ class RenderSession:
 
     def _surface_of(self, space: Space, gel: Gel) -> GelSurface:
         if self._surface is None or self._surface[0] is not space:
-            parts = SUBDIVISIONS[space.element.order] * (FINER_DOME if gel.dome_radius_mm else 1)
+            parts = SUBDIVISIONS[space.element.order] * (1 if gel.is_flat else FINER_DOME)
             self._surface = space, GelSurface(space.surface, parts)
         return self._surface[1]
 
@@ -101,7 +101,7 @@ class RenderSession:
             painted = paint(self._context, number, scene.sensor) if texture is None else texture.result()
             renderer = Renderer(scene.sensor, scene.render, surface, painted, variant)
             rest = None
-            if scene.sensor.gel.dome_radius_mm is None:
+            if scene.sensor.gel.is_flat:
                 rest = renderer.radiances(surface.material, self._seed("rest", number))
             self._sensor = SensorRenderer(number, renderer, rest)
         return self._sensor

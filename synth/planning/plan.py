@@ -72,7 +72,8 @@ def plan(scene: Template, variant: Variant | None = None) -> Plan:
     check_buildable(scene, variant)
     is_batched = scene.numerics.is_batched
     found = decisions(scene, variant, is_batched)
-    return Plan(scene, variant, is_batched, MeshRule.of(scene.numerics), found)
+    round_first = sorted(scene.corners, key=lambda corner: not corner.sensor.gel.is_round)
+    return Plan(scene, variant, is_batched, MeshRule.of(round_first[0]), found)
 
 
 def job_variant(template: Template, device: Device) -> Variant:

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from synth.errors import InputError
+from synth.mesh import default_edge_length
 from synth.planning.plan import Plan
-from synth.scene import MeshIndenter, Scene
+from synth.scene import Gel, MeshIndenter, Scene
 from synth.scene.sampling import draw
 from synth.simulate.load_path import TWIST_ARM_MM
 from synth.simulate.press import edge_radius_mm
@@ -20,7 +21,7 @@ from synth.simulate.resolution import Resolution
 
 INSTANCES = 12
 """Trajectories whose meshes are chosen to predict error and time."""
-NODES_PER_VOLUME, NODES_PER_AREA, FEWEST_NODES = 0.72, 0.25, 300
+NODES_PER_VOLUME, NODES_PER_AREA, NODES_PER_CURVED_AREA, FEWEST_NODES = 0.72, 0.25, 2.3, 300
 """Mesh vertices per cube and per square of the contact face's edge length, for fTetWild's meshes."""
 VERTICES_TO_P2 = 7.0
 """Displacement nodes of P2 elements per vertex of the mesh."""
@@ -136,12 +137,23 @@ def _meshes(plan: Plan) -> _Meshes:
 
 def _tetwild_meshes(plan: Plan) -> _Meshes:
     """Of the corners, without meshing; fTetWild takes long."""
-    edge_mm, first = plan.template.numerics.edge_length_mm or 1.0, plan.template.corners[0]
-    x, y, z = (length / edge_mm for length in first.sensor.gel.size_mm)
-    vertices = NODES_PER_VOLUME * x * y * z + NODES_PER_AREA * 2 * (x * y + y * z + z * x)
+    first = plan.template.corners[0]
+    gel = first.sensor.gel
+    edge_mm = plan.template.numerics.edge_length_mm or default_edge_length(gel)
+    x, y, z = (length / edge_mm for length in _plate(gel))
+    per_area = NODES_PER_CURVED_AREA if gel.is_round else NODES_PER_AREA
+    vertices = NODES_PER_VOLUME * x * y * z + per_area * 2 * (x * y + y * z + z * x)
     nodes = max(FEWEST_NODES, round(_order(first) * vertices))
     text = f"fTetWild meshes with edges of {edge_mm:g} mm at the contact face"
     return _Meshes(tuple((corner, nodes) for corner in plan.template.corners), text, None)
+
+
+def _plate(gel: Gel) -> tuple[float, float, float]:
+    """Edge lengths of a box; of a round gel those of a flat layer as large and as thick."""
+    if not gel.is_round:
+        return gel.size_mm
+    middle = (gel.size_mm[0] - gel.depth_mm) / 2
+    return 2 * np.pi * middle, middle + gel.length_mm, gel.depth_mm
 
 
 def _order(scene: Scene) -> float:

@@ -29,7 +29,7 @@ def decisions(template: Template, variant: Variant, is_batched: bool) -> tuple[D
     mixed = max(poisson) >= DISPLACEMENT_ONLY_BELOW
     cameras = [view.camera for c in corners for view in c.sensor.views.values()]
     lens = any(any(camera.distortion) or camera.lens == "fisheye" for camera in cameras)
-    flat = all(c.sensor.gel.shape == "box" for c in corners)
+    flat = all(c.sensor.gel.is_flat for c in corners)
     apertures = [camera.aperture_mm for camera in cameras]
     blurred = max(apertures) > 0
     mirrors, further = len(corners[0].sensor.mirrors), len(corners[0].sensor.further_cameras)
@@ -50,7 +50,11 @@ def decisions(template: Template, variant: Variant, is_batched: bool) -> tuple[D
         Decision("pressure field", mixed, _span("sensor.gel.poisson_ratio", poisson) + foam),
         Decision("window refraction", max(index) > 1, _span("sensor.window.refractive_index", index)),
         Decision("lens distortion", lens, "sensor.camera.distortion" + ("" if lens else " is zero: a pinhole")),
-        Decision("shared undeformed frame", flat, "sensor.gel.shape" + ("" if flat else ": domes have own meshes")),
+        Decision(
+            "shared undeformed frame",
+            flat,
+            "sensor.gel.shape" + ("" if flat else ": curved faces have own frames"),
+        ),
         Decision(
             "depth of field",
             blurred,

@@ -1,9 +1,9 @@
-"""The part of a scene's schema that is the soft pad: its size, the shape of its contact face, its materials."""
+"""The part of a scene's schema that is the gel: its size, the shape of its contact face, its materials."""
 
 import math
 from typing import Annotated, Literal, TypeVar
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from synth.arrays import FloatArray
 from synth.scene.part import NonNegative, Part, Positive
@@ -13,6 +13,8 @@ THINNEST = 0.3
 their height at the apex, see `synth.mesh.dome` for what becomes of their quality."""
 STEEPEST_DEG = 60.0
 """Largest slope of a dome's face, at its corners."""
+THICKEST = 0.9
+"""Largest share of a capsule's radius that its layer of gel takes."""
 
 
 Number = TypeVar("Number", float, FloatArray)
@@ -34,18 +36,31 @@ class Layer(Part):
 
 
 class Gel(Part):
-    """The soft pad: a box bonded to the window on its +z side, its contact face flat or part of a sphere."""
+    """The soft gel on its rigid window.
+
+    A "box" is bonded on its +z side; so is a "dome", whose contact face is part of a sphere. A "capsule" is a layer
+    around a window of the same shape: a hemisphere about (0, 0, radius_mm), then a cylinder up to z = radius_mm +
+    length_mm, where it is cut.
+    """
 
     size_mm: tuple[
         Annotated[float, Field(ge=1, le=200)],
         Annotated[float, Field(ge=1, le=200)],
         Annotated[float, Field(ge=0.2, le=50)],
-    ]
-    """The third is the thickness, of a domed pad that at the apex."""
-    shape: Literal["box", "dome"] = "box"
+    ] = (0.0, 0.0, 0.0)
+    """The third is the thickness, of a domed pad that at the apex. Left out for capsules: it follows from the shape."""
+    shape: Literal["box", "dome", "capsule"] = "box"
     dome_radius_mm: Positive | None = None
     """Radius of a dome's contact face, which touches z = 0 at its apex (0, 0) and curves away from the indenter; None:
     flat. Patterns are laid on it along z: their places are x and y."""
+    radius_mm: Annotated[float, Field(ge=1, le=100)] | None = None
+    """Of a capsule's contact face."""
+    thickness_mm: Annotated[float, Field(ge=0.2, le=50)] | None = None
+    """Of a capsule's layer of gel."""
+    length_mm: Annotated[float, Field(ge=0, le=200)] = 0.0
+    """Of a capsule's cylinder; 0: a hemisphere."""
+    cut_end: Literal["free", "held"] = "free"
+    """Whether the ring on which a capsule ends is held, as by a rigid frame."""
     youngs_modulus_kpa: Annotated[float, Field(ge=0.1, le=1e6)]
     poisson_ratio: Annotated[float, Field(ge=0, le=0.5)] = 0.4999
     """0.5 is exactly incompressible; below 0.3 no pressure field is needed."""
@@ -56,18 +71,51 @@ class Gel(Part):
     dome their thicknesses are those at the apex; elsewhere they shrink with the pad's."""
 
     def face_mm(self, x: float, y: float) -> float:
-        """Z of the undeformed contact face, mm; the thickness where a dome's sphere does not reach."""
-        radius, square = self.dome_radius_mm, x * x + y * y
+        """Z of the undeformed contact face, mm; the gel's upper end where a sphere does not reach."""
+        radius, square = self.radius_mm or self.dome_radius_mm, x * x + y * y
         if radius is None:
             return 0.0
         return float(dome_height(square, radius)) if square < radius**2 else self.size_mm[2]
 
-    @field_validator("shape", mode="before")
-    @classmethod
-    def _made_here(cls, shape: object) -> object:
-        if shape == "file":
-            raise ValueError("gels are a 'box' or a 'dome'; meshes of pads from files are not supported")
-        return shape
+    @property
+    def is_round(self) -> bool:
+        """Whether the gel surrounds its window; a press then has its place in polar coordinates."""
+        return self.shape == "capsule"
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether the contact face lies in z = 0."""
+        return self.shape == "box"
+
+    @property
+    def depth_mm(self) -> float:
+        """Thickness of the gel, of a domed pad that at the apex."""
+        return self.thickness_mm or self.size_mm[2]
+
+    @model_validator(mode="after")
+    def _capsule(self) -> "Gel":
+        own = {"radius_mm": self.radius_mm, "thickness_mm": self.thickness_mm}
+        if self.shape != "capsule":
+            if "size_mm" not in self.model_fields_set:
+                raise ValueError(f'shape = "{self.shape}" needs size_mm')
+            given = [name for name, value in own.items() if value is not None]
+            if given:
+                raise ValueError(f'{given[0]} belongs to shape = "capsule", the shape is "{self.shape}"')
+            return self
+        if self.radius_mm is None or self.thickness_mm is None:
+            raise ValueError('shape = "capsule" needs radius_mm and thickness_mm')
+        if self.thickness_mm > THICKEST * self.radius_mm:
+            raise ValueError(
+                f"thickness_mm = {self.thickness_mm} leaves no room for a window in radius_mm = {self.radius_mm}: at "
+                f"most {THICKEST * self.radius_mm:.4g}"
+            )
+        if self.layers:
+            raise ValueError('layers are for shape = "box" and "dome": a capsule is of one material')
+        bounds = (2 * self.radius_mm, 2 * self.radius_mm, self.radius_mm + self.length_mm)
+        if "size_mm" in self.model_fields_set and self.size_mm != bounds:
+            raise ValueError("size_mm of a capsule follows from radius_mm and length_mm: leave it out")
+        object.__setattr__(self, "size_mm", bounds)
+        return self
 
     @model_validator(mode="after")
     def _layered(self) -> "Gel":

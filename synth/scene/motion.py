@@ -17,7 +17,13 @@ class Pose(Part):
 
 
 class Motion(Part):
-    """Press at position_mm to depth_mm, then shear and twist together about the indenter's axis, then what follows."""
+    """Press at a place to depth_mm, then shear and twist together about the indenter's axis, then what follows.
+
+    The place is position_mm on boxes and domes, which are pressed along z. Round gels are pressed along the inward
+    normal at polar_deg, or height_mm, and azimuth_deg; there shear_mm lies in the tangent plane, its first component
+    along increasing polar angle and its second along increasing azimuth, and a positive twist turns the first axis
+    toward the second. At the tip, with azimuth 0, these are +x, +y and +z.
+    """
 
     depth_mm: float
     """How far the indenter's lowest point goes past the undeformed surface; negative: it stays off by so much."""
@@ -25,6 +31,12 @@ class Motion(Part):
     twist_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
     """Positive turns +x toward +y."""
     position_mm: Vector2 = (0.0, 0.0)
+    polar_deg: Annotated[float, Field(ge=0, le=175)] | None = None
+    """Angle at the centre of a capsule's hemisphere between the tip and the place; 0 is the tip."""
+    height_mm: NonNegative | None = None
+    """Z of the place, instead of polar_deg."""
+    azimuth_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
+    """Of the place about the axis, from +x toward +y."""
     steps: Annotated[int, Field(ge=1, le=1000)] = 6
     """Recorded states after the undeformed one, split between the legs by the length of their paths."""
     then: tuple[Pose, ...] = ()

@@ -6,6 +6,7 @@ px; the unit is in the field's name. Frame: origin at the centre of the undeform
 through the gel toward the camera, +x right and +y down in the image (a left-handed triple, see docs/decisions.md).
 """
 
+import math
 from typing import Annotated
 
 from pydantic import Field, model_validator
@@ -58,8 +59,9 @@ class Scene(Part):
 
     @model_validator(mode="after")
     def _plausible(self) -> "Scene":
-        size, motion = self.sensor.gel.size_mm, self.motion
-        deepest = 0.85 * (size[2] - self.sensor.gel.face_mm(*motion.position_mm))
+        gel, size, motion = self.sensor.gel, self.sensor.gel.size_mm, self.motion
+        self._check_place()
+        deepest = 0.85 * (gel.depth_mm - (0.0 if gel.is_round else gel.face_mm(*motion.position_mm)))
         if motion.depth_mm < -50:
             raise ValueError(f"motion.depth_mm = {motion.depth_mm} leaves the indenter farther than 50 mm off the gel")
         for axis, x, half in zip("xy", motion.position_mm, (size[0] / 2, size[1] / 2), strict=True):
@@ -70,7 +72,7 @@ class Scene(Part):
         for name, pose in motion.poses.items():
             if pose.depth_mm > deepest:
                 raise ValueError(
-                    f"{name}.depth_mm = {pose.depth_mm} is more than 85 % of the gel's thickness ({size[2]} mm); "
+                    f"{name}.depth_mm = {pose.depth_mm} is more than 85 % of the gel's thickness ({gel.depth_mm} mm); "
                     f"at most {deepest:.3g}"
                 )
             for axis, s, side in zip("xy", pose.shear_mm, size[:2], strict=True):
@@ -85,23 +87,45 @@ class Scene(Part):
             raise ValueError(
                 "numerics.edge_length_mm: fTetWild's meshes have no layers; leave it out for a layered gel"
             )
-        edge = self.numerics.edge_length_mm
-        if edge is not None and not min(size) / 60 <= edge <= min(size):
+        edge, thinnest = self.numerics.edge_length_mm, min(*size, gel.depth_mm)
+        if edge is not None and not thinnest / 60 <= edge <= thinnest:
             raise ValueError(
-                f"numerics.edge_length_mm = {edge} must lie between {min(size) / 60:.3g} and {min(size)} for this pad"
+                f"numerics.edge_length_mm = {edge} must lie between {thinnest / 60:.3g} and {thinnest} for this pad"
             )
         return self
+
+    def _check_place(self) -> None:
+        """Refuse a place of the press that is not in the terms of the gel's shape, or not on its face."""
+        gel, motion = self.sensor.gel, self.motion
+        polar, height = motion.polar_deg, motion.height_mm
+        if not gel.is_round:
+            if polar is not None or height is not None or motion.azimuth_deg != 0:
+                raise ValueError(
+                    f'motion.polar_deg, height_mm and azimuth_deg are for round gels; a "{gel.shape}" has position_mm'
+                )
+            return
+        if motion.position_mm != (0.0, 0.0):
+            raise ValueError("motion.position_mm is for flat gels and domes; a round gel has polar_deg and azimuth_deg")
+        if polar is not None and height is not None:
+            raise ValueError("motion.polar_deg and height_mm both say where the press is: give one of them")
+        radius, top = gel.size_mm[0] / 2, gel.size_mm[2]
+        highest = 90 + math.degrees(math.atan2(top - radius, radius))
+        if polar is not None and polar > highest:
+            raise ValueError(f"motion.polar_deg = {polar} is beyond the gel's end; at most {highest:.4g}")
+        if height is not None and height > top:
+            raise ValueError(f"motion.height_mm = {height} is beyond the gel's end; at most {top:.4g}")
 
     @property
     def warnings(self) -> list[str]:
         """What is possible but unusual."""
         found = []
-        x, y, thickness = self.sensor.gel.size_mm
+        x, y = self.sensor.gel.size_mm[:2]
+        thickness = self.sensor.gel.depth_mm
         for name, pose in self.motion.poses.items():
             given = f"{name}.shear_mm = {list(pose.shear_mm)}"
             if max(map(abs, pose.shear_mm)) > 2 * thickness:
                 found.append(f"{given} is more than twice the gel's thickness ({thickness} mm)")
             ends = zip(self.motion.position_mm, pose.shear_mm, (x / 2, y / 2), strict=True)
-            if any(abs(start + s) > half for start, s, half in ends):
+            if not self.sensor.gel.is_round and any(abs(start + s) > half for start, s, half in ends):
                 found.append(f"{given} takes the indenter's centre off the pad")
         return found

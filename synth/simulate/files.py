@@ -16,7 +16,8 @@ def write_trajectory(directory: Path, scene: Scene, trajectory: Trajectory) -> d
     """Write DIR/trajectory.json and DIR/state_000.vtu and so on, in the place of an earlier trajectory's.
 
     The VTU files hold the deformed contact surface with the fields displacement (mm) and traction (MPa), and the mesh's
-    hash as the field datum "mesh". Returns the JSON's content.
+    hash as the field datum "mesh". On round gels shear_mm lies in the tangent plane at the place of the press, and
+    force_n and torque_nmm are in the sensor's frame. Returns the JSON's content.
     """
     record = {
         "scene": scene.model_dump(mode="json"),

@@ -8,6 +8,9 @@ flat pad that is where it touches, and where the path starts. On a dome a body t
 gel toward the apex before that, and one whose lowest points are off its axis (a ring) touches later: there the path
 starts where it first touches the sphere of which the face is a part. Sideways moves keep the level, whatever the face
 does.
+
+On a round gel all of this happens in the frame of the place (`PressFrame`): depth counts along the inward normal from
+the tangent plane, beyond which a convex gel does not reach, and shear lies in that plane.
 """
 
 from dataclasses import dataclass
@@ -17,7 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from synth.arrays import FloatArray
-from synth.mesh.pad import face_height
+from synth.mesh.capsule import CapsuleFace
+from synth.mesh.face import face_height, face_of
 from synth.scene import Motion, Scene
 from synth.scene import Pose as PoseOfScene
 from synth.simulate.distance import KINDS
@@ -34,7 +38,7 @@ TOUCH_MM = 1e-6
 
 @dataclass(frozen=True)
 class Pose:
-    """The indenter at one point of its path, in the terms of the scene and of the kernels."""
+    """The indenter at one point of its path: in the terms of the scene, and centre and axes in the sensor's frame."""
 
     depth_mm: float
     shear_mm: tuple[float, float]
@@ -44,12 +48,34 @@ class Pose:
 
 
 @dataclass(frozen=True)
+class PressFrame:
+    """Where a round gel is pressed.
+
+    Attributes:
+        origin: (3,) mm, the place on the face.
+        axes: (3, 3) as columns: along increasing polar angle, along increasing azimuth, and along the inward normal.
+    """
+
+    origin: FloatArray
+    axes: FloatArray
+
+    @classmethod
+    def of(cls, motion: Motion, face: CapsuleFace) -> "PressFrame":
+        """The frame of a motion's place on a face."""
+        origin, inward = face.place(motion.polar_deg, motion.height_mm, motion.azimuth_deg)
+        azimuth = np.radians(motion.azimuth_deg)
+        around = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+        return cls(origin, np.column_stack([np.cross(around, inward), around, inward]))
+
+
+@dataclass(frozen=True)
 class LoadPath:
-    """The load path of one indenter over a pad whose face is flat or of the given radius."""
+    """The load path of one indenter over a pad whose face is flat or of the given radius, or over a round gel."""
 
     motion: Motion
     body: RigidBody
     dome_radius_mm: float | None = None
+    frame: PressFrame | None = None
 
     @cached_property
     def face_mm(self) -> float:
@@ -57,7 +83,12 @@ class LoadPath:
         return float(face_height(np.array([self.motion.position_mm]), self.dome_radius_mm)[0])
 
     def is_over(self, size_mm: tuple[float, float, float]) -> bool:
-        """Whether the body's lowest point, a ring's rim for a torus, comes down on a pad's contact face."""
+        """Whether the body's lowest point, a ring's rim for a torus, comes down on the contact face of a gel.
+
+        On a round gel rings may pass it by, or touch later than at depth 0.
+        """
+        if self.frame is not None:
+            return self.body.kind != KINDS["torus"]
         rim = float(self.body.shape[1]) if self.body.kind == KINDS["torus"] else 0.0
         return bool(np.all(np.abs(self.motion.position_mm) + rim < np.array(size_mm[:2]) / 2))
 
@@ -86,6 +117,11 @@ class LoadPath:
         place = np.array([[*self.motion.position_mm, self._level(depth)]])
         distance = Distance(self.body, place, self.body.rotation[None])
         return float(distance(np.array([[0.0, 0.0, radius]]), np.zeros(1, dtype=np.int32))[1][0]) - radius
+
+    @property
+    def direction(self) -> FloatArray:
+        """(3,) of the press, into the gel."""
+        return np.array([0.0, 0.0, 1.0]) if self.frame is None else self.frame.axes[:, 2]
 
     @property
     def may_touch(self) -> bool:
@@ -132,7 +168,10 @@ class LoadPath:
         depth, x, y, twist = (float(np.interp(s, self.ends, column)) for column in self.corners.T)
         motion = self.motion
         centre = np.array([motion.position_mm[0] + x, motion.position_mm[1] + y, self._level(depth)])
-        return Pose(depth, (x, y), twist, centre, rotation_about(2, np.radians(twist)) @ self.body.rotation)
+        rotation = rotation_about(2, np.radians(twist)) @ self.body.rotation
+        if self.frame is not None:
+            centre, rotation = self.frame.origin + self.frame.axes @ centre, self.frame.axes @ rotation
+        return Pose(depth, (x, y), twist, centre, rotation)
 
     def records(self) -> FloatArray:
         """(steps,) path lengths at which states are recorded: each leg in equal parts, its end among them.
@@ -173,4 +212,7 @@ def path_of(scene: Scene, folder: Path | None = None, resolution_mm: float = 0.0
     deepest = max(pose.depth_mm for pose in poses) + gel.face_mm(*motion.position_mm)
     height = BULGE * max(deepest, 0.0) + SLACK_MM
     touchable = Touchable(float(np.hypot(*gel.size_mm[:2])) / 2 + aside, height, max(motion.depth_mm, 0.0))
-    return LoadPath(motion, rigid_body(scene.contact.indenter, folder, resolution_mm, touchable), gel.dome_radius_mm)
+    face = face_of(gel)
+    frame = PressFrame.of(motion, face) if isinstance(face, CapsuleFace) else None
+    body = rigid_body(scene.contact.indenter, folder, resolution_mm, touchable)
+    return LoadPath(motion, body, gel.dome_radius_mm, frame)

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from synth.mesh import pad_mesh
-from synth.scene import Numerics, Scene
+from synth.mesh import default_edge_length, pad_mesh
+from synth.scene import Scene
 from synth.simulate.press import Press
 from synth.simulate.resolution import Resolution, resolve
 from synth.simulate.shared import Accuracy, accuracy, shared_mesh, spacing_mm
@@ -20,7 +20,8 @@ class MeshRule:
 
     Attributes:
         kind: "graded": around each contact, as fine as the target asks for; "even": `numerics.cells`, the same for all
-            trajectories of a pad; "tetwild": `numerics.edge_length_mm`, also the same for all.
+            trajectories of a pad; "tetwild": by fTetWild, also the same for all: round gels, and others where
+            `numerics.edge_length_mm` is given.
         target_error_px: root-mean-square error of the flow that the simulation may leave; NaN for "tetwild", for which
             nothing is predicted.
     """
@@ -29,9 +30,10 @@ class MeshRule:
     target_error_px: float
 
     @classmethod
-    def of(cls, numerics: Numerics) -> "MeshRule":
+    def of(cls, scene: Scene) -> "MeshRule":
         """The rule of a scene."""
-        if numerics.edge_length_mm is not None:
+        numerics = scene.numerics
+        if numerics.edge_length_mm is not None or scene.sensor.gel.is_round:
             return cls("tetwild", float("nan"))
         return cls("even" if numerics.is_batched else "graded", numerics.target_error_px or DEFAULT_TARGET_PX)
 
@@ -53,7 +55,7 @@ class MeshRule:
                 return Resolution(mesh, found.across, numerics.cells[2], spacing, found.error_px)
             case "tetwild":
                 mesh = pad_mesh(gel, numerics, mesh_folders)
-                return Resolution(mesh, 0, 0, numerics.edge_length_mm or 0.0, float("nan"))
+                return Resolution(mesh, 0, 0, numerics.edge_length_mm or default_edge_length(gel), float("nan"))
 
     def press(self, scene: Scene, folder: Path | None = None, mesh_folders: Sequence[Path] | None = None) -> Press:
         """Mesh, body and load path of a scene; arguments as of `resolution`.

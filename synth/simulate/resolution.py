@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from synth.mesh import Counts, Focus, PadMesh, domed, graded_box
+from synth.mesh.face import face_height
 from synth.mesh.graded import spacing
-from synth.mesh.pad import face_height
 from synth.optics import Optics
 from synth.scene import Gel, Scene
 from synth.simulate.error_model import face_error

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from synth.errors import InputError
-from synth.mesh import PadMesh, check_mesh
+from synth.mesh import Face, PadMesh, check_mesh, face_of
 from synth.scene import Gel, Scene
 from synth.simulate.material import pad_material
 from synth.simulate.options import STANDARD, SolverOptions
@@ -79,13 +79,13 @@ def check_shared(scenes: Sequence[Scene], mesh: PadMesh) -> None:
 
 
 def _check_pad(gel: Gel, mesh: PadMesh) -> None:
-    own, other = _pad(gel.size_mm, gel.dome_radius_mm), _pad(mesh.size_mm, mesh.dome_radius_mm)
+    own, other = _pad(gel.size_mm, face_of(gel)), _pad(mesh.size_mm, mesh.face)
     if own != other:
         raise InputError(f"the mesh is of a {other}, the scene's is a {own}")
 
 
-def _pad(size_mm: tuple[float, float, float], dome_radius_mm: float | None) -> str:
-    return f"{size_mm} mm pad" + ("" if dome_radius_mm is None else f" of dome radius {dome_radius_mm} mm")
+def _pad(size_mm: tuple[float, float, float], face: Face) -> str:
+    return f"{size_mm} mm {face}"
 
 
 def _elastic(gel: Gel) -> tuple[float, ...]:

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from synth.arrays import BoolArray, Points, Tets
-from synth.mesh import PadMesh, face_height
+from synth.mesh import PadMesh
 from synth.simulate.element import EDGES, Element
 from synth.surface import FACE_EDGES, ContactFaces
 
@@ -97,15 +97,14 @@ def function_space(mesh: PadMesh, element: Element) -> Space:
 
 
 def _middles(mesh: PadMesh, edges: np.ndarray) -> Points:
-    """(e, 3) mid-edge nodes: half way, but those of a dome's face on the sphere.
+    """(e, 3) mid-edge nodes: half way, but those of the contact face on its shape.
 
     What touches, and what is rendered, is then smooth. The bulk is integrated over straight-sided elements, which makes
     an error of the order of h²/R, as their chords do.
     """
     middles = np.asarray(mesh.points[edges].mean(axis=1))
-    if mesh.dome_radius_mm is not None:
-        on_face = mesh.on_face[edges].all(axis=1)
-        middles[on_face, 2] = face_height(middles[on_face, :2], mesh.dome_radius_mm)
+    on_face = mesh.on_face[edges].all(axis=1)
+    middles[on_face] = mesh.face.project(middles[on_face])
     return middles
 
 

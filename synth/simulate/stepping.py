@@ -168,7 +168,7 @@ class Stepper:
         Ends the press, saying so.
         """
         pressed = target == self.path.press_mm and self.path.is_over(self.system.space.mesh.size_mm)
-        if not pressed or self.system.forces(state)[0][2] > FORCE_FLOOR:
+        if not pressed or self.system.forces(state)[0] @ self.path.direction > FORCE_FLOOR:
             return False
         self.reason = no_contact(target)
         return True

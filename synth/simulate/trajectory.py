@@ -15,10 +15,11 @@ class State:
     """One recorded, converged state of the gel.
 
     Attributes:
-        depth_mm, shear_mm, twist_deg: the indenter's pose.
+        depth_mm, shear_mm, twist_deg: the indenter's pose; on a round gel in the frame of the place, see
+            `synth.scene.Motion`.
         displacement: (n, 3) float64 mm at all nodes of the trajectory's space.
         traction: (s, 3) float64 MPa on the gel at the space's surface nodes, per undeformed area.
-        force_n, torque_nmm: of the indenter on the gel; torque about the origin of the frame.
+        force_n, torque_nmm: of the indenter on the gel, in the sensor's frame; torque about its origin.
         residual: of the unknowns over the norm of the nodal forces.
         min_jacobian: smallest det F at any quadrature point.
         max_penetration_mm: deepest contact point inside the indenter.

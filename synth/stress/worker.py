@@ -47,7 +47,7 @@ def simulated(run: Run, folder: Path, meshes: Path) -> tuple[Scene, PadMesh, Tra
         assignments = [*assignments, f"contact.indenter={{ shape = 'mesh', file = '{file}' }}"]
     template = load_scene(run.base, assignments)
     scene = template.corners[0]  # no distributions: all corners are the same
-    mesh = MeshRule.of(scene.numerics).resolution(scene, folder, [meshes]).mesh
+    mesh = MeshRule.of(scene).resolution(scene, folder, [meshes]).mesh
     if run.case.mesh != "as made":
         mesh = altered_mesh(mesh, run.case.mesh)
     options = SolverOptions(single_precision=run.case.factor == "single")

@@ -83,7 +83,7 @@ def test_reference_is_finer_every_way_also_through_the_thickness(index: int) -> 
     scene, folder = drawn(template, 2, index), template.source.parent
     gel = scene.sensor.gel
     zone = footprint(path_of(scene, folder), gel.size_mm, MARGIN)
-    chosen_mm = MeshRule.of(scene.numerics).resolution(scene, folder).spacing_mm
+    chosen_mm = MeshRule.of(scene).resolution(scene, folder).spacing_mm
     mesh, across, fine = reference_mesh(gel, zone, chosen_mm, 18)
     assert 2.4 * fine <= chosen_mm < 2.4 * fine * across / (across - 2)
     assert reference_mesh(gel, zone, chosen_mm, 8)[1] == 8
@@ -131,7 +131,7 @@ def test_the_command(tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[s
         assert 0 < errors[-1] < errors[0]
         (chosen,) = [row for row in others if row["chosen"]]
         scene = draw(template, 2, index)
-        best = MeshRule.of(scene.numerics).resolution(scene, tiny.parent)
+        best = MeshRule.of(scene).resolution(scene, tiny.parent)
         assert chosen["mesh"] == f"{best.across}x{best.through}"
         assert chosen["predicted_px"] == pytest.approx(best.error_px)
         within += chosen["error_px"] <= 0.0065

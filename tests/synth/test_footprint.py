@@ -177,7 +177,7 @@ def drawn(indenter: dict[str, Any], target: float | None = None, **motion: Any) 
 
 
 def resolve(draw: Scene) -> Resolution:
-    return MeshRule.of(draw.numerics).resolution(draw)
+    return MeshRule.of(draw).resolution(draw)
 
 
 def test_a_tighter_budget_takes_a_finer_mesh_up_to_the_finest() -> None:

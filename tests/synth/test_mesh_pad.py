@@ -15,7 +15,7 @@ from synth.arrays import FloatArray
 from synth.errors import InputError
 from synth.mesh import Focus, PadMesh, check_mesh, default_edge_length, mesh_key, pad_mesh
 from synth.mesh.pad import boundary_faces, signed_volumes
-from synth.mesh.tetrahedralise import WORST_SHAPE, _fault, _repair, shape_quality, tetrahedralise_box
+from synth.mesh.tetrahedralise import WORST_SHAPE, _fault, _repair, _sides, shape_quality, tetrahedralise_box
 from synth.mesh.tetwild_sizing import GRADING, through_thickness
 from synth.scene import Gel, Layer, Numerics
 
@@ -99,23 +99,28 @@ def test_quality_and_volume_of_known_tetrahedra_and_the_hash_names_the_content(p
     assert len({pad.hash, replace(pad, points=moved).hash, replace(pad, tets=turned).hash}) == 3
 
 
+def fault(points: FloatArray, tets: np.ndarray) -> str:
+    return _fault(points, tets, _sides(SIZE), float(np.prod(SIZE)), 1e-9)
+
+
 def test_repair_snaps_turns_and_drops_and_faults_are_named() -> None:
     exact = brick(SIZE, (3, 2, 2))
     noise = 1e-3 * np.random.default_rng(1).uniform(-1, 1, exact.points.shape)
     points = np.concatenate([exact.points + noise, [[9.0, 9.0, 9.0]]])  # the last vertex belongs to no tetrahedron
-    points, tets = _repair(points, exact.tets[:, [0, 2, 1, 3]], SIZE)
+    points, tets = _repair(points, exact.tets[:, [0, 2, 1, 3]], _sides(SIZE), 0.02)
     assert len(points) == len(exact.points)
     assert (signed_volumes(points, tets) > 0).all()
     on_low, on_high = exact.points == exact.points.min(axis=0), exact.points == exact.points.max(axis=0)
     assert (points[on_low | on_high] == exact.points[on_low | on_high]).all()
-    assert _fault(points, tets, SIZE) == ""
-    assert _fault(exact.points, exact.tets, SIZE) == ""
-    assert "fills" in _fault(exact.points, exact.tets[1:], SIZE)
-    assert "volume" in _fault(exact.points, exact.tets[:, [0, 2, 1, 3]], SIZE)
+    assert fault(points, tets) == ""
+    assert fault(exact.points, exact.tets) == ""
+    assert "off the gel's shape" in fault(exact.points + 1e-6, exact.tets)
+    assert "fills" in fault(exact.points, exact.tets[1:])
+    assert "volume" in fault(exact.points, exact.tets[:, [0, 2, 1, 3]])
     flat = exact.points.copy()
     (inside,) = np.flatnonzero((np.abs(flat - [-SIZE[0] / 6, 0.0, SIZE[2] / 2]) < 1e-9).all(axis=1))
     flat[inside, 2] = 1e-3 * SIZE[2]  # a node almost on the contact face: the volume stays right, the shapes do not
-    assert "quality" in _fault(flat, exact.tets, SIZE)
+    assert "quality" in fault(flat, exact.tets)
 
 
 SOUND = brick((4.0, 3.0, 2.0), (2, 2, 2))

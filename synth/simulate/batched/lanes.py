@@ -118,6 +118,7 @@ class Presses:
         waypoints, kind_of, stops: (N, W) path lengths; 0 not recorded, 1 recorded, 2 corrected and recorded; number.
         press_end: path length of the press, mm; deepest: largest depth, at least 0.1 mm.
         over_pad: whether the body comes down on the contact face.
+        origin, axes: of `LoadPath.frame`; zeros and the identity for flat pads and domes.
         position, reach, rotation: of the body, as `LoadPath.pose` uses them.
         kind, shape, friction, sharpness: as `synth.simulate.contact.Indenters`.
         grid, grids: number of its distance grid among the different ones (g, cells).
@@ -132,6 +133,8 @@ class Presses:
     press_end: wp.array(dtype=wp.float64)
     deepest: wp.array(dtype=wp.float64)
     over_pad: wp.array(dtype=wp.int32)
+    origin: wp.array(dtype=wp.vec3d)
+    axes: wp.array(dtype=wp.mat33d)
     position: wp.array(dtype=wp.vec2d)
     reach: wp.array(dtype=wp.float64)
     rotation: wp.array(dtype=wp.mat33d)

@@ -51,13 +51,14 @@ def place_indenters(lanes: Lanes, presses: Presses, indenters: Indenters):
         friction = STICK_FRICTION
     pose = _corner(presses, j, at)
     place = presses.position[j]
-    indenters.centre[i] = wp.vec3d(place[0] + pose[1], place[1] + pose[2], pose[0] - presses.reach[j])
+    local = wp.vec3d(place[0] + pose[1], place[1] + pose[2], pose[0] - presses.reach[j])
+    indenters.centre[i] = presses.origin[j] + presses.axes[j] * local
     zero = wp.float64(0.0)
     angle = pose[3] * (wp.float64(3.14159265358979323846) / wp.float64(180.0))
     c = wp.cos(angle)
     n = wp.sin(angle)
     turn = wp.mat33d(c, -n, zero, n, c, zero, zero, zero, wp.float64(1.0))
-    indenters.rotation[i] = turn * presses.rotation[j]
+    indenters.rotation[i] = presses.axes[j] * (turn * presses.rotation[j])
     indenters.friction[i] = friction
 
 

@@ -46,6 +46,8 @@ def press_tables(
         "press_end": ([path.press_mm for path in paths], wp.float64),
         "deepest": ([max(float(path.corners[:, 0].max()), 0.1) for path in paths], wp.float64),
         "over_pad": ([path.is_over(size_mm) for path in paths], wp.int32),
+        "origin": ([np.zeros(3) if path.frame is None else path.frame.origin for path in paths], wp.vec3d),
+        "axes": ([np.eye(3) if path.frame is None else path.frame.axes for path in paths], wp.mat33d),
         "position": (np.array([path.motion.position_mm for path in paths], dtype=np.float64), wp.vec2d),
         "reach": ([path.body.reach_mm - path.face_mm for path in paths], wp.float64),
         "rotation": ([body.rotation for body in bodies], wp.mat33d),

@@ -171,7 +171,9 @@ def check_contact(lanes: Lanes, presses: Presses, sums: wp.array2d(dtype=wp.floa
     if lanes.phase[s] != phases.AT_RECORD:
         return
     j = lanes.press[s]
-    if lanes.target[s] == presses.press_end[j] and presses.over_pad[j] == 1 and sums[s, 2] <= FORCE_FLOOR:
+    axes = presses.axes[j]
+    force = sums[s, 0] * axes[0, 2] + sums[s, 1] * axes[1, 2] + sums[s, 2] * axes[2, 2]
+    if lanes.target[s] == presses.press_end[j] and presses.over_pad[j] == 1 and force <= FORCE_FLOOR:
         lanes.reason[s] = phases.NO_CONTACT
         lanes.phase[s] = phases.ENDED
         return
