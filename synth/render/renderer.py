@@ -20,6 +20,7 @@ import numpy as np
 from synth.arrays import Image, Points
 from synth.errors import InputError
 from synth.render.camera_rays import CameraRays, pinhole
+from synth.render.chart import chart_of
 from synth.render.coating import reflection
 from synth.render.gel_mesh import GelMesh
 from synth.render.lights import check_view, emitters
@@ -66,7 +67,7 @@ class Renderer:
                 _check_further(name, view)
         separated = is_separated(render, sensor.coating, variant)  # every light at every sample
         self._lit = 1 if separated else sum(light.power > 0 for light in sensor.lights)
-        self._mesh = GelMesh(surface, sensor.gel.size_mm[:2])
+        self._mesh = GelMesh(surface, chart_of(sensor))
         mi = variant.load()
         gel = self._build_gel(mi, sensor.coating, albedo)
         contents = {"type": "scene", "gel": gel, **emitters(sensor, mi)}
@@ -104,7 +105,7 @@ class Renderer:
         """Render this surface from now on: `radiance` gets the positions of its vertices."""
         if surface is self._mesh.surface:
             return
-        self._mesh = GelMesh(surface, self._mesh.size_mm)
+        self._mesh = GelMesh(surface, self._mesh.chart)
         self._replace("gel.faces", self._mesh.faces())
         self._replace("gel.vertex_texcoords", self._mesh.texture_coordinates())
         self._replace("gel.vertex_positions", self._mesh.positions(surface.material))
