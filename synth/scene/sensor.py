@@ -69,6 +69,8 @@ class Coating(Part):
 class Light(Part):
     """A rectangular LED inside the index-matched body, radiating as a Lambertian area toward aim_mm.
 
+    It may also stand in the air that a round window encloses; its light goes on straight at the window's face.
+
     Lights are real obstacles: they must stay out of the camera's view, and one may shade another.
     """
 
@@ -115,10 +117,20 @@ class Sensor(Part):
             self._check_inside()
         else:
             self._check_beyond()
+        thickness = self.gel.size_mm[2]
+        outside = thickness + self.window.thickness_mm
+        for i, light in enumerate(self.lights):
+            if not 0 < light.position_mm[2] < outside:
+                raise ValueError(
+                    f"lights[{i}].position_mm z = {light.position_mm[2]} must lie inside the gel and window, "
+                    f"0 < z < {outside}"
+                )
+            if light.position_mm[2] <= self.gel.face_mm(*light.position_mm[:2]):
+                raise ValueError(f"lights[{i}].position_mm lies outside the curved gel")
         return self
 
     def _check_inside(self) -> None:
-        """Refuse what does not fit into the air that a round window encloses, and lights outside the gel."""
+        """Refuse what does not fit into the air that a round window encloses."""
         for where, camera in self.cameras.items():
             if self.window.clearance_mm(camera.position_mm) <= 0:
                 raise ValueError(
@@ -134,7 +146,7 @@ class Sensor(Part):
             raise ValueError(f"mirrors stand before a flat window only, this one is a {self.window.shape}")
 
     def _check_beyond(self) -> None:
-        """Refuse cameras and mirrors that are not beyond a flat window, and lights that are not before its face."""
+        """Refuse cameras and mirrors that are not beyond a flat window."""
         thickness = self.gel.size_mm[2]
         outside = thickness + self.window.thickness_mm
         for where, camera in self.cameras.items():
@@ -159,11 +171,3 @@ class Sensor(Part):
                     f"mirrors[{i}] reaches down to z = {mirror.lowest_mm:.4g}; mirrors stand in air, beyond the "
                     f"window: z > {outside}"
                 )
-        for i, light in enumerate(self.lights):
-            if not 0 < light.position_mm[2] < outside:
-                raise ValueError(
-                    f"lights[{i}].position_mm z = {light.position_mm[2]} must lie inside the gel and window, "
-                    f"0 < z < {outside}"
-                )
-            if light.position_mm[2] <= self.gel.face_mm(*light.position_mm[:2]):
-                raise ValueError(f"lights[{i}].position_mm lies outside the domed gel")

@@ -59,7 +59,7 @@ class Shell:
         first /= np.sqrt((first**2).sum(axis=1, keepdims=True))
         frame = np.stack([first, np.cross(straight, first)], axis=1)
         aim, found = np.zeros((len(points), 2)), np.full_like(points, np.nan)
-        open_ = np.arange(len(points))
+        open_ = np.flatnonzero(np.isfinite(points).all(axis=1))
 
         def shot(at: FloatArray) -> tuple[FloatArray, Points]:
             ray = straight[open_] + np.einsum("ni,nij->nj", at, frame[open_])
