@@ -21,12 +21,11 @@ from typing import Any
 import numpy as np
 
 from synth.arrays import FloatArray, Pixels
-from synth.optics import Optics
 from synth.render.camera_rays import CameraRays
 from synth.render.coating import coat
 from synth.render.gel_mesh import MIRROR
 from synth.render.variant import Variant
-from synth.render.window_images import reflectance
+from synth.render.window_images import reflectance, reflecting_plane
 from synth.scene import Sensor
 
 _CELLS = 24
@@ -68,9 +67,9 @@ class FlatGel:
         ray, self._weight, _ = CameraRays(sensor, mi).sample(index, mi.Point2f(0.5))
         self._point = ray.o - ray.d * (ray.o.z / ray.d.z)
         self._toward = -ray.d
-        window = Optics.of(sensor).window
-        self._reflects = window.index != 1
-        self._index, self._face = mi.Float(window.index), mi.Float(window.face_z)
+        plane = reflecting_plane(sensor)
+        self._reflects = plane is not None
+        self._index, self._face = mi.Float(sensor.window.refractive_index), mi.Float(plane or 0)
         color = {"type": "rgb", "value": list(sensor.coating.reflectance)}
         self._bsdf = mi.load_dict(coat(sensor.coating, color))
 

@@ -14,6 +14,7 @@ from synth.arrays import BoolArray, FloatArray, Pixels, Points
 from synth.optics.lens import Lens, lens_of
 from synth.optics.mirror import DIRECT, NOTHING, FlatMirror, first_met
 from synth.optics.pose import Pose
+from synth.optics.round_window import RoundWindow
 from synth.optics.window import Window
 from synth.scene import Sensor
 
@@ -57,7 +58,7 @@ class Optics:
 
     pose: Pose
     lens: Lens
-    window: Window
+    window: Window | RoundWindow
     mirrors: tuple[FlatMirror, ...]
     size: tuple[int, int]
 
@@ -68,7 +69,7 @@ class Optics:
         return Optics(
             pose=Pose.of(camera),
             lens=lens_of(camera),
-            window=Window(sensor.window.refractive_index, sensor.gel.size_mm[2] + sensor.window.thickness_mm),
+            window=_window(sensor),
             mirrors=tuple(FlatMirror.of(mirror) for mirror in sensor.mirrors),
             size=(camera.width, camera.height),
         )
@@ -153,3 +154,10 @@ class Optics:
             seen = np.flatnonzero(self.is_inside(pixels))
             path[seen[self.look(pixels[seen]).path == number]] = number
         return path
+
+
+def _window(sensor: Sensor) -> Window | RoundWindow:
+    given = sensor.window
+    if given.radius_mm is None:
+        return Window(given.refractive_index, sensor.gel.size_mm[2] + given.thickness_mm)
+    return RoundWindow(given.refractive_index, given.radius_mm, *given.axis_mm)

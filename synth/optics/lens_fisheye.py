@@ -3,8 +3,8 @@ r"""OpenCV's fisheye lens (module cv2.fisheye): equidistant projection with an o
 .. math::  r_d = θ_d(θ) = θ (1 + k_1 θ^2 + k_2 θ^4 + k_3 θ^6 + k_4 θ^8)
 
 for light at the angle θ to the axis, and the pixel at r_d times the focal length from the centre, in the light's own
-direction. Used where it is one-to-one: up to where θ_d turns back, and below 90 degrees to the axis. The inverse is
-Newton's method kept inside a bracket that bisection shrinks.
+direction. Used where it is one-to-one: up to where θ_d turns back, and below 110 degrees to the axis, 20 of them behind
+the lens. The inverse is Newton's method kept inside a bracket that bisection shrinks.
 
 Reference: Kannala and Brandt, "A generic camera model and calibration method for conventional, wide-angle, and
 fish-eye lenses", IEEE TPAMI 28(8), 2006.
@@ -18,8 +18,10 @@ import numpy as np
 from synth.arrays import FloatArray, Pixels, Points
 from synth.optics.lens_pinhole import smallest_positive_root
 
+WIDEST = np.radians(110)
+"""Largest angle to the axis: half of the field of the widest lenses that are made."""
 _STEPS = 60
-"""Bisection alone would reach float64's resolution of an angle below pi / 2 in 53."""
+"""Bisection alone would reach float64's resolution of such an angle in 54."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,10 +58,10 @@ class FisheyeLens:
 
     @cached_property
     def field_limit(self) -> float:
-        """Angle to the axis, radians, below which the lens model is one-to-one: at most pi / 2."""
+        """Angle to the axis, radians, below which the lens model is one-to-one: at most `WIDEST`."""
         k1, k2, k3, k4 = self.distortion
         first = smallest_positive_root([9 * k4, 7 * k3, 5 * k2, 3 * k1, 1.0])  # derivative of θ_d, in θ²
-        return min(np.pi / 2, float(np.sqrt(first)))
+        return min(WIDEST, float(np.sqrt(first)))
 
     def _distorted(self, angle: FloatArray) -> FloatArray:
         k1, k2, k3, k4 = self.distortion

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from synth.arrays import FloatArray, Points
+from synth.arrays import BoolArray, FloatArray, Points
 
 _RELATIVE_STEP = 1e-9
 """Newton's error after a relative step s is of order s²; below 1e-9 the next iterate is exact to rounding."""
@@ -58,6 +58,10 @@ class Window:
         origins[:, 2] += self.face_z - origins[:, 2]  # exactly on the face; NaN stays NaN
         lateral = air[:, :2] / self.index
         return origins, np.column_stack([lateral, -np.sqrt(1 - (lateral**2).sum(1))])
+
+    def shows(self, points: Points) -> BoolArray:
+        """Which of the points (n, 3) a camera might see: those between the gel's face and this one."""
+        return np.asarray((points[:, 2] > 0) & (points[:, 2] < self.face_z))
 
     def _slope_per_distance(self, points: Points, eye: FloatArray) -> FloatArray:
         """The root m = t / R (n,) 1/mm of the module's equation for points (n, 3)."""

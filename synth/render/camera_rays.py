@@ -1,7 +1,7 @@
 r"""Rays through the camera's pixels, for Mitsuba.
 
 Vectorised variants get every lens and mirror exactly: rays are made here and start inside the body, refracted by
-Snell's law at the window's outer face and weighted by
+Snell's law at the window's face and weighted by
 
 .. math::  \frac{1 - F(\theta)}{n^2},
 
@@ -10,7 +10,7 @@ tracer finds on average behind a smooth dielectric, without its noise. With an a
 ray starts at its own point of the pupil.
 
 Scalar variants trace far too slowly from Python and use Mitsuba's own pinhole camera, which knows square pixels and no
-lens distortion, fisheye, mirror or aperture.
+lens distortion, fisheye, mirror, aperture or round window.
 """
 
 import math
@@ -23,7 +23,9 @@ from synth.arrays import FloatArray
 from synth.errors import InputError
 from synth.optics import Optics
 from synth.optics.mirror import FlatMirror
+from synth.optics.round_window import RoundWindow
 from synth.render.gel_mesh import MIRROR
+from synth.render.round_face import RoundFace
 from synth.render.thin_lens import ThinLens
 from synth.render.variant import LLVM_HINT
 from synth.scene import Camera, Sensor
@@ -46,9 +48,11 @@ class CameraRays:
         axes = (pose.right, pose.down, pose.forward, pose.position)
         self._right, self._down, self._forward, self._position = (self._vector(axis) for axis in axes)
         self._mirrors = [_Mirror(mirror, self._vector, mi, dr) for mirror in optics.mirrors]
-        self._refracts = optics.window.index != 1
-        self._index = dr.opaque(mi.Float, optics.window.index)
-        self._face = dr.opaque(mi.Float, optics.window.face_z)
+        window = optics.window
+        self._refracts = window.index != 1
+        self._index = dr.opaque(mi.Float, window.index)
+        self._round = RoundFace(window, mi) if isinstance(window, RoundWindow) else None
+        self._face = None if isinstance(window, RoundWindow) else dr.opaque(mi.Float, window.face_z)
         self._is_fisheye = camera.lens == "fisheye"
         self._distortion = [dr.opaque(mi.Float, k) for k in camera.distortion] if any(camera.distortion) else None
         thin = ThinLens.of(sensor)
@@ -105,6 +109,11 @@ class CameraRays:
             valid &= unhindered
         if not self._refracts:
             return mi.RayDifferential3f(mi.Ray3f(mi.Point3f(eye), air)), mi.Float(1), valid
+        if self._round is not None:
+            origin, inside, slant, meets = self._round.enter(eye, air)
+            reflected, *_ = mi.fresnel(slant, self._index)
+            ray = mi.RayDifferential3f(mi.Ray3f(mi.Point3f(origin + inside * _START_MM), inside))
+            return ray, (1 - reflected) / dr.square(self._index), valid & meets
         valid &= air.z < 0
         origin = eye + air * ((self._face - eye.z) / air.z)
         origin.z = self._face
@@ -193,12 +202,15 @@ def pinhole(sensor: Sensor) -> dict[str, Any]:
     """Mitsuba's perspective camera, less its film and sampler, for scalar variants.
 
     Raises:
-        InputError: the camera has a fisheye lens, a mirror, distortion, an aperture or pixels that are not square.
+        InputError: the camera has a fisheye lens, a mirror, distortion, an aperture, pixels that are not square or a
+            round window before it.
     """
     optics, camera = Optics.of(sensor), sensor.camera
     need = f"needs LLVM 16 or newer, or an NVIDIA GPU, which this machine lacks ({LLVM_HINT})"
-    if camera.lens != "pinhole" or sensor.mirrors:
+    is_round = sensor.window.is_round and optics.window.index != 1
+    if camera.lens != "pinhole" or sensor.mirrors or is_round:
         what = "sensor.mirrors" if sensor.mirrors else f"sensor.camera.lens = {camera.lens!r}"
+        what = f"sensor.window.shape = {sensor.window.shape!r}" if is_round else what
         raise InputError(f"{what} {need}; there is no way to render it without")
     if any(camera.distortion):
         raise InputError(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.arrays import Points
+from synth.render.chart import Chart
 from synth.surface import GelSurface, vertex_normals
 
 MIRROR = np.array([1.0, -1.0, 1.0])
@@ -22,12 +23,12 @@ class GelMesh:
 
     Attributes:
         surface: the surface whose deformed positions are rendered.
-        size_mm: width and height of the contact face, which the texture spans.
+        chart: how the texture is laid on it.
         behind: z (mm) of the plane in which the arrays show the mirror image of the gel; None: they show the gel.
     """
 
     surface: GelSurface
-    size_mm: tuple[float, float]
+    chart: Chart
     behind: float | None = None
 
     def faces(self) -> NDArray[np.uint32]:
@@ -36,10 +37,10 @@ class GelMesh:
         return np.ascontiguousarray(triangles[:, ::-1] if self.behind is None else triangles).astype(np.uint32).ravel()
 
     def texture_coordinates(self) -> NDArray[np.float32]:
-        """(2 v,) u along +x and v along +y, each 0..1 over the face; Mitsuba's v = 0 is a texture's first row."""
-        material = self.surface.material
-        u = material[:, 0] / self.size_mm[0] + 0.5
-        v = material[:, 1] / self.size_mm[1] + 0.5
+        """(2 v,) u along +x and v along +y, each 0..1 over the chart; Mitsuba's v = 0 is a texture's first row."""
+        places, (width, height) = self.chart.flattened(self.surface.material), self.chart.size_mm
+        u = places[:, 0] / width + 0.5
+        v = places[:, 1] / height + 0.5
         return np.column_stack([u, v]).astype(np.float32).ravel()
 
     def positions(self, positions: Points) -> NDArray[np.float32]:

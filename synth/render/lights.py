@@ -1,4 +1,6 @@
-"""The LEDs: rectangular area emitters inside the index-matched body of gel and window.
+"""The LEDs: rectangular area emitters inside the index-matched body of gel and window, or in the air of a round one.
+
+Their light goes straight to the gel: the face at which the camera's rays bend takes no part in the lighting.
 
 A rectangle of area A that emits the power Φ as a Lambertian source to one side has the radiance L = Φ / (π A).
 Its first size runs parallel to the contact face, its second at right angles to it and to the viewing direction; a light
@@ -64,7 +66,7 @@ def check_view(sensor: Sensor) -> None:
         points = (
             np.array(light.position_mm) + np.outer(u * light.size_mm[0], first) + np.outer(v * light.size_mm[1], second)
         )
-        pixels = optics.project(points[(points[:, 2] > 0) & (points[:, 2] < optics.window.face_z)])
+        pixels = optics.project(points[optics.window.shows(points)])
         inside = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(1)
         if inside.any():
             x, y = pixels[inside][0]

@@ -19,7 +19,9 @@ from synth.arrays import FloatArray, Image
 from synth.errors import InputError
 from synth.optics import Optics
 from synth.render.bitmap import laid_over, read_picture
+from synth.render.chart import RoundChart, chart_of
 from synth.render.marks import dots_coverage, speckle_coverage
+from synth.render.round_marks import round_dots, round_speckle
 from synth.scene import Bitmap, Dots, NoPattern, Pattern, RandomColor, Sensor, Speckle
 
 TEXELS_PER_PIXEL = 4
@@ -48,8 +50,13 @@ def albedo(sensor: Sensor, rng: np.random.Generator, folder: Path | None = None)
     """
     x, y = _texels(sensor)
     _check_detail(sensor.pattern, max(x[1] - x[0], y[1] - y[0]))
+    chart = chart_of(sensor)
     coating = np.array(sensor.coating.reflectance)
     match sensor.pattern:
+        case Dots() as pattern if isinstance(chart, RoundChart):
+            colors, coverage = np.array(pattern.reflectance), round_dots(pattern, chart, x, y, rng)
+        case Speckle() as pattern if isinstance(chart, RoundChart):
+            colors, coverage = np.array(pattern.reflectance), round_speckle(pattern, chart, x, y, rng)
         case Dots() as pattern:
             colors, coverage = np.array(pattern.reflectance), dots_coverage(pattern, x, y, rng)
         case Speckle() as pattern:
@@ -97,7 +104,7 @@ def check_pattern(sensor: Sensor, folder: Path) -> None:
 
 def _texels(sensor: Sensor) -> tuple[FloatArray, FloatArray]:
     """Centres of the texels, x (columns,) and y (rows,), mm."""
-    width, height = sensor.gel.size_mm[:2]
+    width, height = chart_of(sensor).size_mm
     density = TEXELS_PER_PIXEL * pixels_per_mm(sensor)
     density = min(density, MAX_TEXELS / max(width, height))
     columns, rows = max(4, math.ceil(width * density)), max(4, math.ceil(height * density))
@@ -126,7 +133,8 @@ def _check_detail(pattern: Pattern, texel_mm: float) -> None:
 def pixels_per_mm(sensor: Sensor) -> float:
     """Image scale on the undeformed contact face: the finest of all cameras and directions.
 
-    It is taken at the pad's middle; for a camera that does not see that, where a grid of its pixels meets the pad.
+    It is taken at the pad's middle; for a camera that does not see that, where a grid of its pixels meets the pad. For
+    a pattern laid about the axis of a round gel, it is taken all over the face.
 
     Raises:
         InputError: no camera sees the pad.
@@ -139,6 +147,9 @@ def pixels_per_mm(sensor: Sensor) -> float:
 
 def _scale(optics: Optics, sensor: Sensor) -> float:
     """Largest stretch of the map from the contact face to pixels, in px per mm; 0 where nothing is seen."""
+    chart = chart_of(sensor)
+    if isinstance(chart, RoundChart):
+        return _round_scale(optics, chart)
     pixels = optics.project(np.zeros((1, 3)))
     if not optics.is_inside(pixels).all():
         edges = (np.linspace(0, side, 13) for side in (sensor.camera.width, sensor.camera.height))
@@ -154,8 +165,24 @@ def _scale(optics: Optics, sensor: Sensor) -> float:
         (optics.project(points + arm, path) - optics.project(points - arm, path)) / (2 * _STEP_MM)
         for arm in _STEP_MM * np.eye(3)[:2]
     ]
-    jacobian = np.stack(moved, axis=2)
-    jacobian = jacobian[np.isfinite(jacobian).all(axis=(1, 2))]  # at the edge of a lens's field a step may leave it
+    return _largest_stretch(np.stack(moved, axis=2))
+
+
+def _round_scale(optics: Optics, chart: RoundChart) -> float:
+    """As `_scale`, at a grid of arcs and azimuths."""
+    arc, azimuth = (axis.ravel() for axis in np.meshgrid(np.linspace(0.02, 0.98, 25) * chart.end, np.arange(25) / 4))
+    turn = _STEP_MM / chart.across(arc)
+    inside = optics.is_inside(optics.project(chart.points(arc, azimuth)))
+    moved = [
+        optics.project(chart.points(arc + along, azimuth + aside * turn)) / (2 * _STEP_MM)
+        for along, aside in ((_STEP_MM, 0), (-_STEP_MM, 0), (0, 1), (0, -1))
+    ]
+    return _largest_stretch(np.stack([moved[0] - moved[1], moved[2] - moved[3]], axis=2)[inside])
+
+
+def _largest_stretch(jacobian: FloatArray) -> float:
+    """Of Jacobians (n, 2, 2); at the edge of a lens's field, where a step left it, they are NaN and do not count."""
+    jacobian = jacobian[np.isfinite(jacobian).all(axis=(1, 2))]
     return float(np.linalg.svd(jacobian, compute_uv=False)[:, 0].max(initial=0.0))
 
 

@@ -18,8 +18,8 @@ import numpy as np
 
 from synth.arrays import Image, Points
 from synth.errors import InputError
-from synth.optics import Optics
 from synth.render.camera_rays import CameraRays, pinhole
+from synth.render.chart import Chart, chart_of
 from synth.render.coating import reflection
 from synth.render.gel_mesh import GelMesh
 from synth.render.lights import check_view, emitters
@@ -28,7 +28,7 @@ from synth.render.sample_count import PILOT, needed_samples
 from synth.render.separated_light import SeparatedLight, is_separated
 from synth.render.thin_lens import ThinLens
 from synth.render.variant import Variant
-from synth.render.window_images import image_lights, pane
+from synth.render.window_images import image_lights, pane, reflecting_plane
 from synth.scene import Render, Sensor
 from synth.surface import GelSurface
 
@@ -69,16 +69,16 @@ class Renderer:
         mi = variant.load()
         check_view(sensor)
         refracts = sensor.window.refractive_index != 1
-        self._behind = Optics.of(sensor).window.face_z if refracts and variant.is_vectorised else None
+        self._behind = reflecting_plane(sensor) if variant.is_vectorised else None
         lights = sensor.lights if self._behind is None else (*sensor.lights, *image_lights(sensor))
         self._lit = 1 if separated else sum(light.power > 0 for light in lights)
-        self._set_meshes(surface, sensor.gel.size_mm[:2])
+        self._set_meshes(surface, chart_of(sensor))
         bsdf = reflection(mi, sensor.coating, albedo, variant.is_mono)
         gels = {name: _gel(name, mesh, bsdf, mi) for name, mesh in self._meshes.items()}
         contents = {"type": "scene", **gels, **emitters(lights, mi)}
         if refracts and not variant.is_vectorised:
             contents["window"] = _window(sensor, mi)
-        elif refracts and not separated:
+        elif self._behind is not None and not separated:
             contents["window"] = pane(sensor, mi)
         self._scene = mi.load_dict(contents, optimize=False)
         self._parameters = mi.traverse(self._scene)
@@ -113,7 +113,7 @@ class Renderer:
         mesh = self._meshes["gel"]
         if surface is mesh.surface:
             return
-        self._set_meshes(surface, mesh.size_mm)
+        self._set_meshes(surface, mesh.chart)
         for name, mesh in self._meshes.items():
             self._replace(f"{name}.faces", mesh.faces())
             self._replace(f"{name}.vertex_texcoords", mesh.texture_coordinates())
@@ -121,10 +121,10 @@ class Renderer:
             self._replace(f"{name}.vertex_normals", mesh.normals(surface.material))
         self._parameters.update()
 
-    def _set_meshes(self, surface: GelSurface, size_mm: tuple[float, float]) -> None:
-        self._meshes = {"gel": GelMesh(surface, size_mm)}
+    def _set_meshes(self, surface: GelSurface, chart: Chart) -> None:
+        self._meshes = {"gel": GelMesh(surface, chart)}
         if self._behind is not None:
-            self._meshes["image"] = GelMesh(surface, size_mm, self._behind)
+            self._meshes["image"] = GelMesh(surface, chart, self._behind)
 
     def _replace(self, key: str, values: Any) -> None:
         """Set an array of another length. Scalar variants compare old and new by elements, and stop at that."""

@@ -30,11 +30,10 @@ from numpy.typing import NDArray
 
 from synth.arrays import BoolArray, Image
 from synth.errors import InputError
-from synth.optics import Optics
 from synth.render.gel_mesh import GelMesh
 from synth.render.polygon_light import ImageLight, PolygonLight
 from synth.render.variant import Variant
-from synth.render.window_images import image_lights, reflectance
+from synth.render.window_images import image_lights, reflectance, reflecting_plane
 from synth.scene import Coating, Render, Sensor
 
 PILOTS = 16
@@ -99,10 +98,11 @@ class SeparatedLight:
         self._gel, self._image = gels["gel"], gels.get("image")
         self._reflection = self._gel.bsdf()
         self._depth, self._channels = max_depth, 1 if is_mono else 3
-        window = Optics.of(sensor).window
-        self._face, self._index = dr.opaque(mi.Float, window.face_z), dr.opaque(mi.Float, window.index)
+        index = sensor.window.refractive_index
+        # Used only where the window reflects.
+        self._face, self._index = dr.opaque(mi.Float, reflecting_plane(sensor) or 0), dr.opaque(mi.Float, index)
         self._lights = [PolygonLight(light, mi) for light in sensor.lights if light.power > 0]
-        self._lights += [ImageLight(light, window.index, mi) for light in image_lights(sensor) if light.power > 0]
+        self._lights += [ImageLight(light, index, mi) for light in image_lights(sensor) if light.power > 0]
         self._half = [dr.opaque(mi.Float, size / 2) for size in sensor.gel.size_mm[:2]]
 
     def prepare(self, mesh: GelMesh, primary: int, seed: int) -> None:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from synth.optics import Optics
+from synth.optics.window import Window
 from synth.render.gel_mesh import mirrored
 from synth.scene import Light, Sensor
 
@@ -25,12 +26,16 @@ _WIDE = 1e3
 """Half width of the plane, mm: wider than any sensor."""
 
 
-def image_lights(sensor: Sensor) -> tuple[Light, ...]:
-    """The lights' mirror images behind the window's outer face; none where the window does not refract."""
+def reflecting_plane(sensor: Sensor) -> float | None:
+    """Z (mm) of the window's outer face; None where it does not refract, or is round and reflects nothing here."""
     window = Optics.of(sensor).window
-    if window.index == 1:
-        return ()
-    return tuple(_image(light, window.face_z) for light in sensor.lights)
+    return window.face_z if isinstance(window, Window) and window.index != 1 else None
+
+
+def image_lights(sensor: Sensor) -> tuple[Light, ...]:
+    """The lights' mirror images behind the window's outer face; none where it reflects nothing."""
+    plane = reflecting_plane(sensor)
+    return () if plane is None else tuple(_image(light, plane) for light in sensor.lights)
 
 
 def reflectance(cosine: Any, index: Any, mi: Any) -> Any:
@@ -41,9 +46,9 @@ def reflectance(cosine: Any, index: Any, mi: Any) -> Any:
 def pane(sensor: Sensor, mi: Any) -> dict[str, Any]:
     """Mitsuba's description of the outer face, for paths that go on among the images."""
     _register(mi.variant())
-    window, transform = Optics.of(sensor).window, mi.ScalarTransform4f
-    place = transform().translate([0, 0, window.face_z]) @ transform().scale([_WIDE, _WIDE, 1])
-    return {"type": "rectangle", "to_world": place, "bsdf": {"type": PANE, "index": window.index}}
+    transform, index = mi.ScalarTransform4f, sensor.window.refractive_index
+    place = transform().translate([0, 0, reflecting_plane(sensor)]) @ transform().scale([_WIDE, _WIDE, 1])
+    return {"type": "rectangle", "to_world": place, "bsdf": {"type": PANE, "index": index}}
 
 
 def _image(light: Light, face_z: float) -> Light:

@@ -12,7 +12,7 @@ COEFFICIENTS = {"pinhole": "k1, k2, p1, p2, k3", "fisheye": "k1, k2, k3, k4"}
 
 
 class Camera(Part):
-    """A camera in air behind the window, and its image sensor. Right is +x and down +y for a view along -z."""
+    """A camera in air, beyond a flat window or within a round one. Right is +x and down +y for a view along -z."""
 
     width: Annotated[int, Field(ge=16, le=8192)]
     height: Annotated[int, Field(ge=16, le=8192)]
@@ -23,7 +23,7 @@ class Camera(Part):
     position_mm: Vector3
     look_at_mm: Vector3 = (0.0, 0.0, 0.0)
     lens: Literal["pinhole", "fisheye"] = "pinhole"
-    """pinhole: Brown-Conrady; fisheye: Kannala-Brandt as in cv2.fisheye, below 180 degrees."""
+    """pinhole: Brown-Conrady; fisheye: Kannala-Brandt as in cv2.fisheye, up to 220 degrees from side to side."""
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
     """As in OpenCV: k1, k2, p1, p2, k3 of a pinhole lens; k1, k2, k3, k4 of a fisheye lens."""
     exposure: Positive = 1.0

@@ -25,8 +25,19 @@ are printed on the gel and the coating is laid over them (GelSight: Yuan et al.,
 and 4). The paint has no thickness: it moves with the coating, and the flow is that of the coating."""
 
 
+Placing = Literal["z", "spherical", "cylindrical"]
+"""How marks are laid on the face. z: along z, so that where it slopes they are longer. The others are for round gels,
+rows along meridians about the axis, and there marks have their true sizes in mm on the face: spherical counts the
+spacing along the meridian from the tip, cylindrical counts it along z; grains are the same in both."""
+
+
 class Dots(Part):
-    """Printed dots on a grid whose first dot lies offset_mm from the pad's centre."""
+    """Printed dots on a grid whose first dot lies offset_mm from the pad's centre.
+
+    On a round gel the first number of spacing_mm is the distance between meridians, and of offset_mm the first one's
+    from azimuth 0, at the gel's largest radius; toward the tip meridians meet. A whole number of them is made. The
+    second numbers are along the meridian, or along z, from the tip.
+    """
 
     kind: Literal["dots"]
     spacing_mm: tuple[Positive, Positive]
@@ -46,9 +57,12 @@ class Dots(Part):
     """Width of the dot's edge."""
     reflectance: Color = (0.03, 0.03, 0.03)
     layer: MarkLayer = "in_coating"
+    placing: Placing = "z"
 
     @model_validator(mode="after")
     def _leaves_coating(self) -> "Dots":
+        if self.placing != "z" and self.rotation_deg:
+            raise ValueError(f"rotation_deg = {self.rotation_deg}: rows of dots along meridians cannot be turned")
         across, down = self.spacing_mm
         most = math.hypot(across, down) / 2 if self.shape == "round" else (across + down) / 2
         if self.radius_mm >= most:
@@ -79,6 +93,7 @@ class Speckle(Part):
     coverage: Annotated[float, Field(gt=0, lt=1)] = 0.5
     reflectance: Color = (0.03, 0.03, 0.03)
     layer: MarkLayer = "in_coating"
+    placing: Placing = "z"
 
 
 class Bitmap(Part):

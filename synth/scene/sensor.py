@@ -1,6 +1,7 @@
 """The part of a scene's schema that is the sensor: window, coating and lights around gel, pattern and cameras."""
 
-from typing import Annotated
+import math
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
@@ -11,13 +12,46 @@ from synth.scene.pattern import Pattern
 
 
 class Window(Part):
-    """Rigid clear support between gel and camera, index-matched to the gel; flat, from z = gel thickness on.
+    """Rigid clear support between gel and camera, index-matched to the gel.
 
-    Its outer face refracts, and reflects light back onto the gel (but not in scalar variants).
+    Light bends at its face towards the camera: a plane beyond the gel, or a round face about the z axis that encloses
+    the camera in air. A plane also reflects light back onto the gel (but not in scalar variants), a round face does not.
     """
 
     refractive_index: Annotated[float, Field(ge=1, le=2.5)] = 1.45
+    """1: matched to the camera's side, too; nothing bends."""
     thickness_mm: Annotated[float, Field(ge=0, le=100)] = 5.0
+    shape: Literal["plane", "sphere", "cylinder", "capsule"] = "plane"
+    """capsule: a hemisphere toward the tip and a cylinder above it."""
+    radius_mm: Positive | None = None
+    """Of the round face itself."""
+    center_z_mm: float | None = None
+    """Z of the centre of the sphere or hemisphere."""
+
+    @property
+    def is_round(self) -> bool:
+        return self.shape != "plane"
+
+    @property
+    def axis_mm(self) -> tuple[float, float]:
+        """Ends of the part of the z axis from which all of a round face is radius_mm away."""
+        centre = self.center_z_mm or 0.0
+        low = -math.inf if self.shape == "cylinder" else centre
+        return low, centre if self.shape == "sphere" else math.inf
+
+    def clearance_mm(self, point: Vector3) -> float:
+        """How far a point lies inside a round face; negative outside."""
+        x, y, z = point
+        low, high = self.axis_mm
+        return (self.radius_mm or 0.0) - math.hypot(x, y, z - min(max(z, low), high))
+
+    @model_validator(mode="after")
+    def _shaped(self) -> "Window":
+        wanted = {"radius_mm": self.is_round, "center_z_mm": self.shape in ("sphere", "capsule")}
+        for name, is_wanted in wanted.items():
+            if is_wanted != (getattr(self, name) is not None):
+                raise ValueError(f'shape = "{self.shape}" {"needs" if is_wanted else "has no"} {name}')
+        return self
 
 
 class Coating(Part):
@@ -34,6 +68,8 @@ class Coating(Part):
 
 class Light(Part):
     """A rectangular LED inside the index-matched body, radiating as a Lambertian area toward aim_mm.
+
+    It may also stand in the air that a round window encloses; its light goes on straight at the window's face.
 
     Lights are real obstacles: they must stay out of the camera's view, and one may shade another.
     """
@@ -66,13 +102,54 @@ class Sensor(Part):
         others = {camera.name: self.model_copy(update={"camera": camera}) for camera in self.further_cameras}
         return {"": self, **others}
 
+    @property
+    def cameras(self) -> dict[str, Camera]:
+        """All cameras, by their places in a scene file."""
+        further = {f"further_cameras[{i}]": camera for i, camera in enumerate(self.further_cameras)}
+        return {"camera": self.camera, **further}
+
     @model_validator(mode="after")
     def _arranged(self) -> "Sensor":
+        names = [camera.name for camera in self.further_cameras]
+        if len(set(names)) < len(names):
+            raise ValueError(f"further_cameras: names must differ, they are {', '.join(names)}")
+        if self.window.is_round:
+            self._check_inside()
+        else:
+            self._check_beyond()
         thickness = self.gel.size_mm[2]
         outside = thickness + self.window.thickness_mm
-        cameras: dict[str, Camera] = {"camera": self.camera}
-        cameras.update({f"further_cameras[{i}]": camera for i, camera in enumerate(self.further_cameras)})
-        for where, camera in cameras.items():
+        for i, light in enumerate(self.lights):
+            if not 0 < light.position_mm[2] < outside:
+                raise ValueError(
+                    f"lights[{i}].position_mm z = {light.position_mm[2]} must lie inside the gel and window, "
+                    f"0 < z < {outside}"
+                )
+            if light.position_mm[2] <= self.gel.face_mm(*light.position_mm[:2]):
+                raise ValueError(f"lights[{i}].position_mm lies outside the curved gel")
+        return self
+
+    def _check_inside(self) -> None:
+        """Refuse what does not fit into the air that a round window encloses."""
+        for where, camera in self.cameras.items():
+            if self.window.clearance_mm(camera.position_mm) <= 0:
+                raise ValueError(
+                    f"{where}.position_mm = {list(camera.position_mm)} must lie inside the window's "
+                    f"{self.window.shape}, nearer than radius_mm = {self.window.radius_mm:.4g} to its axis or centre"
+                )
+            if camera.aperture_mm:
+                raise ValueError(
+                    f"{where}.aperture_mm = {camera.aperture_mm}: behind a round window only a pinhole is modelled; "
+                    "leave it out, and use blur_px for a blur that is the same in all of the image"
+                )
+        if self.mirrors:
+            raise ValueError(f"mirrors stand before a flat window only, this one is a {self.window.shape}")
+
+    def _check_beyond(self) -> None:
+        """Refuse cameras and mirrors that are not beyond a flat window."""
+        thickness = self.gel.size_mm[2]
+        outside = thickness + self.window.thickness_mm
+        for where, camera in self.cameras.items():
             if camera.position_mm[2] <= outside:
                 raise ValueError(
                     f"{where}.position_mm z = {camera.position_mm[2]} lies inside the sensor; "
@@ -88,21 +165,9 @@ class Sensor(Part):
                     f"{where}.look_at_mm must lie on the gel's side of the camera (smaller z); only a mirror could "
                     "turn its view back"
                 )
-        names = [camera.name for camera in self.further_cameras]
-        if len(set(names)) < len(names):
-            raise ValueError(f"further_cameras: names must differ, they are {', '.join(names)}")
         for i, mirror in enumerate(self.mirrors):
             if mirror.lowest_mm <= outside:
                 raise ValueError(
                     f"mirrors[{i}] reaches down to z = {mirror.lowest_mm:.4g}; mirrors stand in air, beyond the "
                     f"window: z > {outside}"
                 )
-        for i, light in enumerate(self.lights):
-            if not 0 < light.position_mm[2] < outside:
-                raise ValueError(
-                    f"lights[{i}].position_mm z = {light.position_mm[2]} must lie inside the gel and window, "
-                    f"0 < z < {outside}"
-                )
-            if light.position_mm[2] <= self.gel.face_mm(*light.position_mm[:2]):
-                raise ValueError(f"lights[{i}].position_mm lies outside the domed gel")
-        return self

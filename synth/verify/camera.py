@@ -7,13 +7,14 @@ least optical length through that face,
 .. math::  L(s) = \sqrt{s^2 + h_c^2} + n \sqrt{(R - s)^2 + h_p^2}
 
 whose stationary point s (distance along the face from the camera's foot to the crossing) lies between that of the
-straight line and R and is bracketed there by the Illinois variant of regula falsi. Pinhole and lenses are OpenCV's
-`projectPoints` and `fisheye.projectPoints`, in OpenCV's right-handed world: the scene's with z reversed. There is no
-map from pixels to rays: `synth.verify.sheet` inverts this one by root search. Whether light of a point really gets to
-the camera on a path is decided from the points at which that path turns (`reaches`).
+straight line and R and is bracketed there by the Illinois variant of regula falsi. For a round face see
+`synth.verify.shell`. Pinhole and lenses are OpenCV's `projectPoints` and, up to `_OPENCV_FIELD` from the axis,
+`fisheye.projectPoints`, in OpenCV's right-handed world: the scene's with z reversed. There is no map from pixels to
+rays: `synth.verify.sheet` inverts this one by root search. Whether light of a point really gets to the camera on a path
+is decided from the points at which that path turns (`reaches`).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -21,9 +22,13 @@ import numpy as np
 from synth.arrays import BoolArray, FloatArray, Pixels, Points
 from synth.scene import Camera, Sensor
 from synth.verify.plate import Plate
+from synth.verify.shell import Shell
 
 _MIRROR = np.array([1.0, 1.0, -1.0])
 _UP = np.array([0.0, 0.0, 1.0])
+_OPENCV_FIELD = 1.5
+"""Radians; OpenCV's fisheye model divides by the cosine and knows nothing behind the lens."""
+_WIDER = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +42,8 @@ class ForwardCamera:
         distortion: k1, k2, p1, p2, k3, or k1, k2, k3, k4 of a fisheye lens.
         is_fisheye: which of the two.
         index: refractive index of gel and window.
-        face_z: mm, the window's outer face.
+        face_z: mm, the outer face of a flat window.
+        shell: the face of a round window.
         field: angle to the axis, radians, at which the lens model turns back.
         plates: the mirrors; path k > 0 is by plates[k - 1], path 0 is straight.
     """
@@ -49,6 +55,7 @@ class ForwardCamera:
     is_fisheye: bool
     index: float
     face_z: float
+    shell: Shell | None
     field: float
     plates: tuple[Plate, ...]
 
@@ -68,6 +75,7 @@ class ForwardCamera:
             is_fisheye=camera.lens == "fisheye",
             index=sensor.window.refractive_index,
             face_z=sensor.gel.size_mm[2] + sensor.window.thickness_mm,
+            shell=Shell.of(sensor.window),
             field=_turning_angle(camera),
             plates=tuple(Plate.of(mirror) for mirror in sensor.mirrors),
         )
@@ -81,15 +89,33 @@ class ForwardCamera:
 
         By a mirror also where the mirror has ended: see `reaches`.
         """
-        local = (self._aim(points, path) - self.eye) * _MIRROR @ self.rotation.T
-        lost = ~(np.arctan2(np.hypot(local[:, 0], local[:, 1]), local[:, 2]) < self.field)
+        local = self._local(points, path)
+        across, angle = _across(local), _angle(local)
+        lost = ~(angle < self.field)
+        wide = np.flatnonzero(self.is_fisheye & ~lost & (angle > _OPENCV_FIELD))
+        radius = _fisheye_radius(angle[wide], self.distortion)[:, None] if len(wide) else 0.0
+        beyond = local[wide, :2] / across[wide, None] * radius * np.diag(self.matrix)[:2] + self.matrix[:2, 2]
         local[lost] = (0, 0, 1)
+        local[wide] = (0, 0, 1)
         if not len(local):
             return local[:, :2]
         zero = np.zeros(3)
         project = cv2.fisheye.projectPoints if self.is_fisheye else cv2.projectPoints
         pixels = project(local[:, None], zero, zero, self.matrix, self.distortion)[0][:, 0]
+        pixels[wide] = beyond
         return np.where(lost[:, None], np.nan, pixels)
+
+    def widened(self) -> "ForwardCamera":
+        """With a fisheye lens's field some degrees wider: triangles at the field's end then have whole images."""
+        return replace(self, field=min(self.field + _WIDER, np.pi)) if self.is_fisheye else self
+
+    def is_in_field(self, points: Points, path: int) -> BoolArray:
+        """Whether the lens model holds for points (n, 3) mm."""
+        return np.asarray(_angle(self._local(points, path)) < self.field)
+
+    def height(self, points: Points) -> FloatArray:
+        """What falls along every ray in the body, (n,) mm: z below a flat window, nearness to a round one's axis."""
+        return points[:, 2] if self.shell is None else -np.linalg.norm(self.shell.outwards(points), axis=1)
 
     def reaches(self, points: Points, path: int) -> BoolArray:
         """Whether light from points (n, 3) that a path shows meets its mirror, and no other mirror before or after."""
@@ -113,6 +139,10 @@ class ForwardCamera:
         aim = self._aim(points, path) if self.index > 1 else np.broadcast_to(self.eye, points.shape)
         return self.plates[path - 1].reflected(aim) if path > 0 else aim
 
+    def _local(self, points: Points, path: int) -> Points:
+        """Where the camera has to look, in its own right-handed frame, z ahead."""
+        return np.asarray((self._aim(points, path) - self.eye) * _MIRROR @ self.rotation.T)
+
     def _aim(self, points: Points, path: int) -> Points:
         """Where the camera has to look, straight, to see points: the crossing of the window's face, or the points."""
         origin, up = np.array([0.0, 0.0, self.face_z]), _UP
@@ -121,7 +151,11 @@ class ForwardCamera:
             tip = plate.reflected(origin + up)
             points, origin = plate.reflected(points), plate.reflected(origin)
             up = tip - origin
-        return self._crossing(points, origin, up) if self.index > 1 else points
+        if self.index == 1:
+            return points
+        if self.shell is not None:
+            return self.shell.crossings(points, self.eye, self.index)
+        return self._crossing(points, origin, up)
 
     def _crossing(self, points: Points, origin: FloatArray, up: FloatArray) -> Points:
         """Where light from points crosses a face through `origin` whose side of the air is `up`, (n, 3) mm."""
@@ -155,16 +189,29 @@ class ForwardCamera:
         return foot + arm * share[:, None]
 
 
+def _across(local: Points) -> FloatArray:
+    return np.asarray(np.hypot(local[:, 0], local[:, 1]))
+
+
+def _angle(local: Points) -> FloatArray:
+    """To the camera's axis, radians (n,)."""
+    return np.asarray(np.arctan2(_across(local), local[:, 2]))
+
+
 def _turning_angle(camera: Camera) -> float:
-    """Angle to the axis at which the image's radius first stops growing, from a table; at most a right angle."""
+    """Angle to the axis at which the image's radius first stops growing, from a table; at most the widest lens's."""
     if camera.lens == "fisheye":
-        angle = np.linspace(0, np.pi / 2, 200_001)
-        k1, k2, k3, k4 = camera.distortion
-        radius = angle * (1 + k1 * angle**2 + k2 * angle**4 + k3 * angle**6 + k4 * angle**8)
+        angle = np.linspace(0, np.radians(110), 200_001)
+        radius = _fisheye_radius(angle, np.array(camera.distortion))
     else:
         tangent = np.linspace(0, 20, 200_001)
         angle = np.arctan(tangent)
         k1, k2, _, _, k3 = camera.distortion
         radius = tangent * (1 + k1 * tangent**2 + k2 * tangent**4 + k3 * tangent**6)
     stops = np.flatnonzero(np.diff(radius) <= 0)
-    return float(angle[stops[0]]) if len(stops) else np.pi / 2
+    return float(angle[stops[0]]) if len(stops) else float(angle[-1]) if camera.lens == "fisheye" else np.pi / 2
+
+
+def _fisheye_radius(angle: FloatArray, k: FloatArray) -> FloatArray:
+    """Distances (n,) from the image's centre over the focal length, at angles (n,) to the axis."""
+    return np.asarray(angle + k[0] * angle**3 + k[1] * angle**5 + k[2] * angle**7 + k[3] * angle**9)

@@ -43,7 +43,7 @@ class Derived:
         flow: (n, 2) px; NaN where no gel is seen.
         visible: (n,) whether the material point is seen in the other image.
         closure: (n,) px between a place and where its flow's end comes from; NaN where the flow ends out of sight.
-        z: (n,) mm, height of the material point in the other state.
+        height: (n,) mm, of the material point in the other state.
         path: (n,) by which path of the camera the place sees it.
         touched: (n,) whether another part of the surface covers the point there so closely that it may count as hidden.
     """
@@ -51,7 +51,7 @@ class Derived:
     flow: FloatArray
     visible: BoolArray
     closure: FloatArray
-    z: FloatArray
+    height: FloatArray
     path: Indices
     touched: BoolArray
 
@@ -115,17 +115,18 @@ def derive(near: Sheet, far: Sheet, places: Pixels, recorded: FloatArray) -> Der
     end = np.clip(target[query], 0, (near.width, near.height))
     first, origin = _back(near, far, end)
     visible, touched = (np.zeros(len(places), dtype=np.bool_) for _ in range(2))
-    visible[query] = _is_first(first, points[query, 2] + _HIDDEN_MM, seen.path[query])
+    height = near.camera.height(points)
+    visible[query] = _is_first(first, height[query] + _HIDDEN_MM, seen.path[query])
     visible[query] &= far.reached_by(points[query], seen.path[query])
     touched[query] = (
-        visible[query] & (first.z > points[query, 2] + _TOUCHING_MM) & (first.triangle != seen.triangle[query])
+        visible[query] & (first.height > height[query] + _TOUCHING_MM) & (first.triangle != seen.triangle[query])
     )
     closure = np.full(len(places), np.nan)
     closure[query] = np.linalg.norm(origin - places[query], axis=1)
     closure[~(visible & same)] = np.nan
     astray = np.flatnonzero(~same & _is_inside(places + recorded, near))
     closure[astray] = np.linalg.norm(_back(near, far, places[astray] + recorded[astray])[1] - places[astray], axis=1)
-    return Derived(flow, visible, closure, points[:, 2], seen.path, touched)
+    return Derived(flow, visible, closure, height, seen.path, touched)
 
 
 def _back(near: Sheet, far: Sheet, ends: Pixels) -> tuple[Seen, Pixels]:
@@ -139,7 +140,7 @@ def _back(near: Sheet, far: Sheet, ends: Pixels) -> tuple[Seen, Pixels]:
 
 def _is_first(found: Seen, limit: FloatArray, path: Indices) -> BoolArray:
     """Whether what is found by the same path lies no higher than a limit (n,), or nothing is found by that path."""
-    return np.asarray((found.z <= limit) | (found.path != path))
+    return np.asarray((found.height <= limit) | (found.path != path))
 
 
 def _is_inside(pixels: Pixels, image: Sheet) -> BoolArray:
@@ -180,7 +181,7 @@ def _turns_beside(far: Sheet, derived: Derived, places: Pixels, visible: FlowArr
         seen = np.zeros(len(at), dtype=np.bool_)
         path = derived.path[at][query]
         found = far.seen(end[query])
-        seen[query] = (found.z <= derived.z[at][query] + _NEAR_MM) & (found.path == path)
+        seen[query] = (found.height <= derived.height[at][query] + _NEAR_MM) & (found.path == path)
         agreed |= seen == visible[at]
     return agreed
 

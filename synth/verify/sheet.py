@@ -1,7 +1,7 @@
 """What pixels see of a state, without rays: the surface's triangles are projected and the projection is inverted.
 
 `synth.verify.layer` finds all points of the surface that a path shows at a query. Of those whose light really gets to
-the camera, it comes from the highest: inside the gel every ray descends from the window.
+the camera, it comes from the highest (`ForwardCamera.height`): inside the gel every ray descends from the window.
 """
 
 from dataclasses import dataclass
@@ -22,13 +22,13 @@ class Seen:
     Attributes:
         triangle: (n,), -1 where nothing is seen.
         weights: (n, 3) barycentric; NaN where nothing is seen.
-        z: (n,) mm, height of the point in the state looked at; -inf where nothing is seen.
+        height: (n,) mm, of the point in the state looked at; -inf where nothing is seen.
         path: (n,) by which path of the camera; 0 where nothing is seen.
     """
 
     triangle: NDArray[np.intp]
     weights: FloatArray
-    z: FloatArray
+    height: FloatArray
     path: NDArray[np.intp]
 
     def positions(self, triangles: Triangles, positions: Points) -> Points:
@@ -55,12 +55,17 @@ class Sheet:
         """The material points seen at queries (n, 2) px inside the image (or at most a pixel outside)."""
         parts = [self._found(layer, queries) for layer in self._layers]
         query, triangle, weights, path = (np.concatenate(part) for part in zip(*parts, strict=True))
-        z = np.einsum("ni,ni->n", weights, self.positions[self.triangles[triangle], 2])
-        order = np.lexsort((triangle, -z, query))
+        height = self.camera.height(np.einsum("ni,nic->nc", weights, self.positions[self.triangles[triangle]]))
+        order = np.lexsort((triangle, -height, query))
         query, first = np.unique(query[order], return_index=True)
         best, n = order[first], len(queries)
         seen = Seen(np.full(n, -1), np.full((n, 3), np.nan), np.full(n, -np.inf), np.zeros(n, dtype=np.intp))
-        for field, values in ((seen.triangle, triangle), (seen.weights, weights), (seen.z, z), (seen.path, path)):
+        for field, values in (
+            (seen.triangle, triangle),
+            (seen.weights, weights),
+            (seen.height, height),
+            (seen.path, path),
+        ):
             field[query] = values[best]
         return seen
 
@@ -83,16 +88,18 @@ class Sheet:
 
     @cached_property
     def _layers(self) -> tuple[Layer, ...]:
-        size = self.width, self.height
-        return tuple(Layer(self.camera, path, self.triangles, self.positions, *size) for path in self.camera.paths)
+        size, camera = (self.width, self.height), self.camera.widened()
+        return tuple(Layer(camera, path, self.triangles, self.positions, *size) for path in self.camera.paths)
 
     def _found(
         self, layer: Layer, queries: Pixels
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray, NDArray[np.intp]]:
-        """What a layer shows at the queries, less what mirrors keep from the camera; and its path, repeated."""
+        """What a layer shows at the queries, less what lens and mirrors do not; and its path, repeated."""
         query, triangle, weights = layer.found(queries)
-        if self.camera.plates:
+        if self.camera.plates or self.camera.is_fisheye:
             points = np.einsum("ni,nic->nc", weights, self.positions[self.triangles[triangle]])
-            free = self.camera.reaches(points, layer.path)
+            free = self.camera.is_in_field(points, layer.path)
+            if self.camera.plates:
+                free &= self.camera.reaches(points, layer.path)
             query, triangle, weights = query[free], triangle[free], weights[free]
         return query, triangle, weights, np.full(len(query), layer.path)

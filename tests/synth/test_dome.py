@@ -236,7 +236,7 @@ def test_a_dome_of_a_kilometre_is_flat_and_one_without_radius_or_with_lights_out
     raw = scene(SIZE, gel={"shape": "dome", "dome_radius_mm": RADIUS}).model_dump()
     assert raw["sensor"]["lights"][0]["position_mm"] == (0.0, 0.0, 0.1)
     raw["sensor"]["lights"][0]["position_mm"] = (SIZE[0] / 2, SIZE[1] / 2, 0.1)
-    with pytest.raises(ValidationError, match="outside the domed gel"):
+    with pytest.raises(ValidationError, match="outside the curved gel"):
         Scene.model_validate(raw)
 
 

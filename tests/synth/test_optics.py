@@ -121,7 +121,7 @@ def test_fisheye_is_opencvs_and_without_coefficients_pixels_are_angles():
     np.testing.assert_allclose(_fisheye(0.0, 0.0, 0.0, 0.0).project(local)[:, 0], 31.7 + 50 * angle, atol=1e-12)
 
 
-def test_field_ends_where_the_radius_turns_back_or_at_a_right_angle():
+def test_field_ends_where_the_radius_turns_back_or_at_110_degrees():
     lens = _fisheye(-0.25, 0.0, 0.0, 0.0)  # 1 - 0.75 θ² = 0 at θ = 1.1547, radius 2/3 of that
     assert lens.field_limit == pytest.approx(np.sqrt(4 / 3), rel=1e-12)
     edge = 31.7 + 50 * 2 / 3 * lens.field_limit
@@ -130,8 +130,17 @@ def test_field_ends_where_the_radius_turns_back_or_at_a_right_angle():
     seen, lost = lens.project(np.array([[np.sin(angle), 0.0, np.cos(angle)] for angle in (1.15, 1.16)]))
     assert np.isfinite(seen).all()
     assert np.isnan(lost).all()
-    behind = np.array([[1.0, 0.0, -1e-9], [1.0, 0.0, 1e-3]])
+    behind = np.array([[np.sin(angle), 0.0, np.cos(angle)] for angle in np.radians([110.1, 109.9])])
     np.testing.assert_array_equal(np.isnan(_fisheye(0.0, 0.0, 0.0, 0.0).project(behind)).all(1), [True, False])
+
+
+def test_a_fisheye_lens_sees_behind_itself():
+    """Up to 220 degrees from side to side; without coefficients a pixel's distance from the centre is its angle."""
+    angle, around = RNG.uniform(0, np.radians(109.9), 400), RNG.uniform(0, 2 * np.pi, 400)
+    local = np.column_stack([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)])
+    plain, bent = _fisheye(0.0, 0.0, 0.0, 0.0), _fisheye(0.05, -0.02, 0.004, -0.0005)
+    np.testing.assert_allclose(np.hypot(*((plain.project(local) - (31.7, 24.4)) / (50, 52)).T), angle, atol=1e-13)
+    np.testing.assert_allclose(bent.directions(bent.project(local)), local, atol=1e-12)
 
 
 CENTRES = pixel_centres().reshape(-1, 2)
