@@ -15,7 +15,7 @@ class Window(Part):
     """Rigid clear support between gel and camera, index-matched to the gel.
 
     Light bends at its face towards the camera: a plane beyond the gel, or a round face about the z axis that encloses
-    the camera in air. A plane also reflects light back onto the gel (but not in scalar variants), a round face does not.
+    the camera in air. A plane reflects light back onto the gel (but not in scalar variants), a round face does not.
     """
 
     refractive_index: Annotated[float, Field(ge=1, le=2.5)] = 1.45
