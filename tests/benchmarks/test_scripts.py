@@ -45,7 +45,7 @@ def test_render(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     full = [row for row in images if row["window"] and row["max_depth"] == DEEPEST]
     assert all(abs(row["bias_percent"]) < 4 * row["bias_se_percent"] for row in full)
     assert all(row["auto_share"] < 0.2575 for row in autos)  # a quarter, and 3 % for the noise's own uncertainty
-    assert all(row["scene_samples"] == 15 for row in autos)  # 4 are asked for; three for each of five lights
+    assert all(row["scene_samples"] == 20 for row in autos)  # 4 are asked for; two for each of five lights and images
     by_samples = {(row["samples"], row["camera_noise"]): row for row in flows}
     assert len(by_samples) == len(flows) == 8  # 15, 20, 80 and 195 samples, noise off and on
     # More render noise moves the measured flow farther from that without; a factor of 10 in samples.

@@ -14,9 +14,8 @@ from batches import simulate_scenes
 from capsules import capsule, capsule_mesh
 from closed_forms import shear_modulus
 from integrals import integrals
-from pads import far_away
+from pads import equilibrium, far_away
 from pads import system as pad_system
-from problems import equilibrium
 from scipy.integrate import quad
 
 from synth.arrays import FloatArray

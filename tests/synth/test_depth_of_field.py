@@ -85,7 +85,7 @@ def test_blur_circle_is_that_of_the_thin_lens(index: float, focus: float) -> Non
     # Monte Carlo: four standard errors of 8 seeds. Rays at the pupil's rim, u = 0.8 / 18, leave the paraxial depth by
     # u² (n² - 1) / 2 n² = 5e-4 of 4 mm, against defocus of at least 2 mm: 2e-3 in its square.
     assert np.all(np.abs(found - expected) < 4 * error + 2e-3 * expected), (found, expected, error)
-    assert np.all(error < 0.06 * expected)
+    assert np.all(error < 0.12 * expected)
 
 
 @needs_llvm
@@ -170,7 +170,7 @@ def test_in_focus_the_picture_is_the_pinholes_within_noise(index: float, apertur
 
     def frames(seeds: range, texture: Image | None = None, **lens: Any) -> FloatArray:
         sensor = small_sensor(index, MANY, **shape, **lens)
-        renderer, state = _renderer(sensor, texture, 36), flat_surface(sensor).material
+        renderer, state = _renderer(sensor, texture, 144), flat_surface(sensor).material
         return np.stack([renderer.radiance(state, seed)[..., 0] for seed in seeds]).astype(np.float64)
 
     count, bare = len(SEEDS), frames(range(1), plain())  # a dot near the light must not outweigh all others
@@ -237,8 +237,7 @@ def test_a_pinhole_draws_no_point_of_a_pupil() -> None:
     rays = CameraRays(sensor, mi)
     assert not rays.has_aperture
     ray, weight, valid = rays.sample(pixel, sampler.next_2d())
-    integrator = mi.load_dict({"type": "path", "max_depth": 2, "hide_emitters": True})
-    color, seen, _ = integrator.sample(renderer._scene, sampler, ray, active=valid)
+    color, seen, _ = renderer._integrator.sample(renderer._scene, sampler, ray, active=valid)
     red = np.array(dr.block_sum(dr.select(valid & seen, color[0] * weight, 0), 16)) / np.float32(16)
     assert np.array_equal(image[..., 0].ravel(), red)
     blurred = small_sensor(1.45, MANY, aperture_mm=APERTURE, focus_mm=15.0)
