@@ -1,7 +1,15 @@
-"""README and guide: links lead somewhere, commands are ones that the programs know, and the README stays short."""
+"""README, guide, docstrings and examples: links lead somewhere, commands are known, programs give what they say.
 
+The programs in examples/ run as their first lines say, on fewer pairs, and each leaves or prints its result.
+"""
+
+import doctest
+import importlib
+import os
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -44,3 +52,91 @@ def test_commands_are_known() -> None:
     assert len(shown) > 30
     for program, *arguments in shown:
         APPS[program].parse_args(arguments, exit_on_error=False, print_error=False)
+
+
+MODULES = [
+    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+    for package in ("synth", "gelflow")
+    for path in sorted((ROOT / package).rglob("*.py"))
+    if ">>> " in path.read_text(encoding="utf-8")
+]
+
+
+def test_the_public_interface_has_examples() -> None:
+    assert {"synth", "synth.scene.template", "synth.planning.plan", "gelflow.predict.model"} <= set(MODULES)
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_examples_in_docstrings(module: str) -> None:
+    result = doctest.testmod(importlib.import_module(module))
+    assert result.attempted > 0
+    assert result.failed == 0
+
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+NUMBER = r"(\d+\.\d+)"
+
+
+def run(name: str, *arguments: object) -> str:
+    """What an example prints; it finds the packages of this checkout."""
+    environment = os.environ | {"PYTHONPATH": str(EXAMPLES.parent)}
+    command = [sys.executable, str(EXAMPLES / name), *map(str, arguments)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def found(pattern: str, text: str) -> list[float]:
+    """The numbers of a line that must be there."""
+    match = re.search(pattern, text)
+    assert match, text
+    return [float(group) for group in match.groups()]
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two pairs that the first example makes."""
+    out = tmp_path_factory.mktemp("examples") / "ten"
+    printed = run("make_pairs.py", "--n", 2, "--out", out)
+    assert found(rf"largest motion {NUMBER} px", printed)[0] > 1
+    assert (out / "flow.png").stat().st_size > 50_000
+    return out
+
+
+def test_examples_are_short() -> None:
+    programs = sorted(EXAMPLES.glob("*.py"))
+    assert len(programs) == 6
+    assert {program.name: len(program.read_text().splitlines()) for program in programs if
+            len(program.read_text().splitlines()) > 40} == {}  # fmt: skip
+
+
+def test_read_exr(dataset: Path) -> None:
+    printed = run("read_exr.py", dataset / "samples" / "000000" / "flow.exr")
+    assert "flow.units: px" in printed
+    assert found(rf"{NUMBER} % of image 1 is seen", printed)[0] > 50
+
+
+def test_flow_of_two_images(dataset: Path) -> None:
+    folder = dataset / "samples" / "000000"
+    printed = run("flow_of_two_images.py", folder / "image1.png", folder / "image2.png")
+    assert found(rf"there and back: {NUMBER} px in the median", printed)[0] < 0.5
+
+
+def test_dataloader(dataset: Path, tmp_path: Path) -> None:
+    from synth.cli import main
+
+    assert main(["export", str(dataset), "--format", "webdataset", "--out", str(tmp_path)]) == 0
+    error, motion = found(rf"mean endpoint error {NUMBER} px of {NUMBER} px", run("dataloader.py", tmp_path))
+    assert error < motion / 4
+
+
+def test_own_pattern(tmp_path: Path) -> None:
+    assert "1 pairs of the new pattern" in run("own_pattern.py", "--n", 1, "--out", tmp_path / "rings")
+    assert (tmp_path / "rings" / "samples" / "000000" / "image2.png").is_file()
+
+
+@pytest.mark.slow
+def test_error_against_time(tmp_path: Path) -> None:
+    printed = run("error_against_time.py", "--targets", 0.4, 0.2, 0.1, "--out", tmp_path)
+    errors = [float(line.split()[1]) for line in printed.splitlines()[1:]]
+    assert errors[0] > errors[1] > errors[2] == 0.0

@@ -1,15 +1,19 @@
-"""`benchmarks agreement`: the CPU against itself, plainly and with a GPU's rounding, and how outcomes are counted."""
+"""`benchmarks agreement` and `batched`: the CPU against itself and with a GPU's rounding, and the rate of presses."""
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import warp as wp
 
+from benchmarks import batched
 from benchmarks.__main__ import main
 from benchmarks.agreement import WANTED, Noisy, compare, drawn_of, one_by_one, summary, together
+from benchmarks.batched import PLACES_MM, nth_ball, random_ball, reference_mesh, steady, surface_error
 from benchmarks.rows import Row, read
+from synth.errors import InputError
 from synth.scene import MeshIndenter
 from synth.scene.template import load_scene
 from synth.simulate.batched.pad import prepare
@@ -19,7 +23,6 @@ TINY = ["numerics.element=p1p1", "sensor.camera.width=32", "sensor.camera.height
 
 
 def run(out: Path, *options: str) -> Row:
-    """What the command finds."""
     small = ["agreement", "--out", str(out), "--device", "cpu", "--trajectories", "4"]
     status = main([*small, *[part for change in TINY for part in ("--set", change)], *options])
     found = summary(read(out / "agreement.csv"))
@@ -92,8 +95,53 @@ def test_outcomes_are_counted() -> None:
         (["--device", "cpu", "--set", "motion.depth_mm={normal=[0.2, 1e9]}"], "none of 16 draws"),
     ],
 )
-def test_what_cannot_be_compared(
-    options: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_compared(options: list[str], told: str, tmp_path: Path, capsys) -> None:
     assert main(["agreement", "--out", str(tmp_path), *options]) == 2
     assert told in capsys.readouterr().err
+
+
+PRESS: Row = {"depth_mm": 0.3, "drag_mm": 0.0, "steps": 1, "step_mm": None, "smallest_mm": 2.0, "largest_mm": 6.0}
+CASE: Row = {**PRESS, "growth": 2.0, "loose": 0.0, "reference_across": 2, "press": 0}
+
+
+@pytest.mark.parametrize("limits", [(2.0, 6.0), (3.0, 3.5)])
+def test_presses_are_what_they_are_said_to_be(limits: tuple[float, float]) -> None:
+    rng, case = np.random.default_rng(0), {**PRESS, "smallest_mm": limits[0], "largest_mm": limits[1], "drag_mm": 0.5}
+    for scene in (random_ball(rng, case) for _ in range(20)):
+        assert limits[0] <= scene.contact.indenter.radius_mm <= limits[1]
+        assert (np.abs(scene.motion.position_mm) <= PLACES_MM).all()
+        assert np.hypot(*scene.motion.shear_mm) == pytest.approx(0.5)
+
+
+def test_errors_fall_with_the_elements(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And are none on the mesh of the reference."""
+    coarse, finer = (surface_error({**CASE, "cells": cells}) for cells in ("6x4x1", "8x6x2"))
+    assert coarse["surface_error_percent"] > finer["surface_error_percent"] > 0
+    monkeypatch.setattr(batched, "mesh_of", lambda case: reference_mesh(nth_ball(0, PRESS), 2))
+    same = surface_error({**CASE, "loose": 1e-3})
+    assert (same["surface_error_percent"], same["force_error_percent"]) == (0, 0)
+
+
+def test_the_command_and_its_rate_from_the_second_batch_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--out", str(tmp_path), "--device", "cpu", "--cells", "4", "4", "1", "--depth", "0.3"]
+    assert batched.main([*options, "--batch", "2", "--runs", "2", "--seconds", "0.1"]) == 0
+    rows = read(tmp_path / "batched.csv")
+    assert [row["run"] for row in rows] == [0, 1]
+    for row in rows:
+        assert row["presses"] == row["complete"] >= 1
+        assert row["presses_per_s"] > 0
+        assert 0 < row["krylov_busy"] <= 1
+        assert {"ms_residual", "ms_tangent", "ms_krylov", "ms_product", "ms_preconditioner", "ms_stepping"} <= set(row)
+    assert "ms_residual" in capsys.readouterr().out
+    # Another way to intermediate steps leaves another state, since friction remembers it: 0.02 to 0.14 % here.
+    press = ["--out", str(tmp_path), "--cells", "8", "6", "2", "--depth", "0.5", "--radii", "5", "6", "--errors", "1"]
+    for way in ([], ["--step", "0.05"], ["--loose", "0.1"]):
+        assert batched.main([*press, "--across", "4", *way]) == 0
+    found: list[dict[str, Any]] = read(tmp_path / "batched_errors.csv")
+    assert all(5 <= row["radius_mm"] <= 6 for row in found)
+    assert len({row["surface_error_percent"] for row in found}) == 3
+    with pytest.raises(InputError, match="even numbers"):
+        batched.main([*options, "--cells", "5", "4", "1"])
+    assert steady([1.0, 2.0, 2.5, 3.0, 3.5], 2) == pytest.approx(3 / 1.5)
+    assert steady([1.0, 2.0, 3.0], 8) == 1, "too short for that: from its first half on"
+    assert steady([2.0], 8) == 0.5

@@ -35,7 +35,6 @@ numerics = { element = "p1p1", target_error_px = 0.0065 }
 
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A scene file."""
     path = tmp_path_factory.mktemp("scene") / "tiny.toml"
     path.write_text(TINY)
     return path
@@ -156,7 +155,6 @@ def test_the_command(tiny: Path, tmp_path: Path, capsys: pytest.CaptureFixture[s
 
 
 def row(mesh: str, error: float | None, seconds: float, unknowns: int, **other: Any) -> Row:
-    """A mesh of a draw with a target of 1 px."""
     found = {"mesh": mesh, "error_px": error, "seconds": seconds, "unknowns": unknowns, "chosen": False}
     return {**found, "target_px": 1.0, "predicted_px": 0.5, "spacing_mm": 1.0, **other}
 

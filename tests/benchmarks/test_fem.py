@@ -31,7 +31,6 @@ def one_case(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def posed(trajectory: Trajectory, displacement: np.ndarray, force: tuple[float, float, float]) -> Trajectory:
-    """A trajectory with another last state."""
     state = replace(trajectory.states[1], displacement=displacement, force_n=np.array(force))
     return replace(trajectory, states=(trajectory.states[0], state))
 
@@ -60,9 +59,7 @@ def test_face_displacement_is_the_surface(shallow: Trajectory) -> None:
     np.testing.assert_allclose(found[:, 0].reshape(61, 46)[:, 0], np.linspace(-10, 10, 61), atol=1e-12)
 
 
-def test_the_command(
-    one_case: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command(one_case: None, tmp_path: Path, monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Errors fall with the elements as P2/P1's do, and the plain solver finds the same state on the same mesh."""
     meshes = [Setting("graded P2/P1", ("graded", n, 2), numerics=COARSE) for n in (2, 4)]
     ways = [Setting("plain solver", ("graded", 2, 2), numerics=COARSE, options=PLAIN), *meshes]
@@ -120,15 +117,12 @@ def test_settings_are_well_formed() -> None:
     assert beside[np.argmin(np.diff(beside))] == pytest.approx(3.7, abs=3)
 
 
-def test_best_rows_and_speed_up() -> None:
+def test_best_rows_speed_up_and_short_presses_timed_three_times(monkeypatch, shallow: Trajectory) -> None:
     figures = [(10, 1), (1, 4), (2, 5), (4, 2), (0.5, None)]
     rows: list[Row] = [{"seconds": s, **({} if e is None else {"displacement_percent": e})} for s, e in figures]
     mark_best(rows)
     assert [row["best"] for row in rows] == ["*", "*", "", "*", ""]
     assert [row["speed_up"] for row in rows] == [1, 10, 5, 2.5, 20]
-
-
-def test_short_presses_are_timed_three_times(monkeypatch: pytest.MonkeyPatch, shallow: Trajectory) -> None:
     for ends, median in (([0, 1.0, 1, 1.5, 2, 9], 1.0), ([0, 3.0], 3.0)):
         clock = iter(ends)
         monkeypatch.setattr("time.process_time", lambda clock=clock: next(clock))

@@ -1,4 +1,4 @@
-"""The benchmarks' table: a repeated run measures only what is missing, and a killed one leaves whole rows."""
+"""The benchmarks' table, which killed and repeated runs keep whole, and the scripts around data and objects."""
 
 import math
 import os
@@ -8,21 +8,27 @@ import sys
 from pathlib import Path
 
 import pytest
+import pyvista as pv
+import torch
 
+from benchmarks import synthetic_set
 from benchmarks.__main__ import QUESTIONS, main
+from benchmarks.counts import counted
+from benchmarks.loss_order import fitted
+from benchmarks.objects import summary
 from benchmarks.rows import Row, machine, measure, plot, read, show, write
+from gelflow.compare.scores import PairScore
+from gelflow.ops.pyramid import enlarge_flow
 
 CASES = [{"mesh": name, "cells": cells, "step_mm": None} for name in ("fine", "1e-3") for cells in (1, 2)]
 """One name reads like a number, and a key without a value is a key too."""
 
 
 def square(case: Row) -> Row:
-    """A measurement."""
     return {"square": case["cells"] ** 2, "root": math.sqrt(case["cells"])}
 
 
 def no_measurement(case: Row) -> Row:
-    """A case that should not be measured."""
     raise AssertionError(case)
 
 
@@ -43,11 +49,17 @@ def test_only_missing_cases_are_measured(tmp_path: Path, workers: int) -> None:
     assert len(read(path)) == 5, "a case that is asked for twice is measured once"
 
 
-def test_a_case_may_have_several_rows(tmp_path: Path) -> None:
+def test_a_case_may_have_several_rows_whose_values_come_back(tmp_path: Path) -> None:
     several = [{"state": state, "root": state**0.5} for state in (1, 2)]
     rows = measure(tmp_path / "rows.csv", CASES[:1], lambda case: several)
     assert rows == [{**CASES[0], **row} for row in several]
     assert measure(tmp_path / "rows.csv", CASES[:1], no_measurement) == rows
+    rows = [{"a": 1, "b": 0.1, "c": True, "d": "x, y"}, {"a": -2, "e": False, "f": 'say "no"'}]
+    write(tmp_path / "rows.csv", rows)
+    assert read(tmp_path / "rows.csv") == rows
+    assert read(tmp_path / "none.csv") == []
+    write(tmp_path / "rows.csv", [{"a": math.nan, "b": None}])
+    assert math.isnan(read(tmp_path / "rows.csv")[0]["a"])
 
 
 def test_a_killed_run_leaves_whole_rows(tmp_path: Path) -> None:
@@ -76,15 +88,6 @@ rows.measure(Path({str(path)!r}), cases, lambda case: {{"square": case["cells"] 
     assert [row["square"] for row in read(path)] == [row["square"] for row in rows] == [1, 4, 1, 4]
 
 
-def test_values_come_back(tmp_path: Path) -> None:
-    rows = [{"a": 1, "b": 0.1, "c": True, "d": "x, y"}, {"a": -2, "e": False, "f": 'say "no"'}]
-    write(tmp_path / "rows.csv", rows)
-    assert read(tmp_path / "rows.csv") == rows
-    assert read(tmp_path / "none.csv") == []
-    write(tmp_path / "rows.csv", [{"a": math.nan, "b": None}])
-    assert math.isnan(read(tmp_path / "rows.csv")[0]["a"])
-
-
 def test_table_and_plot(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = [{"case": "held", "s": 1.23456, "error": 0.5, "mesh": "fine"}, {"case": "held", "s": math.nan, "mesh": None}]
     show(rows, ["mesh", "s"], "Held")
@@ -106,3 +109,66 @@ def test_help_names_the_questions_and_other_names_are_refused(capsys: pytest.Cap
         assert left.value.code == status
     told = capsys.readouterr().out
     assert all(name in told for name in QUESTIONS)
+
+
+def score(method: str, psnr_db: float, error_px: float | None) -> PairScore:
+    made_up = {"psnr_db": psnr_db, "ssim": psnr_db / 100, "endpoint_error_px": error_px, "median_error_px": error_px}
+    spent = {"seconds": 0.0, "processor_seconds": 0.0, "device": "cpu", "on_gpu": False}
+    return PairScore(method=method, pair="pair", scene="gelsight, dots", **made_up, **spent)
+
+
+def test_counts_of_made_up_scores_and_presses() -> None:
+    """A higher PSNR is better and a smaller error; equal is not better."""
+    best = [score("a", 30, 0.05), score("a", 20, 0.3), score("a", 25, 1.5)]
+    other = [score("b", 29, 0.05), score("b", 21, 0.4), score("b", 24, 1.6)]
+    row = counted(best, other)
+    expected = {"method": "b", "pairs": 3, "<= 0.1 px": 1, "> 1 px": 1, "worst px": 1.6, "better in PSNR": 2,
+                "better in SSIM": 2, "better in mean px": 2}  # fmt: skip
+    assert row | expected == row
+    without = counted([score("a", 30, None)], [score("b", 29, None)])
+    assert without["better in PSNR"] == 1
+    assert not any("px" in name for name in without)
+    rows = [{"status": "complete", "penetration": depth, "times_a_ball": 1 + depth} for depth in (0.01, 0.02, 0.06)]
+    found = summary([*rows, {"status": "partial"}, {"status": "refused"}])
+    assert (found["refused"], found["pressed"], found["complete"]) == (1, 4, 3)
+    assert found["times a ball's time, median"] == 1.02
+    assert (found["sunk in, median"], found["largest"], found["at most 2%"]) == ("2.0%", "6.0%", "67%")
+    assert summary([{"status": "refused"}]) == {"refused": 1, "pressed": 0, "complete": 0}
+
+
+def test_the_fitted_coarse_flow_is_found_again() -> None:
+    """Where the full flow is an enlarged one; the means over blocks, its start, are off by tenths of a pixel."""
+    torch.manual_seed(0)
+    true = torch.randn(1, 2, 6, 7, dtype=torch.float64)
+    flow, known = enlarge_flow(true, 2, (24, 28)), torch.ones(1, 1, 24, 28, dtype=torch.float64)
+    start = torch.nn.functional.avg_pool2d(flow, 4) / 4
+    assert (start - true).abs().max() > 0.1
+    # The squared residual falls to 1e-10 of the first: errors to some 1e-5 of the start's.
+    torch.testing.assert_close(fitted(flow, known, start, 2), true, atol=1e-4, rtol=0)
+
+
+def test_the_synthetic_set_has_every_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    commands: list[list[str]] = []
+
+    def synth(command: list[str]) -> int:
+        commands.append(command)
+        return int("digit" in command)
+
+    monkeypatch.setattr(synthetic_set, "synth", synth)
+    assert synthetic_set.main(["--out", str(tmp_path), "--workers", "2"]) == 1  # the worst of all
+    assert {"digit", "gelsight_mini", "tac3d"} <= {command[command.index("--scene") + 1] for command in commands}
+    assert all(command[-2:] == ["--workers", "2"] for command in commands)
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = [str(tmp_path / name) for name in ("cube.stl", "none.stl")]
+    pv.Cube().triangulate().save(files[0])
+    Path(files[1]).write_text("solid")
+    assert main(["objects", *files, "--draws", "1", "--out", str(tmp_path)]) == 0
+    rows = cube, none = read(tmp_path / "objects.csv")
+    assert [(row["file"], row["status"]) for row in rows] == list(zip(files, ("complete", "refused"), strict=True))
+    assert cube["force_n"] > 0
+    assert 0 <= cube["penetration"] < 0.2
+    assert cube["times_a_ball"] > 0.2
+    assert "none.stl" in none["reason"]
+    assert "none.stl" in capsys.readouterr().out

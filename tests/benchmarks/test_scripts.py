@@ -54,13 +54,21 @@ def test_render(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert all((out / f"{name}.png").read_bytes().startswith(b"\x89PNG") for name in ("render", "render_flow"))
 
 
-def test_settings_of_images_differ_and_keep_below_the_reference() -> None:
+def test_settings_of_images_differ_and_rates_of_a_made_up_run() -> None:
     found = settings(["fast", "slow"], 2, 4, 1200)
     assert len(found) == len({tuple(row.values()) for row in found})
     assert max(row["samples"] for row in found) <= 200
     assert {row["max_depth"] for row in found} == {2, 3, 4, 6, DEEPEST}
     assert {row["variant"] for row in found if not row["window"]} == {"fast", "slow"}
     assert all(row["samples"] % 2 == 0 for row in found)  # a multiple of the lights, as it is really taken
+    # 8 pairs in 4 s after 7 s of start-up, of which the first 4 took 2.5 s, as their presses cost more.
+    seconds = {"render": 0.1, "flow": 0.05, "write": 0.04}
+    entries = [{"index": k, "seconds": {"simulate": 0.4 if k < 6 else 0.2, **seconds}} for k in range(10)]
+    found = rates({2: 7.0, 6: 9.5, 10: 11.0}, entries, 2, 4)
+    expected = {"startup_s": 7.0, "pairs": 8, "seconds": 4.0, "pairs_per_second": 2.0, "growth": 1.6,
+                "work_growth": 2 * 0.49 / 0.59, "simulate_s": 0.3, "other_s": 0.01}  # fmt: skip
+    # 0.5 s a pair less the stages' 0.49 are for other things.
+    assert {name: found[name] for name in expected} == pytest.approx(expected)
 
 
 @needs_llvm
@@ -104,17 +112,6 @@ def test_scale(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert row["bytes_per_pair"] == pytest.approx(alone["bytes_per_pair"], rel=0.01)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["scale.csv", "scale.png"]
     assert "Extrapolated from 32 x 24 px" in capsys.readouterr().out
-
-
-def test_rates_of_a_made_up_run() -> None:
-    """8 pairs in 4 s after 7 s of start-up, of which the first 4 took 2.5 s, as their presses cost more."""
-    seconds = {"render": 0.1, "flow": 0.05, "write": 0.04}
-    entries = [{"index": k, "seconds": {"simulate": 0.4 if k < 6 else 0.2, **seconds}} for k in range(10)]
-    found = rates({2: 7.0, 6: 9.5, 10: 11.0}, entries, 2, 4)
-    expected = {"startup_s": 7.0, "pairs": 8, "seconds": 4.0, "pairs_per_second": 2.0, "growth": 1.6,
-                "work_growth": 2 * 0.49 / 0.59, "simulate_s": 0.3, "other_s": 0.01}  # fmt: skip
-    # 0.5 s a pair less the stages' 0.49 are for other things.
-    assert {name: found[name] for name in expected} == pytest.approx(expected)
 
 
 def test_another_size_keeps_the_field_of_view(tmp_path: Path) -> None:

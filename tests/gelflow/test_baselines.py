@@ -1,18 +1,24 @@
-"""Classical methods on a motion that is known exactly."""
+"""Classical methods on a motion that is known exactly; metrics against closed forms and against scikit-image."""
 
 import itertools
+import math
 from importlib.util import find_spec
 
 import numpy as np
 import pytest
 import torch
-from textures import moved
+from skimage.metrics import structural_similarity
+from textures import REAL, as_bytes, moved
 
 from gelflow.baselines import CLASSICAL, named_methods
 from gelflow.baselines.aldic import ALDIC, INSTALL
+from gelflow.baselines.classical import dis
 from gelflow.baselines.registry import REGISTERED
 from gelflow.baselines.scattered import dense_flow
+from gelflow.compare.metrics import flow_errors, image_similarity, marker_distance, psnr, ssim, ssim_map, warp_image
+from gelflow.compare.scores import score_pair
 from gelflow.config import REGISTRATIONS, Registration
+from gelflow.data import open_pairs
 from gelflow.errors import InputError
 from gelflow.models.registration import registered
 
@@ -36,11 +42,14 @@ def test_recovers_a_sub_pixel_shift(name: str) -> None:
     assert np.median(np.hypot(*np.moveaxis(flow - np.float32(SHIFT), -1, 0))[12:-12, 12:-12]) < TOLERANCE[name]
 
 
-def test_no_motion_is_zero_and_names_are_known_and_given_once() -> None:
+def test_no_motion_is_zero_and_what_cannot_serve_is_named() -> None:
     assert not named_methods(["none"])[0].flow(moved(20, 30, 0, 0), moved(20, 30, 1, 1)).any()
     for names in (["raft"], ["none", "none"]):
         with pytest.raises(InputError, match=names[0]):
             named_methods(names)
+    grey = np.full((40, 40, 3), 0.5, np.float32)
+    with pytest.raises(InputError, match="no corner"):
+        named_methods(["lucas-kanade"])[0].flow(grey, grey)
 
 
 @pytest.mark.parametrize("name", [*CLASSICAL, *REGISTERED])
@@ -92,12 +101,6 @@ def test_interpolation_is_exact_for_affine_motion_inside_and_nearest_outside() -
     assert dense_flow(line, line, 8, 9)[5, 5, 0] == 5.0
 
 
-def test_lucas_kanade_says_that_nothing_can_be_tracked() -> None:
-    grey = np.full((40, 40, 3), 0.5, np.float32)
-    with pytest.raises(InputError, match="no corner"):
-        named_methods(["lucas-kanade"])[0].flow(grey, grey)
-
-
 @pytest.mark.skipif(find_spec("al_dic") is not None, reason="pyALDIC is installed")
 def test_a_missing_package_is_named_with_how_to_get_it() -> None:
     image = moved(64, 64, 0, 0)
@@ -112,3 +115,70 @@ def test_aldic_recovers_a_sub_pixel_shift() -> None:
     flow = ALDIC().flow(moved(96, 128, 0, 0), moved(96, 128, *SHIFT))
     # DIC reaches 0.01 to 0.02 px (Reu et al. 2022).
     assert np.median(np.hypot(flow[..., 0] - SHIFT[0], flow[..., 1] - SHIFT[1])) < 0.02
+
+
+def test_flow_errors_count_visible_gel_only_and_marker_distance_of_a_constant_flow() -> None:
+    truth, flow = np.zeros((2, 1, 6, 2), np.float32)
+    flow[0, :, 0] = [0.0625, 0.5, 2.0, 4.0, 100.0, 100.0]  # exact in binary: no rounding in the expectations below
+    truth[0, 4] = np.nan
+    errors = flow_errors(flow, truth, np.array([[1, 1, 1, 1, 1, 0]], bool))
+    assert (errors.pixels, errors.mean_px, errors.median_px) == (4, (0.0625 + 0.5 + 2 + 4) / 4, 1.25)
+    assert (errors.outliers_1px, errors.outliers_01px) == (0.5, 0.75)
+    flow[0, 0] = np.nan  # a missing estimate is an outlier
+    errors = flow_errors(flow[:, :2], truth[:, :2], np.ones((1, 2), bool))
+    assert errors.outliers_1px == 0.5
+    assert math.isnan(errors.mean_px)
+    for shape, visible in (((3, 4, 2), True), ((3, 5, 2), False)):
+        with pytest.raises(InputError):
+            flow_errors(np.zeros(shape, np.float32), np.zeros((3, 5, 2), np.float32), np.full((3, 5), visible))
+    flow = np.full((30, 40, 2), (2.0, -1.0), np.float32)
+    markers = np.array([[5.5, 6.5, 7.5, 5.5], [10, 10, 15, 13], [20, 20, 22, 19.5]])  # off by 0, (3, 4) and 0.5
+    assert marker_distance(flow, markers) == pytest.approx(0.5, abs=1e-6)
+
+
+def test_psnr_and_ssim_of_constant_images_and_as_scikit_image_has_it() -> None:
+    image = np.full((20, 20, 3), 100, np.uint8)
+    assert psnr(image, image + np.uint8(5)) == pytest.approx(10 * math.log10(255**2 / 25), abs=1e-12)
+    assert psnr(image, image) == math.inf
+    c1 = (0.01 * 255) ** 2
+    # Variances vanish up to the rounding of blurred(x * x) - mean^2, about 1e-16 * 1e4, against c2 = 58.
+    expected = (2 * 100 * 120 + c1) / (100**2 + 120**2 + c1)
+    assert ssim(image[..., 0], image[..., 0] + np.uint8(20)) == pytest.approx(expected, abs=1e-9)
+    still = np.zeros((32, 32, 2), np.float32)
+    assert image_similarity(moved(32, 32, 0, 0), moved(32, 32, 0, 0), still) == (math.inf, 1.0)
+    x, y = (as_bytes(moved(40, 50, *shift))[..., 1] for shift in ((0, 0), (0.7, 0.4)))
+    options = {"data_range": 255, "gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "full": True}
+    _, reference = structural_similarity(x, y, **options)
+    inner = (slice(5, -5), slice(5, -5))  # half the window; the border is treated differently
+    # Both are float64 with the same kernel: rounding of about 1e-16 * 255^2 / c2.
+    np.testing.assert_allclose(ssim_map(x, y)[inner], reference[inner], atol=1e-9)
+
+
+def test_warp_brings_image_2_to_image_1_exactly_where_linear_and_nan_where_unknown() -> None:
+    rows, columns = np.mgrid[:20, :30]
+    image = np.repeat((0.01 * columns + 0.02 * rows)[..., None], 3, axis=2).astype(np.float32)
+    flow = np.full((20, 30, 2), (1.3, -2.6), np.float32)
+    # Bilinear interpolation is exact for linear functions; float32 rounds the image to 3e-8 and the flow to 1e-7.
+    expected = image + 0.01 * 1.3 - 0.02 * 2.6
+    np.testing.assert_allclose(warp_image(image, flow)[3:-3, 3:-3], expected[3:-3, 3:-3], atol=2e-7)
+    flow[3, 4, 0] = np.nan
+    np.testing.assert_array_equal(np.argwhere(np.isnan(warp_image(image, flow)).all(axis=2)), [[3, 4]])
+    assert np.isnan(warp_image(image, flow)).sum() == 3
+    image1, image2 = moved(48, 64, 0, 0), moved(48, 64, 2.3, -1.6)
+    flow = np.full((48, 64, 2), (2.3, -1.6), np.float32)
+    right, wrong = (np.abs(warp_image(image2, f) - image1)[4:-4, 4:-4] for f in (flow, -flow))
+    # Bilinear error of a wave of amplitude a and length L is at most 2 * a/8 * (2 pi / L)^2; 24 waves of amplitude
+    # <= 1/24 and L >= 8 px: 2/8 * (2 pi / 8)^2 = 0.154 if all were in phase. Random phases: a tenth of it.
+    assert right.max() < 0.154
+    assert right.mean() < 0.0154
+    assert wrong.mean() > 3 * right.mean()
+
+
+@pytest.mark.skipif(not (REAL / "validation").is_dir(), reason="the real recordings are not beside the repository")
+def test_real_pair_has_the_published_numbers() -> None:
+    """PSNR, SSIM and distance to dots that another script measured: 32.30 dB, .961 and .14 px, to their last digit."""
+    dataset = open_pairs(REAL / "validation")
+    score = score_pair(dis("medium"), dataset, dataset.names.index("gsmini_rubic_val"))
+    assert score.psnr_db == pytest.approx(32.30, abs=0.01)
+    assert score.ssim == pytest.approx(0.961, abs=0.001)
+    assert score.marker_distance_px == pytest.approx(0.14, abs=0.01)

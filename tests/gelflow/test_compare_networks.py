@@ -52,9 +52,7 @@ def raft(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_all_kinds_of_networks_share_one_table(
-    weights: Path, raft: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_all_kinds_of_networks_share_one_table(weights: Path, raft: Path, tmp_path: Path, capsys) -> None:
     folder, out = write_folder(tmp_path / "data", {"a": (1, 0), "b": (0, 1)}), tmp_path / "out"
     common = ["compare", str(folder), "--weights", f"mine={weights}", "--device", "cpu", "--out", str(out)]
     assert main([*common, "--methods", "none,lucas-kanade", "--weights", str(raft), "--ft", "2"]) == 0
@@ -81,9 +79,7 @@ def test_all_kinds_of_networks_share_one_table(
     assert read_metadata(tuned)["step"] == "3"
 
 
-def test_fine_tuning_needs_a_place_and_a_network(
-    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fine_tuning_needs_a_place_and_a_network(weights: Path, tmp_path: Path, capsys) -> None:
     command = ["compare", write_folder(tmp_path / "data", {"a": (1, 0)}), "--ft", "5"]
     for given in (["--weights", weights], ["--out", tmp_path / "out"]):
         assert "--ft 5: needs --weights of GelFlow, and --out" in fails(capsys, *command, *given)
@@ -91,9 +87,7 @@ def test_fine_tuning_needs_a_place_and_a_network(
     assert "for another number of scales" in fails(capsys, *command, *tail)
 
 
-def test_fine_tuning_changes_the_copy_only_and_lowers_its_loss(
-    weights: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_fine_tuning_changes_the_copy_only_and_lowers_its_loss(weights: Path, tmp_path: Path, capsys) -> None:
     folder, before = write_folder(tmp_path / "data", {"a": (1, 0)}), weights.read_bytes()
     arguments = ["compare", str(folder), "--methods", "", "--weights", f"mine={weights}", "--batch", "0", "--json"]
     assert main([*arguments, "--ft", "40", "--out", str(tmp_path / "out")]) == 0
@@ -104,8 +98,6 @@ def test_fine_tuning_changes_the_copy_only_and_lowers_its_loss(
 
 @dataclass
 class Counting:
-    """Test double: counts its calls."""
-
     name: str = "counting"
     calls: int = 0
 
@@ -114,16 +106,18 @@ class Counting:
         return 0 * image1[..., :2]
 
 
-def test_the_first_call_is_not_timed(tmp_path: Path) -> None:
+def test_speed_leaves_out_the_first_call_and_sees_memory_and_the_front_what_none_beats(tmp_path: Path) -> None:
     method = Counting()
     scores = evaluate(method, open_pairs(write_folder(tmp_path, {"a": (1, 0), "b": (0, 1)})))
     assert (len(scores), method.calls) == (2, 3)
-
-
-def test_the_front_holds_what_no_other_beats_in_both() -> None:
     points = [(3.0, 1.0), (1.0, 5.0), (2.0, 6.0), (2.0, 2.0), (4.0, 1.0), (1.0, 7.0)]
     assert pareto_front(points) == [1, 3, 0]
     assert pareto_front([]) == []
+    speed = network_speed(Hungry(), (64, 64), batch=2, warmup=1, repeats=2)
+    assert speed.pairs_per_second > 0
+    if speed.memory_mib is not None:  # Linux
+        # The tensor itself; what else the process takes meanwhile (code of the kernels, buffers) stays below as much.
+        assert 60 < speed.memory_mib < 128
 
 
 class Hungry(torch.nn.Module):
@@ -131,14 +125,6 @@ class Hungry(torch.nn.Module):
 
     def forward(self, image1: torch.Tensor, image2: torch.Tensor) -> torch.Tensor:
         return torch.full((16 * 2**20,), float(image1.mean()), device=image1.device).sum()
-
-
-def test_speed_sees_the_memory_of_a_pass() -> None:
-    speed = network_speed(Hungry(), (64, 64), batch=2, warmup=1, repeats=2)
-    assert speed.pairs_per_second > 0
-    if speed.memory_mib is not None:  # Linux
-        # The tensor itself; what else the process takes meanwhile (code of the kernels, buffers) stays below as much.
-        assert 60 < speed.memory_mib < 128
 
 
 SMALL = ModelConfig(levels=4, projected_channels=8)
@@ -152,7 +138,6 @@ UNSUITABLE: dict[str, Any] = {
 
 
 def unsuitable(path: Path, size: tuple[int, int] | None = None, **changes: object) -> Path:
-    """Weights that record such a training."""
     return random_weights(path, SMALL, TrainConfig.model_validate({"model": SMALL} | UNSUITABLE | changes), size)
 
 
@@ -172,22 +157,19 @@ def test_whatever_the_preset_the_pairs_are_seen_as_they_are_and_without_truth(pr
         assert found.batch_size == (4 if config is None else min(recorded.batch_size, 8))
 
 
-def test_nothing_else_of_the_training_carries_over(tmp_path: Path) -> None:
+def test_of_the_training_a_constant_rate_and_the_size_of_use_carry_over(tmp_path: Path) -> None:
     method = Learned(unsuitable(tmp_path / "w.safetensors"), device="cpu")
     assert fine_tuning_settings(method, 12, None, pairs=3) == TrainConfig(
         model=SMALL, loss=UNSUITABLE["loss"], supervision="self", mixed_self=3.0, batch_size=3, steps=12,
         learning_rate=1e-4, gradient_clip=1.0, flip=False, seed=5, device="cpu",
     )  # fmt: skip
-
-
-def test_a_constant_rate_and_the_size_of_use_are_kept(tmp_path: Path) -> None:
     path = unsuitable(tmp_path / "w.safetensors", (96, 128), schedule="constant", warmup_steps=0)
     settings = fine_tuning_settings(Learned(path, size=(64, 80), device="cpu"), 12, None, pairs=3)
     assert (settings.learning_rate, settings.image_size) == (4e-4, (64, 80))
     assert fine_tuning_settings(Learned(path, device="cpu"), 12, None, pairs=3).image_size == (96, 128)
 
 
-def test_exact_flow_is_not_looked_at(tmp_path: Path) -> None:
+def test_fine_tuning_does_not_look_at_exact_flow_and_needs_one_size(tmp_path: Path) -> None:
     """The same images with and without their exact flow."""
     shifts = [(1.5, 0.5), (-1.0, 0.0)]
     plain = open_pairs(write_folder(tmp_path / "plain", {"a": shifts[0], "b": shifts[1]}))
@@ -199,14 +181,11 @@ def test_exact_flow_is_not_looked_at(tmp_path: Path) -> None:
     assert not same_weights(runs[0].path, method.path)
     recorded = json.loads(read_metadata(runs[0].path)["train"])
     assert (recorded["supervision"], recorded["steps"]) == ("self", 3)
-
-
-def test_pairs_of_several_sizes_need_one(tmp_path: Path) -> None:
     folders = [write_folder(tmp_path / f"{k}", {"a": (1, 0)}, size) for k, size in enumerate([(64, 80), (72, 80)])]
-    dataset, path = join([open_pairs(folder) for folder in folders]), unsuitable(tmp_path / "w.safetensors")
+    dataset, path = join([open_pairs(folder) for folder in folders]), method.path
     with pytest.raises(InputError, match="64x80, 72x80 px, a batch needs one size; give --size"):
-        fine_tuned(Learned(path, device="cpu"), dataset, tmp_path / "run", 1)
-    assert fine_tuned(Learned(path, size=(64, 80), device="cpu"), dataset, tmp_path / "run", 1).path.is_file()
+        fine_tuned(Learned(path, device="cpu"), dataset, tmp_path / "sizes", 1)
+    assert fine_tuned(Learned(path, size=(64, 80), device="cpu"), dataset, tmp_path / "sizes", 1).path.is_file()
 
 
 OWN = RegistrationConfig(windows_px=(8,), smoothing_px=(4,))
@@ -236,7 +215,7 @@ def own(networks: list[Path]) -> Path:
     return networks[1]
 
 
-def test_the_settings_are_the_weights_own_or_those_of_an_aim(plain: Path, own: Path) -> None:
+def test_settings_are_the_weights_own_or_those_of_an_aim_which_the_name_says(plain: Path, own: Path) -> None:
     motion, brightness = REGISTRATIONS["motion"], REGISTRATIONS["brightness"]
     expected: list[tuple[Path, Registration | None, RegistrationConfig | None, str]] = [
         (plain, None, None, ""), (plain, "none", None, ""), (plain, "motion", motion, "+motion"),
@@ -246,18 +225,13 @@ def test_the_settings_are_the_weights_own_or_those_of_an_aim(plain: Path, own: P
         method = Learned(path, "net", device="cpu", registration=choice)
         assert method.model.config.registration == config
         assert method.name == f"net{added}"
-
-
-def test_the_name_says_so_and_stays_one_of_a_group_of_seeds(plain: Path) -> None:
     names = {"net": "net+motion", "net#2": "net+motion#2", "net#2+ft": "net+motion#2+ft", "net+ft": "net+motion+ft",
              "net+motion": "net+motion", "C# code": "C# code+motion"}  # fmt: skip
     found = {label: Learned(plain, label, device="cpu", registration="motion").name for label in names}
     assert found == names
 
 
-def test_rows_without_and_with_registration_stand_in_one_table_with_one_of_raft(
-    plain: Path, raft: Path, tmp_path: Path
-) -> None:
+def test_rows_without_and_with_registration_stand_in_one_table_with_one_of_raft(plain, raft, tmp_path) -> None:
     folder, out = write_folder(tmp_path / "data", {"a": (1.0, -0.5)}), tmp_path / "out"
     arguments = ["compare", str(folder), "--methods", "none", "--weights", f"net={plain}", "--weights", str(raft)]
     assert main([*arguments, *ROWS, "--device", "cpu", "--ft", "2", "--batch", "0", "--out", str(out)]) == 0
@@ -271,11 +245,19 @@ def test_rows_without_and_with_registration_stand_in_one_table_with_one_of_raft(
     assert model["registration"] is None
 
 
-def test_a_row_is_what_registration_makes_of_the_networks_flow(plain: Path, tmp_path: Path) -> None:
+def test_a_row_is_what_registration_makes_of_the_networks_flow_in_its_time(plain: Path, tmp_path, monkeypatch) -> None:
     images = open_pairs(write_folder(tmp_path, {"a": (1.0, -0.5)})).images(0)
     start, found = (Learned(plain, device="cpu", registration=choice).flow(*images) for choice in CHOICES)
     again = registered(*map(tensor, (start, *images)), REGISTRATIONS["brightness"])[0].numpy()
     np.testing.assert_array_equal(np.moveaxis(found, -1, 0), again)
+
+    def slow(*arguments: object) -> torch.Tensor:
+        time.sleep(0.3)
+        return registered(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(gelflow.models.gelflow, "registered", slow)
+    (score,) = evaluate(Learned(plain, device="cpu", registration="motion"), open_pairs(tmp_path))
+    assert score.seconds >= 0.3
 
 
 def test_the_speed_of_the_network_alone_includes_it(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -291,18 +273,6 @@ def test_the_speed_of_the_network_alone_includes_it(own: Path, tmp_path: Path, m
     method = Learned(own, "net", device="cpu")
     compare([method], dataset)
     np.testing.assert_array_equal(np.moveaxis(measured[0], 0, -1), method.flow(*dataset.images(0)))
-
-
-def test_its_time_counts(plain: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-
-    def slow(*arguments: object) -> torch.Tensor:
-        time.sleep(0.3)
-        return registered(*arguments)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(gelflow.models.gelflow, "registered", slow)
-    dataset = open_pairs(write_folder(tmp_path, {"a": (1.0, -0.5)}))
-    (score,) = evaluate(Learned(plain, device="cpu", registration="motion"), dataset)
-    assert score.seconds >= 0.3
 
 
 def test_predict_and_evaluate_take_it(plain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -321,9 +291,7 @@ def test_predict_and_evaluate_take_it(plain: Path, tmp_path: Path, capsys: pytes
     assert json.loads(capsys.readouterr().out)["methods"][0]["method"].endswith("+motion")
 
 
-def test_registration_is_refused_where_there_is_none(
-    plain: Path, raft: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_registration_is_refused_where_there_is_none(plain: Path, raft: Path, tmp_path: Path, capsys) -> None:
     folder, out = write_folder(tmp_path / "data", {"a": (1, 0)}), tmp_path / "out"
     tail = ("--device", "cpu", "--registration", "motion")
     assert "is RAFT" in fails(capsys, "evaluate", folder, "--weights", raft, *tail)

@@ -36,14 +36,11 @@ def test_seeds_become_mean_and_standard_deviation(tmp_path: Path) -> None:
         ["method", "000000", "000001"], [["net (3 seeds)", "0.50", "1.50"], ["other", "4.00", "3.00"]])  # fmt: skip
 
 
-def test_bins_of_seeds_are_pooled_and_data_without_contact_have_bins_of_motion_alone(tmp_path: Path) -> None:
+def test_bins_of_seeds_are_pooled_and_fine_tuned_methods_and_other_devices_come_apart(tmp_path: Path) -> None:
     dataset = open_pairs(write_synthetic(tmp_path, [(1.0, 0.0)]))
     result = compare([Constant("net#0", 0, 0), Constant("net#1", 0.5, 0)], dataset)
     assert strata_table(result.strata) == (["where", "pixels", "net"], [["motion: 1 to 2 px", "4096", "0.750"]])
-
-
-def test_fine_tuned_methods_come_apart_and_devices_are_named_where_they_differ(tmp_path: Path) -> None:
-    dataset = open_pairs(write_folder(tmp_path, {"a": (1, 0)}))
+    dataset = open_pairs(write_folder(tmp_path / "plain", {"a": (1, 0)}))
     result = compare([Constant("net#0+ft", 1, 0), Constant("net", 0, 0)], dataset)
     named = [[row[0] for row in rows] for _, (_, rows) in tables(result)]
     assert named == [["net"], ["net+ft"], ["net", "net+ft"]]
@@ -56,18 +53,22 @@ def test_fine_tuned_methods_come_apart_and_devices_are_named_where_they_differ(t
     assert [one.cost_seconds for one in means] == [0.5, 2.0]
 
 
-def test_latex_escapes_what_it_must() -> None:
+def test_latex_escapes_distance_is_signed_and_pairs_add_up_pixel_by_pixel() -> None:
     text = latex("Errors of 50 % & more", (["method", "> 1 px %"], [["a_b (3 seeds)", "1.0 ± 0.5"]]))
     assert r"\caption{Errors of 50 \% \& more}" in text
     assert r"method & $>$ 1 px \% \\" in text
     assert r"a\_b (3 seeds) & 1.0 $\pm$ 0.5 \\" in text
     assert text.count(r"\begin") == text.count(r"\end") == 2
-
-
-def test_distance_is_signed_and_measured_from_the_edge_between_pixels() -> None:
     region = np.zeros((5, 12), bool)
     region[:, :4] = True
     np.testing.assert_array_equal(signed_distance(region)[2], [-3.5, -2.5, -1.5, -0.5, *np.arange(0.5, 8)])
+    one = pair_strata(np.full((2, 3), 0.5), np.full((2, 3, 2), 0.1, np.float32), np.ones((2, 3), bool))
+    two = pair_strata(np.full((4, 3), 2.0), np.full((4, 3, 2), 9.0, np.float32), np.ones((4, 3), bool))
+    both = merged([*two, *one, *one])
+    assert [(s.bin, s.pixels, s.error_px, s.above_1px) for s in both] == [
+        ("0 to 0.5 px", 12, 6.0, 0),
+        ("8 to 16 px", 12, 24.0, 12),
+    ]
 
 
 def test_bins_hold_every_compared_pixel_once() -> None:
@@ -87,16 +88,6 @@ def test_bins_hold_every_compared_pixel_once() -> None:
     assert bin_.error_px == pytest.approx(error[compared & (length >= 2) & (length < 4)].sum(), rel=1e-12)
     for edgeless in (None, np.zeros((20, 30), bool), np.ones((20, 30), bool)):
         assert {s.kind for s in pair_strata(error, truth, compared, edgeless)} == {MOTION}
-
-
-def test_pairs_add_up_pixel_by_pixel_in_the_order_of_the_bins() -> None:
-    one = pair_strata(np.full((2, 3), 0.5), np.full((2, 3, 2), 0.1, np.float32), np.ones((2, 3), bool))
-    two = pair_strata(np.full((4, 3), 2.0), np.full((4, 3, 2), 9.0, np.float32), np.ones((4, 3), bool))
-    both = merged([*two, *one, *one])
-    assert [(s.bin, s.pixels, s.error_px, s.above_1px) for s in both] == [
-        ("0 to 0.5 px", 12, 6.0, 0),
-        ("8 to 16 px", 12, 24.0, 12),
-    ]
 
 
 DRAWN_KIND = {"kind": {"choice": ["dots", "speckle"]}}

@@ -37,7 +37,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
-def test_chosen_motion_is_the_true_one_and_within_the_limits(tmp_path: Path, videos: Path) -> None:
+def test_chosen_motion_is_the_true_one_and_the_same_whether_the_recording_is_alone_or_not(tmp_path, videos) -> None:
     result = extract_pairs([str(videos)], tmp_path / "out", ChoiceConfig(per_source=4, maximum_motion_px=7))
     assert {pair.source for pair in result.pairs} == {"a", "b"}
     for pair in result.pairs:
@@ -46,9 +46,6 @@ def test_chosen_motion_is_the_true_one_and_within_the_limits(tmp_path: Path, vid
         # 95th percentile sees: 0.5 px.
         assert pair.motion_px == pytest.approx(abs(second - first), abs=0.5)
         assert 2 <= pair.motion_px <= 7
-
-
-def test_pair_set_holds_the_frames_the_same_whether_the_recording_is_alone_or_not(tmp_path: Path, videos: Path) -> None:
     both = extract_pairs([str(videos)], tmp_path / "both", ChoiceConfig(per_source=3))
     alone = extract_pairs([str(videos / "b.avi")], tmp_path / "alone", ChoiceConfig(per_source=3))
     assert [pair for pair in both.pairs if pair.source == "b"] == list(alone.pairs)
@@ -94,9 +91,7 @@ def test_a_job_goes_on_where_it_was_interrupted_and_is_not_replaced_by_another(t
     assert {path: path.stat().st_mtime_ns for path in cut.rglob("*")} == before
 
 
-def test_undecodable_video_is_counted_the_others_are_used(
-    tmp_path: Path, videos: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_undecodable_videos_are_counted_and_truncated_ones_used_as_far_as_they_decode(tmp_path, videos, capfd) -> None:
     (videos / "broken.avi").write_bytes(b"RIFF" + b"junk" * 500)
     (videos / "empty.mp4").touch()
     result = extract_pairs([str(videos)], tmp_path / "out", ChoiceConfig())
@@ -104,13 +99,10 @@ def test_undecodable_video_is_counted_the_others_are_used(
     assert "broken.avi" in result.failures["broken"]
     assert sorted(result.sources) == ["a", "b"]
     assert capfd.readouterr() == ("", "")
-
-
-def test_truncated_video_is_used_as_far_as_it_decodes_and_says_so(tmp_path: Path) -> None:
     write_video(tmp_path / "a.avi", recording([0, 3, 6, 9, 12, 15, 18, 21]))
     data = (tmp_path / "a.avi").read_bytes()
     (tmp_path / "a.avi").write_bytes(data[: int(0.6 * len(data))])
-    report = extract_pairs([str(tmp_path / "a.avi")], tmp_path / "out", ChoiceConfig()).sources["a"]
+    report = extract_pairs([str(tmp_path / "a.avi")], tmp_path / "cut", ChoiceConfig()).sources["a"]
     assert 2 <= report.frames < 8
     assert report.frames_rejected["undecodable"] == 8 - report.frames
 
@@ -126,14 +118,12 @@ def test_image_folder_is_a_recording_in_natural_order_and_a_broken_image_is_coun
         assert pair.motion_px == pytest.approx(3 * abs(pair.frames[0] - pair.frames[1]), abs=0.5)
 
 
-def test_blank_frames_and_exposure_ramps_are_put_aside() -> None:
+def test_blank_frames_exposure_ramps_still_repeated_and_unrelated_frames_are_no_pairs() -> None:
     frames = recording([0, 3, 6, 9, 12])
     frames[1] = np.full_like(frames[1], 90)
     frames[3] = (frames[3] * np.array([1.0, 0.6, 0.6])).astype(np.uint8)  # green and blue have not come up yet
     assert usable_frames(frames) == ([0, 2, 4], {"blank": 1, "exposure": 1})
 
-
-def test_still_repeated_and_unrelated_frames_are_no_pairs() -> None:
     def choose(frames: list[Frame]) -> Choices:
         return choose_pairs(frames, ChoiceConfig(), np.random.default_rng(0))
 
@@ -148,9 +138,7 @@ def test_still_repeated_and_unrelated_frames_are_no_pairs() -> None:
     assert unrelated.rejected["unreliable"] >= 12
 
 
-def test_inputs_are_found_by_file_folder_and_pattern_and_those_that_hold_nothing_are_named(
-    tmp_path: Path, videos: Path
-) -> None:
+def test_inputs_are_found_by_file_folder_and_pattern_and_those_that_hold_nothing_are_named(tmp_path, videos) -> None:
     expected = [("a", videos / "a.avi"), ("b", videos / "b.avi")]
     for inputs in ([str(videos)], [f"{videos}/*.avi"], [str(videos / "b.avi"), str(videos / "a.avi")]):
         assert [(r.name, r.path) for r in find_recordings(inputs)] == expected

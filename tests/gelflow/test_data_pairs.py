@@ -33,7 +33,7 @@ def test_gelflow_reads_what_synth_writes(tmp_path: Path, dtype: type) -> None:
         assert {item[key].dtype for key in ("image1", "image2", "flow", "visible")} == {torch.float32}
 
 
-def test_unfinished_samples_do_not_count(tmp_path: Path) -> None:
+def test_unfinished_samples_do_not_count_and_both_kinds_fit_into_one_batch(tmp_path: Path) -> None:
     """A run that was killed: a folder without a line, a hidden partial folder, a torn line."""
     folder = write_dataset(tmp_path / "d", [synth_sample(1), synth_sample(3)])
     (folder / "samples" / "000000").mkdir()
@@ -41,9 +41,6 @@ def test_unfinished_samples_do_not_count(tmp_path: Path) -> None:
     lines = (folder / "manifest.jsonl").read_text().splitlines(keepends=True)
     (folder / "manifest.jsonl").write_text(lines[1] + lines[0] + '{"index": 2, "traj')
     assert open_pairs(folder).names == ["000001", "000003"]
-
-
-def test_samples_of_both_kinds_fit_into_one_batch_and_folders_of_one_name_are_numbered(tmp_path: Path) -> None:
     synthetic = open_pairs(write_synthetic(tmp_path / "s", [(1, 0)]))
     plain, same = (open_pairs(write_folder(tmp_path / parent / "p", {"a": (0, 1)})) for parent in "xy")
     assert "flow" not in plain[0]
@@ -81,7 +78,7 @@ def test_broken_synthetic_data_set_is_named(tmp_path: Path, file: str, content: 
         open_pairs(folder)
 
 
-def test_digest_tells_synthetic_data_sets_apart_by_scene_and_seed(tmp_path: Path) -> None:
+def test_digest_tells_scene_and_seed_and_flow_of_another_size_is_named(tmp_path: Path) -> None:
     folder = write_synthetic(tmp_path, [(1, 0)])
     digests = [open_pairs(folder).digest]
     for origin in ({"scene_hash": "a", "seed": 1}, {"scene_hash": "a", "seed": 2}, {"scene_hash": "b", "seed": 2}):
@@ -89,16 +86,12 @@ def test_digest_tells_synthetic_data_sets_apart_by_scene_and_seed(tmp_path: Path
         digests.append(open_pairs(folder).digest)
     assert len(set(digests)) == 4
     assert open_pairs(folder).digest == digests[-1]
-
-
-def test_flow_of_another_size_is_named(tmp_path: Path) -> None:
-    folder = write_synthetic(tmp_path, [(1, 0)])
     write_flow(folder / "samples" / "000000" / "flow.exr", np.zeros((10, 10, 2), np.float32))
     with pytest.raises(InputError, match=r"flow\.exr.*10 x 10.*80 x 64"):
         open_pairs(folder)[0]
 
 
-def test_plain_folder_with_markers_and_half_a_pair(tmp_path: Path) -> None:
+def test_plain_folders_may_have_markers_and_what_is_no_data_set_is_named(tmp_path: Path) -> None:
     folder = write_folder(tmp_path, {"b": (1, 0), "a": (0, 1)})
     # Files of some programs begin with a byte-order mark.
     (folder / "a_markers.csv").write_text("x1,y1,x2,y2\n1,2,3,4\n5,6,7,8.5\n", encoding="utf-8-sig")
@@ -109,6 +102,16 @@ def test_plain_folder_with_markers_and_half_a_pair(tmp_path: Path) -> None:
     (folder / "a_1.png").unlink()
     with pytest.raises(InputError, match=r"a_1\.png"):
         open_pairs(folder)
+    notes, empty, unfinished, broken = (tmp_path / name for name in ("notes/a.txt", "empty", "cut", "broken"))
+    for folder in (notes.parent, empty, unfinished, broken):
+        folder.mkdir()
+    notes.write_text("x")
+    (unfinished / "pairs.json").write_text(json.dumps({"job": {}, "complete": False}))
+    (broken / "pairs.json").write_text("{")
+    for path, word in ((tmp_path / "nothing", "no such folder"), (empty, "empty"), (notes.parent, "no image pairs"),
+                       (notes, "is a file"), (unfinished, "interrupted"), (broken, r"pairs\.json")):  # fmt: skip
+        with pytest.raises(InputError, match=word):
+            open_pairs(path)
 
 
 @pytest.mark.parametrize(
@@ -127,16 +130,3 @@ def test_broken_markers_are_named(tmp_path: Path, text: str) -> None:
     (folder / "a_markers.csv").write_text(text, encoding="latin-1")
     with pytest.raises(InputError, match=r"a_markers\.csv"):
         open_pairs(folder).markers(0)
-
-
-def test_what_is_no_data_set_is_named(tmp_path: Path) -> None:
-    notes, empty, unfinished, broken = (tmp_path / name for name in ("notes/a.txt", "empty", "cut", "broken"))
-    for folder in (notes.parent, empty, unfinished, broken):
-        folder.mkdir()
-    notes.write_text("x")
-    (unfinished / "pairs.json").write_text(json.dumps({"job": {}, "complete": False}))
-    (broken / "pairs.json").write_text("{")
-    for path, word in ((tmp_path / "nothing", "no such folder"), (empty, "empty"), (notes.parent, "no image pairs"),
-                       (notes, "is a file"), (unfinished, "interrupted"), (broken, r"pairs\.json")):  # fmt: skip
-        with pytest.raises(InputError, match=word):
-            open_pairs(path)

@@ -1,4 +1,4 @@
-"""The sum over scales, the endpoint loss, and what `best` and ARFlow's configuration add to them."""
+"""The sum over scales, the endpoint loss, and what ARFlow's configuration adds to them."""
 
 import pytest
 import torch
@@ -7,7 +7,6 @@ from torch.autograd import gradcheck
 from waves import moved_pair, pixel_centres, press_flow
 
 from gelflow.config import LossConfig
-from gelflow.config.sources import train_config
 from gelflow.losses import flow_loss, self_supervised_loss
 from gelflow.losses.augmentation_consistency import consistency_loss, transformed_pair
 from gelflow.losses.endpoint import SOFTNESS_PX, endpoint_loss
@@ -38,9 +37,7 @@ def pressed() -> tuple[Tensor, Tensor, Tensor]:
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda config: f"{config.smoothness}-{config.weight}")
-def test_the_true_flow_scores_better_than_none_and_than_a_tenth_more_or_less(
-    config: LossConfig, pressed: tuple[Tensor, Tensor, Tensor]
-) -> None:
+def test_the_true_flow_scores_better_than_none_and_than_a_tenth_more_or_less(config, pressed) -> None:
     """The latter at the scales that resolve the texture (s = 0, 1, 2). At coarser ones, the published loss itself
     prefers too little motion: the pattern is averaged away, and the regulariser is what is left.
     """
@@ -63,7 +60,7 @@ def test_without_normalisation_no_flow_scores_better_than_the_true_one(pressed: 
     assert true > still
 
 
-def test_parts_add_up_and_scales_are_weighted() -> None:
+def test_parts_add_up_scales_are_weighted_and_a_mask_removes_pixels() -> None:
     flows = flow_pyramid(torch.randn(1, 2, 64, 64, dtype=torch.float64), 3)
     images = torch.rand(2, 1, 3, 64, 64, dtype=torch.float64)
 
@@ -77,17 +74,18 @@ def test_parts_add_up_and_scales_are_weighted() -> None:
     separate = 2 * total(1, 0, 0) + total(0, 1, 0) + 0.5 * total(0, 0, 1)
     assert abs(total(2, 1, 0.5) - separate) < 1e-13
     total(1, 1, 1, smoothness="first_order")
+    images = torch.rand(2, 1, 3, 64, 64, generator=random(3)).unbind()
+    flows = flow_pyramid(torch.zeros(1, 2, 64, 64), 3)
+    config = LossConfig(lambda_s=(1, 1, 1), lambda_dc=0, lambda_df=0, alpha=0)
+    broken = images[0].clone()
+    broken[..., 32:, :] = images[1][..., 32:, :]
+    mask = torch.ones(1, 1, 64, 64)
+    mask[..., :32, :] = 0
+    assert self_supervised_loss(flows, broken, images[1], config)[0] > 0.1
+    assert self_supervised_loss(flows, broken, images[1], config, mask)[0] == 0
 
 
-def test_every_scale_of_the_smallest_image_has_a_gradient() -> None:
-    images = torch.rand(2, 1, 3, 64, 64)
-    flows = [torch.randn(1, 2, 64 >> s, 64 >> s).mul_(0.3).requires_grad_() for s in range(7)]
-    for config in CONFIGS:
-        self_supervised_loss(flows, *images, config)[0].backward()
-    assert all(torch.isfinite(flow.grad).all() for flow in flows)
-
-
-def test_the_endpoint_loss_is_the_distance_and_ignores_what_is_unknown() -> None:
+def test_losses_of_known_flow_grow_with_the_error_and_ignore_what_is_unknown() -> None:
     truth = torch.zeros(1, 2, 4, 5, dtype=torch.float64)
     flow = truth + torch.tensor([3.0, 4.0]).view(1, 2, 1, 1)
     # sqrt(25 + e^2) - e is 5 - e + e^2 / 10
@@ -102,9 +100,6 @@ def test_the_endpoint_loss_is_the_distance_and_ignores_what_is_unknown() -> None
     assert torch.isfinite(flow.grad).all()
     assert not flow.grad[:, :, 2:].any()
     assert endpoint_loss(flow, torch.full_like(truth, torch.nan)) == 0
-
-
-def test_the_flow_loss_is_zero_for_the_truth_at_all_scales_and_grows_with_the_error() -> None:
     truth = press_flow(64, 80, 5.0)[None]
     truth[..., :6] = torch.nan
     filled = [torch.nan_to_num(field) for field in flow_pyramid(truth, 7)]
@@ -112,7 +107,7 @@ def test_the_flow_loss_is_zero_for_the_truth_at_all_scales_and_grows_with_the_er
     assert flow_loss([0.9 * field for field in filled], truth, LossConfig())[0] > 0
 
 
-def test_losses_have_the_gradients_of_finite_differences() -> None:
+def test_losses_have_the_gradients_of_finite_differences_at_every_scale() -> None:
     generator = random(3)
 
     def noise(*size: int) -> Tensor:
@@ -126,6 +121,11 @@ def test_losses_have_the_gradients_of_finite_differences() -> None:
     flow = (target + 0.2 + noise(5, 6)).requires_grad_()
     pixels = (noise(5, 6)[:, :1] > 0.3).double()
     assert gradcheck(lambda f: consistency_loss(f, target, pixels), (flow,))
+    images = torch.rand(2, 1, 3, 64, 64)
+    flows = [torch.randn(1, 2, 64 >> s, 64 >> s).mul_(0.3).requires_grad_() for s in range(7)]
+    for config in CONFIGS:
+        self_supervised_loss(flows, *images, config)[0].backward()
+    assert all(torch.isfinite(flow.grad).all() for flow in flows)
 
 
 def test_second_order_is_zero_for_affine_flows_and_known_for_a_parabola() -> None:
@@ -139,7 +139,7 @@ def test_second_order_is_zero_for_affine_flows_and_known_for_a_parabola() -> Non
     assert second_order_loss(bent[..., :2, :], image[..., :2, :]) == 0
 
 
-def test_occlusion_keeps_what_closes() -> None:
+def test_occlusion_keeps_what_closes_and_hides_nothing_where_nothing_does() -> None:
     x, y = pixel_centres(40, 60)
     # A stretch about the middle: forward x' = 1.4 x, backward exactly its inverse, so that x + forward closes.
     forward = torch.stack([0.4 * (x - 30), 0.4 * (y - 20)])[None]
@@ -150,10 +150,7 @@ def test_occlusion_keeps_what_closes() -> None:
     backward[..., 20:30] += 1.5  # a strip that goes elsewhere: 1.5^2 > 0.5 + 1 % of the motion
     hidden = (1.4 * (x - 30) + 30 > 21.5) & (1.4 * (x - 30) + 30 < 28.5) & stays
     assert not visible_in_both_images(forward, backward)[0, 0][hidden].any()
-
-
-def test_a_flow_that_closes_nowhere_hides_nothing() -> None:
-    """Else a loss over no pixel would leave a new network where it is. The second pair closes on a fifth."""
+    # Else a loss over no pixel would leave a new network where it is. The second pair closes on a fifth.
     forward, backward = torch.full((2, 2, 10, 20), 1.5), torch.full((2, 2, 10, 20), 1.5)
     backward[1, :, :4] = -1.5
     seen = visible_in_both_images(forward, backward)
@@ -162,19 +159,7 @@ def test_a_flow_that_closes_nowhere_hides_nothing() -> None:
     assert 0 < seen[1].mean() < 0.3
 
 
-def test_a_mask_removes_pixels_from_the_photometric_loss() -> None:
-    images = torch.rand(2, 1, 3, 64, 64, generator=random(3)).unbind()
-    flows = flow_pyramid(torch.zeros(1, 2, 64, 64), 3)
-    config = LossConfig(lambda_s=(1, 1, 1), lambda_dc=0, lambda_df=0, alpha=0)
-    broken = images[0].clone()
-    broken[..., 32:, :] = images[1][..., 32:, :]
-    mask = torch.ones(1, 1, 64, 64)
-    mask[..., :32, :] = 0
-    assert self_supervised_loss(flows, broken, images[1], config)[0] > 0.1
-    assert self_supervised_loss(flows, broken, images[1], config, mask)[0] == 0
-
-
-def test_the_transformed_pair_moves_as_its_flow_says() -> None:
+def test_the_transformed_pair_moves_as_its_flow_says_and_follows_the_generator() -> None:
     flow = press_flow(120, 160, 3.0)[None]
     image1, image2 = (image[None] for image in moved_pair(flow[0], seed=8, shortest=24, longest=60))
     for seed in (1, 2, 3):
@@ -189,32 +174,7 @@ def test_the_transformed_pair_moves_as_its_flow_says() -> None:
         assert error(turned) < 1.1 * 3 * 0.0226
         assert error(turned) < min(error(0.8 * turned), error(1.2 * turned), error(flow.to(turned)))
         assert consistency_loss(turned, turned, pixels) == pytest.approx(0.01**0.4)
-
-
-def test_the_transformation_follows_the_generator() -> None:
     flow, images = torch.rand(1, 2, 64, 64), torch.rand(2, 1, 3, 64, 64).unbind()
     one, again, other = (transformed_pair(*images, flow, random(seed))[0] for seed in (4, 4, 5))
     assert torch.equal(one, again)
     assert not torch.equal(one, other)
-
-
-def test_best_judges_every_scale_so_that_the_true_flow_wins() -> None:
-    """At each scale that `best` judges, the truth beats no flow and 0.9 and 1.1 times itself. The published loss does
-    not: from s = 3 on it prefers less motion (the second assertion).
-    """
-    flow = press_flow(240, 320, 8.0)[None]
-    image1, image2 = (image[None] for image in moved_pair(flow[0], seed=5))
-    flows = flow_pyramid(flow, 7)
-    best, paper = train_config("best").loss, train_config("paper").loss
-
-    def losses(config: LossConfig, scale: int) -> list[float]:
-        alone = config.model_copy(update={"lambda_s": tuple(float(s == scale) for s in range(7))})
-        return [self_supervised_loss([f * v for v in flows], image1, image2, alone)[0].item() for f in (1, 0, 0.9, 1.1)]
-
-    judged = [scale for scale, weight in enumerate(best.lambda_s) if weight > 0]
-    assert judged == [0, 3, 4]
-    for scale in judged:
-        truth, *others = losses(best, scale)
-        assert truth < min(others)
-    truth, _, less, _ = losses(paper, 4)
-    assert less < truth

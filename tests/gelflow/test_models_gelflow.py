@@ -51,21 +51,15 @@ def test_gradients_reach_every_parameter(options: dict) -> None:
     assert all(torch.isfinite(gradient).all() for gradient in gradients.values())
 
 
-def test_one_network_for_all_scales_is_smaller() -> None:
-    shared, per_scale = (GelFlow(ModelConfig(estimator=kind)).parameters() for kind in ("shared", "per_scale"))
-    assert sum(p.numel() for p in shared) < 0.4 * sum(p.numel() for p in per_scale)
-
-
-def test_normalised_features_have_mean_zero_and_variance_one_together() -> None:
+def test_features_are_normalised_one_network_is_smaller_and_batches_do_not_matter(network: GelFlow) -> None:
     first, second = 3 + 2 * torch.randn(2, 2, 8, 6, 5, dtype=torch.float64)
     both = torch.stack(normalised(first, second))
     for sample in range(2):
         # the 1e-6 beside a variance of 4 lowers the result by a quarter of it
         assert abs(both[:, sample].mean().item()) < 1e-12
         assert abs(both[:, sample].var(unbiased=False).item() - 1) < 1e-6
-
-
-def test_same_input_and_batch_position_do_not_matter(network: GelFlow) -> None:
+    shared, per_scale = (GelFlow(ModelConfig(estimator=kind)).parameters() for kind in ("shared", "per_scale"))
+    assert sum(p.numel() for p in shared) < 0.4 * sum(p.numel() for p in per_scale)
     image1, image2 = torch.rand(2, 3, 3, 64, 96)
     with torch.no_grad():
         together, alone = network(image1, image2)[0], network(image1[1:2], image2[1:2])[0]
@@ -142,12 +136,9 @@ def test_a_fused_flow_lies_between_its_neighbours_and_a_constant_one_stays(regio
     assert (fused - flow).abs().max() > 0.1
 
 
-def test_gradients_agree_with_finite_differences() -> None:
+def test_fusion_has_the_gradients_of_differences_and_refinement_corrects_two_scales() -> None:
     flow, context = torch.randn(1, 2, 3, 4, dtype=torch.float64), torch.randn(1, 3, 3, 4, dtype=torch.float64)
     assert gradcheck(LocalFlowFusion(3, "inverse_sqrt"), (flow.requires_grad_(), context.requires_grad_()))
-
-
-def test_refinement_corrects_its_scale_and_the_finer_one() -> None:
     torch.manual_seed(0)
     network = GelFlow(ModelConfig(levels=4, refine="half", refine_iterations=2))
     images = torch.rand(2, 1, 3, 66, 71).unbind()

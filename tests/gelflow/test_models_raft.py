@@ -106,7 +106,7 @@ def test_the_flow_has_the_images_size(large: bool, size: tuple[int, int]) -> Non
     assert torch.isfinite(flow).all()
 
 
-def test_the_encoders_see_images_between_minus_one_and_one(small: RAFT) -> None:
+def test_encoders_see_images_from_minus_one_to_one_and_neither_batch_nor_padding_matters(small: RAFT) -> None:
     seen: list[tuple[float, float]] = []
     image = torch.zeros(1, 3, 64, 64)
     image[..., 32:] = 1
@@ -117,9 +117,6 @@ def test_the_encoders_see_images_between_minus_one_and_one(small: RAFT) -> None:
     for hook in hooks:
         hook.remove()
     assert seen == [(-1, 1)] * 3
-
-
-def test_neither_pairs_of_a_batch_nor_padding_change_the_flow(small: RAFT) -> None:
     batch = torch.rand(2, 2, 3, 76, 84).unbind()
     alone = [image[1:] for image in batch]
     # 76 x 84 is padded by 2 px on each side to 80 x 88, which is what `framed` is already.
@@ -131,7 +128,7 @@ def test_neither_pairs_of_a_batch_nor_padding_change_the_flow(small: RAFT) -> No
         torch.testing.assert_close(small(*framed)[..., 2:-2, 2:-2], flow, rtol=0, atol=1e-4)
 
 
-def test_the_lookup_reads_indices_and_orders_displacements_column_by_column() -> None:
+def test_the_lookup_orders_displacements_column_by_column_and_enlarging_multiplies_by_eight() -> None:
     features1, features2 = torch.rand(2, 1, 5, 16, 24, dtype=torch.float64)
     pyramid = correlation_pyramid(features1, features2)
     product = torch.einsum("bchw,bcij->bhwij", features1, features2) / 5**0.5
@@ -146,9 +143,6 @@ def test_the_lookup_reads_indices_and_orders_displacements_column_by_column() ->
     # level 1: index 8 is read at 4, index 8 (row) at 4; each value is the mean of a 2x2 block
     blocks = torch.nn.functional.avg_pool2d(at_pixel[None], 2)[0, 3:6, 3:6].T
     torch.testing.assert_close(found[1], blocks, rtol=0, atol=1e-12)
-
-
-def test_enlarging_keeps_a_constant_and_multiplies_by_eight() -> None:
     flow = torch.tensor([1.5, -0.25]).view(1, 2, 1, 1).expand(1, 2, 4, 5).contiguous()
     assert torch.allclose(enlarge_bilinear(flow), 8 * flow[..., :1, :1].expand(1, 2, 32, 40))
     weights = torch.randn(1, 9 * 64, 4, 5)

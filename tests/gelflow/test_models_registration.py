@@ -53,7 +53,7 @@ def test_it_finds_the_flow_from_none_and_keeps_it(config: RegistrationConfig) ->
     assert error(registered(truth, image1, image2, config), truth) < 0.01
 
 
-def test_texture_reduces_noise_in_the_flow_and_finds_a_lost_patch_again() -> None:
+def test_texture_reduces_noise_and_finds_a_lost_patch_and_without_it_the_flow_stays() -> None:
     image1, image2, truth = pair()
     noise = 0.2 * torch.randn(truth.shape, generator=torch.Generator().manual_seed(0))
     # White noise under a Gaussian of 8 px keeps 1 / (2 sqrt(pi) 8) = 4 % of its height, before any texture.
@@ -61,12 +61,8 @@ def test_texture_reduces_noise_in_the_flow_and_finds_a_lost_patch_again() -> Non
     lost = truth.clone()
     lost[..., 40:60, 60:80] += 14.0
     assert error(registered(lost, image1, image2, MOTION), truth) < 0.1
-
-
-def test_without_texture_and_outside_the_image_the_flow_stays() -> None:
     grey, flow = torch.full((1, 3, 64, 64), 0.5), torch.full((1, 2, 64, 64), 1.5)
     torch.testing.assert_close(registered(flow, grey, grey, MOTION), flow, rtol=0, atol=1e-4)
-    image1, image2, _ = pair()
     flow = torch.full((1, 2, HEIGHT, WIDTH), 200.0)
     torch.testing.assert_close(registered(flow, image1, image2, MOTION), flow, rtol=0, atol=1e-3)
 
@@ -90,7 +86,7 @@ def test_an_error_of_the_flow_is_weighed_against_the_images_as_the_prior_says(it
     assert found == pytest.approx(off - off * texture / (texture + variance / prior**2), abs=0.04 * off)
 
 
-def test_shading_is_ignored_unless_brightness_is_asked_for() -> None:
+def test_shading_is_ignored_unless_asked_for_and_equal_brightness_elsewhere_does_not_spread() -> None:
     image1, image2, truth = pair()
     lit = 0.7 * image2 + 0.15 * shade(60, 50, 15)
     motion, brightness = (error(registered(truth, 0.7 * image1, lit, aim), truth) for aim in (MOTION, BRIGHTNESS))
@@ -100,11 +96,7 @@ def test_shading_is_ignored_unless_brightness_is_asked_for() -> None:
     # On a bare gel, a shade of 12 px that darkens where it is.
     bare, still = 0.1 * shade(54, 50, 12).expand(1, 3, -1, -1), torch.zeros_like(truth)
     assert error(registered(still, 0.4 + bare, 0.4 + 1.5 * bare, MOTION), still) < 0.05
-
-
-def test_flow_that_finds_the_same_brightness_elsewhere_does_not_spread() -> None:
-    """Other light on a faint texture, and at the left a flow that leads to where image 2 is as bright as image 1."""
-    image1, image2, truth = pair()
+    # Other light on a faint texture; at the left a flow leads to where image 2 is as bright as image 1.
     ramp = torch.linspace(0, 0.64, WIDTH)
     dim, lit = 0.25 * image1 + ramp, 0.25 * image2 + ramp + 0.64 / (WIDTH - 1) * 18
     lost = truth.clone()
@@ -141,7 +133,7 @@ def test_pairs_of_a_batch_do_not_see_each_other() -> None:
     torch.testing.assert_close(mirrored, together[:1], rtol=0, atol=1e-3)
 
 
-def test_weights_keep_it_and_a_fine_tuning_may_switch_it_on(tmp_path: Path) -> None:
+def test_weights_keep_it_a_fine_tuning_may_switch_it_on_and_it_is_set_field_by_field(tmp_path: Path) -> None:
     torch.set_num_threads(1)
     torch.manual_seed(0)
     plain, path = GelFlow(ModelConfig(levels=4)), tmp_path / "plain.safetensors"
@@ -159,9 +151,6 @@ def test_weights_keep_it_and_a_fine_tuning_may_switch_it_on(tmp_path: Path) -> N
     other = config.model_copy(update={"model": ModelConfig.model_validate(values | {"lffm": False})})
     with pytest.raises(InputError, match="lffm: True there, False here"):
         train(other, pairs, None, tmp_path / "other", initial=path)
-
-
-def test_it_is_set_field_by_field() -> None:
     start = {"model": ModelConfig().model_dump()}
     config = train_config(None, ["model.registration.prior_px=0.3", "model.registration.iterations=3"], start=start)
     assert config.model.registration == RegistrationConfig(prior_px=0.3, iterations=3)
@@ -213,9 +202,7 @@ def test_without_a_match_flows_stay() -> None:
 
 
 @pytest.mark.parametrize("lost", [(slice(40, 56), slice(None)), (slice(None), slice(60, 76))], ids=["rows", "columns"])
-def test_a_lost_strip_takes_the_flow_beside_it_and_nothing_that_was_not_there_is_found(
-    lost: tuple[slice, slice],
-) -> None:
+def test_a_lost_strip_takes_the_flow_beside_it_and_nothing_that_was_not_there_is_found(lost) -> None:
     _, _, truth = moved_texture()
     flow = truth.clone()
     flow[..., lost[0], lost[1]] = WRONG
@@ -226,7 +213,7 @@ def test_a_lost_strip_takes_the_flow_beside_it_and_nothing_that_was_not_there_is
     assert ((found == 0) | (found == 5)).all()
 
 
-def test_a_gels_flow_is_extrapolated() -> None:
+def test_a_gels_flow_is_extrapolated_and_light_ignored_or_followed() -> None:
     """A stretched texture of which a strip of 12 px is lost, under a window that reduces images to a quarter."""
     x, y = grid(HEIGHT, WIDTH)
     u = 0.1 * (x - WIDTH / 2)
@@ -240,12 +227,6 @@ def test_a_gels_flow_is_extrapolated() -> None:
     error = (found - truth).norm(dim=1)
     assert error[..., 62:66].max() < 0.3  # the edges are interpolated over four px
     assert max(error[..., 40:52].max(), error[..., 76:88].max()) < 1e-5
-
-
-def test_light_is_ignored_or_followed() -> None:
-    """A lamp that is switched on at the right. Beside it there is a flow that would find as bright a place, and no
-    better a pattern.
-    """
     image1, image2, truth = moved_texture()
     flow = truth.clone()
     ramp = torch.linspace(0, 1, WIDTH).expand(1, 3, HEIGHT, WIDTH)

@@ -32,7 +32,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_weights_and_architecture_come_back(saved: Path) -> None:
+def test_weights_and_architecture_come_back_and_both_forms_of_the_correlation_agree(saved: Path) -> None:
     torch.manual_seed(1)
     network, loaded = GelFlow(SMALL), load_weights(saved)
     assert loaded.config == SMALL
@@ -42,9 +42,14 @@ def test_weights_and_architecture_come_back(saved: Path) -> None:
     images = torch.rand(2, 1, 3, 64, 64).unbind()
     with torch.no_grad():
         assert torch.equal(network(*images)[0], loaded(*images)[0])
+    # The exported graph holds another form.
+    first, second = torch.rand(2, 2, 5, 7, 9, dtype=torch.float64)
+    torch.testing.assert_close(local_correlation(first, second, 3), _unfolded(first, second, 3), rtol=0, atol=1e-14)
 
 
-def test_files_that_are_no_weights(saved: Path, tmp_path: Path) -> None:
+def test_files_that_are_no_weights_are_named_and_a_failed_write_keeps_the_former_one(
+    saved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Damaged ones and code that they would run: test_robustness."""
     for share in (0.0, 0.001, 0.5):
         (tmp_path / f"cut{share}.safetensors").write_bytes(saved.read_bytes()[: int(share * saved.stat().st_size)])
@@ -57,6 +62,18 @@ def test_files_that_are_no_weights(saved: Path, tmp_path: Path) -> None:
     ):  # fmt: skip
         with pytest.raises(InputError, match=rf"{name}: .*{words}"):
             load_weights(tmp_path / name)
+    path = tmp_path / "new" / "weights.safetensors"
+    path.parent.mkdir()
+    path.write_bytes(saved.read_bytes())
+
+    def full(*_: object) -> int:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match="No space left"):
+        save_weights(path, GelFlow(SMALL))
+    assert path.read_bytes() == saved.read_bytes()
+    assert list(path.parent.iterdir()) == [path]
 
 
 MISFITS: list[tuple[str, list[str], str]] = [
@@ -81,21 +98,7 @@ def test_metadata_that_do_not_fit(saved: Path, tmp_path: Path, key: str, values:
             load_weights(tmp_path / "wrong.safetensors")
 
 
-def test_a_failed_write_keeps_the_former_file(saved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "weights.safetensors"
-    path.write_bytes(saved.read_bytes())
-
-    def full(*_: object) -> int:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Path, "write_bytes", full)
-    with pytest.raises(OSError, match="No space left"):
-        save_weights(path, GelFlow(SMALL))
-    assert path.read_bytes() == saved.read_bytes()
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_names_and_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_files_and_the_card_of_best(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     shipped, own = weights_file(None), Path("best")
     assert shipped.stat().st_size < 15e6
@@ -107,12 +110,8 @@ def test_names_and_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert weights_file(own) == own
     with pytest.raises(InputError, match="worst: there is no such file"):
         load_weights(weights_file(Path("worst")))
-
-
-def test_the_card_describes_best() -> None:
-    path = weights_file(None)
-    card = path.with_name("README.md").read_text(encoding="utf-8")
-    metadata = read_metadata(path)
+    card = shipped.with_name("README.md").read_text(encoding="utf-8")
+    metadata = read_metadata(shipped)
     assert json.loads(metadata["train"])["supervision"] == "mixed"
     assert f"--steps {metadata['step']}\n" in card
     assert ModelConfig.model_validate_json(metadata["model"]).registration == REGISTRATIONS["motion"]
@@ -153,12 +152,6 @@ def weights(tmp_path: Path) -> Path:
     return tmp_path / "weights.safetensors"
 
 
-def test_both_forms_of_the_correlation_agree() -> None:
-    """The exported graph holds another form."""
-    first, second = torch.rand(2, 2, 5, 7, 9, dtype=torch.float64)
-    torch.testing.assert_close(local_correlation(first, second, 3), _unfolded(first, second, 3), rtol=0, atol=1e-14)
-
-
 @pytest.mark.slow
 def test_the_exported_network_gives_the_same_flow(weights: Path, tmp_path: Path) -> None:
     runtime = pytest.importorskip("onnxruntime", reason="onnxruntime is not installed")
@@ -187,9 +180,7 @@ def test_the_exported_network_gives_the_same_flow(weights: Path, tmp_path: Path)
         (["--out", "x.onnx", "--size", "64x64"], "pip install onnx onnxscript"),
     ],
 )
-def test_mistakes_are_one_line(
-    weights: Path, tail: list[str], word: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_mistakes_are_one_line(weights: Path, tail: list[str], word: str, capsys, monkeypatch) -> None:
     monkeypatch.setattr("gelflow.models.onnx.find_spec", lambda name: None if "pip" in word else name)
     monkeypatch.chdir(weights.parent)
     Path("other.onnx").write_text("another's")

@@ -33,7 +33,7 @@ def test_zero_flow_keeps_the_image(size: tuple[int, int]) -> None:
     torch.testing.assert_close(warp(image.float(), still.float()), image.float(), rtol=0, atol=1.5e-6)
 
 
-def test_integer_shifts_do_not_blur_half_a_pixel_is_the_mean_of_two_and_the_border_is_repeated() -> None:
+def test_shifts_of_whole_and_half_pixels_are_exact_and_what_leaves_is_not_inside() -> None:
     image = torch.rand(1, 3, 20, 30, dtype=torch.float64)
     # warped(row, column) = image(row - 2, column + 3); rounding as above, slopes up to 1 per px
     warped = warp(image, constant_flow(3, -2, 20, 30))
@@ -42,9 +42,6 @@ def test_integer_shifts_do_not_blur_half_a_pixel_is_the_mean_of_two_and_the_bord
     torch.testing.assert_close(warp(image, constant_flow(0.5, 0, 20, 30))[..., :-1], mean, rtol=0, atol=1e-12)
     border = image[..., -1:].expand_as(image)
     torch.testing.assert_close(warp(image, constant_flow(100, 0, 20, 30)), border, rtol=0, atol=1e-12)
-
-
-def test_inside_keeps_all_pixels_of_a_still_image_and_drops_those_that_leave() -> None:
     assert inside(constant_flow(0, 0, 7, 9)).min() == 1
     expected = torch.ones(1, 1, 7, 9, dtype=torch.float64)
     expected[..., -2:] = expected[..., :1, :] = 0
@@ -78,16 +75,13 @@ def test_gradients_agree_with_finite_differences() -> None:
 GENERATOR = torch.Generator().manual_seed(0)
 
 
-def test_it_is_scipys_cubic_spline() -> None:
+def test_the_spline_is_scipys_and_keeps_the_image_at_lowered_precision_too() -> None:
     image = torch.rand(1, 2, 17, 23, generator=GENERATOR, dtype=torch.float64)
     flow = 6 * torch.rand(1, 2, 17, 23, generator=GENERATOR, dtype=torch.float64) - 3
     rows, columns = np.mgrid[:17, :23].astype(float)
     places = [np.clip(rows + flow[0, 1].numpy(), 0, 16), np.clip(columns + flow[0, 0].numpy(), 0, 22)]
     expected = [map_coordinates(channel, places, order=3, mode="mirror") for channel in image[0].numpy()]
     np.testing.assert_allclose(SplineImage(image).at(positions(flow))[0].numpy(), expected, rtol=0, atol=1e-12)
-
-
-def test_no_flow_gives_the_image_at_lowered_precision_too_and_the_border_goes_on_outside() -> None:
     image, still = torch.rand(2, 3, 9, 8, generator=GENERATOR), torch.zeros(2, 2, 9, 8)
     # float32: a matrix of condition 3 and its inverse, and places in an image of a few px.
     torch.testing.assert_close(warp(image, still, "spline"), image, rtol=0, atol=4e-6)
@@ -100,7 +94,7 @@ def test_no_flow_gives_the_image_at_lowered_precision_too_and_the_border_goes_on
 LIKE = torch.zeros((), dtype=torch.float64)
 
 
-def test_sums_are_those_of_a_convolution_with_zeros_beyond_the_border() -> None:
+def test_window_sums_are_a_convolution_and_smoothing_a_gaussian_up_to_the_border() -> None:
     field = torch.rand(2, 3, 21, 34, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     found = window_sums(21, 34, 2.5, LIKE)(field).numpy()
     expected = field.numpy()
@@ -109,9 +103,6 @@ def test_sums_are_those_of_a_convolution_with_zeros_beyond_the_border() -> None:
         height = sum(math.exp(-(k**2) / (2 * 2.5**2)) for k in range(-8, 9))
         expected = height * gaussian_filter1d(expected, 2.5, axis=axis, mode="constant", truncate=8 / 2.5)
     torch.testing.assert_close(torch.from_numpy(expected), torch.from_numpy(found), rtol=1e-12, atol=1e-12)
-
-
-def test_smoothing_keeps_affine_fields_up_to_the_border_and_weakens_waves_as_a_gaussian_does() -> None:
     y, x = torch.meshgrid(torch.arange(20.0).double(), torch.arange(30.0).double(), indexing="ij")
     field = torch.stack([3 + 0.2 * x - 0.1 * y, x * y])[None]
     # Both are affine along each axis. That of 8 px would reach beyond the other border.
@@ -124,7 +115,7 @@ def test_smoothing_keeps_affine_fields_up_to_the_border_and_weakens_waves_as_a_g
     torch.testing.assert_close(found[..., 20:-20], math.exp(-0.32) * wave[..., 20:-20], rtol=0, atol=5e-3)
 
 
-def test_both_derivatives_are_exact_for_an_affine_field_and_none_where_it_is_too_small() -> None:
+def test_derivatives_of_an_affine_field_are_exact_and_window_slopes_the_papers_least_squares() -> None:
     x, y = pixel_centres(6, 9)
     field = (0.7 * x - 0.2 * y + 3)[None, None]
     for derivative, size in ((forward_differences, (5, 8)), (window_slopes, (4, 7))):
@@ -133,9 +124,6 @@ def test_both_derivatives_are_exact_for_an_affine_field_and_none_where_it_is_too
             torch.testing.assert_close(found, torch.full((1, 1, *size), slope, dtype=torch.float64), rtol=0, atol=1e-13)
     assert forward_differences(torch.zeros(1, 2, 1, 5))[0].numel() == 0
     assert window_slopes(torch.zeros(1, 2, 2, 5))[0].numel() == 0
-
-
-def test_one_plus_the_window_slope_is_the_least_squares_ratio_of_the_paper() -> None:
     flow = torch.randn(2, 7, 8, dtype=torch.float64)
     across, down = window_slopes(flow)
     offsets = torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float64)
@@ -154,29 +142,20 @@ def test_sizes_are_halved_and_rounded_up(size: tuple[int, int]) -> None:
     assert sizes == [(-(-size[0] // 2**s), -(-size[1] // 2**s)) for s in range(7)]
 
 
-def test_an_image_is_averaged_over_blocks_of_which_an_odd_last_column_is_one() -> None:
+def test_halving_averages_blocks_at_odd_borders_and_enlarging_keeps_a_linear_flow_linear() -> None:
     image = torch.rand(1, 3, 8, 12, dtype=torch.float64)
     # the mean of 16 numbers below one, in another order
     expected = image.view(1, 3, 2, 4, 3, 4).mean(dim=(3, 5))
     torch.testing.assert_close(image_pyramid(image, 3)[2], expected, rtol=0, atol=1e-15)
     assert image_pyramid(torch.tensor([[[[1.0, 3.0, 7.0]]]]), 2)[1].flatten().tolist() == [2.0, 7.0]
-
-
-def test_a_constant_flow_is_halved_in_px_also_at_odd_borders() -> None:
     for scale, coarse in enumerate(flow_pyramid(constant_flow(6, -4, 9, 7), 4)):
         assert torch.equal(coarse, constant_flow(6, -4, *coarse.shape[2:]) / 2**scale)
-
-
-def test_unknown_flow_is_left_out_of_the_mean_and_spreads_only_where_it_prevails() -> None:
     flow = torch.ones(1, 2, 2, 4)
     flow[:, :, 0, 0] = torch.nan  # one of the first block's four
     flow[:, :, :, 2] = torch.nan  # two of the second's
     assert halve_flow(flow)[0, 0].tolist() == [[0.5, 0.5]]
     flow[:, :, 0, 3] = torch.nan
     assert torch.isnan(halve_flow(flow)[0, :, 0, 1]).all()
-
-
-def test_enlarging_multiplies_values_and_keeps_a_linear_flow_linear() -> None:
     columns = torch.arange(6, dtype=torch.float64) + 0.5
     flow = torch.stack([columns, -columns]).view(1, 2, 1, 6).expand(1, 2, 4, 6)
     fine = enlarge_flow(flow, 2, (15, 23))

@@ -1,4 +1,4 @@
-"""`predict` and the pictures of flow."""
+"""`predict` and its pictures; `gelflow.load_model` and `gelflow.PairDataset` in Python."""
 
 import colorsys
 import csv
@@ -8,8 +8,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
+from synth_samples import synth_sample, write_dataset
 from textures import as_bytes, moved, save, write_folder, write_video
 
+import gelflow
 from gelflow.baselines import named_methods
 from gelflow.errors import InputError
 from gelflow.files.exr import read_flow
@@ -31,7 +34,7 @@ def frame_folder(folder: Path, names: Iterable[object]) -> Path:
     return folder
 
 
-def test_pair_gives_one_flow_in_three_files(tmp_path: Path) -> None:
+def test_pair_gives_one_flow_in_three_files_named_after_the_images(tmp_path: Path) -> None:
     folder = write_folder(tmp_path / "in", {"press": (1.5, -0.5)})
     result = predict_pair(FARNEBACK, folder / "press_1.png", folder / "press_2.png", tmp_path / "out")
     assert [path.name for path in result.files] == ["press.exr", "press.flo", "press.png"]
@@ -41,9 +44,6 @@ def test_pair_gives_one_flow_in_three_files(tmp_path: Path) -> None:
     assert np.abs(np.median(flow, axis=(0, 1)) - (1.5, -0.5)).max() < 0.1
     picture = cv2.imread(str(result.files[2]))
     assert picture.std() > 20
-
-
-def test_names_without_a_number_are_joined(tmp_path: Path) -> None:
     images = [frame_folder(tmp_path, ["before", "after"]) / f"{name}.png" for name in ("before", "after")]
     assert predict_pair(FARNEBACK, *images, tmp_path).files[0].name == "before_to_after.exr"
 
@@ -63,16 +63,13 @@ def test_video_against_its_first_or_previous_frame(tmp_path: Path, reference: st
     assert calls == [(n, 6) for n in range(1, 7)]
 
 
-def test_folder_of_frames_is_a_video_whose_rows_name_their_files(tmp_path: Path) -> None:
+def test_folder_of_frames_is_a_video_and_flow_files_of_an_earlier_run_go(tmp_path: Path, monkeypatch) -> None:
     frames = frame_folder(tmp_path / "in", ["b10", "b9", "a"])
     assert len(predict_video(FARNEBACK, frames, tmp_path / "out").motions) == 2
     with (tmp_path / "out" / "motion.csv").open(newline="") as file:
         assert [row["file"] for row in csv.DictReader(file)] == ["b9.png", "b10.png"]
-
-
-def test_flow_files_of_an_earlier_run_go_and_others_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cv2.VideoWriter, "isOpened", lambda _: False)  # pictures in place of a video
-    frames, out = frame_folder(tmp_path / "in", range(5)), tmp_path / "out"
+    frames, out = frame_folder(tmp_path / "five", range(5)), tmp_path / "again"
     assert len(predict_video(FARNEBACK, frames, out).motions) == 4
     others = [out / "flow" / "12.exr", out / "flow" / "000001.txt", out / "overlay" / "notes.png"]
     for other in others:
@@ -112,7 +109,7 @@ def test_inputs_that_cannot_be_used_are_named(tmp_path: Path) -> None:
             predict_video(FARNEBACK, tmp_path / name, tmp_path / "out", every=every)
 
 
-def test_colour_depends_on_direction_and_grows_with_length() -> None:
+def test_colours_follow_direction_and_length_and_arrows_have_the_true_length() -> None:
     angles = np.arange(0, 2 * np.pi, 0.1)
     flow = np.stack([np.cos(angles), np.sin(angles)], axis=-1)[None].astype(np.float32)
     full, half = flow_to_colour(flow, 1.0)[0], flow_to_colour(0.5 * flow, 1.0)[0]
@@ -123,6 +120,13 @@ def test_colour_depends_on_direction_and_grows_with_length() -> None:
     np.testing.assert_allclose(saturation[1], 0.5, atol=2 / 255)
     assert tuple(flow_to_colour(np.zeros((1, 1, 2), np.float32), 1.0)[0, 0]) == (255, 255, 255)
     assert tuple(flow_to_colour(np.full((1, 1, 2), np.nan, np.float32), 1.0)[0, 0]) == UNKNOWN_COLOUR
+    flow = np.full((241, 321, 2), (12.0, 0.0), np.float32)
+    picture = draw_overlay(np.zeros((241, 321, 3), np.uint8), flow, 12.0)
+    height, width = picture.shape[:2]
+    assert (height % 2, width % 2) == (0, 0)
+    assert height >= 480
+    left = picture[:, : width // 2].max(axis=2) > 128
+    assert left.mean(axis=1).max() > 0.5  # arrows of 12 px at a distance of 13 px fill most of their rows
 
 
 @pytest.mark.parametrize("length", [0.013, 0.7, 42.0])
@@ -136,11 +140,35 @@ def test_scale_makes_small_and_large_flow_look_alike_and_is_one_for_none(length:
     assert robust_scale(0 * flow) == robust_scale(np.nan * flow) == 1.0
 
 
-def test_overlay_has_even_sides_and_arrows_of_the_true_length() -> None:
-    flow = np.full((241, 321, 2), (12.0, 0.0), np.float32)
-    picture = draw_overlay(np.zeros((241, 321, 3), np.uint8), flow, 12.0)
-    height, width = picture.shape[:2]
-    assert (height % 2, width % 2) == (0, 0)
-    assert height >= 480
-    left = picture[:, : width // 2].max(axis=2) > 128
-    assert left.mean(axis=1).max() > 0.5  # arrows of 12 px at a distance of 13 px fill most of their rows
+def test_arrays_and_tensors_give_one_flow_that_follows_a_known_motion(tmp_path: Path) -> None:
+    pairs = gelflow.PairDataset(write_dataset(tmp_path, [synth_sample(0), synth_sample(1)]))
+    batch = next(iter(torch.utils.data.DataLoader(pairs, batch_size=2)))
+    model = gelflow.load_model("best", device="cpu")
+    flow = model.flow(batch["image1"], batch["image2"])
+    assert flow.shape == batch["flow"].shape
+    one = model.flow(batch["image1"][1], batch["image2"][1])
+    arrays = model.flow(*pairs.images(1))
+    # Batches and single pairs are summed in different orders: float32 rounding, some ten layers deep.
+    np.testing.assert_allclose(one.numpy(), flow[1].numpy(), atol=1e-3)
+    np.testing.assert_allclose(arrays, np.moveaxis(one.numpy(), 0, -1), atol=1e-3)
+    image1, image2 = (as_bytes(moved(96, 128, shift, 0)) for shift in (0, 2))
+    flow = gelflow.load_model(device="cpu").flow(image1, image2)
+    assert flow.dtype == np.float32
+    # 8-bit images of texture: a tenth of a px is twenty times what rounding leaves.
+    assert np.median(flow, axis=(0, 1)) == pytest.approx((2.0, 0.0), abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("image1", "image2", "message"),
+    [
+        (np.zeros((64, 64, 3)), torch.zeros(3, 64, 64), "ndarray and Tensor: two NumPy arrays or two torch tensors"),
+        (np.full((64, 64, 3), 9.0), np.zeros((64, 64, 3)), r"image 1 is float64 with values from 9 to 9"),
+        (torch.zeros(3, 64, 64), torch.full((3, 64, 64), -1.0), r"image 2 is torch.float32 with values from -1 to -1"),
+        (np.zeros((64, 64)), np.zeros((64, 64)), r"\(rows, columns, 3\) is needed"),
+        (torch.zeros(3, 64, 64), torch.zeros(3, 64, 80), "differ in shape"),
+        (np.full((64, 64, 3), np.nan), np.zeros((64, 64, 3)), "NaN or infinite"),
+    ],
+)
+def test_images_that_cannot_be_used(image1: object, image2: object, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        gelflow.load_model(device="cpu").flow(image1, image2)  # type: ignore[call-overload]

@@ -58,9 +58,7 @@ def test_a_resumed_run_with_everything_on_ends_with_the_same_weights(pairs: Shif
 
 
 @pytest.mark.parametrize(("step", "late"), [(0, False), (4, False), (5, True), (9, True)])
-def test_losses_that_trust_the_flow_wait_for_their_stage(
-    step: int, late: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_losses_that_trust_the_flow_wait_for_their_stage(step: int, late: bool, monkeypatch) -> None:
     """Else every pixel of a new network is judged hidden, and its flow grows without end."""
     asked: list[bool] = []
     monkeypatch.setattr(FlowModule, "step", step)
@@ -71,9 +69,17 @@ def test_losses_that_trust_the_flow_wait_for_their_stage(
     assert (asked == [True], "consistency" in parts) == (late, late)
 
 
-def test_bfloat16_trains_and_keeps_float32_weights(pairs: Shifts, tmp_path: Path) -> None:
+def test_bfloat16_keeps_float32_weights_and_speed_and_memory_are_reported(pairs: Shifts, tmp_path: Path) -> None:
     values = weights_of(train(small(steps=2, precision="bf16"), pairs, None, tmp_path).weights).values()
     assert all(value.dtype == torch.float32 and torch.isfinite(value).all() for value in values)
+    result = train(small(steps=10), pairs, None, tmp_path / "speed")
+    assert result.pairs_per_second > 0
+    assert "pairs/s" in str(result)
+    rows = list(csv.DictReader(next(tmp_path.glob("speed/logs/csv/*/metrics.csv")).open()))
+    assert float(rows[-1]["train/pairs_per_second"]) > 0
+    if result.memory_mib is not None:  # Linux
+        assert "peak memory" in str(result)
+        assert result.memory_mib > 100  # torch alone
 
 
 def command(tmp_path: Path, data: Path, settings: str, *options: str) -> list[str]:
@@ -134,17 +140,6 @@ def test_sigterm_stops_a_run_as_ctrl_c_does(tmp_path: Path, send: Callable[[int,
     assert (out / "weights.safetensors").exists()
 
 
-def test_speed_and_memory_are_reported(pairs: Shifts, tmp_path: Path) -> None:
-    result = train(small(steps=10), pairs, None, tmp_path)
-    assert result.pairs_per_second > 0
-    assert "pairs/s" in str(result)
-    rows = list(csv.DictReader(next(tmp_path.glob("logs/csv/*/metrics.csv")).open()))
-    assert float(rows[-1]["train/pairs_per_second"]) > 0
-    if result.memory_mib is not None:  # Linux
-        assert "peak memory" in str(result)
-        assert result.memory_mib > 100  # torch alone
-
-
 LOSS = LossConfig(lambda_s=(1, 1, 1))
 CONFIG = TrainConfig(model=ModelConfig(levels=4), loss=LOSS, supervision="mixed", mixed_self=3.0, device="cpu")
 
@@ -179,7 +174,7 @@ def test_each_pair_counts_by_what_is_known_of_it() -> None:
     torch.testing.assert_close(unlabelled, 3.0 * alone([0, 1, 2]))
 
 
-def test_a_run_on_both_kinds_trains(tmp_path: Path) -> None:
+def test_a_run_on_both_kinds_trains_and_scales_have_weights_of_their_own(tmp_path: Path) -> None:
     torch.set_num_threads(1)
     bare, known = (Shifts(2, 64, 1.0, seed=seed) for seed in (6, 5))
     for sample in bare.samples:
@@ -187,9 +182,6 @@ def test_a_run_on_both_kinds_trains(tmp_path: Path) -> None:
     config = CONFIG.model_copy(update={"steps": 2, "batch_size": 2})
     both = ConcatDataset([bare, known])  # the first pair has no flow: not refused
     assert train(config, both, None, tmp_path).weights.is_file()
-
-
-def test_scales_have_weights_of_their_own_under_supervision() -> None:
     flows, truth = [torch.rand(1, 2, 64 >> s, 64 >> s) for s in range(3)], torch.zeros(1, 2, 64, 64)
     coarse, own = LossConfig(lambda_s=(0, 0, 2)), LossConfig(lambda_s=(1, 0, 0), flow_s=(0, 0, 2))
     torch.testing.assert_close(flow_loss(flows, truth, own)[0], flow_loss(flows, truth, coarse)[0])

@@ -49,9 +49,7 @@ class CtrlC(Dataset):
 
 
 @pytest.mark.parametrize("validates", [True, False])
-def test_a_run_interrupted_by_ctrl_c_ends_with_the_same_weights(
-    pairs: Shifts, tmp_path: Path, validates: bool, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_interrupted_by_ctrl_c_ends_with_the_same_weights(pairs, tmp_path, validates, capsys) -> None:
     config = small(steps=5, validate_every=2, save_every=2, schedule="one_cycle", warmup_steps=2)
     validation, cut = pairs if validates else None, tmp_path / "cut"
     whole = train(config, pairs, validation, tmp_path / "whole")
@@ -121,9 +119,7 @@ def test_a_pair_that_a_loading_process_cannot_use_is_named_and_the_process_ends(
 
 
 @pytest.mark.parametrize("steps", [4, 2])
-def test_a_run_whose_validation_failed_is_saved_and_validates_when_resumed(
-    pairs: Shifts, tmp_path: Path, steps: int
-) -> None:
+def test_a_run_whose_validation_failed_is_saved_and_validates_when_resumed(pairs: Shifts, tmp_path, steps: int) -> None:
     class OneSmall(CtrlC):
         def __getitem__(self, index: int) -> dict:
             sample = self.pairs[index]
@@ -170,21 +166,18 @@ def test_the_folder_of_a_run_holds_logs_weights_and_settings(pairs: Shifts, tmp_
     assert np.mean(off) == pytest.approx(result.best, rel=1e-4)
 
 
-def test_without_truth_the_photometric_loss_chooses(tmp_path: Path) -> None:
+def test_without_truth_the_photometric_loss_chooses_and_the_learning_rate_rises_and_falls(tmp_path: Path) -> None:
     pairs = Shifts(2, 64, 1.0, seed=2, flow=False)
     result = train(small(steps=2, validate_every=1), pairs, pairs, tmp_path)
     assert set(result.metrics) == {"psnr_db", "no_motion_psnr_db", "photometric_loss"}
     assert result.best <= result.metrics["photometric_loss"]
-
-
-def test_learning_rate_rises_and_falls() -> None:
     config = TrainConfig(steps=110, warmup_steps=10, schedule="one_cycle")
     factors = [learning_rate_factor(config, step) for step in (0, 9, 10, 60, 110)]
     assert factors == pytest.approx([0.1, 1, 1, 0.5, 0], abs=1e-15)
     assert learning_rate_factor(TrainConfig(), 1000) == 1
 
 
-def test_fine_tuning_starts_from_the_given_weights(pairs: Shifts, tmp_path: Path) -> None:
+def test_fine_tuning_starts_from_the_given_weights_and_folders_of_other_runs_are_refused(pairs, tmp_path) -> None:
     first = train(small(steps=1), pairs, None, tmp_path / "first").weights
     # a learning rate of 1e-12 changes float32 weights of size 1e-2 by less than their rounding
     second = train(small(steps=1, learning_rate=1e-12, seed=5), pairs, None, tmp_path / "second", initial=first).weights
@@ -192,9 +185,6 @@ def test_fine_tuning_starts_from_the_given_weights(pairs: Shifts, tmp_path: Path
     other = small(model={"levels": 5, "projected_channels": 8}, loss={"lambda_s": [1.0] * 4})
     with pytest.raises(InputError, match=r"its architecture is not that of the run .levels: 4 there, 5 here"):
         train(other, pairs, None, tmp_path / "third", initial=first)
-
-
-def test_folders_of_other_runs_are_refused(pairs: Shifts, tmp_path: Path) -> None:
     config, run = small(steps=2), tmp_path / "run"
     with pytest.raises(InputError, match="no run to resume there"):
         train(config, pairs, None, run, resume=True)
@@ -231,7 +221,7 @@ def test_a_run_is_not_resumed_with_other_pairs(tmp_path: Path) -> None:
     assert train(small(steps=2), other, data, run, resume=True).steps == 2
 
 
-def test_settings_that_the_data_or_the_machine_cannot_serve(pairs: Shifts, tmp_path: Path) -> None:
+def test_settings_that_cannot_be_served_or_diverge_are_told_and_leave_nothing(pairs: Shifts, tmp_path: Path) -> None:
     with pytest.raises(InputError, match='supervision = "self"'):
         train(small(supervision="flow"), Shifts(1, 64, 1.0, seed=3, flow=False), None, tmp_path / "a")
     with pytest.raises(InputError, match="training set: holds no pair"):
@@ -240,9 +230,6 @@ def test_settings_that_the_data_or_the_machine_cannot_serve(pairs: Shifts, tmp_p
         with pytest.raises(InputError, match="no CUDA device was found"):
             train(small(device="cuda"), pairs, None, tmp_path / "c")
     assert not list(tmp_path.iterdir())
-
-
-def test_a_run_that_diverges_says_so_and_keeps_no_ruined_state(pairs: Shifts, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="training has diverged; lower learning_rate"):
         train(small(steps=20, learning_rate=1e30), pairs, None, tmp_path)
     assert not (tmp_path / "state.ckpt").exists()

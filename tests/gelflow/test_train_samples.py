@@ -15,15 +15,12 @@ from gelflow.train.resident import resident
 from gelflow.train.samples import CheckedPairs, StepSampler, TrainingBatches, TrainingSamples, checked, collate, resized
 
 
-def test_every_pass_sees_every_pair_once_in_another_order() -> None:
+def test_passes_see_every_pair_once_a_later_start_goes_on_and_processes_share_batches() -> None:
     keys = [key for batch in StepSampler(6, TrainConfig(batch_size=4), 0, 6) for key in batch]
     passes = [[index for index, _ in keys[i : i + 6]] for i in range(0, 24, 6)]
     assert all(sorted(one) == list(range(6)) for one in passes)
     assert passes[0] != passes[1] or passes[1] != passes[2]
     assert [draw for _, draw in keys] == list(range(24))
-
-
-def test_a_later_start_goes_on_with_the_same_batches_and_processes_share_them() -> None:
     config = TrainConfig(batch_size=4, seed=3)
     whole = list(StepSampler(7, config, 0, 10))
     assert list(StepSampler(7, config, 4, 10)) == whole[4:]
@@ -74,13 +71,23 @@ def left_after_warping(sample: dict, counts: torch.Tensor, mode: str = "bilinear
     return float(error / still)
 
 
-def test_resizing_brings_flow_and_images_to_the_new_px() -> None:
+def test_resizing_keeps_flow_and_batches_need_one_size_and_enough_pixels() -> None:
     former = checked(Shifts(1, 96, 6.0, seed=6)[0])
     sample = resized(former, (64, 192))
     scale = torch.tensor([2, 64 / 96])
     torch.testing.assert_close(sample["flow"][:, 0, 0], former["flow"][:, 0, 0] * scale)
     # low-pass filters of the resampling act near the border and attenuate waves alike elsewhere
     assert left_after_warping(sample, torch.ones(64, 192, dtype=torch.bool)) < 0.1
+    small, large, bare = (checked(Shifts(1, side, 1.0, seed=8, flow=flow)[0])
+                          for side, flow in ((64, True), (80, True), (64, False)))  # fmt: skip
+    with pytest.raises(InputError, match="different sizes; set image_size"):
+        collate([small, large])
+    for side, crop, words in ((48, None, "48x48 px, but each side must be at least 64"),
+                              (64, (72, 64), "crop_size 72x64 does not fit")):  # fmt: skip
+        with pytest.raises(InputError, match=words):
+            TrainingSamples(Shifts(1, side, 1.0, seed=8), TrainConfig(crop_size=crop))[(0, 0)]
+    assert "flow" not in collate([small, bare])
+    assert collate([small, small])["flow"].shape == (2, 2, 64, 64)
 
 
 def broken(**changes: object) -> dict:
@@ -104,19 +111,6 @@ def broken(**changes: object) -> dict:
 def test_samples_that_cannot_be_used_are_named(sample: dict, words: str) -> None:
     with pytest.raises(InputError, match=words):
         checked(sample, supervised=True)
-
-
-def test_batches_need_one_size_and_enough_pixels_and_have_flow_only_if_all_samples_do() -> None:
-    small, large, bare = (checked(Shifts(1, side, 1.0, seed=8, flow=flow)[0])
-                          for side, flow in ((64, True), (80, True), (64, False)))  # fmt: skip
-    with pytest.raises(InputError, match="different sizes; set image_size"):
-        collate([small, large])
-    for side, crop, words in ((48, None, "48x48 px, but each side must be at least 64"),
-                              (64, (72, 64), "crop_size 72x64 does not fit")):  # fmt: skip
-        with pytest.raises(InputError, match=words):
-            TrainingSamples(Shifts(1, side, 1.0, seed=8), TrainConfig(crop_size=crop))[(0, 0)]
-    assert "flow" not in collate([small, bare])
-    assert collate([small, small])["flow"].shape == (2, 2, 64, 64)
 
 
 @pytest.mark.parametrize("supervision", ["flow", "mixed"])
@@ -188,15 +182,12 @@ def test_the_moved_pair_obeys_its_flow(seed: int) -> None:
     assert left_after_warping(after, middle, "spline") < 0.01
 
 
-def test_no_motion_leaves_everything_as_it_is() -> None:
+def test_no_motion_leaves_everything_and_any_leaves_a_bare_gel_as_it_is() -> None:
     before = sample()
     after = moved(before, MotionConfig(shift_px=0, turn_deg=0, zoom=0), 0)
     # Sampling positions are rounded to 1e-7 of 112 px, the waves' slope is below 0.1 per px.
     torch.testing.assert_close(after["image2"], before["image2"], rtol=0, atol=1e-5)
     torch.testing.assert_close(after["flow"], before["flow"], rtol=0, atol=1e-5, equal_nan=True)
-
-
-def test_a_bare_gel_stays_as_it_is_beside_others() -> None:
     bare, dotted = sample() | {"bare": True}, sample()
     config = TrainConfig(motion=MotionConfig(), flip=True, color_jitter=0.2)
     for seed in range(4):

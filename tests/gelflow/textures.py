@@ -46,7 +46,6 @@ def save(path: Path, image: NDArray[np.float32]) -> None:
 
 
 def write_video(path: Path, frames: list[NDArray[np.uint8]]) -> None:
-    """Writes frames as Motion JPEG."""
     height, width = frames[0].shape[:2]
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (width, height))
     assert writer.isOpened()

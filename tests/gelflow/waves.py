@@ -90,7 +90,6 @@ def weights_of(path: Path) -> dict[str, Tensor]:
 
 
 def same_weights(first: Path, second: Path) -> bool:
-    """Whether two files hold the same weights, bit by bit."""
     one, two = weights_of(first), weights_of(second)
     return one.keys() == two.keys() and all(torch.equal(one[name], two[name]) for name in one)
 
@@ -98,7 +97,6 @@ def same_weights(first: Path, second: Path) -> bool:
 def random_weights(
     path: Path, model: ModelConfig, train: TrainConfig | None = None, size: tuple[int, int] | None = None
 ) -> Path:
-    """Weights as a new network has them, with the record of a training."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
     network = GelFlow(model)

@@ -19,7 +19,6 @@ def presses_of(scenes: Sequence[Scene], mesh: PadMesh, folder: Path | None = Non
 def simulate_scenes(
     scenes: Sequence[Scene], mesh: PadMesh, folder: Path | None = None, device: str = "cpu", **options: Any
 ) -> list[Trajectory]:
-    """In the order of the scenes; options of `simulate_presses`."""
     pad = prepare(scenes[0], mesh, device)
     found = dict(simulate_presses(presses_of(scenes, mesh, folder), pad, **options))
     assert sorted(found) == list(range(len(scenes)))

@@ -15,8 +15,7 @@ from synth.arrays import FloatArray
 
 Stiffening = tuple[float, float]
 NEO_HOOKEAN: Stiffening = (0.0, 0.0)
-YEOH: Stiffening = (0.2, 0.05)
-"""C20/C10 and C30/C10 large enough to triple the stress at a stretch of two."""
+YEOH: Stiffening = (0.2, 0.05)  # C20/C10 and C30/C10 large enough to triple the stress at a stretch of two
 
 
 def shear_modulus(poisson_ratio: float) -> float:

@@ -8,7 +8,6 @@ from tiny_scene import own_cache, write_tiny
 
 @pytest.fixture
 def tiny(tmp_path: Path) -> Path:
-    """The file of the tiny scene."""
     return write_tiny(tmp_path)
 
 

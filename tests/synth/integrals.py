@@ -82,11 +82,9 @@ class Integrals:
 
     @property
     def positions(self) -> FloatArray:
-        """(m, q, 3) undeformed, mm."""
         return np.einsum("qa,eac->eqc", self.shape, self.space.points[self.space.nodes])
 
     def values(self, nodal: FloatArray) -> FloatArray:
-        """(m, q, 3) of a nodal vector field (n, 3)."""
         return np.einsum("qa,eac->eqc", self.shape, nodal[self.space.nodes])
 
     def deformation(self, displacement: FloatArray) -> FloatArray:
@@ -101,7 +99,6 @@ class Integrals:
         return total
 
     def norm(self, field: FloatArray) -> float:
-        """L2 norm of a field (m, q, ...)."""
         square = (field**2).reshape(*self.volume.shape, -1).sum(axis=-1)
         return float(np.sqrt((self.volume * square).sum()))
 

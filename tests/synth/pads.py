@@ -1,29 +1,32 @@
-"""Small pads and scenes for the tests of mesh and simulation.
+"""Small pads, scenes and boundary-value problems for the tests of mesh and simulation.
 
 `brick` is a structured box whose mesh is its own mirror image in x and in y, so that symmetry can be tested to
-rounding, and free of the mesher's randomness.
+rounding, and free of the mesher's randomness. The solver holds displacement components at the value they have at the
+start, so that prescribed motion is a `held` mask and a start; dead loads are nodal forces. Everything for E = 1.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import permutations
 from typing import Any
 
 import numpy as np
 
-from synth.arrays import FloatArray
+from synth.arrays import BoolArray, FloatArray, Points
 from synth.mesh import PadMesh
 from synth.mesh.pad import boundary_faces, signed_volumes
 from synth.scene import Scene
-from synth.simulate import Trajectory
+from synth.simulate import Trajectory, simulate
 from synth.simulate.contact import Indenters
 from synth.simulate.element import Element, p1, p1p1, p2p1
 from synth.simulate.indenter import rigid_body
 from synth.simulate.load_path import LoadPath
-from synth.simulate.material import pad_material, uniform
+from synth.simulate.material import Material, pad_material, uniform
+from synth.simulate.newton import relative_residual, solve
 from synth.simulate.options import SolverOptions
-from synth.simulate.space import function_space
+from synth.simulate.space import Space, function_space
 from synth.simulate.stepping import Stepper
-from synth.simulate.system import System, Tangent
+from synth.simulate.system import System, Tangent, Unknowns
 from synth.simulate.tables import pack_indenter, place_indenter
 from synth.surface import ContactFaces
 
@@ -32,9 +35,9 @@ SPHERE = {"shape": "sphere", "radius_mm": 3.0}
 PUNCH = {"shape": "cylinder", "radius_mm": 2.0, "length_mm": 6.0, "fillet_mm": 0.5}
 DRAG: dict[str, Any] = {"depth_mm": 0.6, "shear_mm": [0.8, -0.3], "twist_deg": 10.0, "position_mm": [0.4, 0.2]}
 DRAG["steps"] = 4
+FILM = {"thickness_mm": 1.0, "youngs_modulus_kpa": 2000.0, "poisson_ratio": 0.499, "stiffening": (0.1, 0.02)}
 ELEMENT: dict[str, Callable[[], Element]] = {"p1": p1, "p1p1": p1p1, "p2p1": p2p1}
-MIXED = ["p1p1", "p2p1"]
-"""Names of the elements that have a pressure field, to be a test's parameters."""
+MIXED = ["p1p1", "p2p1"]  # Names of the elements that have a pressure field, to be a test's parameters
 
 
 def contact_faces(mesh: PadMesh) -> ContactFaces:
@@ -77,6 +80,18 @@ def crooked(size: tuple[float, float, float] = (3.0, 2.0, 2.0), seed: int = 0) -
     return mesh
 
 
+def layered(mesh: PadMesh, interface: float = 1.0) -> PadMesh:
+    """The same pad in two layers, which meet at z = interface."""
+    layer = (mesh.points[mesh.tets].mean(axis=1)[:, 2] > interface).astype(np.int32)
+    assert 0 < layer.sum() < len(layer)
+    return PadMesh(mesh.points, mesh.tets, mesh.size_mm, layer)
+
+
+def pad(layers: bool) -> PadMesh:
+    """Plain, or with the first of four planes of cells for a film."""
+    return layered(brick(SIZE, (4, 4, 4))) if layers else brick()
+
+
 def scene(size: tuple[float, float, float] = SIZE, **parts: Any) -> Scene:
     """A scene of a bare pad, P1/P1 by default. parts: gel, indenter, friction, motion, numerics as in a scene file."""
     return Scene.model_validate(
@@ -112,6 +127,13 @@ def same(a: Trajectory, b: Trajectory) -> bool:
         (s.displacement == t.displacement).all() and (s.traction == t.traction).all() and s.summary() == t.summary()
         for s, t in zip(a.states, b.states, strict=True)
     )
+
+
+def complete(posed: Scene, mesh: PadMesh) -> Trajectory:
+    """The trajectory of a scene, which must reach its end."""
+    result = simulate(posed, mesh)
+    assert (result.status, result.reason) == ("complete", "")
+    return result
 
 
 def system(mesh: PadMesh, poisson_ratio: float, penalty: float = 50.0, element: Element | None = None) -> System:
@@ -155,3 +177,73 @@ def indenters(posed: Scene, at: float) -> Indenters:
 def far_away() -> Indenters:
     """An indenter that touches nothing."""
     return indenters(scene(motion={"depth_mm": -40.0}), 0.0)
+
+
+TIGHT = 1e-10  # Tolerance of the relative residual: what is compared with closed forms should not show Newton's method
+
+
+def mapped(counts: tuple[int, int, int], to: Callable[[Points], Points], thickness: float) -> PadMesh:
+    """The unit cube [0, 1]³ of counts cells, its nodes moved to `to` of them; bonded where z = thickness."""
+    cube = brick((1.0, 1.0, 1.0), counts)
+    points = to(cube.points + np.array([0.5, 0.5, 0.0]))
+    size = (float(np.ptp(points[:, 0])), float(np.ptp(points[:, 1])), thickness)
+    mesh = PadMesh(points, cube.tets, size)
+    assert mesh.volumes.min() > 0
+    return mesh
+
+
+def supported(mesh: PadMesh, element: Element, held: Callable[[Points], BoolArray]) -> Space:
+    """The space held where `held`, a function of the nodes (n, 3), says so (n, 3)."""
+    space = function_space(mesh, element)
+    return replace(space, held=held(space.points))
+
+
+def equilibrium(
+    space: Space,
+    material: Material,
+    prescribed: FloatArray | None = None,
+    load: FloatArray | None = None,
+    steps: int = 1,
+    guess: Unknowns | None = None,
+    tolerance: float = TIGHT,
+) -> tuple[System, Unknowns, FloatArray]:
+    """Find the equilibrium of a body without contact under prescribed displacements and dead loads, in equal steps.
+
+    Args:
+        space: whose held components move to `prescribed`.
+        material: of its elements.
+        prescribed: (n, 3) mm, read where held; default zero.
+        load: (n, 3) nodal forces in E mm².
+        steps: in how many equal parts; each starts from the last state extrapolated.
+        guess: first iterate of a single step, instead of the undeformed state.
+        tolerance: of Newton's method.
+
+    Returns:
+        the system, its state, and all nodal forces (n, 3): what the supports exert, zero elsewhere.
+    """
+    goal = np.zeros_like(space.points) if prescribed is None else prescribed
+    body = System(space, material, load=load)
+    state = guess or body.zero()
+    before = state
+    for k in range(1, steps + 1):
+        body.load = None if load is None else load * (k / steps)
+        ahead = state.plus(Unknowns(state.u - before.u, state.p - before.p), 1.0)
+        start = Unknowns(np.where(space.held, goal * (k / steps), ahead.u), ahead.p)
+        solution = solve(body, start, far_away(), tolerance)
+        assert solution.converged, f"step {k} of {steps}: residual {relative_residual(solution.residual):.1e}"
+        before, state = state, solution.state
+    return body, state, body.residual(state, far_away()).reaction
+
+
+def face_load(space: Space, on: Callable[[Points], BoolArray], traction: FloatArray) -> FloatArray:
+    """(n, 3) nodal forces of a constant traction (3,) on the boundary faces whose nodes all satisfy `on`.
+
+    A linear face gives a third of its force to each vertex; a straight quadratic one to each middle of an edge.
+    """
+    faces = space.faces[on(space.points)[space.faces].all(axis=1)]
+    a, b, c = (space.points[faces[:, i]] for i in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    bearing = faces if faces.shape[1] == 3 else faces[:, 3:]
+    load = np.zeros_like(space.points)
+    np.add.at(load, bearing, (area[:, None, None] / 3 * traction))
+    return load

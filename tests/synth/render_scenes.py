@@ -4,13 +4,14 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from kinematic_double import sheet
 from scipy.optimize import brentq
 
 from synth.arrays import Image, Points
 from synth.render.renderer import Renderer
 from synth.render.variant import Variant, choose_variant
 from synth.scene import Camera, Coating, Gel, Light, NoPattern, Pattern, Render, Sensor, Window
-from synth.surface import ContactFaces, GelSurface
+from synth.surface import GelSurface
 
 FAST = choose_variant("cpu")
 SCALAR = Variant("scalar_rgb", "test")
@@ -37,14 +38,8 @@ def small_sensor(
 
 
 def flat_surface(sensor: Sensor, cells: int = 12) -> GelSurface:
-    """The undeformed contact face as a regular grid of triangles whose normals point out of the gel (-z)."""
-    width, height = sensor.gel.size_mm[:2]
-    x, y = np.meshgrid(np.linspace(-width / 2, width / 2, cells + 1), np.linspace(-height / 2, height / 2, cells + 1))
-    nodes = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
-    index = np.arange(len(nodes), dtype=np.int32).reshape(x.shape)
-    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:]))
-    faces = np.vstack([np.column_stack([a, c, b]), np.column_stack([b, c, d])])
-    return GelSurface(ContactFaces(nodes, faces), subdivisions=2)
+    """The undeformed contact face as a regular grid of triangles."""
+    return sheet(cells, cells, *sensor.gel.size_mm[:2], 2)
 
 
 def plain(value: float = 0.6) -> Image:

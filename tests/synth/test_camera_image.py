@@ -20,12 +20,20 @@ def _camera(**fields):
     return small_sensor(**(SIZE | fields)).camera
 
 
-def test_noiseless_levels_follow_exposure_and_gamma_and_clip() -> None:
+def test_levels_follow_exposure_gamma_and_the_vignette_and_clip() -> None:
     camera = _camera(gamma=2.0, exposure=1.44)
     lit, overexposed = (camera_image(_flat(value), camera, np.random.default_rng(0)) for value in (0.25, 3.0))
     assert lit.dtype == np.uint8
     assert np.all(lit == round(255 * (0.25 * 1.44) ** 0.5))
     assert np.all(overexposed == 255)
+    camera = _camera(vignetting=0.6, cx=50.5, cy=20.5)
+    fall = vignette(camera)
+    assert fall[20, 50] == 1
+    assert fall.argmin() == fall.size - 1
+    # The corner pixel's centre is half a pixel short of the corner itself.
+    ratio = ((199.5 - 50.5) ** 2 + (149.5 - 20.5) ** 2) / ((200 - 50.5) ** 2 + (150 - 20.5) ** 2)
+    assert fall[-1, -1] == pytest.approx(1 - 0.6 * ratio, rel=1e-12)
+    assert np.allclose(expected_signal(_flat(0.5), camera)[:, :, 0], 0.5 * fall)
 
 
 @pytest.mark.parametrize("bits", [10, 12, 14, 16])
@@ -51,7 +59,7 @@ def test_noise_has_the_photon_transfer_variance_and_comes_from_the_generator_alo
     assert image.mean() == pytest.approx(signal, abs=4 * np.sqrt(expected / image.size))
 
 
-def test_blur_is_a_normalised_gaussian() -> None:
+def test_blur_is_a_normalised_gaussian_and_the_same_in_every_channel() -> None:
     impulse = np.zeros((150, 200, 3), dtype=np.float32)
     impulse[75, 100] = 1
     blurred = expected_signal(impulse, _camera(blur_px=1.5))[:, :, 1]
@@ -59,25 +67,11 @@ def test_blur_is_a_normalised_gaussian() -> None:
     assert blurred.sum() == pytest.approx(1, rel=1e-6)
     # A sampled Gaussian of sigma >= 1 px keeps its second moment to 1e-7; cutting it at 4 sigma costs below 2e-3.
     assert (blurred.sum(0) * x**2).sum() == pytest.approx(1.5**2, rel=2e-3)
-
-
-def test_a_grey_image_is_a_channel_of_a_grey_coloured_one() -> None:
     camera = _camera(blur_px=0.8, vignetting=0.3)
     ramp = np.linspace(0, 1, 150 * 200, dtype=np.float32).reshape(150, 200, 1)
     grey, colour = (expected_signal(image, camera) for image in (ramp, np.repeat(ramp, 3, axis=2)))
     assert grey.shape == (150, 200, 1)
     np.testing.assert_array_equal(grey[:, :, 0], colour[:, :, 1])
-
-
-def test_vignette_is_one_at_the_principal_point_and_least_in_the_farthest_corner() -> None:
-    camera = _camera(vignetting=0.6, cx=50.5, cy=20.5)
-    fall = vignette(camera)
-    assert fall[20, 50] == 1
-    assert fall.argmin() == fall.size - 1
-    # The corner pixel's centre is half a pixel short of the corner itself.
-    ratio = ((199.5 - 50.5) ** 2 + (149.5 - 20.5) ** 2) / ((200 - 50.5) ** 2 + (150 - 20.5) ** 2)
-    assert fall[-1, -1] == pytest.approx(1 - 0.6 * ratio, rel=1e-12)
-    assert np.allclose(expected_signal(_flat(0.5), camera)[:, :, 0], 0.5 * fall)
 
 
 def _lit_from_two_sides(shot_noise: float) -> Sensor:

@@ -50,17 +50,13 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "data"
 
 
-def test_each_camera_has_its_files_in_the_manifest(dataset):
+def test_each_camera_has_its_files_and_is_read_and_exported_by_its_name(dataset, tmp_path) -> None:
     names, data = {"image1.png", "image2.png", "flow.exr"}, read_dataset(dataset)
     for index in (0, 1):
         assert set(data.entry(index).sha256) == names | {"meta.json", "surface.npz"} | {f"left/{n}" for n in names}
         assert data.check_hashes(index) == []
     header = json.loads((dataset / "samples" / "000000" / "meta.json").read_text())
     assert header["scene"]["sensor"]["further_cameras"][0]["name"] == "left"
-
-
-def test_a_camera_is_read_by_its_name(dataset):
-    data = read_dataset(dataset)
     main, left = data.read(0), data.read(0, "left")
     assert (main.image1.shape, left.image1.shape, left.image2.shape) == ((24, 32, 3), (30, 40, 3), (30, 40, 3))
     assert left.flow.forward.shape == (30, 40, 2)
@@ -68,6 +64,10 @@ def test_a_camera_is_read_by_its_name(dataset):
     np.testing.assert_array_equal(main.further["left"].image2, left.image2)
     with pytest.raises(InputError, match=r"no camera 'right'.*left"):
         data.read(0, "right")
+    assert export(dataset, "flo", tmp_path / "left", camera="left") == 2
+    assert np.frombuffer((tmp_path / "left" / "000000_flow.flo").read_bytes()[4:12], "<i4").tolist() == [40, 30]
+    source = dataset / "samples" / "000000" / "left" / "image2.png"
+    assert (tmp_path / "left" / "000000_img2.png").read_bytes() == source.read_bytes()
 
 
 def test_verify_checks_every_camera(dataset, tmp_path):
@@ -105,13 +105,6 @@ def test_inspection_shows_every_camera(dataset, tmp_path):
     assert alone.numbers[0]["name"] == "000001/left"
 
 
-def test_export_takes_a_camera(dataset, tmp_path):
-    assert export(dataset, "flo", tmp_path / "left", camera="left") == 2
-    assert np.frombuffer((tmp_path / "left" / "000000_flow.flo").read_bytes()[4:12], "<i4").tolist() == [40, 30]
-    source = dataset / "samples" / "000000" / "left" / "image2.png"
-    assert (tmp_path / "left" / "000000_img2.png").read_bytes() == source.read_bytes()
-
-
 def test_a_sample_without_a_cameras_file_is_made_again(dataset, tmp_path, monkeypatch):
     own_cache(monkeypatch)
     copy = Path(shutil.copytree(dataset, tmp_path / "copy"))
@@ -137,17 +130,7 @@ def test_a_further_camera_changes_no_bit_of_the_main_one():
     assert frames[1]["other"].mean() > 0
 
 
-def test_lights_in_a_further_cameras_view_and_what_scalar_variants_lack_are_refused():
-    with pytest.raises(InputError, match=r"further_cameras 'other': sensor.lights\[0\].*between the camera"):
-        rendered(_with_other(fx=40.0, fy=40.0))
-    mirror = Mirror(position_mm=(3.0, 0.0, 12.0), normal=(-1, 0, 0), size_mm=(4.0, 4.0))
-    mirrored = small_sensor(1.45).model_copy(update={"mirrors": (mirror,)})
-    for sensor in (mirrored, small_sensor(1.45, lens="fisheye", distortion=(0.0, 0.0, 0.0, 0.0))):
-        with pytest.raises(InputError, match="needs LLVM 16 or newer"):
-            rendered(sensor, variant=SCALAR)
-
-
-def test_names_of_cameras_differ_and_flow_fields_fit_their_images():
+def test_names_sizes_lights_and_scalar_variants_that_further_cameras_cannot_have_are_refused() -> None:
     sensor = json.loads(_with_other().model_dump_json())
     with pytest.raises(ValueError, match="names must differ"):
         Sensor.model_validate({**sensor, "further_cameras": 2 * sensor["further_cameras"]})
@@ -155,3 +138,10 @@ def test_names_of_cameras_differ_and_flow_fields_fit_their_images():
     flow = FlowField(np.zeros((4, 6, 2), np.float32), np.zeros((4, 6), np.float32))
     with pytest.raises(ValueError, match="with a flow of"):
         CameraPair(image, image, flow)
+    with pytest.raises(InputError, match=r"further_cameras 'other': sensor.lights\[0\].*between the camera"):
+        rendered(_with_other(fx=40.0, fy=40.0))
+    mirror = Mirror(position_mm=(3.0, 0.0, 12.0), normal=(-1, 0, 0), size_mm=(4.0, 4.0))
+    mirrored = small_sensor(1.45).model_copy(update={"mirrors": (mirror,)})
+    for sensor in (mirrored, small_sensor(1.45, lens="fisheye", distortion=(0.0, 0.0, 0.0, 0.0))):
+        with pytest.raises(InputError, match="needs LLVM 16 or newer"):
+            rendered(sensor, variant=SCALAR)

@@ -33,16 +33,13 @@ def test_png_round_trip(tmp_path, dtype, shape):
     assert encode_png(image) == encode_png(image.copy(order="F"))
 
 
-def test_png_is_rgb_for_other_readers_and_another_kind_is_refused(tmp_path):
+def test_png_is_rgb_for_other_readers_and_other_kinds_or_damage_are_refused(tmp_path) -> None:
     """Red first: an independent reader must not see blue."""
     (tmp_path / "a.png").write_bytes(encode_png(np.full((4, 5, 3), (200, 0, 0), np.uint8)))
     assert Image.open(tmp_path / "a.png").getpixel((0, 0)) == (200, 0, 0)
     for image in (np.zeros((4, 4), np.float32), np.zeros((4, 4, 4), np.uint8)):
         with pytest.raises(ValueError, match="uint8 or uint16"):
             encode_png(image)  # type: ignore[arg-type]
-
-
-def test_every_truncated_png_and_a_flipped_bit_are_found(tmp_path):
     data, path = encode_png(RNG.integers(0, 255, (12, 12, 3)).astype(np.uint8)), tmp_path / "a.png"
     for size in range(len(data)):
         path.write_bytes(data[:size])
@@ -54,27 +51,13 @@ def test_every_truncated_png_and_a_flipped_bit_are_found(tmp_path):
         read_png(path)
 
 
-def test_npz_round_trip_and_bytes(tmp_path):
+def test_npz_and_json_are_exact(tmp_path) -> None:
     arrays = {"a": RNG.normal(size=(3, 2)), "b": np.arange(4, dtype=np.int32), "n": np.array(4)}
     (tmp_path / "a.npz").write_bytes(encode_npz(arrays))
     found = read_npz(tmp_path / "a.npz", ("a", "b", "n"))
     for name, array in arrays.items():
         np.testing.assert_array_equal(found[name], array, strict=True)
     assert encode_npz(arrays) == encode_npz(arrays)
-
-
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"no archive", "half"])
-def test_damaged_npz_is_named(tmp_path, content):
-    whole = encode_npz({"a": RNG.normal(size=100)})
-    (tmp_path / "a.npz").write_bytes(whole[: len(whole) // 2] if content == "half" else content)
-    with pytest.raises(InputError, match=r"a\.npz"):
-        read_npz(tmp_path / "a.npz", ("a",))
-    (tmp_path / "a.npz").write_bytes(whole)
-    with pytest.raises(InputError, match="lacks the array b"):
-        read_npz(tmp_path / "a.npz", ("b",))
-
-
-def test_json_is_strict_and_exact(tmp_path):
     value = {"x": np.float64(0.1) + 0.2, "nan": np.nan, "v": np.arange(3), "t": (1, True), "s": "[\n 1]", "e": []}
     document = to_document(value)
     expected = {"x": 0.1 + 0.2, "nan": None, "v": [0, 1, 2], "t": [1, True], "s": "[\n 1]", "e": []}
@@ -88,11 +71,22 @@ def test_json_is_strict_and_exact(tmp_path):
         read_document(tmp_path / "a.json")
 
 
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"no archive", "half"])
+def test_damaged_npz_is_named(tmp_path, content):
+    whole = encode_npz({"a": RNG.normal(size=100)})
+    (tmp_path / "a.npz").write_bytes(whole[: len(whole) // 2] if content == "half" else content)
+    with pytest.raises(InputError, match=r"a\.npz"):
+        read_npz(tmp_path / "a.npz", ("a",))
+    (tmp_path / "a.npz").write_bytes(whole)
+    with pytest.raises(InputError, match="lacks the array b"):
+        read_npz(tmp_path / "a.npz", ("b",))
+
+
 def _index(record):
     return int(record["index"])
 
 
-def test_lines_are_found_sorted_and_repaired(tmp_path):
+def test_lines_are_found_sorted_and_repaired_and_a_damaged_one_is_named(tmp_path) -> None:
     path = tmp_path / "a.jsonl"
     for index in (3, 1, 2, 1):
         append_line(path, {"index": index, "place": path.stat().st_size if path.exists() else 0})
@@ -103,6 +97,9 @@ def test_lines_are_found_sorted_and_repaired(tmp_path):
     assert merge_lines(path, _index) == {1, 2, 3}
     assert [json.loads(line)["index"] for line in path.read_text().splitlines()] == [1, 2, 3]
     assert scan_lines(path, _index).tidy
+    path.write_text('{"index": 1}\n{"ind\n{"index": 3}\n')
+    with pytest.raises(InputError, match=r"a\.jsonl: line 2 is damaged"):
+        scan_lines(path, _index)
 
 
 @pytest.mark.parametrize("torn", ['{"index": 9', '{"index": 9}', '{"other": 9}\n', "\0\0\0\n"])
@@ -113,13 +110,6 @@ def test_torn_last_line_does_not_count(tmp_path, torn):
         file.write(torn)
     table = scan_lines(path, _index)
     assert (list(table.places), table.tidy) == ([1], False)
-
-
-def test_damaged_line_in_the_middle_is_named(tmp_path):
-    path = tmp_path / "a.jsonl"
-    path.write_text('{"index": 1}\n{"ind\n{"index": 3}\n')
-    with pytest.raises(InputError, match=r"a\.jsonl: line 2 is damaged"):
-        scan_lines(path, _index)
 
 
 FLOW = translation_sample(5).flow
@@ -133,21 +123,7 @@ def path(tmp_path):
     return path
 
 
-def test_round_trip_is_exact_and_bytes_are_the_same(path):
-    found = read_flow(path)
-    for name in ("forward", "forward_visible", "backward", "backward_visible"):
-        np.testing.assert_array_equal(getattr(found, name), getattr(FLOW, name), strict=True)
-    assert list(found.extras) == ["contact.Y"]
-    np.testing.assert_array_equal(found.extras["contact.Y"], FLOW.extras["contact.Y"], strict=True)
-    before = path.read_bytes()
-    write_flow(path, FLOW, ATTRIBUTES)
-    assert path.read_bytes() == before
-    write_flow(path, FlowField(FLOW.forward, FLOW.forward_visible), {})
-    alone = read_flow(path)
-    assert (alone.backward, alone.backward_visible, dict(alone.extras)) == (None, None, {})
-
-
-def test_file_as_the_library_sees_it(path):
+def test_file_as_the_library_sees_it_and_a_round_trip_to_the_bit(path) -> None:
     """Channel names, type, compression and conventions are the contract with other programs."""
     with OpenEXR.File(str(path), separate_channels=True) as file:
         header, channels = file.header(), file.channels()
@@ -161,9 +137,20 @@ def test_file_as_the_library_sees_it(path):
         assert header["flow.units"] == "px"
         assert [key for key in header if key.startswith("channels.")] == ["channels.contact"]
         assert (header["scene.hash"], header["seed"], header["index"]) == ("abc", str(2**63), 5)
+    found = read_flow(path)
+    for name in ("forward", "forward_visible", "backward", "backward_visible"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(FLOW, name), strict=True)
+    assert list(found.extras) == ["contact.Y"]
+    np.testing.assert_array_equal(found.extras["contact.Y"], FLOW.extras["contact.Y"], strict=True)
+    before = path.read_bytes()
+    write_flow(path, FLOW, ATTRIBUTES)
+    assert path.read_bytes() == before
+    write_flow(path, FlowField(FLOW.forward, FLOW.forward_visible), {})
+    alone = read_flow(path)
+    assert (alone.backward, alone.backward_visible, dict(alone.extras)) == (None, None, {})
 
 
-def test_header_tells_what_the_optional_channels_are(tmp_path):
+def test_header_tells_what_the_optional_channels_are_and_missing_ones_are_listed(tmp_path) -> None:
     extras = {name: FLOW.forward_visible for part in OPTIONAL.values() for name in part.names}
     write_flow(tmp_path / "f.exr", FlowField(FLOW.forward, FLOW.forward_visible, extras=extras), {})
     header = read_channels(tmp_path / "f.exr")[1]
@@ -171,6 +158,15 @@ def test_header_tells_what_the_optional_channels_are(tmp_path):
     assert set(OPTIONAL) == set(Outputs.model_fields) - {"backward"}
     assert "MPa" in header["channels.traction"]
     assert "per undeformed area" in header["channels.traction"]
+    planes = {name: plane for name, plane in channels_of(FLOW).items() if name not in ("forward.V", "backward.visible")}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(dict(header), dict(planes)).write(str(tmp_path / "part.exr"))  # It changes both dictionaries.
+    with pytest.raises(InputError, match=r"lacks the channel forward\.V; it has .*forward\.U"):
+        read_flow(tmp_path / "part.exr")
+    planes["forward.V"] = planes["forward.U"]
+    OpenEXR.File(header, planes).write(str(tmp_path / "part.exr"))
+    with pytest.raises(InputError, match=r"lacks the channel backward\.visible"):
+        read_flow(tmp_path / "part.exr")
 
 
 def test_opencv_reads_the_forward_flow(path):
@@ -212,15 +208,3 @@ def test_foreign_file_is_named(tmp_path, content):
         read_channels(tmp_path / "other.exr")
     with pytest.raises(InputError, match=r"missing\.exr.*No such file"):
         read_channels(tmp_path / "missing.exr")
-
-
-def test_missing_channels_are_listed(tmp_path):
-    planes = {name: plane for name, plane in channels_of(FLOW).items() if name not in ("forward.V", "backward.visible")}
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    OpenEXR.File(dict(header), dict(planes)).write(str(tmp_path / "part.exr"))  # It changes both dictionaries.
-    with pytest.raises(InputError, match=r"lacks the channel forward\.V; it has .*forward\.U"):
-        read_flow(tmp_path / "part.exr")
-    planes["forward.V"] = planes["forward.U"]
-    OpenEXR.File(header, planes).write(str(tmp_path / "part.exr"))
-    with pytest.raises(InputError, match=r"lacks the channel backward\.visible"):
-        read_flow(tmp_path / "part.exr")

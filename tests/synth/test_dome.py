@@ -76,7 +76,7 @@ def test_mesh_fills_the_cap_at_second_order() -> None:
     assert lack[2] < 1e-3 * exact
 
 
-def test_nodes_of_the_face_lie_on_the_sphere_and_the_others_where_the_map_says() -> None:
+def test_structured_and_ftetwild_meshes_have_their_face_on_the_sphere(tmp_path: Path) -> None:
     counts = Counts((6, 4), (3, 2), 3)
     flat = graded_box(SIZE, Focus((2.0, 1.0), (2.0, 2.0)), counts, (0.5,))
     mesh = domed(flat, RADIUS)
@@ -93,9 +93,6 @@ def test_nodes_of_the_face_lie_on_the_sphere_and_the_others_where_the_map_says()
     assert share[film].max() == pytest.approx(0.5 / SIZE[2])
     assert mesh.hash != flat.hash
     assert domed(flat, None) is flat
-
-
-def test_ftetwild_meshes_are_bulged_or_refused(tmp_path: Path) -> None:
     numerics = Numerics(edge_length_mm=2.0)
     mesh = pad_mesh(gel(), numerics, [tmp_path])
     again = pad_mesh(gel(), numerics, [tmp_path])
@@ -150,7 +147,7 @@ def test_rays_meet_the_undeformed_dome_where_they_meet_the_sphere(parts: int) ->
     assert off.max() < (1.62 / parts) ** 2 / (8 * RADIUS) / 0.98 + 1.3e-3
 
 
-def test_shape_of_the_surface_at_rest() -> None:
+def test_shape_of_the_surface_at_rest_which_verify_tells_from_another_radius() -> None:
     """Two triangles for a flat pad as before; a dome's has its corners on the sphere and normals out of the gel."""
     assert len(rest_surface(gel(None)).triangles) == 2
     surface = rest_surface(gel())
@@ -160,9 +157,6 @@ def test_shape_of_the_surface_at_rest() -> None:
     np.testing.assert_allclose(surface.material[:, 2], sphere_z(surface.material), atol=8.6e-4)
     a, b, c = (surface.material[corner] for corner in surface.triangles.T)
     assert (np.cross(b - a, c - a)[:, 2] < 0).all()
-
-
-def test_verify_finds_a_dome_of_another_radius() -> None:
     sensor, _ = optics_of_a_fisheye()
     camera = ForwardCamera.of(sensor)
     for element in (p1p1(), p2p1()):
@@ -182,16 +176,13 @@ def path(
     return LoadPath(Motion.model_validate(given), rigid_body(indenter), radius)
 
 
-def test_depth_counts_from_the_face_below_the_position() -> None:
+def test_depth_counts_from_the_face_and_the_path_starts_where_the_body_first_touches() -> None:
     way = path(BALL, (3.0, -4.0), 0.7, RADIUS, shear_mm=(1.0, 0.5))
     lowest = [way.pose(s).centre[2] + 3.0 for s in (way.press_mm, way.length_mm)]
     assert lowest == pytest.approx([0.7 + 13 - 12] * 2, abs=1e-12)  # 5 mm from the apex of R = 13: √(169 - 25) = 12
     assert way.pose(way.length_mm).centre[:2] == pytest.approx([4.0, -3.5])
     flat = path(BALL, (3.0, -4.0), 0.7, None)
     assert (flat.touch_mm, flat.face_mm, flat.press_mm) == (0.0, 0.0, 0.7)
-
-
-def test_the_path_starts_where_the_body_first_touches() -> None:
     p, r = 5.0, 3.0
     s = math.sqrt(RADIUS**2 - p**2)
     # Two balls touch where their centres are R + r apart: (R + r)² = p² + (s + r - t)².
@@ -232,17 +223,13 @@ def test_footprint_is_the_lens_that_two_spheres_share(depth: float) -> None:
     assert plate.centre_mm == pytest.approx((0, 0), abs=4.1e-3 * circle)
 
 
-def test_a_dome_of_a_kilometre_has_the_flat_pads_footprint() -> None:
+def test_a_dome_of_a_kilometre_is_flat_and_one_without_radius_or_with_lights_outside_refused() -> None:
     ring, motion = Torus(shape="torus", radius_mm=3.0, tube_mm=1.0), {"shear_mm": (0.5, -0.4), "twist_deg": 10.0}
     flat, dome = (footprint(path(ring, (2.0, 1.0), 0.5, radius, **motion), SIZE, -0.05) for radius in (None, 1e6))
     # The face is r² / 2R = 5e-5 mm lower at the corners; where the ring's slope is 1 the overlap changes by as much,
     # and each rectangle is known to 0.2 % of its width of 8 mm.
     assert dome.half_mm == pytest.approx(flat.half_mm, abs=0.02)
     assert dome.centre_mm == pytest.approx(flat.centre_mm, abs=0.02)
-
-
-def test_shape_without_radius_and_lights_outside_the_dome_are_refused() -> None:
-    """0.1 mm behind the face at the apex is outside of the gel near a corner."""
     for radius, shape in ((None, "dome"), (RADIUS, "box")):
         with pytest.raises(ValidationError, match="belong together"):
             gel(radius, shape=shape)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from batches import simulate_scenes
 from bonded_layer import ball
-from pads import brick
+from pads import brick, complete
 from pads import scene as pad_scene
 
 from synth.errors import InputError
@@ -30,12 +30,10 @@ def scene(
 
 
 def pressed(drawn: Scene, focus: Focus, across: int) -> Trajectory:
-    result = simulate(drawn, graded_mesh(drawn.sensor.gel, focus, across)[0])
-    assert result.status == "complete", result.reason
-    return result
+    return complete(drawn, graded_mesh(drawn.sensor.gel, focus, across)[0])
 
 
-def test_a_dome_of_a_kilometre_is_a_flat_pad() -> None:
+def test_a_dome_of_a_kilometre_is_a_flat_pad_but_mesh_and_scene_must_be_of_one() -> None:
     motion, focus = {"position_mm": (0.8, -0.5), "depth_mm": 0.5, "steps": 1}, Focus((0.8, -0.5), (1.0, 1.0))
     drawn = (scene(radius, (10.0, 8.0, 4.0), BALL, **motion) for radius in (None, 1e6))
     flat, dome = (pressed(one, focus, 4).states[-1] for one in drawn)
@@ -46,6 +44,9 @@ def test_a_dome_of_a_kilometre_is_a_flat_pad() -> None:
     # The face itself moved by 2e-5 mm at most; displacements of up to 0.5 mm differ by less than that.
     np.testing.assert_allclose(dome.displacement, flat.displacement, atol=2e-5)
     assert np.abs(flat.displacement).max() > 0.4
+    flat, dome = (scene(radius, (10.0, 8.0, 4.0), BALL, depth_mm=0.1) for radius in (None, 20.0))
+    with pytest.raises(InputError, match=r"the mesh is of a \([^)]*\) mm pad, the scene's .* of dome radius 20"):
+        simulate(dome, graded_mesh(flat.sensor.gel, Focus((0.0, 0.0), (1.0, 1.0)), 4)[0])
 
 
 def test_a_plate_on_a_dome_follows_hertz_and_the_layer() -> None:
@@ -88,12 +89,6 @@ def test_pressed_beside_the_apex_the_plate_meets_the_apex() -> None:
     # and penetration that the passes leave, below 0.002 of each depth, that is up to 0.3 % of the force.
     assert force[1].force_n[2] == pytest.approx(force[0].force_n[2], rel=5e-3)
     assert force[1].depth_mm < 0.1 < force[0].depth_mm
-
-
-def test_mesh_and_scene_must_be_of_one_dome() -> None:
-    flat, dome = (scene(radius, (10.0, 8.0, 4.0), BALL, depth_mm=0.1) for radius in (None, 20.0))
-    with pytest.raises(InputError, match=r"the mesh is of a \([^)]*\) mm pad, the scene's .* of dome radius 20"):
-        simulate(dome, graded_mesh(flat.sensor.gel, Focus((0.0, 0.0), (1.0, 1.0)), 4)[0])
 
 
 def test_many_at_once_press_the_dome_as_one_does() -> None:

@@ -26,7 +26,7 @@ def dataset(tmp_path_factory):
     return directory
 
 
-def test_flo(dataset, tmp_path):
+def test_flo_and_npz(dataset, tmp_path) -> None:
     assert export(dataset, "flo", tmp_path / "o") == 3
     for index, shift in SHIFTS.items():
         flow = translation_sample(index, shift).flow
@@ -40,39 +40,16 @@ def test_flo(dataset, tmp_path):
         np.testing.assert_array_equal(hidden == 0, flow.forward_visible == 1)
         image = read_png(tmp_path / "o" / f"{index:06d}_img2.png")
         np.testing.assert_array_equal(image, translation_sample(index, shift).image2)
-
-
-def test_kitti_within_its_range(dataset, tmp_path):
-    export(dataset, "kitti", tmp_path / "o")
-    for index, shift in SHIFTS.items():
-        flow = translation_sample(index, shift).flow
-        for folder, valid in (("flow_occ", np.isfinite(flow.forward[..., 0])), ("flow_noc", flow.forward_visible == 1)):
-            stored = cv2.imread(str(tmp_path / "o" / "training" / folder / f"{index:06d}_10.png"), cv2.IMREAD_UNCHANGED)
-            assert stored.dtype == np.uint16
-            flag, v, u = np.moveaxis(stored.astype(np.float64), -1, 0)  # OpenCV: blue first.
-            np.testing.assert_array_equal(flag == 1, valid)
-            assert set(np.unique(flag)) <= {0, 1}
-            # Rounded to 1/64 px: off by half of that at most.
-            found = (np.column_stack([u[valid], v[valid]]) - 2**15) / 64
-            np.testing.assert_allclose(found, np.broadcast_to(shift, found.shape), rtol=0, atol=1 / 128)
-        assert (tmp_path / "o" / "training" / "image_2" / f"{index:06d}_11.png").exists()
-    flow = np.full((2, 2, 2), 600.0, np.float32)
-    with pytest.raises(InputError, match=r"600\.0 px is beyond the 512 px"):
-        kitti_png(flow, np.ones((2, 2), np.bool_))
-    kitti_png(flow, np.zeros((2, 2), np.bool_))
-
-
-def test_npz(dataset, tmp_path):
-    export(dataset, "npz", tmp_path / "o")
+    export(dataset, "npz", tmp_path / "npz")
     sample = translation_sample(1, SHIFTS[1])
     expected = {"forward": sample.flow.forward, "backward_visible": sample.flow.backward_visible}
     expected |= {"image1": sample.image1, **sample.flow.extras}
-    with np.load(tmp_path / "o" / "000001.npz") as found:
+    with np.load(tmp_path / "npz" / "000001.npz") as found:
         for name, values in expected.items():
             np.testing.assert_array_equal(found[name], values)
 
 
-def test_webdataset(dataset, tmp_path, monkeypatch):
+def test_webdataset_and_kitti_within_its_range(dataset, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("synth.dataset.export.SAMPLES_PER_SHARD", 2)
     seen: list[tuple[int, int]] = []
     export(dataset, "webdataset", tmp_path / "o", lambda done, total: seen.append((done, total)))
@@ -87,6 +64,25 @@ def test_webdataset(dataset, tmp_path, monkeypatch):
         image = cv2.imdecode(np.frombuffer(archive.extractfile("000000.image1.png").read(), np.uint8), cv2.IMREAD_COLOR)
         assert image.shape == (HEIGHT, WIDTH, 3)
         assert json.loads(archive.extractfile("000001.json").read())["index"] == 1
+    export(dataset, "kitti", tmp_path / "kitti")
+    for index, shift in SHIFTS.items():
+        flow = translation_sample(index, shift).flow
+        for folder, valid in (("flow_occ", np.isfinite(flow.forward[..., 0])), ("flow_noc", flow.forward_visible == 1)):
+            stored = cv2.imread(
+                str(tmp_path / "kitti" / "training" / folder / f"{index:06d}_10.png"), cv2.IMREAD_UNCHANGED
+            )
+            assert stored.dtype == np.uint16
+            flag, v, u = np.moveaxis(stored.astype(np.float64), -1, 0)  # OpenCV: blue first.
+            np.testing.assert_array_equal(flag == 1, valid)
+            assert set(np.unique(flag)) <= {0, 1}
+            # Rounded to 1/64 px: off by half of that at most.
+            found = (np.column_stack([u[valid], v[valid]]) - 2**15) / 64
+            np.testing.assert_allclose(found, np.broadcast_to(shift, found.shape), rtol=0, atol=1 / 128)
+        assert (tmp_path / "kitti" / "training" / "image_2" / f"{index:06d}_11.png").exists()
+    flow = np.full((2, 2, 2), 600.0, np.float32)
+    with pytest.raises(InputError, match=r"600\.0 px is beyond the 512 px"):
+        kitti_png(flow, np.ones((2, 2), np.bool_))
+    kitti_png(flow, np.zeros((2, 2), np.bool_))
 
 
 @pytest.mark.parametrize("format", ["flo", "kitti", "npz", "webdataset"])

@@ -40,11 +40,7 @@ def test_the_dataset_is_what_was_asked_for_and_verifies() -> None:
     assert dataset.entry(0).frames[0] == 0
     report = verify_dataset(reference())
     assert report.ok, report.record()
-
-
-def test_trajectories_of_one_sensor_show_the_same_undeformed_gel() -> None:
-    """Samples 0 and 2 are of one sensor: their first images differ by noise only, sample 4's by its dots."""
-    dataset = read_dataset(reference())
+    # Samples 0 and 2 are of one sensor: their first images differ by noise only, sample 4's by its dots.
     first = [dataset.read(i).image1.astype(float) for i in (0, 2, 4)]
     assert dataset.scene_of(0).sensor == dataset.scene_of(2).sensor != dataset.scene_of(4).sensor
     # read_noise 0.002 in linear light is at most 255 * 0.002 ** (1 / 2.2) = 15 levels in black, and 0.2 in white.
@@ -52,13 +48,19 @@ def test_trajectories_of_one_sensor_show_the_same_undeformed_gel() -> None:
     assert np.abs(first[0] - first[2]).mean() > 4
 
 
-def test_growing_in_steps_gives_the_same_files(tiny: Path, tmp_path: Path) -> None:
+def test_growing_in_steps_gives_the_same_files_and_progress_counts_up_to_n(tiny: Path, tmp_path: Path) -> None:
     """1, then 3 (which finishes a trajectory and begins another), then 5; n is in dataset.json alone."""
     template = load_scene(tiny)
     out = tmp_path / "grown"
     made = [(s.made, s.found) for s in (generate(template, n, out) for n in (1, 3, 5, 5, 2))]
     assert made == [(1, 0), (2, 1), (2, 3), (0, 5), (0, 2)]
     assert fingerprint(out) == fingerprint(reference())
+    calls, template = [], load_scene(tiny, ["motion.depth_mm=-1"])  # no touch: fast
+    summary = generate(template, 3, tmp_path / "d", progress=lambda done, total: calls.append((done, total)))
+    assert calls == [(2, 3), (3, 3)]
+    assert summary.seconds > sum(summary.stages.values()) > 0
+    entry = read_dataset(tmp_path / "d").entry(0)
+    assert entry.max_flow_px == pytest.approx(0, abs=1e-4)  # float32 of a pixel number: 32 * 2^-24
 
 
 def test_three_shards_in_any_order_give_the_same_files(tiny: Path, tmp_path: Path) -> None:
@@ -67,32 +69,6 @@ def test_three_shards_in_any_order_give_the_same_files(tiny: Path, tmp_path: Pat
     said = [(s.shard, s.made, s.asked_for, s.found) for s in done]
     assert said == [("2/3", 1, 1, 0), ("0/3", 2, 2, 0), ("1/3", 2, 2, 0)]  # trajectories of samples 0 1 | 2 3 | 4
     assert fingerprint(out) == fingerprint(reference())
-
-
-def test_ray_that_is_not_installed(tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "ray", None)  # what an import of a missing package does
-    with pytest.raises(InputError, match=r"--ray needs Ray: pip install 'gelflow-synth\[cluster\]'"):
-        generate(load_scene(tiny), 1, tmp_path / "d", scheduling=Scheduling(ray="local"))
-
-
-def test_the_summary_adds_up(tiny: Path, tmp_path: Path) -> None:
-    """Totals of the manifest, whatever runs they were made in; failures by reason, numbers left out."""
-    template, out = load_scene(tiny, ["motion.depth_mm={ normal = [-1.5, 4.0] }"]), tmp_path / "d"
-    seed = _first_seed_whose_draws(template, [False, False, True])
-    first, second = generate(template, 1, out, seed), generate(template, 3, out, seed)
-    summary = json.loads((out / "summary.json").read_text())
-    assert (summary["samples"], summary["asked_for"]) == (3, 3)
-    assert summary["last_run"] == json.loads(json.dumps(second.record()))
-    assert (second.made, second.found) == (2, 1)
-    assert second.samples_per_second == second.made / second.seconds
-    assert first.failures.total() == first.failed_draws >= 2
-    assert all("#" in reason and reason.startswith("draw: ") for reason in first.failures)
-    lines = [json.loads(line) for line in (out / "manifest.jsonl").read_text().splitlines()]
-    for stage, seconds in summary["seconds_per_stage"].items():
-        # Rounded to a thousandth there: up to 5e-4 off, and the rounding of a tie.
-        assert seconds == pytest.approx(sum(line["seconds"][stage] for line in lines), abs=5.1e-4)
-    assert sum(summary["share_per_stage"].values()) == pytest.approx(1, abs=2e-4)  # four, each rounded to 0.00005
-    assert summary["failed_draws"] == len((out / "failures.jsonl").read_text().splitlines())
 
 
 def test_a_lost_folder_and_a_foreign_line_are_made_good(tiny: Path, tmp_path: Path) -> None:
@@ -108,37 +84,22 @@ def test_a_lost_folder_and_a_foreign_line_are_made_good(tiny: Path, tmp_path: Pa
     assert fingerprint(out) == fingerprint(reference())
 
 
-def test_progress_counts_up_to_n(tiny: Path, tmp_path: Path) -> None:
-    calls, template = [], load_scene(tiny, ["motion.depth_mm=-1"])  # no touch: fast
-    summary = generate(template, 3, tmp_path / "d", progress=lambda done, total: calls.append((done, total)))
-    assert calls == [(2, 3), (3, 3)]
-    assert summary.seconds > sum(summary.stages.values()) > 0
-    entry = read_dataset(tmp_path / "d").entry(0)
-    assert entry.max_flow_px == pytest.approx(0, abs=1e-4)  # float32 of a pixel number: 32 * 2^-24
-
-
-@pytest.mark.parametrize(
-    ("changes", "difference"),
-    [
-        ({"seed": 1}, "seed: 0 there, 1 now"),
-        ({"overrides": ["motion.steps=3"]}, "scene.motion.steps: 2 there, 3 now"),
-        ({"overrides": ["motion.depth_mm=0.1"]}, "scene.motion.depth_mm: "),
-        ({"variant": "another"}, "device.variant: "),
-    ],
-)
-def test_a_directory_of_another_job_is_refused_and_left_alone(tiny: Path, changes: dict, difference: str) -> None:
-    template = load_scene(tiny, changes.get("overrides", ()))
-    variant = job_variant(template, "cpu")
-    if "variant" in changes:
-        variant = type(variant)("scalar_rgb" if variant.is_vectorised else "llvm_ad_rgb", "")
-    before = fingerprint(reference())
-    with pytest.raises(InputError, match="holds another job") as caught:
-        generate(template, 5, reference(), changes.get("seed", 0), variant)
-    assert difference in str(caught.value)
+def test_a_directory_of_another_job_is_refused_and_left_alone(tiny: Path) -> None:
+    before, variant = fingerprint(reference()), job_variant(load_scene(tiny), "cpu")
+    other = type(variant)("scalar_rgb" if variant.is_vectorised else "llvm_ad_rgb", "")
+    for overrides, seed, asked, difference in (
+        ([], 1, variant, "seed: 0 there, 1 now"),
+        (["motion.steps=3"], 0, variant, "scene.motion.steps: 2 there, 3 now"),
+        (["motion.depth_mm=0.1"], 0, variant, "scene.motion.depth_mm: "),
+        ([], 0, other, "device.variant: "),
+    ):
+        with pytest.raises(InputError, match="holds another job") as caught:
+            generate(load_scene(tiny, overrides), 5, reference(), seed, asked)
+        assert difference in str(caught.value)
     assert fingerprint(reference()) == before
 
 
-def test_wrong_numbers_and_a_scene_that_cannot_be_built_write_nothing(tiny: Path, tmp_path: Path) -> None:
+def test_wrong_numbers_scenes_that_cannot_be_built_and_a_missing_ray_are_told(tiny, tmp_path, monkeypatch) -> None:
     sound = load_scene(tiny)
     torus = load_scene(tiny, ['contact.indenter={ shape = "torus", radius_mm = 1, tube_mm = 2 }'])
     for template, n, seed, workers, message in (
@@ -150,6 +111,9 @@ def test_wrong_numbers_and_a_scene_that_cannot_be_built_write_nothing(tiny: Path
         with pytest.raises(InputError, match=message):
             generate(template, n, tmp_path / "d", seed, scheduling=Scheduling(workers=workers))
         assert not (tmp_path / "d").exists()
+    monkeypatch.setitem(sys.modules, "ray", None)  # what an import of a missing package does
+    with pytest.raises(InputError, match=r"--ray needs Ray: pip install 'gelflow-synth\[cluster\]'"):
+        generate(load_scene(tiny), 1, tmp_path / "d", scheduling=Scheduling(ray="local"))
 
 
 def _first_seed_whose_draws(template: Template, wanted: list[bool]) -> int:
@@ -165,7 +129,7 @@ def _first_seed_whose_draws(template: Template, wanted: list[bool]) -> int:
     return next(seed for seed in range(1000) if [fits(seed, k) for k in range(len(wanted))] == wanted)
 
 
-def test_failed_draws_are_logged_and_redrawn_the_same_way_in_every_run(tiny: Path, tmp_path: Path) -> None:
+def test_failed_draws_are_logged_redrawn_the_same_way_in_every_run_and_summed_up(tiny: Path, tmp_path: Path) -> None:
     """A depth of which many draws are more than the gel's thickness; going on logs nothing twice."""
     template = load_scene(tiny, ["motion.depth_mm={ normal = [-1.5, 4.0] }"])
     seed = _first_seed_whose_draws(template, [False, False, True])
@@ -176,9 +140,23 @@ def test_failed_draws_are_logged_and_redrawn_the_same_way_in_every_run(tiny: Pat
     assert [(f["index"], f["draw"], f["stage"]) for f in failures[:2]] == [(0, 0, "draw"), (0, 1, "draw")]
     assert "motion.depth_mm" in failures[0]["reason"]
     assert failures[0]["last_good_state"] is None
-    generate(template, 1, tmp_path / "parts", seed)
-    generate(template, 3, tmp_path / "parts", seed)
-    assert fingerprint(tmp_path / "parts") == fingerprint(tmp_path / "whole")
+    out = tmp_path / "parts"
+    first, second = generate(template, 1, out, seed), generate(template, 3, out, seed)
+    assert fingerprint(out) == fingerprint(tmp_path / "whole")
+    # Totals of the manifest, whatever runs they were made in; failures by reason, numbers left out.
+    summary = json.loads((out / "summary.json").read_text())
+    assert (summary["samples"], summary["asked_for"]) == (3, 3)
+    assert summary["last_run"] == json.loads(json.dumps(second.record()))
+    assert (second.made, second.found) == (2, 1)
+    assert second.samples_per_second == second.made / second.seconds
+    assert first.failures.total() == first.failed_draws >= 2
+    assert all("#" in reason and reason.startswith("draw: ") for reason in first.failures)
+    lines = [json.loads(line) for line in (out / "manifest.jsonl").read_text().splitlines()]
+    for stage, seconds in summary["seconds_per_stage"].items():
+        # Rounded to a thousandth there: up to 5e-4 off, and the rounding of a tie.
+        assert seconds == pytest.approx(sum(line["seconds"][stage] for line in lines), abs=5.1e-4)
+    assert sum(summary["share_per_stage"].values()) == pytest.approx(1, abs=2e-4)  # four, each rounded to 0.00005
+    assert summary["failed_draws"] == len((out / "failures.jsonl").read_text().splitlines())
 
 
 def test_a_simulation_that_fails_is_logged_with_its_last_good_state_and_redrawn(tiny: Path, tmp_path: Path) -> None:
@@ -252,9 +230,7 @@ def test_a_full_disk_loses_nothing_and_tears_nothing(tiny: Path, tmp_path: Path)
         (70.0, ["3 of 12", *(f"{done} of 12, 70.0 s each, about " for done in range(4, 12))]),
     ],
 )
-def test_a_line_a_minute_where_stderr_is_no_terminal(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, pace: float, lines: list[str]
-) -> None:
+def test_a_line_a_minute_where_stderr_is_no_terminal(capsys, monkeypatch, pace: float, lines: list[str]) -> None:
     """Two of twelve were there before; each of the others takes `pace` seconds."""
     clock = [0.0]
     monkeypatch.setattr("synth.progress.time.monotonic", lambda: clock[0])

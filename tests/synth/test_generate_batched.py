@@ -50,8 +50,7 @@ BATCHED = (
     .replace("steps = 2", "steps = 3")
     .replace("position_mm = [{ uniform = [-1.0, 1.0] }", "position_mm = [{ normal = [0.0, 3.0] }")
 )
-SAMPLES, SEED = 10, 10
-"""Five trajectories of three sensors and two pads; draws of every kind fail."""
+SAMPLES, SEED = 10, 10  # Five trajectories of three sensors and two pads; draws of every kind fail
 
 pytestmark = pytest.mark.usefixtures("one_cache")
 
@@ -99,14 +98,11 @@ def test_killed_with_workers_and_gone_on_with_alone(template: Template, whole: P
     assert fingerprint(out) == fingerprint(whole)
 
 
-def test_one_trajectory_alone_is_the_same(context: JobContext, whole: Path) -> None:
+def test_one_trajectory_alone_is_the_same_failed_draws_are_replaced_and_the_mesh_is_told(context, whole) -> None:
     """As a task of a cluster. Its second draw can be used."""
     outcome, dataset = Producer(context).produce(4, (8, 9)), read_dataset(whole)
     assert [failure.stage for failure in outcome.failures] == ["simulate"]
     assert [entry.sha256 for entry in outcome.entries] == [dataset.entry(index).sha256 for index in (8, 9)]
-
-
-def test_failed_draws_are_replaced(whole: Path) -> None:
     failures = read_dataset(whole).failures
     kinds = Counter((failure["stage"], failure["last_good_state"] is None) for failure in failures)
     # Broken schema; a body that cannot be built; a body that finds no contact point, with the state before.
@@ -114,6 +110,12 @@ def test_failed_draws_are_replaced(whole: Path) -> None:
     for first in {failure["index"] for failure in failures}:
         draws = [failure["draw"] for failure in failures if failure["index"] == first]
         assert draws == list(range(len(draws)))
+    dataset = read_dataset(whole)
+    told = [dataset.entry(index).diagnostics for index in range(SAMPLES)]
+    assert len({each["mesh"] for each in told}) == 2  # of two pads
+    first, scene = told[0], dataset.scene_of(0)
+    assert first["mesh"] == shared_mesh(scene.sensor.gel, scene.numerics).hash
+    assert first["predicted_error_px"] == round(accuracy(scene).error_px, 4)
 
 
 AGREEMENT = 2e-4
@@ -121,7 +123,7 @@ AGREEMENT = 2e-4
 at most was seen (docs/reports/batched_fem.md). States that are not corrected are off by 0.07 to 0.16."""
 
 
-def test_a_batch_agrees_with_the_single_solver(context: JobContext) -> None:
+def test_a_batch_agrees_with_the_single_solver_and_hopeless_trajectories_are_given_up(context: JobContext) -> None:
     """On the same meshes: the same draws fail for the same reasons, and what is left is the same motion."""
     results = {found.number: found for found in map(_trajectory, in_batches(context, _tasks(range(5)), 4))}
     assert sorted(results) == list(range(5))
@@ -137,6 +139,11 @@ def test_a_batch_agrees_with_the_single_solver(context: JobContext) -> None:
             scale = np.linalg.norm(state.displacement)
             assert np.linalg.norm(other.displacement - state.displacement) <= AGREEMENT * scale
             np.testing.assert_allclose(other.force_n, state.force_n, rtol=0, atol=1e-3 * np.linalg.norm(state.force_n))
+    needle = 'contact.indenter={shape = "sphere", radius_mm = 0.06}'
+    planned = plan(load_scene(context.plan.template.source, [needle, "motion.position_mm=[0.3, 0.2]"]))
+    (result,) = in_batches(replace(context, plan=planned), _tasks([0]), 2)
+    assert isinstance(result, Outcome)
+    assert (result.given_up, len(result.failures)) == ((0, 1), MAX_DRAWS)
 
 
 def _said(failures: Iterable[Failure]) -> list[tuple[object, ...]]:
@@ -155,14 +162,6 @@ def _alone(attempts: Attempts) -> SimulatedTrajectory:
         if simulated is not None:
             return simulated[0]
     raise AssertionError("no draw could be used")
-
-
-def test_a_trajectory_whose_every_draw_fails_is_given_up(context: JobContext) -> None:
-    needle = 'contact.indenter={shape = "sphere", radius_mm = 0.06}'
-    planned = plan(load_scene(context.plan.template.source, [needle, "motion.position_mm=[0.3, 0.2]"]))
-    (result,) = in_batches(replace(context, plan=planned), _tasks([0]), 2)
-    assert isinstance(result, Outcome)
-    assert (result.given_up, len(result.failures)) == ((0, 1), MAX_DRAWS)
 
 
 def test_frames_of_each_job_are_its_own() -> None:
@@ -220,7 +219,7 @@ def test_items_made_ahead_come_in_order_with_errors_and_no_more_than_there_is_ro
 GEL = Gel(size_mm=(20.0, 15.0, 4.0), youngs_modulus_kpa=200.0)
 
 
-def test_the_shared_mesh_is_even_and_as_high_as_wide() -> None:
+def test_the_shared_mesh_is_even_and_the_predicted_error_falls_with_its_spacing(template: Template) -> None:
     """Planes through the thickness: the first element is as high as the others are wide, as far as growth allows."""
     numerics = Numerics(solver="batched", cells=(16, 12, 2))
     mesh = shared_mesh(GEL, numerics)
@@ -231,10 +230,7 @@ def test_the_shared_mesh_is_even_and_as_high_as_wide() -> None:
     np.testing.assert_allclose(np.diff(y), 1.25, atol=1e-9)
     assert z[1] == pytest.approx(max(1.25, 4.0 / 3.2), abs=1e-6)  # 1 + growth of at most 2.2
     assert spacing_mm(GEL, numerics) == pytest.approx(1.25, abs=1e-6)
-
-
-def test_the_predicted_error_falls_with_the_spacing(template: Template) -> None:
-    """By the model's exponent of 1.6, at equal proportions of the elements; and the rule says the same."""
+    # By the model's exponent of 1.6, at equal proportions of the elements; and the rule says the same.
     drawn = draw(template, SEED, 0)
     fine = drawn.model_copy(update={"numerics": drawn.numerics.model_copy(update={"cells": (16, 12, 2)})})
     coarse, better = accuracy(drawn), accuracy(fine)
@@ -255,16 +251,7 @@ def _spacing_of(drawn: Scene) -> float:
     return float(np.sqrt(wide * max(wide, z[1] - z[0])))
 
 
-def test_the_diagnostics_tell_of_the_shared_mesh(context: JobContext, whole: Path) -> None:
-    dataset = read_dataset(whole)
-    told = [dataset.entry(index).diagnostics for index in range(SAMPLES)]
-    assert len({each["mesh"] for each in told}) == 2  # of two pads
-    first, scene = told[0], dataset.scene_of(0)
-    assert first["mesh"] == shared_mesh(scene.sensor.gel, scene.numerics).hash
-    assert first["predicted_error_px"] == round(accuracy(scene).error_px, 4)
-
-
-def test_plan_says_what_is_batched(template: Template) -> None:
+def test_plan_says_what_is_batched_and_wrong_numbers_are_refused(template: Template, tmp_path: Path) -> None:
     planned = plan(template, Variant("cuda_ad_rgb", ""))
     batched = next(decision for decision in planned.decisions if decision.feature == "batched simulation")
     assert batched.runs
@@ -272,9 +259,6 @@ def test_plan_says_what_is_batched(template: Template) -> None:
     assert predict(planned).resolution.startswith("6 x 4 x 2 elements for all draws of a pad")
     alike = load_scene(template.source, ["sensor.gel.size_mm=[8.0, 6.0, 2.5]"])
     assert "another" not in plan(alike, Variant("cuda_ad_rgb", "")).decisions[0].reason
-
-
-def test_wrong_numbers_of_elements_and_a_batch_of_none_are_refused(template: Template, tmp_path: Path) -> None:
     for wrong in ("[5, 4, 2]", "[6, 2, 2]", "[6, 4, 0]", "[6, 4]"):
         with pytest.raises(InputError, match=r"numerics\.cells"):
             load_scene(template.source, [f"numerics.cells={wrong}"])

@@ -177,9 +177,7 @@ def test_killed_within_a_sample_and_a_second_process(tiny: Path, out: Path, caps
 
 
 @pytest.mark.parametrize(("number", "says"), [(errno.EACCES, "Permission denied"), (errno.ENOSPC, "No space left")])
-def test_storage_that_refuses_in_the_middle(
-    tiny: Path, out: Path, monkeypatch: pytest.MonkeyPatch, number: int, says: str
-) -> None:
+def test_storage_that_refuses_in_the_middle(tiny: Path, out: Path, monkeypatch, number: int, says: str) -> None:
     """Permission lost, or the disk full, at the third sample: what was finished stays, the same call goes on."""
     template, rename, calls = load_scene(tiny), os.rename, []
 

@@ -52,13 +52,6 @@ def test_the_same_as_in_a_directory_in_shards_and_steps(url: str, tiny: Path, tm
     assert json.loads((copy / "summary.json").read_text())["samples"] == 5
 
 
-def test_a_file_url_is_a_directory(tiny: Path, tmp_path: Path) -> None:
-    template = load_scene(tiny, ["motion.depth_mm=-1"])
-    summary = generate(template, 1, f"file://{tmp_path}/with%20space")
-    assert summary.directory == tmp_path / "with space"
-    assert (tmp_path / "with space" / ".lock").exists()
-
-
 def test_a_stopped_run_leaves_a_journal_that_the_next_one_reads(url: str) -> None:
     writer = DatasetWriter(url, job(3))
     writer.record(write_sample_files(url, translation_sample(2), job()))
@@ -127,9 +120,7 @@ def test_a_killed_run_holds_nothing_for_long(url: str) -> None:
             assert json.loads(Store(url).read("leases/whole.json") or b"{}")["pid"] == os.getpid()
 
 
-def test_storage_that_refuses_ends_with_one_message_and_goes_on(
-    url: str, tiny: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_storage_that_refuses_ends_with_one_message_and_goes_on(url: str, tiny: Path, tmp_path, monkeypatch) -> None:
     template = load_scene(tiny)
     generate(template, 2, url)
 
@@ -144,7 +135,7 @@ def test_storage_that_refuses_ends_with_one_message_and_goes_on(
     assert fingerprint(_download(url, tmp_path / "copy")) == fingerprint(reference())
 
 
-def test_places_that_cannot_be(tiny: Path) -> None:
+def test_places_that_cannot_be_are_told_and_a_file_url_is_a_directory(tiny: Path, tmp_path: Path) -> None:
     for out, workers, message in (
         ("nowhere://bucket/x", 2, "Protocol not known"),
         ("memory://x", 2, "is seen by one process only"),
@@ -152,3 +143,7 @@ def test_places_that_cannot_be(tiny: Path) -> None:
     ):
         with pytest.raises(InputError, match=message):
             generate(load_scene(tiny), 1, out, scheduling=Scheduling(workers))
+    template = load_scene(tiny, ["motion.depth_mm=-1"])
+    summary = generate(template, 1, f"file://{tmp_path}/with%20space")
+    assert summary.directory == tmp_path / "with space"
+    assert (tmp_path / "with space" / ".lock").exists()

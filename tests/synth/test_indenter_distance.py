@@ -1,14 +1,13 @@
 """Signed distance, normal and reach of every indenter, against points sampled on surfaces that are coded here anew."""
 
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 import pyvista as pv
 import warp as wp
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, cKDTree
 
 from synth.arrays import FloatArray
 from synth.errors import InputError
@@ -22,8 +21,7 @@ BOX = Box(shape="box", size_mm=(2.0, 3.0, 1.6), fillet_mm=0.25)
 CONE = Cone(shape="cone", half_angle_deg=40.0, height_mm=2.4, fillet_mm=0.3)
 TORUS = Torus(shape="torus", radius_mm=1.6, tube_mm=0.5)
 SHAPES: list[Indenter] = [SPHERE, CYLINDER, BOX, CONE, TORUS]
-SPACING = 0.02
-"""Of the sampled surfaces, mm."""
+SPACING = 0.02  # Of the sampled surfaces, mm
 
 
 @wp.kernel
@@ -121,31 +119,15 @@ def scattered(indenter: Indenter, rng: np.random.Generator, count: int = 400) ->
 
 
 def inside(indenter: Indenter, points: FloatArray) -> np.ndarray:
-    """By inequalities; only for points farther from the surface than the sampling resolves."""
-    rho, z = np.hypot(points[:, 0], points[:, 1]), points[:, 2]
-    match indenter:
-        case Sphere(radius_mm=r):
-            return np.hypot(rho, z) < r
-        case Cylinder(radius_mm=r, length_mm=length, fillet_mm=f):
-            over = np.maximum(np.column_stack([rho - r + f, np.abs(z) - length / 2 + f]), 0)
-            return np.linalg.norm(over, axis=1) < f
-        case Torus(radius_mm=r, tube_mm=t):
-            return np.hypot(rho - r, z) < t
-        case Box(size_mm=size, fillet_mm=f):
-            over = np.maximum(np.abs(points) - np.array(size) / 2 + f, 0)
-            return np.linalg.norm(over, axis=1) < f
-        case Cone(half_angle_deg=angle, height_mm=height, fillet_mm=f):
-            low, slope = -(height - 2 * f), np.tan(np.radians(angle))
-            share = np.linspace(0, 1, int(4 * height / SPACING))[:, None]
-            corners = np.array([(0, 0), (-low * slope, low), (0, low)])
-            sides = np.concatenate([p + share * (q - p) for p, q in pairwise(corners)])
-            core = (z < 0) & (z > low) & (rho < -z * slope)
-            return core | (cKDTree(sides).query(np.column_stack([rho, z]))[0] < f)
-    raise TypeError(indenter)
+    """Within the hull of samples, or a ring's tube; only for points farther off than the sampling resolves."""
+    if isinstance(indenter, Torus):
+        return np.hypot(np.hypot(points[:, 0], points[:, 1]) - indenter.radius_mm, points[:, 2]) < indenter.tube_mm
+    faces = ConvexHull(surface(indenter)[::7]).equations
+    return (points @ faces[:, :3].T + faces[:, 3] < 0).all(axis=1)
 
 
 @pytest.mark.parametrize("indenter", SHAPES, ids=lambda i: i.shape)
-def test_distance_against_sampled_surface(indenter: Indenter) -> None:
+def test_distance_against_a_sampled_surface_and_normal_as_its_gradient(indenter: Indenter) -> None:
     rng = np.random.default_rng(1)
     points = scattered(indenter, rng)
     distance, _, _ = measure(rigid_body(indenter), points)
@@ -157,10 +139,6 @@ def test_distance_against_sampled_surface(indenter: Indenter) -> None:
     sure = np.abs(distance) > SPACING
     assert ((distance < 0) == inside(indenter, points))[sure].all()
     assert 20 < (distance < 0).sum() < 380
-
-
-@pytest.mark.parametrize("indenter", SHAPES, ids=lambda i: i.shape)
-def test_normal_is_the_gradient(indenter: Indenter) -> None:
     rng = np.random.default_rng(2)
     body, points = rigid_body(indenter), scattered(indenter, rng)
     _, normal, bending = measure(body, points)
@@ -181,7 +159,7 @@ def test_normal_is_the_gradient(indenter: Indenter) -> None:
     np.testing.assert_allclose(bending[smooth], turning[smooth], atol=1e-5 * (1 + np.abs(turning[smooth]).max()))
 
 
-def test_sphere_by_hand() -> None:
+def test_a_sphere_and_rotations_by_hand_and_unit_normals_on_axes() -> None:
     normals, radii = np.array([[0.0, 0, 1], [0, -1, 0]]), np.array([2.0, 1.0])
     found, direction, bending = measure(rigid_body(SPHERE), normals * radii[:, None])
     np.testing.assert_allclose(found, radii - 1.5, atol=1e-14)
@@ -189,14 +167,14 @@ def test_sphere_by_hand() -> None:
     # The normal of a ball turns by (I - n n^T) / r; central differences of it are good to 1e-9.
     turning = (np.eye(3) - np.einsum("ni,nj->nij", normals, normals)) / radii[:, None, None]
     np.testing.assert_allclose(bending, turning, atol=1e-8)
-
-
-def test_points_on_axes_have_a_unit_normal() -> None:
     for indenter in SHAPES:
         points = np.array([[0, 0, z] for z in (-3.0, -0.5, 0.0, 0.5, 3.0)], dtype=float)
         distance, normal, _ = measure(rigid_body(indenter), points)
         assert np.isfinite(distance).all()
         np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0, atol=1e-12)
+    for axis in range(3):
+        following, last = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3]
+        np.testing.assert_allclose(rotation_about(axis, np.pi / 2) @ following, last, atol=1e-15)
 
 
 TURNS = [(0.0, 0.0, 0.0), (90.0, 0.0, 0.0), (0.0, 90.0, 30.0), (20.0, -35.0, 50.0), (180.0, 0.0, 0.0), (130.0, 10.0, 0)]
@@ -212,25 +190,6 @@ def test_reach_is_the_highest_point(indenter: Indenter, turn: tuple[float, float
     np.testing.assert_allclose(body.rotation, z @ y @ x, atol=1e-15)
     # Of samples SPACING apart on a surface of radius 0.25 mm or more the highest is SPACING^2 / (2 * 0.25) too low.
     assert -1e-9 <= body.reach_mm - world[:, 2].max() <= SPACING**2 / 0.5
-
-
-def test_rotations_turn_the_next_axis_toward_the_one_after() -> None:
-    for axis in range(3):
-        following, last = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3]
-        np.testing.assert_allclose(rotation_about(axis, np.pi / 2) @ following, last, atol=1e-15)
-
-
-def test_edges_are_rounded_to_what_the_mesh_resolves() -> None:
-    """A larger fillet keeps the outer size: the reach does not change for a flat punch."""
-    sharp, blunt = rigid_body(CYLINDER), rigid_body(CYLINDER, resolution_mm=0.6)
-    assert (sharp.shape[0], blunt.shape[0]) == (0.3, 0.6)
-    assert blunt.reach_mm == pytest.approx(sharp.reach_mm)
-    axis = np.array([[0.0, 0.0, 1.3], [1.4, 0.0, 0.0]])
-    np.testing.assert_allclose(measure(blunt, axis)[0], measure(sharp, axis)[0], atol=1e-12)
-    assert rigid_body(CYLINDER, resolution_mm=5.0).shape[0] == pytest.approx(0.9)  # 90 % of half the length
-
-
-# ------------------------------------------------------------------------------------------------------------ meshes
 
 
 def ball(folder: Path, cell_mm: float = 0.15, flip: bool = False, centre: tuple = (0.0, 0.0, 0.0)) -> RigidBody:
@@ -260,7 +219,7 @@ def test_mesh_of_a_sphere_is_the_sphere(tmp_path: Path, flip: bool) -> None:
     np.testing.assert_allclose(measure(body, far)[0], np.linalg.norm(far, axis=1) - 1.5, rtol=0.25)
 
 
-def test_mesh_normal_is_the_gradient(tmp_path: Path) -> None:
+def test_mesh_normal_is_the_gradient_and_a_grid_in_a_larger_batch_read_to_its_own_end(tmp_path: Path) -> None:
     body = ball(tmp_path)
     points = scattered(SPHERE, np.random.default_rng(4), 100)
     points = points[np.abs(measure(body, points)[0]) < 0.3]
@@ -272,9 +231,6 @@ def test_mesh_normal_is_the_gradient(tmp_path: Path) -> None:
     length = np.linalg.norm(slope, axis=1, keepdims=True)
     np.testing.assert_allclose(slope / length, normal, atol=1e-6)
     np.testing.assert_allclose(length, 1.0, atol=0.04)
-
-
-def test_grid_in_a_larger_batch_is_read_to_its_own_end(tmp_path: Path) -> None:
     body = ball(tmp_path, cell_mm=0.3)
     padded = replace(body, coefficients=np.pad(body.coefficients, ((0, 9), (0, 20), (0, 3))))
     points = np.random.default_rng(5).uniform(-4.0, 4.0, (200, 3))
@@ -282,7 +238,7 @@ def test_grid_in_a_larger_batch_is_read_to_its_own_end(tmp_path: Path) -> None:
         assert (alone == together).all()
 
 
-def test_mesh_scale_and_turn(tmp_path: Path) -> None:
+def test_meshes_are_scaled_and_turned_and_edges_rounded_to_what_the_pads_mesh_resolves(tmp_path: Path) -> None:
     pv.Cube(x_length=1.0, y_length=2.0, z_length=3.0).triangulate().save(tmp_path / "block.stl")
     lying = MeshIndenter(shape="mesh", file="block.stl", scale=2.0, cell_mm=0.1, rotation_deg=(90.0, 0.0, 0.0))
     body = rigid_body(lying, tmp_path)
@@ -290,6 +246,12 @@ def test_mesh_scale_and_turn(tmp_path: Path) -> None:
     distance, _, _ = measure(body, np.array([[1.1, 0.0, 0.0], [0.0, 3.1, 0.0], [0.0, 0.0, 2.1], [0.7, 0.0, 0.0]]))
     # Away from edges the distance is linear and the spline exact, but for the filter's tail from the edges.
     np.testing.assert_allclose(distance, [0.1, 0.1, 0.1, -0.3], atol=1e-3)
+    sharp, blunt = rigid_body(CYLINDER), rigid_body(CYLINDER, resolution_mm=0.6)
+    assert (sharp.shape[0], blunt.shape[0]) == (0.3, 0.6)
+    assert blunt.reach_mm == pytest.approx(sharp.reach_mm)
+    axis = np.array([[0.0, 0.0, 1.3], [1.4, 0.0, 0.0]])
+    np.testing.assert_allclose(measure(blunt, axis)[0], measure(sharp, axis)[0], atol=1e-12)
+    assert rigid_body(CYLINDER, resolution_mm=5.0).shape[0] == pytest.approx(0.9)  # 90 % of half the length
 
 
 UNUSABLE: dict[str, tuple[pv.PolyData | bytes | None, str]] = {
@@ -303,9 +265,7 @@ UNUSABLE: dict[str, tuple[pv.PolyData | bytes | None, str]] = {
 
 
 @pytest.mark.parametrize("kind", UNUSABLE)
-def test_unusable_mesh_is_named(
-    tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture, recwarn: pytest.WarningsRecorder
-) -> None:
+def test_unusable_mesh_is_named(tmp_path: Path, kind: str, caplog, recwarn: pytest.WarningsRecorder) -> None:
     content, words = UNUSABLE[kind]
     path = tmp_path / f"{kind}.stl"
     if isinstance(content, bytes):

@@ -35,7 +35,7 @@ def dataset(tmp_path_factory):
     return directory
 
 
-def test_translation_in_numbers(dataset):
+def test_translation_exchanged_directions_and_missing_visibility_in_numbers(dataset, tmp_path) -> None:
     """Every number has a closed form: |(1.25, -0.5)| everywhere, closure 0, the gel's last two columns missing."""
     found = inspect(dataset / "samples" / "000000").as_dict()["samples"][0]
     length = np.hypot(1.25, 0.5)
@@ -54,22 +54,15 @@ def test_translation_in_numbers(dataset):
     # Rounding of both images to 1/255 has an RMS of 0.29/255 each; interpolation adds less than that again.
     assert found["difference"]["after_rmse"] < 2 * 0.29 / 255
     assert found["difference"]["before_rmse"] > 0.05
-
-
-def test_exchanged_directions_show_in_closure(tmp_path, dataset):
-    """Forward + backward(...) of a field that is not its own inverse is twice the flow."""
+    # Forward + backward(...) of a field that is not its own inverse is twice the flow.
     flow = translation_sample().flow
     wrong = dataclasses.replace(flow, backward=flow.forward)
     write_flow(tmp_path / "wrong.exr", wrong, {})
     found = inspect(tmp_path / "wrong.exr").numbers[0]
     assert found["closure"]["median_px"] == pytest.approx(2 * np.hypot(1.25, 0.5))
     assert found["difference"] is found["force_n"] is None
-
-
-def test_flow_file_without_visibility(tmp_path):
-    """An estimate does not know it; that is said, not made up."""
-    flow = translation_sample().flow.forward
-    planes = {f"forward.{name}": np.ascontiguousarray(flow[..., k]) for k, name in enumerate("UV")}
+    # An estimate does not know visibility; that is said, not made up.
+    planes = {f"forward.{name}": np.ascontiguousarray(flow.forward[..., k]) for k, name in enumerate("UV")}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     OpenEXR.File(header, planes).write(str(tmp_path / "e.exr"))
     inspection = inspect(tmp_path / "e.exr")
@@ -79,7 +72,7 @@ def test_flow_file_without_visibility(tmp_path):
     assert "visible in image 2: not given" in (tmp_path / "e.html").read_text()
 
 
-def test_dataset_page_is_self_contained(dataset, tmp_path):
+def test_page_is_self_contained_and_tables_and_json_tell_the_numbers(dataset, tmp_path) -> None:
     inspection = inspect(dataset)
     write_html(inspection, tmp_path / "d.html")
     page = (tmp_path / "d.html").read_text(encoding="utf-8")
@@ -87,6 +80,11 @@ def test_dataset_page_is_self_contained(dataset, tmp_path):
     assert "<script" not in page
     counts = {f'<h2 id="s00000{index}">': 1 for index in range(3)} | {"<figure>": 3 * 9, "<svg ": 3}
     assert {text: page.count(text) for text in counts} == counts
+    record = json.loads(json.dumps(inspection.as_dict(), allow_nan=False))
+    assert (record["kind"], record["finished"], record["failed_draws"], record["seed"]) == ("dataset", 3, 1, 7)
+    text = _printed(inspection, 200)
+    for said in ("000002", "1.35", "simulate 3.3 s"):  # |(1.25, -0.5)| = 1.346 px
+        assert said in text
 
 
 @pytest.mark.parametrize("part", ["", "samples/000001", "samples/000001/flow.exr"])
@@ -95,15 +93,6 @@ def test_sheet_is_a_picture(dataset, tmp_path, part):
     sheet = cv2.imread(str(tmp_path / "s.png"))
     assert min(sheet.shape[:2]) > 300
     assert len(np.unique(sheet.reshape(-1, 3), axis=0)) > 100
-
-
-def test_tables_and_json(dataset):
-    inspection = inspect(dataset)
-    record = json.loads(json.dumps(inspection.as_dict(), allow_nan=False))
-    assert (record["kind"], record["finished"], record["failed_draws"], record["seed"]) == ("dataset", 3, 1, 7)
-    text = _printed(inspection, 200)
-    for said in ("000002", "1.35", "simulate 3.3 s"):  # |(1.25, -0.5)| = 1.346 px
-        assert said in text
 
 
 def _printed(inspection, width):
@@ -132,19 +121,6 @@ def test_tables_keep_their_width_where_stdout_is_no_terminal(dataset, capsys, mo
         monkeypatch.setenv("FORCE_COLOR", "1")
     assert run_inspect(dataset, None, None, 100, False) == 0
     assert capsys.readouterr().out.count("000001") == (2 if terminal else 1)
-
-
-def test_limit_is_told_and_an_empty_dataset_has_pages(dataset, tmp_path):
-    inspection = inspect(dataset, limit=2)
-    assert [numbers["name"] for numbers in inspection.numbers] == ["000000", "000002"]
-    assert (inspection.about["finished"], inspection.about["inspected"]) == (3, 2)
-    assert (evenly_spaced(0, 5), evenly_spaced(100, 3)) == ([], [0, 50, 99])
-    DatasetWriter(tmp_path / "d", job()).close()
-    inspection = inspect(tmp_path / "d")
-    assert inspection.as_dict()["samples"] == []
-    write_sheet(inspection, tmp_path / "d.png")
-    write_html(inspection, tmp_path / "d.html")
-    assert len(tables(inspection)) == 2
 
 
 @pytest.mark.parametrize(("name", "value", "most"), [("nowhere", np.nan, None), ("still", 0.0, 0.0)])
@@ -178,7 +154,7 @@ def test_what_cannot_be_inspected(tmp_path):
         inspect(tmp_path)
 
 
-def test_interpolation_is_exact_to_second_degree_and_of_third_order():
+def test_interpolation_is_exact_to_second_degree_of_third_order_and_stops_at_gaps() -> None:
     """Halving the spacing divides the error of a sine by 8 (Keys 1981)."""
 
     def quadratic(x, y):
@@ -197,9 +173,6 @@ def test_interpolation_is_exact_to_second_degree_and_of_third_order():
         x = np.linspace(2.1, 4.1, 300)
         errors.append(np.abs(sample_at(values, x / step, np.full(300, 4.5))[:, 0] - np.sin(x)).max())
     assert (np.log2(np.array(errors[:-1]) / errors[1:]) > 2.7).all()
-
-
-def test_interpolation_at_borders_and_gaps():
     values = np.arange(36.0).reshape(6, 6, 1)
     values[5, 5] = np.nan
     x = np.array([0.5, 0.4, 1.0, 2.0, 5.5, 4.5, np.nan])
@@ -209,7 +182,7 @@ def test_interpolation_at_borders_and_gaps():
     np.testing.assert_allclose(found, [0, np.nan, np.nan, 1.5, np.nan, 28, np.nan], equal_nan=True)
 
 
-def test_colour_wheel():
+def test_colour_wheel_and_pages_of_limited_and_empty_datasets(dataset, tmp_path) -> None:
     """Baker et al. 2011: right is red, down is yellow-ish, zero is white, beyond the rim is darker, NaN is grey."""
     flow = np.array([[[1, 0], [0, 0], [2, 0], [np.nan, 0], [0, 1], [-1, 0]]], np.float32)
     # A quarter turn is 13.75 of 55 steps of the wheel, of which yellow is at 15: green 13.75 / 15.
@@ -219,6 +192,16 @@ def test_colour_wheel():
     assert flow_colours(flow, 1.0)[0].tolist() == expected
     legend = wheel_legend(64)
     assert (legend[0, 0, 3], legend[32, 63, 0]) == (0, 255)
+    inspection = inspect(dataset, limit=2)
+    assert [numbers["name"] for numbers in inspection.numbers] == ["000000", "000002"]
+    assert (inspection.about["finished"], inspection.about["inspected"]) == (3, 2)
+    assert (evenly_spaced(0, 5), evenly_spaced(100, 3)) == ([], [0, 50, 99])
+    DatasetWriter(tmp_path / "d", job()).close()
+    inspection = inspect(tmp_path / "d")
+    assert inspection.as_dict()["samples"] == []
+    write_sheet(inspection, tmp_path / "d.png")
+    write_html(inspection, tmp_path / "d.html")
+    assert len(tables(inspection)) == 2
 
 
 @pytest.mark.parametrize("size", [1e-4, 0.013, 1.0, 37.0])

@@ -47,7 +47,7 @@ def test_fills_the_box_with_one_topology_and_bounded_shapes(focus: Focus, layers
         assert shape_quality(mesh.points, mesh.tets).min() > WORST_SHAPE
 
 
-def test_neighbours_share_whole_faces() -> None:
+def test_neighbours_share_faces_all_but_the_window_is_touchable_and_mirror_images_are_mirrored() -> None:
     mesh = graded_box(SIZE, CENTRED, COUNTS)
     nx, ny, nz = COUNTS.cells(0), COUNTS.cells(1), COUNTS.through
     assert kuhn_tets(nx, ny, nz) is mesh.tets  # made once
@@ -55,9 +55,16 @@ def test_neighbours_share_whole_faces() -> None:
     assert len(mesh.points) == (nx + 1) * (ny + 1) * (nz + 1)
     assert len(boundary_faces(mesh.tets)) == 4 * (nx * ny + ny * nz + nx * nz)
     assert len(contact_faces(mesh).faces) == 2 * nx * ny
-
-
-def test_centred_focus_gives_its_own_mirror_image_and_a_mirrored_one_mirrored_planes() -> None:
+    mesh = graded_box(SIZE, FOCI["off centre"], COUNTS)
+    a, b, c = (mesh.points[mesh.touchable[:, i]] for i in range(3))
+    area = np.cross(b - a, c - a) / 2
+    assert np.linalg.norm(area, axis=1).sum() == pytest.approx(20 * 15 + 2 * (20 + 15) * 4, rel=1e-12)
+    # Outward: the five faces' area vectors add up to minus the missing window face's, (0, 0, 20 * 15).
+    np.testing.assert_allclose(area.sum(axis=0), [0, 0, -300.0], atol=1e-10)
+    centre = (a + b + c) / 3
+    assert (np.einsum("ij,ij->i", area, centre - [0, 0, 2.0]) > 0).all()
+    assert mesh.touchable.dtype == np.int32
+    assert not mesh.bonded[mesh.touchable].all(axis=1).any()
     mesh = graded_box(SIZE, CENTRED, COUNTS)
     place = {tuple(point): i for i, point in enumerate(mesh.points)}
     for axis in (0, 1):
@@ -71,7 +78,7 @@ def test_centred_focus_gives_its_own_mirror_image_and_a_mirrored_one_mirrored_pl
         assert (planes / GRAIN_MM % 1 == 0).all()
 
 
-def test_centred_spacing_is_even_then_geometric() -> None:
+def test_centred_spacing_is_even_then_geometric_as_is_depth() -> None:
     planes = lateral_planes(20.0, (-3.3, 3.3), COUNTS, 0)
     step = np.diff(planes)
     # Two coordinates rounded to GRAIN_MM.
@@ -79,6 +86,10 @@ def test_centred_spacing_is_even_then_geometric() -> None:
     np.testing.assert_allclose(planes[[3, 11]], [-3.3, 3.3], atol=2 * GRAIN_MM)
     ratio = max(root.real for root in np.roots([1, 1, 1, -6.7 / 0.825]) if abs(root.imag) < 1e-9)
     np.testing.assert_allclose(step[11:], 0.825 * ratio ** np.arange(1, 4), atol=4 * GRAIN_MM)
+    # h (1 + 1.5 + 2.25 + 3.375) = 4 mm.
+    steps = _depth_steps(Counts(through=4, growth=1.5))
+    np.testing.assert_allclose(steps, 4 / 8.125 * 1.5 ** np.arange(4), atol=2 * GRAIN_MM)
+    np.testing.assert_allclose(_depth_steps(Counts(through=4, growth=1.0)), 1.0, atol=2 * GRAIN_MM)
 
 
 def largest_ratio(q: float) -> float:
@@ -114,7 +125,7 @@ def test_spacing_is_even_in_the_focus_and_grows_by_a_bounded_ratio(counts: Count
     assert wide > 100  # the limits are the exception
 
 
-def test_small_focus_outgrows_its_elements() -> None:
+def test_small_focus_outgrows_its_elements_and_planes_move_continuously_with_it() -> None:
     """Where STEEPEST does not fill the pad, the spacing in the focus is coarser than asked, and fills it exactly."""
     fine, rate = spacing(20.0, (-0.1, 0.1), Counts(across=(8, 8), outer=(2, 2)), 0)
     assert np.exp(rate) == pytest.approx(STEEPEST)
@@ -123,10 +134,6 @@ def test_small_focus_outgrows_its_elements() -> None:
     beside = (12 - 0.2 / fine) / 2
     reach = fine * STEEPEST * (STEEPEST**beside - 1) / (STEEPEST - 1)
     assert reach == pytest.approx(9.9, rel=1e-9)  # a root by halving, to the last bits
-
-
-def test_planes_move_continuously_with_the_focus() -> None:
-    """A focus that walks off the pad drags the planes along without a jump."""
     walk = np.linspace(0.0, 12.0, 1201)
     planes = np.array([lateral_planes(20.0, Focus((x, 0), (3, 3)).span(0, 20.0), COUNTS, 0) for x in walk])
     # Planes move at most a few times as fast as the focus (0.01 mm a step; measured 0.05); a gap's element that jumped
@@ -159,27 +166,7 @@ def _depth_steps(counts: Counts) -> FloatArray:
     return np.diff(np.unique(graded_box(SIZE, CENTRED, counts).points[:, 2]))
 
 
-def test_depth_is_graded_from_the_contact_face() -> None:
-    # h (1 + 1.5 + 2.25 + 3.375) = 4 mm.
-    steps = _depth_steps(Counts(through=4, growth=1.5))
-    np.testing.assert_allclose(steps, 4 / 8.125 * 1.5 ** np.arange(4), atol=2 * GRAIN_MM)
-    np.testing.assert_allclose(_depth_steps(Counts(through=4, growth=1.0)), 1.0, atol=2 * GRAIN_MM)
-
-
-def test_touchable_is_all_but_the_window() -> None:
-    mesh = graded_box(SIZE, FOCI["off centre"], COUNTS)
-    a, b, c = (mesh.points[mesh.touchable[:, i]] for i in range(3))
-    area = np.cross(b - a, c - a) / 2
-    assert np.linalg.norm(area, axis=1).sum() == pytest.approx(20 * 15 + 2 * (20 + 15) * 4, rel=1e-12)
-    # Outward: the five faces' area vectors add up to minus the missing window face's, (0, 0, 20 * 15).
-    np.testing.assert_allclose(area.sum(axis=0), [0, 0, -300.0], atol=1e-10)
-    centre = (a + b + c) / 3
-    assert (np.einsum("ij,ij->i", area, centre - [0, 0, 2.0]) > 0).all()
-    assert mesh.touchable.dtype == np.int32
-    assert not mesh.bonded[mesh.touchable].all(axis=1).any()
-
-
-def test_hash_knows_layers_only_where_there_are_several() -> None:
+def test_hash_knows_layers_and_counts_and_layers_that_give_no_mesh_are_refused() -> None:
     mesh = graded_box(SIZE, CENTRED, COUNTS)
     # As it was before there were layers: trajectories and datasets name meshes by it.
     content = mesh.points.astype("<f8").tobytes() + mesh.tets.astype("<i4").tobytes()
@@ -188,9 +175,6 @@ def test_hash_knows_layers_only_where_there_are_several() -> None:
     assert layered.hash != mesh.hash
     with pytest.raises(ValueError, match=r"expected \(2520,\)"):
         PadMesh(mesh.points, mesh.tets, SIZE, np.zeros(3, dtype=np.int32))
-
-
-def test_counts_and_layers_that_give_no_mesh() -> None:
     wrong = {"across": [(7, 8), (0, 8)], "outer": [(3, 0)], "through": [0], "film": [0], "growth": [0.9]}
     for name, value in ((name, value) for name, values in wrong.items() for value in values):
         with pytest.raises(ValueError, match="across must be even"):

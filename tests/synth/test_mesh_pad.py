@@ -39,7 +39,7 @@ def double_area(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.cross(b - a, c - a)
 
 
-def test_fills_the_box_with_exactly_flat_faces(pad: PadMesh) -> None:
+def test_fills_the_box_with_flat_closed_faces_and_edges_graded_toward_the_window(pad: PadMesh) -> None:
     assert pad.volumes.min() > 0
     # Sums of a few hundred volumes of about 0.1 mm^3 round to 1e-14 relative; 1e-12 leaves room.
     assert pad.volumes.sum() == pytest.approx(np.prod(SIZE), rel=1e-12)
@@ -51,9 +51,6 @@ def test_fills_the_box_with_exactly_flat_faces(pad: PadMesh) -> None:
     assert ((pad.points >= low) & (pad.points <= high)).all()
     points = set(map(tuple, pad.points))
     assert points >= set(product(*zip(low, high, strict=True)))
-
-
-def test_boundary_is_closed_and_points_outward(pad: PadMesh) -> None:
     faces = boundary_faces(pad.tets)
     area = double_area(pad.points, faces) / 2
     # Closed: the area vectors of some 500 faces sum to zero but for rounding, 500 * 1e-16 * 1 mm^2.
@@ -61,9 +58,6 @@ def test_boundary_is_closed_and_points_outward(pad: PadMesh) -> None:
     # Divergence theorem: positive only if the normals point out.
     enclosed = np.einsum("ij,ij->", pad.points[faces].mean(axis=1), area) / 3
     assert enclosed == pytest.approx(np.prod(SIZE), rel=1e-12)
-
-
-def test_contact_faces_and_bonded_nodes_are_those_of_gel_and_window(pad: PadMesh) -> None:
     contact = contact_faces(pad)
     area = double_area(contact.nodes, contact.faces) / 2
     assert (pad.on_face == (pad.points[:, 2] == 0)).all()
@@ -74,10 +68,6 @@ def test_contact_faces_and_bonded_nodes_are_those_of_gel_and_window(pad: PadMesh
     assert (np.unique(contact.faces) == np.arange(len(contact.nodes))).all()
     assert (pad.bonded == (pad.points[:, 2] == SIZE[2])).all()
     assert 4 <= pad.bonded.sum() < len(contact.nodes)  # coarser there than at the contact face
-
-
-def test_edge_lengths_are_graded(pad: PadMesh) -> None:
-    """Edges are EDGE long at the contact face and longer toward the window."""
 
     def edge(level: float) -> float:
         """Of as many equilateral triangles on that face."""
@@ -90,7 +80,7 @@ def test_edge_lengths_are_graded(pad: PadMesh) -> None:
     assert 1.2 * edge(0.0) < edge(SIZE[2]) < 4 / 3 * GRADING * EDGE
 
 
-def test_shape_quality_and_signed_volume_of_known_tetrahedra(pad: PadMesh) -> None:
+def test_quality_and_volume_of_known_tetrahedra_and_the_hash_names_the_content(pad: PadMesh) -> None:
     assert shape_quality(pad.points, pad.tets).min() >= WORST_SHAPE
     tets = np.array([[0, 1, 2, 3]], np.int32)
     regular = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], float)
@@ -102,9 +92,14 @@ def test_shape_quality_and_signed_volume_of_known_tetrahedra(pad: PadMesh) -> No
     assert shape_quality(5 * corner, tets)[0] == pytest.approx(6 / (3 + 3**0.5) / 3**0.5, rel=1e-13)
     assert shape_quality(flat, tets)[0] < 1e-5
     assert signed_volumes(corner, np.array([[0, 1, 2, 3], [0, 2, 1, 3]])) == pytest.approx([1 / 6, -1 / 6])
+    assert PadMesh(pad.points.copy(), pad.tets.copy(), SIZE).hash == pad.hash
+    moved, turned = pad.points.copy(), pad.tets.copy()
+    moved[0, 0] = np.nextafter(moved[0, 0], 9.0)
+    turned[0] = turned[0][[1, 2, 0, 3]]
+    assert len({pad.hash, replace(pad, points=moved).hash, replace(pad, tets=turned).hash}) == 3
 
 
-def test_repair_snaps_turns_and_drops() -> None:
+def test_repair_snaps_turns_and_drops_and_faults_are_named() -> None:
     exact = brick(SIZE, (3, 2, 2))
     noise = 1e-3 * np.random.default_rng(1).uniform(-1, 1, exact.points.shape)
     points = np.concatenate([exact.points + noise, [[9.0, 9.0, 9.0]]])  # the last vertex belongs to no tetrahedron
@@ -114,10 +109,6 @@ def test_repair_snaps_turns_and_drops() -> None:
     on_low, on_high = exact.points == exact.points.min(axis=0), exact.points == exact.points.max(axis=0)
     assert (points[on_low | on_high] == exact.points[on_low | on_high]).all()
     assert _fault(points, tets, SIZE) == ""
-
-
-def test_faults_are_named() -> None:
-    exact = brick(SIZE, (3, 2, 2))
     assert _fault(exact.points, exact.tets, SIZE) == ""
     assert "fills" in _fault(exact.points, exact.tets[1:], SIZE)
     assert "volume" in _fault(exact.points, exact.tets[:, [0, 2, 1, 3]], SIZE)
@@ -125,14 +116,6 @@ def test_faults_are_named() -> None:
     (inside,) = np.flatnonzero((np.abs(flat - [-SIZE[0] / 6, 0.0, SIZE[2] / 2]) < 1e-9).all(axis=1))
     flat[inside, 2] = 1e-3 * SIZE[2]  # a node almost on the contact face: the volume stays right, the shapes do not
     assert "quality" in _fault(flat, exact.tets, SIZE)
-
-
-def test_hash_names_the_content(pad: PadMesh) -> None:
-    assert PadMesh(pad.points.copy(), pad.tets.copy(), SIZE).hash == pad.hash
-    moved, turned = pad.points.copy(), pad.tets.copy()
-    moved[0, 0] = np.nextafter(moved[0, 0], 9.0)
-    turned[0] = turned[0][[1, 2, 0, 3]]
-    assert len({pad.hash, replace(pad, points=moved).hash, replace(pad, tets=turned).hash}) == 3
 
 
 SOUND = brick((4.0, 3.0, 2.0), (2, 2, 2))
@@ -145,25 +128,19 @@ def moved(corner: int, place: np.ndarray) -> PadMesh:
     return replace(SOUND, points=points)
 
 
-def test_a_sound_mesh_passes_and_so_does_a_sliver() -> None:
+def test_sound_meshes_and_slivers_pass_but_flat_inverted_and_broken_ones_are_refused() -> None:
     check_mesh(SOUND)
     others = SOUND.points[SOUND.tets[0, :3]]
     top = SOUND.points[SOUND.tets[0, 3]]
     sliver = moved(3, others.mean(axis=0) + 1e-3 * (top - others.mean(axis=0)))
     assert 0 < sliver.volumes[0] < 2e-3 * SOUND.volumes[0]
     check_mesh(PadMesh(sliver.points[sliver.tets[0]], np.array([[0, 1, 2, 3]]), SOUND.size_mm))  # others may turn over
-
-
-def test_flat_is_refused_whatever_the_rounding() -> None:
-    """The volume then is 0 or some 1e-17 of either sign."""
+    # The volume of a flat one is 0 or some 1e-17 of either sign.
     rng = np.random.default_rng(0)
     for corners in rng.normal(size=(12, 3, 3)):
         points = np.vstack([corners, rng.dirichlet(np.ones(3)) @ corners])
         with pytest.raises(InputError, match="must be > 0"):
             check_mesh(PadMesh(points, np.array([[0, 1, 2, 3]]), SOUND.size_mm))
-
-
-def test_inside_out_one_point_not_finite_and_loose() -> None:
     flipped = SOUND.tets.copy()
     flipped[5] = flipped[5][[1, 0, 2, 3]]
     one = SOUND.points.copy()
@@ -196,7 +173,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return calls
 
 
-def test_made_once_and_read_bitwise(tmp_path: Path, made: list[float]) -> None:
+def test_made_once_and_read_bitwise_but_refused_with_layers(tmp_path: Path, made: list[float]) -> None:
     first = pad_mesh(GEL, NUMERICS, [tmp_path])
     again = pad_mesh(GEL, NUMERICS, [tmp_path])
     assert made == [1.5]
@@ -205,6 +182,9 @@ def test_made_once_and_read_bitwise(tmp_path: Path, made: list[float]) -> None:
     assert again.tets.dtype == np.int32
     assert again.hash == first.hash
     assert [path.name for path in tmp_path.iterdir()] == [f"{mesh_key(GEL, NUMERICS)}.npz"]  # nothing left aside
+    layered = GEL.model_copy(update={"layers": (Layer(thickness_mm=0.1, youngs_modulus_kpa=900.0),)})
+    with pytest.raises(InputError, match="cannot follow layers"):
+        pad_mesh(layered, NUMERICS, [tmp_path])
 
 
 @pytest.mark.parametrize("damage", ["empty", "cut", "flipped", "text", "no tets"])
@@ -253,14 +233,6 @@ def test_key_depends_on_what_the_mesh_depends_on_only_and_on_the_default_edge() 
         assert default_edge_length(gel) == pytest.approx(edge)
 
 
-def test_layered_pad_is_refused(tmp_path: Path, made: list[float]) -> None:
-    """Every tetrahedron would count as the first layer."""
-    layered = GEL.model_copy(update={"layers": (Layer(thickness_mm=0.1, youngs_modulus_kpa=900.0),)})
-    with pytest.raises(InputError, match="cannot follow layers"):
-        pad_mesh(layered, NUMERICS, [tmp_path])
-    assert made == []
-
-
 WIDE = (12.0, 9.0, 3.0)
 LOW, HIGH = np.array([-6.0, -4.5, 0.0]), np.array([6.0, 4.5, 3.0])
 FOCUS = Focus((1.5, -1.0), (2.0, 1.5))
@@ -294,38 +266,12 @@ def test_mesh_is_as_good_as_any_and_its_edges_are_small_in_the_focus_only() -> N
     assert len(corners) < 0.5 * WIDE[0] * WIDE[1] / (np.sqrt(3) / 4 * EDGE**2)
 
 
-@pytest.mark.parametrize(
-    "focus",
-    [FOCUS, Focus((5.5, 4.4), (2.0, 2.0)), Focus((0, 0), (50, 50)), Focus((9, 0), (1, 0)), Focus((3.9, 0), (2, 1))],
-)
-def test_background_grows_smoothly_from_the_focus(focus: Focus) -> None:
-    field = around_focus(WIDE, EDGE, focus, COARSE)
-    assert ((field.values >= EDGE) & (field.values <= COARSE)).all()
-    assert signed_volumes(field.points, field.tets).min() > 0
-    assert ((field.points.min(axis=0) <= LOW) & (field.points.max(axis=0) >= HIGH)).all()
-    edge = np.concatenate([field.tets[:, [i, j]] for i in range(4) for j in range(i)])
-    length = np.linalg.norm(field.points[edge[:, 0]] - field.points[edge[:, 1]], axis=1)
-    # The distance from a convex set has slope 1, and moving the outermost points outward lengthens edges.
-    assert (np.abs(field.values[edge[:, 0]] - field.values[edge[:, 1]]) <= SLOPE * length + 1e-12).all()
-    # The field is linear between planes of the grid: it is EDGE throughout the focus if its ends are planes.
-    points = np.clip(field.points, LOW, HIGH)
-    inside = points[:, 2] == 0
-    for axis in (0, 1):
-        low, high = focus.span(axis, WIDE[axis])
-        assert {low, high} <= set(points[:, axis])
-        inside &= (points[:, axis] >= low) & (points[:, axis] <= high)
-    assert (field.values[inside] == EDGE).all()
-
-
-def test_background_is_edge_in_the_focus_and_coarse_far_away() -> None:
+def test_background_is_coarse_far_from_the_focus_and_without_one_toward_the_window() -> None:
     field = around_focus(WIDE, EDGE, FOCUS, COARSE)
     away = distance_from_zone(np.clip(field.points, LOW, HIGH))
     np.testing.assert_allclose(field.values, np.minimum(EDGE + SLOPE * away, COARSE), atol=1e-12)
     assert (away == 0).sum() >= 4
     assert (field.values == COARSE).any()
-
-
-def test_without_a_focus_edges_grow_toward_the_window() -> None:
     field = through_thickness(WIDE, EDGE)
     assert sorted(set(field.values)) == [EDGE, GRADING * EDGE]
     assert ((field.values == EDGE) == (field.points[:, 2] < 0)).all()
@@ -335,14 +281,11 @@ def test_without_a_focus_edges_grow_toward_the_window() -> None:
     assert volumes.sum() == pytest.approx(1.01**3 * np.prod(WIDE), rel=1e-12)
 
 
-def test_focus_is_clipped_to_the_pad() -> None:
+def test_focus_is_clipped_to_the_pad_and_what_is_none_is_refused() -> None:
     assert FOCUS.clipped(WIDE) == FOCUS
     assert Focus((5.0, 0.0), (3.0, 1.0)).clipped(WIDE) == Focus((4.0, 0.0), (2.0, 1.0))  # over the edge
     assert Focus((20.0, -9.0), (3.0, 1.0)).clipped(WIDE) == Focus((6.0, -4.5), (0.0, 0.0))  # beside the pad
     assert Focus((0.0, 0.0), (99.0, 99.0)).clipped(WIDE) == Focus((0.0, 0.0), (6.0, 4.5))
-
-
-def test_what_is_no_focus_is_refused() -> None:
     for half in ((-0.1, 1.0), (np.nan, 1.0), (1.0, np.inf)):
         with pytest.raises(ValueError, match="half widths >= 0"):
             Focus((0.0, 0.0), half)

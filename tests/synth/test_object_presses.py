@@ -1,5 +1,6 @@
-"""Triangle meshes pressed, against an analytic body."""
+"""Objects pressed: against an analytic body, and by relaxation where Newton's method finds no equilibrium."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +11,17 @@ from pads import scene
 
 from synth.mesh import Counts, Focus, graded_box
 from synth.scene import Scene
-from synth.simulate import indenter, simulate
+from synth.simulate import indenter, simulate, stepping
+from synth.simulate.newton import Solution, solve
 from synth.simulate.options import SolverOptions
 from synth.simulate.probe import probe
+from synth.simulate.relaxation import AIM, LEAST_VISCOSITY, MAX_ERROR, MOST_VISCOSITY, next_viscosity
 
 SIZE = (12.0, 10.0, 3.0)
 MESH = graded_box(SIZE, Focus((0.0, 0.0), (2.0, 2.0)), Counts((4, 4), (2, 2), 2))
 EDGE, DEPTH = 3.5, 0.6
 STRICT = SolverOptions(relaxed_tolerance=0.0)
-PX_PER_MM = 17.0
-"""Of the shipped scene gelsight_mini."""
+PX_PER_MM = 17.0  # Of the shipped scene gelsight_mini
 
 
 @pytest.fixture
@@ -39,9 +41,7 @@ def cube(**fields: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("turned", [(0.0, 0.0, 0.0), (20.0, 10.0, 30.0)])
-def test_a_cube_is_the_block_of_its_fillet(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, turned: tuple[float, float, float]
-) -> None:
+def test_a_cube_is_the_block_of_its_fillet(folder: Path, monkeypatch, turned: tuple[float, float, float]) -> None:
     monkeypatch.setattr(indenter, "OBJECT_STIFFNESS", 1.0)  # as that of the block
     fillet = 0.7  # more than what the mesh asks for, so that both keep it
     block = {"shape": "box", "size_mm": [EDGE, EDGE, EDGE], "fillet_mm": fillet, "rotation_deg": turned}
@@ -55,3 +55,47 @@ def test_a_cube_is_the_block_of_its_fillet(
         assert error < 0.01
         moved = (face @ (other.displacement - one.displacement))[:, :2]
         assert PX_PER_MM * np.sqrt((moved**2).sum(axis=1).mean()) < 0.02
+
+
+OBJECTS = Path(__file__).parents[2] / "scenes" / "objects"
+
+
+def dragged(indenter: dict[str, Any], friction: float) -> Any:
+    moves = {"depth_mm": 0.9, "position_mm": [0.1, 0.2], "shear_mm": [0.6, 0.3], "twist_deg": 5.0, "steps": 2}
+    drawn = scene(SIZE, indenter=indenter, friction=friction, motion=moves, numerics={"element": "auto"})
+    return simulate(drawn, MESH, OBJECTS)
+
+
+def test_relaxation_finds_the_equilibrium_of_newtons_method(monkeypatch: pytest.MonkeyPatch) -> None:
+    ball = {"shape": "sphere", "radius_mm": 3.0}
+    expected = dragged(ball, 0.5)
+
+    def unlucky(*arguments: Any) -> Solution:
+        """Newton's method that does not converge in load steps, where it is called without a limit."""
+        found = solve(*arguments)
+        return replace(found, converged=False) if len(arguments) == 4 else found
+
+    monkeypatch.setattr(stepping, "MAX_RELAXED_STEP", 1.0)
+    monkeypatch.setattr(stepping, "solve", unlucky)
+    relaxed = dragged(ball, 0.5)
+    assert relaxed.status == "complete"
+    for one, other in zip(expected.states[1:], relaxed.states[1:], strict=True):
+        assert one.newton_iterations != other.newton_iterations
+        scale = np.abs(one.displacement).max()
+        np.testing.assert_allclose(other.displacement, one.displacement, atol=2e-3 * scale)
+
+
+def test_relaxation_goes_on_where_newtons_method_ends_and_viscosity_follows_the_error(monkeypatch) -> None:
+    """A key that lies askew, whose corners slip over the contact points."""
+    key = {"shape": "mesh", "file": "key.stl", "size_mm": 8.0, "rotation_deg": [66.81, 34.57, 121.22]}
+    trajectory = dragged(key, 0.3)
+    assert trajectory.status == "complete"
+    assert all(state.residual < 1e-5 and state.min_jacobian > 0 for state in trajectory.states)
+    monkeypatch.setattr(stepping, "MAX_RELAXED_STEP", 0.0)
+    assert dragged(key, 0.3).status == "partial"
+    errors = (AIM, AIM / 2, 0.0, 2 * MAX_ERROR, np.inf)
+    same, less, least, more, most = (next_viscosity(1.0, error) for error in errors)
+    assert same == pytest.approx(1.0)
+    assert least < less < same < more <= most
+    assert next_viscosity(LEAST_VISCOSITY, 0.0) == 0.0
+    assert next_viscosity(MOST_VISCOSITY, np.inf) == MOST_VISCOSITY

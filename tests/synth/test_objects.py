@@ -51,7 +51,7 @@ def areas(corners: FloatArray) -> FloatArray:
 
 
 @each_file
-def test_surface_is_closed_and_every_shell_is_oriented_outward(file: Path) -> None:
+def test_surface_is_closed_oriented_outward_without_slivers_and_5_to_30_mm_long(file: Path) -> None:
     """In a consistently oriented closed surface each directed edge occurs once, and its reverse once."""
     surface, corners = pv.read(file).clean(), corners_of(file)
     assert surface.is_manifold
@@ -63,10 +63,6 @@ def test_surface_is_closed_and_every_shell_is_oriented_outward(file: Path) -> No
     assert {tuple(edge) for edge in edges} == {tuple(edge) for edge in edges[:, ::-1]}
     assert surface.split_bodies().n_blocks == 1, "with more shells, look at the volume of each"
     assert volume(corners) > 0
-
-
-@each_file
-def test_no_triangle_is_degenerate_and_the_size_is_5_to_30_mm(file: Path) -> None:
     corners = corners_of(file)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     assert (2 * areas(corners) / longest).min() > SMALLEST_HEIGHT
@@ -218,16 +214,13 @@ def test_a_notch_narrower_than_the_edges_is_filled(tmp_path: Path) -> None:
     assert distances(body_of(path, fillet_mm=0.6), within)[0] < 0
 
 
-def test_what_cannot_touch_has_no_grid(tmp_path: Path) -> None:
+def test_what_cannot_touch_has_no_grid_and_the_radius_is_what_the_gel_can_follow(tmp_path: Path) -> None:
     path = saved(tmp_path, *parts(""))
     whole, part = body_of(path), body_of(path, touchable=Touchable(height_mm=0.5))
     assert part.coefficients.shape[2] < whole.coefficients.shape[2] - 10
     assert part.reach_mm == pytest.approx(whole.reach_mm, abs=1e-6)
     top = around((2.0, 1.5, 0.1)) + np.array([0.0, 0.0, 0.9])
     assert_equal_near(distances(part, top), distances(whole, top), 0.2, 0.01)
-
-
-def test_the_radius_is_the_stated_one_or_what_the_gel_can_follow() -> None:
     stated = MeshIndenter(shape="mesh", file="object.stl", fillet_mm=0.5)
     assert object_radius(stated, 0.1) == 0.5
     assert object_radius(stated, 0.4) == OBJECT_RADIUS * 0.4

@@ -32,7 +32,7 @@ def _centroid(weight: FloatArray, x: FloatArray, y: FloatArray) -> tuple[float, 
     return (weight * x).sum() / total, (weight * y[:, None]).sum() / total
 
 
-def test_strips_blend_as_the_whole_to_the_bit() -> None:
+def test_strips_blend_to_the_bit_and_bare_coating_is_as_fine_as_the_camera_and_capped() -> None:
     dots = Dots(kind="dots", spacing_mm=(1.3, 1.1), radius_mm=0.4, softness_mm=0.3, reflectance=(0.1, 0.2, 0.9))
     sensor, texture, x, y = _painted(dots, seed=3, white=False)
     assert len(y) % 32
@@ -40,9 +40,6 @@ def test_strips_blend_as_the_whole_to_the_bit() -> None:
     coating = np.array(sensor.coating.reflectance)
     painted = coating + share * (np.array(dots.reflectance) - coating)
     np.testing.assert_array_equal(texture.astype(np.float32), painted.astype(np.float32))
-
-
-def test_bare_coating_is_uniform_at_a_resolution_that_follows_the_camera_and_is_capped() -> None:
     sensor = small_sensor()
     texture, sharp = (albedo(one, np.random.default_rng(0)) for one in (sensor, small_sensor(fx=1e5, fy=1e5)))
     # 140 px focal length over 20 mm - 6 mm + 6 mm / 1
@@ -51,7 +48,7 @@ def test_bare_coating_is_uniform_at_a_resolution_that_follows_the_camera_and_is_
     assert max(sharp.shape) <= 3072
 
 
-def test_random_colors_differ_from_cell_to_cell() -> None:
+def test_random_colors_differ_from_cell_to_cell_and_speckle_covers_what_is_asked() -> None:
     sensor = small_sensor(pattern=RandomColor(kind="random_color", cell_mm=1.0, softness_mm=0.0))
     texture = albedo(sensor, np.random.default_rng(3))
     assert texture.max() <= np.float32(0.6)  # a white cell reflects as the bare coating
@@ -59,9 +56,6 @@ def test_random_colors_differ_from_cell_to_cell() -> None:
     row = np.abs(np.diff(texture[100], axis=0)).sum(1) > 0.02
     borders = np.count_nonzero(row & ~np.roll(row, 1))
     assert 11 <= borders <= 12
-
-
-def test_speckle_covers_what_is_asked() -> None:
     pattern = Speckle(kind="speckle", grain_mm=0.5, coverage=0.35, reflectance=(0, 0, 0))
     texture = albedo(small_sensor(pattern=pattern), np.random.default_rng(1))
     # The cut is a quantile of this very texture; only the slope of the density across the edge remains: below 1 %.
@@ -83,7 +77,7 @@ def test_pattern_comes_from_the_generator_alone(pattern) -> None:
     assert 0 <= first.min() < first.max() <= 1
 
 
-def test_grey_is_what_has_no_color_anywhere() -> None:
+def test_grey_is_what_has_no_color_and_texture_as_fine_as_the_finest_view() -> None:
     for pattern, grey in (
         (None, True),
         (RandomColor(kind="random_color", cell_mm=1, saturation=0), True),
@@ -94,9 +88,6 @@ def test_grey_is_what_has_no_color_anywhere() -> None:
         assert is_grey(small_sensor(pattern=pattern)) == grey, pattern
     red = Light(position_mm=(7, 0, 4), size_mm=(1, 1), color=(1, 0, 0), power=1)
     assert not is_grey(small_sensor(lights=(red,)))
-
-
-def test_texture_is_as_fine_as_the_finest_view_sees_it() -> None:
     sensor = small_sensor(position_mm=(0.0, 0.0, 20.0), look_at_mm=(0.0, 0.0, 0.0))
     near = FurtherCamera(**(sensor.camera.model_dump() | {"name": "near", "position_mm": (0.0, 0.0, 14.0)}))
     both = sensor.model_copy(update={"further_cameras": (near,)})
@@ -107,7 +98,7 @@ def test_texture_is_as_fine_as_the_finest_view_sees_it() -> None:
     assert pixels_per_mm(folded) == pytest.approx(4.0)  # 15 mm to the mirror and 20 mm from there to the gel
 
 
-def test_a_turned_grid_turns_about_its_first_dot() -> None:
+def test_turned_grids_turn_about_the_first_dot_and_touching_diamonds_make_a_checkerboard() -> None:
     dots = _grid(spacing_mm=(3.0, 30.0), offset_mm=(0.5, 0.2), rotation_deg=30.0)
     _, texture, x, y = _painted(dots)
     weight = 1 - texture[:, :, 0]
@@ -115,6 +106,17 @@ def test_a_turned_grid_turns_about_its_first_dot() -> None:
     # +x turns toward +y. The next dot's centroid is met within a thirtieth of a texel (0.036 mm).
     assert (weight * near).sum() * (x[1] - x[0]) * (y[1] - y[0]) == pytest.approx(np.pi * 0.4**2, rel=1e-2)
     assert _centroid(weight * near, x, y) == pytest.approx((0.5 + 3 * np.cos(np.pi / 6), 1.7), abs=2e-3)
+    pattern = _grid(shape="diamond", radius_mm=0.75, rotation_deg=25.0, offset_mm=(0.3, 0.2), softness_mm=0.0)
+    _, texture, x, y = _painted(pattern)
+    assert (1 - texture).mean() == pytest.approx(0.5, abs=0.01)  # cells cut by the pad's border: ± 1 of 96, halved
+    angle = np.radians(25.0)
+    u = ((x[None] - 0.3) * np.cos(angle) + (y[:, None] - 0.2) * np.sin(angle)) / 1.5
+    v = ((y[:, None] - 0.2) * np.cos(angle) - (x[None] - 0.3) * np.sin(angle)) / 1.5
+    # The field's own formula: cos(2 pi u) + cos(2 pi v) > 0 where |u| + |v| < 1/2, and so on with period 1.
+    field = np.cos(2 * np.pi * u) + np.cos(2 * np.pi * v)
+    clear = np.abs(field) > 0.3  # off the borders by 0.3 / (2 pi sqrt(2)) · 1.5 mm = 0.05 mm, more than a texel
+    assert clear.mean() > 0.7
+    assert np.array_equal(texture[:, :, 0][clear] < 0.5, field[clear] > 0)
 
 
 def _grid(**changes: object) -> Dots:
@@ -135,20 +137,6 @@ def test_dots_cover_their_area_and_sit_on_the_grid(shape: str) -> None:
     for cx, cy in itertools.product((-5.25, -0.75, 3.75), (-3.9375, 0.5625, 2.8125)):
         near = dark * (np.abs(x[None] - cx) < 0.75) * (np.abs(y[:, None] - cy) < 0.5625)
         assert _centroid(near, x, y) == pytest.approx((cx, cy), abs=1.2e-3)  # a thirtieth of a texel
-
-
-def test_diamonds_that_touch_make_a_checkerboard_turned_with_the_grid() -> None:
-    pattern = _grid(shape="diamond", radius_mm=0.75, rotation_deg=25.0, offset_mm=(0.3, 0.2), softness_mm=0.0)
-    _, texture, x, y = _painted(pattern)
-    assert (1 - texture).mean() == pytest.approx(0.5, abs=0.01)  # cells cut by the pad's border: ± 1 of 96, halved
-    angle = np.radians(25.0)
-    u = ((x[None] - 0.3) * np.cos(angle) + (y[:, None] - 0.2) * np.sin(angle)) / 1.5
-    v = ((y[:, None] - 0.2) * np.cos(angle) - (x[None] - 0.3) * np.sin(angle)) / 1.5
-    # The field's own formula: cos(2 pi u) + cos(2 pi v) > 0 where |u| + |v| < 1/2, and so on with period 1.
-    field = np.cos(2 * np.pi * u) + np.cos(2 * np.pi * v)
-    clear = np.abs(field) > 0.3  # off the borders by 0.3 / (2 pi sqrt(2)) · 1.5 mm = 0.05 mm, more than a texel
-    assert clear.mean() > 0.7
-    assert np.array_equal(texture[:, :, 0][clear] < 0.5, field[clear] > 0)
 
 
 def test_jitter_moves_and_sizes_dots_by_what_is_asked() -> None:

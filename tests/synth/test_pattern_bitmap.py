@@ -23,8 +23,7 @@ from synth.render.variant import choose_variant
 from synth.scene import Bitmap, Coating, Sensor
 from synth.scene.template import load_scene
 
-ROWS, COLUMNS = 252, 336
-"""Texels of the pad of 12 x 9 mm at 7 px per mm."""
+ROWS, COLUMNS = 252, 336  # Texels of the pad of 12 x 9 mm at 7 px per mm
 
 
 def _sensor(pattern: Bitmap, coating: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Sensor:
@@ -105,7 +104,7 @@ def test_fine_stripes_become_their_mean(tmp_path: Path) -> None:
     assert inner.mean() == pytest.approx(0.5, abs=0.01)
 
 
-def test_grey_with_alpha_and_palettes_are_read(tmp_path: Path) -> None:
+def test_grey_with_alpha_palettes_and_turned_photographs_are_read(tmp_path: Path) -> None:
     values = np.random.default_rng(0).integers(0, 256, (6, 8, 2)).astype(np.uint8)
     Pillow.fromarray(values, "LA").save(tmp_path / "la.png")
     Pillow.fromarray(values[:, :, 0]).convert("P").save(tmp_path / "palette.png")
@@ -116,9 +115,6 @@ def test_grey_with_alpha_and_palettes_are_read(tmp_path: Path) -> None:
     opacity, place = values[3, 4, 1] / 255, (int(3.5 / 6 * ROWS), int(4.5 / 8 * COLUMNS))
     # Half a texel of 42 off the pixel's middle.
     assert with_alpha[place] == pytest.approx(1 - opacity * (1 - grey[place]), abs=0.03)
-
-
-def test_a_photograph_is_turned_as_its_exif_says(tmp_path: Path) -> None:
     stored = np.random.default_rng(0).integers(0, 256, (6, 8, 3), np.uint8)
     exif = Pillow.Exif()
     exif[ExifTags.Base.Orientation] = 6  # to be turned by a quarter, clockwise
@@ -159,8 +155,7 @@ def test_what_is_no_picture_is_refused_in_one_line(tmp_path: Path, data: bytes |
 BITMAP = 'sensor.pattern={ kind = "bitmap", file = "art/mine.png", width_mm = 8 }'
 
 DOTS = TEXT[TEXT.index('kind = "dots"') : TEXT.index("[sensor.camera]")]
-HALF = np.where(np.arange(80) < 40, 0, 255).astype(np.uint8)[None].repeat(60, axis=0)
-"""The left half is black."""
+HALF = np.where(np.arange(80) < 40, 0, 255).astype(np.uint8)[None].repeat(60, axis=0)  # The left half is black
 
 
 @pytest.fixture

@@ -168,7 +168,7 @@ def test_nothing_is_compiled_for_another_frame_or_another_draw_of_the_sensor() -
 
 
 @needs_llvm
-def test_grey_scenes_look_the_same_in_one_channel_and_coloured_ones_are_refused() -> None:
+def test_grey_scenes_look_the_same_in_one_channel_and_light_brightens_the_slope_that_faces_it() -> None:
     sensor = small_sensor(1.45, _dots())
     texture = albedo(sensor, np.random.default_rng(0))
     color, mono = (rendered(sensor, texture, variant=one) for one in (FAST, MONO))
@@ -177,21 +177,7 @@ def test_grey_scenes_look_the_same_in_one_channel_and_coloured_ones_are_refused(
     red = Light(position_mm=(7, 0, 4), size_mm=(1, 1), color=(1, 0, 0), power=1)
     with pytest.raises(ValueError, match="grey"):
         rendered(small_sensor(lights=(red,)), variant=MONO)
-
-
-@pytest.mark.parametrize("variant", VARIANTS, **names)
-def test_beside_the_pad_it_is_black(variant: Variant) -> None:
-    light = Light(position_mm=(17.0, 0.0, 5.5), size_mm=(1, 1), color=(1, 1, 1), power=1000)
-    sensor = small_sensor(lights=(light,), fx=40.0, fy=40.0, cx=40.0, cy=30.0)  # 2 px per mm: 24 x 18 px of pad
-    image = rendered(sensor, variant=variant)
-    assert np.all(image[:8] == 0)
-    assert np.all(image[:, :10] == 0)
-    assert np.all(image[25:35, 35:45] > 0)
-
-
-@needs_llvm
-def test_light_from_one_side_brightens_the_slope_that_faces_it() -> None:
-    """A dent toward the camera: the flank on the side of the light is lit, the other one shaded, in x as in y."""
+    # A dent toward the camera: the flank on the side of the light is lit, the other shaded, in x as in y.
     for position, bright, dark in [
         ((7.0, 0.0, 3.0), np.s_[25:35, 46:52], np.s_[25:35, 28:34]),
         ((0.0, 5.5, 3.0), np.s_[36:42, 35:45], np.s_[18:24, 35:45]),
@@ -206,15 +192,22 @@ def test_light_from_one_side_brightens_the_slope_that_faces_it() -> None:
         assert change[bright].mean() > 0 > change[dark].mean()
 
 
-def test_samples_fill_a_grid_and_serve_every_light_alike() -> None:
+@pytest.mark.parametrize("variant", VARIANTS, **names)
+def test_beside_the_pad_it_is_black(variant: Variant) -> None:
+    light = Light(position_mm=(17.0, 0.0, 5.5), size_mm=(1, 1), color=(1, 1, 1), power=1000)
+    sensor = small_sensor(lights=(light,), fx=40.0, fy=40.0, cx=40.0, cy=30.0)  # 2 px per mm: 24 x 18 px of pad
+    image = rendered(sensor, variant=variant)
+    assert np.all(image[:8] == 0)
+    assert np.all(image[:, :10] == 0)
+    assert np.all(image[25:35, 35:45] > 0)
+
+
+def test_samples_fill_a_grid_and_lights_in_the_view_and_scalar_lenses_are_refused() -> None:
     for samples, lights in product((1, 5, 32, 100), (0, 1, 3, 4, 9)):
         got = full_grid(samples, lights)
         assert got >= samples
         assert got % int(np.sqrt(got)) == got % max(lights, 1) == 0
     assert full_grid(36, 3) == 36
-
-
-def test_lights_in_the_view_and_lenses_that_scalar_variants_cannot_render_are_refused() -> None:
     light = Light(position_mm=(1.0, 0.0, 3.0), size_mm=(1, 1), color=(1, 1, 1), power=1)
     with pytest.raises(InputError, match=r"lights\[0\].*between the camera and the gel"):
         rendered(small_sensor(lights=(light,)))

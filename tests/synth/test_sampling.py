@@ -23,7 +23,7 @@ def _draws(template: Template, seed: int = 3) -> list[Scene]:
     return [draw(template, seed, trajectory, sensor=sensor) for trajectory in range(COUNT)]
 
 
-def test_uniform_log_uniform_and_normal_have_their_distribution(tiny: Path) -> None:
+def test_distributions_are_those_asked_for_and_choices_equally_likely(tiny: Path) -> None:
     """Kolmogorov-Smirnov against SciPy's distributions."""
     ranges = ["motion.twist_deg={ normal = [5.0, 2.0] }", "contact.friction={ log_uniform = [0.01, 1.0] }"]
     scenes = _draws(load_scene(tiny, ranges))
@@ -33,9 +33,6 @@ def test_uniform_log_uniform_and_normal_have_their_distribution(tiny: Path) -> N
         ([s.contact.friction for s in scenes], stats.loguniform(0.01, 1)),
     ):
         assert stats.kstest(values, law.cdf).pvalue > SURE
-
-
-def test_choice_takes_numbers_words_and_tables_equally_often(tiny: Path) -> None:
     sphere = '{ shape = "sphere", radius_mm = { uniform = [1, 2] } }'
     torus = '{ shape = "torus", radius_mm = 1, tube_mm = 0.3 }'
     choices = [f"contact.indenter={{ choice = [{sphere}, {torus}] }}", "motion.steps={ choice = [2, 3, 5] }"]
@@ -58,7 +55,7 @@ def test_draws_are_independent_of_each_other(tiny: Path) -> None:
         assert stats.pearsonr(a, b).pvalue > SURE
 
 
-def test_a_draw_is_a_function_of_scene_seed_and_number(tiny: Path) -> None:
+def test_a_draw_is_a_function_of_scene_seed_and_number_as_streams_are_of_purpose(tiny: Path) -> None:
     template = load_scene(tiny)
     assert draw(template, 3, 7) == draw(load_scene(tiny), 3, 7)
     scenes = [draw(template, seed, 7, attempt) for seed, attempt in itertools.product((3, 4), (0, 1))]
@@ -66,9 +63,16 @@ def test_a_draw_is_a_function_of_scene_seed_and_number(tiny: Path) -> None:
     depths = {scene.motion.depth_mm for scene in scenes}
     assert len(depths) == 5
     assert draw(template, 10**30, 7) != draw(template, 0, 7)  # seeds of any size
+    numbers = {
+        float(stream(template, seed, purpose, *key).random())
+        for seed in (0, 1)
+        for purpose in ("noise", "pattern")
+        for key in ((0,), (1,), (0, 0), (0, 1), (1, 0))
+    }
+    assert len(numbers) == 20
 
 
-def test_trajectories_and_redraws_of_a_sensor_share_it_and_nothing_else(tiny: Path) -> None:
+def test_trajectories_and_redraws_share_their_sensor_alone_and_too_many_pairs_are_refused(tiny: Path) -> None:
     template = load_scene(tiny, ["sampling.trajectories_per_sensor=3"])
     scenes = [draw(template, 0, trajectory, attempt) for trajectory in range(9) for attempt in (0, 1)]
     for first in (0, 6, 12):
@@ -76,9 +80,12 @@ def test_trajectories_and_redraws_of_a_sensor_share_it_and_nothing_else(tiny: Pa
     assert len({s.sensor for s in scenes}) == 3
     assert len({s.motion for s in scenes}) == 18
     assert len({s.contact for s in scenes}) == 18
+    check_pairs(load_scene(tiny, ["sampling.pairs_per_trajectory=3"]).corners[0])  # three states: 01, 02, 12
+    with pytest.raises(InputError, match=r"^sampling\.pairs_per_trajectory = 4: motion\.steps = 2 .* at most 3"):
+        check_pairs(load_scene(tiny, ["sampling.pairs_per_trajectory=4"]).corners[0])
 
 
-def test_a_sensor_whose_draw_breaks_the_schema_is_drawn_again(tiny: Path) -> None:
+def test_a_sensor_that_cannot_be_used_is_drawn_again_and_at_last_says_why(tiny: Path) -> None:
     """Half of the draws of a vignetting around 0 are negative."""
     template = load_scene(tiny, ["sensor.camera.vignetting={ normal = [0.0, 0.1] }"])
     draws = [draw_sensor(template, 0, sensor) for sensor in range(40)]
@@ -91,34 +98,17 @@ def test_a_sensor_whose_draw_breaks_the_schema_is_drawn_again(tiny: Path) -> Non
         scene = draw(template, 0, 2 * sensor)
         assert scene.sensor.camera.vignetting >= 0
         assert scene.sensor == draw(template, 0, 2 * sensor + 1).sensor
-
-
-def test_a_sensor_whose_light_gets_into_the_view_is_drawn_again(tiny: Path) -> None:
     template = load_scene(tiny, ["sensor.lights.0.position_mm=[{ normal = [3.9, 1.0] }, 0.0, 2.0]"])
     draws = [draw_sensor(template, 0, sensor) for sensor in range(10)]
     reasons = [reason for found in draws for reason in found.rejected]
     assert reasons
     assert all("between the camera and the gel" in reason for reason in reasons)
-
-
-def test_a_sensor_that_no_draw_makes_usable_says_why(tiny: Path) -> None:
     template = load_scene(tiny, ["sensor.camera.vignetting={ normal = [0.0, 1e9] }"])
     found = draw_sensor(template, 0, 0)
     assert found.content is None
     assert len(found.rejected) == MAX_DRAWS
     with pytest.raises(InputError, match=r"sensor\.camera\.vignetting"):
         draw(template, 0, 0)
-
-
-def test_streams_of_different_purposes_differ(tiny: Path) -> None:
-    template = load_scene(tiny)
-    numbers = {
-        float(stream(template, seed, purpose, *key).random())
-        for seed in (0, 1)
-        for purpose in ("noise", "pattern")
-        for key in ((0,), (1,), (0, 0), (0, 1), (1, 0))
-    }
-    assert len(numbers) == 20
 
 
 @pytest.mark.parametrize(("pairs", "steps"), [(1, 1), (2, 2), (4, 3), (6, 3)])
@@ -132,12 +122,6 @@ def test_pairs_are_numbered_distinct_and_begin_with_the_whole_motion(tiny: Path,
         assert len({pair.frames for pair in found}) == pairs
         assert all(0 <= i < j <= steps for i, j in (pair.frames for pair in found))
         assert found == pairs_of(template, 0, trajectory, steps)
-
-
-def test_more_pairs_than_a_trajectory_has_are_refused(tiny: Path) -> None:
-    check_pairs(load_scene(tiny, ["sampling.pairs_per_trajectory=3"]).corners[0])  # three states: 01, 02, 12
-    with pytest.raises(InputError, match=r"^sampling\.pairs_per_trajectory = 4: motion\.steps = 2 .* at most 3"):
-        check_pairs(load_scene(tiny, ["sampling.pairs_per_trajectory=4"]).corners[0])
 
 
 @pytest.mark.parametrize("name", shipped_scenes())

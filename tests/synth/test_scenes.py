@@ -1,20 +1,30 @@
-"""The shipped scenes: every draw is whole in every camera, and says where its numbers come from."""
+"""The shipped scenes: every draw is whole in every camera, and says where its numbers come from.
+
+And folders of objects: patterns of files, orientations of all kinds, and the scene `objects`, which has both.
+"""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import stats
+from tiny_scene import write_tiny
 
 from synth.arrays import FloatArray, Points
+from synth.dataset.reader import read_dataset
+from synth.errors import InputError
 from synth.optics import Optics, Rays
+from synth.pipeline.generate import generate
+from synth.planning import job_variant, plan, predict
 from synth.render.lights import check_view, light_axes
 from synth.render.pattern import albedo, pixels_per_mm
-from synth.scene import Scene, Sensor
-from synth.scene.sampling import draw
-from synth.scene.template import SCENES, load_scene
+from synth.scene import MeshIndenter, Scene, Sensor
+from synth.scene.sampling import draw, draw_sensor
+from synth.scene.template import SCENES, Template, load_scene, with_files
+from synth.simulate.indenter import turned_by
 
-WIDE = ["gelsight_mini", "deltact", "gelsight"]
-"""Scenes of six kinds of indenter and motions up to 25 px."""
+WIDE = ["gelsight_mini", "deltact", "gelsight"]  # Scenes of six kinds of indenter and motions up to 25 px
 OPTICAL = ["gelslim", "gelstereo", "tac3d", "fingervision", "digit", "omnitact", "soft_bubble"]
 NAMES = [*WIDE, *OPTICAL, "densetact", "gelsight_fingertip"]
 CAMERAS = {"gelstereo": ["right"], "omnitact": ["east", "west", "south", "north"]}
@@ -46,10 +56,7 @@ def _on_face(rays: Rays, radius: float | None) -> Points:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_every_pixel_of_every_camera_sees_gel_and_no_light(name: str) -> None:
-    """Also when the gel is sheared as far as it may be: gel moves less than its indenter.
-
-    Fails with a light of gelsight_fingertip at x = 5 mm, and with its pad of 17 x 14 mm.
-    """
+    """Also when the gel is sheared as far as it may be: gel moves less than its indenter."""
     for scene in _draws(name, 30 if name in WIDE else 8):
         shear = np.abs(scene.motion.shear_mm)
         assert list(scene.sensor.views) == ["", *CAMERAS.get(name, [])]
@@ -96,7 +103,7 @@ def test_every_kind_of_indenter_and_a_fraction_of_a_pixel_to_25(name: str) -> No
     assert 15 < motion.max() < 35
 
 
-def test_gelsight_mini_covers_the_published_field_of_view() -> None:
+def test_gelsight_mini_covers_its_field_of_view_and_the_fingertips_markers_lie_above() -> None:
     """18.6 mm x 14.3 mm (datasheet); square pixels at 4:3 cannot meet both, so within 3 %."""
     sensor = _draws("gelsight_mini", 1)[0].sensor
     scale = pixels_per_mm(sensor)
@@ -104,9 +111,17 @@ def test_gelsight_mini_covers_the_published_field_of_view() -> None:
     assert sensor.camera.height / scale == pytest.approx(14.3, rel=0.03)
     assert 30 < sensor.pattern.spacing_mm[0] * scale < 33  # px, measured in the recordings
     assert 10 < 2 * sensor.pattern.radius_mm * scale < 14.5
+    sensor = _draws("gelsight_fingertip", 1)[0].sensor
+    assert not sensor.coating.is_matt
+    texture = albedo(sensor, np.random.default_rng(0))
+    assert texture.shape[2] == 4
+    radius, (across, down) = sensor.pattern.radius_mm, sensor.pattern.spacing_mm
+    # Some 280 dots, each 16 % off in area (radius_jitter 0.08): 1 %; up to 3 % of them cut by the pad's border.
+    covered = texture[:, :, 3].mean() / (np.pi * radius**2 / (across * down))
+    assert abs(covered - 1) < 0.06
 
 
-def test_the_stereo_pair_sees_height() -> None:
+def test_the_stereo_pair_sees_height_and_lights_of_densetact_stand_above_its_face() -> None:
     """The middle of the pad is in both images; raising it by 1 mm changes the disparity as base and distance say."""
     left, right = (Optics.of(sensor) for sensor in _draws("gelstereo", 1)[0].sensor.views.values())
     x, y = np.meshgrid(np.linspace(-4, 4, 9), np.linspace(-3, 3, 7))
@@ -120,21 +135,6 @@ def test_the_stereo_pair_sees_height() -> None:
     # 1 mm under the window is 1 / 1.41 mm of apparent height; base 12 mm, distance 29.4 mm, f = 316 px: 3.1 px, for
     # rays along the axis. The cameras look 10 degrees askew: the cosine's square, and as much again from Snell's law.
     np.testing.assert_allclose(disparity[1] - disparity[0], 316 * 12 / 1.41 / 29.4**2, rtol=0.08)
-
-
-def test_markers_of_the_fingertip_lie_above_its_shining_coating() -> None:
-    """Fails with layer left out of the file."""
-    sensor = _draws("gelsight_fingertip", 1)[0].sensor
-    assert not sensor.coating.is_matt
-    texture = albedo(sensor, np.random.default_rng(0))
-    assert texture.shape[2] == 4
-    radius, (across, down) = sensor.pattern.radius_mm, sensor.pattern.spacing_mm
-    # Some 280 dots, each 16 % off in area (radius_jitter 0.08): 1 %; up to 3 % of them cut by the pad's border.
-    covered = texture[:, :, 3].mean() / (np.pi * radius**2 / (across * down))
-    assert abs(covered - 1) < 0.06
-
-
-def test_lights_of_densetact_stand_in_gel_or_window_above_the_domed_face() -> None:
     for scene in _draws("densetact", 8):
         gel, window = scene.sensor.gel, scene.sensor.window
         for light in scene.sensor.lights:
@@ -144,3 +144,90 @@ def test_lights_of_densetact_stand_in_gel_or_window_above_the_domed_face() -> No
                 x, y, z = np.array(light.position_mm) + arm
                 face = gel.dome_radius_mm - np.sqrt(gel.dome_radius_mm**2 - x * x - y * y)
                 assert face < z < gel.size_mm[2] + window.thickness_mm
+
+
+ANY = 'contact.indenter={ shape = "mesh", file = "objects/*.stl", rotation_deg = "any" }'
+
+
+@pytest.fixture
+def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A scene beside a folder of two objects, which is the working directory."""
+    (tmp_path / "objects").mkdir()
+    for name in ("b.stl", "a.stl", "notes.txt"):
+        (tmp_path / "objects" / name).write_text(name)
+    monkeypatch.chdir(tmp_path)
+    return write_tiny(tmp_path)
+
+
+def drawn_indenters(template: Template, count: int) -> list[MeshIndenter]:
+    sensor = draw_sensor(template, 0, 0)
+    drawn = [draw(template, 0, trajectory, sensor=sensor).contact.indenter for trajectory in range(count)]
+    return [indenter for indenter in drawn if isinstance(indenter, MeshIndenter)]
+
+
+def test_a_pattern_is_a_choice_of_the_files_that_match_wherever_it_stands(tiny: Path) -> None:
+    folder = tiny.parent / "objects"
+    choice = {"choice": [str(folder / "a.stl"), str(folder / "b.stl")]}
+    assert load_scene(tiny, [ANY]).content["contact"]["indenter"]["file"] == choice
+    sphere = '{ shape = "sphere", radius_mm = 1 }'
+    nested = load_scene(tiny, [f"contact.indenter={{ choice = [{ANY.partition('=')[2]}, {sphere}] }}"])
+    assert nested.content["contact"]["indenter"]["choice"][0]["file"] == choice
+    files = {indenter.file for indenter in drawn_indenters(nested, 40)}
+    assert files == set(choice["choice"])
+    content = {"file": {"choice": ["a", {"choice": ["b"]}]}, "more": [{"file": "c", "name": "file"}]}
+    renamed = {"file": {"choice": ["A", {"choice": ["B"]}]}, "more": [{"file": "C", "name": "file"}]}
+    assert with_files(content, str.upper) == renamed
+
+
+def test_a_pattern_in_a_scenes_file_is_relative_to_it_and_stays_so(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    head, _, _ = tiny.read_text().partition("[contact.indenter]")
+    tiny.write_text(f'{head}[contact.indenter]\nshape = "mesh"\nfile = "objects/*.stl"\n[motion]\ndepth_mm = 0.1\n')
+    monkeypatch.chdir("/")
+    assert load_scene(tiny).content["contact"]["indenter"]["file"] == {"choice": ["objects/a.stl", "objects/b.stl"]}
+
+
+def test_unmatched_patterns_are_refused_new_objects_count_and_names_like_patterns_are_names(tiny: Path) -> None:
+    with pytest.raises(InputError, match=rf"contact\.indenter\.file: there is no file {tiny.parent}/objects/\*\.obj"):
+        load_scene(tiny, [ANY.replace("stl", "obj")])
+    before = load_scene(tiny, [ANY]).hash
+    assert load_scene(tiny, [ANY]).hash == before
+    (tiny.parent / "objects" / "c.stl").touch()
+    assert load_scene(tiny, [ANY]).hash != before
+    file = tiny.parent / "objects" / "a[1].stl"
+    file.touch()
+    override = 'contact.indenter={ shape = "mesh", file = "objects/a[1].stl" }'
+    assert load_scene(tiny, [override]).content["contact"]["indenter"]["file"] == str(file)
+
+
+def test_every_object_is_drawn_and_all_orientations_are_alike_likely(tiny: Path) -> None:
+    """Every entry of a uniformly distributed rotation matrix is a coordinate of a uniform point on the unit sphere.
+
+    Such a coordinate is uniform on [-1, 1] (Archimedes). Angles about y drawn uniformly would give arcsine
+    distributions, 0.11 away, and fail.
+    """
+    indenters = drawn_indenters(load_scene(tiny, [ANY]), 1000)
+    rotations = np.array([turned_by(indenter.rotation_deg) for indenter in indenters])
+    for entries in rotations.reshape(-1, 9).T:
+        assert stats.kstest(entries, stats.uniform(-1, 2).cdf).pvalue > 1e-4
+    indenters = drawn_indenters(load_scene("objects"), 400)
+    files = {SCENES / indenter.file for indenter in indenters}
+    assert files == set((SCENES / "objects").glob("*.stl"))
+    assert all(isinstance(angle, float) for indenter in indenters for angle in indenter.rotation_deg)
+    upright = np.mean([indenter.rotation_deg[:2] == (0.0, 0.0) for indenter in indenters])
+    assert upright == pytest.approx(0.5, abs=5 * 0.5 / np.sqrt(400))  # five standard deviations
+    assert indenters == drawn_indenters(load_scene("objects"), 400)
+    scene, mini = load_scene("objects").content, load_scene("gelsight_mini").content
+    for part in ("references", "sensor", "render", "numerics", "outputs", "sampling"):
+        assert scene[part] == mini[part], part
+
+
+def test_plan_and_samples_tell_how_edges_are_rounded(tiny: Path, tmp_path: Path) -> None:
+    washer = f'{{ shape = "mesh", file = "{SCENES / "objects" / "washer.stl"}", size_mm = 4.0, fillet_mm = 0.9 }}'
+    bodies = washer, '{ shape = "sphere", radius_mm = 2.0 }'
+    scenes = [load_scene(tiny, [f"contact.indenter={b}", "numerics={ target_error_px = 3.0 }"]) for b in bodies]
+    mesh, ball = (predict(plan(template, job_variant(template, "cpu"))) for template in scenes)
+    assert "edges of objects rounded to 0.9 to 0.9 mm" in mesh.resolution
+    # A mesh takes several times a ball's iterations.
+    assert mesh.seconds_per_pair["simulate"] > 3 * ball.seconds_per_pair["simulate"]
+    generate(scenes[0], 1, tmp_path / "data")
+    assert read_dataset(tmp_path / "data").entry(0).diagnostics["edge_radius_mm"] == 0.9

@@ -1,7 +1,4 @@
-"""Many trajectories at once against one by one.
-
-Each comment "fails with" names a change of `synth.simulate.batched` that was tried.
-"""
+"""Many trajectories at once against one by one."""
 
 from pathlib import Path
 from typing import Any
@@ -84,25 +81,18 @@ def apart(a: Trajectory, b: Trajectory) -> float:
 
 @pytest.mark.parametrize("element", MIXED)
 def test_many_at_once_agree_with_one_by_one(element: str) -> None:
-    # Fails with tangential multipliers that are not put back after a record.
     scenes = draws(element) if element == "p1p1" else [draws(element)[i] for i in (1, 3, 6)]
     for posed, result in zip(scenes, simulate_scenes(scenes, MESH, batch=2), strict=True):
         assert apart(alone(posed, MESH), result) < AGREEMENT
 
 
-def test_company_and_order_change_no_bit() -> None:
+def test_company_order_and_lost_samples_change_no_bit() -> None:
     """Lanes are refilled, and what ran in one before leaves no trace."""
-    # Fails with a state that is not cleared when a lane is filled again.
     scenes = draws("p1p1")
     given = simulate_scenes(scenes, MESH, batch=3)
     order = [6, 2, 7, 0, 3, 1, 5, 4]
     for i, result in zip(order, simulate_scenes([scenes[i] for i in order], MESH, batch=2), strict=True):
         assert same(result, given[i])
-
-
-def test_a_lost_sample_does_not_spoil_the_others() -> None:
-    """A ring of thin wire pressed through four fifths of a pad whose faces are three times as wide as the wire."""
-    # Fails with a trial that asks lane 0 for its phase.
     numerics = {"edge_length_mm": 0.1, "max_step_mm": 0.5}
     lost = scene(indenter=WIRE, friction=0.2, motion={"depth_mm": 3.3, "steps": 8}, numerics=numerics)
     good = scene(friction=0.4, motion={"depth_mm": 0.4}, numerics=numerics)
@@ -111,8 +101,7 @@ def test_a_lost_sample_does_not_spoil_the_others() -> None:
     assert same(second, simulate_scenes([good], MESH)[0])
 
 
-def test_an_indenter_that_finds_no_point_is_told_apart() -> None:
-    # Fails with a bound of -NOTHING on the force.
+def test_indenters_that_find_no_point_are_told_apart_and_grids_may_be_unequal(tmp_path: Path) -> None:
     size = (8.0, 6.0, 2.5)
     needle = {"shape": "sphere", "radius_mm": 0.1}
     posed = scene(size, indenter=needle, motion={"depth_mm": 0.5, "steps": 2, "position_mm": (0.3, 0.2)})
@@ -120,11 +109,6 @@ def test_an_indenter_that_finds_no_point_is_told_apart() -> None:
     one, other = alone(posed, mesh), simulate_scenes([posed], mesh)[0]
     assert (other.status, "touches no contact point" in other.reason) == ("partial", True)
     assert apart(one, other) < AGREEMENT
-
-
-def test_mesh_indenters_of_unequal_grids(tmp_path: Path) -> None:
-    """They touch at once, by the error of their grids, so that a lane that remembers another trajectory would show."""
-    # Fails with the first grid in every lane, or with anchors that are not forgotten when a lane is filled again.
     import pyvista as pv
 
     pv.Icosphere(radius=2.5, nsub=3).save(tmp_path / "large.stl")
@@ -145,11 +129,8 @@ def test_mesh_indenters_of_unequal_grids(tmp_path: Path) -> None:
     ("element", "poisson_ratio", "stiffening"),
     [("p2p1", 0.4999, (0.0, 0.0)), ("p2p1", 0.4999, (0.3, 0.1)), ("p1p1", 0.45, (0.2, 0.0)), ("p2p1", 0.2, (0.0, 0.0))],
 )
-def test_the_product_is_the_tangent_times_the_vector(
-    element: str, poisson_ratio: float, stiffening: tuple[float, float]
-) -> None:
+def test_the_product_is_the_tangent_times_the_vector(element, poisson_ratio, stiffening) -> None:
     """At a random state: contact that sticks and slips, pressures that hold dilation, elements near inverting."""
-    # Fails without the unsymmetric remainder, the mean pressure's part of the coupling, or t² in the fold's barrier.
     rng = np.random.default_rng(1)
     mesh = brick((4.0, 3.0, 2.0), (3, 2, 2))
     space = function_space(mesh, ELEMENT[element]())
@@ -205,7 +186,7 @@ def test_the_product_is_the_tangent_times_the_vector(
     assert np.linalg.norm(image.numpy()[: len(body.free), 0] - expected) < 2e-6 * np.linalg.norm(expected)
 
 
-def test_scenes_must_share_the_pad() -> None:
+def test_scenes_must_share_the_pad_which_serves_several_runs() -> None:
     with pytest.raises(InputError, match=r"mm pad"):
         simulate_scenes([scene((8.0, 6.0, 3.0))], MESH)
     different: list[dict[str, Any]] = [
@@ -216,9 +197,6 @@ def test_scenes_must_share_the_pad() -> None:
     for parts in different:
         with pytest.raises(InputError, match="must share the gel's materials and numerics"):
             simulate_scenes([scene(), scene(**parts)], MESH)
-
-
-def test_a_pad_serves_several_runs() -> None:
     posed = scene(friction=0.4, motion={"depth_mm": 0.2})
     pad, presses = prepare(posed, MESH, "cpu"), presses_of([posed], MESH)
     (_, one), (_, other) = (next(simulate_presses(presses, pad)) for _ in range(2))

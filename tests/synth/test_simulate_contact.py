@@ -1,7 +1,4 @@
-"""Contact and friction at the level of one evaluation: traction law, linearisation, multipliers and anchors.
-
-Each comment "fails with" names a change of `synth.simulate.contact` that was tried.
-"""
+"""Contact and friction at the level of one evaluation: traction law, linearisation, multipliers and anchors."""
 
 import numpy as np
 import pytest
@@ -19,8 +16,6 @@ each = pytest.mark.parametrize("element", MIXED)
 @frictions
 @pytest.mark.parametrize("fresh", [0.0, 0.5])
 def test_traction_is_the_law(friction: float, fresh: float, element: str) -> None:
-    # Fails with `limit / length` left out of _returned, with before for -gap in a new point's share, without friction
-    # of new points.
     made = touch(friction, fresh=fresh, element=element)
     normal, along = sphere_law(made)
     below = made.body.space.points[made.body.space.faces][..., 2].max(axis=1) == 0
@@ -50,9 +45,6 @@ def test_friction_stays_in_its_cone_and_plane(friction: float, shape: str, fresh
 @frictions
 @pytest.mark.parametrize(("fresh", "element"), [(0.0, "p1p1"), (0.5, "p1p1"), (1.0, "p1p1"), (0.5, "p2p1")])
 def test_tangent_is_the_derivative_of_the_residual(friction: float, shape: str, fresh: float, element: str) -> None:
-    # Fails with the sign of pressure * H turned, without (n.m) H or n (H m)^T, without mu eps tau n^T, without
-    # I - tau tau^T, with limit / length for one, without the term of a new point's share, with rho for its slope,
-    # without A - mean in the remainder, and with the remainder transposed.
     made = touch(friction, shape, fresh=fresh, element=element)
     body = made.body
     tangent = body.tangent(made.state, made.indenters)
@@ -79,7 +71,6 @@ def test_tangent_is_the_derivative_of_the_residual(friction: float, shape: str, 
 @each
 def test_remainder_of_stick_is_antisymmetric(element: str) -> None:
     """(n (H m)^T - (H m) n^T) / 2: all else of old anchors and stick is in the symmetric part."""
-    # Fails with A for A - mean in the remainder.
     made = touch(1e6, element=element)
     assert set(made.mode.ravel()) == {0, 1}
     tangent = made.body.tangent(made.state, made.indenters)
@@ -92,7 +83,6 @@ def test_remainder_of_stick_is_antisymmetric(element: str) -> None:
 @each
 def test_nodal_forces_and_moments_are_the_tractions(element: str) -> None:
     """`forces` and the residual say the same: what the indenter does to the gel, the nodes get."""
-    # Fails with the position of the undeformed points in `forces`, and with the sides' faces in the nodal mean.
     made = touch(0.7, element=element)
     body, space = made.body, made.body.space
     reaction = body.residual(made.state, made.indenters).reaction
@@ -119,7 +109,7 @@ def test_nodal_forces_and_moments_are_the_tractions(element: str) -> None:
     np.testing.assert_allclose(share @ nodal, on_face, atol=scale)
 
 
-def test_augmenting_takes_the_present_traction() -> None:
+def test_augmenting_takes_the_present_traction_and_deepest_is_the_largest_penetration() -> None:
     made = touch(0.7, multipliers=False)
     contact = made.body.contact
     normal, along = sphere_law(made)
@@ -129,14 +119,19 @@ def test_augmenting_takes_the_present_traction() -> None:
     # Where the gap is closed exactly the traction then needs no penetration: t = lambda - eps g.
     again, _ = sphere_law(made)
     np.testing.assert_allclose(np.linalg.norm(again, axis=-1), 2 * np.linalg.norm(normal, axis=-1), atol=1e-12)
+    made = touch(0.0)
+    away = np.linalg.norm(made.points - made.centre, axis=-1)
+    assert made.body.deepest() == pytest.approx(RADIUS - away.min(), abs=1e-14)
+    made.indenters.centre.assign(np.array([[0.0, 0.0, -50.0]]))
+    made.evaluate()
+    assert made.body.deepest() == 0.0
+    assert made.body.slip_ratio(made.indenters) == 0.0
 
 
 @pytest.mark.parametrize("fresh", [0.0, 0.5])
 @pytest.mark.parametrize("multipliers", [False, True])
 def test_settling_keeps_the_tractions(multipliers: bool, fresh: float) -> None:
     """Accepting a step moves no force: slipping points drag their anchors so far that they are just at the limit."""
-    # Fails with the sign of the anchor's correction turned, with the multiplier left out of it, with 1.0 for ON_CONE (a
-    # quarter of the slipping points then leave their anchors behind), with new points anchored where they are.
     made = touch(0.2, multipliers=multipliers, fresh=fresh)
     body, contact, was = made.body, made.body.contact, made.anchored.copy()
     mode, before = made.mode, body.traction.numpy()[0].copy()
@@ -155,9 +150,8 @@ def test_settling_keeps_the_tractions(multipliers: bool, fresh: float) -> None:
     assert (contact.gap.numpy()[0] == body.gap.numpy()[0]).all()
 
 
-def test_new_contact_is_anchored_where_it_touched() -> None:
+def test_new_contact_is_anchored_where_it_touched_unless_without_past_or_friction() -> None:
     """A point that came through the surface in a straight line is anchored where it passed it, also before a pass."""
-    # Fails with it anchored where it is, or `new_only` not returning early.
     made = touch(STICK, multipliers=False, fresh=1.0)
     body, contact = made.body, made.body.contact
     place, gap = contact.place.numpy()[0].copy(), contact.gap.numpy()[0].copy()
@@ -170,10 +164,7 @@ def test_new_contact_is_anchored_where_it_touched() -> None:
     share = (gap / (gap - now))[..., None]
     expected = place + share * (made.local - place)
     np.testing.assert_allclose(contact.anchor.numpy()[0][touching], expected[touching], atol=1e-13)
-
-
-def test_new_contact_without_a_past_has_no_friction() -> None:
-    """Before the first step, and where a point was too far off to be looked at."""
+    # Before the first step, and where a point was too far off to be looked at.
     made = touch(0.7, multipliers=False, fresh=1.0)
     body, contact = made.body, made.body.contact
     contact.gap.fill_(FAR)
@@ -188,10 +179,6 @@ def test_new_contact_without_a_past_has_no_friction() -> None:
     made.evaluate()
     # Anchors are where the points are but for rounding, which the penalty multiplies.
     np.testing.assert_allclose(made.tractions[1], 0.0, atol=1e-13)
-
-
-def test_no_friction_no_state() -> None:
-    # Fails without the test of friction in `update_contact_history`.
     made = touch(0.0, multipliers=False, fresh=1.0)
     contact = made.body.contact
     anchor = contact.anchor.numpy().copy()
@@ -205,7 +192,6 @@ def test_no_friction_no_state() -> None:
 @pytest.mark.parametrize("friction", [0.0, SLIP, 0.7, STICK])
 def test_slip_ratio_is_the_slipping_share_of_area(friction: float) -> None:
     """1 without friction: then all that touches slips."""
-    # Fails with the number of points for their area.
     made = touch(friction, fresh=0.5)
     weight, mode = made.body._faces.weight.numpy(), made.mode
     expected = weight[mode == 2].sum() / weight[mode > 0].sum()
@@ -213,20 +199,9 @@ def test_slip_ratio_is_the_slipping_share_of_area(friction: float) -> None:
     assert {0.0: expected == 1, 0.7: 0 < expected < 1, STICK: expected < 0.1}.get(friction, expected > 0.8)
 
 
-def test_deepest_is_the_largest_penetration() -> None:
-    made = touch(0.0)
-    away = np.linalg.norm(made.points - made.centre, axis=-1)
-    assert made.body.deepest() == pytest.approx(RADIUS - away.min(), abs=1e-14)
-    made.indenters.centre.assign(np.array([[0.0, 0.0, -50.0]]))
-    made.evaluate()
-    assert made.body.deepest() == 0.0
-    assert made.body.slip_ratio(made.indenters) == 0.0
-
-
 @each
 def test_sides_are_touched_like_the_face(element: str) -> None:
     """A ball beside the pad, at half its height: only side faces touch, and the law holds there."""
-    # Fails with the touchable faces restricted to z = 0.
     made = touch(0.0, element=element)
     made.body.contact.anchored.zero_()
     made.body.contact.normal.zero_()

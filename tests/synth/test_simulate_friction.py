@@ -1,22 +1,21 @@
-"""Friction along whole paths: Coulomb's cone, drag, twist, the sliding limits T = μN and M = μ ∫ p r, reversal, steps.
+"""Friction along whole paths: Coulomb's cone, drag, twist, the sliding limits T = μN and M = μ ∫ p r, reversal."""
 
-Each comment "fails with" names a change of `synth.simulate` that was tried.
-"""
-
-from dataclasses import dataclass
-from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 import pytest
-from layered_pad import FILM, pad
-from pads import DRAG, MIXED, PUNCH, SIZE, SPHERE, brick, gentle, run, scene
+from bonded_layer import growing
+from pads import DRAG, FILM, MIXED, PUNCH, SIZE, SPHERE, brick, complete, gentle, mapped, pad, run, scene, supported
 
-from synth.arrays import BoolArray, FloatArray
+from synth.arrays import BoolArray, FloatArray, Points
 from synth.mesh import PadMesh
-from synth.scene import Motion, Scene
-from synth.simulate import State, simulate
+from synth.scene import Motion
+from synth.simulate.element import p2p1
+from synth.simulate.indenter import rigid_body
 from synth.simulate.load_path import LoadPath
+from synth.simulate.material import uniform
 from synth.simulate.stepping import Stepper
+from synth.simulate.system import System
 from synth.simulate.unknowns import Unknowns
 
 MESH, FINE = brick(), brick(counts=(8, 6, 3))
@@ -24,30 +23,16 @@ TOLERANCE = 1e-6
 each = pytest.mark.parametrize("element", MIXED)
 
 
-def ended(posed: Scene) -> State:
-    result = simulate(posed, MESH)
-    assert (result.status, result.reason) == ("complete", "")
-    return result.states[-1]
-
-
-@dataclass(frozen=True)
-class Touch:
-    """The contact points (f, q) that touch at the end of a path: positions in mm, tractions (k, 3), areas (k,)."""
+class Touch(NamedTuple):
+    """The contact points (f, q) that touch at the end of a path: positions in mm, tractions (k, 3) and their sizes."""
 
     on: BoolArray
     position: FloatArray
     normal: FloatArray
     along: FloatArray
+    pressure: FloatArray
+    friction: FloatArray
     area: FloatArray
-
-    @property
-    def pressure(self) -> FloatArray:
-        return np.asarray(np.linalg.norm(self.normal, axis=1))
-
-    @property
-    def friction(self) -> FloatArray:
-        """Size of the tangential traction."""
-        return np.asarray(np.linalg.norm(self.along, axis=1))
 
 
 def touch(stepper: Stepper) -> Touch:
@@ -58,7 +43,9 @@ def touch(stepper: Stepper) -> Touch:
     on = whole.any(axis=-1)
     nodes = (body.space.points + state.u)[body.space.faces]
     position = np.einsum("qa,fac->fqc", body.space.element.face_shape, nodes)
-    return Touch(on, position[on], (whole - along)[on], along[on], body._faces.weight.numpy()[on])
+    tractions = (whole - along)[on], along[on]
+    sizes = (np.linalg.norm(traction, axis=1) for traction in tractions)
+    return Touch(on, position[on], *tractions, *sizes, body._faces.weight.numpy()[on])
 
 
 @each
@@ -78,39 +65,11 @@ def test_without_friction_nothing_pulls_sideways(element: str) -> None:
     np.testing.assert_allclose(twisted.force_n, pressed.force_n, rtol=10 * TOLERANCE, atol=1e-7)
 
 
-@each
-@pytest.mark.parametrize("shear", [(0.4, 0.0), (0.0, -0.4)])
-def test_friction_drags_the_gel_along(shear: tuple[float, float], element: str) -> None:
-    # Fails with the sign of the trial traction turned.
-    motion = {"depth_mm": 0.6, "shear_mm": shear, "steps": 3}
-    force = ended(scene(friction=0.8, motion=motion, numerics={"element": element})).force_n
-    assert np.dot(force[:2], shear) > 0.05 * force[2] * 0.4
-    assert abs(force[0] * shear[1] - force[1] * shear[0]) < 0.02 * force[2] * 0.4
-
-
-@each
-@pytest.mark.parametrize("twist", [15.0, -15.0])
-def test_twist_turns_the_gel_along(twist: float, element: str) -> None:
-    motion = {"depth_mm": 0.6, "twist_deg": twist, "steps": 3}
-    result = simulate(scene(friction=0.8, motion=motion, numerics={"element": element}), MESH)
-    last, space = result.states[-1], result.space
-    assert last.torque_nmm[2] * np.sign(twist) > 0.05 * last.force_n[2]
-    x, u = space.points[space.surface_nodes], last.displacement[space.surface_nodes]
-    near = (np.hypot(x[:, 0], x[:, 1]) > 0.1) & (np.hypot(x[:, 0], x[:, 1]) < 2.1)
-    assert near.any()
-    turned = x[near, 0] * u[near, 1] - x[near, 1] * u[near, 0]  # positive: from +x toward +y
-    assert (turned * np.sign(twist) > 0).all()
-
-
 @pytest.mark.parametrize("step", [0.5, 0.1])
 @pytest.mark.parametrize("indenter", [SPHERE, PUNCH])
 @pytest.mark.parametrize(("element", "mesh"), [("p1p1", FINE), ("p2p1", MESH)])
-def test_long_shear_slides_at_the_friction_coefficient(
-    element: str, mesh: PadMesh, indenter: dict, step: float
-) -> None:
+def test_long_shear_slides_at_the_friction_coefficient(element, mesh, indenter, step) -> None:
     """Dragged far, every point slips at |t_T| = mu t_n, coarse steps or fine: also what touched in the last step."""
-    # Fails with the limit of _returned halved, without anchors, and without friction of points that touch for the first
-    # time.
     mu = 0.3
     motion = {"depth_mm": 0.5, "shear_mm": [3.0, 0.0], "position_mm": [-1.5, 0.0], "steps": 4}
     numerics = {"max_step_mm": step, "element": element}
@@ -134,8 +93,6 @@ def test_long_shear_slides_at_the_friction_coefficient(
 @each
 def test_traction_stays_in_its_cone(element: str, friction: float, layers: bool) -> None:
     """At every contact point after a press, a drag, a twist and back, at right angles to a pressure that pushes."""
-    # Fails with the limit 5 % too high, with the trial traction not projected on the surface, and with `rotation *`
-    # left out of _trial (no convergence).
     motion = {"depth_mm": 0.8, "shear_mm": [0.6, -0.3], "twist_deg": 20.0, "position_mm": [0.4, 0.2], "steps": 3}
     motion["then"] = [{"depth_mm": 0.6, "shear_mm": [0.2, 0.0], "twist_deg": 5.0}]
     gel = {"poisson_ratio": 0.5, "layers": [FILM] if layers else []}
@@ -154,7 +111,6 @@ def test_traction_stays_in_its_cone(element: str, friction: float, layers: bool)
 @each
 def test_spinning_punch_is_held_by_its_limit(element: str) -> None:
     """Turned far, the tractions go round: M = μ ∫ p r dA about the axis, against the twist's pull, and no net force."""
-    # Fails with the limit 5 % too high, and with slipping anchors moved to the point itself.
     friction, motion = 0.1, {"depth_mm": 0.6, "twist_deg": 60.0, "steps": 2}
     numerics = {"element": element, "max_step_mm": 0.1}
     gel = {"poisson_ratio": 0.5}
@@ -169,7 +125,6 @@ def test_spinning_punch_is_held_by_its_limit(element: str) -> None:
 @each
 def test_rough_contact_sticks(element: str) -> None:
     """Friction of 10: next to nothing slips, and the touching points go where the indenter goes."""
-    # Fails with old anchors renewed at each step.
     motion = {"depth_mm": 0.6, "shear_mm": [0.15, 0.0], "steps": 4}
     stepper = run(scene(friction=10.0, motion=motion, numerics={"element": element}), MESH)
     states, space = stepper.states, stepper.system.space
@@ -187,26 +142,13 @@ def test_rough_contact_sticks(element: str) -> None:
     np.testing.assert_allclose(moved[:, 0], done, atol=0.01)
 
 
-def test_slip_spreads_with_the_shear() -> None:
-    """From the rim of the contact inward, until all slips."""
-    motion = {"depth_mm": 0.6, "shear_mm": [0.8, 0.0], "steps": 10}
-    result = simulate(scene(friction=0.5, motion=motion, numerics={"element": "p1p1"}), FINE)
-    ratios = [state.slip_ratio for state in result.states if state.shear_mm[0] > 0]
-    assert 0 < ratios[0] < 0.7  # the press alone leaves points near the rim at the limit
-    assert ratios[-1] == 1.0
-    # The points' own jumps in and out of contact may undo a little of it.
-    assert all(after > before - 0.1 for before, after in pairwise(ratios))
-
-
 @each
 def test_reversed_shear_reverses_the_force(element: str) -> None:
     """Full slide to one side and then to the other: mirror images, and work lost on the way."""
-    # Fails with anchors left behind by slipping points, and without the rigid-motion predictor at turns.
     there, mu = 0.9, 0.3
     first_leg, *others = ({"depth_mm": 0.5, "shear_mm": [x, 0.0]} for x in (there, -there, there))
     motion = {**first_leg, "steps": 13, "then": others}
-    result = simulate(scene(friction=mu, motion=motion, numerics={"element": element}), MESH)
-    assert (result.status, result.reason) == ("complete", "")
+    result = complete(scene(friction=mu, motion=motion, numerics={"element": element}), MESH)
     x = np.array([state.shear_mm[0] for state in result.states])
     force = np.array([state.force_n for state in result.states])
     first, left = int(np.argmax(x)), int(np.argmin(x))
@@ -224,7 +166,6 @@ def test_reversed_shear_reverses_the_force(element: str) -> None:
 
 def test_the_predictor_at_a_turn_does_not_see_how_exact_the_state_is() -> None:
     """What it adds is a derivative along the load path: a small change of the state changes it little."""
-    # Fails with the residual of the state itself left in: the change then comes back 1 / PATH_DERIVATIVE_STEP times.
     stepper = run(scene(friction=0.5, motion={"depth_mm": 0.6, "steps": 1}), MESH)
     body, state = stepper.system, stepper.state
     motion = {"depth_mm": 0.6, "shear_mm": [0.2, 0.0], "steps": 2}
@@ -243,13 +184,80 @@ def test_the_predictor_at_a_turn_does_not_see_how_exact_the_state_is() -> None:
 
 @each
 def test_friction_converges_with_the_step(element: str) -> None:
-    # Fails with points that stick anchored anew at each step.
     motion = {"depth_mm": 0.6, "shear_mm": [0.1, 0.0], "steps": 2}
 
     def pull(h: float) -> float:
-        return ended(scene(friction=0.8, motion=motion, numerics={"max_step_mm": h, "element": element})).force_n[0]
+        numerics = {"max_step_mm": h, "element": element}
+        return complete(scene(friction=0.8, motion=motion, numerics=numerics), MESH).states[-1].force_n[0]
 
     coarse, middle, fine = pull(0.2), pull(0.05), pull(0.0125)
     # First order: steps of 0.2, 0.05 and 0.0125 mm, of which 0.05 has a fifth of the error of 0.2; half leaves room.
     assert abs(middle - fine) < 0.5 * abs(coarse - fine) + 1e-3 * fine
     assert coarse == pytest.approx(fine, rel=0.02)
+
+
+FRICTION, RADIUS, CONTACT, FAR = 0.5, 20.0, 1.0, 12.0
+
+
+def half_disc(radii: FloatArray, depths: FloatArray) -> PadMesh:
+    """Half a round pad, y >= 0, with rings of elements at radii and planes at depths (mm), both from 0."""
+    rings, planes = len(radii) - 1, len(depths) - 1
+
+    def bend(cube: Points) -> Points:
+        along, across = 2 * cube[:, 0] - 1, cube[:, 1]
+        large, small = np.maximum(np.abs(along), across), np.minimum(np.abs(along), across)
+        angle = np.pi / 4 * small / np.where(large > 0, large, 1.0)
+        angle = np.where(np.abs(along) >= across, angle, np.pi / 2 - angle)
+        radius = np.interp(large * rings, np.arange(rings + 1), radii)
+        depth = np.interp(cube[:, 2] * planes, np.arange(planes + 1), depths)
+        return np.column_stack([np.sign(along) * radius * np.cos(angle), radius * np.sin(angle), depth])
+
+    return mapped((2 * rings, rings, planes), bend, float(depths[-1]))
+
+
+def wall_and_window(points: Points) -> BoolArray:
+    """A smooth wall at y = 0; glued at the bottom."""
+    window = points[:, 2] == FAR
+    return np.column_stack([window, window | (points[:, 1] == 0), window])
+
+
+def test_partial_slip_is_mindlins() -> None:
+    r"""A ball on a thick pad against Cattaneo and Mindlin: friction, sticking and slip with a closed form.
+
+    An incompressible half space and a rigid body have no elastic mismatch (Dundurs' β = 0), so that normal and
+    tangential contact do not influence each other. A ball that presses with P and is then moved aside by x feels
+
+    .. math::  Q = μP (1 - (1 - x/x_s)^{3/2}), \qquad x_s = \frac{3 μ P}{16 a} \frac{2 - ν}{G},
+
+    and sticks within c = a (1 - x/x_s)^{1/2}, so that x/x_s is the slipping share of the contact; beyond x_s all slips
+    (Johnson, Contact Mechanics, 1985, eqs. 7.41 to 7.43).
+    """
+    depth = CONTACT**2 / RADIUS
+    radii = np.concatenate([np.linspace(0, 1.15 * CONTACT, 4), growing(1.15 * CONTACT, FAR, 3, 2.0)])
+    mesh = half_disc(radii, np.concatenate([[0.0], growing(0.0, FAR, 4, 2.2)]))
+    hertz = 16 / 9 * np.sqrt(RADIUS) * depth**1.5
+    all_slips = 3 * FRICTION * hertz / (16 * CONTACT) * 4.5
+    posed = scene(
+        (30.0, 30.0, FAR),
+        indenter={"shape": "sphere", "radius_mm": RADIUS},
+        friction=FRICTION,
+        motion={"depth_mm": depth, "shear_mm": [1.3 * all_slips, 0.0], "steps": 6},
+        numerics={"max_step_mm": depth / 2},
+    )
+    body = System(supported(mesh, p2p1(), wall_and_window), uniform(len(mesh.tets), 0.5))
+    path = LoadPath(posed.motion, rigid_body(posed.contact.indenter))
+    ended = Stepper(body, path, FRICTION, posed.numerics, 1.0).run()
+    assert (ended.status, ended.reason) == ("complete", "")
+    slid = [state for state in ended.states if state.shear_mm[0] > 0]
+    assert len(slid) == 3
+    for state in slid:
+        pull, load = 2 * state.force_n[0], 2 * state.force_n[2]
+        share = min(1.0, state.shear_mm[0] * 16 * CONTACT / (3 * FRICTION * load * 4.5))
+        # Three elements across the contact and a pad of 12 radii are 11 % too stiff, under the ball and sideways alike:
+        # relative to the load at hand, 1 to 2 % of that are left.
+        assert pull / (FRICTION * load) == pytest.approx(1 - (1 - share) ** 1.5, abs=0.02)
+        # The slipping ring is as fine as the contact points: 0.1 mm of 1 mm.
+        assert state.slip_ratio == pytest.approx(share, abs=0.1)
+        assert load == pytest.approx(hertz, rel=0.15)
+    assert share == 1
+    assert state.slip_ratio > 0.99

@@ -1,7 +1,4 @@
-"""The linear solver of the batched simulation by itself.
-
-Each comment "fails with" names a change of `synth.simulate.batched` that was tried.
-"""
+"""The linear solver of the batched simulation by itself."""
 
 from typing import Any
 
@@ -56,10 +53,9 @@ def _systems(
 
 def test_linear_solves_are_as_exact_as_newton_needs() -> None:
     """The first; after a fall to a twentieth 0.9 / 400; near the tolerance 0.3 times what is left; the most."""
-    # Fails without the share of what is left.
     krylov = _systems([1.0, 1.0, 5e-3, 2e-4], [0, 1, 1, 1])[1]
     np.testing.assert_allclose(krylov.goal.numpy(), [0.03, 0.00225, 0.006, 0.03], rtol=1e-6)
-    # Fails with 1e-3 as the least whatever is asked for. The predictor at a turn has no Newton iteration before it.
+    # The predictor at a turn has no Newton iteration before it.
     for phase in (READY, PREDICTOR_READY):
         assert np.all(_systems([1.0, 5e-3], [0, 1], "cpu", 1e-5, phase)[1].goal.numpy() == np.float32(1e-5))
     assert _systems([1.0], [0], phase=PREDICTOR_READY)[1].goal.numpy() == np.float32(1e-3)
@@ -68,8 +64,6 @@ def test_linear_solves_are_as_exact_as_newton_needs() -> None:
 @pytest.mark.parametrize(("device", "batch"), [("cpu", 3), pytest.param("cuda", 600, marks=pytest.mark.cuda)])
 def test_every_lane_solves_its_own_system(device: str, batch: int) -> None:
     """Unsymmetric matrices of 150 unknowns, preconditioned, to goals of their own, together and alone."""
-    # Fails with a rotation of the other sense, or with a solve that goes on after it is done; on a GPU with a tile for
-    # the right side of the substitution.
     if device == "cuda" and not wp.is_cuda_available():
         pytest.skip("no CUDA device")
     rng = np.random.default_rng(2)
@@ -121,7 +115,6 @@ def _bits(numbers: np.ndarray) -> np.ndarray:
 
 def test_numbers_are_rounded_to_the_nearest_of_tf32() -> None:
     """1 + k / 1024 are neighbours; 1 + 1/2048 lies between two."""
-    # Fails with numbers that are cut off, or with an infinite or undefined one that becomes a number.
     given = np.array([1 + 0.4 / 1024, 1 + 0.6 / 1024, -1 - 0.5 / 1024, 3e38, 0.0, np.inf, -np.inf, np.nan])
     most = np.array([0x7FFFFFFF], dtype=np.uint32).view(np.float32)  # what CUDA returns of 0 / 0
     matrix = wp.array(np.append(given, most)[None].astype(np.float32), device="cpu")
@@ -135,7 +128,6 @@ def test_numbers_are_rounded_to_the_nearest_of_tf32() -> None:
 
 def test_a_preconditioner_takes_tf32_from_the_first_vector_on() -> None:
     """Else a GPU would round what a CPU does not."""
-    # Fails with a vector or a matrix that is not rounded, in each of the three places.
     rng = np.random.default_rng(3)
     matrix = rng.standard_normal((150, 150))
     reference = Preconditioner(matrix + matrix.T, "cpu")
@@ -164,7 +156,6 @@ def test_a_preconditioner_takes_tf32_from_the_first_vector_on() -> None:
 @pytest.mark.parametrize("rows", [128, 1792, 10752])
 def test_dense_operations_on_a_gpu(rows: int, batch: int) -> None:
     """Products of numbers in TF32 are exact; what an H200 cuts off its sums is 3.2e-9 of them for each term."""
-    # Fails with factors that are not rounded before (3e-4).
     if not wp.is_cuda_available():
         pytest.skip("no CUDA device")
     rng = np.random.default_rng(0)

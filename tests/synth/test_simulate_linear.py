@@ -1,7 +1,4 @@
-"""Direct factors and GMRES against dense solutions of saddle-point matrices; what makes their answers repeatable.
-
-Each comment "fails with" names a change of `synth.simulate.linear` that was tried.
-"""
+"""Direct factors and GMRES against dense solutions of saddle-point matrices; what makes their answers repeatable."""
 
 from functools import partial
 from types import SimpleNamespace
@@ -75,7 +72,6 @@ def test_factor_is_the_inverse(kind: Any) -> None:
 @each_factor
 def test_answer_does_not_depend_on_what_was_solved_before(kind: Any) -> None:
     """Else a press's last bits would depend on the presses before it."""
-    # Fails with Pardiso's matching and scaling on: its analysis then uses the values of the first matrix.
     matrix, b = saddle(1), right_side(1)
     fresh, used = make(kind, matrix), make(kind, matrix)
     fresh.factorise(matrix.data)
@@ -101,7 +97,6 @@ def test_matrix_without_inverse_gives_no_step_to_trust(kind: Any, values: float)
 @each_factor
 @pytest.mark.parametrize("rest", [None, remainder(12)], ids=["symmetric", "unsymmetric"])
 def test_gmres_solves_with_the_remainder(kind: Any, rest: csr_matrix | None) -> None:
-    # Fails with the remainder left out of the product, or the diagonal counted twice in it.
     matrix, b = saddle(1), right_side(1)
     full = whole(matrix) if rest is None else whole(matrix) + rest.toarray()
     factor = make(kind, matrix)
@@ -114,31 +109,21 @@ def test_gmres_solves_with_the_remainder(kind: Any, rest: csr_matrix | None) -> 
     np.testing.assert_allclose(gmres(matrix, rest, factor, b, 1e-12)[0], exact, atol=1e-9 * np.abs(exact).max())
 
 
-def test_gmres_ends_after_the_remainders_rank() -> None:
+def test_gmres_ends_after_the_remainders_rank_at_its_limit_without_right_side_or_in_nan() -> None:
     """(S + R) S^-1 is the identity but for a matrix of R's rank: one iteration more than that is enough."""
-    # Fails with `basis[i]` orthogonalised against the first vector only.
     matrix, b = saddle(1), right_side(1)
     factor = SuperLUFactor(matrix.indptr, matrix.indices)
     factor.factorise(matrix.data)
     for rank in (1, 5, 12):
         assert gmres(matrix, remainder(rank), factor, b, 1e-10)[1] <= rank + 1
     assert gmres(matrix, None, factor, b, 1e-10)[1] == 1
-
-
-def test_gmres_without_a_right_side() -> None:
     matrix = saddle(1)
     x, iterations, _ = gmres(matrix, remainder(5), SuperLUFactor(matrix.indptr, matrix.indices), np.zeros(SIZE))
     assert not x.any()
     assert iterations == 0
-
-
-def test_gmres_passes_nan_on() -> None:
     broken: Any = SimpleNamespace(apply=lambda right: np.full_like(right, np.nan))
     assert np.isnan(gmres(saddle(1), None, broken, right_side(1))[0]).all()
-
-
-def test_gmres_stops_at_its_limit() -> None:
-    """A remainder too large for so few iterations: the best direction so far, not an endless loop."""
+    # A remainder too large for so few iterations: the best direction so far, not an endless loop.
     matrix, rest, b = saddle(1), remainder(60, 50.0), right_side(1)
     factor = SuperLUFactor(matrix.indptr, matrix.indices)
     factor.factorise(matrix.data)
@@ -158,8 +143,7 @@ def nearly(matrix: csr_matrix, rank: int) -> csr_matrix:
     return changed
 
 
-def test_factor_is_reused_while_it_serves(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Fails with MAX_REUSE_ITERATIONS not used (the third is not made), or with `_own` not compared."""
+def test_factor_is_reused_while_it_serves_and_made_anew_where_told(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(linear, "MAX_REUSE_ITERATIONS", 4)
     first, b = saddle(1), right_side(1)
     factor = SuperLUFactor(first.indptr, first.indices)
@@ -178,10 +162,6 @@ def test_factor_is_reused_while_it_serves(monkeypatch: pytest.MonkeyPatch) -> No
     alone = LinearSolver(SuperLUFactor(first.indptr, first.indices), reuse=True)
     LinearSolver(factor, reuse=True).solve(first, None, b)
     np.testing.assert_array_equal(one.solve(near, None, b, rough=True), alone.solve(near, None, b, rough=True))
-
-
-def test_factor_is_made_anew_where_told() -> None:
-    # Fails with `reuse` or `rough` left out of the condition, and with `forget` doing nothing.
     matrix, b = saddle(1), right_side(1)
     factor = SuperLUFactor(matrix.indptr, matrix.indices)
     never = LinearSolver(factor, reuse=False)

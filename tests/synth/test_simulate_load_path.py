@@ -1,7 +1,4 @@
-"""Poses along a path of several legs, and where states are recorded.
-
-Each comment "fails with" names a change of `synth.simulate.load_path` that was tried.
-"""
+"""Poses along a path of several legs, and where states are recorded."""
 
 from typing import Any
 
@@ -19,8 +16,7 @@ def path(indenter: dict | None = None, **motion: Any) -> LoadPath:
     return LoadPath(Motion.model_validate(motion), rigid_body(posed.contact.indenter))
 
 
-def test_lowest_point_follows_the_depth() -> None:
-    # Fails with the reach left out.
+def test_poses_follow_the_depth_then_shear_and_twist_together() -> None:
     way = path(depth_mm=1.0, shear_mm=[0.5, -0.2], position_mm=[1.0, 2.0])
     for s in (0.0, 0.3, 1.0):
         pose = way.pose(s)
@@ -29,9 +25,6 @@ def test_lowest_point_follows_the_depth() -> None:
     end = way.pose(way.length_mm)
     np.testing.assert_allclose(end.centre, [1.5, 1.8, 1.0 - 3.0])
     assert end.shear_mm == pytest.approx((0.5, -0.2))
-
-
-def test_shear_and_twist_go_together_after_the_press() -> None:
     way = path(depth_mm=1.0, shear_mm=[0.6, 0.8], twist_deg=30.0)
     drag = way.length_mm - way.press_mm
     assert drag == pytest.approx(1.0 + np.radians(30.0) * TWIST_ARM_MM)
@@ -41,9 +34,6 @@ def test_shear_and_twist_go_together_after_the_press() -> None:
     assert half.shear_mm == pytest.approx((0.3, 0.4))
     np.testing.assert_allclose(half.rotation, rotation_about(2, np.radians(15.0)), atol=1e-15)
     np.testing.assert_allclose(half.rotation @ [1, 0, 0], [np.cos(np.radians(15)), np.sin(np.radians(15)), 0])
-
-
-def test_twist_turns_the_turned_body_about_the_world_axis() -> None:
     bar = {"shape": "cylinder", "radius_mm": 1.0, "length_mm": 4.0, "rotation_deg": [90.0, 0.0, 20.0]}
     way = path(bar, depth_mm=0.5, twist_deg=40.0)
     start, end = way.pose(0.0), way.pose(way.length_mm)
@@ -77,8 +67,7 @@ BACK_AND_OFF: dict[str, Any] = {
 }
 
 
-def test_legs_follow_one_another() -> None:
-    # Fails with the legs of `then` relative to the shear before.
+def test_legs_follow_one_another_and_turns_are_seen() -> None:
     way = path(**BACK_AND_OFF)
     np.testing.assert_allclose(way.ends, [0, 1, 1.6, 2.8, 3.8])
     for s, depth, x in ((1.6, 1.0, 0.6), (2.2, 1.0, 0.0), (2.8, 1.0, -0.6), (3.3, 0.5, -0.6), (3.8, 0.0, -0.6)):
@@ -86,23 +75,26 @@ def test_legs_follow_one_another() -> None:
         assert pose.depth_mm == pytest.approx(depth)
         assert pose.shear_mm == pytest.approx((x, 0.0))
         np.testing.assert_allclose(pose.centre, [x, 0.0, depth - 3.0], atol=1e-12)
-
-
-def test_twist_goes_on_from_where_it_was() -> None:
     way = path(depth_mm=0.5, twist_deg=20.0, then=[{"depth_mm": 0.5, "twist_deg": -20.0}])
     assert way.length_mm == pytest.approx(0.5 + np.radians(60.0) * TWIST_ARM_MM)
     assert way.pose((way.ends[1] + way.ends[2]) / 2).twist_deg == pytest.approx(10.0)
     assert way.pose((way.ends[2] + way.ends[3]) / 2).twist_deg == pytest.approx(0.0)
-
-
-def test_pose_that_repeats_is_no_leg() -> None:
     here: dict[str, Any] = {"depth_mm": 1.0, "shear_mm": [0.5, 0.0]}
     way = path(**here, then=[here, here, {"depth_mm": 0.2, "shear_mm": [0.5, 0.0]}])
     np.testing.assert_allclose(way.ends, [0, 1, 1.5, 2.3])
+    way = path(**BACK_AND_OFF)
+    assert way.turns_between(0.9, 1.0)  # the way turns at 1.0: what was learnt before does not hold after
+    assert way.turns_between(1.5, 1.7)
+    assert not way.turns_between(1.0, 1.2)
+    assert not way.turns_between(0.2, 0.9)
+    # A first pose that stays off the gel may be followed by a press.
+    way = path(depth_mm=-0.5, then=[{"depth_mm": 0.4}])
+    np.testing.assert_allclose(way.ends, [0.0, 0.9])
+    assert way.pose(0.0).depth_mm == -0.5
+    assert way.pose(0.9).depth_mm == pytest.approx(0.4)
 
 
 def test_records_are_dealt_by_length_and_every_leg_has_one_if_there_are_enough() -> None:
-    # Fails with the longest leg given all that is left.
     way = path(**BACK_AND_OFF, steps=8)  # legs of 1, 0.6, 1.2 and 1 mm
     np.testing.assert_allclose(way.records(), [0.5, 1.0, 1.3, 1.6, 2.2, 2.8, 3.3, 3.8])
     np.testing.assert_allclose(path(**BACK_AND_OFF, steps=5).records(), [1.0, 1.6, 2.2, 2.8, 3.8])
@@ -111,20 +103,3 @@ def test_records_are_dealt_by_length_and_every_leg_has_one_if_there_are_enough()
     fewer = path(**BACK_AND_OFF, steps=2)
     np.testing.assert_allclose(fewer.records(), [1.9, 3.8])
     np.testing.assert_allclose(fewer.waypoints(), [1.0, 1.6, 1.9, 2.8, 3.8])  # the corners all the same
-
-
-def test_turns_are_seen() -> None:
-    # Fails with >= for >.
-    way = path(**BACK_AND_OFF)
-    assert way.turns_between(0.9, 1.0)  # the way turns at 1.0: what was learnt before does not hold after
-    assert way.turns_between(1.5, 1.7)
-    assert not way.turns_between(1.0, 1.2)
-    assert not way.turns_between(0.2, 0.9)
-
-
-def test_press_after_a_start_off_the_pad() -> None:
-    """A first pose that stays off the gel may be followed by a press."""
-    way = path(depth_mm=-0.5, then=[{"depth_mm": 0.4}])
-    np.testing.assert_allclose(way.ends, [0.0, 0.9])
-    assert way.pose(0.0).depth_mm == -0.5
-    assert way.pose(0.9).depth_mm == pytest.approx(0.4)

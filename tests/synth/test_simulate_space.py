@@ -1,25 +1,26 @@
-"""Function spaces: where displacement and pressure live, what can touch; fields at points of the contact face.
+"""Function spaces and the sparse pattern of their tangent; fields at points of the contact face.
 
-Each comment "fails with" names a change of `synth.simulate.space`, `synth.simulate.probe` or `synth.surface` that was
-tried.
+That every entry of the tangent lands where it belongs is in test_simulate_bulk (tangent against differences).
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from layered_pad import layered
-from pads import ELEMENT, MIXED, brick, crooked
+from pads import ELEMENT, MIXED, brick, crooked, layered
 
+import synth.simulate.pattern as pattern_module
 from synth.arrays import FloatArray, Points
 from synth.errors import InputError
 from synth.mesh import PadMesh
 from synth.simulate.element import EDGES
+from synth.simulate.pattern import pattern_of
 from synth.simulate.probe import probe
 from synth.simulate.space import Space, function_space
 from synth.surface import FACE_EDGES, broken_linear_face, quadratic_face
 
-MESH = crooked()
+MESH, OTHER = crooked(), crooked(seed=1)
 each = pytest.mark.parametrize("element", MIXED)
 
 
@@ -27,8 +28,7 @@ def space_of(element: str, mesh: PadMesh = MESH) -> Space:
     return function_space(mesh, ELEMENT[element]())
 
 
-def test_quadratic_nodes_lie_on_the_middles_of_edges() -> None:
-    # Fails with the order of the middles reversed, of the elements or of the faces.
+def test_quadratic_nodes_lie_on_the_middles_of_edges_and_none_beside_the_pad() -> None:
     space = space_of("p2p1")
     assert len(np.unique(space.points.round(9), axis=0)) == len(space.points)  # an edge has one node
     for k, (i, j) in enumerate(EDGES):
@@ -37,18 +37,14 @@ def test_quadratic_nodes_lie_on_the_middles_of_edges() -> None:
     for k, (i, j) in enumerate(FACE_EDGES):
         ends = space.points[space.faces[:, [i, j]]].mean(axis=1)
         np.testing.assert_allclose(space.points[space.faces[:, 3 + k]], ends, atol=1e-15)
+    with pytest.raises(InputError, match="no point of the contact face"):
+        probe(space_of("p1p1"), np.array([[0.0, 0.0], [MESH.size_mm[0] / 2 + 0.01, 0.0]]))
 
 
 @each
-def test_bonded_face_is_held_and_no_other_node(element: str) -> None:
-    # Fails with `any` for `all` of an edge's ends.
+def test_the_window_is_held_other_faces_can_touch_and_the_face_at_z_0_is_coated_and_probed(element: str) -> None:
     space = space_of(element)
     assert (space.held == (space.points[:, 2] == MESH.size_mm[2])[:, None]).all()
-
-
-@each
-def test_all_faces_but_the_window_can_touch(element: str) -> None:
-    space = space_of(element)
     x, y, z = MESH.size_mm
     a, b, c = (space.points[space.faces[:, i]] for i in range(3))
     normal = np.cross(b - a, c - a) / 2
@@ -56,11 +52,6 @@ def test_all_faces_but_the_window_can_touch(element: str) -> None:
     # Out of the gel, and closed but for the window: the area vectors add up to minus the window's.
     np.testing.assert_allclose(normal.sum(axis=0), [0, 0, -x * y], atol=1e-12)
     assert (np.einsum("fc,fc->f", normal, a - [0, 0, z / 2]) > 0).all()
-
-
-@each
-def test_coated_surface_is_the_face_at_z_0(element: str) -> None:
-    space = space_of(element)
     surface = space.surface
     assert (surface.nodes == space.points[space.surface_nodes]).all()
     assert (surface.nodes[:, 2] == 0).all()
@@ -69,11 +60,13 @@ def test_coated_surface_is_the_face_at_z_0(element: str) -> None:
     normal = np.cross(b - a, c - a) / 2
     assert (normal[:, 2] < 0).all()
     assert normal[:, 2].sum() == pytest.approx(-MESH.size_mm[0] * MESH.size_mm[1])
+    values = np.random.default_rng(3).standard_normal(len(space.points))
+    nodes = space.surface_nodes
+    np.testing.assert_allclose(probe(space, space.points[nodes, :2]) @ values, values[nodes], atol=1e-12)
 
 
 @each
 def test_pressure_is_doubled_at_interfaces(element: str) -> None:
-    # Fails with the layer left out of the pressure's numbering.
     mesh = brick((4.0, 4.0, 3.0), (2, 2, 3))
     plain, double = space_of(element, mesh), space_of(element, layered(mesh, interface=1.0))
     assert plain.pressures == len(mesh.points)
@@ -88,7 +81,6 @@ def test_pressure_is_doubled_at_interfaces(element: str) -> None:
 
 @pytest.mark.parametrize("shape", [quadratic_face, broken_linear_face])
 def test_shape_functions_are_a_partition_of_unity(shape: Callable[[FloatArray], FloatArray]) -> None:
-    # Fails with 1 + 2 b for 1 - 2 b in the inner triangle, or 2 b - 1 not cut off at 0.
     corners = np.eye(3)
     nodes = np.array([*corners, *(corners[[i, j]].mean(axis=0) for i, j in FACE_EDGES)])
     at = np.concatenate([np.random.default_rng(0).dirichlet(np.ones(len(corners)), 500), nodes])
@@ -107,7 +99,6 @@ def field(points: Points, degree: int) -> FloatArray:
 
 @pytest.mark.parametrize(("element", "degree"), [("p1p1", 1), ("p2p1", 2)])
 def test_probe_reproduces_the_elements_polynomials(element: str, degree: int) -> None:
-    # Fails with linear shape functions on quadratic faces, or the second and third barycentric coordinate exchanged.
     space = space_of(element, crooked((6.0, 4.0, 2.0)))
     half = np.array(space.mesh.size_mm[:2]) / 2
     points = np.random.default_rng(2).uniform(-half, half, (300, 2))
@@ -117,15 +108,77 @@ def test_probe_reproduces_the_elements_polynomials(element: str, degree: int) ->
     np.testing.assert_allclose(probe(space, points) @ field(space.points, degree), field(points, degree), atol=1e-12)
 
 
-@each
-def test_probe_at_nodes_takes_their_values(element: str) -> None:
-    space = space_of(element)
-    values = np.random.default_rng(3).standard_normal(len(space.points))
-    nodes = space.surface_nodes
-    np.testing.assert_allclose(probe(space, space.points[nodes, :2]) @ values, values[nodes], atol=1e-12)
+@pytest.fixture(autouse=True)
+def _empty(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pattern_module, "_CACHED", type(pattern_module._CACHED)())
 
 
-def test_probe_beside_the_pad_is_an_error() -> None:
-    # Fails with OUTSIDE = 1.
-    with pytest.raises(InputError, match="no point of the contact face"):
-        probe(space_of("p1p1"), np.array([[0.0, 0.0], [MESH.size_mm[0] / 2 + 0.01, 0.0]]))
+def others_of(space: Space, count: int) -> list[Space]:
+    """Spaces that differ from one, and from each other, in a node that is held or not."""
+    held = [space.held.copy() for _ in range(count)]
+    for node, mask in enumerate(held):
+        mask[node] = ~mask[node]
+    return [replace(space, held=mask) for mask in held]
+
+
+@pytest.mark.parametrize("element", MIXED)
+def test_same_topology_shares_the_pattern_and_its_factor(element: str) -> None:
+    assert not np.array_equal(MESH.points, OTHER.points)
+    one, other = (pattern_of(function_space(mesh, ELEMENT[element]()), True) for mesh in (MESH, OTHER))
+    assert one is other
+    assert one.factor() is other.factor()
+    assert one.factor() is not one.factor(single=False)
+
+
+def test_what_differs_in_topology_does_not_share() -> None:
+    space = function_space(MESH, ELEMENT["p1p1"]())
+    shuffled = MESH.tets[np.random.default_rng(0).permutation(len(MESH.tets))]
+    others = [
+        (space, False),
+        (function_space(layered(MESH), ELEMENT["p1p1"]()), True),
+        (others_of(space, 1)[0], True),
+        (function_space(PadMesh(MESH.points, shuffled, MESH.size_mm), ELEMENT["p1p1"]()), True),
+        (function_space(MESH, ELEMENT["p2p1"]()), True),
+    ]
+    first = pattern_of(space, True)
+    for other, mixed in others:
+        assert pattern_of(other, mixed) is not first
+        assert pattern_of(space, True) is first
+
+
+def test_only_the_last_few_patterns_and_so_many_entries_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    space = function_space(MESH, ELEMENT["p1p1"]())
+    first = pattern_of(space, True)
+    most = pattern_module._MAX_CACHED
+    for other in others_of(space, most):
+        pattern_of(other, True)
+        assert len(pattern_module._CACHED) <= most
+    assert pattern_of(space, True) is not first
+    # The last ones stay that are together within the bound, and the very last whatever its size.
+    pattern_module._CACHED.clear()
+    large = function_space(MESH, ELEMENT["p2p1"]())
+    spaces = others_of(space, 4)
+    sizes = [pattern_of(one, True).size for one in spaces]
+    assert len(pattern_module._CACHED) == 4
+    pattern_module._CACHED.clear()
+    monkeypatch.setattr(pattern_module, "_MAX_ENTRIES", sum(sizes[1:]))
+    made = [pattern_of(one, True) for one in spaces]
+    assert list(pattern_module._CACHED.values()) == made[1:]
+    alone = pattern_of(large, True)
+    assert alone.size > sum(sizes[1:])
+    assert list(pattern_module._CACHED.values()) == [alone]
+    assert pattern_of(large, True) is alone
+
+
+@pytest.mark.parametrize("mixed", [True, False])
+@pytest.mark.parametrize("element", MIXED)
+def test_upper_triangle_in_order_with_its_diagonal(element: str, mixed: bool) -> None:
+    """As Pardiso wants it."""
+    space = function_space(MESH, ELEMENT[element]())
+    made = pattern_of(space, mixed)
+    rows = np.repeat(np.arange(len(made.free)), np.diff(made.indptr))
+    assert (made.indices >= rows).all()
+    assert (made.indices[made.indptr[:-1]] == np.arange(len(made.free))).all()
+    key = rows * len(made.free) + made.indices
+    assert (np.diff(key) > 0).all()
+    assert len(made.free) == 3 * len(space.points) - space.held.sum() + mixed * space.pressures

@@ -1,7 +1,4 @@
-"""`synth stress`: the checker sees what is wrong, the processes are watched, and the shipped expectations make sense.
-
-Each comment "fails with" names a change of `synth.stress` that was tried.
-"""
+"""`synth stress`: its check sees what is wrong, the processes are watched, and shipped expectations make sense."""
 
 import csv
 import json
@@ -26,8 +23,7 @@ from synth.stress.inputs import altered_mesh, write_surface
 from synth.stress.suite import result_of, run_stress
 
 MESH = brick()
-STRETCH = np.diag([0.9, 0.95, 1.1])
-"""A deformation that any check must pass: det F = 0.94."""
+STRETCH = np.diag([0.9, 0.95, 1.1])  # A deformation that any check must pass: det F = 0.94
 
 
 def run(**fields: Any) -> Run:
@@ -57,7 +53,6 @@ def result(asked: Run | None = None, outcome: str = "complete", message: str = "
 
 
 def folded() -> np.ndarray:
-    """Displacement that turns one tetrahedron inside out."""
     moved = np.zeros_like(MESH.points)
     node = int(MESH.tets[0, 0])
     moved[node] = 2 * (MESH.points[MESH.tets[0, 1:]].mean(axis=0) - MESH.points[node])
@@ -70,9 +65,26 @@ def nan_at_one_node() -> np.ndarray:
     return moved
 
 
-def test_a_sound_result_is_as_expected() -> None:
+def test_sound_results_are_as_expected_and_deviations_accepted_only_as_noted() -> None:
     verdict = evaluate(result(), {})
     assert (verdict.broken, verdict.word, verdict.ok) == ((), "as expected", True)
+    worse = state(max_penetration_mm=0.5, residual=9e-7, min_jacobian=0.1, newton_iterations=7)
+    record = {"states": [state(), worse, state()]}
+    found = measured(result(record=record))
+    assert (found["penetration_mm"], found["residual"], found["min_jacobian"]) == (0.5, 9e-7, 0.1)
+    assert (found["iterations"], found["states"], found["force_z_n"]) == (17, 2, 1.0)
+    assert found["side_ratio"] == pytest.approx(0.5)
+    entry: dict[str, Any] = {"bounds": {"force_z_n": [2, 3]}, "deviation": {"outcome": ["complete"], "because": "b"}}
+    verdict = evaluate(result(run(**entry)), {})
+    assert (verdict.ok, verdict.deviates, verdict.word) == (True, True, "explained")
+    entry["deviation"]["bounds"] = {"force_z_n": [4, 5]}
+    verdict = evaluate(result(run(**entry)), {})
+    assert (verdict.ok, verdict.deviates) == (False, False)
+    assert "[2, 3]" in verdict.broken[0]  # what was expected first, not the excuse
+    entry["bounds"] = {"force_z_n": [0, 1]}
+    assert evaluate(result(run(**entry)), {}).word == "as expected"
+    with pytest.raises(ValueError, match="because"):
+        Deviation.model_validate({"outcome": ["complete"]})
 
 
 @pytest.mark.parametrize(
@@ -92,7 +104,6 @@ def test_a_sound_result_is_as_expected() -> None:
     ],
 )
 def test_no_result_may(wrong: dict[str, Any], message: str) -> None:
-    """Fails with a tenfold tolerance, without the stored det F, or without the look at the fields' numbers."""
     lenient = {"outcome": ["complete", "partial"], "deviation": {"outcome": ["complete", "partial"], "because": "b"}}
     verdict = evaluate(result(run(**lenient), **wrong), {})
     assert any(message in text for text in verdict.broken), verdict.broken
@@ -115,28 +126,12 @@ def test_no_result_may(wrong: dict[str, Any], message: str) -> None:
     ],
 )
 def test_expectations_are_compared(entry: dict[str, Any], ended: dict[str, Any], message: str) -> None:
-    """Fails with the upper bounds left out, or with the smallest difference in place of the largest."""
     verdict = evaluate(result(run(**entry), **ended), {"b": result()})
     assert any(message in text for text in verdict.broken), verdict.broken
 
 
-def test_a_noted_deviation_is_accepted_only_as_it_is_noted() -> None:
-    entry: dict[str, Any] = {"bounds": {"force_z_n": [2, 3]}, "deviation": {"outcome": ["complete"], "because": "b"}}
-    verdict = evaluate(result(run(**entry)), {})
-    assert (verdict.ok, verdict.deviates, verdict.word) == (True, True, "explained")
-    entry["deviation"]["bounds"] = {"force_z_n": [4, 5]}
-    verdict = evaluate(result(run(**entry)), {})
-    assert (verdict.ok, verdict.deviates) == (False, False)
-    assert "[2, 3]" in verdict.broken[0]  # what was expected first, not the excuse
-    entry["bounds"] = {"force_z_n": [0, 1]}
-    assert evaluate(result(run(**entry)), {}).word == "as expected"
-
-
-def test_jacobian_of_linear_and_quadratic_elements() -> None:
-    """An affine map has det F everywhere; u_x = c x^2 has 1 + 2 c x.
-
-    Fails with the midpoints' derivatives exchanged.
-    """
+def test_jacobian_of_elements_and_one_folded_at_a_corner_is_held_against_any_state() -> None:
+    """An affine map has det F everywhere; u_x = c x^2 has 1 + 2 c x."""
     space = function_space(MESH, p2p1())
     places = np.concatenate([np.eye(4), GAUSS])
     for points, nodes in ((MESH.points, MESH.tets), (space.points, space.nodes)):
@@ -152,14 +147,7 @@ def test_jacobian_of_linear_and_quadratic_elements() -> None:
 
     square[0] = np.nan
     assert np.isnan(smallest_jacobian(space.points, space.nodes, square, places))
-
-
-def test_a_quadratic_element_folded_at_a_corner_is_held_against_any_state() -> None:
-    """1 + 2 c x changes sign between the corner at x = -4 and the nearest integration point at -3.72 (b = 0.138).
-
-    Fails with the last state's corners alone, or with the largest of the states.
-    """
-    space = function_space(MESH, p2p1())
+    # 1 + 2 c x changes sign between the corner at x = -4 and the nearest integration point at -3.72 (b = 0.138).
     square = np.zeros_like(space.points)
     square[:, 0] = space.points[:, 0] ** 2 / (2 * 3.85)
     for fields in ((0 * square, square), (square, 0 * square)):
@@ -170,15 +158,6 @@ def test_a_quadratic_element_folded_at_a_corner_is_held_against_any_state() -> N
         assert any("corner_jacobian = -0.03" in text for text in evaluate(bent, {}).broken)  # 1 - 4 / 3.85
         excused = {"outcome": ["complete"], "because": "b", "bounds": {"corner_jacobian": [-0.1, 1.0]}}
         assert evaluate(replace(bent, run=run(deviation=excused)), {}).word == "explained"
-
-
-def test_measured_are_of_the_last_state_or_the_worst() -> None:
-    worse = state(max_penetration_mm=0.5, residual=9e-7, min_jacobian=0.1, newton_iterations=7)
-    record = {"states": [state(), worse, state()]}
-    found = measured(result(record=record))
-    assert (found["penetration_mm"], found["residual"], found["min_jacobian"]) == (0.5, 9e-7, 0.1)
-    assert (found["iterations"], found["states"], found["force_z_n"]) == (17, 2, 1.0)
-    assert found["side_ratio"] == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize(
@@ -192,7 +171,6 @@ def test_measured_are_of_the_last_state_or_the_worst() -> None:
     ],
 )
 def test_processes_are_watched(tmp_path: Path, script: str, budget: float, outcome: str, message: str) -> None:
-    """Fails without the timeout (by taking a minute), with the folder not emptied, or without the exit status."""
     asked = replace(run(), budget_s=budget)
     (tmp_path / "case").mkdir()
     (tmp_path / "case" / "run.json").write_text('{"element": "p1p1"}')
@@ -201,13 +179,6 @@ def test_processes_are_watched(tmp_path: Path, script: str, budget: float, outco
     assert (found.outcome, found.wall_s < 25) == (outcome, True)
     assert message in found.message
     assert not evaluate(found, {}).ok
-
-
-def test_a_folder_from_elsewhere_is_not_emptied(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match=r"notes\.txt: exists and does not come from"):
-        result_of(run(), tmp_path, tmp_path)
-    assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
 COARSE = """
@@ -241,8 +212,7 @@ set = ["sensor.gel.size_mm=[20000, 15000, 4000]"]
 """
 
 
-def test_a_small_suite_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Fails with status 0 for any good case, with no partner for a comparison, or with folders left in messages."""
+def test_a_small_suite_end_to_end_and_folders_from_elsewhere_are_not_emptied(tmp_path: Path, capsys) -> None:
     scenes, out = tmp_path / "scenes", tmp_path / "out"
     scenes.mkdir()
     (scenes / "base.toml").write_text((EXTREME / "base.toml").read_text())
@@ -268,9 +238,13 @@ def test_a_small_suite_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert json.loads((out / "stress.json").read_text()) == report
     with pytest.raises(InputError, match=r"no case or group of that name; cases are soft, hard, hopeless"):
         run_stress(out, ["nothing"], 1, False, scenes)
+    (scenes / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match=r": exists and does not come from"):
+        result_of(run(), scenes, tmp_path)
+    assert (scenes / "notes.txt").read_text() == "mine"
 
 
-def test_shipped_expectations_can_be_met() -> None:
+def test_shipped_expectations_can_be_met_and_selection_brings_partners_along() -> None:
     """Every case loads, or refuses where it is expected to; what is bounded is measured; comparisons have partners."""
     expectations = load_expectations(EXTREME / "expected.toml")
     runs = all_runs(expectations)
@@ -288,10 +262,6 @@ def test_shipped_expectations_can_be_met() -> None:
             assert case.says in str(refusal.value)
         else:
             assert load_scene(one.base, one.assignments).corners[0].motion.steps >= 1
-
-
-def test_selection_brings_partners_along() -> None:
-    runs = all_runs(load_expectations(EXTREME / "expected.toml"))
     chosen = selected(runs, ["poisson_0.5"])
     assert [one.case.name for one in chosen if one.element == chosen[0].element] == [
         "reference", "poisson_0.499999", "poisson_0.5",
@@ -317,7 +287,7 @@ def test_a_wrong_file_is_refused(tmp_path: Path, text: str, message: str) -> Non
     assert message in str(refusal.value)
 
 
-def test_altered_meshes_are_what_they_are_called() -> None:
+def test_altered_meshes_and_surfaces_are_what_they_are_called(tmp_path: Path) -> None:
     volume = float(MESH.volumes.sum())
     sliver = altered_mesh(MESH, "sliver")
     assert sliver.volumes.min() > 0
@@ -331,9 +301,6 @@ def test_altered_meshes_are_what_they_are_called() -> None:
     assert len(np.unique(loose.tets)) == len(loose.points) - 1
     assert altered_mesh(MESH, "another pad").size_mm != MESH.size_mm
     assert signed_volumes(MESH.points, MESH.tets).min() > 0  # the given mesh is left alone
-
-
-def test_altered_surfaces_are_what_they_are_called(tmp_path: Path) -> None:
     import pyvista as pv
 
     def made(variant: Any) -> Any:
@@ -353,8 +320,3 @@ def test_altered_surfaces_are_what_they_are_called(tmp_path: Path) -> None:
     assert areas.min() < 1e-4 * np.median(areas)
     assert made("open").n_open_edges > 0
     assert made("metres").length < 0.02
-
-
-def test_a_deviation_needs_a_reason() -> None:
-    with pytest.raises(ValueError, match="because"):
-        Deviation.model_validate({"outcome": ["complete"]})

@@ -45,7 +45,6 @@ HEAVY = {
 
 
 def _modules(package: str) -> dict[str, ast.Module]:
-    """Parsed modules by dotted name."""
     found = {}
     for path in sorted((ROOT / package).rglob("*.py")):
         parts = path.relative_to(ROOT).with_suffix("").parts
@@ -80,19 +79,16 @@ GELFLOW = _modules("gelflow")
 
 
 def _imports_of(modules: dict[str, ast.Module]) -> list[tuple[str, str]]:
-    """Pairs of a module and one that it imports."""
     packages = {name.rpartition(".")[0] for name in modules}
     found = {name: sorted(_imports(name, tree, name in packages)) for name, tree in modules.items()}
     return [(name, imported) for name, all_imported in found.items() for imported in all_imported]
 
 
-def test_every_module_has_a_stage() -> None:
+def test_every_module_has_a_stage_and_imports_only_from_earlier_ones() -> None:
     assert len(SYNTH) > 80
+    assert ("synth.cli", "synth.errors") in _imports_of(SYNTH), "a finder that sees nothing would pass always"
     assert [name for name in SYNTH if name != "synth" and _stage(name) == 0] == []
     assert [stage for stage in STAGES if stage not in SYNTH] == []
-
-
-def test_synth_imports_only_from_earlier_stages() -> None:
     wrong = [
         f"{name} imports {imported}, which comes later"
         for name, imported in _imports_of(SYNTH)
@@ -101,22 +97,19 @@ def test_synth_imports_only_from_earlier_stages() -> None:
     assert wrong == []
 
 
-def test_the_finder_of_imports_sees_every_form() -> None:
-    """A test of the test: one that finds nothing would pass always."""
-    source = """
-import synth.cli
-from synth import arrays
-from synth.commands import run_plan as r
-def f():
-    from . import planning
-    from .mesh.pad import PadMesh
-    if True:
-        import torch.nn as nn
-"""
-    found = _imports("synth.errors", ast.parse(source), False)
-    assert {"synth.cli", "synth.arrays", "synth.commands", "synth.planning", "synth.mesh.pad", "torch.nn"} <= found
-    assert "synth.simulate.load_path" in _imports("synth.simulate", ast.parse("from .load_path import LoadPath"), True)
-    assert _stage("synth.dataset.storage") < _stage("synth.simulate.files") < _stage("synth.dataset.writer")
+ROOMS = (
+    "errors", "arrays", "hardware", "terminal", "config", "files", "ops", "models", "losses", "data", "baselines",
+    "predict", "compare", "train", "cli", "__main__",
+)  # fmt: skip
+"""The same for the parts of gelflow."""
+
+
+def test_gelflow_imports_only_from_earlier_parts() -> None:
+    pairs = [(name.split("."), imported.split(".")) for name, imported in _imports_of(GELFLOW)]
+    parts = [(name[1], other[1]) for name, other in pairs if len(name) > 1 and other[0] == "gelflow" and len(other) > 1]
+    parts = [pair for pair in parts if pair[1] != "__version__"]
+    assert [pair for pair in parts if ROOMS.index(pair[1]) > ROOMS.index(pair[0])] == []
+    assert {imported for _, imported in parts} == set(ROOMS[:-1]), "a finder that sees nothing would pass always"
 
 
 @pytest.mark.parametrize(
@@ -151,6 +144,7 @@ MAIN = "import sys\nfrom {0}.cli import main\nassert main(sys.argv[1:]) == 0"
         (MAIN.format("synth"), ("--help",)),
         (MAIN.format("synth"), ("generate", "--help")),
         (MAIN.format("gelflow"), ("train", "--help")),
+        (MAIN.format("gelflow"), ("compare", "--help")),
     ],
     ids=lambda value: "" if isinstance(value, str) else " ".join(value),
 )
@@ -159,7 +153,18 @@ def test_help_loads_nothing_heavy(code: str, arguments: tuple[str, ...]) -> None
     assert _loaded_after(code, *arguments) & HEAVY == set()
 
 
-def test_simulate_loads_no_renderer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_prediction_loads_nothing_of_training_and_simulate_no_renderer(tmp_path: Path, monkeypatch) -> None:
+    code = (
+        "import gelflow.predict.prediction, gelflow.baselines.learned, gelflow.compare.run, sys\n"
+        "from gelflow.models.weights import load_weights, weights_file\n"
+        "load_weights(weights_file(None))\n"
+        "print(*sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert "gelflow.models.gelflow" in loaded
+    assert not [name for name in loaded if name.startswith(("gelflow.train", "lightning"))]
+    assert not _loaded_after("import gelflow.config") & {"torch", "numpy", "lightning"}
     own_cache(monkeypatch)
     scene = write_tiny(tmp_path)
     loaded = _loaded_after(

@@ -1,7 +1,4 @@
-"""The refined contact surface: one closed sheet that interpolates the nodes and keeps affine and quadratic fields.
-
-Each comment "fails with" names a change of `synth.surface` that was tried.
-"""
+"""The refined contact surface: one closed sheet that interpolates the nodes and keeps affine and quadratic fields."""
 
 import numpy as np
 import pytest
@@ -30,7 +27,6 @@ def normals(points: Points, triangles: np.ndarray) -> FloatArray:
 @pytest.mark.parametrize("coarse", [CROOKED, REGULAR], ids=["crooked", "regular"])
 def test_refined_sheet_is_one_and_conforming(coarse: ContactFaces, n: int) -> None:
     """Every vertex is shared: a rectangle stays one disc (V - E + F = 1) with each inner edge between two triangles."""
-    # Fails with labels whose pairs of weight 0 are not moved to one place (vertices on shared edges double).
     surface = GelSurface(coarse, n)
     pairs, count = edges(surface.triangles)
     assert len(surface.triangles) == n * n * len(coarse.faces)
@@ -44,8 +40,7 @@ def test_refined_sheet_is_one_and_conforming(coarse: ContactFaces, n: int) -> No
 
 
 @pytest.mark.parametrize("n", SUBDIVISIONS)
-def test_triangles_keep_area_and_orientation(n: int) -> None:
-    # Fails with two indices of the inverted small triangles exchanged.
+def test_triangles_keep_area_and_orientation_nodes_and_affine_fields_their_values(n: int) -> None:
     surface = GelSurface(CROOKED, n)
     area = normals(surface.material, surface.triangles) / 2
     assert (area[:, 2] < 0).all()
@@ -53,11 +48,6 @@ def test_triangles_keep_area_and_orientation(n: int) -> None:
     whole = np.repeat(normals(CROOKED.nodes, CROOKED.faces)[:, 2] / 2, n * n) / n**2
     # The n * n parts of a face follow each other and are equal, to rounding.
     np.testing.assert_allclose(area[:, 2], whole, rtol=1e-9)
-
-
-@pytest.mark.parametrize("n", SUBDIVISIONS)
-def test_nodes_are_interpolated_and_affine_fields_exact(n: int) -> None:
-    # Fails with weights that do not sum to 1.
     surface, rng = GelSurface(CROOKED, n), np.random.default_rng(1)
     nodal = rng.standard_normal((len(CROOKED.nodes), 3))
     A, b = rng.standard_normal((3, 3)), rng.standard_normal(3)
@@ -86,7 +76,6 @@ def smooth(points: Points) -> FloatArray:
 @pytest.mark.parametrize("n", [2, 4])
 def test_quadratic_fields_are_exact_inside_a_regular_mesh(n: int) -> None:
     """Where each node's faces are point-symmetric about it the mean gradient is exact, and so is the blend."""
-    # Fails with 0.5 of the correction changed, or with x - x_i turned.
     surface = GelSurface(REGULAR, n)
     error = np.abs(surface.interpolate(quadratic(REGULAR.nodes)) - quadratic(surface.material)).max(axis=1)
     inside = (np.abs(surface.material[:, :2]) <= np.array(SIZE[:2]) / 2 - 1.0).all(axis=1)
@@ -97,7 +86,7 @@ def test_quadratic_fields_are_exact_inside_a_regular_mesh(n: int) -> None:
     assert linear[inside].max() > 0.2
 
 
-def test_smooth_fields_converge_at_third_order() -> None:
+def test_smooth_fields_converge_at_third_order_and_the_map_is_local() -> None:
     """Halving the edges divides the error inside by 8, where linear interpolation divides it by 4."""
 
     def errors(cells: int) -> tuple[float, float]:
@@ -114,9 +103,6 @@ def test_smooth_fields_converge_at_third_order() -> None:
     # The next term of the expansion is an edge length smaller, 0.25 of the leading one at worst: rates 3 and 2, -0.3.
     assert np.log2(coarse / fine) > 2.7
     assert 1.7 < np.log2(coarse_linear / fine_linear) < 2.3
-
-
-def test_the_map_is_linear_and_local() -> None:
     surface = GelSurface(CROOKED, 2)
     one = np.zeros((len(CROOKED.nodes), 1))
     node = int(np.argmin(np.linalg.norm(CROOKED.nodes, axis=1)))

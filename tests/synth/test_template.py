@@ -1,26 +1,28 @@
-"""Scene files: distributions, overrides, corners, and the hash that says which scene it is."""
+"""Scene files: distributions, overrides, corners and the hash; wrong ones get one clear message each.
+
+A message has the file, the field's full path, what was given and what is allowed.
+"""
 
 import pickle
 from pathlib import Path
 
 import pytest
-from tiny_scene import CONTACT, TEXT
+from tiny_scene import CONTACT, TEXT, write_tiny
 
 from synth.errors import InputError
 from synth.scene.sampling import draw
 from synth.scene.template import SCENES, checked_template, load_scene, replaced, shipped_scenes
 
 
-def test_shipped_scenes_are_known_by_name() -> None:
+def test_shipped_scenes_are_known_by_name_and_a_template_needs_no_file(tmp_path, monkeypatch) -> None:
     flat = "deltact digit fingervision gelsight gelsight_fingertip gelsight_mini gelslim gelstereo omnitact soft_bubble"
     assert shipped_scenes() == sorted([*flat.split(), "densetact", "objects", "tac3d"])
     assert load_scene("gelsight_mini").source == SCENES / "gelsight_mini.toml"
-
-
-def test_a_folder_of_a_scenes_name_does_not_hide_the_scene(tmp_path, monkeypatch) -> None:
     (tmp_path / "gelsight_mini").mkdir()
     monkeypatch.chdir(tmp_path)
     assert load_scene("gelsight_mini").name == "gelsight_mini"
+    content = dict(load_scene("deltact").content)
+    assert checked_template(content, tmp_path / "none.toml").hash == load_scene("deltact").hash
 
 
 def test_overrides_set_tables_lists_and_words_and_the_last_wins(tiny: Path) -> None:
@@ -45,15 +47,11 @@ def test_overrides_set_tables_lists_and_words_and_the_last_wins(tiny: Path) -> N
     assert scene.motion.steps == 4
 
 
-def test_corners_are_the_ends_of_the_distributions(tiny: Path) -> None:
+def test_corners_are_the_ends_of_distributions_and_every_option_of_nested_choices(tiny: Path) -> None:
     corners = load_scene(tiny).corners
     assert [corner.motion.depth_mm for corner in corners] == [0.1, 0.3]
     assert [corner.sensor.gel.youngs_modulus_kpa for corner in corners] == [100, 300]
     assert {corner.sensor.camera.cx for corner in corners} == {16.0}  # a normal is at its mean
-
-
-def test_corners_see_every_option_of_nested_choices(tiny: Path) -> None:
-    """A choice of two in a choice of three, beside another choice of two: each option turns up."""
     sphere = '{ shape = "sphere", radius_mm = { choice = [0.5, { uniform = [1.0, 2.0] }, 3.0] } }'
     cone = '{ shape = "cone", half_angle_deg = { choice = [30, 60] } }'
     template = load_scene(tiny, [f"contact.indenter={{ choice = [{cone}, {sphere}] }}", "motion.steps={choice=[1, 2]}"])
@@ -64,11 +62,20 @@ def test_corners_see_every_option_of_nested_choices(tiny: Path) -> None:
     assert len(indenters) == 6
 
 
-def test_a_wrong_option_of_a_nested_choice_is_found_when_the_file_is_loaded(tiny: Path) -> None:
+def test_wrong_options_are_found_at_loading_and_the_hash_covers_files_of_mesh_indenters(tiny, monkeypatch) -> None:
     torus = '{ shape = "torus", radius_mm = 1, tube_mm = 0.2 }'
     sphere = '{ shape = "sphere", radius_mm = { choice = [1.0, -2.0] } }'
     with pytest.raises(InputError, match=r"contact.indenter.radius_mm = -2.0: must be greater than or equal to 0.05"):
         load_scene(tiny, [f"contact.indenter={{ choice = [{sphere}, {torus}] }}"])
+    monkeypatch.chdir(tiny.parent)
+    override = 'contact.indenter={ shape = "mesh", file = { choice = ["a.stl", "b.stl"] } }'
+    (tiny.parent / "a.stl").write_text("first")
+    with pytest.raises(InputError, match=r"there is no file .*b\.stl"):
+        load_scene(tiny, [override])
+    (tiny.parent / "b.stl").write_text("second")
+    before = load_scene(tiny, [override]).hash
+    (tiny.parent / "b.stl").write_text("changed")
+    assert load_scene(tiny, [override]).hash != before
 
 
 def test_replaced_asks_for_each_distribution_and_leaves_the_rest() -> None:
@@ -83,7 +90,7 @@ def test_replaced_asks_for_each_distribution_and_leaves_the_rest() -> None:
     assert asked == ["choice", "normal", "uniform"]  # by the keys' names, not by their order
 
 
-def test_hash_and_draws_are_of_the_content_not_of_its_layout(tmp_path: Path, tiny: Path) -> None:
+def test_hash_and_draws_are_of_the_content_which_is_plain_json(tmp_path: Path, tiny: Path) -> None:
     template = load_scene(tiny)
     assert len(template.hash) == 16
     name, words = 'name = "tiny"\n', 'description = "words"\nreferences = ["a book"]\n'
@@ -96,27 +103,139 @@ def test_hash_and_draws_are_of_the_content_not_of_its_layout(tmp_path: Path, tin
     assert load_scene(tiny, ["motion.steps=3"]).hash != template.hash
     assert load_scene(tiny, ["name=other"]).hash != template.hash
     assert pickle.loads(pickle.dumps(template)).hash == template.hash
-
-
-def test_hash_covers_the_files_of_mesh_indenters(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A dataset must not go on with another object under the same file name."""
-    monkeypatch.chdir(tiny.parent)
-    override = 'contact.indenter={ shape = "mesh", file = { choice = ["a.stl", "b.stl"] } }'
-    (tiny.parent / "a.stl").write_text("first")
-    with pytest.raises(InputError, match=r"there is no file .*b\.stl"):
-        load_scene(tiny, [override])
-    (tiny.parent / "b.stl").write_text("second")
-    before = load_scene(tiny, [override]).hash
-    (tiny.parent / "b.stl").write_text("changed")
-    assert load_scene(tiny, [override]).hash != before
-
-
-def test_a_template_needs_no_file(tmp_path: Path) -> None:
-    content = dict(load_scene("deltact").content)
-    assert checked_template(content, tmp_path / "none.toml").hash == load_scene("deltact").hash
-
-
-def test_content_is_plain_json(tmp_path: Path) -> None:
-    """TOML knows dates; what is kept in dataset.json does not."""
+    # TOML knows dates; what is kept in dataset.json does not.
     (tmp_path / "s.toml").write_text("description = 2026-11-21\n" + TEXT)
     assert load_scene(tmp_path / "s.toml").content["description"] == "2026-11-21"
+
+
+def _refusal(source: Path | str, *overrides: str) -> str:
+    with pytest.raises(InputError) as caught:
+        load_scene(source, overrides)
+    return str(caught.value)
+
+
+WRONG_KEYS_AND_TYPES = [
+    ("motion.dept_mm=1", ": unknown key; did you mean 'depth_mm'?"),
+    ("sensor.camera.focal=3", ": unknown key; allowed here are width, height, fx, fy, cx, cy"),
+    ("sensor.lights.1.colour=[1, 1, 1]", "sensor.lights[1].colour: unknown key; did you mean 'color'?"),
+    ("contact.indenter.radius=1", ": unknown key; did you mean 'radius_mm'?"),
+    ("sensor.pattern.cell_mm=1", ": unknown key; allowed here are kind, spacing_mm, radius_mm"),
+    ("colour=1", ": unknown key; allowed here are name, description"),
+    ("motion.depth_mm=true", " = True: must be a valid number"),
+    ('motion.depth_mm="0.2"', " = '0.2': must be a valid number"),
+    ("motion.depth_mm=0.2mm", " = '0.2mm': must be a valid number"),
+    ("motion.depth_mm=", " = '': must be a valid number"),
+    ("motion.depth_mm=nan", " = nan: must be a finite number"),
+    ("motion.depth_mm=[1]", " = [1]: must be a valid number"),
+    ("motion.steps=2.0", " = 2.0: must be a whole number"),
+    ("motion.steps={ uniform = [2, 4] }", " = 2.0: must be a whole number; to draw one, use { choice"),
+    ("outputs.depth=1", " = 1: must be a valid boolean"),
+    ("sensor.gel.size_mm=[8, 6]", "[2]: is missing"),
+    ("sensor.gel.size_mm=[8, 6, 2, 1]", " = [8, 6, 2, 1]: must have at most 3 entries, not 4"),
+    ("sensor.gel=3", " = 3: must be a table"),
+    ("sensor.lights=[]", " = []: must have at least 1 entry, not 0"),
+    ("sensor.gel.shape=bowl", " = 'bowl': must be 'box' or 'dome'"),
+    ("sensor.gel.shape=file", " = 'file': gels are a 'box' or a 'dome'; meshes of pads from files are not supported"),
+    ("name=two words", " = 'two words': "),
+    ("contact.indenter.shape=ball", " = 'ball': allowed are 'sphere', 'cylinder', 'box'"),
+    ("contact.indenter={ radius_mm = 1 }", ": lacks the key 'shape'"),
+    ("sensor.camera.bit_depth=9", " = 9: must be 8, 10, 12, 14 or 16"),
+]
+IMPOSSIBLE_PHYSICS = [
+    ("sensor.gel.poisson_ratio=0.51", " = 0.51: must be less than or equal to 0.5"),
+    ("sensor.gel.size_mm=[20000, 6, 2.5]", "[0] = 20000: must be less than or equal to 200"),
+    ("sensor.gel.youngs_modulus_kpa=0", " = 0: must be greater than or equal to 0.1"),
+    ("motion.depth_mm=2.4", " = 2.4 is more than 85 % of the gel's thickness (2.5 mm)"),
+    ("motion.depth_mm={ uniform = [0.1, 2.4] }", " = 2.4 is more than 85 %"),
+    ("motion.position_mm=[4.1, 0]", " x = 4.1 puts the indenter beside the pad (|x| <= 4.0)"),
+    ("motion.shear_mm=[0, 6.1]", " y = 6.1 is longer than the pad (6.0 mm): check its unit"),
+    ("motion.then=[{ depth_mm = 0, shear_mm = [-8.1, 0.0] }]", "[0].shear_mm x = -8.1 is longer than the pad (8.0 mm)"),
+    ("motion.then=[{ depth_mm = 0.0 }]", "motion.steps = 2 cannot record every pose of motion.then: there are 3 moves"),
+    ("sensor.camera.position_mm=[0, 0, 2]", "sensor: camera.position_mm z = 2.0 lies inside the sensor"),
+    ("sensor.camera.look_at_mm=[0, 0, 30]", "sensor: camera.look_at_mm must lie on the gel's side of the camera"),
+    (
+        "sensor.lights.2.position_mm=[0, 0, 9]",
+        "sensor: lights[2].position_mm z = 9.0 must lie inside the gel and window",
+    ),
+    ("sensor.lights.2.position_mm=[0, 0, -1]", "sensor: lights[2].position_mm z = -1.0 must lie inside"),
+    ("numerics.edge_length_mm=0.01", " = 0.01 must lie between 0.0417 and 2.5 for this pad"),
+    ("contact.friction=-0.1", " = -0.1: must be greater than or equal to 0"),
+]
+WRONG_DISTRIBUTIONS = [
+    ("motion.depth_mm={ uniform = [0.3, 0.1] }", ": uniform needs [lower, upper], it has [0.3, 0.1]"),
+    ("motion.depth_mm={ uniform = [1] }", ": uniform needs two finite numbers, it has [1]"),
+    ("motion.depth_mm={ uniform = 1 }", ": uniform needs two finite numbers, it has 1"),
+    ("motion.depth_mm={ uniform = [0, inf] }", ": uniform needs two finite numbers"),
+    ("motion.depth_mm={ normal = [0, nan] }", ": normal needs two finite numbers"),
+    ("motion.depth_mm={ normal = [0, true] }", ": normal needs two finite numbers"),
+    ("motion.depth_mm={ normal = [0, -1] }", ": normal's standard deviation must not be negative"),
+    ("motion.depth_mm={ log_uniform = [0, 1] }", ": log_uniform needs positive ends"),
+    ("motion.depth_mm={ choice = [] }", ": choice needs a list with at least one entry"),
+    ("motion.depth_mm={ choice = 3 }", ": choice needs a list with at least one entry"),
+    ("motion.depth_mm={ unifrom = [0, 1] }", ": must be a valid number, it is a table; did you mean 'uniform'"),
+    ("motion.depth_mm={ uniform = [0, 1], normal = [0, 1] }", ": must be a valid number, it is a table"),
+    ("contact.indenter={ chocie = [1, 2] }", ": lacks the key 'shape'; did you mean 'choice'?"),
+    ("contact.indenter.radius_mm={ choice = [1, { uniform = [2] }] }", ".choice[1]: uniform needs"),
+    ("numerics.tolerance={ uniform = [1e-6, 1e-5] }", ": a distribution is not allowed here"),
+    ("sampling.pairs_per_trajectory={ choice = [1, 2] }", ": a distribution is not allowed"),
+    ("name={ choice = ['a', 'b'] }", ": a distribution is not allowed here"),
+]
+
+
+@pytest.mark.parametrize(("override", "message"), WRONG_KEYS_AND_TYPES + IMPOSSIBLE_PHYSICS + WRONG_DISTRIBUTIONS)
+def test_a_wrong_value_is_named_with_file_place_and_what_is_allowed(tiny: Path, override: str, message: str) -> None:
+    """A message that begins with no name is about the override's own key."""
+    key, found = override.partition("=")[0], _refusal(tiny, override)
+    assert found.startswith(f"{tiny} with --set {key}: {message if message[0].isalpha() else key + message}")
+    assert "\n" not in found
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("motion", "give key=value, for instance --set motion.depth_mm=1.2"),
+        ("=1", "give key=value"),
+        ("motion..depth_mm=1", "give key=value"),
+        ("sensor.lights.5.power=1", "'5' is not an entry of a list of 5 (0 is the first)"),
+        ("sensor.lights.first.power=1", "'first' is not an entry of a list of 5"),
+        ("motion.steps.more=1", "'more' lies inside a value that is not a table"),
+        ("motion.depth_mm.uniform=[0, 1]", "motion.depth_mm is a distribution; give all of it, as in --set 'motion."),
+    ],
+)
+def test_overrides(tiny: Path, override: str, message: str) -> None:
+    found = _refusal(tiny, override)
+    assert found.startswith(f"--set {override!r}: ")
+    assert message in found
+
+
+def test_every_problem_is_told_once_on_a_short_line_as_are_missing_files(tiny: Path, tmp_path: Path) -> None:
+    lines = _refusal(tiny, "motion.dept_mm=1", "contact.friction=-1", "sensor.gel.poisson_ratio=1").splitlines()
+    assert len(lines) == 3
+    assert all(line.startswith(f"{tiny} with --set motion.dept_mm, contact.friction, ") for line in lines)
+    assert len(_refusal(tiny, f"motion.depth_mm={list(range(5000))}")) < 400
+    assert len(_refusal(tiny, f"motion.depth_mm={'9' * 400}")) < 1000
+    shipped = ", ".join(shipped_scenes())
+    assert _refusal("gelsight_mni") == f"there is no scene 'gelsight_mni'; shipped: {shipped}; or give a .toml file"
+    assert _refusal(tmp_path / "none.toml") == f"there is no scene file {tmp_path / 'none.toml'}"
+    (tmp_path / "folder.toml").mkdir()
+    assert "there is no scene file" in _refusal(tmp_path / "folder.toml")
+    (tmp_path / "noise.toml").write_bytes(bytes(range(256)))
+    assert "not valid TOML" in _refusal(tmp_path / "noise.toml")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("name = ", "not valid TOML"),
+        ("a = 1\na = 2\n", "not valid TOML"),
+        ("", "name: is missing"),
+        ("name = 'x'\n", "sensor: is missing"),
+        (TEXT.replace('kind = "dots"', ""), "sensor.pattern: lacks the key 'kind'"),
+        (TEXT.replace("width = 32", "widht = 32"), "sensor.camera.width: is missing"),
+    ],
+)
+def test_files(tmp_path: Path, content: str, message: str) -> None:
+    path = write_tiny(tmp_path, content)
+    found = _refusal(path)
+    assert found.startswith(str(path))
+    assert message in found

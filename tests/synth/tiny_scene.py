@@ -89,7 +89,6 @@ TEXT = SENSOR + LIGHTS + CONTACT
 
 
 def write_tiny(folder: Path, text: str = TEXT) -> Path:
-    """The scene file in a folder."""
     path = folder / "tiny.toml"
     path.write_text(text)
     return path
@@ -114,7 +113,6 @@ def fingerprint(dataset: Path) -> dict[str, Any]:
 
 @functools.cache
 def _home() -> Path:
-    """A folder for this test session."""
     folder = Path(tempfile.mkdtemp(prefix="synth-tests-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
@@ -136,6 +134,5 @@ def reference() -> Path:
 
 
 def job_context(template: Template, n: int, out: Path, seed: int = 0) -> JobContext:
-    """Of a job on the processor."""
     planned = plan(template, job_variant(template, "cpu"))
     return JobContext(planned, make_job(planned, n, seed), out, out / "cache")

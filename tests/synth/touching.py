@@ -32,7 +32,6 @@ class Touch:
     friction: float
 
     def evaluate(self, state: Unknowns | None = None) -> FloatArray:
-        """Free residual."""
         return self.body.residual(state or self.state, self.indenters).free
 
     @property
@@ -49,12 +48,10 @@ class Touch:
 
     @cached_property
     def rotation(self) -> FloatArray:
-        """(3, 3) its axes as columns."""
         return np.asarray(self.indenters.rotation.numpy()[0])
 
     @cached_property
     def centre(self) -> FloatArray:
-        """(3,)."""
         return np.asarray(self.indenters.centre.numpy()[0])
 
     @property

@@ -52,7 +52,6 @@ def pressed(depth: float, shear: tuple[float, float], turn: float = 0.0) -> Floa
 
 
 def make_sample(drawn: Scene, displacement1: FloatArray, displacement2: FloatArray, seed: int = 0) -> SampleData:
-    """Exact flow and painted images of two states."""
     camera, optics = drawn.sensor.camera, Optics.of(drawn.sensor)
     states = [SURFACE.positions(u) for u in (displacement1, displacement2)]
     flow = exact_flow(SURFACE, *states, optics, camera.width, camera.height)
@@ -79,7 +78,6 @@ def motion_checks(
 
 
 def as_sample(index: int, drawn: Scene, data: SampleData) -> Sample:
-    """What the dataset's writer takes."""
     fields = (data.image1, data.image2, data.flow, drawn, data.surface, data.displacement1, data.displacement2)
     return Sample(index, 0, (0, 1), 0, *fields)
 
