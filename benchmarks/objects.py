@@ -4,6 +4,10 @@
 
 Each file is pressed, sheared and twisted as the default scene draws it, in a random orientation, its longest edge
 8 mm. A ball on the same mesh, moved in the same way, gives the time to compare with.
+
+    python -m benchmarks objects parts/*.stl --draws 1 --forces
+
+compares the forces of the presses alone with those on meshes of half the spacing, where edges have half the radius.
 """
 
 import time
@@ -20,12 +24,17 @@ from synth.scene import Scene
 from synth.scene.sampling import draw
 from synth.scene.template import load_scene
 from synth.simulate import Trajectory, simulate
+from synth.simulate.footprint import footprint
+from synth.simulate.load_path import path_of
 from synth.simulate.mesh_rule import MeshRule
+from synth.simulate.resolution import MARGIN, graded_mesh
 
 SIZE_MM = 8.0
 BALL = '{ shape = "sphere", radius_mm = 4.0 }'
 DEEP = 0.02
 """Share of the depth by which edges are to sink in at most."""
+NEAR = 0.05
+"""Share by which half the spacing is to change a force at most."""
 
 
 def scene_of(indenter: str, seed: int) -> Scene:
@@ -60,6 +69,33 @@ def press(case: Row) -> Row:
     }
 
 
+def force(case: Row) -> Row:
+    """A row that compares the force of a press with that on a mesh of twice as many elements across the contact."""
+    file = f'shape = "mesh", file = "{case["file"]}", size_mm = {SIZE_MM}, rotation_deg = "any"'
+    drawn = scene_of(f"{{ {file} }}", case["seed"])
+    alone = drawn.motion.model_copy(update={"shear_mm": (0.0, 0.0), "twist_deg": 0.0, "steps": 1})
+    scene = drawn.model_copy(update={"motion": alone})
+    coarse = MeshRule.of(scene.numerics).resolution(scene)
+    gel = scene.sensor.gel
+    fine, spacing = graded_mesh(gel, footprint(path_of(scene), gel.size_mm, MARGIN), 2 * coarse.across)
+    results = [simulate(scene, mesh) for mesh in (coarse.mesh, fine)]
+    if any(result.status != "complete" for result in results):
+        return {"status": "incomplete"}
+    forces = [result.states[-1].force_n[2] for result in results]
+    found: Row = {"status": "complete", "spacing_mm": round(coarse.spacing_mm, 3), "half_mm": round(spacing, 3)}
+    found |= {"force_n": round(forces[0], 4), "half_force_n": round(forces[1], 4)}
+    return found | {"change": round(abs(forces[0] / forces[1] - 1), 4)}
+
+
+def changes(rows: Sequence[Row]) -> Row:
+    """What the rows of `force` say."""
+    found = np.array([row["change"] for row in rows if row["status"] == "complete"])
+    if len(found) == 0:
+        return {"compared": 0}
+    row: Row = {"compared": len(found), "force changes, median": f"{np.median(found):.1%}"}
+    return row | {"largest": f"{found.max():.1%}", f"at most {NEAR:.0%}": f"{np.mean(found <= NEAR):.0%}"}
+
+
 def summary(rows: Sequence[Row]) -> Row:
     """What the rows say."""
     tried = [row for row in rows if row["status"] != "refused"]
@@ -78,8 +114,13 @@ def main(argv: list[str]) -> int:
     parser.add_argument("files", nargs="+", type=Path)
     parser.add_argument("--draws", type=int, default=5, help="orientations of each file; default: 5")
     parser.add_argument("--workers", type=int, default=1, help="presses at once")
+    parser.add_argument("--forces", action="store_true", help="compare forces with those on finer meshes, instead")
     given = parser.parse_args(argv)
     cases = [{"file": str(path.resolve()), "seed": seed} for path in given.files for seed in range(given.draws)]
+    if given.forces:
+        found = changes(measure(given.out / "object_forces.csv", cases, force, given.workers))
+        show([found], list(found))
+        return 0
     rows = measure(given.out / "objects.csv", cases, press, given.workers)
     unlucky = [row for row in rows if row["status"] != "complete"]
     show(unlucky, ["file", "seed", "status", "reason"], "Presses that did not complete")

@@ -26,6 +26,12 @@ points, which passes of the multipliers do not bring to rest."""
 OBJECT_RADIUS = 2.0
 """A mesh's smallest radius over the smallest that the gel's mesh resolves: the distance of its contact points.
 Half of it costs twice the time and gains little."""
+LOWERED = 0.25
+"""Depth counts from the lowest point of a mesh as its file has it, although the gel's mesh makes rounding take that
+off. By this share of what it takes the body is lowered: a coarse mesh of the gel bears on edges with too much force, a
+rounded edge with too little (docs/reports/objects.md). An edge that is rounded on request counts from its own end."""
+MOST_RAISED = 0.3
+"""Most of the depth that may be lost so, on meshes too coarse for the contact."""
 LARGEST_GRID = 4_000_000
 """Points of a mesh's distance grid (32 MB)."""
 USUAL_GRID = 250_000
@@ -43,10 +49,12 @@ class Touchable:
     Attributes:
         radius_mm: distance from the body's axis along z, through its origin.
         height_mm: distance in z from its lowest point, the one that is nearest to the gel.
+        depth_mm: depth of the press.
     """
 
     radius_mm: float = np.inf
     height_mm: float = np.inf
+    depth_mm: float = np.inf
 
 
 EVERYTHING = Touchable()
@@ -60,7 +68,7 @@ class RigidBody:
         kind: number of its shape.
         shape: (SHAPE_LENGTH,) lengths as `synth.simulate.distance.signed_distance` wants them.
         rotation: (3, 3) its axes as columns, before any twist.
-        reach_mm: from its origin to its farthest point in +z, the point that touches first.
+        reach_mm: from its origin to its farthest point in +z, from which the depth of a press counts.
         coefficients: (i, j, k) B-spline coefficients of a mesh's distance grid, else (1, 1, 1) zeros.
         sharpest_mm: its smallest radius of curvature: fillet, tip, tube or, of a mesh, the cell of its grid.
     """
@@ -200,7 +208,9 @@ def _object(indenter: MeshIndenter, folder: Path, resolution_mm: float, touchabl
     shape[:8] = [0.0, *grid.corner, spacing, *counts]
     coefficients = np.asarray(spline_filter(values, order=3, mode="mirror"), dtype=np.float64)
     near = values < radius + spacing
-    reach = float((grid.points(near)[:, 2] - values[near]).max())  # of a solid's balls and of those beside it
+    reach = min(lowest, float((grid.points(near)[:, 2] - values[near]).max()))  # also of balls beside the solid
+    kept = max(min((indenter.fillet_mm or 0.0) / radius, 1.0), LOWERED) if radius > 0 else 0.0
+    reach = lowest - max(kept * (lowest - reach), lowest - reach - MOST_RAISED * touchable.depth_mm)
     return RigidBody(KINDS["mesh"], shape, np.eye(3), reach, coefficients, max(radius, spacing))
 
 

@@ -2,7 +2,8 @@
 
 The path parameter is a length in mm: the distance that the farthest touching point moves, leg by leg.
 
-Depth counts from the undeformed face below motion.position_mm: at 0 the indenter's lowest point is level with it. On a
+Depth counts from the undeformed face below motion.position_mm: at 0 the indenter's lowest point is level with it (of a
+mesh that point before its edges are rounded to what the gel resolves, see `synth.simulate.indenter.LOWERED`). On a
 flat pad that is where it touches, and where the path starts. On a dome a body that comes down beside the apex meets the
 gel toward the apex before that, and one whose lowest points are off its axis (a ring) touches later: there the path
 starts where it first touches the sphere of which the face is a part. Sideways moves keep the level, whatever the face
@@ -170,5 +171,6 @@ def path_of(scene: Scene, folder: Path | None = None, resolution_mm: float = 0.0
     poses: list[Motion | PoseOfScene] = [motion, *motion.then]
     aside = max(float(np.hypot(*np.add(motion.position_mm, pose.shear_mm))) for pose in poses)
     deepest = max(pose.depth_mm for pose in poses) + gel.face_mm(*motion.position_mm)
-    touchable = Touchable(float(np.hypot(*gel.size_mm[:2])) / 2 + aside, BULGE * max(deepest, 0.0) + SLACK_MM)
+    height = BULGE * max(deepest, 0.0) + SLACK_MM
+    touchable = Touchable(float(np.hypot(*gel.size_mm[:2])) / 2 + aside, height, max(motion.depth_mm, 0.0))
     return LoadPath(motion, rigid_body(scene.contact.indenter, folder, resolution_mm, touchable), gel.dome_radius_mm)
