@@ -1,4 +1,4 @@
-"""How good a flow is: against an exact flow, against tracked dots, and by the images themselves.
+"""How good a flow is: against an exact flow, against tracked dots, back again, and by the images themselves.
 
 With a flow V from image 1 to image 2 and the exact flow W, over the n pixels that see gel and are visible in both:
 
@@ -7,6 +7,7 @@ With a flow V from image 1 to image 2 and the exact flow W, over the n pixels th
     SSIM             Wang et al. 2004: Gaussian window 11 x 11, sigma 1.5, K1 = .01, K2 = .03, of the 8-bit luma,
                      mean over the whole image, mirrored at its border
     marker distance  median of |(x1, y1) + V(x1, y1) - (x2, y2)|
+    closure          |V(x) + W(x + V(x))|, W the method's flow from image 2 to image 1; median and 90th percentile
 
 PSNR and SSIM are those of the GelFlow paper (n = 8 bit); they tell how well image 2 can be brought to image 1, not
 where the gel went.
@@ -17,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.arrays import Bytes3, FlowArray, Grey8, ImageArray, MarkerArray, MaskArray
+from gelflow.arrays import Bytes3, FlowArray, Grey8, ImageArray, MarkerArray, MaskArray, PointArray
 from gelflow.errors import InputError
 from gelflow.files.image import to_bytes, to_grey
 from gelflow.ops.warp import warp_image
@@ -108,9 +109,26 @@ def marker_distance(flow: FlowArray, markers: MarkerArray) -> float:
 
     The flow is read bilinearly at (x1, y1), in OpenCV's coordinates: (0, 0) is the centre of the first pixel.
     """
+    return float(np.median(np.hypot(*(moved_points(flow, markers[:, :2]) - markers[:, 2:]).T)))
+
+
+def moved_points(flow: FlowArray, points: PointArray) -> PointArray:
+    """Points (N, 2), moved by a flow that is read bilinearly; NaN where the flow is."""
     from scipy.ndimage import map_coordinates
 
-    start, end = markers[:, :2], markers[:, 2:]
-    position = start[:, ::-1].T
-    moved = [map_coordinates(flow[..., k].astype(np.float64), position, order=1, mode="nearest") for k in (0, 1)]
-    return float(np.median(np.hypot(*(start + np.stack(moved, axis=1) - end).T)))
+    at = points[:, ::-1].T
+    motion = [map_coordinates(flow[..., k].astype(np.float64), at, order=1, mode="nearest") for k in (0, 1)]
+    return points + np.stack(motion, axis=1)
+
+
+def closure(flow: FlowArray, back: FlowArray) -> NDArray[np.float64]:
+    """|V(x) + W(x + V(x))| at each pixel, (H, W) float64 px, W the flow from image 2 to image 1.
+
+    NaN where V leaves the image or either is NaN.
+    """
+    left = flow + warp_image(back, flow)
+    height, width = flow.shape[:2]
+    rows, columns = np.indices((height, width))
+    x, y = columns + flow[..., 0], rows + flow[..., 1]
+    inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+    return np.where(inside, np.hypot(left[..., 0], left[..., 1], dtype=np.float64), np.nan)

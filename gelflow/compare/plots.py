@@ -26,6 +26,7 @@ def plot_means(path: Path, groups: Sequence[Group], note: str) -> None:
         ("PSNR (dB), more is better", "psnr_db", 1, False),
         ("SSIM, more is better", "ssim", 1, False),
         ("endpoint error (px), less is better", "endpoint_error_px", 1, True),
+        ("distance to dots (px), less is better", "dot_distance_px", 1, True),
         ("ms per pair (CPU: of one core)", "cost_seconds", 1000, True),
     ]
     panels = [panel for panel in candidates if any(group.mean(panel[1]) is not None for group in groups)]
@@ -58,7 +59,7 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
 
 
 def plot_work_precision(path: Path, groups: Sequence[Group], note: str) -> None:
-    """Writes a PNG with quality against run time: endpoint error where it is known, and PSNR.
+    """Writes a PNG with quality against run time: endpoint error or distance to dots, and PSNR.
 
     Methods of `UNTIMED` are left out. The note says what the times were measured on.
 
@@ -66,7 +67,11 @@ def plot_work_precision(path: Path, groups: Sequence[Group], note: str) -> None:
     part of the front. A black edge means that it ran on a GPU.
     """
     shown = [group for group in groups if group.name not in UNTIMED]
-    candidates = [("mean endpoint error (px)", "endpoint_error_px", 1.0), ("PSNR (dB)", "psnr_db", -1.0)]
+    candidates = [
+        ("mean endpoint error (px)", "endpoint_error_px", 1.0),
+        ("median distance to dots (px)", "dot_distance_px", 1.0),
+        ("PSNR (dB)", "psnr_db", -1.0),
+    ]
     panels = [panel for panel in candidates if any(_finite(group.mean(panel[1])) for group in shown)]
     looks = _looks([group.name for group in groups])
     figure, axes = _figure(max(1, len(panels)), 4.6 * max(1, len(panels)) + 2.2, 4.2)

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from gelflow.arrays import FlowArray
+from gelflow.arrays import FlowArray, ImageArray
 from gelflow.baselines.exact import ExactFlow
 from gelflow.baselines.method import Method
-from gelflow.compare.metrics import endpoint_error, flow_errors, image_similarity, marker_distance
+from gelflow.compare.dots import dot_distance, find_dots
+from gelflow.compare.metrics import closure, endpoint_error, flow_errors, image_similarity, marker_distance
 from gelflow.compare.strata import Stratum, pair_strata
 from gelflow.data.pairs import PairDataset
 from gelflow.errors import InputError, NothingFoundError
@@ -22,6 +23,7 @@ from gelflow.hardware import hardware
 
 MEASURES = (
     "psnr_db", "ssim", "endpoint_error_px", "median_error_px", "outliers_1px", "outliers_01px", "marker_distance_px",
+    "dot_distance_px", "dot_p90_px", "own_dots", "closure_px", "closure_p90_px",
 )  # fmt: skip
 """Fields of a score that are averaged over pairs."""
 
@@ -37,6 +39,9 @@ class PairScore:
         endpoint_error_px, median_error_px: Mean and median endpoint error.
         outliers_1px, outliers_01px: Share of pixels with an endpoint error above 1 px and 0.1 px.
         marker_distance_px: Median distance to tracked dots.
+        dot_distance_px, dot_p90_px, own_dots: See `gelflow.compare.dots.DotDistance`; where there is no exact flow and
+            both images show a pattern of dots.
+        closure_px, closure_p90_px: Median and 90th percentile of the closure; where there is no exact flow.
         motion_px: Mean length of the true motion over the compared pixels.
         seconds: Run time of the method, images in memory to flow in memory.
         processor_seconds: Time of all its threads on the processor meanwhile; unlike `seconds` it does not grow with
@@ -56,6 +61,11 @@ class PairScore:
     outliers_1px: float | None = None
     outliers_01px: float | None = None
     marker_distance_px: float | None = None
+    dot_distance_px: float | None = None
+    dot_p90_px: float | None = None
+    own_dots: float | None = None
+    closure_px: float | None = None
+    closure_p90_px: float | None = None
     motion_px: float | None = None
     seconds: float
     processor_seconds: float
@@ -77,6 +87,11 @@ class MethodScore:
     outliers_1px: float | None
     outliers_01px: float | None
     marker_distance_px: float | None
+    dot_distance_px: float | None = None
+    dot_p90_px: float | None = None
+    own_dots: float | None = None
+    closure_px: float | None = None
+    closure_p90_px: float | None = None
     seconds: float
     processor_seconds: float
     device: str
@@ -101,17 +116,15 @@ def score_pair(method: Method, dataset: PairDataset, index: int) -> PairScore:
     truth, markers = dataset.truth(index), dataset.markers(index)
     started, busy = time.perf_counter(), time.process_time()
     try:
-        flow = method.of(truth) if isinstance(method, ExactFlow) else method.flow(image1, image2)
-    except NothingFoundError:
-        flow = np.zeros((*image1.shape[:2], 2), np.float32)
+        flow = method.of(truth) if isinstance(method, ExactFlow) else _estimate(method, image1, image2)
     except InputError as error:
         raise InputError(f"{dataset.source}, pair {record.name}, {method.name}: {error}") from error
     seconds, processor_seconds = time.perf_counter() - started, time.process_time() - busy
     psnr_db, ssim = image_similarity(image1, image2, flow)
     try:
-        errors = {} if truth is None else _errors(flow, truth, record.scene)
+        errors = _without_truth(method, image1, image2, flow) if truth is None else _errors(flow, truth, record.scene)
     except InputError as error:
-        raise InputError(f"{record.flow}: {error}") from error
+        raise InputError(f"{record.flow or record.name}: {error}") from error
     device = str(getattr(method, "device", "cpu"))
     return PairScore(
         method=method.name,
@@ -126,6 +139,26 @@ def score_pair(method: Method, dataset: PairDataset, index: int) -> PairScore:
         on_gpu=device == "cuda",
         **errors,
     )
+
+
+def _estimate(method: Method, image1: ImageArray, image2: ImageArray) -> FlowArray:
+    try:
+        return method.flow(image1, image2)
+    except NothingFoundError:
+        return np.zeros((*image1.shape[:2], 2), np.float32)
+
+
+def _without_truth(method: Method, image1: ImageArray, image2: ImageArray, flow: FlowArray) -> dict[str, Any]:
+    """The fields of a score that take the place of errors where there is no exact flow."""
+    found: dict[str, Any] = {}
+    dots1, dots2 = find_dots(image1), find_dots(image2)
+    distance = None if dots1 is None or dots2 is None else dot_distance(flow, dots1, dots2)
+    if distance is not None:
+        found = {"dot_distance_px": distance.median_px, "dot_p90_px": distance.p90_px, "own_dots": distance.own}
+    gap = closure(flow, _estimate(method, image2, image1))
+    if np.isfinite(gap).any():
+        found["closure_px"], found["closure_p90_px"] = (float(q) for q in np.nanpercentile(gap, (50, 90)))
+    return found
 
 
 def _errors(flow: FlowArray, truth: FlowField, scene: str | None) -> dict[str, Any]:

@@ -5,7 +5,7 @@ differ in their seed alone are one row (see `gelflow.compare.seeds`): mean ± st
 the strata.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from statistics import fmean
 
 from gelflow.compare.comparison import Comparison
@@ -34,8 +34,8 @@ def number(value: float | None, digits: int, spread: float | None = None) -> str
 def summary_table(groups: Sequence[Group]) -> Table:
     """Means over the pairs, a row per method; columns that no method has are left out.
 
-    The distance to dots is not averaged here: tracks differ too much in how far they can be trusted. Where all ran on
-    one device its column is left out, too.
+    The distance to tracked dots is not averaged here: tracks differ too much in how far they can be trusted. Where all
+    ran on one device its column is left out, too.
     """
     columns = [
         ("PSNR dB", "psnr_db", 1, 2),
@@ -44,6 +44,11 @@ def summary_table(groups: Sequence[Group]) -> Table:
         ("median px", "median_error_px", 1, 3),
         ("> 1 px %", "outliers_1px", 100, 1),
         ("> 0.1 px %", "outliers_01px", 100, 1),
+        ("dots px", "dot_distance_px", 1, 3),
+        ("90 % px", "dot_p90_px", 1, 3),
+        ("own dot %", "own_dots", 100, 1),
+        ("closure px", "closure_px", 1, 3),
+        ("90 % px", "closure_p90_px", 1, 3),
         ("ms/pair", "seconds", 1000, 1),
         ("core ms", "processor_seconds", 1000, 1),
     ]
@@ -60,16 +65,16 @@ def _scaled(group: Group, field: str, factor: float, digits: int) -> str:
     return number(None if value is None else factor * value, digits, None if spread is None else factor * spread)
 
 
-def pair_table(scores: Sequence[PairScore], cell: Callable[[PairScore], tuple[float, ...] | None], form: str) -> Table:
+def pair_table(scores: Sequence[PairScore], fields: Sequence[str], form: str) -> Table:
     """A row per method and a column per pair, as in the paper; the mean over seeds.
 
-    `cell` gives the numbers of a cell, None where the pair has none; `form` is how to write them, "{:.2f} / {:.3f}".
-    Pairs for which no method has numbers are left out.
+    `fields` of a score make a cell, `form` is how to write them, "{:.2f} / {:.3f}". Pairs for which no method has all
+    of them are left out.
     """
-    found: dict[tuple[str, str], list[tuple[float, ...]]] = {}
+    found: dict[tuple[str, str], list[list[float]]] = {}
     for score in scores:
-        values = cell(score)
-        if values is not None:
+        values = [getattr(score, field) for field in fields]
+        if None not in values:
             found.setdefault((group_name(score.method), score.pair), []).append(values)
     pairs = [pair for pair in dict.fromkeys(s.pair for s in scores) if any(pair == known for _, known in found)]
     rows = []
@@ -116,11 +121,14 @@ def tables(comparison: Comparison) -> list[tuple[str, Table]]:
     ]
     if pairs <= MOST_PAIRS_IN_A_TABLE:
         each = [
-            ("PSNR dB / SSIM", lambda s: (s.psnr_db, s.ssim), "{:.2f} / {:.3f}"),
-            ("mean endpoint error in px", lambda s: _one(s.endpoint_error_px), "{:.3f}"),
-            ("median distance to tracked dots in px", lambda s: _one(s.marker_distance_px), "{:.2f}"),
-        ]
-        found += [(f"Each pair: {name}.", pair_table(comparison.scores, cell, form)) for name, cell, form in each]
+            ("PSNR dB / SSIM", "{:.2f} / {:.3f}", ("psnr_db", "ssim")),
+            ("mean endpoint error in px", "{:.3f}", ("endpoint_error_px",)),
+            ("median distance to tracked dots in px", "{:.2f}", ("marker_distance_px",)),
+            ("distance to dots, median / 90th percentile in px / share that reach one of their own",
+             "{:.3f} / {:.3f} / {:.0%}", ("dot_distance_px", "dot_p90_px", "own_dots")),
+            ("closure, median / 90th percentile in px", "{:.3f} / {:.3f}", ("closure_px", "closure_p90_px")),
+        ]  # fmt: skip
+        found += [(f"Each pair: {name}.", pair_table(comparison.scores, fields, form)) for name, form, fields in each]
     title = "Mean endpoint error in px by the true motion, place, pattern and scene, over all pixels of a bin."
     found.append((title, strata_table(comparison.strata)))
     found.append(("Networks alone, forward pass.", speed_table(comparison.speeds)))
@@ -132,10 +140,6 @@ def with_pattern(comparison: Comparison) -> tuple[list[Group], int]:
     scores = [score for score in comparison.scores if not without_pattern(score.scene)]
     scores = scores or list(comparison.scores)
     return _ordered(summarise(scores)), len({score.pair for score in scores})
-
-
-def _one(value: float | None) -> tuple[float] | None:
-    return None if value is None else (value,)
 
 
 def _ordered(means: Sequence[MethodScore]) -> list[Group]:

@@ -1,4 +1,4 @@
-"""Flow between images of any size by a trained network: resize, estimate, resize the flow back."""
+"""Flow between images of any size by a trained network: resize, estimate, examine what tears, resize the flow back."""
 
 from collections.abc import Callable
 
@@ -8,6 +8,7 @@ from gelflow.arrays import Flow, Images
 from gelflow.config import MINIMUM_SIDE
 from gelflow.errors import InputError
 from gelflow.models import GelFlow
+from gelflow.models.consistency import consistent
 from gelflow.models.gelflow import check_shapes
 from gelflow.ops.resize import resize_flow, resize_images
 
@@ -51,7 +52,11 @@ def estimate_flow(
     model.eval()
     try:
         with torch.no_grad():
-            found = resize_flow((flow or model.flow)(*inputs), native)
+            estimate, settings, (first, second) = flow or model.flow, model.config.registration, inputs
+            found = estimate(first, second)
+            if settings is not None:
+                found = consistent(found, first, second, estimate, settings)
+            found = resize_flow(found, native)
     finally:
         model.train(was_training)
     return found.to(image1.device)

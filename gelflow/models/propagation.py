@@ -28,7 +28,7 @@ from torch.nn.functional import pad
 
 from gelflow.arrays import Flow, Images
 from gelflow.ops.cached import cached
-from gelflow.ops.gaussian import smoother, window_sums
+from gelflow.ops.gaussian import SeparableFilter, smoother, window_sums
 from gelflow.ops.resize import resize_flow, resize_images
 from gelflow.ops.warp import inside, warp
 
@@ -71,22 +71,12 @@ def propagated(
     size = (math.ceil(height / pixel), math.ceil(width / pixel))
     start, first, second = resize_flow(flow, size), resize_images(image1, size), resize_images(image2, size)
     window = window_sums(*size, window_px / pixel, flow)
-    whole = window(torch.ones_like(start[:1, :1]))
 
     def residuals(candidates: Tensor) -> Tensor:
-        """E of (N, B, 2, H, W): (N, B, 1, H, W); infinite where too little of the window is in the image."""
-        flows = candidates.flatten(0, 1)
+        """E of (N, B, 2, H, W): (N, B, 1, H, W)."""
         images1, images2 = (image.repeat(len(candidates), 1, 1, 1) for image in (first, second))
-        counts = inside(flows)
-        left = counts * (warp(images2, flows) - images1)
-        squares = left.square().mean(dim=1, keepdim=True)
-        sums = window(torch.cat([counts, squares, left] if ignore_shading else [counts, squares], dim=1))
-        weight = sums[:, :1]
-        moments = sums[:, 1:] / weight
-        spread = moments
-        if ignore_shading:
-            spread = moments[:, :1] - moments[:, 1:].square().mean(dim=1, keepdim=True)
-        return torch.where(weight > MIN_SHARE_INSIDE * whole, spread, torch.inf).unflatten(0, (len(candidates), -1))
+        left = windowed_residual(candidates.flatten(0, 1), images1, images2, window, ignore_shading)
+        return left.unflatten(0, (len(candidates), -1))
 
     now = residuals(start.unsqueeze(0))[0]
     best, least = start, (MAX_RESIDUAL_RATIO_WITHOUT_SHADING if ignore_shading else MAX_RESIDUAL_RATIO) * now
@@ -101,6 +91,22 @@ def propagated(
         found = proposed.gather(0, which.expand_as(start).unsqueeze(0))[0]
         best, least = torch.where(left < least, found, best), torch.minimum(left, least)
     return flow + resize_flow(torch.where(now > (2 * noise) ** 2, best - start, 0.0), (height, width))
+
+
+def windowed_residual(
+    flow: Flow, image1: Images, image2: Images, window: SeparableFilter, ignore_shading: bool
+) -> Tensor:
+    """E at each pixel, (B, 1, H, W); infinite where too little of the window is in the image."""
+    counts = inside(flow)
+    left = counts * (warp(image2, flow) - image1)
+    squares = left.square().mean(dim=1, keepdim=True)
+    sums = window(torch.cat([counts, squares, left] if ignore_shading else [counts, squares], dim=1))
+    weight = sums[:, :1]
+    moments = sums[:, 1:] / weight
+    spread = moments
+    if ignore_shading:
+        spread = moments[:, :1] - moments[:, 1:].square().mean(dim=1, keepdim=True)
+    return torch.where(weight > MIN_SHARE_INSIDE * window(torch.ones_like(counts[:1])), spread, torch.inf)
 
 
 class _Proposals:

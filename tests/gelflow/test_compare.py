@@ -83,11 +83,11 @@ def test_numbers_that_are_not_finite_come_back_and_markers_are_scored_where_ther
     (folder / "a_markers.csv").write_text("x1,y1,x2,y2\n20,20,23,24\n40,30,43,34\n")
     scores = evaluate(Constant("zero", 0, 0), open_pairs(folder))
     assert [score.marker_distance_px for score in scores] == [5.0, None]
-    table = pair_table(scores, lambda s: None if s.marker_distance_px is None else (s.marker_distance_px,), "{:.2f}")
+    table = pair_table(scores, ["marker_distance_px"], "{:.2f}")
     assert table == (["method", "a"], [["zero", "5.00"]])
     header, rows = summary_table(grouped(summarise(scores[1:])))
-    assert header == ["method", "PSNR dB", "SSIM", "ms/pair", "core ms"]
-    assert markdown((header, rows)).splitlines()[1] == "| --- | ---: | ---: | ---: | ---: |"
+    assert header == ["method", "PSNR dB", "SSIM", "closure px", "90 % px", "ms/pair", "core ms"]
+    assert markdown((header, rows)).splitlines()[1] == "| --- | ---: | ---: | ---: | ---: | ---: | ---: |"
 
 
 def test_earlier_results_are_replaced_on_the_same_data_only(tmp_path: Path) -> None:

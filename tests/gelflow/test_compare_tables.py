@@ -32,7 +32,7 @@ def test_seeds_become_mean_and_standard_deviation(tmp_path: Path) -> None:
     header, rows = summary_table(groups)
     assert [row[header.index("EPE px")] for row in rows] == ["1.000 ± 0.500", "3.500"]
     assert groups[1].spread("endpoint_error_px") is None
-    assert pair_table(scores, lambda s: (s.endpoint_error_px,), "{:.2f}") == (
+    assert pair_table(scores, ["endpoint_error_px"], "{:.2f}") == (
         ["method", "000000", "000001"], [["net (3 seeds)", "0.50", "1.50"], ["other", "4.00", "3.00"]])  # fmt: skip
 
 
@@ -43,7 +43,7 @@ def test_bins_of_seeds_are_pooled_and_fine_tuned_methods_and_other_devices_come_
     dataset = open_pairs(write_folder(tmp_path / "plain", {"a": (1, 0)}))
     result = compare([Constant("net#0+ft", 1, 0), Constant("net", 0, 0)], dataset)
     named = [[row[0] for row in rows] for _, (_, rows) in tables(result)]
-    assert named == [["net"], ["net+ft"], ["net", "net+ft"]]
+    assert named == [["net"], ["net+ft"], ["net", "net+ft"], ["net", "net+ft"]]  # PSNR and closure of each pair
     here = replace(result.scores[1], seconds=2.0, processor_seconds=0.5)
     elsewhere = replace(here, method="net, GPU", device="NVIDIA H200", on_gpu=True)
     means = summarise([here, elsewhere])

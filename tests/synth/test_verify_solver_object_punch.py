@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import pyvista as pv
-from bonded_layer import compliance, gauss, wave_numbers
-from quarter_disc import body, growing, lowered, press, quarter_disc
+from bonded_layer import body, compliance, gauss, growing, lowered, press, quarter_disc, wave_numbers
 from scipy.optimize import brentq
 
 from synth.simulate.element import p2p1
