@@ -16,6 +16,7 @@ QUESTIONS = {
     "batched": "presses a second of the batched solver, and their error against tight solves",
     "agreement": "do the CPU and the GPU give the same trajectories?",
     "objects": "do triangle meshes from files press the gel, and how deep do they sink in?",
+    "draws": "do the draws of the shipped scenes complete?",
     "render": "an image's error against rendering time",
     "light": "separated light against path tracing",
     "flow": "the flow's error against its run time",

@@ -6,6 +6,7 @@ import pytest
 from tiny_scene import TEXT, own_cache, write_tiny
 
 from benchmarks.__main__ import main
+from benchmarks.draws import summaries, together
 from benchmarks.render import DEEPEST, settings
 from benchmarks.rows import Row, read
 from benchmarks.scale import at_size, rates
@@ -52,6 +53,18 @@ def test_render(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert by_samples[15, False]["difference_px"] > by_samples[195, False]["difference_px"]
     assert "llvm_ad_rgb" in capsys.readouterr().out
     assert all((out / f"{name}.png").read_bytes().startswith(b"\x89PNG") for name in ("render", "render_flow"))
+
+
+def test_draws_on_the_cpu_and_by_the_batched_solver(tmp_path: Path) -> None:
+    scene = str(write_tiny(tmp_path, TEXT))
+    alone = again(["draws", "--scenes", scene, "--draws", "2"], tmp_path / "out", "draws_cpu.csv")[0]
+    batched = [{"scene": scene, **row} for row in together({"device": "cpu", "scene": scene, "seed": 0, "draws": 2}, 1)]
+    for rows in (alone, batched):
+        assert [row["trajectory"] for row in rows] == [0, 1]
+        assert [line["share"] for line in summaries(rows)] == ["100.00%", "100.00%"]
+        assert all(row["iterations"] > 0 and row["penetration"] > 0 for row in rows)
+    failed = {**alone[0], "status": "failed", "reason": "made up"}
+    assert [line["share"] for line in summaries([*alone, failed])] == ["66.67%", "66.67%"]
 
 
 def test_settings_of_images_differ_and_rates_of_a_made_up_run() -> None:

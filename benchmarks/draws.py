@@ -1,0 +1,112 @@
+"""Do the draws of the shipped scenes complete?
+
+    python -m benchmarks draws --draws 300 --workers 16                   one by one on the CPU
+    python -m benchmarks draws --draws 300 --workers 16 --device cuda     together on a GPU
+
+Every draw is pressed as `generate` would: on the CPU on a mesh of its own, on a GPU on the batched solver's. One that
+does not complete is a failure, here and there; `generate` replaces it. A repeated run goes on with the CSV file, on a
+GPU by whole scenes.
+"""
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from itertools import groupby
+from multiprocessing import get_context
+
+from benchmarks.rows import Row, arguments, machine, measure, show
+from synth.errors import InputError
+from synth.pipeline.batched_simulation import BATCH, pad_key
+from synth.scene.sampling import draw, pairs_of
+from synth.scene.template import SCENES, load_scene
+from synth.simulate import Trajectory
+from synth.simulate.batched import simulate_presses
+from synth.simulate.batched.pad import prepare
+from synth.simulate.mesh_rule import MeshRule
+from synth.simulate.press import Press
+from synth.simulate.solve import simulate_press
+
+DEEP = 0.02
+"""Share of the press depth by which a body is to sink in at most."""
+
+
+def drawn(case: Row, settings: Sequence[str] = ()) -> tuple[Press, frozenset[int]] | str:
+    """The press of a draw and the states that samples show of it, or why it cannot be built."""
+    template = load_scene(case["scene"], settings)
+    seed, number = case["seed"], case["trajectory"]
+    try:
+        scene = draw(template, seed, number)
+        press = MeshRule.of(scene).press(scene, template.source.parent)
+    except InputError as error:
+        return str(error)
+    pairs = pairs_of(template, seed, number, scene.motion.steps)
+    return press, frozenset(frame for pair in pairs for frame in pair.frames)
+
+
+def found(result: Trajectory, shown: frozenset[int]) -> Row:
+    """What a row says of a draw."""
+    deepest = max(state.depth_mm for state in result.states)
+    sunk = max((state.max_penetration_mm for n, state in enumerate(result.states) if n in shown), default=0.0)
+    return {
+        "status": result.status,
+        "reason": result.reason,
+        "iterations": sum(state.newton_iterations for state in result.states),
+        "penetration": round(sunk / deepest, 5) if deepest > 0 else 0.0,
+    }
+
+
+def one(case: Row) -> Row:
+    """A draw on the CPU."""
+    made = drawn(case)
+    return {"status": "unbuilt", "reason": made} if isinstance(made, str) else found(simulate_press(*made), made[1])
+
+
+def together(case: Row, workers: int) -> list[Row]:
+    """All draws of a scene by the batched solver; their bodies are made by processes."""
+    cases = [{**case, "trajectory": number} for number in range(case["draws"])]
+    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+        made = list(pool.map(partial(drawn, settings=['numerics.solver="batched"']), cases, chunksize=4))
+    rows = {number: {"status": "unbuilt", "reason": each} for number, each in enumerate(made) if isinstance(each, str)}
+    built = [(number, *each) for number, each in enumerate(made) if not isinstance(each, str)]
+    for _, group in groupby(built, lambda each: pad_key(each[1])):
+        numbers, presses, frames = zip(*group, strict=True)
+        pad = prepare(presses[0].scene, presses[0].mesh, case["device"])
+        for k, result in simulate_presses(presses, pad, frames, BATCH["cuda"]):
+            rows[numbers[k]] = found(result, frames[k])
+    return [{"trajectory": number, **rows[number]} for number in range(case["draws"])]
+
+
+def summaries(rows: Sequence[Row]) -> Iterator[Row]:
+    """A line for each scene, and one for all."""
+    names = list(dict.fromkeys(row["scene"] for row in rows))
+    for name in [*names, "all"]:
+        own = [row for row in rows if name in (row["scene"], "all")]
+        done = [row for row in own if row["status"] == "complete"]
+        deep = [row["penetration"] for row in done]
+        line: Row = {"scene": name, "draws": len(own), "complete": len(done), "share": f"{len(done) / len(own):.2%}"}
+        yield line | {"deeper than 2 %": sum(x > DEEP for x in deep), "deepest": f"{max(deep, default=0.0):.1%}"}
+
+
+def main(argv: list[str]) -> int:
+    """Run the command line; 1 if a draw does not complete."""
+    shipped = sorted(path.stem for path in SCENES.glob("*.toml"))
+    parser = arguments("draws", __doc__)
+    parser.add_argument("--scenes", nargs="+", default=shipped, help="default: all that are shipped")
+    parser.add_argument("--draws", type=int, default=300, help="of each scene; default: 300")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    parser.add_argument("--workers", type=int, default=1, help="processes")
+    given = parser.parse_args(argv)
+    print(machine())
+    cases: list[Row] = [{"device": given.device, "scene": name, "seed": given.seed} for name in given.scenes]
+    table = given.out / f"draws_{given.device}.csv"
+    if given.device == "cpu":
+        single = [{**case, "trajectory": number} for case in cases for number in range(given.draws)]
+        rows = measure(table, single, one, given.workers)
+    else:
+        rows = measure(table, [{**c, "draws": given.draws} for c in cases], partial(together, workers=given.workers))
+    failures = [row for row in rows if row["status"] != "complete"]
+    show(failures, ["scene", "seed", "trajectory", "status", "reason"], "Draws that did not complete")
+    lines = list(summaries(rows))
+    show(lines, list(lines[0]), f"Draws on {given.device}")
+    return 1 if failures else 0
