@@ -140,42 +140,73 @@ def _bspline_slope(t: wp.float64) -> wp.vec4d:
 
 
 @wp.func
-def _grid(
-    y: wp.vec3d,
-    corner: wp.vec3d,
-    cell: wp.float64,
-    counts: wp.vec3d,
-    s: int,
-    coefficients: wp.array4d(dtype=wp.float64),
-) -> wp.vec4d:
-    """Cubic B-spline on a grid of counts points (the batch's array is as large as its largest grid); beyond the grid
-    the distance from its border is added.
-    """
-    upper = counts - wp.vec3d(wp.float64(3.0), wp.float64(3.0), wp.float64(3.0))
-    g = (y - corner) / cell
-    held = wp.vec3d(wp.clamp(g[0], ONE, upper[0]), wp.clamp(g[1], ONE, upper[1]), wp.clamp(g[2], ONE, upper[2]))
-    i = wp.min(int(held[0]), int(upper[0]) - 1)
-    j = wp.min(int(held[1]), int(upper[1]) - 1)
-    k = wp.min(int(held[2]), int(upper[2]) - 1)
+def _bspline_curvature(t: wp.float64) -> wp.vec4d:
+    three = wp.float64(3.0)
+    return wp.vec4d(ONE - t, three * t - wp.float64(2.0), ONE - three * t, t)
+
+
+@wp.func
+def _in_grid(y: wp.vec3d, shape: shape_vector) -> wp.vec3d:
+    """The nearest point of the grid where splines are defined, in spacings from its first sample."""
+    g = (y - wp.vec3d(shape[1], shape[2], shape[3])) / shape[4]
+    three = wp.float64(3.0)
+    for axis in range(3):
+        g[axis] = wp.clamp(g[axis], ONE, shape[5 + axis] - three)
+    return g
+
+
+@wp.func
+def _spline(held: wp.vec3d, shape: shape_vector, s: int, coefficients: wp.array4d(dtype=wp.float64)):
+    """Value, gradient and Hessian (xx, yy, zz and yz, zx, xy) of the cubic B-spline, by spacings."""
+    i = wp.min(int(held[0]), int(shape[5]) - 4)
+    j = wp.min(int(held[1]), int(shape[6]) - 4)
+    k = wp.min(int(held[2]), int(shape[7]) - 4)
     tx = held[0] - wp.float64(i)
     ty = held[1] - wp.float64(j)
     tz = held[2] - wp.float64(k)
     wx, wy, wz = _bspline(tx), _bspline(ty), _bspline(tz)
     sx, sy, sz = _bspline_slope(tx), _bspline_slope(ty), _bspline_slope(tz)
+    cx, cy, cz = _bspline_curvature(tx), _bspline_curvature(ty), _bspline_curvature(tz)
     value = wp.float64(0.0)
     slope = wp.vec3d(ZERO, ZERO, ZERO)
+    straight = wp.vec3d(ZERO, ZERO, ZERO)
+    mixed = wp.vec3d(ZERO, ZERO, ZERO)
     for a in range(4):
         for b in range(4):
+            line = wp.vec3d(ZERO, ZERO, ZERO)
             for c in range(4):
-                v = coefficients[s, i + a - 1, j + b - 1, k + c - 1]
-                value += wx[a] * wy[b] * wz[c] * v
-                slope += v * wp.vec3d(sx[a] * wy[b] * wz[c], wx[a] * sy[b] * wz[c], wx[a] * wy[b] * sz[c])
-    beyond = cell * (g - held)
-    n = _unit(slope / cell, wp.vec3d(ZERO, ZERO, ONE))
+                line += coefficients[s, i + a - 1, j + b - 1, k + c - 1] * wp.vec3d(wz[c], sz[c], cz[c])
+            value += wx[a] * wy[b] * line[0]
+            slope += wp.vec3d(sx[a] * wy[b] * line[0], wx[a] * sy[b] * line[0], wx[a] * wy[b] * line[1])
+            straight += wp.vec3d(cx[a] * wy[b] * line[0], wx[a] * cy[b] * line[0], wx[a] * wy[b] * line[2])
+            mixed += wp.vec3d(wx[a] * sy[b] * line[1], sx[a] * wy[b] * line[1], sx[a] * sy[b] * line[0])
+    return value, slope, straight, mixed
+
+
+@wp.func
+def _grid(y: wp.vec3d, shape: shape_vector, s: int, coefficients: wp.array4d(dtype=wp.float64)) -> wp.vec4d:
+    """Cubic B-spline on a grid (the batch's array is as large as its largest grid); beyond the grid the distance from
+    its border is added.
+    """
+    held = _in_grid(y, shape)
+    value, slope, _straight, _mixed = _spline(held, shape, s, coefficients)
+    beyond = y - wp.vec3d(shape[1], shape[2], shape[3]) - shape[4] * held
+    n = _unit(slope / shape[4], wp.vec3d(ZERO, ZERO, ONE))
     if wp.length(beyond) > TINY:
         n = _unit(value * n + beyond, n)
         value = wp.length(value * n + beyond)
     return wp.vec4d(n[0], n[1], n[2], value)
+
+
+@wp.func
+def _grid_normal_derivative(
+    y: wp.vec3d, shape: shape_vector, s: int, coefficients: wp.array4d(dtype=wp.float64)
+) -> wp.mat33d:
+    """Of a point within the grid: (I - n n^T) H / |g| with the spline's gradient g and Hessian H."""
+    _value, slope, d, m = _spline(_in_grid(y, shape), shape, s, coefficients)
+    hessian = wp.mat33d(d[0], m[2], m[1], m[2], d[1], m[0], m[1], m[0], d[2])
+    n = _unit(slope, wp.vec3d(ZERO, ZERO, ONE))
+    return (hessian - wp.outer(n, hessian * n)) / (shape[4] * wp.max(wp.length(slope), TINY))
 
 
 @wp.func
@@ -198,8 +229,7 @@ def signed_distance(
     elif kind == 4:
         d = _torus(y, shape[1])
     else:
-        corner = wp.vec3d(shape[1], shape[2], shape[3])
-        d = _grid(y, corner, shape[4], wp.vec3d(shape[5], shape[6], shape[7]), s, coefficients)
+        d = _grid(y, shape, s, coefficients)
     return wp.vec4d(d[0], d[1], d[2], d[3] - shape[0])
 
 
@@ -207,14 +237,17 @@ def signed_distance(
 def normal_derivative(
     kind: int, shape: shape_vector, y: wp.vec3d, s: int, coefficients: wp.array4d(dtype=wp.float64)
 ) -> wp.mat33d:
-    """Symmetrised derivative of the normal (1/mm) by central differences of the exact normal (error about 1e-9)."""
+    """Symmetrised derivative of the normal (1/mm): of shapes by central differences of it (error about 1e-9)."""
     h = wp.float64(1.0e-5)
     columns = wp.mat33d()
-    for i in range(3):
-        step = wp.vec3d(ZERO, ZERO, ZERO)
-        step[i] = h
-        ahead = signed_distance(kind, shape, y + step, s, coefficients)
-        behind = signed_distance(kind, shape, y - step, s, coefficients)
-        for j in range(3):
-            columns[j, i] = (ahead[j] - behind[j]) / (wp.float64(2.0) * h)
+    if kind == 5:
+        columns = _grid_normal_derivative(y, shape, s, coefficients)
+    else:
+        for i in range(3):
+            step = wp.vec3d(ZERO, ZERO, ZERO)
+            step[i] = h
+            ahead = signed_distance(kind, shape, y + step, s, coefficients)
+            behind = signed_distance(kind, shape, y - step, s, coefficients)
+            for j in range(3):
+                columns[j, i] = (ahead[j] - behind[j]) / (wp.float64(2.0) * h)
     return wp.float64(0.5) * (columns + wp.transpose(columns))
