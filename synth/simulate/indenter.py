@@ -20,9 +20,9 @@ BLUNT_MM = 1.0
 """Smallest radius at which the contact stiffness of `numerics.penalty` is enough."""
 SHARPEST = 4.0
 """Largest factor on the contact stiffness."""
-OBJECT_STIFFNESS = 4.0
-"""A mesh's contact stiffness over that of analytic shapes of its radius. Its edges and corners bear on few contact
-points, which passes of the multipliers do not bring to rest."""
+OBJECT_STIFFNESS = 2.0
+"""A mesh's contact stiffness over that of analytic shapes of its radius: its edges and corners bear on few contact
+points."""
 OBJECT_RADIUS = 2.0
 """A mesh's smallest radius over the smallest that the gel's mesh resolves: the distance of its contact points.
 Half of it costs twice the time and gains little."""

@@ -16,6 +16,7 @@ import numpy as np
 from synth.arrays import FloatArray
 from synth.scene import Numerics
 from synth.simulate.contact_history import restore_contact, saved_contact
+from synth.simulate.distance import KINDS
 from synth.simulate.load_path import LoadPath
 from synth.simulate.newton import FORCE_FLOOR, MAX_ITERATIONS, Solution, relative_residual, solve
 from synth.simulate.options import STANDARD, SolverOptions
@@ -42,6 +43,10 @@ come to rest on the surface, so that more updates make the tractions uneven."""
 FAILURES = 3
 """Of attempts at them, after which the passes end. Updates are halved after a failure and doubled after a success:
 where a whole one upsets Newton's method a part of it does not."""
+MAX_PENETRATION = 0.02
+"""Share of the press depth that no contact point of an object may be inside it in a state with updated multipliers. A
+state that is deeper takes up to MAX_DEEP_UPDATES and DEEP_FAILURES, and is not accepted if that does not do."""
+MAX_DEEP_UPDATES, DEEP_FAILURES = 6.0, 9
 MULTIPLIER_TOLERANCE = 20.0
 """Tolerance of states that multipliers are updated from, over the full one: two updates do not forget what they began
 with."""
@@ -81,6 +86,9 @@ class Stepper:
         records = path.records().tolist()
         self._recorded = frozenset(records)
         self._corrected = frozenset(place for k, place in enumerate(records, 1) if frames is None or k in frames)
+        depth_mm = max(float(path.corners[:, 0].max()), 0.1)
+        self._shallow_mm = PENETRATION * depth_mm
+        self._deepest_mm = MAX_PENETRATION * depth_mm if path.body.kind == KINDS["mesh"] else np.inf
         self._rubs = friction > 0
         self.indenter, self._sticking = pack_indenter(path, friction), pack_indenter(path, STICK_FRICTION)
         self._sticking.centre, self._sticking.rotation = self.indenter.centre, self.indenter.rotation
@@ -212,12 +220,13 @@ class Stepper:
         The last of two whole updates is solved to the full tolerance; where the passes end before it, none is.
         """
         between = min(self._relaxed_tolerance, MULTIPLIER_TOLERANCE * self.numerics.tolerance)
-        shallow = PENETRATION * max(float(self.path.corners[:, 0].max()), 0.1)
         share, done, failures = 1.0, 0.0, 0
-        if self.system.deepest() > shallow:
+        if self.system.deepest() > self._shallow_mm:
             solution = self._polished(solution, between)
-        while solution.converged and self.system.deepest() > shallow:
-            if done >= MAX_MULTIPLIER_UPDATES or failures >= FAILURES:
+        while solution.converged and self.system.deepest() > self._shallow_mm:
+            too_deep = self.system.deepest() > self._deepest_mm
+            most = (MAX_DEEP_UPDATES, DEEP_FAILURES) if too_deep else (MAX_MULTIPLIER_UPDATES, FAILURES)
+            if done >= most[0] or failures >= most[1]:
                 break
             before = saved_contact(self.system.contact)
             self.system.augment(self.indenter, share)
@@ -246,20 +255,21 @@ class Stepper:
         """Record the corrected state, then put contact back to where the path goes on.
 
         Returns:
-            False where the corrected state does not reach the full tolerance: nothing is recorded.
+            False where the corrected state does not reach the full tolerance or is too deep: nothing is recorded.
         """
         saved = saved_contact(self.system.contact)
-        solution = step
+        solution, good = step, step.converged
         if target in self._corrected:
             self.system.anchor(step.state, self.indenter)
             solution = self._polished(self._augmented(step), self.numerics.tolerance)
-        if solution.converged:
+            good = solution.converged and self.system.deepest() <= self._deepest_mm
+        if good:
             self.states.append(self._recorded_state(solution, target))
             self._iterations = 0
         restore_contact(self.system.contact, saved)
         self.system.forget_factor()
         self.system.residual(step.state, self.indenter)
-        return solution.converged
+        return good
 
     def _recorded_state(self, solution: Solution, target: float) -> State:
         """A solution that was just found, in the units of a trajectory."""

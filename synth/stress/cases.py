@@ -18,7 +18,7 @@ EXTREME = SCENES / "extreme"
 END = Literal["complete", "partial", "failed", "refused"]
 """How a case may end: a trajectory's status, or an InputError ("refused"); "crashed" and "hung" are never accepted."""
 MeshVariant = Literal["as made", "sliver", "flat", "one inverted", "all inverted", "nan", "loose node", "another pad"]
-SurfaceVariant = Literal["ball", "inside out", "mixed", "slivers", "open", "metres"]
+SurfaceVariant = Literal["ball", "inside out", "mixed", "slivers", "open", "metres", "pane"]
 Range = tuple[float, float]
 
 
@@ -69,6 +69,7 @@ class Case(Expectation):
     factor: Literal["single", "double"] = "single"
     mesh: MeshVariant = "as made"
     surface: SurfaceVariant | None = None
+    object: str | None = None
     budget_s: Annotated[float, Field(gt=0)] | None = None
     deviation: Deviation | None = None
 
@@ -110,7 +111,9 @@ class Run:
     @property
     def assignments(self) -> list[str]:
         """For --set, on top of the base scene; the element comes last, because a case may replace all of numerics."""
-        return [*self.case.set, f"numerics.element={self.element!r}"]
+        file = SCENES / "objects" / f"{self.case.object}.stl"
+        indenter = [f"contact.indenter={{ shape = 'mesh', file = '{file}' }}"] if self.case.object else []
+        return [*indenter, *self.case.set, f"numerics.element={self.element!r}"]
 
 
 def load_expectations(path: Path) -> Expectations:

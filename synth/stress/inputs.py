@@ -64,7 +64,7 @@ def _flattened(points: Points, tets: Tets, share: float) -> Points:
 
 
 def write_surface(variant: SurfaceVariant, path: Path, radius_mm: float = 3.0) -> None:
-    """A ball as a file of triangles (PLY), as it should be or with one thing wrong."""
+    """A ball as a file of triangles (PLY), as it should be or with one thing wrong; or a pane that stands upright."""
     import pyvista as pv
 
     ball = pv.Icosphere(radius=radius_mm, nsub=3)
@@ -80,6 +80,9 @@ def write_surface(variant: SurfaceVariant, path: Path, radius_mm: float = 3.0) -
             faces = faces[7:]
         case "metres":
             points = points / 1000
+        case "pane":
+            box = pv.Box((-3.0, 3.0, -0.03, 0.03, -2.0, 2.0)).triangulate()
+            points, faces = np.asarray(box.points, dtype=np.float64), box.regular_faces
     pv.PolyData.from_regular_faces(points, faces).save(path, recompute_normals=False)  # which would turn them back
 
 

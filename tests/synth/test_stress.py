@@ -313,6 +313,7 @@ def test_altered_meshes_and_surfaces_are_what_they_are_called(tmp_path: Path) ->
     assert (turned.regular_faces == ball.regular_faces[:, ::-1]).all()
     same = (made("mixed").regular_faces == ball.regular_faces).all(axis=1)
     assert 0.6 < same.mean() < 0.7
+    assert made("pane").length == pytest.approx((6**2 + 0.06**2 + 4**2) ** 0.5, rel=1e-6)
     slivers = made("slivers")
     assert slivers.n_open_edges == 0
     assert slivers.n_cells == ball.n_cells + 2 * (ball.n_cells // 10)

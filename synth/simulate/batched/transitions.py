@@ -18,6 +18,7 @@ from synth.simulate import newton, stepping
 from synth.simulate.batched import lanes as phases
 from synth.simulate.batched.lanes import Lanes, Presses, Settings
 from synth.simulate.batched.relaxation import FIRST_VISCOSITY, LEAST_BORNE, MAX_STEPS, evaluate_relaxation
+from synth.simulate.distance import KINDS
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
@@ -32,6 +33,10 @@ MAX_ITERATIONS_TO_GROW = wp.constant(stepping.MAX_ITERATIONS_TO_GROW)
 FAILURES = wp.constant(stepping.FAILURES)
 MAX_MULTIPLIER_UPDATES = wp.constant(wp.float64(stepping.MAX_MULTIPLIER_UPDATES))
 PENETRATION = wp.constant(wp.float64(stepping.PENETRATION))
+MESH = wp.constant(KINDS["mesh"])
+MAX_PENETRATION = wp.constant(wp.float64(stepping.MAX_PENETRATION))
+MAX_DEEP_UPDATES = wp.constant(wp.float64(stepping.MAX_DEEP_UPDATES))
+DEEP_FAILURES = wp.constant(stepping.DEEP_FAILURES)
 MAX_CORRECTION_RATIO = wp.constant(wp.float64(stepping.MAX_CORRECTION_RATIO))
 MIN_TOLERANCE = wp.constant(wp.float64(1.0e-12))
 """Of a pass: somewhat more than rounding leaves."""
@@ -188,15 +193,23 @@ def check_contact(lanes: Lanes, presses: Presses, sums: wp.array2d(dtype=wp.floa
 
 @wp.kernel
 def choose_pass(lanes: Lanes, presses: Presses, settings: Settings):
-    """Another pass, the full tolerance, or the record."""
+    """Another pass, the full tolerance, the record, or none where passes leave an object too deep."""
     s = wp.tid()
     lanes.new_share[s] = ZERO
     if lanes.phase[s] != phases.CORRECTING:
         return
     j = lanes.press[s]
-    too_deep = lanes.deepest[s] > PENETRATION * presses.deepest[j]
-    over = lanes.failures[s] == FAILURES or lanes.done[s] >= MAX_MULTIPLIER_UPDATES or not too_deep
-    over = over or presses.kind_of[j, lanes.next[s]] == 1
+    corrected = presses.kind_of[j, lanes.next[s]] == 2
+    too_deep = presses.kind[j] == MESH and lanes.deepest[s] > MAX_PENETRATION * presses.deepest[j]
+    over = lanes.failures[s] >= FAILURES or lanes.done[s] >= MAX_MULTIPLIER_UPDATES
+    if too_deep:
+        over = lanes.failures[s] >= DEEP_FAILURES or lanes.done[s] >= MAX_DEEP_UPDATES
+    if corrected and too_deep and over:
+        lanes.stage[s] = phases.POLISH
+        lanes.iteration[s] = 0
+        lanes.phase[s] = phases.FAILED
+        return
+    over = over or lanes.deepest[s] <= PENETRATION * presses.deepest[j] or not corrected
     if over and lanes.relative[s] <= settings.tolerance:
         lanes.phase[s] = phases.RECORD
         return
