@@ -79,7 +79,8 @@ def _show(result: Prediction, name: str, as_json: bool) -> None:
         return
     largest = max(result.motions, key=lambda motion: motion.p95_px)
     where = f" in frame {largest.frame}, the one with most motion," if len(result.motions) > 1 else ""
-    print(f"{name}:{where} mean motion {largest.mean_px:.3g} px, 95th percentile {largest.p95_px:.3g} px")
+    print(f"{name}:{where} mean motion {largest.mean_px:.3g} px, 95th percentile {largest.p95_px:.3g} px; "
+          f"unknown (sigma above 1 px) on {largest.unknown:.0%} of the picture")  # fmt: skip
     shown = result.files if len(result.files) <= 6 else [result.files[0], "...", *result.files[-3:]]
     print(f"written: {', '.join(str(file) for file in shown)}")
 

@@ -2,10 +2,11 @@
 
     forward.U forward.V forward.visible     I1(x) = I2(x + forward(x))
     backward.U backward.V backward.visible  the same with the images exchanged
+    forward.sigma                           of an estimate: radius in px within which 68 % of such flows are right
 
 float32, ZIP-compressed; U right, V down, px of the image; a flow belongs to its pixel's centre, (c + 0.5, r + 0.5).
 `visible` is 1 where the point of the pixel is seen in the other image, 0 where it is hidden or has left the image;
-U and V are NaN only where the pixel sees no gel.
+U and V are NaN only where the pixel sees no gel. Of an estimate it is a probability.
 """
 
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.arrays import FlowArray, MaskArray
+from gelflow.arrays import FlowArray, MapArray, MaskArray
 from gelflow.errors import InputError
 from gelflow.files.atomic import replacing
 from gelflow.files.quiet import quiet
@@ -27,12 +28,14 @@ Direction = Literal["forward", "backward"]
 class FlowField(NamedTuple):
     """A flow (H, W, 2) in px, where its end point is seen, and where the gel is touched in state 2, both (H, W) bool.
 
-    The contact is at the pixels of image 1, and None where the file lacks it or the flow is the backward one.
+    The contact is at the pixels of image 1, and None where the file lacks it or the flow is the backward one. Sigma is
+    (H, W) px, and None where the file lacks it.
     """
 
     flow: FlowArray
     visible: MaskArray
     contact: MaskArray | None = None
+    sigma: MapArray | None = None
 
 
 def read_channels(path: Path) -> dict[str, NDArray[np.float32]]:
@@ -71,19 +74,20 @@ def read_flow(path: Path, direction: Direction = "forward") -> FlowField:
     seen = finite if visible is None else np.logical_and(finite, visible > 0.5)
     touched = channels.get("contact.Y") if direction == "forward" else None
     contact = None if touched is None else np.asarray(touched > 0.5, np.bool_)
-    return FlowField(flow, np.asarray(seen, np.bool_), contact)
+    return FlowField(flow, np.asarray(seen, np.bool_), contact, channels.get(f"{direction}.sigma"))
 
 
-def write_flow(path: Path, forward: FlowArray, visible: MaskArray | None = None) -> None:
-    """Writes a forward flow, and where it is visible if that is known; replaces the file as a whole.
-
-    Without `visible` that channel is left out: an estimate does not know it.
-    """
+def write_flow(
+    path: Path, forward: FlowArray, visible: MaskArray | MapArray | None = None, sigma: MapArray | None = None
+) -> None:
+    """Writes a forward flow, and where it is visible and its sigma if they are known; replaces the file as a whole."""
     import OpenEXR
 
     planes = {f"forward.{name}": np.ascontiguousarray(forward[..., k], np.float32) for k, name in enumerate("UV")}
     if visible is not None:
         planes["forward.visible"] = visible.astype(np.float32)
+    if sigma is not None:
+        planes["forward.sigma"] = sigma
     header = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,

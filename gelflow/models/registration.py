@@ -62,8 +62,8 @@ def registered(flow: Flow, image1: Images, image2: Images, config: RegistrationC
             start = smoother(*size, smoothing_px, flow)(flow)
             flow = start
             for _ in range(config.iterations):
-                evidence = _evidence(flow, first, second, background)
-                step = _posterior(*evidence, flow - start, window, config.prior_px, config.noise)
+                found = evidence(flow, first, second, background)
+                step = _posterior(*found, flow - start, window, config.prior_px, config.noise)
                 flow = flow + step.clamp(-MAX_STEP_PX, MAX_STEP_PX)
         if config.after is not None:
             flow = torch.lerp(former, flow, _unexplained(former, first, second, config.after.noise))
@@ -83,7 +83,7 @@ def _unexplained(flow: Flow, first: Images, second: SplineImage, noise: float) -
     return edge(left) / edge(all_of_it)
 
 
-def _evidence(
+def evidence(
     flow: Flow, first: Images, second: SplineImage, background: SeparableFilter | None
 ) -> tuple[Features, Features, Features, Tensor]:
     """Residual and its derivatives along x and y, (B, C, H, W); 1 where the flow stays in the image and they count."""

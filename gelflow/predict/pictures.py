@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gelflow.arrays import Bytes3, FlowArray, ImageArray
+from gelflow.arrays import Bytes3, FlowArray, ImageArray, MapArray
 from gelflow.files.atomic import replacing
 from gelflow.files.image import to_bytes
 from gelflow.ops.warp import warp_image
@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 UNKNOWN_COLOUR = (70, 70, 70)
 """Colour (R, G, B) of pixels without flow."""
+UNKNOWN_PX = 1.0
+"""A flow whose sigma is larger is not shown."""
 _SEGMENTS = (15, 6, 4, 11, 13, 6)
 """Steps from red to yellow, yellow to green, green to cyan, cyan to blue, blue to magenta, magenta to red."""
 
@@ -49,6 +51,11 @@ def flow_to_colour(flow: FlowArray, scale_px: float) -> Bytes3:
     picture = np.floor(255 * colour).astype(np.uint8)
     picture[unknown] = UNKNOWN_COLOUR
     return picture
+
+
+def certain(flow: FlowArray, sigma: MapArray | None) -> FlowArray:
+    """The flow with NaN where its sigma is above `UNKNOWN_PX`."""
+    return flow if sigma is None else np.where(sigma[..., None] > UNKNOWN_PX, np.float32(np.nan), flow)
 
 
 def robust_scale(flow: FlowArray, percentile: float = 99.0) -> float:
@@ -128,16 +135,19 @@ def _label(picture: Bytes3, text: str, origin: tuple[int, int]) -> None:
     cv2.putText(picture, text, origin, cv2.FONT_HERSHEY_SIMPLEX, 0.6, (0, 0, 0), 1, cv2.LINE_AA)
 
 
-def write_flow_picture(path: Path, image1: ImageArray, image2: ImageArray, flow: FlowArray, title: str) -> None:
-    """Writes a PNG with both images, the flow as colours with their legend and as arrows, and the difference of the
-    images before and after the second is warped by the flow.
+def write_flow_picture(
+    path: Path, image1: ImageArray, image2: ImageArray, flow: FlowArray, sigma: MapArray, title: str
+) -> None:
+    """Writes a PNG with both images, the flow as colours with their legend and as arrows, where it is known, and the
+    difference of the images before and after the second is warped by the flow.
 
     Raises:
         OSError: The file cannot be written.
     """
     from matplotlib.figure import Figure
 
-    scale = robust_scale(flow)
+    known = certain(flow, sigma)
+    scale, unknown = robust_scale(known), (sigma > UNKNOWN_PX).mean()
     height, width = flow.shape[:2]
     figure = Figure(figsize=(12, 12 / 3 * 2 * height / width + 1.1), dpi=110, layout="constrained")
     axes = figure.subplots(2, 3)
@@ -147,7 +157,7 @@ def write_flow_picture(path: Path, image1: ImageArray, image2: ImageArray, flow:
     panels = [
         ("image 1", to_bytes(image1), None),
         ("image 2", to_bytes(image2), None),
-        (f"flow; full colour: {scale:g} px", flow_to_colour(flow, scale), None),
+        (f"flow; full colour: {scale:g} px; grey: unknown, {unknown:.0%}", flow_to_colour(known, scale), None),
         ("", to_bytes(image1), None),
         (f"|image 1 - image 2|, mean {255 * before.mean():.1f} of 255", before, limit),
         (f"|image 1 - warped image 2|, mean {255 * np.nanmean(after):.1f}", after, limit),
@@ -160,7 +170,7 @@ def write_flow_picture(path: Path, image1: ImageArray, image2: ImageArray, flow:
     inset = axes[0, 2].inset_axes((0.01, 0.76, 0.23 * height / width, 0.23))
     inset.imshow(legend(100))
     inset.axis("off")
-    _quiver(axes[1, 0], flow, scale)
+    _quiver(axes[1, 0], known, scale)
     length = np.hypot(flow[..., 0], flow[..., 1])
     motion = f"mean motion {np.nanmean(length):.3g} px, largest {np.nanmax(length):.3g} px"
     figure.suptitle(f"{title}: {motion}", fontsize=11)

@@ -12,8 +12,9 @@ from typing import Literal
 
 import numpy as np
 
-from gelflow.arrays import Bytes3, FlowArray, ImageArray
+from gelflow.arrays import Bytes3, ImageArray
 from gelflow.baselines.method import Method
+from gelflow.baselines.tensors import uncertainty
 from gelflow.errors import InputError
 from gelflow.files.atomic import refuse_foreign, replacing
 from gelflow.files.exr import DIRECTIONS, read_flow, write_flow
@@ -21,14 +22,18 @@ from gelflow.files.flo import write_flo
 from gelflow.files.image import read_pair, write_png
 from gelflow.files.quiet import quiet
 from gelflow.files.video import describe, frame_file, frames, image_files
-from gelflow.predict.pictures import draw_overlay, round_up, write_flow_picture
+from gelflow.predict.model import Estimate
+from gelflow.predict.pictures import UNKNOWN_PX, certain, draw_overlay, round_up, write_flow_picture
 
 Reference = Literal["first", "previous"]
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Length of the flow, its mean and percentiles, to a frame of a video (1 for a pair), and the method's run time."""
+    """Length of the flow, its mean and percentiles, to a frame of a video (1 for a pair), and the method's run time.
+
+    `unknown` is the share of the picture in which sigma is above 1 px.
+    """
 
     frame: int
     file: str
@@ -36,6 +41,7 @@ class Motion:
     p95_px: float
     p99_px: float
     seconds: float
+    unknown: float
 
 
 @dataclass(frozen=True)
@@ -62,12 +68,12 @@ def predict_pair(method: Method, path1: Path, path2: Path, out: Path) -> Predict
     files = [out / f"{name}{suffix}" for suffix in (".exr", ".flo", ".png")]
     refuse_foreign(files[0], DIRECTIONS.encode(), *files[1:])
     try:
-        flow, motion = _estimate(method, image1, image2, 1, path2.name)
+        found, motion = _estimate(method, image1, image2, 1, path2.name)
     except InputError as error:
         raise InputError(f"{path1} and {path2}, {method.name}: {error}") from error
-    write_flow(files[0], flow)
-    write_flo(files[1], flow)
-    write_flow_picture(files[2], image1, image2, flow, f"{name} ({method.name})")
+    write_flow(files[0], found.flow, found.visible, found.sigma)
+    write_flo(files[1], found.flow)
+    write_flow_picture(files[2], image1, image2, found.flow, found.sigma, f"{name} ({method.name})")
     return Prediction(files, [motion])
 
 
@@ -108,14 +114,14 @@ def predict_video(
         source = sources.get(index, path)
         try:
             first, second = (image.astype(np.float32) / np.float32(255) for image in (image1, image2))
-            flow, motion = _estimate(method, first, second, index, source.name)
+            found, motion = _estimate(method, first, second, index, source.name)
         except InputError as error:
             raise InputError(f"{source}, frame {index}, {method.name}: {error}") from error
         if not files:
             for earlier in _numbered(out / "flow", ".exr"):
                 earlier.unlink()
         files.append(out / "flow" / f"{index:06d}.exr")
-        write_flow(files[-1], flow)
+        write_flow(files[-1], found.flow, found.visible, found.sigma)
         motions.append(motion)
         if progress:
             progress(len(motions), total)
@@ -129,7 +135,8 @@ def predict_video(
 
     def overlays() -> Iterator[Bytes3]:
         for count, (index, _, frame) in enumerate(_frame_pairs(path, every, reference), start=len(motions) + 1):
-            yield draw_overlay(frame, read_flow(out / "flow" / f"{index:06d}.exr").flow, scale)
+            field = read_flow(out / "flow" / f"{index:06d}.exr")
+            yield draw_overlay(frame, certain(field.flow, field.sigma), scale)
             if progress:
                 progress(count, total)
 
@@ -137,15 +144,15 @@ def predict_video(
     return Prediction([*files, table, *overlay], motions)
 
 
-def _estimate(
-    method: Method, image1: ImageArray, image2: ImageArray, frame: int, file: str
-) -> tuple[FlowArray, Motion]:
+def _estimate(method: Method, image1: ImageArray, image2: ImageArray, frame: int, file: str) -> tuple[Estimate, Motion]:
     started = time.perf_counter()
     flow = method.flow(image1, image2)
     seconds = time.perf_counter() - started
     length = np.hypot(flow[..., 0], flow[..., 1])
     p95, p99 = (float(value) for value in np.nanpercentile(length, (95, 99)))
-    return flow, Motion(frame, file, float(np.nanmean(length)), p95, p99, seconds)
+    sigma, visible = uncertainty(flow, image1, image2, getattr(method, "device", "cpu"))
+    motion = Motion(frame, file, float(np.nanmean(length)), p95, p99, seconds, float((sigma > UNKNOWN_PX).mean()))
+    return Estimate(flow, sigma, visible), motion
 
 
 def _frame_pairs(path: Path, every: int, reference: Reference) -> Iterator[tuple[int, Bytes3, Bytes3]]:

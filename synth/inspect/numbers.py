@@ -14,7 +14,7 @@ def numbers_of(view: View) -> dict[str, Any]:
 
     Returns:
         name, width, height, bits, forward and backward (min_px, median_px, p95_px, max_px over the pixels that see gel;
-        nan_share of all pixels; visible_share of those with gel), closure (median_px, p95_px, max_px, pixels),
+        nan_share of all pixels; visible_share of those with gel), closure, sigma (median_px, p95_px, max_px, pixels),
         difference (before_rmse, after_rmse as shares of full scale over visible pixels), and from a sample's meta.json
         index, trajectory, frames, force_n, torque_nmm, solver.
     """
@@ -34,6 +34,7 @@ def numbers_of(view: View) -> dict[str, Any]:
         "forward": _motion(flow.forward, view.visible, view.visible_known),
         "backward": backward,
         "closure": None if view.closure is None else _spread(view.closure),
+        "sigma": None if view.sigma is None else _spread(view.sigma),
         "difference": _difference(view),
         "force_n": meta.get("force_n"),
         "torque_nmm": meta.get("torque_nmm"),

@@ -12,8 +12,8 @@ from synth.inspect.text import percent, short
 from synth.inspect.view import View
 from synth.inspect.wheel import NO_GEL, Rgb, flow_colours, robust_scale
 
-CLOSURE_RANGE_PX = (1e-5, 1.0)
-"""Of the logarithmic scale, the same everywhere, so that pictures can be compared."""
+CLOSURE_RANGE_PX, SIGMA_RANGE_PX = (1e-5, 1.0), (0.01, 10.0)
+"""Of the logarithmic scales, the same everywhere, so that pictures can be compared."""
 _VISIBLE, _HIDDEN = (245, 245, 245), (200, 60, 50)
 
 
@@ -65,12 +65,12 @@ def panels_of(view: View, numbers: Mapping[str, Any]) -> list[Panel]:
     share = numbers["forward"]["visible_share"]
     seen = percent(share) if view.visible_known else "not given"
     panels.append(Panel(f"visible in image 2: {seen} (red: hidden or outside)", _visibility(view)))
-    if view.closure is not None:
-        closure = numbers["closure"]
-        low, high = CLOSURE_RANGE_PX
-        found = f"median {short(closure['median_px'])}, max {short(closure['max_px'])} px"
-        caption = f"closure, log {low:g} to {high:g} px: {found}"
-        panels.append(Panel(caption, _closure(view.closure)))
+    for name, values, limits in (("closure", view.closure, CLOSURE_RANGE_PX), ("sigma", view.sigma, SIGMA_RANGE_PX)):
+        if values is not None:
+            found = f"median {short(numbers[name]['median_px'])}, max {short(numbers[name]['max_px'])} px"
+            panels.append(
+                Panel(f"{name}, log {limits[0]:g} to {limits[1]:g} px: {found}", _logarithmic(values, limits))
+            )
     if view.differences is not None:
         limit = _limit(view.differences[0])
         titles = (("image 2 − image 1", "before_rmse"), ("warped image 2 − image 1", "after_rmse"))
@@ -112,11 +112,9 @@ def _visibility(view: View) -> Rgb:
     return np.where(view.gel[..., None], picture, np.array(NO_GEL, np.uint8))
 
 
-def _closure(error: FloatArray) -> Rgb:
-    """Logarithmic over `CLOSURE_RANGE_PX`."""
-    low, high = np.log10(CLOSURE_RANGE_PX)
-    shown = np.log10(np.clip(error, *CLOSURE_RANGE_PX))
-    return _mapped("viridis", (shown - low) / (high - low))
+def _logarithmic(values: FloatArray, limits: tuple[float, float]) -> Rgb:
+    low, high = np.log10(limits)
+    return _mapped("viridis", (np.log10(np.clip(values, *limits)) - low) / (high - low))
 
 
 def _mapped(name: str, share: FloatArray) -> Rgb:

@@ -46,10 +46,10 @@ def facts(numbers: Mapping[str, Any]) -> list[tuple[str, str]]:
         rows.append(
             (f"{direction} without gel, visible", f"{percent(motion['nan_share'])}, {percent(motion['visible_share'])}")
         )
-    closure = numbers["closure"]
-    if closure is not None:
-        lengths = " / ".join(short(closure[key]) for key in ("median_px", "p95_px", "max_px"))
-        rows.append(("closure (interpolated) median / 95 % / max", f"{lengths} px"))
+    for key, name in (("closure", "closure (interpolated)"), ("sigma", "sigma of the estimate")):
+        if (found := numbers[key]) is not None:
+            lengths = " / ".join(short(found[part]) for part in ("median_px", "p95_px", "max_px"))
+            rows.append((f"{name} median / 95 % / max", f"{lengths} px"))
     difference = numbers["difference"]
     if difference is not None:
         before, after = difference["before_rmse"], difference["after_rmse"]

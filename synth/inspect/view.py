@@ -70,6 +70,12 @@ class View:
         forward = self.flow.forward.astype(np.float64)
         return columns + 0.5 + forward[..., 0], rows + 0.5 + forward[..., 1]
 
+    @property
+    def sigma(self) -> FloatArray | None:
+        """(H, W) px, what an estimate says of its error."""
+        sigma = self.flow.extras.get("forward.sigma")
+        return None if sigma is None else sigma.astype(np.float64)
+
     @cached_property
     def closure(self) -> FloatArray | None:
         """(H, W) px, NaN where the pixel is not visible or interpolation meets an edge; None without backward flow."""

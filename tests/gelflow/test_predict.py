@@ -14,9 +14,19 @@ from textures import as_bytes, moved, save, write_folder, write_video
 
 import gelflow
 from gelflow.baselines import named_methods
+from gelflow.baselines.learned import Learned
 from gelflow.errors import InputError
 from gelflow.files.exr import read_flow
-from gelflow.predict.pictures import UNKNOWN_COLOUR, arrow_factor, draw_overlay, flow_to_colour, robust_scale
+from gelflow.models.weights import weights_file
+from gelflow.predict.pictures import (
+    UNKNOWN_COLOUR,
+    UNKNOWN_PX,
+    arrow_factor,
+    certain,
+    draw_overlay,
+    flow_to_colour,
+    robust_scale,
+)
 from gelflow.predict.prediction import predict_pair, predict_video
 
 FARNEBACK = named_methods(["farneback"])[0]
@@ -172,3 +182,22 @@ def test_arrays_and_tensors_give_one_flow_that_follows_a_known_motion(tmp_path: 
 def test_images_that_cannot_be_used(image1: object, image2: object, message: str) -> None:
     with pytest.raises(InputError, match=message):
         gelflow.load_model(device="cpu").flow(image1, image2)  # type: ignore[call-overload]
+
+
+def test_what_is_uncertain_is_in_the_file_and_grey_in_the_picture(tmp_path: Path) -> None:
+    image1, image2 = (as_bytes(moved(96, 128, shift, 0)) for shift in (0, 2))
+    noise = np.random.default_rng(0).normal(0, 2, (2, 96, 64, 3))
+    for image, own in zip((image1, image2), noise, strict=True):
+        image[:, 64:] = np.rint(128 + own)  # nothing but noise in the right half
+    found = gelflow.load_model(device="cpu").estimate(image1, image2)
+    save(tmp_path / "half_1.png", image1 / np.float32(255))
+    save(tmp_path / "half_2.png", image2 / np.float32(255))
+    result = predict_pair(Learned(weights_file(None), device="cpu"), *sorted(tmp_path.glob("*.png")), tmp_path)
+    field = read_flow(result.files[0])
+    np.testing.assert_array_equal(field.sigma, found.sigma)
+    np.testing.assert_array_equal(field.visible, found.visible > 0.5)
+    shown = flow_to_colour(certain(found.flow, found.sigma), 2.0)
+    np.testing.assert_array_equal((shown == UNKNOWN_COLOUR).all(axis=-1), found.sigma > UNKNOWN_PX)
+    assert np.median(found.sigma[:, :48]) < 0.1
+    assert (found.sigma[:, 80:] > UNKNOWN_PX).mean() > 0.8
+    assert result.motions[0].unknown == pytest.approx((found.sigma > UNKNOWN_PX).mean())

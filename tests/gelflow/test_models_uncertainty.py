@@ -1,0 +1,73 @@
+"""The uncertainty of a flow: the Cramer-Rao bound in white noise, and what it says of wrong, bare and lost pixels."""
+
+import math
+
+import pytest
+import torch
+from textures import grid
+from torch import Tensor
+
+from gelflow.models.uncertainty import MAX_SIGMA_PX, SCALE, error_squares, flow_sigma
+
+HEIGHT, WIDTH, LENGTH, HEIGHT_OF_WAVE = 96, 128, 8.0, 0.3
+NUMBER = 2 * math.pi / LENGTH
+INSIDE = (..., slice(16, -16), slice(16, -16))
+
+
+def waves(noise: float, seed: int = 0, shift: float = 0.0, height: float = HEIGHT_OF_WAVE) -> Tensor:
+    """A wave along x in red and one along y in green, moved to the right, in white noise: (1, 3, H, W)."""
+    x, y = (torch.from_numpy(each).float() for each in grid(HEIGHT, WIDTH))
+    image = torch.stack([height * torch.cos(NUMBER * (x - shift)), height * torch.cos(NUMBER * y), 0 * x])[None]
+    return 0.5 + image + noise * torch.randn(image.shape, generator=torch.Generator().manual_seed(seed))
+
+
+def no_flow() -> Tensor:
+    return torch.zeros(1, 2, HEIGHT, WIDTH)
+
+
+@pytest.mark.parametrize("noise", [0.003, 0.03])
+def test_in_white_noise_it_is_the_cramer_rao_bound_and_the_error_of_a_step(noise: float) -> None:
+    pairs = [(waves(noise, 2 * seed), waves(noise, 2 * seed + 1)) for seed in range(6)]
+    found = torch.stack([error_squares(no_flow(), *pair)[0][INSIDE].mean() for pair in pairs]).mean().item()
+    # Both images' noise over the waves' mean square slope by central differences, in a window of 4 pi 5^2 px (the
+    # square of a Gaussian's sum over the sum of its squares), for each of the two components. The flow was not fitted
+    # to these images, so that |d|^2 is as large as tr C.
+    slope_square = (HEIGHT_OF_WAVE * math.sin(NUMBER)) ** 2 / 2
+    bound = 2 * (2 * noise**2) / slope_square / (4 * math.pi * 5**2)
+    # 6 images of some 4,000 px with 2 x 314 px for each independent step: 10 %. The background takes 1 % of both.
+    assert found == pytest.approx(2 * bound, rel=0.2)
+
+
+def test_an_error_of_the_flow_is_part_of_it() -> None:
+    image1, image2 = waves(0.01, 0), waves(0.01, 1, shift=0.4)
+    right, wrong = no_flow(), no_flow()
+    right[:, 0] = 0.4
+    sure, unsure = (flow_sigma(flow, image1, image2)[0][INSIDE].median().item() for flow in (right, wrong))
+    # The step is 10 % too long, because a central difference is below the slope of so short a wave; and the residual
+    # that the error leaves counts as noise, too.
+    assert SCALE * 0.4 < unsure < SCALE * 0.55
+    assert sure < 0.05
+
+
+def test_a_bare_gel_is_unknown_in_whatever_noise_and_light() -> None:
+    x, y = (torch.from_numpy(each).float() for each in grid(HEIGHT, WIDTH))
+    light = 0.4 * torch.exp(-((x - 60) ** 2 + (y - 50) ** 2) / (2 * 30**2))
+    for noise in (0.002, 0.02):
+        image1, image2 = waves(noise, 0, height=0.0), waves(noise, 1, height=0.0) + light
+        unknown = flow_sigma(no_flow(), image1, image2)[0] > 1.0
+        assert unknown.float().mean() > 0.8
+
+
+def test_probability_to_be_seen_is_a_half_at_the_border_and_nothing_is_known_beyond() -> None:
+    image, flow = waves(0.01), no_flow()
+    flow[:, 0] = 0.5
+    flow[:, :, 40, 40] = torch.nan
+    sigma, seen = flow_sigma(flow, image, waves(0.01, 1, shift=0.5))
+    assert (sigma[0, 0, 40, 40], seen[0, 0, 40, 40]) == (MAX_SIGMA_PX, 0)
+    # The last column's centre ends on the image's edge.
+    torch.testing.assert_close(seen[0, 0, 16:-16, -1], torch.full((HEIGHT - 32,), 0.5), atol=1e-3, rtol=0)
+    assert seen[0, 0, 16:-16, 2:-4].nan_to_num(1).median() > 0.999
+    flow[:, 0] = 60.0
+    sigma, seen = flow_sigma(flow, image, image)
+    assert sigma[0, 0, :, -30:].min() == MAX_SIGMA_PX
+    assert seen[0, 0, :, -30:].max() < 1e-3
