@@ -23,7 +23,7 @@ from synth.verify.motion import FLOW_TOLERANCE_PX, derive
 from synth.verify.sheet import Sheet
 
 SCENES = ("gelsight_mini", "tac3d", "densetact")
-"""A flat pad seen straight, one seen by mirrors, which hide some of it, and a dome seen by a fisheye lens."""
+"""A flat pad seen straight, one seen by mirrors, which hide some of it, and a hemisphere seen by a fisheye lens."""
 REPEATS = 5
 
 

@@ -21,7 +21,7 @@ from synth.surface import GelSurface
 SUBDIVISIONS = {1: 4, 2: 3}
 """Parts of a contact face's edge in the rendered surface, by the element's order."""
 FINER_DOME = 2
-"""Factor on that for domes and round gels, which are curved away from the contact, too, where faces are large."""
+"""Factor on that for domes, which are curved away from the contact, too, where faces are large."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +49,7 @@ class RenderedTrajectory:
 class SensorRenderer:
     """What all trajectories of one sensor share: its number, the renderer of its cameras, and the gel at rest.
 
-    `rest` is the undeformed gel's radiance by camera; None for a curved face, whose triangles are each trajectory's.
+    `rest` is the undeformed gel's radiance by camera; None for a dome, whose triangles are each trajectory's.
     """
 
     sensor: int
@@ -74,7 +74,7 @@ class RenderSession:
         """
         started = time.perf_counter()
         surface = self._surface_of(space, simulated.scene.sensor.gel)
-        sensor = self._prepared(simulated.scene, simulated.sensor, texture)
+        sensor = self._prepared(simulated.scene, simulated.sensor, surface, texture)
         frames: dict[int, Frame] = {}
         for number, state in sorted(simulated.states.items()):
             if number == 0 and sensor.rest is not None:
@@ -88,20 +88,24 @@ class RenderSession:
 
     def _surface_of(self, space: Space, gel: Gel) -> GelSurface:
         if self._surface is None or self._surface[0] is not space:
-            parts = SUBDIVISIONS[space.element.order] * (1 if gel.is_flat else FINER_DOME)
+            parts = SUBDIVISIONS[space.element.order] * (FINER_DOME if gel.dome_radius_mm else 1)
             self._surface = space, GelSurface(space.surface, parts)
         return self._surface[1]
 
-    def _prepared(self, scene: Scene, number: int, texture: Future[Image] | None) -> SensorRenderer:
-        """Renderer and undeformed frame of a sensor, kept until another one is wanted."""
+    def _prepared(self, scene: Scene, number: int, meshed: GelSurface, texture: Future[Image] | None) -> SensorRenderer:
+        """Renderer and undeformed frame of a sensor, kept until another one is wanted.
+
+        `meshed` is a trajectory's surface; round gels have the same in all trajectories.
+        """
         if self._sensor is None or self._sensor.sensor != number:
             variant = self._context.plan.variant
             variant.load()
-            surface = rest_surface(scene.sensor.gel)
+            gel = scene.sensor.gel
+            surface = meshed if gel.is_round else rest_surface(gel)
             painted = paint(self._context, number, scene.sensor) if texture is None else texture.result()
             renderer = Renderer(scene.sensor, scene.render, surface, painted, variant)
             rest = None
-            if scene.sensor.gel.is_flat:
+            if not gel.dome_radius_mm:
                 rest = renderer.radiances(surface.material, self._seed("rest", number))
             self._sensor = SensorRenderer(number, renderer, rest)
         return self._sensor

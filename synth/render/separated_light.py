@@ -12,6 +12,7 @@ A Lambertian surface's radiance is its albedo ρ times its irradiance E over π,
 - E_bounced, light that the gel reflects onto itself, does not depend on the view. It is sampled at points of the gel's
   faces and projected (L²) onto functions that are linear on each face, or constant where few of the face's pilots saw
   gel: such faces get little, and its mean is less noisy than its slope. Where no pilot at all saw gel there is none.
+  In a round gel, all of which sees itself, it is smooth and is fitted (`synth.render.cavity_light`).
 - The lights l include their mirror images behind the window (`synth.render.window_images`), which have no closed form.
 - E_returned, light that the gel sends to the window and gets back, is smooth. It is n · V with the normal n, and V is
   fitted to sampled paths as polynomials of the place on the pad.
@@ -30,6 +31,7 @@ from numpy.typing import NDArray
 
 from synth.arrays import BoolArray, Image
 from synth.errors import InputError
+from synth.render.cavity_light import across_cavity
 from synth.render.gel_mesh import GelMesh
 from synth.render.polygon_light import ImageLight, PolygonLight
 from synth.render.variant import Variant
@@ -45,7 +47,7 @@ _STEP = 4
 _DEGREE = 4
 """Of the polynomials for light that comes back from the window: its path is longer than the pad is thick, so smooth."""
 _RETURNED = 2**17
-"""Paths by the window, to which they are fitted; more where there are many faces."""
+"""Paths by the window or across a round gel, to which polynomials are fitted; more where there are many faces."""
 _SHIFT = (0.7548776662466927, 0.5698402909980532)
 """Of one light's shadow rays against the one before's: R2 sequence (Roberts 2018), on a torus to keep the strata."""
 
@@ -98,6 +100,7 @@ class SeparatedLight:
         self._gel, self._image = gels["gel"], gels.get("image")
         self._reflection = self._gel.bsdf()
         self._depth, self._channels = max_depth, 1 if is_mono else 3
+        self._is_round = sensor.gel.is_round
         index = sensor.window.refractive_index
         # Used only where the window reflects.
         self._face, self._index = dr.opaque(mi.Float, reflecting_plane(sensor) or 0), dr.opaque(mi.Float, index)
@@ -200,10 +203,17 @@ class SeparatedLight:
         import drjit as dr
 
         mi, faces = self._mi, len(often)
-        count = _grid(rays, faces)
+        count = _grid(_RETURNED if self._is_round else rays, faces)
         sampler = self._sampler(count, faces, seed, 1)
         points = self._points(dr.arange(mi.UInt32, faces), count, sampler)
         values = _projected(self._bounces(points, sampler, False), points.weights, count, often)
+        if self._is_round:
+            positions, normals = (
+                np.array(self._parameters[f"gel.vertex_{name}"], dtype=np.float64).reshape(-1, 3)
+                for name in ("positions", "normals")
+            )
+            corners = np.stack([np.array(column) for column in self._corners], axis=1)
+            values = across_cavity(values.mean(axis=2), positions, normals, corners)
         self._bounced = [[mi.Float(np.ascontiguousarray(one)) for one in rows.T] for rows in values.swapaxes(0, 1)]
 
     def _fit_returned(self, faces: int, seed: int) -> list[Any]:

@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 from render_scenes import FAST, SCALAR, flat_surface, needs_llvm, plain, rendered, small_sensor
+from round_gels import RADIUS, SPHERE, capsule, sensor
 
 from synth.arrays import FloatArray
 from synth.errors import InputError
@@ -12,7 +13,7 @@ from synth.render.gel_mesh import MIRROR
 from synth.render.lights import light_axes
 from synth.render.polygon_light import PolygonLight
 from synth.render.renderer import Renderer
-from synth.scene import Coating, Light, Render
+from synth.scene import Coating, Gel, Light, Render
 
 LIGHTS = tuple(Light(position_mm=(x, 1.0, 3.0), size_mm=(3, 1), color=(1, 1, 1), power=400) for x in (-7.0, 7.0))
 BLOCK = 10
@@ -104,6 +105,29 @@ def test_second_bounce_is_path_tracings_with_less_noise_and_none_on_flat_gel() -
     first, second = (rendered(small_sensor(1.0, None, LIGHTS), render=render, seed=seed) for seed in (1, 2))
     # Jittered in 4 x 4 cells: 0.05 / sqrt(12) / 4 / sqrt(16) = 0.1 % at most; the largest of 4800 is at 4 sigma.
     assert np.abs(first / second - 1).max() < 4 * 2**0.5 * 1e-3
+
+
+@needs_llvm
+def test_light_bounced_in_a_hemisphere_is_that_of_an_integrating_sphere() -> None:
+    """A part of a sphere of radius R lights each other alike: of the flux Φ that it gets, by ρ Φ / 4 π R²."""
+    power, albedo, surface = 100.0, 0.6, capsule(8, length=0.0)
+    light = Light(
+        position_mm=(3.0, 2.0, 11.9), aim_mm=(3.0, 2.0, 0.0), size_mm=(0.5, 0.5), color=(1, 1, 1), power=power
+    )
+    gel = Gel(shape="capsule", radius_mm=RADIUS, thickness_mm=2.0, youngs_modulus_kpa=200)
+    within = sensor(SPHERE, index=1.0, lights=(light,), fx=30.0, fy=30.0, position_mm=(-3.0, 0.0, 11.0))
+    within = within.model_copy(update={"gel": gel})
+    first, second = (
+        Renderer(within, Render(samples_per_pixel=16, light="separated", max_depth=depth), surface, plain(albedo), FAST)
+        for depth in (2, 3)
+    )
+    direct = first.radiance(surface.material, 1)[..., 0]
+    bounced = (second.radiance(surface.material, 1)[..., 0] - direct)[direct > 0]
+    expected = albedo**2 * power / (4 * np.pi * RADIUS**2) / np.pi
+    # 2^17 paths, whose values scatter by some twice their mean: 0.6 % of the mean, and for up to 75 independent terms
+    # sqrt(75) times that at a place.
+    assert np.mean(bounced) == pytest.approx(expected, rel=0.02)
+    assert np.sqrt(np.mean((bounced / expected - 1) ** 2)) < 0.05
 
 
 def test_what_shines_is_refused_and_scalar_variants_path_trace() -> None:
