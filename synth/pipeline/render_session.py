@@ -74,7 +74,7 @@ class RenderSession:
         """
         started = time.perf_counter()
         surface = self._surface_of(space, simulated.scene.sensor.gel)
-        sensor = self._prepared(simulated.scene, simulated.sensor, texture)
+        sensor = self._prepared(simulated.scene, simulated.sensor, surface, texture)
         frames: dict[int, Frame] = {}
         for number, state in sorted(simulated.states.items()):
             if number == 0 and sensor.rest is not None:
@@ -92,12 +92,12 @@ class RenderSession:
             self._surface = space, GelSurface(space.surface, parts)
         return self._surface[1]
 
-    def _prepared(self, scene: Scene, number: int, texture: Future[Image] | None) -> SensorRenderer:
+    def _prepared(self, scene: Scene, number: int, own: GelSurface, texture: Future[Image] | None) -> SensorRenderer:
         """Renderer and undeformed frame of a sensor, kept until another one is wanted."""
         if self._sensor is None or self._sensor.sensor != number:
             variant = self._context.plan.variant
             variant.load()
-            surface = rest_surface(scene.sensor.gel)
+            surface = own if scene.sensor.gel.shape == "file" else rest_surface(scene.sensor.gel)
             painted = paint(self._context, number, scene.sensor) if texture is None else texture.result()
             renderer = Renderer(scene.sensor, scene.render, surface, painted, variant)
             rest = None
