@@ -60,10 +60,11 @@ class GelSurfaces:
 
         Infinite where no normal meets the window.
         """
-        step = max(1, self.face.n_cells // SAMPLES)
+        centres, normals = self.face.cell_centers().points, self.face.face_normals
         found = [(float("inf"), np.zeros(3))]
-        centres, normals = self.face.cell_centers().points[::step], self.face.face_normals[::step]
-        for centre, normal in zip(centres, normals, strict=True):
+        apart = np.flatnonzero(distance(self.window, centres) > CONTACT * max(self.size_mm))
+        picked = apart[:: 1 + len(apart) // SAMPLES]
+        for centre, normal in zip(centres[picked], normals[picked], strict=True):
             hits = self.window.ray_trace(centre, centre - 2 * LONGEST_MM * normal)[0]
             if len(hits):
                 found.append((float(np.linalg.norm(hits - centre, axis=1).min()), centre))
@@ -125,6 +126,8 @@ def _checked(outer: Path, window: Path, unit: str, *changed_ns: int) -> GelSurfa
     near = CONTACT * float((high - low).max())
     points, faces = solid.points, solid.regular_faces
     free = (points[:, 2] < points[:, 2].max() - 1e-6) & (distance(support, points) > near)
+    if not free.any():
+        raise ValueError(f"window = {window.name!r} leaves no free face of outer = {outer.name!r}")
     side = pv.PolyData.from_regular_faces(points, faces[free[faces].any(axis=1)])
     found = GelSurfaces(solid, support, side)
     end = solid.ray_trace([0.0, 0.0, -1.0], [0.0, 0.0, 2 * found.top_mm])[0][:, 2].max(initial=0.0)

@@ -21,8 +21,6 @@ _INSIDE = -1e-7
 """Barycentric coordinates from here up count as inside: edges belong to both triangles; Newton leaves about 1e-9."""
 _CHORD_STEPS = 8
 _NEWTON_STEPS = 20
-_BENT = 0.02
-"""Slack over height from which on the constant Jacobian may not converge; below it gains a digit or more in a step."""
 _LONGEST_STEP = 0.5
 _STARTS = np.array([(i, j, 3 - i - j) for i in range(4) for j in range(4 - i)]) / 3
 
@@ -123,11 +121,12 @@ class Layer:
         """Points of the triangles that project to the queries: their weights, and which were found inside.
 
         The image triangle's constant Jacobian serves where the bending of its image is small against its width. What
-        is left are triangles seen nearly edge-on: there Newton's method starts from each of ten places.
+        is left are triangles seen nearly edge-on, or where a round window's parts join and the image has a kink: there
+        Newton's method starts from each of ten places.
         """
         solid, corners = self.positions[self.triangles[triangle]], self._corners[triangle]
         weights, solved = self._descend(queries, solid, weights, _CHORD_STEPS, corners[:, 1:] - corners[:, :1])
-        left = np.flatnonzero(~solved & (self._reach[triangle].max(1) > _BENT))
+        left = np.flatnonzero(~solved)
         for start in _STARTS if len(left) else ():
             trial, converged = self._descend(queries[left], solid[left], np.tile(start, (len(left), 1)), _NEWTON_STEPS)
             good = converged & (trial >= _INSIDE).all(1)
