@@ -216,8 +216,8 @@ def path_of(scene: Scene, folder: Path | None = None, resolution_mm: float = 0.0
     aside = max(float(np.hypot(*np.add(motion.position_mm, pose.shear_mm))) for pose in poses)
     face = face_of(gel, folder or Path())
     frame = None if isinstance(face, PadFace) else PressFrame.of(motion, face)
-    deepest = max(pose.depth_mm for pose in poses) + gel.face_mm(*motion.position_mm)
-    deepest -= frame.start_mm if frame else 0.0
+    lowest = -frame.start_mm if frame else gel.face_mm(*motion.position_mm)
+    deepest = max(pose.depth_mm for pose in poses) + lowest
     height = BULGE * max(deepest, 0.0) + SLACK_MM
     touchable = Touchable(float(np.hypot(*gel.size_mm[:2])) / 2 + aside, height, max(motion.depth_mm, 0.0))
     body = rigid_body(scene.contact.indenter, folder, resolution_mm, touchable)

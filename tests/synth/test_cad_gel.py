@@ -144,9 +144,9 @@ def test_a_capsule_agrees_with_its_files(folder: Path, motion: dict[str, Any]) -
 
 def test_a_gel_that_is_hollow_itself_is_bonded_where_it_touches_the_window(tmp_path: Path) -> None:
     """The facets of both files lie beside each other."""
-    write(tmp_path, "outer.stl", CapsuleFace(5.0, 2.0, 2.0).triangles(0.5))
-    write(tmp_path, "window.stl", capsule_body(3.0, 4.0, 2.0, 0.4))
-    given = from_files(capsule(), tmp_path)
+    write(tmp_path, "outer.ply", CapsuleFace(5.0, 2.0, 2.0).triangles(0.5))
+    write(tmp_path, "window.obj", capsule_body(3.0, 4.0, 2.0, 0.4))
+    given = from_files(capsule(), tmp_path, outer="outer.ply", window="window.obj")
     mesh = MeshRule.of(given).resolution(given, tmp_path, [tmp_path]).mesh
     bare = mesh.touchable[~mesh.on_face[mesh.touchable].all(axis=1)]
     np.testing.assert_allclose(mesh.points[bare][:, :, 2], 7.0, atol=1e-9)
