@@ -9,16 +9,14 @@ import hashlib
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
 
 from synth.errors import InputError
-from synth.mesh.capsule import CapsuleFace
 from synth.mesh.dome import domed
-from synth.mesh.face import face_of
+from synth.mesh.face import Face, PadFace, RoundFace, face_of
 from synth.mesh.pad import PadMesh
 from synth.mesh.tetrahedralise import ENVELOPE, tetrahedralise, tetrahedralise_box
 from synth.mesh.tetwild_sizing import GRADING, even
@@ -32,7 +30,7 @@ CHORDS = 0.03
 
 
 def default_edge_length(gel: Gel) -> float:
-    """A fifth of the gel's thickness, at most 1 mm; of a capsule, whose one mesh serves all draws, four fifths of it
+    """A fifth of the gel's thickness, at most 1 mm; of a round gel, whose one mesh serves all draws, four fifths of it
     and at most a sixth of the radius.
     """
     if gel.is_round:
@@ -51,6 +49,8 @@ def mesh_key(gel: Gel, numerics: Numerics) -> str:
     }
     if gel.is_round:
         recipe["thickness_mm"] = gel.thickness_mm
+    if gel.digest:
+        recipe["files"] = gel.digest
     return hashlib.sha256(json.dumps(recipe, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -59,13 +59,16 @@ def user_cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gelflow-synth" / "meshes"
 
 
-def pad_mesh(gel: Gel, numerics: Numerics, folders: Sequence[Path] | None = None) -> PadMesh:
+def pad_mesh(
+    gel: Gel, numerics: Numerics, folders: Sequence[Path] | None = None, scene_folder: Path | None = None
+) -> PadMesh:
     """The mesh of a pad, from the first folder that holds it, else made; afterwards every folder holds it.
 
     Args:
         gel: the pad.
         numerics: its edge length.
         folders: searched in order; default the user's cache.
+        scene_folder: that the gel's own files are relative to.
 
     Raises:
         InputError: the pad has layers, whose interfaces fTetWild does not keep as planes; a dome turns a tetrahedron
@@ -75,38 +78,37 @@ def pad_mesh(gel: Gel, numerics: Numerics, folders: Sequence[Path] | None = None
         raise InputError(
             "sensor.gel.layers: a mesh of even edge length cannot follow layers; leave out numerics.edge_length_mm"
         )
-    key = mesh_key(gel, numerics)
+    key, face = mesh_key(gel, numerics), face_of(gel, scene_folder or Path())
     paths = [folder / f"{key}.npz" for folder in (folders if folders is not None else [user_cache()])]
-    mesh = next((found for path in paths if (found := _read(path, gel)) is not None), None)
+    mesh = next((found for path in paths if (found := _read(path, gel, face)) is not None), None)
     if mesh is None:
-        mesh = _made(gel, numerics.edge_length_mm or default_edge_length(gel))
+        mesh = _made(gel, face, numerics.edge_length_mm or default_edge_length(gel))
     for path in paths:
-        if _read(path, gel) is None:
+        if _read(path, gel, face) is None:
             _write(path, mesh)
     return domed(mesh, gel.dome_radius_mm)
 
 
-def _made(gel: Gel, edge_mm: float) -> PadMesh:
+def _made(gel: Gel, face: PadFace | RoundFace, edge_mm: float) -> PadMesh:
     """A new mesh; of a dome that of its box."""
-    face = face_of(gel)
-    if not isinstance(face, CapsuleFace):
+    if isinstance(face, PadFace):
         return tetrahedralise_box(gel.size_mm, edge_mm)
     sides = (face.project_end, face.project_window, face.project)
     # Edges of that length on the face, whose chords are off it by h² / 8 R, must fit the envelope.
-    off = ROOM * edge_mm**2 / (8 * face.radius_mm)
+    off = ROOM * edge_mm**2 / (4 * min(gel.size_mm[:2]))
     surface, triangles = face.triangles(SURFACE * edge_mm)
     envelope = max(ENVELOPE, off / float(np.linalg.norm(np.ptp(surface, axis=0))))
-    background = even(gel.size_mm, edge_mm)
+    x, y = 2 * np.abs(surface[:, :2]).max(axis=0)
+    background = even((x, y, surface[:, 2].max()), edge_mm)
     points, tets = tetrahedralise(surface, triangles, sides, background, face.volume_mm3, CHORDS, envelope=envelope)
     return PadMesh(points, tets, gel.size_mm, face=face)
 
 
-def _read(path: Path, gel: Gel) -> PadMesh | None:
+def _read(path: Path, gel: Gel, face: Face) -> PadMesh | None:
     """A cached mesh, or None where there is none or the file is damaged (it is then made again)."""
     try:
         with np.load(path) as data:
-            mesh = PadMesh(data["points"], data["tets"], gel.size_mm)
-            return replace(mesh, face=face_of(gel)) if gel.is_round else mesh
+            return PadMesh(data["points"], data["tets"], gel.size_mm, face=face)
     except (OSError, EOFError, ValueError, KeyError, BadZipFile):
         return None
 

@@ -5,11 +5,13 @@ round gels within rounding.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 
 from synth.arrays import BoolArray, FloatArray, Points
+from synth.mesh.cad import CadFace
 from synth.mesh.capsule import CapsuleFace
 from synth.scene import Gel
 from synth.scene.gel import dome_height
@@ -56,10 +58,15 @@ class PadFace:
 FLAT_FACE = PadFace()
 
 
-def face_of(gel: Gel) -> Face:
-    """The shape of a scene's gel."""
+RoundFace = CapsuleFace | CadFace
+
+
+def face_of(gel: Gel, folder: Path = Path()) -> PadFace | RoundFace:
+    """The shape of a scene's gel, whose files are relative to `folder`."""
     if gel.radius_mm is not None and gel.thickness_mm is not None:
         return CapsuleFace(gel.radius_mm, gel.thickness_mm, gel.length_mm, gel.cut_end == "held")
+    if gel.outer is not None and gel.window is not None:
+        return CadFace(folder / gel.outer, folder / gel.window, gel.unit or "mm", gel.cut_end == "held")
     return PadFace(gel.dome_radius_mm)
 
 

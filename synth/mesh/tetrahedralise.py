@@ -23,6 +23,8 @@ ENVELOPE = 1e-3
 """fTetWild's epsilon for flat faces, relative to the bounding box's diagonal."""
 ON_SIDE_MM = 1e-9
 """Distance from a side at which a vertex lies on it."""
+ROUNDS = 50
+"""Vertices of two sides are moved onto one after the other so often at most."""
 WORST_SHAPE = 0.02
 """Smallest accepted ratio of inscribed to circumscribed radius, times 3 (1 for a regular tetrahedron)."""
 
@@ -55,7 +57,7 @@ def tetrahedralise(
     faces: Triangles,
     sides: Sequence[Projection],
     background: Background,
-    volume_mm3: float,
+    volume_mm3: float | None,
     share: float,
     attempts: int = 3,
     envelope: float = ENVELOPE,
@@ -67,7 +69,7 @@ def tetrahedralise(
         faces: (m, 3) its triangles.
         sides: the parts of the shape, each as the projection onto it; vertices of two are moved by both in this order.
         background: target edge lengths.
-        volume_mm3: of the shape.
+        volume_mm3: of the shape; None: not known.
         share: of the volume by which the mesh may differ from it.
         attempts: the mesher is random; a mesh below WORST_SHAPE is made again so often.
         envelope: fTetWild's epsilon, relative to the bounding box's diagonal.
@@ -163,9 +165,12 @@ def _repair(points: Points, tets: Tets, sides: Sequence[Projection], tolerance: 
     # The side of a boundary face is the one to which all three of its corners are near.
     off = _distances(points, faces, sides)
     nearest = np.where(off.min(axis=0) <= tolerance, off.argmin(axis=0), -1)
-    for number, side in enumerate(sides):
-        nodes = np.unique(faces[nearest == number])
-        points[nodes] = side(points[nodes])
+    parts = [(side, np.unique(faces[nearest == number])) for number, side in enumerate(sides)]
+    for _ in range(ROUNDS):  # the second and later ones are for sides that are not at right angles
+        for side, nodes in parts:
+            points[nodes] = side(points[nodes])
+        if all(np.abs(points[nodes] - side(points[nodes])).max(initial=0.0) < ON_SIDE_MM for side, nodes in parts):
+            break
     flipped = signed_volumes(points, tets) < 0
     tets[flipped] = tets[flipped][:, [0, 2, 1, 3]]
     return points, tets
@@ -177,12 +182,12 @@ def _distances(points: Points, faces: Triangles, sides: Sequence[Projection]) ->
     return np.array([np.linalg.norm(corners - side(corners), axis=1).reshape(-1, 3).max(axis=1) for side in sides])
 
 
-def _fault(points: Points, tets: Tets, sides: Sequence[Projection], volume_mm3: float, share: float) -> str:
+def _fault(points: Points, tets: Tets, sides: Sequence[Projection], volume_mm3: float | None, share: float) -> str:
     """What is wrong with a mesh, or an empty string."""
     volumes = signed_volumes(points, tets)
     if volumes.min() <= 0:
         return f"a tetrahedron has volume {volumes.min():.3g} mm^3"
-    if abs(volumes.sum() / volume_mm3 - 1) > share:  # sums of some 1e4 volumes round to about 1e-13
+    if volume_mm3 and abs(volumes.sum() / volume_mm3 - 1) > share:  # sums of some 1e4 volumes round to about 1e-13
         return f"the mesh fills {volumes.sum():.9g} of {volume_mm3:.9g} mm^3"
     off = float(_distances(points, boundary_faces(tets), sides).min(axis=0).max())
     if off > ON_SIDE_MM:

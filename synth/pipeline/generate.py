@@ -225,7 +225,7 @@ def _store_mesh(context: JobContext, writer: DatasetWriter, gel: Gel) -> None:
     """Have the dataset hold a pad's fTetWild mesh: without, every trajectory would make another one."""
     numerics = context.plan.template.numerics
     with writer.making_meshes() as folder:
-        pad_mesh(gel, numerics, (folder, context.cache))
+        pad_mesh(gel, numerics, (folder, context.cache), context.plan.template.folder)
         stored = folder / f"{mesh_key(gel, numerics)}.npz"
         if not stored.is_file():
             raise InputError(f"{stored}: the mesh cannot be written; put this right and give the same command again")

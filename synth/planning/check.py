@@ -1,6 +1,8 @@
 """What fits the schema of a scene and still cannot be built."""
 
 from synth.errors import InputError
+from synth.mesh import default_edge_length, face_of
+from synth.mesh.cad import CadFace
 from synth.render.camera_rays import pinhole
 from synth.render.lights import check_view
 from synth.render.pattern import check_pattern
@@ -19,8 +21,9 @@ def check_buildable(template: Template, variant: Variant) -> None:
 
     Raises:
         InputError: at a corner of the distributions, an indenter whose parts do not fit or whose file is no surface,
-            a light in the camera's view, a lens or a kind of light that this variant or coating cannot have, a pattern
-            that no pixel could show or whose file is no picture, or more pairs than a trajectory has.
+            a gel from files that is too thin or is pressed beside its face, a light in the camera's view, a lens or a
+            kind of light that this variant or coating cannot have, a pattern that no pixel could show or whose file is
+            no picture, or more pairs than a trajectory has.
     """
     try:
         for sensor in dict.fromkeys(view for corner in template.corners for view in corner.sensor.views.values()):
@@ -36,6 +39,9 @@ def check_buildable(template: Template, variant: Variant) -> None:
             else:
                 rigid_body(indenter)
         for corner in template.corners:
+            gel = corner.sensor.gel
+            if isinstance(face := face_of(gel, template.folder), CadFace):
+                face.check(corner.motion, corner.numerics.edge_length_mm or default_edge_length(gel))
             is_separated(corner.render, corner.sensor.coating, variant)
             check_pairs(corner)
     except InputError as error:

@@ -152,6 +152,9 @@ def _plate(gel: Gel) -> tuple[float, float, float]:
     """Edge lengths of a box; of a round gel those of a flat layer as large and as thick."""
     if not gel.is_round:
         return gel.size_mm
+    if gel.shape == "file":
+        x, y, z = gel.size_mm
+        return x + 2 * (1 + x / y) * (z - gel.depth_mm), y, gel.depth_mm
     middle = (gel.size_mm[0] - gel.depth_mm) / 2
     return 2 * np.pi * middle, middle + gel.length_mm, gel.depth_mm
 

@@ -15,6 +15,12 @@ STEEPEST_DEG = 60.0
 """Largest slope of a dome's face, at its corners."""
 THICKEST = 0.9
 """Largest share of a capsule's radius that its layer of gel takes."""
+_NEEDED = {
+    "box": ("size_mm",),
+    "dome": ("size_mm",),
+    "capsule": ("radius_mm", "thickness_mm"),
+    "file": ("outer", "window", "unit"),
+}
 
 
 Number = TypeVar("Number", float, FloatArray)
@@ -40,7 +46,7 @@ class Gel(Part):
 
     A "box" is bonded on its +z side; so is a "dome", whose contact face is part of a sphere. A "capsule" is a layer
     around a window of the same shape: a hemisphere about (0, 0, radius_mm), then a cylinder up to z = radius_mm +
-    length_mm, where it is cut.
+    length_mm, where it is cut. A "file" gel is what lies inside `outer` and outside `window`, to which it is bonded.
     """
 
     size_mm: tuple[
@@ -48,19 +54,28 @@ class Gel(Part):
         Annotated[float, Field(ge=1, le=200)],
         Annotated[float, Field(ge=0.2, le=50)],
     ] = (0.0, 0.0, 0.0)
-    """The third is the thickness, of a domed pad that at the apex. Left out for capsules: it follows from the shape."""
-    shape: Literal["box", "dome", "capsule"] = "box"
+    """The third is the thickness, of a domed pad that at the apex. Follows from the shape of round gels."""
+    shape: Literal["box", "dome", "capsule", "file"] = "box"
     dome_radius_mm: Positive | None = None
     """Radius of a dome's contact face, which touches z = 0 at its apex (0, 0) and curves away from the indenter; None:
     flat. Patterns are laid on it along z: their places are x and y."""
     radius_mm: Annotated[float, Field(ge=1, le=100)] | None = None
     """Of a capsule's contact face."""
     thickness_mm: Annotated[float, Field(ge=0.2, le=50)] | None = None
-    """Of a capsule's layer of gel."""
+    """Of a capsule's layer of gel. Of a gel from files that on the axis, which follows from them."""
     length_mm: Annotated[float, Field(ge=0, le=200)] = 0.0
     """Of a capsule's cylinder; 0: a hemisphere."""
     cut_end: Literal["free", "held"] = "free"
-    """Whether the ring on which a capsule ends is held, as by a rigid frame."""
+    """Whether the plane in which a round gel ends is held, as by a rigid frame."""
+    outer: str | None = None
+    """File of a closed surface, whose bounding box is moved to z = 0 and to the middle in x and y; +z points from the
+    face to the camera, y is mirrored. All of it is coated but what touches the window or lies in the end's plane."""
+    window: str | None = None
+    """File of the closed surface that the gel is bonded to, in the same axes; optics are those of [sensor.window]."""
+    unit: Literal["mm", "cm", "m", "inch"] | None = None
+    """Of the files."""
+    digest: str = ""
+    """Of the files' content; filled in when a scene is loaded."""
     youngs_modulus_kpa: Annotated[float, Field(ge=0.1, le=1e6)]
     poisson_ratio: Annotated[float, Field(ge=0, le=0.5)] = 0.4999
     """0.5 is exactly incompressible; below 0.3 no pressure field is needed."""
@@ -79,8 +94,8 @@ class Gel(Part):
 
     @property
     def is_round(self) -> bool:
-        """Whether the gel surrounds its window; a press then has its place in polar coordinates."""
-        return self.shape == "capsule"
+        """Whether a press may have its place in polar coordinates; the mesh is then always one of fTetWild's."""
+        return self.shape in ("capsule", "file")
 
     @property
     def is_flat(self) -> bool:
@@ -93,24 +108,26 @@ class Gel(Part):
         return self.thickness_mm or self.size_mm[2]
 
     @model_validator(mode="after")
-    def _capsule(self) -> "Gel":
-        own = {"radius_mm": self.radius_mm, "thickness_mm": self.thickness_mm}
-        if self.shape != "capsule":
-            if "size_mm" not in self.model_fields_set:
-                raise ValueError(f'shape = "{self.shape}" needs size_mm')
-            given = [name for name, value in own.items() if value is not None]
-            if given:
-                raise ValueError(f'{given[0]} belongs to shape = "capsule", the shape is "{self.shape}"')
+    def _shaped(self) -> "Gel":
+        needed = _NEEDED[self.shape]
+        if any(name not in self.model_fields_set or getattr(self, name) is None for name in needed):
+            raise ValueError(f'shape = "{self.shape}" needs {" and ".join(needed)}')
+        for shape, names in _NEEDED.items():
+            follows = ("size_mm", "thickness_mm") if self.is_round else ("size_mm",)
+            for name in names:
+                if name not in (*needed, *follows) and getattr(self, name) is not None:
+                    raise ValueError(f'{name} belongs to shape = "{shape}", the shape is "{self.shape}"')
+        if self.is_round and self.layers:
+            raise ValueError(f'layers are for shape = "box" and "dome": a {self.shape} is of one material')
+        if self.shape == "file" and "size_mm" not in self.model_fields_set:
+            raise ValueError("outer and window must each name one file, which load_scene measures")
+        if self.shape != "capsule" or self.radius_mm is None or self.thickness_mm is None:
             return self
-        if self.radius_mm is None or self.thickness_mm is None:
-            raise ValueError('shape = "capsule" needs radius_mm and thickness_mm')
         if self.thickness_mm > THICKEST * self.radius_mm:
             raise ValueError(
                 f"thickness_mm = {self.thickness_mm} leaves no room for a window in radius_mm = {self.radius_mm}: at "
                 f"most {THICKEST * self.radius_mm:.4g}"
             )
-        if self.layers:
-            raise ValueError('layers are for shape = "box" and "dome": a capsule is of one material')
         bounds = (2 * self.radius_mm, 2 * self.radius_mm, self.radius_mm + self.length_mm)
         if "size_mm" in self.model_fields_set and self.size_mm != bounds:
             raise ValueError("size_mm of a capsule follows from radius_mm and length_mm: leave it out")

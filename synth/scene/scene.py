@@ -104,7 +104,10 @@ class Scene(Part):
                     f'motion.polar_deg, height_mm and azimuth_deg are for round gels; a "{gel.shape}" has position_mm'
                 )
             return
-        if motion.position_mm != (0.0, 0.0):
+        if gel.shape == "file":
+            if polar is None and height is None and motion.azimuth_deg != 0:
+                raise ValueError("motion.azimuth_deg goes with polar_deg or height_mm; without, the press is along z")
+        elif motion.position_mm != (0.0, 0.0):
             raise ValueError("motion.position_mm is for flat gels and domes; a round gel has polar_deg and azimuth_deg")
         if polar is not None and height is not None:
             raise ValueError("motion.polar_deg and height_mm both say where the press is: give one of them")

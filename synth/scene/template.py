@@ -13,7 +13,7 @@ import json
 import os
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from glob import glob
 from importlib.resources import files
@@ -22,6 +22,7 @@ from typing import Any
 
 from synth.errors import InputError
 from synth.scene import Bitmap, MeshIndenter, Numerics, Outputs, Sampling, Scene
+from synth.scene.gel_file import measured
 from synth.scene.validation import DISTRIBUTIONS, validated
 
 _INSTALLED = Path(str(files("synth"))).resolve() / "scenes"
@@ -29,6 +30,8 @@ SCENES = _INSTALLED if _INSTALLED.is_dir() else _INSTALLED.parents[1] / "scenes"
 """The shipped scene files: in the package where it is installed, beside it in a checkout."""
 FIXED = ("name", "description", "references", "numerics", "outputs", "sampling")
 """Parts that all samples of a dataset share."""
+FILES = ("file", "outer", "window")
+"""Keys under which names of files stand."""
 
 Chooser = Callable[[str, list[Any]], Any]
 """Kind and arguments of a distribution -> a value; of a choice, the option, which may hold distributions again."""
@@ -144,6 +147,10 @@ def load_scene(name_or_path: str | Path, set: Sequence[str] = ()) -> Template:
 def checked_template(content: dict[str, Any], source: Path, changed: tuple[str, ...] = ()) -> Template:
     """A template whose distributions, corners and mesh files have been checked; InputError says what is wrong."""
     template = Template(content, source, changed)
+    try:
+        template = replace(template, content=measured(content, source.parent))
+    except ValueError as error:
+        raise InputError(f"{template.label}: sensor.gel: {error}") from None
     for kind, arguments, where in template.distributions():
         problem = _distribution_problem(kind, arguments, where)
         if problem:
@@ -178,10 +185,12 @@ def replaced(value: Any, choose: Chooser) -> Any:
 def with_files(value: Any, change: Callable[[str], Any], key: str = "") -> Any:
     """A part of a template, the one under `key`, with every name of a file in it replaced by what `change` returns."""
     if isinstance(value, dict):
-        return {name: with_files(inner, change, key if key == "file" else name) for name, inner in value.items()}
+        return {
+            name: with_files(inner, change, key if name in DISTRIBUTIONS else name) for name, inner in value.items()
+        }
     if isinstance(value, list):
         return [with_files(inner, change, key) for inner in value]
-    return change(value) if key == "file" and isinstance(value, str) else value
+    return change(value) if key in FILES and isinstance(value, str) else value
 
 
 def _find(name_or_path: str | Path) -> Path:

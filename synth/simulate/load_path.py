@@ -10,7 +10,8 @@ starts where it first touches the sphere of which the face is a part. Sideways m
 does.
 
 On a round gel all of this happens in the frame of the place (`PressFrame`): depth counts along the inward normal from
-the tangent plane, beyond which a convex gel does not reach, and shear lies in that plane.
+the tangent plane, and shear lies in that plane. A convex gel does not reach beyond it; where one from files does, as
+where it is pressed along z beside its tip, the path starts level with its farthest point.
 """
 
 from dataclasses import dataclass
@@ -20,8 +21,8 @@ from pathlib import Path
 import numpy as np
 
 from synth.arrays import FloatArray
-from synth.mesh.capsule import CapsuleFace
-from synth.mesh.face import face_height, face_of
+from synth.mesh.cad import CadFace
+from synth.mesh.face import PadFace, RoundFace, face_height, face_of
 from synth.scene import Motion, Scene
 from synth.scene import Pose as PoseOfScene
 from synth.simulate.distance import KINDS
@@ -54,14 +55,18 @@ class PressFrame:
     Attributes:
         origin: (3,) mm, the place on the face.
         axes: (3, 3) as columns: along increasing polar angle, along increasing azimuth, and along the inward normal.
+        start_mm: the gel begins so far along the third, at most 0.
     """
 
     origin: FloatArray
     axes: FloatArray
+    start_mm: float = 0.0
 
     @classmethod
-    def of(cls, motion: Motion, face: CapsuleFace) -> "PressFrame":
+    def of(cls, motion: Motion, face: RoundFace) -> "PressFrame":
         """The frame of a motion's place on a face."""
+        if isinstance(face, CadFace):
+            return cls(*face.frame(motion))
         origin, inward = face.place(motion.polar_deg, motion.height_mm, motion.azimuth_deg)
         azimuth = np.radians(motion.azimuth_deg)
         around = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
@@ -101,7 +106,7 @@ class LoadPath:
         """
         radius = self.dome_radius_mm
         if radius is None:
-            return 0.0
+            return 0.0 if self.frame is None else self.frame.start_mm
         low, high = 0.0 - self.face_mm, max(self.motion.depth_mm, 0.0)
         if self.body.kind == KINDS["mesh"]:
             return low
@@ -209,10 +214,11 @@ def path_of(scene: Scene, folder: Path | None = None, resolution_mm: float = 0.0
     motion, gel = scene.motion, scene.sensor.gel
     poses: list[Motion | PoseOfScene] = [motion, *motion.then]
     aside = max(float(np.hypot(*np.add(motion.position_mm, pose.shear_mm))) for pose in poses)
-    deepest = max(pose.depth_mm for pose in poses) + gel.face_mm(*motion.position_mm)
+    face = face_of(gel, folder or Path())
+    frame = None if isinstance(face, PadFace) else PressFrame.of(motion, face)
+    lowest = -frame.start_mm if frame else gel.face_mm(*motion.position_mm)
+    deepest = max(pose.depth_mm for pose in poses) + lowest
     height = BULGE * max(deepest, 0.0) + SLACK_MM
     touchable = Touchable(float(np.hypot(*gel.size_mm[:2])) / 2 + aside, height, max(motion.depth_mm, 0.0))
-    face = face_of(gel)
-    frame = PressFrame.of(motion, face) if isinstance(face, CapsuleFace) else None
     body = rigid_body(scene.contact.indenter, folder, resolution_mm, touchable)
     return LoadPath(motion, body, gel.dome_radius_mm, frame)

@@ -54,7 +54,7 @@ class MeshRule:
                 mesh, spacing = shared_mesh(gel, numerics), spacing_mm(gel, numerics)
                 return Resolution(mesh, found.across, numerics.cells[2], spacing, found.error_px)
             case "tetwild":
-                mesh = pad_mesh(gel, numerics, mesh_folders)
+                mesh = pad_mesh(gel, numerics, mesh_folders, folder)
                 return Resolution(mesh, 0, 0, numerics.edge_length_mm or default_edge_length(gel), float("nan"))
 
     def press(self, scene: Scene, folder: Path | None = None, mesh_folders: Sequence[Path] | None = None) -> Press:

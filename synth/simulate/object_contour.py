@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from synth.arrays import BoolArray, FloatArray, Points
-from synth.simulate.object_surface import Triangles
+from synth.scene.surface_file import Triangles
 
 FLAT = 0.05
 """Directions in which the planes' normals vary less, as a share of the largest eigenvalue, do not place a vertex."""

@@ -21,8 +21,8 @@ import numpy as np
 import warp as wp
 
 from synth.arrays import BoolArray, FloatArray, Points
+from synth.scene.surface_file import Triangles
 from synth.simulate.object_contour import sharp_contour
-from synth.simulate.object_surface import Triangles
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 

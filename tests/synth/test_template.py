@@ -135,7 +135,7 @@ WRONG_KEYS_AND_TYPES = [
     ("sensor.gel.size_mm=[8, 6, 2, 1]", " = [8, 6, 2, 1]: must have at most 3 entries, not 4"),
     ("sensor.gel=3", " = 3: must be a table"),
     ("sensor.lights=[]", " = []: must have at least 1 entry, not 0"),
-    ("sensor.gel.shape=bowl", " = 'bowl': must be 'box', 'dome' or 'capsule'"),
+    ("sensor.gel.shape=bowl", " = 'bowl': must be 'box', 'dome', 'capsule' or 'file'"),
     ("sensor.gel={ youngs_modulus_kpa = 100.0 }", 'sensor.gel: shape = "box" needs size_mm'),
     ("sensor.gel.radius_mm=9", 'sensor.gel: radius_mm belongs to shape = "capsule", the shape is "box"'),
     ("name=two words", " = 'two words': "),

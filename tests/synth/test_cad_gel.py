@@ -1,0 +1,290 @@
+"""Gels from CAD files: against boxes, domes and capsules of the same shape, bad files, and a verified dataset."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from batches import simulate_scenes
+from capsules import capsule, capsule_mesh
+from pads import brick
+from pads import scene as pad_scene
+from render_scenes import needs_llvm
+
+from synth.arrays import FloatArray, Points, Triangles
+from synth.errors import InputError
+from synth.flow.exact import exact_flow
+from synth.mesh import check_mesh, domed
+from synth.mesh.capsule import CapsuleFace
+from synth.mesh.pad import boundary_faces
+from synth.optics import Optics
+from synth.pipeline.generate import generate
+from synth.planning import check_buildable, job_variant
+from synth.scene import Scene
+from synth.scene.gel_file import measured
+from synth.scene.template import load_scene
+from synth.simulate import Trajectory, simulate
+from synth.simulate.element import p2p1
+from synth.simulate.load_path import path_of
+from synth.simulate.mesh_rule import MeshRule
+from synth.simulate.space import function_space
+from synth.surface import GelSurface
+from synth.verify.dataset import verify_dataset
+
+Body = tuple[Points, Triangles]
+SIZE = (10.0, 8.0, 4.0)
+FILE = {"shape": "file", "outer": "outer.stl", "window": "window.stl", "unit": "mm", "youngs_modulus_kpa": 200.0}
+TARGET_PX = 0.25
+CAMERA = {"width": 96, "height": 72, "fx": 280.0, "fy": 280.0, "cx": 48.0, "cy": 36.0, "position_mm": (0, 0, 24)}
+MOTION = {"depth_mm": 0.6, "shear_mm": (0.2, 0.0), "steps": 2}
+
+
+def block(size: tuple[float, float, float], low: float, dome_mm: float | None = None, cells: int = 1) -> Body:
+    """A closed box from z = low on, its lower face bulged."""
+    mesh = domed(brick(size, (cells, cells, 1)), dome_mm)
+    return np.add(mesh.points, (0.0, 0.0, low)), boundary_faces(mesh.tets)
+
+
+def capsule_body(radius: float, length: float, low: float, edge: float = 0.5) -> Body:
+    """A closed capsule with its tip at z = low."""
+    import pyvista as pv
+
+    face = CapsuleFace(radius, radius / 2, length)
+    points, triangles = face.triangles(edge)
+    shell = pv.PolyData.from_regular_faces(points, triangles[face.holds(points)[triangles].all(axis=1)])
+    body = shell.clean().fill_holes(1e3)
+    return np.add(np.asarray(body.points, float), (0.0, 0.0, low)), body.regular_faces
+
+
+def write(folder: Path, name: str, *bodies: Body, scale: float = 1.0, shift: float = 0.0) -> None:
+    """Bodies as a file of CAD has them: right-handed, anywhere."""
+    import pyvista as pv
+
+    parts = [pv.PolyData.from_regular_faces(points * [1, -1, 1], faces[:, ::-1]) for points, faces in bodies]
+    pv.merge(parts).extract_surface(algorithm=None).translate([shift, 0.0, -shift]).scale(scale).save(folder / name)
+
+
+def from_files(scene: Scene, folder: Path, **gel: Any) -> Scene:
+    """A scene with the gel of the folder's files instead of its own."""
+    content = scene.model_dump(mode="json")
+    content["sensor"]["gel"] = {**FILE, **gel}
+    return Scene.model_validate_json(json.dumps(measured(content, folder)))
+
+
+def pressed(scene: Scene, folder: Path) -> tuple[Trajectory, FloatArray]:
+    """Its trajectory, and the flow (h, w, 2) from the gel at rest to its last state."""
+    mesh = MeshRule.of(scene).resolution(scene, folder, [folder]).mesh
+    check_mesh(mesh)
+    found = simulate(scene, mesh, folder)
+    assert found.status == "complete", found.reason
+    space = function_space(mesh, p2p1())
+    surface = GelSurface(space.surface, 3)
+    states = (surface.material, surface.positions(found.states[-1].displacement[space.surface_nodes]))
+    return found, exact_flow(surface, *states, Optics.of(scene.sensor), 96, 72).forward
+
+
+@pytest.mark.parametrize("dome_mm", [None, 25.0])
+def test_a_box_and_a_dome_agree_with_their_files(tmp_path: Path, dome_mm: float | None) -> None:
+    """The box's window reaches into it and is wider; the dome's lies on it, and the press is beside the apex."""
+    deep = 1.0 if dome_mm is None else 0.0
+    write(tmp_path, "outer.stl", block((10.0, 8.0, 4.0 + deep), 0.0, dome_mm, 1 if dome_mm is None else 20), shift=30.0)
+    write(tmp_path, "window.stl", block((12.0, 11.0, 2.0), 4.0), shift=30.0)
+    place = (0.0, 0.0) if dome_mm is None else (1.5, -1.0)
+    own = pad_scene(SIZE, indenter={"shape": "sphere", "radius_mm": 2.0}, friction=0.5).model_dump(mode="json")
+    own["motion"] = {**MOTION, "position_mm": place}
+    own["numerics"], own["sensor"]["camera"] = {"target_error_px": TARGET_PX}, CAMERA
+    own["sensor"]["gel"] |= {"shape": "dome", "dome_radius_mm": dome_mm} if dome_mm else {}
+    built_in = Scene.model_validate_json(json.dumps(own))
+    own["numerics"] = {"edge_length_mm": 0.8}
+    given = from_files(Scene.model_validate_json(json.dumps(own)), tmp_path)
+    assert given.sensor.gel.size_mm == (10.0, 8.0, 4.0 + deep)
+    assert given.sensor.gel.thickness_mm == 4.0
+    (expected, truth), (found, flow) = pressed(built_in, tmp_path), pressed(given, tmp_path)
+    force, other = (np.array(trajectory.states[-1].force_n) for trajectory in (expected, found))
+    # Boxes of elements that suit this target are up to 4 % too stiff here, against finer ones.
+    np.testing.assert_allclose(other, force, atol=0.05 * force[2])
+    off = np.linalg.norm(flow - truth, axis=-1)
+    assert np.isfinite(off).all()
+    assert np.sqrt(np.mean(off**2)) < TARGET_PX
+    assert np.nanmax(np.linalg.norm(truth, axis=-1)) > 2
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A capsule's two files."""
+    found = tmp_path_factory.mktemp("capsule")
+    write(found, "outer.stl", capsule_body(5.0, 2.0, 0.0))
+    write(found, "window.stl", capsule_body(3.0, 3.0, 2.0))
+    return found
+
+
+@pytest.mark.parametrize("motion", [{}, {"polar_deg": 40.0, "azimuth_deg": 70.0}, {"height_mm": 5.5}])
+def test_a_capsule_agrees_with_its_files(folder: Path, motion: dict[str, Any]) -> None:
+    built_in = capsule(friction=0.5, motion={**MOTION, "depth_mm": 0.5, **motion})
+    given = from_files(built_in, folder)
+    mesh = MeshRule.of(given).resolution(given, folder, [folder]).mesh
+    assert mesh.volumes.sum() == pytest.approx(np.pi * (2 / 3 * (5**3 - 3**3) + 2 * (5**2 - 3**2)), rel=0.03)
+    space = function_space(mesh, p2p1())
+    np.testing.assert_allclose(space.points[space.faces[~space.coated]][:, :, 2], 7.0, atol=1e-9)  # only the cut end
+    frames = [path_of(scene, folder).frame for scene in (built_in, given)]
+    assert frames[0] is not None
+    assert frames[1] is not None
+    np.testing.assert_allclose(frames[1].origin, frames[0].origin, atol=0.02)
+    np.testing.assert_allclose(frames[1].axes.T @ frames[1].axes, np.eye(3), atol=1e-12)
+    assert np.linalg.det(frames[1].axes) == pytest.approx(1)
+    assert (frames[1].axes * frames[0].axes).sum(axis=0).min() > np.cos(np.radians(4))  # facets of some 6 degrees
+    forces = [
+        np.array(simulate(scene, own, folder).states[-1].force_n) @ frame.axes
+        for scene, own, frame in zip((built_in, given), (capsule_mesh(built_in.sensor.gel), mesh), frames, strict=True)
+    ]
+    # Two random meshes with edges of 1.5 mm, under a contact of 1 mm radius: up to 6.5 % apart.
+    np.testing.assert_allclose(forces[1], forces[0], atol=0.1 * forces[0][2])
+
+
+def test_a_gel_that_is_hollow_itself_is_bonded_where_it_touches_the_window(tmp_path: Path) -> None:
+    """The facets of both files lie beside each other."""
+    write(tmp_path, "outer.ply", CapsuleFace(5.0, 2.0, 2.0).triangles(0.5))
+    write(tmp_path, "window.obj", capsule_body(3.0, 4.0, 2.0, 0.4))
+    given = from_files(capsule(), tmp_path, outer="outer.ply", window="window.obj")
+    mesh = MeshRule.of(given).resolution(given, tmp_path, [tmp_path]).mesh
+    bare = mesh.touchable[~mesh.on_face[mesh.touchable].all(axis=1)]
+    np.testing.assert_allclose(mesh.points[bare][:, :, 2], 7.0, atol=1e-9)
+    held = mesh.points[mesh.bonded] - [0.0, 0.0, 5.0]
+    inner = np.linalg.norm(held - np.column_stack([0 * held[:, :2], np.maximum(held[:, 2], 0)]), axis=1)
+    np.testing.assert_allclose(inner, 3.0, atol=0.03)  # chords of 0.4 to 0.5 mm lie 0.01 within
+
+
+def test_the_batched_solver_presses_it(folder: Path) -> None:
+    motion = {"depth_mm": 0.4, "shear_mm": (0.1, 0.0), "polar_deg": 50.0, "azimuth_deg": 200.0, "steps": 2}
+    posed = from_files(capsule(friction=0.5, motion=motion, numerics={"element": "p1p1"}), folder)
+    mesh = MeshRule.of(posed).resolution(posed, folder, [folder]).mesh
+    single = simulate(posed, mesh, folder).states[-1]
+    (batched,) = simulate_scenes([posed], mesh, folder)
+    assert batched.status == "complete", batched.reason
+    np.testing.assert_allclose(batched.states[-1].force_n, single.force_n, atol=2e-3 * np.linalg.norm(single.force_n))
+
+
+SCENE = """
+name = "cad"
+[sensor.window]
+shape = "capsule"
+radius_mm = 2.4
+center_z_mm = 5.0
+thickness_mm = 1.0
+[sensor.pattern]
+kind = "dots"
+spacing_mm = [1.5, 1.5]
+radius_mm = 0.4
+placing = "spherical"
+[[sensor.lights]]
+position_mm = [0.0, 1.5, 7.5]
+size_mm = [0.5, 0.5]
+color = [1.0, 1.0, 1.0]
+power = 150.0
+[sensor.camera]
+width = 48
+height = 48
+lens = "fisheye"
+distortion = [0.0, 0.0, 0.0, 0.0]
+fx = 15.0
+fy = 15.0
+cx = 24.0
+cy = 24.0
+position_mm = [0.0, 0.0, 6.5]
+[contact.indenter]
+shape = "sphere"
+radius_mm = 2.0
+[motion]
+depth_mm = { uniform = [0.3, 0.5] }
+polar_deg = { uniform = [0.0, 60.0] }
+azimuth_deg = { uniform = [-180.0, 180.0] }
+steps = 2
+[render]
+samples_per_pixel = 4
+[numerics]
+element = "p1p1"
+edge_length_mm = 1.5
+"""
+
+
+def scene_file(folder: Path, **gel: Any) -> Path:
+    """A scene with the folder's files; fields of its gel that are None are left out."""
+    fields = [f"{key} = {_toml(value)}\n" for key, value in {**FILE, **gel}.items() if value is not None]
+    path = folder / "cad.toml"
+    path.write_text(f"{SCENE}\n[sensor.gel]\n{''.join(fields)}")
+    return path
+
+
+def build(path: Path, *assignments: str) -> None:
+    template = load_scene(path, set=assignments)
+    check_buildable(template, job_variant(template, "auto"))
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{key} = {_toml(inner)}" for key, inner in value.items()) + " }"
+    return "[" + ", ".join(map(_toml, value)) + "]" if isinstance(value, list) else json.dumps(value)
+
+
+@needs_llvm
+def test_a_dataset_of_files_is_verified_without_them(folder: Path, tmp_path: Path) -> None:
+    files = [folder / name for name in ("outer.stl", "window.stl")]
+    for file in files:
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    out = tmp_path / "out"
+    assert generate(load_scene(scene_file(tmp_path)), 2, out).made == 2
+    for file in files:
+        (tmp_path / file.name).unlink()
+    report = verify_dataset(out)
+    assert report.ok, report
+
+
+BAD = [
+    ({"outer": "none.stl"}, "there is no file"),
+    ({"unit": None}, "needs outer and window and unit"),
+    ({"unit": "m"}, r"outer = 'outer.stl' is 1e\+04 mm long with unit = \"m\"; other units are mm, cm, inch"),
+    ({"outer": "metres.stl", "window": "metres.stl"}, "is 0.01 mm long"),
+    ({"outer": "open.stl"}, "outer = 'open.stl' has open edges"),
+    ({"outer": "two.stl"}, "outer = 'two.stl' consists of 2 pieces"),
+    ({"window": "beside.stl"}, "window = 'beside.stl' lies outside of outer = 'outer.stl'"),
+    ({"window": "above.stl"}, "window = 'above.stl' lies outside of outer = 'outer.stl'"),
+    ({"window": "outer.stl"}, "window = 'outer.stl' leaves no free face"),
+    ({"window": "low.stl"}, "window = 'low.stl' reaches through the gel"),
+    ({"window": "askew.stl"}, "thinner than an element's edge of 1.5 mm"),
+    ({"size_mm": [9.0, 10.0, 7.0]}, "the files say"),
+    ({"window": {"choice": ["window.stl", "above.stl"]}}, "must each name one file"),
+    ({"layers": [{"thickness_mm": 0.1, "youngs_modulus_kpa": 900.0}]}, "a file is of one material"),
+]
+
+
+@pytest.mark.parametrize(("gel", "message"), BAD)
+def test_bad_files_are_told_in_a_sentence(folder: Path, gel: dict[str, Any], message: str) -> None:
+    body, inner = capsule_body(5.0, 2.0, 0.0), capsule_body(3.0, 3.0, 2.0)
+    write(folder, "metres.stl", body, scale=1e-3)
+    write(folder, "open.stl", (body[0], body[1][:-3]))
+    write(folder, "two.stl", body, (body[0] + 30.0, body[1]))
+    for name, shift in (
+        ("beside", (20.0, 0, 0)),
+        ("above", (0, 0, 12.0)),
+        ("askew", (1.2, 0, 0)),
+        ("low", (0, 0, -2.5)),
+    ):
+        write(folder, f"{name}.stl", (inner[0] + shift, inner[1]))
+    with pytest.raises(InputError, match=message):
+        build(scene_file(folder, **gel))
+
+
+@pytest.mark.parametrize(
+    ("place", "message"),
+    [
+        ("polar_deg=112.0", "motion.polar_deg = 112.0 is beyond the gel's end"),
+        ("position_mm=[4.99, 4.99]", "the gel has no coated face at"),
+        ("azimuth_deg=20.0", "azimuth_deg goes with polar_deg or height_mm"),
+    ],
+)
+def test_places_beside_the_face_are_told(folder: Path, place: str, message: str) -> None:
+    path = scene_file(folder)
+    path.write_text(path.read_text().replace("polar_deg", "#").replace("azimuth_deg", "#"))
+    with pytest.raises(InputError, match=message):
+        build(path, f"motion.{place}")
