@@ -44,8 +44,8 @@ FAILURES = 3
 """Of attempts at them, after which the passes end. Updates are halved after a failure and doubled after a success:
 where a whole one upsets Newton's method a part of it does not."""
 MAX_PENETRATION = 0.02
-"""Share of the press depth that no contact point of an object may be inside it in a state with updated multipliers. A
-state that is deeper takes up to MAX_DEEP_UPDATES and DEEP_FAILURES, and the press ends if that does not do."""
+"""Share of the press depth (at least 0.1 mm) by which a triangle mesh may penetrate in a corrected state. Where it is
+deeper, passes go on to MAX_DEEP_UPDATES or DEEP_FAILURES, and the press ends if that does not do."""
 MAX_DEEP_UPDATES, DEEP_FAILURES = 6.0, 9
 MULTIPLIER_TOLERANCE = 20.0
 """Tolerance of states that multipliers are updated from, over the full one: two updates do not forget what they began
