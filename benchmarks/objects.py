@@ -20,7 +20,7 @@ from benchmarks.rows import Row, arguments, measure, show
 from synth.cli_options import DEFAULT_SCENE
 from synth.errors import InputError
 from synth.mesh import PadMesh
-from synth.scene import Scene
+from synth.scene import Scene, Sphere
 from synth.scene.sampling import draw
 from synth.scene.template import load_scene
 from synth.simulate import Trajectory, simulate
@@ -30,9 +30,9 @@ from synth.simulate.mesh_rule import MeshRule
 from synth.simulate.resolution import MARGIN, graded_mesh
 
 SIZE_MM = 8.0
-BALL = '{ shape = "sphere", radius_mm = 4.0 }'
+BALL = Sphere(shape="sphere", radius_mm=4.0)
 DEEP = 0.02
-"""Share of the depth by which edges are to sink in at most."""
+"""Share of the press depth by which edges are to sink in at most."""
 NEAR = 0.05
 """Share by which half the spacing is to change a force at most."""
 
@@ -54,18 +54,20 @@ def press(case: Row) -> Row:
     try:
         file = f'shape = "mesh", file = "{case["file"]}", size_mm = {SIZE_MM}, rotation_deg = "any"'
         scene = scene_of(f"{{ {file} }}", seed)
+        ball = scene.contact.model_copy(update={"indenter": BALL})
         mesh = MeshRule.of(scene).resolution(scene).mesh
         result, seconds = timed(scene, mesh)
     except InputError as error:
         return {"status": "refused", "reason": str(error)}
-    pressed = result.states[1:]
+    depth, pressed = scene.motion.depth_mm, result.states[1:]
     return {
         "status": result.status,
         "reason": result.reason,
         "seconds": round(seconds, 2),
-        "times_a_ball": round(seconds / timed(scene_of(BALL, seed), mesh)[1], 2),
+        "times_a_ball": round(seconds / timed(scene.model_copy(update={"contact": ball}), mesh)[1], 2),
         "force_n": round(result.states[-1].force_n[2], 4),
-        "penetration": round(max((s.max_penetration_mm / s.depth_mm for s in pressed), default=0.0), 4),
+        "iterations": sum(state.newton_iterations for state in pressed),
+        "penetration": round(max((state.max_penetration_mm for state in pressed), default=0.0) / depth, 4),
     }
 
 

@@ -68,11 +68,11 @@ class Grid:
         known = away < 2 * self.spacing if surface.closed else everywhere
         sign = np.ones((*self.counts[:2], self.counts[2] + 1))  # beyond the last sample is outside
         near = self.points(known)
-        sign[:, :, :-1][known] = nearest.signs(near)
+        sign[:, :, :-1][known] = near_sign = nearest.signs(near)
         above = np.where(known, np.arange(self.counts[2]), self.counts[2])
         above = np.minimum.accumulate(above[:, :, ::-1], axis=2)[:, :, ::-1]
         values = np.asarray(away * np.take_along_axis(sign, above, axis=2))
-        if (nearest.signs(near, TWICE) > 0).all():
+        if (nearest.signs(near[near_sign < 0], TWICE) > 0).all():
             return values
         outer = sharp_contour(values, self.corner, self.spacing, nearest.depth)
         return np.where(values < 0, -1.0, 1.0) * self.distance(Nearest(outer), everywhere)

@@ -23,7 +23,7 @@ from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.relaxation import relax
 from synth.simulate.system import System
 from synth.simulate.tables import pack_indenter, place_indenter
-from synth.simulate.trajectory import State, Trajectory, no_contact, not_converged, trajectory_of
+from synth.simulate.trajectory import State, Trajectory, no_contact, not_converged, too_deep, trajectory_of
 from synth.simulate.unknowns import Unknowns
 
 SHORTEST_STEP = 1 / 128
@@ -44,8 +44,8 @@ FAILURES = 3
 """Of attempts at them, after which the passes end. Updates are halved after a failure and doubled after a success:
 where a whole one upsets Newton's method a part of it does not."""
 MAX_PENETRATION = 0.02
-"""Share of the press depth that no contact point of an object may be inside it in a state with updated multipliers. A
-state that is deeper takes up to MAX_DEEP_UPDATES and DEEP_FAILURES, and is not accepted if that does not do."""
+"""Share of the press depth (at least 0.1 mm) by which a triangle mesh may penetrate in a corrected state. Where it is
+deeper, passes go on to MAX_DEEP_UPDATES or DEEP_FAILURES, and the press ends if that does not do."""
 MAX_DEEP_UPDATES, DEEP_FAILURES = 6.0, 9
 MULTIPLIER_TOLERANCE = 20.0
 """Tolerance of states that multipliers are updated from, over the full one: two updates do not forget what they began
@@ -224,9 +224,10 @@ class Stepper:
         if self.system.deepest() > self._shallow_mm:
             solution = self._polished(solution, between)
         while solution.converged and self.system.deepest() > self._shallow_mm:
-            too_deep = self.system.deepest() > self._deepest_mm
-            most = (MAX_DEEP_UPDATES, DEEP_FAILURES) if too_deep else (MAX_MULTIPLIER_UPDATES, FAILURES)
-            if done >= most[0] or failures >= most[1]:
+            deep = self.system.deepest() > self._deepest_mm
+            if done >= (MAX_DEEP_UPDATES if deep else MAX_MULTIPLIER_UPDATES):
+                break
+            if failures >= (DEEP_FAILURES if deep else FAILURES):
                 break
             before = saved_contact(self.system.contact)
             self.system.augment(self.indenter, share)
@@ -255,21 +256,23 @@ class Stepper:
         """Record the corrected state, then put contact back to where the path goes on.
 
         Returns:
-            False where the corrected state does not reach the full tolerance or is too deep: nothing is recorded.
+            False where the corrected state does not reach the full tolerance: nothing is recorded. Nor is a state that
+            is too deep, which ends the press, saying so.
         """
         saved = saved_contact(self.system.contact)
-        solution, good = step, step.converged
+        solution = step
         if target in self._corrected:
             self.system.anchor(step.state, self.indenter)
             solution = self._polished(self._augmented(step), self.numerics.tolerance)
-            good = solution.converged and self.system.deepest() <= self._deepest_mm
-        if good:
+            if solution.converged and self.system.deepest() > self._deepest_mm:
+                self.reason = too_deep(self.path.pose(target), MAX_PENETRATION)
+        if solution.converged and not self.reason:
             self.states.append(self._recorded_state(solution, target))
             self._iterations = 0
         restore_contact(self.system.contact, saved)
         self.system.forget_factor()
         self.system.residual(step.state, self.indenter)
-        return good
+        return solution.converged
 
     def _recorded_state(self, solution: Solution, target: float) -> State:
         """A solution that was just found, in the units of a trajectory."""

@@ -91,3 +91,11 @@ def not_converged(beyond_mm: float, pose: Pose) -> str:
         f"Newton's method did not converge {beyond_mm:.2g} mm beyond depth {pose.depth_mm:.3g} mm, "
         f"shear {np.hypot(*pose.shear_mm):.3g} mm, twist {pose.twist_deg:.3g} deg"
     )
+
+
+def too_deep(pose: Pose, share: float) -> str:
+    """Why a trajectory ends whose indenter stays deeper inside the gel than this share of its depth."""
+    return (
+        f"at depth {pose.depth_mm:.3g} mm an edge stays inside the gel by more than {share:.0%} of the depth: lower "
+        "numerics.target_error_px or edge_length_mm, or raise numerics.penalty"
+    )

@@ -12,10 +12,15 @@ from pads import scene
 from synth.mesh import Counts, Focus, graded_box
 from synth.scene import Scene
 from synth.simulate import indenter, simulate, stepping
+from synth.simulate.batched import simulate_presses
+from synth.simulate.batched.pad import prepare
 from synth.simulate.newton import Solution, solve
 from synth.simulate.options import SolverOptions
+from synth.simulate.press import Press
 from synth.simulate.probe import probe
 from synth.simulate.relaxation import AIM, LEAST_VISCOSITY, MAX_ERROR, MOST_VISCOSITY, next_viscosity
+from synth.simulate.solve import simulate_press
+from synth.simulate.trajectory import Trajectory
 
 SIZE = (12.0, 10.0, 3.0)
 MESH = graded_box(SIZE, Focus((0.0, 0.0), (2.0, 2.0)), Counts((4, 4), (2, 2), 2))
@@ -55,6 +60,32 @@ def test_a_cube_is_the_block_of_its_fillet(folder: Path, monkeypatch, turned: tu
         assert error < 0.01
         moved = (face @ (other.displacement - one.displacement))[:, :2]
         assert PX_PER_MM * np.sqrt((moved**2).sum(axis=1).mean()) < 0.02
+
+
+def test_an_object_is_no_deeper_in_the_gel_than_allowed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On the CPU and by the batched solver, with contacts so soft that two updates of the multipliers do not do."""
+
+    def soft(penalty: float) -> Press:
+        drawn = pressed(cube())
+        numerics = drawn.numerics.model_copy(update={"penalty": penalty})
+        return Press.of(drawn.model_copy(update={"numerics": numerics}), MESH, folder)
+
+    def both(press: Press) -> list[Trajectory]:
+        return [simulate_press(press), *dict(simulate_presses([press], prepare(press.scene, MESH, "cpu"))).values()]
+
+    found, allowed = both(soft(15.0)), stepping.MAX_PENETRATION * DEPTH
+    for trajectory in found:
+        assert trajectory.status == "complete"
+        assert 0 < max(state.max_penetration_mm for state in trajectory.states) <= allowed
+    for one, other in zip(*(trajectory.states[1:] for trajectory in found), strict=True):
+        # Intermediate steps have a relaxed tolerance of 1e-3 on the CPU, which friction remembers.
+        np.testing.assert_allclose(one.force_n, other.force_n, atol=5e-3 * one.force_n[2])
+    for trajectory in both(soft(5.0)):
+        assert "an edge stays inside the gel by more than 2% of the depth" in trajectory.reason
+    monkeypatch.setattr(stepping, "MAX_PENETRATION", np.inf)
+    two_updates = simulate_press(soft(15.0))
+    assert two_updates.status == "complete"
+    assert max(state.max_penetration_mm for state in two_updates.states) > allowed
 
 
 OBJECTS = Path(__file__).parents[2] / "scenes" / "objects"

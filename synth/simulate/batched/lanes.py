@@ -32,7 +32,7 @@ SEARCH, SOLVED, FAILED, AT_RECORD, CORRECTING, RESTORED, RECORD, ADVANCE, ENDED,
 STEP, CORRECTION, POLISH = range(3)
 """What Newton's method is solving: a load step, a pass at a recorded state, or that state to the full tolerance."""
 RELAXING, RELAXED = 1, 2
-COMPLETE, NO_EQUILIBRIUM, NO_CONTACT = range(3)
+COMPLETE, NO_EQUILIBRIUM, NO_CONTACT, TOO_DEEP = range(4)
 """Why a trajectory ended."""
 TAKE_TRIAL, RESET, RESTORE_RECORDED, ACCEPT, ROLL_BACK = range(1, 6)
 """Moves of a lane's fields: trial to iterate; state to iterate; recorded solution to iterate; iterate to state; the

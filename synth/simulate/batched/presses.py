@@ -6,13 +6,14 @@ import numpy as np
 import warp as wp
 
 from synth.arrays import FloatArray
-from synth.simulate.batched.lanes import COMPLETE, NO_EQUILIBRIUM, Presses
+from synth.simulate.batched.lanes import COMPLETE, NO_CONTACT, NO_EQUILIBRIUM, TOO_DEEP, Presses
 from synth.simulate.batched.reductions import SCALARS
 from synth.simulate.distance import shape_vector
 from synth.simulate.press import Press
 from synth.simulate.space import Space
+from synth.simulate.stepping import MAX_PENETRATION
 from synth.simulate.tables import warp_array
-from synth.simulate.trajectory import State, Trajectory, no_contact, not_converged, trajectory_of
+from synth.simulate.trajectory import State, Trajectory, no_contact, not_converged, too_deep, trajectory_of
 
 
 def press_tables(
@@ -101,10 +102,13 @@ def trajectory(
     for length, record in zip(press.path.records(), records, strict=False):
         states.append(_state(press, float(length), record, space))
     code, reached, target = ended
-    reason = "" if code == COMPLETE else no_contact(target)
-    if code == NO_EQUILIBRIUM:
-        reason = not_converged(target - reached, press.path.pose(reached))
-    return trajectory_of(tuple(states), reason, seconds, space)
+    reasons = {
+        COMPLETE: "",
+        NO_EQUILIBRIUM: not_converged(target - reached, press.path.pose(reached)),
+        NO_CONTACT: no_contact(target),
+        TOO_DEEP: too_deep(press.path.pose(target), MAX_PENETRATION),
+    }
+    return trajectory_of(tuple(states), reasons[code], seconds, space)
 
 
 def _state(press: Press, length: float, record: FloatArray, space: Space) -> State:

@@ -193,7 +193,7 @@ def check_contact(lanes: Lanes, presses: Presses, sums: wp.array2d(dtype=wp.floa
 
 @wp.kernel
 def choose_pass(lanes: Lanes, presses: Presses, settings: Settings):
-    """Another pass, the full tolerance, the record, or none where passes leave an object too deep."""
+    """Another pass, the full tolerance, the record, or the end where passes leave an object too deep."""
     s = wp.tid()
     lanes.new_share[s] = ZERO
     if lanes.phase[s] != phases.CORRECTING:
@@ -205,9 +205,8 @@ def choose_pass(lanes: Lanes, presses: Presses, settings: Settings):
     if too_deep:
         over = lanes.failures[s] >= DEEP_FAILURES or lanes.done[s] >= MAX_DEEP_UPDATES
     if corrected and too_deep and over:
-        lanes.stage[s] = phases.POLISH
-        lanes.iteration[s] = 0
-        lanes.phase[s] = phases.FAILED
+        lanes.reason[s] = phases.TOO_DEEP
+        lanes.phase[s] = phases.ENDED
         return
     over = over or lanes.deepest[s] <= PENETRATION * presses.deepest[j] or not corrected
     if over and lanes.relative[s] <= settings.tolerance:
