@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from benchmarks.rows import Row, arguments, show
@@ -18,7 +17,7 @@ from gelflow.baselines.tensors import as_tensor
 from gelflow.compare.metrics import endpoint_error
 from gelflow.data.open import open_all
 from gelflow.data.pairs import PairDataset, without_pattern
-from gelflow.models.uncertainty import CURVATURE, SCALE, error_squares
+from gelflow.models.uncertainty import CURVATURE, SCALE, error_squares, smoothed
 from gelflow.predict.model import load_model
 
 EVERY = 7
@@ -44,7 +43,8 @@ def pixels(dataset: PairDataset, folder: Path) -> Scenes:
         flow = np.load(stored)
         squares = error_squares(*(as_tensor(array, "cpu") for array in (flow, image1, image2)))
         counts = truth.visible & np.isfinite(truth.flow).all(axis=-1)
-        values = [*torch.cat(squares)[:, 0].double().numpy(), endpoint_error(flow, truth.flow)]
+        step, bent = (smoothed(one)[0, 0].double().numpy() for one in squares)
+        values = [step, bent, endpoint_error(flow, truth.flow)]
         found.setdefault(str(record.scene), []).append(np.stack([value[counts][::EVERY] for value in values]))
         print(f"{len(found)} scenes, pair {index + 1} of {len(dataset)}", flush=True)
     return {scene: np.concatenate(parts, axis=1) for scene, parts in found.items()}

@@ -16,6 +16,7 @@ FILES = ("scores.csv", "strata.csv", SCORES, "table.md", "table.tex", "table.png
 """What `write_report` writes; strata.csv and strata.png where some pair has an exact flow."""
 
 _LATEX = {"%": r"\%", "_": r"\_", "&": r"\&", "#": r"\#", ">": r"$>$", "±": r"$\pm$", "×": r"$\times$"}
+_LATEX |= {"σ": r"$\sigma$", "≤": r"$\leq$"}
 
 
 def markdown(table: Table) -> str:

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from gelflow.arrays import FlowArray, ImageArray
+from gelflow.arrays import FlowArray, ImageArray, MapArray
 from gelflow.baselines.exact import ExactFlow
 from gelflow.baselines.method import Method
+from gelflow.baselines.tensors import uncertainty
 from gelflow.compare.dots import dot_distance, find_dots
 from gelflow.compare.metrics import closure, endpoint_error, flow_errors, image_similarity, marker_distance
 from gelflow.compare.strata import Stratum, pair_strata
@@ -20,10 +21,11 @@ from gelflow.data.pairs import PairDataset
 from gelflow.errors import InputError, NothingFoundError
 from gelflow.files.exr import FlowField
 from gelflow.hardware import hardware
+from gelflow.models.uncertainty import CERTAIN_PX, UNKNOWN_PX
 
 MEASURES = (
     "psnr_db", "ssim", "endpoint_error_px", "median_error_px", "outliers_1px", "outliers_01px", "marker_distance_px",
-    "dot_distance_px", "dot_p90_px", "own_dots", "closure_px", "closure_p90_px",
+    "dot_distance_px", "dot_p90_px", "own_dots", "closure_px", "closure_p90_px", "unknown", "certain", "calibration",
 )  # fmt: skip
 """Fields of a score that are averaged over pairs."""
 
@@ -42,6 +44,8 @@ class PairScore:
         dot_distance_px, dot_p90_px, own_dots: See `gelflow.compare.dots.DotDistance`; where there is no exact flow and
             both images show a pattern of dots.
         closure_px, closure_p90_px: Median and 90th percentile of the closure; where there is no exact flow.
+        unknown, certain: Share of pixels whose sigma (`gelflow.models.uncertainty`) is above 1 px, and up to 0.1 px.
+        calibration: Share of the certain pixels whose endpoint error is within sigma; 0.68 if sigma is right.
         motion_px: Mean length of the true motion over the compared pixels.
         seconds: Run time of the method, images in memory to flow in memory.
         processor_seconds: Time of all its threads on the processor meanwhile; unlike `seconds` it does not grow with
@@ -66,6 +70,9 @@ class PairScore:
     own_dots: float | None = None
     closure_px: float | None = None
     closure_p90_px: float | None = None
+    unknown: float | None = None
+    certain: float | None = None
+    calibration: float | None = None
     motion_px: float | None = None
     seconds: float
     processor_seconds: float
@@ -92,6 +99,9 @@ class MethodScore:
     own_dots: float | None = None
     closure_px: float | None = None
     closure_p90_px: float | None = None
+    unknown: float | None = None
+    certain: float | None = None
+    calibration: float | None = None
     seconds: float
     processor_seconds: float
     device: str
@@ -121,11 +131,15 @@ def score_pair(method: Method, dataset: PairDataset, index: int) -> PairScore:
         raise InputError(f"{dataset.source}, pair {record.name}, {method.name}: {error}") from error
     seconds, processor_seconds = time.perf_counter() - started, time.process_time() - busy
     psnr_db, ssim = image_similarity(image1, image2, flow)
+    device = str(getattr(method, "device", "cpu"))
+    sigma = uncertainty(flow, image1, image2, device)[0]
     try:
-        errors = _without_truth(method, image1, image2, flow) if truth is None else _errors(flow, truth, record.scene)
+        if truth is None:
+            errors = _without_truth(method, image1, image2, flow)
+        else:
+            errors = _errors(flow, truth, record.scene, sigma)
     except InputError as error:
         raise InputError(f"{record.flow or record.name}: {error}") from error
-    device = str(getattr(method, "device", "cpu"))
     return PairScore(
         method=method.name,
         pair=record.name,
@@ -137,6 +151,8 @@ def score_pair(method: Method, dataset: PairDataset, index: int) -> PairScore:
         processor_seconds=processor_seconds,
         device=hardware(device),
         on_gpu=device == "cuda",
+        unknown=float((sigma > UNKNOWN_PX).mean()),
+        certain=float((sigma <= CERTAIN_PX).mean()),
         **errors,
     )
 
@@ -161,18 +177,20 @@ def _without_truth(method: Method, image1: ImageArray, image2: ImageArray, flow:
     return found
 
 
-def _errors(flow: FlowArray, truth: FlowField, scene: str | None) -> dict[str, Any]:
+def _errors(flow: FlowArray, truth: FlowField, scene: str | None, sigma: MapArray) -> dict[str, Any]:
     """The fields of a score that need the exact flow."""
     errors = flow_errors(flow, truth.flow, truth.visible)
     compared = np.logical_and(truth.visible, np.isfinite(truth.flow).all(axis=-1))
     motion = np.hypot(truth.flow[..., 0], truth.flow[..., 1])[compared]
+    error, certain = endpoint_error(flow, truth.flow), compared & (sigma <= CERTAIN_PX)
     return {
         "endpoint_error_px": errors.mean_px,
         "median_error_px": errors.median_px,
         "outliers_1px": errors.outliers_1px,
         "outliers_01px": errors.outliers_01px,
+        "calibration": float((error <= sigma)[certain].mean()) if certain.any() else None,
         "motion_px": float(motion.mean(dtype=np.float64)),
-        "strata": pair_strata(endpoint_error(flow, truth.flow), truth.flow, compared, truth.contact, scene),
+        "strata": pair_strata(error, truth.flow, compared, truth.contact, scene),
     }
 
 

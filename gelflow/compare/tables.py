@@ -34,8 +34,9 @@ def number(value: float | None, digits: int, spread: float | None = None) -> str
 def summary_table(groups: Sequence[Group]) -> Table:
     """Means over the pairs, a row per method; columns that no method has are left out.
 
-    The distance to tracked dots is not averaged here: tracks differ too much in how far they can be trusted. Where all
-    ran on one device its column is left out, too.
+    "error ≤ σ" counts pixels with σ ≤ 0.1 px; it is 68 % if σ is calibrated. The distance to tracked dots is not
+    averaged here: tracks differ too much in how far they can be trusted. Where all ran on one device its column is left
+    out, too.
     """
     columns = [
         ("PSNR dB", "psnr_db", 1, 2),
@@ -49,6 +50,9 @@ def summary_table(groups: Sequence[Group]) -> Table:
         ("own dot %", "own_dots", 100, 1),
         ("closure px", "closure_px", 1, 3),
         ("90 % px", "closure_p90_px", 1, 3),
+        ("σ > 1 px %", "unknown", 100, 1),
+        ("σ ≤ 0.1 px %", "certain", 100, 1),
+        ("error ≤ σ %", "calibration", 100, 1),
         ("ms/pair", "seconds", 1000, 1),
         ("core ms", "processor_seconds", 1000, 1),
     ]

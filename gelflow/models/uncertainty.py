@@ -16,7 +16,9 @@ z the sum of g r over a small neighbourhood (Newey and West 1987). A window has 
 at a mean square distance m from x, so that the flow's second derivatives V'' add an error. Together, as what is left of
 a step is an error, too,
 
-    sigma^2 = SCALE^2 (tr C + |d|^2 + (CURVATURE m |V''|)^2).
+    sigma^2 = SCALE^2 (tr C + |d|^2 + (CURVATURE m |V''|)^2),
+
+smoothed, because the flow is.
 
 What the network knows does not count: of a bare gel nothing is known, however plausible its flow. An error that leaves
 no trace in the images, such as dots taken for the next ones, is not seen.
@@ -34,12 +36,12 @@ from gelflow.ops.gaussian import SeparableFilter, smoother, window_sums
 from gelflow.ops.spline import SplineImage
 from gelflow.ops.warp import pixel_indices, positions
 
-SCALE, CURVATURE = 1.17, 0.2
+SCALE, CURVATURE = 0.96, 0.28
 """Fitted to the errors of the shipped network on synthetic pairs by `python -m benchmarks sigma`."""
-CORRELATION_PX = 1.0
-"""Standard deviation of the Gaussian under which g r is summed."""
-MAX_SIGMA_PX = 10.0
-"""Sigma where nothing is known."""
+CORRELATION_PX, SMOOTHING_PX = 1.0, 2.0
+"""Standard deviations of the Gaussians under which g r is summed and sigma^2 is smoothed."""
+CERTAIN_PX, UNKNOWN_PX, MAX_SIGMA_PX = 0.1, 1.0, 10.0
+"""A flow counts as certain up to the first sigma and as unknown above the second; the last: nothing is known."""
 RADIUS = math.sqrt(-2 * math.log(1 - 0.68))
 """Radius that holds 68 % of a normal distribution in the plane whose components have a standard deviation of 1."""
 _MOTION = RegistrationConfig()
@@ -55,7 +57,7 @@ def flow_sigma(flow: Flow, image1: Images, image2: Images) -> tuple[Tensor, Tens
     with torch.no_grad(), torch.autocast(flow.device.type, enabled=False):
         known, flow = flow.isfinite().all(dim=1, keepdim=True), flow.float().nan_to_num()
         step, curvature = error_squares(flow, image1.float(), image2.float())
-        sigma = SCALE * (step + CURVATURE**2 * curvature).sqrt()
+        sigma = SCALE * smoothed(step + CURVATURE**2 * curvature).sqrt()
         sigma = torch.where(known, sigma, MAX_SIGMA_PX).clamp(max=MAX_SIGMA_PX)
         sides = flow.new_tensor([flow.shape[-1], flow.shape[-2]]).view(2, 1, 1)
         place, spread = positions(flow) + 0.5, sigma / RADIUS
@@ -87,6 +89,12 @@ def error_squares(flow: Flow, image1: Images, image2: Images) -> tuple[Tensor, T
     return step, torch.where(enough, (moment / trace).square() * _curvature_square(flow), 0.0)
 
 
+def smoothed(square: Tensor) -> Tensor:
+    """The mean of squared errors in px^2 around each pixel; the largest count as much as `MAX_SIGMA_PX`."""
+    window = window_sums(square.shape[-2], square.shape[-1], SMOOTHING_PX, square)
+    return window(square.clamp(max=(MAX_SIGMA_PX / SCALE) ** 2)) / window(torch.ones_like(square))
+
+
 def _squares(x: Features, y: Features) -> Tensor:
     """x^2, x y and y^2, summed over the colours: (B, 3, H, W) of (B, C, H, W)."""
     return torch.stack([x * x, x * y, y * y], dim=1).sum(dim=2)
@@ -101,6 +109,6 @@ def _second_moment(window: SeparableFilter, field: Features) -> Features:
 
 def _curvature_square(flow: Flow) -> Tensor:
     """|V''|^2 of the flow under the last stage's smoothing, px^-2; (B, 1, H, W)."""
-    smoothed = smoother(flow.shape[-2], flow.shape[-1], _MOTION.smoothing_px[-1], flow)(flow)
-    slopes = torch.cat(torch.gradient(smoothed, dim=(-1, -2)), dim=1)
+    smooth = smoother(flow.shape[-2], flow.shape[-1], _MOTION.smoothing_px[-1], flow)(flow)
+    slopes = torch.cat(torch.gradient(smooth, dim=(-1, -2)), dim=1)
     return torch.cat(torch.gradient(slopes, dim=(-1, -2)), dim=1).square().sum(dim=1, keepdim=True)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gelflow.arrays import Bytes3, FlowArray, ImageArray, MapArray
 from gelflow.files.atomic import replacing
 from gelflow.files.image import to_bytes
+from gelflow.models.uncertainty import UNKNOWN_PX
 from gelflow.ops.warp import warp_image
 
 if TYPE_CHECKING:
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
 
 UNKNOWN_COLOUR = (70, 70, 70)
 """Colour (R, G, B) of pixels without flow."""
-UNKNOWN_PX = 1.0
-"""A flow whose sigma is larger is not shown."""
 _SEGMENTS = (15, 6, 4, 11, 13, 6)
 """Steps from red to yellow, yellow to green, green to cyan, cyan to blue, blue to magenta, magenta to red."""
 

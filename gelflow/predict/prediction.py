@@ -22,8 +22,9 @@ from gelflow.files.flo import write_flo
 from gelflow.files.image import read_pair, write_png
 from gelflow.files.quiet import quiet
 from gelflow.files.video import describe, frame_file, frames, image_files
+from gelflow.models.uncertainty import UNKNOWN_PX
 from gelflow.predict.model import Estimate
-from gelflow.predict.pictures import UNKNOWN_PX, certain, draw_overlay, round_up, write_flow_picture
+from gelflow.predict.pictures import certain, draw_overlay, round_up, write_flow_picture
 
 Reference = Literal["first", "previous"]
 

@@ -42,7 +42,9 @@ def test_errors_of_known_flows_are_exact_and_the_true_one_warps_best(tmp_path: P
     assert [(score.endpoint_error_px, score.outliers_1px) for score in scores] == [(5.0, 1.0), (0.5, 0.0)]
     (mean,) = summarise(scores)
     assert (mean.endpoint_error_px, mean.outliers_01px, mean.pairs) == (2.75, 1.0, 2)
-    assert evaluate(Constant("true", 3, 4), dataset)[0].endpoint_error_px == 0.0
+    true = evaluate(Constant("true", 3, 4), dataset)[0]
+    assert (true.endpoint_error_px, true.calibration) == (0.0, 1.0)
+    assert min(true.certain or 0, scores[0].unknown or 0) > 0.5  # sigma knows which one is right
     dataset = open_pairs(write_folder(tmp_path / "plain", {"a": (2.5, -1.5)}))
     best, *others = (evaluate(Constant("x", 2.5 * f, -1.5 * f), dataset)[0] for f in (1, 0, -1, 0.8, 1.2))
     assert best.psnr_db > max(other.psnr_db for other in others)
@@ -86,8 +88,18 @@ def test_numbers_that_are_not_finite_come_back_and_markers_are_scored_where_ther
     table = pair_table(scores, ["marker_distance_px"], "{:.2f}")
     assert table == (["method", "a"], [["zero", "5.00"]])
     header, rows = summary_table(grouped(summarise(scores[1:])))
-    assert header == ["method", "PSNR dB", "SSIM", "closure px", "90 % px", "ms/pair", "core ms"]
-    assert markdown((header, rows)).splitlines()[1] == "| --- | ---: | ---: | ---: | ---: | ---: | ---: |"
+    assert header == [
+        "method",
+        "PSNR dB",
+        "SSIM",
+        "closure px",
+        "90 % px",
+        "σ > 1 px %",
+        "σ ≤ 0.1 px %",
+        "ms/pair",
+        "core ms",
+    ]
+    assert markdown((header, rows)).splitlines()[1] == "| --- |" + 8 * " ---: |"
 
 
 def test_earlier_results_are_replaced_on_the_same_data_only(tmp_path: Path) -> None:

@@ -17,10 +17,10 @@ from gelflow.baselines import named_methods
 from gelflow.baselines.learned import Learned
 from gelflow.errors import InputError
 from gelflow.files.exr import read_flow
+from gelflow.models.uncertainty import UNKNOWN_PX
 from gelflow.models.weights import weights_file
 from gelflow.predict.pictures import (
     UNKNOWN_COLOUR,
-    UNKNOWN_PX,
     arrow_factor,
     certain,
     draw_overlay,

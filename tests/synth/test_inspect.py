@@ -70,6 +70,14 @@ def test_translation_exchanged_directions_and_missing_visibility_in_numbers(data
     assert inspection.numbers[0]["backward"] is None
     write_html(inspection, tmp_path / "e.html")
     assert "visible in image 2: not given" in (tmp_path / "e.html").read_text()
+    # What gelflow says of its error is shown.
+    sigma = np.full((HEIGHT, WIDTH), 0.25, np.float32)
+    planes = {"forward.U": sigma.copy(), "forward.V": sigma.copy(), "forward.sigma": sigma}
+    OpenEXR.File(header, planes).write(str(tmp_path / "e.exr"))
+    inspection = inspect(tmp_path / "e.exr")
+    assert inspection.numbers[0]["sigma"]["median_px"] == 0.25
+    write_html(inspection, tmp_path / "e.html")
+    assert "sigma, log 0.01 to 10 px: median 0.25" in (tmp_path / "e.html").read_text()
 
 
 def test_page_is_self_contained_and_tables_and_json_tell_the_numbers(dataset, tmp_path) -> None:
