@@ -29,6 +29,7 @@ _UP = np.array([0.0, 0.0, 1.0])
 _OPENCV_FIELD = 1.5
 """Radians; OpenCV's fisheye model divides by the cosine and knows nothing behind the lens."""
 _WIDER = 0.2
+"""Radians; wider than a triangle of a round gel is seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,9 +106,19 @@ class ForwardCamera:
         pixels[wide] = beyond
         return np.where(lost[:, None], np.nan, pixels)
 
-    def widened(self) -> "ForwardCamera":
-        """With a fisheye lens's field some degrees wider: triangles at the field's end then have whole images."""
-        return replace(self, field=min(self.field + _WIDER, np.pi)) if self.is_fisheye else self
+    def around(self, width: int, height: int) -> "ForwardCamera":
+        """With the field from which triangles reach into the image, some degrees wider than it.
+
+        A fisheye lens's field grows, so that triangles at its end have whole images. A pinhole within a round gel has
+        gel beside and behind it, whose images would be endless: its field ends soon after the image.
+        """
+        if self.is_fisheye:
+            return replace(self, field=min(self.field + _WIDER, np.pi))
+        if self.shell is None:
+            return self
+        corners = np.array([(x, y) for x in (0.0, width) for y in (0.0, height)])
+        ends = cv2.undistortPoints(corners[:, None], self.matrix, self.distortion)
+        return replace(self, field=min(self.field, float(np.arctan(np.linalg.norm(ends, axis=2).max())) + _WIDER))
 
     def is_in_field(self, points: Points, path: int) -> BoolArray:
         """Whether the lens model holds for points (n, 3) mm."""

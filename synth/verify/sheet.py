@@ -88,7 +88,8 @@ class Sheet:
 
     @cached_property
     def _layers(self) -> tuple[Layer, ...]:
-        size, camera = (self.width, self.height), self.camera.widened()
+        size = (self.width, self.height)
+        camera = self.camera.around(*size)
         return tuple(Layer(camera, path, self.triangles, self.positions, *size) for path in self.camera.paths)
 
     def _found(

@@ -245,11 +245,8 @@ def test_a_dome_of_a_kilometre_is_flat_and_one_without_radius_or_with_lights_out
 def test_a_dome_generates_and_verifies(tmp_path: Path) -> None:
     camera = {"width": 120, "height": 120, "fx": 75.0, "fy": 75.0, "cx": 60.0, "cy": 60.0}
     overrides = [f"sensor.camera.{name}={value}" for name, value in camera.items()]
-    overrides += [
-        "sensor.gel={shape='dome', size_mm=[25.0, 25.0, 12.0], dome_radius_mm=23.0, youngs_modulus_kpa=200.0}"
-    ]
-    overrides += ["sensor.window={thickness_mm=2.0}"]
-    overrides += ["sensor.camera.position_mm=[0.0, 0.0, 18.5]"]
+    gel = "{shape='dome', size_mm=[25.0, 25.0, 12.0], dome_radius_mm=23.0, youngs_modulus_kpa=200.0}"
+    overrides += [f"sensor.gel={gel}", "sensor.window={thickness_mm=2.0}", "sensor.camera.position_mm=[0.0, 0.0, 18.5]"]
     overrides += ["render.samples_per_pixel=16", "numerics.target_error_px=2.0", "sensor.pattern.placing=z"]
     overrides += ["contact.indenter={shape='sphere', radius_mm=5.0}", "sensor.pattern.grain_mm=1.2"]
     overrides += ["motion={depth_mm=1.2, position_mm=[2.0, -1.5], shear_mm=[0.5, -0.4], steps=2}"]
