@@ -1,5 +1,6 @@
 """Named array types. Every array of lengths is in mm and float64 unless its docstring says otherwise."""
 
+from collections.abc import Callable
 from typing import TypeAlias
 
 import numpy as np
@@ -9,6 +10,8 @@ FloatArray: TypeAlias = NDArray[np.float64]
 """float64."""
 Points: TypeAlias = NDArray[np.float64]
 """(n, 3) float64, mm."""
+Projection: TypeAlias = Callable[[Points], Points]
+"""Moves points (n, 3) onto a surface."""
 Pixels: TypeAlias = NDArray[np.float64]
 """(n, 2) float64, px; the centre of pixel (row r, column c) is (c + 0.5, r + 0.5)."""
 Triangles: TypeAlias = NDArray[np.int32]

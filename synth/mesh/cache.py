@@ -93,14 +93,15 @@ def _made(gel: Gel, face: PadFace | RoundFace, edge_mm: float) -> PadMesh:
     """A new mesh; of a dome that of its box."""
     if isinstance(face, PadFace):
         return tetrahedralise_box(gel.size_mm, edge_mm)
-    sides = (face.project_end, face.project_window, face.project)
     # Edges of that length on the face, whose chords are off it by h² / 8 R, must fit the envelope.
     off = ROOM * edge_mm**2 / (4 * min(gel.size_mm[:2]))
     surface, triangles = face.triangles(SURFACE * edge_mm)
     envelope = max(ENVELOPE, off / float(np.linalg.norm(np.ptp(surface, axis=0))))
     x, y = 2 * np.abs(surface[:, :2]).max(axis=0)
     background = even((x, y, surface[:, 2].max()), edge_mm)
-    points, tets = tetrahedralise(surface, triangles, sides, background, face.volume_mm3, CHORDS, envelope=envelope)
+    points, tets = tetrahedralise(
+        surface, triangles, face.sides, background, face.volume_mm3, CHORDS, envelope=envelope
+    )
     return PadMesh(points, tets, gel.size_mm, face=face)
 
 

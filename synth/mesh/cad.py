@@ -1,12 +1,12 @@
 """Gels from files, as a shape: which nodes lie on it, where between them it runs, and where it is pressed."""
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
 
-from synth.arrays import BoolArray, FloatArray, Points, Triangles
+from synth.arrays import BoolArray, FloatArray, Points, Projection, Triangles
 from synth.errors import InputError
 from synth.scene import Motion
 from synth.scene.gel_file import GelSurfaces, distance, gel_surfaces, nearest
@@ -38,19 +38,18 @@ class CadFace:
     def bonded(self, points: Points, size_mm: tuple[float, float, float]) -> BoolArray:
         """Which points (n, 3) mm lie on the window, or on an end that is held."""
         inner = np.asarray(distance(self.surfaces.window, points) <= ON_MM)
-        return inner | (points[:, 2] == self.surfaces.top_mm) if self.holds_end else inner
+        return inner | (points[:, 2] >= self.surfaces.top_mm - ON_MM) if self.holds_end else inner
 
     def project(self, points: Points) -> Points:
         """The nearest points of the coated face."""
         return nearest(self.surfaces.face, points)
 
-    def project_window(self, points: Points) -> Points:
-        """The nearest points of the window."""
-        return nearest(self.surfaces.window, points)
-
-    def project_end(self, points: Points) -> Points:
-        """Points (n, 3) mm moved onto the plane of the gel's end."""
-        return np.column_stack([points[:, :2], np.full(len(points), self.surfaces.top_mm)])
+    @property
+    def sides(self) -> list[Projection]:
+        """Projections onto all parts of the boundary."""
+        found = self.surfaces
+        parts = [partial(nearest, part) for part in (found.rest, found.window, found.face)]
+        return [lambda points: np.column_stack([points[:, :2], np.full(len(points), found.top_mm)]), *parts]
 
     def triangles(self, edge_mm: float) -> tuple[Points, Triangles]:
         """Triangles whose winding number is 1 in the gel and less elsewhere: outer's, and the window's turned over."""

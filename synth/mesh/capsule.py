@@ -8,10 +8,11 @@ triangles are about alike all over the hemisphere; the cylinder's rings have 4 m
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
-from synth.arrays import BoolArray, FloatArray, Points, Triangles
+from synth.arrays import BoolArray, FloatArray, Points, Projection, Triangles
 from synth.surface import FACE_EDGES, ContactFaces, GelSurface
 
 ROUNDING = 1e-9
@@ -56,13 +57,15 @@ class CapsuleFace:
         """Points (n, 3) mm moved onto the coated face, away from the axis."""
         return self._at_radius(points, self.radius_mm)
 
-    def project_window(self, points: Points) -> Points:
-        """Points (n, 3) mm moved onto the window's face."""
-        return self._at_radius(points, self.radius_mm - self.thickness_mm)
-
-    def project_end(self, points: Points) -> Points:
-        """Points (n, 3) mm moved onto the plane of the gel's end."""
-        return np.column_stack([points[:, :2], np.full(len(points), self.top_mm)])
+    @property
+    def sides(self) -> list[Projection]:
+        """Projections onto the plane of the gel's end, the window's face and the coated face."""
+        window = partial(self._at_radius, radius=self.radius_mm - self.thickness_mm)
+        return [
+            lambda points: np.column_stack([points[:, :2], np.full(len(points), self.top_mm)]),
+            window,
+            self.project,
+        ]
 
     def __str__(self) -> str:
         return f"capsule with radius_mm = {self.radius_mm}, thickness_mm = {self.thickness_mm}"

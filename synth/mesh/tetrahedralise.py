@@ -9,12 +9,12 @@ import contextlib
 import signal
 import tempfile
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 
 import numpy as np
 
-from synth.arrays import FloatArray, Points, Tets, Triangles
+from synth.arrays import FloatArray, Points, Projection, Tets, Triangles
 from synth.errors import InputError
 from synth.mesh.pad import PadMesh, boundary_faces, signed_volumes
 from synth.mesh.tetwild_sizing import Background, through_thickness
@@ -27,10 +27,6 @@ ROUNDS = 50
 """Vertices of two sides are moved onto one after the other so often at most."""
 WORST_SHAPE = 0.02
 """Smallest accepted ratio of inscribed to circumscribed radius, times 3 (1 for a regular tetrahedron)."""
-
-
-Projection = Callable[[Points], Points]
-"""Moves points (n, 3) onto a surface."""
 
 
 def tetrahedralise_box(
@@ -162,9 +158,10 @@ def _repair(points: Points, tets: Tets, sides: Sequence[Projection], tolerance: 
     used, renumbered = np.unique(tets, return_inverse=True)
     points, tets = points[used].copy(), renumbered.reshape(tets.shape).astype(np.int32)
     faces = boundary_faces(tets)
-    # The side of a boundary face is the one to which all three of its corners are near.
-    off = _distances(points, faces, sides)
-    nearest = np.where(off.min(axis=0) <= tolerance, off.argmin(axis=0), -1)
+    # The side of a boundary face is, of those to which all three of its corners are near, the nearest to its middle.
+    near, middles = _distances(points, faces, sides) <= tolerance, points[faces].mean(axis=1)
+    away = np.where(near, [np.linalg.norm(middles - side(middles), axis=1) for side in sides], np.inf)
+    nearest = np.where(near.any(axis=0), away.argmin(axis=0), -1)
     parts = [(side, np.unique(faces[nearest == number])) for number, side in enumerate(sides)]
     for _ in range(ROUNDS):  # the second and later ones are for sides that are not at right angles
         for side, nodes in parts:

@@ -66,10 +66,10 @@ class Gel(Part):
     length_mm: Annotated[float, Field(ge=0, le=200)] = 0.0
     """Of a capsule's cylinder; 0: a hemisphere."""
     cut_end: Literal["free", "held"] = "free"
-    """Whether the plane in which a round gel ends is held, as by a rigid frame."""
+    """Whether the plane of largest z, in which a round gel ends, is held, as by a rigid frame."""
     outer: str | None = None
     """File of a closed surface, whose bounding box is moved to z = 0 and to the middle in x and y; +z points from the
-    face to the camera, y is mirrored. All of it is coated but what touches the window or lies in the end's plane."""
+    face to the camera, y is mirrored. It is coated from its point on the axis up to the first sharp edges."""
     window: str | None = None
     """File of the closed surface that the gel is bonded to, in the same axes; optics are those of [sensor.window]."""
     unit: Literal["mm", "cm", "m", "inch"] | None = None

@@ -20,6 +20,8 @@ SHORTEST_MM, LONGEST_MM = 2.0, 400.0
 """Longest edges of bounding boxes beyond which a file is taken to be in another unit."""
 CONTACT = 2e-3
 """Outer and window touch where they are nearer than this share of outer's longest edge."""
+SHARP_DEG = 40.0
+"""The coated face ends at edges that are sharper."""
 SAMPLES = 300
 """Triangles at which a gel's thickness is measured."""
 
@@ -30,12 +32,14 @@ class GelSurfaces:
 
     Attributes:
         outer, window: as the files have them.
-        face: of outer, what is neither on the window nor in the plane of its largest z, where the gel is cut.
+        face: of outer, what no sharp edge parts from its point on the axis: what is coated.
+        rest: of outer, what is neither coated, nor on the window, nor in the plane of its largest z, where it is cut.
     """
 
     outer: Any
     window: Any
     face: Any
+    rest: Any
 
     @property
     def size_mm(self) -> tuple[float, float, float]:
@@ -105,8 +109,8 @@ def measured(value: Any, folder: Path) -> Any:
 
 def nearest(surface: Any, points: Points) -> Points:
     """(n, 3) points of a surface that are nearest to others."""
-    if len(points) == 0:
-        return points
+    if len(points) == 0 or surface.n_cells == 0:
+        return np.full_like(points, np.inf)
     return np.asarray(surface.find_closest_cell(points, return_closest_point=True)[1], float).reshape(-1, 3)
 
 
@@ -125,14 +129,17 @@ def _checked(outer: Path, window: Path, unit: str, *changed_ns: int) -> GelSurfa
         body.points -= [*(low[:2] + high[:2]) / 2, low[2]]
     near = CONTACT * float((high - low).max())
     points, faces = solid.points, solid.regular_faces
-    free = (points[:, 2] < points[:, 2].max() - 1e-6) & (distance(support, points) > near)
-    if not free.any():
-        raise ValueError(f"window = {window.name!r} leaves no free face of outer = {outer.name!r}")
-    side = pv.PolyData.from_regular_faces(points, faces[free[faces].any(axis=1)])
-    found = GelSurfaces(solid, support, side)
-    end = solid.ray_trace([0.0, 0.0, -1.0], [0.0, 0.0, 2 * found.top_mm])[0][:, 2].max(initial=0.0)
+    hits, cells = solid.ray_trace([0.0, 0.0, -1.0], [0.0, 0.0, high[2] - low[2] + 1])
+    if len(hits) == 0:
+        raise ValueError(f"outer = {outer.name!r} has no face on its axis")
+    parted = solid.compute_normals(split_vertices=True, feature_angle=SHARP_DEG, consistent_normals=False)
+    region = parted.connectivity("all").cell_data["RegionId"]
+    coated = region == region[cells[hits[:, 2].argmin()]]
+    apart = (points[:, 2] < points[:, 2].max() - 1e-6) & (distance(support, points) > near)
+    parts = coated, ~coated & apart[faces].any(axis=1)
+    found = GelSurfaces(solid, support, *(pv.PolyData.from_regular_faces(points, faces[part]) for part in parts))
     thickness = found.thickness_mm
-    if not thickness <= end + near:
+    if not thickness <= hits[:, 2].max() + near:
         raise ValueError(
             f"window = {window.name!r} lies outside of outer = {outer.name!r}: it holds no gel on the axis"
         )
