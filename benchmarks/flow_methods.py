@@ -124,7 +124,7 @@ def fitted_pinhole(view: View) -> Sensor:
     """A sensor without refraction whose focal lengths fit the undeformed gel best, as a calibration would find them."""
     tracer, sensor = _tracer(view), without_window(view.sensor)
     camera = sensor.camera
-    seen = Optics.of(sensor).project(_rest_points(tracer), tracer.own.path) - (camera.cx, camera.cy)
+    seen = Optics.of(sensor).project(_rest_points(tracer), tracer.optics.own.path) - (camera.cx, camera.cy)
     true = tracer.optics.centres - (camera.cx, camera.cy)
     known = np.isfinite(seen).all(axis=1)
     ratio = float((seen[known] * true[known]).sum() / (seen[known] ** 2).sum())
@@ -159,7 +159,7 @@ def is_inside(flow: FloatArray | FlowArray) -> BoolArray:
 def _tracer(view: View, kind: type[Tracer] = Tracer, sensor: Sensor | None = None) -> Tracer:
     sensor = sensor or view.sensor
     tracer = kind(view.surface, Optics.of(sensor), sensor.camera.width, sensor.camera.height)
-    _ = tracer.own, tracer.optics.centres  # belong to the camera
+    _ = tracer.optics.own  # belongs to the camera
     return tracer
 
 
@@ -171,9 +171,9 @@ def _rest_points(tracer: Tracer) -> Points:
 
 def _paths(tracer: Tracer) -> Iterator[tuple[int, BoolArray]]:
     """Light paths, directly or by mirrors, by which pixels look, and which pixels."""
-    for path in np.unique(tracer.own.path):
+    for path in np.unique(tracer.optics.own.path):
         if path >= 0:
-            yield int(path), tracer.own.path == path
+            yield int(path), tracer.optics.own.path == path
 
 
 def _all_visible(tracer: Tracer, flow: FloatArray) -> Motion:

@@ -83,7 +83,7 @@ def exact_flow(
     if hits2 is not None:
         for number, hits, positions in (("1", hits1, positions1), ("2", hits2, positions2)):
             if depth:
-                depths = optics.depth(hits.interpolate(triangles, positions), view.own.path)
+                depths = optics.depth(hits.interpolate(triangles, positions), optics.own.path)
                 extras[f"depth{number}.Z"] = view.image(depths)
             if normal:
                 smooth = hits.interpolate(triangles, -vertex_normals(positions, triangles))

@@ -1,7 +1,7 @@
 """One camera that looks at the states of one surface: what does not change between them, and what a state has shown.
 
-Cached are the rays of the pixel centres, and the last few states' first hits: a trajectory's pairs share their states,
-and each state of a pair is needed in both directions.
+Cached are the last few states' first hits: a trajectory's pairs share their states, and each state of a pair is needed
+in both directions.
 """
 
 from collections import deque
@@ -46,14 +46,10 @@ class View:
     height: int
 
     @cached_property
-    def own(self) -> Rays:
-        return self.optics.look(self.optics.centres)
-
-    @cached_property
     def _is_whole(self) -> bool:
         """Whether every place in the image looks straight at the window."""
         corners = np.array([(x, y) for x in (0.0, self.width) for y in (0.0, self.height)])
-        return bool((self.own.path == 0).all() and (self.optics.look(corners).path == 0).all())
+        return bool((self.optics.own.path == 0).all() and (self.optics.look(corners).path == 0).all())
 
     @cached_property
     def _boundary(self) -> Triangles:
@@ -68,20 +64,20 @@ class View:
         for known, hits in self._seen:
             if known is positions:
                 return hits
-        hits = trace(positions, self.surface.triangles, self.own.origins, self.own.directions)
+        hits = trace(positions, self.surface.triangles, self.optics.own.origins, self.optics.own.directions)
         self._seen.append((positions, hits))
         return hits
 
     def motion(self, hits: Hits, target: Points) -> tuple[FlowArray, FlowArray]:
         """Flow (H, W, 2) and visibility (H, W) of the hits' material points when the surface moves to `target`."""
         points = hits.interpolate(self.surface.triangles, target)
-        pixels = self.optics.project(points, self.own.path)
+        pixels = self.optics.project(points, self.optics.own.path)
         x, y = pixels[:, 0], pixels[:, 1]
         with np.errstate(invalid="ignore"):
             visible: BoolArray = (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
         doubtful = self._may_be_hidden(pixels, visible, target)
         rays = self.optics.look(pixels[doubtful])
-        same = rays.path == self.own.path[doubtful]
+        same = rays.path == self.optics.own.path[doubtful]
         visible[doubtful] = same & self._is_unobstructed(points[doubtful], rays, target)
         flow = (pixels - self.optics.centres).astype(np.float32).reshape(self.height, self.width, 2)
         return flow, self.image(visible)

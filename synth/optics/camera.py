@@ -5,7 +5,7 @@ point may be seen in several places of one image, one for each path; a camera wi
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,6 +63,7 @@ class Optics:
     size: tuple[int, int]
 
     @staticmethod
+    @lru_cache(maxsize=4)  # each holds the rays of its pixels, which trajectories of a sensor share
     def of(sensor: Sensor) -> "Optics":
         """The optics of a sensor's main camera (`Sensor.views` gives the others); InputError for a view along x."""
         camera = sensor.camera
@@ -79,6 +80,11 @@ class Optics:
         """(n, 2) centres of all pixels, row by row."""
         row, column = np.mgrid[: self.size[1], : self.size[0]]
         return np.column_stack([column.ravel() + 0.5, row.ravel() + 0.5])
+
+    @cached_property
+    def own(self) -> Rays:
+        """Of the centres of all pixels."""
+        return self.look(self.centres)
 
     @cached_property
     def poses(self) -> tuple[Pose, ...]:

@@ -13,6 +13,8 @@ from synth.arrays import BoolArray, FloatArray, Pixels, Points
 _RELATIVE_STEP = 1e-9
 """Newton's error after a relative step s is of order s²; below 1e-9 the next iterate is exact to rounding."""
 _MAX_ITERATIONS = 40
+_MAX_HALVINGS = 8
+"""Of a step, where the residual would grow."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,35 +76,39 @@ class PinholeLens:
         """Newton with step halving; (n, 2) -> (n, 2), NaN where the target has no preimage inside the field."""
         if not any(self.distortion):
             return target
-        tx, ty = target[:, 0], target[:, 1]
+        tx, ty = np.ascontiguousarray(target.T)
         limit = self.field_limit
         # Start inside the field: pixels far outside a barrel lens' image circle would start beyond it.
         shrink = np.minimum(1, 0.9 * np.sqrt(limit / np.maximum(tx * tx + ty * ty, 1e-300)))
         x, y = tx * shrink, ty * shrink
-        error = self._error(x, y, target)
+        left_x, left_y = self._residual(x, y, tx, ty)
+        error = np.hypot(left_x, left_y)
         for _ in range(_MAX_ITERATIONS):
             xx, xy, yy = self._distortion_jacobian(x, y)
-            fx, fy = self._distort(x, y)
             determinant = xx * yy - xy * xy
             with np.errstate(divide="ignore", invalid="ignore"):
-                dx = (yy * (tx - fx) - xy * (ty - fy)) / determinant
-                dy = (xx * (ty - fy) - xy * (tx - fx)) / determinant
+                dx = (yy * left_x - xy * left_y) / determinant
+                dy = (xx * left_y - xy * left_x) / determinant
             dx, dy = np.nan_to_num(dx), np.nan_to_num(dy)
-            scale = np.ones_like(dx)
-            for _halving in range(8):  # only where the residual would grow
-                worse = self._error(x + scale * dx, y + scale * dy, target) > error
-                if not worse.any():
+            scale: FloatArray | float = 1.0
+            for halvings in range(_MAX_HALVINGS + 1):
+                new_x, new_y = x + scale * dx, y + scale * dy
+                left_x, left_y = self._residual(new_x, new_y, tx, ty)
+                new_error = np.hypot(left_x, left_y)
+                worse = new_error > error
+                if halvings == _MAX_HALVINGS or not worse.any():
                     break
-                scale[worse] /= 2
-            x, y = x + scale * dx, y + scale * dy
-            error = self._error(x, y, target)
+                scale = np.where(worse, scale / 2, scale)
+            x, y, error = new_x, new_y, new_error
             if not np.any(np.hypot(dx, dy) > _RELATIVE_STEP * (1 + np.hypot(x, y))):
                 break
         return np.where(self._is_inside(x, y, error)[:, None], np.column_stack([x, y]), np.nan)
 
-    def _error(self, x: FloatArray, y: FloatArray, target: FloatArray) -> FloatArray:
-        fx, fy = self._distort(x, y)
-        return np.hypot(fx - target[:, 0], fy - target[:, 1])
+    def _residual(
+        self, x: FloatArray, y: FloatArray, target_x: FloatArray, target_y: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        distorted_x, distorted_y = self._distort(x, y)
+        return target_x - distorted_x, target_y - distorted_y
 
     def _is_inside(self, x: FloatArray, y: FloatArray, error: FloatArray) -> BoolArray:
         """Converged (to rounding of a coordinate of order 1) and on the branch of the lens model that is one-to-one."""

@@ -7,6 +7,7 @@ Its first size runs parallel to the contact face, its second at right angles to 
 that shines straight down has its first size along x. Its back is black.
 """
 
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from synth.arrays import FloatArray
 from synth.errors import InputError
 from synth.optics import Optics
 from synth.render.gel_mesh import MIRROR
-from synth.scene import Light, Sensor
+from synth.scene import Light, Sensor, Vector3
 
 
 def emitters(lights: tuple[Light, ...], mi: Any) -> dict[str, Any]:
@@ -74,3 +75,9 @@ def check_view(sensor: Sensor) -> None:
                 f"sensor.lights[{i}] at position_mm = {list(light.position_mm)} stands between the camera and the gel "
                 f"(at pixel {x:.0f}, {y:.0f}): move it out of the camera's view"
             )
+
+
+def reaches(light: Light, size_mm: Vector3) -> bool:
+    """Whether a light shines, and not away from all of a box twice as long as the gel, in which its surface moves."""
+    corners = np.array(list(product((-1, 1), repeat=3))) * size_mm - light.position_mm
+    return light.power > 0 and bool(np.any(corners @ np.subtract(light.aim_mm, light.position_mm) > 0))

@@ -24,7 +24,7 @@ from synth.scene import Light
 
 _DEGREE = 9
 """Of the polynomial: it errs by 2e-8, less than float32's rounding."""
-_STRATA = 4
+_STRATA = 2
 """Points of a mirror image for each of a pixel's samples, spread along its first side."""
 
 

@@ -8,14 +8,15 @@ A Lambertian surface's radiance is its albedo ρ times its irradiance E over π,
   every sample of every pixel: neither has any noise but the pixel filter's.
 - B_l, what of it the gel or another light blocks, is sampled: one shadow ray for each light and sample. It is a
   control variate: nothing blocked, no noise, and the expectation is path tracing's.
-- From faces of which all pilot rays reached a light, and from their neighbours, no shadow ray is traced to it.
+- From faces of which all pilot rays reached a light, and from their neighbours, no shadow ray is traced to it. Pilots
+  to a light that gives next to nothing there count as having reached it.
 - E_bounced, light that the gel reflects onto itself, does not depend on the view. It is sampled at points of the gel's
   faces and projected (L²) onto functions that are linear on each face, or constant where few of the face's pilots saw
   gel: such faces get little, and its mean is less noisy than its slope. Where no pilot at all saw gel there is none.
   In a round gel, all of which sees itself, it is smooth and is fitted (`synth.render.cavity_light`).
 - The lights l include their mirror images behind the window (`synth.render.window_images`), which have no closed form.
 - E_returned, light that the gel sends to the window and gets back, is smooth. It is n · V with the normal n, and V is
-  fitted to sampled paths as polynomials of the place on the pad.
+  fitted to sampled paths as polynomials of the place on the pad; like the normal it is interpolated between vertices.
 
 What remains of systematic error: shadows that all pilot rays of a neighbourhood missed, and how bounced light departs
 from linear within one triangle; docs/reports/light.md measures both. Random numbers are the sampler's, sums are of
@@ -24,15 +25,18 @@ fixed order: the same seed gives the same bits.
 
 import math
 from dataclasses import dataclass
+from functools import reduce
+from operator import or_
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.arrays import BoolArray, Image
+from synth.arrays import BoolArray, FloatArray, Image
 from synth.errors import InputError
 from synth.render.cavity_light import across_cavity
 from synth.render.gel_mesh import GelMesh
+from synth.render.lights import reaches
 from synth.render.polygon_light import ImageLight, PolygonLight
 from synth.render.variant import Variant
 from synth.render.window_images import image_lights, reflectance, reflecting_plane
@@ -48,6 +52,10 @@ _DEGREE = 4
 """Of the polynomials for light that comes back from the window: its path is longer than the pad is thick, so smooth."""
 _RETURNED = 2**17
 """Paths by the window or across a round gel, to which polynomials are fitted; more where there are many faces."""
+_CLEARANCE_MM = 1e-3
+"""Above the gel, where rays to it may end: far more than rounding."""
+_NEGLIGIBLE = 1e-4
+"""Of all light on a point: shadows of so little are not sampled."""
 _SHIFT = (0.7548776662466927, 0.5698402909980532)
 """Of one light's shadow rays against the one before's: R2 sequence (Roberts 2018), on a torus to keep the strata."""
 
@@ -104,9 +112,10 @@ class SeparatedLight:
         index = sensor.window.refractive_index
         # Used only where the window reflects.
         self._face, self._index = dr.opaque(mi.Float, reflecting_plane(sensor) or 0), dr.opaque(mi.Float, index)
-        self._lights = [PolygonLight(light, mi) for light in sensor.lights if light.power > 0]
-        self._lights += [ImageLight(light, index, mi) for light in image_lights(sensor) if light.power > 0]
-        self._half = [dr.opaque(mi.Float, size / 2) for size in sensor.gel.size_mm[:2]]
+        size = sensor.gel.size_mm
+        self._lights = [PolygonLight(light, mi) for light in sensor.lights if reaches(light, size)]
+        self._lights += [ImageLight(light, index, mi) for light in image_lights(sensor) if reaches(light, size)]
+        self._half = [dr.opaque(mi.Float, side / 2) for side in size[:2]]
 
     def prepare(self, mesh: GelMesh, primary: int, seed: int) -> None:
         """Pilots and bounced light for the gel as it lies now, for all cameras.
@@ -117,18 +126,21 @@ class SeparatedLight:
             seed: non-negative, below 2^32.
         """
         mi = self._mi
-        triangles = mesh.surface.triangles
-        self._corners = [mi.UInt32(column) for column in np.ascontiguousarray(mesh.faces().reshape(-1, 3).T)]
+        triangles = mesh.faces().reshape(-1, 3)
+        self._corners = [mi.UInt32(column) for column in np.ascontiguousarray(triangles.T)]
         met = self._pilots(len(triangles), seed)
         touched: BoolArray = np.zeros((len(mesh.surface.material), len(self._lights)), dtype=bool)
         for corner in triangles.T:
             np.logical_or.at(touched, corner, met[:, :-1] > 0)
         near: BoolArray = np.any(touched[triangles], axis=1)
         self._shaded = [mi.Bool(np.ascontiguousarray(near[:, number])) for number in range(len(self._lights))]
-        self._any_bounce = self._depth > 2 and bool(met[:, -1].any())
-        if self._any_bounce:
-            self._gather(met[:, -1] >= _MANY, primary, seed)
-        self._returned = self._fit_returned(len(triangles), seed) if self._image and self._depth > 2 else None
+        indirect = []
+        if self._depth > 2 and met[:, -1].any():
+            indirect.append(self._gather(triangles, met[:, -1] >= _MANY, primary, seed))
+        if self._depth > 2 and self._image:
+            indirect.append(self._returned(triangles, seed))
+        values = np.moveaxis(np.sum(indirect, axis=0), 0, -1) if indirect else np.zeros((0, 3, 0), dtype=np.float32)
+        self._indirect = [[mi.Float(np.ascontiguousarray(corner)) for corner in channel] for channel in values]
 
     def radiance(self, ray: Any, sampler: Any, active: Any) -> tuple[list[Any], Any]:
         """Radiance (channels of mi.Float) along rays from the camera, and whether they meet the gel (mi.Bool)."""
@@ -140,17 +152,10 @@ class SeparatedLight:
         seen = active & at.is_valid() & (hit.shape == mi.ShapePtr(self._gel))
         normal = dr.mulsign(mi.Vector3f(at.sh_frame.n), at.wi.z)  # the coating reflects on either side
         light = self._direct(at, normal, hit.prim_index, sampler.next_2d(), seen)
-        if self._any_bounce:
-            weights = (1 - hit.prim_uv.x - hit.prim_uv.y, hit.prim_uv.x, hit.prim_uv.y)
-            for channel, values in enumerate(self._bounced):
-                for value, weight in zip(values, weights, strict=True):
-                    light[channel] += dr.gather(mi.Float, value, hit.prim_index, seen) * weight
-        if self._returned is not None:
-            terms = self._terms(at.p, normal)
-            for channel, values in enumerate(self._returned):
-                light[channel] += dr.maximum(
-                    sum(dr.gather(mi.Float, values, k) * term for k, term in enumerate(terms)), 0
-                )
+        weights = (1 - hit.prim_uv.x - hit.prim_uv.y, hit.prim_uv.x, hit.prim_uv.y)
+        for channel, values in enumerate(self._indirect):
+            for value, weight in zip(values, weights, strict=True):
+                light[channel] += dr.gather(mi.Float, value, hit.prim_index, seen) * weight
         albedo = self._albedo(at, seen)
         return [dr.select(seen, a * e / dr.pi, 0) for a, e in zip(albedo, light, strict=True)], seen
 
@@ -161,21 +166,19 @@ class SeparatedLight:
         mi = self._mi
         total = [mi.Float(0) for _ in range(self._channels)]
         for number, (light, shaded) in enumerate(zip(self._lights, self._shaded, strict=True)):
-            blocked = self._blocked(
-                light, number, at, normal, offset, active & dr.gather(mi.Bool, shaded, face, active)
-            )
-            value = light.whole(at.p, normal, offset) - blocked
+            asked = active & dr.gather(mi.Bool, shaded, face, active)
+            sampled, blocked = self._sampled(light, number, at, normal, offset, asked)
+            value = light.whole(at.p, normal, offset) - dr.select(blocked, sampled, 0)
             total = [dr.fma(value, color, sum_) for color, sum_ in zip(light.radiance, total, strict=False)]
         return total
 
-    def _blocked(self, light: PolygonLight, number: int, at: Any, normal: Any, offset: Any, active: Any) -> Any:
-        """Irradiance per radiance that a point of the light would give if its ray were not blocked, else 0."""
+    def _sampled(self, light: PolygonLight, number: int, at: Any, normal: Any, offset: Any, active: Any) -> Any:
+        """Irradiance per radiance that a point of the light gives unless its ray is blocked, and whether it is."""
         import drjit as dr
 
         moved = [offset.x + number * _SHIFT[0] % 1, offset.y + number * _SHIFT[1] % 1]
         place, value = light.sample(at.p, normal, self._mi.Point2f(*(x - dr.floor(x) for x in moved)))
-        active = active & (value > 0)
-        return dr.select(self._scene.ray_test(at.spawn_ray_to(place), active), value, 0)
+        return value, self._scene.ray_test(at.spawn_ray_to(place), active & (value > 0))
 
     def _albedo(self, at: Any, active: Any) -> list[Any]:
         color = self._reflection.eval_diffuse_reflectance(at, active)
@@ -189,56 +192,65 @@ class SeparatedLight:
         sampler = self._sampler(PILOTS, faces, seed, 0)
         points = self._points(dr.arange(mi.UInt32, faces), PILOTS, sampler)
         offset, everywhere = sampler.next_2d(), mi.Bool(True)
-        met = [
-            self._blocked(light, number, points.at, points.normal, offset, everywhere) > 0
+        sampled = [
+            self._sampled(light, number, points.at, points.normal, offset, everywhere)
             for number, light in enumerate(self._lights)
         ]
-        met.append(self._onward(points.at, points.normal, sampler.next_2d(), everywhere)[2])  # the image is no bounce
+        given = [[value * c for c in light.radiance] for light, (value, _) in zip(self._lights, sampled, strict=True)]
+        least = [_NEGLIGIBLE * sum(channel) for channel in zip(*given, strict=True)]
+        counted = [reduce(or_, (c > limit for c, limit in zip(one, least, strict=True))) for one in given]
+        met = [blocked & counts for (_, blocked), counts in zip(sampled, counted, strict=True)]
+        met.append(self._onward(points.at, points.normal, sampler.next_2d())[2])  # the image is no bounce
         counts = [dr.select(one, mi.UInt32(1), 0) for one in met]
         dr.eval(counts)
         return np.stack([np.array(dr.block_sum(count, PILOTS)) for count in counts], axis=-1)
 
-    def _gather(self, often: BoolArray, rays: int, seed: int) -> None:
-        """Bounced light on all faces from about so many rays; linear on faces where `often` (faces,)."""
+    def _gather(self, triangles: NDArray[np.uint32], often: BoolArray, rays: int, seed: int) -> Image:
+        """Bounced light (faces, channels, corners) from about so many rays; linear on faces where `often` (faces,)."""
         import drjit as dr
 
         mi, faces = self._mi, len(often)
         count = _grid(_RETURNED if self._is_round else rays, faces)
         sampler = self._sampler(count, faces, seed, 1)
         points = self._points(dr.arange(mi.UInt32, faces), count, sampler)
-        values = _projected(self._bounces(points, sampler, False), points.weights, count, often)
-        if self._is_round:
-            positions, normals = (
-                np.array(self._parameters[f"gel.vertex_{name}"], dtype=np.float64).reshape(-1, 3)
-                for name in ("positions", "normals")
-            )
-            corners = np.stack([np.array(column) for column in self._corners], axis=1)
-            values = across_cavity(values.mean(axis=2), positions, normals, corners)
-        self._bounced = [[mi.Float(np.ascontiguousarray(one)) for one in rows.T] for rows in values.swapaxes(0, 1)]
+        top = np.array(self._parameters["gel.vertex_positions"])[2::3].max() + _CLEARANCE_MM
+        values = self._bounces(points, sampler, dr.opaque(mi.Float, float(top)))
+        projected = _projected(values, points.weights, count, often)
+        if not self._is_round:
+            return projected
+        positions, normals = (
+            np.array(self._parameters[f"gel.vertex_{name}"], dtype=np.float64).reshape(-1, 3)
+            for name in ("positions", "normals")
+        )
+        return across_cavity(projected.mean(axis=2), positions, normals, triangles)
 
-    def _fit_returned(self, faces: int, seed: int) -> list[Any]:
-        """Coefficients (channels of mi.Float) of what the gel sends to the window and gets back, in `_terms`."""
+    def _returned(self, triangles: NDArray[np.uint32], seed: int) -> Image:
+        """What the gel sends to the window and gets back: (faces, channels, corners)."""
         import drjit as dr
 
+        mi, faces = self._mi, len(triangles)
         count = _grid(_RETURNED, faces)
         sampler = self._sampler(count, faces, seed, 2)
-        points = self._points(dr.arange(self._mi.UInt32, faces), count, sampler)
-        values = self._bounces(points, sampler, True)
-        terms = self._terms(points.at.p, points.normal)
-        dr.eval(values, terms)
-        design = np.stack([np.array(term) for term in terms], axis=1).astype(np.float64)
-        right = np.stack([np.array(value) for value in values], axis=1).astype(np.float64)
+        points = self._points(dr.arange(mi.UInt32, faces), count, sampler)
+        right = _columns(self._bounces(points, sampler))
+        design = self._terms(points.at.p, points.normal)
         found = np.linalg.lstsq(design.T @ design, design.T @ right, rcond=None)[0]
-        return [self._mi.Float(np.ascontiguousarray(column, dtype=np.float32)) for column in found.T]
+        corners = dr.unravel(mi.Point3f, self._parameters["gel.vertex_positions"])
+        normals = -dr.unravel(mi.Vector3f, self._parameters["gel.vertex_normals"])
+        values = np.maximum(self._terms(corners, normals) @ found, 0)
+        return np.asarray(values[triangles].swapaxes(1, 2), dtype=np.float32)
 
-    def _terms(self, point: Any, normal: Any) -> list[Any]:
-        """Monomials of the place on the pad up to a degree, times each component of the normal."""
+    def _terms(self, point: Any, normal: Any) -> FloatArray:
+        """Columns: monomials of the place on the pad up to a degree, times each component of the normal."""
         x, y = (coordinate / half for coordinate, half in zip((point.x, point.y), self._half, strict=True))
         powers = [x**i * y**j for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
-        return [power * component for power in powers for component in (normal.x, normal.y, normal.z)]
+        return _columns([power * component for power in powers for component in (normal.x, normal.y, normal.z)])
 
-    def _bounces(self, points: _Points, sampler: Any, by_window: bool) -> list[Any]:
-        """Irradiance (channels) from the gel itself, one path from each point; its first step by the window, or not."""
+    def _bounces(self, points: _Points, sampler: Any, top: Any | None = None) -> list[Any]:
+        """Irradiance (channels) from the gel itself, one path from each point.
+
+        Its first step goes by the window, or straight: then `top` is a height that the gel does not reach.
+        """
         import drjit as dr
 
         mi = self._mi
@@ -247,12 +259,11 @@ class SeparatedLight:
         share = [dr.full(mi.Float, 1, count) for _ in range(self._channels)]
         start = dr.arange(mi.UInt32, count)
         for step in range(self._depth - 2):
-            ray, hit, straight, mirrored = self._onward(
-                at, normal, dr.gather(mi.Point2f, sampler.next_2d(), start), True
-            )
-            active = straight | mirrored if step else mirrored if by_window else straight
             offset = dr.gather(mi.Point2f, sampler.next_2d(), start)
-            dr.eval(ray, hit, active, mirrored, offset, start, share)  # each gather alone would trace everything anew
+            ray, hit, straight, mirrored = self._onward(at, normal, offset, None if step else top)
+            active = straight | mirrored if step else mirrored if top is None else straight
+            offset = dr.gather(mi.Point2f, sampler.next_2d(), start)
+            dr.eval(ray, hit, active, mirrored, offset)  # each gather alone would trace everything anew
             onward = dr.compress(active)  # few paths meet the gel: only these go on
             if dr.width(onward) == 0:
                 break
@@ -272,12 +283,16 @@ class SeparatedLight:
                 dr.scatter_add(sum_, s * e, start)
         return total
 
-    def _onward(self, at: Any, normal: Any, offset: Any, active: Any) -> tuple[Any, Any, Any, Any]:
-        """Rays in the cosine's distribution, their next hits; whether these are on the lit side of gel, or image."""
+    def _onward(self, at: Any, normal: Any, offset: Any, top: Any | None = None) -> tuple[Any, Any, Any, Any]:
+        """Rays in the cosine's distribution, up to `top`; their next hits; whether on the lit side of gel, or image."""
+        import drjit as dr
+
         mi = self._mi
         ray = at.spawn_ray(mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(offset)))
-        hit = self._scene.ray_intersect_preliminary(ray, active=active)
-        nearest = hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
+        if top is not None:
+            ray.maxt = dr.select(ray.d.z > 0, (top - at.p.z) / ray.d.z, dr.inf)
+        hit = self._scene.ray_intersect_preliminary(ray)
+        nearest = hit.compute_surface_interaction(ray, mi.RayFlags.ShadingFrame)
         lit = nearest.is_valid() & (nearest.wi.z < 0)
         image = lit & (hit.shape == mi.ShapePtr(self._image)) if self._image else mi.Bool(False)
         return ray, hit, lit & (hit.shape == mi.ShapePtr(self._gel)), image
@@ -306,6 +321,14 @@ class SeparatedLight:
         at.n = mi.Normal3f(dr.normalize(dr.cross(b - a, c - a)))
         normal = sum(dr.gather(mi.Vector3f, normals, i) * w for i, w in zip(corners, weights, strict=True))
         return _Points(at, -dr.normalize(normal), weights)  # vertex normals point out of the gel
+
+
+def _columns(values: list[Any]) -> FloatArray:
+    """Arrays of Dr.Jit as the columns of a matrix, evaluated together."""
+    import drjit as dr
+
+    dr.eval(values)
+    return np.stack([np.array(value) for value in values], axis=1).astype(np.float64)
 
 
 def _grid(rays: int, faces: int) -> int:

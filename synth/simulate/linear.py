@@ -12,6 +12,7 @@ along with it (`LinearSolver`).
 import ctypes
 import weakref
 from functools import cache
+from importlib.metadata import PackageNotFoundError, files
 from typing import Any, Protocol
 
 import numpy as np
@@ -165,10 +166,17 @@ def has_pardiso() -> bool:
 
 @cache
 def _mkl() -> Any:
-    """MKL as pypardiso finds it (it searches the whole environment: half a second), one thread, reproducible."""
-    from pypardiso.pardiso_wrapper import PyPardisoSolver
+    """MKL, one thread, reproducible: pip's, or what pypardiso finds, which searches the whole environment twice."""
+    try:
+        packaged = [file.locate() for file in files("mkl") or [] if "mkl_rt" in file.name]
+    except PackageNotFoundError:
+        packaged = []
+    if packaged:
+        library = ctypes.CDLL(str(packaged[0]))
+    else:
+        from pypardiso.pardiso_wrapper import PyPardisoSolver
 
-    library = PyPardisoSolver().libmkl
+        library = PyPardisoSolver().libmkl
     library.MKL_Set_Num_Threads(1)
     library.MKL_CBWR_Set(2)  # MKL_CBWR_AUTO: same result whatever the memory alignment
     return library

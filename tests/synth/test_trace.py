@@ -171,7 +171,7 @@ def test_a_view_of_something_else_is_refused_and_mirrors_are_always_looked_at() 
     view, same = View(SURFACE, camera, *SIZE), (SURFACE.material, SURFACE.material)
     twin = GelSurface(ContactFaces(SURFACE.coarse.nodes, SURFACE.coarse.faces), SURFACE.subdivisions)
     exact_flow(SURFACE, *same, camera, *SIZE, view=view)
-    others = [(twin, *same, camera, *SIZE), (SURFACE, *same, optics(), *SIZE)]
+    others = [(twin, *same, camera, *SIZE), (SURFACE, *same, optics(index=1.2), *SIZE)]
     others += [(SURFACE, *same, camera, *size) for size in ((WIDTH - 1, HEIGHT), (WIDTH, HEIGHT - 1))]
     for other in others:
         with pytest.raises(ValueError, match="another surface, camera or size"):
