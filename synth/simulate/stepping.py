@@ -45,8 +45,9 @@ FAILURES = 3
 where a whole one upsets Newton's method a part of it does not."""
 MAX_PENETRATION = 0.02
 """Share of the press depth (at least 0.1 mm) by which a triangle mesh may penetrate in a corrected state. Where it is
-deeper, passes go on to MAX_DEEP_UPDATES or DEEP_FAILURES, and the press ends if that does not do."""
-MAX_DEEP_UPDATES, DEEP_FAILURES = 6.0, 9
+deeper, passes go on to MAX_DEEP_UPDATES or DEEP_FAILURES, and the press ends if that does not do. After FAILURES shares
+do not grow again, and all passes count as failures."""
+MAX_DEEP_UPDATES, DEEP_FAILURES = 6.0, 16
 MULTIPLIER_TOLERANCE = 20.0
 """Tolerance of states that multipliers are updated from, over the full one: two updates do not forget what they began
 with."""
@@ -235,7 +236,8 @@ class Stepper:
             reach = MAX_CORRECTION_RATIO * self.system.deepest()
             better = self._solved_again(solution, tolerance, self.options.correction_iterations, reach)
             if better.converged:
-                solution, done, share = better, done + share, min(1.0, 2 * share)
+                solution, done = better, done + share
+                share, failures = (min(1.0, 2 * share), failures) if failures < FAILURES else (share, failures + 1)
             else:
                 restore_contact(self.system.contact, before)
                 self.system.residual(solution.state, self.indenter)

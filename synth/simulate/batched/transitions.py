@@ -122,7 +122,10 @@ def finish_solve(lanes: Lanes, presses: Presses, settings: Settings):
     if lanes.stage[s] == phases.CORRECTION:
         if phase == phases.SOLVED:
             lanes.done[s] = lanes.done[s] + lanes.share[s]
-            lanes.share[s] = wp.min(ONE, wp.float64(2.0) * lanes.share[s])
+            if lanes.failures[s] < FAILURES:
+                lanes.share[s] = wp.min(ONE, wp.float64(2.0) * lanes.share[s])
+            else:
+                lanes.failures[s] = lanes.failures[s] + 1
             lanes.phase[s] = phases.CORRECTING
         else:
             lanes.failures[s] = lanes.failures[s] + 1
