@@ -47,7 +47,7 @@ _STEP = 4
 _DEGREE = 4
 """Of the polynomials for light that comes back from the window: its path is longer than the pad is thick, so smooth."""
 _RETURNED = 2**17
-"""Paths by the window or across a round gel, to which polynomials are fitted; more where there are many faces."""
+"""Paths by the window, to which they are fitted; more where there are many faces."""
 _SHIFT = (0.7548776662466927, 0.5698402909980532)
 """Of one light's shadow rays against the one before's: R2 sequence (Roberts 2018), on a torus to keep the strata."""
 
@@ -203,7 +203,7 @@ class SeparatedLight:
         import drjit as dr
 
         mi, faces = self._mi, len(often)
-        count = _grid(_RETURNED if self._is_round else rays, faces)
+        count = _grid(rays, faces)
         sampler = self._sampler(count, faces, seed, 1)
         points = self._points(dr.arange(mi.UInt32, faces), count, sampler)
         values = _projected(self._bounces(points, sampler, False), points.weights, count, often)
