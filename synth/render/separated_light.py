@@ -51,7 +51,7 @@ _STEP = 4
 _DEGREE = 4
 """Of the polynomials for light that comes back from the window: its path is longer than the pad is thick, so smooth."""
 _RETURNED = 2**17
-"""Paths by the window or across a round gel, to which polynomials are fitted; more where there are many faces."""
+"""Paths by the window, to which they are fitted; more where there are many faces."""
 _CLEARANCE_MM = 1e-3
 """Above the gel, where rays to it may end: far more than rounding."""
 _NEGLIGIBLE = 1e-4
@@ -210,7 +210,7 @@ class SeparatedLight:
         import drjit as dr
 
         mi, faces = self._mi, len(often)
-        count = _grid(_RETURNED if self._is_round else rays, faces)
+        count = _grid(rays, faces)
         sampler = self._sampler(count, faces, seed, 1)
         points = self._points(dr.arange(mi.UInt32, faces), count, sampler)
         top = np.array(self._parameters["gel.vertex_positions"])[2::3].max() + _CLEARANCE_MM

@@ -118,13 +118,13 @@ def test_light_bounced_in_a_hemisphere_is_that_of_an_integrating_sphere() -> Non
     within = sensor(SPHERE, index=1.0, lights=(light,), fx=30.0, fy=30.0, position_mm=(-3.0, 0.0, 11.0))
     within = within.model_copy(update={"gel": gel})
     first, second = (
-        Renderer(within, Render(samples_per_pixel=16, light="separated", max_depth=depth), surface, plain(albedo), FAST)
+        Renderer(within, Render(samples_per_pixel=64, light="separated", max_depth=depth), surface, plain(albedo), FAST)
         for depth in (2, 3)
     )
     direct = first.radiance(surface.material, 1)[..., 0]
     bounced = (second.radiance(surface.material, 1)[..., 0] - direct)[direct > 0]
     expected = albedo**2 * power / (4 * np.pi * RADIUS**2) / np.pi
-    # 2^17 paths, whose values scatter by some twice their mean: 0.6 % of the mean, and for up to 75 independent terms
+    # 2^18 paths, whose values scatter by some twice their mean: 0.4 % of the mean, and for up to 75 independent terms
     # sqrt(75) times that at a place.
     assert np.mean(bounced) == pytest.approx(expected, rel=0.02)
     assert np.sqrt(np.mean((bounced / expected - 1) ** 2)) < 0.05
