@@ -16,7 +16,7 @@ A Lambertian surface's radiance is its albedo ρ times its irradiance E over π,
   In a round gel, all of which sees itself, it is smooth and is fitted (`synth.render.cavity_light`).
 - The lights l include their mirror images behind the window (`synth.render.window_images`), which have no closed form.
 - E_returned, light that the gel sends to the window and gets back, is smooth. It is n · V with the normal n, and V is
-  fitted to sampled paths as polynomials of the place on the pad; like the normal it is interpolated between vertices.
+  fitted to sampled paths as polynomials of the place on the pad.
 
 What remains of systematic error: shadows that all pilot rays of a neighbourhood missed, and how bounced light departs
 from linear within one triangle; docs/reports/light.md measures both. Random numbers are the sampler's, sums are of
@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.arrays import BoolArray, FloatArray, Image
+from synth.arrays import BoolArray, Image
 from synth.errors import InputError
 from synth.render.cavity_light import across_cavity
 from synth.render.gel_mesh import GelMesh
@@ -134,13 +134,10 @@ class SeparatedLight:
             np.logical_or.at(touched, corner, met[:, :-1] > 0)
         near: BoolArray = np.any(touched[triangles], axis=1)
         self._shaded = [mi.Bool(np.ascontiguousarray(near[:, number])) for number in range(len(self._lights))]
-        indirect = []
-        if self._depth > 2 and met[:, -1].any():
-            indirect.append(self._gather(triangles, met[:, -1] >= _MANY, primary, seed))
-        if self._depth > 2 and self._image:
-            indirect.append(self._returned(triangles, seed))
-        values = np.moveaxis(np.sum(indirect, axis=0), 0, -1) if indirect else np.zeros((0, 3, 0), dtype=np.float32)
-        self._indirect = [[mi.Float(np.ascontiguousarray(corner)) for corner in channel] for channel in values]
+        self._any_bounce = self._depth > 2 and bool(met[:, -1].any())
+        if self._any_bounce:
+            self._gather(triangles, met[:, -1] >= _MANY, primary, seed)
+        self._returned = self._fit_returned(len(triangles), seed) if self._image and self._depth > 2 else None
 
     def radiance(self, ray: Any, sampler: Any, active: Any) -> tuple[list[Any], Any]:
         """Radiance (channels of mi.Float) along rays from the camera, and whether they meet the gel (mi.Bool)."""
@@ -152,10 +149,17 @@ class SeparatedLight:
         seen = active & at.is_valid() & (hit.shape == mi.ShapePtr(self._gel))
         normal = dr.mulsign(mi.Vector3f(at.sh_frame.n), at.wi.z)  # the coating reflects on either side
         light = self._direct(at, normal, hit.prim_index, sampler.next_2d(), seen)
-        weights = (1 - hit.prim_uv.x - hit.prim_uv.y, hit.prim_uv.x, hit.prim_uv.y)
-        for channel, values in enumerate(self._indirect):
-            for value, weight in zip(values, weights, strict=True):
-                light[channel] += dr.gather(mi.Float, value, hit.prim_index, seen) * weight
+        if self._any_bounce:
+            weights = (1 - hit.prim_uv.x - hit.prim_uv.y, hit.prim_uv.x, hit.prim_uv.y)
+            for channel, values in enumerate(self._bounced):
+                for value, weight in zip(values, weights, strict=True):
+                    light[channel] += dr.gather(mi.Float, value, hit.prim_index, seen) * weight
+        if self._returned is not None:
+            terms = self._terms(at.p, normal)
+            for channel, values in enumerate(self._returned):
+                light[channel] += dr.maximum(
+                    sum(dr.gather(mi.Float, values, k) * term for k, term in enumerate(terms)), 0
+                )
         albedo = self._albedo(at, seen)
         return [dr.select(seen, a * e / dr.pi, 0) for a, e in zip(albedo, light, strict=True)], seen
 
@@ -205,8 +209,8 @@ class SeparatedLight:
         dr.eval(counts)
         return np.stack([np.array(dr.block_sum(count, PILOTS)) for count in counts], axis=-1)
 
-    def _gather(self, triangles: NDArray[np.uint32], often: BoolArray, rays: int, seed: int) -> Image:
-        """Bounced light (faces, channels, corners) from about so many rays; linear on faces where `often` (faces,)."""
+    def _gather(self, triangles: NDArray[np.uint32], often: BoolArray, rays: int, seed: int) -> None:
+        """Bounced light on all faces from about so many rays; linear on faces where `often` (faces,)."""
         import drjit as dr
 
         mi, faces = self._mi, len(often)
@@ -214,37 +218,36 @@ class SeparatedLight:
         sampler = self._sampler(count, faces, seed, 1)
         points = self._points(dr.arange(mi.UInt32, faces), count, sampler)
         top = np.array(self._parameters["gel.vertex_positions"])[2::3].max() + _CLEARANCE_MM
-        values = self._bounces(points, sampler, dr.opaque(mi.Float, float(top)))
-        projected = _projected(values, points.weights, count, often)
-        if not self._is_round:
-            return projected
-        positions, normals = (
-            np.array(self._parameters[f"gel.vertex_{name}"], dtype=np.float64).reshape(-1, 3)
-            for name in ("positions", "normals")
-        )
-        return across_cavity(projected.mean(axis=2), positions, normals, triangles)
+        parts = self._bounces(points, sampler, dr.opaque(mi.Float, float(top)))
+        values = _projected(parts, points.weights, count, often)
+        if self._is_round:
+            positions, normals = (
+                np.array(self._parameters[f"gel.vertex_{name}"], dtype=np.float64).reshape(-1, 3)
+                for name in ("positions", "normals")
+            )
+            values = across_cavity(values.mean(axis=2), positions, normals, triangles)
+        self._bounced = [[mi.Float(np.ascontiguousarray(one)) for one in rows.T] for rows in values.swapaxes(0, 1)]
 
-    def _returned(self, triangles: NDArray[np.uint32], seed: int) -> Image:
-        """What the gel sends to the window and gets back: (faces, channels, corners)."""
+    def _fit_returned(self, faces: int, seed: int) -> list[Any]:
+        """Coefficients (channels of mi.Float) of what the gel sends to the window and gets back, in `_terms`."""
         import drjit as dr
 
-        mi, faces = self._mi, len(triangles)
         count = _grid(_RETURNED, faces)
         sampler = self._sampler(count, faces, seed, 2)
-        points = self._points(dr.arange(mi.UInt32, faces), count, sampler)
-        right = _columns(self._bounces(points, sampler))
-        design = self._terms(points.at.p, points.normal)
+        points = self._points(dr.arange(self._mi.UInt32, faces), count, sampler)
+        values = self._bounces(points, sampler)
+        terms = self._terms(points.at.p, points.normal)
+        dr.eval(values, terms)
+        design = np.stack([np.array(term) for term in terms], axis=1).astype(np.float64)
+        right = np.stack([np.array(value) for value in values], axis=1).astype(np.float64)
         found = np.linalg.lstsq(design.T @ design, design.T @ right, rcond=None)[0]
-        corners = dr.unravel(mi.Point3f, self._parameters["gel.vertex_positions"])
-        normals = -dr.unravel(mi.Vector3f, self._parameters["gel.vertex_normals"])
-        values = np.maximum(self._terms(corners, normals) @ found, 0)
-        return np.asarray(values[triangles].swapaxes(1, 2), dtype=np.float32)
+        return [self._mi.Float(np.ascontiguousarray(column, dtype=np.float32)) for column in found.T]
 
-    def _terms(self, point: Any, normal: Any) -> FloatArray:
-        """Columns: monomials of the place on the pad up to a degree, times each component of the normal."""
+    def _terms(self, point: Any, normal: Any) -> list[Any]:
+        """Monomials of the place on the pad up to a degree, times each component of the normal."""
         x, y = (coordinate / half for coordinate, half in zip((point.x, point.y), self._half, strict=True))
         powers = [x**i * y**j for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
-        return _columns([power * component for power in powers for component in (normal.x, normal.y, normal.z)])
+        return [power * component for power in powers for component in (normal.x, normal.y, normal.z)]
 
     def _bounces(self, points: _Points, sampler: Any, top: Any | None = None) -> list[Any]:
         """Irradiance (channels) from the gel itself, one path from each point.
@@ -321,14 +324,6 @@ class SeparatedLight:
         at.n = mi.Normal3f(dr.normalize(dr.cross(b - a, c - a)))
         normal = sum(dr.gather(mi.Vector3f, normals, i) * w for i, w in zip(corners, weights, strict=True))
         return _Points(at, -dr.normalize(normal), weights)  # vertex normals point out of the gel
-
-
-def _columns(values: list[Any]) -> FloatArray:
-    """Arrays of Dr.Jit as the columns of a matrix, evaluated together."""
-    import drjit as dr
-
-    dr.eval(values)
-    return np.stack([np.array(value) for value in values], axis=1).astype(np.float64)
 
 
 def _grid(rays: int, faces: int) -> int:
