@@ -8,12 +8,13 @@ import sys
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from cyclopts import App, CycloptsError, Parameter
 
 from synth import __version__
-from synth.cli_options import DEFAULT_SCENE, AsJson, Assignments, Dataset, Device, SceneName, whole
+from synth.cli_options import DEFAULT_SCENE, AsJson, Assignments, SceneName, whole
+from synth.commands import export, generate, inspect, plan, simulate, verify
 from synth.errors import InputError
 
 app = App(
@@ -24,75 +25,8 @@ app = App(
     result_action="return_value",
     suppress_keyboard_interrupt=False,
 )
-
-
-@app.command
-def generate(
-    *,
-    scene: SceneName = DEFAULT_SCENE,
-    n: Annotated[int, Parameter(converter=whole(1), help="Samples in the dataset.")] = 8,
-    out: Annotated[
-        str, Parameter(help="Directory or fsspec URL of the dataset; one that holds part of the same job goes on.")
-    ] = "data/demo",
-    seed: Annotated[int, Parameter(converter=whole(0), help="Seed of everything random.")] = 0,
-    assignments: Assignments = None,
-    device: Device = "auto",
-    workers: Annotated[
-        int | None,
-        Parameter(
-            converter=whole(1),
-            help="Processes that make samples on one core each; the same come out. Default: none, this process makes "
-            "them and renders on all cores. With numerics.solver = batched: processes beside the one that simulates "
-            "and renders, 1 for none; default on a GPU: one for every other core.",
-        ),
-    ] = None,
-    ray: Annotated[
-        str | None, Parameter(help="Address of a Ray cluster to make samples on, such as auto; local begins one here.")
-    ] = None,
-    shard: Annotated[
-        str | None,
-        Parameter(
-            help="i/N: make every N-th trajectory from i on (from 0), beside other processes with the same --out."
-        ),
-    ] = None,
-    dry_run: Annotated[bool, Parameter(negative=(), help="Only show the plan.")] = False,
-    as_json: AsJson = False,
-) -> int:
-    """Generates image pairs with exact flow."""
-    from synth.commands import run_generate
-
-    return run_generate(scene, n, out, seed, assignments or [], device, workers, ray, shard, dry_run, as_json)
-
-
-@app.command
-def plan(
-    *,
-    scene: SceneName = DEFAULT_SCENE,
-    n: Annotated[int, Parameter(converter=whole(1), help="Samples to predict time and size for.")] = 8,
-    assignments: Assignments = None,
-    device: Device = "auto",
-    as_json: AsJson = False,
-) -> int:
-    """Shows what will run, what is left out and why, and the predicted time and size."""
-    from synth.commands import run_plan
-
-    return run_plan(scene, n, assignments or [], device, as_json)
-
-
-@app.command
-def simulate(
-    *,
-    scene: SceneName,
-    out: Annotated[Path, Parameter(help="Directory for trajectory.json and a VTU file per state.")],
-    seed: Annotated[int, Parameter(converter=whole(0), help="Seed of the draw.")] = 0,
-    index: Annotated[int, Parameter(converter=whole(0), help="Number of the trajectory that is drawn.")] = 0,
-    assignments: Assignments = None,
-    as_json: AsJson = False,
-) -> int:
-    """Runs the finite-element simulation alone; renders nothing."""
-    from synth.commands import run_simulate
-
-    return run_simulate(scene, out, seed, index, assignments or [], as_json)
+for command in (generate, plan, simulate, inspect, verify, export):
+    app.command(command)
 
 
 @app.command
@@ -133,45 +67,6 @@ def calibrate(
     from synth.calibrate import run_calibrate
 
     return run_calibrate(scene, frames, judge or [], out, assignments or [], spacing_mm, steps, as_json)
-
-
-@app.command
-def inspect(
-    path: Annotated[Path, Parameter(help="A dataset, a sample's folder or one flow EXR.")],
-    /,
-    *,
-    png: Annotated[Path | None, Parameter(help="Write a picture sheet.")] = None,
-    html: Annotated[Path | None, Parameter(help="Write one self-contained page.")] = None,
-    limit: Annotated[int, Parameter(converter=whole(1), help="Most samples of a dataset to look at.")] = 100,
-    as_json: AsJson = False,
-) -> int:
-    """Shows a dataset, a sample or a flow in numbers and pictures."""
-    from synth.commands import run_inspect
-
-    return run_inspect(path, png, html, limit, as_json)
-
-
-@app.command
-def verify(path: Dataset, /, *, as_json: AsJson = False) -> int:
-    """Derives the ground truth again by an independent route; exit status 1 if it disagrees."""
-    from synth.commands import run_verify
-
-    return run_verify(path, as_json)
-
-
-@app.command
-def export(
-    path: Dataset,
-    /,
-    *,
-    format: Annotated[Literal["flo", "kitti", "npz", "webdataset"], Parameter(help="Layout to write.")],
-    out: Annotated[Path, Parameter(help="Directory to write to.")],
-    camera: Annotated[str, Parameter(help="Name of a further camera; default: the main one.")] = "",
-) -> int:
-    """Writes a dataset in another layout."""
-    from synth.commands import run_export
-
-    return run_export(path, format, out, camera)
 
 
 @app.command

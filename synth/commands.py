@@ -1,53 +1,77 @@
-"""What the commands do, between the command line and the stages."""
+"""The commands that make, look at and check datasets. Nothing heavy is imported before one runs."""
+
+from __future__ import annotations
 
 import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import numpy as np
+from cyclopts import Parameter
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from synth.dataset.export import ExportFormat, export
-from synth.dataset.shard import Shard
-from synth.dataset.store import output_of
-from synth.dataset.summary import shares
+from synth.cli_options import DEFAULT_SCENE, AsJson, Assignments, Dataset, Device, SceneName, whole
 from synth.errors import InputError
-from synth.pipeline.generate import Scheduling, Summary
-from synth.pipeline.generate import generate as generate_samples
-from synth.planning import Plan, Prediction, job_variant, plan, predict
-from synth.progress import duration, progress
-from synth.render.variant import Device, Variant
-from synth.scene.template import Template, load_scene
+
+if TYPE_CHECKING:
+    from synth.pipeline.generate import Summary
+    from synth.planning import Prediction
+    from synth.render.variant import Variant
+    from synth.scene.template import Template
 
 _NO_LIMIT = 10_000
 """Characters: wider than any table."""
 
 
-def run_generate(
-    scene: str,
-    n: int,
-    out: str,
-    seed: int,
-    assignments: Sequence[str],
-    device: Device,
-    workers: int | None,
-    ray: str | None,
-    shard: str | None,
-    dry_run: bool,
-    as_json: bool,
+def generate(
+    *,
+    scene: SceneName = DEFAULT_SCENE,
+    n: Annotated[int, Parameter(converter=whole(1), help="Samples in the dataset.")] = 8,
+    out: Annotated[
+        str, Parameter(help="Directory or fsspec URL of the dataset; one that holds part of the same job goes on.")
+    ] = "data/demo",
+    seed: Annotated[int, Parameter(converter=whole(0), help="Seed of everything random.")] = 0,
+    assignments: Assignments = None,
+    device: Device = "auto",
+    workers: Annotated[
+        int | None,
+        Parameter(
+            converter=whole(1),
+            help="Processes that make samples on one core each; the same come out. Default: none, this process makes "
+            "them and renders on all cores. With numerics.solver = batched: processes beside the one that simulates "
+            "and renders, 1 for none; default on a GPU: one for every other core.",
+        ),
+    ] = None,
+    ray: Annotated[
+        str | None, Parameter(help="Address of a Ray cluster to make samples on, such as auto; local begins one here.")
+    ] = None,
+    shard: Annotated[
+        str | None,
+        Parameter(
+            help="i/N: make every N-th trajectory from i on (from 0), beside other processes with the same --out."
+        ),
+    ] = None,
+    dry_run: Annotated[bool, Parameter(negative=(), help="Only show the plan.")] = False,
+    as_json: AsJson = False,
 ) -> int:
-    """See `synth.cli.generate`."""
-    scheduling = Scheduling(workers, ray, Shard.parse(shard) if shard else None)
+    """Generates image pairs with exact flow."""
+    from synth.dataset.shard import Shard
+    from synth.dataset.store import output_of
+    from synth.pipeline import generate as pipeline
+    from synth.planning import job_variant
+    from synth.progress import progress
+
+    scheduling = pipeline.Scheduling(workers, ray, Shard.parse(shard) if shard else None)
     template = _loaded(scene, assignments)
     variant = job_variant(template, device)
     if dry_run:
-        return _show_plan(plan(template, variant), n, as_json)
+        return _show_plan(template, variant, n, as_json)
     _say_hint(variant)
     with progress(f"{template.name}: pairs", n) as advance:
-        summary = generate_samples(template, n, output_of(out), seed, variant, scheduling, advance)
+        summary = pipeline.generate(template, n, output_of(out), seed, variant, scheduling, advance)
     if as_json:
         print(json.dumps({"directory": str(summary.directory), **summary.record()}))
     else:
@@ -55,18 +79,36 @@ def run_generate(
     return 1 if summary.given_up else 0
 
 
-def run_plan(scene: str, n: int, assignments: Sequence[str], device: Device, as_json: bool) -> int:
-    """See `synth.cli.plan`."""
+def plan(
+    *,
+    scene: SceneName = DEFAULT_SCENE,
+    n: Annotated[int, Parameter(converter=whole(1), help="Samples to predict time and size for.")] = 8,
+    assignments: Assignments = None,
+    device: Device = "auto",
+    as_json: AsJson = False,
+) -> int:
+    """Shows what will run, what is left out and why, and the predicted time and size."""
+    from synth.planning import job_variant
+
     template = _loaded(scene, assignments)
-    planned = plan(template, job_variant(template, device))
+    variant = job_variant(template, device)
     if not as_json:
-        _say_hint(planned.variant)
-    return _show_plan(planned, n, as_json)
+        _say_hint(variant)
+    return _show_plan(template, variant, n, as_json)
 
 
-def run_simulate(scene: str, out: Path, seed: int, index: int, assignments: Sequence[str], as_json: bool) -> int:
-    """See `synth.cli.simulate`."""
+def simulate(
+    *,
+    scene: SceneName,
+    out: Annotated[Path, Parameter(help="Directory for trajectory.json and a VTU file per state.")],
+    seed: Annotated[int, Parameter(converter=whole(0), help="Seed of the draw.")] = 0,
+    index: Annotated[int, Parameter(converter=whole(0), help="Number of the trajectory that is drawn.")] = 0,
+    assignments: Assignments = None,
+    as_json: AsJson = False,
+) -> int:
+    """Runs the finite-element simulation alone; renders nothing."""
     from synth.dataset.storage import refuse_foreign, storage_errors
+    from synth.progress import progress
     from synth.scene.sampling import draw
     from synth.simulate.files import write_trajectory
     from synth.simulate.mesh_rule import MeshRule
@@ -93,31 +135,39 @@ def run_simulate(scene: str, out: Path, seed: int, index: int, assignments: Sequ
         for state in trajectory.states:
             table.add_row(
                 f"{state.depth_mm:.3f}",
-                " ".join(f"{s:.3f}" for s in np.add(state.shear_mm, 0.0)),  # + 0: no negative zero
+                " ".join(f"{s + 0.0:.3f}" for s in state.shear_mm),  # + 0: no negative zero
                 f"{state.twist_deg + 0.0:.2f}",
                 " ".join(f"{f:.3g}" for f in state.force_n),
                 f"{state.min_jacobian:.3f}",
                 f"{state.max_penetration_mm:.4f}",
                 str(state.newton_iterations),
             )
-        console = Console()
-        console.print(table)
-        _say(console, f"{trajectory.status} in {trajectory.seconds:.1f} s: {out / 'trajectory.json'}")
+        Console().print(table)
+        print(f"{trajectory.status} in {trajectory.seconds:.1f} s: {out / 'trajectory.json'}")
     if trajectory.status != "complete":
         print(f"synth: simulation {trajectory.status}: {trajectory.reason}", file=sys.stderr)
         return 1
     return 0
 
 
-def run_inspect(path: Path, png: Path | None, html: Path | None, limit: int, as_json: bool) -> int:
-    """See `synth.cli.inspect`."""
+def inspect(
+    path: Annotated[Path, Parameter(help="A dataset, a sample's folder or one flow EXR.")],
+    /,
+    *,
+    png: Annotated[Path | None, Parameter(help="Write a picture sheet.")] = None,
+    html: Annotated[Path | None, Parameter(help="Write one self-contained page.")] = None,
+    limit: Annotated[int, Parameter(converter=whole(1), help="Most samples of a dataset to look at.")] = 100,
+    as_json: AsJson = False,
+) -> int:
+    """Shows a dataset, a sample or a flow in numbers and pictures."""
     from synth.dataset.storage import refuse_foreign
-    from synth.inspect import PAGE_MARK, SHEET_MARK, inspect, tables, write_html, write_sheet
+    from synth.inspect import PAGE_MARK, SHEET_MARK, tables, write_html, write_sheet
+    from synth.inspect import inspect as look
 
     for file, mark in ((png, SHEET_MARK), (html, PAGE_MARK)):
         if file is not None:
             refuse_foreign(file, mark.encode())
-    inspection = inspect(path, limit)
+    inspection = look(path, limit)
     if as_json:
         print(json.dumps(inspection.as_dict()))
     else:
@@ -131,15 +181,13 @@ def run_inspect(path: Path, png: Path | None, html: Path | None, limit: int, as_
     return 0
 
 
-def run_verify(path: Path, as_json: bool) -> int:
-    """See `synth.cli.verify`."""
-    from synth.dataset.reader import read_dataset
-    from synth.verify.dataset import verify_dataset
+def verify(path: Dataset, /, *, as_json: AsJson = False) -> int:
+    """Derives the ground truth again by an independent route; exit status 1 if it disagrees."""
+    from synth.progress import progress
+    from synth.verify import verify_dataset
 
-    count = len(read_dataset(path).samples)
-    done = iter(range(1, count + 1))
-    with progress("verify: samples", count) as advance:
-        report = verify_dataset(path, on_sample=lambda _: advance(next(done), count))
+    with progress("verify: samples") as advance:
+        report = verify_dataset(path, progress=advance)
     if as_json:
         print(json.dumps(report.record()))
     else:
@@ -147,17 +195,29 @@ def run_verify(path: Path, as_json: bool) -> int:
     return 0 if report.ok else 1
 
 
-def run_export(path: Path, format: ExportFormat, out: Path, camera: str) -> int:
-    """See `synth.cli.export`."""
+def export(
+    path: Dataset,
+    /,
+    *,
+    format: Annotated[Literal["flo", "kitti", "npz", "webdataset"], Parameter(help="Layout to write.")],
+    out: Annotated[Path, Parameter(help="Directory to write to.")],
+    camera: Annotated[str, Parameter(help="Name of a further camera; default: the main one.")] = "",
+) -> int:
+    """Writes a dataset in another layout."""
+    from synth.dataset.export import export as write_copies
+    from synth.progress import progress
+
     with progress("export: samples") as advance:
-        count = export(path, format, out, advance, camera)
-    _say(Console(), f"{count} samples written to {out}")
+        count = write_copies(path, format, out, advance, camera)
+    print(f"{count} samples written to {out}")
     return 0
 
 
-def _loaded(scene: str, assignments: Sequence[str]) -> Template:
+def _loaded(scene: str, assignments: Sequence[str] | None) -> Template:
     """The scene; what is unusual in it is told on stderr."""
-    template = load_scene(scene, assignments)
+    from synth.scene.template import load_scene
+
+    template = load_scene(scene, assignments or [])
     for warning in dict.fromkeys(line for corner in template.corners for line in corner.warnings):
         print(f"synth: warning: {template.label}: {warning}", file=sys.stderr)
     return template
@@ -168,21 +228,23 @@ def _say_hint(variant: Variant) -> None:
         print(f"synth: rendering with {variant.name} ({variant.reason}); {variant.hint}", file=sys.stderr)
 
 
-def _show_plan(planned: Plan, n: int, as_json: bool) -> int:
+def _show_plan(template: Template, variant: Variant, n: int, as_json: bool) -> int:
+    from synth.planning import plan, predict
+    from synth.progress import duration
+
+    planned = plan(template, variant)
     predicted = predict(planned)
     if as_json:
         print(json.dumps({**planned.record(), **predicted.record(), "n": n}))
         return 0
-    console = Console()
-    title = f"{planned.template.name} with {planned.variant.name}"
+    title = f"{template.name} with {variant.name}"
     table = Table("feature", "runs", "because", title=title, title_justify="left")
     for decision in planned.decisions:
         table.add_row(decision.feature, "yes" if decision.runs else "left out", Text(decision.reason))
-    console.print(table)
+    Console().print(table)
     seconds = sum(predicted.seconds_per_pair.values())
     stages = ", ".join(f"{stage} {value:.2f} s" for stage, value in predicted.seconds_per_pair.items())
-    _say(
-        console,
+    print(
         f"mesh: {predicted.resolution}, about {predicted.nodes} displacement nodes\n"
         + _error_line(predicted)
         + f"predicted per pair: {stages}; {predicted.bytes_per_pair / 1e6:.2f} MB\n"
@@ -204,20 +266,21 @@ def _error_line(predicted: Prediction) -> str:
 
 
 def _show_summary(summary: Summary, variant: Variant) -> None:
-    console = Console()
+    from synth.dataset.summary import shares
+    from synth.progress import duration
+
     stages = ", ".join(f"{name} {share:.0%}" for name, share in shares(summary.stages).items())
     rate = f", {summary.samples_per_second:.2f} pairs/s" if summary.made else ""
-    _say(
-        console,
+    print(
         f"{summary.made} pairs made ({summary.found} were there) in {duration(summary.seconds)}{rate} "
         f"with {variant.name}: {summary.directory}" + (f", shard {summary.shard}" if summary.shard else ""),
     )
     if stages:
-        _say(console, f"time: {stages}")
+        print(f"time: {stages}")
     if summary.failed_draws:
-        _say(console, f"{summary.failed_draws} draws failed and were drawn again (failures.jsonl):")
+        print(f"{summary.failed_draws} draws failed and were drawn again (failures.jsonl):")
         for reason, count in summary.failures.most_common(5):
-            _say(console, f"  {count} x {reason}")
+            print(f"  {count} x {reason}")
     if summary.given_up:
         print(
             f"synth: {len(summary.given_up)} samples could not be made, see {summary.directory}/failures.jsonl",
@@ -231,8 +294,3 @@ def _console() -> Console:
     if not console.is_terminal:
         console.width = _NO_LIMIT
     return console
-
-
-def _say(console: Console, text: str) -> None:
-    """Plain text: square brackets in a path are no markup."""
-    console.print(text, markup=False, highlight=False, soft_wrap=True)

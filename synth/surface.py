@@ -19,6 +19,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 
 from synth.arrays import FloatArray, Points, Triangles
 
@@ -121,8 +122,6 @@ class GelSurface:
     def _linear(self) -> Any:
         if self.coarse.is_quadratic:
             return self._matrix(broken_linear_face)
-        import scipy.sparse as sp
-
         _, _, weights, corners, _ = self._refined
         rows, shape = np.repeat(np.arange(len(weights)), 3), (len(weights), len(self.coarse.nodes))
         return sp.csr_matrix((weights.ravel(), (rows, corners.ravel())), shape=shape)
@@ -131,8 +130,6 @@ class GelSurface:
     def _smooth(self) -> Any:
         if self.coarse.is_quadratic:
             return self._matrix(quadratic_face)
-        import scipy.sparse as sp
-
         material, _, weights, corners, _ = self._refined
         nodes, n, v = self.coarse.nodes, len(self.coarse.nodes), len(material)
         rows = np.repeat(np.arange(v), 3)
@@ -145,9 +142,7 @@ class GelSurface:
 
     def _matrix(self, shape: Callable[[FloatArray], FloatArray]) -> Any:
         """Sparse (v, n) map of nodal values by a quadratic face's shape functions at the refined vertices."""
-        import scipy.sparse as sp
-
-        faces, local, vertex = self.coarse.faces, _grid(self.subdivisions)[1], self._members
+        faces, local, vertex = self.coarse.faces, _grid(self.subdivisions)[1], self._refined[4]
         values = shape(local / self.subdivisions)
         # A vertex on an edge belongs to two faces, which agree there: the last one is taken.
         vertices = len(self._refined[0])
@@ -156,11 +151,6 @@ class GelSurface:
         rows = np.repeat(np.arange(len(face)), 6)
         size = (len(face), len(self.coarse.nodes))
         return sp.csr_matrix((values[place].ravel(), (rows, faces[face].ravel())), shape=size)
-
-    @cached_property
-    def _members(self) -> np.ndarray:
-        """(k, (n + 1)(n + 2) / 2) the refined vertices of each coarse face, in the order of `_grid`."""
-        return self._refined[4]
 
 
 def _grid(n: int) -> tuple[list[tuple[int, int, int]], np.ndarray]:
@@ -181,7 +171,8 @@ def _subdivide(coarse: ContactFaces, n: int) -> tuple[Points, Triangles, FloatAr
     """Split each face into n x n triangles.
 
     Returns:
-        Vertices; triangles; each vertex's weights and the coarse corners they belong to; each coarse face's vertices.
+        Vertices; triangles; each vertex's weights and the coarse corners they belong to; and each coarse face's
+        vertices, in the order of `_grid`.
     """
     nodes, faces = coarse.nodes, coarse.faces[:, :3].astype(np.int64)
     small, local = _grid(n)
@@ -201,8 +192,6 @@ def _subdivide(coarse: ContactFaces, n: int) -> tuple[Points, Triangles, FloatAr
 
 def _recovered_gradients(coarse: ContactFaces) -> list[Any]:
     """Three sparse (n, n) matrices: nodal values -> x, y, z of the recovered surface gradient at the nodes."""
-    import scipy.sparse as sp
-
     nodes, faces = coarse.nodes, coarse.faces
     n, k = len(nodes), len(faces)
     a, b, c = (nodes[faces[:, i]] for i in range(3))

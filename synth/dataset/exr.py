@@ -87,7 +87,7 @@ def read_flow(path: Path) -> FlowField:
     return flow_of(path, read_channels(path)[0])
 
 
-def flow_of(path: Path, channels: Mapping[str, FlowArray]) -> FlowField:
+def flow_of(path: Path, channels: Mapping[str, NDArray[Any]]) -> FlowField:
     """Sorts channels into a field; `path` is for the message.
 
     Raises:
@@ -97,29 +97,19 @@ def flow_of(path: Path, channels: Mapping[str, FlowArray]) -> FlowField:
     given = any(name.startswith("backward.") for name in channels)
     backward, seen = _direction(path, channels, "backward") if given else (None, None)
     own = {*ALIASES, *(f"{direction}.{part}" for direction in ("forward", "backward") for part in _PARTS)}
-    extras = {name: plane for name, plane in channels.items() if name not in own}
+    extras = {name: plane.astype(np.float32) for name, plane in channels.items() if name not in own}
     return FlowField(*forward, backward=backward, backward_visible=seen, extras=extras)
 
 
-def _direction(path: Path, channels: Mapping[str, FlowArray], direction: str) -> tuple[FlowArray, FlowArray]:
+def _direction(path: Path, channels: Mapping[str, NDArray[Any]], direction: str) -> tuple[FlowArray, FlowArray]:
     """(H, W, 2) flow and (H, W) visibility."""
     names = [f"{direction}.{part}" for part in _PARTS]
     missing = [name for name in names if name not in channels]
     if missing:
         present = ", ".join(sorted(channels)) or "none"
         raise InputError(f"{path}: lacks the channel {' and '.join(missing)}; it has {present}")
-    u, v, visible = (channels[name] for name in names)
+    u, v, visible = (channels[name].astype(np.float32) for name in names)
     return np.stack([u, v], axis=-1), visible
-
-
-def read_channels(path: Path) -> tuple[dict[str, FlowArray], dict[str, str | int]]:
-    """All channels, (H, W) float32 by name, and the header's text and integer attributes.
-
-    Raises:
-        InputError: The file is missing, no OpenEXR image, truncated or damaged, or its channels differ in size.
-    """
-    planes, header = read_stored(path)
-    return {name: plane.astype(np.float32) for name, plane in planes.items()}, header
 
 
 @contextlib.contextmanager
@@ -138,8 +128,12 @@ def _silenced() -> Iterator[None]:
             os.close(descriptor)
 
 
-def read_stored(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str | int]]:
-    """As `read_channels`, with the channels in the type in which they are stored: float32, float16 or uint32."""
+def read_channels(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str | int]]:
+    """All channels (H, W) by name, float32 in a file of ours, and the header's text and integer attributes.
+
+    Raises:
+        InputError: The file is missing, no OpenEXR image, truncated or damaged, or its channels differ in size.
+    """
     import OpenEXR
 
     try:

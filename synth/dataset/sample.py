@@ -37,12 +37,6 @@ class CameraPair:
     image2: Raster
     flow: FlowField
 
-    def __post_init__(self) -> None:
-        """Refuses parts that do not fit each other (a programming error)."""
-        size = self.flow.forward.shape[:2]
-        if self.image1.shape[:2] != size or self.image2.shape != self.image1.shape:
-            raise ValueError(f"images of {self.image1.shape} and {self.image2.shape} with a flow of {size}")
-
 
 @dataclass(frozen=True)
 class Sample:
@@ -81,15 +75,6 @@ class Sample:
     torque_nmm: FloatArray = field(default_factory=lambda: np.zeros((2, 3)))
     seconds: Mapping[str, float] = field(default_factory=dict)
     further: Mapping[str, CameraPair] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        """Refuses parts that do not fit each other (a programming error)."""
-        CameraPair(self.image1, self.image2, self.flow)
-        nodes = self.surface.coarse.nodes.shape
-        if self.displacement1.shape != nodes or self.displacement2.shape != nodes:
-            raise ValueError(
-                f"displacements of {self.displacement1.shape} and {self.displacement2.shape} at {nodes} nodes"
-            )
 
 
 def largest_motion(flow: FlowField) -> float | None:

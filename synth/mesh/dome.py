@@ -18,7 +18,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from synth.arrays import FloatArray, Points
 from synth.errors import InputError
 from synth.mesh.capsule import CapsuleFace
 from synth.mesh.face import PadFace, face_height, face_of
@@ -38,8 +37,11 @@ def domed(mesh: PadMesh, dome_radius_mm: float | None) -> PadMesh:
     """
     if dome_radius_mm is None:
         return mesh
-    points = mesh.points.copy()
-    points[:, 2] = _raised(points, mesh.size_mm[2], dome_radius_mm)
+    points, thickness = mesh.points.copy(), mesh.size_mm[2]
+    face = face_height(points[:, :2], dome_radius_mm)
+    inner = face + points[:, 2] * ((thickness - face) / thickness)
+    # The face's nodes and the bonded ones come out to the last bit.
+    points[:, 2] = np.where(points[:, 2] == thickness, thickness, inner)
     bulged = replace(mesh, points=points, face=PadFace(dome_radius_mm))
     if bulged.volumes.min() <= 0:
         raise InputError(
@@ -47,13 +49,6 @@ def domed(mesh: PadMesh, dome_radius_mm: float | None) -> PadMesh:
             f"{dome_radius_mm}: leave out numerics.edge_length_mm, or make it smaller"
         )
     return bulged
-
-
-def _raised(points: Points, thickness: float, dome_radius_mm: float) -> FloatArray:
-    """Z (n,) of the map in the module's docstring; the face's nodes and the bonded ones come out to the last bit."""
-    face = face_height(points[:, :2], dome_radius_mm)
-    inner = face + points[:, 2] * ((thickness - face) / thickness)
-    return np.where(points[:, 2] == thickness, thickness, inner)
 
 
 def flat_surface(size_mm: tuple[float, float, float]) -> GelSurface:

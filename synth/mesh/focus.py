@@ -2,8 +2,6 @@
 
 from dataclasses import dataclass
 
-import numpy as np
-
 
 @dataclass(frozen=True)
 class Focus:
@@ -12,18 +10,10 @@ class Focus:
     Attributes:
         centre_mm: x and y of its centre.
         half_mm: half its width along x and along y, >= 0; a half width of 0 is a line or a point.
-
-    Raises:
-        ValueError: a half width is negative or a number is not finite.
     """
 
     centre_mm: tuple[float, float]
     half_mm: tuple[float, float]
-
-    def __post_init__(self) -> None:
-        """Refuse what is no rectangle."""
-        if not np.isfinite([*self.centre_mm, *self.half_mm]).all() or min(self.half_mm) < 0:
-            raise ValueError(f"a focus needs finite numbers and half widths >= 0, given {self}")
 
     def span(self, axis: int, length_mm: float) -> tuple[float, float]:
         """Lower and upper end along an axis (0: x, 1: y), clipped to a pad of that length around the origin.
@@ -35,6 +25,5 @@ class Focus:
 
     def clipped(self, size_mm: tuple[float, float, float]) -> "Focus":
         """The part of it that lies on a pad of that size."""
-        spans = [self.span(axis, size_mm[axis]) for axis in (0, 1)]
-        (left, right), (top, bottom) = spans
+        (left, right), (top, bottom) = (self.span(axis, size_mm[axis]) for axis in (0, 1))
         return Focus(((left + right) / 2, (top + bottom) / 2), ((right - left) / 2, (bottom - top) / 2))

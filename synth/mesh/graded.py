@@ -51,9 +51,6 @@ class Counts:
         through: elements through the thickness of a pad of one layer.
         film: at least so many elements through each layer of a pad of several.
         growth: ratio of neighbouring spacings along z, from the contact face inward.
-
-    Raises:
-        ValueError: a number is too small, or `across` is odd.
     """
 
     across: tuple[int, int] = (8, 8)
@@ -61,12 +58,6 @@ class Counts:
     through: int = 3
     film: int = 2
     growth: float = 1.3
-
-    def __post_init__(self) -> None:
-        """Refuse what gives no mesh."""
-        even = all(n >= 2 and n % 2 == 0 for n in self.across)
-        if not even or min(*self.outer, self.through, self.film) < 1 or not 1 <= self.growth <= 4:
-            raise ValueError(f"across must be even and >= 2, outer, through, film >= 1, growth 1 to 4; given {self}")
 
     def cells(self, axis: int) -> int:
         """Elements along x (0) or y (1)."""

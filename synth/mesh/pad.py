@@ -28,9 +28,6 @@ class PadMesh:
         layer: (m,) int32, the layer of material that each tetrahedron lies in, counted from the contact face; left
             out, all lie in layer 0.
         face: the shape of the contact face.
-
-    Raises:
-        ValueError: `layer` is not one number per tetrahedron.
     """
 
     points: Points
@@ -43,8 +40,6 @@ class PadMesh:
         """Fill in the single layer."""
         if self.layer.size == 0:
             object.__setattr__(self, "layer", np.zeros(len(self.tets), dtype=np.int32))
-        if self.layer.shape != (len(self.tets),):
-            raise ValueError(f"layer has shape {self.layer.shape}, expected ({len(self.tets)},)")
 
     @cached_property
     def volumes(self) -> FloatArray:

@@ -25,12 +25,14 @@ ON_SIDE_MM = 1e-9
 """Distance from a side at which a vertex lies on it."""
 ROUNDS = 50
 """Vertices of two sides are moved onto one after the other so often at most."""
+ATTEMPTS = 3
+"""The mesher is random: a mesh that is not valid is made again so often."""
 WORST_SHAPE = 0.02
 """Smallest accepted ratio of inscribed to circumscribed radius, times 3 (1 for a regular tetrahedron)."""
 
 
 def tetrahedralise_box(
-    size_mm: tuple[float, float, float], edge_length_mm: float, background: Background | None = None, attempts: int = 3
+    size_mm: tuple[float, float, float], edge_length_mm: float, background: Background | None = None
 ) -> PadMesh:
     """Mesh a box whose tetrahedra have edges of edge_length_mm at the contact face, or as a background says.
 
@@ -38,13 +40,12 @@ def tetrahedralise_box(
         size_mm: edge lengths of the box.
         edge_length_mm: target edge length at z = 0.
         background: target edge lengths everywhere; default GRADING times edge_length_mm at the window.
-        attempts: see `tetrahedralise`.
 
     Raises:
         InputError: no attempt gave a valid mesh.
     """
     background = background or through_thickness(size_mm, edge_length_mm)
-    points, tets = tetrahedralise(*_box(size_mm), _sides(size_mm), background, float(np.prod(size_mm)), 1e-9, attempts)
+    points, tets = tetrahedralise(*_box(size_mm), _sides(size_mm), background, float(np.prod(size_mm)), 1e-9)
     return PadMesh(points, tets, size_mm)
 
 
@@ -55,7 +56,6 @@ def tetrahedralise(
     background: Background,
     volume_mm3: float | None,
     share: float,
-    attempts: int = 3,
     envelope: float = ENVELOPE,
 ) -> tuple[Points, Tets]:
     """Mesh what a closed surface encloses, with the vertices of its boundary moved onto the shape that it stands for.
@@ -67,7 +67,6 @@ def tetrahedralise(
         background: target edge lengths.
         volume_mm3: of the shape; None: not known.
         share: of the volume by which the mesh may differ from it.
-        attempts: the mesher is random; a mesh below WORST_SHAPE is made again so often.
         envelope: fTetWild's epsilon, relative to the bounding box's diagonal.
 
     Returns:
@@ -78,14 +77,14 @@ def tetrahedralise(
     """
     problem = ""
     tolerance = 2 * envelope * float(np.linalg.norm(np.ptp(corners, axis=0)))
-    for _ in range(attempts):
+    for _ in range(ATTEMPTS):
         points, tets = _repair(*_ftetwild(corners, faces, background, envelope), sides, tolerance)
         problem = _fault(points, tets, sides, volume_mm3, share)
         if not problem:
             return points, tets
     edge_mm = float(background.values.min())
     raise InputError(
-        f"no valid mesh of the gel with edge length {edge_mm:.3g} mm in {attempts} attempts: {problem}; "
+        f"no valid mesh of the gel with edge length {edge_mm:.3g} mm in {ATTEMPTS} attempts: {problem}; "
         "try another numerics.edge_length_mm"
     )
 

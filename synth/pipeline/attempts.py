@@ -52,7 +52,7 @@ class Attempts:
             try:
                 scene = draw(plan.template, seed, self.trajectory, self._count - 1, self._sensor)
                 stage = "simulate"
-                press = plan.press(scene, self._context.mesh_folders)
+                press = plan.mesh.press(scene, plan.template.folder, self._context.mesh_folders)
             except InputError as error:
                 self.fail(stage, str(error))
                 if stage == "simulate" and not retry:

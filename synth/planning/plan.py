@@ -1,19 +1,15 @@
 """What a scene needs, decided once; what comes later is handed the plan and asks nothing again."""
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 from synth.planning.check import check_buildable
 from synth.planning.reasons import Decision, decisions
 from synth.render.pattern import is_grey
 from synth.render.variant import Device, Variant, choose_variant
-from synth.scene import Scene
 from synth.scene.template import Template
 from synth.simulate.mesh_rule import MeshRule
-from synth.simulate.press import Press
 
 
 @dataclass(frozen=True)
@@ -38,14 +34,6 @@ class Plan:
     def solver_device(self) -> Literal["cuda", "cpu"]:
         """Where the batched solver runs: beside the renderer."""
         return "cuda" if self.variant.is_on_gpu else "cpu"
-
-    def press(self, scene: Scene, mesh_folders: Sequence[Path] | None) -> Press:
-        """What is simulated of one random instance of the scene; fTetWild's meshes are kept in `mesh_folders`.
-
-        Raises:
-            InputError: the indenter or the mesh cannot be built.
-        """
-        return self.mesh.press(scene, self.template.folder, mesh_folders)
 
     def record(self) -> dict[str, Any]:
         named = {"scene": self.template.name, "variant": self.variant.name}

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from synth.dataset.storage import refuse_foreign, storage_errors
+from synth.dataset.storage import refuse_foreign, replace_file, storage_errors
 from synth.stress.cases import EXTREME, Run, all_runs, compared, load_expectations, selected
 from synth.stress.check import Result, evaluate
 
@@ -23,10 +23,10 @@ WORKER = (sys.executable, "-m", "synth.stress.worker")
 
 
 def run_stress(out: Path, only: Sequence[str] | None, workers: int, as_json: bool, scenes: Path = EXTREME) -> int:
-    """Run the cases of a folder of base.toml and expected.toml; write stress.csv and stress.json, or print the latter.
+    """Run the cases of a folder of base.toml and expected.toml; write stress.json, or print it.
 
     Args:
-        out: directory for these, for the meshes, and for a folder per run.
+        out: directory for it, for the meshes, and for a folder per run.
         only: shell patterns of cases or groups; cases that others are compared with come along. Default all.
         workers: processes at a time.
         as_json: print stress.json instead of the table.
@@ -41,9 +41,9 @@ def run_stress(out: Path, only: Sequence[str] | None, workers: int, as_json: boo
     from rich.console import Console
 
     from synth.progress import progress
-    from synth.stress.report import outcome_table, record, remarks, summary, write_report
+    from synth.stress.report import outcome_table, record, remarks, summary
 
-    refuse_foreign(out / "stress.json", b'"software"', out / "stress.csv")
+    refuse_foreign(out / "stress.json", b'"software"')
     expectations = load_expectations(scenes / "expected.toml")
     runs = selected(all_runs(expectations, (scenes / "base.toml").resolve()), only)
     started = time.perf_counter()
@@ -52,14 +52,12 @@ def run_stress(out: Path, only: Sequence[str] | None, workers: int, as_json: boo
         results = all_results(runs, out, workers, lambda _: advance(next(done), len(runs)))
     verdicts = [evaluate(result, comparable(result, results)) for result in results]
     found = record(verdicts, time.perf_counter() - started)
-    write_report(out, verdicts, found)
+    replace_file(out / "stress.json", json.dumps(found, indent=1).encode("utf-8"))
     if as_json:
         print(json.dumps(found))
     else:
-        shown = Console()
-        shown.print(outcome_table(verdicts))
-        for line in ["", *remarks(verdicts), f"{summary(verdicts, found['seconds'])}: {out / 'stress.json'}"]:
-            shown.print(line, markup=False, highlight=False, soft_wrap=True)
+        Console().print(outcome_table(verdicts))
+        print("", *remarks(verdicts), f"{summary(verdicts, found['seconds'])}: {out / 'stress.json'}", sep="\n")
     return 0 if all(verdict.ok for verdict in verdicts) else 1
 
 

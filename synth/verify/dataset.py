@@ -22,14 +22,14 @@ from synth.verify.sheet import Sheet
 
 
 def verify_dataset(
-    path: Path | str, *, samples: Sequence[int] | None = None, on_sample: Callable[[SampleReport], None] | None = None
+    path: Path | str, *, samples: Sequence[int] | None = None, progress: Callable[[int, int], None] | None = None
 ) -> Report:
     """Verifies a dataset directory.
 
     Args:
         path: the dataset.
         samples: indices to verify; by default all finished ones.
-        on_sample: called after each sample.
+        progress: called after each sample with how many are done and how many there are.
 
     Returns:
         The report; `ok` is False where any check failed or there is no sample.
@@ -43,10 +43,9 @@ def verify_dataset(
         dataset.folder(index)
     reports = []
     for index in wanted:
-        report = _verify_files(dataset, index)
-        reports.append(report)
-        if on_sample is not None:
-            on_sample(report)
+        reports.append(_verify_files(dataset, index))
+        if progress is not None:
+            progress(len(reports), len(wanted))
     return Report(dataset.path, tuple(reports))
 
 

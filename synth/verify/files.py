@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from synth.dataset.exr import ALIASES, read_stored
+from synth.dataset.exr import ALIASES, read_channels
 from synth.dataset.exr_channels import OPTIONAL
 from synth.scene import Outputs, Scene
 
@@ -23,7 +23,7 @@ def flow_file_problems(folder: Path, scene: Scene, meta: Mapping[str, Any]) -> l
     problems = []
     for camera in scene.sensor.views:
         name = f"{camera}/flow.exr" if camera else "flow.exr"
-        planes, header = read_stored(folder / name)
+        planes, header = read_channels(folder / name)
         found = [*_channel_problems(planes, scene.outputs), *_header_problems(header, meta)]
         problems += [f"{name}: {problem}" for problem in found]
     return problems

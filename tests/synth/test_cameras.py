@@ -12,9 +12,7 @@ from tiny_scene import CONTACT, LIGHTS, SENSOR, fingerprint, own_cache, write_ti
 from synth.dataset.export import export
 from synth.dataset.exr import read_flow, write_flow
 from synth.dataset.reader import read_dataset
-from synth.dataset.sample import CameraPair
 from synth.errors import InputError
-from synth.flow.field import FlowField
 from synth.inspect import inspect, tables, write_html, write_sheet
 from synth.pipeline.generate import generate
 from synth.render.renderer import Renderer
@@ -134,10 +132,6 @@ def test_names_sizes_lights_and_scalar_variants_that_further_cameras_cannot_have
     sensor = json.loads(_with_other().model_dump_json())
     with pytest.raises(ValueError, match="names must differ"):
         Sensor.model_validate({**sensor, "further_cameras": 2 * sensor["further_cameras"]})
-    image = np.zeros((4, 5, 3), np.uint8)
-    flow = FlowField(np.zeros((4, 6, 2), np.float32), np.zeros((4, 6), np.float32))
-    with pytest.raises(ValueError, match="with a flow of"):
-        CameraPair(image, image, flow)
     with pytest.raises(InputError, match=r"further_cameras 'other': sensor.lights\[0\].*between the camera"):
         rendered(_with_other(fx=40.0, fy=40.0))
     mirror = Mirror(position_mm=(3.0, 0.0, 12.0), normal=(-1, 0, 0), size_mm=(4.0, 4.0))

@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 from samples import HEIGHT, WIDTH, job, translation_sample
 
-from synth.commands import run_inspect
+from synth.commands import inspect as inspect_command
 from synth.dataset.exr import write_flow
 from synth.dataset.writer import DatasetWriter
 from synth.errors import InputError
@@ -127,7 +127,7 @@ def test_tables_keep_their_width_where_stdout_is_no_terminal(dataset, capsys, mo
     monkeypatch.setenv("COLUMNS", "80")
     if terminal:
         monkeypatch.setenv("FORCE_COLOR", "1")
-    assert run_inspect(dataset, None, None, 100, False) == 0
+    assert inspect_command(dataset) == 0
     assert capsys.readouterr().out.count("000001") == (2 if terminal else 1)
 
 

@@ -31,8 +31,8 @@ STAGES = (
     "synth.calibrate",
     "synth.stress",
     "synth.doctor",
-    "synth.commands",
     "synth.cli_options",
+    "synth.commands",
     "synth.cli",
     "synth.__main__",
 )

@@ -114,10 +114,10 @@ def test_debug_adds_the_traceback_which_a_mistake_of_the_program_keeps(capsys, m
     assert "Traceback" in err
     assert err.rstrip().splitlines()[-1].startswith("synth: there is no scene 'nowhere'")
 
-    def broken(*_: object) -> int:
+    def broken(*_: object, **__: object) -> int:
         raise RuntimeError("a bug")
 
-    monkeypatch.setattr("synth.commands.run_verify", broken)
+    monkeypatch.setattr("synth.verify.verify_dataset", broken)
     with pytest.raises(RuntimeError, match="a bug"):
         main(["verify", "x"])
 

@@ -13,7 +13,7 @@ from kinematic_double import LENS, OBLIQUE, sensor, sheet
 from rich.console import Console
 from verified_sample import HEIGHT, WIDTH, as_sample, make_sample, motion_checks, pressed, scene, sheets
 
-from synth.dataset.exr import read_stored, write_flow
+from synth.dataset.exr import read_channels, write_flow
 from synth.dataset.job import Job
 from synth.dataset.reader import SampleData
 from synth.dataset.writer import DatasetWriter
@@ -154,9 +154,10 @@ def test_dataset_on_disk(tmp_path, sample):
         writer.write(as_sample(0, SCENE, sample))
         writer.write(as_sample(1, SCENE, sample))
     seen = []
-    report = verify_dataset(path, samples=[1], on_sample=seen.append)
+    report = verify_dataset(path, samples=[1], progress=lambda *numbers: seen.append(numbers))
     assert report.ok
-    assert [s.index for s in report.samples] == [s.index for s in seen] == [1]
+    assert [s.index for s in report.samples] == [1]
+    assert seen == [(1, 1)]
     json.dumps(report.record())
 
     forward = sample.flow.forward.copy()
@@ -190,7 +191,7 @@ def _file_problems(folder, scene, **changes):
     meta = {"scene_hash": "abc", "seed": 2**40, "index": 3}
     write_flow(folder / "flow.exr", flow, {"scene.hash": "abc", "seed": str(2**40), "index": 3})
     if "planes" in changes:
-        planes, header = read_stored(folder / "flow.exr")
+        planes, header = read_channels(folder / "flow.exr")
         OpenEXR.File(header, planes | changes["planes"]).write(str(folder / "flow.exr"))
     return flow_file_problems(folder, scene, meta | changes.get("meta", {}))
 
