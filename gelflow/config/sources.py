@@ -100,9 +100,7 @@ def _assign(values: dict[str, Any], assignment: str) -> None:
         value = text
     table = values
     for name in names[:-1]:
-        if (
-            table.get(name) is None
-        ):  # a part that is switched off, such as model.registration, is switched on by its fields
+        if table.get(name) is None:  # what is switched off, such as model.registration, is switched on by its fields
             table[name] = {}
         table = table[name]
         if not isinstance(table, dict):

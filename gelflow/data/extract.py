@@ -141,21 +141,11 @@ def _opened(out: Path, job: dict[str, Any]) -> PairSet:
 
 
 def _differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
-    """What differs between two jobs, in words."""
-    old, new = there.get("settings", {}), here["settings"]
-    names = sorted(old.keys() | new.keys())
-    differences = [f"{name} is {old.get(name)} there and {new.get(name)} here" for name in names
-                   if old.get(name) != new.get(name)]  # fmt: skip
-    before, now = there.get("sources", {}), here["sources"]
-    for label, names in (
-        ("only there", sorted(before.keys() - now.keys())),
-        ("only here", sorted(now.keys() - before.keys())),
-        ("of another size", sorted(name for name in before.keys() & now.keys() if before[name] != now[name])),
-    ):
-        if names:
-            more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-            differences.append(f"recordings {label}: {names[0]}{more}")
-    return differences
+    """What differs between two jobs, in words: settings, and the sizes of recordings."""
+    old, new = ({**job.get("settings", {}), **job.get("sources", {})} for job in (there, here))
+    names = sorted(name for name in old.keys() | new.keys() if old.get(name) != new.get(name))
+    shown = [f"{name} is {old.get(name, 'missing')} there and {new.get(name, 'missing')} here" for name in names[:5]]
+    return [*shown, f"and {len(names) - 5} more"] if len(names) > 5 else shown
 
 
 def _extract_one(recording: Recording, out: Path, config: ChoiceConfig) -> tuple[SourceReport, list[ChosenPair]]:

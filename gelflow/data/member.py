@@ -90,18 +90,12 @@ class FlowMembers:
 
 
 def _read_array(member: Member, dtype: type[np.generic]) -> NDArray[Any]:
-    """The array of a .npy file, whose size is checked before memory is taken for it."""
-    data = member.read_bytes()
-    stream = io.BytesIO(data)
+    """The array of a .npy file."""
+    stream = io.BytesIO(member.read_bytes())
     try:
-        if np.lib.format.read_magic(stream) != (1, 0):
-            raise ValueError("not version 1.0 of the format")
-        shape, column_major, found = np.lib.format.read_array_header_1_0(stream)
-    except (ValueError, TypeError, SyntaxError, tokenize.TokenError) as error:
-        raise InputError(f"{member}: not a readable .npy file (damaged?)") from error
-    if found != dtype or column_major:
-        raise InputError(f"{member}: {found} values, column-major: {column_major}; {np.dtype(dtype)} by rows is needed")
-    expected = int(np.prod(shape, dtype=object)) * found.itemsize
-    if len(data) - stream.tell() != expected:
-        raise InputError(f"{member}: {len(data) - stream.tell()} bytes of numbers, its header says {expected}; damaged")
-    return np.frombuffer(data, dtype, offset=stream.tell()).reshape(shape).copy()
+        array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
+    except (ValueError, TypeError, SyntaxError, MemoryError, tokenize.TokenError) as error:
+        raise InputError(f"{member}: not a readable .npy file, truncated or damaged ({error})") from error
+    if array.dtype != dtype:
+        raise InputError(f"{member}: {array.dtype} values; {np.dtype(dtype)} is needed")
+    return array

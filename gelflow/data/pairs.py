@@ -1,16 +1,4 @@
-"""Image pairs as a map-style data set for torch.
-
-A sample is a dictionary:
-
-    image1, image2  (3, H, W) float32, RGB in [0, 1]
-    name            str, unique within the data set
-    bare            bool, whether the pair is synthetic and its gel has no pattern
-    flow            (2, H, W) float32, U right and V down in px, I1(x) = I2(x + flow(x)); NaN where no gel is seen
-    visible         (1, H, W) float32, 1 where the point of the pixel is seen in image 2, else 0
-
-`flow` and `visible` are there if any pair of the data set has an exact flow; a pair without one then has NaN and 0
-throughout, so that samples of both kinds fit into one batch.
-"""
+"""Image pairs as a map-style data set for torch."""
 
 import hashlib
 import json
@@ -64,9 +52,16 @@ def without_pattern(scene: str | None) -> bool:
 class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
     """Image pairs that are read from disk when they are asked for; a map-style data set for a torch DataLoader.
 
-    `dataset[i]` is a dictionary of tensors and texts: `image1`, `image2` (3, H, W) float32, RGB in [0, 1]; `name`;
-    `bare`; and where the data have an exact flow `flow` (2, H, W) float32 px, (U right, V down), NaN where no gel is
-    seen, with `visible` (1, H, W) float32, 0 or 1.
+    `dataset[i]` is a dictionary:
+
+        image1, image2  (3, H, W) float32, RGB in [0, 1]
+        name            str, unique within the data set
+        bare            bool, whether the pair is synthetic and its gel has no pattern
+        flow            (2, H, W) float32, U right and V down in px, I1(x) = I2(x + flow(x)); NaN where no gel is seen
+        visible         (1, H, W) float32, 1 where the point of the pixel is seen in image 2, else 0
+
+    `flow` and `visible` are there if any pair of the data set has an exact flow; a pair without one then has NaN and 0
+    throughout, so that samples of both kinds fit into one batch.
 
     Args:
         source: A data set of synth, a pair set of `gelflow pairs`, a folder of NAME_1.png and NAME_2.png, or
@@ -139,7 +134,7 @@ class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
         return markers[:, [2, 3, 0, 1]] if record.exchanged else markers
 
     def __getitem__(self, index: int) -> dict[str, Tensor | str | bool]:
-        """The sample described at the top of this module.
+        """The sample that the class describes.
 
         Raises:
             InputError: A file of the pair is missing or damaged, or the sizes differ.
@@ -209,21 +204,15 @@ def read_markers(path: Path) -> MarkerArray:
     import csv
 
     columns = ("x1", "y1", "x2", "y2")
-    if not path.is_file():
-        raise InputError(f"{path}: there is no such file")
-    rows: list[list[float]] = []
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:  # with or without a byte order mark
-            reader = csv.DictReader(file)
-            if not set(columns) <= set(reader.fieldnames or ()):
-                raise InputError(f"{path}: needs the columns x1,y1,x2,y2; it has: {','.join(reader.fieldnames or ())}")
-            for row in reader:
-                try:
-                    rows.append([float(row[name]) for name in columns])
-                except (TypeError, ValueError) as error:
-                    raise InputError(f"{path}, line {reader.line_num}: four numbers are needed") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: not a CSV file in UTF-8 ({error})") from error
+            rows = [[float(row[name]) for name in columns] for row in csv.DictReader(file)]
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except (KeyError, TypeError, ValueError, csv.Error) as error:
+        raise InputError(
+            f"{path}: not a CSV file in UTF-8 with the columns {','.join(columns)} and a number in each ({error!r})"
+        ) from error
     markers = np.array(rows, np.float64).reshape(-1, 4)
     if not len(markers) or not np.isfinite(markers).all():
         raise InputError(f"{path}: holds no marker, or one that is not finite")

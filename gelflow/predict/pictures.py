@@ -57,11 +57,11 @@ def certain(flow: FlowArray, sigma: MapArray | None) -> FlowArray:
     return flow if sigma is None else np.where(sigma[..., None] > UNKNOWN_PX, np.float32(np.nan), flow)
 
 
-def robust_scale(flow: FlowArray, percentile: float = 99.0) -> float:
-    """A scale in px for a picture: the given percentile of the length, rounded up to two digits; 1 for no flow."""
+def robust_scale(flow: FlowArray) -> float:
+    """A scale in px for a picture: the 99th percentile of the length, rounded up to two digits; 1 for no flow."""
     length = np.hypot(flow[..., 0], flow[..., 1])
     length = length[np.isfinite(length)]
-    return round_up(float(np.percentile(length, percentile))) if length.size else 1.0
+    return round_up(float(np.percentile(length, 99.0))) if length.size else 1.0
 
 
 def round_up(value: float) -> float:

@@ -19,7 +19,7 @@ from gelflow.errors import InputError
 from gelflow.files.atomic import refuse_foreign, replacing
 from gelflow.files.exr import DIRECTIONS, read_flow, write_flow
 from gelflow.files.flo import write_flo
-from gelflow.files.image import read_pair, write_png
+from gelflow.files.image import read_pair
 from gelflow.files.quiet import quiet
 from gelflow.files.video import describe, frame_file, frames, image_files
 from gelflow.models.uncertainty import UNKNOWN_PX
@@ -104,9 +104,9 @@ def predict_video(
     if every < 1:
         raise InputError(f"every = {every}: at least 1 is needed")
     total = 2 * max(0, -(-describe(path).frames // every) - 1)
-    table = out / "motion.csv"
-    refuse_foreign(table, b"mean_px,p95_px", out / "overlay.mp4", *_numbered(out / "overlay", ".png"))
-    for earlier in _numbered(out / "flow", ".exr"):
+    table, video = out / "motion.csv", out / "overlay.mp4"
+    refuse_foreign(table, b"mean_px,p95_px", video)
+    for earlier in _earlier_flows(out):
         refuse_foreign(earlier, DIRECTIONS.encode())
     sources = dict(enumerate(image_files(path))) if path.is_dir() else {}
     files: list[Path] = []
@@ -119,7 +119,7 @@ def predict_video(
         except InputError as error:
             raise InputError(f"{source}, frame {index}, {method.name}: {error}") from error
         if not files:
-            for earlier in _numbered(out / "flow", ".exr"):
+            for earlier in _earlier_flows(out):
                 earlier.unlink()
         files.append(out / "flow" / f"{index:06d}.exr")
         write_flow(files[-1], found.flow, found.visible, found.sigma)
@@ -141,8 +141,8 @@ def predict_video(
             if progress:
                 progress(count, total)
 
-    overlay = _write_overlay(overlays(), out, describe(path).frames_per_second / every)
-    return Prediction([*files, table, *overlay], motions)
+    _write_overlay(overlays(), video, describe(path).frames_per_second / every)
+    return Prediction([*files, table, video], motions)
 
 
 def _estimate(method: Method, image1: ImageArray, image2: ImageArray, frame: int, file: str) -> tuple[Estimate, Motion]:
@@ -170,18 +170,16 @@ def _frame_pairs(path: Path, every: int, reference: Reference) -> Iterator[tuple
             before = frame
 
 
-def _write_overlay(pictures: Iterator[Bytes3], out: Path, frames_per_second: float) -> list[Path]:
-    """Writes overlay.mp4, or overlay/000000.png ... where OpenCV has no encoder for it."""
+def _write_overlay(pictures: Iterator[Bytes3], video: Path, frames_per_second: float) -> None:
+    """Writes overlay.mp4."""
     import cv2
 
     first = next(pictures)
-    video, temporary = out / "overlay.mp4", out / ".overlay.part.mp4"
+    temporary = video.with_name(".overlay.part.mp4")
     try:
         with quiet():
             rate, size = max(frames_per_second, 1.0), (first.shape[1], first.shape[0])
             writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
-        if not writer.isOpened():
-            return _write_sequence(first, pictures, out / "overlay")
         count = 0
         for picture in chain([first], pictures):
             writer.write(np.ascontiguousarray(picture[..., ::-1]))
@@ -194,20 +192,8 @@ def _write_overlay(pictures: Iterator[Bytes3], out: Path, frames_per_second: flo
         os.replace(temporary, video)
     finally:
         temporary.unlink(missing_ok=True)
-    return [video]
 
 
-def _write_sequence(first: Bytes3, rest: Iterator[Bytes3], folder: Path) -> list[Path]:
-    for earlier in _numbered(folder, ".png"):
-        earlier.unlink()
-    files = [folder / "000000.png"]
-    write_png(files[0], first)
-    for number, picture in enumerate(rest, start=1):
-        files.append(folder / f"{number:06d}.png")
-        write_png(files[-1], picture)
-    return files
-
-
-def _numbered(folder: Path, suffix: str) -> list[Path]:
+def _earlier_flows(out: Path) -> list[Path]:
     """What an earlier run wrote, which may have had other frames: files named by six digits or more."""
-    return [path for path in folder.glob(f"*{suffix}") if re.fullmatch(r"[0-9]{6,}", path.stem)]
+    return [path for path in (out / "flow").glob("*.exr") if re.fullmatch(r"[0-9]{6,}", path.stem)]

@@ -3,6 +3,7 @@
 Ctrl-C (SIGINT) and SIGTERM (a time limit, `docker stop`) ask alike.
 """
 
+import math
 import signal
 import sys
 import threading
@@ -12,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
-import torch
 from lightning.pytorch.utilities import rank_zero_only
 
 from gelflow.config import TrainConfig
@@ -35,9 +35,10 @@ class CheckpointCallback(L.Callback):
     """
 
     def __init__(
-        self, config: TrainConfig, out: Path, validates: bool, score: float | None, metrics: Mapping[str, float]
+        self, module: FlowModule, out: Path, validates: bool, score: float | None, metrics: Mapping[str, float]
     ) -> None:
-        self.config = config
+        self.module = module
+        self.config = module.config
         self.out = out
         self.validates = validates
         self.score = score
@@ -63,28 +64,26 @@ class CheckpointCallback(L.Callback):
         """Whether a validation follows this step."""
         return self.validates and (step % self.config.validate_every == 0 or step == self.config.steps)
 
-    def on_train_batch_end(self, trainer: L.Trainer, module: L.LightningModule, *_: Any) -> None:
+    def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
         """Shows progress; saves where it is due, and before a validation; stops where that was asked for."""
-        flow_module = _ours(module)
-        step = flow_module.step
+        module, step = self.module, self.module.step
         self.throughput.add(self.config.batch_size * trainer.world_size)
         if step % LOG_EVERY == 0 or step == self.config.steps:
-            self._check(flow_module)
+            self._check()
             rate, memory = self.throughput.pairs_per_second, peak_memory_mib()
             known = {"train/pairs_per_second": rate, "train/peak_memory_mib": memory}
-            flow_module.write({name: value for name, value in known.items() if value is not None}, step)
+            module.write({name: value for name, value in known.items() if value is not None}, step)
             if self.advance is not None:
-                item = f"step {step} of {self.config.steps}, loss {float(flow_module.last_loss):.4g}"
+                item = f"step {step} of {self.config.steps}, loss {float(module.last_loss):.4g}"
                 item += "" if rate is None else f", {rate:.3g} pairs/s"
-                done = step - flow_module.start
-                self.advance(done, self.config.steps - flow_module.start, f"{item}{_brief(self.metrics)}")
+                self.advance(step - module.start, self.config.steps - module.start, f"{item}{_brief(self.metrics)}")
         stop = trainer.strategy.reduce_boolean_decision(self.stop, all=False)  # whichever process was asked to
         validation_due = self.validates_at(step)
         if stop or validation_due or step % self.config.save_every == 0 or step == self.config.steps:
-            self._save(trainer, flow_module, validation_due)
+            self._save(trainer, validation_due)
         if stop:
             if not self.validates:
-                self._keep_weights(trainer, flow_module)
+                self._keep_weights(trainer)
             trainer.strategy.barrier()  # no process leaves before the first has written the files
             raise Stopped
 
@@ -92,46 +91,42 @@ class CheckpointCallback(L.Callback):
         """Stops the clock."""
         self.throughput.pause()
 
-    def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+    def on_validation_end(self, trainer: L.Trainer, *_: Any) -> None:
         """Keeps the weights if they are the best so far, and saves."""
         self.throughput.resume()
-        flow_module = _ours(module)
-        self.metrics = flow_module.metrics
+        self.metrics = self.module.metrics
         score = self.metrics.get("endpoint_error_px", self.metrics.get("photometric_loss"))
         if score is None:
             raise InputError("validation: no pair has a finite result; look at the validation pairs")
         if self.score is None or score < self.score:
             self.score = score
-            self._keep_weights(trainer, flow_module)
-        self._save(trainer, flow_module)
+            self._keep_weights(trainer)
+        self._save(trainer)
         if trainer.is_global_zero:
-            print(f"step {flow_module.step}: {describe(self.metrics)}", file=sys.stderr)
+            print(f"step {self.module.step}: {describe(self.metrics)}", file=sys.stderr)
 
-    def _keep_weights(self, trainer: L.Trainer, module: FlowModule) -> None:
+    def _keep_weights(self, trainer: L.Trainer) -> None:
         if trainer.is_global_zero:
-            save_weights(self.out / WEIGHTS, module.evaluated, **weights_metadata(self.config, module.step))
+            metadata = weights_metadata(self.config, self.module.step)
+            save_weights(self.out / WEIGHTS, self.module.evaluated, **metadata)
 
-    def _check(self, module: FlowModule) -> None:
-        if not torch.isfinite(module.last_loss):
+    def _check(self) -> None:
+        loss = float(self.module.last_loss)
+        if not math.isfinite(loss):
             raise InputError(
-                f"step {module.step}: loss {float(module.last_loss)}: training has diverged; lower learning_rate "
+                f"step {self.module.step}: loss {loss}: training has diverged; lower learning_rate "
                 f"({self.config.learning_rate:g}) or set gradient_clip (now {self.config.gradient_clip})"
             )
 
-    def _save(self, trainer: L.Trainer, module: FlowModule, validation_due: bool = False) -> None:
-        self._check(module)
+    def _save(self, trainer: L.Trainer, validation_due: bool = False) -> None:
+        self._check()
         if trainer.is_global_zero:
+            module = self.module
             optimiser = trainer.optimizers[0].state_dict()
             average = None if module.average is None else module.average.state_dict()
             model, metrics = module.model.state_dict(), dict(self.metrics)
             state = State(module.step, model, optimiser, self.score, metrics, average, validation_due)
             save_state(self.out, state)
-
-
-def _ours(module: L.LightningModule) -> FlowModule:
-    if not isinstance(module, FlowModule):
-        raise TypeError(f"CheckpointCallback works with FlowModule, not {type(module).__name__}")
-    return module
 
 
 def weights_metadata(config: TrainConfig, step: int) -> dict[str, str]:

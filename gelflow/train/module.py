@@ -66,8 +66,7 @@ class FlowModule(L.LightningModule):
             self.average = copy.deepcopy(model).eval().requires_grad_(False)
             if average is not None:
                 self.average.load_state_dict(average)
-        # In a tuple, because a submodule's parameters would count twice: they are the model's own.
-        self._network: tuple[Any] = (model,)
+        self._graphed: GraphedNetwork | None = None
         self.start = start
         self.optimiser_state = optimiser
         self.metrics: dict[str, float] = {}
@@ -77,12 +76,12 @@ class FlowModule(L.LightningModule):
     @property
     def network(self) -> Any:
         """The network as it is called once a step: recorded where the configuration asks for it."""
-        return self._network[0]
+        return self._graphed or self.model
 
     def on_fit_start(self) -> None:
         """Records the network's passes on a CUDA device, where the configuration asks for it."""
         if self.config.cuda_graph and self.device.type == "cuda":
-            self._network = (GraphedNetwork(self.model),)
+            self._graphed = GraphedNetwork(self.model)
 
     @property
     def step(self) -> int:

@@ -8,6 +8,7 @@ end with the same weights, bit by bit.
 import sys
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from gelflow.train.callback import CheckpointCallback, Stopped, describe, is_fir
 from gelflow.train.loading import end_with_run, loading_context
 from gelflow.train.module import FlowModule, check_side
 from gelflow.train.resident import ResidentPairs, resident
-from gelflow.train.samples import CheckedPairs, StepSampler, TrainingBatches, TrainingSamples, checked, collate
+from gelflow.train.samples import CheckedPairs, StepSampler, TrainingSamples, augmented_batch, checked, collate
 from gelflow.train.state import STATE, WEIGHTS, State, load_state, open_run
 from gelflow.train.throughput import peak_memory_mib
 
@@ -103,9 +104,9 @@ def train(
         state = State(0, model.state_dict(), None, None, {})
     model.load_state_dict(state.model)
     module = FlowModule(config, model, state.step, state.optimiser, state.average)
-    callback = CheckpointCallback(config, out, validation_pairs > 0, state.score, state.metrics)
+    callback = CheckpointCallback(module, out, validation_pairs > 0, state.score, state.metrics)
     if module.start < config.steps or state.validation_due:
-        _fit(module, callback, _Data(config, train_set, validation_set, module), device, state.validation_due)
+        _fit(callback, _Data(config, train_set, validation_set, module), device, state.validation_due)
     weights = out / WEIGHTS
     if validation_set is None and is_first_process():
         save_weights(weights, module.evaluated.cpu(), **weights_metadata(config, config.steps))
@@ -141,14 +142,14 @@ def _initial_network(config: TrainConfig, initial: Path | None) -> GelFlow:
     return model.train()
 
 
-def _fit(module: FlowModule, callback: CheckpointCallback, data: "_Data", device: str, validation_due: bool) -> None:
+def _fit(callback: CheckpointCallback, data: "_Data", device: str, validation_due: bool) -> None:
     """Validates first where that is due, then runs the remaining steps.
 
     Raises:
         InputError: A pair cannot be used.
         KeyboardInterrupt: Somebody asked to stop; the message says how to go on.
     """
-    config, out = callback.config, callback.out
+    module, config, out = callback.module, callback.module.config, callback.out
     session = f"from_step_{module.start:06d}"
     with ExitStack() as stack:
         stack.enter_context(quiet_logger("lightning.pytorch", r"lightning\..*"))  # notes on hardware, workers, products
@@ -220,7 +221,7 @@ class _Data(L.LightningDataModule):
         sampler = StepSampler(len(self.train_set), config, start, stop, trainer.global_rank, trainer.world_size)
         samples = TrainingSamples(self.train_set, config)
         loading = {} if isinstance(self.train_set, ResidentPairs) else self._loading
-        return DataLoader(samples, batch_sampler=sampler, collate_fn=TrainingBatches(config), **loading)
+        return DataLoader(samples, batch_sampler=sampler, collate_fn=partial(augmented_batch, config=config), **loading)
 
     def _cache(self) -> None:
         """Puts the training pairs on the device, once, where the configuration and the memory allow it."""

@@ -90,15 +90,9 @@ class TrainingSamples(Dataset[tuple[Sample, np.random.Generator]]):
         return cropped(sample, self.config, random), random
 
 
-class TrainingBatches:
-    """Puts samples of `TrainingSamples` together to an augmented batch."""
-
-    def __init__(self, config: TrainConfig) -> None:
-        self.config = config
-
-    def __call__(self, drawn: Sequence[tuple[Sample, np.random.Generator]]) -> Sample:
-        """Collates samples and augments the batch, each pair by its own source of random numbers."""
-        return augmented(collate([sample for sample, _ in drawn]), self.config, [random for _, random in drawn])
+def augmented_batch(drawn: Sequence[tuple[Sample, np.random.Generator]], config: TrainConfig) -> Sample:
+    """Samples of `TrainingSamples` as a batch, each pair augmented by its own source of random numbers."""
+    return augmented(collate([sample for sample, _ in drawn]), config, [random for _, random in drawn])
 
 
 def checked(sample: Sample, supervised: bool = False) -> Sample:

@@ -73,15 +73,14 @@ def test_video_against_its_first_or_previous_frame(tmp_path: Path, reference: st
     assert calls == [(n, 6) for n in range(1, 7)]
 
 
-def test_folder_of_frames_is_a_video_and_flow_files_of_an_earlier_run_go(tmp_path: Path, monkeypatch) -> None:
+def test_folder_of_frames_is_a_video_and_flow_files_of_an_earlier_run_go(tmp_path: Path) -> None:
     frames = frame_folder(tmp_path / "in", ["b10", "b9", "a"])
     assert len(predict_video(FARNEBACK, frames, tmp_path / "out").motions) == 2
     with (tmp_path / "out" / "motion.csv").open(newline="") as file:
         assert [row["file"] for row in csv.DictReader(file)] == ["b9.png", "b10.png"]
-    monkeypatch.setattr(cv2.VideoWriter, "isOpened", lambda _: False)  # pictures in place of a video
     frames, out = frame_folder(tmp_path / "five", range(5)), tmp_path / "again"
     assert len(predict_video(FARNEBACK, frames, out).motions) == 4
-    others = [out / "flow" / "12.exr", out / "flow" / "000001.txt", out / "overlay" / "notes.png"]
+    others = [out / "flow" / "12.exr", out / "flow" / "000001.txt"]
     for other in others:
         other.touch()
     second = predict_video(FARNEBACK, frames, out, every=3)
@@ -100,7 +99,7 @@ def test_a_pairs_results_replace_those_of_an_earlier_run_and_nothing_else(tmp_pa
         predict_pair(FARNEBACK, *images, tmp_path / "out")
 
 
-@pytest.mark.parametrize("name", ["flow/000007.exr", "motion.csv", "overlay.mp4", "overlay/000000.png"])
+@pytest.mark.parametrize("name", ["flow/000007.exr", "motion.csv", "overlay.mp4"])
 def test_a_videos_results_do_not_replace_anothers_files(tmp_path: Path, name: str) -> None:
     other = tmp_path / name
     other.parent.mkdir(exist_ok=True)

@@ -12,7 +12,7 @@ from gelflow.errors import InputError
 from gelflow.ops.warp import inside, warp
 from gelflow.train.augment import augmented
 from gelflow.train.resident import resident
-from gelflow.train.samples import CheckedPairs, StepSampler, TrainingBatches, TrainingSamples, checked, collate, resized
+from gelflow.train.samples import CheckedPairs, StepSampler, TrainingSamples, augmented_batch, checked, collate, resized
 
 
 def test_passes_see_every_pair_once_a_later_start_goes_on_and_processes_share_batches() -> None:
@@ -31,7 +31,7 @@ def test_passes_see_every_pair_once_a_later_start_goes_on_and_processes_share_ba
 
 def drawn(pairs: Dataset, config: TrainConfig, draw: int) -> dict:
     """Pair 0 as a training step gets it, alone in its batch, without the batch's axis."""
-    batch = TrainingBatches(config)([TrainingSamples(pairs, config)[(0, draw)]])
+    batch = augmented_batch([TrainingSamples(pairs, config)[(0, draw)]], config)
     return {key: value[0] for key, value in batch.items()}
 
 
@@ -204,7 +204,7 @@ def test_training_draws_it_where_the_configuration_asks_for_it() -> None:
 
     def flow(draw: int, motion: MotionConfig | None) -> torch.Tensor:
         config = TrainConfig(supervision="flow", flip=False, motion=motion)
-        return TrainingBatches(config)([TrainingSamples(pairs, config)[(0, draw)]])["flow"][0]
+        return augmented_batch([TrainingSamples(pairs, config)[(0, draw)]], config)["flow"][0]
 
     assert torch.equal(flow(3, None), pairs[0]["flow"])
     shifts = MotionConfig(turn_deg=0, zoom=0)
@@ -215,4 +215,4 @@ def test_training_draws_it_where_the_configuration_asks_for_it() -> None:
     assert train_config(None, ["motion.turn_deg=5"]).motion == MotionConfig(turn_deg=5)
     config = TrainConfig(motion=MotionConfig())
     unlabelled = TrainingSamples(Shifts(1, 80, 1.0, seed=2, flow=False), config)
-    assert "flow" not in TrainingBatches(config)([unlabelled[(0, 0)]])
+    assert "flow" not in augmented_batch([unlabelled[(0, 0)]], config)
