@@ -69,13 +69,6 @@ def compare(
     ft: Annotated[
         int, Parameter(help="Steps of test-time optimisation of each GelFlow network on these pairs, reported apart.")
     ] = 0,
-    ft_config: Annotated[
-        str | None,
-        Parameter(
-            help="A preset or TOML file with its losses, learning rate, batch and flips; default: those of the "
-            "network's own training, in batches of 4. What it takes of neither: gelflow/train/test_time.py."
-        ),
-    ] = None,
     batch: Annotated[int, Parameter(help="Pairs at once where networks' speed and memory are measured; 0: not.")] = 1,
     every: Annotated[int, Parameter(help="Take every n-th pair only, for methods that are slow.")] = 1,
     add: Annotated[
@@ -110,7 +103,7 @@ def compare(
         if out is None or not own:
             raise InputError(f"--ft {ft}: needs --weights of GelFlow, and --out beside which their copies are kept")
         folder = out.with_name(f"{out.name}_ft")
-        networks += [fine_tuned(one, dataset, folder / one.label.replace("/", "_"), ft, ft_config) for one in own]
+        networks += [fine_tuned(one, dataset, folder / one.label.replace("/", "_"), ft) for one in own]
     _score(dataset, [*chosen, *networks], out, as_json, batch, add)
     return 0
 

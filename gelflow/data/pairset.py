@@ -15,7 +15,7 @@
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -54,7 +54,7 @@ class SourceReport(_Record):
 class PairSet(_Record):
     """The contents of pairs.json."""
 
-    schema_version: int = 1
+    schema_version: Literal[1] = 1
     job: dict[str, Any]
     complete: bool = False
     sources: dict[str, SourceReport] = {}
@@ -66,15 +66,12 @@ def read_pair_set(folder: Path) -> PairSet:
     """Reads pairs.json; InputError where it is missing, damaged or of a newer format."""
     path = folder / FILE
     try:
-        content = PairSet.model_validate_json(path.read_text(encoding="utf-8"))
+        return PairSet.model_validate_json(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise InputError(f"{path}: there is no such file") from error
     except (ValidationError, UnicodeDecodeError) as error:
-        detail = f"{error.errors()[0]['msg']}" if isinstance(error, ValidationError) else str(error)
+        detail = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
         raise InputError(f"{path}: not the description of a pair set ({detail})") from error
-    if content.schema_version != 1:
-        raise InputError(f"{path}: schema_version {content.schema_version} is not 1, which this gelflow reads")
-    return content
 
 
 def write_pair_set(folder: Path, content: PairSet) -> None:

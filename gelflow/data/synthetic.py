@@ -15,7 +15,7 @@ from gelflow.data.pairs import PairRecord
 from gelflow.errors import InputError
 
 SCHEMA_VERSION = 1
-"""Newest major version of the format that is understood here."""
+"""Version of the format that is understood here."""
 
 
 def is_synthetic(folder: Path) -> bool:
@@ -75,12 +75,8 @@ def _read_header(path: Path) -> dict[str, Any]:
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: not valid JSON ({error})") from error
     version = header.get("schema_version") if isinstance(header, dict) else None
-    try:
-        major = int(str(version).split(".")[0])
-    except ValueError as error:
-        raise InputError(f"{path}: schema_version is {version!r}; a number is needed") from error
-    if major > SCHEMA_VERSION:
-        raise InputError(f"{path}: schema_version {version} is newer than {SCHEMA_VERSION}, which this gelflow reads")
+    if version != SCHEMA_VERSION:
+        raise InputError(f"{path}: schema_version is {version!r}; this gelflow reads {SCHEMA_VERSION}")
     return dict(header)
 
 

@@ -95,8 +95,12 @@ def train(
     if validation_set is not None:
         check_side(_one_pair([validation_set[0]]), config)
     if is_first_process():
-        data = {"pairs": pairs, "digest": getattr(train_set, "digest", None), "validation_pairs": validation_pairs,
-                "validation_digest": getattr(validation_set, "digest", None)}  # fmt: skip
+        data = {
+            "pairs": pairs,
+            "validation_pairs": validation_pairs,
+            "training_pairs_sha256": getattr(train_set, "digest", None),
+            "validation_pairs_sha256": getattr(validation_set, "digest", None),
+        }
         state = open_run(out, config, data, initial, resume)
     else:
         state = load_state(out) if resume else None

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
 from gelflow.config import MINIMUM_SIDE, TrainConfig
@@ -54,7 +53,7 @@ class StepSampler(Sampler[list[tuple[int, int]]]):
 
 
 class CheckedPairs(Dataset[Sample]):
-    """Pairs with what training needs of them, see `checked`; a pair that cannot be used is refused."""
+    """Pairs with what training needs of them, see `checked`."""
 
     def __init__(self, pairs: Dataset[Any], supervised: bool) -> None:
         self.pairs = pairs
@@ -96,30 +95,13 @@ def augmented_batch(drawn: Sequence[tuple[Sample, np.random.Generator]], config:
 
 
 def checked(sample: Sample, supervised: bool = False) -> Sample:
-    """What training needs of a sample.
-
-    Raises:
-        InputError: A part is missing, has another shape, or an image holds values that are not finite.
-    """
-    name = sample.get("name", "(without a name)")
-    for key in ("image1", "image2"):
-        image = sample.get(key)
-        if not isinstance(image, Tensor) or image.ndim != 3 or image.shape[0] != 3:
-            raise InputError(f"pair {name}: {key} must be a (3, rows, columns) tensor")
-        if not torch.isfinite(image).all():
-            raise InputError(f"pair {name}: {key} holds NaN or infinite values")
-    if sample["image1"].shape != sample["image2"].shape:
-        sizes = [tuple(sample[key].shape[1:]) for key in ("image1", "image2")]
-        raise InputError(f"pair {name}: its images have different sizes, {sizes[0]} and {sizes[1]}")
-    kept = {key: sample[key] for key in ("image1", "image2", "bare") if key in sample} | {"name": name}
+    """What training needs of a sample; InputError where it lacks the exact flow of supervised training."""
     flow = sample.get("flow")
-    if flow is not None:
-        if flow.shape[1:] != sample["image1"].shape[1:]:
-            raise InputError(f"pair {name}: its flow has another size than its images")
-        kept["flow"] = flow
     if supervised and (flow is None or not torch.isfinite(flow).any()):
-        raise InputError(f'pair {name}: has no exact flow, which supervision = "flow" needs; use supervision = "self"')
-    return kept
+        raise InputError(
+            f'pair {sample["name"]}: has no exact flow, which supervision = "flow" needs; use supervision = "self"'
+        )
+    return {key: sample[key] for key in ("image1", "image2", "bare", "name", "flow") if key in sample}
 
 
 def resized(sample: Sample, size: tuple[int, int]) -> Sample:

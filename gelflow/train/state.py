@@ -18,7 +18,6 @@ import torch
 
 from gelflow import __version__
 from gelflow.config import TrainConfig
-from gelflow.config.validation import validated
 from gelflow.errors import InputError
 from gelflow.files.atomic import refuse_foreign, replacing, write_text
 from gelflow.files.tensors import Unreadable, load_tensors
@@ -72,8 +71,9 @@ def open_run(
 ) -> State | None:
     """Claims the folder for a new run, or checks that it holds this very run.
 
-    `data` is what is known of the data sets: `pairs` and `validation_pairs` (0 without), their numbers, and `digest`
-    and `validation_digest` (None where a data set has none). `initial` are the weights that the run starts from.
+    `data` is what is known of the data sets: `pairs` and `validation_pairs` (0 without), their numbers, and
+    `training_pairs_sha256` and `validation_pairs_sha256`, digests of their names, scenes and seeds (None where a data
+    set has none). `initial` are the weights that the run starts from.
 
     Returns:
         The state to resume from; None for a new run.
@@ -97,19 +97,13 @@ def open_run(
         write_text(out / RUN, json.dumps(record, indent=2) + "\n")
         return None
     state = load_state(out)
-    former = _read_run(out)
+    old, new = _flat(_read_run(out)), _flat(record)
+    free = ("gelflow", *(f"config.{name}" for name in (FREE if config.schedule == "constant" else FREE[1:])))
     differences = [
-        f"{name}: {former.get(name)!r} there, {record[name]!r} now"
-        for name in ("pairs", "validation_pairs", "initial_sha256")
-        if former.get(name) != record[name]
+        f"{name.removeprefix('config.')}: {old.get(name)!r} there, {value!r} now"
+        for name, value in new.items()
+        if name not in free and old.get(name) != value
     ]
-    differences += [
-        f"the {words} have other names, scenes or seeds there"
-        for name, words in (("digest", "training pairs"), ("validation_digest", "validation pairs"))
-        if None not in (former.get(name), record[name]) and former[name] != record[name]
-    ]
-    before = validated(TrainConfig, former.get("config", {}), str(out / RUN))
-    differences += _differences(before, config)
     if differences:
         raise InputError(f"{out}: holds another run than the one to resume ({'; '.join(differences)})")
     if state.step > config.steps:
@@ -126,13 +120,6 @@ def _read_run(out: Path) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise InputError(f"{out / RUN}: damaged, the run cannot be resumed")
     return values
-
-
-def _differences(before: TrainConfig, now: TrainConfig) -> list[str]:
-    free = FREE if now.schedule == "constant" else FREE[1:]
-    old, new = _flat(before.model_dump(mode="json")), _flat(now.model_dump(mode="json"))
-    return [f"{name}: {old[name]!r} there, {new[name]!r} now"
-            for name in new if name not in free and old[name] != new[name]]  # fmt: skip
 
 
 def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:

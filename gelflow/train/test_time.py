@@ -4,8 +4,8 @@ It cannot be compared with methods that see each pair once; tables list it apart
 additional 800 epochs using the validation dataset" and says no more, so everything else is as in its training: the
 self-supervised losses, whole images at the network's size, batches of 4, a constant rate.
 
-Losses, gradient clipping, flips, weight decay and seed are those that the network's training recorded with its weights,
-or those of `--ft-config`. Nothing else of a training carries over, whatever its preset:
+Losses, gradient clipping, flips, weight decay and seed are those that the network's training recorded with its weights.
+Nothing else of a training carries over, whatever its preset:
 
 - exact flow is not looked at, also where the pairs have it (`supervision`);
 - the pairs are neither moved nor recoloured nor cropped: these very images are to be matched, and most of a large
@@ -26,7 +26,6 @@ from typing import Any
 from gelflow.baselines.learned import Learned
 from gelflow.compare.seeds import FINE_TUNED
 from gelflow.config import TrainConfig
-from gelflow.config.sources import train_config
 from gelflow.config.validation import validated
 from gelflow.data.pairs import PairDataset
 from gelflow.errors import InputError
@@ -37,27 +36,20 @@ RATE = 1e-4
 """Largest constant learning rate in place of a falling one: that of ARFlow, on which the paper builds."""
 
 
-def fine_tuning_settings(method: Learned, steps: int, config: str | None, pairs: int) -> TrainConfig:
+def fine_tuning_settings(method: Learned, steps: int, pairs: int) -> TrainConfig:
     """The settings of a test-time optimisation; batches are not larger than the number of pairs.
 
-    `config` is a preset or TOML file, whose batch size holds in place of `BATCH`; None: the settings that the weights
-    were trained with. The paper's 800 epochs of 8 pairs in batches of 4 are 1600 steps.
+    The paper's 800 epochs of 8 pairs in batches of 4 are 1600 steps.
 
     Raises:
-        InputError: The weights carry no settings, or `config` cannot be used.
+        InputError: The weights carry no settings.
     """
     from gelflow.models.weights import read_metadata
 
-    if config is None:
-        text = read_metadata(method.path).get("train")
-        if text is None:
-            raise InputError(f"{method.path}: its metadata lack the settings of its training; give --ft-config")
-        values = json.loads(text) | {"batch_size": BATCH, "workers": 0}
-    else:
-        chosen = train_config(config)
-        values = chosen.model_dump(mode="json")
-        if len(chosen.loss.lambda_s) != method.trained.levels - 1:
-            raise InputError(f"--ft-config {config}: its losses are for another number of scales than {method.path}")
+    text = read_metadata(method.path).get("train")
+    if text is None:
+        raise InputError(f"{method.path}: its metadata lack the settings of its training, by which --ft goes on")
+    values = json.loads(text)
     fixed: dict[str, Any] = {
         "model": method.trained.model_dump(),
         "supervision": "self",
@@ -69,7 +61,8 @@ def fine_tuning_settings(method: Learned, steps: int, config: str | None, pairs:
         "schedule": "constant",
         "warmup_steps": 0,
         "steps": steps,
-        "batch_size": min(values["batch_size"], pairs),
+        "batch_size": min(BATCH, pairs),
+        "workers": 0,
         "device": method.device,
         "devices": 1,
         "nodes": 1,
@@ -79,11 +72,11 @@ def fine_tuning_settings(method: Learned, steps: int, config: str | None, pairs:
     return validated(TrainConfig, values | fixed, f"{method.path}, fine-tuning")
 
 
-def fine_tuned(method: Learned, dataset: PairDataset, out: Path, steps: int, config: str | None = None) -> Learned:
+def fine_tuned(method: Learned, dataset: PairDataset, out: Path, steps: int) -> Learned:
     """Trains a copy of a network on the pairs of a comparison; its name ends with "+ft".
 
     A run of the same settings in the folder `out` is resumed, or used if it is finished. It is the same run however the
-    flow is registered. For `config` see `fine_tuning_settings`.
+    flow is registered.
 
     Raises:
         InputError: The pairs differ in size and the network has none of its own; see also `fine_tuning_settings` and
@@ -92,7 +85,7 @@ def fine_tuned(method: Learned, dataset: PairDataset, out: Path, steps: int, con
     from gelflow.train import train
     from gelflow.train.state import STATE
 
-    settings = fine_tuning_settings(method, steps, config, len(dataset))
+    settings = fine_tuning_settings(method, steps, len(dataset))
     sizes = {dataset.images(index)[0].shape[:2] for index in range(len(dataset))}
     if settings.image_size is None and len(sizes) > 1:
         given = ", ".join(f"{rows}x{columns}" for rows, columns in sorted(sizes))

@@ -20,7 +20,7 @@ import shutil
 import tarfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,11 +60,9 @@ def export(
         How many samples were written.
 
     Raises:
-        InputError: Unknown format or camera, `out` is not empty, no finished sample, a damaged file, a flow beyond
+        InputError: Unknown camera, `out` is not empty, no finished sample, a damaged file, a flow beyond
             KITTI's range, or the storage refuses.
     """
-    if format not in get_args(ExportFormat):
-        raise InputError(f"--format {format}: unknown; allowed are {', '.join(get_args(ExportFormat))}")
     final = Path(out)
     dataset = read_dataset(path)
     if not dataset.samples:

@@ -59,6 +59,8 @@ class DatasetWriter:
     """The folder of this machine with the lines of all: the dataset's, or a temporary copy of what is under the URL."""
     _own: Path
     """The folder that takes this process's lines: the same, or a shard's."""
+    run: Mapping[str, Any] | None = None
+    """What `finalise` writes to summary.json about this run, beside the totals of the dataset."""
 
     def __init__(self, out: Path | str, job: Job, shard: Shard | None = None, pairs_per_trajectory: int = 1) -> None:
         """Creates the dataset, or goes on with the job that is there.
@@ -76,7 +78,6 @@ class DatasetWriter:
         """
         self._store, self.job, self._shard, self._pairs = Store(out), job, shard, pairs_per_trajectory
         self._directory = self._store.directory
-        self._run: Mapping[str, Any] | None = None
         self._check_place()
         self._closing = contextlib.ExitStack()
         self._lock: DirectoryLock | Lease
@@ -161,10 +162,6 @@ class DatasetWriter:
         for path in made:
             self._store.put(path, f"{MESHES_FOLDER}/{path.name}")
 
-    def note_run(self, run: Mapping[str, Any]) -> None:
-        """What `finalise` writes to summary.json about this run, beside the totals of the dataset."""
-        self._run = run
-
     def finalise(self) -> None:
         """Merges the lines of all into manifest and failures, writes the summary; in a shard only the last to leave.
 
@@ -177,9 +174,9 @@ class DatasetWriter:
             if self._directory is None:
                 for name in (MANIFEST_FILE, FAILURES_FILE):
                     self._store.put(self._whole / name, name)
-            if self._run is not None:
+            if self.run is not None:
                 asked_for = int((self._record() or self.job.record())["n"])
-                self._store.write(SUMMARY_FILE, summary_document(self._whole, self._run, asked_for))
+                self._store.write(SUMMARY_FILE, summary_document(self._whole, self.run, asked_for))
             if self._directory is None:
                 self._store.delete(f"{JOURNAL_FOLDER}/{name}" for name in self._store.names(JOURNAL_FOLDER))
 

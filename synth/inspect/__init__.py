@@ -3,6 +3,6 @@
 from synth.inspect.html import PAGE_MARK, write_html
 from synth.inspect.inspection import Inspection, inspect
 from synth.inspect.sheet import SHEET_MARK, write_sheet
-from synth.inspect.table import tables
+from synth.inspect.text import tables
 
 __all__ = ["PAGE_MARK", "SHEET_MARK", "Inspection", "inspect", "tables", "write_html", "write_sheet"]

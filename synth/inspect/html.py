@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from synth.dataset.images import encode_png
 from synth.dataset.storage import replace_file
 from synth.inspect.inspection import Inspection
-from synth.inspect.panels import CLOSURE_RANGE_PX, Arrows, Panel, image_picture, panels_of
+from synth.inspect.panels import CLOSURE_RANGE_PX, Arrows, Panel, panels_of
 from synth.inspect.text import COLUMNS, about_rows, facts
 from synth.inspect.view import View
-from synth.inspect.wheel import flow_colours, robust_scale, wheel_legend
+from synth.inspect.wheel import wheel_legend
 
 PAGE_MARK = "<title>synth: "
 """In each page's head."""
@@ -32,7 +32,6 @@ th { font-weight: 600; white-space: nowrap; }
 table.rows td, table.rows th { text-align: right; vertical-align: middle; white-space: nowrap; }
 table.rows tr > * { border-bottom: 1px solid var(--line); }
 table.rows td:first-child, table.rows th:first-child { text-align: left; }
-table.rows img { width: 110px; display: block; }
 .scroll { overflow-x: auto; }
 .pictures { display: grid; grid-template-columns: repeat(auto-fill, minmax(270px, 1fr)); gap: 1rem; }
 figure { margin: 0; } figcaption { font-size: .85rem; padding: .25rem 0; }
@@ -48,7 +47,7 @@ p.note { color: #888; font-size: .85rem; max-width: 60rem; }
 def write_html(inspection: Inspection, html: Path | str) -> None:
     """Writes the page; a file of that name is replaced. InputError where a sample has gone or the storage refuses."""
     body = _dataset_body(inspection) if inspection.kind == "dataset" else _view_body(inspection)
-    title = escape(inspection.title)
+    title = escape(inspection.path.resolve().name)
     page = (
         f'<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">{PAGE_MARK}{title}</title>'
         f'<meta name="viewport" content="width=device-width"><style>{_STYLE}</style></head>\n<body>\n{body}\n'
@@ -79,15 +78,14 @@ def _dataset_body(inspection: Inspection) -> str:
     pictured = set(inspection.spread(PICTURED))
     rows, sections = [], []
     for number, numbers in enumerate(inspection.numbers):
-        view = inspection.view(number) if number in pictured else None
-        rows.append(_row(numbers, view))
-        if view is not None:
-            name = escape(numbers["name"])
+        name, *cells = (escape(text(numbers)) for _, text in COLUMNS)
+        rows.append(_cells("td", [f'<a href="#s{name}">{name}</a>' if number in pictured else name, *cells]))
+        if number in pictured:
             sections.append(
-                f'<h2 id="s{name}">Sample {name}</h2>\n{_pictures(view, numbers)}\n'
+                f'<h2 id="s{name}">Sample {name}</h2>\n{_pictures(inspection.view(number), numbers)}\n'
                 f"<details><summary>all numbers</summary>{_facts(facts(numbers))}</details>"
             )
-    heads = [*(name.replace("-\n", "") for name, _ in COLUMNS), "image 1", "image 2", "forward flow"]
+    heads = [name.replace("-\n", "") for name, _ in COLUMNS]
     some = f'<p class="note">{len(pictured)} of {len(rows)} samples have pictures.</p>'
     table = f'<table class="rows">{_cells("th", heads)}\n{"".join(rows)}</table>'
     return (
@@ -96,22 +94,8 @@ def _dataset_body(inspection: Inspection) -> str:
     )
 
 
-def _row(numbers: dict[str, Any], view: View | None) -> str:
-    name, *cells = (escape(text(numbers)) for _, text in COLUMNS)
-    return _cells("td", [f'<a href="#s{name}">{name}</a>' if view is not None else name, *cells, *_thumbnails(view)])
-
-
 def _cells(tag: str, cells: list[str]) -> str:
     return "<tr>" + "".join(f"<{tag}>{cell}</{tag}>" for cell in cells) + "</tr>\n"
-
-
-def _thumbnails(view: View | None) -> list[str]:
-    if view is None or view.image1 is None or view.image2 is None:
-        return ["", "", ""]
-    step = max(1, view.size[1] // 160)
-    flow = flow_colours(view.flow.forward, robust_scale(view.flow.forward))
-    pictures = (image_picture(view.image1), image_picture(view.image2), flow)
-    return [f'<img alt="" src="{_inline(picture[::step, ::step])}">' for picture in pictures]
 
 
 def _facts(rows: list[tuple[str, str]]) -> str:

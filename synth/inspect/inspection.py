@@ -47,10 +47,6 @@ class Inspection:
         samples = evenly_spaced(len(self.places) // self.cameras, max(1, count // self.cameras))
         return [sample * self.cameras + camera for sample in samples for camera in range(self.cameras)]
 
-    @property
-    def title(self) -> str:
-        return self.path.resolve().name
-
     def as_dict(self) -> dict[str, Any]:
         return {"kind": self.kind, "path": str(self.path), **self.about, "samples": list(self.numbers)}
 

@@ -1,30 +1,35 @@
-"""Numbers as short text, and the rows and columns that table, sheet and page show."""
+"""Numbers as short text, the rows and columns that table, sheet and page show, and the tables for the terminal."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from rich.cells import cell_len
+from rich.table import Table
+from rich.text import Text
+
 from synth.inspect.inspection import Inspection
 
 NONE = "–"
+Column = tuple[str, list[str]]
+"""Heading of a table, and a cell for each sample."""
 
 
-def short(value: object, unit: str = "") -> str:
+def short(value: object) -> str:
     """A number to three digits, a truth as yes or no, nothing as a dash."""
     if value is None:
         return NONE
     if isinstance(value, bool):
         return "yes" if value else "no"
-    text = f"{value:.3g}" if isinstance(value, float) else str(value)
-    return f"{text} {unit}".strip()
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
 def percent(share: float | None) -> str:
     return NONE if share is None else f"{100 * share:.4g} %"
 
 
-def vector(values: Sequence[float] | None, unit: str = "") -> str:
+def vector(values: Sequence[float]) -> str:
     """Components to three digits."""
-    return NONE if values is None else f"({', '.join(f'{value:.3g}' for value in values)}) {unit}".strip()
+    return f"({', '.join(f'{value:.3g}' for value in values)})"
 
 
 def facts(numbers: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -118,3 +123,51 @@ COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
     ("con-\nverged", lambda n: short(_solver(n).get("converged"))),
 )
 """Of a dataset's samples: heading, and the cell from a sample's numbers."""
+
+
+def tables(inspection: Inspection, width: int | None = None) -> list[Table]:
+    """For `rich.console.Console.print`: of a dataset its facts and a row per sample and camera, else all numbers.
+
+    Columns that do not fit the terminal's width in characters, where one is given, follow in further tables.
+    """
+    if inspection.kind != "dataset":
+        return [_pairs(str(place), facts(n)) for place, n in zip(inspection.places, inspection.numbers, strict=True)]
+    columns = [(name, [text(numbers) for numbers in inspection.numbers]) for name, text in COLUMNS]
+    return [
+        _pairs(str(inspection.path), about_rows(inspection)),
+        *(_samples(part) for part in _fitting(columns, width)),
+    ]
+
+
+def _fitting(columns: list[Column], width: int | None) -> list[list[Column]]:
+    """The columns in parts that fit; each begins with the first column, which names the sample."""
+    parts = [columns[:1]]
+    for column in columns[1:]:
+        if width is not None and len(parts[-1]) > 1 and _width([*parts[-1], column]) > width:
+            parts.append(columns[:1])
+        parts[-1] = [*parts[-1], column]
+    return parts
+
+
+def _width(columns: list[Column]) -> int:
+    """Characters of a table: two of padding and a border for each column, and the last border."""
+    lines = [[*name.splitlines(), *cells] for name, cells in columns]
+    return 1 + sum(3 + max(cell_len(line) for line in column) for column in lines)
+
+
+def _samples(columns: list[Column]) -> Table:
+    rows = Table(title="samples", title_justify="left", header_style="bold")
+    for name, _ in columns:
+        rows.add_column(name, justify="right", overflow="fold")
+    for cells in zip(*(cells for _, cells in columns), strict=True):
+        rows.add_row(*map(Text, cells))
+    return rows
+
+
+def _pairs(title: str, rows: list[tuple[str, str]]) -> Table:
+    table = Table(title=Text(title, style="table.title"), title_justify="left", show_header=False)
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, value in rows:
+        table.add_row(name, Text(value))
+    return table

@@ -68,8 +68,7 @@ class Summary:
         found: samples that were there already.
         made: samples written by this call.
         given_up: indices whose every draw failed.
-        failed_draws: draws that failed and were redrawn.
-        failures: stage and reason, numbers left out -> how many draws.
+        failures: stage and reason, numbers left out -> how many draws failed so and were redrawn.
         seconds: wall time.
         stages: stage -> its seconds summed over samples.
     """
@@ -80,7 +79,6 @@ class Summary:
     found: int
     made: int = 0
     given_up: list[int] = field(default_factory=list)
-    failed_draws: int = 0
     failures: Counter[str] = field(default_factory=Counter)
     seconds: float = 0.0
     stages: Counter[str] = field(default_factory=Counter)
@@ -88,10 +86,13 @@ class Summary:
     def add(self, outcome: Outcome) -> None:
         self.made += len(outcome.entries)
         self.given_up = sorted([*self.given_up, *outcome.given_up])
-        self.failed_draws += len(outcome.failures)
         self.failures.update(reason_group(failure.stage, failure.reason) for failure in outcome.failures)
         for entry in outcome.entries:
             self.stages.update(entry.seconds)
+
+    @property
+    def failed_draws(self) -> int:
+        return self.failures.total()
 
     @property
     def samples_per_second(self) -> float:
@@ -185,7 +186,7 @@ def generate(
                 if progress is not None:
                     progress(summary.found + summary.made + len(summary.given_up), summary.asked_for)
         summary.seconds = time.perf_counter() - started
-        writer.note_run(summary.record())
+        writer.run = summary.record()
     return summary
 
 

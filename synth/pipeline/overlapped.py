@@ -9,15 +9,16 @@ long enough that rendering goes on while the next chunk is drawn. A killed run l
 instances and samples come out the same the next time.
 """
 
+from collections import deque
 from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, contextmanager
 from functools import partial
+from typing import Any, TypeVar
 
 from synth.arrays import Image
 from synth.pipeline.batched_simulation import Result, in_batches
 from synth.pipeline.finishing import finish
-from synth.pipeline.prefetch import prefetched
 from synth.pipeline.records import JobContext, Outcome, Task
 from synth.pipeline.render_session import RenderedTrajectory, RenderSession
 from synth.pipeline.textures import Textures
@@ -28,6 +29,8 @@ PREFETCHED = 256
 TEXTURE_THREADS = 6
 
 Rendered = RenderedTrajectory | Outcome
+Item = TypeVar("Item")
+_END: Any = object()
 
 
 def outcomes_of_batches(
@@ -59,6 +62,27 @@ def outcomes_of_batches(
                 yield from spread(context, _finisher, items, workers, number)
         finally:
             threads.shutdown(wait=False, cancel_futures=True)
+
+
+@contextmanager
+def prefetched(items: Iterable[Item], limit: int) -> Iterator[Iterator[Item]]:
+    """Take items, in their order, from an iterator that runs in another thread; what it raises is raised here.
+
+    When `limit` items wait to be taken, the other thread waits. On leaving, it stops after its present item.
+    """
+    source = iter(items)
+    thread = ThreadPoolExecutor(1)
+    waiting = deque(thread.submit(next, source, _END) for _ in range(limit))
+
+    def in_order() -> Iterator[Item]:
+        while (item := waiting.popleft().result()) is not _END:
+            waiting.append(thread.submit(next, source, _END))
+            yield item
+
+    try:
+        yield in_order()
+    finally:
+        thread.shutdown(cancel_futures=True)
 
 
 def _with_textures(results: Iterable[Result], textures: Textures) -> Iterator[tuple[Result, Future[Image] | None]]:

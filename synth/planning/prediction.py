@@ -19,6 +19,8 @@ from synth.simulate.load_path import TWIST_ARM_MM
 from synth.simulate.press import edge_radius_mm
 from synth.simulate.resolution import Resolution
 
+_Meshes = tuple[list[tuple[Scene, int]], str, tuple[float, float] | None]
+"""Random instances with their displacement nodes; `Prediction.resolution` and `Prediction.error_px`."""
 INSTANCES = 12
 """Trajectories whose meshes are chosen to predict error and time."""
 NODES_PER_VOLUME, NODES_PER_AREA, NODES_PER_CURVED_AREA, FEWEST_NODES = 0.72, 0.25, 2.3, 300
@@ -80,17 +82,17 @@ def predict(plan: Plan) -> Prediction:
     template, variant, pairs = plan.template, plan.variant, plan.template.sampling.pairs_per_trajectory
     corner = template.corners[0]
     cameras = [view.camera for view in corner.sensor.views.values()]
-    meshes = _tetwild_meshes(plan) if plan.mesh.kind == "tetwild" else _meshes(plan)
-    simulate = float(np.mean([_simulation_seconds(scene, nodes, plan) for scene, nodes in meshes.presses]))
+    presses, resolution, error_px = _tetwild_meshes(plan) if plan.mesh.kind == "tetwild" else _meshes(plan)
+    simulate = float(np.mean([_simulation_seconds(scene, nodes, plan) for scene, nodes in presses]))
     pixels = sum(camera.width * camera.height for camera in cameras)
     samples = AUTO_SAMPLES if corner.render.samples_per_pixel == "auto" else corner.render.samples_per_pixel
     frame = pixels * samples / 1e6 * SECONDS_PER_MILLION_SAMPLES[variant.name.split("_")[0]]
     directions = 2 if plan.template.outputs.backward else 1
     return Prediction(
-        resolution=meshes.resolution,
-        error_px=meshes.error_px,
-        target_error_px=None if meshes.error_px is None else plan.mesh.target_error_px,
-        nodes=round(float(np.mean([nodes for _, nodes in meshes.presses]))),
+        resolution=resolution,
+        error_px=error_px,
+        target_error_px=None if error_px is None else plan.mesh.target_error_px,
+        nodes=round(float(np.mean([nodes for _, nodes in presses]))),
         seconds_per_pair={
             "simulate": round(simulate / pairs, 3),
             "render": round(frame * (1 + 1 / pairs), 3),
@@ -98,15 +100,6 @@ def predict(plan: Plan) -> Prediction:
         },
         bytes_per_pair=round(pixels * (BYTES_PER_PIXEL_OF_FLOW * directions / 2 + 2 * BYTES_PER_PIXEL_OF_IMAGE)),
     )
-
-
-@dataclass(frozen=True)
-class _Meshes:
-    """Some random instances with their displacement nodes, and what Prediction says of their meshes."""
-
-    presses: tuple[tuple[Scene, int], ...]
-    resolution: str
-    error_px: tuple[float, float] | None
 
 
 def _meshes(plan: Plan) -> _Meshes:
@@ -131,8 +124,8 @@ def _meshes(plan: Plan) -> _Meshes:
     rounded = [radius for radius in radii if radius is not None]
     if rounded:
         text += f", edges of objects rounded to {min(rounded):.2g} to {max(rounded):.2g} mm"
-    presses = tuple((scene, round(_order(scene) * len(resolution.mesh.points))) for scene, resolution in found)
-    return _Meshes(presses, text, (float(np.median(errors)), max(errors)))
+    presses = [(scene, round(_order(scene) * len(resolution.mesh.points))) for scene, resolution in found]
+    return presses, text, (float(np.median(errors)), max(errors))
 
 
 def _tetwild_meshes(plan: Plan) -> _Meshes:
@@ -145,7 +138,7 @@ def _tetwild_meshes(plan: Plan) -> _Meshes:
     vertices = NODES_PER_VOLUME * x * y * z + per_area * 2 * (x * y + y * z + z * x)
     nodes = max(FEWEST_NODES, round(_order(first) * vertices))
     text = f"fTetWild meshes with edges of {edge_mm:g} mm at the contact face"
-    return _Meshes(tuple((corner, nodes) for corner in plan.template.corners), text, None)
+    return [(corner, nodes) for corner in plan.template.corners], text, None
 
 
 def _plate(gel: Gel) -> tuple[float, float, float]:

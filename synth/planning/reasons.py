@@ -30,8 +30,9 @@ def decisions(template: Template, variant: Variant, is_batched: bool) -> tuple[D
     cameras = [view.camera for c in corners for view in c.sensor.views.values()]
     lens = any(any(camera.distortion) or camera.lens == "fisheye" for camera in cameras)
     flat = all(c.sensor.gel.is_flat for c in corners)
+    own_frames = "" if flat else ": curved faces have own frames"
     apertures = [camera.aperture_mm for camera in cameras]
-    blurred = max(apertures) > 0
+    pinhole = "" if max(apertures) > 0 else ": a pinhole"
     mirrors, further = len(corners[0].sensor.mirrors), len(corners[0].sensor.further_cameras)
     light = corners[0].render.light
     separated = is_separated(corners[0].render, corners[0].sensor.coating, variant)
@@ -50,16 +51,8 @@ def decisions(template: Template, variant: Variant, is_batched: bool) -> tuple[D
         Decision("pressure field", mixed, _span("sensor.gel.poisson_ratio", poisson) + foam),
         Decision("window refraction", max(index) > 1, _span("sensor.window.refractive_index", index)),
         Decision("lens distortion", lens, "sensor.camera.distortion" + ("" if lens else " is zero: a pinhole")),
-        Decision(
-            "shared undeformed frame",
-            flat,
-            "sensor.gel.shape" + ("" if flat else ": curved faces have own frames"),
-        ),
-        Decision(
-            "depth of field",
-            blurred,
-            _span("sensor.camera.aperture_mm", apertures) + ("" if blurred else ": a pinhole"),
-        ),
+        Decision("shared undeformed frame", flat, "sensor.gel.shape" + own_frames),
+        Decision("depth of field", max(apertures) > 0, _span("sensor.camera.aperture_mm", apertures) + pinhole),
         Decision("mirrors", mirrors > 0, f"{mirrors} in sensor.mirrors"),
         Decision("further cameras", further > 0, f"{further} in sensor.further_cameras"),
         Decision("separated light", separated, f"render.light = {light}{instead}"),

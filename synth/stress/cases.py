@@ -17,7 +17,6 @@ EXTREME = SCENES / "extreme"
 """Folder of the base scene and the expectations."""
 END = Literal["complete", "partial", "failed", "refused"]
 """How a case may end: a trajectory's status, or an InputError ("refused"); "crashed" and "hung" are never accepted."""
-MeshVariant = Literal["as made", "sliver", "flat", "one inverted", "all inverted", "nan", "loose node", "another pad"]
 SurfaceVariant = Literal["ball", "inside out", "mixed", "slivers", "open", "metres", "pane"]
 Range = tuple[float, float]
 
@@ -67,7 +66,6 @@ class Case(Expectation):
     set: tuple[str, ...] = ()
     elements: tuple[str, ...] = Field(default=(), max_length=4)
     factor: Literal["single", "double"] = "single"
-    mesh: MeshVariant = "as made"
     surface: SurfaceVariant | None = None
     object: str | None = None
     budget_s: Annotated[float, Field(gt=0)] | None = None

@@ -28,7 +28,7 @@ def _row(verdict: Verdict) -> dict[str, Any]:
     return {
         "case": case.name,
         "element": result.run.element,
-        **case.model_dump(mode="json", include={"group", "why", "set", "mesh", "surface"}),
+        **case.model_dump(mode="json", include={"group", "why", "set", "surface"}),
         "outcome": result.outcome,
         "expected": list(case.outcome),
         "verdict": verdict.word,

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from synth.arrays import Points
 from synth.errors import InputError
 from synth.mesh import PadMesh
 from synth.mesh.tetrahedralise import shape_quality
@@ -21,8 +22,11 @@ from synth.scene.template import load_scene
 from synth.simulate import Trajectory, simulate
 from synth.simulate.mesh_rule import MeshRule
 from synth.simulate.options import SolverOptions
-from synth.stress.cases import Case, Run
-from synth.stress.inputs import altered_mesh, write_surface
+from synth.stress.cases import Case, Run, SurfaceVariant
+
+NEAR = 1e-5
+"""Distance of a sliver triangle's third corner from its opposite edge, relative to that edge."""
+RADIUS_MM = 3.0
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -48,8 +52,6 @@ def simulated(run: Run, folder: Path, meshes: Path) -> tuple[Scene, PadMesh, Tra
     template = load_scene(run.base, assignments)
     scene = template.corners[0]  # no distributions: all corners are the same
     mesh = MeshRule.of(scene).resolution(scene, folder, [meshes]).mesh
-    if run.case.mesh != "as made":
-        mesh = altered_mesh(mesh, run.case.mesh)
     options = SolverOptions(single_precision=run.case.factor == "single")
     return scene, mesh, simulate(scene, mesh, folder, options=options)
 
@@ -84,6 +86,39 @@ def _without_folders(message: str, *places: Path) -> str:
         folder = place.resolve() if place.is_dir() else place.resolve().parent
         message = message.replace(f"{folder}{os.sep}", "")
     return message
+
+
+def write_surface(variant: SurfaceVariant, path: Path) -> None:
+    """A ball as a file of triangles (PLY), as it should be or with one thing wrong; or a pane that stands upright."""
+    import pyvista as pv
+
+    ball = pv.Icosphere(radius=RADIUS_MM, nsub=3)
+    points, faces = np.asarray(ball.points, dtype=np.float64), ball.regular_faces.copy()
+    match variant:
+        case "inside out":
+            faces = faces[:, ::-1]
+        case "mixed":
+            faces[::3] = faces[::3, ::-1]
+        case "slivers":
+            points, faces = _slivers(points, faces)
+        case "open":
+            faces = faces[7:]
+        case "metres":
+            points = points / 1000
+        case "pane":
+            box = pv.Box((-3.0, 3.0, -0.03, 0.03, -2.0, 2.0)).triangulate()
+            points, faces = np.asarray(box.points, dtype=np.float64), box.regular_faces
+    pv.PolyData.from_regular_faces(points, faces).save(path, recompute_normals=False)  # which would turn them back
+
+
+def _slivers(points: Points, faces: np.ndarray) -> tuple[Points, np.ndarray]:
+    """Split every tenth triangle from a point within it, NEAR its first edge."""
+    split = np.arange(0, len(faces), 10)
+    a, b, c = faces[split].T
+    added = len(points) + np.arange(len(split))
+    inside = (1 - NEAR) * (points[a] + points[b]) / 2 + NEAR * points[c]
+    parts = [np.column_stack(part) for part in ((a, b, added), (b, c, added), (c, a, added))]
+    return np.concatenate([points, inside]), np.concatenate([np.delete(faces, split, axis=0), *parts])
 
 
 if __name__ == "__main__":

@@ -145,11 +145,6 @@ class ForwardCamera:
                 free &= ~plate.crossed(self.eye, turn) & ~plate.crossed(turn, end)
         return free
 
-    def entrances(self, points: Points, path: int) -> Points:
-        """Where light from points (n, 3) leaves the body on its way to the camera; at index 1 the eye or its image."""
-        aim = self._aim(points, path) if self.index > 1 else np.broadcast_to(self.eye, points.shape)
-        return self.plates[path - 1].reflected(aim) if path > 0 else aim
-
     def _local(self, points: Points, path: int) -> Points:
         """Where the camera has to look, in its own right-handed frame, z ahead."""
         return np.asarray((self._aim(points, path) - self.eye) * _MIRROR @ self.rotation.T)

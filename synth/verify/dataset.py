@@ -1,51 +1,51 @@
 """Verification of samples and datasets: all checks together.
 
 The flow and its visibility are derived again at every pixel, in each direction. Of optional channels (depth, normal,
-displacement, traction, contact) it is checked that they are there (`synth.verify.files`); their values are not derived
-again.
+displacement, traction, contact) it is checked that they are there (`flow_file_problems`); their values are not
+derived again.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+
+from synth.dataset.exr import ALIASES, read_channels
+from synth.dataset.exr_channels import OPTIONAL
 from synth.dataset.reader import Dataset, SampleData, read_dataset
 from synth.errors import InputError
-from synth.scene import Scene, Sensor
+from synth.scene import Outputs, Scene, Sensor
 from synth.verify.camera import ForwardCamera
-from synth.verify.dome import check_dome
-from synth.verify.files import flow_file_problems
 from synth.verify.motion import check_motion
 from synth.verify.photometry import check_photometry
 from synth.verify.report import Check, Report, SampleReport
 from synth.verify.sheet import Sheet
 
+_NAMED = {"scene.hash": "scene_hash", "seed": "seed", "index": "index"}
+"""Of the header of flow.exr, and of meta.json."""
 
-def verify_dataset(
-    path: Path | str, *, samples: Sequence[int] | None = None, progress: Callable[[int, int], None] | None = None
-) -> Report:
+
+def verify_dataset(path: Path | str, progress: Callable[[int, int], None] | None = None) -> Report:
     """Verifies a dataset directory.
 
     Args:
         path: the dataset.
-        samples: indices to verify; by default all finished ones.
         progress: called after each sample with how many are done and how many there are.
 
     Returns:
         The report; `ok` is False where any check failed or there is no sample.
 
     Raises:
-        InputError: not a dataset, or a sample asked for that it lacks. A damaged sample is a failed check.
+        InputError: not a dataset. A damaged sample is a failed check.
     """
     dataset = read_dataset(path)
-    wanted = dataset.samples if samples is None else list(samples)
-    for index in wanted:
-        dataset.folder(index)
     reports = []
-    for index in wanted:
+    for index in dataset.samples:
         reports.append(_verify_files(dataset, index))
         if progress is not None:
-            progress(len(reports), len(wanted))
+            progress(len(reports), len(dataset))
     return Report(dataset.path, tuple(reports))
 
 
@@ -72,10 +72,7 @@ def _view_checks(sensor: Sensor, backward: bool, sample: SampleData) -> list[Che
         Sheet(forward, sample.surface.triangles, sample.surface.positions(u), camera.width, camera.height)
         for u in (sample.displacement1, sample.displacement2)
     ]
-    checks = []
-    if sensor.gel.dome_radius_mm is not None:
-        checks.append(check_dome(forward, sample.surface, sensor.gel.dome_radius_mm, camera))
-    checks += check_motion("forward", states[0], states[1], flow.forward, flow.forward_visible)
+    checks = check_motion("forward", states[0], states[1], flow.forward, flow.forward_visible)
     if flow.backward is not None and flow.backward_visible is not None:
         checks += check_motion("backward", states[1], states[0], flow.backward, flow.backward_visible)
     elif backward:
@@ -98,3 +95,37 @@ def _verify_files(dataset: Dataset, index: int) -> SampleReport:
 
 def _files(problems: Sequence[str]) -> Check:
     return Check("files", float(len(problems)), 0, "problems", "; ".join(problems) or "as manifest and scene say")
+
+
+def flow_file_problems(folder: Path, scene: Scene, meta: Mapping[str, Any]) -> list[str]:
+    """What is wrong with the channels and headers of the flow.exr files in a sample's folder, one message each.
+
+    Raises:
+        InputError: a file is missing or damaged.
+    """
+    problems = []
+    for camera in scene.sensor.views:
+        name = f"{camera}/flow.exr" if camera else "flow.exr"
+        planes, header = read_channels(folder / name)
+        found = [*_channel_problems(planes, scene.outputs), *_header_problems(header, meta)]
+        problems += [f"{name}: {problem}" for problem in found]
+    return problems
+
+
+def _channel_problems(planes: Mapping[str, np.ndarray], outputs: Outputs) -> list[str]:
+    asked = [name for key in OPTIONAL if getattr(outputs, key) for name in OPTIONAL[key].names]
+    problems = [f"lacks the channel {name}" for name in (*asked, *ALIASES) if name not in planes]
+    problems += [f"{name} is {plane.dtype}, not float32" for name, plane in planes.items() if plane.dtype != np.float32]
+    for alias, name in ALIASES.items():
+        if {alias, name} <= planes.keys() and not np.array_equal(planes[alias], planes[name], equal_nan=True):
+            problems.append(f"{alias} is not {name}")
+    return problems
+
+
+def _header_problems(header: Mapping[str, str | int], meta: Mapping[str, Any]) -> list[str]:
+    """Compared as text: OpenEXR's integers are too short for seeds."""
+    return [
+        f"its header has {key} = {header.get(key)}, meta.json {meta.get(name)}"
+        for key, name in _NAMED.items()
+        if str(header.get(key)) != str(meta.get(name))
+    ]

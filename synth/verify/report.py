@@ -38,6 +38,11 @@ class Check:
         """NaN never passes."""
         return self.figure is None or self.figure <= self.tolerance
 
+    @property
+    def badness(self) -> tuple[bool, float]:
+        """The worst of several is one that failed, or the one nearest to its tolerance."""
+        return not self.passed, -1 if self.figure is None else self.figure / (self.tolerance or 1)
+
 
 @dataclass(frozen=True)
 class SampleReport:
@@ -83,21 +88,14 @@ class Report:
             more = f" and {len(failed) - 10} more" if len(failed) > 10 else ""
             caption = f"failed: samples {', '.join(failed[:10])}{more}" if failed else _AGREED
         title = Text(f"{self.path}: {len(self.samples)} samples", style="table.title")
-        table = Table(title=title, caption=caption, caption_justify="left")
-        for column, justify in (("check", "left"), ("worst", "right"), ("tolerance", "right"), ("sample", "right")):
-            table.add_column(column, justify=justify)  # type: ignore[arg-type]
+        table = Table("check", title=title, caption=caption, caption_justify="left")
+        for column in ("worst", "tolerance", "sample"):
+            table.add_column(column, justify="right")
         table.add_column("")
         every = [(sample.index, check) for sample in self.samples for check in sample.checks]
         for name in dict.fromkeys(check.name for _, check in every):
             rows = [(index, check) for index, check in every if check.name == name]
-            # The worst is one that failed, or the one nearest to its tolerance; a check may not apply anywhere.
-            index, worst = max(
-                rows,
-                key=lambda row: (
-                    not row[1].passed,
-                    -1 if (f := row[1].figure) is None else f / (row[1].tolerance or 1),
-                ),
-            )
+            index, worst = max(rows, key=lambda row: row[1].badness)
             if worst.figure is None:
                 table.add_row(name, "-", "", "", Text(rows[0][1].detail))
                 continue

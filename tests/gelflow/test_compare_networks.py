@@ -83,8 +83,6 @@ def test_fine_tuning_needs_a_place_and_a_network(weights: Path, tmp_path: Path, 
     command = ["compare", write_folder(tmp_path / "data", {"a": (1, 0)}), "--ft", "5"]
     for given in (["--weights", weights], ["--out", tmp_path / "out"]):
         assert "--ft 5: needs --weights of GelFlow, and --out" in fails(capsys, *command, *given)
-    tail = ["--weights", weights, "--ft-config", "paper", "--out", tmp_path / "out"]
-    assert "for another number of scales" in fails(capsys, *command, *tail)
 
 
 def test_fine_tuning_changes_the_copy_only_and_lowers_its_loss(weights: Path, tmp_path: Path, capsys) -> None:
@@ -148,25 +146,23 @@ def test_whatever_the_preset_the_pairs_are_seen_as_they_are_and_without_truth(pr
                         registration=RegistrationConfig())  # fmt: skip
     rate = min(recorded.learning_rate, 1e-4) if recorded.schedule == "one_cycle" else recorded.learning_rate
     method = Learned(random_weights(tmp_path / "w.safetensors", model, recorded, recorded.image_size), device="cpu")
-    for config in (None, preset):
-        found = fine_tuning_settings(method, 1600, config, pairs=8)
-        assert (found.supervision, found.motion, found.color_jitter, found.crop_size) == ("self", None, 0, None)
-        assert (found.schedule, found.warmup_steps, found.learning_rate, found.ema_decay) == ("constant", 0, rate, 0)
-        assert (found.image_size, found.loss, found.model) == (recorded.image_size, recorded.loss, model)
-        # From the weights the paper's batches of 4, so that 1600 steps are 800 epochs; a file's own, if pairs suffice.
-        assert found.batch_size == (4 if config is None else min(recorded.batch_size, 8))
+    found = fine_tuning_settings(method, 1600, pairs=8)
+    assert (found.supervision, found.motion, found.color_jitter, found.crop_size) == ("self", None, 0, None)
+    assert (found.schedule, found.warmup_steps, found.learning_rate, found.ema_decay) == ("constant", 0, rate, 0)
+    assert (found.image_size, found.loss, found.model) == (recorded.image_size, recorded.loss, model)
+    assert found.batch_size == 4  # the paper's, so that 1600 steps are 800 epochs
 
 
 def test_of_the_training_a_constant_rate_and_the_size_of_use_carry_over(tmp_path: Path) -> None:
     method = Learned(unsuitable(tmp_path / "w.safetensors"), device="cpu")
-    assert fine_tuning_settings(method, 12, None, pairs=3) == TrainConfig(
+    assert fine_tuning_settings(method, 12, pairs=3) == TrainConfig(
         model=SMALL, loss=UNSUITABLE["loss"], supervision="self", mixed_self=3.0, batch_size=3, steps=12,
         learning_rate=1e-4, gradient_clip=1.0, flip=False, seed=5, device="cpu",
     )  # fmt: skip
     path = unsuitable(tmp_path / "w.safetensors", (96, 128), schedule="constant", warmup_steps=0)
-    settings = fine_tuning_settings(Learned(path, size=(64, 80), device="cpu"), 12, None, pairs=3)
+    settings = fine_tuning_settings(Learned(path, size=(64, 80), device="cpu"), 12, pairs=3)
     assert (settings.learning_rate, settings.image_size) == (4e-4, (64, 80))
-    assert fine_tuning_settings(Learned(path, device="cpu"), 12, None, pairs=3).image_size == (96, 128)
+    assert fine_tuning_settings(Learned(path, device="cpu"), 12, pairs=3).image_size == (96, 128)
 
 
 def test_fine_tuning_does_not_look_at_exact_flow_and_needs_one_size(tmp_path: Path) -> None:

@@ -206,19 +206,14 @@ def test_fine_tuning_starts_from_the_given_weights_and_folders_of_other_runs_are
 
 
 def test_a_run_is_not_resumed_with_other_pairs(tmp_path: Path) -> None:
-    """But a run whose record is older than the digests and than `nodes` is."""
     data, other = (
         open_pairs(write_folder(tmp_path / names, dict.fromkeys(names, (1.0, 0.0)))) for names in ("ab", "ac")
     )
     run = tmp_path / "run"
     train(small(steps=1), data, data, run)
     for pairs, validation, words in ((other, data, "training"), (data, other, "validation")):
-        with pytest.raises(InputError, match=f"the {words} pairs have other names, scenes or seeds there"):
+        with pytest.raises(InputError, match=f"{words}_pairs_sha256: "):
             train(small(steps=2), pairs, validation, run, resume=True)
-    record = json.loads((run / "run.json").read_text())
-    del record["digest"], record["validation_digest"], record["config"]["nodes"]
-    (run / "run.json").write_text(json.dumps(record))
-    assert train(small(steps=2), other, data, run, resume=True).steps == 2
 
 
 def test_settings_that_cannot_be_served_or_diverge_are_told_and_leave_nothing(pairs: Shifts, tmp_path: Path) -> None:

@@ -83,7 +83,7 @@ def test_verify_checks_every_camera(dataset, tmp_path):
     assert {"files", "left: forward flow"} <= failed
     assert "forward flow" not in failed
     shutil.rmtree(path.parent)
-    assert not verify_dataset(copy, samples=[1]).ok
+    assert not verify_dataset(copy).samples[1].ok
 
 
 def test_inspection_shows_every_camera(dataset, tmp_path):

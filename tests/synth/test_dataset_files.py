@@ -33,13 +33,10 @@ def test_png_round_trip(tmp_path, dtype, shape):
     assert encode_png(image) == encode_png(image.copy(order="F"))
 
 
-def test_png_is_rgb_for_other_readers_and_other_kinds_or_damage_are_refused(tmp_path) -> None:
+def test_png_is_rgb_for_other_readers_and_damage_is_refused(tmp_path) -> None:
     """Red first: an independent reader must not see blue."""
     (tmp_path / "a.png").write_bytes(encode_png(np.full((4, 5, 3), (200, 0, 0), np.uint8)))
     assert Image.open(tmp_path / "a.png").getpixel((0, 0)) == (200, 0, 0)
-    for image in (np.zeros((4, 4), np.float32), np.zeros((4, 4, 4), np.uint8)):
-        with pytest.raises(ValueError, match="uint8 or uint16"):
-            encode_png(image)  # type: ignore[arg-type]
     data, path = encode_png(RNG.integers(0, 255, (12, 12, 3)).astype(np.uint8)), tmp_path / "a.png"
     for size in range(len(data)):
         path.write_bytes(data[:size])

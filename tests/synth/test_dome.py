@@ -21,15 +21,13 @@ from synth.optics import Optics
 from synth.pipeline.generate import generate
 from synth.scene import Box, Gel, Motion, Numerics, Scene, Sensor, Sphere, Torus, Window
 from synth.scene.template import load_scene
-from synth.simulate.element import p1p1, p2p1
+from synth.simulate.element import p2p1
 from synth.simulate.footprint import footprint
 from synth.simulate.indenter import rigid_body
 from synth.simulate.load_path import LoadPath
 from synth.simulate.space import function_space
 from synth.surface import GelSurface
 from synth.verify import verify_dataset
-from synth.verify.camera import ForwardCamera
-from synth.verify.dome import check_dome
 
 SIZE, RADIUS = (16.0, 12.0, 8.0), 13.0
 BALL = Sphere(shape="sphere", radius_mm=3.0)
@@ -147,7 +145,7 @@ def test_rays_meet_the_undeformed_dome_where_they_meet_the_sphere(parts: int) ->
     assert off.max() < (1.62 / parts) ** 2 / (8 * RADIUS) / 0.98 + 1.3e-3
 
 
-def test_shape_of_the_surface_at_rest_which_verify_tells_from_another_radius() -> None:
+def test_shape_of_the_surface_at_rest() -> None:
     """Two triangles for a flat pad as before; a dome's has its corners on the sphere and normals out of the gel."""
     assert len(rest_surface(gel(None)).triangles) == 2
     surface = rest_surface(gel())
@@ -157,16 +155,6 @@ def test_shape_of_the_surface_at_rest_which_verify_tells_from_another_radius() -
     np.testing.assert_allclose(surface.material[:, 2], sphere_z(surface.material), atol=8.6e-4)
     a, b, c = (surface.material[corner] for corner in surface.triangles.T)
     assert (np.cross(b - a, c - a)[:, 2] < 0).all()
-    sensor, _ = optics_of_a_fisheye()
-    camera = ForwardCamera.of(sensor)
-    for element in (p1p1(), p2p1()):
-        mesh = domed(graded_box(SIZE, Focus((1.0, 0.0), (3.0, 3.0)), Counts((6, 6), (3, 3), 2)), RADIUS)
-        surface = GelSurface(function_space(mesh, element).surface, 6)
-        assert check_dome(camera, surface, RADIUS, sensor.camera).passed
-        # 8 mm from the apex the faces of R = 13 and 12.5 mm are 0.15 mm apart; the triangles of 2 mm / 6 keep 1e-3.
-        assert not check_dome(camera, surface, 12.5 if element.order == 2 else 11.0, sensor.camera).passed
-    flat = GelSurface(function_space(graded_box(SIZE, Focus((1, 0), (3, 3)), Counts()), p2p1()).surface, 6)
-    assert not check_dome(camera, flat, RADIUS, sensor.camera).passed
 
 
 def path(
@@ -255,7 +243,6 @@ def test_a_dome_generates_and_verifies(tmp_path: Path) -> None:
     report = verify_dataset(tmp_path / "out")
     checks = {check.name: check for check in report.samples[0].checks}
     assert report.ok, [check for check in checks.values() if not check.passed]
-    assert checks["undeformed dome against the sphere"].figure < 0.05
     assert max(checks[f"{way} flow"].figure for way in ("forward", "backward")) < 1e-3
     assert checks["image 2 warped to image 1"].figure is not None
     data = read_dataset(tmp_path / "out").read(0)

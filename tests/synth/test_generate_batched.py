@@ -25,7 +25,7 @@ from synth.errors import InputError
 from synth.pipeline.attempts import Attempts
 from synth.pipeline.batched_simulation import Result, by_sensor, in_batches
 from synth.pipeline.generate import Scheduling, generate
-from synth.pipeline.prefetch import prefetched
+from synth.pipeline.overlapped import prefetched
 from synth.pipeline.producer import Producer
 from synth.pipeline.records import Failure, JobContext, Outcome, SimulatedTrajectory, Task
 from synth.planning import plan, predict
