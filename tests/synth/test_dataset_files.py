@@ -33,7 +33,7 @@ def test_png_round_trip(tmp_path, dtype, shape):
     assert encode_png(image) == encode_png(image.copy(order="F"))
 
 
-def test_png_is_rgb_for_other_readers_and_damage_is_refused(tmp_path) -> None:
+def test_png_is_rgb_for_other_readers_and_other_kinds_or_damage_are_refused(tmp_path) -> None:
     """Red first: an independent reader must not see blue."""
     (tmp_path / "a.png").write_bytes(encode_png(np.full((4, 5, 3), (200, 0, 0), np.uint8)))
     assert Image.open(tmp_path / "a.png").getpixel((0, 0)) == (200, 0, 0)

@@ -286,7 +286,7 @@ def test_background_is_coarse_far_from_the_focus_and_without_one_toward_the_wind
     assert volumes.sum() == pytest.approx(1.01**3 * np.prod(WIDE), rel=1e-12)
 
 
-def test_focus_is_clipped_to_the_pad() -> None:
+def test_focus_is_clipped_to_the_pad_and_what_is_none_is_refused() -> None:
     assert FOCUS.clipped(WIDE) == FOCUS
     assert Focus((5.0, 0.0), (3.0, 1.0)).clipped(WIDE) == Focus((4.0, 0.0), (2.0, 1.0))  # over the edge
     assert Focus((20.0, -9.0), (3.0, 1.0)).clipped(WIDE) == Focus((6.0, -4.5), (0.0, 0.0))  # beside the pad
