@@ -84,20 +84,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     tokens = [token for token in tokens if token != "--debug"]
     try:
         status = app(tokens, exit_on_error=False, print_error=False)
-    except (InputError, CycloptsError, OSError) as error:
+    except (InputError, CycloptsError, OSError, KeyboardInterrupt) as error:
         if debug:
             traceback.print_exc()
         print(f"synth: {_message(error)}", file=sys.stderr)
-        return 2
-    except KeyboardInterrupt:
-        if debug:
-            traceback.print_exc()
-        print("synth: interrupted; finished samples are kept: run the same command again to go on", file=sys.stderr)
-        return 130
+        return 130 if isinstance(error, KeyboardInterrupt) else 2
     return status if isinstance(status, int) else 0
 
 
-def _message(error: Exception) -> str:
+def _message(error: BaseException) -> str:
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted; finished samples are kept: run the same command again to go on"
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
     return str(error).strip()

@@ -76,7 +76,8 @@ class CheckpointCallback(L.Callback):
             if self.advance is not None:
                 item = f"step {step} of {self.config.steps}, loss {float(module.last_loss):.4g}"
                 item += "" if rate is None else f", {rate:.3g} pairs/s"
-                self.advance(step - module.start, self.config.steps - module.start, f"{item}{_brief(self.metrics)}")
+                item += f"; validation: {describe(self.metrics)}" if self.metrics else ""
+                self.advance(step - module.start, self.config.steps - module.start, item)
         stop = trainer.strategy.reduce_boolean_decision(self.stop, all=False)  # whichever process was asked to
         validation_due = self.validates_at(step)
         if stop or validation_due or step % self.config.save_every == 0 or step == self.config.steps:
@@ -143,12 +144,6 @@ def describe(metrics: Mapping[str, float]) -> str:
     if "psnr_db" in metrics:
         texts.append(f"PSNR {metrics['psnr_db']:.2f} dB (no motion {metrics['no_motion_psnr_db']:.2f} dB)")
     return ", ".join(texts)
-
-
-def _brief(metrics: Mapping[str, float]) -> str:
-    if "endpoint_error_px" in metrics:
-        return f", validation {metrics['endpoint_error_px']:.3f} px"
-    return f", validation {metrics['psnr_db']:.2f} dB" if "psnr_db" in metrics else ""
 
 
 @contextmanager

@@ -16,7 +16,7 @@ import numpy as np
 
 from synth.errors import InputError
 from synth.mesh.dome import domed
-from synth.mesh.face import Face, PadFace, RoundFace, face_of
+from synth.mesh.face import Face, PadFace, face_of
 from synth.mesh.pad import PadMesh
 from synth.mesh.tetrahedralise import ENVELOPE, tetrahedralise, tetrahedralise_box
 from synth.mesh.tetwild_sizing import GRADING, even
@@ -89,7 +89,7 @@ def pad_mesh(
     return domed(mesh, gel.dome_radius_mm)
 
 
-def _made(gel: Gel, face: PadFace | RoundFace, edge_mm: float) -> PadMesh:
+def _made(gel: Gel, face: Face, edge_mm: float) -> PadMesh:
     """A new mesh; of a dome that of its box."""
     if isinstance(face, PadFace):
         return tetrahedralise_box(gel.size_mm, edge_mm)

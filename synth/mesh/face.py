@@ -6,7 +6,6 @@ round gels within rounding.
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -17,22 +16,6 @@ from synth.scene import Gel
 from synth.scene.gel import dome_height
 
 
-class Face(Protocol):
-    """What the later stages ask of a gel's shape."""
-
-    def holds(self, points: Points) -> BoolArray:
-        """(n,) which points (n, 3) mm lie on the contact face."""
-        ...
-
-    def bonded(self, points: Points, size_mm: tuple[float, float, float]) -> BoolArray:
-        """(n,) which points (n, 3) mm of a gel whose bounding box is of that size are held by the window."""
-        ...
-
-    def project(self, points: Points) -> Points:
-        """Points (n, 3) mm near the contact face, moved onto it."""
-        ...
-
-
 @dataclass(frozen=True)
 class PadFace:
     """The face of a box or of a dome, part of a sphere of that radius; bonded where z is the pad's thickness."""
@@ -40,15 +23,15 @@ class PadFace:
     dome_radius_mm: float | None = None
 
     def holds(self, points: Points) -> BoolArray:
-        """See `Face`."""
+        """Which points (n, 3) mm lie on the contact face."""
         return np.asarray(points[:, 2] == face_height(points[:, :2], self.dome_radius_mm))
 
     def bonded(self, points: Points, size_mm: tuple[float, float, float]) -> BoolArray:
-        """See `Face`."""
+        """Which points (n, 3) mm of a gel whose bounding box is of that size are held by the window."""
         return np.asarray(points[:, 2] == size_mm[2])
 
     def project(self, points: Points) -> Points:
-        """Along z."""
+        """Points (n, 3) mm near the contact face, moved onto it along z."""
         return np.column_stack([points[:, :2], face_height(points[:, :2], self.dome_radius_mm)])
 
     def __str__(self) -> str:
@@ -56,12 +39,11 @@ class PadFace:
 
 
 FLAT_FACE = PadFace()
-
-
 RoundFace = CapsuleFace | CadFace
+Face = PadFace | RoundFace
 
 
-def face_of(gel: Gel, folder: Path = Path()) -> PadFace | RoundFace:
+def face_of(gel: Gel, folder: Path = Path()) -> Face:
     """The shape of a scene's gel, whose files are relative to `folder`."""
     if gel.radius_mm is not None and gel.thickness_mm is not None:
         return CapsuleFace(gel.radius_mm, gel.thickness_mm, gel.length_mm, gel.cut_end == "held")

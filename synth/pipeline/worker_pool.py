@@ -40,7 +40,7 @@ MAX_DEATHS = 3
 
 def outcomes_of_processes(context: JobContext, tasks: Iterator[Task], workers: int) -> Generator[Outcome, None, None]:
     """Outcomes of whole trajectories, each made by one worker on one core; see `spread`."""
-    yield from spread(context, _trajectory_maker, tasks, workers, _trajectory)
+    yield from spread(context, _trajectory_maker, tasks, workers, number=lambda task: task[0])
 
 
 def spread(
@@ -160,7 +160,3 @@ def _trajectory_maker(context: JobContext) -> Maker[Task]:
     render_on_one_core(context.plan.variant)
     producer = Producer(context)
     return lambda task: producer.produce(*task)
-
-
-def _trajectory(task: Task) -> int:
-    return task[0]
