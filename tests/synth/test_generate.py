@@ -15,7 +15,6 @@ from synth.dataset.reader import read_dataset
 from synth.dataset.shard import Shard
 from synth.errors import InputError
 from synth.pipeline.generate import Scheduling, generate
-from synth.planning import job_variant
 from synth.progress import progress
 from synth.scene.sampling import draw
 from synth.scene.template import Template, load_scene
@@ -82,21 +81,6 @@ def test_a_lost_folder_and_a_foreign_line_are_made_good(tiny: Path, tmp_path: Pa
     summary = generate(load_scene(tiny), 5, out)
     assert (summary.made, summary.found) == (2, 3)
     assert fingerprint(out) == fingerprint(reference())
-
-
-def test_a_directory_of_another_job_is_refused_and_left_alone(tiny: Path) -> None:
-    before, variant = fingerprint(reference()), job_variant(load_scene(tiny), "cpu")
-    other = type(variant)("scalar_rgb" if variant.is_vectorised else "llvm_ad_rgb", "")
-    for overrides, seed, asked, difference in (
-        ([], 1, variant, "seed: 0 there, 1 now"),
-        (["motion.steps=3"], 0, variant, "scene.motion.steps: 2 there, 3 now"),
-        (["motion.depth_mm=0.1"], 0, variant, "scene.motion.depth_mm: "),
-        ([], 0, other, "device.variant: "),
-    ):
-        with pytest.raises(InputError, match="holds another job") as caught:
-            generate(load_scene(tiny, overrides), 5, reference(), seed, asked)
-        assert difference in str(caught.value)
-    assert fingerprint(reference()) == before
 
 
 def test_wrong_numbers_scenes_that_cannot_be_built_and_a_missing_ray_are_told(tiny, tmp_path, monkeypatch) -> None:

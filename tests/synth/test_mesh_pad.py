@@ -10,13 +10,13 @@ import pytest
 from pads import brick, contact_faces, crooked
 
 import synth.mesh.cache as cache
-from benchmarks.focused_mesh import SLOPE, around_focus
+from benchmarks.focused_mesh import around_focus
 from synth.arrays import FloatArray
 from synth.errors import InputError
 from synth.mesh import Focus, PadMesh, check_mesh, default_edge_length, mesh_key, pad_mesh
 from synth.mesh.pad import boundary_faces, signed_volumes
 from synth.mesh.tetrahedralise import WORST_SHAPE, _fault, _repair, _sides, shape_quality, tetrahedralise_box
-from synth.mesh.tetwild_sizing import GRADING, through_thickness
+from synth.mesh.tetwild_sizing import GRADING
 from synth.scene import Gel, Layer, Numerics
 
 SIZE = (7.0, 5.0, 2.5)
@@ -269,21 +269,6 @@ def test_mesh_is_as_good_as_any_and_its_edges_are_small_in_the_focus_only() -> N
     assert 0.8 * EDGE < edges[away == 0].mean() < 1.5 * EDGE
     assert edges[away > 2.5].mean() > 1.25 * edges[away == 0].mean()
     assert len(corners) < 0.5 * WIDE[0] * WIDE[1] / (np.sqrt(3) / 4 * EDGE**2)
-
-
-def test_background_is_coarse_far_from_the_focus_and_without_one_toward_the_window() -> None:
-    field = around_focus(WIDE, EDGE, FOCUS, COARSE)
-    away = distance_from_zone(np.clip(field.points, LOW, HIGH))
-    np.testing.assert_allclose(field.values, np.minimum(EDGE + SLOPE * away, COARSE), atol=1e-12)
-    assert (away == 0).sum() >= 4
-    assert (field.values == COARSE).any()
-    field = through_thickness(WIDE, EDGE)
-    assert sorted(set(field.values)) == [EDGE, GRADING * EDGE]
-    assert ((field.values == EDGE) == (field.points[:, 2] < 0)).all()
-    volumes = signed_volumes(field.points, field.tets)
-    assert volumes.min() > 0
-    # 1.01 times the box along each axis.
-    assert volumes.sum() == pytest.approx(1.01**3 * np.prod(WIDE), rel=1e-12)
 
 
 def test_focus_is_clipped_to_the_pad_and_what_is_none_is_refused() -> None:

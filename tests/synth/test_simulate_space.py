@@ -168,17 +168,3 @@ def test_only_the_last_few_patterns_and_so_many_entries_are_kept(monkeypatch: py
     assert alone.size > sum(sizes[1:])
     assert list(pattern_module._CACHED.values()) == [alone]
     assert pattern_of(large, True) is alone
-
-
-@pytest.mark.parametrize("mixed", [True, False])
-@pytest.mark.parametrize("element", MIXED)
-def test_upper_triangle_in_order_with_its_diagonal(element: str, mixed: bool) -> None:
-    """As Pardiso wants it."""
-    space = function_space(MESH, ELEMENT[element]())
-    made = pattern_of(space, mixed)
-    rows = np.repeat(np.arange(len(made.free)), np.diff(made.indptr))
-    assert (made.indices >= rows).all()
-    assert (made.indices[made.indptr[:-1]] == np.arange(len(made.free))).all()
-    key = rows * len(made.free) + made.indices
-    assert (np.diff(key) > 0).all()
-    assert len(made.free) == 3 * len(space.points) - space.held.sum() + mixed * space.pressures
