@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from render_scenes import needs_llvm
 from tiny_scene import TEXT, own_cache, write_tiny
 
 from benchmarks.__main__ import main
@@ -10,9 +11,7 @@ from benchmarks.draws import summaries, together
 from benchmarks.render import DEEPEST, settings
 from benchmarks.rows import Row, read
 from benchmarks.scale import at_size, rates
-from synth.render.variant import choose_variant
 
-needs_llvm = pytest.mark.skipif(not choose_variant("cpu").is_vectorised, reason="no LLVM of version 16 or newer here")
 NOISY = TEXT.replace("read_noise = 0.002", "read_noise = 0.1")
 """A camera so noisy that "auto" needs few samples."""
 

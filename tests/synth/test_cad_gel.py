@@ -171,21 +171,13 @@ def test_the_batched_solver_presses_it(folder: Path) -> None:
 
 SCENE = """
 name = "cad"
-[sensor.window]
-shape = "capsule"
-radius_mm = 2.4
-center_z_mm = 5.0
-thickness_mm = 1.0
-[sensor.pattern]
-kind = "dots"
-spacing_mm = [1.5, 1.5]
-radius_mm = 0.4
-placing = "spherical"
-[[sensor.lights]]
-position_mm = [0.0, 1.5, 7.5]
-size_mm = [0.5, 0.5]
-color = [1.0, 1.0, 1.0]
-power = 150.0
+contact.indenter = { shape = "sphere", radius_mm = 2.0 }
+render.samples_per_pixel = 4
+numerics = { element = "p1p1", edge_length_mm = 1.5 }
+[sensor]
+window = { shape = "capsule", radius_mm = 2.4, center_z_mm = 5.0, thickness_mm = 1.0 }
+pattern = { kind = "dots", spacing_mm = [1.5, 1.5], radius_mm = 0.4, placing = "spherical" }
+lights = [{ position_mm = [0.0, 1.5, 7.5], size_mm = [0.5, 0.5], color = [1.0, 1.0, 1.0], power = 150.0 }]
 [sensor.camera]
 width = 48
 height = 48
@@ -196,19 +188,11 @@ fy = 15.0
 cx = 24.0
 cy = 24.0
 position_mm = [0.0, 0.0, 6.5]
-[contact.indenter]
-shape = "sphere"
-radius_mm = 2.0
 [motion]
 depth_mm = { uniform = [0.3, 0.5] }
 polar_deg = { uniform = [0.0, 60.0] }
 azimuth_deg = { uniform = [-180.0, 180.0] }
 steps = 2
-[render]
-samples_per_pixel = 4
-[numerics]
-element = "p1p1"
-edge_length_mm = 1.5
 """
 
 

@@ -262,10 +262,7 @@ def test_mesh_is_as_good_as_any_and_its_edges_are_small_in_the_focus_only() -> N
     corners = contact.nodes[contact.faces]
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean(axis=1)
     away = distance_from_zone(corners.mean(axis=1))
-    # fTetWild aims at edges of 4/5 to 4/3 of the target and is random: 20 meshes had means of 1.10 to 1.28 times EDGE
-    # in the focus (mean 1.19, standard deviation 0.05), edges 1.6 to 2.3 times as long away from it, and 0.28 to 0.38
-    # of the triangles that an evenly fine face would have; one more, on a loaded machine, 1.36 times EDGE. The limits
-    # lie 6 deviations away.
+    # fTetWild aims at edges of 4/5 to 4/3 of the target and is random: the limits lie 6 deviations of 20 meshes away.
     assert 0.8 * EDGE < edges[away == 0].mean() < 1.5 * EDGE
     assert edges[away > 2.5].mean() > 1.25 * edges[away == 0].mean()
     assert len(corners) < 0.5 * WIDE[0] * WIDE[1] / (np.sqrt(3) / 4 * EDGE**2)
