@@ -50,7 +50,6 @@ def test_weights_and_architecture_come_back_and_both_forms_of_the_correlation_ag
 def test_files_that_are_no_weights_are_named_and_a_failed_write_keeps_the_former_one(
     saved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Damaged ones and code that they would run: test_robustness."""
     for share in (0.0, 0.001, 0.5):
         (tmp_path / f"cut{share}.safetensors").write_bytes(saved.read_bytes()[: int(share * saved.stat().st_size)])
     torch.save({"model": GelFlow(SMALL).state_dict()}, tmp_path / "model.ckpt")

@@ -28,5 +28,4 @@ def capsule(gel: dict[str, Any] | None = None, **parts: Any) -> Scene:
 
 @functools.cache
 def capsule_mesh(gel: Gel, edge_mm: float = EDGE) -> PadMesh:
-    """Its mesh."""
     return pad_mesh(gel, Numerics(edge_length_mm=edge_mm), [home() / "capsules"])

@@ -132,8 +132,6 @@ def test_a_capsule_agrees_with_its_files(folder: Path, motion: dict[str, Any]) -
     space = function_space(mesh, p2p1())
     np.testing.assert_allclose(space.points[space.faces[~space.coated]][:, :, 2], 7.0, atol=1e-9)  # only the cut end
     frames = [path_of(scene, folder).frame for scene in (built_in, given)]
-    assert frames[0] is not None
-    assert frames[1] is not None
     np.testing.assert_allclose(frames[1].origin, frames[0].origin, atol=0.02)
     np.testing.assert_allclose(frames[1].axes.T @ frames[1].axes, np.eye(3), atol=1e-12)
     assert np.linalg.det(frames[1].axes) == pytest.approx(1)

@@ -21,7 +21,7 @@ from synth.dataset.reader import read_dataset
 from synth.dataset.shard import Shard
 from synth.errors import InputError
 from synth.pipeline.attempts import Attempts
-from synth.pipeline.batched_simulation import Result, in_batches
+from synth.pipeline.batched_simulation import in_batches
 from synth.pipeline.generate import Scheduling, generate
 from synth.pipeline.prefetch import prefetched
 from synth.pipeline.producer import Producer
@@ -123,7 +123,7 @@ at most was seen (docs/reports/batched_fem.md). States that are not corrected ar
 
 def test_a_batch_agrees_with_the_single_solver_and_hopeless_trajectories_are_given_up(context: JobContext) -> None:
     """On the same meshes: the same draws fail for the same reasons, and what is left is the same motion."""
-    results = {found.number: found for found in map(_trajectory, in_batches(context, _tasks(range(5)), 4))}
+    results = {found.number: found for found, *_ in in_batches(context, _tasks(range(5)), 4)}
     assert sorted(results) == list(range(5))
     for task in _tasks(range(5)):
         template = context.plan.template
@@ -146,11 +146,6 @@ def test_a_batch_agrees_with_the_single_solver_and_hopeless_trajectories_are_giv
 
 def _said(failures: Iterable[Failure]) -> list[tuple[object, ...]]:
     return [(failure.index, failure.draw, failure.stage, failure.reason) for failure in failures]
-
-
-def _trajectory(result: Result) -> SimulatedTrajectory:
-    assert not isinstance(result, Outcome)
-    return result[0]
 
 
 def _alone(attempts: Attempts) -> SimulatedTrajectory:

@@ -164,7 +164,6 @@ def test_a_press_converges_and_a_start_in_equilibrium_costs_one_iteration(body: 
 
 
 def test_the_limit_is_kept_far_from_equilibrium_doubled_near_it_and_too_far_is_no_convergence(body: System) -> None:
-    """Far from equilibrium."""
     needed = press(body).iterations
     for limit in (1, needed):
         found = press(body, limit=limit)

@@ -129,8 +129,7 @@ def test_every_ray_that_meets_the_surface_more_than_once_is_found(state: str, vi
 
 
 @pytest.mark.parametrize("size", [(40.0, 30.0), (3.0, 2.0)])
-def test_one_sheet_above_another(size: tuple[float, float]) -> None:
-    """Two pieces that both face the camera."""
+def test_one_sheet_above_another_that_faces_the_camera_too(size: tuple[float, float]) -> None:
     upper = sheet(24, 18, *size)
     lower, shift = SURFACE.material, np.array([4.0, 2.0, 1.0])
     positions = np.concatenate([lower, upper.material + (shift if size[0] < 10 else [0, 0, 1.0])])
