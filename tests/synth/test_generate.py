@@ -15,6 +15,7 @@ from synth.dataset.shard import Shard
 from synth.errors import InputError
 from synth.pipeline.generate import Scheduling, generate
 from synth.progress import progress
+from synth.render.variant import choose_variant
 from synth.scene.sampling import draw
 from synth.scene.template import Template, load_scene
 from synth.verify import verify_dataset
@@ -27,6 +28,7 @@ def test_the_dataset_is_what_was_asked_for_and_verifies() -> None:
     assert dataset.samples == [0, 1, 2, 3, 4]  # of three trajectories of two: the last one is not finished
     assert [dataset.entry(i).trajectory for i in range(5)] == [0, 0, 1, 1, 2]
     assert (dataset.failures, dataset.info["n"]) == ([], 5)
+    assert dataset.info["device"]["variant"] == choose_variant("cpu").name
     assert set(dataset.info["software"]) >= {"gelflow-synth", "mitsuba", "warp-lang", "pytetwild"}
     for index in range(5):
         entry, sample = dataset.entry(index), dataset.read(index)

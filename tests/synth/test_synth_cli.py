@@ -12,8 +12,6 @@ from tiny_scene import fingerprint, reference
 
 from synth.cli import main
 
-ROOT = Path(__file__).parents[2]
-
 pytestmark = pytest.mark.usefixtures("one_cache")
 
 Run = Callable[..., str]
