@@ -14,6 +14,7 @@ from samples import job, translation_sample, tree, writing_elsewhere
 
 from synth.cli import main
 from synth.dataset import lines, sample_files
+from synth.dataset.npz import encode_npz
 from synth.dataset.reader import read_dataset
 from synth.dataset.sample_files import write_sample_files
 from synth.dataset.shard import Shard
@@ -215,6 +216,7 @@ def test_unreadable_datasets_are_named(tmp_path):
         ("samples/000000/image1.png", lambda data: data[:100], r"000000/image1\.png.*truncated"),
         ("samples/000000/flow.exr", lambda data: data[:-40], r"000000/flow\.exr.*truncated"),
         ("samples/000000/surface.npz", lambda data: data[:-40], r"000000/surface\.npz"),
+        ("samples/000000/surface.npz", lambda _: encode_npz({}), r"000000/surface\.npz: lacks the array"),
         ("samples/000000/meta.json", lambda data: data[:-40], r"000000/meta\.json.*not valid JSON"),
     ):
         file = tmp_path / "d" / name
