@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from render_scenes import needs_llvm
 from tiny_scene import TEXT, own_cache, write_tiny
 
 from benchmarks.__main__ import main
@@ -10,11 +11,9 @@ from benchmarks.draws import summaries, together
 from benchmarks.render import DEEPEST, settings
 from benchmarks.rows import Row, read
 from benchmarks.scale import at_size, rates
-from synth.render.variant import choose_variant
 
-needs_llvm = pytest.mark.skipif(not choose_variant("cpu").is_vectorised, reason="no LLVM of version 16 or newer here")
 NOISY = TEXT.replace("read_noise = 0.002", "read_noise = 0.1")
-"""A camera so noisy that "auto" needs few samples, and that any light is within a quarter of its noise."""
+"""A camera so noisy that "auto" needs few samples."""
 
 
 @pytest.fixture(autouse=True)
@@ -91,9 +90,13 @@ def test_light(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     # Two states by path tracing and three numbers of samples; two methods on these and on the reference's halves.
     assert [row["light"] for row in images] == 2 * ["path_traced"] + 6 * ["separated"]
     assert len(flows) == 2 * 5
-    assert all(row["share"] <= 0.25 for row in images)
-    noise = {(row["light"], row["samples"], row["state"]): row["noise"] for row in images}
-    assert noise["separated", 9, "pressed"] < noise["path_traced", 15, "pressed"]
+    # The same image: no systematic error beyond four standard errors of its square, of which the limit has two.
+    assert all(row["systematic"] ** 2 < 2 * row["systematic_limit"] ** 2 for row in images)
+    # A quarter of the error with fewer samples; 3 images of 768 pixels tell each within a few per cent.
+    traced, separated = ({row["state"]: row for row in images if row["samples"] == samples} for samples in (15, 9))
+    for state, row in separated.items():
+        assert row["share"] < traced[state]["share"] / 2
+        assert row["noise"] < traced[state]["noise"] / 2
     assert "path_tracing_s" in capsys.readouterr().out
     (tmp_path / "shining").mkdir()
     shining = write_tiny(tmp_path / "shining", NOISY + "\n[sensor.coating]\nroughness = 0.5\n")

@@ -88,17 +88,7 @@ def test_numbers_that_are_not_finite_come_back_and_markers_are_scored_where_ther
     table = pair_table(scores, ["marker_distance_px"], "{:.2f}")
     assert table == (["method", "a"], [["zero", "5.00"]])
     header, rows = summary_table(grouped(summarise(scores[1:])))
-    assert header == [
-        "method",
-        "PSNR dB",
-        "SSIM",
-        "closure px",
-        "90 % px",
-        "σ > 1 px %",
-        "σ ≤ 0.1 px %",
-        "ms/pair",
-        "core ms",
-    ]
+    assert ", ".join(header) == "method, PSNR dB, SSIM, closure px, 90 % px, σ > 1 px %, σ ≤ 0.1 px %, ms/pair, core ms"
     assert markdown((header, rows)).splitlines()[1] == "| --- |" + 8 * " ---: |"
 
 

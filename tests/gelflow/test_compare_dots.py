@@ -39,17 +39,13 @@ def constant(u: float, v: float) -> NDArray[np.float32]:
 def test_centres_of_dots_are_found_and_the_true_flow_leads_to_them(contrast: float) -> None:
     true, shift = lattice(), (3.3, -2.6)
     dots1, dots2 = find_dots(image(true, contrast)), find_dots(image(lattice(shift), contrast))
-    assert dots1 is not None
-    assert dots2 is not None
     assert len(dots1.centres) == len(dots2.centres) == len(true)
     distance = np.linalg.norm(dots1.centres[:, None] - true, axis=2).min(axis=1)
     # Images of 8 bit: a centroid over 100 px of contrast 38 of 255 errs by about 0.3 * 5 / (38 * sqrt(100)) = 0.004 px.
     assert distance.max() < 0.02
     found = dot_distance(constant(*shift), dots1, dots2)
-    assert found is not None
     assert (found.own, found.median_px, found.p90_px) == (1.0, pytest.approx(0, abs=0.02), pytest.approx(0, abs=0.03))
     still = dot_distance(constant(0, 0), dots1, dots2)
-    assert still is not None
     assert still.median_px == pytest.approx(np.hypot(*shift), abs=0.01)
 
 
@@ -60,7 +56,6 @@ def test_share_of_dots_that_reach_one_of_their_own() -> None:
     dots1 = Dots(np.array([[21.0, 20.0], [18.0, 20.0], [44.0, 20.5], [75.0, 20.0], [220.0, 100.0]]), 10.0)
     flow[100, 220] = [11.0, 0.0]
     found = dot_distance(flow, dots1, dots2)
-    assert found is not None
     assert (found.median_px, found.own) == (1.5, 2 / 5)
     assert dot_distance(constant(300, 0), dots1, dots2) is None
 

@@ -2,7 +2,6 @@
 
 import gzip
 import io
-import json
 import pickle
 import shutil
 import tarfile
@@ -14,19 +13,12 @@ import pytest
 import torch
 from synth_samples import synth_sample, write_dataset
 
-from gelflow.cli import main
 from gelflow.data import PairDataset, open_pairs
 from gelflow.errors import InputError
 from synth.dataset import export as exporting
 from synth.dataset.sample import Sample
 
 INDICES = (0, 1, 999999, 1000000)  # With a gap, and with the last key before the first in the order of texts
-SETTINGS = """batch_size = 2
-validate_every = 2
-supervision = "flow"
-model = {levels = 4, projected_channels = 8}
-loss.lambda_s = [1.0, 1.0, 1.0]
-"""
 
 
 def write_both(parent: Path, samples: list[Sample]) -> tuple[Path, Path]:
@@ -90,26 +82,6 @@ def test_one_shard_alone_workers_and_copies_read_the_same(both: tuple[Path, Path
     loader = torch.utils.data.DataLoader(dataset, batch_size=None, num_workers=2, multiprocessing_context="fork")
     assert [bits(item) for item in loader] == expected
     assert all_bits(pickle.loads(pickle.dumps(dataset))) == expected
-
-
-def test_commands_take_shards(both: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    data, shards = map(str, both)
-    settings, weights = tmp_path / "settings.toml", str(tmp_path / "run" / "weights.safetensors")
-    settings.write_text(SETTINGS)
-    options = ["--out", str(tmp_path / "run"), "--config", str(settings), "--steps", "1", "--device", "cpu"]
-    assert main(["train", shards, "--validation", f"{shards}/shard-000000.tar", *options]) == 0
-    capsys.readouterr()
-    found: dict[str, list] = {data: [], shards: []}
-    for path, answers in found.items():
-        for command in (["evaluate", path, "--weights", weights, "--device", "cpu"],
-                        ["compare", path, "--methods", "none", "--batch", "0"]):  # fmt: skip
-            assert main([*command, "--json"]) == 0
-            answer = json.loads(capsys.readouterr().out)
-            scores = [{k: v for k, v in score.items() if not k.endswith("seconds")} for score in answer["scores"]]
-            answers.append((scores, answer["strata"]))
-    assert [len(scores) for scores, _ in found[data]] == [len(INDICES)] * 2
-    assert found[data] == found[shards]
-    assert main(["evaluate", f"{shards}/none.tar", "--weights", weights]) == 2
 
 
 def header_flipped(data: bytes, members: list[tarfile.TarInfo]) -> bytes:

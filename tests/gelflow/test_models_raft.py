@@ -169,7 +169,6 @@ def test_published_small_weights_see_shifts_and_no_motion() -> None:
 
 @pytest.mark.parametrize("kind", ["list", "other", "missing key"])
 def test_files_of_other_tensors_are_refused(kind: str, tmp_path: Path) -> None:
-    """Those that are damaged or hold code: test_robustness."""
     tensors = {f"module.{name}": torch.zeros(shape) for name, shape in published_names(False).items()}
     contents = {
         "list": [1, 2],

@@ -181,8 +181,7 @@ def spread(flow: Tensor, *distances: int) -> Tensor:
 
 
 @pytest.mark.parametrize("ignore_shading", [False, True])
-def test_noise_moves_nothing(ignore_shading: bool) -> None:
-    """Two grey images with a camera's noise: all flows are alike."""
+def test_between_grey_images_noise_moves_nothing(ignore_shading: bool) -> None:
     grey = torch.full((1, 3, HEIGHT, WIDTH), 0.5)
     noise = NOISE * torch.randn(grey.shape, generator=torch.Generator().manual_seed(0))
     flow = torch.randn((1, 2, HEIGHT, WIDTH), generator=torch.Generator().manual_seed(1))

@@ -136,12 +136,6 @@ def test_derivatives_of_an_affine_field_are_exact_and_window_slopes_the_papers_l
             assert abs(1 + slopes[k, row - 1, column - 1].item() - ratio) < 1e-13
 
 
-@pytest.mark.parametrize("size", [(64, 64), (240, 320), (67, 101)])
-def test_sizes_are_halved_and_rounded_up(size: tuple[int, int]) -> None:
-    sizes = [tuple(image.shape[-2:]) for image in image_pyramid(torch.zeros(1, 3, *size), 7)]
-    assert sizes == [(-(-size[0] // 2**s), -(-size[1] // 2**s)) for s in range(7)]
-
-
 def test_halving_averages_blocks_at_odd_borders_and_enlarging_keeps_a_linear_flow_linear() -> None:
     image = torch.rand(1, 3, 8, 12, dtype=torch.float64)
     # the mean of 16 numbers below one, in another order

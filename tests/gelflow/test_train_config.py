@@ -29,17 +29,7 @@ def test_defaults_are_the_readings_of_the_paper_and_its_preset_states_them() -> 
     assert paper == TrainConfig(image_size=(512, 640))
     assert paper.steps == 200 * 1328 // 4  # 200 epochs of 1327 pairs in batches of 4, the last one filled up
     text = tomllib.loads(files("gelflow").joinpath("presets", "paper.toml").read_text(encoding="utf-8"))
-    published = {
-        "alpha",
-        "lambda_dc",
-        "lambda_theta",
-        "lambda_zeta",
-        "lambda_df",
-        "beta",
-        "lambda_s",
-        "ratio",
-        "weight",
-    }
+    published = {f"lambda_{name}" for name in ("dc", "theta", "zeta", "df", "s")} | {"alpha", "beta", "ratio", "weight"}
     assert published <= set(text["loss"])
     assert {"levels", "lffm", "lffm_region", "finest_scale"} <= set(text["model"])
 
@@ -50,7 +40,6 @@ def test_defaults_are_the_readings_of_the_paper_and_its_preset_states_them() -> 
         ({"lr": 1}, "lr: there is no such setting; allowed: model, loss"),
         ({"loss": {"lambda_x": 1}}, "loss.lambda_x: there is no such setting; allowed: alpha"),
         ({"loss": {"alpha": 2}}, r"loss.alpha: .*less than or equal to 1 \(given: 2\)"),
-        ({"loss": {"alpha": "high"}}, "loss.alpha: .*number.*high"),
         ({"model": {"estimator": "both"}}, "model.estimator: .*'per_scale' or 'shared'.*both"),
         ({"model": {"registration": {"prior": 1}}}, "model.registration.prior: .*allowed: windows_px, "),
         ({"model": {"levels": 4, "finest_scale": 3}}, "finest_scale = 3 must be below the coarsest scale 3"),
@@ -62,13 +51,11 @@ def test_defaults_are_the_readings_of_the_paper_and_its_preset_states_them() -> 
         ({"steps": 0}, "steps: .*greater than or equal to 1"),
         ({"learning_rate": float("nan")}, "learning_rate"),
         ({"batch_size": True}, "batch_size: .*integer .*True"),
-        ({"batch_size": 2.5}, "batch_size: .*integer .*2.5"),
         ({"batch_size": "2"}, "batch_size: .*integer .*'2'"),
         ({"loss": {"alpha": True}}, "loss.alpha: .*number .*True"),
         ({"loss": {"lambda_dc": "5"}}, "loss.lambda_dc: .*number .*'5'"),
         ({"loss": {"lambda_s": [True] * 7}}, "loss.lambda_s.0: .*number .*True"),
         ({"flip": "no"}, "flip: .*boolean .*no"),
-        ({"flip": 1}, "flip: .*boolean .*1"),
         ({"seed": datetime.date(2000, 1, 1)}, "seed: .*integer .*2000-01-01"),
     ],
 )
@@ -119,13 +106,8 @@ def test_presets_say_what_they_differ_in() -> None:
     assert (best.supervision, best.loss.compare_at, best.loss.warping) == ("flow", "image", "spline")
     assert best.ema_decay > 0
     # Nothing that a sensor could not do to pairs.
-    assert (bare.supervision, bare.motion, bare.flip, bare.color_jitter, bare.crop_size) == (
-        "flow",
-        None,
-        False,
-        0,
-        None,
-    )
+    assert (bare.supervision, bare.flip, bare.color_jitter) == ("flow", False, 0)
+    assert bare.motion is bare.crop_size is None
     assert bare.model == best.model.model_copy(update={"registration": None})
 
 

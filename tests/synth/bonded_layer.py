@@ -61,15 +61,9 @@ def wave_numbers() -> tuple[FloatArray, FloatArray]:
 
 
 def respond(radius: float, thickness: float, poisson_ratio: float) -> tuple[FloatArray, FloatArray]:
-    """Solutions for the right sides 1 (all points sink alike) and x² (the ball's curvature), by Nyström's method.
+    """Forces (2,) and strengths φ(a) (2,) over E for the right sides 1 (all points sink alike) and x² (the ball's).
 
-    Args:
-        radius: of the contact, a.
-        thickness: of the layer, h.
-        poisson_ratio: up to 0.5.
-
-    Returns:
-        (2,) forces over E and (2,) strengths φ(a) over E.
+    By Nyström's method; `radius` is the contact's, a, and `thickness` the layer's, h.
     """
     nodes, weights = gauss(POINTS)
     t, dt = radius / 2 * (nodes + 1), radius / 2 * weights

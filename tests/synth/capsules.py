@@ -1,13 +1,10 @@
-"""A capsule's scene for the tests, and a folder in which its meshes of fTetWild are kept for the session."""
+"""A capsule's scene for the tests, and its meshes of fTetWild, which are kept for the session."""
 
-import atexit
 import functools
-import shutil
-import tempfile
-from pathlib import Path
 from typing import Any
 
 from pads import scene as pad_scene
+from tiny_scene import home
 
 from synth.mesh import PadMesh, pad_mesh
 from synth.scene import Gel, Numerics, Scene
@@ -15,13 +12,6 @@ from synth.scene import Gel, Numerics, Scene
 SHAPE = {"shape": "capsule", "radius_mm": 5.0, "thickness_mm": 2.0, "length_mm": 2.0, "youngs_modulus_kpa": 200.0}
 SIZE = (10.0, 10.0, 7.0)
 EDGE = 1.5
-
-
-@functools.cache
-def _folder() -> Path:
-    folder = Path(tempfile.mkdtemp(prefix="synth-capsules-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return folder
 
 
 def capsule(gel: dict[str, Any] | None = None, **parts: Any) -> Scene:
@@ -38,5 +28,4 @@ def capsule(gel: dict[str, Any] | None = None, **parts: Any) -> Scene:
 
 @functools.cache
 def capsule_mesh(gel: Gel, edge_mm: float = EDGE) -> PadMesh:
-    """Its mesh."""
-    return pad_mesh(gel, Numerics(edge_length_mm=edge_mm), [_folder()])
+    return pad_mesh(gel, Numerics(edge_length_mm=edge_mm), [home() / "capsules"])

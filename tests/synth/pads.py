@@ -207,19 +207,10 @@ def equilibrium(
     guess: Unknowns | None = None,
     tolerance: float = TIGHT,
 ) -> tuple[System, Unknowns, FloatArray]:
-    """Find the equilibrium of a body without contact under prescribed displacements and dead loads, in equal steps.
+    """The equilibrium without contact under prescribed displacements (n, 3) mm where held and dead loads (n, 3) E mm².
 
-    Args:
-        space: whose held components move to `prescribed`.
-        material: of its elements.
-        prescribed: (n, 3) mm, read where held; default zero.
-        load: (n, 3) nodal forces in E mm².
-        steps: in how many equal parts; each starts from the last state extrapolated.
-        guess: first iterate of a single step, instead of the undeformed state.
-        tolerance: of Newton's method.
-
-    Returns:
-        the system, its state, and all nodal forces (n, 3): what the supports exert, zero elsewhere.
+    In equal steps, each from the last state extrapolated; `guess` is the first iterate of a single one. Returns the
+    system, its state, and all nodal forces (n, 3): what the supports exert, zero elsewhere.
     """
     goal = np.zeros_like(space.points) if prescribed is None else prescribed
     body = System(space, material, load=load)

@@ -118,7 +118,6 @@ def writing_elsewhere(directory: Path, shard: str = "", indices: Sequence[int] =
     command = [sys.executable, "-c", HOLD, str(directory), shard, " ".join(map(str, indices)), *paths]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     try:
-        assert process.stdout is not None
         assert process.stdout.readline() == "held\n"
         yield process
     finally:

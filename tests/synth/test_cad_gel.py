@@ -132,8 +132,6 @@ def test_a_capsule_agrees_with_its_files(folder: Path, motion: dict[str, Any]) -
     space = function_space(mesh, p2p1())
     np.testing.assert_allclose(space.points[space.faces[~space.coated]][:, :, 2], 7.0, atol=1e-9)  # only the cut end
     frames = [path_of(scene, folder).frame for scene in (built_in, given)]
-    assert frames[0] is not None
-    assert frames[1] is not None
     np.testing.assert_allclose(frames[1].origin, frames[0].origin, atol=0.02)
     np.testing.assert_allclose(frames[1].axes.T @ frames[1].axes, np.eye(3), atol=1e-12)
     assert np.linalg.det(frames[1].axes) == pytest.approx(1)
@@ -171,21 +169,13 @@ def test_the_batched_solver_presses_it(folder: Path) -> None:
 
 SCENE = """
 name = "cad"
-[sensor.window]
-shape = "capsule"
-radius_mm = 2.4
-center_z_mm = 5.0
-thickness_mm = 1.0
-[sensor.pattern]
-kind = "dots"
-spacing_mm = [1.5, 1.5]
-radius_mm = 0.4
-placing = "spherical"
-[[sensor.lights]]
-position_mm = [0.0, 1.5, 7.5]
-size_mm = [0.5, 0.5]
-color = [1.0, 1.0, 1.0]
-power = 150.0
+contact.indenter = { shape = "sphere", radius_mm = 2.0 }
+render.samples_per_pixel = 4
+numerics = { element = "p1p1", edge_length_mm = 1.5 }
+[sensor]
+window = { shape = "capsule", radius_mm = 2.4, center_z_mm = 5.0, thickness_mm = 1.0 }
+pattern = { kind = "dots", spacing_mm = [1.5, 1.5], radius_mm = 0.4, placing = "spherical" }
+lights = [{ position_mm = [0.0, 1.5, 7.5], size_mm = [0.5, 0.5], color = [1.0, 1.0, 1.0], power = 150.0 }]
 [sensor.camera]
 width = 48
 height = 48
@@ -196,19 +186,11 @@ fy = 15.0
 cx = 24.0
 cy = 24.0
 position_mm = [0.0, 0.0, 6.5]
-[contact.indenter]
-shape = "sphere"
-radius_mm = 2.0
 [motion]
 depth_mm = { uniform = [0.3, 0.5] }
 polar_deg = { uniform = [0.0, 60.0] }
 azimuth_deg = { uniform = [-180.0, 180.0] }
 steps = 2
-[render]
-samples_per_pixel = 4
-[numerics]
-element = "p1p1"
-edge_length_mm = 1.5
 """
 
 

@@ -108,8 +108,7 @@ def test_number_follows_from_the_pilots_noise_and_quantisation_is_noise_too() ->
 
 
 @pytest.mark.parametrize("level", [0.0, 0.002, 0.2])
-def test_the_cameras_noise_is_that_of_its_photographs(level: float) -> None:
-    """In the dark, too."""
+def test_the_cameras_noise_is_that_of_its_photographs_in_the_dark_too(level: float) -> None:
     camera = small_sensor(read_noise=0.004, shot_noise=0.01, bit_depth=16).camera
     radiance = np.full((60, 80, 3), level, dtype=np.float32)
     photograph = camera_image(radiance, camera, np.random.default_rng(0)) / 65535

@@ -94,16 +94,13 @@ def test_places_and_their_frames() -> None:
         ({"height_mm": 6.0, "azimuth_deg": 180.0}, (-5, 0, 6), (1, 0, 0)),
     ):
         frame = path_of(capsule(motion=motion)).frame
-        assert frame is not None
         np.testing.assert_allclose(frame.origin, place, atol=1e-14)
         np.testing.assert_allclose(frame.axes[:, 2], inward, atol=1e-15)
         np.testing.assert_allclose(np.linalg.det(frame.axes), 1.0, rtol=1e-14)
         further = {**motion, "polar_deg": motion["polar_deg"] - 1} if "polar_deg" in motion else motion
         back = path_of(capsule(motion=further)).frame
-        assert back is not None
         assert further is motion or (frame.origin - back.origin) @ frame.axes[:, 0] > 0  # along rising polar angle
     at_tip = path_of(capsule()).frame
-    assert at_tip is not None
     np.testing.assert_array_equal(at_tip.axes, np.eye(3))
 
 

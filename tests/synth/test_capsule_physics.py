@@ -97,7 +97,6 @@ def pressed(posed: Scene) -> Trajectory:
 def local(posed: Scene, force: tuple[float, float, float]) -> FloatArray:
     """A force in the frame of the place: along polar angle, azimuth and inward normal."""
     frame = path_of(posed).frame
-    assert frame is not None
     np.testing.assert_allclose(frame.axes.T @ frame.axes, np.eye(3), atol=1e-15)
     return np.array(force) @ frame.axes
 

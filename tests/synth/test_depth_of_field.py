@@ -16,7 +16,6 @@ from synth.errors import InputError
 from synth.flow.exact import exact_flow
 from synth.optics import Optics
 from synth.pipeline.generate import generate
-from synth.render.camera_rays import CameraRays
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
 from synth.render.sample_count import camera_noise, render_noise
@@ -220,28 +219,6 @@ def test_the_flow_does_not_know_of_the_aperture() -> None:
     assert np.isfinite(first.forward).all()
     for name in ("forward", "backward", "forward_visible", "backward_visible"):
         assert np.array_equal(getattr(first, name), getattr(second, name), equal_nan=True)
-
-
-@needs_llvm
-def test_a_pinhole_draws_no_point_of_a_pupil() -> None:
-    """Its picture is, bit by bit, what the pixel's own point and the path draw."""
-    sensor, mi = small_sensor(1.45, MANY, focus_mm=15.0), FAST.load()
-    import drjit as dr
-
-    renderer = _renderer(sensor)
-    image = renderer.radiance(flat_surface(sensor).material, 3)
-    sampler = mi.load_dict({"type": "multijitter", "sample_count": 16})
-    sampler.set_samples_per_wavefront(16)
-    sampler.seed(int(np.random.SeedSequence([3, 0]).generate_state(1)[0]), 80 * 60 * 16)
-    pixel = dr.arange(mi.UInt32, 80 * 60 * 16) // 16
-    rays = CameraRays(sensor, mi)
-    assert not rays.has_aperture
-    ray, weight, valid = rays.sample(pixel, sampler.next_2d())
-    color, seen, _ = renderer._integrator.sample(renderer._scene, sampler, ray, active=valid)
-    red = np.array(dr.block_sum(dr.select(valid & seen, color[0] * weight, 0), 16)) / np.float32(16)
-    assert np.array_equal(image[..., 0].ravel(), red)
-    blurred = small_sensor(1.45, MANY, aperture_mm=APERTURE, focus_mm=15.0)
-    assert CameraRays(blurred, mi).has_aperture
 
 
 @needs_llvm

@@ -1,7 +1,6 @@
 """The whole chain in one process: what lands on disk, going on, growing, and draws that fail."""
 
 import json
-import shutil
 import sys
 from itertools import count, islice
 from pathlib import Path
@@ -15,8 +14,8 @@ from synth.dataset.reader import read_dataset
 from synth.dataset.shard import Shard
 from synth.errors import InputError
 from synth.pipeline.generate import Scheduling, generate
-from synth.planning import job_variant
 from synth.progress import progress
+from synth.render.variant import choose_variant
 from synth.scene.sampling import draw
 from synth.scene.template import Template, load_scene
 from synth.verify import verify_dataset
@@ -29,6 +28,7 @@ def test_the_dataset_is_what_was_asked_for_and_verifies() -> None:
     assert dataset.samples == [0, 1, 2, 3, 4]  # of three trajectories of two: the last one is not finished
     assert [dataset.entry(i).trajectory for i in range(5)] == [0, 0, 1, 1, 2]
     assert (dataset.failures, dataset.info["n"]) == ([], 5)
+    assert dataset.info["device"]["variant"] == choose_variant("cpu").name
     assert set(dataset.info["software"]) >= {"gelflow-synth", "mitsuba", "warp-lang", "pytetwild"}
     for index in range(5):
         entry, sample = dataset.entry(index), dataset.read(index)
@@ -69,34 +69,6 @@ def test_three_shards_in_any_order_give_the_same_files(tiny: Path, tmp_path: Pat
     said = [(s.shard, s.made, s.asked_for, s.found) for s in done]
     assert said == [("2/3", 1, 1, 0), ("0/3", 2, 2, 0), ("1/3", 2, 2, 0)]  # trajectories of samples 0 1 | 2 3 | 4
     assert fingerprint(out) == fingerprint(reference())
-
-
-def test_a_lost_folder_and_a_foreign_line_are_made_good(tiny: Path, tmp_path: Path) -> None:
-    """Deleted files, a torn line and leftovers of a killed writer."""
-    out = Path(shutil.copytree(reference(), tmp_path / "mended"))
-    (out / "samples" / "000002" / "flow.exr").unlink()
-    shutil.rmtree(out / "samples" / "000004")
-    (out / "samples" / ".000003.partial-1").mkdir()
-    with (out / "manifest.jsonl").open("a") as file:
-        file.write('{"index": 5, "tra')
-    summary = generate(load_scene(tiny), 5, out)
-    assert (summary.made, summary.found) == (2, 3)
-    assert fingerprint(out) == fingerprint(reference())
-
-
-def test_a_directory_of_another_job_is_refused_and_left_alone(tiny: Path) -> None:
-    before, variant = fingerprint(reference()), job_variant(load_scene(tiny), "cpu")
-    other = type(variant)("scalar_rgb" if variant.is_vectorised else "llvm_ad_rgb", "")
-    for overrides, seed, asked, difference in (
-        ([], 1, variant, "seed: 0 there, 1 now"),
-        (["motion.steps=3"], 0, variant, "scene.motion.steps: 2 there, 3 now"),
-        (["motion.depth_mm=0.1"], 0, variant, "scene.motion.depth_mm: "),
-        ([], 0, other, "device.variant: "),
-    ):
-        with pytest.raises(InputError, match="holds another job") as caught:
-            generate(load_scene(tiny, overrides), 5, reference(), seed, asked)
-        assert difference in str(caught.value)
-    assert fingerprint(reference()) == before
 
 
 def test_wrong_numbers_scenes_that_cannot_be_built_and_a_missing_ray_are_told(tiny, tmp_path, monkeypatch) -> None:

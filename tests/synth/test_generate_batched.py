@@ -14,8 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from batches import simulate_scenes
-from pads import brick, gentle
 from processes_of import end_family, needs_proc, started
 from tiny_scene import TEXT, fingerprint, job_context, write_tiny
 
@@ -23,7 +21,7 @@ from synth.dataset.reader import read_dataset
 from synth.dataset.shard import Shard
 from synth.errors import InputError
 from synth.pipeline.attempts import Attempts
-from synth.pipeline.batched_simulation import Result, by_sensor, in_batches
+from synth.pipeline.batched_simulation import in_batches
 from synth.pipeline.generate import Scheduling, generate
 from synth.pipeline.overlapped import prefetched
 from synth.pipeline.producer import Producer
@@ -125,7 +123,7 @@ at most was seen (docs/reports/batched_fem.md). States that are not corrected ar
 
 def test_a_batch_agrees_with_the_single_solver_and_hopeless_trajectories_are_given_up(context: JobContext) -> None:
     """On the same meshes: the same draws fail for the same reasons, and what is left is the same motion."""
-    results = {found.number: found for found in map(_trajectory, in_batches(context, _tasks(range(5)), 4))}
+    results = {found.number: found for found, *_ in in_batches(context, _tasks(range(5)), 4)}
     assert sorted(results) == list(range(5))
     for task in _tasks(range(5)):
         template = context.plan.template
@@ -150,11 +148,6 @@ def _said(failures: Iterable[Failure]) -> list[tuple[object, ...]]:
     return [(failure.index, failure.draw, failure.stage, failure.reason) for failure in failures]
 
 
-def _trajectory(result: Result) -> SimulatedTrajectory:
-    assert not isinstance(result, Outcome)
-    return result[0]
-
-
 def _alone(attempts: Attempts) -> SimulatedTrajectory:
     """By the single solver, as `Producer` does it."""
     while (attempt := attempts.next()) is not None:
@@ -162,35 +155,6 @@ def _alone(attempts: Attempts) -> SimulatedTrajectory:
         if simulated is not None:
             return simulated[0]
     raise AssertionError("no draw could be used")
-
-
-def test_frames_of_each_job_are_its_own() -> None:
-    """Those that are wanted are the same to the bit as when all are; others keep their penetration."""
-    scenes = [gentle(motion={"depth_mm": 0.4, "steps": 3}), gentle(motion={"depth_mm": 0.5, "steps": 3})]
-    mesh, wanted = brick(counts=(4, 4, 2)), [frozenset({1}), frozenset({3})]
-    every, some = simulate_scenes(scenes, mesh), simulate_scenes(scenes, mesh, frames=wanted)
-    for one, other, frames in zip(every, some, wanted, strict=True):
-        for k in (1, 2, 3):
-            assert (one.states[k].displacement == other.states[k].displacement).all() == (k in frames)
-    with pytest.raises(ValueError, match="1 sets of frames for 2 presses"):
-        simulate_scenes(scenes, mesh, frames=wanted[:1])
-
-
-def test_the_trajectories_of_a_sensor_come_together_but_many_do_not_wait_for_all(template: Template) -> None:
-    """Two a sensor; handed on when the second has ended."""
-    assert _order(template, [0, 2, 1, 3, 5, 4]) == [0, 1, 2, 3, 5, 4]
-    assert _order(template, [4, 5, 2, 0, 1, 3]) == [4, 5, 0, 1, 2, 3]
-    one = load_scene(template.source, ["sampling.trajectories_per_sensor=1000"])
-    assert _order(one, range(20)) == list(range(20))
-
-
-def _order(template: Template, ends: Iterable[int]) -> list[int]:
-    """Trajectories in the order in which they are handed on; of a sensor of many, more are to come."""
-    sensors = Counter(sensor_of(template, trajectory) for trajectory in ends)
-    if template.corners[0].sampling.trajectories_per_sensor > 2:
-        sensors[0] += 1
-    named = ((trajectory, Outcome((), (), (trajectory,))) for trajectory in ends)
-    return [result.given_up[0] for result in by_sensor(template, named, sensors) if isinstance(result, Outcome)]
 
 
 def test_items_made_ahead_come_in_order_with_errors_and_no_more_than_there_is_room_for() -> None:

@@ -165,8 +165,7 @@ def test_formats(tmp_path: Path, ending: str) -> None:
     assert body_of(path).reach_mm == pytest.approx(1.0)
 
 
-def test_many_triangles(tmp_path: Path) -> None:
-    """Hundred thousands of triangles give the ball that they lie on."""
+def test_hundred_thousands_of_triangles_give_the_ball_that_they_lie_on(tmp_path: Path) -> None:
     ball = pv.Sphere(radius=2.0, theta_resolution=400, phi_resolution=300)
     assert ball.n_cells > 200_000
     body = body_of(saved(tmp_path, ball.points, ball.regular_faces))
@@ -186,7 +185,6 @@ def test_edges_are_rounded_as_those_of_a_block(tmp_path: Path) -> None:
 
 
 def joined(*pieces: pv.PolyData) -> tuple[FloatArray, np.ndarray]:
-    """Points and faces of all."""
     starts = np.cumsum([0, *(len(piece.points) for piece in pieces)])
     faces = [piece.regular_faces + start for piece, start in zip(pieces, starts, strict=False)]
     return np.concatenate([piece.points for piece in pieces]), np.concatenate(faces)

@@ -90,8 +90,7 @@ def test_white_transparent_and_beside_it_is_the_bare_coating(tmp_path: Path) -> 
     assert 0 <= edge.min() <= edge.max() <= 0.6 + 1e-6  # no fringe brighter than coating or black
 
 
-def test_fine_stripes_become_their_mean(tmp_path: Path) -> None:
-    """Stripes of 0.6 texels a period."""
+def test_stripes_finer_than_a_texel_become_their_mean(tmp_path: Path) -> None:
     columns = round(COLUMNS / 0.3)  # one dark and one bright column a period
     stored = np.zeros((600, columns), np.uint8)
     stored[:, ::2] = 255

@@ -81,6 +81,7 @@ def test_one_draw_that_needs_a_feature_is_enough_and_nodes_are_about_the_meshs(t
 
 
 GREY = [f"sensor.lights.{i}.color=[1, 1, 1]" for i in range(5)]
+GREY_AT_BOTH_ENDS = f"sensor.coating.reflectance=[{', '.join(3 * ['{uniform=[0.5, 0.6]}'])}]"
 
 
 @pytest.mark.parametrize(
@@ -89,10 +90,7 @@ GREY = [f"sensor.lights.{i}.color=[1, 1, 1]" for i in range(5)]
         ([], False),
         (GREY, True),
         ([*GREY, "sensor.coating.reflectance=[0.5, 0.5, 0.6]"], False),
-        (
-            [*GREY, f"sensor.coating.reflectance=[{', '.join(['{uniform=[0.5, 0.6]}'] * 3)}]"],
-            False,
-        ),  # grey at both ends
+        ([*GREY, GREY_AT_BOTH_ENDS], False),
         ([*GREY, 'sensor.pattern={ kind = "random_color", cell_mm = 0.5, saturation = { normal = [0, 0.1] } }'], False),
         ([*GREY, 'sensor.pattern={ kind = "random_color", cell_mm = 0.5, saturation = 0 }'], True),
     ],

@@ -46,8 +46,7 @@ def test_distributions_are_those_asked_for_and_choices_equally_likely(tiny: Path
     assert len(radii) > COUNT / 3  # drawn anew each time, not once
 
 
-def test_draws_are_independent_of_each_other(tiny: Path) -> None:
-    """Neighbouring trajectories, two axes of one draw, and two seeds do not correlate."""
+def test_neighbouring_trajectories_two_axes_of_one_draw_and_two_seeds_do_not_correlate(tiny: Path) -> None:
     template = load_scene(tiny)
     position = np.array([s.motion.position_mm for s in _draws(template)])
     other = np.array([s.motion.position_mm for s in _draws(template, 4)])

@@ -23,7 +23,7 @@ from synth.render.lights import check_view
 from synth.render.pattern import albedo, pixels_per_mm
 from synth.scene import MeshIndenter, Scene, Sensor
 from synth.scene.sampling import draw, draw_sensor
-from synth.scene.template import SCENES, Template, load_scene, with_files
+from synth.scene.template import SCENES, Template, load_scene
 from synth.simulate.indenter import turned_by
 
 WIDE = ["gelsight_mini", "deltact", "gelsight"]  # Scenes of six kinds of indenter and motions up to 25 px
@@ -174,9 +174,6 @@ def test_a_pattern_is_a_choice_of_the_files_that_match_wherever_it_stands(tiny: 
     assert nested.content["contact"]["indenter"]["choice"][0]["file"] == choice
     files = {indenter.file for indenter in drawn_indenters(nested, 40)}
     assert files == set(choice["choice"])
-    content = {"file": {"choice": ["a", {"choice": ["b"]}]}, "more": [{"file": "c", "name": "file"}]}
-    renamed = {"file": {"choice": ["A", {"choice": ["B"]}]}, "more": [{"file": "C", "name": "file"}]}
-    assert with_files(content, str.upper) == renamed
 
 
 def test_a_pattern_in_a_scenes_file_is_relative_to_it_and_stays_so(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -197,6 +197,8 @@ def test_scenes_must_share_the_pad_which_serves_several_runs() -> None:
     for parts in different:
         with pytest.raises(InputError, match="must share the gel's materials and numerics"):
             simulate_scenes([scene(), scene(**parts)], MESH)
+    with pytest.raises(ValueError, match="1 sets of frames for 2 presses"):
+        simulate_scenes([scene(), scene()], MESH, frames=[frozenset({1})])
     posed = scene(friction=0.4, motion={"depth_mm": 0.2})
     pad, presses = prepare(posed, MESH, "cpu"), presses_of([posed], MESH)
     (_, one), (_, other) = (next(simulate_presses(presses, pad)) for _ in range(2))

@@ -10,7 +10,7 @@ from scipy.sparse import csr_matrix, triu
 
 import synth.simulate.linear as linear
 from synth.arrays import FloatArray
-from synth.simulate.linear import Factor, LinearSolver, PardisoFactor, SuperLUFactor, direct_factor, gmres, has_pardiso
+from synth.simulate.linear import Factor, LinearSolver, PardisoFactor, SuperLUFactor, gmres, has_pardiso
 
 SIZE = 120
 needs_mkl = pytest.mark.skipif(not has_pardiso(), reason="no MKL")
@@ -177,11 +177,3 @@ def test_factor_is_reused_while_it_serves_and_made_anew_where_told(monkeypatch: 
     assert factor.made == 5
     one.solve(matrix, None, b, rough=True)
     assert factor.made == 5
-
-
-def test_best_factor_is_chosen(monkeypatch: pytest.MonkeyPatch) -> None:
-    kept = saddle(1)
-    expected = PardisoFactor if has_pardiso() else SuperLUFactor
-    assert isinstance(direct_factor(kept.indptr, kept.indices), expected)
-    monkeypatch.setattr(linear, "has_pardiso", lambda: False)
-    assert isinstance(direct_factor(kept.indptr, kept.indices), SuperLUFactor)

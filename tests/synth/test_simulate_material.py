@@ -208,8 +208,7 @@ def test_forces_are_the_energys_gradient_tangent_their_derivative_and_corners_ar
     assert smallest <= lattice_jacobian(body, state.u)[0].min() + 1e-12
 
 
-def test_nothing_is_added_where_nothing_folds() -> None:
-    """To the bit."""
+def test_not_a_bit_is_added_where_nothing_folds() -> None:
     body, bare = guarded_pad(), guarded_pad(guarded=False)
     gentle = squeezed(body, 0.01)
     assert lattice_jacobian(body, gentle.u)[0].min() > ONSET

@@ -147,38 +147,16 @@ def test_what_differs_in_topology_does_not_share() -> None:
 
 
 def test_only_the_last_few_patterns_and_so_many_entries_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    space = function_space(MESH, ELEMENT["p1p1"]())
-    first = pattern_of(space, True)
-    most = pattern_module._MAX_CACHED
-    for other in others_of(space, most):
-        pattern_of(other, True)
-        assert len(pattern_module._CACHED) <= most
-    assert pattern_of(space, True) is not first
-    # The last ones stay that are together within the bound, and the very last whatever its size.
-    pattern_module._CACHED.clear()
-    large = function_space(MESH, ELEMENT["p2p1"]())
-    spaces = others_of(space, 4)
+    """The last ones that are together within the bound, and the very last whatever its size."""
+    space, large = (function_space(MESH, ELEMENT[element]()) for element in MIXED)
+    spaces = others_of(space, pattern_module._MAX_CACHED + 1)
     sizes = [pattern_of(one, True).size for one in spaces]
-    assert len(pattern_module._CACHED) == 4
+    assert len(pattern_module._CACHED) == pattern_module._MAX_CACHED
     pattern_module._CACHED.clear()
-    monkeypatch.setattr(pattern_module, "_MAX_ENTRIES", sum(sizes[1:]))
+    monkeypatch.setattr(pattern_module, "_MAX_ENTRIES", sum(sizes[2:]))
     made = [pattern_of(one, True) for one in spaces]
-    assert list(pattern_module._CACHED.values()) == made[1:]
+    assert list(pattern_module._CACHED.values()) == made[2:]
     alone = pattern_of(large, True)
-    assert alone.size > sum(sizes[1:])
+    assert alone.size > sum(sizes[2:])
     assert list(pattern_module._CACHED.values()) == [alone]
     assert pattern_of(large, True) is alone
-
-
-@pytest.mark.parametrize("mixed", [True, False])
-@pytest.mark.parametrize("element", MIXED)
-def test_upper_triangle_in_order_with_its_diagonal(element: str, mixed: bool) -> None:
-    """As Pardiso wants it."""
-    space = function_space(MESH, ELEMENT[element]())
-    made = pattern_of(space, mixed)
-    rows = np.repeat(np.arange(len(made.free)), np.diff(made.indptr))
-    assert (made.indices >= rows).all()
-    assert (made.indices[made.indptr[:-1]] == np.arange(len(made.free))).all()
-    key = rows * len(made.free) + made.indices
-    assert (np.diff(key) > 0).all()
-    assert len(made.free) == 3 * len(space.points) - space.held.sum() + mixed * space.pressures

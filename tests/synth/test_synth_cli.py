@@ -12,8 +12,6 @@ from tiny_scene import fingerprint, reference
 
 from synth.cli import main
 
-ROOT = Path(__file__).parents[2]
-
 pytestmark = pytest.mark.usefixtures("one_cache")
 
 Run = Callable[..., str]
@@ -70,34 +68,23 @@ def test_help_lists_commands_and_options(said: Run, command: str, words: list[st
         (["frobnicate"], 'Unknown command "frobnicate"'),
         (["generate", "--frobnicate"], "frobnicate"),
         (["generate", "--n", "0"], "--n: it is '0', allowed are whole numbers from 1 on"),
-        (["generate", "--n", "-3"], "--n: it is '-3'"),
-        (["generate", "--n", "1.5"], "--n: it is '1.5'"),
         (["generate", "--n", "many"], "--n: it is 'many'"),
         (["generate", "--seed", "-1"], "--seed: it is '-1', allowed are whole numbers from 0 on"),
         (["generate", "--workers", "0"], "--workers: it is '0'"),
         (["generate", "--device", "tpu"], "tpu"),
         (["generate", "--scene", "gelsight_mni"], "there is no scene 'gelsight_mni'"),
         (["generate", "--set", "motion"], "--set 'motion': give key=value"),
-        (
-            ["plan", "--set", "motion.steps=3", "--set", "motion.steps=4"],
-            "motion.steps undoes the earlier motion.steps",
-        ),
         (["plan", "--set", "motion.steps=3", "--set", "motion={}"], "motion undoes the earlier motion.steps"),
         (["generate", "--set", "motion.dept_mm=1"], "motion.dept_mm: unknown key; did you mean 'depth_mm'?"),
-        (["generate", "--set", "sensor.gel.poisson_ratio=0.51"], "must be less than or equal to 0.5"),
         (["generate", "--set", "sensor.lights.0.position_mm=[0, 0, 3]"], "between the camera and the gel"),
         (["plan", "--set", "contact.indenter={shape='torus',radius_mm=1,tube_mm=2}"], "contact.indenter.tube_mm = 2"),
-        (["plan", "--n", "0"], "--n: it is '0'"),
         (["simulate", "--scene", "deltact"], "--out"),
         (["simulate", "--out", "x"], "--scene"),
-        (["simulate", "--scene", "deltact", "--out", "x", "--seed", "-1"], "--seed: it is '-1'"),
         (["simulate", "--scene", "deltact", "--out", "x", "--index", "-1"], "--index: it is '-1'"),
-        (["inspect"], "PATH"),
         (["inspect", "nowhere"], "nowhere: there is no such file or directory"),
         (["inspect", ".", "--limit", "0"], "--limit: it is '0'"),
         (["verify", "nowhere"], "nowhere: there is no such directory"),
         (["verify", "."], "not a dataset"),
-        (["export", ".", "--format", "flo"], "--out"),
         (["export", ".", "--format", "gif", "--out", "x"], "gif"),
         (["export", ".", "--format", "flo", "--out", "x"], "not a dataset"),
     ],
@@ -170,8 +157,17 @@ def test_generate_says_what_it_did_and_a_job_that_partly_fails_has_status_1(said
     assert "10 draws failed" in said
 
 
-@pytest.mark.parametrize("kind", ["file", "foreign", "another job", "below a file", "not writable"])
-def test_places_that_cannot_take_the_dataset(complaint: Run, tiny: Path, tmp_path: Path, kind: str) -> None:
+@pytest.mark.parametrize(
+    ("kind", "says"),
+    [
+        ("file", "is a file"),
+        ("foreign", "not a dataset: holds thesis.tex"),
+        ("another job", "seed: 0 there, 5 now"),
+        ("below a file", "NotADirectoryError"),
+        ("not writable", "cannot be written"),
+    ],
+)
+def test_places_that_cannot_take_the_dataset(complaint: Run, tiny, tmp_path, kind: str, says: str) -> None:
     out = tmp_path / "d"
     match kind:
         case "file":
@@ -189,7 +185,7 @@ def test_places_that_cannot_take_the_dataset(complaint: Run, tiny: Path, tmp_pat
     before = tree(tmp_path)
     message = complaint("generate", "--scene", tiny, "--out", out, "--seed", "5", "--n", "1")
     assert str(out) in message
-    assert kind != "another job" or "seed: 0 there, 5 now" in message
+    assert says in message
     assert before == tree(tmp_path)
 
 

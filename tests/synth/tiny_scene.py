@@ -112,7 +112,8 @@ def fingerprint(dataset: Path) -> dict[str, Any]:
 
 
 @functools.cache
-def _home() -> Path:
+def home() -> Path:
+    """A folder of the session."""
     folder = Path(tempfile.mkdtemp(prefix="synth-tests-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
@@ -122,14 +123,14 @@ def own_cache(monkeypatch: pytest.MonkeyPatch) -> None:
     """Keep meshes apart from the user's and share them within the session; Warp's kernels stay where they are."""
     kept = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     monkeypatch.setenv("WARP_CACHE_PATH", os.environ.get("WARP_CACHE_PATH") or str(kept / "warp"))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(_home() / "cache"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(home() / "cache"))
 
 
 @functools.cache
 def reference() -> Path:
     """Five samples of the scene, seed 0, made in one go in this process; made once per session, after `own_cache`."""
-    out = _home() / "reference"
-    generate(load_scene(write_tiny(_home())), 5, out)
+    out = home() / "reference"
+    generate(load_scene(write_tiny(home())), 5, out)
     return out
 
 

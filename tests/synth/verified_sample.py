@@ -1,7 +1,7 @@
 """A small sample whose flow is exact and whose images show a painted pattern, without solver and renderer."""
 
 import numpy as np
-from kinematic_double import LENS, sheet
+from kinematic_double import LENS, sensor, sheet
 
 from synth.arrays import FloatArray, Points
 from synth.dataset.reader import SampleData
@@ -26,20 +26,10 @@ def scene(pattern: dict[str, object] | None = None, index: float = 1.45, **camer
     """A 20 x 15 mm pad that a little more than fills a 160 x 120 image, under an oblique camera with a lens."""
     view = {"position_mm": (1.0, -0.7, 24.0), "look_at_mm": (0.2, 0.1, 0.0), "distortion": LENS}
     size = {"width": WIDTH, "height": HEIGHT, "fx": 175.0, "fy": 176.0, "cx": 79.3, "cy": 60.4}
-    return Scene.model_validate(
-        {
-            "name": "double",
-            "sensor": {
-                "gel": {"size_mm": (20, 15, 4), "youngs_modulus_kpa": 200},
-                "window": {"refractive_index": index, "thickness_mm": 5},
-                "pattern": pattern or {"kind": "speckle", "grain_mm": 0.5},
-                "lights": [{"position_mm": (9, 0, 3), "size_mm": (1, 1), "color": (1, 1, 1), "power": 1}],
-                "camera": {**view, **size, "read_noise": NOISE, **camera},
-            },
-            "contact": {"indenter": {"shape": "sphere", "radius_mm": 4}},
-            "motion": {"depth_mm": 1},
-        }
-    )
+    drawn = sensor(index=index, **{**view, **size, "read_noise": NOISE, **camera}).model_dump()
+    drawn["pattern"] = pattern or {"kind": "speckle", "grain_mm": 0.5}
+    press = {"contact": {"indenter": {"shape": "sphere", "radius_mm": 4}}, "motion": {"depth_mm": 1}}
+    return Scene.model_validate({"name": "double", "sensor": drawn, **press})
 
 
 def pressed(depth: float, shear: tuple[float, float], turn: float = 0.0) -> FloatArray:
