@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from gelflow.arrays import Features, Flow, Images
+from gelflow.config import RegistrationConfig
 from gelflow.ops.gaussian import SeparableFilter, window_sums
 from gelflow.ops.spline import SplineImage
 from gelflow.ops.warp import inside_at, positions
@@ -60,17 +61,18 @@ def evidence(
     return residual, counts * across, counts * down, counts
 
 
-def gauss_newton(
-    flow: Flow, first: Images, second: SplineImage, background: SeparableFilter, window: SeparableFilter
-) -> Step:
-    """The step from a flow, without a prior, and its variance."""
+def gauss_newton(flow: Flow, first: Images, second: SplineImage, config: RegistrationConfig) -> Step:
+    """The step from a flow in the last window of a registration for motion, without a prior, and its variance."""
+    size = (flow.shape[-2], flow.shape[-1])
+    background = window_sums(*size, config.background_px or 0.0, flow)
+    window = window_sums(*size, config.windows_px[-1], flow)
     residual, across, down, counts = evidence(flow, first, second, background)
     weight = background(counts).clamp(min=TINY)
     across, down = (gradient - counts * background(gradient) / weight for gradient in (across, down))
     noise = (counts * slope / 2 for slope in torch.gradient(residual, dim=(-1, -2)))
     texture = _squares(across, down) - _squares(*noise)
     pull = torch.stack([across * residual, down * residual], dim=1).sum(dim=2)
-    z = window_sums(*_size(flow), CORRELATION_PX, flow)(pull) / (math.sqrt(math.pi) * CORRELATION_PX)
+    z = window_sums(*size, CORRELATION_PX, flow)(pull) / (math.sqrt(math.pi) * CORRELATION_PX)
     # The sum under w^2 is about half of that under w.
     sums = window(torch.cat([texture, _squares(*z.split(1, dim=1)) / 2, pull], dim=1))
     xx, xy, yy, one, two, three, right, left = sums.split(1, dim=1)
@@ -87,7 +89,3 @@ def gauss_newton(
 def _squares(x: Features, y: Features) -> Tensor:
     """x^2, x y and y^2, summed over the colours: (B, 3, H, W) of (B, C, H, W)."""
     return torch.stack([x * x, x * y, y * y], dim=1).sum(dim=2)
-
-
-def _size(field: Tensor) -> tuple[int, int]:
-    return field.shape[-2], field.shape[-1]

@@ -67,7 +67,7 @@ def registered(flow: Flow, image1: Images, image2: Images, config: RegistrationC
                 step = _posterior(*found, flow - start, window, config.prior_px, config.noise)
                 flow = flow + step.clamp(-MAX_STEP_PX, MAX_STEP_PX)
         if background is not None:
-            last = gauss_newton(flow, first, second, background, window)
+            last = gauss_newton(flow, first, second, config)
             variance = 1 / (1 / (TWO_STEPS * last.variance) + 1 / (2 * config.prior_px**2))
             flow, _ = best_window(flow, variance, window(last.texture), config.windows_px[-1])
         if config.after is not None:

@@ -61,9 +61,8 @@ def flow_sigma(flow: Flow, image1: Images, image2: Images) -> tuple[Tensor, Tens
 def error_squares(flow: Flow, image1: Images, image2: Images) -> tuple[Tensor, Tensor]:
     """E + |V - V*|^2 and (m |V''|)^2, both (B, 1, H, W) px^2."""
     size = (flow.shape[-2], flow.shape[-1])
-    background = window_sums(*size, _MOTION.background_px or 0.0, flow)
     window = window_sums(*size, _MOTION.windows_px[-1], flow)
-    found = gauss_newton(flow, image1, SplineImage(image2), background, window)
+    found = gauss_newton(flow, image1, SplineImage(image2), _MOTION)
     texture, variance = window(found.texture), TWO_STEPS * found.variance
     narrow = flow + found.step.clamp(-MAX_STEP_PX, MAX_STEP_PX)
     best, error = best_window(narrow, variance, texture, _MOTION.windows_px[-1])

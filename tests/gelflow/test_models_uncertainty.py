@@ -7,9 +7,9 @@ import torch
 from textures import grid
 from torch import Tensor
 
+from gelflow.config import RegistrationConfig
 from gelflow.models.evidence import gauss_newton
 from gelflow.models.uncertainty import MAX_SIGMA_PX, RADIUS, flow_sigma
-from gelflow.ops.gaussian import window_sums
 from gelflow.ops.spline import SplineImage
 
 HEIGHT, WIDTH, LENGTH, HEIGHT_OF_WAVE = 96, 128, 8.0, 0.3
@@ -30,9 +30,9 @@ def no_flow() -> Tensor:
 
 @pytest.mark.parametrize("noise", [0.003, 0.03])
 def test_in_white_noise_a_step_has_the_variance_of_the_cramer_rao_bound(noise: float) -> None:
-    background, window = (window_sums(HEIGHT, WIDTH, deviation, no_flow()) for deviation in (4.0, 5.0))
+    config = RegistrationConfig()
     found = [
-        gauss_newton(no_flow(), waves(noise, 2 * seed), SplineImage(waves(noise, 2 * seed + 1)), background, window)
+        gauss_newton(no_flow(), waves(noise, 2 * seed), SplineImage(waves(noise, 2 * seed + 1)), config)
         for seed in range(6)
     ]
     # Both images' noise over the waves' mean square slope by central differences, in a window of 4 pi 5^2 px (the
