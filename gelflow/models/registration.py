@@ -16,7 +16,7 @@ Gauss-Newton steps stay in the basin that they start in. With `propagation_px` e
 flows first (`gelflow.models.propagation`); where a whole neighbourhood mistook dots for the next ones, that does not
 help. With `after`, another registration comes before all stages. Its flow stays wherever the residual that it leaves is
 below its `noise`. So registration for both keeps the motion where motion explains the images, and follows brightness
-elsewhere.
+elsewhere. Where shading is ignored, each pixel at last takes the window that fits it (`gelflow.models.wider_window`).
 
 Lucas and Kanade 1981, with a prior (Simoncelli, Adelson and Heeger, "Probability distributions of optical flow", 1991);
 smoothing the field between the steps: Thirion's demons, 1998.
@@ -27,14 +27,15 @@ from torch import Tensor
 
 from gelflow.arrays import Features, Flow, Images
 from gelflow.config import RegistrationConfig
+from gelflow.models.evidence import TINY, evidence, gauss_newton
 from gelflow.models.propagation import propagated
+from gelflow.models.wider_window import TWO_STEPS, best_window
 from gelflow.ops.gaussian import SeparableFilter, smoother, window_sums
 from gelflow.ops.spline import SplineImage
-from gelflow.ops.warp import inside_at, positions
+from gelflow.ops.warp import positions
 
 MAX_STEP_PX = 1.0
 """Limit on a Gauss-Newton step of each component."""
-TINY = 1e-6
 RESIDUAL_WINDOW_PX, BLENDING_PX = 6.0, 2.0
 """Standard deviations of the window of the residual that decides between two flows, and of the blending at its edge."""
 
@@ -65,6 +66,10 @@ def registered(flow: Flow, image1: Images, image2: Images, config: RegistrationC
                 found = evidence(flow, first, second, background)
                 step = _posterior(*found, flow - start, window, config.prior_px, config.noise)
                 flow = flow + step.clamp(-MAX_STEP_PX, MAX_STEP_PX)
+        if background is not None:
+            last = gauss_newton(flow, first, second, config)
+            variance = 1 / (1 / (TWO_STEPS * last.variance) + 1 / (2 * config.prior_px**2))
+            flow, _ = best_window(flow, variance, window(last.texture), config.windows_px[-1])
         if config.after is not None:
             flow = torch.lerp(former, flow, _unexplained(former, first, second, config.after.noise))
     return flow
@@ -81,21 +86,6 @@ def _unexplained(flow: Flow, first: Images, second: SplineImage, noise: float) -
     all_of_it = torch.ones_like(squares)
     left = (window(squares) > noise**2 * window(all_of_it)).float()
     return edge(left) / edge(all_of_it)
-
-
-def evidence(
-    flow: Flow, first: Images, second: SplineImage, background: SeparableFilter | None
-) -> tuple[Features, Features, Features, Tensor]:
-    """Residual and its derivatives along x and y, (B, C, H, W); 1 where the flow stays in the image and they count."""
-    places = positions(flow)
-    counts, moved = inside_at(places), second.at(places)
-    residual = counts * (moved - first)
-    if background is not None:
-        mean, weight = background(torch.cat([residual, counts], dim=1)).split([residual.shape[1], 1], dim=1)
-        residual = counts * (residual - mean / weight.clamp(min=TINY))
-    # The mean of both images' gradients converges from further away than either alone.
-    across, down = torch.gradient((moved + first) / 2, dim=(-1, -2))
-    return residual, counts * across, counts * down, counts
 
 
 def _posterior(

@@ -7,7 +7,10 @@ import torch
 from textures import grid
 from torch import Tensor
 
-from gelflow.models.uncertainty import MAX_SIGMA_PX, SCALE, error_squares, flow_sigma
+from gelflow.config import RegistrationConfig
+from gelflow.models.evidence import gauss_newton
+from gelflow.models.uncertainty import MAX_SIGMA_PX, RADIUS, flow_sigma
+from gelflow.ops.spline import SplineImage
 
 HEIGHT, WIDTH, LENGTH, HEIGHT_OF_WAVE = 96, 128, 8.0, 0.3
 NUMBER = 2 * math.pi / LENGTH
@@ -26,16 +29,19 @@ def no_flow() -> Tensor:
 
 
 @pytest.mark.parametrize("noise", [0.003, 0.03])
-def test_in_white_noise_it_is_the_cramer_rao_bound_and_the_error_of_a_step(noise: float) -> None:
-    pairs = [(waves(noise, 2 * seed), waves(noise, 2 * seed + 1)) for seed in range(6)]
-    found = torch.stack([error_squares(no_flow(), *pair)[0][INSIDE].mean() for pair in pairs]).mean().item()
+def test_in_white_noise_a_step_has_the_variance_of_the_cramer_rao_bound(noise: float) -> None:
+    config = RegistrationConfig()
+    found = [
+        gauss_newton(no_flow(), waves(noise, 2 * seed), SplineImage(waves(noise, 2 * seed + 1)), config)
+        for seed in range(6)
+    ]
     # Both images' noise over the waves' mean square slope by central differences, in a window of 4 pi 5^2 px (the
-    # square of a Gaussian's sum over the sum of its squares), for each of the two components. The flow was not fitted
-    # to these images, so that |d|^2 is as large as tr C.
+    # square of a Gaussian's sum over the sum of its squares), for each of the two components.
     slope_square = (HEIGHT_OF_WAVE * math.sin(NUMBER)) ** 2 / 2
     bound = 2 * (2 * noise**2) / slope_square / (4 * math.pi * 5**2)
     # 6 images of some 4,000 px with 2 x 314 px for each independent step: 10 %. The background takes 1 % of both.
-    assert found == pytest.approx(2 * bound, rel=0.2)
+    for square in ([one.variance for one in found], [one.step.square().sum(dim=1, keepdim=True) for one in found]):
+        assert torch.stack(square)[INSIDE].mean().item() == pytest.approx(bound, rel=0.2)
 
 
 def test_an_error_of_the_flow_is_part_of_it() -> None:
@@ -45,7 +51,7 @@ def test_an_error_of_the_flow_is_part_of_it() -> None:
     sure, unsure = (flow_sigma(flow, image1, image2)[0][INSIDE].median().item() for flow in (right, wrong))
     # The step is 10 % too long, because a central difference is below the slope of so short a wave; and the residual
     # that the error leaves counts as noise, too.
-    assert SCALE * 0.4 < unsure < SCALE * 0.55
+    assert 0.4 < unsure * math.sqrt(2) / RADIUS < 0.55
     assert sure < 0.05
 
 

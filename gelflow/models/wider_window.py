@@ -1,0 +1,73 @@
+"""The window that fits the place: a flow under the window with the least estimated mean square error at each pixel.
+
+Two Gauss-Newton steps in a Gaussian window of deviation s pass a wave of wave number k of motion and of noise by
+``H_s(k) = 1 - (1 - exp(-(s k)^2 / 2))^2``. Noise of a step has a variance that falls with ``s^2`` and the square of the
+images' gradient (Cramer-Rao; C of `gelflow.models.evidence`), and two steps have 11/6 of it. The bias is what H takes
+from the motion, with the fourth power of s times its curvature's curvature. So a flow V, found under a narrow window,
+is smoothed by H of wider ones, pixels weighted by their texture: as good as steps in these windows, without the images.
+Which one is best is estimated without bias (Stein 1981; Lepski 1991),
+
+    risk_s = <|H_s V - V|^2 / var V> + 2 cov(H_s V, V) / var V - 1,
+
+< > a mean under the window. The narrow window's risk is 1.
+"""
+
+import functools
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gelflow.arrays import Features, Flow
+from gelflow.ops.gaussian import SeparableFilter, window_sums
+
+WIDTHS_PX = (6.0, 12.0, 20.0)
+"""Standard deviations of the windows that a pixel may choose, beside its own."""
+TWO_STEPS = 11 / 6
+"""Variance of the noise after two steps over that of one."""
+MIN_VARIANCE = 1e-8
+"""Of a flow, px^2; of equal images it would be zero."""
+FLAT = 0.04
+"""Sum of squared gradients in a window below which pixels count alike; what the network's flow is worth by default."""
+
+
+def best_window(flow: Flow, variance: Tensor, texture: Tensor, window_px: float) -> tuple[Flow, Tensor]:
+    """Smooths a flow (B, 2, H, W) where that makes it more precise.
+
+    Args:
+        flow: Found by two steps in a window of `window_px`.
+        variance: Of its noise, both components together, (B, 1, H, W) px^2.
+        texture: Sum of the squares of the gradient in the window, (B, 1, H, W).
+        window_px: Standard deviation.
+
+    Returns:
+        The flow, and its mean square error, px^2.
+    """
+    variance, weight = variance.clamp(min=MIN_VARIANCE), texture.clamp(min=0) + FLAT
+    least, error = torch.ones_like(variance), variance
+    best = flow
+    for width in WIDTHS_PX:
+        window = window_sums(flow.shape[-2], flow.shape[-1], width, flow)
+        wide = _mean(flow, weight, window)
+        wide = wide + _mean(flow - wide, weight, window)
+        shared, left = _noise_shares(window_px, width)
+        apart = (wide - flow).square().sum(dim=1, keepdim=True)
+        risk = _mean(apart / variance, weight, window) + 2 * shared - 1
+        better = risk < least
+        best, least = torch.where(better, wide, best), torch.where(better, risk, least)
+        error = torch.where(better, variance * risk.clamp(min=left), error)
+    return best, error
+
+
+def _mean(field: Features, weight: Tensor, window: SeparableFilter) -> Features:
+    """The weighted mean of each channel under a window."""
+    return window(weight * field) / window(weight)
+
+
+@functools.cache
+def _noise_shares(window_px: float, width: float) -> tuple[float, float]:
+    """Covariance of the noise before and after smoothing, and variance after it, over the variance before."""
+    k = np.linspace(0, 5 / window_px, 1001)
+    steps, wide = (1 - (1 - np.exp(-((deviation * k) ** 2) / 2)) ** 2 for deviation in (window_px, width))
+    noise = k * steps**2
+    return float((noise * wide).sum() / noise.sum()), float((noise * wide**2).sum() / noise.sum())
