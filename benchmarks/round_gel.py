@@ -11,15 +11,17 @@ from functools import cache
 
 import numpy as np
 
-from benchmarks.focused_mesh import around_focus
+from benchmarks.focused_mesh import SLOPE
 from benchmarks.press import timed
 from benchmarks.rows import Row, arguments, machine, measure, plot, show
 from synth.flow.exact import exact_flow
 from synth.flow.field import FlowArray
-from synth.mesh import Focus, PadMesh, face_of, pad_mesh
+from synth.mesh import PadMesh, face_of, pad_mesh
 from synth.mesh.cache import CHORDS, SURFACE
 from synth.mesh.capsule import CapsuleFace
+from synth.mesh.graded import kuhn_tets
 from synth.mesh.tetrahedralise import tetrahedralise
+from synth.mesh.tetwild_sizing import ROOM, Background
 from synth.optics import Optics
 from synth.pipeline.render_session import SUBDIVISIONS
 from synth.scene import Scene
@@ -34,10 +36,11 @@ SETTINGS = (
     "motion.shear_mm=[0.4, 0.0]", "motion.twist_deg=0.0", "motion.polar_deg=0.0", "motion.azimuth_deg=0.0",
     "motion.steps=2",
 )  # fmt: skip
-ZONE, COARSE_MM = Focus((0.0, 0.0), (3.5, 3.5)), 1.6
+ZONE_MM, COARSE_MM = 6.5, 1.6
+"""Distance from the tip within which a finer mesh is fine; edges far from there."""
 EVEN = (2.4, 1.6, 1.2, 1.0)
-FINER = (1.2, 0.85, 0.6)
-REFERENCE = 0.45
+FINER = (1.2, 0.85)
+REFERENCE = 0.6
 
 
 def mesh_of(scene: Scene, family: str, edge_mm: float) -> PadMesh:
@@ -48,9 +51,19 @@ def mesh_of(scene: Scene, family: str, edge_mm: float) -> PadMesh:
     face = face_of(gel)
     assert isinstance(face, CapsuleFace)
     surface, triangles = face.triangles(SURFACE * COARSE_MM / 2)
-    background = around_focus(gel.size_mm, edge_mm, ZONE, COARSE_MM)
-    points, tets = tetrahedralise(surface, triangles, face.sides, background, face.volume_mm3, CHORDS)
+    points, tets = tetrahedralise(
+        surface, triangles, face.sides, _background(gel.size_mm, edge_mm), face.volume_mm3, CHORDS
+    )
     return PadMesh(points, tets, gel.size_mm, face=face)
+
+
+def _background(size_mm: tuple[float, float, float], edge_mm: float) -> Background:
+    """Edges of edge_mm near the tip, SLOPE longer per distance from there, at most COARSE_MM."""
+    cells = 16
+    x, y, z = (ROOM * np.linspace(-length / 2, length / 2, cells + 1) for length in size_mm)
+    points = np.stack(np.meshgrid(x, y, z + size_mm[2] / 2, indexing="ij"), axis=-1).reshape(-1, 3)
+    away = np.maximum(np.linalg.norm(points, axis=1) - ZONE_MM, 0)
+    return Background(points, kuhn_tets(cells, cells, cells), np.minimum(edge_mm + SLOPE * away, COARSE_MM))
 
 
 def flow_of(scene: Scene, found: Trajectory) -> FlowArray:
