@@ -21,6 +21,7 @@ QUESTIONS = {
     "light": "separated light against path tracing",
     "flow": "the flow's error against its run time",
     "scale": "pairs a second, and where the time goes",
+    "round_gel": "the flow's error against run time for a round gel, by mesh",
     "synthetic_set": "makes the synthetic test set of the report on gelflow",
     "counts": "on how many pairs of a comparison is one method better than the others?",
     "sigma": "is the flow's uncertainty calibrated? fits its constants",

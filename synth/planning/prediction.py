@@ -18,6 +18,7 @@ from synth.scene.sampling import draw
 from synth.simulate.load_path import TWIST_ARM_MM
 from synth.simulate.press import edge_radius_mm
 from synth.simulate.resolution import Resolution
+from synth.simulate.vicinity import REACH
 
 _Meshes = tuple[list[tuple[Scene, int]], str, tuple[float, float] | None]
 """Random instances with their displacement nodes; `Prediction.resolution` and `Prediction.error_px`."""
@@ -142,14 +143,18 @@ def _tetwild_meshes(plan: Plan) -> _Meshes:
 
 
 def _plate(gel: Gel) -> tuple[float, float, float]:
-    """Edge lengths of a box; of a round gel those of a flat layer as large and as thick."""
+    """Edge lengths of a box; of a round gel those of a flat layer as large as what a press moves of it."""
     if not gel.is_round:
         return gel.size_mm
+    thickness = gel.depth_mm
     if gel.shape == "file":
         x, y, z = gel.size_mm
-        return x + 2 * (1 + x / y) * (z - gel.depth_mm), y, gel.depth_mm
-    middle = (gel.size_mm[0] - gel.depth_mm) / 2
-    return 2 * np.pi * middle, middle + gel.length_mm, gel.depth_mm
+        around, along = x + 2 * (1 + x / y) * (z - thickness), y
+    else:
+        middle = (gel.size_mm[0] - thickness) / 2
+        around, along = 2 * np.pi * middle, middle + gel.length_mm
+    moved = 2 * (REACH + 1) * thickness
+    return min(around, moved), min(along, moved), thickness
 
 
 def _order(scene: Scene) -> float:

@@ -1,6 +1,7 @@
 """From a scene and a mesh to a trajectory: the stage's entry points."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from synth.errors import InputError
@@ -9,10 +10,11 @@ from synth.scene import Gel, Scene
 from synth.simulate.material import pad_material
 from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.press import ELEMENTS, Press
-from synth.simulate.space import function_space
+from synth.simulate.space import Space, function_space
 from synth.simulate.stepping import Stepper
 from synth.simulate.system import System
 from synth.simulate.trajectory import Trajectory
+from synth.simulate.vicinity import Vicinity
 
 
 def simulate(
@@ -34,15 +36,16 @@ def simulate(
     Raises:
         InputError: the indenter cannot be built; the mesh is of another pad, or no element can be built on it.
     """
-    return stepper_of(Press.of(scene, mesh, folder), frames, options).run()
+    return simulate_press(Press.of(scene, mesh, folder), frames, options=options)
 
 
 def simulate_press(
     press: Press,
     frames: frozenset[int] | None = None,
     on_progress: Callable[[float], None] | None = None,
+    options: SolverOptions = STANDARD,
 ) -> Trajectory:
-    """Simulate one press.
+    """Simulate one press; of a round gel only the vicinity of the contact is solved for, see `Vicinity`.
 
     Args:
         press: scene, mesh and load path.
@@ -50,23 +53,38 @@ def simulate_press(
             penalty's penetration and the load path's relaxed tolerance; those that are wanted are the same to the bit,
             unless one of them misses the full tolerance and its step is halved.
         on_progress: told after each step what share of the load path is done.
+        options: of Newton's method.
 
     Raises:
         InputError: the mesh is of another pad, or no element can be built on it.
     """
-    return stepper_of(press, frames).run(on_progress)
+    gel, whole = press.scene.sensor.gel, space_of(press)
+    if not gel.is_round:
+        return stepper_of(press, frames, options, whole).run(on_progress)
+    near = Vicinity(whole, press.path, gel.depth_mm)
+    found = stepper_of(press, frames, options, near.space).run(on_progress)
+    return replace(found, states=tuple(map(near.widened, found.states)), space=whole)
 
 
-def stepper_of(press: Press, frames: frozenset[int] | None = None, options: SolverOptions = STANDARD) -> Stepper:
-    """A press at the start of its load path; arguments and errors as of `simulate_press`."""
-    scene, mesh = press.scene, press.mesh
-    gel, numerics = scene.sensor.gel, scene.numerics
-    _check_pad(gel, mesh)
-    check_mesh(mesh)
-    space = function_space(mesh, ELEMENTS[numerics.element]())
-    system = System(space, pad_material(gel, mesh), numerics.penalty, options=options)
+def stepper_of(
+    press: Press,
+    frames: frozenset[int] | None = None,
+    options: SolverOptions = STANDARD,
+    space: Space | None = None,
+) -> Stepper:
+    """A press at the start of its load path, on a part of its gel's space, default all of it; see `simulate_press`."""
+    scene, gel, numerics = press.scene, press.scene.sensor.gel, press.scene.numerics
+    space = space or space_of(press)
+    system = System(space, pad_material(gel, space.mesh), numerics.penalty, options=options)
     modulus_mpa = gel.youngs_modulus_kpa / 1000
     return Stepper(system, press.path, scene.contact.friction, numerics, modulus_mpa, options, frames)
+
+
+def space_of(press: Press) -> Space:
+    """The space of a press's whole gel; errors as of `simulate_press`."""
+    _check_pad(press.scene.sensor.gel, press.mesh)
+    check_mesh(press.mesh)
+    return function_space(press.mesh, ELEMENTS[press.scene.numerics.element]())
 
 
 def check_shared(scenes: Sequence[Scene], mesh: PadMesh) -> None:

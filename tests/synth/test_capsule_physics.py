@@ -26,6 +26,8 @@ from synth.simulate.element import p2p1
 from synth.simulate.indenter import rotation_about
 from synth.simulate.load_path import path_of
 from synth.simulate.material import uniform
+from synth.simulate.press import Press
+from synth.simulate.solve import stepper_of
 from synth.simulate.space import function_space
 from synth.simulate.system import Unknowns
 
@@ -132,6 +134,23 @@ def test_a_ring_touches_where_the_face_has_curved_away() -> None:
     states = pressed(capsule(indenter=ring, motion={"depth_mm": reach + 0.3, "steps": 2})).states
     assert states[1].depth_mm < reach + 0.1
     assert states[2].force_n[2] > 0.05
+
+
+def test_far_from_the_press_the_gel_is_left_out() -> None:
+    """Against the whole gel: less than 1 % of the largest displacement, and of the force."""
+    motion = {"depth_mm": 0.3, "shear_mm": (0.2, 0.0), "steps": 2, "polar_deg": 30.0}
+    thin = {"thickness_mm": 0.8, "length_mm": 6.0}
+    posed = capsule(thin, friction=0.5, motion=motion, numerics={"element": "p1p1", "edge_length_mm": 0.8})
+    mesh = capsule_mesh(posed.sensor.gel, 0.8)
+    near, whole = simulate(posed, mesh), stepper_of(Press.of(posed, mesh)).run()
+    found, true = near.states[-1], whole.states[-1]
+    moved = np.linalg.norm(true.displacement, axis=1)
+    np.testing.assert_allclose(found.displacement, true.displacement, atol=0.01 * moved.max())
+    np.testing.assert_allclose(found.force_n, true.force_n, atol=0.01 * np.linalg.norm(true.force_n))
+    np.testing.assert_allclose(found.traction, true.traction, atol=0.02 * np.abs(true.traction).max())
+    still = ~found.displacement.any(axis=1)
+    assert still[moved < 1e-6 * moved.max()].all()
+    assert still.mean() > 0.4
 
 
 def test_the_batched_solver_presses_the_same_gel() -> None:
