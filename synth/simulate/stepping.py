@@ -32,7 +32,8 @@ MAX_ITERATIONS_TO_GROW = 7
 """A step that took at most so many iterations is followed by a longer one."""
 GROWTH = 1.5
 MAX_RELAXED_STEP = 1 / 4
-"""A step that fails is relaxed (`synth.simulate.relaxation`) when it is at most this share of max_step_mm."""
+"""A step that fails is relaxed (`synth.simulate.relaxation`) when it is at most this share of max_step_mm, and a pass
+when it is at most this share of a whole update and begins deeper than MAX_PENETRATION."""
 STICK_FRICTION = 1e6
 """Coefficient of friction at which nothing slides."""
 PATH_DERIVATIVE_STEP = 1e-3
@@ -235,6 +236,8 @@ class Stepper:
             tolerance = between if done + share < MAX_MULTIPLIER_UPDATES else self.numerics.tolerance
             reach = MAX_CORRECTION_RATIO * self.system.deepest()
             better = self._solved_again(solution, tolerance, self.options.correction_iterations, reach)
+            if not better.converged and deep and share <= MAX_RELAXED_STEP:
+                better = self._counted(relax(self.system, solution.state, self.indenter, tolerance))
             if better.converged:
                 solution, done = better, done + share
                 share, failures = (min(1.0, 2 * share), failures) if failures < FAILURES else (share, failures + 1)
