@@ -18,7 +18,7 @@ from synth.scene import Numerics
 from synth.simulate.contact_history import restore_contact, saved_contact
 from synth.simulate.distance import KINDS
 from synth.simulate.load_path import LoadPath
-from synth.simulate.newton import FORCE_FLOOR, MAX_ITERATIONS, Solution, relative_residual, solve
+from synth.simulate.newton import FORCE_FLOOR, Solution, relative_residual, solve
 from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.relaxation import relax
 from synth.simulate.system import System
@@ -46,9 +46,8 @@ FAILURES = 3
 where a whole one upsets Newton's method a part of it does not."""
 MAX_PENETRATION = 0.02
 """Share of the press depth (at least 0.1 mm) by which a triangle mesh may penetrate in a corrected state. Where it is
-deeper, passes go on to MAX_DEEP_UPDATES or DEEP_FAILURES, and the press ends if that does not do. After FAILURES shares
-do not grow again, and all passes count as failures."""
-MAX_DEEP_UPDATES, DEEP_FAILURES = 6.0, 16
+deeper, passes go on to MAX_DEEP_UPDATES or DEEP_FAILURES, and the press ends if that does not do."""
+MAX_DEEP_UPDATES, DEEP_FAILURES = 6.0, 8
 MULTIPLIER_TOLERANCE = 20.0
 """Tolerance of states that multipliers are updated from, over the full one: two updates do not forget what they began
 with."""
@@ -235,12 +234,12 @@ class Stepper:
             self.system.augment(self.indenter, share)
             tolerance = between if done + share < MAX_MULTIPLIER_UPDATES else self.numerics.tolerance
             reach = MAX_CORRECTION_RATIO * self.system.deepest()
-            better = self._solved_again(solution, tolerance, self.options.correction_iterations, reach)
+            start, limit = solution.state, self.options.correction_iterations
+            better = self._counted(solve(self.system, start, self.indenter, tolerance, limit, reach))
             if not better.converged and deep and share <= MAX_RELAXED_STEP:
-                better = self._counted(relax(self.system, solution.state, self.indenter, tolerance))
+                better = self._counted(relax(self.system, start, self.indenter, tolerance))
             if better.converged:
-                solution, done = better, done + share
-                share, failures = (min(1.0, 2 * share), failures) if failures < FAILURES else (share, failures + 1)
+                solution, done, share = better, done + share, min(1.0, 2 * share)
             else:
                 restore_contact(self.system.contact, before)
                 self.system.residual(solution.state, self.indenter)
@@ -251,11 +250,7 @@ class Stepper:
         """A solution brought to a tolerance where it is not there yet; see `converged`."""
         if not solution.converged or relative_residual(solution.residual) <= limit:
             return solution
-        return self._solved_again(solution, limit, MAX_ITERATIONS)
-
-    def _solved_again(self, solution: Solution, tolerance: float, limit: int, reach_mm: float = np.inf) -> Solution:
-        """From a solution on, its iterations counted."""
-        return self._counted(solve(self.system, solution.state, self.indenter, tolerance, limit, reach_mm))
+        return self._counted(solve(self.system, solution.state, self.indenter, limit))
 
     def _record(self, step: Solution, target: float) -> bool:
         """Record the corrected state, then put contact back to where the path goes on.

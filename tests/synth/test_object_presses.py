@@ -1,5 +1,6 @@
 """Objects pressed: against an analytic body, and by relaxation where Newton's method finds no equilibrium."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from synth.simulate import indenter, simulate, stepping
 from synth.simulate.batched import simulate_presses
 from synth.simulate.batched.pad import prepare
 from synth.simulate.newton import Solution, solve
-from synth.simulate.options import SolverOptions
+from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.press import Press
 from synth.simulate.probe import probe
 from synth.simulate.relaxation import AIM, LEAST_VISCOSITY, MAX_ERROR, MOST_VISCOSITY, next_viscosity
@@ -98,18 +99,19 @@ def dragged(indenter: dict[str, Any], friction: float) -> Any:
 
 
 def test_relaxation_finds_the_equilibrium_of_newtons_method(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In load steps, for which it is called without a reach, and in passes, which have one."""
+    """In load steps, which have a relaxed tolerance, and in passes, which have a reach."""
     ball = pressed({"shape": "sphere", "radius_mm": 3.0})
     soft = pressed(cube(rotation_deg=[20.0, 10.0, 30.0]))
     soft = soft.model_copy(update={"numerics": soft.numerics.model_copy(update={"penalty": 10.0})})
-    for drawn, in_passes in ((ball, False), (soft, True)):
+    for drawn, fails in (
+        (ball, lambda tolerance, *rest: tolerance == STANDARD.relaxed_tolerance),
+        (soft, lambda *settings: len(settings) == 3),
+    ):
         expected = simulate(drawn, MESH, folder)
 
-        def unlucky(*arguments: Any, in_passes: bool = in_passes) -> Solution:
-            found, fails = solve(*arguments), len(arguments) == 4
-            if in_passes:
-                fails = not fails and np.isfinite(arguments[-1])
-            return replace(found, converged=False) if fails else found
+        def unlucky(*given: Any, fails: Callable[..., bool] = fails) -> Solution:
+            found = solve(*given)
+            return replace(found, converged=False) if fails(*given[3:]) else found
 
         with monkeypatch.context() as patched:
             patched.setattr(stepping, "MAX_RELAXED_STEP", 1.0)

@@ -87,8 +87,8 @@ def evaluate_trial(lanes: Lanes, settings: Settings):
             return
         lanes.move[s] = phases.TAKE_TRIAL
         lanes.iteration[s] = lanes.iteration[s] + 1
-    too_far = lanes.stage[s] == phases.CORRECTION and lanes.trial_moved[s] > lanes.most_moved[s]
-    too_far = too_far and lanes.relaxing[s] == 0
+    passes = lanes.stage[s] == phases.CORRECTION and lanes.relaxing[s] == 0
+    too_far = passes and lanes.trial_moved[s] > lanes.most_moved[s]
     lanes.norm[s] = norm
     lanes.relative[s] = relative
     lanes.jacobian[s] = lanes.trial_jacobian[s]
@@ -139,9 +139,7 @@ def finish_solve(lanes: Lanes, presses: Presses, settings: Settings):
         lanes.part[s] = ONE
         lanes.iteration[s] = 0
         lanes.predicted[s] = 0
-        lanes.move[s] = phases.RESET
-        if correction:
-            lanes.move[s] = phases.REPEAT_RECORDED
+        lanes.move[s] = wp.where(correction, phases.REPEAT_RECORDED, phases.RESET)
         lanes.phase[s] = phases.START
         return
     lanes.relaxing[s] = 0
@@ -149,10 +147,7 @@ def finish_solve(lanes: Lanes, presses: Presses, settings: Settings):
     if correction:
         if phase == phases.SOLVED:
             lanes.done[s] = lanes.done[s] + lanes.share[s]
-            if lanes.failures[s] < FAILURES:
-                lanes.share[s] = wp.min(ONE, wp.float64(2.0) * lanes.share[s])
-            else:
-                lanes.failures[s] = lanes.failures[s] + 1
+            lanes.share[s] = wp.min(ONE, wp.float64(2.0) * lanes.share[s])
             lanes.phase[s] = phases.CORRECTING
         else:
             lanes.failures[s] = lanes.failures[s] + 1
@@ -175,9 +170,7 @@ def finish_solve(lanes: Lanes, presses: Presses, settings: Settings):
         lanes.phase[s] = phases.RECORD
         return
     lanes.step_iterations[s] = lanes.iteration[s]
-    lanes.has_previous[s] = settings.extrapolate
-    if relaxed:
-        lanes.has_previous[s] = 0
+    lanes.has_previous[s] = wp.where(relaxed, 0, settings.extrapolate)
     lanes.move[s] = phases.ACCEPT
     j = lanes.press[s]
     stop = lanes.next[s]
