@@ -15,10 +15,9 @@ import numpy as np
 
 from synth.arrays import FloatArray
 from synth.scene import Numerics
-from synth.simulate.contact_history import restore_contact, saved_contact
 from synth.simulate.distance import KINDS
 from synth.simulate.load_path import LoadPath
-from synth.simulate.newton import FORCE_FLOOR, Solution, relative_residual, solve
+from synth.simulate.newton import FORCE_FLOOR, MAX_ITERATIONS, Solution, relative_residual, solve
 from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.relaxation import relax
 from synth.simulate.system import System
@@ -47,7 +46,7 @@ where a whole one upsets Newton's method a part of it does not."""
 MAX_PENETRATION = 0.02
 """Share of the press depth (at least 0.1 mm) by which a triangle mesh may penetrate in a corrected state. Where it is
 deeper, passes go on to MAX_DEEP_UPDATES or DEEP_FAILURES, and the press ends if that does not do."""
-MAX_DEEP_UPDATES, DEEP_FAILURES = 6.0, 8
+MAX_DEEP_UPDATES, DEEP_FAILURES = 16.0, 8
 MULTIPLIER_TOLERANCE = 20.0
 """Tolerance of states that multipliers are updated from, over the full one: two updates do not forget what they began
 with."""
@@ -230,18 +229,19 @@ class Stepper:
                 break
             if failures >= (DEEP_FAILURES if deep else FAILURES):
                 break
-            before = saved_contact(self.system.contact)
+            before = self.system.saved_contact()
             self.system.augment(self.indenter, share)
-            tolerance = between if done + share < MAX_MULTIPLIER_UPDATES else self.numerics.tolerance
+            tolerance = between if deep or done + share < MAX_MULTIPLIER_UPDATES else self.numerics.tolerance
             reach = MAX_CORRECTION_RATIO * self.system.deepest()
             start, limit = solution.state, self.options.correction_iterations
             better = self._counted(solve(self.system, start, self.indenter, tolerance, limit, reach))
-            if not better.converged and deep and share <= MAX_RELAXED_STEP:
+            relaxed = not better.converged and deep and share <= MAX_RELAXED_STEP
+            if relaxed:
                 better = self._counted(relax(self.system, start, self.indenter, tolerance))
             if better.converged:
-                solution, done, share = better, done + share, min(1.0, 2 * share)
+                solution, done, share = better, done + share, share if relaxed else min(1.0, 2 * share)
             else:
-                restore_contact(self.system.contact, before)
+                self.system.restore_contact(before)
                 self.system.residual(solution.state, self.indenter)
                 failures, share = failures + 1, share / 2
         return solution
@@ -250,7 +250,7 @@ class Stepper:
         """A solution brought to a tolerance where it is not there yet; see `converged`."""
         if not solution.converged or relative_residual(solution.residual) <= limit:
             return solution
-        return self._counted(solve(self.system, solution.state, self.indenter, limit))
+        return self._counted(solve(self.system, solution.state, self.indenter, limit, MAX_ITERATIONS))
 
     def _record(self, step: Solution, target: float) -> bool:
         """Record the corrected state, then put contact back to where the path goes on.
@@ -259,7 +259,7 @@ class Stepper:
             False where the corrected state does not reach the full tolerance: nothing is recorded. Nor is a state that
             is too deep, which ends the press, saying so.
         """
-        saved = saved_contact(self.system.contact)
+        saved = self.system.saved_contact()
         solution = step
         if target in self._corrected:
             self.system.anchor(step.state, self.indenter)
@@ -269,7 +269,7 @@ class Stepper:
         if solution.converged and not self.reason:
             self.states.append(self._recorded_state(solution, target))
             self._iterations = 0
-        restore_contact(self.system.contact, saved)
+        self.system.restore_contact(saved)
         self.system.forget_factor()
         self.system.residual(step.state, self.indenter)
         return solution.converged

@@ -37,6 +37,7 @@ MESH = wp.constant(KINDS["mesh"])
 MAX_PENETRATION = wp.constant(wp.float64(stepping.MAX_PENETRATION))
 MAX_DEEP_UPDATES = wp.constant(wp.float64(stepping.MAX_DEEP_UPDATES))
 DEEP_FAILURES = wp.constant(stepping.DEEP_FAILURES)
+MULTIPLIER_TOLERANCE = wp.constant(wp.float64(stepping.MULTIPLIER_TOLERANCE))
 MAX_CORRECTION_RATIO = wp.constant(wp.float64(stepping.MAX_CORRECTION_RATIO))
 MIN_TOLERANCE = wp.constant(wp.float64(1.0e-12))
 """Of a pass: somewhat more than rounding leaves."""
@@ -147,7 +148,8 @@ def finish_solve(lanes: Lanes, presses: Presses, settings: Settings):
     if correction:
         if phase == phases.SOLVED:
             lanes.done[s] = lanes.done[s] + lanes.share[s]
-            lanes.share[s] = wp.min(ONE, wp.float64(2.0) * lanes.share[s])
+            if not relaxed:
+                lanes.share[s] = wp.min(ONE, wp.float64(2.0) * lanes.share[s])
             lanes.phase[s] = phases.CORRECTING
         else:
             lanes.failures[s] = lanes.failures[s] + 1
@@ -236,6 +238,8 @@ def choose_pass(lanes: Lanes, presses: Presses, settings: Settings):
         lanes.tolerance[s] = wp.max(settings.closer * settings.tolerance, MIN_TOLERANCE)
         if lanes.done[s] + lanes.share[s] < MAX_MULTIPLIER_UPDATES:
             lanes.tolerance[s] = wp.max(settings.loose, lanes.tolerance[s])
+        if too_deep:
+            lanes.tolerance[s] = wp.max(MULTIPLIER_TOLERANCE * settings.tolerance, lanes.tolerance[s])
     lanes.iteration[s] = 0
     lanes.predicted[s] = 0
     lanes.phase[s] = phases.START
