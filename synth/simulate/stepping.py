@@ -41,8 +41,8 @@ MAX_MULTIPLIER_UPDATES = 2.0
 """Whole updates of the multipliers at a recorded state, in all. Not every contact point of a face on a curved body can
 come to rest on the surface, so that more updates make the tractions uneven."""
 FAILURES = 3
-"""Of attempts at them, after which the passes end. Updates are halved after a failure and doubled after a success:
-where a whole one upsets Newton's method a part of it does not."""
+"""Of attempts at them, after which the passes end. Updates are halved after a failure, doubled after a success and kept
+after a relaxation: where a whole one upsets Newton's method a part of it does not."""
 MAX_PENETRATION = 0.02
 """Share of the press depth (at least 0.1 mm) by which a triangle mesh may penetrate in a corrected state. Where it is
 deeper, passes go on to MAX_DEEP_UPDATES or DEEP_FAILURES, and the press ends if that does not do."""
@@ -225,9 +225,8 @@ class Stepper:
             solution = self._polished(solution, between)
         while solution.converged and self.system.deepest() > self._shallow_mm:
             deep = self.system.deepest() > self._deepest_mm
-            if done >= (MAX_DEEP_UPDATES if deep else MAX_MULTIPLIER_UPDATES):
-                break
-            if failures >= (DEEP_FAILURES if deep else FAILURES):
+            most, worst = (MAX_DEEP_UPDATES, DEEP_FAILURES) if deep else (MAX_MULTIPLIER_UPDATES, FAILURES)
+            if done >= most or failures >= worst:
                 break
             before = self.system.saved_contact()
             self.system.augment(self.indenter, share)
@@ -247,7 +246,7 @@ class Stepper:
         return solution
 
     def _polished(self, solution: Solution, limit: float) -> Solution:
-        """A solution brought to a tolerance where it is not there yet; see `converged`."""
+        """A solution brought to a tolerance where it is not there yet."""
         if not solution.converged or relative_residual(solution.residual) <= limit:
             return solution
         return self._counted(solve(self.system, solution.state, self.indenter, limit, MAX_ITERATIONS))
