@@ -22,7 +22,7 @@ from synth.errors import InputError
 from synth.mesh import PadMesh
 from synth.scene import Scene, Sphere
 from synth.scene.sampling import draw
-from synth.scene.template import load_scene
+from synth.scene.template import checked_template, load_scene
 from synth.simulate import Trajectory, simulate
 from synth.simulate.footprint import footprint
 from synth.simulate.load_path import path_of
@@ -37,50 +37,53 @@ NEAR = 0.05
 """Share by which half the spacing is to change a force at most."""
 
 
-def scene_of(indenter: str, seed: int) -> Scene:
-    """A draw of the default scene with another indenter."""
-    return draw(load_scene(DEFAULT_SCENE, [f"contact.indenter={indenter}", "motion.steps=2"]), seed, 0)
+def scene_of(case: Row) -> tuple[Scene, Path]:
+    """A draw of the default scene with an object, and the folder of its file, on which the draw does not depend."""
+    file = Path(case["file"])
+    content = load_scene(DEFAULT_SCENE, ["motion.steps=2"]).content
+    indenter = {"shape": "mesh", "file": file.name, "size_mm": SIZE_MM, "rotation_deg": "any"}
+    template = checked_template({**content, "contact": {**content["contact"], "indenter": indenter}}, file)
+    return draw(template, case["seed"], 0), file.parent
 
 
-def timed(scene: Scene, mesh: PadMesh) -> tuple[Trajectory, float]:
-    """A simulation and its seconds of processor time, which other programs on the machine do not lengthen."""
+def timed(scene: Scene, mesh: PadMesh, folder: Path) -> tuple[Trajectory, float, int]:
+    """A simulation, its seconds of processor time, which other programs do not lengthen, and its iterations."""
     started = time.process_time()
-    return simulate(scene, mesh), time.process_time() - started
+    result = simulate(scene, mesh, folder)
+    return result, time.process_time() - started, sum(state.newton_iterations for state in result.states)
 
 
 def press(case: Row) -> Row:
     """One row of the table."""
-    seed = case["seed"]
     try:
-        file = f'shape = "mesh", file = "{case["file"]}", size_mm = {SIZE_MM}, rotation_deg = "any"'
-        scene = scene_of(f"{{ {file} }}", seed)
+        scene, folder = scene_of(case)
         ball = scene.contact.model_copy(update={"indenter": BALL})
-        mesh = MeshRule.of(scene).resolution(scene).mesh
-        result, seconds = timed(scene, mesh)
+        mesh = MeshRule.of(scene).resolution(scene, folder).mesh
+        result, seconds, iterations = timed(scene, mesh, folder)
     except InputError as error:
         return {"status": "refused", "reason": str(error)}
-    depth, pressed = scene.motion.depth_mm, result.states[1:]
+    _, ball_seconds, ball_iterations = timed(scene.model_copy(update={"contact": ball}), mesh, folder)
     return {
         "status": result.status,
         "reason": result.reason,
         "seconds": round(seconds, 2),
-        "times_a_ball": round(seconds / timed(scene.model_copy(update={"contact": ball}), mesh)[1], 2),
+        "times_a_ball": round(seconds / ball_seconds, 2),
         "force_n": round(result.states[-1].force_n[2], 4),
-        "iterations": sum(state.newton_iterations for state in pressed),
-        "penetration": round(max((state.max_penetration_mm for state in pressed), default=0.0) / depth, 4),
+        "iterations": iterations,
+        "times_its_iterations": round(iterations / ball_iterations, 2),
+        "penetration": round(max(state.max_penetration_mm for state in result.states) / scene.motion.depth_mm, 4),
     }
 
 
 def force(case: Row) -> Row:
     """A row that compares the force of a press with that on a mesh of twice as many elements across the contact."""
-    file = f'shape = "mesh", file = "{case["file"]}", size_mm = {SIZE_MM}, rotation_deg = "any"'
-    drawn = scene_of(f"{{ {file} }}", case["seed"])
+    drawn, folder = scene_of(case)
     alone = drawn.motion.model_copy(update={"shear_mm": (0.0, 0.0), "twist_deg": 0.0, "steps": 1})
     scene = drawn.model_copy(update={"motion": alone})
-    coarse = MeshRule.of(scene).resolution(scene)
+    coarse = MeshRule.of(scene).resolution(scene, folder)
     gel = scene.sensor.gel
-    fine, spacing = graded_mesh(gel, footprint(path_of(scene), gel.size_mm, MARGIN), 2 * coarse.across)
-    results = [simulate(scene, mesh) for mesh in (coarse.mesh, fine)]
+    fine, spacing = graded_mesh(gel, footprint(path_of(scene, folder), gel.size_mm, MARGIN), 2 * coarse.across)
+    results = [simulate(scene, mesh, folder) for mesh in (coarse.mesh, fine)]
     if any(result.status != "complete" for result in results):
         return {"status": "incomplete"}
     forces = [result.states[-1].force_n[2] for result in results]

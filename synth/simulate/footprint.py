@@ -79,10 +79,8 @@ def _rectangle(path: LoadPath, poses: Sequence[Pose], size_mm: tuple[float, floa
         return None
     distance = Distance(body, np.array([p.centre for p in poses]), np.array([p.rotation for p in poses]))
     deepest = min(max(pose.depth_mm for pose in poses) + path.face_mm, size_mm[2])
-    lower, upper = (
-        np.array([-size_mm[0] / 2, -size_mm[1] / 2, 0.0]),
-        np.array([size_mm[0] / 2, size_mm[1] / 2, deepest]),
-    )
+    lower = np.array([-size_mm[0] / 2, -size_mm[1] / 2, 0.0])
+    upper = np.array([size_mm[0] / 2, size_mm[1] / 2, deepest])
     half = (upper - lower) / (2 * np.array(_CELLS))
     grid = np.array(list(product(*(range(n) for n in _CELLS))))
     centres = np.tile(lower + half * (2 * grid + 1), (len(poses), 1))

@@ -24,8 +24,7 @@ OBJECT_STIFFNESS = 2.0
 """A mesh's contact stiffness over that of analytic shapes of its radius: its edges and corners bear on few contact
 points."""
 OBJECT_RADIUS = 2.0
-"""A mesh's smallest radius over the smallest that the gel's mesh resolves: the distance of its contact points.
-Half of it costs twice the time and gains little."""
+"""A mesh's smallest radius over the smallest that the gel's mesh resolves: the distance of its contact points."""
 LOWERED = 0.25
 """Depth counts from the lowest point of a mesh as its file has it, although the gel's mesh makes rounding take that
 off. By this share of what it takes the body is lowered: a coarse mesh of the gel bears on edges with too much force, a
@@ -85,9 +84,7 @@ class RigidBody:
         """Factor on the contact stiffness: 1 for blunt bodies, more for those with sharp edges.
 
         Where pressure of some E meets an edge, the gel must not sink in by as much as the edge's radius: the surface
-        that it is held by, and the direction of the force, are lost there. With the stiffness of blunt bodies a block
-        of fillet 0.2 mm, 1.2 mm deep, sank in by 0.15 mm and lacked 8 % of its force; with four times that stiffness
-        by 0.05 mm, and it lacked 1.5 %.
+        that it is held by, and the direction of the force, are lost there.
         """
         factor = OBJECT_STIFFNESS if self.kind == KINDS["mesh"] else 1.0
         return float(np.clip(factor * BLUNT_MM / self.sharpest_mm, 1.0, factor * SHARPEST))

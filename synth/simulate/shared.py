@@ -16,12 +16,7 @@ from synth.mesh import Counts, Focus, PadMesh, domed, graded_box
 from synth.scene import Gel, Numerics, Scene
 from synth.simulate.footprint import footprint
 from synth.simulate.load_path import path_of
-from synth.simulate.resolution import (
-    MARGIN,
-    Resolution,
-    depth_growth,
-    predicted_error_px,
-)
+from synth.simulate.resolution import MARGIN, Resolution, depth_growth, element_size, predicted_error_px
 
 
 @dataclass(frozen=True)
@@ -76,7 +71,7 @@ def spacing_mm(gel: Gel, numerics: Numerics) -> float:
     size, cells = gel.size_mm, numerics.cells
     wide, growth = _width(size, cells), _growth(size, cells)
     high = size[2] / sum(growth**k for k in range(cells[2]))
-    return float(np.sqrt(wide * max(wide, high)))
+    return element_size(wide, high)
 
 
 def accuracy(scene: Scene, folder: Path | None = None) -> Accuracy:

@@ -15,7 +15,6 @@ import numpy as np
 
 from synth.arrays import FloatArray
 from synth.scene import Numerics
-from synth.simulate.contact_history import restore_contact, saved_contact
 from synth.simulate.distance import KINDS
 from synth.simulate.load_path import LoadPath
 from synth.simulate.newton import FORCE_FLOOR, MAX_ITERATIONS, Solution, relative_residual, solve
@@ -32,7 +31,8 @@ MAX_ITERATIONS_TO_GROW = 7
 """A step that took at most so many iterations is followed by a longer one."""
 GROWTH = 1.5
 MAX_RELAXED_STEP = 1 / 4
-"""A step that fails is relaxed (`synth.simulate.relaxation`) when it is at most this share of max_step_mm."""
+"""A step that fails is relaxed (`synth.simulate.relaxation`) when it is at most this share of max_step_mm, and a pass
+when it is at most this share of a whole update and begins deeper than MAX_PENETRATION."""
 STICK_FRICTION = 1e6
 """Coefficient of friction at which nothing slides."""
 PATH_DERIVATIVE_STEP = 1e-3
@@ -41,13 +41,12 @@ MAX_MULTIPLIER_UPDATES = 2.0
 """Whole updates of the multipliers at a recorded state, in all. Not every contact point of a face on a curved body can
 come to rest on the surface, so that more updates make the tractions uneven."""
 FAILURES = 3
-"""Of attempts at them, after which the passes end. Updates are halved after a failure and doubled after a success:
-where a whole one upsets Newton's method a part of it does not."""
+"""Of attempts at them, after which the passes end. Updates are halved after a failure, doubled after a success and kept
+after a relaxation: where a whole one upsets Newton's method a part of it does not."""
 MAX_PENETRATION = 0.02
 """Share of the press depth (at least 0.1 mm) by which a triangle mesh may penetrate in a corrected state. Where it is
-deeper, passes go on to MAX_DEEP_UPDATES or DEEP_FAILURES, and the press ends if that does not do. After FAILURES shares
-do not grow again, and all passes count as failures."""
-MAX_DEEP_UPDATES, DEEP_FAILURES = 6.0, 16
+deeper, passes go on to MAX_DEEP_UPDATES or DEEP_FAILURES, and the press ends if that does not do."""
+MAX_DEEP_UPDATES, DEEP_FAILURES = 16.0, 8
 MULTIPLIER_TOLERANCE = 20.0
 """Tolerance of states that multipliers are updated from, over the full one: two updates do not forget what they began
 with."""
@@ -226,33 +225,31 @@ class Stepper:
             solution = self._polished(solution, between)
         while solution.converged and self.system.deepest() > self._shallow_mm:
             deep = self.system.deepest() > self._deepest_mm
-            if done >= (MAX_DEEP_UPDATES if deep else MAX_MULTIPLIER_UPDATES):
+            most, worst = (MAX_DEEP_UPDATES, DEEP_FAILURES) if deep else (MAX_MULTIPLIER_UPDATES, FAILURES)
+            if done >= most or failures >= worst:
                 break
-            if failures >= (DEEP_FAILURES if deep else FAILURES):
-                break
-            before = saved_contact(self.system.contact)
+            before = self.system.saved_contact()
             self.system.augment(self.indenter, share)
-            tolerance = between if done + share < MAX_MULTIPLIER_UPDATES else self.numerics.tolerance
+            tolerance = between if deep or done + share < MAX_MULTIPLIER_UPDATES else self.numerics.tolerance
             reach = MAX_CORRECTION_RATIO * self.system.deepest()
-            better = self._solved_again(solution, tolerance, self.options.correction_iterations, reach)
+            start, limit = solution.state, self.options.correction_iterations
+            better = self._counted(solve(self.system, start, self.indenter, tolerance, limit, reach))
+            relaxed = not better.converged and deep and share <= MAX_RELAXED_STEP
+            if relaxed:
+                better = self._counted(relax(self.system, start, self.indenter, tolerance))
             if better.converged:
-                solution, done = better, done + share
-                share, failures = (min(1.0, 2 * share), failures) if failures < FAILURES else (share, failures + 1)
+                solution, done, share = better, done + share, share if relaxed else min(1.0, 2 * share)
             else:
-                restore_contact(self.system.contact, before)
+                self.system.restore_contact(before)
                 self.system.residual(solution.state, self.indenter)
                 failures, share = failures + 1, share / 2
         return solution
 
     def _polished(self, solution: Solution, limit: float) -> Solution:
-        """A solution brought to a tolerance where it is not there yet; see `converged`."""
+        """A solution brought to a tolerance where it is not there yet."""
         if not solution.converged or relative_residual(solution.residual) <= limit:
             return solution
-        return self._solved_again(solution, limit, MAX_ITERATIONS)
-
-    def _solved_again(self, solution: Solution, tolerance: float, limit: int, reach_mm: float = np.inf) -> Solution:
-        """From a solution on, its iterations counted."""
-        return self._counted(solve(self.system, solution.state, self.indenter, tolerance, limit, reach_mm))
+        return self._counted(solve(self.system, solution.state, self.indenter, limit, MAX_ITERATIONS))
 
     def _record(self, step: Solution, target: float) -> bool:
         """Record the corrected state, then put contact back to where the path goes on.
@@ -261,7 +258,7 @@ class Stepper:
             False where the corrected state does not reach the full tolerance: nothing is recorded. Nor is a state that
             is too deep, which ends the press, saying so.
         """
-        saved = saved_contact(self.system.contact)
+        saved = self.system.saved_contact()
         solution = step
         if target in self._corrected:
             self.system.anchor(step.state, self.indenter)
@@ -271,7 +268,7 @@ class Stepper:
         if solution.converged and not self.reason:
             self.states.append(self._recorded_state(solution, target))
             self._iterations = 0
-        restore_contact(self.system.contact, saved)
+        self.system.restore_contact(saved)
         self.system.forget_factor()
         self.system.residual(step.state, self.indenter)
         return solution.converged

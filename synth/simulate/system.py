@@ -27,6 +27,8 @@ from synth.simulate.tables import barrier_tables, bulk_tables, face_tables, lapl
 from synth.simulate.unknowns import Residual, Tangent, Unknowns
 from synth.surface import broken_linear_face
 
+MEMORY = ("normal", "tangent", "anchor", "anchored", "place", "gap")
+
 
 class System:
     """Kernels, arrays and sparse pattern of one pad; see the module's docstring.
@@ -199,6 +201,15 @@ class System:
         at_last = [indenter, self.gap, self.tangential, self.penalty]
         u = _on_device(state)[0]
         _launch(update_contact_history, self.gap.shape, u, self._active, self._faces, *at_last, new_only, self.contact)
+
+    def saved_contact(self) -> dict[str, np.ndarray]:
+        """Copies of what contact remembers, by their names in `ContactState`."""
+        return {name: getattr(self.contact, name).numpy().copy() for name in MEMORY}
+
+    def restore_contact(self, saved: dict[str, np.ndarray]) -> None:
+        """Put the copies back, after a corrected state that the load path does not go on from."""
+        for name, before in saved.items():
+            getattr(self.contact, name).assign(before)
 
     def deepest(self) -> float:
         """Largest penetration at the last residual, mm."""

@@ -11,7 +11,6 @@ from pads import SIZE, brick, gentle, indenters, same, scene, system
 import synth.simulate.stepping as stepping
 from synth.scene import Scene
 from synth.simulate import Trajectory, simulate
-from synth.simulate.contact_history import saved_contact
 from synth.simulate.newton import NEAR, Solution, relative_residual, solve
 from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.press import Press
@@ -68,7 +67,7 @@ class Losing:
 def memory(stepper: Stepper) -> list[np.ndarray]:
     """What the next step goes on from: the state, contact, and the place on the path."""
     places = np.array([stepper.at, stepper.next, len(stepper.states)])
-    return [stepper.state.u.copy(), stepper.state.p.copy(), *saved_contact(stepper.system.contact).values(), places]
+    return [stepper.state.u.copy(), stepper.state.p.copy(), *stepper.system.saved_contact().values(), places]
 
 
 def followed(stepper: Stepper, losing: Losing, monkeypatch: pytest.MonkeyPatch) -> tuple[Trajectory, int]:

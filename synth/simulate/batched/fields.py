@@ -81,8 +81,8 @@ def compute_trial(
     scale = wp.float64(0.0)
     if lanes.phase[s] == phases.SEARCH:
         scale = lanes.scale[s]
-        if lanes.relaxing[s] == phases.RELAXING:
-            scale = lanes.share[s]
+        if lanes.relaxing[s] == 1:
+            scale = lanes.part[s]
     count = fields.state_u.shape[1]
     if i < count:
         u = fields.iterate_u[s, i]
@@ -143,7 +143,7 @@ def _move(
     x = iterate[s, i]
     if kind == phases.TAKE_TRIAL:
         x = trial[s, i]
-    elif kind == phases.RESTORE_RECORDED:
+    elif kind == phases.RESTORE_RECORDED or kind == phases.REPEAT_RECORDED:
         x = recorded[s, i]
     elif kind == phases.RESET:
         x = state[s, i]

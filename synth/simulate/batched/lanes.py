@@ -31,12 +31,11 @@ IDLE, FRESH, FIRST, BEGIN, PREDICTOR, PREDICTOR_READY, PREDICTOR_LINEAR, START, 
 SEARCH, SOLVED, FAILED, AT_RECORD, CORRECTING, RESTORED, RECORD, ADVANCE, ENDED, ROLLED_BACK = range(10, 20)
 STEP, CORRECTION, POLISH = range(3)
 """What Newton's method is solving: a load step, a pass at a recorded state, or that state to the full tolerance."""
-RELAXING, RELAXED = 1, 2
 COMPLETE, NO_EQUILIBRIUM, NO_CONTACT, TOO_DEEP = range(4)
 """Why a trajectory ended."""
-TAKE_TRIAL, RESET, RESTORE_RECORDED, ACCEPT, ROLL_BACK = range(1, 6)
-"""Moves of a lane's fields: trial to iterate; state to iterate; recorded solution to iterate; iterate to state; the
-state before the last to state."""
+TAKE_TRIAL, RESET, RESTORE_RECORDED, REPEAT_RECORDED, ACCEPT, ROLL_BACK = range(1, 7)
+"""Moves of a lane's fields: trial to iterate; state to iterate; recorded solution to iterate, with its multipliers or
+without; iterate to state; the state before the last to state."""
 
 
 @wp.struct
@@ -56,11 +55,11 @@ class Lanes:
             det F.
         trial_norm, trial_force, trial_jacobian: of the trial; trial_moved: of a pass, farthest that a node has gone
             from the solution before it, mm; most_moved: how far it may.
-        relaxing: RELAXING while a step is relaxed (`synth.simulate.relaxation`), RELAXED when it was; viscosity: θ of
-            the relaxation, else 0; trial_error: of its step, in units of the residual before.
+        relaxing: 1 while a step or pass is relaxed (`synth.simulate.relaxation`); viscosity: θ of the relaxation, else
+            0; part: of the linear step that is tried; trial_error: its error in units of the residual before.
         trial_held_force: norm of the forces on held nodes; held_force: the least that a relaxation must leave of it.
         failures, done, share: of augmented-Lagrangian passes: those that failed, the shares of the others together, and
-            the share of the next; new_share: of the one that begins. While relaxing, share is that of a step.
+            the share of the next; new_share: of the one that begins.
         save: whether contact's memory is saved in this cycle; anchor: whether points that have come to touch are
             anchored for passes.
         deepest: penetration at the last evaluation, mm.
@@ -95,6 +94,7 @@ class Lanes:
     most_moved: wp.array(dtype=wp.float64)
     relaxing: wp.array(dtype=wp.int32)
     viscosity: wp.array(dtype=wp.float64)
+    part: wp.array(dtype=wp.float64)
     trial_error: wp.array(dtype=wp.float64)
     trial_held_force: wp.array(dtype=wp.float64)
     held_force: wp.array(dtype=wp.float64)

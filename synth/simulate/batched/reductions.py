@@ -6,7 +6,7 @@
 import warp as wp
 
 from synth.simulate.batched.fields import Fields, node_step
-from synth.simulate.batched.lanes import CORRECTION, RELAXING, Lanes
+from synth.simulate.batched.lanes import CORRECTION, Lanes
 from synth.simulate.contact import Faces, Indenters, position
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
@@ -92,10 +92,10 @@ def relaxation_errors(
     right: (B, at least rows), first -r(u) over its norm, the linear solve's right side.
     """
     s, thread = wp.tid()
-    if mask[s] == 0 or lanes.relaxing[s] != RELAXING:
+    if mask[s] == 0 or lanes.relaxing[s] == 0:
         return
     borne = wp.float64(0.0)
-    left = (wp.float64(1.0) - lanes.share[s]) * lanes.norm[s]
+    left = (wp.float64(1.0) - lanes.part[s]) * lanes.norm[s]
     total = wp.float64(0.0)
     for i in range(thread, force.shape[1], wp.block_dim()):
         row = node_row[i]

@@ -42,12 +42,12 @@ def evaluate_relaxation(lanes: Lanes, s: int, valid: bool):
     lanes.iteration[s] = lanes.iteration[s] + 1
     if error <= MAX_ERROR:
         lanes.move[s] = TAKE_TRIAL
-        lanes.share[s] = ONE
+        lanes.part[s] = ONE
     else:
         if lanes.viscosity[s] >= MOST_VISCOSITY:
-            lanes.share[s] = wp.float64(0.5) * lanes.share[s]
+            lanes.part[s] = wp.float64(0.5) * lanes.part[s]
         lanes.phase[s] = START
-        if lanes.iteration[s] >= MAX_STEPS or lanes.share[s] < LEAST_SHARE:
+        if lanes.iteration[s] >= MAX_STEPS or lanes.part[s] < LEAST_SHARE:
             lanes.phase[s] = FAILED
     if lanes.phase[s] == SEARCH and lanes.trial_held_force[s] < lanes.held_force[s]:
         lanes.phase[s] = FAILED

@@ -37,6 +37,7 @@ MESH = wp.constant(KINDS["mesh"])
 MAX_PENETRATION = wp.constant(wp.float64(stepping.MAX_PENETRATION))
 MAX_DEEP_UPDATES = wp.constant(wp.float64(stepping.MAX_DEEP_UPDATES))
 DEEP_FAILURES = wp.constant(stepping.DEEP_FAILURES)
+MULTIPLIER_TOLERANCE = wp.constant(wp.float64(stepping.MULTIPLIER_TOLERANCE))
 MAX_CORRECTION_RATIO = wp.constant(wp.float64(stepping.MAX_CORRECTION_RATIO))
 MIN_TOLERANCE = wp.constant(wp.float64(1.0e-12))
 """Of a pass: somewhat more than rounding leaves."""
@@ -72,9 +73,9 @@ def evaluate_trial(lanes: Lanes, settings: Settings):
         else:
             lanes.phase[s] = phases.FAILED
         return
-    if phase == phases.START and lanes.relaxing[s] == phases.RELAXING and lanes.iteration[s] == 0:
+    if phase == phases.START and lanes.relaxing[s] == 1 and lanes.iteration[s] == 0:
         lanes.held_force[s] = LEAST_BORNE * lanes.trial_held_force[s]
-    if phase == phases.SEARCH and lanes.relaxing[s] == phases.RELAXING:
+    if phase == phases.SEARCH and lanes.relaxing[s] == 1:
         evaluate_relaxation(lanes, s, valid)
         if lanes.phase[s] != phases.SEARCH:
             return
@@ -87,7 +88,8 @@ def evaluate_trial(lanes: Lanes, settings: Settings):
             return
         lanes.move[s] = phases.TAKE_TRIAL
         lanes.iteration[s] = lanes.iteration[s] + 1
-    too_far = lanes.stage[s] == phases.CORRECTION and lanes.trial_moved[s] > lanes.most_moved[s]
+    passes = lanes.stage[s] == phases.CORRECTION and lanes.relaxing[s] == 0
+    too_far = passes and lanes.trial_moved[s] > lanes.most_moved[s]
     lanes.norm[s] = norm
     lanes.relative[s] = relative
     lanes.jacobian[s] = lanes.trial_jacobian[s]
@@ -95,7 +97,7 @@ def evaluate_trial(lanes: Lanes, settings: Settings):
     limit = lanes.limit[s]
     spent = iteration == 2 * limit or (iteration >= limit and relative > NEAR)
     stalled = iteration >= STALL_ITERATIONS and relative >= STALLED_RESIDUAL
-    if lanes.relaxing[s] == phases.RELAXING:
+    if lanes.relaxing[s] == 1:
         spent = iteration >= MAX_STEPS
         stalled = False
     if phase == phases.RESTORED:
@@ -110,6 +112,13 @@ def evaluate_trial(lanes: Lanes, settings: Settings):
         lanes.phase[s] = phases.READY
 
 
+@wp.func
+def _is_too_deep(lanes: Lanes, presses: Presses, s: int) -> bool:
+    """Whether an object is deeper in the gel than a corrected state may leave it; at a pass, than before it."""
+    j = lanes.press[s]
+    return presses.kind[j] == MESH and lanes.deepest[s] > MAX_PENETRATION * presses.deepest[j]
+
+
 @wp.kernel
 def finish_solve(lanes: Lanes, presses: Presses, settings: Settings):
     """After Newton's method: accept, halve, or end the step; count the pass or undo it."""
@@ -119,13 +128,28 @@ def finish_solve(lanes: Lanes, presses: Presses, settings: Settings):
     if phase != phases.SOLVED and phase != phases.FAILED:
         return
     lanes.total[s] = lanes.total[s] + lanes.iteration[s]
-    if lanes.stage[s] == phases.CORRECTION:
+    correction = lanes.stage[s] == phases.CORRECTION
+    polish = lanes.stage[s] == phases.POLISH
+    relaxed = lanes.relaxing[s] == 1
+    small = lanes.target[s] - lanes.at[s] <= MAX_RELAXED_STEP * settings.longest
+    if correction:
+        small = lanes.share[s] <= MAX_RELAXED_STEP and _is_too_deep(lanes, presses, s)
+    if phase == phases.FAILED and not relaxed and not polish and small:
+        lanes.relaxing[s] = 1
+        lanes.viscosity[s] = FIRST_VISCOSITY
+        lanes.part[s] = ONE
+        lanes.iteration[s] = 0
+        lanes.predicted[s] = 0
+        lanes.move[s] = wp.where(correction, phases.REPEAT_RECORDED, phases.RESET)
+        lanes.phase[s] = phases.START
+        return
+    lanes.relaxing[s] = 0
+    lanes.viscosity[s] = ZERO
+    if correction:
         if phase == phases.SOLVED:
             lanes.done[s] = lanes.done[s] + lanes.share[s]
-            if lanes.failures[s] < FAILURES:
+            if not relaxed:
                 lanes.share[s] = wp.min(ONE, wp.float64(2.0) * lanes.share[s])
-            else:
-                lanes.failures[s] = lanes.failures[s] + 1
             lanes.phase[s] = phases.CORRECTING
         else:
             lanes.failures[s] = lanes.failures[s] + 1
@@ -133,20 +157,6 @@ def finish_solve(lanes: Lanes, presses: Presses, settings: Settings):
             lanes.move[s] = phases.RESTORE_RECORDED
             lanes.phase[s] = phases.RESTORED
         return
-    polish = lanes.stage[s] == phases.POLISH
-    step = lanes.target[s] - lanes.at[s]
-    if phase == phases.FAILED and lanes.relaxing[s] == 0 and not polish and step <= MAX_RELAXED_STEP * settings.longest:
-        lanes.relaxing[s] = phases.RELAXING
-        lanes.viscosity[s] = FIRST_VISCOSITY
-        lanes.share[s] = ONE
-        lanes.iteration[s] = 0
-        lanes.predicted[s] = 0
-        lanes.move[s] = phases.RESET
-        lanes.phase[s] = phases.START
-        return
-    lanes.viscosity[s] = ZERO
-    if lanes.relaxing[s] == phases.RELAXING:
-        lanes.relaxing[s] = phases.RELAXED
     if phase == phases.FAILED:
         lanes.step[s] = wp.float64(0.5) * (lanes.target[s] - lanes.at[s])
         lanes.has_previous[s] = 0
@@ -162,6 +172,7 @@ def finish_solve(lanes: Lanes, presses: Presses, settings: Settings):
         lanes.phase[s] = phases.RECORD
         return
     lanes.step_iterations[s] = lanes.iteration[s]
+    lanes.has_previous[s] = wp.where(relaxed, 0, settings.extrapolate)
     lanes.move[s] = phases.ACCEPT
     j = lanes.press[s]
     stop = lanes.next[s]
@@ -203,7 +214,7 @@ def choose_pass(lanes: Lanes, presses: Presses, settings: Settings):
         return
     j = lanes.press[s]
     corrected = presses.kind_of[j, lanes.next[s]] == 2
-    too_deep = presses.kind[j] == MESH and lanes.deepest[s] > MAX_PENETRATION * presses.deepest[j]
+    too_deep = _is_too_deep(lanes, presses, s)
     over = lanes.failures[s] >= FAILURES or lanes.done[s] >= MAX_MULTIPLIER_UPDATES
     if too_deep:
         over = lanes.failures[s] >= DEEP_FAILURES or lanes.done[s] >= MAX_DEEP_UPDATES
@@ -227,6 +238,8 @@ def choose_pass(lanes: Lanes, presses: Presses, settings: Settings):
         lanes.tolerance[s] = wp.max(settings.closer * settings.tolerance, MIN_TOLERANCE)
         if lanes.done[s] + lanes.share[s] < MAX_MULTIPLIER_UPDATES:
             lanes.tolerance[s] = wp.max(settings.loose, lanes.tolerance[s])
+        if too_deep:
+            lanes.tolerance[s] = wp.max(MULTIPLIER_TOLERANCE * settings.tolerance, lanes.tolerance[s])
     lanes.iteration[s] = 0
     lanes.predicted[s] = 0
     lanes.phase[s] = phases.START
@@ -265,9 +278,6 @@ def choose_target(lanes: Lanes, presses: Presses, settings: Settings):
         target = lanes.target[s]
         taken = target - lanes.at[s]
         lanes.previous[s] = lanes.at[s]
-        lanes.has_previous[s] = settings.extrapolate
-        if lanes.relaxing[s] == phases.RELAXED:
-            lanes.has_previous[s] = 0
         lanes.at[s] = target
         if target == presses.waypoints[j, lanes.next[s]]:
             lanes.next[s] = lanes.next[s] + 1
@@ -292,7 +302,6 @@ def choose_target(lanes: Lanes, presses: Presses, settings: Settings):
         lanes.stage[s] = phases.STEP
         lanes.iteration[s] = 0
         lanes.limit[s] = settings.limit
-        lanes.relaxing[s] = 0
         lanes.ratio[s] = ZERO
         lanes.predicted[s] = 0
         lanes.move[s] = phases.RESET
