@@ -22,6 +22,7 @@ from synth.scene import Light, Sensor, Vector3
 def emitters(lights: tuple[Light, ...], mi: Any) -> dict[str, Any]:
     """Mitsuba's description of all lights that shine, in the renderer's frame."""
     shapes = {}
+    black = mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}})
     for i, light in enumerate(lights):
         if light.power == 0:
             continue
@@ -35,7 +36,7 @@ def emitters(lights: tuple[Light, ...], mi: Any) -> dict[str, Any]:
         shapes[f"light{i}"] = {
             "type": "rectangle",
             "to_world": mi.ScalarTransform4f(frame.tolist()),
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
+            "bsdf": black,
             "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance.tolist()}},
         }
     return shapes
