@@ -169,21 +169,19 @@ class SeparatedLight:
         total = [mi.Float(0) for _ in range(self._channels)]
         for number, (light, shaded) in enumerate(zip(self._lights, self._shaded, strict=True)):
             asked = active & dr.gather(mi.Bool, shaded, face, active)
-            blocked = dr.if_stmt(
-                (at, normal, offset),
-                asked,
-                lambda *where: self._blocked(light, number, *where),
-                lambda *_: mi.Float(0),
-            )
-            value = light.whole(at.p, normal, offset) - blocked
+            value = light.whole(at.p, normal, offset) - self._blocked(light, number, at, normal, offset, asked)
             total = [dr.fma(value, color, sum_) for color, sum_ in zip(light.radiance, total, strict=False)]
         return total
 
-    def _blocked(self, light: PolygonLight, number: int, at: Any, normal: Any, offset: Any) -> Any:
+    def _blocked(self, light: PolygonLight, number: int, at: Any, normal: Any, offset: Any, asked: Any) -> Any:
+        """What of `_sampled` is blocked (mi.Float): computed only where it is `asked`, 0 elsewhere."""
         import drjit as dr
 
-        value, blocked = self._sampled(light, number, at, normal, offset, self._mi.Bool(True))
-        return dr.select(blocked, value, 0)
+        def sample(at: Any, normal: Any, offset: Any) -> Any:
+            value, blocked = self._sampled(light, number, at, normal, offset, self._mi.Bool(True))
+            return dr.select(blocked, value, 0)
+
+        return dr.if_stmt((at, normal, offset), asked, sample, lambda *_: self._mi.Float(0))
 
     def _sampled(self, light: PolygonLight, number: int, at: Any, normal: Any, offset: Any, active: Any) -> Any:
         """Irradiance per radiance that a point of the light gives unless its ray is blocked, and whether it is."""
