@@ -237,7 +237,7 @@ def test_a_pinhole_draws_no_point_of_a_pupil() -> None:
     rays = CameraRays(sensor, mi)
     assert not rays.has_aperture
     ray, weight, valid = rays.sample(pixel, sampler.next_2d())
-    color, seen, _ = renderer._integrator.sample(renderer._scene, sampler, ray, active=valid)
+    color, seen = renderer._light.radiance(ray, sampler, valid)
     red = np.array(dr.block_sum(dr.select(valid & seen, color[0] * weight, 0), 16)) / np.float32(16)
     assert np.array_equal(image[..., 0].ravel(), red)
     blurred = small_sensor(1.45, MANY, aperture_mm=APERTURE, focus_mm=15.0)
