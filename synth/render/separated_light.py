@@ -245,9 +245,8 @@ class SeparatedLight:
         values = self._bounces(points, sampler)
         terms = self._terms(points.at.p, points.normal)
         dr.eval(values, terms)
-        design = np.stack([np.array(term) for term in terms], axis=1).astype(np.float64)
-        right = np.stack([np.array(value) for value in values], axis=1).astype(np.float64)
-        found = np.linalg.lstsq(design.T @ design, design.T @ right, rcond=None)[0]
+        design, right = (np.array([np.array(one) for one in part], dtype=np.float64) for part in (terms, values))
+        found = np.linalg.lstsq(design @ design.T, design @ right.T, rcond=None)[0]
         # Each a variable of its own: gathered, they would take a fifth of a frame's time.
         return [[dr.opaque(self._mi.Float, float(value)) for value in column] for column in found.T]
 
