@@ -20,8 +20,9 @@ from synth.scene import Light, Sensor, Vector3
 
 
 def emitters(lights: tuple[Light, ...], mi: Any) -> dict[str, Any]:
-    """Mitsuba's description of all lights that shine, in the renderer's frame."""
+    """Mitsuba's description of all lights that shine, in the renderer's frame, for scalar variants."""
     shapes = {}
+    black = mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}})
     for i, light in enumerate(lights):
         if light.power == 0:
             continue
@@ -31,14 +32,42 @@ def emitters(lights: tuple[Light, ...], mi: Any) -> dict[str, Any]:
         # Mirroring alone would make the frame left-handed and turn the rectangle's normal: negate its first axis too.
         frame[:3] *= MIRROR[:, None]
         frame[:3, 0] *= -1
-        radiance = light.power / (np.pi * light.size_mm[0] * light.size_mm[1]) * np.array(light.color)
         shapes[f"light{i}"] = {
             "type": "rectangle",
             "to_world": mi.ScalarTransform4f(frame.tolist()),
-            "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}},
-            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance.tolist()}},
+            "bsdf": black,
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance(light).tolist()}},
         }
     return shapes
+
+
+def panels(lights: tuple[Light, ...], mi: Any) -> Any:
+    """One mesh of rectangles, two triangles each, for vectorised variants: black, as Mitsuba knows no light in it."""
+    corner, first, second, _ = rectangles(lights).swapaxes(0, 1)
+    vertices = np.stack([corner, corner + first, corner + first + second, corner + second], axis=1)
+    faces = np.array([[0, 1, 2], [0, 2, 3]]) + 4 * np.arange(len(lights))[:, None, None]
+    shape = mi.Mesh("lights", 4 * len(lights), 2 * len(lights))
+    parameters = mi.traverse(shape)
+    parameters["faces"] = faces.ravel().astype(np.uint32)
+    parameters["vertex_positions"] = vertices.ravel().astype(np.float32)
+    parameters.update()
+    return shape
+
+
+def rectangles(lights: tuple[Light, ...]) -> FloatArray:
+    """(n, 4, 3) of each light a corner, its two sides and its direction (unit), in the renderer's frame."""
+    found = np.empty((len(lights), 4, 3))
+    for light, (corner, *sides, direction) in zip(lights, found, strict=True):
+        *axes, direction[:] = light_axes(light)
+        for side, axis, size in zip(sides, axes, light.size_mm, strict=True):
+            side[:] = size * axis
+        corner[:] = np.array(light.position_mm) - sides[0] / 2 - sides[1] / 2
+    return found * MIRROR
+
+
+def radiance(light: Light) -> FloatArray:
+    """(3,) emitted to the light's front."""
+    return np.asarray(light.power / (np.pi * light.size_mm[0] * light.size_mm[1]) * np.array(light.color))
 
 
 def light_axes(light: Light) -> FloatArray:

@@ -18,7 +18,7 @@ from numpy.polynomial import Chebyshev, Polynomial
 
 from synth.arrays import FloatArray
 from synth.render.gel_mesh import MIRROR
-from synth.render.lights import light_axes
+from synth.render.lights import light_axes, radiance
 from synth.render.window_images import reflectance
 from synth.scene import Light
 
@@ -50,8 +50,7 @@ class PolygonLight:
         self._corner, self._sides = self._corners[0], (vector(first), vector(second))
         self._front = vector(direction)
         self._area = dr.opaque(mi.Float, width * height)
-        radiance = light.power / (np.pi * width * height) * np.array(light.color)
-        self.radiance = [dr.opaque(mi.Float, float(value)) for value in radiance]
+        self.radiance = [dr.opaque(mi.Float, float(value)) for value in radiance(light)]
 
     def whole(self, point: Any, normal: Any, offset: Any) -> Any:
         """Irradiance per radiance (mi.Float) of surface points with unit normals where nothing stands in between.

@@ -22,18 +22,19 @@ from synth.render.camera_rays import CameraRays, pinhole
 from synth.render.chart import Chart, chart_of
 from synth.render.coating import reflection
 from synth.render.gel_mesh import GelMesh
-from synth.render.lights import check_view, emitters
+from synth.render.lights import check_view, emitters, panels
+from synth.render.path_tracer import PathTracer
 from synth.render.pattern import is_grey
 from synth.render.sample_count import PILOT, needed_samples
 from synth.render.separated_light import SeparatedLight, is_separated
 from synth.render.thin_lens import ThinLens
 from synth.render.variant import Variant
-from synth.render.window_images import image_lights, pane, reflecting_plane
+from synth.render.window_images import all_lights, reflecting_plane
 from synth.scene import Render, Sensor
 from synth.surface import GelSurface
 
-_MAX_WAVEFRONT = 2**22
-"""Samples traced at once. A constant, because the split into passes decides the random numbers."""
+_MAX_WAVEFRONT, _MAX_WAVEFRONT_GPU = 2**22, 2**24
+"""Samples traced at once. Constants, because the split into passes decides the random numbers."""
 
 _PILOT_SEEDS = (1, 2)
 
@@ -70,26 +71,27 @@ class Renderer:
         check_view(sensor)
         refracts = sensor.window.refractive_index != 1
         self._behind = reflecting_plane(sensor) if variant.is_vectorised else None
-        lights = sensor.lights if self._behind is None else (*sensor.lights, *image_lights(sensor))
+        lights = all_lights(sensor) if variant.is_vectorised else sensor.lights
         self._lit = 1 if separated else sum(light.power > 0 for light in lights)
         self._set_meshes(surface, chart_of(sensor))
         bsdf = reflection(mi, sensor.coating, albedo, variant.is_mono)
-        gels = {name: _gel(name, mesh, bsdf, mi) for name, mesh in self._meshes.items()}
-        contents = {"type": "scene", **gels, **emitters(lights, mi)}
-        if refracts and not variant.is_vectorised:
-            contents["window"] = _window(sensor, mi)
-        elif self._behind is not None and not separated:
-            contents["window"] = pane(sensor, mi)
-        self._scene = mi.load_dict(contents, optimize=False)
-        self._parameters = mi.traverse(self._scene)
+        shapes = {name: _gel(name, mesh, bsdf, mi) for name, mesh in self._meshes.items()}
         if variant.is_vectorised:
-            self._share_kernels()
-        shared = (self._scene, gels, self._parameters, render.max_depth, variant.is_mono, mi)
-        self._light = SeparatedLight(sensor, *shared) if separated else None
-        # A path through Mitsuba's window is one interaction longer than one that starts inside.
-        depth = render.max_depth + (1 if not variant.is_vectorised and refracts else 0)
-        kind = "path" if self._behind is None else "volpath"  # the latter sees lights through the pane
-        self._integrator = mi.load_dict({"type": kind, "max_depth": depth, "hide_emitters": True})
+            shapes["lights"] = panels(lights, mi)
+            contents = shapes
+        else:
+            contents = shapes | emitters(lights, mi) | ({"window": _window(sensor, mi)} if refracts else {})
+        self._scene = mi.load_dict({"type": "scene", **contents}, optimize=False)
+        self._parameters = mi.traverse(self._scene)
+        self._light: Any = None
+        if separated:
+            shared = (self._scene, shapes, self._parameters, render.max_depth, variant.is_mono, mi)
+            self._light = SeparatedLight(sensor, *shared)
+        elif variant.is_vectorised:
+            self._light = PathTracer(sensor, self._scene, shapes, render.max_depth, mi)
+        else:  # a path through Mitsuba's window is one interaction longer than one that starts inside
+            depth = render.max_depth + refracts
+            self._integrator = mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": True})
         if variant.is_vectorised:
             self._rays = {name: CameraRays(view, mi) for name, view in self._views.items()}
         wanted = render.samples_per_pixel
@@ -173,26 +175,16 @@ class Renderer:
         for name, mesh in self._meshes.items():
             self._parameters[f"{name}.vertex_normals"] = mesh.normals(positions)
         self._parameters.update()
-        if self._light is not None:
+        if isinstance(self._light, SeparatedLight):
             camera = self._views[""].camera
             primary = camera.width * camera.height * self._samples
             self._light.prepare(self._meshes["gel"], primary, _mitsuba_seed(seed, _LIGHT_PART, 0))
-
-    def _share_kernels(self) -> None:
-        """Keep the lights' places out of the compiled code, so that another draw of the sensor needs no compiler."""
-        import drjit as dr
-
-        for key in [key for key in self._parameters.keys() if key.endswith(".to_world")]:  # noqa: SIM118
-            transform = self._parameters[key]
-            dr.make_opaque(transform)
-            self._parameters[key] = transform
-        self._parameters.update()
 
     def _trace(self, mi: Any, name: str, seed: int, number: int) -> Image:
         """All pixels in passes of whole pixels, each pixel's samples one after another in the wavefront."""
         camera, samples = self._views[name].camera, self._samples
         pixels = camera.width * camera.height
-        step = max(1, _MAX_WAVEFRONT // samples)
+        step = max(1, (_MAX_WAVEFRONT_GPU if self._variant.is_on_gpu else _MAX_WAVEFRONT) // samples)
         parts = [
             self._trace_pixels(mi, self._rays[name], first, min(step, pixels - first), _mitsuba_seed(seed, k, number))
             for k, first in enumerate(range(0, pixels, step))
@@ -215,10 +207,7 @@ class Renderer:
         offset = sampler.next_2d()
         pupil = sampler.next_2d() if rays.has_aperture else None
         ray, weight, valid = rays.sample(pixel, offset, pupil)
-        if self._light is not None:
-            color, seen = self._light.radiance(ray, sampler, valid)
-        else:
-            color, seen, _ = self._integrator.sample(self._scene, sampler, ray, active=valid)
+        color, seen = self._light.radiance(ray, sampler, valid)
         channels = [dr.select(valid & seen, color[i] * weight, 0) for i in range(1 if self._variant.is_mono else 3)]
         dr.eval(channels)  # all at once: each sum alone would trace everything anew
         return [dr.block_sum(channel, self._samples) for channel in channels]

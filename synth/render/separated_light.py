@@ -50,11 +50,11 @@ _STEP = 4
 """Bounced rays of a face are squares of its multiples: a sampler's size is compiled into the kernel."""
 _DEGREE = 4
 """Of the polynomials for light that comes back from the window: its path is longer than the pad is thick, so smooth."""
-_RETURNED = 2**17
+_RETURNED = 2**15
 """Paths by the window, to which they are fitted; more where there are many faces."""
 _CLEARANCE_MM = 1e-3
 """Above the gel, where rays to it may end: far more than rounding."""
-_NEGLIGIBLE = 1e-4
+_NEGLIGIBLE = 1e-3
 """Of all light on a point: shadows of so little are not sampled."""
 _SHIFT = (0.7548776662466927, 0.5698402909980532)
 """Of one light's shadow rays against the one before's: R2 sequence (Roberts 2018), on a torus to keep the strata."""
@@ -157,9 +157,7 @@ class SeparatedLight:
         if self._returned is not None:
             terms = self._terms(at.p, normal)
             for channel, values in enumerate(self._returned):
-                light[channel] += dr.maximum(
-                    sum(dr.gather(mi.Float, values, k) * term for k, term in enumerate(terms)), 0
-                )
+                light[channel] += dr.maximum(sum(a * b for a, b in zip(values, terms, strict=True)), 0)
         albedo = self._albedo(at, seen)
         return [dr.select(seen, a * e / dr.pi, 0) for a, e in zip(albedo, light, strict=True)], seen
 
@@ -171,10 +169,19 @@ class SeparatedLight:
         total = [mi.Float(0) for _ in range(self._channels)]
         for number, (light, shaded) in enumerate(zip(self._lights, self._shaded, strict=True)):
             asked = active & dr.gather(mi.Bool, shaded, face, active)
-            sampled, blocked = self._sampled(light, number, at, normal, offset, asked)
-            value = light.whole(at.p, normal, offset) - dr.select(blocked, sampled, 0)
+            value = light.whole(at.p, normal, offset) - self._blocked(light, number, at, normal, offset, asked)
             total = [dr.fma(value, color, sum_) for color, sum_ in zip(light.radiance, total, strict=False)]
         return total
+
+    def _blocked(self, light: PolygonLight, number: int, at: Any, normal: Any, offset: Any, asked: Any) -> Any:
+        """What of `_sampled` is blocked (mi.Float): computed only where it is `asked`, 0 elsewhere."""
+        import drjit as dr
+
+        def sample(at: Any, normal: Any, offset: Any) -> Any:
+            value, blocked = self._sampled(light, number, at, normal, offset, self._mi.Bool(True))
+            return dr.select(blocked, value, 0)
+
+        return dr.if_stmt((at, normal, offset), asked, sample, lambda *_: self._mi.Float(0))
 
     def _sampled(self, light: PolygonLight, number: int, at: Any, normal: Any, offset: Any, active: Any) -> Any:
         """Irradiance per radiance that a point of the light gives unless its ray is blocked, and whether it is."""
@@ -238,10 +245,10 @@ class SeparatedLight:
         values = self._bounces(points, sampler)
         terms = self._terms(points.at.p, points.normal)
         dr.eval(values, terms)
-        design = np.stack([np.array(term) for term in terms], axis=1).astype(np.float64)
-        right = np.stack([np.array(value) for value in values], axis=1).astype(np.float64)
-        found = np.linalg.lstsq(design.T @ design, design.T @ right, rcond=None)[0]
-        return [self._mi.Float(np.ascontiguousarray(column, dtype=np.float32)) for column in found.T]
+        design, right = (np.array([np.array(one) for one in part], dtype=np.float64) for part in (terms, values))
+        found = np.linalg.lstsq(design @ design.T, design @ right.T, rcond=None)[0]
+        # Each a variable of its own: gathered, they would take a fifth of a frame's time.
+        return [[dr.opaque(self._mi.Float, float(value)) for value in column] for column in found.T]
 
     def _terms(self, point: Any, normal: Any) -> list[Any]:
         """Monomials of the place on the pad up to a degree, times each component of the normal."""

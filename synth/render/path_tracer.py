@@ -1,0 +1,132 @@
+r"""Path tracing of the gel under its lights, for vectorised variants.
+
+At every point of a path light is sampled in two ways: from one of the rectangles, chosen evenly, and from wherever the
+path goes on to. Both are weighted by the power heuristic (Veach, Robust Monte Carlo Methods, 1997, § 9.2). Lights are
+numbers in tables and not Mitsuba's emitters, whose virtual functions Dr.Jit would record one by one in every pass.
+
+Paths that the window reflects go on in the space behind it (`synth.render.window_images`). A path that meets the mirror
+image of the gel is mirrored back onto the gel there, so that each of its rays starts in front of the window.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from synth.render.lights import radiance, rectangles
+from synth.render.window_images import all_lights, reflectance, reflecting_plane
+from synth.scene import Sensor
+
+
+class PathTracer:
+    """Light on one renderer's gel.
+
+    Args:
+        sensor: its lights and window are used.
+        scene: Mitsuba's.
+        shapes: in it: "gel", "lights", and "image" where the window reflects.
+        max_depth: longest path in surfaces and lights.
+        mi: the Mitsuba module.
+    """
+
+    def __init__(self, sensor: Sensor, scene: Any, shapes: dict[str, Any], max_depth: int, mi: Any) -> None:
+        import drjit as dr
+
+        self._mi, self._scene = mi, scene
+        self._reflection, self._lights, self._image = shapes["gel"].bsdf(), shapes["lights"], shapes.get("image")
+        self._face = dr.opaque(mi.Float, reflecting_plane(sensor) or 0)
+        self._index, self._depth = dr.opaque(mi.Float, sensor.window.refractive_index), dr.opaque(mi.UInt32, max_depth)
+        lights = all_lights(sensor)
+        self._count = dr.opaque(mi.UInt32, len(lights))
+        self._before = dr.opaque(mi.UInt32, len(lights) // (2 if self._image else 1))  # images come last
+        self._places = [mi.Float(column.ravel()) for column in rectangles(lights).astype(np.float32).swapaxes(0, 1)]
+        self._areas = mi.Float([light.size_mm[0] * light.size_mm[1] for light in lights])
+        given = np.array([radiance(light)[: len(mi.Spectrum(0))] for light in lights], dtype=np.float32)
+        self._radiance = mi.Float(given.ravel())
+
+    def radiance(self, ray: Any, sampler: Any, active: Any) -> tuple[Any, Any]:
+        """Radiance (mi.Spectrum) along rays from the camera, and whether they meet the gel (mi.Bool)."""
+        import drjit as dr
+
+        mi = self._mi
+        start = (
+            mi.Ray3f(ray),
+            sampler,
+            mi.Spectrum(1),
+            mi.Spectrum(0),
+            mi.UInt32(0),
+            mi.Float(0),
+            active,
+            mi.Bool(False),
+        )
+        _, _, _, total, _, _, _, seen = dr.while_loop(start, lambda *state: state[6], self._step)
+        return total, seen
+
+    def _step(
+        self, ray: Any, sampler: Any, share: Any, total: Any, depth: Any, density: Any, active: Any, seen: Any
+    ) -> tuple[Any, ...]:
+        """Follow rays to what they meet, add the light there, and send them on.
+
+        The camera gets `share` of the light that comes along a ray, whose direction was drawn with the `density` per
+        solid angle.
+        """
+        import drjit as dr
+
+        mi = self._mi
+        context = mi.BSDFContext()
+        hit = self._scene.ray_intersect_preliminary(ray, active=active)
+        met = active & hit.is_valid()
+        shines = met & (hit.shape == mi.ShapePtr(self._lights))
+        given, chance = self._towards(hit.prim_index // 2, ray.d, dr.square(hit.t), shines & (depth > 0))
+        total = total + share * given * _weight(density, chance)
+        goes = met & ~shines
+        mirrored = goes & (hit.shape == mi.ShapePtr(self._image)) if self._image else mi.Bool(False)
+        at = hit.compute_surface_interaction(ray, mi.RayFlags.All, goes)
+        at.p.z = dr.select(mirrored, 2 * self._face - at.p.z, at.p.z)
+        for axis in (at.n, at.sh_frame.s, at.sh_frame.t, at.sh_frame.n):
+            axis.z = dr.select(mirrored, -axis.z, axis.z)
+        share = share * dr.select(mirrored, reflectance(dr.abs(ray.d.z), self._index, mi), 1)
+        seen = seen | (goes & (depth == 0))
+        goes &= depth + 1 < self._depth
+
+        offset = sampler.next_2d(goes)
+        chosen = offset.x * mi.Float(self._count)
+        number = dr.minimum(mi.UInt32(chosen), self._count - 1)
+        corner, first, second = (dr.gather(mi.Vector3f, self._places[k], number, goes) for k in range(3))
+        place = mi.Point3f(corner + first * (chosen - mi.Float(number)) + second * offset.y)
+        arm = place - at.p
+        square = dr.squared_norm(arm)
+        arm *= dr.rsqrt(square)
+        given, chance = self._towards(number, arm, square, goes)
+        lit = goes & (chance > 0)
+        reflected, density = self._reflection.eval_pdf(context, at, at.to_local(arm), lit)
+        lit &= ~self._scene.ray_test(at.spawn_ray_to(place), lit)
+        total = total + dr.select(lit, share * reflected * given * (_weight(chance, density) / chance), 0)
+
+        onward, kept = self._reflection.sample(context, at, sampler.next_1d(goes), sampler.next_2d(goes), goes)
+        share = share * kept
+        goes &= dr.any(share != 0)
+        ray = at.spawn_ray(at.to_world(onward.wo))
+        return ray, sampler, share, total, depth + 1, onward.pdf, goes, seen
+
+    def _towards(self, number: Any, direction: Any, square: Any, active: Any) -> tuple[Any, Any]:
+        """Radiance of lights along unit directions to them; the density per solid angle with which these are chosen.
+
+        `square` is the squared distance. Both are 0 for a light's back.
+        """
+        import drjit as dr
+
+        mi = self._mi
+        front = -dr.dot(direction, dr.gather(mi.Vector3f, self._places[3], number, active))
+        active = active & (front > 0)
+        area = dr.gather(mi.Float, self._areas, number, active)
+        given = dr.gather(mi.Spectrum, self._radiance, number, active)
+        kept = dr.select(number < self._before, 1, reflectance(dr.abs(direction.z), self._index, mi))
+        density = dr.select(active, square / (front * area * mi.Float(self._count)), 0)
+        return dr.select(active, given * kept, 0), density
+
+
+def _weight(own: Any, other: Any) -> Any:
+    """The power heuristic's weight of what was drawn with the density `own`; 0 where both are."""
+    import drjit as dr
+
+    return dr.select(own > 0, dr.square(own) / (dr.square(own) + dr.square(other)), 0)
