@@ -24,11 +24,13 @@ import numpy as np
 from synth.arrays import BoolArray, FloatArray
 from synth.calibrate.irradiance import FlatGel, LightGeometry
 
-CENTRE_MM, DIRECTION, LOG_SIZE, VIGNETTING = 2.0, 0.4, 0.5, 0.3
-"""Standard deviations of the prior: of a light's place, of its unit direction, of the logarithm of its sizes, and of
-the vignetting."""
+CENTRE_MM, DIRECTION, LOG_SIZE, LOG_ANGLE, VIGNETTING = 2.0, 0.4, 0.5, 0.4, 0.3
+"""Standard deviations of the prior: of a light's place, of its unit direction, of the logarithms of its sizes and of
+its viewing angle, and of the vignetting."""
+_SCALE = np.repeat([CENTRE_MM, DIRECTION, LOG_SIZE, LOG_ANGLE], [3, 3, 2, 1])
 _SIZES = 1.5
 """Bound of the sizes' displacements: by a factor of 2.1 either way."""
+_NARROWEST_DEG, _WIDEST_DEG = 10.0, 120.0
 RESIDUAL = 1 / 255
 """Standard deviation of what the model may leave, encoded."""
 INDEPENDENT = 300.0
@@ -125,24 +127,26 @@ class _Problem:
         self._gel, self._target, self._shines, self._vignetting = gel, target, shines, vignetting
         self._cached: tuple[FloatArray, tuple[FloatArray, FloatArray, LightGeometry]] | None = None
         self._lights = len(start.centre)
-        self.size = 8 * self._lights + 1
+        self._scale = _SCALE * np.ones((self._lights, 1))
+        self._scale[start.viewing_angle_deg[:, 0] == _WIDEST_DEG, 8] = 0  # Lambertian lights stay so
+        self.size = 9 * self._lights + 1
         self._factor = float(np.sqrt(INDEPENDENT / target.signal.size)) / RESIDUAL
 
     def geometry(self, theta: FloatArray) -> LightGeometry:
-        m = self._lights
-        centre, direction, size = (part.reshape(m, -1) for part in np.split(theta[:-1], [3 * m, 6 * m]))
-        return LightGeometry(
-            self._start.centre + CENTRE_MM * centre,
-            self._start.direction + DIRECTION * direction,
-            self._start.size * np.exp(LOG_SIZE * size),
-        )
+        centre, direction, size, angle = np.split(theta[:-1].reshape(-1, 9) * self._scale, [3, 6, 8], axis=1)
+        start = self._start
+        angles = start.viewing_angle_deg * np.exp(angle)
+        return LightGeometry(start.centre + centre, start.direction + direction, start.size * np.exp(size), angles)
 
     def box(self, bounds: Bounds) -> tuple[FloatArray, FloatArray]:
-        wide = np.concatenate([np.full(3 * self._lights, 4.0), np.full(2 * self._lights, _SIZES)])
-        low = (bounds.low - self._start.centre) / CENTRE_MM
-        high = (bounds.high - self._start.centre) / CENTRE_MM
-        dark = ((0 - self._vignetting) / VIGNETTING, (0.9 - self._vignetting) / VIGNETTING)
-        return np.r_[low.ravel(), -wide, dark[0]], np.r_[high.ravel(), wide, dark[1]]
+        low, high = np.full((self._lights, 9), -4.0), np.full((self._lights, 9), 4.0)
+        low[:, 6:8], high[:, 6:8] = -_SIZES, _SIZES
+        low[:, 8], high[:, 8] = 0, 1 * (self._scale[:, 8] == 0)  # room where it has no effect: steps end at bounds
+        for box, centre, angle in ((low, bounds.low, _NARROWEST_DEG), (high, bounds.high, _WIDEST_DEG)):
+            box[:, :3] = (centre - self._start.centre) / CENTRE_MM
+            box[:, 8:] += np.log(angle / self._start.viewing_angle_deg) / LOG_ANGLE
+        dark = (np.array([0, 0.9]) - self._vignetting) / VIGNETTING
+        return np.r_[low.ravel(), dark[0]], np.r_[high.ravel(), dark[1]]
 
     def residual(self, theta: FloatArray) -> FloatArray:
         """(3 n + len(theta),): weighted misfit by channel, and the prior."""
@@ -156,15 +160,16 @@ class _Problem:
         weight = self._factor * self._target.slope
         vignette = self._vignette(theta)[None, None, :, None]
         change = self._gel.derivatives(geometry) * (self._target.gain * vignette)
-        change[:, :3] *= CENTRE_MM
-        change[:, 3:6] *= DIRECTION
-        change[:, 6:] *= LOG_SIZE * geometry.size[:, :, None, None]
+        logarithmic = np.c_[np.ones((self._lights, 6)), geometry.size, geometry.viewing_angle_deg]
+        change *= (self._scale * logarithmic)[:, :, None, None]
         radiance = np.einsum("mpc,mc->pc", basis, powers) / self._vignette(theta)[:, None]
         corner = -VIGNETTING * self._target.corner[:, None] * radiance
         blocks = []
         for channel in range(3):
             moved = change[..., channel] * powers[:, None, None, channel]
-            columns = np.column_stack([_by_number(moved), corner[:, channel]]) * weight[:, channel, None]
+            columns = (
+                np.column_stack([moved.reshape(self.size - 1, -1).T, corner[:, channel]]) * weight[:, channel, None]
+            )
             lit = powers[:, channel] > 0
             if lit.any():
                 span = np.linalg.qr((basis[lit, :, channel] * weight[:, channel]).T)[0]
@@ -193,12 +198,6 @@ class _Problem:
 
     def _vignette(self, theta: FloatArray) -> FloatArray:
         return 1 - self._loss(theta) * self._target.corner
-
-
-def _by_number(change: FloatArray) -> FloatArray:
-    """(n, 8 m) in the order of theta, from (m, 8, n)."""
-    parts = (change[:, :3], change[:, 3:6], change[:, 6:])
-    return np.concatenate([part.reshape(-1, change.shape[2]) for part in parts]).T
 
 
 def fit_powers(basis: FloatArray, target: Target, shines: BoolArray) -> tuple[FloatArray, FloatArray]:

@@ -89,6 +89,7 @@ def _lights(fit: SensorFit, start: Sensor) -> list[dict[str, Any]]:
                 "position_mm": np.round(fit.lights.geometry.centre[i], 4).tolist(),
                 "moved_mm": round(float(np.linalg.norm(moved)), 3),
                 "size_mm": np.round(fit.lights.geometry.size[i], 4).tolist(),
+                "viewing_angle_deg": round(float(fit.lights.geometry.viewing_angle_deg[i, 0]), 2),
             }
         )
     return found

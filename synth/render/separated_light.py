@@ -14,7 +14,8 @@ A Lambertian surface's radiance is its albedo ρ times its irradiance E over π,
   faces and projected (L²) onto functions that are linear on each face, or constant where few of the face's pilots saw
   gel: such faces get little, and its mean is less noisy than its slope. Where no pilot at all saw gel there is none.
   In a round gel, all of which sees itself, it is smooth and is fitted (`synth.render.cavity_light`).
-- The lights l include their mirror images behind the window (`synth.render.window_images`), which have no closed form.
+- The lights l include their mirror images behind the window (`synth.render.window_images`). These and lights narrower
+  than Lambertian have no closed form.
 - E_returned, light that the gel sends to the window and gets back, is smooth. It is n · V with the normal n, and V is
   fitted to sampled paths as polynomials of the place on the pad.
 
@@ -37,7 +38,7 @@ from synth.errors import InputError
 from synth.render.cavity_light import across_cavity
 from synth.render.gel_mesh import GelMesh
 from synth.render.lights import reaches
-from synth.render.polygon_light import ImageLight, PolygonLight
+from synth.render.polygon_light import PolygonLight, SampledLight
 from synth.render.variant import Variant
 from synth.render.window_images import image_lights, reflectance, reflecting_plane
 from synth.scene import Coating, Render, Sensor
@@ -113,8 +114,12 @@ class SeparatedLight:
         # Used only where the window reflects.
         self._face, self._index = dr.opaque(mi.Float, reflecting_plane(sensor) or 0), dr.opaque(mi.Float, index)
         size = sensor.gel.size_mm
-        self._lights = [PolygonLight(light, mi) for light in sensor.lights if reaches(light, size)]
-        self._lights += [ImageLight(light, index, mi) for light in image_lights(sensor) if reaches(light, size)]
+        self._lights = [
+            SampledLight(light, None, mi) if light.narrowness else PolygonLight(light, mi)
+            for light in sensor.lights
+            if reaches(light, size)
+        ]
+        self._lights += [SampledLight(light, index, mi) for light in image_lights(sensor) if reaches(light, size)]
         self._half = [dr.opaque(mi.Float, side / 2) for side in size[:2]]
 
     def prepare(self, mesh: GelMesh, primary: int, seed: int) -> None:

@@ -3,6 +3,7 @@
 import json
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -131,11 +132,12 @@ def test_a_known_spacing_gives_the_focal_length() -> None:
 
 
 @needs_llvm
+@pytest.mark.parametrize("angle", [120.0, 50.0])
 @pytest.mark.parametrize("coating", [{}, {"roughness": 0.5, "metallic": 0.6}], ids=["matt", "metallic"])
-def test_contributions_are_what_the_renderer_renders(coating: dict[str, float]) -> None:
+def test_contributions_are_what_the_renderer_renders(coating: dict[str, float], angle: float) -> None:
     """They share Mitsuba's BSDF and the rays, not the integral."""
     sensor = _start(**coating)
-    light = sensor.lights[1].model_copy(update={"power": 200.0, "size_mm": (3.0, 0.5)})
+    light = sensor.lights[1].model_copy(update={"power": 200.0, "size_mm": (3.0, 0.5), "viewing_angle_deg": angle})
     dark = light.model_copy(update={"position_mm": (-3.0, 4.8, 2.2), "size_mm": (3.0, 0.6), "power": 1e-9})
     sensor = sensor.model_copy(update={"lights": (light, dark)})  # the second shades a part of what the first lights
     surface = flat_surface(sensor.gel.size_mm)
@@ -144,7 +146,7 @@ def test_contributions_are_what_the_renderer_renders(coating: dict[str, float]) 
     image = Renderer(sensor, render, surface, plain, FAST).radiance(surface.material, 0)
     columns, rows = (axis.ravel() for axis in np.meshgrid(np.arange(2, 160, 8), np.arange(2, 120, 8)))
     gel = FlatGel(sensor, np.column_stack([columns, rows]) + 0.5, FAST)
-    lit = 200 * gel.contributions(_geometry(sensor))[0]
+    lit = 200 * gel.contributions(LightGeometry.of(sensor.lights))[0]
     # Half of 256 samples, stratified, leave some 1 % at a pixel and 0.1 % in the mean over 300 pixels. The shade, 20 %
     # of the light, has an edge that the light's 24 cells resolve in steps of 4 %: below 1 % of the mean remains.
     assert lit.mean(axis=0) == pytest.approx(image[rows, columns].mean(axis=0), rel=0.012)
@@ -157,27 +159,22 @@ def test_derivatives_agree_with_finite_differences(index: float) -> None:
     start = _start()
     sensor = start.model_copy(update={"window": start.window.model_copy(update={"refractive_index": index})})
     columns, rows = (axis.ravel() for axis in np.meshgrid(np.arange(2, 160, 16), np.arange(2, 120, 16)))
-    gel, geometry = FlatGel(sensor, np.column_stack([columns, rows]) + 0.5, FAST), _geometry(sensor)
+    gel, geometry = FlatGel(sensor, np.column_stack([columns, rows]) + 0.5, FAST), LightGeometry.of(sensor.lights)
+    geometry = replace(geometry, viewing_angle_deg=np.array([[119.0], [60.0], [30.0]]))
     exact = gel.derivatives(geometry)
     step = 0.02
-    for number in range(8):
-        name, axis = [("centre", number), ("direction", number - 3), ("size", number - 6)][(number > 2) + (number > 5)]
+    parts = (("centre", 3), ("direction", 3), ("size", 2), ("viewing_angle_deg", 1))
+    for number, (name, axis) in enumerate((name, axis) for name, count in parts for axis in range(count)):
         lit = []
         for sign in (1, -1):
             moved = getattr(geometry, name).copy()
             moved[:, axis] += sign * step
-            lit.append(gel.contributions(LightGeometry(**{**vars(geometry), name: moved})))
+            lit.append(gel.contributions(replace(geometry, **{name: moved})))
         difference = (lit[0] - lit[1]) / (2 * step)
         # Central differences err by step² / 6 times a third derivative of order E / (3 mm)³: 2e-5; float32 less.
         error = np.abs(exact[:, number] - difference) / np.abs(exact).max()
         # A window's reflectance rises with infinite slope at the critical angle, in one or two of a light's 24 cells.
         assert (error if index == 1 else np.percentile(error, 80)).max() < 3e-3
-
-
-def _geometry(sensor: Sensor) -> LightGeometry:
-    centre = np.array([light.position_mm for light in sensor.lights])
-    aim, size = ([getattr(light, name) for light in sensor.lights] for name in ("aim_mm", "size_mm"))
-    return LightGeometry(centre, np.array(aim) - centre, np.array(size))
 
 
 @needs_llvm
