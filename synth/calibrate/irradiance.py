@@ -9,9 +9,13 @@ each light's rectangle and nothing else. For a light of power 1 and colour white
 with the coating's BSDF f (Mitsuba's), θ at the face and θ' at the light, which is Lambertian for k = 0. The midpoint
 rule on a grid over the rectangle evaluates it: no noise, and the same radiometry as the renderer's, with the shade that
 one light throws on another. The light's mirror image behind the window adds its own integral
-(`synth.render.window_images`), without shade; what the gel itself sends to the window and gets back is left out. Dr.Jit
-differentiates both with respect to the lights' centres, directions, sizes and viewing angles, the shade held. Mitsuba's
-path integrators would as well, with Monte Carlo noise in every step and for paths that an undeformed face has not.
+(`synth.render.window_images`), without shade. A matt gel lights itself once by way of the window, as if by its mirror
+image: with the radiance L of patches of area A, their reflectance ρ, and the image at the height 2 Z,
+
+.. math::  L_{returned}(x) = \frac{ρ}{\pi} \sum_{y} A L(y) R(\theta) \frac{(2 Z)^2}{|x - y'|^4} .
+
+Dr.Jit differentiates all of it with respect to the lights' centres, directions, sizes and viewing angles, the shade
+held. Mitsuba's path integrators would as well, with noise in every step and for paths that an undeformed face has not.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,6 +36,8 @@ _CELLS = 24
 """Midpoints on each light; its longer side gets more of them."""
 _ALONG = np.array([2, 3, 4, 6, 8, 12, 24], dtype=np.uint32)
 """How many of them may be along its first side."""
+_PATCHES = 16
+"""Along each side of the pad, of which light comes back by the window: smooth over the height of the image."""
 
 _NUMBERS = (*((part, axis) for part in (0, 1) for axis in range(3)), (2, 0), (2, 1), (3, 0))
 """Of a light's 9 numbers: centre (0), direction (1), size (2) or viewing angle (3), and which component."""
@@ -72,20 +78,31 @@ class FlatGel:
 
     def __init__(self, sensor: Sensor, pixels: Pixels, variant: Variant) -> None:
         mi = variant.load()
-        import drjit as dr
-
-        self._mi, self._count = mi, len(pixels)
+        self._mi, self._pixels = mi, len(pixels)
         column, row = np.floor(pixels).astype(np.uint32).T
         index = mi.UInt32(row * np.uint32(sensor.camera.width) + column)
         ray, weight, _ = CameraRays(sensor, mi).sample(index, mi.Point2f(0.5))
-        self._weight = weight + dr.zeros(mi.Float, self._count)  # of width 1 where nothing bends
-        self._point = ray.o - ray.d * (ray.o.z / ray.d.z)
-        self._toward = -ray.d
+        point, toward = np.array(ray.o - ray.d * (ray.o.z / ray.d.z)), np.array(-ray.d)
+        weight = np.broadcast_to(np.array(weight), self._pixels)
         plane = reflecting_plane(sensor)
         self._reflects = plane is not None
         self._index, self._face = mi.Float(sensor.window.refractive_index), mi.Float(plane or 0)
         color = {"type": "rgb", "value": list(sensor.coating.reflectance)}
         self._bsdf = mi.load_dict(coat(sensor.coating, color))
+        self._returned = None
+        if plane is not None and sensor.coating.is_matt:
+            width, height = np.array(sensor.gel.size_mm[:2]) / _PATCHES
+            middle = np.arange(_PATCHES) + 0.5 - _PATCHES / 2
+            patches = np.stack([*np.meshgrid(width * middle, height * middle), np.zeros((_PATCHES, _PATCHES))])
+            patches = patches.reshape(3, -1)
+            square = ((point[:2, :, None] - patches[:2, None]) ** 2).sum(axis=0) + 4 * plane**2
+            back = np.array(reflectance(mi.Float((2 * plane / np.sqrt(square)).ravel()), self._index, mi))
+            form = back.reshape(square.shape) * 4 * plane**2 / square**2 * (width * height / np.pi)
+            self._returned = (weight[:, None] * form)[..., None] * np.array(sensor.coating.reflectance)
+            point, toward = np.c_[point, patches], np.c_[toward, np.tile([[0.0], [0], [1]], patches.shape[1])]
+            weight = np.r_[weight, np.ones(patches.shape[1])]
+        self._count, self._weight = len(weight), mi.Float(weight)
+        self._point, self._toward = mi.Vector3f(point), mi.Vector3f(toward)
 
     def contributions(self, lights: LightGeometry) -> FloatArray:
         """E (m, n, 3) float64: radiance per channel and unit of power, on the camera's side of the window."""
@@ -188,7 +205,11 @@ class FlatGel:
 
         dr.eval(color)  # one kernel, not one for each channel
         stacked = np.stack([np.array(color[k], dtype=np.float64) for k in range(3)], axis=1)
-        return stacked.reshape(-1, self._count, 3)
+        whole = stacked.reshape(-1, self._count, 3)
+        seen, patches = whole[:, : self._pixels], whole[:, self._pixels :]
+        return (
+            seen if self._returned is None else seen + np.einsum("npc,mpc->mnc", self._returned, patches, optimize=True)
+        )
 
 
 def _axes(mi: Any, direction: Any) -> tuple[Any, Any, Any]:

@@ -14,8 +14,7 @@ A Lambertian surface's radiance is its albedo ρ times its irradiance E over π,
   faces and projected (L²) onto functions that are linear on each face, or constant where few of the face's pilots saw
   gel: such faces get little, and its mean is less noisy than its slope. Where no pilot at all saw gel there is none.
   In a round gel, all of which sees itself, it is smooth and is fitted (`synth.render.cavity_light`).
-- The lights l include their mirror images behind the window (`synth.render.window_images`). These and lights narrower
-  than Lambertian have no closed form.
+- The lights l include their mirror images behind the window (`synth.render.window_images`), which have no closed form.
 - E_returned, light that the gel sends to the window and gets back, is smooth. It is n · V with the normal n, and V is
   fitted to sampled paths as polynomials of the place on the pad.
 
@@ -114,11 +113,8 @@ class SeparatedLight:
         # Used only where the window reflects.
         self._face, self._index = dr.opaque(mi.Float, reflecting_plane(sensor) or 0), dr.opaque(mi.Float, index)
         size = sensor.gel.size_mm
-        self._lights = [
-            SampledLight(light, None, mi) if light.narrowness else PolygonLight(light, mi)
-            for light in sensor.lights
-            if reaches(light, size)
-        ]
+        own = [light for light in sensor.lights if reaches(light, size)]
+        self._lights = [SampledLight(light, None, mi) if light.narrowness else PolygonLight(light, mi) for light in own]
         self._lights += [SampledLight(light, index, mi) for light in image_lights(sensor) if reaches(light, size)]
         self._half = [dr.opaque(mi.Float, side / 2) for side in size[:2]]
 

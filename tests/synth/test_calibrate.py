@@ -5,6 +5,7 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -38,7 +39,7 @@ CLIPS = Path(__file__).parents[3] / "shared/real/gelsight_mini/clips"
 POWERS = np.array([[420.0, 80, 30], [60, 390, 90], [45, 120, 510]])
 
 
-def _start(**coating: float) -> Sensor:
+def _start(**coating: Any) -> Sensor:
     """Three white lights around a dotted pad of 12 x 9 mm at 160 x 120 px."""
     places = [(7.0, 0.5, 3.0), (-4.0, 5.6, 4.0), (-3.5, -5.6, 2.5)]
     lights = tuple(Light(position_mm=p, size_mm=(1.5, 0.6), color=(1, 1, 1), power=300) for p in places)
@@ -142,7 +143,7 @@ def test_contributions_are_what_the_renderer_renders(coating: dict[str, float], 
     sensor = sensor.model_copy(update={"lights": (light, dark)})  # the second shades a part of what the first lights
     surface = flat_surface(sensor.gel.size_mm)
     plain = np.full((4, 4, 3), 0.6, dtype=np.float32)
-    render = Render(samples_per_pixel=256, max_depth=2)
+    render = Render(samples_per_pixel=256, max_depth=2 if coating else 3)  # a matt gel lights itself by the window
     image = Renderer(sensor, render, surface, plain, FAST).radiance(surface.material, 0)
     columns, rows = (axis.ravel() for axis in np.meshgrid(np.arange(2, 160, 8), np.arange(2, 120, 8)))
     gel = FlatGel(sensor, np.column_stack([columns, rows]) + 0.5, FAST)
@@ -151,6 +152,29 @@ def test_contributions_are_what_the_renderer_renders(coating: dict[str, float], 
     # of the light, has an edge that the light's 24 cells resolve in steps of 4 %: below 1 % of the mean remains.
     assert lit.mean(axis=0) == pytest.approx(image[rows, columns].mean(axis=0), rel=0.012)
     assert np.median(np.abs(lit / image[rows, columns] - 1)) < 0.02
+
+
+@needs_llvm
+def test_a_matt_gel_is_lit_by_itself_by_way_of_the_window() -> None:
+    """The renderer samples the paths whose integral is taken here: what a third surface adds to two."""
+    window = _start().window.model_copy(
+        update={"thickness_mm": 1.2, "refractive_index": 2.0}
+    )  # total beyond 30 degrees
+    bright, dim = (_start(reflectance=(value,) * 3).model_copy(update={"window": window}) for value in (0.9, 0.45))
+    surface, plain = flat_surface(bright.gel.size_mm), np.full((4, 4, 3), 0.9, dtype=np.float32)
+    columns, rows = (axis.ravel() for axis in np.meshgrid(np.arange(2, 160, 8), np.arange(2, 120, 8)))
+    direct, both = (
+        Renderer(bright, Render(samples_per_pixel=64, max_depth=depth, light="separated"), surface, plain, FAST)
+        .radiance(surface.material, 0)[rows, columns, 0]
+        .mean()
+        for depth in (2, 3)
+    )
+    pixels, lights = np.column_stack([columns, rows]) + 0.5, LightGeometry.of(bright.lights)
+    lit = [300 * FlatGel(sensor, pixels, FAST).contributions(lights).sum(axis=0).mean() for sensor in (bright, dim)]
+    # Direct light is proportional to the reflectance, what comes back to its square. Lights near the window shade their
+    # images, which is left out here: 3 % of the light.
+    assert both > 1.1 * direct
+    assert 2 * (lit[0] - 2 * lit[1]) == pytest.approx(both - direct, rel=0.05)
 
 
 @needs_llvm
