@@ -61,10 +61,9 @@ class LightGeometry:
 
     @staticmethod
     def of(lights: Sequence[Light]) -> "LightGeometry":
-        centre = np.array([light.position_mm for light in lights])
-        size = np.array([light.size_mm for light in lights])
-        angle = np.array([[light.viewing_angle_deg] for light in lights])
-        return LightGeometry(centre, np.array([light.aim_mm for light in lights]) - centre, size, angle)
+        numbers = [(*each.position_mm, *each.aim_mm, *each.size_mm, each.viewing_angle_deg) for each in lights]
+        centre, aim, size, angle = np.split(np.array(numbers), [3, 6, 8], axis=1)
+        return LightGeometry(centre, aim - centre, size, angle)
 
 
 class FlatGel:

@@ -18,6 +18,7 @@ does not tell stays where it was.
 """
 
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -54,12 +55,8 @@ class Target:
     corner: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class Bounds:
-    """Box of each light's centre (m, 3) mm: inside the body and outside the camera's view."""
-
-    low: FloatArray
-    high: FloatArray
+Bounds: TypeAlias = tuple[FloatArray, FloatArray]
+"""Least and largest places of the lights' centres, (m, 3) mm each: in the body and outside the camera's view."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +66,6 @@ class LightFit:
     Attributes:
         geometry: of the lights.
         powers: (m, 3) per channel.
-        power_sd: (m, 3) standard error of the powers with the geometry held, from the residual; 0 where the power is
-            held at zero.
         vignetting: of the camera.
         residual: root mean square, encoded, full scale 1.
         steps: Gauss-Newton steps taken.
@@ -78,7 +73,6 @@ class LightFit:
 
     geometry: LightGeometry
     powers: FloatArray
-    power_sd: FloatArray
     vignetting: float
     residual: float
     steps: int
@@ -142,7 +136,7 @@ class _Problem:
         low, high = np.full((self._lights, 9), -4.0), np.full((self._lights, 9), 4.0)
         low[:, 6:8], high[:, 6:8] = -_SIZES, _SIZES
         low[:, 8], high[:, 8] = 0, 1 * (self._scale[:, 8] == 0)  # room where it has no effect: steps end at bounds
-        for box, centre, angle in ((low, bounds.low, _NARROWEST_DEG), (high, bounds.high, _WIDEST_DEG)):
+        for box, centre, angle in ((low, bounds[0], _NARROWEST_DEG), (high, bounds[1], _WIDEST_DEG)):
             box[:, :3] = (centre - self._start.centre) / CENTRE_MM
             box[:, 8:] += np.log(angle / self._start.viewing_angle_deg) / LOG_ANGLE
         dark = (np.array([0, 0.9]) - self._vignetting) / VIGNETTING
@@ -179,9 +173,9 @@ class _Problem:
 
     def result(self, theta: FloatArray, steps: int) -> LightFit:
         basis, powers, geometry = self._solved(theta)
-        _, errors = fit_powers(basis, self._target, self._shines)
         miss = self._target.slope * (np.einsum("mpc,mc->pc", basis, powers) - self._target.signal)
-        return LightFit(geometry, powers, errors, self._loss(theta), float(np.sqrt(np.mean(miss**2))), steps)
+        vignetting = float(self._vignetting + VIGNETTING * theta[-1])
+        return LightFit(geometry, powers, vignetting, float(np.sqrt(np.mean(miss**2))), steps)
 
     def _solved(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, LightGeometry]:
         """Signals (m, n, 3) under lights of power 1, the best powers (m, 3), and the geometry; cached for one theta."""
@@ -189,31 +183,24 @@ class _Problem:
             geometry = self.geometry(theta)
             gain = self._target.gain * self._vignette(theta)
             basis = self._gel.contributions(geometry) * gain[None, :, None]
-            self._cached = (theta.copy(), (basis, fit_powers(basis, self._target, self._shines)[0], geometry))
+            self._cached = (theta.copy(), (basis, fit_powers(basis, self._target, self._shines), geometry))
         return self._cached[1]
 
-    def _loss(self, theta: FloatArray) -> float:
-        """The vignetting: relative loss in the corner."""
-        return float(self._vignetting + VIGNETTING * theta[-1])
-
     def _vignette(self, theta: FloatArray) -> FloatArray:
-        return 1 - self._loss(theta) * self._target.corner
+        return 1 - (self._vignetting + VIGNETTING * theta[-1]) * self._target.corner
 
 
-def fit_powers(basis: FloatArray, target: Target, shines: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Non-negative least squares per channel.
+def fit_powers(basis: FloatArray, target: Target, shines: BoolArray) -> FloatArray:
+    """Powers (m, 3), by non-negative least squares per channel.
 
     Args:
         basis: (m, n, 3) signal under each light of power 1.
         target: at the same n pixels.
         shines: (m, 3) channels in which each light may have power.
-
-    Returns:
-        Powers (m, 3), and their standard errors (m, 3), as if INDEPENDENT pixels had independent residuals.
     """
     from scipy.optimize import nnls
 
-    powers, errors = np.zeros((len(basis), 3)), np.zeros((len(basis), 3))
+    powers = np.zeros((len(basis), 3))
     for channel in range(3):
         weight = target.slope[:, channel]
         lights = np.flatnonzero(shines[:, channel] & (basis[:, :, channel] * weight > 0).any(axis=1))
@@ -221,24 +208,8 @@ def fit_powers(basis: FloatArray, target: Target, shines: BoolArray) -> tuple[Fl
             continue
         matrix = (basis[lights, :, channel] * weight).T
         scale = np.linalg.norm(matrix, axis=0)
-        triangle, right = _reduced(matrix / scale, target.signal[:, channel] * weight)
-        solution, _ = nnls(triangle, right)
-        powers[lights, channel] = solution / scale
-        errors[lights, channel] = _standard_errors(triangle, right, solution, len(matrix)) / scale
-    return powers, errors
-
-
-def _reduced(matrix: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The same least-squares problem in as many rows as unknowns, and one more for what no solution explains."""
-    factor: FloatArray = np.asarray(np.linalg.qr(np.column_stack([matrix, right]), mode="r"))
-    return factor[:, :-1], factor[:, -1]
-
-
-def _standard_errors(triangle: FloatArray, right: FloatArray, solution: FloatArray, rows: int) -> FloatArray:
-    """Of the solution's positive part."""
-    free = solution > 0
-    variance = float(((triangle @ solution - right) ** 2).sum()) / rows
-    covariance = np.linalg.pinv(triangle[:, free].T @ triangle[:, free]) * variance * rows / INDEPENDENT
-    errors = np.zeros(len(solution))
-    errors[free] = np.sqrt(np.diag(covariance))
-    return errors
+        # The same problem in as many rows as unknowns, and one more for what no solution explains.
+        both = np.column_stack([matrix / scale, target.signal[:, channel] * weight])
+        factor = np.asarray(np.linalg.qr(both, mode="r"))
+        powers[lights, channel] = nnls(factor[:, :-1], factor[:, -1])[0] / scale
+    return powers

@@ -172,7 +172,7 @@ def _bounds(sensor: Sensor) -> Bounds:
         at = centre[:, axis]
         high[:, axis] = np.where(at < least, np.minimum(high[:, axis], least), high[:, axis])
         low[:, axis] = np.where(at > most, np.maximum(low[:, axis], most), low[:, axis])
-    return Bounds(low, high)
+    return low, high
 
 
 def _clear_of_view(sensor: Sensor, geometry: LightGeometry) -> LightGeometry:
