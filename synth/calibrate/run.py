@@ -90,9 +90,7 @@ def _check_places(template: Template, out: Path) -> None:
     """Refuses round gels, and to write over what is not calibrate's own."""
     gel = template.corners[0].sensor.gel
     if not gel.is_flat:
-        raise InputError(
-            f"{template.label}: sensor.gel.shape: calibrate fits flat gels only, this one is a {gel.shape}"
-        )
+        raise InputError(f"{template.label}: sensor.gel.shape: calibrate fits flat gels only, not a {gel.shape}")
     refuse_foreign(out / SCENE, MARK.encode(), out / PICTURE, out / NUMBERS)
     if (out / SCENE).resolve() == template.source.resolve():
         raise InputError(f"--out {out}: its {SCENE} is what --scene starts from and would be lost; give another --out")
