@@ -39,8 +39,6 @@ class Comparison:
         found = {
             "mean_absolute_outside_dots": np.abs(bare).mean(axis=0),
             "bias_outside_dots": bare.mean(axis=0),
-            "p95_outside_dots": np.percentile(np.abs(bare), 95, axis=0),
-            "mean_absolute": np.abs(difference).mean(axis=(0, 1)),
         }
         rounded = {name: [round(float(x), 3) for x in values] for name, values in found.items()}
         return rounded | {"pixels_outside_dots": int(self.outside.sum())}

@@ -1,7 +1,8 @@
 """Which dot of the grid each found dot is, and the camera and layout that put them there."""
 
+import json
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -157,15 +158,8 @@ def pattern_points(pattern: Dots, index: NDArray[np.int64]) -> FloatArray:
 
 def _rounded(part: _Part) -> _Part:
     """With numbers that are fit to read: 6 decimals, a thousandth of what a frame tells."""
-    return type(part).model_validate(_shortened(part.model_dump()))
-
-
-def _shortened(value: Any) -> Any:
-    if isinstance(value, float):
-        return round(value, 6)
-    if isinstance(value, dict):
-        return {key: _shortened(inner) for key, inner in value.items()}
-    return tuple(_shortened(inner) for inner in value) if isinstance(value, tuple) else value
+    content = json.loads(part.model_dump_json(), parse_float=lambda text: round(float(text), 6))
+    return type(part).model_validate(content)
 
 
 def _corner(sensor: Sensor, pattern: Dots, camera: Camera) -> Pixels:

@@ -3,18 +3,22 @@ r"""What each light alone contributes to the picture of the undeformed gel, diff
 The undeformed contact face is a plane that cannot light itself, so its radiance toward the camera is an integral over
 each light's rectangle and nothing else. For a light of power 1 and colour white, with area A, at a point x of the face:
 
-.. math::  E_i(x) = \frac{1 - F}{n^2} \int_A f(\omega_o, \omega) \cos\theta \, \max(\cos\theta', 0) \,
-                    \frac{1}{\pi A} \frac{dA'}{|x' - x|^2}
+.. math::  E_i(x) = \frac{1 - F}{n^2} \int_A f(\omega_o, \omega) \cos\theta \, \max(\cos\theta', 0)^{k + 1} \,
+                    \frac{k + 2}{2 \pi A} \frac{dA'}{|x' - x|^2}
 
-with the coating's BSDF f (Mitsuba's), θ at the face and θ' at the light. It is evaluated by the midpoint rule on a
-grid over the rectangle: no noise, and the same radiometry as the renderer's, with the shade that one light throws on
-another. The light's mirror image behind the window adds its own integral (`synth.render.window_images`), without shade;
-what the gel itself sends to the window and gets back is left out. Dr.Jit differentiates both with respect to the
-lights' centres, directions and sizes, the shade held. Mitsuba's path integrators would as well, with Monte Carlo noise
-in every step and for paths that an undeformed face has not.
+with the coating's BSDF f (Mitsuba's), θ at the face and θ' at the light, which is Lambertian for k = 0. The midpoint
+rule on a grid over the rectangle evaluates it: no noise, and the same radiometry as the renderer's, with the shade that
+one light throws on another. The light's mirror image behind the window adds its own integral
+(`synth.render.window_images`), without shade. A matt gel lights itself once by way of the window, as if by its mirror
+image: with the radiance L of patches of area A, their reflectance ρ, and the image at the height 2 Z,
+
+.. math::  L_{returned}(x) = \frac{ρ}{\pi} \sum_{y} A L(y) R(\theta) \frac{(2 Z)^2}{|x - y'|^4} .
+
+Dr.Jit differentiates all of it with respect to the lights' centres, directions, sizes and viewing angles, the shade
+held. Mitsuba's path integrators would as well, with noise in every step and for paths that an undeformed face has not.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,28 +30,40 @@ from synth.render.coating import coat
 from synth.render.gel_mesh import MIRROR
 from synth.render.variant import Variant
 from synth.render.window_images import reflectance, reflecting_plane
-from synth.scene import Sensor
+from synth.scene import Light, Sensor
 
 _CELLS = 24
 """Midpoints on each light; its longer side gets more of them."""
+_ALONG = np.array([2, 3, 4, 6, 8, 12, 24], dtype=np.uint32)
+"""How many of them may be along its first side."""
+_PATCHES = 16
+"""Along each side of the pad, of which light comes back by the window: smooth over the height of the image."""
 
-_NUMBERS = (*((part, axis, float(MIRROR[axis])) for part in (0, 1) for axis in range(3)), (2, 0, 1.0), (2, 1, 1.0))
-"""Of a light's 8 numbers: centre (0), direction (1) or size (2), which component, and its sign in the renderer."""
+_NUMBERS = (*((part, axis) for part in (0, 1) for axis in range(3)), (2, 0), (2, 1), (3, 0))
+"""Of a light's 9 numbers: centre (0), direction (1), size (2) or viewing angle (3), and which component."""
 
 
 @dataclass(frozen=True, eq=False)
 class LightGeometry:
-    """Where lights are and how they are turned.
+    """Where m lights are, how they are turned and how widely they shine.
 
     Attributes:
         centre: (m, 3) float64 mm.
         direction: (m, 3) float64, of any length; need not be unit vectors.
         size: (m, 2) float64 mm.
+        viewing_angle_deg: (m, 1) float64.
     """
 
     centre: FloatArray
     direction: FloatArray
     size: FloatArray
+    viewing_angle_deg: FloatArray
+
+    @staticmethod
+    def of(lights: Sequence[Light]) -> "LightGeometry":
+        numbers = [(*each.position_mm, *each.aim_mm, *each.size_mm, each.viewing_angle_deg) for each in lights]
+        centre, aim, size, angle = np.split(np.array(numbers), [3, 6, 8], axis=1)
+        return LightGeometry(centre, aim - centre, size, angle)
 
 
 class FlatGel:
@@ -61,130 +77,138 @@ class FlatGel:
 
     def __init__(self, sensor: Sensor, pixels: Pixels, variant: Variant) -> None:
         mi = variant.load()
-        self._mi, self._count = mi, len(pixels)
+        self._mi, self._pixels = mi, len(pixels)
         column, row = np.floor(pixels).astype(np.uint32).T
         index = mi.UInt32(row * np.uint32(sensor.camera.width) + column)
-        ray, self._weight, _ = CameraRays(sensor, mi).sample(index, mi.Point2f(0.5))
-        self._point = ray.o - ray.d * (ray.o.z / ray.d.z)
-        self._toward = -ray.d
+        ray, weight, _ = CameraRays(sensor, mi).sample(index, mi.Point2f(0.5))
+        point, toward = np.array(ray.o - ray.d * (ray.o.z / ray.d.z)), np.array(-ray.d)
+        weight = np.broadcast_to(np.array(weight), self._pixels)
         plane = reflecting_plane(sensor)
         self._reflects = plane is not None
         self._index, self._face = mi.Float(sensor.window.refractive_index), mi.Float(plane or 0)
         color = {"type": "rgb", "value": list(sensor.coating.reflectance)}
         self._bsdf = mi.load_dict(coat(sensor.coating, color))
+        self._returned = None
+        if plane is not None and sensor.coating.is_matt:
+            width, height = np.array(sensor.gel.size_mm[:2]) / _PATCHES
+            middle = np.arange(_PATCHES) + 0.5 - _PATCHES / 2
+            patches = np.stack([*np.meshgrid(width * middle, height * middle), np.zeros((_PATCHES, _PATCHES))])
+            patches = patches.reshape(3, -1)
+            square = ((point[:2, :, None] - patches[:2, None]) ** 2).sum(axis=0) + 4 * plane**2
+            back = np.array(reflectance(mi.Float((2 * plane / np.sqrt(square)).ravel()), self._index, mi))
+            form = back.reshape(square.shape) * 4 * plane**2 / square**2 * (width * height / np.pi)
+            self._returned = (weight[:, None] * form)[..., None] * np.array(sensor.coating.reflectance)
+            point, toward = np.c_[point, patches], np.c_[toward, np.tile([[0.0], [0], [1]], patches.shape[1])]
+            weight = np.r_[weight, np.ones(patches.shape[1])]
+        self._count, self._weight = len(weight), mi.Float(weight)
+        self._point, self._toward = mi.Vector3f(point), mi.Vector3f(toward)
 
     def contributions(self, lights: LightGeometry) -> FloatArray:
         """E (m, n, 3) float64: radiance per channel and unit of power, on the camera's side of the window."""
-        return np.stack(
-            [self._numpy(self._lit(*self._parts(lights, i), self._unshaded(lights, i))) for i in _each(lights)]
-        )
+        parts = self._parts(lights)
+        return self._numpy(self._lit(parts, self._unshaded(parts)))
 
     def derivatives(self, lights: LightGeometry) -> FloatArray:
-        """Derivatives of E (m, 8, n, 3) float64 by each light's centre, direction and size, in forward mode.
+        """Derivatives of E (m, 9, n, 3) float64 by each light's centre, direction, size and angle, in forward mode.
 
-        A light's 8 numbers change its own contribution only, so all derivatives cost 8 pictures of each light.
+        A light's 9 numbers change its own contribution only, so all derivatives cost 9 pictures of each light.
         """
-        return np.stack([self._derivatives(lights, i) for i in _each(lights)])
-
-    def _derivatives(self, lights: LightGeometry, i: int) -> FloatArray:
         import drjit as dr
 
-        found, unshaded = [], self._unshaded(lights, i)
-        for part, component, sign in _NUMBERS:
-            parts = self._parts(lights, i)
-            for each in parts:
-                dr.enable_grad(each)
-                dr.set_grad(each, 0)
-            seed = [0.0] * (2 if part == 2 else 3)
-            seed[component] = sign
-            dr.set_grad(parts[part], type(parts[part])(*seed))
-            lit = self._lit(*parts, unshaded)
+        found, unshaded = [], self._unshaded(self._parts(lights))
+        for part, component in _NUMBERS:
+            parts = self._parts(lights)
+            dr.enable_grad(parts[:-1])
+            dr.set_grad(parts[part][component], MIRROR[component] if part < 2 else 1)
+            lit = self._lit(parts, unshaded)
             found.append(self._numpy(dr.forward_to(lit)))
-        return np.stack(found)
+        return np.stack(found, axis=1)
 
-    def _parts(self, lights: LightGeometry, i: int) -> tuple[Any, Any, Any]:
-        """Centre and direction of a light in the renderer's frame, and its size."""
+    def _parts(self, lights: LightGeometry) -> tuple[Any, ...]:
+        """Centres and directions in the renderer's frame, sizes, viewing angles, midpoints along the first size."""
+        mi = self._mi
+        angle = (mi.Float(lights.viewing_angle_deg[:, 0]),)
+        turned = (mi.Vector3f((part * MIRROR).T) for part in (lights.centre, lights.direction))
+        nearest = np.abs(np.log(_ALONG**2 / _CELLS * (lights.size[:, 1:] / lights.size[:, :1]))).argmin(axis=1)
+        return *turned, mi.Vector2f(lights.size.T), angle, mi.UInt32(_ALONG[nearest])
+
+    def _arms(self, parts: tuple[Any, ...]) -> tuple[Any, Any, Any, Any]:
+        """Of each light, point and cell: the vector from point to cell, the point's number, the light's and normal."""
         import drjit as dr
 
         mi = self._mi
+        centre, direction, size, _, along = parts
+        lane = dr.arange(mi.UInt32, dr.width(centre) * self._count * _CELLS)
+        cell, pixel, light = lane % _CELLS, lane // _CELLS % self._count, lane // (_CELLS * self._count)
+        long = dr.gather(mi.UInt32, along, light)
+        first, second, facing = (dr.gather(mi.Vector3f, axis, light) for axis in _axes(mi, direction))
+        width, height = dr.gather(mi.Float, size.x, light), dr.gather(mi.Float, size.y, light)
+        u = (mi.Float(cell % long) + 0.5) / mi.Float(long) - 0.5
+        v = (mi.Float(cell // long) + 0.5) * mi.Float(long) / _CELLS - 0.5
+        source = dr.gather(mi.Vector3f, centre, light) + first * (u * width) + second * (v * height)
+        return source - dr.gather(mi.Vector3f, self._point, pixel), pixel, light, facing
 
-        def opaque(kind: Any, values: FloatArray) -> Any:
-            """Opaque numbers stay out of the compiled code: other geometry, same kernel."""
-            return kind(*(dr.opaque(mi.Float, float(x)) for x in values))
-
-        centre, direction = (opaque(mi.Vector3f, part[i] * MIRROR) for part in (lights.centre, lights.direction))
-        return centre, direction, opaque(mi.Vector2f, lights.size[i])
-
-    def _arms(self, centre: Any, direction: Any, size: Any) -> tuple[Any, Any, Any, int]:
-        """Vectors from the points to the light's cells, point by point; the points; the light's normal; cells."""
+    def _unshaded(self, parts: tuple[Any, ...]) -> Any:
+        """1 where no other light's rectangle stands between a point and a light's cell, else 0."""
         import drjit as dr
 
         mi = self._mi
-        long = round(min(_CELLS, max(2.0, (_CELLS * float(size.x[0]) / float(size.y[0])) ** 0.5)))
-        across = max(2, _CELLS // long)
-        cells = long * across
-        first, second, facing = _axes(mi, direction)
-        lane = dr.arange(mi.UInt32, self._count * cells)
-        pixel, cell = lane // cells, lane % cells
-        u = (mi.Float(cell % long) + 0.5) / long - 0.5
-        v = (mi.Float(cell // long) + 0.5) / across - 0.5
-        source = centre + first * (u * size.x) + second * (v * size.y)
-        return source - dr.gather(mi.Vector3f, self._point, pixel), pixel, facing, cells
-
-    def _unshaded(self, lights: LightGeometry, i: int) -> Any:
-        """1 where no other light's rectangle stands between a point and a cell of light i, else 0."""
-        import drjit as dr
-
-        mi = self._mi
-        arm, pixel, _, _ = self._arms(*self._parts(lights, i))
+        arm, pixel, light, _ = self._arms(parts)
         point = dr.gather(mi.Vector3f, self._point, pixel)
-        free = mi.Bool(True)
-        for other in _each(lights):
-            if other == i:
-                continue
-            centre, direction, size = self._parts(lights, other)
+        free, (centres, directions, sizes, *_) = mi.Bool(True), parts
+        for other in range(dr.width(centres)):
+            number = dr.opaque(mi.UInt32, other)
+            centre, direction = (dr.gather(mi.Vector3f, part, number) for part in (centres, directions))
+            size = dr.gather(mi.Vector2f, sizes, number)
             first, second, facing = _axes(mi, direction)
             share = dr.dot(centre - point, facing) / dr.dot(arm, facing)
             beside = point + arm * share - centre
             within = (dr.abs(dr.dot(beside, first)) < size.x / 2) & (dr.abs(dr.dot(beside, second)) < size.y / 2)
-            free &= ~(within & (share > 0) & (share < 1))
+            free &= ~(within & (share > 0) & (share < 1) & (light != number))
         lit = dr.select(free, mi.Float(1), 0)
         dr.eval(lit)
         return lit
 
-    def _lit(self, centre: Any, direction: Any, size: Any, unshaded: Any) -> Any:
-        """Radiance (n,) as mi.Color3f under a light of power 1 and its image in the window."""
+    def _lit(self, parts: tuple[Any, ...], unshaded: Any) -> Any:
+        """Radiance (m n,) as mi.Color3f under each light of power 1 and its image in the window."""
         import drjit as dr
 
-        lit = self._scattered(centre, direction, size, lambda away: unshaded)
+        lit = self._scattered(parts, lambda away: unshaded)
         if not self._reflects:
             return lit
         mi = self._mi
         flip, behind = mi.Vector3f(1, 1, -1), mi.Vector3f(0, 0, 2 * self._face)
-        image = (centre * flip + behind, direction * flip, size)
-        return lit + self._scattered(*image, lambda away: reflectance(dr.abs(away.z), self._index, mi))
+        image = (parts[0] * flip + behind, parts[1] * flip, *parts[2:])
+        return lit + self._scattered(image, lambda away: reflectance(dr.abs(away.z), self._index, mi))
 
-    def _scattered(self, centre: Any, direction: Any, size: Any, share: Callable[[Any], Any]) -> Any:
-        """Radiance (n,) as mi.Color3f under a rectangle of which a share arrives, by the directions to its cells."""
+    def _scattered(self, parts: tuple[Any, ...], share: Callable[[Any], Any]) -> Any:
+        """Radiance (m n,) as mi.Color3f under rectangles of which a share arrives, by the directions to their cells."""
         import drjit as dr
 
         mi = self._mi
-        arm, pixel, facing, cells = self._arms(centre, direction, size)
+        arm, pixel, light, facing = self._arms(parts)
         square = dr.squared_norm(arm)
         away = arm / dr.sqrt(square)
-        interaction = dr.zeros(mi.SurfaceInteraction3f, self._count * cells)
+        interaction = dr.zeros(mi.SurfaceInteraction3f, dr.width(arm))
         interaction.wi = dr.gather(mi.Vector3f, self._toward, pixel)
         scattered = self._bsdf.eval(mi.BSDFContext(), interaction, away)
-        cosine = dr.maximum(-dr.dot(away, facing), 0) * share(away)
-        each = scattered * (cosine / (square * (dr.pi * cells)))
-        return mi.Color3f(*(dr.block_sum(each[k], cells) * self._weight for k in range(3)))
+        power = -dr.log(2) / dr.log(dr.cos(dr.deg2rad(parts[3][0] / 2)))  # of the intensity: Light.narrowness + 1
+        cosine = dr.power(dr.maximum(-dr.dot(away, facing), 1e-6), dr.gather(mi.Float, power, light)) * share(away)
+        each = scattered * (cosine * dr.gather(mi.Float, power + 1, light) / (square * (2 * dr.pi * _CELLS)))
+        weight = dr.tile(self._weight, dr.width(parts[0]))
+        return mi.Color3f(*(dr.block_sum(each[k], _CELLS) * weight for k in range(3)))
 
     def _numpy(self, color: Any) -> FloatArray:
-        return np.stack([np.array(color[k], dtype=np.float64) for k in range(3)], axis=1)
+        """(m, n, 3)."""
+        import drjit as dr
 
-
-def _each(lights: LightGeometry) -> range:
-    return range(len(lights.centre))
+        dr.eval(color)  # one kernel, not one for each channel
+        stacked = np.stack([np.array(color[k], dtype=np.float64) for k in range(3)], axis=1)
+        whole = stacked.reshape(-1, self._count, 3)
+        seen, patches = whole[:, : self._pixels], whole[:, self._pixels :]
+        return (
+            seen if self._returned is None else seen + np.einsum("npc,mpc->mnc", self._returned, patches, optimize=True)
+        )
 
 
 def _axes(mi: Any, direction: Any) -> tuple[Any, Any, Any]:

@@ -18,17 +18,20 @@ does not tell stays where it was.
 """
 
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 
 from synth.arrays import BoolArray, FloatArray
 from synth.calibrate.irradiance import FlatGel, LightGeometry
 
-CENTRE_MM, DIRECTION, LOG_SIZE, VIGNETTING = 2.0, 0.4, 0.5, 0.3
-"""Standard deviations of the prior: of a light's place, of its unit direction, of the logarithm of its sizes, and of
-the vignetting."""
+CENTRE_MM, DIRECTION, LOG_SIZE, LOG_ANGLE, VIGNETTING = 2.0, 0.4, 0.5, 0.4, 0.3
+"""Standard deviations of the prior: of a light's place, of its unit direction, of the logarithms of its sizes and of
+its viewing angle, and of the vignetting."""
+_SCALE = np.repeat([CENTRE_MM, DIRECTION, LOG_SIZE, LOG_ANGLE], [3, 3, 2, 1])
 _SIZES = 1.5
 """Bound of the sizes' displacements: by a factor of 2.1 either way."""
+_NARROWEST_DEG, _WIDEST_DEG = 10.0, 120.0
 RESIDUAL = 1 / 255
 """Standard deviation of what the model may leave, encoded."""
 INDEPENDENT = 300.0
@@ -52,12 +55,8 @@ class Target:
     corner: FloatArray
 
 
-@dataclass(frozen=True, eq=False)
-class Bounds:
-    """Box of each light's centre (m, 3) mm: inside the body and outside the camera's view."""
-
-    low: FloatArray
-    high: FloatArray
+Bounds: TypeAlias = tuple[FloatArray, FloatArray]
+"""Least and largest places of the lights' centres, (m, 3) mm each: in the body and outside the camera's view."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +66,6 @@ class LightFit:
     Attributes:
         geometry: of the lights.
         powers: (m, 3) per channel.
-        power_sd: (m, 3) standard error of the powers with the geometry held, from the residual; 0 where the power is
-            held at zero.
         vignetting: of the camera.
         residual: root mean square, encoded, full scale 1.
         steps: Gauss-Newton steps taken.
@@ -76,7 +73,6 @@ class LightFit:
 
     geometry: LightGeometry
     powers: FloatArray
-    power_sd: FloatArray
     vignetting: float
     residual: float
     steps: int
@@ -102,15 +98,8 @@ def fit_lights(
     from scipy.optimize import least_squares
 
     low, high = problem.box(bounds)
-    found = least_squares(
-        problem.residual,
-        np.clip(np.zeros(problem.size), low + 1e-6, high - 1e-6),
-        jac=problem.jacobian,
-        bounds=(low, high),
-        max_nfev=steps,
-        ftol=1e-3,
-        xtol=1e-3,
-    )
+    first, limits = np.clip(np.zeros(problem.size), low + 1e-6, high - 1e-6), {"ftol": 1e-3, "xtol": 1e-3}
+    found = least_squares(problem.residual, first, problem.jacobian, (low, high), max_nfev=steps, **limits)
     return problem.result(found.x, int(found.njev))
 
 
@@ -125,24 +114,26 @@ class _Problem:
         self._gel, self._target, self._shines, self._vignetting = gel, target, shines, vignetting
         self._cached: tuple[FloatArray, tuple[FloatArray, FloatArray, LightGeometry]] | None = None
         self._lights = len(start.centre)
-        self.size = 8 * self._lights + 1
+        self._scale = _SCALE * np.ones((self._lights, 1))
+        self._scale[start.viewing_angle_deg[:, 0] == _WIDEST_DEG, 8] = 0  # Lambertian lights stay so
+        self.size = 9 * self._lights + 1
         self._factor = float(np.sqrt(INDEPENDENT / target.signal.size)) / RESIDUAL
 
     def geometry(self, theta: FloatArray) -> LightGeometry:
-        m = self._lights
-        centre, direction, size = (part.reshape(m, -1) for part in np.split(theta[:-1], [3 * m, 6 * m]))
-        return LightGeometry(
-            self._start.centre + CENTRE_MM * centre,
-            self._start.direction + DIRECTION * direction,
-            self._start.size * np.exp(LOG_SIZE * size),
-        )
+        centre, direction, size, angle = np.split(theta[:-1].reshape(-1, 9) * self._scale, [3, 6, 8], axis=1)
+        start = self._start
+        angles = start.viewing_angle_deg * np.exp(angle)
+        return LightGeometry(start.centre + centre, start.direction + direction, start.size * np.exp(size), angles)
 
     def box(self, bounds: Bounds) -> tuple[FloatArray, FloatArray]:
-        wide = np.concatenate([np.full(3 * self._lights, 4.0), np.full(2 * self._lights, _SIZES)])
-        low = (bounds.low - self._start.centre) / CENTRE_MM
-        high = (bounds.high - self._start.centre) / CENTRE_MM
-        dark = ((0 - self._vignetting) / VIGNETTING, (0.9 - self._vignetting) / VIGNETTING)
-        return np.r_[low.ravel(), -wide, dark[0]], np.r_[high.ravel(), wide, dark[1]]
+        low, high = np.full((self._lights, 9), -4.0), np.full((self._lights, 9), 4.0)
+        low[:, 6:8], high[:, 6:8] = -_SIZES, _SIZES
+        low[:, 8], high[:, 8] = 0, 1 * (self._scale[:, 8] == 0)  # room where it has no effect: steps end at bounds
+        for box, centre, angle in ((low, bounds[0], _NARROWEST_DEG), (high, bounds[1], _WIDEST_DEG)):
+            box[:, :3] = (centre - self._start.centre) / CENTRE_MM
+            box[:, 8:] += np.log(angle / self._start.viewing_angle_deg) / LOG_ANGLE
+        dark = (np.array([0, 0.9]) - self._vignetting) / VIGNETTING
+        return np.r_[low.ravel(), dark[0]], np.r_[high.ravel(), dark[1]]
 
     def residual(self, theta: FloatArray) -> FloatArray:
         """(3 n + len(theta),): weighted misfit by channel, and the prior."""
@@ -156,15 +147,16 @@ class _Problem:
         weight = self._factor * self._target.slope
         vignette = self._vignette(theta)[None, None, :, None]
         change = self._gel.derivatives(geometry) * (self._target.gain * vignette)
-        change[:, :3] *= CENTRE_MM
-        change[:, 3:6] *= DIRECTION
-        change[:, 6:] *= LOG_SIZE * geometry.size[:, :, None, None]
+        logarithmic = np.c_[np.ones((self._lights, 6)), geometry.size, geometry.viewing_angle_deg]
+        change *= (self._scale * logarithmic)[:, :, None, None]
         radiance = np.einsum("mpc,mc->pc", basis, powers) / self._vignette(theta)[:, None]
         corner = -VIGNETTING * self._target.corner[:, None] * radiance
         blocks = []
         for channel in range(3):
             moved = change[..., channel] * powers[:, None, None, channel]
-            columns = np.column_stack([_by_number(moved), corner[:, channel]]) * weight[:, channel, None]
+            columns = (
+                np.column_stack([moved.reshape(self.size - 1, -1).T, corner[:, channel]]) * weight[:, channel, None]
+            )
             lit = powers[:, channel] > 0
             if lit.any():
                 span = np.linalg.qr((basis[lit, :, channel] * weight[:, channel]).T)[0]
@@ -174,9 +166,9 @@ class _Problem:
 
     def result(self, theta: FloatArray, steps: int) -> LightFit:
         basis, powers, geometry = self._solved(theta)
-        _, errors = fit_powers(basis, self._target, self._shines)
         miss = self._target.slope * (np.einsum("mpc,mc->pc", basis, powers) - self._target.signal)
-        return LightFit(geometry, powers, errors, self._loss(theta), float(np.sqrt(np.mean(miss**2))), steps)
+        vignetting = float(self._vignetting + VIGNETTING * theta[-1])
+        return LightFit(geometry, powers, vignetting, float(np.sqrt(np.mean(miss**2))), steps)
 
     def _solved(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, LightGeometry]:
         """Signals (m, n, 3) under lights of power 1, the best powers (m, 3), and the geometry; cached for one theta."""
@@ -184,37 +176,24 @@ class _Problem:
             geometry = self.geometry(theta)
             gain = self._target.gain * self._vignette(theta)
             basis = self._gel.contributions(geometry) * gain[None, :, None]
-            self._cached = (theta.copy(), (basis, fit_powers(basis, self._target, self._shines)[0], geometry))
+            self._cached = (theta.copy(), (basis, fit_powers(basis, self._target, self._shines), geometry))
         return self._cached[1]
 
-    def _loss(self, theta: FloatArray) -> float:
-        """The vignetting: relative loss in the corner."""
-        return float(self._vignetting + VIGNETTING * theta[-1])
-
     def _vignette(self, theta: FloatArray) -> FloatArray:
-        return 1 - self._loss(theta) * self._target.corner
+        return 1 - (self._vignetting + VIGNETTING * theta[-1]) * self._target.corner
 
 
-def _by_number(change: FloatArray) -> FloatArray:
-    """(n, 8 m) in the order of theta, from (m, 8, n)."""
-    parts = (change[:, :3], change[:, 3:6], change[:, 6:])
-    return np.concatenate([part.reshape(-1, change.shape[2]) for part in parts]).T
-
-
-def fit_powers(basis: FloatArray, target: Target, shines: BoolArray) -> tuple[FloatArray, FloatArray]:
-    """Non-negative least squares per channel.
+def fit_powers(basis: FloatArray, target: Target, shines: BoolArray) -> FloatArray:
+    """Powers (m, 3), by non-negative least squares per channel.
 
     Args:
         basis: (m, n, 3) signal under each light of power 1.
         target: at the same n pixels.
         shines: (m, 3) channels in which each light may have power.
-
-    Returns:
-        Powers (m, 3), and their standard errors (m, 3), as if INDEPENDENT pixels had independent residuals.
     """
     from scipy.optimize import nnls
 
-    powers, errors = np.zeros((len(basis), 3)), np.zeros((len(basis), 3))
+    powers = np.zeros((len(basis), 3))
     for channel in range(3):
         weight = target.slope[:, channel]
         lights = np.flatnonzero(shines[:, channel] & (basis[:, :, channel] * weight > 0).any(axis=1))
@@ -222,24 +201,8 @@ def fit_powers(basis: FloatArray, target: Target, shines: BoolArray) -> tuple[Fl
             continue
         matrix = (basis[lights, :, channel] * weight).T
         scale = np.linalg.norm(matrix, axis=0)
-        triangle, right = _reduced(matrix / scale, target.signal[:, channel] * weight)
-        solution, _ = nnls(triangle, right)
-        powers[lights, channel] = solution / scale
-        errors[lights, channel] = _standard_errors(triangle, right, solution, len(matrix)) / scale
-    return powers, errors
-
-
-def _reduced(matrix: FloatArray, right: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """The same least-squares problem in as many rows as unknowns, and one more for what no solution explains."""
-    factor: FloatArray = np.asarray(np.linalg.qr(np.column_stack([matrix, right]), mode="r"))
-    return factor[:, :-1], factor[:, -1]
-
-
-def _standard_errors(triangle: FloatArray, right: FloatArray, solution: FloatArray, rows: int) -> FloatArray:
-    """Of the solution's positive part."""
-    free = solution > 0
-    variance = float(((triangle @ solution - right) ** 2).sum()) / rows
-    covariance = np.linalg.pinv(triangle[:, free].T @ triangle[:, free]) * variance * rows / INDEPENDENT
-    errors = np.zeros(len(solution))
-    errors[free] = np.sqrt(np.diag(covariance))
-    return errors
+        # The same problem in as many rows as unknowns, and one more for what no solution explains.
+        both = np.column_stack([matrix / scale, target.signal[:, channel] * weight])
+        factor = np.asarray(np.linalg.qr(both, mode="r"))
+        powers[lights, channel] = nnls(factor[:, :-1], factor[:, -1])[0] / scale
+    return powers

@@ -84,11 +84,11 @@ def _lights(fit: SensorFit, start: Sensor) -> list[dict[str, Any]]:
         found.append(
             {
                 "power_per_channel": [float(f"{value:.6g}") for value in fit.lights.powers[i]],
-                "standard_error": [float(f"{value:.3g}") for value in fit.lights.power_sd[i]],
                 "preset_power_per_channel": [round(light.power * value, 3) for value in light.color],
                 "position_mm": np.round(fit.lights.geometry.centre[i], 4).tolist(),
                 "moved_mm": round(float(np.linalg.norm(moved)), 3),
                 "size_mm": np.round(fit.lights.geometry.size[i], 4).tolist(),
+                "viewing_angle_deg": round(float(fit.lights.geometry.viewing_angle_deg[i, 0]), 2),
             }
         )
     return found

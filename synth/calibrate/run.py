@@ -6,17 +6,27 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
+import tomli_w
+
+from synth.arrays import FloatArray
+from synth.calibrate.comparison import Comparison, compare, picture, render_undeformed
+from synth.calibrate.dot_grid import DotGridFit
+from synth.calibrate.frames import Frames, read_frames
+from synth.calibrate.preset import render_settings, start_sensor
+from synth.calibrate.report import fitted_content, numbers, summary
+from synth.calibrate.sensor_fit import SensorFit, find_grid, fit_sensor
+from synth.calibrate.verdict import verdict
+from synth.dataset.storage import refuse_foreign, replace_file, storage_errors
 from synth.errors import InputError
-
-if TYPE_CHECKING:
-    from synth.scene import Sensor
+from synth.render.variant import LLVM_HINT, choose_variant
+from synth.scene import Dots, Sensor
+from synth.scene.template import Template, checked_template, load_scene
 
 SCENE, PICTURE, NUMBERS = "scene.toml", "calibration.png", "calibration.json"
 MARK = "Fitted by `synth calibrate"
 """How the scene that is written begins."""
-_WHAT_FRAMES = "they must be pictures of this kind of sensor with its gel undeformed"
 _SPACINGS = 4.0
 """Most that a spacing may differ from the preset's, as a factor: further off, a lens is not like the preset's."""
 
@@ -49,70 +59,54 @@ def run_calibrate(
     Raises:
         InputError: frames, preset or storage are at fault, or this machine has no differentiable variant.
     """
-    import tomli_w
-
-    from synth.calibrate.comparison import compare, picture, render_undeformed
-    from synth.calibrate.frames import read_frames
-    from synth.calibrate.preset import render_settings, start_sensor
-    from synth.calibrate.report import fitted_content, numbers, summary
-    from synth.calibrate.sensor_fit import find_grid, fit_sensor
-    from synth.calibrate.verdict import verdict
-    from synth.dataset.storage import refuse_foreign, replace_file, storage_errors
-    from synth.render.variant import LLVM_HINT, choose_variant
-    from synth.scene.template import checked_template, load_scene
-
     started = time.perf_counter()
     template = load_scene(scene, assignments)
-    gel = template.corners[0].sensor.gel
-    if not gel.is_flat:
-        raise InputError(
-            f"{template.label}: sensor.gel.shape: calibrate fits flat gels only, this one is a {gel.shape}"
-        )
-    refuse_foreign(out / SCENE, MARK.encode(), out / PICTURE, out / NUMBERS)
-    if (out / SCENE).resolve() == template.source.resolve():
-        raise InputError(f"--out {out}: its {SCENE} is what --scene starts from and would be lost; give another --out")
+    _check_places(template, out)
     variant = choose_variant("auto")
     if not variant.is_vectorised:
         raise InputError(f"calibration differentiates the rendering, which needs LLVM or an NVIDIA GPU: {LLVM_HINT}")
-    given = read_frames(frames)
-    others = {str(path): read_frames([path]) for path in judge}
-    for name, other in others.items():
-        if other.size != given.size:
-            raise InputError(f"{name}: has {other.size} pixels, the frames that are fitted have {given.size}")
-    with storage_errors(out):
-        out.mkdir(parents=True, exist_ok=True)  # before minutes of work, not after
+    given, others = _read(frames, judge)
     start = start_sensor(template, given.size)
     if spacing_mm is not None:
         _check_spacing(spacing_mm, start, scene)
+    with storage_errors(out):
+        out.mkdir(parents=True, exist_ok=True)  # before minutes of work, not after
     print("synth: fitting the sensor to the frames", file=sys.stderr, flush=True)
     fit = fit_sensor(start, given, variant, spacing_mm, steps)
-    rendered = render_undeformed(fit.sensor, render_settings(template), variant)
-    rows, grids = {"frames": compare(given.encoded, rendered, fit.bare, fit.sensor)}, {"frames": fit.grid}
-    for path, other in others.items():
-        name = f"not fitted: {Path(path).name}"
-        _, grids[name], bare = find_grid(fit.sensor, other.encoded**fit.sensor.camera.gamma, None)
-        rows[name] = compare(other.encoded, rendered, bare, fit.sensor)
+    rows, grids = _compared(fit, render_undeformed(fit.sensor, render_settings(template), variant), given, others)
     found = verdict(rows, grids, fit.sensor, spacing_mm is not None)
-    content = fitted_content(template, fit, os.path.relpath(template.source.parent.resolve(), out.resolve()))
-    file = out / SCENE
-    try:
-        checked_template(content, file)
-    except InputError as error:
-        problem = str(error).replace(f"{file}: ", "")
-        raise InputError(f"the frames do not fit --scene {scene}: they give {problem}; {_WHAT_FRAMES}") from error
+    content = _checked_content(template, fit, out, scene)
     record = numbers(template.name, frames, fit, start, rows, found, given, time.perf_counter() - started)
     comment = f"# {MARK} --scene {scene}` to {len(frames)} frame(s); numbers in {NUMBERS}.\n"
-    replace_file(file, (comment + tomli_w.dumps(content)).encode())
+    replace_file(out / SCENE, (comment + tomli_w.dumps(content)).encode())
     replace_file(out / PICTURE, picture(rows, found.lines()[0]))
     replace_file(out / NUMBERS, (json.dumps(record, indent=1) + "\n").encode())
-    print(json.dumps(record) if as_json else "\n".join([*summary(record), f"written: {file}", *found.lines()]))
+    text = "\n".join([*summary(record), f"written: {out / SCENE}", *found.lines()])
+    print(json.dumps(record) if as_json else text)
     return 0 if found.good else 1
 
 
-def _check_spacing(spacing_mm: float, start: "Sensor", scene: str) -> None:
-    """Refuses what the dots' columns of this kind of sensor cannot be apart."""
-    from synth.scene import Dots
+def _check_places(template: Template, out: Path) -> None:
+    """Refuses round gels, and to write over what is not calibrate's own."""
+    gel = template.corners[0].sensor.gel
+    if not gel.is_flat:
+        raise InputError(f"{template.label}: sensor.gel.shape: calibrate fits flat gels only, not a {gel.shape}")
+    refuse_foreign(out / SCENE, MARK.encode(), out / PICTURE, out / NUMBERS)
+    if (out / SCENE).resolve() == template.source.resolve():
+        raise InputError(f"--out {out}: its {SCENE} is what --scene starts from and would be lost; give another --out")
 
+
+def _read(frames: Sequence[Path], judge: Sequence[Path]) -> tuple[Frames, dict[str, Frames]]:
+    """The frames to fit, and the others by path; all of one size."""
+    given, others = read_frames(frames), {str(path): read_frames([path]) for path in judge}
+    for name, other in others.items():
+        if other.size != given.size:
+            raise InputError(f"{name}: has {other.size} pixels, the frames that are fitted have {given.size}")
+    return given, others
+
+
+def _check_spacing(spacing_mm: float, start: Sensor, scene: str) -> None:
+    """Refuses what the dots' columns of this kind of sensor cannot be apart."""
     given = f"--spacing-mm = {spacing_mm:g}"
     if not isinstance(start.pattern, Dots):
         raise InputError(f"{given}: --scene {scene} has no dots; leave it out")
@@ -122,3 +116,29 @@ def _check_spacing(spacing_mm: float, start: "Sensor", scene: str) -> None:
             f"{given}: must be from {usual / _SPACINGS:.3g} to {usual * _SPACINGS:.3g} mm, the dots of --scene {scene} "
             f"being {usual:.3g} mm apart; take a preset that is more like your sensor, or change it with --set"
         )
+
+
+def _compared(
+    fit: SensorFit, rendered: FloatArray, given: Frames, others: dict[str, Frames]
+) -> tuple[dict[str, Comparison], dict[str, DotGridFit | None]]:
+    """Comparisons with the picture (H, W, 3) and grids of dots, of the fitted frames and of others, by name."""
+    rows, grids = {"frames": compare(given.encoded, rendered, fit.bare, fit.sensor)}, {"frames": fit.grid}
+    for path, other in others.items():
+        name = f"not fitted: {Path(path).name}"
+        _, grids[name], bare = find_grid(fit.sensor, other.encoded**fit.sensor.camera.gamma, None)
+        rows[name] = compare(other.encoded, rendered, bare, fit.sensor)
+    return rows, grids
+
+
+def _checked_content(template: Template, fit: SensorFit, out: Path, scene: str) -> dict[str, Any]:
+    """The fitted scene's content, refused with its reason where the schema does not allow what was found."""
+    content = fitted_content(template, fit, os.path.relpath(template.source.parent.resolve(), out.resolve()))
+    try:
+        checked_template(content, out / SCENE)
+    except InputError as error:
+        problem = str(error).replace(f"{out / SCENE}: ", "")
+        raise InputError(
+            f"the frames do not fit --scene {scene}: they give {problem}; they must be pictures of this kind of sensor "
+            "with its gel undeformed"
+        ) from error
+    return content

@@ -20,7 +20,7 @@ from synth.render.pattern import pixels_per_mm
 from synth.render.variant import Variant
 from synth.scene import Camera, Dots, Light, Sensor
 
-_PIXELS = 2500
+_PIXELS = 1200
 """Pixels that the lights are fitted to: the picture without dots is smooth."""
 _REACH_MM = 4.0
 """How far a light may move from the preset's place, along each axis."""
@@ -68,7 +68,9 @@ def fit_sensor(start: Sensor, frames: Frames, variant: Variant, spacing_mm: floa
     gel = FlatGel(sensor, pixels, variant)
     target = _target(smooth, sensor.camera, pixels)
     shines = np.array([light.color for light in sensor.lights]) > 0
-    fit = fit_lights(gel, target, _geometry(sensor.lights), shines, sensor.camera.vignetting, _bounds(sensor), steps)
+    fit = fit_lights(
+        gel, target, LightGeometry.of(sensor.lights), shines, sensor.camera.vignetting, _bounds(sensor), steps
+    )
     if steps > 0:
         clear = _clear_of_view(sensor, fit.geometry)
         again = fit_lights(gel, target, clear, shines, fit.vignetting, _bounds(sensor), 0)
@@ -152,19 +154,12 @@ def _sees_gel(sensor: Sensor) -> BoolArray:
     return np.asarray(inside.reshape(camera.height, camera.width))
 
 
-def _geometry(lights: tuple[Light, ...]) -> LightGeometry:
-    centre = np.array([light.position_mm for light in lights])
-    return LightGeometry(
-        centre, np.array([light.aim_mm for light in lights]) - centre, np.array([light.size_mm for light in lights])
-    )
-
-
 def _bounds(sensor: Sensor) -> Bounds:
     """Each light stays near its place, in the body, and on its side of what the camera sees of the contact face."""
     camera = sensor.camera
     u, v = np.meshgrid(np.linspace(0, camera.width, 5), np.linspace(0, camera.height, 5))
     seen = Optics.of(sensor).look(np.column_stack([u.ravel(), v.ravel()])).on_flat_face[:, :2]
-    geometry = _geometry(sensor.lights)
+    geometry = LightGeometry.of(sensor.lights)
     centre = geometry.centre
     low, high = centre - _REACH_MM, centre + _REACH_MM
     face = sensor.gel.size_mm[2] + sensor.window.thickness_mm
@@ -177,7 +172,7 @@ def _bounds(sensor: Sensor) -> Bounds:
         at = centre[:, axis]
         high[:, axis] = np.where(at < least, np.minimum(high[:, axis], least), high[:, axis])
         low[:, axis] = np.where(at > most, np.maximum(low[:, axis], most), low[:, axis])
-    return Bounds(low, high)
+    return low, high
 
 
 def _clear_of_view(sensor: Sensor, geometry: LightGeometry) -> LightGeometry:
@@ -186,7 +181,7 @@ def _clear_of_view(sensor: Sensor, geometry: LightGeometry) -> LightGeometry:
     for i, light in enumerate(sensor.lights):
         outward = centre[i, :2] / max(float(np.linalg.norm(centre[i, :2])), 1e-9)
         for _ in range(_LONGEST_PUSH):
-            moved = _placed(light, LightGeometry(centre, geometry.direction, geometry.size), i)
+            moved = _placed(light, replace(geometry, centre=centre), i)
             try:
                 check_view(sensor.model_copy(update={"lights": (moved,)}))
                 break
@@ -196,7 +191,7 @@ def _clear_of_view(sensor: Sensor, geometry: LightGeometry) -> LightGeometry:
 
 
 def _placed(light: Light, geometry: LightGeometry, i: int) -> Light:
-    """The light with the i-th place, direction and size; its aim stays as far away as it was."""
+    """The light with the i-th place, direction, size and angle; its aim stays as far away as it was."""
     direction = geometry.direction[i] / np.linalg.norm(geometry.direction[i])
     distance = float(np.linalg.norm(np.subtract(light.aim_mm, light.position_mm)))
     fields = {
@@ -204,7 +199,8 @@ def _placed(light: Light, geometry: LightGeometry, i: int) -> Light:
         "aim_mm": geometry.centre[i] + distance * direction,
         "size_mm": geometry.size[i],
     }
-    return light.model_copy(update={key: tuple(np.round(value, 4).tolist()) for key, value in fields.items()})
+    placed = {key: tuple(np.round(value, 4).tolist()) for key, value in fields.items()}
+    return light.model_copy(update=placed | {"viewing_angle_deg": round(float(geometry.viewing_angle_deg[i, 0]), 2)})
 
 
 def _shining(light: Light, power: FloatArray) -> Light:

@@ -203,7 +203,7 @@ def pinhole(sensor: Sensor) -> dict[str, Any]:
 
     Raises:
         InputError: the camera has a fisheye lens, a mirror, distortion, an aperture, pixels that are not square or a
-            round window before it.
+            round window before it, or a light is narrower than Lambertian.
     """
     optics, camera = Optics.of(sensor), sensor.camera
     need = f"needs LLVM 16 or newer, or an NVIDIA GPU, which this machine lacks ({LLVM_HINT})"
@@ -222,6 +222,9 @@ def pinhole(sensor: Sensor) -> dict[str, Any]:
         raise InputError(
             f"sensor.camera.fx = {camera.fx} and fy = {camera.fy} differ, which {need}; without, make them equal"
         )
+    for light in sensor.lights:
+        if light.narrowness:
+            raise InputError(f"viewing_angle_deg = {light.viewing_angle_deg} of a light {need}; without, set it to 120")
     frame = np.eye(4)
     # Mitsuba's camera looks along its z axis, with x to the left and y up.
     pose = optics.pose

@@ -2,9 +2,9 @@
 
 Their light goes straight to the gel: the face at which the camera's rays bend takes no part in the lighting.
 
-A rectangle of area A that emits the power Φ as a Lambertian source to one side has the radiance L = Φ / (π A).
-Its first size runs parallel to the contact face, its second at right angles to it and to the viewing direction; a light
-that shines straight down has its first size along x. Its back is black.
+A rectangle emits to one side (`synth.scene.Light.radiance`); its back is black. Its first size runs parallel to the
+contact face, its second at right angles to it and to its direction; a light that shines straight down has its first
+size along x.
 """
 
 from itertools import product
@@ -36,7 +36,7 @@ def emitters(lights: tuple[Light, ...], mi: Any) -> dict[str, Any]:
             "type": "rectangle",
             "to_world": mi.ScalarTransform4f(frame.tolist()),
             "bsdf": black,
-            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance(light).tolist()}},
+            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": list(light.radiance)}},
         }
     return shapes
 
@@ -63,11 +63,6 @@ def rectangles(lights: tuple[Light, ...]) -> FloatArray:
             side[:] = size * axis
         corner[:] = np.array(light.position_mm) - sides[0] / 2 - sides[1] / 2
     return found * MIRROR
-
-
-def radiance(light: Light) -> FloatArray:
-    """(3,) emitted to the light's front."""
-    return np.asarray(light.power / (np.pi * light.size_mm[0] * light.size_mm[1]) * np.array(light.color))
 
 
 def light_axes(light: Light) -> FloatArray:

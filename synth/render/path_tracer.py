@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from synth.render.lights import radiance, rectangles
+from synth.render.lights import rectangles
 from synth.render.window_images import all_lights, reflectance, reflecting_plane
 from synth.scene import Sensor
 
@@ -40,8 +40,10 @@ class PathTracer:
         self._before = dr.opaque(mi.UInt32, len(lights) // (2 if self._image else 1))  # images come last
         self._places = [mi.Float(column.ravel()) for column in rectangles(lights).astype(np.float32).swapaxes(0, 1)]
         self._areas = mi.Float([light.size_mm[0] * light.size_mm[1] for light in lights])
-        given = np.array([radiance(light)[: len(mi.Spectrum(0))] for light in lights], dtype=np.float32)
+        given = np.array([light.radiance[: len(mi.Spectrum(0))] for light in lights], dtype=np.float32)
         self._radiance = mi.Float(given.ravel())
+        narrowness = [light.narrowness for light in lights]
+        self._narrowness = mi.Float(narrowness) if any(narrowness) else None
 
     def radiance(self, ray: Any, sampler: Any, active: Any) -> tuple[Any, Any]:
         """Radiance (mi.Spectrum) along rays from the camera, and whether they meet the gel (mi.Bool)."""
@@ -120,6 +122,8 @@ class PathTracer:
         active = active & (front > 0)
         area = dr.gather(mi.Float, self._areas, number, active)
         given = dr.gather(mi.Spectrum, self._radiance, number, active)
+        if self._narrowness is not None:
+            given *= dr.power(dr.maximum(front, 0), dr.gather(mi.Float, self._narrowness, number, active))
         kept = dr.select(number < self._before, 1, reflectance(dr.abs(direction.z), self._index, mi))
         density = dr.select(active, square / (front * area * mi.Float(self._count)), 0)
         return dr.select(active, given * kept, 0), density

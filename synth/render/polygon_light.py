@@ -18,14 +18,14 @@ from numpy.polynomial import Chebyshev, Polynomial
 
 from synth.arrays import FloatArray
 from synth.render.gel_mesh import MIRROR
-from synth.render.lights import light_axes, radiance
+from synth.render.lights import light_axes
 from synth.render.window_images import reflectance
 from synth.scene import Light
 
 _DEGREE = 9
 """Of the polynomial: it errs by 2e-8, less than float32's rounding."""
 _STRATA = 2
-"""Points of a mirror image for each of a pixel's samples, spread along its first side."""
+"""Points of a light without closed form for each of a pixel's samples, spread along its first side."""
 
 
 class PolygonLight:
@@ -50,7 +50,7 @@ class PolygonLight:
         self._corner, self._sides = self._corners[0], (vector(first), vector(second))
         self._front = vector(direction)
         self._area = dr.opaque(mi.Float, width * height)
-        self.radiance = [dr.opaque(mi.Float, float(value)) for value in radiance(light)]
+        self.radiance = [dr.opaque(mi.Float, value) for value in light.radiance]
 
     def whole(self, point: Any, normal: Any, offset: Any) -> Any:
         """Irradiance per radiance (mi.Float) of surface points with unit normals where nothing stands in between.
@@ -106,17 +106,23 @@ class PolygonLight:
         return 0.5 * dr.abs(total)
 
 
-class ImageLight(PolygonLight):
-    """A light's mirror image behind the window's outer face (`synth.render.window_images`).
+class SampledLight(PolygonLight):
+    """A light without a closed form: narrower than Lambertian, or a mirror image (`synth.render.window_images`).
 
-    What of it arrives depends on the angle at the face, so `whole` is no closed form but the mean over a few points.
+    What of an image arrives depends on the angle at the window's face. `whole` is the mean over a few points.
+
+    Args:
+        light: with power.
+        index: of the window, for an image.
+        mi: the Mitsuba module, of a vectorised variant.
     """
 
-    def __init__(self, light: Light, index: float, mi: Any) -> None:
+    def __init__(self, light: Light, index: float | None, mi: Any) -> None:
         import drjit as dr
 
         super().__init__(light, mi)
-        self._index = dr.opaque(mi.Float, index)
+        self._index = None if index is None else dr.opaque(mi.Float, index)
+        self._narrowness = dr.opaque(mi.Float, light.narrowness) if light.narrowness else None
 
     def whole(self, point: Any, normal: Any, offset: Any) -> Any:
         parts = [
@@ -128,7 +134,12 @@ class ImageLight(PolygonLight):
         import drjit as dr
 
         place, value = super().sample(point, normal, offset)
-        return place, value * reflectance(dr.abs(dr.normalize(place - point).z), self._index, self._mi)
+        away = dr.normalize(place - point)
+        if self._narrowness is not None:
+            value *= dr.power(dr.maximum(-dr.dot(away, self._front), 0), self._narrowness)
+        if self._index is not None:
+            value *= reflectance(dr.abs(away.z), self._index, self._mi)
+        return place, value
 
 
 _CORNERS = ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))

@@ -37,7 +37,7 @@ from synth.errors import InputError
 from synth.render.cavity_light import across_cavity
 from synth.render.gel_mesh import GelMesh
 from synth.render.lights import reaches
-from synth.render.polygon_light import ImageLight, PolygonLight
+from synth.render.polygon_light import PolygonLight, SampledLight
 from synth.render.variant import Variant
 from synth.render.window_images import image_lights, reflectance, reflecting_plane
 from synth.scene import Coating, Render, Sensor
@@ -113,8 +113,9 @@ class SeparatedLight:
         # Used only where the window reflects.
         self._face, self._index = dr.opaque(mi.Float, reflecting_plane(sensor) or 0), dr.opaque(mi.Float, index)
         size = sensor.gel.size_mm
-        self._lights = [PolygonLight(light, mi) for light in sensor.lights if reaches(light, size)]
-        self._lights += [ImageLight(light, index, mi) for light in image_lights(sensor) if reaches(light, size)]
+        own = [light for light in sensor.lights if reaches(light, size)]
+        self._lights = [SampledLight(light, None, mi) if light.narrowness else PolygonLight(light, mi) for light in own]
+        self._lights += [SampledLight(light, index, mi) for light in image_lights(sensor) if reaches(light, size)]
         self._half = [dr.opaque(mi.Float, side / 2) for side in size[:2]]
 
     def prepare(self, mesh: GelMesh, primary: int, seed: int) -> None:

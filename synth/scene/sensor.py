@@ -67,7 +67,7 @@ class Coating(Part):
 
 
 class Light(Part):
-    """A rectangular LED inside the index-matched body, radiating as a Lambertian area toward aim_mm.
+    """A rectangular LED inside the index-matched body, radiating toward aim_mm.
 
     It may also stand in the air that a round window encloses; its light goes on straight at the window's face.
 
@@ -81,6 +81,21 @@ class Light(Part):
     color: Color
     power: NonNegative
     """Radiant power, in units in which exposure 1 maps a radiance of 1 to full scale."""
+    viewing_angle_deg: Annotated[float, Field(ge=10, le=120)] = 120.0
+    """Full angle, as in data sheets: half of it off the aim the intensity is half of that along it. 120: Lambertian."""
+
+    @property
+    def narrowness(self) -> float:
+        """Exponent k of the radiance cos^k θ at the angle θ off the aim; 0 for a Lambertian LED."""
+        wide = self.viewing_angle_deg == 120
+        return 0.0 if wide else -math.log(2) / math.log(math.cos(math.radians(self.viewing_angle_deg / 2))) - 1
+
+    @property
+    def radiance(self) -> Vector3:
+        """Along the aim, by channel: the power is its integral of cos^(k + 1) θ over area and hemisphere."""
+        width, height = self.size_mm
+        level = self.power * (self.narrowness + 2) / (2 * math.pi * width * height)
+        return (level * self.color[0], level * self.color[1], level * self.color[2])
 
 
 class Sensor(Part):

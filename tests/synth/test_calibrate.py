@@ -3,7 +3,9 @@
 import json
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -37,7 +39,7 @@ CLIPS = Path(__file__).parents[3] / "shared/real/gelsight_mini/clips"
 POWERS = np.array([[420.0, 80, 30], [60, 390, 90], [45, 120, 510]])
 
 
-def _start(**coating: float) -> Sensor:
+def _start(**coating: Any) -> Sensor:
     """Three white lights around a dotted pad of 12 x 9 mm at 160 x 120 px."""
     places = [(7.0, 0.5, 3.0), (-4.0, 5.6, 4.0), (-3.5, -5.6, 2.5)]
     lights = tuple(Light(position_mm=p, size_mm=(1.5, 0.6), color=(1, 1, 1), power=300) for p in places)
@@ -131,24 +133,48 @@ def test_a_known_spacing_gives_the_focal_length() -> None:
 
 
 @needs_llvm
+@pytest.mark.parametrize("angle", [120.0, 50.0])
 @pytest.mark.parametrize("coating", [{}, {"roughness": 0.5, "metallic": 0.6}], ids=["matt", "metallic"])
-def test_contributions_are_what_the_renderer_renders(coating: dict[str, float]) -> None:
+def test_contributions_are_what_the_renderer_renders(coating: dict[str, float], angle: float) -> None:
     """They share Mitsuba's BSDF and the rays, not the integral."""
     sensor = _start(**coating)
-    light = sensor.lights[1].model_copy(update={"power": 200.0, "size_mm": (3.0, 0.5)})
+    light = sensor.lights[1].model_copy(update={"power": 200.0, "size_mm": (3.0, 0.5), "viewing_angle_deg": angle})
     dark = light.model_copy(update={"position_mm": (-3.0, 4.8, 2.2), "size_mm": (3.0, 0.6), "power": 1e-9})
     sensor = sensor.model_copy(update={"lights": (light, dark)})  # the second shades a part of what the first lights
     surface = flat_surface(sensor.gel.size_mm)
     plain = np.full((4, 4, 3), 0.6, dtype=np.float32)
-    render = Render(samples_per_pixel=256, max_depth=2)
+    render = Render(samples_per_pixel=256, max_depth=2 if coating else 3)  # a matt gel lights itself by the window
     image = Renderer(sensor, render, surface, plain, FAST).radiance(surface.material, 0)
     columns, rows = (axis.ravel() for axis in np.meshgrid(np.arange(2, 160, 8), np.arange(2, 120, 8)))
     gel = FlatGel(sensor, np.column_stack([columns, rows]) + 0.5, FAST)
-    lit = 200 * gel.contributions(_geometry(sensor))[0]
+    lit = 200 * gel.contributions(LightGeometry.of(sensor.lights))[0]
     # Half of 256 samples, stratified, leave some 1 % at a pixel and 0.1 % in the mean over 300 pixels. The shade, 20 %
     # of the light, has an edge that the light's 24 cells resolve in steps of 4 %: below 1 % of the mean remains.
     assert lit.mean(axis=0) == pytest.approx(image[rows, columns].mean(axis=0), rel=0.012)
     assert np.median(np.abs(lit / image[rows, columns] - 1)) < 0.02
+
+
+@needs_llvm
+def test_a_matt_gel_is_lit_by_itself_by_way_of_the_window() -> None:
+    """The renderer samples the paths whose integral is taken here: what a third surface adds to two."""
+    window = _start().window.model_copy(
+        update={"thickness_mm": 1.2, "refractive_index": 2.0}
+    )  # total beyond 30 degrees
+    bright, dim = (_start(reflectance=(value,) * 3).model_copy(update={"window": window}) for value in (0.9, 0.45))
+    surface, plain = flat_surface(bright.gel.size_mm), np.full((4, 4, 3), 0.9, dtype=np.float32)
+    columns, rows = (axis.ravel() for axis in np.meshgrid(np.arange(2, 160, 8), np.arange(2, 120, 8)))
+    direct, both = (
+        Renderer(bright, Render(samples_per_pixel=64, max_depth=depth, light="separated"), surface, plain, FAST)
+        .radiance(surface.material, 0)[rows, columns, 0]
+        .mean()
+        for depth in (2, 3)
+    )
+    pixels, lights = np.column_stack([columns, rows]) + 0.5, LightGeometry.of(bright.lights)
+    lit = [300 * FlatGel(sensor, pixels, FAST).contributions(lights).sum(axis=0).mean() for sensor in (bright, dim)]
+    # Direct light is proportional to the reflectance, what comes back to its square. Lights near the window shade their
+    # images, which is left out here: 3 % of the light.
+    assert both > 1.1 * direct
+    assert 2 * (lit[0] - 2 * lit[1]) == pytest.approx(both - direct, rel=0.05)
 
 
 @needs_llvm
@@ -157,27 +183,22 @@ def test_derivatives_agree_with_finite_differences(index: float) -> None:
     start = _start()
     sensor = start.model_copy(update={"window": start.window.model_copy(update={"refractive_index": index})})
     columns, rows = (axis.ravel() for axis in np.meshgrid(np.arange(2, 160, 16), np.arange(2, 120, 16)))
-    gel, geometry = FlatGel(sensor, np.column_stack([columns, rows]) + 0.5, FAST), _geometry(sensor)
+    gel, geometry = FlatGel(sensor, np.column_stack([columns, rows]) + 0.5, FAST), LightGeometry.of(sensor.lights)
+    geometry = replace(geometry, viewing_angle_deg=np.array([[119.0], [60.0], [30.0]]))
     exact = gel.derivatives(geometry)
     step = 0.02
-    for number in range(8):
-        name, axis = [("centre", number), ("direction", number - 3), ("size", number - 6)][(number > 2) + (number > 5)]
+    parts = (("centre", 3), ("direction", 3), ("size", 2), ("viewing_angle_deg", 1))
+    for number, (name, axis) in enumerate((name, axis) for name, count in parts for axis in range(count)):
         lit = []
         for sign in (1, -1):
             moved = getattr(geometry, name).copy()
             moved[:, axis] += sign * step
-            lit.append(gel.contributions(LightGeometry(**{**vars(geometry), name: moved})))
+            lit.append(gel.contributions(replace(geometry, **{name: moved})))
         difference = (lit[0] - lit[1]) / (2 * step)
         # Central differences err by step² / 6 times a third derivative of order E / (3 mm)³: 2e-5; float32 less.
         error = np.abs(exact[:, number] - difference) / np.abs(exact).max()
         # A window's reflectance rises with infinite slope at the critical angle, in one or two of a light's 24 cells.
         assert (error if index == 1 else np.percentile(error, 80)).max() < 3e-3
-
-
-def _geometry(sensor: Sensor) -> LightGeometry:
-    centre = np.array([light.position_mm for light in sensor.lights])
-    aim, size = ([getattr(light, name) for light in sensor.lights] for name in ("aim_mm", "size_mm"))
-    return LightGeometry(centre, np.array(aim) - centre, np.array(size))
 
 
 @needs_llvm

@@ -1,5 +1,6 @@
 """Marks brighter than the coating, and which frames a calibration says are no good."""
 
+import json
 from pathlib import Path
 
 import cv2
@@ -129,3 +130,13 @@ def test_the_white_dots_of_a_real_gel_are_found_and_its_press_refused() -> None:
 def test_a_real_bare_gel_at_rest_passes_and_pressed_ones_do_not(tmp_path: Path, frame: str, status: int) -> None:
     path = str(REAL / f"other_sensors/{frame}.png")
     assert main(["calibrate", "--scene", "digit", "--frames", path, "--steps", "4", "--out", str(tmp_path)]) == status
+
+
+@needs_llvm
+@needs_recordings
+def test_the_scene_of_a_photographed_digit_meets_the_photograph(tmp_path: Path) -> None:
+    """Without moving its lights; with the camera's noise, 2.2, 1.4 and 2.6 levels, which no scene explains."""
+    path = str(REAL / "other_sensors/digit/rest.png")
+    main(["calibrate", "--scene", "digit_calibrated", "--frames", path, "--steps", "0", "--out", str(tmp_path)])
+    found = json.loads((tmp_path / "calibration.json").read_text())["verdict"]["residual_levels"]
+    assert max(found.values()) < 4.8

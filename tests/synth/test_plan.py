@@ -126,7 +126,8 @@ def test_shipped_scenes_are_planned_and_buildable(name: str) -> None:
     cameras = [c.sensor.camera for c in template.corners]
     plain = all(c.lens == "pinhole" and c.fx == c.fy and not any(c.distortion) for c in cameras)
     sensor = template.corners[0].sensor
-    if sensor.mirrors or sensor.window.is_round or not plain:
+    narrow = any(light.narrowness for light in sensor.lights)
+    if sensor.mirrors or sensor.window.is_round or narrow or not plain:
         with pytest.raises(InputError, match="needs LLVM"):
             check_buildable(template, SCALAR)
     else:

@@ -137,3 +137,29 @@ def test_what_shines_is_refused_and_scalar_variants_path_trace() -> None:
         rendered(shining, render=Render(light="separated"))
     images = [rendered(sensor, render=Render(light=one), variant=SCALAR) for one in ("separated", "path_traced")]
     np.testing.assert_array_equal(*images)
+
+
+@needs_llvm
+@pytest.mark.parametrize("index", [1.0, 1.45])
+def test_a_narrow_light_is_the_same_separated_and_path_traced(index: float) -> None:
+    """Two integrals over one light, in columns of the picture."""
+    light = Light(position_mm=(6.5, 1, 3), size_mm=(2, 1), color=(1, 0.5, 0.2), power=300, viewing_angle_deg=40)
+    sensor = small_sensor(index, None, (light,))
+    separated, traced = (
+        rendered(sensor, None, Render(samples_per_pixel=count, max_depth=2, light=kind), FAST).mean(axis=0)
+        for kind, count in (("separated", 64), ("path_traced", 256))
+    )
+    assert separated.max() > 3 * separated.min()
+    # A pixel's error is below 5 % of it; the mean of a column of 60 is known within 0.7 %.
+    np.testing.assert_allclose(traced, separated, rtol=0.02)
+
+
+def test_a_lights_power_is_what_its_radiance_sums_to() -> None:
+    """Midpoint rule over the hemisphere of cos^(k + 1) θ, which is half of its value at half the viewing angle."""
+    for angle in (120.0, 60.0, 15.0):
+        light = Light(position_mm=(0, 0, 3), size_mm=(2, 0.5), color=(1, 1, 1), power=7, viewing_angle_deg=angle)
+        theta = (np.arange(20000) + 0.5) / 20000 * np.pi / 2
+        intensity = np.cos(theta) ** (light.narrowness + 1)
+        assert np.cos(np.radians(angle / 2)) ** (light.narrowness + 1) == pytest.approx(0.5)
+        solid = 2 * np.pi * np.sin(theta) * np.pi / 2 / 20000
+        assert light.radiance[0] * 2 * 0.5 * (intensity * solid).sum() == pytest.approx(7, rel=1e-6)

@@ -27,7 +27,7 @@ from synth.scene.template import SCENES, Template, load_scene
 from synth.simulate.indenter import turned_by
 
 WIDE = ["gelsight_mini", "deltact", "gelsight"]  # Scenes of six kinds of indenter and motions up to 25 px
-OPTICAL = ["gelslim", "gelstereo", "tac3d", "fingervision", "digit", "soft_bubble"]
+OPTICAL = ["gelslim", "gelstereo", "tac3d", "fingervision", "digit", "digit_calibrated", "soft_bubble"]
 NAMES = [*WIDE, *OPTICAL, "gelsight_fingertip"]
 ROUND = {"allsight": 0.8, "densetact": 0.95, "omnitact": 1.0}  # Share of an image that shows gel
 CAMERAS = {"gelstereo": ["right"], "omnitact": ["east", "west", "south", "north"]}
