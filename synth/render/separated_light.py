@@ -32,12 +32,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.arrays import BoolArray, Image
+from synth.arrays import BoolArray
 from synth.errors import InputError
 from synth.render.cavity_light import across_cavity
 from synth.render.gel_mesh import GelMesh
 from synth.render.lights import reaches
 from synth.render.polygon_light import PolygonLight, SampledLight
+from synth.render.projection import projected
 from synth.render.variant import Variant
 from synth.render.window_images import image_lights, reflectance, reflecting_plane
 from synth.scene import Coating, Render, Sensor
@@ -227,7 +228,7 @@ class SeparatedLight:
         points = self._points(dr.arange(mi.UInt32, faces), count, sampler)
         top = np.array(self._parameters["gel.vertex_positions"])[2::3].max() + _CLEARANCE_MM
         parts = self._bounces(points, sampler, dr.opaque(mi.Float, float(top)))
-        values = _projected(parts, points.weights, count, often)
+        values = projected(parts, points.weights, count, often)
         if self._is_round:
             positions, normals = (
                 np.array(self._parameters[f"gel.vertex_{name}"], dtype=np.float64).reshape(-1, 3)
@@ -337,19 +338,3 @@ class SeparatedLight:
 def _grid(rays: int, faces: int) -> int:
     """Rays of each face, of about so many in all."""
     return (_STEP * max(1, round(math.sqrt(rays / faces) / _STEP))) ** 2
-
-
-def _projected(values: list[Any], weights: tuple[Any, Any, Any], count: int, is_linear: BoolArray) -> Image:
-    """Corner values (faces, channels, 3) of the functions nearest to samples of evenly distributed points.
-
-    The corners' functions φ have the mass matrix A/12 (1 + I), whose inverse makes of the means m_i of φ_i f the
-    values 12 m_i - 3 Σ m. The nearest constant is Σ m, since Σ φ = 1.
-    """
-    import drjit as dr
-
-    parts = [value * weight for value in values for weight in weights]
-    dr.eval(parts)
-    means = np.stack([np.array(dr.block_sum(part, count)) for part in parts], axis=-1) / count
-    means = means.reshape(-1, len(values), 3)
-    whole = means.sum(axis=2, keepdims=True)
-    return np.where(is_linear[:, None, None], 12 * means - 3 * whole, whole).astype(np.float32)
