@@ -51,9 +51,8 @@ def mesh_of(scene: Scene, family: str, edge_mm: float) -> PadMesh:
     face = face_of(gel)
     assert isinstance(face, CapsuleFace)
     surface, triangles = face.triangles(SURFACE * COARSE_MM / 2)
-    points, tets = tetrahedralise(
-        surface, triangles, face.sides, _background(gel.size_mm, edge_mm), face.volume_mm3, CHORDS
-    )
+    sizes = _background(gel.size_mm, edge_mm)
+    points, tets = tetrahedralise(surface, triangles, face.sides, sizes, face.volume_mm3, CHORDS)
     return PadMesh(points, tets, gel.size_mm, face=face)
 
 
@@ -102,9 +101,8 @@ def main(argv: list[str]) -> int:
         errors = {"flow_percent": 100 * float(share), "largest_px": float(np.nanmax(off))}
         return {"elements": elements, "seconds": seconds, **errors, "force_percent": 100 * float(lack)}
 
-    cases = [{"family": "even", "edge_mm": edge} for edge in EVEN]
-    cases += [{"family": "whole", "edge_mm": 1.6}]
-    cases += [{"family": "finer at the contact", "edge_mm": edge} for edge in FINER]
+    settings = [*(("even", edge) for edge in EVEN), ("whole", 1.6), *(("finer at the contact", edge) for edge in FINER)]
+    cases = [{"family": family, "edge_mm": edge} for family, edge in settings]
     rows = measure(given.out / "round_gel.csv", cases, row)
     print(machine())
     show(rows, list(rows[0]), "Error of a round gel's flow")

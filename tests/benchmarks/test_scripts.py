@@ -6,6 +6,7 @@ import pytest
 from render_scenes import needs_llvm
 from tiny_scene import TEXT, own_cache, write_tiny
 
+from benchmarks import round_gel
 from benchmarks.__main__ import main
 from benchmarks.draws import summaries, together
 from benchmarks.render import DEEPEST, settings
@@ -113,6 +114,15 @@ def test_flow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert (out / "flow.png").read_bytes().startswith(b"\x89PNG")
     monkeypatch.setattr("benchmarks.flow.FLOW_TOLERANCE_PX", 0.0)
     assert main(["flow", scene, "--out", str(out)]) == 1
+
+
+@pytest.mark.slow
+def test_round_gel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, edges_mm in {"EVEN": (3.0, 1.6), "FINER": (), "REFERENCE": 1.0}.items():
+        monkeypatch.setattr(round_gel, name, edges_mm)
+    ((coarse, even, whole),) = again(["round_gel"], tmp_path / "out", "round_gel.csv")
+    assert even["flow_percent"] < coarse["flow_percent"]
+    assert even["flow_percent"] == pytest.approx(whole["flow_percent"], rel=0.1)
 
 
 def test_scale(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
