@@ -51,11 +51,11 @@ _STEP = 4
 """Bounced rays of a face are squares of its multiples: a sampler's size is compiled into the kernel."""
 _DEGREE = 4
 """Of the polynomials for light that comes back from the window: its path is longer than the pad is thick, so smooth."""
-_RETURNED = 2**15
+_RETURNED = 2**17
 """Paths by the window, to which they are fitted; more where there are many faces."""
 _CLEARANCE_MM = 1e-3
 """Above the gel, where rays to it may end: far more than rounding."""
-_NEGLIGIBLE = 1e-3
+_NEGLIGIBLE = 1e-4
 """Of all light on a point: shadows of so little are not sampled."""
 _SHIFT = (0.7548776662466927, 0.5698402909980532)
 """Of one light's shadow rays against the one before's: R2 sequence (Roberts 2018), on a torus to keep the strata."""
