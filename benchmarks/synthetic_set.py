@@ -1,8 +1,7 @@
-"""Generates the test set of docs/reports/gelflow.md: 20 pairs of every shipped scene, from 5 trajectories each.
+"""Generates the test set of docs/reports/gelflow.md: 20 pairs of every shipped scene, as `generate` makes them.
 
-Every trajectory has a sensor of its own; all but the main camera are left out and the contact channel is written.
-Meshes are those of a target error of 1 px, coarser than most scenes ask for: the flow is exact for the surface that was
-rendered, however coarse. Seed 77 is used nowhere else. Further options go to `synth generate`. Run again, it goes on.
+Every trajectory has a sensor of its own; all but the main camera are left out and the contact channel is written. Seed
+77 is used nowhere else. Further options go to `synth generate`. Run again, it goes on.
 """
 
 from pathlib import Path
@@ -11,10 +10,7 @@ from benchmarks.rows import arguments
 from synth.cli import main as synth
 from synth.scene.template import shipped_scenes
 
-CHANGES = (
-    "sampling.pairs_per_trajectory=4", "sampling.trajectories_per_sensor=1", "numerics.target_error_px=1.0",
-    "outputs.contact=true", "sensor.further_cameras=[]",
-)  # fmt: skip
+CHANGES = ("sampling.trajectories_per_sensor=1", "outputs.contact=true", "sensor.further_cameras=[]")
 
 
 def main(argv: list[str]) -> int:
