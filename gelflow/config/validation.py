@@ -11,9 +11,13 @@ from gelflow.errors import InputError
 Config = TypeVar("Config", bound=BaseModel)
 
 RETIRED: Mapping[str, tuple[Any, ...]] = {
-    "loss.lambda_ph": (1,), "loss.lambda_census": (0,), "loss.mask_outside": (True,), "compile": (False, True),
+    "finest_scale": (2,), "correlation_radius": (4,), "normalise_features": (True,), "lffm_region": (3,),
+    "lffm_scale": ("inverse_sqrt",), "refine_iterations": (3,), "loss.lambda_ph": (1,), "loss.lambda_census": (0,),
+    "loss.mask_outside": (True,), "loss.flow_normalisation": ("min_side",), "loss.ratio": ("product",),
+    "loss.weight": ("anti_edge",), "loss.weight_floor": (0.1,), "compile": (False, True),
 }  # fmt: skip
-"""Settings of earlier versions, which weights and runs record, with the values that mean what every run does now."""
+"""Settings of earlier versions, which weights and runs record, with the values that mean what every run does now; those
+of a model by their names alone."""
 
 
 def validated(kind: type[Config], values: Mapping[str, Any], source: str) -> Config:
@@ -51,7 +55,7 @@ def _whole(value: Any, place: str = "") -> Any:
         return {
             name: _whole(part, f"{place}{name}.")
             for name, part in value.items()
-            if part not in RETIRED.get(f"{place}{name}", ())
+            if part not in RETIRED.get(f"{place}{name}".removeprefix("model."), ())
         }
     if isinstance(value, (list, tuple)):
         return [_whole(part) for part in value]
