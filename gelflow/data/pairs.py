@@ -170,28 +170,6 @@ def _channels_first(array: NDArray[np.float32]) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(np.moveaxis(array, -1, 0)))
 
 
-def join(datasets: Sequence[PairDataset]) -> PairDataset:
-    """Several data sets as one, in order; with more than one, names begin with the folder's name.
-
-    Raises:
-        InputError: There is none.
-    """
-    if not datasets:
-        raise InputError("no data set given")
-    if len(datasets) == 1:
-        return datasets[0]
-    records: list[PairRecord] = []
-    taken: set[str] = set()
-    for dataset in datasets:
-        label = stem = Path(dataset.source).name
-        number = 2
-        while label in taken:
-            label, number = f"{stem}-{number}", number + 1
-        taken.add(label)
-        records += [replace(record, name=f"{label}/{record.name}") for record in dataset.records]
-    return PairDataset(", ".join(dataset.source for dataset in datasets), records)
-
-
 def read_markers(path: Path) -> MarkerArray:
     """Reads tracked dots from a CSV file with the columns x1, y1, x2, y2 (px).
 
