@@ -13,15 +13,7 @@ from gelflow.errors import InputError
 
 
 def pair_records(folder: Path) -> list[PairRecord]:
-    """The pairs of a folder, recognised by what lies in it, or of one shard.
-
-    Args:
-        folder: A data set of synth (dataset.json), a pair set (pairs.json), a folder of NAME_1.png and NAME_2.png, or
-            a folder of WebDataset shards (*.tar) or one of them.
-
-    Raises:
-        InputError: There is no such folder, it is none of these or empty, or it is damaged.
-    """
+    """The pairs of a folder, recognised by what lies in it, or of one shard; see `PairDataset`."""
     if not folder.is_dir() and not shard_files(folder):
         if folder.exists():
             raise InputError(
@@ -61,11 +53,7 @@ def open_all(paths: Sequence[Path]) -> PairDataset:
 
 
 def _folder_records(folder: Path) -> list[PairRecord]:
-    """The pairs NAME_1.png and NAME_2.png of a folder, by name, with NAME_markers.csv where dots were tracked.
-
-    Raises:
-        InputError: One of the two images of a pair is missing.
-    """
+    """The pairs NAME_1.png and NAME_2.png of a folder, by name, with NAME_markers.csv where dots were tracked."""
     stems = {path.name[: -len("_1.png")] for path in (*folder.glob("*_1.png"), *folder.glob("*_2.png"))}
     records = []
     for name in sorted(stems):

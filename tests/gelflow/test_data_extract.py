@@ -141,7 +141,7 @@ def test_blank_frames_exposure_ramps_still_repeated_and_unrelated_frames_are_no_
 def test_inputs_are_found_by_file_folder_and_pattern_and_those_that_hold_nothing_are_named(tmp_path, videos) -> None:
     expected = [("a", videos / "a.avi"), ("b", videos / "b.avi")]
     for inputs in ([str(videos)], [f"{videos}/*.avi"], [str(videos / "b.avi"), str(videos / "a.avi")]):
-        assert [(r.name, r.path) for r in find_recordings(inputs)] == expected
+        assert list(find_recordings(inputs).items()) == expected
     empty = tmp_path / "empty"
     empty.mkdir()
     (empty / "notes.txt").touch()
