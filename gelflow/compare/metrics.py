@@ -29,15 +29,9 @@ def endpoint_error(flow: FlowArray, truth: FlowArray) -> NDArray[np.float64]:
 
 
 def flow_errors(flow: FlowArray, truth: FlowArray, visible: MaskArray) -> dict[str, float]:
-    """Endpoint errors and shares of outliers over the pixels where the truth is finite and visible.
+    """Endpoint errors over the pixels where the truth is finite and visible, by the names of `scores.Measures`.
 
-    Args:
-        flow: Estimate, (H, W, 2) px. A NaN in it is an outlier at both limits and makes mean and median NaN.
-        truth: Exact flow, (H, W, 2) px, NaN where no gel is seen.
-        visible: (H, W) bool.
-
-    Returns:
-        By the names of `gelflow.compare.scores.Measures`.
+    A NaN in the estimate is an outlier at both limits and makes mean and median NaN.
 
     Raises:
         InputError: The shapes differ, or no pixel can be compared.
@@ -68,7 +62,7 @@ def ssim(grey: Grey8, other: Grey8) -> float:
 
 
 def ssim_map(grey: Grey8, other: Grey8) -> NDArray[np.float64]:
-    """Structural similarity at each pixel of two grey 8-bit images, (H, W), as stated at the top of this module."""
+    """Structural similarity at each pixel of two grey 8-bit images, (H, W)."""
     import cv2
 
     def blurred(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -104,7 +104,7 @@ class MethodScore(Measures):
 def score_pair(method: Method, dataset: PairDataset, index: int) -> PairScore:
     """Runs a method on one pair and scores it; where it finds nothing to follow, it is scored as no motion.
 
-    To leave it out there would make a method that gives up look better than one that tries.
+    Otherwise a method that gives up would look better than one that tries.
 
     Raises:
         InputError: The pair cannot be read, or the method cannot work on it; the message names the pair.
@@ -184,9 +184,6 @@ def evaluate(
     """Scores a method on all pairs, in order; `progress` is called after each.
 
     The first pair is estimated once before, untimed: libraries and devices take longer the first time.
-
-    Raises:
-        InputError: A pair cannot be read, or the method cannot work on it.
     """
     scores = []
     with suppress(InputError):  # is raised again, with the pair's name, when the pair is scored

@@ -7,6 +7,7 @@ that they belong to; scale s has 1/2^s of the image's resolution.
 
 from __future__ import annotations
 
+from operator import gt
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -237,12 +238,8 @@ class TrainConfig(_Frozen):
         for name, size in (("image_size", self.image_size), ("crop_size", self.crop_size)):
             if size is not None and min(size) < MINIMUM_SIDE:
                 raise ValueError(f"{name} = {list(size)}: each side must be at least {MINIMUM_SIDE} px")
-        if self.image_size and self.crop_size and _exceeds(self.crop_size, self.image_size):
+        if self.image_size and self.crop_size and any(map(gt, self.crop_size, self.image_size)):
             raise ValueError(f"crop_size = {list(self.crop_size)} does not fit into image_size {list(self.image_size)}")
         if self.warmup_steps >= self.steps:
             raise ValueError(f"warmup_steps = {self.warmup_steps} must be below steps = {self.steps}")
         return self
-
-
-def _exceeds(inner: tuple[int, int], outer: tuple[int, int]) -> bool:
-    return inner[0] > outer[0] or inner[1] > outer[1]

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from typing import Any, TypeGuard, TypeVar, get_args
+from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 
@@ -62,14 +62,11 @@ def _whole(value: Any, place: str = "") -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def _is_table(annotation: Any) -> TypeGuard[type[BaseModel]]:
-    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
-
-
 def _fields_at(kind: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
     for name in location:
         annotation = kind.model_fields[str(name)].annotation
-        tables = [part for part in (annotation, *get_args(annotation)) if _is_table(part)]
+        parts = (annotation, *get_args(annotation))
+        tables = [part for part in parts if isinstance(part, type) and issubclass(part, BaseModel)]
         if not tables:
             return []
         kind = tables[0]

@@ -98,21 +98,13 @@ class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
         return hashlib.sha256(json.dumps(known).encode()).hexdigest()
 
     def images(self, index: int) -> tuple[ImageArray, ImageArray]:
-        """Both images of a pair, (H, W, 3) float32 in [0, 1].
-
-        Raises:
-            InputError: An image is missing, damaged or too small, or the two differ in size.
-        """
+        """Both images of a pair, (H, W, 3) float32 in [0, 1]; exceptions as for `gelflow.files.image.read_pair`."""
         record = self.records[index]
         # Of a path, read_pair asks for is_file, read_bytes and its text: all that a member of a shard has, too.
         return read_pair(cast(Path, record.image1), cast(Path, record.image2))
 
     def truth(self, index: int) -> FlowField | None:
-        """Exact flow (H, W, 2) in px and its visibility (H, W) bool; None where the pair has none.
-
-        Raises:
-            InputError: The file is missing or damaged, or lacks this direction.
-        """
+        """Exact flow of a pair; None where it has none. InputError: a file that is damaged or lacks this direction."""
         record = self.records[index]
         if record.flow is None:
             return None
@@ -122,11 +114,7 @@ class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
         return read_flow(record.flow, direction)
 
     def markers(self, index: int) -> MarkerArray | None:
-        """Tracked dots of a pair, (N, 4) float64: x1, y1, x2, y2 in px; None where the pair has none.
-
-        Raises:
-            InputError: The CSV file lacks a column or holds something other than numbers.
-        """
+        """Tracked dots of a pair, None where it has none; exceptions as for `read_markers`."""
         record = self.records[index]
         if record.markers is None:
             return None
@@ -134,11 +122,7 @@ class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
         return markers[:, [2, 3, 0, 1]] if record.exchanged else markers
 
     def __getitem__(self, index: int) -> dict[str, Tensor | str | bool]:
-        """The sample that the class describes.
-
-        Raises:
-            InputError: A file of the pair is missing or damaged, or the sizes differ.
-        """
+        """The sample that the class describes; InputError where a file is missing or damaged, or the sizes differ."""
         record = self.records[index]
         images = self.images(index)
         size = images[0].shape[:2]
@@ -172,9 +156,6 @@ def _channels_first(array: NDArray[np.float32]) -> Tensor:
 
 def read_markers(path: Path) -> MarkerArray:
     """Reads tracked dots from a CSV file with the columns x1, y1, x2, y2 (px).
-
-    Returns:
-        (N, 4) float64: x1, y1, x2, y2.
 
     Raises:
         InputError: The file is missing, lacks a column or a row, or holds something other than finite numbers.

@@ -13,11 +13,7 @@ from gelflow.ops.gradients import forward_differences, window_slopes
 
 
 def area_ratio(flow: Flow) -> Tensor:
-    """R at the pixels that have all eight neighbours.
-
-    Returns:
-        (B, 1, H-2, W-2), without unit; 1 where nothing is stretched.
-    """
+    """R at the pixels that have all eight neighbours, (B, 1, H-2, W-2); 1 where nothing is stretched."""
     slope_x, slope_y = window_slopes(flow)
     return (1 + slope_x[:, :1]) * (1 + slope_y[:, 1:])
 

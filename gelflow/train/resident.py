@@ -26,7 +26,6 @@ class ResidentPairs(Dataset[Sample]):
         return len(self._samples)
 
     def __getitem__(self, index: int) -> Sample:
-        """The sample as the files give it, its tensors on the device."""
         return {key: _unpacked(value) for key, value in self._samples[index].items()}
 
 

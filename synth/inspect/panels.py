@@ -19,13 +19,7 @@ _VISIBLE, _HIDDEN = (245, 245, 245), (200, 60, 50)
 
 @dataclass(frozen=True)
 class Arrows:
-    """A thinned flow to draw over an image, magnified so that small flows can be seen.
-
-    Attributes:
-        start: (n, 2) px.
-        tip: (n, 2) px, start + magnification * flow.
-        magnification: how many times longer than the flow the arrows are.
-    """
+    """A thinned flow to draw over an image: from start to start + magnification * flow, both (n, 2) px."""
 
     start: Pixels
     tip: Pixels

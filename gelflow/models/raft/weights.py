@@ -30,8 +30,6 @@ def looks_like_raft(path: Path) -> bool:
 def load_raft(path: Path, device: str = "cpu") -> RAFT:
     """Builds the network that a file's shapes describe, with the file's weights, in evaluation mode.
 
-    Only tensors are read: a file with anything else in it is refused before any of it runs.
-
     Raises:
         InputError: No such file, damaged, one that would run code, or not RAFT's weights.
     """
