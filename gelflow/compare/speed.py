@@ -1,4 +1,4 @@
-"""How fast a network is and how much memory it takes, on the device that it is on.
+"""How fast a network is and how much memory it takes.
 
 Pairs per second: batches of random images, after warm-up, the median of several. Memory: on a CUDA device the most
 that torch held at once beyond the network's weights and the inputs; on Linux the growth of the process's resident
@@ -55,7 +55,7 @@ def network_speed(model: Any, size: tuple[int, int], batch: int, device: str) ->
 
 
 def _start_memory(device: str) -> float | None:
-    """Bytes held now; the peak is forgotten."""
+    """Bytes held now, from which the peak is counted anew."""
     import torch
 
     if device == "cuda":

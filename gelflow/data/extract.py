@@ -71,8 +71,6 @@ def _recordings_at(path: Path) -> list[Path]:
 def extract_pairs(inputs: Sequence[str], out: Path, config: ChoiceConfig, progress: Progress | None = None) -> PairSet:
     """Chooses pairs from recordings and writes them as a pair set; goes on where the same job was interrupted.
 
-    Recordings that cannot be read are in its `failures`.
-
     Raises:
         InputError: Nothing to read, a value out of range, or `out` holds something else than this job.
         OSError: The disk is full or not writable; what is there stays and the same command goes on from it.

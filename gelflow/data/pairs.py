@@ -98,13 +98,21 @@ class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
         return hashlib.sha256(json.dumps(known).encode()).hexdigest()
 
     def images(self, index: int) -> tuple[ImageArray, ImageArray]:
-        """Both images of a pair, (H, W, 3) float32 in [0, 1]; exceptions as for `gelflow.files.image.read_pair`."""
+        """Both images of a pair, (H, W, 3) float32 in [0, 1].
+
+        Raises:
+            InputError: An image is missing, damaged or too small, or the two differ in size.
+        """
         record = self.records[index]
         # Of a path, read_pair asks for is_file, read_bytes and its text: all that a member of a shard has, too.
         return read_pair(cast(Path, record.image1), cast(Path, record.image2))
 
     def truth(self, index: int) -> FlowField | None:
-        """Exact flow of a pair; None where it has none. InputError: a file that is damaged or lacks this direction."""
+        """Exact flow (H, W, 2) in px and its visibility (H, W) bool; None where the pair has none.
+
+        Raises:
+            InputError: The file is missing or damaged, or lacks this direction.
+        """
         record = self.records[index]
         if record.flow is None:
             return None
