@@ -9,7 +9,7 @@ from gelflow.baselines.learned import Learned
 from gelflow.compare.scores import evaluate
 from gelflow.config import LossConfig
 from gelflow.config.sources import train_config
-from gelflow.data.open import open_pairs
+from gelflow.data import PairDataset
 from gelflow.losses import self_supervised_loss
 from gelflow.models.weights import weights_file
 from gelflow.ops.pyramid import flow_pyramid
@@ -50,7 +50,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Tensor, Tensor, Tens
     folder: Path = tmp_path_factory.mktemp("toy")
     (folder / "toy.toml").write_text(SCENE)
     generate(load_scene(folder / "toy.toml"), 1, folder / "data")
-    sample = open_pairs(folder / "data")[0]
+    sample = PairDataset(folder / "data")[0]
     assert sample["flow"].norm(dim=0).max() > 3  # enough to tell a tenth of it
     return sample["flow"][None], sample["image1"][None], sample["image2"][None]
 
@@ -83,6 +83,6 @@ QUICK = ["sampling.pairs_per_trajectory=3", "numerics.target_error_px=2.0", "out
 def test_they_find_what_moved(scene: str, share: float, tmp_path: Path) -> None:
     """Endpoint error as a share of the motion: 0.28 and 0.05."""
     generate(load_scene(scene, QUICK), 6, tmp_path / "pairs", seed=4)
-    pairs = open_pairs(tmp_path / "pairs")
+    pairs = PairDataset(tmp_path / "pairs")
     scores = evaluate(Learned(weights_file(None), device="cpu"), pairs)
     assert sum(score.endpoint_error_px for score in scores) < share * sum(score.motion_px for score in scores)

@@ -31,8 +31,6 @@ class ALDIC:
     """pyALDIC with windows of 32 px and a node every 8 px."""
 
     name: str = "pyALDIC"
-    window_px: int = 32
-    step_px: int = 8
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
         """See `Method.flow`.
@@ -46,9 +44,7 @@ class ALDIC:
             raise InputError(f"{width} x {height} px: {self.name} needs {MINIMUM_SIDE} px a side")
         dic, grid = _package()
         roi = grid(gridx=(0, width - 1), gridy=(0, height - 1))
-        settings = dic.dicpara_default(
-            winsize=self.window_px, winstepsize=self.step_px, img_size=(height, width), gridxy_roi_range=roi
-        )
+        settings = dic.dicpara_default(winsize=32, winstepsize=8, img_size=(height, width), gridxy_roi_range=roi)
         grey = [image.astype(np.float64) @ LUMA for image in (image1, image2)]
         everywhere = np.ones((height, width))
         try:

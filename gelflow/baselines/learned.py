@@ -99,10 +99,7 @@ def _suffix(settings: RegistrationConfig | None) -> str:
 
 
 class PublishedRaft:
-    """RAFT, small or large, with published weights; arguments and exceptions as for `Learned`.
-
-    Images work at their own size unless one is given.
-    """
+    """RAFT, small or large, with published weights; arguments and exceptions as for `Learned`."""
 
     def __init__(
         self, path: Path, name: str | None = None, size: tuple[int, int] | None = None, device: str = "auto"

@@ -35,15 +35,14 @@ def pairs(
 ) -> int:
     """Chooses image pairs with enough motion from recordings; goes on where the same job was interrupted."""
     from gelflow.data.choose import ChoiceConfig
-    from gelflow.data.extract import extract_pairs, find_recordings
+    from gelflow.data.extract import extract_pairs
     from gelflow.data.pairset import FILE
     from gelflow.terminal import progress
 
     config = ChoiceConfig(per_video, min_motion, max_motion, min_difference, frames, tries, seed)
-    total = len(find_recordings(inputs))
     with progress("recordings", not as_json) as advance:
 
-        def step(done: int, _: int, name: str, outcome: SourceReport | str) -> None:
+        def step(done: int, total: int, name: str, outcome: SourceReport | str) -> None:
             if isinstance(outcome, str):
                 print(f"gelflow: skipped: {outcome}", file=sys.stderr)
             advance(done, total, name)

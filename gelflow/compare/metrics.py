@@ -13,8 +13,6 @@ PSNR and SSIM are those of the GelFlow paper (n = 8 bit); they tell how well ima
 where the gel went.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,30 +22,16 @@ from gelflow.files.image import to_bytes, to_grey
 from gelflow.ops.warp import warp_image
 
 
-@dataclass(frozen=True)
-class FlowErrors:
-    """Endpoint errors of one pair; outliers are shares, in [0, 1], of the pixels that were compared."""
-
-    mean_px: float
-    median_px: float
-    outliers_1px: float
-    outliers_01px: float
-    pixels: int
-
-
 def endpoint_error(flow: FlowArray, truth: FlowArray) -> NDArray[np.float64]:
     """|flow - truth| at each pixel, (H, W) float64 in px; NaN where either is."""
     difference = flow.astype(np.float64) - truth
     return np.hypot(difference[..., 0], difference[..., 1])
 
 
-def flow_errors(flow: FlowArray, truth: FlowArray, visible: MaskArray) -> FlowErrors:
-    """Endpoint error and outlier rates over the pixels where the truth is finite and visible.
+def flow_errors(flow: FlowArray, truth: FlowArray, visible: MaskArray) -> dict[str, float]:
+    """Endpoint errors over the pixels where the truth is finite and visible, by the names of `scores.Measures`.
 
-    Args:
-        flow: Estimate, (H, W, 2) px. A NaN in it is an outlier at both limits and makes mean and median NaN.
-        truth: Exact flow, (H, W, 2) px, NaN where no gel is seen.
-        visible: (H, W) bool.
+    A NaN in the estimate is an outlier at both limits and makes mean and median NaN.
 
     Raises:
         InputError: The shapes differ, or no pixel can be compared.
@@ -58,13 +42,12 @@ def flow_errors(flow: FlowArray, truth: FlowArray, visible: MaskArray) -> FlowEr
     if not compared.any():
         raise InputError("the exact flow has no visible pixel that sees gel; nothing can be compared")
     error = endpoint_error(flow, truth)[compared]
-    return FlowErrors(
-        mean_px=float(error.mean()),
-        median_px=float(np.median(error)),
-        outliers_1px=float(np.mean(~(error <= 1.0))),
-        outliers_01px=float(np.mean(~(error <= 0.1))),
-        pixels=int(error.size),
-    )
+    return {
+        "endpoint_error_px": float(error.mean()),
+        "median_error_px": float(np.median(error)),
+        "outliers_1px": float(np.mean(~(error <= 1.0))),
+        "outliers_01px": float(np.mean(~(error <= 0.1))),
+    }
 
 
 def psnr(image: Bytes3, other: Bytes3) -> float:
@@ -79,7 +62,7 @@ def ssim(grey: Grey8, other: Grey8) -> float:
 
 
 def ssim_map(grey: Grey8, other: Grey8) -> NDArray[np.float64]:
-    """Structural similarity at each pixel of two grey 8-bit images, (H, W), as stated at the top of this module."""
+    """Structural similarity at each pixel of two grey 8-bit images, (H, W)."""
     import cv2
 
     def blurred(values: NDArray[np.float64]) -> NDArray[np.float64]:

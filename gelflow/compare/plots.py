@@ -61,10 +61,8 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
 def plot_work_precision(path: Path, groups: Sequence[Group], note: str) -> None:
     """Writes a PNG with quality against run time: endpoint error or distance to dots, and PSNR.
 
-    Methods of `UNTIMED` are left out. The note says what the times were measured on.
-
     Methods that no other beats in both are joined; those that were fine-tuned on the very pairs are hollow and not
-    part of the front. A black edge means that it ran on a GPU.
+    part of the front. A black edge means that it ran on a GPU. The note says what the times were measured on.
     """
     shown = [group for group in groups if group.name not in UNTIMED]
     candidates = [

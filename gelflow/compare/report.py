@@ -39,7 +39,8 @@ def latex(title: str, table: Table) -> str:
 
 def write_report(out: Path, comparison: Comparison) -> None:
     """Writes `FILES` into a folder, each as a whole."""
-    names = [field.name for field in fields(PairScore) if field.name != "strata"]
+    first = ("method", "pair", "scene")
+    names = [*first, *(field.name for field in fields(PairScore) if field.name not in (*first, "strata"))]
     _write_csv(out / "scores.csv", names, [[getattr(score, name) for name in names] for score in comparison.scores])
     write_text(out / SCORES, comparison.to_json() + "\n")
     found = tables(comparison)

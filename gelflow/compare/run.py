@@ -29,8 +29,7 @@ def compare(
     Args:
         methods: At least one, with names that differ.
         dataset: The pairs.
-        out: Folder for the report, written anew after each method, so that an interruption
-            loses one method at most.
+        out: Folder for the report, written anew after each method, so that an interruption loses one method at most.
         progress: Called after each pair.
         batch: Pairs at once where the speed of networks is measured; 0: it is not.
         add: Keep the methods that `out` holds already, except those that are scored again. Without it an earlier
@@ -72,11 +71,7 @@ def _speed(method: Method, dataset: PairDataset, batch: int) -> Speed | None:
 
 
 def _earlier(out: Path, dataset: PairDataset, add: bool) -> Comparison | None:
-    """What a folder holds already.
-
-    Raises:
-        InputError: Something else, or a comparison of other pairs.
-    """
+    """What a folder holds already; InputError for something else, or a comparison of other pairs."""
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
         return None
     if not (out / SCORES).is_file():

@@ -4,7 +4,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from statistics import median
 from typing import Any
 
@@ -23,20 +23,12 @@ from gelflow.files.exr import FlowField
 from gelflow.hardware import hardware
 from gelflow.models.uncertainty import CERTAIN_PX, UNKNOWN_PX
 
-MEASURES = (
-    "psnr_db", "ssim", "endpoint_error_px", "median_error_px", "outliers_1px", "outliers_01px", "marker_distance_px",
-    "dot_distance_px", "dot_p90_px", "own_dots", "closure_px", "closure_p90_px", "unknown", "certain", "calibration",
-)  # fmt: skip
-"""Fields of a score that are averaged over pairs."""
-
 
 @dataclass(frozen=True, kw_only=True)
-class PairScore:
-    """How one method did on one pair; None where the pair has no exact flow, scene or markers.
+class Measures:
+    """How good a flow is; None where a pair has no exact flow or markers.
 
     Attributes:
-        method, pair: Their names.
-        scene: Scene and kind of pattern of a synthetic pair, "gelsight_mini, dots".
         psnr_db, ssim: Of image 1 and image 2 warped by the flow.
         endpoint_error_px, median_error_px: Mean and median endpoint error.
         outliers_1px, outliers_01px: Share of pixels with an endpoint error above 1 px and 0.1 px.
@@ -46,18 +38,8 @@ class PairScore:
         closure_px, closure_p90_px: Median and 90th percentile of the closure; where there is no exact flow.
         unknown, certain: Share of pixels whose sigma (`gelflow.models.uncertainty`) is above 1 px, and up to 0.1 px.
         calibration: Share of the certain pixels whose endpoint error is within sigma; 0.68 if sigma is right.
-        motion_px: Mean length of the true motion over the compared pixels.
-        seconds: Run time of the method, images in memory to flow in memory.
-        processor_seconds: Time of all its threads on the processor meanwhile; unlike `seconds` it does not grow with
-            what else the machine does.
-        device: What the method ran on.
-        on_gpu: Whether that was a CUDA device.
-        strata: Its endpoint errors sorted by what they may depend on.
     """
 
-    method: str
-    pair: str
-    scene: str | None
     psnr_db: float
     ssim: float
     endpoint_error_px: float | None = None
@@ -73,6 +55,27 @@ class PairScore:
     unknown: float | None = None
     certain: float | None = None
     calibration: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairScore(Measures):
+    """How one method did on one pair.
+
+    Attributes:
+        method, pair: Their names.
+        scene: Scene and kind of pattern of a synthetic pair, "gelsight_mini, dots".
+        motion_px: Mean length of the true motion over the compared pixels.
+        seconds: Run time of the method, images in memory to flow in memory.
+        processor_seconds: Time of all its threads on the processor meanwhile; unlike `seconds` it does not grow with
+            what else the machine does.
+        device: What the method ran on.
+        on_gpu: Whether that was a CUDA device.
+        strata: Its endpoint errors sorted by what they may depend on.
+    """
+
+    method: str
+    pair: str
+    scene: str | None
     motion_px: float | None = None
     seconds: float
     processor_seconds: float
@@ -82,26 +85,11 @@ class PairScore:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MethodScore:
+class MethodScore(Measures):
     """Means over pairs, pair by pair with equal weight; times are medians. None where no pair has the number."""
 
     method: str
     pairs: int
-    psnr_db: float
-    ssim: float
-    endpoint_error_px: float | None
-    median_error_px: float | None
-    outliers_1px: float | None
-    outliers_01px: float | None
-    marker_distance_px: float | None
-    dot_distance_px: float | None = None
-    dot_p90_px: float | None = None
-    own_dots: float | None = None
-    closure_px: float | None = None
-    closure_p90_px: float | None = None
-    unknown: float | None = None
-    certain: float | None = None
-    calibration: float | None = None
     seconds: float
     processor_seconds: float
     device: str
@@ -116,7 +104,7 @@ class MethodScore:
 def score_pair(method: Method, dataset: PairDataset, index: int) -> PairScore:
     """Runs a method on one pair and scores it; where it finds nothing to follow, it is scored as no motion.
 
-    To leave it out there would make a method that gives up look better than one that tries.
+    Otherwise a method that gives up would look better than one that tries.
 
     Raises:
         InputError: The pair cannot be read, or the method cannot work on it; the message names the pair.
@@ -179,15 +167,11 @@ def _without_truth(method: Method, image1: ImageArray, image2: ImageArray, flow:
 
 def _errors(flow: FlowArray, truth: FlowField, scene: str | None, sigma: MapArray) -> dict[str, Any]:
     """The fields of a score that need the exact flow."""
-    errors = flow_errors(flow, truth.flow, truth.visible)
+    errors: dict[str, Any] = flow_errors(flow, truth.flow, truth.visible)
     compared = np.logical_and(truth.visible, np.isfinite(truth.flow).all(axis=-1))
     motion = np.hypot(truth.flow[..., 0], truth.flow[..., 1])[compared]
     error, certain = endpoint_error(flow, truth.flow), compared & (sigma <= CERTAIN_PX)
-    return {
-        "endpoint_error_px": errors.mean_px,
-        "median_error_px": errors.median_px,
-        "outliers_1px": errors.outliers_1px,
-        "outliers_01px": errors.outliers_01px,
+    return errors | {
         "calibration": float((error <= sigma)[certain].mean()) if certain.any() else None,
         "motion_px": float(motion.mean(dtype=np.float64)),
         "strata": pair_strata(error, truth.flow, compared, truth.contact, scene),
@@ -200,9 +184,6 @@ def evaluate(
     """Scores a method on all pairs, in order; `progress` is called after each.
 
     The first pair is estimated once before, untimed: libraries and devices take longer the first time.
-
-    Raises:
-        InputError: A pair cannot be read, or the method cannot work on it.
     """
     scores = []
     with suppress(InputError):  # is raised again, with the pair's name, when the pair is scored
@@ -216,10 +197,10 @@ def evaluate(
 
 def summarise(scores: Sequence[PairScore]) -> list[MethodScore]:
     """Means per method, in the order in which the methods appear."""
-    means = []
+    means, measures = [], [field.name for field in fields(Measures)]
     for name in dict.fromkeys(score.method for score in scores):
         own = [score for score in scores if score.method == name]
-        values: dict[str, Any] = {field: _mean([getattr(score, field) for score in own]) for field in MEASURES}
+        values: dict[str, Any] = {field: _mean([getattr(score, field) for score in own]) for field in measures}
         values |= {field: median(getattr(score, field) for score in own) for field in ("seconds", "processor_seconds")}
         means.append(MethodScore(method=name, pairs=len(own), device=own[0].device, on_gpu=own[0].on_gpu, **values))
     return means

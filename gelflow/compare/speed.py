@@ -1,4 +1,4 @@
-"""How fast a network is and how much memory it takes, on the device that it is on.
+"""How fast a network is and how much memory it takes.
 
 Pairs per second: batches of random images, after warm-up, the median of several. Memory: on a CUDA device the most
 that torch held at once beyond the network's weights and the inputs; on Linux the growth of the process's resident
@@ -16,6 +16,8 @@ from typing import Any
 from gelflow.hardware import hardware, process_memory
 
 CLEAR_PEAK = Path("/proc/self/clear_refs")
+WARMUP, REPEATS = 2, 5
+"""Passes before the measurement, and measured ones."""
 
 
 @dataclass(frozen=True)
@@ -29,13 +31,8 @@ class Speed:
     device: str
 
 
-def network_speed(
-    model: Any, size: tuple[int, int], batch: int = 1, device: str = "cpu", warmup: int = 2, repeats: int = 5
-) -> Speed:
-    """Measures a network's forward pass.
-
-    The network takes two image batches (B, 3, H, W) on the device; `repeats` passes are measured after `warmup` passes.
-    """
+def network_speed(model: Any, size: tuple[int, int], batch: int, device: str) -> Speed:
+    """Measures the pass of a network that takes two image batches (B, 3, H, W) on the device."""
     import torch
 
     random = torch.Generator().manual_seed(0)
@@ -44,9 +41,9 @@ def network_speed(
     seconds = []
     with torch.no_grad():
         start = _start_memory(device)
-        for _ in range(warmup):
+        for _ in range(WARMUP):
             model(*images)
-        for _ in range(repeats):
+        for _ in range(REPEATS):
             synchronise()
             started = time.perf_counter()
             model(*images)
@@ -58,7 +55,7 @@ def network_speed(
 
 
 def _start_memory(device: str) -> float | None:
-    """Bytes held now; the peak is forgotten."""
+    """Bytes held now, from which the peak is counted anew."""
     import torch
 
     if device == "cuda":

@@ -7,6 +7,7 @@ that they belong to; scale s has 1/2^s of the image's resolution.
 
 from __future__ import annotations
 
+from operator import gt
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -74,43 +75,20 @@ class ModelConfig(_Frozen):
 
     levels: int = Field(default=8, ge=4, le=8)
     """Scales l of the pyramid, the image (s = 0) included; features at s = 1 .. levels-1. Paper: 8."""
-    finest_scale: int = Field(default=2, ge=1, le=3)
-    """Finest scale that is decoded; finer flows are bilinear enlargements of it. Paper: V0 is up4 of V2."""
-    correlation_radius: int = Field(default=4, ge=1, le=8)
-    """Search range of the cost volume in px of the scale: (2 r + 1)^2 displacements, mean over channels. PWC-Net: 4."""
     projected_channels: int = Field(default=32, ge=8, le=128)
     """Channels to which each scale's features are projected by 1x1 convolutions (ARFlow: 32)."""
     estimator: Literal["per_scale", "shared"] = "per_scale"
     """A flow estimator and context network for each scale (PWC-Net) or one for all (ARFlow's PWC-lite), which has a
     third of the weights and takes more steps to follow the motion. The paper names both ancestors and does not say."""
-    normalise_features: bool = True
-    """Bring both images' features to mean 0 and variance 1 (jointly, per scale and sample) before they are correlated
-    (UFlow). The paper is silent; without it training from scratch hardly finds motion."""
     lffm: bool = True
     """The local flow fusion module; False for the ablation."""
-    lffm_region: Literal[3, 5] = 3
-    """Side of the module's window in px of the scale. Paper: 3."""
-    lffm_scale: Literal["inverse_sqrt", "none"] = "inverse_sqrt"
-    """Factor on the dot products before the softmax: 1/sqrt(C), or 1 as published. Unscaled products of long feature
-    vectors turn the softmax into a selection of the centre, and the module into the identity."""
-
     refine: Literal["none", "half"] = "none"
     """A refinement head after the last decoded flow: local correlation of fine features around the flow so far, at half
     of the resolution. Not in the paper, whose finest flow is an enlargement of V2."""
-    refine_iterations: int = Field(default=3, ge=1, le=16)
-    """Times that the refinement head, with the same weights, corrects the flow."""
     registration: RegistrationConfig | None = None
     """Correction of the network's flow on the images where it is used (validation, evaluation, prediction; neither the
     training steps nor the exported network); in a configuration, a name of `REGISTRATIONS` or a table. Takes no part in
     the weights: a fine-tuning may change it. Not in the paper."""
-
-    @model_validator(mode="after")
-    def _decodes_something(self) -> ModelConfig:
-        if self.finest_scale >= self.levels - 1:
-            raise ValueError(f"finest_scale = {self.finest_scale} must be below the coarsest scale {self.levels - 1}")
-        if self.refine == "half" and self.finest_scale == 1:
-            raise ValueError('refine = "half" adds nothing to finest_scale = 1, which decodes that scale already')
-        return self
 
 
 class LossConfig(_Frozen):
@@ -140,26 +118,18 @@ class LossConfig(_Frozen):
     """Share of the steps after which `occlusion` and `lambda_ar` begin, which rely on the network's own flow. 0: from
     the start, for a network that has learnt before. ARFlow has them in later stages, too."""
     lambda_dc: float = Field(default=75.0, ge=0)
-    """Weight of the regulariser."""
+    """Weight of the regulariser, whose flow is divided by the shorter side of the image (scale 0, in px, for all scales
+    alike, as ARFlow does). With flow in px, the paper's 75 makes training collapse to no flow."""
     lambda_theta: float = Field(default=0.01, ge=0)
     """Weight of the shear distortion rate within the decomposition loss."""
     lambda_zeta: float = Field(default=0.01, ge=0)
     """Weight of the rotation within the decomposition loss."""
-    flow_normalisation: Literal["min_side", "none"] = "min_side"
-    """Divide the flow by the shorter side of the image (scale 0, in px, for all scales alike, as ARFlow does) before
-    the regulariser. Without it, lambda_dc = 75 makes training collapse to no flow."""
     lambda_df: float = Field(default=0.01, ge=0)
     """Weight of the deformation loss."""
-    ratio: Literal["product", "det"] = "product"
-    """Area ratio in the deformation loss: R_x R_y as published, which rotations change, or the determinant of the
-    deformation gradient, which they do not."""
     beta: float = Field(default=10.0, ge=0)
     """Steepness of the weight in the image gradient."""
-    weight: Literal["anti_edge", "edge_aware", "floor"] = "anti_edge"
-    """Weight of the decomposition and deformation losses at a pixel: 1 - exp(-beta |grad I|) as published, which
-    vanishes where there is no texture; exp(-beta |grad I|); or the published one raised to at least weight_floor."""
-    weight_floor: float = Field(default=0.1, ge=0, le=1)
-    """Smallest weight of weight = "floor"."""
+    least_weight: float = Field(default=0.0, ge=0, le=1)
+    """Smallest weight of the decomposition and deformation losses at a pixel. Paper: 0, where there is no texture."""
     lambda_s: tuple[float, ...] = (1.0,) * 7
     """Weight of each scale, finest (s = 0) first; levels - 1 numbers. Paper: 1 for s = 0 .. 6. A scale of weight 0 is
     not computed."""
@@ -268,12 +238,8 @@ class TrainConfig(_Frozen):
         for name, size in (("image_size", self.image_size), ("crop_size", self.crop_size)):
             if size is not None and min(size) < MINIMUM_SIDE:
                 raise ValueError(f"{name} = {list(size)}: each side must be at least {MINIMUM_SIDE} px")
-        if self.image_size and self.crop_size and _exceeds(self.crop_size, self.image_size):
+        if self.image_size and self.crop_size and any(map(gt, self.crop_size, self.image_size)):
             raise ValueError(f"crop_size = {list(self.crop_size)} does not fit into image_size {list(self.image_size)}")
         if self.warmup_steps >= self.steps:
             raise ValueError(f"warmup_steps = {self.warmup_steps} must be below steps = {self.steps}")
         return self
-
-
-def _exceeds(inner: tuple[int, int], outer: tuple[int, int]) -> bool:
-    return inner[0] > outer[0] or inner[1] > outer[1]

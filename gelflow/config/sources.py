@@ -75,11 +75,7 @@ def _merge(values: dict[str, Any], new: Mapping[str, Any]) -> None:
 
 
 def _spell_out(values: dict[str, Any]) -> None:
-    """Puts what a registration's name stands for in its place, so that what follows can change single fields of it.
-
-    Raises:
-        InputError: there is no such registration.
-    """
+    """Puts what a registration's name stands for in its place, so that what follows can change single fields of it."""
     model = values.get("model")
     if not isinstance(model, dict) or not isinstance(name := model.get("registration"), str):
         return

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from typing import Any, TypeGuard, TypeVar, get_args
+from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ValidationError
 
@@ -11,9 +11,13 @@ from gelflow.errors import InputError
 Config = TypeVar("Config", bound=BaseModel)
 
 RETIRED: Mapping[str, tuple[Any, ...]] = {
-    "loss.lambda_ph": (1,), "loss.lambda_census": (0,), "loss.mask_outside": (True,), "compile": (False, True),
+    "finest_scale": (2,), "correlation_radius": (4,), "normalise_features": (True,), "lffm_region": (3,),
+    "lffm_scale": ("inverse_sqrt",), "refine_iterations": (3,), "loss.lambda_ph": (1,), "loss.lambda_census": (0,),
+    "loss.mask_outside": (True,), "loss.flow_normalisation": ("min_side",), "loss.ratio": ("product",),
+    "loss.weight": ("anti_edge",), "loss.weight_floor": (0.1,), "compile": (False, True),
 }  # fmt: skip
-"""Settings of earlier versions, which weights and runs record, with the values that mean what every run does now."""
+"""Settings of earlier versions, which weights and runs record, with the values that mean what every run does now; those
+of a model by their names alone."""
 
 
 def validated(kind: type[Config], values: Mapping[str, Any], source: str) -> Config:
@@ -51,21 +55,18 @@ def _whole(value: Any, place: str = "") -> Any:
         return {
             name: _whole(part, f"{place}{name}.")
             for name, part in value.items()
-            if part not in RETIRED.get(f"{place}{name}", ())
+            if part not in RETIRED.get(f"{place}{name}".removeprefix("model."), ())
         }
     if isinstance(value, (list, tuple)):
         return [_whole(part) for part in value]
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
-def _is_table(annotation: Any) -> TypeGuard[type[BaseModel]]:
-    return isinstance(annotation, type) and issubclass(annotation, BaseModel)
-
-
 def _fields_at(kind: type[BaseModel], location: tuple[int | str, ...]) -> list[str]:
     for name in location:
         annotation = kind.model_fields[str(name)].annotation
-        tables = [part for part in (annotation, *get_args(annotation)) if _is_table(part)]
+        parts = (annotation, *get_args(annotation))
+        tables = [part for part in parts if isinstance(part, type) and issubclass(part, BaseModel)]
         if not tables:
             return []
         kind = tables[0]

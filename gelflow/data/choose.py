@@ -114,13 +114,7 @@ def length(flow: FlowArray) -> NDArray[np.float32]:
 
 
 def choose_pairs(frames: Sequence[Bytes3], config: ChoiceConfig, generator: np.random.Generator) -> Choices:
-    """Chooses pairs from the frames of one recording.
-
-    Frames are of one size, in order of time; which of a pair's frames comes first is random, too.
-
-    Returns:
-        At most `config.per_source` pairs. The same frames, settings and generator state give the same pairs.
-    """
+    """Chooses pairs from the frames, of one size, of a recording; which of a pair's comes first is random, too."""
     choices = Choices()
     usable, choices.frames_rejected = usable_frames(frames)
     if len(usable) < 2:

@@ -8,7 +8,7 @@ neither on the other recordings nor on interruptions.
 import glob
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -25,16 +25,8 @@ Progress = Callable[[int, int, str, SourceReport | str], None]
 """Called after each recording: done, total, its name, and its report or why it failed."""
 
 
-@dataclass(frozen=True)
-class Recording:
-    """A video file or a folder of frames, under a name that is unique within the job."""
-
-    name: str
-    path: Path
-
-
-def find_recordings(inputs: Sequence[str]) -> list[Recording]:
-    """Recordings among files, folders and glob patterns, sorted by path.
+def find_recordings(inputs: Sequence[str]) -> dict[str, Path]:
+    """Recordings among files, folders and glob patterns, by name, sorted by path.
 
     A folder stands for the videos in it; if it holds none, for its images as one recording; if it holds neither, for
     each of its folders of images.
@@ -57,7 +49,7 @@ def find_recordings(inputs: Sequence[str]) -> list[Recording]:
     repeated = sorted({name for name in names if names.count(name) > 1})
     if repeated:
         raise InputError(f"two recordings are called {repeated[0]}; rename one, or make two pair sets")
-    return [Recording(name, path) for name, path in zip(names, ordered, strict=True)]
+    return dict(zip(names, ordered, strict=True))
 
 
 def _recordings_at(path: Path) -> list[Path]:
@@ -79,32 +71,30 @@ def _recordings_at(path: Path) -> list[Path]:
 def extract_pairs(inputs: Sequence[str], out: Path, config: ChoiceConfig, progress: Progress | None = None) -> PairSet:
     """Chooses pairs from recordings and writes them as a pair set; goes on where the same job was interrupted.
 
-    Recordings that cannot be read are in its `failures`.
-
     Raises:
         InputError: Nothing to read, a value out of range, or `out` holds something else than this job.
         OSError: The disk is full or not writable; what is there stays and the same command goes on from it.
     """
     _check(config)
     recordings = find_recordings(inputs)
-    job = {"sources": {one.name: _size(one.path) for one in recordings}, "settings": asdict(config)}
+    job = {"sources": {name: _size(path) for name, path in recordings.items()}, "settings": asdict(config)}
     content = _opened(out, job)
-    for done, recording in enumerate(recordings, start=1):
-        if recording.name in content.sources or recording.name in content.failures:
+    for done, (name, path) in enumerate(recordings.items(), start=1):
+        if name in content.sources or name in content.failures:
             continue
         outcome: SourceReport | str
         try:
-            outcome, pairs = _extract_one(recording, out, config)
+            outcome, pairs = _extract_one(name, path, out, config)
         except InputError as error:
             outcome = str(error)
-            content = content.model_copy(update={"failures": content.failures | {recording.name: outcome}})
+            content = content.model_copy(update={"failures": content.failures | {name: outcome}})
         else:
             content = content.model_copy(
-                update={"sources": content.sources | {recording.name: outcome}, "pairs": content.pairs + tuple(pairs)}
+                update={"sources": content.sources | {name: outcome}, "pairs": content.pairs + tuple(pairs)}
             )
         write_pair_set(out, content)
         if progress:
-            progress(done, len(recordings), recording.name, outcome)
+            progress(done, len(recordings), name, outcome)
     if not content.complete:
         content = content.model_copy(update={"complete": True})
         write_pair_set(out, content)
@@ -148,26 +138,27 @@ def _differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
     return [*shown, f"and {len(names) - 5} more"] if len(names) > 5 else shown
 
 
-def _extract_one(recording: Recording, out: Path, config: ChoiceConfig) -> tuple[SourceReport, list[ChosenPair]]:
-    count = describe(recording.path).frames
+def _extract_one(name: str, path: Path, out: Path, config: ChoiceConfig) -> tuple[SourceReport, list[ChosenPair]]:
+    count = describe(path).frames
     every = max(1, -(-count // config.frames))
     indices: list[int] = []
     pictures: list[Bytes3] = []
-    for index, frame in frames(recording.path, every):
+    for index, frame in frames(path, every):
         if frame is None:
             continue
         if pictures and frame.shape != pictures[0].shape:
-            raise InputError(f"{recording.path}: frame {index} has another size than the first")
+            raise InputError(f"{path}: frame {index} has another size than the first")
         indices.append(index)
         pictures.append(frame)
     if len(pictures) < 2:
-        raise InputError(f"{recording.path}: {len(pictures)} of its {count} frames decode; two are needed for a pair")
+        raise InputError(f"{path}: {len(pictures)} of its {count} frames decode; two are needed for a pair")
     height, width = pictures[0].shape[:2]
     if min(height, width) < MINIMUM_SIDE:
-        raise InputError(f"{recording.path}: frames of {width} x {height} px; each side needs {MINIMUM_SIDE}")
-    choices = choose_pairs(pictures, config, _generator(config.seed, recording.name))
+        raise InputError(f"{path}: frames of {width} x {height} px; each side needs {MINIMUM_SIDE}")
+    digest = hashlib.sha256(f"{config.seed}:{name}".encode()).digest()
+    choices = choose_pairs(pictures, config, np.random.default_rng(int.from_bytes(digest[:16], "big")))
     lost = -(-count // every) - len(pictures)
-    pairs = _write(recording.name, choices, indices, pictures, out)
+    pairs = _write(name, choices, indices, pictures, out)
     report = SourceReport(
         frames=len(pictures),
         frames_rejected=choices.frames_rejected | ({"undecodable": lost} if lost > 0 else {}),
@@ -176,11 +167,6 @@ def _extract_one(recording: Recording, out: Path, config: ChoiceConfig) -> tuple
         chosen=len(pairs),
     )
     return report, pairs
-
-
-def _generator(seed: int, name: str) -> np.random.Generator:
-    digest = hashlib.sha256(f"{seed}:{name}".encode()).digest()
-    return np.random.default_rng(int.from_bytes(digest[:16], "big"))
 
 
 def _write(

@@ -39,11 +39,7 @@ class Member:
         return self.shard.is_file()
 
     def read_bytes(self) -> bytes:
-        """The content.
-
-        Raises:
-            InputError: The shard cannot be read or has become shorter, or a member called .png is none.
-        """
+        """The content; InputError where the shard cannot be read or has become shorter, or a .png is none."""
         try:
             with self.shard.open("rb") as file:
                 file.seek(self.offset)
@@ -90,7 +86,6 @@ class FlowMembers:
 
 
 def _read_array(member: Member, dtype: type[np.generic]) -> NDArray[Any]:
-    """The array of a .npy file."""
     stream = io.BytesIO(member.read_bytes())
     try:
         array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)

@@ -1,9 +1,10 @@
 """Opening whatever holds pairs: a data set of synth or its shards, a pair set of `gelflow pairs`, a plain folder."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from gelflow.data.pairs import PairDataset, PairRecord, join
+from gelflow.data.pairs import PairDataset, PairRecord
 from gelflow.data.pairset import FILE as PAIR_SET_FILE
 from gelflow.data.pairset import pair_set_records
 from gelflow.data.shards import shard_files, shard_records
@@ -11,21 +12,8 @@ from gelflow.data.synthetic import is_synthetic, synthetic_records
 from gelflow.errors import InputError
 
 
-def open_pairs(path: Path | str) -> PairDataset:
-    """Opens a folder of image pairs or one shard; see `PairDataset`."""
-    return PairDataset(path)
-
-
 def pair_records(folder: Path) -> list[PairRecord]:
-    """The pairs of a folder, recognised by what lies in it, or of one shard.
-
-    Args:
-        folder: A data set of synth (dataset.json), a pair set (pairs.json), a folder of NAME_1.png and NAME_2.png, or
-            a folder of WebDataset shards (*.tar) or one of them.
-
-    Raises:
-        InputError: There is no such folder, it is none of these or empty, or it is damaged.
-    """
+    """The pairs of a folder, recognised by what lies in it, or of one shard; see `PairDataset`."""
     if not folder.is_dir() and not shard_files(folder):
         if folder.exists():
             raise InputError(
@@ -48,16 +36,24 @@ def pair_records(folder: Path) -> list[PairRecord]:
 
 
 def open_all(paths: Sequence[Path]) -> PairDataset:
-    """Several folders of pairs as one data set; see `open_pairs` and `join`."""
-    return join([open_pairs(path) for path in paths])
+    """Folders of pairs or shards as one data set, in order; with more than one, names begin with the folder's name."""
+    datasets = [PairDataset(path) for path in paths]
+    if len(datasets) == 1:
+        return datasets[0]
+    records: list[PairRecord] = []
+    taken: set[str] = set()
+    for dataset in datasets:
+        label = stem = Path(dataset.source).name
+        number = 2
+        while label in taken:
+            label, number = f"{stem}-{number}", number + 1
+        taken.add(label)
+        records += [replace(record, name=f"{label}/{record.name}") for record in dataset.records]
+    return PairDataset(", ".join(dataset.source for dataset in datasets), records)
 
 
 def _folder_records(folder: Path) -> list[PairRecord]:
-    """The pairs NAME_1.png and NAME_2.png of a folder, by name, with NAME_markers.csv where dots were tracked.
-
-    Raises:
-        InputError: One of the two images of a pair is missing.
-    """
+    """The pairs NAME_1.png and NAME_2.png of a folder, by name, with NAME_markers.csv where dots were tracked."""
     stems = {path.name[: -len("_1.png")] for path in (*folder.glob("*_1.png"), *folder.glob("*_2.png"))}
     records = []
     for name in sorted(stems):

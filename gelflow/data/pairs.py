@@ -122,11 +122,7 @@ class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
         return read_flow(record.flow, direction)
 
     def markers(self, index: int) -> MarkerArray | None:
-        """Tracked dots of a pair, (N, 4) float64: x1, y1, x2, y2 in px; None where the pair has none.
-
-        Raises:
-            InputError: The CSV file lacks a column or holds something other than numbers.
-        """
+        """Tracked dots of a pair, None where it has none; exceptions as for `read_markers`."""
         record = self.records[index]
         if record.markers is None:
             return None
@@ -134,11 +130,7 @@ class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
         return markers[:, [2, 3, 0, 1]] if record.exchanged else markers
 
     def __getitem__(self, index: int) -> dict[str, Tensor | str | bool]:
-        """The sample that the class describes.
-
-        Raises:
-            InputError: A file of the pair is missing or damaged, or the sizes differ.
-        """
+        """The sample that the class describes; InputError where a file is missing or damaged, or the sizes differ."""
         record = self.records[index]
         images = self.images(index)
         size = images[0].shape[:2]
@@ -170,33 +162,8 @@ def _channels_first(array: NDArray[np.float32]) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(np.moveaxis(array, -1, 0)))
 
 
-def join(datasets: Sequence[PairDataset]) -> PairDataset:
-    """Several data sets as one, in order; with more than one, names begin with the folder's name.
-
-    Raises:
-        InputError: There is none.
-    """
-    if not datasets:
-        raise InputError("no data set given")
-    if len(datasets) == 1:
-        return datasets[0]
-    records: list[PairRecord] = []
-    taken: set[str] = set()
-    for dataset in datasets:
-        label = stem = Path(dataset.source).name
-        number = 2
-        while label in taken:
-            label, number = f"{stem}-{number}", number + 1
-        taken.add(label)
-        records += [replace(record, name=f"{label}/{record.name}") for record in dataset.records]
-    return PairDataset(", ".join(dataset.source for dataset in datasets), records)
-
-
 def read_markers(path: Path) -> MarkerArray:
     """Reads tracked dots from a CSV file with the columns x1, y1, x2, y2 (px).
-
-    Returns:
-        (N, 4) float64: x1, y1, x2, y2.
 
     Raises:
         InputError: The file is missing, lacks a column or a row, or holds something other than finite numbers.

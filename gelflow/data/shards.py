@@ -3,14 +3,13 @@
     shard-000000.tar   uncompressed; for each sample 000000.{image1.png, image2.png, forward.npy, forward_visible.npy,
                        backward.npy, backward_visible.npy (both or neither), json}; the key ends at the first dot
 
-Opening reads every tar header once and keeps where each member lies. A pair is then read by seeking, in any order, so
-that a shard data set is used like a directory: the same pairs in the same order, the same bits, the same sampling,
-resuming and division among processes; nothing is streamed.
+Opening reads every tar header once, in each process, and keeps where each member lies. A pair is then read by seeking,
+in any order, so that a shard data set is used like a directory. The order is that of the shards' names, then that
+within a shard.
 
-Limits: local or mounted files, no URLs. Opening reads a header per member, in each process; reading opens the shard and
-seeks once per member. The order is that of the shards' names, then that within a shard. Shards hold no channels beside
-the flow (no contact), and do not say how many of them belong together: that one is missing altogether is noticed only
-by `--resume`, which compares the number of pairs.
+Limits: local or mounted files, no URLs. Shards hold no channels beside the flow (no contact), and do not say how many
+of them belong together: that one is missing altogether is noticed only by `--resume`, which compares the number of
+pairs.
 
 Reference: POSIX.1-1988 ustar; https://github.com/webdataset/webdataset.
 """
@@ -72,11 +71,7 @@ def _samples(shard: Path) -> dict[str, dict[str, Member]]:
 
 
 def _members(shard: Path) -> Iterator[Member]:
-    """Where the files of a shard lie, in order.
-
-    Raises:
-        InputError: The shard cannot be read, is no uncompressed tar, or is truncated or damaged.
-    """
+    """Where the files of a shard lie, in order."""
     end = 0
     try:
         with tarfile.open(shard, "r:") as archive:

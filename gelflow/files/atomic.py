@@ -18,8 +18,7 @@ HEAD = 4096
 def replacing(path: Path) -> Iterator[Path]:
     """Yields a temporary path with the same suffix in the same folder; renames it to `path` if the block succeeds.
 
-    Folders that are missing are made. If the block fails (a full disk, an interruption) the temporary file is removed
-    and whatever was at `path` stays.
+    Folders that are missing are made. If the block fails, the temporary file is removed and what was at `path` stays.
 
     Raises:
         OSError: The folder cannot be written to or the disk is full; its `filename` says which file.
@@ -44,15 +43,9 @@ def write_text(path: Path, text: str) -> None:
 
 
 def refuse_foreign(path: Path, mark: bytes, *beside: Path) -> None:
-    """Sees that files which are about to be replaced come from an earlier run.
+    """Sees that files which are about to be replaced come from an earlier run; InputError where one does not.
 
-    Args:
-        path: A file, with `mark` near its beginning if it is ours.
-        mark: Bytes.
-        beside: Files without a mark, which are ours where `path` is there.
-
-    Raises:
-        InputError: One of them is somebody else's.
+    A file of ours has `mark` near its beginning; those `beside` it, without a mark, are ours where it is there.
     """
     if path.is_file():
         with path.open("rb") as file:

@@ -20,11 +20,7 @@ MINIMUM_SIDE = 16
 
 
 def _check(path: Path, data: bytes) -> None:
-    """Refuses what OpenCV decodes, as far as it goes, without complaint: PNGs by their checksums, others by decoding.
-
-    Raises:
-        InputError: No image, or truncated or damaged.
-    """
+    """Refuses what OpenCV decodes, as far as it goes, without complaint: PNGs by checksums, others by decoding."""
     from PIL import Image, UnidentifiedImageError
 
     try:
@@ -50,8 +46,6 @@ def read_image(path: Path) -> ImageArray:
     if not path.is_file():
         raise InputError(f"{path}: there is no such image file")
     data = path.read_bytes()
-    if not data:
-        raise InputError(f"{path}: the image file is empty")
     _check(path, data)
     with quiet():
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)

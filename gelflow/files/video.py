@@ -5,6 +5,7 @@ Frames are (H, W, 3) uint8, RGB, as the decoder gives them.
 
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -74,7 +75,10 @@ def frames(path: Path, every: int = 1) -> Iterator[tuple[int, Bytes3 | None]]:
     if path.is_dir():
         for index, file in enumerate(image_files(path)):
             if index % every == 0:
-                yield index, _image_or_none(file)
+                image = None
+                with suppress(InputError):
+                    image = to_bytes(read_image(file))
+                yield index, image
         return
     capture = _open(path)
     index = 0
@@ -99,13 +103,6 @@ def frames(path: Path, every: int = 1) -> Iterator[tuple[int, Bytes3 | None]]:
 def frame_file(path: Path, index: int) -> Path:
     """The file that holds a frame: one of a folder's images, or the video."""
     return image_files(path)[index] if path.is_dir() else path
-
-
-def _image_or_none(path: Path) -> Bytes3 | None:
-    try:
-        return to_bytes(read_image(path))
-    except InputError:
-        return None
 
 
 def _open(path: Path) -> Any:  # a cv2.VideoCapture; OpenCV has no types

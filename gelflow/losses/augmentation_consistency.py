@@ -23,13 +23,9 @@ EPSILON, EXPONENT = 0.01, 0.4
 def transformed_pair(
     image1: Images, image2: Images, flow: Flow, random: torch.Generator
 ) -> tuple[Images, Images, Flow, Mask]:
-    """A pair under a random transformation, with the flow that belongs to it.
+    """Pairs under one random transformation, the flow that belongs to them, and a mask of the pixels where it is known.
 
-    The transformation is the same for all pairs of the batch; `random` is a generator on the CPU. No gradient is
-    followed through the flow.
-
-    Returns:
-        Both images, the flow that belongs to them, and a mask of the pixels where it is known.
+    `random` is a generator on the CPU. No gradient is followed through the flow.
     """
     draw = 2 * torch.rand(7, generator=random, dtype=torch.float64) - 1
     angle, scale = ROTATION * float(draw[0]), ENLARGEMENT ** (float(draw[1]) / 2 - 0.5)

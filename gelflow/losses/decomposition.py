@@ -5,11 +5,8 @@
 ``omega = (v_x - u_y) / 2`` and a weight w from the gradient of image 1. Forward differences, as in eq. 2; mean over
 the pixels that have a right and a lower neighbour. Zero for every translation.
 
-The weight, from ``||grad I||_1 = |I_x| + |I_y|`` as a mean over colours of an image in [0, 1], is one of
-
-- anti_edge (paper, eq. 6): ``1 - exp(-beta ||grad I||_1)``: strong on edges, none where there is no texture.
-- edge_aware: ``exp(-beta ||grad I||_1)``: the usual opposite.
-- floor: anti_edge, raised to at least `floor`, so that untextured gel is regularised too.
+The weight (paper, eq. 6) is ``1 - exp(-beta ||grad I||_1)``, ``||grad I||_1 = |I_x| + |I_y|`` as a mean over colours of
+an image in [0, 1]: strong on edges, none where there is no texture.
 """
 
 import torch
@@ -18,11 +15,11 @@ from gelflow.arrays import Flow, Images, Mask, Scalar
 from gelflow.ops.gradients import forward_differences
 
 
-def decomposition_loss(flow: Flow, weight: Mask, lambda_theta: float = 0.01, lambda_zeta: float = 0.01) -> Scalar:
+def decomposition_loss(flow: Flow, weight: Mask, lambda_theta: float, lambda_zeta: float) -> Scalar:
     """The decomposition loss at one scale.
 
     Args:
-        flow: (B, 2, H, W), in px or, as `LossConfig.flow_normalisation` says, divided by the image's shorter side.
+        flow: (B, 2, H, W), divided by the image's shorter side.
         weight: (B, 1, H-1, W-1).
         lambda_theta: Weight of the shear distortion rate.
         lambda_zeta: Weight of the rotation.
@@ -40,14 +37,8 @@ def decomposition_loss(flow: Flow, weight: Mask, lambda_theta: float = 0.01, lam
     return (weight * (linear + lambda_theta * shear + lambda_zeta * rotation)).mean()
 
 
-def regulariser_weight(image: Images, kind: str, beta: float, floor: float) -> Mask:
-    """The weight on the (H-1) x (W-1) pixels that have a right and a lower neighbour.
-
-    Returns:
-        (B, 1, H-1, W-1) in [0, 1].
-    """
+def regulariser_weight(image: Images, beta: float, least: float) -> Mask:
+    """The weight, raised to at least `least`: (B, 1, H-1, W-1), at pixels that have a right and a lower neighbour."""
     across, down = forward_differences(image)
     fading = torch.exp(-beta * (across.abs() + down.abs()).mean(dim=1, keepdim=True))
-    if kind == "edge_aware":
-        return fading
-    return 1 - fading if kind == "anti_edge" else (1 - fading).clamp(min=floor)
+    return (1 - fading).clamp(min=least)

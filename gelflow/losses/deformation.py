@@ -2,8 +2,8 @@
 
 ``L_df = w |grad R|_1``. R_x and R_y are the least-squares slopes of the warped positions x' = x + u and y' = y + v
 over 3x3 windows, which is exactly ``R_x = 1 + Prewitt_x(u) / 6``, ``R_y = 1 + Prewitt_y(v) / 6``. Published:
-``R = R_x R_y``. Beside it: ``R = det(1 + grad V) = R_x R_y - u_y v_x``, the true ratio of areas, which a rotation
-leaves at one. Both are constant, and the loss zero, for every affine flow.
+``R = R_x R_y``, which rotations change, unlike the true ratio of areas. It is constant, and the loss zero, for every
+affine flow.
 """
 
 from torch import Tensor
@@ -12,31 +12,23 @@ from gelflow.arrays import Flow, Mask, Scalar
 from gelflow.ops.gradients import forward_differences, window_slopes
 
 
-def area_ratio(flow: Flow, ratio: str = "product") -> Tensor:
-    """R at the pixels that have all eight neighbours.
-
-    Returns:
-        (B, 1, H-2, W-2), without unit; 1 where nothing is stretched.
-    """
+def area_ratio(flow: Flow) -> Tensor:
+    """R at the pixels that have all eight neighbours, (B, 1, H-2, W-2); 1 where nothing is stretched."""
     slope_x, slope_y = window_slopes(flow)
-    u_x, v_x = slope_x.split(1, dim=1)
-    u_y, v_y = slope_y.split(1, dim=1)
-    product = (1 + u_x) * (1 + v_y)
-    return product - u_y * v_x if ratio == "det" else product
+    return (1 + slope_x[:, :1]) * (1 + slope_y[:, 1:])
 
 
-def deformation_loss(flow: Flow, weight: Mask, ratio: str = "product") -> Scalar:
+def deformation_loss(flow: Flow, weight: Mask) -> Scalar:
     """The deformation loss at one scale.
 
     Args:
         flow: (B, 2, H, W), px of this scale (never divided by the image's size: R is a ratio of lengths).
         weight: (B, 1, H-1, W-1), of which the part belonging to the centres of R is used.
-        ratio: "product" or "det".
 
     Returns:
         A scalar >= 0, the mean over pixels; 0 for a scale of fewer than 4x4 px, which has no gradient of R.
     """
     if min(flow.shape[-2:]) < 4:
         return flow.sum() * 0
-    across, down = forward_differences(area_ratio(flow, ratio))
+    across, down = forward_differences(area_ratio(flow))
     return (weight[..., 1:-1, 1:-1] * (across.abs() + down.abs())).mean()

@@ -13,11 +13,7 @@ SOFTNESS_PX = 0.01
 
 
 def endpoint_loss(flow: Flow, truth: Flow) -> Scalar:
-    """Mean softened distance of a flow from the truth at one scale.
-
-    Returns:
-        A scalar >= 0, px; 0 where nothing is known.
-    """
+    """Mean softened distance of a flow from the truth at one scale, px; 0 where nothing is known."""
     known = torch.isfinite(truth).all(dim=1, keepdim=True)
     squared = (flow - torch.where(known, truth, flow.detach())).square().sum(dim=1, keepdim=True)
     distance = torch.sqrt(squared + SOFTNESS_PX**2) - SOFTNESS_PX

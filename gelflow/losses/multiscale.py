@@ -34,7 +34,7 @@ def self_supervised_loss(
     Returns:
         The loss, and its weighted parts "photometric", "smoothness" and "deformation", detached, which add up to it.
     """
-    side = min(image1.shape[-2:]) if config.flow_normalisation == "min_side" else 1
+    side = min(image1.shape[-2:])
     coarse = len(flows) if config.compare_at == "scale" else 1
     first, second = image_pyramid(image1, coarse), image_pyramid(image2, coarse)
     seen = None if visible is None else image_pyramid(visible, coarse)
@@ -68,9 +68,9 @@ def _regulariser(flow: Flow, image: Images, config: LossConfig, side: int) -> tu
     if config.smoothness != "helmholtz":
         loss = first_order_loss if config.smoothness == "first_order" else second_order_loss
         return config.lambda_dc * loss(flow / side, image, config.beta), zero
-    weight = regulariser_weight(image, config.weight, config.beta, config.weight_floor)
+    weight = regulariser_weight(image, config.beta, config.least_weight)
     smooth = decomposition_loss(flow / side, weight, config.lambda_theta, config.lambda_zeta)
-    deformed = config.lambda_df * deformation_loss(flow, weight, config.ratio) if config.lambda_df > 0 else zero
+    deformed = config.lambda_df * deformation_loss(flow, weight) if config.lambda_df > 0 else zero
     return config.lambda_dc * smooth, deformed
 
 

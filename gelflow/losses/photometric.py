@@ -32,11 +32,7 @@ def structural_similarity(first: Images, second: Images) -> Tensor:
 
 
 def photometric_loss(image1: Images, image2: Images, flow: Flow, alpha: float = 0.85) -> Scalar:
-    """The photometric loss at one scale.
-
-    Returns:
-        A scalar >= 0; 0 where the flow maps image 2 onto image 1, and where it takes every pixel out of the image.
-    """
+    """The photometric loss at one scale; 0 where the flow takes every pixel out of the image."""
     return appearance_loss(image1, warp(image2, flow), inside(flow), alpha)
 
 

@@ -39,14 +39,9 @@ FILLING_PX = (1.0, 4.0, 16.0, 64.0)
 def consistent(
     flow: Flow, image1: Images, image2: Images, estimate: Callable[[Images, Images], Flow], config: RegistrationConfig
 ) -> Flow:
-    """The flow with patches of the flow back where that one is right.
+    """The flow that `estimate` found for two images, with patches of the flow back where that one is right.
 
-    Args:
-        flow: (B, 2, H, W), what `estimate` found for these images.
-        image1: (B, 3, H, W).
-        image2: The same shape.
-        estimate: Called with the images of single pairs exchanged.
-        config: Registration of inverse flows.
+    `estimate` is called with the images of single pairs exchanged; inverse flows are registered as `config` says.
     """
     slope = torch.cat(torch.gradient(flow, dim=(-1, -2)), dim=1).norm(dim=1)
     torn = (slope > MAX_SLOPE).float().mean(dim=(1, 2)) > MAX_TORN_SHARE

@@ -1,10 +1,12 @@
 """The GelFlow network (paper, section 3.1): PWC-Net's coarse-to-fine estimation with local flow fusion at each scale.
 
-From the coarsest scale to `finest_scale`: enlarge the flow so far, warp the second image's features by it, correlate,
-estimate a coarse flow, refine it by the context network, fuse it locally. Finer flows, down to the image's own
-resolution, are bilinear enlargements: ``V1 = 2 up2(V2)``, ``V0 = 4 up4(V2)``.
+From the coarsest scale to s = 2: enlarge the flow so far, warp the second image's features by it, correlate, estimate a
+coarse flow, refine it by the context network, fuse it locally. Finer flows, down to the image's own resolution, are
+bilinear enlargements: ``V1 = 2 up2(V2)``, ``V0 = 4 up4(V2)``.
 
-What it cannot do: at `finest_scale` = 2 and without `refine` it resolves no detail of the motion finer than about 4 px.
+The paper is silent on normalising the features (UFlow); without it training from scratch hardly finds motion.
+
+What it cannot do: without `refine` it resolves no detail of the motion finer than about 4 px.
 """
 
 import torch
@@ -24,6 +26,11 @@ from gelflow.ops.correlation import local_correlation
 from gelflow.ops.pyramid import enlarge_flow
 from gelflow.ops.warp import warp
 
+FINEST_SCALE = 2
+"""Finest scale that is decoded."""
+CORRELATION_RADIUS = 4
+"""Search range of the cost volume in px of the scale, PWC-Net's."""
+
 
 class GelFlow(nn.Module):
     """Flow from image 1 to image 2 at all scales.
@@ -37,15 +44,15 @@ class GelFlow(nn.Module):
         super().__init__()
         self.config = config
         self.image_size: tuple[int, int] | None = None
-        scales = range(config.finest_scale, config.levels)
-        costs = (2 * config.correlation_radius + 1) ** 2
+        scales = range(FINEST_SCALE, config.levels)
+        costs = (2 * CORRELATION_RADIUS + 1) ** 2
         networks = 1 if config.estimator == "shared" else len(scales)
         self.encoder = Encoder(config.levels)
         self.projections = nn.ModuleList(_projection(CHANNELS[s - 1], config.projected_channels) for s in scales)
         self.estimators = nn.ModuleList(Estimator(costs + config.projected_channels + 2) for _ in range(networks))
         self.contexts = nn.ModuleList(ContextNetwork() for _ in range(networks))
-        self.fusion = LocalFlowFusion(config.lffm_region, config.lffm_scale) if config.lffm else None
-        self.refinement = RefinementHead(config.refine_iterations) if config.refine == "half" else None
+        self.fusion = LocalFlowFusion() if config.lffm else None
+        self.refinement = RefinementHead() if config.refine == "half" else None
 
     def forward(self, image1: Images, image2: Images) -> list[Flow]:
         """Estimates the flow.
@@ -65,7 +72,7 @@ class GelFlow(nn.Module):
         features = self.encoder(torch.cat([image1, image2]))
         flow: Flow | None = None
         decoded: dict[int, Flow] = {}
-        for scale in range(self.config.levels - 1, self.config.finest_scale - 1, -1):
+        for scale in range(self.config.levels - 1, FINEST_SCALE - 1, -1):
             first, second = features[scale - 1].split(batch)
             size = (first.shape[-2], first.shape[-1])
             if flow is None:
@@ -74,7 +81,7 @@ class GelFlow(nn.Module):
                 start = enlarge_flow(flow, 1, size)
             flow = self._decode(scale, first, second, start)
             decoded[scale] = flow
-        finest = self.config.finest_scale
+        finest = FINEST_SCALE
         for scale in range(finest - 1, -1, -1):
             size = (-(-height // 2**scale), -(-width // 2**scale))
             decoded[scale] = enlarge_flow(decoded[finest], finest - scale, size)
@@ -94,11 +101,9 @@ class GelFlow(nn.Module):
 
     def _decode(self, scale: int, first: Features, second: Features, start: Flow) -> Flow:
         """The flow of one scale from its features (B, C, H, W) and the enlarged flow of the coarser one."""
-        place = scale - self.config.finest_scale
+        place = scale - FINEST_SCALE
         network = 0 if self.config.estimator == "shared" else place
-        moved = warp(second, start)
-        pair = normalised(first.float(), moved) if self.config.normalise_features else (first.float(), moved)
-        costs = local_correlation(*pair, self.config.correlation_radius)
+        costs = local_correlation(*normalised(first.float(), warp(second, start)), CORRELATION_RADIUS)
         projected = self.projections[place](first)
         evidence = torch.cat([F.leaky_relu(costs, SLOPE), projected, start], dim=1)
         context, correction = self.estimators[network](evidence)

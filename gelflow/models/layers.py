@@ -8,15 +8,15 @@ SLOPE = 0.1
 """Negative slope of every leaky ReLU, as in PWC-Net."""
 
 
-def convolution(inputs: int, outputs: int, *, stride: int = 1, dilation: int = 1, active: bool = True) -> nn.Module:
+def convolution(inputs: int, outputs: int, *, stride: int = 1, dilation: int = 1) -> nn.Module:
     """A 3x3 convolution, padded to keep the size (at stride 2: half of it, rounded up), with its leaky ReLU.
 
     Weights start normal with the variance that keeps the signal's (He et al. 2015, fan-in), biases at zero.
     """
     layer = nn.Conv2d(inputs, outputs, 3, stride=stride, padding=dilation, dilation=dilation)
-    nn.init.kaiming_normal_(layer.weight, a=SLOPE if active else 1.0)
+    nn.init.kaiming_normal_(layer.weight, a=SLOPE)
     nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
-    return nn.Sequential(layer, nn.LeakyReLU(SLOPE)) if active else layer
+    return nn.Sequential(layer, nn.LeakyReLU(SLOPE))
 
 
 def flow_head(inputs: int) -> nn.Conv2d:

@@ -1,10 +1,9 @@
 """Local flow fusion module (paper, section 3.2): a flow smoothed where neighbouring context features agree.
 
-``V'(x) = sum_d w(x, d) V(x + d)``,  ``w(x, .) = softmax_d( k <C(x), C(x + d)> )`` over the neighbours d of a square
-window that lie inside the image. The paper has k = 1; the default here is k = 1/sqrt(number of channels), as in
-scaled dot-product attention, because with k = 1 the weight of the centre tends to one as features grow. Neighbours
-beyond the border get no weight, so a constant flow stays exactly as it is, and every fused flow lies between the
-flows that it was made from.
+``V'(x) = sum_d w(x, d) V(x + d)``,  ``w(x, .) = softmax_d( k <C(x), C(x + d)> )`` over the neighbours d of a 3x3 window
+that lie inside the image. The paper has k = 1; here k = 1/sqrt(number of channels), as in scaled dot-product attention,
+because with k = 1 the weight of the centre tends to one as features grow. Neighbours beyond the border get no weight,
+so a constant flow stays exactly as it is, and every fused flow lies between the flows that it was made from.
 """
 
 import math
@@ -18,26 +17,17 @@ from gelflow.ops.correlation import local_correlation
 
 
 class LocalFlowFusion(nn.Module):
-    """Local flow fusion over a square window; the module has no parameters."""
-
-    def __init__(self, region: int, scale: str) -> None:
-        super().__init__()
-        self.region = region
-        self.scale = scale
+    """Local flow fusion; the module has no parameters."""
 
     def weights(self, context: Features) -> Tensor:
-        """Weight of each neighbour, (B, region^2, H, W), row by row; at every pixel they sum to one."""
+        """Weight of each neighbour, (B, 9, H, W), row by row; at every pixel they sum to one."""
         channels, height, width = context.shape[1:]
-        radius = self.region // 2
-        factor = math.sqrt(channels) if self.scale == "inverse_sqrt" else channels  # the correlation is a mean over C
-        similarity = factor * local_correlation(context, context, radius)
-        exists = F.unfold(context.new_ones(1, 1, height, width), self.region, padding=radius)
-        beyond = exists.view(1, self.region**2, height, width) == 0
+        similarity = math.sqrt(channels) * local_correlation(context, context, 1)  # which is a mean over C
+        beyond = F.unfold(context.new_ones(1, 1, height, width), 3, padding=1).view(1, 9, height, width) == 0
         return torch.softmax(similarity.masked_fill(beyond, -torch.inf), dim=1)
 
     def forward(self, flow: Flow, context: Features) -> Flow:
         """Fuses a flow (B, 2, H, W) by the context (B, C, H, W)."""
         batch, _, height, width = flow.shape
-        neighbours = F.unfold(flow, self.region, padding=self.region // 2)
-        neighbours = neighbours.view(batch, 2, self.region**2, height, width)
+        neighbours = F.unfold(flow, 3, padding=1).view(batch, 2, 9, height, width)
         return (neighbours * self.weights(context).unsqueeze(1)).sum(dim=2)

@@ -17,16 +17,15 @@ from gelflow.ops.warp import warp
 
 RADIUS = 3
 CHANNELS_WITHIN = 48
+ITERATIONS = 3
 
 
 class RefinementHead(nn.Module):
-    """Corrections of the flow at half of the resolution, a number of times with the same weights."""
+    """Corrections of the flow at half of the resolution."""
 
-    def __init__(self, iterations: int) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        channels = CHANNELS[0]
-        self.iterations = iterations
-        inputs = (2 * RADIUS + 1) ** 2 + channels + 2
+        inputs = (2 * RADIUS + 1) ** 2 + CHANNELS[0] + 2
         self.layers = nn.Sequential(
             convolution(inputs, CHANNELS_WITHIN), convolution(CHANNELS_WITHIN, CHANNELS_WITHIN, dilation=2)
         )
@@ -39,7 +38,7 @@ class RefinementHead(nn.Module):
         """
         # Unit length: a correlation near one says "here", whatever the contrast.
         first, second = F.normalize(encoded.float(), dim=1).split(flow.shape[0])
-        for _ in range(self.iterations):
+        for _ in range(ITERATIONS):
             costs = encoded.shape[1] * local_correlation(first, warp(second, flow), RADIUS)
             evidence = torch.cat([F.leaky_relu(costs, SLOPE), first, flow], dim=1)
             flow = flow + self.head(self.layers(evidence)).float()

@@ -34,10 +34,7 @@ def weights_file(given: Path | None) -> Path:
 
 
 def save_weights(path: Path, model: GelFlow, **metadata: str) -> None:
-    """Writes a network's weights, as a whole or not at all.
-
-    `metadata` are further texts to store with them. Folders are made.
-    """
+    """Writes a network's weights, and further texts with them, as a whole or not at all."""
     texts = metadata | {
         "format": FORMAT,
         "version": __version__,
@@ -51,11 +48,7 @@ def save_weights(path: Path, model: GelFlow, **metadata: str) -> None:
 
 
 def read_metadata(path: Path) -> dict[str, str]:
-    """The texts that `save_weights` kept with the weights.
-
-    Raises:
-        InputError: No such file, not a safetensors file, damaged, or not weights of GelFlow.
-    """
+    """The texts that `save_weights` kept with the weights; exceptions as for `load_weights`."""
     return _read(path)[0]
 
 

@@ -14,10 +14,7 @@ P = ParamSpec("P")
 
 
 def cached(make: Callable[P, Tensor]) -> Callable[P, Tensor]:
-    """A function whose tensors are made once for each set of its (hashable) arguments.
-
-    They must not be changed, and are never freed: a recorded CUDA graph reads them at fixed addresses.
-    """
+    """A function whose tensors, which must not be changed, are made once for each set of its (hashable) arguments."""
     made = functools.cache(make)
 
     @functools.wraps(make)

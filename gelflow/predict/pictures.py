@@ -84,8 +84,6 @@ def legend(side: int) -> Bytes3:
 def draw_overlay(frame: Bytes3, flow: FlowArray, scale_px: float) -> Bytes3:
     """A frame of an overlay video: arrows on the frame at the left, colours with their legend at the right.
 
-    The flow leads from the reference to this frame; `scale_px` is the length in full colour, the same for all frames.
-
     An arrow starts where the gel was in the reference frame and ends where it is in this frame. Arrows are as long as
     the motion; where the scale is below 3 px they are enlarged, by a factor that is written on the frame.
 
@@ -139,9 +137,6 @@ def write_flow_picture(
 ) -> None:
     """Writes a PNG with both images, the flow as colours with their legend and as arrows, where it is known, and the
     difference of the images before and after the second is warped by the flow.
-
-    Raises:
-        OSError: The file cannot be written.
     """
     from matplotlib.figure import Figure
 

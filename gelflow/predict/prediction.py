@@ -88,13 +88,9 @@ def predict_video(
 ) -> Prediction:
     """Writes flow/000001.exr ... (numbered by frame), motion.csv and overlay.mp4 in place of an earlier run's.
 
-    Args:
-        method: Estimates the flow.
-        path: A video file, or a folder of images in the natural order of their names.
-        out: Folder for the results.
-        reference: Flow from the first frame to each frame, or from each frame's predecessor to it.
-        every: Take every n-th frame only.
-        progress: Called with the number of frames done and to be done; each frame counts twice, flow and overlay.
+    Every `every`-th frame of a video file or a folder of images is taken; the flow leads to it from the first one or
+    from its predecessor. `progress` is called with the number of frames done and to be done; each counts twice, for
+    flow and overlay.
 
     Raises:
         InputError: The video does not open, fewer than two frames decode, a frame cannot be used, or files of these
@@ -171,7 +167,6 @@ def _frame_pairs(path: Path, every: int, reference: Reference) -> Iterator[tuple
 
 
 def _write_overlay(pictures: Iterator[Bytes3], video: Path, frames_per_second: float) -> None:
-    """Writes overlay.mp4."""
     import cv2
 
     first = next(pictures)

@@ -36,10 +36,7 @@ def loading_context(config: TrainConfig) -> BaseContext | None:
 
 
 def end_with_run(_: int) -> None:
-    """Prepares a loading process: ignores Ctrl-C, and ends at the run's SIGTERM and with the run alone.
-
-    For `worker_init_fn`.
-    """
+    """Prepares a loading process: ignores Ctrl-C, and ends at the run's SIGTERM and with the run alone."""
     run = multiprocessing.parent_process()
     if run is None:
         raise RuntimeError("end_with_run: call it in a process that multiprocessing started")

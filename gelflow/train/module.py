@@ -176,7 +176,6 @@ class FlowModule(L.LightningModule):
         return self.model if self.average is None else self.average
 
     def on_validation_epoch_start(self) -> None:
-        """Forgets the sums of the last validation."""
         self._sums = {}
 
     def validation_step(self, batch: dict[str, Any], _: int) -> None:

@@ -26,26 +26,16 @@ class ResidentPairs(Dataset[Sample]):
         return len(self._samples)
 
     def __getitem__(self, index: int) -> Sample:
-        """The sample as the files give it, its tensors on the device."""
         return {key: _unpacked(value) for key, value in self._samples[index].items()}
 
 
 def resident(
     pairs: CheckedPairs, device: torch.device, *, room: int | None = None, **loading: Any
 ) -> ResidentPairs | None:
-    """Decodes all pairs and puts them on a device.
+    """Decodes all pairs and puts them on a device; None where they do not fit. InputError for one that cannot be used.
 
-    Args:
-        pairs: The pairs, as training needs them.
-        device: Where to.
-        room: Bytes that they may take; None: half of what is free on the CUDA device.
-        loading: How the DataLoader that decodes them starts its processes; empty: this process decodes.
-
-    Returns:
-        The pairs, or None where they do not fit.
-
-    Raises:
-        InputError: A pair cannot be used.
+    `room` is the number of bytes that they may take; None: half of what is free on the CUDA device. `loading` says how
+    the DataLoader that decodes them starts its processes; empty: this process decodes.
     """
     if room is None:
         room = int(SHARE_OF_MEMORY * torch.cuda.mem_get_info(device)[0])

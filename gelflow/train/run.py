@@ -51,7 +51,6 @@ class TrainResult:
     memory_mib: float | None = None
 
     def __str__(self) -> str:
-        """One line with steps, last results, speed, memory and the file of weights."""
         speed = "" if self.pairs_per_second is None else f"{self.pairs_per_second:.3g} pairs/s"
         memory = "" if self.memory_mib is None else f"peak memory {self.memory_mib:.0f} MiB"
         texts = (f"{self.steps} steps", describe(self.metrics), speed, memory, f"{self.weights}")
@@ -147,12 +146,7 @@ def _initial_network(config: TrainConfig, initial: Path | None) -> GelFlow:
 
 
 def _fit(callback: CheckpointCallback, data: "_Data", device: str, validation_due: bool) -> None:
-    """Validates first where that is due, then runs the remaining steps.
-
-    Raises:
-        InputError: A pair cannot be used.
-        KeyboardInterrupt: Somebody asked to stop; the message says how to go on.
-    """
+    """Validates first where that is due, then runs the remaining steps."""
     module, config, out = callback.module, callback.module.config, callback.out
     session = f"from_step_{module.start:06d}"
     with ExitStack() as stack:

@@ -67,10 +67,7 @@ class CheckedPairs(Dataset[Sample]):
 
 
 class TrainingSamples(Dataset[tuple[Sample, np.random.Generator]]):
-    """Checked pairs resized and cropped, each with the source of the random numbers of its augmentation.
-
-    Its keys are those of `StepSampler`.
-    """
+    """Pairs at `StepSampler`'s keys, resized and cropped, each with the source of its augmentation's random numbers."""
 
     def __init__(self, pairs: Dataset[Sample], config: TrainConfig) -> None:
         self.pairs = pairs
@@ -119,9 +116,6 @@ def cropped(sample: Sample, config: TrainConfig, random: np.random.Generator) ->
 
     Images whose flow is known and that are smaller than the crop are continued beyond their border by its colours, with
     no flow there, so that data sets of several sensors can be trained on together.
-
-    Raises:
-        InputError: The crop does not fit into images without a flow.
     """
     if config.crop_size is None:
         return sample

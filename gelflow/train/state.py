@@ -52,11 +52,7 @@ def save_state(out: Path, state: State) -> None:
 
 
 def load_state(out: Path) -> State:
-    """Reads the state of a run. Only tensors and plain values are read; nothing in the file can run code.
-
-    Raises:
-        InputError: There is none, or it is damaged.
-    """
+    """Reads the state of a run, without running code in it; InputError where there is none, or it is damaged."""
     path = out / STATE
     try:
         return State(**load_tensors(path))

@@ -39,8 +39,6 @@ RATE = 1e-4
 def fine_tuning_settings(method: Learned, steps: int, pairs: int) -> TrainConfig:
     """The settings of a test-time optimisation; batches are not larger than the number of pairs.
 
-    The paper's 800 epochs of 8 pairs in batches of 4 are 1600 steps.
-
     Raises:
         InputError: The weights carry no settings.
     """

@@ -88,7 +88,8 @@ def fit_dot_grid(sensor: Sensor, pattern: Dots, centres: Pixels, spacing_mm: flo
     found = least_squares(misfit, start, loss="soft_l1", f_scale=3.0, x_scale=np.maximum(np.abs(start), 0.05))
     layout, fitted = build(found.x)
     residual = centres[used] - _predicted(sensor, layout, fitted, index)
-    arms = np.linalg.norm(np.diff(_corner(sensor, layout, fitted), axis=0), axis=1)
+    corner = _predicted(sensor, layout, fitted, np.array([[1, 0], [0, 0], [0, 1]]))
+    arms = np.linalg.norm(np.diff(corner, axis=0), axis=1)  # of columns and of rows
     jitter = 1.4826 * float(np.median(np.abs(residual)) / np.mean(arms / layout.spacing_mm))
     layout = _near_centre(layout.model_copy(update={"jitter_mm": round(jitter, 4)}))
     return DotGridFit(_rounded(layout), _rounded(fitted), residual, used, index, float(arms.mean()))
@@ -160,11 +161,6 @@ def _rounded(part: _Part) -> _Part:
     """With numbers that are fit to read: 6 decimals, a thousandth of what a frame tells."""
     content = json.loads(part.model_dump_json(), parse_float=lambda text: round(float(text), 6))
     return type(part).model_validate(content)
-
-
-def _corner(sensor: Sensor, pattern: Dots, camera: Camera) -> Pixels:
-    """Pixels of the dots (1, 0), (0, 0), (0, 1): their distances are those of columns and of rows."""
-    return _predicted(sensor, pattern, camera, np.array([[1, 0], [0, 0], [0, 1]]))
 
 
 def _near_centre(pattern: Dots) -> Dots:

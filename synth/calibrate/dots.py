@@ -32,11 +32,7 @@ class FoundDots:
 
 
 def find_dots(linear: FloatArray, pitch_px: float) -> FoundDots:
-    """Find dots and measure them against the coating around.
-
-    Args:
-        linear: (H, W, 3) in [0, 1].
-        pitch_px: about how far dots are apart.
+    """Find dots, about `pitch_px` apart in a linear frame (H, W, 3), and measure them against the coating around.
 
     Raises:
         InputError: fewer than nine whole dots, or dots of about a pixel.

@@ -45,7 +45,7 @@ class Target:
     Attributes:
         signal: (n, 3) linear, full scale 1.
         slope: (n, 3) derivative of the encoded value with respect to the linear one.
-        gain: (n,) or scalar: exposure.
+        gain: exposure.
         corner: (n,) squared distance from the principal point over that of the farthest corner.
     """
 
@@ -184,13 +184,7 @@ class _Problem:
 
 
 def fit_powers(basis: FloatArray, target: Target, shines: BoolArray) -> FloatArray:
-    """Powers (m, 3), by non-negative least squares per channel.
-
-    Args:
-        basis: (m, n, 3) signal under each light of power 1.
-        target: at the same n pixels.
-        shines: (m, 3) channels in which each light may have power.
-    """
+    """Powers (m, 3), by non-negative least squares per channel, of lights with signals (m, n, 3) at power 1."""
     from scipy.optimize import nnls
 
     powers = np.zeros((len(basis), 3))

@@ -45,7 +45,7 @@ def numbers(
     given: Frames,
     seconds: float,
 ) -> dict[str, Any]:
-    """JSON-able: everything that was found, how sure it is, and how well it fits."""
+    """JSON-able: everything that was found, and how well it fits."""
     camera = fit.sensor.camera
     record: dict[str, Any] = {
         "preset": preset,

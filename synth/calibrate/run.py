@@ -43,15 +43,7 @@ def run_calibrate(
 ) -> int:
     """Fit a preset to frames of a user's sensor; write OUT/scene.toml, calibration.png and calibration.json.
 
-    Args:
-        scene: the preset: a shipped scene's name or a TOML file.
-        frames: images of the undeformed gel to fit.
-        judge: further images of the same undeformed gel, which the fit does not see.
-        out: directory.
-        assignments: KEY=VALUE changes of the preset.
-        spacing_mm: distance of the dots' columns where it is known; without, the preset's field of view is trusted.
-        steps: most steps for the lights' geometry.
-        as_json: print the numbers instead of a summary.
+    Arguments are the options of the command (`synth.cli`).
 
     Returns:
         0 if the fit is good, 1 if the verdict is that it is not.

@@ -103,12 +103,7 @@ def _cannot_tell(sensor: Sensor, spacing_is_known: bool) -> tuple[str, ...]:
 
 
 def common_displacement(index: NDArray[np.int64], residual: Pixels) -> float:
-    """Root mean square of what neighbours share of their displacement off the grid, px.
-
-    Args:
-        index: (n, 2) columns and rows of the dots in the grid.
-        residual: (n, 2) px, found minus predicted.
-    """
+    """Root mean square of what neighbours share of their displacement off the grid, px; see `DotGridFit`."""
     near = np.abs(index[:, None] - index[None]).sum(axis=2) <= 1  # a dot itself, and the next ones along row and column
     shared = near @ residual / near.sum(axis=1, keepdims=True)
     return float(np.sqrt((shared**2).sum(axis=1).mean()))

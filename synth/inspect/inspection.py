@@ -61,11 +61,7 @@ def evenly_spaced(total: int, count: int) -> list[int]:
 
 
 def inspect(path: Path | str, limit: int = 100) -> Inspection:
-    """Looks at a dataset, a sample's folder or one flow file.
-
-    Args:
-        path: what to look at.
-        limit: of a dataset, look at no more than so many samples, evenly spaced; `about` says how many there are.
+    """Looks at a dataset, of it at no more than `limit` samples, evenly spaced, a sample's folder or one flow file.
 
     Raises:
         InputError: Nothing that can be inspected, or a file is missing or damaged.

@@ -23,6 +23,9 @@ def numbers_of(view: View) -> dict[str, Any]:
     backward = None
     if flow.backward is not None and flow.backward_visible is not None:
         backward = _motion(flow.backward, flow.backward_visible > 0.5, view.visible_known)
+    difference = None
+    if view.differences is not None:
+        difference = dict(zip(("before_rmse", "after_rmse"), map(_rms, view.differences), strict=True))
     return {
         "name": view.name,
         "index": meta.get("index"),
@@ -35,7 +38,7 @@ def numbers_of(view: View) -> dict[str, Any]:
         "backward": backward,
         "closure": None if view.closure is None else _spread(view.closure),
         "sigma": None if view.sigma is None else _spread(view.sigma),
-        "difference": _difference(view),
+        "difference": difference,
         "force_n": meta.get("force_n"),
         "torque_nmm": meta.get("torque_nmm"),
         "solver": meta.get("diagnostics", {}).get("solver") if isinstance(meta.get("diagnostics"), dict) else None,
@@ -63,13 +66,6 @@ def _percentiles(values: FloatArray, **percents: int) -> dict[str, float | None]
     return {
         name: float(value) for name, value in zip(percents, np.percentile(values, [*percents.values()]), strict=True)
     }
-
-
-def _difference(view: View) -> dict[str, float | None] | None:
-    if view.differences is None:
-        return None
-    before, after = (_rms(values) for values in view.differences)
-    return {"before_rmse": before, "after_rmse": after}
 
 
 def _rms(values: FloatArray) -> float | None:

@@ -19,13 +19,7 @@ _VISIBLE, _HIDDEN = (245, 245, 245), (200, 60, 50)
 
 @dataclass(frozen=True)
 class Arrows:
-    """A thinned flow to draw over an image, magnified so that small flows can be seen.
-
-    Attributes:
-        start: (n, 2) px.
-        tip: (n, 2) px, start + magnification * flow.
-        magnification: how many times longer than the flow the arrows are.
-    """
+    """A thinned flow to draw over an image: from start to start + magnification * flow, both (n, 2) px."""
 
     start: Pixels
     tip: Pixels
@@ -81,10 +75,10 @@ def panels_of(view: View, numbers: Mapping[str, Any]) -> list[Panel]:
     return panels
 
 
-def arrows_of(view: View, across: int = 18) -> Arrows:
-    """About `across` arrows in a row; all but the longest 1 % are at most 1.6 times as long as their spacing."""
+def arrows_of(view: View) -> Arrows:
+    """About 18 arrows in a row; all but the longest 1 % are at most 1.6 times as long as their spacing."""
     height, width = view.size
-    spacing = max(1, round(width / across))
+    spacing = max(1, round(width / 18))
     columns, rows = np.meshgrid(np.arange(spacing // 2, width, spacing), np.arange(spacing // 2, height, spacing))
     flow = view.flow.forward[rows.ravel(), columns.ravel()].astype(np.float64)
     known = np.isfinite(flow).all(axis=-1)

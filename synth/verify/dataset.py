@@ -28,14 +28,7 @@ _NAMED = {"scene.hash": "scene_hash", "seed": "seed", "index": "index"}
 
 
 def verify_dataset(path: Path | str, progress: Callable[[int, int], None] | None = None) -> Report:
-    """Verifies a dataset directory.
-
-    Args:
-        path: the dataset.
-        progress: called after each sample with how many are done and how many there are.
-
-    Returns:
-        The report; `ok` is False where any check failed or there is no sample.
+    """Verifies a dataset directory; `progress` is called after each sample with how many are done and of how many.
 
     Raises:
         InputError: not a dataset. A damaged sample is a failed check.

@@ -116,7 +116,8 @@ def derive(near: Sheet, far: Sheet, places: Pixels, recorded: FloatArray) -> Der
     first, origin = _back(near, far, end)
     visible, touched = (np.zeros(len(places), dtype=np.bool_) for _ in range(2))
     height = near.camera.height(points)
-    visible[query] = _is_first(first, height[query] + _HIDDEN_MM, seen.path[query])
+    # Nothing higher is found by the same path.
+    visible[query] = (first.height <= height[query] + _HIDDEN_MM) | (first.path != seen.path[query])
     visible[query] &= far.reached_by(points[query], seen.path[query])
     touched[query] = (
         visible[query] & (first.height > height[query] + _TOUCHING_MM) & (first.triangle != seen.triangle[query])
@@ -136,11 +137,6 @@ def _back(near: Sheet, far: Sheet, ends: Pixels) -> tuple[Seen, Pixels]:
     pixels = np.full(ends.shape, np.nan)
     pixels[found] = near.pixels(seen.positions(far.triangles, near.positions)[found], seen.path[found])
     return seen, pixels
-
-
-def _is_first(found: Seen, limit: FloatArray, path: Indices) -> BoolArray:
-    """Whether what is found by the same path lies no higher than a limit (n,), or nothing is found by that path."""
-    return np.asarray((found.height <= limit) | (found.path != path))
 
 
 def _is_inside(pixels: Pixels, image: Sheet) -> BoolArray:

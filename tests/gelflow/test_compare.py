@@ -20,7 +20,7 @@ from gelflow.compare.run import compare
 from gelflow.compare.scores import evaluate, score_pair, summarise
 from gelflow.compare.seeds import grouped
 from gelflow.compare.tables import pair_table, summary_table
-from gelflow.data import join, open_pairs
+from gelflow.data import PairDataset, open_all
 from gelflow.errors import InputError
 
 
@@ -37,7 +37,7 @@ class Constant:
 
 
 def test_errors_of_known_flows_are_exact_and_the_true_one_warps_best(tmp_path: Path) -> None:
-    dataset = open_pairs(write_synthetic(tmp_path, [(3.0, 4.0), (0.0, 0.5)]))
+    dataset = PairDataset(write_synthetic(tmp_path, [(3.0, 4.0), (0.0, 0.5)]))
     scores = evaluate(Constant("zero", 0, 0), dataset)
     assert [(score.endpoint_error_px, score.outliers_1px) for score in scores] == [(5.0, 1.0), (0.5, 0.0)]
     (mean,) = summarise(scores)
@@ -45,14 +45,14 @@ def test_errors_of_known_flows_are_exact_and_the_true_one_warps_best(tmp_path: P
     true = evaluate(Constant("true", 3, 4), dataset)[0]
     assert (true.endpoint_error_px, true.calibration) == (0.0, 1.0)
     assert min(true.certain or 0, scores[0].unknown or 0) > 0.5  # sigma knows which one is right
-    dataset = open_pairs(write_folder(tmp_path / "plain", {"a": (2.5, -1.5)}))
+    dataset = PairDataset(write_folder(tmp_path / "plain", {"a": (2.5, -1.5)}))
     best, *others = (evaluate(Constant("x", 2.5 * f, -1.5 * f), dataset)[0] for f in (1, 0, -1, 0.8, 1.2))
     assert best.psnr_db > max(other.psnr_db for other in others)
     assert best.ssim > max(other.ssim for other in others)
 
 
 def test_files_hold_every_score_and_are_read_back_the_same(tmp_path: Path) -> None:
-    dataset = open_pairs(write_synthetic(tmp_path / "data", [(1.0, 0.0), (0.0, 2.0)]))
+    dataset = PairDataset(write_synthetic(tmp_path / "data", [(1.0, 0.0), (0.0, 2.0)]))
     methods = named_methods(["none", "farneback", "dis-medium"])
     written = compare(methods, dataset, tmp_path / "out")
     scores, again = written.scores, read_comparison(tmp_path / "out" / "scores.json")
@@ -70,8 +70,8 @@ def test_files_hold_every_score_and_are_read_back_the_same(tmp_path: Path) -> No
 
 def test_numbers_that_are_not_finite_come_back_and_markers_are_scored_where_there_are_some(tmp_path: Path) -> None:
     """Equal images have an infinite PSNR; an estimate with a gap has no mean error, which is not "no truth"."""
-    plain = open_pairs(write_folder(tmp_path / "plain", {"a": (0, 0)}))
-    exact = open_pairs(write_synthetic(tmp_path / "exact", [(1, 0)]))
+    plain = PairDataset(write_folder(tmp_path / "plain", {"a": (0, 0)}))
+    exact = PairDataset(write_synthetic(tmp_path / "exact", [(1, 0)]))
     compare(named_methods(["none"]), plain, tmp_path / "out1")
     text = (tmp_path / "out1" / "scores.json").read_text()
     assert "Infinity" not in text
@@ -83,7 +83,7 @@ def test_numbers_that_are_not_finite_come_back_and_markers_are_scored_where_ther
     assert np.isnan(score.endpoint_error_px)
     folder = write_folder(tmp_path / "marked", {"a": (3, 4), "b": (1, 0)})
     (folder / "a_markers.csv").write_text("x1,y1,x2,y2\n20,20,23,24\n40,30,43,34\n")
-    scores = evaluate(Constant("zero", 0, 0), open_pairs(folder))
+    scores = evaluate(Constant("zero", 0, 0), PairDataset(folder))
     assert [score.marker_distance_px for score in scores] == [5.0, None]
     table = pair_table(scores, ["marker_distance_px"], "{:.2f}")
     assert table == (["method", "a"], [["zero", "5.00"]])
@@ -93,7 +93,7 @@ def test_numbers_that_are_not_finite_come_back_and_markers_are_scored_where_ther
 
 
 def test_earlier_results_are_replaced_on_the_same_data_only(tmp_path: Path) -> None:
-    first, second = (open_pairs(write_folder(tmp_path / name, {"a": (1, 0)})) for name in ("first", "second"))
+    first, second = (PairDataset(write_folder(tmp_path / name, {"a": (1, 0)})) for name in ("first", "second"))
     compare(named_methods(["none"]), first, tmp_path / "out")
     compare(named_methods(["none", "dis-fast"]), first, tmp_path / "out")
     assert "DIS fast" in (tmp_path / "out" / "table.md").read_text()
@@ -104,7 +104,7 @@ def test_earlier_results_are_replaced_on_the_same_data_only(tmp_path: Path) -> N
 
 
 def test_no_method_two_of_one_name_and_broken_pairs_are_refused(tmp_path: Path) -> None:
-    dataset = open_pairs(write_folder(tmp_path, {"a": (1, 0), "b": (1, 0)}))
+    dataset = PairDataset(write_folder(tmp_path, {"a": (1, 0), "b": (1, 0)}))
     with pytest.raises(InputError, match="no method"):
         compare([], dataset)
     with pytest.raises(InputError, match="two methods are called 'x'"):
@@ -119,16 +119,16 @@ def test_where_nothing_can_be_followed_no_motion_counts_and_exact_flow_is_for_sy
     folder = write_folder(tmp_path, {"a": (2, 0), "b": (2, 0)})
     for number in (1, 2):
         save(folder / f"b_{number}.png", np.full((64, 80, 3), 0.5, np.float32))
-    tracked, none = compare(named_methods(["lucas-kanade", "none"]), open_pairs(folder)).scores[1::2]
+    tracked, none = compare(named_methods(["lucas-kanade", "none"]), PairDataset(folder)).scores[1::2]
     assert (tracked.method, tracked.pair, tracked.ssim) == ("Lucas-Kanade", "b", none.ssim)
     assert math.isinf(tracked.psnr_db)
-    dataset = open_pairs(write_synthetic(tmp_path / "exact", [(2.0, 1.0)]))
+    dataset = PairDataset(write_synthetic(tmp_path / "exact", [(2.0, 1.0)]))
     (exact,) = evaluate(named_methods(["exact"])[0], dataset)
     (true,) = evaluate(Constant("true", 2, 1), dataset)
     (none,) = evaluate(Constant("none", 0, 0), dataset)
     assert (exact.method, exact.endpoint_error_px, exact.outliers_01px) == ("exact flow", 0.0, 0.0)
     assert none.psnr_db + 3 < exact.psnr_db < true.psnr_db  # the strip of 8 of 80 px does move in these images
-    plain = open_pairs(write_folder(tmp_path / "plain", {"a": (1, 0)}))
+    plain = PairDataset(write_folder(tmp_path / "plain", {"a": (1, 0)}))
     with pytest.raises(InputError, match="pair a, exact flow: the pair has no exact flow; leave the method exact out"):
         evaluate(named_methods(["exact"])[0], plain)
 
@@ -156,8 +156,8 @@ def test_methods_are_added_and_scored_again(tmp_path: Path, capsys: pytest.Captu
 def test_a_moved_copy_of_the_data_is_the_same_data_and_other_pairs_are_not(tmp_path: Path) -> None:
     shifts = {"first": [(1, 0), (0, 2)], "moved": [(1, 0), (0, 2)], "longer": [(1, 0), (0, 2), (3, 0)],
               "other": [(1, 0), (0, 2.5)]}  # fmt: skip
-    first, moved, longer, other = (open_pairs(write_synthetic(tmp_path / name, shifts[name])) for name in shifts)
-    plain = open_pairs(write_folder(tmp_path / "plain", {"000000": (1, 0), "000001": (0, 2)}))
+    first, moved, longer, other = (PairDataset(write_synthetic(tmp_path / name, shifts[name])) for name in shifts)
+    plain = PairDataset(write_folder(tmp_path / "plain", {"000000": (1, 0), "000001": (0, 2)}))
     out = tmp_path / "out"
     compare([Constant("a", 0, 0)], first, out)
     result = compare([Constant("b", 0, 0)], moved, out, add=True)
@@ -174,7 +174,7 @@ def test_a_moved_copy_of_the_data_is_the_same_data_and_other_pairs_are_not(tmp_p
     "content", ["{", "[]", '{"data": ["x"]}', '{"data": [], "scores": [{"method": "a"}], "strata": {}, "networks": {}}']
 )
 def test_scores_that_cannot_be_read_are_named(content: str, tmp_path: Path) -> None:
-    dataset = open_pairs(write_folder(tmp_path / "data", {"a": (1, 0)}))
+    dataset = PairDataset(write_folder(tmp_path / "data", {"a": (1, 0)}))
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "scores.json").write_text(content)
     with pytest.raises(InputError, match=r"scores\.json: not the scores of a comparison of this version"):
@@ -187,7 +187,7 @@ def test_every_nth_pair_of_several_folders(tmp_path: Path, capsys: pytest.Captur
     assert main([*command, "--every", "3"]) == 0
     scores = json.loads(capsys.readouterr().out)["scores"]
     assert [(s["pair"], s["motion_px"]) for s in scores] == [("a/000000", 5.0), ("a/000003", 2.0), ("b/000002", 1.0)]
-    assert join([open_pairs(folder) for folder in folders]).names[::3] == [s["pair"] for s in scores]
+    assert open_all(folders).names[::3] == [s["pair"] for s in scores]
     assert main([*command, "--every", "0"]) == 2
     assert "--every 0" in capsys.readouterr().err
 
@@ -209,7 +209,7 @@ class Working:
 
 
 def test_processor_time_is_that_of_the_work(tmp_path: Path) -> None:
-    dataset = open_pairs(write_folder(tmp_path, {"a": (1, 0)}))
+    dataset = PairDataset(write_folder(tmp_path, {"a": (1, 0)}))
     waiting, busy = (score_pair(Working(kind), dataset, 0) for kind in (False, True))
     # Clocks tick at least every 10 ms.
     assert waiting.seconds >= 0.1

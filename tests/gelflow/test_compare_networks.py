@@ -27,7 +27,7 @@ from gelflow.compare.scores import evaluate
 from gelflow.compare.speed import Speed, network_speed
 from gelflow.config import REGISTRATIONS, ModelConfig, MotionConfig, Registration, RegistrationConfig, TrainConfig
 from gelflow.config.sources import train_config
-from gelflow.data import join, open_pairs
+from gelflow.data import PairDataset, open_all
 from gelflow.errors import InputError
 from gelflow.files.exr import read_flow
 from gelflow.models.raft import RAFT
@@ -106,12 +106,12 @@ class Counting:
 
 def test_speed_leaves_out_the_first_call_and_sees_memory_and_the_front_what_none_beats(tmp_path: Path) -> None:
     method = Counting()
-    scores = evaluate(method, open_pairs(write_folder(tmp_path, {"a": (1, 0), "b": (0, 1)})))
+    scores = evaluate(method, PairDataset(write_folder(tmp_path, {"a": (1, 0), "b": (0, 1)})))
     assert (len(scores), method.calls) == (2, 1 + 2 * 2)  # there and back for closure
     points = [(3.0, 1.0), (1.0, 5.0), (2.0, 6.0), (2.0, 2.0), (4.0, 1.0), (1.0, 7.0)]
     assert pareto_front(points) == [1, 3, 0]
     assert pareto_front([]) == []
-    speed = network_speed(Hungry(), (64, 64), batch=2, warmup=1, repeats=2)
+    speed = network_speed(Hungry(), (64, 64), 2, "cpu")
     assert speed.pairs_per_second > 0
     if speed.memory_mib is not None:  # Linux
         # The tensor itself; what else the process takes meanwhile (code of the kernels, buffers) stays below as much.
@@ -168,8 +168,8 @@ def test_of_the_training_a_constant_rate_and_the_size_of_use_carry_over(tmp_path
 def test_fine_tuning_does_not_look_at_exact_flow_and_needs_one_size(tmp_path: Path) -> None:
     """The same images with and without their exact flow."""
     shifts = [(1.5, 0.5), (-1.0, 0.0)]
-    plain = open_pairs(write_folder(tmp_path / "plain", {"a": shifts[0], "b": shifts[1]}))
-    exact = open_pairs(write_synthetic(tmp_path / "exact", shifts))
+    plain = PairDataset(write_folder(tmp_path / "plain", {"a": shifts[0], "b": shifts[1]}))
+    exact = PairDataset(write_synthetic(tmp_path / "exact", shifts))
     method = Learned(unsuitable(tmp_path / "w.safetensors"), "net", device="cpu")
     runs = [fine_tuned(method, dataset, tmp_path / f"run{k}", 3) for k, dataset in enumerate((plain, exact))]
     assert [run.name for run in runs] == ["net+ft"] * 2
@@ -178,7 +178,7 @@ def test_fine_tuning_does_not_look_at_exact_flow_and_needs_one_size(tmp_path: Pa
     recorded = json.loads(read_metadata(runs[0].path)["train"])
     assert (recorded["supervision"], recorded["steps"]) == ("self", 3)
     folders = [write_folder(tmp_path / f"{k}", {"a": (1, 0)}, size) for k, size in enumerate([(64, 80), (72, 80)])]
-    dataset, path = join([open_pairs(folder) for folder in folders]), method.path
+    dataset, path = open_all(folders), method.path
     with pytest.raises(InputError, match="64x80, 72x80 px, a batch needs one size; give --size"):
         fine_tuned(Learned(path, device="cpu"), dataset, tmp_path / "sizes", 1)
     assert fine_tuned(Learned(path, size=(64, 80), device="cpu"), dataset, tmp_path / "sizes", 1).path.is_file()
@@ -242,7 +242,7 @@ def test_rows_without_and_with_registration_stand_in_one_table_with_one_of_raft(
 
 
 def test_a_row_is_what_registration_makes_of_the_networks_flow_in_its_time(plain: Path, tmp_path, monkeypatch) -> None:
-    images = open_pairs(write_folder(tmp_path, {"a": (1.0, -0.5)})).images(0)
+    images = PairDataset(write_folder(tmp_path, {"a": (1.0, -0.5)})).images(0)
     start, found = (Learned(plain, device="cpu", registration=choice).flow(*images) for choice in CHOICES)
     again = registered(*map(tensor, (start, *images)), REGISTRATIONS["brightness"])[0].numpy()
     np.testing.assert_array_equal(np.moveaxis(found, -1, 0), again)
@@ -252,12 +252,12 @@ def test_a_row_is_what_registration_makes_of_the_networks_flow_in_its_time(plain
         return registered(*arguments)  # type: ignore[arg-type]
 
     monkeypatch.setattr(gelflow.models.gelflow, "registered", slow)
-    (score,) = evaluate(Learned(plain, device="cpu", registration="motion"), open_pairs(tmp_path))
+    (score,) = evaluate(Learned(plain, device="cpu", registration="motion"), PairDataset(tmp_path))
     assert score.seconds >= 0.3
 
 
 def test_the_speed_of_the_network_alone_includes_it(own: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    dataset = open_pairs(write_folder(tmp_path, {"a": (1.0, -0.5)}))
+    dataset = PairDataset(write_folder(tmp_path, {"a": (1.0, -0.5)}))
     measured = []
 
     def kept(passes: Callable[..., torch.Tensor], *_: object) -> Speed:

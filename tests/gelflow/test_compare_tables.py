@@ -17,13 +17,13 @@ from gelflow.compare.scores import evaluate, summarise
 from gelflow.compare.seeds import group_name, grouped
 from gelflow.compare.strata import EDGE, MOTION, PATTERN, SCENE, merged, pair_strata, signed_distance
 from gelflow.compare.tables import pair_table, strata_table, summary_table, tables
-from gelflow.data import PairDataset, open_pairs
+from gelflow.data import PairDataset
 
 
 def test_seeds_become_mean_and_standard_deviation(tmp_path: Path) -> None:
     names = ["best#0", "best#12+ft", "best", "C# code", "a#1b", "x#2#3"]
     assert [group_name(name) for name in names] == ["best", "best+ft", "best", "C# code", "a#1b", "x#2"]
-    dataset = open_pairs(write_synthetic(tmp_path, [(1.0, 0.0), (2.0, 0.0)]))
+    dataset = PairDataset(write_synthetic(tmp_path, [(1.0, 0.0), (2.0, 0.0)]))
     methods = [Constant("net#0", 0, 0), Constant("other", 5, 0), Constant("net#1", 0.5, 0), Constant("net#2", 1, 0)]
     scores = [score for method in methods for score in evaluate(method, dataset)]
     groups = grouped(summarise(scores))
@@ -37,10 +37,10 @@ def test_seeds_become_mean_and_standard_deviation(tmp_path: Path) -> None:
 
 
 def test_bins_of_seeds_are_pooled_and_fine_tuned_methods_and_other_devices_come_apart(tmp_path: Path) -> None:
-    dataset = open_pairs(write_synthetic(tmp_path, [(1.0, 0.0)]))
+    dataset = PairDataset(write_synthetic(tmp_path, [(1.0, 0.0)]))
     result = compare([Constant("net#0", 0, 0), Constant("net#1", 0.5, 0)], dataset)
     assert strata_table(result.strata) == (["where", "pixels", "net"], [["motion: 1 to 2 px", "4096", "0.750"]])
-    dataset = open_pairs(write_folder(tmp_path / "plain", {"a": (1, 0)}))
+    dataset = PairDataset(write_folder(tmp_path / "plain", {"a": (1, 0)}))
     result = compare([Constant("net#0+ft", 1, 0), Constant("net", 0, 0)], dataset)
     named = [[row[0] for row in rows] for _, (_, rows) in tables(result)]
     assert named == [["net"], ["net+ft"], ["net", "net+ft"], ["net", "net+ft"]]  # PSNR and closure of each pair
@@ -114,7 +114,7 @@ def with_contact(folder: Path, pattern: dict) -> Path:
 
 @pytest.mark.parametrize("pattern", [DRAWN_KIND, DRAWN_PATTERN], ids=["kind", "pattern"])
 def test_a_data_set_with_contact_and_patterns_is_sorted(pattern: dict, tmp_path: Path) -> None:
-    dataset = open_pairs(with_contact(tmp_path / "data", pattern))
+    dataset = PairDataset(with_contact(tmp_path / "data", pattern))
     result = compare([Constant("zero", 0, 0), Constant("right", 3, 0)], dataset, tmp_path / "out")
     header, rows = strata_table(result.strata)
     assert header == ["where", "pixels", "zero", "right"]
@@ -135,7 +135,7 @@ def test_a_data_set_with_contact_and_patterns_is_sorted(pattern: dict, tmp_path:
 
 def test_bare_gels_are_left_out_of_a_second_table_of_means(tmp_path: Path) -> None:
     """Nothing can be followed on a gel without a pattern, whose errors would hide all others."""
-    dataset = open_pairs(with_contact(tmp_path, DRAWN_KIND))  # a pair moves by 3 px, the other by 0.25 px
+    dataset = PairDataset(with_contact(tmp_path, DRAWN_KIND))  # a pair moves by 3 px, the other by 0.25 px
     first = dataset.records[0]
     bare = PairDataset(dataset.source, [replace(first, scene="toy, none"), *dataset.records[1:]])
     result = compare([Constant("zero", 0, 0)], bare)

@@ -12,7 +12,7 @@ from synth_samples import synth_sample, write_dataset
 from textures import as_bytes, moved, save, write_folder, write_synthetic
 
 from gelflow.arrays import FlowArray
-from gelflow.data import join, open_pairs
+from gelflow.data import PairDataset, open_all
 from gelflow.errors import InputError
 from gelflow.files.exr import read_channels, read_flow, write_flow
 from gelflow.files.flo import write_flo
@@ -95,7 +95,7 @@ def test_a_photograph_is_turned_as_its_exif_says(tmp_path: Path, orientation: in
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_gelflow_reads_what_synth_writes(tmp_path: Path, dtype: type) -> None:
     samples = [synth_sample(index, dtype) for index in (0, 2)]
-    pairs = open_pairs(write_dataset(tmp_path / "d", samples)).both_directions()
+    pairs = PairDataset(write_dataset(tmp_path / "d", samples)).both_directions()
     assert pairs.names[::2] == ["000000", "000002"]
     assert len(set(pairs.names)) == len(pairs) == 4
     for item, sample, back in zip(pairs, (s for s in samples for _ in range(2)), 2 * [False, True], strict=True):
@@ -118,17 +118,17 @@ def test_unfinished_samples_do_not_count_and_both_kinds_fit_into_one_batch(tmp_p
     (folder / "samples" / ".000002.partial-1").mkdir()
     lines = (folder / "manifest.jsonl").read_text().splitlines(keepends=True)
     (folder / "manifest.jsonl").write_text(lines[1] + lines[0] + '{"index": 2, "traj')
-    assert open_pairs(folder).names == ["000001", "000003"]
-    synthetic = open_pairs(write_synthetic(tmp_path / "s", [(1, 0)]))
-    plain, same = (open_pairs(write_folder(tmp_path / parent / "p", {"a": (0, 1)})) for parent in "xy")
-    assert "flow" not in plain[0]
-    both = join([synthetic, plain])
+    assert PairDataset(folder).names == ["000001", "000003"]
+    synthetic = write_synthetic(tmp_path / "s", [(1, 0)])
+    plain, same = (write_folder(tmp_path / parent / "p", {"a": (0, 1)}) for parent in "xy")
+    assert "flow" not in PairDataset(plain)[0]
+    both = open_all([synthetic, plain])
     assert both.names == ["s/000000", "p/a"]
     batch = next(iter(torch.utils.data.DataLoader(both, batch_size=2)))
     assert batch["flow"].shape == (2, 2, 64, 80)
     assert torch.isnan(batch["flow"][1]).all()
     assert not batch["visible"][1].any()
-    assert join([plain, same]).names == ["p/a", "p-2/a"]
+    assert open_all([plain, same]).names == ["p/a", "p-2/a"]
 
 
 @pytest.mark.parametrize(
@@ -153,33 +153,33 @@ def test_broken_synthetic_data_set_is_named(tmp_path: Path, file: str, content: 
     else:
         (folder / file).write_text(content)
     with pytest.raises(InputError, match=word):
-        open_pairs(folder)
+        PairDataset(folder)
 
 
 def test_digest_tells_scene_and_seed_and_flow_of_another_size_is_named(tmp_path: Path) -> None:
     folder = write_synthetic(tmp_path, [(1, 0)])
-    digests = [open_pairs(folder).digest]
+    digests = [PairDataset(folder).digest]
     for origin in ({"scene_hash": "a", "seed": 1}, {"scene_hash": "a", "seed": 2}, {"scene_hash": "b", "seed": 2}):
         (folder / "dataset.json").write_text(json.dumps({"schema_version": 1} | origin))
-        digests.append(open_pairs(folder).digest)
+        digests.append(PairDataset(folder).digest)
     assert len(set(digests)) == 4
-    assert open_pairs(folder).digest == digests[-1]
+    assert PairDataset(folder).digest == digests[-1]
     write_flow(folder / "samples" / "000000" / "flow.exr", np.zeros((10, 10, 2), np.float32))
     with pytest.raises(InputError, match=r"flow\.exr.*10 x 10.*80 x 64"):
-        open_pairs(folder)[0]
+        PairDataset(folder)[0]
 
 
 def test_plain_folders_may_have_markers_and_what_is_no_data_set_is_named(tmp_path: Path) -> None:
     folder = write_folder(tmp_path, {"b": (1, 0), "a": (0, 1)})
     # Files of some programs begin with a byte-order mark.
     (folder / "a_markers.csv").write_text("x1,y1,x2,y2\n1,2,3,4\n5,6,7,8.5\n", encoding="utf-8-sig")
-    dataset = open_pairs(folder)
+    dataset = PairDataset(folder)
     assert dataset.names == ["a", "b"]
     assert dataset.markers(0).tolist() == [[1, 2, 3, 4], [5, 6, 7, 8.5]]
     assert dataset.markers(1) is dataset.truth(0) is None
     (folder / "a_1.png").unlink()
     with pytest.raises(InputError, match=r"a_1\.png"):
-        open_pairs(folder)
+        PairDataset(folder)
     notes, empty, unfinished, broken = (tmp_path / name for name in ("notes/a.txt", "empty", "cut", "broken"))
     for folder in (notes.parent, empty, unfinished, broken):
         folder.mkdir()
@@ -189,7 +189,7 @@ def test_plain_folders_may_have_markers_and_what_is_no_data_set_is_named(tmp_pat
     for path, word in ((tmp_path / "nothing", "no such folder"), (empty, "empty"), (notes.parent, "no image pairs"),
                        (notes, "is a file"), (unfinished, "interrupted"), (broken, r"pairs\.json")):  # fmt: skip
         with pytest.raises(InputError, match=word):
-            open_pairs(path)
+            PairDataset(path)
 
 
 @pytest.mark.parametrize(
@@ -207,4 +207,4 @@ def test_broken_markers_are_named(tmp_path: Path, text: str) -> None:
     folder = write_folder(tmp_path, {"a": (1, 0)})
     (folder / "a_markers.csv").write_text(text, encoding="latin-1")
     with pytest.raises(InputError, match=r"a_markers\.csv"):
-        open_pairs(folder).markers(0)
+        PairDataset(folder).markers(0)

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from textures import REAL, as_bytes, moved, save, write_video
 
-from gelflow.data import open_pairs
+from gelflow.data import PairDataset
 from gelflow.data.choose import ChoiceConfig, Choices, choose_pairs, usable_frames
 from gelflow.data.extract import extract_pairs, find_recordings
 from gelflow.data.pairset import read_pair_set
@@ -49,7 +49,7 @@ def test_chosen_motion_is_the_true_one_and_the_same_whether_the_recording_is_alo
     both = extract_pairs([str(videos)], tmp_path / "both", ChoiceConfig(per_source=3))
     alone = extract_pairs([str(videos / "b.avi")], tmp_path / "alone", ChoiceConfig(per_source=3))
     assert [pair for pair in both.pairs if pair.source == "b"] == list(alone.pairs)
-    dataset = open_pairs(tmp_path / "alone")
+    dataset = PairDataset(tmp_path / "alone")
     assert dataset.names == [pair.name for pair in alone.pairs]
     expected = moved(96, 128, SHIFTS["b"][alone.pairs[0].frames[0]], 0, 2)
     # Motion JPEG at OpenCV's quality of 95: a few grey levels of 255 on average.
@@ -76,7 +76,7 @@ def test_a_job_goes_on_where_it_was_interrupted_and_is_not_replaced_by_another(t
         extract_pairs([str(videos)], cut, ChoiceConfig(), interrupt)
     assert list(read_pair_set(cut).sources) == ["a"]
     with pytest.raises(InputError, match="interrupted"):
-        open_pairs(cut)
+        PairDataset(cut)
     extract_pairs([str(videos)], cut, ChoiceConfig())
     assert contents(cut) == contents(whole)
     before = {path: path.stat().st_mtime_ns for path in cut.rglob("*")}
@@ -141,7 +141,7 @@ def test_blank_frames_exposure_ramps_still_repeated_and_unrelated_frames_are_no_
 def test_inputs_are_found_by_file_folder_and_pattern_and_those_that_hold_nothing_are_named(tmp_path, videos) -> None:
     expected = [("a", videos / "a.avi"), ("b", videos / "b.avi")]
     for inputs in ([str(videos)], [f"{videos}/*.avi"], [str(videos / "b.avi"), str(videos / "a.avi")]):
-        assert [(r.name, r.path) for r in find_recordings(inputs)] == expected
+        assert list(find_recordings(inputs).items()) == expected
     empty = tmp_path / "empty"
     empty.mkdir()
     (empty / "notes.txt").touch()

@@ -13,7 +13,7 @@ import pytest
 import torch
 from synth_samples import synth_sample, write_dataset
 
-from gelflow.data import PairDataset, open_pairs
+from gelflow.data import PairDataset
 from gelflow.errors import InputError
 from synth.dataset import export as exporting
 from synth.dataset.sample import Sample
@@ -54,7 +54,7 @@ def all_bits(dataset: PairDataset) -> list[dict[str, tuple[object, ...]]]:
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_shards_give_the_bits_of_the_data_set_in_both_directions(tmp_path: Path, dtype: type) -> None:
     folders = write_both(tmp_path, [synth_sample(index, dtype) for index in INDICES])
-    data, shards = map(open_pairs, folders)
+    data, shards = map(PairDataset, folders)
     assert len(list(folders[1].glob("*.tar"))) == 2
     assert shards.names == data.names == [f"{index:06d}" for index in INDICES]
     assert shards.digest == data.digest
@@ -66,18 +66,18 @@ def test_shards_give_the_bits_of_the_data_set_in_both_directions(tmp_path: Path,
 
 def test_without_a_backward_flow_the_forward_one_is_read(tmp_path: Path) -> None:
     folders = write_both(tmp_path, [synth_sample(0, backward=False)])
-    data, shards = (open_pairs(path).both_directions() for path in folders)
+    data, shards = (PairDataset(path).both_directions() for path in folders)
     assert bits(shards[0]) == bits(data[0])
     with pytest.raises(InputError, match=r"000000\.forward\.npy.*no backward flow"):
         shards[1]
 
 
 def test_one_shard_alone_workers_and_copies_read_the_same(both: tuple[Path, Path]) -> None:
-    expected = all_bits(open_pairs(both[0]))
-    shard = open_pairs(both[1] / "shard-000001.tar")
+    expected = all_bits(PairDataset(both[0]))
+    shard = PairDataset(both[1] / "shard-000001.tar")
     assert shard.names == ["999999", "1000000"]
     assert all_bits(shard) == expected[2:]
-    dataset = open_pairs(both[1])
+    dataset = PairDataset(both[1])
     dataset[0]  # before the workers start: whatever this left open they would share
     loader = torch.utils.data.DataLoader(dataset, batch_size=None, num_workers=2, multiprocessing_context="fork")
     assert [bits(item) for item in loader] == expected
@@ -104,13 +104,13 @@ DAMAGE: dict[str, Callable[[bytes, list[tarfile.TarInfo]], bytes]] = {
 
 @pytest.mark.parametrize("damage", DAMAGE.values(), ids=DAMAGE.keys())
 def test_truncated_and_damaged_shards_are_named(shard, damage) -> None:
-    assert len(open_pairs(shard)) == 2
+    assert len(PairDataset(shard)) == 2
     with tarfile.open(shard) as archive:
         members = archive.getmembers()
     shard.write_bytes(damage(shard.read_bytes(), members))
     for path in (shard, shard.parent):
         with pytest.raises(InputError, match=r"shard-000000\.tar: .*truncated"):
-            open_pairs(path)
+            PairDataset(path)
 
 
 def rewrite(shard: Path, change: Callable[[str, bytes], Iterator[tuple[str, bytes]]]) -> None:
@@ -130,16 +130,16 @@ def rewrite(shard: Path, change: Callable[[str, bytes], Iterator[tuple[str, byte
 def test_a_missing_member_is_named(shard: Path, suffix: str) -> None:
     rewrite(shard, lambda name, data: iter([(name, data)] if name != f"000001.{suffix}" else []))
     with pytest.raises(InputError, match=rf"shard-000000\.tar: sample 000001 lacks {suffix};"):
-        open_pairs(shard)
+        PairDataset(shard)
 
 
 def test_two_samples_of_one_key_are_named(shard: Path) -> None:
     shutil.copy(shard, shard.with_name("other.tar"))
     with pytest.raises(InputError, match=r"shard-000000\.tar: sample 000000 is in .*other\.tar, too"):
-        open_pairs(shard.parent)
+        PairDataset(shard.parent)
     rewrite(shard, lambda name, data: iter([(name.replace("000001", "000000"), data)]))
     with pytest.raises(InputError, match=r"shard-000000\.tar, member 000000\.image1\.png: occurs twice"):
-        open_pairs(shard)
+        PairDataset(shard)
 
 
 def _npy(array: np.ndarray) -> bytes:
@@ -168,14 +168,14 @@ def _npy(array: np.ndarray) -> bytes:
 )
 def test_a_damaged_member_is_named(shard: Path, suffix: str, content: Callable[[bytes], bytes], words: str) -> None:
     rewrite(shard, lambda name, data: iter([(name, content(data) if name == f"000001.{suffix}" else data)]))
-    dataset = open_pairs(shard)
+    dataset = PairDataset(shard)
     with pytest.raises(InputError, match=rf"shard-000000\.tar, member 000001\.(forward|image2)[^ ]*: .*({words})"):
         dataset[1]
     dataset[0]
 
 
 def test_a_shard_that_changes_after_opening_is_named(shard: Path) -> None:
-    dataset = open_pairs(shard)
+    dataset = PairDataset(shard)
     shard.write_bytes(shard.read_bytes()[:1000])
     with pytest.raises(InputError, match=r"member 000000\.image1\.png: ends after \d+ of \d+ bytes"):
         dataset[0]
@@ -193,8 +193,8 @@ def test_what_holds_no_sample_is_named(tmp_path: Path) -> None:
             for name in names:
                 archive.addfile(tarfile.TarInfo(name))
         with pytest.raises(InputError, match=words):
-            open_pairs(tmp_path)
+            PairDataset(tmp_path)
     path.unlink()
     path.mkdir()  # a folder of that name is no shard
     with pytest.raises(InputError, match="no image pairs"):
-        open_pairs(tmp_path)
+        PairDataset(tmp_path)

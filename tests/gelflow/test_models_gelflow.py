@@ -37,9 +37,8 @@ def test_flows_of_all_scales_for_sizes_of_any_parity(network: GelFlow, size: tup
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"estimator": "shared"}, {"lffm": False}, {"levels": 5, "finest_scale": 1}, {"normalise_features": False},
-     {"levels": 4, "refine": "half", "refine_iterations": 1}],
-)  # fmt: skip
+    [{}, {"estimator": "shared"}, {"lffm": False}, {"levels": 4, "refine": "half"}],
+)
 def test_gradients_reach_every_parameter(options: dict) -> None:
     torch.manual_seed(0)
     network = GelFlow(ModelConfig(**options))
@@ -91,7 +90,7 @@ class FixedFlow(GelFlow):
 
 
 def test_estimate_scales_each_component_with_its_side_and_works_at_the_size_of_training_unless_told_otherwise() -> None:
-    network = FixedFlow(ModelConfig(levels=4, finest_scale=2)).train()
+    network = FixedFlow(ModelConfig(levels=4)).train()
     images = torch.rand(2, 2, 3, 120, 320).unbind()
     flow = estimate_flow(network, *images, size=(240, 64))
     assert (network.seen, network.training, flow.requires_grad) == ((240, 64), True, False)
@@ -107,30 +106,27 @@ def test_estimate_scales_each_component_with_its_side_and_works_at_the_size_of_t
         estimate_flow(network, *images, size=(10, 64))
 
 
-@pytest.mark.parametrize("region", [3, 5])
-@pytest.mark.parametrize("scale", ["inverse_sqrt", "none"])
-def test_weights_are_a_softmax_over_the_neighbours_inside(region: int, scale: str) -> None:
+def test_weights_are_a_softmax_over_the_neighbours_inside() -> None:
     context = torch.randn(2, 8, 6, 7, dtype=torch.float64)
-    weights = LocalFlowFusion(region, scale).weights(context)
-    # a softmax of at most 25 terms in double precision
+    weights = LocalFlowFusion().weights(context)
+    # a softmax of at most 9 terms in double precision
     torch.testing.assert_close(weights.sum(dim=1), torch.ones(2, 6, 7, dtype=torch.float64), rtol=0, atol=1e-14)
-    radius, factor, row, column = region // 2, 8**-0.5 if scale == "inverse_sqrt" else 1.0, 0, 5
-    logits = torch.full((region**2,), -torch.inf, dtype=torch.float64)
-    for place, (dy, dx) in enumerate(itertools.product(range(-radius, radius + 1), repeat=2)):
+    row, column = 0, 5
+    logits = torch.full((9,), -torch.inf, dtype=torch.float64)
+    for place, (dy, dx) in enumerate(itertools.product((-1, 0, 1), repeat=2)):
         if 0 <= row + dy < 6 and 0 <= column + dx < 7:
-            logits[place] = factor * context[0, :, row, column] @ context[0, :, row + dy, column + dx]
+            logits[place] = 8**-0.5 * context[0, :, row, column] @ context[0, :, row + dy, column + dx]
     torch.testing.assert_close(weights[0, :, row, column], logits.softmax(dim=0), rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize("region", [3, 5])
-def test_a_fused_flow_lies_between_its_neighbours_and_a_constant_one_stays(region: int) -> None:
-    fuse, context = LocalFlowFusion(region, "inverse_sqrt"), torch.randn(1, 32, 9, 8, dtype=torch.float64)
+def test_a_fused_flow_lies_between_its_neighbours_and_a_constant_one_stays() -> None:
+    fuse, context = LocalFlowFusion(), torch.randn(1, 32, 9, 8, dtype=torch.float64)
     constant = torch.tensor([3.0, -1.5], dtype=torch.float64).view(1, 2, 1, 1).expand(1, 2, 9, 8)
     # weights sum to one within 1e-14, times 3 px
     torch.testing.assert_close(fuse(constant, context), constant, rtol=0, atol=1e-13)
     flow = torch.randn(1, 2, 9, 8, dtype=torch.float64)
     fused = fuse(flow, context)
-    upper, lower = (sign * torch.nn.functional.max_pool2d(sign * flow, region, 1, region // 2) for sign in (1, -1))
+    upper, lower = (sign * torch.nn.functional.max_pool2d(sign * flow, 3, 1, 1) for sign in (1, -1))
     assert (fused <= upper + 1e-12).all()  # sums of numbers of size 1
     assert (fused >= lower - 1e-12).all()
     assert (fused - flow).abs().max() > 0.1
@@ -138,9 +134,9 @@ def test_a_fused_flow_lies_between_its_neighbours_and_a_constant_one_stays(regio
 
 def test_fusion_has_the_gradients_of_differences_and_refinement_corrects_two_scales() -> None:
     flow, context = torch.randn(1, 2, 3, 4, dtype=torch.float64), torch.randn(1, 3, 3, 4, dtype=torch.float64)
-    assert gradcheck(LocalFlowFusion(3, "inverse_sqrt"), (flow.requires_grad_(), context.requires_grad_()))
+    assert gradcheck(LocalFlowFusion(), (flow.requires_grad_(), context.requires_grad_()))
     torch.manual_seed(0)
-    network = GelFlow(ModelConfig(levels=4, refine="half", refine_iterations=2))
+    network = GelFlow(ModelConfig(levels=4, refine="half"))
     images = torch.rand(2, 1, 3, 66, 71).unbind()
     with torch.no_grad():
         before = [flow.clone() for flow in network(*images)]
@@ -149,7 +145,5 @@ def test_fusion_has_the_gradients_of_differences_and_refinement_corrects_two_sca
     assert [tuple(flow.shape[2:]) for flow in after] == [(66, 71), (33, 36), (17, 18)]
     assert torch.equal(after[2], before[2])
     assert (after[1] != before[1]).any()
-    # Two corrections of about 0.5 px at the head's scale, doubled where it is enlarged.
-    assert (after[0] - before[0])[:, 0].mean() == pytest.approx(2.0, rel=0.1)
-    with pytest.raises(ValueError, match="adds nothing to finest_scale = 1"):
-        ModelConfig(finest_scale=1, refine="half")
+    # Three corrections of about 0.5 px at the head's scale, doubled where it is enlarged.
+    assert (after[0] - before[0])[:, 0].mean() == pytest.approx(3.0, rel=0.1)

@@ -14,24 +14,24 @@ from gelflow.config import REGISTRATIONS, LossConfig, ModelConfig, RegistrationC
 from gelflow.config.sources import PRESETS, train_config
 from gelflow.config.validation import validated
 from gelflow.errors import InputError
+from gelflow.models.gelflow import CORRELATION_RADIUS, FINEST_SCALE
 from gelflow.train import train
 
 
 def test_defaults_are_the_readings_of_the_paper_and_its_preset_states_them() -> None:
     model, loss, run = ModelConfig(), LossConfig(), TrainConfig()
-    assert (model.levels, model.finest_scale, model.correlation_radius, model.lffm_region) == (8, 2, 4, 3)
+    assert (model.levels, FINEST_SCALE, CORRELATION_RADIUS, model.lffm) == (8, 2, 4, True)
     assert (loss.alpha, loss.beta, loss.lambda_theta, loss.lambda_zeta) == (0.85, 10, 0.01, 0.01)
     assert (loss.lambda_dc, loss.lambda_df, loss.lambda_s) == (75, 0.01, (1,) * 7)
-    assert (loss.smoothness, loss.flow_normalisation, loss.ratio, loss.weight) == (
-        "helmholtz", "min_side", "product", "anti_edge")  # fmt: skip
+    assert (loss.smoothness, loss.least_weight) == ("helmholtz", 0)
     assert (run.batch_size, run.learning_rate, run.weight_decay, run.supervision) == (4, 1e-4, 1e-6, "self")
     paper = train_config("paper")
     assert paper == TrainConfig(image_size=(512, 640))
     assert paper.steps == 200 * 1328 // 4  # 200 epochs of 1327 pairs in batches of 4, the last one filled up
     text = tomllib.loads(files("gelflow").joinpath("presets", "paper.toml").read_text(encoding="utf-8"))
-    published = {f"lambda_{name}" for name in ("dc", "theta", "zeta", "df", "s")} | {"alpha", "beta", "ratio", "weight"}
+    published = {f"lambda_{name}" for name in ("dc", "theta", "zeta", "df", "s")} | {"alpha", "beta"}
     assert published <= set(text["loss"])
-    assert {"levels", "lffm", "lffm_region", "finest_scale"} <= set(text["model"])
+    assert {"levels", "lffm"} <= set(text["model"])
 
 
 @pytest.mark.parametrize(
@@ -42,7 +42,6 @@ def test_defaults_are_the_readings_of_the_paper_and_its_preset_states_them() -> 
         ({"loss": {"alpha": 2}}, r"loss.alpha: .*less than or equal to 1 \(given: 2\)"),
         ({"model": {"estimator": "both"}}, "model.estimator: .*'per_scale' or 'shared'.*both"),
         ({"model": {"registration": {"prior": 1}}}, "model.registration.prior: .*allowed: windows_px, "),
-        ({"model": {"levels": 4, "finest_scale": 3}}, "finest_scale = 3 must be below the coarsest scale 3"),
         ({"model": {"levels": 6}}, "loss.lambda_s has 7 numbers; model.levels asks for 5"),
         ({"loss": {"lambda_s": [0.0] * 7}}, "at least one of them above 0"),
         ({"crop_size": [32, 64]}, r"crop_size = \[32, 64\]: each side must be at least 64 px"),
@@ -74,10 +73,12 @@ def test_numbers_lists_json_and_earlier_records_serve_where_they_mean_the_same()
     assert found == expected
     assert list(map(type, found.values())) == list(map(type, expected.values()))
     # Settings that are gone are read with the value that every run has now, and refused with another.
-    config = TrainConfig(image_size=(64, 80), loss=LossConfig(weight="floor"))
+    config = TrainConfig(image_size=(64, 80), loss=LossConfig(least_weight=0.1))
     assert validated(TrainConfig, config.model_dump(mode="json"), "json") == config
-    loss = {"lambda_ph": 1.0, "lambda_census": 0.0, "mask_outside": True}
-    assert validated(TrainConfig, {"loss": loss, "compile": True}, "weights") == TrainConfig()
+    loss = {"lambda_ph": 1.0, "lambda_census": 0.0, "mask_outside": True, "weight": "anti_edge", "weight_floor": 0.1}
+    model = {"finest_scale": 2, "normalise_features": True, "lffm_scale": "inverse_sqrt"}
+    assert validated(TrainConfig, {"model": model, "loss": loss, "compile": True}, "weights") == TrainConfig()
+    assert validated(ModelConfig, model, "weights") == ModelConfig()
     with pytest.raises(InputError, match=r"loss\.lambda_census: there is no such setting"):
         validated(TrainConfig, {"loss": {"lambda_census": 0.1}}, "weights")
 

@@ -19,7 +19,7 @@ from waves import Shifts, same_weights, small, weights_of
 
 from gelflow.config import LossConfig, ModelConfig, TrainConfig
 from gelflow.config.sources import train_config
-from gelflow.data import open_pairs
+from gelflow.data import PairDataset
 from gelflow.errors import InputError
 from gelflow.losses import flow_loss, self_supervised_loss
 from gelflow.models import GelFlow
@@ -96,7 +96,7 @@ def test_two_processes_end_as_one_with_twice_the_batch(tmp_path: Path, option: s
     """Gradients are averaged over processes, so that 2 x 1 pairs are 1 x 2 pairs."""
     folder = write_synthetic(tmp_path / "data", [(1.0, 0.5)] * 4, (64, 64))
     config = small(batch_size=2, steps=3, learning_rate=1e-4, supervision="flow")
-    one = train(config, open_pairs(folder), None, tmp_path / "one").weights
+    one = train(config, PairDataset(folder), None, tmp_path / "one").weights
     both = command(tmp_path, folder, "steps = 3\nbatch_size = 1\nsupervision = 'flow'\nworkers = 1", option, "2")
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

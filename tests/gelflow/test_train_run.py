@@ -15,7 +15,7 @@ from torch.utils.data import Dataset
 from waves import Shifts, same_weights, small, weights_of
 
 from gelflow.config import TrainConfig
-from gelflow.data import open_pairs
+from gelflow.data import PairDataset
 from gelflow.errors import InputError
 from gelflow.models.estimate import estimate_flow
 from gelflow.models.weights import load_weights, read_metadata
@@ -207,7 +207,7 @@ def test_fine_tuning_starts_from_the_given_weights_and_folders_of_other_runs_are
 
 def test_a_run_is_not_resumed_with_other_pairs(tmp_path: Path) -> None:
     data, other = (
-        open_pairs(write_folder(tmp_path / names, dict.fromkeys(names, (1.0, 0.0)))) for names in ("ab", "ac")
+        PairDataset(write_folder(tmp_path / names, dict.fromkeys(names, (1.0, 0.0)))) for names in ("ab", "ac")
     )
     run = tmp_path / "run"
     train(small(steps=1), data, data, run)

@@ -56,10 +56,11 @@ class RAFT(nn.Module):
         """
         check_shapes(image1, image2)
         height, width = image1.shape[-2:]
-        padding = _padding(height, width)
+        across, down = -width % STRIDE, -height % STRIDE
+        left, top = across // 2, down // 2
+        padding = (left, across - left, top, down - top)
         first, second = (F.pad(2 * image - 1, padding, mode="replicate") for image in (image1, image2))
         flow = self._iterate(first, second)
-        left, _, top, _ = padding
         return flow[..., top : top + height, left : left + width].contiguous()
 
     def _iterate(self, first: Images, second: Images) -> Flow:
@@ -76,12 +77,6 @@ class RAFT(nn.Module):
             position = position + change.float()
         flow = position - start
         return enlarge_bilinear(flow) if weights is None else enlarge_convex(flow, weights)
-
-
-def _padding(height: int, width: int) -> tuple[int, int, int, int]:
-    """Columns left and right, rows above and below, that make both sides multiples of `STRIDE`."""
-    across, down = -width % STRIDE, -height % STRIDE
-    return across // 2, across - across // 2, down // 2, down - down // 2
 
 
 def enlarge_bilinear(flow: Flow) -> Flow:

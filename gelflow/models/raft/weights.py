@@ -27,10 +27,8 @@ def looks_like_raft(path: Path) -> bool:
     return path.suffix.lower() in (".pth", ".pt")
 
 
-def load_raft(path: Path, device: str = "cpu", iterations: int = 20) -> RAFT:
+def load_raft(path: Path, device: str = "cpu") -> RAFT:
     """Builds the network that a file's shapes describe, with the file's weights, in evaluation mode.
-
-    Only tensors are read: a file with anything else in it is refused before any of it runs.
 
     Raises:
         InputError: No such file, damaged, one that would run code, or not RAFT's weights.
@@ -42,7 +40,7 @@ def load_raft(path: Path, device: str = "cpu", iterations: int = 20) -> RAFT:
             f"{path}: not weights of RAFT small or large (fnet.conv2.weight is missing or of another "
             "size); give a state dictionary of princeton-vl/RAFT"
         )
-    model = RAFT(large=last.shape[0] == 256, iterations=iterations)
+    model = RAFT(large=last.shape[0] == 256)
     if problem := misfit(tensors, model):
         raise InputError(f"{path}: does not fit RAFT {'large' if model.large else 'small'}: {problem}")
     model.load_state_dict(tensors)
