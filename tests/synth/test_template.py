@@ -15,8 +15,8 @@ from synth.scene.template import SCENES, checked_template, load_scene, shipped_s
 
 
 def test_shipped_scenes_are_known_by_name_and_a_template_needs_no_file(tmp_path, monkeypatch) -> None:
-    flat = "deltact digit digit_calibrated fingervision gelsight gelsight_fingertip gelsight_mini gelslim gelstereo soft_bubble"
-    other = "allsight densetact dmtac objects omnitact tac3d tac3d_single"
+    flat = "deltact digit digit_calibrated fingervision gelsight gelsight_fingertip gelsight_mini gelslim gelstereo"
+    other = "allsight densetact dmtac objects omnitact soft_bubble tac3d tac3d_single"
     assert shipped_scenes() == sorted([*flat.split(), *other.split()])
     assert load_scene("gelsight_mini").source == SCENES / "gelsight_mini.toml"
     (tmp_path / "gelsight_mini").mkdir()
