@@ -190,7 +190,6 @@ class PardisoFactor:
     """
 
     ANALYSE, FACTORISE, SOLVE, RELEASE = 11, 22, 33, -1
-    SYMMETRIC_INDEFINITE = -2
 
     def __init__(self, indptr: np.ndarray, indices: np.ndarray, single: bool = True) -> None:
         self._type = np.float32 if single else np.float64
