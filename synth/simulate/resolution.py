@@ -59,9 +59,6 @@ class Fineness(NamedTuple):
     across: int
     through: int
 
-    def __str__(self) -> str:
-        return f"{self.across}x{self.through}"
-
 
 def mesh_levels(gel: Gel, focus: Focus) -> list[Fineness]:
     """Meshes worth having for a zone, cheapest first; each is finer than all that cost less."""
