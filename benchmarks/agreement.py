@@ -25,6 +25,7 @@ from synth.arrays import FloatArray
 from synth.cli_options import DEFAULT_SCENE
 from synth.errors import InputError
 from synth.flow.exact import exact_flow
+from synth.flow.view import View
 from synth.mesh import PadMesh
 from synth.optics import Optics
 from synth.scene import Scene
@@ -163,8 +164,7 @@ def last_flow(one: Drawn, trajectory: Trajectory) -> FloatArray:
     space, sensor = trajectory.space, one.scene.sensor
     surface = GelSurface(space.surface, PARTS)
     pressed = surface.positions(trajectory.states[-1].displacement[space.surface_nodes])
-    size = (sensor.camera.width, sensor.camera.height)
-    field = exact_flow(surface, surface.material, pressed, Optics.of(sensor), *size, backward=False)
+    field = exact_flow(View(surface, Optics.of(sensor)), surface.material, pressed, backward=False)
     return np.asarray(field.forward, dtype=np.float64)
 
 

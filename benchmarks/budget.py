@@ -182,7 +182,7 @@ def press_draw(case: Row, assignments: list[str], most: int) -> list[Row]:
         for fineness in meshes:
             mesh, spacing_mm = graded_mesh(gel, zone, *fineness)
             found, seconds = timed(partial(simulate, scene, mesh, folder, frames=frames))
-            row = {**about, "mesh": str(fineness), "chosen": fineness == own, **_outcome(found, shown)}
+            row = {**about, "mesh": "x".join(map(str, fineness)), "chosen": fineness == own, **_outcome(found, shown)}
             row |= {"seconds": round(seconds, 3), "unknowns": 3 * len(found.space.points), "spacing_mm": spacing_mm}
             row["predicted_px"] = predicted_error_px(scene, zone, spacing_mm)
             if field is not None and found.status == "complete":

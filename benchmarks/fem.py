@@ -37,7 +37,7 @@ from synth.mesh import Counts, Focus, PadMesh, graded_box
 from synth.mesh.tetrahedralise import tetrahedralise_box
 from synth.scene import Scene
 from synth.simulate import Trajectory
-from synth.simulate.element import Element, p1, p1p1, p2p1
+from synth.simulate.element import Element, p1p1, p2p1
 from synth.simulate.footprint import footprint
 from synth.simulate.load_path import path_of
 from synth.simulate.material import pad_material
@@ -55,8 +55,8 @@ LARGEST_PENETRATION_MM = 0.01
 """Of a reference; one that is deeper in the ball was not corrected, and its force is some per cent too low."""
 ELEMENTS: dict[str, Callable[[int], Element]] = {
     "P2/P1": p2p1,
-    "P1/P1": lambda contact_split: p1p1(contact_split=contact_split),
-    "P1": p1,
+    "P1/P1": p1p1,
+    "P1": lambda contact_split: replace(p1p1(contact_split), name="p1", stabilisation=0.0),  # no pressure: it locks
 }
 POINTS = face_grid(PAD_MM, (61, 46))
 PLAIN = SolverOptions(relaxed_tolerance=0.0, extrapolate=False, single_precision=False, reuse_factors=False)
@@ -140,7 +140,7 @@ def stepper_of(scene: Scene, mesh: PadMesh, setting: Setting) -> Stepper:
     space = function_space(mesh, ELEMENTS[setting.element](setting.contact_split))
     gel, options = scene.sensor.gel, setting.options
     system = System(space, pad_material(gel, mesh), numerics.penalty, options=options)
-    path = path_of(scene, None, space.resolution_mm)
+    path = path_of(scene, None, mesh.spacing_mm / (2 * space.element.order))
     return Stepper(system, path, scene.contact.friction, numerics, gel.youngs_modulus_kpa / 1000, options)
 
 

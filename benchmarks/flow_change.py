@@ -22,6 +22,7 @@ from synth.arrays import BoolArray, FloatArray, Image
 from synth.errors import InputError
 from synth.flow.exact import exact_flow
 from synth.flow.field import FlowArray
+from synth.flow.view import View as Tracer
 from synth.optics import Optics
 from synth.render.camera_image import camera_image
 from synth.scene import Camera
@@ -48,8 +49,7 @@ class Truth:
         Raises:
             InputError: No point is visible in both images.
         """
-        camera, optics = view.sensor.camera, Optics.of(view.sensor)
-        found = exact_flow(view.surface, *view.states, optics, camera.width, camera.height, backward=False)
+        found = exact_flow(Tracer(view.surface, Optics.of(view.sensor)), *view.states, backward=False)
         flow = found.forward.astype(np.float64)
         counts = (found.forward_visible > 0) & np.isfinite(flow).all(axis=2)
         if not counts.any():

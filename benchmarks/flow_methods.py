@@ -43,7 +43,7 @@ def traced(view: View, kind: type[Tracer] = Tracer, sensor: Sensor | None = None
     tracer = _tracer(view, kind, sensor)
 
     def pair(first: Points, second: Points) -> tuple[Motion, Motion]:
-        found = exact_flow(tracer.surface, first, second, tracer.optics, tracer.width, tracer.height, view=tracer)
+        found = exact_flow(tracer, first, second)
         if found.backward is None or found.backward_visible is None:
             raise RuntimeError("the flow has no backward part")
         return (found.forward, found.forward_visible > 0), (found.backward, found.backward_visible > 0)
@@ -158,7 +158,7 @@ def is_inside(flow: FloatArray | FlowArray) -> BoolArray:
 
 def _tracer(view: View, kind: type[Tracer] = Tracer, sensor: Sensor | None = None) -> Tracer:
     sensor = sensor or view.sensor
-    tracer = kind(view.surface, Optics.of(sensor), sensor.camera.width, sensor.camera.height)
+    tracer = kind(view.surface, Optics.of(sensor))
     _ = tracer.optics.own  # belongs to the camera
     return tracer
 
@@ -178,5 +178,5 @@ def _paths(tracer: Tracer) -> Iterator[tuple[int, BoolArray]]:
 
 def _all_visible(tracer: Tracer, flow: FloatArray) -> Motion:
     """Motion (n, 2) as an image in which all that stays inside it counts as visible."""
-    image = flow.reshape(tracer.height, tracer.width, 2)
+    image = flow.reshape(*tracer.optics.size[::-1], 2)
     return image, is_inside(image)

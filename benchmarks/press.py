@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.probe import probe
 from synth.arrays import FloatArray
 from synth.scene import Scene
 from synth.simulate import Trajectory
-from synth.simulate.probe import probe
 
 PAD_MM = (20.0, 15.0, 4.0)
 SHORT_S, REPEATS = 2.0, 3

@@ -16,6 +16,7 @@ from benchmarks.press import timed
 from benchmarks.rows import Row, arguments, machine, measure, plot, show
 from synth.flow.exact import exact_flow
 from synth.flow.field import FlowArray
+from synth.flow.view import View
 from synth.mesh import PadMesh, face_of, pad_mesh
 from synth.mesh.cache import CHORDS, SURFACE
 from synth.mesh.capsule import CapsuleFace
@@ -67,11 +68,11 @@ def _background(size_mm: tuple[float, float, float], edge_mm: float) -> Backgrou
 
 def flow_of(scene: Scene, found: Trajectory) -> FlowArray:
     """(height, width, 2) px: flow from rest to the last state."""
-    camera, space = scene.sensor.camera, found.space
+    space = found.space
     surface = GelSurface(space.surface, SUBDIVISIONS[space.element.order])
     pressed = surface.positions(found.states[-1].displacement[space.surface_nodes])
-    optics = Optics.of(scene.sensor)
-    return exact_flow(surface, surface.material, pressed, optics, camera.width, camera.height, backward=False).forward
+    view = View(surface, Optics.of(scene.sensor))
+    return exact_flow(view, surface.material, pressed, backward=False).forward
 
 
 def main(argv: list[str]) -> int:

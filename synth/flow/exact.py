@@ -16,17 +16,13 @@ from synth.arrays import FloatArray, Points
 from synth.errors import InputError
 from synth.flow.field import FlowArray, FlowField
 from synth.flow.view import View
-from synth.optics import Optics
-from synth.surface import GelSurface, vertex_normals
+from synth.surface import vertex_normals
 
 
 def exact_flow(
-    surface: GelSurface,
+    view: View,
     positions1: Points,
     positions2: Points,
-    optics: Optics,
-    width: int,
-    height: int,
     *,
     backward: bool = True,
     depth: bool = False,
@@ -34,17 +30,13 @@ def exact_flow(
     displacement: bool = False,
     traction: FloatArray | None = None,
     contact: FloatArray | None = None,
-    view: View | None = None,
 ) -> FlowField:
     """Exact flow between two states, and what else the surface knows at each pixel.
 
     Args:
-        surface: the gel's surface; its `triangles` are used, the states are given apart.
+        view: the camera and the surface. One that has shown a state before saves what both pairs have in common.
         positions1: (v, 3) float64 mm, the surface's vertices in the state of image 1.
         positions2: the same in the state of image 2.
-        optics: the camera.
-        width: columns of both images.
-        height: rows of both images.
         backward: also the flow from image 2 to image 1.
         depth: depth1.Z and depth2.Z, mm: distance of the surface point from the camera along the camera's viewing axis
             (folded where the pixel looks by a mirror), measured straight through the window: where the point is, not
@@ -56,7 +48,6 @@ def exact_flow(
             pixels of image 1.
         contact: (v,) 0 or 1 at the vertices; gives contact.Y, 1 where the linear interpolation is at least one half, at
             the pixels of image 1.
-        view: of this surface, camera and size, cached from another pair: saves what both have in common.
 
     Returns:
         The flow, float32. Beside pixels that see no gel, NaN marks the rare material point that has no image at all
@@ -64,18 +55,13 @@ def exact_flow(
 
     Raises:
         InputError: an array has the wrong length.
-        ValueError: a view of another surface, camera or size.
     """
-    triangles, vertices = surface.triangles, len(surface.material)
+    triangles, vertices, optics = view.surface.triangles, len(view.surface.material), view.optics
     for name, array in (("positions1", positions1), ("positions2", positions2), ("traction", traction)):
         if array is not None and array.shape != (vertices, 3):
             raise InputError(f"{name} has shape {array.shape}; this surface needs ({vertices}, 3), one row per vertex")
     if contact is not None and contact.shape != (vertices,):
         raise InputError(f"contact has shape {contact.shape}; this surface needs ({vertices},), one value per vertex")
-    if view is None:
-        view = View(surface, optics, width, height)
-    elif view.surface is not surface or view.optics is not optics or (view.width, view.height) != (width, height):
-        raise ValueError("the view is of another surface, camera or size")
     hits1 = view.first_hits(positions1)
     forward, forward_visible = view.motion(hits1, positions2)
     extras: dict[str, FlowArray] = {}

@@ -31,9 +31,7 @@ def boundary_edges(triangles: Triangles) -> Triangles:
     return np.asarray(edges[~np.isin(there, back)])
 
 
-def may_overlap(
-    positions: Points, triangles: Triangles, boundary: Triangles, optics: Optics, size: tuple[int, int]
-) -> BoolArray:
+def may_overlap(positions: Points, triangles: Triangles, boundary: Triangles, optics: Optics) -> BoolArray:
     """Where a point of the surface may be hidden.
 
     Args:
@@ -41,12 +39,11 @@ def may_overlap(
         triangles: (f, 3) into `positions`, their normals away from the camera (as `ContactFaces` says).
         boundary: from `boundary_edges`.
         optics: the camera.
-        size: width and height of the image, px.
 
     Returns:
         (height, width); False is certain.
     """
-    width, height = size
+    width, height = size = optics.size
     everywhere: BoolArray = np.ones((height, width), dtype=bool)
     if optics.mirrors:
         return everywhere

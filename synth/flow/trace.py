@@ -16,7 +16,6 @@ import warp as wp
 from synth.arrays import Points, Triangles
 from synth.flow.hits import Hits, as_warp
 
-wp.config.log_level = wp.LOG_WARNING
 wp.set_module_options({"enable_backward": False})
 
 _MARGIN = 1e-5

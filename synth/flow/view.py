@@ -37,18 +37,16 @@ class View:
     Attributes:
         surface: its `triangles` are used.
         optics: the camera.
-        width, height: of the image, px.
     """
 
     surface: GelSurface
     optics: Optics
-    width: int
-    height: int
 
     @cached_property
     def _is_whole(self) -> bool:
         """Whether every place in the image looks straight at the window."""
-        corners = np.array([(x, y) for x in (0.0, self.width) for y in (0.0, self.height)])
+        width, height = self.optics.size
+        corners = np.array([(x, y) for x in (0.0, width) for y in (0.0, height)])
         return bool((self.optics.own.path == 0).all() and (self.optics.look(corners).path == 0).all())
 
     @cached_property
@@ -72,22 +70,20 @@ class View:
         """Flow (H, W, 2) and visibility (H, W) of the hits' material points when the surface moves to `target`."""
         points = hits.interpolate(self.surface.triangles, target)
         pixels = self.optics.project(points, self.optics.own.path)
-        x, y = pixels[:, 0], pixels[:, 1]
-        with np.errstate(invalid="ignore"):
-            visible: BoolArray = (x >= 0) & (x < self.width) & (y >= 0) & (y < self.height)
+        visible = self.optics.is_inside(pixels)
         doubtful = self._may_be_hidden(pixels, visible, target)
         rays = self.optics.look(pixels[doubtful])
         same = rays.path == self.optics.own.path[doubtful]
         visible[doubtful] = same & self._is_unobstructed(points[doubtful], rays, target)
-        flow = (pixels - self.optics.centres).astype(np.float32).reshape(self.height, self.width, 2)
-        return flow, self.image(visible)
+        width, height = self.optics.size
+        return (pixels - self.optics.centres).astype(np.float32).reshape(height, width, 2), self.image(visible)
 
     def _may_be_hidden(self, pixels: Pixels, inside: BoolArray, target: Points) -> NDArray[np.intp]:
         """Which of the points that are seen in pixels (n, 2), if in any, must be looked at."""
         at = np.flatnonzero(inside)
         if not self._is_whole:
             return at
-        overlap = may_overlap(target, self.surface.triangles, self._boundary, self.optics, (self.width, self.height))
+        overlap = may_overlap(target, self.surface.triangles, self._boundary, self.optics)
         if not overlap.any():
             return at[:0]
         column, row = pixels[at].astype(np.intp).T
@@ -102,7 +98,8 @@ class View:
 
     def image(self, values: FloatArray | BoolArray) -> FlowArray:
         """Values (n,) of the pixels as an image (H, W)."""
-        return values.astype(np.float32).reshape(self.height, self.width)
+        width, height = self.optics.size
+        return values.astype(np.float32).reshape(height, width)
 
     def vector(self, name: str, values: FloatArray) -> dict[str, FlowArray]:
         """Vectors (n, 3) of the pixels as three channels."""

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.arrays import BoolArray, FloatArray, Pixels, Points
-from synth.optics.lens import Lens, lens_of
+from synth.optics.lens_fisheye import FisheyeLens
+from synth.optics.lens_pinhole import PinholeLens
 from synth.optics.mirror import DIRECT, NOTHING, FlatMirror, first_met
 from synth.optics.pose import Pose
 from synth.optics.round_window import RoundWindow
@@ -50,14 +51,14 @@ class Optics:
 
     Attributes:
         pose: the camera's place.
-        lens: its lens.
+        lens: a one-to-one map between directions in the camera's frame and pixels; both are NaN beyond its field.
         window: the face at which light bends.
         mirrors: in the scene's order.
         size: width and height of the image, px.
     """
 
     pose: Pose
-    lens: Lens
+    lens: PinholeLens | FisheyeLens
     window: Window | RoundWindow
     mirrors: tuple[FlatMirror, ...]
     size: tuple[int, int]
@@ -67,9 +68,10 @@ class Optics:
     def of(sensor: Sensor) -> "Optics":
         """The optics of a sensor's main camera (`Sensor.views` gives the others); InputError for a view along x."""
         camera = sensor.camera
+        lens = FisheyeLens if camera.lens == "fisheye" else PinholeLens
         return Optics(
             pose=Pose.of(camera),
-            lens=lens_of(camera),
+            lens=lens(np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy]), camera.distortion),
             window=_window(sensor),
             mirrors=tuple(FlatMirror.of(mirror) for mirror in sensor.mirrors),
             size=(camera.width, camera.height),

@@ -32,10 +32,8 @@ def finish(context: JobContext, rendered: RenderedTrajectory) -> Outcome:
     """Write a trajectory's samples; InputError where the storage refuses."""
     simulated = rendered.simulated
     diagnostics = _diagnostics(context, simulated)
-    views = {
-        name: View(rendered.surface, Optics.of(sensor), sensor.camera.width, sensor.camera.height)
-        for name, sensor in simulated.scene.sensor.views.items()
-    }
+    sensors = simulated.scene.sensor.views
+    views = {name: View(rendered.surface, Optics.of(sensor)) for name, sensor in sensors.items()}
     count, entries = len(simulated.pairs), []
     shared = {"simulate": simulated.seconds / count, "render": rendered.seconds / count}
     for pair in simulated.pairs:
@@ -107,17 +105,13 @@ def _flow(outputs: Outputs, view: View, frames: list[Frame], pressed: State) -> 
     traction = surface.interpolate_linear(pressed.traction) if outputs.traction else None
     touching = (np.linalg.norm(pressed.traction, axis=1, keepdims=True) > 0).astype(np.float64)
     return exact_flow(
-        surface,
+        view,
         frames[0].positions,
         frames[1].positions,
-        view.optics,
-        view.width,
-        view.height,
         backward=outputs.backward,
         depth=outputs.depth,
         normal=outputs.normal,
         displacement=outputs.displacement,
         traction=traction,
         contact=surface.interpolate_linear(touching)[:, 0] if outputs.contact else None,
-        view=view,
     )

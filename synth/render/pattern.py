@@ -5,9 +5,8 @@ at y = -size_y / 2 (x right, y down), and the centre of texel (row r, column c) 
 
     x = ((c + 0.5) / columns - 0.5) · size_x,   y = ((r + 0.5) / rows - 0.5) · size_y.
 
-Edges are at least one texel wide, so that the texture holds no detail beyond its own resolution. Marks that lie above a
-coating that shines come with their coverage: the renderer blends the two reflections (`render.coating`). On a dome the
-texture is laid on along z; its resolution is that at the apex.
+Marks that lie above a coating that shines come with their coverage: the renderer blends the two reflections
+(`render.coating`). On a dome the texture is laid on along z; its resolution is that at the apex.
 """
 
 import math
@@ -22,7 +21,7 @@ from synth.render.bitmap import laid_over, read_picture
 from synth.render.chart import RoundChart, chart_of
 from synth.render.marks import dots_coverage, speckle_coverage
 from synth.render.round_marks import round_dots, round_speckle
-from synth.scene import Bitmap, Dots, NoPattern, Pattern, RandomColor, Sensor, Speckle
+from synth.scene import Bitmap, Dots, NoPattern, RandomColor, Sensor, Speckle
 
 TEXELS_PER_PIXEL = 4
 """Texels per image pixel and axis on the undeformed contact face: bilinear lookup stays below the pixel's own blur."""
@@ -49,7 +48,6 @@ def albedo(sensor: Sensor, rng: np.random.Generator, folder: Path | None = None)
         InputError: a pattern finer than the camera could see, or a bitmap that cannot be read.
     """
     x, y = _texels(sensor)
-    _check_detail(sensor.pattern, max(x[1] - x[0], y[1] - y[0]))
     chart = chart_of(sensor)
     coating = np.array(sensor.coating.reflectance)
     match sensor.pattern:
@@ -98,36 +96,29 @@ def check_pattern(sensor: Sensor, folder: Path) -> None:
     if isinstance(sensor.pattern, Bitmap):
         read_picture(sensor.pattern, folder)
     if not isinstance(sensor.pattern, NoPattern):
-        x, y = _texels(sensor)
-        _check_detail(sensor.pattern, max(x[1] - x[0], y[1] - y[0]))
+        _texels(sensor)
 
 
 def _texels(sensor: Sensor) -> tuple[FloatArray, FloatArray]:
-    """Centres of the texels, x (columns,) and y (rows,), mm."""
+    """Centres of the texels, x (columns,) and y (rows,), mm.
+
+    Raises:
+        InputError: a spacing, cell or grain below one texel, which would take hours to paint.
+    """
     width, height = chart_of(sensor).size_mm
     density = TEXELS_PER_PIXEL * pixels_per_mm(sensor)
     density = min(density, MAX_TEXELS / max(width, height))
     columns, rows = max(4, math.ceil(width * density)), max(4, math.ceil(height * density))
     x = ((np.arange(columns) + 0.5) / columns - 0.5) * width
     y = ((np.arange(rows) + 0.5) / rows - 0.5) * height
-    return x, y
-
-
-def _check_detail(pattern: Pattern, texel_mm: float) -> None:
-    """Refuse what a texture cannot hold, and would take hours to paint.
-
-    Raises:
-        InputError: a spacing, cell or grain below one texel.
-    """
-    field = {"dots": "spacing_mm", "random_color": "cell_mm", "speckle": "grain_mm"}.get(pattern.kind)
-    if field is None:
-        return
-    detail = float(np.min(getattr(pattern, field)))
-    if detail < texel_mm:
+    field = {"dots": "spacing_mm", "random_color": "cell_mm", "speckle": "grain_mm"}.get(sensor.pattern.kind)
+    texel_mm = max(x[1] - x[0], y[1] - y[0])
+    if field and (detail := float(np.min(getattr(sensor.pattern, field)))) < texel_mm:
         raise InputError(
             f"sensor.pattern.{field} = {detail}: far finer than this camera's pixels on the gel; "
             f"it must be at least {texel_mm:.4g}"
         )
+    return x, y
 
 
 def pixels_per_mm(sensor: Sensor) -> float:

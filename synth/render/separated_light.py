@@ -23,8 +23,6 @@ from linear within one triangle; docs/reports/light.md measures both. Random num
 fixed order: the same seed gives the same bits.
 """
 
-import math
-from dataclasses import dataclass
 from functools import reduce
 from operator import or_
 from typing import Any
@@ -35,6 +33,7 @@ from numpy.typing import NDArray
 from synth.arrays import BoolArray
 from synth.errors import InputError
 from synth.render.cavity_light import across_cavity
+from synth.render.face_points import FacePoints, count_per_face
 from synth.render.gel_mesh import GelMesh
 from synth.render.lights import reaches
 from synth.render.polygon_light import PolygonLight, SampledLight
@@ -47,8 +46,6 @@ PILOTS = 16
 """Rays from each face to each light, and to the gel."""
 _MANY = 4
 """Of a face's pilots that saw gel, from which on its bounced light is linear."""
-_STEP = 4
-"""Bounced rays of a face are squares of its multiples: a sampler's size is compiled into the kernel."""
 _DEGREE = 4
 """Of the polynomials for light that comes back from the window: its path is longer than the pad is thick, so smooth."""
 _RETURNED = 2**17
@@ -76,15 +73,6 @@ def is_separated(render: Render, coating: Coating, variant: Variant) -> bool:
             'set render.light to "path_traced"'
         )
     return variant.is_vectorised
-
-
-@dataclass(frozen=True, eq=False)
-class _Points:
-    """Points on faces, each face's one after another: surface interactions, unit normals into the gel, barycentrics."""
-
-    at: Any
-    normal: Any
-    weights: tuple[Any, Any, Any]
 
 
 class SeparatedLight:
@@ -130,7 +118,7 @@ class SeparatedLight:
         mi = self._mi
         triangles = mesh.faces().reshape(-1, 3)
         self._corners = [mi.UInt32(column) for column in np.ascontiguousarray(triangles.T)]
-        met = self._pilots(len(triangles), seed)
+        met = self._pilots(seed)
         touched: BoolArray = np.zeros((len(mesh.surface.material), len(self._lights)), dtype=bool)
         for corner in triangles.T:
             np.logical_or.at(touched, corner, met[:, :-1] > 0)
@@ -197,14 +185,13 @@ class SeparatedLight:
         color = self._reflection.eval_diffuse_reflectance(at, active)
         return [color[channel] for channel in range(self._channels)]
 
-    def _pilots(self, faces: int, seed: int) -> NDArray[np.uint32]:
+    def _pilots(self, seed: int) -> NDArray[np.uint32]:
         """(faces, lights + 1) counts of a face's pilots that were blocked before a light, or met the gel."""
         import drjit as dr
 
         mi = self._mi
-        sampler = self._sampler(PILOTS, faces, seed, 0)
-        points = self._points(dr.arange(mi.UInt32, faces), PILOTS, sampler)
-        offset, everywhere = sampler.next_2d(), mi.Bool(True)
+        points = self._points(PILOTS, seed)
+        offset, everywhere = points.sampler.next_2d(), mi.Bool(True)
         sampled = [
             self._sampled(light, number, points.at, points.normal, offset, everywhere)
             for number, light in enumerate(self._lights)
@@ -213,7 +200,7 @@ class SeparatedLight:
         least = [_NEGLIGIBLE * sum(channel) for channel in zip(*given, strict=True)]
         counted = [reduce(or_, (c > limit for c, limit in zip(one, least, strict=True))) for one in given]
         met = [blocked & counts for (_, blocked), counts in zip(sampled, counted, strict=True)]
-        met.append(self._onward(points.at, points.normal, sampler.next_2d())[2])  # the image is no bounce
+        met.append(self._onward(points.at, points.normal, points.sampler.next_2d())[2])  # the image is no bounce
         counts = [dr.select(one, mi.UInt32(1), 0) for one in met]
         dr.eval(counts)
         return np.stack([np.array(dr.block_sum(count, PILOTS)) for count in counts], axis=-1)
@@ -222,12 +209,10 @@ class SeparatedLight:
         """Bounced light on all faces from about so many rays; linear on faces where `often` (faces,)."""
         import drjit as dr
 
-        mi, faces = self._mi, len(often)
-        count = _grid(rays, faces)
-        sampler = self._sampler(count, faces, seed, 1)
-        points = self._points(dr.arange(mi.UInt32, faces), count, sampler)
+        mi, count = self._mi, count_per_face(rays, len(often))
+        points = self._points(count, seed + 1)
         top = np.array(self._parameters["gel.vertex_positions"])[2::3].max() + _CLEARANCE_MM
-        parts = self._bounces(points, sampler, dr.opaque(mi.Float, float(top)))
+        parts = self._bounces(points, dr.opaque(mi.Float, float(top)))
         values = projected(parts, points.weights, count, often)
         if self._is_round:
             positions, normals = (
@@ -241,10 +226,8 @@ class SeparatedLight:
         """Coefficients (channels of mi.Float) of what the gel sends to the window and gets back, in `_terms`."""
         import drjit as dr
 
-        count = _grid(_RETURNED, faces)
-        sampler = self._sampler(count, faces, seed, 2)
-        points = self._points(dr.arange(self._mi.UInt32, faces), count, sampler)
-        values = self._bounces(points, sampler)
+        points = self._points(count_per_face(_RETURNED, faces), seed + 2)
+        values = self._bounces(points)
         terms = self._terms(points.at.p, points.normal)
         dr.eval(values, terms)
         design, right = (np.array([np.array(one) for one in part], dtype=np.float64) for part in (terms, values))
@@ -258,7 +241,7 @@ class SeparatedLight:
         powers = [x**i * y**j for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
         return [power * component for power in powers for component in (normal.x, normal.y, normal.z)]
 
-    def _bounces(self, points: _Points, sampler: Any, top: Any | None = None) -> list[Any]:
+    def _bounces(self, points: FacePoints, top: Any | None = None) -> list[Any]:
         """Irradiance (channels) from the gel itself, one path from each point.
 
         Its first step goes by the window, or straight: then `top` is a height that the gel does not reach.
@@ -271,10 +254,10 @@ class SeparatedLight:
         share = [dr.full(mi.Float, 1, count) for _ in range(self._channels)]
         start = dr.arange(mi.UInt32, count)
         for step in range(self._depth - 2):
-            offset = dr.gather(mi.Point2f, sampler.next_2d(), start)
+            offset = dr.gather(mi.Point2f, points.sampler.next_2d(), start)
             ray, hit, straight, mirrored = self._onward(at, normal, offset, None if step else top)
             active = straight | mirrored if step else mirrored if top is None else straight
-            offset = dr.gather(mi.Point2f, sampler.next_2d(), start)
+            offset = dr.gather(mi.Point2f, points.sampler.next_2d(), start)
             dr.eval(ray, hit, active, mirrored, offset)  # each gather alone would trace everything anew
             onward = dr.compress(active)  # few paths meet the gel: only these go on
             if dr.width(onward) == 0:
@@ -309,32 +292,5 @@ class SeparatedLight:
         image = lit & (hit.shape == mi.ShapePtr(self._image)) if self._image else mi.Bool(False)
         return ray, hit, lit & (hit.shape == mi.ShapePtr(self._gel)), image
 
-    def _sampler(self, count: int, faces: int, seed: int, part: int) -> Any:
-        sampler = self._mi.load_dict({"type": "multijitter", "sample_count": count})
-        sampler.set_samples_per_wavefront(count)
-        sampler.seed((seed + part) % 2**32, faces * count)
-        return sampler
-
-    def _points(self, faces: Any, count: int, sampler: Any) -> _Points:
-        """Evenly distributed points, `count` on each of the faces (mi.UInt32)."""
-        import drjit as dr
-
-        mi = self._mi
-        number = dr.arange(mi.UInt32, dr.width(faces) * count) // dr.opaque(mi.UInt32, count)
-        face = dr.gather(mi.UInt32, faces, number)
-        place = mi.warp.square_to_uniform_triangle(sampler.next_2d())
-        weights = (1 - place.x - place.y, place.x, place.y)
-        corners = [dr.gather(mi.UInt32, column, face) for column in self._corners]
-        positions = dr.unravel(mi.Point3f, self._parameters["gel.vertex_positions"])
-        normals = dr.unravel(mi.Vector3f, self._parameters["gel.vertex_normals"])
-        a, b, c = (dr.gather(mi.Point3f, positions, corner) for corner in corners)
-        at = dr.zeros(mi.SurfaceInteraction3f, dr.width(number))
-        at.p = a * weights[0] + b * weights[1] + c * weights[2]
-        at.n = mi.Normal3f(dr.normalize(dr.cross(b - a, c - a)))
-        normal = sum(dr.gather(mi.Vector3f, normals, i) * w for i, w in zip(corners, weights, strict=True))
-        return _Points(at, -dr.normalize(normal), weights)  # vertex normals point out of the gel
-
-
-def _grid(rays: int, faces: int) -> int:
-    """Rays of each face, of about so many in all."""
-    return (_STEP * max(1, round(math.sqrt(rays / faces) / _STEP))) ** 2
+    def _points(self, count: int, seed: int) -> FacePoints:
+        return FacePoints.on(self._corners, self._parameters, count, seed, self._mi)

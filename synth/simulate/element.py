@@ -2,8 +2,7 @@
 
 P2/P1 (Taylor-Hood): quadratic displacement, linear continuous pressure; inf-sup stable. P1/P1: both linear, which
 violates the inf-sup condition; the projection of Dohrmann & Bochev (Int. J. Numer. Meth. Fluids 46, 2004) restores it:
-the energy loses (alpha / 2 mu) |p - mean(p)|^2 in each element. P1 alone has no pressure and locks when the material is
-nearly incompressible; it exists for foams and as the benchmark's warning.
+the energy loses (alpha / 2 mu) |p - mean(p)|^2 in each element.
 
 Nodes of a quadratic tetrahedron: its four vertices, then the midpoints of EDGES; of a quadratic face: as in
 `synth.surface`.
@@ -81,20 +80,11 @@ def p2p1(contact_split: int = CONTACT_SPLIT) -> Element:
     )
 
 
-def p1p1(stabilisation: float = 2.0, contact_split: int = CONTACT_SPLIT) -> Element:
+def p1p1(contact_split: int = CONTACT_SPLIT) -> Element:
     """Stabilised linear-linear element; its strain is constant, so that one point is exact."""
     centre = np.full((1, 4), 0.25)
     face, weights = _face_rule(contact_split)
-    return Element("p1p1", 1, centre, np.ones(1), np.eye(4)[None], stabilisation, 0.0, face, weights, face)
-
-
-def p1(contact_split: int = CONTACT_SPLIT) -> Element:
-    """Linear displacement alone."""
-    mixed = p1p1(0.0, contact_split)
-    return Element(
-        "p1", 1, mixed.barycentric, mixed.weights, mixed.derivative, 0.0, 0.0, mixed.face_barycentric,
-        mixed.face_weights, mixed.face_shape,
-    )  # fmt: skip
+    return Element("p1p1", 1, centre, np.ones(1), np.eye(4)[None], 2.0, 0.0, face, weights, face)
 
 
 def _quadratic_derivative(barycentric: FloatArray) -> FloatArray:

@@ -42,17 +42,12 @@ def footprint(path: LoadPath, size_mm: tuple[float, float, float], margin: float
     Args:
         path: of the indenter; its end of press and the load path from there count.
         size_mm: of the pad.
-        margin: the footprint of the press grows by this fraction of its half widths on every side; may be negative.
+        margin: the footprint of the press grows by this fraction of its half widths on every side; above -1.
 
     Returns:
         A rectangle on the pad. Where nothing overlaps, a small one around the pad's point nearest to the indenter's
         position.
-
-    Raises:
-        ValueError: margin is not above -1.
     """
-    if not margin > -1:
-        raise ValueError(f"margin = {margin} must be above -1")
     press = _rectangle(path, [path.pose(path.press_mm)], size_mm)
     even = np.linspace(path.press_mm, path.length_mm, POSES)
     after = np.unique(np.concatenate([even, path.ends[path.ends > path.press_mm]]))

@@ -126,21 +126,15 @@ def rigid_body(
         case Sphere(radius_mm=radius):
             lengths, reach, sharpest = [0.0, radius], radius, radius
         case Cylinder(radius_mm=radius, length_mm=length, fillet_mm=fillet):
-            _require(fillet < min(radius, length / 2), indenter, "fillet_mm", f"less than {min(radius, length / 2)}")
-            fillet = _rounded(fillet, resolution_mm, min(radius, length / 2))
-            sharpest = fillet
+            fillet = sharpest = _fillet(indenter, fillet, resolution_mm, min(radius, length / 2))
             core, half = radius - fillet, length / 2 - fillet
             lengths, reach = [fillet, core, half], core * radial + half * abs(axial) + fillet
         case Box(size_mm=size, fillet_mm=fillet):
-            _require(fillet < min(size) / 2, indenter, "fillet_mm", f"less than {min(size) / 2}")
-            fillet = _rounded(fillet, resolution_mm, min(size) / 2)
-            sharpest = fillet
+            fillet = sharpest = _fillet(indenter, fillet, resolution_mm, min(size) / 2)
             half_edges = np.array(size) / 2 - fillet
             lengths, reach = [fillet, *half_edges], float(np.abs(up) @ half_edges) + fillet
         case Cone(half_angle_deg=angle, height_mm=height, fillet_mm=fillet):
-            _require(2 * fillet < height, indenter, "fillet_mm", f"less than {height / 2}")
-            fillet = _rounded(fillet, resolution_mm, height / 2)
-            sharpest = fillet
+            fillet = sharpest = _fillet(indenter, fillet, resolution_mm, height / 2)
             core = height - 2 * fillet
             base = core * float(np.tan(np.radians(angle)))
             lengths, reach = [fillet, base, core], max(0.0, base * radial - core * axial) + fillet
@@ -152,8 +146,9 @@ def rigid_body(
     return RigidBody(KINDS[indenter.shape], shape, rotation, reach, np.zeros((1, 1, 1)), sharpest)
 
 
-def _rounded(fillet: float, resolution: float, half_thickness: float) -> float:
-    """The fillet that is simulated; at most 90 % of what the body's thickness allows."""
+def _fillet(indenter: Indenter, fillet: float, resolution: float, half_thickness: float) -> float:
+    """The fillet that is simulated; rounding up to a resolution stops at 90 % of what the body's thickness allows."""
+    _require(fillet < half_thickness, indenter, "fillet_mm", f"less than {half_thickness}")
     return max(fillet, min(resolution, 0.9 * half_thickness))
 
 

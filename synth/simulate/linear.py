@@ -190,7 +190,6 @@ class PardisoFactor:
     """
 
     ANALYSE, FACTORISE, SOLVE, RELEASE = 11, 22, 33, -1
-    SYMMETRIC_INDEFINITE = -2
 
     def __init__(self, indptr: np.ndarray, indices: np.ndarray, single: bool = True) -> None:
         self._type = np.float32 if single else np.float64
@@ -208,7 +207,6 @@ class PardisoFactor:
         self.made = 0
 
     def factorise(self, values: FloatArray) -> bool:
-        """See Factor."""
         self.made += 1
         self._values[:] = values
         if not np.isfinite(self._values).all():  # MKL was seen to crash on a matrix of NaN
@@ -279,7 +277,6 @@ class SuperLUFactor:
         self.made = 0
 
     def factorise(self, values: FloatArray) -> bool:
-        """See Factor."""
         import scipy.sparse as sp
         from scipy.sparse.linalg import splu
 
@@ -293,5 +290,4 @@ class SuperLUFactor:
         return True
 
     def apply(self, right: FloatArray) -> FloatArray:
-        """See Factor."""
         return np.asarray(self._factor.solve(right))

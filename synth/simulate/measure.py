@@ -1,8 +1,5 @@
 """Signed distances of points from a rigid body at given places, as a Warp kernel on the CPU."""
 
-# Kernels are written in Warp's own language; their annotations only look like Python's.
-# mypy: disable-error-code="valid-type, no-untyped-def"
-
 import numpy as np
 import warp as wp
 

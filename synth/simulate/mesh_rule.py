@@ -65,4 +65,4 @@ class MeshRule:
         if self.kind == "even":
             return Press.of(scene, shared_mesh(scene.sensor.gel, scene.numerics), folder)
         found = self.resolution(scene, folder, mesh_folders)
-        return Press.of(scene, found.mesh, folder, Accuracy.of(found))
+        return Press.of(scene, found.mesh, folder, Accuracy(found.across, found.error_px))

@@ -12,9 +12,6 @@ and those of contours that keep their edges (`synth.simulate.object_contour`). T
 winding number (Jacobson, Kavan & Sorkine-Hornung 2013), which closes holes and fills cavities.
 """
 
-# Kernels are written in Warp's own language; their annotations only look like Python's.
-# mypy: disable-error-code="valid-type, no-untyped-def"
-
 from dataclasses import dataclass
 
 import numpy as np

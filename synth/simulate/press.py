@@ -43,5 +43,5 @@ def edge_radius_mm(scene: Scene, mesh: PadMesh) -> float | None:
 
 
 def resolution_mm(scene: Scene, mesh: PadMesh) -> float:
-    """As `Space.resolution_mm`, without a space."""
+    """Smallest radius of an indenter's edges that the contact points resolve: half their distance."""
     return mesh.spacing_mm / (2 * ELEMENTS[scene.numerics.element]().order)

@@ -6,7 +6,6 @@ predicted error is within the budget; the prediction (`synth.simulate.error_mode
 against much finer solutions (docs/reports/budget.md).
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -60,18 +59,12 @@ class Fineness(NamedTuple):
     across: int
     through: int
 
-    def __str__(self) -> str:
-        return f"{self.across}x{self.through}"
 
-
-def mesh_levels(gel: Gel, focus: Focus, across: Sequence[int] = ELEMENTS_ACROSS) -> list[Fineness]:
-    """Meshes worth having for a zone, cheapest first; each is finer than all that cost less.
-
-    `across` are the numbers of elements across the zone to choose from.
-    """
+def mesh_levels(gel: Gel, focus: Focus) -> list[Fineness]:
+    """Meshes worth having for a zone, cheapest first; each is finer than all that cost less."""
     size = gel.size_mm
     found = []
-    for number in across:
+    for number in ELEMENTS_ACROSS:
         counts = Counts((number, number), OUTER)
         wide, fewest = lateral_spacing(gel, focus, counts), 2
         while size[2] / wide > TALLEST * _reach(fewest):

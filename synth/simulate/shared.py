@@ -16,7 +16,7 @@ from synth.mesh import Counts, Focus, PadMesh, domed, graded_box
 from synth.scene import Gel, Numerics, Scene
 from synth.simulate.footprint import footprint
 from synth.simulate.load_path import path_of
-from synth.simulate.resolution import MARGIN, Resolution, depth_growth, element_size, predicted_error_px
+from synth.simulate.resolution import MARGIN, depth_growth, element_size, predicted_error_px
 
 
 @dataclass(frozen=True)
@@ -31,11 +31,6 @@ class Accuracy:
 
     across: int
     error_px: float
-
-    @staticmethod
-    def of(resolution: Resolution) -> "Accuracy":
-        """Of a mesh that was made for its draw."""
-        return Accuracy(resolution.across, resolution.error_px)
 
 
 def shared_mesh(gel: Gel, numerics: Numerics) -> PadMesh:

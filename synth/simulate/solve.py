@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from synth.errors import InputError
-from synth.mesh import Face, PadMesh, check_mesh, face_of
+from synth.mesh import PadMesh, check_mesh, face_of
 from synth.scene import Gel, Scene
 from synth.simulate.material import pad_material
 from synth.simulate.options import STANDARD, SolverOptions
@@ -97,13 +97,9 @@ def check_shared(scenes: Sequence[Scene], mesh: PadMesh) -> None:
 
 
 def _check_pad(gel: Gel, mesh: PadMesh) -> None:
-    own, other = _pad(gel.size_mm, face_of(gel)), _pad(mesh.size_mm, mesh.face)
+    own, other = f"{gel.size_mm} mm {face_of(gel)}", f"{mesh.size_mm} mm {mesh.face}"
     if own != other:
         raise InputError(f"the mesh is of a {other}, the scene's is a {own}")
-
-
-def _pad(size_mm: tuple[float, float, float], face: Face) -> str:
-    return f"{size_mm} mm {face}"
 
 
 def _elastic(gel: Gel) -> tuple[float, ...]:

@@ -39,11 +39,6 @@ class Space:
     held: BoolArray
     faces: np.ndarray
 
-    @property
-    def resolution_mm(self) -> float:
-        """Smallest radius of an indenter's edges that the contact points resolve: half their distance."""
-        return self.mesh.spacing_mm / (2 * self.element.order)
-
     @cached_property
     def surface_nodes(self) -> np.ndarray:
         """(s,) int: displacement nodes of the coated contact face, in the order of `surface.nodes`."""

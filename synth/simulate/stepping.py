@@ -17,12 +17,12 @@ from synth.arrays import FloatArray
 from synth.scene import Numerics
 from synth.simulate.distance import KINDS
 from synth.simulate.load_path import LoadPath
-from synth.simulate.newton import FORCE_FLOOR, MAX_ITERATIONS, Solution, relative_residual, solve
+from synth.simulate.newton import FORCE_FLOOR, Solution, relative_residual, solve
 from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.relaxation import relax
 from synth.simulate.system import System
 from synth.simulate.tables import pack_indenter, place_indenter
-from synth.simulate.trajectory import State, Trajectory, no_contact, not_converged, too_deep, trajectory_of
+from synth.simulate.trajectory import State, Trajectory, no_contact, not_converged, too_deep, trajectory_of, undeformed
 from synth.simulate.unknowns import Unknowns
 
 SHORTEST_STEP = 1 / 128
@@ -82,6 +82,7 @@ class Stepper:
     ) -> None:
         """frames: numbers of the states that are wanted; the others are recorded as the path goes through them."""
         self.system, self.path, self.numerics, self.options = system, path, numerics, options
+        self._relaxed_tolerance = max(options.relaxed_tolerance, numerics.tolerance)
         self._modulus, self._waypoints = modulus_mpa, path.waypoints().tolist()
         records = path.records().tolist()
         self._recorded = frozenset(records)
@@ -99,22 +100,11 @@ class Stepper:
         self.states: list[State] = []
         self.reason = ""
 
-    @property
-    def finished(self) -> bool:
-        """Whether the load path has come to its end, or to the last good state."""
-        return bool(self.reason) or self.next >= len(self._waypoints)
-
-    def target(self) -> float:
-        """Path length of the next step's end: equal steps of at most `step` to the next waypoint."""
-        goal = float(self._waypoints[self.next])
-        count = max(1, int(np.ceil((goal - self.at) / self.step - 1e-9)))
-        return goal if count == 1 else self.at + (goal - self.at) / count
-
     def run(self, on_progress: Callable[[float], None] | None = None) -> Trajectory:
         """Follow the load path to its end or to its last good state; `on_progress` is told what share of it is done."""
         started = time.perf_counter()
         self._start()
-        while not self.finished:
+        while self.next < len(self._waypoints) and not self.reason:
             self._advance()
             if on_progress is not None:
                 on_progress(self.at / self._waypoints[-1])
@@ -123,25 +113,20 @@ class Stepper:
     def _start(self) -> None:
         """The undeformed state; a path that never touches stays in it and needs no solve."""
         self.system.forget_factor()
-        self.states = [self._undeformed(0.0)]
+        untouched = [] if self.path.may_touch else self.path.records().tolist()
+        self.states = [undeformed(self.path.pose(place), self.system.space) for place in (0.0, *untouched)]
         if not self.path.may_touch:
-            self.states += [self._undeformed(place) for place in self.path.records()]
             self.next = len(self._waypoints)
-        if not self.finished:
+        if self.next < len(self._waypoints):
             self._place(0.0)
             self.system.residual(self.state, self.indenter)
             self.system.update_contact_history(self.state, self.indenter)
 
-    def _undeformed(self, place: float) -> State:
-        pose = self.path.pose(place)
-        nodes, contact = len(self.system.space.points), len(self.system.space.surface_nodes)
-        zero = (0.0, 0.0, 0.0)
-        fields = np.zeros((nodes, 3)), np.zeros((contact, 3))
-        return State(pose.depth_mm, pose.shear_mm, pose.twist_deg, *fields, zero, zero, 0, 0.0, 1.0, 0.0, 0.0)
-
     def _advance(self) -> None:
-        """One step."""
-        target = self.target()
+        """One step: as many equal ones of at most `step` lead to the next waypoint."""
+        goal = float(self._waypoints[self.next])
+        count = max(1, int(np.ceil((goal - self.at) / self.step - 1e-9)))
+        target = goal if count == 1 else self.at + (goal - self.at) / count
         self._place(target)
         between = target in self._recorded or target not in self._waypoints
         tolerance = self._relaxed_tolerance if between else self.numerics.tolerance
@@ -164,11 +149,6 @@ class Stepper:
         """A solution, its iterations added to those since the last recorded state."""
         self._iterations += solution.iterations
         return solution
-
-    @property
-    def _relaxed_tolerance(self) -> float:
-        """Tolerance of intermediate steps."""
-        return max(self.options.relaxed_tolerance, self.numerics.tolerance)
 
     def _slipped_through(self, target: float, state: Unknowns) -> bool:
         """Whether the indenter, at the end of its press, bears on nothing: it passed between the contact points.
@@ -249,7 +229,7 @@ class Stepper:
         """A solution brought to a tolerance where it is not there yet."""
         if not solution.converged or relative_residual(solution.residual) <= limit:
             return solution
-        return self._counted(solve(self.system, solution.state, self.indenter, limit, MAX_ITERATIONS))
+        return self._counted(solve(self.system, solution.state, self.indenter, limit))
 
     def _record(self, step: Solution, target: float) -> bool:
         """Record the corrected state, then put contact back to where the path goes on.

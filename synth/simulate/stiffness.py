@@ -5,9 +5,6 @@ of 5 for 2016 quadratic elements). I ∫ 2 W' g_a.g_b depends on the deformation
 is a table.
 """
 
-# Kernels are written in Warp's own language; their annotations only look like Python's.
-# mypy: disable-error-code="valid-type, no-untyped-def"
-
 import warp as wp
 
 from synth.simulate.bulk import Bulk, _deformation_gradient, _dilation, _slopes

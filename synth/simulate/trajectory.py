@@ -56,6 +56,13 @@ class State:
         }
 
 
+def undeformed(pose: Pose, space: Space) -> State:
+    """The gel at rest, while the indenter is at a pose where it does not touch."""
+    fields = np.zeros((len(space.points), 3)), np.zeros((len(space.surface_nodes), 3))
+    zero = (0.0, 0.0, 0.0)
+    return State(pose.depth_mm, pose.shear_mm, pose.twist_deg, *fields, zero, zero, 0, 0.0, 1.0, 0.0, 0.0)
+
+
 @dataclass(frozen=True)
 class Trajectory:
     """Converged states only, the undeformed one first.

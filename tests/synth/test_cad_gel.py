@@ -15,6 +15,7 @@ from render_scenes import needs_llvm
 from synth.arrays import FloatArray, Points, Triangles
 from synth.errors import InputError
 from synth.flow.exact import exact_flow
+from synth.flow.view import View
 from synth.mesh import check_mesh, domed
 from synth.mesh.capsule import CapsuleFace
 from synth.mesh.pad import boundary_faces
@@ -85,7 +86,7 @@ def pressed(scene: Scene, folder: Path) -> tuple[Trajectory, FloatArray]:
     space = function_space(mesh, p2p1())
     surface = GelSurface(space.surface, 3)
     states = (surface.material, surface.positions(found.states[-1].displacement[space.surface_nodes]))
-    return found, exact_flow(surface, *states, Optics.of(scene.sensor), 96, 72).forward
+    return found, exact_flow(View(surface, Optics.of(scene.sensor)), *states).forward
 
 
 @pytest.mark.parametrize("dome_mm", [None, 25.0])

@@ -14,6 +14,7 @@ from render_scenes import FAST, SCALAR, flat_surface, needs_llvm, plain, refract
 from synth.arrays import FloatArray, Image, Points
 from synth.errors import InputError
 from synth.flow.exact import exact_flow
+from synth.flow.view import View
 from synth.optics import Optics
 from synth.pipeline.generate import generate
 from synth.render.pattern import albedo
@@ -215,7 +216,7 @@ def test_the_flow_does_not_know_of_the_aperture() -> None:
     blurred = small_sensor(1.45, aperture_mm=APERTURE, focus_mm=15.0)
     surface = flat_surface(sharp)
     states = surface.material, rigid(rotation("z", 3.0), (0.3, -0.2, 1.0))(surface.material)
-    first, second = (exact_flow(surface, *states, Optics.of(sensor), 80, 60) for sensor in (sharp, blurred))
+    first, second = (exact_flow(View(surface, Optics.of(sensor)), *states) for sensor in (sharp, blurred))
     assert np.isfinite(first.forward).all()
     for name in ("forward", "backward", "forward_visible", "backward_visible"):
         assert np.array_equal(getattr(first, name), getattr(second, name), equal_nan=True)

@@ -9,6 +9,7 @@ from verified_sample import motion_checks, sheets
 
 from synth.errors import InputError
 from synth.flow.exact import exact_flow
+from synth.flow.view import View
 from synth.mesh import rest_surface
 from synth.scene import Gel, Window
 from synth.verify.motion import check_motion
@@ -26,7 +27,7 @@ ROUNDING = 1e-6
 
 def _flow(camera, motion1, motion2, **options):
     surface = sheet(7, 6, 40.0, 30.0, 2)  # fills the view
-    return exact_flow(surface, motion1(surface.material), motion2(surface.material), camera, WIDTH, HEIGHT, **options)
+    return exact_flow(View(surface, camera), motion1(surface.material), motion2(surface.material), **options)
 
 
 def _homography(camera, motion1, motion2):
@@ -91,7 +92,7 @@ def test_visibility_ends_at_the_image_border_and_no_motion_is_zero_flow() -> Non
 def test_pixels_beside_the_gel_are_nan_and_extra_channels_closed_forms() -> None:
     surface = sheet(4, 4, 8.0, 6.0)
     moved = rigid(np.eye(3), (0.3, 0, 0))(surface.material)
-    flow = exact_flow(surface, surface.material, moved, optics(), WIDTH, HEIGHT, depth=True, displacement=True)
+    flow = exact_flow(View(surface, optics()), surface.material, moved, depth=True, displacement=True)
     centre = pixel_centres()
     x, y = (centre[..., 0] - 31.7) / 70 * 24 + 1.0, (centre[..., 1] - 24.4) / 71 * 24 - 0.5
     on_gel = (abs(x) <= 4) & (abs(y) <= 3)
@@ -105,7 +106,7 @@ def test_pixels_beside_the_gel_are_nan_and_extra_channels_closed_forms() -> None
     traction = np.column_stack([surface.material[:, 0], 2 * surface.material[:, 1], np.ones(len(surface.material))])
     camera = optics(**double.OBLIQUE)
     flow = exact_flow(
-        surface, surface.material, moved, camera, WIDTH, HEIGHT,
+        View(surface, camera), surface.material, moved,
         backward=False, depth=True, normal=True, displacement=True,
         traction=traction, contact=surface.material[:, 0] > 0,
     )  # fmt: skip
@@ -126,9 +127,9 @@ def test_pixels_beside_the_gel_are_nan_and_extra_channels_closed_forms() -> None
     np.testing.assert_array_equal(flow.extras["contact.Y"].ravel()[clear], at[clear, 0] > 0)
     surface = sheet(2, 2, 4.0, 4.0)
     with pytest.raises(InputError, match="positions2 has shape"):
-        exact_flow(surface, surface.material, surface.material[:-1], optics(), WIDTH, HEIGHT)
+        exact_flow(View(surface, optics()), surface.material, surface.material[:-1])
     with pytest.raises(InputError, match="contact has shape"):
-        exact_flow(surface, surface.material, surface.material, optics(), WIDTH, HEIGHT, contact=np.ones(2))
+        exact_flow(View(surface, optics()), surface.material, surface.material, contact=np.ones(2))
 
 
 @pytest.mark.parametrize("index", [1.0, 1.45])
@@ -136,7 +137,7 @@ def test_a_fold_hides_what_lies_under_it(index):
     """The sheet's right half folds over at x = 2: it then covers 0 < x < 2 from a height of 1 mm."""
     surface = sheet(160, 40, 16.0, 12.0)
     camera = optics(index=index)
-    flow = exact_flow(surface, surface.material, folded(surface.material), camera, WIDTH, HEIGHT)
+    flow = exact_flow(View(surface, camera), surface.material, folded(surface.material))
     at = camera.look(camera.centres).on_flat_face.reshape(HEIGHT, WIDTH, 3)
     on_gel = (abs(at[..., 0]) < 8) & (abs(at[..., 1]) < 6)
     # The flap's far edge, at 2 - 6/3 = 0 and 1 mm up, hides points right of where the ray over it meets z = 0; its

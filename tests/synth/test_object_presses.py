@@ -10,6 +10,7 @@ import pytest
 import pyvista as pv
 from pads import scene
 
+from benchmarks.probe import probe
 from synth.mesh import Counts, Focus, graded_box
 from synth.scene import Scene
 from synth.simulate import indenter, simulate, stepping
@@ -18,7 +19,6 @@ from synth.simulate.batched.pad import prepare
 from synth.simulate.newton import Solution, solve
 from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.press import Press
-from synth.simulate.probe import probe
 from synth.simulate.relaxation import AIM, LEAST_VISCOSITY, MAX_ERROR, MOST_VISCOSITY, next_viscosity
 from synth.simulate.solve import simulate_press
 from synth.simulate.trajectory import Trajectory

@@ -16,6 +16,7 @@ from synth.arrays import FloatArray, Image, Points
 from synth.dataset.reader import read_dataset
 from synth.flow.exact import exact_flow
 from synth.flow.field import FlowField
+from synth.flow.view import View
 from synth.mesh import face_height, rest_surface
 from synth.optics import Optics
 from synth.pipeline.generate import generate
@@ -208,7 +209,7 @@ def test_dot_centres_move_as_the_flow_says(view):
     x = surface.material
     states = x, rigid(rotation("z", 2.0), (0.0, 0.1, 0.0))(dented(x, 0.7, (0.5, -0.3)))
     optics, camera = Optics.of(sensor), sensor.camera
-    flow = exact_flow(surface, *states, optics, camera.width, camera.height)
+    flow = exact_flow(View(surface, optics), *states)
     first, second = _darkness(sensor, surface, states)
     centres = np.stack(np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5), axis=-1)
     path = optics.look(centres.reshape(-1, 2)).path.reshape(camera.height, camera.width)

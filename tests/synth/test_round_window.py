@@ -7,6 +7,7 @@ from scipy.optimize import brentq, least_squares
 from verified_sample import motion_checks, sheets
 
 from synth.flow.exact import exact_flow
+from synth.flow.view import View
 from synth.optics import Optics
 from synth.optics.round_window import RoundWindow
 from synth.verify.camera import ForwardCamera
@@ -109,7 +110,7 @@ def test_flow_and_visibility_through_round_windows_against_verification(window, 
 def test_verification_finds_another_index_and_another_radius():
     right = sensor(CAPSULE, **ASKEW)
     states = SURFACE.material, pressed(SURFACE.material, PLACE, 1.0)
-    flow = exact_flow(SURFACE, *states, Optics.of(right), 64, 64, backward=False)
+    flow = exact_flow(View(SURFACE, Optics.of(right)), *states, backward=False)
     for wrong in (sensor(CAPSULE, 1.44, **ASKEW), sensor({**CAPSULE, "radius_mm": INNER + 0.1}, **ASKEW)):
         near, far = sheets(wrong, SURFACE, *states)
         checks = check_motion("forward", near, far, flow.forward, flow.forward_visible)

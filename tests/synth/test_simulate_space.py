@@ -11,12 +11,12 @@ import pytest
 from pads import ELEMENT, MIXED, brick, crooked, layered
 
 import synth.simulate.pattern as pattern_module
+from benchmarks.probe import probe
 from synth.arrays import FloatArray, Points
 from synth.errors import InputError
 from synth.mesh import PadMesh
 from synth.simulate.element import EDGES
 from synth.simulate.pattern import pattern_of
-from synth.simulate.probe import probe
 from synth.simulate.space import Space, function_space
 from synth.surface import FACE_EDGES, broken_linear_face, quadratic_face
 

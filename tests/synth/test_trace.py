@@ -8,7 +8,6 @@ from synth.flow.exact import exact_flow
 from synth.flow.overlap import boundary_edges, may_overlap
 from synth.flow.trace import trace
 from synth.flow.view import View
-from synth.surface import ContactFaces, GelSurface
 
 RNG = np.random.default_rng(5)
 
@@ -82,7 +81,6 @@ def test_rays_through_grid_lines_of_a_flat_sheet_beside_it_and_away_from_it() ->
 
 
 SURFACE = sheet(28, 21, 40.0, 30.0)
-SIZE = WIDTH, HEIGHT
 
 
 def _bump(height: float, radius: float, steep: float) -> np.ndarray:
@@ -117,7 +115,7 @@ def _meetings(positions, triangles, camera):
 def test_every_ray_that_meets_the_surface_more_than_once_is_found(state: str, view: dict) -> None:
     camera = optics(**view)
     triangles = SURFACE.triangles
-    found = may_overlap(STATES[state], triangles, boundary_edges(triangles), camera, SIZE)
+    found = may_overlap(STATES[state], triangles, boundary_edges(triangles), camera)
     many = _meetings(STATES[state], triangles, camera) > 1
     assert many.any() == (state == "overhanging")
     assert found[many].all()
@@ -135,7 +133,7 @@ def test_one_sheet_above_another_that_faces_the_camera_too(size: tuple[float, fl
     positions = np.concatenate([lower, upper.material + (shift if size[0] < 10 else [0, 0, 1.0])])
     triangles = np.concatenate([SURFACE.triangles, upper.triangles + len(lower)]).astype(np.int32)
     camera = optics()
-    found = may_overlap(positions, triangles, boundary_edges(triangles), camera, SIZE)
+    found = may_overlap(positions, triangles, boundary_edges(triangles), camera)
     many = _meetings(positions, triangles, camera) > 1
     assert many.sum() > 15
     assert found[many].all()
@@ -144,25 +142,14 @@ def test_one_sheet_above_another_that_faces_the_camera_too(size: tuple[float, fl
 @pytest.mark.parametrize("view", [{}, {"mirrors": SIDES}, {"index": 1.45, "distortion": LENS}])
 def test_a_kept_view_gives_what_a_new_one_gives(view: dict) -> None:
     camera, states = optics(**view), list(STATES.values())
-    kept = View(SURFACE, camera, *SIZE)
+    kept = View(SURFACE, camera)
     for i, j in ((0, 1), (1, 2), (2, 0), (0, 1), (2, 1)):
-        first, second = (
-            exact_flow(SURFACE, states[i], states[j], camera, *SIZE, depth=True, view=used) for used in (kept, None)
-        )
+        first, second = (exact_flow(used, states[i], states[j], depth=True) for used in (kept, View(SURFACE, camera)))
         for name in ("forward", "forward_visible", "backward", "backward_visible"):
             np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
         np.testing.assert_array_equal(first.extras["depth1.Z"], second.extras["depth1.Z"])
 
 
-def test_a_view_of_something_else_is_refused_and_mirrors_are_always_looked_at() -> None:
-    camera = optics()
-    view, same = View(SURFACE, camera, *SIZE), (SURFACE.material, SURFACE.material)
-    twin = GelSurface(ContactFaces(SURFACE.coarse.nodes, SURFACE.coarse.faces), SURFACE.subdivisions)
-    exact_flow(SURFACE, *same, camera, *SIZE, view=view)
-    others = [(twin, *same, camera, *SIZE), (SURFACE, *same, optics(index=1.2), *SIZE)]
-    others += [(SURFACE, *same, camera, *size) for size in ((WIDTH - 1, HEIGHT), (WIDTH, HEIGHT - 1))]
-    for other in others:
-        with pytest.raises(ValueError, match="another surface, camera or size"):
-            exact_flow(*other, view=view)
+def test_mirrors_are_always_looked_at() -> None:
     camera = optics(mirrors=SIDES)
-    assert may_overlap(SURFACE.material, SURFACE.triangles, boundary_edges(SURFACE.triangles), camera, SIZE).all()
+    assert may_overlap(SURFACE.material, SURFACE.triangles, boundary_edges(SURFACE.triangles), camera).all()

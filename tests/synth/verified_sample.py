@@ -9,6 +9,7 @@ from synth.dataset.sample import Sample
 from synth.flow.exact import exact_flow
 from synth.flow.field import FlowField
 from synth.flow.trace import trace
+from synth.flow.view import View
 from synth.optics import Optics
 from synth.scene import Scene, Sensor
 from synth.surface import GelSurface
@@ -42,9 +43,9 @@ def pressed(depth: float, shear: tuple[float, float], turn: float = 0.0) -> Floa
 
 
 def make_sample(drawn: Scene, displacement1: FloatArray, displacement2: FloatArray, seed: int = 0) -> SampleData:
-    camera, optics = drawn.sensor.camera, Optics.of(drawn.sensor)
+    optics = Optics.of(drawn.sensor)
     states = [SURFACE.positions(u) for u in (displacement1, displacement2)]
-    flow = exact_flow(SURFACE, *states, optics, camera.width, camera.height)
+    flow = exact_flow(View(SURFACE, optics), *states)
     rng = np.random.default_rng(seed)
     images = [_paint(SURFACE, positions, optics, drawn, rng) for positions in states]
     return SampleData(images[0], images[1], flow, SURFACE, displacement1, displacement2, {})
@@ -60,7 +61,7 @@ def motion_checks(
     sensor: Sensor, surface: GelSurface, first: Points, second: Points
 ) -> tuple[FlowField, dict[str, Check]]:
     """The exact flow between two states, both ways, and the checks of it by name."""
-    flow = exact_flow(surface, first, second, Optics.of(sensor), sensor.camera.width, sensor.camera.height)
+    flow = exact_flow(View(surface, Optics.of(sensor)), first, second)
     near, far = sheets(sensor, surface, first, second)
     checks = check_motion("forward", near, far, flow.forward, flow.forward_visible)
     checks += check_motion("backward", far, near, flow.backward, flow.backward_visible)

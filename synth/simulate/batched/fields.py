@@ -1,8 +1,5 @@
 """Moves of the lanes' fields between state, iterate and trial, and of contact's memory, as Warp kernels."""
 
-# Kernels are written in Warp's own language; their annotations only look like Python's.
-# mypy: disable-error-code="valid-type, no-untyped-def"
-
 from typing import Any
 
 import warp as wp

@@ -40,13 +40,11 @@ class Host:
     """See Dense. A product takes one row after the other, so that its numbers do not depend on its neighbours."""
 
     def product(self, a: wp.array, x: wp.array, c: wp.array, wanted: wp.array) -> None:
-        """See Dense."""
         matrix, given, found = a.numpy(), x.numpy(), c.numpy()
         for s in np.flatnonzero(wanted.numpy() == 1):
             found[s] = matrix @ given[s]
 
     def transpose(self, x: wp.array, c: wp.array) -> None:
-        """See Dense."""
         c.numpy()[...] = x.numpy().T
 
 
@@ -74,7 +72,6 @@ class Cublas:
         )  # fmt: skip
 
     def transpose(self, x: wp.array, c: wp.array) -> None:
-        """See Dense."""
         m, n = x.shape
         self._join()
         given, found = ctypes.c_void_p(x.ptr), ctypes.c_void_p(c.ptr)

@@ -7,9 +7,6 @@ With G the vector's gradient at a sample point where J < J_0, F^{-T} : G = δ an
 Few elements come near inversion, so that only their flags are stored: the rest is evaluated again in every product.
 """
 
-# Kernels are written in Warp's own language; their annotations only look like Python's.
-# mypy: disable-error-code="valid-type, no-untyped-def"
-
 import warp as wp
 
 from synth.simulate.batched.krylov import RUNNING

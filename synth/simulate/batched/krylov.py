@@ -12,9 +12,6 @@ and its result. Sums are taken by a block in a fixed order, so that nothing here
 goes in does on a GPU: see `synth.simulate.batched.solver`).
 """
 
-# Kernels are written in Warp's own language; their annotations only look like Python's.
-# mypy: disable-error-code="valid-type, no-untyped-def"
-
 from functools import cache
 
 import warp as wp

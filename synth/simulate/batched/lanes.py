@@ -20,9 +20,6 @@ a trajectory. These are the phases, in the order in which a load step passes thr
     ENDED             waits for the host; IDLE: the lane is empty
 """
 
-# Kernels are written in Warp's own language; their annotations only look like Python's.
-# mypy: disable-error-code="valid-type, no-untyped-def"
-
 import warp as wp
 
 from synth.simulate.distance import shape_vector

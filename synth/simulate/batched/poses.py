@@ -1,8 +1,5 @@
 """Pose and body of each lane's indenter, as Warp kernels: `synth.simulate.load_path` on the device."""
 
-# Kernels are written in Warp's own language; their annotations only look like Python's.
-# mypy: disable-error-code="valid-type, no-untyped-def"
-
 import warp as wp
 
 from synth.simulate import stepping

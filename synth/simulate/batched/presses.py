@@ -13,7 +13,7 @@ from synth.simulate.press import Press
 from synth.simulate.space import Space
 from synth.simulate.stepping import MAX_PENETRATION
 from synth.simulate.tables import warp_array
-from synth.simulate.trajectory import State, Trajectory, no_contact, not_converged, too_deep, trajectory_of
+from synth.simulate.trajectory import State, Trajectory, no_contact, not_converged, too_deep, trajectory_of, undeformed
 
 
 def press_tables(
@@ -80,10 +80,8 @@ def _stacked(arrays: Sequence[np.ndarray]) -> np.ndarray:
 
 def untouched(press: Press, space: Space) -> Trajectory:
     """The trajectory of an indenter that never touches: the gel stays as it is."""
-    rest = np.zeros(SCALARS + 3 * len(space.points) + 3 * len(space.surface_nodes))
-    rest[9] = 1.0
-    states = tuple(_state(press, length, rest, space) for length in (0.0, *map(float, press.path.records())))
-    return Trajectory(states, "complete", "", 0.0, space)
+    places = (0.0, *press.path.records().tolist())
+    return trajectory_of(tuple(undeformed(press.path.pose(place), space) for place in places), "", 0.0, space)
 
 
 def trajectory(
@@ -98,7 +96,7 @@ def trajectory(
         seconds: its share of the run time.
         space: of the pad.
     """
-    states = [untouched(press, space).states[0]]
+    states = [undeformed(press.path.pose(0.0), space)]
     for length, record in zip(press.path.records(), records, strict=False):
         states.append(_state(press, float(length), record, space))
     code, reached, target = ended

@@ -15,9 +15,6 @@ on neighbouring lanes of the same element, so that every access to them is one p
 no particular order on a GPU: there the last bits differ from run to run, on a CPU they do not.
 """
 
-# Kernels are written in Warp's own language; their annotations only look like Python's.
-# mypy: disable-error-code="valid-type, no-untyped-def"
-
 from functools import cache
 
 import warp as wp

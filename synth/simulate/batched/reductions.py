@@ -1,8 +1,5 @@
 """Sums over a lane's nodes and faces, as Warp kernels: norms of the residual, forces, and what a record holds."""
 
-# Kernels are written in Warp's own language; their annotations only look like Python's.
-# mypy: disable-error-code="valid-type, no-untyped-def"
-
 import warp as wp
 
 from synth.simulate.batched.fields import Fields, node_step

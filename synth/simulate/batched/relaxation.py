@@ -1,8 +1,5 @@
 """Relaxation of a lane, as Warp functions: the rules and constants are those of `synth.simulate.relaxation`."""
 
-# Kernels are written in Warp's own language; their annotations only look like Python's.
-# mypy: disable-error-code="valid-type, no-untyped-def"
-
 import warp as wp
 
 from synth.simulate import relaxation

@@ -5,9 +5,6 @@ round in its factors, the products of two such numbers are exact in single preci
 between it and a CPU.
 """
 
-# Kernels are written in Warp's own language; their annotations only look like Python's.
-# mypy: disable-error-code="valid-type, no-untyped-def"
-
 import warp as wp
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})

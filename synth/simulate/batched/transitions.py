@@ -9,9 +9,6 @@ tolerance before it is recorded (POLISH); where that fails, the step is halved a
 path goes on from the state before, so that it does not depend on which states are corrected.
 """
 
-# Kernels are written in Warp's own language; their annotations only look like Python's.
-# mypy: disable-error-code="valid-type, no-untyped-def"
-
 import warp as wp
 
 from synth.simulate import newton, stepping
