@@ -23,7 +23,6 @@ QUESTIONS = {
     "scale": "pairs a second, and where the time goes",
     "round_gel": "the flow's error against run time for a round gel, by mesh",
     "synthetic_set": "makes the synthetic test set of the report on gelflow",
-    "counts": "on how many pairs of a comparison is one method better than the others?",
     "sigma": "is the flow's uncertainty calibrated? fits its constants",
     "loss_order": "does the true flow have the lowest self-supervised loss?",
     "pictures": "draws the README's pictures of data",

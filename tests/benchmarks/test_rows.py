@@ -13,11 +13,9 @@ import torch
 
 from benchmarks import synthetic_set
 from benchmarks.__main__ import QUESTIONS, main
-from benchmarks.counts import counted
 from benchmarks.loss_order import fitted
 from benchmarks.objects import summary
 from benchmarks.rows import Row, machine, measure, plot, read, show, write
-from gelflow.compare.scores import PairScore
 from gelflow.ops.pyramid import enlarge_flow
 
 CASES = [{"mesh": name, "cells": cells, "step_mm": None} for name in ("fine", "1e-3") for cells in (1, 2)]
@@ -111,23 +109,7 @@ def test_help_names_the_questions_and_other_names_are_refused(capsys: pytest.Cap
     assert all(name in told for name in QUESTIONS)
 
 
-def score(method: str, psnr_db: float, error_px: float | None) -> PairScore:
-    made_up = {"psnr_db": psnr_db, "ssim": psnr_db / 100, "endpoint_error_px": error_px, "median_error_px": error_px}
-    spent = {"seconds": 0.0, "processor_seconds": 0.0, "device": "cpu", "on_gpu": False}
-    return PairScore(method=method, pair="pair", scene="gelsight, dots", **made_up, **spent)
-
-
-def test_counts_of_made_up_scores_and_presses() -> None:
-    """A higher PSNR is better and a smaller error; equal is not better."""
-    best = [score("a", 30, 0.05), score("a", 20, 0.3), score("a", 25, 1.5)]
-    other = [score("b", 29, 0.05), score("b", 21, 0.4), score("b", 24, 1.6)]
-    row = counted(best, other)
-    expected = {"method": "b", "pairs": 3, "<= 0.1 px": 1, "> 1 px": 1, "worst px": 1.6, "better in PSNR": 2,
-                "better in SSIM": 2, "better in mean px": 2}  # fmt: skip
-    assert row | expected == row
-    without = counted([score("a", 30, None)], [score("b", 29, None)])
-    assert without["better in PSNR"] == 1
-    assert not any("px" in name for name in without)
+def test_the_summary_of_made_up_presses() -> None:
     rows = [{"status": "complete", "penetration": depth, "times_a_ball": 1 + depth} for depth in (0.01, 0.02, 0.06)]
     found = summary([*rows, {"status": "partial"}, {"status": "refused"}])
     assert (found["refused"], found["pressed"], found["complete"]) == (1, 4, 3)
