@@ -1,4 +1,7 @@
-"""Lines of manifest.jsonl, one for each finished sample, and the keys of its lines and of those of failures.jsonl."""
+"""Lines of manifest.jsonl, one for each finished sample, and the keys of its lines and of those of failures.jsonl.
+
+`synth.dataset.sample_files` makes the entries.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

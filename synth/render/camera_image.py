@@ -19,6 +19,11 @@ from synth.arrays import FloatArray, Image
 from synth.scene import Camera
 
 
+def noise_deviation(signal: FloatArray, camera: Camera) -> FloatArray:
+    """Standard deviation of the noise of an expected linear signal."""
+    return np.asarray(np.sqrt(camera.read_noise**2 + camera.shot_noise**2 * signal))
+
+
 def camera_image(radiance: Image, camera: Camera, rng: np.random.Generator) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """The image as it is read from the camera.
 
@@ -32,8 +37,7 @@ def camera_image(radiance: Image, camera: Camera, rng: np.random.Generator) -> N
         stored as round(q · 65535 / 1023)), as readers of 16-bit PNGs expect; the steps between values stay 10-bit.
     """
     signal = expected_signal(radiance, camera)
-    deviation = np.sqrt(camera.read_noise**2 + camera.shot_noise**2 * signal)
-    noisy = signal + deviation * rng.standard_normal(signal.shape)
+    noisy = signal + noise_deviation(signal, camera) * rng.standard_normal(signal.shape)
     encoded = np.clip(noisy, 0, 1) ** (1 / camera.gamma)
     levels = 2**camera.bit_depth - 1
     quantised = np.floor(encoded * levels + 0.5)

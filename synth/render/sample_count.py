@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from synth.arrays import FloatArray, Image
-from synth.render.camera_image import expected_signal
+from synth.render.camera_image import expected_signal, noise_deviation
 from synth.scene import Camera
 
 SHARE = 0.25
@@ -40,7 +40,7 @@ def render_noise(first: Image, second: Image, camera: Camera) -> float:
 def camera_noise(radiance: Image, camera: Camera) -> float:
     """Root mean square of the camera's own noise, quantisation included, encoded, full scale 1."""
     signal = np.clip(expected_signal(radiance, camera), 0, 1)
-    deviation = np.sqrt(camera.read_noise**2 + camera.shot_noise**2 * signal)
+    deviation = noise_deviation(signal, camera)
     mean, square = np.zeros_like(signal), np.zeros_like(signal)
     for node, weight in zip(_NODES, _WEIGHTS / _WEIGHTS.sum(), strict=True):
         value = encoded(signal + node * deviation, camera)

@@ -17,7 +17,9 @@ derivative of n, D = -∂m/∂x):
 
 The linear solver takes a symmetric matrix and what is left over apart (`synth.simulate.linear`): the symmetric share is
 that of all terms but μ ε τ n^T and the (y - y_0) n^T in D. Tractions are per undeformed area. Anchors and λ_T live in
-the indenter's frame and so turn with it. Without friction none of this state is touched.
+the indenter's frame and so turn with it. Without friction none of this state is touched. Which points slipped is asked
+again where multipliers are updated (`synth.simulate.multipliers`) and where the slip ratio is summed (`System`, and
+`synth.simulate.batched.reductions`).
 """
 
 import warp as wp
