@@ -17,7 +17,7 @@ from synth.arrays import FloatArray
 from synth.scene import Numerics
 from synth.simulate.distance import KINDS
 from synth.simulate.load_path import LoadPath
-from synth.simulate.newton import FORCE_FLOOR, Solution, relative_residual, solve
+from synth.simulate.newton import FORCE_FLOOR, MAX_ITERATIONS, Solution, relative_residual, solve
 from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.relaxation import relax
 from synth.simulate.system import System
@@ -100,6 +100,12 @@ class Stepper:
         self.states: list[State] = []
         self.reason = ""
 
+    def target(self) -> float:
+        """Path length of the next step's end: equal steps of at most `step` to the next waypoint."""
+        goal = float(self._waypoints[self.next])
+        count = max(1, int(np.ceil((goal - self.at) / self.step - 1e-9)))
+        return goal if count == 1 else self.at + (goal - self.at) / count
+
     def run(self, on_progress: Callable[[float], None] | None = None) -> Trajectory:
         """Follow the load path to its end or to its last good state; `on_progress` is told what share of it is done."""
         started = time.perf_counter()
@@ -123,10 +129,8 @@ class Stepper:
             self.system.update_contact_history(self.state, self.indenter)
 
     def _advance(self) -> None:
-        """One step: as many equal ones of at most `step` lead to the next waypoint."""
-        goal = float(self._waypoints[self.next])
-        count = max(1, int(np.ceil((goal - self.at) / self.step - 1e-9)))
-        target = goal if count == 1 else self.at + (goal - self.at) / count
+        """One step."""
+        target = self.target()
         self._place(target)
         between = target in self._recorded or target not in self._waypoints
         tolerance = self._relaxed_tolerance if between else self.numerics.tolerance
@@ -229,7 +233,7 @@ class Stepper:
         """A solution brought to a tolerance where it is not there yet."""
         if not solution.converged or relative_residual(solution.residual) <= limit:
             return solution
-        return self._counted(solve(self.system, solution.state, self.indenter, limit))
+        return self._counted(solve(self.system, solution.state, self.indenter, limit, MAX_ITERATIONS))
 
     def _record(self, step: Solution, target: float) -> bool:
         """Record the corrected state, then put contact back to where the path goes on.
