@@ -69,7 +69,7 @@ def _open(flow: Flow, back: Flow) -> Tensor:
 
 def _residuals(flow: Flow, other: Flow, image1: Images, image2: Images, counts: Tensor) -> tuple[Tensor, Tensor]:
     """Sums of two flows' windowed residuals where both have one."""
-    window = window_sums(flow.shape[-2], flow.shape[-1], WINDOW_PX, flow)
+    window = window_sums(flow, WINDOW_PX)
     one, two = (
         NOISE**2 + windowed_residual(each, image1, image2, window, ignore_shading=True) for each in (flow, other)
     )
@@ -89,6 +89,5 @@ def inverse(flow: Flow) -> Flow:
     sums = flow.new_zeros(1, 3, rows * columns).index_add_(2, (y * columns + x)[hit], values).view(1, 3, rows, columns)
     found = sums
     for deviation in FILLING_PX:
-        wider = window_sums(rows, columns, deviation, flow)(sums)
-        found = torch.where(found[:, 2:] > 0, found, wider)
+        found = torch.where(found[:, 2:] > 0, found, window_sums(flow, deviation)(sums))
     return found[:, :2] / found[:, 2:].clamp(min=torch.finfo(flow.dtype).tiny)

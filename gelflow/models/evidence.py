@@ -63,16 +63,15 @@ def evidence(
 
 def gauss_newton(flow: Flow, first: Images, second: SplineImage, config: RegistrationConfig) -> Step:
     """The step from a flow in the last window of a registration for motion, without a prior, and its variance."""
-    size = (flow.shape[-2], flow.shape[-1])
-    background = window_sums(*size, config.background_px or 0.0, flow)
-    window = window_sums(*size, config.windows_px[-1], flow)
+    background = window_sums(flow, config.background_px or 0.0)
+    window = window_sums(flow, config.windows_px[-1])
     residual, across, down, counts = evidence(flow, first, second, background)
     weight = background(counts).clamp(min=TINY)
     across, down = (gradient - counts * background(gradient) / weight for gradient in (across, down))
     noise = (counts * slope / 2 for slope in torch.gradient(residual, dim=(-1, -2)))
     texture = _squares(across, down) - _squares(*noise)
     pull = torch.stack([across * residual, down * residual], dim=1).sum(dim=2)
-    z = window_sums(*size, CORRELATION_PX, flow)(pull) / (math.sqrt(math.pi) * CORRELATION_PX)
+    z = window_sums(flow, CORRELATION_PX)(pull) / (math.sqrt(math.pi) * CORRELATION_PX)
     # The sum under w^2 is about half of that under w.
     sums = window(torch.cat([texture, _squares(*z.split(1, dim=1)) / 2, pull], dim=1))
     xx, xy, yy, one, two, three, right, left = sums.split(1, dim=1)

@@ -70,7 +70,7 @@ def propagated(
     pixel = math.ceil(window_px / PIXELS_PER_DEVIATION)
     size = (math.ceil(height / pixel), math.ceil(width / pixel))
     start, first, second = resize_flow(flow, size), resize_images(image1, size), resize_images(image2, size)
-    window = window_sums(*size, window_px / pixel, flow)
+    window = window_sums(start, window_px / pixel)
 
     def residuals(candidates: Tensor) -> Tensor:
         """E of (N, B, 2, H, W): (N, B, 1, H, W)."""
@@ -119,7 +119,7 @@ class _Proposals:
     def __init__(self, flow: Flow, reach: int, extrapolate: bool) -> None:
         self._size, self._reach, self._extrapolate = (flow.shape[-2], flow.shape[-1]), reach, extrapolate
         if extrapolate:
-            flow = smoother(*self._size, SLOPE_WINDOW_PX, flow)(flow)
+            flow = smoother(flow, SLOPE_WINDOW_PX)(flow)
             flow = torch.cat([flow, *torch.gradient(flow, dim=(-1, -2))], dim=1)
         self._padded = pad(flow, (reach,) * 4, mode="replicate")
 

@@ -46,7 +46,6 @@ def registered(flow: Flow, image1: Images, image2: Images, config: RegistrationC
     Returns:
         The corrected flow, same shape, float32, without gradient. Each pair of a batch is treated on its own.
     """
-    size = (flow.shape[-2], flow.shape[-1])
     with torch.no_grad(), torch.autocast(flow.device.type, enabled=False):
         flow, first, image2 = flow.float(), image1.float(), image2.float()
         second = SplineImage(image2)
@@ -54,13 +53,13 @@ def registered(flow: Flow, image1: Images, image2: Images, config: RegistrationC
         if config.after is not None:
             former = flow = registered(flow, first, image2, config.after)
         width = config.background_px
-        background = None if width is None else window_sums(*size, width, flow)
+        background = None if width is None else window_sums(flow, width)
         for window_px, smoothing_px in zip(config.windows_px, config.smoothing_px, strict=True):
-            window = window_sums(*size, window_px, flow)
+            window = window_sums(flow, window_px)
             if config.propagation_px:
                 fit = (window_px, config.propagation_px, config.noise, background is not None)
                 flow = propagated(flow, first, image2, *fit)
-            start = smoother(*size, smoothing_px, flow)(flow)
+            start = smoother(flow, smoothing_px)(flow)
             flow = start
             for _ in range(config.iterations):
                 found = evidence(flow, first, second, background)
@@ -80,9 +79,8 @@ def _unexplained(flow: Flow, first: Images, second: SplineImage, noise: float) -
 
     Where a flow leaves the image, the border counts that `SplineImage` repeats there.
     """
-    size = (flow.shape[-2], flow.shape[-1])
     squares = (second.at(positions(flow)) - first).square().mean(dim=1, keepdim=True)
-    window, edge = window_sums(*size, RESIDUAL_WINDOW_PX, flow), window_sums(*size, BLENDING_PX, flow)
+    window, edge = window_sums(flow, RESIDUAL_WINDOW_PX), window_sums(flow, BLENDING_PX)
     all_of_it = torch.ones_like(squares)
     left = (window(squares) > noise**2 * window(all_of_it)).float()
     return edge(left) / edge(all_of_it)

@@ -60,8 +60,7 @@ def flow_sigma(flow: Flow, image1: Images, image2: Images) -> tuple[Tensor, Tens
 
 def error_squares(flow: Flow, image1: Images, image2: Images) -> tuple[Tensor, Tensor]:
     """E + |V - V*|^2 and (m |V''|)^2, both (B, 1, H, W) px^2."""
-    size = (flow.shape[-2], flow.shape[-1])
-    window = window_sums(*size, _MOTION.windows_px[-1], flow)
+    window = window_sums(flow, _MOTION.windows_px[-1])
     found = gauss_newton(flow, image1, SplineImage(image2), _MOTION)
     texture, variance = window(found.texture), TWO_STEPS * found.variance
     narrow = flow + found.step.clamp(-MAX_STEP_PX, MAX_STEP_PX)
@@ -74,7 +73,7 @@ def error_squares(flow: Flow, image1: Images, image2: Images) -> tuple[Tensor, T
 def combined(error: Tensor, curvature: Tensor, factor: float) -> Tensor:
     """Sigma in px from squared errors in px^2, smoothed; the largest count as much as `MAX_SIGMA_PX`."""
     square = (RADIUS**2 / 2) * (error + factor**2 * curvature)
-    window = window_sums(square.shape[-2], square.shape[-1], SMOOTHING_PX, square)
+    window = window_sums(square, SMOOTHING_PX)
     return (window(square.clamp(max=MAX_SIGMA_PX**2)) / window(torch.ones_like(square))).sqrt()
 
 
@@ -87,6 +86,6 @@ def _second_moment(window: SeparableFilter, field: Features) -> Features:
 
 def _curvature_square(flow: Flow) -> Tensor:
     """|V''|^2 of the flow under the last stage's smoothing, px^-2; (B, 1, H, W)."""
-    smooth = smoother(flow.shape[-2], flow.shape[-1], _MOTION.smoothing_px[-1], flow)(flow)
+    smooth = smoother(flow, _MOTION.smoothing_px[-1])(flow)
     slopes = torch.cat(torch.gradient(smooth, dim=(-1, -2)), dim=1)
     return torch.cat(torch.gradient(slopes, dim=(-1, -2)), dim=1).square().sum(dim=1, keepdim=True)

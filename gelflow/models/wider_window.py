@@ -47,7 +47,7 @@ def best_window(flow: Flow, variance: Tensor, texture: Tensor, window_px: float)
     least, error = torch.ones_like(variance), variance
     best = flow
     for width in WIDTHS_PX:
-        window = window_sums(flow.shape[-2], flow.shape[-1], width, flow)
+        window = window_sums(flow, width)
         wide = _mean(flow, weight, window)
         wide = wide + _mean(flow - wide, weight, window)
         shared, left = _noise_shares(window_px, width)

@@ -24,21 +24,21 @@ class SeparableFilter(NamedTuple):
         return self.down @ field @ self.across.T
 
 
-def window_sums(rows: int, columns: int, deviation: float, like: Tensor) -> SeparableFilter:
+def window_sums(like: Tensor, deviation: float) -> SeparableFilter:
     """Sums under a Gaussian of height one around each pixel; nothing is added where the window leaves the image.
 
-    `deviation` is the Gaussian's standard deviation in px; `like` gives dtype and device.
+    `like` is a (..., H, W) with the fields' sides, dtype and device; `deviation` is the standard deviation in px.
     """
-    return SeparableFilter(*(_sums(pixels, deviation, like.dtype, like.device) for pixels in (rows, columns)))
+    return SeparableFilter(*(_sums(pixels, deviation, like.dtype, like.device) for pixels in like.shape[-2:]))
 
 
-def smoother(rows: int, columns: int, deviation: float, like: Tensor) -> SeparableFilter:
+def smoother(like: Tensor, deviation: float) -> SeparableFilter:
     """Means under a Gaussian around each pixel; arguments as for `window_sums`, a deviation of 0 changes nothing.
 
     Beyond the border fields go on turned about their border's pixel, so that affine fields stay as they are up to the
     border; under a mean over what lies inside, the border of a rotation or an enlargement would follow the inside.
     """
-    return SeparableFilter(*(_mean(pixels, deviation, like.dtype, like.device) for pixels in (rows, columns)))
+    return SeparableFilter(*(_mean(pixels, deviation, like.dtype, like.device) for pixels in like.shape[-2:]))
 
 
 @cached

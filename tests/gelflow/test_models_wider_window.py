@@ -13,7 +13,7 @@ TEXTURE = torch.ones(1, 1, *SIZE)
 
 def noise_of_two_steps(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Noise of a flow (1, 2, H, W) after two steps in a narrow window, and its variance."""
-    window = window_sums(*SIZE, NARROW, TEXTURE)
+    window = window_sums(TEXTURE, NARROW)
     white = NOISE * torch.randn((1, 2, *SIZE), generator=torch.Generator().manual_seed(seed))
     step = window(white) / window(TEXTURE)
     # A Gaussian mean has the variance of white noise over 4 pi 5^2 px, for each of two components.

@@ -91,12 +91,9 @@ def test_the_spline_is_scipys_and_keeps_the_image_at_lowered_precision_too() -> 
     torch.testing.assert_close(far, image[..., -1:, -1:].expand_as(image), rtol=0, atol=2e-6)
 
 
-LIKE = torch.zeros((), dtype=torch.float64)
-
-
 def test_window_sums_are_a_convolution_and_smoothing_a_gaussian_up_to_the_border() -> None:
     field = torch.rand(2, 3, 21, 34, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    found = window_sums(21, 34, 2.5, LIKE)(field).numpy()
+    found = window_sums(field, 2.5)(field).numpy()
     expected = field.numpy()
     for axis in (-1, -2):
         # scipy's window ends at int(truncate * s + 0.5) px, ours at ceil(3 s) = 8, and has the sum one.
@@ -107,10 +104,10 @@ def test_window_sums_are_a_convolution_and_smoothing_a_gaussian_up_to_the_border
     field = torch.stack([3 + 0.2 * x - 0.1 * y, x * y])[None]
     # Both are affine along each axis. That of 8 px would reach beyond the other border.
     for deviation in (3.0, 8.0):
-        torch.testing.assert_close(smoother(20, 30, deviation, LIKE)(field), field, rtol=1e-12, atol=1e-11)
-    torch.testing.assert_close(smoother(20, 30, 0.0, LIKE)(field), field, rtol=0, atol=0)
+        torch.testing.assert_close(smoother(field, deviation)(field), field, rtol=1e-12, atol=1e-11)
+    torch.testing.assert_close(smoother(field, 0.0)(field), field, rtol=0, atol=0)
     wave = torch.cos(0.4 * torch.arange(121.0, dtype=torch.float64)).expand(1, 1, 4, -1)
-    found = smoother(4, 121, 2.0, LIKE)(wave)
+    found = smoother(wave, 2.0)(wave)
     # exp(-s² k² / 2) = 0.726; the window's end at 3 s leaves out 0.3 % of the Gaussian, as does the sum over pixels.
     torch.testing.assert_close(found[..., 20:-20], math.exp(-0.32) * wave[..., 20:-20], rtol=0, atol=5e-3)
 
