@@ -4,7 +4,7 @@ import numpy as np
 
 from synth.mesh import Focus
 from synth.mesh.graded import kuhn_tets
-from synth.mesh.tetwild_sizing import ROOM, Background
+from synth.mesh.tetrahedralise import ROOM, Background
 
 SLOPE = 0.35
 """Growth of the target edge length per distance from the zone."""

@@ -21,8 +21,7 @@ from synth.mesh import PadMesh, face_of, pad_mesh
 from synth.mesh.cache import CHORDS, SURFACE
 from synth.mesh.capsule import CapsuleFace
 from synth.mesh.graded import kuhn_tets
-from synth.mesh.tetrahedralise import tetrahedralise
-from synth.mesh.tetwild_sizing import ROOM, Background
+from synth.mesh.tetrahedralise import ROOM, Background, tetrahedralise
 from synth.optics import Optics
 from synth.pipeline.render_session import SUBDIVISIONS
 from synth.scene import Scene

@@ -18,8 +18,7 @@ from synth.errors import InputError
 from synth.mesh.dome import domed
 from synth.mesh.face import Face, PadFace, face_of
 from synth.mesh.pad import PadMesh
-from synth.mesh.tetrahedralise import ENVELOPE, tetrahedralise, tetrahedralise_box
-from synth.mesh.tetwild_sizing import GRADING, even
+from synth.mesh.tetrahedralise import ENVELOPE, GRADING, background_of, tetrahedralise, tetrahedralise_box
 from synth.scene import Gel, Numerics
 
 SURFACE, ROOM = 0.5, 1.5
@@ -98,7 +97,7 @@ def _made(gel: Gel, face: Face, edge_mm: float) -> PadMesh:
     surface, triangles = face.triangles(SURFACE * edge_mm)
     envelope = max(ENVELOPE, off / float(np.linalg.norm(np.ptp(surface, axis=0))))
     x, y = 2 * np.abs(surface[:, :2]).max(axis=0)
-    background = even((x, y, surface[:, 2].max()), edge_mm)
+    background = background_of((x, y, surface[:, 2].max()), edge_mm)
     points, tets = tetrahedralise(
         surface, triangles, face.sides, background, face.volume_mm3, CHORDS, envelope=envelope
     )

@@ -28,7 +28,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.arrays import FloatArray, Tets
-from synth.mesh.focus import Focus
 from synth.mesh.pad import PadMesh
 
 STEEPEST = 2.5
@@ -39,6 +38,32 @@ FINEST = 0.04
 GRAIN_MM = 2.0**-32
 """Coordinates are multiples of it, but for the pad's faces and the layers' interfaces: the last bits of
 `log` and `exp` differ between processors."""
+
+
+@dataclass(frozen=True)
+class Focus:
+    """The zone to be resolved: an axis-parallel rectangle of the undeformed contact face.
+
+    Attributes:
+        centre_mm: x and y of its centre.
+        half_mm: half its width along x and along y, >= 0; a half width of 0 is a line or a point.
+    """
+
+    centre_mm: tuple[float, float]
+    half_mm: tuple[float, float]
+
+    def span(self, axis: int, length_mm: float) -> tuple[float, float]:
+        """Lower and upper end along an axis (0: x, 1: y), clipped to a pad of that length around the origin.
+
+        A focus beyond the pad becomes the nearest edge, of no width.
+        """
+        centre, half, edge = self.centre_mm[axis], self.half_mm[axis], length_mm / 2
+        return min(max(centre - half, -edge), edge), min(max(centre + half, -edge), edge)
+
+    def clipped(self, size_mm: tuple[float, float, float]) -> "Focus":
+        """The part of it that lies on a pad of that size."""
+        (left, right), (top, bottom) = (self.span(axis, size_mm[axis]) for axis in (0, 1))
+        return Focus(((left + right) / 2, (top + bottom) / 2), ((right - left) / 2, (bottom - top) / 2))
 
 
 @dataclass(frozen=True)

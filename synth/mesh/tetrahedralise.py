@@ -10,6 +10,7 @@ import signal
 import tempfile
 import threading
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -17,8 +18,11 @@ import numpy as np
 from synth.arrays import FloatArray, Points, Projection, Tets, Triangles
 from synth.errors import InputError
 from synth.mesh.pad import PadMesh, boundary_faces, signed_volumes
-from synth.mesh.tetwild_sizing import Background, through_thickness
 
+GRADING = 2.0
+"""Edge length at a box's window over edge length at its contact face."""
+ROOM = 1.01
+"""A background covers the box with room to spare, for points that rounding puts outside."""
 ENVELOPE = 1e-3
 """fTetWild's epsilon for flat faces, relative to the bounding box's diagonal."""
 ON_SIDE_MM = 1e-9
@@ -29,6 +33,32 @@ ATTEMPTS = 3
 """The mesher is random: a mesh that is not valid is made again so often."""
 WORST_SHAPE = 0.02
 """Smallest accepted ratio of inscribed to circumscribed radius, times 3 (1 for a regular tetrahedron)."""
+
+
+@dataclass(frozen=True)
+class Background:
+    """Target edge lengths for fTetWild, linear within tetrahedra.
+
+    Attributes:
+        points: (n, 3) float64 mm.
+        tets: (m, 4) int32.
+        values: (n,) float64 mm.
+    """
+
+    points: Points
+    tets: Tets
+    values: FloatArray
+
+
+def background_of(size_mm: tuple[float, float, float], edge_mm: float, grading: float = 1.0) -> Background:
+    """Edges of edge_mm at z = 0 of a bounding box of that size, and linearly up to `grading` times that at its top."""
+    corners = np.array([(x, y, z) for z in (0, size_mm[2]) for y in (-0.5, 0.5) for x in (-0.5, 0.5)], dtype=float)
+    corners[:, :2] *= size_mm[:2]
+    centre = np.array([0.0, 0.0, size_mm[2] / 2])
+    points = centre + ROOM * (corners - centre)
+    tets = [(0, 1, 3, 7), (0, 3, 2, 7), (0, 2, 6, 7), (0, 6, 4, 7), (0, 4, 5, 7), (0, 5, 1, 7)]
+    values = edge_mm * (1 + (grading - 1) * np.clip(points[:, 2] / size_mm[2], 0, 1))
+    return Background(points, np.array(tets, dtype=np.int32), values)
 
 
 def tetrahedralise_box(
@@ -44,7 +74,7 @@ def tetrahedralise_box(
     Raises:
         InputError: no attempt gave a valid mesh.
     """
-    background = background or through_thickness(size_mm, edge_length_mm)
+    background = background or background_of(size_mm, edge_length_mm, GRADING)
     points, tets = tetrahedralise(*_box(size_mm), _sides(size_mm), background, float(np.prod(size_mm)), 1e-9)
     return PadMesh(points, tets, size_mm)
 

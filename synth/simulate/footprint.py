@@ -18,8 +18,7 @@ from itertools import product
 import numpy as np
 
 from synth.arrays import BoolArray, FloatArray, Points
-from synth.mesh.face import face_height
-from synth.mesh.focus import Focus
+from synth.mesh import Focus, face_height
 from synth.simulate.distance import KINDS
 from synth.simulate.load_path import LoadPath, Pose
 from synth.simulate.measure import Distance
