@@ -1,7 +1,6 @@
 """What a scene needs, decided once (`plan`), and what it will cost (`predict`)."""
 
-from synth.planning.check import check_buildable
-from synth.planning.plan import Plan, job_variant, plan
+from synth.planning.plan import Plan, check_buildable, job_variant, plan
 from synth.planning.prediction import Prediction, predict
 
 __all__ = ["Plan", "Prediction", "check_buildable", "job_variant", "plan", "predict"]

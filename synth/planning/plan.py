@@ -1,15 +1,35 @@
 """What a scene needs, decided once; what comes later is handed the plan and asks nothing again."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from synth.planning.check import check_buildable
-from synth.planning.reasons import Decision, decisions
-from synth.render.pattern import is_grey
+from synth.errors import InputError
+from synth.mesh import default_edge_length, face_of
+from synth.mesh.cad import CadFace
+from synth.render.camera_rays import pinhole
+from synth.render.lights import check_view
+from synth.render.pattern import check_pattern, is_grey
+from synth.render.separated_light import is_separated
+from synth.render.thin_lens import ThinLens
 from synth.render.variant import Device, Variant, choose_variant
+from synth.scene import MeshIndenter
+from synth.scene.sampling import check_pairs
 from synth.scene.template import Template
+from synth.simulate.indenter import rigid_body
+from synth.simulate.material import DISPLACEMENT_ONLY_BELOW
 from synth.simulate.mesh_rule import MeshRule
+from synth.simulate.object_surface import object_triangles
+
+
+@dataclass(frozen=True)
+class Decision:
+    """Whether a feature runs, and why."""
+
+    feature: str
+    runs: bool
+    reason: str
 
 
 @dataclass(frozen=True)
@@ -58,10 +78,8 @@ def plan(scene: Template, variant: Variant | None = None) -> Plan:
     """
     variant = variant or job_variant(scene, "auto")
     check_buildable(scene, variant)
-    is_batched = scene.numerics.is_batched
-    found = decisions(scene, variant, is_batched)
     round_first = sorted(scene.corners, key=lambda corner: not corner.sensor.gel.is_round)
-    return Plan(scene, variant, is_batched, MeshRule.of(round_first[0]), found)
+    return Plan(scene, variant, scene.numerics.is_batched, MeshRule.of(round_first[0]), _decisions(scene, variant))
 
 
 def job_variant(template: Template, device: Device) -> Variant:
@@ -69,3 +87,98 @@ def job_variant(template: Template, device: Device) -> Variant:
     # Corners that are grey say nothing of the draws between them where a single channel is drawn.
     drawn = any(re.search(r"\.(color|reflectance)\[\d\]$|\.saturation$", at) for _, _, at in template.distributions())
     return choose_variant(device, grey=not drawn and all(is_grey(scene.sensor) for scene in template.corners))
+
+
+def check_buildable(template: Template, variant: Variant) -> None:
+    """Build what fits the schema and may still be impossible, so that a job does not find out after its first hour.
+
+    Raises:
+        InputError: at a corner of the distributions, an indenter whose parts do not fit or whose file is no surface,
+            a gel from files that is too thin or is pressed beside its face, a light in the camera's view, a lens or a
+            kind of light that this variant or coating cannot have, a pattern that no pixel could show or whose file is
+            no picture, or more pairs than a trajectory has.
+    """
+    try:
+        for sensor in dict.fromkeys(view for corner in template.corners for view in corner.sensor.views.values()):
+            check_view(sensor)
+            ThinLens.of(sensor)
+            if not variant.is_vectorised:
+                pinhole(sensor)
+        for sensor in dict.fromkeys(corner.sensor for corner in template.corners):
+            check_pattern(sensor, template.folder)
+        for indenter in dict.fromkeys(corner.contact.indenter for corner in template.corners):
+            if isinstance(indenter, MeshIndenter):
+                object_triangles(indenter, template.folder)
+            else:
+                rigid_body(indenter)
+        for corner in template.corners:
+            gel = corner.sensor.gel
+            if isinstance(face := face_of(gel, template.folder), CadFace):
+                face.check(corner.motion, corner.numerics.edge_length_mm or default_edge_length(gel))
+            is_separated(corner.render, corner.sensor.coating, variant)
+            check_pairs(corner)
+    except InputError as error:
+        raise InputError(f"{template.label}: {error}") from error
+
+
+def _decisions(template: Template, variant: Variant) -> tuple[Decision, ...]:
+    """Feature by feature, from the corners of a template's distributions."""
+    corners = template.corners
+    outputs = template.outputs
+    depth, friction = [c.motion.depth_mm for c in corners], [c.contact.friction for c in corners]
+    poisson = [c.sensor.gel.poisson_ratio for c in corners]
+    index, bounces = [c.sensor.window.refractive_index for c in corners], [c.render.max_depth for c in corners]
+    mixed = max(poisson) >= DISPLACEMENT_ONLY_BELOW
+    cameras = [view.camera for c in corners for view in c.sensor.views.values()]
+    lens = any(any(camera.distortion) or camera.lens == "fisheye" for camera in cameras)
+    flat = all(c.sensor.gel.is_flat for c in corners)
+    own_frames = "" if flat else ": curved faces have own frames"
+    apertures = [camera.aperture_mm for camera in cameras]
+    pinhole = "" if max(apertures) > 0 else ": a pinhole"
+    mirrors, further = len(corners[0].sensor.mirrors), len(corners[0].sensor.further_cameras)
+    light = corners[0].render.light
+    separated = is_separated(corners[0].render, corners[0].sensor.coating, variant)
+    instead = f", but {variant.name} path-traces" if light == "separated" and not separated else ""
+    grey = all(is_grey(c.sensor) for c in corners)
+    hue = "lights, coating and pattern are grey" if grey else "a light, the coating or the pattern has colour"
+    if grey and not variant.is_mono:
+        hue += f", but {variant.name} has no grey counterpart here"
+    optional = [name for name in ("depth", "normal", "displacement", "traction", "contact") if getattr(outputs, name)]
+    foam = "" if mixed else ": a compressible foam needs none"
+    smooth = "" if max(friction) > 0 else ": half the matrix is enough"
+    return (
+        _batching(template),
+        Decision("simulation", max(depth) > 0, _span("motion.depth_mm", depth)),
+        Decision("friction state", max(friction) > 0, _span("contact.friction", friction) + smooth),
+        Decision("pressure field", mixed, _span("sensor.gel.poisson_ratio", poisson) + foam),
+        Decision("window refraction", max(index) > 1, _span("sensor.window.refractive_index", index)),
+        Decision("lens distortion", lens, "sensor.camera.distortion" + ("" if lens else " is zero: a pinhole")),
+        Decision("shared undeformed frame", flat, "sensor.gel.shape" + own_frames),
+        Decision("depth of field", max(apertures) > 0, _span("sensor.camera.aperture_mm", apertures) + pinhole),
+        Decision("mirrors", mirrors > 0, f"{mirrors} in sensor.mirrors"),
+        Decision("further cameras", further > 0, f"{further} in sensor.further_cameras"),
+        Decision("separated light", separated, f"render.light = {light}{instead}"),
+        Decision("indirect light", max(bounces) > 2, _span("render.max_depth", bounces)),
+        Decision("colour", not variant.is_mono, hue),
+        Decision("backward flow", outputs.backward, f"outputs.backward = {str(outputs.backward).lower()}"),
+        Decision("optional channels", bool(optional), ", ".join(optional) or "none asked for in outputs"),
+        Decision("indenter in the picture", False, "the coating is opaque"),
+    )
+
+
+def _batching(template: Template) -> Decision:
+    """Whether trajectories are simulated many at once, and whether that is worth it."""
+    reason = f'numerics.solver = "{template.numerics.solver}"'
+    if template.numerics.is_batched:
+        # Without layers stiffness only scales forces, so that pads which differ in nothing else share a mesh.
+        alike = () if template.corners[0].sensor.gel.layers else ("sensor.gel.youngs_modulus_kpa",)
+        drawn = [at for _, _, at in template.distributions() if at.startswith("sensor.gel.") and at not in alike]
+        if drawn:
+            reason += f": but {', '.join(drawn)} make each sensor's pad another, with a mesh and a batch of its own"
+    return Decision("batched simulation", template.numerics.is_batched, reason)
+
+
+def _span(name: str, values: Sequence[float]) -> str:
+    """What a field is at the corners."""
+    low, high = min(values), max(values)
+    return f"{name} = {low:g}" if low == high else f"{name} = {low:g} to {high:g}"
