@@ -29,9 +29,8 @@ from typing import Any, Self
 
 from synth.dataset.job import DATASET_FILE, Job, check_record, continued, refuse_another_job
 from synth.dataset.jsontext import parse_document, to_document, to_line
-from synth.dataset.lease import LEASES_FOLDER, Lease
 from synth.dataset.lines import append_line, merge_lines, scan_lines
-from synth.dataset.lock import LOCK_FILE, DirectoryLock
+from synth.dataset.lock import LEASES_FOLDER, LOCK_FILE, DirectoryLock, Lease
 from synth.dataset.manifest import FAILURES_FILE, MANIFEST_FILE, ManifestEntry, failure_key, manifest_key
 from synth.dataset.meshes import MESHES_FOLDER, mesh_folder
 from synth.dataset.sample import SAMPLE_FILES, SAMPLES_FOLDER, VIEW_FILES, Sample, further_cameras, sample_name

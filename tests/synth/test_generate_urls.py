@@ -13,7 +13,7 @@ from fsspec.implementations.memory import MemoryFileSystem
 from samples import job, translation_sample
 from tiny_scene import fingerprint, reference
 
-from synth.dataset.lease import EXPIRES_S
+from synth.dataset.lock import EXPIRES_S
 from synth.dataset.meshes import mesh_folder
 from synth.dataset.sample_files import write_sample_files
 from synth.dataset.shard import Shard
