@@ -9,6 +9,7 @@ long enough that rendering goes on while the next chunk is drawn. A killed run l
 instances and samples come out the same the next time.
 """
 
+import threading
 from collections import deque
 from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -20,13 +21,14 @@ from synth.arrays import Image
 from synth.pipeline.batched_simulation import Result, in_batches
 from synth.pipeline.finishing import finish
 from synth.pipeline.records import JobContext, Outcome, Task
-from synth.pipeline.render_session import RenderedTrajectory, RenderSession
-from synth.pipeline.textures import Textures
+from synth.pipeline.render_session import RenderedTrajectory, RenderSession, paint
 from synth.pipeline.worker_pool import Maker, spread
+from synth.scene import Sensor
 
 PREFETCHED = 256
 """Simulated trajectories that wait to be rendered, at most: some hundred kilobytes each."""
-TEXTURE_THREADS = 6
+TEXTURES, TEXTURE_THREADS = 8, 6
+"""Textures that are being painted or wait to be used, at most, up to 94 MB each; and threads that paint them."""
 
 Rendered = RenderedTrajectory | Outcome
 Item = TypeVar("Item")
@@ -62,6 +64,29 @@ def outcomes_of_batches(
                 yield from spread(context, _finisher, items, workers, number)
         finally:
             threads.shutdown(wait=False, cancel_futures=True)
+            textures.release(TEXTURE_THREADS)  # no thread waits for room any more
+
+
+class Textures:
+    """Textures of a job's sensors, painted by the given threads in the order in which they are asked for.
+
+    At most `room` are being painted or wait to be used.
+    """
+
+    def __init__(self, context: JobContext, threads: ThreadPoolExecutor, room: int = TEXTURES) -> None:
+        self._context, self._threads, self._room = context, threads, threading.Semaphore(room)
+
+    def request(self, number: int, sensor: Sensor) -> "Future[Image]":
+        """The texture of a sensor, by its number, begun when there is room; in any thread."""
+        return self._threads.submit(self._paint, number, sensor)
+
+    def release(self, count: int = 1) -> None:
+        """So many textures that were requested are no longer held: there is room for others; in any thread."""
+        self._room.release(count)
+
+    def _paint(self, number: int, sensor: Sensor) -> Image:
+        self._room.acquire()
+        return paint(self._context, number, sensor)
 
 
 @contextmanager

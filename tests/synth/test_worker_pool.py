@@ -12,7 +12,7 @@ from processes_of import HAS_PROC, workers_of
 from tiny_scene import TEXT, fingerprint, job_context, own_cache, reference, write_tiny
 
 from synth.arrays import Image
-from synth.pipeline import textures
+from synth.pipeline import overlapped
 from synth.pipeline import worker_pool as pool
 from synth.pipeline.generate import Scheduling, generate
 from synth.pipeline.overlapped import outcomes_of_batches
@@ -73,10 +73,10 @@ def test_textures_are_painted_in_order_and_one_thread_each_leaves_the_environmen
             raise MemoryError("no room for sensor 5")
         return np.full((1, 1, 3), sensor, dtype=np.float32)
 
-    monkeypatch.setattr(textures, "paint", painted)
+    monkeypatch.setattr(overlapped, "paint", painted)
     scene = context.plan.template.corners[0].sensor
     with ThreadPoolExecutor(1) as threads:
-        early = textures.Textures(context, threads, room=2)
+        early = overlapped.Textures(context, threads, room=2)
         asked = [early.request(sensor, scene) for sensor in range(6)]
         for sensor, texture in enumerate(asked[:5]):
             assert texture.result(10)[0, 0, 0] == sensor
