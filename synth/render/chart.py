@@ -6,7 +6,7 @@ About the axis, the texture's place is the arc s from the tip along a meridian, 
 
 which has no seam and is smooth at the tip. The face is taken to be a hemisphere about (0, 0, R) and a cylinder above
 it. The chart is true along the meridians and at the tip, and s / ρ too wide across, ρ being the distance from the axis:
-marks are therefore painted by their distances in space (`synth.render.round_marks`).
+marks are therefore painted by their distances in space (`synth.render.marks`).
 """
 
 from dataclasses import dataclass

@@ -19,8 +19,7 @@ from synth.errors import InputError
 from synth.optics import Optics
 from synth.render.bitmap import laid_over, read_picture
 from synth.render.chart import RoundChart, chart_of
-from synth.render.marks import dots_coverage, speckle_coverage
-from synth.render.round_marks import round_dots, round_speckle
+from synth.render.marks import marks_coverage
 from synth.scene import Bitmap, Dots, NoPattern, RandomColor, Sensor, Speckle
 
 TEXELS_PER_PIXEL = 4
@@ -48,17 +47,10 @@ def albedo(sensor: Sensor, rng: np.random.Generator, folder: Path | None = None)
         InputError: a pattern finer than the camera could see, or a bitmap that cannot be read.
     """
     x, y = _texels(sensor)
-    chart = chart_of(sensor)
     coating = np.array(sensor.coating.reflectance)
     match sensor.pattern:
-        case Dots() as pattern if isinstance(chart, RoundChart):
-            colors, coverage = np.array(pattern.reflectance), round_dots(pattern, chart, x, y, rng)
-        case Speckle() as pattern if isinstance(chart, RoundChart):
-            colors, coverage = np.array(pattern.reflectance), round_speckle(pattern, chart, x, y, rng)
-        case Dots() as pattern:
-            colors, coverage = np.array(pattern.reflectance), dots_coverage(pattern, x, y, rng)
-        case Speckle() as pattern:
-            colors, coverage = np.array(pattern.reflectance), speckle_coverage(pattern, x, y, rng)
+        case Dots() | Speckle() as pattern:
+            colors, coverage = np.array(pattern.reflectance), marks_coverage(pattern, chart_of(sensor), x, y, rng)
         case Bitmap() as pattern:
             colors, coverage = laid_over(pattern, read_picture(pattern, folder or Path()), x, y)
             colors = colors * coating

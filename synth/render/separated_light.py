@@ -33,11 +33,10 @@ from numpy.typing import NDArray
 from synth.arrays import BoolArray
 from synth.errors import InputError
 from synth.render.cavity_light import across_cavity
-from synth.render.face_points import FacePoints, count_per_face
+from synth.render.face_points import FacePoints, count_per_face, projected
 from synth.render.gel_mesh import GelMesh
 from synth.render.lights import reaches
 from synth.render.polygon_light import PolygonLight, SampledLight
-from synth.render.projection import projected
 from synth.render.variant import Variant
 from synth.render.window_images import image_lights, reflectance, reflecting_plane
 from synth.scene import Coating, Render, Sensor

@@ -10,7 +10,8 @@ from render_scenes import small_sensor
 
 from synth.arrays import FloatArray
 from synth.errors import InputError
-from synth.render.marks import dots_coverage
+from synth.render.chart import FlatChart
+from synth.render.marks import marks_coverage
 from synth.render.pattern import albedo, check_pattern, is_grey, pixels_per_mm
 from synth.scene import Bitmap, Coating, Dots, FurtherCamera, Light, Mirror, Pattern, RandomColor, Sensor, Speckle
 
@@ -36,7 +37,7 @@ def test_strips_blend_to_the_bit_and_bare_coating_is_as_fine_as_the_camera_and_c
     dots = Dots(kind="dots", spacing_mm=(1.3, 1.1), radius_mm=0.4, softness_mm=0.3, reflectance=(0.1, 0.2, 0.9))
     sensor, texture, x, y = _painted(dots, seed=3, white=False)
     assert len(y) % 32
-    share = dots_coverage(dots, x, y, np.random.default_rng(3))[:, :, None]
+    share = marks_coverage(dots, FlatChart((1.0, 1.0)), x, y, np.random.default_rng(3))[:, :, None]
     coating = np.array(sensor.coating.reflectance)
     painted = coating + share * (np.array(dots.reflectance) - coating)
     np.testing.assert_array_equal(texture.astype(np.float32), painted.astype(np.float32))

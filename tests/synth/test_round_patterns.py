@@ -12,9 +12,9 @@ from synth.flow.trace import trace
 from synth.optics import Optics
 from synth.render.chart import RoundChart, chart_of
 from synth.render.gel_mesh import GelMesh
+from synth.render.marks import marks_coverage
 from synth.render.pattern import albedo, pixels_per_mm
 from synth.render.renderer import Renderer
-from synth.render.round_marks import round_dots, round_speckle
 from synth.scene import Dots, Light, Render, Speckle
 
 CHART = RoundChart(RADIUS, RADIUS + LENGTH)
@@ -40,7 +40,7 @@ def test_the_chart_keeps_arcs_and_azimuths() -> None:
 @pytest.mark.parametrize("placing", ["spherical", "cylindrical"])
 def test_dots_have_their_size_and_places_on_the_face(placing: str) -> None:
     x, area = _texels(1500)
-    coverage = round_dots(DOTS.model_copy(update={"placing": placing}), CHART, x, x, np.random.default_rng(0))
+    coverage = marks_coverage(DOTS.model_copy(update={"placing": placing}), CHART, x, x, np.random.default_rng(0))
     assert coverage[749:751, 749:751].min() == 1  # one at the tip
     angle, arc = np.arctan2(*np.meshgrid(x, x)[::-1]), np.hypot(*np.meshgrid(x, x))
     for height in (3.0, 9.0, 15.0):
@@ -57,9 +57,9 @@ def test_speckle_has_its_coverage_and_grain_size_all_over_the_face() -> None:
     x, area = _texels(1200)
     pattern = Speckle(kind="speckle", grain_mm=1.0, coverage=0.4, placing="spherical")
     rng = np.random.default_rng(5)
-    coverage = np.mean([(round_speckle(pattern, CHART, x, x, rng) * area).sum() / area.sum() for _ in range(3)])
+    coverage = np.mean([(marks_coverage(pattern, CHART, x, x, rng) * area).sum() / area.sum() for _ in range(3)])
     assert coverage == pytest.approx(0.4, abs=0.01)
-    dark = round_speckle(pattern.model_copy(update={"coverage": 0.5}), CHART, x, x, rng)
+    dark = marks_coverage(pattern.model_copy(update={"coverage": 0.5}), CHART, x, x, rng)
 
     def at(arc: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
         place = np.stack([arc * np.sin(azimuth), arc * np.cos(azimuth)]) / CHART.size_mm[0] * 1200 + 599.5
