@@ -249,7 +249,7 @@ def _show_plan(template: Template, variant: Variant, n: int, as_json: bool) -> i
         + _error_line(predicted)
         + f"predicted per pair: {stages}; {predicted.bytes_per_pair / 1e6:.2f} MB\n"
         f"predicted for {n} pairs: {duration(n * seconds)} on one core, {n * predicted.bytes_per_pair / 1e9:.2f} GB\n"
-        "times are predicted within a factor of three",
+        "times are predicted within a factor of three"
     )
     return 0
 
@@ -273,7 +273,7 @@ def _show_summary(summary: Summary, variant: Variant) -> None:
     rate = f", {summary.samples_per_second:.2f} pairs/s" if summary.made else ""
     print(
         f"{summary.made} pairs made ({summary.found} were there) in {duration(summary.seconds)}{rate} "
-        f"with {variant.name}: {summary.directory}" + (f", shard {summary.shard}" if summary.shard else ""),
+        f"with {variant.name}: {summary.directory}" + (f", shard {summary.shard}" if summary.shard else "")
     )
     if stages:
         print(f"time: {stages}")

@@ -36,10 +36,7 @@ class Comparison:
         """Mean absolute and signed differences per channel, levels of 255."""
         difference = 255 * (self.rendered - self.frame)
         bare = difference[self.outside]
-        found = {
-            "mean_absolute_outside_dots": np.abs(bare).mean(axis=0),
-            "bias_outside_dots": bare.mean(axis=0),
-        }
+        found = {"mean_absolute_outside_dots": np.abs(bare).mean(axis=0), "bias_outside_dots": bare.mean(axis=0)}
         rounded = {name: [round(float(x), 3) for x in values] for name, values in found.items()}
         return rounded | {"pixels_outside_dots": int(self.outside.sum())}
 

@@ -118,9 +118,7 @@ class CapsuleFace:
         raised = self.length_mm * np.maximum(ring - rings, 0) / max(bands, 1)
         across = radius * np.where(ring < rings, np.sin(polar), 1.0)
         down = radius * np.where(ring < rings, np.cos(polar), 0.0)
-        return np.column_stack(
-            [across * np.cos(azimuth), across * np.sin(azimuth), self.radius_mm + raised - down],
-        )
+        return np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), self.radius_mm + raised - down])
 
     def _centres(self, points: Points) -> Points:
         """(n, 3) mm: the nearest points of the axis."""

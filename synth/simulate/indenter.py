@@ -100,10 +100,7 @@ def rotation_about(axis: int, angle: float) -> FloatArray:
 
 
 def rigid_body(
-    indenter: Indenter,
-    folder: Path | None = None,
-    resolution_mm: float = 0.0,
-    touchable: Touchable = EVERYTHING,
+    indenter: Indenter, folder: Path | None = None, resolution_mm: float = 0.0, touchable: Touchable = EVERYTHING
 ) -> RigidBody:
     """Pack an indenter.
 

@@ -67,10 +67,7 @@ def simulate_press(
 
 
 def stepper_of(
-    press: Press,
-    frames: frozenset[int] | None = None,
-    options: SolverOptions = STANDARD,
-    space: Space | None = None,
+    press: Press, frames: frozenset[int] | None = None, options: SolverOptions = STANDARD, space: Space | None = None
 ) -> Stepper:
     """A press at the start of its load path, on a part of its gel's space, default all of it; see `simulate_press`."""
     scene, gel, numerics = press.scene, press.scene.sensor.gel, press.scene.numerics

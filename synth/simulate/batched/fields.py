@@ -217,10 +217,7 @@ def copy_memory(mask: wp.array(dtype=wp.int32), source: ContactMemory, target: C
 
 @wp.kernel
 def save_multipliers(
-    lanes: Lanes,
-    contact: ContactState,
-    normal: wp.array3d(dtype=wp.float64),
-    tangent: wp.array3d(dtype=wp.vec3d),
+    lanes: Lanes, contact: ContactState, normal: wp.array3d(dtype=wp.float64), tangent: wp.array3d(dtype=wp.vec3d)
 ):
     """One thread per (lane, face, point): before a pass begins."""
     s, f, q = wp.tid()
@@ -232,10 +229,7 @@ def save_multipliers(
 
 @wp.kernel
 def restore_multipliers(
-    lanes: Lanes,
-    normal: wp.array3d(dtype=wp.float64),
-    tangent: wp.array3d(dtype=wp.vec3d),
-    contact: ContactState,
+    lanes: Lanes, normal: wp.array3d(dtype=wp.float64), tangent: wp.array3d(dtype=wp.vec3d), contact: ContactState
 ):
     """One thread per (lane, face, point): after a pass failed."""
     s, f, q = wp.tid()

@@ -61,11 +61,7 @@ def place_indenters(lanes: Lanes, presses: Presses, indenters: Indenters):
 
 @wp.kernel
 def fill_lanes(
-    assignment: wp.array(dtype=wp.int32),
-    presses: Presses,
-    settings: Settings,
-    lanes: Lanes,
-    indenters: Indenters,
+    assignment: wp.array(dtype=wp.int32), presses: Presses, settings: Settings, lanes: Lanes, indenters: Indenters
 ):
     """A new trajectory in each lane that is assigned one (-1: none; -2: none, and the lane is empty)."""
     s = wp.tid()
