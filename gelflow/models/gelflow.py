@@ -16,11 +16,7 @@ from torch import Tensor, nn
 from gelflow.arrays import Features, Flow, Images
 from gelflow.config import MINIMUM_SIDE, ModelConfig
 from gelflow.errors import InputError
-from gelflow.models.encoder import CHANNELS, Encoder
-from gelflow.models.estimator import ContextNetwork, Estimator
-from gelflow.models.layers import SLOPE
-from gelflow.models.lffm import LocalFlowFusion
-from gelflow.models.refinement import RefinementHead
+from gelflow.models import layers
 from gelflow.models.registration import registered
 from gelflow.ops.correlation import local_correlation
 from gelflow.ops.pyramid import enlarge_flow
@@ -47,12 +43,13 @@ class GelFlow(nn.Module):
         scales = range(FINEST_SCALE, config.levels)
         costs = (2 * CORRELATION_RADIUS + 1) ** 2
         networks = 1 if config.estimator == "shared" else len(scales)
-        self.encoder = Encoder(config.levels)
-        self.projections = nn.ModuleList(_projection(CHANNELS[s - 1], config.projected_channels) for s in scales)
-        self.estimators = nn.ModuleList(Estimator(costs + config.projected_channels + 2) for _ in range(networks))
-        self.contexts = nn.ModuleList(ContextNetwork() for _ in range(networks))
-        self.fusion = LocalFlowFusion() if config.lffm else None
-        self.refinement = RefinementHead() if config.refine == "half" else None
+        self.encoder = layers.Encoder(config.levels)
+        projected = config.projected_channels
+        self.projections = nn.ModuleList(layers.convolution(layers.CHANNELS[s - 1], projected, side=1) for s in scales)
+        self.estimators = nn.ModuleList(layers.Estimator(costs + projected + 2) for _ in range(networks))
+        self.contexts = nn.ModuleList(layers.ContextNetwork() for _ in range(networks))
+        self.fusion = layers.LocalFlowFusion() if config.lffm else None
+        self.refinement = layers.RefinementHead() if config.refine == "half" else None
 
     def forward(self, image1: Images, image2: Images) -> list[Flow]:
         """Estimates the flow.
@@ -105,18 +102,11 @@ class GelFlow(nn.Module):
         network = 0 if self.config.estimator == "shared" else place
         costs = local_correlation(*normalised(first.float(), warp(second, start)), CORRELATION_RADIUS)
         projected = self.projections[place](first)
-        evidence = torch.cat([F.leaky_relu(costs, SLOPE), projected, start], dim=1)
+        evidence = torch.cat([F.leaky_relu(costs, layers.SLOPE), projected, start], dim=1)
         context, correction = self.estimators[network](evidence)
         coarse = start + correction.float()
         refined = coarse + self.contexts[network](context, coarse).float()
         return self.fusion(refined, context.float()) if self.fusion is not None else refined
-
-
-def _projection(inputs: int, outputs: int) -> nn.Module:
-    layer = nn.Conv2d(inputs, outputs, 1)
-    nn.init.kaiming_normal_(layer.weight, a=SLOPE)
-    nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
-    return nn.Sequential(layer, nn.LeakyReLU(SLOPE))
 
 
 def normalised(first: Features, second: Features) -> tuple[Tensor, Tensor]:

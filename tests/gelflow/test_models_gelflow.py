@@ -12,7 +12,7 @@ from gelflow.errors import InputError
 from gelflow.models import GelFlow
 from gelflow.models.estimate import estimate_flow
 from gelflow.models.gelflow import normalised
-from gelflow.models.lffm import LocalFlowFusion
+from gelflow.models.layers import LocalFlowFusion
 
 
 @pytest.fixture(scope="module")
