@@ -37,7 +37,7 @@ from synth.simulate.batched.pad import Pad, prepare
 from synth.simulate.batched.run import OPTIONS, simulate_presses
 from synth.simulate.options import SolverOptions
 from synth.simulate.press import Press
-from synth.simulate.shared import shared_mesh
+from synth.simulate.resolution import shared_mesh
 from synth.simulate.solve import check_shared
 from synth.surface import GelSurface
 

@@ -12,8 +12,7 @@ CPU_INFO, PROCESS_STATUS = Path("/proc/cpuinfo"), Path("/proc/self/status")
 def chosen_device(device: str) -> str:
     """The device, "cpu" or "cuda", that an option stands for; "auto" is a CUDA device where there is one.
 
-    Raises:
-        InputError: A CUDA device is asked for and there is none.
+    InputError where a CUDA device is asked for and there is none.
     """
     import torch
 

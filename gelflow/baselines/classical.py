@@ -15,6 +15,8 @@ import numpy as np
 
 from gelflow.arrays import FlowArray, Grey8, ImageArray
 from gelflow.baselines.method import check_images
+from gelflow.baselines.tensors import as_array, as_tensor
+from gelflow.config import RegistrationConfig
 from gelflow.errors import InputError
 from gelflow.files.image import to_grey
 
@@ -75,3 +77,27 @@ NO_MOTION = Classical("no motion", _still)
 """Says that nothing moved: what every method has to beat."""
 FARNEBACK = Classical("Farnebäck", _farneback)
 TVL1 = Classical("TV-L1", _tvl1)
+
+
+@dataclass(frozen=True)
+class RegisteredDIS:
+    """DIS medium on the processor, then registration, on a device, at the images' own size. Not one of the paper's.
+
+    Registration (`gelflow.models.registration`) learns nothing and starts from any flow. What it adds to a network has
+    to be compared with what it adds to the best classical method.
+    """
+
+    aim: str
+    settings: RegistrationConfig
+    device: str = "cpu"
+
+    @property
+    def name(self) -> str:
+        return f"DIS medium+{self.aim}"
+
+    def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
+        from gelflow.models.registration import registered
+
+        start = dis("medium").flow(image1, image2)
+        first, second = as_tensor(image1, self.device), as_tensor(image2, self.device)
+        return as_array(registered(as_tensor(start, self.device), first, second, self.settings))

@@ -3,11 +3,10 @@
 from collections.abc import Sequence
 
 from gelflow.baselines.aldic import ALDIC
-from gelflow.baselines.classical import FARNEBACK, NO_MOTION, TVL1, dis
+from gelflow.baselines.classical import FARNEBACK, NO_MOTION, TVL1, RegisteredDIS, dis
 from gelflow.baselines.exact import ExactFlow
 from gelflow.baselines.lucas_kanade import LucasKanade
 from gelflow.baselines.method import Method
-from gelflow.baselines.registered import RegisteredDIS
 from gelflow.config import REGISTRATIONS
 from gelflow.errors import InputError
 from gelflow.hardware import chosen_device

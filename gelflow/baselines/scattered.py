@@ -12,12 +12,9 @@ from gelflow.arrays import FlowArray
 
 
 def dense_flow(points: NDArray[np.float64], motion: NDArray[np.float64], height: int, width: int) -> FlowArray:
-    """Interpolates motions to every pixel.
+    """Interpolates motions to every pixel: (height, width, 2) float32 px, finite everywhere.
 
     Points are (N, 2) columns and rows as pixel indices, N >= 1, their motions (N, 2) px.
-
-    Returns:
-        (height, width, 2) float32 px, finite everywhere.
     """
     from scipy.interpolate import CloughTocher2DInterpolator, NearestNDInterpolator
     from scipy.spatial import QhullError

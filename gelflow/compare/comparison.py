@@ -75,11 +75,7 @@ class Comparison:
 
 
 def read_comparison(path: Path) -> Comparison:
-    """Reads what `Comparison.to_json` wrote.
-
-    Raises:
-        InputError: The file is missing, damaged, or was written by another version.
-    """
+    """Reads what `Comparison.to_json` wrote; InputError where the file is missing, damaged or of another version."""
     try:
         answer = json.loads(path.read_text(encoding="utf-8"))
         return Comparison(

@@ -16,16 +16,10 @@ from gelflow.ops.gradients import forward_differences
 
 
 def decomposition_loss(flow: Flow, weight: Mask, lambda_theta: float, lambda_zeta: float) -> Scalar:
-    """The decomposition loss at one scale.
+    """The decomposition loss at one scale; 0 for a single row or column, which has no such gradient.
 
-    Args:
-        flow: (B, 2, H, W), divided by the image's shorter side.
-        weight: (B, 1, H-1, W-1).
-        lambda_theta: Weight of the shear distortion rate.
-        lambda_zeta: Weight of the rotation.
-
-    Returns:
-        A scalar >= 0; 0 for a scale of a single row or column, which has no such gradient.
+    The flow (B, 2, H, W) is divided by the image's shorter side; the weight is (B, 1, H-1, W-1). `lambda_theta` and
+    `lambda_zeta` weigh the shear distortion rate and the rotation.
     """
     across, down = forward_differences(flow)
     if across.numel() == 0:

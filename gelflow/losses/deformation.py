@@ -19,14 +19,10 @@ def area_ratio(flow: Flow) -> Tensor:
 
 
 def deformation_loss(flow: Flow, weight: Mask) -> Scalar:
-    """The deformation loss at one scale.
+    """The deformation loss at one scale, the mean over pixels; 0 for fewer than 4x4 px, which have no gradient of R.
 
-    Args:
-        flow: (B, 2, H, W), px of this scale (never divided by the image's size: R is a ratio of lengths).
-        weight: (B, 1, H-1, W-1), of which the part belonging to the centres of R is used.
-
-    Returns:
-        A scalar >= 0, the mean over pixels; 0 for a scale of fewer than 4x4 px, which has no gradient of R.
+    The flow (B, 2, H, W) is in px of this scale, never divided by the image's size: R is a ratio of lengths. Of the
+    weight (B, 1, H-1, W-1) the part that belongs to the centres of R is used.
     """
     if min(flow.shape[-2:]) < 4:
         return flow.sum() * 0

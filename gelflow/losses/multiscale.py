@@ -12,11 +12,25 @@ from gelflow.arrays import Flow, Images, Mask, Scalar
 from gelflow.config import LossConfig
 from gelflow.losses.decomposition import decomposition_loss, regulariser_weight
 from gelflow.losses.deformation import deformation_loss
-from gelflow.losses.endpoint import endpoint_loss
 from gelflow.losses.photometric import appearance_loss
 from gelflow.losses.smoothness import first_order_loss, second_order_loss
 from gelflow.ops.pyramid import enlarge_flow, flow_pyramid, image_pyramid
 from gelflow.ops.warp import inside, warp
+
+SOFTNESS_PX = 0.01
+"""e: below this error the loss turns from linear to quadratic."""
+
+
+def endpoint_loss(flow: Flow, truth: Flow) -> Scalar:
+    """Mean of ``sqrt(|V - V*|^2 + e^2) - e`` at one scale, px, differentiable at zero; 0 where nothing is known.
+
+    Pixels that see no gel (NaN in the true flow) do not count; pixels whose point is hidden or outside in the other
+    image do, since their true motion is known.
+    """
+    known = torch.isfinite(truth).all(dim=1, keepdim=True)
+    squared = (flow - torch.where(known, truth, flow.detach())).square().sum(dim=1, keepdim=True)
+    distance = torch.sqrt(squared + SOFTNESS_PX**2) - SOFTNESS_PX
+    return (distance * known).sum() / known.sum().clamp(min=1)
 
 
 def self_supervised_loss(
@@ -75,12 +89,10 @@ def _regulariser(flow: Flow, image: Images, config: LossConfig, side: int) -> tu
 
 
 def flow_loss(flows: list[Flow], truth: Flow, config: LossConfig) -> tuple[Scalar, dict[str, Tensor]]:
-    """The endpoint loss at all scales, for training on the exact flow.
+    """The endpoint loss at all scales, for training on the exact flow, and that of the finest alone as "endpoint".
 
-    Scales have the weights `flow_s`, or `lambda_s` in its absence; flows are as for `self_supervised_loss`.
-
-    Returns:
-        The loss, and its part "endpoint": the loss of the finest scale alone, px, detached.
+    Both are in px, the latter detached. Scales have the weights `flow_s`, or `lambda_s` in its absence; flows are as
+    for `self_supervised_loss`.
     """
     truths = flow_pyramid(truth, len(flows))
     shares = config.lambda_s if config.flow_s is None else config.flow_s

@@ -12,13 +12,10 @@ from gelflow.ops.gradients import forward_differences
 
 
 def first_order_loss(flow: Flow, image: Images, beta: float = 10.0) -> Scalar:
-    """The smoothness loss at one scale.
+    """The smoothness loss at one scale; 0 for a single row or column.
 
-    The flow is in px or divided by the image's shorter side; `beta` is the weight's steepness in the image gradient.
-
-    Returns:
-        A scalar >= 0, the mean over the pixels that have a right and a lower neighbour and over both directions; 0 for
-        a scale of a single row or column.
+    The mean is over the pixels that have a right and a lower neighbour and over both directions. The flow is in px or
+    divided by the image's shorter side; `beta` is the weight's steepness in the image gradient.
     """
     if min(flow.shape[-2:]) < 2:
         return flow.sum() * 0
@@ -30,13 +27,10 @@ def first_order_loss(flow: Flow, image: Images, beta: float = 10.0) -> Scalar:
 
 
 def second_order_loss(flow: Flow, image: Images, beta: float = 10.0) -> Scalar:
-    """The smoothness loss of second order at one scale; arguments as for `first_order_loss`.
+    """The smoothness loss of second order at one scale, 0 where a side is below 3; arguments as for `first_order_loss`.
 
-    The second difference of the flow around a pixel is weighted by the image's step from that pixel to the next.
-
-    Returns:
-        A scalar >= 0, the mean over the pixels that have all four neighbours and over both directions; 0 for a scale
-        with a side below 3.
+    The second difference of the flow around a pixel is weighted by the image's step from that pixel to the next. The
+    mean is over the pixels that have all four neighbours and over both directions.
     """
     if min(flow.shape[-2:]) < 3:
         return flow.sum() * 0

@@ -58,8 +58,7 @@ def _windows(height: int, width: int, radius: int) -> list[tuple[slice, slice]]:
 def local_correlation(first: Features, second: Features, radius: int) -> Tensor:
     """Mean over channels of the products of each pixel's features with those of its neighbours in the other image.
 
-    Returns:
-        (B, (2 r + 1)^2, H, W). Differentiable once.
+    It is (B, (2 r + 1)^2, H, W), and differentiable once.
     """
     if torch.compiler.is_exporting() or torch.onnx.is_in_onnx_export():
         return _unfolded(first, second, radius)

@@ -8,20 +8,15 @@ from torch import Tensor
 
 
 def forward_differences(field: Tensor) -> tuple[Tensor, Tensor]:
-    """Differences to the right and to the lower neighbour.
-
-    Returns:
-        d/dx and d/dy, each (..., H-1, W-1), per px; empty where a side is 1.
-    """
+    """Differences to the right and to the lower neighbour, per px, each (..., H-1, W-1); empty where a side is 1."""
     here = field[..., :-1, :-1]
     return field[..., :-1, 1:] - here, field[..., 1:, :-1] - here
 
 
 def window_slopes(field: Tensor) -> tuple[Tensor, Tensor]:
-    """Slopes of the plane that fits each 3x3 window best in least squares: Prewitt / 6. Exact for an affine field.
+    """Slopes d/dx and d/dy, per px, each (..., H-2, W-2), of the plane that fits each 3x3 window best in least squares.
 
-    Returns:
-        d/dx and d/dy, each (..., H-2, W-2), per px; empty where a side is below 3.
+    That is Prewitt / 6; exact for an affine field, empty where a side is below 3.
     """
     across = field[..., :, 2:] - field[..., :, :-2]
     down = field[..., 2:, :] - field[..., :-2, :]

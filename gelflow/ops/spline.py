@@ -39,13 +39,9 @@ class SplineImage:
         self._size = (height, width)
 
     def at(self, places: Tensor) -> Features:
-        """The image at places in it; outside, the nearest value of its border.
+        """The image (B, C, H', W') at places in it; outside, the nearest value of its border.
 
-        Args:
-            places: (B, 2, H', W'), x and y, finite, px from the centre of the first pixel.
-
-        Returns:
-            (B, C, H', W').
+        Places (B, 2, H', W') are x and y, finite, in px from the centre of the first pixel.
         """
         height, width = self._size
         x, y = places[:, 0].clamp(0, width - 1), places[:, 1].clamp(0, height - 1)

@@ -23,8 +23,8 @@ from gelflow.losses.occlusion import visible_in_both_images
 from gelflow.losses.photometric import photometric_loss
 from gelflow.models import GelFlow
 from gelflow.models.estimate import estimate_flow
+from gelflow.models.recorded import GraphedNetwork
 from gelflow.ops.warp import inside, warp
-from gelflow.train.graph import GraphedNetwork
 
 LOG_EVERY = 10
 """Steps between entries in the logs."""

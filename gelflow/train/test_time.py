@@ -39,8 +39,7 @@ RATE = 1e-4
 def fine_tuning_settings(method: Learned, steps: int, pairs: int) -> TrainConfig:
     """The settings of a test-time optimisation; batches are not larger than the number of pairs.
 
-    Raises:
-        InputError: The weights carry no settings.
+    InputError where the weights carry no settings.
     """
     from gelflow.models.weights import read_metadata
 

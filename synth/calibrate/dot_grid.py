@@ -98,8 +98,7 @@ def fit_dot_grid(sensor: Sensor, pattern: Dots, centres: Pixels, spacing_mm: flo
 def grid_index(centres: Pixels) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Dots of a grid whose rows are within 40 degrees of horizontal: which (k,), and their column and row (k, 2).
 
-    Raises:
-        InputError: they form no grid.
+    InputError where they form none.
     """
     from scipy.spatial import cKDTree
 

@@ -34,8 +34,7 @@ class FoundDots:
 def find_dots(linear: FloatArray, pitch_px: float) -> FoundDots:
     """Find dots, about `pitch_px` apart in a linear frame (H, W, 3), and measure them against the coating around.
 
-    Raises:
-        InputError: fewer than nine whole dots, or dots of about a pixel.
+    InputError for fewer than nine whole dots, or dots of about a pixel.
     """
     import cv2
 

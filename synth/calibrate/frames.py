@@ -33,13 +33,9 @@ class Frames:
 
 
 def read_frames(paths: Sequence[Path]) -> Frames:
-    """Frames of one sensor with its gel undeformed.
+    """Frames of one sensor with its gel undeformed, of 8 or 16 bits; grey ones get three equal channels.
 
-    Args:
-        paths: image files of 8 or 16 bits in any format of OpenCV's; grey ones get three equal channels.
-
-    Raises:
-        InputError: none given; one that is missing or no image; sizes that differ; frames that show different things.
+    InputError where none is given, one is missing or no image, sizes differ, or frames show different things.
     """
     import cv2
 

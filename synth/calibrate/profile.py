@@ -38,8 +38,7 @@ class DotProfile:
 def fit_profile(dots: FoundDots) -> DotProfile:
     """Fit the model to the median profile of all dots, each dot scaled to the common radius first.
 
-    Raises:
-        InputError: the dots are too small to have an edge.
+    InputError where the dots are too small to have an edge.
     """
     from scipy.optimize import least_squares
     from scipy.stats import ncx2

@@ -43,13 +43,8 @@ def run_calibrate(
 ) -> int:
     """Fit a preset to frames of a user's sensor; write OUT/scene.toml, calibration.png and calibration.json.
 
-    Arguments are the options of the command (`synth.cli`).
-
-    Returns:
-        0 if the fit is good, 1 if the verdict is that it is not.
-
-    Raises:
-        InputError: frames, preset or storage are at fault, or this machine has no differentiable variant.
+    Arguments are the options of the command (`synth.cli`); returns 0 if the fit is good, 1 if it is not. InputError
+    where frames, preset or storage are at fault, or this machine has no differentiable variant.
     """
     started = time.perf_counter()
     template = load_scene(scene, assignments)

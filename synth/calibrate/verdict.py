@@ -54,14 +54,7 @@ class Verdict:
 def verdict(
     rows: dict[str, Comparison], grids: dict[str, DotGridFit | None], sensor: Sensor, spacing_is_known: bool
 ) -> Verdict:
-    """Judge a fit.
-
-    Args:
-        rows: comparisons by name; the fitted frames' and others'.
-        grids: the same frames' own grids of dots, if they have any.
-        sensor: fitted.
-        spacing_is_known: the dots' spacing was given.
-    """
+    """Judge a fit by comparisons, and grids of dots if there are any, of the fitted frames and of others, by name."""
     residuals = {name: row.numbers()["mean_absolute_outside_dots"] for name, row in rows.items()}
     reasons = []
     for name, residual in residuals.items():

@@ -104,11 +104,7 @@ def flo_bytes(flow: FlowArray) -> bytes:
 
 
 def kitti_png(flow: FlowArray, valid: BoolArray) -> bytes:
-    """KITTI's 16-bit flow PNG: (64 u + 2^15, 64 v + 2^15, valid) as RGB.
-
-    Raises:
-        InputError: A valid flow is beyond its range of 512 px.
-    """
+    """KITTI's 16-bit flow PNG, (64 u + 2^15, 64 v + 2^15, valid) as RGB; InputError for a valid flow beyond 512 px."""
     known = valid & np.isfinite(flow).all(axis=-1)
     coded = np.rint(np.where(known[..., None], flow, 0.0).astype(np.float64) * _KITTI_SCALE + _KITTI_ZERO)
     if coded.min() < 0 or coded.max() > 65535:

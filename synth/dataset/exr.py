@@ -44,15 +44,10 @@ _PARTS = ("U", "V", "visible")
 
 
 def write_flow(path: Path, flow: FlowField, attributes: Mapping[str, str | int]) -> None:
-    """Writes a flow field; the same field and attributes give the same bytes.
+    """Writes a flow field in the place of an older file; the same field and attributes give the same bytes.
 
-    Args:
-        path: the file, replaced if it is there.
-        flow: (H, W) fields.
-        attributes: added to the header beside `CONVENTIONS`; integers must fit 32 bits.
-
-    Raises:
-        OSError: The storage refuses.
+    `attributes`, whose integers must fit 32 bits, stand in the header beside `CONVENTIONS`. OSError where the storage
+    refuses.
     """
     import OpenEXR
 
@@ -90,8 +85,7 @@ def read_flow(path: Path) -> FlowField:
 def flow_of(path: Path, channels: Mapping[str, NDArray[Any]]) -> FlowField:
     """Sorts channels into a field; `path` is for the message.
 
-    Raises:
-        InputError: A channel of the forward flow, or a part of the backward flow, is missing.
+    InputError where a channel of the forward flow, or a part of the backward flow, is missing.
     """
     forward = _direction(path, channels, "forward")
     given = any(name.startswith("backward.") for name in channels)

@@ -20,8 +20,7 @@ _BREAK = re.compile(r"\n\s+")
 def jsonable(value: object) -> Any:
     """The value with NumPy arrays, tuples, paths and pydantic models turned into JSON's types.
 
-    Raises:
-        TypeError: Something that has no JSON form.
+    TypeError for something that has no JSON form.
     """
     return to_jsonable_python(value, by_alias=False, inf_nan_mode="null", fallback=_numpy)
 

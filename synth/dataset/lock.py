@@ -157,8 +157,7 @@ class Lease:
     def join(self, shard: Shard | None) -> Iterator[bool]:
         """Takes the place of a plain run, or of one shard; yields whether it is a plain run's.
 
-        Raises:
-            InputError: another process writes there, or the storage refuses.
+        InputError where another process writes there, or the storage refuses.
         """
         own = f"{shard.name if shard else 'whole'}.json"
         for name in self._store.names(LEASES_FOLDER):

@@ -19,19 +19,17 @@ from synth.dataset.manifest import FAILURES_FILE, MANIFEST_FILE, ManifestEntry, 
 from synth.dataset.npz import read_npz
 from synth.dataset.sample import SAMPLES_FOLDER, CameraPair, further_cameras, sample_name
 from synth.errors import InputError
-from synth.flow.field import FlowArray, FlowField
+from synth.flow.field import FlowArray
 from synth.scene import Scene
 from synth.surface import ContactFaces, GelSurface
 
 
 @dataclass(frozen=True)
-class SampleData:
+class SampleData(CameraPair):
     """One image pair of a dataset with its exact flow.
 
     Attributes:
-        image1: (H, W) grey or (H, W, 3) RGB, uint8 or uint16.
-        image2: the same kind and shape.
-        flow: in both directions, and the optional channels.
+        image1, image2, flow: the main camera's, as of `CameraPair`.
         surface: the undeformed contact surface of the gel, mm.
         displacement1: of its nodes in the state of image 1, (N, 3) float64, mm.
         displacement2: of its nodes in the state of image 2, (N, 3) float64, mm.
@@ -39,9 +37,6 @@ class SampleData:
         further: images and flow of the scene's further cameras, by name.
     """
 
-    image1: Raster
-    image2: Raster
-    flow: FlowField
     surface: GelSurface
     displacement1: FloatArray
     displacement2: FloatArray
@@ -75,8 +70,7 @@ class SampleData:
         if camera not in self.further:
             names = ", ".join(self.further) or "none"
             raise InputError(f"the sample has no camera {camera!r}; beside the main camera it has: {names}")
-        pair = self.further[camera]
-        return replace(self, image1=pair.image1, image2=pair.image2, flow=pair.flow)
+        return replace(self, **vars(self.further[camera]))
 
 
 @dataclass(frozen=True)
@@ -174,16 +168,13 @@ def read_dataset(path: Path | str) -> Dataset:
 def read_sample(folder: Path) -> SampleData:
     """The files of one sample's folder; InputError where they are missing or damaged, or do not fit each other."""
     meta = read_document(folder / "meta.json")
-    pair = read_pair(folder)
     names = ("nodes", "faces", "subdivisions", "displacement1", "displacement2")
     arrays = read_npz(folder / "surface.npz", names)
     nodes = arrays["nodes"]
     if any(arrays[name].shape != nodes.shape for name in ("displacement1", "displacement2")):
         raise InputError(f"{folder / 'surface.npz'}: nodes and displacements differ in shape; the file is damaged")
     return SampleData(
-        image1=pair.image1,
-        image2=pair.image2,
-        flow=pair.flow,
+        **vars(read_pair(folder)),
         surface=GelSurface(ContactFaces(nodes, arrays["faces"].astype(np.int32)), int(arrays["subdivisions"])),
         displacement1=arrays["displacement1"],
         displacement2=arrays["displacement2"],

@@ -31,7 +31,12 @@ def further_cameras(scene: Mapping[str, Any]) -> list[str]:
 
 @dataclass(frozen=True)
 class CameraPair:
-    """What one camera contributes to a sample: fields as of `Sample`."""
+    """What one camera contributes to a sample.
+
+    Attributes:
+        image1, image2: (H, W) grey or (H, W, 3) RGB, uint8 or uint16 (full scale 65535).
+        flow: (H, W) fields, in both directions, and the optional channels.
+    """
 
     image1: Raster
     image2: Raster
@@ -39,16 +44,14 @@ class CameraPair:
 
 
 @dataclass(frozen=True)
-class Sample:
-    """A finished sample, before it is written.
+class Sample(CameraPair):
+    """A finished sample, before it is written, with what the main camera saw.
 
     Attributes:
         index: its number in the dataset.
         trajectory: number of the trajectory that its frames belong to.
         frames: (i, j), states of that trajectory shown in image 1 and image 2.
         seed: of the job.
-        image1, image2: (H, W) grey or (H, W, 3) RGB, uint8 or uint16 (full scale 65535), of the main camera.
-        flow: (H, W) fields.
         scene: the draw that was simulated and rendered.
         surface: what was rendered and traced.
         displacement1, displacement2: (n, 3) float64 mm of `surface.coarse.nodes`.
@@ -63,9 +66,6 @@ class Sample:
     trajectory: int
     frames: tuple[int, int]
     seed: int
-    image1: Raster
-    image2: Raster
-    flow: FlowField
     scene: Scene
     surface: GelSurface
     displacement1: FloatArray

@@ -49,7 +49,7 @@ def _write_folder(final: Path, sample: Sample, job: Job) -> ManifestEntry:
     """The sample's folder, written aside, flushed and renamed into place."""
     partial = partial_name(final)
     files = {"meta.json": to_document(_meta(sample, job)).encode("utf-8"), "surface.npz": _surface(sample)}
-    views = {"": CameraPair(sample.image1, sample.image2, sample.flow), **sample.further}
+    views = {"": sample, **sample.further}
     with storage_errors(final):
         try:
             partial.mkdir(parents=True)

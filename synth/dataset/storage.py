@@ -70,8 +70,7 @@ def flush(path: Path) -> None:
 def replacing(path: Path) -> Iterator[BinaryIO]:
     """A file for the new content of `path`, which takes its place when all is written and flushed.
 
-    Raises:
-        InputError: The storage refuses; the old content is still there, as after any other error.
+    InputError where the storage refuses; the old content is still there, as after any other error.
     """
     partial = partial_name(path)
     with storage_errors(path):
@@ -93,15 +92,9 @@ def replace_file(path: Path, content: bytes) -> None:
 
 
 def refuse_foreign(path: Path, mark: bytes, *beside: Path) -> None:
-    """Sees that files which are about to be replaced come from an earlier run.
+    """Sees that files which are about to be replaced come from an earlier run; InputError where one does not.
 
-    Args:
-        path: a file, with `mark` near its beginning if it is ours.
-        mark: bytes.
-        beside: files without a mark, which are ours where `path` is there.
-
-    Raises:
-        InputError: one of them is somebody else's.
+    A file of ours has `mark` near its beginning; those `beside` it, without a mark, are ours where it is there.
     """
     if path.is_file():
         with path.open("rb") as file:

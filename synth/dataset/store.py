@@ -7,8 +7,9 @@ Reference: https://filesystem-spec.readthedocs.io
 
 import contextlib
 import os
+import tempfile
 from collections.abc import Iterable, Iterator
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlparse
@@ -18,6 +19,7 @@ from synth.errors import InputError
 
 Output = Path | str
 """A local directory, or a URL."""
+MESHES_FOLDER = "meshes"
 
 
 def output_of(out: Path | str) -> Output:
@@ -51,8 +53,7 @@ class Store:
     def _place(self) -> tuple[Any, str]:
         """The file system and the root's path in it.
 
-        Raises:
-            InputError: The protocol is unknown, or its package is missing.
+        InputError where the protocol is unknown or its package is missing.
         """
         from fsspec.core import url_to_fs
         from fsspec.implementations.local import LocalFileSystem
@@ -134,3 +135,21 @@ class Store:
                 f"{self.out}/{name}: the storage refuses: {type(error).__name__}: {error}; what was finished before is "
                 "safe, put this right and give the same command again to go on"
             ) from error
+
+
+def mesh_folder(out: Output) -> Path:
+    """A folder of this machine that holds the dataset's meshes; InputError where the storage refuses."""
+    store = Store(out)
+    if store.directory is not None:
+        return store.directory / MESHES_FOLDER
+    folder = Path(_temporary_folder(str(store.out)).name)
+    for name in store.names(MESHES_FOLDER):
+        if not (folder / name).exists():
+            store.get(f"{MESHES_FOLDER}/{name}", folder / name)
+    return folder
+
+
+@cache
+def _temporary_folder(url: str) -> "tempfile.TemporaryDirectory[str]":
+    """One per process and URL, removed when the process ends."""
+    return tempfile.TemporaryDirectory(prefix="synth-meshes-")

@@ -32,12 +32,11 @@ from synth.dataset.jsontext import parse_document, to_document, to_line
 from synth.dataset.lines import append_line, merge_lines, scan_lines
 from synth.dataset.lock import LEASES_FOLDER, LOCK_FILE, DirectoryLock, Lease
 from synth.dataset.manifest import FAILURES_FILE, MANIFEST_FILE, ManifestEntry, failure_key, manifest_key
-from synth.dataset.meshes import MESHES_FOLDER, mesh_folder
 from synth.dataset.sample import SAMPLE_FILES, SAMPLES_FOLDER, VIEW_FILES, Sample, further_cameras, sample_name
 from synth.dataset.sample_files import write_sample_files
 from synth.dataset.shard import Shard
 from synth.dataset.storage import PARTIAL, remove_partials, storage_errors
-from synth.dataset.store import Store
+from synth.dataset.store import MESHES_FOLDER, Store, mesh_folder
 from synth.dataset.summary import SUMMARY_FILE, summary_document
 from synth.errors import InputError
 
@@ -143,8 +142,7 @@ class DatasetWriter:
     def making_meshes(self) -> Iterator[Path]:
         """The folder of meshes that all who write this dataset share; within, nobody else makes one in a directory.
 
-        Raises:
-            InputError: A mesh was made in a shard under a URL: another shard might have made another one.
+        InputError where a mesh was made in a shard under a URL: another shard might have made another one.
         """
         with self._lock.setup():
             folder = mesh_folder(self._store.out)

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from synth.arrays import BoolArray, FloatArray
 from synth.dataset.exr import flow_of, read_channels
@@ -23,7 +24,6 @@ from synth.dataset.images import Raster
 from synth.dataset.jsontext import read_document
 from synth.dataset.reader import read_pair
 from synth.flow.field import FlowField
-from synth.inspect.interpolation import sample_at
 
 META_FILE = "meta.json"
 
@@ -121,3 +121,45 @@ def _linear(image: Raster) -> FloatArray:
     """(H, W, C) in [0, 1]."""
     values = image.astype(np.float64) / np.iinfo(image.dtype).max
     return values[..., None] if values.ndim == 2 else values
+
+
+def sample_at(values: NDArray[np.floating], x: FloatArray, y: FloatArray) -> FloatArray:
+    """Values (..., C) at image positions x, y (...) px, by cubic convolution of pixels (H, W, C).
+
+    It is local (4 x 4 pixels), so that a NaN or a border spoils only what touches it: NaN where the position is NaN, a
+    pixel with weight is NaN, or such a pixel is outside. OpenCV's `remap` would round positions to 1/32 px.
+
+    Reference: R. Keys, IEEE TASSP 29, 1981 (a = -1/2).
+    """
+    height, width = values.shape[:2]
+    column, row = x - 0.5, y - 0.5
+    left, top = np.floor(column), np.floor(row)
+    # A position on a pixel centre needs only that pixel in its direction, so it may lie at the image's border.
+    inside = _fits(column, left, width) & _fits(row, top, height)
+    left, top = (np.where(inside, corner, 0).astype(np.intp) for corner in (left, top))
+    across = _weights(np.where(inside, column - left, 0.0))
+    down = _weights(np.where(inside, row - top, 0.0))
+    total = np.zeros((*x.shape, values.shape[2]))
+    for j in range(4):
+        r = np.clip(top + j - 1, 0, height - 1)
+        for i in range(4):
+            weight = (down[j] * across[i])[..., None]
+            tap = values[r, np.clip(left + i - 1, 0, width - 1)]
+            total += np.where(weight == 0, 0.0, weight * tap)
+    return np.where(inside[..., None], total, np.nan)
+
+
+def _fits(place: FloatArray, first: FloatArray, count: int) -> NDArray[np.bool_]:
+    """The pixels that have a weight are inside the image; False for NaN."""
+    on_centre = (place == first) & (place >= 0) & (place <= count - 1)
+    return on_centre | ((first >= 1) & (first + 2 <= count - 1))
+
+
+def _weights(t: FloatArray) -> list[FloatArray]:
+    """Of the pixels at -1, 0, 1, 2 for a position at t in [0, 1)."""
+    return [
+        ((-0.5 * t + 1.0) * t - 0.5) * t,
+        (1.5 * t - 2.5) * t * t + 1.0,
+        ((-1.5 * t + 2.0) * t + 0.5) * t,
+        (0.5 * t - 0.5) * t * t,
+    ]

@@ -32,8 +32,7 @@ REST_CELLS = 24
 def domed(mesh: PadMesh, dome_radius_mm: float | None) -> PadMesh:
     """A flat pad's mesh with its contact face bulged to a sphere; the mesh itself for None.
 
-    Raises:
-        InputError: a tetrahedron that lost its volume.
+    InputError where a tetrahedron turns over.
     """
     if dome_radius_mm is None:
         return mesh

@@ -113,11 +113,7 @@ def graded_box(
 def spacing(length_mm: float, span_mm: tuple[float, float], counts: Counts, axis: int) -> tuple[float, float]:
     """Spacing in the focus (mm), and logarithm of the ratio of neighbouring spacings beside it, 0 to ln STEEPEST.
 
-    Args:
-        length_mm: of the pad along that axis.
-        span_mm: lower and upper end of the focus, on the pad.
-        counts: numbers of elements.
-        axis: 0 for x, 1 for y.
+    `length_mm` is the pad's along an axis (0: x, 1: y), `span_mm` the lower and upper end of the focus, on the pad.
     """
     low, high = span_mm
     gaps, width, cells = (low + length_mm / 2, length_mm / 2 - high), high - low, counts.cells(axis)

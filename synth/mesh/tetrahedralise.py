@@ -64,15 +64,9 @@ def background_of(size_mm: tuple[float, float, float], edge_mm: float, grading: 
 def tetrahedralise_box(
     size_mm: tuple[float, float, float], edge_length_mm: float, background: Background | None = None
 ) -> PadMesh:
-    """Mesh a box whose tetrahedra have edges of edge_length_mm at the contact face, or as a background says.
+    """Mesh a box whose tetrahedra have edges of edge_length_mm at z = 0, its contact face, or as a background says.
 
-    Args:
-        size_mm: edge lengths of the box.
-        edge_length_mm: target edge length at z = 0.
-        background: target edge lengths everywhere; default GRADING times edge_length_mm at the window.
-
-    Raises:
-        InputError: no attempt gave a valid mesh.
+    By default edges are GRADING times as long at the window. InputError where no attempt gave a valid mesh.
     """
     background = background or background_of(size_mm, edge_length_mm, GRADING)
     points, tets = tetrahedralise(*_box(size_mm), _sides(size_mm), background, float(np.prod(size_mm)), 1e-9)

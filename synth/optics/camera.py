@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.arrays import BoolArray, FloatArray, Pixels, Points
-from synth.optics.lens_fisheye import FisheyeLens
-from synth.optics.lens_pinhole import PinholeLens
+from synth.optics.lens import FisheyeLens, PinholeLens
 from synth.optics.mirror import DIRECT, NOTHING, FlatMirror, first_met
 from synth.optics.pose import Pose
 from synth.optics.round_window import RoundWindow

@@ -52,15 +52,10 @@ class RoundWindow:
         return np.where(converged[:, None], crossing, np.nan) - eye
 
     def enter(self, eye: FloatArray, air: Points) -> tuple[Points, Points]:
-        """Rays in the body that continue rays in air.
+        """Rays in the body that continue rays in air from an eye (3,) mm in unit directions (n, 3).
 
-        Args:
-            eye: (3,) mm, where the rays in air come from.
-            air: (n, 3) unit directions.
-
-        Returns:
-            Origins (n, 3) mm on the face (at index 1: the eye) and unit directions (n, 3); NaN where a ray leaves by an
-            open end.
+        Origins (n, 3) mm on the face (at index 1: the eye) and unit directions (n, 3); NaN where a ray leaves by an
+        open end.
         """
         if self.index == 1:
             return np.where(np.isnan(air), np.nan, eye), air
@@ -83,10 +78,9 @@ class RoundWindow:
         return np.asarray(np.linalg.norm(points - self._foot(points), axis=1) < self.radius)
 
     def crossings(self, points: Points, eye: FloatArray) -> tuple[Points, BoolArray]:
-        """Where light from points (n, 3) to an eye (3,) crosses the face.
+        """Where (n, 3) mm light from points (n, 3) to an eye (3,) crosses the face, and which converged (n,).
 
-        Returns:
-            (n, 3) mm, and which converged (n,). For points in air, and at index 1, the points themselves.
+        For points in air, and at index 1, the points themselves.
         """
         found, converged = points.copy(), np.ones(len(points), dtype=np.bool_)
         at = np.flatnonzero(~self.holds(points)) if self.index != 1 else np.arange(0)

@@ -41,15 +41,10 @@ class Window:
         return np.column_stack([arm[:, :2] * self._slope_per_distance(points, eye)[:, None], np.full(len(arm), -1.0)])
 
     def enter(self, eye: FloatArray, air: Points) -> tuple[Points, Points]:
-        """Rays in the body that continue rays in air.
+        """Rays in the body that continue rays in air from an eye (3,) mm in unit directions (n, 3).
 
-        Args:
-            eye: (3,) mm, where the rays in air come from.
-            air: (n, 3) unit directions.
-
-        Returns:
-            Origins (n, 3) mm on the face (at index 1: the eye) and unit directions (n, 3); NaN where a ray does not
-            go down.
+        Origins (n, 3) mm on the face (at index 1: the eye) and unit directions (n, 3); NaN where a ray does not go
+        down.
         """
         air = np.where(air[:, 2:] < 0, air, np.nan)
         if self.index == 1:

@@ -42,11 +42,7 @@ class Pads:
         self._cached: tuple[Gel, Pad] | None = None
 
     def of(self, press: Press) -> Pad:
-        """The pad of a press.
-
-        Raises:
-            InputError: a mesh that no element can be built on, or CUDA without cuBLAS or cuSOLVER.
-        """
+        """The pad of a press; InputError for a mesh that allows no element, or CUDA without cuBLAS or cuSOLVER."""
         key = pad_key(press)
         if self._cached is None or self._cached[0] != key:
             self._cached = None  # gives its memory back first
@@ -63,10 +59,8 @@ def pad_key(press: Press) -> Gel:
 def in_batches(context: JobContext, tasks: Iterator[Task], batch: int | None = None) -> Iterator[Result]:
     """Simulate tasks; each comes out once, in no particular order but with a sensor's trajectories together.
 
-    At most `batch` trajectories run at a time, which changes no bit of what comes out.
-
-    Raises:
-        InputError: the storage refuses, or CUDA without cuBLAS or cuSOLVER.
+    At most `batch` trajectories run at a time, which changes no bit of what comes out. InputError where the storage
+    refuses, or for CUDA without cuBLAS or cuSOLVER.
     """
     simulation = _Simulation(context, tasks, batch or BATCH[context.plan.solver_device])
     return by_sensor(context.plan.template, simulation, simulation.open)

@@ -25,7 +25,7 @@ from synth.render.camera_image import camera_image
 from synth.scene import Camera, Outputs
 from synth.scene.sampling import Pair
 from synth.simulate import State
-from synth.simulate.shared import accuracy
+from synth.simulate.resolution import accuracy
 
 
 def finish(context: JobContext, rendered: RenderedTrajectory) -> Outcome:

@@ -203,8 +203,7 @@ def _check(scheduling: Scheduling, out: Output) -> None:
 def _tasks(context: JobContext, writer: DatasetWriter, n: int, finished: set[int], shard: Shard) -> Iterator[Task]:
     """Trajectories with samples to make. Their meshes are made here: the mesher is random, so one process does it.
 
-    Raises:
-        InputError: a mesh cannot be made or kept.
+    InputError where a mesh cannot be made or kept.
     """
     template = context.plan.template
     count = template.sampling.pairs_per_trajectory

@@ -14,7 +14,6 @@ from collections import deque
 from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
-from functools import partial
 from typing import Any, TypeVar
 
 from synth.arrays import Image
@@ -136,8 +135,4 @@ def _rendered(
 
 def _finisher(context: JobContext) -> Maker[Rendered]:
     """In a worker process."""
-    return partial(_finished, context)
-
-
-def _finished(context: JobContext, item: Rendered) -> Outcome:
-    return item if isinstance(item, Outcome) else finish(context, item)
+    return lambda item: item if isinstance(item, Outcome) else finish(context, item)

@@ -24,8 +24,7 @@ class Producer:
     def produce(self, trajectory: int, wanted: Sequence[int]) -> Outcome:
         """Write the samples of a trajectory that are wanted, since they are not there yet.
 
-        Raises:
-            InputError: the storage refuses, or the batched solver lacks something.
+        InputError where the storage refuses, or the batched solver lacks something.
         """
         template, seed = self._context.plan.template, self._context.job.seed
         sensor = draw_sensor(template, seed, sensor_of(template, trajectory))

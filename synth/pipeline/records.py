@@ -8,13 +8,12 @@ import numpy as np
 
 from synth.dataset.job import Job
 from synth.dataset.manifest import ManifestEntry
-from synth.dataset.meshes import mesh_folder
-from synth.dataset.store import Output
+from synth.dataset.store import Output, mesh_folder
 from synth.planning import Plan
 from synth.scene import Scene
 from synth.scene.sampling import Pair, stream
 from synth.simulate import State
-from synth.simulate.shared import Accuracy
+from synth.simulate.resolution import Accuracy
 from synth.simulate.space import Space
 
 Task = tuple[int, tuple[int, ...]]

@@ -17,10 +17,9 @@ from synth.render.variant import Device, Variant, choose_variant
 from synth.scene import MeshIndenter
 from synth.scene.sampling import check_pairs
 from synth.scene.template import Template
-from synth.simulate.indenter import rigid_body
+from synth.simulate.indenter import object_triangles, rigid_body
 from synth.simulate.material import DISPLACEMENT_ONLY_BELOW
 from synth.simulate.mesh_rule import MeshRule
-from synth.simulate.object_surface import object_triangles
 
 
 @dataclass(frozen=True)

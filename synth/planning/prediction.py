@@ -18,7 +18,7 @@ from synth.scene.sampling import draw
 from synth.simulate.load_path import TWIST_ARM_MM
 from synth.simulate.press import edge_radius_mm
 from synth.simulate.resolution import Resolution
-from synth.simulate.vicinity import REACH
+from synth.simulate.solve import REACH
 
 _Meshes = tuple[list[tuple[Scene, int]], str, tuple[float, float] | None]
 """Random instances with their displacement nodes; `Prediction.resolution` and `Prediction.error_px`."""

@@ -1,12 +1,22 @@
-"""Evenly distributed random points on the faces of a mesh, and the functions nearest (L²) to samples on them."""
+r"""Evenly distributed random points on the faces of a mesh, and the functions nearest (L²) to samples on them.
+
+Light that a round gel sends to itself across its cavity is smooth (`across_cavity`). A point x of the face with the
+normal n gets, from directions ω in which it sees the radiance L,
+
+.. math::  E = \int L(ω) \max(n · ω, 0) \, dω = n · V(x), \qquad V(x) = \int L(ω) \, ω \, dω ,
+
+where all of the gel lies above the point's horizon: exactly so in a convex cavity, nearly so where a contact bulges
+into it. V is fitted to the means of all faces as polynomials of the place.
+"""
 
 import math
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
 
-from synth.arrays import BoolArray, Image
+from synth.arrays import BoolArray, FloatArray, Image, Points
 
 _STEP = 4
 """Points of a face are squares of its multiples: a sampler's size is compiled into the kernel."""
@@ -70,3 +80,32 @@ def projected(values: list[Any], weights: tuple[Any, Any, Any], count: int, is_l
     means = means.reshape(-1, len(values), 3)
     whole = means.sum(axis=2, keepdims=True)
     return np.where(is_linear[:, None, None], 12 * means - 3 * whole, whole).astype(np.float32)
+
+
+_DEGREE = 4
+"""Of V's polynomials."""
+
+
+def across_cavity(means: FloatArray, positions: Points, normals: Points, faces: np.ndarray) -> Image:
+    """Irradiance at the corners of faces, (f, channels, 3) float32.
+
+    Args:
+        means: (f, channels) irradiance sampled on each face.
+        positions: (v, 3) of the vertices.
+        normals: (v, 3) unit, all on the same side of the face.
+        faces: (f, 3) vertices.
+    """
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    places = 2 * (positions - low) / (high - low) - 1
+    centre, upright = places[faces].mean(axis=1), normals[faces].mean(axis=1)
+    design = _terms(centre, upright)
+    found = np.linalg.lstsq(design.T @ design, design.T @ means, rcond=None)[0]
+    at_vertices = np.maximum(_terms(places, normals) @ found, 0)
+    return np.ascontiguousarray(at_vertices[faces].swapaxes(1, 2), dtype=np.float32)
+
+
+def _terms(places: Points, normals: Points) -> FloatArray:
+    """(n, t) monomials of places times each component of the normals."""
+    powers = [power for power in product(range(_DEGREE + 1), repeat=3) if sum(power) <= _DEGREE]
+    monomials = np.stack([np.prod(places**power, axis=1) for power in powers], axis=1)
+    return np.asarray((monomials[:, :, None] * normals[:, None, :]).reshape(len(places), -1))

@@ -68,8 +68,7 @@ def rectangles(lights: tuple[Light, ...]) -> FloatArray:
 def light_axes(light: Light) -> FloatArray:
     """Unit vectors (3, 3) float64 along a light's first size, its second size and its direction, in the scene's frame.
 
-    Raises:
-        InputError: position_mm and aim_mm are the same point.
+    InputError where position_mm and aim_mm are the same point.
     """
     direction = np.array(light.aim_mm) - np.array(light.position_mm)
     distance = np.linalg.norm(direction)

@@ -92,11 +92,7 @@ def check_pattern(sensor: Sensor, folder: Path) -> None:
 
 
 def _texels(sensor: Sensor) -> tuple[FloatArray, FloatArray]:
-    """Centres of the texels, x (columns,) and y (rows,), mm.
-
-    Raises:
-        InputError: a spacing, cell or grain below one texel, which would take hours to paint.
-    """
+    """Centres of texels, x (columns,) and y (rows,), mm; InputError for a spacing, cell or grain below one texel."""
     width, height = chart_of(sensor).size_mm
     density = TEXELS_PER_PIXEL * pixels_per_mm(sensor)
     density = min(density, MAX_TEXELS / max(width, height))

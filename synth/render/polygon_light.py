@@ -29,12 +29,7 @@ _STRATA = 2
 
 
 class PolygonLight:
-    """One light that shines. Every number is opaque to Dr.Jit, so that another draw of it needs no compiler.
-
-    Args:
-        light: with power.
-        mi: the Mitsuba module, of a vectorised variant.
-    """
+    """One light with power. Every number is opaque to Dr.Jit, so that another draw of it needs no compiler."""
 
     def __init__(self, light: Light, mi: Any) -> None:
         import drjit as dr
@@ -66,15 +61,9 @@ class PolygonLight:
         return dr.select(dr.dot(point - self._corner, self._front) > 0, value, 0)
 
     def sample(self, point: Any, normal: Any, offset: Any) -> tuple[Any, Any]:
-        """A point of the light, and what the light gives as if all of it stood there.
+        """A point of the light, and the irradiance per radiance as if all of it stood there, whose mean is `whole`.
 
-        Args:
-            point: mi.Point3f of the surface.
-            normal: mi.Vector3f, unit.
-            offset: mi.Point2f in [0, 1)².
-
-        Returns:
-            The point (mi.Point3f) and the irradiance per radiance (mi.Float): `whole` is the latter's mean.
+        The surface's point is a mi.Point3f with the unit normal mi.Vector3f; `offset` is a mi.Point2f in [0, 1)².
         """
         import drjit as dr
 
@@ -109,12 +98,8 @@ class PolygonLight:
 class SampledLight(PolygonLight):
     """A light without a closed form: narrower than Lambertian, or a mirror image (`synth.render.window_images`).
 
-    What of an image arrives depends on the angle at the window's face. `whole` is the mean over a few points.
-
-    Args:
-        light: with power.
-        index: of the window, for an image.
-        mi: the Mitsuba module, of a vectorised variant.
+    What of an image arrives depends on the angle at the face of a window of this index. `whole` is the mean over a few
+    points.
     """
 
     def __init__(self, light: Light, index: float | None, mi: Any) -> None:

@@ -281,11 +281,7 @@ def _window(sensor: Sensor, mi: Any) -> dict[str, Any]:
 
 
 def _check_further(name: str, view: Sensor) -> None:
-    """Refuse what is wrong with a further camera; `emitters` and `CameraRays` look after the main one.
-
-    Raises:
-        InputError: names the camera, and the light and pixel where a light stands in its view.
-    """
+    """Refuse what is wrong with a further camera, naming it; `emitters` and `CameraRays` look after the main one."""
     try:
         check_view(view)
         ThinLens.of(view)

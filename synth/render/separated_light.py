@@ -13,7 +13,7 @@ A Lambertian surface's radiance is its albedo ρ times its irradiance E over π,
 - E_bounced, light that the gel reflects onto itself, does not depend on the view. It is sampled at points of the gel's
   faces and projected (L²) onto functions that are linear on each face, or constant where few of the face's pilots saw
   gel: such faces get little, and its mean is less noisy than its slope. Where no pilot at all saw gel there is none.
-  In a round gel, all of which sees itself, it is smooth and is fitted (`synth.render.cavity_light`).
+  In a round gel, all of which sees itself, it is smooth and is fitted (`synth.render.face_points`).
 - The lights l include their mirror images behind the window (`synth.render.window_images`), which have no closed form.
 - E_returned, light that the gel sends to the window and gets back, is smooth. It is n · V with the normal n, and V is
   fitted to sampled paths as polynomials of the place on the pad.
@@ -32,8 +32,7 @@ from numpy.typing import NDArray
 
 from synth.arrays import BoolArray
 from synth.errors import InputError
-from synth.render.cavity_light import across_cavity
-from synth.render.face_points import FacePoints, count_per_face, projected
+from synth.render.face_points import FacePoints, across_cavity, count_per_face, projected
 from synth.render.gel_mesh import GelMesh
 from synth.render.lights import reaches
 from synth.render.polygon_light import PolygonLight, SampledLight
@@ -60,8 +59,7 @@ _SHIFT = (0.7548776662466927, 0.5698402909980532)
 def is_separated(render: Render, coating: Coating, variant: Variant) -> bool:
     """Whether light is separated or path traced: decided here alone. Scalar variants path-trace.
 
-    Raises:
-        InputError: separated light is asked for, and the coating shines.
+    InputError where separated light is asked for, and the coating shines.
     """
     if render.light != "separated":
         return False

@@ -49,8 +49,7 @@ class ThinLens:
     def of(sensor: Sensor) -> "ThinLens | None":
         """The thin lens of a sensor's main camera; None for a pinhole.
 
-        Raises:
-            InputError: the viewing axis does not reach the window, so that nothing on it could be in focus.
+        InputError where the viewing axis does not reach the window, so that nothing on it could be in focus.
         """
         camera = sensor.camera
         if not camera.aperture_mm or camera.focus_mm is None:

@@ -81,14 +81,9 @@ def gel_surfaces(outer: Path, window: Path, unit: str) -> GelSurfaces:
 
 
 def measured(value: Any, folder: Path) -> Any:
-    """A part of a scene, in which every gel from files has what follows from them: size, thickness and digest.
+    """A JSON-able part of a scene, where gels from files have what follows from them: size, thickness and digest.
 
-    Args:
-        value: JSON-able.
-        folder: that the files are relative to.
-
-    Raises:
-        ValueError: a file is not fit for a gel, or the part gives another size.
+    The files are relative to `folder`; ValueError where one is not fit for a gel, or the part gives another size.
     """
     if isinstance(value, list):
         return [measured(inner, folder) for inner in value]

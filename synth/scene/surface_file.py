@@ -28,11 +28,7 @@ class Triangles:
 
 
 def read_surface(path: Path) -> Triangles:
-    """A file's surface in its own unit, cleaned; kept for as long as the file does not change.
-
-    Raises:
-        ValueError: there is no such file, or it is no surface.
-    """
+    """A file's surface in its own unit, cleaned, cached while the file does not change; ValueError if there is none."""
     if not path.is_file():
         raise ValueError(f"there is no file {path}")
     try:

@@ -73,8 +73,7 @@ class Template:
     def corners(self) -> tuple[Scene, ...]:
         """The scene at the lower ends, at the upper ends, and with every option of every choice taken once.
 
-        Raises:
-            InputError: one of them breaks the schema.
+        InputError where one of them breaks the schema.
         """
         turns = range(_options(self.content))
         contents = [_corner(self.content, high, turn) for turn in turns for high in (False, True)]

@@ -44,13 +44,12 @@ def face_error(scene: Scene, focus: Focus, spacing_mm: float) -> float:
     `spacing_mm` is the size of the elements under the contact, as `synth.simulate.resolution` has it.
     """
     motion, indenter = scene.motion, scene.contact.indenter
-    poses = [(motion.depth_mm, motion.shear_mm, motion.twist_deg)]
-    poses += [(pose.depth_mm, pose.shear_mm, pose.twist_deg) for pose in motion.then]
-    depth = max(pose[0] for pose in poses)
+    poses = motion.poses.values()
+    depth = max(pose.depth_mm for pose in poses)
     if depth <= 0:
         return 0.0
     width = max(focus.half_mm)
-    drag = max(2 * np.hypot(*shear) + width * abs(np.radians(twist)) for _, shear, twist in poses)
+    drag = max(2 * np.hypot(*pose.shear_mm) + width * abs(np.radians(pose.twist_deg)) for pose in poses)
     moved = depth + np.sqrt(min(scene.contact.friction, 1.0)) * drag
     rim, band = _rim(indenter, focus), _band(indenter, focus, depth)
     scale = CERTAINTY * ERROR_SCALES[_class_of(indenter)] * scene.sensor.gel.size_mm[2] ** -0.6

@@ -12,9 +12,9 @@ import numpy as np
 from synth.arrays import FloatArray
 from synth.errors import InputError
 from synth.scene import Box, Cone, Cylinder, Indenter, MeshIndenter, Sphere, Torus, Vector3
+from synth.scene.surface_file import Triangles, read_surface
 from synth.simulate.distance import KINDS, SHAPE_LENGTH
 from synth.simulate.object_grid import Grid
-from synth.simulate.object_surface import object_triangles
 
 BLUNT_MM = 1.0
 """Smallest radius at which the contact stiffness of `numerics.penalty` is enough."""
@@ -219,3 +219,31 @@ def turned_by(rotation_deg: Vector3) -> FloatArray:
     """(3, 3) rotation by angles about x, then y, then z."""
     turns = [rotation_about(axis, np.radians(angle)) for axis, angle in enumerate(rotation_deg)]
     return turns[2] @ turns[1] @ turns[0]
+
+
+SHORTEST_MM, LONGEST_MM = 0.5, 1000.0
+"""Longest edges beyond which a file is taken to be in another unit."""
+
+
+def object_triangles(indenter: MeshIndenter, folder: Path) -> Triangles:
+    """An object's surface in mm, not turned, its bounding box centred on the origin; its file is relative to `folder`.
+
+    Files have right-handed axes; the scene's are left-handed, because y points down in the image. So y changes its
+    sign: a letter can be read in the picture, a screw keeps its hand.
+
+    Raises:
+        InputError: a file that is missing or no surface, or of a size that speaks for another unit.
+    """
+    try:
+        surface = read_surface(folder / indenter.file)
+    except ValueError as error:
+        raise InputError(f"contact.indenter.file = {indenter.file!r}: {error}") from None
+    longest = float(np.ptp(surface.points, axis=0).max())
+    scale = indenter.size_mm / longest if indenter.size_mm is not None else indenter.scale
+    if not SHORTEST_MM <= scale * longest <= LONGEST_MM:
+        raise InputError(
+            f"contact.indenter.scale = {scale:g}: {indenter.file} is then {scale * longest:.3g} mm long. Is it in "
+            "metres (scale = 1000) or inches (scale = 25.4)? size_mm gives its longest edge instead"
+        )
+    centre = (surface.points.min(axis=0) + surface.points.max(axis=0)) / 2
+    return Triangles(scale * (surface.points - centre) * [1, -1, 1], surface.faces[:, ::-1], surface.closed)

@@ -16,6 +16,7 @@ where it is pressed along z beside its tip, the path starts level with its farth
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import groupby
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,6 @@ from synth.arrays import FloatArray
 from synth.mesh.cad import CadFace
 from synth.mesh.face import PadFace, RoundFace, face_height, face_of
 from synth.scene import Motion, Scene
-from synth.scene import Pose as PoseOfScene
 from synth.simulate.distance import KINDS
 from synth.simulate.indenter import RigidBody, Touchable, rigid_body, rotation_about
 from synth.simulate.measure import Distance
@@ -143,13 +143,8 @@ class LoadPath:
         motion = self.motion
         start = min(motion.depth_mm, self.touch_mm)
         poses = [(start, 0.0, 0.0, 0.0), (motion.depth_mm, 0.0, 0.0, 0.0)]
-        poses.append((motion.depth_mm, *motion.shear_mm, motion.twist_deg))
-        poses += [(pose.depth_mm, *pose.shear_mm, pose.twist_deg) for pose in motion.then]
-        kept = [poses[0]]
-        for pose in poses[1:]:
-            if pose != kept[-1]:
-                kept.append(pose)
-        return np.array(kept)
+        poses += [(pose.depth_mm, *pose.shear_mm, pose.twist_deg) for pose in motion.poses.values()]
+        return np.array([pose for pose, _ in groupby(poses)])
 
     @cached_property
     def ends(self) -> FloatArray:
@@ -206,13 +201,11 @@ class LoadPath:
 def path_of(scene: Scene, folder: Path | None = None, resolution_mm: float = 0.0) -> LoadPath:
     """The load path of a fully drawn scene's indenter, whose mesh file is relative to `folder`.
 
-    `resolution_mm` is the smallest radius that the gel's mesh resolves, see `rigid_body`.
-
-    Raises:
-        InputError: the indenter cannot be built.
+    `resolution_mm` is the smallest radius that the gel's mesh resolves, see `rigid_body`. InputError where the indenter
+    cannot be built.
     """
     motion, gel = scene.motion, scene.sensor.gel
-    poses: list[Motion | PoseOfScene] = [motion, *motion.then]
+    poses = motion.poses.values()
     aside = max(float(np.hypot(*np.add(motion.position_mm, pose.shear_mm))) for pose in poses)
     face = face_of(gel, folder or Path())
     frame = None if isinstance(face, PadFace) else PressFrame.of(motion, face)

@@ -11,16 +11,12 @@ wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 
 class Distance:
-    """Signed distance of points of the gel from one body at one of several places."""
+    """Signed distance of points of the gel from one body at one of several places.
+
+    A place is where the body's origin is, `centres` (k, 3) mm, and its axes as columns, `rotations` (k, 3, 3).
+    """
 
     def __init__(self, body: RigidBody, centres: FloatArray, rotations: FloatArray) -> None:
-        """Hand body and places to the kernel's device.
-
-        Args:
-            body: whose distance is wanted.
-            centres: (k, 3) mm of its origin.
-            rotations: (k, 3, 3) its axes as columns.
-        """
         self._kind = body.kind
         self._constant = [
             wp.array(body.shape[None], dtype=shape_vector, device="cpu"),

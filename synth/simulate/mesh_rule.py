@@ -8,8 +8,7 @@ from typing import Literal
 from synth.mesh import default_edge_length, pad_mesh
 from synth.scene import Scene
 from synth.simulate.press import Press
-from synth.simulate.resolution import Resolution, resolve
-from synth.simulate.shared import Accuracy, accuracy, shared_mesh, spacing_mm
+from synth.simulate.resolution import Accuracy, Resolution, accuracy, resolve, shared_mesh, shared_spacing_mm
 
 DEFAULT_TARGET_PX = 0.5
 
@@ -42,8 +41,7 @@ class MeshRule:
     ) -> Resolution:
         """The mesh of a fully drawn scene, and what it is predicted to give; fTetWild's are kept in `mesh_folders`.
 
-        Raises:
-            InputError: the indenter, whose mesh file is relative to `folder`, or the mesh cannot be built.
+        InputError where the indenter, whose mesh file is relative to `folder`, or the mesh cannot be built.
         """
         gel, numerics = scene.sensor.gel, scene.numerics
         match self.kind:
@@ -51,11 +49,11 @@ class MeshRule:
                 return resolve(scene, folder, self.target_error_px)
             case "even":
                 found = accuracy(scene, folder)
-                mesh, spacing = shared_mesh(gel, numerics), spacing_mm(gel, numerics)
-                return Resolution(mesh, found.across, numerics.cells[2], spacing, found.error_px)
+                mesh, spacing = shared_mesh(gel, numerics), shared_spacing_mm(gel, numerics)
+                return Resolution(found.across, found.error_px, mesh, numerics.cells[2], spacing)
             case "tetwild":
                 mesh = pad_mesh(gel, numerics, mesh_folders, folder)
-                return Resolution(mesh, 0, 0, numerics.edge_length_mm or default_edge_length(gel), float("nan"))
+                return Resolution(0, float("nan"), mesh, 0, numerics.edge_length_mm or default_edge_length(gel))
 
     def press(self, scene: Scene, folder: Path | None = None, mesh_folders: Sequence[Path] | None = None) -> Press:
         """Mesh, body and load path of a scene; arguments as of `resolution`.

@@ -10,8 +10,7 @@ import numpy as np
 
 from synth.simulate.contact import Indenters
 from synth.simulate.linear import norm
-from synth.simulate.system import System
-from synth.simulate.unknowns import Residual, Unknowns
+from synth.simulate.system import Residual, System, Unknowns
 
 MAX_ITERATIONS = 20
 MAX_ROUGH_ITERATIONS = 5
@@ -56,15 +55,10 @@ def solve(
     limit: int = MAX_ITERATIONS,
     reach_mm: float = np.inf,
 ) -> Solution:
-    """Find the equilibrium near a first iterate.
+    """Find the equilibrium near a first iterate, to a tolerance of `relative_residual`.
 
-    Args:
-        system: the pad.
-        start: first iterate.
-        indenter: where it is.
-        tolerance: of `relative_residual`.
-        limit: most iterations; twice as many where the equilibrium is near.
-        reach_mm: farthest that a node may go from the first iterate; a solve that goes farther has not converged.
+    `limit` is the most iterations; twice as many where the equilibrium is near. A solve that takes a node farther than
+    `reach_mm` from the first iterate has not converged.
     """
     state, residual = start, system.residual(start, indenter)
     iterations = 0

@@ -9,7 +9,7 @@ from synth.scene import MeshIndenter, Scene
 from synth.simulate.element import Element, p1p1, p2p1
 from synth.simulate.indenter import object_radius
 from synth.simulate.load_path import LoadPath, path_of
-from synth.simulate.shared import Accuracy
+from synth.simulate.resolution import Accuracy
 
 ELEMENTS: dict[str, Callable[[], Element]] = {"auto": p2p1, "p1p1": p1p1, "p2p1": p2p1}
 
@@ -22,7 +22,7 @@ class Press:
         scene: fully drawn.
         mesh: of scene.sensor.gel.
         path: the load path of its body, whose edges are rounded to what the mesh resolves.
-        accuracy: what the mesh is predicted to give; None where that is left to `synth.simulate.shared.accuracy`.
+        accuracy: what the mesh is predicted to give; None where that is left to `synth.simulate.resolution.accuracy`.
     """
 
     scene: Scene

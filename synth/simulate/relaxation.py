@@ -16,8 +16,7 @@ import numpy as np
 from synth.simulate.contact import Indenters
 from synth.simulate.linear import norm
 from synth.simulate.newton import Solution, relative_residual
-from synth.simulate.system import System
-from synth.simulate.unknowns import Residual, Unknowns
+from synth.simulate.system import Residual, System, Unknowns
 
 MAX_STEPS = 300
 """Presses of objects need some hundred; see docs/decisions.md."""

@@ -4,9 +4,14 @@ The mesh is structured and graded around where the draw's indenter will touch: `
 as many through the thickness as keep elements under the contact about as high as wide. It is the cheapest mesh whose
 predicted error is within the budget; the prediction (`synth.simulate.error_model`) was calibrated, and is tested,
 against much finer solutions (docs/reports/budget.md).
+
+Draws of a pad that are simulated many at once share one mesh, wherever their indenters touch: it is even along x and y,
+`numerics.cells` says how fine, and graded through the thickness so that elements at the contact face are about as high
+as wide. Each draw has a predicted error of its own, calibrated on meshes graded around the contact: it extrapolates.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +21,7 @@ from synth.mesh import Counts, Focus, PadMesh, domed, graded_box
 from synth.mesh.face import face_height
 from synth.mesh.graded import spacing
 from synth.optics import Optics
-from synth.scene import Gel, Scene
+from synth.scene import Gel, Numerics, Scene
 from synth.simulate.error_model import face_error
 from synth.simulate.footprint import footprint
 from synth.simulate.load_path import path_of
@@ -35,22 +40,32 @@ OUTER = (3, 2)
 
 
 @dataclass(frozen=True)
-class Resolution:
+class Accuracy:
+    """How well a mesh resolves one draw.
+
+    Attributes:
+        across: whole elements across the contact, along its shorter side; 0 where less than one, and for an fTetWild
+            mesh, whose elements are not counted.
+        error_px: predicted root-mean-square error of the flow over the contact face; NaN for an fTetWild mesh.
+    """
+
+    across: int
+    error_px: float
+
+
+@dataclass(frozen=True)
+class Resolution(Accuracy):
     """A draw's mesh and what it is expected to cost in accuracy.
 
     Attributes:
         mesh: of the pad.
-        across: elements across the contact; 0 for an fTetWild mesh.
         through: elements through the thickness, without those that layers add; 0 for an fTetWild mesh.
         spacing_mm: size of the elements under the contact.
-        error_px: predicted root-mean-square error of the flow over the contact face; NaN for an fTetWild mesh.
     """
 
     mesh: PadMesh
-    across: int
     through: int
     spacing_mm: float
-    error_px: float
 
 
 class Fineness(NamedTuple):
@@ -174,8 +189,7 @@ def scale_px_per_mm(scene: Scene) -> float:
 def resolve(scene: Scene, folder: Path | None, target_error_px: float) -> Resolution:
     """The cheapest graded mesh of a draw whose predicted error of the flow is within a target, else the finest.
 
-    Raises:
-        InputError: the indenter, whose mesh file is relative to `folder`, or the mesh cannot be built.
+    InputError where the indenter, whose mesh file is relative to `folder`, or the mesh cannot be built.
     """
     gel = scene.sensor.gel
     focus = footprint(path_of(scene, folder), gel.size_mm, MARGIN)
@@ -184,4 +198,48 @@ def resolve(scene: Scene, folder: Path | None, target_error_px: float) -> Resolu
         error = predicted_error_px(scene, focus, fine)
         if error <= target_error_px:
             break
-    return Resolution(mesh, *fineness, fine, error)
+    return Resolution(fineness.across, error, mesh, fineness.through, fine)
+
+
+def shared_mesh(gel: Gel, numerics: Numerics) -> PadMesh:
+    """The mesh of all draws of a pad; its Young's modulus does not enter."""
+    layers = tuple(layer.thickness_mm for layer in gel.layers)
+    return _even_mesh(gel.size_mm, gel.dome_radius_mm, layers, numerics.cells)
+
+
+@lru_cache(maxsize=4)
+def _even_mesh(
+    size_mm: tuple[float, float, float],
+    dome_radius_mm: float | None,
+    layers_mm: tuple[float, ...],
+    cells: tuple[int, int, int],
+) -> PadMesh:
+    """The structured mesh; kept, since a job asks for the same one again and again."""
+    whole = Focus((0.0, 0.0), (size_mm[0] / 2, size_mm[1] / 2))
+    counts = Counts((cells[0] - 2, cells[1] - 2), (1, 1), cells[2], growth=_growth(size_mm, cells))
+    return domed(graded_box(size_mm, whole, counts, layers_mm), dome_radius_mm)
+
+
+def _width(size_mm: tuple[float, float, float], cells: tuple[int, int, int]) -> float:
+    """Of the elements, mm: geometric mean of both directions."""
+    return float(np.sqrt(size_mm[0] / cells[0] * size_mm[1] / cells[1]))
+
+
+def _growth(size_mm: tuple[float, float, float], cells: tuple[int, int, int]) -> float:
+    return depth_growth(cells[2], size_mm[2] / _width(size_mm, cells))
+
+
+def shared_spacing_mm(gel: Gel, numerics: Numerics) -> float:
+    """Size of the elements at the contact face as the error model takes it: see `element_size`."""
+    size, cells = gel.size_mm, numerics.cells
+    wide, growth = _width(size, cells), _growth(size, cells)
+    high = size[2] / sum(growth**k for k in range(cells[2]))
+    return element_size(wide, high)
+
+
+def accuracy(scene: Scene, folder: Path | None = None) -> Accuracy:
+    """What the shared mesh gives for one draw; InputError where the indenter cannot be built."""
+    gel, numerics = scene.sensor.gel, scene.numerics
+    focus = footprint(path_of(scene, folder), gel.size_mm, MARGIN)
+    error = predicted_error_px(scene, focus, shared_spacing_mm(gel, numerics))
+    return Accuracy(int(2 * min(focus.half_mm) / _width(gel.size_mm, numerics.cells)), error)

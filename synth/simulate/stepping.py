@@ -20,10 +20,9 @@ from synth.simulate.load_path import LoadPath
 from synth.simulate.newton import FORCE_FLOOR, MAX_ITERATIONS, Solution, relative_residual, solve
 from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.relaxation import relax
-from synth.simulate.system import System
+from synth.simulate.system import System, Unknowns
 from synth.simulate.tables import pack_indenter, place_indenter
 from synth.simulate.trajectory import State, Trajectory, no_contact, not_converged, too_deep, trajectory_of, undeformed
-from synth.simulate.unknowns import Unknowns
 
 SHORTEST_STEP = 1 / 128
 """Shortest step, as a share of max_step_mm."""
@@ -236,11 +235,9 @@ class Stepper:
         return self._counted(solve(self.system, solution.state, self.indenter, limit, MAX_ITERATIONS))
 
     def _record(self, step: Solution, target: float) -> bool:
-        """Record the corrected state, then put contact back to where the path goes on.
+        """Record the corrected state, if it reaches the full tolerance, and put contact back to where the path goes on.
 
-        Returns:
-            False where the corrected state does not reach the full tolerance: nothing is recorded. Nor is a state that
-            is too deep, which ends the press, saying so.
+        Returns whether it does. A state that is too deep is not recorded either, and ends the press, saying so.
         """
         saved = self.system.saved_contact()
         solution = step

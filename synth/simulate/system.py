@@ -7,6 +7,7 @@ stiffer deforms identically.
 The kernels are those of the batched solver, too: their arrays have a leading axis, here of length one.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ import warp as wp
 
 from synth.arrays import FloatArray
 from synth.simulate.bulk import bulk_residual
-from synth.simulate.contact import ContactState, Indenters, contact_residual, contact_stiffness, contact_tangent
+from synth.simulate.contact import FAR, ContactState, Indenters, contact_residual, contact_stiffness, contact_tangent
 from synth.simulate.inversion_barrier import barrier_residual, barrier_tangent
 from synth.simulate.linear import LinearSolver
 from synth.simulate.material import Material
@@ -23,11 +24,48 @@ from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.pattern import pattern_of
 from synth.simulate.space import Space
 from synth.simulate.stiffness import bulk_tangent, linearise, pressure_tangent, viscous_force
-from synth.simulate.tables import barrier_tables, bulk_tables, face_tables, laplace_table, warp_array
-from synth.simulate.unknowns import Residual, Tangent, Unknowns
+from synth.simulate.tables import barrier_tables, bulk_tables, face_tables, laplace_table, warp_array, zeros_of
 from synth.surface import broken_linear_face
 
-MEMORY = ("normal", "tangent", "anchor", "anchored", "place", "gap")
+
+@dataclass(frozen=True)
+class Unknowns:
+    """State of a pad: displacement (n, 3) mm and pressure (k,) in units of E."""
+
+    u: FloatArray
+    p: FloatArray
+
+    def plus(self, step: "Unknowns", scale: float) -> "Unknowns":
+        """This plus scale times step."""
+        return Unknowns(self.u + scale * step.u, self.p + scale * step.p)
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Residual of the equilibrium equations.
+
+    Attributes:
+        free: (k,) residual of the unknowns that are not held.
+        reaction: (n, 3) all nodal forces including those on held nodes, in units of E mm².
+        smallest_jacobian: smallest det F; the residual means nothing where it is <= 0.
+    """
+
+    free: FloatArray
+    reaction: FloatArray
+    smallest_jacobian: float
+
+
+@dataclass(frozen=True)
+class Tangent:
+    """Derivative of the free residual.
+
+    Attributes:
+        values: (nnz,) CSR data of the symmetric part's upper triangle.
+        remainder: the unsymmetric rest of friction, SciPy CSR over the free unknowns, or None.
+    """
+
+    values: FloatArray
+    remainder: Any
 
 
 class System:
@@ -80,14 +118,9 @@ class System:
     def _allocate(self) -> None:
         element, count = self.space.element, len(self.space.nodes)
         points = (1, len(self.space.faces), len(element.face_weights))
-        self.contact = ContactState()
-        self.contact.normal = _zeros(points, wp.float64)
-        self.contact.tangent = _zeros(points, wp.vec3d)
-        self.contact.anchor = _zeros(points, wp.vec3d)
-        self.contact.anchored = _zeros(points, wp.int32)
-        self.contact.place = _zeros(points, wp.vec3d)
-        self.contact.gap = wp.full(points, 1e30, dtype=wp.float64, device="cpu")
-        self.gap = wp.full(points, 1e30, dtype=wp.float64, device="cpu")
+        self.contact: ContactState = zeros_of(ContactState, lambda _: points, "cpu")
+        self.contact.gap.fill_(FAR)
+        self.gap = wp.full(points, FAR, dtype=wp.float64, device="cpu")
         self.tangential = _zeros(points, wp.vec3d)
         self.traction = _zeros(points, wp.vec3d)
         self._stiffness = _zeros(points, wp.mat33d)
@@ -204,7 +237,7 @@ class System:
 
     def saved_contact(self) -> dict[str, np.ndarray]:
         """Copies of what contact remembers, by their names in `ContactState`."""
-        return {name: getattr(self.contact, name).numpy().copy() for name in MEMORY}
+        return {name: getattr(self.contact, name).numpy().copy() for name in ContactState.vars}  # type: ignore[attr-defined]
 
     def restore_contact(self, saved: dict[str, np.ndarray]) -> None:
         """Put the copies back, after a corrected state that the load path does not go on from."""

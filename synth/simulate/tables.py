@@ -1,5 +1,8 @@
 """Constant arrays of a pad's elements and faces and of its indenter, as the kernels take them."""
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import warp as wp
 
@@ -16,6 +19,14 @@ from synth.simulate.space import Space
 def warp_array(values: np.ndarray, dtype: type, device: str) -> wp.array:
     """A Warp array of contiguous values; vectors and matrices take the trailing axes."""
     return wp.array(np.ascontiguousarray(values), dtype=dtype, device=device)
+
+
+def zeros_of(struct: Any, shape: Callable[[str], tuple[int, ...]], device: str) -> Any:
+    """A Warp struct whose arrays are zeros; shape of each by its name."""
+    made = struct()
+    for name, variable in struct.vars.items():
+        setattr(made, name, wp.zeros(shape(name), dtype=variable.type.dtype, device=device))
+    return made
 
 
 def bulk_tables(space: Space, material: Material, mixed: bool, d: str) -> Bulk:

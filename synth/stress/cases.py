@@ -140,8 +140,7 @@ def all_runs(expectations: Expectations, base: Path = EXTREME / "base.toml") -> 
 def selected(runs: Sequence[Run], patterns: Sequence[str] | None) -> list[Run]:
     """The runs whose name, case or group fits one of the shell patterns, and those that they are compared with.
 
-    Raises:
-        InputError: a pattern fits none.
+    InputError where a pattern fits none.
     """
     if not patterns:
         return list(runs)

@@ -1,4 +1,7 @@
-"""Running the cases: each in a process that is killed when its budget is spent, then evaluated from what it left."""
+"""Running the cases: each in a process that is killed when its budget is spent, then evaluated from what it left.
+
+The results are shown as a table, and written as JSON.
+"""
 
 import contextlib
 import json
@@ -8,17 +11,23 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from importlib.metadata import version
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from synth import __version__
 from synth.dataset.storage import refuse_foreign, replace_file, storage_errors
 from synth.stress.cases import EXTREME, Run, all_runs, compared, load_expectations, selected
-from synth.stress.check import Result, evaluate
+from synth.stress.check import Result, Verdict, evaluate
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 Report = Callable[[Result], None]
+PACKAGES = ("numpy", "scipy", "warp-lang", "pytetwild")
 WORKER = (sys.executable, "-m", "synth.stress.worker")
 
 
@@ -41,7 +50,6 @@ def run_stress(out: Path, only: Sequence[str] | None, workers: int, as_json: boo
     from rich.console import Console
 
     from synth.progress import progress
-    from synth.stress.report import outcome_table, record, remarks, summary
 
     refuse_foreign(out / "stress.json", b'"software"')
     expectations = load_expectations(scenes / "expected.toml")
@@ -134,3 +142,68 @@ def _last_words(log: Path, status: int) -> str:
     lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
     said = lines[-1] if lines else "it said nothing"
     return f"signal {-status}: {said}" if status < 0 else f"exit status {status}: {said}"
+
+
+def record(verdicts: Sequence[Verdict], seconds: float) -> dict[str, Any]:
+    """The whole suite, JSON-able."""
+    return {
+        "ok": all(verdict.ok for verdict in verdicts),
+        "seconds": round(seconds, 1),
+        "software": {"synth": __version__, **{name: version(name) for name in PACKAGES}},
+        "cases": [_row(verdict) for verdict in verdicts],
+    }
+
+
+def _row(verdict: Verdict) -> dict[str, Any]:
+    result, case = verdict.result, verdict.result.run.case
+    return {
+        "case": case.name,
+        "element": result.run.element,
+        **case.model_dump(mode="json", include={"group", "why", "set", "surface"}),
+        "outcome": result.outcome,
+        "expected": list(case.outcome),
+        "verdict": verdict.word,
+        "ok": verdict.ok,
+        "wall_s": round(result.wall_s, 2),
+        "budget_s": result.run.budget_s,
+        **{name: result.record.get(name) for name in ("states_asked", "nodes", "tetrahedra", "worst_shape")},
+        **verdict.measured,
+        "message": result.message,
+        "broken": list(verdict.broken),
+    }
+
+
+def outcome_table(verdicts: Sequence[Verdict]) -> "Table":
+    """For the terminal; fits 80 columns. "!" marks what ended otherwise than written down, "*" an explained one."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table("case", "ended", "", box=None, padding=(0, 1, 0, 0), pad_edge=False)
+    for heading in ("N", "mm", "det F", "iter.", "s"):
+        table.add_column(heading, justify="right")
+    forms = {"force_z_n": ".4g", "penetration_mm": ".2g", "min_jacobian": ".3f", "iterations": ".0f"}
+    for verdict in verdicts:
+        mark, style = {"OTHERWISE": ("!", "red"), "explained": ("*", "yellow")}.get(verdict.word, ("", None))
+        numbers = [f"{verdict.measured[key]:{form}}" if verdict.measured else "" for key, form in forms.items()]
+        result = verdict.result
+        cells = (result.run.name, result.outcome, mark, *numbers, f"{result.wall_s:.1f}")
+        table.add_row(*map(escape, cells), style=style)
+    return table
+
+
+def remarks(verdicts: Sequence[Verdict]) -> list[str]:
+    """A line for every run that is not as expected."""
+    found = []
+    for verdict in verdicts:
+        deviation = verdict.result.run.case.deviation
+        if verdict.broken:
+            found.append(f"{verdict.result.run.name}: {verdict.word}: {'; '.join(verdict.broken)}")
+        elif verdict.deviates and deviation is not None:
+            found.append(f"{verdict.result.run.name}: {verdict.word}: {deviation.because}")
+    return found
+
+
+def summary(verdicts: Sequence[Verdict], seconds: float) -> str:
+    count = {word: sum(verdict.word == word for verdict in verdicts) for word in ("explained", "OTHERWISE")}
+    text = f"{len(verdicts)} runs in {seconds / 60:.1f} min: {len(verdicts) - sum(count.values())} as expected"
+    return f"{text}, {count['explained']} otherwise with an explanation, {count['OTHERWISE']} otherwise"

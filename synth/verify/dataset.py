@@ -30,8 +30,7 @@ _NAMED = {"scene.hash": "scene_hash", "seed": "seed", "index": "index"}
 def verify_dataset(path: Path | str, progress: Callable[[int, int], None] | None = None) -> Report:
     """Verifies a dataset directory; `progress` is called after each sample with how many are done and of how many.
 
-    Raises:
-        InputError: not a dataset. A damaged sample is a failed check.
+    A damaged sample is a failed check; InputError where it is no dataset.
     """
     dataset = read_dataset(path)
     reports = []
@@ -91,11 +90,7 @@ def _files(problems: Sequence[str]) -> Check:
 
 
 def flow_file_problems(folder: Path, scene: Scene, meta: Mapping[str, Any]) -> list[str]:
-    """What is wrong with the channels and headers of the flow.exr files in a sample's folder, one message each.
-
-    Raises:
-        InputError: a file is missing or damaged.
-    """
+    """What is wrong with channels and headers of a sample's flow.exr files; InputError if one is missing or damaged."""
     problems = []
     for camera in scene.sensor.views:
         name = f"{camera}/flow.exr" if camera else "flow.exr"

@@ -13,7 +13,7 @@ from gelflow.losses import flow_loss, self_supervised_loss
 from gelflow.losses.augmentation_consistency import consistency_loss, transformed_pair
 from gelflow.losses.decomposition import decomposition_loss, regulariser_weight
 from gelflow.losses.deformation import area_ratio, deformation_loss
-from gelflow.losses.endpoint import SOFTNESS_PX, endpoint_loss
+from gelflow.losses.multiscale import SOFTNESS_PX, endpoint_loss
 from gelflow.losses.occlusion import visible_in_both_images
 from gelflow.losses.photometric import C1, C2, appearance_loss, photometric_loss, structural_similarity
 from gelflow.losses.smoothness import first_order_loss, second_order_loss

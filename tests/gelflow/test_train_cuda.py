@@ -9,12 +9,11 @@ from waves import Shifts
 
 from gelflow.config import REGISTRATIONS, LossConfig, ModelConfig, Registration, TrainConfig
 from gelflow.models import GelFlow
-from gelflow.models.recorded import RecordedNetwork
+from gelflow.models.recorded import GraphedNetwork, RecordedNetwork
 from gelflow.models.registration import registered
 from gelflow.models.weights import load_weights
 from gelflow.ops.correlation import local_correlation
 from gelflow.train import train
-from gelflow.train.graph import GraphedNetwork
 
 pytestmark = [pytest.mark.cuda, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")]
 

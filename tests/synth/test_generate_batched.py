@@ -32,7 +32,7 @@ from synth.scene import Gel, Numerics, Scene
 from synth.scene.sampling import MAX_DRAWS, draw, draw_sensor, sensor_of
 from synth.scene.template import Template, load_scene
 from synth.simulate.mesh_rule import MeshRule
-from synth.simulate.shared import accuracy, shared_mesh, spacing_mm
+from synth.simulate.resolution import accuracy, shared_mesh, shared_spacing_mm
 from synth.simulate.solve import simulate_press
 
 SPHERE = 'shape = "sphere"\nradius_mm = { uniform = [1.5, 2.5] }'
@@ -193,7 +193,7 @@ def test_the_shared_mesh_is_even_and_the_predicted_error_falls_with_its_spacing(
     np.testing.assert_allclose(np.diff(x), 1.25, atol=1e-9)  # coordinates are multiples of 2e-10 mm
     np.testing.assert_allclose(np.diff(y), 1.25, atol=1e-9)
     assert z[1] == pytest.approx(max(1.25, 4.0 / 3.2), abs=1e-6)  # 1 + growth of at most 2.2
-    assert spacing_mm(GEL, numerics) == pytest.approx(1.25, abs=1e-6)
+    assert shared_spacing_mm(GEL, numerics) == pytest.approx(1.25, abs=1e-6)
     # By the model's exponent of 1.6, at equal proportions of the elements; and the rule says the same.
     drawn = draw(template, SEED, 0)
     fine = drawn.model_copy(update={"numerics": drawn.numerics.model_copy(update={"cells": (16, 12, 2)})})

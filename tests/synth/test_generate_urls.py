@@ -14,10 +14,9 @@ from samples import job, translation_sample
 from tiny_scene import fingerprint, reference
 
 from synth.dataset.lock import EXPIRES_S
-from synth.dataset.meshes import mesh_folder
 from synth.dataset.sample_files import write_sample_files
 from synth.dataset.shard import Shard
-from synth.dataset.store import Store
+from synth.dataset.store import Store, mesh_folder
 from synth.dataset.writer import DatasetWriter
 from synth.errors import InputError
 from synth.pipeline.generate import Scheduling, generate

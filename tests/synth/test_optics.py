@@ -8,7 +8,7 @@ from render_scenes import refracted_angle
 
 from synth.errors import InputError
 from synth.optics import Optics
-from synth.optics.lens_fisheye import FisheyeLens
+from synth.optics.lens import FisheyeLens
 
 RNG = np.random.default_rng(3)
 POINTS = RNG.uniform((-7, -5, 0), (7, 5, 4), (200, 3))

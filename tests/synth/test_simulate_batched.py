@@ -14,12 +14,12 @@ from synth.mesh import PadMesh
 from synth.scene import Scene
 from synth.simulate import Trajectory
 from synth.simulate.batched import simulate_presses
+from synth.simulate.batched.arrays import number_rows
 from synth.simulate.batched.inversion_barrier import barrier_product, find_inverting
 from synth.simulate.batched.krylov import padded
 from synth.simulate.batched.pad import prepare
 from synth.simulate.batched.product import STORED_YEOH, bulk_product, contact_product, store_bulk, store_contact
 from synth.simulate.batched.run import OPTIONS
-from synth.simulate.batched.unknown_rows import number_rows
 from synth.simulate.contact import contact_stiffness
 from synth.simulate.load_path import path_of
 from synth.simulate.material import pad_material, uniform

@@ -69,8 +69,8 @@ def motion_checks(
 
 
 def as_sample(index: int, drawn: Scene, data: SampleData) -> Sample:
-    fields = (data.image1, data.image2, data.flow, drawn, data.surface, data.displacement1, data.displacement2)
-    return Sample(index, 0, (0, 1), 0, *fields)
+    pair, rest = (data.image1, data.image2, data.flow), (drawn, data.surface, data.displacement1, data.displacement2)
+    return Sample(*pair, index, 0, (0, 1), 0, *rest)
 
 
 def _paint(

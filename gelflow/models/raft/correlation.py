@@ -22,12 +22,9 @@ LEVELS = 4
 
 
 def correlation_pyramid(first: Features, second: Features) -> list[Tensor]:
-    """All-pairs correlation at `LEVELS` resolutions of the second image.
+    """All-pairs correlation at `LEVELS` resolutions of the second image, (B H W, 1, H // 2^k, W // 2^k) at level k.
 
     H and W are at least 8, so that every level has a pixel.
-
-    Returns:
-        For each level k, (B H W, 1, H // 2^k, W // 2^k).
     """
     batch, channels, height, width = first.shape
     product = torch.einsum("bcn,bcm->bnm", first.flatten(2), second.flatten(2)) / channels**0.5

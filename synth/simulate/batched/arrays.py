@@ -1,28 +1,28 @@
-"""The arrays of a batch: the state of its lanes, their fields, contact, and the linear solver's vectors.
+"""The arrays of a batch: the state of its lanes, their fields, contact, the linear solver's vectors, and tables for it.
 
-At 512 lanes of an 11,500-unknown P2/P1 mesh they take some 7 GB, most of it contact's memory and the Krylov basis.
+Rows of the vectors: three for each free node's displacement, then the pressures, then rows that fill up, which stay
+zero. At 512 lanes of an 11,500-unknown P2/P1 mesh all take some 7 GB, most of it contact's memory and the Krylov
+basis.
 """
 
-from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import warp as wp
 
+from synth.arrays import FloatArray
 from synth.simulate.batched.fields import ContactMemory, Fields
 from synth.simulate.batched.krylov import Krylov, flat, shapes
 from synth.simulate.batched.lanes import Lanes
 from synth.simulate.batched.pad import Pad
-from synth.simulate.batched.product import STORED, STORED_YEOH
-from synth.simulate.batched.reductions import SCALARS
+from synth.simulate.batched.product import STORED, STORED_YEOH, SingleTables
+from synth.simulate.batched.reductions import SCALARS, SurfaceTables
+from synth.simulate.bulk import Bulk
 from synth.simulate.contact import ContactState, Indenters
-
-
-def _filled(struct: Any, shape: Callable[[str], tuple[int, ...]], device: str) -> Any:
-    """A Warp struct whose arrays are zeros; shape of each by its name."""
-    made = struct()
-    for name, variable in struct.vars.items():
-        setattr(made, name, wp.zeros(shape(name), dtype=variable.type.dtype, device=device))
-    return made
+from synth.simulate.space import Space
+from synth.simulate.tables import warp_array, zeros_of
+from synth.surface import broken_linear_face
 
 
 class BatchArrays:
@@ -39,10 +39,10 @@ class BatchArrays:
 
         nodes, pressures, elements = len(space.points), space.pressures if pad.mixed else 0, len(space.nodes)
         self.points = (batch, len(space.faces), len(space.element.face_weights))
-        self.lanes: Lanes = _filled(Lanes, lambda _: (batch,), device)
-        self.fields: Fields = _filled(Fields, lambda n: (batch, nodes if n.endswith("_u") else pressures), device)
-        self.contact: ContactState = _filled(ContactState, lambda _: self.points, device)
-        self.saved: ContactMemory = _filled(ContactMemory, lambda _: self.points, device)
+        self.lanes: Lanes = zeros_of(Lanes, lambda _: (batch,), device)
+        self.fields: Fields = zeros_of(Fields, lambda n: (batch, nodes if n.endswith("_u") else pressures), device)
+        self.contact: ContactState = zeros_of(ContactState, lambda _: self.points, device)
+        self.saved: ContactMemory = zeros_of(ContactMemory, lambda _: self.points, device)
         self.force, self.volume = zeros((batch, nodes), wp.vec3d), zeros((batch, pressures), wp.float64)
         self.viscous = zeros((batch, nodes), wp.vec3d)
         self.jacobian = zeros((batch, elements), wp.float64)
@@ -53,7 +53,7 @@ class BatchArrays:
             setattr(self.memory, name, getattr(self.contact, name))
         self.traction = zeros(self.points, wp.vec3d)
         self.normal_before, self.tangent_before = zeros(self.points, wp.float64), zeros(self.points, wp.vec3d)
-        self.indenters: Indenters = _filled(
+        self.indenters: Indenters = zeros_of(
             Indenters, lambda name: (batch, *grid) if name == "coefficients" else (batch,), device
         )
         self.records = zeros((batch, records, SCALARS + 3 * nodes + 3 * len(space.surface_nodes)), wp.float64)
@@ -66,5 +66,68 @@ class BatchArrays:
         self.symmetric, self.remainder = zeros(self.points, wp.mat33d), zeros(self.points, wp.mat33d)
         self.stored_contact = zeros(self.points, wp.mat33f)
         sizes = shapes(pad.preconditioner.rows, batch)
-        self.krylov: Krylov = _filled(Krylov, lambda name: sizes[name], device)
+        self.krylov: Krylov = zeros_of(Krylov, lambda name: sizes[name], device)
         self.step = flat(self.krylov.step)
+
+
+@dataclass(frozen=True)
+class UnknownRows:
+    """See the module's docstring; Warp arrays.
+
+    Attributes:
+        free: (rows,) number of the unknown, displacements of all nodes first; -1 where there is none.
+        node_row: (n,) first row of a node, -1 where it is held. pressure_row: (k,).
+        face_row: (f, ns) first rows of a face's nodes. face_shape: (nq, ns) float32.
+        single: tables of the elements.
+    """
+
+    free: wp.array
+    node_row: wp.array
+    pressure_row: wp.array
+    face_row: wp.array
+    face_shape: wp.array
+    single: SingleTables
+
+
+def number_rows(space: Space, free: np.ndarray, rows: int, bulk: Bulk, device: str) -> UnknownRows:
+    """Number the free unknowns (k,), displacements first, of a space in vectors of so many rows.
+
+    ValueError where a node is held in some directions only.
+    """
+    nodes, element, mixed = len(space.points), space.element, bool(bulk.mixed)
+    row = np.full(3 * nodes + (space.pressures if mixed else 0), -1, dtype=np.int32)
+    row[free] = np.arange(len(free))
+    moving, pressure_row = row[: 3 * nodes].reshape(nodes, 3), row[3 * nodes :]
+    if not ((moving >= 0).all(axis=1) | (moving < 0).all(axis=1)).all():
+        raise ValueError("a batch needs nodes that are held in all directions or in none")
+    padded = np.full(rows, -1, dtype=np.int32)
+    padded[: len(free)] = free
+    single = SingleTables()
+    single.row = warp_array(moving[space.nodes, 0], wp.int32, device)
+    empty = np.zeros((0, 4), dtype=np.int32)
+    single.pressure_row = warp_array(pressure_row[space.pressure_nodes] if mixed else empty, wp.int32, device)
+    single.gradient = warp_array(bulk.gradient.numpy().astype(np.float32), wp.vec3f, device)
+    single.pressure_shape = warp_array(element.barycentric.astype(np.float32), wp.float32, device)
+    single.stabilisation = warp_array(bulk.stabilisation.numpy().astype(np.float32), wp.float32, device)
+    return UnknownRows(
+        free=warp_array(padded, wp.int32, device),
+        node_row=warp_array(moving[:, 0], wp.int32, device),
+        pressure_row=warp_array(pressure_row, wp.int32, device),
+        face_row=warp_array(moving[space.faces, 0], wp.int32, device),
+        face_shape=warp_array(element.face_shape.astype(np.float32), wp.float32, device),
+        single=single,
+    )
+
+
+def surface_tables(space: Space, weight: FloatArray, device: str) -> SurfaceTables:
+    """How points of the coated face, of weights (f, nq) in mm², give tractions to its nodes, as in `System.forces`."""
+    element, coated, tables = space.element, space.coated, SurfaceTables()
+    hat = element.face_shape if element.order == 1 else broken_linear_face(element.face_barycentric)
+    number = np.full(space.faces.shape, -1, dtype=np.int32)
+    number[coated] = np.searchsorted(space.surface_nodes, space.faces[coated])
+    area = np.zeros(len(space.surface_nodes))
+    np.add.at(area, number[coated], np.einsum("fq,qa->fa", weight[coated], hat))
+    tables.hat = warp_array(hat, wp.float64, device)
+    tables.number = warp_array(number, wp.int32, device)
+    tables.area = warp_array(area, wp.float64, device)
+    return tables

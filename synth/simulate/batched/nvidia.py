@@ -32,12 +32,9 @@ def library(name: str) -> ctypes.CDLL:
 
 
 def call(name: str, function: str, *arguments: Any) -> None:
-    """Call a function of a library by its C name.
+    """Call a function of a library by its C name, which returns 0 if it succeeds; RuntimeError if it does not.
 
-    Arguments are pointers wrapped in ctypes' types, int for an int. The function returns 0 if it succeeds.
-
-    Raises:
-        RuntimeError: the function reported something else.
+    Arguments are pointers wrapped in ctypes' types, int for an int.
     """
     status = getattr(library(name), function)(*arguments)
     if status != 0:

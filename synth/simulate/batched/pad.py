@@ -45,10 +45,8 @@ class Pad:
 def prepare(scene: Scene, mesh: PadMesh, device: str, products: Dense | None = None) -> Pad:
     """Prepare the pad of a scene, for all scenes of the same mesh, materials and element.
 
-    `products` apply the preconditioner; by default they are the Warp device's own.
-
-    Raises:
-        InputError: CUDA without cuBLAS or cuSOLVER.
+    `products` apply the preconditioner; by default they are the Warp device's own. InputError for CUDA without cuBLAS
+    or cuSOLVER.
     """
     check_mesh(mesh)
     material = pad_material(scene.sensor.gel, mesh)

@@ -30,9 +30,7 @@ def stiffness(system: System, away: Indenters) -> FloatArray:
 def inverse(matrix: FloatArray, device: str) -> FloatArray:
     """(k, k) of a symmetric float64 matrix; 2 k³ flops on a CPU: 15 s for 13,000 unknowns at 300 GFLOP/s.
 
-    Raises:
-        InputError: CUDA without cuSOLVER.
-        numpy.linalg.LinAlgError: singular.
+    InputError for CUDA without cuSOLVER, numpy.linalg.LinAlgError for a singular matrix.
     """
     where = wp.get_device(device)
     return _inverse_by_cusolver(matrix, where) if where.is_cuda else np.asarray(np.linalg.inv(matrix), np.float64)

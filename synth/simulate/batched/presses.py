@@ -87,14 +87,10 @@ def untouched(press: Press, space: Space) -> Trajectory:
 def trajectory(
     press: Press, records: FloatArray, ended: tuple[int, float, float], seconds: float, space: Space
 ) -> Trajectory:
-    """The trajectory of a press that ran in a lane.
+    """The trajectory of a press that ran in a lane, `seconds` of the run being its share.
 
-    Args:
-        press: that ran.
-        records: (r, ...) what the lane wrote, see `synth.simulate.batched.reductions.write_record`.
-        ended: code of the reason, path length reached, and where the next step would have led, mm.
-        seconds: its share of the run time.
-        space: of the pad.
+    `records` (r, ...) are what the lane wrote, see `synth.simulate.batched.reductions.write_record`; `ended` is the
+    reason's code, the path length reached, and where the next step would have led, mm.
     """
     states = [undeformed(press.path.pose(0.0), space)]
     for length, record in zip(press.path.records(), records, strict=False):

@@ -98,11 +98,7 @@ def store_bulk(
 def bulk_product(nodes: int, mixed: bool, stabilised: bool, yeoh: bool) -> wp.Kernel:
     """The kernel that adds the bulk's tangent times x to y; one thread per (element, lane).
 
-    Args:
-        nodes: displacement nodes of an element; known to the compiler, so that their values stay in registers.
-        mixed: whether there is a pressure field.
-        stabilised: whether it is stabilised.
-        yeoh: whether the material stiffens.
+    The number of an element's displacement nodes is known to the compiler, so that their values stay in registers.
     """
     count = wp.constant(nodes)
     nodal = wp.types.matrix(shape=(nodes, 3), dtype=wp.float32)

@@ -70,14 +70,8 @@ def simulate_presses(
 class Run:
     """An iterator over (number of the press, trajectory) in the order in which they end.
 
-    Args:
-        presses: those whose indenters touch, with common numerics.
-        pad: theirs.
-        frames: numbers of the states that are corrected, of each press; default all.
-        batch: number of lanes.
-        options: of Newton's method along the load paths.
-        order: numbers of the presses in which they begin, default each once.
-        inner: Krylov iterations of a cycle.
+    Arguments as of `simulate_presses`, of presses whose indenters touch; `order` are the numbers of the presses in
+    which they begin, by default each once, and `inner` the Krylov iterations of a cycle.
     """
 
     def __init__(

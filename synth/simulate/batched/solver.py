@@ -21,7 +21,7 @@ from synth.arrays import FloatArray
 from synth.simulate.batched import fields, reductions
 from synth.simulate.batched import krylov as gmres
 from synth.simulate.batched import lanes as phases
-from synth.simulate.batched.arrays import BatchArrays
+from synth.simulate.batched.arrays import BatchArrays, number_rows, surface_tables
 from synth.simulate.batched.inversion_barrier import barrier_product, find_inverting
 from synth.simulate.batched.pad import Pad
 from synth.simulate.batched.poses import PATH_DERIVATIVE_STEP, copy_grids, fill_lanes, place_indenters
@@ -34,7 +34,6 @@ from synth.simulate.batched.transitions import (
     finish_record,
     finish_solve,
 )
-from synth.simulate.batched.unknown_rows import number_rows, surface_tables
 from synth.simulate.bulk import bulk_residual
 from synth.simulate.contact import contact_residual, contact_stiffness
 from synth.simulate.inversion_barrier import barrier_residual
@@ -51,15 +50,8 @@ LINE_SEARCH_TRIALS = 2
 class BatchedSolver:
     """See the module's docstring.
 
-    Args:
-        pad: what the lanes share.
-        presses: all that are to be run.
-        batch: number of lanes.
-        records: most states that a trajectory records.
-        grid: counts of the largest distance grid of the indenters.
-        settings: of Newton's method and of stepping.
-        penalty: contact stiffness, E per mm.
-        inner: Krylov iterations of a cycle.
+    A trajectory records at most `records` states; `grid` are the counts of the largest distance grid of the indenters.
+    `penalty` is the contact stiffness, E per mm, and `inner` the Krylov iterations of a cycle.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """What happens next to a lane, as Warp kernels of one thread a lane.
 
-The rules are those of `synth.simulate.newton` and `synth.simulate.stepping`, whose constants they use; what differs
-is that each lane follows them at its own pace, that passes are solved to a share of the full tolerance, and that where
+The rules are those of `synth.simulate.newton`, `relaxation` and `stepping`, whose constants they use; what differs is
+that each lane follows them at its own pace, that passes are solved to a share of the full tolerance, and that where
 intermediate steps have a relaxed tolerance the full one holds for what is recorded only. A step that ends at a recorded
 state, and every pass but the last, then has the relaxed tolerance: what they find is changed by the next pass. A state
 without passes, or whose passes end early, because they fail or nothing is deep any more, is brought to the full
@@ -11,16 +11,14 @@ path goes on from the state before, so that it does not depend on which states a
 
 import warp as wp
 
-from synth.simulate import newton, stepping
+from synth.simulate import newton, relaxation, stepping
 from synth.simulate.batched import lanes as phases
 from synth.simulate.batched.lanes import Lanes, Presses, Settings
-from synth.simulate.batched.relaxation import FIRST_VISCOSITY, LEAST_BORNE, MAX_STEPS, evaluate_relaxation
 from synth.simulate.distance import KINDS
 
 wp.set_module_options({"enable_backward": False, "fast_math": False})
 
-ZERO = wp.constant(wp.float64(0.0))
-ONE = wp.constant(wp.float64(1.0))
+ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 FORCE_FLOOR = wp.constant(wp.float64(newton.FORCE_FLOOR))
 INDIFFERENT = wp.constant(wp.float64(newton.INDIFFERENT))
 SHORTEST = wp.constant(wp.float64(newton.SHORTEST))
@@ -43,6 +41,47 @@ STALL_ITERATIONS = wp.constant(newton.STALL_ITERATIONS)
 STALLED_RESIDUAL = wp.constant(wp.float64(newton.STALLED_RESIDUAL))
 NEAR = wp.constant(wp.float64(newton.NEAR))
 MAX_RELAXED_STEP = wp.constant(wp.float64(stepping.MAX_RELAXED_STEP))
+MAX_STEPS = wp.constant(relaxation.MAX_STEPS)
+FIRST_VISCOSITY = wp.constant(wp.float64(relaxation.FIRST_VISCOSITY))
+LEAST_VISCOSITY = wp.constant(wp.float64(relaxation.LEAST_VISCOSITY))
+MOST_VISCOSITY = wp.constant(wp.float64(relaxation.MOST_VISCOSITY))
+LEAST_SHARE = wp.constant(wp.float64(relaxation.LEAST_SHARE))
+LEAST_BORNE = wp.constant(wp.float64(relaxation.MIN_REACTION_RATIO))
+MAX_ERROR, AIM = wp.constant(wp.float64(relaxation.MAX_ERROR)), wp.constant(wp.float64(relaxation.AIM))
+FALL, RISE = wp.constant(wp.float64(relaxation.FALL)), wp.constant(wp.float64(relaxation.RISE))
+
+
+@wp.func
+def next_viscosity(viscosity: wp.float64, error: wp.float64) -> wp.float64:
+    """`synth.simulate.relaxation.next_viscosity`."""
+    if error <= MAX_ERROR:
+        taken = viscosity * wp.clamp(error / AIM, FALL, RISE)
+        if taken < LEAST_VISCOSITY:
+            return ZERO
+        return taken
+    refused = wp.max(viscosity * wp.clamp(error / AIM, wp.float64(2.0), RISE), LEAST_VISCOSITY)
+    return wp.min(refused, MOST_VISCOSITY)
+
+
+@wp.func
+def evaluate_relaxation(lanes: Lanes, s: int, valid: bool):
+    """A step of a relaxation is taken where it errs little; else the next is shorter, from where this began."""
+    error = wp.float64(1.0e30)
+    if valid and wp.isfinite(lanes.trial_error[s]):
+        error = lanes.trial_error[s]
+    lanes.iteration[s] = lanes.iteration[s] + 1
+    if error <= MAX_ERROR:
+        lanes.move[s] = phases.TAKE_TRIAL
+        lanes.part[s] = ONE
+    else:
+        if lanes.viscosity[s] >= MOST_VISCOSITY:
+            lanes.part[s] = wp.float64(0.5) * lanes.part[s]
+        lanes.phase[s] = phases.START
+        if lanes.iteration[s] >= MAX_STEPS or lanes.part[s] < LEAST_SHARE:
+            lanes.phase[s] = phases.FAILED
+    if lanes.phase[s] == phases.SEARCH and lanes.trial_held_force[s] < lanes.held_force[s]:
+        lanes.phase[s] = phases.FAILED
+    lanes.viscosity[s] = next_viscosity(lanes.viscosity[s], error)
 
 
 @wp.kernel
