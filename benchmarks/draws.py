@@ -22,8 +22,7 @@ from synth.scene.template import SCENES, load_scene
 from synth.simulate import Trajectory
 from synth.simulate.batched import simulate_presses
 from synth.simulate.batched.pad import prepare
-from synth.simulate.mesh_rule import MeshRule
-from synth.simulate.press import Press
+from synth.simulate.press import MeshRule, Press
 from synth.simulate.solve import simulate_press
 
 DEEP = 0.02

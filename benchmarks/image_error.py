@@ -28,9 +28,8 @@ from statistics import median
 import numpy as np
 
 from synth.arrays import FloatArray, Image, Points
-from synth.render.camera_image import camera_image, expected_signal
+from synth.render.camera_image import camera_image, encoded, expected_signal
 from synth.render.renderer import Renderer
-from synth.render.sample_count import encoded
 from synth.scene import Camera
 
 LEVELS = 255

@@ -26,7 +26,7 @@ from synth.scene.template import checked_template, load_scene
 from synth.simulate import Trajectory, simulate
 from synth.simulate.footprint import footprint
 from synth.simulate.load_path import path_of
-from synth.simulate.mesh_rule import MeshRule
+from synth.simulate.press import MeshRule
 from synth.simulate.resolution import MARGIN, graded_mesh
 
 SIZE_MM = 8.0

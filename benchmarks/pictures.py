@@ -17,8 +17,7 @@ def gallery(folders: list[Path], out: Path) -> None:
     from matplotlib.figure import Figure
 
     from synth.dataset.reader import read_dataset
-    from synth.inspect.panels import image_picture
-    from synth.inspect.wheel import flow_colours, robust_scale
+    from synth.inspect.panels import flow_colours, image_picture, robust_scale
 
     rows = -(-len(folders) // 3)
     figure = Figure(figsize=(3 * 4.3, rows * 1.8), dpi=100)

@@ -13,7 +13,7 @@ from synth.scene.sampling import MAX_DRAWS, draw, stream
 from synth.scene.template import Template
 from synth.scene.validation import validated
 from synth.simulate import simulate
-from synth.simulate.mesh_rule import MeshRule
+from synth.simulate.press import MeshRule
 from synth.surface import GelSurface
 
 

@@ -24,9 +24,9 @@ from synth.cli_options import DEFAULT_SCENE
 from synth.errors import InputError
 from synth.mesh import rest_surface
 from synth.planning import job_variant
+from synth.render.camera_image import render_noise
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer, full_grid
-from synth.render.sample_count import render_noise
 from synth.render.variant import Device, Variant, choose_variant, cpu_variant, llvm_version
 from synth.scene import Render
 from synth.scene.sampling import draw, stream

@@ -19,7 +19,7 @@ from synth.cli_options import DEFAULT_SCENE
 from synth.dataset.manifest import MANIFEST_FILE
 from synth.errors import InputError
 from synth.pipeline.generate import Scheduling, generate
-from synth.pipeline.threads import cores
+from synth.pipeline.worker_pool import cores
 from synth.planning import job_variant
 from synth.render.variant import Device
 from synth.scene.template import Template, load_scene

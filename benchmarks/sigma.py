@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.rows import Row, arguments, show
-from gelflow.baselines.tensors import as_tensor
+from gelflow.baselines.method import as_tensor
 from gelflow.compare.metrics import endpoint_error
 from gelflow.config import RegistrationConfig
 from gelflow.data.open import open_all

@@ -30,11 +30,7 @@ def progress(label: str, shown: bool = True) -> Iterator[Advance]:
                TextColumn("{task.fields[item]}"))  # fmt: skip
     with Progress(*columns, console=console, disable=not (shown and console.is_terminal), transient=True) as bar:
         task = bar.add_task(label, total=None, item="")
-
-        def advance(done: int, total: int, item: str) -> None:
-            bar.update(task, completed=done, total=total, item=item)
-
-        yield advance
+        yield lambda done, total, item: bar.update(task, completed=done, total=total, item=item)
 
 
 def show_table(title: str, header: list[str], rows: list[list[str]]) -> None:

@@ -110,9 +110,9 @@ def simulate(
     from synth.dataset.storage import refuse_foreign, storage_errors
     from synth.progress import progress
     from synth.scene.sampling import draw
-    from synth.simulate.files import write_trajectory
-    from synth.simulate.mesh_rule import MeshRule
+    from synth.simulate.press import MeshRule
     from synth.simulate.solve import simulate_press
+    from synth.simulate.trajectory import write_trajectory
 
     refuse_foreign(out / "trajectory.json", b'"scene": {')
     for surface in out.glob("state_*.vtu"):
@@ -266,7 +266,7 @@ def _error_line(predicted: Prediction) -> str:
 
 
 def _show_summary(summary: Summary, variant: Variant) -> None:
-    from synth.dataset.summary import shares
+    from synth.dataset.manifest import shares
     from synth.progress import duration
 
     stages = ", ".join(f"{name} {share:.0%}" for name, share in shares(summary.stages).items())

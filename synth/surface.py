@@ -46,12 +46,10 @@ def broken_linear_face(barycentric: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class ContactFaces:
-    """The part of a pad's boundary that carries the coating.
+    """The part of a pad's boundary that carries the coating, by undeformed nodes (n, 3) float64 mm.
 
-    Attributes:
-        nodes: (n, 3) float64 mm, undeformed positions.
-        faces: (k, 3) or, quadratic, (k, 6) int32 into `nodes`; the normals of their vertices (right-hand rule on the
-            components) point out of the gel.
+    Faces are (k, 3) or, quadratic, (k, 6) int32; the normals of their vertices (right-hand rule on the components)
+    point out of the gel.
     """
 
     nodes: Points
@@ -65,12 +63,7 @@ class ContactFaces:
 
 @dataclass(frozen=True)
 class GelSurface:
-    """Refined contact surface.
-
-    Attributes:
-        coarse: the FEM's faces.
-        subdivisions: each coarse edge becomes so many.
-    """
+    """Refined contact surface: each edge of the FEM's faces, `coarse`, becomes so many."""
 
     coarse: ContactFaces
     subdivisions: int = 4
@@ -170,9 +163,8 @@ def _grid(n: int) -> tuple[list[tuple[int, int, int]], np.ndarray]:
 def _subdivide(coarse: ContactFaces, n: int) -> tuple[Points, Triangles, FloatArray, Triangles, np.ndarray]:
     """Split each face into n x n triangles.
 
-    Returns:
-        Vertices; triangles; each vertex's weights and the coarse corners they belong to; and each coarse face's
-        vertices, in the order of `_grid`.
+    Vertices; triangles; each vertex's weights and the coarse corners they belong to; and each coarse face's vertices,
+    in the order of `_grid`.
     """
     nodes, faces = coarse.nodes, coarse.faces[:, :3].astype(np.int64)
     small, local = _grid(n)
@@ -208,14 +200,10 @@ def _recovered_gradients(coarse: ContactFaces) -> list[Any]:
 
 
 def vertex_normals(positions: Points, triangles: Triangles) -> Points:
-    """Unit normals at vertices: the mean of the adjoining triangles' normals, weighted by area, as rendered.
+    """Unit normals (v, 3) at vertices: the mean of the adjoining triangles' normals, weighted by area, as rendered.
 
-    Args:
-        positions: (v, 3) float64 mm.
-        triangles: (f, 3) int32; a vertex of none gets zeros.
-
-    Returns:
-        (v, 3) float64, on the side to which the triangles are oriented (right-hand rule on the components).
+    Positions are (v, 3) float64 mm; a vertex of none of the triangles (f, 3) gets zeros. Normals lie on the side to
+    which triangles are oriented (right-hand rule on the components).
     """
     a, b, c = (positions[corner] for corner in triangles.T)
     weighted = np.repeat(np.cross(b - a, c - a), 3, axis=0)

@@ -1,7 +1,7 @@
 """Augmented-Lagrangian digital image correlation: pyALDIC (PyPI al-dic, BSD-3), the accuracy to beat.
 
 Windows of 32 px, a node every 8 px, its defaults otherwise; float64 luma. Nodes that it could not track are dropped,
-the others interpolated as in `gelflow.baselines.scattered`, which also fills the margin of half a window that has no
+the others interpolated as in `gelflow.baselines.method`, which also fills the margin of half a window that has no
 nodes. The first call compiles its code, which takes minutes.
 
 It is optional and not a requirement of this package: it asks for a graphical toolkit and for a build of OpenCV that
@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 
 from gelflow.arrays import FlowArray, ImageArray
-from gelflow.baselines.method import check_images
-from gelflow.baselines.scattered import dense_flow
+from gelflow.baselines.method import check_images, dense_flow
 from gelflow.errors import InputError
 
 INSTALL = "pip install --no-deps al-dic && pip install numba imageio"
@@ -33,11 +32,7 @@ class ALDIC:
     name: str = "pyALDIC"
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
-        """See `Method.flow`.
-
-        Raises:
-            InputError: pyALDIC is not installed, the images are below 64 px, or it could not solve this pair.
-        """
+        """See `Method.flow`; InputError also where pyALDIC is not installed, or could not solve this pair."""
         check_images(image1, image2)
         height, width = image1.shape[:2]
         if min(height, width) < MINIMUM_SIDE:

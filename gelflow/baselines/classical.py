@@ -14,8 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from gelflow.arrays import FlowArray, Grey8, ImageArray
-from gelflow.baselines.method import check_images
-from gelflow.baselines.tensors import as_array, as_tensor
+from gelflow.baselines.method import as_array, as_tensor, check_images
 from gelflow.config import RegistrationConfig
 from gelflow.errors import InputError
 from gelflow.files.image import to_grey

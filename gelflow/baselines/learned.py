@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from gelflow.arrays import FlowArray, ImageArray
-from gelflow.baselines.method import check_images
-from gelflow.baselines.tensors import as_array, as_tensor
+from gelflow.baselines.method import as_array, as_tensor, check_images
 from gelflow.config import REGISTRATIONS, Registration, RegistrationConfig
 from gelflow.errors import InputError
 from gelflow.hardware import chosen_device
@@ -24,9 +23,8 @@ def open_network(
 ) -> "Learned | PublishedRaft":
     """The network that a file of weights belongs to: GelFlow (.safetensors) or RAFT (.pth); see `Learned`.
 
-    Raises:
-        InputError: The file is missing, damaged or of another network, the device is not there, or `registration` is
-            given for RAFT.
+    InputError where the file is missing, damaged or of another network, the device is not there, or `registration` is
+    given for RAFT.
     """
     from gelflow.models.raft import looks_like_raft
 
@@ -116,7 +114,7 @@ class PublishedRaft:
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
         import torch
 
-        from gelflow.ops.resize import resize_flow, resize_images
+        from gelflow.ops.pyramid import resize_flow, resize_images
 
         check_images(image1, image2)
         native = (image1.shape[0], image1.shape[1])

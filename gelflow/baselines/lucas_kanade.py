@@ -2,7 +2,7 @@
 
 Corners of Shi and Tomasi (at most 2000, at least 5 px apart, of 1 % or more of the best corner's quality) are tracked
 by OpenCV with windows of 21 px over 5 octaves, there and back. Points that do not come back to within 0.5 px are
-dropped; the others are interpolated as in `gelflow.baselines.scattered`. 8-bit luma.
+dropped; the others are interpolated as in `gelflow.baselines.method`. 8-bit luma.
 """
 
 from dataclasses import dataclass
@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gelflow.arrays import FlowArray, ImageArray
-from gelflow.baselines.method import check_images
-from gelflow.baselines.scattered import dense_flow
+from gelflow.baselines.method import check_images, dense_flow
 from gelflow.errors import NothingFoundError
 from gelflow.files.image import to_grey
 

@@ -1,11 +1,14 @@
-"""The interface of everything that estimates flow."""
+"""The interface of everything that estimates flow, whose arrays are (H, W, C), and torch's tensors, (1, C, H, W)."""
 
-from typing import Protocol
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
-from gelflow.arrays import FlowArray, ImageArray
+from gelflow.arrays import FlowArray, ImageArray, MapArray
 from gelflow.errors import InputError
+from gelflow.files.exr import FlowField
 from gelflow.files.image import MINIMUM_SIDE
 
 
@@ -37,3 +40,67 @@ def check_images(image1: ImageArray, image2: ImageArray) -> None:
             raise InputError(f"{name} holds NaN or infinite values; values in [0, 1] are needed")
     if image1.shape != image2.shape:
         raise InputError(f"image 1 has shape {image1.shape} and image 2 {image2.shape}; they must be equal")
+
+
+def as_tensor(image: ImageArray, device: str) -> Any:
+    """An image or flow (H, W, C) float32 as a tensor (1, C, H, W) on a device."""
+    import torch
+
+    return torch.from_numpy(np.ascontiguousarray(np.moveaxis(image, -1, 0)))[None].to(device)
+
+
+def as_array(flow: Any) -> FlowArray:
+    """The first flow of a tensor (B, 2, H, W) as (H, W, 2) float32; waits for the device."""
+    array: FlowArray = flow[0].permute(1, 2, 0).float().contiguous().cpu().numpy()
+    return array
+
+
+def uncertainty(flow: FlowArray, image1: ImageArray, image2: ImageArray, device: str) -> tuple[MapArray, MapArray]:
+    """Sigma in px and the probability to be seen in image 2, see `gelflow.models.uncertainty`; (H, W) float32."""
+    from gelflow.models.uncertainty import flow_sigma
+
+    sigma, visible = flow_sigma(*(as_tensor(array, device) for array in (flow, image1, image2)))
+    return sigma[0, 0].cpu().numpy(), visible[0, 0].cpu().numpy()
+
+
+@dataclass(frozen=True)
+class ExactFlow:
+    """The data set's own exact flow as a row of the comparison: what PSNR and SSIM say of the truth.
+
+    Its endpoint error is zero by definition. Neither is its PSNR infinite nor its SSIM 1: image 2 has noise and shading
+    of its own, and hides a part of image 1. A method with a higher PSNR has followed those, too, not the gel alone.
+    """
+
+    name: str = "exact flow"
+
+    def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
+        """Always raises InputError: images alone do not tell."""
+        raise InputError("the exact flow cannot be estimated from images; it is a row of `compare` on synthetic pairs")
+
+    def of(self, truth: FlowField | None) -> FlowArray:
+        """The true flow (H, W, 2) px, zero where no gel is seen; InputError where the pair has none."""
+        if truth is None:
+            raise InputError("the pair has no exact flow; leave the method exact out")
+        return np.nan_to_num(truth.flow)
+
+
+def dense_flow(points: NDArray[np.float64], motion: NDArray[np.float64], height: int, width: int) -> FlowArray:
+    """A dense flow (height, width, 2) float32 px, finite everywhere, from motions at scattered points.
+
+    Points are (N, 2) columns and rows as pixel indices, N >= 1, their motions (N, 2) px. Inside the points' convex
+    hull: Clough and Tocher's piecewise cubic on the Delaunay triangulation, continuous with its first derivatives,
+    gradients chosen for least curvature (SciPy). Outside: the motion of the nearest point. With fewer than four points,
+    or all of them on a line, there are no triangles: the nearest point everywhere.
+    """
+    from scipy.interpolate import CloughTocher2DInterpolator, NearestNDInterpolator
+    from scipy.spatial import QhullError
+
+    columns, rows = np.meshgrid(np.arange(width, dtype=np.float64), np.arange(height, dtype=np.float64))
+    flow = np.asarray(NearestNDInterpolator(points, motion)(columns, rows))
+    if len(points) >= 4:
+        try:
+            smooth = np.asarray(CloughTocher2DInterpolator(points, motion)(columns, rows))
+        except QhullError:  # all points on a line
+            return flow.astype(np.float32)
+        flow = np.where(np.isfinite(smooth), smooth, flow)
+    return flow.astype(np.float32)

@@ -4,9 +4,8 @@ from collections.abc import Sequence
 
 from gelflow.baselines.aldic import ALDIC
 from gelflow.baselines.classical import FARNEBACK, NO_MOTION, TVL1, RegisteredDIS, dis
-from gelflow.baselines.exact import ExactFlow
 from gelflow.baselines.lucas_kanade import LucasKanade
-from gelflow.baselines.method import Method
+from gelflow.baselines.method import ExactFlow, Method
 from gelflow.config import REGISTRATIONS
 from gelflow.errors import InputError
 from gelflow.hardware import chosen_device
@@ -31,14 +30,10 @@ REGISTERED = {f"dis-{aim}": (aim, settings) for aim, settings in REGISTRATIONS.i
 
 
 def named_methods(names: Sequence[str], device: str = "cpu") -> list[Method]:
-    """Methods without weights by name, in the given order.
+    """Methods without weights by their keys in `CLASSICAL`, `BESIDE` and `REGISTERED`, in the given order.
 
-    Args:
-        names: Keys of `CLASSICAL`, `BESIDE` and `REGISTERED`.
-        device: "auto", "cpu" or "cuda": for what can run on another device than the processor.
-
-    Raises:
-        InputError: A name is not known, or is given twice, or the device is not there.
+    The device, "auto", "cpu" or "cuda", is for what can run on another than the processor. InputError where a name is
+    not known, or is given twice, or the device is not there.
     """
     known = [*CLASSICAL, *REGISTERED, *BESIDE]
     for name in names:

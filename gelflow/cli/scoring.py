@@ -125,8 +125,7 @@ def _networks(
 def _score(
     dataset: PairDataset, methods: Sequence[Method], out: Path | None, as_json: bool, batch: int, add: bool = False
 ) -> None:
-    from gelflow.compare.report import FILES
-    from gelflow.compare.run import compare
+    from gelflow.compare.run import FILES, compare
     from gelflow.compare.tables import tables
     from gelflow.terminal import progress, show_table
 

@@ -21,13 +21,9 @@ _ERRORS = ("endpoint_error_px", "median_error_px")
 
 @dataclass(frozen=True)
 class Comparison:
-    """Scores of methods on the same pairs.
+    """Scores of methods on the same pairs of some data, method after method.
 
-    Attributes:
-        data: Where the pairs came from.
-        scores: Every method on every pair, method after method.
-        strata: Bins over all pairs, by method.
-        speeds: Of networks alone, by method; what was not measured is missing.
+    Strata are bins over all pairs, by method, speeds those of networks alone; what was not measured is missing.
     """
 
     data: tuple[str, ...]

@@ -31,10 +31,8 @@ def endpoint_error(flow: FlowArray, truth: FlowArray) -> NDArray[np.float64]:
 def flow_errors(flow: FlowArray, truth: FlowArray, visible: MaskArray) -> dict[str, float]:
     """Endpoint errors over the pixels where the truth is finite and visible, by the names of `scores.Measures`.
 
-    A NaN in the estimate is an outlier at both limits and makes mean and median NaN.
-
-    Raises:
-        InputError: The shapes differ, or no pixel can be compared.
+    A NaN in the estimate is an outlier at both limits and makes mean and median NaN. InputError where the shapes
+    differ, or no pixel can be compared.
     """
     if flow.shape != truth.shape or visible.shape != truth.shape[:2]:
         raise InputError(f"flow {flow.shape}, exact flow {truth.shape} and visibility {visible.shape} do not fit")

@@ -11,9 +11,7 @@ from typing import Any
 import numpy as np
 
 from gelflow.arrays import FlowArray, ImageArray, MapArray
-from gelflow.baselines.exact import ExactFlow
-from gelflow.baselines.method import Method
-from gelflow.baselines.tensors import uncertainty
+from gelflow.baselines.method import ExactFlow, Method, uncertainty
 from gelflow.compare.dots import dot_distance, find_dots
 from gelflow.compare.metrics import closure, endpoint_error, flow_errors, image_similarity, marker_distance
 from gelflow.compare.strata import Stratum, pair_strata
@@ -104,10 +102,8 @@ class MethodScore(Measures):
 def score_pair(method: Method, dataset: PairDataset, index: int) -> PairScore:
     """Runs a method on one pair and scores it; where it finds nothing to follow, it is scored as no motion.
 
-    Otherwise a method that gives up would look better than one that tries.
-
-    Raises:
-        InputError: The pair cannot be read, or the method cannot work on it; the message names the pair.
+    Otherwise a method that gives up would look better than one that tries. InputError where the pair cannot be read, or
+    the method cannot work on it; the message names the pair.
     """
     record = dataset.records[index]
     image1, image2 = dataset.images(index)

@@ -25,14 +25,11 @@ def train_config(
 ) -> TrainConfig:
     """Puts a configuration together and validates it once.
 
-    Args:
-        path: A preset's name, or a TOML file with the fields of `TrainConfig`; tables [model] and [loss].
-        assignments: `key=value`, key with dots (`loss.lambda_dc=10`), value in TOML; a value that is no TOML is text.
-        options: Top-level fields given by options of their own; None values are left out.
-        start: Fields that stand before the file is read.
-
-    Raises:
-        InputError: The file cannot be read, an assignment is malformed, or a field does not exist or is out of range.
+    The path is a preset's name, or a TOML file with the fields of `TrainConfig`; tables [model] and [loss]. Assignments
+    are `key=value`, key with dots (`loss.lambda_dc=10`), value in TOML; a value that is no TOML is text. `options` are
+    top-level fields given by options of their own; None values are left out. The fields of `start` stand before the
+    file is read. InputError where the file cannot be read, an assignment is malformed, or a field does not exist or is
+    out of range.
     """
     values: dict[str, Any] = {name: dict(v) if isinstance(v, Mapping) else v for name, v in (start or {}).items()}
     sources = []

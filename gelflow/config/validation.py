@@ -21,18 +21,12 @@ of a model by their names alone."""
 
 
 def validated(kind: type[Config], values: Mapping[str, Any], source: str) -> Config:
-    """Builds a configuration from plain values.
+    """Builds a `ModelConfig`, `LossConfig` or `TrainConfig` from plain values, nested as the configuration is.
 
     Types are strict: true and "1" are no numbers, 1 is no truth value. But 1e3 is a whole number, 1 a number with a
-    decimal point, too, and a list serves as a tuple.
-
-    Args:
-        kind: `ModelConfig`, `LossConfig` or `TrainConfig`.
-        values: Field names and values, nested as the configuration is.
-        source: What the values come from (a path, an option), for the message.
-
-    Raises:
-        InputError: A field that does not exist, has the wrong type or lies outside its range; one line per field.
+    decimal point, too, and a list serves as a tuple. `source` is what the values come from (a path, an option), for the
+    message. InputError for fields that do not exist, have the wrong type or lie outside their range; one line per
+    field.
     """
     try:
         return kind.model_validate_json(json.dumps(_whole(values), default=str), strict=True)

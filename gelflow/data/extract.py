@@ -29,10 +29,8 @@ def find_recordings(inputs: Sequence[str]) -> dict[str, Path]:
     """Recordings among files, folders and glob patterns, by name, sorted by path.
 
     A folder stands for the videos in it; if it holds none, for its images as one recording; if it holds neither, for
-    each of its folders of images.
-
-    Raises:
-        InputError: A path does not exist, a pattern matches nothing, or a folder holds nothing to read.
+    each of its folders of images. InputError where a path does not exist, a pattern matches nothing, or a folder holds
+    nothing to read.
     """
     paths: set[Path] = set()
     for given in inputs:
@@ -71,9 +69,8 @@ def _recordings_at(path: Path) -> list[Path]:
 def extract_pairs(inputs: Sequence[str], out: Path, config: ChoiceConfig, progress: Progress | None = None) -> PairSet:
     """Chooses pairs from recordings and writes them as a pair set; goes on where the same job was interrupted.
 
-    Raises:
-        InputError: Nothing to read, a value out of range, or `out` holds something else than this job.
-        OSError: The disk is full or not writable; what is there stays and the same command goes on from it.
+    InputError for nothing to read, a value out of range, or an `out` that holds something else than this job; OSError
+    where the disk is full or not writable: what is there stays and the same command goes on from it.
     """
     _check(config)
     recordings = find_recordings(inputs)

@@ -68,8 +68,7 @@ class FlowMembers:
     def read(self, direction: Direction) -> FlowField:
         """One direction, as `gelflow.files.exr.read_flow` gives it. Shards hold no contact.
 
-        Raises:
-            InputError: This direction is not there, or an array is damaged or of another type or shape.
+        InputError where this direction is not there, or an array is damaged or of another type or shape.
         """
         if direction == "forward":
             motion, seen = self.forward, self.forward_visible

@@ -165,8 +165,7 @@ def _channels_first(array: NDArray[np.float32]) -> Tensor:
 def read_markers(path: Path) -> MarkerArray:
     """Reads tracked dots from a CSV file with the columns x1, y1, x2, y2 (px).
 
-    Raises:
-        InputError: The file is missing, lacks a column or a row, or holds something other than finite numbers.
+    InputError where it is missing, lacks a column or a row, or holds something other than finite numbers.
     """
     import csv
 

@@ -42,8 +42,7 @@ def shard_files(path: Path) -> list[Path]:
 def shard_records(shards: list[Path]) -> list[PairRecord]:
     """The pairs in shards, in order.
 
-    Raises:
-        InputError: A shard is unreadable, truncated or damaged, a sample lacks a member, or a key occurs twice.
+    InputError where a shard is unreadable, truncated or damaged, a sample lacks a member, or a key occurs twice.
     """
     records: list[PairRecord] = []
     shard_of: dict[str, Path] = {}

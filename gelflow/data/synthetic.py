@@ -26,9 +26,8 @@ def is_synthetic(folder: Path) -> bool:
 def synthetic_records(folder: Path) -> list[PairRecord]:
     """The finished samples of a synth data set, by index.
 
-    Raises:
-        InputError: dataset.json or the manifest is missing or damaged, comes from a newer format, lists no sample, or
-            lists a file that is not there.
+    InputError where dataset.json or the manifest is missing or damaged, comes from a newer format, lists no sample, or
+    lists a file that is not there.
     """
     header, manifest = _read_header(folder / "dataset.json"), folder / "manifest.jsonl"
     records = []

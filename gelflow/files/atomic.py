@@ -19,9 +19,7 @@ def replacing(path: Path) -> Iterator[Path]:
     """Yields a temporary path with the same suffix in the same folder; renames it to `path` if the block succeeds.
 
     Folders that are missing are made. If the block fails, the temporary file is removed and what was at `path` stays.
-
-    Raises:
-        OSError: The folder cannot be written to or the disk is full; its `filename` says which file.
+    OSError where the folder cannot be written to or the disk is full; its `filename` says which file.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")

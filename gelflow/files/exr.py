@@ -7,6 +7,10 @@
 float32, ZIP-compressed; U right, V down, px of the image; a flow belongs to its pixel's centre, (c + 0.5, r + 0.5).
 `visible` is 1 where the point of the pixel is seen in the other image, 0 where it is hidden or has left the image;
 U and V are NaN only where the pixel sees no gel. Of an estimate it is a probability.
+
+Beside it, Middlebury's .flo format (Baker et al. 2011, vision.middlebury.edu/flow). Little-endian: float32 202021.25,
+int32 width, int32 height, then height x width x (u, v) float32, row by row. By the format's convention a value above
+1e9 means unknown; here unknown flow is NaN in memory and 1e10 in the file.
 """
 
 from pathlib import Path
@@ -39,11 +43,7 @@ class FlowField(NamedTuple):
 
 
 def read_channels(path: Path) -> dict[str, NDArray[np.float32]]:
-    """All channels of an EXR file by name, each (H, W), converted to float32.
-
-    Raises:
-        InputError: The file is missing, is no EXR file, or is truncated or damaged.
-    """
+    """All channels (H, W) of an EXR file by name, as float32; InputError if missing, none, truncated or damaged."""
     import OpenEXR
 
     if not path.is_file():
@@ -59,8 +59,7 @@ def read_channels(path: Path) -> dict[str, NDArray[np.float32]]:
 def read_flow(path: Path, direction: Direction = "forward") -> FlowField:
     """One direction of a flow file. A file without a `visible` channel is visible wherever the flow is finite.
 
-    Raises:
-        InputError: The file cannot be read, or lacks the U or V channel of this direction.
+    InputError where the file cannot be read, or lacks the U or V channel of this direction.
     """
     channels = read_channels(path)
     needed = [f"{direction}.U", f"{direction}.V"]
@@ -101,3 +100,15 @@ def write_flow(
                 OpenEXR.File(header, planes).write(str(temporary))
         except RuntimeError as error:
             raise OSError(f"cannot write {path}: {error}") from error
+
+
+MAGIC = np.float32(202021.25)
+UNKNOWN = np.float32(1e10)
+
+
+def write_flo(path: Path, flow: FlowArray) -> None:
+    """Writes a flow (H, W, 2) in px; NaN becomes the format's unknown flow. Replaces the file as a whole."""
+    height, width = flow.shape[:2]
+    data = np.where(np.isnan(flow), UNKNOWN, flow).astype("<f4")
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        file.write(MAGIC.astype("<f4").tobytes() + np.array([width, height], "<i4").tobytes() + data.tobytes())

@@ -36,11 +36,7 @@ def _check(path: Path, data: bytes) -> None:
 
 
 def read_image(path: Path) -> ImageArray:
-    """Reads an image as (H, W, 3) float32, RGB in [0, 1].
-
-    Raises:
-        InputError: The file is missing, is no image, is truncated or damaged, or has neither 8 nor 16 bits.
-    """
+    """An image as (H, W, 3) float32, RGB in [0, 1]; InputError if missing, damaged, or neither of 8 nor 16 bits."""
     import cv2
 
     if not path.is_file():
@@ -58,11 +54,7 @@ def read_image(path: Path) -> ImageArray:
 
 
 def read_pair(path1: Path, path2: Path) -> tuple[ImageArray, ImageArray]:
-    """Reads two images and checks that a flow between them makes sense.
-
-    Raises:
-        InputError: One of them cannot be read, is smaller than `MINIMUM_SIDE`, or their sizes differ.
-    """
+    """Two images; InputError where one cannot be read or is smaller than `MINIMUM_SIDE`, or their sizes differ."""
     image1, image2 = read_image(path1), read_image(path2)
     size1, size2 = (f"{image.shape[1]} x {image.shape[0]} px" for image in (image1, image2))
     for path, image, size in ((path1, image1, size1), (path2, image2, size2)):

@@ -23,12 +23,7 @@ class Unreadable(Exception):
 
 
 def load_tensors(path: Path) -> Any:
-    """Tensors and plain values, on the CPU.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        Unreadable: It holds anything else.
-    """
+    """Tensors and plain values, on the CPU; FileNotFoundError where there is no file, Unreadable for anything else."""
     import torch
 
     try:

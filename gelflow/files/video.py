@@ -41,10 +41,8 @@ class VideoInfo:
 def describe(path: Path) -> VideoInfo:
     """Number of frames and their rate; a folder of images has a nominal rate of 25 frames/s.
 
-    The number is the header's; where the header does not know it, frames are counted.
-
-    Raises:
-        InputError: The video is missing or does not open, or the folder holds no image.
+    The number is the header's; where the header does not know it, frames are counted. InputError where the video is
+    missing or does not open, or the folder holds no image.
     """
     if path.is_dir():
         files = image_files(path)
@@ -68,9 +66,7 @@ def frames(path: Path, every: int = 1) -> Iterator[tuple[int, Bytes3 | None]]:
     """Yields (index, frame) of every `every`-th frame, beginning with frame 0.
 
     A video ends at the first frame that does not decode. An image of a folder that cannot be read is yielded as None.
-
-    Raises:
-        InputError: The video is missing or does not open.
+    InputError where the video is missing or does not open.
     """
     if path.is_dir():
         for index, file in enumerate(image_files(path)):

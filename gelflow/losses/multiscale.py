@@ -10,10 +10,14 @@ from torch import Tensor
 
 from gelflow.arrays import Flow, Images, Mask, Scalar
 from gelflow.config import LossConfig
-from gelflow.losses.decomposition import decomposition_loss, regulariser_weight
-from gelflow.losses.deformation import deformation_loss
 from gelflow.losses.photometric import appearance_loss
-from gelflow.losses.smoothness import first_order_loss, second_order_loss
+from gelflow.losses.regularisers import (
+    decomposition_loss,
+    deformation_loss,
+    first_order_loss,
+    regulariser_weight,
+    second_order_loss,
+)
 from gelflow.ops.pyramid import enlarge_flow, flow_pyramid, image_pyramid
 from gelflow.ops.warp import inside, warp
 
@@ -36,17 +40,12 @@ def endpoint_loss(flow: Flow, truth: Flow) -> Scalar:
 def self_supervised_loss(
     flows: list[Flow], image1: Images, image2: Images, config: LossConfig, visible: Mask | None = None
 ) -> tuple[Scalar, dict[str, Tensor]]:
-    """The paper's loss, or that of one of its comparisons, from the images alone.
+    """The paper's loss, or that of one of its comparisons, from the images (B, 3, H, W) in [0, 1] alone.
 
-    Args:
-        flows: For s = 0 .. n-1, finest first, (B, 2, ceil(H / 2^s), ceil(W / 2^s)), px of scale s.
-        image1: (B, 3, H, W) in [0, 1].
-        image2: The same shape.
-        config: Weights; `lambda_s` has n entries.
-        visible: (B, 1, H, W), 0 where the photometric losses should not count beside what leaves the image; or None.
-
-    Returns:
-        The loss, and its weighted parts "photometric", "smoothness" and "deformation", detached, which add up to it.
+    Flows are for s = 0 .. n-1, finest first, (B, 2, ceil(H / 2^s), ceil(W / 2^s)), px of scale s; `lambda_s` has n
+    entries. `visible`, (B, 1, H, W), is 0 where the photometric losses should not count beside what leaves the image.
+    Returned are also the weighted parts "photometric", "smoothness" and "deformation", detached, which add up to the
+    loss.
     """
     side = min(image1.shape[-2:])
     coarse = len(flows) if config.compare_at == "scale" else 1

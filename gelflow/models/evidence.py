@@ -36,9 +36,8 @@ MAX_VARIANCE = 100.0
 class Step(NamedTuple):
     """A Gauss-Newton step (B, 2, H, W), px, zero where the window holds no texture.
 
-    Attributes:
-        variance: Tr C, at most `MAX_VARIANCE`, (B, 1, H, W) px^2.
-        texture: Sum of the squares of the gradient that each pixel adds to tr A, (B, 1, H, W).
+    The variance is Tr C, at most `MAX_VARIANCE`, (B, 1, H, W) px^2, the texture the sum of the squares of the gradient
+    that each pixel adds to tr A, (B, 1, H, W).
     """
 
     step: Flow

@@ -52,17 +52,9 @@ class GelFlow(nn.Module):
         self.refinement = layers.RefinementHead() if config.refine == "half" else None
 
     def forward(self, image1: Images, image2: Images) -> list[Flow]:
-        """Estimates the flow.
+        """Flows for s = 0 .. levels-2, finest first: (B, 2, ceil(H / 2^s), ceil(W / 2^s)) float32, px of scale s.
 
-        Args:
-            image1: (B, 3, H, W) float32 in [0, 1]; H, W >= 64, of any parity.
-            image2: The same shape.
-
-        Returns:
-            Flows for s = 0 .. levels-2, finest first: (B, 2, ceil(H / 2^s), ceil(W / 2^s)) float32, px of scale s.
-
-        Raises:
-            InputError: The images' shapes differ or are not (B, 3, H >= 64, W >= 64).
+        Both images are (B, 3, H, W) float32 in [0, 1]; H, W >= 64, of any parity; InputError for other shapes.
         """
         check_shapes(image1, image2)
         batch, _, height, width = image1.shape

@@ -27,20 +27,11 @@ NEEDED = ("onnx", "onnxscript")
 
 
 def export_onnx(weights: Path, out: Path, size: tuple[int, int] | None = None) -> tuple[int, int]:
-    """Writes a network as ONNX, as a whole or not at all.
+    """Writes a network, from a file of `gelflow train`, as ONNX to a file ending in .onnx, as a whole or not at all.
 
-    Args:
-        weights: A file that `gelflow train` wrote.
-        out: File to write, ending in .onnx.
-        size: Rows and columns; None: those of the training images, if they were resized to one size.
-
-    Returns:
-        The size that the file works at.
-
-    Raises:
-        InputError: A package is missing, no size is known, a side is below 64 px, the weights cannot be used, or `out`
-            is a file from elsewhere.
-        OSError: The file cannot be written.
+    `size`, rows and columns, is by default that of the training images, if they were resized to one size. Returns the
+    size that the file works at. InputError where a package is missing, no size is known, a side is below 64 px, the
+    weights cannot be used, or `out` is a file from elsewhere; OSError where it cannot be written.
     """
     missing = [name for name in NEEDED if find_spec(name) is None]
     if missing:

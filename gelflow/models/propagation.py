@@ -29,7 +29,7 @@ from torch.nn.functional import pad
 from gelflow.arrays import Flow, Images
 from gelflow.ops.cached import cached
 from gelflow.ops.gaussian import SeparableFilter, smoother, window_sums
-from gelflow.ops.resize import resize_flow, resize_images
+from gelflow.ops.pyramid import resize_flow, resize_images
 from gelflow.ops.warp import inside, warp
 
 DIRECTIONS = ((-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (1, 1), (-1, 1), (1, -1))
@@ -52,19 +52,11 @@ def propagated(
     noise: float,
     ignore_shading: bool,
 ) -> Flow:
-    """The flow after each pixel has had the choice among its neighbours' flows.
+    """The flow (B, 2, H, W), px, after each pixel has had the choice among its neighbours' flows.
 
-    Args:
-        flow: (B, 2, H, W), px.
-        image1: (B, C, H, W).
-        image2: The same shape.
-        window_px: Standard deviation of w.
-        distances: Of the neighbours, px, each in eight directions.
-        noise: Standard deviation of the images' noise; where the residual is below twice that, the flow stays.
-        ignore_shading: The flow is that of a gel, in whatever light; else it follows brightness.
-
-    Returns:
-        Same shape.
+    Images are (B, C, H, W); `window_px` is the standard deviation of w, `distances` are those of the neighbours, px,
+    each in eight directions. Where the residual is below twice the standard deviation of the images' noise, the flow
+    stays. With `ignore_shading` it is that of a gel, in whatever light; else it follows brightness.
     """
     height, width = flow.shape[-2:]
     pixel = math.ceil(window_px / PIXELS_PER_DEVIATION)

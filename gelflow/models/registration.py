@@ -41,11 +41,7 @@ RESIDUAL_WINDOW_PX, BLENDING_PX = 6.0, 2.0
 
 
 def registered(flow: Flow, image1: Images, image2: Images, config: RegistrationConfig) -> Flow:
-    """Corrects a flow.
-
-    Returns:
-        The corrected flow, same shape, float32, without gradient. Each pair of a batch is treated on its own.
-    """
+    """Corrects a flow; same shape, float32, without gradient. Each pair of a batch is treated on its own."""
     with torch.no_grad(), torch.autocast(flow.device.type, enabled=False):
         flow, first, image2 = flow.float(), image1.float(), image2.float()
         second = SplineImage(image2)

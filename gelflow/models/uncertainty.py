@@ -43,9 +43,8 @@ _MOTION = RegistrationConfig()
 def flow_sigma(flow: Flow, image1: Images, image2: Images) -> tuple[Tensor, Tensor]:
     """The uncertainty of a flow (B, 2, H, W), by whatever method.
 
-    Returns:
-        Sigma, the radius in px within which 68 % of such flows are right, at most `MAX_SIGMA_PX`; and the probability
-        that the pixel's point lies in image 2. Both are (B, 1, H, W), and `MAX_SIGMA_PX` and 0 where the flow is NaN.
+    Sigma, the radius in px within which 68 % of such flows are right, at most `MAX_SIGMA_PX`; and the probability that
+    the pixel's point lies in image 2. Both are (B, 1, H, W), and `MAX_SIGMA_PX` and 0 where the flow is NaN.
     """
     with torch.no_grad(), torch.autocast(flow.device.type, enabled=False):
         known, flow = flow.isfinite().all(dim=1, keepdim=True), flow.float().nan_to_num()

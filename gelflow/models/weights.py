@@ -55,8 +55,7 @@ def read_metadata(path: Path) -> dict[str, str]:
 def load_weights(path: Path, device: str = "cpu") -> GelFlow:
     """Builds the network that a file describes, with the file's weights, in evaluation mode.
 
-    Raises:
-        InputError: No such file, not a safetensors file, damaged, or weights of another model.
+    InputError for no such file, not a safetensors file, a damaged one, or weights of another model.
     """
     metadata, tensors = _read(path)
     try:

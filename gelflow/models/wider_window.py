@@ -32,16 +32,11 @@ FLAT = 0.04
 
 
 def best_window(flow: Flow, variance: Tensor, texture: Tensor, window_px: float) -> tuple[Flow, Tensor]:
-    """Smooths a flow (B, 2, H, W) where that makes it more precise.
+    """Smooths a flow (B, 2, H, W) where that makes it more precise; the flow, and its mean square error, px^2.
 
-    Args:
-        flow: Found by two steps in a window of `window_px`.
-        variance: Of its noise, both components together, (B, 1, H, W) px^2.
-        texture: Sum of the squares of the gradient in the window, (B, 1, H, W).
-        window_px: Standard deviation.
-
-    Returns:
-        The flow, and its mean square error, px^2.
+    It was found by two steps in a window of the standard deviation `window_px`. `variance` is that of its noise, both
+    components together, (B, 1, H, W) px^2; `texture` is the sum of the squares of the gradient in the window, (B, 1, H,
+    W).
     """
     variance, weight = variance.clamp(min=MIN_VARIANCE), texture.clamp(min=0) + FLAT
     least, error = torch.ones_like(variance), variance

@@ -1,4 +1,4 @@
-"""Scales: images and flows halved or enlarged by exact powers of two.
+"""Images and flows of another size, and at scales, by exact powers of two.
 
 Scale s has ceil(H / 2^s) rows and ceil(W / 2^s) columns; its pixel (c, r) covers columns [2^s c, 2^s (c + 1)) of the
 image, the last one possibly only in part. Lengths shrink by exactly 2^s, whatever H and W are, so no size needs to be
@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gelflow.arrays import Features, Flow
+from gelflow.arrays import Features, Flow, Images
 
 
 def halve(image: Features) -> Features:
@@ -55,3 +55,23 @@ def enlarge_flow(flow: Flow, octaves: int, size: tuple[int, int]) -> Flow:
     factor = 2**octaves
     finer: Tensor = F.interpolate(flow, scale_factor=float(factor), mode="bilinear", align_corners=False)
     return factor * finer[..., : size[0], : size[1]]
+
+
+def resize_images(images: Images, size: tuple[int, int]) -> Images:
+    """Images of another size: bilinear between pixel centres, low-pass filtered first where they shrink."""
+    if (images.shape[-2], images.shape[-1]) == size:
+        return images
+    resized: Tensor = F.interpolate(images, size=size, mode="bilinear", align_corners=False, antialias=True)
+    return resized
+
+
+def resize_flow(flow: Flow, size: tuple[int, int]) -> Flow:
+    """A flow for images of another size: bilinear between pixel centres, U and V each scaled with its own side.
+
+    A pixel that touches a NaN of the given flow becomes NaN.
+    """
+    height, width = flow.shape[-2:]
+    if (height, width) == size:
+        return flow
+    u, v = F.interpolate(flow, size=size, mode="bilinear", align_corners=False).unbind(dim=1)
+    return torch.stack([u * (size[1] / width), v * (size[0] / height)], dim=1)

@@ -48,13 +48,8 @@ def warp(image: Features, flow: Flow, mode: Literal["bilinear", "spline"] = "bil
     In float32 the sampling position is rounded to about 1e-7 of the image's width (3e-5 px at 640 px). Where the flow
     is not finite the result is NaN; `grid_sample` itself would crash the process there, on a CPU, in its gradient.
 
-    Args:
-        image: The second image or its features, (B, C, H, W).
-        flow: (B, 2, H, W), px of this image.
-        mode: "bilinear", or "spline" (cubic, see `gelflow.ops.spline`), which overshoots at edges.
-
-    Returns:
-        (B, C, H, W), dtype of the flow.
+    The image, or its features, is (B, C, H, W), and so is the result, in the flow's dtype; the flow is (B, 2, H, W), px
+    of this image. Mode "spline" (cubic, see `gelflow.ops.spline`) overshoots at edges.
     """
     height, width = flow.shape[-2:]
     x, y = positions(flow).unbind(dim=1)

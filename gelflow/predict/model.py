@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gelflow.arrays import Bytes3, Flow, FlowArray, ImageArray, Images, MapArray
 from gelflow.baselines.learned import Learned
-from gelflow.baselines.tensors import uncertainty
+from gelflow.baselines.method import uncertainty
 from gelflow.config import Registration
 from gelflow.errors import InputError
 from gelflow.models.estimate import estimate_flow
@@ -17,12 +17,10 @@ from gelflow.models.weights import SHIPPED, weights_file
 
 
 class Estimate(NamedTuple):
-    """A flow (H, W, 2) and how certain it is, both (H, W) float32.
+    """A flow (H, W, 2) px, see `FlowModel.flow`, and how certain it is, both (H, W) float32.
 
-    Attributes:
-        flow: px, see `FlowModel.flow`.
-        sigma: Radius in px within which 68 % of such flows are right; at most 10.
-        visible: Probability that the pixel's point is seen in image 2.
+    Sigma is the radius in px within which 68 % of such flows are right, at most 10; `visible` the probability that the
+    pixel's point is seen in image 2.
     """
 
     flow: FlowArray

@@ -85,10 +85,8 @@ def draw_overlay(frame: Bytes3, flow: FlowArray, scale_px: float) -> Bytes3:
     """A frame of an overlay video: arrows on the frame at the left, colours with their legend at the right.
 
     An arrow starts where the gel was in the reference frame and ends where it is in this frame. Arrows are as long as
-    the motion; where the scale is below 3 px they are enlarged, by a factor that is written on the frame.
-
-    Returns:
-        uint8 RGB, twice as wide as the frame, enlarged to at least 480 rows, both sides even (as video encoders ask).
+    the motion; where the scale is below 3 px they are enlarged, by a factor that is written on the frame. The picture
+    is uint8 RGB, twice as wide as the frame, enlarged to at least 480 rows, both sides even (as video encoders ask).
     """
     import cv2
 

@@ -13,12 +13,10 @@ from typing import Literal
 import numpy as np
 
 from gelflow.arrays import Bytes3, ImageArray
-from gelflow.baselines.method import Method
-from gelflow.baselines.tensors import uncertainty
+from gelflow.baselines.method import Method, uncertainty
 from gelflow.errors import InputError
 from gelflow.files.atomic import refuse_foreign, replacing
-from gelflow.files.exr import DIRECTIONS, read_flow, write_flow
-from gelflow.files.flo import write_flo
+from gelflow.files.exr import DIRECTIONS, read_flow, write_flo, write_flow
 from gelflow.files.image import read_pair
 from gelflow.files.quiet import quiet
 from gelflow.files.video import describe, frame_file, frames, image_files
@@ -56,11 +54,8 @@ class Prediction:
 def predict_pair(method: Method, path1: Path, path2: Path, out: Path) -> Prediction:
     """Writes NAME.exr, NAME.flo and NAME.png, the flow from the first image to the second; replaces an earlier run's.
 
-    NAME is what the two file names have in front of _1 and _2, else FIRST_to_SECOND.
-
-    Raises:
-        InputError: An image cannot be read, the two do not fit, or files of these names are somebody else's.
-        OSError: A file cannot be written.
+    NAME is what the two file names have in front of _1 and _2, else FIRST_to_SECOND. InputError where an image cannot
+    be read, the two do not fit, or files of these names are somebody else's; OSError where a file cannot be written.
     """
     image1, image2 = read_pair(path1, path2)
     stem1, stem2 = path1.stem, path2.stem
@@ -90,12 +85,8 @@ def predict_video(
 
     Every `every`-th frame of a video file or a folder of images is taken; the flow leads to it from the first one or
     from its predecessor. `progress` is called with the number of frames done and to be done; each counts twice, for
-    flow and overlay.
-
-    Raises:
-        InputError: The video does not open, fewer than two frames decode, a frame cannot be used, or files of these
-            names are somebody else's.
-        OSError: A file cannot be written.
+    flow and overlay. InputError where the video does not open, fewer than two frames decode, a frame cannot be used, or
+    files of these names are somebody else's; OSError where a file cannot be written.
     """
     if every < 1:
         raise InputError(f"every = {every}: at least 1 is needed")

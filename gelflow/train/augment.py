@@ -30,16 +30,10 @@ UNCHANGED = np.array([1, 0, 0, 1, 1, 0, 0, 1, 0, 0, 1, 1, 1, 1, 1], np.float32)
 
 
 def augmented(batch: dict[str, Any], config: TrainConfig, randoms: Sequence[np.random.Generator]) -> dict[str, Any]:
-    """The batch after the augmentation that the configuration asks for.
+    """A new batch, after the augmentation that `motion`, `flip` and `color_jitter` of the configuration ask for.
 
-    Args:
-        batch: image1, image2 (B, 3, H, W); bare, whose gels have no pattern; perhaps flow (B, 2, H, W) px, NaN where
-            unknown.
-        config: Its `motion`, `flip` and `color_jitter` count.
-        randoms: A source of random numbers for each pair.
-
-    Returns:
-        A new batch; what is not named above is passed on.
+    It holds image1, image2 (B, 3, H, W); bare, whose gels have no pattern; perhaps flow (B, 2, H, W) px, NaN where
+    unknown; what else it holds is passed on. There is a source of random numbers for each pair.
     """
     new = dict(batch)
     sampled = [

@@ -19,8 +19,7 @@ from gelflow.config import MINIMUM_SIDE, TrainConfig
 from gelflow.errors import InputError
 from gelflow.losses import flow_loss, self_supervised_loss
 from gelflow.losses.augmentation_consistency import consistency_loss, transformed_pair
-from gelflow.losses.occlusion import visible_in_both_images
-from gelflow.losses.photometric import photometric_loss
+from gelflow.losses.photometric import photometric_loss, visible_in_both_images
 from gelflow.models import GelFlow
 from gelflow.models.estimate import estimate_flow
 from gelflow.models.recorded import GraphedNetwork
@@ -45,9 +44,7 @@ def learning_rate_factor(config: TrainConfig, step: int) -> float:
 class FlowModule(L.LightningModule):
     """Training of one network, from the state that it has after `start` steps, with optimiser and moving average.
 
-    Attributes:
-        metrics: Results of the last validation, see `validation_metrics`.
-        last_loss: Loss of the last step, detached.
+    It holds the results of the last validation, see `validation_metrics`, and the loss of the last step, detached.
     """
 
     def __init__(
@@ -216,9 +213,8 @@ def check_side(batch: dict[str, Any], config: TrainConfig) -> None:
 def validation_metrics(batch: dict[str, Any], flow: Tensor, config: TrainConfig) -> dict[str, Tensor]:
     """How good the flow of one pair is: against the truth where there is one, and by the warped image.
 
-    Returns:
-        Scalars by the names in `METRICS`; endpoint errors only where a flow is known. PSNR is that of floats over the
-        pixels that stay inside the image, not the 8-bit one of the comparison tables.
+    Scalars by the names in `METRICS`; endpoint errors only where a flow is known. PSNR is that of floats over the
+    pixels that stay inside the image, not the 8-bit one of the comparison tables.
     """
     image1, image2 = batch["image1"], batch["image2"]
     still = torch.zeros_like(flow)

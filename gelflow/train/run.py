@@ -25,13 +25,19 @@ from gelflow.hardware import chosen_device
 from gelflow.models import GelFlow
 from gelflow.models.weights import load_weights, save_weights
 from gelflow.terminal import progress
-from gelflow.train.callback import CheckpointCallback, Stopped, describe, is_first_process, stopping, weights_metadata
-from gelflow.train.loading import end_with_run, loading_context
+from gelflow.train.callback import (
+    CheckpointCallback,
+    Stopped,
+    describe,
+    is_first_process,
+    peak_memory_mib,
+    stopping,
+    weights_metadata,
+)
+from gelflow.train.loading import ResidentPairs, end_with_run, loading_context, resident
 from gelflow.train.module import FlowModule, check_side
-from gelflow.train.resident import ResidentPairs, resident
 from gelflow.train.samples import CheckedPairs, StepSampler, TrainingSamples, augmented_batch, checked, collate
 from gelflow.train.state import STATE, WEIGHTS, State, load_state, open_run
-from gelflow.train.throughput import peak_memory_mib
 
 
 @dataclass(frozen=True)

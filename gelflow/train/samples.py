@@ -14,7 +14,7 @@ from torch.utils.data import Dataset, Sampler
 
 from gelflow.config import MINIMUM_SIDE, TrainConfig
 from gelflow.errors import InputError
-from gelflow.ops.resize import resize_flow, resize_images
+from gelflow.ops.pyramid import resize_flow, resize_images
 from gelflow.train.augment import augmented
 
 Sample = dict[str, Any]

@@ -65,18 +65,12 @@ def load_state(out: Path) -> State:
 def open_run(
     out: Path, config: TrainConfig, data: Mapping[str, int | str | None], initial: Path | None, resume: bool
 ) -> State | None:
-    """Claims the folder for a new run, or checks that it holds this very run.
+    """Claims the folder for a new run, or checks that it holds this very run; the state to resume from, None for a new.
 
     `data` is what is known of the data sets: `pairs` and `validation_pairs` (0 without), their numbers, and
     `training_pairs_sha256` and `validation_pairs_sha256`, digests of their names, scenes and seeds (None where a data
-    set has none). `initial` are the weights that the run starts from.
-
-    Returns:
-        The state to resume from; None for a new run.
-
-    Raises:
-        InputError: A folder that holds a run, or a `RUN` from elsewhere, although resume is False; none, or another
-            run, although it is True.
+    set has none). `initial` are the weights that the run starts from. InputError for a folder that holds a run, or a
+    `RUN` from elsewhere, although resume is False; for none, or another run, although it is True.
     """
     record = {
         "gelflow": __version__,

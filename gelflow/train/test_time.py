@@ -73,11 +73,8 @@ def fine_tuned(method: Learned, dataset: PairDataset, out: Path, steps: int) -> 
     """Trains a copy of a network on the pairs of a comparison; its name ends with "+ft".
 
     A run of the same settings in the folder `out` is resumed, or used if it is finished. It is the same run however the
-    flow is registered.
-
-    Raises:
-        InputError: The pairs differ in size and the network has none of its own; see also `fine_tuning_settings` and
-            `gelflow.train.train`.
+    flow is registered. InputError where the pairs differ in size and the network has none of its own; see also
+    `fine_tuning_settings` and `gelflow.train.train`.
     """
     from gelflow.train import train
     from gelflow.train.state import STATE

@@ -7,10 +7,9 @@ import numpy as np
 
 from synth.arrays import BoolArray, FloatArray
 from synth.mesh import flat_surface
-from synth.render.camera_image import expected_signal
+from synth.render.camera_image import encoded, expected_signal
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
-from synth.render.sample_count import encoded
 from synth.render.variant import Variant
 from synth.scene import Dots, Render, Sensor
 
@@ -20,12 +19,9 @@ AMPLIFIED = 8
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """A frame and the sensor's picture of it, both (H, W, 3) in [0, 1], encoded.
+    """A frame and the sensor's picture of it without noise and quantisation, both (H, W, 3) in [0, 1], encoded.
 
-    Attributes:
-        frame: real.
-        rendered: without noise and quantisation.
-        outside: (H, W) pixels without dots in either picture.
+    `outside` (H, W) are the pixels without dots in either picture.
     """
 
     frame: FloatArray

@@ -44,14 +44,11 @@ class DotGridFit:
 
 
 def fit_dot_grid(sensor: Sensor, pattern: Dots, centres: Pixels, spacing_mm: float | None) -> DotGridFit:
-    """Fit the grid, and the camera as far as the grid tells.
+    """Fit the grid, and the camera as far as the grid tells; InputError where dots at `centres` (n, 2) px form none.
 
     A flat grid fixes the ratio of spacing and focal length alone. So either the spacing is known and the focal lengths
     are found, or the camera's scale is taken from the preset and the spacing is found. Principal point, tilt and the
     distortion k1 are weakly determined and held near the preset by a prior. The preset's camera has the frame's size.
-
-    Raises:
-        InputError: the dots, at `centres` (n, 2) px, form no grid.
     """
     from scipy.optimize import least_squares
 

@@ -16,13 +16,10 @@ _CLEAREST = 0.75
 
 @dataclass(frozen=True, eq=False)
 class FoundDots:
-    """Dots that lie wholly in the image.
+    """Dots that lie wholly in the image: centres (n, 2) px of contrast to the coating, and radii (n,) px.
 
-    Attributes:
-        centres: (n, 2) px, centroids of contrast to the coating.
-        radii: (n,) px, of disks of the same integrated contrast.
-        ratio: (H, W, 3) linear brightness over that of the coating around.
-        covered: (H, W) whether a pixel may hold some of a dot, at the image's border as well.
+    The radii are of disks of the same integrated contrast. `ratio` (H, W, 3) is the linear brightness over that of the
+    coating around; `covered` (H, W) whether a pixel may hold some of a dot, at the image's border as well.
     """
 
     centres: Pixels

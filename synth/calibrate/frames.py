@@ -15,12 +15,9 @@ _SAME = 6.0
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """What the frames show together.
+    """What the frames show together: (H, W, 3) float64 RGB in [0, 1], the mean of all, and one with all of its noise.
 
-    Attributes:
-        encoded: (H, W, 3) float64 RGB in [0, 1], the mean of all frames.
-        single: (H, W, 3) the first of them, with all of its noise.
-        step: of one level of quantisation, full scale 1.
+    `step` is that of one level of quantisation, full scale 1.
     """
 
     encoded: FloatArray

@@ -9,7 +9,7 @@ each light's rectangle and nothing else. For a light of power 1 and colour white
 with the coating's BSDF f (Mitsuba's), θ at the face and θ' at the light, which is Lambertian for k = 0. The midpoint
 rule on a grid over the rectangle evaluates it: no noise, and the same radiometry as the renderer's, with the shade that
 one light throws on another. The light's mirror image behind the window adds its own integral
-(`synth.render.window_images`), without shade. A matt gel lights itself once by way of the window, as if by its mirror
+(`synth.render.lights`), without shade. A matt gel lights itself once by way of the window, as if by its mirror
 image: with the radiance L of patches of area A, their reflectance ρ, and the image at the height 2 Z,
 
 .. math::  L_{returned}(x) = \frac{ρ}{\pi} \sum_{y} A L(y) R(\theta) \frac{(2 Z)^2}{|x - y'|^4} .
@@ -28,8 +28,8 @@ from synth.arrays import FloatArray, Pixels
 from synth.render.camera_rays import CameraRays
 from synth.render.coating import coat
 from synth.render.gel_mesh import MIRROR
+from synth.render.lights import reflectance, reflecting_plane
 from synth.render.variant import Variant
-from synth.render.window_images import reflectance, reflecting_plane
 from synth.scene import Light, Sensor
 
 _CELLS = 24
@@ -45,13 +45,9 @@ _NUMBERS = (*((part, axis) for part in (0, 1) for axis in range(3)), (2, 0), (2,
 
 @dataclass(frozen=True, eq=False)
 class LightGeometry:
-    """Where m lights are, how they are turned and how widely they shine.
+    """Where m lights are, how they are turned and how widely they shine, float64.
 
-    Attributes:
-        centre: (m, 3) float64 mm.
-        direction: (m, 3) float64, of any length; need not be unit vectors.
-        size: (m, 2) float64 mm.
-        viewing_angle_deg: (m, 1) float64.
+    Centres (m, 3) and sizes (m, 2) are in mm, directions (m, 3) of any length, viewing angles (m, 1).
     """
 
     centre: FloatArray
@@ -67,12 +63,9 @@ class LightGeometry:
 
 
 class FlatGel:
-    """Pixels of the undeformed gel, ready to be lit.
+    """Pixels of the undeformed gel, ready to be lit: their centres (n, 2) float64 px see its face.
 
-    Args:
-        sensor: camera, window and coating; its pattern and lights do not enter.
-        pixels: (n, 2) float64 px, centres of pixels of the main camera that see the contact face.
-        variant: a vectorised one.
+    Of the sensor camera, window and coating count, not its pattern and lights; the variant is a vectorised one.
     """
 
     def __init__(self, sensor: Sensor, pixels: Pixels, variant: Variant) -> None:

@@ -40,13 +40,10 @@ INDEPENDENT = 300.0
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """What the lights are to explain, at n pixels.
+    """What the lights are to explain, at n pixels, with the camera's exposure as gain.
 
-    Attributes:
-        signal: (n, 3) linear, full scale 1.
-        slope: (n, 3) derivative of the encoded value with respect to the linear one.
-        gain: exposure.
-        corner: (n,) squared distance from the principal point over that of the farthest corner.
+    Signals (n, 3) are linear, full scale 1, with the slope (n, 3) of the encoded value by the linear one; `corner` (n,)
+    is the squared distance from the principal point over that of the farthest corner.
     """
 
     signal: FloatArray
@@ -61,14 +58,9 @@ Bounds: TypeAlias = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class LightFit:
-    """What was found.
+    """The lights' geometry and powers (m, 3) per channel, and the camera's vignetting, found in so many steps.
 
-    Attributes:
-        geometry: of the lights.
-        powers: (m, 3) per channel.
-        vignetting: of the camera.
-        residual: root mean square, encoded, full scale 1.
-        steps: Gauss-Newton steps taken.
+    The residual is the root mean square, encoded, full scale 1.
     """
 
     geometry: LightGeometry
@@ -81,16 +73,11 @@ class LightFit:
 def fit_lights(
     gel: FlatGel, target: Target, start: LightGeometry, shines: BoolArray, vignetting: float, bounds: Bounds, steps: int
 ) -> LightFit:
-    """Fit powers, geometry and vignetting.
+    """Fit powers, geometry and vignetting to a target at the pixels of a gel.
 
-    Args:
-        gel: the pixels.
-        target: at the same pixels.
-        start: geometry to start from; its distance is what the prior penalises.
-        shines: (m, 3) channels in which each light may have power.
-        vignetting: of the camera at the start.
-        bounds: for the centres.
-        steps: at most so many Gauss-Newton steps; 0 fits the powers alone.
+    The geometry starts from `start`, the distance from which is what the prior penalises, and keeps its centres in
+    bounds. `shines` (m, 3) are the channels in which each light may have power. At most so many Gauss-Newton steps are
+    taken; 0 fits the powers alone.
     """
     problem = _Problem(gel, target, start, shines, vignetting)
     if steps == 0:

@@ -16,13 +16,10 @@ _FEWEST = 100
 
 
 def fit_noise(encoded: FloatArray, bare: BoolArray, gamma: float, step: float) -> tuple[float, float]:
-    """Read and shot noise of `synth.scene.Camera`.
+    """Read and shot noise of `synth.scene.Camera` from one frame (H, W, 3) in [0, 1].
 
-    Args:
-        encoded: (H, W, 3) one frame in [0, 1].
-        bare: (H, W) pixels whose neighbourhood shows nothing but smooth coating.
-        gamma: of the camera's response.
-        step: of one level of quantisation.
+    `bare` (H, W) are pixels whose neighbourhood shows nothing but smooth coating, `step` is that of one level of
+    quantisation.
     """
     import cv2
     from scipy.optimize import nnls

@@ -20,13 +20,10 @@ _BIN_PX = 0.25
 
 @dataclass(frozen=True, eq=False)
 class DotProfile:
-    """What all dots have in common.
+    """What all dots have in common: their disks' radius, and its relative standard deviation.
 
-    Attributes:
-        radius_px: of the disk.
-        radius_jitter: relative standard deviation of the dots' radii.
-        spread_px: standard deviation of point spread, pixel and soft edge together.
-        ratio: (3,) reflectance of a dot over the coating's.
+    `spread_px` is the standard deviation of point spread, pixel and soft edge together; `ratio` (3,) a dot's
+    reflectance over the coating's.
     """
 
     radius_px: float

@@ -49,10 +49,8 @@ def fit_sensor(start: Sensor, frames: Frames, variant: Variant, spacing_mm: floa
     """Fit everything that undeformed frames tell.
 
     The preset's camera has the frames' size. Without the spacing of the dots' columns its field of view is trusted. The
-    lights' geometry takes at most `steps` steps. The variant is a vectorised one.
-
-    Raises:
-        InputError: no dots, or no grid, where the preset has some; nothing that tells of the lights; overexposure.
+    lights' geometry takes at most `steps` steps. The variant is a vectorised one. InputError for no dots, or no grid,
+    where the preset has some; for nothing that tells of the lights; and for overexposure.
     """
     gamma = start.camera.gamma
     linear = frames.encoded**gamma

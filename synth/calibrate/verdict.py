@@ -26,14 +26,10 @@ ALLOWED_OFF_GRID = 0.015
 
 @dataclass(frozen=True)
 class Verdict:
-    """What `synth calibrate` ends with.
+    """What `synth calibrate` ends with: a fit is good where no reason speaks against it.
 
-    Attributes:
-        good: no reason speaks against the fit.
-        residual_levels: largest mean absolute difference of all frames outside the dots, by channel, of 255.
-        allowed_levels: the most that is good.
-        reasons: against the fit.
-        cannot_tell: what such frames leave to the preset.
+    Residuals are the largest mean absolute difference of all frames outside the dots, by channel, of 255. `cannot_tell`
+    is what such frames leave to the preset.
     """
 
     good: bool

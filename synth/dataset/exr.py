@@ -3,7 +3,8 @@
 Channels (of two directions, both read `I1(x) = I2(x + forward(x))`, `I2(x) = I1(x + backward(x))`):
 
     forward.U forward.V forward.visible   backward.U backward.V backward.visible
-    and by name whatever FlowField.extras holds: see `synth.dataset.exr_channels`
+    and by name whatever FlowField.extras holds: see `OPTIONAL`; vectors are in the scene's frame (dataset.json:
+    conventions.frame), "in image 1" is at the pixels of image 1
     R G B    the same numbers as forward.U forward.V forward.visible once more
 
 U is right, V is down, px at the pixel's centre (c + 0.5, r + 0.5); NaN where the pixel sees no gel. R, G, B are there
@@ -18,14 +19,13 @@ Reference: OpenEXR file layout, https://openexr.com/en/latest/OpenEXRFileLayout.
 import contextlib
 import io
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.dataset.exr_channels import meanings
 from synth.errors import InputError
 from synth.flow.field import FlowArray, FlowField
 
@@ -38,9 +38,41 @@ CONVENTIONS = {
     "flow.nan": "the pixel sees no gel",
     "flow.aliases": "R = forward.U, G = forward.V, B = forward.visible",
 }
-"""Header attributes of every file; those of optional channels come beside them (`synth.dataset.exr_channels`)."""
+"""Header attributes of every file; those of optional channels come beside them."""
 
 _PARTS = ("U", "V", "visible")
+
+
+def _vector(name: str) -> tuple[str, ...]:
+    return tuple(f"{name}.{axis}" for axis in "XYZ")
+
+
+OPTIONAL: dict[str, tuple[tuple[str, ...], str]] = {
+    "depth": (
+        ("depth1.Z", "depth2.Z"),
+        "mm; distance of the surface point from the camera along its viewing axis, straight through the window; "
+        "1 in image 1, 2 in image 2",
+    ),
+    "normal": (
+        _vector("normal1") + _vector("normal2"),
+        "unit vector, frame of the scene; from the surface into the gel; 1 in image 1, 2 in image 2",
+    ),
+    "displacement": (
+        _vector("displacement"),
+        "mm, frame of the scene; place in image 2's state less that in image 1's; in image 1",
+    ),
+    "traction": (
+        _vector("traction"),
+        "MPa, frame of the scene; force of the indenter on the gel per undeformed area, in image 2's state; in image 1",
+    ),
+    "contact": (("contact.Y",), "1 where the indenter touches in image 2's state, else 0; in image 1"),
+}
+"""Names of channels, and their unit, frame, state and image, by the key of `[outputs]` that asks for them."""
+
+
+def meanings(written: Collection[str]) -> dict[str, str]:
+    """Header attributes for the optional channels among those that a file holds."""
+    return {f"channels.{key}": meaning for key, (names, meaning) in OPTIONAL.items() if set(names) <= set(written)}
 
 
 def write_flow(path: Path, flow: FlowField, attributes: Mapping[str, str | int]) -> None:
@@ -125,8 +157,7 @@ def _silenced() -> Iterator[None]:
 def read_channels(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str | int]]:
     """All channels (H, W) by name, float32 in a file of ours, and the header's text and integer attributes.
 
-    Raises:
-        InputError: The file is missing, no OpenEXR image, truncated or damaged, or its channels differ in size.
+    InputError where it is missing, no OpenEXR image, truncated or damaged, or its channels differ in size.
     """
     import OpenEXR
 

@@ -30,9 +30,8 @@ def encode_png(image: Raster) -> bytes:
 def read_png(path: Path) -> Raster:
     """The image in a PNG file, as it was given to `encode_png`.
 
-    Raises:
-        InputError: The file is missing, is no PNG, is truncated or damaged (each chunk's checksum is tested), or holds
-            something other than grey or RGB.
+    InputError where it is missing, is no PNG, is truncated or damaged (each chunk's checksum is tested), or holds
+    something other than grey or RGB.
     """
     import cv2
     from PIL import Image, UnidentifiedImageError

@@ -83,14 +83,11 @@ def check_record(record: dict[str, Any], where: str) -> dict[str, Any]:
 
 
 def refuse_another_job(job: Job, record: Mapping[str, Any], where: str) -> None:
-    """Compares a job with the dataset.json of a place.
+    """Compares a job with the dataset.json of a place; InputError says in what they differ.
 
     The scene (by its digest), the seed and the device make a job: each changes pixels, the device by its own rounding
     and sequence of random numbers. n does not, since a sample does not depend on it. Versions of software are recorded,
     not compared.
-
-    Raises:
-        InputError: They differ; the message says in what.
     """
     different = []
     if job.scene_hash != record["scene_hash"]:

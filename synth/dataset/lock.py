@@ -53,12 +53,9 @@ class DirectoryLock:
     def join(self, shard: Shard | None) -> Iterator[bool]:
         """Takes the dataset alone, or a shard beside others; within, no other shard comes or goes.
 
-        Yields:
-            Whether nobody else is writing, so that the files of all may be put in order.
-
-        Raises:
-            InputError: A plain run writes the dataset, or another process this shard, or any where `shard` is None; or
-                the file system offers no locks.
+        Yields whether nobody else is writing, so that the files of all may be put in order. InputError where a plain
+        run writes the dataset, or another process this shard, or any where `shard` is None; or the file system offers
+        no locks.
         """
         if shard is None:
             if not self._take(WHOLE):
@@ -78,8 +75,7 @@ class DirectoryLock:
     def leave(self, shard: Shard | None) -> Iterator[bool]:
         """Ends a shard's part in the dataset; within, no other shard comes or goes.
 
-        Yields:
-            Whether nobody else is writing: always for a plain run, which keeps the dataset until `release`.
+        Yields whether nobody else is writing: always for a plain run, which keeps the dataset until `release`.
         """
         if shard is None:
             yield True

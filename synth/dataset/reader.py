@@ -14,8 +14,16 @@ from synth.dataset.exr import read_flow
 from synth.dataset.images import Raster, read_png
 from synth.dataset.job import read_job_record
 from synth.dataset.jsontext import read_document
-from synth.dataset.lines import LineTable, read_line, scan_lines
-from synth.dataset.manifest import FAILURES_FILE, MANIFEST_FILE, ManifestEntry, failure_key, manifest_key
+from synth.dataset.manifest import (
+    FAILURES_FILE,
+    MANIFEST_FILE,
+    LineTable,
+    ManifestEntry,
+    failure_key,
+    manifest_key,
+    read_line,
+    scan_lines,
+)
 from synth.dataset.npz import read_npz
 from synth.dataset.sample import SAMPLES_FOLDER, CameraPair, further_cameras, sample_name
 from synth.errors import InputError
@@ -77,11 +85,8 @@ class SampleData(CameraPair):
 class Dataset:
     """A dataset directory as it was when it was opened; iterating reads its finished samples one by one.
 
-    Methods raise InputError for a sample or camera that is not there, and for a file that is missing or damaged.
-
-    Attributes:
-        path: the directory.
-        info: dataset.json.
+    Methods raise InputError for a sample or camera that is not there, and for a file that is missing or damaged. `path`
+    is the directory, `info` its dataset.json.
     """
 
     path: Path

@@ -31,11 +31,9 @@ def further_cameras(scene: Mapping[str, Any]) -> list[str]:
 
 @dataclass(frozen=True)
 class CameraPair:
-    """What one camera contributes to a sample.
+    """What one camera contributes to a sample: its flow (H, W), in both directions, with the optional channels.
 
-    Attributes:
-        image1, image2: (H, W) grey or (H, W, 3) RGB, uint8 or uint16 (full scale 65535).
-        flow: (H, W) fields, in both directions, and the optional channels.
+    Images are (H, W) grey or (H, W, 3) RGB, uint8 or uint16 (full scale 65535).
     """
 
     image1: Raster

@@ -22,19 +22,10 @@ from synth.dataset.store import Output, Store
 def write_sample_files(out: Output, sample: Sample, job: Job) -> ManifestEntry:
     """Writes samples/NNNNNN, in a directory whole or not at all; equal samples give equal bytes (without times).
 
-    An older folder of that number is replaced: without a line in the manifest it counts as unfinished.
-
-    Args:
-        out: the dataset, opened by a `DatasetWriter` of some process. Under a URL the files are made in a folder of
-            this machine's temporary space and copied.
-        sample: what to write.
-        job: for the header of flow.exr.
-
-    Returns:
-        What `DatasetWriter.record` appends to the manifest.
-
-    Raises:
-        InputError: The storage refuses (disk full, no permission).
+    An older folder of that number is replaced: without a line in the manifest it counts as unfinished. The dataset was
+    opened by a `DatasetWriter` of some process; under a URL the files are made in a folder of this machine's temporary
+    space and copied. The job is for the header of flow.exr. Returns what `DatasetWriter.record` appends to the
+    manifest. InputError where the storage refuses (disk full, no permission).
     """
     store, name = Store(out), f"{SAMPLES_FOLDER}/{sample_name(sample.index)}"
     if store.directory is not None:

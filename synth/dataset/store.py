@@ -37,11 +37,8 @@ def is_shared(out: Output) -> bool:
 class Store:
     """Files or objects by their name in a dataset, such as "samples/000000/meta.json".
 
-    Every method raises InputError where the storage refuses.
-
-    Attributes:
-        out: the place, for messages.
-        directory: the same where it is a local directory, else None.
+    Every method raises InputError where the storage refuses. `out` is the place, for messages; `directory` the same
+    where it is a local directory, else None.
     """
 
     def __init__(self, out: Path | str) -> None:

@@ -29,15 +29,24 @@ from typing import Any, Self
 
 from synth.dataset.job import DATASET_FILE, Job, check_record, continued, refuse_another_job
 from synth.dataset.jsontext import parse_document, to_document, to_line
-from synth.dataset.lines import append_line, merge_lines, scan_lines
 from synth.dataset.lock import LEASES_FOLDER, LOCK_FILE, DirectoryLock, Lease
-from synth.dataset.manifest import FAILURES_FILE, MANIFEST_FILE, ManifestEntry, failure_key, manifest_key
+from synth.dataset.manifest import (
+    FAILURES_FILE,
+    MANIFEST_FILE,
+    SUMMARY_FILE,
+    ManifestEntry,
+    append_line,
+    failure_key,
+    manifest_key,
+    merge_lines,
+    scan_lines,
+    summary_document,
+)
 from synth.dataset.sample import SAMPLE_FILES, SAMPLES_FOLDER, VIEW_FILES, Sample, further_cameras, sample_name
 from synth.dataset.sample_files import write_sample_files
 from synth.dataset.shard import Shard
 from synth.dataset.storage import PARTIAL, remove_partials, storage_errors
 from synth.dataset.store import MESHES_FOLDER, Store, mesh_folder
-from synth.dataset.summary import SUMMARY_FILE, summary_document
 from synth.errors import InputError
 
 SHARDS_FOLDER = "shards"

@@ -10,12 +10,16 @@ that in which triangles are met, so results are the same in every run. Edge-on t
 neighbours' edges are.
 """
 
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
-from synth.arrays import Points, Triangles
-from synth.flow.hits import Hits, as_warp
+from synth.arrays import FloatArray, Points, Triangles
 
+wp.config.log_level = wp.LOG_WARNING
 wp.set_module_options({"enable_backward": False})
 
 _MARGIN = 1e-5
@@ -24,17 +28,60 @@ _TRIANGLES_PER_LEAF = 4
 """Of the tree. It changes the time and no bit of a result."""
 
 
+@dataclass(frozen=True)
+class Hits:
+    """Nearest hits of n rays: triangles, barycentric weights (n, 3) of their vertices, mm along the unit directions.
+
+    Where nothing is hit these are -1, NaN and infinite.
+    """
+
+    triangle: NDArray[np.int32]
+    barycentric: FloatArray
+    distance: FloatArray
+
+    def interpolate(self, triangles: Triangles, values: FloatArray) -> FloatArray:
+        """Values (n, c) at the hits from values (v, c) at the vertices; NaN where nothing is hit."""
+        rays = len(self.triangle)
+        found = wp.empty((rays, values.shape[1]), dtype=wp.float64, device="cpu")
+        given = (
+            (self.triangle, np.int32, wp.int32),
+            (self.barycentric, np.float64, wp.vec3d),
+            (triangles, np.int32, wp.int32),
+            (values, np.float64, wp.float64),
+        )
+        inputs = [as_warp(array, kind, element) for array, kind, element in given]
+        wp.launch(_interpolate, dim=rays, inputs=inputs, outputs=[found], device="cpu")
+        return np.asarray(found.numpy())
+
+
+def as_warp(array: Any, kind: type, element: Any) -> Any:
+    """A Warp array in the caller's own memory, which kernels only read."""
+    return wp.array(np.ascontiguousarray(array, dtype=kind), dtype=element, device="cpu", copy=False)
+
+
+@wp.kernel
+def _interpolate(
+    triangle: wp.array[wp.int32],
+    barycentric: wp.array[wp.vec3d],
+    corners: wp.array2d[wp.int32],
+    values: wp.array2d[wp.float64],
+    found: wp.array2d[wp.float64],
+) -> None:
+    ray = wp.tid()
+    t, weights = triangle[ray], barycentric[ray]
+    for k in range(values.shape[1]):
+        if t < 0:
+            found[ray, k] = wp.float64(wp.nan)
+        else:
+            a, b, c = values[corners[t, 0], k], values[corners[t, 1], k], values[corners[t, 2], k]
+            found[ray, k] = weights[0] * a + weights[1] * b + weights[2] * c
+
+
 def trace(positions: Points, triangles: Triangles, origins: Points, directions: Points) -> Hits:
-    """Find where rays first meet a surface.
+    """Find where n rays first meet a surface; what lies behind their origins is not hit.
 
-    Args:
-        positions: (v, 3) float64 mm.
-        triangles: (f, 3) int32 into `positions`.
-        origins: (n, 3) float64 mm; NaN for rays that do not exist.
-        directions: (n, 3) unit; NaN as the origins.
-
-    Returns:
-        Hits of the n rays. They start at their origin: what lies behind it is not hit.
+    Positions are (v, 3) float64 mm, triangles (f, 3) int32; origins (n, 3) float64 mm and unit directions (n, 3) are
+    NaN for rays that do not exist.
     """
     rays = len(origins)
     margin = _MARGIN * max(np.abs(positions).max(), np.nanmax(np.abs(origins), initial=0.0))

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 from synth.dataset.images import encode_png
 from synth.dataset.storage import replace_file
 from synth.inspect.inspection import Inspection
-from synth.inspect.panels import CLOSURE_RANGE_PX, Arrows, Panel, panels_of
+from synth.inspect.panels import CLOSURE_RANGE_PX, Arrows, Panel, panels_of, wheel_legend
 from synth.inspect.text import COLUMNS, about_rows, facts
 from synth.inspect.view import View
-from synth.inspect.wheel import wheel_legend
 
 PAGE_MARK = "<title>synth: "
 """In each page's head."""

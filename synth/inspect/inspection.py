@@ -64,8 +64,7 @@ def evenly_spaced(total: int, count: int) -> list[int]:
 def inspect(path: Path | str, limit: int = 100) -> Inspection:
     """Looks at a dataset, of it at no more than `limit` samples, evenly spaced, a sample's folder or one flow file.
 
-    Raises:
-        InputError: Nothing that can be inspected, or a file is missing or damaged.
+    InputError for nothing that can be inspected, or a file that is missing or damaged.
     """
     place = Path(path)
     if not place.exists():
@@ -128,11 +127,10 @@ def _about(place: Path) -> tuple[dict[str, Any], list[Path]]:
 def numbers_of(view: View) -> dict[str, Any]:
     """What a view says in numbers; None where there is nothing to say it from.
 
-    Returns:
-        name, width, height, bits, forward and backward (min_px, median_px, p95_px, max_px over the pixels that see gel;
-        nan_share of all pixels; visible_share of those with gel), closure, sigma (median_px, p95_px, max_px, pixels),
-        difference (before_rmse, after_rmse as shares of full scale over visible pixels), and from a sample's meta.json
-        index, trajectory, frames, force_n, torque_nmm, solver.
+    Name, width, height, bits, forward and backward (min_px, median_px, p95_px, max_px over the pixels that see gel;
+    nan_share of all pixels; visible_share of those with gel), closure, sigma (median_px, p95_px, max_px, pixels),
+    difference (before_rmse, after_rmse as shares of full scale over visible pixels), and from a sample's meta.json
+    index, trajectory, frames, force_n, torque_nmm, solver.
     """
     height, width = view.size
     flow, meta = view.flow, view.meta

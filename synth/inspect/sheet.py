@@ -12,9 +12,8 @@ import numpy as np
 
 from synth.dataset.storage import replace_file
 from synth.inspect.inspection import Inspection
-from synth.inspect.panels import Panel, panels_of
+from synth.inspect.panels import Panel, panels_of, wheel_legend
 from synth.inspect.text import facts
-from synth.inspect.wheel import wheel_legend
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

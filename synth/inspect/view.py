@@ -30,14 +30,9 @@ META_FILE = "meta.json"
 
 @dataclass(frozen=True)
 class View:
-    """One sample, or one flow file (then there are no images and `meta` is its header).
+    """One sample, or one flow file (then there are no images and `meta` is its header, else meta.json).
 
-    Attributes:
-        name: for titles.
-        flow: (H, W) fields.
-        visible_known: False for a flow file that does not tell (an estimate).
-        image1, image2: see `synth.dataset.sample.Sample`, or None.
-        meta: meta.json, or the header's attributes.
+    `visible_known` is False for a flow file that does not tell (an estimate); the name is for titles.
     """
 
     name: str

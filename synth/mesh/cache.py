@@ -63,15 +63,9 @@ def pad_mesh(
 ) -> PadMesh:
     """The mesh of a pad, from the first folder that holds it, else made; afterwards every folder holds it.
 
-    Args:
-        gel: the pad.
-        numerics: its edge length.
-        folders: searched in order; default the user's cache.
-        scene_folder: that the gel's own files are relative to.
-
-    Raises:
-        InputError: the pad has layers, whose interfaces fTetWild does not keep as planes; a dome turns a tetrahedron
-            over.
+    Of the numerics the edge length counts. The folders are searched in order, by default the user's cache; the gel's
+    own files are relative to `scene_folder`. InputError where the pad has layers, whose interfaces fTetWild does not
+    keep as planes, or a dome turns a tetrahedron over.
     """
     if gel.layers:
         raise InputError(

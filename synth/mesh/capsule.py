@@ -21,12 +21,7 @@ ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class CapsuleFace:
-    """The shape of a capsule; see the module's docstring.
-
-    Attributes:
-        radius_mm, thickness_mm, length_mm: R, t and L.
-        holds_end: whether the ring at z = R + L is held, too.
-    """
+    """The shape of a capsule, by R, t and L of the module's docstring, and whether the ring at z = R + L is held."""
 
     radius_mm: float
     thickness_mm: float

@@ -42,11 +42,9 @@ GRAIN_MM = 2.0**-32
 
 @dataclass(frozen=True)
 class Focus:
-    """The zone to be resolved: an axis-parallel rectangle of the undeformed contact face.
+    """The zone to be resolved: an axis-parallel rectangle of the undeformed face, by its centre and half widths, mm.
 
-    Attributes:
-        centre_mm: x and y of its centre.
-        half_mm: half its width along x and along y, >= 0; a half width of 0 is a line or a point.
+    A half width of 0 is a line or a point.
     """
 
     centre_mm: tuple[float, float]
@@ -92,16 +90,11 @@ class Counts:
 def graded_box(
     size_mm: tuple[float, float, float], focus: Focus, counts: Counts, layers_mm: tuple[float, ...] = ()
 ) -> PadMesh:
-    """Mesh a box whose elements are small under the focus.
+    """Mesh a box whose elements are small under the focus, a zone of the contact face, cut off where the pad ends.
 
-    Args:
-        size_mm: edge lengths of the box.
-        focus: zone of the contact face to be resolved; what lies beyond the pad is cut off.
-        counts: numbers of elements. Equal counts, size_mm[2] and layers_mm give the same `tets` array.
-        layers_mm: thicknesses from the contact face inward; the rest of size_mm[2] is one more layer.
-
-    Raises:
-        ValueError: the layers are not positive or leave nothing of the thickness.
+    Layers have their thicknesses from the contact face inward; the rest of size_mm[2] is one more. Equal counts,
+    size_mm[2] and layers_mm give the same `tets` array. ValueError where layers are not positive or leave nothing of
+    the thickness.
     """
     x, y = (lateral_planes(size_mm[axis], focus.span(axis, size_mm[axis]), counts, axis) for axis in (0, 1))
     z, layer = _depth_planes(size_mm[2], layers_mm, counts)

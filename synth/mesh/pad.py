@@ -89,11 +89,7 @@ class PadMesh:
 
 
 def check_mesh(mesh: PadMesh) -> None:
-    """Refuse what no element can be built on.
-
-    Raises:
-        InputError: points that are not finite, an element without volume or inside out, a node of no element.
-    """
+    """Refuse, by InputError, points that are not finite, elements without volume or inside out, nodes of no element."""
     if not np.isfinite(mesh.points).all():
         raise InputError("the mesh has points that are not finite")
     corners = mesh.points[mesh.tets]

@@ -37,13 +37,7 @@ WORST_SHAPE = 0.02
 
 @dataclass(frozen=True)
 class Background:
-    """Target edge lengths for fTetWild, linear within tetrahedra.
-
-    Attributes:
-        points: (n, 3) float64 mm.
-        tets: (m, 4) int32.
-        values: (n,) float64 mm.
-    """
+    """Target edge lengths (n,) mm for fTetWild at points (n, 3) mm, linear within tetrahedra (m, 4) int32."""
 
     points: Points
     tets: Tets
@@ -84,20 +78,12 @@ def tetrahedralise(
 ) -> tuple[Points, Tets]:
     """Mesh what a closed surface encloses, with the vertices of its boundary moved onto the shape that it stands for.
 
-    Args:
-        corners: (n, 3) mm of the surface.
-        faces: (m, 3) its triangles.
-        sides: the parts of the shape, each as the projection onto it; vertices of two are moved by both in this order.
-        background: target edge lengths.
-        volume_mm3: of the shape; None: not known.
-        share: of the volume by which the mesh may differ from it.
-        envelope: fTetWild's epsilon, relative to the bounding box's diagonal.
+    The surface has corners (n, 3) mm and triangles (m, 3). `sides` are the parts of the shape, each as the projection
+    onto it; vertices of two are moved by both in this order. The background gives target edge lengths. The mesh may
+    differ from the shape's volume, where that is known, by a share of it. `envelope` is fTetWild's epsilon, relative to
+    the bounding box's diagonal.
 
-    Returns:
-        Points (n, 3) mm and positively oriented tetrahedra (m, 4).
-
-    Raises:
-        InputError: no attempt gave a valid mesh.
+    Returns points (n, 3) mm and positively oriented tetrahedra (m, 4); InputError where no attempt gave a valid mesh.
     """
     problem = ""
     tolerance = 2 * envelope * float(np.linalg.norm(np.ptp(corners, axis=0)))

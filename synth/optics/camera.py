@@ -14,8 +14,7 @@ from synth.arrays import BoolArray, FloatArray, Pixels, Points
 from synth.optics.lens import FisheyeLens, PinholeLens
 from synth.optics.mirror import DIRECT, NOTHING, FlatMirror, first_met
 from synth.optics.pose import Pose
-from synth.optics.round_window import RoundWindow
-from synth.optics.window import Window
+from synth.optics.window import RoundWindow, Window
 from synth.scene import Sensor
 
 Paths = NDArray[np.intp]
@@ -24,14 +23,11 @@ Paths = NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """How pixels look.
+    """How n pixels look: by which path, -1 where there is no ray, and from where (n, 3) mm, in unit directions (n, 3).
 
-    Attributes:
-        origins: (n, 3) mm on the window's outer face; at index 1 the camera's position, or its mirror image. NaN for
-            pixels that no ray reaches: outside the range of the lens model, looking away from the window, or at the
-            back of a mirror or by two mirrors.
-        directions: (n, 3) unit, inside the gel; NaN as the origins.
-        path: (n,) path numbers, -1 where there is no ray.
+    Origins lie on the window's outer face; at index 1 they are the camera's position, or its mirror image. Directions
+    are those inside the gel. NaN for pixels that no ray reaches: outside the range of the lens model, looking away from
+    the window, or at the back of a mirror or by two mirrors.
     """
 
     origins: Points
@@ -46,14 +42,10 @@ class Rays:
 
 @dataclass(frozen=True, eq=False)
 class Optics:
-    """A camera, what stands before it, and the window that it looks through.
+    """A camera's pose and lens, the mirrors before it in the scene's order, and the window that it looks through.
 
-    Attributes:
-        pose: the camera's place.
-        lens: a one-to-one map between directions in the camera's frame and pixels; both are NaN beyond its field.
-        window: the face at which light bends.
-        mirrors: in the scene's order.
-        size: width and height of the image, px.
+    The lens maps one-to-one between directions in the camera's frame and pixels; both are NaN beyond its field. The
+    size is the image's width and height, px.
     """
 
     pose: Pose

@@ -35,13 +35,7 @@ _STEPS = 60
 
 @dataclass(frozen=True, eq=False)
 class PinholeLens:
-    """Pinhole and distortion.
-
-    Attributes:
-        focal: (fx, fy) px.
-        centre: (cx, cy) px.
-        distortion: k1, k2, p1, p2, k3.
-    """
+    """Pinhole and distortion: (fx, fy) px, (cx, cy) px, and k1, k2, p1, p2, k3."""
 
     focal: FloatArray
     centre: FloatArray
@@ -135,13 +129,7 @@ class PinholeLens:
 
 @dataclass(frozen=True, eq=False)
 class FisheyeLens:
-    """Equidistant projection and its polynomial.
-
-    Attributes:
-        focal: (fx, fy) px per radian.
-        centre: (cx, cy) px.
-        distortion: k1, k2, k3, k4.
-    """
+    """Equidistant projection and its polynomial: (fx, fy) px per radian, (cx, cy) px, and k1, k2, k3, k4."""
 
     focal: FloatArray
     centre: FloatArray

@@ -25,13 +25,9 @@ DIRECT, NOTHING = 0, -1
 
 @dataclass(frozen=True, eq=False)
 class FlatMirror:
-    """A rectangular mirror.
+    """A rectangular mirror: centre (3,) mm, unit vectors (2, 3) along its sides, whose halves are (2,) mm.
 
-    Attributes:
-        centre: (3,) mm.
-        axes: (2, 3) unit vectors along its sides.
-        normal: (3,) unit, away from the reflecting side.
-        half: (2,) mm, half of its sides.
+    The unit normal (3,) points away from the reflecting side.
     """
 
     centre: FloatArray

@@ -15,12 +15,9 @@ from synth.scene import Camera
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """A camera's place.
+    """A camera's place: (3,) mm, the pinhole, and (3,) unit vectors of the image's axes and of the viewing axis.
 
-    Attributes:
-        position: (3,) mm, the pinhole.
-        right, down, forward: (3,) unit vectors of the image's axes and of the viewing axis. Behind a mirror they are
-            the mirrored ones, so that the same pixel belongs to both cameras.
+    Behind a mirror these are the mirrored ones, so that the same pixel belongs to both cameras.
     """
 
     position: FloatArray

@@ -16,9 +16,9 @@ from typing import Any
 
 from synth import __version__
 from synth.dataset.job import Job
+from synth.dataset.manifest import reason_group, shares
 from synth.dataset.shard import Shard
 from synth.dataset.store import Output, is_shared, output_of
-from synth.dataset.summary import reason_group, shares
 from synth.dataset.writer import DatasetWriter
 from synth.errors import InputError
 from synth.mesh import mesh_key, pad_mesh
@@ -27,8 +27,7 @@ from synth.pipeline.overlapped import outcomes_of_batches
 from synth.pipeline.producer import Producer
 from synth.pipeline.ray_pool import outcomes_of_ray
 from synth.pipeline.records import JobContext, Outcome, Task
-from synth.pipeline.threads import cores
-from synth.pipeline.worker_pool import outcomes_of_processes
+from synth.pipeline.worker_pool import cores, outcomes_of_processes
 from synth.planning import Plan, plan
 from synth.render.variant import Variant
 from synth.scene import Gel

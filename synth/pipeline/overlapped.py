@@ -40,10 +40,8 @@ def outcomes_of_batches(
     """Outcomes in the order in which they are ready; tasks are taken in the solver's thread.
 
     Flow, noise and files are made by so many worker processes; with 1 this process does everything, one thing after
-    another. At most `batch` trajectories are simulated at a time; None for what suits the device.
-
-    Raises:
-        InputError: the storage refuses, CUDA without cuBLAS or cuSOLVER, or worker processes die again and again.
+    another. At most `batch` trajectories are simulated at a time; None for what suits the device. InputError where the
+    storage refuses, for CUDA without cuBLAS or cuSOLVER, or if worker processes die again and again.
     """
     session, results = RenderSession(context), in_batches(context, tasks, batch)
     if workers == 1:

@@ -19,7 +19,7 @@ from typing import Any
 from synth.errors import InputError
 from synth.pipeline.producer import Producer
 from synth.pipeline.records import JobContext, Outcome, Task
-from synth.pipeline.threads import render_on_one_core
+from synth.pipeline.worker_pool import render_on_one_core
 
 LOCAL = "local"
 """The address that means: a cluster of worker processes on this machine, for as long as the command runs."""
@@ -39,11 +39,8 @@ def outcomes_of_ray(
     """Outcomes in the order in which they are ready; at most two tasks per processor core are waiting at any time.
 
     The address is as `ray.init` takes it, or "local"; `workers` limits the tasks at once, by default to the cluster's
-    cores.
-
-    Raises:
-        InputError: Ray is not installed, there is no such cluster, it has no GPU where one is needed, the storage
-            refuses, or a task's worker was lost again and again.
+    cores. InputError where Ray is not installed, there is no such cluster, it has no GPU where one is needed, the
+    storage refuses, or a task's worker was lost again and again.
     """
     ray = _ray()
     gpus = GPU_SHARE if context.plan.variant.is_on_gpu else 0

@@ -43,12 +43,8 @@ class JobContext:
 class Failure:
     """A random instance that gave no trajectory.
 
-    Attributes:
-        index: of the trajectory's first sample.
-        draw: 0 for the trajectory's first failure, and so on.
-        stage: "sensor", "draw" or "simulate".
-        reason: for the user.
-        last_good_state: of a simulation.
+    The index is that of the trajectory's first sample, `draw` 0 for its first failure, and so on; the stage is
+    "sensor", "draw" or "simulate"; the reason is for the user, the last good state a simulation's.
     """
 
     index: int

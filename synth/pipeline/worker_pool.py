@@ -9,6 +9,9 @@ terminal at once; the workers are started with it blocked, and the driver, which
 
 A worker that dies (killed, out of memory) takes the pool with it. What was under way goes to a new pool: an item may be
 done twice, with the same result.
+
+Beside the libraries here nothing starts threads that compute: Pardiso always has one (`synth.simulate.linear`), and so
+have Warp's kernels on a CPU.
 """
 
 import contextlib
@@ -28,7 +31,7 @@ from typing import Any, TypeAlias, TypeVar
 from synth.errors import InputError
 from synth.pipeline.producer import Producer
 from synth.pipeline.records import JobContext, Outcome, Task
-from synth.pipeline.threads import one_thread_each, render_on_one_core
+from synth.render.variant import Variant
 
 Item = TypeVar("Item")
 Maker: TypeAlias = Callable[[Item], Outcome]
@@ -52,16 +55,9 @@ def spread(
 ) -> Generator[Outcome, None, None]:
     """Outcomes in the order in which they are ready; at most two items per worker are waiting at any time.
 
-    Args:
-        context: of the job.
-        make: gives, in each worker process, what makes an outcome of an item, and keeps a renderer to one core; like
-            the items it is picklable.
-        items: to do.
-        workers: processes.
-        number: trajectory of an item, for messages.
-
-    Raises:
-        InputError: the storage refuses, or worker processes die again and again.
+    `make` gives, in each worker process, what makes an outcome of an item, and keeps a renderer to one core; like the
+    items it is picklable. `number` gives the trajectory of an item, for messages. InputError where the storage refuses,
+    or worker processes die again and again.
     """
     again: deque[Item] = deque()
     deaths = 0
@@ -160,3 +156,37 @@ def _trajectory_maker(context: JobContext) -> Maker[Task]:
     render_on_one_core(context.plan.variant)
     producer = Producer(context)
     return lambda task: producer.produce(*task)
+
+
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
+"""Read by linear algebra libraries and OpenCV when they are loaded."""
+
+
+def cores() -> int:
+    """That this process may use; on a cluster fewer than the machine has."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextlib.contextmanager
+def one_thread_each() -> Iterator[None]:
+    """Processes started meanwhile use one thread in every library but the renderer; what this process has loaded keeps
+    its own.
+    """
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def render_on_one_core(variant: Variant) -> None:
+    """Have this process, a worker, render with one thread; Mitsuba's scalar code has its threads from Dr.Jit, too."""
+    variant.load()
+    import drjit
+
+    drjit.set_thread_count(1)

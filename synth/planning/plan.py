@@ -19,7 +19,7 @@ from synth.scene.sampling import check_pairs
 from synth.scene.template import Template
 from synth.simulate.indenter import object_triangles, rigid_body
 from synth.simulate.material import DISPLACEMENT_ONLY_BELOW
-from synth.simulate.mesh_rule import MeshRule
+from synth.simulate.press import MeshRule
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,9 @@ class Decision:
 class Plan:
     """What runs, for all samples of a scene; picklable.
 
-    Attributes:
-        template: the scene with its distributions; `template.outputs` and `template.sampling` are the same for all.
-        variant: that renders.
-        is_batched: whether trajectories are simulated many at once, on one mesh for all of a pad.
-        mesh: how the meshes of the trajectories are chosen.
-        decisions: feature by feature, with reasons; light and lens among them are each sensor's own.
+    `template.outputs` and `template.sampling` are the same for all. With `is_batched` trajectories are simulated many
+    at once, on one mesh for all of a pad. Decisions are feature by feature, with reasons; light and lens among them are
+    each sensor's own.
     """
 
     template: Template

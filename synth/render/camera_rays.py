@@ -23,7 +23,7 @@ from synth.arrays import FloatArray
 from synth.errors import InputError
 from synth.optics import Optics
 from synth.optics.mirror import FlatMirror
-from synth.optics.round_window import RoundWindow
+from synth.optics.window import RoundWindow
 from synth.render.gel_mesh import MIRROR
 from synth.render.thin_lens import ThinLens
 from synth.render.variant import LLVM_HINT
@@ -74,15 +74,10 @@ class CameraRays:
         return self._radius is not None
 
     def sample(self, pixel: Any, offset: Any, pupil: Any | None = None) -> tuple[Any, Any, Any]:
-        """Rays through points of pixels.
+        """Rays (mi.RayDifferential3f) through points of pixels, weights (mi.Float), and whether the lens looks there.
 
-        Args:
-            pixel: mi.UInt32, row-major index of the pixel.
-            offset: mi.Point2f in [0, 1)², the point within the pixel (right, down).
-            pupil: mi.Point2f in [0, 1)², made into a uniform point of the pupil; None: its centre, the pinhole.
-
-        Returns:
-            Ray (mi.RayDifferential3f), weight (mi.Float) and whether the lens looks there at all (mi.Bool).
+        `pixel` is mi.UInt32, row-major; `offset` (mi.Point2f in [0, 1)²) the point within the pixel (right, down).
+        `pupil`, likewise, is made into a uniform point of the pupil; None: its centre, the pinhole.
         """
         mi, dr = self._mi, self._dr
         column, row = pixel % self._width, pixel // self._width
@@ -110,17 +105,15 @@ class CameraRays:
             return mi.RayDifferential3f(mi.Ray3f(mi.Point3f(eye), air)), mi.Float(1), valid
         if self._round is not None:
             origin, inside, slant, meets = self._round.enter(eye, air)
-            reflected, *_ = mi.fresnel(slant, self._index)
-            ray = mi.RayDifferential3f(mi.Ray3f(mi.Point3f(origin + inside * _START_MM), inside))
-            return ray, (1 - reflected) / dr.square(self._index), valid & meets
-        valid &= air.z < 0
-        origin = eye + air * ((self._face - eye.z) / air.z)
-        origin.z = self._face
-        across = mi.Vector2f(air.x, air.y) / self._index
-        inside = mi.Vector3f(across.x, across.y, -dr.sqrt(dr.maximum(1 - dr.squared_norm(across), 0)))
-        reflected, *_ = mi.fresnel(-air.z, self._index)
+        else:
+            slant, meets = -air.z, air.z < 0
+            origin = eye + air * ((self._face - eye.z) / air.z)
+            origin.z = self._face
+            across = mi.Vector2f(air.x, air.y) / self._index
+            inside = mi.Vector3f(across.x, across.y, -dr.sqrt(dr.maximum(1 - dr.squared_norm(across), 0)))
+        reflected, *_ = mi.fresnel(slant, self._index)
         ray = mi.RayDifferential3f(mi.Ray3f(mi.Point3f(origin + inside * _START_MM), inside))
-        return ray, (1 - reflected) / dr.square(self._index), valid
+        return ray, (1 - reflected) / dr.square(self._index), valid & meets
 
     def _reflect(self, eye: Any, air: Any) -> tuple[Any, Any, Any]:
         """Where rays in air from `eye` start after their mirror, their directions, and whether they may go on.
@@ -198,7 +191,7 @@ class _Mirror:
 
 
 class RoundFace:
-    """The round inner face of `synth.optics.round_window` in the renderer's frame, opaque to Dr.Jit."""
+    """The round inner face of `synth.optics.window` in the renderer's frame, opaque to Dr.Jit."""
 
     def __init__(self, window: RoundWindow, mi: Any) -> None:
         import drjit as dr

@@ -30,12 +30,7 @@ class FlatChart:
 
 @dataclass(frozen=True)
 class RoundChart:
-    """About the axis.
-
-    Attributes:
-        radius: mm, of hemisphere and cylinder.
-        top: z of the gel's upper end, mm.
-    """
+    """About the axis; the radius, mm, is that of hemisphere and cylinder, `top` is z of the gel's upper end, mm."""
 
     radius: float
     top: float

@@ -17,16 +17,11 @@ from synth.scene import Coating
 
 
 def reflection(mi: Any, coating: Coating, texture: Image, is_mono: bool) -> Any:
-    """The face's reflection, the same from either side.
+    """The face's reflection, the same from either side, as Mitsuba's BSDF.
 
-    Args:
-        mi: the Mitsuba module.
-        coating: roughness and metallic, and its reflectance where marks lie above it.
-        texture: (rows, columns, 3 or 4) float32, from `pattern.albedo`; must not be changed afterwards.
-        is_mono: colours are grey, and one channel is wanted.
-
-    Returns:
-        Mitsuba's BSDF.
+    Of the coating its roughness and metallic count, and its reflectance where marks lie above it. The texture, (rows,
+    columns, 3 or 4) float32, is from `pattern.albedo` and must not be changed afterwards. With `is_mono` colours are
+    grey, and one channel is wanted.
     """
     colors = texture[:, :, :3].mean(axis=2, keepdims=True) if is_mono else texture[:, :, :3]
     if texture.shape[2] == 3:

@@ -24,13 +24,9 @@ _STEP = 4
 
 @dataclass(frozen=True, eq=False)
 class FacePoints:
-    """Points on faces, each face's one after another.
+    """Points on faces, each face's one after another: surface interactions, barycentric weights, and unit normals.
 
-    Attributes:
-        at: their surface interactions.
-        normal: mi.Vector3f, unit, into the gel.
-        weights: barycentric coordinates.
-        sampler: of further random numbers, stratified within each face.
+    These, mi.Vector3f, point into the gel; the sampler is of further random numbers, stratified within each face.
     """
 
     at: Any
@@ -87,13 +83,9 @@ _DEGREE = 4
 
 
 def across_cavity(means: FloatArray, positions: Points, normals: Points, faces: np.ndarray) -> Image:
-    """Irradiance at the corners of faces, (f, channels, 3) float32.
+    """Irradiance at the corners of faces, (f, channels, 3) float32, from means (f, channels) sampled on each face.
 
-    Args:
-        means: (f, channels) irradiance sampled on each face.
-        positions: (v, 3) of the vertices.
-        normals: (v, 3) unit, all on the same side of the face.
-        faces: (f, 3) vertices.
+    Vertices have positions (v, 3) and unit normals (v, 3), all on the same side of the faces (f, 3).
     """
     low, high = positions.min(axis=0), positions.max(axis=0)
     places = 2 * (positions - low) / (high - low) - 1

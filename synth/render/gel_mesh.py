@@ -19,12 +19,10 @@ MIRROR = np.array([1.0, -1.0, 1.0])
 
 @dataclass(frozen=True, eq=False)
 class GelMesh:
-    """Topology and texture coordinates of the gel's surface, and the arrays that Mitsuba takes per frame.
+    """Topology and texture coordinates of a surface before it is deformed, and the arrays that Mitsuba takes per frame.
 
-    Attributes:
-        surface: the surface whose deformed positions are rendered.
-        chart: how the texture is laid on it.
-        behind: z (mm) of the plane in which the arrays show the mirror image of the gel; None: they show the gel.
+    The chart says how the texture is laid on it. `behind` is z (mm) of the plane in which the arrays show the mirror
+    image of the gel; None: they show the gel.
     """
 
     surface: GelSurface

@@ -1,10 +1,20 @@
-"""The LEDs: rectangular area emitters inside the index-matched body of gel and window, or in the air of a round one.
+r"""The LEDs: rectangular area emitters inside the index-matched body of gel and window, or in the air of a round one.
 
 Their light goes straight to the gel: the face at which the camera's rays bend takes no part in the lighting.
 
 A rectangle emits to one side (`synth.scene.Light.radiance`); its back is black. Its first size runs parallel to the
 contact face, its second at right angles to it and to its direction; a light that shines straight down has its first
 size along x.
+
+Light that the window's outer face throws back onto the gel is found by the method of images. The face z = Z is a plane,
+so a path that it reflects is a straight one in the space behind it that holds a mirror image of the gel and of every
+light: z becomes 2 Z - z. On its way through the plane light is weakened to Fresnel's internal reflectance for
+unpolarised light,
+
+.. math::  R(\theta) = F(\cos\theta, 1 / n), \qquad R = 1 \text{ for } \sin\theta \ge 1 / n .
+
+That is exact for any number of reflections, and images of lights are sampled like lights: no path has to hit a small
+one by chance.
 """
 
 from itertools import product
@@ -15,7 +25,8 @@ import numpy as np
 from synth.arrays import FloatArray
 from synth.errors import InputError
 from synth.optics import Optics
-from synth.render.gel_mesh import MIRROR
+from synth.optics.window import Window
+from synth.render.gel_mesh import MIRROR, mirrored
 from synth.scene import Light, Sensor, Vector3
 
 
@@ -104,3 +115,30 @@ def reaches(light: Light, size_mm: Vector3) -> bool:
     """Whether a light shines, and not away from all of a box twice as long as the gel, in which its surface moves."""
     corners = np.array(list(product((-1, 1), repeat=3))) * size_mm - light.position_mm
     return light.power > 0 and bool(np.any(corners @ np.subtract(light.aim_mm, light.position_mm) > 0))
+
+
+def reflecting_plane(sensor: Sensor) -> float | None:
+    """Z (mm) of the window's outer face; None where it does not refract, or is round and reflects nothing here."""
+    window = Optics.of(sensor).window
+    return window.face_z if isinstance(window, Window) and window.index != 1 else None
+
+
+def image_lights(sensor: Sensor) -> tuple[Light, ...]:
+    """The lights' mirror images behind the window's outer face; none where it reflects nothing."""
+    plane = reflecting_plane(sensor)
+    return () if plane is None else tuple(_image(light, plane) for light in sensor.lights)
+
+
+def all_lights(sensor: Sensor) -> tuple[Light, ...]:
+    """What shines: the lights, then their mirror images."""
+    return tuple(light for light in (*sensor.lights, *image_lights(sensor)) if light.power > 0)
+
+
+def reflectance(cosine: Any, index: Any, mi: Any) -> Any:
+    """R (mi.Float) of the body's outer face for light from inside, from cos θ >= 0."""
+    return mi.fresnel(cosine, 1 / index)[0]
+
+
+def _image(light: Light, face_z: float) -> Light:
+    behind = mirrored(np.array([light.position_mm, light.aim_mm]), face_z)
+    return light.model_copy(update={"position_mm": tuple(behind[0]), "aim_mm": tuple(behind[1])})

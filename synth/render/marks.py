@@ -19,17 +19,10 @@ _STEPS_PER_GRAIN = 16
 def marks_coverage(
     pattern: Dots | Speckle, chart: Chart, x: FloatArray, y: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """The share of each texel that is covered.
+    """The share of each texel that is covered, (rows, columns) in [0, 1].
 
-    Args:
-        pattern: the marks.
-        chart: how the texture is laid on the face.
-        x: (columns,) texel centres, mm; even.
-        y: (rows,) likewise.
-        rng: draws three normal numbers for every dot, or the noise that grains are cut from.
-
-    Returns:
-        (rows, columns) in [0, 1].
+    The chart says how the texture is laid on the face; x (columns,) and y (rows,) are texel centres, mm, both even.
+    `rng` draws three normal numbers for every dot, or the noise that grains are cut from.
     """
     if isinstance(pattern, Dots):
         return _round_dots(pattern, chart, x, y, rng) if isinstance(chart, RoundChart) else _dots(pattern, x, y, rng)

@@ -4,7 +4,7 @@ At every point of a path light is sampled in two ways: from one of the rectangle
 path goes on to. Both are weighted by the power heuristic (Veach, Robust Monte Carlo Methods, 1997, § 9.2). Lights are
 numbers in tables and not Mitsuba's emitters, whose virtual functions Dr.Jit would record one by one in every pass.
 
-Paths that the window reflects go on in the space behind it (`synth.render.window_images`). A path that meets the mirror
+Paths that the window reflects go on in the space behind it (`synth.render.lights`). A path that meets the mirror
 image of the gel is mirrored back onto the gel there, so that each of its rays starts in front of the window.
 """
 
@@ -12,20 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from synth.render.lights import rectangles
-from synth.render.window_images import all_lights, reflectance, reflecting_plane
+from synth.render.lights import all_lights, rectangles, reflectance, reflecting_plane
 from synth.scene import Sensor
 
 
 class PathTracer:
-    """Light on one renderer's gel.
+    """Light on one renderer's gel, by the lights and the window of a sensor.
 
-    Args:
-        sensor: its lights and window are used.
-        scene: Mitsuba's.
-        shapes: in it: "gel", "lights", and "image" where the window reflects.
-        max_depth: longest path in surfaces and lights.
-        mi: the Mitsuba module.
+    `scene` is Mitsuba's, `shapes` are those in it: "gel", "lights", and "image" where the window reflects. `max_depth`
+    is the longest path in surfaces and lights.
     """
 
     def __init__(self, sensor: Sensor, scene: Any, shapes: dict[str, Any], max_depth: int, mi: Any) -> None:
@@ -50,16 +45,8 @@ class PathTracer:
         import drjit as dr
 
         mi = self._mi
-        start = (
-            mi.Ray3f(ray),
-            sampler,
-            mi.Spectrum(1),
-            mi.Spectrum(0),
-            mi.UInt32(0),
-            mi.Float(0),
-            active,
-            mi.Bool(False),
-        )
+        share, total, depth, density = mi.Spectrum(1), mi.Spectrum(0), mi.UInt32(0), mi.Float(0)
+        start = (mi.Ray3f(ray), sampler, share, total, depth, density, active, mi.Bool(False))
         _, _, _, total, _, _, _, seen = dr.while_loop(start, lambda *state: state[6], self._step)
         return total, seen
 

@@ -7,6 +7,13 @@ at y = -size_y / 2 (x right, y down), and the centre of texel (row r, column c) 
 
 Marks that lie above a coating that shines come with their coverage: the renderer blends the two reflections
 (`render.coating`). On a dome the texture is laid on along z; its resolution is that at the apex.
+
+A picture of the user's own is stored in sRGB (IEC 61966-2-1) and decoded to linear values before anything is averaged,
+
+    c = s / 12.92 for s <= 0.04045,   c = ((s + 0.055) / 1.055)^2.4 above,
+
+with the opacity multiplied in. A picture finer than the texture is first averaged over areas of one texel, so that fine
+detail becomes its mean; then it is interpolated linearly at the texels' centres.
 """
 
 import math
@@ -17,7 +24,6 @@ import numpy as np
 from synth.arrays import FloatArray, Image
 from synth.errors import InputError
 from synth.optics import Optics
-from synth.render.bitmap import laid_over, read_picture
 from synth.render.chart import RoundChart, chart_of
 from synth.render.marks import marks_coverage
 from synth.scene import Bitmap, Dots, NoPattern, RandomColor, Sensor, Speckle
@@ -32,19 +38,12 @@ _STRIP = 32
 
 
 def albedo(sensor: Sensor, rng: np.random.Generator, folder: Path | None = None) -> Image:
-    """Reflectance over the contact face (see the module for the mapping).
+    """Reflectance over the contact face (see the module for the mapping), (rows, columns, 3) float32 in [0, 1]; linear.
 
-    Args:
-        sensor: pad size, coating, pattern, and the camera, which sets the resolution.
-        rng: draws the pattern.
-        folder: that a bitmap's file is relative to; default is the current directory.
-
-    Returns:
-        (rows, columns, 3) float32 in [0, 1]; linear. Where marks lie above a coating that shines, (rows, columns, 4):
-        the marks' reflectance and the share of each texel that they cover.
-
-    Raises:
-        InputError: a pattern finer than the camera could see, or a bitmap that cannot be read.
+    Where marks lie above a coating that shines, it is (rows, columns, 4): the marks' reflectance and the share of each
+    texel that they cover. The camera sets the resolution, `rng` draws the pattern, and a bitmap's file is relative to
+    the folder, by default the current directory. InputError for a pattern finer than the camera could see, or a bitmap
+    that cannot be read.
     """
     x, y = _texels(sensor)
     coating = np.array(sensor.coating.reflectance)
@@ -110,13 +109,10 @@ def _texels(sensor: Sensor) -> tuple[FloatArray, FloatArray]:
 
 
 def pixels_per_mm(sensor: Sensor) -> float:
-    """Image scale on the undeformed contact face: the finest of all cameras and directions.
+    """Image scale on the undeformed contact face: the finest of all cameras and directions; InputError for none.
 
     It is taken at the pad's middle; for a camera that does not see that, where a grid of its pixels meets the pad. For
     a pattern laid about the axis of a round gel, it is taken all over the face.
-
-    Raises:
-        InputError: no camera sees the pad.
     """
     finest = max(_scale(Optics.of(view), view) for view in sensor.views.values())
     if finest == 0:
@@ -216,3 +212,64 @@ def _blend_matrix(at: FloatArray, start: float, cell: float, count: int, softnes
     passed = np.clip((at[:, None] - edges) / softness + 0.5, 0, 1)
     ones, zeros = np.ones((len(at), 1)), np.zeros((len(at), 1))
     return np.hstack([ones, passed]) - np.hstack([passed, zeros])
+
+
+def read_picture(pattern: Bitmap, folder: Path) -> Image:
+    """The picture in linear light, (h, w, 4) float32 in [0, 1], from its file in a folder.
+
+    Red, green and blue, each multiplied by the opacity, and the opacity. InputError where there is no such file, or no
+    picture of 8 or 16 bits that OpenCV can read.
+    """
+    import cv2
+
+    path = folder / pattern.file
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"sensor.pattern.file: {path} cannot be read: {error.strerror or error}") from error
+    try:
+        stored = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        if stored is not None and stored.shape[2:] != (4,):  # no opacity: turned as EXIF says, three channels
+            stored = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    except cv2.error:  # an empty file, or one of absurd size
+        stored = None
+    if stored is None or stored.dtype not in (np.uint8, np.uint16):
+        raise InputError(
+            f"sensor.pattern.file: {path} is no whole picture of 8 or 16 bits that OpenCV can read; save it as PNG"
+        )
+    values = stored.astype(np.float32) / np.iinfo(stored.dtype).max
+    opacity = values[:, :, 3:] if values.shape[2] == 4 else np.ones((*values.shape[:2], 1), np.float32)
+    return np.concatenate([_linear(values[:, :, 2::-1]) * opacity, opacity], axis=2)
+
+
+def laid_over(pattern: Bitmap, picture: Image, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """What a picture puts on the face, at texel centres x (columns,) and y (rows,) mm, both even.
+
+    Colours (rows, columns, 3), linear, and the share of each texel that is painted (rows, columns). Where nothing is,
+    the colour is the picture's mean, so that interpolated edges have no fringe.
+    """
+    import cv2
+    from scipy.ndimage import map_coordinates
+
+    rows, columns = picture.shape[:2]
+    height_mm = pattern.width_mm * rows / columns
+    texel = max(x[1] - x[0], y[1] - y[0])
+    wanted = (max(1, min(columns, round(pattern.width_mm / texel))), max(1, min(rows, round(height_mm / texel))))
+    coarse = cv2.resize(picture, wanted, interpolation=cv2.INTER_AREA)
+    angle = np.radians(pattern.rotation_deg)
+    dx, dy = x[None] - pattern.offset_mm[0], y[:, None] - pattern.offset_mm[1]
+    across, down = dx * np.cos(angle) + dy * np.sin(angle), dy * np.cos(angle) - dx * np.sin(angle)
+    place = [(down / height_mm + 0.5) * wanted[1] - 0.5, (across / pattern.width_mm + 0.5) * wanted[0] - 0.5]
+    values = [map_coordinates(coarse[:, :, k], place, output=np.float64, order=1, mode="nearest") for k in range(4)]
+    inside = np.minimum(pattern.width_mm / 2 - np.abs(across), height_mm / 2 - np.abs(down))
+    painted = values[3] * np.clip(inside / texel + 0.5, 0, 1)
+    total = picture.sum(axis=(0, 1), dtype=np.float64)
+    colors = np.broadcast_to(total[:3] / max(total[3], 1.0), (*painted.shape, 3)).copy()
+    seen = values[3] > 1e-6
+    colors[seen] = np.stack(values[:3], axis=-1)[seen] / values[3][seen, None]
+    return colors, painted
+
+
+def _linear(values: Image) -> Image:
+    low = values / np.float32(12.92)
+    return np.where(values <= 0.04045, low, ((values + np.float32(0.055)) / np.float32(1.055)) ** np.float32(2.4))

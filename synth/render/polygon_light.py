@@ -18,8 +18,7 @@ from numpy.polynomial import Chebyshev, Polynomial
 
 from synth.arrays import FloatArray
 from synth.render.gel_mesh import MIRROR
-from synth.render.lights import light_axes
-from synth.render.window_images import reflectance
+from synth.render.lights import light_axes, reflectance
 from synth.scene import Light
 
 _DEGREE = 9
@@ -96,7 +95,7 @@ class PolygonLight:
 
 
 class SampledLight(PolygonLight):
-    """A light without a closed form: narrower than Lambertian, or a mirror image (`synth.render.window_images`).
+    """A light without a closed form: narrower than Lambertian, or a mirror image (`synth.render.lights`).
 
     What of an image arrives depends on the angle at the face of a window of this index. `whole` is the mean over a few
     points.

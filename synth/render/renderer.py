@@ -4,7 +4,7 @@ One Mitsuba scene per sensor draw: the coated surface, the LEDs, and nothing out
 the opaque coating and never part of it. For a frame only vertex positions and normals are exchanged; several cameras
 are several sets of rays in that one scene.
 
-Light that the window's outer face reflects back onto the gel comes from mirror images (`synth.render.window_images`);
+Light that the window's outer face reflects back onto the gel comes from mirror images (`synth.render.lights`);
 scalar variants, whose camera stands outside, leave it out. All leave out light that the pad's sides reflect.
 
 Pixels are box-filtered. In vectorised variants the samples of one pixel are neighbours in the wavefront and are summed
@@ -18,18 +18,17 @@ import numpy as np
 
 from synth.arrays import Image, Points
 from synth.errors import InputError
+from synth.render.camera_image import PILOT, needed_samples
 from synth.render.camera_rays import CameraRays, pinhole
 from synth.render.chart import Chart, chart_of
 from synth.render.coating import reflection
 from synth.render.gel_mesh import GelMesh
-from synth.render.lights import check_view, emitters, panels
+from synth.render.lights import all_lights, check_view, emitters, panels, reflecting_plane
 from synth.render.path_tracer import PathTracer
 from synth.render.pattern import is_grey
-from synth.render.sample_count import PILOT, needed_samples
 from synth.render.separated_light import SeparatedLight, is_separated
 from synth.render.thin_lens import ThinLens
 from synth.render.variant import Variant
-from synth.render.window_images import all_lights, reflecting_plane
 from synth.scene import Render, Sensor
 from synth.surface import GelSurface
 
@@ -138,14 +137,10 @@ class Renderer:
         self._parameters.set_dirty(key)
 
     def radiance(self, positions: Points, seed: int) -> Image:
-        """Linear radiance of the deformed gel in the main camera; zero where a pixel sees past it.
+        """Linear radiance (H, W, 3) float32 of the deformed gel in the main camera; zero where a pixel sees past it.
 
-        Args:
-            positions: (v, 3) float64 mm, deformed positions of the surface's vertices.
-            seed: non-negative; frames with different seeds have independent noise.
-
-        Returns:
-            (H, W, 3) float32; three equal channels in mono variants.
+        Positions are (v, 3) float64 mm, those of the surface's vertices; frames with different non-negative seeds have
+        independent noise. Mono variants give three equal channels.
         """
         self._deform(positions, seed)
         return self._frame("", seed)
@@ -233,14 +228,8 @@ def _gel(name: str, mesh: GelMesh, bsdf: Any, mi: Any) -> Any:
     properties = mi.Properties()
     properties["bsdf"] = bsdf
     surface = mesh.surface
-    shape = mi.Mesh(
-        name,
-        len(surface.material),
-        len(surface.triangles),
-        has_vertex_normals=True,
-        has_vertex_texcoords=True,
-        props=properties,
-    )
+    counts, fields = (len(surface.material), len(surface.triangles)), ("has_vertex_normals", "has_vertex_texcoords")
+    shape = mi.Mesh(name, *counts, props=properties, **dict.fromkeys(fields, True))
     parameters = mi.traverse(shape)
     parameters["faces"] = mesh.faces()
     parameters["vertex_texcoords"] = mesh.texture_coordinates()

@@ -14,7 +14,7 @@ A Lambertian surface's radiance is its albedo ρ times its irradiance E over π,
   faces and projected (L²) onto functions that are linear on each face, or constant where few of the face's pilots saw
   gel: such faces get little, and its mean is less noisy than its slope. Where no pilot at all saw gel there is none.
   In a round gel, all of which sees itself, it is smooth and is fitted (`synth.render.face_points`).
-- The lights l include their mirror images behind the window (`synth.render.window_images`), which have no closed form.
+- The lights l include their mirror images behind the window (`synth.render.lights`), which have no closed form.
 - E_returned, light that the gel sends to the window and gets back, is smooth. It is n · V with the normal n, and V is
   fitted to sampled paths as polynomials of the place on the pad.
 
@@ -34,10 +34,9 @@ from synth.arrays import BoolArray
 from synth.errors import InputError
 from synth.render.face_points import FacePoints, across_cavity, count_per_face, projected
 from synth.render.gel_mesh import GelMesh
-from synth.render.lights import reaches
+from synth.render.lights import image_lights, reaches, reflectance, reflecting_plane
 from synth.render.polygon_light import PolygonLight, SampledLight
 from synth.render.variant import Variant
-from synth.render.window_images import image_lights, reflectance, reflecting_plane
 from synth.scene import Coating, Render, Sensor
 
 PILOTS = 16
@@ -73,16 +72,10 @@ def is_separated(render: Render, coating: Coating, variant: Variant) -> bool:
 
 
 class SeparatedLight:
-    """Light on one renderer's gel.
+    """Light on one renderer's gel, by the lights and the window of a sensor.
 
-    Args:
-        sensor: its lights and window are used.
-        scene: Mitsuba's.
-        gels: the shapes in it: "gel", and "image" where the window reflects.
-        parameters: the scene's, of which the gel's vertices are read.
-        max_depth: longest path in surfaces and lights.
-        is_mono: one channel is wanted.
-        mi: the Mitsuba module.
+    `scene` is Mitsuba's, `gels` are the shapes in it: "gel", and "image" where the window reflects; the gel's vertices
+    are read from its parameters. `max_depth` is the longest path in surfaces and lights.
     """
 
     def __init__(
@@ -105,12 +98,9 @@ class SeparatedLight:
         self._half = [dr.opaque(mi.Float, side / 2) for side in size[:2]]
 
     def prepare(self, mesh: GelMesh, primary: int, seed: int) -> None:
-        """Pilots and bounced light for the gel as it lies now, for all cameras.
+        """Pilots and bounced light for the gel as it lies now in the scene, for all cameras.
 
-        Args:
-            mesh: the gel's, whose vertices the scene has.
-            primary: samples that a camera takes of it in all.
-            seed: non-negative, below 2^32.
+        `primary` are the samples that a camera takes of it in all; the seed is non-negative, below 2^32.
         """
         mi = self._mi
         triangles = mesh.faces().reshape(-1, 3)

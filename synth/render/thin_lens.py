@@ -35,12 +35,7 @@ from synth.scene import Sensor
 
 @dataclass(frozen=True)
 class ThinLens:
-    """A pupil and where it focuses.
-
-    Attributes:
-        radius_mm: of the pupil.
-        distance_mm: s', from the pupil to the plane of focus, as if everything were air.
-    """
+    """The radius of a pupil, and s', from it to the plane of focus, as if everything were air; both in mm."""
 
     radius_mm: float
     distance_mm: float

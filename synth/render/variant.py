@@ -53,13 +53,10 @@ _PROBE = (
 
 @dataclass(frozen=True)
 class Variant:
-    """A Mitsuba variant that works here.
+    """A Mitsuba variant that works here, by Mitsuba's name, e.g. "llvm_ad_rgb", and why this one.
 
-    Attributes:
-        name: Mitsuba's name for it, e.g. "llvm_ad_rgb".
-        reason: why this one, for `doctor` and `plan`.
-        hint: how to get a faster one; None when there is nothing to gain on this machine. The caller says it, once.
-        llvm: the LLVM library that Dr.Jit is to load; None for other back ends.
+    The hint says how to get a faster one, None when there is nothing to gain on this machine; the caller says it, once.
+    `llvm` is the library that Dr.Jit is to load; None for other back ends.
     """
 
     name: str
@@ -101,12 +98,8 @@ class Variant:
 def choose_variant(device: Device = "auto", grey: bool = False) -> Variant:
     """The fastest variant that works here; the machine is asked once per process.
 
-    Args:
-        device: "auto"; "cpu": never CUDA; "cuda": nothing else.
-        grey: pattern, coating and lights are all grey, so that one channel is enough.
-
-    Raises:
-        InputError: `device` is "cuda" and CUDA with OptiX does not work.
+    Device "cpu" stands for never CUDA, and "cuda" for nothing else: InputError where CUDA with OptiX does not work.
+    `grey` says that pattern, coating and lights are all grey, so that one channel is enough.
     """
     kind = "mono" if grey else "rgb"
     if device != "cpu":
@@ -120,12 +113,10 @@ def choose_variant(device: Device = "auto", grey: bool = False) -> Variant:
 
 
 def cpu_variant(candidates: Iterable[Path], version_of: Callable[[Path], Version | None], kind: str) -> Variant:
-    """LLVM where one of the candidates is new enough, else scalar.
+    """LLVM where one of the candidates, best first, is new enough, else scalar.
 
-    Args:
-        candidates: LLVM libraries, best first.
-        version_of: reads a library's version; None where it is older than 16 or does not load.
-        kind: "rgb" or "mono"; Mitsuba's packages hold no scalar mono variant, so scalar is always rgb.
+    `version_of` reads a library's version; None where it is older than 16 or does not load. The kind is "rgb" or
+    "mono"; Mitsuba's packages hold no scalar mono variant, so scalar is always rgb.
     """
     rejected = []
     for path in candidates:

@@ -30,10 +30,8 @@ SAMPLES = 300
 class GelSurfaces:
     """Surfaces in the sensor's frame, mm, as pyvista's PolyData with triangles whose normals point out of the bodies.
 
-    Attributes:
-        outer, window: as the files have them.
-        face: of outer, what no sharp edge parts from its point on the axis: what is coated.
-        rest: of outer, what is neither coated, nor on the window, nor in the plane of its largest z, where it is cut.
+    `face` is of outer what no sharp edge parts from its point on the axis: what is coated; `rest` what is neither
+    coated, nor on the window, nor in the plane of its largest z, where it is cut.
     """
 
     outer: Any

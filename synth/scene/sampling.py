@@ -26,11 +26,9 @@ MAX_DRAWS = 10
 
 @dataclass(frozen=True)
 class SensorInstance:
-    """The parts of a scene that all trajectories of one sensor share.
+    """The parts of a scene, by name, that all trajectories of one sensor share; None where no draw can be used.
 
-    Attributes:
-        content: parts by name; None where no draw can be used.
-        rejected: why earlier instances, or all of them, could not be used.
+    `rejected` says why earlier instances, or all of them, could not be used.
     """
 
     content: dict[str, Any] | None
@@ -79,17 +77,11 @@ def draw_sensor(template: Template, seed: int, sensor: int) -> SensorInstance:
 def draw(
     template: Template, seed: int, trajectory: int, attempt: int = 0, sensor: SensorInstance | None = None
 ) -> Scene:
-    """The scene of one trajectory.
+    """The scene of one trajectory, by its number, of a job's seed.
 
-    Args:
-        template: the scene file.
-        seed: of the job.
-        trajectory: its number.
-        attempt: 0, or how many instances of contact and motion were of no use.
-        sensor: the draw of the trajectory's sensor, where the caller has it.
-
-    Raises:
-        InputError: this draw breaks the schema (the tail of a `normal`, say), or no draw of the sensor can be used.
+    `attempt` is how many instances of contact and motion were of no use; `sensor` is the draw of the trajectory's
+    sensor, where the caller has it. InputError where this draw breaks the schema (the tail of a `normal`, say), or no
+    draw of the sensor can be used.
     """
     sensor = sensor or draw_sensor(template, seed, sensor_of(template, trajectory))
     if sensor.content is None:

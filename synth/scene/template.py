@@ -39,12 +39,9 @@ Chooser = Callable[[str, list[Any]], Any]
 
 @dataclass(frozen=True)
 class Template:
-    """A loaded scene file.
+    """A loaded scene file: the parsed TOML after overrides, and the keys that these gave values.
 
-    Attributes:
-        content: the parsed TOML after overrides.
-        source: the file, for messages and as the place that meshes and bitmaps are relative to.
-        changed: keys that overrides gave values.
+    The source is the file, for messages and as the place that meshes and bitmaps are relative to.
     """
 
     content: dict[str, Any]

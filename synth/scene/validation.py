@@ -23,14 +23,8 @@ _LONGEST = 80
 def validated(content: Any, source: str, model: type[Model], at: str = "") -> Model:
     """Plain content as a part of a scene. Types are strict: true and "1" are not numbers, 2.0 is no whole number.
 
-    Args:
-        content: JSON-able.
-        source: file, for the messages.
-        model: Scene, or the part that stands at `at`.
-        at: key of that part in a scene.
-
-    Raises:
-        InputError: one line per problem with file, path, what was given and what is allowed.
+    The content is JSON-able; `source` is its file, for the messages; the model is Scene, or the part that stands at the
+    key `at`. InputError has one line per problem with file, path, what was given and what is allowed.
     """
     try:
         return model.model_validate_json(json.dumps(content), strict=True)

@@ -8,11 +8,12 @@ import warp
 
 
 def _start_warp() -> None:
-    """Start Warp without a word.
+    """Start Warp without a word, for kernels that nothing differentiates.
 
     Where there is no NVIDIA driver its native code says so on the process's error output, whatever the log level.
     """
     warp.config.log_level = warp.LOG_ERROR  # no banner, no compiler chatter in the user's output
+    warp.config.enable_backward = False
     try:
         ctypes.CDLL("nvcuda.dll" if os.name == "nt" else "libcuda.so.1")
         return

@@ -22,8 +22,6 @@ the symmetric tangent is assembled. float64; leading axis of every state array i
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False, "fast_math": False})
-
 
 @wp.struct
 class Bulk:

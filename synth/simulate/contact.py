@@ -26,8 +26,6 @@ import warp as wp
 
 from synth.simulate.distance import normal_derivative, shape_vector, signed_distance
 
-wp.set_module_options({"enable_backward": False, "fast_math": False})
-
 ON_CONE = wp.constant(wp.float64(1.0 - 1.0e-9))
 """A point slips whose traction is this share of the limit. (Inside a kernel 1.0 - 1.0e-9 would be float32: 1.)"""
 

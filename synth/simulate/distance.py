@@ -8,8 +8,6 @@ differentiable, so that Newton's method keeps its order).
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False, "fast_math": False})
-
 KINDS = {"sphere": 0, "cylinder": 1, "box": 2, "cone": 3, "torus": 4, "mesh": 5}
 SHAPE_LENGTH = 8
 """Numbers that describe a shape."""

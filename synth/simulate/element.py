@@ -65,19 +65,9 @@ def p2p1(contact_split: int = CONTACT_SPLIT) -> Element:
     """Taylor-Hood. Four points integrate quadratics: exact for the mass-like terms, one order short for det F."""
     a, b = (5 + 3 * np.sqrt(5)) / 20, (5 - np.sqrt(5)) / 20
     points = np.full((4, 4), b) + (a - b) * np.eye(4)
+    derivative = _quadratic_derivative(points)
     face, weights = _face_rule(contact_split)
-    return Element(
-        "p2p1",
-        2,
-        points,
-        np.full(4, 0.25),
-        _quadratic_derivative(points),
-        0.0,
-        P2_HOLD,
-        face,
-        weights,
-        quadratic_face(face),
-    )
+    return Element("p2p1", 2, points, np.full(4, 0.25), derivative, 0.0, P2_HOLD, face, weights, quadratic_face(face))
 
 
 def p1p1(contact_split: int = CONTACT_SPLIT) -> Element:

@@ -36,16 +36,10 @@ _CONVEX = tuple(KINDS[shape] for shape in ("sphere", "cylinder", "box", "cone"))
 
 
 def footprint(path: LoadPath, size_mm: tuple[float, float, float], margin: float) -> Focus:
-    """The part of the contact face that a path's indenter overlaps.
+    """The part of the contact face that a path's indenter overlaps, from its end of press on: a rectangle on the pad.
 
-    Args:
-        path: of the indenter; its end of press and the load path from there count.
-        size_mm: of the pad.
-        margin: the footprint of the press grows by this fraction of its half widths on every side; above -1.
-
-    Returns:
-        A rectangle on the pad. Where nothing overlaps, a small one around the pad's point nearest to the indenter's
-        position.
+    The footprint of the press grows by `margin`, above -1, of its half widths on every side. Where nothing overlaps, it
+    is a small rectangle around the pad's point nearest to the indenter's position.
     """
     press = _rectangle(path, [path.pose(path.press_mm)], size_mm)
     even = np.linspace(path.press_mm, path.length_mm, POSES)

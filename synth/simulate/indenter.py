@@ -43,12 +43,10 @@ CELLS_PER_RADIUS = 3.0
 
 @dataclass(frozen=True)
 class Touchable:
-    """The part of a body that a gel can touch.
+    """The part of a body that a gel can touch in a press of a depth.
 
-    Attributes:
-        radius_mm: distance from the body's axis along z, through its origin.
-        height_mm: distance in z from its lowest point, the one that is nearest to the gel.
-        depth_mm: depth of the press.
+    The radius is about the body's axis along z, through its origin; the height is from its lowest point, the one that
+    is nearest to the gel.
     """
 
     radius_mm: float = np.inf
@@ -102,17 +100,11 @@ def rotation_about(axis: int, angle: float) -> FloatArray:
 def rigid_body(
     indenter: Indenter, folder: Path | None = None, resolution_mm: float = 0.0, touchable: Touchable = EVERYTHING
 ) -> RigidBody:
-    """Pack an indenter.
+    """Pack an indenter, of which the part that is touchable matters; what a mesh has beyond is left out.
 
-    Args:
-        indenter: from the scene.
-        resolution_mm: smallest radius that the gel's mesh resolves; sharper edges and tips are rounded to it.
-        folder: what a mesh indenter's relative file name is relative to.
-        touchable: the part of it that matters; what a mesh has beyond is left out.
-
-    Raises:
-        InputError: a fillet or tube too large for its shape; a mesh file that is missing, no solid or too
-            fine for a grid.
+    Edges and tips that are sharper than `resolution_mm`, the smallest radius that the gel's mesh resolves, are rounded
+    to it. A mesh indenter's relative file name is relative to the folder. InputError for a fillet or tube too large for
+    its shape; a mesh file that is missing, no solid or too fine for a grid.
     """
     if isinstance(indenter, MeshIndenter):
         return _object(indenter, folder or Path(), resolution_mm, touchable)
@@ -229,10 +221,8 @@ def object_triangles(indenter: MeshIndenter, folder: Path) -> Triangles:
     """An object's surface in mm, not turned, its bounding box centred on the origin; its file is relative to `folder`.
 
     Files have right-handed axes; the scene's are left-handed, because y points down in the image. So y changes its
-    sign: a letter can be read in the picture, a screw keeps its hand.
-
-    Raises:
-        InputError: a file that is missing or no surface, or of a size that speaks for another unit.
+    sign: a letter can be read in the picture, a screw keeps its hand. InputError for a file that is missing or no
+    surface, or of a size that speaks for another unit.
     """
     try:
         surface = read_surface(folder / indenter.file)

@@ -17,8 +17,6 @@ F is linear in an element, so that four corners give it everywhere. With h_a = F
 
 import warp as wp
 
-wp.set_module_options({"enable_backward": False, "fast_math": False})
-
 ONSET = 0.4
 """J_0: below what a resolved mesh reaches in ordinary presses; forces hardly depend on it."""
 SAMPLE_DEGREE = 3
@@ -61,6 +59,16 @@ def corner_gradient(barrier: BarrierTables, u: wp.array2d(dtype=wp.vec3d), s: in
 
 
 @wp.func
+def corner_gradients(barrier: BarrierTables, u: wp.array2d(dtype=wp.vec3d), s: int, e: int):
+    """F at the four corners."""
+    F0 = corner_gradient(barrier, u, s, e, 0)
+    F1 = corner_gradient(barrier, u, s, e, 1)
+    F2 = corner_gradient(barrier, u, s, e, 2)
+    F3 = corner_gradient(barrier, u, s, e, 3)
+    return F0, F1, F2, F3
+
+
+@wp.func
 def shape_gradient(barrier: BarrierTables, at: wp.vec4d, e: int, a: int) -> wp.vec3d:
     g = wp.vec3d()
     for i in range(4):
@@ -81,10 +89,7 @@ def barrier_residual(
     s, e = wp.tid()
     if active[s] == 0:
         return
-    F0 = corner_gradient(barrier, u, s, e, 0)
-    F1 = corner_gradient(barrier, u, s, e, 1)
-    F2 = corner_gradient(barrier, u, s, e, 2)
-    F3 = corner_gradient(barrier, u, s, e, 3)
+    F0, F1, F2, F3 = corner_gradients(barrier, u, s, e)
     smallest = jacobian[s, e]
     for p in range(barrier.at.shape[0]):
         at = barrier.at[p]
@@ -113,10 +118,7 @@ def barrier_tangent(
     s, e = wp.tid()
     if active[s] == 0:
         return
-    F0 = corner_gradient(barrier, u, s, e, 0)
-    F1 = corner_gradient(barrier, u, s, e, 1)
-    F2 = corner_gradient(barrier, u, s, e, 2)
-    F3 = corner_gradient(barrier, u, s, e, 3)
+    F0, F1, F2, F3 = corner_gradients(barrier, u, s, e)
     for p in range(barrier.at.shape[0]):
         at = barrier.at[p]
         F = at[0] * F0 + at[1] * F1 + at[2] * F2 + at[3] * F3

@@ -31,11 +31,7 @@ MAX_REUSE_ITERATIONS = 12
 
 
 class Factor(Protocol):
-    """A factorised symmetric matrix, applied as an approximate inverse.
-
-    Attributes:
-        made: number of matrices that were factorised.
-    """
+    """A factorised symmetric matrix, applied as an approximate inverse; `made` counts matrices that were factorised."""
 
     made: int
 
@@ -54,14 +50,10 @@ def direct_factor(indptr: np.ndarray, indices: np.ndarray, single: bool = True) 
 
 
 class LinearSolver:
-    """Solves the linear systems of one press, one after another.
+    """Solves the linear systems of one press, one after another; with `reuse` roughly where that is enough.
 
     Neighbouring tangents differ where contact changed: a few iterations of GMRES with the factor of an earlier one cost
-    less than a new factor.
-
-    Args:
-        factor: of this press's matrices; others may use it, too, and then this press begins with a new one.
-        reuse: solve roughly where that is enough, with factors of earlier matrices.
+    less than a new factor. The factor may be used by others, too, and then this press begins with a new one.
     """
 
     def __init__(self, factor: Factor, reuse: bool) -> None:
@@ -98,18 +90,11 @@ def gmres(
     tolerance: float = GMRES_TOLERANCE,
     limit: int = GMRES_LIMIT,
 ) -> tuple[FloatArray, int, float]:
-    """Solve (S + R) x = right by flexible GMRES without restart.
+    """Solve (S + R) x = right by flexible GMRES without restart, in at most `limit` iterations.
 
-    Args:
-        matrix: upper triangle of S, SciPy CSR.
-        remainder: R, SciPy CSR, or None.
-        factor: of S, or of a matrix like it.
-        right: (n,) float64.
-        tolerance: of the residual, relative to the right side.
-        limit: most iterations.
-
-    Returns:
-        (n,) the solution, NaN where the factor gave no numbers; the iterations; and the relative residual.
+    `matrix` is the upper triangle of S and `remainder` R or None, both SciPy CSR; the factor is of S, or of a matrix
+    like it. The tolerance is of the residual, relative to the right side (n,) float64. Returns (n,) the solution, NaN
+    where the factor gave no numbers; the iterations; and the relative residual.
     """
     diagonal = matrix.diagonal()
     transposed = matrix.T
@@ -235,28 +220,14 @@ class PardisoFactor:
 
 def _pardiso(handle: np.ndarray, phase: int, size: int, *arrays: np.ndarray) -> int:
     """One call of Pardiso; arrays: values, row pointers, columns, settings, right side, solution. Its error code."""
-    values, indptr, indices, settings, right, solution = (a.ctypes.data_as(ctypes.c_void_p) for a in arrays)
-    one, kind, silent, error = ctypes.c_int32(1), ctypes.c_int32(-2), ctypes.c_int32(0), ctypes.c_int32(0)
+    state, values, *pattern, settings, right, solution = (a.ctypes.data_as(ctypes.c_void_p) for a in (handle, *arrays))
+    error = ctypes.c_int32(0)
+    one, kind, stage, count, silent, told = (
+        ctypes.byref(number) for number in (*map(ctypes.c_int32, (1, -2, phase, size, 0)), error)
+    )
     call = _mkl().pardiso
     call.argtypes, call.restype = None, None
-    call(
-        handle.ctypes.data_as(ctypes.c_void_p),
-        ctypes.byref(one),
-        ctypes.byref(one),
-        ctypes.byref(kind),
-        ctypes.byref(ctypes.c_int32(phase)),
-        ctypes.byref(ctypes.c_int32(size)),
-        values,
-        indptr,
-        indices,
-        None,
-        ctypes.byref(one),
-        settings,
-        ctypes.byref(silent),
-        right,
-        solution,
-        ctypes.byref(error),
-    )
+    call(state, one, one, kind, stage, count, values, *pattern, None, one, settings, silent, right, solution, told)
     return int(error.value)
 
 

@@ -50,12 +50,10 @@ class Pose:
 
 @dataclass(frozen=True)
 class PressFrame:
-    """Where a round gel is pressed.
+    """Where a round gel is pressed: the place (3,) mm on the face, and axes (3, 3) as columns.
 
-    Attributes:
-        origin: (3,) mm, the place on the face.
-        axes: (3, 3) as columns: along increasing polar angle, along increasing azimuth, and along the inward normal.
-        start_mm: the gel begins so far along the third, at most 0.
+    They are along increasing polar angle, along increasing azimuth, and along the inward normal; the gel begins
+    `start_mm` along that, at most 0.
     """
 
     origin: FloatArray

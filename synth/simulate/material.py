@@ -23,13 +23,9 @@ DISPLACEMENT_ONLY_BELOW = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """Per-element constants, in units of a reference Young's modulus.
+    """Per-element constants in units of a reference Young's modulus: μ (m,), λ (m,), and c_2 and c_3 (m, 2).
 
-    Attributes:
-        shear: (m,) μ.
-        lame: (m,) λ; infinite where incompressible (needs `mixed`).
-        yeoh: (m, 2) c_2 and c_3.
-        mixed: whether pressure is a field of its own.
+    λ is infinite where incompressible, which needs `mixed`: that pressure is a field of its own.
     """
 
     shear: FloatArray

@@ -7,8 +7,6 @@ from synth.arrays import FloatArray, Points
 from synth.simulate.distance import shape_vector, signed_distance
 from synth.simulate.indenter import RigidBody
 
-wp.set_module_options({"enable_backward": False, "fast_math": False})
-
 
 class Distance:
     """Signed distance of points of the gel from one body at one of several places.

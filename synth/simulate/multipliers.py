@@ -7,8 +7,6 @@ import warp as wp
 
 from synth.simulate.contact import FAR, ON_CONE, ContactState, Faces, Indenters, anchor_of, position
 
-wp.set_module_options({"enable_backward": False, "fast_math": False})
-
 
 @wp.kernel
 def augment(

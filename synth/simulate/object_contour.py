@@ -23,17 +23,11 @@ Planes = Callable[[Points], tuple[FloatArray, Points]]
 
 
 def sharp_contour(values: FloatArray, corner: FloatArray, spacing: float, planes: Planes) -> Triangles:
-    """The surface on which a function is zero.
+    """The surface on which a function is zero: triangles without regard to orientation, open where it leaves the grid.
 
-    Args:
-        values: (i, j, k) samples, negative inside.
-        corner: (3,) mm, of the first sample.
-        spacing: mm.
-        planes: the function itself. Where its value at a crossing is larger than the spacing the samples hold a jump
-            (a hole that was closed, the border of a part), and the plane lies across the cell's edge.
-
-    Returns:
-        Triangles without regard to orientation; open where the contour leaves the grid.
+    The samples (i, j, k) are negative inside, the first lies at `corner` (3,) mm, and their spacing is in mm. `planes`
+    is the function itself: where its value at a crossing is larger than the spacing the samples hold a jump (a hole
+    that was closed, the border of a part), and the plane lies across the cell's edge.
     """
     inside = values <= 0
     places, axes = _crossings(inside)

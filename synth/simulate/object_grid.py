@@ -21,8 +21,6 @@ from synth.arrays import BoolArray, FloatArray, Points
 from synth.scene.surface_file import Triangles
 from synth.simulate.object_contour import sharp_contour
 
-wp.set_module_options({"enable_backward": False, "fast_math": False})
-
 BAND = 2.0
 """Rounding is done so many radii from the surface, and two samples."""
 LOST = 1.25

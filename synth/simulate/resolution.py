@@ -41,12 +41,10 @@ OUTER = (3, 2)
 
 @dataclass(frozen=True)
 class Accuracy:
-    """How well a mesh resolves one draw.
+    """How well a mesh resolves one draw, and the predicted root-mean-square error of the flow over the contact face.
 
-    Attributes:
-        across: whole elements across the contact, along its shorter side; 0 where less than one, and for an fTetWild
-            mesh, whose elements are not counted.
-        error_px: predicted root-mean-square error of the flow over the contact face; NaN for an fTetWild mesh.
+    `across` are whole elements across the contact, along its shorter side; 0 where less than one. Of an fTetWild mesh
+    elements are not counted, and the error is NaN.
     """
 
     across: int
@@ -55,12 +53,9 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class Resolution(Accuracy):
-    """A draw's mesh and what it is expected to cost in accuracy.
+    """A draw's mesh and what it is expected to cost in accuracy, with the size of the elements under the contact.
 
-    Attributes:
-        mesh: of the pad.
-        through: elements through the thickness, without those that layers add; 0 for an fTetWild mesh.
-        spacing_mm: size of the elements under the contact.
+    `through` are the elements through the thickness, without those that layers add; 0 for an fTetWild mesh.
     """
 
     mesh: PadMesh

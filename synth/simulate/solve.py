@@ -33,17 +33,10 @@ def simulate(
     frames: frozenset[int] | None = None,
     options: SolverOptions = STANDARD,
 ) -> Trajectory:
-    """Press, shear and twist one scene's indenter into its pad, on a given mesh.
+    """Press, shear and twist a fully drawn scene's indenter into its pad, on a given mesh of it.
 
-    Args:
-        scene: fully drawn.
-        mesh: of scene.sensor.gel.
-        folder: what a mesh indenter's file name is relative to.
-        frames: see `simulate_press`.
-        options: of Newton's method.
-
-    Raises:
-        InputError: the indenter cannot be built; the mesh is of another pad, or no element can be built on it.
+    `folder` is what a mesh indenter's file name is relative to; for `frames`, `options` and further errors see
+    `simulate_press`. InputError where the indenter cannot be built.
     """
     return simulate_press(Press.of(scene, mesh, folder), frames, options=options)
 
@@ -56,16 +49,10 @@ def simulate_press(
 ) -> Trajectory:
     """Simulate one press; of a round gel only the vicinity of the contact is solved for, see `Vicinity`.
 
-    Args:
-        press: scene, mesh and load path.
-        frames: numbers of the states that are wanted, default all. The others are part of the trajectory, but keep the
-            penalty's penetration and the load path's relaxed tolerance; those that are wanted are the same to the bit,
-            unless one of them misses the full tolerance and its step is halved.
-        on_progress: told after each step what share of the load path is done.
-        options: of Newton's method.
-
-    Raises:
-        InputError: the mesh is of another pad, or no element can be built on it.
+    `frames` are the numbers of the states that are wanted, default all. The others are part of the trajectory, but keep
+    the penalty's penetration and the load path's relaxed tolerance; those that are wanted are the same to the bit,
+    unless one of them misses the full tolerance and its step is halved. `on_progress` is told after each step what
+    share of the load path is done. InputError where the mesh is of another pad, or no element can be built on it.
     """
     gel, whole = press.scene.sensor.gel, space_of(press)
     if not gel.is_round:

@@ -17,9 +17,8 @@ from synth.arrays import FloatArray
 from synth.scene import Numerics
 from synth.simulate.distance import KINDS
 from synth.simulate.load_path import LoadPath
-from synth.simulate.newton import FORCE_FLOOR, MAX_ITERATIONS, Solution, relative_residual, solve
+from synth.simulate.newton import FORCE_FLOOR, MAX_ITERATIONS, Solution, relative_residual, relax, solve
 from synth.simulate.options import STANDARD, SolverOptions
-from synth.simulate.relaxation import relax
 from synth.simulate.system import System, Unknowns
 from synth.simulate.tables import pack_indenter, place_indenter
 from synth.simulate.trajectory import State, Trajectory, no_contact, not_converged, too_deep, trajectory_of, undeformed
@@ -30,7 +29,7 @@ MAX_ITERATIONS_TO_GROW = 7
 """A step that took at most so many iterations is followed by a longer one."""
 GROWTH = 1.5
 MAX_RELAXED_STEP = 1 / 4
-"""A step that fails is relaxed (`synth.simulate.relaxation`) when it is at most this share of max_step_mm, and a pass
+"""A step that fails is relaxed (`synth.simulate.newton`) when it is at most this share of max_step_mm, and a pass
 when it is at most this share of a whole update and begins deeper than MAX_PENETRATION."""
 STICK_FRICTION = 1e6
 """Coefficient of friction at which nothing slides."""
@@ -242,7 +241,7 @@ class Stepper:
         saved = self.system.saved_contact()
         solution = step
         if target in self._corrected:
-            self.system.anchor(step.state, self.indenter)
+            self.system.update_contact_history(step.state, self.indenter, new_only=1)
             solution = self._polished(self._augmented(step), self.numerics.tolerance)
             if solution.converged and self.system.deepest() > self._deepest_mm:
                 self.reason = too_deep(self.path.pose(target), MAX_PENETRATION)

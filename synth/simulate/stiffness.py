@@ -9,8 +9,6 @@ import warp as wp
 
 from synth.simulate.bulk import Bulk, _deformation_gradient, _dilation, _slopes
 
-wp.set_module_options({"enable_backward": False, "fast_math": False})
-
 
 @wp.kernel
 def linearise(
@@ -64,7 +62,7 @@ def bulk_tangent(
 
     Adds them to the entries slot[e, pair, 3 i + j] of the sparse values; entries of held unknowns and below the
     diagonal share one slot past the end. laplace: (m, pairs) of `synth.simulate.tables.laplace_table`; so many times
-    it is added again as the sample's viscosity (B,) says, see `synth.simulate.relaxation`.
+    it is added again as the sample's viscosity (B,) says, see `synth.simulate.newton`.
     """
     s, e = wp.tid()
     if active[s] == 0:

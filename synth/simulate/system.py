@@ -42,12 +42,9 @@ class Unknowns:
 
 @dataclass(frozen=True)
 class Residual:
-    """Residual of the equilibrium equations.
+    """Residual of the equilibrium equations: (k,) of the unknowns that are not held; meaningless where det F <= 0.
 
-    Attributes:
-        free: (k,) residual of the unknowns that are not held.
-        reaction: (n, 3) all nodal forces including those on held nodes, in units of E mm².
-        smallest_jacobian: smallest det F; the residual means nothing where it is <= 0.
+    The reaction (n, 3) are all nodal forces including those on held nodes, in units of E mm².
     """
 
     free: FloatArray
@@ -57,11 +54,9 @@ class Residual:
 
 @dataclass(frozen=True)
 class Tangent:
-    """Derivative of the free residual.
+    """Derivative of the free residual: CSR data (nnz,) of the symmetric part's upper triangle, and the unsymmetric.
 
-    Attributes:
-        values: (nnz,) CSR data of the symmetric part's upper triangle.
-        remainder: the unsymmetric rest of friction, SciPy CSR over the free unknowns, or None.
+    That is friction's, SciPy CSR over the free unknowns, or None.
     """
 
     values: FloatArray
@@ -69,14 +64,10 @@ class Tangent:
 
 
 class System:
-    """Kernels, arrays and sparse pattern of one pad; see the module's docstring.
+    """Kernels, arrays and sparse pattern of one pad, its space and its elements' material; see the module's docstring.
 
-    Args:
-        space: the pad's finite-element space.
-        material: of its elements.
-        penalty: contact stiffness, E per mm.
-        load: (n, 3) dead nodal forces in E mm², or None.
-        options: precision and use of the linear solver's factors.
+    The penalty is the contact stiffness, E per mm; the load, if any, (n, 3) dead nodal forces in E mm². Of the options
+    precision and use of the linear solver's factors count.
     """
 
     def __init__(
@@ -176,7 +167,7 @@ class System:
         return Tangent(self._values.numpy()[0, :-1], self._unsymmetric())
 
     def viscous_force(self, before: Unknowns, after: Unknowns, viscosity: float) -> FloatArray:
-        """(k,) force on the free unknowns against a step with a viscosity, see `synth.simulate.relaxation`."""
+        """(k,) force on the free unknowns against a step with a viscosity, see `synth.simulate.newton`."""
         force = _zeros((1, len(self.space.points)), wp.vec3d)
         (old, _), (new, _) = _on_device(before), _on_device(after)
         thick = _array(np.array([viscosity]), wp.float64)
@@ -222,15 +213,8 @@ class System:
         amount = _array(np.array([share]), wp.float64)
         _launch(augment, self.gap.shape, amount, indenter, self.gap, self.tangential, self.penalty, self.contact)
 
-    def anchor(self, state: Unknowns, indenter: Indenters) -> None:
-        """Anchor the points that touch for the first time."""
-        self._update_contact_history(state, indenter, new_only=1)
-
-    def update_contact_history(self, state: Unknowns, indenter: Indenters) -> None:
-        """Accept a step: friction's anchors follow."""
-        self._update_contact_history(state, indenter, new_only=0)
-
-    def _update_contact_history(self, state: Unknowns, indenter: Indenters, new_only: int) -> None:
+    def update_contact_history(self, state: Unknowns, indenter: Indenters, new_only: int = 0) -> None:
+        """Accept a step: friction's anchors follow. If new_only, points that touch for the first time are anchored."""
         at_last = [indenter, self.gap, self.tangential, self.penalty]
         u = _on_device(state)[0]
         _launch(update_contact_history, self.gap.shape, u, self._active, self._faces, *at_last, new_only, self.contact)
@@ -264,10 +248,9 @@ class System:
     def forces(self, state: Unknowns) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Of the indenter on the gel at the last residual, in units of E.
 
-        Returns:
-            (3,) force in E mm²; (3,) moment about the frame's origin in E mm³; (s, 3) traction at the nodes of the
-            coated surface (E, per undeformed area), the mean of the quadrature points near a node, weighted by the
-            node's piecewise linear function.
+        (3,) force in E mm²; (3,) moment about the frame's origin in E mm³; (s, 3) traction at the nodes of the coated
+        surface (E, per undeformed area), the mean of the quadrature points near a node, weighted by the node's
+        piecewise linear function.
         """
         shape, weight = self.space.element.face_shape, self._faces.weight.numpy()
         traction = self.traction.numpy()[0]

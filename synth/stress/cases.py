@@ -22,12 +22,10 @@ Range = tuple[float, float]
 
 
 class Comparison(Part):
-    """With the last state of another case.
+    """With the last state of another case, "with" in the file.
 
-    Attributes:
-        with_case: its name ("with" in the file).
-        displacement: largest accepted difference at any node over the largest displacement; needs the same mesh.
-        force_ratio: accepted range of this case's normal force over the other's.
+    The displacement is the largest accepted difference at any node over the largest displacement, and needs the same
+    mesh; the ratio is the accepted range of this case's normal force over the other's.
     """
 
     with_case: Annotated[str, Field(alias="with")]
@@ -36,13 +34,10 @@ class Comparison(Part):
 
 
 class Expectation(Part):
-    """What holds for a case when it has ended.
+    """What holds for a case when it has ended: acceptable outcomes, and the comparison with another case.
 
-    Attributes:
-        outcome: acceptable ends.
-        says: appears in the reason or message of every end but "complete".
-        bounds: accepted range of quantities of `synth.stress.check.measured`, where a pressed state was recorded.
-        compare: with another case.
+    `says` appears in the reason or message of every end but "complete"; `bounds` are accepted ranges of quantities of
+    `synth.stress.check.measured`, where a pressed state was recorded.
     """
 
     outcome: tuple[END, ...] = Field(min_length=1)

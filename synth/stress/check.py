@@ -51,13 +51,10 @@ class Result:
 
 @dataclass(frozen=True)
 class Verdict:
-    """A run's result beside its expectation.
+    """A run's result beside its expectation; what was measured is empty without states.
 
-    Attributes:
-        result: how it ended.
-        measured: quantities of the run; empty without states.
-        broken: what is not as it has to be; empty where the run is as expected, or deviates in the way that is noted.
-        deviates: whether only the noted deviation holds.
+    `broken` is what is not as it has to be; empty where the run is as expected, or deviates in the way that is noted
+    (`deviates`).
     """
 
     result: Result
@@ -123,13 +120,10 @@ def _state_faults(result: Result, number: int, state: Mapping[str, Any]) -> list
 
 
 def smallest_jacobian(points: FloatArray, nodes: np.ndarray, displacement: FloatArray, at: FloatArray) -> float:
-    """Smallest det F of straight-edged tetrahedra.
+    """Smallest det F of straight-edged tetrahedra at barycentric coordinates (k, 4).
 
-    Args:
-        points: (n, 3) mm, vertices first, for quadratic elements then the midpoints of their edges.
-        nodes: (m, 4) or (m, 10); a tetrahedron's vertices, then the midpoints of EDGES.
-        displacement: (n, 3) mm.
-        at: (k, 4) barycentric coordinates of the points to look at.
+    Points are (n, 3) mm, vertices first, for quadratic elements then the midpoints of their edges; nodes are (m, 4) or
+    (m, 10), a tetrahedron's vertices, then the midpoints of EDGES; the displacement is (n, 3) mm.
     """
     corner = points[nodes[:, :4]]
     inverse = np.linalg.inv(corner[:, 1:] - corner[:, :1])

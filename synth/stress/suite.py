@@ -34,18 +34,9 @@ WORKER = (sys.executable, "-m", "synth.stress.worker")
 def run_stress(out: Path, only: Sequence[str] | None, workers: int, as_json: bool, scenes: Path = EXTREME) -> int:
     """Run the cases of a folder of base.toml and expected.toml; write stress.json, or print it.
 
-    Args:
-        out: directory for it, for the meshes, and for a folder per run.
-        only: shell patterns of cases or groups; cases that others are compared with come along. Default all.
-        workers: processes at a time.
-        as_json: print stress.json instead of the table.
-        scenes: folder of base.toml and expected.toml.
-
-    Returns:
-        0, or 1 when any case ended otherwise than written down.
-
-    Raises:
-        InputError: unknown case; the expectations or the storage are not usable.
+    `out` is the directory for it, for the meshes, and for a folder per run. `only` are shell patterns of cases or
+    groups; cases that others are compared with come along. So many workers run at a time. Returns 0, or 1 when any case
+    ended otherwise than written down. InputError for an unknown case, and where expectations or storage are not usable.
     """
     from rich.console import Console
 

@@ -20,8 +20,8 @@ from synth.mesh.tetrahedralise import shape_quality
 from synth.scene import Scene
 from synth.scene.template import load_scene
 from synth.simulate import Trajectory, simulate
-from synth.simulate.mesh_rule import MeshRule
 from synth.simulate.options import SolverOptions
+from synth.simulate.press import MeshRule
 from synth.stress.cases import Case, Run, SurfaceVariant
 
 NEAR = 1e-5

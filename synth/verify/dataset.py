@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from synth.dataset.exr import ALIASES, read_channels
-from synth.dataset.exr_channels import OPTIONAL
+from synth.dataset.exr import ALIASES, OPTIONAL, read_channels
 from synth.dataset.reader import Dataset, SampleData, read_dataset
 from synth.errors import InputError
 from synth.scene import Outputs, Scene, Sensor
@@ -101,7 +100,7 @@ def flow_file_problems(folder: Path, scene: Scene, meta: Mapping[str, Any]) -> l
 
 
 def _channel_problems(planes: Mapping[str, np.ndarray], outputs: Outputs) -> list[str]:
-    asked = [name for key in OPTIONAL if getattr(outputs, key) for name in OPTIONAL[key].names]
+    asked = [name for key, (names, _) in OPTIONAL.items() if getattr(outputs, key) for name in names]
     problems = [f"lacks the channel {name}" for name in (*asked, *ALIASES) if name not in planes]
     problems += [f"{name} is {plane.dtype}, not float32" for name, plane in planes.items() if plane.dtype != np.float32]
     for alias, name in ALIASES.items():

@@ -59,12 +59,8 @@ class Derived:
 def check_motion(name: str, near: Sheet, far: Sheet, flow: FlowArray, visible: FlowArray) -> list[Check]:
     """Checks of the recorded motion from the state `near` to the state `far`: flow, missing gel, visibility, closure.
 
-    Args:
-        name: "forward" or "backward".
-        near: the state of the image to whose pixels the flow belongs.
-        far: the state of the other image.
-        flow: (H, W, 2) px as recorded.
-        visible: (H, W) as recorded.
+    The name is "forward" or "backward"; flow (H, W, 2) px and visibility (H, W) are as recorded, at the pixels of the
+    image of `near`.
     """
     size = (near.height, near.width)
     if flow.shape != (*size, 2) or visible.shape != size:

@@ -54,14 +54,9 @@ Textured = tuple[FloatArray, FloatArray, NDArray[np.intp], NDArray[np.intp]]
 
 
 def check_photometry(sensor: Sensor, image1: Raster, image2: Raster, flow: FlowArray, visible: FlowArray) -> Check:
-    """Compares the images through the forward flow.
+    """Compares the images, (H, W) or (H, W, 3), through the forward flow (H, W, 2) px with its visibility (H, W).
 
-    Args:
-        sensor: its camera's response and noise, and its pattern.
-        image1: (H, W) or (H, W, 3).
-        image2: the same.
-        flow: (H, W, 2) px, forward.
-        visible: (H, W).
+    Of the sensor its pattern, and its camera's response and noise, count.
     """
     if isinstance(sensor.pattern, NoPattern):
         return _not_applicable(ALLOWANCE_PX, "the coating is bare")

@@ -17,14 +17,10 @@ _AGREED = (
 
 @dataclass(frozen=True)
 class Check:
-    """One figure and its limit.
+    """One figure and its limit, the largest that passes, both in the unit.
 
-    Attributes:
-        name: what was checked.
-        figure: what was found; None where the check does not apply (it then passes, and `detail` says why).
-        tolerance: the largest figure that passes.
-        unit: of both.
-        detail: where the worst place is, what was excused, or what is wrong.
+    The figure is None where the check does not apply; it then passes, and `detail` says why, as else where the worst
+    place is, what was excused, or what is wrong.
     """
 
     name: str

@@ -1,4 +1,4 @@
-r"""Refraction at a round face seen from within, by shooting: nothing here is shared with `synth.optics.round_window`.
+r"""Refraction at a round face seen from within, by shooting: nothing here is shared with `synth.optics.window`.
 
 A ray leaves the eye, is turned at the face by Snell's law in angles, and passes the wanted point at some distance, of
 which the components across the straight line from eye to point are to vanish. They are functions of the ray's two
@@ -22,12 +22,10 @@ _MISS = 1e-13
 
 @dataclass(frozen=True)
 class Shell:
-    """A sphere, a cylinder about the z axis, or a half sphere with a cylinder above it; a `bottom` at -inf: no sphere.
+    """A sphere, a cylinder about the z axis, or a half sphere with a cylinder above it.
 
-    Attributes:
-        radius: mm.
-        bottom: z of the lowest centre, mm; below it the face is a sphere.
-        top: z of the highest centre, mm; above it the face is a sphere.
+    Below the height `bottom` of the lowest centre, and above `top`, that of the highest, the face is a sphere; a
+    `bottom` at -inf: no sphere. All in mm.
     """
 
     radius: float

@@ -17,7 +17,7 @@ from synth.scene.template import load_scene
 from synth.simulate import simulate
 from synth.simulate.footprint import footprint
 from synth.simulate.load_path import path_of
-from synth.simulate.mesh_rule import MeshRule
+from synth.simulate.press import MeshRule
 from synth.simulate.resolution import MARGIN, graded_mesh, scale_px_per_mm
 
 TINY = """

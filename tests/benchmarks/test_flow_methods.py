@@ -14,7 +14,7 @@ from benchmarks.pressed_gel import View, main_camera
 from benchmarks.render import others
 from benchmarks.rows import Row
 from synth.arrays import Image
-from synth.render import sample_count
+from synth.render import camera_image
 from synth.render.camera_image import expected_signal
 
 FOCAL = 160.0  # px, so that the gel's edges stay out of the image
@@ -139,7 +139,7 @@ def test_camera_noise_is_the_models_and_the_same_on_both_pairs() -> None:
     camera = small_sensor(gamma=1.0, shot_noise=0.04, bit_depth=16).camera
     grey = np.full((60, 80, 3), 0.25, dtype=np.float32)
     # 14400 values: 0.6 %, 4 times.
-    assert camera_noise(grey, camera) == pytest.approx(255 * sample_count.camera_noise(grey, camera), rel=0.024)
+    assert camera_noise(grey, camera) == pytest.approx(255 * camera_image.camera_noise(grey, camera), rel=0.024)
     camera = CAMERA.model_copy(update={"read_noise": 0.2})
     pictures = [[flat(0.5)], [flat(0.5)]]
     truth = Truth(np.zeros((60, 80, 2)), np.ones((60, 80), dtype=bool))

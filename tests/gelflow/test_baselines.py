@@ -13,8 +13,8 @@ from textures import REAL, as_bytes, moved
 from gelflow.baselines import CLASSICAL, named_methods
 from gelflow.baselines.aldic import ALDIC, INSTALL
 from gelflow.baselines.classical import dis
+from gelflow.baselines.method import dense_flow
 from gelflow.baselines.registry import REGISTERED
-from gelflow.baselines.scattered import dense_flow
 from gelflow.compare.metrics import flow_errors, image_similarity, marker_distance, psnr, ssim, ssim_map, warp_image
 from gelflow.compare.scores import score_pair
 from gelflow.config import REGISTRATIONS, Registration

@@ -15,8 +15,7 @@ from gelflow.arrays import FlowArray, ImageArray
 from gelflow.baselines import named_methods
 from gelflow.cli import main
 from gelflow.compare.comparison import read_comparison
-from gelflow.compare.report import markdown
-from gelflow.compare.run import compare
+from gelflow.compare.run import compare, markdown
 from gelflow.compare.scores import evaluate, score_pair, summarise
 from gelflow.compare.seeds import grouped
 from gelflow.compare.tables import pair_table, summary_table

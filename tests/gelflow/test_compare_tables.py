@@ -11,8 +11,7 @@ import pytest
 from test_compare import Constant
 from textures import write_folder, write_synthetic
 
-from gelflow.compare.report import latex
-from gelflow.compare.run import compare
+from gelflow.compare.run import compare, latex
 from gelflow.compare.scores import evaluate, summarise
 from gelflow.compare.seeds import group_name, grouped
 from gelflow.compare.strata import EDGE, MOTION, PATTERN, SCENE, merged, pair_strata, signed_distance

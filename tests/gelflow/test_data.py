@@ -14,8 +14,7 @@ from textures import as_bytes, moved, save, write_folder, write_synthetic
 from gelflow.arrays import FlowArray
 from gelflow.data import PairDataset, open_all
 from gelflow.errors import InputError
-from gelflow.files.exr import read_channels, read_flow, write_flow
-from gelflow.files.flo import write_flo
+from gelflow.files.exr import read_channels, read_flow, write_flo, write_flow
 from gelflow.files.image import read_image, read_pair, write_png
 
 

@@ -11,12 +11,23 @@ from waves import moved_pair, pixel_centres, press_flow
 from gelflow.config import LossConfig
 from gelflow.losses import flow_loss, self_supervised_loss
 from gelflow.losses.augmentation_consistency import consistency_loss, transformed_pair
-from gelflow.losses.decomposition import decomposition_loss, regulariser_weight
-from gelflow.losses.deformation import area_ratio, deformation_loss
 from gelflow.losses.multiscale import SOFTNESS_PX, endpoint_loss
-from gelflow.losses.occlusion import visible_in_both_images
-from gelflow.losses.photometric import C1, C2, appearance_loss, photometric_loss, structural_similarity
-from gelflow.losses.smoothness import first_order_loss, second_order_loss
+from gelflow.losses.photometric import (
+    C1,
+    C2,
+    appearance_loss,
+    photometric_loss,
+    structural_similarity,
+    visible_in_both_images,
+)
+from gelflow.losses.regularisers import (
+    area_ratio,
+    decomposition_loss,
+    deformation_loss,
+    first_order_loss,
+    regulariser_weight,
+    second_order_loss,
+)
 from gelflow.ops.pyramid import flow_pyramid
 from gelflow.ops.warp import inside, warp
 

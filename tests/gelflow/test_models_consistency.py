@@ -7,7 +7,7 @@ from waves import moved_pair, press_flow
 
 from gelflow.arrays import Flow, Images
 from gelflow.config import RegistrationConfig
-from gelflow.models.consistency import consistent, inverse
+from gelflow.models.estimate import consistent, inverse
 from gelflow.ops.warp import warp
 
 PATCH = (..., slice(36, 60), slice(50, 78))

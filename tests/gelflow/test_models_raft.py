@@ -10,8 +10,7 @@ from waves import moved_pair
 
 from gelflow.errors import InputError
 from gelflow.models.raft import RAFT, load_raft
-from gelflow.models.raft.correlation import correlation_pyramid, lookup
-from gelflow.models.raft.network import enlarge_bilinear, enlarge_convex
+from gelflow.models.raft.network import correlation_pyramid, enlarge_bilinear, enlarge_convex, lookup
 
 PUBLISHED = Path(__file__).resolve().parents[2].parent / "shared" / "weights" / "raft-small" / "raft-small.pth"
 needs_weights = pytest.mark.skipif(

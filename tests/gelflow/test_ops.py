@@ -11,10 +11,10 @@ from torch import Tensor
 from torch.autograd import gradcheck
 from waves import pixel_centres, wave_image
 
+from gelflow.losses.regularisers import forward_differences, window_slopes
 from gelflow.ops.cached import cached
 from gelflow.ops.correlation import local_correlation
 from gelflow.ops.gaussian import smoother, window_sums
-from gelflow.ops.gradients import forward_differences, window_slopes
 from gelflow.ops.pyramid import enlarge_flow, flow_pyramid, halve_flow, image_pyramid
 from gelflow.ops.spline import SplineImage
 from gelflow.ops.warp import inside, positions, warp

@@ -11,7 +11,7 @@ from gelflow.config.sources import train_config
 from gelflow.errors import InputError
 from gelflow.ops.warp import inside, warp
 from gelflow.train.augment import augmented
-from gelflow.train.resident import resident
+from gelflow.train.loading import resident
 from gelflow.train.samples import CheckedPairs, StepSampler, TrainingSamples, augmented_batch, checked, collate, resized
 
 

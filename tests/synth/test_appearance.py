@@ -8,7 +8,7 @@ import pytest
 from appearance import bright_dots, speckle
 from render_scenes import needs_llvm
 
-from synth.calibrate.preset import middle, render_settings
+from synth.calibrate.run import middle, render_settings
 from synth.mesh import flat_surface
 from synth.render.camera_image import camera_image
 from synth.render.pattern import albedo

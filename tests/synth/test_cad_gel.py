@@ -28,7 +28,7 @@ from synth.scene.template import load_scene
 from synth.simulate import Trajectory, simulate
 from synth.simulate.element import p2p1
 from synth.simulate.load_path import path_of
-from synth.simulate.mesh_rule import MeshRule
+from synth.simulate.press import MeshRule
 from synth.simulate.space import function_space
 from synth.surface import GelSurface
 from synth.verify.dataset import verify_dataset

@@ -21,9 +21,8 @@ from synth.calibrate.dots import find_dots
 from synth.calibrate.frames import Frames, read_frames
 from synth.calibrate.irradiance import FlatGel, LightGeometry
 from synth.calibrate.noise import fit_noise
-from synth.calibrate.preset import start_sensor
 from synth.calibrate.profile import fit_profile
-from synth.calibrate.run import MARK
+from synth.calibrate.run import MARK, start_sensor
 from synth.calibrate.sensor_fit import SensorFit, fit_sensor
 from synth.cli import main
 from synth.errors import InputError

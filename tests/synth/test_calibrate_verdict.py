@@ -14,7 +14,7 @@ from synth.calibrate.comparison import Comparison
 from synth.calibrate.dot_grid import fit_dot_grid
 from synth.calibrate.dots import find_dots
 from synth.calibrate.frames import Frames
-from synth.calibrate.preset import start_sensor
+from synth.calibrate.run import start_sensor
 from synth.calibrate.sensor_fit import find_grid, fit_sensor
 from synth.calibrate.verdict import ALLOWED_OFF_GRID, common_displacement, verdict
 from synth.cli import main

@@ -4,9 +4,15 @@ import numpy as np
 import pytest
 from render_scenes import FAST, flat_surface, needs_llvm, plain, small_sensor
 
-from synth.render.camera_image import camera_image, expected_signal, vignette
+from synth.render.camera_image import (
+    camera_image,
+    camera_noise,
+    expected_signal,
+    needed_samples,
+    render_noise,
+    vignette,
+)
 from synth.render.renderer import Renderer, full_grid
-from synth.render.sample_count import camera_noise, needed_samples, render_noise
 from synth.scene import Light, Render, Sensor
 
 SIZE = {"width": 200, "height": 150, "cx": 100.0, "cy": 75.0}

@@ -12,7 +12,7 @@ from synth.mesh.capsule import CapsuleFace
 from synth.scene import Gel, Numerics, Scene
 from synth.simulate.element import p2p1
 from synth.simulate.load_path import path_of
-from synth.simulate.mesh_rule import MeshRule
+from synth.simulate.press import MeshRule
 from synth.simulate.space import function_space
 
 FACE = CapsuleFace(5.0, 2.0, 2.0)

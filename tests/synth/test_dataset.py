@@ -13,7 +13,7 @@ from processes_of import largest_file
 from samples import job, translation_sample, tree, writing_elsewhere
 
 from synth.cli import main
-from synth.dataset import lines, sample_files
+from synth.dataset import manifest, sample_files
 from synth.dataset.npz import encode_npz
 from synth.dataset.reader import read_dataset
 from synth.dataset.sample_files import write_sample_files
@@ -187,9 +187,9 @@ def test_full_disk_in_the_manifest(tmp_path, monkeypatch, call):
         whole = os.write
         with monkeypatch.context() as patch:
             if call == "write":
-                patch.setattr(lines.os, "write", lambda descriptor, line: whole(descriptor, line[:20]))
+                patch.setattr(manifest.os, "write", lambda descriptor, line: whole(descriptor, line[:20]))
             else:
-                patch.setattr(lines.os, "fsync", _full)
+                patch.setattr(manifest.os, "fsync", _full)
             with pytest.raises(InputError, match=r"manifest\.jsonl: cannot be written: No space left"):
                 writer.record(entry)
         assert tree(tmp_path / "d") == before

@@ -11,11 +11,10 @@ import pytest
 from PIL import Image
 from samples import translation_sample
 
-from synth.dataset.exr import channels_of, read_channels, read_flow, write_flow
-from synth.dataset.exr_channels import OPTIONAL
+from synth.dataset.exr import OPTIONAL, channels_of, read_channels, read_flow, write_flow
 from synth.dataset.images import encode_png, read_png
 from synth.dataset.jsontext import jsonable, read_document, to_document, to_line
-from synth.dataset.lines import append_line, merge_lines, read_line, scan_lines
+from synth.dataset.manifest import append_line, merge_lines, read_line, scan_lines
 from synth.errors import InputError
 from synth.flow.field import FlowField
 from synth.scene import Outputs
@@ -121,7 +120,7 @@ def test_file_as_the_library_sees_it_and_a_round_trip_to_the_bit(path) -> None:
 
 
 def test_header_tells_what_the_optional_channels_are_and_missing_ones_are_listed(tmp_path) -> None:
-    extras = {name: FLOW.forward_visible for part in OPTIONAL.values() for name in part.names}
+    extras = {name: FLOW.forward_visible for names, _ in OPTIONAL.values() for name in names}
     write_flow(tmp_path / "f.exr", FlowField(FLOW.forward, FLOW.forward_visible, extras=extras), {})
     header = read_channels(tmp_path / "f.exr")[1]
     assert {key for key in header if key.startswith("channels.")} == {f"channels.{key}" for key in OPTIONAL}

@@ -17,9 +17,9 @@ from synth.flow.exact import exact_flow
 from synth.flow.view import View
 from synth.optics import Optics
 from synth.pipeline.generate import generate
+from synth.render.camera_image import camera_noise, render_noise
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
-from synth.render.sample_count import camera_noise, render_noise
 from synth.render.thin_lens import ThinLens
 from synth.scene import Camera, Dots, FurtherCamera, Light, Mirror, Render, Sensor
 from synth.scene.template import load_scene

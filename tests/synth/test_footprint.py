@@ -21,7 +21,7 @@ from synth.simulate.error_model import RATE, face_error
 from synth.simulate.footprint import FINEST_MM, RESOLUTION, UNTOUCHED, footprint
 from synth.simulate.indenter import rigid_body
 from synth.simulate.load_path import LoadPath
-from synth.simulate.mesh_rule import MeshRule
+from synth.simulate.press import MeshRule
 from synth.simulate.resolution import (
     ELEMENTS_ACROSS,
     MARGIN,

@@ -31,7 +31,7 @@ from synth.render.variant import Variant
 from synth.scene import Gel, Numerics, Scene
 from synth.scene.sampling import MAX_DRAWS, draw, draw_sensor, sensor_of
 from synth.scene.template import Template, load_scene
-from synth.simulate.mesh_rule import MeshRule
+from synth.simulate.press import MeshRule
 from synth.simulate.resolution import accuracy, shared_mesh, shared_spacing_mm
 from synth.simulate.solve import simulate_press
 

@@ -19,9 +19,8 @@ from synth.dataset.writer import DatasetWriter
 from synth.errors import InputError
 from synth.inspect import inspect, tables, write_html, write_sheet
 from synth.inspect.inspection import evenly_spaced
-from synth.inspect.panels import arrows_of
+from synth.inspect.panels import NO_GEL, arrows_of, flow_colours, robust_scale, wheel_legend
 from synth.inspect.view import View, sample_at
-from synth.inspect.wheel import NO_GEL, flow_colours, robust_scale, wheel_legend
 
 
 @pytest.fixture(scope="module")

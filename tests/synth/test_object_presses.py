@@ -16,10 +16,9 @@ from synth.scene import Scene
 from synth.simulate import indenter, simulate, stepping
 from synth.simulate.batched import simulate_presses
 from synth.simulate.batched.pad import prepare
-from synth.simulate.newton import Solution, solve
+from synth.simulate.newton import AIM, LEAST_VISCOSITY, MAX_ERROR, MOST_VISCOSITY, Solution, next_viscosity, solve
 from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.press import Press
-from synth.simulate.relaxation import AIM, LEAST_VISCOSITY, MAX_ERROR, MOST_VISCOSITY, next_viscosity
 from synth.simulate.solve import simulate_press
 from synth.simulate.trajectory import Trajectory
 

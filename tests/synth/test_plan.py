@@ -17,7 +17,7 @@ from synth.render.variant import Variant
 from synth.scene.sampling import draw
 from synth.scene.template import load_scene, shipped_scenes
 from synth.simulate.indenter import rigid_body
-from synth.simulate.mesh_rule import DEFAULT_TARGET_PX, MeshRule
+from synth.simulate.press import DEFAULT_TARGET_PX, MeshRule
 
 LLVM, MONO, SCALAR = Variant("llvm_ad_rgb", ""), Variant("llvm_ad_mono", ""), Variant("scalar_rgb", "")
 

@@ -9,7 +9,7 @@ from verified_sample import motion_checks, sheets
 from synth.flow.exact import exact_flow
 from synth.flow.view import View
 from synth.optics import Optics
-from synth.optics.round_window import RoundWindow
+from synth.optics.window import RoundWindow
 from synth.verify.camera import ForwardCamera
 from synth.verify.motion import check_motion
 

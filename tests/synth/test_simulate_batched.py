@@ -15,10 +15,17 @@ from synth.scene import Scene
 from synth.simulate import Trajectory
 from synth.simulate.batched import simulate_presses
 from synth.simulate.batched.arrays import number_rows
-from synth.simulate.batched.inversion_barrier import barrier_product, find_inverting
 from synth.simulate.batched.krylov import padded
 from synth.simulate.batched.pad import prepare
-from synth.simulate.batched.product import STORED_YEOH, bulk_product, contact_product, store_bulk, store_contact
+from synth.simulate.batched.product import (
+    STORED_YEOH,
+    barrier_product,
+    bulk_product,
+    contact_product,
+    find_inverting,
+    store_bulk,
+    store_contact,
+)
 from synth.simulate.batched.run import OPTIONS
 from synth.simulate.contact import contact_stiffness
 from synth.simulate.load_path import path_of
@@ -139,7 +146,7 @@ def test_the_product_is_the_tangent_times_the_vector(element, poisson_ratio, sti
     bodies = indenters(scene(friction=0.3, motion={"depth_mm": 0.5, "shear_mm": [0.1, 0.0]}), 0.45)
     zero = body.zero()
     body.residual(zero, bodies)
-    body.anchor(zero, bodies)
+    body.update_contact_history(zero, bodies, new_only=1)
     u = np.where(space.held, 0.0, 0.05 * rng.standard_normal(zero.u.shape))
     state = Unknowns(u, rng.uniform(-4.0, 0.0, zero.p.shape))
     tangent = dense(body, body.tangent(state, bodies, 0.7))

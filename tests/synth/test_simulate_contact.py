@@ -144,7 +144,7 @@ def test_new_contact_is_anchored_where_it_touched_unless_without_past_or_frictio
     place, gap = contact.place.numpy()[0].copy(), contact.gap.numpy()[0].copy()
     touching = made.mode > 0
     assert touching.any()
-    body.anchor(made.state, made.indenters)
+    body.update_contact_history(made.state, made.indenters, new_only=1)
     assert (made.anchored == touching).all()
     assert (contact.gap.numpy()[0] == gap).all()  # the step is not accepted yet
     now = np.linalg.norm(made.local, axis=-1) - RADIUS

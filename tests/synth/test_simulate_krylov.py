@@ -16,12 +16,12 @@ from synth.simulate.batched.krylov import (
     block_size,
     flat,
     padded,
+    round_matrix,
     shapes,
     solution,
 )
 from synth.simulate.batched.lanes import PREDICTOR_READY, READY, Lanes, Settings
-from synth.simulate.batched.preconditioner import Preconditioner, inverse
-from synth.simulate.batched.tf32 import round_matrix
+from synth.simulate.batched.pad import Preconditioner, inverse
 from synth.simulate.options import STANDARD
 
 

@@ -5,9 +5,8 @@ import pytest
 from kinematic_double import FISHEYE, HEIGHT, LENS, OBLIQUE, SIDES, WIDTH, optics, pixel_centres, sheet
 
 from synth.flow.exact import exact_flow
-from synth.flow.overlap import boundary_edges, may_overlap
 from synth.flow.trace import trace
-from synth.flow.view import View
+from synth.flow.view import View, boundary_edges, may_overlap
 
 RNG = np.random.default_rng(5)
 

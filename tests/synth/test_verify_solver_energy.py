@@ -62,7 +62,9 @@ class Ledger(System):
 
     account: Account
 
-    def update_contact_history(self, state: Unknowns, indenter: Indenters) -> None:
+    def update_contact_history(self, state: Unknowns, indenter: Indenters, new_only: int = 0) -> None:
+        if new_only:
+            return super().update_contact_history(state, indenter, new_only)
         centre, rotation = indenter.centre.numpy()[0].copy(), indenter.rotation.numpy()[0].copy()
         force, moment = self.forces(state)[:2]
         along, whole = self.tangential.numpy()[0], self.traction.numpy()[0]

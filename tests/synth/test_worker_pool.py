@@ -17,8 +17,7 @@ from synth.pipeline import worker_pool as pool
 from synth.pipeline.generate import Scheduling, generate
 from synth.pipeline.overlapped import outcomes_of_batches
 from synth.pipeline.records import JobContext, Task
-from synth.pipeline.threads import THREADS, one_thread_each
-from synth.pipeline.worker_pool import outcomes_of_processes
+from synth.pipeline.worker_pool import THREADS, one_thread_each, outcomes_of_processes
 from synth.scene import Sensor
 from synth.scene.template import load_scene
 

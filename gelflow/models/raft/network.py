@@ -7,20 +7,134 @@ neighbours (large network).
 
 What it cannot do: learn here; it runs published weights, for comparison. Memory grows with the square of the number
 of pixels: a pair of 640 x 480 px holds 4800^2 correlations and their pyramid, 120 MB.
+
+Encoder (Teed and Deng 2020, section 3.1): features at an eighth of the image's resolution.
+
+A strided 7x7 convolution, three stages of two residual units each (the second and third stage halve the resolution
+once more), and a 1x1 convolution. The large network's units are two 3x3 convolutions, the small one's are bottlenecks
+with a quarter of the channels. Names of submodules are those of the published weights, see
+`gelflow.models.raft.weights`.
+
+Correlation and its lookup (Teed and Deng 2020, section 3.2).
+
+``C(x, y) = <f1(x), f2(y)> / sqrt(channels)`` for every pixel x of image 1 and y of image 2, at four resolutions of
+image 2: level k is the mean over blocks of 2^k x 2^k pixels y. The lookup reads C(x, .) bilinearly on a grid of
+(2 r + 1)^2 unit steps of each level around the point that x has moved to; outside the image it reads zero.
+
+Two conventions that the published weights were trained with, and that differ from the rest of gelflow:
+
+- Positions are pixel *indices* at every level: index i of level 0 is read at index i / 2^k of level k, although the
+  centre of its block lies at (i + 1/2) / 2^k - 1/2.
+- Displacements are ordered column by column: channel (d_x + r)(2 r + 1) + (d_y + r).
 """
 
+from collections.abc import Callable
+
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from gelflow.arrays import Flow, Images
+from gelflow.arrays import Features, Flow, Images
 from gelflow.models.gelflow import check_shapes
-from gelflow.models.raft.correlation import LEVELS, correlation_pyramid, lookup
-from gelflow.models.raft.encoder import RaftEncoder
 from gelflow.models.raft.update import LARGE, SMALL, UpdateBlock
 from gelflow.ops.warp import pixel_indices
 
 STRIDE = 8
 """Resolution of the image over that of the features."""
+
+
+LEVELS = 4
+"""Resolutions of the correlation."""
+
+
+def correlation_pyramid(first: Features, second: Features) -> list[Tensor]:
+    """All-pairs correlation at `LEVELS` resolutions of the second image, (B H W, 1, H // 2^k, W // 2^k) at level k.
+
+    H and W are at least 8, so that every level has a pixel.
+    """
+    batch, channels, height, width = first.shape
+    product = torch.einsum("bcn,bcm->bnm", first.flatten(2), second.flatten(2)) / channels**0.5
+    levels = [product.reshape(batch * height * width, 1, height, width)]
+    for _ in range(LEVELS - 1):
+        levels.append(F.avg_pool2d(levels[-1], 2))
+    return levels
+
+
+def lookup(pyramid: list[Tensor], position: Flow, radius: int) -> Features:
+    """Correlation around given positions, (B, LEVELS (2 r + 1)^2, H, W), finest level first.
+
+    The pyramid is as `correlation_pyramid` gives it; positions are where each pixel of image 1 is in image 2, (B, 2, H,
+    W), (column, row) as indices; the radius is r, px of each level.
+    """
+    batch, _, height, width = position.shape
+    side = 2 * radius + 1
+    step = torch.arange(-radius, radius + 1, dtype=position.dtype, device=position.device)
+    across, down = torch.meshgrid(step, step, indexing="ij")
+    window = torch.stack([across, down], dim=-1)
+    centre = position.permute(0, 2, 3, 1).reshape(batch * height * width, 1, 1, 2)
+    found = []
+    for level, costs in enumerate(pyramid):
+        size = costs.new_tensor([costs.shape[-1], costs.shape[-2]])
+        # An index i is at (2 i + 1) / size - 1 in grid_sample's coordinates, with align_corners=False.
+        place = (2 * (centre / 2**level + window) + 1) / size - 1
+        values = F.grid_sample(costs, place, mode="bilinear", padding_mode="zeros", align_corners=False)
+        found.append(values.view(batch, height, width, side * side))
+    return torch.cat(found, dim=-1).permute(0, 3, 1, 2).contiguous()
+
+
+Norm = Callable[[int], nn.Module]
+"""Normalisation of so many channels: over each channel of a sample, by the weights' own statistics, or none."""
+
+
+class ResidualUnit(nn.Module):
+    """Two 3x3 convolutions, or a 3x3 one of a quarter of the channels between two of 1x1, beside a shortcut."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int, norm: Norm, bottleneck: bool) -> None:
+        super().__init__()
+        inner = outputs // 4
+        layers = [(inputs, outputs, 3, stride), (outputs, outputs, 3, 1)]  # channels in and out, kernel, stride
+        if bottleneck:
+            layers = [(inputs, inner, 1, 1), (inner, inner, 3, stride), (inner, outputs, 1, 1)]
+        self.depth = len(layers)
+        for number, (before, after, side, step) in enumerate(layers, start=1):
+            self.add_module(f"conv{number}", nn.Conv2d(before, after, side, stride=step, padding=side // 2))
+            self.add_module(f"norm{number}", norm(after))
+        self.downsample = nn.Sequential()
+        if stride > 1:
+            self.downsample = nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride=stride), norm(outputs))
+
+    def forward(self, state: Features) -> Tensor:
+        """Features (B, outputs, H / stride, W / stride)."""
+        change = state
+        for number in range(1, self.depth + 1):
+            change = self.get_submodule(f"norm{number}")(self.get_submodule(f"conv{number}")(change)).relu()
+        shortcut: Tensor = self.downsample(state)
+        return (shortcut + change).relu()
+
+
+class RaftEncoder(nn.Module):
+    """Features of images at an eighth of their resolution; `stages` are the channels of its three stages."""
+
+    def __init__(self, stages: tuple[int, int, int], outputs: int, norm: Norm, bottleneck: bool) -> None:
+        super().__init__()
+
+        def stage(inputs: int, channels: int, stride: int) -> nn.Module:
+            first = ResidualUnit(inputs, channels, stride, norm, bottleneck)
+            return nn.Sequential(first, ResidualUnit(channels, channels, 1, norm, bottleneck))
+
+        first, second, third = stages
+        self.conv1 = nn.Conv2d(3, first, 7, stride=2, padding=3)
+        self.norm1 = norm(first)
+        self.layer1 = stage(first, first, 1)
+        self.layer2 = stage(first, second, 2)
+        self.layer3 = stage(second, third, 2)
+        self.conv2 = nn.Conv2d(third, outputs, 1)
+
+    def forward(self, images: Images) -> Features:
+        """Features (B, outputs, H / 8, W / 8) of images (B, 3, H, W) in [-1, 1], H and W multiples of 8."""
+        state = self.norm1(self.conv1(images)).relu()
+        features: Tensor = self.conv2(self.layer3(self.layer2(self.layer1(state))))
+        return features
 
 
 class RAFT(nn.Module):
@@ -42,17 +156,9 @@ class RAFT(nn.Module):
         self.update_block = UpdateBlock(self.sizes, costs, large=large)
 
     def forward(self, image1: Images, image2: Images) -> Flow:
-        """Estimates the flow.
+        """The flow (B, 2, H, W) float32, px, of images (B, 3, H, W) float32 in [0, 1]; H, W >= 64, else InputError.
 
-        Args:
-            image1: (B, 3, H, W) float32 in [0, 1]; H, W >= 64; repeated at the border up to multiples of 8.
-            image2: The same shape.
-
-        Returns:
-            (B, 2, H, W) float32, px.
-
-        Raises:
-            InputError: The images' shapes differ or are not (B, 3, H >= 64, W >= 64).
+        Images are repeated at the border up to multiples of 8.
         """
         check_shapes(image1, image2)
         height, width = image1.shape[-2:]

@@ -30,8 +30,7 @@ def looks_like_raft(path: Path) -> bool:
 def load_raft(path: Path, device: str = "cpu") -> RAFT:
     """Builds the network that a file's shapes describe, with the file's weights, in evaluation mode.
 
-    Raises:
-        InputError: No such file, damaged, one that would run code, or not RAFT's weights.
+    InputError for no such file, a damaged one, one that would run code, or not RAFT's weights.
     """
     tensors = renamed(_read(path), path)
     last = tensors.get("fnet.conv2.weight")

@@ -21,7 +21,7 @@ from synth.simulate.batched.reductions import SCALARS, SurfaceTables
 from synth.simulate.bulk import Bulk
 from synth.simulate.contact import ContactState, Indenters
 from synth.simulate.space import Space
-from synth.simulate.tables import warp_array, zeros_of
+from synth.simulate.tables import struct_of, warp_array, zeros_of
 from synth.surface import broken_linear_face
 
 
@@ -102,32 +102,27 @@ def number_rows(space: Space, free: np.ndarray, rows: int, bulk: Bulk, device: s
         raise ValueError("a batch needs nodes that are held in all directions or in none")
     padded = np.full(rows, -1, dtype=np.int32)
     padded[: len(free)] = free
-    single = SingleTables()
-    single.row = warp_array(moving[space.nodes, 0], wp.int32, device)
-    empty = np.zeros((0, 4), dtype=np.int32)
-    single.pressure_row = warp_array(pressure_row[space.pressure_nodes] if mixed else empty, wp.int32, device)
-    single.gradient = warp_array(bulk.gradient.numpy().astype(np.float32), wp.vec3f, device)
-    single.pressure_shape = warp_array(element.barycentric.astype(np.float32), wp.float32, device)
-    single.stabilisation = warp_array(bulk.stabilisation.numpy().astype(np.float32), wp.float32, device)
+    rows_of = {
+        "row": moving[space.nodes, 0],
+        "pressure_row": pressure_row[space.pressure_nodes] if mixed else np.zeros((0, 4)),
+    }
+    shapes = {name: getattr(bulk, name).numpy() for name in ("gradient", "pressure_shape", "stabilisation")}
     return UnknownRows(
         free=warp_array(padded, wp.int32, device),
         node_row=warp_array(moving[:, 0], wp.int32, device),
         pressure_row=warp_array(pressure_row, wp.int32, device),
         face_row=warp_array(moving[space.faces, 0], wp.int32, device),
         face_shape=warp_array(element.face_shape.astype(np.float32), wp.float32, device),
-        single=single,
+        single=struct_of(SingleTables, device, **rows_of, **shapes),
     )
 
 
 def surface_tables(space: Space, weight: FloatArray, device: str) -> SurfaceTables:
     """How points of the coated face, of weights (f, nq) in mm², give tractions to its nodes, as in `System.forces`."""
-    element, coated, tables = space.element, space.coated, SurfaceTables()
+    element, coated = space.element, space.coated
     hat = element.face_shape if element.order == 1 else broken_linear_face(element.face_barycentric)
     number = np.full(space.faces.shape, -1, dtype=np.int32)
     number[coated] = np.searchsorted(space.surface_nodes, space.faces[coated])
     area = np.zeros(len(space.surface_nodes))
     np.add.at(area, number[coated], np.einsum("fq,qa->fa", weight[coated], hat))
-    tables.hat = warp_array(hat, wp.float64, device)
-    tables.number = warp_array(number, wp.int32, device)
-    tables.area = warp_array(area, wp.float64, device)
-    return tables
+    return struct_of(SurfaceTables, device, hat=hat, number=number, area=area)

@@ -8,8 +8,6 @@ from synth.simulate.batched import lanes as phases
 from synth.simulate.batched.lanes import Lanes
 from synth.simulate.contact import FAR, ContactState
 
-wp.set_module_options({"enable_backward": False, "fast_math": False})
-
 
 @wp.struct
 class Fields:

@@ -1,16 +1,70 @@
 """Dense matrix operations of a batch: a product and a transpose, by cuBLAS on an NVIDIA GPU and by NumPy elsewhere.
 
 float32 in and out, sums are float32. A GPU takes the factors of a product as TF32, so callers round them to that before
-(`synth.simulate.batched.tf32`).
+(`synth.simulate.batched.krylov`).
+
+NVIDIA's mathematical libraries, loaded through ctypes: nothing of torch is imported, which brings them along. They come
+with the CUDA builds of torch (packages nvidia-cublas, nvidia-cusolver) or with the CUDA toolkit.
 """
 
 import ctypes
-from typing import Protocol
+import ctypes.util
+import importlib.util
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 import warp as wp
 
-from synth.simulate.batched.nvidia import call
+from synth.errors import InputError
+
+NEEDS = {"cublas": ("cublasLt",), "cusolver": ("nvJitLink", "cusparse", "cublas")}
+"""Libraries that are loaded before, since a wheel's library does not always know where the others are."""
+
+
+@cache
+def library(name: str) -> ctypes.CDLL:
+    """The newest cublas or cusolver of this Python environment, else the system's; InputError where there is none."""
+    for other in NEEDS[name]:
+        _load(other)
+    found = _load(name)
+    if found is None:
+        raise InputError(
+            f"the batched solver on CUDA needs lib{name}, and none was found: install a CUDA build of torch or the "
+            "packages nvidia-cublas and nvidia-cusolver, or simulate with --device cpu"
+        )
+    return found
+
+
+def call(name: str, function: str, *arguments: Any) -> None:
+    """Call a function of a library by its C name, which returns 0 if it succeeds; RuntimeError if it does not.
+
+    Arguments are pointers wrapped in ctypes' types, int for an int.
+    """
+    status = getattr(library(name), function)(*arguments)
+    if status != 0:
+        raise RuntimeError(f"{function} reported status {status}")
+
+
+@cache
+def _load(name: str) -> ctypes.CDLL | None:
+    for path in _places(name):
+        try:
+            return ctypes.CDLL(path)
+        except OSError:
+            continue
+    return None
+
+
+def _places(name: str) -> Iterator[str]:
+    spec = importlib.util.find_spec("nvidia")
+    for folder in (spec.submodule_search_locations or []) if spec else []:
+        yield from sorted(map(str, Path(folder).glob(f"**/lib{name}.so.*")), reverse=True)
+    if system := ctypes.util.find_library(name):
+        yield system
+
 
 WORKSPACE = 32 << 20
 """Bytes given to cuBLAS, so that it allocates none of its own: NVIDIA's recommendation for Hopper."""

@@ -3,16 +3,14 @@
 from collections.abc import Sequence
 
 import numpy as np
-import warp as wp
 
 from synth.arrays import FloatArray
 from synth.simulate.batched.lanes import COMPLETE, NO_CONTACT, NO_EQUILIBRIUM, TOO_DEEP, Presses
 from synth.simulate.batched.reductions import SCALARS
-from synth.simulate.distance import shape_vector
 from synth.simulate.press import Press
 from synth.simulate.space import Space
 from synth.simulate.stepping import MAX_PENETRATION
-from synth.simulate.tables import warp_array
+from synth.simulate.tables import struct_of
 from synth.simulate.trajectory import State, Trajectory, no_contact, not_converged, too_deep, trajectory_of, undeformed
 
 
@@ -37,32 +35,29 @@ def press_tables(
     for room, grid in zip(padded, grids.values(), strict=True):
         room[tuple(slice(0, n) for n in grid.shape)] = grid
     size_mm = presses[0].mesh.size_mm
-    columns: dict[str, tuple[Sequence[object] | np.ndarray, type]] = {
-        "corners": (_stacked([path.corners for path in paths]), wp.vec4d),
-        "ends": (_stacked([path.ends for path in paths]), wp.float64),
-        "legs": ([len(path.ends) for path in paths], wp.int32),
-        "waypoints": (_stacked([path.waypoints() for path in paths]), wp.float64),
-        "kind_of": (_stacked(kinds), wp.int32),
-        "stops": ([len(path.waypoints()) for path in paths], wp.int32),
-        "press_end": ([path.press_mm for path in paths], wp.float64),
-        "deepest": ([max(float(path.corners[:, 0].max()), 0.1) for path in paths], wp.float64),
-        "over_pad": ([path.is_over(size_mm) for path in paths], wp.int32),
-        "origin": ([np.zeros(3) if path.frame is None else path.frame.origin for path in paths], wp.vec3d),
-        "axes": ([np.eye(3) if path.frame is None else path.frame.axes for path in paths], wp.mat33d),
-        "position": (np.array([path.motion.position_mm for path in paths], dtype=np.float64), wp.vec2d),
-        "reach": ([path.body.reach_mm - path.face_mm for path in paths], wp.float64),
-        "rotation": ([body.rotation for body in bodies], wp.mat33d),
-        "kind": ([body.kind for body in bodies], wp.int32),
-        "shape": ([body.shape for body in bodies], shape_vector),
-        "grid": ([numbers[_grid_key(body.coefficients)] for body in bodies], wp.int32),
-        "grids": (padded.reshape(len(grids), -1), wp.float64),
-        "friction": (np.array([press.scene.contact.friction for press in presses], dtype=np.float64), wp.float64),
-        "sharpness": ([body.sharpness for body in bodies], wp.float64),
+    columns = {
+        "corners": _stacked([path.corners for path in paths]),
+        "ends": _stacked([path.ends for path in paths]),
+        "legs": [len(path.ends) for path in paths],
+        "waypoints": _stacked([path.waypoints() for path in paths]),
+        "kind_of": _stacked(kinds),
+        "stops": [len(path.waypoints()) for path in paths],
+        "press_end": [path.press_mm for path in paths],
+        "deepest": [max(float(path.corners[:, 0].max()), 0.1) for path in paths],
+        "over_pad": [path.is_over(size_mm) for path in paths],
+        "origin": [np.zeros(3) if path.frame is None else path.frame.origin for path in paths],
+        "axes": [np.eye(3) if path.frame is None else path.frame.axes for path in paths],
+        "position": [path.motion.position_mm for path in paths],
+        "reach": [path.body.reach_mm - path.face_mm for path in paths],
+        "rotation": [body.rotation for body in bodies],
+        "kind": [body.kind for body in bodies],
+        "shape": [body.shape for body in bodies],
+        "grid": [numbers[_grid_key(body.coefficients)] for body in bodies],
+        "grids": padded.reshape(len(grids), -1),
+        "friction": [press.scene.contact.friction for press in presses],
+        "sharpness": [body.sharpness for body in bodies],
     }
-    table = Presses()
-    for name, (values, dtype) in columns.items():
-        setattr(table, name, warp_array(np.array(values), dtype, d))
-    return table, (counts[0], counts[1], counts[2])
+    return struct_of(Presses, d, **columns), (counts[0], counts[1], counts[2])
 
 
 def _grid_key(grid: FloatArray) -> tuple[bytes, tuple[int, ...]]:

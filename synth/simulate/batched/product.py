@@ -13,6 +13,13 @@ with friction's unsymmetric part, by `contact_stiffness` itself.
 Vectors are (rows, B): all displacements of a free node in three rows, then the pressures, and neighbouring threads work
 on neighbouring lanes of the same element, so that every access to them is one piece of memory. Elements add to a row in
 no particular order on a GPU: there the last bits differ from run to run, on a CPU they do not.
+
+The barrier of `synth.simulate.inversion_barrier` adds its own: with G the vector's gradient at a sample point where J <
+J_0, F^{-T} : G = δ and t = ln(J_0 / J), node a gets S g_a of
+
+    S = w (2 t δ F^{-T} + t² F^{-T} G^T F^{-T})
+
+Few elements come near inversion, so that only their flags are stored: the rest is evaluated again in every product.
 """
 
 from functools import cache
@@ -21,8 +28,13 @@ import warp as wp
 
 from synth.simulate.batched.krylov import RUNNING
 from synth.simulate.bulk import Bulk, _deformation_gradient, _dilation, _slopes
-
-wp.set_module_options({"enable_backward": False, "fast_math": False})
+from synth.simulate.inversion_barrier import (
+    ONSET_JACOBIAN,
+    BarrierTables,
+    corner_gradient,
+    corner_gradients,
+    shape_gradient,
+)
 
 BLOCK, RESIDENT_BLOCKS = 128, 4
 """Threads of a block of `bulk_product`, and blocks that a multiprocessor is to run side by side: the compiler takes
@@ -248,3 +260,68 @@ def contact_product(nodes: int) -> wp.Kernel:
                 wp.atomic_add(y, first + 2, s, r[a, 2])
 
     return product
+
+
+@wp.func
+def _gradient_at(barrier: BarrierTables, u: wp.array2d(dtype=wp.vec3d), s: int, e: int, at: wp.vec4d) -> wp.mat33d:
+    """F at barycentric coordinates."""
+    F = at[0] * corner_gradient(barrier, u, s, e, 0)
+    for i in range(1, 4):
+        F += at[i] * corner_gradient(barrier, u, s, e, i)
+    return F
+
+
+@wp.kernel
+def find_inverting(
+    mask: wp.array(dtype=wp.int32),
+    u: wp.array2d(dtype=wp.vec3d),
+    barrier: BarrierTables,
+    inverting: wp.array2d(dtype=wp.int32),
+):
+    """One thread per (element, lane): whether det F is below the barrier's onset somewhere; (m, B)."""
+    e, s = wp.tid()
+    if mask[s] == 0:
+        return
+    F0, F1, F2, F3 = corner_gradients(barrier, u, s, e)
+    found = wp.int32(0)
+    for p in range(barrier.at.shape[0]):
+        at = barrier.at[p]
+        if wp.determinant(at[0] * F0 + at[1] * F1 + at[2] * F2 + at[3] * F3) < ONSET_JACOBIAN:
+            found = wp.int32(1)
+    inverting[e, s] = found
+
+
+@wp.kernel
+def barrier_product(
+    running: wp.array(dtype=wp.int32),
+    inverting: wp.array2d(dtype=wp.int32),
+    u: wp.array2d(dtype=wp.vec3d),
+    barrier: BarrierTables,
+    row: wp.array2d(dtype=wp.int32),
+    x: wp.array2d(dtype=wp.float32),
+    y: wp.array2d(dtype=wp.float32),
+):
+    """One thread per (element, lane): adds the barrier's tangent times x to y."""
+    e, s = wp.tid()
+    if running[s] != RUNNING or inverting[e, s] == 0:
+        return
+    for p in range(barrier.at.shape[0]):
+        at = barrier.at[p]
+        F = _gradient_at(barrier, u, s, e, at)
+        J = wp.determinant(F)
+        if J < ONSET_JACOBIAN:
+            G = wp.mat33d()
+            for a in range(10):
+                first = row[e, a]
+                if first >= 0:
+                    v = wp.vec3d(wp.float64(x[first, s]), wp.float64(x[first + 1, s]), wp.float64(x[first + 2, s]))
+                    G += wp.outer(v, shape_gradient(barrier, at, e, a))
+            t = wp.log(ONSET_JACOBIAN / J)
+            Fit = wp.transpose(wp.inverse(F))
+            S = (wp.float64(2.0) * t * wp.ddot(Fit, G)) * Fit + (t * t) * (Fit * wp.transpose(G) * Fit)
+            for a in range(10):
+                first = row[e, a]
+                if first >= 0:
+                    pull = barrier.weight[e] * (S * shape_gradient(barrier, at, e, a))
+                    for i in range(3):
+                        wp.atomic_add(y, first + i, s, wp.float32(pull[i]))

@@ -6,8 +6,6 @@ from synth.simulate.batched.fields import Fields, node_step
 from synth.simulate.batched.lanes import CORRECTION, Lanes
 from synth.simulate.contact import Faces, Indenters, position
 
-wp.set_module_options({"enable_backward": False, "fast_math": False})
-
 BLOCK = 256
 """Threads that sum a lane's residual."""
 SLIPS = wp.constant(wp.float64(1.0 - 1.0e-6))
@@ -18,12 +16,10 @@ SCALARS = 12
 
 @wp.struct
 class SurfaceTables:
-    """How points of the coated face give tractions to its nodes.
+    """How points of the coated face give tractions to its nodes, of areas (s,) mm².
 
-    Attributes:
-        hat: (nq, ns) functions by which a face's points share in its nodes.
-        number: (f, ns) of a face's nodes among the surface's, -1 on other faces.
-        area: (s,) of the nodes, mm².
+    `hat` (nq, ns) are functions by which a face's points share in its nodes; `number` (f, ns) is that of a face's nodes
+    among the surface's, -1 on other faces.
     """
 
     hat: wp.array2d(dtype=wp.float64)

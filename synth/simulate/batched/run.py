@@ -34,21 +34,12 @@ def simulate_presses(
     batch: int = MAX_BATCH,
     options: SolverOptions = OPTIONS,
 ) -> Iterator[tuple[int, Trajectory]]:
-    """Simulate presses into pads of one mesh, each as if it were alone.
+    """Simulate presses into pads of one mesh, each as if it were alone; their numbers and trajectories, as they end.
 
-    Args:
-        presses: they share the gel's materials and the numerics.
-        pad: from `synth.simulate.batched.pad.prepare`.
-        frames: numbers of the states that are wanted, of each press; see `synth.simulate.simulate_press`.
-        batch: most trajectories at a time.
-        options: of Newton's method along the load paths.
-
-    Yields:
-        The number of a press and its trajectory, in the order in which they end.
-
-    Raises:
-        InputError: presses that do not share the pad.
-        ValueError: not as many sets of frames as presses.
+    The presses share the gel's materials and the numerics, else InputError; the pad is of
+    `synth.simulate.batched.pad.prepare`. `frames` are the numbers of the states that are wanted, of each press (else
+    ValueError), see `synth.simulate.simulate_press`; at most `batch` trajectories run at a time; `options` hold along
+    the load paths.
     """
     if frames is not None and len(frames) != len(presses):
         raise ValueError(f"{len(frames)} sets of frames for {len(presses)} presses")

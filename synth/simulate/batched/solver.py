@@ -18,21 +18,20 @@ import numpy as np
 import warp as wp
 
 from synth.arrays import FloatArray
-from synth.simulate.batched import fields, reductions
+from synth.simulate.batched import fields, reductions, transitions
 from synth.simulate.batched import krylov as gmres
 from synth.simulate.batched import lanes as phases
 from synth.simulate.batched.arrays import BatchArrays, number_rows, surface_tables
-from synth.simulate.batched.inversion_barrier import barrier_product, find_inverting
+from synth.simulate.batched.lanes import PATH_DERIVATIVE_STEP, copy_grids, fill_lanes, place_indenters
 from synth.simulate.batched.pad import Pad
-from synth.simulate.batched.poses import PATH_DERIVATIVE_STEP, copy_grids, fill_lanes, place_indenters
-from synth.simulate.batched.product import BLOCK, bulk_product, contact_product, store_bulk, store_contact
-from synth.simulate.batched.transitions import (
-    check_contact,
-    choose_pass,
-    choose_target,
-    evaluate_trial,
-    finish_record,
-    finish_solve,
+from synth.simulate.batched.product import (
+    BLOCK,
+    barrier_product,
+    bulk_product,
+    contact_product,
+    find_inverting,
+    store_bulk,
+    store_contact,
 )
 from synth.simulate.bulk import bulk_residual
 from synth.simulate.contact import contact_residual, contact_stiffness
@@ -133,31 +132,31 @@ class BatchedSolver:
         self._launch(viscous_force, elements, mask, f.iterate_u, f.trial_u, s.viscosity, self._bulk, a.viscous)
         moved = (a.force, a.viscous, a.volume, *where, gmres.flat(a.krylov.basis))
         self._launch_blocks(reductions.relaxation_errors, reductions.BLOCK, mask, *moved, s)
-        self._launch(evaluate_trial, self.batch, s, self.settings)
+        self._launch(transitions.evaluate_trial, self.batch, s, self.settings)
         self._launch(fields.move_fields, self._value_dim, s, 0, f)
 
     def _advance(self) -> None:
         """Where a Newton solve ended: accept, correct, record, and choose the next step."""
         a, self._part = self._arrays, "stepping"
         s, f, multipliers = self.lanes, a.fields, (a.normal_before, a.tangent_before)
-        self._launch(finish_solve, self.batch, s, self._presses, self.settings)
+        self._launch(transitions.finish_solve, self.batch, s, self._presses, self.settings)
         self._launch(fields.move_fields, self._value_dim, s, phases.bits(phases.AT_RECORD, phases.CORRECTING), f)
         self._launch(fields.restore_multipliers, a.points, s, *multipliers, a.contact)
         self._sum(phases.AT_RECORD)
-        self._launch(check_contact, self.batch, s, self._presses, a.sums)
+        self._launch(transitions.check_contact, self.batch, s, self._presses, a.sums)
         self._launch(fields.copy_memory, a.points, s.save, a.memory, a.saved)
         self._settle(s.anchor, 1)
         self._select(phases.CORRECTING)
         self._launch(reductions.clear_sums, a.sums.shape, a.mask, s, a.sums)
         self._launch(reductions.penetrations, self._face_dim, a.mask, a.gap, s)
-        self._launch(choose_pass, self.batch, s, self._presses, self.settings)
+        self._launch(transitions.choose_pass, self.batch, s, self._presses, self.settings)
         self._launch(fields.save_multipliers, a.points, s, a.contact, *multipliers)
         found = (a.gap, a.tangential, self.penalty)
         self._launch(augment, a.points, s.new_share, a.indenters, *found, a.contact)
         self._record()
         self._select(phases.ADVANCE, phases.FIRST)
         self._settle(a.mask, 0)
-        self._launch(choose_target, self.batch, s, self._presses, self.settings)
+        self._launch(transitions.choose_target, self.batch, s, self._presses, self.settings)
         self._launch(fields.move_fields, self._value_dim, s, 0, f)
 
     def _sum(self, phase: int) -> None:
@@ -183,7 +182,7 @@ class BatchedSolver:
         self._launch(reductions.write_tractions, self._face_dim, a.mask, s, *where, a.records)
         self._select(phases.RECORD, phases.ROLLED_BACK)
         self._launch(fields.copy_memory, a.points, a.mask, a.saved, a.memory)
-        self._launch(finish_record, self.batch, s)
+        self._launch(transitions.finish_record, self.batch, s)
 
     def _linearise(self) -> None:
         """Linearise all lanes that are ready for a linear solve, and begin it."""

@@ -1,22 +1,20 @@
 """What happens next to a lane, as Warp kernels of one thread a lane.
 
-The rules are those of `synth.simulate.newton`, `relaxation` and `stepping`, whose constants they use; what differs is
-that each lane follows them at its own pace, that passes are solved to a share of the full tolerance, and that where
-intermediate steps have a relaxed tolerance the full one holds for what is recorded only. A step that ends at a recorded
-state, and every pass but the last, then has the relaxed tolerance: what they find is changed by the next pass. A state
-without passes, or whose passes end early, because they fail or nothing is deep any more, is brought to the full
-tolerance before it is recorded (POLISH); where that fails, the step is halved as if it had not been taken. The load
-path goes on from the state before, so that it does not depend on which states are corrected.
+The rules are those of `synth.simulate.newton` and `stepping`, whose constants they use; what differs is that each lane
+follows them at its own pace, that passes are solved to a share of the full tolerance, and that where intermediate steps
+have a relaxed tolerance the full one holds for what is recorded only. A step that ends at a recorded state, and every
+pass but the last, then has the relaxed tolerance: what they find is changed by the next pass. A state without passes,
+or whose passes end early, because they fail or nothing is deep any more, is brought to the full tolerance before it is
+recorded (POLISH); where that fails, the step is halved as if it had not been taken. The load path goes on from the
+state before, so that it does not depend on which states are corrected.
 """
 
 import warp as wp
 
-from synth.simulate import newton, relaxation, stepping
+from synth.simulate import newton, stepping
 from synth.simulate.batched import lanes as phases
 from synth.simulate.batched.lanes import Lanes, Presses, Settings
 from synth.simulate.distance import KINDS
-
-wp.set_module_options({"enable_backward": False, "fast_math": False})
 
 ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 FORCE_FLOOR = wp.constant(wp.float64(newton.FORCE_FLOOR))
@@ -41,19 +39,19 @@ STALL_ITERATIONS = wp.constant(newton.STALL_ITERATIONS)
 STALLED_RESIDUAL = wp.constant(wp.float64(newton.STALLED_RESIDUAL))
 NEAR = wp.constant(wp.float64(newton.NEAR))
 MAX_RELAXED_STEP = wp.constant(wp.float64(stepping.MAX_RELAXED_STEP))
-MAX_STEPS = wp.constant(relaxation.MAX_STEPS)
-FIRST_VISCOSITY = wp.constant(wp.float64(relaxation.FIRST_VISCOSITY))
-LEAST_VISCOSITY = wp.constant(wp.float64(relaxation.LEAST_VISCOSITY))
-MOST_VISCOSITY = wp.constant(wp.float64(relaxation.MOST_VISCOSITY))
-LEAST_SHARE = wp.constant(wp.float64(relaxation.LEAST_SHARE))
-LEAST_BORNE = wp.constant(wp.float64(relaxation.MIN_REACTION_RATIO))
-MAX_ERROR, AIM = wp.constant(wp.float64(relaxation.MAX_ERROR)), wp.constant(wp.float64(relaxation.AIM))
-FALL, RISE = wp.constant(wp.float64(relaxation.FALL)), wp.constant(wp.float64(relaxation.RISE))
+MAX_STEPS = wp.constant(newton.MAX_STEPS)
+FIRST_VISCOSITY = wp.constant(wp.float64(newton.FIRST_VISCOSITY))
+LEAST_VISCOSITY = wp.constant(wp.float64(newton.LEAST_VISCOSITY))
+MOST_VISCOSITY = wp.constant(wp.float64(newton.MOST_VISCOSITY))
+LEAST_SHARE = wp.constant(wp.float64(newton.LEAST_SHARE))
+LEAST_BORNE = wp.constant(wp.float64(newton.MIN_REACTION_RATIO))
+MAX_ERROR, AIM = wp.constant(wp.float64(newton.MAX_ERROR)), wp.constant(wp.float64(newton.AIM))
+FALL, RISE = wp.constant(wp.float64(newton.FALL)), wp.constant(wp.float64(newton.RISE))
 
 
 @wp.func
 def next_viscosity(viscosity: wp.float64, error: wp.float64) -> wp.float64:
-    """`synth.simulate.relaxation.next_viscosity`."""
+    """`synth.simulate.newton.next_viscosity`."""
     if error <= MAX_ERROR:
         taken = viscosity * wp.clamp(error / AIM, FALL, RISE)
         if taken < LEAST_VISCOSITY:
