@@ -32,7 +32,7 @@ from synth.optics import Optics
 from synth.render.camera_image import camera_image
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
-from synth.scene import Camera, Coating, Dots, Light, Render, Sensor
+from synth.scene import Camera, Coating, Dots, Light, Render, Sensor, Vector3
 from synth.scene.template import load_scene
 
 CLIPS = Path(__file__).parents[3] / "shared/real/gelsight_mini/clips"
@@ -135,12 +135,15 @@ def test_a_known_spacing_gives_the_focal_length() -> None:
 @needs_llvm
 @pytest.mark.parametrize("angle", [120.0, 50.0])
 @pytest.mark.parametrize("coating", [{}, {"roughness": 0.5, "metallic": 0.6}], ids=["matt", "metallic"])
-def test_contributions_are_what_the_renderer_renders(coating: dict[str, float], angle: float) -> None:
+@pytest.mark.parametrize("shade", [((-3.0, 4.8, 2.2), 0.6), ((-3.2, 4.6, 5.2), 2.0)], ids=["light", "its image"])
+def test_contributions_are_what_the_renderer_renders(
+    coating: dict[str, float], angle: float, shade: tuple[Vector3, float]
+) -> None:
     """They share Mitsuba's BSDF and the rays, not the integral."""
     sensor = _start(**coating)
     light = sensor.lights[1].model_copy(update={"power": 200.0, "size_mm": (3.0, 0.5), "viewing_angle_deg": angle})
-    dark = light.model_copy(update={"position_mm": (-3.0, 4.8, 2.2), "size_mm": (3.0, 0.6), "power": 1e-9})
-    sensor = sensor.model_copy(update={"lights": (light, dark)})  # the second shades a part of what the first lights
+    dark = light.model_copy(update={"position_mm": shade[0], "size_mm": (3.0, shade[1]), "power": 1e-9})
+    sensor = sensor.model_copy(update={"lights": (light, dark)})  # the second shades a part of the first's
     surface = flat_surface(sensor.gel.size_mm)
     plain = np.full((4, 4, 3), 0.6, dtype=np.float32)
     render = Render(samples_per_pixel=256, max_depth=2 if coating else 3)  # a matt gel lights itself by the window
