@@ -10,7 +10,7 @@ from render_scenes import FAST, needs_llvm
 from test_calibrate import _frame, _start
 
 from synth.arrays import FloatArray
-from synth.calibrate.comparison import Comparison
+from synth.calibrate.comparison import Comparison, at_rest
 from synth.calibrate.dot_grid import fit_dot_grid
 from synth.calibrate.dots import find_dots
 from synth.calibrate.frames import Frames
@@ -95,6 +95,19 @@ def test_the_verdict_names_the_residual_and_the_contact(offset: float, spot: flo
     assert len(found.reasons) == len(words)
     assert all(word in reason for word, reason in zip(words, found.reasons, strict=True))
     assert "scale" in found.lines()[-1]
+
+
+def test_other_frames_of_a_bare_gel_are_compared_where_they_are_not_pressed() -> None:
+    """A contact of 40 levels on a gel whose every level rose by 3; the edge of what counts as pressed is at 8."""
+    rest = np.full((120, 160, 3), 0.4)
+    y, x = np.mgrid[:120, :160]
+    contact = 40 * np.exp(-((x - 60) ** 2 + (y - 40) ** 2) / 200)
+    frame = rest + (3 + contact[..., None]) / 255
+    still, smooth = at_rest(frame, rest)
+    assert not still[contact > 5].any()
+    assert still[contact < 0.5].all()  # four pixels further out: the neighbourhood's 3, and 1 by smoothing
+    floor = Comparison(frame, rest, still, smooth).numbers()["floor"]
+    assert floor == pytest.approx([3 + contact[still].mean()] * 3, abs=1e-3)
 
 
 @needs_recordings
