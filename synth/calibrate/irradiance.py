@@ -141,7 +141,7 @@ class FlatGel:
         centre, direction, size, _, along = parts
         lane = dr.arange(mi.UInt32, dr.width(centre) * self._count * _CELLS)
         cell, pixel, light = lane % _CELLS, lane // _CELLS % self._count, lane // (_CELLS * self._count)
-        long = dr.gather(mi.UInt32, along, light)
+        long = dr.maximum(dr.gather(mi.UInt32, along, light), 1)  # lanes that fill up a vector gather 0, and divide too
         first, second, facing = (dr.gather(mi.Vector3f, axis, light) for axis in _axes(mi, direction))
         width, height = dr.gather(mi.Float, size.x, light), dr.gather(mi.Float, size.y, light)
         u = (mi.Float(cell % long) + 0.5) / mi.Float(long) - 0.5
