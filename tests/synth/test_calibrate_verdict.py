@@ -148,8 +148,13 @@ def test_a_real_bare_gel_at_rest_passes_and_pressed_ones_do_not(tmp_path: Path, 
 @needs_llvm
 @needs_recordings
 def test_the_scene_of_a_photographed_digit_meets_the_photograph(tmp_path: Path) -> None:
-    """Without moving its lights; with the camera's noise, 2.2, 1.4 and 2.6 levels, which no scene explains."""
-    path = str(REAL / "other_sensors/digit/rest.png")
-    main(["calibrate", "--scene", "digit_calibrated", "--frames", path, "--steps", "0", "--out", str(tmp_path)])
-    found = json.loads((tmp_path / "calibration.json").read_text())["verdict"]["residual_levels"]
-    assert max(found.values()) < 4.8
+    """Without moving its lights; a pressed frame is compared where it is not pressed, in red a change of the camera."""
+    rest, pressed = (str(REAL / f"other_sensors/digit/{name}.png") for name in ("rest", "0016"))
+    command = ["calibrate", "--scene", "digit_calibrated", "--frames", rest, "--steps", "0", "--out", str(tmp_path)]
+    assert main(command) == 0  # at most 4 levels
+    main([*command, "--judge", pressed])
+    found = json.loads((tmp_path / "calibration.json").read_text())["differences"]["not fitted: 0016.png"]
+    above = np.subtract(found["mean_absolute_outside_dots"], found["floor"])
+    assert above.min() > 0
+    assert above.max() < 1.5  # measured: 0.80, 0.74 and 0.29
+    assert 20_000 < found["pixels_outside_dots"] < 60_000
