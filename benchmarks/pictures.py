@@ -1,9 +1,9 @@
-"""Draws the README's pictures of data: `gallery` from datasets of synth, `bare_gel` with what flow methods find.
+"""Draws the pictures of data in README and guide: `gallery` and `row` from datasets of synth, `bare_gel` of flow.
 
 gallery: of each data set, as ordered, the first sample's second image and its flow in colour; data/gallery/NAME is made
-by `python -m synth generate --scene NAME --n 2 --out data/gallery/NAME`. bare_gel: a row for each of the given pairs of
-one data set: image 1, image 2, the exact flow, the shipped network's and Farnebäck's, in the colours of its largest
-motion.
+by `python -m synth generate --scene NAME --n 2 --out data/gallery/NAME`. row: the images alone, side by side.
+bare_gel: a row for each of the given pairs of one data set: image 1, image 2, the exact flow, the shipped network's and
+Farnebäck's, in the colours of its largest motion.
 """
 
 from argparse import ArgumentParser
@@ -11,12 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
+from synth.dataset.reader import SampleData, read_dataset
+
 
 def gallery(folders: list[Path], out: Path) -> None:
     """A panel for each data set, three in a row."""
     from matplotlib.figure import Figure
 
-    from synth.dataset.reader import read_dataset
     from synth.inspect.panels import flow_colours, image_picture, robust_scale
 
     rows = -(-len(folders) // 3)
@@ -25,13 +26,37 @@ def gallery(folders: list[Path], out: Path) -> None:
     for axis in axes:
         axis.set_axis_off()
     for axis, folder in zip(axes, folders, strict=False):
-        dataset = read_dataset(folder)
-        sample = dataset.read(dataset.samples[0])
+        name, sample = _first(folder)
         scale = robust_scale(sample.flow.forward)
         axis.imshow(np.hstack([image_picture(sample.image2), flow_colours(sample.flow.forward, scale)]))
-        axis.set_title(f"{dataset.info['scene']['name']}: image 2, flow to {scale:.3g} px", fontsize=8, pad=2)
+        axis.set_title(f"{name}: image 2, flow to {scale:.3g} px", fontsize=8, pad=2)
     figure.tight_layout(pad=0.3)
     figure.savefig(out, pil_kwargs={"quality": 88})
+
+
+def row(folders: list[Path], out: Path) -> None:
+    """The second images, as high as each other."""
+    from matplotlib.figure import Figure
+
+    from synth.inspect.panels import image_picture
+
+    samples = [_first(folder) for folder in folders]
+    images = [image_picture(sample.image2) for _, sample in samples]
+    widths = [image.shape[1] / image.shape[0] for image in images]
+    figure = Figure(figsize=(2.4 * sum(widths), 2.6), dpi=100)
+    for axis, image, (name, _) in zip(figure.subplots(1, len(images), width_ratios=widths, squeeze=False)[0], images,
+                                      samples, strict=True):  # fmt: skip
+        axis.set_axis_off()
+        axis.imshow(image)
+        axis.set_title(name, fontsize=8, pad=2)
+    figure.tight_layout(pad=0.3)
+    figure.savefig(out, pil_kwargs={"quality": 88})
+
+
+def _first(folder: Path) -> tuple[str, SampleData]:
+    """The scene's name and the first sample of a data set."""
+    dataset = read_dataset(folder)
+    return dataset.info["scene"]["name"], dataset.read(dataset.samples[0])
 
 
 def bare_gel(folder: Path, pairs: list[int], out: Path) -> None:
@@ -62,13 +87,13 @@ def bare_gel(folder: Path, pairs: list[int], out: Path) -> None:
 def main(argv: list[str]) -> int:
     """Draw one of them."""
     parser = ArgumentParser("python -m benchmarks pictures", description=__doc__)
-    parser.add_argument("picture", choices=("gallery", "bare_gel"))
+    parser.add_argument("picture", choices=("gallery", "row", "bare_gel"))
     parser.add_argument("datasets", nargs="+", type=Path)
     parser.add_argument("--pairs", type=int, nargs="+", default=[2, 10, 14, 16], help="of bare_gel")
     parser.add_argument("--out", type=Path, required=True, help="JPEG file")
     given = parser.parse_args(argv)
-    if given.picture == "gallery":
-        gallery(given.datasets, given.out)
-    else:
+    if given.picture == "bare_gel":
         bare_gel(given.datasets[0], given.pairs, given.out)
+    else:
+        {"gallery": gallery, "row": row}[given.picture](given.datasets, given.out)
     return 0

@@ -9,8 +9,9 @@ each light's rectangle and nothing else. For a light of power 1 and colour white
 with the coating's BSDF f (Mitsuba's), θ at the face and θ' at the light, which is Lambertian for k = 0. The midpoint
 rule on a grid over the rectangle evaluates it: no noise, and the same radiometry as the renderer's, with the shade that
 one light throws on another. The light's mirror image behind the window adds its own integral
-(`synth.render.lights`), without shade. A matt gel lights itself once by way of the window, as if by its mirror
-image: with the radiance L of patches of area A, their reflectance ρ, and the image at the height 2 Z,
+(`synth.render.lights`), in the shade of lights and images. A matt gel lights itself once by way of the window,
+as if by its mirror image: with the radiance L of patches of area A, their reflectance ρ, and the image at the height
+2 Z,
 
 .. math::  L_{returned}(x) = \frac{ρ}{\pi} \sum_{y} A L(y) R(\theta) \frac{(2 Z)^2}{|x - y'|^4} .
 
@@ -18,7 +19,7 @@ Dr.Jit differentiates all of it with respect to the lights' centres, directions,
 held. Mitsuba's path integrators would as well, with noise in every step and for paths that an undeformed face has not.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -99,7 +100,7 @@ class FlatGel:
     def contributions(self, lights: LightGeometry) -> FloatArray:
         """E (m, n, 3) float64: radiance per channel and unit of power, on the camera's side of the window."""
         parts = self._parts(lights)
-        return self._numpy(self._lit(parts, self._unshaded(parts)))
+        return self._numpy(self._lit(parts, self._all_unshaded(parts)))
 
     def derivatives(self, lights: LightGeometry) -> FloatArray:
         """Derivatives of E (m, 9, n, 3) float64 by each light's centre, direction, size and angle, in forward mode.
@@ -108,7 +109,7 @@ class FlatGel:
         """
         import drjit as dr
 
-        found, unshaded = [], self._unshaded(self._parts(lights))
+        found, unshaded = [], self._all_unshaded(self._parts(lights))
         for part, component in _NUMBERS:
             parts = self._parts(lights)
             dr.enable_grad(parts[:-1])
@@ -133,7 +134,7 @@ class FlatGel:
         centre, direction, size, _, along = parts
         lane = dr.arange(mi.UInt32, dr.width(centre) * self._count * _CELLS)
         cell, pixel, light = lane % _CELLS, lane // _CELLS % self._count, lane // (_CELLS * self._count)
-        long = dr.gather(mi.UInt32, along, light)
+        long = dr.maximum(dr.gather(mi.UInt32, along, light), 1)  # lanes that fill up a vector gather 0, and divide too
         first, second, facing = (dr.gather(mi.Vector3f, axis, light) for axis in _axes(mi, direction))
         width, height = dr.gather(mi.Float, size.x, light), dr.gather(mi.Float, size.y, light)
         u = (mi.Float(cell % long) + 0.5) / mi.Float(long) - 0.5
@@ -141,41 +142,51 @@ class FlatGel:
         source = dr.gather(mi.Vector3f, centre, light) + first * (u * width) + second * (v * height)
         return source - dr.gather(mi.Vector3f, self._point, pixel), pixel, light, facing
 
-    def _unshaded(self, parts: tuple[Any, ...]) -> Any:
-        """1 where no other light's rectangle stands between a point and a light's cell, else 0."""
+    def _image(self, parts: tuple[Any, ...]) -> tuple[Any, ...]:
+        """The lights' mirror images behind the window."""
+        flip, behind = self._mi.Vector3f(1, 1, -1), self._mi.Vector3f(0, 0, 2 * self._face)
+        return parts[0] * flip + behind, parts[1] * flip, *parts[2:]
+
+    def _all_unshaded(self, parts: tuple[Any, ...]) -> tuple[Any, ...]:
+        """`_unshaded` of the lights and, where the window reflects, of their images."""
+        if not self._reflects:
+            return (self._unshaded(parts, (parts,)),)
+        image = self._image(parts)
+        return self._unshaded(parts, (parts,)), self._unshaded(image, (image, parts))
+
+    def _unshaded(self, parts: tuple[Any, ...], obstacles: tuple[tuple[Any, ...], ...]) -> Any:
+        """1 where no rectangle but its own stands between a point and a light's cell, else 0.
+
+        The obstacles are `parts` themselves first, then others.
+        """
         import drjit as dr
 
         mi = self._mi
         arm, pixel, light, _ = self._arms(parts)
         point = dr.gather(mi.Vector3f, self._point, pixel)
-        free, (centres, directions, sizes, *_) = mi.Bool(True), parts
-        for other in range(dr.width(centres)):
-            number = dr.opaque(mi.UInt32, other)
-            centre, direction = (dr.gather(mi.Vector3f, part, number) for part in (centres, directions))
-            size = dr.gather(mi.Vector2f, sizes, number)
-            first, second, facing = _axes(mi, direction)
-            share = dr.dot(centre - point, facing) / dr.dot(arm, facing)
-            beside = point + arm * share - centre
-            within = (dr.abs(dr.dot(beside, first)) < size.x / 2) & (dr.abs(dr.dot(beside, second)) < size.y / 2)
-            free &= ~(within & (share > 0) & (share < 1) & (light != number))
+        free = mi.Bool(True)
+        for centres, directions, sizes, *_ in obstacles:
+            for other in range(dr.width(centres)):
+                number = dr.opaque(mi.UInt32, other)
+                centre, direction = (dr.gather(mi.Vector3f, part, number) for part in (centres, directions))
+                size = dr.gather(mi.Vector2f, sizes, number)
+                first, second, facing = _axes(mi, direction)
+                share = dr.dot(centre - point, facing) / dr.dot(arm, facing)
+                beside = point + arm * share - centre
+                within = (dr.abs(dr.dot(beside, first)) < size.x / 2) & (dr.abs(dr.dot(beside, second)) < size.y / 2)
+                itself = (light == number) & (centres is parts[0])
+                free &= ~(within & (share > 0) & (share < 1) & ~itself)
         lit = dr.select(free, mi.Float(1), 0)
         dr.eval(lit)
         return lit
 
-    def _lit(self, parts: tuple[Any, ...], unshaded: Any) -> Any:
+    def _lit(self, parts: tuple[Any, ...], unshaded: tuple[Any, ...]) -> Any:
         """Radiance (m n,) as mi.Color3f under each light of power 1 and its image in the window."""
-        import drjit as dr
+        lit = self._scattered(parts, unshaded[0], is_image=False)
+        return lit + self._scattered(self._image(parts), unshaded[1], is_image=True) if self._reflects else lit
 
-        lit = self._scattered(parts, lambda away: unshaded)
-        if not self._reflects:
-            return lit
-        mi = self._mi
-        flip, behind = mi.Vector3f(1, 1, -1), mi.Vector3f(0, 0, 2 * self._face)
-        image = (parts[0] * flip + behind, parts[1] * flip, *parts[2:])
-        return lit + self._scattered(image, lambda away: reflectance(dr.abs(away.z), self._index, mi))
-
-    def _scattered(self, parts: tuple[Any, ...], share: Callable[[Any], Any]) -> Any:
-        """Radiance (m n,) as mi.Color3f under rectangles of which a share arrives, by the directions to their cells."""
+    def _scattered(self, parts: tuple[Any, ...], unshaded: Any, is_image: bool) -> Any:
+        """Radiance (m n,) as mi.Color3f under rectangles, or under images of them that the window weakens."""
         import drjit as dr
 
         mi = self._mi
@@ -186,7 +197,8 @@ class FlatGel:
         interaction.wi = dr.gather(mi.Vector3f, self._toward, pixel)
         scattered = self._bsdf.eval(mi.BSDFContext(), interaction, away)
         power = -dr.log(2) / dr.log(dr.cos(dr.deg2rad(parts[3][0] / 2)))  # of the intensity: Light.narrowness + 1
-        cosine = dr.power(dr.maximum(-dr.dot(away, facing), 1e-6), dr.gather(mi.Float, power, light)) * share(away)
+        share = unshaded * reflectance(dr.abs(away.z), self._index, mi) if is_image else unshaded
+        cosine = dr.power(dr.maximum(-dr.dot(away, facing), 1e-6), dr.gather(mi.Float, power, light)) * share
         each = scattered * (cosine * dr.gather(mi.Float, power + 1, light) / (square * (2 * dr.pi * _CELLS)))
         weight = dr.tile(self._weight, dr.width(parts[0]))
         return mi.Color3f(*(dr.block_sum(each[k], _CELLS) * weight for k in range(3)))

@@ -85,7 +85,7 @@ def fit_lights(
     from scipy.optimize import least_squares
 
     low, high = problem.box(bounds)
-    first, limits = np.clip(np.zeros(problem.size), low + 1e-6, high - 1e-6), {"ftol": 1e-3, "xtol": 1e-3}
+    first, limits = np.clip(np.zeros(problem.size), low + 1e-6, high - 1e-6), {"ftol": 2e-4, "xtol": 1e-3}
     found = least_squares(problem.residual, first, problem.jacobian, (low, high), max_nfev=steps, **limits)
     return problem.result(found.x, int(found.njev))
 

@@ -97,11 +97,16 @@ def _lights(fit: SensorFit, start: Sensor) -> list[dict[str, Any]]:
 def summary(record: dict[str, Any]) -> list[str]:
     lines = [f"{record['preset']}: fitted in {record['seconds']} s, {record['steps']} steps of the lights' geometry"]
     for name, difference in record["differences"].items():
-        errors = " ".join(f"{value:.2f}" for value in difference["mean_absolute_outside_dots"])
-        lines.append(f"{name}: mean absolute difference outside dots {errors} of 255 (red green blue)")
+        line = f"mean absolute difference outside dots {_levels(difference['mean_absolute_outside_dots'])} of 255"
+        floor = f"; the fitted frame itself, smoothed: {_levels(difference['floor'])}" if "floor" in difference else ""
+        lines.append(f"{name}: {line} (red green blue){floor}")
     if "dots" in record:
         dots = record["dots"]
         lines.append(
             f"dots: {dots['in_grid']} of {dots['found']} on the grid, {dots['off_grid_px_rms']:.2f} px off it (rms)"
         )
     return lines
+
+
+def _levels(values: Sequence[float]) -> str:
+    return " ".join(f"{value:.2f}" for value in values)

@@ -6,6 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 import tomli_w
 
 from synth.arrays import FloatArray
-from synth.calibrate.comparison import Comparison, compare, picture, render_undeformed
+from synth.calibrate.comparison import Comparison, at_rest, compare, picture, render_undeformed
 from synth.calibrate.dot_grid import DotGridFit
 from synth.calibrate.frames import Frames, read_frames
 from synth.calibrate.report import fitted_content, numbers, summary
@@ -166,6 +167,11 @@ def _compared(
         name = f"not fitted: {Path(path).name}"
         _, grids[name], bare = find_grid(fit.sensor, other.encoded**fit.sensor.camera.gamma, None)
         rows[name] = compare(other.encoded, rendered, bare, fit.sensor)
+        if fit.grid is None:
+            still, rest = at_rest(other.encoded, given.encoded)
+            if not still.any():
+                raise InputError(f"{path}: shows the gel nowhere as the fitted frames do; give frames of the same gel")
+            rows[name] = replace(rows[name], outside=still, rest=rest)
     return rows, grids
 
 

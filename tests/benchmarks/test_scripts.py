@@ -3,9 +3,11 @@
 from pathlib import Path
 
 import pytest
+from PIL import Image
 from render_scenes import needs_llvm
 from tiny_scene import TEXT, own_cache, write_tiny
 
+import synth.cli
 from benchmarks import round_gel
 from benchmarks.__main__ import main
 from benchmarks.draws import summaries, together
@@ -165,3 +167,19 @@ def test_another_size_keeps_the_field_of_view(tmp_path: Path) -> None:
 def test_wrong_arguments(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: list[str], message: str) -> None:
     assert main([*command, "--out", str(tmp_path / "out")]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_pictures_of_two_data_sets(tmp_path: Path) -> None:
+    scene = str(write_tiny(tmp_path))
+    folders = [str(tmp_path / name) for name in "ab"]
+    for folder in folders:
+        assert synth.cli.main(["generate", "--scene", scene, "--n", "1", "--out", folder]) == 0
+    sizes = {}
+    for picture, sets in {"gallery": folders, "row": folders, "one": folders[:1]}.items():
+        kind, out = ("row" if picture == "one" else picture), tmp_path / f"{picture}.jpg"
+        assert main(["pictures", kind, *sets, "--out", str(out)]) == 0
+        with Image.open(out) as image:
+            sizes[picture] = image.size
+    assert sizes["gallery"] == (1290, 180)
+    assert sizes["row"][0] == pytest.approx(2 * sizes["one"][0], abs=1)
+    assert sizes["row"][1] == sizes["one"][1]

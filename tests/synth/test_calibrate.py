@@ -31,7 +31,7 @@ from synth.optics import Optics
 from synth.render.camera_image import camera_image
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
-from synth.scene import Camera, Coating, Dots, Light, Render, Sensor
+from synth.scene import Camera, Coating, Dots, Light, Render, Sensor, Vector3
 from synth.scene.template import load_scene
 
 CLIPS = Path(__file__).parents[3] / "shared/real/gelsight_mini/clips"
@@ -134,12 +134,15 @@ def test_a_known_spacing_gives_the_focal_length() -> None:
 @needs_llvm
 @pytest.mark.parametrize("angle", [120.0, 50.0])
 @pytest.mark.parametrize("coating", [{}, {"roughness": 0.5, "metallic": 0.6}], ids=["matt", "metallic"])
-def test_contributions_are_what_the_renderer_renders(coating: dict[str, float], angle: float) -> None:
+@pytest.mark.parametrize("shade", [((-3.0, 4.8, 2.2), 0.6), ((-3.2, 4.6, 5.2), 2.0)], ids=["light", "its image"])
+def test_contributions_are_what_the_renderer_renders(
+    coating: dict[str, float], angle: float, shade: tuple[Vector3, float]
+) -> None:
     """They share Mitsuba's BSDF and the rays, not the integral."""
     sensor = _start(**coating)
     light = sensor.lights[1].model_copy(update={"power": 200.0, "size_mm": (3.0, 0.5), "viewing_angle_deg": angle})
-    dark = light.model_copy(update={"position_mm": (-3.0, 4.8, 2.2), "size_mm": (3.0, 0.6), "power": 1e-9})
-    sensor = sensor.model_copy(update={"lights": (light, dark)})  # the second shades a part of what the first lights
+    dark = light.model_copy(update={"position_mm": shade[0], "size_mm": (3.0, shade[1]), "power": 1e-9})
+    sensor = sensor.model_copy(update={"lights": (light, dark)})  # the second shades a part of the first's
     surface = flat_surface(sensor.gel.size_mm)
     plain = np.full((4, 4, 3), 0.6, dtype=np.float32)
     render = Render(samples_per_pixel=256, max_depth=2 if coating else 3)  # a matt gel lights itself by the window
@@ -345,11 +348,11 @@ def test_noise_is_measured_through_the_response() -> None:
 @needs_llvm
 @pytest.mark.skipif(not CLIPS.is_dir(), reason="the real recordings are not here")
 def test_a_real_frame_that_was_not_fitted_is_met_within_4_levels(tmp_path: Path) -> None:
-    """Undeformed gels after the object was lost; measured 3.9, 2.1 and 4.0 of 255."""
+    """Undeformed gels after the object was lost; measured 3.7, 1.8 and 3.6 of 255."""
     for name, number in [("screw_driver_red__exp_num_2__camera_0", 344), ("avocado_real__exp_num_7__camera_0", 408)]:
         cv2.imwrite(str(tmp_path / f"{number}.png"), _real_frame(name, number))
     frames = ["--frames", str(tmp_path / "344.png"), "--judge", str(tmp_path / "408.png")]
-    assert main(["calibrate", *frames, "--steps", "10", "--out", str(tmp_path / "out")]) == 0
+    assert main(["calibrate", *frames, "--out", str(tmp_path / "out")]) == 0
     differences = json.loads((tmp_path / "out/calibration.json").read_text())["differences"]
     assert max(differences["not fitted: 408.png"]["mean_absolute_outside_dots"]) <= 4
 

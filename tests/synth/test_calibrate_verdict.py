@@ -10,7 +10,7 @@ from render_scenes import FAST, needs_llvm
 from test_calibrate import _frame, _start
 
 from synth.arrays import FloatArray
-from synth.calibrate.comparison import Comparison
+from synth.calibrate.comparison import Comparison, at_rest
 from synth.calibrate.dot_grid import fit_dot_grid
 from synth.calibrate.dots import find_dots
 from synth.calibrate.frames import Frames
@@ -97,6 +97,19 @@ def test_the_verdict_names_the_residual_and_the_contact(offset: float, spot: flo
     assert "scale" in found.lines()[-1]
 
 
+def test_other_frames_of_a_bare_gel_are_compared_where_they_are_not_pressed() -> None:
+    """A contact of 40 levels on a gel whose every level rose by 3; the edge of what counts as pressed is at 8."""
+    rest = np.full((120, 160, 3), 0.4)
+    y, x = np.mgrid[:120, :160]
+    contact = 40 * np.exp(-((x - 60) ** 2 + (y - 40) ** 2) / 200)
+    frame = rest + (3 + contact[..., None]) / 255
+    still, smooth = at_rest(frame, rest)
+    assert not still[contact > 5].any()
+    assert still[contact < 0.5].all()  # four pixels further out: the neighbourhood's 3, and 1 by smoothing
+    floor = Comparison(frame, rest, still, smooth).numbers()["floor"]
+    assert floor == pytest.approx([3 + contact[still].mean()] * 3, abs=1e-3)
+
+
 @needs_recordings
 def test_pressed_real_gels_are_told_from_gels_at_rest_by_their_dots() -> None:
     def off_grid(image: FloatArray) -> float:
@@ -135,8 +148,13 @@ def test_a_real_bare_gel_at_rest_passes_and_pressed_ones_do_not(tmp_path: Path, 
 @needs_llvm
 @needs_recordings
 def test_the_scene_of_a_photographed_digit_meets_the_photograph(tmp_path: Path) -> None:
-    """Without moving its lights; with the camera's noise, 2.2, 1.4 and 2.6 levels, which no scene explains."""
-    path = str(REAL / "other_sensors/digit/rest.png")
-    main(["calibrate", "--scene", "digit_calibrated", "--frames", path, "--steps", "0", "--out", str(tmp_path)])
-    found = json.loads((tmp_path / "calibration.json").read_text())["verdict"]["residual_levels"]
-    assert max(found.values()) < 4.8
+    """Without moving its lights; a pressed frame is compared where it is not pressed, in red a change of the camera."""
+    rest, pressed = (str(REAL / f"other_sensors/digit/{name}.png") for name in ("rest", "0016"))
+    command = ["calibrate", "--scene", "digit_calibrated", "--frames", rest, "--steps", "0", "--out", str(tmp_path)]
+    assert main(command) == 0  # at most 4 levels
+    main([*command, "--judge", pressed])
+    found = json.loads((tmp_path / "calibration.json").read_text())["differences"]["not fitted: 0016.png"]
+    above = np.subtract(found["mean_absolute_outside_dots"], found["floor"])
+    assert above.min() > 0
+    assert above.max() < 1.5  # measured: 0.80, 0.74 and 0.29
+    assert 20_000 < found["pixels_outside_dots"] < 60_000
