@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 import warp as wp
+from refusals import refused
 
 from benchmarks import batched
 from benchmarks.__main__ import main
 from benchmarks.agreement import WANTED, Noisy, compare, drawn_of, one_by_one, summary, together
 from benchmarks.batched import PLACES_MM, nth_ball, random_ball, reference_mesh, steady, surface_error
 from benchmarks.rows import Row, read
-from synth.errors import InputError
 from synth.scene import MeshIndenter
 from synth.scene.template import load_scene
 from synth.simulate.batched.pad import prepare
@@ -140,8 +140,7 @@ def test_the_command_and_its_rate_from_the_second_batch_on(tmp_path: Path, capsy
     found: list[dict[str, Any]] = read(tmp_path / "batched_errors.csv")
     assert all(5 <= row["radius_mm"] <= 6 for row in found)
     assert len({row["surface_error_percent"] for row in found}) == 3
-    with pytest.raises(InputError, match="even numbers"):
-        batched.main([*options, "--cells", "5", "4", "1"])
+    refused("even numbers", batched.main, [*options, "--cells", "5", "4", "1"])
     assert steady([1.0, 2.0, 2.5, 3.0, 3.5], 2) == pytest.approx(3 / 1.5)
     assert steady([1.0, 2.0, 3.0], 8) == 1, "too short for that: from its first half on"
     assert steady([2.0], 8) == 0.5

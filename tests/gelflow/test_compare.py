@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refused
 from textures import save, write_folder, write_synthetic
 
 from gelflow.arrays import FlowArray, ImageArray
@@ -97,21 +98,16 @@ def test_earlier_results_are_replaced_on_the_same_data_only(tmp_path: Path) -> N
     compare(named_methods(["none"]), first, tmp_path / "out")
     compare(named_methods(["none", "dis-fast"]), first, tmp_path / "out")
     assert "DIS fast" in (tmp_path / "out" / "table.md").read_text()
-    with pytest.raises(InputError, match=r"comparison on .*first.* not on .*second"):
-        compare(named_methods(["none"]), second, tmp_path / "out")
-    with pytest.raises(InputError, match="holds other things"):
-        compare(named_methods(["none"]), first, tmp_path / "first")
+    refused(r"comparison on .*first.* not on .*second", compare, named_methods(["none"]), second, tmp_path / "out")
+    refused("holds other things", compare, named_methods(["none"]), first, tmp_path / "first")
 
 
 def test_no_method_two_of_one_name_and_broken_pairs_are_refused(tmp_path: Path) -> None:
     dataset = PairDataset(write_folder(tmp_path, {"a": (1, 0), "b": (1, 0)}))
-    with pytest.raises(InputError, match="no method"):
-        compare([], dataset)
-    with pytest.raises(InputError, match="two methods are called 'x'"):
-        compare([Constant("x", 0, 0), Constant("x", 1, 0)], dataset)
+    refused("no method", compare, [], dataset)
+    refused("two methods are called 'x'", compare, [Constant("x", 0, 0), Constant("x", 1, 0)], dataset)
     (tmp_path / "b_2.png").write_bytes(b"broken")
-    with pytest.raises(InputError, match=r"b_2\.png"):
-        compare(named_methods(["none"]), dataset)
+    refused(r"b_2\.png", compare, named_methods(["none"]), dataset)
 
 
 def test_where_nothing_can_be_followed_no_motion_counts_and_exact_flow_is_for_synthetic_pairs(tmp_path: Path) -> None:
@@ -165,8 +161,7 @@ def test_a_moved_copy_of_the_data_is_the_same_data_and_other_pairs_are_not(tmp_p
     kept = (out / "scores.json").read_bytes()
     for dataset, words in ((longer, r"\(2 pairs\), not on .*longer \(3 pairs\)"), (other, "these are other pairs"),
                            (plain, "these are other pairs")):  # fmt: skip
-        with pytest.raises(InputError, match=words):
-            compare([Constant("c", 0, 0)], dataset, out, add=True)
+        refused(words, compare, [Constant("c", 0, 0)], dataset, out, add=True)
     assert (out / "scores.json").read_bytes() == kept
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from refusals import refused
 from textures import REAL, as_bytes, moved, save, write_video
 
 from gelflow.data import PairDataset
@@ -75,8 +76,7 @@ def test_a_job_goes_on_where_it_was_interrupted_and_is_not_replaced_by_another(t
     with pytest.raises(KeyboardInterrupt):
         extract_pairs([str(videos)], cut, ChoiceConfig(), interrupt)
     assert list(read_pair_set(cut).sources) == ["a"]
-    with pytest.raises(InputError, match="interrupted"):
-        PairDataset(cut)
+    refused("interrupted", PairDataset, cut)
     extract_pairs([str(videos)], cut, ChoiceConfig())
     assert contents(cut) == contents(whole)
     before = {path: path.stat().st_mtime_ns for path in cut.rglob("*")}
@@ -86,8 +86,7 @@ def test_a_job_goes_on_where_it_was_interrupted_and_is_not_replaced_by_another(t
         (videos / "b.avi", cut, ChoiceConfig(), r"a is \d+ there and missing here"),
         (videos, videos, ChoiceConfig(), "holds other things"),
     ):  # fmt: skip
-        with pytest.raises(InputError, match=words):
-            extract_pairs([str(inputs)], out, config)
+        refused(words, extract_pairs, [str(inputs)], out, config)
     assert {path: path.stat().st_mtime_ns for path in cut.rglob("*")} == before
 
 
@@ -146,8 +145,7 @@ def test_inputs_are_found_by_file_folder_and_pattern_and_those_that_hold_nothing
     empty.mkdir()
     (empty / "notes.txt").touch()
     for given, word in (("nothing", "no file"), ("*.avi", "pattern"), ("notes.txt", "not a video"), ("", "neither")):
-        with pytest.raises(InputError, match=word):
-            find_recordings([str(empty / given)])
+        refused(word, find_recordings, [str(empty / given)])
 
 
 @pytest.mark.parametrize("wrong", [{"per_source": 0}, {"frames": 1}, {"tries": 0}, {"minimum_motion_px": 99}])

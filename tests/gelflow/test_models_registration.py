@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 from textures import grid, texture
 from torch import Tensor
 from waves import Shifts
 
 from gelflow.config import REGISTRATIONS, ModelConfig, RegistrationConfig, TrainConfig
 from gelflow.config.sources import train_config
-from gelflow.errors import InputError
 from gelflow.models import GelFlow
 from gelflow.models.estimate import estimate_flow
 from gelflow.models.propagation import propagated
@@ -149,8 +149,7 @@ def test_weights_keep_it_a_fine_tuning_may_switch_it_on_and_it_is_set_field_by_f
     assert network.config.registration == RegistrationConfig.model_validate(settings)
     assert error(estimate_flow(network, image1, image2), truth) < 0.1
     other = config.model_copy(update={"model": ModelConfig.model_validate(values | {"lffm": False})})
-    with pytest.raises(InputError, match="lffm: True there, False here"):
-        train(other, pairs, None, tmp_path / "other", initial=path)
+    refused("lffm: True there, False here", train, other, pairs, None, tmp_path / "other", initial=path)
     start = {"model": ModelConfig().model_dump()}
     config = train_config(None, ["model.registration.prior_px=0.3", "model.registration.iterations=3"], start=start)
     assert config.model.registration == RegistrationConfig(prior_px=0.3, iterations=3)
@@ -158,8 +157,7 @@ def test_weights_keep_it_a_fine_tuning_may_switch_it_on_and_it_is_set_field_by_f
         ("windows_px=[]", "at least one"), ("windows_px=[3]", "one number each"), ("prior_px=0", "prior_px"),
         ("smoothing_px=[1, 1, -1]", "at least 0"), ("windows_px=[3, 3, 0.5]", "at least 1"),
     ):  # fmt: skip
-        with pytest.raises(InputError, match=words):
-            train_config(None, [f"model.registration.{assignment}"], start=start)
+        refused(words, train_config, None, [f"model.registration.{assignment}"], start=start)
 
 
 NOISE = 0.01

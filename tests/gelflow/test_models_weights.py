@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 from safetensors.torch import load_file, save_file
 from test_cli import fails
 from waves import press_flow
 
 from gelflow.cli import app, main
 from gelflow.config import REGISTRATIONS, ModelConfig
-from gelflow.errors import InputError
 from gelflow.files.exr import read_flow
 from gelflow.files.image import write_png
 from gelflow.models import GelFlow
@@ -59,8 +59,7 @@ def test_files_that_are_no_weights_are_named_and_a_failed_write_keeps_the_former
         ("other.safetensors", "not weights of GelFlow"),
         *((f"cut{share}.safetensors", "not a whole safetensors file") for share in (0.0, 0.001, 0.5)),
     ):  # fmt: skip
-        with pytest.raises(InputError, match=rf"{name}: .*{words}"):
-            load_weights(tmp_path / name)
+        refused(rf"{name}: .*{words}", load_weights, tmp_path / name)
     path = tmp_path / "new" / "weights.safetensors"
     path.parent.mkdir()
     path.write_bytes(saved.read_bytes())
@@ -93,8 +92,7 @@ MISFITS: list[tuple[str, list[str], str]] = [
 def test_metadata_that_do_not_fit(saved: Path, tmp_path: Path, key: str, values: list[str], words: str) -> None:
     for value in values:
         save_file(load_file(saved), tmp_path / "wrong.safetensors", read_metadata(saved) | {key: value})
-        with pytest.raises(InputError, match=words):
-            load_weights(tmp_path / "wrong.safetensors")
+        refused(words, load_weights, tmp_path / "wrong.safetensors")
 
 
 def test_names_files_and_the_card_of_best(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -107,8 +105,7 @@ def test_names_files_and_the_card_of_best(tmp_path: Path, monkeypatch: pytest.Mo
     own.rmdir()
     own.touch()  # a file of one's own comes first
     assert weights_file(own) == own
-    with pytest.raises(InputError, match="worst: there is no such file"):
-        load_weights(weights_file(Path("worst")))
+    refused("worst: there is no such file", load_weights, weights_file(Path("worst")))
     card = shipped.with_name("README.md").read_text(encoding="utf-8")
     metadata = read_metadata(shipped)
     assert json.loads(metadata["train"])["supervision"] == "mixed"

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 from synth_samples import synth_sample, write_dataset
 from textures import as_bytes, moved, save, write_folder, write_video
 
 import gelflow
 from gelflow.baselines import named_methods
 from gelflow.baselines.learned import Learned
-from gelflow.errors import InputError
 from gelflow.files.exr import read_flow
 from gelflow.models.uncertainty import UNKNOWN_PX
 from gelflow.models.weights import weights_file
@@ -92,8 +92,7 @@ def test_a_pairs_results_replace_those_of_an_earlier_run_and_nothing_else(tmp_pa
     folder = write_folder(tmp_path / "in", {"a": (1.5, -0.5)})
     images = (folder / "a_1.png", folder / "a_2.png")
     (folder / name).write_text("another's")
-    with pytest.raises(InputError, match=rf"{name}: exists and does not come from"):
-        predict_pair(FARNEBACK, *images, folder)
+    refused(rf"{name}: exists and does not come from", predict_pair, FARNEBACK, *images, folder)
     assert (folder / name).read_text() == "another's"
     for _ in range(2):
         predict_pair(FARNEBACK, *images, tmp_path / "out")
@@ -104,8 +103,7 @@ def test_a_videos_results_do_not_replace_anothers_files(tmp_path: Path, name: st
     other = tmp_path / name
     other.parent.mkdir(exist_ok=True)
     other.write_text("another's")
-    with pytest.raises(InputError, match=rf"{name}: exists and does not come from"):
-        predict_video(FARNEBACK, video(tmp_path / "a.avi", 2), tmp_path)
+    refused(rf"{name}: exists and does not come from", predict_video, FARNEBACK, video(tmp_path / "a.avi", 2), tmp_path)
     assert other.read_text() == "another's"
 
 
@@ -114,8 +112,7 @@ def test_inputs_that_cannot_be_used_are_named(tmp_path: Path) -> None:
     (frame_folder(tmp_path / "in", [0]) / "1.png").write_bytes(b"broken")
     for name, every, word in (("one.avi", 1, "fewer than two"), ("none.avi", 1, "none.avi"),
                               ("in", 1, r"1\.png: cannot be read"), ("one.avi", 0, "every")):  # fmt: skip
-        with pytest.raises(InputError, match=word):
-            predict_video(FARNEBACK, tmp_path / name, tmp_path / "out", every=every)
+        refused(word, predict_video, FARNEBACK, tmp_path / name, tmp_path / "out", every=every)
 
 
 def test_colours_follow_direction_and_length_and_arrows_have_the_true_length() -> None:
@@ -179,8 +176,7 @@ def test_arrays_and_tensors_give_one_flow_that_follows_a_known_motion(tmp_path: 
     ],
 )
 def test_images_that_cannot_be_used(image1: object, image2: object, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        gelflow.load_model(device="cpu").flow(image1, image2)  # type: ignore[call-overload]
+    refused(message, gelflow.load_model(device="cpu").flow, image1, image2)  # type: ignore[call-overload]
 
 
 def test_what_is_uncertain_is_in_the_file_and_grey_in_the_picture(tmp_path: Path) -> None:

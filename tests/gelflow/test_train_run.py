@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 from textures import write_folder
 from torch.utils.data import Dataset
 from waves import Shifts, same_weights, small, weights_of
@@ -132,8 +133,7 @@ def test_a_run_whose_validation_failed_is_saved_and_validates_when_resumed(pairs
     with pytest.raises(InputError, match=r"validation pair shift_0: 63x64 px, but each side must be at least 64 px"):
         train(config, pairs, OneSmall(pairs, 0), refused)
     assert not refused.exists()
-    with pytest.raises(InputError, match=r"validation pair shift_1: 63x64 px"):
-        train(config, pairs, OneSmall(pairs, 1), cut)
+    refused(r"validation pair shift_1: 63x64 px", train, config, pairs, OneSmall(pairs, 1), cut)
     assert load_state(cut).step == 2
     resumed = train(config, pairs, pairs, cut, resume=True)
     assert (resumed.best, resumed.metrics) == (whole.best, whole.metrics)
@@ -186,8 +186,7 @@ def test_fine_tuning_starts_from_the_given_weights_and_folders_of_other_runs_are
     with pytest.raises(InputError, match=r"its architecture is not that of the run .levels: 4 there, 5 here"):
         train(other, pairs, None, tmp_path / "third", initial=first)
     config, run = small(steps=2), tmp_path / "run"
-    with pytest.raises(InputError, match="no run to resume there"):
-        train(config, pairs, None, run, resume=True)
+    refused("no run to resume there", train, config, pairs, None, run, resume=True)
     train(config, pairs, None, run)
     before = (run / "weights.safetensors").read_bytes()
     for changed, data, resume, words in (
@@ -196,12 +195,10 @@ def test_fine_tuning_starts_from_the_given_weights_and_folders_of_other_runs_are
         (config, Shifts(1, 64, 1.0, seed=3), True, "pairs: 3 there, 1 now"),
         (small(steps=1), pairs, True, "has done 2 steps, more than the 1 asked for"),
     ):
-        with pytest.raises(InputError, match=words):
-            train(changed, data, None, run, resume=resume)
+        refused(words, train, changed, data, None, run, resume=resume)
     assert (run / "weights.safetensors").read_bytes() == before
     (tmp_path / "run.json").write_text("{}")
-    with pytest.raises(InputError, match=r"run\.json: exists and does not come from"):
-        train(small(steps=1), pairs, None, tmp_path)
+    refused(r"run\.json: exists and does not come from", train, small(steps=1), pairs, None, tmp_path)
     assert (tmp_path / "run.json").read_text() == "{}"
 
 
@@ -212,18 +209,15 @@ def test_a_run_is_not_resumed_with_other_pairs(tmp_path: Path) -> None:
     run = tmp_path / "run"
     train(small(steps=1), data, data, run)
     for pairs, validation, words in ((other, data, "training"), (data, other, "validation")):
-        with pytest.raises(InputError, match=f"{words}_pairs_sha256: "):
-            train(small(steps=2), pairs, validation, run, resume=True)
+        refused(f"{words}_pairs_sha256: ", train, small(steps=2), pairs, validation, run, resume=True)
 
 
 def test_settings_that_cannot_be_served_or_diverge_are_told_and_leave_nothing(pairs: Shifts, tmp_path: Path) -> None:
     with pytest.raises(InputError, match='supervision = "self"'):
         train(small(supervision="flow"), Shifts(1, 64, 1.0, seed=3, flow=False), None, tmp_path / "a")
-    with pytest.raises(InputError, match="training set: holds no pair"):
-        train(small(), Shifts(0, 64, 1.0, seed=3), None, tmp_path / "b")
+    refused("training set: holds no pair", train, small(), Shifts(0, 64, 1.0, seed=3), None, tmp_path / "b")
     if not torch.cuda.is_available():
-        with pytest.raises(InputError, match="no CUDA device was found"):
-            train(small(device="cuda"), pairs, None, tmp_path / "c")
+        refused("no CUDA device was found", train, small(device="cuda"), pairs, None, tmp_path / "c")
     assert not list(tmp_path.iterdir())
     with pytest.raises(InputError, match="training has diverged; lower learning_rate"):
         train(small(steps=20, learning_rate=1e30), pairs, None, tmp_path)

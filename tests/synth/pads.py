@@ -7,23 +7,25 @@ start, so that prescribed motion is a `held` mask and a start; dead loads are no
 
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import permutations
 from typing import Any
 
 import numpy as np
 
 from synth.arrays import BoolArray, FloatArray, Points
 from synth.mesh import PadMesh
-from synth.mesh.pad import boundary_faces, signed_volumes
+from synth.mesh.graded import kuhn_tets
+from synth.mesh.pad import boundary_faces
 from synth.scene import Scene
 from synth.simulate import Trajectory, simulate
 from synth.simulate.contact import Indenters
 from synth.simulate.element import Element, p1p1, p2p1
 from synth.simulate.indenter import rigid_body
 from synth.simulate.load_path import LoadPath
-from synth.simulate.material import Material, pad_material, uniform
+from synth.simulate.material import Material, uniform
 from synth.simulate.newton import relative_residual, solve
 from synth.simulate.options import SolverOptions
+from synth.simulate.press import Press
+from synth.simulate.solve import stepper_of
 from synth.simulate.space import Space, function_space
 from synth.simulate.stepping import Stepper
 from synth.simulate.system import System, Tangent, Unknowns
@@ -57,19 +59,7 @@ def brick(size: tuple[float, float, float] = SIZE, counts: tuple[int, int, int] 
     axes = [np.linspace(-size[axis] / 2, size[axis] / 2, counts[axis] + 1) for axis in (0, 1)]
     axes.append(np.linspace(0.0, size[2], counts[2] + 1))
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    cell = np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), axis=-1).reshape(-1, 3)
-    tets = []
-    for order in permutations(range(3)):
-        corner, way = np.zeros(3, int), [np.zeros(3, int)]
-        for axis in order:
-            corner = corner + np.eye(3, dtype=int)[axis]
-            way.append(corner)
-        grid = [cell + np.where(cell % 2 == 1, 1 - step, step) for step in way]
-        tets.append(np.stack([(g[:, 0] * (counts[1] + 1) + g[:, 1]) * (counts[2] + 1) + g[:, 2] for g in grid], axis=1))
-    joined = np.concatenate(tets).astype(np.int32)
-    flipped = signed_volumes(points, joined) < 0
-    joined[flipped] = joined[flipped][:, [0, 2, 1, 3]]
-    return PadMesh(points, joined, size)
+    return PadMesh(points, kuhn_tets(*counts), size)
 
 
 def crooked(size: tuple[float, float, float] = (3.0, 2.0, 2.0), seed: int = 0) -> PadMesh:
@@ -148,14 +138,8 @@ def system(mesh: PadMesh, poisson_ratio: float, penalty: float = 50.0, element: 
 
 def run(posed: Scene, mesh: PadMesh) -> Stepper:
     """A stepper at the end of a scene's path, which it must have reached."""
-    gel, numerics = posed.sensor.gel, posed.numerics
-    name = "p2p1" if numerics.element == "auto" else numerics.element
-    space = function_space(mesh, ELEMENT[name]())
-    body = System(space, pad_material(gel, mesh), numerics.penalty)
-    path = LoadPath(posed.motion, rigid_body(posed.contact.indenter, resolution_mm=0.5))
     # The full tolerance for all steps: the state in which the path ends is looked at, beside the recorded ones.
-    modulus_mpa, options = gel.youngs_modulus_kpa / 1000, SolverOptions(relaxed_tolerance=0.0)
-    stepper = Stepper(body, path, posed.contact.friction, numerics, modulus_mpa, options)
+    stepper = stepper_of(Press.of(posed, mesh), options=SolverOptions(relaxed_tolerance=0.0))
     ended = stepper.run()
     assert (ended.status, ended.reason) == ("complete", "")
     return stepper
@@ -230,15 +214,22 @@ def equilibrium(
     return body, state, body.residual(state, far_away()).reaction
 
 
-def face_load(space: Space, on: Callable[[Points], BoolArray], traction: FloatArray) -> FloatArray:
-    """(n, 3) nodal forces of a constant traction (3,) on the boundary faces whose nodes all satisfy `on`.
+def area_vectors(points: Points, faces: np.ndarray) -> FloatArray:
+    """(f, 3) mm², each along its face's normal by the right-hand rule."""
+    a, b, c = (points[faces[:, i]] for i in range(3))
+    return np.asarray(np.cross(b - a, c - a) / 2)
 
-    A linear face gives a third of its force to each vertex; a straight quadratic one to each middle of an edge.
-    """
+
+def areas(points: Points, faces: np.ndarray) -> FloatArray:
+    """(f,) mm²."""
+    return np.asarray(np.linalg.norm(area_vectors(points, faces), axis=1))
+
+
+def face_load(space: Space, on: Callable[[Points], BoolArray], traction: FloatArray) -> FloatArray:
+    """(n, 3) nodal forces of a constant traction (3,) on the boundary faces whose nodes all satisfy `on`."""
     faces = space.faces[on(space.points)[space.faces].all(axis=1)]
-    a, b, c = (space.points[faces[:, i]] for i in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    # A linear face gives a third of its force to each vertex; a straight quadratic one to each middle of an edge.
     bearing = faces if faces.shape[1] == 3 else faces[:, 3:]
     load = np.zeros_like(space.points)
-    np.add.at(load, bearing, (area[:, None, None] / 3 * traction))
+    np.add.at(load, bearing, (areas(space.points, faces)[:, None, None] / 3 * traction))
     return load

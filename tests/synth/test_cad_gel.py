@@ -10,10 +10,10 @@ from batches import simulate_scenes
 from capsules import capsule, capsule_mesh
 from pads import brick, contact_faces
 from pads import scene as pad_scene
+from refusals import refused
 from render_scenes import needs_llvm
 
 from synth.arrays import FloatArray, Points, Triangles
-from synth.errors import InputError
 from synth.flow.exact import exact_flow
 from synth.flow.view import View
 from synth.mesh import check_mesh, domed
@@ -257,8 +257,7 @@ def test_bad_files_are_told_in_a_sentence(folder: Path, gel: dict[str, Any], mes
         ("low", (0, 0, -2.5)),
     ):
         write(folder, f"{name}.stl", (inner[0] + shift, inner[1]))
-    with pytest.raises(InputError, match=message):
-        build(scene_file(folder, **gel))
+    refused(message, build, scene_file(folder, **gel))
 
 
 @pytest.mark.parametrize(
@@ -272,5 +271,4 @@ def test_bad_files_are_told_in_a_sentence(folder: Path, gel: dict[str, Any], mes
 def test_places_beside_the_face_are_told(folder: Path, place: str, message: str) -> None:
     path = scene_file(folder)
     path.write_text(path.read_text().replace("polar_deg", "#").replace("azimuth_deg", "#"))
-    with pytest.raises(InputError, match=message):
-        build(path, f"motion.{place}")
+    refused(message, build, path, f"motion.{place}")

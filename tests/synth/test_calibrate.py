@@ -13,6 +13,7 @@ import pytest
 import tomli_w
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
+from refusals import refused
 from render_scenes import FAST, needs_llvm, small_sensor
 
 from synth.arrays import FloatArray
@@ -26,7 +27,6 @@ from synth.calibrate.profile import fit_profile
 from synth.calibrate.run import MARK
 from synth.calibrate.sensor_fit import SensorFit, fit_sensor
 from synth.cli import main
-from synth.errors import InputError
 from synth.mesh import flat_surface
 from synth.optics import Optics
 from synth.render.camera_image import camera_image
@@ -256,8 +256,7 @@ def test_frames_that_do_not_belong_together_are_refused(tmp_path: Path) -> None:
         (["missing"], r"missing\.png: there is no such file"),
         ([], "no frames"),
     ]:
-        with pytest.raises(InputError, match=message):
-            read_frames([tmp_path / f"{name}.png" for name in names])
+        refused(message, read_frames, [tmp_path / f"{name}.png" for name in names])
 
 
 def test_a_photograph_is_turned_as_its_exif_says(tmp_path: Path) -> None:
@@ -269,16 +268,13 @@ def test_a_photograph_is_turned_as_its_exif_says(tmp_path: Path) -> None:
 
 
 def test_a_frame_without_dots_dots_without_a_grid_and_dots_of_a_pixel_are_refused() -> None:
-    with pytest.raises(InputError, match="0 whole dots"):
-        find_dots(np.full((120, 160, 3), 0.3), 15.0)
-    with pytest.raises(InputError, match="grid"):
-        grid_index(np.random.default_rng(0).uniform(0, 100, (12, 2)))
+    refused("0 whole dots", find_dots, np.full((120, 160, 3), 0.3), 15.0)
+    refused("grid", grid_index, np.random.default_rng(0).uniform(0, 100, (12, 2)))
     y, x = np.mgrid[:48, :64] + 0.5
     away = np.hypot(*((part + 2) % 5 - 2.5 for part in (x, y)))
     for radius in (0.5, 0.9):
         frame = np.repeat(0.5 * np.clip(away - radius + 0.5, 0.1, 1)[..., None], 3, axis=2)
-        with pytest.raises(InputError, match=r"radius of .* px, needed is more than 1 px"):
-            fit_profile(find_dots(frame, 5.0))
+        refused(r"radius of .* px, needed is more than 1 px", fit_profile, find_dots(frame, 5.0))
 
 
 @pytest.mark.parametrize(

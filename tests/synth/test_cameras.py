@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refused
 from render_scenes import FAST, SCALAR, flat_surface, plain, rendered, small_sensor
 from tiny_scene import CONTACT, LIGHTS, SENSOR, fingerprint, own_cache, write_tiny
 
 from synth.dataset.export import export
 from synth.dataset.exr import read_flow, write_flow
 from synth.dataset.reader import read_dataset
-from synth.errors import InputError
 from synth.inspect import inspect, tables, write_html, write_sheet
 from synth.pipeline.generate import generate
 from synth.render.renderer import Renderer
@@ -60,8 +60,7 @@ def test_each_camera_has_its_files_and_is_read_and_exported_by_its_name(dataset,
     assert left.flow.forward.shape == (30, 40, 2)
     np.testing.assert_array_equal(left.displacement2, main.displacement2)
     np.testing.assert_array_equal(main.further["left"].image2, left.image2)
-    with pytest.raises(InputError, match=r"no camera 'right'.*left"):
-        data.read(0, "right")
+    refused(r"no camera 'right'.*left", data.read, 0, "right")
     assert export(dataset, "flo", tmp_path / "left", camera="left") == 2
     assert np.frombuffer((tmp_path / "left" / "000000_flow.flo").read_bytes()[4:12], "<i4").tolist() == [40, 30]
     source = dataset / "samples" / "000000" / "left" / "image2.png"
@@ -132,10 +131,8 @@ def test_names_sizes_lights_and_scalar_variants_that_further_cameras_cannot_have
     sensor = json.loads(_with_other().model_dump_json())
     with pytest.raises(ValueError, match="names must differ"):
         Sensor.model_validate({**sensor, "further_cameras": 2 * sensor["further_cameras"]})
-    with pytest.raises(InputError, match=r"further_cameras 'other': sensor.lights\[0\].*between the camera"):
-        rendered(_with_other(fx=40.0, fy=40.0))
+    refused(r"further_cameras 'other': sensor.lights\[0\].*between the camera", rendered, _with_other(fx=40.0, fy=40.0))
     mirror = Mirror(position_mm=(3.0, 0.0, 12.0), normal=(-1, 0, 0), size_mm=(4.0, 4.0))
     mirrored = small_sensor(1.45).model_copy(update={"mirrors": (mirror,)})
     for sensor in (mirrored, small_sensor(1.45, lens="fisheye", distortion=(0.0, 0.0, 0.0, 0.0))):
-        with pytest.raises(InputError, match="needs LLVM 16 or newer"):
-            rendered(sensor, variant=SCALAR)
+        refused("needs LLVM 16 or newer", rendered, sensor, variant=SCALAR)

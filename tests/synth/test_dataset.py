@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from processes_of import largest_file
+from refusals import refused
 from samples import job, translation_sample, tree, writing_elsewhere
 
 from synth.cli import main
@@ -138,8 +139,7 @@ def test_lost_folder_is_made_again_and_n_may_grow_and_shrink(tmp_path):
 def test_another_job_is_refused_and_named(tmp_path, other, named):
     _write_all(tmp_path / "d")
     before = tree(tmp_path / "d")
-    with pytest.raises(InputError, match=named):
-        DatasetWriter(tmp_path / "d", other)
+    refused(named, DatasetWriter, tmp_path / "d", other)
     assert tree(tmp_path / "d") == before
     DatasetWriter(tmp_path / "d", job()).close()  # The refused writer holds no lock.
 
@@ -170,8 +170,7 @@ def test_full_disk_in_a_sample(tmp_path, monkeypatch):
         before = tree(tmp_path / "d")
         with monkeypatch.context() as patch:
             patch.setattr(sample_files, "install_folder", _full)
-            with pytest.raises(InputError, match=r"000001: cannot be written: No space left on device"):
-                writer.write(translation_sample(1))
+            refused(r"000001: cannot be written: No space left on device", writer.write, translation_sample(1))
         assert tree(tmp_path / "d") == before
         writer.write(translation_sample(1))
     assert read_dataset(tmp_path / "d").samples == [0, 1]
@@ -190,8 +189,7 @@ def test_full_disk_in_the_manifest(tmp_path, monkeypatch, call):
                 patch.setattr(lines.os, "write", lambda descriptor, line: whole(descriptor, line[:20]))
             else:
                 patch.setattr(lines.os, "fsync", _full)
-            with pytest.raises(InputError, match=r"manifest\.jsonl: cannot be written: No space left"):
-                writer.record(entry)
+            refused(r"manifest\.jsonl: cannot be written: No space left", writer.record, entry)
         assert tree(tmp_path / "d") == before
         assert writer.finished == {0}
 
@@ -205,13 +203,10 @@ def test_file_size_limit_of_the_system(tmp_path):
 
 
 def test_unreadable_datasets_are_named(tmp_path):
-    with pytest.raises(InputError, match="no such directory"):
-        read_dataset(tmp_path / "none")
-    with pytest.raises(InputError, match=r"has no dataset\.json"):
-        read_dataset(tmp_path)
+    refused("no such directory", read_dataset, tmp_path / "none")
+    refused(r"has no dataset\.json", read_dataset, tmp_path)
     _write_all(tmp_path / "d")
-    with pytest.raises(InputError, match=r"no finished sample 7; it has 0 to 2 \(3 of 3\)"):
-        read_dataset(tmp_path / "d").read(7)
+    refused(r"no finished sample 7; it has 0 to 2 \(3 of 3\)", read_dataset(tmp_path / "d").read, 7)
     for name, damage, message in (
         ("samples/000000/image1.png", lambda data: data[:100], r"000000/image1\.png.*truncated"),
         ("samples/000000/flow.exr", lambda data: data[:-40], r"000000/flow\.exr.*truncated"),
@@ -222,13 +217,11 @@ def test_unreadable_datasets_are_named(tmp_path):
         file = tmp_path / "d" / name
         whole = file.read_bytes()
         file.write_bytes(damage(whole))
-        with pytest.raises(InputError, match=message):
-            read_dataset(tmp_path / "d").read(0)
+        refused(message, read_dataset(tmp_path / "d").read, 0)
         file.write_bytes(whole)
     info = tmp_path / "d" / "dataset.json"
     info.write_text(info.read_text().replace('"schema_version": 1', '"schema_version": 9'))
-    with pytest.raises(InputError, match="version 9 of the format"):
-        read_dataset(tmp_path / "d")
+    refused("version 9 of the format", read_dataset, tmp_path / "d")
 
 
 PAIRS = 2  # Samples 0 1 | 2 3 | 4 5: with two shards, 0 and 1 and 4 and 5 are of shard 0/2, 2 and 3 of shard 1/2
@@ -311,8 +304,7 @@ def test_who_is_refused_beside_a_shard(tmp_path: Path) -> None:
             (job(N), Shard(1, 3), r"is being made in another number of shards \(0-of-2\)"),
             (job(N, seed=8), Shard(1, 2), "seed: 7 there, 8 now"),
         ):
-            with pytest.raises(InputError, match=message):
-                DatasetWriter(directory, asked, shard, PAIRS)
+            refused(message, DatasetWriter, directory, asked, shard, PAIRS)
         assert tree(directory) == before
         DatasetWriter(directory, job(N), Shard(1, 2), PAIRS).close()
     DatasetWriter(directory, job(N), Shard(1, 3), PAIRS).close()  # once the others have ended
@@ -320,8 +312,7 @@ def test_who_is_refused_beside_a_shard(tmp_path: Path) -> None:
 
 def test_wrong_shards_are_refused_and_right_ones_cover_each_trajectory_once(tmp_path: Path, capsys) -> None:
     for text in ("", "1", "2/2", "-1/2", "0/0", "1/x", "0.5/2", "a0/2"):
-        with pytest.raises(InputError, match=r"--shard .*: give i/N with 0 <= i < N"):
-            Shard.parse(text)
+        refused(r"--shard .*: give i/N with 0 <= i < N", Shard.parse, text)
     assert main(["generate", "--out", str(tmp_path / "d"), "--shard", "2/2"]) == 2
     assert "--shard 2/2: give i/N with 0 <= i < N, such as 0/16; the last of 2 is 1/2" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

@@ -7,12 +7,12 @@ import tarfile
 import cv2
 import numpy as np
 import pytest
+from refusals import refused
 from samples import HEIGHT, WIDTH, job, translation_sample, tree
 
 from synth.dataset.export import export, kitti_png
 from synth.dataset.images import read_png
 from synth.dataset.writer import DatasetWriter
-from synth.errors import InputError
 
 SHIFTS = {0: (1.25, -0.5), 1: (-3.0, 0.3), 3: (0.01, 0.02)}
 
@@ -80,8 +80,7 @@ def test_webdataset_and_kitti_within_its_range(dataset, tmp_path, monkeypatch) -
             np.testing.assert_allclose(found, np.broadcast_to(shift, found.shape), rtol=0, atol=1 / 128)
         assert (tmp_path / "kitti" / "training" / "image_2" / f"{index:06d}_11.png").exists()
     flow = np.full((2, 2, 2), 600.0, np.float32)
-    with pytest.raises(InputError, match=r"600\.0 px is beyond the 512 px"):
-        kitti_png(flow, np.ones((2, 2), np.bool_))
+    refused(r"600\.0 px is beyond the 512 px", kitti_png, flow, np.ones((2, 2), np.bool_))
     kitti_png(flow, np.zeros((2, 2), np.bool_))
 
 
@@ -95,8 +94,7 @@ def test_same_bytes_every_time(dataset, tmp_path, format):
 def test_nothing_is_overwritten_and_nothing_half_done(dataset, tmp_path, monkeypatch):
     (tmp_path / "o").mkdir()
     (tmp_path / "o" / "mine").write_text("x")
-    with pytest.raises(InputError, match="never overwrites"):
-        export(dataset, "flo", tmp_path / "o")
+    refused("never overwrites", export, dataset, "flo", tmp_path / "o")
 
     def fail(done: int, total: int) -> None:
         raise KeyboardInterrupt
@@ -105,5 +103,4 @@ def test_nothing_is_overwritten_and_nothing_half_done(dataset, tmp_path, monkeyp
         export(dataset, "npz", tmp_path / "p", fail)
     assert [entry.name for entry in tmp_path.iterdir()] == ["o"]
     DatasetWriter(tmp_path / "empty", job()).close()
-    with pytest.raises(InputError, match="no finished sample"):
-        export(tmp_path / "empty", "flo", tmp_path / "p")
+    refused("no finished sample", export, tmp_path / "empty", "flo", tmp_path / "p")

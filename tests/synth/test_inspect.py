@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 import OpenEXR
 import pytest
+from refusals import refused
 from rich.console import Console
 from samples import HEIGHT, WIDTH, job, translation_sample
 
 from synth.commands import inspect as inspect_command
 from synth.dataset.exr import write_flow
 from synth.dataset.writer import DatasetWriter
-from synth.errors import InputError
 from synth.inspect import inspect, tables, write_html, write_sheet
 from synth.inspect.inspection import evenly_spaced
 from synth.inspect.interpolation import sample_at
@@ -148,18 +148,13 @@ def test_what_cannot_be_inspected(tmp_path):
         writer.write(translation_sample())
     image = tmp_path / "d/samples/000000/image2.png"
     cv2.imwrite(str(image), cv2.imread(str(image))[:-1])
-    with pytest.raises(InputError, match=r"image1\.png is .*, image2\.png .*, flow\.exr .*; they must agree"):
-        inspect(tmp_path / "d")
-    with pytest.raises(InputError, match="no such file"):
-        inspect(tmp_path / "none")
-    with pytest.raises(InputError, match=r"holds neither dataset\.json nor flow\.exr"):
-        inspect(tmp_path)
+    refused(r"image1\.png is .*, image2\.png .*, flow\.exr .*; they must agree", inspect, tmp_path / "d")
+    refused("no such file", inspect, tmp_path / "none")
+    refused(r"holds neither dataset\.json nor flow\.exr", inspect, tmp_path)
     (tmp_path / "a.txt").write_text("x")
-    with pytest.raises(InputError, match=r"a\.txt: cannot be inspected"):
-        inspect(tmp_path / "a.txt")
+    refused(r"a\.txt: cannot be inspected", inspect, tmp_path / "a.txt")
     (tmp_path / "flow.exr").write_bytes(b"x")
-    with pytest.raises(InputError, match=r"meta\.json.*cannot be read"):
-        inspect(tmp_path)
+    refused(r"meta\.json.*cannot be read", inspect, tmp_path)
 
 
 def test_interpolation_is_exact_to_second_degree_and_stops_at_gaps() -> None:

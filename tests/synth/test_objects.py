@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import pyvista as pv
+from refusals import refused
 
 from synth.arrays import FloatArray
-from synth.errors import InputError
 from synth.scene import Box, MeshIndenter
 from synth.simulate.indenter import EVERYTHING, OBJECT_RADIUS, RigidBody, Touchable, object_radius, rigid_body
 from synth.simulate.measure import Distance
@@ -149,8 +149,7 @@ def test_a_hole_is_closed_but_more_hole_than_surface_is_refused(tmp_path: Path) 
     assert distances(body, np.array([[0.0, 0.0, 0.0]]))[0] < 0
     rest = pv.Sphere(radius=4.0).clip("z", origin=(0, 0, 3.0), invert=False)
     cap = rest.extract_surface(algorithm=None).triangulate()
-    with pytest.raises(InputError, match="open sheet"):
-        body_of(saved(tmp_path, cap.points, cap.regular_faces))
+    refused("open sheet", body_of, saved(tmp_path, cap.points, cap.regular_faces))
 
 
 @pytest.mark.parametrize("ending", ["stl", "obj", "ply", "off"])

@@ -110,7 +110,7 @@ def test_second_bounce_is_path_tracings_with_less_noise_and_none_on_flat_gel() -
 @needs_llvm
 def test_light_bounced_in_a_hemisphere_is_that_of_an_integrating_sphere() -> None:
     """A part of a sphere of radius R lights each other alike: of the flux Φ that it gets, by ρ Φ / 4 π R²."""
-    power, albedo, surface = 100.0, 0.6, capsule(8, length=0.0)
+    power, albedo, surface = 100.0, 0.6, capsule(2.4, length=0.0)
     light = Light(
         position_mm=(3.0, 2.0, 11.9), aim_mm=(3.0, 2.0, 0.0), size_mm=(0.5, 0.5), color=(1, 1, 1), power=power
     )

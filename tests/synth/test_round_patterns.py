@@ -19,7 +19,7 @@ from synth.scene import Dots, Light, Render, Speckle
 
 CHART = RoundChart(RADIUS, RADIUS + LENGTH)
 DOTS = Dots(kind="dots", spacing_mm=(4.2, 3.0), radius_mm=0.35, softness_mm=0.0, placing="spherical")
-SURFACE = capsule(10)
+SURFACE = capsule(2.7)
 
 
 def _texels(count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -14,7 +14,7 @@ from synth.verify.camera import ForwardCamera
 from synth.verify.motion import check_motion
 
 RNG = np.random.default_rng(11)
-SURFACE = capsule(8)
+SURFACE = capsule(3.4)
 PLACE = on_capsule(np.array([[8.0, 3.0, 6.0]]))[0]
 SHAPES = {
     "sphere": RoundWindow(1.45, INNER, RADIUS, RADIUS),

@@ -8,8 +8,8 @@ import pytest
 import warp as wp
 from batches import presses_of, simulate_scenes
 from pads import ELEMENT, MIXED, PUNCH, SPHERE, brick, dense, indenters, same, scene
+from refusals import refused
 
-from synth.errors import InputError
 from synth.mesh import PadMesh
 from synth.scene import Scene
 from synth.simulate import Trajectory
@@ -187,16 +187,14 @@ def test_the_product_is_the_tangent_times_the_vector(element, poisson_ratio, sti
 
 
 def test_scenes_must_share_the_pad_which_serves_several_runs() -> None:
-    with pytest.raises(InputError, match=r"mm pad"):
-        simulate_scenes([scene((8.0, 6.0, 3.0))], MESH)
+    refused(r"mm pad", simulate_scenes, [scene((8.0, 6.0, 3.0))], MESH)
     different: list[dict[str, Any]] = [
         {"gel": {"poisson_ratio": 0.45}},
         {"gel": {"stiffening": [0.1, 0.0]}},
         {"numerics": {"penalty": 20.0}},
     ]
     for parts in different:
-        with pytest.raises(InputError, match="must share the gel's materials and numerics"):
-            simulate_scenes([scene(), scene(**parts)], MESH)
+        refused("must share the gel's materials and numerics", simulate_scenes, [scene(), scene(**parts)], MESH)
     with pytest.raises(ValueError, match="1 sets of frames for 2 presses"):
         simulate_scenes([scene(), scene()], MESH, frames=[frozenset({1})])
     posed = scene(friction=0.4, motion={"depth_mm": 0.2})

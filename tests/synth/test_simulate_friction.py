@@ -1,14 +1,14 @@
 """Friction along whole paths: Coulomb's cone, drag, twist, the sliding limits T = μN and M = μ ∫ p r, reversal."""
 
-from typing import NamedTuple
+from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from bonded_layer import growing
-from pads import DRAG, FILM, MIXED, PUNCH, SIZE, SPHERE, brick, complete, gentle, mapped, pad, run, scene, supported
+from bonded_layer import disc, growing, walls_and_window
+from pads import DRAG, FILM, MIXED, PUNCH, SIZE, SPHERE, brick, complete, gentle, pad, run, scene, supported
+from touching import Touch
 
-from synth.arrays import BoolArray, FloatArray, Points
-from synth.mesh import PadMesh
 from synth.simulate.element import p2p1
 from synth.simulate.indenter import rigid_body
 from synth.simulate.load_path import LoadPath
@@ -21,29 +21,16 @@ TOLERANCE = 1e-6
 each = pytest.mark.parametrize("element", MIXED)
 
 
-class Touch(NamedTuple):
+def touch(stepper: Stepper) -> SimpleNamespace:
     """The contact points (f, q) that touch at the end of a path: positions in mm, tractions (k, 3) and their sizes."""
-
-    on: BoolArray
-    position: FloatArray
-    normal: FloatArray
-    along: FloatArray
-    pressure: FloatArray
-    friction: FloatArray
-    area: FloatArray
-
-
-def touch(stepper: Stepper) -> Touch:
-    body, state = stepper.system, stepper.state
     stepper._place(stepper.at)
-    body.residual(state, stepper.indenter)
-    whole, along = body.traction.numpy()[0], body.tangential.numpy()[0]
-    on = whole.any(axis=-1)
-    nodes = (body.space.points + state.u)[body.space.faces]
-    position = np.einsum("qa,fac->fqc", body.space.element.face_shape, nodes)
-    tractions = (whole - along)[on], along[on]
-    sizes = (np.linalg.norm(traction, axis=1) for traction in tractions)
-    return Touch(on, position[on], *tractions, *sizes, body._faces.weight.numpy()[on])
+    made = Touch(stepper.system, stepper.state, stepper.indenter, 0.0)
+    made.evaluate()
+    on = made.tractions[0].any(axis=-1)
+    normal, along = (traction[on] for traction in made.tractions)
+    pressure, friction = (np.linalg.norm(traction, axis=1) for traction in (normal, along))
+    at = {"on": on, "position": made.points[on], "area": made.body._faces.weight.numpy()[on]}
+    return SimpleNamespace(**at, normal=normal, along=along, pressure=pressure, friction=friction)
 
 
 @each
@@ -179,28 +166,6 @@ def test_friction_converges_with_the_step(element: str) -> None:
 FRICTION, RADIUS, CONTACT, FAR = 0.5, 20.0, 1.0, 12.0
 
 
-def half_disc(radii: FloatArray, depths: FloatArray) -> PadMesh:
-    """Half a round pad, y >= 0, with rings of elements at radii and planes at depths (mm), both from 0."""
-    rings, planes = len(radii) - 1, len(depths) - 1
-
-    def bend(cube: Points) -> Points:
-        along, across = 2 * cube[:, 0] - 1, cube[:, 1]
-        large, small = np.maximum(np.abs(along), across), np.minimum(np.abs(along), across)
-        angle = np.pi / 4 * small / np.where(large > 0, large, 1.0)
-        angle = np.where(np.abs(along) >= across, angle, np.pi / 2 - angle)
-        radius = np.interp(large * rings, np.arange(rings + 1), radii)
-        depth = np.interp(cube[:, 2] * planes, np.arange(planes + 1), depths)
-        return np.column_stack([np.sign(along) * radius * np.cos(angle), radius * np.sin(angle), depth])
-
-    return mapped((2 * rings, rings, planes), bend, float(depths[-1]))
-
-
-def wall_and_window(points: Points) -> BoolArray:
-    """A smooth wall at y = 0; glued at the bottom."""
-    window = points[:, 2] == FAR
-    return np.column_stack([window, window | (points[:, 1] == 0), window])
-
-
 def test_partial_slip_is_mindlins() -> None:
     r"""A ball on a thick pad against Cattaneo and Mindlin: friction, sticking and slip with a closed form.
 
@@ -214,7 +179,7 @@ def test_partial_slip_is_mindlins() -> None:
     """
     depth = CONTACT**2 / RADIUS
     radii = np.concatenate([np.linspace(0, 1.15 * CONTACT, 4), growing(1.15 * CONTACT, FAR, 3, 2.0)])
-    mesh = half_disc(radii, np.concatenate([[0.0], growing(0.0, FAR, 4, 2.2)]))
+    mesh = disc(radii, np.concatenate([[0.0], growing(0.0, FAR, 4, 2.2)]), half=True)
     hertz = 16 / 9 * np.sqrt(RADIUS) * depth**1.5
     all_slips = 3 * FRICTION * hertz / (16 * CONTACT) * 4.5
     posed = scene(
@@ -224,7 +189,8 @@ def test_partial_slip_is_mindlins() -> None:
         motion={"depth_mm": depth, "shear_mm": [1.3 * all_slips, 0.0], "steps": 6},
         numerics={"max_step_mm": depth / 2},
     )
-    body = System(supported(mesh, p2p1(), wall_and_window), uniform(len(mesh.tets), 0.5))
+    space = supported(mesh, p2p1(), partial(walls_and_window, half=True))
+    body = System(space, uniform(len(mesh.tets), 0.5))
     path = LoadPath(posed.motion, rigid_body(posed.contact.indenter))
     ended = Stepper(body, path, FRICTION, posed.numerics, 1.0).run()
     assert (ended.status, ended.reason) == ("complete", "")

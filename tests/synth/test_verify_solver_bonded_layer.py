@@ -6,7 +6,18 @@ integral equation, is itself held against published values.
 
 import numpy as np
 import pytest
-from bonded_layer import ball_ratio, body, compliance, growing, lowered, press, punch_factor, quarter_disc, wave_numbers
+from bonded_layer import (
+    ball_ratio,
+    body,
+    compliance,
+    disc,
+    disc_under_punch,
+    growing,
+    lowered,
+    press,
+    punch_factor,
+    wave_numbers,
+)
 
 from synth.simulate.element import p1p1, p2p1
 
@@ -53,11 +64,8 @@ def test_ball_approaches_linear_theory_as_the_depth_vanishes() -> None:
 )
 def test_flat_punch_on_a_layer(element, nu, ratio, cells, tolerance) -> None:
     """A cylinder whose fillet is a four hundredth of its radius; κ = 1.7, 3.6 and 9.1 where incompressible."""
-    radius, thickness, stretch = 4.0, 4.0 / ratio, 1.8 if element is p2p1 else 1.5
-    towards_edge = radius - growing(0.0, radius, cells, stretch)[::-1]
-    radii = np.concatenate([[0.0], towards_edge[1:], [radius], growing(radius, 2.5 * thickness, cells + 1, stretch)])
-    depths = np.concatenate([[0.0], growing(0.0, thickness, cells, 1.4)])
-    quarter = body(quarter_disc(radii, depths), element(), nu)
+    radius, thickness = 4.0, 4.0 / ratio
+    quarter = body(disc_under_punch(radius, thickness, cells, 1.8 if element is p2p1 else 1.5), element(), nu)
     shape: dict[str, object] = {"shape": "cylinder", "radius_mm": radius + 0.005, "fillet_mm": 0.01, "length_mm": 4.0}
     depth = LINEAR * thickness
     force = press(quarter, lowered(shape, depth, thickness), (5.0, 100.0))
@@ -74,7 +82,7 @@ def test_hertz_for_a_thick_pad(nu: float) -> None:
     depth, reach = contact**2 / radius, 1.2 * contact
     radii = np.concatenate([np.linspace(0, reach, 5), growing(reach, thickness, 5, 1.9)])
     depths = np.concatenate([[0.0], growing(0.0, thickness, 6, 2.0)])
-    quarter = body(quarter_disc(radii, depths), p2p1(), nu)
+    quarter = body(disc(radii, depths), p2p1(), nu)
     force = press(quarter, lowered({"shape": "sphere", "radius_mm": radius}, depth, thickness), (50.0, 1000.0))
     hertz = 4 / 3 / (1 - nu**2) * np.sqrt(radius) * depth**1.5
     x, dx = wave_numbers()

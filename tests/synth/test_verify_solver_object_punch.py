@@ -11,51 +11,38 @@ from pathlib import Path
 import numpy as np
 import pytest
 import pyvista as pv
-from bonded_layer import body, compliance, gauss, growing, lowered, press, quarter_disc, wave_numbers
+from bonded_layer import body, disc_under_punch, lowered, press, respond
 from scipy.optimize import brentq
 
+from synth.arrays import FloatArray
 from synth.simulate.element import p2p1
 
 RADIUS, FILLET, CELL = 2.0, 0.12, 0.04
-SIDES = 128
 NU, DEPTH = 0.5, 0.005
 """Depth over thickness; the layer is linear there."""
 POINTS = 400
 
 
 def punch_on_a_layer(flat: float, fillet: float, depth: float, thickness: float) -> float:
-    """Force over E of the punch, by Nyström's method; the contact radius is where the pressure's edge term vanishes."""
-    nodes, weights = gauss(POINTS)
-    wave, d_wave = wave_numbers()
-    defect = 2 / (np.pi * thickness) * d_wave * (1 - compliance(wave, NU))
+    """Force over E of the punch; the contact radius is where the pressure's edge term vanishes."""
 
-    def solved(contact: float) -> tuple[float, float]:
-        t, dt = contact / 2 * (nodes + 1), contact / 2 * weights
-        x = np.append(t, contact)
-        cosines = np.cos(np.outer(x, wave / thickness))
-        kernel = np.einsum("ik,k,jk->ij", cosines, defect, cosines[:-1], optimize=True) * dt
+    def right(x: FloatArray) -> FloatArray:
         beyond = np.maximum(x, flat)
         lost = beyond / fillet * (np.sqrt(beyond**2 - flat**2) - flat * np.arccos(flat / beyond))
-        right = (depth - lost) / (np.pi * (1 - NU**2))
-        phi = np.linalg.solve(np.eye(POINTS) - kernel[:-1], right[:-1])
-        return 2 * np.pi * float(dt @ phi), float(right[-1] + kernel[-1] @ phi)
+        return np.asarray((depth - lost)[:, None])
 
-    contact = brentq(lambda a: solved(a)[1], flat, flat + fillet)
-    return solved(float(contact))[0]
+    contact = brentq(lambda a: respond(a, thickness, NU, right, POINTS)[1][0], flat, flat + fillet)
+    return float(respond(contact, thickness, NU, right, POINTS)[0][0])
 
 
 @pytest.mark.parametrize("ratio", [0.6, 1.0, 2.0])
 def test_a_punch_as_a_mesh_presses_a_layer_as_the_theory_says(tmp_path: Path, ratio: float) -> None:
     """Flat radius over thickness of 0.6, 1 and 2; κ = 2.2, 3.6 and 9.1 of a sharp punch."""
     flat = RADIUS - FILLET
-    thickness, cells = flat / ratio, 4
-    file = tmp_path / "punch.stl"
-    pv.Cylinder(radius=RADIUS, height=1.0, direction=(0, 0, 1), resolution=SIDES).triangulate().save(file)
+    thickness, file = flat / ratio, tmp_path / "punch.stl"
+    pv.Cylinder(radius=RADIUS, height=1.0, direction=(0, 0, 1), resolution=128).triangulate().save(file)
     shape: dict[str, object] = {"shape": "mesh", "file": str(file), "fillet_mm": FILLET, "cell_mm": CELL}
-    towards_edge = RADIUS - growing(0.0, RADIUS, cells, 1.8)[::-1]
-    radii = np.concatenate([[0.0], towards_edge[1:], [RADIUS], growing(RADIUS, 2.5 * thickness, cells + 1, 1.8)])
-    depths = np.concatenate([[0.0], growing(0.0, thickness, cells, 1.4)])
-    depth = DEPTH * thickness
-    found = press(body(quarter_disc(radii, depths), p2p1(), NU), lowered(shape, depth, thickness), (0.5, 10.0))
+    quarter, depth = body(disc_under_punch(RADIUS, thickness, 4, 1.8), p2p1(), NU), DEPTH * thickness
+    found = press(quarter, lowered(shape, depth, thickness), (0.5, 10.0))
     # As for the analytic punch (`test_verify_solver_bonded_layer`): the smallest element costs up to 2.5 %.
     assert found == pytest.approx(punch_on_a_layer(flat, FILLET, depth, thickness), rel=0.03)
