@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import warp as wp
-from refusals import refused
+from commands import refused
 
 from benchmarks import batched
 from benchmarks.__main__ import main

@@ -5,7 +5,7 @@ from functools import partial
 
 import pytest
 import torch
-from refusals import refused
+from commands import refused
 from torch.autograd import gradcheck
 
 from gelflow.config import ModelConfig

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from refusals import refused
+from commands import refused
 from textures import grid, texture
 from torch import Tensor
 from waves import Shifts

@@ -1,7 +1,6 @@
 """Practice: moving average, both directions, mixed pairs, bf16, two processes, signals, speed."""
 
 import contextlib
-import csv
 import os
 import signal
 import socket
@@ -13,8 +12,8 @@ from pathlib import Path
 
 import pytest
 import torch
-from refusals import refused
-from textures import write_folder, write_synthetic
+from commands import refused
+from textures import table, write_folder, write_synthetic
 from torch.utils.data import ConcatDataset
 from waves import Shifts, same_weights, small, weights_of
 
@@ -75,7 +74,7 @@ def test_bfloat16_keeps_float32_weights_and_speed_and_memory_are_reported(pairs:
     result = train(small(steps=10), pairs, None, tmp_path / "speed")
     assert result.pairs_per_second > 0
     assert "pairs/s" in str(result)
-    rows = list(csv.DictReader(next(tmp_path.glob("speed/logs/csv/*/metrics.csv")).open()))
+    rows = table(next(tmp_path.glob("speed/logs/csv/*/metrics.csv")))
     assert float(rows[-1]["train/pairs_per_second"]) > 0
     if result.memory_mib is not None:  # Linux
         assert "peak memory" in str(result)
@@ -144,16 +143,12 @@ LOSS = LossConfig(lambda_s=(1, 1, 1))
 CONFIG = TrainConfig(model=ModelConfig(levels=4), loss=LOSS, supervision="mixed", mixed_self=3.0, device="cpu")
 
 
-def flow_module() -> FlowModule:
-    torch.manual_seed(0)
-    return FlowModule(CONFIG, GelFlow(CONFIG.model))
-
-
 def test_each_pair_counts_by_what_is_known_of_it() -> None:
     samples = [checked(sample) for sample in Shifts(3, 64, 2.0, seed=4)]
     samples[1]["flow"] = torch.full((2, 64, 64), torch.nan)
     samples[2]["flow"][:, :5] = torch.nan  # known in part: supervised
-    batch, trained = collate(samples), flow_module()
+    torch.manual_seed(0)
+    batch, trained = collate(samples), FlowModule(CONFIG, GelFlow(CONFIG.model))
 
     def supervised(which: list[int]) -> torch.Tensor:
         flows = trained.model(batch["image1"][which], batch["image2"][which])

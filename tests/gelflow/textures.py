@@ -1,5 +1,6 @@
 """Images whose motion is known exactly: a sum of plane waves is evaluated at moved positions, nothing is resampled."""
 
+import csv
 import json
 from pathlib import Path
 
@@ -37,6 +38,12 @@ def moved(height: int, width: int, u: float, v: float, seed: int = 0) -> NDArray
 
 def as_bytes(image: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.rint(image * 255).astype(np.uint8)
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    """Rows of a CSV file."""
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def save(path: Path, image: NDArray[np.float32]) -> None:

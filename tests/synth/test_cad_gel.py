@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from batches import simulate_scenes
 from capsules import capsule, capsule_mesh
+from commands import refused
 from pads import brick, contact_faces
 from pads import scene as pad_scene
-from refusals import refused
 from render_scenes import needs_llvm
 
 from synth.arrays import FloatArray, Points, Triangles

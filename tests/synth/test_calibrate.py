@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import pytest
 import tomli_w
+from commands import refused
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
-from refusals import refused
 from render_scenes import FAST, needs_llvm, small_sensor
 
 from synth.arrays import FloatArray

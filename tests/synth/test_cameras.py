@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from refusals import refused
+from commands import refused
 from render_scenes import FAST, SCALAR, flat_surface, plain, rendered, small_sensor
 from tiny_scene import CONTACT, LIGHTS, SENSOR, fingerprint, own_cache, write_tiny
 

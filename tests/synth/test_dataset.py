@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import refused
 from processes_of import largest_file
-from refusals import refused
 from samples import job, translation_sample, tree, writing_elsewhere
 
 from synth.cli import main

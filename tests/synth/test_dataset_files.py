@@ -8,8 +8,8 @@ import sys
 import numpy as np
 import OpenEXR
 import pytest
+from commands import refused
 from PIL import Image
-from refusals import refused
 from samples import translation_sample
 
 from synth.dataset.exr import channels_of, read_channels, read_flow, write_flow

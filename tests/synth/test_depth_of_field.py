@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 import render_scenes
+from commands import refused
 from kinematic_double import rigid, rotation
-from refusals import refused
 from render_scenes import FAST, SCALAR, flat_surface, needs_llvm, plain, refracted_angle, rendered, small_sensor
 
 from synth.arrays import FloatArray, Image, Points

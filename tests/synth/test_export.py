@@ -7,7 +7,7 @@ import tarfile
 import cv2
 import numpy as np
 import pytest
-from refusals import refused
+from commands import refused
 from samples import HEIGHT, WIDTH, job, translation_sample, tree
 
 from synth.dataset.export import export, kitti_png

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import refused
 from processes_of import end_family, needs_proc, started
-from refusals import refused
 from tiny_scene import TEXT, fingerprint, job_context, write_tiny
 
 from synth.dataset.reader import read_dataset

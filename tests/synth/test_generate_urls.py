@@ -9,8 +9,8 @@ from pathlib import Path
 
 import fsspec
 import pytest
+from commands import refused
 from fsspec.implementations.memory import MemoryFileSystem
-from refusals import refused
 from samples import job, translation_sample
 from tiny_scene import fingerprint, reference
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import OpenEXR
 import pytest
-from refusals import refused
+from commands import refused
 from rich.console import Console
 from samples import HEIGHT, WIDTH, job, translation_sample
 

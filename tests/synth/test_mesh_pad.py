@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import refused
 from pads import brick, contact_faces, crooked
-from refusals import refused
 
 import synth.mesh.cache as cache
 from benchmarks.focused_mesh import around_focus

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import pyvista as pv
-from refusals import refused
+from commands import refused
 
 from synth.arrays import FloatArray
 from synth.scene import Box, MeshIndenter

@@ -3,8 +3,8 @@
 import cv2
 import numpy as np
 import pytest
+from commands import refused
 from kinematic_double import FISHEYE, LENS, OBLIQUE, PERISCOPE_VIEW, SIDES, WIDTH, optics, pixel_centres, sensor
-from refusals import refused
 from render_scenes import refracted_angle
 
 from synth.optics import Optics

@@ -5,8 +5,8 @@ import itertools
 
 import numpy as np
 import pytest
+from commands import refused
 from pydantic import ValidationError
-from refusals import refused
 from render_scenes import small_sensor
 
 from synth.arrays import FloatArray

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import render_scenes
-from refusals import refused
+from commands import refused
 from render_scenes import (
     DIRECT,
     FAST,

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from refusals import refused
+from commands import refused
 
 from synth.render import variant
 from synth.render.variant import (

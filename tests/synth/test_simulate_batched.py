@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import warp as wp
 from batches import presses_of, simulate_scenes
+from commands import refused
 from pads import ELEMENT, MIXED, PUNCH, SPHERE, brick, dense, indenters, same, scene
-from refusals import refused
 
 from synth.mesh import PadMesh
 from synth.scene import Scene

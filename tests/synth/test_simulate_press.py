@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import refused
 from pads import DRAG, FILM, MIXED, PUNCH, SIZE, SPHERE, brick, complete, gentle, pad, same, scene
-from refusals import refused
 
 import synth.simulate.linear as linear
 import synth.simulate.pattern as pattern
