@@ -9,7 +9,8 @@ import pytest
 import torch
 from commands import refused
 from PIL import ExifTags, Image, ImageOps
-from synth_samples import synth_sample, write_dataset
+from samples import write_dataset
+from synth_samples import synth_sample
 from textures import as_bytes, moved, save, write_folder, write_synthetic
 
 from gelflow.arrays import FlowArray

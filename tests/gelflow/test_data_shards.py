@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import torch
 from commands import refused
-from synth_samples import synth_sample, write_dataset
+from samples import write_dataset
+from synth_samples import synth_sample
 
 from gelflow.data import PairDataset
 from synth.dataset import export as exporting
@@ -22,7 +23,7 @@ INDICES = (0, 1, 999999, 1000000)  # With a gap, and with the last key before th
 
 
 def write_both(parent: Path, samples: list[Sample]) -> tuple[Path, Path]:
-    write_dataset(parent / "data", samples)
+    write_dataset(parent / "data", samples, n=10**6 + 1)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(exporting, "SAMPLES_PER_SHARD", 2)
         exporting.export(parent / "data", "webdataset", parent / "shards")

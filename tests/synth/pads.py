@@ -5,8 +5,9 @@ rounding, and free of the mesher's randomness. The solver holds displacement com
 start, so that prescribed motion is a `held` mask and a start; dead loads are nodal forces. Everything for E = 1.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ from synth.mesh.graded import kuhn_tets
 from synth.mesh.pad import boundary_faces
 from synth.scene import Scene
 from synth.simulate import Trajectory, simulate
+from synth.simulate.batched import simulate_presses
+from synth.simulate.batched.pad import prepare
 from synth.simulate.contact import Indenters
 from synth.simulate.element import Element, p1p1, p2p1
 from synth.simulate.indenter import rigid_body
@@ -123,9 +126,9 @@ def same(a: Trajectory, b: Trajectory) -> bool:
     )
 
 
-def complete(posed: Scene, mesh: PadMesh) -> Trajectory:
+def complete(posed: Scene, mesh: PadMesh, folder: Path | None = None, **options: Any) -> Trajectory:
     """The trajectory of a scene, which must reach its end."""
-    result = simulate(posed, mesh)
+    result = simulate(posed, mesh, folder, **options)
     assert (result.status, result.reason) == ("complete", "")
     return result
 
@@ -143,6 +146,19 @@ def run(posed: Scene, mesh: PadMesh) -> Stepper:
     ended = stepper.run()
     assert (ended.status, ended.reason) == ("complete", "")
     return stepper
+
+
+def presses_of(scenes: Sequence[Scene], mesh: PadMesh, folder: Path | None = None) -> list[Press]:
+    return [Press.of(scene, mesh, folder) for scene in scenes]
+
+
+def simulate_scenes(
+    scenes: Sequence[Scene], mesh: PadMesh, folder: Path | None = None, device: str = "cpu", **options: Any
+) -> list[Trajectory]:
+    pad = prepare(scenes[0], mesh, device)
+    found = dict(simulate_presses(presses_of(scenes, mesh, folder), pad, **options))
+    assert sorted(found) == list(range(len(scenes)))
+    return [found[number] for number in range(len(scenes))]
 
 
 def dense(body: System, tangent: Tangent) -> FloatArray:
@@ -197,8 +213,7 @@ def equilibrium(
 ) -> tuple[System, Unknowns, FloatArray]:
     """The equilibrium without contact under prescribed displacements (n, 3) mm where held and dead loads (n, 3) E mm².
 
-    In equal steps, each from the last state extrapolated; `guess` is the first iterate of a single one. Returns the
-    system, its state, and all nodal forces (n, 3): what the supports exert, zero elsewhere.
+    Returns the system, its state, and all nodal forces (n, 3), which the supports exert.
     """
     goal = np.zeros_like(space.points) if prescribed is None else prescribed
     body = System(space, material, load=load)

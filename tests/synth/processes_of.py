@@ -96,10 +96,7 @@ def workers_of(pid: int, name: bytes = b"spawn_main") -> list[int]:
 
 @contextlib.contextmanager
 def largest_file(count: int) -> Iterator[None]:
-    """Let no file become larger than so many bytes: a write beyond that fails as on a full disk, at the same place.
-
-    Held no longer than the call it is for: pytest's own output may go to a file.
-    """
+    """Let no file become larger than so many bytes: a write beyond that fails as on a full disk, at the same place."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (count, hard))
     try:

@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from batches import presses_of, simulate_scenes
-from pads import SPHERE, brick, same, scene
+from pads import SPHERE, brick, presses_of, same, scene, simulate_scenes
 
 from synth.scene import Scene
 from synth.simulate import Trajectory, simulate, stepping
@@ -58,8 +57,7 @@ def test_a_state_without_balance_to_the_full_tolerance_leaves_no_trace(monkeypat
     """One iteration suffices for the way, but not even two for what is to be recorded: back to where the step began."""
     monkeypatch.setattr(running, "MAX_ITERATIONS", 1)
     posed = pressed(5000.0, depth_mm=0.2, steps=1)
-    pad = prepare(posed, MESH, "cpu")
-    run = running.Run(presses_of([posed], MESH), pad, None, 1, SolverOptions(relaxed_tolerance=0.3))
+    run = Run(presses_of([posed], MESH), prepare(posed, MESH, "cpu"), None, 1, SolverOptions(relaxed_tolerance=0.3))
     solver = run.solver
     fields, contact = solver._arrays.fields, solver._arrays.contact
     phase, stage = solver.lanes.phase, solver.lanes.stage
@@ -86,10 +84,6 @@ def test_a_state_without_balance_to_the_full_tolerance_leaves_no_trace(monkeypat
     assert (result.status, "did not converge" in result.reason, len(result.states)) == ("failed", True, 1)
 
 
-BOX = {"shape": "box", "size_mm": [3.0, 2.5, 4.0], "fillet_mm": 0.6, "rotation_deg": [0, 0, 20]}
-ROD = {"shape": "cylinder", "radius_mm": 1.5, "length_mm": 4.0, "fillet_mm": 0.3}
-
-
 def sliding(body: dict[str, Any]) -> Scene:
     """On its end. A pass at the last state wanders."""
     motion = {"depth_mm": 0.6, "shear_mm": [0.5, 0.6], "twist_deg": 10.0, "steps": 3, "position_mm": [0.4, 0.3]}
@@ -98,9 +92,8 @@ def sliding(body: dict[str, Any]) -> Scene:
 
 def test_a_pass_that_goes_too_far_is_given_up() -> None:
     """As soon as it does; what is taken has stayed within reach, and the other passes take penetration away."""
-    posed = sliding(BOX)
-    mesh = brick(counts=(4, 4, 2))
-    run = Run(presses_of([posed], mesh), prepare(posed, mesh, "cpu"), None, 1, STRICT_WAY)
+    posed = sliding({"shape": "box", "size_mm": [3.0, 2.5, 4.0], "fillet_mm": 0.6, "rotation_deg": [0, 0, 20]})
+    run = Run(presses_of([posed], MESH), prepare(posed, MESH, "cpu"), None, 1, STRICT_WAY)
     solver = run.solver
     lanes, fields = solver.lanes, solver._arrays.fields
     lost, solved, depths = [], 0, {}
@@ -143,7 +136,8 @@ def test_so_does_the_solver_for_one_sample(monkeypatch: pytest.MonkeyPatch) -> N
         return found
 
     monkeypatch.setattr(stepping, "solve", watched)
-    result = simulate(sliding(ROD), brick(counts=(5, 5, 2)), options=STRICT_WAY)
+    rod = {"shape": "cylinder", "radius_mm": 1.5, "length_mm": 4.0, "fillet_mm": 0.3}
+    result = simulate(sliding(rod), brick(counts=(5, 5, 2)), options=STRICT_WAY)
     assert result.status == "complete"
     passes = [one for one in given if np.isfinite(one[2]) and one[2]]
     assert all(share <= 1 for converged, _, share in passes if converged)

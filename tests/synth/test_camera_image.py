@@ -7,9 +7,7 @@ from render_scenes import FAST, flat_surface, needs_llvm, plain, small_sensor
 from synth.render.camera_image import camera_image, expected_signal, vignette
 from synth.render.renderer import Renderer, full_grid
 from synth.render.sample_count import camera_noise, needed_samples, render_noise
-from synth.scene import Light, Render, Sensor
-
-SIZE = {"width": 200, "height": 150, "cx": 100.0, "cy": 75.0}
+from synth.scene import Light, Render
 
 
 def _flat(value: float) -> np.ndarray:
@@ -17,7 +15,7 @@ def _flat(value: float) -> np.ndarray:
 
 
 def _camera(**fields):
-    return small_sensor(**(SIZE | fields)).camera
+    return small_sensor(**({"width": 200, "height": 150, "cx": 100.0, "cy": 75.0} | fields)).camera
 
 
 def test_levels_follow_exposure_gamma_and_the_vignette_and_clip() -> None:
@@ -74,15 +72,14 @@ def test_blur_is_a_normalised_gaussian_and_the_same_in_every_channel() -> None:
     np.testing.assert_array_equal(grey[:, :, 0], colour[:, :, 1])
 
 
-def _lit_from_two_sides(shot_noise: float) -> Sensor:
-    lights = tuple(Light(position_mm=(x, 1.0, 3.0), size_mm=(3, 1), color=(1, 1, 1), power=400) for x in (-7.0, 7.0))
-    return small_sensor(1.45, lights=lights, gamma=2.2, shot_noise=shot_noise, bit_depth=16)
+LENS = {"aperture_mm": 3.0, "focus_mm": 15.0}
 
 
 @needs_llvm
-@pytest.mark.parametrize("shot_noise", [0.01, 0.02])
-def test_auto_keeps_render_noise_below_a_quarter_of_the_cameras(shot_noise: float) -> None:
-    sensor = _lit_from_two_sides(shot_noise)
+@pytest.mark.parametrize(("shot_noise", "lens"), [(0.01, {}), (0.02, {}), (0.02, LENS)], ids=["fine", "coarse", "lens"])
+def test_auto_keeps_render_noise_below_a_quarter_of_the_cameras(shot_noise: float, lens: dict) -> None:
+    lights = tuple(Light(position_mm=(x, 1.0, 3.0), size_mm=(3, 1), color=(1, 1, 1), power=400) for x in (-7.0, 7.0))
+    sensor = small_sensor(1.45, lights=lights, gamma=2.2, shot_noise=shot_noise, bit_depth=16, **lens)
     surface, render = flat_surface(sensor), Render(samples_per_pixel="auto", max_depth=2)
     renderer, again = (Renderer(sensor, render, surface, plain(), FAST) for _ in "12")
     first, second = (renderer.radiance(surface.material, seed) for seed in (11, 12))

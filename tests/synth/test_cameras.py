@@ -20,23 +20,10 @@ from synth.scene import FurtherCamera, Mirror, Render, Sensor
 from synth.scene.template import load_scene
 from synth.verify import verify_dataset
 
-LEFT = """
-[[sensor.further_cameras]]
-name = "left"
-width = 40
-height = 30
-fx = 95.0
-fy = 95.0
-cx = 20.0
-cy = { normal = [15.0, 0.2] }
-position_mm = [-2.0, 0.5, 19.0]
-read_noise = 0.001
-"""
-TEXT = SENSOR.replace("\n[render]", f"{LEFT}\n[render]") + LIGHTS + CONTACT
-OTHER = {
-    "name": "other", "width": 48, "height": 40, "fx": 120.0, "fy": 120.0, "cx": 24.0, "cy": 20.0,
-    "position_mm": (2.0, 0.0, 19.0),
-}  # fmt: skip
+VIEW = "width = 40, height = 30, fx = 95, fy = 95, cx = 20, cy = { normal = [15.0, 0.2] }, read_noise = 0.001"
+LEFT = f'further_cameras = [{{ name = "left", position_mm = [-2.0, 0.5, 19.0], {VIEW} }}]'
+TEXT = SENSOR.replace("[sensor.camera]", f"{LEFT}\n[sensor.camera]") + LIGHTS + CONTACT
+OTHER = {"width": 48, "height": 40, "fx": 120.0, "fy": 120.0, "cx": 24.0, "cy": 20.0, "position_mm": (2.0, 0.0, 19.0)}
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +99,7 @@ def test_a_sample_without_a_cameras_file_is_made_again(dataset, tmp_path, monkey
 
 
 def _with_other(**changes: object) -> Sensor:
-    camera = FurtherCamera.model_validate({**OTHER, **changes})
+    camera = FurtherCamera.model_validate({"name": "other", **OTHER, **changes})
     return small_sensor(1.45).model_copy(update={"further_cameras": (camera,)})
 
 

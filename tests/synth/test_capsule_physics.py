@@ -10,20 +10,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from batches import simulate_scenes
 from capsules import capsule, capsule_mesh
 from closed_forms import shear_modulus
 from integrals import integrals
-from pads import equilibrium, far_away
-from pads import system as pad_system
+from pads import complete, equilibrium
 from scipy.integrate import quad
 
 from synth.arrays import FloatArray
-from synth.mesh.face import FLAT_FACE
 from synth.scene import Gel, Scene
 from synth.simulate import Trajectory, simulate
 from synth.simulate.element import p2p1
-from synth.simulate.indenter import rotation_about
 from synth.simulate.load_path import path_of
 from synth.simulate.material import uniform
 from synth.simulate.press import Press
@@ -79,21 +75,8 @@ def test_a_thick_shell_expands_as_its_closed_form_says() -> None:
     assert 1.5 < rates[1] < 3.2
 
 
-def test_rigid_motion_gives_no_forces() -> None:
-    """The bulk's elements have straight sides: displacements are those at their edges' middles, beside the face."""
-    mesh = replace(capsule_mesh(capsule().sensor.gel), face=FLAT_FACE)
-    body = pad_system(mesh, 0.5, element=p2p1())
-    turn = rotation_about(2, 0.7) @ rotation_about(0, -0.4)
-    moved = body.space.points @ turn.T + [0.3, -0.2, 0.1] - body.space.points
-    forces = body.residual(Unknowns(moved, np.zeros(body.space.pressures)), far_away()).reaction
-    # In E mm²; the forces of a press of 1 mm are some 1. Sums of some 20 elements' rounding at each node.
-    assert np.abs(forces).max() < 1e-12
-
-
 def pressed(posed: Scene) -> Trajectory:
-    result = simulate(posed, capsule_mesh(posed.sensor.gel))
-    assert result.status == "complete", result.reason
-    return result
+    return complete(posed, capsule_mesh(posed.sensor.gel))
 
 
 def local(posed: Scene, force: tuple[float, float, float]) -> FloatArray:
@@ -151,13 +134,3 @@ def test_far_from_the_press_the_gel_is_left_out() -> None:
     still = ~found.displacement.any(axis=1)
     assert still[moved < 1e-6 * moved.max()].all()
     assert still.mean() > 0.4
-
-
-def test_the_batched_solver_presses_the_same_gel() -> None:
-    motion = {"depth_mm": 0.4, "shear_mm": (0.1, 0.0), "polar_deg": 50.0, "azimuth_deg": 200.0, "steps": 2}
-    posed = capsule(friction=0.5, motion=motion, numerics={"element": "p1p1"})
-    single = pressed(posed).states[-1]
-    (batched,) = simulate_scenes([posed], capsule_mesh(posed.sensor.gel))
-    assert batched.status == "complete", batched.reason
-    # Both within the tolerance of 1e-6 at the recorded states; steps between are solved to other tolerances.
-    np.testing.assert_allclose(batched.states[-1].force_n, single.force_n, atol=2e-3 * np.linalg.norm(single.force_n))

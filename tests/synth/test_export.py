@@ -8,22 +8,18 @@ import cv2
 import numpy as np
 import pytest
 from commands import refused
-from samples import HEIGHT, WIDTH, job, translation_sample, tree
+from samples import HEIGHT, WIDTH, translation_sample, tree, write_dataset
 
 from synth.dataset.export import export, kitti_png
 from synth.dataset.images import read_png
-from synth.dataset.writer import DatasetWriter
 
 SHIFTS = {0: (1.25, -0.5), 1: (-3.0, 0.3), 3: (0.01, 0.02)}
 
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
-    directory = tmp_path_factory.mktemp("export") / "d"
-    with DatasetWriter(directory, job(4)) as writer:
-        for index, shift in SHIFTS.items():
-            writer.write(translation_sample(index, shift))
-    return directory
+    samples = (translation_sample(index, shift) for index, shift in SHIFTS.items())
+    return write_dataset(tmp_path_factory.mktemp("export") / "d", samples, n=4)
 
 
 def test_flo_and_npz(dataset, tmp_path) -> None:
@@ -68,9 +64,8 @@ def test_webdataset_and_kitti_within_its_range(dataset, tmp_path, monkeypatch) -
     for index, shift in SHIFTS.items():
         flow = translation_sample(index, shift).flow
         for folder, valid in (("flow_occ", np.isfinite(flow.forward[..., 0])), ("flow_noc", flow.forward_visible == 1)):
-            stored = cv2.imread(
-                str(tmp_path / "kitti" / "training" / folder / f"{index:06d}_10.png"), cv2.IMREAD_UNCHANGED
-            )
+            path = tmp_path / "kitti" / "training" / folder / f"{index:06d}_10.png"
+            stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
             assert stored.dtype == np.uint16
             flag, v, u = np.moveaxis(stored.astype(np.float64), -1, 0)  # OpenCV: blue first.
             np.testing.assert_array_equal(flag == 1, valid)
@@ -102,5 +97,4 @@ def test_nothing_is_overwritten_and_nothing_half_done(dataset, tmp_path, monkeyp
     with pytest.raises(KeyboardInterrupt):
         export(dataset, "npz", tmp_path / "p", fail)
     assert [entry.name for entry in tmp_path.iterdir()] == ["o"]
-    DatasetWriter(tmp_path / "empty", job()).close()
-    refused("no finished sample", export, tmp_path / "empty", "flo", tmp_path / "p")
+    refused("no finished sample", export, write_dataset(tmp_path / "empty", []), "flo", tmp_path / "p")

@@ -214,25 +214,19 @@ def test_a_full_disk_under_workers_ends_with_one_line(tiny: Path, out: Path) -> 
     assert fingerprint(out) == fingerprint(reference())
 
 
-def _resident_mb() -> float:
-    found = re.search(r"VmRSS:\s+(\d+)", Path("/proc/self/status").read_text())
-    return int(found[1]) / 1024
-
-
 @pytest.mark.slow
 @needs_proc
 def test_a_soak_of_500_samples(tiny: Path, out: Path) -> None:
-    """Resident memory stays where it was after the first fifty; an index of 339 bytes a sample is all that grows.
-
-    Single readings jump by 10 MB, the smallest of several by 6 where other tests ran in the process before.
-    """
+    """Resident memory stays where it was after the first fifty; an index of 339 bytes a sample is all that grows."""
     resident = {}
 
     def look(done: int, _: int) -> None:
         gc.collect()
-        resident[done] = _resident_mb()
+        found = re.search(r"VmRSS:\s+(\d+)", Path("/proc/self/status").read_text())
+        resident[done] = int(found[1]) / 1024  # MB
 
     generate(load_scene(tiny), 500, out, progress=look)
+    # Single readings jump by 10 MB, the smallest of several by 6 where other tests ran in the process before.
     early, late = (min(resident[done] for done in resident if low < done <= low + 50) for low in (50, 450))
     assert late - early < 9.0, resident  # 20 kB a sample
 

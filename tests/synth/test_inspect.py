@@ -12,7 +12,7 @@ import OpenEXR
 import pytest
 from commands import refused
 from rich.console import Console
-from samples import HEIGHT, WIDTH, job, translation_sample
+from samples import HEIGHT, WIDTH, job, translation_sample, write_dataset
 
 from synth.commands import inspect as inspect_command
 from synth.dataset.exr import write_flow
@@ -27,10 +27,8 @@ from synth.inspect.wheel import NO_GEL, flow_colours, robust_scale, wheel_legend
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
-    directory = tmp_path_factory.mktemp("inspect") / "d"
+    directory = write_dataset(tmp_path_factory.mktemp("inspect") / "d", map(translation_sample, range(3)))
     with DatasetWriter(directory, job(3)) as writer:
-        for index in range(3):
-            writer.write(translation_sample(index))
         writer.fail(1, 0, "simulate", "Newton failed")
     return directory
 
@@ -45,8 +43,7 @@ def test_translation_exchanged_directions_and_missing_visibility_in_numbers(data
     # x + 0.5 + 1.25 < 32 keeps columns 0 ... 29 whole; y + 0.5 - 0.5 > 0 loses row 0: 23 of 24 rows.
     assert found["forward"]["visible_share"] == pytest.approx(23 / 24)
     assert found["closure"]["max_px"] == 0
-    # Between 4 x 4 pixels with gel (columns 0 ... 29, rows 0 ... 23): column
-    # c + 1.25 takes c ... c + 3, so c = 0 ... 26. Row r - 0.5 takes r - 2 ... r + 1, so r = 2 ... 22.
+    # Between 4 x 4 pixels with gel: column c + 1.25 takes c ... c + 3 of 30, row r - 0.5 takes r - 2 ... r + 1 of 24.
     assert found["closure"]["pixels"] == 27 * 21
     assert (found["width"], found["height"], found["bits"]) == (WIDTH, HEIGHT, 8)
     assert found["force_n"][1] == [0.1, 0.0, 1.5]
@@ -144,9 +141,7 @@ def test_gel_out_of_sight_or_at_rest(tmp_path, name, value, most):
 
 
 def test_what_cannot_be_inspected(tmp_path):
-    with DatasetWriter(tmp_path / "d", job(1)) as writer:
-        writer.write(translation_sample())
-    image = tmp_path / "d/samples/000000/image2.png"
+    image = write_dataset(tmp_path / "d", [translation_sample()]) / "samples/000000/image2.png"
     cv2.imwrite(str(image), cv2.imread(str(image))[:-1])
     refused(r"image1\.png is .*, image2\.png .*, flow\.exr .*; they must agree", inspect, tmp_path / "d")
     refused("no such file", inspect, tmp_path / "none")
@@ -189,8 +184,7 @@ def test_colour_wheel_and_pages_of_limited_and_empty_datasets(dataset, tmp_path)
     assert [numbers["name"] for numbers in inspection.numbers] == ["000000", "000002"]
     assert (inspection.about["finished"], inspection.about["inspected"]) == (3, 2)
     assert (evenly_spaced(0, 5), evenly_spaced(100, 3)) == ([], [0, 50, 99])
-    DatasetWriter(tmp_path / "d", job()).close()
-    inspection = inspect(tmp_path / "d")
+    inspection = inspect(write_dataset(tmp_path / "d", []))
     assert inspection.as_dict()["samples"] == []
     write_sheet(inspection, tmp_path / "d.png")
     write_html(inspection, tmp_path / "d.html")

@@ -4,7 +4,7 @@ import hashlib
 
 import numpy as np
 import pytest
-from pads import contact_faces
+from pads import area_vectors, contact_faces
 
 from synth.arrays import FloatArray
 from synth.mesh import Counts, Focus, PadMesh, graded_box
@@ -56,12 +56,11 @@ def test_neighbours_share_faces_all_but_the_window_is_touchable_and_mirror_image
     assert len(boundary_faces(mesh.tets)) == 4 * (nx * ny + ny * nz + nx * nz)
     assert len(contact_faces(mesh).faces) == 2 * nx * ny
     mesh = graded_box(SIZE, FOCI["off centre"], COUNTS)
-    a, b, c = (mesh.points[mesh.touchable[:, i]] for i in range(3))
-    area = np.cross(b - a, c - a) / 2
+    area = area_vectors(mesh.points, mesh.touchable)
     assert np.linalg.norm(area, axis=1).sum() == pytest.approx(20 * 15 + 2 * (20 + 15) * 4, rel=1e-12)
     # Outward: the five faces' area vectors add up to minus the missing window face's, (0, 0, 20 * 15).
     np.testing.assert_allclose(area.sum(axis=0), [0, 0, -300.0], atol=1e-10)
-    centre = (a + b + c) / 3
+    centre = mesh.points[mesh.touchable].mean(axis=1)
     assert (np.einsum("ij,ij->i", area, centre - [0, 0, 2.0]) > 0).all()
     assert mesh.touchable.dtype == np.int32
     assert not mesh.bonded[mesh.touchable].all(axis=1).any()
@@ -93,11 +92,8 @@ def test_centred_spacing_is_even_then_geometric_as_is_depth() -> None:
 
 
 def largest_ratio(q: float) -> float:
-    """Bound on the ratio of neighbouring spacings, from the mesh's density.
-
-    An element across the zone's end, a share t of it inside, is t f + f q (q^(1-t) - 1) / (q - 1) long, the next one
-    f q^(2-t). For whole elements (t = 0) the ratio is q; between, it is a little more.
-    """
+    """Bound on the ratio of neighbouring spacings, q for whole elements and a little more between."""
+    # An element across the zone's end, a share t inside, is t f + f q (q^(1-t) - 1) / (q - 1) long, the next f q^(2-t).
     t = np.linspace(0, 1, 2001)
     return float((q ** (2 - t) / (t + q * (q ** (1 - t) - 1) / (q - 1))).max()) if q > 1 else 1.0
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import refused
-from pads import brick, contact_faces, crooked
+from pads import area_vectors, brick, contact_faces, crooked
 
 import synth.mesh.cache as cache
 from benchmarks.focused_mesh import around_focus
@@ -34,11 +34,6 @@ def pad(tmp_path_factory: pytest.TempPathFactory) -> PadMesh:
     return mesh
 
 
-def double_area(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    a, b, c = (points[faces[:, i]] for i in range(3))
-    return np.cross(b - a, c - a)
-
-
 def test_fills_the_box_with_flat_closed_faces_and_edges_graded_toward_the_window(pad: PadMesh) -> None:
     assert pad.volumes.min() > 0
     # Sums of a few hundred volumes of about 0.1 mm^3 round to 1e-14 relative; 1e-12 leaves room.
@@ -52,14 +47,14 @@ def test_fills_the_box_with_flat_closed_faces_and_edges_graded_toward_the_window
     points = set(map(tuple, pad.points))
     assert points >= set(product(*zip(low, high, strict=True)))
     faces = boundary_faces(pad.tets)
-    area = double_area(pad.points, faces) / 2
+    area = area_vectors(pad.points, faces)
     # Closed: the area vectors of some 500 faces sum to zero but for rounding, 500 * 1e-16 * 1 mm^2.
     np.testing.assert_allclose(area.sum(axis=0), 0.0, atol=1e-12)
     # Divergence theorem: positive only if the normals point out.
     enclosed = np.einsum("ij,ij->", pad.points[faces].mean(axis=1), area) / 3
     assert enclosed == pytest.approx(np.prod(SIZE), rel=1e-12)
     contact = contact_faces(pad)
-    area = double_area(contact.nodes, contact.faces) / 2
+    area = area_vectors(contact.nodes, contact.faces)
     assert (pad.on_face == (pad.points[:, 2] == 0)).all()
     assert (contact.nodes == pad.points[pad.on_face]).all()
     assert (area[:, :2] == 0).all()
@@ -238,17 +233,10 @@ def test_key_depends_on_what_the_mesh_depends_on_only_and_on_the_default_edge() 
 WIDE = (12.0, 9.0, 3.0)
 LOW, HIGH = np.array([-6.0, -4.5, 0.0]), np.array([6.0, 4.5, 3.0])
 FOCUS = Focus((1.5, -1.0), (2.0, 1.5))
-COARSE = 2.0
-
-
-def distance_from_zone(points: FloatArray) -> FloatArray:
-    """(n,) mm from the zone of the contact face."""
-    away = np.abs(points[:, :2] - FOCUS.centre_mm) - FOCUS.half_mm
-    return np.hypot(np.linalg.norm(np.maximum(away, 0), axis=1), np.maximum(points[:, 2], 0))
 
 
 def test_mesh_is_as_good_as_any_and_its_edges_are_small_in_the_focus_only() -> None:
-    pad = tetrahedralise_box(WIDE, EDGE, around_focus(WIDE, EDGE, FOCUS, COARSE))
+    pad = tetrahedralise_box(WIDE, EDGE, around_focus(WIDE, EDGE, FOCUS, 2.0))
     assert pad.volumes.min() > 0
     # Sums of some 2000 volumes round to 1e-14 relative.
     assert pad.volumes.sum() == pytest.approx(np.prod(WIDE), rel=1e-12)
@@ -258,7 +246,8 @@ def test_mesh_is_as_good_as_any_and_its_edges_are_small_in_the_focus_only() -> N
     contact = contact_faces(pad)
     corners = contact.nodes[contact.faces]
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).mean(axis=1)
-    away = distance_from_zone(corners.mean(axis=1))
+    beyond = np.abs(corners.mean(axis=1)[:, :2] - FOCUS.centre_mm) - FOCUS.half_mm
+    away = np.linalg.norm(np.maximum(beyond, 0), axis=1)  # from the zone
     # fTetWild aims at edges of 4/5 to 4/3 of the target and is random: the limits lie 6 deviations of 20 meshes away.
     assert 0.8 * EDGE < edges[away == 0].mean() < 1.5 * EDGE
     assert edges[away > 2.5].mean() > 1.25 * edges[away == 0].mean()

@@ -14,9 +14,7 @@ from synth.render import variant
 from synth.render.variant import (
     LLVM_HINT,
     PACKAGE,
-    choose_variant,
     cpu_variant,
-    cuda_trouble,
     llvm_candidates,
     llvm_version,
 )
@@ -97,10 +95,9 @@ def test_the_packages_library_renders_before_its_links_are_made(tmp_path: Path, 
 
 
 def test_cuda_is_refused_with_a_reason_where_there_is_none() -> None:
-    trouble = cuda_trouble("cuda_ad_rgb")
-    if trouble is None:
+    if variant.cuda_trouble("cuda_ad_rgb") is None:
         pytest.skip("this machine has CUDA with OptiX")
-    refused("cuda", choose_variant, "cuda")
+    refused("cuda", variant.choose_variant, "cuda")
 
 
 OLD_ONLY = """
@@ -123,14 +120,9 @@ sys.exit(main(["doctor", "--json"]))
 
 def _python(code: str, home: Path, *arguments: str) -> "subprocess.CompletedProcess[str]":
     """Run code in a process that knows this checkout and nothing of the environment."""
-    return subprocess.run(
-        [sys.executable, "-c", code, *arguments],
-        cwd=home,
-        env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(Path(__file__).parents[2]), "HOME": str(home)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    environment = {"PATH": "/usr/bin:/bin", "PYTHONPATH": str(Path(__file__).parents[2]), "HOME": str(home)}
+    command = [sys.executable, "-c", code, *arguments]
+    return subprocess.run(command, cwd=home, env=environment, capture_output=True, text=True, check=False)
 
 
 @pytest.mark.parametrize("real", [False, True])

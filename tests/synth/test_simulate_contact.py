@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from pads import MIXED, dense
+from pads import MIXED, areas, dense
 from touching import INDENTERS, MESH, PENALTY, RADIUS, SLIP, STICK, sphere_law, touch
 
 from synth.simulate.contact import FAR
@@ -83,9 +83,7 @@ def test_nodal_forces_and_moments_are_the_tractions(element: str) -> None:
     # The nodal mean keeps the resultant of the coated face: its integral with each node's share of area.
     coated = (space.points[space.faces][:, :, 2] == 0).all(axis=1)
     on_face = np.einsum("fq,fqc->c", weight[coated], (normal + along)[coated])
-    a, b, c = (space.surface.nodes[space.surface.faces[:, i]] for i in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-    share = np.zeros(len(nodal))
+    area, share = areas(space.surface.nodes, space.surface.faces), np.zeros(len(nodal))
     # A node's piecewise linear function has a third of its faces' area; on a quadratic face a corner has a twelfth of
     # the face, the middle of an edge a quarter.
     part = [1 / 3] * 3 if space.element.order == 1 else [1 / 12] * 3 + [1 / 4] * 3

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pads import SIZE, brick, gentle, indenters, same, scene, system
+from pads import SIZE, brick, complete, gentle, indenters, same, scene, system
 
 import synth.simulate.stepping as stepping
 from synth.scene import Scene
@@ -126,8 +126,7 @@ def test_relaxed_steps_end_where_tight_ones_do_and_save_iterations() -> None:
     counts = []
     for relaxed, extrapolate in product((exact.relaxed_tolerance, 0.0), (True, False)):
         options = replace(exact, relaxed_tolerance=relaxed, extrapolate=extrapolate)
-        found = simulate(posed, MESH, options=options)
-        assert found.status == "complete"
+        found = complete(posed, MESH, options=options)
         counts.append(sum(state.newton_iterations for state in found.states))
     standard, unpredicted, tight, plain = counts
     assert standard < min(tight, unpredicted)
