@@ -163,9 +163,7 @@ VIEWS = {
     "fisheye": _dotted(lens="fisheye", distortion=(0.08, -0.03, 0.01, 0.0), fx=150.0, fy=148.0),
     "mirror": _dotted((MIRROR,), width=130, cx=30.0, position_mm=(-1.0, 0.0, 20.0), look_at_mm=(-1.0, 0.0, 0.0)),
     "dome": _domed(distortion=(-0.2, 0.05, 1e-3, -2e-3, 0.0), fx=130.0, fy=130.0),
-    "dome, close fisheye": _domed(
-        lens="fisheye", distortion=(0.02, -0.01, 0, 0), fx=72, fy=72, position_mm=(0.2, 0, 13)
-    ),
+    "close fisheye": _domed(lens="fisheye", distortion=(0.02, -0.01, 0, 0), fx=72, fy=72, position_mm=(0.2, 0, 13)),
 }
 
 

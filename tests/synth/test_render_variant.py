@@ -11,13 +11,7 @@ import pytest
 from commands import refused
 
 from synth.render import variant
-from synth.render.variant import (
-    LLVM_HINT,
-    PACKAGE,
-    cpu_variant,
-    llvm_candidates,
-    llvm_version,
-)
+from synth.render.variant import LLVM_HINT, PACKAGE, cpu_variant, llvm_candidates, llvm_version
 
 OLD, LEAST, NEW = Path("/lib/libLLVM-15.so.1"), Path("/lib/libLLVM.so.16"), Path("/lib/libLLVM.so.19.1")
 VERSIONS = {OLD: (15, 0, 6), LEAST: (16, 0, 0), NEW: (19, 1, 7)}

@@ -12,7 +12,7 @@ from pads import ELEMENT, MIXED, PUNCH, SPHERE, brick, dense, indenters, presses
 
 from synth.mesh import PadMesh
 from synth.scene import Scene
-from synth.simulate import Trajectory
+from synth.simulate import Trajectory, simulate
 from synth.simulate.batched import simulate_presses
 from synth.simulate.batched.inversion_barrier import barrier_product, find_inverting
 from synth.simulate.batched.krylov import padded

@@ -77,7 +77,7 @@ class Touch:
 def touch(
     friction: float, shape: str = "sphere", multipliers: bool = True, fresh: float = 0.0, element: str = "p1p1"
 ) -> Touch:
-    """The gel with random displacements and multipliers; a share `fresh` of the contact points was off before the step."""
+    """The gel with random displacements and multipliers; a share `fresh` of the points was off before the step."""
     rng = np.random.default_rng(1)
     body = system(MESH, 0.4999, penalty=PENALTY, element=ELEMENT[element]())
     posed = scene(MESH.size_mm, indenter=INDENTERS[shape], motion={"depth_mm": 0.5})
