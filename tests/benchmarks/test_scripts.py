@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from commands import said
 from render_scenes import needs_llvm
 from tiny_scene import TEXT, own_cache, write_tiny
 
@@ -101,8 +102,8 @@ def test_light(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "path_tracing_s" in capsys.readouterr().out
     (tmp_path / "shining").mkdir()
     shining = write_tiny(tmp_path / "shining", NOISY + "\n[sensor.coating]\nroughness = 0.5\n")
-    assert main(["light", str(shining), "--device", "cpu", "--out", str(tmp_path / "other")]) == 2
-    assert "needs a matt coating" in capsys.readouterr().err
+    refusal = said(capsys, main, "light", shining, "--device", "cpu", "--out", tmp_path / "other", status=2)
+    assert "needs a matt coating" in refusal
 
 
 def test_flow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,9 +143,8 @@ def test_scale(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_another_size_keeps_the_field_of_view(tmp_path: Path) -> None:
     scene = str(write_tiny(tmp_path))
-    before, after = (
-        at_size(scene, ["sensor.camera.cy=9.0"], *size).corners[0].sensor.camera for size in ((32, 24), (64, 36))
-    )
+    templates = (at_size(scene, ["sensor.camera.cy=9.0"], *size) for size in ((32, 24), (64, 36)))
+    before, after = (template.corners[0].sensor.camera for template in templates)
     assert (after.width, after.height) == (64, 36)
     # Half the image over the focal length is the tangent of half the angle; written with 6 decimals.
     assert after.width / after.fx == pytest.approx(before.width / before.fx, rel=1e-7)
@@ -163,5 +163,4 @@ def test_another_size_keeps_the_field_of_view(tmp_path: Path) -> None:
     ],
 )
 def test_wrong_arguments(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: list[str], message: str) -> None:
-    assert main([*command, "--out", str(tmp_path / "out")]) == 2
-    assert message in capsys.readouterr().err
+    assert message in said(capsys, main, *command, "--out", tmp_path / "out", status=2)

@@ -75,9 +75,8 @@ def test_an_error_of_the_flow_is_weighed_against_the_images_as_the_prior_says(it
     x, _ = grid(64, 64)
     image = torch.from_numpy(0.5 + wave * np.sin(2 * np.pi * x / 16)).float().expand(1, 3, 64, 64)
     flow = torch.tensor([off, 0.0]).view(1, 2, 1, 1).repeat(1, 1, 64, 64)
-    config = RegistrationConfig(
-        windows_px=(4,), smoothing_px=(0,), iterations=iterations, prior_px=prior, background_px=None, noise=0.01
-    )
+    one = {"windows_px": (4,), "smoothing_px": (0,), "background_px": None, "noise": 0.01}
+    config = RegistrationConfig(**one, iterations=iterations, prior_px=prior)
     found = registered(flow, image, image, config)[0, 0, 32, 32].item()
     gradient2 = (wave * np.sin(2 * np.pi / 16)) ** 2 / 2  # mean square of a central difference
     texture = 3 * 2 * np.pi * 4**2 * gradient2
@@ -187,14 +186,13 @@ def test_between_grey_images_noise_moves_nothing(ignore_shading: bool) -> None:
 
 
 def test_without_a_match_flows_stay() -> None:
-    """Images that have nothing to do with each other. A residual is the mean of some 3 x 113 squares, so that two of
-    them differ by 7 % or so, rarely by a sixth.
-    """
+    """Images that have nothing to do with each other."""
     image1, _, _ = moved_texture()
     other = torch.rand(image1.shape, generator=torch.Generator().manual_seed(0))
     flow = torch.zeros((1, 2, HEIGHT, WIDTH))
     flow[..., 64:] = 5.0
     found = propagated(flow, image1, other, 3.0, (8, 16), NOISE, ignore_shading=False)
+    # A residual is the mean of some 3 x 113 squares, so that two differ by 7 % or so, rarely by a sixth.
     assert (found != flow).float().mean() < 0.03
 
 
@@ -214,9 +212,7 @@ def test_a_gels_flow_is_extrapolated_and_light_ignored_or_followed() -> None:
     """A stretched texture of which a strip of 12 px is lost, under a window that reduces images to a quarter."""
     x, y = grid(HEIGHT, WIDTH)
     u = 0.1 * (x - WIDTH / 2)
-    image1, image2 = (
-        torch.from_numpy(texture(*places)).permute(2, 0, 1)[None] for places in ((x + u, y), (x, y))
-    )  # fmt: skip
+    image1, image2 = (torch.from_numpy(texture(*p)).permute(2, 0, 1)[None] for p in ((x + u, y), (x, y)))
     truth = torch.from_numpy(np.stack([u, np.zeros_like(u)])).float()[None]
     flow = truth.clone()
     flow[..., 58:70] += WRONG
@@ -229,8 +225,6 @@ def test_a_gels_flow_is_extrapolated_and_light_ignored_or_followed() -> None:
     ramp = torch.linspace(0, 1, WIDTH).expand(1, 3, HEIGHT, WIDTH)
     flow[..., :32] = torch.tensor([-24.0, 0.0]).view(2, 1, 1)
     grey1, grey2 = 0.1 * image1 + 0.4 * ramp, 0.1 * image2 + 0.4 * ramp + 0.075
-    motion, brightness = (
-        propagated(flow, grey1, grey2, 3.0, (8, 16, 32), NOISE, ignore_shading) for ignore_shading in (True, False)
-    )
+    motion, brightness = (propagated(flow, grey1, grey2, 3.0, (8, 16, 32), NOISE, ignore) for ignore in (True, False))
     assert torch.equal(motion[..., 48:], flow[..., 48:])
     assert (brightness[..., 48:] != flow[..., 48:]).float().mean() > 0.1

@@ -30,11 +30,8 @@ def no_flow() -> Tensor:
 
 @pytest.mark.parametrize("noise", [0.003, 0.03])
 def test_in_white_noise_a_step_has_the_variance_of_the_cramer_rao_bound(noise: float) -> None:
-    config = RegistrationConfig()
-    found = [
-        gauss_newton(no_flow(), waves(noise, 2 * seed), SplineImage(waves(noise, 2 * seed + 1)), config)
-        for seed in range(6)
-    ]
+    pairs = ((waves(noise, 2 * seed), SplineImage(waves(noise, 2 * seed + 1))) for seed in range(6))
+    found = [gauss_newton(no_flow(), image1, image2, RegistrationConfig()) for image1, image2 in pairs]
     # Both images' noise over the waves' mean square slope by central differences, in a window of 4 pi 5^2 px (the
     # square of a Gaussian's sum over the sum of its squares), for each of the two components.
     slope_square = (HEIGHT_OF_WAVE * math.sin(NUMBER)) ** 2 / 2

@@ -100,8 +100,7 @@ def test_flow_and_visibility_through_round_windows_against_verification(window, 
     second = pressed(first, PLACE, 0.8, (0.6, -1.0, 0.8))
     flow, checks = motion_checks(seen, SURFACE, first, second)
     assert all(check.passed for check in checks.values()), checks
-    assert checks["forward flow"].figure < 1e-4
-    assert checks["backward flow"].figure < 1e-4
+    assert max(checks[f"{way} flow"].figure for way in ("forward", "backward")) < 1e-4
     assert 0.5 < np.nanmax(np.abs(flow.forward)) < 10
     rays = Optics.of(seen).look(Optics.of(seen).centres)
     assert (rays.directions[np.isfinite(flow.forward[..., 0]).ravel(), 2] > 0.05).any()

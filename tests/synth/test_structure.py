@@ -127,9 +127,8 @@ def test_the_two_programs_share_nothing(modules: dict[str, ast.Module], forbidde
 def _loaded_after(code: str, *arguments: str) -> set[str]:
     """Top-level modules that a fresh interpreter holds after `code`."""
     report = "\nimport sys\nsys.stderr.write('\\nLOADED ' + ' '.join({name.split('.')[0] for name in sys.modules}))"
-    done = subprocess.run(
-        [sys.executable, "-c", code + report, *arguments], cwd=ROOT, capture_output=True, text=True, check=True
-    )
+    command = [sys.executable, "-c", code + report, *arguments]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     return set(done.stderr.rpartition("LOADED ")[2].split())
 
 
@@ -154,32 +153,24 @@ def test_help_loads_nothing_heavy(code: str, arguments: tuple[str, ...]) -> None
 
 
 def test_prediction_loads_nothing_of_training_and_simulate_no_renderer(tmp_path: Path, monkeypatch) -> None:
-    code = (
-        "import gelflow.predict.prediction, gelflow.baselines.learned, gelflow.compare.run, sys\n"
-        "from gelflow.models.weights import load_weights, weights_file\n"
-        "load_weights(weights_file(None))\n"
-        "print(*sys.modules)"
-    )
+    code = """
+import gelflow.predict.prediction, gelflow.baselines.learned, gelflow.compare.run, sys
+from gelflow.models.weights import load_weights, weights_file
+load_weights(weights_file(None))
+print(*sys.modules)"""
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    loaded = set(done.stdout.split())
-    assert "gelflow.models.gelflow" in loaded
-    assert not [name for name in loaded if name.startswith(("gelflow.train", "lightning"))]
+    assert "gelflow.models.gelflow" in done.stdout.split()
+    assert not [name for name in done.stdout.split() if name.startswith(("gelflow.train", "lightning"))]
     assert not _loaded_after("import gelflow.config") & {"torch", "numpy", "lightning"}
     own_cache(monkeypatch)
     scene = write_tiny(tmp_path)
-    loaded = _loaded_after(
-        MAIN.format("synth"), "simulate", "--scene", str(scene), "--out", str(tmp_path / "out"), "--json"
-    )
+    command = ["simulate", "--scene", str(scene), "--out", str(tmp_path / "out"), "--json"]
+    loaded = _loaded_after(MAIN.format("synth"), *command)
     assert "warp" in loaded
     assert not loaded & {"mitsuba", "drjit", "torch", "matplotlib", "OpenEXR"}
     assert (tmp_path / "out" / "trajectory.json").exists()
 
 
 def test_files_stay_short() -> None:
-    long = [
-        f"{path.relative_to(ROOT)}: {count} lines"
-        for package in ("synth", "gelflow", "benchmarks")
-        for path in sorted((ROOT / package).rglob("*.py"))
-        if (count := len(path.read_text(encoding="utf-8").splitlines())) > 350
-    ]
-    assert long == []
+    paths = [path for package in ("synth", "gelflow", "benchmarks") for path in (ROOT / package).rglob("*.py")]
+    assert [path for path in paths if len(path.read_text(encoding="utf-8").splitlines()) > 350] == []

@@ -3,8 +3,10 @@
 import json
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
+import commands
 import numpy as np
 import pytest
 from samples import tree
@@ -19,13 +21,7 @@ Run = Callable[..., str]
 
 @pytest.fixture
 def said(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run a command that must end with a status, 0 unless told: what it printed on stdout."""
-
-    def run(*arguments: object, status: int = 0) -> str:
-        assert main([str(argument) for argument in arguments]) == status
-        return capsys.readouterr().out
-
-    return run
+    return partial(commands.said, capsys, main)
 
 
 @pytest.fixture
@@ -95,9 +91,8 @@ def test_wrong_input_is_one_message_and_status_2(complaint: Run, tmp_path, monke
     assert list(tmp_path.iterdir()) == []
 
 
-def test_debug_adds_the_traceback_which_a_mistake_of_the_program_keeps(capsys, monkeypatch) -> None:
-    assert main(["plan", "--scene", "nowhere", "--debug"]) == 2
-    err = capsys.readouterr().err
+def test_debug_adds_the_traceback_which_a_mistake_of_the_program_keeps(said: Run, monkeypatch) -> None:
+    err = said("plan", "--scene", "nowhere", "--debug", status=2)
     assert "Traceback" in err
     assert err.rstrip().splitlines()[-1].startswith("synth: there is no scene 'nowhere'")
 
@@ -152,9 +147,9 @@ def test_generate_says_what_it_did_and_a_job_that_partly_fails_has_status_1(said
     out = tmp_path / "d"
     impossible = ["--set", "motion.depth_mm={normal=[0, 1e9]}"]
     assert main(["generate", "--scene", str(tiny), "--out", str(out), "--n", "1", *impossible]) == 1
-    said, err = capsys.readouterr()
+    printed, err = capsys.readouterr()
     assert f"synth: 1 samples could not be made, see {out}/failures.jsonl" in err
-    assert "10 draws failed" in said
+    assert "10 draws failed" in printed
 
 
 @pytest.mark.parametrize(
@@ -247,18 +242,17 @@ def test_simulate_names_the_scene_file_and_the_file_it_cannot_write_into(complai
     damaged = tmp_path / "damaged.stl"
     damaged.write_bytes(b"")
     indenter = f"contact.indenter={{ shape = 'mesh', file = '{damaged}' }}"
-    assert complaint("simulate", "--scene", tiny, "--out", tmp_path / "s", "--set", indenter).startswith(
-        f"{tiny} with --set contact.indenter: contact.indenter.file = '{damaged}': it cannot be read"
-    )
+    words = complaint("simulate", "--scene", tiny, "--out", tmp_path / "s", "--set", indenter)
+    begin = f"{tiny} with --set contact.indenter: contact.indenter.file = '{damaged}': it cannot be read"
+    assert words.startswith(begin)
     assert "cannot be written" in complaint("simulate", "--scene", tiny, "--out", tiny)
 
 
-def test_a_simulation_that_ends_early_is_written_and_has_status_1(capsys, tiny: Path, tmp_path: Path) -> None:
+def test_a_simulation_that_ends_early_is_written_and_has_status_1(said: Run, tiny: Path, tmp_path: Path) -> None:
     # A ring of wire thinner than the contact points are apart passes between them.
     wire = "contact.indenter={shape='torus',radius_mm=1.5,tube_mm=0.1}"
     sets = ["--set", wire, "--set", "motion.depth_mm=2.0", "--set", "motion.shear_mm=[0, 0]"]
-    assert main(["simulate", "--scene", str(tiny), "--out", str(tmp_path / "s"), *sets]) == 1
-    err = capsys.readouterr().err
+    err = said("simulate", "--scene", tiny, "--out", tmp_path / "s", *sets, status=1)
     assert "synth: simulation partial: pressed 2 mm deep, the indenter touches no contact point" in err
     record = json.loads((tmp_path / "s" / "trajectory.json").read_text())
     assert record["status"] == "partial"
@@ -290,7 +284,7 @@ def test_simulate_and_stress_replace_no_others_files(complaint: Run, tiny: Path,
     assert tree(tmp_path) == before
 
 
-def test_inspect_verify_and_export_take_a_dataset_and_changed_files_have_status_1(said: Run, tmp_path: Path) -> None:
+def test_inspect_verify_and_export_take_a_dataset_and_changed_files_have_status_1(said, tmp_path, capsys) -> None:
     data = reference()
     assert "tiny, 0" in said("inspect", data, "--png", tmp_path / "a.png", "--html", tmp_path / "a.html")
     assert (tmp_path / "a.png").stat().st_size > 10_000
@@ -303,10 +297,11 @@ def test_inspect_verify_and_export_take_a_dataset_and_changed_files_have_status_
     shutil.copytree(reference(), copy)
     with (copy / "samples" / "000001" / "flow.exr").open("r+b") as file:
         file.truncate(3000)
-    assert "FAILED" in said("verify", copy, status=1)
+    assert main(["verify", str(copy)]) == 1
+    assert "FAILED" in capsys.readouterr().out
 
 
-def test_doctor_tells_what_there_is_and_how_to_get_what_is_missing(said: Run, monkeypatch) -> None:
+def test_doctor_tells_what_there_is_and_how_to_get_what_is_missing(said: Run, capsys, monkeypatch) -> None:
     findings = {finding["what"]: finding for finding in json.loads(said("doctor", "--json"))}
     assert findings["machine"]["state"] == "ok"
     assert "Mitsuba" in findings["rendering on the CPU"]["detail"]
@@ -319,6 +314,7 @@ def test_doctor_tells_what_there_is_and_how_to_get_what_is_missing(said: Run, mo
 
     monkeypatch.setattr(synth.doctor, "version", nothing)
     monkeypatch.setattr("synth.simulate.linear.has_pardiso", lambda: False)
-    findings = {finding["what"]: finding for finding in json.loads(said("doctor", "--json", status=1))}
+    assert main(["doctor", "--json"]) == 1
+    findings = {finding["what"]: finding for finding in json.loads(capsys.readouterr().out)}
     assert findings["meshing"] == {"what": "meshing", "state": "missing", "detail": "pip install pytetwild"}
     assert "pip install pypardiso" in findings["linear solver"]["detail"]

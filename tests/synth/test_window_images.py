@@ -16,9 +16,8 @@ SEEDS = range(4)
 def _sensor() -> Sensor:
     """Two wide lights, that chance may find them; the second shines mostly up."""
     places = [((7.0, 1.0, 3.5), (0.0, 0.0, 2.5)), ((-1.0, -7.2, 2.0), (0.0, 3.0, 5.0))]
-    lights = tuple(
-        Light(position_mm=at, aim_mm=aim, size_mm=(3.0, 1.5), color=(1, 1, 1), power=300) for at, aim in places
-    )
+    common = {"size_mm": (3.0, 1.5), "color": (1, 1, 1), "power": 300}
+    lights = tuple(Light(position_mm=at, aim_mm=aim, **common) for at, aim in places)
     view = {"width": 16, "height": 16, "fx": 28.0, "fy": 28.0, "cx": 8.0, "cy": 8.0}
     return small_sensor(INDEX, None, lights, **view, position_mm=(0.0, 0.0, 20.0), look_at_mm=(0.0, 0.0, 0.0))
 
