@@ -35,10 +35,7 @@ def test_flows_of_all_scales_for_sizes_of_any_parity(network: GelFlow, size: tup
             assert torch.equal(flows[scale], expected)
 
 
-@pytest.mark.parametrize(
-    "options",
-    [{}, {"estimator": "shared"}, {"lffm": False}, {"levels": 4, "refine": "half"}],
-)
+@pytest.mark.parametrize("options", [{}, {"estimator": "shared"}, {"lffm": False}, {"levels": 4, "refine": "half"}])
 def test_gradients_reach_every_parameter(options: dict) -> None:
     torch.manual_seed(0)
     network = GelFlow(ModelConfig(**options))

@@ -100,9 +100,9 @@ def test_two_processes_end_as_one_with_twice_the_batch(tmp_path: Path, option: s
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         environment = os.environ | {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(free.getsockname()[1])}
-    machines = [subprocess.Popen(both, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-                                 env=environment | {"NODE_RANK": str(rank)})
-                for rank in range(2 if option == "--nodes" else 1)]  # fmt: skip
+    said = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    ranks = ({"NODE_RANK": str(rank)} for rank in range(2 if option == "--nodes" else 1))
+    machines = [subprocess.Popen(both, env=environment | rank, **said) for rank in ranks]
     texts = [machine.communicate(timeout=240) for machine in machines]
     assert [machine.returncode for machine in machines] == [0] * len(machines), texts
     assert sum(printed.count("weights.safetensors") for printed, _ in texts) == 1

@@ -14,15 +14,12 @@ The right side is proportional to δ for a flat punch and to δ - x²/R for a ba
 the strength of the pressure's singularity at the edge, vanishes. Lebedev & Ufliand, PMM 22 (1958); Hayes et al.,
 J. Biomech. 5 (1972). Lengths in any unit; forces in units of E times length squared.
 
-Solved by finite elements on a quarter of a round layer under an axisymmetric indenter, with circles of elements around
-the contact.
-
-Walls of symmetry at x = 0 and y = 0, bonded at z = thickness, free at the rim. The square grid's rings max(x, y) become
-circles, so that few elements resolve a round contact; forces of the whole layer are four times the quarter's.
+Also the layer's finite elements: a quarter with walls of symmetry at x = 0 and y = 0, bonded at z = thickness, free at
+the rim. The square grid's rings become circles, so that few elements resolve a round contact.
 """
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 from pads import indenters, mapped, scene, supported
@@ -98,10 +95,9 @@ def ball_at(contact: float, radius: float, thickness: float, poisson_ratio: floa
 def ball(depth: float, radius: float, thickness: float, poisson_ratio: float = 0.5) -> tuple[float, float]:
     """Contact radius a and force over E of a ball pressed `depth` deep."""
     half_space = np.sqrt(radius * depth)  # a layer widens the contact, to twice that at most
-    contact = brentq(
-        lambda a: ball_at(a, radius, thickness, poisson_ratio)[0] - depth, 0.9 * half_space, 2 * half_space, xtol=1e-12
-    )
-    return float(contact), ball_at(contact, radius, thickness, poisson_ratio)[1]
+    found = partial(ball_at, radius=radius, thickness=thickness, poisson_ratio=poisson_ratio)
+    contact = brentq(lambda a: found(a)[0] - depth, 0.9 * half_space, 2 * half_space, xtol=1e-12)
+    return float(contact), found(contact)[1]
 
 
 TOLERANCE = 1e-7  # Of the relative residual; a thousand times below the discretisation error
@@ -171,14 +167,10 @@ def press(quarter: System, indenter: Indenters, penalties: tuple[float, ...] = (
     return 4 * float(quarter.forces(state)[0][2])
 
 
-def ball_ratio(
-    element: Element, poisson_ratio: float, radius: float, depth: float, cells: int, thickness: float = 1.0
-) -> float:
-    """Force of a ball over the integral equation's: `cells` across the contact, beside it, and through the layer."""
-    contact, force = ball(depth, radius, thickness, poisson_ratio)
+def ball_ratio(element: Element, poisson_ratio: float, radius: float, depth: float, cells: int) -> float:
+    """Force of a ball over the integral equation's: `cells` across the contact, beside it, and through a layer of 1."""
+    contact, force = ball(depth, radius, 1.0, poisson_ratio)
     reach = 1.15 * contact
-    radii = np.concatenate([np.linspace(0, reach, cells + 1), growing(reach, 2.5 * thickness, cells, 1.5)])
-    depths = np.concatenate([[0.0], growing(0.0, thickness, cells, 1.3)])
-    quarter = body(disc(radii, depths), element, poisson_ratio)
-    shape = {"shape": "sphere", "radius_mm": radius}
-    return press(quarter, lowered(shape, depth, thickness)) / force
+    radii = np.concatenate([np.linspace(0, reach, cells + 1), growing(reach, 2.5, cells, 1.5)])
+    quarter = body(disc(radii, np.append(0.0, growing(0.0, 1.0, cells, 1.3))), element, poisson_ratio)
+    return press(quarter, lowered({"shape": "sphere", "radius_mm": radius}, depth, 1.0)) / force

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import tomli_w
 from capsules import capsule, capsule_mesh
 from commands import refused
 from pads import areas, brick, complete, contact_faces, simulate_scenes
@@ -25,7 +26,7 @@ from synth.planning import check_buildable, job_variant
 from synth.scene import Scene
 from synth.scene.gel_file import measured
 from synth.scene.template import load_scene
-from synth.simulate import Trajectory, simulate
+from synth.simulate import Trajectory
 from synth.simulate.element import p2p1
 from synth.simulate.load_path import path_of
 from synth.simulate.mesh_rule import MeshRule
@@ -149,10 +150,9 @@ def test_a_capsule_agrees_with_its_files(folder: Path, motion: dict[str, Any]) -
     np.testing.assert_allclose(frames[1].axes.T @ frames[1].axes, np.eye(3), atol=1e-12)
     assert np.linalg.det(frames[1].axes) == pytest.approx(1)
     assert (frames[1].axes * frames[0].axes).sum(axis=0).min() > np.cos(np.radians(4))  # facets of some 6 degrees
-    forces = [
-        np.array(simulate(scene, own, folder).states[-1].force_n) @ frame.axes
-        for scene, own, frame in zip((built_in, given), (capsule_mesh(built_in.sensor.gel), mesh), frames, strict=True)
-    ]
+    presses = (built_in, capsule_mesh(built_in.sensor.gel)), (given, mesh)
+    ends = (np.array(complete(scene, own, folder).states[-1].force_n) for scene, own in presses)
+    forces = [force @ frame.axes for force, frame in zip(ends, frames, strict=True)]
     # Two random meshes with edges of 1.5 mm, under a contact of 1 mm radius: up to 6.5 % apart.
     np.testing.assert_allclose(forces[1], forces[0], atol=0.1 * forces[0][2])
 
@@ -212,9 +212,9 @@ steps = 2
 
 def scene_file(folder: Path, **gel: Any) -> Path:
     """A scene with the folder's files; fields of its gel that are None are left out."""
-    fields = [f"{key} = {_toml(value)}\n" for key, value in {**FILE, **gel}.items() if value is not None]
+    fields = {key: value for key, value in {**FILE, **gel}.items() if value is not None}
     path = folder / "cad.toml"
-    path.write_text(f"{SCENE}\n[sensor.gel]\n{''.join(fields)}")
+    path.write_text(f"{SCENE}\n{tomli_w.dumps({'sensor': {'gel': fields}}).replace('[sensor]', '')}")
     return path
 
 
@@ -223,21 +223,11 @@ def build(path: Path, *assignments: str) -> None:
     check_buildable(template, job_variant(template, "auto"))
 
 
-def _toml(value: Any) -> str:
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{key} = {_toml(inner)}" for key, inner in value.items()) + " }"
-    return "[" + ", ".join(map(_toml, value)) + "]" if isinstance(value, list) else json.dumps(value)
-
-
 @needs_llvm
 def test_a_dataset_of_files_is_verified_without_them(folder: Path, tmp_path: Path) -> None:
-    files = [folder / name for name in ("outer.stl", "window.stl")]
-    for file in files:
-        (tmp_path / file.name).write_bytes(file.read_bytes())
-    out = tmp_path / "out"
-    assert generate(load_scene(scene_file(tmp_path)), 2, out).made == 2
-    for file in files:
-        (tmp_path / file.name).unlink()
+    copy, out = Path(shutil.copytree(folder, tmp_path / "copy")), tmp_path / "out"
+    assert generate(load_scene(scene_file(copy)), 2, out).made == 2
+    shutil.rmtree(copy)
     report = verify_dataset(out)
     assert report.ok, report
 

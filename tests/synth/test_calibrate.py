@@ -55,9 +55,8 @@ def _truth(start: Sensor) -> Sensor:
     lights = []
     for light, power in zip(start.lights, POWERS, strict=True):
         shift = 0.3 * rng.standard_normal(3)
-        place = {"position_mm": np.add(light.position_mm, shift), "aim_mm": np.add(light.aim_mm, shift)}
-        shine = {"power": float(power.max()), "color": tuple(power / power.max())}
-        lights.append(light.model_copy(update={key: tuple(value) for key, value in place.items()} | shine))
+        place = {key: tuple(np.add(getattr(light, key), shift)) for key in ("position_mm", "aim_mm")}
+        lights.append(light.model_copy(update=place | {"power": power.max(), "color": tuple(power / power.max())}))
     grid = {"spacing_mm": (1.55, 1.62), "rotation_deg": 2.0, "offset_mm": (0.33, -0.2), "radius_mm": 0.3}
     pattern = start.pattern.model_copy(update=grid | {"reflectance": (0.1, 0.08, 0.05)})
     lens = {"vignetting": 0.35, "blur_px": 0.8, "distortion": (0.04, 0.0, 0.0, 0.0, 0.0)}
@@ -67,11 +66,9 @@ def _truth(start: Sensor) -> Sensor:
 
 def _frame(sensor: Sensor) -> FloatArray:
     """The undeformed gel's picture as an 8-bit camera gives it, in [0, 1]."""
-    surface = flat_surface(sensor.gel.size_mm)
-    texture = albedo(sensor, np.random.default_rng(0))
+    surface, texture = flat_surface(sensor.gel.size_mm), albedo(sensor, np.random.default_rng(0))
     renderer = Renderer(sensor, Render(samples_per_pixel=144, max_depth=2), surface, texture, FAST)
-    radiance = renderer.radiance(surface.material, 1)
-    return camera_image(radiance, sensor.camera, np.random.default_rng(5)) / 255
+    return camera_image(renderer.radiance(surface.material, 1), sensor.camera, np.random.default_rng(5)) / 255
 
 
 def _fit(truth: Sensor, spacing_mm: float | None, steps: int) -> SensorFit:
@@ -185,12 +182,9 @@ def test_derivatives_agree_with_finite_differences(index: float) -> None:
     step = 0.02
     parts = (("centre", 3), ("direction", 3), ("size", 2), ("viewing_angle_deg", 1))
     for number, (name, axis) in enumerate((name, axis) for name, count in parts for axis in range(count)):
-        lit = []
-        for sign in (1, -1):
-            moved = getattr(geometry, name).copy()
-            moved[:, axis] += sign * step
-            lit.append(gel.contributions(replace(geometry, **{name: moved})))
-        difference = (lit[0] - lit[1]) / (2 * step)
+        moves = (sign * step * np.eye(getattr(geometry, name).shape[1])[axis] for sign in (1, -1))
+        more, less = (gel.contributions(replace(geometry, **{name: getattr(geometry, name) + m})) for m in moves)
+        difference = (more - less) / (2 * step)
         # Central differences err by step² / 6 times a third derivative of order E / (3 mm)³: 2e-5; float32 less.
         error = np.abs(exact[:, number] - difference) / np.abs(exact).max()
         # A window's reflectance rises with infinite slope at the critical angle, in one or two of a light's 24 cells.
@@ -241,13 +235,10 @@ def test_frames_that_do_not_belong_together_are_refused(tmp_path: Path) -> None:
     for name, image in {"a": dark, "b": bright, "c": np.zeros((20, 40, 3))}.items():
         cv2.imwrite(str(tmp_path / f"{name}.png"), image.astype(np.uint8))
     (tmp_path / "text.png").write_text("no image")
-    for names, message in [
-        (["a", "b"], r"b\.png: differs from .*a\.png by .* of 255"),
-        (["a", "c"], r"c\.png: has 40 x 20 pixels"),
-        (["text"], r"text\.png: is no image"),
-        (["missing"], r"missing\.png: there is no such file"),
-        ([], "no frames"),
-    ]:
+    for names, message in (
+        ("ab", r"b\.png: differs from .*a\.png by .* of 255"), ("ac", r"c\.png: has 40 x 20 pixels"),
+        (["text"], r"text\.png: is no image"), (["missing"], r"missing\.png: there is no such file"), ([], "no frames"),
+    ):  # fmt: skip
         refused(message, read_frames, [tmp_path / f"{name}.png" for name in names])
 
 
@@ -320,8 +311,8 @@ def test_a_preset_that_calibration_does_not_know_is_refused(refusal: Callable, p
 
 
 def test_noise_is_measured_through_the_response() -> None:
-    camera = Camera(width=320, height=240, fx=1, fy=1, cx=0, cy=0, position_mm=(0, 0, 1), gamma=2.2, read_noise=0.002,
-                    shot_noise=0.012)  # fmt: skip
+    noise = {"gamma": 2.2, "read_noise": 0.002, "shot_noise": 0.012}
+    camera = Camera(width=320, height=240, fx=1, fy=1, cx=0, cy=0, position_mm=(0, 0, 1), **noise)
     ramp = np.linspace(0.02, 0.6, 320, dtype=np.float32)[None, :, None] * np.ones((240, 1, 3), dtype=np.float32)
     image = camera_image(ramp, camera, np.random.default_rng(0)) / 255
     read, shot = fit_noise(image, np.ones((240, 320), dtype=bool), 2.2, 1 / 255)

@@ -1,9 +1,7 @@
-r"""Capsules in the simulation: a thick shell against its closed form, rigid motion, presses at places that are alike.
+"""Capsules in the simulation: a thick shell against its closed form, presses at places that are alike.
 
-An incompressible hemispherical shell whose inner face moves outward by a uniform amount moves radially, r³ = R³ + c,
-whatever its material; for a neo-Hookean one the pressure on that face is (Green & Zerna, Theoretical Elasticity, 1968)
-
-.. math::  P = 2 μ \int_{r_i}^{r_o} (λ² - λ^{-4}) \frac{dr}{r}, \qquad λ = r / R
+An incompressible hemispherical shell whose inner face moves outward by a uniform amount moves radially, r³ = R³ + c;
+the pressure on that face is P = 2 μ ∫ (λ² - λ⁻⁴) dr / r with λ = r / R (Green & Zerna, Theoretical Elasticity, 1968).
 """
 
 from dataclasses import replace

@@ -49,13 +49,11 @@ def _renderer(sensor: Sensor, texture: Image | None = None, samples: int = 16) -
 @functools.cache
 def _variances(sensor: Sensor) -> FloatArray:
     """Second central moments (seeds, 2) px² along x and y of the one dot in a sensor's frames."""
-    frames = _removed(sensor)
-    total = frames.sum((1, 2))
-    moments = []
-    for places in (COLUMNS, ROWS):
-        mean = (frames * places).sum((1, 2)) / total
-        moments.append((frames * (places - mean[:, None, None]) ** 2).sum((1, 2)) / total)
-    return np.column_stack(moments)
+    weights = _removed(sensor)
+    weights /= weights.sum((1, 2), keepdims=True)
+    means = [(weights * places).sum((1, 2), keepdims=True) for places in (COLUMNS, ROWS)]
+    spread = zip((COLUMNS, ROWS), means, strict=True)
+    return np.column_stack([(weights * (places - mean) ** 2).sum((1, 2)) for places, mean in spread])
 
 
 def _added_variance(sensor: Sensor) -> tuple[FloatArray, FloatArray]:
@@ -125,20 +123,13 @@ def _slopes(camera: Camera, index: float, target: FloatArray, radius: float) -> 
     return pupil, np.array(seen)
 
 
-def _point_of_the_axis(camera: Camera, index: float, focus: float) -> FloatArray:
-    """Where the axis, bent by Snell's law, is after the focus distance."""
-    eye, ray = _axis(camera)
-    before = (eye[2] - FACE) / -ray[2]
-    bent = np.array([ray[0] / index, ray[1] / index, 0.0])
-    bent[2] = -np.sqrt(1 - bent @ bent)
-    return eye + before * ray + (focus - before) * bent
-
-
 @pytest.mark.parametrize("index", [1.0, 1.45])
 def test_an_oblique_axis_is_in_focus_where_its_rays_spread_least(index: float) -> None:
-    """Least squares of t = t0 - p / s over the pupil p."""
+    """Least squares of t = t0 - p / s over the pupil p, from where the axis, bent by Snell's law, is in focus."""
     sensor = small_sensor(index, aperture_mm=0.2, focus_mm=22.0, **OBLIQUE)
-    target = _point_of_the_axis(sensor.camera, index, 22.0)
+    eye, ray = _axis(sensor.camera)
+    before, (x, y) = (eye[2] - FACE) / -ray[2], ray[:2] / index
+    target = eye + before * ray + (22.0 - before) * np.array([x, y, -np.sqrt(1 - x**2 - y**2)])
     pupil, slopes = _slopes(sensor.camera, index, target, 0.1)
     best = -(pupil**2).sum() / (pupil * (slopes - slopes.mean(0))).sum()
     assert ThinLens.of(sensor).distance_mm == pytest.approx(best, rel=1e-4)  # paraxial: (0.1 / 20)² = 3e-5
@@ -237,15 +228,18 @@ def test_a_dataset_with_an_aperture_passes_verify(tiny: Path, tmp_path: Path) ->
     assert report.ok, report.record()
 
 
-def test_impossible_lenses_are_named() -> None:
-    for change, message in (
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
         ({}, "needs focus_mm"),
         ({"focus_mm": 1.5}, "wider than focus_mm"),
         ({"focus_mm": 20.0, "lens": "fisheye", "distortion": (0, 0, 0, 0)}, "fisheye lens has no flat plane"),
         ({"focus_mm": 20.0, "position_mm": (9.0, 0.0, 6.5), "look_at_mm": (0, 0, 0)}, "tilted pupil reaches down"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            small_sensor(1.45, aperture_mm=APERTURE, **change)
+    ],
+)
+def test_impossible_lenses_are_named(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        small_sensor(1.45, aperture_mm=APERTURE, **change)
 
 
 def test_an_axis_that_does_not_reach_the_window_and_scalar_variants_are_refused() -> None:

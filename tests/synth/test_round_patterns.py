@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from commands import refused
 from pydantic import ValidationError
 from render_scenes import FAST, SCALAR, needs_llvm
 from round_gels import ASKEW, CAPSULE, LENGTH, RADIUS, capsule, on_capsule, sensor
 from scipy.ndimage import map_coordinates
 
-from synth.errors import InputError
 from synth.flow.trace import trace
 from synth.optics import Optics
 from synth.render.chart import RoundChart, chart_of
@@ -109,5 +109,5 @@ def test_textures_are_fine_enough_for_the_nearest_part_of_the_face() -> None:
 
 def test_scalar_variants_refuse_round_windows() -> None:
     seen = sensor(CAPSULE, lens="pinhole", distortion=(0.0,) * 5, fx=60.0, fy=60.0)
-    with pytest.raises(InputError, match=r"sensor\.window\.shape = 'capsule' needs LLVM"):
-        Renderer(seen, Render(samples_per_pixel=1), SURFACE, np.full((4, 4, 3), 0.5, np.float32), SCALAR)
+    given = (Render(samples_per_pixel=1), SURFACE, np.full((4, 4, 3), 0.5, np.float32), SCALAR)
+    refused(r"sensor\.window\.shape = 'capsule' needs LLVM", Renderer, seen, *given)

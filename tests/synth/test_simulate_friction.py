@@ -167,28 +167,19 @@ FRICTION, RADIUS, CONTACT, FAR = 0.5, 20.0, 1.0, 12.0
 
 
 def test_partial_slip_is_mindlins() -> None:
-    r"""A ball on a thick pad against Cattaneo and Mindlin: friction, sticking and slip with a closed form.
+    """A ball on a thick pad against Cattaneo and Mindlin (Johnson, Contact Mechanics, 1985, eqs. 7.41 to 7.43).
 
-    An incompressible half space and a rigid body have no elastic mismatch (Dundurs' β = 0), so that normal and
-    tangential contact do not influence each other. A ball that presses with P and is then moved aside by x feels
-
-    .. math::  Q = μP (1 - (1 - x/x_s)^{3/2}), \qquad x_s = \frac{3 μ P}{16 a} \frac{2 - ν}{G},
-
-    and sticks within c = a (1 - x/x_s)^{1/2}, so that x/x_s is the slipping share of the contact; beyond x_s all slips
-    (Johnson, Contact Mechanics, 1985, eqs. 7.41 to 7.43).
+    A ball that presses an incompressible half space with P and is then moved aside by x feels
+    Q = μP (1 - (1 - x/s)^1.5) with s = 3 μ P (2 - ν) / 16 a G, and x/s is the slipping share of the contact.
     """
     depth = CONTACT**2 / RADIUS
     radii = np.concatenate([np.linspace(0, 1.15 * CONTACT, 4), growing(1.15 * CONTACT, FAR, 3, 2.0)])
     mesh = disc(radii, np.concatenate([[0.0], growing(0.0, FAR, 4, 2.2)]), half=True)
     hertz = 16 / 9 * np.sqrt(RADIUS) * depth**1.5
     all_slips = 3 * FRICTION * hertz / (16 * CONTACT) * 4.5
-    posed = scene(
-        (30.0, 30.0, FAR),
-        indenter={"shape": "sphere", "radius_mm": RADIUS},
-        friction=FRICTION,
-        motion={"depth_mm": depth, "shear_mm": [1.3 * all_slips, 0.0], "steps": 6},
-        numerics={"max_step_mm": depth / 2},
-    )
+    ball, numerics = {"shape": "sphere", "radius_mm": RADIUS}, {"max_step_mm": depth / 2}
+    motion = {"depth_mm": depth, "shear_mm": [1.3 * all_slips, 0.0], "steps": 6}
+    posed = scene((30.0, 30.0, FAR), indenter=ball, friction=FRICTION, motion=motion, numerics=numerics)
     space = supported(mesh, p2p1(), partial(walls_and_window, half=True))
     body = System(space, uniform(len(mesh.tets), 0.5))
     path = LoadPath(posed.motion, rigid_body(posed.contact.indenter))
