@@ -75,7 +75,6 @@ NUMBER = r"(\d+\.\d+)"
 
 
 def run(name: str, *arguments: object) -> str:
-    """What an example prints; it finds the packages of this checkout."""
     environment = os.environ | {"PYTHONPATH": str(EXAMPLES.parent)}
     command = [sys.executable, str(EXAMPLES / name), *map(str, arguments)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
@@ -84,7 +83,6 @@ def run(name: str, *arguments: object) -> str:
 
 
 def found(pattern: str, text: str) -> list[float]:
-    """The numbers of a line that must be there."""
     match = re.search(pattern, text)
     assert match, text
     return [float(group) for group in match.groups()]
@@ -92,7 +90,6 @@ def found(pattern: str, text: str) -> list[float]:
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two pairs that the first example makes."""
     out = tmp_path_factory.mktemp("examples") / "ten"
     printed = run("make_pairs.py", "--n", 2, "--out", out)
     assert found(rf"largest motion {NUMBER} px", printed)[0] > 1

@@ -37,7 +37,6 @@ SCALES = 7
 
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Tensor, Tensor, Tensor]:
-    """True flow and both images, in batches of one."""
     folder: Path = tmp_path_factory.mktemp("toy")
     (folder / "toy.toml").write_text(SCENE)
     generate(load_scene(folder / "toy.toml"), 1, folder / "data")

@@ -110,7 +110,6 @@ def test_presses_are_what_they_are_said_to_be(limits: tuple[float, float]) -> No
 
 
 def test_errors_fall_with_the_elements(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And are none on the mesh of the reference."""
     coarse, finer = (surface_error({**CASE, "cells": cells}) for cells in ("6x4x1", "8x6x2"))
     assert coarse["surface_error_percent"] > finer["surface_error_percent"] > 0
     monkeypatch.setattr(batched, "mesh_of", lambda case: reference_mesh(nth_ball(0, PRESS), 2))

@@ -68,8 +68,7 @@ def test_what_slides_out_of_the_picture_does_not_count(name: str) -> None:
     scale, zero = scale_px_per_mm(scene), np.zeros((3, len(places(scene)), 3))
     moved = zero + np.array([(0.3, 0.0, 0.0), (0.0, -0.3, 0.0), (0.0, 6.0, 0.0)])[:, None]
     found, shares = picture_errors(moved, zero, scene)
-    # Two mirrors at 45 degrees to the view fold it without changing its magnification; drawn tilts of some 0.01 rad
-    # do, by the square root of that squared.
+    # Mirrors at 45 degrees fold the view without magnifying it; drawn tilts of some 0.01 rad do, by their square.
     np.testing.assert_allclose(found[:2], 0.3 * scale, rtol=5e-3)
     # 0.3 mm are 3 % of the half of a picture that is 10 mm wide; 6 mm are most of its height, so that too few are left.
     assert (shares[:2] > 0.9).all()
@@ -92,8 +91,7 @@ def test_reference_is_finer_every_way_also_through_the_thickness(index: int) -> 
     assert len(planes) > len(theirs)
     assert planes[1] < 1.01 * fine
     heights = np.diff(planes)
-    # With one element more than a growth of 2.2 asks for, 1 + q + ... + q^n = 1 + ... + 2.2^(n - 1): q < 1.8 from
-    # three elements on.
+    # One element more than growth 2.2 asks for: 1 + ... + q^n = 1 + ... + 2.2^(n - 1), q < 1.8 from three on.
     assert (heights[1:] / heights[:-1]).max() < 1.8
 
 

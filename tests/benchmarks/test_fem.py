@@ -26,7 +26,6 @@ def shallow() -> Trajectory:
 
 @pytest.fixture
 def one_case(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The shallow press as a case of the benchmark, of which the last state counts."""
     monkeypatch.setitem(fem.CASES, "shallow", SHALLOW)
     monkeypatch.setitem(fem.COUNTED, "shallow", [1])
 

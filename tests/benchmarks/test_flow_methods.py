@@ -96,7 +96,6 @@ CAMERA = small_sensor(read_noise=0.0, shot_noise=0.0, gamma=1.0).camera
 
 
 def images(count: int, deviation: float, offset: float = 0.0, seed: int = 0) -> list[Image]:
-    """Images of 0.25 with independent Gaussian noise in every value."""
     noise = deviation * np.random.default_rng(seed).standard_normal((count, 60, 80, 3))
     return list((0.25 + offset + noise).astype(np.float32))
 

@@ -62,7 +62,6 @@ def test_a_case_may_have_several_rows_whose_values_come_back(tmp_path: Path) -> 
 
 
 def test_a_killed_run_leaves_whole_rows(tmp_path: Path) -> None:
-    """Killed while the file is being written: no half row is taken for a case."""
     path = tmp_path / "rows.csv"
     program = f"""
 import os, signal

@@ -14,8 +14,7 @@ from benchmarks.render import DEEPEST, settings
 from benchmarks.rows import Row, read
 from benchmarks.scale import at_size, rates
 
-NOISY = TEXT.replace("read_noise = 0.002", "read_noise = 0.1")
-"""A camera so noisy that "auto" needs few samples."""
+NOISY = TEXT.replace("read_noise = 0.002", "read_noise = 0.1")  # A camera so noisy that "auto" needs few samples
 
 
 @pytest.fixture(autouse=True)
@@ -127,7 +126,6 @@ def test_round_gel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_scale(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """No touch: no solve, all else real."""
     command = ["scale", "--scene", str(write_tiny(tmp_path)), "--n", "4", "--size", "32x24", "--workers", "1"]
     ((alone, row),) = again([*command, "--set", "motion.depth_mm=-1.0"], tmp_path / "out", "scale.csv")
     assert (alone["workers"], alone["pairs"], row["workers"], row["pairs"]) == (0, 8, 1, 8)

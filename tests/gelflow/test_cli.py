@@ -133,7 +133,6 @@ class Evil:
 
 @pytest.fixture(scope="module")
 def networks(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Weights of GelFlow and of RAFT, as they are at the start of a training."""
     folder = tmp_path_factory.mktemp("networks")
     torch.save(RAFT(large=False, iterations=1).state_dict(), folder / "raft.pth")
     model = ModelConfig(levels=4, projected_channels=8)
@@ -141,7 +140,6 @@ def networks(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 def damaged(kind: str, good: Path, path: Path, trace: Path) -> None:
-    """Writes a broken copy of a file of weights."""
     contents = {"truncated": good.read_bytes()[: good.stat().st_size // 2], "empty": b"", "text": b"no weights\n",
                 "code": pickle.dumps(Evil(trace))}  # fmt: skip
     if kind in contents:

@@ -25,8 +25,6 @@ from gelflow.data import PairDataset, open_all
 
 @dataclass(frozen=True)
 class Constant:
-    """Test double: the same flow everywhere."""
-
     name: str
     u: float
     v: float
@@ -183,8 +181,6 @@ def test_every_nth_pair_of_several_folders(tmp_path: Path, capsys: pytest.Captur
 
 @dataclass(frozen=True)
 class Working:
-    """Test double: waits, or keeps a processor busy, for as long."""
-
     busy: bool
     name: str = "working"
 
@@ -200,8 +196,7 @@ class Working:
 def test_processor_time_is_that_of_the_work(tmp_path: Path) -> None:
     dataset = PairDataset(write_folder(tmp_path, {"a": (1, 0)}))
     waiting, busy = (score_pair(Working(kind), dataset, 0) for kind in (False, True))
-    # Clocks tick at least every 10 ms.
-    assert waiting.seconds >= 0.1
+    assert waiting.seconds >= 0.1  # Clocks tick at least every 10 ms
     assert waiting.processor_seconds < 0.05
     assert 0.1 <= busy.processor_seconds < 0.15
     assert "core" in busy.device

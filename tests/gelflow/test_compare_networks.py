@@ -38,7 +38,6 @@ from gelflow.train.test_time import fine_tuned, fine_tuning_settings
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A GelFlow network after one step."""
     config = small(steps=1, batch_size=1, learning_rate=1e-4)
     return train(config, Shifts(1, 64, 1.0, seed=1), None, tmp_path_factory.mktemp("run")).weights
 
@@ -163,7 +162,6 @@ def test_of_the_training_a_constant_rate_and_the_size_of_use_carry_over(tmp_path
 
 
 def test_fine_tuning_does_not_look_at_exact_flow_and_needs_one_size(tmp_path: Path) -> None:
-    """The same images with and without their exact flow."""
     shifts = [(1.5, 0.5), (-1.0, 0.0)]
     plain = PairDataset(write_folder(tmp_path / "plain", {"a": shifts[0], "b": shifts[1]}))
     exact = PairDataset(write_synthetic(tmp_path / "exact", shifts))
@@ -191,13 +189,11 @@ def tensor(array: np.ndarray) -> torch.Tensor:
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Weights without a registration."""
     return random_weights(tmp_path_factory.mktemp("plain") / "w.safetensors", SMALL, small(model=SMALL))
 
 
 @pytest.fixture(scope="module")
 def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Weights with a registration of their own."""
     model = SMALL.model_copy(update={"registration": OWN})
     return random_weights(tmp_path_factory.mktemp("own") / "w.safetensors", model, small(model=model))
 

@@ -168,8 +168,7 @@ def test_plain_folders_may_have_markers_and_what_is_no_data_set_is_named(tmp_pat
     # Files of some programs begin with a byte-order mark.
     (folder / "a_markers.csv").write_text("x1,y1,x2,y2\n1,2,3,4\n5,6,7,8.5\n", encoding="utf-8-sig")
     dataset = PairDataset(folder)
-    assert dataset.names == ["a", "b"]
-    assert dataset.markers(0).tolist() == [[1, 2, 3, 4], [5, 6, 7, 8.5]]
+    assert (dataset.names, dataset.markers(0).tolist()) == (["a", "b"], [[1, 2, 3, 4], [5, 6, 7, 8.5]])
     assert dataset.markers(1) is dataset.truth(0) is None
     (folder / "a_1.png").unlink()
     refused(r"a_1\.png", PairDataset, folder)

@@ -37,8 +37,7 @@ def test_chosen_motion_is_the_true_one_and_the_same_whether_the_recording_is_alo
     assert {pair.source for pair in result.pairs} == {"a", "b"}
     for pair in result.pairs:
         first, second = (SHIFTS[pair.source][k] for k in pair.frames)
-        # A rigid shift; the cheap flow errs by up to 0.25 px (see test_baselines), and by more at the border, which the
-        # 95th percentile sees: 0.5 px.
+        # A rigid shift; the cheap flow errs by up to 0.25 px (test_baselines), at the border by more: 0.5 px.
         assert pair.motion_px == pytest.approx(abs(second - first), abs=0.5)
         assert 2 <= pair.motion_px <= 7
     both = extract_pairs([str(videos)], tmp_path / "both", ChoiceConfig(per_source=3))

@@ -38,7 +38,6 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 @pytest.fixture
 def shard(both: tuple[Path, Path], tmp_path: Path) -> Path:
-    """A copy of the first shard, to be damaged."""
     return Path(shutil.copy(both[1] / "shard-000000.tar", tmp_path))
 
 

@@ -33,8 +33,7 @@ def test_structural_similarity_follows_its_definition_and_equal_images_cost_noth
         assert abs(structural_similarity(first, second)[0, 0, row, column] - expected) < 1e-11
     image = torch.rand(1, 3, 12, 15, dtype=torch.float64)
     loss = photometric_loss(image, image, torch.zeros(1, 2, 12, 15, dtype=torch.float64))
-    # warping errs by 1e-14; SSIM is 1 up to 1e-14 / C2
-    assert 0 <= loss + 1e-11 < 2e-11
+    assert 0 <= loss + 1e-11 < 2e-11  # warping errs by 1e-14; SSIM is 1 up to 1e-14 / C2
     image1, image2 = torch.rand(2, 1, 3, 1, 1, dtype=torch.float64)
     loss = photometric_loss(image1, image2, torch.zeros(1, 2, 1, 1, dtype=torch.float64), alpha=0)
     assert abs(loss - (image1 - image2).abs().mean()) < 1e-15
@@ -71,8 +70,7 @@ def test_decomposition_separates_stretch_shear_and_rotation_and_affine_flows_cos
     # 100 times differences of numbers up to 5, in double precision
     assert loss.item() == pytest.approx(parts[0] + 10 * parts[1] + 100 * parts[2], abs=1e-11)
     assert (first_order_loss(flow, torch.rand(1, 3, 10, 12, dtype=torch.float64)) == 0) == (not any(parts))
-    # rounding: numbers up to 5 give slopes good to 1e-15
-    assert deformation_loss(flow, ONES) < 1e-13
+    assert deformation_loss(flow, ONES) < 1e-13  # rounding: numbers up to 5 give slopes good to 1e-15
 
 
 def test_area_ratios_of_a_stretch_and_of_a_rotation_and_the_cost_of_a_growing_stretch() -> None:
@@ -191,8 +189,7 @@ def test_parts_add_up_scales_are_weighted_and_a_mask_removes_pixels() -> None:
     def total(*weights: float, smoothness: str = "helmholtz") -> Tensor:
         loss, parts = self_supervised_loss(flows, *images, LossConfig(lambda_s=weights, smoothness=smoothness))
         assert bool(parts["deformation"]) == (smoothness == "helmholtz")  # SelfFlow has none
-        # a sum of three numbers of size one
-        assert abs(sum(parts.values()) - loss) < 1e-14
+        assert abs(sum(parts.values()) - loss) < 1e-14  # a sum of three numbers of size one
         return loss
 
     separate = 2 * total(1, 0, 0) + total(0, 1, 0) + 0.5 * total(0, 0, 1)
@@ -212,8 +209,7 @@ def test_parts_add_up_scales_are_weighted_and_a_mask_removes_pixels() -> None:
 def test_losses_of_known_flow_grow_with_the_error_and_ignore_what_is_unknown() -> None:
     truth = torch.zeros(1, 2, 4, 5, dtype=torch.float64)
     flow = truth + torch.tensor([3.0, 4.0]).view(1, 2, 1, 1)
-    # sqrt(25 + e^2) - e is 5 - e + e^2 / 10
-    expected = pytest.approx(5 - SOFTNESS_PX, abs=2e-5)
+    expected = pytest.approx(5 - SOFTNESS_PX, abs=2e-5)  # sqrt(25 + e^2) - e is 5 - e + e^2 / 10
     assert endpoint_loss(flow, truth).item() == expected
     assert endpoint_loss(truth, truth) == 0
     truth[:, 0, 2:], flow[:, :, 2:] = torch.nan, 1000
@@ -288,8 +284,7 @@ def test_the_transformed_pair_moves_as_its_flow_says_and_follows_the_generator()
         def error(field: Tensor, mask: Tensor = mask, first: Tensor = first, second: Tensor = second) -> float:
             return (((warp(second, field) - first).abs()) * mask).sum().item() / mask.sum().item()
 
-        # Both images carry noise of 0.02: a mean difference of 0.02 * sqrt(2) * sqrt(2/pi) = 0.0226 per colour, three
-        # of them; interpolation adds less than a tenth.
+        # Noise of 0.02 in both: 0.02 * sqrt(2) * sqrt(2/pi) = 0.0226 in each of three colours; interpolation: a tenth.
         assert error(turned) < 1.1 * 3 * 0.0226
         assert error(turned) < min(error(0.8 * turned), error(1.2 * turned), error(flow.to(turned)))
         assert consistency_loss(turned, turned, pixels) == pytest.approx(0.01**0.4)

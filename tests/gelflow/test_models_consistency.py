@@ -32,7 +32,6 @@ def lost(flow: Flow) -> Flow:
 
 
 def error(flow: Flow, truth: Flow) -> Tensor:
-    """Mean endpoint error in the patch, px."""
     return (flow - truth)[PATCH].norm(dim=1).mean()
 
 
@@ -50,8 +49,7 @@ def test_a_lost_patch_is_taken_from_the_flow_back() -> None:
     found = consistent(lost(there), image1, image2, lambda *_: back, RegistrationConfig())
     assert error(lost(there), there) > 19
     assert error(found, there) < 0.1
-    # Of a batch only the pair that is torn is examined.
-    calls: list[Images] = []
+    calls: list[Images] = []  # Of a batch only the pair that is torn is examined
 
     def estimate(first: Images, second: Images) -> Flow:
         calls.append(first)

@@ -129,8 +129,7 @@ def test_the_lookup_orders_displacements_column_by_column_and_enlarging_multipli
     position = torch.tensor([column + 0.0, row + 2.0], dtype=torch.float64).view(1, 2, 1, 1).expand(1, 2, 16, 24)
     found = lookup(pyramid, position, radius=1)[0, :, row, column].view(4, 3, 3)  # level, across, down
     at_pixel = product[0, row, column]
-    # exact reads at integers: double precision
-    fine = at_pixel[row + 1 : row + 4, column - 1 : column + 2].T
+    fine = at_pixel[row + 1 : row + 4, column - 1 : column + 2].T  # exact reads at integers: double precision
     torch.testing.assert_close(found[0], fine, rtol=0, atol=1e-12)
     # level 1: index 8 is read at 4, index 8 (row) at 4; each value is the mean of a 2x2 block
     blocks = torch.nn.functional.avg_pool2d(at_pixel[None], 2)[0, 3:6, 3:6].T

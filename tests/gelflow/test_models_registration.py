@@ -33,13 +33,11 @@ def pair(size: float = 1.0) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def shade(column: float, row: float, radius: float) -> Tensor:
-    """(H, W): a Gaussian of height one, px."""
     x, y = grid(HEIGHT, WIDTH)
     return torch.from_numpy(np.exp(-((x - column) ** 2 + (y - row) ** 2) / (2 * radius**2))).float()
 
 
 def error(flow: Tensor, truth: Tensor) -> float:
-    """Mean endpoint error, px."""
     return (flow - truth).norm(dim=1).mean().item()
 
 
@@ -89,8 +87,7 @@ def test_shading_is_ignored_unless_asked_for_and_equal_brightness_elsewhere_does
     image1, image2, truth = pair()
     lit = 0.7 * image2 + 0.15 * shade(60, 50, 15)
     motion, brightness = (error(registered(truth, 0.7 * image1, lit, aim), truth) for aim in (MOTION, BRIGHTNESS))
-    # Under the background's 4 px a shade of 15 px keeps (4 / 15)² = 7 % of its curvature.
-    assert motion < 0.1
+    assert motion < 0.1  # Under the background's 4 px a shade of 15 px keeps (4 / 15)² = 7 % of its curvature
     assert brightness > 4 * motion
     # On a bare gel, a shade of 12 px that darkens where it is.
     bare, still = 0.1 * shade(54, 50, 12).expand(1, 3, -1, -1), torch.zeros_like(truth)
@@ -186,7 +183,6 @@ def test_between_grey_images_noise_moves_nothing(ignore_shading: bool) -> None:
 
 
 def test_without_a_match_flows_stay() -> None:
-    """Images that have nothing to do with each other."""
     image1, _, _ = moved_texture()
     other = torch.rand(image1.shape, generator=torch.Generator().manual_seed(0))
     flow = torch.zeros((1, 2, HEIGHT, WIDTH))

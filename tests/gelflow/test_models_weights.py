@@ -42,8 +42,7 @@ def test_weights_and_architecture_come_back_and_both_forms_of_the_correlation_ag
     images = torch.rand(2, 1, 3, 64, 64).unbind()
     with torch.no_grad():
         assert torch.equal(network(*images)[0], loaded(*images)[0])
-    # The exported graph holds another form.
-    first, second = torch.rand(2, 2, 5, 7, 9, dtype=torch.float64)
+    first, second = torch.rand(2, 2, 5, 7, 9, dtype=torch.float64)  # The exported graph holds another form
     torch.testing.assert_close(local_correlation(first, second, 3), _unfolded(first, second, 3), rtol=0, atol=1e-14)
 
 

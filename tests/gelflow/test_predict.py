@@ -27,7 +27,6 @@ FARNEBACK = named_methods(["farneback"])[0]
 
 
 def video(path: Path, frames: int) -> Path:
-    """Frames of 48 x 64 px, each 1 px further to the right."""
     write_video(path, [as_bytes(moved(48, 64, shift, 0)) for shift in range(frames)])
     return path
 

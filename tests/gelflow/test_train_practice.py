@@ -82,7 +82,6 @@ def test_bfloat16_keeps_float32_weights_and_speed_and_memory_are_reported(pairs:
 
 
 def command(tmp_path: Path, data: Path, settings: str, *options: str) -> list[str]:
-    """Trains a small network on a CPU into `tmp_path / "run"`."""
     path = tmp_path / "settings.toml"
     path.write_text(f"{settings}\nmodel = {{levels = 4, projected_channels = 8}}\nloss.lambda_s = [1.0, 1.0, 1.0]\n")
     return [sys.executable, "-m", "gelflow", "train", str(data), "--out", str(tmp_path / "run"), "--device", "cpu",

@@ -156,8 +156,7 @@ def test_the_folder_of_a_run_holds_logs_weights_and_settings(pairs: Shifts, tmp_
     assert metadata["step"] == ("20" if last < first else "10")
     assert json.loads(metadata["train"])["learning_rate"] == 1e-3
     assert "endpoint error" in str(result)
-    # the kept weights are those that were validated
-    network = load_weights(result.weights)
+    network = load_weights(result.weights)  # the kept weights are those that were validated
     flows = [estimate_flow(network, pair["image1"][None], pair["image2"][None])[0] for pair in pairs.samples]
     off = [(flow - pair["flow"]).norm(dim=0).mean() for flow, pair in zip(flows, pairs.samples, strict=True)]
     assert np.mean(off) == pytest.approx(result.best, rel=1e-4)

@@ -13,7 +13,6 @@ from gelflow.models.weights import load_weights, save_weights
 
 
 def pixel_centres(height: int, width: int) -> tuple[Tensor, Tensor]:
-    """Columns x and rows y in px, both (H, W) float64."""
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     return x.double(), y.double()
 

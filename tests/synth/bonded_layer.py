@@ -52,7 +52,7 @@ def gauss(count: int) -> tuple[FloatArray, FloatArray]:
     return nodes, weights
 
 
-def wave_numbers() -> tuple[FloatArray, FloatArray]:
+def waves() -> tuple[FloatArray, FloatArray]:
     """(WAVES,) points and weights for integrals over x = ξh from 0 to the cutoff."""
     nodes, weights = gauss(WAVES)
     return CUTOFF / 2 * (nodes + 1), CUTOFF / 2 * weights
@@ -69,7 +69,7 @@ def respond(
     """Forces (k,) and strengths φ(a) (k,) over E for right sides (n, k) of places x (n,), by Nyström's method."""
     nodes, weights = gauss(points)
     t, dt = contact / 2 * (nodes + 1), contact / 2 * weights
-    wave, d_wave = wave_numbers()
+    wave, d_wave = waves()
     defect = 2 / (np.pi * thickness) * d_wave * (1 - compliance(wave, poisson_ratio))
     x = np.append(t, contact)
     cosines = np.cos(np.outer(x, wave / thickness))
@@ -79,7 +79,7 @@ def respond(
     return 2 * np.pi * dt @ phi, given[-1] + kernel[-1] @ phi
 
 
-def punch_factor(radius: float, thickness: float, poisson_ratio: float = 0.5) -> float:
+def kappa(radius: float, thickness: float, poisson_ratio: float = 0.5) -> float:
     """κ: the force of a flat punch over that on a half space, 2 E a δ / (1 - ν²)."""
     force, _ = respond(radius, thickness, poisson_ratio)
     return float(force[0] * (1 - poisson_ratio**2) / (2 * radius))
@@ -124,7 +124,7 @@ def disc(radii: FloatArray, depths: FloatArray, half: bool = False) -> PadMesh:
     return mapped(((1 + half) * rings, rings, planes), bend, float(depths[-1]))
 
 
-def disc_under_punch(radius: float, thickness: float, cells: int, ratio: float) -> PadMesh:
+def punch_disc(radius: float, thickness: float, cells: int, ratio: float) -> PadMesh:
     """A quarter whose rings narrow toward a punch's edge from both sides."""
     towards_edge = radius - growing(0.0, radius, cells, ratio)[::-1]
     radii = np.concatenate([[0.0], towards_edge[1:], [radius], growing(radius, 2.5 * thickness, cells + 1, ratio)])

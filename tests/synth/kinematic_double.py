@@ -84,7 +84,6 @@ def dented(points: Points, depth: float, shear: tuple[float, float] = (0.0, 0.0)
 
 
 def assert_same_flow(first: FlowField, second: FlowField) -> None:
-    """To the bit, both ways."""
     for name in ("forward", "forward_visible", "backward", "backward_visible"):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name), strict=True)
 

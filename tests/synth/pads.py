@@ -50,7 +50,6 @@ MIXED = ["p1p1", "p2p1"]  # Names of the elements that have a pressure field, to
 
 
 def contact_faces(mesh: PadMesh) -> ContactFaces:
-    """The contact surface of a mesh, its nodes in the mesh's order."""
     faces = boundary_faces(mesh.tets)
     faces = faces[mesh.on_face[faces].all(axis=1)]
     nodes = np.unique(faces)
@@ -118,7 +117,6 @@ def gentle(**parts: Any) -> Scene:
 
 
 def same(a: Trajectory, b: Trajectory) -> bool:
-    """Bitwise, but for the time it took."""
     assert (a.status, a.reason, len(a.states)) == (b.status, b.reason, len(b.states))
     return all(
         (s.displacement == t.displacement).all() and (s.traction == t.traction).all() and s.summary() == t.summary()
@@ -127,14 +125,12 @@ def same(a: Trajectory, b: Trajectory) -> bool:
 
 
 def complete(posed: Scene, mesh: PadMesh, folder: Path | None = None, **options: Any) -> Trajectory:
-    """The trajectory of a scene, which must reach its end."""
     result = simulate(posed, mesh, folder, **options)
     assert (result.status, result.reason) == ("complete", "")
     return result
 
 
 def system(mesh: PadMesh, poisson_ratio: float, penalty: float = 50.0, element: Element | None = None) -> System:
-    """The discrete system of a pad of E = 1; P1/P1 unless said otherwise."""
     space = function_space(mesh, element or p1p1())
     return System(space, uniform(len(mesh.tets), poisson_ratio), penalty)
 
@@ -179,7 +175,6 @@ def indenters(posed: Scene, at: float) -> Indenters:
 
 
 def far_away() -> Indenters:
-    """An indenter that touches nothing."""
     return indenters(scene(motion={"depth_mm": -40.0}), 0.0)
 
 
@@ -236,7 +231,6 @@ def area_vectors(points: Points, faces: np.ndarray) -> FloatArray:
 
 
 def areas(points: Points, faces: np.ndarray) -> FloatArray:
-    """(f,) mm²."""
     return np.asarray(np.linalg.norm(area_vectors(points, faces), axis=1))
 
 

@@ -38,12 +38,10 @@ def small_sensor(
 
 
 def flat_surface(sensor: Sensor, cells: int = 12) -> GelSurface:
-    """The undeformed contact face as a regular grid of triangles."""
     return sheet(cells, cells, *sensor.gel.size_mm[:2], 2)
 
 
 def plain(value: float = 0.6) -> Image:
-    """A texture of one reflectance."""
     return np.full((4, 4, 3), value, dtype=np.float32)
 
 

@@ -7,10 +7,8 @@ from synth.mesh.capsule import CapsuleFace
 from synth.scene import Camera, Gel, Light, NoPattern, Sensor, Window
 from synth.surface import GelSurface
 
-RADIUS, LENGTH = 12.0, 8.0
-"""Of the coated face, mm: a hemisphere about (0, 0, RADIUS) and a cylinder above it."""
-INNER = 9.0
-"""Radius of the window's face."""
+RADIUS, LENGTH = 12.0, 8.0  # Of the coated face, mm: a hemisphere about (0, 0, RADIUS) and a cylinder above it
+INNER = 9.0  # Radius of the window's face
 SPHERE = {"shape": "sphere", "radius_mm": INNER, "center_z_mm": RADIUS}
 CAPSULE = {"shape": "capsule", "radius_mm": INNER, "center_z_mm": RADIUS}
 CYLINDER = {"shape": "cylinder", "radius_mm": INNER}
@@ -32,8 +30,7 @@ def sensor(window: dict, index: float = 1.45, lights: tuple[Light, ...] = (), **
     )
 
 
-def on_capsule(points: Points) -> Points:
-    """Points (n, 3) moved along the normal onto the face."""
+def on_face(points: Points) -> Points:
     foot = points * (0, 0, 1)
     foot[:, 2] = np.maximum(foot[:, 2], RADIUS)
     arm = points - foot
@@ -45,7 +42,7 @@ def capsule(edge_mm: float, length: float = LENGTH) -> GelSurface:
     return CapsuleFace(RADIUS, RADIUS - INNER, length).rest_surface(edge_mm)
 
 
-def pressed(points: Points, place: Points, depth: float, shear: tuple[float, float, float] = (0, 0, 0)) -> Points:
+def dented(points: Points, place: Points, depth: float, shear: tuple[float, float, float] = (0, 0, 0)) -> Points:
     """Moved inward about a place (3,) on the face by a dent of some 3 mm radius, and sideways."""
     dent = np.exp(-((points - place) ** 2).sum(axis=1) / 9.0)[:, None]
     foot = np.array([0.0, 0.0, max(place[2], RADIUS)])

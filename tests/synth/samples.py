@@ -75,7 +75,6 @@ def translation_sample(
 
 
 def job(n: int = 3, *, seed: int = 7, **changes: object) -> Job:
-    """A job whose scene is `SCENE` with top-level keys changed."""
     scene = {**SCENE, **changes}
     scene_hash = hashlib.sha256(repr(scene).encode()).hexdigest()[:16]
     software, device = {"synth": "0.1.0"}, {"device": "cpu", "variant": "scalar_rgb"}

@@ -42,13 +42,11 @@ MOTION = {"depth_mm": 0.6, "shear_mm": (0.2, 0.0), "steps": 2}
 
 
 def block(size: tuple[float, float, float], low: float, dome_mm: float | None = None, cells: int = 1) -> Body:
-    """A closed box from z = low on, its lower face bulged."""
     mesh = domed(brick(size, (cells, cells, 1)), dome_mm)
     return np.add(mesh.points, (0.0, 0.0, low)), boundary_faces(mesh.tets)
 
 
 def capsule_body(radius: float, length: float, low: float, edge: float = 0.5) -> Body:
-    """A closed capsule with its tip at z = low."""
     import pyvista as pv
 
     face = CapsuleFace(radius, radius / 2, length)
@@ -67,7 +65,6 @@ def write(folder: Path, name: str, *bodies: Body, scale: float = 1.0, shift: flo
 
 
 def from_files(scene: Scene, folder: Path, **gel: Any) -> Scene:
-    """A scene with the gel of the folder's files instead of its own."""
     content = scene.model_dump(mode="json")
     content["sensor"]["gel"] = {**FILE, **gel}
     return Scene.model_validate_json(json.dumps(measured(content, folder)))
@@ -116,7 +113,6 @@ def test_a_box_and_a_dome_agree_with_their_files(tmp_path: Path, dome_mm: float 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A capsule's two files."""
     found = tmp_path_factory.mktemp("capsule")
     write(found, "outer.stl", capsule_body(5.0, 2.0, 0.0))
     write(found, "window.stl", capsule_body(3.0, 3.0, 2.0))
@@ -125,7 +121,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def bad(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The same files and faulty ones."""
     found = Path(shutil.copytree(folder, tmp_path_factory.mktemp("bad"), dirs_exist_ok=True))
     (points, faces), inner = capsule_body(5.0, 2.0, 0.0), capsule_body(3.0, 3.0, 2.0)
     write(found, "metres.stl", (points, faces), scale=1e-3)
@@ -192,16 +187,7 @@ numerics = { element = "p1p1", edge_length_mm = 1.5 }
 window = { shape = "capsule", radius_mm = 2.4, center_z_mm = 5.0, thickness_mm = 1.0 }
 pattern = { kind = "dots", spacing_mm = [1.5, 1.5], radius_mm = 0.4, placing = "spherical" }
 lights = [{ position_mm = [0.0, 1.5, 7.5], size_mm = [0.5, 0.5], color = [1.0, 1.0, 1.0], power = 150.0 }]
-[sensor.camera]
-lens = "fisheye"
-distortion = [0.0, 0.0, 0.0, 0.0]
-position_mm = [0.0, 0.0, 6.5]
-width = 48
-height = 48
-fx = 15.0
-fy = 15.0
-cx = 24.0
-cy = 24.0
+camera = {lens="fisheye", distortion=[0,0,0,0], position_mm=[0,0,6.5], width=48, height=48, fx=15, fy=15, cx=24, cy=24}
 [motion]
 depth_mm = { uniform = [0.3, 0.5] }
 polar_deg = { uniform = [0.0, 60.0] }
@@ -211,7 +197,6 @@ steps = 2
 
 
 def scene_file(folder: Path, **gel: Any) -> Path:
-    """A scene with the folder's files; fields of its gel that are None are left out."""
     fields = {key: value for key, value in {**FILE, **gel}.items() if value is not None}
     path = folder / "cad.toml"
     path.write_text(f"{SCENE}\n{tomli_w.dumps({'sensor': {'gel': fields}}).replace('[sensor]', '')}")

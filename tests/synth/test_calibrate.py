@@ -72,7 +72,6 @@ def _frame(sensor: Sensor) -> FloatArray:
 
 
 def _fit(truth: Sensor, spacing_mm: float | None, steps: int) -> SensorFit:
-    """From one frame of the truth."""
     image = _frame(truth)
     return fit_sensor(_start(), Frames(image, image, 1 / 255), FAST, spacing_mm, steps)
 
@@ -127,7 +126,6 @@ def test_a_known_spacing_gives_the_focal_length() -> None:
 
 
 def _every(step: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Columns and rows of some pixels."""
     columns, rows = np.meshgrid(np.arange(2, 160, step), np.arange(2, 120, step))
     return columns.ravel(), rows.ravel()
 
@@ -165,8 +163,7 @@ def test_a_matt_gel_is_lit_by_itself_by_way_of_the_window() -> None:
     direct, both = (picture[rows, columns, 0].mean() for picture in pictures)
     pixels, lights = np.column_stack([columns, rows]) + 0.5, LightGeometry.of(bright.lights)
     lit = [300 * FlatGel(sensor, pixels, FAST).contributions(lights).sum(axis=0).mean() for sensor in (bright, dim)]
-    # Direct light is proportional to the reflectance, what comes back to its square. Lights near the window shade their
-    # images, which is left out here: 3 % of the light.
+    # Direct light goes as the reflectance, what comes back as its square; shade on the images is left out: 3 %.
     assert both > 1.1 * direct
     assert 2 * (lit[0] - 2 * lit[1]) == pytest.approx(both - direct, rel=0.05)
 
@@ -257,7 +254,7 @@ def test_a_frame_without_dots_dots_without_a_grid_and_dots_of_a_pixel_are_refuse
     away = np.hypot(*((part + 2) % 5 - 2.5 for part in (x, y)))
     for radius in (0.5, 0.9):
         frame = np.repeat(0.5 * np.clip(away - radius + 0.5, 0.1, 1)[..., None], 3, axis=2)
-        refused(r"radius of .* px, needed is more than 1 px", fit_profile, find_dots(frame, 5.0))
+        refused(r"radius of .* px, needed is more than 1 px", lambda f: fit_profile(find_dots(f, 5.0)), frame)
 
 
 @pytest.mark.parametrize(

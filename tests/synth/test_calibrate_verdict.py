@@ -57,7 +57,6 @@ def _dots(move: FloatArray) -> FloatArray:
 
 
 def _off_grid(linear: FloatArray) -> float:
-    """Common displacement over the pitch."""
     sensor = start_sensor(load_scene("gelsight_mini", []), (320, 240))
     dots = find_dots(linear, sensor.pattern.spacing_mm[0] * pixels_per_mm(sensor))
     grid = fit_dot_grid(sensor, sensor.pattern, dots.centres, None)

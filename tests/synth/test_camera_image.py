@@ -84,8 +84,7 @@ def test_auto_keeps_render_noise_below_a_quarter_of_the_cameras(shot_noise: floa
     renderer, again = (Renderer(sensor, render, surface, plain(), FAST) for _ in "12")
     first, second = (renderer.radiance(surface.material, seed) for seed in (11, 12))
     share = render_noise(first, second, sensor.camera) / camera_noise(first, sensor.camera)
-    # Noise of 14400 values is known within 1 %; the pilots' as well.
-    assert share <= 0.25 * 1.03
+    assert share <= 0.25 * 1.03  # Noise of 14400 values is known within 1 %; the pilots' as well
     # Not wasteful: stratified noise falls as 1 / samples at best, so that a pilot of 16 asks for n / 16 times too many.
     assert share >= 0.25 / (renderer.samples_per_pixel / 16) ** 0.5 / 1.5 or renderer.samples_per_pixel == 16
     assert again.samples_per_pixel == renderer.samples_per_pixel == full_grid(renderer.samples_per_pixel, 2)

@@ -138,8 +138,7 @@ def test_other_software_is_recorded(tmp_path):
     for _ in range(2):
         DatasetWriter(tmp_path / "d", replace(job(), software={"synth": "0.2.0"})).close()
     info = read_dataset(tmp_path / "d").info
-    assert info["software"] == {"synth": "0.1.0"}
-    assert info["continued_with"] == [{"synth": "0.2.0"}]
+    assert (info["software"], info["continued_with"]) == ({"synth": "0.1.0"}, [{"synth": "0.2.0"}])
 
 
 def _full(*_: object) -> int:

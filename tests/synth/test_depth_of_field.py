@@ -27,8 +27,7 @@ SEEDS = range(8)
 ROWS, COLUMNS = np.mgrid[0:60, 0:80] + 0.5
 SINGLE = Dots(kind="dots", spacing_mm=(30, 30), radius_mm=0.4, softness_mm=0.1, offset_mm=(0.3, 0.1))
 MANY = Dots(kind="dots", spacing_mm=(2.5, 2.0), radius_mm=0.4, softness_mm=0.1, offset_mm=(0.3, 0.1))
-FACE, EYE = 6.0, 20.0
-"""Heights in mm of the window's outer face and of the camera in `small_sensor`."""
+FACE, EYE = 6.0, 20.0  # Heights in mm of the window's outer face and of the camera in `small_sensor`
 APERTURE = 1.6
 OBLIQUE: dict[str, Any] = {"pattern": SINGLE, "position_mm": (8.0, 9.0, 17.0), "look_at_mm": (1.8, 2.0, 2.0)}
 
@@ -41,7 +40,6 @@ def _removed(sensor: Sensor, state: Points | None = None, samples: int = 64) -> 
 
 
 def _renderer(sensor: Sensor, texture: Image | None = None, samples: int = 16) -> Renderer:
-    """Of the flat gel with its pattern, or another texture."""
     painted = albedo(sensor, np.random.default_rng(0)) if texture is None else texture
     return Renderer(sensor, Render(samples_per_pixel=samples, max_depth=2), flat_surface(sensor), painted, FAST)
 
@@ -97,7 +95,6 @@ def test_focus_is_measured_by_the_mirror(focus: float) -> None:
 
 
 def _axis(camera: Camera) -> tuple[FloatArray, FloatArray]:
-    """Its position and unit direction."""
     eye = np.array(camera.position_mm)
     along = np.array(camera.look_at_mm) - eye
     return eye, along / np.linalg.norm(along)
@@ -165,8 +162,7 @@ def test_in_focus_the_picture_is_the_pinholes_within_noise(index: float, apertur
         other = frames(range(100, 100 + count), aperture_mm=aperture, focus_mm=focus) / bare  # independent noise
         noise = (sharp.var(0, ddof=1) + other.var(0, ddof=1)).mean() / count
         misses[focus] = ((sharp.mean(0) - other.mean(0)) ** 2).mean() / noise
-    # Noise sits at the dots' edges, in the equivalent of 150 pixels: 1 ± √(2 / 150) and as many for √(2 / (150 · 14)),
-    # times four.
+    # Noise sits at the dots' edges, some 150 pixels: four times √(2 / 150), and as many for √(2 / (150 · 14)).
     assert misses[EYE] == pytest.approx(1, abs=0.5)
     assert misses[14.5] > 10
 

@@ -179,7 +179,6 @@ DOME_VIEWS = {
 
 
 def _paths(view):
-    """(HEIGHT, WIDTH) by which mirror each pixel looks."""
     return optics(**VIEWS[view]).look(pixel_centres().reshape(-1, 2)).path.reshape(HEIGHT, WIDTH)
 
 
@@ -205,7 +204,6 @@ def test_flow_is_the_independent_projections(view):
 
 @pytest.mark.parametrize("view", DOME_VIEWS)
 def test_flow_of_a_dome_is_the_independent_projections(view):
-    """The pad of the other tests with a dome, its window's outer face where it was."""
     window = Window(refractive_index=DOME_VIEWS[view]["index"], thickness_mm=1.0)
     domed, surface = sensor(**DOME_VIEWS[view]).model_copy(update={"gel": DOME, "window": window}), rest_surface(DOME)
     for first in (surface.material, dented(surface.material, 0.3)):

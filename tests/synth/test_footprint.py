@@ -157,7 +157,6 @@ BLOCK = {"shape": "box", "size_mm": (5.0, 4.0, 4.0), "fillet_mm": 0.8}
 
 
 def drawn(indenter: dict[str, Any], target: float | None = None, **motion: Any) -> Scene:
-    """A draw whose mesh is chosen."""
     numerics = {"element": "auto", "edge_length_mm": None, "target_error_px": target}
     moves = {"depth_mm": 0.8, "shear_mm": [0.4, 0.2], "steps": 2, **motion}
     return scene(PAD, indenter=indenter, friction=0.5, motion=moves, numerics=numerics)
@@ -197,8 +196,6 @@ SHAPES = {
 
 
 def enlarged(part: Any, factor: float) -> Any:
-    """A scene's dictionary with all that is in mm that much larger."""
-
     def times(value: Any) -> Any:
         return type(value)(map(times, value)) if isinstance(value, (tuple, list)) else factor * value
 

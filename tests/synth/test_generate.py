@@ -89,7 +89,6 @@ def test_wrong_numbers_scenes_that_cannot_be_built_and_a_missing_ray_are_told(ti
 
 
 def _fits(template: Template, seed: int, attempt: int) -> bool:
-    """Whether an attempt of trajectory 0 fits the schema."""
     try:
         draw(template, seed, 0, attempt)
     except InputError:

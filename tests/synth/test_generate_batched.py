@@ -54,7 +54,6 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Template:
 
 @pytest.fixture(scope="module")
 def whole(template: Template, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The dataset in one go, all trajectories at once."""
     out = tmp_path_factory.mktemp("whole") / "d"
     summary = generate(template, SAMPLES, out, SEED, scheduling=Scheduling(batch=8))
     assert (summary.made, summary.given_up) == (SAMPLES, [])

@@ -37,7 +37,6 @@ def _ctrl_c() -> None:
 
 @pytest.fixture
 def out(tmp_path: Path) -> Path:
-    """Where the dataset goes."""
     return tmp_path / "d"
 
 
@@ -104,7 +103,6 @@ def test_a_killed_worker_is_replaced(tiny: Path, out: Path) -> None:
 @pytest.mark.slow
 @needs_proc
 def test_a_ray_worker_killed_in_mid_task_changes_nothing(tiny: Path, out: Path) -> None:
-    """On a local cluster of two worker processes."""
     pytest.importorskip("ray", reason="Ray is not installed: pip install -e '.[cluster]'")
     process = start(tiny, out, "--n", "5", "--ray", "local", "--workers", "2")
     busy = b"ray::_work"  # an idle worker is called ray::IDLE

@@ -29,7 +29,6 @@ pytestmark = pytest.mark.usefixtures("one_cache")
 
 @pytest.fixture
 def url() -> Iterator[str]:
-    """An empty place in this process's memory."""
     place = f"memory://{uuid.uuid4().hex}/data"
     yield place
     fsspec.filesystem("memory").rm(place.removeprefix("memory:/").rpartition("/")[0], recursive=True)

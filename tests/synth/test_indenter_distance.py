@@ -51,7 +51,6 @@ def measure(body: RigidBody, points: FloatArray) -> tuple[FloatArray, FloatArray
 
 
 def differences(body: RigidBody, points: FloatArray, h: float = 1e-5) -> tuple[FloatArray, FloatArray]:
-    """Central differences of the distance (n, 3) and of the normal (n, 3, 3)."""
     ends = [(measure(body, points + step), measure(body, points - step)) for step in h * np.eye(3)]
     slope, turning = (np.stack([ahead[k] - behind[k] for ahead, behind in ends], axis=-1) for k in (0, 1))
     return slope / (2 * h), turning / (2 * h)
@@ -118,7 +117,6 @@ def surface(indenter: Indenter) -> FloatArray:
 
 
 def scattered(indenter: Indenter, rng: np.random.Generator, count: int = 400) -> FloatArray:
-    """Points within 0.6 mm of the surface, on both sides."""
     found = surface(indenter)
     offset = rng.standard_normal((count, 3))
     offset *= 0.6 * rng.random((count, 1)) / np.linalg.norm(offset, axis=1, keepdims=True)
@@ -188,7 +186,6 @@ def test_reach_is_the_highest_point(indenter: Indenter, turn: tuple[float, float
 
 
 def ball(folder: Path, cell_mm: float = 0.15, flip: bool = False, centre: tuple = (0.0, 0.0, 0.0)) -> RigidBody:
-    """The mesh of a sphere as SPHERE, by an absolute path, which needs no folder."""
     mesh = pv.Icosphere(radius=1.5, nsub=4, center=centre)
     if flip:
         mesh = pv.PolyData(np.asarray(mesh.points), np.insert(mesh.regular_faces[:, ::-1], 0, 3, axis=1))
@@ -208,8 +205,7 @@ def test_mesh_of_a_sphere_is_the_sphere(tmp_path: Path, flip: bool) -> None:
     np.testing.assert_allclose(distance[near], exact[near], atol=2.5e-3)
     assert (np.linalg.norm(normal - radial, axis=1)[near] < 0.04).all()
     assert body.reach_mm == pytest.approx(1.5, abs=2.5e-3)
-    # Beyond the grid, which ends 0.4 mm off the ball's box, distances are those to the border and from there: still
-    # right in sign, and less than a quarter off.
+    # Beyond the grid, 0.4 mm off the ball's box, distances go by its border: right in sign, less than a quarter off.
     far = np.array([[4.0, 0.0, 0.0], [0.0, -3.0, 2.0], [2.5, 2.5, 2.5]])
     np.testing.assert_allclose(measure(body, far)[0], np.linalg.norm(far, axis=1) - 1.5, rtol=0.25)
 

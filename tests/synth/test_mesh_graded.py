@@ -80,13 +80,11 @@ def test_neighbours_share_faces_all_but_the_window_is_touchable_and_mirror_image
 def test_centred_spacing_is_even_then_geometric_as_is_depth() -> None:
     planes = lateral_planes(20.0, (-3.3, 3.3), COUNTS, 0)
     step = np.diff(planes)
-    # Two coordinates rounded to GRAIN_MM.
-    np.testing.assert_allclose(step[3:11], 6.6 / 8, atol=2 * GRAIN_MM)
+    np.testing.assert_allclose(step[3:11], 6.6 / 8, atol=2 * GRAIN_MM)  # Two coordinates rounded to GRAIN_MM
     np.testing.assert_allclose(planes[[3, 11]], [-3.3, 3.3], atol=2 * GRAIN_MM)
     ratio = max(root.real for root in np.roots([1, 1, 1, -6.7 / 0.825]) if abs(root.imag) < 1e-9)
     np.testing.assert_allclose(step[11:], 0.825 * ratio ** np.arange(1, 4), atol=4 * GRAIN_MM)
-    # h (1 + 1.5 + 2.25 + 3.375) = 4 mm.
-    steps = _depth_steps(Counts(through=4, growth=1.5))
+    steps = _depth_steps(Counts(through=4, growth=1.5))  # h (1 + 1.5 + 2.25 + 3.375) = 4 mm
     np.testing.assert_allclose(steps, 4 / 8.125 * 1.5 ** np.arange(4), atol=2 * GRAIN_MM)
     np.testing.assert_allclose(_depth_steps(Counts(through=4, growth=1.0)), 1.0, atol=2 * GRAIN_MM)
 
@@ -132,8 +130,7 @@ def test_small_focus_outgrows_its_elements_and_planes_move_continuously_with_it(
     assert reach == pytest.approx(9.9, rel=1e-9)  # a root by halving, to the last bits
     walk = np.linspace(0.0, 12.0, 1201)
     planes = np.array([lateral_planes(20.0, Focus((x, 0), (3, 3)).span(0, 20.0), COUNTS, 0) for x in walk])
-    # Planes move at most a few times as fast as the focus (0.01 mm a step; measured 0.05); a gap's element that jumped
-    # to the other side would move them by a spacing, 0.75 mm and more.
+    # Planes move a few times as fast as the focus at most (0.05 mm a step was seen); a jump would be 0.75 mm or more.
     assert np.abs(np.diff(planes, axis=0)).max() < 0.2
 
 
@@ -158,7 +155,6 @@ def test_layers_are_bounded_by_planes(layers: tuple[float, ...]) -> None:
 
 
 def _depth_steps(counts: Counts) -> FloatArray:
-    """Distances of the planes through the thickness."""
     return np.diff(np.unique(graded_box(SIZE, CENTRED, counts).points[:, 2]))
 
 

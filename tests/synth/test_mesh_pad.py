@@ -65,7 +65,6 @@ def test_fills_the_box_with_flat_closed_faces_and_edges_graded_toward_the_window
     assert 4 <= pad.bonded.sum() < len(contact.nodes)  # coarser there than at the contact face
 
     def edge(level: float) -> float:
-        """Of as many equilateral triangles on that face."""
         faces = boundary_faces(pad.tets)
         count = (pad.points[faces][:, :, 2] == level).all(axis=1).sum()
         return float(np.sqrt(4 / np.sqrt(3) * SIZE[0] * SIZE[1] / count))
@@ -122,7 +121,6 @@ SOUND = brick((4.0, 3.0, 2.0), (2, 2, 2))
 
 
 def moved(corner: int, place: np.ndarray) -> PadMesh:
-    """The mesh with one corner of its first tetrahedron somewhere else."""
     points = SOUND.points.copy()
     points[SOUND.tets[0, corner]] = place
     return replace(SOUND, points=points)
@@ -135,8 +133,7 @@ def test_sound_meshes_and_slivers_pass_but_flat_inverted_and_broken_ones_are_ref
     sliver = moved(3, others.mean(axis=0) + 1e-3 * (top - others.mean(axis=0)))
     assert 0 < sliver.volumes[0] < 2e-3 * SOUND.volumes[0]
     check_mesh(PadMesh(sliver.points[sliver.tets[0]], np.array([[0, 1, 2, 3]]), SOUND.size_mm))  # others may turn over
-    # The volume of a flat one is 0 or some 1e-17 of either sign.
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(0)  # The volume of a flat one is 0 or some 1e-17 of either sign
     for corners in rng.normal(size=(12, 3, 3)):
         points = np.vstack([corners, rng.dirichlet(np.ones(3)) @ corners])
         refused("must be > 0", check_mesh, PadMesh(points, np.array([[0, 1, 2, 3]]), SOUND.size_mm))

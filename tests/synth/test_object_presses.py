@@ -32,7 +32,6 @@ STRICT = SolverOptions(relaxed_tolerance=0.0)
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """With a cube in it whose edges are sharp."""
     pv.Cube(x_length=EDGE, y_length=EDGE, z_length=EDGE).triangulate().clean().save(tmp_path / "cube.stl")
     return tmp_path
 

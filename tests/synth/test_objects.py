@@ -101,18 +101,15 @@ def distances(body: RigidBody, points: FloatArray) -> FloatArray:
 
 
 def around(half: tuple[float, float, float]) -> FloatArray:
-    """(n, 3) places in a block's box and some cells beyond it."""
     return np.random.default_rng(7).uniform(-1, 1, (4000, 3)) * (np.array(half) + 2 * CELL)
 
 
 def assert_equal_near(found: FloatArray, exact: FloatArray, near: float, error: float) -> None:
-    """Distances agree at the places that are less than `near` from the surface."""
     close = np.abs(exact) < near
     np.testing.assert_allclose(found[close], exact[close], atol=error)
 
 
 def parts(kind: str) -> tuple[FloatArray, np.ndarray]:
-    """The block's points and faces with one thing wrong."""
     points, faces = np.asarray(CUBE.points, dtype=float), np.asarray(CUBE.regular_faces)
     match kind:
         case "inverted":

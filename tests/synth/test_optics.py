@@ -106,7 +106,6 @@ def _fisheye(*distortion: float) -> FisheyeLens:
 
 
 def _directions(angle: np.ndarray, around: np.ndarray | float = 0.0) -> np.ndarray:
-    """(n, 3) at angles from the lens's axis."""
     return np.column_stack([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)])
 
 

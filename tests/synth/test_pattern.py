@@ -41,8 +41,7 @@ def test_strips_blend_to_the_bit_and_bare_coating_is_as_fine_as_the_camera_and_c
     np.testing.assert_array_equal(texture.astype(np.float32), painted.astype(np.float32))
     sensor = small_sensor()
     texture, sharp = (albedo(one, np.random.default_rng(0)) for one in (sensor, small_sensor(fx=1e5, fy=1e5)))
-    # 140 px focal length over 20 mm - 6 mm + 6 mm / 1
-    assert pixels_per_mm(sensor) == pytest.approx(7.0)
+    assert pixels_per_mm(sensor) == pytest.approx(7.0)  # 140 px focal length over 20 mm - 6 mm + 6 mm / 1
     np.testing.assert_array_equal(texture, np.full((4 * 7 * 9, 4 * 7 * 12, 3), np.float32(0.6)), strict=True)
     assert max(sharp.shape) <= 3072
 

@@ -140,7 +140,6 @@ BITMAP = 'sensor.pattern={ kind = "bitmap", file = "art/mine.png", width_mm = 8 
 
 @pytest.fixture
 def scene(tiny: Path, one_cache: None, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The user is in its folder."""
     (tiny.parent / "art").mkdir()
     monkeypatch.chdir(tiny.parent)
     return tiny

@@ -233,7 +233,6 @@ def test_dot_centres_move_as_the_flow_says(view):
 
 
 def _slope(flow: FloatArray, row: int, column: int) -> FloatArray:
-    """(2, 2) derivative of the flow at a pixel, by central differences."""
     across = (flow[row, column + 1] - flow[row, column - 1]) / 2
     down = (flow[row + 1, column] - flow[row - 1, column]) / 2
     return np.column_stack([across, down]).astype(np.float64)

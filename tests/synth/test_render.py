@@ -254,11 +254,9 @@ def test_irradiance_under_a_large_light_is_the_sum_over_it() -> None:
     foot = np.array([-1.5, -0.1])  # seen at the principal point
     view = {"position_mm": (*foot, 20.0), "look_at_mm": (*foot, 0.0)}
     image = rendered(small_sensor(lights=(light,), fx=500.0, fy=500.0, **view))
-    # By 400 x 400 midpoints of cos² / (π r²), whose error is 1e-5.
-    u = (np.arange(400) + 0.5) / 400 - 0.5
+    u = (np.arange(400) + 0.5) / 400 - 0.5  # By 400 x 400 midpoints of cos² / (π r²), whose error is 1e-5
     x, y = np.meshgrid(5 + 4 * u - foot[0], 6 * u - foot[1])
     factor = (9 / (np.pi * (x**2 + y**2 + 9) ** 2)).mean() * 24
     expected = 0.6 / np.pi * np.pi * 300 / (np.pi * 24) * factor
-    # 36 stratified samples of a light seen under 60 degrees: 2 % a pixel, 0.2 % in the mean of 9 x 9 px; its curvature
-    # over 0.4 mm changes the mean by (0.2 / 4)² / 3 < 0.1 %.
+    # 36 stratified samples: 2 % a pixel, 0.2 % in the mean of 9 x 9 px; the curvature over 0.4 mm below 0.1 %.
     assert image[24:33, 38:47].mean() == pytest.approx(expected, rel=6e-3)

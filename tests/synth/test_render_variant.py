@@ -113,7 +113,6 @@ sys.exit(main(["doctor", "--json"]))
 
 
 def _python(code: str, home: Path, *arguments: str) -> "subprocess.CompletedProcess[str]":
-    """Run code in a process that knows this checkout and nothing of the environment."""
     environment = {"PATH": "/usr/bin:/bin", "PYTHONPATH": str(Path(__file__).parents[2]), "HOME": str(home)}
     command = [sys.executable, "-c", code, *arguments]
     return subprocess.run(command, cwd=home, env=environment, capture_output=True, text=True, check=False)

@@ -141,7 +141,6 @@ ANY = 'contact.indenter={ shape = "mesh", file = "objects/*.stl", rotation_deg =
 
 @pytest.fixture
 def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A scene beside a folder of two objects, which is the working directory."""
     (tmp_path / "objects").mkdir()
     for name in ("b.stl", "a.stl", "notes.txt"):
         (tmp_path / "objects" / name).write_text(name)

@@ -31,8 +31,7 @@ BOX = {"shape": "box", "size_mm": [3.0, 2.5, 4.0], "fillet_mm": 0.6, "rotation_d
 WIRE = {"shape": "torus", "radius_mm": 1.5, "tube_mm": 0.3}
 MESH = brick(counts=(4, 4, 2))
 TOLERANCE = 1e-9
-AGREEMENT = 1e-6
-"""Of displacements, relative. Newton's method to 1e-9 leaves some 1e-10 (5e-11 was seen)."""
+AGREEMENT = 1e-6  # Of displacements, relative. Newton's method to 1e-9 leaves some 1e-10 (5e-11 was seen)
 
 
 def draws(element: str) -> list[Scene]:

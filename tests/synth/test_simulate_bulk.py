@@ -120,7 +120,6 @@ def test_tangent_is_the_derivative_of_the_residual(case: Case) -> None:
 
 
 def turn(rng: np.random.Generator) -> FloatArray:
-    """A proper rotation far from the identity."""
     q = np.linalg.qr(rng.standard_normal((3, 3)))[0]
     return np.asarray(q * np.sign(np.linalg.det(q)))
 

@@ -190,8 +190,7 @@ def test_partial_slip_is_mindlins() -> None:
     for state in slid:
         pull, load = 2 * state.force_n[0], 2 * state.force_n[2]
         share = min(1.0, state.shear_mm[0] * 16 * CONTACT / (3 * FRICTION * load * 4.5))
-        # Three elements across the contact and a pad of 12 radii are 11 % too stiff, under the ball and sideways alike:
-        # relative to the load at hand, 1 to 2 % of that are left.
+        # Three elements across the contact are 11 % too stiff, under the ball and sideways alike: 1 to 2 % are left.
         assert pull / (FRICTION * load) == pytest.approx(1 - (1 - share) ** 1.5, abs=0.02)
         # The slipping ring is as fine as the contact points: 0.1 mm of 1 mm.
         assert state.slip_ratio == pytest.approx(share, abs=0.1)

@@ -176,6 +176,5 @@ def test_the_inverse_of_a_gpu() -> None:
     matrix = turn @ np.diag(np.geomspace(1e-3, 1e3, 700) * np.where(np.arange(700) % 3, 1, -1)) @ turn.T
     matrix = (matrix + matrix.T) / 2
     found, known = inverse(matrix, "cuda"), np.linalg.inv(matrix)
-    # Condition 1e6, and 1e-16 of each entry.
-    assert np.abs(found - known).max() < 1e-9 * np.abs(known).max()
+    assert np.abs(found - known).max() < 1e-9 * np.abs(known).max()  # Condition 1e6, and 1e-16 of each entry
     np.testing.assert_allclose(found @ matrix, np.eye(700), atol=1e-8)

@@ -128,7 +128,6 @@ CORNERS = np.array([n for n in np.ndindex(*4 * [SAMPLE_DEGREE + 1]) if sum(n) ==
 
 
 def guarded_pad(guarded: bool = True) -> System:
-    """Incompressible P2/P1, with or without the barrier."""
     body = System(function_space(MESH, p2p1()), uniform(len(MESH.tets), 0.5))
     if not guarded:
         body._barrier = None
@@ -156,7 +155,6 @@ def barrier(body: System, u: FloatArray) -> float:
 
 @pytest.fixture(scope="module")
 def state() -> Unknowns:
-    """A valid state in which some points are below the onset."""
     body = guarded_pad()
     sizes = np.linspace(0.03, 0.2, 35)
     valid = [size for size in sizes if lattice_jacobian(body, squeezed(body, size).u)[0].min() > 0.05]

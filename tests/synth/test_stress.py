@@ -51,15 +51,13 @@ def result(asked: Run | None = None, outcome: str = "complete", message: str = "
 
 
 def moved(node: int, by: Any) -> np.ndarray:
-    """Displacements of one node alone."""
     displacement = np.zeros_like(MESH.points)
     displacement[node] = by
     return displacement
 
 
 FIRST, *OTHERS = MESH.tets[0]
-BEYOND = 2 * (MESH.points[OTHERS].mean(axis=0) - MESH.points[FIRST])
-"""Turns the first tetrahedron over."""
+BEYOND = 2 * (MESH.points[OTHERS].mean(axis=0) - MESH.points[FIRST])  # Turns the first tetrahedron over
 
 
 def test_sound_results_are_as_expected_and_deviations_accepted_only_as_noted() -> None:
@@ -218,8 +216,7 @@ def test_a_small_suite_end_to_end_and_folders_from_elsewhere_are_not_emptied(tmp
     assert f"hard-p1p1: OTHERWISE: {broken}" in shown
     assert [case["verdict"] for case in report["cases"]] == ["as expected", "OTHERWISE", "as expected"]
     assert str(tmp_path) not in (out / "stress.json").read_text()  # it is read elsewhere
-    # Only what is asked for, in place of the first.
-    assert run_stress(out, ["wrong"], 1, True, scenes) == 0
+    assert run_stress(out, ["wrong"], 1, True, scenes) == 0  # Only what is asked for, in place of the first
     report = json.loads(capsys.readouterr().out)
     assert [case["case"] for case in report["cases"]] == ["hopeless"]
     assert json.loads((out / "stress.json").read_text()) == report

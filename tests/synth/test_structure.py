@@ -11,31 +11,14 @@ from tiny_scene import own_cache, write_tiny
 ROOT = Path(__file__).parents[2]
 STAGES = (
     "synth",  # the package itself: its version, and where its public names are, which it loads when they are asked for
-    "synth.errors",
-    "synth.arrays",
+    "synth.errors", "synth.arrays",
     "synth.dataset.storage",  # how a file gets to the disk as a whole; knows nothing of datasets
-    "synth.scene",
-    "synth.surface",
-    "synth.optics",
-    "synth.mesh",
-    "synth.simulate",
-    "synth.render",
+    "synth.scene", "synth.surface", "synth.optics", "synth.mesh", "synth.simulate", "synth.render",
     "synth.scene.sampling",  # draws again what could not be rendered
-    "synth.flow",
-    "synth.dataset",
-    "synth.verify",
-    "synth.inspect",
-    "synth.planning",
-    "synth.pipeline",
-    "synth.progress",
-    "synth.calibrate",
-    "synth.stress",
-    "synth.doctor",
-    "synth.cli_options",
-    "synth.commands",
-    "synth.cli",
-    "synth.__main__",
-)
+    "synth.flow", "synth.dataset", "synth.verify", "synth.inspect", "synth.planning", "synth.pipeline",
+    "synth.progress", "synth.calibrate", "synth.stress", "synth.doctor", "synth.cli_options", "synth.commands",
+    "synth.cli", "synth.__main__",
+)  # fmt: skip
 """A module imports from its own stage and from those above it in this list, never from those below."""
 
 HEAVY = {
@@ -69,7 +52,6 @@ def _imports(name: str, tree: ast.Module, is_package: bool) -> set[str]:
 
 
 def _stage(module: str) -> int:
-    """Number of the most specific stage that a module lies in."""
     fitting = [stage for stage in STAGES[1:] if module == stage or module.startswith(f"{stage}.")]
     return STAGES.index(max(fitting, key=len)) if fitting else 0
 
@@ -125,7 +107,6 @@ def test_the_two_programs_share_nothing(modules: dict[str, ast.Module], forbidde
 
 
 def _loaded_after(code: str, *arguments: str) -> set[str]:
-    """Top-level modules that a fresh interpreter holds after `code`."""
     report = "\nimport sys\nsys.stderr.write('\\nLOADED ' + ' '.join({name.split('.')[0] for name in sys.modules}))"
     command = [sys.executable, "-c", code + report, *arguments]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)

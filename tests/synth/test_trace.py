@@ -2,18 +2,7 @@
 
 import numpy as np
 import pytest
-from kinematic_double import (
-    FISHEYE,
-    HEIGHT,
-    LENS,
-    OBLIQUE,
-    SIDES,
-    WIDTH,
-    assert_same_flow,
-    optics,
-    pixel_centres,
-    sheet,
-)
+from kinematic_double import FISHEYE, LENS, OBLIQUE, SIDES, assert_same_flow, optics, pixel_centres, sheet
 
 from synth.flow.exact import exact_flow
 from synth.flow.overlap import boundary_edges, may_overlap
@@ -29,7 +18,6 @@ def _rough(subdivisions: int = 1) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _through(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rays from above through given points, tilted at random."""
     directions = np.column_stack([RNG.uniform(-0.5, 0.5, (len(points), 2)), np.full(len(points), -1.0)])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return points - 9 * directions, directions
@@ -115,7 +103,7 @@ def _meetings(positions, triangles, camera):
         sides = np.stack([np.cross(p - o, q - o) @ d for p, q in ((a, b), (b, c), (c, a))])
         share = sides / sides.sum(axis=0)
         count[n] = (share > -1e-6).all(axis=0).sum() if (share > 1e-6).all(axis=0).any() else 1
-    return count.reshape(HEIGHT, WIDTH)
+    return count.reshape(pixel_centres().shape[:2])
 
 
 @pytest.mark.parametrize("view", [{}, {"index": 1.45, "distortion": LENS}, {"index": 1.41, **OBLIQUE}, FISHEYE])

@@ -196,8 +196,7 @@ def test_channels_and_headers_of_the_flow_file_and_the_report(tmp_path) -> None:
     plain = SCENE.model_copy(update={"outputs": Outputs(backward=False)})
     rich = SCENE.model_copy(update={"outputs": Outputs(backward=False, depth=True, contact=True)})
     whole = {name: np.zeros((3, 4), np.float32) for name in ("depth1.Z", "depth2.Z", "contact.Y")}
-    assert _file_problems(tmp_path, plain) == []
-    assert _file_problems(tmp_path, rich, extras=whole) == []
+    assert (_file_problems(tmp_path, plain), _file_problems(tmp_path, rich, extras=whole)) == ([], [])
     assert _file_problems(tmp_path, rich) == [f"flow.exr: lacks the channel {name}" for name in whole]
     half = {"depth2.Z": whole["depth2.Z"].astype(np.float16)}
     assert _file_problems(tmp_path, rich, extras=whole, planes=half) == ["flow.exr: depth2.Z is float16, not float32"]

@@ -36,9 +36,7 @@ def clamped(points: Points) -> BoolArray:
 
 @cache
 def tip(element: str, cells: int) -> float:
-    """Vertical displacement of the upper corner, mm."""
-    # No node lies at z = 2: nothing is bonded.
-    mesh = mapped((cells, cells, 1), taper, 2.0)
+    mesh = mapped((cells, cells, 1), taper, 2.0)  # No node lies at z = 2: nothing is bonded
     space = supported(mesh, ELEMENT[element](), clamped)
     shear = np.array([0.0, 100.0 / (YOUNG * END * THICKNESS), 0.0])
     load = face_load(space, lambda x: np.isclose(x[:, 0], 48.0), shear)
@@ -83,8 +81,7 @@ def graded(counts: tuple[int, int, int]) -> PadMesh:
     return PadMesh(points, even.tets, SIZE)
 
 
-# Linear elements of this size are 4 % too stiff, for want of resolution at the contact's edge; quadratic ones twice as
-# wide were within 0.7 %.
+# Linear elements of this size are 4 % too stiff at the contact's edge; quadratic ones twice as wide within 0.7 %.
 @pytest.mark.parametrize(
     ("element", "counts", "close"), [("p1p1", (20, 16, 5), 0.15), ("p2p1", (10, 8, 3), 0.03)], ids=["p1p1", "p2p1"]
 )

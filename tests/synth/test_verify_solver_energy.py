@@ -37,7 +37,6 @@ class Account:
 
     @property
     def missing(self) -> float:
-        """Share of the work that is in none of the others."""
         return 1 - (self.stored + self.springs + self.lost) / self.work
 
 

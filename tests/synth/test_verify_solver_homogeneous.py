@@ -120,7 +120,6 @@ class Exact(NamedTuple):
 
 
 def gradient(points: Points, entries: dict[tuple[int, int], FloatArray]) -> FloatArray:
-    """(..., 3, 3) identity with some entries replaced."""
     F = np.broadcast_to(np.eye(3), (*points.shape, 3)).copy()
     for (i, j), values in entries.items():
         F[..., i, j] = values
@@ -152,7 +151,6 @@ def skewed(cube: Points) -> Points:
 
 
 def all_walls(points: Points) -> BoolArray:
-    """All faces of the cube but z = 0."""
     on = (points[:, 2] == 1.0) | (np.abs(points[:, :2] - 0.5) == 0.5).any(axis=1)
     return np.repeat(on[:, None], 3, axis=1)
 

@@ -83,7 +83,6 @@ def fingerprint(dataset: Path) -> dict[str, Any]:
 
 @functools.cache
 def home() -> Path:
-    """A folder of the session."""
     folder = Path(tempfile.mkdtemp(prefix="synth-tests-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder
