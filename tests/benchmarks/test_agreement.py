@@ -84,14 +84,11 @@ def test_outcomes_are_counted() -> None:
     assert summary(rows[:1])["displacement, largest"] is None
 
 
-@pytest.mark.parametrize(
-    ("options", "told"),
-    [
-        (["--device", "cuda", "--noise", "0.1"], "use cpu"),
-        (["--device", "cpu", "--trajectories", "0"], "at least 1"),
-        (["--device", "cpu", "--set", "motion.depth_mm={normal=[0.2, 1e9]}"], "none of 16 draws"),
-    ],
-)
+@pytest.mark.parametrize(("options", "told"), [
+    (["--device", "cuda", "--noise", "0.1"], "use cpu"),
+    (["--device", "cpu", "--trajectories", "0"], "at least 1"),
+    (["--device", "cpu", "--set", "motion.depth_mm={normal=[0.2, 1e9]}"], "none of 16 draws"),
+])  # fmt: skip
 def test_what_cannot_be_compared(options: list[str], told: str, tmp_path: Path, capsys) -> None:
     assert told in said(capsys, main, "agreement", "--out", tmp_path, *options, status=2)
 

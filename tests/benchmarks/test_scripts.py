@@ -150,15 +150,12 @@ def test_another_size_keeps_the_field_of_view(tmp_path: Path) -> None:
     assert after.cy / after.height == pytest.approx(9 / 24, rel=1e-7)  # of the scene that was changed
 
 
-@pytest.mark.parametrize(
-    ("command", "message"),
-    [
-        (["scale", "--size", "640"], "--size 640: give WIDTHxHEIGHT"),
-        (["scale", "--workers", "-1"], "--workers: give whole numbers from 1 on"),
-        (["scale", "--set", "motion.dept_mm=1"], "motion.dept_mm: unknown key"),
-        (["render", "--seeds", "2"], "--seeds 2: the standard error of the flow's change needs at least 3"),
-        (["render", "--scene", "nowhere"], "nowhere"),
-    ],
-)
+@pytest.mark.parametrize(("command", "message"), [
+    (["scale", "--size", "640"], "--size 640: give WIDTHxHEIGHT"),
+    (["scale", "--workers", "-1"], "--workers: give whole numbers from 1 on"),
+    (["scale", "--set", "motion.dept_mm=1"], "motion.dept_mm: unknown key"),
+    (["render", "--seeds", "2"], "--seeds 2: the standard error of the flow's change needs at least 3"),
+    (["render", "--scene", "nowhere"], "nowhere"),
+])  # fmt: skip
 def test_wrong_arguments(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: list[str], message: str) -> None:
     assert message in said(capsys, main, *command, "--out", tmp_path / "out", status=2)

@@ -43,33 +43,30 @@ def test_the_module_passes_the_status_on_and_debug_shows_the_traceback(capsys: p
     assert "Traceback" in said(capsys, main, "--debug", "compare", "/nothing/here", status=2)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "word"),
-    [
-        (["fly"], "Unknown command"),
-        (["compare"], "DATA"),
-        (["compare", ".", "--wings"], "--wings"),
-        (["pairs", ".", "--out", "o", "--seed", "many"], "seed"),
-        (["predict", "a.png", "b.png", "--out", "o", "--method", "none"], "a.png"),
-        (["predict", ".", ".", ".", "--out", "o", "--method", "none"], "3 inputs"),
-        (["predict", ".", "--out", "o", "--weights", "w", "--method", "tvl1"], "--weights"),
-        (["predict", ".", "--out", "o"], "holds no image"),
-        (["predict", ".", "--out", "o", "--method", "raft"], "raft"),
-        (["evaluate", ".", "--weights", "none.safetensors"], "none.safetensors"),
-        (["compare", ".", "--weights", "best=none.safetensors"], "none.safetensors"),
-        (["compare", ".", "--weights", "x", "--size", "big"], "--size big"),
-        (["predict", ".", "--out", "o", "--size", "100000x100000"], "at most 16777216 px are allowed"),
-        (["compare", ".", "--methods", "none,none"], "twice"),
-        (["compare", ".", "--batch", "-1"], "--batch -1: a number from 0"),
-        (["train", ".", "--out", "o", "--set", "seed=99999999999999999999999"], "seed: "),
-        (["train", ".", "--out", "o", "--set", "loss"], "KEY=VALUE"),
-        (["train", ".", "--out", "o", "--set", "loss.wings=2"], "loss.wings"),
-        (["train", ".", "--out", "o", "--set", "steps=2", "--set", "steps=3"], "steps undoes the earlier steps"),
-        (["train", ".", "--out", "o", "--steps", "0"], "steps"),
-        (["train", ".", "--out", "o", "--config", "none.toml"], "none.toml"),
-        (["train", ".", "--out", "o"], "no image pairs"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "word"), [
+    (["fly"], "Unknown command"),
+    (["compare"], "DATA"),
+    (["compare", ".", "--wings"], "--wings"),
+    (["pairs", ".", "--out", "o", "--seed", "many"], "seed"),
+    (["predict", "a.png", "b.png", "--out", "o", "--method", "none"], "a.png"),
+    (["predict", ".", ".", ".", "--out", "o", "--method", "none"], "3 inputs"),
+    (["predict", ".", "--out", "o", "--weights", "w", "--method", "tvl1"], "--weights"),
+    (["predict", ".", "--out", "o"], "holds no image"),
+    (["predict", ".", "--out", "o", "--method", "raft"], "raft"),
+    (["evaluate", ".", "--weights", "none.safetensors"], "none.safetensors"),
+    (["compare", ".", "--weights", "best=none.safetensors"], "none.safetensors"),
+    (["compare", ".", "--weights", "x", "--size", "big"], "--size big"),
+    (["predict", ".", "--out", "o", "--size", "100000x100000"], "at most 16777216 px are allowed"),
+    (["compare", ".", "--methods", "none,none"], "twice"),
+    (["compare", ".", "--batch", "-1"], "--batch -1: a number from 0"),
+    (["train", ".", "--out", "o", "--set", "seed=99999999999999999999999"], "seed: "),
+    (["train", ".", "--out", "o", "--set", "loss"], "KEY=VALUE"),
+    (["train", ".", "--out", "o", "--set", "loss.wings=2"], "loss.wings"),
+    (["train", ".", "--out", "o", "--set", "steps=2", "--set", "steps=3"], "steps undoes the earlier steps"),
+    (["train", ".", "--out", "o", "--steps", "0"], "steps"),
+    (["train", ".", "--out", "o", "--config", "none.toml"], "none.toml"),
+    (["train", ".", "--out", "o"], "no image pairs"),
+])  # fmt: skip
 def test_mistake_is_one_line_and_status_2(tmp_path: Path, monkeypatch, capsys, arguments: list[str], word: str) -> None:
     (tmp_path / "notes.txt").touch()
     monkeypatch.chdir(tmp_path)

@@ -127,21 +127,18 @@ def test_unfinished_samples_do_not_count_and_both_kinds_fit_into_one_batch(tmp_p
     assert open_all([plain, same]).names == ["p/a", "p-2/a"]
 
 
-@pytest.mark.parametrize(
-    ("file", "content", "word"),
-    [
-        ("dataset.json", None, "dataset.json"),
-        ("dataset.json", "{", "dataset.json"),
-        ("dataset.json", '{"schema_version": 99}', "99"),
-        ("dataset.json", "{}", "schema_version"),
-        ("manifest.jsonl", None, "manifest.jsonl"),
-        ("manifest.jsonl", "", "no finished sample"),
-        ("manifest.jsonl", '{"index": 0}\nrubbish\n', "line 2"),
-        ("manifest.jsonl", '{"index": 7}\n', "000007"),
-        ("samples/000000/image2.png", None, "image2.png"),
-        ("samples/000000/flow.exr", None, "flow.exr"),
-    ],
-)
+@pytest.mark.parametrize(("file", "content", "word"), [
+    ("dataset.json", None, "dataset.json"),
+    ("dataset.json", "{", "dataset.json"),
+    ("dataset.json", '{"schema_version": 99}', "99"),
+    ("dataset.json", "{}", "schema_version"),
+    ("manifest.jsonl", None, "manifest.jsonl"),
+    ("manifest.jsonl", "", "no finished sample"),
+    ("manifest.jsonl", '{"index": 0}\nrubbish\n', "line 2"),
+    ("manifest.jsonl", '{"index": 7}\n', "000007"),
+    ("samples/000000/image2.png", None, "image2.png"),
+    ("samples/000000/flow.exr", None, "flow.exr"),
+])  # fmt: skip
 def test_broken_synthetic_data_set_is_named(tmp_path: Path, file: str, content: str | None, word: str) -> None:
     folder = write_synthetic(tmp_path, [(1, 0)])
     if content is None:
@@ -183,17 +180,14 @@ def test_plain_folders_may_have_markers_and_what_is_no_data_set_is_named(tmp_pat
         refused(word, PairDataset, path)
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "x1,y1,x2\n1,2,3\n",
-        "x1,y1,x2,y2\n1,2,3,dot\n",
-        "x1,y1,x2,y2\n",
-        "x1,y1,x2,y2\n1,2,3\n",
-        "x1,y1,x2,y2,müde\n1,2,3,4,5\n",  # in Latin-1, see below
-        f"x1,y1,x2,y2\n1,2,3,{'4' * 200_000}\n",  # the csv module's limit is 131,072
-    ],
-)
+@pytest.mark.parametrize("text", [
+    "x1,y1,x2\n1,2,3\n",
+    "x1,y1,x2,y2\n1,2,3,dot\n",
+    "x1,y1,x2,y2\n",
+    "x1,y1,x2,y2\n1,2,3\n",
+    "x1,y1,x2,y2,müde\n1,2,3,4,5\n",  # in Latin-1, see below
+    f"x1,y1,x2,y2\n1,2,3,{'4' * 200_000}\n",  # the csv module's limit is 131,072
+])  # fmt: skip
 def test_broken_markers_are_named(tmp_path: Path, text: str) -> None:
     folder = write_folder(tmp_path, {"a": (1, 0)})
     (folder / "a_markers.csv").write_text(text, encoding="latin-1")

@@ -143,24 +143,21 @@ def _npy(array: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
-@pytest.mark.parametrize(
-    ("suffix", "content", "words"),
-    [
-        ("image2.png", lambda data: data[:300] + bytes([data[300] ^ 1]) + data[301:], "damaged image .*checksum"),
-        ("image2.png", lambda data: data[:-20], "truncated or damaged image"),
-        ("image2.png", lambda data: b"GIF" + data[3:], "not a PNG"),
-        ("image2.png", lambda data: b"", "not a PNG"),
-        ("forward.npy", lambda data: data[:-4], r"not a readable \.npy"),
-        ("forward.npy", lambda data: data[:50], r"not a readable \.npy"),
-        ("forward.npy", lambda data: data.replace(b"'shape': (", b"'shape': ["), r"not a readable \.npy"),
-        ("forward.npy", lambda data: data.replace(b"(64, 64, 2)", b"(6444444444444, 64, 2)"), r"not a readable \.npy"),
-        ("forward.npy", lambda data: b"", r"not a readable \.npy"),
-        ("forward.npy", lambda data: _npy(np.zeros((64, 64, 2))), "float64"),
-        ("forward.npy", lambda data: _npy(np.array([[{}]])), "Object"),
-        ("forward.npy", lambda data: _npy(np.zeros((64, 64), np.float32)), "shapes"),
-        ("forward_visible.npy", lambda data: _npy(np.zeros((64, 60), np.uint8)), "shapes"),
-    ],
-)
+@pytest.mark.parametrize(("suffix", "content", "words"), [
+    ("image2.png", lambda data: data[:300] + bytes([data[300] ^ 1]) + data[301:], "damaged image .*checksum"),
+    ("image2.png", lambda data: data[:-20], "truncated or damaged image"),
+    ("image2.png", lambda data: b"GIF" + data[3:], "not a PNG"),
+    ("image2.png", lambda data: b"", "not a PNG"),
+    ("forward.npy", lambda data: data[:-4], r"not a readable \.npy"),
+    ("forward.npy", lambda data: data[:50], r"not a readable \.npy"),
+    ("forward.npy", lambda data: data.replace(b"'shape': (", b"'shape': ["), r"not a readable \.npy"),
+    ("forward.npy", lambda data: data.replace(b"(64, 64, 2)", b"(6444444444444, 64, 2)"), r"not a readable \.npy"),
+    ("forward.npy", lambda data: b"", r"not a readable \.npy"),
+    ("forward.npy", lambda data: _npy(np.zeros((64, 64, 2))), "float64"),
+    ("forward.npy", lambda data: _npy(np.array([[{}]])), "Object"),
+    ("forward.npy", lambda data: _npy(np.zeros((64, 64), np.float32)), "shapes"),
+    ("forward_visible.npy", lambda data: _npy(np.zeros((64, 60), np.uint8)), "shapes"),
+])  # fmt: skip
 def test_a_damaged_member_is_named(shard: Path, suffix: str, content: Callable[[bytes], bytes], words: str) -> None:
     rewrite(shard, lambda name, data: iter([(name, content(data) if name == f"000001.{suffix}" else data)]))
     dataset = PairDataset(shard)

@@ -54,16 +54,13 @@ def affine_flow(matrix: list[list[float]], shift: tuple[float, float] = (1.5, -0
     return torch.stack([m[0] * x + m[1] * y + s for m, s in zip(matrix, shift, strict=True)])[None]
 
 
-@pytest.mark.parametrize(
-    ("matrix", "parts"),
-    [
-        ([[0, 0], [0, 0]], (0, 0, 0)),  # translation
-        ([[0.2, 0], [0, -0.1]], (0.3, 0, 0)),  # stretch: |e_xx| + |e_yy|
-        ([[0, 0.1], [0.1, 0]], (0, 0.2, 0)),  # pure shear: 2 |e_xy|
-        ([[0, -0.1], [0.1, 0]], (0, 0, 0.2)),  # rotation: 2 |omega|
-        ([[0.1, 0.3], [-0.05, 0.2]], (0.3, 0.25, 0.35)),
-    ],
-)
+@pytest.mark.parametrize(("matrix", "parts"), [
+    ([[0, 0], [0, 0]], (0, 0, 0)),  # translation
+    ([[0.2, 0], [0, -0.1]], (0.3, 0, 0)),  # stretch: |e_xx| + |e_yy|
+    ([[0, 0.1], [0.1, 0]], (0, 0.2, 0)),  # pure shear: 2 |e_xy|
+    ([[0, -0.1], [0.1, 0]], (0, 0, 0.2)),  # rotation: 2 |omega|
+    ([[0.1, 0.3], [-0.05, 0.2]], (0.3, 0.25, 0.35)),
+])  # fmt: skip
 def test_decomposition_separates_stretch_shear_and_rotation_and_affine_flows_cost_no_deformation(matrix, parts) -> None:
     flow = affine_flow(matrix)
     loss = decomposition_loss(flow, ONES, lambda_theta=10, lambda_zeta=100)

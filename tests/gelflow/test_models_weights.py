@@ -160,17 +160,14 @@ def test_the_exported_network_gives_the_same_flow(weights: Path, tmp_path: Path)
     np.testing.assert_allclose(flow, expected, atol=3e-5 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize(
-    ("tail", "word"),
-    [
-        (["--out", "x.onnx"], "was trained on images of any size"),
-        (["--out", "x.pt", "--size", "64x64"], "ending in .onnx"),
-        (["--out", "x.onnx", "--size", "32x64"], "at least 64 px"),
-        (["--out", "x.onnx", "--size", "big"], "ROWSxCOLUMNS"),
-        (["--out", "other.onnx", "--size", "64x64"], "other.onnx: exists and does not come from this command"),
-        (["--out", "x.onnx", "--size", "64x64"], "pip install onnx onnxscript"),
-    ],
-)
+@pytest.mark.parametrize(("tail", "word"), [
+    (["--out", "x.onnx"], "was trained on images of any size"),
+    (["--out", "x.pt", "--size", "64x64"], "ending in .onnx"),
+    (["--out", "x.onnx", "--size", "32x64"], "at least 64 px"),
+    (["--out", "x.onnx", "--size", "big"], "ROWSxCOLUMNS"),
+    (["--out", "other.onnx", "--size", "64x64"], "other.onnx: exists and does not come from this command"),
+    (["--out", "x.onnx", "--size", "64x64"], "pip install onnx onnxscript"),
+])  # fmt: skip
 def test_mistakes_are_one_line(weights: Path, tail: list[str], word: str, capsys, monkeypatch) -> None:
     monkeypatch.setattr("gelflow.models.onnx.find_spec", lambda name: None if "pip" in word else name)
     monkeypatch.chdir(weights.parent)

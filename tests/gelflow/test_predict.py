@@ -154,17 +154,14 @@ def test_arrays_and_tensors_give_one_flow_that_follows_a_known_motion(tmp_path: 
     assert np.median(flow, axis=(0, 1)) == pytest.approx((2.0, 0.0), abs=0.1)
 
 
-@pytest.mark.parametrize(
-    ("image1", "image2", "message"),
-    [
-        (np.zeros((64, 64, 3)), torch.zeros(3, 64, 64), "ndarray and Tensor: two NumPy arrays or two torch tensors"),
-        (np.full((64, 64, 3), 9.0), np.zeros((64, 64, 3)), r"image 1 is float64 with values from 9 to 9"),
-        (torch.zeros(3, 64, 64), torch.full((3, 64, 64), -1.0), r"image 2 is torch.float32 with values from -1 to -1"),
-        (np.zeros((64, 64)), np.zeros((64, 64)), r"\(rows, columns, 3\) is needed"),
-        (torch.zeros(3, 64, 64), torch.zeros(3, 64, 80), "differ in shape"),
-        (np.full((64, 64, 3), np.nan), np.zeros((64, 64, 3)), "NaN or infinite"),
-    ],
-)
+@pytest.mark.parametrize(("image1", "image2", "message"), [
+    (np.zeros((64, 64, 3)), torch.zeros(3, 64, 64), "ndarray and Tensor: two NumPy arrays or two torch tensors"),
+    (np.full((64, 64, 3), 9.0), np.zeros((64, 64, 3)), r"image 1 is float64 with values from 9 to 9"),
+    (torch.zeros(3, 64, 64), torch.full((3, 64, 64), -1.0), r"image 2 is torch.float32 with values from -1 to -1"),
+    (np.zeros((64, 64)), np.zeros((64, 64)), r"\(rows, columns, 3\) is needed"),
+    (torch.zeros(3, 64, 64), torch.zeros(3, 64, 80), "differ in shape"),
+    (np.full((64, 64, 3), np.nan), np.zeros((64, 64, 3)), "NaN or infinite"),
+])  # fmt: skip
 def test_images_that_cannot_be_used(image1: object, image2: object, message: str) -> None:
     refused(message, gelflow.load_model(device="cpu").flow, image1, image2)  # type: ignore[call-overload]
 

@@ -34,30 +34,27 @@ def test_defaults_are_the_readings_of_the_paper_and_its_preset_states_them() -> 
     assert {"levels", "lffm"} <= set(text["model"])
 
 
-@pytest.mark.parametrize(
-    ("values", "words"),
-    [
-        ({"lr": 1}, "lr: there is no such setting; allowed: model, loss"),
-        ({"loss": {"lambda_x": 1}}, "loss.lambda_x: there is no such setting; allowed: alpha"),
-        ({"loss": {"alpha": 2}}, r"loss.alpha: .*less than or equal to 1 \(given: 2\)"),
-        ({"model": {"estimator": "both"}}, "model.estimator: .*'per_scale' or 'shared'.*both"),
-        ({"model": {"registration": {"prior": 1}}}, "model.registration.prior: .*allowed: windows_px, "),
-        ({"model": {"levels": 6}}, "loss.lambda_s has 7 numbers; model.levels asks for 5"),
-        ({"loss": {"lambda_s": [0.0] * 7}}, "at least one of them above 0"),
-        ({"crop_size": [32, 64]}, r"crop_size = \[32, 64\]: each side must be at least 64 px"),
-        ({"image_size": [64, 64], "crop_size": [64, 80]}, "does not fit into image_size"),
-        ({"steps": 10, "warmup_steps": 10}, "warmup_steps = 10 must be below steps = 10"),
-        ({"steps": 0}, "steps: .*greater than or equal to 1"),
-        ({"learning_rate": float("nan")}, "learning_rate"),
-        ({"batch_size": True}, "batch_size: .*integer .*True"),
-        ({"batch_size": "2"}, "batch_size: .*integer .*'2'"),
-        ({"loss": {"alpha": True}}, "loss.alpha: .*number .*True"),
-        ({"loss": {"lambda_dc": "5"}}, "loss.lambda_dc: .*number .*'5'"),
-        ({"loss": {"lambda_s": [True] * 7}}, "loss.lambda_s.0: .*number .*True"),
-        ({"flip": "no"}, "flip: .*boolean .*no"),
-        ({"seed": datetime.date(2000, 1, 1)}, "seed: .*integer .*2000-01-01"),
-    ],
-)
+@pytest.mark.parametrize(("values", "words"), [
+    ({"lr": 1}, "lr: there is no such setting; allowed: model, loss"),
+    ({"loss": {"lambda_x": 1}}, "loss.lambda_x: there is no such setting; allowed: alpha"),
+    ({"loss": {"alpha": 2}}, r"loss.alpha: .*less than or equal to 1 \(given: 2\)"),
+    ({"model": {"estimator": "both"}}, "model.estimator: .*'per_scale' or 'shared'.*both"),
+    ({"model": {"registration": {"prior": 1}}}, "model.registration.prior: .*allowed: windows_px, "),
+    ({"model": {"levels": 6}}, "loss.lambda_s has 7 numbers; model.levels asks for 5"),
+    ({"loss": {"lambda_s": [0.0] * 7}}, "at least one of them above 0"),
+    ({"crop_size": [32, 64]}, r"crop_size = \[32, 64\]: each side must be at least 64 px"),
+    ({"image_size": [64, 64], "crop_size": [64, 80]}, "does not fit into image_size"),
+    ({"steps": 10, "warmup_steps": 10}, "warmup_steps = 10 must be below steps = 10"),
+    ({"steps": 0}, "steps: .*greater than or equal to 1"),
+    ({"learning_rate": float("nan")}, "learning_rate"),
+    ({"batch_size": True}, "batch_size: .*integer .*True"),
+    ({"batch_size": "2"}, "batch_size: .*integer .*'2'"),
+    ({"loss": {"alpha": True}}, "loss.alpha: .*number .*True"),
+    ({"loss": {"lambda_dc": "5"}}, "loss.lambda_dc: .*number .*'5'"),
+    ({"loss": {"lambda_s": [True] * 7}}, "loss.lambda_s.0: .*number .*True"),
+    ({"flip": "no"}, "flip: .*boolean .*no"),
+    ({"seed": datetime.date(2000, 1, 1)}, "seed: .*integer .*2000-01-01"),
+])  # fmt: skip
 def test_wrong_values_are_named_with_what_is_allowed(values: dict, words: str) -> None:
     said = refused(words, validated, TrainConfig, values, "run.toml")
     assert said.startswith("run.toml: ")

@@ -239,14 +239,11 @@ def test_bad_files_are_told_in_a_sentence(bad: Path, gel: dict[str, Any], messag
     refused(message, build, scene_file(bad, **gel))
 
 
-@pytest.mark.parametrize(
-    ("place", "message"),
-    [
-        ("polar_deg=112.0", "motion.polar_deg = 112.0 is beyond the gel's end"),
-        ("position_mm=[4.99, 4.99]", "the gel has no coated face at"),
-        ("azimuth_deg=20.0", "azimuth_deg goes with polar_deg or height_mm"),
-    ],
-)
+@pytest.mark.parametrize(("place", "message"), [
+    ("polar_deg=112.0", "motion.polar_deg = 112.0 is beyond the gel's end"),
+    ("position_mm=[4.99, 4.99]", "the gel has no coated face at"),
+    ("azimuth_deg=20.0", "azimuth_deg goes with polar_deg or height_mm"),
+])  # fmt: skip
 def test_places_beside_the_face_are_told(folder: Path, place: str, message: str) -> None:
     path = scene_file(folder)
     path.write_text(path.read_text().replace("polar_deg", "#").replace("azimuth_deg", "#"))

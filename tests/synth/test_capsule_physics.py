@@ -140,31 +140,25 @@ def test_far_from_the_press_the_gel_is_left_out() -> None:
 FACE = CapsuleFace(5.0, 2.0, 2.0)
 
 
-@pytest.mark.parametrize(
-    ("gel", "message"),
-    [
-        ({"radius_mm": None}, "needs radius_mm and thickness_mm"),
-        ({"thickness_mm": 4.6}, r"leaves no room for a window in radius_mm = 5.0: at most 4.5"),
-        ({"size_mm": (9.0, 9.0, 7.0)}, "follows from radius_mm and length_mm: leave it out"),
-        ({"layers": [{"thickness_mm": 0.1, "youngs_modulus_kpa": 900.0}]}, "a capsule is of one material"),
-        ({"shape": "box", "size_mm": (9.0, 9.0, 7.0)}, 'radius_mm belongs to shape = "capsule"'),
-    ],
-)
+@pytest.mark.parametrize(("gel", "message"), [
+    ({"radius_mm": None}, "needs radius_mm and thickness_mm"),
+    ({"thickness_mm": 4.6}, r"leaves no room for a window in radius_mm = 5.0: at most 4.5"),
+    ({"size_mm": (9.0, 9.0, 7.0)}, "follows from radius_mm and length_mm: leave it out"),
+    ({"layers": [{"thickness_mm": 0.1, "youngs_modulus_kpa": 900.0}]}, "a capsule is of one material"),
+    ({"shape": "box", "size_mm": (9.0, 9.0, 7.0)}, 'radius_mm belongs to shape = "capsule"'),
+])  # fmt: skip
 def test_impossible_capsules_are_refused(gel: dict[str, Any], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         Gel.model_validate({**SHAPE, **gel})
 
 
-@pytest.mark.parametrize(
-    ("motion", "message"),
-    [
-        ({"depth_mm": 1.8}, "more than 85 % of the gel's thickness"),
-        ({"position_mm": (1.0, 0.0)}, "position_mm is for flat gels and domes"),
-        ({"polar_deg": 10.0, "height_mm": 1.0}, "both say where the press is"),
-        ({"polar_deg": 112.0}, "is beyond the gel's end; at most 111.8"),
-        ({"height_mm": 7.1}, "is beyond the gel's end; at most 7"),
-    ],
-)
+@pytest.mark.parametrize(("motion", "message"), [
+    ({"depth_mm": 1.8}, "more than 85 % of the gel's thickness"),
+    ({"position_mm": (1.0, 0.0)}, "position_mm is for flat gels and domes"),
+    ({"polar_deg": 10.0, "height_mm": 1.0}, "both say where the press is"),
+    ({"polar_deg": 112.0}, "is beyond the gel's end; at most 111.8"),
+    ({"height_mm": 7.1}, "is beyond the gel's end; at most 7"),
+])  # fmt: skip
 def test_impossible_places_are_refused(motion: dict[str, Any], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         capsule(motion=motion)

@@ -116,15 +116,12 @@ def test_lost_folder_is_made_again_and_n_may_grow_and_shrink(tmp_path):
         assert read_dataset(tmp_path / "d").info["n"] == expected
 
 
-@pytest.mark.parametrize(
-    ("other", "named"),
-    [
-        (job(seed=8), r"seed: 7 there, 8 now"),
-        (job(motion={"depth_mm": 0.3}), r"scene\.motion\.depth_mm: 0\.1 there, 0\.3 now"),
-        (job(render={"max_depth": 2}), r"scene\.render: None there"),
-        (replace(job(), device={"variant": "llvm_ad_rgb"}), r"device\.variant: scalar_rgb there, llvm_ad_rgb now"),
-    ],
-)
+@pytest.mark.parametrize(("other", "named"), [
+    (job(seed=8), r"seed: 7 there, 8 now"),
+    (job(motion={"depth_mm": 0.3}), r"scene\.motion\.depth_mm: 0\.1 there, 0\.3 now"),
+    (job(render={"max_depth": 2}), r"scene\.render: None there"),
+    (replace(job(), device={"variant": "llvm_ad_rgb"}), r"device\.variant: scalar_rgb there, llvm_ad_rgb now"),
+])  # fmt: skip
 def test_another_job_is_refused_and_named(tmp_path, other, named):
     _write_all(tmp_path / "d")
     before = tree(tmp_path / "d")

@@ -224,15 +224,12 @@ def test_a_dataset_with_an_aperture_passes_verify(tiny: Path, tmp_path: Path) ->
     assert report.ok, report.record()
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({}, "needs focus_mm"),
-        ({"focus_mm": 1.5}, "wider than focus_mm"),
-        ({"focus_mm": 20.0, "lens": "fisheye", "distortion": (0, 0, 0, 0)}, "fisheye lens has no flat plane"),
-        ({"focus_mm": 20.0, "position_mm": (9.0, 0.0, 6.5), "look_at_mm": (0, 0, 0)}, "tilted pupil reaches down"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    ({}, "needs focus_mm"),
+    ({"focus_mm": 1.5}, "wider than focus_mm"),
+    ({"focus_mm": 20.0, "lens": "fisheye", "distortion": (0, 0, 0, 0)}, "fisheye lens has no flat plane"),
+    ({"focus_mm": 20.0, "position_mm": (9.0, 0.0, 6.5), "look_at_mm": (0, 0, 0)}, "tilted pupil reaches down"),
+])  # fmt: skip
 def test_impossible_lenses_are_named(change: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         small_sensor(1.45, aperture_mm=APERTURE, **change)

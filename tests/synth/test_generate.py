@@ -183,14 +183,11 @@ def test_a_full_disk_loses_nothing_and_tears_nothing(tiny: Path, tmp_path: Path)
     assert fingerprint(out) == fingerprint(reference())
 
 
-@pytest.mark.parametrize(
-    ("pace", "lines"),
-    [
-        (10.0, ["8 of 12, 10.0 s each, about 40.0 s left"]),
-        (0.1, []),
-        (70.0, ["3 of 12", *(f"{done} of 12, 70.0 s each, about " for done in range(4, 12))]),
-    ],
-)
+@pytest.mark.parametrize(("pace", "lines"), [
+    (10.0, ["8 of 12, 10.0 s each, about 40.0 s left"]),
+    (0.1, []),
+    (70.0, ["3 of 12", *(f"{done} of 12, 70.0 s each, about " for done in range(4, 12))]),
+])  # fmt: skip
 def test_a_line_a_minute_where_stderr_is_no_terminal(capsys, monkeypatch, pace: float, lines: list[str]) -> None:
     """Two of twelve were there before; each of the others takes `pace` seconds."""
     clock = [0.0]

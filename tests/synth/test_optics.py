@@ -240,16 +240,13 @@ def test_backs_second_reflections_and_what_is_beyond_the_field_show_nothing():
     assert set(path) == {0, -1}  # without mirrors: -1 beyond the lens's field
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"mirrors": ({**SIDES[0], "normal": (0, 0, 0)},)}, "normal is zero"),
-        ({"mirrors": ({**SIDES[0], "position_mm": (6.0, 0.0, 12.0)},)}, "reaches down to z"),
-        ({"look_at_mm": (0.0, 0.0, 30.0)}, "only a mirror could turn its view back"),
-        ({"lens": "fisheye"}, "needs distortion = \\[k1, k2, k3, k4\\]"),
-        ({"distortion": (0.1, 0.0)}, "distortion has 2 numbers; a pinhole lens needs"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "words"), [
+    ({"mirrors": ({**SIDES[0], "normal": (0, 0, 0)},)}, "normal is zero"),
+    ({"mirrors": ({**SIDES[0], "position_mm": (6.0, 0.0, 12.0)},)}, "reaches down to z"),
+    ({"look_at_mm": (0.0, 0.0, 30.0)}, "only a mirror could turn its view back"),
+    ({"lens": "fisheye"}, "needs distortion = \\[k1, k2, k3, k4\\]"),
+    ({"distortion": (0.1, 0.0)}, "distortion has 2 numbers; a pinhole lens needs"),
+])  # fmt: skip
 def test_impossible_optics_are_named(changes, words):
     with pytest.raises(ValueError, match=words):
         sensor(index=1.45, **changes)

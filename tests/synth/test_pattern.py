@@ -60,14 +60,11 @@ def test_random_colors_differ_from_cell_to_cell_and_speckle_covers_what_is_asked
     assert (1 - texture[:, :, 0] / 0.6).mean() == pytest.approx(0.35, abs=0.01)
 
 
-@pytest.mark.parametrize(
-    "pattern",
-    [
-        Dots(kind="dots", spacing_mm=(1, 1), radius_mm=0.2, jitter_mm=0.1, radius_jitter=0.2),
-        RandomColor(kind="random_color", cell_mm=0.5),
-        Speckle(kind="speckle", grain_mm=0.4),
-    ],
-)
+@pytest.mark.parametrize("pattern", [
+    Dots(kind="dots", spacing_mm=(1, 1), radius_mm=0.2, jitter_mm=0.1, radius_jitter=0.2),
+    RandomColor(kind="random_color", cell_mm=0.5),
+    Speckle(kind="speckle", grain_mm=0.4),
+])  # fmt: skip
 def test_pattern_comes_from_the_generator_alone(pattern) -> None:
     first, again, other = (albedo(small_sensor(pattern=pattern), np.random.default_rng(seed)) for seed in (5, 5, 6))
     assert np.array_equal(first, again)
@@ -190,14 +187,11 @@ def test_speckle_has_the_grain_that_is_asked(grain: float) -> None:
     assert crossings == pytest.approx(4 / (np.pi * np.sqrt(2) * grain), rel=0.08)
 
 
-@pytest.mark.parametrize(
-    ("pattern", "field"),
-    [
-        (Dots(kind="dots", spacing_mm=(1, 0.03), radius_mm=0.02), "spacing_mm"),
-        (RandomColor(kind="random_color", cell_mm=0.03), "cell_mm"),
-        (Speckle(kind="speckle", grain_mm=0.03), "grain_mm"),
-    ],
-)
+@pytest.mark.parametrize(("pattern", "field"), [
+    (Dots(kind="dots", spacing_mm=(1, 0.03), radius_mm=0.02), "spacing_mm"),
+    (RandomColor(kind="random_color", cell_mm=0.03), "cell_mm"),
+    (Speckle(kind="speckle", grain_mm=0.03), "grain_mm"),
+])  # fmt: skip
 def test_what_no_pixel_shows_is_refused(pattern: Pattern, field: str, tmp_path) -> None:
     """A quarter of a pixel, one texel, is 0.0357 mm here: 140 px of focal length over 20 mm."""
     sensor = small_sensor(pattern=pattern)

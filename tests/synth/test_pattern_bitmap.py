@@ -174,13 +174,10 @@ def test_a_missing_picture_is_told_and_another_one_is_another_scene(scene: Path)
     assert hashes[0] == hashes[1] != hashes[2]
 
 
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        (BITMAP, "sensor.pattern.file: .*mine.png is no whole picture"),
-        ("sensor.pattern.spacing_mm=[1, 0.05]", "sensor.pattern.spacing_mm = 0.05: .*at least"),
-    ],
-)
+@pytest.mark.parametrize(("override", "message"), [
+    (BITMAP, "sensor.pattern.file: .*mine.png is no whole picture"),
+    ("sensor.pattern.spacing_mm=[1, 0.05]", "sensor.pattern.spacing_mm = 0.05: .*at least"),
+])  # fmt: skip
 def test_what_cannot_be_painted_is_refused_before_the_job(scene: Path, override: str, message: str) -> None:
     (scene.parent / "art" / "mine.png").write_text("no picture")
     said = refused(message, lambda: check_buildable(load_scene(scene, [override]), choose_variant("cpu")))

@@ -42,19 +42,16 @@ def _decided(tiny: Path, *overrides: str, variant: Variant = LLVM) -> dict[str, 
     return {d.feature: (d.runs, d.reason) for d in plan(load_scene(tiny, overrides), variant).decisions}
 
 
-@pytest.mark.parametrize(
-    ("feature", "override", "needed"),
-    [
-        ("simulation", "motion.depth_mm={ uniform = [-0.3, 0.0] }", False),
-        ("friction state", "contact.friction=0", False),
-        ("pressure field", "sensor.gel.poisson_ratio=0.2", False),
-        ("window refraction", "sensor.window.refractive_index=1", False),
-        ("backward flow", "outputs.backward=false", False),
-        ("lens distortion", "sensor.camera.distortion=[0.01, 0, 0, 0, 0]", True),
-        ("indirect light", "render.max_depth=3", True),
-        ("optional channels", "outputs.depth=true", True),
-    ],
-)
+@pytest.mark.parametrize(("feature", "override", "needed"), [
+    ("simulation", "motion.depth_mm={ uniform = [-0.3, 0.0] }", False),
+    ("friction state", "contact.friction=0", False),
+    ("pressure field", "sensor.gel.poisson_ratio=0.2", False),
+    ("window refraction", "sensor.window.refractive_index=1", False),
+    ("backward flow", "outputs.backward=false", False),
+    ("lens distortion", "sensor.camera.distortion=[0.01, 0, 0, 0, 0]", True),
+    ("indirect light", "render.max_depth=3", True),
+    ("optional channels", "outputs.depth=true", True),
+])  # fmt: skip
 def test_what_a_scene_does_not_need_is_left_out_and_why(tiny: Path, feature: str, override: str, needed: bool) -> None:
     assert _decided(tiny)[feature][0] != needed
     runs, reason = _decided(tiny, override)[feature]
@@ -83,17 +80,14 @@ def test_one_draw_that_needs_a_feature_is_enough_and_nodes_are_about_the_meshs(t
 GREY = [f"sensor.lights.{i}.color=[1, 1, 1]" for i in range(5)]
 
 
-@pytest.mark.parametrize(
-    ("overrides", "grey"),
-    [
-        ([], False),
-        (GREY, True),
-        ([*GREY, "sensor.coating.reflectance=[0.5, 0.5, 0.6]"], False),
-        ([*GREY, f"sensor.coating.reflectance=[{', '.join(3 * ['{uniform=[0.5, 0.6]}'])}]"], False),
-        ([*GREY, 'sensor.pattern={ kind = "random_color", cell_mm = 0.5, saturation = { normal = [0, 0.1] } }'], False),
-        ([*GREY, 'sensor.pattern={ kind = "random_color", cell_mm = 0.5, saturation = 0 }'], True),
-    ],
-)
+@pytest.mark.parametrize(("overrides", "grey"), [
+    ([], False),
+    (GREY, True),
+    ([*GREY, "sensor.coating.reflectance=[0.5, 0.5, 0.6]"], False),
+    ([*GREY, f"sensor.coating.reflectance=[{', '.join(3 * ['{uniform=[0.5, 0.6]}'])}]"], False),
+    ([*GREY, 'sensor.pattern={ kind = "random_color", cell_mm = 0.5, saturation = { normal = [0, 0.1] } }'], False),
+    ([*GREY, 'sensor.pattern={ kind = "random_color", cell_mm = 0.5, saturation = 0 }'], True),
+])  # fmt: skip
 def test_one_channel_is_rendered_only_where_every_draw_is_grey(tiny: Path, overrides: list[str], grey: bool) -> None:
     variant = job_variant(load_scene(tiny, overrides), "cpu")
     assert variant.is_mono == (grey and variant.is_vectorised)
@@ -142,20 +136,17 @@ def _write_stl(path: Path, *, closed: bool) -> None:
     pv.PolyData.from_regular_faces(corners, faces).save(path)
 
 
-@pytest.mark.parametrize(
-    ("overrides", "variant", "message"),
-    [
-        (['contact.indenter={ shape = "torus", radius_mm = 1, tube_mm = 2 }'], LLVM, "contact.indenter.tube_mm = 2"),
-        (['contact.indenter={ shape = "cylinder", radius_mm = 1, fillet_mm = 1 }'], LLVM, "contact.indenter.fillet_mm"),
-        (['contact.indenter={ shape = "mesh", file = "text.stl" }'], LLVM, "text.stl"),
-        (['contact.indenter={ shape = "mesh", file = "*.stl", rotation_deg = "any" }'], LLVM, "text.stl"),
-        (["sensor.lights.3.position_mm=[0, 0, 3]"], LLVM, r"sensor.lights\[3\].* between the camera and the gel"),
-        (["sensor.lights.3.aim_mm=[0.0, -2.9, 2.0]"], LLVM, "aims at itself"),
-        (["sensor.camera.distortion=[0.1, 0, 0, 0, 0]"], SCALAR, "LLVM 16"),
-        (["sensor.camera.fy=83"], SCALAR, "LLVM 16"),
-        (["sampling.pairs_per_trajectory=4"], LLVM, r"pairs_per_trajectory = 4: .* at most 3"),
-    ],
-)
+@pytest.mark.parametrize(("overrides", "variant", "message"), [
+    (['contact.indenter={ shape = "torus", radius_mm = 1, tube_mm = 2 }'], LLVM, "contact.indenter.tube_mm = 2"),
+    (['contact.indenter={ shape = "cylinder", radius_mm = 1, fillet_mm = 1 }'], LLVM, "contact.indenter.fillet_mm"),
+    (['contact.indenter={ shape = "mesh", file = "text.stl" }'], LLVM, "text.stl"),
+    (['contact.indenter={ shape = "mesh", file = "*.stl", rotation_deg = "any" }'], LLVM, "text.stl"),
+    (["sensor.lights.3.position_mm=[0, 0, 3]"], LLVM, r"sensor.lights\[3\].* between the camera and the gel"),
+    (["sensor.lights.3.aim_mm=[0.0, -2.9, 2.0]"], LLVM, "aims at itself"),
+    (["sensor.camera.distortion=[0.1, 0, 0, 0, 0]"], SCALAR, "LLVM 16"),
+    (["sensor.camera.fy=83"], SCALAR, "LLVM 16"),
+    (["sampling.pairs_per_trajectory=4"], LLVM, r"pairs_per_trajectory = 4: .* at most 3"),
+])  # fmt: skip
 @pytest.mark.filterwarnings("ignore:The VTK reader")
 def test_what_cannot_be_built_is_refused_with_the_file_and_the_field(
     tiny: Path, overrides: list[str], variant: Variant, message: str, monkeypatch: pytest.MonkeyPatch

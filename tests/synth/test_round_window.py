@@ -149,15 +149,12 @@ def test_a_cylinder_is_open_at_its_ends_and_what_is_in_air_is_seen_straight():
     np.testing.assert_array_equal(SHAPES["cylinder"].aim(inside, eye), inside - eye)
 
 
-@pytest.mark.parametrize(
-    ("window", "camera", "words"),
-    [
-        ({"shape": "sphere", "radius_mm": 9.0}, {}, "needs center_z_mm"),
-        ({"radius_mm": 9.0}, {}, "has no radius_mm"),
-        (CAPSULE, {"position_mm": (0.0, 0.0, 2.5)}, "must lie inside the window's capsule"),
-        (SPHERE, {"lens": "pinhole", "distortion": (0.0,) * 5, "aperture_mm": 1.0, "focus_mm": 9.0}, "only a pinhole"),
-    ],
-)
+@pytest.mark.parametrize(("window", "camera", "words"), [
+    ({"shape": "sphere", "radius_mm": 9.0}, {}, "needs center_z_mm"),
+    ({"radius_mm": 9.0}, {}, "has no radius_mm"),
+    (CAPSULE, {"position_mm": (0.0, 0.0, 2.5)}, "must lie inside the window's capsule"),
+    (SPHERE, {"lens": "pinhole", "distortion": (0.0,) * 5, "aperture_mm": 1.0, "focus_mm": 9.0}, "only a pinhole"),
+])  # fmt: skip
 def test_what_does_not_fit_a_round_window_is_named(window, camera, words):
     with pytest.raises(ValueError, match=words):
         sensor(window, **camera)

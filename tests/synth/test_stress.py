@@ -82,22 +82,19 @@ def test_sound_results_are_as_expected_and_deviations_accepted_only_as_noted() -
         Deviation.model_validate({"outcome": ["complete"]})
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"displacement": moved(7, np.nan)}, "state 1: a field is not finite"),
-        ({"last": {"force_n": [0.0, float("nan"), 1.0]}}, "state 1: force_n is not finite"),
-        ({"last": {"residual": 2e-6}}, "residual 2e-06 is above the tolerance 1e-06"),
-        ({"last": {"residual": float("nan")}}, "residual is not finite"),
-        ({"last": {"min_jacobian": 0.0}}, "smallest det F is 0"),
-        ({"displacement": moved(FIRST, BEYOND)}, "det F of the stored displacements is -"),
-        ({"record": {"states_asked": 3}}, "complete with 2 of 3 states"),
-        ({"outcome": "partial", "message": "why", "record": {"states_asked": 2}}, "partial with 2 of 2 states"),
-        ({"outcome": "partial", "record": {"states_asked": 3}}, "partial without a reason"),
-        ({"outcome": "hung"}, "hung: killed after its budget of 60 s"),
-        ({"outcome": "crashed", "message": "exit status 1"}, "crashed: exit status 1"),
-    ],
-)
+@pytest.mark.parametrize(("wrong", "message"), [
+    ({"displacement": moved(7, np.nan)}, "state 1: a field is not finite"),
+    ({"last": {"force_n": [0.0, float("nan"), 1.0]}}, "state 1: force_n is not finite"),
+    ({"last": {"residual": 2e-6}}, "residual 2e-06 is above the tolerance 1e-06"),
+    ({"last": {"residual": float("nan")}}, "residual is not finite"),
+    ({"last": {"min_jacobian": 0.0}}, "smallest det F is 0"),
+    ({"displacement": moved(FIRST, BEYOND)}, "det F of the stored displacements is -"),
+    ({"record": {"states_asked": 3}}, "complete with 2 of 3 states"),
+    ({"outcome": "partial", "message": "why", "record": {"states_asked": 2}}, "partial with 2 of 2 states"),
+    ({"outcome": "partial", "record": {"states_asked": 3}}, "partial without a reason"),
+    ({"outcome": "hung"}, "hung: killed after its budget of 60 s"),
+    ({"outcome": "crashed", "message": "exit status 1"}, "crashed: exit status 1"),
+])  # fmt: skip
 def test_no_result_may(wrong: dict[str, Any], message: str) -> None:
     lenient = {"outcome": ["complete", "partial"], "deviation": {"outcome": ["complete", "partial"], "because": "b"}}
     verdict = evaluate(result(run(**lenient), **wrong), {})
@@ -105,21 +102,18 @@ def test_no_result_may(wrong: dict[str, Any], message: str) -> None:
     assert not verdict.ok
 
 
-@pytest.mark.parametrize(
-    ("entry", "ended", "message"),
-    [
-        ({"outcome": ["partial"]}, {}, "complete, expected partial"),
-        ({"says": "too small"}, {"outcome": "failed", "message": "no"}, "does not say 'too small'"),
-        ({"bounds": {"force_z_n": [0.1, 0.9]}}, {}, "force_z_n = 1 is not within [0.1, 0.9]"),
-        ({"bounds": {"side_ratio": [0.6, 0.9]}}, {}, "side_ratio = 0.5 is not within"),
-        ({"bounds": {"penetration_mm": [0, 0.009]}}, {}, "penetration_mm = 0.01 is not within"),
-        ({"bounds": {"weight": [0, 1]}}, {}, "weight is not measured"),
-        ({"compare": {"with": "b", "force_ratio": [1.1, 2]}}, {}, "force 1 N is 1 of b's"),
-        ({"compare": {"with": "b", "displacement": 1e-9}}, {"displacement": 0 * MESH.points}, "differs from b's by 1"),
-        ({"compare": {"with": "b", "displacement": 1}}, {"record": {"mesh": "other"}}, "another mesh"),
-        ({"compare": {"with": "c", "displacement": 1}}, {}, "cannot be compared with c, which was not run"),
-    ],
-)
+@pytest.mark.parametrize(("entry", "ended", "message"), [
+    ({"outcome": ["partial"]}, {}, "complete, expected partial"),
+    ({"says": "too small"}, {"outcome": "failed", "message": "no"}, "does not say 'too small'"),
+    ({"bounds": {"force_z_n": [0.1, 0.9]}}, {}, "force_z_n = 1 is not within [0.1, 0.9]"),
+    ({"bounds": {"side_ratio": [0.6, 0.9]}}, {}, "side_ratio = 0.5 is not within"),
+    ({"bounds": {"penetration_mm": [0, 0.009]}}, {}, "penetration_mm = 0.01 is not within"),
+    ({"bounds": {"weight": [0, 1]}}, {}, "weight is not measured"),
+    ({"compare": {"with": "b", "force_ratio": [1.1, 2]}}, {}, "force 1 N is 1 of b's"),
+    ({"compare": {"with": "b", "displacement": 1e-9}}, {"displacement": 0 * MESH.points}, "differs from b's by 1"),
+    ({"compare": {"with": "b", "displacement": 1}}, {"record": {"mesh": "other"}}, "another mesh"),
+    ({"compare": {"with": "c", "displacement": 1}}, {}, "cannot be compared with c, which was not run"),
+])  # fmt: skip
 def test_expectations_are_compared(entry: dict[str, Any], ended: dict[str, Any], message: str) -> None:
     verdict = evaluate(result(run(**entry), **ended), {"b": result()})
     assert any(message in text for text in verdict.broken), verdict.broken
@@ -152,16 +146,13 @@ def test_jacobian_of_elements_and_one_folded_at_a_corner_is_held_against_any_sta
         assert evaluate(replace(bent, run=run(deviation=excused)), {}).word == "explained"
 
 
-@pytest.mark.parametrize(
-    ("script", "budget", "outcome", "message"),
-    [
-        ("import time; time.sleep(60)", 0.7, "hung", ""),
-        ("raise RuntimeError('boom')", 30, "crashed", "exit status 1: RuntimeError: boom"),
-        ("import os; os.kill(os.getpid(), 11)", 30, "crashed", "signal 11"),
-        ("pass", 30, "crashed", "exit status 0: it said nothing"),
-        ("import sys; open(sys.argv[1] + '/result.json', 'w').write('{}'); sys.exit(3)", 30, "crashed", "status 3"),
-    ],
-)
+@pytest.mark.parametrize(("script", "budget", "outcome", "message"), [
+    ("import time; time.sleep(60)", 0.7, "hung", ""),
+    ("raise RuntimeError('boom')", 30, "crashed", "exit status 1: RuntimeError: boom"),
+    ("import os; os.kill(os.getpid(), 11)", 30, "crashed", "signal 11"),
+    ("pass", 30, "crashed", "exit status 0: it said nothing"),
+    ("import sys; open(sys.argv[1] + '/result.json', 'w').write('{}'); sys.exit(3)", 30, "crashed", "status 3"),
+])  # fmt: skip
 def test_processes_are_watched(tmp_path: Path, script: str, budget: float, outcome: str, message: str) -> None:
     asked = replace(run(), budget_s=budget)
     (tmp_path / "case").mkdir()
@@ -249,16 +240,13 @@ def test_shipped_expectations_can_be_met_and_selection_brings_partners_along() -
     assert names == ["reference", "poisson_0.499999", "poisson_0.5"]
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        (SUITE.replace('name = "hard"', 'name = "soft"'), "there are two cases 'soft'"),
-        (SUITE.replace('with = "soft"', 'with = "sfot"'), "compares with 'sfot', which is none"),
-        (SUITE.replace("says =", "say ="), "say: Extra inputs"),
-        (SUITE.replace('["refused"]', '["exploded"]'), "outcome.0: Input should be"),
-        ("elements = [", "not valid TOML"),
-    ],
-)
+@pytest.mark.parametrize(("text", "message"), [
+    (SUITE.replace('name = "hard"', 'name = "soft"'), "there are two cases 'soft'"),
+    (SUITE.replace('with = "soft"', 'with = "sfot"'), "compares with 'sfot', which is none"),
+    (SUITE.replace("says =", "say ="), "say: Extra inputs"),
+    (SUITE.replace('["refused"]', '["exploded"]'), "outcome.0: Input should be"),
+    ("elements = [", "not valid TOML"),
+])  # fmt: skip
 def test_a_wrong_file_is_refused(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / "expected.toml"
     path.write_text(text)

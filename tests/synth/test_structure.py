@@ -94,14 +94,10 @@ def test_gelflow_imports_only_from_earlier_parts() -> None:
     assert {imported for _, imported in parts} == set(ROOMS[:-1]), "a finder that sees nothing would pass always"
 
 
-@pytest.mark.parametrize(
-    ("modules", "forbidden"),
-    [
-        (SYNTH, {"gelflow", "benchmarks", "torch", "lightning", "torchmetrics"}),
-        (GELFLOW, {"synth", "benchmarks", "warp", "mitsuba", "drjit", "pytetwild", "pypardiso", "pyvista"}),
-    ],
-    ids=["synth", "gelflow"],
-)
+@pytest.mark.parametrize(("modules", "forbidden"), [
+    (SYNTH, {"gelflow", "benchmarks", "torch", "lightning", "torchmetrics"}),
+    (GELFLOW, {"synth", "benchmarks", "warp", "mitsuba", "drjit", "pytetwild", "pypardiso", "pyvista"}),
+], ids=["synth", "gelflow"])  # fmt: skip
 def test_the_two_programs_share_nothing(modules: dict[str, ast.Module], forbidden: set[str]) -> None:
     assert [pair for pair in _imports_of(modules) if pair[1].split(".")[0] in forbidden] == []
 
@@ -116,18 +112,14 @@ def _loaded_after(code: str, *arguments: str) -> set[str]:
 MAIN = "import sys\nfrom {0}.cli import main\nassert main(sys.argv[1:]) == 0"
 
 
-@pytest.mark.parametrize(
-    ("code", "arguments"),
-    [
-        ("import synth", ()),
-        ("import gelflow", ()),
-        (MAIN.format("synth"), ("--help",)),
-        (MAIN.format("synth"), ("generate", "--help")),
-        (MAIN.format("gelflow"), ("train", "--help")),
-        (MAIN.format("gelflow"), ("compare", "--help")),
-    ],
-    ids=lambda value: "" if isinstance(value, str) else " ".join(value),
-)
+@pytest.mark.parametrize(("code", "arguments"), [
+    ("import synth", ()),
+    ("import gelflow", ()),
+    (MAIN.format("synth"), ("--help",)),
+    (MAIN.format("synth"), ("generate", "--help")),
+    (MAIN.format("gelflow"), ("train", "--help")),
+    (MAIN.format("gelflow"), ("compare", "--help")),
+], ids=lambda value: "" if isinstance(value, str) else " ".join(value))  # fmt: skip
 def test_help_loads_nothing_heavy(code: str, arguments: tuple[str, ...]) -> None:
     """The reason that it answers in a fraction of a second; seconds themselves depend on the machine."""
     assert _loaded_after(code, *arguments) & HEAVY == set()

@@ -40,51 +40,45 @@ def complaint(capsys: pytest.CaptureFixture[str]) -> Run:
     return run
 
 
-@pytest.mark.parametrize(
-    ("command", "words"),
-    [
-        ("", ["generate", "plan", "simulate", "inspect", "verify", "export", "doctor", "--debug"]),
-        ("generate", ["--scene", "--n", "--out", "--seed", "--set", "--device", "--workers", "--dry-run", "--json"]),
-        ("plan", ["--scene", "--set", "--n", "--device", "--json"]),
-        ("simulate", ["--scene", "--out", "--seed", "--set", "--json"]),
-        ("inspect", ["PATH", "--png", "--html", "--json"]),
-        ("verify", ["PATH", "--json"]),
-        ("export", ["PATH", "--format", "--out"]),
-        ("doctor", ["--json"]),
-    ],
-)
+@pytest.mark.parametrize(("command", "words"), [
+    ("", ["generate", "plan", "simulate", "inspect", "verify", "export", "doctor", "--debug"]),
+    ("generate", ["--scene", "--n", "--out", "--seed", "--set", "--device", "--workers", "--dry-run", "--json"]),
+    ("plan", ["--scene", "--set", "--n", "--device", "--json"]),
+    ("simulate", ["--scene", "--out", "--seed", "--set", "--json"]),
+    ("inspect", ["PATH", "--png", "--html", "--json"]),
+    ("verify", ["PATH", "--json"]),
+    ("export", ["PATH", "--format", "--out"]),
+    ("doctor", ["--json"]),
+])  # fmt: skip
 def test_help_lists_commands_and_options(said: Run, command: str, words: list[str]) -> None:
     out = said(*command.split(), "--help")
     assert [word for word in words if word not in out] == []
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["frobnicate"], 'Unknown command "frobnicate"'),
-        (["generate", "--frobnicate"], "frobnicate"),
-        (["generate", "--n", "0"], "--n: it is '0', allowed are whole numbers from 1 on"),
-        (["generate", "--n", "many"], "--n: it is 'many'"),
-        (["generate", "--seed", "-1"], "--seed: it is '-1', allowed are whole numbers from 0 on"),
-        (["generate", "--workers", "0"], "--workers: it is '0'"),
-        (["generate", "--device", "tpu"], "tpu"),
-        (["generate", "--scene", "gelsight_mni"], "there is no scene 'gelsight_mni'"),
-        (["generate", "--set", "motion"], "--set 'motion': give key=value"),
-        (["plan", "--set", "motion.steps=3", "--set", "motion={}"], "motion undoes the earlier motion.steps"),
-        (["generate", "--set", "motion.dept_mm=1"], "motion.dept_mm: unknown key; did you mean 'depth_mm'?"),
-        (["generate", "--set", "sensor.lights.0.position_mm=[0, 0, 3]"], "between the camera and the gel"),
-        (["plan", "--set", "contact.indenter={shape='torus',radius_mm=1,tube_mm=2}"], "contact.indenter.tube_mm = 2"),
-        (["simulate", "--scene", "deltact"], "--out"),
-        (["simulate", "--out", "x"], "--scene"),
-        (["simulate", "--scene", "deltact", "--out", "x", "--index", "-1"], "--index: it is '-1'"),
-        (["inspect", "nowhere"], "nowhere: there is no such file or directory"),
-        (["inspect", ".", "--limit", "0"], "--limit: it is '0'"),
-        (["verify", "nowhere"], "nowhere: there is no such directory"),
-        (["verify", "."], "not a dataset"),
-        (["export", ".", "--format", "gif", "--out", "x"], "gif"),
-        (["export", ".", "--format", "flo", "--out", "x"], "not a dataset"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "message"), [
+    (["frobnicate"], 'Unknown command "frobnicate"'),
+    (["generate", "--frobnicate"], "frobnicate"),
+    (["generate", "--n", "0"], "--n: it is '0', allowed are whole numbers from 1 on"),
+    (["generate", "--n", "many"], "--n: it is 'many'"),
+    (["generate", "--seed", "-1"], "--seed: it is '-1', allowed are whole numbers from 0 on"),
+    (["generate", "--workers", "0"], "--workers: it is '0'"),
+    (["generate", "--device", "tpu"], "tpu"),
+    (["generate", "--scene", "gelsight_mni"], "there is no scene 'gelsight_mni'"),
+    (["generate", "--set", "motion"], "--set 'motion': give key=value"),
+    (["plan", "--set", "motion.steps=3", "--set", "motion={}"], "motion undoes the earlier motion.steps"),
+    (["generate", "--set", "motion.dept_mm=1"], "motion.dept_mm: unknown key; did you mean 'depth_mm'?"),
+    (["generate", "--set", "sensor.lights.0.position_mm=[0, 0, 3]"], "between the camera and the gel"),
+    (["plan", "--set", "contact.indenter={shape='torus',radius_mm=1,tube_mm=2}"], "contact.indenter.tube_mm = 2"),
+    (["simulate", "--scene", "deltact"], "--out"),
+    (["simulate", "--out", "x"], "--scene"),
+    (["simulate", "--scene", "deltact", "--out", "x", "--index", "-1"], "--index: it is '-1'"),
+    (["inspect", "nowhere"], "nowhere: there is no such file or directory"),
+    (["inspect", ".", "--limit", "0"], "--limit: it is '0'"),
+    (["verify", "nowhere"], "nowhere: there is no such directory"),
+    (["verify", "."], "not a dataset"),
+    (["export", ".", "--format", "gif", "--out", "x"], "gif"),
+    (["export", ".", "--format", "flo", "--out", "x"], "not a dataset"),
+])  # fmt: skip
 def test_wrong_input_is_one_message_and_status_2(complaint: Run, tmp_path, monkeypatch, arguments, message) -> None:
     monkeypatch.chdir(tmp_path)
     assert message in complaint(*arguments)
@@ -117,13 +111,10 @@ def test_plan_explains_and_predicts_and_a_dry_run_writes_nothing(said: Run, tiny
     assert list(tmp_path.iterdir()) == [tiny]
 
 
-@pytest.mark.parametrize(
-    ("width", "warning"),
-    [
-        (25.0, "motion.shear_mm = [10.0, 0.0] is more than twice the gel's thickness (2.5 mm)"),
-        (16.0, "motion.shear_mm = [10.0, 0.0] takes the indenter's centre off the pad"),
-    ],
-)
+@pytest.mark.parametrize(("width", "warning"), [
+    (25.0, "motion.shear_mm = [10.0, 0.0] is more than twice the gel's thickness (2.5 mm)"),
+    (16.0, "motion.shear_mm = [10.0, 0.0] takes the indenter's centre off the pad"),
+])  # fmt: skip
 def test_a_long_slide_is_warned_of_and_done(capsys, tiny: Path, width: float, warning: str) -> None:
     """It is unusual, not impossible; what JSON is asked for stays JSON."""
     slide = ["--set", f"sensor.gel.size_mm=[{width}, 6.0, 2.5]", "--set", "motion.shear_mm=[10.0, 0.0]"]
@@ -152,16 +143,13 @@ def test_generate_says_what_it_did_and_a_job_that_partly_fails_has_status_1(said
     assert "10 draws failed" in printed
 
 
-@pytest.mark.parametrize(
-    ("kind", "says"),
-    [
-        ("file", "is a file"),
-        ("foreign", "not a dataset: holds thesis.tex"),
-        ("another job", "seed: 0 there, 5 now"),
-        ("below a file", "NotADirectoryError"),
-        ("not writable", "cannot be written"),
-    ],
-)
+@pytest.mark.parametrize(("kind", "says"), [
+    ("file", "is a file"),
+    ("foreign", "not a dataset: holds thesis.tex"),
+    ("another job", "seed: 0 there, 5 now"),
+    ("below a file", "NotADirectoryError"),
+    ("not writable", "cannot be written"),
+])  # fmt: skip
 def test_places_that_cannot_take_the_dataset(complaint: Run, tiny, tmp_path, kind: str, says: str) -> None:
     out = tmp_path / "d"
     match kind:

@@ -150,18 +150,15 @@ def test_a_wrong_value_is_named_with_file_place_and_what_is_allowed(tiny: Path, 
     assert "\n" not in found
 
 
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("motion", "give key=value, for instance --set motion.depth_mm=1.2"),
-        ("=1", "give key=value"),
-        ("motion..depth_mm=1", "give key=value"),
-        ("sensor.lights.5.power=1", "'5' is not an entry of a list of 5 (0 is the first)"),
-        ("sensor.lights.first.power=1", "'first' is not an entry of a list of 5"),
-        ("motion.steps.more=1", "'more' lies inside a value that is not a table"),
-        ("motion.depth_mm.uniform=[0, 1]", "motion.depth_mm is a distribution; give all of it, as in --set 'motion."),
-    ],
-)
+@pytest.mark.parametrize(("override", "message"), [
+    ("motion", "give key=value, for instance --set motion.depth_mm=1.2"),
+    ("=1", "give key=value"),
+    ("motion..depth_mm=1", "give key=value"),
+    ("sensor.lights.5.power=1", "'5' is not an entry of a list of 5 (0 is the first)"),
+    ("sensor.lights.first.power=1", "'first' is not an entry of a list of 5"),
+    ("motion.steps.more=1", "'more' lies inside a value that is not a table"),
+    ("motion.depth_mm.uniform=[0, 1]", "motion.depth_mm is a distribution; give all of it, as in --set 'motion."),
+])  # fmt: skip
 def test_overrides(tiny: Path, override: str, message: str) -> None:
     assert re.match(rf"{re.escape(f'--set {override!r}: ')}.*{re.escape(message)}", _refusal(tiny, override))
 
@@ -181,17 +178,14 @@ def test_every_problem_is_told_once_on_a_short_line_as_are_missing_files(tiny: P
     assert "not valid TOML" in _refusal(tmp_path / "noise.toml")
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("name = ", "not valid TOML"),
-        ("a = 1\na = 2\n", "not valid TOML"),
-        ("", "name: is missing"),
-        ("name = 'x'\n", "sensor: is missing"),
-        (TEXT.replace('kind = "dots",', ""), "sensor.pattern: lacks the key 'kind'"),
-        (TEXT.replace("width = 32", "widht = 32"), "sensor.camera.width: is missing"),
-    ],
-)
+@pytest.mark.parametrize(("content", "message"), [
+    ("name = ", "not valid TOML"),
+    ("a = 1\na = 2\n", "not valid TOML"),
+    ("", "name: is missing"),
+    ("name = 'x'\n", "sensor: is missing"),
+    (TEXT.replace('kind = "dots",', ""), "sensor.pattern: lacks the key 'kind'"),
+    (TEXT.replace("width = 32", "widht = 32"), "sensor.camera.width: is missing"),
+])  # fmt: skip
 def test_files(tmp_path: Path, content: str, message: str) -> None:
     path = write_tiny(tmp_path, content)
     found = _refusal(path)

@@ -45,16 +45,13 @@ def test_ball_approaches_linear_theory_as_the_depth_vanishes() -> None:
     assert 0.005 < shallow - deep < 0.03
 
 
-@pytest.mark.parametrize(
-    ("element", "nu", "ratio", "cells", "tolerance"),
-    [
-        (p2p1, 0.5, 0.4, 4, 0.03),
-        (p2p1, 0.5, 1.0, 4, 0.03),
-        (p2p1, 0.5, 2.0, 4, 0.03),
-        (p2p1, 0.3, 1.0, 4, 0.03),
-        (p1p1, 0.5, 1.0, 8, 0.08),
-    ],
-)
+@pytest.mark.parametrize(("element", "nu", "ratio", "cells", "tolerance"), [
+    (p2p1, 0.5, 0.4, 4, 0.03),
+    (p2p1, 0.5, 1.0, 4, 0.03),
+    (p2p1, 0.5, 2.0, 4, 0.03),
+    (p2p1, 0.3, 1.0, 4, 0.03),
+    (p1p1, 0.5, 1.0, 8, 0.08),
+])  # fmt: skip
 def test_flat_punch_on_a_layer(element, nu, ratio, cells, tolerance) -> None:
     """A cylinder whose fillet is a four hundredth of its radius; κ = 1.7, 3.6 and 9.1 where incompressible."""
     radius, thickness = 4.0, 4.0 / ratio
