@@ -17,6 +17,8 @@ import synth.cli
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs" / "guide").glob("*.md"))]
 APPS = {"synth": synth.cli.app, "gelflow": gelflow.cli.app}
+EXAMPLES = Path(__file__).parents[1] / "examples"
+NUMBER = r"(\d+\.\d+)"
 
 
 def commands(page: Path) -> list[list[str]]:
@@ -68,10 +70,6 @@ def test_examples_in_docstrings(module: str) -> None:
     result = doctest.testmod(importlib.import_module(module))
     assert result.attempted > 0
     assert result.failed == 0
-
-
-EXAMPLES = Path(__file__).parents[1] / "examples"
-NUMBER = r"(\d+\.\d+)"
 
 
 def run(name: str, *arguments: object) -> str:

@@ -20,6 +20,8 @@ from synth.simulate.batched.pad import prepare
 from synth.simulate.batched.run import OPTIONS
 
 TINY = ["numerics.element=p1p1", "sensor.camera.width=32", "sensor.camera.height=24", "motion.steps=2"]
+PRESS: Row = {"depth_mm": 0.3, "drag_mm": 0.0, "steps": 1, "step_mm": None, "smallest_mm": 2.0, "largest_mm": 6.0}
+CASE: Row = {**PRESS, "growth": 2.0, "loose": 0.0, "reference_across": 2, "press": 0}
 
 
 def run(out: Path, *options: str) -> Row:
@@ -91,10 +93,6 @@ def test_outcomes_are_counted() -> None:
 ])  # fmt: skip
 def test_what_cannot_be_compared(options: list[str], told: str, tmp_path: Path, capsys) -> None:
     assert told in said(capsys, main, "agreement", "--out", tmp_path, *options, status=2)
-
-
-PRESS: Row = {"depth_mm": 0.3, "drag_mm": 0.0, "steps": 1, "step_mm": None, "smallest_mm": 2.0, "largest_mm": 6.0}
-CASE: Row = {**PRESS, "growth": 2.0, "loose": 0.0, "reference_across": 2, "press": 0}
 
 
 @pytest.mark.parametrize("limits", [(2.0, 6.0), (3.0, 3.5)])

@@ -18,6 +18,8 @@ from synth.render import sample_count
 from synth.render.camera_image import expected_signal
 
 FOCAL = 160.0  # px, so that the gel's edges stay out of the image
+LINEAR = small_sensor(gamma=1.0).camera
+CAMERA = small_sensor(read_noise=0.0, shot_noise=0.0, gamma=1.0).camera
 
 
 def moved(index: float, motion: tuple[float, float, float], cells: int = 12) -> View:
@@ -89,10 +91,6 @@ def test_another_size_keeps_what_the_camera_sees() -> None:
     # The vignette is quadratic; its mean over pixels of twice the width differs by (1/80)² / 4 of 1/2 at most.
     assert signals[0].mean() == pytest.approx(signals[1].mean(), abs=1e-4)
     assert small.camera.fx / small.camera.width == sensor.camera.fx / sensor.camera.width
-
-
-LINEAR = small_sensor(gamma=1.0).camera
-CAMERA = small_sensor(read_noise=0.0, shot_noise=0.0, gamma=1.0).camera
 
 
 def images(count: int, deviation: float, offset: float = 0.0, seed: int = 0) -> list[Image]:

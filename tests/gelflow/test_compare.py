@@ -22,6 +22,8 @@ from gelflow.compare.seeds import grouped
 from gelflow.compare.tables import pair_table, summary_table
 from gelflow.data import PairDataset, open_all
 
+SHIFTS = [(3.0, 4.0), (0.0, 0.5), (1.0, 0.0), (2.0, 0.0)]
+
 
 @dataclass(frozen=True)
 class Constant:
@@ -122,9 +124,6 @@ def test_where_nothing_can_be_followed_no_motion_counts_and_exact_flow_is_for_sy
     plain = PairDataset(write_folder(tmp_path / "plain", {"a": (1, 0)}))
     words = "pair a, exact flow: the pair has no exact flow; leave the method exact out"
     refused(words, evaluate, named_methods(["exact"])[0], plain)
-
-
-SHIFTS = [(3.0, 4.0), (0.0, 0.5), (1.0, 0.0), (2.0, 0.0)]
 
 
 def test_methods_are_added_and_scored_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

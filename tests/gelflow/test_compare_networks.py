@@ -35,6 +35,9 @@ from gelflow.models.weights import read_metadata
 from gelflow.train import train
 from gelflow.train.test_time import fine_tuned, fine_tuning_settings
 
+OWN = RegistrationConfig(windows_px=(8,), smoothing_px=(4,))
+CHOICES: tuple[Registration, Registration] = ("none", "brightness")
+
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -177,10 +180,6 @@ def test_fine_tuning_does_not_look_at_exact_flow_and_needs_one_size(tmp_path: Pa
     words = "64x80, 72x80 px, a batch needs one size; give --size"
     refused(words, fine_tuned, Learned(path, device="cpu"), *given)
     assert fine_tuned(Learned(path, size=(64, 80), device="cpu"), *given).path.is_file()
-
-
-OWN = RegistrationConfig(windows_px=(8,), smoothing_px=(4,))
-CHOICES: tuple[Registration, Registration] = ("none", "brightness")
 
 
 def tensor(array: np.ndarray) -> torch.Tensor:

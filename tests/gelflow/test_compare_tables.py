@@ -23,6 +23,8 @@ from gelflow.compare.tables import pair_table, strata_table, summary_table, tabl
 from gelflow.data import PairDataset
 from gelflow.files.image import read_image
 
+PITCH = 24.0
+
 
 def test_seeds_become_mean_and_standard_deviation(tmp_path: Path) -> None:
     names = ["best#0", "best#12+ft", "best", "C# code", "a#1b", "x#2#3"]
@@ -148,9 +150,6 @@ def test_bare_gels_are_left_out_of_a_second_table_of_means(tmp_path: Path) -> No
     assert cells["distance to contact edge: -4 to 0 px"] == cells["motion: 0 to 0.5 px"] == "0.250"
     assert "motion: 2 to 4 px" not in cells
     assert len([title for title, _ in tables(compare([Constant("zero", 0, 0)], dataset)) if "Means" in title]) == 1
-
-
-PITCH = 24.0
 
 
 def lattice(shift: tuple[float, float] = (0.0, 0.0)) -> PointArray:

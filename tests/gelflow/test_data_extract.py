@@ -147,9 +147,7 @@ def test_settings_out_of_range_are_refused(tmp_path: Path, videos: Path, wrong: 
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.skipif(
-    not (REAL / "clips_large_dots").is_dir(), reason="the real recordings are not beside the repository"
-)
+@pytest.mark.skipif(not (REAL / "clips_large_dots").is_dir(), reason="the real recordings are not here")
 def test_real_exposure_ramp_is_put_aside(tmp_path: Path) -> None:
     """The first frame of this recording is dark and red; no pair may contain it."""
     clip = REAL / "clips_large_dots" / "tin_box__exp_num_2__camera_0.avi"

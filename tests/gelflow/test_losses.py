@@ -20,6 +20,8 @@ from gelflow.losses.smoothness import first_order_loss, second_order_loss
 from gelflow.ops.pyramid import flow_pyramid
 from gelflow.ops.warp import inside, warp
 
+ONES = torch.ones(1, 1, 9, 11, dtype=torch.float64)
+
 
 def test_structural_similarity_follows_its_definition_and_equal_images_cost_nothing() -> None:
     first, second = torch.rand(2, 1, 1, 5, 6, dtype=torch.float64)
@@ -43,9 +45,6 @@ def test_structural_similarity_follows_its_definition_and_equal_images_cost_noth
     assert photometric_loss(image1, image2, flow[None]) < 1e-9  # an integer shift: exact but for rounding, as above
     assert appearance_loss(image1, warp(image2, flow[None]), torch.ones(1, 1, 64, 64), 0.85) > 0.01
     assert photometric_loss(image1, image2, flow[None] * 100) == 0  # nothing left to judge by
-
-
-ONES = torch.ones(1, 1, 9, 11, dtype=torch.float64)
 
 
 def affine_flow(matrix: list[list[float]], shift: tuple[float, float] = (1.5, -0.7)) -> Tensor:

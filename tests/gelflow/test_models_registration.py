@@ -22,6 +22,8 @@ from gelflow.train import train
 
 HEIGHT, WIDTH = 96, 128
 MOTION, BOTH, BRIGHTNESS = RegistrationConfig(), REGISTRATIONS["both"], REGISTRATIONS["brightness"]
+NOISE = 0.01
+SHIFT, WRONG = (3.0, -2.0), torch.tensor([9.0, 7.0]).view(2, 1, 1)
 
 
 def pair(size: float = 1.0) -> tuple[Tensor, Tensor, Tensor]:
@@ -154,10 +156,6 @@ def test_weights_keep_it_a_fine_tuning_may_switch_it_on_and_it_is_set_field_by_f
         ("smoothing_px=[1, 1, -1]", "at least 0"), ("windows_px=[3, 3, 0.5]", "at least 1"),
     ):  # fmt: skip
         refused(words, train_config, None, [f"model.registration.{assignment}"], start=start)
-
-
-NOISE = 0.01
-SHIFT, WRONG = (3.0, -2.0), torch.tensor([9.0, 7.0]).view(2, 1, 1)
 
 
 def moved_texture() -> tuple[Tensor, Tensor, Tensor]:

@@ -47,7 +47,7 @@ def test_weights_and_architecture_come_back_and_both_forms_of_the_correlation_ag
 
 
 def test_files_that_are_no_weights_are_named_and_a_failed_write_keeps_the_former_one(
-    saved: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    saved, tmp_path, monkeypatch
 ) -> None:
     for share in (0.0, 0.001, 0.5):
         (tmp_path / f"cut{share}.safetensors").write_bytes(saved.read_bytes()[: int(share * saved.stat().st_size)])
@@ -73,17 +73,14 @@ def test_files_that_are_no_weights_are_named_and_a_failed_write_keeps_the_former
     assert list(path.parent.iterdir()) == [path]
 
 
-MISFITS: list[tuple[str, list[str], str]] = [
+@pytest.mark.parametrize(("key", "values", "words"), [
     ("model", ["{", "[1]"], "do not describe a network"),
     ("model", ['{"levels": 99}'], "architecture in its metadata: levels"),
     ("model", ['{"shape": "round"}'], "shape: there is no such setting"),
     ("model", [ModelConfig(levels=4).model_dump_json()], "do not fit its architecture: estimators.1.*is missing"),
     ("model", [SMALL.model_copy(update={"projected_channels": 16}).model_dump_json()], "has shape"),
     ("image_size", ["5", "[]", '"x"', "[64]", "[64, 80.5]", "[true, 64]"], "image_size in its metadata must be null"),
-]
-
-
-@pytest.mark.parametrize(("key", "values", "words"), MISFITS)
+])  # fmt: skip
 def test_metadata_that_do_not_fit(saved: Path, tmp_path: Path, key: str, values: list[str], words: str) -> None:
     for value in values:
         save_file(load_file(saved), tmp_path / "wrong.safetensors", read_metadata(saved) | {key: value})
@@ -118,7 +115,7 @@ def dotted(side: int, flow: torch.Tensor) -> torch.Tensor:
 
 
 def test_the_shipped_network_follows_dots_that_it_has_never_seen_and_commands_take_it_by_default(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path, capsys
 ) -> None:
     flow = press_flow(240, 240, 6.0)
     for name, motion in (("a", flow), ("b", torch.zeros_like(flow))):

@@ -19,6 +19,8 @@ from gelflow.ops.pyramid import enlarge_flow, flow_pyramid, halve_flow, image_py
 from gelflow.ops.spline import SplineImage
 from gelflow.ops.warp import inside, positions, warp
 
+LIKE = torch.zeros((), dtype=torch.float64)
+
 
 def constant_flow(u: float, v: float, rows: int, columns: int) -> Tensor:
     return torch.tensor([u, v], dtype=torch.float64).view(1, 2, 1, 1).repeat(1, 1, rows, columns)
@@ -86,9 +88,6 @@ def test_the_spline_is_scipys_and_keeps_the_image_at_lowered_precision_too() -> 
         torch.testing.assert_close(warp(image, still, "spline"), image, rtol=0, atol=4e-6)
     far = warp(image, still + 100, "spline")
     torch.testing.assert_close(far, image[..., -1:, -1:].expand_as(image), rtol=0, atol=2e-6)
-
-
-LIKE = torch.zeros((), dtype=torch.float64)
 
 
 def test_window_sums_are_a_convolution_and_smoothing_a_gaussian_up_to_the_border() -> None:

@@ -27,6 +27,10 @@ from gelflow.train.module import FlowModule
 from gelflow.train.samples import checked, collate
 from gelflow.train.state import load_state
 
+EVERYTHING = {"lambda_s": [1.0, 1.0, 1.0], "occlusion": "forward_backward", "lambda_ar": 0.01}
+LOSS = LossConfig(lambda_s=(1, 1, 1))
+CONFIG = TrainConfig(model=ModelConfig(levels=4), loss=LOSS, supervision="mixed", mixed_self=3.0, device="cpu")
+
 
 @pytest.fixture(scope="module")
 def pairs() -> Shifts:
@@ -43,9 +47,6 @@ def test_the_average_follows_the_weights_and_is_what_is_kept(pairs: Shifts, tmp_
     # average_2 = 0.75 average_1 + 0.25 weights_2, one rounding each
     expected = {name: 0.75 * former + 0.25 * states[1].model[name] for name, former in states[0].average.items()}
     torch.testing.assert_close(dict(states[1].average), expected, rtol=1e-6, atol=1e-7)
-
-
-EVERYTHING = {"lambda_s": [1.0, 1.0, 1.0], "occlusion": "forward_backward", "lambda_ar": 0.01}
 
 
 def test_a_resumed_run_with_everything_on_ends_with_the_same_weights(pairs: Shifts, tmp_path: Path) -> None:
@@ -136,10 +137,6 @@ def test_sigterm_stops_a_run_as_ctrl_c_does(tmp_path: Path, send: Callable[[int,
     assert [text.count(words) for words in ("stopping after this step", "stopped; step")] == [1, 1]
     assert f"stopped; step {load_state(out).step} of 100000 is saved" in text
     assert (out / "weights.safetensors").exists()
-
-
-LOSS = LossConfig(lambda_s=(1, 1, 1))
-CONFIG = TrainConfig(model=ModelConfig(levels=4), loss=LOSS, supervision="mixed", mixed_self=3.0, device="cpu")
 
 
 def test_each_pair_counts_by_what_is_known_of_it() -> None:

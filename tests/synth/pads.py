@@ -90,25 +90,21 @@ def pad(layers: bool) -> PadMesh:
 
 def scene(size: tuple[float, float, float] = SIZE, **parts: Any) -> Scene:
     """A scene of a bare pad, P1/P1 by default. parts: gel, indenter, friction, motion, numerics as in a scene file."""
-    return Scene.model_validate(
-        {
-            "name": "pad",
-            "sensor": {
-                "gel": {"size_mm": size, "youngs_modulus_kpa": 200.0, "poisson_ratio": 0.4999, **parts.get("gel", {})},
-                "pattern": {"kind": "none"},
-                "lights": [{"position_mm": [0, 0, 0.1], "size_mm": [1, 1], "color": [1, 1, 1], "power": 1}],
-                "camera": {
-                    "width": 16, "height": 16, "fx": 9, "fy": 9, "cx": 8, "cy": 8, "position_mm": [0, 0, 90],
-                },
-            },
-            "contact": {"indenter": parts.get("indenter", SPHERE), "friction": parts.get("friction", 0.0)},
-            "motion": {"depth_mm": 0.5, "steps": 1, **parts.get("motion", {})},
-            "numerics": {
-                **({} if parts.get("gel", {}).get("layers") else {"edge_length_mm": min(size) / 4}),
-                "element": "p1p1", **parts.get("numerics", {}),
-            },
-        }
-    )  # fmt: skip
+    return Scene.model_validate({
+        "name": "pad",
+        "sensor": {
+            "gel": {"size_mm": size, "youngs_modulus_kpa": 200.0, "poisson_ratio": 0.4999, **parts.get("gel", {})},
+            "pattern": {"kind": "none"},
+            "lights": [{"position_mm": [0, 0, 0.1], "size_mm": [1, 1], "color": [1, 1, 1], "power": 1}],
+            "camera": {"width": 16, "height": 16, "fx": 9, "fy": 9, "cx": 8, "cy": 8, "position_mm": [0, 0, 90]},
+        },
+        "contact": {"indenter": parts.get("indenter", SPHERE), "friction": parts.get("friction", 0.0)},
+        "motion": {"depth_mm": 0.5, "steps": 1, **parts.get("motion", {})},
+        "numerics": {
+            **({} if parts.get("gel", {}).get("layers") else {"edge_length_mm": min(size) / 4}),
+            "element": "p1p1", **parts.get("numerics", {}),
+        },
+    })  # fmt: skip
 
 
 def gentle(**parts: Any) -> Scene:

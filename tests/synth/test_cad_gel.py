@@ -217,7 +217,7 @@ def test_a_dataset_of_files_is_verified_without_them(folder: Path, tmp_path: Pat
     assert report.ok, report
 
 
-BAD = [
+@pytest.mark.parametrize(("gel", "message"), [
     ({"outer": "none.stl"}, "there is no file"),
     ({"unit": None}, "needs outer and window and unit"),
     ({"unit": "m"}, r"outer = 'outer.stl' is 1e\+04 mm long with unit = \"m\"; other units are mm, cm, inch"),
@@ -231,10 +231,7 @@ BAD = [
     ({"size_mm": [9.0, 10.0, 7.0]}, "the files say"),
     ({"window": {"choice": ["window.stl", "above.stl"]}}, "must each name one file"),
     ({"layers": [{"thickness_mm": 0.1, "youngs_modulus_kpa": 900.0}]}, "a file is of one material"),
-]
-
-
-@pytest.mark.parametrize(("gel", "message"), BAD)
+])  # fmt: skip
 def test_bad_files_are_told_in_a_sentence(bad: Path, gel: dict[str, Any], message: str) -> None:
     refused(message, build, scene_file(bad, **gel))
 

@@ -72,14 +72,12 @@ def test_blur_is_a_normalised_gaussian_and_the_same_in_every_channel() -> None:
     np.testing.assert_array_equal(grey[:, :, 0], colour[:, :, 1])
 
 
-LENS = {"aperture_mm": 3.0, "focus_mm": 15.0}
-
-
 @needs_llvm
-@pytest.mark.parametrize(("shot_noise", "lens"), [(0.01, {}), (0.02, {}), (0.02, LENS)], ids=["fine", "coarse", "lens"])
-def test_auto_keeps_render_noise_below_a_quarter_of_the_cameras(shot_noise: float, lens: dict) -> None:
+@pytest.mark.parametrize(("shot_noise", "aperture"), [(0.01, 0.0), (0.02, 0.0), (0.02, 3.0)])
+def test_auto_keeps_render_noise_below_a_quarter_of_the_cameras(shot_noise: float, aperture: float) -> None:
     lights = tuple(Light(position_mm=(x, 1.0, 3.0), size_mm=(3, 1), color=(1, 1, 1), power=400) for x in (-7.0, 7.0))
-    sensor = small_sensor(1.45, lights=lights, gamma=2.2, shot_noise=shot_noise, bit_depth=16, **lens)
+    camera = {"aperture_mm": aperture, "focus_mm": 15.0, "shot_noise": shot_noise, "bit_depth": 16}
+    sensor = small_sensor(1.45, lights=lights, gamma=2.2, **camera)
     surface, render = flat_surface(sensor), Render(samples_per_pixel="auto", max_depth=2)
     renderer, again = (Renderer(sensor, render, surface, plain(), FAST) for _ in "12")
     first, second = (renderer.radiance(surface.material, seed) for seed in (11, 12))

@@ -33,6 +33,7 @@ from synth.simulate.system import Unknowns
 RADIUS, THICKNESS, MOVED = 4.0, 1.6, 0.3
 INNER = RADIUS - THICKNESS
 SHELL = Gel(shape="capsule", radius_mm=RADIUS, thickness_mm=THICKNESS, youngs_modulus_kpa=100.0)
+FACE = CapsuleFace(5.0, 2.0, 2.0)
 
 
 def expanded(edge_mm: float) -> tuple[float, float, float]:
@@ -135,9 +136,6 @@ def test_far_from_the_press_the_gel_is_left_out() -> None:
     still = ~found.displacement.any(axis=1)
     assert still[moved < 1e-6 * moved.max()].all()
     assert still.mean() > 0.4
-
-
-FACE = CapsuleFace(5.0, 2.0, 2.0)
 
 
 @pytest.mark.parametrize(("gel", "message"), [

@@ -21,6 +21,9 @@ from synth.dataset.sample_files import write_sample_files
 from synth.dataset.shard import Shard
 from synth.dataset.writer import DatasetWriter
 
+PAIRS = 2  # Samples 0 1 | 2 3 | 4 5: with two shards, 0 and 1 and 4 and 5 are of shard 0/2, 2 and 3 of shard 1/2
+N = 6
+
 
 def _write_all(directory: Path, order: tuple[int, ...] = (0, 1, 2)) -> None:
     write_dataset(directory, map(translation_sample, order))
@@ -180,10 +183,6 @@ def test_unreadable_datasets_are_named(tmp_path):
     info = tmp_path / "d" / "dataset.json"
     info.write_text(info.read_text().replace('"schema_version": 1', '"schema_version": 9'))
     refused("version 9 of the format", read_dataset, tmp_path / "d")
-
-
-PAIRS = 2  # Samples 0 1 | 2 3 | 4 5: with two shards, 0 and 1 and 4 and 5 are of shard 0/2, 2 and 3 of shard 1/2
-N = 6
 
 
 def _in_one_go(directory: Path) -> dict[str, object]:

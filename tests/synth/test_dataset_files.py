@@ -22,6 +22,8 @@ from synth.flow.field import FlowField
 from synth.scene import Outputs
 
 RNG = np.random.default_rng(0)
+FLOW = translation_sample(5).flow
+ATTRIBUTES: dict[str, str | int] = {"scene.hash": "abc", "seed": str(2**63), "index": 5}
 
 
 def test_png_is_rgb_for_other_readers_and_other_kinds_or_damage_are_refused(tmp_path) -> None:
@@ -77,10 +79,6 @@ def test_torn_last_line_does_not_count(tmp_path, torn):
         file.write(torn)
     table = scan_lines(path, _index)
     assert (list(table.places), table.tidy) == ([1], False)
-
-
-FLOW = translation_sample(5).flow
-ATTRIBUTES: dict[str, str | int] = {"scene.hash": "abc", "seed": str(2**63), "index": 5}
 
 
 @pytest.fixture

@@ -38,6 +38,7 @@ from synth.verify import verify_dataset
 SIZE, RADIUS = (16.0, 12.0, 8.0), 13.0
 BALL = Sphere(shape="sphere", radius_mm=3.0)
 PLATE = Box(shape="box", size_mm=(60.0, 60.0, 20.0), fillet_mm=0.5)
+YOUNG_MPA = 0.2
 
 
 def gel(radius: float | None = RADIUS, size: tuple[float, float, float] = SIZE, **more: object) -> Gel:
@@ -148,9 +149,7 @@ def test_shape_of_the_surface_at_rest() -> None:
     assert (area_vectors(surface.material, surface.triangles)[:, 2] < 0).all()
 
 
-def path(
-    indenter: object, position: tuple[float, float], depth: float, radius: float | None, **motion: object
-) -> LoadPath:
+def path(indenter: object, position: tuple, depth: float, radius: float | None, **motion: object) -> LoadPath:
     given = {"depth_mm": depth, "position_mm": position, **motion}
     return LoadPath(Motion.model_validate(given), rigid_body(indenter), radius)
 
@@ -240,12 +239,7 @@ def test_a_dome_generates_and_verifies(tmp_path: Path) -> None:
     assert np.abs(off).max() < 0.04
 
 
-YOUNG_MPA = 0.2
-
-
-def posed(
-    radius: float | None, size: tuple[float, float, float], indenter: Indenter, friction: float = 0, **motion: Any
-) -> Scene:
+def posed(radius: float | None, size: tuple, indenter: Indenter, friction: float = 0, **motion: Any) -> Scene:
     face = gel(radius, size, youngs_modulus_kpa=1e3 * YOUNG_MPA, poisson_ratio=0.5).model_dump()
     numerics = {"element": "auto", "edge_length_mm": None}
     return scene(size, gel=face, indenter=indenter.model_dump(), friction=friction, motion=motion, numerics=numerics)

@@ -22,6 +22,9 @@ from synth.simulate.resolution import ELEMENTS_ACROSS, MARGIN, graded_mesh, pred
 Pair = tuple[float, float]
 SIZE = (20.0, 15.0, 4.0)
 SPHERE = Sphere(shape="sphere", radius_mm=4.0)
+PAD = (16.0, 12.0, 4.0)
+BALL = {"shape": "sphere", "radius_mm": 4.0}
+BLOCK = {"shape": "box", "size_mm": (5.0, 4.0, 4.0), "fillet_mm": 0.8}
 
 
 def print_of(indenter: Indenter, margin: float = 0.0, folder: Path | None = None, **motion: object) -> Focus:
@@ -149,11 +152,6 @@ def test_the_slightest_touch_is_found(indenter: Indenter) -> None:
     reach = rim + np.sqrt(2 * curvature_radius * np.sqrt(3) * FINEST_MM)
     assert (np.array(focus.half_mm) <= reach).all()
     assert (np.array(focus.half_mm) >= rim).all()
-
-
-PAD = (16.0, 12.0, 4.0)
-BALL = {"shape": "sphere", "radius_mm": 4.0}
-BLOCK = {"shape": "box", "size_mm": (5.0, 4.0, 4.0), "fillet_mm": 0.8}
 
 
 def drawn(indenter: dict[str, Any], target: float | None = None, **motion: Any) -> Scene:

@@ -45,6 +45,7 @@ BATCHED = (
 SAMPLES, SEED = 10, 10  # Five trajectories of three sensors and two pads; draws of every kind fail
 
 pytestmark = pytest.mark.usefixtures("one_cache")
+GEL = Gel(size_mm=(20.0, 15.0, 4.0), youngs_modulus_kpa=200.0)
 
 
 @pytest.fixture(scope="module")
@@ -164,9 +165,6 @@ def test_items_made_ahead_come_in_order_with_errors_and_no_more_than_there_is_ro
         assert len(made) <= 5  # one taken, three in line, one in hand
     assert threading.active_count() == before
     assert len(made) <= 6
-
-
-GEL = Gel(size_mm=(20.0, 15.0, 4.0), youngs_modulus_kpa=200.0)
 
 
 def test_the_shared_mesh_is_even_and_the_predicted_error_falls_with_its_spacing(template: Template) -> None:

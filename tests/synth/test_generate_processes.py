@@ -27,6 +27,16 @@ from synth.scene.template import load_scene
 ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.usefixtures("one_cache")
 INTERRUPTED = "synth: interrupted; finished samples are kept: run the same command again to go on"
+AFTER_MESHING = """
+import os, signal, time
+from synth.mesh.tetrahedralise import tetrahedralise_box
+tetrahedralise_box((4.0, 4.0, 2.0), 2.0)
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(10)
+except KeyboardInterrupt:
+    print("interrupted")
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -138,18 +148,6 @@ def test_workers_that_die_again_and_again_are_said_in_one_line(tiny: Path, out: 
     assert words.startswith("synth: worker processes died 3 times in a row")
     assert lines(out) == 0
     assert list((out / "samples").iterdir()) == []
-
-
-AFTER_MESHING = """
-import os, signal, time
-from synth.mesh.tetrahedralise import tetrahedralise_box
-tetrahedralise_box((4.0, 4.0, 2.0), 2.0)
-try:
-    os.kill(os.getpid(), signal.SIGINT)
-    time.sleep(10)
-except KeyboardInterrupt:
-    print("interrupted")
-"""
 
 
 def test_ctrl_c_still_reaches_python_after_meshing() -> None:

@@ -27,6 +27,8 @@ from synth.inspect.panels import arrows_of
 from synth.inspect.view import View
 from synth.inspect.wheel import NO_GEL, flow_colours, robust_scale, wheel_legend
 
+SHIFTS = {0: (1.25, -0.5), 1: (-3.0, 0.3), 3: (0.01, 0.02)}
+
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
@@ -208,9 +210,6 @@ def test_arrows_can_be_seen_at_any_flow(size):
     # Spacing 2 px: at most 1.6 of it; steps 1 2 3 5 7 10 at least half of that, less 5 % for the scale's rounding.
     assert (drawn <= 1.6 * 2 + 1e-9).all()
     assert (drawn >= 0.45 * 1.6 * 2).all()
-
-
-SHIFTS = {0: (1.25, -0.5), 1: (-3.0, 0.3), 3: (0.01, 0.02)}
 
 
 @pytest.fixture(scope="module")

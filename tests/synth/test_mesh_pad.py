@@ -21,6 +21,12 @@ from synth.scene import Gel, Layer, Numerics
 
 SIZE = (7.0, 5.0, 2.5)
 EDGE = 0.6
+SOUND = brick((4.0, 3.0, 2.0), (2, 2, 2))
+GEL = Gel(size_mm=(4.0, 4.0, 3.0), youngs_modulus_kpa=200.0)
+NUMERICS = Numerics(edge_length_mm=1.5)
+WIDE = (12.0, 9.0, 3.0)
+LOW, HIGH = np.array([-6.0, -4.5, 0.0]), np.array([6.0, 4.5, 3.0])
+FOCUS = Focus((1.5, -1.0), (2.0, 1.5))
 
 
 @pytest.fixture(scope="module")
@@ -117,9 +123,6 @@ def test_repair_snaps_turns_and_drops_and_faults_are_named() -> None:
     assert "quality" in fault(flat, exact.tets)
 
 
-SOUND = brick((4.0, 3.0, 2.0), (2, 2, 2))
-
-
 def moved(corner: int, place: np.ndarray) -> PadMesh:
     points = SOUND.points.copy()
     points[SOUND.tets[0, corner]] = place
@@ -149,10 +152,6 @@ def test_sound_meshes_and_slivers_pass_but_flat_inverted_and_broken_ones_are_ref
         (replace(SOUND, points=lost), f"node {len(SOUND.points)} of the mesh belongs to no tetrahedron"),
     ):
         refused(message, check_mesh, mesh)
-
-
-GEL = Gel(size_mm=(4.0, 4.0, 3.0), youngs_modulus_kpa=200.0)
-NUMERICS = Numerics(edge_length_mm=1.5)
 
 
 @pytest.fixture
@@ -225,11 +224,6 @@ def test_key_depends_on_what_the_mesh_depends_on_only_and_on_the_default_edge() 
     for thickness, edge in ((2.0, 0.4), (4.0, 0.8), (8.0, 1.0)):
         gel = GEL.model_copy(update={"size_mm": (20.0, 20.0, thickness)})
         assert default_edge_length(gel) == pytest.approx(edge)
-
-
-WIDE = (12.0, 9.0, 3.0)
-LOW, HIGH = np.array([-6.0, -4.5, 0.0]), np.array([6.0, 4.5, 3.0])
-FOCUS = Focus((1.5, -1.0), (2.0, 1.5))
 
 
 def test_mesh_is_as_good_as_any_and_its_edges_are_small_in_the_focus_only() -> None:

@@ -20,6 +20,8 @@ FILES = sorted(FOLDER.glob("*.stl"))
 SIMPLIFICATION = 0.01
 """mm, TOLERANCE in make.py: another version of manifold3d may simplify elsewhere and move the surface by as much."""
 each_file = pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+CUBE = pv.Cube(x_length=4.0, y_length=3.0, z_length=2.0).triangulate().clean()
+CELL = 0.1
 
 
 @pytest.fixture(scope="module")
@@ -80,10 +82,6 @@ def test_script_makes_the_shipped_shape(file: Path, made: tuple[Path, Path]) -> 
         np.testing.assert_allclose(extreme(again, axis=(0, 1)), extreme(shipped, axis=(0, 1)), atol=SIMPLIFICATION)
     # A surface that moves by a distance changes the volume by at most that distance times its area.
     assert volume(again) == pytest.approx(volume(shipped), abs=SIMPLIFICATION * triangle_areas(shipped).sum())
-
-
-CUBE = pv.Cube(x_length=4.0, y_length=3.0, z_length=2.0).triangulate().clean()
-CELL = 0.1
 
 
 def saved(folder: Path, points: FloatArray, faces: np.ndarray, name: str = "object.stl") -> Path:

@@ -22,6 +22,12 @@ LENSES = {
     "fisheye": FISHEYE,
     "barrel fisheye": {**FISHEYE, "distortion": (-0.2, 0.03, 0.0, 0.0)},
 }
+CENTRES = pixel_centres().reshape(-1, 2)
+VIEWS = {
+    "sides": {"mirrors": SIDES, "distortion": LENS, "fx": 40.0, "fy": 41.0},
+    "periscope": PERISCOPE_VIEW,
+    "fisheye": {"mirrors": SIDES, **FISHEYE, "fx": 35.0, "fy": 35.0},
+}
 
 
 @pytest.mark.parametrize("index", [1.0, 1.41, 2.2])
@@ -137,14 +143,6 @@ def test_a_fisheye_lens_sees_behind_itself():
     plain, bent = _fisheye(0.0, 0.0, 0.0, 0.0), _fisheye(0.05, -0.02, 0.004, -0.0005)
     np.testing.assert_allclose(np.hypot(*((plain.project(local) - (31.7, 24.4)) / (50, 52)).T), angle, atol=1e-13)
     np.testing.assert_allclose(bent.directions(bent.project(local)), local, atol=1e-12)
-
-
-CENTRES = pixel_centres().reshape(-1, 2)
-VIEWS = {
-    "sides": {"mirrors": SIDES, "distortion": LENS, "fx": 40.0, "fy": 41.0},
-    "periscope": PERISCOPE_VIEW,
-    "fisheye": {"mirrors": SIDES, **FISHEYE, "fx": 35.0, "fy": 35.0},
-}
 
 
 @pytest.mark.parametrize("index", [1.0, 1.45])

@@ -23,6 +23,9 @@ from synth.scene import Bitmap, Coating, Sensor
 from synth.scene.template import load_scene
 
 ROWS, COLUMNS = 252, 336  # Texels of the pad of 12 x 9 mm at 7 px per mm
+WHOLE, FLOATS = cv2.imencode(".png", np.eye(50, dtype=np.uint8))[1].tobytes(), cv2.imencode(".tiff", np.ones((4, 4)))[1]
+NO_PICTURES = {"missing": None, "empty": b"", "text": b"<svg/>", "truncated": WHOLE[:-20], "float": FLOATS.tobytes()}
+BITMAP = 'sensor.pattern={ kind = "bitmap", file = "art/mine.png", width_mm = 8 }'
 
 
 def _sensor(pattern: Bitmap, coating: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Sensor:
@@ -120,10 +123,6 @@ def test_grey_with_alpha_palettes_and_turned_photographs_are_read(tmp_path: Path
     np.testing.assert_array_equal(*pictures)
 
 
-WHOLE, FLOATS = cv2.imencode(".png", np.eye(50, dtype=np.uint8))[1].tobytes(), cv2.imencode(".tiff", np.ones((4, 4)))[1]
-NO_PICTURES = {"missing": None, "empty": b"", "text": b"<svg/>", "truncated": WHOLE[:-20], "float": FLOATS.tobytes()}
-
-
 @pytest.mark.parametrize("data", NO_PICTURES.values(), ids=NO_PICTURES)
 def test_what_is_no_picture_is_refused_in_one_line(tmp_path: Path, data: bytes | None) -> None:
     path, sensor = tmp_path / "mine.png", _sensor(_bitmap("mine.png"))
@@ -133,9 +132,6 @@ def test_what_is_no_picture_is_refused_in_one_line(tmp_path: Path, data: bytes |
     line = rf"\Asensor\.pattern\.file: {re.escape(str(path))}.*{message}.*\Z"
     refused(line, albedo, sensor, np.random.default_rng(0), tmp_path)
     refused(line, check_pattern, sensor, tmp_path)
-
-
-BITMAP = 'sensor.pattern={ kind = "bitmap", file = "art/mine.png", width_mm = 8 }'
 
 
 @pytest.fixture

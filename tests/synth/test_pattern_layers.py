@@ -30,6 +30,10 @@ SHINING = Coating(reflectance=(0.6, 0.55, 0.5), roughness=0.3, metallic=0.9)
 LAMP = Light(position_mm=(5.0, 0.0, 5.5), aim_mm=(2.0, 0.0, 0.0), size_mm=(1.0, 1.0), color=(1, 0.9, 0.8), power=100)
 """The mirror image of it in the flat face is seen about 4 mm right of the middle."""
 INK = (0.05, 0.06, 0.08)
+RENDER = Render(samples_per_pixel=256, max_depth=2)
+SURFACE = sheet(24, 18, 12.0, 9.0, 2)
+REACH = 6  # px from a dot's centre within which its darkness is summed; dots have radii of 2 to 3 px
+MIRROR = Mirror(position_mm=(3.0, 0.0, 13.5), normal=(-1.0, 0.0, -0.12), size_mm=(14.0, 12.0))
 
 
 def _sensor(layer: str, coating: Coating = SHINING) -> Sensor:
@@ -135,12 +139,6 @@ def test_flow_does_not_depend_on_the_pattern(tiny: Path, tmp_path: Path) -> None
     assert not np.array_equal(samples[0].image2, samples[1].image2)
     assert_same_flow(first, second)
     np.testing.assert_equal(second.extras, first.extras)
-
-
-RENDER = Render(samples_per_pixel=256, max_depth=2)
-SURFACE = sheet(24, 18, 12.0, 9.0, 2)
-REACH = 6  # px from a dot's centre within which its darkness is summed; dots have radii of 2 to 3 px
-MIRROR = Mirror(position_mm=(3.0, 0.0, 13.5), normal=(-1.0, 0.0, -0.12), size_mm=(14.0, 12.0))
 
 
 def _dotted(mirrors: tuple[Mirror, ...] = (), **camera: object) -> Sensor:

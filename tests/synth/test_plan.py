@@ -20,6 +20,7 @@ from synth.simulate.indenter import rigid_body
 from synth.simulate.mesh_rule import DEFAULT_TARGET_PX, MeshRule
 
 LLVM, MONO, SCALAR = Variant("llvm_ad_rgb", ""), Variant("llvm_ad_mono", ""), Variant("scalar_rgb", "")
+GREY = [f"sensor.lights.{i}.color=[1, 1, 1]" for i in range(5)]
 
 
 def test_the_public_interface_plans_a_scene_and_decides_the_mesh_rule_with_its_target(tiny: Path) -> None:
@@ -75,9 +76,6 @@ def test_one_draw_that_needs_a_feature_is_enough_and_nodes_are_about_the_meshs(t
     mesh = pad_mesh(scene.sensor.gel, scene.numerics, [tmp_path / "meshes"])
     # The fit is 12 % off here and the mesher is random; promised is a factor of three in times, as nodes^1.6.
     assert predict(plan(template, LLVM)).nodes == pytest.approx(len(mesh.points), rel=0.3)
-
-
-GREY = [f"sensor.lights.{i}.color=[1, 1, 1]" for i in range(5)]
 
 
 @pytest.mark.parametrize(("overrides", "grey"), [
@@ -148,9 +146,7 @@ def _write_stl(path: Path, *, closed: bool) -> None:
     (["sampling.pairs_per_trajectory=4"], LLVM, r"pairs_per_trajectory = 4: .* at most 3"),
 ])  # fmt: skip
 @pytest.mark.filterwarnings("ignore:The VTK reader")
-def test_what_cannot_be_built_is_refused_with_the_file_and_the_field(
-    tiny: Path, overrides: list[str], variant: Variant, message: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_cannot_be_built_is_refused_with_the_file_and_the_field(tiny, overrides, variant, message, monkeypatch):
     monkeypatch.chdir(tiny.parent)
     _write_stl(tiny.parent / "closed.stl", closed=True)
     (tiny.parent / "text.stl").write_text("this is no surface")

@@ -19,6 +19,8 @@ from synth.scene import Coating, Gel, Light, Render, Sensor
 LIGHTS = tuple(Light(position_mm=(x, 1.0, 3.0), size_mm=(3, 1), color=(1, 1, 1), power=400) for x in (-7.0, 7.0))
 BLOCK = 10
 SENSOR = small_sensor(1.45, None, LIGHTS, width=40, height=30, fx=70.0, fy=70.0, cx=21.25, cy=14.25)
+INDEX, REFLECTANCE = 1.45, 0.6
+SEEDS = range(4)
 
 
 def _summed(light: Light, point: FloatArray, normal: FloatArray) -> float:
@@ -156,10 +158,6 @@ def test_a_lights_power_is_what_its_radiance_sums_to() -> None:
         assert np.cos(np.radians(angle / 2)) ** (light.narrowness + 1) == pytest.approx(0.5)
         solid = 2 * np.pi * np.sin(theta) * np.pi / 2 / 20000
         assert light.radiance[0] * 2 * 0.5 * (intensity * solid).sum() == pytest.approx(7, rel=1e-6)
-
-
-INDEX, REFLECTANCE = 1.45, 0.6
-SEEDS = range(4)
 
 
 def _sensor() -> Sensor:

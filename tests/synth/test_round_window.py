@@ -34,6 +34,9 @@ SHAPES = {
     "dense": RoundWindow(2.5, INNER, RADIUS, np.inf),
 }
 EYES = np.array([(0.0, 0.0, 13.0), (2.5, -3.0, 14.0), (0.0, 8.7, 12.5)])
+CHART = RoundChart(RADIUS, RADIUS + LENGTH)
+DOTS = Dots(kind="dots", spacing_mm=(4.2, 3.0), radius_mm=0.35, softness_mm=0.0, placing="spherical")
+FACE = capsule(2.7)
 
 
 def _directions(n: int) -> np.ndarray:
@@ -158,11 +161,6 @@ def test_a_cylinder_is_open_at_its_ends_and_what_is_in_air_is_seen_straight():
 def test_what_does_not_fit_a_round_window_is_named(window, camera, words):
     with pytest.raises(ValueError, match=words):
         sensor(window, **camera)
-
-
-CHART = RoundChart(RADIUS, RADIUS + LENGTH)
-DOTS = Dots(kind="dots", spacing_mm=(4.2, 3.0), radius_mm=0.35, softness_mm=0.0, placing="spherical")
-FACE = capsule(2.7)
 
 
 def _texels(count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -28,6 +28,7 @@ NAMES = [*WIDE, *OPTICAL, "gelsight_fingertip"]
 ROUND = {"allsight": 0.8, "densetact": 0.95, "omnitact": 1.0}  # Share of an image that shows gel
 CAMERAS = {"gelstereo": ["right"], "omnitact": ["east", "west", "south", "north"]}
 PATHS = {"gelslim": {1}, "tac3d": {0, 1, 2}}
+ANY = 'contact.indenter={ shape = "mesh", file = "objects/*.stl", rotation_deg = "any" }'
 
 
 def _draws(name: str, count: int) -> list[Scene]:
@@ -134,9 +135,6 @@ def test_the_stereo_pair_sees_height() -> None:
     # 1 mm under the window is 1 / 1.41 mm of apparent height; base 12 mm, distance 29.4 mm, f = 316 px: 3.1 px, for
     # rays along the axis. The cameras look 10 degrees askew: the cosine's square, and as much again from Snell's law.
     np.testing.assert_allclose(disparity[1] - disparity[0], 316 * 12 / 1.41 / 29.4**2, rtol=0.08)
-
-
-ANY = 'contact.indenter={ shape = "mesh", file = "objects/*.stl", rotation_deg = "any" }'
 
 
 @pytest.fixture

@@ -19,6 +19,7 @@ from synth.simulate.system import System
 MESH, FINE = brick(), brick(counts=(8, 6, 3))
 TOLERANCE = 1e-6
 each = pytest.mark.parametrize("element", MIXED)
+FRICTION, RADIUS, CONTACT, FAR = 0.5, 20.0, 1.0, 12.0
 
 
 def touch(stepper: Stepper) -> SimpleNamespace:
@@ -161,9 +162,6 @@ def test_friction_converges_with_the_step(element: str) -> None:
     # First order: steps of 0.2, 0.05 and 0.0125 mm, of which 0.05 has a fifth of the error of 0.2; half leaves room.
     assert abs(middle - fine) < 0.5 * abs(coarse - fine) + 1e-3 * fine
     assert coarse == pytest.approx(fine, rel=0.02)
-
-
-FRICTION, RADIUS, CONTACT, FAR = 0.5, 20.0, 1.0, 12.0
 
 
 def test_partial_slip_is_mindlins() -> None:

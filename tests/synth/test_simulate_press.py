@@ -20,6 +20,7 @@ from synth.simulate.solve import check_shared
 MESH = brick()
 TOLERANCE = 1e-6
 each = pytest.mark.parametrize("element", MIXED)
+RING = {"shape": "torus", "radius_mm": 1.2, "tube_mm": 0.8, "rotation_deg": [8.0, 0.0, 0.0]}
 
 
 @cache
@@ -201,9 +202,6 @@ def test_scipy_and_pardiso_agree(monkeypatch: pytest.MonkeyPatch) -> None:
         close = 2e-3 if friction else 10 * TOLERANCE
         np.testing.assert_allclose(slow.force_n, fast.force_n, rtol=close, atol=1e-8)
         np.testing.assert_allclose(slow.displacement, fast.displacement, atol=close)
-
-
-RING = {"shape": "torus", "radius_mm": 1.2, "tube_mm": 0.8, "rotation_deg": [8.0, 0.0, 0.0]}
 
 
 def case(element: str, friction: float, motion: dict, size: tuple = SIZE, **parts: object) -> Scene:

@@ -29,6 +29,10 @@ BETWEEN = stepping.MULTIPLIER_TOLERANCE * TOLERANCE
 POLISHES = {"before the passes": (2e-3, BETWEEN), "after a pass": (0.06, TOLERANCE), "for no pass": (np.inf, TOLERANCE)}
 """stepping.PENETRATION, and a polish's tolerance: the ball is 0.08 of its depth inside, after a pass less than 0.06."""
 each = pytest.mark.parametrize("polish", list(POLISHES))
+PRESSED = 0.3  # mm of depth, in one go
+PAD = brick(SIZE, (4, 4, 2))
+EXACT = 1e-9
+STRICT_WAY, LOOSE_WAY = (SolverOptions(relaxed_tolerance=loose, forcing=1e-3) for loose in (0.0, 1e-2))
 
 
 def pressed(friction: float = 0.5, steps: int = 2) -> Scene:
@@ -137,11 +141,6 @@ def test_relaxed_steps_end_where_tight_ones_do_and_save_iterations() -> None:
     assert max(tight, unpredicted) < plain
 
 
-PRESSED = 0.3  # mm of depth, in one go
-PAD = brick(SIZE, (4, 4, 2))
-EXACT = 1e-9
-
-
 @pytest.fixture(scope="module")
 def body() -> System:
     return system(PAD, 0.49)
@@ -197,9 +196,6 @@ def test_double_factor_solves_to_double_precision() -> None:
     left = upper @ solution + upper.T @ solution - upper.diagonal() * solution + right
     # A backward stable solve leaves some 1e-16 of |K| |x|, which at a Poisson ratio of 0.4999 is 1e4 times |r|.
     assert np.linalg.norm(left) < 1e-10 * np.linalg.norm(right)
-
-
-STRICT_WAY, LOOSE_WAY = (SolverOptions(relaxed_tolerance=loose, forcing=1e-3) for loose in (0.0, 1e-2))
 
 
 def dragged(penalty: float = 50.0, depth_mm: float = 0.6, steps: int = 2) -> Scene:

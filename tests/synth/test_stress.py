@@ -22,6 +22,8 @@ from synth.stress.worker import write_surface
 
 MESH = brick()
 STRETCH = np.diag([0.9, 0.95, 1.1])  # A deformation that any check must pass: det F = 0.94
+FIRST, *OTHERS = MESH.tets[0]
+BEYOND = 2 * (MESH.points[OTHERS].mean(axis=0) - MESH.points[FIRST])  # Turns the first tetrahedron over
 
 
 def run(**fields: Any) -> Run:
@@ -54,10 +56,6 @@ def moved(node: int, by: Any) -> np.ndarray:
     displacement = np.zeros_like(MESH.points)
     displacement[node] = by
     return displacement
-
-
-FIRST, *OTHERS = MESH.tets[0]
-BEYOND = 2 * (MESH.points[OTHERS].mean(axis=0) - MESH.points[FIRST])  # Turns the first tetrahedron over
 
 
 def test_sound_results_are_as_expected_and_deviations_accepted_only_as_noted() -> None:

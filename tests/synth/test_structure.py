@@ -25,6 +25,7 @@ HEAVY = {
     "numpy", "scipy", "pydantic", "mitsuba", "drjit", "warp", "pytetwild", "pyvista", "vtk", "vtkmodules", "cv2", "ray",
     "matplotlib", "torch", "lightning", "torchmetrics", "OpenEXR", "skimage", "pypardiso", "fsspec", "tensorboard",
 }  # fmt: skip
+MAIN = "import sys\nfrom {0}.cli import main\nassert main(sys.argv[1:]) == 0"
 
 
 def _modules(package: str) -> dict[str, ast.Module]:
@@ -107,9 +108,6 @@ def _loaded_after(code: str, *arguments: str) -> set[str]:
     command = [sys.executable, "-c", code + report, *arguments]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     return set(done.stderr.rpartition("LOADED ")[2].split())
-
-
-MAIN = "import sys\nfrom {0}.cli import main\nassert main(sys.argv[1:]) == 0"
 
 
 @pytest.mark.parametrize(("code", "arguments"), [

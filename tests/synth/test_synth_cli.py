@@ -17,6 +17,10 @@ from synth.cli import main
 pytestmark = pytest.mark.usefixtures("one_cache")
 
 Run = Callable[..., str]
+STEP = {
+    "depth_mm", "shear_mm", "twist_deg", "force_n", "torque_nmm", "converged", "newton_iterations", "residual",
+    "min_jacobian", "max_penetration_mm", "slip_ratio",
+}  # fmt: skip
 
 
 @pytest.fixture
@@ -172,12 +176,6 @@ def test_places_that_cannot_take_the_dataset(complaint: Run, tiny, tmp_path, kin
     assert before == tree(tmp_path)
 
 
-STEP = {
-    "depth_mm", "shear_mm", "twist_deg", "force_n", "torque_nmm", "converged", "newton_iterations", "residual",
-    "min_jacobian", "max_penetration_mm", "slip_ratio",
-}  # fmt: skip
-
-
 def test_simulate_writes_the_trajectory_of_the_contract(said: Run, tiny: Path, tmp_path: Path) -> None:
     import pyvista as pv
 
@@ -211,7 +209,7 @@ def test_simulate_writes_the_trajectory_of_the_contract(said: Run, tiny: Path, t
 
 
 def test_simulate_prints_a_table_and_how_far_it_is_and_replaces_its_own_files(
-    capsys, tiny: Path, tmp_path: Path, monkeypatch
+    capsys, tiny, tmp_path, monkeypatch
 ) -> None:
     monkeypatch.setattr("synth.progress.LINE_S", 0.0)
     motion = ["--set", "motion.depth_mm=0.2", "--set", "motion.steps=5"]

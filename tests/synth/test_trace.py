@@ -10,6 +10,7 @@ from synth.flow.trace import trace
 from synth.flow.view import View
 
 RNG = np.random.default_rng(5)
+SURFACE = sheet(28, 21, 40.0, 30.0)
 
 
 def _rough(subdivisions: int = 1) -> tuple[np.ndarray, np.ndarray]:
@@ -77,9 +78,6 @@ def test_rays_through_grid_lines_of_a_flat_sheet_beside_it_and_away_from_it() ->
     directions = np.array([[0, 0, -1.0], [np.nan] * 3, [0, 0, -1.0], [0, 0, -1.0], [0, 0, 1.0]])
     hits = trace(surface.material, surface.triangles, origins, directions)
     np.testing.assert_array_equal(hits.triangle >= 0, [1, 0, 0, 0, 0])
-
-
-SURFACE = sheet(28, 21, 40.0, 30.0)
 
 
 def _bump(height: float, radius: float, steep: float) -> np.ndarray:

@@ -17,6 +17,11 @@ from synth.simulate.element import p1p1, p2p1
 
 LINEAR = 0.005
 """Depth over thickness; finite strain changes the force by some 0.2 % there (see the vanishing depth below)."""
+PUNCH = {0.2: 1.281, 0.4: 1.684, 0.6: 2.213, 0.8: 2.860, 1.0: 3.619, 1.5: 6.003, 2.0: 9.149}
+"""κ(a/h) of an incompressible layer: Lebedev & Ufliand (1958), Hayes et al. (1972)."""
+RADIUS, FILLET, CELL = 2.0, 0.12, 0.04
+NU, DEPTH = 0.5, 0.005  # Depth over thickness; the layer is linear there
+POINTS = 400
 
 
 @pytest.mark.parametrize(
@@ -81,18 +86,9 @@ def test_hertz_for_a_thick_pad(nu: float) -> None:
     assert force / hertz == pytest.approx(window, rel=0.02)
 
 
-PUNCH = {0.2: 1.281, 0.4: 1.684, 0.6: 2.213, 0.8: 2.860, 1.0: 3.619, 1.5: 6.003, 2.0: 9.149}
-"""κ(a/h) of an incompressible layer: Lebedev & Ufliand (1958), Hayes et al. (1972)."""
-
-
 @pytest.mark.parametrize("ratio", PUNCH)
 def test_flat_punch_is_as_tabulated(ratio: float) -> None:
     assert kappa(3.0 * ratio, 3.0) == pytest.approx(PUNCH[ratio], abs=5e-4)  # the table's last digit
-
-
-RADIUS, FILLET, CELL = 2.0, 0.12, 0.04
-NU, DEPTH = 0.5, 0.005  # Depth over thickness; the layer is linear there
-POINTS = 400
 
 
 def punch_on_a_layer(flat: float, fillet: float, depth: float, thickness: float) -> float:

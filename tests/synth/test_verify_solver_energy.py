@@ -24,6 +24,10 @@ from synth.simulate.space import Space, function_space
 from synth.simulate.stepping import Stepper
 from synth.simulate.system import System, Unknowns
 
+PRESS = {"depth_mm": 0.8}
+DRAG = {"depth_mm": 0.8, "shear_mm": [1.2, 0.3]}
+TWIST = {"depth_mm": 0.8, "shear_mm": [0.3, 0.2], "twist_deg": 40.0}
+
 
 @dataclass
 class Account:
@@ -84,11 +88,6 @@ def accounted(scene: Scene, mesh: PadMesh) -> Account:
     return ledger.account
 
 
-PRESS = {"depth_mm": 0.8}
-DRAG = {"depth_mm": 0.8, "shear_mm": [1.2, 0.3]}
-TWIST = {"depth_mm": 0.8, "shear_mm": [0.3, 0.2], "twist_deg": 40.0}
-
-
 def landing(mesh: PadMesh, element: str) -> tuple[float, float]:
     """The contact point nearest to the pad's middle: there the ball touches from the start of its way."""
     shape = ELEMENT[element]().face_barycentric
@@ -98,9 +97,7 @@ def landing(mesh: PadMesh, element: str) -> tuple[float, float]:
     return float(x), float(y)
 
 
-def account(
-    element: str, steps: int, motion: dict, friction: float = 0.0, layers: bool = False, nu: float = 0.4999
-) -> Account:
+def account(element: str, steps: int, motion: dict, friction=0.0, layers=False, nu=0.4999) -> Account:
     mesh = pad(layers)
     case = scene(
         SIZE,
