@@ -97,7 +97,7 @@ def test_a_box_and_a_dome_agree_with_their_files(tmp_path: Path, dome_mm: float 
     own["numerics"], own["sensor"]["camera"] = {"target_error_px": TARGET_PX}, CAMERA
     own["sensor"]["gel"] |= {"shape": "dome", "dome_radius_mm": dome_mm} if dome_mm else {}
     built_in = Scene.model_validate_json(json.dumps(own))
-    own["numerics"] = {"edge_length_mm": 0.8}
+    own["numerics"] = {"edge_length_mm": 1.0}
     given = from_files(Scene.model_validate_json(json.dumps(own)), tmp_path)
     assert given.sensor.gel.size_mm == (10.0, 8.0, 4.0 + deep)
     assert given.sensor.gel.thickness_mm == 4.0

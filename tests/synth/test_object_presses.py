@@ -64,14 +64,15 @@ def test_a_cube_is_the_block_of_its_fillet(folder: Path, monkeypatch, turned: tu
 
 def test_an_object_is_no_deeper_in_the_gel_than_allowed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On the CPU and by the batched solver, with contacts so soft that two updates of the multipliers do not do."""
+    mesh = graded_box(SIZE, Focus((0.0, 0.0), (2.0, 2.0)), Counts((3, 3), (1, 1), 2))
 
     def soft(penalty: float) -> Press:
         drawn = pressed(cube())
         numerics = drawn.numerics.model_copy(update={"penalty": penalty})
-        return Press.of(drawn.model_copy(update={"numerics": numerics}), MESH, folder)
+        return Press.of(drawn.model_copy(update={"numerics": numerics}), mesh, folder)
 
     def both(press: Press) -> list[Trajectory]:
-        return [simulate_press(press), *dict(simulate_presses([press], prepare(press.scene, MESH, "cpu"))).values()]
+        return [simulate_press(press), *dict(simulate_presses([press], prepare(press.scene, mesh, "cpu"))).values()]
 
     found, allowed = both(soft(15.0)), stepping.MAX_PENETRATION * DEPTH
     for trajectory in found:

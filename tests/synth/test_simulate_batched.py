@@ -84,11 +84,12 @@ def test_company_order_and_lost_samples_change_no_bit() -> None:
     for i, result in zip(order, simulate_scenes([scenes[i] for i in order], MESH, batch=2), strict=True):
         assert same(result, given[i])
     numerics = {"edge_length_mm": 0.1, "max_step_mm": 0.5}
-    lost = scene(indenter=WIRE, friction=0.2, motion={"depth_mm": 3.3, "steps": 8}, numerics=numerics)
+    lost = scene(indenter=WIRE, friction=0.2, motion={"depth_mm": 3.3, "steps": 4}, numerics=numerics)
     good = scene(friction=0.4, motion={"depth_mm": 0.4}, numerics=numerics)
-    first, second = simulate_scenes([lost, good], MESH)
+    thin = brick(counts=(4, 4, 1))
+    first, second = simulate_scenes([lost, good], thin)
     assert (first.status, "did not converge" in first.reason) == ("partial", True)
-    assert same(second, simulate_scenes([good], MESH)[0])
+    assert same(second, simulate_scenes([good], thin)[0])
 
 
 def test_indenters_that_find_no_point_are_told_apart_and_grids_may_be_unequal(tmp_path: Path) -> None:
