@@ -1,7 +1,4 @@
-"""README, guide, docstrings and examples: links lead somewhere, commands are known, programs give what they say.
-
-The programs in examples/ run as their first lines say, on fewer pairs, and each leaves or prints its result.
-"""
+"""README, guide, docstrings and examples: links lead somewhere, commands are known, programs give what they say."""
 
 import doctest
 import importlib
@@ -20,6 +17,8 @@ import synth.cli
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs" / "guide").glob("*.md"))]
 APPS = {"synth": synth.cli.app, "gelflow": gelflow.cli.app}
+EXAMPLES = Path(__file__).parents[1] / "examples"
+NUMBER = r"(\d+\.\d+)"
 
 
 def commands(page: Path) -> list[list[str]]:
@@ -73,12 +72,7 @@ def test_examples_in_docstrings(module: str) -> None:
     assert result.failed == 0
 
 
-EXAMPLES = Path(__file__).parents[1] / "examples"
-NUMBER = r"(\d+\.\d+)"
-
-
 def run(name: str, *arguments: object) -> str:
-    """What an example prints; it finds the packages of this checkout."""
     environment = os.environ | {"PYTHONPATH": str(EXAMPLES.parent)}
     command = [sys.executable, str(EXAMPLES / name), *map(str, arguments)]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
@@ -87,7 +81,6 @@ def run(name: str, *arguments: object) -> str:
 
 
 def found(pattern: str, text: str) -> list[float]:
-    """The numbers of a line that must be there."""
     match = re.search(pattern, text)
     assert match, text
     return [float(group) for group in match.groups()]
@@ -95,7 +88,6 @@ def found(pattern: str, text: str) -> list[float]:
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two pairs that the first example makes."""
     out = tmp_path_factory.mktemp("examples") / "ten"
     printed = run("make_pairs.py", "--n", 2, "--out", out)
     assert found(rf"largest motion {NUMBER} px", printed)[0] > 1
@@ -106,8 +98,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_examples_are_short() -> None:
     programs = sorted(EXAMPLES.glob("*.py"))
     assert len(programs) == 6
-    assert {program.name: len(program.read_text().splitlines()) for program in programs if
-            len(program.read_text().splitlines()) > 40} == {}  # fmt: skip
+    assert [program.name for program in programs if len(program.read_text().splitlines()) > 40] == []
 
 
 def test_read_exr(dataset: Path) -> None:

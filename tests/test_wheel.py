@@ -20,9 +20,8 @@ pytestmark = pytest.mark.slow
 def run(folder: Path, *words: object) -> str:
     """Run a command in a folder, without the checkout on its path; what it printed. Only the programs may speak."""
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-    done = subprocess.run(
-        list(map(str, words)), cwd=folder, env=environment, capture_output=True, text=True, check=False
-    )
+    command = list(map(str, words))
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     noise = [line for line in done.stderr.splitlines() if not line.startswith(("synth: ", "gelflow: "))]  # progress
     assert (done.returncode, noise) == (0, []), done.stderr
     return done.stdout

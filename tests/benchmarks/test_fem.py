@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import said
 
 from benchmarks import fem
 from benchmarks.fem import CASES, PLAIN, PX_PER_MM, Setting, errors, mark_best, mesh_of, press, settings_of, stepper_of
@@ -25,7 +26,6 @@ def shallow() -> Trajectory:
 
 @pytest.fixture
 def one_case(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The shallow press as a case of the benchmark, of which the last state counts."""
     monkeypatch.setitem(fem.CASES, "shallow", SHALLOW)
     monkeypatch.setitem(fem.COUNTED, "shallow", [1])
 
@@ -67,7 +67,7 @@ def test_the_command(one_case: None, tmp_path: Path, monkeypatch, capsys: pytest
     reference = stepper_of(SHALLOW, mesh_of(wide.mesh, SHALLOW), wide).run()
     monkeypatch.setattr(fem, "settings_of", lambda every, across: {"shallow": ways})
     monkeypatch.setattr(fem, "reference", lambda case, across: reference)
-    assert fem.main(["--out", str(tmp_path)]) == 0
+    assert "graded 4 2" in said(capsys, fem.main, "--out", tmp_path)
     rows = plain, coarse, fine = read(tmp_path / "fem.csv")
     assert {row["status"] for row in rows} == {"complete"}
     assert min(row["seconds"] for row in rows) > 0
@@ -77,7 +77,6 @@ def test_the_command(one_case: None, tmp_path: Path, monkeypatch, capsys: pytest
     for name in ("displacement_percent", "force_percent"):
         assert plain[name] == pytest.approx(coarse[name], rel=1e-3)
     assert (tmp_path / "fem.png").read_bytes().startswith(b"\x89PNG")
-    assert "graded 4 2" in capsys.readouterr().out
     monkeypatch.setattr(fem, "press", lambda case, settings: pytest.fail(str(case)))  # all rows are there
     assert fem.main(["--out", str(tmp_path)]) == 0
 

@@ -9,7 +9,7 @@ from render_scenes import flat_surface, plain, small_sensor
 from benchmarks.flow import derived, method_row
 from benchmarks.flow_change import Truth, changes, jackknife
 from benchmarks.flow_methods import METHODS, SHIPPED, fitted_pinhole, is_inside
-from benchmarks.image_error import Halves, camera_noise, errors, reference_noise
+from benchmarks.image_error import camera_noise, errors, reference_noise
 from benchmarks.pressed_gel import View, main_camera
 from benchmarks.render import others
 from benchmarks.rows import Row
@@ -18,6 +18,8 @@ from synth.render import camera_image
 from synth.render.camera_image import expected_signal
 
 FOCAL = 160.0  # px, so that the gel's edges stay out of the image
+LINEAR = small_sensor(gamma=1.0).camera
+CAMERA = small_sensor(read_noise=0.0, shot_noise=0.0, gamma=1.0).camera
 
 
 def moved(index: float, motion: tuple[float, float, float], cells: int = 12) -> View:
@@ -54,10 +56,9 @@ def test_what_a_camera_without_perspective_misses() -> None:
 
 
 def test_the_fitted_pinhole_is_the_paraxial_one_and_refraction_left_out_a_scale() -> None:
-    """Apparent depth: 14 mm of air and 6 mm of gel at n = 1.45 look like 14 + 6 / 1.45. Off the axis the last term, 23
-    % of the depth, differs by (1 - 1 / n²) tan² / 2: 0.7 % of the depth at the corners, less in the mean.
-    """
+    """Apparent depth: 14 mm of air and 6 mm of gel at n = 1.45 look like 14 + 6 / 1.45."""
     camera = fitted_pinhole(moved(1.45, (0, 0, 0))).camera
+    # Off the axis the last term differs by (1 - 1 / n²) tan² / 2: 0.7 % of the depth at the corners.
     assert camera.fx / FOCAL == pytest.approx(20 / (14 + 6 / 1.45), rel=0.007)
     assert camera.fy / camera.fx == pytest.approx(1, rel=1e-12)
     # Seen straight from above a translation is scaled by the ratio of the apparent depths.
@@ -92,24 +93,14 @@ def test_another_size_keeps_what_the_camera_sees() -> None:
     assert small.camera.fx / small.camera.width == sensor.camera.fx / sensor.camera.width
 
 
-LINEAR = small_sensor(gamma=1.0).camera
-
-
 def images(count: int, deviation: float, offset: float = 0.0, seed: int = 0) -> list[Image]:
-    """Images of 0.25 with independent Gaussian noise in every value."""
-    rng = np.random.default_rng(seed)
-    shape = (60, 80, 3)
-    return [(0.25 + offset + deviation * rng.standard_normal(shape)).astype(np.float32) for _ in range(count)]
-
-
-def halves(deviation: float, seed: int) -> Halves:
-    first, second = images(2, deviation, seed=seed)
-    return first, second
+    noise = deviation * np.random.default_rng(seed).standard_normal((count, 60, 80, 3))
+    return list((0.25 + offset + noise).astype(np.float32))
 
 
 def test_errors_of_known_images() -> None:
     """Noise 0.01 in the images, 0.008 in each half of the reference, an offset of 0.004, full scale 255 levels."""
-    reference = halves(0.008, 1)
+    reference = images(2, 0.008, seed=1)
     found = errors(images(4, 0.01, 0.004), reference, LINEAR)
     # 14400 values: a standard deviation is known within 1 / sqrt(2 · 14400) = 0.6 %, here of several; 4 times that.
     assert found["noise"] == pytest.approx(2.55, rel=0.024)
@@ -127,7 +118,7 @@ def test_errors_of_known_images() -> None:
 def test_standard_errors_hold_where_nothing_is_systematic(blur_px: float) -> None:
     """Of 60 made-up settings without offset the scores must scatter as their standard errors say."""
     camera = LINEAR.model_copy(update={"blur_px": blur_px})
-    found = [errors(images(3, 0.01, seed=k), halves(0.01, 1000 + k), camera) for k in range(60)]
+    found = [errors(images(3, 0.01, seed=k), images(2, 0.01, seed=1000 + k), camera) for k in range(60)]
     # A standard deviation of 60 scores: within 1 ± 4 / sqrt(120).
     assert np.std([one["bias_percent"] / one["bias_se_percent"] for one in found]) == pytest.approx(1, abs=0.37)
     # Channels count as one though they are three: the limit is at 2 sqrt(3) standard errors, 0.03 % of the cases.
@@ -147,9 +138,6 @@ def test_camera_noise_is_the_models_and_the_same_on_both_pairs() -> None:
     assert found["difference_px"] == found["change_px"] == 0
     assert found["error_px"] > 0
     assert np.isnan(found["change_se_px"])  # one pair has no spread
-
-
-CAMERA = small_sensor(read_noise=0.0, shot_noise=0.0, gamma=1.0).camera
 
 
 class Brightness:

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from commands import said
 from PIL import Image
 from render_scenes import needs_llvm
 from tiny_scene import TEXT, own_cache, write_tiny
@@ -15,8 +16,7 @@ from benchmarks.render import DEEPEST, settings
 from benchmarks.rows import Row, read
 from benchmarks.scale import at_size, rates
 
-NOISY = TEXT.replace("read_noise = 0.002", "read_noise = 0.1")
-"""A camera so noisy that "auto" needs few samples."""
+NOISY = TEXT.replace("read_noise = 0.002", "read_noise = 0.1")  # A camera so noisy that "auto" needs few samples
 
 
 @pytest.fixture(autouse=True)
@@ -103,8 +103,8 @@ def test_light(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "path_tracing_s" in capsys.readouterr().out
     (tmp_path / "shining").mkdir()
     shining = write_tiny(tmp_path / "shining", NOISY + "\n[sensor.coating]\nroughness = 0.5\n")
-    assert main(["light", str(shining), "--device", "cpu", "--out", str(tmp_path / "other")]) == 2
-    assert "needs a matt coating" in capsys.readouterr().err
+    refusal = said(capsys, main, "light", shining, "--device", "cpu", "--out", tmp_path / "other", status=2)
+    assert "needs a matt coating" in refusal
 
 
 def test_flow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,7 +128,6 @@ def test_round_gel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_scale(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """No touch: no solve, all else real."""
     command = ["scale", "--scene", str(write_tiny(tmp_path)), "--n", "4", "--size", "32x24", "--workers", "1"]
     ((alone, row),) = again([*command, "--set", "motion.depth_mm=-1.0"], tmp_path / "out", "scale.csv")
     assert (alone["workers"], alone["pairs"], row["workers"], row["pairs"]) == (0, 8, 1, 8)
@@ -144,9 +143,8 @@ def test_scale(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_another_size_keeps_the_field_of_view(tmp_path: Path) -> None:
     scene = str(write_tiny(tmp_path))
-    before, after = (
-        at_size(scene, ["sensor.camera.cy=9.0"], *size).corners[0].sensor.camera for size in ((32, 24), (64, 36))
-    )
+    templates = (at_size(scene, ["sensor.camera.cy=9.0"], *size) for size in ((32, 24), (64, 36)))
+    before, after = (template.corners[0].sensor.camera for template in templates)
     assert (after.width, after.height) == (64, 36)
     # Half the image over the focal length is the tangent of half the angle; written with 6 decimals.
     assert after.width / after.fx == pytest.approx(before.width / before.fx, rel=1e-7)
@@ -154,19 +152,15 @@ def test_another_size_keeps_the_field_of_view(tmp_path: Path) -> None:
     assert after.cy / after.height == pytest.approx(9 / 24, rel=1e-7)  # of the scene that was changed
 
 
-@pytest.mark.parametrize(
-    ("command", "message"),
-    [
-        (["scale", "--size", "640"], "--size 640: give WIDTHxHEIGHT"),
-        (["scale", "--workers", "-1"], "--workers: give whole numbers from 1 on"),
-        (["scale", "--set", "motion.dept_mm=1"], "motion.dept_mm: unknown key"),
-        (["render", "--seeds", "2"], "--seeds 2: the standard error of the flow's change needs at least 3"),
-        (["render", "--scene", "nowhere"], "nowhere"),
-    ],
-)
+@pytest.mark.parametrize(("command", "message"), [
+    (["scale", "--size", "640"], "--size 640: give WIDTHxHEIGHT"),
+    (["scale", "--workers", "-1"], "--workers: give whole numbers from 1 on"),
+    (["scale", "--set", "motion.dept_mm=1"], "motion.dept_mm: unknown key"),
+    (["render", "--seeds", "2"], "--seeds 2: the standard error of the flow's change needs at least 3"),
+    (["render", "--scene", "nowhere"], "nowhere"),
+])  # fmt: skip
 def test_wrong_arguments(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: list[str], message: str) -> None:
-    assert main([*command, "--out", str(tmp_path / "out")]) == 2
-    assert message in capsys.readouterr().err
+    assert message in said(capsys, main, *command, "--out", tmp_path / "out", status=2)
 
 
 def test_pictures_of_two_data_sets(tmp_path: Path) -> None:

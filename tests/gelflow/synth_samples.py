@@ -1,14 +1,12 @@
 """Samples as synth writes them, without simulation: moving waves, random flow and visibility beside them."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-from samples import job, translation_sample
+from samples import translation_sample
 from textures import moved
 
 from synth.dataset.sample import Sample
-from synth.dataset.writer import DatasetWriter
 from synth.flow.field import FlowField
 
 SIDE = 64
@@ -23,10 +21,3 @@ def synth_sample(index: int, dtype: type = np.uint8, backward: bool = True) -> S
     flows[:, :4, :9], seen[:, :4, :9] = np.nan, 0
     flow = FlowField(flows[0], seen[0], flows[1], seen[1]) if backward else FlowField(flows[0], seen[0])
     return replace(translation_sample(index), image1=images[0], image2=images[1], flow=flow)
-
-
-def write_dataset(folder: Path, samples: list[Sample]) -> Path:
-    with DatasetWriter(folder, job(9)) as writer:
-        for sample in samples:
-            writer.write(sample)
-    return folder

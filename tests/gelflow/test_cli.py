@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from commands import said
 from safetensors.torch import load_file, save_file
 from textures import as_bytes, moved, save, write_folder, write_synthetic, write_video
 from waves import random_weights
@@ -39,37 +40,33 @@ def test_the_module_passes_the_status_on_and_debug_shows_the_traceback(capsys: p
     done = subprocess.run([sys.executable, "-m", "gelflow", "compare", "/nothing/here"], capture_output=True, text=True)
     assert done.returncode == 2
     assert done.stderr == "gelflow: /nothing/here: there is no such folder; a folder with image pairs is needed\n"
-    assert main(["--debug", "compare", "/nothing/here"]) == 2
-    assert "Traceback" in capsys.readouterr().err
+    assert "Traceback" in said(capsys, main, "--debug", "compare", "/nothing/here", status=2)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "word"),
-    [
-        (["fly"], "Unknown command"),
-        (["compare"], "DATA"),
-        (["compare", ".", "--wings"], "--wings"),
-        (["pairs", ".", "--out", "o", "--seed", "many"], "seed"),
-        (["predict", "a.png", "b.png", "--out", "o", "--method", "none"], "a.png"),
-        (["predict", ".", ".", ".", "--out", "o", "--method", "none"], "3 inputs"),
-        (["predict", ".", "--out", "o", "--weights", "w", "--method", "tvl1"], "--weights"),
-        (["predict", ".", "--out", "o"], "holds no image"),
-        (["predict", ".", "--out", "o", "--method", "raft"], "raft"),
-        (["evaluate", ".", "--weights", "none.safetensors"], "none.safetensors"),
-        (["compare", ".", "--weights", "best=none.safetensors"], "none.safetensors"),
-        (["compare", ".", "--weights", "x", "--size", "big"], "--size big"),
-        (["predict", ".", "--out", "o", "--size", "100000x100000"], "at most 16777216 px are allowed"),
-        (["compare", ".", "--methods", "none,none"], "twice"),
-        (["compare", ".", "--batch", "-1"], "--batch -1: a number from 0"),
-        (["train", ".", "--out", "o", "--set", "seed=99999999999999999999999"], "seed: "),
-        (["train", ".", "--out", "o", "--set", "loss"], "KEY=VALUE"),
-        (["train", ".", "--out", "o", "--set", "loss.wings=2"], "loss.wings"),
-        (["train", ".", "--out", "o", "--set", "steps=2", "--set", "steps=3"], "steps undoes the earlier steps"),
-        (["train", ".", "--out", "o", "--steps", "0"], "steps"),
-        (["train", ".", "--out", "o", "--config", "none.toml"], "none.toml"),
-        (["train", ".", "--out", "o"], "no image pairs"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "word"), [
+    (["fly"], "Unknown command"),
+    (["compare"], "DATA"),
+    (["compare", ".", "--wings"], "--wings"),
+    (["pairs", ".", "--out", "o", "--seed", "many"], "seed"),
+    (["predict", "a.png", "b.png", "--out", "o", "--method", "none"], "a.png"),
+    (["predict", ".", ".", ".", "--out", "o", "--method", "none"], "3 inputs"),
+    (["predict", ".", "--out", "o", "--weights", "w", "--method", "tvl1"], "--weights"),
+    (["predict", ".", "--out", "o"], "holds no image"),
+    (["predict", ".", "--out", "o", "--method", "raft"], "raft"),
+    (["evaluate", ".", "--weights", "none.safetensors"], "none.safetensors"),
+    (["compare", ".", "--weights", "best=none.safetensors"], "none.safetensors"),
+    (["compare", ".", "--weights", "x", "--size", "big"], "--size big"),
+    (["predict", ".", "--out", "o", "--size", "100000x100000"], "at most 16777216 px are allowed"),
+    (["compare", ".", "--methods", "none,none"], "twice"),
+    (["compare", ".", "--batch", "-1"], "--batch -1: a number from 0"),
+    (["train", ".", "--out", "o", "--set", "seed=99999999999999999999999"], "seed: "),
+    (["train", ".", "--out", "o", "--set", "loss"], "KEY=VALUE"),
+    (["train", ".", "--out", "o", "--set", "loss.wings=2"], "loss.wings"),
+    (["train", ".", "--out", "o", "--set", "steps=2", "--set", "steps=3"], "steps undoes the earlier steps"),
+    (["train", ".", "--out", "o", "--steps", "0"], "steps"),
+    (["train", ".", "--out", "o", "--config", "none.toml"], "none.toml"),
+    (["train", ".", "--out", "o"], "no image pairs"),
+])  # fmt: skip
 def test_mistake_is_one_line_and_status_2(tmp_path: Path, monkeypatch, capsys, arguments: list[str], word: str) -> None:
     (tmp_path / "notes.txt").touch()
     monkeypatch.chdir(tmp_path)
@@ -79,19 +76,15 @@ def test_mistake_is_one_line_and_status_2(tmp_path: Path, monkeypatch, capsys, a
 
 def test_compare_and_predict_print_tables_files_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_synthetic(tmp_path / "data", [(2.0, 1.0)])
-    assert main(["compare", str(folder), "--methods", "none,dis-fast", "--out", str(tmp_path / "out")]) == 0
-    text = capsys.readouterr().out
+    text = said(capsys, main, "compare", folder, "--methods", "none,dis-fast", "--out", tmp_path / "out")
     assert "DIS fast" in text
     assert "000000" in text
-    assert main(["compare", str(folder), "--methods", "none", "--json"]) == 0
-    answer = json.loads(capsys.readouterr().out)
+    answer = json.loads(said(capsys, main, "compare", folder, "--methods", "none", "--json"))
     assert answer["methods"][0]["endpoint_error_px"] == pytest.approx(5**0.5, rel=1e-6)  # float32 flow
     folder = write_folder(tmp_path / "in", {"a": (1, 0)})
-    tail = ["--out", str(tmp_path / "flow"), "--method", "farneback"]
-    assert main(["predict", str(folder / "a_1.png"), str(folder / "a_2.png"), *tail]) == 0
-    assert "a.exr" in capsys.readouterr().out
-    assert main(["predict", str(video(tmp_path / "v.avi")), *tail, "--json"]) == 0
-    answer = json.loads(capsys.readouterr().out)
+    tail = ["--out", tmp_path / "flow", "--method", "farneback"]
+    assert "a.exr" in said(capsys, main, "predict", folder / "a_1.png", folder / "a_2.png", *tail)
+    answer = json.loads(said(capsys, main, "predict", video(tmp_path / "v.avi"), *tail, "--json"))
     assert [motion["frame"] for motion in answer["motions"]] == [1, 2, 3]
     assert all(Path(file).is_file() for file in answer["files"])
 
@@ -99,21 +92,19 @@ def test_compare_and_predict_print_tables_files_and_json(tmp_path: Path, capsys:
 def test_images_and_folders_that_cannot_be_used_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for name, size in (("a_1", (32, 32)), ("a_2", (32, 40)), ("b", (1, 1))):
         save(tmp_path / f"{name}.png", moved(*size, 0, 0))
-    tail = ["--method", "farneback", "--out", tmp_path / "out"]
+    one, two, tiny = (tmp_path / f"{name}.png" for name in ("a_1", "a_2", "b"))
+    tail = ["--method", "farneback", "--out"]
     assert "40 x 32" in fails(capsys, "compare", tmp_path, "--methods", "none")
-    assert "40 x 32" in fails(capsys, "predict", tmp_path / "a_1.png", tmp_path / "a_2.png", *tail)
-    assert "1 x 1" in fails(capsys, "predict", tmp_path / "b.png", tmp_path / "b.png", *tail)
-    inside = tmp_path / "b.png" / "x"
-    images = [tmp_path / "a_1.png"] * 2
-    assert str(inside.parent) in fails(capsys, "predict", *images, "--method", "none", "--out", inside)
+    assert "40 x 32" in fails(capsys, "predict", one, two, *tail, tmp_path / "out")
+    assert "1 x 1" in fails(capsys, "predict", tiny, tiny, *tail, tmp_path / "out")
+    assert str(tiny) in fails(capsys, "predict", one, one, *tail, tiny / "x")
 
 
 def test_pairs_exit_statuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """0 if every recording could be read, 1 if some could not, 2 if none could or no pair has motion."""
     good, bad = video(tmp_path / "good.avi"), tmp_path / "bad.avi"
     bad.write_bytes(b"junk" * 100)
-    assert main(["pairs", str(good), "--out", str(tmp_path / "a"), "--json"]) == 0
-    answer = json.loads(capsys.readouterr().out)
+    answer = json.loads(said(capsys, main, "pairs", good, "--out", tmp_path / "a", "--json"))
     motions = [pair["motion_px"] for pair in json.loads((tmp_path / "a" / "pairs.json").read_text())["pairs"]]
     assert (answer["recordings"], answer["pairs"] >= 2) == (1, True)
     deciles = answer["motion_deciles_px"]
@@ -122,8 +113,7 @@ def test_pairs_exit_statuses(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     captured = capsys.readouterr()
     assert "bad.avi" in captured.err
     assert "1 unreadable" in captured.out
-    assert main(["pairs", str(bad), "--out", str(tmp_path / "c")]) == 2
-    assert "none of the 1 recordings" in capsys.readouterr().err
+    assert "none of the 1 recordings" in said(capsys, main, "pairs", bad, "--out", tmp_path / "c", status=2)
     assert "--min-motion" in fails(capsys, "pairs", good, "--out", tmp_path / "d", "--min-motion", "50")
     assert "seed is 0 there and 1 here" in fails(capsys, "pairs", good, "--out", tmp_path / "a", "--seed", "1")
 
@@ -140,7 +130,6 @@ class Evil:
 
 @pytest.fixture(scope="module")
 def networks(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Weights of GelFlow and of RAFT, as they are at the start of a training."""
     folder = tmp_path_factory.mktemp("networks")
     torch.save(RAFT(large=False, iterations=1).state_dict(), folder / "raft.pth")
     model = ModelConfig(levels=4, projected_channels=8)
@@ -148,7 +137,6 @@ def networks(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 def damaged(kind: str, good: Path, path: Path, trace: Path) -> None:
-    """Writes a broken copy of a file of weights."""
     contents = {"truncated": good.read_bytes()[: good.stat().st_size // 2], "empty": b"", "text": b"no weights\n",
                 "code": pickle.dumps(Evil(trace))}  # fmt: skip
     if kind in contents:
@@ -191,9 +179,8 @@ def test_a_state_to_resume_from_cannot_run_code(tmp_path: Path, capsys: pytest.C
     folder = write_folder(tmp_path / "data", {"a": (1, 0)})
     run, trace, settings = tmp_path / "run", tmp_path / "ran", tmp_path / "small.toml"
     settings.write_text("steps = 1\nmodel.levels = 4\nloss.lambda_s = [1.0, 1.0, 1.0]\n")
-    command = ["train", str(folder), "--out", str(run), "--config", str(settings), "--device", "cpu"]
-    assert main(command) == 0
-    capsys.readouterr()
+    command = ["train", folder, "--out", run, "--config", settings, "--device", "cpu"]
+    said(capsys, main, *command)
     torch.save({"step": 0, "model": Evil(trace)}, run / "state.ckpt")
     assert "state.ckpt: damaged" in fails(capsys, *command, "--resume")
     assert not trace.exists()
@@ -213,9 +200,7 @@ def test_images_that_cannot_be_used_are_named(number: int, networks: tuple[Path,
         return fails(capsys, "predict", tmp_path / first, tmp_path / second, *tail, *options)
 
     assert "one.png: 1 x 1 px" in predict("one.png", "good.png")
-    refusal = predict("small.png", "small.png")
-    assert "small.png" in refusal
-    assert "64 px" in refusal
+    assert "64 px" in predict("small.png", "small.png")
     assert "good.png has 80 x 64 px, " in predict("good.png", "wide.png")
     assert "nan.tiff" in predict("good.png", "nan.tiff")
     if number == 0:

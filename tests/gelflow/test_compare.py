@@ -1,6 +1,5 @@
 """Comparing methods: the numbers, the files, adding to an earlier comparison, refusals."""
 
-import csv
 import json
 import math
 import time
@@ -9,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from textures import save, write_folder, write_synthetic
+from commands import refused, said
+from textures import save, table, write_folder, write_synthetic
 
 from gelflow.arrays import FlowArray, ImageArray
 from gelflow.baselines import named_methods
@@ -20,13 +20,12 @@ from gelflow.compare.scores import evaluate, score_pair, summarise
 from gelflow.compare.seeds import grouped
 from gelflow.compare.tables import pair_table, summary_table
 from gelflow.data import PairDataset, open_all
-from gelflow.errors import InputError
+
+SHIFTS = [(3.0, 4.0), (0.0, 0.5), (1.0, 0.0), (2.0, 0.0)]
 
 
 @dataclass(frozen=True)
 class Constant:
-    """Test double: the same flow everywhere."""
-
     name: str
     u: float
     v: float
@@ -53,18 +52,18 @@ def test_errors_of_known_flows_are_exact_and_the_true_one_warps_best(tmp_path: P
 def test_files_hold_every_score_and_are_read_back_the_same(tmp_path: Path) -> None:
     dataset = PairDataset(write_synthetic(tmp_path / "data", [(1.0, 0.0), (0.0, 2.0)]))
     methods = named_methods(["none", "farneback", "dis-medium"])
-    written = compare(methods, dataset, tmp_path / "out")
-    scores, again = written.scores, read_comparison(tmp_path / "out" / "scores.json")
+    out = tmp_path / "out"
+    written = compare(methods, dataset, out)
+    scores, again = written.scores, read_comparison(out / "scores.json")
     assert (again.pairs, again.strata, again.to_json()) == (dataset.names, written.strata, written.to_json())
-    with (tmp_path / "out" / "scores.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = table(out / "scores.csv")
     assert [(row["method"], row["pair"]) for row in rows] == [(score.method, score.pair) for score in scores]
     assert float(rows[0]["endpoint_error_px"]) == scores[0].endpoint_error_px == 1.0
-    content = json.loads((tmp_path / "out" / "scores.json").read_text())
+    content = json.loads((out / "scores.json").read_text())
     assert [method["method"] for method in content["methods"]] == ["no motion", "Farnebäck", "DIS medium"]
     assert content["methods"][1]["endpoint_error_px"] < content["methods"][0]["endpoint_error_px"] / 3
-    assert "| DIS medium |" in (tmp_path / "out" / "table.md").read_text()
-    assert (tmp_path / "out" / "table.png").stat().st_size > 5000
+    assert "| DIS medium |" in (out / "table.md").read_text()
+    assert (out / "table.png").stat().st_size > 5000
 
 
 def test_numbers_that_are_not_finite_come_back_and_markers_are_scored_where_there_are_some(tmp_path: Path) -> None:
@@ -84,8 +83,7 @@ def test_numbers_that_are_not_finite_come_back_and_markers_are_scored_where_ther
     (folder / "a_markers.csv").write_text("x1,y1,x2,y2\n20,20,23,24\n40,30,43,34\n")
     scores = evaluate(Constant("zero", 0, 0), PairDataset(folder))
     assert [score.marker_distance_px for score in scores] == [5.0, None]
-    table = pair_table(scores, ["marker_distance_px"], "{:.2f}")
-    assert table == (["method", "a"], [["zero", "5.00"]])
+    assert pair_table(scores, ["marker_distance_px"], "{:.2f}") == (["method", "a"], [["zero", "5.00"]])
     header, rows = summary_table(grouped(summarise(scores[1:])))
     assert ", ".join(header) == "method, PSNR dB, SSIM, closure px, 90 % px, σ > 1 px %, σ ≤ 0.1 px %, ms/pair, core ms"
     assert markdown((header, rows)).splitlines()[1] == "| --- |" + 8 * " ---: |"
@@ -96,21 +94,16 @@ def test_earlier_results_are_replaced_on_the_same_data_only(tmp_path: Path) -> N
     compare(named_methods(["none"]), first, tmp_path / "out")
     compare(named_methods(["none", "dis-fast"]), first, tmp_path / "out")
     assert "DIS fast" in (tmp_path / "out" / "table.md").read_text()
-    with pytest.raises(InputError, match=r"comparison on .*first.* not on .*second"):
-        compare(named_methods(["none"]), second, tmp_path / "out")
-    with pytest.raises(InputError, match="holds other things"):
-        compare(named_methods(["none"]), first, tmp_path / "first")
+    refused(r"comparison on .*first.* not on .*second", compare, named_methods(["none"]), second, tmp_path / "out")
+    refused("holds other things", compare, named_methods(["none"]), first, tmp_path / "first")
 
 
 def test_no_method_two_of_one_name_and_broken_pairs_are_refused(tmp_path: Path) -> None:
     dataset = PairDataset(write_folder(tmp_path, {"a": (1, 0), "b": (1, 0)}))
-    with pytest.raises(InputError, match="no method"):
-        compare([], dataset)
-    with pytest.raises(InputError, match="two methods are called 'x'"):
-        compare([Constant("x", 0, 0), Constant("x", 1, 0)], dataset)
+    refused("no method", compare, [], dataset)
+    refused("two methods are called 'x'", compare, [Constant("x", 0, 0), Constant("x", 1, 0)], dataset)
     (tmp_path / "b_2.png").write_bytes(b"broken")
-    with pytest.raises(InputError, match=r"b_2\.png"):
-        compare(named_methods(["none"]), dataset)
+    refused(r"b_2\.png", compare, named_methods(["none"]), dataset)
 
 
 def test_where_nothing_can_be_followed_no_motion_counts_and_exact_flow_is_for_synthetic_pairs(tmp_path: Path) -> None:
@@ -128,11 +121,8 @@ def test_where_nothing_can_be_followed_no_motion_counts_and_exact_flow_is_for_sy
     assert (exact.method, exact.endpoint_error_px, exact.outliers_01px) == ("exact flow", 0.0, 0.0)
     assert none.psnr_db + 3 < exact.psnr_db < true.psnr_db  # the strip of 8 of 80 px does move in these images
     plain = PairDataset(write_folder(tmp_path / "plain", {"a": (1, 0)}))
-    with pytest.raises(InputError, match="pair a, exact flow: the pair has no exact flow; leave the method exact out"):
-        evaluate(named_methods(["exact"])[0], plain)
-
-
-SHIFTS = [(3.0, 4.0), (0.0, 0.5), (1.0, 0.0), (2.0, 0.0)]
+    words = "pair a, exact flow: the pair has no exact flow; leave the method exact out"
+    refused(words, evaluate, named_methods(["exact"])[0], plain)
 
 
 def test_methods_are_added_and_scored_again(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -144,12 +134,11 @@ def test_methods_are_added_and_scored_again(tmp_path: Path, capsys: pytest.Captu
     assert after.methods == ["DIS fast", "Farnebäck", "no motion"]
     assert after.strata["DIS fast"] == before.strata["DIS fast"]
     assert [s for s in after.scores if s.method == "DIS fast"] == [s for s in before.scores if s.method == "DIS fast"]
-    table = (out / "table.md").read_text()
-    assert table.index("| DIS fast |") < table.index("| Farnebäck |")
+    text = (out / "table.md").read_text()
+    assert text.index("| DIS fast |") < text.index("| Farnebäck |")
     assert all((out / name).stat().st_size > 5000 for name in ("table.png", "work_precision.png", "strata.png"))
-    capsys.readouterr()
-    assert main(["compare", folder, "--methods", "none", "--add"]) == 2
-    assert "--add: give the folder of the earlier comparison as --out" in capsys.readouterr().err
+    refusal = said(capsys, main, "compare", folder, "--methods", "none", "--add", status=2)
+    assert "--add: give the folder of the earlier comparison as --out" in refusal
 
 
 def test_a_moved_copy_of_the_data_is_the_same_data_and_other_pairs_are_not(tmp_path: Path) -> None:
@@ -164,8 +153,7 @@ def test_a_moved_copy_of_the_data_is_the_same_data_and_other_pairs_are_not(tmp_p
     kept = (out / "scores.json").read_bytes()
     for dataset, words in ((longer, r"\(2 pairs\), not on .*longer \(3 pairs\)"), (other, "these are other pairs"),
                            (plain, "these are other pairs")):  # fmt: skip
-        with pytest.raises(InputError, match=words):
-            compare([Constant("c", 0, 0)], dataset, out, add=True)
+        refused(words, compare, [Constant("c", 0, 0)], dataset, out, add=True)
     assert (out / "scores.json").read_bytes() == kept
 
 
@@ -176,25 +164,21 @@ def test_scores_that_cannot_be_read_are_named(content: str, tmp_path: Path) -> N
     dataset = PairDataset(write_folder(tmp_path / "data", {"a": (1, 0)}))
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "scores.json").write_text(content)
-    with pytest.raises(InputError, match=r"scores\.json: not the scores of a comparison of this version"):
-        compare([Constant("a", 0, 0)], dataset, tmp_path / "out", add=True)
+    words = r"scores\.json: not the scores of a comparison of this version"
+    refused(words, compare, [Constant("a", 0, 0)], dataset, tmp_path / "out", add=True)
 
 
 def test_every_nth_pair_of_several_folders(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folders = [write_synthetic(tmp_path / name, SHIFTS) for name in ("a", "b")]
-    command = ["compare", *map(str, folders), "--methods", "none", "--json"]
-    assert main([*command, "--every", "3"]) == 0
-    scores = json.loads(capsys.readouterr().out)["scores"]
+    command = ["compare", *folders, "--methods", "none", "--json", "--every"]
+    scores = json.loads(said(capsys, main, *command, "3"))["scores"]
     assert [(s["pair"], s["motion_px"]) for s in scores] == [("a/000000", 5.0), ("a/000003", 2.0), ("b/000002", 1.0)]
     assert open_all(folders).names[::3] == [s["pair"] for s in scores]
-    assert main([*command, "--every", "0"]) == 2
-    assert "--every 0" in capsys.readouterr().err
+    assert "--every 0" in said(capsys, main, *command, "0", status=2)
 
 
 @dataclass(frozen=True)
 class Working:
-    """Test double: waits, or keeps a processor busy, for as long."""
-
     busy: bool
     name: str = "working"
 
@@ -210,8 +194,7 @@ class Working:
 def test_processor_time_is_that_of_the_work(tmp_path: Path) -> None:
     dataset = PairDataset(write_folder(tmp_path, {"a": (1, 0)}))
     waiting, busy = (score_pair(Working(kind), dataset, 0) for kind in (False, True))
-    # Clocks tick at least every 10 ms.
-    assert waiting.seconds >= 0.1
+    assert waiting.seconds >= 0.1  # Clocks tick at least every 10 ms
     assert waiting.processor_seconds < 0.05
     assert 0.1 <= busy.processor_seconds < 0.15
     assert "core" in busy.device

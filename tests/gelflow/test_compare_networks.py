@@ -1,6 +1,5 @@
 """Networks in a comparison: RAFT and GelFlow, speed, fine-tuning on the pairs, registration, the Pareto front."""
 
-import csv
 import json
 import time
 from collections.abc import Callable
@@ -11,9 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from commands import refused, said
 from safetensors.torch import load_file
 from test_cli import fails
-from textures import write_folder, write_synthetic
+from textures import table, write_folder, write_synthetic
 from waves import Shifts, random_weights, same_weights, small
 
 import gelflow.compare.run
@@ -28,7 +28,6 @@ from gelflow.compare.speed import Speed, network_speed
 from gelflow.config import REGISTRATIONS, ModelConfig, MotionConfig, Registration, RegistrationConfig, TrainConfig
 from gelflow.config.sources import train_config
 from gelflow.data import PairDataset, open_all
-from gelflow.errors import InputError
 from gelflow.files.exr import read_flow
 from gelflow.models.raft import RAFT
 from gelflow.models.registration import registered
@@ -36,10 +35,12 @@ from gelflow.models.weights import read_metadata
 from gelflow.train import train
 from gelflow.train.test_time import fine_tuned, fine_tuning_settings
 
+OWN = RegistrationConfig(windows_px=(8,), smoothing_px=(4,))
+CHOICES: tuple[Registration, Registration] = ("none", "brightness")
+
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A GelFlow network after one step."""
     config = small(steps=1, batch_size=1, learning_rate=1e-4)
     return train(config, Shifts(1, 64, 1.0, seed=1), None, tmp_path_factory.mktemp("run")).weights
 
@@ -54,13 +55,11 @@ def raft(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_all_kinds_of_networks_share_one_table(weights: Path, raft: Path, tmp_path: Path, capsys) -> None:
     folder, out = write_folder(tmp_path / "data", {"a": (1, 0), "b": (0, 1)}), tmp_path / "out"
-    common = ["compare", str(folder), "--weights", f"mine={weights}", "--device", "cpu", "--out", str(out)]
-    assert main([*common, "--methods", "none,lucas-kanade", "--weights", str(raft), "--ft", "2"]) == 0
-    text = capsys.readouterr().out
+    common = ["compare", folder, "--weights", f"mine={weights}", "--device", "cpu", "--out", out]
+    text = said(capsys, main, *common, "--methods", "none,lucas-kanade", "--weights", raft, "--ft", 2)
     names = ["no motion", "Lucas-Kanade", "mine", "RAFT small", "mine+ft"]
     assert all(name in text for name in names)
-    with (out / "scores.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = table(out / "scores.csv")
     assert list(dict.fromkeys(row["method"] for row in rows)) == names
     assert "strata" not in rows[0]
     apart = (out / "table.md").read_text().split("Fine-tuned on these very pairs")
@@ -73,9 +72,9 @@ def test_all_kinds_of_networks_share_one_table(weights: Path, raft: Path, tmp_pa
     tuned = tmp_path / "out_ft" / "mine" / "weights.safetensors"
     assert read_metadata(tuned)["step"] == "2"
     before = load_file(tuned)
-    assert main([*common, "--methods", "", "--batch", "0", "--ft", "2"]) == 0
+    said(capsys, main, *common, "--methods", "", "--batch", 0, "--ft", 2)
     torch.testing.assert_close(load_file(tuned), before, rtol=0, atol=0)
-    assert main([*common, "--methods", "", "--batch", "0", "--ft", "3"]) == 0
+    said(capsys, main, *common, "--methods", "", "--batch", 0, "--ft", 3)
     assert read_metadata(tuned)["step"] == "3"
 
 
@@ -87,10 +86,10 @@ def test_fine_tuning_needs_a_place_and_a_network(weights: Path, tmp_path: Path, 
 
 def test_fine_tuning_changes_the_copy_only_and_lowers_its_loss(weights: Path, tmp_path: Path, capsys) -> None:
     folder, before = write_folder(tmp_path / "data", {"a": (1, 0)}), weights.read_bytes()
-    arguments = ["compare", str(folder), "--methods", "", "--weights", f"mine={weights}", "--batch", "0", "--json"]
-    assert main([*arguments, "--ft", "40", "--out", str(tmp_path / "out")]) == 0
+    arguments = ["compare", folder, "--methods", "", "--weights", f"mine={weights}", "--batch", 0, "--json"]
+    answer = json.loads(said(capsys, main, *arguments, "--ft", 40, "--out", tmp_path / "out"))
     assert weights.read_bytes() == before
-    scores = {one["method"]: one for one in json.loads(capsys.readouterr().out)["methods"]}
+    scores = {one["method"]: one for one in answer["methods"]}
     assert scores["mine+ft"]["psnr_db"] > scores["mine"]["psnr_db"]
 
 
@@ -166,7 +165,6 @@ def test_of_the_training_a_constant_rate_and_the_size_of_use_carry_over(tmp_path
 
 
 def test_fine_tuning_does_not_look_at_exact_flow_and_needs_one_size(tmp_path: Path) -> None:
-    """The same images with and without their exact flow."""
     shifts = [(1.5, 0.5), (-1.0, 0.0)]
     plain = PairDataset(write_folder(tmp_path / "plain", {"a": shifts[0], "b": shifts[1]}))
     exact = PairDataset(write_synthetic(tmp_path / "exact", shifts))
@@ -178,15 +176,10 @@ def test_fine_tuning_does_not_look_at_exact_flow_and_needs_one_size(tmp_path: Pa
     recorded = json.loads(read_metadata(runs[0].path)["train"])
     assert (recorded["supervision"], recorded["steps"]) == ("self", 3)
     folders = [write_folder(tmp_path / f"{k}", {"a": (1, 0)}, size) for k, size in enumerate([(64, 80), (72, 80)])]
-    dataset, path = open_all(folders), method.path
-    with pytest.raises(InputError, match="64x80, 72x80 px, a batch needs one size; give --size"):
-        fine_tuned(Learned(path, device="cpu"), dataset, tmp_path / "sizes", 1)
-    assert fine_tuned(Learned(path, size=(64, 80), device="cpu"), dataset, tmp_path / "sizes", 1).path.is_file()
-
-
-OWN = RegistrationConfig(windows_px=(8,), smoothing_px=(4,))
-CHOICES: tuple[Registration, Registration] = ("none", "brightness")
-ROWS = [word for choice in CHOICES for word in ("--registration", choice)]
+    path, given = method.path, (open_all(folders), tmp_path / "sizes", 1)
+    words = "64x80, 72x80 px, a batch needs one size; give --size"
+    refused(words, fine_tuned, Learned(path, device="cpu"), *given)
+    assert fine_tuned(Learned(path, size=(64, 80), device="cpu"), *given).path.is_file()
 
 
 def tensor(array: np.ndarray) -> torch.Tensor:
@@ -194,21 +187,14 @@ def tensor(array: np.ndarray) -> torch.Tensor:
 
 
 @pytest.fixture(scope="module")
-def networks(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    """Weights without and with a registration of their own."""
-    models = [ModelConfig(levels=4, projected_channels=8, registration=config) for config in (None, OWN)]
-    folder = tmp_path_factory.mktemp("networks")
-    return [random_weights(folder / f"{k}.safetensors", model, small(model=model)) for k, model in enumerate(models)]
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return random_weights(tmp_path_factory.mktemp("plain") / "w.safetensors", SMALL, small(model=SMALL))
 
 
-@pytest.fixture
-def plain(networks: list[Path]) -> Path:
-    return networks[0]
-
-
-@pytest.fixture
-def own(networks: list[Path]) -> Path:
-    return networks[1]
+@pytest.fixture(scope="module")
+def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    model = SMALL.model_copy(update={"registration": OWN})
+    return random_weights(tmp_path_factory.mktemp("own") / "w.safetensors", model, small(model=model))
 
 
 def test_settings_are_the_weights_own_or_those_of_an_aim_which_the_name_says(plain: Path, own: Path) -> None:
@@ -230,7 +216,8 @@ def test_settings_are_the_weights_own_or_those_of_an_aim_which_the_name_says(pla
 def test_rows_without_and_with_registration_stand_in_one_table_with_one_of_raft(plain, raft, tmp_path) -> None:
     folder, out = write_folder(tmp_path / "data", {"a": (1.0, -0.5)}), tmp_path / "out"
     arguments = ["compare", str(folder), "--methods", "none", "--weights", f"net={plain}", "--weights", str(raft)]
-    assert main([*arguments, *ROWS, "--device", "cpu", "--ft", "2", "--batch", "0", "--out", str(out)]) == 0
+    rows = [word for choice in CHOICES for word in ("--registration", choice)]
+    assert main([*arguments, *rows, "--device", "cpu", "--ft", "2", "--batch", "0", "--out", str(out)]) == 0
     scores = {one["method"]: one for one in json.loads((out / "scores.json").read_text())["methods"]}
     assert list(scores) == ["no motion", "net", "net+brightness", "RAFT small", "net+ft", "net+brightness+ft"]
     assert scores["net+brightness"]["psnr_db"] > scores["net"]["psnr_db"] + 6
@@ -273,18 +260,18 @@ def test_the_speed_of_the_network_alone_includes_it(own: Path, tmp_path: Path, m
 
 def test_predict_and_evaluate_take_it(plain: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = write_folder(tmp_path / "data", {"a": (1.0, -0.5)})
-    common = ["--weights", str(plain), "--device", "cpu", "--registration"]
+    common = ["--weights", plain, "--device", "cpu", "--registration"]
     flows = []
     for choice in CHOICES:
         out = tmp_path / choice
-        assert main(["predict", *(str(folder / f"a_{k}.png") for k in (1, 2)), "--out", str(out), *common, choice]) == 0
+        text = said(capsys, main, "predict", folder / "a_1.png", folder / "a_2.png", "--out", out, *common, choice)
         flows.append(read_flow(out / "a.exr").flow)
-        assert ("+brightness: mean motion" in capsys.readouterr().out) == (choice == "brightness")
+        assert ("+brightness: mean motion" in text) == (choice == "brightness")
     # 1/8 px: the images are rounded to 8 bit, as in test_predict.
     assert np.abs(np.median(flows[1], axis=(0, 1)) - (1.0, -0.5)).max() < 1 / 8
     assert np.abs(np.median(flows[0], axis=(0, 1)) - (1.0, -0.5)).max() > 1 / 2
-    assert main(["evaluate", str(folder), *common, "motion", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["methods"][0]["method"].endswith("+motion")
+    answer = json.loads(said(capsys, main, "evaluate", folder, *common, "motion", "--json"))
+    assert answer["methods"][0]["method"].endswith("+motion")
 
 
 def test_registration_is_refused_where_there_is_none(plain: Path, raft: Path, tmp_path: Path, capsys) -> None:

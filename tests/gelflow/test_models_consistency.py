@@ -32,7 +32,6 @@ def lost(flow: Flow) -> Flow:
 
 
 def error(flow: Flow, truth: Flow) -> Tensor:
-    """Mean endpoint error in the patch, px."""
     return (flow - truth)[PATCH].norm(dim=1).mean()
 
 
@@ -50,8 +49,7 @@ def test_a_lost_patch_is_taken_from_the_flow_back() -> None:
     found = consistent(lost(there), image1, image2, lambda *_: back, RegistrationConfig())
     assert error(lost(there), there) > 19
     assert error(found, there) < 0.1
-    # Of a batch only the pair that is torn is examined.
-    calls: list[Images] = []
+    calls: list[Images] = []  # Of a batch only the pair that is torn is examined
 
     def estimate(first: Images, second: Images) -> Flow:
         calls.append(first)
@@ -69,9 +67,8 @@ def test_a_flow_is_kept_where_the_flow_back_is_lost(noise: float) -> None:
     image2 = image2 + noise * torch.randn(image2.shape, generator=torch.Generator().manual_seed(0))
     torn = there.clone()
     torn[..., :2, :] += JUMP_PX  # examined, though right where it does not close
-    assert torch.equal(
-        consistent(torn, image1, image2, lambda *_: lost(back), RegistrationConfig())[PATCH], torn[PATCH]
-    )
+    found = consistent(torn, image1, image2, lambda *_: lost(back), RegistrationConfig())
+    assert torch.equal(found[PATCH], torn[PATCH])
 
 
 def test_without_evidence_the_flow_is_kept() -> None:

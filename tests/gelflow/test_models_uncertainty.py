@@ -1,4 +1,4 @@
-"""The uncertainty of a flow: the Cramer-Rao bound in white noise, and what it says of wrong, bare and lost pixels."""
+"""The uncertainty of a flow: in white noise, where pixels are wrong, bare or lost; the window that fits the place."""
 
 import math
 
@@ -10,6 +10,8 @@ from torch import Tensor
 from gelflow.config import RegistrationConfig
 from gelflow.models.evidence import gauss_newton
 from gelflow.models.uncertainty import MAX_SIGMA_PX, RADIUS, flow_sigma
+from gelflow.models.wider_window import TWO_STEPS, best_window
+from gelflow.ops.gaussian import window_sums
 from gelflow.ops.spline import SplineImage
 
 HEIGHT, WIDTH, LENGTH, HEIGHT_OF_WAVE = 96, 128, 8.0, 0.3
@@ -30,11 +32,8 @@ def no_flow() -> Tensor:
 
 @pytest.mark.parametrize("noise", [0.003, 0.03])
 def test_in_white_noise_a_step_has_the_variance_of_the_cramer_rao_bound(noise: float) -> None:
-    config = RegistrationConfig()
-    found = [
-        gauss_newton(no_flow(), waves(noise, 2 * seed), SplineImage(waves(noise, 2 * seed + 1)), config)
-        for seed in range(6)
-    ]
+    pairs = ((waves(noise, 2 * seed), SplineImage(waves(noise, 2 * seed + 1))) for seed in range(6))
+    found = [gauss_newton(no_flow(), image1, image2, RegistrationConfig()) for image1, image2 in pairs]
     # Both images' noise over the waves' mean square slope by central differences, in a window of 4 pi 5^2 px (the
     # square of a Gaussian's sum over the sum of its squares), for each of the two components.
     slope_square = (HEIGHT_OF_WAVE * math.sin(NUMBER)) ** 2 / 2
@@ -49,8 +48,7 @@ def test_an_error_of_the_flow_is_part_of_it() -> None:
     right, wrong = no_flow(), no_flow()
     right[:, 0] = 0.4
     sure, unsure = (flow_sigma(flow, image1, image2)[0][INSIDE].median().item() for flow in (right, wrong))
-    # The step is 10 % too long, because a central difference is below the slope of so short a wave; and the residual
-    # that the error leaves counts as noise, too.
+    # The step is 10 % too long (central differences of so short a wave); the residual of the error counts as noise.
     assert 0.4 < unsure * math.sqrt(2) / RADIUS < 0.55
     assert sure < 0.05
 
@@ -77,3 +75,44 @@ def test_probability_to_be_seen_is_a_half_at_the_border_and_nothing_is_known_bey
     sigma, seen = flow_sigma(flow, image, image)
     assert sigma[0, 0, :, -30:].min().item() == pytest.approx(MAX_SIGMA_PX)
     assert seen[0, 0, :, -30:].max() < 1e-3
+
+
+SIZE, NARROW, NOISE = (160, 200), 5.0, 0.05
+MIDDLE = (..., slice(40, -40), slice(40, -40))
+TEXTURE = torch.ones(1, 1, *SIZE)
+
+
+def noise_of_two_steps(seed: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Noise of a flow (1, 2, H, W) after two steps in a narrow window, and its variance."""
+    window = window_sums(TEXTURE, NARROW)
+    white = NOISE * torch.randn((1, 2, *SIZE), generator=torch.Generator().manual_seed(seed))
+    step = window(white) / window(TEXTURE)
+    # A Gaussian mean has the variance of white noise over 4 pi 5^2 px, for each of two components.
+    variance = TWO_STEPS * 2 * NOISE**2 / (4 * torch.pi * NARROW**2)
+    return 2 * step - window(step) / window(TEXTURE), torch.full_like(TEXTURE, variance)
+
+
+def test_noise_is_smoothed_as_far_as_theory_says_and_the_error_is_known() -> None:
+    before, after, said = [], [], []
+    for seed in range(6):
+        flow, variance = noise_of_two_steps(seed)
+        found, error = best_window(flow, variance, 9 * TEXTURE, NARROW)
+        before.append((flow.square().sum(dim=1) / variance[0])[MIDDLE].mean())
+        after.append(found.square().sum(dim=1)[MIDDLE].mean())
+        said.append(error[MIDDLE].mean())
+    # 6 x 80 x 120 px with 4 pi 5^2 / (11 / 6) px for each independent value: 6 %.
+    assert torch.stack(before).mean().item() == pytest.approx(1, rel=0.12)
+    # Under 20 px the variance is (5 / 20)^2 of that under 5 px, for the same kernel.
+    ratio = (torch.stack(after).mean() / variance.mean()).item()
+    assert ratio < 1.5 / 16
+    assert torch.stack(said).mean().item() == pytest.approx(ratio * variance.mean().item(), rel=0.5)
+
+
+def test_what_bends_more_than_noise_stays() -> None:
+    noise, variance = noise_of_two_steps(0)
+    flow = noise.clone()
+    flow[..., 100:] += 1.0
+    found, _ = best_window(flow, variance, 9 * TEXTURE, NARROW)
+    # The step is a hundred times the noise: no window that reaches it has the smaller risk.
+    assert torch.equal(found[..., 90:110], flow[..., 90:110])
+    assert found[..., :20].square().mean() < 0.5 * flow[..., :20].square().mean()

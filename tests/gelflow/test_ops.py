@@ -19,6 +19,8 @@ from gelflow.ops.pyramid import enlarge_flow, flow_pyramid, halve_flow, image_py
 from gelflow.ops.spline import SplineImage
 from gelflow.ops.warp import inside, positions, warp
 
+LIKE = torch.zeros((), dtype=torch.float64)
+
 
 def constant_flow(u: float, v: float, rows: int, columns: int) -> Tensor:
     return torch.tensor([u, v], dtype=torch.float64).view(1, 2, 1, 1).repeat(1, 1, rows, columns)
@@ -72,17 +74,14 @@ def test_gradients_agree_with_finite_differences() -> None:
     assert gradcheck(lambda a, b: local_correlation(a, b, 2), (first.requires_grad_(), second.requires_grad_()))
 
 
-GENERATOR = torch.Generator().manual_seed(0)
-
-
 def test_the_spline_is_scipys_and_keeps_the_image_at_lowered_precision_too() -> None:
-    image = torch.rand(1, 2, 17, 23, generator=GENERATOR, dtype=torch.float64)
-    flow = 6 * torch.rand(1, 2, 17, 23, generator=GENERATOR, dtype=torch.float64) - 3
+    image, flow = torch.rand(2, 1, 2, 17, 23, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    flow = 6 * flow - 3
     rows, columns = np.mgrid[:17, :23].astype(float)
     places = [np.clip(rows + flow[0, 1].numpy(), 0, 16), np.clip(columns + flow[0, 0].numpy(), 0, 22)]
     expected = [map_coordinates(channel, places, order=3, mode="mirror") for channel in image[0].numpy()]
     np.testing.assert_allclose(SplineImage(image).at(positions(flow))[0].numpy(), expected, rtol=0, atol=1e-12)
-    image, still = torch.rand(2, 3, 9, 8, generator=GENERATOR), torch.zeros(2, 2, 9, 8)
+    image, still = torch.rand(2, 3, 9, 8), torch.zeros(2, 2, 9, 8)
     # float32: a matrix of condition 3 and its inverse, and places in an image of a few px.
     torch.testing.assert_close(warp(image, still, "spline"), image, rtol=0, atol=4e-6)
     with torch.autocast("cpu", torch.bfloat16):
@@ -161,10 +160,8 @@ def test_halving_averages_blocks_at_odd_borders_and_enlarging_keeps_a_linear_flo
 def by_definition(first: Tensor, second: Tensor, radius: int) -> Tensor:
     batch, _, height, width = first.shape
     costs = torch.zeros(batch, (2 * radius + 1) ** 2, height, width, dtype=first.dtype)
-    shifts = list(itertools.product(range(-radius, radius + 1), repeat=2))
-    for b, (k, (dy, dx)), row, column in itertools.product(
-        range(batch), enumerate(shifts), range(height), range(width)
-    ):
+    shifts = list(enumerate(itertools.product(range(-radius, radius + 1), repeat=2)))
+    for b, (k, (dy, dx)), row, column in itertools.product(range(batch), shifts, range(height), range(width)):
         if 0 <= row + dy < height and 0 <= column + dx < width:
             costs[b, k, row, column] = (first[b, :, row, column] * second[b, :, row + dy, column + dx]).mean()
     return costs

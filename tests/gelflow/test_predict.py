@@ -1,7 +1,6 @@
 """`predict` and its pictures; `gelflow.load_model` and `gelflow.PairDataset` in Python."""
 
 import colorsys
-import csv
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -9,31 +8,25 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from synth_samples import synth_sample, write_dataset
-from textures import as_bytes, moved, save, write_folder, write_video
+from commands import refused
+from samples import write_dataset
+from synth_samples import synth_sample
+from textures import as_bytes, moved, save, table, write_folder, write_video
 
 import gelflow
 from gelflow.baselines import named_methods
 from gelflow.baselines.learned import Learned
-from gelflow.errors import InputError
 from gelflow.files.exr import read_flow
 from gelflow.models.uncertainty import UNKNOWN_PX
 from gelflow.models.weights import weights_file
-from gelflow.predict.pictures import (
-    UNKNOWN_COLOUR,
-    arrow_factor,
-    certain,
-    draw_overlay,
-    flow_to_colour,
-    robust_scale,
-)
+from gelflow.predict import pictures
+from gelflow.predict.pictures import UNKNOWN_COLOUR, flow_to_colour, robust_scale
 from gelflow.predict.prediction import predict_pair, predict_video
 
 FARNEBACK = named_methods(["farneback"])[0]
 
 
 def video(path: Path, frames: int) -> Path:
-    """Frames of 48 x 64 px, each 1 px further to the right."""
     write_video(path, [as_bytes(moved(48, 64, shift, 0)) for shift in range(frames)])
     return path
 
@@ -46,14 +39,13 @@ def frame_folder(folder: Path, names: Iterable[object]) -> Path:
 
 def test_pair_gives_one_flow_in_three_files_named_after_the_images(tmp_path: Path) -> None:
     folder = write_folder(tmp_path / "in", {"press": (1.5, -0.5)})
-    result = predict_pair(FARNEBACK, folder / "press_1.png", folder / "press_2.png", tmp_path / "out")
-    assert [path.name for path in result.files] == ["press.exr", "press.flo", "press.png"]
-    flow = read_flow(result.files[0]).flow
-    np.testing.assert_array_equal(flow, cv2.readOpticalFlow(str(result.files[1])))
+    exr, flo, png = predict_pair(FARNEBACK, folder / "press_1.png", folder / "press_2.png", tmp_path / "out").files
+    assert [path.name for path in (exr, flo, png)] == ["press.exr", "press.flo", "press.png"]
+    flow = read_flow(exr).flow
+    np.testing.assert_array_equal(flow, cv2.readOpticalFlow(str(flo)))
     # The limit of test_baselines for Farnebäck, 1/16 px, plus the rounding of images to 8 bit.
     assert np.abs(np.median(flow, axis=(0, 1)) - (1.5, -0.5)).max() < 0.1
-    picture = cv2.imread(str(result.files[2]))
-    assert picture.std() > 20
+    assert cv2.imread(str(png)).std() > 20
     images = [frame_folder(tmp_path, ["before", "after"]) / f"{name}.png" for name in ("before", "after")]
     assert predict_pair(FARNEBACK, *images, tmp_path).files[0].name == "before_to_after.exr"
 
@@ -66,8 +58,7 @@ def test_video_against_its_first_or_previous_frame(tmp_path: Path, reference: st
     flows = [read_flow(out / "flow" / f"{frame:06d}.exr").flow[..., 0] for frame in (2, 4, 6)]
     # 1/16 px as above; Motion JPEG adds noise of a few grey levels: twice that.
     np.testing.assert_allclose([np.median(flow) for flow in flows], expected, rtol=0, atol=1 / 8)
-    with (out / "motion.csv").open(newline="") as file:
-        assert [int(row["frame"]) for row in csv.DictReader(file)] == [2, 4, 6]
+    assert [int(row["frame"]) for row in table(out / "motion.csv")] == [2, 4, 6]
     assert int(cv2.VideoCapture(str(out / "overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT)) == 3
     assert not list(out.glob(".*"))
     assert calls == [(n, 6) for n in range(1, 7)]
@@ -76,8 +67,7 @@ def test_video_against_its_first_or_previous_frame(tmp_path: Path, reference: st
 def test_folder_of_frames_is_a_video_and_flow_files_of_an_earlier_run_go(tmp_path: Path) -> None:
     frames = frame_folder(tmp_path / "in", ["b10", "b9", "a"])
     assert len(predict_video(FARNEBACK, frames, tmp_path / "out").motions) == 2
-    with (tmp_path / "out" / "motion.csv").open(newline="") as file:
-        assert [row["file"] for row in csv.DictReader(file)] == ["b9.png", "b10.png"]
+    assert [row["file"] for row in table(tmp_path / "out" / "motion.csv")] == ["b9.png", "b10.png"]
     frames, out = frame_folder(tmp_path / "five", range(5)), tmp_path / "again"
     assert len(predict_video(FARNEBACK, frames, out).motions) == 4
     others = [out / "flow" / "12.exr", out / "flow" / "000001.txt"]
@@ -92,8 +82,7 @@ def test_a_pairs_results_replace_those_of_an_earlier_run_and_nothing_else(tmp_pa
     folder = write_folder(tmp_path / "in", {"a": (1.5, -0.5)})
     images = (folder / "a_1.png", folder / "a_2.png")
     (folder / name).write_text("another's")
-    with pytest.raises(InputError, match=rf"{name}: exists and does not come from"):
-        predict_pair(FARNEBACK, *images, folder)
+    refused(rf"{name}: exists and does not come from", predict_pair, FARNEBACK, *images, folder)
     assert (folder / name).read_text() == "another's"
     for _ in range(2):
         predict_pair(FARNEBACK, *images, tmp_path / "out")
@@ -104,8 +93,7 @@ def test_a_videos_results_do_not_replace_anothers_files(tmp_path: Path, name: st
     other = tmp_path / name
     other.parent.mkdir(exist_ok=True)
     other.write_text("another's")
-    with pytest.raises(InputError, match=rf"{name}: exists and does not come from"):
-        predict_video(FARNEBACK, video(tmp_path / "a.avi", 2), tmp_path)
+    refused(rf"{name}: exists and does not come from", predict_video, FARNEBACK, video(tmp_path / "a.avi", 2), tmp_path)
     assert other.read_text() == "another's"
 
 
@@ -114,8 +102,7 @@ def test_inputs_that_cannot_be_used_are_named(tmp_path: Path) -> None:
     (frame_folder(tmp_path / "in", [0]) / "1.png").write_bytes(b"broken")
     for name, every, word in (("one.avi", 1, "fewer than two"), ("none.avi", 1, "none.avi"),
                               ("in", 1, r"1\.png: cannot be read"), ("one.avi", 0, "every")):  # fmt: skip
-        with pytest.raises(InputError, match=word):
-            predict_video(FARNEBACK, tmp_path / name, tmp_path / "out", every=every)
+        refused(word, predict_video, FARNEBACK, tmp_path / name, tmp_path / "out", every=every)
 
 
 def test_colours_follow_direction_and_length_and_arrows_have_the_true_length() -> None:
@@ -130,7 +117,7 @@ def test_colours_follow_direction_and_length_and_arrows_have_the_true_length() -
     assert tuple(flow_to_colour(np.zeros((1, 1, 2), np.float32), 1.0)[0, 0]) == (255, 255, 255)
     assert tuple(flow_to_colour(np.full((1, 1, 2), np.nan, np.float32), 1.0)[0, 0]) == UNKNOWN_COLOUR
     flow = np.full((241, 321, 2), (12.0, 0.0), np.float32)
-    picture = draw_overlay(np.zeros((241, 321, 3), np.uint8), flow, 12.0)
+    picture = pictures.draw_overlay(np.zeros((241, 321, 3), np.uint8), flow, 12.0)
     height, width = picture.shape[:2]
     assert (height % 2, width % 2) == (0, 0)
     assert height >= 480
@@ -144,7 +131,7 @@ def test_scale_makes_small_and_large_flow_look_alike_and_is_one_for_none(length:
     flow *= length / np.hypot(flow[..., 0], flow[..., 1]).max()
     scale = robust_scale(flow)
     assert 0.7 * length < scale < 1.1 * length  # the 99th percentile, rounded up by a tenth at most
-    assert scale * arrow_factor(scale) >= 3
+    assert scale * pictures.arrow_factor(scale) >= 3
     assert flow_to_colour(flow, scale).std() > 40
     assert robust_scale(0 * flow) == robust_scale(np.nan * flow) == 1.0
 
@@ -167,20 +154,16 @@ def test_arrays_and_tensors_give_one_flow_that_follows_a_known_motion(tmp_path: 
     assert np.median(flow, axis=(0, 1)) == pytest.approx((2.0, 0.0), abs=0.1)
 
 
-@pytest.mark.parametrize(
-    ("image1", "image2", "message"),
-    [
-        (np.zeros((64, 64, 3)), torch.zeros(3, 64, 64), "ndarray and Tensor: two NumPy arrays or two torch tensors"),
-        (np.full((64, 64, 3), 9.0), np.zeros((64, 64, 3)), r"image 1 is float64 with values from 9 to 9"),
-        (torch.zeros(3, 64, 64), torch.full((3, 64, 64), -1.0), r"image 2 is torch.float32 with values from -1 to -1"),
-        (np.zeros((64, 64)), np.zeros((64, 64)), r"\(rows, columns, 3\) is needed"),
-        (torch.zeros(3, 64, 64), torch.zeros(3, 64, 80), "differ in shape"),
-        (np.full((64, 64, 3), np.nan), np.zeros((64, 64, 3)), "NaN or infinite"),
-    ],
-)
+@pytest.mark.parametrize(("image1", "image2", "message"), [
+    (np.zeros((64, 64, 3)), torch.zeros(3, 64, 64), "ndarray and Tensor: two NumPy arrays or two torch tensors"),
+    (np.full((64, 64, 3), 9.0), np.zeros((64, 64, 3)), r"image 1 is float64 with values from 9 to 9"),
+    (torch.zeros(3, 64, 64), torch.full((3, 64, 64), -1.0), r"image 2 is torch.float32 with values from -1 to -1"),
+    (np.zeros((64, 64)), np.zeros((64, 64)), r"\(rows, columns, 3\) is needed"),
+    (torch.zeros(3, 64, 64), torch.zeros(3, 64, 80), "differ in shape"),
+    (np.full((64, 64, 3), np.nan), np.zeros((64, 64, 3)), "NaN or infinite"),
+])  # fmt: skip
 def test_images_that_cannot_be_used(image1: object, image2: object, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        gelflow.load_model(device="cpu").flow(image1, image2)  # type: ignore[call-overload]
+    refused(message, gelflow.load_model(device="cpu").flow, image1, image2)  # type: ignore[call-overload]
 
 
 def test_what_is_uncertain_is_in_the_file_and_grey_in_the_picture(tmp_path: Path) -> None:
@@ -195,7 +178,7 @@ def test_what_is_uncertain_is_in_the_file_and_grey_in_the_picture(tmp_path: Path
     field = read_flow(result.files[0])
     np.testing.assert_array_equal(field.sigma, found.sigma)
     np.testing.assert_array_equal(field.visible, found.visible > 0.5)
-    shown = flow_to_colour(certain(found.flow, found.sigma), 2.0)
+    shown = flow_to_colour(pictures.certain(found.flow, found.sigma), 2.0)
     np.testing.assert_array_equal((shown == UNKNOWN_COLOUR).all(axis=-1), found.sigma > UNKNOWN_PX)
     assert np.median(found.sigma[:, :48]) < 0.1
     assert (found.sigma[:, 80:] > UNKNOWN_PX).mean() > 0.8

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 import torch
+from commands import refused
 from torch.utils.data import Dataset
 from waves import Shifts, pixel_centres, wave_image
 
 from gelflow.config import MotionConfig, TrainConfig
 from gelflow.config.sources import train_config
-from gelflow.errors import InputError
 from gelflow.ops.warp import inside, warp
 from gelflow.train.augment import augmented
 from gelflow.train.loading import resident
@@ -80,27 +80,25 @@ def test_resizing_keeps_flow_and_batches_need_one_size_and_enough_pixels() -> No
     assert left_after_warping(sample, torch.ones(64, 192, dtype=torch.bool)) < 0.1
     small, large, bare = (checked(Shifts(1, side, 1.0, seed=8, flow=flow)[0])
                           for side, flow in ((64, True), (80, True), (64, False)))  # fmt: skip
-    with pytest.raises(InputError, match="different sizes; set image_size"):
-        collate([small, large])
+    refused("different sizes; set image_size", collate, [small, large])
     for side, crop, words in ((48, None, "48x48 px, but each side must be at least 64"),
                               (64, (72, 64), "crop_size 72x64 does not fit")):  # fmt: skip
-        with pytest.raises(InputError, match=words):
-            TrainingSamples(Shifts(1, side, 1.0, seed=8), TrainConfig(crop_size=crop))[(0, 0)]
+        refused(words, TrainingSamples(Shifts(1, side, 1.0, seed=8), TrainConfig(crop_size=crop)).__getitem__, (0, 0))
     assert "flow" not in collate([small, bare])
     assert collate([small, small])["flow"].shape == (2, 2, 64, 64)
 
 
 @pytest.mark.parametrize("flow", [None, torch.full((2, 64, 64), torch.nan)])
 def test_pairs_without_the_flow_that_supervision_needs_are_refused(flow: torch.Tensor | None) -> None:
-    with pytest.raises(InputError, match=r'pair shift_0: .*use supervision = "self"'):
-        checked(Shifts(1, 64, 1.0, seed=7)[0] | {"flow": flow}, supervised=True)
+    pair = Shifts(1, 64, 1.0, seed=7)[0] | {"flow": flow}
+    refused(r'pair shift_0: .*use supervision = "self"', checked, pair, supervised=True)
 
 
 @pytest.mark.parametrize("supervision", ["flow", "mixed"])
 def test_a_pair_smaller_than_the_crop_is_set_into_it_without_flow_around(supervision: str) -> None:
     config = TrainConfig(supervision=supervision, crop_size=(96, 160), flip=False)
-    with pytest.raises(InputError, match="crop_size 96x160 does not fit into its 80x80 px"):
-        TrainingSamples(Shifts(1, 80, 1.0, seed=8, flow=False), TrainConfig(crop_size=(96, 160)))[(0, 0)]
+    bare = TrainingSamples(Shifts(1, 80, 1.0, seed=8, flow=False), TrainConfig(crop_size=(96, 160)))
+    refused("crop_size 96x160 does not fit into its 80x80 px", bare.__getitem__, (0, 0))
     pairs = Shifts(1, 80, 1.0, seed=8)
     places = set()
     for draw in range(6):
@@ -186,8 +184,7 @@ def test_training_draws_it_where_the_configuration_asks_for_it() -> None:
     pairs = Shifts(1, 80, 1.0, seed=2)
 
     def flow(draw: int, motion: MotionConfig | None) -> torch.Tensor:
-        config = TrainConfig(supervision="flow", flip=False, motion=motion)
-        return augmented_batch([TrainingSamples(pairs, config)[(0, draw)]], config)["flow"][0]
+        return drawn(pairs, TrainConfig(supervision="flow", flip=False, motion=motion), draw)["flow"]
 
     assert torch.equal(flow(3, None), pairs[0]["flow"])
     shifts = MotionConfig(turn_deg=0, zoom=0)
@@ -196,6 +193,4 @@ def test_training_draws_it_where_the_configuration_asks_for_it() -> None:
     assert max(float(shift.abs().max()) for shift in added) > 4
     assert torch.equal(flow(3, shifts), flow(3, shifts))
     assert train_config(None, ["motion.turn_deg=5"]).motion == MotionConfig(turn_deg=5)
-    config = TrainConfig(motion=MotionConfig())
-    unlabelled = TrainingSamples(Shifts(1, 80, 1.0, seed=2, flow=False), config)
-    assert "flow" not in augmented_batch([unlabelled[(0, 0)]], config)
+    assert "flow" not in drawn(Shifts(1, 80, 1.0, seed=2, flow=False), TrainConfig(motion=MotionConfig()), 0)

@@ -1,5 +1,6 @@
 """Images whose motion is known exactly: a sum of plane waves is evaluated at moved positions, nothing is resampled."""
 
+import csv
 import json
 from pathlib import Path
 
@@ -24,7 +25,6 @@ def texture(x: NDArray[np.float64], y: NDArray[np.float64], seed: int = 0) -> ND
 
 
 def grid(height: int, width: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Columns x and rows y of the pixel centres, both (H, W)."""
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     return x, y
 
@@ -39,8 +39,12 @@ def as_bytes(image: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.rint(image * 255).astype(np.uint8)
 
 
+def table(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
 def save(path: Path, image: NDArray[np.float32]) -> None:
-    """Writes an image in [0, 1] as 8-bit PNG, by OpenCV alone."""
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), as_bytes(image)[..., ::-1])
 
@@ -55,7 +59,6 @@ def write_video(path: Path, frames: list[NDArray[np.uint8]]) -> None:
 
 
 def write_folder(folder: Path, shifts: dict[str, tuple[float, float]], size: tuple[int, int] = (64, 80)) -> Path:
-    """A plain folder of pairs, each moved by its own (u, v) px."""
     for name, (u, v) in shifts.items():
         save(folder / f"{name}_1.png", moved(*size, 0, 0))
         save(folder / f"{name}_2.png", moved(*size, u, v))

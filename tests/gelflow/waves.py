@@ -13,15 +13,12 @@ from gelflow.models.weights import load_weights, save_weights
 
 
 def pixel_centres(height: int, width: int) -> tuple[Tensor, Tensor]:
-    """Columns x and rows y in px, both (H, W) float64."""
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     return x.double(), y.double()
 
 
 def wave_image(x: Tensor, y: Tensor, seed: int, shortest: float = 8.0, longest: float = 24.0) -> Tensor:
-    """(3, H, W) float64 at positions in px: 0.5 plus 24 waves of random length, direction and phase, each of at most
-    0.05 in a colour; the standard deviation is about 0.1.
-    """
+    """(3, H, W) float64 at positions in px: 0.5 plus 24 waves of random length, direction and phase up to 0.05 high."""
     random = torch.Generator().manual_seed(seed)
     total = torch.zeros(3, *x.shape, dtype=torch.float64)
     for _ in range(24):
@@ -94,9 +91,7 @@ def same_weights(first: Path, second: Path) -> bool:
     return one.keys() == two.keys() and all(torch.equal(one[name], two[name]) for name in one)
 
 
-def random_weights(
-    path: Path, model: ModelConfig, train: TrainConfig | None = None, size: tuple[int, int] | None = None
-) -> Path:
+def random_weights(path: Path, model: ModelConfig, train: TrainConfig | None = None, size: tuple | None = None) -> Path:
     torch.set_num_threads(1)
     torch.manual_seed(0)
     network = GelFlow(model)

@@ -14,14 +14,12 @@ The right side is proportional to δ for a flat punch and to δ - x²/R for a ba
 the strength of the pressure's singularity at the edge, vanishes. Lebedev & Ufliand, PMM 22 (1958); Hayes et al.,
 J. Biomech. 5 (1972). Lengths in any unit; forces in units of E times length squared.
 
-Solved by finite elements on a quarter of a round layer under an axisymmetric indenter, with circles of elements around
-the contact.
-
-Walls of symmetry at x = 0 and y = 0, bonded at z = thickness, free at the rim. The square grid's rings max(x, y) become
-circles, so that few elements resolve a round contact; forces of the whole layer are four times the quarter's.
+Also the layer's finite elements: a quarter with walls of symmetry at x = 0 and y = 0, bonded at z = thickness, free at
+the rim. The square grid's rings become circles, so that few elements resolve a round contact.
 """
 
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
 
 import numpy as np
 from pads import indenters, mapped, scene, supported
@@ -54,29 +52,34 @@ def gauss(count: int) -> tuple[FloatArray, FloatArray]:
     return nodes, weights
 
 
-def wave_numbers() -> tuple[FloatArray, FloatArray]:
+def waves() -> tuple[FloatArray, FloatArray]:
     """(WAVES,) points and weights for integrals over x = ξh from 0 to the cutoff."""
     nodes, weights = gauss(WAVES)
     return CUTOFF / 2 * (nodes + 1), CUTOFF / 2 * weights
 
 
-def respond(radius: float, thickness: float, poisson_ratio: float) -> tuple[FloatArray, FloatArray]:
-    """Forces (2,) and strengths φ(a) (2,) over E for the right sides 1 (all points sink alike) and x² (the ball's).
+def flat_and_ball(x: FloatArray) -> FloatArray:
+    """Right sides (n, 2): 1 where all points sink alike, and x² of a ball."""
+    return np.asarray(x[:, None] ** (0, 2))
 
-    By Nyström's method; `radius` is the contact's, a, and `thickness` the layer's, h.
-    """
-    nodes, weights = gauss(POINTS)
-    t, dt = radius / 2 * (nodes + 1), radius / 2 * weights
-    wave, d_wave = wave_numbers()
+
+def respond(
+    contact: float, thickness: float, poisson_ratio: float, right: Callable = flat_and_ball, points: int = POINTS
+) -> tuple[FloatArray, FloatArray]:
+    """Forces (k,) and strengths φ(a) (k,) over E for right sides (n, k) of places x (n,), by Nyström's method."""
+    nodes, weights = gauss(points)
+    t, dt = contact / 2 * (nodes + 1), contact / 2 * weights
+    wave, d_wave = waves()
     defect = 2 / (np.pi * thickness) * d_wave * (1 - compliance(wave, poisson_ratio))
-    cosines = np.cos(np.outer(np.append(t, radius), wave / thickness))
-    kernel = np.einsum("ik,k,jk->ij", cosines, defect, cosines[:-1]) * dt  # threads of a product would cost more
-    right = np.append(t, radius)[:, None] ** (0, 2) / (np.pi * (1 - poisson_ratio**2))
-    phi = np.linalg.solve(np.eye(POINTS) - kernel[:-1], right[:-1])
-    return 2 * np.pi * dt @ phi, right[-1] + kernel[-1] @ phi
+    x = np.append(t, contact)
+    cosines = np.cos(np.outer(x, wave / thickness))
+    kernel = (cosines * defect) @ cosines[:-1].T * dt
+    given = right(x) / (np.pi * (1 - poisson_ratio**2))
+    phi = np.linalg.solve(np.eye(points) - kernel[:-1], given[:-1])
+    return 2 * np.pi * dt @ phi, given[-1] + kernel[-1] @ phi
 
 
-def punch_factor(radius: float, thickness: float, poisson_ratio: float = 0.5) -> float:
+def kappa(radius: float, thickness: float, poisson_ratio: float = 0.5) -> float:
     """κ: the force of a flat punch over that on a half space, 2 E a δ / (1 - ν²)."""
     force, _ = respond(radius, thickness, poisson_ratio)
     return float(force[0] * (1 - poisson_ratio**2) / (2 * radius))
@@ -90,39 +93,42 @@ def ball_at(contact: float, radius: float, thickness: float, poisson_ratio: floa
 
 
 def ball(depth: float, radius: float, thickness: float, poisson_ratio: float = 0.5) -> tuple[float, float]:
-    """Contact radius a and force over E of a ball pressed `depth` deep.
-
-    On a half space a² = Rδ; a layer widens the contact, to a² = 4 Rδ at most (incompressible and infinitely thin).
-    """
-    half_space = np.sqrt(radius * depth)
-    contact = brentq(
-        lambda a: ball_at(a, radius, thickness, poisson_ratio)[0] - depth, 0.9 * half_space, 2 * half_space, xtol=1e-12
-    )
-    return float(contact), ball_at(contact, radius, thickness, poisson_ratio)[1]
+    """Contact radius a and force over E of a ball pressed `depth` deep."""
+    half_space = np.sqrt(radius * depth)  # a layer widens the contact, to twice that at most
+    found = partial(ball_at, radius=radius, thickness=thickness, poisson_ratio=poisson_ratio)
+    contact = brentq(lambda a: found(a)[0] - depth, 0.9 * half_space, 2 * half_space, xtol=1e-12)
+    return float(contact), found(contact)[1]
 
 
 TOLERANCE = 1e-7  # Of the relative residual; a thousand times below the discretisation error
 
 
-def quarter_disc(radii: FloatArray, depths: FloatArray) -> PadMesh:
-    """The quarter with rings at radii (from 0) and planes at depths (from 0 to the thickness), mm.
+def disc(radii: FloatArray, depths: FloatArray, half: bool = False) -> PadMesh:
+    """A quarter or the half y >= 0, with rings at radii and planes at depths, both from 0 (mm).
 
-    Ring k is a polygon of 2 k edges over the quarter; it encloses as much as the circle does.
+    Ring k is a polygon of 2 k edges over a quarter; it encloses as much as the circle does.
     """
     rings, planes = len(radii) - 1, len(depths) - 1
     angle_of_edge = np.pi / 4 / np.arange(1, rings + 1)
     corners = np.append(0.0, radii[1:] * np.sqrt(angle_of_edge / np.sin(angle_of_edge)))
 
     def bend(cube: Points) -> Points:
-        large, small = cube[:, :2].max(axis=1), cube[:, :2].min(axis=1)
+        along, across = (1 + half) * cube[:, 0] - half, cube[:, 1]
+        large, small = np.maximum(np.abs(along), across), np.minimum(np.abs(along), across)
         radius = np.interp(large * rings, np.arange(rings + 1), corners)
         angle = np.pi / 4 * small / np.where(large > 0, large, 1.0)
-        along, across = radius * np.cos(angle), radius * np.sin(angle)
-        first = cube[:, 0] >= cube[:, 1]
+        angle = np.where(np.abs(along) >= across, angle, np.pi / 2 - angle)
         depth = np.interp(cube[:, 2] * planes, np.arange(planes + 1), depths)
-        return np.column_stack([np.where(first, along, across), np.where(first, across, along), depth])
+        return np.column_stack([np.sign(along) * radius * np.cos(angle), radius * np.sin(angle), depth])
 
-    return mapped((rings, rings, planes), bend, float(depths[-1]))
+    return mapped(((1 + half) * rings, rings, planes), bend, float(depths[-1]))
+
+
+def punch_disc(radius: float, thickness: float, cells: int, ratio: float) -> PadMesh:
+    """A quarter whose rings narrow toward a punch's edge from both sides."""
+    towards_edge = radius - growing(0.0, radius, cells, ratio)[::-1]
+    radii = np.concatenate([[0.0], towards_edge[1:], [radius], growing(radius, 2.5 * thickness, cells + 1, ratio)])
+    return disc(radii, np.concatenate([[0.0], growing(0.0, thickness, cells, 1.4)]))
 
 
 def growing(start: float, length: float, count: int, ratio: float) -> FloatArray:
@@ -131,10 +137,10 @@ def growing(start: float, length: float, count: int, ratio: float) -> FloatArray
     return np.asarray(start + length * share / share[-1])
 
 
-def walls_and_window(points: Points) -> BoolArray:
-    """Smooth walls at x = 0 and y = 0; glued to the window."""
+def walls_and_window(points: Points, half: bool = False) -> BoolArray:
+    """Smooth walls at y = 0 and, of a quarter, at x = 0; glued to the window."""
     window = points[:, 2] == points[:, 2].max()
-    return np.column_stack([window | (points[:, 0] == 0), window | (points[:, 1] == 0), window])
+    return np.column_stack([window | (points[:, 0] == 0) & (not half), window | (points[:, 1] == 0), window])
 
 
 def body(mesh: PadMesh, element: Element, poisson_ratio: float) -> System:
@@ -148,10 +154,7 @@ def lowered(shape: dict[str, object], depth: float, thickness: float) -> Indente
 
 
 def press(quarter: System, indenter: Indenters, penalties: tuple[float, ...] = (20.0, 200.0), passes: int = 2) -> float:
-    """Force of the whole layer over E, mm²: one step at rising penalties, then augmented-Lagrangian updates.
-
-    The updates leave less than 0.5 % of the depth as penetration at these penalties, and so that much of the force.
-    """
+    """Force of the whole layer over E, mm²: at rising penalties, then with updates that leave less than 0.5 % of it."""
     state: Unknowns = quarter.zero()
     for k in range(len(penalties) + passes):
         if k < len(penalties):
@@ -164,14 +167,10 @@ def press(quarter: System, indenter: Indenters, penalties: tuple[float, ...] = (
     return 4 * float(quarter.forces(state)[0][2])
 
 
-def ball_ratio(
-    element: Element, poisson_ratio: float, radius: float, depth: float, cells: int, thickness: float = 1.0
-) -> float:
-    """Force of a ball over the integral equation's: `cells` across the contact, beside it, and through the layer."""
-    contact, force = ball(depth, radius, thickness, poisson_ratio)
+def ball_ratio(element: Element, poisson_ratio: float, radius: float, depth: float, cells: int) -> float:
+    """Force of a ball over the integral equation's: `cells` across the contact, beside it, and through a layer of 1."""
+    contact, force = ball(depth, radius, 1.0, poisson_ratio)
     reach = 1.15 * contact
-    radii = np.concatenate([np.linspace(0, reach, cells + 1), growing(reach, 2.5 * thickness, cells, 1.5)])
-    depths = np.concatenate([[0.0], growing(0.0, thickness, cells, 1.3)])
-    quarter = body(quarter_disc(radii, depths), element, poisson_ratio)
-    shape = {"shape": "sphere", "radius_mm": radius}
-    return press(quarter, lowered(shape, depth, thickness)) / force
+    radii = np.concatenate([np.linspace(0, reach, cells + 1), growing(reach, 2.5, cells, 1.5)])
+    quarter = body(disc(radii, np.append(0.0, growing(0.0, 1.0, cells, 1.3))), element, poisson_ratio)
+    return press(quarter, lowered({"shape": "sphere", "radius_mm": radius}, depth, 1.0)) / force

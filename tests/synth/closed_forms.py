@@ -43,14 +43,10 @@ def piola(F: FloatArray, pressure: FloatArray, poisson_ratio: float, stiffening:
 
 
 def uniaxial(stretch: float, poisson_ratio: float, stiffening: Stiffening) -> tuple[float, float]:
-    """Lateral stretch and pulling force per undeformed area of a bar that is free sideways.
-
-    Incompressible: the textbook's 2 (l - l⁻²) (C10 + 2 C20 (I_1 - 3) + 3 C30 (I_1 - 3)²), Yeoh, Rubber Chem. Technol.
-    66 (1993). Otherwise the lateral stretch t is where the lateral stress vanishes; p = λ (l t² - 1).
-    """
+    """Lateral stretch and pulling force per undeformed area of a bar that is free sideways."""
     c2, c3 = stiffening
     mu, lame = shear_modulus(poisson_ratio), lame_modulus(poisson_ratio)
-    if np.isinf(lame):
+    if np.isinf(lame):  # 2 (l - l⁻²) (C10 + 2 C20 (I_1 - 3) + 3 C30 (I_1 - 3)²), Yeoh, Rubber Chem. Technol. 66 (1993)
         invariant = stretch**2 + 2 / stretch - 3
         return stretch**-0.5, (stretch - stretch**-2) * mu * (1 + 2 * c2 * invariant + 3 * c3 * invariant**2)
 
@@ -61,14 +57,12 @@ def uniaxial(stretch: float, poisson_ratio: float, stiffening: Stiffening) -> tu
     def pressure_times_volume(t: float) -> float:
         return float(lame * (stretch * t**2 - 1) * stretch * t**2)
 
+    # Otherwise the lateral stretch t is where the lateral stress vanishes; p = λ (l t² - 1).
     lateral = brentq(lambda t: slope(t) * (t - 1 / t) + pressure_times_volume(t) / t, 0.3, 3.0, xtol=1e-15)
     return lateral, slope(lateral) * (stretch - 1 / stretch) + pressure_times_volume(lateral) / stretch
 
 
 def shear_traction(amount: float, poisson_ratio: float, stiffening: Stiffening) -> float:
-    """Shear stress τ of F = I + γ e_x ⊗ e_z; it keeps the volume, I_1 - 3 = γ², and P = τ (e_x ⊗ e_z + e_z ⊗ e_x).
-
-    The faces normal to x feel it along z. True stress P F^T has the normal part γτ along x, too (Poynting's effect).
-    """
+    """Shear stress τ of F = I + γ e_x ⊗ e_z; it keeps the volume, I_1 - 3 = γ², and P = τ (e_x ⊗ e_z + e_z ⊗ e_x)."""
     c2, c3 = stiffening
     return float(shear_modulus(poisson_ratio) * amount * (1 + 2 * c2 * amount**2 + 3 * c3 * amount**4))

@@ -31,13 +31,7 @@ def collapsed_rule(n: int) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True)
 class Integrals:
-    """Quadrature on every element of a space.
-
-    Attributes:
-        space: displacement and pressure nodes.
-        barycentric: (q, 4) points, also the pressure's shape functions there.
-        weights: (q,) of sum 1.
-    """
+    """Quadrature on every element of a space, at points (q, 4), the pressure's shape functions, of weights (q,)."""
 
     space: Space
     barycentric: FloatArray
@@ -102,9 +96,7 @@ class Integrals:
         square = (field**2).reshape(*self.volume.shape, -1).sum(axis=-1)
         return float(np.sqrt((self.volume * square).sum()))
 
-    def dilation(
-        self, material: Material, F: FloatArray, nodal: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def dilation(self, material: Material, F: FloatArray, nodal: FloatArray) -> tuple[FloatArray, ...]:
         """(m, q) of a mixed element: the pressure field p, D = J - 1 - p/λ, and γ, that of `synth.simulate.bulk`."""
         local = nodal[self.space.pressure_nodes]
         p, inverse = local @ self.barycentric.T, 1 / material.lame[:, None]
@@ -130,11 +122,7 @@ class Integrals:
         return np.asarray(slope[..., None, None] * (F - inverse) + volumetric[..., None, None] * inverse)
 
     def energy(self, material: Material, displacement: FloatArray, nodal: FloatArray) -> float:
-        """Stored energy in E mm³ of displacements (n, 3) and pressure unknowns.
-
-        W of `synth.simulate.material`, γ/2 D², and -α/2μ |p - mean(p)|² of the P1/P1 element, whose integral is exact
-        with the mean square (sum p_a² + (sum p_a)²) / 20 of a linear function in a tetrahedron.
-        """
+        """Stored energy in E mm³: W of `synth.simulate.material`, γ/2 D², and -α/2μ |p - mean(p)|² of P1/P1."""
         F = self.deformation(displacement)
         s, J = excess(F), np.linalg.det(F)
         c2, c3 = material.yeoh[:, :1], material.yeoh[:, 1:]
@@ -144,6 +132,7 @@ class Integrals:
         p, D, gamma = self.dilation(material, F, nodal)
         density += p * (J - 1) - p**2 / (2 * material.lame[:, None]) + gamma / 2 * D**2
         local = nodal[self.space.pressure_nodes]
+        # The mean square of a linear function in a tetrahedron is (sum p_a² + (sum p_a)²) / 20.
         roughness = ((local**2).sum(axis=1) + local.sum(axis=1) ** 2) / 20 - local.mean(axis=1) ** 2
         smoothing = self.space.element.stabilisation / (2 * material.shear) * roughness
         return float((self.volume * density).sum() - (self.volume.sum(axis=1) * smoothing).sum())

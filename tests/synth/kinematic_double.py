@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from synth.arrays import FloatArray, Points
+from synth.flow.field import FlowField
 from synth.optics import Optics
 from synth.scene import Camera, Gel, Light, Mirror, NoPattern, Sensor, Window
 from synth.surface import ContactFaces, GelSurface
@@ -80,6 +81,11 @@ def dented(points: Points, depth: float, shear: tuple[float, float] = (0.0, 0.0)
     """With a dent of some 3 mm radius beside the middle, carried along."""
     dent = np.exp(-((points[:, :2] - (0.4, -0.3)) ** 2).sum(1) / 9.0)
     return points + np.outer(dent, [*shear, depth])
+
+
+def assert_same_flow(first: FlowField, second: FlowField) -> None:
+    for name in ("forward", "forward_visible", "backward", "backward_visible"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name), strict=True)
 
 
 def pixel_centres(width: int = WIDTH, height: int = HEIGHT) -> FloatArray:

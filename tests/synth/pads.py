@@ -5,25 +5,30 @@ rounding, and free of the mesher's randomness. The solver holds displacement com
 start, so that prescribed motion is a `held` mask and a start; dead loads are nodal forces. Everything for E = 1.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from itertools import permutations
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from synth.arrays import BoolArray, FloatArray, Points
 from synth.mesh import PadMesh
-from synth.mesh.pad import boundary_faces, signed_volumes
+from synth.mesh.graded import kuhn_tets
+from synth.mesh.pad import boundary_faces
 from synth.scene import Scene
 from synth.simulate import Trajectory, simulate
+from synth.simulate.batched import simulate_presses
+from synth.simulate.batched.pad import prepare
 from synth.simulate.contact import Indenters
 from synth.simulate.element import Element, p1p1, p2p1
 from synth.simulate.indenter import rigid_body
 from synth.simulate.load_path import LoadPath
-from synth.simulate.material import Material, pad_material, uniform
+from synth.simulate.material import Material, uniform
 from synth.simulate.newton import relative_residual, solve
 from synth.simulate.options import SolverOptions
+from synth.simulate.press import Press
+from synth.simulate.solve import stepper_of
 from synth.simulate.space import Space, function_space
 from synth.simulate.stepping import Stepper
 from synth.simulate.system import System, Tangent, Unknowns
@@ -45,7 +50,6 @@ MIXED = ["p1p1", "p2p1"]  # Names of the elements that have a pressure field, to
 
 
 def contact_faces(mesh: PadMesh) -> ContactFaces:
-    """The contact surface of a mesh, its nodes in the mesh's order."""
     faces = boundary_faces(mesh.tets)
     faces = faces[mesh.on_face[faces].all(axis=1)]
     nodes = np.unique(faces)
@@ -57,19 +61,7 @@ def brick(size: tuple[float, float, float] = SIZE, counts: tuple[int, int, int] 
     axes = [np.linspace(-size[axis] / 2, size[axis] / 2, counts[axis] + 1) for axis in (0, 1)]
     axes.append(np.linspace(0.0, size[2], counts[2] + 1))
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    cell = np.stack(np.meshgrid(*(np.arange(n) for n in counts), indexing="ij"), axis=-1).reshape(-1, 3)
-    tets = []
-    for order in permutations(range(3)):
-        corner, way = np.zeros(3, int), [np.zeros(3, int)]
-        for axis in order:
-            corner = corner + np.eye(3, dtype=int)[axis]
-            way.append(corner)
-        grid = [cell + np.where(cell % 2 == 1, 1 - step, step) for step in way]
-        tets.append(np.stack([(g[:, 0] * (counts[1] + 1) + g[:, 1]) * (counts[2] + 1) + g[:, 2] for g in grid], axis=1))
-    joined = np.concatenate(tets).astype(np.int32)
-    flipped = signed_volumes(points, joined) < 0
-    joined[flipped] = joined[flipped][:, [0, 2, 1, 3]]
-    return PadMesh(points, joined, size)
+    return PadMesh(points, kuhn_tets(*counts), size)
 
 
 def crooked(size: tuple[float, float, float] = (3.0, 2.0, 2.0), seed: int = 0) -> PadMesh:
@@ -98,25 +90,21 @@ def pad(layers: bool) -> PadMesh:
 
 def scene(size: tuple[float, float, float] = SIZE, **parts: Any) -> Scene:
     """A scene of a bare pad, P1/P1 by default. parts: gel, indenter, friction, motion, numerics as in a scene file."""
-    return Scene.model_validate(
-        {
-            "name": "pad",
-            "sensor": {
-                "gel": {"size_mm": size, "youngs_modulus_kpa": 200.0, "poisson_ratio": 0.4999, **parts.get("gel", {})},
-                "pattern": {"kind": "none"},
-                "lights": [{"position_mm": [0, 0, 0.1], "size_mm": [1, 1], "color": [1, 1, 1], "power": 1}],
-                "camera": {
-                    "width": 16, "height": 16, "fx": 9, "fy": 9, "cx": 8, "cy": 8, "position_mm": [0, 0, 90],
-                },
-            },
-            "contact": {"indenter": parts.get("indenter", SPHERE), "friction": parts.get("friction", 0.0)},
-            "motion": {"depth_mm": 0.5, "steps": 1, **parts.get("motion", {})},
-            "numerics": {
-                **({} if parts.get("gel", {}).get("layers") else {"edge_length_mm": min(size) / 4}),
-                "element": "p1p1", **parts.get("numerics", {}),
-            },
-        }
-    )  # fmt: skip
+    return Scene.model_validate({
+        "name": "pad",
+        "sensor": {
+            "gel": {"size_mm": size, "youngs_modulus_kpa": 200.0, "poisson_ratio": 0.4999, **parts.get("gel", {})},
+            "pattern": {"kind": "none"},
+            "lights": [{"position_mm": [0, 0, 0.1], "size_mm": [1, 1], "color": [1, 1, 1], "power": 1}],
+            "camera": {"width": 16, "height": 16, "fx": 9, "fy": 9, "cx": 8, "cy": 8, "position_mm": [0, 0, 90]},
+        },
+        "contact": {"indenter": parts.get("indenter", SPHERE), "friction": parts.get("friction", 0.0)},
+        "motion": {"depth_mm": 0.5, "steps": 1, **parts.get("motion", {})},
+        "numerics": {
+            **({} if parts.get("gel", {}).get("layers") else {"edge_length_mm": min(size) / 4}),
+            "element": "p1p1", **parts.get("numerics", {}),
+        },
+    })  # fmt: skip
 
 
 def gentle(**parts: Any) -> Scene:
@@ -125,7 +113,6 @@ def gentle(**parts: Any) -> Scene:
 
 
 def same(a: Trajectory, b: Trajectory) -> bool:
-    """Bitwise, but for the time it took."""
     assert (a.status, a.reason, len(a.states)) == (b.status, b.reason, len(b.states))
     return all(
         (s.displacement == t.displacement).all() and (s.traction == t.traction).all() and s.summary() == t.summary()
@@ -133,32 +120,37 @@ def same(a: Trajectory, b: Trajectory) -> bool:
     )
 
 
-def complete(posed: Scene, mesh: PadMesh) -> Trajectory:
-    """The trajectory of a scene, which must reach its end."""
-    result = simulate(posed, mesh)
+def complete(posed: Scene, mesh: PadMesh, folder: Path | None = None, **options: Any) -> Trajectory:
+    result = simulate(posed, mesh, folder, **options)
     assert (result.status, result.reason) == ("complete", "")
     return result
 
 
 def system(mesh: PadMesh, poisson_ratio: float, penalty: float = 50.0, element: Element | None = None) -> System:
-    """The discrete system of a pad of E = 1; P1/P1 unless said otherwise."""
     space = function_space(mesh, element or p1p1())
     return System(space, uniform(len(mesh.tets), poisson_ratio), penalty)
 
 
 def run(posed: Scene, mesh: PadMesh) -> Stepper:
     """A stepper at the end of a scene's path, which it must have reached."""
-    gel, numerics = posed.sensor.gel, posed.numerics
-    name = "p2p1" if numerics.element == "auto" else numerics.element
-    space = function_space(mesh, ELEMENT[name]())
-    body = System(space, pad_material(gel, mesh), numerics.penalty)
-    path = LoadPath(posed.motion, rigid_body(posed.contact.indenter, resolution_mm=0.5))
     # The full tolerance for all steps: the state in which the path ends is looked at, beside the recorded ones.
-    modulus_mpa, options = gel.youngs_modulus_kpa / 1000, SolverOptions(relaxed_tolerance=0.0)
-    stepper = Stepper(body, path, posed.contact.friction, numerics, modulus_mpa, options)
+    stepper = stepper_of(Press.of(posed, mesh), options=SolverOptions(relaxed_tolerance=0.0))
     ended = stepper.run()
     assert (ended.status, ended.reason) == ("complete", "")
     return stepper
+
+
+def presses_of(scenes: Sequence[Scene], mesh: PadMesh, folder: Path | None = None) -> list[Press]:
+    return [Press.of(scene, mesh, folder) for scene in scenes]
+
+
+def simulate_scenes(
+    scenes: Sequence[Scene], mesh: PadMesh, folder: Path | None = None, device: str = "cpu", **options: Any
+) -> list[Trajectory]:
+    pad = prepare(scenes[0], mesh, device)
+    found = dict(simulate_presses(presses_of(scenes, mesh, folder), pad, **options))
+    assert sorted(found) == list(range(len(scenes)))
+    return [found[number] for number in range(len(scenes))]
 
 
 def dense(body: System, tangent: Tangent) -> FloatArray:
@@ -179,7 +171,6 @@ def indenters(posed: Scene, at: float) -> Indenters:
 
 
 def far_away() -> Indenters:
-    """An indenter that touches nothing."""
     return indenters(scene(motion={"depth_mm": -40.0}), 0.0)
 
 
@@ -213,8 +204,7 @@ def equilibrium(
 ) -> tuple[System, Unknowns, FloatArray]:
     """The equilibrium without contact under prescribed displacements (n, 3) mm where held and dead loads (n, 3) E mm².
 
-    In equal steps, each from the last state extrapolated; `guess` is the first iterate of a single one. Returns the
-    system, its state, and all nodal forces (n, 3): what the supports exert, zero elsewhere.
+    Returns the system, its state, and all nodal forces (n, 3), which the supports exert.
     """
     goal = np.zeros_like(space.points) if prescribed is None else prescribed
     body = System(space, material, load=load)
@@ -230,15 +220,21 @@ def equilibrium(
     return body, state, body.residual(state, far_away()).reaction
 
 
-def face_load(space: Space, on: Callable[[Points], BoolArray], traction: FloatArray) -> FloatArray:
-    """(n, 3) nodal forces of a constant traction (3,) on the boundary faces whose nodes all satisfy `on`.
+def area_vectors(points: Points, faces: np.ndarray) -> FloatArray:
+    """(f, 3) mm², each along its face's normal by the right-hand rule."""
+    a, b, c = (points[faces[:, i]] for i in range(3))
+    return np.asarray(np.cross(b - a, c - a) / 2)
 
-    A linear face gives a third of its force to each vertex; a straight quadratic one to each middle of an edge.
-    """
+
+def areas(points: Points, faces: np.ndarray) -> FloatArray:
+    return np.asarray(np.linalg.norm(area_vectors(points, faces), axis=1))
+
+
+def face_load(space: Space, on: Callable[[Points], BoolArray], traction: FloatArray) -> FloatArray:
+    """(n, 3) nodal forces of a constant traction (3,) on the boundary faces whose nodes all satisfy `on`."""
     faces = space.faces[on(space.points)[space.faces].all(axis=1)]
-    a, b, c = (space.points[faces[:, i]] for i in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    # A linear face gives a third of its force to each vertex; a straight quadratic one to each middle of an edge.
     bearing = faces if faces.shape[1] == 3 else faces[:, 3:]
     load = np.zeros_like(space.points)
-    np.add.at(load, bearing, (area[:, None, None] / 3 * traction))
+    np.add.at(load, bearing, (areas(space.points, faces)[:, None, None] / 3 * traction))
     return load

@@ -46,7 +46,6 @@ def end_family(process: "subprocess.Popen[str]", number: signal.Signals) -> str:
 
 
 def lines(out: Path) -> int:
-    """Samples on record."""
     manifest = out / "manifest.jsonl"
     return manifest.read_bytes().count(b"\n") if manifest.exists() else 0
 
@@ -74,7 +73,6 @@ def alive(pids: Sequence[int]) -> list[int]:
 
 
 def descendants(pid: int) -> list[int]:
-    """Children, their children, and so on."""
     try:
         children = [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
     except OSError:
@@ -83,8 +81,6 @@ def descendants(pid: int) -> list[int]:
 
 
 def workers_of(pid: int, name: bytes = b"spawn_main") -> list[int]:
-    """Descendants with a name in their command line."""
-
     def command(pid: int) -> bytes:
         try:
             return Path(f"/proc/{pid}/cmdline").read_bytes()
@@ -96,10 +92,7 @@ def workers_of(pid: int, name: bytes = b"spawn_main") -> list[int]:
 
 @contextlib.contextmanager
 def largest_file(count: int) -> Iterator[None]:
-    """Let no file become larger than so many bytes: a write beyond that fails as on a full disk, at the same place.
-
-    Held no longer than the call it is for: pytest's own output may go to a file.
-    """
+    """Let no file become larger than so many bytes: a write beyond that fails as on a full disk, at the same place."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (count, hard))
     try:

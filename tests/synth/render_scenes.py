@@ -38,12 +38,10 @@ def small_sensor(
 
 
 def flat_surface(sensor: Sensor, cells: int = 12) -> GelSurface:
-    """The undeformed contact face as a regular grid of triangles."""
     return sheet(cells, cells, *sensor.gel.size_mm[:2], 2)
 
 
 def plain(value: float = 0.6) -> Image:
-    """A texture of one reflectance."""
     return np.full((4, 4, 3), value, dtype=np.float32)
 
 
@@ -85,10 +83,7 @@ def kernels_compiled(frame: Callable[[], object]) -> int:
 
 
 def refracted_angle(above: float, below: float, distance: float, index: float) -> float:
-    """The angle a from the normal in air of a ray that Snell's law bends: a root, by Brent's method.
-
-    Of R = h tan(a) + d tan(g), sin(a) = n sin(g), with heights h above and d below the face; shares no code with synth.
-    """
+    """The angle a from the normal in air of a ray that Snell's law bends: the root of R = h tan(a) + d tan(g)."""
 
     def beyond(angle: float) -> float:
         return above * np.tan(angle) + below * np.tan(np.arcsin(np.sin(angle) / index)) - distance

@@ -8,16 +8,17 @@ import contextlib
 import hashlib
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+from kinematic_double import sheet
 
 from synth.dataset.job import Job
 from synth.dataset.sample import Sample
+from synth.dataset.writer import DatasetWriter
 from synth.flow.field import FlowField
 from synth.scene import Scene
-from synth.surface import ContactFaces, GelSurface
 
 HEIGHT, WIDTH = 24, 32
 SCENE = {
@@ -31,13 +32,6 @@ SCENE = {
     "contact": {"indenter": {"shape": "sphere", "radius_mm": 1.0}},
     "motion": {"depth_mm": 0.1},
 }
-
-
-def flat_surface() -> GelSurface:
-    """Four triangles over the pad of `SCENE`."""
-    nodes = np.array([[-2, -1.5, 0], [2, -1.5, 0], [2, 1.5, 0], [-2, 1.5, 0], [0, 0, 0]], np.float64)
-    faces = np.array([[0, 4, 1], [1, 4, 2], [2, 4, 3], [3, 4, 0]], np.int32)
-    return GelSurface(ContactFaces(nodes, faces), subdivisions=2)
 
 
 def texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -63,37 +57,35 @@ def translation_sample(
         u, v = x + k * shift[0], y + k * shift[1]
         return ((u > 0) & (u < WIDTH) & (v > 0) & (v < HEIGHT) & gel).astype(np.float32)
 
-    contact, surface = np.where(gel, index, np.nan).astype(np.float32), flat_surface()
+    contact, surface = np.where(gel, index, np.nan).astype(np.float32), sheet(1, 1, 4.0, 3.0, 2)
     rest = np.zeros_like(surface.coarse.nodes)
     solver = {
         "depth_mm": 0.1, "shear_mm": [0.0, 0.0], "twist_deg": 0.0, "converged": True, "newton_iterations": 4,
         "residual": 1e-9, "min_jacobian": 0.97, "max_penetration_mm": 1e-4,
     }  # fmt: skip
+    flow = FlowField(forward, visible(1), -forward, visible(-1), extras={"contact.Y": contact})
+    moved = rest + np.array([shift[0] / 4, shift[1] / 4, 0.0])
     return Sample(
-        index=index,
-        trajectory=index // 2,
-        frames=(0, 3),
-        seed=7,
-        image1=images[0],
-        image2=images[1],
-        flow=FlowField(forward, visible(1), -forward, visible(-1), extras={"contact.Y": contact}),
-        scene=Scene.model_validate(SCENE),
-        surface=surface,
-        displacement1=rest,
-        displacement2=rest + np.array([shift[0] / 4, shift[1] / 4, 0.0]),
+        index, index // 2, (0, 3), 7, *images, flow, Scene.model_validate(SCENE), surface, rest, moved,
         diagnostics={"solver": [solver, {**solver, "depth_mm": np.float64(0.2)}]},
         force_n=np.array([[0.0, 0.0, 0.5], [0.1, 0.0, 1.5]]),
         torque_nmm=np.zeros((2, 3)),
         seconds={"simulate": 0.1 + index, "render": 0.2},
-    )
+    )  # fmt: skip
 
 
 def job(n: int = 3, *, seed: int = 7, **changes: object) -> Job:
-    """A job whose scene is `SCENE` with top-level keys changed."""
     scene = {**SCENE, **changes}
     scene_hash = hashlib.sha256(repr(scene).encode()).hexdigest()[:16]
     software, device = {"synth": "0.1.0"}, {"device": "cpu", "variant": "scalar_rgb"}
     return Job(scene, "flat", scene_hash, seed, n, software, device)
+
+
+def write_dataset(folder: Path, samples: Iterable[Sample], n: int = 3) -> Path:
+    with DatasetWriter(folder, job(n)) as writer:
+        for sample in samples:
+            writer.write(sample)
+    return folder
 
 
 HOLD = """

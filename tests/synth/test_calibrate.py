@@ -11,9 +11,10 @@ import cv2
 import numpy as np
 import pytest
 import tomli_w
+from commands import refused, said
 from numpy.typing import NDArray
 from PIL import ExifTags, Image
-from render_scenes import FAST, needs_llvm, small_sensor
+from render_scenes import FAST, needs_llvm, plain, small_sensor
 
 from synth.arrays import FloatArray
 from synth.calibrate.dot_grid import fit_dot_grid, grid_index, pattern_points
@@ -25,7 +26,6 @@ from synth.calibrate.profile import fit_profile
 from synth.calibrate.run import MARK, start_sensor
 from synth.calibrate.sensor_fit import SensorFit, fit_sensor
 from synth.cli import main
-from synth.errors import InputError
 from synth.mesh import flat_surface
 from synth.optics import Optics
 from synth.render.camera_image import camera_image
@@ -40,7 +40,7 @@ POWERS = np.array([[420.0, 80, 30], [60, 390, 90], [45, 120, 510]])
 
 def _start(**coating: Any) -> Sensor:
     """Three white lights around a dotted pad of 12 x 9 mm at 160 x 120 px."""
-    places = [(7.0, 0.5, 3.0), (-4.0, 5.6, 4.0), (-3.5, -5.6, 2.5)]
+    places = (7.0, 0.5, 3.0), (-4.0, 5.6, 4.0), (-3.5, -5.6, 2.5)
     lights = tuple(Light(position_mm=p, size_mm=(1.5, 0.6), color=(1, 1, 1), power=300) for p in places)
     pattern = Dots(kind="dots", spacing_mm=(1.6, 1.6), radius_mm=0.33, offset_mm=(0.2, 0.1), reflectance=(0.06,) * 3)
     view = {"width": 160, "height": 120, "fx": 265.0, "fy": 265.0, "cx": 80.0, "cy": 60.0, "gamma": 2.2}
@@ -54,9 +54,8 @@ def _truth(start: Sensor) -> Sensor:
     lights = []
     for light, power in zip(start.lights, POWERS, strict=True):
         shift = 0.3 * rng.standard_normal(3)
-        place = {"position_mm": np.add(light.position_mm, shift), "aim_mm": np.add(light.aim_mm, shift)}
-        shine = {"power": float(power.max()), "color": tuple(power / power.max())}
-        lights.append(light.model_copy(update={key: tuple(value) for key, value in place.items()} | shine))
+        place = {key: tuple(np.add(getattr(light, key), shift)) for key in ("position_mm", "aim_mm")}
+        lights.append(light.model_copy(update=place | {"power": power.max(), "color": tuple(power / power.max())}))
     grid = {"spacing_mm": (1.55, 1.62), "rotation_deg": 2.0, "offset_mm": (0.33, -0.2), "radius_mm": 0.3}
     pattern = start.pattern.model_copy(update=grid | {"reflectance": (0.1, 0.08, 0.05)})
     lens = {"vignetting": 0.35, "blur_px": 0.8, "distortion": (0.04, 0.0, 0.0, 0.0, 0.0)}
@@ -66,15 +65,12 @@ def _truth(start: Sensor) -> Sensor:
 
 def _frame(sensor: Sensor) -> FloatArray:
     """The undeformed gel's picture as an 8-bit camera gives it, in [0, 1]."""
-    surface = flat_surface(sensor.gel.size_mm)
-    texture = albedo(sensor, np.random.default_rng(0))
+    surface, texture = flat_surface(sensor.gel.size_mm), albedo(sensor, np.random.default_rng(0))
     renderer = Renderer(sensor, Render(samples_per_pixel=144, max_depth=2), surface, texture, FAST)
-    radiance = renderer.radiance(surface.material, 1)
-    return camera_image(radiance, sensor.camera, np.random.default_rng(5)) / 255
+    return camera_image(renderer.radiance(surface.material, 1), sensor.camera, np.random.default_rng(5)) / 255
 
 
 def _fit(truth: Sensor, spacing_mm: float | None, steps: int) -> SensorFit:
-    """From one frame of the truth."""
     image = _frame(truth)
     return fit_sensor(_start(), Frames(image, image, 1 / 255), FAST, spacing_mm, steps)
 
@@ -98,16 +94,13 @@ def test_colours_powers_and_places_of_displaced_lights_are_recovered(recovered: 
 
 @needs_llvm
 def test_dots_are_predicted_within_a_tenth_of_a_pixel(recovered: tuple[Sensor, SensorFit]) -> None:
-    true, found = (_all_dots(sensor) for sensor in (recovered[0], recovered[1].sensor))
+    index = np.stack(np.meshgrid(np.arange(-9, 10), np.arange(-9, 10)), axis=-1).reshape(-1, 2)
+    sensors = recovered[0], recovered[1].sensor
+    true, found = (Optics.of(sensor).project(pattern_points(sensor.pattern, index)) for sensor in sensors)
     true = true[((true > 6) & (true < [154, 114])).all(axis=1)]
     assert len(true) > 30
     away = np.linalg.norm(true[:, None] - found[None], axis=2).min(axis=1)
     assert away.max() < 0.1
-
-
-def _all_dots(sensor: Sensor) -> FloatArray:
-    index = np.stack(np.meshgrid(np.arange(-9, 10), np.arange(-9, 10)), axis=-1).reshape(-1, 2)
-    return Optics.of(sensor).project(pattern_points(sensor.pattern, index))
 
 
 @needs_llvm
@@ -131,6 +124,11 @@ def test_a_known_spacing_gives_the_focal_length() -> None:
     assert fit.sensor.pattern.spacing_mm == pytest.approx((1.55 * 1.1, 1.62 * 1.1), rel=2e-3)
 
 
+def _every(step: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    columns, rows = np.meshgrid(np.arange(2, 160, step), np.arange(2, 120, step))
+    return columns.ravel(), rows.ravel()
+
+
 @needs_llvm
 @pytest.mark.parametrize("angle", [120.0, 50.0])
 @pytest.mark.parametrize("coating", [{}, {"roughness": 0.5, "metallic": 0.6}], ids=["matt", "metallic"])
@@ -144,10 +142,9 @@ def test_contributions_are_what_the_renderer_renders(
     dark = light.model_copy(update={"position_mm": shade[0], "size_mm": (3.0, shade[1]), "power": 1e-9})
     sensor = sensor.model_copy(update={"lights": (light, dark)})  # the second shades a part of the first's
     surface = flat_surface(sensor.gel.size_mm)
-    plain = np.full((4, 4, 3), 0.6, dtype=np.float32)
     render = Render(samples_per_pixel=256, max_depth=2 if coating else 3)  # a matt gel lights itself by the window
-    image = Renderer(sensor, render, surface, plain, FAST).radiance(surface.material, 0)
-    columns, rows = (axis.ravel() for axis in np.meshgrid(np.arange(2, 160, 8), np.arange(2, 120, 8)))
+    image = Renderer(sensor, render, surface, plain(), FAST).radiance(surface.material, 0)
+    columns, rows = _every(8)
     gel = FlatGel(sensor, np.column_stack([columns, rows]) + 0.5, FAST)
     lit = 200 * gel.contributions(LightGeometry.of(sensor.lights))[0]
     # Half of 256 samples, stratified, leave some 1 % at a pixel and 0.1 % in the mean over 300 pixels. The shade, 20 %
@@ -159,22 +156,16 @@ def test_contributions_are_what_the_renderer_renders(
 @needs_llvm
 def test_a_matt_gel_is_lit_by_itself_by_way_of_the_window() -> None:
     """The renderer samples the paths whose integral is taken here: what a third surface adds to two."""
-    window = _start().window.model_copy(
-        update={"thickness_mm": 1.2, "refractive_index": 2.0}
-    )  # total beyond 30 degrees
+    thin = {"thickness_mm": 1.2, "refractive_index": 2.0}  # total reflection beyond 30 degrees
+    window = _start().window.model_copy(update=thin)
     bright, dim = (_start(reflectance=(value,) * 3).model_copy(update={"window": window}) for value in (0.9, 0.45))
-    surface, plain = flat_surface(bright.gel.size_mm), np.full((4, 4, 3), 0.9, dtype=np.float32)
-    columns, rows = (axis.ravel() for axis in np.meshgrid(np.arange(2, 160, 8), np.arange(2, 120, 8)))
-    direct, both = (
-        Renderer(bright, Render(samples_per_pixel=64, max_depth=depth, light="separated"), surface, plain, FAST)
-        .radiance(surface.material, 0)[rows, columns, 0]
-        .mean()
-        for depth in (2, 3)
-    )
+    surface, (columns, rows) = flat_surface(bright.gel.size_mm), _every(8)
+    renders = (Render(samples_per_pixel=64, max_depth=depth, light="separated") for depth in (2, 3))
+    pictures = (Renderer(bright, one, surface, plain(0.9), FAST).radiance(surface.material, 0) for one in renders)
+    direct, both = (picture[rows, columns, 0].mean() for picture in pictures)
     pixels, lights = np.column_stack([columns, rows]) + 0.5, LightGeometry.of(bright.lights)
     lit = [300 * FlatGel(sensor, pixels, FAST).contributions(lights).sum(axis=0).mean() for sensor in (bright, dim)]
-    # Direct light is proportional to the reflectance, what comes back to its square. Lights near the window shade their
-    # images, which is left out here: 3 % of the light.
+    # Direct light goes as the reflectance, what comes back as its square; shade on the images is left out: 3 %.
     assert both > 1.1 * direct
     assert 2 * (lit[0] - 2 * lit[1]) == pytest.approx(both - direct, rel=0.05)
 
@@ -184,19 +175,15 @@ def test_a_matt_gel_is_lit_by_itself_by_way_of_the_window() -> None:
 def test_derivatives_agree_with_finite_differences(index: float) -> None:
     start = _start()
     sensor = start.model_copy(update={"window": start.window.model_copy(update={"refractive_index": index})})
-    columns, rows = (axis.ravel() for axis in np.meshgrid(np.arange(2, 160, 16), np.arange(2, 120, 16)))
-    gel, geometry = FlatGel(sensor, np.column_stack([columns, rows]) + 0.5, FAST), LightGeometry.of(sensor.lights)
+    gel, geometry = FlatGel(sensor, np.column_stack(_every(16)) + 0.5, FAST), LightGeometry.of(sensor.lights)
     geometry = replace(geometry, viewing_angle_deg=np.array([[119.0], [60.0], [30.0]]))
     exact = gel.derivatives(geometry)
     step = 0.02
     parts = (("centre", 3), ("direction", 3), ("size", 2), ("viewing_angle_deg", 1))
     for number, (name, axis) in enumerate((name, axis) for name, count in parts for axis in range(count)):
-        lit = []
-        for sign in (1, -1):
-            moved = getattr(geometry, name).copy()
-            moved[:, axis] += sign * step
-            lit.append(gel.contributions(replace(geometry, **{name: moved})))
-        difference = (lit[0] - lit[1]) / (2 * step)
+        moves = (sign * step * np.eye(getattr(geometry, name).shape[1])[axis] for sign in (1, -1))
+        more, less = (gel.contributions(replace(geometry, **{name: getattr(geometry, name) + m})) for m in moves)
+        difference = (more - less) / (2 * step)
         # Central differences err by step² / 6 times a third derivative of order E / (3 mm)³: 2e-5; float32 less.
         error = np.abs(exact[:, number] - difference) / np.abs(exact).max()
         # A window's reflectance rises with infinite slope at the critical angle, in one or two of a light's 24 cells.
@@ -212,14 +199,11 @@ def test_the_command_writes_a_scene_that_loads_and_generates(tmp_path: Path, cap
         cv2.imwrite(str(path), np.round(255 * _frame(_truth(_start())))[:, :, ::-1])
     out = tmp_path / "mine"
     command = ["calibrate", "--scene", str(preset), "--frames", str(frame), "--judge", str(other), "--out", str(out)]
-    assert main([*command, "--steps", "0", "--json"]) == 0
-    record = json.loads(capsys.readouterr().out)
+    record = json.loads(said(capsys, main, *command, "--steps", 0, "--json"))
     assert record == json.loads((out / "calibration.json").read_text())
-    assert main([*command, "--steps", "6"]) == 0  # in place of the first
-    assert "verdict: good; residual" in capsys.readouterr().out
+    assert "verdict: good; residual" in said(capsys, main, *command, "--steps", 6)  # in place of the first
     record = json.loads((out / "calibration.json").read_text())
-    assert record["verdict"]["good"]
-    assert record["verdict"]["reasons"] == []
+    assert (record["verdict"]["good"], record["verdict"]["reasons"]) == (True, [])
     assert set(record["differences"]) == {"frames", "not fitted: other.png"}
     for difference in record["differences"].values():
         # The fit itself leaves below 0.5; rounding to 8 bits and the camera's noise of 1 level, 0.8 on average.
@@ -229,8 +213,7 @@ def test_the_command_writes_a_scene_that_loads_and_generates(tmp_path: Path, cap
     assert fitted.corners[0].contact.indenter.radius_mm == 2.0  # what no frame tells keeps its distribution
     assert fitted.content["contact"]["indenter"]["radius_mm"] == {"uniform": [2.0, 3.0]}
     small = ["--set", "sensor.camera.width=40", "--set", "sensor.camera.height=30"]
-    generated = ["--n", "1", "--out", str(tmp_path / "data"), *small]
-    assert main(["generate", "--scene", str(out / "scene.toml"), *generated]) == 0
+    said(capsys, main, "generate", "--scene", out / "scene.toml", "--n", 1, "--out", tmp_path / "data", *small)
 
 
 def _preset() -> dict:
@@ -251,15 +234,11 @@ def test_frames_that_do_not_belong_together_are_refused(tmp_path: Path) -> None:
     for name, image in {"a": dark, "b": bright, "c": np.zeros((20, 40, 3))}.items():
         cv2.imwrite(str(tmp_path / f"{name}.png"), image.astype(np.uint8))
     (tmp_path / "text.png").write_text("no image")
-    for names, message in [
-        (["a", "b"], r"b\.png: differs from .*a\.png by .* of 255"),
-        (["a", "c"], r"c\.png: has 40 x 20 pixels"),
-        (["text"], r"text\.png: is no image"),
-        (["missing"], r"missing\.png: there is no such file"),
-        ([], "no frames"),
-    ]:
-        with pytest.raises(InputError, match=message):
-            read_frames([tmp_path / f"{name}.png" for name in names])
+    for names, message in (
+        ("ab", r"b\.png: differs from .*a\.png by .* of 255"), ("ac", r"c\.png: has 40 x 20 pixels"),
+        (["text"], r"text\.png: is no image"), (["missing"], r"missing\.png: there is no such file"), ([], "no frames"),
+    ):  # fmt: skip
+        refused(message, read_frames, [tmp_path / f"{name}.png" for name in names])
 
 
 def test_a_photograph_is_turned_as_its_exif_says(tmp_path: Path) -> None:
@@ -271,16 +250,13 @@ def test_a_photograph_is_turned_as_its_exif_says(tmp_path: Path) -> None:
 
 
 def test_a_frame_without_dots_dots_without_a_grid_and_dots_of_a_pixel_are_refused() -> None:
-    with pytest.raises(InputError, match="0 whole dots"):
-        find_dots(np.full((120, 160, 3), 0.3), 15.0)
-    with pytest.raises(InputError, match="grid"):
-        grid_index(np.random.default_rng(0).uniform(0, 100, (12, 2)))
+    refused("0 whole dots", find_dots, np.full((120, 160, 3), 0.3), 15.0)
+    refused("grid", grid_index, np.random.default_rng(0).uniform(0, 100, (12, 2)))
     y, x = np.mgrid[:48, :64] + 0.5
     away = np.hypot(*((part + 2) % 5 - 2.5 for part in (x, y)))
     for radius in (0.5, 0.9):
         frame = np.repeat(0.5 * np.clip(away - radius + 0.5, 0.1, 1)[..., None], 3, axis=2)
-        with pytest.raises(InputError, match=r"radius of .* px, needed is more than 1 px"):
-            fit_profile(find_dots(frame, 5.0))
+        refused(r"radius of .* px, needed is more than 1 px", lambda f: fit_profile(find_dots(f, 5.0)), frame)
 
 
 @pytest.mark.parametrize(
@@ -300,13 +276,12 @@ def test_calibration_replaces_no_other_scene(tmp_path: Path, refusal: Callable, 
 def refusal(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
     """What the command says when it refuses a frame, by default a black one."""
 
-    def said(*options: str, frame: FloatArray | None = None) -> str:
+    def refuse(*options: str, frame: FloatArray | None = None) -> str:
         path, image = str(tmp_path / "frame.png"), np.zeros((24, 32, 3)) if frame is None else frame
         cv2.imwrite(path, image.astype(np.uint8))
-        assert main(["calibrate", "--frames", path, "--out", str(tmp_path), *options]) == 2
-        return capsys.readouterr().err
+        return said(capsys, main, "calibrate", "--frames", path, "--out", tmp_path, *options, status=2)
 
-    return said
+    return refuse
 
 
 @pytest.mark.parametrize("spacing", ["-3", "nan", "0", "0.1", "100", "inf"])
@@ -324,9 +299,9 @@ def test_frames_that_tell_nothing_of_the_lights_are_refused(refusal: Callable, l
     noise = np.random.default_rng(0).integers(0, 256, (60, 80, 3))
     frame = noise if level is None else np.full((60, 80, 3), level)
     options = ["--scene", "digit", "--steps", "0", "--set", "render.samples_per_pixel=1"]
-    said = refusal(*options, frame=frame)
-    assert message in said
-    assert "scene.toml" not in said
+    words = refusal(*options, frame=frame)
+    assert message in words
+    assert "scene.toml" not in words
 
 
 @pytest.mark.parametrize(("preset", "message"), [("deltact", "sensor.pattern.kind"), ("gelslim", "without mirrors")])
@@ -335,8 +310,8 @@ def test_a_preset_that_calibration_does_not_know_is_refused(refusal: Callable, p
 
 
 def test_noise_is_measured_through_the_response() -> None:
-    camera = Camera(width=320, height=240, fx=1, fy=1, cx=0, cy=0, position_mm=(0, 0, 1), gamma=2.2, read_noise=0.002,
-                    shot_noise=0.012)  # fmt: skip
+    noise = {"gamma": 2.2, "read_noise": 0.002, "shot_noise": 0.012}
+    camera = Camera(width=320, height=240, fx=1, fy=1, cx=0, cy=0, position_mm=(0, 0, 1), **noise)
     ramp = np.linspace(0.02, 0.6, 320, dtype=np.float32)[None, :, None] * np.ones((240, 1, 3), dtype=np.float32)
     image = camera_image(ramp, camera, np.random.default_rng(0)) / 255
     read, shot = fit_noise(image, np.ones((240, 320), dtype=bool), 2.2, 1 / 255)
@@ -363,9 +338,9 @@ def test_real_dots_tell_the_lens_of_gelsight_mini(name: str) -> None:
     """One frame overrules a preset without distortion; its k1 is the scene's within two of that one's deviations."""
     shipped = start_sensor(load_scene("gelsight_mini"), (320, 240))
     camera = shipped.camera.model_copy(update={"distortion": (0.0,) * 5})
-    plain = shipped.model_copy(update={"camera": camera})
+    straight = shipped.model_copy(update={"camera": camera})
     dots = find_dots((_real_frame(name, 449) / 255.0) ** camera.gamma, 32.0)
-    found = fit_dot_grid(plain, plain.pattern, dots.centres, None)
+    found = fit_dot_grid(straight, straight.pattern, dots.centres, None)
     assert found.camera.distortion[0] == pytest.approx(shipped.camera.distortion[0], abs=0.02)
     assert np.sqrt((found.residual_px**2).sum(axis=1).mean()) < 0.6  # 1.2 without distortion
 

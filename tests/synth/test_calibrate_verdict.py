@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 from render_scenes import FAST, needs_llvm
-from test_calibrate import _frame, _start
+from test_calibrate import _frame, _real_frame, _start
 
 from synth.arrays import FloatArray
 from synth.calibrate.comparison import Comparison, at_rest
@@ -30,17 +30,13 @@ needs_recordings = pytest.mark.skipif(not REAL.is_dir(), reason="the real record
 @needs_llvm
 def test_dots_brighter_than_the_coating_are_recovered() -> None:
     start = _start()
-    coating, lights = (
-        Coating(reflectance=(0.05,) * 3),
-        tuple(light.model_copy(update={"power": 900.0}) for light in start.lights),
-    )
-    light = {"coating": coating, "lights": lights}
+    lights = tuple(light.model_copy(update={"power": 900.0}) for light in start.lights)
+    light = {"coating": Coating(reflectance=(0.05,) * 3), "lights": lights}
     grid = {"spacing_mm": (1.55, 1.62), "offset_mm": (0.33, -0.2), "radius_mm": 0.3, "reflectance": (0.6, 0.4, 0.5)}
     camera = start.camera.model_copy(update={"blur_px": 0.8})
     truth = start.model_copy(update=light | {"camera": camera, "pattern": start.pattern.model_copy(update=grid)})
     image = _frame(truth)
-    preset = start.model_copy(update=light)
-    fit = fit_sensor(preset, Frames(image, image, 1 / 255), FAST, None, 0)
+    fit = fit_sensor(start.model_copy(update=light), Frames(image, image, 1 / 255), FAST, None, 0)
     pattern = fit.sensor.pattern
     # As for dark dots; brightness differs across a dot by the lights' fall-off, some 2 % of a ratio of 12.
     assert pattern.spacing_mm == pytest.approx((1.55, 1.62), rel=3e-3)
@@ -61,7 +57,6 @@ def _dots(move: FloatArray) -> FloatArray:
 
 
 def _off_grid(linear: FloatArray) -> float:
-    """Common displacement over the pitch."""
     sensor = start_sensor(load_scene("gelsight_mini", []), (320, 240))
     dots = find_dots(linear, sensor.pattern.spacing_mm[0] * pixels_per_mm(sensor))
     grid = fit_dot_grid(sensor, sensor.pattern, dots.centres, None)
@@ -122,9 +117,7 @@ def test_pressed_real_gels_are_told_from_gels_at_rest_by_their_dots() -> None:
     assert len(pressed) == 16
     assert min(off_grid(cv2.imread(str(path))) for path in pressed) > ALLOWED_OFF_GRID
     for name, number in [("avocado_real__exp_num_7__camera_0", 408), ("screw_driver_red__exp_num_2__camera_0", 344)]:
-        clip = cv2.VideoCapture(str(REAL / f"gelsight_mini/clips/{name}.avi"))
-        clip.set(cv2.CAP_PROP_POS_FRAMES, number)
-        assert off_grid(clip.read()[1]) < ALLOWED_OFF_GRID
+        assert off_grid(_real_frame(name, number)) < ALLOWED_OFF_GRID
 
 
 @needs_recordings

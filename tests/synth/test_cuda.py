@@ -13,11 +13,9 @@ from synth.scene.template import load_scene
 from synth.verify import verify_dataset
 
 CAMERA = {"width": 64, "height": 48, "fx": 90.0, "fy": 90.0, "cx": 32.0, "cy": 24.0}
-TINY = [
-    *(f"sensor.camera.{name}={value}" for name, value in CAMERA.items()),
-    *("render.samples_per_pixel=144", "motion.steps=2", "motion.depth_mm=0.5", "motion.shear_mm=[0.2, 0.1]"),
-    'contact.indenter={shape="sphere", radius_mm=4.0}',
-]
+TINY = [f"sensor.camera.{name}={value}" for name, value in CAMERA.items()]
+TINY += ["render.samples_per_pixel=144", "motion.steps=2", "motion.depth_mm=0.5", "motion.shear_mm=[0.2, 0.1]"]
+TINY += ['contact.indenter={shape="sphere", radius_mm=4.0}']
 
 
 @pytest.fixture(scope="module")

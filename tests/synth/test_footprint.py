@@ -1,9 +1,4 @@
-"""Footprints of indenters against closed forms, meshes chosen from an error budget, and the error model.
-
-The rectangle may fall short of the true one on each side by RESOLUTION times its smaller width (`slack`), never more.
-It exceeds it only where that is below FINEST_MM and cells that may hold a part of the body are counted in: by a cell,
-2 FINEST_MM.
-"""
+"""Footprints of indenters against closed forms, meshes chosen from an error budget, and the error model."""
 
 from pathlib import Path
 from typing import Any
@@ -22,18 +17,14 @@ from synth.simulate.footprint import FINEST_MM, RESOLUTION, UNTOUCHED, footprint
 from synth.simulate.indenter import rigid_body
 from synth.simulate.load_path import LoadPath
 from synth.simulate.press import MeshRule
-from synth.simulate.resolution import (
-    ELEMENTS_ACROSS,
-    MARGIN,
-    Resolution,
-    graded_mesh,
-    predicted_error_px,
-    scale_px_per_mm,
-)
+from synth.simulate.resolution import ELEMENTS_ACROSS, MARGIN, graded_mesh, predicted_error_px, scale_px_per_mm
 
 Pair = tuple[float, float]
 SIZE = (20.0, 15.0, 4.0)
 SPHERE = Sphere(shape="sphere", radius_mm=4.0)
+PAD = (16.0, 12.0, 4.0)
+BALL = {"shape": "sphere", "radius_mm": 4.0}
+BLOCK = {"shape": "box", "size_mm": (5.0, 4.0, 4.0), "fillet_mm": 0.8}
 
 
 def print_of(indenter: Indenter, margin: float = 0.0, folder: Path | None = None, **motion: object) -> Focus:
@@ -47,7 +38,7 @@ def ends(focus: Focus) -> np.ndarray:
 
 
 def assert_covers(focus: Focus, low: Pair, high: Pair, slack: float | None = None) -> None:
-    """The rectangle from low to high to within the resolution."""
+    """The rectangle from low to high, on each side short of it by the resolution at most or beyond by a finest cell."""
     short = np.concatenate([ends(focus)[:2] - low, high - ends(focus)[2:]])
     allowed = RESOLUTION * np.subtract(high, low).min() if slack is None else slack
     # 1e-9: rounding where a cell's centre lies on the body's surface.
@@ -86,13 +77,14 @@ BODIES = {
     "punch": (Cylinder(shape="cylinder", radius_mm=2.0, fillet_mm=0.2), 0.5, (2.0, 2.0)),
     "bar": (Cylinder(**BAR, rotation_deg=(0.0, 90.0, 0.0)), 0.5, (4.0, CHORD)),
     "askew bar": (Cylinder(**BAR, rotation_deg=(0.0, 90.0, 30.0)), 0.5, (4 * COS + CHORD * SIN, 4 * SIN + CHORD * COS)),
-    "turned box": (  # the core, 2.8 and 0.8 mm to either side, turned and grown by the fillet
-        Box(shape="box", size_mm=(6.0, 2.0, 3.0), fillet_mm=0.2, rotation_deg=(0.0, 0.0, 30.0)),
+    # the core, 2.8 and 0.8 mm to either side, turned and grown by the fillet
+    "turned box": (
+        Box(shape="box", size_mm=(6, 2, 3), fillet_mm=0.2, rotation_deg=(0, 0, 30)),
         0.5,
         (2.8 * COS + 0.8 * SIN + 0.2, 2.8 * SIN + 0.8 * COS + 0.2),
     ),
     "roof": (
-        Box(shape="box", size_mm=(4.0, 5.0, 4.0), fillet_mm=0.01, rotation_deg=(0.0, 45.0, 0.0)),
+        Box(shape="box", size_mm=(4, 5, 4), fillet_mm=0.01, rotation_deg=(0, 45, 0)),
         1.0,
         (1.0 + 0.01 * (np.sqrt(2) - 1), 2.5),
     ),
@@ -162,29 +154,20 @@ def test_the_slightest_touch_is_found(indenter: Indenter) -> None:
     assert (np.array(focus.half_mm) >= rim).all()
 
 
-PAD = (16.0, 12.0, 4.0)
-BALL = {"shape": "sphere", "radius_mm": 4.0}
-BLOCK = {"shape": "box", "size_mm": (5.0, 4.0, 4.0), "fillet_mm": 0.8}
-
-
 def drawn(indenter: dict[str, Any], target: float | None = None, **motion: Any) -> Scene:
-    """A draw whose mesh is chosen."""
     numerics = {"element": "auto", "edge_length_mm": None, "target_error_px": target}
     moves = {"depth_mm": 0.8, "shear_mm": [0.4, 0.2], "steps": 2, **motion}
     return scene(PAD, indenter=indenter, friction=0.5, motion=moves, numerics=numerics)
 
 
-def resolve(draw: Scene) -> Resolution:
-    return MeshRule.of(draw).resolution(draw)
-
-
 def test_a_tighter_budget_takes_a_finer_mesh_up_to_the_finest() -> None:
     targets = scale_px_per_mm(drawn(BALL)) * np.array([0.05, 0.01, 0.005])
-    found = [resolve(drawn(BALL, target)) for target in targets]
+    found = [MeshRule.of(one).resolution(one) for one in (drawn(BALL, target) for target in targets)]
     assert (np.diff([r.across for r in found]) > 0).all()
     assert (np.diff([r.spacing_mm for r in found]) < 0).all()
     assert (np.array([r.error_px for r in found]) <= targets).all()
-    hopeless, away = resolve(drawn(BLOCK, 1e-6)), resolve(drawn(BALL, 1e-6, depth_mm=-0.5))
+    impossible, above = drawn(BLOCK, 1e-6), drawn(BALL, 1e-6, depth_mm=-0.5)
+    hopeless, away = (MeshRule.of(one).resolution(one) for one in (impossible, above))
     assert hopeless.across == ELEMENTS_ACROSS[-1]
     assert hopeless.error_px > 1e-6
     assert (away.across, away.error_px) == (ELEMENTS_ACROSS[0], 0.0)
@@ -211,8 +194,6 @@ SHAPES = {
 
 
 def enlarged(part: Any, factor: float) -> Any:
-    """A scene's dictionary with all that is in mm that much larger."""
-
     def times(value: Any) -> Any:
         return type(value)(map(times, value)) if isinstance(value, (tuple, list)) else factor * value
 

@@ -88,23 +88,18 @@ def test_wrong_numbers_scenes_that_cannot_be_built_and_a_missing_ray_are_told(ti
         generate(load_scene(tiny), 1, tmp_path / "d", scheduling=Scheduling(ray="local"))
 
 
-def _first_seed_whose_draws(template: Template, wanted: list[bool]) -> int:
-    """A seed for which the attempts of trajectory 0 fit the schema as wanted."""
-
-    def fits(seed: int, attempt: int) -> bool:
-        try:
-            draw(template, seed, 0, attempt)
-        except InputError:
-            return False
-        return True
-
-    return next(seed for seed in range(1000) if [fits(seed, k) for k in range(len(wanted))] == wanted)
+def _fits(template: Template, seed: int, attempt: int) -> bool:
+    try:
+        draw(template, seed, 0, attempt)
+    except InputError:
+        return False
+    return True
 
 
 def test_failed_draws_are_logged_redrawn_the_same_way_in_every_run_and_summed_up(tiny: Path, tmp_path: Path) -> None:
     """A depth of which many draws are more than the gel's thickness; going on logs nothing twice."""
     template = load_scene(tiny, ["motion.depth_mm={ normal = [-1.5, 4.0] }"])
-    seed = _first_seed_whose_draws(template, [False, False, True])
+    seed = next(n for n in range(1000) if [_fits(template, n, k) for k in range(3)] == [False, False, True])
     whole = generate(template, 3, tmp_path / "whole", seed)
     assert whole.failed_draws >= 2
     assert whole.given_up == []
@@ -155,15 +150,9 @@ def test_a_simulation_that_fails_is_logged_with_its_last_good_state_and_redrawn(
     assert read_dataset(out).scene_of(0).motion.shear_mm == (0.05, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("override", "stage"),
-    [
-        ("motion.depth_mm={ normal = [0.2, 1e9] }", "draw"),
-        ("sensor.camera.vignetting={ normal = [0.0, 1e9] }", "sensor"),
-    ],
-)
-def test_samples_whose_every_draw_fails_are_given_up(tiny: Path, tmp_path: Path, override: str, stage: str) -> None:
-    template = load_scene(tiny, [override])
+@pytest.mark.parametrize(("field", "stage"), [("motion.depth_mm", "draw"), ("sensor.camera.vignetting", "sensor")])
+def test_samples_whose_every_draw_fails_are_given_up(tiny: Path, tmp_path: Path, field: str, stage: str) -> None:
+    template = load_scene(tiny, [f"{field}={{ normal = [0.2, 1e9] }}"])
     for _ in range(2):  # again: neither more samples nor more lines
         summary = generate(template, 3, tmp_path / "d")
         assert (summary.made, summary.given_up, summary.failed_draws) == (0, [0, 1, 2], 20)
@@ -194,14 +183,11 @@ def test_a_full_disk_loses_nothing_and_tears_nothing(tiny: Path, tmp_path: Path)
     assert fingerprint(out) == fingerprint(reference())
 
 
-@pytest.mark.parametrize(
-    ("pace", "lines"),
-    [
-        (10.0, ["8 of 12, 10.0 s each, about 40.0 s left"]),
-        (0.1, []),
-        (70.0, ["3 of 12", *(f"{done} of 12, 70.0 s each, about " for done in range(4, 12))]),
-    ],
-)
+@pytest.mark.parametrize(("pace", "lines"), [
+    (10.0, ["8 of 12, 10.0 s each, about 40.0 s left"]),
+    (0.1, []),
+    (70.0, ["3 of 12", *(f"{done} of 12, 70.0 s each, about " for done in range(4, 12))]),
+])  # fmt: skip
 def test_a_line_a_minute_where_stderr_is_no_terminal(capsys, monkeypatch, pace: float, lines: list[str]) -> None:
     """Two of twelve were there before; each of the others takes `pace` seconds."""
     clock = [0.0]

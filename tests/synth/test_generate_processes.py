@@ -14,6 +14,7 @@ import tracemalloc
 from pathlib import Path
 
 import pytest
+from commands import refused, said
 from processes_of import PATIENCE_S, end_family, lines, needs_proc, own_words, start, started, wait_for, workers_of
 from tiny_scene import fingerprint, reference
 
@@ -26,18 +27,26 @@ from synth.scene.template import load_scene
 ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.usefixtures("one_cache")
 INTERRUPTED = "synth: interrupted; finished samples are kept: run the same command again to go on"
+AFTER_MESHING = """
+import os, signal, time
+from synth.mesh.tetrahedralise import tetrahedralise_box
+tetrahedralise_box((4.0, 4.0, 2.0), 2.0)
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(10)
+except KeyboardInterrupt:
+    print("interrupted")
+"""
 
 
 @pytest.fixture(autouse=True)
 def _ctrl_c() -> None:
     """A shell starts background jobs with Ctrl-C ignored, and the processes that tests start would inherit it."""
-    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture
 def out(tmp_path: Path) -> Path:
-    """Where the dataset goes."""
     return tmp_path / "d"
 
 
@@ -79,16 +88,13 @@ def test_ctrl_c_in_one_process_ends_with_130_and_one_line(tiny: Path, out: Path,
         wait_for("the first sample", lambda: lines(out) > 0)
         os.kill(os.getpid(), signal.SIGINT)
 
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # whatever other tests left: pytest must survive
     thread = threading.Thread(target=press_ctrl_c)
     thread.start()
     try:
-        status = main(["generate", "--scene", str(tiny), "--out", str(out), "--n", "400"])
+        words = said(capsys, main, "generate", "--scene", tiny, "--out", out, "--n", 400, status=130)
     finally:
         thread.join()
-        signal.signal(signal.SIGINT, before)
-    assert status == 130
-    assert own_words(capsys.readouterr().err) == [INTERRUPTED]
+    assert own_words(words) == [INTERRUPTED]
     _assert_goes_on(tiny, out)
 
 
@@ -107,7 +113,6 @@ def test_a_killed_worker_is_replaced(tiny: Path, out: Path) -> None:
 @pytest.mark.slow
 @needs_proc
 def test_a_ray_worker_killed_in_mid_task_changes_nothing(tiny: Path, out: Path) -> None:
-    """On a local cluster of two worker processes."""
     pytest.importorskip("ray", reason="Ray is not installed: pip install -e '.[cluster]'")
     process = start(tiny, out, "--n", "5", "--ray", "local", "--workers", "2")
     busy = b"ray::_work"  # an idle worker is called ray::IDLE
@@ -123,8 +128,8 @@ def test_a_ray_worker_killed_in_mid_task_changes_nothing(tiny: Path, out: Path) 
 
 def test_no_such_ray_cluster_is_said_at_once(tiny: Path, out: Path) -> None:
     pytest.importorskip("ray", reason="Ray is not installed: pip install -e '.[cluster]'")
-    with pytest.raises(InputError, match=r"--ray 127\.0\.0\.1:9: there is no cluster"):
-        generate(load_scene(tiny), 1, out, scheduling=Scheduling(ray="127.0.0.1:9"))
+    absent = Scheduling(ray="127.0.0.1:9")
+    refused(r"--ray 127\.0\.0\.1:9: there is no cluster", generate, load_scene(tiny), 1, out, scheduling=absent)
 
 
 @needs_proc
@@ -145,18 +150,6 @@ def test_workers_that_die_again_and_again_are_said_in_one_line(tiny: Path, out: 
     assert list((out / "samples").iterdir()) == []
 
 
-AFTER_MESHING = """
-import os, signal, time
-from synth.mesh.tetrahedralise import tetrahedralise_box
-tetrahedralise_box((4.0, 4.0, 2.0), 2.0)
-try:
-    os.kill(os.getpid(), signal.SIGINT)
-    time.sleep(10)
-except KeyboardInterrupt:
-    print("interrupted")
-"""
-
-
 def test_ctrl_c_still_reaches_python_after_meshing() -> None:
     """FTetWild's library takes the signal for itself; then the process would end without a word and without order."""
     done = subprocess.run([sys.executable, "-c", AFTER_MESHING], cwd=ROOT, capture_output=True, text=True, check=False)
@@ -167,8 +160,7 @@ def test_ctrl_c_still_reaches_python_after_meshing() -> None:
 def test_killed_within_a_sample_and_a_second_process(tiny: Path, out: Path, capsys: pytest.CaptureFixture) -> None:
     """The second one is told; the first is killed the moment a half-written sample can be seen."""
     process = started(tiny, out, "--n", "400")
-    assert main(["generate", "--scene", str(tiny), "--n", "400", "--out", str(out)]) == 2
-    (words,) = own_words(capsys.readouterr().err)
+    (words,) = own_words(said(capsys, main, "generate", "--scene", tiny, "--n", 400, "--out", out, status=2))
     assert re.search(rf"another process \(pid {process.pid} on .*\) is writing this dataset", words)
     wait_for("a sample being written", lambda: any((out / "samples").glob(".*.partial-*")), process)
     process.kill()
@@ -201,9 +193,8 @@ def test_storage_that_refuses_in_the_middle(tiny: Path, out: Path, monkeypatch, 
 def test_a_full_disk_under_workers_ends_with_one_line(tiny: Path, out: Path) -> None:
     """No file beyond 6 KiB (the kernel's own refusal, in the workers): exit status 2, one line, then as ever."""
     generate(load_scene(tiny), 2, out)
-    command = "ulimit -f 6; trap '' XFSZ; exec "
-    command += f"{sys.executable} -m synth generate --scene {tiny} --out {out} --n 5 --workers 2"
-    limited = ["bash", "-c", command]
+    command = f"exec {sys.executable} -m synth generate --scene {tiny} --out {out} --n 5 --workers 2"
+    limited = ["bash", "-c", f"ulimit -f 6; trap '' XFSZ; {command}"]
     done = subprocess.run(limited, cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert done.returncode == 2, done.stderr
     (words,) = own_words(done.stderr)
@@ -214,25 +205,19 @@ def test_a_full_disk_under_workers_ends_with_one_line(tiny: Path, out: Path) -> 
     assert fingerprint(out) == fingerprint(reference())
 
 
-def _resident_mb() -> float:
-    found = re.search(r"VmRSS:\s+(\d+)", Path("/proc/self/status").read_text())
-    return int(found[1]) / 1024
-
-
 @pytest.mark.slow
 @needs_proc
 def test_a_soak_of_500_samples(tiny: Path, out: Path) -> None:
-    """Resident memory stays where it was after the first fifty; an index of 339 bytes a sample is all that grows.
-
-    Single readings jump by 10 MB, the smallest of several by 6 where other tests ran in the process before.
-    """
+    """Resident memory stays where it was after the first fifty; an index of 339 bytes a sample is all that grows."""
     resident = {}
 
     def look(done: int, _: int) -> None:
         gc.collect()
-        resident[done] = _resident_mb()
+        found = re.search(r"VmRSS:\s+(\d+)", Path("/proc/self/status").read_text())
+        resident[done] = int(found[1]) / 1024  # MB
 
     generate(load_scene(tiny), 500, out, progress=look)
+    # Single readings jump by 10 MB, the smallest of several by 6 where other tests ran in the process before.
     early, late = (min(resident[done] for done in resident if low < done <= low + 50) for low in (50, 450))
     assert late - early < 9.0, resident  # 20 kB a sample
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import fsspec
 import pytest
+from commands import refused
 from fsspec.implementations.memory import MemoryFileSystem
 from samples import job, translation_sample
 from tiny_scene import fingerprint, reference
@@ -27,7 +28,6 @@ pytestmark = pytest.mark.usefixtures("one_cache")
 
 @pytest.fixture
 def url() -> Iterator[str]:
-    """An empty place in this process's memory."""
     place = f"memory://{uuid.uuid4().hex}/data"
     yield place
     fsspec.filesystem("memory").rm(place.removeprefix("memory:/").rpartition("/")[0], recursive=True)
@@ -74,17 +74,13 @@ def test_a_stopped_run_leaves_a_journal_that_the_next_one_reads(url: str) -> Non
 def test_who_is_refused(url: str) -> None:
     with DatasetWriter(url, job()):
         for shard in (None, Shard(0, 2)):
-            with pytest.raises(InputError, match=rf"another process \(pid {os.getpid()} on .*\) is writing"):
-                DatasetWriter(url, job(), shard)
+            refused(rf"another process \(pid {os.getpid()} on .*\) is writing", DatasetWriter, url, job(), shard)
     with DatasetWriter(url, job(), Shard(0, 2)), DatasetWriter(url, job(), Shard(1, 2)):
         for shard in (None, Shard(1, 2)):
-            with pytest.raises(InputError, match="another process"):
-                DatasetWriter(url, job(), shard)
-    with pytest.raises(InputError, match="seed: 7 there, 8 now"):
-        DatasetWriter(url, job(seed=8))
+            refused("another process", DatasetWriter, url, job(), shard)
+    refused("seed: 7 there, 8 now", DatasetWriter, url, job(seed=8))
     Store(url).delete(["dataset.json"])
-    with pytest.raises(InputError, match=r"holds .* but no dataset"):
-        DatasetWriter(url, job())
+    refused(r"holds .* but no dataset", DatasetWriter, url, job())
 
 
 def test_meshes_are_put_under_the_url_but_not_by_a_shard(url: str) -> None:
@@ -104,8 +100,7 @@ def test_a_sample_whose_files_are_elsewhere_is_refused(place: str, request: pyte
     out = request.getfixturevalue(place)
     elsewhere = write_sample_files(request.getfixturevalue("tmp_path") / "elsewhere", translation_sample(1), job())
     with DatasetWriter(out if place == "url" else out / "d", job()) as writer:
-        with pytest.raises(InputError, match=r"samples/000001: the sample's files are not there"):
-            writer.record(elsewhere)
+        refused(r"samples/000001: the sample's files are not there", writer.record, elsewhere)
         assert writer.finished == set()
 
 
@@ -128,8 +123,7 @@ def test_storage_that_refuses_ends_with_one_message_and_goes_on(url: str, tiny: 
 
     with monkeypatch.context() as patch:
         patch.setattr(MemoryFileSystem, "put_file", refuse)
-        with pytest.raises(InputError, match=r"samples/000002: the storage refuses: RuntimeError: 403 Forbidden"):
-            generate(template, 5, url)
+        refused(r"samples/000002: the storage refuses: RuntimeError: 403 Forbidden", generate, template, 5, url)
     assert generate(template, 5, url).found == 2
     assert fingerprint(_download(url, tmp_path / "copy")) == fingerprint(reference())
 
@@ -140,8 +134,7 @@ def test_places_that_cannot_be_are_told_and_a_file_url_is_a_directory(tiny: Path
         ("memory://x", 2, "is seen by one process only"),
         ("memory://x", 1, "is seen by one process only"),
     ):
-        with pytest.raises(InputError, match=message):
-            generate(load_scene(tiny), 1, out, scheduling=Scheduling(workers))
+        refused(message, generate, load_scene(tiny), 1, out, scheduling=Scheduling(workers))
     template = load_scene(tiny, ["motion.depth_mm=-1"])
     summary = generate(template, 1, f"file://{tmp_path}/with%20space")
     assert summary.directory == tmp_path / "with space"

@@ -1,34 +1,37 @@
-"""Inspection of flows that are known, and what its pictures and pages must contain."""
+"""Inspection of flows that are known, its pictures and pages, and exports against independent readers."""
 
 import dataclasses
 import io
 import json
 import re
+import tarfile
 from pathlib import Path
 
 import cv2
 import numpy as np
 import OpenEXR
 import pytest
+from commands import refused
 from rich.console import Console
-from samples import HEIGHT, WIDTH, job, translation_sample
+from samples import HEIGHT, WIDTH, job, translation_sample, tree, write_dataset
 
 from synth.commands import inspect as inspect_command
+from synth.dataset.export import export, kitti_png
 from synth.dataset.exr import write_flow
+from synth.dataset.images import read_png
 from synth.dataset.writer import DatasetWriter
-from synth.errors import InputError
 from synth.inspect import inspect, tables, write_html, write_sheet
 from synth.inspect.inspection import evenly_spaced
 from synth.inspect.panels import NO_GEL, arrows_of, flow_colours, robust_scale, wheel_legend
 from synth.inspect.view import View, sample_at
 
+SHIFTS = {0: (1.25, -0.5), 1: (-3.0, 0.3), 3: (0.01, 0.02)}
+
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory):
-    directory = tmp_path_factory.mktemp("inspect") / "d"
+    directory = write_dataset(tmp_path_factory.mktemp("inspect") / "d", map(translation_sample, range(3)))
     with DatasetWriter(directory, job(3)) as writer:
-        for index in range(3):
-            writer.write(translation_sample(index))
         writer.fail(1, 0, "simulate", "Newton failed")
     return directory
 
@@ -43,12 +46,10 @@ def test_translation_exchanged_directions_and_missing_visibility_in_numbers(data
     # x + 0.5 + 1.25 < 32 keeps columns 0 ... 29 whole; y + 0.5 - 0.5 > 0 loses row 0: 23 of 24 rows.
     assert found["forward"]["visible_share"] == pytest.approx(23 / 24)
     assert found["closure"]["max_px"] == 0
-    # Between 4 x 4 pixels with gel (columns 0 ... 29, rows 0 ... 23): column
-    # c + 1.25 takes c ... c + 3, so c = 0 ... 26. Row r - 0.5 takes r - 2 ... r + 1, so r = 2 ... 22.
+    # Between 4 x 4 pixels with gel: column c + 1.25 takes c ... c + 3 of 30, row r - 0.5 takes r - 2 ... r + 1 of 24.
     assert found["closure"]["pixels"] == 27 * 21
     assert (found["width"], found["height"], found["bits"]) == (WIDTH, HEIGHT, 8)
-    assert found["force_n"][1] == [0.1, 0.0, 1.5]
-    assert found["solver"][1]["depth_mm"] == 0.2
+    assert (found["force_n"][1], found["solver"][1]["depth_mm"]) == ([0.1, 0.0, 1.5], 0.2)
     # Rounding of both images to 1/255 has an RMS of 0.29/255 each; interpolation adds less than that again.
     assert found["difference"]["after_rmse"] < 2 * 0.29 / 255
     assert found["difference"]["before_rmse"] > 0.05
@@ -68,8 +69,7 @@ def test_translation_exchanged_directions_and_missing_visibility_in_numbers(data
     assert inspection.numbers[0]["backward"] is None
     write_html(inspection, tmp_path / "e.html")
     assert "visible in image 2: not given" in (tmp_path / "e.html").read_text()
-    # What gelflow says of its error is shown.
-    sigma = np.full((HEIGHT, WIDTH), 0.25, np.float32)
+    sigma = np.full((HEIGHT, WIDTH), 0.25, np.float32)  # What gelflow says of its error is shown
     planes = {"forward.U": sigma.copy(), "forward.V": sigma.copy(), "forward.sigma": sigma}
     OpenEXR.File(header, planes).write(str(tmp_path / "e.exr"))
     inspection = inspect(tmp_path / "e.exr")
@@ -142,22 +142,15 @@ def test_gel_out_of_sight_or_at_rest(tmp_path, name, value, most):
 
 
 def test_what_cannot_be_inspected(tmp_path):
-    with DatasetWriter(tmp_path / "d", job(1)) as writer:
-        writer.write(translation_sample())
-    image = tmp_path / "d/samples/000000/image2.png"
+    image = write_dataset(tmp_path / "d", [translation_sample()]) / "samples/000000/image2.png"
     cv2.imwrite(str(image), cv2.imread(str(image))[:-1])
-    with pytest.raises(InputError, match=r"image1\.png is .*, image2\.png .*, flow\.exr .*; they must agree"):
-        inspect(tmp_path / "d")
-    with pytest.raises(InputError, match="no such file"):
-        inspect(tmp_path / "none")
-    with pytest.raises(InputError, match=r"holds neither dataset\.json nor flow\.exr"):
-        inspect(tmp_path)
+    refused(r"image1\.png is .*, image2\.png .*, flow\.exr .*; they must agree", inspect, tmp_path / "d")
+    refused("no such file", inspect, tmp_path / "none")
+    refused(r"holds neither dataset\.json nor flow\.exr", inspect, tmp_path)
     (tmp_path / "a.txt").write_text("x")
-    with pytest.raises(InputError, match=r"a\.txt: cannot be inspected"):
-        inspect(tmp_path / "a.txt")
+    refused(r"a\.txt: cannot be inspected", inspect, tmp_path / "a.txt")
     (tmp_path / "flow.exr").write_bytes(b"x")
-    with pytest.raises(InputError, match=r"meta\.json.*cannot be read"):
-        inspect(tmp_path)
+    refused(r"meta\.json.*cannot be read", inspect, tmp_path)
 
 
 def test_interpolation_is_exact_to_second_degree_and_stops_at_gaps() -> None:
@@ -192,8 +185,7 @@ def test_colour_wheel_and_pages_of_limited_and_empty_datasets(dataset, tmp_path)
     assert [numbers["name"] for numbers in inspection.numbers] == ["000000", "000002"]
     assert (inspection.about["finished"], inspection.about["inspected"]) == (3, 2)
     assert (evenly_spaced(0, 5), evenly_spaced(100, 3)) == ([], [0, 50, 99])
-    DatasetWriter(tmp_path / "d", job()).close()
-    inspection = inspect(tmp_path / "d")
+    inspection = inspect(write_dataset(tmp_path / "d", []))
     assert inspection.as_dict()["samples"] == []
     write_sheet(inspection, tmp_path / "d.png")
     write_html(inspection, tmp_path / "d.html")
@@ -216,3 +208,87 @@ def test_arrows_can_be_seen_at_any_flow(size):
     # Spacing 2 px: at most 1.6 of it; steps 1 2 3 5 7 10 at least half of that, less 5 % for the scale's rounding.
     assert (drawn <= 1.6 * 2 + 1e-9).all()
     assert (drawn >= 0.45 * 1.6 * 2).all()
+
+
+@pytest.fixture(scope="module")
+def shifted(tmp_path_factory):
+    samples = (translation_sample(index, shift) for index, shift in SHIFTS.items())
+    return write_dataset(tmp_path_factory.mktemp("export") / "d", samples, n=4)
+
+
+def test_flo_and_npz(shifted, tmp_path) -> None:
+    assert export(shifted, "flo", tmp_path / "o") == 3
+    for index, shift in SHIFTS.items():
+        flow = translation_sample(index, shift).flow
+        found = cv2.readOpticalFlow(str(tmp_path / "o" / f"{index:06d}_flow.flo"))
+        known = np.isfinite(flow.forward[..., 0])
+        np.testing.assert_array_equal(found[known], flow.forward[known])
+        assert (found[~known] > 1e9).all()  # Middlebury: unknown.
+        back = cv2.readOpticalFlow(str(tmp_path / "o" / "backward" / f"{index:06d}.flo"))
+        np.testing.assert_array_equal(back[known], flow.backward[known])
+        hidden = read_png(tmp_path / "o" / "occlusions" / f"{index:06d}.png")
+        np.testing.assert_array_equal(hidden == 0, flow.forward_visible == 1)
+        image = read_png(tmp_path / "o" / f"{index:06d}_img2.png")
+        np.testing.assert_array_equal(image, translation_sample(index, shift).image2)
+    export(shifted, "npz", tmp_path / "npz")
+    sample = translation_sample(1, SHIFTS[1])
+    expected = {"forward": sample.flow.forward, "backward_visible": sample.flow.backward_visible}
+    expected |= {"image1": sample.image1, **sample.flow.extras}
+    with np.load(tmp_path / "npz" / "000001.npz") as found:
+        for name, values in expected.items():
+            np.testing.assert_array_equal(found[name], values)
+
+
+def test_webdataset_and_kitti_within_its_range(shifted, tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr("synth.dataset.export.SAMPLES_PER_SHARD", 2)
+    seen: list[tuple[int, int]] = []
+    export(shifted, "webdataset", tmp_path / "o", lambda done, total: seen.append((done, total)))
+    assert seen == [(1, 3), (2, 3), (3, 3)]
+    assert sorted(file.name for file in (tmp_path / "o").iterdir()) == ["shard-000000.tar", "shard-000001.tar"]
+    with tarfile.open(tmp_path / "o" / "shard-000000.tar") as archive:
+        names = archive.getnames()
+        keys = [name.split(".")[0] for name in names]  # WebDataset: the key ends at the first dot.
+        assert keys == ["000000"] * 7 + ["000001"] * 7  # A sample's members are neighbours.
+        forward = np.load(io.BytesIO(archive.extractfile("000001.forward.npy").read()))
+        np.testing.assert_array_equal(forward, translation_sample(1, SHIFTS[1]).flow.forward)
+        image = cv2.imdecode(np.frombuffer(archive.extractfile("000000.image1.png").read(), np.uint8), cv2.IMREAD_COLOR)
+        assert image.shape == (HEIGHT, WIDTH, 3)
+        assert json.loads(archive.extractfile("000001.json").read())["index"] == 1
+    export(shifted, "kitti", tmp_path / "kitti")
+    for index, shift in SHIFTS.items():
+        flow = translation_sample(index, shift).flow
+        for folder, valid in (("flow_occ", np.isfinite(flow.forward[..., 0])), ("flow_noc", flow.forward_visible == 1)):
+            path = tmp_path / "kitti" / "training" / folder / f"{index:06d}_10.png"
+            stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            assert stored.dtype == np.uint16
+            flag, v, u = np.moveaxis(stored.astype(np.float64), -1, 0)  # OpenCV: blue first.
+            np.testing.assert_array_equal(flag == 1, valid)
+            assert set(np.unique(flag)) <= {0, 1}
+            # Rounded to 1/64 px: off by half of that at most.
+            found = (np.column_stack([u[valid], v[valid]]) - 2**15) / 64
+            np.testing.assert_allclose(found, np.broadcast_to(shift, found.shape), rtol=0, atol=1 / 128)
+        assert (tmp_path / "kitti" / "training" / "image_2" / f"{index:06d}_11.png").exists()
+    flow = np.full((2, 2, 2), 600.0, np.float32)
+    refused(r"600\.0 px is beyond the 512 px", kitti_png, flow, np.ones((2, 2), np.bool_))
+    kitti_png(flow, np.zeros((2, 2), np.bool_))
+
+
+@pytest.mark.parametrize("format", ["flo", "kitti", "npz", "webdataset"])
+def test_same_bytes_every_time(shifted, tmp_path, format):
+    for name in "ab":
+        export(shifted, format, tmp_path / name)
+    assert tree(tmp_path / "a") == tree(tmp_path / "b")
+
+
+def test_nothing_is_overwritten_and_nothing_half_done(shifted, tmp_path, monkeypatch):
+    (tmp_path / "o").mkdir()
+    (tmp_path / "o" / "mine").write_text("x")
+    refused("never overwrites", export, shifted, "flo", tmp_path / "o")
+
+    def fail(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        export(shifted, "npz", tmp_path / "p", fail)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["o"]
+    refused("no finished sample", export, write_dataset(tmp_path / "empty", []), "flo", tmp_path / "p")

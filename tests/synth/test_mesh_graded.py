@@ -4,7 +4,7 @@ import hashlib
 
 import numpy as np
 import pytest
-from pads import contact_faces
+from pads import area_vectors, contact_faces
 
 from synth.arrays import FloatArray
 from synth.mesh import Counts, Focus, PadMesh, graded_box
@@ -56,12 +56,11 @@ def test_neighbours_share_faces_all_but_the_window_is_touchable_and_mirror_image
     assert len(boundary_faces(mesh.tets)) == 4 * (nx * ny + ny * nz + nx * nz)
     assert len(contact_faces(mesh).faces) == 2 * nx * ny
     mesh = graded_box(SIZE, FOCI["off centre"], COUNTS)
-    a, b, c = (mesh.points[mesh.touchable[:, i]] for i in range(3))
-    area = np.cross(b - a, c - a) / 2
+    area = area_vectors(mesh.points, mesh.touchable)
     assert np.linalg.norm(area, axis=1).sum() == pytest.approx(20 * 15 + 2 * (20 + 15) * 4, rel=1e-12)
     # Outward: the five faces' area vectors add up to minus the missing window face's, (0, 0, 20 * 15).
     np.testing.assert_allclose(area.sum(axis=0), [0, 0, -300.0], atol=1e-10)
-    centre = (a + b + c) / 3
+    centre = mesh.points[mesh.touchable].mean(axis=1)
     assert (np.einsum("ij,ij->i", area, centre - [0, 0, 2.0]) > 0).all()
     assert mesh.touchable.dtype == np.int32
     assert not mesh.bonded[mesh.touchable].all(axis=1).any()
@@ -81,23 +80,18 @@ def test_neighbours_share_faces_all_but_the_window_is_touchable_and_mirror_image
 def test_centred_spacing_is_even_then_geometric_as_is_depth() -> None:
     planes = lateral_planes(20.0, (-3.3, 3.3), COUNTS, 0)
     step = np.diff(planes)
-    # Two coordinates rounded to GRAIN_MM.
-    np.testing.assert_allclose(step[3:11], 6.6 / 8, atol=2 * GRAIN_MM)
+    np.testing.assert_allclose(step[3:11], 6.6 / 8, atol=2 * GRAIN_MM)  # Two coordinates rounded to GRAIN_MM
     np.testing.assert_allclose(planes[[3, 11]], [-3.3, 3.3], atol=2 * GRAIN_MM)
     ratio = max(root.real for root in np.roots([1, 1, 1, -6.7 / 0.825]) if abs(root.imag) < 1e-9)
     np.testing.assert_allclose(step[11:], 0.825 * ratio ** np.arange(1, 4), atol=4 * GRAIN_MM)
-    # h (1 + 1.5 + 2.25 + 3.375) = 4 mm.
-    steps = _depth_steps(Counts(through=4, growth=1.5))
+    steps = _depth_steps(Counts(through=4, growth=1.5))  # h (1 + 1.5 + 2.25 + 3.375) = 4 mm
     np.testing.assert_allclose(steps, 4 / 8.125 * 1.5 ** np.arange(4), atol=2 * GRAIN_MM)
     np.testing.assert_allclose(_depth_steps(Counts(through=4, growth=1.0)), 1.0, atol=2 * GRAIN_MM)
 
 
 def largest_ratio(q: float) -> float:
-    """Bound on the ratio of neighbouring spacings, from the mesh's density.
-
-    An element across the zone's end, a share t of it inside, is t f + f q (q^(1-t) - 1) / (q - 1) long, the next one
-    f q^(2-t). For whole elements (t = 0) the ratio is q; between, it is a little more.
-    """
+    """Bound on the ratio of neighbouring spacings, q for whole elements and a little more between."""
+    # An element across the zone's end, a share t inside, is t f + f q (q^(1-t) - 1) / (q - 1) long, the next f q^(2-t).
     t = np.linspace(0, 1, 2001)
     return float((q ** (2 - t) / (t + q * (q ** (1 - t) - 1) / (q - 1))).max()) if q > 1 else 1.0
 
@@ -136,8 +130,7 @@ def test_small_focus_outgrows_its_elements_and_planes_move_continuously_with_it(
     assert reach == pytest.approx(9.9, rel=1e-9)  # a root by halving, to the last bits
     walk = np.linspace(0.0, 12.0, 1201)
     planes = np.array([lateral_planes(20.0, Focus((x, 0), (3, 3)).span(0, 20.0), COUNTS, 0) for x in walk])
-    # Planes move at most a few times as fast as the focus (0.01 mm a step; measured 0.05); a gap's element that jumped
-    # to the other side would move them by a spacing, 0.75 mm and more.
+    # Planes move a few times as fast as the focus at most (0.05 mm a step was seen); a jump would be 0.75 mm or more.
     assert np.abs(np.diff(planes, axis=0)).max() < 0.2
 
 
@@ -162,7 +155,6 @@ def test_layers_are_bounded_by_planes(layers: tuple[float, ...]) -> None:
 
 
 def _depth_steps(counts: Counts) -> FloatArray:
-    """Distances of the planes through the thickness."""
     return np.diff(np.unique(graded_box(SIZE, CENTRED, counts).points[:, 2]))
 
 

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 import pyvista as pv
-from pads import scene
+from pads import complete, scene
 
 from benchmarks.probe import probe
 from synth.mesh import Counts, Focus, graded_box
 from synth.scene import Scene
+from synth.scene.template import SCENES
 from synth.simulate import indenter, simulate, stepping
 from synth.simulate.batched import simulate_presses
 from synth.simulate.batched.pad import prepare
@@ -26,12 +27,10 @@ SIZE = (12.0, 10.0, 3.0)
 MESH = graded_box(SIZE, Focus((0.0, 0.0), (2.0, 2.0)), Counts((4, 4), (2, 2), 2))
 EDGE, DEPTH = 3.5, 0.6
 STRICT = SolverOptions(relaxed_tolerance=0.0)
-PX_PER_MM = 17.0  # Of the shipped scene gelsight_mini
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """With a cube in it whose edges are sharp."""
     pv.Cube(x_length=EDGE, y_length=EDGE, z_length=EDGE).triangulate().clean().save(tmp_path / "cube.stl")
     return tmp_path
 
@@ -59,19 +58,20 @@ def test_a_cube_is_the_block_of_its_fillet(folder: Path, monkeypatch, turned: tu
         error = np.linalg.norm(np.subtract(one.force_n, other.force_n)) / np.linalg.norm(one.force_n)
         assert error < 0.01
         moved = (face @ (other.displacement - one.displacement))[:, :2]
-        assert PX_PER_MM * np.sqrt((moved**2).sum(axis=1).mean()) < 0.02
+        assert 17.0 * np.sqrt((moved**2).sum(axis=1).mean()) < 0.02  # px of the shipped scene gelsight_mini
 
 
 def test_an_object_is_no_deeper_in_the_gel_than_allowed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On the CPU and by the batched solver, with contacts so soft that two updates of the multipliers do not do."""
+    mesh = graded_box(SIZE, Focus((0.0, 0.0), (2.0, 2.0)), Counts((3, 3), (1, 1), 2))
 
     def soft(penalty: float) -> Press:
         drawn = pressed(cube())
         numerics = drawn.numerics.model_copy(update={"penalty": penalty})
-        return Press.of(drawn.model_copy(update={"numerics": numerics}), MESH, folder)
+        return Press.of(drawn.model_copy(update={"numerics": numerics}), mesh, folder)
 
     def both(press: Press) -> list[Trajectory]:
-        return [simulate_press(press), *dict(simulate_presses([press], prepare(press.scene, MESH, "cpu"))).values()]
+        return [simulate_press(press), *dict(simulate_presses([press], prepare(press.scene, mesh, "cpu"))).values()]
 
     found, allowed = both(soft(15.0)), stepping.MAX_PENETRATION * DEPTH
     for trajectory in found:
@@ -83,18 +83,7 @@ def test_an_object_is_no_deeper_in_the_gel_than_allowed(folder: Path, monkeypatc
     for trajectory in both(soft(2.0)):
         assert "an edge stays inside the gel by more than 2% of the depth" in trajectory.reason
     monkeypatch.setattr(stepping, "MAX_PENETRATION", np.inf)
-    two_updates = simulate_press(soft(15.0))
-    assert two_updates.status == "complete"
-    assert max(state.max_penetration_mm for state in two_updates.states) > allowed
-
-
-OBJECTS = Path(__file__).parents[2] / "scenes" / "objects"
-
-
-def dragged(indenter: dict[str, Any], friction: float) -> Any:
-    moves = {"depth_mm": 0.9, "position_mm": [0.1, 0.2], "shear_mm": [0.6, 0.3], "twist_deg": 5.0, "steps": 2}
-    drawn = scene(SIZE, indenter=indenter, friction=friction, motion=moves, numerics={"element": "auto"})
-    return simulate(drawn, MESH, OBJECTS)
+    assert max(state.max_penetration_mm for state in simulate_press(soft(15.0)).states) > allowed
 
 
 def test_relaxation_finds_the_equilibrium_of_newtons_method(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -115,8 +104,7 @@ def test_relaxation_finds_the_equilibrium_of_newtons_method(folder: Path, monkey
         with monkeypatch.context() as patched:
             patched.setattr(stepping, "MAX_RELAXED_STEP", 1.0)
             patched.setattr(stepping, "solve", unlucky)
-            relaxed = simulate(drawn, MESH, folder)
-        assert relaxed.status == "complete"
+            relaxed = complete(drawn, MESH, folder)
         for one, other in zip(expected.states[1:], relaxed.states[1:], strict=True):
             assert one.newton_iterations != other.newton_iterations
             scale = np.abs(one.displacement).max()
@@ -126,11 +114,12 @@ def test_relaxation_finds_the_equilibrium_of_newtons_method(folder: Path, monkey
 def test_relaxation_goes_on_where_newtons_method_ends_and_viscosity_follows_the_error(monkeypatch) -> None:
     """A key that lies askew, whose corners slip over the contact points."""
     key = {"shape": "mesh", "file": "key.stl", "size_mm": 8.0, "rotation_deg": [66.81, 34.57, 121.22]}
-    trajectory = dragged(key, 0.3)
-    assert trajectory.status == "complete"
-    assert all(state.residual < 1e-5 and state.min_jacobian > 0 for state in trajectory.states)
+    moves = {"depth_mm": 0.9, "position_mm": [0.1, 0.2], "shear_mm": [0.6, 0.3], "twist_deg": 5.0, "steps": 2}
+    drawn = scene(SIZE, indenter=key, friction=0.3, motion=moves, numerics={"element": "auto"})
+    states = complete(drawn, MESH, SCENES / "objects").states
+    assert all(state.residual < 1e-5 and state.min_jacobian > 0 for state in states)
     monkeypatch.setattr(stepping, "MAX_RELAXED_STEP", 0.0)
-    assert dragged(key, 0.3).status == "partial"
+    assert simulate(drawn, MESH, SCENES / "objects").status == "partial"
     errors = (AIM, AIM / 2, 0.0, 2 * MAX_ERROR, np.inf)
     same, less, least, more, most = (next_viscosity(1.0, error) for error in errors)
     assert same == pytest.approx(1.0)

@@ -1,23 +1,26 @@
-"""Separated light against closed forms and path tracing."""
+"""Light by area against closed forms, path tracing and, for what the window throws back, Mitsuba's own interface."""
 
 from functools import cache
 
 import numpy as np
 import pytest
+from commands import refused
 from render_scenes import FAST, SCALAR, flat_surface, needs_llvm, plain, rendered, small_sensor
 from round_gels import RADIUS, SPHERE, capsule, sensor
 
 from synth.arrays import FloatArray
-from synth.errors import InputError
+from synth.render.camera_rays import pinhole
 from synth.render.gel_mesh import MIRROR
-from synth.render.lights import light_axes
+from synth.render.lights import emitters, light_axes
 from synth.render.polygon_light import PolygonLight
 from synth.render.renderer import Renderer
-from synth.scene import Coating, Gel, Light, Render
+from synth.scene import Coating, Gel, Light, Render, Sensor
 
 LIGHTS = tuple(Light(position_mm=(x, 1.0, 3.0), size_mm=(3, 1), color=(1, 1, 1), power=400) for x in (-7.0, 7.0))
 BLOCK = 10
 SENSOR = small_sensor(1.45, None, LIGHTS, width=40, height=30, fx=70.0, fy=70.0, cx=21.25, cy=14.25)
+INDEX, REFLECTANCE = 1.45, 0.6
+SEEDS = range(4)
 
 
 def _summed(light: Light, point: FloatArray, normal: FloatArray) -> float:
@@ -62,7 +65,6 @@ def _pictures(light: str, samples: int, depth: int = 4) -> FloatArray:
 
 
 def _blocks(pictures: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Means of blocks over pictures, and their standard errors."""
     count, height, width = pictures.shape
     cut = pictures.reshape(count, height // BLOCK, BLOCK, width // BLOCK, BLOCK).mean(axis=(2, 4))
     return cut.mean(axis=0), cut.std(axis=0, ddof=1) / count**0.5
@@ -95,8 +97,7 @@ def test_second_bounce_is_path_tracings_with_less_noise_and_none_on_flat_gel() -
     # At 16 samples less than half of what path tracing leaves at 36, edge of contact and shadows included.
     noise = [_pictures(*one).std(axis=0, ddof=1) for one in (("separated", 16), ("path_traced", 36))]
     assert np.sqrt((noise[0] ** 2).mean()) < 0.5 * np.sqrt((noise[1] ** 2).mean())
-    # Nothing blocked, nothing bounced: what remains is the pixel filter, where light varies by 5 % in a pixel. A window
-    # adds the lights' images, whose light is sampled: 64 points a pixel, spread evenly.
+    # What remains is the pixel filter, where light varies by 5 % in a pixel; a window's images are 64 samples of it.
     render = Render(samples_per_pixel=16, light="separated")
     window = small_sensor(1.45, None, LIGHTS)
     first, second, same = (rendered(window, render=render, seed=seed) for seed in (1, 2, 1))
@@ -110,22 +111,18 @@ def test_second_bounce_is_path_tracings_with_less_noise_and_none_on_flat_gel() -
 @needs_llvm
 def test_light_bounced_in_a_hemisphere_is_that_of_an_integrating_sphere() -> None:
     """A part of a sphere of radius R lights each other alike: of the flux Φ that it gets, by ρ Φ / 4 π R²."""
-    power, albedo, surface = 100.0, 0.6, capsule(8, length=0.0)
-    light = Light(
-        position_mm=(3.0, 2.0, 11.9), aim_mm=(3.0, 2.0, 0.0), size_mm=(0.5, 0.5), color=(1, 1, 1), power=power
-    )
+    power, albedo, surface = 100.0, 0.6, capsule(2.4, length=0.0)
+    place = {"position_mm": (3.0, 2.0, 11.9), "aim_mm": (3.0, 2.0, 0.0), "size_mm": (0.5, 0.5)}
+    light = Light(**place, color=(1, 1, 1), power=power)
     gel = Gel(shape="capsule", radius_mm=RADIUS, thickness_mm=2.0, youngs_modulus_kpa=200)
     within = sensor(SPHERE, index=1.0, lights=(light,), fx=30.0, fy=30.0, position_mm=(-3.0, 0.0, 11.0))
     within = within.model_copy(update={"gel": gel})
-    first, second = (
-        Renderer(within, Render(samples_per_pixel=64, light="separated", max_depth=depth), surface, plain(albedo), FAST)
-        for depth in (2, 3)
-    )
-    direct = first.radiance(surface.material, 1)[..., 0]
-    bounced = (second.radiance(surface.material, 1)[..., 0] - direct)[direct > 0]
+    renders = (Render(samples_per_pixel=64, light="separated", max_depth=depth) for depth in (2, 3))
+    renderers = (Renderer(within, render, surface, plain(albedo), FAST) for render in renders)
+    direct, both = (renderer.radiance(surface.material, 1)[..., 0] for renderer in renderers)
+    bounced = (both - direct)[direct > 0]
     expected = albedo**2 * power / (4 * np.pi * RADIUS**2) / np.pi
-    # 2^18 paths, whose values scatter by some twice their mean: 0.4 % of the mean, and for up to 75 independent terms
-    # sqrt(75) times that at a place.
+    # 2^18 paths that scatter by twice their mean: 0.4 % of it, for up to 75 terms sqrt(75) times that at a place.
     assert np.mean(bounced) == pytest.approx(expected, rel=0.02)
     assert np.sqrt(np.mean((bounced / expected - 1) ** 2)) < 0.05
 
@@ -133,8 +130,8 @@ def test_light_bounced_in_a_hemisphere_is_that_of_an_integrating_sphere() -> Non
 def test_what_shines_is_refused_and_scalar_variants_path_trace() -> None:
     sensor = small_sensor(1.0, None, LIGHTS)
     shining = sensor.model_copy(update={"coating": Coating(roughness=0.5)})
-    with pytest.raises(InputError, match=r'render.light = "separated" needs a matt coating .* roughness = 0.5'):
-        rendered(shining, render=Render(light="separated"))
+    words = r'render.light = "separated" needs a matt coating .* roughness = 0.5'
+    refused(words, rendered, shining, render=Render(light="separated"))
     images = [rendered(sensor, render=Render(light=one), variant=SCALAR) for one in ("separated", "path_traced")]
     np.testing.assert_array_equal(*images)
 
@@ -142,13 +139,11 @@ def test_what_shines_is_refused_and_scalar_variants_path_trace() -> None:
 @needs_llvm
 @pytest.mark.parametrize("index", [1.0, 1.45])
 def test_a_narrow_light_is_the_same_separated_and_path_traced(index: float) -> None:
-    """Two integrals over one light, in columns of the picture."""
     light = Light(position_mm=(6.5, 1, 3), size_mm=(2, 1), color=(1, 0.5, 0.2), power=300, viewing_angle_deg=40)
     sensor = small_sensor(index, None, (light,))
-    separated, traced = (
-        rendered(sensor, None, Render(samples_per_pixel=count, max_depth=2, light=kind), FAST).mean(axis=0)
-        for kind, count in (("separated", 64), ("path_traced", 256))
-    )
+    kinds = (("separated", 64), ("path_traced", 256))
+    renders = (Render(samples_per_pixel=count, max_depth=2, light=kind) for kind, count in kinds)
+    separated, traced = (rendered(sensor, render=render).mean(axis=0) for render in renders)
     assert separated.max() > 3 * separated.min()
     # A pixel's error is below 5 % of it; the mean of a column of 60 is known within 0.7 %.
     np.testing.assert_allclose(traced, separated, rtol=0.02)
@@ -163,3 +158,52 @@ def test_a_lights_power_is_what_its_radiance_sums_to() -> None:
         assert np.cos(np.radians(angle / 2)) ** (light.narrowness + 1) == pytest.approx(0.5)
         solid = 2 * np.pi * np.sin(theta) * np.pi / 2 / 20000
         assert light.radiance[0] * 2 * 0.5 * (intensity * solid).sum() == pytest.approx(7, rel=1e-6)
+
+
+def _sensor() -> Sensor:
+    """Two wide lights, that chance may find them; the second shines mostly up."""
+    places = [((7.0, 1.0, 3.5), (0.0, 0.0, 2.5)), ((-1.0, -7.2, 2.0), (0.0, 3.0, 5.0))]
+    common = {"size_mm": (3.0, 1.5), "color": (1, 1, 1), "power": 300}
+    lights = tuple(Light(position_mm=at, aim_mm=aim, **common) for at, aim in places)
+    view = {"width": 16, "height": 16, "fx": 28.0, "fy": 28.0, "cx": 8.0, "cy": 8.0}
+    return small_sensor(INDEX, None, lights, **view, position_mm=(0.0, 0.0, 20.0), look_at_mm=(0.0, 0.0, 0.0))
+
+
+def _by_chance(sensor: Sensor, seed: int, reflected: float) -> FloatArray:
+    """Mitsuba's path tracer, pinhole and interface around a flat Lambertian face."""
+    mi, camera = FAST.load(), sensor.camera
+    transform = mi.ScalarTransform4f
+    film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "rfilter": {"type": "box"}}
+    view = pinhole(sensor) | {"film": film}
+    color = {"type": "rgb", "value": REFLECTANCE}
+    interface = {"type": "dielectric", "int_ior": INDEX, "ext_ior": 1.0}
+    interface["specular_reflectance"] = {"type": "rgb", "value": reflected}
+    face = {"type": "rectangle", "to_world": transform().scale([6.0, 4.5, 1.0])}
+    window = {"type": "rectangle", "to_world": transform().translate([0, 0, 6.0]) @ transform().scale([500, 500, 1])}
+    scene = {
+        "type": "scene",
+        "gel": face | {"bsdf": {"type": "diffuse", "reflectance": color}},
+        "window": window | {"bsdf": interface},
+        **emitters(sensor.lights, mi),
+    }
+    view["to_world"] = transform(view["to_world"])
+    integrator = mi.load_dict({"type": "path", "max_depth": 24, "rr_depth": 50, "hide_emitters": True})
+    image = mi.render(mi.load_dict(scene), sensor=mi.load_dict(view), integrator=integrator, spp=2**13, seed=seed)
+    return _means(np.array(image))
+
+
+def _means(image: FloatArray) -> FloatArray:
+    return image[2:14, :, 0].reshape(3, 4, 4, 4).mean(axis=(1, 3))
+
+
+@needs_llvm
+def test_images_behind_the_window_give_what_a_dielectric_interface_gives_by_chance() -> None:
+    sensor = _sensor()
+    found = np.stack([_by_chance(sensor, seed, 1.0) for seed in SEEDS])
+    expected, error = found.mean(axis=0), found.std(axis=0, ddof=1).max() / np.sqrt(len(SEEDS))
+    for light in ("path_traced", "separated"):
+        image = _means(rendered(sensor, render=Render(samples_per_pixel=256, max_depth=8, light=light), cells=1))
+        assert image == pytest.approx(expected, abs=4 * error)
+        assert image.mean() == pytest.approx(expected.mean(), rel=3e-3)
+    # Fails without the images: they are a sixth of the light here.
+    assert _by_chance(sensor, 0, 0.0).mean() < 0.9 * expected.mean()

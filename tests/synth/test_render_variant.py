@@ -8,21 +8,42 @@ import sys
 from pathlib import Path
 
 import pytest
+from commands import refused
 
-from synth.errors import InputError
 from synth.render import variant
-from synth.render.variant import (
-    LLVM_HINT,
-    PACKAGE,
-    choose_variant,
-    cpu_variant,
-    cuda_trouble,
-    llvm_candidates,
-    llvm_version,
-)
+from synth.render.variant import LLVM_HINT, PACKAGE, cpu_variant, llvm_candidates, llvm_version
 
 OLD, LEAST, NEW = Path("/lib/libLLVM-15.so.1"), Path("/lib/libLLVM.so.16"), Path("/lib/libLLVM.so.19.1")
 VERSIONS = {OLD: (15, 0, 6), LEAST: (16, 0, 0), NEW: (19, 1, 7)}
+RENDER = """
+import sys
+from pathlib import Path
+from synth.render.variant import Variant, llvm_version
+
+library = Path(sys.argv[1])
+if sys.argv[2] == "choose":
+    assert llvm_version(library)[0] >= 16
+mi = Variant("llvm_ad_rgb", "", llvm=library).load()
+scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle"}})
+assert scene.ray_test(mi.Ray3f([0, 0, 1], [0, 0, -1]))[0]
+print("rendered")
+"""
+OLD_ONLY = """
+import os, sys
+os.environ["DRJIT_LIBLLVM_PATH"] = "/nonexistent/libLLVM.so.19"
+import synth.render.variant as variant
+variant._PATTERNS, variant.PACKAGE = (sys.argv[1],), "not-installed"
+variant.sys.prefix = "/nonexistent"
+chosen = variant.choose_variant("cpu")
+assert chosen.name == "scalar_rgb", chosen
+assert "too old" in chosen.reason and chosen.hint, chosen
+mi = chosen.load()
+scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle"}})
+assert scene.ray_test(mi.Ray3f([0, 0, 1], [0, 0, -1]))
+print("rendered")
+from synth.cli import main
+sys.exit(main(["doctor", "--json"]))
+"""
 
 
 @pytest.mark.parametrize(
@@ -66,21 +87,6 @@ def test_the_users_library_comes_before_the_packages_and_that_before_the_systems
     assert llvm_candidates() == [OLD, *paths]
 
 
-RENDER = """
-import sys
-from pathlib import Path
-from synth.render.variant import Variant, llvm_version
-
-library = Path(sys.argv[1])
-if sys.argv[2] == "choose":
-    assert llvm_version(library)[0] >= 16
-mi = Variant("llvm_ad_rgb", "", llvm=library).load()
-scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle"}})
-assert scene.ray_test(mi.Ray3f([0, 0, 1], [0, 0, -1]))[0]
-print("rendered")
-"""
-
-
 @pytest.mark.parametrize("process", ["choose", "worker"])
 def test_the_packages_library_renders_before_its_links_are_made(tmp_path: Path, process: str) -> None:
     packaged = variant._packaged()
@@ -97,41 +103,15 @@ def test_the_packages_library_renders_before_its_links_are_made(tmp_path: Path, 
 
 
 def test_cuda_is_refused_with_a_reason_where_there_is_none() -> None:
-    trouble = cuda_trouble("cuda_ad_rgb")
-    if trouble is None:
+    if variant.cuda_trouble("cuda_ad_rgb") is None:
         pytest.skip("this machine has CUDA with OptiX")
-    with pytest.raises(InputError, match="cuda"):
-        choose_variant("cuda")
-
-
-OLD_ONLY = """
-import os, sys
-os.environ["DRJIT_LIBLLVM_PATH"] = "/nonexistent/libLLVM.so.19"
-import synth.render.variant as variant
-variant._PATTERNS, variant.PACKAGE = (sys.argv[1],), "not-installed"
-variant.sys.prefix = "/nonexistent"
-chosen = variant.choose_variant("cpu")
-assert chosen.name == "scalar_rgb", chosen
-assert "too old" in chosen.reason and chosen.hint, chosen
-mi = chosen.load()
-scene = mi.load_dict({"type": "scene", "shape": {"type": "rectangle"}})
-assert scene.ray_test(mi.Ray3f([0, 0, 1], [0, 0, -1]))
-print("rendered")
-from synth.cli import main
-sys.exit(main(["doctor", "--json"]))
-"""
+    refused("cuda", variant.choose_variant, "cuda")
 
 
 def _python(code: str, home: Path, *arguments: str) -> "subprocess.CompletedProcess[str]":
-    """Run code in a process that knows this checkout and nothing of the environment."""
-    return subprocess.run(
-        [sys.executable, "-c", code, *arguments],
-        cwd=home,
-        env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(Path(__file__).parents[2]), "HOME": str(home)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    environment = {"PATH": "/usr/bin:/bin", "PYTHONPATH": str(Path(__file__).parents[2]), "HOME": str(home)}
+    command = [sys.executable, "-c", code, *arguments]
+    return subprocess.run(command, cwd=home, env=environment, capture_output=True, text=True, check=False)
 
 
 @pytest.mark.parametrize("real", [False, True])

@@ -1,19 +1,15 @@
-"""The shipped scenes: every draw is whole in every camera, and says where its numbers come from.
-
-And folders of objects: patterns of files, orientations of all kinds, and the scene `objects`, which has both.
-"""
+"""The shipped scenes: every draw is whole in every camera, and says where its numbers come from; folders of objects."""
 
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import refused
 from scipy import stats
-from tiny_scene import write_tiny
+from tiny_scene import TEXT, write_tiny
 
-from synth.arrays import FloatArray
 from synth.dataset.reader import read_dataset
-from synth.errors import InputError
 from synth.flow.trace import trace
 from synth.mesh import face_of, rest_surface
 from synth.optics import Optics
@@ -21,7 +17,7 @@ from synth.pipeline.generate import generate
 from synth.planning import job_variant, plan, predict
 from synth.render.lights import check_view
 from synth.render.pattern import albedo, pixels_per_mm
-from synth.scene import MeshIndenter, Scene, Sensor
+from synth.scene import MeshIndenter, Scene
 from synth.scene.sampling import draw, draw_sensor
 from synth.scene.template import SCENES, Template, load_scene
 from synth.simulate.indenter import turned_by
@@ -32,19 +28,12 @@ NAMES = [*WIDE, *OPTICAL, "gelsight_fingertip"]
 ROUND = {"allsight": 0.8, "densetact": 0.95, "omnitact": 1.0}  # Share of an image that shows gel
 CAMERAS = {"gelstereo": ["right"], "omnitact": ["east", "west", "south", "north"]}
 PATHS = {"gelslim": {1}, "tac3d": {0, 1, 2}}
+ANY = 'contact.indenter={ shape = "mesh", file = "objects/*.stl", rotation_deg = "any" }'
 
 
 def _draws(name: str, count: int) -> list[Scene]:
     template = load_scene(name)
     return [draw(template, 3, trajectory) for trajectory in range(0, 2 * count, 2)]
-
-
-def _places(sensor: Sensor) -> FloatArray:
-    """All pixel centres, and places along the image's border."""
-    width, height = Optics.of(sensor).size
-    u, v = np.linspace(0, width, 9), np.linspace(0, height, 9)
-    border = [(x, y) for x in u for y in v if x in (0, width) or y in (0, height)]
-    return np.concatenate([Optics.of(sensor).centres, border])
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -55,7 +44,9 @@ def test_every_pixel_of_every_camera_sees_gel_and_no_light(name: str) -> None:
         assert list(scene.sensor.views) == ["", *CAMERAS.get(name, [])]
         for sensor in scene.sensor.views.values():
             check_view(sensor)
-            rays = Optics.of(sensor).look(_places(sensor))
+            optics = Optics.of(sensor)
+            border = [p for p in np.ndindex(9, 9) if 0 in p or 8 in p]
+            rays = optics.look(np.concatenate([optics.centres, np.array(border) / 8 * optics.size]))
             assert set(rays.path) == PATHS.get(name, {0})
             assert np.all(np.abs(rays.on_flat_face[:, :2]) + shear < np.array(sensor.gel.size_mm[:2]) / 2)
 
@@ -146,12 +137,8 @@ def test_the_stereo_pair_sees_height() -> None:
     np.testing.assert_allclose(disparity[1] - disparity[0], 316 * 12 / 1.41 / 29.4**2, rtol=0.08)
 
 
-ANY = 'contact.indenter={ shape = "mesh", file = "objects/*.stl", rotation_deg = "any" }'
-
-
 @pytest.fixture
 def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A scene beside a folder of two objects, which is the working directory."""
     (tmp_path / "objects").mkdir()
     for name in ("b.stl", "a.stl", "notes.txt"):
         (tmp_path / "objects" / name).write_text(name)
@@ -161,7 +148,7 @@ def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def drawn_indenters(template: Template, count: int) -> list[MeshIndenter]:
     sensor = draw_sensor(template, 0, 0)
-    drawn = [draw(template, 0, trajectory, sensor=sensor).contact.indenter for trajectory in range(count)]
+    drawn = (draw(template, 0, trajectory, sensor=sensor).contact.indenter for trajectory in range(count))
     return [indenter for indenter in drawn if isinstance(indenter, MeshIndenter)]
 
 
@@ -177,15 +164,14 @@ def test_a_pattern_is_a_choice_of_the_files_that_match_wherever_it_stands(tiny: 
 
 
 def test_a_pattern_in_a_scenes_file_is_relative_to_it_and_stays_so(tiny: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    head, _, _ = tiny.read_text().partition("[contact.indenter]")
-    tiny.write_text(f'{head}[contact.indenter]\nshape = "mesh"\nfile = "objects/*.stl"\n[motion]\ndepth_mm = 0.1\n')
+    tiny.write_text(re.sub(r"indenter = .*", 'indenter = { shape = "mesh", file = "objects/*.stl" }', TEXT))
     monkeypatch.chdir("/")
     assert load_scene(tiny).content["contact"]["indenter"]["file"] == {"choice": ["objects/a.stl", "objects/b.stl"]}
 
 
 def test_unmatched_patterns_are_refused_new_objects_count_and_names_like_patterns_are_names(tiny: Path) -> None:
-    with pytest.raises(InputError, match=rf"contact\.indenter\.file: there is no file {tiny.parent}/objects/\*\.obj"):
-        load_scene(tiny, [ANY.replace("stl", "obj")])
+    words = rf"contact\.indenter\.file: there is no file {tiny.parent}/objects/\*\.obj"
+    refused(words, load_scene, tiny, [ANY.replace("stl", "obj")])
     before = load_scene(tiny, [ANY]).hash
     assert load_scene(tiny, [ANY]).hash == before
     (tiny.parent / "objects" / "c.stl").touch()
@@ -197,11 +183,7 @@ def test_unmatched_patterns_are_refused_new_objects_count_and_names_like_pattern
 
 
 def test_every_object_is_drawn_and_all_orientations_are_alike_likely(tiny: Path) -> None:
-    """Every entry of a uniformly distributed rotation matrix is a coordinate of a uniform point on the unit sphere.
-
-    Such a coordinate is uniform on [-1, 1] (Archimedes). Angles about y drawn uniformly would give arcsine
-    distributions, 0.11 away, and fail.
-    """
+    """Entries of uniformly distributed rotation matrices are uniform on [-1, 1] (Archimedes)."""
     indenters = drawn_indenters(load_scene(tiny, [ANY]), 1000)
     rotations = np.array([turned_by(indenter.rotation_deg) for indenter in indenters])
     for entries in rotations.reshape(-1, 9).T:

@@ -52,13 +52,10 @@ class Case:
 
 CASES = [Case(e, nu) for e in MIXED for nu in (0.0, 0.2, 0.3, 0.45, 0.4999, 0.5)]
 CASES += [Case("p1", 0.45), Case("p1p1", 0.45, "yeoh"), Case("p2p1", 0.2, "yeoh"), Case("p2p1", 0.5, "yeoh")]
-MOTLEY = [
-    Case(e, nu, "motley") for e, nu in (("p1p1", 0.2), ("p1p1", 0.45), *(("p2p1", nu) for nu in (0.2, 0.45, 0.5)))
-]
+MOTLEY = [Case(e, nu, "motley") for e in MIXED for nu in (0.2, 0.45, 0.5) if (e, nu) != ("p1p1", 0.5)]
 FEW = [Case("p1p1", 0.2), Case("p1p1", 0.4999), Case("p2p1", 0.4999, "yeoh")]
 each = pytest.mark.parametrize("case", CASES + MOTLEY, ids=str)
 few = pytest.mark.parametrize("case", FEW, ids=str)
-compressible = pytest.mark.parametrize("case", [c for c in CASES if c.nu < 0.5], ids=str)
 
 
 def random_state(body: System, rng: np.random.Generator, size: float = 0.03) -> Unknowns:
@@ -123,7 +120,6 @@ def test_tangent_is_the_derivative_of_the_residual(case: Case) -> None:
 
 
 def turn(rng: np.random.Generator) -> FloatArray:
-    """A proper rotation far from the identity."""
     q = np.linalg.qr(rng.standard_normal((3, 3)))[0]
     return np.asarray(q * np.sign(np.linalg.det(q)))
 
@@ -152,12 +148,9 @@ def test_rigid_motion_is_free_of_stress_and_inner_forces_turn_with_the_body_and_
     np.testing.assert_allclose(np.cross(body.space.points + state.u, force).sum(axis=0), 0.0, atol=2 * scale)
 
 
-@compressible
+@pytest.mark.parametrize("case", [case for case in CASES if case.nu < 0.5], ids=str)  # at 0.5 the pressure is free
 def test_patch_and_stress_of_a_uniform_strain(case: Case) -> None:
-    """Affine displacement on the boundary of an irregular mesh: affine inside, with the exact constant pressure.
-
-    (At nu = 0.5 the pressure would be free by a constant.)
-    """
+    """Affine displacement on the boundary of an irregular mesh: affine inside, with the exact constant pressure."""
     body = case.body(held=False)
     rest = body.space.points
     exact = rest @ GRADIENT.T
@@ -179,7 +172,7 @@ def test_patch_and_stress_of_a_uniform_strain(case: Case) -> None:
     np.testing.assert_allclose(state.p, lame_modulus(case.nu) * (np.linalg.det(np.eye(3) + GRADIENT) - 1), rtol=1e-9)
     # Nodal forces do the work of the closed form's stress P = 2 W' (F - F^-T) + lambda J (J - 1) F^-T.
     F = np.eye(3) + GRADIENT
-    p, rest = lame_modulus(case.nu) * (np.linalg.det(F) - 1), body.space.points
+    p = lame_modulus(case.nu) * (np.linalg.det(F) - 1)
     full = residual(body, Unknowns(rest @ GRADIENT.T, np.full_like(body.zero().p, p)))
     stress = piola(F, np.array(p), case.nu, LAWS[case.law])
     work = full[: rest.size].reshape(-1, 3).T @ rest  # one virtual affine displacement per component

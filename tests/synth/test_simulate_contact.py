@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from pads import MIXED, dense
+from pads import MIXED, areas, dense
 from touching import INDENTERS, MESH, PENALTY, RADIUS, SLIP, STICK, sphere_law, touch
 
 from synth.simulate.contact import FAR
@@ -20,8 +20,7 @@ def test_traction_is_the_law(friction: float, fresh: float, element: str) -> Non
     normal, along = sphere_law(made)
     below = made.body.space.points[made.body.space.faces][..., 2].max(axis=1) == 0
     assert 0.2 < (normal[below] != 0).any(axis=-1).mean() < 0.95  # some points touch and some do not
-    # Rounding of a dozen operations on numbers of order 1.
-    found = made.tractions
+    found = made.tractions  # Rounding of a dozen operations on numbers of order 1
     np.testing.assert_allclose(found[0], normal, atol=1e-13)
     np.testing.assert_allclose(found[1], along, atol=1e-13)
     if fresh and friction:
@@ -50,8 +49,7 @@ def test_tangent_is_the_derivative_of_the_residual(friction: float, shape: str, 
         assert (modes[0] == modes[1]).all()
         difference = (ends[0] - ends[1]) / (2 * h)
         along = np.concatenate([direction.u.ravel(), direction.p.ravel()])[body.free]
-        # Central difference: rounding 1e-16 * 1e2 / 1e-7 of the residual and h^2 of its third derivative; the
-        # kernels' H is a central difference itself (1e-9).
+        # Central difference: rounding 1e-16 * 1e2 / 1e-7, and h^2; the kernels' H is a central difference (1e-9).
         assert np.linalg.norm(matrix @ along - difference) < 1e-6 * np.linalg.norm(difference)
 
 
@@ -83,11 +81,8 @@ def test_nodal_forces_and_moments_are_the_tractions(element: str) -> None:
     # The nodal mean keeps the resultant of the coated face: its integral with each node's share of area.
     coated = (space.points[space.faces][:, :, 2] == 0).all(axis=1)
     on_face = np.einsum("fq,fqc->c", weight[coated], (normal + along)[coated])
-    a, b, c = (space.surface.nodes[space.surface.faces[:, i]] for i in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-    share = np.zeros(len(nodal))
-    # A node's piecewise linear function has a third of its faces' area; on a quadratic face a corner has a twelfth of
-    # the face, the middle of an edge a quarter.
+    area, share = areas(space.surface.nodes, space.surface.faces), np.zeros(len(nodal))
+    # A node has a third of its linear faces' area; of a quadratic face a corner a twelfth, an edge's middle a quarter.
     part = [1 / 3] * 3 if space.element.order == 1 else [1 / 12] * 3 + [1 / 4] * 3
     np.add.at(share, space.surface.faces, area[:, None] * part)
     assert share.sum() == pytest.approx(MESH.size_mm[0] * MESH.size_mm[1], rel=1e-12)
@@ -111,8 +106,7 @@ def test_augmenting_takes_the_present_traction_and_deepest_is_the_largest_penetr
     assert made.body.deepest() == pytest.approx(RADIUS - away.min(), abs=1e-14)
     made.indenters.centre.assign(np.array([[0.0, 0.0, -50.0]]))
     made.evaluate()
-    assert made.body.deepest() == 0.0
-    assert made.body.slip_ratio(made.indenters) == 0.0
+    assert (made.body.deepest(), made.body.slip_ratio(made.indenters)) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("fresh", [0.0, 0.5])

@@ -6,20 +6,9 @@ import numpy as np
 import pytest
 import warp as wp
 
+from synth.simulate.batched import krylov as kernels
 from synth.simulate.batched.gemm import dense
-from synth.simulate.batched.krylov import (
-    RUNNING,
-    Krylov,
-    arnoldi,
-    begin_solve,
-    begin_vectors,
-    block_size,
-    flat,
-    padded,
-    round_matrix,
-    shapes,
-    solution,
-)
+from synth.simulate.batched.krylov import Krylov, arnoldi, block_size, flat, padded, round_matrix
 from synth.simulate.batched.lanes import PREDICTOR_READY, READY, Lanes, Settings
 from synth.simulate.batched.pad import Preconditioner, inverse
 from synth.simulate.options import STANDARD
@@ -35,7 +24,7 @@ def _systems(
     """Lanes that are ready for a linear solve, its right side of norm 1, the one before of norm 20."""
     rows, batch = padded(150), len(relative)
     lanes, krylov, settings = Lanes(), Krylov(), Settings()
-    sizes = shapes(rows, batch)
+    sizes = kernels.shapes(rows, batch)
     for struct, kind in ((lanes, Lanes), (krylov, Krylov)):
         for name, variable in kind.vars.items():
             shape = sizes[name] if struct is krylov else batch
@@ -47,7 +36,7 @@ def _systems(
     lanes.relative.assign(np.array(relative))
     lanes.iteration.assign(np.array(iteration, dtype=np.int32))
     settings.forcing = forcing
-    wp.launch(begin_solve, batch, inputs=[lanes, settings, krylov], device=device)
+    wp.launch(kernels.begin_solve, batch, inputs=[lanes, settings, krylov], device=device)
     return lanes, krylov, settings
 
 
@@ -86,7 +75,7 @@ def test_every_lane_solves_its_own_system(device: str, batch: int) -> None:
         krylov.basis.assign(basis)
         rows = first.shape[1]
         launch: dict[str, Any] = {"dim": [len(which)], "block_dim": block_size(rows), "device": device}
-        while (krylov.running.numpy() == RUNNING).any():
+        while (krylov.running.numpy() == kernels.RUNNING).any():
             preconditioned, product = np.zeros_like(first), np.zeros_like(first)
             preconditioned[:, :size] = flat(krylov.current).numpy()[:, :size] / scale
             product[:, :size] = np.einsum("bij,bj->bi", matrices[which], preconditioned[:, :size])
@@ -94,7 +83,7 @@ def test_every_lane_solves_its_own_system(device: str, batch: int) -> None:
             flat(krylov.product).assign(product)
             wp.launch_tiled(arnoldi(rows), inputs=[krylov], **launch)
         begun = wp.zeros(len(which), dtype=wp.int32, device=device)
-        wp.launch_tiled(solution(rows), inputs=[lanes, krylov, begun], **launch)
+        wp.launch_tiled(kernels.solution(rows), inputs=[lanes, krylov, begun], **launch)
         count = krylov.k.numpy()
         return flat(krylov.step).numpy(), np.abs(krylov.residual.numpy()[np.arange(len(which)), count])
 
@@ -139,7 +128,7 @@ def test_a_preconditioner_takes_tf32_from_the_first_vector_on() -> None:
     force = wp.array(rng.standard_normal((2, 50, 3)), dtype=wp.vec3d, device="cpu")
     volume = wp.zeros((2, 0), dtype=wp.float64, device="cpu")
     inputs = [lanes, wp.array(free, device="cpu"), force, volume, krylov]
-    wp.launch(begin_vectors, (2, rows // 4), inputs=inputs, device="cpu")
+    wp.launch(kernels.begin_vectors, (2, rows // 4), inputs=inputs, device="cpu")
     first = flat(krylov.current).numpy().copy()
     flat(krylov.product).assign(rng.standard_normal((2, rows)).astype(np.float32))
     wp.launch_tiled(arnoldi(rows), dim=[2], inputs=[krylov], block_dim=block_size(rows), device="cpu")
@@ -186,6 +175,5 @@ def test_the_inverse_of_a_gpu() -> None:
     matrix = turn @ np.diag(np.geomspace(1e-3, 1e3, 700) * np.where(np.arange(700) % 3, 1, -1)) @ turn.T
     matrix = (matrix + matrix.T) / 2
     found, known = inverse(matrix, "cuda"), np.linalg.inv(matrix)
-    # Condition 1e6, and 1e-16 of each entry.
-    assert np.abs(found - known).max() < 1e-9 * np.abs(known).max()
+    assert np.abs(found - known).max() < 1e-9 * np.abs(known).max()  # Condition 1e6, and 1e-16 of each entry
     np.testing.assert_allclose(found @ matrix, np.eye(700), atol=1e-8)

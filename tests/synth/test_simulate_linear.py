@@ -117,16 +117,13 @@ def test_gmres_ends_after_the_remainders_rank_at_its_limit_without_right_side_or
     for rank in (1, 5, 12):
         assert gmres(matrix, remainder(rank), factor, b, 1e-10)[1] <= rank + 1
     assert gmres(matrix, None, factor, b, 1e-10)[1] == 1
-    matrix = saddle(1)
-    x, iterations, _ = gmres(matrix, remainder(5), SuperLUFactor(matrix.indptr, matrix.indices), np.zeros(SIZE))
+    x, iterations, _ = gmres(matrix, remainder(5), factor, np.zeros(SIZE))
     assert not x.any()
     assert iterations == 0
     broken: Any = SimpleNamespace(apply=lambda right: np.full_like(right, np.nan))
-    assert np.isnan(gmres(saddle(1), None, broken, right_side(1))[0]).all()
+    assert np.isnan(gmres(matrix, None, broken, b)[0]).all()
     # A remainder too large for so few iterations: the best direction so far, not an endless loop.
-    matrix, rest, b = saddle(1), remainder(60, 50.0), right_side(1)
-    factor = SuperLUFactor(matrix.indptr, matrix.indices)
-    factor.factorise(matrix.data)
+    rest = remainder(60, 50.0)
     x, iterations, told = gmres(matrix, rest, factor, b, limit=3)
     assert iterations == 3
     left = np.linalg.norm((whole(matrix) + rest.toarray()) @ x - b) / np.linalg.norm(b)
@@ -162,18 +159,12 @@ def test_factor_is_reused_while_it_serves_and_made_anew_where_told(monkeypatch: 
     alone = LinearSolver(SuperLUFactor(first.indptr, first.indices), reuse=True)
     LinearSolver(factor, reuse=True).solve(first, None, b)
     np.testing.assert_array_equal(one.solve(near, None, b, rough=True), alone.solve(near, None, b, rough=True))
-    matrix, b = saddle(1), right_side(1)
-    factor = SuperLUFactor(matrix.indptr, matrix.indices)
-    never = LinearSolver(factor, reuse=False)
-    for _ in range(2):
-        never.solve(matrix, None, b, rough=True)
-    assert factor.made == 2
-    one = LinearSolver(factor, reuse=True)
-    one.solve(matrix, None, b, rough=True)
-    one.solve(matrix, None, b)
-    assert factor.made == 4
+    factor = SuperLUFactor(first.indptr, first.indices)
+    never, one = (LinearSolver(factor, reuse=reuse) for reuse in (False, True))
+    for solver, rough, made in ((never, True, 1), (never, True, 2), (one, True, 3), (one, False, 4)):
+        solver.solve(first, None, b, rough=rough)
+        assert factor.made == made
     one.forget()
-    one.solve(matrix, None, b, rough=True)
-    assert factor.made == 5
-    one.solve(matrix, None, b, rough=True)
-    assert factor.made == 5
+    for _ in range(2):
+        one.solve(first, None, b, rough=True)
+        assert factor.made == 5

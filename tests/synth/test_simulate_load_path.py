@@ -44,8 +44,8 @@ def test_poses_follow_the_depth_then_shear_and_twist_together() -> None:
 @pytest.mark.parametrize("motion", [
     {"depth_mm": 1.0, "steps": 1}, {"depth_mm": 1.0, "steps": 5}, {"depth_mm": 0.2, "shear_mm": [2.0, 0.0], "steps": 6},
     {"depth_mm": 1.0, "shear_mm": [0.1, 0.0], "steps": 2}, {"depth_mm": 1.0, "twist_deg": 5.0, "steps": 1},
-    {"depth_mm": -1.0, "shear_mm": [1.0, 0.0], "steps": 3}, {"depth_mm": -1.0, "steps": 3}, {"depth_mm": 0.0, "steps":
-    2}, {"depth_mm": 1.0, "steps": 7, "then": [{"depth_mm": 0.5}, {"depth_mm": 0.5, "twist_deg": 20}]},
+    {"depth_mm": -1.0, "shear_mm": [1.0, 0.0], "steps": 3}, {"depth_mm": -1.0, "steps": 3}, {"depth_mm": 0, "steps": 2},
+    {"depth_mm": 1.0, "steps": 7, "then": [{"depth_mm": 0.5}, {"depth_mm": 0.5, "twist_deg": 20}]},
 ])  # fmt: skip
 def test_records_are_as_many_as_steps_and_end_at_the_end(motion: dict) -> None:
     way = path(**motion)

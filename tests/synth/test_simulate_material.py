@@ -1,9 +1,4 @@
-"""Materials: constants, layers with the jump of pressure between them, and exact incompressibility.
-
-And the barrier against inverted P2 elements: gradient, Hessian, nothing where nothing inverts, none under an edge.
-"""
-
-from itertools import product
+"""Materials: layers with the jump of pressure between them, exact incompressibility, and the barrier against folds."""
 
 import numpy as np
 import pytest
@@ -14,7 +9,6 @@ from scipy.optimize import brentq
 from synth.arrays import BoolArray, FloatArray, Points
 from synth.mesh import Focus
 from synth.scene import Gel
-from synth.simulate import simulate
 from synth.simulate.element import p2p1
 from synth.simulate.inversion_barrier import ONSET, SAMPLE_DEGREE
 from synth.simulate.material import lame_constants, pad_material, uniform
@@ -34,14 +28,6 @@ def gel(**parts: object) -> Gel:
 FILM = {"thickness_mm": INTERFACE, "youngs_modulus_kpa": 200e3, "poisson_ratio": 0.3, "stiffening": (0.5, 0.1)}
 
 
-@pytest.mark.parametrize("nu", [0.0, 0.3, 0.4999])
-def test_lame_constants_give_back_youngs_modulus_and_are_infinite_without_compression(nu: float) -> None:
-    mu, lame = lame_constants(nu)
-    assert mu * (3 * lame + 2 * mu) / (lame + mu) == pytest.approx(1, rel=1e-12)
-    assert lame / (2 * (lame + mu)) == pytest.approx(nu, abs=1e-12)
-    assert lame_constants(0.5) == (pytest.approx(1 / 3), np.inf)
-
-
 def test_layers_are_relative_to_the_gel() -> None:
     mesh = layered(brick(SIZE, (2, 2, 3)))
     made = pad_material(gel(layers=[FILM], poisson_ratio=0.5, stiffening=(0.2, 0.0)), mesh)
@@ -50,7 +36,7 @@ def test_layers_are_relative_to_the_gel() -> None:
     np.testing.assert_allclose(made.shear[film], 1000 * mu, rtol=1e-12)
     np.testing.assert_allclose(made.lame[film], 1000 * lame, rtol=1e-12)
     assert (made.yeoh[film] == (0.5, 0.1)).all()
-    assert (made.shear[~film] == lame_constants(0.5)[0]).all()
+    np.testing.assert_allclose(made.shear[~film], 1 / 3, rtol=1e-12)
     assert (made.lame[~film] == np.inf).all()
     assert (made.yeoh[~film] == (0.2, 0.0)).all()
     assert made.mixed
@@ -137,13 +123,11 @@ def test_exactly_incompressible_is_the_limit(element: str) -> None:
 
 
 MESH = crooked()
-_STEPS = [steps for steps in product(range(SAMPLE_DEGREE + 1), repeat=4) if sum(steps) == SAMPLE_DEGREE]
-CORNERS = np.array(_STEPS) / SAMPLE_DEGREE
+CORNERS = np.array([n for n in np.ndindex(*4 * [SAMPLE_DEGREE + 1]) if sum(n) == SAMPLE_DEGREE]) / SAMPLE_DEGREE
 """(20, 4) barycentric coordinates of the points at which folds are looked for."""
 
 
 def guarded_pad(guarded: bool = True) -> System:
-    """Incompressible P2/P1, with or without the barrier."""
     body = System(function_space(MESH, p2p1()), uniform(len(MESH.tets), 0.5))
     if not guarded:
         body._barrier = None
@@ -171,7 +155,6 @@ def barrier(body: System, u: FloatArray) -> float:
 
 @pytest.fixture(scope="module")
 def state() -> Unknowns:
-    """A valid state in which some points are below the onset."""
     body = guarded_pad()
     sizes = np.linspace(0.03, 0.2, 35)
     valid = [size for size in sizes if lattice_jacobian(body, squeezed(body, size).u)[0].min() > 0.05]
@@ -220,8 +203,7 @@ def test_no_fold_under_a_tip() -> None:
     cone = {"shape": "cone", "half_angle_deg": 20.0, "height_mm": 6.0, "fillet_mm": 0.05}
     posed = scene((12.0, 10.0, 4.0), indenter=cone, motion={"depth_mm": 1.6, "steps": 1}, numerics={"element": "p2p1"})
     mesh, _ = graded_mesh(posed.sensor.gel, Focus((0.0, 0.0), (0.8, 0.8)), 4)
-    pressed = simulate(posed, mesh)
-    assert pressed.status == "complete"
+    last = complete(posed, mesh).states[-1]
     body = System(function_space(mesh, p2p1()), uniform(len(mesh.tets), 0.5))
-    assert lattice_jacobian(body, pressed.states[-1].displacement)[0].min() > 0
-    assert pressed.states[-1].min_jacobian > 0
+    assert lattice_jacobian(body, last.displacement)[0].min() > 0
+    assert last.min_jacobian > 0

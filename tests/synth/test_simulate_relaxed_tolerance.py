@@ -1,4 +1,4 @@
-"""Newton's method, how it ends where there is no convergence, and what the relaxed tolerance holds for."""
+"""Newton's method without convergence, and what recorded states and passes keep to, of one press and of many."""
 
 from dataclasses import replace
 from itertools import product
@@ -6,11 +6,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pads import SIZE, brick, gentle, indenters, same, scene, system
+from pads import SIZE, SPHERE, brick, complete, gentle, indenters, presses_of, same, scene, simulate_scenes, system
 
 import synth.simulate.stepping as stepping
 from synth.scene import Scene
 from synth.simulate import Trajectory, simulate
+from synth.simulate.batched import lanes as phases
+from synth.simulate.batched import run as running
+from synth.simulate.batched.pad import prepare
+from synth.simulate.batched.run import Run
 from synth.simulate.newton import NEAR, Solution, relative_residual, solve
 from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.press import Press
@@ -25,6 +29,10 @@ BETWEEN = stepping.MULTIPLIER_TOLERANCE * TOLERANCE
 POLISHES = {"before the passes": (2e-3, BETWEEN), "after a pass": (0.06, TOLERANCE), "for no pass": (np.inf, TOLERANCE)}
 """stepping.PENETRATION, and a polish's tolerance: the ball is 0.08 of its depth inside, after a pass less than 0.06."""
 each = pytest.mark.parametrize("polish", list(POLISHES))
+PRESSED = 0.3  # mm of depth, in one go
+PAD = brick(SIZE, (4, 4, 2))
+EXACT = 1e-9
+STRICT_WAY, LOOSE_WAY = (SolverOptions(relaxed_tolerance=loose, forcing=1e-3) for loose in (0.0, 1e-2))
 
 
 def pressed(friction: float = 0.5, steps: int = 2) -> Scene:
@@ -126,17 +134,11 @@ def test_relaxed_steps_end_where_tight_ones_do_and_save_iterations() -> None:
     counts = []
     for relaxed, extrapolate in product((exact.relaxed_tolerance, 0.0), (True, False)):
         options = replace(exact, relaxed_tolerance=relaxed, extrapolate=extrapolate)
-        found = simulate(posed, MESH, options=options)
-        assert found.status == "complete"
+        found = complete(posed, MESH, options=options)
         counts.append(sum(state.newton_iterations for state in found.states))
     standard, unpredicted, tight, plain = counts
     assert standard < min(tight, unpredicted)
     assert max(tight, unpredicted) < plain
-
-
-PRESSED = 0.3  # mm of depth, in one go
-PAD = brick(SIZE, (4, 4, 2))
-EXACT = 1e-9
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +147,6 @@ def body() -> System:
 
 
 def press(body: System, tolerance: float = EXACT, **limits: float) -> Solution:
-    """From rest as the first time, without the last solve's factor."""
     body.forget_factor()
     return solve(body, body.zero(), indenters(scene(), PRESSED), tolerance, **limits)
 
@@ -195,3 +196,125 @@ def test_double_factor_solves_to_double_precision() -> None:
     left = upper @ solution + upper.T @ solution - upper.diagonal() * solution + right
     # A backward stable solve leaves some 1e-16 of |K| |x|, which at a Poisson ratio of 0.4999 is 1e4 times |r|.
     assert np.linalg.norm(left) < 1e-10 * np.linalg.norm(right)
+
+
+def dragged(penalty: float = 50.0, depth_mm: float = 0.6, steps: int = 2) -> Scene:
+    """A ball that is pressed and dragged with friction. With a penalty of 3,000 nothing is deep enough to correct."""
+    motion = {"depth_mm": depth_mm, "shear_mm": [0.15, -0.05] if steps > 1 else [0.0, 0.0], "steps": steps}
+    numerics = {"element": "p1p1", "tolerance": TOLERANCE, "penalty": penalty}
+    return scene(indenter=SPHERE, friction=0.5, motion=motion, numerics=numerics)
+
+
+def led(posed: Scene, driver: SolverOptions, frames: frozenset[int] | None = None) -> Trajectory:
+    return simulate_scenes([posed], MESH, options=driver, frames=None if frames is None else [frames])[0]
+
+
+@pytest.mark.parametrize("penalty", [50.0, 3000.0])
+def test_what_is_recorded_meets_the_full_tolerance(penalty: float) -> None:
+    """After whole passes, and where none is needed, so that only a loose step came before."""
+    one, other = led(dragged(penalty), STRICT_WAY), led(dragged(penalty), LOOSE_WAY)
+    assert one.status == other.status == "complete"
+    assert sum(s.newton_iterations for s in other.states) < sum(s.newton_iterations for s in one.states)
+    for strict, loose in zip(one.states[1:], other.states[1:], strict=True):
+        assert max(strict.residual, loose.residual) <= TOLERANCE
+        distance = np.linalg.norm(strict.displacement - loose.displacement)
+        # Friction remembers the way: a residual of 1e-2 of the force moved the surface of six balls by up to 4e-4.
+        assert distance < 1e-3 * np.linalg.norm(strict.displacement)
+
+
+def test_states_that_are_not_corrected_meet_it_too() -> None:
+    """And the way does not depend on which are: the corrected one is the same to the bit."""
+    every, last = led(dragged(), LOOSE_WAY), led(dragged(), LOOSE_WAY, frozenset({2}))
+    assert max(state.residual for state in last.states) <= TOLERANCE
+    assert last.states[1].max_penetration_mm > every.states[1].max_penetration_mm
+    assert same(replace(last, states=last.states[2:]), replace(every, states=every.states[2:]))
+
+
+def test_a_state_without_balance_to_the_full_tolerance_leaves_no_trace(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One iteration suffices for the way, but not even two for what is to be recorded: back to where the step began."""
+    monkeypatch.setattr(running, "MAX_ITERATIONS", 1)
+    posed = dragged(5000.0, depth_mm=0.2, steps=1)
+    run = Run(presses_of([posed], MESH), prepare(posed, MESH, "cpu"), None, 1, SolverOptions(relaxed_tolerance=0.3))
+    solver = run.solver
+    fields, contact = solver._arrays.fields, solver._arrays.contact
+    phase, stage = solver.lanes.phase, solver.lanes.stage
+    begun, rejected, changed = [], [], []
+
+    def memory() -> list[np.ndarray]:
+        arrays = (fields.state_u, fields.state_p, contact.anchored, contact.anchor, contact.normal, contact.tangent)
+        return [array.numpy().copy() for array in arrays]
+
+    def look(part: str, kernel: str) -> None:
+        if stage.numpy()[0] == phases.STEP and phase.numpy()[0] in (phases.BEGIN, phases.PREDICTOR, phases.START):
+            begun[:] = memory()
+        elif kernel == "finish_solve" and phase.numpy()[0] == phases.ROLLED_BACK:
+            rejected[:] = memory()
+        elif kernel == "finish_record" and rejected:
+            changed.append(any((a != b).any() for a, b in zip(rejected, begun, strict=True)))
+            assert all((a == b).all() for a, b in zip(memory(), begun, strict=True))
+            rejected.clear()
+
+    solver.watch = look
+    ((_, result),) = run
+    assert changed
+    assert all(changed)
+    assert (result.status, "did not converge" in result.reason, len(result.states)) == ("failed", True, 1)
+
+
+def sliding(body: dict[str, Any]) -> Scene:
+    motion = {"depth_mm": 0.6, "shear_mm": [0.5, 0.6], "twist_deg": 10.0, "steps": 3, "position_mm": [0.4, 0.3]}
+    return scene(indenter=body, friction=0.6, motion=motion, numerics={"element": "p2p1"})
+
+
+def test_a_pass_that_goes_too_far_is_given_up() -> None:
+    """As soon as it does; what is taken has stayed within reach, and the other passes take penetration away."""
+    posed = sliding({"shape": "box", "size_mm": [3.0, 2.5, 4.0], "fillet_mm": 0.6, "rotation_deg": [0, 0, 20]})
+    run = Run(presses_of([posed], MESH), prepare(posed, MESH, "cpu"), None, 1, STRICT_WAY)
+    solver = run.solver
+    lanes, fields = solver.lanes, solver._arrays.fields
+    lost, solved, depths = [], 0, {}
+
+    def look(part: str, kernel: str) -> None:
+        nonlocal solved
+        if kernel != "evaluate_trial" or lanes.stage.numpy()[0] != phases.CORRECTION:
+            return
+        phase, reach = lanes.phase.numpy()[0], lanes.most_moved.numpy()[0]
+        moved = np.linalg.norm(fields.trial_u.numpy()[0] - fields.recorded_u.numpy()[0], axis=1).max()
+        if phase in (phases.READY, phases.SOLVED, phases.FAILED):
+            assert lanes.trial_moved.numpy()[0] == pytest.approx(moved, abs=1e-15)
+        if phase in (phases.READY, phases.SOLVED):
+            assert moved <= reach
+            assert reach == pytest.approx(stepping.MAX_CORRECTION_RATIO * lanes.deepest.numpy()[0], rel=1e-12)
+            depths.setdefault(lanes.target.numpy()[0], lanes.deepest.numpy()[0])
+        if phase == phases.SOLVED:
+            solved += 1
+            assert lanes.relative.numpy()[0] <= 0.1 * posed.numerics.tolerance
+        if phase == phases.FAILED:
+            lost.append((lanes.iteration.numpy()[0], moved / reach))
+
+    solver.watch = look
+    ((_, result),) = run
+    assert result.status == "complete"
+    assert any(iteration < STRICT_WAY.correction_iterations and share > 1 for iteration, share in lost)
+    assert solved >= len(depths) == 3
+    for state, before in zip(result.states[1:], depths.values(), strict=True):
+        assert state.max_penetration_mm < 0.5 * before
+
+
+def test_so_does_the_solver_for_one_sample(monkeypatch: pytest.MonkeyPatch) -> None:
+    solve, given = stepping.solve, []
+
+    def watched(system: Any, start: Any, *others: Any) -> Any:
+        found = solve(system, start, *others)
+        if len(others) == 4:  # with a limit of iterations and a reach
+            moved = np.linalg.norm(found.state.u - start.u, axis=1).max()
+            given.append((found.converged, found.iterations, float(moved / others[3])))
+        return found
+
+    monkeypatch.setattr(stepping, "solve", watched)
+    rod = {"shape": "cylinder", "radius_mm": 1.5, "length_mm": 4.0, "fillet_mm": 0.3}
+    result = simulate(sliding(rod), brick(counts=(5, 5, 2)), options=STRICT_WAY)
+    assert result.status == "complete"
+    passes = [one for one in given if np.isfinite(one[2]) and one[2]]
+    assert all(share <= 1 for converged, _, share in passes if converged)
+    assert any(iterations < STRICT_WAY.correction_iterations and share > 1 for _, iterations, share in passes)

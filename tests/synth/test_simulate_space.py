@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pads import ELEMENT, MIXED, brick, crooked, layered
+from commands import refused
+from pads import ELEMENT, MIXED, area_vectors, brick, crooked, layered
 
 import synth.simulate.pattern as pattern_module
 from benchmarks.probe import probe
 from synth.arrays import FloatArray, Points
-from synth.errors import InputError
 from synth.mesh import PadMesh
 from synth.simulate.element import EDGES
 from synth.simulate.pattern import pattern_of
@@ -37,8 +37,8 @@ def test_quadratic_nodes_lie_on_the_middles_of_edges_and_none_beside_the_pad() -
     for k, (i, j) in enumerate(FACE_EDGES):
         ends = space.points[space.faces[:, [i, j]]].mean(axis=1)
         np.testing.assert_allclose(space.points[space.faces[:, 3 + k]], ends, atol=1e-15)
-    with pytest.raises(InputError, match="no point of the contact face"):
-        probe(space_of("p1p1"), np.array([[0.0, 0.0], [MESH.size_mm[0] / 2 + 0.01, 0.0]]))
+    beside = np.array([[0.0, 0.0], [MESH.size_mm[0] / 2 + 0.01, 0.0]])
+    refused("no point of the contact face", probe, space_of("p1p1"), beside)
 
 
 @each
@@ -46,18 +46,16 @@ def test_the_window_is_held_other_faces_can_touch_and_the_face_at_z_0_is_coated_
     space = space_of(element)
     assert (space.held == (space.points[:, 2] == MESH.size_mm[2])[:, None]).all()
     x, y, z = MESH.size_mm
-    a, b, c = (space.points[space.faces[:, i]] for i in range(3))
-    normal = np.cross(b - a, c - a) / 2
+    normal = area_vectors(space.points, space.faces)
     assert np.linalg.norm(normal, axis=1).sum() == pytest.approx(x * y + 2 * (x + y) * z)
     # Out of the gel, and closed but for the window: the area vectors add up to minus the window's.
     np.testing.assert_allclose(normal.sum(axis=0), [0, 0, -x * y], atol=1e-12)
-    assert (np.einsum("fc,fc->f", normal, a - [0, 0, z / 2]) > 0).all()
+    assert (np.einsum("fc,fc->f", normal, space.points[space.faces[:, 0]] - [0, 0, z / 2]) > 0).all()
     surface = space.surface
     assert (surface.nodes == space.points[space.surface_nodes]).all()
     assert (surface.nodes[:, 2] == 0).all()
     assert len(surface.nodes) == (space.points[:, 2] == 0).sum()
-    a, b, c = (surface.nodes[surface.faces[:, i]] for i in range(3))
-    normal = np.cross(b - a, c - a) / 2
+    normal = area_vectors(surface.nodes, surface.faces)
     assert (normal[:, 2] < 0).all()
     assert normal[:, 2].sum() == pytest.approx(-MESH.size_mm[0] * MESH.size_mm[1])
     values = np.random.default_rng(3).standard_normal(len(space.points))

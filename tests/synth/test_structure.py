@@ -11,37 +11,21 @@ from tiny_scene import own_cache, write_tiny
 ROOT = Path(__file__).parents[2]
 STAGES = (
     "synth",  # the package itself: its version, and where its public names are, which it loads when they are asked for
-    "synth.errors",
-    "synth.arrays",
+    "synth.errors", "synth.arrays",
     "synth.dataset.storage",  # how a file gets to the disk as a whole; knows nothing of datasets
-    "synth.scene",
-    "synth.surface",
-    "synth.optics",
-    "synth.mesh",
-    "synth.simulate",
-    "synth.render",
+    "synth.scene", "synth.surface", "synth.optics", "synth.mesh", "synth.simulate", "synth.render",
     "synth.scene.sampling",  # draws again what could not be rendered
-    "synth.flow",
-    "synth.dataset",
-    "synth.verify",
-    "synth.inspect",
-    "synth.planning",
-    "synth.pipeline",
-    "synth.progress",
-    "synth.calibrate",
-    "synth.stress",
-    "synth.doctor",
-    "synth.cli_options",
-    "synth.commands",
-    "synth.cli",
-    "synth.__main__",
-)
+    "synth.flow", "synth.dataset", "synth.verify", "synth.inspect", "synth.planning", "synth.pipeline",
+    "synth.progress", "synth.calibrate", "synth.stress", "synth.doctor", "synth.cli_options", "synth.commands",
+    "synth.cli", "synth.__main__",
+)  # fmt: skip
 """A module imports from its own stage and from those above it in this list, never from those below."""
 
 HEAVY = {
     "numpy", "scipy", "pydantic", "mitsuba", "drjit", "warp", "pytetwild", "pyvista", "vtk", "vtkmodules", "cv2", "ray",
     "matplotlib", "torch", "lightning", "torchmetrics", "OpenEXR", "skimage", "pypardiso", "fsspec", "tensorboard",
 }  # fmt: skip
+MAIN = "import sys\nfrom {0}.cli import main\nassert main(sys.argv[1:]) == 0"
 
 
 def _modules(package: str) -> dict[str, ast.Module]:
@@ -69,7 +53,6 @@ def _imports(name: str, tree: ast.Module, is_package: bool) -> set[str]:
 
 
 def _stage(module: str) -> int:
-    """Number of the most specific stage that a module lies in."""
     fitting = [stage for stage in STAGES[1:] if module == stage or module.startswith(f"{stage}.")]
     return STAGES.index(max(fitting, key=len)) if fitting else 0
 
@@ -112,74 +95,53 @@ def test_gelflow_imports_only_from_earlier_parts() -> None:
     assert {imported for _, imported in parts} == set(ROOMS[:-1]), "a finder that sees nothing would pass always"
 
 
-@pytest.mark.parametrize(
-    ("modules", "forbidden"),
-    [
-        (SYNTH, {"gelflow", "benchmarks", "torch", "lightning", "torchmetrics"}),
-        (GELFLOW, {"synth", "benchmarks", "warp", "mitsuba", "drjit", "pytetwild", "pypardiso", "pyvista"}),
-    ],
-    ids=["synth", "gelflow"],
-)
+@pytest.mark.parametrize(("modules", "forbidden"), [
+    (SYNTH, {"gelflow", "benchmarks", "torch", "lightning", "torchmetrics"}),
+    (GELFLOW, {"synth", "benchmarks", "warp", "mitsuba", "drjit", "pytetwild", "pypardiso", "pyvista"}),
+], ids=["synth", "gelflow"])  # fmt: skip
 def test_the_two_programs_share_nothing(modules: dict[str, ast.Module], forbidden: set[str]) -> None:
     assert [pair for pair in _imports_of(modules) if pair[1].split(".")[0] in forbidden] == []
 
 
 def _loaded_after(code: str, *arguments: str) -> set[str]:
-    """Top-level modules that a fresh interpreter holds after `code`."""
     report = "\nimport sys\nsys.stderr.write('\\nLOADED ' + ' '.join({name.split('.')[0] for name in sys.modules}))"
-    done = subprocess.run(
-        [sys.executable, "-c", code + report, *arguments], cwd=ROOT, capture_output=True, text=True, check=True
-    )
+    command = [sys.executable, "-c", code + report, *arguments]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     return set(done.stderr.rpartition("LOADED ")[2].split())
 
 
-MAIN = "import sys\nfrom {0}.cli import main\nassert main(sys.argv[1:]) == 0"
-
-
-@pytest.mark.parametrize(
-    ("code", "arguments"),
-    [
-        ("import synth", ()),
-        ("import gelflow", ()),
-        (MAIN.format("synth"), ("--help",)),
-        (MAIN.format("synth"), ("generate", "--help")),
-        (MAIN.format("gelflow"), ("train", "--help")),
-        (MAIN.format("gelflow"), ("compare", "--help")),
-    ],
-    ids=lambda value: "" if isinstance(value, str) else " ".join(value),
-)
+@pytest.mark.parametrize(("code", "arguments"), [
+    ("import synth", ()),
+    ("import gelflow", ()),
+    (MAIN.format("synth"), ("--help",)),
+    (MAIN.format("synth"), ("generate", "--help")),
+    (MAIN.format("gelflow"), ("train", "--help")),
+    (MAIN.format("gelflow"), ("compare", "--help")),
+], ids=lambda value: "" if isinstance(value, str) else " ".join(value))  # fmt: skip
 def test_help_loads_nothing_heavy(code: str, arguments: tuple[str, ...]) -> None:
     """The reason that it answers in a fraction of a second; seconds themselves depend on the machine."""
     assert _loaded_after(code, *arguments) & HEAVY == set()
 
 
 def test_prediction_loads_nothing_of_training_and_simulate_no_renderer(tmp_path: Path, monkeypatch) -> None:
-    code = (
-        "import gelflow.predict.prediction, gelflow.baselines.learned, gelflow.compare.run, sys\n"
-        "from gelflow.models.weights import load_weights, weights_file\n"
-        "load_weights(weights_file(None))\n"
-        "print(*sys.modules)"
-    )
+    code = """
+import gelflow.predict.prediction, gelflow.baselines.learned, gelflow.compare.run, sys
+from gelflow.models.weights import load_weights, weights_file
+load_weights(weights_file(None))
+print(*sys.modules)"""
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    loaded = set(done.stdout.split())
-    assert "gelflow.models.gelflow" in loaded
-    assert not [name for name in loaded if name.startswith(("gelflow.train", "lightning"))]
+    assert "gelflow.models.gelflow" in done.stdout.split()
+    assert not [name for name in done.stdout.split() if name.startswith(("gelflow.train", "lightning"))]
     assert not _loaded_after("import gelflow.config") & {"torch", "numpy", "lightning"}
     own_cache(monkeypatch)
     scene = write_tiny(tmp_path)
-    loaded = _loaded_after(
-        MAIN.format("synth"), "simulate", "--scene", str(scene), "--out", str(tmp_path / "out"), "--json"
-    )
+    command = ["simulate", "--scene", str(scene), "--out", str(tmp_path / "out"), "--json"]
+    loaded = _loaded_after(MAIN.format("synth"), *command)
     assert "warp" in loaded
     assert not loaded & {"mitsuba", "drjit", "torch", "matplotlib", "OpenEXR"}
     assert (tmp_path / "out" / "trajectory.json").exists()
 
 
 def test_files_stay_short() -> None:
-    long = [
-        f"{path.relative_to(ROOT)}: {count} lines"
-        for package in ("synth", "gelflow", "benchmarks")
-        for path in sorted((ROOT / package).rglob("*.py"))
-        if (count := len(path.read_text(encoding="utf-8").splitlines())) > 350
-    ]
-    assert long == []
+    paths = [path for package in ("synth", "gelflow", "benchmarks") for path in (ROOT / package).rglob("*.py")]
+    assert [path for path in paths if len(path.read_text(encoding="utf-8").splitlines()) > 350] == []

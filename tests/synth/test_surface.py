@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from pads import SIZE, brick, contact_faces, crooked
+from pads import SIZE, area_vectors, brick, contact_faces, crooked
 
 from synth.arrays import FloatArray, Points
 from synth.surface import ContactFaces, GelSurface
@@ -16,11 +16,6 @@ def edges(triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Each edge once, and how many triangles it belongs to."""
     pairs = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     return np.unique(pairs, axis=0, return_counts=True)
-
-
-def normals(points: Points, triangles: np.ndarray) -> FloatArray:
-    a, b, c = (points[triangles[:, i]] for i in range(3))
-    return np.asarray(np.cross(b - a, c - a))
 
 
 @pytest.mark.parametrize("n", SUBDIVISIONS)
@@ -42,10 +37,10 @@ def test_refined_sheet_is_one_and_conforming(coarse: ContactFaces, n: int) -> No
 @pytest.mark.parametrize("n", SUBDIVISIONS)
 def test_triangles_keep_area_and_orientation_nodes_and_affine_fields_their_values(n: int) -> None:
     surface = GelSurface(CROOKED, n)
-    area = normals(surface.material, surface.triangles) / 2
+    area = area_vectors(surface.material, surface.triangles)
     assert (area[:, 2] < 0).all()
     assert -area[:, 2].sum() == pytest.approx(6.0, rel=1e-12)
-    whole = np.repeat(normals(CROOKED.nodes, CROOKED.faces)[:, 2] / 2, n * n) / n**2
+    whole = np.repeat(area_vectors(CROOKED.nodes, CROOKED.faces)[:, 2], n * n) / n**2
     # The n * n parts of a face follow each other and are equal, to rounding.
     np.testing.assert_allclose(area[:, 2], whole, rtol=1e-9)
     surface, rng = GelSurface(CROOKED, n), np.random.default_rng(1)
@@ -71,15 +66,13 @@ def smooth(points: Points) -> FloatArray:
 def test_smooth_fields_converge_at_third_order_and_the_map_is_local() -> None:
     """Halving the edges divides the error inside by 8, where linear interpolation divides it by 4."""
 
-    def errors(cells: int) -> tuple[float, float]:
+    def errors(cells: int) -> tuple[float, ...]:
         coarse = contact_faces(brick((4.0, 4.0, 1.0), (cells, cells, 1)))
         surface = GelSurface(coarse, 4)
         inside = (np.abs(surface.material[:, :2]) <= 1.0).all(axis=1)
         wanted, nodal = smooth(surface.material)[inside], smooth(coarse.nodes)
-        return (
-            float(np.abs(surface.interpolate(nodal)[inside] - wanted).max()),
-            float(np.abs(surface.interpolate_linear(nodal)[inside] - wanted).max()),
-        )
+        both = surface.interpolate(nodal), surface.interpolate_linear(nodal)
+        return tuple(float(np.abs(values[inside] - wanted).max()) for values in both)
 
     (coarse, coarse_linear), (fine, fine_linear) = errors(8), errors(16)
     # The next term of the expansion is an edge length smaller, 0.25 of the leading one at worst: rates 3 and 2, -0.3.

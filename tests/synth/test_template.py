@@ -1,15 +1,13 @@
-"""Scene files: distributions, overrides, corners and the hash; wrong ones get one clear message each.
-
-A message has the file, the field's full path, what was given and what is allowed.
-"""
+"""Scene files: distributions, overrides, corners and the hash; wrong ones get one clear message each."""
 
 import pickle
+import re
 from pathlib import Path
 
 import pytest
+from commands import refused
 from tiny_scene import CONTACT, TEXT, write_tiny
 
-from synth.errors import InputError
 from synth.scene.sampling import draw
 from synth.scene.template import SCENES, checked_template, load_scene, shipped_scenes
 
@@ -27,20 +25,10 @@ def test_shipped_scenes_are_known_by_name_and_a_template_needs_no_file(tmp_path,
 
 
 def test_overrides_set_tables_lists_and_words_and_the_last_wins(tiny: Path) -> None:
-    template = load_scene(
-        tiny,
-        [
-            "motion.depth_mm=0.25",
-            "sensor.lights.1.power=7",
-            "name=another",
-            "outputs.depth=true",
-            'contact.indenter={ shape = "torus", radius_mm = 1.0, tube_mm = 0.3 }',
-            "sensor.camera.position_mm=[0, 0, 21.5]",
-            "motion.steps=3",
-            "motion.steps=4",
-        ],
-    )
-    scene = template.corners[0]
+    torus = 'contact.indenter={ shape = "torus", radius_mm = 1.0, tube_mm = 0.3 }'
+    words = ["motion.depth_mm=0.25", "sensor.lights.1.power=7", "name=another", "outputs.depth=true", torus]
+    numbers = ["sensor.camera.position_mm=[0, 0, 21.5]", "motion.steps=3", "motion.steps=4"]
+    scene = load_scene(tiny, words + numbers).corners[0]
     assert (scene.motion.depth_mm, scene.sensor.lights[1].power, scene.name) == (0.25, 7, "another")
     assert scene.outputs.depth
     assert scene.contact.indenter.shape == "torus"
@@ -66,13 +54,12 @@ def test_corners_are_the_ends_of_distributions_and_every_option_of_nested_choice
 def test_wrong_options_are_found_at_loading_and_the_hash_covers_files_of_mesh_indenters(tiny, monkeypatch) -> None:
     torus = '{ shape = "torus", radius_mm = 1, tube_mm = 0.2 }'
     sphere = '{ shape = "sphere", radius_mm = { choice = [1.0, -2.0] } }'
-    with pytest.raises(InputError, match=r"contact.indenter.radius_mm = -2.0: must be greater than or equal to 0.05"):
-        load_scene(tiny, [f"contact.indenter={{ choice = [{sphere}, {torus}] }}"])
+    found = _refusal(tiny, f"contact.indenter={{ choice = [{sphere}, {torus}] }}")
+    assert "contact.indenter.radius_mm = -2.0: must be greater than or equal to 0.05" in found
     monkeypatch.chdir(tiny.parent)
     override = 'contact.indenter={ shape = "mesh", file = { choice = ["a.stl", "b.stl"] } }'
     (tiny.parent / "a.stl").write_text("first")
-    with pytest.raises(InputError, match=r"there is no file .*b\.stl"):
-        load_scene(tiny, [override])
+    assert re.search(r"there is no file .*b\.stl", _refusal(tiny, override))
     (tiny.parent / "b.stl").write_text("second")
     before = load_scene(tiny, [override]).hash
     (tiny.parent / "b.stl").write_text("changed")
@@ -82,9 +69,9 @@ def test_wrong_options_are_found_at_loading_and_the_hash_covers_files_of_mesh_in
 def test_hash_and_draws_are_of_the_content_which_is_plain_json(tmp_path: Path, tiny: Path) -> None:
     template = load_scene(tiny)
     assert len(template.hash) == 16
-    name, words = 'name = "tiny"\n', 'description = "words"\nreferences = ["a book"]\n'
-    sensor = TEXT.removesuffix(CONTACT).replace(name, "")
-    (tmp_path / "other.toml").write_text(words + name + CONTACT + sensor)
+    head, sensor = TEXT.removesuffix(CONTACT).split("[sensor]")
+    words = 'description = "words"\nreferences = ["a book"]\n'
+    (tmp_path / "other.toml").write_text(f"{words}{head}{CONTACT}[sensor]{sensor}")
     other = load_scene(tmp_path / "other.toml")
     assert other.hash == template.hash
     one, same = draw(template, 3, 5), draw(other, 3, 5)
@@ -98,9 +85,7 @@ def test_hash_and_draws_are_of_the_content_which_is_plain_json(tmp_path: Path, t
 
 
 def _refusal(source: Path | str, *overrides: str) -> str:
-    with pytest.raises(InputError) as caught:
-        load_scene(source, overrides)
-    return str(caught.value)
+    return refused(".", load_scene, source, overrides)
 
 
 WRONG_KEYS_AND_TYPES = [
@@ -165,22 +150,17 @@ def test_a_wrong_value_is_named_with_file_place_and_what_is_allowed(tiny: Path, 
     assert "\n" not in found
 
 
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("motion", "give key=value, for instance --set motion.depth_mm=1.2"),
-        ("=1", "give key=value"),
-        ("motion..depth_mm=1", "give key=value"),
-        ("sensor.lights.5.power=1", "'5' is not an entry of a list of 5 (0 is the first)"),
-        ("sensor.lights.first.power=1", "'first' is not an entry of a list of 5"),
-        ("motion.steps.more=1", "'more' lies inside a value that is not a table"),
-        ("motion.depth_mm.uniform=[0, 1]", "motion.depth_mm is a distribution; give all of it, as in --set 'motion."),
-    ],
-)
+@pytest.mark.parametrize(("override", "message"), [
+    ("motion", "give key=value, for instance --set motion.depth_mm=1.2"),
+    ("=1", "give key=value"),
+    ("motion..depth_mm=1", "give key=value"),
+    ("sensor.lights.5.power=1", "'5' is not an entry of a list of 5 (0 is the first)"),
+    ("sensor.lights.first.power=1", "'first' is not an entry of a list of 5"),
+    ("motion.steps.more=1", "'more' lies inside a value that is not a table"),
+    ("motion.depth_mm.uniform=[0, 1]", "motion.depth_mm is a distribution; give all of it, as in --set 'motion."),
+])  # fmt: skip
 def test_overrides(tiny: Path, override: str, message: str) -> None:
-    found = _refusal(tiny, override)
-    assert found.startswith(f"--set {override!r}: ")
-    assert message in found
+    assert re.match(rf"{re.escape(f'--set {override!r}: ')}.*{re.escape(message)}", _refusal(tiny, override))
 
 
 def test_every_problem_is_told_once_on_a_short_line_as_are_missing_files(tiny: Path, tmp_path: Path) -> None:
@@ -198,17 +178,14 @@ def test_every_problem_is_told_once_on_a_short_line_as_are_missing_files(tiny: P
     assert "not valid TOML" in _refusal(tmp_path / "noise.toml")
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ("name = ", "not valid TOML"),
-        ("a = 1\na = 2\n", "not valid TOML"),
-        ("", "name: is missing"),
-        ("name = 'x'\n", "sensor: is missing"),
-        (TEXT.replace('kind = "dots"', ""), "sensor.pattern: lacks the key 'kind'"),
-        (TEXT.replace("width = 32", "widht = 32"), "sensor.camera.width: is missing"),
-    ],
-)
+@pytest.mark.parametrize(("content", "message"), [
+    ("name = ", "not valid TOML"),
+    ("a = 1\na = 2\n", "not valid TOML"),
+    ("", "name: is missing"),
+    ("name = 'x'\n", "sensor: is missing"),
+    (TEXT.replace('kind = "dots",', ""), "sensor.pattern: lacks the key 'kind'"),
+    (TEXT.replace("width = 32", "widht = 32"), "sensor.camera.width: is missing"),
+])  # fmt: skip
 def test_files(tmp_path: Path, content: str, message: str) -> None:
     path = write_tiny(tmp_path, content)
     found = _refusal(path)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import refused
 from kinematic_double import LENS, OBLIQUE, sensor, sheet
 from rich.console import Console
 from verified_sample import HEIGHT, WIDTH, as_sample, make_sample, motion_checks, pressed, scene, sheets
@@ -17,7 +18,6 @@ from synth.dataset.exr import read_channels, write_flow
 from synth.dataset.job import Job
 from synth.dataset.reader import SampleData
 from synth.dataset.writer import DatasetWriter
-from synth.errors import InputError
 from synth.flow.field import FlowField
 from synth.scene import Outputs
 from synth.verify import Check, Report, SampleReport, verify_dataset, verify_sample
@@ -149,11 +149,10 @@ def test_photometry_tells_the_right_flow_from_wrong_ones_or_that_it_does_not_app
 
 
 def test_dataset_on_disk(tmp_path, sample):
-    path = tmp_path / "data"
+    path, seen = tmp_path / "data", []
     with DatasetWriter(path, Job(SCENE.model_dump(mode="json"), "double", "0", seed=0, n=2)) as writer:
         writer.write(as_sample(0, SCENE, sample))
         writer.write(as_sample(1, SCENE, sample))
-    seen = []
     report = verify_dataset(path, progress=lambda *numbers: seen.append(numbers))
     assert report.ok
     assert [s.index for s in report.samples] == [0, 1]
@@ -174,8 +173,7 @@ def test_dataset_on_disk(tmp_path, sample):
     assert "row 70, column 90" in failed["forward flow"]
     assert not damaged.samples[1].ok
     assert "truncated" in damaged.samples[1].checks[0].detail
-    with pytest.raises(InputError):
-        verify_dataset(tmp_path)
+    refused("not a dataset", verify_dataset, tmp_path)
 
 
 def _file_problems(folder, scene, **changes):
@@ -198,8 +196,7 @@ def test_channels_and_headers_of_the_flow_file_and_the_report(tmp_path) -> None:
     plain = SCENE.model_copy(update={"outputs": Outputs(backward=False)})
     rich = SCENE.model_copy(update={"outputs": Outputs(backward=False, depth=True, contact=True)})
     whole = {name: np.zeros((3, 4), np.float32) for name in ("depth1.Z", "depth2.Z", "contact.Y")}
-    assert _file_problems(tmp_path, plain) == []
-    assert _file_problems(tmp_path, rich, extras=whole) == []
+    assert (_file_problems(tmp_path, plain), _file_problems(tmp_path, rich, extras=whole)) == ([], [])
     assert _file_problems(tmp_path, rich) == [f"flow.exr: lacks the channel {name}" for name in whole]
     half = {"depth2.Z": whole["depth2.Z"].astype(np.float16)}
     assert _file_problems(tmp_path, rich, extras=whole, planes=half) == ["flow.exr: depth2.Z is float16, not float32"]

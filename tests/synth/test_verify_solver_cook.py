@@ -9,11 +9,10 @@ from functools import cache
 
 import numpy as np
 import pytest
-from pads import ELEMENT, brick, equilibrium, face_load, mapped, scene, supported
+from pads import ELEMENT, brick, complete, equilibrium, face_load, mapped, scene, supported
 
 from synth.arrays import BoolArray, Points
 from synth.mesh import PadMesh
-from synth.simulate import simulate
 from synth.simulate.material import uniform
 
 POISSON = 0.4999
@@ -21,13 +20,8 @@ YOUNG = 80.1938 * 2 * (1 + POISSON)
 THICKNESS, END = 1.0, 16.0
 CONVERGED = 6.93  # Tip displacement, mm: what the elements below tend to (P2/P1 at n = 32: 6.922)
 REFERENCE = {
-    ("p2p1", 8): 6.87,
-    ("p2p1", 16): 6.908,
-    ("p1p1", 8): 6.37,
-    ("p1p1", 16): 6.71,
-    ("p1p1", 32): 6.85,
-    ("p1", 16): 6.32,
-}
+    ("p2p1", 8): 6.87, ("p2p1", 16): 6.908, ("p1p1", 8): 6.37, ("p1p1", 16): 6.71, ("p1p1", 32): 6.85, ("p1", 16): 6.32
+}  # fmt: skip
 """Tip displacement (mm) of another program of ours with the same elements and n cells along each edge."""
 
 
@@ -42,9 +36,7 @@ def clamped(points: Points) -> BoolArray:
 
 @cache
 def tip(element: str, cells: int) -> float:
-    """Vertical displacement of the upper corner, mm."""
-    # No node lies at z = 2: nothing is bonded.
-    mesh = mapped((cells, cells, 1), taper, 2.0)
+    mesh = mapped((cells, cells, 1), taper, 2.0)  # No node lies at z = 2: nothing is bonded
     space = supported(mesh, ELEMENT[element](), clamped)
     shear = np.array([0.0, 100.0 / (YOUNG * END * THICKNESS), 0.0])
     load = face_load(space, lambda x: np.isclose(x[:, 0], 48.0), shear)
@@ -89,16 +81,14 @@ def graded(counts: tuple[int, int, int]) -> PadMesh:
     return PadMesh(points, even.tets, SIZE)
 
 
-# Linear elements of this size are 4 % too stiff, for want of resolution at the contact's edge; quadratic ones twice as
-# wide were within 0.7 %.
+# Linear elements of this size are 4 % too stiff at the contact's edge; quadratic ones twice as wide within 0.7 %.
 @pytest.mark.parametrize(
     ("element", "counts", "close"), [("p1p1", (20, 16, 5), 0.15), ("p2p1", (10, 8, 3), 0.03)], ids=["p1p1", "p2p1"]
 )
 def test_press_at_nu_04999_does_not_lock(element: str, counts: tuple[int, int, int], close: float) -> None:
     ball, motion = {"shape": "sphere", "radius_mm": 4.0}, {"depth_mm": 2.0, "steps": 5}
     gel, numerics = {"youngs_modulus_kpa": 200.0, "poisson_ratio": 0.4999}, {"element": element}
-    result = simulate(scene(SIZE, gel=gel, indenter=ball, motion=motion, numerics=numerics), graded(counts))
-    assert result.status == "complete"
+    result = complete(scene(SIZE, gel=gel, indenter=ball, motion=motion, numerics=numerics), graded(counts))
     forces = {round(state.depth_mm, 9): state.force_n for state in result.states}
     for depth, force in PRESS_N.items():
         assert forces[depth][2] == pytest.approx(force, rel=close)

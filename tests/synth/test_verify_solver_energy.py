@@ -1,44 +1,32 @@
 """What the indenter exerts the window bears, and its work is the gel's energy and what friction takes.
 
 Without friction the solver's steps are equilibria of an energy, so that only the trapezoidal rule of the account stands
-between the two sides: an error that falls with the square of the step. Friction's return map ends each step on the
-cone; the account's mean of the tractions at both ends makes it second order, too, except at points that begin to slip.
-`integrals` finds stresses and nodal forces from displacements and pressures apart from the solver's kernels.
-
-The contact's springs hold (t_n² + |t_T|²) / 2ε per area, ε the penalty: a part of the elastic energy that belongs to
-the discretisation. What rubbing loses is the tangential traction times the motion of the anchors.
+between the two sides: an error that falls with the square of the step. With friction the mean of the tractions at both
+ends makes it second order, too, except at points that begin to slip. The contact's springs hold (t_n² + |t_T|²) / 2ε
+per area, ε the penalty; what rubbing loses is the tangential traction times the motion of the anchors.
 """
 
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from integrals import own_integrals
-from pads import ELEMENT, FILM, MIXED, SIZE, contact_faces, pad, run, scene
+from pads import ELEMENT, FILM, MIXED, SIZE, complete, contact_faces, pad, run, scene
 
 from synth.arrays import FloatArray
 from synth.mesh import PadMesh
 from synth.scene import Scene
-from synth.simulate import simulate
 from synth.simulate.contact import Indenters
-from synth.simulate.indenter import rigid_body
-from synth.simulate.load_path import LoadPath
 from synth.simulate.material import pad_material
-from synth.simulate.solve import ELEMENTS
+from synth.simulate.press import Press
 from synth.simulate.space import Space, function_space
 from synth.simulate.stepping import Stepper
 from synth.simulate.system import System, Unknowns
 
-
-@dataclass(frozen=True)
-class Moment:
-    """The indenter and its load at one accepted step; `rubbing` (f, q, 3) is the tangential traction in its frame."""
-
-    centre: FloatArray
-    rotation: FloatArray
-    force: FloatArray
-    moment: FloatArray
-    rubbing: FloatArray
+PRESS = {"depth_mm": 0.8}
+DRAG = {"depth_mm": 0.8, "shear_mm": [1.2, 0.3]}
+TWIST = {"depth_mm": 0.8, "shear_mm": [0.3, 0.2], "twist_deg": 40.0}
 
 
 @dataclass
@@ -49,11 +37,10 @@ class Account:
     lost: float = 0.0
     springs: float = 0.0
     stored: float = 0.0
-    last: Moment | None = field(default=None, repr=False)
+    last: SimpleNamespace | None = field(default=None, repr=False)
 
     @property
     def missing(self) -> float:
-        """Share of the work that is in none of the others."""
         return 1 - (self.stored + self.springs + self.lost) / self.work
 
 
@@ -68,7 +55,8 @@ class Ledger(System):
         centre, rotation = indenter.centre.numpy()[0].copy(), indenter.rotation.numpy()[0].copy()
         force, moment = self.forces(state)[:2]
         along, whole = self.tangential.numpy()[0], self.traction.numpy()[0]
-        now = Moment(centre, rotation, force, moment - np.cross(centre, force), along @ rotation)
+        about = {"force": force, "moment": moment - np.cross(centre, force), "rubbing": along @ rotation}
+        now = SimpleNamespace(centre=centre, rotation=rotation, **about)
         weight = self._faces.weight.numpy()
         anchor, anchored = self.contact.anchor.numpy()[0].copy(), self.contact.anchored.numpy()[0] == 1
         super().update_contact_history(state, indenter)
@@ -92,19 +80,14 @@ def accounted(scene: Scene, mesh: PadMesh) -> Account:
     """Run a scene, whose trajectory must be complete, and close the account with the energy of its last state."""
     gel, numerics = scene.sensor.gel, scene.numerics
     material = pad_material(gel, mesh)
-    ledger = Ledger(function_space(mesh, ELEMENTS[numerics.element]()), material, penalty=numerics.penalty)
+    ledger = Ledger(function_space(mesh, ELEMENT[numerics.element]()), material, penalty=numerics.penalty)
     ledger.account = Account()
-    path = LoadPath(scene.motion, rigid_body(scene.contact.indenter))
+    path = Press.of(scene, mesh).path
     stepper = Stepper(ledger, path, scene.contact.friction, numerics, gel.youngs_modulus_kpa / 1000)
     ended = stepper.run()
     assert (ended.status, ended.reason) == ("complete", "")
     ledger.account.stored = own_integrals(ledger.space).energy(material, stepper.state.u, stepper.state.p)
     return ledger.account
-
-
-PRESS = {"depth_mm": 0.8}
-DRAG = {"depth_mm": 0.8, "shear_mm": [1.2, 0.3]}
-TWIST = {"depth_mm": 0.8, "shear_mm": [0.3, 0.2], "twist_deg": 40.0}
 
 
 def landing(mesh: PadMesh, element: str) -> tuple[float, float]:
@@ -116,9 +99,7 @@ def landing(mesh: PadMesh, element: str) -> tuple[float, float]:
     return float(x), float(y)
 
 
-def account(
-    element: str, steps: int, motion: dict, friction: float = 0.0, layers: bool = False, nu: float = 0.4999
-) -> Account:
+def account(element: str, steps: int, motion: dict, friction=0.0, layers=False, nu=0.4999) -> Account:
     mesh = pad(layers)
     case = scene(
         SIZE,
@@ -200,8 +181,7 @@ def check(space: Space, displacement: FloatArray, internal: FloatArray, force: F
 def test_recorded_displacement_and_force_belong_together(element: str, friction: float) -> None:
     """Of a foam, whose stress is the displacement's alone: what the user gets, with multipliers and all."""
     posed, mesh = case(element, 0.2, friction, SLIDE), pad(False)
-    result = simulate(posed, mesh)
-    assert result.status == "complete"
+    result = complete(posed, mesh)
     rule, material = own_integrals(result.space), pad_material(posed.sensor.gel, mesh)
     for state in result.states[1:]:
         internal = rule.forces(rule.stress(material, state.displacement, np.zeros(0)))

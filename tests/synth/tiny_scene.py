@@ -19,19 +19,12 @@ from synth.scene.template import Template, load_scene
 
 SENSOR = """
 name = "tiny"
-
-[sensor.gel]
-size_mm = [8.0, 6.0, 2.5]
-youngs_modulus_kpa = { log_uniform = [100.0, 300.0] }
-
-[sensor.window]
-thickness_mm = 3.0
-
-[sensor.pattern]
-kind = "dots"
-spacing_mm = [1.0, 1.0]
-radius_mm = { uniform = [0.2, 0.3] }
-
+numerics = { element = "p1p1", edge_length_mm = 1.25 }
+render = { samples_per_pixel = 4, max_depth = 2 }
+[sensor]
+gel = { size_mm = [8.0, 6.0, 2.5], youngs_modulus_kpa = { log_uniform = [100.0, 300.0] } }
+window.thickness_mm = 3.0
+pattern = { kind = "dots", spacing_mm = [1.0, 1.0], radius_mm = { uniform = [0.2, 0.3] } }
 [sensor.camera]
 width = 32
 height = 24
@@ -41,16 +34,12 @@ cx = { normal = [16.0, 0.3] }
 cy = 12.0
 position_mm = [0.0, 0.0, 20.0]
 read_noise = 0.002
-
-[render]
-samples_per_pixel = 4
-max_depth = 2
-
-[numerics]
-element = "p1p1"
-edge_length_mm = 1.25
 """
 # Five lights: a scene whose lights came in another order every time would be the same by chance in 1 of 120 runs.
+PLACES = {
+    (3.8, 0.0): [1.0, 0.2, 0.2], (-3.8, 0.0): [0.2, 1.0, 0.2], (0.0, 2.9): [0.2, 0.2, 1.0],
+    (0.0, -2.9): [1.0, 1.0, 0.2], (3.8, 2.9): [0.2, 1.0, 1.0],
+}  # fmt: skip
 LIGHTS = "".join(
     f"""
 [[sensor.lights]]
@@ -59,28 +48,17 @@ size_mm = [0.3, 0.3]
 color = {color}
 power = {{ uniform = [90.0, 110.0] }}
 """
-    for x, y, color in [
-        (3.8, 0.0, [1.0, 0.2, 0.2]),
-        (-3.8, 0.0, [0.2, 1.0, 0.2]),
-        (0.0, 2.9, [0.2, 0.2, 1.0]),
-        (0.0, -2.9, [1.0, 1.0, 0.2]),
-        (3.8, 2.9, [0.2, 1.0, 1.0]),
-    ]
+    for (x, y), color in PLACES.items()
 )
 CONTACT = """
 [contact]
 friction = { uniform = [0.3, 0.8] }
-
-[contact.indenter]
-shape = "sphere"
-radius_mm = { uniform = [1.5, 2.5] }
-
+indenter = { shape = "sphere", radius_mm = { uniform = [1.5, 2.5] } }
 [motion]
 depth_mm = { uniform = [0.1, 0.3] }
 position_mm = [{ uniform = [-1.0, 1.0] }, { uniform = [-1.0, 1.0] }]
 shear_mm = [{ uniform = [-0.1, 0.1] }, 0.0]
 steps = 2
-
 [sampling]
 pairs_per_trajectory = 2
 trajectories_per_sensor = 2
@@ -94,26 +72,17 @@ def write_tiny(folder: Path, text: str = TEXT) -> Path:
     return path
 
 
-def without_times(record: dict[str, Any]) -> dict[str, Any]:
-    """A manifest line less its only part that depends on the machine's load."""
-    return {key: value for key, value in record.items() if key != "seconds"}
-
-
 def fingerprint(dataset: Path) -> dict[str, Any]:
-    """SHA-256 of every file of a dataset by relative path; manifest lines less their seconds.
-
-    The lock and summary.json, which tells of times, are left out.
-    """
+    """SHA-256 of every file of a dataset by relative path; manifest lines less their seconds; no lock, no summary."""
     files = [f for f in sorted(dataset.rglob("*")) if f.is_file() and f.name not in (".lock", "summary.json")]
     found: dict[str, Any] = {str(f.relative_to(dataset)): hashlib.sha256(f.read_bytes()).hexdigest() for f in files}
     lines = (dataset / "manifest.jsonl").read_text().splitlines()
-    found["manifest.jsonl"] = [without_times(json.loads(line)) for line in lines]
+    found["manifest.jsonl"] = [json.loads(line) | {"seconds": None} for line in lines]
     return found
 
 
 @functools.cache
 def home() -> Path:
-    """A folder of the session."""
     folder = Path(tempfile.mkdtemp(prefix="synth-tests-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return folder

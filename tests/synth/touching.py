@@ -38,8 +38,7 @@ class Touch:
     def points(self) -> FloatArray:
         """(f, q, 3) positions of the contact points."""
         space = self.body.space
-        nodes = (space.points + self.state.u)[space.faces]
-        return np.einsum("qa,fac->fqc", space.element.face_shape, nodes)
+        return np.einsum("qa,fac->fqc", space.element.face_shape, (space.points + self.state.u)[space.faces])
 
     @property
     def local(self) -> FloatArray:
@@ -74,13 +73,8 @@ class Touch:
         return np.where(pressure > 0, 1 + slip, 0)
 
 
-def touch(
-    friction: float, shape: str = "sphere", multipliers: bool = True, fresh: float = 0.0, element: str = "p1p1"
-) -> Touch:
-    """The gel with random displacements and multipliers; a share `fresh` of the contact points was off before the step.
-
-    The others have anchors near them, the fresh ones a place and a gap before the step.
-    """
+def touch(friction: float, shape: str = "sphere", multipliers: bool = True, fresh: float = 0, element="p1p1") -> Touch:
+    """The gel with random displacements and multipliers; a share `fresh` of the points was off before the step."""
     rng = np.random.default_rng(1)
     body = system(MESH, 0.4999, penalty=PENALTY, element=ELEMENT[element]())
     posed = scene(MESH.size_mm, indenter=INDENTERS[shape], motion={"depth_mm": 0.5})

@@ -47,7 +47,7 @@ def make_sample(drawn: Scene, displacement1: FloatArray, displacement2: FloatArr
     states = [SURFACE.positions(u) for u in (displacement1, displacement2)]
     flow = exact_flow(View(SURFACE, optics), *states)
     rng = np.random.default_rng(seed)
-    images = [_paint(SURFACE, positions, optics, drawn, rng) for positions in states]
+    images = [_paint(positions, optics, drawn, rng) for positions in states]
     return SampleData(images[0], images[1], flow, SURFACE, displacement1, displacement2, {})
 
 
@@ -57,9 +57,10 @@ def sheets(sensor: Sensor, surface: GelSurface, *states: Points) -> list[Sheet]:
     return [Sheet(camera, surface.triangles, state, sensor.camera.width, sensor.camera.height) for state in states]
 
 
-def motion_checks(
-    sensor: Sensor, surface: GelSurface, first: Points, second: Points
-) -> tuple[FlowField, dict[str, Check]]:
+Checked = tuple[FlowField, dict[str, Check]]
+
+
+def motion_checks(sensor: Sensor, surface: GelSurface, first: Points, second: Points) -> Checked:
     """The exact flow between two states, both ways, and the checks of it by name."""
     flow = exact_flow(View(surface, Optics.of(sensor)), first, second)
     near, far = sheets(sensor, surface, first, second)
@@ -73,11 +74,9 @@ def as_sample(index: int, drawn: Scene, data: SampleData) -> Sample:
     return Sample(*pair, index, 0, (0, 1), 0, *rest)
 
 
-def _paint(
-    surface: GelSurface, positions: Points, optics: Optics, drawn: Scene, rng: np.random.Generator
-) -> np.ndarray:
+def _paint(positions: Points, optics: Optics, drawn: Scene, rng: np.random.Generator) -> np.ndarray:
     """Waves in material coordinates under light that depends on place, 2 x 2 samples a pixel, with noise, 8 bit."""
-    camera = drawn.sensor.camera
+    camera, surface = drawn.sensor.camera, SURFACE
     row, column = np.mgrid[: 2 * camera.height, : 2 * camera.width]
     rays = optics.look(np.column_stack([column.ravel(), row.ravel()]) / 2 + 0.25)
     hits = trace(positions, surface.triangles, rays.origins, rays.directions)

@@ -1,0 +1,23 @@
+"""What commands and calls say, above all when they refuse."""
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+import gelflow.errors
+import synth.errors
+
+
+def said(capsys: pytest.CaptureFixture[str], main: Callable, *arguments: object, status: int = 0) -> str:
+    """What a command prints: on stdout, or on stderr where it must end with another status than 0."""
+    assert main([str(argument) for argument in arguments]) == status
+    out, err = capsys.readouterr()
+    return err if status else out
+
+
+def refused(message: str, call: Callable[..., object], *arguments: Any, **options: Any) -> str:
+    """What the program's InputError says, which the call must raise and the regular expression must match."""
+    with pytest.raises((synth.errors.InputError, gelflow.errors.InputError), match=message) as error:
+        call(*arguments, **options)
+    return str(error.value)
