@@ -148,10 +148,10 @@ class RoundWindow:
     def crossings(self, points: Points, eye: FloatArray) -> tuple[Points, BoolArray]:
         """Where (n, 3) mm light from points (n, 3) to an eye (3,) crosses the face, and which converged (n,).
 
-        For points in air, and at index 1, the points themselves.
+        For points in air, and at index 1, the points themselves. NaN does not converge.
         """
-        found, converged = points.copy(), np.ones(len(points), dtype=np.bool_)
-        at = np.flatnonzero(~self.holds(points)) if self.index != 1 else np.arange(0)
+        found, converged = points.copy(), np.isfinite(points).all(axis=1)
+        at = np.flatnonzero(converged & ~self.holds(points)) if self.index != 1 else np.arange(0)
         arm = points[at] - eye
         direction = arm / np.linalg.norm(arm, axis=1, keepdims=True)
         found[at] = eye + direction * self._way_out(eye, direction)[:, None]
