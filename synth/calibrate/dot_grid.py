@@ -24,23 +24,14 @@ _DOT_PX = 0.3
 
 @dataclass(frozen=True, eq=False)
 class DotGridFit:
-    """Layout and camera.
+    """Layout and camera."""
 
-    Attributes:
-        pattern: with spacing, rotation, offset and jitter as found; its radius has grown with the spacing.
-        camera: with focal lengths, principal point, tilt and k1 as found.
-        residual_px: (n, 2) found minus predicted centres.
-        used: (n,) indices of the found dots that are part of the grid.
-        index: (n, 2) their columns and rows.
-        pitch_px: mean distance of columns and of rows.
-    """
-
-    pattern: Dots
-    camera: Camera
-    residual_px: Pixels
-    used: NDArray[np.int64]
-    index: NDArray[np.int64]
-    pitch_px: float
+    pattern: Dots  # with spacing, rotation, offset and jitter as found; its radius has grown with the spacing
+    camera: Camera  # with focal lengths, principal point, tilt and k1 as found
+    residual_px: Pixels  # (n, 2) found minus predicted centres
+    used: NDArray[np.int64]  # (n,) indices of the found dots that are part of the grid
+    index: NDArray[np.int64]  # (n, 2) their columns and rows
+    pitch_px: float  # mean distance of columns and of rows
 
 
 def fit_dot_grid(sensor: Sensor, pattern: Dots, centres: Pixels, spacing_mm: float | None) -> DotGridFit:

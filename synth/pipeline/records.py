@@ -65,29 +65,17 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedTrajectory:
-    """A simulated trajectory, less what no sample shows; picklable.
+    """A simulated trajectory, less what no sample shows; picklable."""
 
-    Attributes:
-        number: of the trajectory.
-        scene: fully drawn.
-        pairs: the samples that are wanted.
-        states: by number, those that the samples show; displacements are those of the contact face.
-        mesh: what is said of the mesh: hash and element.
-        edge_radius_mm: of a mesh indenter, else None.
-        accuracy: of the mesh; None where it is left to whoever finishes the samples.
-        failures: instances that failed before.
-        seconds: of the simulation.
-    """
-
-    number: int
-    scene: Scene
-    pairs: tuple[Pair, ...]
-    states: dict[int, State]
-    mesh: dict[str, Any]
-    edge_radius_mm: float | None
-    accuracy: Accuracy | None
-    failures: tuple[Failure, ...]
-    seconds: float
+    number: int  # of the trajectory
+    scene: Scene  # fully drawn
+    pairs: tuple[Pair, ...]  # the samples that are wanted
+    states: dict[int, State]  # by number, those that the samples show; displacements are those of the contact face
+    mesh: dict[str, Any]  # what is said of the mesh: hash and element
+    edge_radius_mm: float | None  # of a mesh indenter, else None
+    accuracy: Accuracy | None  # of the mesh; None where it is left to whoever finishes the samples
+    failures: tuple[Failure, ...]  # instances that failed before
+    seconds: float  # of the simulation
 
     @property
     def sensor(self) -> int:

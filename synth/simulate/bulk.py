@@ -25,33 +25,19 @@ import warp as wp
 
 @wp.struct
 class Bulk:
-    """Tables of a pad's elements.
+    """Tables of a pad's elements."""
 
-    Attributes:
-        nodes: (m, nn) displacement nodes.
-        pressure_nodes: (m, 4).
-        gradient: (m, nq, nn) 1/mm, undeformed gradients of the displacement's shape functions.
-        weight: (m, nq) mm³.
-        pressure_shape: (nq, 4).
-        stabilisation: (m, 4, 4) constant pressure block of `synth.simulate.element`.
-        shear: (m,) μ.
-        compliance: (m,) 1/λ.
-        mixed: whether there is a pressure field.
-        hold: C, of `synth.simulate.element`.
-        yeoh: (m,) c_2, c_3.
-    """
-
-    nodes: wp.array2d(dtype=wp.int32)
-    pressure_nodes: wp.array2d(dtype=wp.int32)
-    gradient: wp.array3d(dtype=wp.vec3d)
-    weight: wp.array2d(dtype=wp.float64)
-    pressure_shape: wp.array2d(dtype=wp.float64)
-    stabilisation: wp.array3d(dtype=wp.float64)
-    shear: wp.array(dtype=wp.float64)
-    compliance: wp.array(dtype=wp.float64)
-    mixed: int
-    hold: wp.float64
-    yeoh: wp.array(dtype=wp.vec2d)
+    nodes: wp.array2d(dtype=wp.int32)  # (m, nn) displacement nodes
+    pressure_nodes: wp.array2d(dtype=wp.int32)  # (m, 4)
+    gradient: wp.array3d(dtype=wp.vec3d)  # (m, nq, nn) 1/mm, undeformed gradients of the displacement's shape functions
+    weight: wp.array2d(dtype=wp.float64)  # (m, nq) mm³
+    pressure_shape: wp.array2d(dtype=wp.float64)  # (nq, 4)
+    stabilisation: wp.array3d(dtype=wp.float64)  # (m, 4, 4) constant pressure block of `synth.simulate.element`
+    shear: wp.array(dtype=wp.float64)  # (m,) μ
+    compliance: wp.array(dtype=wp.float64)  # (m,) 1/λ
+    mixed: int  # whether there is a pressure field
+    hold: wp.float64  # C, of `synth.simulate.element`
+    yeoh: wp.array(dtype=wp.vec2d)  # (m,) c_2, c_3
 
 
 @wp.func

@@ -17,27 +17,16 @@ from synth.surface import FACE_EDGES, ContactFaces
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """See the module's docstring.
+    """See the module's docstring."""
 
-    Attributes:
-        mesh: the pad's linear tetrahedra.
-        element: on each of them.
-        points: (n, 3) float64 mm, displacement nodes: the mesh's vertices, then the edges' midpoints for P2.
-        nodes: (m, nn) int32 displacement nodes of each element.
-        pressure_nodes: (m, 4) int32 pressure unknowns of each element.
-        pressures: number of pressure unknowns.
-        held: (n, 3) bool, displacement components that keep their value.
-        faces: (f, ns) int32 displacement nodes of the boundary faces that can touch.
-    """
-
-    mesh: PadMesh
-    element: Element
-    points: Points
-    nodes: np.ndarray
-    pressure_nodes: Tets
-    pressures: int
-    held: BoolArray
-    faces: np.ndarray
+    mesh: PadMesh  # the pad's linear tetrahedra
+    element: Element  # on each of them
+    points: Points  # (n, 3) float64 mm, displacement nodes: the mesh's vertices, then the edges' midpoints for P2
+    nodes: np.ndarray  # (m, nn) int32 displacement nodes of each element
+    pressure_nodes: Tets  # (m, 4) int32 pressure unknowns of each element
+    pressures: int  # number of pressure unknowns
+    held: BoolArray  # (n, 3) bool, displacement components that keep their value
+    faces: np.ndarray  # (f, ns) int32 displacement nodes of the boundary faces that can touch
 
     @cached_property
     def surface_nodes(self) -> np.ndarray:

@@ -25,23 +25,14 @@ NOT_INVERTED = {"corner_jacobian": (0.0, np.inf)}
 
 @dataclass(frozen=True)
 class Result:
-    """How a run ended.
+    """How a run ended."""
 
-    Attributes:
-        run: what was run.
-        outcome: "complete", "partial", "failed", "refused", "crashed" or "hung".
-        message: reason, refusal, or the last line of the traceback.
-        wall_s: seconds of the whole process.
-        record: result.json; empty where there is none.
-        arrays: states.npz; empty where there is none.
-    """
-
-    run: Run
-    outcome: str
-    message: str
-    wall_s: float
-    record: Mapping[str, Any]
-    arrays: Mapping[str, np.ndarray]
+    run: Run  # what was run
+    outcome: str  # "complete", "partial", "failed", "refused", "crashed" or "hung"
+    message: str  # reason, refusal, or the last line of the traceback
+    wall_s: float  # seconds of the whole process
+    record: Mapping[str, Any]  # result.json; empty where there is none
+    arrays: Mapping[str, np.ndarray]  # states.npz; empty where there is none
 
     @property
     def states(self) -> list[dict[str, Any]]:

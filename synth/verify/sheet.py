@@ -173,19 +173,12 @@ def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class Seen:
-    """Material points seen at n queries.
+    """Material points seen at n queries."""
 
-    Attributes:
-        triangle: (n,), -1 where nothing is seen.
-        weights: (n, 3) barycentric; NaN where nothing is seen.
-        height: (n,) mm, of the point in the state looked at; -inf where nothing is seen.
-        path: (n,) by which path of the camera; 0 where nothing is seen.
-    """
-
-    triangle: NDArray[np.intp]
-    weights: FloatArray
-    height: FloatArray
-    path: NDArray[np.intp]
+    triangle: NDArray[np.intp]  # (n,), -1 where nothing is seen
+    weights: FloatArray  # (n, 3) barycentric; NaN where nothing is seen
+    height: FloatArray  # (n,) mm, of the point in the state looked at; -inf where nothing is seen
+    path: NDArray[np.intp]  # (n,) by which path of the camera; 0 where nothing is seen
 
     def positions(self, triangles: Triangles, positions: Points) -> Points:
         """Where the points are when the surface's vertices are at `positions`: (n, 3), NaN where nothing is seen."""
