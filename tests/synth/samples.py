@@ -66,7 +66,7 @@ def translation_sample(
     flow = FlowField(forward, visible(1), -forward, visible(-1), extras={"contact.Y": contact})
     moved = rest + np.array([shift[0] / 4, shift[1] / 4, 0.0])
     return Sample(
-        index, index // 2, (0, 3), 7, *images, flow, Scene.model_validate(SCENE), surface, rest, moved,
+        *images, flow, index, index // 2, (0, 3), 7, Scene.model_validate(SCENE), surface, rest, moved,
         diagnostics={"solver": [solver, {**solver, "depth_mm": np.float64(0.2)}]},
         force_n=np.array([[0.0, 0.0, 0.5], [0.1, 0.0, 1.5]]),
         torque_nmm=np.zeros((2, 3)),
