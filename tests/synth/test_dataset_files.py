@@ -114,7 +114,7 @@ def test_file_as_the_library_sees_it_and_a_round_trip_to_the_bit(path) -> None:
 
 
 def test_header_tells_what_the_optional_channels_are_and_missing_ones_are_listed(tmp_path) -> None:
-    extras = {name: FLOW.forward_visible for part in OPTIONAL.values() for name in part.names}
+    extras = {name: FLOW.forward_visible for names, _ in OPTIONAL.values() for name in names}
     write_flow(tmp_path / "f.exr", FlowField(FLOW.forward, FLOW.forward_visible, extras=extras), {})
     header = read_channels(tmp_path / "f.exr")[1]
     assert {key for key in header if key.startswith("channels.")} == {f"channels.{key}" for key in OPTIONAL}
