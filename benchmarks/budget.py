@@ -146,10 +146,8 @@ def reference_mesh(gel: Gel, zone: Focus, chosen_mm: float, most: int) -> tuple[
 def press_draw(case: Row, assignments: list[str], most: int) -> list[Row]:
     """A row for the reference, and one for each mesh of a draw, coarsest first.
 
-    Args:
-        case: scene, seed and draw.
-        assignments: `--set` of the command.
-        most: elements across the contact in the reference, at most.
+    A case has scene, seed and draw; `assignments` are `--set` of the command; `most` limits the elements across the
+    contact in the reference.
     """
     template = load_scene(case["scene"], assignments)
     try:

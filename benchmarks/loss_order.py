@@ -29,11 +29,7 @@ MAX_ITERATIONS, TOLERANCE = 60, 1e-10
 def fitted(flow: Tensor, known: Tensor, start: Tensor, scale: int) -> Tensor:
     """The coarse flow whose enlargement is nearest to a full one: conjugate gradients on the normal equations.
 
-    Args:
-        flow: (1, 2, H, W), px.
-        known: (1, 1, H, W), 1 where it counts.
-        start: (1, 2, ceil(H / 2^scale), ceil(W / 2^scale)), px of the scale.
-        scale: from 1 on.
+    Full flow (1, 2, H, W) px, which counts where `known` (1, 1, H, W) is 1; the start is in px of the scale, from 1 on.
     """
     size = (flow.shape[-2], flow.shape[-1])
 

@@ -10,16 +10,14 @@ from argparse import ArgumentParser
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from synth.dataset.reader import SampleData, read_dataset
+from synth.inspect.panels import flow_colours, image_picture, robust_scale
 
 
 def gallery(folders: list[Path], out: Path) -> None:
     """A panel for each data set, three in a row."""
-    from matplotlib.figure import Figure
-
-    from synth.inspect.panels import flow_colours, image_picture, robust_scale
-
     rows = -(-len(folders) // 3)
     figure = Figure(figsize=(3 * 4.3, rows * 1.8), dpi=100)
     axes = figure.subplots(rows, 3, squeeze=False).ravel()
@@ -36,10 +34,6 @@ def gallery(folders: list[Path], out: Path) -> None:
 
 def row(folders: list[Path], out: Path) -> None:
     """The second images, as high as each other."""
-    from matplotlib.figure import Figure
-
-    from synth.inspect.panels import image_picture
-
     samples = [_first(folder) for folder in folders]
     images = [image_picture(sample.image2) for _, sample in samples]
     widths = [image.shape[1] / image.shape[0] for image in images]

@@ -9,8 +9,7 @@ import pytest
 import torch
 from commands import refused
 from PIL import ExifTags, Image, ImageOps
-from samples import write_dataset
-from synth_samples import synth_sample
+from samples import synth_sample, write_dataset
 from textures import as_bytes, moved, save, write_folder, write_synthetic
 
 from gelflow.arrays import FlowArray

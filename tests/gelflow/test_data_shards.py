@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 import torch
 from commands import refused
-from samples import write_dataset
-from synth_samples import synth_sample
+from samples import synth_sample, write_dataset
 
 from gelflow.data import PairDataset
 from synth.dataset import export as exporting

@@ -19,8 +19,6 @@ from gelflow.ops.pyramid import enlarge_flow, flow_pyramid, halve_flow, image_py
 from gelflow.ops.spline import SplineImage
 from gelflow.ops.warp import inside, positions, warp
 
-LIKE = torch.zeros((), dtype=torch.float64)
-
 
 def constant_flow(u: float, v: float, rows: int, columns: int) -> Tensor:
     return torch.tensor([u, v], dtype=torch.float64).view(1, 2, 1, 1).repeat(1, 1, rows, columns)

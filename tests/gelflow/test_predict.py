@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 from commands import refused
-from samples import write_dataset
-from synth_samples import synth_sample
+from samples import synth_sample, write_dataset
 from textures import as_bytes, moved, save, table, write_folder, write_video
 
 import gelflow

@@ -5,18 +5,20 @@ rounding, and free of the mesher's randomness. The solver holds displacement com
 start, so that prescribed motion is a `held` mask and a start; dead loads are nodal forces. Everything for E = 1.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tiny_scene import home
 
 from synth.arrays import BoolArray, FloatArray, Points
-from synth.mesh import PadMesh
+from synth.mesh import PadMesh, pad_mesh
 from synth.mesh.graded import kuhn_tets
 from synth.mesh.pad import boundary_faces
-from synth.scene import Scene
+from synth.scene import Gel, Numerics, Scene
 from synth.simulate import Trajectory, simulate
 from synth.simulate.batched import simulate_presses
 from synth.simulate.batched.pad import prepare
@@ -238,3 +240,23 @@ def face_load(space: Space, on: Callable[[Points], BoolArray], traction: FloatAr
     load = np.zeros_like(space.points)
     np.add.at(load, bearing, (areas(space.points, faces)[:, None, None] / 3 * traction))
     return load
+
+
+CAPSULE = {"shape": "capsule", "radius_mm": 5.0, "thickness_mm": 2.0, "length_mm": 2.0, "youngs_modulus_kpa": 200.0}
+
+
+def capsule(gel: dict[str, Any] | None = None, **parts: Any) -> Scene:
+    """A scene with a ball of 2 mm pressed on a capsule; parts: indenter, friction, motion, numerics as in a file."""
+    motion = {"depth_mm": 0.5, "steps": 1, **parts.pop("motion", {})}
+    content = {**scene((10.0, 10.0, 7.0), **parts).model_dump(), "motion": motion}
+    content["numerics"] |= {"edge_length_mm": 1.5, "element": "auto", **parts.get("numerics", {})}
+    content["sensor"]["gel"] = {**CAPSULE, **(gel or {})}
+    if "indenter" not in parts:
+        content["contact"]["indenter"] = {"shape": "sphere", "radius_mm": 2.0}
+    return Scene.model_validate(content)
+
+
+@functools.cache
+def capsule_mesh(gel: Gel, edge_mm: float = 1.5) -> PadMesh:
+    """Of fTetWild, kept for the session."""
+    return pad_mesh(gel, Numerics(edge_length_mm=edge_mm), [home() / "capsules"])

@@ -21,13 +21,9 @@ def sensor(window: dict, index: float = 1.45, lights: tuple[Light, ...] = (), **
     """A camera of 64 x 64 px and some 190 degrees of field, unless other numbers are given."""
     given = {"width": 64, "height": 64, "cx": 31.8, "cy": 32.3, **WIDE, **INSIDE, **camera}
     light = Light(position_mm=(10.0, 0.0, 14.0), size_mm=(0.5, 0.5), color=(1, 1, 1), power=1)
-    return Sensor(
-        gel=Gel(size_mm=(24, 24, 20), youngs_modulus_kpa=200),
-        window=Window(refractive_index=index, thickness_mm=1, **window),
-        pattern=NoPattern(kind="none"),
-        lights=lights or (light,),
-        camera=Camera(**given),
-    )
+    parts = {"gel": Gel(size_mm=(24, 24, 20), youngs_modulus_kpa=200), "pattern": NoPattern(kind="none")}
+    glass = Window(refractive_index=index, thickness_mm=1, **window)
+    return Sensor(**parts, window=glass, lights=lights or (light,), camera=Camera(**given))
 
 
 def on_face(points: Points) -> Points:

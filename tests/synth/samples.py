@@ -9,6 +9,7 @@ import hashlib
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -45,8 +46,7 @@ def translation_sample(
 ) -> Sample:
     """The gel moves by `shift` px. The last two columns see no gel; what moves off the image is not visible."""
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
-    x, y = columns + 0.5, rows + 0.5
-    full = np.iinfo(dtype).max
+    x, y, full = columns + 0.5, rows + 0.5, np.iinfo(dtype).max
     images = [np.rint(texture(x - k * shift[0], y - k * shift[1]) * full).astype(dtype) for k in (0, 1)]
     if grey:
         images = [np.ascontiguousarray(image[:, :, 0]) for image in images]
@@ -121,3 +121,16 @@ def tree(directory: Path) -> dict[str, bytes]:
     """Every file's content by relative path, the lock left out."""
     files = (file for file in sorted(directory.rglob("*")) if file.is_file() and file.name != ".lock")
     return {str(file.relative_to(directory)): file.read_bytes() for file in files}
+
+
+def synth_sample(index: int, dtype: type = np.uint8, backward: bool = True) -> Sample:
+    """An exchange of any two arrays shows, and of rows or columns; the first rows and columns see no gel."""
+    from textures import moved  # of the tests of gelflow
+
+    rng, full = np.random.default_rng(index), np.iinfo(dtype).max
+    images = [np.rint(full * moved(64, 64, k * 1.5, -k, seed=index)).astype(dtype) for k in (0, 1)]
+    flows = rng.normal(0, 2, (2, 64, 64, 2)).astype(np.float32)
+    seen = (rng.random((2, 64, 64)) < 0.7).astype(np.float32)
+    flows[:, :4, :9], seen[:, :4, :9] = np.nan, 0
+    flow = FlowField(flows[0], seen[0], flows[1], seen[1]) if backward else FlowField(flows[0], seen[0])
+    return replace(translation_sample(index), image1=images[0], image2=images[1], flow=flow)

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 import tomli_w
-from capsules import capsule, capsule_mesh
 from commands import refused
-from pads import areas, brick, complete, contact_faces, simulate_scenes
+from pads import areas, brick, capsule, capsule_mesh, complete, contact_faces, simulate_scenes
 from pads import scene as pad_scene
 from render_scenes import needs_llvm
 

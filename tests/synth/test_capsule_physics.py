@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from capsules import SHAPE, capsule, capsule_mesh
 from closed_forms import shear_modulus
 from integrals import integrals
-from pads import area_vectors, complete, equilibrium
+from pads import CAPSULE, area_vectors, capsule, capsule_mesh, complete, equilibrium
 from pydantic import ValidationError
 from scipy.integrate import quad
 
@@ -146,7 +145,7 @@ def test_far_from_the_press_the_gel_is_left_out() -> None:
 ])  # fmt: skip
 def test_impossible_capsules_are_refused(gel: dict[str, Any], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
-        Gel.model_validate({**SHAPE, **gel})
+        Gel.model_validate({**CAPSULE, **gel})
 
 
 @pytest.mark.parametrize(("motion", "message"), [
@@ -187,11 +186,11 @@ def test_the_mesh_fills_the_shape_and_its_nodes_lie_on_it() -> None:
 
 
 def test_a_mesh_is_named_by_its_shape_alone() -> None:
-    gel, numerics = Gel.model_validate(SHAPE), Numerics(edge_length_mm=1.5)
+    gel, numerics = Gel.model_validate(CAPSULE), Numerics(edge_length_mm=1.5)
     key = mesh_key(gel, numerics)
     assert mesh_key(gel.model_copy(update={"youngs_modulus_kpa": 7.0}), numerics) == key
     for field, value in (("thickness_mm", 1.9), ("radius_mm", 5.1), ("length_mm", 1.0)):
-        assert mesh_key(Gel.model_validate({**SHAPE, field: value}), numerics) != key
+        assert mesh_key(Gel.model_validate({**CAPSULE, field: value}), numerics) != key
     assert MeshRule.of(capsule()).kind == "tetwild"
 
 
@@ -215,7 +214,7 @@ def test_places_and_their_frames() -> None:
 
 
 def test_the_face_at_rest_lies_on_the_shape() -> None:
-    gel = Gel.model_validate(SHAPE)
+    gel = Gel.model_validate(CAPSULE)
     assert face_of(gel) == FACE
     surface = rest_surface(gel)
     assert FACE.holds(surface.coarse.nodes).all()
