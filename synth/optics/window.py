@@ -150,7 +150,7 @@ class RoundWindow:
 
         For points in air, and at index 1, the points themselves. NaN does not converge.
         """
-        found, converged = points.copy(), np.isfinite(points).all(axis=1)
+        found, converged = points.copy(), np.asarray(np.isfinite(points).all(axis=1))
         at = np.flatnonzero(converged & ~self.holds(points)) if self.index != 1 else np.arange(0)
         arm = points[at] - eye
         direction = arm / np.linalg.norm(arm, axis=1, keepdims=True)
