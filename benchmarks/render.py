@@ -27,7 +27,7 @@ from synth.planning import job_variant
 from synth.render.camera_image import render_noise
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer, full_grid
-from synth.render.variant import Device, Variant, choose_variant, cpu_variant, llvm_version
+from synth.render.variant import Device, Variant, choose_variant
 from synth.scene import Render
 from synth.scene.sampling import draw, stream
 from synth.scene.template import Template, load_scene
@@ -44,7 +44,7 @@ FEWER_THAN_REFERENCE = 6
 def variants(device: Device, grey: bool) -> dict[str, Variant]:
     """The variants of Mitsuba that can be compared here, by name and the fastest first."""
     found = [choose_variant(device, grey), choose_variant("cpu", grey), choose_variant("cpu", False)]
-    return {variant.name: variant for variant in [*found, cpu_variant((), llvm_version, "rgb")]}
+    return {variant.name: variant for variant in found}
 
 
 def settings(names: Sequence[str], lights: int, own_depth: int, reference: int) -> list[Row]:
