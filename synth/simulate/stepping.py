@@ -30,7 +30,7 @@ MAX_ITERATIONS_TO_GROW = 7
 GROWTH = 1.5
 MAX_RELAXED_STEP = 1 / 4
 """A step that fails is relaxed (`synth.simulate.newton`) when it is at most this share of max_step_mm, and a pass
-when it is at most this share of a whole update and begins deeper than MAX_PENETRATION."""
+when it is at most this share of a whole update and begins deeper than DEEP."""
 STICK_FRICTION = 1e6
 """Coefficient of friction at which nothing slides."""
 PATH_DERIVATIVE_STEP = 1e-3
@@ -41,10 +41,10 @@ come to rest on the surface, so that more updates make the tractions uneven."""
 FAILURES = 3
 """Of attempts at them, after which the passes end. Updates are halved after a failure, doubled after a success and kept
 after a relaxation: where a whole one upsets Newton's method a part of it does not."""
-MAX_PENETRATION = 0.02
-"""Share of the press depth (at least 0.1 mm) by which a triangle mesh may penetrate in a corrected state. Where it is
-deeper, passes go on to MAX_DEEP_UPDATES or DEEP_FAILURES, and the press ends if that does not do."""
-MAX_DEEP_UPDATES, DEEP_FAILURES = 16.0, 8
+DEEP, MAX_PENETRATION = 0.02, 0.05
+"""Shares of the press depth (at least 0.1 mm). Where a triangle mesh penetrates by more than the first, passes go on to
+MAX_DEEP_UPDATES or DEEP_FAILURES; where it still does by more than the second, the press ends."""
+MAX_DEEP_UPDATES, DEEP_FAILURES = 6.0, 4
 MULTIPLIER_TOLERANCE = 20.0
 """Tolerance of states that multipliers are updated from, over the full one: two updates do not forget what they began
 with."""
@@ -87,7 +87,8 @@ class Stepper:
         self._corrected = frozenset(place for k, place in enumerate(records, 1) if frames is None or k in frames)
         depth_mm = max(float(path.corners[:, 0].max()), 0.1)
         self._shallow_mm = PENETRATION * depth_mm
-        self._deepest_mm = MAX_PENETRATION * depth_mm if path.body.kind == KINDS["mesh"] else np.inf
+        limit_mm = depth_mm if path.body.kind == KINDS["mesh"] else np.inf
+        self._deep_mm, self._deepest_mm = DEEP * limit_mm, MAX_PENETRATION * limit_mm
         self._rubs = friction > 0
         self.indenter, self._sticking = pack_indenter(path, friction), pack_indenter(path, STICK_FRICTION)
         self._sticking.centre, self._sticking.rotation = self.indenter.centre, self.indenter.rotation
@@ -206,7 +207,7 @@ class Stepper:
         if self.system.deepest() > self._shallow_mm:
             solution = self._polished(solution, between)
         while solution.converged and self.system.deepest() > self._shallow_mm:
-            deep = self.system.deepest() > self._deepest_mm
+            deep = self.system.deepest() > self._deep_mm
             most, worst = (MAX_DEEP_UPDATES, DEEP_FAILURES) if deep else (MAX_MULTIPLIER_UPDATES, FAILURES)
             if done >= most or failures >= worst:
                 break

@@ -27,6 +27,7 @@ FAILURES = wp.constant(stepping.FAILURES)
 MAX_MULTIPLIER_UPDATES = wp.constant(wp.float64(stepping.MAX_MULTIPLIER_UPDATES))
 PENETRATION = wp.constant(wp.float64(stepping.PENETRATION))
 MESH = wp.constant(KINDS["mesh"])
+DEEP = wp.constant(wp.float64(stepping.DEEP))
 MAX_PENETRATION = wp.constant(wp.float64(stepping.MAX_PENETRATION))
 MAX_DEEP_UPDATES = wp.constant(wp.float64(stepping.MAX_DEEP_UPDATES))
 DEEP_FAILURES = wp.constant(stepping.DEEP_FAILURES)
@@ -147,10 +148,10 @@ def evaluate_trial(lanes: Lanes, settings: Settings):
 
 
 @wp.func
-def _is_too_deep(lanes: Lanes, presses: Presses, s: int) -> bool:
-    """Whether an object is deeper in the gel than a corrected state may leave it; at a pass, than before it."""
+def _is_deeper(lanes: Lanes, presses: Presses, s: int, share: wp.float64) -> bool:
+    """Whether an object is deeper in the gel than a share of the press depth; at a pass, before it."""
     j = lanes.press[s]
-    return presses.kind[j] == MESH and lanes.deepest[s] > MAX_PENETRATION * presses.deepest[j]
+    return presses.kind[j] == MESH and lanes.deepest[s] > share * presses.deepest[j]
 
 
 @wp.kernel
@@ -167,7 +168,7 @@ def finish_solve(lanes: Lanes, presses: Presses, settings: Settings):
     relaxed = lanes.relaxing[s] == 1
     small = lanes.target[s] - lanes.at[s] <= MAX_RELAXED_STEP * settings.longest
     if correction:
-        small = lanes.share[s] <= MAX_RELAXED_STEP and _is_too_deep(lanes, presses, s)
+        small = lanes.share[s] <= MAX_RELAXED_STEP and _is_deeper(lanes, presses, s, DEEP)
     if phase == phases.FAILED and not relaxed and not polish and small:
         lanes.relaxing[s] = 1
         lanes.viscosity[s] = FIRST_VISCOSITY
@@ -248,11 +249,11 @@ def choose_pass(lanes: Lanes, presses: Presses, settings: Settings):
         return
     j = lanes.press[s]
     corrected = presses.kind_of[j, lanes.next[s]] == 2
-    too_deep = _is_too_deep(lanes, presses, s)
+    deep = _is_deeper(lanes, presses, s, DEEP)
     over = lanes.failures[s] >= FAILURES or lanes.done[s] >= MAX_MULTIPLIER_UPDATES
-    if too_deep:
+    if deep:
         over = lanes.failures[s] >= DEEP_FAILURES or lanes.done[s] >= MAX_DEEP_UPDATES
-    if corrected and too_deep and over:
+    if corrected and over and _is_deeper(lanes, presses, s, MAX_PENETRATION):
         lanes.reason[s] = phases.TOO_DEEP
         lanes.phase[s] = phases.ENDED
         return
@@ -272,7 +273,7 @@ def choose_pass(lanes: Lanes, presses: Presses, settings: Settings):
         lanes.tolerance[s] = wp.max(settings.closer * settings.tolerance, MIN_TOLERANCE)
         if lanes.done[s] + lanes.share[s] < MAX_MULTIPLIER_UPDATES:
             lanes.tolerance[s] = wp.max(settings.loose, lanes.tolerance[s])
-        if too_deep:
+        if deep:
             lanes.tolerance[s] = wp.max(MULTIPLIER_TOLERANCE * settings.tolerance, lanes.tolerance[s])
     lanes.iteration[s] = 0
     lanes.predicted[s] = 0
