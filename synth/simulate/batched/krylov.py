@@ -315,7 +315,7 @@ def rounded_four(x: wp.vec4f) -> wp.vec4f:
 
 
 @wp.kernel
-def round_matrix(a: wp.array2d(dtype=wp.float32)):
-    """In place; one thread per number."""
+def round_rows(rows: wp.array2d(dtype=wp.float64), first: int, matrix: wp.array2d(dtype=wp.float32)):
+    """Rows of a matrix, from a first one on; one thread per number."""
     i, j = wp.tid()
-    a[i, j] = rounded(a[i, j])
+    matrix[first + i, j] = rounded(wp.float32(rows[i, j]))

@@ -9,16 +9,17 @@ little with its argument, which flexible GMRES allows for.
 
 import ctypes
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import scipy.sparse
 import warp as wp
 
-from synth.arrays import FloatArray
+from synth.errors import InputError
 from synth.mesh import PadMesh, check_mesh
 from synth.scene import Scene
 from synth.simulate.batched.gemm import Dense, call, dense
-from synth.simulate.batched.krylov import Krylov, flat, padded, round_matrix
+from synth.simulate.batched.krylov import Krylov, flat, padded, round_rows
 from synth.simulate.contact import Indenters
 from synth.simulate.indenter import RigidBody
 from synth.simulate.load_path import LoadPath
@@ -28,55 +29,73 @@ from synth.simulate.space import Space, function_space
 from synth.simulate.system import System
 from synth.simulate.tables import pack_indenter, place_indenter
 
+FLOAT64 = 1
+"""CUDA_R_64F."""
+COLUMNS = 1024
+"""Of the inverse, found at a time on a GPU, to save memory."""
 
-def stiffness(system: System, away: Indenters) -> FloatArray:
+
+def stiffness(system: System, away: Indenters) -> scipy.sparse.csr_array:
     """(k, k) the undeformed pad's tangent over the free unknowns; `away`: an indenter that touches nothing."""
     values = system.tangent(system.zero(), away).values
     upper = system.matrix(np.asarray(values, dtype=np.float64))
-    return np.asarray((upper + scipy.sparse.triu(upper, 1).T).toarray())
+    return upper + scipy.sparse.triu(upper, 1).T
 
 
-def inverse(matrix: FloatArray, device: str) -> FloatArray:
-    """(k, k) of a symmetric float64 matrix; 2 k³ flops on a CPU: 15 s for 13,000 unknowns at 300 GFLOP/s.
+def inverse(matrix: scipy.sparse.csr_array, device: str) -> wp.array:
+    """(rows, rows) of a symmetric matrix (k, k): its inverse in TF32, then zeros to the length of Krylov vectors.
 
-    InputError for CUDA without cuSOLVER, numpy.linalg.LinAlgError for a singular matrix.
+    2 k³ flops in float64: on a CPU 15 s for 13,000 unknowns at 300 GFLOP/s. InputError where memory does not suffice,
+    or for CUDA without cuSOLVER; numpy.linalg.LinAlgError for a singular matrix.
     """
-    where = wp.get_device(device)
-    return _inverse_by_cusolver(matrix, where) if where.is_cuda else np.asarray(np.linalg.inv(matrix), np.float64)
+    k, where = matrix.shape[0], wp.get_device(device)
+    try:
+        found = wp.zeros((padded(k), padded(k)), dtype=wp.float32, device=where)
+        full = wp.array(matrix.toarray(), dtype=wp.float64, device=where)
+        if where.is_cuda:
+            _invert_by_cusolver(full, found)
+        else:
+            wp.launch(round_rows, (k, k), inputs=[np.linalg.inv(full.numpy()), 0, found], device=where)
+    except (MemoryError, RuntimeError) as error:
+        raise InputError(
+            f"the batched solver inverts a matrix of {k:,} unknowns, which takes {12e-9 * k * k:.1f} GB: {error}; simulate "
+            'with numerics.solver="direct"'
+        ) from error
+    return found
 
 
-def _inverse_by_cusolver(matrix: FloatArray, device: wp.Device) -> FloatArray:
-    """LU factors, then the identity as right side. cuSOLVER counts by columns, which symmetry makes the same."""
-    n = len(matrix)
-    factors, found = (wp.array(each, dtype=wp.float64, device=device) for each in (matrix, np.eye(n)))
-    pivots, info = wp.empty(n, dtype=wp.int32, device=device), wp.zeros(1, dtype=wp.int32, device=device)
-    handle, size = ctypes.c_void_p(), ctypes.c_int()
-    left, right, order, told = (ctypes.c_void_p(each.ptr) for each in (factors, found, pivots, info))
+def _invert_by_cusolver(factors: wp.array, found: wp.array) -> None:
+    """LU factors, then unit vectors as right sides. cuSOLVER counts by columns, which symmetry makes the same."""
+    n, device = len(factors), factors.device
+    handle, settings, here, there = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_size_t(), ctypes.c_size_t()
+    pivots, info = wp.empty(n, dtype=wp.int64, device=device), wp.zeros(1, dtype=wp.int32, device=device)
+    left, order, told = (ctypes.c_void_p(each.ptr) for each in (factors, pivots, info))
+    size, run = ctypes.c_int64(n), partial(call, "cusolver")
     with wp.ScopedDevice(device):
-        call("cusolver", "cusolverDnCreate", ctypes.byref(handle))
-        call("cusolver", "cusolverDnSetStream", handle, ctypes.c_void_p(device.stream.cuda_stream))
-        call("cusolver", "cusolverDnDgetrf_bufferSize", handle, n, n, left, n, ctypes.byref(size))
-        room = wp.empty(size.value, dtype=wp.float64, device=device)
-        call("cusolver", "cusolverDnDgetrf", handle, n, n, left, n, ctypes.c_void_p(room.ptr), order, told)
-        singular = info.numpy()[0]
-        call("cusolver", "cusolverDnDgetrs", handle, 0, n, n, left, n, order, right, n, told)
-        values = found.numpy()
-        call("cusolver", "cusolverDnDestroy", handle)
-    if singular:
-        raise np.linalg.LinAlgError("Singular matrix")
-    return np.asarray(values)
+        run("cusolverDnCreate", ctypes.byref(handle))
+        run("cusolverDnCreateParams", ctypes.byref(settings))
+        run("cusolverDnSetStream", handle, ctypes.c_void_p(device.stream.cuda_stream))
+        given = (handle, settings, size, size, FLOAT64, left, size)
+        run("cusolverDnXgetrf_bufferSize", *given, FLOAT64, ctypes.byref(here), ctypes.byref(there))
+        room, host = wp.empty(here.value, dtype=wp.uint8, device=device), ctypes.create_string_buffer(there.value)
+        run("cusolverDnXgetrf", *given, order, FLOAT64, ctypes.c_void_p(room.ptr), here, host, there, told)
+        if info.numpy()[0]:
+            raise np.linalg.LinAlgError("Singular matrix")
+        for first in range(0, n, COLUMNS):
+            columns = wp.array(np.eye(min(COLUMNS, n - first), n, first), dtype=wp.float64, device=device)
+            right = (ctypes.c_int64(len(columns)), FLOAT64, left, size, order, FLOAT64, ctypes.c_void_p(columns.ptr))
+            run("cusolverDnXgetrs", handle, settings, 0, size, *right, size, told)
+            wp.launch(round_rows, columns.shape, inputs=[columns, first, found], device=device)
+        wp.synchronize_device(device)
+        run("cusolverDnDestroy", handle)
 
 
 class Preconditioner:
-    """K_0^{-1} (k, k), float64, on a device, filled up with zeros to as many rows as the Krylov vectors have."""
+    """K_0^{-1} on a device, of `inverse`."""
 
-    def __init__(self, inverse: FloatArray, device: str, products: Dense | None = None) -> None:
-        self.rows = padded(len(inverse))
-        filled = np.zeros((self.rows, self.rows), dtype=np.float32)
-        filled[: len(inverse), : len(inverse)] = inverse
-        self.matrix = wp.array(filled, dtype=wp.float32, device=device)
-        wp.launch(round_matrix, self.matrix.shape, inputs=[self.matrix], device=device)
-        self.dense = products or dense(device)
+    def __init__(self, matrix: wp.array, products: Dense | None = None) -> None:
+        self.matrix, self.rows = matrix, matrix.shape[0]
+        self.dense = products or dense(str(matrix.device))
 
     def apply(self, krylov: Krylov) -> None:
         """`preconditioned` = K_0^{-1} `current`, at least where a solve is running."""
@@ -119,7 +138,7 @@ def prepare(scene: Scene, mesh: PadMesh, device: str, products: Dense | None = N
     material = pad_material(scene.sensor.gel, mesh)
     space = function_space(mesh, ELEMENTS[scene.numerics.element]())
     system = System(space, material)
-    preconditioner = Preconditioner(inverse(stiffness(system, _away(scene)), device), device, products)
+    preconditioner = Preconditioner(inverse(stiffness(system, _away(scene)), device), products)
     return Pad(space, material, system.free, preconditioner, device)
 
 
