@@ -58,8 +58,8 @@ def inverse(matrix: scipy.sparse.csr_array, device: str) -> wp.array:
             wp.launch(round_rows, (k, k), inputs=[np.linalg.inv(full.numpy()), 0, found], device=where)
     except (MemoryError, RuntimeError) as error:
         raise InputError(
-            f"the batched solver inverts a matrix of {k:,} unknowns, which takes {12e-9 * k * k:.1f} GB: {error}; simulate "
-            'with numerics.solver="direct"'
+            f"the batched solver inverts a matrix of {k:,} unknowns, which takes {12e-9 * k * k:.1f} GB: {error}; "
+            'simulate with numerics.solver="direct"'
         ) from error
     return found
 
