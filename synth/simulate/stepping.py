@@ -43,16 +43,19 @@ FAILURES = 3
 after a relaxation: where a whole one upsets Newton's method a part of it does not."""
 DEEP, MAX_PENETRATION = 0.02, 0.05
 """Shares of the press depth (at least 0.1 mm). Where a triangle mesh penetrates by more than the first, passes go on to
-MAX_DEEP_UPDATES or DEEP_FAILURES; where it still does by more than the second, the press ends."""
-MAX_DEEP_UPDATES, DEEP_FAILURES = 6.0, 4
+MAX_DEEP_UPDATES or DEEP_FAILURES; where it still does by more than the second, to TOO_DEEP_FAILURES, and then the press
+ends. A relaxation that fails counts as DEEP_FAILURES. A share is not doubled after the first success that follows a
+failure."""
+MAX_DEEP_UPDATES, DEEP_FAILURES, TOO_DEEP_FAILURES = 6.0, 4, 12
 MULTIPLIER_TOLERANCE = 20.0
 """Tolerance of states that multipliers are updated from, over the full one: two updates do not forget what they began
 with."""
 PENETRATION = 2e-3
 """Passes end when no contact point is deeper inside the indenter than this share of the press depth."""
-MAX_CORRECTION_RATIO = 3.0
+MAX_CORRECTION_RATIO, DEEP_CORRECTION_RATIO = 3.0, 10.0
 """A pass fails that moves a node, in any iteration, farther than so many times the deepest penetration, which is what
-it is to take away: at edges that slip Newton's method can wander off to another equilibrium."""
+it is to take away: at edges that slip Newton's method can wander off to another equilibrium. The second is that of deep
+meshes, between whose edges the gel moves more."""
 
 
 class Stepper:
@@ -146,7 +149,7 @@ class Stepper:
             self.system.update_contact_history(self.state, self.indenter)
             self._lengthen(target, solution.iterations, relaxed)
         else:
-            self._shorten(target)
+            self._shorten(target, relaxed)
 
     def _counted(self, solution: Solution) -> Solution:
         """A solution, its iterations added to those since the last recorded state."""
@@ -203,29 +206,32 @@ class Stepper:
         The last of two whole updates is solved to the full tolerance; where the passes end before it, none is.
         """
         between = min(self._relaxed_tolerance, MULTIPLIER_TOLERANCE * self.numerics.tolerance)
-        share, done, failures = 1.0, 0.0, 0
+        share, done, failures, failed = 1.0, 0.0, 0, False
         if self.system.deepest() > self._shallow_mm:
             solution = self._polished(solution, between)
         while solution.converged and self.system.deepest() > self._shallow_mm:
-            deep = self.system.deepest() > self._deep_mm
-            most, worst = (MAX_DEEP_UPDATES, DEEP_FAILURES) if deep else (MAX_MULTIPLIER_UPDATES, FAILURES)
+            deepest, most, worst = self.system.deepest(), MAX_MULTIPLIER_UPDATES, FAILURES
+            deep = deepest > self._deep_mm
+            if deep:
+                most, worst = MAX_DEEP_UPDATES, TOO_DEEP_FAILURES if deepest > self._deepest_mm else DEEP_FAILURES
             if done >= most or failures >= worst:
                 break
             before = self.system.saved_contact()
             self.system.augment(self.indenter, share)
             tolerance = between if deep or done + share < MAX_MULTIPLIER_UPDATES else self.numerics.tolerance
-            reach = MAX_CORRECTION_RATIO * self.system.deepest()
+            reach = (DEEP_CORRECTION_RATIO if deep else MAX_CORRECTION_RATIO) * deepest
             start, limit = solution.state, self.options.correction_iterations
             better = self._counted(solve(self.system, start, self.indenter, tolerance, limit, reach))
             relaxed = not better.converged and deep and share <= MAX_RELAXED_STEP
             if relaxed:
                 better = self._counted(relax(self.system, start, self.indenter, tolerance))
             if better.converged:
-                solution, done, share = better, done + share, share if relaxed else min(1.0, 2 * share)
+                solution, done = better, done + share
+                share, failed = share if relaxed or (deep and failed) else min(1.0, 2 * share), False
             else:
                 self.system.restore_contact(before)
                 self.system.residual(solution.state, self.indenter)
-                failures, share = failures + 1, share / 2
+                failures, share, failed = failures + (DEEP_FAILURES if relaxed else 1), share / 2, True
         return solution
 
     def _polished(self, solution: Solution, limit: float) -> Solution:
@@ -285,9 +291,9 @@ class Stepper:
         if iterations <= MAX_ITERATIONS_TO_GROW:
             self.step = min(self.numerics.max_step_mm, GROWTH * max(taken, self.step / GROWTH))
 
-    def _shorten(self, target: float) -> None:
-        """After a failure: half the step, and the end below the shortest."""
-        self.step = (target - self.at) / 2
+    def _shorten(self, target: float, relaxed: bool) -> None:
+        """After a failure: half the step, a quarter if it was relaxed, too; and the end below the shortest."""
+        self.step = (target - self.at) / (4 if relaxed else 2)
         self._previous = None
         if self.step < SHORTEST_STEP * self.numerics.max_step_mm:
             self.reason = not_converged(target - self.at, self.path.pose(self.at))

@@ -31,8 +31,10 @@ DEEP = wp.constant(wp.float64(stepping.DEEP))
 MAX_PENETRATION = wp.constant(wp.float64(stepping.MAX_PENETRATION))
 MAX_DEEP_UPDATES = wp.constant(wp.float64(stepping.MAX_DEEP_UPDATES))
 DEEP_FAILURES = wp.constant(stepping.DEEP_FAILURES)
+TOO_DEEP_FAILURES = wp.constant(stepping.TOO_DEEP_FAILURES)
 MULTIPLIER_TOLERANCE = wp.constant(wp.float64(stepping.MULTIPLIER_TOLERANCE))
 MAX_CORRECTION_RATIO = wp.constant(wp.float64(stepping.MAX_CORRECTION_RATIO))
+DEEP_CORRECTION_RATIO = wp.constant(wp.float64(stepping.DEEP_CORRECTION_RATIO))
 MIN_TOLERANCE = wp.constant(wp.float64(1.0e-12))
 """Of a pass: somewhat more than rounding leaves."""
 SUFFICIENT_DECREASE = wp.constant(wp.float64(newton.SUFFICIENT_DECREASE))
@@ -167,8 +169,9 @@ def finish_solve(lanes: Lanes, presses: Presses, settings: Settings):
     polish = lanes.stage[s] == phases.POLISH
     relaxed = lanes.relaxing[s] == 1
     small = lanes.target[s] - lanes.at[s] <= MAX_RELAXED_STEP * settings.longest
+    deep = _is_deeper(lanes, presses, s, DEEP)
     if correction:
-        small = lanes.share[s] <= MAX_RELAXED_STEP and _is_deeper(lanes, presses, s, DEEP)
+        small = lanes.share[s] <= MAX_RELAXED_STEP and deep
     if phase == phases.FAILED and not relaxed and not polish and small:
         lanes.relaxing[s] = 1
         lanes.viscosity[s] = FIRST_VISCOSITY
@@ -183,17 +186,19 @@ def finish_solve(lanes: Lanes, presses: Presses, settings: Settings):
     if correction:
         if phase == phases.SOLVED:
             lanes.done[s] = lanes.done[s] + lanes.share[s]
-            if not relaxed:
+            if not (relaxed or (deep and lanes.failed[s] == 1)):
                 lanes.share[s] = wp.min(ONE, wp.float64(2.0) * lanes.share[s])
+            lanes.failed[s] = 0
             lanes.phase[s] = phases.CORRECTING
         else:
-            lanes.failures[s] = lanes.failures[s] + 1
+            lanes.failed[s] = 1
+            lanes.failures[s] = lanes.failures[s] + wp.where(relaxed, DEEP_FAILURES, 1)
             lanes.share[s] = wp.float64(0.5) * lanes.share[s]
             lanes.move[s] = phases.RESTORE_RECORDED
             lanes.phase[s] = phases.RESTORED
         return
     if phase == phases.FAILED:
-        lanes.step[s] = wp.float64(0.5) * (lanes.target[s] - lanes.at[s])
+        lanes.step[s] = wp.where(relaxed, wp.float64(0.25), wp.float64(0.5)) * (lanes.target[s] - lanes.at[s])
         lanes.has_previous[s] = 0
         lanes.phase[s] = phases.BEGIN
         if polish:
@@ -233,6 +238,7 @@ def check_contact(lanes: Lanes, presses: Presses, sums: wp.array2d(dtype=wp.floa
         return
     lanes.save[s] = 1
     lanes.failures[s] = 0
+    lanes.failed[s] = 0
     lanes.share[s] = ONE
     lanes.done[s] = ZERO
     lanes.phase[s] = phases.CORRECTING
@@ -249,11 +255,12 @@ def choose_pass(lanes: Lanes, presses: Presses, settings: Settings):
         return
     j = lanes.press[s]
     corrected = presses.kind_of[j, lanes.next[s]] == 2
-    deep = _is_deeper(lanes, presses, s, DEEP)
+    deep, too_deep = _is_deeper(lanes, presses, s, DEEP), _is_deeper(lanes, presses, s, MAX_PENETRATION)
     over = lanes.failures[s] >= FAILURES or lanes.done[s] >= MAX_MULTIPLIER_UPDATES
     if deep:
-        over = lanes.failures[s] >= DEEP_FAILURES or lanes.done[s] >= MAX_DEEP_UPDATES
-    if corrected and over and _is_deeper(lanes, presses, s, MAX_PENETRATION):
+        over = lanes.failures[s] >= wp.where(too_deep, TOO_DEEP_FAILURES, DEEP_FAILURES)
+        over = over or lanes.done[s] >= MAX_DEEP_UPDATES
+    if corrected and over and too_deep:
         lanes.reason[s] = phases.TOO_DEEP
         lanes.phase[s] = phases.ENDED
         return
@@ -268,7 +275,7 @@ def choose_pass(lanes: Lanes, presses: Presses, settings: Settings):
     else:
         lanes.new_share[s] = lanes.share[s]
         lanes.stage[s] = phases.CORRECTION
-        lanes.most_moved[s] = MAX_CORRECTION_RATIO * lanes.deepest[s]
+        lanes.most_moved[s] = wp.where(deep, DEEP_CORRECTION_RATIO, MAX_CORRECTION_RATIO) * lanes.deepest[s]
         lanes.limit[s] = settings.correction_limit
         lanes.tolerance[s] = wp.max(settings.closer * settings.tolerance, MIN_TOLERANCE)
         if lanes.done[s] + lanes.share[s] < MAX_MULTIPLIER_UPDATES:
