@@ -231,6 +231,7 @@ def _say_hint(variant: Variant) -> None:
 def _show_plan(template: Template, variant: Variant, n: int, as_json: bool) -> int:
     from synth.planning import plan, predict
     from synth.progress import duration
+    from synth.render.pattern import pixels_per_mm
 
     planned = plan(template, variant)
     predicted = predict(planned)
@@ -244,7 +245,11 @@ def _show_plan(template: Template, variant: Variant, n: int, as_json: bool) -> i
     Console().print(table)
     seconds = sum(predicted.seconds_per_pair.values())
     stages = ", ".join(f"{stage} {value:.2f} s" for stage, value in predicted.seconds_per_pair.items())
+    sensor = template.corners[0].sensor
+    scale, camera = pixels_per_mm(sensor), sensor.camera
     print(
+        f"picture: {camera.width} x {camera.height} px, principal point {camera.cx:.4g}, {camera.cy:.4g}, {scale:.3g} "
+        f"px per mm of the contact face, so {camera.width / scale:.3g} x {camera.height / scale:.3g} mm\n"
         f"mesh: {predicted.resolution}, about {predicted.nodes} displacement nodes\n"
         + _error_line(predicted)
         + f"predicted per pair: {stages}; {predicted.bytes_per_pair / 1e6:.2f} MB\n"

@@ -91,7 +91,8 @@ def refuse_another_job(job: Job, record: Mapping[str, Any], where: str) -> None:
     """
     different = []
     if job.scene_hash != record["scene_hash"]:
-        changed = _changed(jsonable(record["scene"]), jsonable(job.scene), "scene")
+        unhashed = {"description": "", "references": []}
+        changed = _changed({**jsonable(record["scene"]), **unhashed}, {**jsonable(job.scene), **unhashed}, "scene")
         different += changed or _changed(record["scene_hash"], job.scene_hash, "scene_hash")
     different += _changed(record["seed"], job.seed, "seed")
     different += _changed(record.get("device", {}), jsonable(job.device), "device")

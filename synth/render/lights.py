@@ -107,7 +107,8 @@ def check_view(sensor: Sensor) -> None:
             x, y = pixels[inside][0]
             raise InputError(
                 f"sensor.lights[{i}] at position_mm = {list(light.position_mm)} stands between the camera and the gel "
-                f"(at pixel {x:.0f}, {y:.0f}): move it out of the camera's view"
+                f"(at pixel {x:.0f}, {y:.0f}): move it out of the camera's view, or check that fx, fy, cx and cy "
+                "are in pixels of this width and height"
             )
 
 

@@ -123,7 +123,9 @@ class Scene(Part):
         """What is possible but unusual."""
         found = []
         x, y = self.sensor.gel.size_mm[:2]
-        thickness = self.sensor.gel.depth_mm
+        thickness, modulus = self.sensor.gel.depth_mm, self.sensor.gel.youngs_modulus_kpa
+        if not 1 <= modulus <= 20_000:
+            found.append(f"sensor.gel.youngs_modulus_kpa = {modulus:g}: gels have 10 to 2,000 kPa; check its unit")
         for name, pose in self.motion.poses.items():
             given = f"{name}.shear_mm = {list(pose.shear_mm)}"
             if max(map(abs, pose.shear_mm)) > 2 * thickness:

@@ -3,9 +3,11 @@
     { uniform = [a, b] }   { normal = [mean, sd] }   { log_uniform = [a, b] }   { choice = [...] }
 
 `choice` may hold whole tables (indenters, say) with distributions inside. A `file` with wildcards, "objects/*.stl", is
-a choice of the files that match. A scene is checked when it is loaded: at the lower and upper end of all its
-distributions and for every choice, so that a mistake shows before any work is done. A `normal` is checked at its mean:
-a draw from its tails that breaks the schema is drawn again (`synth.scene.sampling`).
+a choice of the files that match. `extends = "gelsight_mini"` takes the rest from another scene.
+
+A scene is checked when it is loaded: at the lower and upper end of all its distributions and for every choice, so that
+a mistake shows before any work is done. A `normal` is checked at its mean: a draw from its tails that breaks the schema
+is drawn again (`synth.scene.sampling`).
 """
 
 import hashlib
@@ -127,12 +129,7 @@ def load_scene(name_or_path: str | Path, set: Sequence[str] = ()) -> Template:
         ('deltact', 1.0)
     """
     path = _find(name_or_path)
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    content = _read(path)
     for override in set:
         _apply(content, override)
     changed = tuple(override.partition("=")[0].strip() for override in set)
@@ -187,6 +184,36 @@ def with_files(value: Any, change: Callable[[str], Any], key: str = "") -> Any:
     if isinstance(value, list):
         return [with_files(inner, change, key) for inner in value]
     return change(value) if key in FILES and isinstance(value, str) else value
+
+
+def _read(path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
+    """The content of a scene file; what it `extends` (a shipped scene, or a file beside it) has the rest.
+
+    `above` are the files that extend it.
+    """
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    if "extends" not in content:
+        return content
+    given = str(content.pop("extends"))
+    base = _find(path.parent / given if given.endswith(".toml") else given)
+    if base in (path, *above):
+        raise InputError(f"{path}: extends = {given!r}: a scene cannot extend itself")
+    below = with_files(_read(base, (path, *above)), lambda name: str(base.parent.absolute() / name))
+    return _extended({**below, "name": path.stem, "description": "", "references": []}, content)
+
+
+def _extended(below: dict[str, Any], content: dict[str, Any]) -> dict[str, Any]:
+    """A table over another: tables within it alike, but one that says its kind or shape replaces that below it."""
+    both = dict(below)
+    for key, value in content.items():
+        tables = all(isinstance(each, dict) and not _is_distribution(each) for each in (value, below.get(key)))
+        both[key] = _extended(below[key], value) if tables and not {"kind", "shape"} & set(value) else value
+    return both
 
 
 def _find(name_or_path: str | Path) -> Path:

@@ -36,6 +36,18 @@ def test_overrides_set_tables_lists_and_words_and_the_last_wins(tiny: Path) -> N
     assert scene.motion.steps == 4
 
 
+def test_a_scene_extends_another_whose_files_stay_where_they_are(tmp_path: Path) -> None:
+    mine = tmp_path / "mine.toml"
+    mine.write_text('extends = "objects"\n[sensor.pattern]\nkind = "speckle"\ngrain_mm = 0.3\n[motion]\nsteps = 2\n')
+    found, base = load_scene(mine), load_scene("objects")
+    assert (found.name, found.content["references"]) == ("mine", [])
+    assert found.content["sensor"].pop("pattern") == {"kind": "speckle", "grain_mm": 0.3}
+    assert found.content["motion"] == {**base.content["motion"], "steps": 2}
+    assert found.content["sensor"].items() <= base.content["sensor"].items()
+    mine.write_text('extends = "mine.toml"')
+    refused("cannot extend itself", load_scene, mine)
+
+
 def test_corners_are_the_ends_of_distributions_and_every_option_of_nested_choices(tiny: Path) -> None:
     corners = load_scene(tiny).corners
     assert [corner.motion.depth_mm for corner in corners] == [0.1, 0.3]
