@@ -77,7 +77,7 @@ def _speckle(pattern: Speckle, x: FloatArray, y: FloatArray, rng: np.random.Gene
 
 
 def _round_dots(pattern: Dots, chart: RoundChart, x: FloatArray, y: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Rows of dots along meridians; a dot's distances are those in space."""
+    """Rows of dots along meridians, of which every other one ends where dots would be less than their size apart."""
     softness = max(pattern.softness_mm, x[1] - x[0], y[1] - y[0])
     coverage = np.zeros((len(y), len(x)))
     (across_mm, along_mm), (turned, first) = pattern.spacing_mm, pattern.offset_mm
@@ -88,7 +88,9 @@ def _round_dots(pattern: Dots, chart: RoundChart, x: FloatArray, y: FloatArray, 
     else:
         arcs = chart.arc(np.arange(first % along_mm, chart.top, along_mm))
     for arc in arcs:
-        for azimuth in azimuths if arc > 0 else azimuths[:1]:
+        room = max(1.0, 2 * math.pi * float(chart.across(np.array(arc))) / (4 * pattern.radius_mm))
+        stride = 2 ** max(0, math.ceil(math.log2(meridians / room)))
+        for azimuth in azimuths[::stride]:
             shift, aside, grow = rng.standard_normal(3)
             place = max(0.0, arc + pattern.jitter_mm * shift)
             angle = azimuth + pattern.jitter_mm * aside / max(float(chart.across(place)), pattern.radius_mm)
