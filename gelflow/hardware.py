@@ -1,4 +1,4 @@
-"""The machine: which device a computation runs on, what it is called, and how much memory the process has held."""
+"""The machine: which device a computation runs on and what it is called."""
 
 import os
 import platform
@@ -6,7 +6,7 @@ from pathlib import Path
 
 from gelflow.errors import InputError
 
-CPU_INFO, PROCESS_STATUS = Path("/proc/cpuinfo"), Path("/proc/self/status")
+CPU_INFO = Path("/proc/cpuinfo")
 
 
 def chosen_device(device: str) -> str:
@@ -29,21 +29,11 @@ def hardware(device: str) -> str:
 
         return torch.cuda.get_device_name()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    # Linux tells the processor's model; elsewhere its architecture has to do.
-    model = _entry(CPU_INFO, "model name") or platform.machine()
-    return f"{model}, {cores} {'core' if cores == 1 else 'cores'}"
+    return f"{_processor()}, {cores} {'core' if cores == 1 else 'cores'}"
 
 
-def process_memory(peak: bool) -> float | None:
-    """This process's resident memory in bytes, at its peak or now; None on systems other than Linux."""
-    entry = _entry(PROCESS_STATUS, "VmHWM" if peak else "VmRSS")
-    return None if entry is None else float(entry.split()[0]) * 1024
-
-
-def _entry(path: Path, field: str) -> str | None:
-    """What follows the first `field:` of a file under /proc; None where it is not there."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return None
-    return next((line.partition(":")[2].strip() for line in lines if line.partition(":")[0].strip() == field), None)
+def _processor() -> str:
+    """The processor's model, which Linux tells; elsewhere its architecture."""
+    lines = CPU_INFO.read_text(encoding="utf-8").splitlines() if CPU_INFO.is_file() else []
+    models = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(models, "") or platform.machine()

@@ -1,21 +1,16 @@
 """How fast a network is and how much memory it takes.
 
 Pairs per second: batches of random images, after warm-up, the median of several. Memory: on a CUDA device the most
-that torch held at once beyond the network's weights and the inputs; on Linux the growth of the process's resident
-memory to its peak; elsewhere unknown.
+that torch held at once beyond the network's weights and the inputs; elsewhere unknown.
 """
 
-import ctypes
 import statistics
 import time
-from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-from gelflow.hardware import hardware, process_memory
+from gelflow.hardware import hardware
 
-CLEAR_PEAK = Path("/proc/self/clear_refs")
 WARMUP, REPEATS = 2, 5
 """Passes before the measurement, and measured ones."""
 
@@ -40,7 +35,9 @@ def network_speed(model: Any, size: tuple[int, int], batch: int, device: str) ->
     synchronise = torch.cuda.synchronize if device == "cuda" else lambda: None
     seconds = []
     with torch.no_grad():
-        start = _start_memory(device)
+        if device == "cuda":
+            torch.cuda.reset_peak_memory_stats()
+            held = torch.cuda.memory_allocated()
         for _ in range(WARMUP):
             model(*images)
         for _ in range(REPEATS):
@@ -49,22 +46,5 @@ def network_speed(model: Any, size: tuple[int, int], batch: int, device: str) ->
             model(*images)
             synchronise()
             seconds.append(time.perf_counter() - started)
-    peak = float(torch.cuda.max_memory_allocated()) if device == "cuda" else process_memory(peak=True)
-    memory = None if peak is None or start is None else max(0.0, (peak - start) / 2**20)
+    memory = (torch.cuda.max_memory_allocated() - held) / 2**20 if device == "cuda" else None
     return Speed(batch / statistics.median(seconds), memory, batch, size, hardware(device))
-
-
-def _start_memory(device: str) -> float | None:
-    """Bytes held now, from which the peak is counted anew."""
-    import torch
-
-    if device == "cuda":
-        torch.cuda.reset_peak_memory_stats()
-        return float(torch.cuda.memory_allocated())
-    try:
-        with suppress(AttributeError):  # a C library other than glibc
-            ctypes.CDLL(None).malloc_trim(0)  # give back what earlier passes left in the heap
-        CLEAR_PEAK.write_text("5", encoding="ascii")  # Linux: forget the peak of the resident memory
-    except OSError:
-        return None
-    return process_memory(peak=False)

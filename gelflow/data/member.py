@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.errors import InputError
-from gelflow.files.exr import Direction, FlowField
+from gelflow.files.exr import FlowField
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
@@ -55,27 +55,20 @@ class Member:
 
 @dataclass(frozen=True, slots=True)
 class FlowMembers:
-    """The exact flow of one pair in a shard: `.npy` files of flow and visibility, backward where it was exported."""
+    """The exact flow of one pair in a shard: `.npy` files of flow and visibility, forward."""
 
     forward: Member
     forward_visible: Member
-    backward: Member | None = None
-    backward_visible: Member | None = None
 
     def __str__(self) -> str:
         return str(self.forward)
 
-    def read(self, direction: Direction) -> FlowField:
-        """One direction, as `gelflow.files.exr.read_flow` gives it. Shards hold no contact.
+    def read(self) -> FlowField:
+        """The flow, as `gelflow.files.exr.read_flow` gives it; shards hold no contact.
 
-        InputError where this direction is not there, or an array is damaged or of another type or shape.
+        InputError where an array is damaged or of another type or shape.
         """
-        if direction == "forward":
-            motion, seen = self.forward, self.forward_visible
-        elif self.backward is not None and self.backward_visible is not None:
-            motion, seen = self.backward, self.backward_visible
-        else:
-            raise InputError(f"{self.forward}: beside it there is no backward flow; export a data set that has one")
+        motion, seen = self.forward, self.forward_visible
         flow, visible = _read_array(motion, np.float32), _read_array(seen, np.uint8)
         if flow.ndim != 3 or flow.shape[2] != 2 or visible.shape != flow.shape[:2]:
             raise InputError(f"{motion}: shapes {flow.shape} and {visible.shape} of flow and visibility; "

@@ -3,7 +3,7 @@
 import hashlib
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import cast
 
@@ -16,7 +16,7 @@ from torch.utils.data import Dataset
 from gelflow.arrays import ImageArray, MarkerArray
 from gelflow.data.member import FlowMembers, Member
 from gelflow.errors import InputError
-from gelflow.files.exr import Direction, FlowField, read_flow
+from gelflow.files.exr import FlowField, read_flow
 from gelflow.files.image import read_pair
 
 
@@ -29,7 +29,6 @@ class PairRecord:
         image1, image2: Image files of one size.
         flow: EXR file, or members of a shard, with the exact flow in both directions, or None.
         markers: CSV file with tracked dots (columns x1, y1, x2, y2 in px), or None.
-        exchanged: The images have been exchanged: the exact flow is the file's `backward`.
         scene: Scene and kind of pattern of a synthetic pair, or None.
         origin: Hash of its data set's scene, and its seed; or None.
     """
@@ -39,7 +38,6 @@ class PairRecord:
     image2: Path | Member
     flow: Path | FlowMembers | None = None
     markers: Path | None = None
-    exchanged: bool = False
     scene: str | None = None
     origin: str | None = None
 
@@ -110,24 +108,15 @@ class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
     def truth(self, index: int) -> FlowField | None:
         """Exact flow (H, W, 2) in px and its visibility (H, W) bool; None where the pair has none.
 
-        Raises:
-            InputError: The file is missing or damaged, or lacks this direction.
+        InputError where the file is missing or damaged.
         """
-        record = self.records[index]
-        if record.flow is None:
-            return None
-        direction: Direction = "backward" if record.exchanged else "forward"
-        if isinstance(record.flow, FlowMembers):
-            return record.flow.read(direction)
-        return read_flow(record.flow, direction)
+        flow = self.records[index].flow
+        return flow.read() if isinstance(flow, FlowMembers) else None if flow is None else read_flow(flow)
 
     def markers(self, index: int) -> MarkerArray | None:
         """Tracked dots of a pair, None where it has none; exceptions as for `read_markers`."""
-        record = self.records[index]
-        if record.markers is None:
-            return None
-        markers = read_markers(record.markers)
-        return markers[:, [2, 3, 0, 1]] if record.exchanged else markers
+        path = self.records[index].markers
+        return None if path is None else read_markers(path)
 
     def __getitem__(self, index: int) -> dict[str, Tensor | str | bool]:
         """The sample that the class describes; InputError where a file is missing or damaged, or the sizes differ."""
@@ -148,14 +137,6 @@ class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
                              f"the images have {size[1]} x {size[0]} px")  # fmt: skip
         visible = torch.from_numpy(truth.visible[None].astype(np.float32))
         return sample | {"flow": _channels_first(truth.flow), "visible": visible}
-
-    def both_directions(self) -> "PairDataset":
-        """Each pair, and after it the same pair with its images exchanged and its backward flow."""
-        records = []
-        for record in self.records:
-            records += [record, replace(record, name=f"{record.name}~back", exchanged=not record.exchanged,
-                                        image1=record.image2, image2=record.image1)]  # fmt: skip
-        return PairDataset(self.source, records)
 
 
 def _channels_first(array: NDArray[np.float32]) -> Tensor:

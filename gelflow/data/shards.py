@@ -1,7 +1,7 @@
 """Shards in WebDataset's layout, as `python -m synth export --format webdataset` writes them.
 
     shard-000000.tar   uncompressed; for each sample 000000.{image1.png, image2.png, forward.npy, forward_visible.npy,
-                       backward.npy, backward_visible.npy (both or neither), json}; the key ends at the first dot
+                       json}, others are passed over; the key ends at the first dot
 
 Opening reads every tar header once, in each process, and keeps where each member lies. A pair is then read by seeking,
 in any order, so that a shard data set is used like a directory. The order is that of the shards' names, then that
@@ -26,7 +26,6 @@ from gelflow.errors import InputError
 
 SUFFIX = ".tar"
 _NEEDED = ("image1.png", "image2.png", "forward.npy", "forward_visible.npy", "json")
-_BACKWARD = ("backward.npy", "backward_visible.npy")
 _BLOCK = 512
 _END = bytes(2 * _BLOCK)
 """A tar file ends with two blocks of zeros (POSIX); Python's tarfile takes a damaged header for the end, too."""
@@ -92,12 +91,11 @@ def _members(shard: Path) -> Iterator[Member]:
 
 
 def _record(shard: Path, key: str, members: dict[str, Member]) -> PairRecord:
-    needed = _NEEDED + (_BACKWARD if any(name in members for name in _BACKWARD) else ())
-    missing = [name for name in needed if name not in members]
+    missing = [name for name in _NEEDED if name not in members]
     if missing:
         raise InputError(f"{shard}: sample {key} lacks {' and '.join(missing)}; allowed are shards of "
                          "`python -m synth export --format webdataset`; export it again")  # fmt: skip
-    flow = FlowMembers(members["forward.npy"], members["forward_visible.npy"], *map(members.get, _BACKWARD))
+    flow = FlowMembers(members["forward.npy"], members["forward_visible.npy"])
     try:
         meta = json.loads(members["json"].read_bytes())
     except ValueError:

@@ -4,6 +4,7 @@ Ctrl-C (SIGINT) and SIGTERM (a time limit, `docker stop`) ask alike.
 """
 
 import math
+import resource
 import signal
 import sys
 import threading
@@ -19,7 +20,6 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from gelflow.config import TrainConfig
 from gelflow.errors import InputError
-from gelflow.hardware import process_memory
 from gelflow.models.weights import save_weights
 from gelflow.terminal import Advance
 from gelflow.train.module import LOG_EVERY, FlowModule
@@ -56,12 +56,11 @@ class Throughput:
         return self._pairs / (time.perf_counter() - self._started) if self._started and self._pairs else None
 
 
-def peak_memory_mib() -> float | None:
-    """The most memory that torch held on the CUDA device, or on a CPU the process; MiB, None where it is not known."""
+def peak_memory_mib() -> float:
+    """The most memory, MiB, that torch held on the CUDA device, or on a CPU the process."""
     if torch.cuda.is_available() and torch.cuda.is_initialized():
         return torch.cuda.max_memory_allocated() / 2**20
-    peak = process_memory(peak=True)
-    return None if peak is None else peak / 2**20
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
 
 
 class Stopped(Exception):

@@ -103,25 +103,14 @@ class Counting:
         return 0 * image1[..., :2]
 
 
-def test_speed_leaves_out_the_first_call_and_sees_memory_and_the_front_what_none_beats(tmp_path: Path) -> None:
+def test_speed_leaves_out_the_first_call_and_the_front_what_none_beats(tmp_path: Path) -> None:
     method = Counting()
     scores = evaluate(method, PairDataset(write_folder(tmp_path, {"a": (1, 0), "b": (0, 1)})))
     assert (len(scores), method.calls) == (2, 1 + 2 * 2)  # there and back for closure
     points = [(3.0, 1.0), (1.0, 5.0), (2.0, 6.0), (2.0, 2.0), (4.0, 1.0), (1.0, 7.0)]
     assert pareto_front(points) == [1, 3, 0]
     assert pareto_front([]) == []
-    speed = network_speed(Hungry(), (64, 64), 2, "cpu")
-    assert speed.pairs_per_second > 0
-    if speed.memory_mib is not None:  # Linux
-        # The tensor itself; what else the process takes meanwhile (code of the kernels, buffers) stays below as much.
-        assert 60 < speed.memory_mib < 128
-
-
-class Hungry(torch.nn.Module):
-    """Holds 64 MiB while it runs."""
-
-    def forward(self, image1: torch.Tensor, image2: torch.Tensor) -> torch.Tensor:
-        return torch.full((16 * 2**20,), float(image1.mean()), device=image1.device).sum()
+    assert network_speed(torch.add, (64, 64), 2, "cpu").pairs_per_second > 0
 
 
 SMALL = ModelConfig(levels=4, projected_channels=8)

@@ -89,19 +89,17 @@ def test_a_photograph_is_turned_as_its_exif_says(tmp_path: Path, orientation: in
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_gelflow_reads_what_synth_writes(tmp_path: Path, dtype: type) -> None:
     samples = [synth_sample(index, dtype) for index in (0, 2)]
-    pairs = PairDataset(write_dataset(tmp_path / "d", samples)).both_directions()
-    assert pairs.names[::2] == ["000000", "000002"]
-    assert len(set(pairs.names)) == len(pairs) == 4
-    for item, sample, back in zip(pairs, (s for s in samples for _ in range(2)), 2 * [False, True], strict=True):
-        images = [sample.image1, sample.image2][:: -1 if back else 1]
-        for name, image in zip(("image1", "image2"), images, strict=True):
+    pairs = PairDataset(write_dataset(tmp_path / "d", samples))
+    assert pairs.names == ["000000", "000002"]
+    for item, sample in zip(pairs, samples, strict=True):
+        for name, image in (("image1", sample.image1), ("image2", sample.image2)):
             # float32 in [0, 1]: rounded to at most 2^-24, by one division.
             found = np.moveaxis(item[name].numpy(), 0, -1)
             np.testing.assert_allclose(found, image / np.iinfo(dtype).max, atol=2.0**-23)
-        field = sample.flow
-        flow, visible = (field.backward, field.backward_visible) if back else (field.forward, field.forward_visible)
-        np.testing.assert_array_equal(np.moveaxis(item["flow"].numpy(), 0, -1), flow)
-        np.testing.assert_array_equal(item["visible"].numpy()[0], visible)
+        np.testing.assert_array_equal(np.moveaxis(item["flow"].numpy(), 0, -1), sample.flow.forward)
+        np.testing.assert_array_equal(item["visible"].numpy()[0], sample.flow.forward_visible)
+        back = read_flow(tmp_path / "d" / "samples" / item["name"] / "flow.exr", "backward")
+        np.testing.assert_array_equal(back.flow, sample.flow.backward)
         assert {item[key].dtype for key in ("image1", "image2", "flow", "visible")} == {torch.float32}
 
 

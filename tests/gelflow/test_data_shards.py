@@ -51,7 +51,7 @@ def all_bits(dataset: PairDataset) -> list[dict[str, tuple[object, ...]]]:
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_shards_give_the_bits_of_the_data_set_in_both_directions(tmp_path: Path, dtype: type) -> None:
+def test_shards_give_the_bits_of_the_data_set(tmp_path: Path, dtype: type) -> None:
     folders = write_both(tmp_path, [synth_sample(index, dtype) for index in INDICES])
     data, shards = map(PairDataset, folders)
     assert len(list(folders[1].glob("*.tar"))) == 2
@@ -60,14 +60,7 @@ def test_shards_give_the_bits_of_the_data_set_in_both_directions(tmp_path: Path,
     assert {record.scene for record in (*shards.records, *data.records)} == {"flat, none"}
     assert set(shards[0]) == {"image1", "image2", "name", "bare", "flow", "visible"}
     assert shards[0]["bare"] is True
-    assert all_bits(shards.both_directions()) == all_bits(data.both_directions())
-
-
-def test_without_a_backward_flow_the_forward_one_is_read(tmp_path: Path) -> None:
-    folders = write_both(tmp_path, [synth_sample(0, backward=False)])
-    data, shards = (PairDataset(path).both_directions() for path in folders)
-    assert bits(shards[0]) == bits(data[0])
-    refused(r"000000\.forward\.npy.*no backward flow", shards.__getitem__, 1)
+    assert all_bits(shards) == all_bits(data)
 
 
 def test_one_shard_alone_workers_and_copies_read_the_same(both: tuple[Path, Path]) -> None:
@@ -122,8 +115,7 @@ def rewrite(shard: Path, change: Callable[[str, bytes], Iterator[tuple[str, byte
                 archive.addfile(info, io.BytesIO(data))
 
 
-@pytest.mark.parametrize("suffix", ["image1.png", "image2.png", "forward.npy", "forward_visible.npy",
-                                    "backward.npy", "backward_visible.npy", "json"])  # fmt: skip
+@pytest.mark.parametrize("suffix", ["image1.png", "image2.png", "forward.npy", "forward_visible.npy", "json"])
 def test_a_missing_member_is_named(shard: Path, suffix: str) -> None:
     rewrite(shard, lambda name, data: iter([(name, data)] if name != f"000001.{suffix}" else []))
     refused(rf"shard-000000\.tar: sample 000001 lacks {suffix};", PairDataset, shard)

@@ -77,9 +77,8 @@ def test_bfloat16_keeps_float32_weights_and_speed_and_memory_are_reported(pairs:
     assert "pairs/s" in str(result)
     rows = table(next(tmp_path.glob("speed/logs/csv/*/metrics.csv")))
     assert float(rows[-1]["train/pairs_per_second"]) > 0
-    if result.memory_mib is not None:  # Linux
-        assert "peak memory" in str(result)
-        assert result.memory_mib > 100  # torch alone
+    assert "peak memory" in str(result)
+    assert (result.memory_mib or 0) > 100  # torch alone
 
 
 def command(tmp_path: Path, data: Path, settings: str, *options: str) -> list[str]:
