@@ -29,11 +29,7 @@ def hardware(device: str) -> str:
 
         return torch.cuda.get_device_name()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return f"{_processor()}, {cores} {'core' if cores == 1 else 'cores'}"
-
-
-def _processor() -> str:
-    """The processor's model, which Linux tells; elsewhere its architecture."""
+    # Linux tells the processor's model; elsewhere its architecture has to do.
     lines = CPU_INFO.read_text(encoding="utf-8").splitlines() if CPU_INFO.is_file() else []
     models = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(models, "") or platform.machine()
+    return f"{next(models, '') or platform.machine()}, {cores} {'core' if cores == 1 else 'cores'}"

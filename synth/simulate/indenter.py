@@ -37,6 +37,7 @@ USUAL_GRID = 250_000
 """Points that a grid has at most by default."""
 MOST_MISSING = 1 / 3
 """Largest share of a closed surface that is made up where a file has holes: half a sphere lacks a quarter."""
+TIP_MM = 0.05  # points that are at most so much higher than a mesh's lowest belong to its tip
 CELLS_PER_RADIUS = 3.0
 """Spacings of the grid to the radius of the edges."""
 
@@ -46,12 +47,13 @@ class Touchable:
     """The part of a body that a gel can touch in a press of a depth.
 
     The radius is about the body's axis along z, through its origin; the height is from its lowest point, the one that
-    is nearest to the gel.
+    is nearest to the gel. On a round gel, which recedes beside the place, that point comes down `at_tip`: on the axis.
     """
 
     radius_mm: float = np.inf
     height_mm: float = np.inf
     depth_mm: float = np.inf
+    at_tip: bool = False
 
 
 EVERYTHING = Touchable()
@@ -159,6 +161,9 @@ def _object(indenter: MeshIndenter, folder: Path, resolution_mm: float, touchabl
     turned = replace(surface, points=np.asarray(surface.points @ turned_by(indenter.rotation_deg).T))
     radius = object_radius(indenter, resolution_mm)
     lowest = turned.points.max(axis=0)[2]
+    if touchable.at_tip:
+        tip = turned.points[turned.points[:, 2] > lowest - TIP_MM].mean(axis=0)
+        turned = replace(turned, points=turned.points - tip * [1, 1, 0])
     low, high = turned.points.min(axis=0), turned.points.max(axis=0)
     low = np.maximum(low, [-touchable.radius_mm, -touchable.radius_mm, lowest - touchable.height_mm])
     high = np.minimum(high, [touchable.radius_mm, touchable.radius_mm, np.inf])

@@ -11,7 +11,8 @@ does.
 
 On a round gel all of this happens in the frame of the place (`PressFrame`): depth counts along the inward normal from
 the tangent plane, and shear lies in that plane. A convex gel does not reach beyond it; where one from files does, as
-where it is pressed along z beside its tip, the path starts level with its farthest point.
+where it is pressed along z beside its tip, the path starts level with its farthest point. A mesh's lowest point comes
+down on the place.
 """
 
 from dataclasses import dataclass
@@ -210,6 +211,7 @@ def path_of(scene: Scene, folder: Path | None = None, resolution_mm: float = 0.0
     lowest = -frame.start_mm if frame else gel.face_mm(*motion.position_mm)
     deepest = max(pose.depth_mm for pose in poses) + lowest
     height = BULGE * max(deepest, 0.0) + SLACK_MM
-    touchable = Touchable(float(np.hypot(*gel.size_mm[:2])) / 2 + aside, height, max(motion.depth_mm, 0.0))
+    at_tip = gel.shape == "capsule" or (motion.polar_deg, motion.height_mm) != (None, None)
+    touchable = Touchable(float(np.hypot(*gel.size_mm[:2])) / 2 + aside, height, max(motion.depth_mm, 0.0), at_tip)
     body = rigid_body(scene.contact.indenter, folder, resolution_mm, touchable)
     return LoadPath(motion, body, gel.dome_radius_mm, frame)

@@ -89,7 +89,7 @@ def test_a_photograph_is_turned_as_its_exif_says(tmp_path: Path, orientation: in
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_gelflow_reads_what_synth_writes(tmp_path: Path, dtype: type) -> None:
     samples = [synth_sample(index, dtype) for index in (0, 2)]
-    pairs = PairDataset(write_dataset(tmp_path / "d", samples))
+    pairs = PairDataset(folder := write_dataset(tmp_path / "d", samples))
     assert pairs.names == ["000000", "000002"]
     for item, sample in zip(pairs, samples, strict=True):
         for name, image in (("image1", sample.image1), ("image2", sample.image2)):
@@ -98,8 +98,8 @@ def test_gelflow_reads_what_synth_writes(tmp_path: Path, dtype: type) -> None:
             np.testing.assert_allclose(found, image / np.iinfo(dtype).max, atol=2.0**-23)
         np.testing.assert_array_equal(np.moveaxis(item["flow"].numpy(), 0, -1), sample.flow.forward)
         np.testing.assert_array_equal(item["visible"].numpy()[0], sample.flow.forward_visible)
-        back = read_flow(tmp_path / "d" / "samples" / item["name"] / "flow.exr", "backward")
-        np.testing.assert_array_equal(back.flow, sample.flow.backward)
+        exr = folder / "samples" / str(item["name"]) / "flow.exr"
+        np.testing.assert_array_equal(read_flow(exr, "backward").flow, sample.flow.backward)
         assert {item[key].dtype for key in ("image1", "image2", "flow", "visible")} == {torch.float32}
 
 

@@ -73,11 +73,9 @@ def test_bfloat16_keeps_float32_weights_and_speed_and_memory_are_reported(pairs:
     values = weights_of(train(small(steps=2, precision="bf16"), pairs, None, tmp_path).weights).values()
     assert all(value.dtype == torch.float32 and torch.isfinite(value).all() for value in values)
     result = train(small(steps=10), pairs, None, tmp_path / "speed")
-    assert result.pairs_per_second > 0
-    assert "pairs/s" in str(result)
     rows = table(next(tmp_path.glob("speed/logs/csv/*/metrics.csv")))
     assert float(rows[-1]["train/pairs_per_second"]) > 0
-    assert "peak memory" in str(result)
+    assert "pairs/s; peak memory" in str(result)
     assert (result.memory_mib or 0) > 100  # torch alone
 
 

@@ -196,10 +196,17 @@ def test_a_thin_part_is_kept(tmp_path: Path) -> None:
 def test_a_notch_narrower_than_the_edges_is_filled(tmp_path: Path) -> None:
     boxes = [pv.Cube(x_length=2.0, y_length=3.0, z_length=2.0, center=(x, 0.0, 0.0)).triangulate() for x in (-1.1, 1.1)]
     base = pv.Cube(x_length=4.2, y_length=3.0, z_length=1.0, center=(0.0, 0.0, -0.9)).triangulate()
-    path = saved(tmp_path, *joined(*boxes, base))
-    within = np.array([[0.0, 0.0, 0.5]])
+    path, within = saved(tmp_path, *joined(*boxes, base)), np.array([[0.0, 0.0, 0.5]])
     assert distances(body_of(path), within)[0] > 0
     assert distances(body_of(path, fillet_mm=0.6), within)[0] < 0
+
+
+def test_the_lowest_point_of_an_object_comes_down_on_the_axis_of_a_round_gel(tmp_path: Path) -> None:
+    peg = pv.Cube(x_length=0.8, y_length=0.8, z_length=1.0, center=(1.5, 0.0, 1.0)).triangulate()
+    base = pv.Cube(x_length=4.2, y_length=3.0, z_length=1.0).triangulate()
+    path, within = saved(tmp_path, *joined(peg, base)), np.array([[0.0, 0.0, 0.5]])
+    assert distances(body_of(path), within)[0] > 0
+    assert distances(body_of(path, touchable=Touchable(at_tip=True)), within)[0] < 0
 
 
 def test_what_cannot_touch_has_no_grid_and_the_radius_is_what_the_gel_can_follow(tmp_path: Path) -> None:
@@ -210,5 +217,4 @@ def test_what_cannot_touch_has_no_grid_and_the_radius_is_what_the_gel_can_follow
     top = around((2.0, 1.5, 0.1)) + np.array([0.0, 0.0, 0.9])
     assert_equal_near(distances(part, top), distances(whole, top), 0.2, 0.01)
     stated = MeshIndenter(shape="mesh", file="object.stl", fillet_mm=0.5)
-    assert object_radius(stated, 0.1) == 0.5
-    assert object_radius(stated, 0.4) == OBJECT_RADIUS * 0.4
+    assert [object_radius(stated, spacing) for spacing in (0.1, 0.4)] == [0.5, OBJECT_RADIUS * 0.4]

@@ -29,10 +29,8 @@ from synth.simulate.space import Space, function_space
 from synth.simulate.system import System
 from synth.simulate.tables import pack_indenter, place_indenter
 
-FLOAT64 = 1
-"""CUDA_R_64F."""
-COLUMNS = 1024
-"""Of the inverse, found at a time on a GPU, to save memory."""
+FLOAT64 = 1  # CUDA_R_64F
+COLUMNS = 1024  # of the inverse that are found at a time on a GPU, to save memory
 
 
 def stiffness(system: System, away: Indenters) -> scipy.sparse.csr_array:
