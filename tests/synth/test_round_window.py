@@ -187,7 +187,7 @@ def test_dots_have_their_size_and_places_on_the_face(placing: str) -> None:
     for height in (3.0, 9.0, 15.0):
         middle = height if placing == "spherical" else float(CHART.arc(np.array(height)))
         ring = (np.abs(arc - middle) < 0.6) * coverage
-        # round(2 pi 12 / 4.2) = 18 discs of 0.35 mm, at 3 mm half of them; the cap has 1e-4 more, texels err by some 1 %.
+        # round(2 pi 12 / 4.2) = 18 discs of 0.35 mm, at 3 mm half of them; the cap has 1e-4 more, texels err by 1 %.
         assert (ring * area).sum() == pytest.approx((9 if middle == 3.0 else 18) * np.pi * 0.35**2, rel=0.02)
         turned = np.exp(18j * angle)  # 1 at each meridian
         assert abs((ring * area * turned).sum() / (ring * area).sum()) > np.cos(18 * 0.35 / float(CHART.across(middle)))
