@@ -85,7 +85,7 @@ def test_the_spline_is_scipys_and_keeps_the_image_at_lowered_precision_too() -> 
     with torch.autocast("cpu", torch.bfloat16):
         torch.testing.assert_close(warp(image, still, "spline"), image, rtol=0, atol=4e-6)
     far = warp(image, still + 100, "spline")
-    torch.testing.assert_close(far, image[..., -1:, -1:].expand_as(image), rtol=0, atol=2e-6)
+    torch.testing.assert_close(far, image[..., -1:, -1:].expand_as(image), rtol=0, atol=4e-6)
 
 
 def test_window_sums_are_a_convolution_and_smoothing_a_gaussian_up_to_the_border() -> None:

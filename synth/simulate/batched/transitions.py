@@ -19,24 +19,20 @@ from synth.simulate.distance import KINDS
 ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
 FORCE_FLOOR = wp.constant(wp.float64(newton.FORCE_FLOOR))
 INDIFFERENT = wp.constant(wp.float64(newton.INDIFFERENT))
-SHORTEST = wp.constant(wp.float64(newton.SHORTEST))
-SHORTEST_STEP = wp.constant(wp.float64(stepping.SHORTEST_STEP))
+SHORTEST, SHORTEST_STEP = (wp.constant(wp.float64(v)) for v in (newton.SHORTEST, stepping.SHORTEST_STEP))
 GROWTH = wp.constant(wp.float64(stepping.GROWTH))
 MAX_ITERATIONS_TO_GROW = wp.constant(stepping.MAX_ITERATIONS_TO_GROW)
 FAILURES = wp.constant(stepping.FAILURES)
 MAX_MULTIPLIER_UPDATES = wp.constant(wp.float64(stepping.MAX_MULTIPLIER_UPDATES))
 PENETRATION = wp.constant(wp.float64(stepping.PENETRATION))
 MESH = wp.constant(KINDS["mesh"])
-DEEP = wp.constant(wp.float64(stepping.DEEP))
-MAX_PENETRATION = wp.constant(wp.float64(stepping.MAX_PENETRATION))
+DEEP, MAX_PENETRATION = (wp.constant(wp.float64(share)) for share in (stepping.DEEP, stepping.MAX_PENETRATION))
 MAX_DEEP_UPDATES = wp.constant(wp.float64(stepping.MAX_DEEP_UPDATES))
-DEEP_FAILURES = wp.constant(stepping.DEEP_FAILURES)
-TOO_DEEP_FAILURES = wp.constant(stepping.TOO_DEEP_FAILURES)
+DEEP_FAILURES, TOO_DEEP_FAILURES = wp.constant(stepping.DEEP_FAILURES), wp.constant(stepping.TOO_DEEP_FAILURES)
 MULTIPLIER_TOLERANCE = wp.constant(wp.float64(stepping.MULTIPLIER_TOLERANCE))
 MAX_CORRECTION_RATIO = wp.constant(wp.float64(stepping.MAX_CORRECTION_RATIO))
 DEEP_CORRECTION_RATIO = wp.constant(wp.float64(stepping.DEEP_CORRECTION_RATIO))
-MIN_TOLERANCE = wp.constant(wp.float64(1.0e-12))
-"""Of a pass: somewhat more than rounding leaves."""
+MIN_TOLERANCE = wp.constant(wp.float64(1.0e-12))  # of a pass: somewhat more than rounding leaves
 SUFFICIENT_DECREASE = wp.constant(wp.float64(newton.SUFFICIENT_DECREASE))
 STALL_ITERATIONS = wp.constant(newton.STALL_ITERATIONS)
 STALLED_RESIDUAL = wp.constant(wp.float64(newton.STALLED_RESIDUAL))
@@ -44,10 +40,8 @@ NEAR = wp.constant(wp.float64(newton.NEAR))
 MAX_RELAXED_STEP = wp.constant(wp.float64(stepping.MAX_RELAXED_STEP))
 MAX_STEPS = wp.constant(newton.MAX_STEPS)
 FIRST_VISCOSITY = wp.constant(wp.float64(newton.FIRST_VISCOSITY))
-LEAST_VISCOSITY = wp.constant(wp.float64(newton.LEAST_VISCOSITY))
-MOST_VISCOSITY = wp.constant(wp.float64(newton.MOST_VISCOSITY))
-LEAST_SHARE = wp.constant(wp.float64(newton.LEAST_SHARE))
-LEAST_BORNE = wp.constant(wp.float64(newton.MIN_REACTION_RATIO))
+LEAST_VISCOSITY, MOST_VISCOSITY = (wp.constant(wp.float64(v)) for v in (newton.LEAST_VISCOSITY, newton.MOST_VISCOSITY))
+LEAST_SHARE, LEAST_BORNE = (wp.constant(wp.float64(v)) for v in (newton.LEAST_SHARE, newton.MIN_REACTION_RATIO))
 MAX_ERROR, AIM = wp.constant(wp.float64(newton.MAX_ERROR)), wp.constant(wp.float64(newton.AIM))
 FALL, RISE = wp.constant(wp.float64(newton.FALL)), wp.constant(wp.float64(newton.RISE))
 
@@ -125,13 +119,13 @@ def evaluate_trial(lanes: Lanes, settings: Settings):
             return
         lanes.move[s] = phases.TAKE_TRIAL
         lanes.iteration[s] = lanes.iteration[s] + 1
-    passes = lanes.stage[s] == phases.CORRECTION and lanes.relaxing[s] == 0
-    too_far = passes and lanes.trial_moved[s] > lanes.most_moved[s]
+    too_far = (
+        lanes.stage[s] == phases.CORRECTION and lanes.trial_moved[s] > lanes.most_moved[s] and lanes.relaxing[s] == 0
+    )
     lanes.norm[s] = norm
     lanes.relative[s] = relative
     lanes.jacobian[s] = lanes.trial_jacobian[s]
-    iteration = lanes.iteration[s]
-    limit = lanes.limit[s]
+    iteration, limit = lanes.iteration[s], lanes.limit[s]
     spent = iteration == 2 * limit or (iteration >= limit and relative > NEAR)
     stalled = iteration >= STALL_ITERATIONS and relative >= STALLED_RESIDUAL
     if lanes.relaxing[s] == 1:
@@ -258,8 +252,8 @@ def choose_pass(lanes: Lanes, presses: Presses, settings: Settings):
     deep, too_deep = _is_deeper(lanes, presses, s, DEEP), _is_deeper(lanes, presses, s, MAX_PENETRATION)
     over = lanes.failures[s] >= FAILURES or lanes.done[s] >= MAX_MULTIPLIER_UPDATES
     if deep:
-        over = lanes.failures[s] >= wp.where(too_deep, TOO_DEEP_FAILURES, DEEP_FAILURES)
-        over = over or lanes.done[s] >= MAX_DEEP_UPDATES
+        failures = wp.where(too_deep, TOO_DEEP_FAILURES, DEEP_FAILURES)
+        over = lanes.failures[s] >= failures or lanes.done[s] >= MAX_DEEP_UPDATES
     if corrected and over and too_deep:
         lanes.reason[s] = phases.TOO_DEEP
         lanes.phase[s] = phases.ENDED
