@@ -68,10 +68,9 @@ class FlowMembers:
 
         InputError where an array is damaged or of another type or shape.
         """
-        motion, seen = self.forward, self.forward_visible
-        flow, visible = _read_array(motion, np.float32), _read_array(seen, np.uint8)
+        flow, visible = _read_array(self.forward, np.float32), _read_array(self.forward_visible, np.uint8)
         if flow.ndim != 3 or flow.shape[2] != 2 or visible.shape != flow.shape[:2]:
-            raise InputError(f"{motion}: shapes {flow.shape} and {visible.shape} of flow and visibility; "
+            raise InputError(f"{self}: shapes {flow.shape} and {visible.shape} of flow and visibility; "
                              "(rows, columns, 2) and (rows, columns) are needed")  # fmt: skip
         finite = np.isfinite(flow).all(axis=-1)
         return FlowField(flow, np.asarray(finite & (visible > 0), np.bool_))

@@ -111,7 +111,9 @@ class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
         InputError where the file is missing or damaged.
         """
         flow = self.records[index].flow
-        return flow.read() if isinstance(flow, FlowMembers) else None if flow is None else read_flow(flow)
+        if isinstance(flow, FlowMembers):
+            return flow.read()
+        return None if flow is None else read_flow(flow)
 
     def markers(self, index: int) -> MarkerArray | None:
         """Tracked dots of a pair, None where it has none; exceptions as for `read_markers`."""

@@ -48,8 +48,8 @@ def inverse(matrix: scipy.sparse.csr_array, device: str) -> wp.array:
     """
     k, where = matrix.shape[0], wp.get_device(device)
     try:
-        found = wp.zeros((padded(k), padded(k)), dtype=wp.float32, device=where)
         full = wp.array(matrix.toarray(), dtype=wp.float64, device=where)
+        found = wp.zeros((padded(k), padded(k)), dtype=wp.float32, device=where)
         if where.is_cuda:
             _invert_by_cusolver(full, found)
         else:
