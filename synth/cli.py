@@ -52,13 +52,13 @@ def calibrate(
         "data/calibration"
     ),
     judge: Annotated[
-        list[Path] | None, Parameter(consume_multiple=True, help="More of such images, to judge the fit by.")
+        list[Path] | None, Parameter(consume_multiple=True, help="Further images, compared but not fitted.")
     ] = None,
     spacing_mm: Annotated[
-        float | None, Parameter(help="Distance of the dots' columns where known; else the scene's field of view holds.")
+        float | None, Parameter(help="Distance between columns of dots; default: keep the scene's field of view.")
     ] = None,
     steps: Annotated[
-        int, Parameter(converter=whole(0), help="Most steps of the lights' geometry; 0: powers only.")
+        int, Parameter(converter=whole(0), help="Most steps of the fit of the lights' geometry; 0: powers only.")
     ] = 30,
     assignments: Assignments = None,
     as_json: AsJson = False,
@@ -71,7 +71,7 @@ def calibrate(
 
 @app.command
 def doctor(*, as_json: AsJson = False) -> int:
-    """Tells what this machine can run, and how to get the rest."""
+    """Tells what this machine can run and how to install the rest."""
     from synth.doctor import run_doctor
 
     return run_doctor(as_json)

@@ -36,7 +36,7 @@ Assignments = Annotated[
         "--set", validator=each_key_once, help="KEY=VALUE with a TOML value, such as motion.depth_mm=1.2; repeatable."
     ),
 ]
-Device = Annotated[Literal["auto", "cpu", "cuda"], Parameter(help="Where to render; auto: a GPU with OptiX if any.")]
+Device = Annotated[Literal["auto", "cpu", "cuda"], Parameter(help="Where to render; auto: a GPU with OptiX, if any.")]
 AsJson = Annotated[bool, Parameter("--json", negative=(), help="Print the answer as JSON on stdout.")]
 Dataset = Annotated[Path, Parameter(help="A dataset directory.")]
 

@@ -31,7 +31,7 @@ def generate(
     scene: SceneName = DEFAULT_SCENE,
     n: Annotated[int, Parameter(converter=whole(1), help="Samples in the dataset.")] = 8,
     out: Annotated[
-        str, Parameter(help="Directory or fsspec URL of the dataset; one that holds part of the same job goes on.")
+        str, Parameter(help="Directory or fsspec URL of the dataset; a part of the same job in it is continued.")
     ] = "data/demo",
     seed: Annotated[int, Parameter(converter=whole(0), help="Seed of everything random.")] = 0,
     assignments: Assignments = None,
@@ -40,18 +40,18 @@ def generate(
         int | None,
         Parameter(
             converter=whole(1),
-            help="Processes that make samples on one core each; the same come out. Default: none, this process makes "
-            "them and renders on all cores. With numerics.solver = batched: processes beside the one that simulates "
-            "and renders, 1 for none; default on a GPU: one for every other core.",
+            help="Processes that make samples, on one core each. Default: this process makes them and renders on all "
+            "cores. The samples are the same. With numerics.solver = batched: processes beside the one that simulates "
+            "and renders, 1 for none; default on a GPU: one for each further core.",
         ),
     ] = None,
     ray: Annotated[
-        str | None, Parameter(help="Address of a Ray cluster to make samples on, such as auto; local begins one here.")
+        str | None, Parameter(help="Address of a Ray cluster to make samples on, such as auto; local starts one here.")
     ] = None,
     shard: Annotated[
         str | None,
         Parameter(
-            help="i/N: make every N-th trajectory from i on (from 0), beside other processes with the same --out."
+            help="i/N: make every N-th trajectory, from number i (0 to N - 1) on; other processes make the rest."
         ),
     ] = None,
     dry_run: Annotated[bool, Parameter(negative=(), help="Only show the plan.")] = False,
@@ -101,8 +101,8 @@ def simulate(
     *,
     scene: SceneName,
     out: Annotated[Path, Parameter(help="Directory for trajectory.json and a VTU file per state.")],
-    seed: Annotated[int, Parameter(converter=whole(0), help="Seed of the draw.")] = 0,
-    index: Annotated[int, Parameter(converter=whole(0), help="Number of the trajectory that is drawn.")] = 0,
+    seed: Annotated[int, Parameter(converter=whole(0), help="Seed of everything random.")] = 0,
+    index: Annotated[int, Parameter(converter=whole(0), help="Number of the trajectory.")] = 0,
     assignments: Assignments = None,
     as_json: AsJson = False,
 ) -> int:
@@ -156,7 +156,7 @@ def inspect(
     *,
     png: Annotated[Path | None, Parameter(help="Write a picture sheet.")] = None,
     html: Annotated[Path | None, Parameter(help="Write one self-contained page.")] = None,
-    limit: Annotated[int, Parameter(converter=whole(1), help="Most samples of a dataset to look at.")] = 100,
+    limit: Annotated[int, Parameter(converter=whole(1), help="Largest number of samples to show.")] = 100,
     as_json: AsJson = False,
 ) -> int:
     """Shows a dataset, a sample or a flow in numbers and pictures."""
@@ -182,7 +182,7 @@ def inspect(
 
 
 def verify(path: Dataset, /, *, as_json: AsJson = False) -> int:
-    """Derives the ground truth again by an independent route; exit status 1 if it disagrees."""
+    """Derives the ground truth again by independent code; exit status 1 if the two disagree."""
     from synth.progress import progress
     from synth.verify import verify_dataset
 

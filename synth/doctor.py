@@ -1,4 +1,4 @@
-"""What this machine can run, and how to get the rest."""
+"""What this machine can run and how to install the rest."""
 
 import json
 import os

@@ -12,7 +12,7 @@ MAXIMUM_PIXELS = 4096 * 4096
 """Largest size at which a network may be asked to work; it takes some 0.6 kB of memory for each pixel."""
 
 Paths = Annotated[
-    list[Path], Parameter(help="Folders of pairs: of synth or its *.tar shards, of `pairs`, or NAME_1.png, NAME_2.png.")
+    list[Path], Parameter(help="Datasets or *.tar shards of synth, folders made by 'pairs', or of NAME_1.png, NAME_2.png.")
 ]
 AsJson = Annotated[bool, Parameter("--json", negative=(), help="Print the answer as JSON on stdout.")]
 Size = Annotated[str | None, Parameter(help="ROWSxCOLUMNS at which the network works; default: as in training.")]
@@ -28,9 +28,9 @@ Registered = Literal["none", "motion", "both", "brightness"]
 Registration = Annotated[
     Registered | None,
     Parameter(
-        help="Correct the network's flow on the images: to follow the gel's motion, or to bring image 2 as close to "
-        "image 1 as can be, shading included, or both: this where motion alone leaves much. Default: as the weights' "
-        "training asked for; best: motion."
+        help="How to correct the network's flow. motion: follow the gel; brightness: bring image 2 as close to image 1 "
+        "as possible, shading included; both: brightness only where motion leaves a large difference. Default: as the "
+        "weights state; best: motion."
     ),
 ]
 

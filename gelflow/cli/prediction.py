@@ -26,20 +26,20 @@ def predict(
     method: Annotated[
         str | None,
         Parameter(
-            help="Instead: lucas-kanade, farneback, dis-ultrafast, dis-fast, dis-medium, tvl1, dis-motion, "
-            "dis-both, dis-brightness, al-dic."
+            help="In place of the network: lucas-kanade, farneback, dis-ultrafast, dis-fast, dis-medium, tvl1, "
+            "dis-motion, dis-both, dis-brightness, al-dic."
         ),
     ] = None,
     registration: Registration = None,
     reference: Annotated[
-        Literal["first", "previous"], Parameter(help="Of a video: flow from its first frame, or from the one before.")
+        Literal["first", "previous"], Parameter(help="Of a video: flow from its first or from the previous frame.")
     ] = "first",
     every: Annotated[int, Parameter(help="Of a video: take every n-th frame.")] = 1,
     size: Size = None,
     device: OnDevice = "auto",
     as_json: AsJson = False,
 ) -> int:
-    """Flow of a pair of images, to EXR, .flo and a picture, or of a video, to EXR, motion.csv and a video."""
+    """Writes the flow of two images (EXR, .flo and a picture) or of a video (EXR, motion.csv and a video)."""
     from gelflow.baselines import named_methods
     from gelflow.baselines.learned import open_network
     from gelflow.models.weights import weights_file
@@ -92,7 +92,7 @@ def export(
     out: Annotated[Path, Parameter(help="File to write, ending in .onnx.")],
     size: Annotated[str | None, Parameter(help="ROWSxCOLUMNS of the images; default: as in training.")] = None,
 ) -> int:
-    """Writes a network as ONNX: image1, image2 in, flow out, at one size."""
+    """Writes a network for images of one size as ONNX: image1 and image2 in, flow out."""
     from gelflow.models.onnx import export_onnx
     from gelflow.models.weights import weights_file
 

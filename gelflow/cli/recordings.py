@@ -22,18 +22,18 @@ def pairs(
     /,
     *,
     out: Out,
-    per_video: Annotated[int, Parameter(help="Most pairs from one recording.")] = 10,
-    min_motion: Annotated[float, Parameter(help="Least motion in px, 95th percentile over the image.")] = 2.0,
+    per_video: Annotated[int, Parameter(help="Largest number of pairs from one recording.")] = 10,
+    min_motion: Annotated[float, Parameter(help="Least motion in px, as the 95th percentile over the image.")] = 2.0,
     max_motion: Annotated[float, Parameter(help="Most motion in px.")] = 60.0,
     min_difference: Annotated[
         float, Parameter(help="Least difference in px between the flows of two pairs of one recording.")
     ] = 1.0,
-    frames: Annotated[int, Parameter(help="Most frames of a recording that are looked at.")] = 40,
-    tries: Annotated[int, Parameter(help="Most pairs of a recording that are tried.")] = 200,
+    frames: Annotated[int, Parameter(help="Largest number of frames used of a recording.")] = 40,
+    tries: Annotated[int, Parameter(help="Largest number of pairs tried of a recording.")] = 200,
     seed: Annotated[int, Parameter(help="Seed of the random choice.")] = 0,
     as_json: AsJson = False,
 ) -> int:
-    """Chooses image pairs with enough motion from recordings; goes on where the same job was interrupted."""
+    """Chooses image pairs with enough motion from recordings; continues an interrupted job."""
     from gelflow.data.choose import ChoiceConfig
     from gelflow.data.extract import extract_pairs
     from gelflow.data.pairset import FILE

@@ -46,33 +46,33 @@ def compare(
     methods: Annotated[
         str,
         Parameter(
-            help="Methods, separated by commas; an empty text for none. Beside the default ones, which are the "
-            "paper's: dis-motion, dis-both, dis-brightness (DIS medium, then registration), exact (the exact flow "
+            help="Methods, separated by commas; an empty text for none. Besides the default ones (the paper's) there "
+            "are dis-motion, dis-both, dis-brightness (DIS medium, then registration), exact (the exact flow "
             "of synthetic pairs), al-dic (pyALDIC)."
         ),
     ] = "none,lucas-kanade,farneback,dis-ultrafast,dis-fast,dis-medium,tvl1",
     weights: Annotated[
         list[str] | None,
         Parameter(
-            help="FILE or LABEL=FILE of a network: GelFlow (.safetensors; best: ours) or RAFT (.pth); "
-            "repeatable. Labels that differ after # alone (best#0, best#1) are seeds: one row, mean and standard "
-            "deviation."
+            help="FILE or LABEL=FILE of a network: GelFlow (.safetensors; best: the shipped one) or RAFT (.pth); "
+            "repeatable. Labels that differ only after # (best#0, best#1) are seeds: they share a row with mean and "
+            "standard deviation."
         ),
     ] = None,
     registration: Annotated[
         list[Registered] | None,
         Parameter(
-            help="Registration of GelFlow networks, see predict; repeatable, a row of each, whose name ends with "
-            "+motion, +both or +brightness. Default: as the weights' training asked for."
+            help="Registration of GelFlow networks (see predict); repeatable. Each gives a row, whose name ends with "
+            "+motion, +both or +brightness. Default: as the weights state."
         ),
     ] = None,
     ft: Annotated[
         int, Parameter(help="Steps of test-time optimisation of each GelFlow network on these pairs, reported apart.")
     ] = 0,
-    batch: Annotated[int, Parameter(help="Pairs at once where networks' speed and memory are measured; 0: not.")] = 1,
-    every: Annotated[int, Parameter(help="Take every n-th pair only, for methods that are slow.")] = 1,
+    batch: Annotated[int, Parameter(help="Pairs at once to measure networks' speed and memory; 0: do not.")] = 1,
+    every: Annotated[int, Parameter(help="Take only every n-th pair, for slow methods.")] = 1,
     add: Annotated[
-        bool, Parameter(negative=(), help="Keep the methods that --out holds already; pairs are known by their names.")
+        bool, Parameter(negative=(), help="Keep the methods that are in --out already; pairs are matched by name.")
     ] = False,
     size: Size = None,
     device: OnDevice = "auto",

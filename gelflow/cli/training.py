@@ -38,7 +38,7 @@ class RunOptions:
             "MASTER_ADDR, MASTER_PORT and NODE_RANK set."
         ),
     ] = None
-    resume: Annotated[bool, Parameter(negative=(), help="Go on with the run that --out holds.")] = False
+    resume: Annotated[bool, Parameter(negative=(), help="Continue the run in --out.")] = False
 
 
 DEFAULTS = RunOptions()
@@ -50,7 +50,7 @@ def train(data: Paths, /, *, out: Out, options: RunOptions = DEFAULTS) -> int:
 
 
 def finetune(data: Paths, /, *, out: Out, weights: ShippedOrFile = None, options: RunOptions = DEFAULTS) -> int:
-    """Trains on, from given weights, whose architecture is kept."""
+    """Continues training from given weights and keeps their architecture."""
     from gelflow.models.weights import weights_file
 
     return _train(data, out, options, options.config or "real", weights_file(weights))
