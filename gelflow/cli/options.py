@@ -12,7 +12,7 @@ MAXIMUM_PIXELS = 4096 * 4096
 """Largest size at which a network may be asked to work; it takes some 0.6 kB of memory for each pixel."""
 
 Paths = Annotated[
-    list[Path], Parameter(help="Datasets or *.tar shards of synth, folders made by 'pairs', or of NAME_1.png, NAME_2.png.")
+    list[Path], Parameter(help="Datasets or *.tar shards of synth, folders by 'pairs', or of NAME_1.png, NAME_2.png.")
 ]
 AsJson = Annotated[bool, Parameter("--json", negative=(), help="Print the answer as JSON on stdout.")]
 Size = Annotated[str | None, Parameter(help="ROWSxCOLUMNS at which the network works; default: as in training.")]

@@ -26,7 +26,7 @@ def plot_means(path: Path, groups: Sequence[Group], note: str) -> None:
         ("PSNR (dB), more is better", "psnr_db", 1, False),
         ("SSIM, more is better", "ssim", 1, False),
         ("endpoint error (px), less is better", "endpoint_error_px", 1, True),
-        ("distance to dots (px), less is better", "dot_distance_px", 1, True),
+        ("distance from dots (px), less is better", "dot_distance_px", 1, True),
         ("ms per pair (CPU: of one core)", "cost_seconds", 1000, True),
     ]
     panels = [panel for panel in candidates if any(group.mean(panel[1]) is not None for group in groups)]
@@ -59,7 +59,7 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
 
 
 def plot_work_precision(path: Path, groups: Sequence[Group], note: str) -> None:
-    """Writes a PNG with quality against run time: endpoint error or distance to dots, and PSNR.
+    """Writes a PNG with quality against run time: endpoint error or distance from dots, and PSNR.
 
     Methods that no other beats in both are joined; those that were fine-tuned on the very pairs are hollow and not
     part of the front. A black edge means that it ran on a GPU. The note says what the times were measured on.
@@ -67,7 +67,7 @@ def plot_work_precision(path: Path, groups: Sequence[Group], note: str) -> None:
     shown = [group for group in groups if group.name not in UNTIMED]
     candidates = [
         ("mean endpoint error (px)", "endpoint_error_px", 1.0),
-        ("median distance to dots (px)", "dot_distance_px", 1.0),
+        ("median distance from dots (px)", "dot_distance_px", 1.0),
         ("PSNR (dB)", "psnr_db", -1.0),
     ]
     panels = [panel for panel in candidates if any(_finite(group.mean(panel[1])) for group in shown)]

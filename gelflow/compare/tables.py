@@ -128,7 +128,7 @@ def tables(comparison: Comparison) -> list[tuple[str, Table]]:
             ("PSNR dB / SSIM", "{:.2f} / {:.3f}", ("psnr_db", "ssim")),
             ("mean endpoint error in px", "{:.3f}", ("endpoint_error_px",)),
             ("median distance to tracked dots in px", "{:.2f}", ("marker_distance_px",)),
-            ("distance to dots, median / 90th percentile in px / share that reach one of their own",
+            ("distance from dots, median / 90th percentile in px / share that reach one of their own",
              "{:.3f} / {:.3f} / {:.0%}", ("dot_distance_px", "dot_p90_px", "own_dots")),
             ("closure, median / 90th percentile in px", "{:.3f} / {:.3f}", ("closure_px", "closure_p90_px")),
         ]  # fmt: skip
