@@ -120,15 +120,15 @@ MAX_ERROR, AIM = 0.5, 0.2
 """Largest error of a step that is taken, and what the next θ aims at."""
 MIN_REACTION_RATIO = 0.25
 """A relaxation fails that leaves less than this share of the reaction: the body has slipped between contact points."""
-FALL, RISE = 0.1, 6.0
-"""Largest change of θ from one step to the next, down and up."""
+FALL, FALL_AFTER_REFUSAL, RISE = 0.1, 0.5, 6.0
+"""Largest change of θ from one step to the next: down, down from the step after a refused one, and up."""
 
 
 def relax(system: System, start: Unknowns, indenter: Indenters, tolerance: float) -> Solution:
     """Let a state come to rest; arguments and result as of `synth.simulate.newton.solve`."""
     state, residual = start, system.residual(start, indenter)
     least = MIN_REACTION_RATIO * _reaction(system, residual)
-    viscosity, share, iterations = FIRST_VISCOSITY, 1.0, 0
+    viscosity, share, iterations, refused = FIRST_VISCOSITY, 1.0, 0, False
     while residual.smallest_jacobian > 0 and iterations < MAX_STEPS and share >= LEAST_SHARE:
         step = system.newton_step(system.tangent(state, indenter, viscosity), residual.free)
         trial = state.plus(step, share)
@@ -146,7 +146,7 @@ def relax(system: System, start: Unknowns, indenter: Indenters, tolerance: float
                 return Solution(state, residual, True, iterations)
         elif viscosity >= MOST_VISCOSITY:
             share /= 2
-        viscosity = next_viscosity(viscosity, error)
+        viscosity, refused = next_viscosity(viscosity, error, refused), error > MAX_ERROR
     return Solution(state, residual, False, iterations)
 
 
@@ -155,10 +155,10 @@ def _reaction(system: System, residual: Residual) -> float:
     return norm(residual.reaction[system.space.held.any(axis=1)])
 
 
-def next_viscosity(viscosity: float, error: float) -> float:
-    """θ after a step of this error."""
+def next_viscosity(viscosity: float, error: float, refused: bool = False) -> float:
+    """θ after a step of this error, and whether the step before it was refused."""
     if error <= MAX_ERROR:
-        taken = viscosity * min(max(error / AIM, FALL), RISE)
+        taken = viscosity * min(max(error / AIM, FALL_AFTER_REFUSAL if refused else FALL), RISE)
         return taken if taken >= LEAST_VISCOSITY else 0.0
-    refused = max(viscosity * min(max(error / AIM, 2.0), RISE), LEAST_VISCOSITY)
-    return min(refused, MOST_VISCOSITY)
+    raised = max(viscosity * min(max(error / AIM, 2.0), RISE), LEAST_VISCOSITY)
+    return min(raised, MOST_VISCOSITY)

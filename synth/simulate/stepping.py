@@ -41,11 +41,11 @@ come to rest on the surface, so that more updates make the tractions uneven."""
 FAILURES = 3
 """Of attempts at them, after which the passes end. Updates are halved after a failure, doubled after a success and kept
 after a relaxation: where a whole one upsets Newton's method a part of it does not."""
-DEEP, MAX_PENETRATION = 0.02, 0.05
+DEEP, TOO_DEEP, MAX_PENETRATION = 0.02, 0.05, 0.1
 """Shares of the press depth (at least 0.1 mm). Where a triangle mesh penetrates by more than the first, passes go on to
-MAX_DEEP_UPDATES or DEEP_FAILURES; where it still does by more than the second, to TOO_DEEP_FAILURES, and then the press
-ends. A relaxation that fails counts as DEEP_FAILURES. A share is not doubled after the first success that follows a
-failure."""
+MAX_DEEP_UPDATES or DEEP_FAILURES; where it still does by more than the second, to TOO_DEEP_FAILURES; by more than the
+third, the press ends. A relaxation that fails counts as DEEP_FAILURES. A share is not doubled after the first success
+that follows a failure."""
 MAX_DEEP_UPDATES, DEEP_FAILURES, TOO_DEEP_FAILURES = 6.0, 4, 12
 MULTIPLIER_TOLERANCE = 20.0
 """Tolerance of states that multipliers are updated from, over the full one: two updates do not forget what they began
@@ -91,7 +91,8 @@ class Stepper:
         depth_mm = max(float(path.corners[:, 0].max()), 0.1)
         self._shallow_mm = PENETRATION * depth_mm
         limit_mm = depth_mm if path.body.kind == KINDS["mesh"] else np.inf
-        self._deep_mm, self._deepest_mm = DEEP * limit_mm, MAX_PENETRATION * limit_mm
+        self._deep_mm, self._too_deep_mm = DEEP * limit_mm, TOO_DEEP * limit_mm
+        self._deepest_mm = MAX_PENETRATION * limit_mm
         self._rubs = friction > 0
         self.indenter, self._sticking = pack_indenter(path, friction), pack_indenter(path, STICK_FRICTION)
         self._sticking.centre, self._sticking.rotation = self.indenter.centre, self.indenter.rotation
@@ -213,7 +214,7 @@ class Stepper:
             deepest, most, worst = self.system.deepest(), MAX_MULTIPLIER_UPDATES, FAILURES
             deep = deepest > self._deep_mm
             if deep:
-                most, worst = MAX_DEEP_UPDATES, TOO_DEEP_FAILURES if deepest > self._deepest_mm else DEEP_FAILURES
+                most, worst = MAX_DEEP_UPDATES, TOO_DEEP_FAILURES if deepest > self._too_deep_mm else DEEP_FAILURES
             if done >= most or failures >= worst:
                 break
             before = self.system.saved_contact()

@@ -76,7 +76,7 @@ def compute_trial(
     scale = wp.float64(0.0)
     if lanes.phase[s] == phases.SEARCH:
         scale = lanes.scale[s]
-        if lanes.relaxing[s] == 1:
+        if lanes.relaxing[s] > 0:
             scale = lanes.part[s]
     count = fields.state_u.shape[1]
     if i < count:

@@ -54,8 +54,8 @@ class Lanes:
             det F.
         trial_norm, trial_force, trial_jacobian: of the trial; trial_moved: of a pass, farthest that a node has gone
             from the solution before it, mm; most_moved: how far it may.
-        relaxing: 1 while a step or pass is relaxed (`synth.simulate.newton`); viscosity: θ of the relaxation, else
-            0; part: of the linear step that is tried; trial_error: its error in units of the residual before.
+        relaxing: 1 while a step or pass is relaxed (`synth.simulate.newton`), 2 after a refused step of it; viscosity:
+            its θ, else 0; part: of the linear step that is tried; trial_error: its error over the residual before.
         trial_held_force: norm of the forces on held nodes; held_force: the least that a relaxation must leave of it.
         failures, done, share: of augmented-Lagrangian passes: those that failed, the shares of the others together, and
             the share of the next; new_share: of the one that begins; failed: 1 where the last one did.

@@ -9,6 +9,8 @@ recorded (POLISH); where that fails, the step is halved as if it had not been ta
 state before, so that it does not depend on which states are corrected.
 """
 
+from typing import Any
+
 import warp as wp
 
 from synth.simulate import newton, stepping
@@ -16,46 +18,42 @@ from synth.simulate.batched import lanes as phases
 from synth.simulate.batched.lanes import Lanes, Presses, Settings
 from synth.simulate.distance import KINDS
 
-ZERO, ONE = wp.constant(wp.float64(0.0)), wp.constant(wp.float64(1.0))
-FORCE_FLOOR = wp.constant(wp.float64(newton.FORCE_FLOOR))
-INDIFFERENT = wp.constant(wp.float64(newton.INDIFFERENT))
-SHORTEST, SHORTEST_STEP = (wp.constant(wp.float64(v)) for v in (newton.SHORTEST, stepping.SHORTEST_STEP))
-GROWTH = wp.constant(wp.float64(stepping.GROWTH))
-MAX_ITERATIONS_TO_GROW = wp.constant(stepping.MAX_ITERATIONS_TO_GROW)
-FAILURES = wp.constant(stepping.FAILURES)
-MAX_MULTIPLIER_UPDATES = wp.constant(wp.float64(stepping.MAX_MULTIPLIER_UPDATES))
-PENETRATION = wp.constant(wp.float64(stepping.PENETRATION))
-MESH = wp.constant(KINDS["mesh"])
-DEEP, MAX_PENETRATION = (wp.constant(wp.float64(share)) for share in (stepping.DEEP, stepping.MAX_PENETRATION))
-MAX_DEEP_UPDATES = wp.constant(wp.float64(stepping.MAX_DEEP_UPDATES))
-DEEP_FAILURES, TOO_DEEP_FAILURES = wp.constant(stepping.DEEP_FAILURES), wp.constant(stepping.TOO_DEEP_FAILURES)
-MULTIPLIER_TOLERANCE = wp.constant(wp.float64(stepping.MULTIPLIER_TOLERANCE))
-MAX_CORRECTION_RATIO = wp.constant(wp.float64(stepping.MAX_CORRECTION_RATIO))
-DEEP_CORRECTION_RATIO = wp.constant(wp.float64(stepping.DEEP_CORRECTION_RATIO))
+
+def _doubles(*values: float) -> list[Any]:
+    return [wp.constant(wp.float64(value)) for value in values]
+
+
+ZERO, ONE = _doubles(0.0, 1.0)
 MIN_TOLERANCE = wp.constant(wp.float64(1.0e-12))  # of a pass: somewhat more than rounding leaves
-SUFFICIENT_DECREASE = wp.constant(wp.float64(newton.SUFFICIENT_DECREASE))
-STALL_ITERATIONS = wp.constant(newton.STALL_ITERATIONS)
-STALLED_RESIDUAL = wp.constant(wp.float64(newton.STALLED_RESIDUAL))
-NEAR = wp.constant(wp.float64(newton.NEAR))
-MAX_RELAXED_STEP = wp.constant(wp.float64(stepping.MAX_RELAXED_STEP))
-MAX_STEPS = wp.constant(newton.MAX_STEPS)
-FIRST_VISCOSITY = wp.constant(wp.float64(newton.FIRST_VISCOSITY))
-LEAST_VISCOSITY, MOST_VISCOSITY = (wp.constant(wp.float64(v)) for v in (newton.LEAST_VISCOSITY, newton.MOST_VISCOSITY))
-LEAST_SHARE, LEAST_BORNE = (wp.constant(wp.float64(v)) for v in (newton.LEAST_SHARE, newton.MIN_REACTION_RATIO))
-MAX_ERROR, AIM = wp.constant(wp.float64(newton.MAX_ERROR)), wp.constant(wp.float64(newton.AIM))
-FALL, RISE = wp.constant(wp.float64(newton.FALL)), wp.constant(wp.float64(newton.RISE))
+FORCE_FLOOR, INDIFFERENT, SHORTEST = _doubles(newton.FORCE_FLOOR, newton.INDIFFERENT, newton.SHORTEST)
+SUFFICIENT_DECREASE, STALLED_RESIDUAL = _doubles(newton.SUFFICIENT_DECREASE, newton.STALLED_RESIDUAL)
+NEAR, STALL_ITERATIONS = wp.constant(wp.float64(newton.NEAR)), wp.constant(newton.STALL_ITERATIONS)
+GROWTH, SHORTEST_STEP = _doubles(stepping.GROWTH, stepping.SHORTEST_STEP)
+MAX_ITERATIONS_TO_GROW = wp.constant(stepping.MAX_ITERATIONS_TO_GROW)
+FAILURES, DEEP_FAILURES = wp.constant(stepping.FAILURES), wp.constant(stepping.DEEP_FAILURES)
+TOO_DEEP_FAILURES = wp.constant(stepping.TOO_DEEP_FAILURES)
+MAX_MULTIPLIER_UPDATES, MAX_DEEP_UPDATES = _doubles(stepping.MAX_MULTIPLIER_UPDATES, stepping.MAX_DEEP_UPDATES)
+MULTIPLIER_TOLERANCE, PENETRATION = _doubles(stepping.MULTIPLIER_TOLERANCE, stepping.PENETRATION)
+MESH = wp.constant(KINDS["mesh"])
+DEEP, TOO_DEEP, MAX_PENETRATION = _doubles(stepping.DEEP, stepping.TOO_DEEP, stepping.MAX_PENETRATION)
+MAX_CORRECTION_RATIO, DEEP_CORRECTION_RATIO = _doubles(stepping.MAX_CORRECTION_RATIO, stepping.DEEP_CORRECTION_RATIO)
+MAX_RELAXED_STEP, MAX_STEPS = wp.constant(wp.float64(stepping.MAX_RELAXED_STEP)), wp.constant(newton.MAX_STEPS)
+FIRST_VISCOSITY, LEAST_VISCOSITY = _doubles(newton.FIRST_VISCOSITY, newton.LEAST_VISCOSITY)
+MOST_VISCOSITY, LEAST_SHARE = _doubles(newton.MOST_VISCOSITY, newton.LEAST_SHARE)
+LEAST_BORNE, MAX_ERROR, AIM = _doubles(newton.MIN_REACTION_RATIO, newton.MAX_ERROR, newton.AIM)
+FALL, FALL_AFTER_REFUSAL, RISE = _doubles(newton.FALL, newton.FALL_AFTER_REFUSAL, newton.RISE)
 
 
 @wp.func
-def next_viscosity(viscosity: wp.float64, error: wp.float64) -> wp.float64:
+def next_viscosity(viscosity: wp.float64, error: wp.float64, refused: bool) -> wp.float64:
     """`synth.simulate.newton.next_viscosity`."""
     if error <= MAX_ERROR:
-        taken = viscosity * wp.clamp(error / AIM, FALL, RISE)
+        taken = viscosity * wp.clamp(error / AIM, wp.where(refused, FALL_AFTER_REFUSAL, FALL), RISE)
         if taken < LEAST_VISCOSITY:
             return ZERO
         return taken
-    refused = wp.max(viscosity * wp.clamp(error / AIM, wp.float64(2.0), RISE), LEAST_VISCOSITY)
-    return wp.min(refused, MOST_VISCOSITY)
+    raised = wp.max(viscosity * wp.clamp(error / AIM, wp.float64(2.0), RISE), LEAST_VISCOSITY)
+    return wp.min(raised, MOST_VISCOSITY)
 
 
 @wp.func
@@ -76,7 +74,8 @@ def evaluate_relaxation(lanes: Lanes, s: int, valid: bool):
             lanes.phase[s] = phases.FAILED
     if lanes.phase[s] == phases.SEARCH and lanes.trial_held_force[s] < lanes.held_force[s]:
         lanes.phase[s] = phases.FAILED
-    lanes.viscosity[s] = next_viscosity(lanes.viscosity[s], error)
+    lanes.viscosity[s] = next_viscosity(lanes.viscosity[s], error, lanes.relaxing[s] == 2)
+    lanes.relaxing[s] = wp.where(error <= MAX_ERROR, 1, 2)
 
 
 @wp.kernel
@@ -104,9 +103,9 @@ def evaluate_trial(lanes: Lanes, settings: Settings):
         else:
             lanes.phase[s] = phases.FAILED
         return
-    if phase == phases.START and lanes.relaxing[s] == 1 and lanes.iteration[s] == 0:
+    if phase == phases.START and lanes.relaxing[s] > 0 and lanes.iteration[s] == 0:
         lanes.held_force[s] = LEAST_BORNE * lanes.trial_held_force[s]
-    if phase == phases.SEARCH and lanes.relaxing[s] == 1:
+    if phase == phases.SEARCH and lanes.relaxing[s] > 0:
         evaluate_relaxation(lanes, s, valid)
         if lanes.phase[s] != phases.SEARCH:
             return
@@ -128,7 +127,7 @@ def evaluate_trial(lanes: Lanes, settings: Settings):
     iteration, limit = lanes.iteration[s], lanes.limit[s]
     spent = iteration == 2 * limit or (iteration >= limit and relative > NEAR)
     stalled = iteration >= STALL_ITERATIONS and relative >= STALLED_RESIDUAL
-    if lanes.relaxing[s] == 1:
+    if lanes.relaxing[s] > 0:
         spent = iteration >= MAX_STEPS
         stalled = False
     if phase == phases.RESTORED:
@@ -161,7 +160,7 @@ def finish_solve(lanes: Lanes, presses: Presses, settings: Settings):
     lanes.total[s] = lanes.total[s] + lanes.iteration[s]
     correction = lanes.stage[s] == phases.CORRECTION
     polish = lanes.stage[s] == phases.POLISH
-    relaxed = lanes.relaxing[s] == 1
+    relaxed = lanes.relaxing[s] > 0
     small = lanes.target[s] - lanes.at[s] <= MAX_RELAXED_STEP * settings.longest
     deep = _is_deeper(lanes, presses, s, DEEP)
     if correction:
@@ -249,12 +248,12 @@ def choose_pass(lanes: Lanes, presses: Presses, settings: Settings):
         return
     j = lanes.press[s]
     corrected = presses.kind_of[j, lanes.next[s]] == 2
-    deep, too_deep = _is_deeper(lanes, presses, s, DEEP), _is_deeper(lanes, presses, s, MAX_PENETRATION)
+    deep, too_deep = _is_deeper(lanes, presses, s, DEEP), _is_deeper(lanes, presses, s, TOO_DEEP)
     over = lanes.failures[s] >= FAILURES or lanes.done[s] >= MAX_MULTIPLIER_UPDATES
     if deep:
         failures = wp.where(too_deep, TOO_DEEP_FAILURES, DEEP_FAILURES)
         over = lanes.failures[s] >= failures or lanes.done[s] >= MAX_DEEP_UPDATES
-    if corrected and over and too_deep:
+    if corrected and over and _is_deeper(lanes, presses, s, MAX_PENETRATION):
         lanes.reason[s] = phases.TOO_DEEP
         lanes.phase[s] = phases.ENDED
         return
