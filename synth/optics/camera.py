@@ -1,7 +1,7 @@
-"""The camera: rays from pixels and pixels from points, through the lens, by a mirror and through the window.
+"""The camera's geometry: rays from pixels and pixels from points, through the lens, by a mirror and through the window.
 
 A path says how a pixel sees: 0 straight through the window, k by mirror k - 1, -1 not at all. With mirrors one material
-point may be seen in several places of one image, one for each path; a camera without mirrors has path 0 alone.
+point may be seen in several places of one image, one for each path. Noise is made in `synth.render.camera_image`.
 """
 
 from dataclasses import dataclass
