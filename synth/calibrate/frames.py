@@ -1,4 +1,4 @@
-"""Frames of a user's sensor: read, made linear, averaged."""
+"""Frames of a user's sensor: read, and the median taken of them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,14 +10,14 @@ from synth.arrays import FloatArray
 from synth.errors import InputError
 
 _SAME = 6.0
-"""Levels of 255 by which frames of one undeformed gel may differ on average."""
+"""Levels of 255 by which half of a frame may differ from the median of all."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """What the frames show together: (H, W, 3) float64 RGB in [0, 1], the mean of all, and one with all of its noise.
+    """What the frames show together: (H, W, 3) float64 RGB in [0, 1], their median, and one with all of its noise.
 
-    `step` is that of one level of quantisation, full scale 1.
+    The median of three or more shows no contact of a few. `step` is that of one level of quantisation, full scale 1.
     """
 
     encoded: FloatArray
@@ -30,7 +30,7 @@ class Frames:
 
 
 def read_frames(paths: Sequence[Path]) -> Frames:
-    """Frames of one sensor with its gel undeformed, of 8 or 16 bits; grey ones get three equal channels.
+    """Frames of one sensor with its gel at rest or pressed at different places, of 8 or 16 bits, grey or in colour.
 
     InputError where none is given, one is missing or no image, sizes differ, or frames show different things.
     """
@@ -51,13 +51,15 @@ def read_frames(paths: Sequence[Path]) -> Frames:
             raise InputError(
                 f"{path}: has {_size(images[-1])} pixels, {paths[0]} has {_size(images[0])}; give one size"
             )
-        difference = 255 * float(np.abs(images[-1] - images[0]).mean())
+    together = np.median(images, axis=0)
+    for path, image in zip(paths, images, strict=True):
+        difference = 255 * float(np.median(np.abs(image - together)))
         if difference > _SAME:
             raise InputError(
-                f"{path}: differs from {paths[0]} by {difference:.1f} of 255 on average (allowed are {_SAME:g}); "
-                "all frames must show the same undeformed gel"
+                f"{path}: half of it differs from the frames' median by {difference:.1f} of 255 and more (allowed are "
+                f"{_SAME:g}); all frames must show the same gel, at rest or pressed at different places"
             )
-    return Frames(np.mean(images, axis=0), images[0], max(steps))
+    return Frames(together, images[0], max(steps))
 
 
 def _size(image: FloatArray) -> str:
