@@ -63,11 +63,14 @@ class PadMesh:
         return faces[~self.bonded[faces].all(axis=1)]
 
     @cached_property
+    def coated(self) -> Triangles:
+        """(k, 3) int32 into `points`: the contact face's triangles, normals pointing out."""
+        return self._boundary[self.on_face[self._boundary].all(axis=1)]
+
+    @cached_property
     def spacing_mm(self) -> float:
         """Length of the contact face's short edges, their 10 % quantile: what the finest part resolves."""
-        faces = self._boundary
-        faces = faces[self.on_face[faces].all(axis=1)]
-        edges = self.points[faces] - self.points[np.roll(faces, 1, axis=1)]
+        edges = self.points[self.coated] - self.points[np.roll(self.coated, 1, axis=1)]
         return float(np.quantile(np.linalg.norm(edges, axis=2), 0.1))
 
     @cached_property

@@ -15,7 +15,7 @@ from benchmarks.focused_mesh import around_focus
 from synth.arrays import FloatArray
 from synth.mesh import Focus, PadMesh, check_mesh, default_edge_length, mesh_key, pad_mesh
 from synth.mesh.pad import boundary_faces, signed_volumes
-from synth.mesh.tetrahedralise import GRADING, WORST_SHAPE, _fault, _repair, _sides, shape_quality, tetrahedralise_box
+from synth.mesh.tetrahedralise import GRADING, WORST_SHAPE, _fault, _repair, box_sides, shape_quality, tetrahedralise_box
 from synth.scene import Gel, Layer, Numerics
 
 SIZE = (7.0, 5.0, 2.5)
@@ -99,14 +99,14 @@ def test_quality_and_volume_of_known_tetrahedra_and_the_hash_names_the_content(p
 
 
 def fault(points: FloatArray, tets: np.ndarray) -> str:
-    return _fault(points, tets, _sides(SIZE), float(np.prod(SIZE)), 1e-9)
+    return _fault(points, tets, box_sides(SIZE), float(np.prod(SIZE)), 1e-9)
 
 
 def test_repair_snaps_turns_and_drops_and_faults_are_named() -> None:
     exact = brick(SIZE, (3, 2, 2))
     noise = 1e-3 * np.random.default_rng(1).uniform(-1, 1, exact.points.shape)
     points = np.concatenate([exact.points + noise, [[9.0, 9.0, 9.0]]])  # the last vertex belongs to no tetrahedron
-    points, tets = _repair(points, exact.tets[:, [0, 2, 1, 3]], _sides(SIZE), 0.02)
+    points, tets = _repair(points, exact.tets[:, [0, 2, 1, 3]], box_sides(SIZE), 0.02)
     assert len(points) == len(exact.points)
     assert (signed_volumes(points, tets) > 0).all()
     on_low, on_high = exact.points == exact.points.min(axis=0), exact.points == exact.points.max(axis=0)
@@ -166,7 +166,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return calls
 
 
-def test_made_once_and_read_bitwise_but_refused_with_layers(tmp_path: Path, made: list[float]) -> None:
+def test_made_once_and_read_bitwise_with_and_without_layers(tmp_path: Path, made: list[float]) -> None:
     first = pad_mesh(GEL, NUMERICS, [tmp_path])
     again = pad_mesh(GEL, NUMERICS, [tmp_path])
     assert made == [1.5]
@@ -175,8 +175,13 @@ def test_made_once_and_read_bitwise_but_refused_with_layers(tmp_path: Path, made
     assert again.tets.dtype == np.int32
     assert again.hash == first.hash
     assert [path.name for path in tmp_path.iterdir()] == [f"{mesh_key(GEL, NUMERICS)}.npz"]  # nothing left aside
-    layered = GEL.model_copy(update={"layers": (Layer(thickness_mm=0.1, youngs_modulus_kpa=900.0),)})
-    refused("cannot follow layers", pad_mesh, layered, NUMERICS, [tmp_path])
+    film = GEL.model_copy(update={"layers": (Layer(thickness_mm=0.1, youngs_modulus_kpa=900.0),)})
+    layered = pad_mesh(film, NUMERICS, [tmp_path])
+    below = layered.points[layered.tets[layered.layer == 0]][:, :, 2]
+    assert (below.min(), below.max()) == pytest.approx((0.0, 0.1), abs=1e-12)
+    assert layered.volumes[layered.layer == 0].sum() == pytest.approx(0.1 * 4 * 4, rel=1e-12)
+    assert layered.volumes.sum() == pytest.approx(4 * 4 * 3, rel=1e-12)
+    assert made == [1.5]
 
 
 @pytest.mark.parametrize("damage", ["empty", "cut", "flipped", "text", "no tets"])
