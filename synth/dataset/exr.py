@@ -19,7 +19,7 @@ Reference: OpenEXR file layout, https://openexr.com/en/latest/OpenEXRFileLayout.
 import contextlib
 import io
 import os
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -70,11 +70,6 @@ OPTIONAL: dict[str, tuple[tuple[str, ...], str]] = {
 """Names of channels, and their unit, frame, state and image, by the key of `[outputs]` that asks for them."""
 
 
-def meanings(written: Collection[str]) -> dict[str, str]:
-    """Header attributes for the optional channels among those that a file holds."""
-    return {f"channels.{key}": meaning for key, (names, meaning) in OPTIONAL.items() if set(names) <= set(written)}
-
-
 def write_flow(path: Path, flow: FlowField, attributes: Mapping[str, str | int]) -> None:
     """Writes a flow field in the place of an older file; the same field and attributes give the same bytes.
 
@@ -86,7 +81,8 @@ def write_flow(path: Path, flow: FlowField, attributes: Mapping[str, str | int])
     planes = channels_of(flow)
     planes |= {alias: planes[name] for alias, name in ALIASES.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    header |= {**CONVENTIONS, **meanings(planes), **attributes}
+    meanings = {f"channels.{key}": meaning for key, (names, meaning) in OPTIONAL.items() if set(names) <= set(planes)}
+    header |= {**CONVENTIONS, **meanings, **attributes}
     try:
         OpenEXR.File(header, planes).write(str(path))
     except RuntimeError as error:  # How the library reports a failing disk.

@@ -17,7 +17,7 @@ import numpy as np
 
 from synth.arrays import BoolArray, FloatArray, Points, Projection, Tets, Triangles
 from synth.errors import InputError
-from synth.mesh.pad import PadMesh
+from synth.mesh.pad import PadMesh, barycentric_gradients
 
 FILM = 2
 """At least so many elements through each layer; more where it is thicker than as many edges of the face are long."""
@@ -31,7 +31,7 @@ def elements_through(layers_mm: Sequence[float], edge_mm: float) -> list[int]:
 
 
 def layered(mesh: PadMesh, sides: Sequence[Projection], layers_mm: Sequence[float]) -> PadMesh:
-    """A gel's mesh with layers of these thicknesses, from the contact face inward; the mesh itself where there are none.
+    """A gel's mesh with layers of these thicknesses, from the contact face inward; the mesh itself for none.
 
     `sides` are projections onto the parts of the gel's boundary, the window and then the contact face last. InputError
     where the layers leave no room for elements.
@@ -48,7 +48,8 @@ def layered(mesh: PadMesh, sides: Sequence[Projection], layers_mm: Sequence[floa
     depth = np.cumsum([0.0, *np.divide(layers_mm, elements)[layer]])[:-1, None, None]
     planes = mesh.points[nodes] + depth / thickness * (moved[nodes] - mesh.points[nodes])
     numbers = np.vstack([len(moved) + np.arange(len(layer) * len(nodes)).reshape(len(layer), -1), nodes])
-    prisms = [_prisms(coated.reshape(-1, 3), *pair) for pair in pairwise(numbers)]
+    faces = coated.reshape(-1, 3).astype(np.int32)
+    prisms = [_prisms(faces, *pair) for pair in pairwise(numbers)]
     found = PadMesh(
         np.concatenate([moved, planes.reshape(-1, 3)]),
         np.concatenate([mesh.tets, *prisms]).astype(np.int32),
@@ -58,7 +59,7 @@ def layered(mesh: PadMesh, sides: Sequence[Projection], layers_mm: Sequence[floa
     )
     if found.volumes.min() <= 0:
         raise InputError(
-            f"sensor.gel.layers: {thickness:.3g} mm of layers leave no room for the elements below them where the gel is "
+            f"sensor.gel.layers: {thickness:.3g} mm of layers leave no room for elements below them where the gel is "
             "thinnest or most curved; make them thinner, or try another numerics.edge_length_mm"
         )
     return found
@@ -79,10 +80,8 @@ def _room(mesh: PadMesh, window: Projection, thickness: float) -> FloatArray:
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     moved = -thickness * normals / np.where(length > 0, length, 1.0)
     free = (length[:, 0] == 0) & ~_lies_on(window, mesh.points)
-    corners = mesh.points[mesh.tets]
-    slopes = np.linalg.inv(corners[:, 1:] - corners[:, :1])  # columns: of the last three corners' shape functions
-    slopes = np.concatenate([-slopes.sum(axis=2, keepdims=True), slopes], axis=2)
-    values = mesh.volumes[:, None, None] * (np.swapaxes(slopes, 1, 2) @ slopes)
+    slopes = barycentric_gradients(mesh.points, mesh.tets)
+    values = mesh.volumes[:, None, None] * (slopes @ np.swapaxes(slopes, 1, 2))
     places = np.repeat(mesh.tets, 4, axis=1).ravel(), np.tile(mesh.tets, 4).ravel()
     matrix = coo_array((values.ravel(), places)).tocsr()[free]
     moved[free] = splu(matrix[:, free].tocsc()).solve(-(matrix @ moved))

@@ -115,6 +115,14 @@ def signed_volumes(points: Points, tets: Tets) -> FloatArray:
     return np.asarray(np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) / 6)
 
 
+def barycentric_gradients(points: Points, tets: Tets) -> FloatArray:
+    """(m, 4, 3) float64 1/mm: gradients of the four barycentric coordinates in the undeformed tetrahedra."""
+    corner = points[tets]
+    inverse = np.linalg.inv(corner[:, 1:] - corner[:, :1])  # columns are the gradients of coordinates 1..3
+    gradients = np.swapaxes(inverse, 1, 2)
+    return np.concatenate([-gradients.sum(axis=1, keepdims=True), gradients], axis=1)
+
+
 def boundary_faces(tets: Tets) -> Triangles:
     """(k, 3) int32: faces of exactly one tetrahedron, normals pointing out."""
     faces = tets[:, _FACES_OF_TET].reshape(-1, 3)

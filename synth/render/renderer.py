@@ -17,17 +17,16 @@ from typing import Any
 import numpy as np
 
 from synth.arrays import Image, Points
-from synth.errors import InputError
 from synth.render.camera_image import PILOT, needed_samples
 from synth.render.camera_rays import CameraRays, pinhole
 from synth.render.chart import Chart, chart_of
 from synth.render.coating import reflection
 from synth.render.gel_mesh import GelMesh
-from synth.render.lights import all_lights, check_view, emitters, panels, reflecting_plane
+from synth.render.lights import all_lights, emitters, panels, reflecting_plane
 from synth.render.path_tracer import PathTracer
 from synth.render.pattern import is_grey
 from synth.render.separated_light import SeparatedLight, is_separated
-from synth.render.thin_lens import ThinLens
+from synth.render.thin_lens import check_views
 from synth.render.variant import Variant
 from synth.scene import Render, Sensor
 from synth.surface import GelSurface
@@ -62,12 +61,9 @@ class Renderer:
         if variant.is_mono and not is_grey(sensor):
             raise ValueError(f"{variant.name} renders grey sensors only: choose the variant with grey=is_grey(sensor)")
         self._variant, self._views = variant, sensor.views
-        for name, view in self._views.items():
-            if name:
-                _check_further(name, view)
         separated = is_separated(render, sensor.coating, variant)  # every light at every sample
         mi = variant.load()
-        check_view(sensor)
+        check_views(sensor)
         refracts = sensor.window.refractive_index != 1
         self._behind = reflecting_plane(sensor) if variant.is_vectorised else None
         lights = all_lights(sensor) if variant.is_vectorised else sensor.lights
@@ -267,15 +263,6 @@ def _window(sensor: Sensor, mi: Any) -> dict[str, Any]:
             "specular_reflectance": {"type": "rgb", "value": 0.0},
         },
     }
-
-
-def _check_further(name: str, view: Sensor) -> None:
-    """Refuse what is wrong with a further camera, naming it; `emitters` and `CameraRays` look after the main one."""
-    try:
-        check_view(view)
-        ThinLens.of(view)
-    except InputError as error:
-        raise InputError(f"sensor.further_cameras {name!r}: {error}") from error
 
 
 def _mitsuba_seed(seed: int, part: int, camera: int) -> int:

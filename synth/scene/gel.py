@@ -137,7 +137,9 @@ class Gel(Part):
     def _layered(self) -> "Gel":
         covered = sum(layer.thickness_mm for layer in self.layers)
         if covered >= self.depth_mm:
-            raise ValueError(f"layers are {covered:.4g} mm thick together and leave nothing of the gel's {self.depth_mm} mm")
+            raise ValueError(
+                f"layers are {covered:.4g} mm thick together and leave nothing of the gel's {self.depth_mm} mm"
+            )
         if self.layers and self.poisson_ratio < 0.3:
             raise ValueError(f"poisson_ratio = {self.poisson_ratio}: a layered pad needs at least 0.3")
         return self

@@ -61,10 +61,6 @@ class Plate:
         matrix = np.eye(3) - 2 * np.outer(self.normal, self.normal)
         return (points - self.corners[0]) @ matrix + self.corners[0]
 
-    def is_before(self, point: FloatArray) -> bool:
-        """Whether a point (3,) is on the reflecting side."""
-        return bool((point - self.corners[0]) @ self.normal > 0)
-
     def crossing(self, start: FloatArray, end: Points) -> Points:
         """Where the lines from start to end meet the plane: the place that divides them as their heights."""
         a, b = (start - self.corners[0]) @ self.normal, (end - self.corners[0]) @ self.normal
@@ -188,7 +184,7 @@ class ForwardCamera:
                 free &= ~plate.crossed(self.eye, aim)
             return free
         own = self.plates[path - 1]
-        free &= own.crossed(self.eye, aim) & own.is_before(self.eye)
+        free &= own.crossed(self.eye, aim) & bool((self.eye - own.corners[0]) @ own.normal > 0)
         turn = own.crossing(self.eye, aim)
         end = own.reflected(aim)
         for plate in self.plates:

@@ -15,7 +15,15 @@ from benchmarks.focused_mesh import around_focus
 from synth.arrays import FloatArray
 from synth.mesh import Focus, PadMesh, check_mesh, default_edge_length, mesh_key, pad_mesh
 from synth.mesh.pad import boundary_faces, signed_volumes
-from synth.mesh.tetrahedralise import GRADING, WORST_SHAPE, _fault, _repair, box_sides, shape_quality, tetrahedralise_box
+from synth.mesh.tetrahedralise import (
+    GRADING,
+    WORST_SHAPE,
+    _fault,
+    _repair,
+    box_sides,
+    shape_quality,
+    tetrahedralise_box,
+)
 from synth.scene import Gel, Layer, Numerics
 
 SIZE = (7.0, 5.0, 2.5)
