@@ -23,8 +23,10 @@ import numpy as np
 
 from synth.arrays import FloatArray, Image
 from synth.errors import InputError
+from synth.mesh import face_of
+from synth.mesh.cad import CadFace
 from synth.optics import Optics
-from synth.render.chart import RoundChart, chart_of
+from synth.render.chart import RoundChart, chart_of, texture_coordinates
 from synth.render.marks import marks_coverage
 from synth.scene import Bitmap, Dots, NoPattern, RandomColor, Sensor, Speckle
 
@@ -51,7 +53,11 @@ def albedo(sensor: Sensor, rng: np.random.Generator, folder: Path | None = None)
         case Dots() | Speckle() as pattern:
             colors, coverage = np.array(pattern.reflectance), marks_coverage(pattern, chart_of(sensor), x, y, rng)
         case Bitmap() as pattern:
-            colors, coverage = laid_over(pattern, read_picture(pattern, folder or Path()), x, y)
+            picture = read_picture(pattern, folder or Path())
+            if pattern.placing == "uv":
+                colors, coverage = wrapped(picture, texture_coordinates(sensor, folder or Path(), x, y))
+            else:
+                colors, coverage = laid_over(pattern, picture, x, y)
             colors = colors * coating
         case RandomColor() as pattern:
             return _clipped(_random_colors(pattern, x, y, rng) * coating)
@@ -86,6 +92,8 @@ def check_pattern(sensor: Sensor, folder: Path) -> None:
     """Find out whether `albedo` could paint a sensor's pattern, without painting it; InputError where it could not."""
     if isinstance(sensor.pattern, Bitmap):
         read_picture(sensor.pattern, folder)
+        if isinstance(face := face_of(sensor.gel, folder), CadFace) and sensor.pattern.placing == "uv":
+            face.textured()
     if not isinstance(sensor.pattern, NoPattern):
         _texels(sensor)
 
@@ -248,21 +256,42 @@ def laid_over(pattern: Bitmap, picture: Image, x: FloatArray, y: FloatArray) -> 
     Colours (rows, columns, 3), linear, and the share of each texel that is painted (rows, columns). Where nothing is,
     the colour is the picture's mean, so that interpolated edges have no fringe.
     """
-    import cv2
-    from scipy.ndimage import map_coordinates
-
-    rows, columns = picture.shape[:2]
-    height_mm = pattern.width_mm * rows / columns
+    width_mm = pattern.width_mm or 0.0
+    height_mm = width_mm * picture.shape[0] / picture.shape[1]
     texel = max(x[1] - x[0], y[1] - y[0])
-    wanted = (max(1, min(columns, round(pattern.width_mm / texel))), max(1, min(rows, round(height_mm / texel))))
-    coarse = cv2.resize(picture, wanted, interpolation=cv2.INTER_AREA)
     angle = np.radians(pattern.rotation_deg)
     dx, dy = x[None] - pattern.offset_mm[0], y[:, None] - pattern.offset_mm[1]
     across, down = dx * np.cos(angle) + dy * np.sin(angle), dy * np.cos(angle) - dx * np.sin(angle)
-    place = [(down / height_mm + 0.5) * wanted[1] - 0.5, (across / pattern.width_mm + 0.5) * wanted[0] - 0.5]
-    values = [map_coordinates(coarse[:, :, k], place, output=np.float64, order=1, mode="nearest") for k in range(4)]
-    inside = np.minimum(pattern.width_mm / 2 - np.abs(across), height_mm / 2 - np.abs(down))
-    painted = values[3] * np.clip(inside / texel + 0.5, 0, 1)
+    inside = np.minimum(width_mm / 2 - np.abs(across), height_mm / 2 - np.abs(down))
+    place = across / width_mm + 0.5, down / height_mm + 0.5
+    return _sampled(picture, (width_mm / texel, height_mm / texel), place, np.clip(inside / texel + 0.5, 0, 1))
+
+
+def wrapped(picture: Image, coordinates: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """As of `laid_over`, by texture coordinates u and v (rows, columns, 2), v upward; NaN where there is no face."""
+    across, down = coordinates[..., 0], 1 - coordinates[..., 1]
+    steps = [float(np.nanmedian(np.hypot(*np.gradient(place)))) for place in (across, down)]
+    inside = np.isfinite(across)
+    place = np.where(inside, across, 0.0), np.where(inside, down, 0.0)
+    return _sampled(picture, (1 / steps[0], 1 / steps[1]), place, inside.astype(float))
+
+
+def _sampled(
+    picture: Image, texels: tuple[float, float], place: tuple[FloatArray, FloatArray], inside: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """What `laid_over` returns, from places across and down the picture, each 0 to 1, and the share of a texel inside.
+
+    The picture covers so many texels across and down.
+    """
+    import cv2
+    from scipy.ndimage import map_coordinates
+
+    sides = picture.shape[1::-1]
+    wanted = [max(1, min(side, round(count))) for side, count in zip(sides, texels, strict=True)]
+    coarse = cv2.resize(picture, wanted, interpolation=cv2.INTER_AREA)
+    at = [place[1] * wanted[1] - 0.5, place[0] * wanted[0] - 0.5]
+    values = [map_coordinates(coarse[:, :, k], at, output=np.float64, order=1, mode="nearest") for k in range(4)]
+    painted = values[3] * inside
     total = picture.sum(axis=(0, 1), dtype=np.float64)
     colors = np.broadcast_to(total[:3] / max(total[3], 1.0), (*painted.shape, 3)).copy()
     seen = values[3] > 1e-6
