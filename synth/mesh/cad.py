@@ -13,8 +13,6 @@ from synth.scene.gel_file import UNITS_MM, GelSurfaces, distance, gel_surfaces, 
 
 ON_MM = 1e-6
 """Distance at which a node lies on a surface."""
-TEXTURED_MM = 1e-3
-"""Distance from the cleaned face at which a triangle of the file is part of it."""
 
 
 @dataclass(frozen=True)
@@ -54,9 +52,9 @@ class CadFace:
         return [lambda points: np.column_stack([points[:, :2], np.full(len(points), found.top_mm)]), *parts]
 
     def textured(self) -> tuple[Points, Triangles, FloatArray]:
-        """Corners (n, 3) mm and triangles (m, 3) of the coated face, and texture coordinates (n, 2); seams are apart.
+        """Corners (n, 3) mm and triangles (m, 3) of outer, and texture coordinates (n, 2); seams are apart.
 
-        InputError where outer's file has no such coordinates.
+        InputError where the file has no such coordinates.
         """
         import pyvista as pv
 
@@ -68,8 +66,7 @@ class CadFace:
             )
         points = UNITS_MM[self.unit] * np.asarray(read.points, float) * [1, -1, 1]
         points += self.surfaces.outer.points.min(axis=0) - points[faces].min(axis=(0, 1))
-        coated = distance(self.surfaces.face, points[faces].mean(axis=1)) <= TEXTURED_MM
-        return points, faces[coated].astype(np.int32), np.asarray(places, float)
+        return points, faces.astype(np.int32), np.asarray(places, float)
 
     def triangles(self, edge_mm: float) -> tuple[Points, Triangles]:
         """Triangles whose winding number is 1 in the gel and less elsewhere: outer's, and the window's turned over."""

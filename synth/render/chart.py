@@ -87,7 +87,7 @@ def chart_of(sensor: Sensor) -> Chart:
 def texture_coordinates(sensor: Sensor, folder: Path, x: FloatArray, y: FloatArray) -> FloatArray:
     """(rows, columns, 2) u and v of a gel's file at texel centres x (columns,) and y (rows,) mm; NaN beside the face.
 
-    Each texel looks from the axis, or from the hemisphere's centre, at the face. InputError as of `CadFace.textured`.
+    Each texel looks from outside at the axis, or at the hemisphere's centre. InputError as of `CadFace.textured`.
     """
     from synth.flow.trace import trace
 
@@ -96,8 +96,8 @@ def texture_coordinates(sensor: Sensor, folder: Path, x: FloatArray, y: FloatArr
     found = []
     for strip in np.array_split(y, -(-len(y) // _ROWS)):
         across, down = (axis.ravel() for axis in np.meshgrid(x, strip))
-        ends = chart.points(np.hypot(across, down), np.arctan2(down, across))
-        starts = np.maximum(ends, chart.radius) * (0.0, 0.0, 1.0)
-        hits = trace(points, triangles, starts, (ends - starts) / chart.radius)
+        on = chart.points(np.hypot(across, down), np.arctan2(down, across))
+        outward = (on - np.maximum(on, chart.radius) * (0.0, 0.0, 1.0)) / chart.radius
+        hits = trace(points, triangles, on + 2 * chart.end * outward, -outward)
         found.append(hits.interpolate(triangles, places))
     return np.concatenate(found).reshape(len(y), len(x), 2)

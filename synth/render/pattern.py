@@ -55,9 +55,11 @@ def albedo(sensor: Sensor, rng: np.random.Generator, folder: Path | None = None)
         case Bitmap() as pattern:
             picture = read_picture(pattern, folder or Path())
             if pattern.placing == "uv":
-                colors, coverage = wrapped(picture, texture_coordinates(sensor, folder or Path(), x, y))
+                u, v = np.moveaxis(texture_coordinates(sensor, folder or Path(), x, y), 2, 0)
+                place = u, 1 - v, np.isfinite(u).astype(float)
             else:
-                colors, coverage = laid_over(pattern, picture, x, y)
+                place = _placed(pattern, picture.shape[0] / picture.shape[1], x, y)
+            colors, coverage = laid_over(picture, *place)
             colors = colors * coating
         case RandomColor() as pattern:
             return _clipped(_random_colors(pattern, x, y, rng) * coating)
@@ -250,46 +252,32 @@ def read_picture(pattern: Bitmap, folder: Path) -> Image:
     return np.concatenate([_linear(values[:, :, 2::-1]) * opacity, opacity], axis=2)
 
 
-def laid_over(pattern: Bitmap, picture: Image, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """What a picture puts on the face, at texel centres x (columns,) and y (rows,) mm, both even.
-
-    Colours (rows, columns, 3), linear, and the share of each texel that is painted (rows, columns). Where nothing is,
-    the colour is the picture's mean, so that interpolated edges have no fringe.
-    """
-    width_mm = pattern.width_mm or 0.0
-    height_mm = width_mm * picture.shape[0] / picture.shape[1]
-    texel = max(x[1] - x[0], y[1] - y[0])
+def _placed(pattern: Bitmap, tall: float, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Places of `laid_over` for a picture that is so many times as high as wide; texel centres x and y are even."""
+    width_mm, texel = pattern.width_mm or 0.0, max(x[1] - x[0], y[1] - y[0])
     angle = np.radians(pattern.rotation_deg)
     dx, dy = x[None] - pattern.offset_mm[0], y[:, None] - pattern.offset_mm[1]
     across, down = dx * np.cos(angle) + dy * np.sin(angle), dy * np.cos(angle) - dx * np.sin(angle)
-    inside = np.minimum(width_mm / 2 - np.abs(across), height_mm / 2 - np.abs(down))
-    place = across / width_mm + 0.5, down / height_mm + 0.5
-    return _sampled(picture, (width_mm / texel, height_mm / texel), place, np.clip(inside / texel + 0.5, 0, 1))
+    inside = np.minimum(width_mm / 2 - np.abs(across), tall * width_mm / 2 - np.abs(down))
+    return across / width_mm + 0.5, down / (tall * width_mm) + 0.5, np.clip(inside / texel + 0.5, 0, 1)
 
 
-def wrapped(picture: Image, coordinates: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """As of `laid_over`, by texture coordinates u and v (rows, columns, 2), v upward; NaN where there is no face."""
-    across, down = coordinates[..., 0], 1 - coordinates[..., 1]
-    steps = [float(np.nanmedian(np.hypot(*np.gradient(place)))) for place in (across, down)]
-    inside = np.isfinite(across)
-    place = np.where(inside, across, 0.0), np.where(inside, down, 0.0)
-    return _sampled(picture, (1 / steps[0], 1 / steps[1]), place, inside.astype(float))
-
-
-def _sampled(
-    picture: Image, texels: tuple[float, float], place: tuple[FloatArray, FloatArray], inside: FloatArray
+def laid_over(
+    picture: Image, across: FloatArray, down: FloatArray, inside: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """What `laid_over` returns, from places across and down the picture, each 0 to 1, and the share of a texel inside.
+    """What a picture puts on texels, by their places across and down it, each 0 to 1, and their shares inside it.
 
-    The picture covers so many texels across and down.
+    Colours (rows, columns, 3), linear, and the share of each texel that is painted (rows, columns). Where nothing is,
+    the colour is the picture's mean, so that interpolated edges have no fringe. Places may be NaN where nothing is.
     """
     import cv2
     from scipy.ndimage import map_coordinates
 
-    sides = picture.shape[1::-1]
-    wanted = [max(1, min(side, round(count))) for side, count in zip(sides, texels, strict=True)]
+    sides, places = picture.shape[1::-1], (across, down)
+    steps = [float(np.nanmedian(np.hypot(*np.gradient(place)))) for place in places]  # of the picture, per texel
+    wanted = [max(1, min(side, round(1 / step))) for side, step in zip(sides, steps, strict=True)]
     coarse = cv2.resize(picture, wanted, interpolation=cv2.INTER_AREA)
-    at = [place[1] * wanted[1] - 0.5, place[0] * wanted[0] - 0.5]
+    at = [np.nan_to_num(place) * count - 0.5 for place, count in zip(places, wanted, strict=True)][::-1]
     values = [map_coordinates(coarse[:, :, k], at, output=np.float64, order=1, mode="nearest") for k in range(4)]
     painted = values[3] * inside
     total = picture.sum(axis=(0, 1), dtype=np.float64)
