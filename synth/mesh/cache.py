@@ -75,7 +75,7 @@ def pad_mesh(
         if _read(path, gel, face) is None:
             _write(path, mesh)
     sides = box_sides(gel.size_mm) if isinstance(face, PadFace) else face.sides
-    return domed(layered(mesh, sides, [layer.thickness_mm for layer in gel.layers]), gel.dome_radius_mm)
+    return domed(layered(mesh, sides, gel.layers_mm), gel.dome_radius_mm)
 
 
 def _made(gel: Gel, face: Face, edge_mm: float) -> PadMesh:

@@ -17,16 +17,15 @@ import numpy as np
 
 from synth.arrays import BoolArray, FloatArray, Points, Projection, Tets, Triangles
 from synth.errors import InputError
+from synth.mesh.graded import FILM
 from synth.mesh.pad import PadMesh, barycentric_gradients
 
-FILM = 2
-"""At least so many elements through each layer; more where it is thicker than as many edges of the face are long."""
 ON_SIDE_MM = 1e-6
 """Distance from a side at which a vertex lies on it."""
 
 
 def elements_through(layers_mm: Sequence[float], edge_mm: float) -> list[int]:
-    """Elements through each of the layers of a mesh with such edges on its contact face."""
+    """Elements through each layer of a mesh with such edges on its contact face, about as high as these are long."""
     return [max(FILM, round(thickness / edge_mm)) for thickness in layers_mm]
 
 

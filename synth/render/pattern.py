@@ -132,37 +132,24 @@ def pixels_per_mm(sensor: Sensor) -> float:
 
 def _scale(optics: Optics, sensor: Sensor) -> float:
     """Largest stretch of the map from the contact face to pixels, in px per mm; 0 where nothing is seen."""
-    chart = chart_of(sensor)
+    chart, arms = chart_of(sensor), list(_STEP_MM * np.eye(3)[:2])
     if isinstance(chart, RoundChart):
-        return _round_scale(optics, chart)
-    pixels = optics.project(np.zeros((1, 3)))
-    if not optics.is_inside(pixels).all():
-        edges = (np.linspace(0, side, 13) for side in (sensor.camera.width, sensor.camera.height))
-        pixels = np.column_stack([axis.ravel() for axis in np.meshgrid(*edges)])
-    rays = optics.look(pixels)
-    points = rays.on_flat_face
-    with np.errstate(invalid="ignore"):
-        seen = np.all(np.abs(points[:, :2]) <= np.array(sensor.gel.size_mm[:2]) / 2, axis=1)
-    if not seen.any():
-        return 0.0
-    points, path = points[seen], rays.path[seen]
-    moved = [
-        (optics.project(points + arm, path) - optics.project(points - arm, path)) / (2 * _STEP_MM)
-        for arm in _STEP_MM * np.eye(3)[:2]
-    ]
-    return _largest_stretch(np.stack(moved, axis=2))
-
-
-def _round_scale(optics: Optics, chart: RoundChart) -> float:
-    """As `_scale`, at a grid of arcs and azimuths."""
-    arc, azimuth = (axis.ravel() for axis in np.meshgrid(np.linspace(0.02, 0.98, 25) * chart.end, np.arange(25) / 4))
-    turn = _STEP_MM / chart.across(arc)
-    inside = optics.is_inside(optics.project(chart.points(arc, azimuth)))
-    moved = [
-        optics.project(chart.points(arc + along, azimuth + aside * turn)) / (2 * _STEP_MM)
-        for along, aside in ((_STEP_MM, 0), (-_STEP_MM, 0), (0, 1), (0, -1))
-    ]
-    return _largest_stretch(np.stack([moved[0] - moved[1], moved[2] - moved[3]], axis=2)[inside])
+        arc, azimuth = (a.ravel() for a in np.meshgrid(np.linspace(0.02, 0.98, 25) * chart.end, np.arange(25) / 4))
+        points, path = chart.points(arc, azimuth), np.zeros(len(arc), dtype=int)
+        ends = (arc + _STEP_MM, azimuth), (arc, azimuth + _STEP_MM / chart.across(arc))
+        arms = [chart.points(*end) - points for end in ends]
+        seen = optics.is_inside(optics.project(points))
+    else:
+        pixels = optics.project(np.zeros((1, 3)))
+        if not optics.is_inside(pixels).all():
+            edges = (np.linspace(0, side, 13) for side in (sensor.camera.width, sensor.camera.height))
+            pixels = np.column_stack([axis.ravel() for axis in np.meshgrid(*edges)])
+        rays = optics.look(pixels)
+        points, path = rays.on_flat_face, rays.path
+        with np.errstate(invalid="ignore"):
+            seen = np.all(np.abs(points[:, :2]) <= np.array(sensor.gel.size_mm[:2]) / 2, axis=1)
+    moved = [(optics.project(points + arm, path) - optics.project(points - arm, path)) / (2 * _STEP_MM) for arm in arms]
+    return _largest_stretch(np.stack(moved, axis=2)[seen])
 
 
 def _largest_stretch(jacobian: FloatArray) -> float:

@@ -108,6 +108,11 @@ class Gel(Part):
         """Thickness of the gel, of a domed pad that at the apex."""
         return self.thickness_mm or self.size_mm[2]
 
+    @property
+    def layers_mm(self) -> tuple[float, ...]:
+        """Thicknesses of the layers."""
+        return tuple(layer.thickness_mm for layer in self.layers)
+
     @model_validator(mode="after")
     def _shaped(self) -> "Gel":
         needed = _NEEDED[self.shape]
@@ -135,7 +140,7 @@ class Gel(Part):
 
     @model_validator(mode="after")
     def _layered(self) -> "Gel":
-        covered = sum(layer.thickness_mm for layer in self.layers)
+        covered = sum(self.layers_mm)
         if covered >= self.depth_mm:
             raise ValueError(
                 f"layers are {covered:.4g} mm thick together and leave nothing of the gel's {self.depth_mm} mm"
