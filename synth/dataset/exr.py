@@ -43,10 +43,6 @@ CONVENTIONS = {
 _PARTS = ("U", "V", "visible")
 
 
-def _vector(name: str) -> tuple[str, ...]:
-    return tuple(f"{name}.{axis}" for axis in "XYZ")
-
-
 OPTIONAL: dict[str, tuple[tuple[str, ...], str]] = {
     "depth": (
         ("depth1.Z", "depth2.Z"),
@@ -54,15 +50,15 @@ OPTIONAL: dict[str, tuple[tuple[str, ...], str]] = {
         "1 in image 1, 2 in image 2",
     ),
     "normal": (
-        _vector("normal1") + _vector("normal2"),
+        tuple(f"normal{image}.{axis}" for image in (1, 2) for axis in "XYZ"),
         "unit vector, frame of the scene; from the surface into the gel; 1 in image 1, 2 in image 2",
     ),
     "displacement": (
-        _vector("displacement"),
+        ("displacement.X", "displacement.Y", "displacement.Z"),
         "mm, frame of the scene; place in image 2's state less that in image 1's; in image 1",
     ),
     "traction": (
-        _vector("traction"),
+        ("traction.X", "traction.Y", "traction.Z"),
         "MPa, frame of the scene; force of the indenter on the gel per undeformed area, in image 2's state; in image 1",
     ),
     "contact": (("contact.Y",), "1 where the indenter touches in image 2's state, else 0; in image 1"),

@@ -14,6 +14,8 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from synth.dataset.storage import replacing
+from synth.errors import InputError
 from synth.mesh.dome import domed
 from synth.mesh.face import FLAT_FACE, Face, PadFace, face_of
 from synth.mesh.layered import layered
@@ -105,9 +107,7 @@ def _read(path: Path, gel: Gel, face: Face) -> PadMesh | None:
 
 def _write(path: Path, mesh: PadMesh) -> None:
     """Store a mesh, whole or not at all. A folder that cannot be written gets none: the mesh itself is not at stake."""
-    aside = path.with_name(f".{path.name}.{os.getpid()}")
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError, InputError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with aside.open("wb") as file:
+        with replacing(path) as file:
             np.savez(file, points=mesh.points, tets=mesh.tets)
-        aside.replace(path)

@@ -93,17 +93,13 @@ class Renderer:
         self._set_samples(mi, PILOT if wanted == "auto" else wanted)
         if wanted == "auto":  # fixed seeds, so that a sensor always gets the same number
             first, second = (self.radiance(surface.material, seed) for seed in _PILOT_SEEDS)
-            self._set_samples(mi, needed_samples(first, second, self._views[""].camera, self._samples))
+            self._set_samples(mi, needed_samples(first, second, self._views[""].camera, self.samples_per_pixel))
 
     def _set_samples(self, mi: Any, wanted: int) -> None:
-        self._samples = full_grid(wanted, self._lit)
-        self._sampler = mi.load_dict({"type": "multijitter", "sample_count": self._samples})
+        self.samples_per_pixel = full_grid(wanted, self._lit)
+        self._sampler = mi.load_dict({"type": "multijitter", "sample_count": self.samples_per_pixel})
         if not self._variant.is_vectorised:
             self._sensors = {name: self._build_pinhole(mi, view) for name, view in self._views.items()}
-
-    @property
-    def samples_per_pixel(self) -> int:
-        return self._samples
 
     def take(self, surface: GelSurface) -> None:
         """Render this surface from now on: `radiance` gets the positions of its vertices."""
@@ -168,12 +164,12 @@ class Renderer:
         self._parameters.update()
         if isinstance(self._light, SeparatedLight):
             camera = self._views[""].camera
-            primary = camera.width * camera.height * self._samples
+            primary = camera.width * camera.height * self.samples_per_pixel
             self._light.prepare(self._meshes["gel"], primary, _mitsuba_seed(seed, _LIGHT_PART, 0))
 
     def _trace(self, mi: Any, name: str, seed: int, number: int) -> Image:
         """All pixels in passes of whole pixels, each pixel's samples one after another in the wavefront."""
-        camera, samples = self._views[name].camera, self._samples
+        camera, samples = self._views[name].camera, self.samples_per_pixel
         pixels = camera.width * camera.height
         step = max(1, (_MAX_WAVEFRONT_GPU if self._variant.is_on_gpu else _MAX_WAVEFRONT) // samples)
         parts = [
@@ -191,9 +187,9 @@ class Renderer:
         import drjit as dr
 
         sampler = self._sampler
-        sampler.set_samples_per_wavefront(self._samples)
-        sampler.seed(seed, count * self._samples)
-        pixel = dr.arange(mi.UInt32, count * self._samples) // dr.opaque(mi.UInt32, self._samples)
+        sampler.set_samples_per_wavefront(self.samples_per_pixel)
+        sampler.seed(seed, count * self.samples_per_pixel)
+        pixel = dr.arange(mi.UInt32, count * self.samples_per_pixel) // dr.opaque(mi.UInt32, self.samples_per_pixel)
         pixel += dr.opaque(mi.UInt32, first)
         offset = sampler.next_2d()
         pupil = sampler.next_2d() if rays.has_aperture else None
@@ -201,7 +197,7 @@ class Renderer:
         color, seen = self._light.radiance(ray, sampler, valid)
         channels = [dr.select(valid & seen, color[i] * weight, 0) for i in range(1 if self._variant.is_mono else 3)]
         dr.eval(channels)  # all at once: each sum alone would trace everything anew
-        return [dr.block_sum(channel, self._samples) for channel in channels]
+        return [dr.block_sum(channel, self.samples_per_pixel) for channel in channels]
 
     def _build_pinhole(self, mi: Any, sensor: Sensor) -> Any:
         camera = sensor.camera

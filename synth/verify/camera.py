@@ -138,7 +138,7 @@ class ForwardCamera:
         By a mirror also where the mirror has ended: see `reaches`.
         """
         local = self._local(points, path)
-        across, angle = _across(local), _angle(local)
+        across, angle = np.hypot(local[:, 0], local[:, 1]), _angle(local)
         lost = ~(angle < self.field)
         wide = np.flatnonzero(self.is_fisheye & ~lost & (angle > _OPENCV_FIELD))
         radius = _fisheye_radius(angle[wide], self.distortion)[:, None] if len(wide) else 0.0
@@ -242,13 +242,9 @@ class ForwardCamera:
         return foot + arm * share[:, None]
 
 
-def _across(local: Points) -> FloatArray:
-    return np.asarray(np.hypot(local[:, 0], local[:, 1]))
-
-
 def _angle(local: Points) -> FloatArray:
     """To the camera's axis, radians (n,)."""
-    return np.asarray(np.arctan2(_across(local), local[:, 2]))
+    return np.asarray(np.arctan2(np.hypot(local[:, 0], local[:, 1]), local[:, 2]))
 
 
 def _turning_angle(camera: Camera) -> float:
