@@ -176,12 +176,6 @@ def test_impossible_places_are_refused(motion: dict[str, Any], message: str) -> 
         capsule(motion=motion)
 
 
-def test_a_written_scene_is_read_again() -> None:
-    posed = capsule(motion={"polar_deg": 20.0})
-    assert posed.sensor.gel.size_mm == (10.0, 10.0, 7.0)
-    assert Scene.model_validate(posed.model_dump()) == posed
-
-
 def test_the_mesh_fills_the_shape_and_its_nodes_lie_on_it() -> None:
     gel = capsule().sensor.gel
     mesh = capsule_mesh(gel)
