@@ -2,9 +2,9 @@
 
 import json
 import os
-import platform
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
+from platform import machine, python_version, system
 
 from rich.console import Console
 from rich.table import Table
@@ -23,7 +23,7 @@ class Finding:
 def run_doctor(as_json: bool) -> int:
     """Print the findings; 1 when something that `generate` or the trainer needs is missing."""
     findings = [
-        _machine(),
+        Finding("machine", "ok", f"Python {python_version()}, {system()} {machine()}, {os.cpu_count()} cores"),
         _rendering(),
         _gpu(),
         _package("meshing", "pytetwild", "the gel's tetrahedra"),
@@ -42,11 +42,6 @@ def run_doctor(as_json: bool) -> int:
             table.add_row(finding.what, Text(finding.state, style=colours[finding.state]), Text(finding.detail))
         Console().print(table)
     return 1 if any(finding.state == "missing" for finding in findings) else 0
-
-
-def _machine() -> Finding:
-    detail = f"Python {platform.python_version()}, {platform.system()} {platform.machine()}, {os.cpu_count()} cores"
-    return Finding("machine", "ok", detail)
 
 
 def _rendering() -> Finding:

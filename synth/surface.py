@@ -82,17 +82,11 @@ class GelSurface:
         straight = self._refined[0]
         if not self.coarse.is_quadratic:
             return straight
-        bulge = self._bulge
-        return np.asarray(straight + self._matrix(quadratic_face) @ bulge) if bulge.any() else straight
-
-    @property
-    def _bulge(self) -> FloatArray:
-        """(n, 3) mm from the middles of the coarse faces' edges to their nodes; zeros at the corners."""
         nodes, faces = self.coarse.nodes, self.coarse.faces
-        bulge = np.zeros_like(nodes)
+        bulge = np.zeros_like(nodes)  # from the middles of the coarse faces' edges to their nodes
         for k, (i, j) in enumerate(FACE_EDGES, 3):
             bulge[faces[:, k]] = nodes[faces[:, k]] - (nodes[faces[:, i]] + nodes[faces[:, j]]) / 2
-        return bulge
+        return np.asarray(straight + self._matrix(quadratic_face) @ bulge) if bulge.any() else straight
 
     @property
     def triangles(self) -> Triangles:

@@ -6,7 +6,7 @@ from typing import Any
 
 from gelflow.arrays import FlowArray, ImageArray
 from gelflow.baselines.method import as_array, as_tensor, check_images
-from gelflow.config import REGISTRATIONS, Registration, RegistrationConfig
+from gelflow.config import REGISTRATIONS, Registration
 from gelflow.errors import InputError
 from gelflow.hardware import chosen_device
 
@@ -79,7 +79,8 @@ class Learned:
             self.model.config = self.trained.model_copy(update={"registration": REGISTRATIONS[registration]})
         self.forward = RecordedNetwork(self.model)
         self.label = name or "/".join(path.with_suffix("").parts[-2:])
-        added = _suffix(self.model.config.registration)
+        known = (name for name, config in REGISTRATIONS.items() if config == self.model.config.registration)
+        added = f"+{next(known, 'registration')}".replace("+none", "")
         self.name = self.label if added in self.label else _END.sub(rf"{added}\1", self.label, count=1)
         self.size = size
 
@@ -89,11 +90,6 @@ class Learned:
         check_images(image1, image2)
         tensors = [as_tensor(image, self.device) for image in (image1, image2)]
         return as_array(estimate_flow(self.model, tensors[0], tensors[1], self.size, self.forward))
-
-
-def _suffix(settings: RegistrationConfig | None) -> str:
-    known = next((name for name, config in REGISTRATIONS.items() if config == settings), "registration")
-    return "" if known == "none" else f"+{known}"
 
 
 class PublishedRaft:

@@ -36,10 +36,6 @@ class Comparison:
         return list(dict.fromkeys(score.pair for score in self.scores))
 
     @property
-    def methods(self) -> list[str]:
-        return list(dict.fromkeys(score.method for score in self.scores))
-
-    @property
     def devices(self) -> str:
         """Names of the devices that the methods ran on."""
         return " and ".join(dict.fromkeys(score.device for score in self.scores))

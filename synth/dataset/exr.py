@@ -19,7 +19,7 @@ Reference: OpenEXR file layout, https://openexr.com/en/latest/OpenEXRFileLayout.
 import contextlib
 import io
 import os
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -43,10 +43,6 @@ CONVENTIONS = {
 _PARTS = ("U", "V", "visible")
 
 
-def _vector(name: str) -> tuple[str, ...]:
-    return tuple(f"{name}.{axis}" for axis in "XYZ")
-
-
 OPTIONAL: dict[str, tuple[tuple[str, ...], str]] = {
     "depth": (
         ("depth1.Z", "depth2.Z"),
@@ -54,25 +50,20 @@ OPTIONAL: dict[str, tuple[tuple[str, ...], str]] = {
         "1 in image 1, 2 in image 2",
     ),
     "normal": (
-        _vector("normal1") + _vector("normal2"),
+        tuple(f"normal{image}.{axis}" for image in (1, 2) for axis in "XYZ"),
         "unit vector, frame of the scene; from the surface into the gel; 1 in image 1, 2 in image 2",
     ),
     "displacement": (
-        _vector("displacement"),
+        ("displacement.X", "displacement.Y", "displacement.Z"),
         "mm, frame of the scene; place in image 2's state less that in image 1's; in image 1",
     ),
     "traction": (
-        _vector("traction"),
+        ("traction.X", "traction.Y", "traction.Z"),
         "MPa, frame of the scene; force of the indenter on the gel per undeformed area, in image 2's state; in image 1",
     ),
     "contact": (("contact.Y",), "1 where the indenter touches in image 2's state, else 0; in image 1"),
 }
 """Names of channels, and their unit, frame, state and image, by the key of `[outputs]` that asks for them."""
-
-
-def meanings(written: Collection[str]) -> dict[str, str]:
-    """Header attributes for the optional channels among those that a file holds."""
-    return {f"channels.{key}": meaning for key, (names, meaning) in OPTIONAL.items() if set(names) <= set(written)}
 
 
 def write_flow(path: Path, flow: FlowField, attributes: Mapping[str, str | int]) -> None:
@@ -86,7 +77,8 @@ def write_flow(path: Path, flow: FlowField, attributes: Mapping[str, str | int])
     planes = channels_of(flow)
     planes |= {alias: planes[name] for alias, name in ALIASES.items()}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    header |= {**CONVENTIONS, **meanings(planes), **attributes}
+    meanings = {f"channels.{key}": meaning for key, (names, meaning) in OPTIONAL.items() if set(names) <= set(planes)}
+    header |= {**CONVENTIONS, **meanings, **attributes}
     try:
         OpenEXR.File(header, planes).write(str(path))
     except RuntimeError as error:  # How the library reports a failing disk.

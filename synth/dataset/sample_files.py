@@ -3,7 +3,6 @@
 import hashlib
 import shutil
 import tempfile
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from synth.dataset.job import Job
 from synth.dataset.jsontext import jsonable, to_document
 from synth.dataset.manifest import ManifestEntry
 from synth.dataset.npz import encode_npz
-from synth.dataset.sample import SAMPLES_FOLDER, CameraPair, Sample, largest_motion, sample_name
+from synth.dataset.sample import SAMPLES_FOLDER, Sample, largest_motion, sample_name
 from synth.dataset.storage import install_folder, partial_name, storage_errors
 from synth.dataset.store import Output, Store
 
@@ -47,7 +46,10 @@ def _write_folder(final: Path, sample: Sample, job: Job) -> ManifestEntry:
             for name, content in files.items():
                 (partial / name).write_bytes(content)
             for camera, pair in views.items():
-                _write_view(partial / camera, pair, _attributes(sample, job, camera))
+                (partial / camera).mkdir(exist_ok=True)
+                for name, image in (("image1.png", pair.image1), ("image2.png", pair.image2)):
+                    (partial / camera / name).write_bytes(encode_png(image))
+                write_flow(partial / camera / "flow.exr", pair.flow, _attributes(sample, job, camera))
             written = sorted(file for file in partial.rglob("*") if file.is_file())
             sha256 = {
                 file.relative_to(partial).as_posix(): hashlib.sha256(file.read_bytes()).hexdigest() for file in written
@@ -68,13 +70,6 @@ def _write_folder(final: Path, sample: Sample, job: Job) -> ManifestEntry:
         torque_nmm=tuple(tuple(row) for row in np.asarray(sample.torque_nmm, np.float64).tolist()),
         max_flow_px=largest_motion(sample.flow),
     )
-
-
-def _write_view(folder: Path, pair: CameraPair, attributes: Mapping[str, str | int]) -> None:
-    folder.mkdir(exist_ok=True)
-    (folder / "image1.png").write_bytes(encode_png(pair.image1))
-    (folder / "image2.png").write_bytes(encode_png(pair.image2))
-    write_flow(folder / "flow.exr", pair.flow, attributes)
 
 
 def _attributes(sample: Sample, job: Job, camera: str) -> dict[str, str | int]:

@@ -75,16 +75,12 @@ def inspect(path: Path | str, limit: int = 100) -> Inspection:
         about, folders = _about(place)
         places = [folders[i] for i in evenly_spaced(len(folders), limit)]
         about["inspected"] = len(places)
-    names = _further(places[0]) if places and kind != "flow" else []
+    names: list[str] = []
+    if places and (meta := places[0] / META_FILE).exists():
+        names = further_cameras(read_document(meta).get("scene", {}))
     places = [folder / name for folder in places for name in ("", *names)]
     numbers = tuple(numbers_of(_look(kind, item)) for item in places)
     return Inspection(kind, place, about, tuple(places), numbers, 1 + len(names))
-
-
-def _further(folder: Path) -> list[str]:
-    """Names of the further cameras of a sample's folder."""
-    path = folder / META_FILE
-    return further_cameras(read_document(path).get("scene", {})) if path.exists() else []
 
 
 def _kind_of(place: Path) -> Kind:
@@ -142,9 +138,7 @@ def numbers_of(view: View) -> dict[str, Any]:
         difference = dict(zip(("before_rmse", "after_rmse"), map(_rms, view.differences), strict=True))
     return {
         "name": view.name,
-        "index": meta.get("index"),
-        "trajectory": meta.get("trajectory"),
-        "frames": meta.get("frames"),
+        **{key: meta.get(key) for key in ("index", "trajectory", "frames", "force_n", "torque_nmm")},
         "width": width,
         "height": height,
         "bits": None if view.image1 is None else 8 * view.image1.itemsize,
@@ -153,8 +147,6 @@ def numbers_of(view: View) -> dict[str, Any]:
         "closure": None if view.closure is None else _spread(view.closure),
         "sigma": None if view.sigma is None else _spread(view.sigma),
         "difference": difference,
-        "force_n": meta.get("force_n"),
-        "torque_nmm": meta.get("torque_nmm"),
         "solver": meta.get("diagnostics", {}).get("solver") if isinstance(meta.get("diagnostics"), dict) else None,
         "channels": sorted(flow.extras),
     }

@@ -73,7 +73,8 @@ def panels_of(view: View, numbers: Mapping[str, Any]) -> list[Panel]:
                 Panel(f"{name}, log {limits[0]:g} to {limits[1]:g} px: {found}", _logarithmic(values, limits))
             )
     if view.differences is not None:
-        limit = _limit(view.differences[0])
+        known = np.abs(view.differences[0][np.isfinite(view.differences[0])])
+        limit = (float(np.percentile(known, 99)) if known.size else 0.0) or 1.0  # one colour scale for both
         titles = (("image 2 − image 1", "before_rmse"), ("warped image 2 − image 1", "after_rmse"))
         for (title, key), values in zip(titles, view.differences, strict=True):
             caption = f"{title} (±{100 * limit:.2g} %): RMS {percent(numbers['difference'][key])}"
@@ -100,12 +101,6 @@ def image_picture(image: Raster) -> Rgb:
     """8-bit RGB of an image."""
     small = image.astype(np.uint8) if image.dtype == np.uint8 else (image >> 8).astype(np.uint8)
     return np.ascontiguousarray(small if small.ndim == 3 else np.repeat(small[..., None], 3, axis=-1))
-
-
-def _limit(before: FloatArray) -> float:
-    """99th percentile of the unwarped difference: one colour scale for before and after."""
-    found = np.abs(before[np.isfinite(before)])
-    return (float(np.percentile(found, 99)) if found.size else 0.0) or 1.0
 
 
 def _visibility(view: View) -> Rgb:

@@ -14,11 +14,13 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from synth.dataset.storage import replacing
 from synth.errors import InputError
 from synth.mesh.dome import domed
-from synth.mesh.face import Face, PadFace, face_of
+from synth.mesh.face import FLAT_FACE, Face, PadFace, face_of
+from synth.mesh.layered import layered
 from synth.mesh.pad import PadMesh
-from synth.mesh.tetrahedralise import ENVELOPE, GRADING, background_of, tetrahedralise, tetrahedralise_box
+from synth.mesh.tetrahedralise import ENVELOPE, GRADING, background_of, box_sides, tetrahedralise, tetrahedralise_box
 from synth.scene import Gel, Numerics
 
 SURFACE, ROOM = 0.5, 1.5
@@ -64,14 +66,9 @@ def pad_mesh(
     """The mesh of a pad, from the first folder that holds it, else made; afterwards every folder holds it.
 
     Of the numerics the edge length counts. The folders are searched in order, by default the user's cache; the gel's
-    own files are relative to `scene_folder`. InputError where the pad has layers, whose interfaces fTetWild does not
-    keep as planes, or a dome turns a tetrahedron over.
+    own files are relative to `scene_folder`. InputError where layers or a dome turn a tetrahedron over.
     """
-    if gel.layers:
-        raise InputError(
-            "sensor.gel.layers: a mesh of even edge length cannot follow layers; leave out numerics.edge_length_mm"
-        )
-    key, face = mesh_key(gel, numerics), face_of(gel, scene_folder or Path())
+    key, face = mesh_key(gel, numerics), face_of(gel, scene_folder or Path()) if gel.is_round else FLAT_FACE
     paths = [folder / f"{key}.npz" for folder in (folders if folders is not None else [user_cache()])]
     mesh = next((found for path in paths if (found := _read(path, gel, face)) is not None), None)
     if mesh is None:
@@ -79,7 +76,8 @@ def pad_mesh(
     for path in paths:
         if _read(path, gel, face) is None:
             _write(path, mesh)
-    return domed(mesh, gel.dome_radius_mm)
+    sides = box_sides(gel.size_mm) if isinstance(face, PadFace) else face.sides
+    return domed(layered(mesh, sides, gel.layers_mm), gel.dome_radius_mm)
 
 
 def _made(gel: Gel, face: Face, edge_mm: float) -> PadMesh:
@@ -109,9 +107,7 @@ def _read(path: Path, gel: Gel, face: Face) -> PadMesh | None:
 
 def _write(path: Path, mesh: PadMesh) -> None:
     """Store a mesh, whole or not at all. A folder that cannot be written gets none: the mesh itself is not at stake."""
-    aside = path.with_name(f".{path.name}.{os.getpid()}")
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError, InputError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with aside.open("wb") as file:
+        with replacing(path) as file:
             np.savez(file, points=mesh.points, tets=mesh.tets)
-        aside.replace(path)

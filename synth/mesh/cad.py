@@ -9,7 +9,7 @@ import numpy as np
 from synth.arrays import BoolArray, FloatArray, Points, Projection, Triangles
 from synth.errors import InputError
 from synth.scene import Motion
-from synth.scene.gel_file import GelSurfaces, distance, gel_surfaces, nearest
+from synth.scene.gel_file import UNITS_MM, GelSurfaces, distance, gel_surfaces, nearest
 
 ON_MM = 1e-6
 """Distance at which a node lies on a surface."""
@@ -50,6 +50,23 @@ class CadFace:
         found = self.surfaces
         parts = [partial(nearest, part) for part in (found.rest, found.window, found.face)]
         return [lambda points: np.column_stack([points[:, :2], np.full(len(points), found.top_mm)]), *parts]
+
+    def textured(self) -> tuple[Points, Triangles, FloatArray]:
+        """Corners (n, 3) mm and triangles (m, 3) of outer, and texture coordinates (n, 2); seams are apart.
+
+        InputError where the file has no such coordinates.
+        """
+        import pyvista as pv
+
+        read = pv.read(self.outer).extract_surface(algorithm=None).triangulate()
+        places, faces = read.active_texture_coordinates, read.regular_faces
+        if places is None:
+            raise InputError(
+                f'sensor.pattern.placing = "uv": {self.outer.name} has no texture coordinates; save it as OBJ or PLY'
+            )
+        points = UNITS_MM[self.unit] * np.asarray(read.points, float) * [1, -1, 1]
+        points += self.surfaces.outer.points.min(axis=0) - points[faces].min(axis=(0, 1))
+        return points, faces.astype(np.int32), np.asarray(places, float)
 
     def triangles(self, edge_mm: float) -> tuple[Points, Triangles]:
         """Triangles whose winding number is 1 in the gel and less elsewhere: outer's, and the window's turned over."""

@@ -1,10 +1,7 @@
-"""Capsules: a layer of gel around a hemisphere and a cylinder, as a shape, as triangles and as the coated face at rest.
+"""Capsules: a layer of gel around a hemisphere and a cylinder, as a shape and as triangles.
 
 With R the outer radius, t the thickness and L the length, the coated face has the distance R from the axis that runs
 from (0, 0, R) to (0, 0, R + L), and the window's face the distance R - t; the gel is cut at z = R + L.
-
-Triangles come from a lattice of rings. Ring i of m, at a polar angle of 90 i / m degrees, has 4 i points, so that
-triangles are about alike all over the hemisphere; the cylinder's rings have 4 m points each.
 """
 
 from dataclasses import dataclass
@@ -13,7 +10,6 @@ from functools import partial
 import numpy as np
 
 from synth.arrays import BoolArray, FloatArray, Points, Projection, Triangles
-from synth.surface import FACE_EDGES, ContactFaces, GelSurface
 
 ROUNDING = 1e-9
 """Distance from a shape, relative to its radius, at which a node lies on it."""
@@ -81,39 +77,27 @@ class CapsuleFace:
         return np.array([0.0, 0.0, max(radius, z)]) + radius * outward, -outward
 
     def triangles(self, edge_mm: float) -> tuple[Points, Triangles]:
-        """The gel's closed boundary as triangles with edges of about edge_mm, their normals pointing out of the gel."""
-        rings, bands = self._counts(edge_mm)
-        outer, inner = (self._positions(rings, bands, r) for r in (self.radius_mm, self.radius_mm - self.thickness_mm))
-        face = _number(_lattice(rings, bands), rings)
-        last = _number(np.array([[rings + bands, k] for k in range(4 * rings)]), rings)
+        """The gel's closed boundary as triangles with edges of about edge_mm, their normals pointing out of the gel.
+
+        Their corners lie on rings. Ring i of the hemisphere's m, at a polar angle of 90 i / m degrees, has 4 i, so that
+        triangles are about alike all over it; the cylinder's have 4 m each.
+        """
+        from scipy.spatial import Delaunay
+
+        m, bands = max(4, int(np.ceil(np.pi / 2 * self.radius_mm / edge_mm))), int(np.ceil(self.length_mm / edge_mm))
+        ring, step = np.array([(i, k) for i in range(m + bands + 1) for k in range(4 * min(i, m) or 1)]).T
+        azimuth, polar = np.pi / 2 * step / np.clip(ring, 1, m), np.pi / 2 * np.minimum(ring, m) / m
+        around = np.column_stack([np.cos(azimuth), np.sin(azimuth)])
+        across, down = np.where(ring < m, (np.sin(polar), np.cos(polar)), ([1.0], [0.0]))
+        z = self.radius_mm + self.length_mm * np.maximum(ring - m, 0) / max(bands, 1)
+        radii = self.radius_mm, self.radius_mm - self.thickness_mm
+        outer, inner = (np.column_stack([r * across[:, None] * around, z - r * down]) for r in radii)
+        face = Delaunay(ring[:, None] * around).simplices[:, ::-1]  # rolled out: rings are circles
+        last = np.arange(len(outer) - 4 * m, len(outer))
         behind = len(outer) + last
-        ring = [(last, np.roll(behind, -1), behind), (last, np.roll(last, -1), np.roll(behind, -1))]
-        parts = [face, len(outer) + face[:, ::-1], *(np.column_stack(corners) for corners in ring)]
+        end = [(last, np.roll(behind, -1), behind), (last, np.roll(last, -1), np.roll(behind, -1))]
+        parts = [face, len(outer) + face[:, ::-1], *(np.column_stack(corners) for corners in end)]
         return np.concatenate([outer, inner]), np.concatenate(parts).astype(np.int32)
-
-    def rest_surface(self, edge_mm: float) -> GelSurface:
-        """The undeformed coated face as quadratic triangles."""
-        rings, bands = self._counts(edge_mm)
-        corners = 2 * _lattice(rings, bands)  # every second ring and place holds mid-edge nodes
-        middles = [(corners[:, i] + corners[:, j]) // 2 for i, j in FACE_EDGES]
-        faces = _number(np.concatenate([corners, np.stack(middles, axis=1)], axis=1), 2 * rings)
-        nodes = self._positions(2 * rings, 2 * bands, self.radius_mm)
-        return GelSurface(ContactFaces(nodes, faces.astype(np.int32)), 3)
-
-    def _counts(self, edge_mm: float) -> tuple[int, int]:
-        """Rings of the hemisphere and of the cylinder."""
-        return (max(4, int(np.ceil(np.pi / 2 * self.radius_mm / edge_mm))), int(np.ceil(self.length_mm / edge_mm)))
-
-    def _positions(self, rings: int, bands: int, radius: float) -> Points:
-        """(n, 3) mm of the lattice's points, in the order of their numbers."""
-        place = [(i, k) for i in range(rings + bands + 1) for k in range(4 * min(i, rings) or 1)]
-        ring, step = np.array(place).T
-        azimuth = np.pi / 2 * step / np.clip(ring, 1, rings)
-        polar = np.pi / 2 * np.minimum(ring, rings) / rings
-        raised = self.length_mm * np.maximum(ring - rings, 0) / max(bands, 1)
-        across = radius * np.where(ring < rings, np.sin(polar), 1.0)
-        down = radius * np.where(ring < rings, np.cos(polar), 0.0)
-        return np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), self.radius_mm + raised - down])
 
     def _centres(self, points: Points) -> Points:
         """(n, 3) mm: the nearest points of the axis."""
@@ -128,28 +112,3 @@ class CapsuleFace:
         centres = self._centres(points)
         offset = points - centres
         return np.asarray(centres + offset * (radius / np.linalg.norm(offset, axis=1, keepdims=True)))
-
-
-def _lattice(rings: int, bands: int) -> np.ndarray:
-    """(f, 3, 2) triangles of the lattice: ring and place along it of each corner, normals pointing away from the axis.
-
-    The last place of a ring may be written as the number of its places, which is its first.
-    """
-    found = []
-    for i in range(rings):
-        for quarter in range(4):
-            inner, outer = quarter * i, quarter * (i + 1)
-            found += [((i, inner + k), (i + 1, outer + k + 1), (i + 1, outer + k)) for k in range(i + 1)]
-            found += [((i, inner + k), (i, inner + k + 1), (i + 1, outer + k + 1)) for k in range(i)]
-    for i in range(rings, rings + bands):
-        found += [((i, k), (i + 1, k + 1), (i + 1, k)) for k in range(4 * rings)]
-        found += [((i, k), (i, k + 1), (i + 1, k + 1)) for k in range(4 * rings)]
-    return np.array(found)
-
-
-def _number(place: np.ndarray, rings: int) -> np.ndarray:
-    """(...) numbers of the lattice's points (..., 2) of a capsule with so many rings on its hemisphere."""
-    ring, step = place[..., 0], place[..., 1]
-    inner = np.minimum(ring, rings)
-    first = np.where(ring == 0, 0, 1 + 2 * inner * (inner - 1) + 4 * rings * (ring - inner))
-    return np.asarray(first + step % np.maximum(4 * inner, 1))

@@ -19,14 +19,13 @@ from dataclasses import replace
 import numpy as np
 
 from synth.errors import InputError
-from synth.mesh.capsule import CapsuleFace
-from synth.mesh.face import PadFace, face_height, face_of
+from synth.mesh.face import PadFace, face_height
 from synth.mesh.pad import PadMesh
 from synth.scene import Gel
 from synth.surface import FACE_EDGES, ContactFaces, GelSurface
 
 REST_CELLS = 24
-"""Squares of the undeformed face along its longer side; of a capsule, edges along its diameter."""
+"""Squares of the undeformed face along its longer side."""
 
 
 def domed(mesh: PadMesh, dome_radius_mm: float | None) -> PadMesh:
@@ -58,10 +57,7 @@ def flat_surface(size_mm: tuple[float, float, float]) -> GelSurface:
 
 
 def rest_surface(gel: Gel) -> GelSurface:
-    """The undeformed contact face of a gel, whatever its mesh: two triangles, or quadratic ones where it is curved."""
-    face = face_of(gel)
-    if isinstance(face, CapsuleFace):
-        return face.rest_surface(gel.size_mm[0] / REST_CELLS)
+    """The undeformed contact face of a pad, whatever its mesh: two triangles, or quadratic ones where it is curved."""
     if gel.dome_radius_mm is None:
         return flat_surface(gel.size_mm)
     x, y = gel.size_mm[0] / 2, gel.size_mm[1] / 2

@@ -38,6 +38,8 @@ FINEST = 0.04
 GRAIN_MM = 2.0**-32
 """Coordinates are multiples of it, but for the pad's faces and the layers' interfaces: the last bits of
 `log` and `exp` differ between processors."""
+FILM = 2
+"""At least so many elements through each layer of a pad of several."""
 
 
 @dataclass(frozen=True)
@@ -72,14 +74,12 @@ class Counts:
         across: elements across the focus along x and along y; even, so that a centred focus gives a symmetric mesh.
         outer: elements beside the focus on each side, along x and along y, where the focus is centred.
         through: elements through the thickness of a pad of one layer.
-        film: at least so many elements through each layer of a pad of several.
         growth: ratio of neighbouring spacings along z, from the contact face inward.
     """
 
     across: tuple[int, int] = (8, 8)
     outer: tuple[int, int] = (3, 2)
     through: int = 3
-    film: int = 2
     growth: float = 1.3
 
     def cells(self, axis: int) -> int:
@@ -181,10 +181,8 @@ def _depth_planes(
     rate = math.log(counts.growth)
     first = thickness / float(_reach(np.full(1, float(counts.through)), rate)[0])
     place = np.array([_elements(float(z) / first, rate) for z in interfaces])
-    if layers_mm:  # each has at least as many elements as the grading of the whole thickness would give it
-        number = np.maximum(np.ceil(np.diff(place) - 1e-9).astype(int), counts.film)
-    else:
-        number = np.array([counts.through])
+    # Each layer has at least as many elements as the grading of the whole thickness would give it.
+    number = np.maximum(np.ceil(np.diff(place) - 1e-9).astype(int), FILM if layers_mm else 1)
     planes = [np.zeros(1)]
     for k, elements in enumerate(number):
         numbers = np.linspace(place[k], place[k + 1], elements + 1, dtype=np.float64)[1:]

@@ -63,11 +63,14 @@ class PadMesh:
         return faces[~self.bonded[faces].all(axis=1)]
 
     @cached_property
+    def coated(self) -> Triangles:
+        """(k, 3) int32 into `points`: the contact face's triangles, normals pointing out."""
+        return self._boundary[self.on_face[self._boundary].all(axis=1)]
+
+    @cached_property
     def spacing_mm(self) -> float:
         """Length of the contact face's short edges, their 10 % quantile: what the finest part resolves."""
-        faces = self._boundary
-        faces = faces[self.on_face[faces].all(axis=1)]
-        edges = self.points[faces] - self.points[np.roll(faces, 1, axis=1)]
+        edges = self.points[self.coated] - self.points[np.roll(self.coated, 1, axis=1)]
         return float(np.quantile(np.linalg.norm(edges, axis=2), 0.1))
 
     @cached_property
@@ -110,6 +113,14 @@ def signed_volumes(points: Points, tets: Tets) -> FloatArray:
     """(m,) float64 volumes, positive for positive orientation."""
     a, b, c, d = (points[tets[:, i]] for i in range(4))
     return np.asarray(np.einsum("ij,ij->i", np.cross(b - a, c - a), d - a) / 6)
+
+
+def barycentric_gradients(points: Points, tets: Tets) -> FloatArray:
+    """(m, 4, 3) float64 1/mm: gradients of the four barycentric coordinates in the undeformed tetrahedra."""
+    corner = points[tets]
+    inverse = np.linalg.inv(corner[:, 1:] - corner[:, :1])  # columns are the gradients of coordinates 1..3
+    gradients = np.swapaxes(inverse, 1, 2)
+    return np.concatenate([-gradients.sum(axis=1, keepdims=True), gradients], axis=1)
 
 
 def boundary_faces(tets: Tets) -> Triangles:

@@ -63,7 +63,7 @@ def tetrahedralise_box(
     By default edges are GRADING times as long at the window. InputError where no attempt gave a valid mesh.
     """
     background = background or background_of(size_mm, edge_length_mm, GRADING)
-    points, tets = tetrahedralise(*_box(size_mm), _sides(size_mm), background, float(np.prod(size_mm)), 1e-9)
+    points, tets = tetrahedralise(*_box(size_mm), box_sides(size_mm), background, float(np.prod(size_mm)), 1e-9)
     return PadMesh(points, tets, size_mm)
 
 
@@ -123,8 +123,9 @@ def _box(size: tuple[float, float, float]) -> tuple[Points, Triangles]:
     return corners, np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))], dtype=np.int32)
 
 
-def _sides(size: tuple[float, float, float]) -> list[Projection]:
-    planes = [(axis, side * size[axis] / 2) for axis in (0, 1) for side in (-1, 1)] + [(2, 0.0), (2, size[2])]
+def box_sides(size: tuple[float, float, float]) -> list[Projection]:
+    """Projections onto the planes of a box, the one on the window and then the contact face last."""
+    planes = [(axis, side * size[axis] / 2) for axis in (0, 1) for side in (-1, 1)] + [(2, size[2]), (2, 0.0)]
     return [partial(_onto_plane, axis=axis, value=value) for axis, value in planes]
 
 

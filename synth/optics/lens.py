@@ -156,19 +156,16 @@ class FisheyeLens:
     @cached_property
     def field_limit(self) -> float:
         """Angle to the axis, radians, below which the lens model is one-to-one: at most `WIDEST`."""
+        return min(WIDEST, float(np.sqrt(smallest_positive_root(self._slope))))
+
+    @property
+    def _slope(self) -> list[float]:
+        """Coefficients of the derivative of θ_d in θ², the highest power first."""
         k1, k2, k3, k4 = self.distortion
-        first = smallest_positive_root([9 * k4, 7 * k3, 5 * k2, 3 * k1, 1.0])  # derivative of θ_d, in θ²
-        return min(WIDEST, float(np.sqrt(first)))
+        return [9 * k4, 7 * k3, 5 * k2, 3 * k1, 1.0]
 
     def _distorted(self, angle: FloatArray) -> FloatArray:
-        k1, k2, k3, k4 = self.distortion
-        s = angle * angle
-        return angle * (1 + s * (k1 + s * (k2 + s * (k3 + s * k4))))
-
-    def _slope(self, angle: FloatArray) -> FloatArray:
-        k1, k2, k3, k4 = self.distortion
-        s = angle * angle
-        return 1 + s * (3 * k1 + s * (5 * k2 + s * (7 * k3 + s * 9 * k4)))
+        return np.asarray(angle * np.polyval([*reversed(self.distortion), 1.0], angle * angle))
 
     def _angle(self, radius: FloatArray) -> FloatArray:
         """The angles (n,) whose distorted radii (n,) are given; NaN beyond the field."""
@@ -181,7 +178,7 @@ class FisheyeLens:
             miss = self._distorted(angle) - target
             low, high = np.where(miss <= 0, angle, low), np.where(miss >= 0, angle, high)
             with np.errstate(divide="ignore", invalid="ignore"):
-                trial = angle - miss / self._slope(angle)
+                trial = angle - miss / np.polyval(self._slope, angle * angle)
             after = np.where((trial >= low) & (trial <= high), trial, (low + high) / 2)
             moved = np.abs(after - angle)
             angle = after

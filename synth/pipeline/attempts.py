@@ -6,9 +6,8 @@ from typing import Any
 from synth.errors import InputError
 from synth.pipeline.records import Failure, JobContext, Outcome, Simulated, SimulatedTrajectory, Task
 from synth.scene.sampling import MAX_DRAWS, Pair, SensorInstance, draw, pairs_of
-from synth.simulate import State, Trajectory
+from synth.simulate import Trajectory
 from synth.simulate.press import Press, edge_radius_mm
-from synth.simulate.space import Space
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,13 +67,13 @@ class Attempts:
         if result.status != "complete":
             self.fail("simulate", result.reason, result.states[-1].summary())
             return None
-        press, space = attempt.press, result.space
+        press, space, states = attempt.press, result.space, result.states
         shown = sorted({frame for pair in attempt.pairs for frame in pair.frames})
         trajectory = SimulatedTrajectory(
             self.trajectory,
             press.scene,
             attempt.pairs,
-            {frame: _on_face(result.states[frame], space) for frame in shown},
+            {n: replace(states[n], displacement=states[n].displacement[space.surface_nodes]) for n in shown},
             {"mesh": press.mesh.hash, "element": space.element.name},
             edge_radius_mm(press.scene, press.mesh),
             press.accuracy,
@@ -90,8 +89,3 @@ class Attempts:
     def given_up(self) -> Outcome:
         """What is reported when no instance is left."""
         return Outcome((), tuple(self.failures), tuple(self.wanted))
-
-
-def _on_face(state: State, space: Space) -> State:
-    """The state with the displacement of the contact face alone."""
-    return replace(state, displacement=state.displacement[space.surface_nodes])

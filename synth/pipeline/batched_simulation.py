@@ -17,7 +17,6 @@ from synth.pipeline.records import JobContext, Outcome, Simulated, Task
 from synth.scene import Gel
 from synth.scene.sampling import SensorInstance, draw_sensor, sensor_of
 from synth.scene.template import Template
-from synth.simulate import Trajectory
 from synth.simulate.batched import simulate_presses
 from synth.simulate.batched.pad import Pad, prepare
 from synth.simulate.press import Press
@@ -90,7 +89,10 @@ class _Simulation:
                 else:
                     again.append(attempts)
             while ready:
-                for attempts, attempt, result in self._run(ready.pop(next(iter(ready)))):
+                members = ready.pop(next(iter(ready)))
+                presses, frames = zip(*((attempt.press, attempt.frames) for _, attempt in members), strict=True)
+                for number, result in simulate_presses(presses, self._pads.of(presses[0]), frames, self._batch):
+                    attempts, attempt = members[number]
                     simulated = attempts.simulated(attempt, result)
                     if simulated is None:
                         again.append(attempts)
@@ -107,12 +109,6 @@ class _Simulation:
             self.open[sensor] += 1
             begun.append(Attempts(self._context, task, self._sensor[1]))
         return begun
-
-    def _run(self, members: list[tuple[Attempts, Attempt]]) -> Iterator[tuple[Attempts, Attempt, Trajectory]]:
-        presses = [attempt.press for _, attempt in members]
-        frames = [attempt.frames for _, attempt in members]
-        for number, result in simulate_presses(presses, self._pads.of(presses[0]), frames, self._batch):
-            yield *members[number], result
 
 
 def by_sensor(template: Template, ended: Iterable[tuple[int, Result]], open: Counter[int]) -> Iterator[Result]:

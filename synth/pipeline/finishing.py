@@ -108,10 +108,7 @@ def _flow(outputs: Outputs, view: View, frames: list[Frame], pressed: State) -> 
         view,
         frames[0].positions,
         frames[1].positions,
-        backward=outputs.backward,
-        depth=outputs.depth,
-        normal=outputs.normal,
-        displacement=outputs.displacement,
+        **outputs.model_dump(include={"backward", "depth", "normal", "displacement"}),
         traction=traction,
         contact=surface.interpolate_linear(touching)[:, 0] if outputs.contact else None,
     )

@@ -9,10 +9,9 @@ from synth.errors import InputError
 from synth.mesh import default_edge_length, face_of
 from synth.mesh.cad import CadFace
 from synth.render.camera_rays import pinhole
-from synth.render.lights import check_view
 from synth.render.pattern import check_pattern, is_grey
 from synth.render.separated_light import is_separated
-from synth.render.thin_lens import ThinLens
+from synth.render.thin_lens import check_views
 from synth.render.variant import Device, Variant, choose_variant
 from synth.scene import MeshIndenter
 from synth.scene.sampling import check_pairs
@@ -95,13 +94,11 @@ def check_buildable(template: Template, variant: Variant) -> None:
             no picture, or more pairs than a trajectory has.
     """
     try:
-        for sensor in dict.fromkeys(view for corner in template.corners for view in corner.sensor.views.values()):
-            check_view(sensor)
-            ThinLens.of(sensor)
-            if not variant.is_vectorised:
-                pinhole(sensor)
         for sensor in dict.fromkeys(corner.sensor for corner in template.corners):
+            check_views(sensor)
             check_pattern(sensor, template.folder)
+            for view in () if variant.is_vectorised else sensor.views.values():
+                pinhole(view)
         for indenter in dict.fromkeys(corner.contact.indenter for corner in template.corners):
             if isinstance(indenter, MeshIndenter):
                 object_triangles(indenter, template.folder)

@@ -12,6 +12,7 @@ import numpy as np
 
 from synth.errors import InputError
 from synth.mesh import default_edge_length
+from synth.mesh.layered import elements_through
 from synth.planning.plan import Plan
 from synth.scene import Gel, MeshIndenter, Scene
 from synth.scene.sampling import draw
@@ -137,6 +138,7 @@ def _tetwild_meshes(plan: Plan) -> _Meshes:
     x, y, z = (length / edge_mm for length in _plate(gel))
     per_area = NODES_PER_CURVED_AREA if gel.is_round else NODES_PER_AREA
     vertices = NODES_PER_VOLUME * x * y * z + per_area * 2 * (x * y + y * z + z * x)
+    vertices += NODES_PER_CURVED_AREA * x * y * sum(elements_through(gel.layers_mm, edge_mm))
     nodes = max(FEWEST_NODES, round(_order(first) * vertices))
     text = f"fTetWild meshes with edges of {edge_mm:g} mm at the contact face"
     return [(corner, nodes) for corner in plan.template.corners], text, None

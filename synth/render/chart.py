@@ -10,10 +10,14 @@ marks are therefore painted by their distances in space (`synth.render.marks`).
 """
 
 from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
 
 import numpy as np
 
 from synth.arrays import FloatArray, Pixels, Points
+from synth.mesh import face_of
+from synth.mesh.cad import CadFace
 from synth.scene import NoPattern, Sensor
 
 
@@ -68,6 +72,8 @@ class RoundChart:
 
 
 Chart = FlatChart | RoundChart
+_ROWS = 64
+"""Of texels that are looked up at a time, which bounds memory."""
 
 
 def chart_of(sensor: Sensor) -> Chart:
@@ -76,3 +82,22 @@ def chart_of(sensor: Sensor) -> Chart:
     if isinstance(sensor.pattern, NoPattern) or getattr(sensor.pattern, "placing", "z") == "z":
         return FlatChart((x, y))
     return RoundChart(x / 2, top)
+
+
+def texture_coordinates(sensor: Sensor, folder: Path, x: FloatArray, y: FloatArray) -> FloatArray:
+    """(rows, columns, 2) u and v of a gel's file at texel centres x (columns,) and y (rows,) mm; NaN beside the face.
+
+    Each texel looks from outside at the axis, or at the hemisphere's centre. InputError as of `CadFace.textured`.
+    """
+    from synth.flow.trace import trace
+
+    chart, face = cast(RoundChart, chart_of(sensor)), cast(CadFace, face_of(sensor.gel, folder))
+    points, triangles, places = face.textured()
+    found = []
+    for strip in np.array_split(y, -(-len(y) // _ROWS)):
+        across, down = (axis.ravel() for axis in np.meshgrid(x, strip))
+        on = chart.points(np.hypot(across, down), np.arctan2(down, across))
+        outward = (on - np.maximum(on, chart.radius) * (0.0, 0.0, 1.0)) / chart.radius
+        hits = trace(points, triangles, on + 2 * chart.end * outward, -outward)
+        found.append(hits.interpolate(triangles, places))
+    return np.concatenate(found).reshape(len(y), len(x), 2)

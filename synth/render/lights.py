@@ -34,15 +34,12 @@ def emitters(lights: tuple[Light, ...], mi: Any) -> dict[str, Any]:
     """Mitsuba's description of all lights that shine, in the renderer's frame, for scalar variants."""
     shapes = {}
     black = mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}})
-    for i, light in enumerate(lights):
+    for i, (light, (corner, first, second, direction)) in enumerate(zip(lights, rectangles(lights), strict=True)):
         if light.power == 0:
             continue
         frame = np.eye(4)
-        frame[:3, :3] = light_axes(light).T * [light.size_mm[0] / 2, light.size_mm[1] / 2, 1.0]
-        frame[:3, 3] = light.position_mm
-        # Mirroring alone would make the frame left-handed and turn the rectangle's normal: negate its first axis too.
-        frame[:3] *= MIRROR[:, None]
-        frame[:3, 0] *= -1
+        # Mirrored axes alone would make a left-handed frame and turn the rectangle's normal: the first is negated, too.
+        frame[:3] = np.column_stack([-first / 2, second / 2, direction, corner + (first + second) / 2])
         shapes[f"light{i}"] = {
             "type": "rectangle",
             "to_world": mi.ScalarTransform4f(frame.tolist()),

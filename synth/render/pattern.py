@@ -23,8 +23,10 @@ import numpy as np
 
 from synth.arrays import FloatArray, Image
 from synth.errors import InputError
+from synth.mesh import face_of
+from synth.mesh.cad import CadFace
 from synth.optics import Optics
-from synth.render.chart import RoundChart, chart_of
+from synth.render.chart import RoundChart, chart_of, texture_coordinates
 from synth.render.marks import marks_coverage
 from synth.scene import Bitmap, Dots, NoPattern, RandomColor, Sensor, Speckle
 
@@ -51,7 +53,13 @@ def albedo(sensor: Sensor, rng: np.random.Generator, folder: Path | None = None)
         case Dots() | Speckle() as pattern:
             colors, coverage = np.array(pattern.reflectance), marks_coverage(pattern, chart_of(sensor), x, y, rng)
         case Bitmap() as pattern:
-            colors, coverage = laid_over(pattern, read_picture(pattern, folder or Path()), x, y)
+            picture = read_picture(pattern, folder or Path())
+            if pattern.placing == "uv":
+                u, v = np.moveaxis(texture_coordinates(sensor, folder or Path(), x, y), 2, 0)
+                place = u, 1 - v, np.isfinite(u).astype(float)
+            else:
+                place = _placed(pattern, picture.shape[0] / picture.shape[1], x, y)
+            colors, coverage = laid_over(picture, *place)
             colors = colors * coating
         case RandomColor() as pattern:
             return _clipped(_random_colors(pattern, x, y, rng) * coating)
@@ -86,6 +94,8 @@ def check_pattern(sensor: Sensor, folder: Path) -> None:
     """Find out whether `albedo` could paint a sensor's pattern, without painting it; InputError where it could not."""
     if isinstance(sensor.pattern, Bitmap):
         read_picture(sensor.pattern, folder)
+        if isinstance(face := face_of(sensor.gel, folder), CadFace) and sensor.pattern.placing == "uv":
+            face.textured()
     if not isinstance(sensor.pattern, NoPattern):
         _texels(sensor)
 
@@ -122,37 +132,24 @@ def pixels_per_mm(sensor: Sensor) -> float:
 
 def _scale(optics: Optics, sensor: Sensor) -> float:
     """Largest stretch of the map from the contact face to pixels, in px per mm; 0 where nothing is seen."""
-    chart = chart_of(sensor)
+    chart, arms = chart_of(sensor), list(_STEP_MM * np.eye(3)[:2])
     if isinstance(chart, RoundChart):
-        return _round_scale(optics, chart)
-    pixels = optics.project(np.zeros((1, 3)))
-    if not optics.is_inside(pixels).all():
-        edges = (np.linspace(0, side, 13) for side in (sensor.camera.width, sensor.camera.height))
-        pixels = np.column_stack([axis.ravel() for axis in np.meshgrid(*edges)])
-    rays = optics.look(pixels)
-    points = rays.on_flat_face
-    with np.errstate(invalid="ignore"):
-        seen = np.all(np.abs(points[:, :2]) <= np.array(sensor.gel.size_mm[:2]) / 2, axis=1)
-    if not seen.any():
-        return 0.0
-    points, path = points[seen], rays.path[seen]
-    moved = [
-        (optics.project(points + arm, path) - optics.project(points - arm, path)) / (2 * _STEP_MM)
-        for arm in _STEP_MM * np.eye(3)[:2]
-    ]
-    return _largest_stretch(np.stack(moved, axis=2))
-
-
-def _round_scale(optics: Optics, chart: RoundChart) -> float:
-    """As `_scale`, at a grid of arcs and azimuths."""
-    arc, azimuth = (axis.ravel() for axis in np.meshgrid(np.linspace(0.02, 0.98, 25) * chart.end, np.arange(25) / 4))
-    turn = _STEP_MM / chart.across(arc)
-    inside = optics.is_inside(optics.project(chart.points(arc, azimuth)))
-    moved = [
-        optics.project(chart.points(arc + along, azimuth + aside * turn)) / (2 * _STEP_MM)
-        for along, aside in ((_STEP_MM, 0), (-_STEP_MM, 0), (0, 1), (0, -1))
-    ]
-    return _largest_stretch(np.stack([moved[0] - moved[1], moved[2] - moved[3]], axis=2)[inside])
+        arc, azimuth = (a.ravel() for a in np.meshgrid(np.linspace(0.02, 0.98, 25) * chart.end, np.arange(25) / 4))
+        points, path = chart.points(arc, azimuth), np.zeros(len(arc), dtype=int)
+        ends = (arc + _STEP_MM, azimuth), (arc, azimuth + _STEP_MM / chart.across(arc))
+        arms = [chart.points(*end) - points for end in ends]
+        seen = optics.is_inside(optics.project(points))
+    else:
+        pixels = optics.project(np.zeros((1, 3)))
+        if not optics.is_inside(pixels).all():
+            edges = (np.linspace(0, side, 13) for side in (sensor.camera.width, sensor.camera.height))
+            pixels = np.column_stack([axis.ravel() for axis in np.meshgrid(*edges)])
+        rays = optics.look(pixels)
+        points, path = rays.on_flat_face, rays.path
+        with np.errstate(invalid="ignore"):
+            seen = np.all(np.abs(points[:, :2]) <= np.array(sensor.gel.size_mm[:2]) / 2, axis=1)
+    moved = [(optics.project(points + arm, path) - optics.project(points - arm, path)) / (2 * _STEP_MM) for arm in arms]
+    return _largest_stretch(np.stack(moved, axis=2)[seen])
 
 
 def _largest_stretch(jacobian: FloatArray) -> float:
@@ -242,27 +239,34 @@ def read_picture(pattern: Bitmap, folder: Path) -> Image:
     return np.concatenate([_linear(values[:, :, 2::-1]) * opacity, opacity], axis=2)
 
 
-def laid_over(pattern: Bitmap, picture: Image, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """What a picture puts on the face, at texel centres x (columns,) and y (rows,) mm, both even.
+def _placed(pattern: Bitmap, tall: float, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Places of `laid_over` for a picture that is so many times as high as wide; texel centres x and y are even."""
+    width_mm, texel = pattern.width_mm or 0.0, max(x[1] - x[0], y[1] - y[0])
+    angle = np.radians(pattern.rotation_deg)
+    dx, dy = x[None] - pattern.offset_mm[0], y[:, None] - pattern.offset_mm[1]
+    across, down = dx * np.cos(angle) + dy * np.sin(angle), dy * np.cos(angle) - dx * np.sin(angle)
+    inside = np.minimum(width_mm / 2 - np.abs(across), tall * width_mm / 2 - np.abs(down))
+    return across / width_mm + 0.5, down / (tall * width_mm) + 0.5, np.clip(inside / texel + 0.5, 0, 1)
+
+
+def laid_over(
+    picture: Image, across: FloatArray, down: FloatArray, inside: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """What a picture puts on texels, by their places across and down it, each 0 to 1, and their shares inside it.
 
     Colours (rows, columns, 3), linear, and the share of each texel that is painted (rows, columns). Where nothing is,
-    the colour is the picture's mean, so that interpolated edges have no fringe.
+    the colour is the picture's mean, so that interpolated edges have no fringe. Places may be NaN where nothing is.
     """
     import cv2
     from scipy.ndimage import map_coordinates
 
-    rows, columns = picture.shape[:2]
-    height_mm = pattern.width_mm * rows / columns
-    texel = max(x[1] - x[0], y[1] - y[0])
-    wanted = (max(1, min(columns, round(pattern.width_mm / texel))), max(1, min(rows, round(height_mm / texel))))
+    sides, places = picture.shape[1::-1], (across, down)
+    steps = [float(np.nanmedian(np.hypot(*np.gradient(place)))) for place in places]  # of the picture, per texel
+    wanted = [max(1, min(side, round(1 / step))) for side, step in zip(sides, steps, strict=True)]
     coarse = cv2.resize(picture, wanted, interpolation=cv2.INTER_AREA)
-    angle = np.radians(pattern.rotation_deg)
-    dx, dy = x[None] - pattern.offset_mm[0], y[:, None] - pattern.offset_mm[1]
-    across, down = dx * np.cos(angle) + dy * np.sin(angle), dy * np.cos(angle) - dx * np.sin(angle)
-    place = [(down / height_mm + 0.5) * wanted[1] - 0.5, (across / pattern.width_mm + 0.5) * wanted[0] - 0.5]
-    values = [map_coordinates(coarse[:, :, k], place, output=np.float64, order=1, mode="nearest") for k in range(4)]
-    inside = np.minimum(pattern.width_mm / 2 - np.abs(across), height_mm / 2 - np.abs(down))
-    painted = values[3] * np.clip(inside / texel + 0.5, 0, 1)
+    at = [np.nan_to_num(place) * count - 0.5 for place, count in zip(places, wanted, strict=True)][::-1]
+    values = [map_coordinates(coarse[:, :, k], at, output=np.float64, order=1, mode="nearest") for k in range(4)]
+    painted = values[3] * inside
     total = picture.sum(axis=(0, 1), dtype=np.float64)
     colors = np.broadcast_to(total[:3] / max(total[3], 1.0), (*painted.shape, 3)).copy()
     seen = values[3] > 1e-6

@@ -16,9 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.polynomial import Chebyshev, Polynomial
 
-from synth.arrays import FloatArray
-from synth.render.gel_mesh import MIRROR
-from synth.render.lights import light_axes, reflectance
+from synth.render.lights import rectangles, reflectance
 from synth.scene import Light
 
 _DEGREE = 9
@@ -33,17 +31,12 @@ class PolygonLight:
     def __init__(self, light: Light, mi: Any) -> None:
         import drjit as dr
 
-        def vector(values: FloatArray) -> Any:
-            return mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in values * MIRROR))
-
-        across, along, direction = light_axes(light)
-        centre, (width, height) = np.array(light.position_mm), light.size_mm
-        first, second = across * width, along * height
-        self._mi = mi
-        self._corners = [vector(centre + s * first + t * second) for s, t in _CORNERS]
-        self._corner, self._sides = self._corners[0], (vector(first), vector(second))
-        self._front = vector(direction)
-        self._area = dr.opaque(mi.Float, width * height)
+        corner, first, second, self._front = (
+            mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in row)) for row in rectangles((light,))[0]
+        )
+        self._mi, self._corner, self._sides = mi, corner, (first, second)
+        self._corners = [corner, corner + first, corner + first + second, corner + second]
+        self._area = dr.opaque(mi.Float, light.size_mm[0] * light.size_mm[1])
         self.radiance = [dr.opaque(mi.Float, value) for value in light.radiance]
 
     def whole(self, point: Any, normal: Any, offset: Any) -> Any:
@@ -124,9 +117,6 @@ class SampledLight(PolygonLight):
         if self._index is not None:
             value *= reflectance(dr.abs(away.z), self._index, self._mi)
         return place, value
-
-
-_CORNERS = ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))
 
 
 def _edge(a: Any, b: Any, normal: Any) -> Any:

@@ -17,17 +17,16 @@ from typing import Any
 import numpy as np
 
 from synth.arrays import Image, Points
-from synth.errors import InputError
 from synth.render.camera_image import PILOT, needed_samples
 from synth.render.camera_rays import CameraRays, pinhole
 from synth.render.chart import Chart, chart_of
 from synth.render.coating import reflection
 from synth.render.gel_mesh import GelMesh
-from synth.render.lights import all_lights, check_view, emitters, panels, reflecting_plane
+from synth.render.lights import all_lights, emitters, panels, reflecting_plane
 from synth.render.path_tracer import PathTracer
 from synth.render.pattern import is_grey
 from synth.render.separated_light import SeparatedLight, is_separated
-from synth.render.thin_lens import ThinLens
+from synth.render.thin_lens import check_views
 from synth.render.variant import Variant
 from synth.scene import Render, Sensor
 from synth.surface import GelSurface
@@ -62,12 +61,9 @@ class Renderer:
         if variant.is_mono and not is_grey(sensor):
             raise ValueError(f"{variant.name} renders grey sensors only: choose the variant with grey=is_grey(sensor)")
         self._variant, self._views = variant, sensor.views
-        for name, view in self._views.items():
-            if name:
-                _check_further(name, view)
         separated = is_separated(render, sensor.coating, variant)  # every light at every sample
         mi = variant.load()
-        check_view(sensor)
+        check_views(sensor)
         refracts = sensor.window.refractive_index != 1
         self._behind = reflecting_plane(sensor) if variant.is_vectorised else None
         lights = all_lights(sensor) if variant.is_vectorised else sensor.lights
@@ -97,17 +93,13 @@ class Renderer:
         self._set_samples(mi, PILOT if wanted == "auto" else wanted)
         if wanted == "auto":  # fixed seeds, so that a sensor always gets the same number
             first, second = (self.radiance(surface.material, seed) for seed in _PILOT_SEEDS)
-            self._set_samples(mi, needed_samples(first, second, self._views[""].camera, self._samples))
+            self._set_samples(mi, needed_samples(first, second, self._views[""].camera, self.samples_per_pixel))
 
     def _set_samples(self, mi: Any, wanted: int) -> None:
-        self._samples = full_grid(wanted, self._lit)
-        self._sampler = mi.load_dict({"type": "multijitter", "sample_count": self._samples})
+        self.samples_per_pixel = full_grid(wanted, self._lit)
+        self._sampler = mi.load_dict({"type": "multijitter", "sample_count": self.samples_per_pixel})
         if not self._variant.is_vectorised:
             self._sensors = {name: self._build_pinhole(mi, view) for name, view in self._views.items()}
-
-    @property
-    def samples_per_pixel(self) -> int:
-        return self._samples
 
     def take(self, surface: GelSurface) -> None:
         """Render this surface from now on: `radiance` gets the positions of its vertices."""
@@ -172,12 +164,12 @@ class Renderer:
         self._parameters.update()
         if isinstance(self._light, SeparatedLight):
             camera = self._views[""].camera
-            primary = camera.width * camera.height * self._samples
+            primary = camera.width * camera.height * self.samples_per_pixel
             self._light.prepare(self._meshes["gel"], primary, _mitsuba_seed(seed, _LIGHT_PART, 0))
 
     def _trace(self, mi: Any, name: str, seed: int, number: int) -> Image:
         """All pixels in passes of whole pixels, each pixel's samples one after another in the wavefront."""
-        camera, samples = self._views[name].camera, self._samples
+        camera, samples = self._views[name].camera, self.samples_per_pixel
         pixels = camera.width * camera.height
         step = max(1, (_MAX_WAVEFRONT_GPU if self._variant.is_on_gpu else _MAX_WAVEFRONT) // samples)
         parts = [
@@ -195,9 +187,9 @@ class Renderer:
         import drjit as dr
 
         sampler = self._sampler
-        sampler.set_samples_per_wavefront(self._samples)
-        sampler.seed(seed, count * self._samples)
-        pixel = dr.arange(mi.UInt32, count * self._samples) // dr.opaque(mi.UInt32, self._samples)
+        sampler.set_samples_per_wavefront(self.samples_per_pixel)
+        sampler.seed(seed, count * self.samples_per_pixel)
+        pixel = dr.arange(mi.UInt32, count * self.samples_per_pixel) // dr.opaque(mi.UInt32, self.samples_per_pixel)
         pixel += dr.opaque(mi.UInt32, first)
         offset = sampler.next_2d()
         pupil = sampler.next_2d() if rays.has_aperture else None
@@ -205,7 +197,7 @@ class Renderer:
         color, seen = self._light.radiance(ray, sampler, valid)
         channels = [dr.select(valid & seen, color[i] * weight, 0) for i in range(1 if self._variant.is_mono else 3)]
         dr.eval(channels)  # all at once: each sum alone would trace everything anew
-        return [dr.block_sum(channel, self._samples) for channel in channels]
+        return [dr.block_sum(channel, self.samples_per_pixel) for channel in channels]
 
     def _build_pinhole(self, mi: Any, sensor: Sensor) -> Any:
         camera = sensor.camera
@@ -267,15 +259,6 @@ def _window(sensor: Sensor, mi: Any) -> dict[str, Any]:
             "specular_reflectance": {"type": "rgb", "value": 0.0},
         },
     }
-
-
-def _check_further(name: str, view: Sensor) -> None:
-    """Refuse what is wrong with a further camera, naming it; `emitters` and `CameraRays` look after the main one."""
-    try:
-        check_view(view)
-        ThinLens.of(view)
-    except InputError as error:
-        raise InputError(f"sensor.further_cameras {name!r}: {error}") from error
 
 
 def _mitsuba_seed(seed: int, part: int, camera: int) -> int:

@@ -30,6 +30,7 @@ import numpy as np
 
 from synth.errors import InputError
 from synth.optics import Optics
+from synth.render.lights import check_view
 from synth.scene import Sensor
 
 
@@ -69,3 +70,13 @@ class ThinLens:
         sagittal = before + within / n
         tangential = before + within / n * (above / below) ** 2
         return ThinLens(radius, 2 / (1 / sagittal + 1 / tangential))
+
+
+def check_views(sensor: Sensor) -> None:
+    """Refuse, by InputError, lights in a camera's view and lenses that cannot focus; further cameras are named."""
+    for name, view in sensor.views.items():
+        try:
+            check_view(view)
+            ThinLens.of(view)
+        except InputError as error:
+            raise InputError(f"sensor.further_cameras {name!r}: {error}" if name else str(error)) from error

@@ -135,9 +135,6 @@ def llvm_candidates() -> list[Path]:
     found += [
         path for pattern in ("libLLVM*.so*", "libLLVM*.dylib") for path in (Path(sys.prefix) / "lib").glob(pattern)
     ]
-    found += Path(sys.prefix).glob("Library/bin/LLVM-C.dll")
-    if os.name == "nt":
-        found += Path(os.environ.get("PROGRAMFILES", "C:/Program Files")).glob("LLVM/bin/LLVM-C.dll")
     newest_first = sorted({path.resolve() for path in found}, key=_name_version, reverse=True)
     named = os.environ.get("DRJIT_LIBLLVM_PATH")
     return list(dict.fromkeys([*([Path(named)] if named else []), *_packaged(), *newest_first]))
@@ -162,19 +159,17 @@ def cuda_trouble(name: str) -> str | None:
     Asks the driver first, which costs nothing where there is no GPU; then one ray is traced in another process, so that
     a broken OptiX cannot take this one down.
     """
-    windows = os.name == "nt"
     try:
-        cuda = ctypes.CDLL("nvcuda.dll" if windows else "libcuda.so.1")
+        cuda = ctypes.CDLL("libcuda.so.1")
     except OSError:
         return "there is no NVIDIA driver"
     count = ctypes.c_int(0)
     if cuda.cuInit(0) != 0 or cuda.cuDeviceGetCount(ctypes.byref(count)) != 0 or count.value < 1:
         return "the NVIDIA driver finds no GPU"
-    if not windows:
-        try:
-            ctypes.CDLL("libnvoptix.so.1")
-        except OSError:
-            return "the NVIDIA driver has no OptiX (libnvoptix.so.1; in a container, add the 'graphics' capability)"
+    try:
+        ctypes.CDLL("libnvoptix.so.1")
+    except OSError:
+        return "the NVIDIA driver has no OptiX (libnvoptix.so.1; in a container, add the 'graphics' capability)"
     probe = subprocess.run([sys.executable, "-c", _PROBE, name], capture_output=True, text=True, check=False)
     if probe.returncode != 0:
         last = (probe.stderr.strip().splitlines() or [f"exit status {probe.returncode}"])[-1]

@@ -82,8 +82,9 @@ class Gel(Part):
     stiffening: tuple[NonNegative, NonNegative] = (0.0, 0.0)
     """Yeoh's C20/C10 and C30/C10 (Rubber Chem. Technol. 66, 1993); zeros: neo-Hookean."""
     layers: tuple[Layer, ...] = ()
-    """From the contact face inward, within size_mm; what is left of the thickness is the gel's own material. Under a
-    dome their thicknesses are those at the apex; elsewhere they shrink with the pad's."""
+    """From the contact face inward; what is left of the thickness is the gel's own material. Under a dome their
+    thicknesses are those at the apex; elsewhere they shrink with the pad's. In round gels they are depths below the
+    coated face."""
 
     def face_mm(self, x: float, y: float) -> float:
         """Z of the undeformed contact face, mm; the gel's upper end where a sphere does not reach."""
@@ -107,6 +108,11 @@ class Gel(Part):
         """Thickness of the gel, of a domed pad that at the apex."""
         return self.thickness_mm or self.size_mm[2]
 
+    @property
+    def layers_mm(self) -> tuple[float, ...]:
+        """Thicknesses of the layers."""
+        return tuple(layer.thickness_mm for layer in self.layers)
+
     @model_validator(mode="after")
     def _shaped(self) -> "Gel":
         needed = _NEEDED[self.shape]
@@ -117,8 +123,6 @@ class Gel(Part):
             for name in names:
                 if name not in (*needed, *follows) and getattr(self, name) is not None:
                     raise ValueError(f'{name} belongs to shape = "{shape}", the shape is "{self.shape}"')
-        if self.is_round and self.layers:
-            raise ValueError(f'layers are for shape = "box" and "dome": a {self.shape} is of one material')
         if self.shape == "file" and "size_mm" not in self.model_fields_set:
             raise ValueError("outer and window must each name one file, which load_scene measures")
         if self.shape != "capsule" or self.radius_mm is None or self.thickness_mm is None:
@@ -136,10 +140,10 @@ class Gel(Part):
 
     @model_validator(mode="after")
     def _layered(self) -> "Gel":
-        covered = sum(layer.thickness_mm for layer in self.layers)
-        if covered >= self.size_mm[2]:
+        covered = sum(self.layers_mm)
+        if covered >= self.depth_mm:
             raise ValueError(
-                f"layers are {covered:.4g} mm thick together and leave nothing of the gel's {self.size_mm[2]} mm"
+                f"layers are {covered:.4g} mm thick together and leave nothing of the gel's {self.depth_mm} mm"
             )
         if self.layers and self.poisson_ratio < 0.3:
             raise ValueError(f"poisson_ratio = {self.poisson_ratio}: a layered pad needs at least 0.3")

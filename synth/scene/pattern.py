@@ -107,7 +107,10 @@ class Bitmap(Part):
     file: Annotated[str, Field(min_length=1)]
     """PNG, TIFF, JPEG or another format that OpenCV reads, 8 or 16 bit, grey or colour, with or without transparency;
     relative to the scene file."""
-    width_mm: Annotated[float, Field(ge=0.1, le=1000)]
+    placing: Literal["z", "uv"] = "z"
+    """z: along z, by the fields below. uv: by the texture coordinates in a gel's `outer` file (OBJ or PLY), v = 0 being
+    the picture's lower edge."""
+    width_mm: Annotated[float, Field(ge=0.1, le=1000)] | None = None
     """Of the whole picture; its height follows from square pixels."""
     offset_mm: Vector2 = (0.0, 0.0)
     """The picture's middle."""
@@ -115,6 +118,12 @@ class Bitmap(Part):
     """About its middle; positive turns +x toward +y."""
     layer: MarkLayer = "in_coating"
     """above_coating: what is not transparent is a layer of its own."""
+
+    @model_validator(mode="after")
+    def _placed(self) -> "Bitmap":
+        if (self.placing == "uv") != (self.width_mm is None):
+            raise ValueError('placing = "z" needs width_mm; with "uv" the gel\'s file says where the picture lies')
+        return self
 
 
 Pattern = Annotated[NoPattern | Dots | RandomColor | Speckle | Bitmap, Field(discriminator="kind")]

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from synth.errors import InputError
-from synth.render.lights import check_view
-from synth.render.thin_lens import ThinLens
+from synth.render.thin_lens import check_views
 from synth.scene import Render, Scene, Sensor
 from synth.scene.template import Chooser, Template, replaced
 from synth.scene.validation import validated
@@ -64,9 +63,7 @@ def draw_sensor(template: Template, seed: int, sensor: int) -> SensorInstance:
         content = {part: replaced(template.content[part], choose) for part in _parts(template, of_trajectory=False)}
         try:
             validated(content.get("render", {}), str(template.source), Render, "render")
-            for view in validated(content["sensor"], str(template.source), Sensor, "sensor").views.values():
-                check_view(view)
-                ThinLens.of(view)
+            check_views(validated(content["sensor"], str(template.source), Sensor, "sensor"))
         except InputError as error:
             rejected.append(str(error))
             continue

@@ -83,10 +83,6 @@ class Scene(Part):
                 f"motion.steps = {motion.steps} cannot record every pose of motion.then: there are {motion.moves} "
                 f"moves, press and shear among them, and each needs a step; at least {motion.moves}"
             )
-        if self.numerics.edge_length_mm is not None and self.sensor.gel.layers:
-            raise ValueError(
-                "numerics.edge_length_mm: fTetWild's meshes have no layers; leave it out for a layered gel"
-            )
         edge, thinnest = self.numerics.edge_length_mm, min(*size, gel.depth_mm)
         if edge is not None and not thinnest / 60 <= edge <= thinnest:
             raise ValueError(

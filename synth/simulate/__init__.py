@@ -15,7 +15,7 @@ def _start_warp() -> None:
     warp.config.log_level = warp.LOG_ERROR  # no banner, no compiler chatter in the user's output
     warp.config.enable_backward = False
     try:
-        ctypes.CDLL("nvcuda.dll" if os.name == "nt" else "libcuda.so.1")
+        ctypes.CDLL("libcuda.so.1")
         return
     except OSError:
         if sys.__stderr__ is None:  # closed: there is nothing to keep clean

@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from synth.arrays import FloatArray, Points, Tets
+from synth.arrays import FloatArray
 from synth.surface import quadratic_face
 
 EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
@@ -103,12 +103,3 @@ def _split_triangle(n: int) -> list[FloatArray]:
             if i + j < n - 1:
                 parts.append([(i + 1, j + 1), (i, j + 1), (i + 1, j)])
     return [np.array([(n - i - j, i, j) for i, j in part]) / n for part in parts]
-
-
-def barycentric_gradients(points: Points, tets: Tets) -> FloatArray:
-    """(m, 4, 3) float64 1/mm: gradients of the four barycentric coordinates in the undeformed tetrahedra."""
-    corner = points[tets]
-    edges = corner[:, 1:] - corner[:, :1]
-    inverse = np.linalg.inv(edges)  # columns are the gradients of coordinates 1..3
-    gradients = np.swapaxes(inverse, 1, 2)
-    return np.concatenate([-gradients.sum(axis=1, keepdims=True), gradients], axis=1)

@@ -107,8 +107,7 @@ def graded_mesh(gel: Gel, focus: Focus, across: int, through: int | None = None)
         while _reach(through) * wide < size[2]:
             through += 1
     growth = depth_growth(through, size[2] / wide)
-    layers = tuple(layer.thickness_mm for layer in gel.layers)
-    box = graded_box(size, focus, Counts((across, across), OUTER, through, growth=growth), layers)
+    box = graded_box(size, focus, Counts((across, across), OUTER, through, growth), gel.layers_mm)
     return domed(box, gel.dome_radius_mm), element_size(wide, size[2] / _reach(through))
 
 
@@ -198,8 +197,7 @@ def resolve(scene: Scene, folder: Path | None, target_error_px: float) -> Resolu
 
 def shared_mesh(gel: Gel, numerics: Numerics) -> PadMesh:
     """The mesh of all draws of a pad; its Young's modulus does not enter."""
-    layers = tuple(layer.thickness_mm for layer in gel.layers)
-    return _even_mesh(gel.size_mm, gel.dome_radius_mm, layers, numerics.cells)
+    return _even_mesh(gel.size_mm, gel.dome_radius_mm, gel.layers_mm, numerics.cells)
 
 
 @lru_cache(maxsize=4)
@@ -211,7 +209,8 @@ def _even_mesh(
 ) -> PadMesh:
     """The structured mesh; kept, since a job asks for the same one again and again."""
     whole = Focus((0.0, 0.0), (size_mm[0] / 2, size_mm[1] / 2))
-    counts = Counts((cells[0] - 2, cells[1] - 2), (1, 1), cells[2], growth=_growth(size_mm, cells))
+    growth = depth_growth(cells[2], size_mm[2] / _width(size_mm, cells))
+    counts = Counts((cells[0] - 2, cells[1] - 2), (1, 1), cells[2], growth)
     return domed(graded_box(size_mm, whole, counts, layers_mm), dome_radius_mm)
 
 
@@ -220,16 +219,12 @@ def _width(size_mm: tuple[float, float, float], cells: tuple[int, int, int]) -> 
     return float(np.sqrt(size_mm[0] / cells[0] * size_mm[1] / cells[1]))
 
 
-def _growth(size_mm: tuple[float, float, float], cells: tuple[int, int, int]) -> float:
-    return depth_growth(cells[2], size_mm[2] / _width(size_mm, cells))
-
-
 def shared_spacing_mm(gel: Gel, numerics: Numerics) -> float:
     """Size of the elements at the contact face as the error model takes it: see `element_size`."""
     size, cells = gel.size_mm, numerics.cells
-    wide, growth = _width(size, cells), _growth(size, cells)
-    high = size[2] / sum(growth**k for k in range(cells[2]))
-    return element_size(wide, high)
+    wide = _width(size, cells)
+    growth = depth_growth(cells[2], size[2] / wide)
+    return element_size(wide, size[2] / sum(growth**k for k in range(cells[2])))
 
 
 def accuracy(scene: Scene, folder: Path | None = None) -> Accuracy:

@@ -21,7 +21,8 @@ from synth.simulate.system import System
 from synth.simulate.trajectory import State, Trajectory
 
 REACH = 6.0
-"""Distance from the body within which a round gel may move, over its thickness: what is left there moves some 1 %."""
+"""Distance from the body within which a round gel may move, over its thickness or a film's shear lag, whichever is
+longer: what is left there moves some 1 %."""
 POSES = 9
 """Poses of the load path that the distance is taken from, besides its corners."""
 
@@ -57,7 +58,9 @@ def simulate_press(
     gel, whole = press.scene.sensor.gel, space_of(press)
     if not gel.is_round:
         return stepper_of(press, frames, options, whole).run(on_progress)
-    near = Vicinity(whole, press.path, gel.depth_mm)
+    # A film pulls as far as its shear lag, √(E t h / G) with the gel's thickness h and G = E / 3 of the gel.
+    film = sum(layer.youngs_modulus_kpa * layer.thickness_mm for layer in gel.layers) / gel.youngs_modulus_kpa
+    near = Vicinity(whole, press.path, max(gel.depth_mm, (3 * film * gel.depth_mm) ** 0.5))
     found = stepper_of(press, frames, options, near.space).run(on_progress)
     return replace(found, states=tuple(map(near.widened, found.states)), space=whole)
 
@@ -114,9 +117,9 @@ class Vicinity:
         space: of these elements, held as the whole gel's and on the cut.
     """
 
-    def __init__(self, whole: Space, path: LoadPath, thickness_mm: float) -> None:
-        """Cut the vicinity of a path out of the space of a gel."""
-        near = _distance(whole.mesh.points, path) <= REACH * thickness_mm
+    def __init__(self, whole: Space, path: LoadPath, decay_mm: float) -> None:
+        """Cut the vicinity of a path out of the space of a gel in which displacements die away over such a length."""
+        near = _distance(whole.mesh.points, path) <= REACH * decay_mm
         kept = np.asarray(near[whole.mesh.tets].any(axis=1))
         self._whole, self._nodes = whole, np.unique(whole.nodes[kept])
         self.space = _part(whole, kept, self._nodes)

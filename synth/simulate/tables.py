@@ -7,9 +7,10 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
+from synth.mesh.pad import barycentric_gradients
 from synth.simulate.bulk import Bulk
 from synth.simulate.contact import Faces, Indenters
-from synth.simulate.element import EDGES, barycentric_gradients
+from synth.simulate.element import EDGES
 from synth.simulate.inversion_barrier import SAMPLE_DEGREE, BarrierTables
 from synth.simulate.load_path import LoadPath, Pose
 from synth.simulate.material import Material

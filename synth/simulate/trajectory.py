@@ -45,19 +45,8 @@ class State:
 
     def summary(self) -> dict[str, Any]:
         """The state without its fields, as trajectory.json has it."""
-        return {
-            "depth_mm": self.depth_mm,
-            "shear_mm": list(self.shear_mm),
-            "twist_deg": self.twist_deg,
-            "force_n": list(self.force_n),
-            "torque_nmm": list(self.torque_nmm),
-            "converged": True,
-            "newton_iterations": self.newton_iterations,
-            "residual": self.residual,
-            "min_jacobian": self.min_jacobian,
-            "max_penetration_mm": self.max_penetration_mm,
-            "slip_ratio": self.slip_ratio,
-        }
+        numbers = {name: value for name, value in vars(self).items() if name not in ("displacement", "traction")}
+        return {**numbers, "converged": True}
 
 
 def undeformed(pose: Pose, space: Space) -> State:

@@ -61,10 +61,6 @@ class Plate:
         matrix = np.eye(3) - 2 * np.outer(self.normal, self.normal)
         return (points - self.corners[0]) @ matrix + self.corners[0]
 
-    def is_before(self, point: FloatArray) -> bool:
-        """Whether a point (3,) is on the reflecting side."""
-        return bool((point - self.corners[0]) @ self.normal > 0)
-
     def crossing(self, start: FloatArray, end: Points) -> Points:
         """Where the lines from start to end meet the plane: the place that divides them as their heights."""
         a, b = (start - self.corners[0]) @ self.normal, (end - self.corners[0]) @ self.normal
@@ -142,7 +138,7 @@ class ForwardCamera:
         By a mirror also where the mirror has ended: see `reaches`.
         """
         local = self._local(points, path)
-        across, angle = _across(local), _angle(local)
+        across, angle = np.hypot(local[:, 0], local[:, 1]), _angle(local)
         lost = ~(angle < self.field)
         wide = np.flatnonzero(self.is_fisheye & ~lost & (angle > _OPENCV_FIELD))
         radius = _fisheye_radius(angle[wide], self.distortion)[:, None] if len(wide) else 0.0
@@ -188,7 +184,7 @@ class ForwardCamera:
                 free &= ~plate.crossed(self.eye, aim)
             return free
         own = self.plates[path - 1]
-        free &= own.crossed(self.eye, aim) & own.is_before(self.eye)
+        free &= own.crossed(self.eye, aim) & bool((self.eye - own.corners[0]) @ own.normal > 0)
         turn = own.crossing(self.eye, aim)
         end = own.reflected(aim)
         for plate in self.plates:
@@ -246,13 +242,9 @@ class ForwardCamera:
         return foot + arm * share[:, None]
 
 
-def _across(local: Points) -> FloatArray:
-    return np.asarray(np.hypot(local[:, 0], local[:, 1]))
-
-
 def _angle(local: Points) -> FloatArray:
     """To the camera's axis, radians (n,)."""
-    return np.asarray(np.arctan2(_across(local), local[:, 2]))
+    return np.asarray(np.arctan2(np.hypot(local[:, 0], local[:, 1]), local[:, 2]))
 
 
 def _turning_angle(camera: Camera) -> float:

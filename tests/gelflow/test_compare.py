@@ -131,7 +131,7 @@ def test_methods_are_added_and_scored_again(tmp_path: Path, capsys: pytest.Captu
     before = read_comparison(out / "scores.json")
     assert main(["compare", folder, "--methods", "farneback,none", "--out", str(out), "--add"]) == 0
     after = read_comparison(out / "scores.json")
-    assert after.methods == ["DIS fast", "Farnebäck", "no motion"]
+    assert list(after.strata) == ["DIS fast", "Farnebäck", "no motion"]
     assert after.strata["DIS fast"] == before.strata["DIS fast"]
     assert [s for s in after.scores if s.method == "DIS fast"] == [s for s in before.scores if s.method == "DIS fast"]
     text = (out / "table.md").read_text()
@@ -149,7 +149,7 @@ def test_a_moved_copy_of_the_data_is_the_same_data_and_other_pairs_are_not(tmp_p
     out = tmp_path / "out"
     compare([Constant("a", 0, 0)], first, out)
     result = compare([Constant("b", 0, 0)], moved, out, add=True)
-    assert (result.methods, result.data) == (["a", "b"], (first.source, moved.source))
+    assert (list(result.strata), result.data) == (["a", "b"], (first.source, moved.source))
     kept = (out / "scores.json").read_bytes()
     for dataset, words in ((longer, r"\(2 pairs\), not on .*longer \(3 pairs\)"), (other, "these are other pairs"),
                            (plain, "these are other pairs")):  # fmt: skip

@@ -164,31 +164,6 @@ def random(seed: int) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-@pytest.fixture(scope="module")
-def pressed() -> tuple[Tensor, Tensor, Tensor]:
-    """True flow, up to 8 px, and both images, 240 x 320 px."""
-    flow = press_flow(240, 320, 8.0)
-    image1, image2 = moved_pair(flow, seed=5)
-    return flow[None], image1[None], image2[None]
-
-
-@pytest.mark.parametrize("options", [
-    {}, {"smoothness": "first_order"}, {"least_weight": 0.1}, {"lambda_dc": 0, "lambda_df": 0},
-], ids=["helmholtz", "first order", "least weight", "images alone"])  # fmt: skip
-def test_the_true_flow_scores_better_than_none_and_than_a_tenth_more_or_less(options: dict, pressed) -> None:
-    """The latter at the scales that resolve the texture (s = 0, 1, 2)."""
-    flow, image1, image2 = pressed
-    config, fine = LossConfig(**options), LossConfig(**options, lambda_s=(1.0, 1.0, 1.0))
-    flows = flow_pyramid(flow, 7)
-
-    def loss(factor: float, flows: list[Tensor], config: LossConfig) -> Tensor:
-        return self_supervised_loss([factor * field for field in flows], image1, image2, config)[0]
-
-    assert loss(1, flows, config) < 0.75 * loss(0, flows, config)
-    less, true, more = (loss(factor, flows[:3], fine) for factor in (0.9, 1, 1.1))
-    assert true < min(less, more)
-
-
 def test_parts_add_up_scales_are_weighted_and_a_mask_removes_pixels() -> None:
     flows = flow_pyramid(torch.randn(1, 2, 64, 64, dtype=torch.float64), 3)
     images = torch.rand(2, 1, 3, 64, 64, dtype=torch.float64)

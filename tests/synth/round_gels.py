@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from benchmarks.capsule_surface import capsule_surface
 from synth.arrays import Points
 from synth.mesh.capsule import CapsuleFace
 from synth.scene import Camera, Gel, Light, NoPattern, Sensor, Window
@@ -35,7 +36,7 @@ def on_face(points: Points) -> Points:
 
 def capsule(edge_mm: float, length: float = LENGTH) -> GelSurface:
     """The face at rest, of quadratic triangles with edges of about that length."""
-    return CapsuleFace(RADIUS, RADIUS - INNER, length).rest_surface(edge_mm)
+    return capsule_surface(CapsuleFace(RADIUS, RADIUS - INNER, length), edge_mm)
 
 
 def dented(points: Points, place: Points, depth: float, shear: tuple[float, float, float] = (0, 0, 0)) -> Points:

@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import tomli_w
@@ -22,6 +23,8 @@ from synth.mesh.pad import boundary_faces
 from synth.optics import Optics
 from synth.pipeline.generate import generate
 from synth.planning import check_buildable, job_variant
+from synth.render.chart import chart_of
+from synth.render.pattern import albedo
 from synth.scene import Scene
 from synth.scene.gel_file import measured
 from synth.scene.template import load_scene
@@ -110,11 +113,27 @@ def test_a_box_and_a_dome_agree_with_their_files(tmp_path: Path, dome_mm: float 
     assert np.nanmax(np.linalg.norm(truth, axis=-1)) > 2
 
 
+def write_textured(path: Path, points: Points, faces: Triangles) -> None:
+    """An OBJ file, right-handed, with u the azimuth from 0 to 1, its seam at +x, and v from 0 at the tip to 1."""
+    corners = points[faces[:, ::-1]] * [1, -1, 1]
+    turn = np.arctan2(corners[..., 1], corners[..., 0]) / (2 * np.pi)
+    middle = corners.mean(axis=1)
+    near = np.arctan2(middle[:, 1], middle[:, 0])[:, None] / (2 * np.pi) % 1
+    places = np.stack([turn + np.round(near - turn), corners[..., 2] / points[:, 2].max()], axis=-1)
+    lines = [f"v {x} {y} {z}" for x, y, z in points * [1, -1, 1]]
+    lines += [f"vt {u} {v}" for u, v in places.reshape(-1, 2)]
+    numbers = zip(faces[:, ::-1] + 1, np.arange(faces.size).reshape(-1, 3) + 1, strict=True)
+    lines += ["f " + " ".join(f"{a}/{b}" for a, b in zip(*face, strict=True)) for face in numbers]
+    path.write_text("\n".join(lines))
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     found = tmp_path_factory.mktemp("capsule")
     write(found, "outer.stl", capsule_body(5.0, 2.0, 0.0))
+    write_textured(found / "outer.obj", *capsule_body(5.0, 2.0, 0.0))
     write(found, "window.stl", capsule_body(3.0, 3.0, 2.0))
+    cv2.imwrite(str(found / "quadrants.png"), np.kron(QUADRANTS[..., ::-1], np.ones((40, 40, 1))))
     return found
 
 
@@ -165,10 +184,11 @@ def test_a_gel_that_is_hollow_itself_is_bonded_where_it_touches_the_window(tmp_p
 
 
 @pytest.mark.parametrize("is_file", [False, True], ids=["built in", "files"])
-def test_the_batched_solver_presses_it(folder: Path, is_file: bool) -> None:
+def test_the_batched_solver_presses_its_layers(folder: Path, is_file: bool) -> None:
     motion = {"depth_mm": 0.4, "shear_mm": (0.1, 0.0), "polar_deg": 50.0, "azimuth_deg": 200.0, "steps": 2}
-    posed = capsule(friction=0.5, motion=motion, numerics={"element": "p1p1"})
-    posed = from_files(posed, folder) if is_file else posed
+    layers = [{"thickness_mm": 0.3, "youngs_modulus_kpa": 800.0}]
+    posed = capsule({"layers": layers}, friction=0.5, motion=motion, numerics={"element": "p1p1"})
+    posed = from_files(posed, folder, layers=layers) if is_file else posed
     mesh = MeshRule.of(posed).resolution(posed, folder, [folder]).mesh
     single = complete(posed, mesh, folder).states[-1]
     (batched,) = simulate_scenes([posed], mesh, folder)
@@ -202,6 +222,28 @@ def scene_file(folder: Path, **gel: Any) -> Path:
     return path
 
 
+UV = 'sensor.pattern={ kind = "bitmap", file = "FOLDER/quadrants.png", placing = "uv" }'
+QUADRANTS = np.array([[(255, 0, 0), (0, 255, 0)], [(0, 0, 255), (255, 255, 255)]])  # RGB: v > 1/2 above, u < 1/2 left
+
+
+def test_a_picture_lies_where_the_files_texture_coordinates_say(folder: Path) -> None:
+    path = scene_file(folder, outer="outer.obj")
+    sensor = (
+        load_scene(path, set=[UV.replace("FOLDER", str(folder)), "sensor.coating.reflectance=[1, 1, 1]"])
+        .corners[0]
+        .sensor
+    )
+    texture, chart = albedo(sensor, np.random.default_rng(0), folder), chart_of(sensor)
+    arc, azimuth = (axis.ravel() for axis in np.meshgrid(np.linspace(1.5, 9.5, 40), np.linspace(-3, 3, 61)))
+    points = chart.points(arc, azimuth)
+    column, row = ((chart.flattened(points) / chart.size_mm + 0.5) * texture.shape[1::-1]).astype(int).T
+    # The files' y is the scene's, mirrored; facets and texels are up to 0.2 mm away from the capsule.
+    clear = (np.abs(points[:, 1]) > 0.2) & (np.abs(points[:, 2] - 3.5) > 0.2)
+    expected = QUADRANTS[(points[:, 2] < 3.5).astype(int), (points[:, 1] > 0).astype(int)] / 255
+    assert clear.mean() > 0.8
+    np.testing.assert_allclose(texture[row, column][clear], expected[clear], atol=1e-6)
+
+
 def build(path: Path, *assignments: str) -> None:
     template = load_scene(path, set=assignments)
     check_buildable(template, job_variant(template, "auto"))
@@ -210,7 +252,9 @@ def build(path: Path, *assignments: str) -> None:
 @needs_llvm
 def test_a_dataset_of_files_is_verified_without_them(folder: Path, tmp_path: Path) -> None:
     copy, out = Path(shutil.copytree(folder, tmp_path / "copy")), tmp_path / "out"
-    assert generate(load_scene(scene_file(copy)), 2, out).made == 2
+    layers = [{"thickness_mm": 0.3, "youngs_modulus_kpa": 800.0}]
+    scene = load_scene(scene_file(copy, outer="outer.obj", layers=layers), set=[UV.replace("FOLDER", str(copy))])
+    assert generate(scene, 2, out).made == 2
     shutil.rmtree(copy)
     report = verify_dataset(out)
     assert report.ok, report
@@ -229,10 +273,13 @@ def test_a_dataset_of_files_is_verified_without_them(folder: Path, tmp_path: Pat
     ({"window": "askew.stl"}, "thinner than an element's edge of 1.5 mm"),
     ({"size_mm": [9.0, 10.0, 7.0]}, "the files say"),
     ({"window": {"choice": ["window.stl", "above.stl"]}}, "must each name one file"),
-    ({"layers": [{"thickness_mm": 0.1, "youngs_modulus_kpa": 900.0}]}, "a file is of one material"),
 ])  # fmt: skip
 def test_bad_files_are_told_in_a_sentence(bad: Path, gel: dict[str, Any], message: str) -> None:
     refused(message, build, scene_file(bad, **gel))
+
+
+def test_files_without_texture_coordinates_are_told(folder: Path) -> None:
+    refused("outer.stl has no texture coordinates", build, scene_file(folder), UV.replace("FOLDER", str(folder)))
 
 
 @pytest.mark.parametrize(("place", "message"), [

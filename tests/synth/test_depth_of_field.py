@@ -8,12 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 from commands import refused
-from kinematic_double import assert_same_flow, rigid, rotation
+from kinematic_double import rigid, rotation
 from render_scenes import FAST, SCALAR, flat_surface, needs_llvm, plain, refracted_angle, rendered, small_sensor
 
 from synth.arrays import FloatArray, Image, Points
-from synth.flow.exact import exact_flow
-from synth.flow.view import View
 from synth.optics import Optics
 from synth.pipeline.generate import generate
 from synth.render.pattern import albedo
@@ -190,16 +188,6 @@ def test_defocus_does_not_move_centroids() -> None:
     # at random would leave 0.8 / √12000 = 0.007 px a dot: four times that, and its 18th part's root for the mean.
     assert np.abs(shifts).max() < 0.03
     assert np.abs(np.mean(shifts, axis=0)).max() < 0.03 / np.sqrt(18)
-
-
-def test_the_flow_does_not_know_of_the_aperture() -> None:
-    sharp = small_sensor(1.45)
-    blurred = small_sensor(1.45, aperture_mm=APERTURE, focus_mm=15.0)
-    surface = flat_surface(sharp)
-    states = surface.material, rigid(rotation("z", 3.0), (0.3, -0.2, 1.0))(surface.material)
-    first, second = (exact_flow(View(surface, Optics.of(sensor)), *states) for sensor in (sharp, blurred))
-    assert np.isfinite(first.forward).all()
-    assert_same_flow(first, second)
 
 
 @needs_llvm

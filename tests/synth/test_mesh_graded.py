@@ -8,7 +8,7 @@ from pads import area_vectors, contact_faces
 
 from synth.arrays import FloatArray
 from synth.mesh import Counts, Focus, PadMesh, graded_box
-from synth.mesh.graded import FINEST, GRAIN_MM, STEEPEST, kuhn_tets, lateral_planes, spacing
+from synth.mesh.graded import FILM, FINEST, GRAIN_MM, STEEPEST, kuhn_tets, lateral_planes, spacing
 from synth.mesh.pad import boundary_faces
 from synth.mesh.tetrahedralise import WORST_SHAPE, shape_quality
 
@@ -136,7 +136,7 @@ def test_small_focus_outgrows_its_elements_and_planes_move_continuously_with_it(
 
 @pytest.mark.parametrize("layers", LAYERS.values(), ids=LAYERS)
 def test_layers_are_bounded_by_planes(layers: tuple[float, ...]) -> None:
-    counts = Counts(through=3, film=2)
+    counts = Counts(through=3)
     mesh = graded_box(SIZE, CENTRED, counts, layers)
     faces = np.concatenate([[0.0], np.cumsum(layers), [SIZE[2]]])
     z = mesh.points[mesh.tets][:, :, 2]
@@ -148,7 +148,7 @@ def test_layers_are_bounded_by_planes(layers: tuple[float, ...]) -> None:
     assert (z <= faces[mesh.layer + 1][:, None]).all()
     for k in range(len(layers) + 1):
         between = ((planes > faces[k]) & (planes <= faces[k + 1])).sum()
-        assert between >= (counts.film if layers else counts.through)
+        assert between >= (FILM if layers else counts.through)
         volume = SIZE[0] * SIZE[1] * (faces[k + 1] - faces[k])
         assert mesh.volumes[mesh.layer == k].sum() == pytest.approx(volume, rel=1e-12)
     assert np.diff(planes).max() <= _depth_steps(counts).max() + 1e-9

@@ -22,7 +22,7 @@ from synth.pipeline.generate import generate
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
 from synth.render.variant import Variant
-from synth.scene import Coating, Dots, Gel, Light, Mirror, NoPattern, Render, Sensor, Speckle
+from synth.scene import Coating, Dots, Gel, Light, Mirror, NoPattern, Render, Sensor
 from synth.scene.template import load_scene
 from synth.surface import GelSurface
 
@@ -98,17 +98,6 @@ def test_matt_dots_lack_the_highlight_and_on_a_matt_coating_both_layers_are_one(
     # The same marks in the same places: blending by hand gives the one texture from the other.
     by_hand = np.array(matt.reflectance) * (1 - shining[:, :, 3:]) + shining[:, :, :3] * shining[:, :, 3:]
     assert by_hand == pytest.approx(first, abs=1e-6)
-
-
-@needs_llvm
-def test_grey_layers_look_the_same_in_one_channel() -> None:
-    grey = Coating(reflectance=(0.5, 0.5, 0.5), roughness=0.4, metallic=0.8)
-    pattern = Speckle(kind="speckle", grain_mm=0.8, reflectance=(0.1, 0.1, 0.1), layer="above_coating")
-    sensor = small_sensor(pattern=pattern).model_copy(update={"coating": grey})
-    color = _render(sensor)
-    mono = _render(sensor, variant=Variant("llvm_ad_mono", "test", llvm=FAST.llvm))
-    # The same samples; only the luminance weights round differently.
-    assert mono == pytest.approx(color, rel=1e-5)
 
 
 FIXED = [

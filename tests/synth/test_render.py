@@ -18,7 +18,7 @@ from synth.render import path_tracer
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer, full_grid
 from synth.render.variant import Variant
-from synth.scene import Dots, Light, Render, Sensor
+from synth.scene import Coating, Dots, Light, Render, Sensor, Speckle
 
 MONO = replace(FAST, name="llvm_ad_mono")
 names = {"ids": lambda value: value.name if isinstance(value, Variant) else str(value)}
@@ -182,8 +182,10 @@ def test_nothing_is_compiled_for_another_frame_or_another_draw_of_the_sensor() -
 @needs_llvm
 def test_grey_scenes_look_the_same_in_one_channel_and_light_brightens_the_slope_that_faces_it() -> None:
     separated = DIRECT.model_copy(update={"light": "separated"})
-    for index, render in ((1.0, DIRECT), (1.45, separated)):
-        sensor = small_sensor(index, _dots())
+    grains = Speckle(kind="speckle", grain_mm=0.8, reflectance=(0.1, 0.1, 0.1), layer="above_coating")
+    shining = {"coating": Coating(reflectance=(0.5, 0.5, 0.5), roughness=0.4, metallic=0.8)}
+    for index, render, pattern, coating in ((1.0, DIRECT, grains, shining), (1.45, separated, _dots(), {})):
+        sensor = small_sensor(index, pattern).model_copy(update=coating)
         texture = albedo(sensor, np.random.default_rng(0))
         color, mono = (rendered(sensor, texture, render, variant=one) for one in (FAST, MONO))
         # The same samples; only the luminance weights 0.2126 + 0.7152 + 0.0722 round differently.

@@ -13,9 +13,10 @@ STAGES = (
     "synth",  # the package itself: its version, and where its public names are, which it loads when they are asked for
     "synth.errors", "synth.arrays",
     "synth.dataset.storage",  # how a file gets to the disk as a whole; knows nothing of datasets
-    "synth.scene", "synth.surface", "synth.optics", "synth.mesh", "synth.simulate", "synth.render",
+    "synth.scene", "synth.surface", "synth.optics", "synth.mesh", "synth.simulate", "synth.flow",
+    "synth.render",
     "synth.scene.sampling",  # draws again what could not be rendered
-    "synth.flow", "synth.dataset", "synth.verify", "synth.inspect", "synth.planning", "synth.pipeline",
+    "synth.dataset", "synth.verify", "synth.inspect", "synth.planning", "synth.pipeline",
     "synth.progress", "synth.calibrate", "synth.stress", "synth.doctor", "synth.cli_options", "synth.commands",
     "synth.cli", "synth.__main__",
 )  # fmt: skip

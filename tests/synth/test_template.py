@@ -118,6 +118,8 @@ WRONG_KEYS_AND_TYPES = [
     ("sensor.gel.shape=bowl", " = 'bowl': must be 'box', 'dome', 'capsule' or 'file'"),
     ("sensor.gel={ youngs_modulus_kpa = 100.0 }", 'sensor.gel: shape = "box" needs size_mm'),
     ("sensor.gel.radius_mm=9", 'sensor.gel: radius_mm belongs to shape = "capsule", the shape is "box"'),
+    ('sensor.pattern={ kind = "bitmap", file = "a.png" }', ': placing = "z" needs width_mm'),
+    ('sensor.pattern={ kind = "bitmap", file = "a.png", placing = "uv" }', 'sensor: pattern.placing = "uv" needs gel.'),
     ("name=two words", " = 'two words': "),
     ("contact.indenter.shape=ball", " = 'ball': allowed are 'sphere', 'cylinder', 'box'"),
     ("contact.indenter={ radius_mm = 1 }", ": lacks the key 'shape'"),
@@ -141,7 +143,6 @@ IMPOSSIBLE_PHYSICS = [
 WRONG_DISTRIBUTIONS = [
     ("motion.depth_mm={ uniform = [0.3, 0.1] }", ": uniform needs [lower, upper], it has [0.3, 0.1]"),
     ("motion.depth_mm={ uniform = [1] }", ": uniform needs two finite numbers, it has [1]"),
-    ("motion.depth_mm={ uniform = [0, inf] }", ": uniform needs two finite numbers"),
     ("motion.depth_mm={ normal = [0, true] }", ": normal needs two finite numbers"),
     ("motion.depth_mm={ normal = [0, -1] }", ": normal's standard deviation must not be negative"),
     ("motion.depth_mm={ log_uniform = [0, 1] }", ": log_uniform needs positive ends"),
@@ -167,7 +168,6 @@ def test_a_wrong_value_is_named_with_file_place_and_what_is_allowed(tiny: Path, 
     ("=1", "give key=value"),
     ("motion..depth_mm=1", "give key=value"),
     ("sensor.lights.5.power=1", "'5' is not an entry of a list of 5 (0 is the first)"),
-    ("sensor.lights.first.power=1", "'first' is not an entry of a list of 5"),
     ("motion.steps.more=1", "'more' lies inside a value that is not a table"),
     ("motion.depth_mm.uniform=[0, 1]", "motion.depth_mm is a distribution; give all of it, as in --set 'motion."),
 ])  # fmt: skip
@@ -192,7 +192,6 @@ def test_every_problem_is_told_once_on_a_short_line_as_are_missing_files(tiny: P
 
 @pytest.mark.parametrize(("content", "message"), [
     ("name = ", "not valid TOML"),
-    ("a = 1\na = 2\n", "not valid TOML"),
     ("", "name: is missing"),
     ("name = 'x'\n", "sensor: is missing"),
     (TEXT.replace('kind = "dots",', ""), "sensor.pattern: lacks the key 'kind'"),
