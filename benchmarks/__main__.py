@@ -24,7 +24,6 @@ QUESTIONS = {
     "round_gel": "the flow's error against run time for a round gel, by mesh",
     "synthetic_set": "makes the synthetic test set of the report on gelflow",
     "sigma": "is the flow's uncertainty calibrated? fits its constants",
-    "loss_order": "does the true flow have the lowest self-supervised loss?",
     "pictures": "draws the README's pictures of data",
 }
 

@@ -9,15 +9,12 @@ from pathlib import Path
 
 import pytest
 import pyvista as pv
-import torch
 from commands import said
 
 from benchmarks import synthetic_set
 from benchmarks.__main__ import QUESTIONS, main
-from benchmarks.loss_order import fitted
 from benchmarks.objects import summary
 from benchmarks.rows import Row, machine, measure, plot, read, show, write
-from gelflow.ops.pyramid import enlarge_flow
 
 CASES = [{"mesh": name, "cells": cells, "step_mm": None} for name in ("fine", "1e-3") for cells in (1, 2)]
 """One name reads like a number, and a key without a value is a key too."""
@@ -116,17 +113,6 @@ def test_the_summary_of_made_up_presses() -> None:
     assert found["times a ball's time, median"] == 1.02
     assert (found["sunk in, median"], found["largest"], found["at most 2%"]) == ("2.0%", "6.0%", "67%")
     assert summary([{"status": "refused"}]) == {"refused": 1, "pressed": 0, "complete": 0}
-
-
-def test_the_fitted_coarse_flow_is_found_again() -> None:
-    """Where the full flow is an enlarged one; the means over blocks, its start, are off by tenths of a pixel."""
-    torch.manual_seed(0)
-    true = torch.randn(1, 2, 6, 7, dtype=torch.float64)
-    flow, known = enlarge_flow(true, 2, (24, 28)), torch.ones(1, 1, 24, 28, dtype=torch.float64)
-    start = torch.nn.functional.avg_pool2d(flow, 4) / 4
-    assert (start - true).abs().max() > 0.1
-    # The squared residual falls to 1e-10 of the first: errors to some 1e-5 of the start's.
-    torch.testing.assert_close(fitted(flow, known, start, 2), true, atol=1e-4, rtol=0)
 
 
 def test_the_synthetic_set_has_every_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
