@@ -3,8 +3,9 @@
     python -m benchmarks draws --draws 300 --workers 16                   one by one on the CPU
     python -m benchmarks draws --draws 300 --workers 16 --device cuda     together on a GPU
 
-Every draw is pressed as `generate` would: on the CPU on a mesh of its own, on a GPU on the batched solver's. One that
-does not complete is a failure, here and there; `generate` replaces it. A repeated run goes on with the CSV file, on a
+Every draw is pressed as `generate` would: on the CPU on a mesh of its own, on a GPU on the batched solver's; an object
+whose press does not complete once more, with rounder edges. One that does not complete then is a failure; `generate`
+replaces it. A repeated run goes on with the CSV file, on a
 GPU by whole scenes.
 """
 
@@ -22,7 +23,7 @@ from synth.scene.template import SCENES, load_scene
 from synth.simulate import Trajectory
 from synth.simulate.batched import simulate_presses
 from synth.simulate.batched.pad import prepare
-from synth.simulate.press import MeshRule, Press
+from synth.simulate.press import MeshRule, Press, blunter
 from synth.simulate.solve import simulate_press
 
 DEEP = 0.02
@@ -42,13 +43,20 @@ def drawn(case: Row, settings: Sequence[str] = ()) -> tuple[Press, frozenset[int
     return press, frozenset(frame for pair in pairs for frame in pair.frames)
 
 
-def found(result: Trajectory, shown: frozenset[int]) -> Row:
+def rounder(case: Row, press: Press) -> Press | None:
+    """A press with rounder edges, None for other bodies than objects."""
+    scene = blunter(press)
+    return None if scene is None else MeshRule.of(scene).press(scene, load_scene(case["scene"]).folder)
+
+
+def found(result: Trajectory, shown: frozenset[int], is_rounder: bool) -> Row:
     """What a row says of a draw."""
     deepest = max(state.depth_mm for state in result.states)
     sunk = max((state.max_penetration_mm for n, state in enumerate(result.states) if n in shown), default=0.0)
     return {
         "status": result.status,
         "reason": result.reason,
+        "rounder": is_rounder,
         "iterations": sum(state.newton_iterations for state in result.states),
         "penetration": round(sunk / deepest, 5) if deepest > 0 else 0.0,
     }
@@ -57,7 +65,13 @@ def found(result: Trajectory, shown: frozenset[int]) -> Row:
 def one(case: Row) -> Row:
     """A draw on the CPU."""
     made = drawn(case)
-    return {"status": "unbuilt", "reason": made} if isinstance(made, str) else found(simulate_press(*made), made[1])
+    if isinstance(made, str):
+        return {"status": "unbuilt", "reason": made}
+    press, shown = made
+    result, again = simulate_press(press, shown), None
+    if result.status != "complete" and (again := rounder(case, press)):
+        result = simulate_press(again, shown)
+    return found(result, shown, again is not None)
 
 
 def together(case: Row, workers: int) -> list[Row]:
@@ -67,11 +81,14 @@ def together(case: Row, workers: int) -> list[Row]:
         made = list(pool.map(partial(drawn, settings=['numerics.solver="batched"']), cases, chunksize=4))
     rows = {number: {"status": "unbuilt", "reason": each} for number, each in enumerate(made) if isinstance(each, str)}
     built = [(number, *each) for number, each in enumerate(made) if not isinstance(each, str)]
-    for _, group in groupby(built, lambda each: pad_key(each[1])):
-        numbers, presses, frames = zip(*group, strict=True)
-        pad = prepare(presses[0].scene, presses[0].mesh, case["device"])
-        for k, result in simulate_presses(presses, pad, frames, BATCH["cuda"]):
-            rows[numbers[k]] = found(result, frames[k])
+    for is_rounder in (False, True):
+        for _, group in groupby(built, lambda each: pad_key(each[1])):
+            numbers, presses, frames = zip(*group, strict=True)
+            pad = prepare(presses[0].scene, presses[0].mesh, case["device"])
+            for k, result in simulate_presses(presses, pad, frames, BATCH["cuda"]):
+                rows[numbers[k]] = found(result, frames[k], is_rounder)
+        failed = [each for each in built if rows[each[0]]["status"] != "complete"]
+        built = [(number, again, shown) for number, press, shown in failed if (again := rounder(case, press))]
     return [{"trajectory": number, **rows[number]} for number in range(case["draws"])]
 
 
@@ -83,6 +100,7 @@ def summaries(rows: Sequence[Row]) -> Iterator[Row]:
         done = [row for row in own if row["status"] == "complete"]
         deep = [row["penetration"] for row in done]
         line: Row = {"scene": name, "draws": len(own), "complete": len(done), "share": f"{len(done) / len(own):.2%}"}
+        line["with rounder edges"] = sum(row["rounder"] is True for row in done)
         yield line | {"deeper than 2 %": sum(x > DEEP for x in deep), "deepest": f"{max(deep, default=0.0):.1%}"}
 
 

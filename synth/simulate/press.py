@@ -12,6 +12,8 @@ from synth.simulate.indenter import object_radius
 from synth.simulate.load_path import LoadPath, path_of
 from synth.simulate.resolution import Accuracy, Resolution, accuracy, resolve, shared_mesh, shared_spacing_mm
 
+BLUNTER = 1.5
+"""Factor on the radius of an object's edges where its press does not complete."""
 ELEMENTS: dict[str, Callable[[], Element]] = {"auto": p2p1, "p1p1": p1p1, "p2p1": p2p1}
 
 
@@ -38,6 +40,17 @@ def edge_radius_mm(scene: Scene, mesh: PadMesh) -> float | None:
     """Radius to which a mesh rounds the edges of a mesh indenter; None for other shapes."""
     indenter = scene.contact.indenter
     return object_radius(indenter, resolution_mm(scene, mesh)) if isinstance(indenter, MeshIndenter) else None
+
+
+def blunter(press: Press) -> Scene | None:
+    """The scene with an object's edges rounder than the mesh resolves; None for other shapes, or if they are already."""
+    indenter, radius = press.scene.contact.indenter, edge_radius_mm(press.scene, press.mesh)
+    if not isinstance(indenter, MeshIndenter) or radius is None or (indenter.fillet_mm or 0.0) >= radius:
+        return None
+    contact = press.scene.contact.model_copy(
+        update={"indenter": indenter.model_copy(update={"fillet_mm": BLUNTER * radius})}
+    )
+    return press.scene.model_copy(update={"contact": contact})
 
 
 def resolution_mm(scene: Scene, mesh: PadMesh) -> float:
