@@ -74,13 +74,10 @@ def render_undeformed(sensor: Sensor, render: Render, variant: Variant) -> Float
 
 
 def at_rest(frame: FloatArray, rest: FloatArray) -> tuple[BoolArray, FloatArray]:
-    """Where a bare gel's frame (H, W, 3) is not pressed, and its picture at rest, smoothed.
+    """Where a bare gel's frame (H, W, 3) is not pressed, (H, W), and its picture at rest, smoothed, (H, W, 3).
 
     Both frames are smoothed by a Gaussian of 2 % of the width. A pixel counts as pressed, or as shaded by what is, if
     they differ by more than 8 of 255 levels in any channel there or within that distance.
-
-    Returns:
-        (H, W) pixels that are not pressed; (H, W, 3) the smoothed frame at rest.
     """
     import cv2
 

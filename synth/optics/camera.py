@@ -85,17 +85,13 @@ class Optics:
         return (self.pose, *(mirror.virtual(self.pose) for mirror in self.mirrors))
 
     def project(self, points: Points, path: Paths | int | None = None) -> Pixels:
-        """Pixels at which points inside the gel or window are seen.
+        """Pixels (n, 2) px, float64, at which points (n, 3) mm inside the gel or window are seen.
 
-        Args:
-            points: (n, 3) float64 mm.
-            path: by which path, one for all points or one for each; by default the first by which the point is seen
-                inside the image, or else straight.
-
-        Returns:
-            (n, 2) float64 px, also outside the image and, where a path is given, beyond the ends of a mirror; NaN for
-            points that have no image: behind the camera, above the window's outer face (where there is one), or beyond
-            the field of the lens model; for path -1; and by default where a mirror hides what would be in the image.
+        The path is one for all points or one for each; by default the first by which the point is seen inside the
+        image, or else straight. Pixels may lie outside the image and, where a path is given, beyond the ends of a
+        mirror. NaN for points that have no image: behind the camera, above the window's outer face (where there is
+        one), or beyond the field of the lens model; for path -1; and by default where a mirror hides what would be in
+        the image.
         """
         points = np.asarray(points, dtype=np.float64)
         if not self.mirrors:

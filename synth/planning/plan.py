@@ -87,11 +87,10 @@ def job_variant(template: Template, device: Device) -> Variant:
 def check_buildable(template: Template, variant: Variant) -> None:
     """Build what fits the schema and may still be impossible, so that a job does not find out after its first hour.
 
-    Raises:
-        InputError: at a corner of the distributions, an indenter whose parts do not fit or whose file is no surface,
-            a gel from files that is too thin or is pressed beside its face, a light in the camera's view, a lens or a
-            kind of light that this variant or coating cannot have, a pattern that no pixel could show or whose file is
-            no picture, or more pairs than a trajectory has.
+    InputError, at a corner of the distributions, for an indenter whose parts do not fit or whose file is no surface, a
+    gel from files that is too thin or is pressed beside its face, a light in the camera's view, a lens or a kind of
+    light that this variant or coating cannot have, a pattern that no pixel could show or whose file is no picture, or
+    more pairs than a trajectory has.
     """
     try:
         for sensor in dict.fromkeys(corner.sensor for corner in template.corners):

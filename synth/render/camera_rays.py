@@ -237,9 +237,8 @@ def _far_root(square: Any, half: Any, rest: Any) -> Any:
 def pinhole(sensor: Sensor) -> dict[str, Any]:
     """Mitsuba's perspective camera, less its film and sampler, for scalar variants.
 
-    Raises:
-        InputError: the camera has a fisheye lens, a mirror, distortion, an aperture, pixels that are not square or a
-            round window before it, or a light is narrower than Lambertian.
+    InputError for a fisheye lens, a mirror, distortion, an aperture, pixels that are not square, a round window before
+    the camera, or a light that is narrower than Lambertian.
     """
     optics, camera = Optics.of(sensor), sensor.camera
     need = f"needs LLVM 16 or newer, or an NVIDIA GPU, which this machine lacks ({LLVM_HINT})"

@@ -43,18 +43,10 @@ _LIGHT_PART = 2**31
 class Renderer:
     """The renderer of one sensor draw.
 
-    Args:
-        sensor: gel, coating, lights and cameras.
-        render: samples and path length; `samples_per_pixel` is rounded up to the next full grid (see `full_grid`).
-        surface: the contact surface whose positions `radiance` gets.
-        albedo: (rows, columns, 3 or 4) float32 over the contact face, from `pattern.albedo`; must not be changed
-            afterwards.
-        variant: from `choose_variant`.
-
-    Raises:
-        InputError: a light in the camera's view; a lens that cannot focus, or that a scalar variant cannot render;
-            separated light with a coating that shines.
-        ValueError: a mono variant for a sensor that is not grey.
+    `samples_per_pixel` is rounded up to the next full grid (see `full_grid`). The albedo, (rows, columns, 3 or 4)
+    float32 over the contact face from `pattern.albedo`, must not be changed afterwards. InputError for a light in the
+    camera's view, a lens that cannot focus or that a scalar variant cannot render, and separated light with a coating
+    that shines; ValueError for a mono variant with a sensor that is not grey.
     """
 
     def __init__(self, sensor: Sensor, render: Render, surface: GelSurface, albedo: Image, variant: Variant) -> None:

@@ -43,14 +43,12 @@ def edge_radius_mm(scene: Scene, mesh: PadMesh) -> float | None:
 
 
 def blunter(press: Press) -> Scene | None:
-    """The scene with an object's edges rounder than the mesh resolves; None for other shapes, or if they are already."""
-    indenter, radius = press.scene.contact.indenter, edge_radius_mm(press.scene, press.mesh)
-    if not isinstance(indenter, MeshIndenter) or radius is None or (indenter.fillet_mm or 0.0) >= radius:
+    """The scene with an object's edges rounder than the mesh resolves; None for other shapes, or if they are so."""
+    scene, indenter, radius = press.scene, press.scene.contact.indenter, edge_radius_mm(press.scene, press.mesh)
+    if not isinstance(indenter, MeshIndenter) or not radius or (indenter.fillet_mm or 0.0) >= radius:
         return None
-    contact = press.scene.contact.model_copy(
-        update={"indenter": indenter.model_copy(update={"fillet_mm": BLUNTER * radius})}
-    )
-    return press.scene.model_copy(update={"contact": contact})
+    rounder = indenter.model_copy(update={"fillet_mm": BLUNTER * radius})
+    return scene.model_copy(update={"contact": scene.contact.model_copy(update={"indenter": rounder})})
 
 
 def resolution_mm(scene: Scene, mesh: PadMesh) -> float:

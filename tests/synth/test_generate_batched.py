@@ -7,9 +7,12 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+import pyvista as pv
 from commands import refused
 from processes_of import end_family, needs_proc, started
 from tiny_scene import TEXT, fingerprint, job_context, write_tiny
@@ -28,7 +31,7 @@ from synth.render.variant import Variant
 from synth.scene import Gel, Numerics, Scene
 from synth.scene.sampling import MAX_DRAWS, draw, draw_sensor, sensor_of
 from synth.scene.template import Template, load_scene
-from synth.simulate.press import MeshRule
+from synth.simulate.press import MeshRule, edge_radius_mm
 from synth.simulate.resolution import accuracy, shared_mesh, shared_spacing_mm
 from synth.simulate.solve import simulate_press
 
@@ -130,6 +133,17 @@ def test_a_batch_agrees_with_the_single_solver_and_hopeless_trajectories_are_giv
     (result,) = in_batches(replace(context, plan=planned), _tasks([0]), 2)
     assert isinstance(result, Outcome)
     assert (result.given_up, len(result.failures)) == ((0, 1), MAX_DRAWS)
+
+
+def test_an_object_whose_press_fails_is_pressed_again_with_rounder_edges(template: Template, tmp_path: Path) -> None:
+    pv.Cube().triangulate().save(tmp_path / "cube.stl")
+    cube = f'contact.indenter={{shape="mesh",file="{tmp_path}/cube.stl",size_mm=2.0}}'
+    objects = load_scene(template.source, [cube, "motion.position_mm=[0.0,0.0]"])
+    attempts = Attempts(job_context(objects, 2, tmp_path, SEED), (0, (0, 1)), draw_sensor(objects, SEED, 0))
+    failed: Any = SimpleNamespace(status="partial", reason="made up", states=[SimpleNamespace(summary=dict)])
+    presses = [tried.press for tried in iter(attempts.next, None) if attempts.simulated(tried, failed) is None]
+    radii = [edge_radius_mm(press.scene, press.mesh) for press in presses]
+    np.testing.assert_allclose(np.divide(radii, radii[0]), [1, 1.5] * (MAX_DRAWS // 2))
 
 
 def _said(failures: Iterable[Failure]) -> list[tuple[object, ...]]:
