@@ -26,6 +26,7 @@ from gelflow.ops.gaussian import SeparableFilter, window_sums
 from gelflow.ops.spline import SplineImage
 from gelflow.ops.warp import inside_at, positions
 
+Evidence = tuple[Features, Features, Features, Tensor]
 TINY = 1e-6
 CORRELATION_PX = 1.0
 """Standard deviation of the Gaussian under which g r is summed."""
@@ -45,9 +46,7 @@ class Step(NamedTuple):
     texture: Tensor
 
 
-def evidence(
-    flow: Flow, first: Images, second: SplineImage, background: SeparableFilter | None
-) -> tuple[Features, Features, Features, Tensor]:
+def evidence(flow: Flow, first: Images, second: SplineImage, background: SeparableFilter | None) -> Evidence:
     """Residual and its derivatives along x and y, (B, C, H, W); 1 where the flow stays in the image and they count."""
     places = positions(flow)
     counts, moved = inside_at(places), second.at(places)

@@ -8,9 +8,10 @@ distances are proposed to each pixel, and it takes the one with the least window
 
 if that is below a share of its own (c is 1 where the flow stays in the image). Where shading is ignored, a proposal is
 the neighbour's flow extrapolated by its slope, because a gel's flow is smooth, and m is the residual's mean in the
-window, because light on a gel does not move with it. Where flow follows brightness, it is proposed as it is, and m is
-zero. Windows are wide and smooth, so that images and flow are reduced until a pixel is a third of the window's
-deviation.
+window, because light on a gel does not move with it. The residual must also be below that share of what unrelated
+images leave, Var F1 + Var F2: a flow into clipped white leaves little, but explains nothing. Where flow follows
+brightness, it is proposed as it is, and m is zero. Windows are wide and smooth, so that images and flow are reduced
+until a pixel is a third of the window's deviation.
 
 Nothing is searched for, so that a pattern's period proposes nothing that is not some neighbour's flow already. A window
 that the flow takes out of the image has no residual, and takes a neighbour's flow that keeps it inside.
@@ -27,6 +28,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from gelflow.arrays import Flow, Images
+from gelflow.config import RegistrationConfig
 from gelflow.ops.cached import cached
 from gelflow.ops.gaussian import SeparableFilter, smoother, window_sums
 from gelflow.ops.pyramid import resize_flow, resize_images
@@ -43,21 +45,14 @@ MIN_SHARE_INSIDE = 0.3
 """Share of a window's weight that must lie in the image for its residual to count."""
 
 
-def propagated(
-    flow: Flow,
-    image1: Images,
-    image2: Images,
-    window_px: float,
-    distances: Sequence[int],
-    noise: float,
-    ignore_shading: bool,
-) -> Flow:
+def propagated(flow: Flow, image1: Images, image2: Images, window_px: float, config: RegistrationConfig) -> Flow:
     """The flow (B, 2, H, W), px, after each pixel has had the choice among its neighbours' flows.
 
-    Images are (B, C, H, W); `window_px` is the standard deviation of w, `distances` are those of the neighbours, px,
-    each in eight directions. Where the residual is below twice the standard deviation of the images' noise, the flow
-    stays. With `ignore_shading` it is that of a gel, in whatever light; else it follows brightness.
+    Images are (B, C, H, W); `window_px` is the standard deviation of w. Neighbours are at the distances of the
+    configuration, each in eight directions. Where the residual is below twice its `noise`, the flow stays; shading is
+    ignored if it has a background.
     """
+    ignore_shading = config.background_px is not None
     height, width = flow.shape[-2:]
     pixel = math.ceil(window_px / PIXELS_PER_DEVIATION)
     size = (math.ceil(height / pixel), math.ceil(width / pixel))
@@ -72,7 +67,7 @@ def propagated(
 
     now = residuals(start.unsqueeze(0))[0]
     best, least = start, (MAX_RESIDUAL_RATIO_WITHOUT_SHADING if ignore_shading else MAX_RESIDUAL_RATIO) * now
-    steps = [max(1, round(distance / pixel)) for distance in distances]
+    steps = [max(1, round(distance / pixel)) for distance in config.propagation_px]
     proposals = _Proposals(start, max(steps), extrapolate=ignore_shading)
     places = [(step * right, step * down) for step in steps for right, down in DIRECTIONS]
     # Launches are what takes time on a GPU, all neighbours together are too much for a processor's cache.
@@ -82,7 +77,12 @@ def propagated(
         left, which = residuals(proposed).min(dim=0)
         found = proposed.gather(0, which.expand_as(start).unsqueeze(0))[0]
         best, least = torch.where(left < least, found, best), torch.minimum(left, least)
-    return flow + resize_flow(torch.where(now > (2 * noise) ** 2, best - start, 0.0), (height, width))
+    taken = now > (2 * config.noise) ** 2
+    if ignore_shading:
+        # Var F1 + Var F2 is the mean of the variances of difference and sum.
+        difference, total = (windowed_residual(best, image, second, window, True) for image in (first, -first))
+        taken = taken & (difference < MAX_RESIDUAL_RATIO_WITHOUT_SHADING * (difference + total) / 2)
+    return flow + resize_flow(torch.where(taken, best - start, 0.0), (height, width))
 
 
 def windowed_residual(
@@ -94,10 +94,9 @@ def windowed_residual(
     squares = left.square().mean(dim=1, keepdim=True)
     sums = window(torch.cat([counts, squares, left] if ignore_shading else [counts, squares], dim=1))
     weight = sums[:, :1]
-    moments = sums[:, 1:] / weight
-    spread = moments
+    spread = sums[:, 1:2] / weight
     if ignore_shading:
-        spread = moments[:, :1] - moments[:, 1:].square().mean(dim=1, keepdim=True)
+        spread = spread - (sums[:, 2:] / weight).square().mean(dim=1, keepdim=True)
     return torch.where(weight > MIN_SHARE_INSIDE * window(torch.ones_like(counts[:1])), spread, torch.inf)
 
 

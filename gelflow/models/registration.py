@@ -25,9 +25,9 @@ smoothing the field between the steps: Thirion's demons, 1998.
 import torch
 from torch import Tensor
 
-from gelflow.arrays import Features, Flow, Images
+from gelflow.arrays import Flow, Images
 from gelflow.config import RegistrationConfig
-from gelflow.models.evidence import TINY, evidence, gauss_newton
+from gelflow.models.evidence import TINY, Evidence, evidence, gauss_newton
 from gelflow.models.propagation import propagated
 from gelflow.models.wider_window import TWO_STEPS, best_window
 from gelflow.ops.gaussian import SeparableFilter, smoother, window_sums
@@ -53,13 +53,12 @@ def registered(flow: Flow, image1: Images, image2: Images, config: RegistrationC
         for window_px, smoothing_px in zip(config.windows_px, config.smoothing_px, strict=True):
             window = window_sums(flow, window_px)
             if config.propagation_px:
-                fit = (window_px, config.propagation_px, config.noise, background is not None)
-                flow = propagated(flow, first, image2, *fit)
+                flow = propagated(flow, first, image2, window_px, config)
             start = smoother(flow, smoothing_px)(flow)
             flow = start
             for _ in range(config.iterations):
                 found = evidence(flow, first, second, background)
-                step = _posterior(*found, flow - start, window, config.prior_px, config.noise)
+                step = _posterior(found, flow - start, window, config)
                 flow = flow + step.clamp(-MAX_STEP_PX, MAX_STEP_PX)
         if background is not None:
             last = gauss_newton(flow, first, second, config)
@@ -82,24 +81,16 @@ def _unexplained(flow: Flow, first: Images, second: SplineImage, noise: float) -
     return edge(left) / edge(all_of_it)
 
 
-def _posterior(
-    residual: Features,
-    across: Features,
-    down: Features,
-    counts: Tensor,
-    so_far: Flow,
-    window: SeparableFilter,
-    prior: float,
-    noise: float,
-) -> Flow:
+def _posterior(found: Evidence, so_far: Flow, window: SeparableFilter, config: RegistrationConfig) -> Flow:
     """The Gauss-Newton step (B, 2, H, W): the solution of a system of two equations at each pixel."""
+    residual, across, down, counts = found
     three = torch.stack([across, down, residual], dim=1)
     products = torch.cat(
         [across.unsqueeze(1) * three, down.unsqueeze(1) * three[:, 1:], residual.square().unsqueeze(1)], dim=1
     )
     xx, xy, xr, yy, yr, rr, pixels = window(torch.cat([products.sum(dim=2), counts], dim=1)).split(1, dim=1)
-    variance = rr / (residual.shape[1] * pixels).clamp(min=TINY) + noise**2
-    weight = variance / prior**2
+    variance = rr / (residual.shape[1] * pixels).clamp(min=TINY) + config.noise**2
+    weight = variance / config.prior_px**2
     xx, yy = xx + weight, yy + weight
     u, v = (-torch.cat([xr, yr], dim=1) - weight * so_far).split(1, dim=1)
     return torch.cat([yy * u - xy * v, xx * v - xy * u], dim=1) / (xx * yy - xy.square())

@@ -8,11 +8,10 @@ Together,
 
     sigma^2 = RADIUS^2 / 2 (e + |V - V*|^2 + (CURVATURE m |V''|)^2),
 
-smoothed, because the flow is.
-
-What the network knows does not count: of a bare gel nothing is known, however plausible its flow. Nor do wide windows
-where the narrow one finds nothing, because they would take light for texture. An error that leaves no trace in the
-images, such as dots taken for the next ones, is not seen.
+smoothed, because the flow is. Where the narrow window finds nothing, e + |V - V*|^2 and m are means under a wider one,
+over those places alone of which the images say more than the network: between dots a flow is known unless it bends. A
+bare gel has no such places, so that nothing is known, however plausible its flow. Over all places, wide windows would
+take light for texture. An error that leaves no trace in the images, such as dots taken for the next ones, is not seen.
 """
 
 import math
@@ -22,9 +21,9 @@ from torch import Tensor
 
 from gelflow.arrays import Features, Flow, Images
 from gelflow.config import RegistrationConfig
-from gelflow.models.evidence import gauss_newton
+from gelflow.models.evidence import TINY, gauss_newton
 from gelflow.models.registration import MAX_STEP_PX
-from gelflow.models.wider_window import TWO_STEPS, best_window
+from gelflow.models.wider_window import MIN_VARIANCE, TWO_STEPS, best_window
 from gelflow.ops.gaussian import SeparableFilter, smoother, window_sums
 from gelflow.ops.spline import SplineImage
 from gelflow.ops.warp import pixel_indices, positions
@@ -61,12 +60,19 @@ def error_squares(flow: Flow, image1: Images, image2: Images) -> tuple[Tensor, T
     """E + |V - V*|^2 and (m |V''|)^2, both (B, 1, H, W) px^2."""
     window = window_sums(flow, _MOTION.windows_px[-1])
     found = gauss_newton(flow, image1, SplineImage(image2), _MOTION)
-    texture, variance = window(found.texture), TWO_STEPS * found.variance
+    texture, variance = window(found.texture), (TWO_STEPS * found.variance).clamp(min=MIN_VARIANCE)
     narrow = flow + found.step.clamp(-MAX_STEP_PX, MAX_STEP_PX)
     best, error = best_window(narrow, variance, texture, _MOTION.windows_px[-1])
-    error = torch.where(variance < UNKNOWN_PX**2, error, variance) + (flow - best).square().sum(dim=1, keepdim=True)
-    curvature = (_second_moment(window, found.texture) / texture).square() * _curvature_square(flow)
-    return error, torch.where(variance < UNKNOWN_PX**2, curvature, 0.0)
+    known = variance < UNKNOWN_PX**2
+    error = torch.where(known, error, variance) + (flow - best).square().sum(dim=1, keepdim=True)
+    moment = torch.where(known, _second_moment(window, found.texture) / texture, 0.0)
+    marks = (variance < 2 * _MOTION.prior_px**2) / variance
+    wide = window_sums(flow, _MOTION.windows_px[0])
+    weight = wide(marks)
+    between = ~known & (weight > TINY)
+    error = torch.where(between, wide(marks * error) / weight, error)
+    moment = torch.where(between, _second_moment(wide, marks) / weight, moment)
+    return error, moment.square() * _curvature_square(flow)
 
 
 def combined(error: Tensor, curvature: Tensor, factor: float) -> Tensor:

@@ -53,13 +53,19 @@ def test_an_error_of_the_flow_is_part_of_it() -> None:
     assert sure < 0.05
 
 
-def test_a_bare_gel_is_unknown_in_whatever_noise_and_light() -> None:
+def test_a_bare_gel_is_unknown_in_whatever_noise_and_light_and_between_dots_a_flow_that_bends() -> None:
     x, y = (torch.from_numpy(each).float() for each in grid(HEIGHT, WIDTH))
     light = 0.4 * torch.exp(-((x - 60) ** 2 + (y - 50) ** 2) / (2 * 30**2))
     for noise in (0.002, 0.02):
         image1, image2 = waves(noise, 0, height=0.0), waves(noise, 1, height=0.0) + light
         unknown = flow_sigma(no_flow(), image1, image2)[0] > 1.0
         assert unknown.float().mean() > 0.8
+    dots = 0.4 * torch.exp(-((x % 48 - 24) ** 2 + (y % 48 - 24) ** 2) / (2 * 3**2))
+    bump = torch.exp(-((x - 48) ** 2 + (y - 48) ** 2) / (2 * 8**2)).expand(1, 2, -1, -1)
+    images = [waves(0.005, seed, height=0.0) - dots for seed in (0, 1)]
+    straight, bent = (flow_sigma(flow, *images)[0][0, 0, 48, 48] for flow in (no_flow(), bump))
+    assert straight < 0.1
+    assert bent > 1.0
 
 
 def test_probability_to_be_seen_is_a_half_at_the_border_and_nothing_is_known_beyond() -> None:
