@@ -111,11 +111,9 @@ def anchor_of(state: ContactState, y: wp.vec3d, gap: wp.float64, s: int, f: int,
 
 
 @wp.func
-def _trial(
-    state: ContactState, y: wp.vec3d, anchor: wp.vec4d, stiffness: wp.float64, s: int, f: int, q: int
-) -> wp.vec3d:
+def _trial(state: ContactState, y: wp.vec3d, a: wp.vec4d, stiffness: wp.float64, s: int, f: int, q: int) -> wp.vec3d:
     """The trial traction m, in the indenter's frame."""
-    return state.tangent[s, f, q] - stiffness * (y - wp.vec3d(anchor[0], anchor[1], anchor[2]))
+    return state.tangent[s, f, q] - stiffness * (y - wp.vec3d(a[0], a[1], a[2]))
 
 
 @wp.func

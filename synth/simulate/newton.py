@@ -83,7 +83,7 @@ def solve(
         if stalled or iterations == 2 * limit or (iterations >= limit and relative > NEAR):
             break
         rough = iterations < MAX_ROUGH_ITERATIONS and (tolerance > ROUGH_ABOVE or relative > NEAR)
-        step = system.newton_step(system.tangent(state, indenter, max_turn=MAX_TURN), residual.free, rough)
+        step = system.newton_step(system.tangent(state, indenter, turn=MAX_TURN), residual.free, rough)
         found = _line_search(system, state, residual, step, indenter) if np.isfinite(step.u).all() else None
         if found is None:
             break
