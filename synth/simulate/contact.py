@@ -24,7 +24,7 @@ again where multipliers are updated (`synth.simulate.multipliers`) and where the
 
 import warp as wp
 
-from synth.simulate.distance import normal_derivative, shape_vector, signed_distance
+from synth.simulate.distance import TINY, normal_derivative, shape_vector, signed_distance
 
 ON_CONE = wp.constant(wp.float64(1.0 - 1.0e-9))
 """A point slips whose traction is this share of the limit. (Inside a kernel 1.0 - 1.0e-9 would be float32: 1.)"""
@@ -111,18 +111,9 @@ def anchor_of(state: ContactState, y: wp.vec3d, gap: wp.float64, s: int, f: int,
 
 
 @wp.func
-def _trial(
-    state: ContactState,
-    rotation: wp.mat33d,
-    y: wp.vec3d,
-    anchor: wp.vec4d,
-    stiffness: wp.float64,
-    s: int,
-    f: int,
-    q: int,
-) -> wp.vec3d:
-    """The trial traction m, in world axes."""
-    return rotation * (state.tangent[s, f, q] - stiffness * (y - wp.vec3d(anchor[0], anchor[1], anchor[2])))
+def _trial(state: ContactState, y: wp.vec3d, a: wp.vec4d, stiffness: wp.float64, s: int, f: int, q: int) -> wp.vec3d:
+    """The trial traction m, in the indenter's frame."""
+    return state.tangent[s, f, q] - stiffness * (y - wp.vec3d(a[0], a[1], a[2]))
 
 
 @wp.func
@@ -191,7 +182,7 @@ def contact_residual(
             t = pressure * n
             anchor = anchor_of(state, y, d[3], s, f, q)
             if indenters.friction[s] > wp.float64(0.0) and anchor[3] > wp.float64(0.0):
-                m = _trial(state, rotation, y, anchor, stiffness, s, f, q)
+                m = rotation * _trial(state, y, anchor, stiffness, s, f, q)
                 along = _returned(m - wp.dot(n, m) * n, indenters.friction[s] * pressure)
                 t += along
             for a in range(faces.nodes.shape[1]):
@@ -208,13 +199,15 @@ def contact_stiffness(
     indenters: Indenters,
     state: ContactState,
     penalty: wp.float64,
+    max_turn: wp.float64,
     touching: wp.array2d(dtype=wp.int32),
     symmetric: wp.array3d(dtype=wp.mat33d),
     remainder: wp.array3d(dtype=wp.mat33d),
 ):
     """One thread per (sample, face): -∂t/∂x at its points, as a symmetric matrix and what is left over.
 
-    touching: (B, f) 0: nothing touches, the matrices are not written; 1: without friction; 2: with friction.
+    touching: (B, f) 0: nothing touches, the matrices are not written; 1: without friction; 2: with friction. max_turn:
+    most (rad) that H turns a mesh's normal over what a point is deeper than its multiplier says; infinite: as it is.
     """
     s, f = wp.tid()
     touching[s, f] = 0
@@ -239,12 +232,15 @@ def contact_stiffness(
             n = rotation * wp.vec3d(d[0], d[1], d[2])
             local = normal_derivative(indenters.kind[s], indenters.shape[s], y, s, indenters.coefficients)
             H = rotation * local * wp.transpose(rotation)
+            if indenters.kind[s] == 5:
+                whole = state.normal[s, f, q] + max_turn * stiffness / wp.max(wp.sqrt(wp.ddot(H, H)), TINY)
+                H = wp.min(whole / pressure, wp.float64(1.0)) * H
             block = stiffness * wp.outer(n, n) - pressure * H
             touching[s, f] = wp.max(touching[s, f], 1)
             anchor = anchor_of(state, y, d[3], s, f, q)
             if friction > wp.float64(0.0) and anchor[3] > wp.float64(0.0):
                 touching[s, f] = 2
-                m = _trial(state, rotation, y, anchor, stiffness, s, f, q)
+                m = rotation * _trial(state, y, anchor, stiffness, s, f, q)
                 tangential = m - wp.dot(n, m) * n
                 length = wp.length(tangential)
                 limit = friction * pressure

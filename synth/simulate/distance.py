@@ -33,19 +33,12 @@ def _sphere(y: wp.vec3d, radius: wp.float64) -> wp.vec4d:
 
 
 @wp.func
-def _sign(x: wp.float64) -> wp.float64:
-    if x < ZERO:
-        return -ONE
-    return ONE
-
-
-@wp.func
 def _box(y: wp.vec3d, half: wp.vec3d) -> wp.vec4d:
     """Sharp box; inside, the distance to the nearest face."""
     q = wp.vec3d(wp.abs(y[0]) - half[0], wp.abs(y[1]) - half[1], wp.abs(y[2]) - half[2])
     out = wp.vec3d(wp.max(q[0], ZERO), wp.max(q[1], ZERO), wp.max(q[2], ZERO))
     length = wp.length(out)
-    sign = wp.vec3d(_sign(y[0]), _sign(y[1]), _sign(y[2]))
+    sign = wp.vec3d(wp.sign(y[0]), wp.sign(y[1]), wp.sign(y[2]))
     if length > TINY:
         return wp.vec4d(sign[0] * out[0] / length, sign[1] * out[1] / length, sign[2] * out[2] / length, length)
     if q[0] > q[1] and q[0] > q[2]:

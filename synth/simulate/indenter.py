@@ -176,7 +176,7 @@ def _object(indenter: MeshIndenter, folder: Path, resolution_mm: float, touchabl
             f"{LARGEST_GRID}; use a larger cell_mm"
         )
     grid = Grid(low - margin, spacing, (int(counts[0]), int(counts[1]), int(counts[2])))
-    values = grid.signed_distance(turned)
+    values = grid.signed_distance(turned, radius)
     missing = 0.0 if turned.closed else grid.missing(values)
     if missing > MOST_MISSING:
         raise InputError(
@@ -190,8 +190,7 @@ def _object(indenter: MeshIndenter, folder: Path, resolution_mm: float, touchabl
             f"contact.indenter.file = {indenter.file!r}: it encloses no volume that a grid of {spacing:.2g} mm "
             "resolves; a single sheet needs a thickness"
         )
-    shape = np.zeros(SHAPE_LENGTH)
-    shape[:8] = [0.0, *grid.corner, spacing, *counts]
+    shape = np.array([0.0, *grid.corner, spacing, *counts])
     coefficients = np.asarray(spline_filter(values, order=3, mode="mirror"), dtype=np.float64)
     near = values < radius + spacing
     reach = min(lowest, float((grid.points(near)[:, 2] - values[near]).max()))  # also of balls beside the solid

@@ -16,8 +16,6 @@ FLAT = 0.05
 """Directions in which the planes' normals vary less, as a share of the largest eigenvalue, do not place a vertex."""
 OUTSIDE = 1.0
 """Cells that a vertex may lie outside its own: there are tips that cross no edge of the cell that they end in."""
-FAR_MM = 1e3
-"""Samples are cut off here: those of a function that is known near its contour alone are infinite."""
 Planes = Callable[[Points], tuple[FloatArray, Points]]
 """Values (n,) mm and unit gradients (n, 3) of a distance function at points (n, 3)."""
 
@@ -30,11 +28,11 @@ def sharp_contour(values: FloatArray, corner: FloatArray, spacing: float, planes
     that was closed, the border of a part), and the plane lies across the cell's edge.
     """
     inside = values <= 0
-    places, axes = _crossings(inside)
+    places, beyond, axes = crossings(inside)
     if len(places) == 0:
         return Triangles(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64), True)
-    along = np.eye(3, dtype=np.int64)[axes]
-    here, there = (np.clip(values[tuple(at.T)], -FAR_MM, FAR_MM) for at in (places, places + along))
+    along = beyond - places
+    here, there = (values[tuple(at.T)] for at in (places, beyond))
     points = corner + spacing * (places + (here / (here - there))[:, None] * along)
     value, normal = planes(points)
     smooth = np.abs(value) < spacing
@@ -54,10 +52,11 @@ def sharp_contour(values: FloatArray, corner: FloatArray, spacing: float, planes
     return Triangles(vertices, np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]), True)
 
 
-def _crossings(inside: BoolArray) -> tuple[np.ndarray, np.ndarray]:
-    """Lower ends (n, 3) and axes (n,) of the grid's edges that the contour crosses."""
-    places: list[np.ndarray] = [np.argwhere(np.diff(inside, axis=axis)) for axis in range(3)]
-    return np.concatenate(places), np.repeat(np.arange(3), [len(part) for part in places])
+def crossings(inside: BoolArray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Lower and upper ends (n, 3) and axes (n,) of the grid's edges that the contour crosses."""
+    parts: list[np.ndarray] = [np.argwhere(np.diff(inside, axis=axis)) for axis in range(3)]
+    places, axes = np.concatenate(parts), np.repeat(np.arange(3), [len(part) for part in parts])
+    return places, places + np.eye(3, dtype=np.int64)[axes], axes
 
 
 def _cells_around(places: np.ndarray, axes: np.ndarray) -> np.ndarray:

@@ -19,8 +19,10 @@ import warp as wp
 
 from synth.arrays import BoolArray, FloatArray, Points
 from synth.scene.surface_file import Triangles
-from synth.simulate.object_contour import sharp_contour
+from synth.simulate.object_contour import crossings, sharp_contour
 
+STRIDE = 3
+"""Far from the surface one of so many samples along an axis is exact."""
 BAND = 2.0
 """Rounding is done so many radii from the surface, and two samples."""
 LOST = 1.25
@@ -30,6 +32,7 @@ TWICE = 1.5
 """A winding number above this is that of a place within two shells."""
 TOUCHING_MM = 1e-4
 """Points that are nearer to a surface have its normal for the gradient of their distance."""
+Core = tuple["Nearest", float]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,16 +54,32 @@ class Grid:
         found[where] = np.linalg.norm(points - surface(points)[0], axis=1)
         return found
 
-    def signed_distance(self, surface: Triangles) -> FloatArray:
-        """Distances of all samples, negative inside.
+    def _away(self, surface: "Nearest", reach_mm: float) -> FloatArray:
+        """Distances of all samples from a surface, mm: exact within the reach, beyond it interpolated linearly.
+
+        The farther away a query begins the longer it takes.
+        """
+        from scipy.interpolate import make_interp_spline
+
+        known = [np.unique([*range(0, count, STRIDE), count - 1]) for count in self.counts]
+        some = np.zeros(self.counts, dtype=bool)
+        some[np.ix_(*known)] = True
+        away = self.distance(surface, some)[np.ix_(*known)]
+        for axis, count in enumerate(self.counts):
+            away = make_interp_spline(known[axis], away, k=1, axis=axis)(np.arange(count))
+        near = away < reach_mm + np.sqrt(3) * STRIDE / 2 * self.spacing
+        return np.where(near, self.distance(surface, near), away)
+
+    def signed_distance(self, surface: Triangles, radius_mm: float) -> FloatArray:
+        """Distances of all samples, negative inside, and exact where edges are rounded to that radius.
 
         A closed surface lies between two neighbouring samples of different sign: winding numbers, which take ten times
         as long as distances, are then found near it alone, and the signs of others are those next to them toward +z.
         Where shells overlap, faces of one lie within another: distances are then those from a contour around all.
         """
-        nearest, everywhere = Nearest(surface, winding=True), np.ones(self.counts, dtype=bool)
-        away = self.distance(nearest, everywhere)
-        known = away < 2 * self.spacing if surface.closed else everywhere
+        nearest, reach = Nearest(surface, winding=True), max(BAND * radius_mm, 4 * self.spacing) + 2 * self.spacing
+        away = self._away(nearest, reach)
+        known = away < 1.1 * self.spacing if surface.closed else np.ones(self.counts, dtype=bool)
         sign = np.ones((*self.counts[:2], self.counts[2] + 1))  # beyond the last sample is outside
         near = self.points(known)
         sign[:, :, :-1][known] = near_sign = nearest.signs(near)
@@ -70,25 +89,20 @@ class Grid:
         if (nearest.signs(near[near_sign < 0], TWICE) > 0).all():
             return values
         outer = sharp_contour(values, self.corner, self.spacing, nearest.depth)
-        return np.where(values < 0, -1.0, 1.0) * self.distance(Nearest(outer), everywhere)
+        return np.where(values < 0, -1.0, 1.0) * self._away(Nearest(outer), reach)
 
     def missing(self, values: FloatArray) -> float:
         """The share of the boundary of what is inside that is far from the surface: where holes were closed.
 
         Across a surface two neighbouring samples of the signed distance are at most a spacing apart.
         """
-        crossings = holes = 0
-        for axis, count in enumerate(self.counts):
-            here, there = (np.take(values, range(k, count - 1 + k), axis) for k in (0, 1))
-            crossing = (here < 0) != (there < 0)
-            crossings += int(crossing.sum())
-            holes += int((crossing & (np.abs(here) + np.abs(there) > 2 * self.spacing)).sum())
-        return holes / max(crossings, 1)
+        here, there, _ = crossings(values < 0)
+        jump = np.abs(values[tuple(here.T)] - values[tuple(there.T)])
+        return float(np.mean(jump > 2 * self.spacing)) if len(jump) else 0.0
 
     def rounded(self, values: FloatArray, surface: Triangles, radius_mm: float) -> FloatArray:
         """The signed distance of a solid after its edges and notches are rounded; see the module's docstring."""
-        band = np.abs(values) < BAND * radius_mm + 2 * self.spacing
-        cores, opened = self._opened(values, Nearest(surface), radius_mm, band)
+        cores, opened = self._opened(values, Nearest(surface), radius_mm)
 
         def outer(points: Points) -> tuple[FloatArray, Points]:
             """Distance from the opening less the radius, and its gradient."""
@@ -101,15 +115,17 @@ class Grid:
         shell = sharp_contour(opened - radius_mm, self.corner, self.spacing, outer)
         if not cores or len(shell.faces) == 0:
             return values
+        band = np.abs(values) < BAND * radius_mm + 2 * self.spacing
         away = self.distance(Nearest(shell), band)
         closed = radius_mm + np.where(opened > radius_mm, away, -away)
         return np.where(band, closed, values)
 
-    def _opened(
-        self, values: FloatArray, surface: "Nearest", radius_mm: float, band: BoolArray
-    ) -> tuple[list[tuple["Nearest", float]], FloatArray]:
-        """The E_k with their r_k, and samples of d_1, exact outside and down to the radius within the band."""
-        cores: list[tuple[Nearest, float]] = []
+    def _opened(self, values: FloatArray, surface: "Nearest", radius_mm: float) -> tuple[list[Core], FloatArray]:
+        """The E_k with their r_k, and samples of d_1 where its sign, or that of d_1 - r, is not d's; d elsewhere."""
+        from scipy.ndimage import distance_transform_edt
+
+        cores: list[Core] = []
+        band = np.abs(values) < radius_mm + 2 * self.spacing
         found, near = np.where(band, np.inf, values), np.ones(self.counts, dtype=bool)
         while True:
 
@@ -124,17 +140,11 @@ class Grid:
                 cores.append((Nearest(contour), radius_mm))
                 away = self.distance(cores[-1][0], band)
                 found = np.minimum(found, np.where(core <= 0, -away, away) - radius_mm)
-            lost = band & (values <= 0) & (found > LOST * radius_mm)
+            lost = (values <= 0) & (found > LOST * radius_mm)
             if radius_mm == 0 or not lost.any():
                 return cores, found
-            near = self._within(lost, (1 + LOST) * radius_mm)
+            near = distance_transform_edt(~lost, sampling=self.spacing) <= (1 + LOST) * radius_mm
             radius_mm = radius_mm / 2 if radius_mm > 2 * self.spacing else 0.0
-
-    def _within(self, part: BoolArray, reach_mm: float) -> BoolArray:
-        """The samples that are no farther than that from one of a part."""
-        from scipy.ndimage import distance_transform_edt
-
-        return np.asarray(distance_transform_edt(~part, sampling=self.spacing) <= reach_mm)
 
 
 class Nearest:
