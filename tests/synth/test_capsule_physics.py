@@ -207,7 +207,7 @@ def test_layers_lie_at_their_depths_in_the_same_mesh() -> None:
         nodes = mesh.points[np.unique(mesh.tets[mesh.layer == number])]
         away = np.linalg.norm(nodes - np.maximum(nodes, 5.0) * (0, 0, 1), axis=1)
         # The face's triangles are up to some 2 degrees off the sphere's tangent planes.
-        assert (away.min(), away.max()) == pytest.approx(ends, abs=2e-3)
+        assert (away.min(), away.max()) == pytest.approx(ends, abs=5e-3)
     refused("1.99 mm of layers leave no room", capsule_mesh, with_layers(1.99))
 
 
