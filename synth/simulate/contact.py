@@ -26,9 +26,6 @@ import warp as wp
 
 from synth.simulate.distance import TINY, normal_derivative, shape_vector, signed_distance
 
-MAX_TURN = wp.constant(wp.float64(0.1))
-"""Most (rad) that H turns a mesh's normal over what a point is deeper than its multiplier says: iterates are far deeper
-in edges than equilibria, and H misleads there."""
 ON_CONE = wp.constant(wp.float64(1.0 - 1.0e-9))
 """A point slips whose traction is this share of the limit. (Inside a kernel 1.0 - 1.0e-9 would be float32: 1.)"""
 
@@ -202,15 +199,15 @@ def contact_stiffness(
     indenters: Indenters,
     state: ContactState,
     penalty: wp.float64,
-    relaxing: wp.array(dtype=wp.int32),
+    max_turn: wp.float64,
     touching: wp.array2d(dtype=wp.int32),
     symmetric: wp.array3d(dtype=wp.mat33d),
     remainder: wp.array3d(dtype=wp.mat33d),
 ):
     """One thread per (sample, face): -∂t/∂x at its points, as a symmetric matrix and what is left over.
 
-    touching: (B, f) 0: nothing touches, the matrices are not written; 1: without friction; 2: with friction. Where
-    relaxing (B,) is 0, H is limited by MAX_TURN.
+    touching: (B, f) 0: nothing touches, the matrices are not written; 1: without friction; 2: with friction. max_turn:
+    most (rad) that H turns a mesh's normal over what a point is deeper than its multiplier says; infinite: as it is.
     """
     s, f = wp.tid()
     touching[s, f] = 0
@@ -235,8 +232,8 @@ def contact_stiffness(
             n = rotation * wp.vec3d(d[0], d[1], d[2])
             local = normal_derivative(indenters.kind[s], indenters.shape[s], y, s, indenters.coefficients)
             H = rotation * local * wp.transpose(rotation)
-            if indenters.kind[s] == 5 and relaxing[s] == 0:
-                whole = state.normal[s, f, q] + MAX_TURN * stiffness / wp.max(wp.sqrt(wp.ddot(H, H)), TINY)
+            if indenters.kind[s] == 5:
+                whole = state.normal[s, f, q] + max_turn * stiffness / wp.max(wp.sqrt(wp.ddot(H, H)), TINY)
                 H = wp.min(whole / pressure, wp.float64(1.0)) * H
             block = stiffness * wp.outer(n, n) - pressure * H
             touching[s, f] = wp.max(touching[s, f], 1)

@@ -144,8 +144,8 @@ class System:
         full = np.concatenate([reaction.ravel(), volume.numpy()[0]])
         return Residual(full[self.free], reaction, float(jacobian.numpy().min()))
 
-    def tangent(self, state: Unknowns, indenter: Indenters, viscosity: float = 0.0) -> Tangent:
-        """Derivative of the free residual, plus viscosity times `viscous_force`'s."""
+    def tangent(self, state: Unknowns, indenter: Indenters, viscosity: float = 0.0, turn: float = np.inf) -> Tangent:
+        """Derivative of the free residual, plus viscosity times `viscous_force`'s; turn: `contact_stiffness`'s most."""
         u, p = _on_device(state)
         active, elements = self._active, (1, len(self.space.nodes))
         thick = _array(np.array([viscosity]), wp.float64)
@@ -161,8 +161,7 @@ class System:
             _launch(pressure_tangent, elements, active, self._bulk, held, pushed, *slots, self._values)
         contact = [u, active, self._faces, indenter, self.contact, self.penalty]
         faces = self.gap.shape[:2]
-        relaxing = _array(np.array([viscosity > 0]), wp.int32)
-        _launch(contact_stiffness, faces, *contact, relaxing, self._touching, self._stiffness, self._remainder)
+        _launch(contact_stiffness, faces, *contact, turn, self._touching, self._stiffness, self._remainder)
         blocks = [self._faces, self._face_pairs, self._touching, self._stiffness, self._face_slot]
         _launch(contact_tangent, (*faces, len(self._pattern.face_pairs)), *blocks, self._values)
         return Tangent(self._values.numpy()[0, :-1], self._unsymmetric())

@@ -194,9 +194,7 @@ class BatchedSolver:
         if self._barrier is not None:
             self._launch(find_inverting, elements, mask, f.iterate_u, self._barrier, a.inverting)
         law, matrices = (self._faces, a.indenters, a.contact, self.penalty), (a.symmetric, a.remainder)
-        self._launch(
-            contact_stiffness, self._face_dim, f.iterate_u, mask, *law, self.lanes.relaxing, a.touching, *matrices
-        )
+        self._launch(contact_stiffness, self._face_dim, f.iterate_u, mask, *law, np.inf, a.touching, *matrices)
         stored = (a.stored_contact, a.touched)
         self._launch(store_contact, self._face_dim, mask, a.touching, self._faces.weight, *matrices, *stored)
         right = (self._rows.free, a.force, a.volume, a.krylov)
