@@ -3,10 +3,9 @@
     python -m benchmarks draws --draws 300 --workers 16                   one by one on the CPU
     python -m benchmarks draws --draws 300 --workers 16 --device cuda     together on a GPU
 
-Every draw is pressed as `generate` would: on the CPU on a mesh of its own, on a GPU on the batched solver's; an object
-whose press does not complete once more, with rounder edges. One that does not complete then is a failure; `generate`
-replaces it. A repeated run goes on with the CSV file, on a
-GPU by whole scenes.
+Every draw is pressed as `generate` would: on the CPU on a mesh of its own, on a GPU on the batched solver's. An object
+whose press does not complete is pressed once more, with rounder edges. A draw that does not complete then is a failure,
+which `generate` replaces. A repeated run goes on with the CSV file, on a GPU by whole scenes.
 """
 
 from collections.abc import Iterator, Sequence

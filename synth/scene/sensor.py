@@ -77,7 +77,7 @@ class Light(Part):
     position_mm: Vector3
     aim_mm: Vector3 = (0.0, 0.0, 0.0)
     size_mm: tuple[Positive, Positive]
-    """Along the contact face, and at right angles to that and to the aim. For a round LED: a square of its area."""
+    """Along the contact face, and at right angles to that and to the aim. A round LED is a square of its area."""
     color: Color
     power: NonNegative
     """Radiant power, in units in which exposure 1 maps a radiance of 1 to full scale."""
