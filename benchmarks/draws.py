@@ -4,7 +4,7 @@
     python -m benchmarks draws --draws 300 --workers 16 --device cuda     together on a GPU
 
 Every draw is pressed as `generate` would: on the CPU on a mesh of its own, on a GPU on the batched solver's. An object
-whose press does not complete is pressed once more, with rounder edges. A draw that does not complete then is a failure,
+whose press does not complete is pressed again, with rounder edges. A draw that does not complete then is a failure,
 which `generate` replaces. A repeated run goes on with the CSV file, on a GPU by whole scenes.
 """
 
@@ -22,7 +22,7 @@ from synth.scene.template import SCENES, load_scene
 from synth.simulate import Trajectory
 from synth.simulate.batched import simulate_presses
 from synth.simulate.batched.pad import prepare
-from synth.simulate.press import MeshRule, Press, blunter
+from synth.simulate.press import BLUNTER, MeshRule, Press, blunter
 from synth.simulate.solve import simulate_press
 
 DEEP = 0.02
@@ -42,20 +42,21 @@ def drawn(case: Row, settings: Sequence[str] = ()) -> tuple[Press, frozenset[int
     return press, frozenset(frame for pair in pairs for frame in pair.frames)
 
 
-def rounder(case: Row, press: Press) -> Press | None:
-    """A press with rounder edges, None for other bodies than objects."""
-    scene = blunter(press)
-    return None if scene is None else MeshRule.of(scene).press(scene, load_scene(case["scene"]).folder)
+def tries(case: Row, press: Press) -> Iterator[Press]:
+    """A press, and those of the same object with rounder edges."""
+    yield press
+    for scene in blunter(press):
+        yield MeshRule.of(scene).press(scene, load_scene(case["scene"]).folder)
 
 
-def found(result: Trajectory, shown: frozenset[int], is_rounder: bool) -> Row:
-    """What a row says of a draw."""
+def found(result: Trajectory, shown: frozenset[int], rounder: int) -> Row:
+    """What a row says of a draw whose edges were made rounder so many times."""
     deepest = max(state.depth_mm for state in result.states)
     sunk = max((state.max_penetration_mm for n, state in enumerate(result.states) if n in shown), default=0.0)
     return {
         "status": result.status,
         "reason": result.reason,
-        "rounder": is_rounder,
+        "rounder": rounder,
         "iterations": sum(state.newton_iterations for state in result.states),
         "penetration": round(sunk / deepest, 5) if deepest > 0 else 0.0,
     }
@@ -67,10 +68,11 @@ def one(case: Row) -> Row:
     if isinstance(made, str):
         return {"status": "unbuilt", "reason": made}
     press, shown = made
-    result, again = simulate_press(press, shown), None
-    if result.status != "complete" and (again := rounder(case, press)):
-        result = simulate_press(again, shown)
-    return found(result, shown, again is not None)
+    for rounder, tried in enumerate(tries(case, press)):
+        row = found(simulate_press(tried, shown), shown, rounder)
+        if row["status"] == "complete":
+            break
+    return row
 
 
 def together(case: Row, workers: int) -> list[Row]:
@@ -79,15 +81,15 @@ def together(case: Row, workers: int) -> list[Row]:
     with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
         made = list(pool.map(partial(drawn, settings=['numerics.solver="batched"']), cases, chunksize=4))
     rows = {number: {"status": "unbuilt", "reason": each} for number, each in enumerate(made) if isinstance(each, str)}
-    built = [(number, *each) for number, each in enumerate(made) if not isinstance(each, str)]
-    for is_rounder in (False, True):
-        for _, group in groupby(built, lambda each: pad_key(each[1])):
+    built = [(number, tries(case, each[0]), each[1]) for number, each in enumerate(made) if not isinstance(each, str)]
+    for rounder in range(1 + len(BLUNTER)):
+        pressed = [(number, press, shown) for number, those, shown in built if (press := next(those, None))]
+        for _, group in groupby(pressed, lambda each: pad_key(each[1])):
             numbers, presses, frames = zip(*group, strict=True)
             pad = prepare(presses[0].scene, presses[0].mesh, case["device"])
             for k, result in simulate_presses(presses, pad, frames, BATCH["cuda"]):
-                rows[numbers[k]] = found(result, frames[k], is_rounder)
-        failed = [each for each in built if rows[each[0]]["status"] != "complete"]
-        built = [(number, again, shown) for number, press, shown in failed if (again := rounder(case, press))]
+                rows[numbers[k]] = found(result, frames[k], rounder)
+        built = [each for each in built if rows[each[0]]["status"] != "complete"]
     return [{"trajectory": number, **rows[number]} for number in range(case["draws"])]
 
 
@@ -99,7 +101,7 @@ def summaries(rows: Sequence[Row]) -> Iterator[Row]:
         done = [row for row in own if row["status"] == "complete"]
         deep = [row["penetration"] for row in done]
         line: Row = {"scene": name, "draws": len(own), "complete": len(done), "share": f"{len(done) / len(own):.2%}"}
-        line["with rounder edges"] = sum(row["rounder"] is True for row in done)
+        line["with rounder edges"] = sum(row["rounder"] > 0 for row in done)
         yield line | {"deeper than 2 %": sum(x > DEEP for x in deep), "deepest": f"{max(deep, default=0.0):.1%}"}
 
 

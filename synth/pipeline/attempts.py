@@ -1,6 +1,6 @@
 """The random instances of one trajectory, one after the other, until one of them can be used.
 
-An object whose press does not complete is pressed once more with rounder edges before another instance is drawn.
+An object whose press does not complete is pressed again with rounder edges before another instance is drawn.
 """
 
 from dataclasses import dataclass, replace
@@ -35,7 +35,7 @@ class Attempts:
         self.trajectory, self.wanted = task
         self._context, self._sensor, self._count = context, sensor, 0
         self._first = self.trajectory * context.plan.template.sampling.pairs_per_trajectory
-        self._blunter: Scene | None = None
+        self._waiting: list[Scene] = []
         self.failures: list[Failure] = []
         for reason in sensor.rejected:
             self.fail("sensor", reason)
@@ -54,8 +54,9 @@ class Attempts:
             self._count += 1
             stage = "draw"
             try:
-                drawn = self._blunter or draw(plan.template, seed, self.trajectory, self._count - 1, self._sensor)
-                scene, self._blunter, stage = drawn, None, "simulate"
+                if not self._waiting:
+                    self._waiting = [draw(plan.template, seed, self.trajectory, self._count - 1, self._sensor)]
+                scene, stage = self._waiting.pop(0), "simulate"
                 press = plan.mesh.press(scene, plan.template.folder, self._context.mesh_folders)
             except InputError as error:
                 self.fail(stage, str(error))
@@ -71,7 +72,7 @@ class Attempts:
         """What is handed on of an instance's trajectory; None if it cannot be used, which is put on record."""
         if result.status != "complete":
             self.fail("simulate", result.reason, result.states[-1].summary())
-            self._blunter = blunter(attempt.press)
+            self._waiting += blunter(attempt.press)
             return None
         press, space, states = attempt.press, result.space, result.states
         shown = sorted({frame for pair in attempt.pairs for frame in pair.frames})

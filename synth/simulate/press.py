@@ -1,6 +1,6 @@
 """One press: a random scene instance with all that its simulation needs, and the rule by which its mesh is chosen."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -12,8 +12,8 @@ from synth.simulate.indenter import object_radius
 from synth.simulate.load_path import LoadPath, path_of
 from synth.simulate.resolution import Accuracy, Resolution, accuracy, resolve, shared_mesh, shared_spacing_mm
 
-BLUNTER = 1.5
-"""Factor on the radius of an object's edges where its press does not complete."""
+BLUNTER = (1.5, 2.25)
+"""Factors on the radius of an object's edges, one after the other, where its press does not complete."""
 ELEMENTS: dict[str, Callable[[], Element]] = {"auto": p2p1, "p1p1": p1p1, "p2p1": p2p1}
 
 
@@ -42,13 +42,13 @@ def edge_radius_mm(scene: Scene, mesh: PadMesh) -> float | None:
     return object_radius(indenter, resolution_mm(scene, mesh)) if isinstance(indenter, MeshIndenter) else None
 
 
-def blunter(press: Press) -> Scene | None:
-    """The scene with an object's edges rounder than the mesh resolves; None for other shapes, or if they are so."""
-    scene, indenter, radius = press.scene, press.scene.contact.indenter, edge_radius_mm(press.scene, press.mesh)
-    if not isinstance(indenter, MeshIndenter) or not radius or (indenter.fillet_mm or 0.0) >= radius:
-        return None
-    rounder = indenter.model_copy(update={"fillet_mm": BLUNTER * radius})
-    return scene.model_copy(update={"contact": scene.contact.model_copy(update={"indenter": rounder})})
+def blunter(press: Press) -> Iterator[Scene]:
+    """Scenes with an object's edges rounder than the mesh resolves; none for other shapes, or if they are so."""
+    scene, indenter, radius = press.scene, press.scene.contact.indenter, edge_radius_mm(press.scene, press.mesh) or 0.0
+    if isinstance(indenter, MeshIndenter) and (indenter.fillet_mm or 0.0) < radius:
+        for factor in BLUNTER:
+            rounder = indenter.model_copy(update={"fillet_mm": factor * radius})
+            yield scene.model_copy(update={"contact": scene.contact.model_copy(update={"indenter": rounder})})
 
 
 def resolution_mm(scene: Scene, mesh: PadMesh) -> float:
