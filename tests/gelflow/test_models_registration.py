@@ -8,13 +8,12 @@ import torch
 from commands import refused
 from textures import grid, texture
 from torch import Tensor
-from waves import Shifts, moved_pair, press_flow
+from waves import Shifts
 
-from gelflow.arrays import Flow, Images
 from gelflow.config import REGISTRATIONS, ModelConfig, RegistrationConfig, TrainConfig
 from gelflow.config.sources import train_config
 from gelflow.models import GelFlow
-from gelflow.models.estimate import consistent, estimate_flow, inverse
+from gelflow.models.estimate import estimate_flow
 from gelflow.models.propagation import propagated
 from gelflow.models.registration import registered
 from gelflow.models.weights import load_weights, save_weights
@@ -227,60 +226,3 @@ def test_a_gels_flow_is_extrapolated_and_light_ignored_or_followed() -> None:
     motion, brightness = (propagated(flow, grey1, grey2, 3.0, config) for config in (MOTION, BRIGHTNESS))
     assert torch.equal(motion[..., 48:], flow[..., 48:])
     assert (brightness[..., 48:] != flow[..., 48:]).float().mean() > 0.1
-
-
-PATCH = (..., slice(36, 60), slice(50, 78))
-JUMP_PX = 14.0
-
-
-def example() -> tuple[Images, Images, Flow, Flow]:
-    """Images, flow and flow back of a press of 6 px, each (1, ., 96, 128); the flow back by fixed-point iteration."""
-    flow = press_flow(96, 128, 6.0)
-    image1, image2 = (image.float()[None] for image in moved_pair(flow, seed=0))
-    there = flow.float()[None]
-    back = -there
-    for _ in range(60):
-        back = -warp(there, back)
-    return image1, image2, there, back
-
-
-def lost(flow: Flow) -> Flow:
-    wrong = flow.clone()
-    wrong[PATCH] += JUMP_PX
-    return wrong
-
-
-def test_inverse_of_a_press() -> None:
-    _, _, there, back = example()
-    found = (inverse(there) - back).norm(dim=1)[..., 8:-8, 8:-8]
-    # Each pixel takes what ends within half a pixel of it: an error of the flow's slope, at most 1, times 0.7 px.
-    assert found.max() < 0.7
-    assert found.mean() < 0.05
-    assert torch.isfinite(inverse(torch.full((1, 2, 64, 64), 500.0))).all()
-
-
-def test_a_lost_patch_is_taken_from_the_flow_back() -> None:
-    image1, image2, there, back = example()
-    found = consistent(lost(there), image1, image2, lambda *_: back, RegistrationConfig())
-    assert error(lost(there)[PATCH], there[PATCH]) > 19
-    assert error(found[PATCH], there[PATCH]) < 0.1
-    calls: list[Images] = []  # Of a batch only the pair that is torn is examined
-
-    def estimate(first: Images, second: Images) -> Flow:
-        calls.append(first)
-        return back
-
-    both = (torch.cat([image, image]) for image in (image1, image2))
-    batch = consistent(torch.cat([there, lost(there)]), *both, estimate, RegistrationConfig())
-    assert torch.equal(batch, torch.cat([there, found]))
-    assert [torch.equal(call, image2) for call in calls] == [True]
-
-
-@pytest.mark.parametrize("noise", [0.0, 0.02])
-def test_a_flow_is_kept_where_the_flow_back_is_lost(noise: float) -> None:
-    image1, image2, there, back = example()
-    image2 = image2 + noise * torch.randn(image2.shape, generator=torch.Generator().manual_seed(0))
-    torn = there.clone()
-    torn[..., :2, :] += JUMP_PX  # examined, though right where it does not close
-    found = consistent(torn, image1, image2, lambda *_: lost(back), RegistrationConfig())
-    assert torch.equal(found[PATCH], torn[PATCH])
