@@ -241,6 +241,7 @@ def summary(name: str, draws: int, judged: list[Row]) -> Row:
         "draws": draws,
         "judged": len(judged),
         "within": f"{sum(row['within'] for row in judged)} ({np.mean([row['within'] for row in judged]):.0%})",
+        "with own": sum(row["error_px"] + (row["own_px"] or 0.0) <= row["target_px"] for row in judged),
         "cost <= 2x": cheap("times_cheapest"),
         "by unknowns": cheap("times_cheapest_by_unknowns"),
         "error/target": float(np.median(share)),

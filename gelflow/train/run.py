@@ -156,7 +156,7 @@ def _fit(callback: CheckpointCallback, data: "_Data", device: str, validation_du
     module, config, out = callback.module, callback.module.config, callback.out
     session = f"from_step_{module.start:06d}"
     with ExitStack() as stack:
-        stack.enter_context(quiet_logger("lightning.pytorch", r"lightning\..*"))  # notes on hardware, workers, products
+        stack.enter_context(quiet_logger("lightning.pytorch", r"lightning\..*|torch\.autograd\.graph"))
         trainer = L.Trainer(
             accelerator="gpu" if device == "cuda" else "cpu",
             devices=config.devices,
