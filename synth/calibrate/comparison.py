@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from synth.arrays import BoolArray, FloatArray
+from synth.calibrate.frames import PLACE
 from synth.mesh import flat_surface
 from synth.render.camera_image import encoded, expected_signal
 from synth.render.pattern import albedo
@@ -15,10 +16,6 @@ from synth.scene import Dots, Render, Sensor
 
 AMPLIFIED = 8
 """Factor of the differences in the picture."""
-_PLACE = 0.02
-"""Standard deviation of the Gaussian neighbourhood that makes a place, over the image's width."""
-_PRESSED = 8 / 255
-"""Difference of a place from the gel at rest beyond which it counts as pressed or shaded, encoded."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +33,7 @@ class Comparison:
 
     def numbers(self) -> dict[str, Any]:
         """Mean absolute and signed differences per channel, levels of 255."""
-        difference = 255 * (self.rendered - self.frame)
-        bare = difference[self.outside]
+        bare = 255 * (self.rendered - self.frame)[self.outside]
         found = {"mean_absolute_outside_dots": np.abs(bare).mean(axis=0), "bias_outside_dots": bare.mean(axis=0)}
         if self.rest is not None:
             found["floor"] = 255 * np.abs(self.rest - self.frame)[self.outside].mean(axis=0)
@@ -51,7 +47,7 @@ class Comparison:
         """
         import cv2
 
-        sigma = _PLACE * self.frame.shape[1]
+        sigma = PLACE * self.frame.shape[1]
         difference = 255 * (self.rendered - self.frame) * self.outside[:, :, None]
         weight = np.maximum(cv2.GaussianBlur(self.outside.astype(np.float64), (0, 0), sigma), 1e-6)
         local = np.abs(cv2.GaussianBlur(difference, (0, 0), sigma)).max(axis=2) / weight * self.outside
@@ -71,21 +67,6 @@ def render_undeformed(sensor: Sensor, render: Render, variant: Variant) -> Float
     surface = flat_surface(sensor.gel.size_mm)
     renderer = Renderer(sensor, render, surface, albedo(plain, np.random.default_rng(0)), variant)
     return encoded(expected_signal(renderer.radiance(surface.material, 0), sensor.camera), sensor.camera)
-
-
-def at_rest(frame: FloatArray, rest: FloatArray) -> tuple[BoolArray, FloatArray]:
-    """Where a bare gel's frame (H, W, 3) is not pressed, (H, W), and its picture at rest, smoothed, (H, W, 3).
-
-    Both frames are smoothed by a Gaussian of 2 % of the width. A pixel counts as pressed, or as shaded by what is, if
-    they differ by more than 8 of 255 levels in any channel there or within that distance.
-    """
-    import cv2
-
-    sigma = _PLACE * frame.shape[1]
-    smooth, plain = (cv2.GaussianBlur(each, (0, 0), sigma) for each in (frame, rest))
-    pressed = (np.abs(smooth - plain).max(axis=2) > _PRESSED).astype(np.uint8)
-    near = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * round(sigma) + 1,) * 2)
-    return cv2.dilate(pressed, near) == 0, plain
 
 
 def compare(frame: FloatArray, rendered: FloatArray, bare: BoolArray, sensor: Sensor) -> Comparison:

@@ -1,4 +1,4 @@
-"""Frames of a user's sensor: read, and the median taken of them."""
+"""Frames of a user's sensor: read, and one picture of the gel at rest made of them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,18 +6,23 @@ from pathlib import Path
 
 import numpy as np
 
-from synth.arrays import FloatArray
+from synth.arrays import BoolArray, FloatArray
 from synth.errors import InputError
 
+PLACE = 0.02
+"""Standard deviation of the Gaussian neighbourhood that makes a place, over the image's width."""
+_PRESSED = 8 / 255
+"""Difference of a place from the gel at rest beyond which it counts as pressed or shaded, encoded."""
 _SAME = 6.0
 """Levels of 255 by which half of a frame may differ from the median of all."""
 
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """What the frames show together: (H, W, 3) float64 RGB in [0, 1], their median, and one with all of its noise.
+    """What the frames show together: (H, W, 3) float64 RGB in [0, 1], and one of them with all of its noise.
 
-    The median of three or more shows no contact of a few. `step` is that of one level of quantisation, full scale 1.
+    The median of three or more shows no contact of a few; where frames show the gel as it does, their mean is taken.
+    `step` is that of one level of quantisation, full scale 1.
     """
 
     encoded: FloatArray
@@ -59,7 +64,24 @@ def read_frames(paths: Sequence[Path]) -> Frames:
                 f"{path}: half of it differs from the frames' median by {difference:.1f} of 255 and more (allowed are "
                 f"{_SAME:g}); all frames must show the same gel, at rest or pressed at different places"
             )
-    return Frames(together, images[0], max(steps))
+    pressed = np.array([~at_rest(image, together)[0] for image in images])
+    mean = np.ma.array(images, mask=np.repeat(pressed[..., None], 3, axis=-1)).mean(axis=0)
+    return Frames(mean.filled(together), images[0], max(steps))
+
+
+def at_rest(frame: FloatArray, rest: FloatArray) -> tuple[BoolArray, FloatArray]:
+    """Where a bare gel's frame (H, W, 3) is not pressed, (H, W), and its picture at rest, smoothed, (H, W, 3).
+
+    Both frames are smoothed by a Gaussian of 2 % of the width. A pixel counts as pressed, or as shaded by what is, if
+    they differ by more than 8 of 255 levels in any channel there or within that distance.
+    """
+    import cv2
+
+    sigma = PLACE * frame.shape[1]
+    smooth, plain = (cv2.GaussianBlur(each, (0, 0), sigma) for each in (frame, rest))
+    pressed = (np.abs(smooth - plain).max(axis=2) > _PRESSED).astype(np.uint8)
+    near = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * round(sigma) + 1,) * 2)
+    return cv2.dilate(pressed, near) == 0, plain
 
 
 def _size(image: FloatArray) -> str:

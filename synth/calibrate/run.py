@@ -14,9 +14,9 @@ import numpy as np
 import tomli_w
 
 from synth.arrays import FloatArray
-from synth.calibrate.comparison import Comparison, at_rest, compare, picture, render_undeformed
+from synth.calibrate.comparison import Comparison, compare, picture, render_undeformed
 from synth.calibrate.dot_grid import DotGridFit
-from synth.calibrate.frames import Frames, read_frames
+from synth.calibrate.frames import Frames, at_rest, read_frames
 from synth.calibrate.report import fitted_content, numbers, summary
 from synth.calibrate.sensor_fit import SensorFit, find_grid, fit_sensor
 from synth.calibrate.verdict import verdict

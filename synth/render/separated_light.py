@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.arrays import BoolArray
+from synth.arrays import BoolArray, FloatArray
 from synth.errors import InputError
 from synth.render.face_points import FacePoints, across_cavity, count_per_face, projected
 from synth.render.gel_mesh import GelMesh
@@ -39,9 +39,9 @@ from synth.render.polygon_light import PolygonLight, SampledLight
 from synth.render.variant import Variant
 from synth.scene import Coating, Render, Sensor
 
-PILOTS = 16
-"""Rays from each face to each light, and to the gel."""
-_MANY = 4
+_PILOTS = 2**14
+"""Rays to each light, and to the gel, from a gel of few faces; 16 from each face where there are many."""
+_MANY = 0.25
 """Of a face's pilots that saw gel, from which on its bounced light is linear."""
 _DEGREE = 4
 """Of the polynomials for light that comes back from the window: its path is longer than the pad is thick, so smooth."""
@@ -155,42 +155,39 @@ class SeparatedLight:
         import drjit as dr
 
         def sample(at: Any, normal: Any, offset: Any) -> Any:
-            value, blocked = self._sampled(light, number, at, normal, offset, self._mi.Bool(True))
+            value, blocked = self._sampled(light, number, at, normal, offset)
             return dr.select(blocked, value, 0)
 
         return dr.if_stmt((at, normal, offset), asked, sample, lambda *_: self._mi.Float(0))
 
-    def _sampled(self, light: PolygonLight, number: int, at: Any, normal: Any, offset: Any, active: Any) -> Any:
+    def _sampled(self, light: PolygonLight, number: int, at: Any, normal: Any, offset: Any) -> Any:
         """Irradiance per radiance that a point of the light gives unless its ray is blocked, and whether it is."""
         import drjit as dr
 
         moved = [offset.x + number * _SHIFT[0] % 1, offset.y + number * _SHIFT[1] % 1]
         place, value = light.sample(at.p, normal, self._mi.Point2f(*(x - dr.floor(x) for x in moved)))
-        return value, self._scene.ray_test(at.spawn_ray_to(place), active & (value > 0))
+        return value, self._scene.ray_test(at.spawn_ray_to(place), value > 0)
 
     def _albedo(self, at: Any, active: Any) -> list[Any]:
         color = self._reflection.eval_diffuse_reflectance(at, active)
         return [color[channel] for channel in range(self._channels)]
 
-    def _pilots(self, seed: int) -> NDArray[np.uint32]:
-        """(faces, lights + 1) counts of a face's pilots that were blocked before a light, or met the gel."""
+    def _pilots(self, seed: int) -> FloatArray:
+        """(faces, lights + 1) shares of a face's pilots that were blocked before a light, or met the gel."""
         import drjit as dr
 
-        mi = self._mi
-        points = self._points(PILOTS, seed)
-        offset, everywhere = points.sampler.next_2d(), mi.Bool(True)
-        sampled = [
-            self._sampled(light, number, points.at, points.normal, offset, everywhere)
-            for number, light in enumerate(self._lights)
-        ]
+        count = count_per_face(_PILOTS, dr.width(self._corners[0]))
+        points = self._points(count, seed)
+        shared = points.at, points.normal, points.sampler.next_2d()
+        sampled = [self._sampled(light, number, *shared) for number, light in enumerate(self._lights)]
         given = [[value * c for c in light.radiance] for light, (value, _) in zip(self._lights, sampled, strict=True)]
         least = [_NEGLIGIBLE * sum(channel) for channel in zip(*given, strict=True)]
         counted = [reduce(or_, (c > limit for c, limit in zip(one, least, strict=True))) for one in given]
         met = [blocked & counts for (_, blocked), counts in zip(sampled, counted, strict=True)]
         met.append(self._onward(points.at, points.normal, points.sampler.next_2d())[2])  # the image is no bounce
-        counts = [dr.select(one, mi.UInt32(1), 0) for one in met]
+        counts = [dr.select(one, self._mi.UInt32(1), 0) for one in met]
         dr.eval(counts)
-        return np.stack([np.array(dr.block_sum(count, PILOTS)) for count in counts], axis=-1)
+        return np.stack([np.array(dr.block_sum(one, count)) for one in counts], axis=-1) / count
 
     def _gather(self, triangles: NDArray[np.uint32], often: BoolArray, rays: int, seed: int) -> None:
         """Bounced light on all faces from about so many rays; linear on faces where `often` (faces,)."""

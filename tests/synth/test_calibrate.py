@@ -241,6 +241,18 @@ def test_frames_that_do_not_belong_together_are_refused(tmp_path: Path) -> None:
         refused(message, read_frames, [tmp_path / f"{name}.png" for name in names])
 
 
+def test_frames_together_are_the_mean_of_those_that_are_not_pressed(tmp_path: Path) -> None:
+    """Three frames of levels near their median, 102; the brightest has a contact."""
+    for level in (100, 102, 107):
+        image = np.full((120, 160, 3), level, np.uint8)
+        if level == 107:
+            image[40:80, 20:60] += 60
+        cv2.imwrite(str(tmp_path / f"{level}.png"), image)
+    together = 255 * read_frames(sorted(tmp_path.glob("*.png"))).encoded
+    np.testing.assert_allclose(together[60, 40], 101)
+    np.testing.assert_allclose(together[60, 120], 103)
+
+
 def test_a_photograph_is_turned_as_its_exif_says(tmp_path: Path) -> None:
     stored = np.random.default_rng(0).integers(0, 256, (6, 8, 3), np.uint8)
     exif = Image.Exif()

@@ -10,10 +10,10 @@ from render_scenes import FAST, needs_llvm
 from test_calibrate import _frame, _real_frame, _start
 
 from synth.arrays import FloatArray
-from synth.calibrate.comparison import Comparison, at_rest
+from synth.calibrate.comparison import Comparison
 from synth.calibrate.dot_grid import fit_dot_grid
 from synth.calibrate.dots import find_dots
-from synth.calibrate.frames import Frames
+from synth.calibrate.frames import Frames, at_rest
 from synth.calibrate.run import start_sensor
 from synth.calibrate.sensor_fit import find_grid, fit_sensor
 from synth.calibrate.verdict import ALLOWED_OFF_GRID, common_displacement, verdict
@@ -141,13 +141,13 @@ def test_a_real_bare_gel_at_rest_passes_and_pressed_ones_do_not(tmp_path: Path, 
 @needs_llvm
 @needs_recordings
 def test_the_scene_of_a_photographed_digit_meets_photographs_that_it_was_not_fitted_to(tmp_path: Path) -> None:
-    """It was fitted to the one at rest and every second one with a ball: their median shows no contact."""
+    """It was fitted to the one at rest and every second one with a ball: together they show no contact."""
     fitted, others = ([f"{k:04d}" for k in range(first, 40, 4)] for first in (0, 2))
     names = {"--frames": ["rest", *fitted], "--judge": others}
     paths = {key: [str(REAL / f"other_sensors/digit/{name}.png") for name in of] for key, of in names.items()}
     given = [word for key, of in paths.items() for word in (key, *of)]
     main(["calibrate", "--scene", "digit_calibrated", *given, "--steps", "0", "--out", str(tmp_path)])
     found = json.loads((tmp_path / "calibration.json").read_text())["differences"]
-    assert np.mean(found.pop("frames")["mean_absolute_outside_dots"]) < 3  # measured: 2.73
+    assert np.mean(found.pop("frames")["mean_absolute_outside_dots"]) < 3  # measured: 2.65
     off, floor = (np.array([each[key] for each in found.values()]) for key in ("mean_absolute_outside_dots", "floor"))
-    assert floor.mean() < off.mean() < off.mean(axis=1).max() < 4  # measured: 2.76, 3.64 and 3.89
+    assert floor.mean() < off.mean() < off.mean(axis=0).max() < 4  # measured: 2.69, 3.51 and 3.99
