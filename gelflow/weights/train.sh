@@ -1,0 +1,49 @@
+#!/usr/bin/env bash
+# Trains weights as the shipped ones were, on NVIDIA GPUs: bash gelflow/weights/train.sh CLIPS OUT
+#
+# CLIPS is a folder of videos of a real gel. The first four stages of the shipped weights were trained on the scenes of
+# version 0.1.0.
+set -euo pipefail
+clips=$1 out=$2 devices=${DEVICES:-1} n=${PAIRS:-900} here=$(cd "$(dirname "$0")" && pwd)
+others="densetact fingervision gelsight gelsight_fingertip gelslim gelstereo omnitact tac3d"
+
+pairs() { # NAME SCENE N SEED PAIRS_PER_TRAJECTORY, further options
+    local name=$1 scene=$2 n=$3 seed=$4 per=$5
+    python -m synth generate --scene "$scene" --n "$n" --seed "$seed" --device cuda --set outputs.backward=false \
+        --set 'sensor.further_cameras=[]' --set sampling.pairs_per_trajectory="$per" "${@:6}" --out "$out/$name"
+}
+
+finetune() { # NAME FROM STEPS LEARNING_RATE WARMUP_STEPS SEED, further options and folders of pairs
+    python -m gelflow finetune "$out/real" "${@:7}" --config real \
+        --weights "$out/$2/weights.safetensors" $network --set ema_decay=0.999 --steps "$3" \
+        --set learning_rate="$4" --set warmup_steps="$5" --set seed="$6" --out "$out/$1"
+}
+
+together="--workers 3 --set numerics.solver=batched"
+turned="--set motion.twist_deg={uniform=[-45.0,45.0]}"
+network="--device cuda --set precision=bf16 --set batch_size=16 --set crop_size=[240,320]"
+
+python -m gelflow pairs "$clips" --min-motion 6 --per-video 8 --tries 80 --out "$out/real"
+for scene in deltact soft_bubble gelsight_mini digit $others; do
+    pairs "first/$scene" "$scene" "$n" 11 6 --set numerics.target_error_px=2.5
+done
+pairs far "$here/gelsight_mini_far.toml" "$n" 11 6 --set numerics.target_error_px=2.5
+pairs turned "$here/gelsight_mini_far.toml" $((n * 5 / 3)) 32 6 $together $turned
+pairs bare digit $((n * 5)) 31 6 $together
+for scene in $others; do pairs "few/$scene" "$scene" $((n * 2 / 9)) 21 6; done
+for scene in allsight deltact densetact dmtac fingervision gelsight gelsight_fingertip gelslim gelstereo omnitact \
+    soft_bubble tac3d tac3d_single "$here/any_pattern.toml" "$here/any_round.toml"; do
+    pairs "all/$(basename "$scene" .toml)" "$scene" $((n * 5 / 9)) 41 5 $together
+done
+pairs all/gelsight_mini gelsight_mini $((n * 5 / 2)) 41 5 $together
+pairs all/objects objects $((n * 4 / 3)) 41 5 $together
+pairs all/digit digit $((n * 5 / 3)) 41 5 $together
+pairs all/turned "$here/gelsight_mini_far.toml" "$n" 41 5 $together $turned
+
+two="$out/first/deltact $out/first/soft_bubble"
+python -m gelflow train "$out"/first/* "$out/far" --config best $network \
+    --set learning_rate=5e-4 --set warmup_steps=661 --steps 13220 --out "$out/1"
+finetune 2 1 5301 1e-4 265 0 "$out/far" $two "$out/first/gelsight_mini"
+finetune 3 2 15062 3e-4 265 0 "$out/far" $two "$out"/few/* "$out/bare"
+finetune 4 3 9646 2e-4 192 1 "$out/far" "$out/turned" $two "$out"/few/* "$out/bare"
+finetune 5 4 8157 3e-4 300 2 --devices "$devices" "$out"/all/*
