@@ -162,5 +162,4 @@ def next_viscosity(viscosity: float, error: float, refused: bool = False) -> flo
     if error <= MAX_ERROR:
         taken = viscosity * min(max(error / AIM, FALL_AFTER_REFUSAL if refused else FALL), RISE)
         return taken if taken >= LEAST_VISCOSITY else 0.0
-    raised = max(viscosity * min(max(error / AIM, 2.0), RISE), LEAST_VISCOSITY)
-    return min(raised, MOST_VISCOSITY)
+    return min(max(viscosity * min(max(error / AIM, 2.0), RISE), LEAST_VISCOSITY), MOST_VISCOSITY)

@@ -12,6 +12,7 @@ and those of contours that keep their edges (`synth.simulate.object_contour`). T
 winding number (Jacobson, Kavan & Sorkine-Hornung 2013), which closes holes and fills cavities.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,8 +24,6 @@ from synth.simulate.object_contour import crossings, sharp_contour
 
 STRIDE = 3
 """Far from the surface one of so many samples along an axis is exact."""
-BAND = 2.0
-"""Rounding is done so many radii from the surface, and two samples."""
 LOST = 1.25
 """What an opening by r leaves out farther than this times r is a thin part or a sharp tip. A right-angled edge loses
 0.41 r, its corner 0.73 r, a tetrahedron's edge 0.73 r and its corner 2 r."""
@@ -50,42 +49,43 @@ class Grid:
     def distance(self, surface: "Nearest", where: BoolArray) -> FloatArray:
         """Distances of some samples from a surface, mm; infinite elsewhere."""
         found = np.full(self.counts, np.inf)
-        points = self.points(where)
-        found[where] = np.linalg.norm(points - surface(points)[0], axis=1)
+        found[where] = surface.away(self.points(where))
         return found
 
-    def _away(self, surface: "Nearest", reach_mm: float) -> FloatArray:
-        """Distances of all samples from a surface, mm: exact within the reach, beyond it interpolated linearly.
-
-        The farther away a query begins the longer it takes.
-        """
+    def _coarse(self, function: Callable[[Points], FloatArray]) -> FloatArray:
+        """A function of points (n, 3) at every STRIDE-th sample along each axis, linearly interpolated between them."""
         from scipy.interpolate import make_interp_spline
 
         known = [np.unique([*range(0, count, STRIDE), count - 1]) for count in self.counts]
-        some = np.zeros(self.counts, dtype=bool)
-        some[np.ix_(*known)] = True
-        away = self.distance(surface, some)[np.ix_(*known)]
+        places = np.stack(np.meshgrid(*known, indexing="ij"), axis=-1)
+        values = function(self.corner + self.spacing * places.reshape(-1, 3)).reshape(places.shape[:3])
         for axis, count in enumerate(self.counts):
-            away = make_interp_spline(known[axis], away, k=1, axis=axis)(np.arange(count))
+            values = make_interp_spline(known[axis], values, k=1, axis=axis)(np.arange(count))
+        return values
+
+    def _away(self, surface: "Nearest", reach_mm: float) -> FloatArray:
+        """Distances of all samples from a surface, mm; beyond the reach, where queries take longer, interpolated."""
+        away = self._coarse(surface.away)
         near = away < reach_mm + np.sqrt(3) * STRIDE / 2 * self.spacing
         return np.where(near, self.distance(surface, near), away)
 
     def signed_distance(self, surface: Triangles, radius_mm: float) -> FloatArray:
         """Distances of all samples, negative inside, and exact where edges are rounded to that radius.
 
-        A closed surface lies between two neighbouring samples of different sign: winding numbers, which take ten times
-        as long as distances, are then found near it alone, and the signs of others are those next to them toward +z.
+        Winding numbers take ten times as long and are found near the surface. A closed one lies between neighbouring
+        samples of different sign: the signs of others are those next to them toward +z. Around an open one they are
+        those of coarse samples, the nearest of which is √3 spacings away, and found, too, where these differ.
         Where shells overlap, faces of one lie within another: distances are then those from a contour around all.
         """
-        nearest, reach = Nearest(surface, winding=True), max(BAND * radius_mm, 4 * self.spacing) + 2 * self.spacing
-        away = self._away(nearest, reach)
-        known = away < 1.1 * self.spacing if surface.closed else np.ones(self.counts, dtype=bool)
-        sign = np.ones((*self.counts[:2], self.counts[2] + 1))  # beyond the last sample is outside
+        nearest, reach, closed = Nearest(surface, winding=True), radius_mm + 3 * self.spacing, surface.closed
+        away, sign = self._away(nearest, reach), np.ones(self.counts) if closed else self._coarse(nearest.signs)
+        known = (away < (1.1 if closed else 1.75) * self.spacing) | (np.abs(sign) < 0.99)
         near = self.points(known)
-        sign[:, :, :-1][known] = near_sign = nearest.signs(near)
-        above = np.where(known, np.arange(self.counts[2]), self.counts[2])
-        above = np.minimum.accumulate(above[:, :, ::-1], axis=2)[:, :, ::-1]
-        values = np.asarray(away * np.take_along_axis(sign, above, axis=2))
+        sign[known] = near_sign = nearest.signs(near)
+        if closed:
+            above = np.where(known, np.arange(self.counts[2]), self.counts[2] - 1)
+            sign = np.take_along_axis(sign, np.minimum.accumulate(above[:, :, ::-1], axis=2)[:, :, ::-1], axis=2)
+        values = away * sign
         if (nearest.signs(near[near_sign < 0], TWICE) > 0).all():
             return values
         outer = sharp_contour(values, self.corner, self.spacing, nearest.depth)
@@ -115,7 +115,7 @@ class Grid:
         shell = sharp_contour(opened - radius_mm, self.corner, self.spacing, outer)
         if not cores or len(shell.faces) == 0:
             return values
-        band = np.abs(values) < BAND * radius_mm + 2 * self.spacing
+        band = np.abs(values) < radius_mm + 2 * self.spacing  # the surface moves by less than the radius
         away = self.distance(Nearest(shell), band)
         closed = radius_mm + np.where(opened > radius_mm, away, -away)
         return np.where(band, closed, values)
@@ -163,6 +163,10 @@ class Nearest:
         wp.launch(_nearest, len(points), inputs=inputs, outputs=[found, normal], device="cpu")
         return found.numpy().astype(np.float64), normal.numpy().astype(np.float64)
 
+    def away(self, points: Points) -> FloatArray:
+        """The distances of points (n, 3)."""
+        return np.asarray(np.linalg.norm(points - self(points)[0], axis=1))
+
     def depth(self, points: Points) -> tuple[FloatArray, Points]:
         """The signed distance of points (n, 3) that are inside, and its gradient."""
         nearest, normal = self(points)
@@ -178,15 +182,12 @@ class Nearest:
         return found.numpy().astype(np.float64)
 
 
-FARTHEST = wp.constant(1.0e6)
-
-
 @wp.kernel
 def _nearest(
     mesh: wp.uint64, points: wp.array(dtype=wp.vec3), found: wp.array(dtype=wp.vec3), normal: wp.array(dtype=wp.vec3)
 ):
     i = wp.tid()
-    near = wp.mesh_query_point_no_sign(mesh, points[i], FARTHEST)
+    near = wp.mesh_query_point_no_sign(mesh, points[i], wp.inf)
     found[i] = wp.mesh_eval_position(mesh, near.face, near.u, near.v)
     normal[i] = wp.mesh_eval_face_normal(mesh, near.face)
 
@@ -194,4 +195,4 @@ def _nearest(
 @wp.kernel
 def _signs(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), least: float, found: wp.array(dtype=wp.float32)):
     i = wp.tid()
-    found[i] = wp.mesh_query_point_sign_winding_number(mesh, points[i], FARTHEST, 2.0, least).sign
+    found[i] = wp.mesh_query_point_sign_winding_number(mesh, points[i], wp.inf, 2.0, least).sign
