@@ -97,10 +97,10 @@ def plot_work_precision(path: Path, groups: Sequence[Group], note: str) -> None:
 
 
 def plot_strata(path: Path, strata: Mapping[str, Sequence[Stratum]]) -> None:
-    """Writes a PNG with the mean endpoint error by true motion, by distance to the contact's edge and by pattern."""
+    """Writes a PNG with the mean endpoint error by true motion, by distance to the contact's edge and by patterns."""
     by_method = pooled(strata)
-    present = {one.kind for bins in by_method.values() for one in bins}
-    kinds = [kind for kind in (MOTION, EDGE, PATTERN) if kind in present]
+    present = {(one.kind, one.bin) for bins in by_method.values() for one in bins}
+    kinds = [kind for kind in (MOTION, EDGE, PATTERN) if sum(kind in each for each in present) > (kind == PATTERN)]
     looks = _looks(list(by_method))
     figure, axes = _figure(len(kinds), 5.0 * len(kinds) + 1.5, 4.4)
     for axis, kind in zip(axes, kinds, strict=True):

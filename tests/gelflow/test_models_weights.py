@@ -87,7 +87,7 @@ def test_metadata_that_do_not_fit(saved: Path, tmp_path: Path, key: str, values:
         refused(words, load_weights, tmp_path / "wrong.safetensors")
 
 
-def test_names_files_and_the_card_of_best(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_files_and_the_recipe_of_best(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     shipped, own = weights_file(None), Path("best")
     assert shipped.stat().st_size < 15e6
@@ -98,10 +98,9 @@ def test_names_files_and_the_card_of_best(tmp_path: Path, monkeypatch: pytest.Mo
     own.touch()  # a file of one's own comes first
     assert weights_file(own) == own
     refused("worst: there is no such file", load_weights, weights_file(Path("worst")))
-    card = shipped.with_name("README.md").read_text(encoding="utf-8")
     metadata = read_metadata(shipped)
     assert json.loads(metadata["train"])["supervision"] == "mixed"
-    assert f"--steps {metadata['step']}\n" in card
+    assert f" {metadata['step']} " in shipped.with_name("train.sh").read_text(encoding="utf-8")
     assert load_weights(shipped).config.registration == REGISTRATIONS["motion"]
 
 
