@@ -1,7 +1,7 @@
 """What error does the simulation of a scene make in the picture, on which mesh, in which time; is it within its budget?
 
     python -m benchmarks budget --scene my_sensor.toml              three random draws, some minutes
-    python -m benchmarks budget --all --draws 20 --seed 3 --workers 8    all shipped scenes, many hours
+    python -m benchmarks budget --all --draws 12 --workers 40       all shipped scenes, on many cores
 
 Draws are those of `synth generate`, and pressed as there: load steps, solver options and the states that samples show.
 Each is simulated on the mesh that `numerics.target_error_px` chooses, on coarser ones, on up to three finer ones, and

@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Trains weights as the shipped ones were, on NVIDIA GPUs: bash gelflow/weights/train.sh CLIPS OUT
 #
-# CLIPS is a folder of videos of a real gel. The first four stages of the shipped weights were trained on the scenes of
-# version 0.1.0.
+# CLIPS is a folder of videos of a real gel. DEVICES is the number of GPUs of the fifth stage, PAIRS that of pairs of a
+# scene in the first. The first four stages of the shipped weights used the scenes of version 0.1.0.
 set -euo pipefail
 clips=$1 out=$2 devices=${DEVICES:-1} n=${PAIRS:-900} here=$(cd "$(dirname "$0")" && pwd)
 others="densetact fingervision gelsight gelsight_fingertip gelslim gelstereo omnitact tac3d"
@@ -13,7 +13,7 @@ pairs() { # NAME SCENE N SEED PAIRS_PER_TRAJECTORY, further options
         --set 'sensor.further_cameras=[]' --set sampling.pairs_per_trajectory="$per" "${@:6}" --out "$out/$name"
 }
 
-finetune() { # NAME FROM STEPS LEARNING_RATE WARMUP_STEPS SEED, further options and folders of pairs
+finetune() { # NAME FROM STEPS LEARNING_RATE WARMUP_STEPS SEED, folders of pairs and further options
     python -m gelflow finetune "$out/real" "${@:7}" --config real \
         --weights "$out/$2/weights.safetensors" $network --set ema_decay=0.999 --steps "$3" \
         --set learning_rate="$4" --set warmup_steps="$5" --set seed="$6" --out "$out/$1"
@@ -46,4 +46,4 @@ python -m gelflow train "$out"/first/* "$out/far" --config best $network \
 finetune 2 1 5301 1e-4 265 0 "$out/far" $two "$out/first/gelsight_mini"
 finetune 3 2 15062 3e-4 265 0 "$out/far" $two "$out"/few/* "$out/bare"
 finetune 4 3 9646 2e-4 192 1 "$out/far" "$out/turned" $two "$out"/few/* "$out/bare"
-finetune 5 4 8157 3e-4 300 2 --devices "$devices" "$out"/all/*
+finetune 5 4 8157 3e-4 300 2 "$out"/all/* --devices "$devices"
