@@ -21,8 +21,8 @@ _SAME = 6.0
 class Frames:
     """What the frames show together: (H, W, 3) float64 RGB in [0, 1], and one of them with all of its noise.
 
-    The median of three or more shows no contact of a few; where frames show the gel as it does, their mean is taken.
-    `step` is that of one level of quantisation, full scale 1.
+    Each pixel is the mean of the frames in which it is not pressed; where it is pressed in all, their median. `step` is
+    that of one level of quantisation, full scale 1.
     """
 
     encoded: FloatArray
