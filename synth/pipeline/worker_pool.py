@@ -101,7 +101,7 @@ def _outcomes_of_pool(
                 if begins:
                     item = again[0]  # not lost should the pool be broken already
                     with interrupts_blocked():
-                        under_way[pool.submit(_work, item)] = item
+                        under_way[_submit(pool, item)] = item
                     again.popleft()
                 if not under_way:
                     return
@@ -117,6 +117,13 @@ def _outcomes_of_pool(
         except BaseException:
             parents_end.close()
             raise
+
+
+def _submit(pool: ProcessPoolExecutor, item: Item) -> Future[Outcome]:
+    try:
+        return pool.submit(_work, item)
+    except (OSError, ValueError) as error:  # "handle is closed": the pool broke while this call started a worker
+        raise BrokenProcessPool from error
 
 
 @contextlib.contextmanager

@@ -5,6 +5,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -51,6 +52,21 @@ def test_a_worker_is_a_process_that_takes_one_core(tmp_path: Path, monkeypatch, 
     assert os.getpid() not in {process for process, *_ in found}
     assert {tuple(threads) for _, *threads in found} == {(1,) * (2 + len(THREADS))}
     assert [os.environ[name] for name in THREADS] == ["2"] * len(THREADS)
+
+
+def test_a_pool_that_breaks_while_it_starts_a_worker(tmp_path: Path, monkeypatch, capsys) -> None:
+    submit, errors = pool.ProcessPoolExecutor.submit, [OSError("handle is closed"), ValueError("bad value(s)")]
+
+    def submit_late(*args: Any) -> Any:
+        if errors:
+            raise errors.pop()
+        return submit(*args)
+
+    monkeypatch.setattr(pool.ProcessPoolExecutor, "submit", submit_late)
+    monkeypatch.setattr(pool, "_trajectory_maker", _threads)
+    context = job_context(load_scene(write_tiny(tmp_path)), 8, tmp_path / "d")
+    assert len(list(outcomes_of_processes(context, ((k, (2 * k, 2 * k + 1)) for k in range(4)), 1))) == 4
+    assert capsys.readouterr().err == "synth: a worker process died; trajectories 0 are made again\n" * 2
 
 
 @pytest.fixture
