@@ -10,6 +10,7 @@ into it. V is fitted to the means of all faces as polynomials of the place.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -26,25 +27,30 @@ _STEP = 4
 class FacePoints:
     """Points on faces, each face's one after another: surface interactions, barycentric weights, and unit normals.
 
-    These, mi.Vector3f, point into the gel; the sampler is of further random numbers, stratified within each face.
+    These, mi.Vector3f, point into the gel; `numbers` are random (mi.Point2f), stratified within each face.
     """
 
     at: Any
     normal: Any
     weights: tuple[Any, Any, Any]
-    sampler: Any
+    numbers: Iterator[Any]
 
     @staticmethod
-    def on(corners: list[Any], parameters: Any, count: int, seed: int, mi: Any) -> "FacePoints":
-        """`count` points on each of the gel's faces, whose corners (3 of mi.UInt32) are vertices in `parameters`."""
+    def on(corners: list[Any], parameters: Any, count: int, draws: int, seed: int, mi: Any) -> "FacePoints":
+        """`count` points, each with as many `draws` of numbers, on each of the gel's faces.
+
+        The faces' corners (3 of mi.UInt32) are vertices in `parameters`.
+        """
         import drjit as dr
 
         total = dr.width(corners[0]) * count
         sampler = mi.load_dict({"type": "multijitter", "sample_count": count})
         sampler.set_samples_per_wavefront(count)
         sampler.seed(seed % 2**32, total)
+        first, *numbers = (sampler.next_2d() for _ in range(1 + draws))
+        dr.eval(first, numbers)  # by a kernel of their own: the sampler's size is compiled into it
         face = dr.arange(mi.UInt32, total) // dr.opaque(mi.UInt32, count)
-        place = mi.warp.square_to_uniform_triangle(sampler.next_2d())
+        place = mi.warp.square_to_uniform_triangle(first)
         weights = (1 - place.x - place.y, place.x, place.y)
         vertices = [dr.gather(mi.UInt32, column, face) for column in corners]
         positions = dr.unravel(mi.Point3f, parameters["gel.vertex_positions"])
@@ -54,7 +60,7 @@ class FacePoints:
         at.p = a * weights[0] + b * weights[1] + c * weights[2]
         at.n = mi.Normal3f(dr.normalize(dr.cross(b - a, c - a)))
         normal = sum(dr.gather(mi.Vector3f, normals, i) * w for i, w in zip(vertices, weights, strict=True))
-        return FacePoints(at, -dr.normalize(normal), weights, sampler)  # vertex normals point out of the gel
+        return FacePoints(at, -dr.normalize(normal), weights, iter(numbers))  # vertex normals point out of the gel
 
 
 def count_per_face(total: int, faces: int) -> int:

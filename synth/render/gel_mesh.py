@@ -15,6 +15,8 @@ from synth.surface import GelSurface, vertex_normals
 
 MIRROR = np.array([1.0, -1.0, 1.0])
 """Componentwise factor from the scene's frame to the renderer's and back."""
+_ALIGNED = 16
+"""Numbers of float32 in the widest of a processor's registers, 64 bytes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,11 +37,18 @@ class GelMesh:
         return np.ascontiguousarray(triangles[:, ::-1] if self.behind is None else triangles).astype(np.uint32).ravel()
 
     def texture_coordinates(self) -> NDArray[np.float32]:
-        """(2 v,) u along +x and v along +y, each 0..1 over the chart; Mitsuba's v = 0 is a texture's first row."""
+        """(2 v,) u along +x and v along +y, each 0..1 over the chart; Mitsuba's v = 0 is a texture's first row.
+
+        Aligned: on a processor Dr.Jit uses this memory, and reads pairs from it by other code if it is not.
+        """
         places, (width, height) = self.chart.flattened(self.surface.material), self.chart.size_mm
         u = places[:, 0] / width + 0.5
         v = places[:, 1] / height + 0.5
-        return np.column_stack([u, v]).astype(np.float32).ravel()
+        room = np.empty(2 * len(u) + _ALIGNED, dtype=np.float32)
+        start = -room.ctypes.data // room.itemsize % _ALIGNED
+        found = room[start : start + 2 * len(u)]
+        found[::2], found[1::2] = u, v
+        return found
 
     def positions(self, positions: Points) -> NDArray[np.float32]:
         """(3 v,) in the renderer's frame, from positions (v, 3) float64 mm."""

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from synth.render.gel_hits import GelHits
 from synth.render.lights import all_lights, rectangles, reflectance, reflecting_plane
 from synth.scene import Sensor
 
@@ -27,12 +28,17 @@ class PathTracer:
         import drjit as dr
 
         self._mi, self._scene = mi, scene
-        self._reflection, self._lights, self._image = shapes["gel"].bsdf(), shapes["lights"], shapes.get("image")
+        self._reflection, self._gel, self._lights = (
+            shapes["gel"].bsdf(),
+            GelHits(shapes, mi),
+            mi.ShapePtr(shapes["lights"]),
+        )
+        dr.make_opaque(self._lights)
         self._face = dr.opaque(mi.Float, reflecting_plane(sensor) or 0)
         self._index, self._depth = dr.opaque(mi.Float, sensor.window.refractive_index), dr.opaque(mi.UInt32, max_depth)
         lights = all_lights(sensor)
         self._count = dr.opaque(mi.UInt32, len(lights))
-        self._before = dr.opaque(mi.UInt32, len(lights) // (2 if self._image else 1))  # images come last
+        self._before = dr.opaque(mi.UInt32, len(lights) // (2 if "image" in shapes else 1))  # images come last
         self._places = [mi.Float(column.ravel()) for column in rectangles(lights).astype(np.float32).swapaxes(0, 1)]
         self._areas = mi.Float([light.size_mm[0] * light.size_mm[1] for light in lights])
         given = np.array([light.radiance[: len(mi.Spectrum(0))] for light in lights], dtype=np.float32)
@@ -64,15 +70,12 @@ class PathTracer:
         context = mi.BSDFContext()
         hit = self._scene.ray_intersect_preliminary(ray, active=active)
         met = active & hit.is_valid()
-        shines = met & (hit.shape == mi.ShapePtr(self._lights))
+        shines = met & (hit.shape == self._lights)
         given, chance = self._towards(hit.prim_index // 2, ray.d, dr.square(hit.t), shines & (depth > 0))
         total = total + share * given * _weight(density, chance)
         goes = met & ~shines
-        mirrored = goes & (hit.shape == mi.ShapePtr(self._image)) if self._image else mi.Bool(False)
-        at = hit.compute_surface_interaction(ray, mi.RayFlags.All, goes)
-        at.p.z = dr.select(mirrored, 2 * self._face - at.p.z, at.p.z)
-        for axis in (at.n, at.sh_frame.s, at.sh_frame.t, at.sh_frame.n):
-            axis.z = dr.select(mirrored, -axis.z, axis.z)
+        _, mirrored = self._gel.kinds(hit, goes)
+        at = self._gel.point(ray, hit, mirrored, goes)
         share = share * dr.select(mirrored, reflectance(dr.abs(ray.d.z), self._index, mi), 1)
         seen = seen | (goes & (depth == 0))
         goes &= depth + 1 < self._depth

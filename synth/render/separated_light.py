@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 from synth.arrays import BoolArray, FloatArray
 from synth.errors import InputError
 from synth.render.face_points import FacePoints, across_cavity, count_per_face, projected
+from synth.render.gel_hits import GelHits
 from synth.render.gel_mesh import GelMesh
 from synth.render.lights import image_lights, reaches, reflectance, reflecting_plane
 from synth.render.polygon_light import PolygonLight, SampledLight
@@ -84,8 +85,8 @@ class SeparatedLight:
         import drjit as dr
 
         self._mi, self._scene, self._parameters = mi, scene, parameters
-        self._gel, self._image = gels["gel"], gels.get("image")
-        self._reflection = self._gel.bsdf()
+        self._gel, self._has_image = GelHits(gels, mi), "image" in gels
+        self._reflection = gels["gel"].bsdf()
         self._depth, self._channels = max_depth, 1 if is_mono else 3
         self._is_round = sensor.gel.is_round
         index = sensor.window.refractive_index
@@ -111,10 +112,8 @@ class SeparatedLight:
             np.logical_or.at(touched, corner, met[:, :-1] > 0)
         near: BoolArray = np.any(touched[triangles], axis=1)
         self._shaded = [mi.Bool(np.ascontiguousarray(near[:, number])) for number in range(len(self._lights))]
-        self._any_bounce = self._depth > 2 and bool(met[:, -1].any())
-        if self._any_bounce:
-            self._gather(triangles, met[:, -1] >= _MANY, primary, seed)
-        self._returned = self._fit_returned(len(triangles), seed) if self._image and self._depth > 2 else None
+        self._bounced = self._gather(triangles, met[:, -1], primary, seed) if self._depth > 2 else None
+        self._returned = self._fit_returned(len(triangles), seed) if self._has_image and self._depth > 2 else None
 
     def radiance(self, ray: Any, sampler: Any, active: Any) -> tuple[list[Any], Any]:
         """Radiance (channels of mi.Float) along rays from the camera, and whether they meet the gel (mi.Bool)."""
@@ -122,11 +121,11 @@ class SeparatedLight:
 
         mi = self._mi
         hit = self._scene.ray_intersect_preliminary(ray, active=active)
-        at = hit.compute_surface_interaction(ray, mi.RayFlags.All, active)
-        seen = active & at.is_valid() & (hit.shape == mi.ShapePtr(self._gel))
+        seen, _ = self._gel.kinds(hit, active)
+        at = self._gel.point(ray, hit, False, seen)
         normal = dr.mulsign(mi.Vector3f(at.sh_frame.n), at.wi.z)  # the coating reflects on either side
         light = self._direct(at, normal, hit.prim_index, sampler.next_2d(), seen)
-        if self._any_bounce:
+        if self._bounced is not None:
             weights = (1 - hit.prim_uv.x - hit.prim_uv.y, hit.prim_uv.x, hit.prim_uv.y)
             for channel, values in enumerate(self._bounced):
                 for value, weight in zip(values, weights, strict=True):
@@ -177,40 +176,45 @@ class SeparatedLight:
         import drjit as dr
 
         count = count_per_face(_PILOTS, dr.width(self._corners[0]))
-        points = self._points(count, seed)
-        shared = points.at, points.normal, points.sampler.next_2d()
+        points = self._points(count, 2, seed)
+        shared = points.at, points.normal, next(points.numbers)
         sampled = [self._sampled(light, number, *shared) for number, light in enumerate(self._lights)]
         given = [[value * c for c in light.radiance] for light, (value, _) in zip(self._lights, sampled, strict=True)]
         least = [_NEGLIGIBLE * sum(channel) for channel in zip(*given, strict=True)]
         counted = [reduce(or_, (c > limit for c, limit in zip(one, least, strict=True))) for one in given]
         met = [blocked & counts for (_, blocked), counts in zip(sampled, counted, strict=True)]
-        met.append(self._onward(points.at, points.normal, points.sampler.next_2d())[2])  # the image is no bounce
+        met.append(self._onward(points.at, points.normal, next(points.numbers))[2])  # the image is no bounce
         counts = [dr.select(one, self._mi.UInt32(1), 0) for one in met]
         dr.eval(counts)
         return np.stack([np.array(dr.block_sum(one, count)) for one in counts], axis=-1) / count
 
-    def _gather(self, triangles: NDArray[np.uint32], often: BoolArray, rays: int, seed: int) -> None:
-        """Bounced light on all faces from about so many rays; linear on faces where `often` (faces,)."""
+    def _gather(self, triangles: NDArray[np.uint32], met: FloatArray, rays: int, seed: int) -> list[list[Any]]:
+        """Bounced light (channels of 3 corners of mi.Float) on all faces from about so many rays.
+
+        `met` are the shares (faces,) of pilots that met the gel.
+        """
         import drjit as dr
 
-        mi, count = self._mi, count_per_face(rays, len(often))
-        points = self._points(count, seed + 1)
-        top = np.array(self._parameters["gel.vertex_positions"])[2::3].max() + _CLEARANCE_MM
-        parts = self._bounces(points, dr.opaque(mi.Float, float(top)))
-        values = projected(parts, points.weights, count, often)
-        if self._is_round:
+        mi, count = self._mi, count_per_face(rays, len(met))
+        values = np.zeros((len(met), self._channels, 3), dtype=np.float32)
+        if met.any():
+            points = self._points(count, 2 * (self._depth - 2), seed + 1)
+            top = np.array(self._parameters["gel.vertex_positions"])[2::3].max() + _CLEARANCE_MM
+            parts = self._bounces(points, dr.opaque(mi.Float, float(top)))
+            values = projected(parts, points.weights, count, met >= _MANY)
+        if met.any() and self._is_round:
             positions, normals = (
                 np.array(self._parameters[f"gel.vertex_{name}"], dtype=np.float64).reshape(-1, 3)
                 for name in ("positions", "normals")
             )
             values = across_cavity(values.mean(axis=2), positions, normals, triangles)
-        self._bounced = [[mi.Float(np.ascontiguousarray(one)) for one in rows.T] for rows in values.swapaxes(0, 1)]
+        return [[mi.Float(np.ascontiguousarray(one)) for one in rows.T] for rows in values.swapaxes(0, 1)]
 
     def _fit_returned(self, faces: int, seed: int) -> list[Any]:
         """Coefficients (channels of mi.Float) of what the gel sends to the window and gets back, in `_terms`."""
         import drjit as dr
 
-        points = self._points(count_per_face(_RETURNED, faces), seed + 2)
+        points = self._points(count_per_face(_RETURNED, faces), 2 * (self._depth - 2), seed + 2)
         values = self._bounces(points)
         terms = self._terms(points.at.p, points.normal)
         dr.eval(values, terms)
@@ -238,10 +242,10 @@ class SeparatedLight:
         share = [dr.full(mi.Float, 1, count) for _ in range(self._channels)]
         start = dr.arange(mi.UInt32, count)
         for step in range(self._depth - 2):
-            offset = dr.gather(mi.Point2f, points.sampler.next_2d(), start)
+            offset = dr.gather(mi.Point2f, next(points.numbers), start)
             ray, hit, straight, mirrored = self._onward(at, normal, offset, None if step else top)
             active = straight | mirrored if step else mirrored if top is None else straight
-            offset = dr.gather(mi.Point2f, points.sampler.next_2d(), start)
+            offset = dr.gather(mi.Point2f, next(points.numbers), start)
             dr.eval(ray, hit, active, mirrored, offset)  # each gather alone would trace everything anew
             onward = dr.compress(active)  # few paths meet the gel: only these go on
             if dr.width(onward) == 0:
@@ -249,17 +253,14 @@ class SeparatedLight:
             ray, hit, mirrored, offset, start = (
                 dr.gather(type(x), x, onward) for x in (ray, hit, mirrored, offset, start)
             )
-            at = hit.compute_surface_interaction(ray)
-            at.p.z = dr.select(mirrored, 2 * self._face - at.p.z, at.p.z)
-            at.n.z = dr.select(mirrored, -at.n.z, at.n.z)
+            at = self._gel.point(ray, hit, mirrored, mi.Bool(True))
             normal = -mi.Vector3f(at.sh_frame.n)
-            normal.z = dr.select(mirrored, -normal.z, normal.z)
             kept = dr.select(mirrored, reflectance(dr.abs(ray.d.z), self._index, mi), 1)
             albedo = self._albedo(at, mi.Bool(True))
             share = [dr.gather(mi.Float, s, onward) * a * kept for s, a in zip(share, albedo, strict=True)]
             light = self._direct(at, normal, hit.prim_index, offset, mi.Bool(True))
             for sum_, s, e in zip(total, share, light, strict=True):
-                dr.scatter_add(sum_, s * e, start)
+                dr.scatter_add(sum_, s * e, start, mode=dr.ReduceMode.NoConflicts)
         return total
 
     def _onward(self, at: Any, normal: Any, offset: Any, top: Any | None = None) -> tuple[Any, Any, Any, Any]:
@@ -271,10 +272,9 @@ class SeparatedLight:
         if top is not None:
             ray.maxt = dr.select(ray.d.z > 0, (top - at.p.z) / ray.d.z, dr.inf)
         hit = self._scene.ray_intersect_preliminary(ray)
-        nearest = hit.compute_surface_interaction(ray, mi.RayFlags.ShadingFrame)
-        lit = nearest.is_valid() & (nearest.wi.z < 0)
-        image = lit & (hit.shape == mi.ShapePtr(self._image)) if self._image else mi.Bool(False)
-        return ray, hit, lit & (hit.shape == mi.ShapePtr(self._gel)), image
+        straight, mirrored = self._gel.kinds(hit, mi.Bool(True))
+        lit = self._gel.point(ray, hit, mirrored, straight | mirrored).wi.z < 0
+        return ray, hit, lit & straight, lit & mirrored
 
-    def _points(self, count: int, seed: int) -> FacePoints:
-        return FacePoints.on(self._corners, self._parameters, count, seed, self._mi)
+    def _points(self, count: int, draws: int, seed: int) -> FacePoints:
+        return FacePoints.on(self._corners, self._parameters, count, draws, seed, self._mi)

@@ -159,14 +159,20 @@ def test_bits_do_not_depend_on_the_number_of_threads() -> None:
 
 
 @needs_llvm
-def test_nothing_is_compiled_for_another_frame_or_another_draw_of_the_sensor() -> None:
+@pytest.mark.parametrize("render", [DIRECT, Render(samples_per_pixel=36, light="separated")])
+def test_nothing_is_compiled_for_another_frame_or_another_draw_of_the_sensor(render: Render) -> None:
+    """Nor while other scenes' shapes are still alive."""
     FAST.load()
     import drjit as dr
 
+    kept = []
+
     def compiled(sensor: Sensor, *seeds: int) -> list[int]:
-        surface, rise = flat_surface(sensor), np.array([0, 0, 0.01])
-        renderer = Renderer(sensor, DIRECT, surface, plain(), FAST)
-        frames = (lambda k=k: renderer.radiance(surface.material + k * rise, k) for k in seeds)
+        surface = flat_surface(sensor)
+        bump = np.exp(-(surface.material[:, :2] ** 2).sum(axis=1, keepdims=True)) * [0, 0, 1.0]
+        renderer = Renderer(sensor, render, surface, plain(), FAST)
+        kept.append(renderer)
+        frames = (lambda k=k: renderer.radiance(surface.material + k * bump, k) for k in seeds)
         return [render_scenes.kernels_compiled(frame) for frame in frames]
 
     light = Light(position_mm=(-6.5, 1.0, 3.0), size_mm=(1, 2), color=(1, 0.5, 0), power=70)
