@@ -21,7 +21,7 @@ from synth.simulate.newton import FORCE_FLOOR, MAX_ITERATIONS, Solution, relativ
 from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.system import System, Unknowns
 from synth.simulate.tables import pack_indenter, place_indenter
-from synth.simulate.trajectory import State, Trajectory, no_contact, not_converged, too_deep, trajectory_of, undeformed
+from synth.simulate.trajectory import State, Trajectory, no_contact, not_converged, too_deep, undeformed
 
 SHORTEST_STEP = 1 / 128
 """Shortest step, as a share of max_step_mm."""
@@ -117,7 +117,7 @@ class Stepper:
             self._advance()
             if on_progress is not None:
                 on_progress(self.at / self._waypoints[-1])
-        return trajectory_of(tuple(self.states), self.reason, time.perf_counter() - started, self.system.space)
+        return Trajectory(tuple(self.states), self.reason, time.perf_counter() - started, self.system.space)
 
     def _start(self) -> None:
         """The undeformed state; a path that never touches stays in it and needs no solve."""
