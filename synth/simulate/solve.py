@@ -71,7 +71,7 @@ def stepper_of(
     """A press at the start of its load path, on a part of its gel's space, default all of it; see `simulate_press`."""
     scene, gel, numerics = press.scene, press.scene.sensor.gel, press.scene.numerics
     space = space or space_of(press)
-    system = System(space, pad_material(gel, space.mesh), numerics.penalty, options=options)
+    system = System(space, pad_material(gel, space.mesh), numerics.penalty, options)
     modulus_mpa = gel.youngs_modulus_kpa / 1000
     return Stepper(system, press.path, scene.contact.friction, numerics, modulus_mpa, options, frames)
 
