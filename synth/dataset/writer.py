@@ -42,8 +42,7 @@ from synth.dataset.manifest import (
     scan_lines,
     summary_document,
 )
-from synth.dataset.sample import SAMPLE_FILES, SAMPLES_FOLDER, VIEW_FILES, Sample, further_cameras, sample_name
-from synth.dataset.sample_files import write_sample_files
+from synth.dataset.sample import SAMPLE_FILES, SAMPLES_FOLDER, VIEW_FILES, further_cameras, sample_name
 from synth.dataset.shard import Shard
 from synth.dataset.storage import PARTIAL, remove_partials, storage_errors
 from synth.dataset.store import MESHES_FOLDER, Store, mesh_folder
@@ -115,12 +114,6 @@ class DatasetWriter:
     def finished(self) -> set[int]:
         """Indices of the samples that are whole and on record; of a shard in a directory only its own."""
         return set(self._finished)
-
-    def write(self, sample: Sample) -> ManifestEntry:
-        """Writes a sample's files and its line; where the storage refuses the sample counts as unfinished."""
-        entry = write_sample_files(self._store.out, sample, self.job)
-        self.record(entry)
-        return entry
 
     def record(self, entry: ManifestEntry) -> None:
         """Appends the line of a sample whose files are there (else InputError); again for a known one: nothing."""
