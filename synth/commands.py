@@ -236,7 +236,7 @@ def _show_plan(template: Template, variant: Variant, n: int, as_json: bool) -> i
     planned = plan(template, variant)
     predicted = predict(planned)
     if as_json:
-        print(json.dumps({**planned.record(), **predicted.record(), "n": n}))
+        print(json.dumps({**planned.record(), **vars(predicted), "n": n}))
         return 0
     title = f"{template.name} with {variant.name}"
     table = Table("feature", "runs", "because", title=title, title_justify="left")

@@ -53,9 +53,6 @@ class ManifestEntry:
         rows = {name: tuple(map(tuple, record[name])) for name in ("force_n", "torque_nmm")}
         return cls(**{**values, **rows, "index": int(record["index"]), "frames": tuple(record["frames"])})
 
-    def record(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in self.__dataclass_fields__}
-
 
 def manifest_key(record: dict[str, Any]) -> int:
     """Index of a line of the manifest; KeyError or TypeError where it is not one."""

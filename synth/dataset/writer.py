@@ -125,7 +125,7 @@ class DatasetWriter:
                 f"{self._store.out}/{SAMPLES_FOLDER}/{name}: the sample's files are not there; were they written to "
                 "another place, or to storage that is not shared?"
             )
-        self._append(MANIFEST_FILE, name, entry.record())
+        self._append(MANIFEST_FILE, name, vars(entry))
         self._finished.add(entry.index)
 
     def fail(self, index: int, draw: int, stage: str, reason: str, last_good_state: Any = None) -> None:

@@ -6,7 +6,6 @@ seconds, so that `generate`, which needs none of this, does not ask for it.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -74,9 +73,6 @@ class Prediction:
     nodes: int
     seconds_per_pair: dict[str, float]
     bytes_per_pair: int
-
-    def record(self) -> dict[str, Any]:
-        return {**vars(self), "error_px": None if self.error_px is None else list(self.error_px)}
 
 
 def predict(plan: Plan) -> Prediction:
