@@ -9,10 +9,11 @@ from synth.arrays import BoolArray, FloatArray, Pixels
 from synth.errors import InputError
 
 _FEWEST = 9
+"""Whole dots that a frame must show."""
 SMALLEST_PX = 1.0
 """Radius of dots whose edge can be told from the blur, which `synth.calibrate.profile` at first takes for 1 px."""
 _CLEAREST = 0.75
-"""A dot's middle is at least so much darker than the coating around, or brighter: ratio of linear brightness."""
+"""A dot's middle has at most this share of the linear brightness around it, or is as much brighter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +61,7 @@ def find_dots(linear: FloatArray, pitch_px: float) -> FoundDots:
 
 
 def _middles(grey: FloatArray, pitch_px: float) -> tuple[NDArray[np.uint8], float]:
-    """Where (H, W) a pixel is as dark as marks are, or as bright, and how bright that is over the coating around.
+    """The pixels (H, W) nearer to the marks' brightness than to the coating's, and the marks' over the coating's.
 
     InputError where nothing stands out.
     """

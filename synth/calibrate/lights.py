@@ -30,10 +30,10 @@ CENTRE_MM, DIRECTION, LOG_SIZE, LOG_ANGLE, VIGNETTING = 2.0, 0.4, 0.5, 0.4, 0.3
 its viewing angle, and of the vignetting."""
 _SCALE = np.repeat([CENTRE_MM, DIRECTION, LOG_SIZE, LOG_ANGLE], [3, 3, 2, 1])
 _SIZES = 1.5
-"""Bound of the sizes' displacements: by a factor of 2.1 either way."""
+"""Largest displacement of a size, in standard deviations: a factor of 2.1 either way."""
 _NARROWEST_DEG, _WIDEST_DEG = 10.0, 120.0
 RESIDUAL = 1 / 255
-"""Standard deviation of what the model may leave, encoded."""
+"""Standard deviation of the misfit that the model may leave, in encoded values."""
 INDEPENDENT = 300.0
 """Number of independent values that a smooth picture counts for."""
 

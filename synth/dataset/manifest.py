@@ -48,7 +48,7 @@ class ManifestEntry:
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> "ManifestEntry":
-        """From the line's JSON object; KeyError or TypeError where it is not one of a sample."""
+        """The entry of a line's JSON object; KeyError or TypeError where that is not a sample's."""
         values = {name: record[name] for name in cls.__dataclass_fields__}
         rows = {name: tuple(map(tuple, record[name])) for name in ("force_n", "torque_nmm")}
         return cls(**{**values, **rows, "index": int(record["index"]), "frames": tuple(record["frames"])})
@@ -70,7 +70,7 @@ Key = TypeVar("Key", bound=Any)
 
 @dataclass(frozen=True)
 class LineTable(Generic[Key]):
-    """Where the lines of a file are: of each key the last one's (offset, length) in bytes, in the order of first lines.
+    """Places of a file's lines: (offset, length) in bytes of each key's last line, in the order of first lines.
 
     A tidy file holds the intact lines in the order of their keys, each once, and nothing else.
     """

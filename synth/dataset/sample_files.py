@@ -73,7 +73,7 @@ def _write_folder(final: Path, sample: Sample, job: Job) -> ManifestEntry:
 
 
 def _attributes(sample: Sample, job: Job, camera: str) -> dict[str, str | int]:
-    """Of flow.exr. The seed is text: OpenEXR's integers have 32 bits."""
+    """Header attributes of flow.exr. The seed is text: OpenEXR's integers have 32 bits."""
     named = {"camera": camera} if camera else {}
     return {
         **named,

@@ -39,11 +39,10 @@ Parts of the surface less than 1e-6 mm apart touch.
 """
 _CACHED_STATES = 3
 """States whose first hits are cached: those of a pair, and the undeformed one."""
-
-
 _SLOPE = 1e-3
 """Least sine of the angle between a triangle and the rays that meet it."""
 _WIDER = 0.25
+"""Share of its size by which a box around an image of a triangle is widened, beside one pixel."""
 
 
 def boundary_edges(triangles: Triangles) -> Triangles:
@@ -55,7 +54,7 @@ def boundary_edges(triangles: Triangles) -> Triangles:
 
 
 def may_overlap(positions: Points, triangles: Triangles, boundary: Triangles, optics: Optics) -> BoolArray:
-    """Where a point of the surface may be hidden from a camera, (height, width); False is certain.
+    """The pixels (height, width) in which a point of the surface may be hidden from a camera; False is certain.
 
     Positions are (v, 3) float64 mm; the normals of the triangles (f, 3) point away from the camera (as `ContactFaces`
     says); the boundary is from `boundary_edges`.
@@ -150,7 +149,7 @@ class View:
         return (pixels - self.optics.centres).astype(np.float32).reshape(height, width, 2), self.image(visible)
 
     def _may_be_hidden(self, pixels: Pixels, inside: BoolArray, target: Points) -> NDArray[np.intp]:
-        """Which of the points that are seen in pixels (n, 2), if in any, must be looked at."""
+        """Numbers of the points, seen in pixels (n, 2) if in any, whose visibility must be traced."""
         at = np.flatnonzero(inside)
         if not self._is_whole:
             return at

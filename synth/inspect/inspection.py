@@ -57,7 +57,7 @@ class Inspection:
 
 
 def evenly_spaced(total: int, count: int) -> list[int]:
-    """At most `count` of 0 ... total - 1, the first and the last among them."""
+    """Numbers, at most `count` of 0 ... total - 1, the first and the last among them."""
     return sorted({int(i) for i in np.linspace(0, total - 1, min(count, total)).round()})
 
 
@@ -166,7 +166,7 @@ def _spread(values: FloatArray) -> dict[str, float | int | None]:
 
 
 def _percentiles(values: FloatArray, **percents: int) -> dict[str, float | None]:
-    """By the names of the percents; None of no values."""
+    """Percentiles of values by the names of the percents; None where there are no values."""
     if not values.size:
         return dict.fromkeys(percents)
     return {

@@ -39,7 +39,7 @@ GRAIN_MM = 2.0**-32
 """Coordinates are multiples of it, but for the pad's faces and the layers' interfaces: the last bits of
 `log` and `exp` differ between processors."""
 FILM = 2
-"""At least so many elements through each layer of a pad of several."""
+"""Fewest elements through each layer of a pad of several."""
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,7 @@ def _reach(elements: FloatArray, rate: float) -> FloatArray:
 
 
 def _root(rising: Callable[[float], float], low: float, high: float) -> float:
-    """Where an increasing function is zero, by halving to the last bit."""
+    """The zero of an increasing function, by halving to the last bit."""
     while True:
         middle = (low + high) / 2
         if middle in (low, high):

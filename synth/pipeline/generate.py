@@ -98,7 +98,7 @@ class Summary:
         return self.made / self.seconds if self.seconds > 0 else 0.0
 
     def record(self) -> dict[str, Any]:
-        """For summary.json and `--json`; without the place, so that a dataset can be moved."""
+        """Content of summary.json and of `--json`; without the place, so that a dataset can be moved."""
         return {
             "shard": self.shard,
             "asked_for": self.asked_for,

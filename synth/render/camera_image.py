@@ -73,10 +73,11 @@ def vignette(camera: Camera) -> FloatArray:
 
 
 SHARE = 0.25
-"""Of the camera's noise that the renderer's may have; both together are then 3 % more than the camera's alone."""
+"""Share of the camera's noise that the renderer's may have; both together are then 3 % more than the camera's alone."""
 PILOT = 16
 """Samples a pixel of the pilots."""
 MOST = 4096
+"""Most samples a pixel that are chosen."""
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(15)
 
 

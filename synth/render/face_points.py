@@ -79,7 +79,7 @@ def projected(values: list[Any], weights: tuple[Any, Any, Any], count: int, is_l
 
 
 _DEGREE = 4
-"""Of V's polynomials."""
+"""Degree of V's polynomials."""
 
 
 def across_cavity(means: FloatArray, positions: Points, normals: Points, faces: np.ndarray) -> Image:

@@ -33,6 +33,7 @@ from synth.scene import Bitmap, Dots, NoPattern, RandomColor, Sensor, Speckle
 TEXELS_PER_PIXEL = 4
 """Texels per image pixel and axis on the undeformed contact face: bilinear lookup stays below the pixel's own blur."""
 _STEP_MM = 0.01
+"""Step of the differences that give the image's scale."""
 MAX_TEXELS = 3072
 """Per axis; a finer pattern than this would not fit on many GPUs."""
 _STRIP = 32
@@ -153,7 +154,7 @@ def _scale(optics: Optics, sensor: Sensor) -> float:
 
 
 def _largest_stretch(jacobian: FloatArray) -> float:
-    """Of Jacobians (n, 2, 2); at the edge of a lens's field, where a step left it, they are NaN and do not count."""
+    """The largest stretch of Jacobians (n, 2, 2); NaN, where a step left the lens's field, does not count."""
     jacobian = jacobian[np.isfinite(jacobian).all(axis=(1, 2))]
     return float(np.linalg.svd(jacobian, compute_uv=False)[:, 0].max(initial=0.0))
 

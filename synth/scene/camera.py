@@ -27,7 +27,7 @@ class Camera(Part):
     lens: Literal["pinhole", "fisheye"] = "pinhole"
     """pinhole: Brown-Conrady; fisheye: Kannala-Brandt as in cv2.fisheye, up to 220 degrees from side to side."""
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """As in OpenCV: k1, k2, p1, p2, k3 of a pinhole lens; k1, k2, k3, k4 of a fisheye lens."""
+    """Coefficients as in OpenCV: k1, k2, p1, p2, k3 of a pinhole lens; k1, k2, k3, k4 of a fisheye lens."""
     exposure: Positive = 1.0
     gamma: Annotated[float, Field(ge=0.2, le=4)] = 2.2
     """Encoded value = linear value ** (1 / gamma)."""
@@ -96,11 +96,11 @@ class Mirror(Part):
     """A flat, ideal, rectangular mirror in air between cameras and window; its back is black."""
 
     position_mm: Vector3
-    """Its centre."""
+    """The mirror's centre."""
     normal: Vector3
-    """Away from its reflecting side; of any length."""
+    """Direction away from the reflecting side; of any length."""
     size_mm: tuple[Positive, Positive]
-    """Along the contact face, and at right angles to that and to the normal; along x and y for a normal along z."""
+    """Sides along the contact face, and at right angles to that and the normal; along x and y for a normal along z."""
     rotation_deg: float = 0.0
     """Turns the rectangle in its own plane, from its first size's direction toward its second's."""
 

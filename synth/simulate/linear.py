@@ -20,12 +20,12 @@ import numpy as np
 from synth.arrays import FloatArray
 
 GMRES_TOLERANCE = 1e-3
-"""Of the linear residual, relative to the right side; Newton's convergence is then as with an exact solution."""
+"""Largest linear residual, relative to the right side; Newton's convergence is then as with an exact solution."""
 GMRES_LIMIT = 40
 """Most iterations; where they do not do, the direction is used as it is and the line search judges it."""
 ROUGH_TOLERANCE = 0.03
-"""Of the linear residual of a rough direction, with this tangent's factor or an earlier one's. Far from the solution it
-is the changes of the contact set that count."""
+"""Largest linear residual of a rough direction, with this tangent's factor or an earlier one's. Far from the solution
+changes of the contact set are what counts."""
 MAX_REUSE_ITERATIONS = 12
 """Iterations after which an earlier tangent's factor is given up."""
 

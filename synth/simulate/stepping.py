@@ -39,8 +39,8 @@ MAX_MULTIPLIER_UPDATES = 2.0
 """Whole updates of the multipliers at a recorded state, in all. Not every contact point of a face on a curved body can
 come to rest on the surface, so that more updates make the tractions uneven."""
 FAILURES = 3
-"""Of attempts at them, after which the passes end. Updates are halved after a failure, doubled after a success and kept
-after a relaxation: where a whole one upsets Newton's method a part of it does not."""
+"""Failed updates after which the passes end. Updates are halved after a failure, doubled after a success and kept after
+a relaxation: where a whole one upsets Newton's method a part of it does not."""
 DEEP, TOO_DEEP, MAX_PENETRATION = 0.02, 0.05, 0.1
 """Shares of the press depth (at least 0.1 mm). Where a triangle mesh penetrates by more than the first, passes go on to
 MAX_DEEP_UPDATES or DEEP_FAILURES; where it still does by more than the second, to TOO_DEEP_FAILURES; by more than the

@@ -239,7 +239,7 @@ class System:
         return float((weight * slipping).sum()) / area if area > 0 else 0.0
 
     def forces(self, state: Unknowns) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Of the indenter on the gel at the last residual, in units of E.
+        """Force, moment and traction of the indenter on the gel at the last residual, in units of E.
 
         (3,) force in E mm²; (3,) moment about the frame's origin in E mm³; (s, 3) traction at the nodes of the coated
         surface (E, per undeformed area), the mean of the quadrature points near a node, weighted by the node's

@@ -165,7 +165,7 @@ def _row(verdict: Verdict) -> dict[str, Any]:
 
 
 def outcome_table(verdicts: Sequence[Verdict]) -> "Table":
-    """For the terminal; fits 80 columns. "!" marks what ended otherwise than written down, "*" an explained one."""
+    """Fits 80 columns. "!" marks a run that ended otherwise than written down, "*" one whose deviation is explained."""
     from rich.markup import escape
     from rich.table import Table
 

@@ -34,7 +34,7 @@ from synth.verify.report import Check
 
 NAME = "image 2 warped to image 1"
 ALLOWANCE_PX = 0.15
-"""For what is not the sensor's noise: shading, rendering noise and interpolation."""
+"""Allowance for what is not the sensor's noise: shading, rendering noise and interpolation."""
 _NOISE_FACTOR = 1.5
 """The median of 60 values scatters by 15 % of itself: three standard deviations."""
 _FEWEST = 60

@@ -20,11 +20,11 @@ from synth.arrays import BoolArray, FloatArray, Pixels, Points, Triangles
 from synth.verify.camera import ForwardCamera
 
 _CONVERGED_PX = 1e-8
+"""Distance from the query at which Newton's method has arrived."""
 _INSIDE = -1e-7
 """Barycentric coordinates from here up count as inside: edges belong to both triangles; Newton leaves about 1e-9."""
-_CHORD_STEPS = 8
-_NEWTON_STEPS = 20
-_LONGEST_STEP = 0.5
+_CHORD_STEPS, _NEWTON_STEPS, _LONGEST_STEP = 8, 20, 0.5
+"""Most steps with the constant Jacobian and with Newton's, and the longest step in barycentric coordinates."""
 _STARTS = np.array([(i, j, 3 - i - j) for i in range(4) for j in range(4 - i)]) / 3
 
 
