@@ -63,7 +63,7 @@ class ContactFaces:
 
 @dataclass(frozen=True)
 class GelSurface:
-    """Refined contact surface: each edge of the FEM's faces, `coarse`, becomes so many."""
+    """Refined contact surface: each edge of the FEM's faces, `coarse`, is split into `subdivisions` edges."""
 
     coarse: ContactFaces
     subdivisions: int = 4

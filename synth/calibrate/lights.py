@@ -58,7 +58,7 @@ Bounds: TypeAlias = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class LightFit:
-    """The lights' geometry and powers (m, 3) per channel, and the camera's vignetting, found in so many steps.
+    """The lights' geometry and powers (m, 3) per channel, and the camera's vignetting, found in `steps` steps.
 
     The residual is the root mean square, encoded, full scale 1.
     """
@@ -76,7 +76,7 @@ def fit_lights(
     """Fit powers, geometry and vignetting to a target at the pixels of a gel.
 
     The geometry starts from `start`, the distance from which is what the prior penalises, and keeps its centres in
-    bounds. `shines` (m, 3) are the channels in which each light may have power. At most so many Gauss-Newton steps are
+    bounds. `shines` (m, 3) are the channels in which each light may have power. At most `steps` Gauss-Newton steps are
     taken; 0 fits the powers alone.
     """
     problem = _Problem(gel, target, start, shines, vignetting)

@@ -159,7 +159,7 @@ def merge_lines(
 ) -> set[Key]:
     """Gives a file its own intact lines and those of other files, in the order of their keys; whole or not at all.
 
-    Missing files are as empty. `key` is as of `scan_lines`; of several lines with one key the last counts, and lines
+    Missing files are as empty. `key` is as for `scan_lines`; of several lines with one key the last counts, and lines
     are left out for whose key `keep` is false. Returns the keys of the file's lines. InputError where a file is
     damaged, or the storage refuses; the file is then as before.
     """

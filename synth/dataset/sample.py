@@ -14,7 +14,7 @@ from synth.surface import GelSurface
 
 SAMPLES_FOLDER = "samples"
 VIEW_FILES = ("image1.png", "image2.png", "flow.exr")
-"""Files of each camera: the main one's in the sample's folder, another's in a folder of its name therein."""
+"""Files of each camera: the main one's in the sample's folder, another's in a folder of its name in that."""
 SAMPLE_FILES = (*VIEW_FILES, "meta.json", "surface.npz")
 
 

@@ -17,7 +17,7 @@ ON_MM = 1e-6
 
 @dataclass(frozen=True)
 class CadFace:
-    """The shape of a gel between two files' surfaces; attributes as of `synth.scene.Gel`."""
+    """The shape of a gel between two files' surfaces; the attributes are those of `synth.scene.Gel`."""
 
     outer: Path
     window: Path

@@ -39,7 +39,7 @@ def outcomes_of_batches(
 ) -> Generator[Outcome, None, None]:
     """Outcomes in the order in which they are ready; tasks are taken in the solver's thread.
 
-    Flow, noise and files are made by so many worker processes; with 1 this process does everything, one thing after
+    Flow, noise and files are made by worker processes; if `workers` is 1 this process does everything, one thing after
     another. At most `batch` trajectories are simulated at a time; None for what suits the device. InputError where the
     storage refuses, for CUDA without cuBLAS or cuSOLVER, or if worker processes die again and again.
     """
@@ -78,7 +78,7 @@ class Textures:
         return self._threads.submit(self._paint, number, sensor)
 
     def release(self, count: int = 1) -> None:
-        """Makes room for so many other textures, because requested ones are no longer held; in any thread."""
+        """Makes room for `count` other textures, because requested ones are no longer held; in any thread."""
         self._room.release(count)
 
     def _paint(self, number: int, sensor: Sensor) -> Image:

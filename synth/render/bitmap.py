@@ -21,9 +21,9 @@ from synth.scene import Bitmap, Sensor
 def painted(
     pattern: Bitmap, sensor: Sensor, folder: Path, x: FloatArray, y: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Colours, and the share of each texel that is painted, as of `laid_over`; texel centres x and y are even.
+    """Colours, and the share of each texel that is painted, as `laid_over` gives them; texel centres x and y are even.
 
-    Files are relative to the folder; InputError as of `read_picture` and `texture_coordinates`.
+    Files are relative to the folder; InputError as for `read_picture` and `texture_coordinates`.
     """
     picture = read_picture(pattern, folder)
     if pattern.placing == "uv":
@@ -61,7 +61,7 @@ def read_picture(pattern: Bitmap, folder: Path) -> Image:
 
 
 def _placed(pattern: Bitmap, tall: float, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Places of `laid_over` for a picture that is so many times as high as wide; texel centres x and y are even."""
+    """Places for `laid_over` of a picture that is `tall` times as high as wide; texel centres x and y are even."""
     width_mm, texel = pattern.width_mm or 0.0, max(x[1] - x[0], y[1] - y[0])
     angle = np.radians(pattern.rotation_deg)
     dx, dy = x[None] - pattern.offset_mm[0], y[:, None] - pattern.offset_mm[1]

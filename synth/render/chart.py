@@ -87,7 +87,7 @@ def chart_of(sensor: Sensor) -> Chart:
 def texture_coordinates(sensor: Sensor, folder: Path, x: FloatArray, y: FloatArray) -> FloatArray:
     """(rows, columns, 2) u and v of a gel's file at texel centres x (columns,) and y (rows,) mm; NaN beside the face.
 
-    Each texel looks from outside at the axis, or at the hemisphere's centre. InputError as of `CadFace.textured`.
+    Each texel looks from outside at the axis, or at the hemisphere's centre. InputError as for `CadFace.textured`.
     """
     from synth.flow.trace import trace
 

@@ -58,7 +58,7 @@ class FacePoints:
 
 
 def count_per_face(total: int, faces: int) -> int:
-    """Points of each face, of about so many in all."""
+    """Points of each face where there are about `total` in all."""
     return (_STEP * max(1, round(math.sqrt(total / faces) / _STEP))) ** 2
 
 

@@ -190,7 +190,7 @@ class SeparatedLight:
         return np.stack([np.array(dr.block_sum(one, count)) for one in counts], axis=-1) / count
 
     def _gather(self, triangles: NDArray[np.uint32], often: BoolArray, rays: int, seed: int) -> None:
-        """Bounced light on all faces from about so many rays; linear on faces where `often` (faces,)."""
+        """Bounced light on all faces from about `rays` rays; linear on faces where `often` (faces,)."""
         import drjit as dr
 
         mi, count = self._mi, count_per_face(rays, len(often))

@@ -26,7 +26,7 @@ class Motion(Part):
     """
 
     depth_mm: float
-    """How far the indenter's lowest point goes past the undeformed surface; negative: it stays off by so much."""
+    """How far the indenter's lowest point goes past the undeformed surface; negative: how far it stays off."""
     shear_mm: Vector2 = (0.0, 0.0)
     twist_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
     """Positive turns +x toward +y."""

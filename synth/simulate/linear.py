@@ -65,7 +65,7 @@ class LinearSolver:
         self._own = -1
 
     def solve(self, matrix: Any, remainder: Any, right: FloatArray, rough: bool = False) -> FloatArray:
-        """The solution (n,) of (S + R) x = right, NaN where the matrix is singular; arguments as of `gmres`.
+        """The solution (n,) of (S + R) x = right, NaN where the matrix is singular; arguments as for `gmres`.
 
         rough: to ROUGH_TOLERANCE, with the factor of an earlier matrix if it serves; else with this matrix's factor.
         """

@@ -96,7 +96,7 @@ def mesh_levels(gel: Gel, focus: Focus) -> list[Fineness]:
 
 
 def graded_mesh(gel: Gel, focus: Focus, across: int, through: int | None = None) -> tuple[PadMesh, float]:
-    """The structured mesh of a pad with so many elements across a zone, and their size (see `_spacing`).
+    """The structured mesh of a pad with `across` elements across a zone, and their size (see `element_size`).
 
     `across` is even; without `through`, as many elements go through the thickness as keep those under the zone no
     higher than wide.
@@ -124,12 +124,12 @@ def element_size(wide: float, high: float) -> float:
 
 
 def _reach(through: int) -> float:
-    """Thickness that so many elements can fill when the first is 1 high."""
+    """Largest thickness that `through` elements can fill when the first is 1 high."""
     return float(sum(STEEPEST_DEPTH**k for k in range(through)))
 
 
 def depth_growth(through: int, height: float) -> float:
-    """The growth with which so many elements fill `height` when the first is 1; at most STEEPEST_DEPTH."""
+    """The growth with which `through` elements fill `height` when the first is 1; at most STEEPEST_DEPTH."""
     low, high = 1.0, STEEPEST_DEPTH
     for _ in range(40):
         middle = (low + high) / 2

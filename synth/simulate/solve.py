@@ -77,7 +77,7 @@ def stepper_of(
 
 
 def space_of(press: Press) -> Space:
-    """The space of a press's whole gel; errors as of `simulate_press`."""
+    """The space of a press's whole gel; errors as for `simulate_press`."""
     _check_pad(press.scene.sensor.gel, press.mesh)
     check_mesh(press.mesh)
     return function_space(press.mesh, ELEMENTS[press.scene.numerics.element]())

@@ -26,7 +26,7 @@ from synth.simulate.trajectory import State, Trajectory, no_contact, not_converg
 SHORTEST_STEP = 1 / 128
 """Shortest step, as a share of max_step_mm."""
 MAX_ITERATIONS_TO_GROW = 7
-"""A step that took at most so many iterations is followed by a longer one."""
+"""Most iterations of a step that is followed by a longer one."""
 GROWTH = 1.5
 MAX_RELAXED_STEP = 1 / 4
 """A step that fails is relaxed (`synth.simulate.newton`) when it is at most this share of max_step_mm, and a pass

@@ -32,7 +32,7 @@ _STARTS = np.array([(i, j, 3 - i - j) for i in range(4) for j in range(4 - i)]) 
 class Layer:
     """One state of the surface, triangles (f, 3) and positions (v, 3) mm, as one path of the camera shows it.
 
-    The camera's image has so many px.
+    The camera's image has `width` x `height` px.
     """
 
     camera: ForwardCamera
@@ -187,7 +187,7 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """A state, triangles (f, 3) and positions (v, 3) mm, before the camera, whose image has so many px."""
+    """A state, triangles (f, 3) and positions (v, 3) mm, before a camera whose image has `width` x `height` px."""
 
     camera: ForwardCamera
     triangles: Triangles
@@ -234,7 +234,7 @@ class Sheet:
     def _found(
         self, layer: Layer, queries: Pixels
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray, NDArray[np.intp]]:
-        """What a layer shows at the queries, less what lens and mirrors do not; and its path, repeated."""
+        """What a layer shows at the queries, without what lens and mirrors do not show; and its path, repeated."""
         query, triangle, weights = layer.found(queries)
         if self.camera.plates or self.camera.is_fisheye:
             points = np.einsum("ni,nic->nc", weights, self.positions[self.triangles[triangle]])
