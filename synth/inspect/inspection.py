@@ -41,7 +41,7 @@ class Inspection:
     about: Mapping[str, Any]
     places: tuple[Path, ...]
     numbers: tuple[dict[str, Any], ...]
-    cameras: int = 1
+    cameras: int
 
     def spread(self, count: int) -> list[int]:
         """Numbers of the places of at most about `count`, evenly spaced; all cameras of a sample or none."""

@@ -22,7 +22,7 @@ class CadFace:
     outer: Path
     window: Path
     unit: str
-    holds_end: bool = False
+    holds_end: bool
     volume_mm3 = None
     """Not known before the gel is meshed."""
 

@@ -55,7 +55,7 @@ def pad_key(press: Press) -> Gel:
     return gel if gel.layers else gel.model_copy(update={"youngs_modulus_kpa": 1.0})
 
 
-def in_batches(context: JobContext, tasks: Iterator[Task], batch: int | None = None) -> Iterator[Result]:
+def in_batches(context: JobContext, tasks: Iterator[Task], batch: int | None) -> Iterator[Result]:
     """Simulate tasks; each comes out once, in no particular order but with a sensor's trajectories together.
 
     At most `batch` trajectories run at a time, which changes no bit of what comes out. InputError where the storage

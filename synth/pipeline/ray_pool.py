@@ -35,7 +35,7 @@ GPU_SHARE = 0.25
 
 
 def outcomes_of_ray(
-    context: JobContext, tasks: Iterator[Task], address: str, workers: int | None = None
+    context: JobContext, tasks: Iterator[Task], address: str, workers: int | None
 ) -> Generator[Outcome, None, None]:
     """Outcomes in the order in which they are ready; at most two tasks per processor core are waiting at any time.
 

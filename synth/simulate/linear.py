@@ -42,7 +42,7 @@ class Factor(Protocol):
         """The approximate solution (n,) float64 for a right side (n,)."""
 
 
-def direct_factor(indptr: np.ndarray, indices: np.ndarray, single: bool = True) -> Factor:
+def direct_factor(indptr: np.ndarray, indices: np.ndarray, single: bool) -> Factor:
     """The best factor there is for this pattern of an upper triangle (CSR, sorted)."""
     if has_pardiso():
         return PardisoFactor(indptr, indices, single)
@@ -176,7 +176,7 @@ class PardisoFactor:
 
     ANALYSE, FACTORISE, SOLVE, RELEASE = 11, 22, 33, -1
 
-    def __init__(self, indptr: np.ndarray, indices: np.ndarray, single: bool = True) -> None:
+    def __init__(self, indptr: np.ndarray, indices: np.ndarray, single: bool) -> None:
         self._type = np.float32 if single else np.float64
         self._size = len(indptr) - 1
         self._indptr = np.ascontiguousarray(indptr, dtype=np.int32)

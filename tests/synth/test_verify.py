@@ -21,11 +21,11 @@ from synth.dataset.reader import SampleData
 from synth.dataset.writer import DatasetWriter
 from synth.flow.field import FlowField
 from synth.scene import Outputs
-from synth.verify import Check, Report, SampleReport, verify_dataset, verify_sample
-from synth.verify.dataset import flow_file_problems
+from synth.verify.dataset import flow_file_problems, verify_dataset, verify_sample
 from synth.verify.motion import check_motion
 from synth.verify.photometry import NAME as PHOTOMETRY
 from synth.verify.photometry import check_photometry
+from synth.verify.report import Check, Report, SampleReport
 
 SCENE = scene()
 
