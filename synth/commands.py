@@ -276,7 +276,7 @@ def _error_line(predicted: Prediction) -> str:
 
 
 def _show_summary(summary: Summary, variant: Variant) -> None:
-    from synth.dataset.manifest import shares
+    from synth.dataset.summary import shares
     from synth.progress import duration
 
     stages = ", ".join(f"{name} {share:.0%}" for name, share in shares(summary.stages).items())

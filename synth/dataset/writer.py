@@ -33,19 +33,18 @@ from synth.dataset.lock import LEASES_FOLDER, LOCK_FILE, DirectoryLock, Lease
 from synth.dataset.manifest import (
     FAILURES_FILE,
     MANIFEST_FILE,
-    SUMMARY_FILE,
     ManifestEntry,
     append_line,
     failure_key,
     manifest_key,
     merge_lines,
     scan_lines,
-    summary_document,
 )
 from synth.dataset.sample import SAMPLE_FILES, SAMPLES_FOLDER, VIEW_FILES, further_cameras, sample_name
 from synth.dataset.shard import Shard
 from synth.dataset.storage import PARTIAL, remove_partials, storage_errors
 from synth.dataset.store import MESHES_FOLDER, Store, mesh_folder
+from synth.dataset.summary import SUMMARY_FILE, summary_document
 from synth.errors import InputError
 
 SHARDS_FOLDER = "shards"

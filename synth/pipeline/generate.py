@@ -16,9 +16,9 @@ from typing import Any
 
 from synth import __version__
 from synth.dataset.job import Job
-from synth.dataset.manifest import reason_group, shares
 from synth.dataset.shard import Shard
 from synth.dataset.store import Output, is_shared, output_of
+from synth.dataset.summary import reason_group, shares
 from synth.dataset.writer import DatasetWriter
 from synth.errors import InputError
 from synth.mesh import mesh_key, pad_mesh
