@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from synth.planning import Prediction
     from synth.render.variant import Variant
     from synth.scene.template import Template
+    from synth.simulate import Trajectory
 
 _NO_LIMIT = 10_000
 """Characters: wider than any table."""
@@ -131,18 +132,7 @@ def simulate(
     if as_json:
         print(json.dumps(record))
     else:
-        table = Table("depth", "shear", "twist", "force", "det F", "penetr.", "iter.", title="mm, degrees, N")
-        for state in trajectory.states:
-            table.add_row(
-                f"{state.depth_mm:.3f}",
-                " ".join(f"{s + 0.0:.3f}" for s in state.shear_mm),  # + 0: no negative zero
-                f"{state.twist_deg + 0.0:.2f}",
-                " ".join(f"{f:.3g}" for f in state.force_n),
-                f"{state.min_jacobian:.3f}",
-                f"{state.max_penetration_mm:.4f}",
-                str(state.newton_iterations),
-            )
-        Console().print(table)
+        Console().print(_states_table(trajectory))
         print(f"{trajectory.status} in {trajectory.seconds:.1f} s: {out / 'trajectory.json'}")
     if trajectory.status != "complete":
         print(f"synth: simulation {trajectory.status}: {trajectory.reason}", file=sys.stderr)
@@ -213,6 +203,21 @@ def export(
     return 0
 
 
+def _states_table(trajectory: Trajectory) -> Table:
+    table = Table("depth", "shear", "twist", "force", "det F", "penetr.", "iter.", title="mm, degrees, N")
+    for state in trajectory.states:
+        table.add_row(
+            f"{state.depth_mm:.3f}",
+            " ".join(f"{s + 0.0:.3f}" for s in state.shear_mm),  # + 0: no negative zero
+            f"{state.twist_deg + 0.0:.2f}",
+            " ".join(f"{f:.3g}" for f in state.force_n),
+            f"{state.min_jacobian:.3f}",
+            f"{state.max_penetration_mm:.4f}",
+            str(state.newton_iterations),
+        )
+    return table
+
+
 def _loaded(scene: str, assignments: Sequence[str] | None) -> Template:
     """The scene; what is unusual in it is told on stderr."""
     from synth.scene.template import load_scene
@@ -236,7 +241,7 @@ def _show_plan(template: Template, variant: Variant, n: int, as_json: bool) -> i
     planned = plan(template, variant)
     predicted = predict(planned)
     if as_json:
-        print(json.dumps({**planned.record(), **predicted.record(), "n": n}))
+        print(json.dumps({**planned.record(), **vars(predicted), "n": n}))
         return 0
     title = f"{template.name} with {variant.name}"
     table = Table("feature", "runs", "because", title=title, title_justify="left")
@@ -271,7 +276,7 @@ def _error_line(predicted: Prediction) -> str:
 
 
 def _show_summary(summary: Summary, variant: Variant) -> None:
-    from synth.dataset.manifest import shares
+    from synth.dataset.summary import shares
     from synth.progress import duration
 
     stages = ", ".join(f"{name} {share:.0%}" for name, share in shares(summary.stages).items())

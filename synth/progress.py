@@ -31,14 +31,14 @@ def progress(label: str, total: int | None = None) -> Iterator[Advance]:
 
 
 def duration(seconds: float) -> str:
-    """As a person says it."""
+    """A time as a person says it, "3.2 min"."""
     if seconds < 90:
         return f"{seconds:.1f} s"
     return f"{seconds / 60:.1f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 def _lines(label: str) -> Advance:
-    """At most a line every LINE_S. The rate is that since the first call: what was there before has cost no time."""
+    """Prints a line every LINE_S at most, with the rate since the first call; what was there before cost no time."""
     told = time.monotonic()
     first: tuple[float, int] | None = None
 

@@ -63,10 +63,10 @@ class ContactFaces:
 
 @dataclass(frozen=True)
 class GelSurface:
-    """Refined contact surface: each edge of the FEM's faces, `coarse`, becomes so many."""
+    """Refined contact surface: each edge of the FEM's faces, `coarse`, is split into `subdivisions` edges."""
 
     coarse: ContactFaces
-    subdivisions: int = 4
+    subdivisions: int
 
     @cached_property
     def _refined(self) -> tuple[Points, Triangles, FloatArray, Triangles, np.ndarray]:

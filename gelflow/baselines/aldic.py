@@ -9,7 +9,6 @@ hides the one used here, neither of which its numerical part needs.
 """
 
 import warnings
-from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
@@ -25,11 +24,10 @@ MINIMUM_SIDE = 64
 """Shortest side of an image, px, that holds enough windows."""
 
 
-@dataclass(frozen=True)
 class ALDIC:
     """pyALDIC with windows of 32 px and a node every 8 px."""
 
-    name: str = "pyALDIC"
+    name = "pyALDIC"
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
         """See `Method.flow`; InputError also where pyALDIC is not installed, or could not solve this pair."""

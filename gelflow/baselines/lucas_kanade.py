@@ -5,8 +5,6 @@ by OpenCV with windows of 21 px over 5 octaves, there and back. Points that do n
 dropped; the others are interpolated as in `gelflow.baselines.method`. 8-bit luma.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from gelflow.arrays import FlowArray, ImageArray
@@ -20,11 +18,10 @@ CLOSURE_PX = 0.5
 """Largest distance between a point and where its track there and back ends."""
 
 
-@dataclass(frozen=True)
 class LucasKanade:
     """Tracks corners and interpolates their motion."""
 
-    name: str = "Lucas-Kanade"
+    name = "Lucas-Kanade"
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
         """See `Method.flow`.

@@ -1,6 +1,5 @@
 """The interface of everything that estimates flow, whose arrays are (H, W, C), and torch's tensors, (1, C, H, W)."""
 
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -63,7 +62,6 @@ def uncertainty(flow: FlowArray, image1: ImageArray, image2: ImageArray, device:
     return sigma[0, 0].cpu().numpy(), visible[0, 0].cpu().numpy()
 
 
-@dataclass(frozen=True)
 class ExactFlow:
     """The data set's own exact flow as a row of the comparison: what PSNR and SSIM say of the truth.
 
@@ -71,7 +69,7 @@ class ExactFlow:
     of its own, and hides a part of image 1. A method with a higher PSNR has followed those, too, not the gel alone.
     """
 
-    name: str = "exact flow"
+    name = "exact flow"
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
         """Always raises InputError: images alone do not tell."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,7 +15,6 @@ from gelflow.errors import InputError
 if TYPE_CHECKING:
     from gelflow.baselines import Method
     from gelflow.baselines.learned import Learned, PublishedRaft
-    from gelflow.compare.scores import PairScore
     from gelflow.data import PairDataset
 
 
@@ -129,15 +129,11 @@ def _score(
     from gelflow.compare.tables import tables
     from gelflow.terminal import progress, show_table
 
-    done = 0
+    done, total = count(1), len(dataset) * len(methods)
     with progress("pairs", not as_json) as advance:
-
-        def step(score: PairScore) -> None:
-            nonlocal done
-            done += 1
-            advance(done, len(dataset) * len(methods), f"{score.method}, {score.pair}")
-
-        result = compare(methods, dataset, out, step, batch, add)
+        result = compare(
+            methods, dataset, out, lambda one: advance(next(done), total, f"{one.method}, {one.pair}"), batch, add
+        )
     if as_json:
         print(result.to_json())
         return

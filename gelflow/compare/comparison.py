@@ -55,7 +55,7 @@ class Comparison:
         return Comparison(self.data, (*self.scores, *scores), strata, speeds)
 
     def to_json(self) -> str:
-        """As JSON; numbers that are not finite (PSNR of equal images, errors of an estimate with gaps) become null."""
+        """JSON; numbers that are not finite (PSNR of equal images, errors of an estimate with gaps) become null."""
         answer = {
             "data": list(self.data),
             "methods": [_plain(asdict(score)) for score in summarise(self.scores)],

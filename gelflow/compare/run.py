@@ -1,10 +1,8 @@
 """Comparing methods on the same pairs, and the report: tables in Markdown and LaTeX, numbers in CSV and JSON, plots."""
 
-import csv
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 from gelflow.baselines.learned import Learned, PublishedRaft
 from gelflow.baselines.method import Method
@@ -15,7 +13,7 @@ from gelflow.compare.speed import Speed, network_speed
 from gelflow.compare.tables import Table, tables, with_pattern
 from gelflow.data.pairs import PairDataset
 from gelflow.errors import InputError
-from gelflow.files.atomic import replacing, write_text
+from gelflow.files.atomic import write_csv, write_text
 
 SAME_MOTION_PX = 0.01
 """Pairs of one name are the same pair if their true motions differ by no more than this in the mean."""
@@ -120,7 +118,7 @@ def write_report(out: Path, comparison: Comparison) -> None:
     """Writes `FILES` into a folder, each as a whole."""
     first = ("method", "pair", "scene")
     names = [*first, *(field.name for field in fields(PairScore) if field.name not in (*first, "strata"))]
-    _write_csv(out / "scores.csv", names, [[getattr(score, name) for name in names] for score in comparison.scores])
+    write_csv(out / "scores.csv", names, [[getattr(score, name) for name in names] for score in comparison.scores])
     write_text(out / SCORES, comparison.to_json() + "\n")
     found = tables(comparison)
     parts = [f"Pairs of {', '.join(comparison.data)}; times on {comparison.devices}.\n"]
@@ -135,12 +133,5 @@ def write_report(out: Path, comparison: Comparison) -> None:
         rows = [[name, s.kind, s.bin, s.pixels, s.error_px / s.pixels, s.above_1px / s.pixels, s.above_01px / s.pixels]
                 for name, bins in comparison.strata.items() for s in bins]  # fmt: skip
         header = ["method", "kind", "bin", "pixels", "endpoint_error_px", "outliers_1px", "outliers_01px"]
-        _write_csv(out / "strata.csv", header, rows)
+        write_csv(out / "strata.csv", header, rows)
         plot_strata(out / "strata.png", comparison.strata)
-
-
-def _write_csv(path: Path, header: list[str], rows: list[list[Any]]) -> None:
-    with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(header)
-        writer.writerows(rows)

@@ -5,7 +5,7 @@ Each kind sorts the compared pixels of a pair into bins; sums over pixels are ke
 with every pixel counting the same. The distance to the contact's edge is signed, negative inside the contact, and
 needs the channel contact.Y (synth: `--set outputs.contact=true`); pairs without it, or without a contact, have no such
 bins. Between pictures of a gel without a pattern nothing but shading can be followed, and errors are as large as the
-motion: such pairs have bins of motion and distance of their own, lest they hide all others.
+motion: such pairs have bins of motion and distance of their own, so that they do not hide all others.
 """
 
 from collections.abc import Iterable, Mapping, Sequence

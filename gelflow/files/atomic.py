@@ -3,10 +3,12 @@
 Files of the same name that an earlier run wrote are replaced; those of somebody else are not (`refuse_foreign`).
 """
 
+import csv
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from gelflow.errors import InputError
 
@@ -38,6 +40,12 @@ def write_text(path: Path, text: str) -> None:
     """Writes UTF-8 text to `path`, as a whole or not at all."""
     with replacing(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Writes a table as CSV in UTF-8, as a whole or not at all."""
+    with replacing(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file).writerows([header, *rows])
 
 
 def refuse_foreign(path: Path, mark: bytes, *beside: Path) -> None:

@@ -1,6 +1,5 @@
 """Flow of a pair of images or of a video, written as EXR, Middlebury .flo and pictures."""
 
-import csv
 import os
 import re
 import time
@@ -15,7 +14,7 @@ import numpy as np
 from gelflow.arrays import Bytes3, ImageArray
 from gelflow.baselines.method import Method, uncertainty
 from gelflow.errors import InputError
-from gelflow.files.atomic import refuse_foreign, replacing
+from gelflow.files.atomic import refuse_foreign, write_csv
 from gelflow.files.exr import DIRECTIONS, read_flow, write_flo, write_flow
 from gelflow.files.image import read_pair
 from gelflow.files.quiet import quiet
@@ -115,10 +114,7 @@ def predict_video(
             progress(len(motions), total)
     if not motions:
         raise InputError(f"{path}: fewer than two frames decode; a flow needs two")
-    with replacing(table) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow([column.name for column in fields(Motion)])
-        writer.writerows(astuple(motion) for motion in motions)
+    write_csv(table, [column.name for column in fields(Motion)], map(astuple, motions))
     scale = round_up(max(motion.p99_px for motion in motions))
 
     def overlays() -> Iterator[Bytes3]:

@@ -46,19 +46,19 @@ class TrainResult:
 
     `weights` are the best on the validation pairs, without such pairs the last; `metrics` those of the last validation
     (`gelflow.train.module.METRICS`); `best` the best validation score: endpoint error in px where the flow is known,
-    else photometric loss. Speed (of this session, validation left out) and peak memory are None where unknown.
+    else photometric loss. Speed (of this session, validation left out) is None where unknown.
     """
 
     weights: Path
     steps: int
     metrics: dict[str, float]
     best: float | None
-    pairs_per_second: float | None = None
-    memory_mib: float | None = None
+    pairs_per_second: float | None
+    memory_mib: float
 
     def __str__(self) -> str:
         speed = "" if self.pairs_per_second is None else f"{self.pairs_per_second:.3g} pairs/s"
-        memory = "" if self.memory_mib is None else f"peak memory {self.memory_mib:.0f} MiB"
+        memory = f"peak memory {self.memory_mib:.0f} MiB"
         texts = (f"{self.steps} steps", describe(self.metrics), speed, memory, f"{self.weights}")
         return "; ".join(text for text in texts if text)
 

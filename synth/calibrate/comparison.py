@@ -7,7 +7,7 @@ import numpy as np
 
 from synth.arrays import BoolArray, FloatArray
 from synth.calibrate.frames import PLACE
-from synth.mesh import flat_surface
+from synth.mesh import rest_surface
 from synth.render.camera_image import encoded, expected_signal
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
@@ -64,7 +64,7 @@ def render_undeformed(sensor: Sensor, render: Render, variant: Variant) -> Float
     if isinstance(sensor.pattern, Dots):
         even = sensor.pattern.model_copy(update={"jitter_mm": 0.0, "radius_jitter": 0.0})
         plain = sensor.model_copy(update={"pattern": even})
-    surface = flat_surface(sensor.gel.size_mm)
+    surface = rest_surface(sensor.gel)
     renderer = Renderer(sensor, render, surface, albedo(plain, np.random.default_rng(0)), variant)
     return encoded(expected_signal(renderer.radiance(surface.material, 0), sensor.camera), sensor.camera)
 

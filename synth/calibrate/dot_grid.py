@@ -14,12 +14,11 @@ from synth.scene import Camera, Dots, Part, Sensor
 
 _Part = TypeVar("_Part", bound=Part)
 _FEWEST = 9
-_CENTRE = 0.02
-"""Prior of the principal point: standard deviation over the image's width."""
-_TILT_MM = 1.0
-_K1 = 0.1
+"""Dots that make a grid."""
+_CENTRE, _TILT_MM, _K1 = 0.02, 1.0, 0.1
+"""Standard deviations of the prior: of the principal point over the image's width, of look_at_mm, and of k1."""
 _DOT_PX = 0.3
-"""How far dots may lie off their grid, for their weight against the priors."""
+"""Distance of a dot from its grid that weighs as much as one standard deviation of the prior."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +144,7 @@ def pattern_points(pattern: Dots, index: NDArray[np.int64]) -> FloatArray:
 
 
 def _rounded(part: _Part) -> _Part:
-    """With numbers that are fit to read: 6 decimals, a thousandth of what a frame tells."""
+    """The same part with 6 decimals, which are fit to read: a thousandth of what a frame tells."""
     content = json.loads(part.model_dump_json(), parse_float=lambda text: round(float(text), 6))
     return type(part).model_validate(content)
 

@@ -3,15 +3,17 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from synth.arrays import BoolArray, FloatArray, Pixels
 from synth.errors import InputError
 
 _FEWEST = 9
+"""Whole dots that a frame must show."""
 SMALLEST_PX = 1.0
 """Radius of dots whose edge can be told from the blur, which `synth.calibrate.profile` at first takes for 1 px."""
 _CLEAREST = 0.75
-"""A dot's middle is at least so much darker than the coating around, or brighter: ratio of linear brightness."""
+"""A dot's middle has at most this share of the linear brightness around it, or is as much brighter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,21 +37,13 @@ def find_dots(linear: FloatArray, pitch_px: float) -> FoundDots:
     """
     import cv2
 
-    grey = linear.mean(axis=2)
-    window = 2 * int(pitch_px / 2) + 1
-    coarse = cv2.medianBlur(np.round(255 * np.sqrt(np.clip(grey, 0, 1))).astype(np.uint8), window)
-    ratio = grey / np.maximum((coarse / 255.0) ** 2, 1e-4)
-    dark, bright = np.percentile(ratio, [1, 99])
-    extreme = float(dark if dark * bright < 1 else np.median(ratio[ratio > np.sqrt(bright)]))  # of the marks
-    if _CLEAREST < extreme < 1 / _CLEAREST:
-        raise _too_few(0, pitch_px)
-    middle = ((1 - ratio) / (1 - extreme) > 0.5).astype(np.uint8)
+    middle, extreme = _middles(linear.mean(axis=2), pitch_px)
     _, labels, table, _ = cv2.connectedComponentsWithStats(middle)
     area = table[1:, cv2.CC_STAT_AREA].astype(np.float64)
-    large = area > 0.3 * np.median(area[area > (0.1 * pitch_px) ** 2]) if (area > (0.1 * pitch_px) ** 2).any() else []
-    if not np.any(large):
+    marks = area[area > (0.1 * pitch_px) ** 2]
+    if not len(marks):
         raise _too_few(0, pitch_px)
-    typical = float(np.median(area[large]))
+    typical = float(np.median(area[area > 0.3 * np.median(marks)]))
     radius = float(np.sqrt(typical / np.pi))
     check_size(radius)
     margin = max(2, round(0.45 * radius))
@@ -64,6 +58,23 @@ def find_dots(linear: FloatArray, pitch_px: float) -> FoundDots:
         raise _too_few(len(found), pitch_px)
     centres, radii = (np.array(part) for part in zip(*found, strict=True))
     return FoundDots(centres, radii, linear / around, covered)
+
+
+def _middles(grey: FloatArray, pitch_px: float) -> tuple[NDArray[np.uint8], float]:
+    """The pixels (H, W) nearer to the marks' brightness than to the coating's, and the marks' over the coating's.
+
+    InputError where nothing stands out.
+    """
+    import cv2
+
+    window = 2 * int(pitch_px / 2) + 1
+    coarse = cv2.medianBlur(np.round(255 * np.sqrt(np.clip(grey, 0, 1))).astype(np.uint8), window)
+    ratio = grey / np.maximum((coarse / 255.0) ** 2, 1e-4)
+    dark, bright = np.percentile(ratio, [1, 99])
+    extreme = float(dark if dark * bright < 1 else np.median(ratio[ratio > np.sqrt(bright)]))
+    if _CLEAREST < extreme < 1 / _CLEAREST:
+        raise _too_few(0, pitch_px)
+    return ((1 - ratio) / (1 - extreme) > 0.5).astype(np.uint8), extreme
 
 
 def check_size(radius_px: float) -> None:

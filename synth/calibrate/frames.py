@@ -70,7 +70,7 @@ def read_frames(paths: Sequence[Path]) -> Frames:
 
 
 def at_rest(frame: FloatArray, rest: FloatArray) -> tuple[BoolArray, FloatArray]:
-    """Where a bare gel's frame (H, W, 3) is not pressed, (H, W), and its picture at rest, smoothed, (H, W, 3).
+    """The pixels (H, W) of a bare gel's frame that are not pressed, and its picture at rest, smoothed, (H, W, 3).
 
     Both frames are smoothed by a Gaussian of 2 % of the width. A pixel counts as pressed, or as shaded by what is, if
     they differ by more than 8 of 255 levels in any channel there or within that distance.

@@ -36,12 +36,12 @@ from synth.scene import Light, Sensor
 _CELLS = 24
 """Midpoints on each light; its longer side gets more of them."""
 _ALONG = np.array([2, 3, 4, 6, 8, 12, 24], dtype=np.uint32)
-"""How many of them may be along its first side."""
+"""Numbers of midpoints that may lie along a light's first side: divisors of `_CELLS`."""
 _PATCHES = 16
-"""Along each side of the pad, of which light comes back by the window: smooth over the height of the image."""
+"""Patches along each side of the pad that send light back by way of the window; it is smooth, so few will do."""
 
 _NUMBERS = (*((part, axis) for part in (0, 1) for axis in range(3)), (2, 0), (2, 1), (3, 0))
-"""Of a light's 9 numbers: centre (0), direction (1), size (2) or viewing angle (3), and which component."""
+"""Part and component of each of a light's 9 numbers; parts: centre (0), direction (1), size (2), viewing angle (3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +127,7 @@ class FlatGel:
         return *turned, mi.Vector2f(lights.size.T), angle, mi.UInt32(_ALONG[nearest])
 
     def _arms(self, parts: tuple[Any, ...]) -> tuple[Any, Any, Any, Any]:
-        """Of each light, point and cell: the vector from point to cell, the point's number, the light's and normal."""
+        """For each light, point and cell: vector from point to cell, numbers of point and light, the light's normal."""
         import drjit as dr
 
         mi = self._mi

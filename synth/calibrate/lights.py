@@ -30,10 +30,10 @@ CENTRE_MM, DIRECTION, LOG_SIZE, LOG_ANGLE, VIGNETTING = 2.0, 0.4, 0.5, 0.4, 0.3
 its viewing angle, and of the vignetting."""
 _SCALE = np.repeat([CENTRE_MM, DIRECTION, LOG_SIZE, LOG_ANGLE], [3, 3, 2, 1])
 _SIZES = 1.5
-"""Bound of the sizes' displacements: by a factor of 2.1 either way."""
+"""Largest displacement of a size, in standard deviations: a factor of 2.1 either way."""
 _NARROWEST_DEG, _WIDEST_DEG = 10.0, 120.0
 RESIDUAL = 1 / 255
-"""Standard deviation of what the model may leave, encoded."""
+"""Standard deviation of the misfit that the model may leave, in encoded values."""
 INDEPENDENT = 300.0
 """Number of independent values that a smooth picture counts for."""
 
@@ -58,7 +58,7 @@ Bounds: TypeAlias = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class LightFit:
-    """The lights' geometry and powers (m, 3) per channel, and the camera's vignetting, found in so many steps.
+    """The lights' geometry and powers (m, 3) per channel, and the camera's vignetting, found in `steps` steps.
 
     The residual is the root mean square, encoded, full scale 1.
     """
@@ -76,7 +76,7 @@ def fit_lights(
     """Fit powers, geometry and vignetting to a target at the pixels of a gel.
 
     The geometry starts from `start`, the distance from which is what the prior penalises, and keeps its centres in
-    bounds. `shines` (m, 3) are the channels in which each light may have power. At most so many Gauss-Newton steps are
+    bounds. `shines` (m, 3) are the channels in which each light may have power. At most `steps` Gauss-Newton steps are
     taken; 0 fits the powers alone.
     """
     problem = _Problem(gel, target, start, shines, vignetting)

@@ -11,8 +11,8 @@ import numpy as np
 from synth.arrays import BoolArray, FloatArray
 
 _KERNEL = np.outer([1.0, -2.0, 1.0], [1.0, -2.0, 1.0]) / 6
-_BANDS = 12
-_FEWEST = 100
+_BANDS, _FEWEST = 12, 100
+"""Bands of brightness, and pixels that a band needs."""
 
 
 def fit_noise(encoded: FloatArray, bare: BoolArray, gamma: float, step: float) -> tuple[float, float]:

@@ -27,6 +27,7 @@ _REACH_MM = 4.0
 _VIEW_MM = 0.3
 """Lights stay so far outside the camera's view."""
 _PUSH_MM, _LONGEST_PUSH = 0.25, 40
+"""Length of a step by which a light in the view is moved outward, and most such steps."""
 _DARKEST, _BRIGHTEST = 2 / 255, 253 / 255
 """Encoded values beyond these are clipped and tell nothing."""
 

@@ -13,7 +13,7 @@ Raster: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 """(H, W) grey or (H, W, 3) RGB; uint8 with full scale 255 or uint16 with full scale 65535."""
 
 _COMPRESSION = 4
-"""zlib level; run-length matching makes nothing of it but that it is not zero."""
+"""zlib level; with run-length matching all levels but zero give the same file."""
 
 
 def encode_png(image: Raster) -> bytes:

@@ -36,6 +36,7 @@ WHOLE, SETUP, _FIRST_SHARD = 0, 1, 2
 _ROOM = 64
 """Bytes of the lock file for each lock: the first is locked, all hold the holder's name."""
 RENEWED_S, EXPIRES_S = 20.0, 90.0
+"""Seconds from one renewal of a note to the next, and after which a note no longer counts."""
 LEASES_FOLDER = "leases"
 
 
@@ -139,7 +140,7 @@ class DirectoryLock:
 
 
 class Lease:
-    """As `DirectoryLock`, by notes under a URL: held from `join` until `release` or the end of the process.
+    """A `DirectoryLock` made of notes under a URL: held from `join` until `release` or the end of the process.
 
     Nobody knows to be the last here, so that shards leave it to a plain run to put the dataset together.
     """

@@ -3,23 +3,18 @@
 A line counts when it is ended by a newline and parses. Appending is one write, flushed to the disk; a run that was
 killed in between leaves at most one torn line, the last, which a writer cuts off and a reader passes over. The entries
 of manifest.jsonl, one for each finished sample, are made by `synth.dataset.sample_files`.
-
-summary.json says what a dataset took, and what its last run did. The totals are counted from manifest and failures, so
-that they hold whatever was interrupted in between.
 """
 
 import errno
 import json
 import os
-import re
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import Any, BinaryIO, Generic, TypeVar
 
-from synth.dataset.jsontext import to_document, to_line
+from synth.dataset.jsontext import to_line
 from synth.dataset.storage import replacing, storage_errors
 from synth.errors import InputError
 
@@ -48,13 +43,10 @@ class ManifestEntry:
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> "ManifestEntry":
-        """From the line's JSON object; KeyError or TypeError where it is not one of a sample."""
+        """The entry of a line's JSON object; KeyError or TypeError where that is not a sample's."""
         values = {name: record[name] for name in cls.__dataclass_fields__}
         rows = {name: tuple(map(tuple, record[name])) for name in ("force_n", "torque_nmm")}
         return cls(**{**values, **rows, "index": int(record["index"]), "frames": tuple(record["frames"])})
-
-    def record(self) -> dict[str, Any]:
-        return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
 
 def manifest_key(record: dict[str, Any]) -> int:
@@ -73,7 +65,7 @@ Key = TypeVar("Key", bound=Any)
 
 @dataclass(frozen=True)
 class LineTable(Generic[Key]):
-    """Where the lines of a file are: of each key the last one's (offset, length) in bytes, in the order of first lines.
+    """Places of a file's lines: (offset, length) in bytes of each key's last line, in the order of first lines.
 
     A tidy file holds the intact lines in the order of their keys, each once, and nothing else.
     """
@@ -162,7 +154,7 @@ def merge_lines(
 ) -> set[Key]:
     """Gives a file its own intact lines and those of other files, in the order of their keys; whole or not at all.
 
-    Missing files are as empty. `key` is as of `scan_lines`; of several lines with one key the last counts, and lines
+    Missing files are as empty. `key` is as for `scan_lines`; of several lines with one key the last counts, and lines
     are left out for whose key `keep` is false. Returns the keys of the file's lines. InputError where a file is
     damaged, or the storage refuses; the file is then as before.
     """
@@ -181,43 +173,3 @@ def _copy(lines: Sequence[tuple[Path, tuple[int, int]]], target: BinaryIO) -> No
         for _, (offset, length) in lines:
             file.seek(offset)
             target.write(file.read(length))
-
-
-SUMMARY_FILE = "summary.json"
-
-
-def reason_group(stage: str, reason: str) -> str:
-    """Stage and reason with the numbers left out: draws that fail alike fall into one group."""
-    line = reason.strip().splitlines()[0] if reason.strip() else "no reason given"
-    return f"{stage}: {re.sub(r'[-+]?[0-9]+([.][0-9]+)?(e[-+]?[0-9]+)?', '#', line)[:200]}"
-
-
-def shares(seconds: Mapping[str, float]) -> dict[str, float]:
-    total = sum(seconds.values())
-    return {stage: round(value / total, 4) for stage, value in seconds.items()} if total > 0 else {}
-
-
-def summary_document(folder: Path, run: Mapping[str, Any], asked_for: int) -> bytes:
-    """The file's content, from a folder that holds sorted manifest and failures."""
-    seconds: Counter[str] = Counter()
-    samples = 0
-    for entry in _lines(folder / MANIFEST_FILE):
-        samples += 1
-        seconds.update(entry["seconds"])
-    reasons = Counter(reason_group(failure["stage"], failure["reason"]) for failure in _lines(folder / FAILURES_FILE))
-    content = {
-        "samples": samples,
-        "asked_for": asked_for,
-        "seconds_per_stage": {stage: round(value, 3) for stage, value in seconds.items()},
-        "share_per_stage": shares(seconds),
-        "failed_draws": reasons.total(),
-        "failures_by_reason": dict(sorted(reasons.items(), key=lambda item: (-item[1], item[0]))),
-        "last_run": run,
-    }
-    return to_document(content).encode("utf-8")
-
-
-def _lines(path: Path) -> Iterator[dict[str, Any]]:
-    with path.open("rb") as file:
-        for line in file:
-            yield json.loads(line)

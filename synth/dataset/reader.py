@@ -37,7 +37,7 @@ class SampleData(CameraPair):
     """One image pair of a dataset with its exact flow.
 
     Attributes:
-        image1, image2, flow: the main camera's, as of `CameraPair`.
+        image1, image2, flow: the main camera's, see `CameraPair`.
         surface: the undeformed contact surface of the gel, mm.
         displacement1: of its nodes in the state of image 1, (N, 3) float64, mm.
         displacement2: of its nodes in the state of image 2, (N, 3) float64, mm.

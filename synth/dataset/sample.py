@@ -14,7 +14,7 @@ from synth.surface import GelSurface
 
 SAMPLES_FOLDER = "samples"
 VIEW_FILES = ("image1.png", "image2.png", "flow.exr")
-"""Of each camera: the main camera's in the sample's folder, another's in a folder of its name therein."""
+"""Files of each camera: the main one's in the sample's folder, another's in a folder of its name in that."""
 SAMPLE_FILES = (*VIEW_FILES, "meta.json", "surface.npz")
 
 
@@ -56,7 +56,6 @@ class Sample(CameraPair):
         diagnostics: JSON-able; "solver" is a list with a record for each of the two frames (depth_mm, shear_mm,
             twist_deg, converged, newton_iterations, residual, min_jacobian, max_penetration_mm).
         force_n, torque_nmm: (2, 3) of the indenter on the gel, per frame.
-        seconds: stage -> wall time.
         further: what the other cameras saw, by their names.
     """
 
@@ -71,7 +70,6 @@ class Sample(CameraPair):
     diagnostics: Mapping[str, Any] = field(default_factory=dict)
     force_n: FloatArray = field(default_factory=lambda: np.zeros((2, 3)))
     torque_nmm: FloatArray = field(default_factory=lambda: np.zeros((2, 3)))
-    seconds: Mapping[str, float] = field(default_factory=dict)
     further: Mapping[str, CameraPair] = field(default_factory=dict)
 
 

@@ -24,7 +24,7 @@ def write_sample_files(out: Output, sample: Sample, job: Job) -> ManifestEntry:
     An older folder of that number is replaced: without a line in the manifest it counts as unfinished. The dataset was
     opened by a `DatasetWriter` of some process; under a URL the files are made in a folder of this machine's temporary
     space and copied. The job is for the header of flow.exr. Returns what `DatasetWriter.record` appends to the
-    manifest. InputError where the storage refuses (disk full, no permission).
+    manifest, but for the times. InputError where the storage refuses (disk full, no permission).
     """
     store, name = Store(out), f"{SAMPLES_FOLDER}/{sample_name(sample.index)}"
     if store.directory is not None:
@@ -64,7 +64,7 @@ def _write_folder(final: Path, sample: Sample, job: Job) -> ManifestEntry:
         frames=sample.frames,
         seed=sample.seed,
         sha256=sha256,
-        seconds={stage: round(value, 4) for stage, value in sample.seconds.items()},
+        seconds={},
         diagnostics=jsonable(sample.diagnostics),
         force_n=tuple(tuple(row) for row in np.asarray(sample.force_n, np.float64).tolist()),
         torque_nmm=tuple(tuple(row) for row in np.asarray(sample.torque_nmm, np.float64).tolist()),
@@ -73,7 +73,7 @@ def _write_folder(final: Path, sample: Sample, job: Job) -> ManifestEntry:
 
 
 def _attributes(sample: Sample, job: Job, camera: str) -> dict[str, str | int]:
-    """Of flow.exr. The seed is text: OpenEXR's integers have 32 bits."""
+    """Header attributes of flow.exr. The seed is text: OpenEXR's integers have 32 bits."""
     named = {"camera": camera} if camera else {}
     return {
         **named,

@@ -18,7 +18,7 @@ from typing import BinaryIO
 from synth.errors import InputError
 
 PARTIAL = ".partial-"
-"""In the hidden name of anything unfinished: `.NAME.partial-PID-TOKEN`."""
+"""Part of the hidden name of anything unfinished: `.NAME.partial-PID-TOKEN`."""
 
 HEAD = 4096
 """Bytes at the beginning of a file among which its mark stands."""
@@ -43,7 +43,7 @@ def storage_errors(path: Path) -> Iterator[None]:
 
 
 def partial_name(path: Path) -> Path:
-    """Where this process prepares the content of `path`."""
+    """The neighbour of `path` in which this process prepares its content."""
     return path.with_name(f".{path.name}{PARTIAL}{os.getpid()}-{_TOKEN}")
 
 

@@ -33,20 +33,18 @@ from synth.dataset.lock import LEASES_FOLDER, LOCK_FILE, DirectoryLock, Lease
 from synth.dataset.manifest import (
     FAILURES_FILE,
     MANIFEST_FILE,
-    SUMMARY_FILE,
     ManifestEntry,
     append_line,
     failure_key,
     manifest_key,
     merge_lines,
     scan_lines,
-    summary_document,
 )
-from synth.dataset.sample import SAMPLE_FILES, SAMPLES_FOLDER, VIEW_FILES, Sample, further_cameras, sample_name
-from synth.dataset.sample_files import write_sample_files
+from synth.dataset.sample import SAMPLE_FILES, SAMPLES_FOLDER, VIEW_FILES, further_cameras, sample_name
 from synth.dataset.shard import Shard
 from synth.dataset.storage import PARTIAL, remove_partials, storage_errors
 from synth.dataset.store import MESHES_FOLDER, Store, mesh_folder
+from synth.dataset.summary import SUMMARY_FILE, summary_document
 from synth.errors import InputError
 
 SHARDS_FOLDER = "shards"
@@ -116,12 +114,6 @@ class DatasetWriter:
         """Indices of the samples that are whole and on record; of a shard in a directory only its own."""
         return set(self._finished)
 
-    def write(self, sample: Sample) -> ManifestEntry:
-        """Writes a sample's files and its line; where the storage refuses the sample counts as unfinished."""
-        entry = write_sample_files(self._store.out, sample, self.job)
-        self.record(entry)
-        return entry
-
     def record(self, entry: ManifestEntry) -> None:
         """Appends the line of a sample whose files are there (else InputError); again for a known one: nothing."""
         if entry.index in self._finished:
@@ -132,7 +124,7 @@ class DatasetWriter:
                 f"{self._store.out}/{SAMPLES_FOLDER}/{name}: the sample's files are not there; were they written to "
                 "another place, or to storage that is not shared?"
             )
-        self._append(MANIFEST_FILE, name, entry.record())
+        self._append(MANIFEST_FILE, name, vars(entry))
         self._finished.add(entry.index)
 
     def fail(self, index: int, draw: int, stage: str, reason: str, last_good_state: Any = None) -> None:

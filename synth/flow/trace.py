@@ -23,9 +23,9 @@ wp.config.log_level = wp.LOG_WARNING
 wp.set_module_options({"enable_backward": False})
 
 _MARGIN = 1e-5
-"""Of the largest coordinate, by which boxes are widened: about a hundred times what float32 rounds there."""
+"""Share of the largest coordinate by which boxes are widened: about a hundred times what float32 rounds there."""
 _TRIANGLES_PER_LEAF = 4
-"""Of the tree. It changes the time and no bit of a result."""
+"""A setting of the tree that changes the time and no bit of a result."""
 
 
 @dataclass(frozen=True)

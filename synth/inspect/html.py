@@ -17,7 +17,7 @@ from synth.inspect.text import COLUMNS, about_rows, facts
 from synth.inspect.view import View
 
 PAGE_MARK = "<title>synth: "
-"""In each page's head."""
+"""Text in each page's head, by which our pages are known."""
 PICTURED = 24
 """Samples (and cameras) of a dataset that are shown with pictures, evenly spaced."""
 

@@ -41,7 +41,7 @@ class Inspection:
     about: Mapping[str, Any]
     places: tuple[Path, ...]
     numbers: tuple[dict[str, Any], ...]
-    cameras: int = 1
+    cameras: int
 
     def spread(self, count: int) -> list[int]:
         """Numbers of the places of at most about `count`, evenly spaced; all cameras of a sample or none."""
@@ -57,7 +57,7 @@ class Inspection:
 
 
 def evenly_spaced(total: int, count: int) -> list[int]:
-    """At most `count` of 0 ... total - 1, the first and the last among them."""
+    """Numbers, at most `count` of 0 ... total - 1, the first and the last among them."""
     return sorted({int(i) for i in np.linspace(0, total - 1, min(count, total)).round()})
 
 
@@ -166,7 +166,7 @@ def _spread(values: FloatArray) -> dict[str, float | int | None]:
 
 
 def _percentiles(values: FloatArray, **percents: int) -> dict[str, float | None]:
-    """By the names of the percents; None of no values."""
+    """Percentiles of values by the names of the percents; None where there are no values."""
     if not values.size:
         return dict.fromkeys(percents)
     return {

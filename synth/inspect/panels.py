@@ -27,7 +27,7 @@ from synth.inspect.view import View
 Rgb: TypeAlias = NDArray[np.uint8]
 """(H, W, 3) uint8, sRGB."""
 CLOSURE_RANGE_PX, SIGMA_RANGE_PX = (1e-5, 1.0), (0.01, 10.0)
-"""Of the logarithmic scales, the same everywhere, so that pictures can be compared."""
+"""Ends of the logarithmic colour scales, the same everywhere, so that pictures can be compared."""
 _VISIBLE, _HIDDEN = (245, 245, 245), (200, 60, 50)
 
 

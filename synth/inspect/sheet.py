@@ -17,6 +17,7 @@ from synth.inspect.text import facts
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 SHEET_MARK = "synth inspect"
 """Software in each sheet's header."""
@@ -28,8 +29,6 @@ _TOP, _MARGIN, _GAP = 0.4, 0.25, 0.1
 
 def write_sheet(inspection: Inspection, png: Path | str) -> None:
     """Draws the sheet; a file of that name is replaced. InputError where a sample has gone or the storage refuses."""
-    from matplotlib.figure import Figure
-
     is_dataset = inspection.kind == "dataset"
     chosen = inspection.spread(ROWS) if is_dataset else list(range(len(inspection.places)))
     views = [inspection.view(number) for number in chosen]
@@ -47,15 +46,8 @@ def write_sheet(inspection: Inspection, png: Path | str) -> None:
         max(-(-len(panels) // columns) * (height + caption), 0.185 * len(lines))
         for panels, (_, height), lines in zip(blocks, cells, texts, strict=True)
     ]
-    title = str(inspection.path)
-    if is_dataset:
-        about = inspection.about
-        title += f": {about['finished']} of {about['n']} samples, scene {about['scene']}, seed {about['seed']}"
-    figure = Figure(figsize=(max(8.0, right + beside), max(1.0, _TOP + sum(tall) + _MARGIN)), dpi=100)
-    axes = figure.add_axes((0, 0, 1, 1), xlim=(0, figure.get_figwidth()), ylim=(figure.get_figheight(), 0))
-    axes.set_axis_off()
-    axes.set_autoscale_on(False)
-    axes.text(_MARGIN, 0.1, title, fontsize=12, va="top")
+    figure, axes = _empty_sheet(max(8.0, right + beside), max(1.0, _TOP + sum(tall) + _MARGIN))
+    axes.text(_MARGIN, 0.1, _title(inspection), fontsize=12, va="top")
     top = _TOP
     for view, panels, cell, lines, tallness in zip(views, blocks, cells, texts, tall, strict=True):
         if len(views) > 1:
@@ -69,6 +61,24 @@ def write_sheet(inspection: Inspection, png: Path | str) -> None:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": SHEET_MARK})
     replace_file(Path(png), buffer.getvalue())
+
+
+def _empty_sheet(width: float, height: float) -> "tuple[Figure, Axes]":
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), dpi=100)
+    axes = figure.add_axes((0, 0, 1, 1), xlim=(0, width), ylim=(height, 0))
+    axes.set_axis_off()
+    axes.set_autoscale_on(False)
+    return figure, axes
+
+
+def _title(inspection: Inspection) -> str:
+    if inspection.kind != "dataset":
+        return str(inspection.path)
+    about = inspection.about
+    counts = f"{about['finished']} of {about['n']} samples"
+    return f"{inspection.path}: {counts}, scene {about['scene']}, seed {about['seed']}"
 
 
 def _draw(axes: "Axes", panel: Panel, corner: tuple[float, float], size: tuple[float, float], letters: float) -> None:

@@ -122,11 +122,11 @@ COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
     ("difference\nwarped", lambda n: percent(n["difference"]["after_rmse"])),
     ("con-\nverged", lambda n: short(_solver(n).get("converged"))),
 )
-"""Of a dataset's samples: heading, and the cell from a sample's numbers."""
+"""Columns of the table of samples: the heading, and the cell from a sample's numbers."""
 
 
 def tables(inspection: Inspection, width: int | None = None) -> list[Table]:
-    """For `rich.console.Console.print`: of a dataset its facts and a row per sample and camera, else all numbers.
+    """Tables for the terminal: of a dataset its facts and a row per sample and camera, else all numbers.
 
     Columns that do not fit the terminal's width in characters, where one is given, follow in further tables.
     """

@@ -93,7 +93,7 @@ class View:
 
 
 def view_sample(folder: Path) -> View:
-    """Of a sample's folder, or of a further camera's folder therein; InputError where files are missing or damaged."""
+    """The view of a sample's or a further camera's folder; InputError where files are missing or damaged."""
     is_further = not (folder / META_FILE).exists() and (folder.parent / META_FILE).exists()
     meta = read_document((folder.parent if is_further else folder) / META_FILE)
     pair = read_pair(folder)
@@ -102,7 +102,7 @@ def view_sample(folder: Path) -> View:
 
 
 def view_flow(path: Path) -> View:
-    """Of a flow file, also one without visibility; InputError where it is missing or damaged, or holds no flow."""
+    """The view of a flow file, with or without visibility; InputError where it is missing or damaged or has no flow."""
     channels, header = read_channels(path)
     known = "forward.visible" in channels
     for direction in ("forward", "backward"):
@@ -151,7 +151,7 @@ def _fits(place: FloatArray, first: FloatArray, count: int) -> NDArray[np.bool_]
 
 
 def _weights(t: FloatArray) -> list[FloatArray]:
-    """Of the pixels at -1, 0, 1, 2 for a position at t in [0, 1)."""
+    """Weights of the pixels at -1, 0, 1, 2 for a position at t in [0, 1)."""
     return [
         ((-0.5 * t + 1.0) * t - 0.5) * t,
         (1.5 * t - 2.5) * t * t + 1.0,

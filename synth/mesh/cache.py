@@ -24,8 +24,8 @@ from synth.mesh.tetrahedralise import ENVELOPE, GRADING, background_of, box_side
 from synth.scene import Gel, Numerics
 
 SURFACE, ROOM = 0.5, 1.5
-"""Edges of the surface that fTetWild is given, over those that it is to make, and its envelope over their chords'
-distance from a curved face."""
+"""Edge length of the surface that fTetWild is given, over that of the mesh; and fTetWild's envelope, over the distance
+of the mesh's chords from a curved face."""
 CHORDS = 0.03
 """Share of a round gel's volume that flat faces may add or take away."""
 

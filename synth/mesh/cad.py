@@ -17,12 +17,12 @@ ON_MM = 1e-6
 
 @dataclass(frozen=True)
 class CadFace:
-    """The shape of a gel between two files' surfaces; attributes as of `synth.scene.Gel`."""
+    """The shape of a gel between two files' surfaces; the attributes are those of `synth.scene.Gel`."""
 
     outer: Path
     window: Path
     unit: str
-    holds_end: bool = False
+    holds_end: bool
     volume_mm3 = None
     """Not known before the gel is meshed."""
 
@@ -75,11 +75,11 @@ class CadFace:
         return np.concatenate([outer.points, window.points]), np.concatenate(faces).astype(np.int32)
 
     def frame(self, motion: Motion) -> tuple[FloatArray, FloatArray, float]:
-        """Where a motion presses: origin (3,) mm; axes (3, 3), columns, the third inward; where on it the gel begins.
+        """The frame of a press: origin (3,) mm; axes (3, 3) as columns, the third inward; where on that the gel begins.
 
-        That is at most 0. The place lies below position_mm; or, where polar_deg or height_mm is given, on a ray from
-        the axis, which starts half the gel's width above its lowest point or is level. InputError where there is no
-        coated face.
+        The last is at most 0. The place lies below position_mm; or, where polar_deg or height_mm is given, on a ray
+        from the axis, which starts half the gel's width above its lowest point or is level. InputError where there is
+        no coated face.
         """
         face, size = self.surfaces.face, np.array(self.surfaces.size_mm)
         level, axes = motion.height_mm is not None, np.eye(3)

@@ -31,7 +31,7 @@ class CapsuleFace:
 
     @property
     def volume_mm3(self) -> float:
-        """Of the gel."""
+        """Volume of the gel."""
         outer, inner = self.radius_mm, self.radius_mm - self.thickness_mm
         return float(np.pi * (2 / 3 * (outer**3 - inner**3) + self.length_mm * (outer**2 - inner**2)))
 

@@ -49,18 +49,15 @@ def domed(mesh: PadMesh, dome_radius_mm: float | None) -> PadMesh:
     return bulged
 
 
-def flat_surface(size_mm: tuple[float, float, float]) -> GelSurface:
-    """The undeformed face of a flat pad as two triangles: its picture must not depend on the first trajectory."""
-    x, y = size_mm[0] / 2, size_mm[1] / 2
-    nodes = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
-    return GelSurface(ContactFaces(nodes, np.array([[0, 2, 1], [0, 3, 2]], dtype=np.int32)), 1)
-
-
 def rest_surface(gel: Gel) -> GelSurface:
-    """The undeformed contact face of a pad, whatever its mesh: two triangles, or quadratic ones where it is curved."""
-    if gel.dome_radius_mm is None:
-        return flat_surface(gel.size_mm)
+    """The undeformed contact face of a pad: two triangles, or quadratic ones where it is curved.
+
+    It does not depend on the meshes of trajectories, so that neither does the picture of a sensor at rest.
+    """
     x, y = gel.size_mm[0] / 2, gel.size_mm[1] / 2
+    if gel.dome_radius_mm is None:
+        corners_of_pad = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
+        return GelSurface(ContactFaces(corners_of_pad, np.array([[0, 2, 1], [0, 3, 2]], dtype=np.int32)), 1)
     cell = 2 * max(x, y) / REST_CELLS
     columns, rows = int(np.ceil(2 * x / cell)), int(np.ceil(2 * y / cell))
     # Every second line of the grid holds mid-edge nodes.

@@ -39,7 +39,7 @@ GRAIN_MM = 2.0**-32
 """Coordinates are multiples of it, but for the pad's faces and the layers' interfaces: the last bits of
 `log` and `exp` differ between processors."""
 FILM = 2
-"""At least so many elements through each layer of a pad of several."""
+"""Fewest elements through each layer of a pad of several."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ def spacing(length_mm: float, span_mm: tuple[float, float], counts: Counts, axis
 
 
 def lateral_planes(length_mm: float, span_mm: tuple[float, float], counts: Counts, axis: int) -> FloatArray:
-    """(cells + 1,) coordinates along x or y, increasing from -length_mm / 2; arguments as of `spacing`.
+    """(cells + 1,) coordinates along x or y, increasing from -length_mm / 2; arguments as for `spacing`.
 
     A span mirrored at the origin gives the mirror image to the bit.
     """
@@ -154,13 +154,13 @@ def _elements(gap: float, rate: float) -> float:
 
 
 def _reach(elements: FloatArray, rate: float) -> FloatArray:
-    """How far so many elements reach: the inverse of `_elements`, 0 where there are none."""
+    """Length of a number of elements: the inverse of `_elements`, 0 where there are none."""
     elements = np.maximum(elements, 0.0)
     return elements if rate == 0 else np.asarray(-np.expm1(rate * elements) / math.expm1(-rate))
 
 
 def _root(rising: Callable[[float], float], low: float, high: float) -> float:
-    """Where an increasing function is zero, by halving to the last bit."""
+    """The zero of an increasing function, by halving to the last bit."""
     while True:
         middle = (low + high) / 2
         if middle in (low, high):
@@ -193,7 +193,7 @@ def _depth_planes(
 
 @functools.cache
 def kuhn_tets(nx: int, ny: int, nz: int) -> Tets:
-    """(6 nx ny nz, 4) int32, read-only: tetrahedra of a grid of so many cells, positively oriented for increasing axes.
+    """(6 nx ny nz, 4) int32, read-only: tetrahedra of a grid of nx x ny x nz cells, positive for increasing axes.
 
     Node (i, j, k) of the grid is number (i (ny + 1) + j) (nz + 1) + k. The order is such that the tetrahedra of one
     cell column lie together: index = 6 (cell number) + (one of its six), cells numbered alike with nx, ny, nz.

@@ -22,15 +22,15 @@ from synth.mesh.pad import PadMesh, boundary_faces, signed_volumes
 GRADING = 2.0
 """Edge length at a box's window over edge length at its contact face."""
 ROOM = 1.01
-"""A background covers the box with room to spare, for points that rounding puts outside."""
+"""Size of a background mesh over the box's: points that rounding puts outside of the box are still in it."""
 ENVELOPE = 1e-3
 """fTetWild's epsilon for flat faces, relative to the bounding box's diagonal."""
 ON_SIDE_MM = 1e-9
 """Distance from a side at which a vertex lies on it."""
 ROUNDS = 50
-"""Vertices of two sides are moved onto one after the other so often at most."""
+"""Most rounds in which vertices of several sides are moved onto one side after the other."""
 ATTEMPTS = 3
-"""The mesher is random: a mesh that is not valid is made again so often."""
+"""Meshes that are made until one is valid; the mesher is random."""
 WORST_SHAPE = 0.02
 """Smallest accepted ratio of inscribed to circumscribed radius, times 3 (1 for a regular tetrahedron)."""
 

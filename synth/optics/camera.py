@@ -76,7 +76,7 @@ class Optics:
 
     @cached_property
     def own(self) -> Rays:
-        """Of the centres of all pixels."""
+        """Rays of the centres of all pixels."""
         return self.look(self.centres)
 
     @cached_property

@@ -26,11 +26,11 @@ _RELATIVE_STEP = 1e-9
 """Newton's error after a relative step s is of order s²; below 1e-9 the next iterate is exact to rounding."""
 _MAX_ITERATIONS = 40
 _MAX_HALVINGS = 8
-"""Of a step, where the residual would grow."""
+"""Most halvings of a step that would make the residual grow."""
 WIDEST = np.radians(110)
 """Largest angle to a fisheye lens's axis: half of the field of the widest lenses that are made."""
 _STEPS = 60
-"""Bisection alone would reach float64's resolution of such an angle in 54."""
+"""Most steps to a fisheye lens's angle; bisection alone would reach float64's resolution of it in 54."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +188,7 @@ class FisheyeLens:
 
 
 def smallest_positive_root(coefficients: list[float]) -> float:
-    """Of a polynomial, its highest power first; infinite where it has none."""
+    """The smallest positive root of a polynomial, its highest power first; infinite where it has none."""
     roots = np.roots(coefficients)
     real = roots[np.abs(roots.imag) <= 1e-9 * np.abs(roots)].real
     return float(real[real > 0].min(initial=np.inf))

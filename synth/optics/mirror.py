@@ -37,8 +37,8 @@ class FlatMirror:
 
     @staticmethod
     def of(mirror: Mirror) -> "FlatMirror":
-        first, second, normal = (np.array(axis) for axis in mirror.axes)
-        return FlatMirror(np.array(mirror.position_mm), np.stack([first, second]), normal, np.array(mirror.size_mm) / 2)
+        *axes, normal = mirror.axes
+        return FlatMirror(np.array(mirror.position_mm), np.array(axes), normal, np.array(mirror.size_mm) / 2)
 
     def turned(self, vectors: FloatArray) -> FloatArray:
         """Directions (..., 3) after reflection."""

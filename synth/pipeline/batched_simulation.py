@@ -24,10 +24,10 @@ from synth.simulate.press import Press
 BATCH = {"cuda": 256, "cpu": 8}
 """Trajectories at once."""
 CHUNK = 4
-"""Trajectories of a chunk in batches: its last ones run beside empty lanes. The first chunk is one batch: nothing
-can be rendered while it is drawn."""
+"""Batches in a chunk of tasks that are drawn together: lanes are left empty at its end alone. The first
+chunk is one batch, because nothing can be rendered before it has been drawn."""
 MIN_PER_SENSOR = 16
-"""Trajectories that are worth a change of the sensor."""
+"""Waiting trajectories of a sensor that are worth building its renderer for."""
 
 Result = Simulated | Outcome
 """A simulated trajectory, or the record of one whose every instance failed."""
@@ -55,7 +55,7 @@ def pad_key(press: Press) -> Gel:
     return gel if gel.layers else gel.model_copy(update={"youngs_modulus_kpa": 1.0})
 
 
-def in_batches(context: JobContext, tasks: Iterator[Task], batch: int | None = None) -> Iterator[Result]:
+def in_batches(context: JobContext, tasks: Iterator[Task], batch: int | None) -> Iterator[Result]:
     """Simulate tasks; each comes out once, in no particular order but with a sensor's trajectories together.
 
     At most `batch` trajectories run at a time, which changes no bit of what comes out. InputError where the storage

@@ -16,9 +16,9 @@ from typing import Any
 
 from synth import __version__
 from synth.dataset.job import Job
-from synth.dataset.manifest import reason_group, shares
 from synth.dataset.shard import Shard
 from synth.dataset.store import Output, is_shared, output_of
+from synth.dataset.summary import reason_group, shares
 from synth.dataset.writer import DatasetWriter
 from synth.errors import InputError
 from synth.mesh import mesh_key, pad_mesh
@@ -98,7 +98,7 @@ class Summary:
         return self.made / self.seconds if self.seconds > 0 else 0.0
 
     def record(self) -> dict[str, Any]:
-        """For summary.json and `--json`; without the place, so that a dataset can be moved."""
+        """Content of summary.json and of `--json`; without the place, so that a dataset can be moved."""
         return {
             "shard": self.shard,
             "asked_for": self.asked_for,

@@ -27,7 +27,7 @@ from synth.scene import Sensor
 PREFETCHED = 256
 """Simulated trajectories that wait to be rendered, at most: some hundred kilobytes each."""
 TEXTURES, TEXTURE_THREADS = 8, 6
-"""Textures that are being painted or wait to be used, at most, up to 94 MB each; and threads that paint them."""
+"""Most textures, up to 94 MB each, that are being painted or wait to be used; and threads that paint them."""
 
 Rendered = RenderedTrajectory | Outcome
 Item = TypeVar("Item")
@@ -39,7 +39,7 @@ def outcomes_of_batches(
 ) -> Generator[Outcome, None, None]:
     """Outcomes in the order in which they are ready; tasks are taken in the solver's thread.
 
-    Flow, noise and files are made by so many worker processes; with 1 this process does everything, one thing after
+    Flow, noise and files are made by worker processes; if `workers` is 1 this process does everything, one thing after
     another. At most `batch` trajectories are simulated at a time; None for what suits the device. InputError where the
     storage refuses, for CUDA without cuBLAS or cuSOLVER, or if worker processes die again and again.
     """
@@ -78,7 +78,7 @@ class Textures:
         return self._threads.submit(self._paint, number, sensor)
 
     def release(self, count: int = 1) -> None:
-        """So many textures that were requested are no longer held: there is room for others; in any thread."""
+        """Makes room for `count` other textures, because requested ones are no longer held; in any thread."""
         self._room.release(count)
 
     def _paint(self, number: int, sensor: Sensor) -> Image:
@@ -122,7 +122,7 @@ def _with_textures(results: Iterable[Result], textures: Textures) -> Iterator[tu
 def _rendered(
     session: RenderSession, ready: Iterable[tuple[Result, Future[Image] | None]], textures: Textures
 ) -> Generator[Rendered, None, None]:
-    """In this thread: Mitsuba has one variant a process and Dr.Jit one stream a thread."""
+    """Rendered trajectories, in this thread: Mitsuba has one variant a process and Dr.Jit one stream a thread."""
     for result, texture in ready:
         rendered = result if isinstance(result, Outcome) else session.render_frames(*result, texture)
         if texture is not None:
@@ -132,5 +132,5 @@ def _rendered(
 
 
 def _finisher(context: JobContext) -> Maker[Rendered]:
-    """In a worker process."""
+    """What a worker process does with a rendered trajectory."""
     return lambda item: item if isinstance(item, Outcome) else finish(context, item)

@@ -28,13 +28,14 @@ MAX_RETRIES = 3
 """Repetitions of a task whose worker or machine was lost."""
 
 CONNECT_S = 10.0
+"""Seconds in which a cluster's address must answer."""
 
 GPU_SHARE = 0.25
-"""Of a GPU that a task takes: simulation on the processor, encoding and writing leave it idle most of the time."""
+"""Share of a GPU that a task asks for: simulation on the processor, encoding and writing leave it idle mostly."""
 
 
 def outcomes_of_ray(
-    context: JobContext, tasks: Iterator[Task], address: str, workers: int | None = None
+    context: JobContext, tasks: Iterator[Task], address: str, workers: int | None
 ) -> Generator[Outcome, None, None]:
     """Outcomes in the order in which they are ready; at most two tasks per processor core are waiting at any time.
 

@@ -31,7 +31,7 @@ class JobContext:
 
     @property
     def mesh_folders(self) -> tuple[Path, Path] | None:
-        """Where fTetWild's meshes are kept; it is random, so that all must use the same ones. None for other meshes."""
+        """Folders of fTetWild's meshes, which are random, so that all must use the same ones. None for other meshes."""
         return (mesh_folder(self.out), self.cache) if self.plan.mesh.kind == "tetwild" else None
 
     def stream(self, purpose: str, *numbers: int) -> np.random.Generator:
@@ -83,4 +83,4 @@ class SimulatedTrajectory:
 
 
 Simulated = tuple[SimulatedTrajectory, Space]
-"""With the space that its states' numbers are nodes of."""
+"""A simulated trajectory, and the finite-element space that it was simulated in."""

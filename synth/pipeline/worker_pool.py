@@ -170,7 +170,7 @@ THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV
 
 
 def cores() -> int:
-    """That this process may use; on a cluster fewer than the machine has."""
+    """Number of processor cores that this process may use; on a cluster fewer than the machine has."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

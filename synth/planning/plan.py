@@ -47,7 +47,7 @@ class Plan:
 
     @property
     def solver_device(self) -> Literal["cuda", "cpu"]:
-        """Where the batched solver runs: beside the renderer."""
+        """The device of the batched solver: that of the renderer."""
         return "cuda" if self.variant.is_on_gpu else "cpu"
 
     def record(self) -> dict[str, Any]:

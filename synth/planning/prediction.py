@@ -6,7 +6,6 @@ seconds, so that `generate`, which needs none of this, does not ask for it.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -26,11 +25,12 @@ _Meshes = tuple[list[tuple[Scene, int]], str, tuple[float, float] | None]
 INSTANCES = 12
 """Trajectories whose meshes are chosen to predict error and time."""
 NODES_PER_VOLUME, NODES_PER_AREA, NODES_PER_CURVED_AREA, FEWEST_NODES = 0.72, 0.25, 2.3, 300
-"""Mesh vertices per cube and per square of the contact face's edge length, for fTetWild's meshes."""
+"""Vertices of fTetWild's meshes: in a cube, on a flat and on a curved square with the contact face's edge length for a
+side; and in all, at least."""
 VERTICES_TO_P2 = 7.0
 """Displacement nodes of P2 elements per vertex of the mesh."""
 SOLVE_SECONDS = 0.06
-"""One Newton iteration (assembly, factorisation, solution) without friction, with SOLVE_NODES displacement nodes."""
+"""Seconds of a Newton iteration (assembly, factorisation, solution) without friction, with SOLVE_NODES nodes."""
 SOLVE_NODES = 5000
 SOLVE_GROWTH = 1.25
 """Exponent of a solve's time in the nodes."""
@@ -40,7 +40,7 @@ ITERATIONS_PER_STEP, ITERATIONS_PER_RECORD = 4.5, 7.0
 MESH_INDENTER = 7.0
 """Time of a press by a mesh indenter over a ball's: its edges take more iterations (docs/reports/objects.md)."""
 BATCHED_SECONDS = {"cuda": 5.5e-5, "cpu": 0.8}
-"""One Newton iteration of one trajectory by the batched solver, with BATCHED_NODES displacement nodes; on a GPU among
+"""Seconds of a Newton iteration of one trajectory by the batched solver, with BATCHED_NODES nodes; on a GPU among
 hundreds of trajectories (docs/reports/batched_fem.md)."""
 BATCHED_NODES = 3500
 BATCHED_GROWTH = 1.6
@@ -48,7 +48,7 @@ BATCHED_GROWTH = 1.6
 AUTO_SAMPLES = 64
 """What samples_per_pixel = "auto" counts for, before a sensor has been measured."""
 SECONDS_PER_MILLION_SAMPLES = {"llvm": 0.4, "scalar": 1.0, "cuda": 0.002}
-"""Path-traced camera samples of one frame."""
+"""Seconds of path tracing a million camera samples, by the kind of variant."""
 FLOW_SECONDS_PER_MEGAPIXEL = 1.0
 BYTES_PER_PIXEL_OF_FLOW = 14.0
 BYTES_PER_PIXEL_OF_IMAGE = 1.4
@@ -74,9 +74,6 @@ class Prediction:
     nodes: int
     seconds_per_pair: dict[str, float]
     bytes_per_pair: int
-
-    def record(self) -> dict[str, Any]:
-        return {**vars(self), "error_px": None if self.error_px is None else list(self.error_px)}
 
 
 def predict(plan: Plan) -> Prediction:
@@ -105,7 +102,7 @@ def predict(plan: Plan) -> Prediction:
 
 
 def _meshes(plan: Plan) -> _Meshes:
-    """Of the first INSTANCES trajectories."""
+    """Meshes of the first INSTANCES trajectories."""
     template = plan.template
     found: list[tuple[Scene, Resolution]] = []
     for trajectory in range(INSTANCES):
@@ -131,7 +128,7 @@ def _meshes(plan: Plan) -> _Meshes:
 
 
 def _tetwild_meshes(plan: Plan) -> _Meshes:
-    """Of the corners, without meshing; fTetWild takes long."""
+    """Meshes of the corners, estimated without meshing; fTetWild takes long."""
     first = plan.template.corners[0]
     gel = first.sensor.gel
     edge_mm = plan.template.numerics.edge_length_mm or default_edge_length(gel)

@@ -9,7 +9,7 @@ Per channel, with full scale 1 and all steps but the last two linear:
 The radiance of a wide-angle lens falls off towards the corners; the vignette 1 - v ρ² (ρ = 1 at the image's farthest
 corner from the principal point) stands for natural and mechanical vignetting together.
 
-A pixel needs so many samples that nobody sees the renderer's noise behind the camera's own. Two pilot pictures with
+A pixel has enough samples when nobody sees the renderer's noise behind the camera's own. Two pilot pictures with
 different seeds differ by √2 times the renderer's noise, after the lens's blur and in encoded values, as they are seen.
 The camera's own noise there is that of v(s + e), with v the response and e Gaussian of the variance read² + shot² s, by
 quadrature, because in the dark the response is no straight line over e; and step² / 12.
@@ -73,10 +73,11 @@ def vignette(camera: Camera) -> FloatArray:
 
 
 SHARE = 0.25
-"""Of the camera's noise that the renderer's may have; both together are then 3 % more than the camera's alone."""
+"""Share of the camera's noise that the renderer's may have; both together are then 3 % more than the camera's alone."""
 PILOT = 16
 """Samples a pixel of the pilots."""
 MOST = 4096
+"""Most samples a pixel that are chosen."""
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(15)
 
 

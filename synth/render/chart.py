@@ -23,7 +23,7 @@ from synth.scene import NoPattern, Sensor
 
 @dataclass(frozen=True)
 class FlatChart:
-    """Along z: places are x and y. The texture spans `size_mm` about the origin."""
+    """A texture laid on along z: places are x and y. It spans `size_mm` about the origin."""
 
     size_mm: tuple[float, float]
 
@@ -34,7 +34,7 @@ class FlatChart:
 
 @dataclass(frozen=True)
 class RoundChart:
-    """About the axis; the radius, mm, is that of hemisphere and cylinder, `top` is z of the gel's upper end, mm."""
+    """A texture laid on about the axis; `radius` mm of hemisphere and cylinder, `top` z mm of the gel's upper end."""
 
     radius: float
     top: float
@@ -58,7 +58,7 @@ class RoundChart:
         return np.asarray(self.radius * np.sin(np.minimum(arc / self.radius, np.pi / 2)))
 
     def flattened(self, material: Points) -> Pixels:
-        """As of `FlatChart`."""
+        """Places (n, 2) mm in the texture of points (n, 3) mm of the undeformed face."""
         across, z = np.hypot(material[:, 0], material[:, 1]), material[:, 2]
         arc = self.radius * np.arctan2(across, np.maximum(self.radius - z, 0)) + np.maximum(z - self.radius, 0)
         return material[:, :2] * np.divide(arc, across, out=np.ones_like(arc), where=across > 0)[:, None]
@@ -73,7 +73,7 @@ class RoundChart:
 
 Chart = FlatChart | RoundChart
 _ROWS = 64
-"""Of texels that are looked up at a time, which bounds memory."""
+"""Rows of texels that are looked up at a time, which bounds memory."""
 
 
 def chart_of(sensor: Sensor) -> Chart:
@@ -87,7 +87,7 @@ def chart_of(sensor: Sensor) -> Chart:
 def texture_coordinates(sensor: Sensor, folder: Path, x: FloatArray, y: FloatArray) -> FloatArray:
     """(rows, columns, 2) u and v of a gel's file at texel centres x (columns,) and y (rows,) mm; NaN beside the face.
 
-    Each texel looks from outside at the axis, or at the hemisphere's centre. InputError as of `CadFace.textured`.
+    Each texel looks from outside at the axis, or at the hemisphere's centre. InputError as for `CadFace.textured`.
     """
     from synth.flow.trace import trace
 

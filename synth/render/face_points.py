@@ -64,7 +64,7 @@ class FacePoints:
 
 
 def count_per_face(total: int, faces: int) -> int:
-    """Points of each face, of about so many in all."""
+    """Points of each face where there are about `total` in all."""
     return (_STEP * max(1, round(math.sqrt(total / faces) / _STEP))) ** 2
 
 
@@ -85,7 +85,7 @@ def projected(values: list[Any], weights: tuple[Any, Any, Any], count: int, is_l
 
 
 _DEGREE = 4
-"""Of V's polynomials."""
+"""Degree of V's polynomials."""
 
 
 def across_cavity(means: FloatArray, positions: Points, normals: Points, faces: np.ndarray) -> Image:

@@ -13,7 +13,7 @@ from synth.render.chart import Chart, RoundChart
 from synth.scene import Dots, Speckle
 
 _STEPS_PER_GRAIN = 16
-"""Of the noise from which the grains of round faces are cut."""
+"""Steps a grain of the noise from which the grains of round faces are cut."""
 
 
 def marks_coverage(

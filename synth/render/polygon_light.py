@@ -20,7 +20,7 @@ from synth.render.lights import rectangles, reflectance
 from synth.scene import Light
 
 _DEGREE = 9
-"""Of the polynomial: it errs by 2e-8, less than float32's rounding."""
+"""Degree of the polynomial, which errs by 2e-8, less than float32's rounding."""
 _STRATA = 2
 """Points of a light without closed form for each of a pixel's samples, spread along its first side."""
 

@@ -43,17 +43,17 @@ from synth.scene import Coating, Render, Sensor
 _PILOTS = 2**14
 """Rays to each light, and to the gel, from a gel of few faces; 16 from each face where there are many."""
 _MANY = 0.25
-"""Of a face's pilots that saw gel, from which on its bounced light is linear."""
+"""Share of a face's pilots that must see gel for its bounced light to be linear and not constant."""
 _DEGREE = 4
-"""Of the polynomials for light that comes back from the window: its path is longer than the pad is thick, so smooth."""
+"""Degree of the polynomials for light that comes back from the window, which is smooth after so long a path."""
 _RETURNED = 2**17
 """Paths by the window, to which they are fitted; more where there are many faces."""
 _CLEARANCE_MM = 1e-3
-"""Above the gel, where rays to it may end: far more than rounding."""
+"""Height above the gel's highest point at which rays end that look for gel alone: far more than rounding."""
 _NEGLIGIBLE = 1e-4
-"""Of all light on a point: shadows of so little are not sampled."""
+"""Share of all light on a point up to which a light's shadows are not sampled."""
 _SHIFT = (0.7548776662466927, 0.5698402909980532)
-"""Of one light's shadow rays against the one before's: R2 sequence (Roberts 2018), on a torus to keep the strata."""
+"""Shift of shadow rays from one light to the next: R2 sequence (Roberts 2018), on a torus to keep the strata."""
 
 
 def is_separated(render: Render, coating: Coating, variant: Variant) -> bool:
@@ -189,7 +189,7 @@ class SeparatedLight:
         return np.stack([np.array(dr.block_sum(one, count)) for one in counts], axis=-1) / count
 
     def _gather(self, triangles: NDArray[np.uint32], met: FloatArray, rays: int, seed: int) -> list[list[Any]]:
-        """Bounced light (channels of 3 corners of mi.Float) on all faces from about so many rays.
+        """Bounced light (channels of 3 corners of mi.Float) on all faces from about `rays` rays.
 
         `met` are the shares (faces,) of pilots that met the gel.
         """

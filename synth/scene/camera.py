@@ -3,8 +3,10 @@
 import math
 from typing import Annotated, Literal
 
+import numpy as np
 from pydantic import Field, model_validator
 
+from synth.arrays import FloatArray
 from synth.scene.part import Fraction, NonNegative, Part, Positive, Vector3
 
 COEFFICIENTS = {"pinhole": "k1, k2, p1, p2, k3", "fisheye": "k1, k2, k3, k4"}
@@ -25,7 +27,7 @@ class Camera(Part):
     lens: Literal["pinhole", "fisheye"] = "pinhole"
     """pinhole: Brown-Conrady; fisheye: Kannala-Brandt as in cv2.fisheye, up to 220 degrees from side to side."""
     distortion: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """As in OpenCV: k1, k2, p1, p2, k3 of a pinhole lens; k1, k2, k3, k4 of a fisheye lens."""
+    """Coefficients as in OpenCV: k1, k2, p1, p2, k3 of a pinhole lens; k1, k2, k3, k4 of a fisheye lens."""
     exposure: Positive = 1.0
     gamma: Annotated[float, Field(ge=0.2, le=4)] = 2.2
     """Encoded value = linear value ** (1 / gamma)."""
@@ -94,32 +96,28 @@ class Mirror(Part):
     """A flat, ideal, rectangular mirror in air between cameras and window; its back is black."""
 
     position_mm: Vector3
-    """Its centre."""
+    """The mirror's centre."""
     normal: Vector3
-    """Away from its reflecting side; of any length."""
+    """Direction away from the reflecting side; of any length."""
     size_mm: tuple[Positive, Positive]
-    """Along the contact face, and at right angles to that and to the normal; along x and y for a normal along z."""
+    """Sides along the contact face, and at right angles to that and the normal; along x and y for a normal along z."""
     rotation_deg: float = 0.0
     """Turns the rectangle in its own plane, from its first size's direction toward its second's."""
 
     @property
-    def axes(self) -> tuple[Vector3, Vector3, Vector3]:
-        """Unit vectors along the first size, along the second size, and of the normal."""
-        length = math.hypot(*self.normal)
-        nx, ny, nz = (component / length for component in self.normal)
-        level = math.hypot(nx, ny)
-        a = (-ny / level, nx / level, 0.0) if level > 1e-9 else (1.0, 0.0, 0.0)
-        b = (ny * a[2] - nz * a[1], nz * a[0] - nx * a[2], nx * a[1] - ny * a[0])
-        turn = math.radians(self.rotation_deg)
+    def axes(self) -> FloatArray:
+        """(3, 3) unit vectors as rows: along the first size, along the second size, and the normal."""
+        normal = np.array(self.normal) / math.hypot(*self.normal)
+        level, turn = math.hypot(normal[0], normal[1]), math.radians(self.rotation_deg)
+        along = np.array([-normal[1], normal[0], 0.0]) / level if level > 1e-9 else np.array([1.0, 0.0, 0.0])
+        across = np.cross(normal, along)
         c, s = math.cos(turn), math.sin(turn)
-        first = (c * a[0] + s * b[0], c * a[1] + s * b[1], c * a[2] + s * b[2])
-        second = (c * b[0] - s * a[0], c * b[1] - s * a[1], c * b[2] - s * a[2])
-        return first, second, (nx, ny, nz)
+        return np.stack([c * along + s * across, c * across - s * along, normal])
 
     @property
     def lowest_mm(self) -> float:
-        first, second, _ = self.axes
-        return self.position_mm[2] - (abs(first[2]) * self.size_mm[0] + abs(second[2]) * self.size_mm[1]) / 2
+        first, second, _ = np.abs(self.axes[:, 2])
+        return float(self.position_mm[2] - (first * self.size_mm[0] + second * self.size_mm[1]) / 2)
 
     @model_validator(mode="after")
     def _facing(self) -> "Mirror":

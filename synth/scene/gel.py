@@ -38,7 +38,7 @@ class Layer(Part):
     youngs_modulus_kpa: Annotated[float, Field(ge=0.1, le=1e6)]
     poisson_ratio: Annotated[float, Field(ge=0.3, le=0.5)] = 0.4999
     stiffening: tuple[NonNegative, NonNegative] = (0.0, 0.0)
-    """As of the gel."""
+    """As `Gel.stiffening`."""
 
 
 class Gel(Part):
@@ -60,11 +60,11 @@ class Gel(Part):
     """Radius of a dome's contact face, which touches z = 0 at its apex (0, 0) and curves away from the indenter; None:
     flat. Patterns are laid on it along z: their places are x and y."""
     radius_mm: Annotated[float, Field(ge=1, le=100)] | None = None
-    """Of a capsule's contact face."""
+    """Radius of a capsule's contact face."""
     thickness_mm: Annotated[float, Field(ge=0.2, le=50)] | None = None
-    """Of a capsule's layer of gel. Of a gel from files that on the axis, which follows from them."""
+    """Thickness of a capsule's layer of gel; of a gel from files that on the axis, which follows from them."""
     length_mm: Annotated[float, Field(ge=0, le=200)] = 0.0
-    """Of a capsule's cylinder; 0: a hemisphere."""
+    """Length of a capsule's cylinder; 0: a hemisphere."""
     cut_end: Literal["free", "held"] = "free"
     """Whether the plane of largest z, in which a round gel ends, is held, as by a rigid frame."""
     outer: str | None = None
@@ -73,16 +73,16 @@ class Gel(Part):
     window: str | None = None
     """File of the closed surface that the gel is bonded to, in the same axes; optics are those of [sensor.window]."""
     unit: Literal["mm", "cm", "m", "inch"] | None = None
-    """Of the files."""
+    """Unit of lengths in the files."""
     digest: str = ""
-    """Of the files' content; filled in when a scene is loaded."""
+    """Digest of the files' content; filled in when a scene is loaded."""
     youngs_modulus_kpa: Annotated[float, Field(ge=0.1, le=1e6)]
     poisson_ratio: Annotated[float, Field(ge=0, le=0.5)] = 0.4999
     """0.5 is exactly incompressible; below 0.3 no pressure field is needed."""
     stiffening: tuple[NonNegative, NonNegative] = (0.0, 0.0)
     """Yeoh's C20/C10 and C30/C10 (Rubber Chem. Technol. 66, 1993); zeros: neo-Hookean."""
     layers: tuple[Layer, ...] = ()
-    """From the contact face inward; what is left of the thickness is the gel's own material. Under a dome their
+    """Layers from the contact face inward; what is left of the thickness is the gel's own material. Under a dome their
     thicknesses are those at the apex; elsewhere they shrink with the pad's. In round gels they are depths below the
     coated face."""
 

@@ -41,7 +41,7 @@ class GelSurfaces:
 
     @property
     def size_mm(self) -> tuple[float, float, float]:
-        """Of outer's bounding box."""
+        """Size of outer's bounding box."""
         x, y, z = (round(float(edge), 6) for edge in np.ptp(self.outer.points, axis=0))
         return x, y, z
 
@@ -52,7 +52,7 @@ class GelSurfaces:
 
     @property
     def thickness_mm(self) -> float:
-        """Along z on the axis; NaN where there is no gel below the window."""
+        """Thickness of the gel along z on the axis; NaN where there is no gel below the window."""
         axis = np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 2 * self.top_mm]])
         face, window = (body.ray_trace(*axis)[0][:, 2] for body in (self.face, self.window))
         return round(float(window.min() - face.min()), 6) if len(face) and len(window) else float("nan")

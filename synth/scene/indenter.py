@@ -65,7 +65,7 @@ class MeshIndenter(Part):
     size_mm: Positive | None = None
     """Longest edge of the bounding box before it is turned; in place of `scale`."""
     rotation_deg: Vector3 | Literal["any"] = (0.0, 0.0, 0.0)
-    """As of the other shapes; "any" draws an orientation, all alike likely."""
+    """Angles as for the other shapes; "any" draws an orientation, all alike likely."""
     fillet_mm: Annotated[float, Field(ge=0, le=100)] | None = None
     """Radius to which edges and notches are rounded; default what the gel's mesh resolves, and never less."""
     cell_mm: Annotated[float, Field(ge=0.01, le=10)] | None = None

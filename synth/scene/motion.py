@@ -26,7 +26,7 @@ class Motion(Part):
     """
 
     depth_mm: float
-    """How far the indenter's lowest point goes past the undeformed surface; negative: it stays off by so much."""
+    """How far the indenter's lowest point goes past the undeformed surface; negative: how far it stays off."""
     shear_mm: Vector2 = (0.0, 0.0)
     twist_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0
     """Positive turns +x toward +y."""
@@ -36,7 +36,7 @@ class Motion(Part):
     height_mm: NonNegative | None = None
     """Z of the place, instead of polar_deg."""
     azimuth_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
-    """Of the place about the axis, from +x toward +y."""
+    """Azimuth of the place about the axis, from +x toward +y."""
     steps: Annotated[int, Field(ge=1, le=1000)] = 6
     """Recorded states after the undeformed one, split between the legs by the length of their paths."""
     then: tuple[Pose, ...] = ()

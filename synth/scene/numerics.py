@@ -11,8 +11,8 @@ class Render(Part):
     """Path tracing."""
 
     samples_per_pixel: Annotated[int, Field(ge=1, le=65536)] | Literal["auto"] = 36
-    """At least so many; rounded up to a full grid and a multiple of the number of lights. auto: for every sensor drawn,
-    so many that the renderer's noise is a quarter of the main camera's own."""
+    """Rounded up to a full grid and a multiple of the number of lights. auto: for every sensor drawn, as many as it
+    takes so that the renderer's noise is a quarter of the main camera's own."""
     max_depth: Annotated[int, Field(ge=2, le=64)] = 4
     """Longest light path in surfaces and lights; 2 is direct light only. The window does not count."""
     light: Literal["path_traced", "separated"] = "path_traced"

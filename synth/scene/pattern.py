@@ -42,7 +42,7 @@ class Dots(Part):
     kind: Literal["dots"]
     spacing_mm: tuple[Positive, Positive]
     radius_mm: Positive
-    """Of a round dot; from the middle to the corners of a diamond."""
+    """Radius of a round dot; distance from the middle to the corners of a diamond."""
     shape: Literal["round", "diamond"] = "round"
     """diamond: a square whose corners point along the grid. With a radius of half the spacing neighbours touch and make
     a checkerboard, the continuous marker pattern of arXiv:2305.11782."""
@@ -111,7 +111,7 @@ class Bitmap(Part):
     """z: along z, by the fields below. uv: by the texture coordinates in a gel's `outer` file (OBJ or PLY), v = 0 being
     the picture's lower edge."""
     width_mm: Annotated[float, Field(ge=0.1, le=1000)] | None = None
-    """Of the whole picture; its height follows from square pixels."""
+    """Width of the whole picture; its height follows from square pixels."""
     offset_mm: Vector2 = (0.0, 0.0)
     """The picture's middle."""
     rotation_deg: Annotated[float, Field(ge=-180, le=180)] = 0.0

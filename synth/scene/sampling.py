@@ -20,7 +20,7 @@ from synth.scene.validation import validated
 TRAJECTORY_PARTS = ("contact", "motion")
 """Drawn anew for every trajectory; everything else belongs to the sensor."""
 MAX_DRAWS = 10
-"""A sensor, and a trajectory on it, is drawn at most so often before the samples are given up."""
+"""Most draws of a sensor, and of a trajectory on it, before the samples are given up."""
 
 
 @dataclass(frozen=True)

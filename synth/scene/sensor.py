@@ -24,7 +24,7 @@ class Window(Part):
     shape: Literal["plane", "sphere", "cylinder", "capsule"] = "plane"
     """capsule: a hemisphere toward the tip and a cylinder above it."""
     radius_mm: Positive | None = None
-    """Of the round face itself."""
+    """Radius of the round face itself."""
     center_z_mm: float | None = None
     """Z of the centre of the sphere or hemisphere."""
 
@@ -77,7 +77,7 @@ class Light(Part):
     position_mm: Vector3
     aim_mm: Vector3 = (0.0, 0.0, 0.0)
     size_mm: tuple[Positive, Positive]
-    """Along the contact face, and at right angles to that and to the aim. A round LED is a square of its area."""
+    """Sides along the contact face, and at right angles to that and the aim. A round LED is a square of its area."""
     color: Color
     power: NonNegative
     """Radiant power, in units in which exposure 1 maps a radiance of 1 to full scale."""
@@ -92,7 +92,7 @@ class Light(Part):
 
     @property
     def radiance(self) -> Vector3:
-        """Along the aim, by channel: the power is its integral of cos^(k + 1) θ over area and hemisphere."""
+        """Radiance along the aim, by channel: the power is its integral of cos^(k + 1) θ over area and hemisphere."""
         width, height = self.size_mm
         level = self.power * (self.narrowness + 2) / (2 * math.pi * width * height)
         return (level * self.color[0], level * self.color[1], level * self.color[2])
@@ -109,7 +109,7 @@ class Sensor(Part):
     camera: Camera
     further_cameras: tuple[FurtherCamera, ...] = ()
     mirrors: tuple[Mirror, ...] = ()
-    """Between cameras and window. They take no part in the lighting: a mirror neither shades nor lights the gel."""
+    """Mirrors between cameras and window. They take no part in the lighting: they neither shade nor light the gel."""
 
     @property
     def views(self) -> dict[str, "Sensor"]:

@@ -62,7 +62,7 @@ def _read(path: Path, changed_ns: int) -> Triangles:
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """Without VTK's log and warnings, which tell of addresses and reference counts."""
+    """Silences VTK's log and warnings, which tell of addresses and reference counts."""
     disabled = logging.root.manager.disable
     logging.disable(logging.CRITICAL)
     try:

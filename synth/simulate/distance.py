@@ -50,7 +50,7 @@ def _box(y: wp.vec3d, half: wp.vec3d) -> wp.vec4d:
 
 @wp.func
 def _revolve(y: wp.vec3d, gradient: wp.vec2d, distance: wp.float64) -> wp.vec4d:
-    """From the half plane (distance from the axis, z) to space; on the axis any radial direction will do."""
+    """Turns a distance in the half plane (rho, z) about the axis; on the axis any radial direction will do."""
     rho = wp.sqrt(y[0] * y[0] + y[1] * y[1])
     if rho < TINY:
         return wp.vec4d(gradient[0], ZERO, gradient[1], distance)
@@ -193,7 +193,7 @@ def _grid(y: wp.vec3d, shape: shape_vector, s: int, coefficients: wp.array4d(dty
 def _grid_normal_derivative(
     y: wp.vec3d, shape: shape_vector, s: int, coefficients: wp.array4d(dtype=wp.float64)
 ) -> wp.mat33d:
-    """Of a point within the grid: (I - n n^T) H / |g| with the spline's gradient g and Hessian H."""
+    """Derivative of the normal within the grid: (I - n n^T) H / |g| with the spline's gradient g and Hessian H."""
     _value, slope, d, m = _spline(_in_grid(y, shape), shape, s, coefficients)
     hessian = wp.mat33d(d[0], m[2], m[1], m[2], d[1], m[0], m[1], m[0], d[2])
     n = _unit(slope, wp.vec3d(ZERO, ZERO, ONE))

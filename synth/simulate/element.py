@@ -19,7 +19,7 @@ from synth.surface import quadratic_face
 EDGES = ((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))
 
 CONTACT_SPLIT = 3
-"""Contact is integrated over each face split into so many parts an edge: with three points a face, an edge of the
+"""Parts of an edge when a face is split to integrate contact over it: with three points a face, an edge of the
 indenter that is sharper than an element makes Newton's method chatter."""
 
 P2_HOLD = 2.0

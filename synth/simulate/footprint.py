@@ -32,6 +32,7 @@ POSES = 33
 UNTOUCHED = 0.25
 """Half width of the zone under an indenter that does not touch, over the pad's thickness."""
 _CELLS = (16, 16, 1)
+"""Cells along x, y and z that the search begins with."""
 _CONVEX = tuple(KINDS[shape] for shape in ("sphere", "cylinder", "box", "cone"))
 
 

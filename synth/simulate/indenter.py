@@ -164,8 +164,21 @@ def _object(indenter: MeshIndenter, folder: Path, resolution_mm: float, touchabl
     if touchable.at_tip:
         tip = turned.points[turned.points[:, 2] > lowest - TIP_MM].mean(axis=0)
         turned = replace(turned, points=turned.points - tip * [1, 1, 0])
+    grid = _grid_over(turned, indenter, radius, touchable)
+    values = _rounded_distance(turned, grid, radius, f"contact.indenter.file = {indenter.file!r}")
+    shape = np.array([0.0, *grid.corner, grid.spacing, *grid.counts])
+    coefficients = np.asarray(spline_filter(values, order=3, mode="mirror"), dtype=np.float64)
+    near = values < radius + grid.spacing
+    reach = min(lowest, float((grid.points(near)[:, 2] - values[near]).max()))  # also of balls beside the solid
+    kept = max(min((indenter.fillet_mm or 0.0) / radius, 1.0), LOWERED) if radius > 0 else 0.0
+    reach = lowest - max(kept * (lowest - reach), lowest - reach - MOST_RAISED * touchable.depth_mm)
+    return RigidBody(KINDS["mesh"], shape, np.eye(3), reach, coefficients, max(radius, grid.spacing))
+
+
+def _grid_over(turned: Triangles, indenter: MeshIndenter, radius: float, touchable: Touchable) -> Grid:
+    """The grid over the part of a turned surface that is touchable; InputError for one of too many points."""
     low, high = turned.points.min(axis=0), turned.points.max(axis=0)
-    low = np.maximum(low, [-touchable.radius_mm, -touchable.radius_mm, lowest - touchable.height_mm])
+    low = np.maximum(low, [-touchable.radius_mm, -touchable.radius_mm, high[2] - touchable.height_mm])
     high = np.minimum(high, [touchable.radius_mm, touchable.radius_mm, np.inf])
     spacing = indenter.cell_mm or _spacing(radius, high - low)
     margin = radius + 4 * spacing
@@ -175,28 +188,26 @@ def _object(indenter: MeshIndenter, folder: Path, resolution_mm: float, touchabl
             f"contact.indenter.cell_mm = {spacing:g}: {indenter.file} needs {counts.prod()} grid points, more than "
             f"{LARGEST_GRID}; use a larger cell_mm"
         )
-    grid = Grid(low - margin, spacing, (int(counts[0]), int(counts[1]), int(counts[2])))
+    return Grid(low - margin, spacing, (int(counts[0]), int(counts[1]), int(counts[2])))
+
+
+def _rounded_distance(turned: Triangles, grid: Grid, radius: float, named: str) -> FloatArray:
+    """A surface's signed distance on a grid after rounding; InputError, beginning as `named`, where it is no solid."""
     values = grid.signed_distance(turned, radius)
     missing = 0.0 if turned.closed else grid.missing(values)
     if missing > MOST_MISSING:
         raise InputError(
-            f"contact.indenter.file = {indenter.file!r}: it is an open sheet, {missing:.0%} of a closed surface would "
-            "have to be made up; give it a thickness"
+            f"{named}: it is an open sheet, {missing:.0%} of a closed surface would have to be made up; give it a "
+            "thickness"
         )
     if radius > 0:
         values = grid.rounded(values, turned, radius)
     if not (values < 0).any():
         raise InputError(
-            f"contact.indenter.file = {indenter.file!r}: it encloses no volume that a grid of {spacing:.2g} mm "
-            "resolves; a single sheet needs a thickness"
+            f"{named}: it encloses no volume that a grid of {grid.spacing:.2g} mm resolves; a single sheet needs a "
+            "thickness"
         )
-    shape = np.array([0.0, *grid.corner, spacing, *counts])
-    coefficients = np.asarray(spline_filter(values, order=3, mode="mirror"), dtype=np.float64)
-    near = values < radius + spacing
-    reach = min(lowest, float((grid.points(near)[:, 2] - values[near]).max()))  # also of balls beside the solid
-    kept = max(min((indenter.fillet_mm or 0.0) / radius, 1.0), LOWERED) if radius > 0 else 0.0
-    reach = lowest - max(kept * (lowest - reach), lowest - reach - MOST_RAISED * touchable.depth_mm)
-    return RigidBody(KINDS["mesh"], shape, np.eye(3), reach, coefficients, max(radius, spacing))
+    return values
 
 
 def object_radius(indenter: MeshIndenter, resolution_mm: float) -> float:

@@ -20,12 +20,12 @@ import numpy as np
 from synth.arrays import FloatArray
 
 GMRES_TOLERANCE = 1e-3
-"""Of the linear residual, relative to the right side; Newton's convergence is then as with an exact solution."""
+"""Largest linear residual, relative to the right side; Newton's convergence is then as with an exact solution."""
 GMRES_LIMIT = 40
 """Most iterations; where they do not do, the direction is used as it is and the line search judges it."""
 ROUGH_TOLERANCE = 0.03
-"""Of the linear residual of a rough direction, with this tangent's factor or an earlier one's. Far from the solution it
-is the changes of the contact set that count."""
+"""Largest linear residual of a rough direction, with this tangent's factor or an earlier one's. Far from the solution
+changes of the contact set are what counts."""
 MAX_REUSE_ITERATIONS = 12
 """Iterations after which an earlier tangent's factor is given up."""
 
@@ -42,7 +42,7 @@ class Factor(Protocol):
         """The approximate solution (n,) float64 for a right side (n,)."""
 
 
-def direct_factor(indptr: np.ndarray, indices: np.ndarray, single: bool = True) -> Factor:
+def direct_factor(indptr: np.ndarray, indices: np.ndarray, single: bool) -> Factor:
     """The best factor there is for this pattern of an upper triangle (CSR, sorted)."""
     if has_pardiso():
         return PardisoFactor(indptr, indices, single)
@@ -65,7 +65,7 @@ class LinearSolver:
         self._own = -1
 
     def solve(self, matrix: Any, remainder: Any, right: FloatArray, rough: bool = False) -> FloatArray:
-        """The solution (n,) of (S + R) x = right, NaN where the matrix is singular; arguments as of `gmres`.
+        """The solution (n,) of (S + R) x = right, NaN where the matrix is singular; arguments as for `gmres`.
 
         rough: to ROUGH_TOLERANCE, with the factor of an earlier matrix if it serves; else with this matrix's factor.
         """
@@ -176,7 +176,7 @@ class PardisoFactor:
 
     ANALYSE, FACTORISE, SOLVE, RELEASE = 11, 22, 33, -1
 
-    def __init__(self, indptr: np.ndarray, indices: np.ndarray, single: bool = True) -> None:
+    def __init__(self, indptr: np.ndarray, indices: np.ndarray, single: bool) -> None:
         self._type = np.float32 if single else np.float64
         self._size = len(indptr) - 1
         self._indptr = np.ascontiguousarray(indptr, dtype=np.int32)

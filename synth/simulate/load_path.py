@@ -159,7 +159,7 @@ class LoadPath:
 
     @property
     def length_mm(self) -> float:
-        """Of the whole load path."""
+        """Length of the whole load path."""
         return float(self.ends[-1])
 
     def pose(self, s: float) -> Pose:

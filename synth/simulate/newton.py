@@ -25,14 +25,14 @@ from synth.simulate.system import Residual, System, Unknowns
 
 MAX_ITERATIONS = 20
 MAX_ROUGH_ITERATIONS = 5
-"""After so many iterations directions are exact: far from the solution rough ones may not get there at all."""
+"""Iterations after which directions are exact: far from the solution rough ones may not get there at all."""
 ROUGH_ABOVE = 1e-5
 """A tolerance above it is reached with rough directions."""
 NEAR = 1e-2
 """Relative residual below which the equilibrium is near: directions are exact for a smaller tolerance, and a solve may
 take up to twice its iterations, so that rounding does not decide whether the last of them met the tolerance."""
 MAX_TURN = 0.1
-"""Of `synth.simulate.contact.contact_stiffness`: iterates are far deeper in edges than equilibria; H misleads there."""
+"""`max_turn` of `contact_stiffness`: iterates are far deeper in edges than equilibria; H misleads there."""
 SHORTEST = 1 / 1024
 """Shortest step of the line search."""
 FORCE_FLOOR = 1e-6
@@ -40,7 +40,7 @@ FORCE_FLOOR = 1e-6
 INDIFFERENT = 0.3
 """Below this step length any valid state is taken: a kink of the contact set can make every step raise the residual."""
 STALL_ITERATIONS, STALLED_RESIDUAL = 5, 0.5
-"""After so many iterations a solve ends whose relative residual is still so large."""
+"""A solve ends after so many iterations if its relative residual is still as large as the second number."""
 SUFFICIENT_DECREASE = 1e-4
 """Share of the predicted decrease of the residual that a step of the line search must reach (Armijo's condition)."""
 
@@ -127,7 +127,7 @@ FALL, FALL_AFTER_REFUSAL, RISE = 0.1, 0.5, 6.0
 
 
 def relax(system: System, start: Unknowns, indenter: Indenters, tolerance: float) -> Solution:
-    """Let a state come to rest; arguments and result as of `synth.simulate.newton.solve`."""
+    """Let a state come to rest; arguments and result as for `solve`."""
     state, residual = start, system.residual(start, indenter)
     least = MIN_REACTION_RATIO * _reaction(system, residual)
     viscosity, share, iterations, refused = FIRST_VISCOSITY, 1.0, 0, False

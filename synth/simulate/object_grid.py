@@ -23,7 +23,7 @@ from synth.scene.surface_file import Triangles
 from synth.simulate.object_contour import crossings, sharp_contour
 
 STRIDE = 3
-"""Far from the surface one of so many samples along an axis is exact."""
+"""Far from the surface every STRIDE-th sample along an axis is exact, the others are interpolated."""
 LOST = 1.25
 """What an opening by r leaves out farther than this times r is a thin part or a sharp tip. A right-angled edge loses
 0.41 r, its corner 0.73 r, a tetrahedron's edge 0.73 r and its corner 2 r."""

@@ -98,9 +98,8 @@ def _pairs(count: int) -> np.ndarray:
 
 
 _CACHED: OrderedDict[str, Pattern] = OrderedDict()
-_MAX_CACHED = 8
-_MAX_ENTRIES = 4_000_000
-"""Of all that are cached, which bounds memory."""
+_MAX_CACHED, _MAX_ENTRIES = 8, 4_000_000
+"""Most patterns that are cached, and most entries of them all, which bounds memory."""
 
 
 def pattern_of(space: Space, mixed: bool) -> Pattern:

@@ -100,7 +100,7 @@ class MeshRule:
                 return Resolution(0, float("nan"), mesh, 0, numerics.edge_length_mm or default_edge_length(gel))
 
     def press(self, scene: Scene, folder: Path | None = None, mesh_folders: Sequence[Path] | None = None) -> Press:
-        """Mesh, body and load path of a scene; arguments as of `resolution`.
+        """Mesh, body and load path of a scene; arguments as for `resolution`.
 
         The accuracy of an even mesh is left out: whoever finishes the samples predicts it, beside the simulation.
         """

@@ -37,6 +37,7 @@ MARGIN = -0.05
 STEEPEST_DEPTH = 2.2
 """Largest ratio of neighbouring spacings through the thickness."""
 OUTER = (3, 2)
+"""Elements beside a centred zone, on each side along x and along y."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ def mesh_levels(gel: Gel, focus: Focus) -> list[Fineness]:
 
 
 def graded_mesh(gel: Gel, focus: Focus, across: int, through: int | None = None) -> tuple[PadMesh, float]:
-    """The structured mesh of a pad with so many elements across a zone, and their size (see `_spacing`).
+    """The structured mesh of a pad with `across` elements across a zone, and their size (see `element_size`).
 
     `across` is even; without `through`, as many elements go through the thickness as keep those under the zone no
     higher than wide.
@@ -123,12 +124,12 @@ def element_size(wide: float, high: float) -> float:
 
 
 def _reach(through: int) -> float:
-    """Thickness that so many elements can fill when the first is 1 high."""
+    """Largest thickness that `through` elements can fill when the first is 1 high."""
     return float(sum(STEEPEST_DEPTH**k for k in range(through)))
 
 
 def depth_growth(through: int, height: float) -> float:
-    """The growth with which so many elements fill `height` when the first is 1; at most STEEPEST_DEPTH."""
+    """The growth with which `through` elements fill `height` when the first is 1; at most STEEPEST_DEPTH."""
     low, high = 1.0, STEEPEST_DEPTH
     for _ in range(40):
         middle = (low + high) / 2
@@ -140,7 +141,7 @@ def depth_growth(through: int, height: float) -> float:
 
 
 _FACE, _ZONE = (41, 33), (9, 9)
-"""Points along x and y at which it is looked up what the camera sees, of the contact face and of the zone."""
+"""Points along x and y of the contact face, and of the zone, that stand for what the camera sees of them."""
 _LEAST_SEEN = 0.1
 """Share of the error that is counted at least, however little of the zone the camera sees."""
 
@@ -215,7 +216,7 @@ def _even_mesh(
 
 
 def _width(size_mm: tuple[float, float, float], cells: tuple[int, int, int]) -> float:
-    """Of the elements, mm: geometric mean of both directions."""
+    """Width of the elements, mm: geometric mean of both directions."""
     return float(np.sqrt(size_mm[0] / cells[0] * size_mm[1] / cells[1]))
 
 

@@ -71,13 +71,13 @@ def stepper_of(
     """A press at the start of its load path, on a part of its gel's space, default all of it; see `simulate_press`."""
     scene, gel, numerics = press.scene, press.scene.sensor.gel, press.scene.numerics
     space = space or space_of(press)
-    system = System(space, pad_material(gel, space.mesh), numerics.penalty, options=options)
+    system = System(space, pad_material(gel, space.mesh), numerics.penalty, options)
     modulus_mpa = gel.youngs_modulus_kpa / 1000
     return Stepper(system, press.path, scene.contact.friction, numerics, modulus_mpa, options, frames)
 
 
 def space_of(press: Press) -> Space:
-    """The space of a press's whole gel; errors as of `simulate_press`."""
+    """The space of a press's whole gel; errors as for `simulate_press`."""
     _check_pad(press.scene.sensor.gel, press.mesh)
     check_mesh(press.mesh)
     return function_space(press.mesh, ELEMENTS[press.scene.numerics.element]())

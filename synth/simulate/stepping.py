@@ -21,12 +21,12 @@ from synth.simulate.newton import FORCE_FLOOR, MAX_ITERATIONS, Solution, relativ
 from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.system import System, Unknowns
 from synth.simulate.tables import pack_indenter, place_indenter
-from synth.simulate.trajectory import State, Trajectory, no_contact, not_converged, too_deep, trajectory_of, undeformed
+from synth.simulate.trajectory import State, Trajectory, no_contact, not_converged, too_deep, undeformed
 
 SHORTEST_STEP = 1 / 128
 """Shortest step, as a share of max_step_mm."""
 MAX_ITERATIONS_TO_GROW = 7
-"""A step that took at most so many iterations is followed by a longer one."""
+"""Most iterations of a step that is followed by a longer one."""
 GROWTH = 1.5
 MAX_RELAXED_STEP = 1 / 4
 """A step that fails is relaxed (`synth.simulate.newton`) when it is at most this share of max_step_mm, and a pass
@@ -39,8 +39,8 @@ MAX_MULTIPLIER_UPDATES = 2.0
 """Whole updates of the multipliers at a recorded state, in all. Not every contact point of a face on a curved body can
 come to rest on the surface, so that more updates make the tractions uneven."""
 FAILURES = 3
-"""Of attempts at them, after which the passes end. Updates are halved after a failure, doubled after a success and kept
-after a relaxation: where a whole one upsets Newton's method a part of it does not."""
+"""Failed updates after which the passes end. Updates are halved after a failure, doubled after a success and kept after
+a relaxation: where a whole one upsets Newton's method a part of it does not."""
 DEEP, TOO_DEEP, MAX_PENETRATION = 0.02, 0.05, 0.1
 """Shares of the press depth (at least 0.1 mm). Where a triangle mesh penetrates by more than the first, passes go on to
 MAX_DEEP_UPDATES or DEEP_FAILURES; where it still does by more than the second, to TOO_DEEP_FAILURES; by more than the
@@ -117,7 +117,7 @@ class Stepper:
             self._advance()
             if on_progress is not None:
                 on_progress(self.at / self._waypoints[-1])
-        return trajectory_of(tuple(self.states), self.reason, time.perf_counter() - started, self.system.space)
+        return Trajectory(tuple(self.states), self.reason, time.perf_counter() - started, self.system.space)
 
     def _start(self) -> None:
         """The undeformed state; a path that never touches stays in it and needs no solve."""

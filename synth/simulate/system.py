@@ -66,19 +66,14 @@ class Tangent:
 class System:
     """Kernels, arrays and sparse pattern of one pad, its space and its elements' material; see the module's docstring.
 
-    The penalty is the contact stiffness, E per mm; the load, if any, (n, 3) dead nodal forces in E mm². Of the options
-    precision and use of the linear solver's factors count.
+    The penalty is the contact stiffness, E per mm. Of the options precision and use of the linear solver's factors
+    count.
     """
 
     def __init__(
-        self,
-        space: Space,
-        material: Material,
-        penalty: float = 50.0,
-        load: FloatArray | None = None,
-        options: SolverOptions = STANDARD,
+        self, space: Space, material: Material, penalty: float = 50.0, options: SolverOptions = STANDARD
     ) -> None:
-        self.space, self.penalty, self.load = space, penalty, load
+        self.space, self.penalty = space, penalty
         self.mixed = material.mixed and space.element.has_pressure
         self._pattern = pattern_of(space, self.mixed)
         self._linear_solver = LinearSolver(self._pattern.factor(options.single_precision), options.reuse_factors)
@@ -139,8 +134,6 @@ class System:
         contact = [u, self._active, self._faces, indenter, self.contact, self.penalty]
         _launch(contact_residual, self.gap.shape[:2], *contact, force, self.gap, self.tangential, self.traction)
         reaction = force.numpy()[0]
-        if self.load is not None:
-            reaction = reaction - self.load
         full = np.concatenate([reaction.ravel(), volume.numpy()[0]])
         return Residual(full[self.free], reaction, float(jacobian.numpy().min()))
 
@@ -246,7 +239,7 @@ class System:
         return float((weight * slipping).sum()) / area if area > 0 else 0.0
 
     def forces(self, state: Unknowns) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Of the indenter on the gel at the last residual, in units of E.
+        """Force, moment and traction of the indenter on the gel at the last residual, in units of E.
 
         (3,) force in E mm²; (3,) moment about the frame's origin in E mm³; (s, 3) traction at the nodes of the coated
         surface (E, per undeformed area), the mean of the quadrature points near a node, weighted by the node's

@@ -60,21 +60,19 @@ def undeformed(pose: Pose, space: Space) -> State:
 class Trajectory:
     """Converged states only, the undeformed one first.
 
-    status "complete": every state asked for; "partial": the first ones, up to the last good state; "failed": none after
-    the undeformed one. `reason` says why when it is not complete. `space` tells where the displacements are.
+    `reason` says why it ended early; empty where it has every state asked for. `space` tells where the displacements
+    are.
     """
 
     states: tuple[State, ...]
-    status: Literal["complete", "partial", "failed"]
     reason: str
     seconds: float
     space: Space
 
-
-def trajectory_of(states: tuple[State, ...], reason: str, seconds: float, space: Space) -> Trajectory:
-    """A trajectory that ended for a reason, or without one at its end."""
-    status: Literal["complete", "partial", "failed"] = "partial" if len(states) > 1 else "failed"
-    return Trajectory(states, status if reason else "complete", reason, seconds, space)
+    @property
+    def status(self) -> Literal["complete", "partial", "failed"]:
+        """Partial: the first states, up to the last good one; failed: none after the undeformed one."""
+        return "complete" if not self.reason else "partial" if len(self.states) > 1 else "failed"
 
 
 def no_contact(depth_mm: float) -> str:

@@ -22,7 +22,7 @@ Range = tuple[float, float]
 
 
 class Comparison(Part):
-    """With the last state of another case, "with" in the file.
+    """A comparison with the last state of another case, "with" in the file.
 
     The displacement is the largest accepted difference at any node over the largest displacement, and needs the same
     mesh; the ratio is the accepted range of this case's normal force over the other's.
@@ -103,7 +103,7 @@ class Run:
 
     @property
     def assignments(self) -> list[str]:
-        """For --set, on top of the base scene; the element comes last, because a case may replace all of numerics."""
+        """Values of --set over the base scene; the element comes last, because a case may replace all of numerics."""
         file = SCENES / "objects" / f"{self.case.object}.stl"
         indenter = [f"contact.indenter={{ shape = 'mesh', file = '{file}' }}"] if self.case.object else []
         return [*indenter, *self.case.set, f"numerics.element={self.element!r}"]

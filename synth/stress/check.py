@@ -173,7 +173,7 @@ def measured(result: Result) -> dict[str, float]:
 def differences(
     result: Result, quantities: Mapping[str, float], expected: Expectation, others: Mapping[str, Result]
 ) -> list[str]:
-    """Where a result is not what was written down."""
+    """What of a result is not as it was written down."""
     found = []
     if result.outcome not in expected.outcome:
         found.append(f"{result.outcome}, expected {' or '.join(expected.outcome)}: {result.message or 'no reason'}")

@@ -26,7 +26,6 @@ from synth.stress.check import Result, Verdict, evaluate
 if TYPE_CHECKING:
     from rich.table import Table
 
-Report = Callable[[Result], None]
 PACKAGES = ("numpy", "scipy", "warp-lang", "pytetwild")
 WORKER = (sys.executable, "-m", "synth.stress.worker")
 
@@ -60,7 +59,7 @@ def run_stress(out: Path, only: Sequence[str] | None, workers: int, as_json: boo
     return 0 if all(verdict.ok for verdict in verdicts) else 1
 
 
-def all_results(runs: Sequence[Run], out: Path, workers: int, report: Report = lambda _: None) -> list[Result]:
+def all_results(runs: Sequence[Run], out: Path, workers: int, report: Callable[[Result], None]) -> list[Result]:
     """Results in the order of the runs.
 
     Runs that others are compared with come first and one by one: they make the meshes that the others then read
@@ -165,7 +164,7 @@ def _row(verdict: Verdict) -> dict[str, Any]:
 
 
 def outcome_table(verdicts: Sequence[Verdict]) -> "Table":
-    """For the terminal; fits 80 columns. "!" marks what ended otherwise than written down, "*" an explained one."""
+    """Fits 80 columns. "!" marks a run that ended otherwise than written down, "*" one whose deviation is explained."""
     from rich.markup import escape
     from rich.table import Table
 

@@ -45,7 +45,7 @@ class Plate:
 
     @staticmethod
     def of(mirror: Mirror) -> "Plate":
-        """From the scene's description: the rectangle laid flat, spun, tilted up about its first side, and turned."""
+        """The plate of a scene's mirror: its rectangle laid flat, spun, tilted up about its first side, and turned."""
         normal = np.array(mirror.normal) / math.hypot(*mirror.normal)
         width, height = mirror.size_mm
         flat = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]) * [width / 2, height / 2, 0]
@@ -154,7 +154,7 @@ class ForwardCamera:
         return np.where(lost[:, None], np.nan, pixels)
 
     def around(self, width: int, height: int) -> "ForwardCamera":
-        """With the field from which triangles reach into the image, some degrees wider than it.
+        """The camera with the field from which triangles reach into the image, some degrees wider than it.
 
         A fisheye lens's field grows, so that triangles at its end have whole images. A pinhole within a round gel has
         gel beside and behind it, whose images would be endless: its field ends soon after the image.
@@ -243,7 +243,7 @@ class ForwardCamera:
 
 
 def _angle(local: Points) -> FloatArray:
-    """To the camera's axis, radians (n,)."""
+    """Angles to the camera's axis, radians (n,)."""
     return np.asarray(np.arctan2(np.hypot(local[:, 0], local[:, 1]), local[:, 2]))
 
 

@@ -23,7 +23,7 @@ from synth.verify.report import Check, Report, SampleReport
 from synth.verify.sheet import Sheet
 
 _NAMED = {"scene.hash": "scene_hash", "seed": "seed", "index": "index"}
-"""Of the header of flow.exr, and of meta.json."""
+"""Keys in the header of flow.exr, and the same in meta.json."""
 
 
 def verify_dataset(path: Path | str, progress: Callable[[int, int], None] | None = None) -> Report:

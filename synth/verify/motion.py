@@ -28,9 +28,10 @@ _MANY = 0.02
 _HIDDEN_MM = 1e-4
 """A point is hidden if another lies higher by more than this on the way of its light to the camera. Queries are
 rounded to float32 (1e-6 px, 1e-7 mm), so heights agree to 1e-4 mm up to slopes of 1000."""
-_TOUCHING_MM = 1e-7
-_NEAR_MM = 0.01
+_TOUCHING_MM, _NEAR_MM = 1e-7, 0.01
+"""Distance up to which parts of the surface may touch: at one place, and within a thousandth of a px of it."""
 _SAME_PLACE_PX = 1e-4
+"""Difference up to which the recorded flow stands for the derived one."""
 Indices = NDArray[np.intp]
 _AROUND = BAND_PX * np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y], dtype=np.float64)
 

@@ -25,6 +25,7 @@ has a median above 0.1 px. Where most blocks are, in images too small for the co
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median
 
 from synth.arrays import BoolArray, FloatArray
 from synth.dataset.images import Raster
@@ -34,7 +35,7 @@ from synth.verify.report import Check
 
 NAME = "image 2 warped to image 1"
 ALLOWANCE_PX = 0.15
-"""For what is not the sensor's noise: shading, rendering noise and interpolation."""
+"""Allowance for what is not the sensor's noise: shading, rendering noise and interpolation."""
 _NOISE_FACTOR = 1.5
 """The median of 60 values scatters by 15 % of itself: three standard deviations."""
 _FEWEST = 60
@@ -96,8 +97,8 @@ def _bent_blocks(flow: FlowArray, usable: BoolArray, side: int) -> set[tuple[int
     bend = np.linalg.norm(bends, axis=3).max(axis=0)
     places = np.argwhere(usable)
     blocks, member = np.unique(places // side, axis=0, return_inverse=True)
-    values = bend[usable]
-    return {(int(r), int(c)) for i, (r, c) in enumerate(blocks) if np.median(values[member == i]) > _BENT_PX}
+    bent = median(bend[usable], member, np.arange(len(blocks))) > _BENT_PX
+    return {(row, column) for row, column in blocks[bent].tolist()}
 
 
 def _block_medians(channels: list[Textured], side: int) -> dict[tuple[int, int], tuple[float, float]]:
@@ -106,13 +107,9 @@ def _block_medians(channels: list[Textured], side: int) -> dict[tuple[int, int],
     blocks, member, count = np.unique(
         np.column_stack([row, column]) // side, axis=0, return_inverse=True, return_counts=True
     )
-    return {
-        (int(blocks[i, 0]), int(blocks[i, 1])): (
-            float(np.median(error[member == i])),
-            float(np.median(noise[member == i])),
-        )
-        for i in np.flatnonzero(count >= _FEWEST)
-    }
+    kept = np.flatnonzero(count >= _FEWEST)
+    medians = (median(part, member, kept).tolist() for part in (error, noise))
+    return {(r, c): (e, n) for (r, c), e, n in zip(blocks[kept].tolist(), *medians, strict=True)}
 
 
 def _unexplained(camera: Camera, one: FloatArray, two: FloatArray, flow: FlowArray, usable: BoolArray) -> Textured:

@@ -20,11 +20,11 @@ from synth.arrays import BoolArray, FloatArray, Pixels, Points, Triangles
 from synth.verify.camera import ForwardCamera
 
 _CONVERGED_PX = 1e-8
+"""Distance from the query at which Newton's method has arrived."""
 _INSIDE = -1e-7
 """Barycentric coordinates from here up count as inside: edges belong to both triangles; Newton leaves about 1e-9."""
-_CHORD_STEPS = 8
-_NEWTON_STEPS = 20
-_LONGEST_STEP = 0.5
+_CHORD_STEPS, _NEWTON_STEPS, _LONGEST_STEP = 8, 20, 0.5
+"""Most steps with the constant Jacobian and with Newton's, and the longest step in barycentric coordinates."""
 _STARTS = np.array([(i, j, 3 - i - j) for i in range(4) for j in range(4 - i)]) / 3
 
 
@@ -32,7 +32,7 @@ _STARTS = np.array([(i, j, 3 - i - j) for i in range(4) for j in range(4 - i)]) 
 class Layer:
     """One state of the surface, triangles (f, 3) and positions (v, 3) mm, as one path of the camera shows it.
 
-    The camera's image has so many px.
+    The camera's image has `width` x `height` px.
     """
 
     camera: ForwardCamera
@@ -187,7 +187,7 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """A state, triangles (f, 3) and positions (v, 3) mm, before the camera, whose image has so many px."""
+    """A state, triangles (f, 3) and positions (v, 3) mm, before a camera whose image has `width` x `height` px."""
 
     camera: ForwardCamera
     triangles: Triangles
@@ -234,7 +234,7 @@ class Sheet:
     def _found(
         self, layer: Layer, queries: Pixels
     ) -> tuple[NDArray[np.intp], NDArray[np.intp], FloatArray, NDArray[np.intp]]:
-        """What a layer shows at the queries, less what lens and mirrors do not; and its path, repeated."""
+        """What a layer shows at the queries, without what lens and mirrors do not show; and its path, repeated."""
         query, triangle, weights = layer.found(queries)
         if self.camera.plates or self.camera.is_fisheye:
             points = np.einsum("ni,nic->nc", weights, self.positions[self.triangles[triangle]])

@@ -13,11 +13,13 @@ import numpy as np
 from synth.arrays import FloatArray, Points
 from synth.scene import Window
 
-_DIFFERENCE = 1e-6
-_STEPS = 40
-_HALVINGS = 20
+_STEPS, _HALVINGS = 40, 20
+"""Most steps of Newton's method, and most halvings of one."""
 _MISS = 1e-13
-"""Of the distance from eye to point."""
+"""Largest miss over the distance from eye to point."""
+_DIFFERENCE = 1e-6
+_ARMS = _DIFFERENCE * np.eye(2)
+"""Steps of the differences, along both components of the aim."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,6 @@ class Shell:
 
     def _turned(self, rays: Points, eye: FloatArray, index: float) -> tuple[Points, Points]:
         """Where unit rays (n, 3) from the eye meet the face, and their unit directions behind it."""
-        place = np.full_like(rays, np.nan)
         across = rays[:, 0] ** 2 + rays[:, 1] ** 2
         with np.errstate(divide="ignore", invalid="ignore"):
             side = eye + rays * _later(across, rays[:, :2] @ eye[:2], eye[:2] @ eye[:2] - self.radius**2)[:, None]
@@ -106,9 +107,6 @@ class Shell:
             angle = np.arcsin(np.minimum(sine / index, 1))
             sideways = np.where(sine > 0, level / sine, 0)
         return place, np.cos(angle) * normal + np.sin(angle) * sideways
-
-
-_ARMS = _DIFFERENCE * np.eye(2)
 
 
 def _later(square: FloatArray | float, half: FloatArray, constant: FloatArray | float) -> FloatArray:

@@ -82,7 +82,7 @@ def test_the_command(one_case: None, tmp_path: Path, monkeypatch, capsys: pytest
 
 
 def test_references_that_are_none_are_refused(monkeypatch: pytest.MonkeyPatch, shallow: Trajectory) -> None:
-    lost = replace(shallow, status="partial")
+    lost = replace(shallow, reason="lost")
     monkeypatch.setattr(fem, "stepper_of", lambda *_: type("Ended", (), {"run": lambda self: lost})())
     with pytest.raises(RuntimeError, match="is partial"):
         fem.reference.__wrapped__("centred", 8)

@@ -33,7 +33,7 @@ from synth.simulate.press import Press
 from synth.simulate.solve import stepper_of
 from synth.simulate.space import Space, function_space
 from synth.simulate.stepping import Stepper
-from synth.simulate.system import System, Tangent, Unknowns
+from synth.simulate.system import Residual, System, Tangent, Unknowns
 from synth.simulate.tables import pack_indenter, place_indenter
 from synth.surface import ContactFaces
 
@@ -195,6 +195,17 @@ def supported(mesh: PadMesh, element: Element, held: Callable[[Points], BoolArra
     return replace(space, held=held(space.points))
 
 
+class LoadedSystem(System):
+    """A system under dead loads (n, 3), nodal forces in E mm²."""
+
+    load: FloatArray
+
+    def residual(self, state: Unknowns, indenter: Indenters) -> Residual:
+        found = super().residual(state, indenter)
+        full = np.concatenate([self.load.ravel(), np.zeros_like(state.p)])
+        return replace(found, free=found.free - full[self.free], reaction=found.reaction - self.load)
+
+
 def equilibrium(
     space: Space,
     material: Material,
@@ -209,11 +220,11 @@ def equilibrium(
     Returns the system, its state, and all nodal forces (n, 3), which the supports exert.
     """
     goal = np.zeros_like(space.points) if prescribed is None else prescribed
-    body = System(space, material, load=load)
+    body = LoadedSystem(space, material)
     state = guess or body.zero()
     before = state
     for k in range(1, steps + 1):
-        body.load = None if load is None else load * (k / steps)
+        body.load = np.zeros_like(space.points) if load is None else load * (k / steps)
         ahead = state.plus(Unknowns(state.u - before.u, state.p - before.p), 1.0)
         start = Unknowns(np.where(space.held, goal * (k / steps), ahead.u), ahead.p)
         solution = solve(body, start, far_away(), tolerance)

@@ -17,6 +17,7 @@ from kinematic_double import sheet
 
 from synth.dataset.job import Job
 from synth.dataset.sample import Sample
+from synth.dataset.sample_files import write_sample_files
 from synth.dataset.writer import DatasetWriter
 from synth.flow.field import FlowField
 from synth.scene import Scene
@@ -70,7 +71,6 @@ def translation_sample(
         diagnostics={"solver": [solver, {**solver, "depth_mm": np.float64(0.2)}]},
         force_n=np.array([[0.0, 0.0, 0.5], [0.1, 0.0, 1.5]]),
         torque_nmm=np.zeros((2, 3)),
-        seconds={"simulate": 0.1 + index, "render": 0.2},
     )  # fmt: skip
 
 
@@ -81,23 +81,28 @@ def job(n: int = 3, *, seed: int = 7, **changes: object) -> Job:
     return Job(scene, "flat", scene_hash, seed, n, software, device)
 
 
+def write(writer: DatasetWriter, *samples: Sample) -> None:
+    for sample in samples:
+        entry = write_sample_files(writer._store.out, sample, writer.job)
+        writer.record(replace(entry, seconds={"simulate": 0.1 + sample.index, "render": 0.2}))
+
+
 def write_dataset(folder: Path, samples: Iterable[Sample], n: int = 3) -> Path:
     with DatasetWriter(folder, job(n)) as writer:
-        for sample in samples:
-            writer.write(sample)
+        write(writer, *samples)
     return folder
 
 
 HOLD = """
 import sys
 sys.path[:0] = sys.argv[4:]
-from samples import job, translation_sample
+from samples import job, translation_sample, write
 from synth.dataset.shard import Shard
 from synth.dataset.writer import DatasetWriter
 shard = Shard.parse(sys.argv[2]) if sys.argv[2] else None
 with DatasetWriter(sys.argv[1], job(6), shard, 2) as writer:
     for index in sys.argv[3].split():
-        writer.write(translation_sample(int(index)))
+        write(writer, translation_sample(int(index)))
     print("held", flush=True)
     sys.stdin.readline()
 """

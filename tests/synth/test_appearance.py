@@ -12,7 +12,7 @@ from render_scenes import needs_llvm
 
 from synth.arrays import FloatArray
 from synth.calibrate.run import middle, render_settings
-from synth.mesh import flat_surface
+from synth.mesh import rest_surface
 from synth.render.camera_image import camera_image
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
@@ -87,7 +87,7 @@ def speckle(image: FloatArray) -> dict[str, float]:
 def test_a_rendered_gel_measures_as_its_photographs_within_a_tenth(scene: str, folder: str, measure) -> None:
     template = load_scene(scene, [])
     sensor = validated(replaced(template.content["sensor"], middle), scene, Sensor, "sensor")
-    surface, texture = flat_surface(sensor.gel.size_mm), albedo(sensor, np.random.default_rng(0))
+    surface, texture = rest_surface(sensor.gel), albedo(sensor, np.random.default_rng(0))
     renderer = Renderer(sensor, render_settings(template), surface, texture, choose_variant("auto"))
     radiance = renderer.radiance(surface.material, 0)
     rendered = measure(camera_image(radiance, sensor.camera, np.random.default_rng(1)).astype(float))

@@ -26,7 +26,7 @@ from synth.calibrate.profile import fit_profile
 from synth.calibrate.run import MARK, start_sensor
 from synth.calibrate.sensor_fit import SensorFit, fit_sensor
 from synth.cli import main
-from synth.mesh import flat_surface
+from synth.mesh import rest_surface
 from synth.optics import Optics
 from synth.render.camera_image import camera_image
 from synth.render.pattern import albedo
@@ -65,7 +65,7 @@ def _truth(start: Sensor) -> Sensor:
 
 def _frame(sensor: Sensor) -> FloatArray:
     """The undeformed gel's picture as an 8-bit camera gives it, in [0, 1]."""
-    surface, texture = flat_surface(sensor.gel.size_mm), albedo(sensor, np.random.default_rng(0))
+    surface, texture = rest_surface(sensor.gel), albedo(sensor, np.random.default_rng(0))
     renderer = Renderer(sensor, Render(samples_per_pixel=144, max_depth=2), surface, texture, FAST)
     return camera_image(renderer.radiance(surface.material, 1), sensor.camera, np.random.default_rng(5)) / 255
 
@@ -141,7 +141,7 @@ def test_contributions_are_what_the_renderer_renders(
     light = sensor.lights[1].model_copy(update={"power": 200.0, "size_mm": (3.0, 0.5), "viewing_angle_deg": angle})
     dark = light.model_copy(update={"position_mm": shade[0], "size_mm": (3.0, shade[1]), "power": 1e-9})
     sensor = sensor.model_copy(update={"lights": (light, dark)})  # the second shades a part of the first's
-    surface = flat_surface(sensor.gel.size_mm)
+    surface = rest_surface(sensor.gel)
     render = Render(samples_per_pixel=256, max_depth=2 if coating else 3)  # a matt gel lights itself by the window
     image = Renderer(sensor, render, surface, plain(), FAST).radiance(surface.material, 0)
     columns, rows = _every(8)
@@ -159,7 +159,7 @@ def test_a_matt_gel_is_lit_by_itself_by_way_of_the_window() -> None:
     thin = {"thickness_mm": 1.2, "refractive_index": 2.0}  # total reflection beyond 30 degrees
     window = _start().window.model_copy(update=thin)
     bright, dim = (_start(reflectance=(value,) * 3).model_copy(update={"window": window}) for value in (0.9, 0.45))
-    surface, (columns, rows) = flat_surface(bright.gel.size_mm), _every(8)
+    surface, (columns, rows) = rest_surface(bright.gel), _every(8)
     renders = (Render(samples_per_pixel=64, max_depth=depth, light="separated") for depth in (2, 3))
     pictures = (Renderer(bright, one, surface, plain(0.9), FAST).radiance(surface.material, 0) for one in renders)
     direct, both = (picture[rows, columns, 0].mean() for picture in pictures)

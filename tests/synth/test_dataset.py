@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from commands import refused, said
-from samples import job, translation_sample, tree, write_dataset, writing_elsewhere
+from samples import job, translation_sample, tree, write, write_dataset, writing_elsewhere
 from tiny_scene import fingerprint
 
 from synth.cli import main
@@ -80,7 +80,7 @@ def test_order_and_interruptions_leave_no_trace(tmp_path):
     _write_all(tmp_path / "a")
     _write_all(tmp_path / "b", order=(2, 0, 1))
     killed = DatasetWriter(tmp_path / "c", job(1))
-    killed.write(translation_sample(2))
+    write(killed, translation_sample(2))
     killed.fail(1, 0, "simulate", "Newton failed")
     write_sample_files(tmp_path / "c", translation_sample(0), job())  # Whole, but without its line.
     stale = tmp_path / "c" / "samples" / ".000001.partial-99"
@@ -94,7 +94,7 @@ def test_order_and_interruptions_leave_no_trace(tmp_path):
         assert not stale.exists()
         writer.fail(1, 0, "simulate", "Newton failed")
         for index in (1, 0, 1):  # once more: recorded once
-            writer.write(translation_sample(index))
+            write(writer, translation_sample(index))
     assert (tmp_path / "b" / "failures.jsonl").read_bytes() == b""
     for name in "ab":
         with DatasetWriter(tmp_path / name, job()) as writer:
@@ -111,7 +111,7 @@ def test_lost_folder_is_made_again_and_n_may_grow_and_shrink(tmp_path):
     (tmp_path / "d" / "samples" / "000001" / "flow.exr").unlink()
     with DatasetWriter(tmp_path / "d", job()) as writer:
         assert writer.finished == {0, 2}
-        writer.write(translation_sample(1))
+        write(writer, translation_sample(1))
     assert tree(tmp_path / "d") == before
     for n, expected in ((5, 5), (2, 5)):
         with DatasetWriter(tmp_path / "d", job(n)) as writer:
@@ -149,7 +149,7 @@ def _full(*_: object) -> int:
 def test_full_disk_in_the_manifest(tmp_path, monkeypatch, call):
     """The line is half on the disk when the space ends: it is taken back."""
     with DatasetWriter(tmp_path / "d", job()) as writer:
-        writer.write(translation_sample(0))
+        write(writer, translation_sample(0))
         entry = write_sample_files(tmp_path / "d", translation_sample(1), job())
         before = tree(tmp_path / "d")
         whole = os.write
@@ -193,7 +193,7 @@ def _in_one_go(directory: Path) -> dict[str, object]:
 
 def _make(writer: DatasetWriter, indices: Iterable[int]) -> None:
     for index in indices:
-        writer.write(translation_sample(index))
+        write(writer, translation_sample(index))
         if index == 4:
             writer.fail(4, 0, "simulate", "Newton failed")
 

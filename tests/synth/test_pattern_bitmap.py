@@ -16,7 +16,8 @@ from synth.arrays import FloatArray
 from synth.dataset.reader import read_dataset
 from synth.pipeline.generate import generate
 from synth.planning import check_buildable
-from synth.render.pattern import albedo, check_pattern, read_picture
+from synth.render.bitmap import read_picture
+from synth.render.pattern import albedo, check_pattern
 from synth.render.variant import choose_variant
 from synth.scene import Bitmap, Coating, Sensor
 from synth.scene.template import load_scene

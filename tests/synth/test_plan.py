@@ -121,7 +121,7 @@ def test_shipped_scenes_are_planned_and_buildable(name: str) -> None:
     else:
         check_buildable(template, SCALAR)
     planned = plan(template, LLVM)
-    record = json.loads(json.dumps({**planned.record(), **predict(planned).record()}))
+    record = json.loads(json.dumps({**planned.record(), **vars(predict(planned))}))
     assert record["scene"] == name
     assert record["nodes"] > 1000
     assert all(seconds > 0 for seconds in record["seconds_per_pair"].values())

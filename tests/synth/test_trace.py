@@ -5,8 +5,9 @@ import pytest
 from kinematic_double import FISHEYE, LENS, OBLIQUE, SIDES, assert_same_flow, optics, pixel_centres, sheet
 
 from synth.flow.exact import exact_flow
+from synth.flow.overlap import boundary_edges, may_overlap
 from synth.flow.trace import trace
-from synth.flow.view import View, boundary_edges, may_overlap
+from synth.flow.view import View
 
 RNG = np.random.default_rng(5)
 SURFACE = sheet(28, 21, 40.0, 30.0)

@@ -12,6 +12,7 @@ import pytest
 from commands import refused
 from kinematic_double import LENS, OBLIQUE, sensor, sheet
 from rich.console import Console
+from samples import write
 from verified_sample import HEIGHT, WIDTH, as_sample, make_sample, motion_checks, pressed, scene, sheets
 
 from synth.dataset.exr import read_channels, write_flow
@@ -20,11 +21,11 @@ from synth.dataset.reader import SampleData
 from synth.dataset.writer import DatasetWriter
 from synth.flow.field import FlowField
 from synth.scene import Outputs
-from synth.verify import Check, Report, SampleReport, verify_dataset, verify_sample
-from synth.verify.dataset import flow_file_problems
+from synth.verify.dataset import flow_file_problems, verify_dataset, verify_sample
 from synth.verify.motion import check_motion
 from synth.verify.photometry import NAME as PHOTOMETRY
 from synth.verify.photometry import check_photometry
+from synth.verify.report import Check, Report, SampleReport
 
 SCENE = scene()
 
@@ -151,8 +152,7 @@ def test_photometry_tells_the_right_flow_from_wrong_ones_or_that_it_does_not_app
 def test_dataset_on_disk(tmp_path, sample):
     path, seen = tmp_path / "data", []
     with DatasetWriter(path, Job(SCENE.model_dump(mode="json"), "double", "0", seed=0, n=2)) as writer:
-        writer.write(as_sample(0, SCENE, sample))
-        writer.write(as_sample(1, SCENE, sample))
+        write(writer, as_sample(0, SCENE, sample), as_sample(1, SCENE, sample))
     report = verify_dataset(path, progress=lambda *numbers: seen.append(numbers))
     assert report.ok
     assert [s.index for s in report.samples] == [0, 1]

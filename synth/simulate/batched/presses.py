@@ -11,7 +11,7 @@ from synth.simulate.press import Press
 from synth.simulate.space import Space
 from synth.simulate.stepping import MAX_PENETRATION
 from synth.simulate.tables import struct_of
-from synth.simulate.trajectory import State, Trajectory, no_contact, not_converged, too_deep, trajectory_of, undeformed
+from synth.simulate.trajectory import State, Trajectory, no_contact, not_converged, too_deep, undeformed
 
 
 def press_tables(
@@ -76,7 +76,7 @@ def _stacked(arrays: Sequence[np.ndarray]) -> np.ndarray:
 def untouched(press: Press, space: Space) -> Trajectory:
     """The trajectory of an indenter that never touches: the gel stays as it is."""
     places = (0.0, *press.path.records().tolist())
-    return trajectory_of(tuple(undeformed(press.path.pose(place), space) for place in places), "", 0.0, space)
+    return Trajectory(tuple(undeformed(press.path.pose(place), space) for place in places), "", 0.0, space)
 
 
 def trajectory(
@@ -97,7 +97,7 @@ def trajectory(
         NO_CONTACT: no_contact(target),
         TOO_DEEP: too_deep(press.path.pose(target), MAX_PENETRATION),
     }
-    return trajectory_of(tuple(states), reasons[code], seconds, space)
+    return Trajectory(tuple(states), reasons[code], seconds, space)
 
 
 def _state(press: Press, length: float, record: FloatArray, space: Space) -> State:
