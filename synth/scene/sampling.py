@@ -1,5 +1,7 @@
 """Random instances of a scene: what sample i shows depends on (scene, seed, i) alone.
 
+With `sampling.common_draws` the scene's hash is left out of what follows.
+
 Sample i belongs to trajectory i // pairs_per_trajectory, and a trajectory to a sensor in the same way. Each level has
 its own random streams, seeded by the scene's hash, the job's seed, the level's name, its number and the attempt: a draw
 that cannot be used is drawn again. Workers, batches and resumption do not enter.
@@ -46,7 +48,8 @@ class Pair:
 
 def stream(template: Template, seed: int, purpose: str, *numbers: int) -> np.random.Generator:
     """The random stream of one purpose."""
-    entropy = [int(template.hash, 16), seed, zlib.crc32(purpose.encode()), *numbers]
+    scene = 0 if template.sampling.common_draws else int(template.hash, 16)
+    entropy = [scene, seed, zlib.crc32(purpose.encode()), *numbers]
     return np.random.default_rng(np.random.SeedSequence(entropy))
 
 

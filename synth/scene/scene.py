@@ -37,10 +37,12 @@ class Outputs(Part):
 
 
 class Sampling(Part):
-    """How random instances are shared: samples of one trajectory, trajectories of one sensor."""
+    """How random instances are shared: samples of one trajectory, trajectories of one sensor, draws of several scenes."""
 
     pairs_per_trajectory: Annotated[int, Field(ge=1, le=1000)] = 2
     trajectories_per_sensor: Annotated[int, Field(ge=1, le=100000)] = 2
+    common_draws: bool = False
+    """Draw by seed and number alone: scenes that differ in fixed values get the same gels and presses."""
 
 
 class Scene(Part):

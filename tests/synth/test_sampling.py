@@ -61,6 +61,8 @@ def test_a_draw_is_a_function_of_scene_seed_and_number_as_streams_are_of_purpose
     scenes.append(draw(load_scene(tiny, ["numerics.tolerance=1e-7"]), 3, 7))
     depths = {scene.motion.depth_mm for scene in scenes}
     assert len(depths) == 5
+    common = [load_scene(tiny, ["sampling.common_draws=true", f"numerics.tolerance={x}"]) for x in (1e-6, 1e-7)]
+    assert len({draw(one, 3, 7).motion.depth_mm for one in common} | depths) == 6
     assert draw(template, 10**30, 7) != draw(template, 0, 7)  # seeds of any size
     numbers = {
         float(stream(template, seed, purpose, *key).random())
