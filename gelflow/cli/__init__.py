@@ -3,6 +3,7 @@
 Exit status: 0 done, 1 done in part, 2 wrong input, 130 interrupted. Nothing heavy is imported before a command runs.
 """
 
+import os
 import sys
 import traceback
 from collections.abc import Sequence
@@ -29,6 +30,7 @@ for command in (train, finetune, evaluate, compare, predict, export, pairs):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command and returns the exit status. A mistake is one line on stderr, or a traceback with --debug."""
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # torch's threads that spin lose most of a busy machine's time
     tokens = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in tokens
     tokens = [token for token in tokens if token != "--debug"]
