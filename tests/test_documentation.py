@@ -12,12 +12,13 @@ from pathlib import Path
 import pytest
 
 import gelflow.cli
+import synth
 import synth.cli
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs" / "guide").glob("*.md"))]
 APPS = {"synth": synth.cli.app, "gelflow": gelflow.cli.app}
-EXAMPLES = Path(__file__).parents[1] / "examples"
+EXAMPLES = ROOT / "examples"
 NUMBER = r"(\d+\.\d+)"
 
 
@@ -51,6 +52,19 @@ def test_commands_are_known() -> None:
     assert len(shown) > 30
     for program, *arguments in shown:
         APPS[program].parse_args(arguments, exit_on_error=False, print_error=False)
+
+
+def test_tables_are_scenes(tmp_path: Path) -> None:
+    """A table extends what its page says, or a flat sensor; only files of the reader's own may be missing."""
+    for page in PAGES:
+        base = f'extends = "{"allsight" if page.stem == "round_sensor" else "gelsight_mini"}"\n'
+        for table in re.findall(r"```toml\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL):
+            (scene := tmp_path / "mine.toml").write_text(table if "extends" in table else base + table)
+            try:
+                synth.plan(synth.load_scene(scene))
+            except ValueError as error:
+                if "there is no file" not in str(error):
+                    raise
 
 
 MODULES = [
