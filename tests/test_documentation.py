@@ -61,7 +61,7 @@ def test_tables_are_scenes(tmp_path: Path) -> None:
         for table in re.findall(r"```toml\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL):
             (scene := tmp_path / "mine.toml").write_text(table if "extends" in table else base + table)
             try:
-                synth.plan(synth.load_scene(scene))
+                synth.plan(scene)
             except ValueError as error:
                 if "there is no file" not in str(error):
                     raise
