@@ -102,15 +102,8 @@ def test_debug_adds_the_traceback_which_a_mistake_of_the_program_keeps(said: Run
 
 def test_plan_explains_and_predicts_and_a_dry_run_writes_nothing(said: Run, tiny: Path, tmp_path: Path) -> None:
     out = said("plan", "--scene", tiny, "--set", "contact.friction=0", "--n", "100")
-    expected = (
-        "friction state",
-        "left out",
-        "contact.friction = 0",
-        "predicted per pair",
-        "for 100 pairs",
-        "factor of",
-    )
-    assert [words for words in expected if words not in out] == []
+    wanted = ("friction state", "left out", "contact.friction = 0", "predicted per pair", "for 100 pairs", "factor of")
+    assert [words for words in wanted if words not in out] == []
     unread = f"{sys.executable} -m synth plan --json | true; exit ${{PIPESTATUS[0]}}"
     assert subprocess.run(["bash", "-c", unread], stderr=subprocess.PIPE).returncode == 141
     answer = json.loads(said("plan", "--scene", tiny, "--json", "--n", "100"))
