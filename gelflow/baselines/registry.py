@@ -21,9 +21,9 @@ CLASSICAL: dict[str, Method] = {
 }
 """The paper's methods that need no training, and no motion."""
 
-BESIDE: dict[str, Method] = {"exact": ExactFlow(), "al-dic": ALDIC()}
-"""Methods that the paper does not have: the answer itself, where the data have it, and pyALDIC, another package that
-is named where it is missing."""
+BESIDE: dict[str, Method] = {"al-dic": ALDIC(), "exact": ExactFlow()}
+"""Methods that the paper does not have: pyALDIC, another package that is named where it is missing, and the answer
+itself, where the data have it."""
 
 REGISTERED = {f"dis-{aim}": (aim, settings) for aim, settings in REGISTRATIONS.items() if settings is not None}
 """DIS medium with this project's registration, which may run on a device; not in the paper."""
@@ -38,7 +38,7 @@ def named_methods(names: Sequence[str], device: str = "cpu") -> list[Method]:
     known = [*CLASSICAL, *REGISTERED, *BESIDE]
     for name in names:
         if name not in known:
-            raise InputError(f"there is no method {name!r}; allowed: {', '.join(known)}")
+            raise InputError(f"there is no method {name!r}; allowed: {', '.join(known[:-1])}; in compare, exact")
         if list(names).count(name) > 1:
             raise InputError(f"the method {name!r} is given twice")
     plain = CLASSICAL | BESIDE

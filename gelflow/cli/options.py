@@ -35,6 +35,12 @@ Registration = Annotated[
 ]
 
 
+METHODS = (
+    "none, lucas-kanade, farneback, dis-ultrafast, dis-fast, dis-medium, tvl1, dis-motion, dis-both, "
+    "dis-brightness, al-dic"
+)
+
+
 def each_key_once(_: Any, given: Sequence[str] | None) -> None:
     """Refuses a --set that a later one would undo: the same key again, or the table that holds it."""
     keys = [text.partition("=")[0].strip() for text in given or ()]

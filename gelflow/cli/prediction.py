@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from gelflow.cli.options import AsJson, OnDevice, Out, Registration, ShippedOrFile, Size, parse_size
+from gelflow.cli.options import METHODS, AsJson, OnDevice, Out, Registration, ShippedOrFile, Size, parse_size
 from gelflow.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,13 +23,7 @@ def predict(
     *,
     out: Out,
     weights: ShippedOrFile = None,
-    method: Annotated[
-        str | None,
-        Parameter(
-            help="In place of the network: lucas-kanade, farneback, dis-ultrafast, dis-fast, dis-medium, tvl1, "
-            "dis-motion, dis-both, dis-brightness, al-dic."
-        ),
-    ] = None,
+    method: Annotated[str | None, Parameter(help=f"In place of the network: {METHODS}.")] = None,
     registration: Registration = None,
     reference: Annotated[
         Literal["first", "previous"], Parameter(help="Of a video: flow from its first or from the previous frame.")

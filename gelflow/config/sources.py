@@ -28,8 +28,8 @@ def train_config(
     The path is a preset's name, or a TOML file with the fields of `TrainConfig`; tables [model] and [loss]. Assignments
     are `key=value`, key with dots (`loss.lambda_dc=10`), value in TOML; a value that is no TOML is text. `options` are
     top-level fields given by options of their own; None values are left out. The fields of `start` stand before the
-    file is read. InputError where the file cannot be read, an assignment is malformed, or a field does not exist or is
-    out of range.
+    file is read. A preset's warm-up is shortened where the run would end in it. InputError where the file cannot be
+    read, an assignment is malformed, or a field does not exist or is out of range.
     """
     values: dict[str, Any] = {name: dict(v) if isinstance(v, Mapping) else v for name, v in (start or {}).items()}
     sources = []
@@ -44,6 +44,9 @@ def train_config(
         sources.append("--set")
     given = {name: value for name, value in (options or {}).items() if value is not None}
     values |= given
+    steps, stated = values.get("steps"), any(text.partition("=")[0].strip() == "warmup_steps" for text in assignments)
+    if str(path) in PRESETS and isinstance(steps, int) and not stated:
+        values["warmup_steps"] = max(0, min(values.get("warmup_steps", 0), steps - 1))
     sources += [f"--{name}" for name in given]
     return validated(TrainConfig, values, " with ".join(sources) or "default configuration")
 

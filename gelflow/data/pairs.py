@@ -100,7 +100,10 @@ class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
 
         Raises:
             InputError: An image is missing, damaged or too small, or the two differ in size.
+            IndexError: There is no pair of this number.
         """
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"there is no pair {index}: {self.source} has {len(self)}, the first is 0")
         record = self.records[index]
         # Of a path, read_pair asks for is_file, read_bytes and its text: all that a member of a shard has, too.
         return read_pair(cast(Path, record.image1), cast(Path, record.image2))
@@ -122,8 +125,7 @@ class PairDataset(Dataset[dict[str, Tensor | str | bool]]):
 
     def __getitem__(self, index: int) -> dict[str, Tensor | str | bool]:
         """The sample that the class describes; InputError where a file is missing or damaged, or the sizes differ."""
-        record = self.records[index]
-        images = self.images(index)
+        images, record = self.images(index), self.records[index]
         size = images[0].shape[:2]
         image1, image2 = (_channels_first(image) for image in images)
         sample: dict[str, Tensor | str | bool] = {

@@ -12,6 +12,8 @@ from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
+from operator import index
+from pathlib import Path
 from typing import Any
 
 from synth import __version__
@@ -119,7 +121,8 @@ Progress = Callable[[int, int], None]
 
 
 def make_job(plan: Plan, n: int, seed: int) -> Job:
-    """The record of what is asked for; InputError for n < 1 or a negative seed."""
+    """The record of what is asked for; InputError for n < 1 or a negative seed, TypeError for no whole numbers."""
+    n, seed = index(n), index(seed)
     if n < 1:
         raise InputError(f"--n = {n}: ask for at least 1 sample")
     if seed < 0:
@@ -136,7 +139,7 @@ def make_job(plan: Plan, n: int, seed: int) -> Job:
 
 
 def generate(
-    scene: Template,
+    scene: Template | str | Path,
     n: int,
     out: Output,
     seed: int = 0,
@@ -147,7 +150,7 @@ def generate(
     """Write samples 0 .. n - 1 of a scene, or one shard of them; those that are there already are kept.
 
     Args:
-        scene: of `load_scene`.
+        scene: of `load_scene`, or the name or path of one.
         n: number of samples in the dataset, at least 1.
         out: the dataset's directory or fsspec URL.
         seed: of everything random, not negative.
@@ -166,7 +169,7 @@ def generate(
     _check(scheduling, out)
     planned = plan(scene, variant)
     job = make_job(planned, n, seed)
-    count = scene.sampling.pairs_per_trajectory
+    count = planned.template.sampling.pairs_per_trajectory
     with DatasetWriter(out, job, scheduling.shard, count) as writer:
         context = JobContext(planned, job, out, user_cache())
         finished = writer.finished

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 from synth.errors import InputError
@@ -15,7 +16,7 @@ from synth.render.thin_lens import check_views
 from synth.render.variant import Device, Variant, choose_variant
 from synth.scene import MeshIndenter
 from synth.scene.sampling import check_pairs
-from synth.scene.template import Template
+from synth.scene.template import Template, load_scene
 from synth.simulate.indenter import object_triangles, rigid_body
 from synth.simulate.material import DISPLACEMENT_ONLY_BELOW
 from synth.simulate.press import MeshRule
@@ -55,11 +56,11 @@ class Plan:
         return {**named, "decisions": [vars(decision) for decision in self.decisions]}
 
 
-def plan(scene: Template, variant: Variant | None = None) -> Plan:
+def plan(scene: Template | str | Path, variant: Variant | None = None) -> Plan:
     """Decide what runs, with reasons.
 
     Args:
-        scene: of `load_scene`.
+        scene: of `load_scene`, or the name or path of one.
         variant: the renderer; by default the fastest here that the scene needs.
 
     Raises:
@@ -71,6 +72,7 @@ def plan(scene: Template, variant: Variant | None = None) -> Plan:
         >>> [decision.reason for decision in planned.decisions if decision.feature == "friction state"]
         ['contact.friction = 0: half the matrix is enough']
     """
+    scene = scene if isinstance(scene, Template) else load_scene(scene)
     variant = variant or job_variant(scene, "auto")
     check_buildable(scene, variant)
     round_first = sorted(scene.corners, key=lambda corner: not corner.sensor.gel.is_round)

@@ -77,20 +77,19 @@ def _speckle(pattern: Speckle, x: FloatArray, y: FloatArray, rng: np.random.Gene
 
 
 def _round_dots(pattern: Dots, chart: RoundChart, x: FloatArray, y: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Rows of dots along meridians, of which every other one ends where dots would be less than their size apart."""
+    """Rows of dots along meridians, halved in number, and even, where dots would be less than their size apart."""
     softness = max(pattern.softness_mm, x[1] - x[0], y[1] - y[0])
     coverage = np.zeros((len(y), len(x)))
     (across_mm, along_mm), (turned, first) = pattern.spacing_mm, pattern.offset_mm
     meridians = max(1, round(2 * math.pi * chart.radius / across_mm))
-    azimuths = turned / chart.radius + 2 * math.pi / meridians * np.arange(meridians)
     if pattern.placing == "spherical":
         arcs = np.arange(first % along_mm, chart.end, along_mm)
     else:
         arcs = chart.arc(np.arange(first % along_mm, chart.top, along_mm))
     for arc in arcs:
         room = max(1.0, 2 * math.pi * float(chart.across(np.array(arc))) / (4 * pattern.radius_mm))
-        stride = 2 ** max(0, math.ceil(math.log2(meridians / room)))
-        for azimuth in azimuths[::stride]:
+        count = max(1, meridians // 2 ** max(0, math.ceil(math.log2(meridians / room))))
+        for azimuth in turned / chart.radius + 2 * math.pi / count * np.arange(count):
             shift, aside, grow = rng.standard_normal(3)
             place = max(0.0, arc + pattern.jitter_mm * shift)
             angle = azimuth + pattern.jitter_mm * aside / max(float(chart.across(place)), pattern.radius_mm)

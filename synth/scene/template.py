@@ -128,6 +128,8 @@ def load_scene(name_or_path: str | Path, set: Sequence[str] = ()) -> Template:
         >>> scene.name, scene.content["motion"]["depth_mm"]
         ('deltact', 1.0)
     """
+    if isinstance(set, str):
+        raise InputError(f"set = {set!r}: a list is needed, as in set=[{set!r}]")
     path = _find(name_or_path)
     content = _read(path)
     for override in set:

@@ -16,6 +16,7 @@ from textures import as_bytes, moved, save, write_folder, write_synthetic, write
 from waves import random_weights
 
 from gelflow.cli import main
+from gelflow.cli.options import METHODS
 from gelflow.config import ModelConfig
 from gelflow.models.raft import RAFT
 from gelflow.models.weights import read_metadata
@@ -52,7 +53,7 @@ def test_the_module_passes_the_status_on_and_debug_shows_the_traceback(capsys: p
     (["predict", ".", ".", ".", "--out", "o", "--method", "none"], "3 inputs"),
     (["predict", ".", "--out", "o", "--weights", "w", "--method", "tvl1"], "--weights"),
     (["predict", ".", "--out", "o"], "holds no image"),
-    (["predict", ".", "--out", "o", "--method", "raft"], "raft"),
+    (["predict", ".", "--out", "o", "--method", "raft"], f"allowed: {METHODS}; in compare"),
     (["evaluate", ".", "--weights", "none.safetensors"], "none.safetensors"),
     (["compare", ".", "--weights", "best=none.safetensors"], "none.safetensors"),
     (["compare", ".", "--weights", "x", "--size", "big"], "--size big"),
@@ -79,6 +80,8 @@ def test_compare_and_predict_print_tables_files_and_json(tmp_path: Path, capsys:
     text = said(capsys, main, "compare", folder, "--methods", "none,dis-fast", "--out", tmp_path / "out")
     assert "DIS fast" in text
     assert "000000" in text
+    unread = f"{sys.executable} -m gelflow compare {folder} --methods none --json | true; exit ${{PIPESTATUS[0]}}"
+    assert subprocess.run(["bash", "-c", unread], stderr=subprocess.PIPE).returncode == 141
     answer = json.loads(said(capsys, main, "compare", folder, "--methods", "none", "--json"))
     assert answer["methods"][0]["endpoint_error_px"] == pytest.approx(5**0.5, rel=1e-6)  # float32 flow
     folder = write_folder(tmp_path / "in", {"a": (1, 0)})
@@ -97,7 +100,8 @@ def test_images_and_folders_that_cannot_be_used_are_named(tmp_path: Path, capsys
     assert "40 x 32" in fails(capsys, "compare", tmp_path, "--methods", "none")
     assert "40 x 32" in fails(capsys, "predict", one, two, *tail, tmp_path / "out")
     assert "1 x 1" in fails(capsys, "predict", tiny, tiny, *tail, tmp_path / "out")
-    assert str(tiny) in fails(capsys, "predict", one, one, *tail, tiny / "x")
+    for out in (tiny, tiny / "x"):
+        assert f"{out}: is a file or lies in one" in fails(capsys, "predict", one, one, *tail, out)
 
 
 def test_pairs_exit_statuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -112,7 +116,7 @@ def test_pairs_exit_statuses(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert main(["pairs", str(good), str(bad), "--out", str(tmp_path / "b")]) == 1
     captured = capsys.readouterr()
     assert "bad.avi" in captured.err
-    assert "1 unreadable" in captured.out
+    assert " pairs from 1 recording (0 without enough motion, 1 unreadable)" in captured.out
     assert "none of the 1 recordings" in said(capsys, main, "pairs", bad, "--out", tmp_path / "c", status=2)
     assert "--min-motion" in fails(capsys, "pairs", good, "--out", tmp_path / "d", "--min-motion", "50")
     assert "seed is 0 there and 1 here" in fails(capsys, "pairs", good, "--out", tmp_path / "a", "--seed", "1")

@@ -154,6 +154,8 @@ def test_digest_tells_scene_and_seed_and_flow_of_another_size_is_named(tmp_path:
     assert PairDataset(folder).digest == digests[-1]
     write_flow(folder / "samples" / "000000" / "flow.exr", np.zeros((10, 10, 2), np.float32))
     refused(r"flow\.exr.*10 x 10.*80 x 64", PairDataset(folder).__getitem__, 0)
+    with pytest.raises(IndexError, match=r"there is no pair 9: .* has 1"):
+        PairDataset(folder)[9]
 
 
 def test_plain_folders_may_have_markers_and_what_is_no_data_set_is_named(tmp_path: Path) -> None:

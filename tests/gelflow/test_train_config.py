@@ -109,7 +109,7 @@ def test_presets_say_what_they_differ_in() -> None:
 def test_every_preset_trains(name: str, tmp_path: Path) -> None:
     torch.set_num_threads(1)
     # The published numbers of levels and channels are what takes the time: two steps at the smallest size.
-    tiny = ["steps=2", "warmup_steps=0", "batch_size=2", "image_size=[64, 64]", "crop_size=[64, 64]", "device=cpu"]
+    tiny = ["steps=2", "batch_size=2", "image_size=[64, 64]", "crop_size=[64, 64]", "device=cpu"]
     result = train(train_config(name, tiny), Shifts(2, 64, 1.0, seed=1), None, tmp_path)
     assert result.steps == 2
     assert result.weights.is_file()
@@ -122,3 +122,4 @@ def test_settings_come_from_a_file_a_preset_and_assignments(tmp_path: Path) -> N
     assert (config.steps, config.loss.lambda_dc, config.loss.lambda_df) == (7, 3, 0.5)
     words = r"papier: neither a configuration file nor a preset; presets are best, real, bare, paper"
     refused(words, train_config, "papier")
+    refused("must be below steps = 4", train_config, "best", ["warmup_steps=4"], {"steps": 4})

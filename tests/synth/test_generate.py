@@ -50,9 +50,8 @@ def test_the_dataset_is_what_was_asked_for_and_verifies() -> None:
 
 def test_growing_in_steps_gives_the_same_files_and_progress_counts_up_to_n(tiny: Path, tmp_path: Path) -> None:
     """1, then 3 (which finishes a trajectory and begins another), then 5; n is in dataset.json alone."""
-    template = load_scene(tiny)
     out = tmp_path / "grown"
-    made = [(s.made, s.found) for s in (generate(template, n, out) for n in (1, 3, 5, 5, 2))]
+    made = [(s.made, s.found) for s in (generate(tiny, n, out) for n in (1, 3, 5, 5, 2))]
     assert made == [(1, 0), (2, 1), (2, 3), (0, 5), (0, 2)]
     assert fingerprint(out) == fingerprint(reference())
     calls, template = [], load_scene(tiny, ["motion.depth_mm=-1"])  # no touch: fast
@@ -77,10 +76,11 @@ def test_wrong_numbers_scenes_that_cannot_be_built_and_a_missing_ray_are_told(ti
     for template, n, seed, workers, message in (
         (sound, 0, 0, 1, "--n = 0"),
         (sound, 1, -1, 1, "--seed = -1"),
+        (sound, 1.5, 0, 1, "'float' object"),
         (sound, 1, 0, 0, "--workers = 0"),
         (torus, 1, 0, 1, "tube_mm"),
     ):
-        with pytest.raises(InputError, match=message):
+        with pytest.raises(InputError if n < 1.5 else TypeError, match=message):
             generate(template, n, tmp_path / "d", seed, scheduling=Scheduling(workers=workers))
         assert not (tmp_path / "d").exists()
     monkeypatch.setitem(sys.modules, "ray", None)  # what an import of a missing package does

@@ -173,6 +173,7 @@ def test_a_wrong_value_is_named_with_file_place_and_what_is_allowed(tiny: Path, 
 ])  # fmt: skip
 def test_overrides(tiny: Path, override: str, message: str) -> None:
     assert re.match(rf"{re.escape(f'--set {override!r}: ')}.*{re.escape(message)}", _refusal(tiny, override))
+    refused("a list is needed", load_scene, tiny, set=override)
 
 
 def test_every_problem_is_told_once_on_a_short_line_as_are_missing_files(tiny: Path, tmp_path: Path) -> None:
