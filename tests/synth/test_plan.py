@@ -20,6 +20,7 @@ from synth.simulate.indenter import rigid_body
 from synth.simulate.press import DEFAULT_TARGET_PX, MeshRule
 
 LLVM, MONO, SCALAR = Variant("llvm_ad_rgb", ""), Variant("llvm_ad_mono", ""), Variant("scalar_rgb", "")
+AWAY = "sensor.lights=[{position_mm=[3, 0, 3], aim_mm=[3, 0, 4], size_mm=[1, 1], color=[1, 1, 1], power=1}]"
 GREY = [f"sensor.lights.{i}.color=[1, 1, 1]" for i in range(5)]
 
 
@@ -141,6 +142,7 @@ def _write_stl(path: Path, *, closed: bool) -> None:
     (['contact.indenter={ shape = "mesh", file = "*.stl", rotation_deg = "any" }'], LLVM, "text.stl"),
     (["sensor.lights.3.position_mm=[0, 0, 3]"], LLVM, r"sensor.lights\[3\].* between the camera and the gel"),
     (["sensor.lights.3.aim_mm=[0.0, -2.9, 2.0]"], LLVM, "aims at itself"),
+    (["sensor.window.refractive_index=1", AWAY], LLVM, "sensor.lights: no light with power shines toward the gel"),
     (["sensor.camera.distortion=[0.1, 0, 0, 0, 0]"], SCALAR, "LLVM 16"),
     (["sensor.camera.fy=83"], SCALAR, "LLVM 16"),
     (["sampling.pairs_per_trajectory=4"], LLVM, r"pairs_per_trajectory = 4: .* at most 3"),
