@@ -30,7 +30,7 @@ def validated(content: Any, source: str, model: type[Model], at: str = "") -> Mo
         return model.model_validate_json(json.dumps(content), strict=True)
     except ValidationError as error:
         whole = {at: content} if at else content
-        lines = [_explain(problem, whole, at) for problem in error.errors()]
+        lines = [_explain(problem, whole, at) for problem in error.errors() if not _follows(problem)]
         raise InputError("\n".join(f"{source}: {line}" for line in dict.fromkeys(lines))) from error
 
 
@@ -58,6 +58,11 @@ def _explain(problem: ErrorDetails, content: Any, at: str) -> str:
     return f"{where}{shown}: {_said(problem)}" if where else _said(problem)
 
 
+def _follows(problem: ErrorDetails) -> bool:
+    """Whether a list is called too short only because entries of it are wrong."""
+    return problem["type"] == "too_short" and len(problem["input"]) >= problem["ctx"]["min_length"]
+
+
 def _said(problem: ErrorDetails) -> str:
     """Pydantic's message in TOML's words."""
     message = problem["msg"].removeprefix("Value error, ")
@@ -65,6 +70,8 @@ def _said(problem: ErrorDetails) -> str:
     message = message.replace("an object", "a table").replace("valid array", "list").replace("item", "entry")
     if problem["type"] in ("int_type", "int_from_float"):
         message = "must be a whole number; to draw one, use { choice = [...] }"
+    if problem["type"] == "string_pattern_mismatch":
+        message = "must consist of letters A to Z, digits, _ and - alone"
     return message.replace(" after validation", "").replace("entrys", "entries")
 
 
