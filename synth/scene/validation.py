@@ -30,7 +30,9 @@ def validated(content: Any, source: str, model: type[Model], at: str = "") -> Mo
         return model.model_validate_json(json.dumps(content), strict=True)
     except ValidationError as error:
         whole = {at: content} if at else content
-        lines = [_explain(problem, whole, at) for problem in error.errors() if not _follows(problem)]
+        # A list is also called too short where wrong entries of it were left out.
+        told = [p for p in error.errors() if p["type"] != "too_short" or len(p["input"]) < p["ctx"]["min_length"]]
+        lines = [_explain(problem, whole, at) for problem in told]
         raise InputError("\n".join(f"{source}: {line}" for line in dict.fromkeys(lines))) from error
 
 
@@ -56,11 +58,6 @@ def _explain(problem: ErrorDetails, content: Any, at: str) -> str:
     shown = "" if isinstance(given, dict) else f" = {given!r}"
     shown = shown if len(shown) <= _LONGEST else f"{shown[:_LONGEST]}..."
     return f"{where}{shown}: {_said(problem)}" if where else _said(problem)
-
-
-def _follows(problem: ErrorDetails) -> bool:
-    """Whether a list is called too short only because entries of it are wrong."""
-    return problem["type"] == "too_short" and len(problem["input"]) >= problem["ctx"]["min_length"]
 
 
 def _said(problem: ErrorDetails) -> str:

@@ -141,7 +141,7 @@ def _write_stl(path: Path, *, closed: bool) -> None:
     (['contact.indenter={ shape = "mesh", file = "text.stl" }'], LLVM, "text.stl"),
     (['contact.indenter={ shape = "mesh", file = "nan.obj", size_mm = 2 }'], LLVM, "not all .* are finite"),
     (['contact.indenter={ shape = "mesh", file = "tiny.toml" }'], LLVM, "none of the surface files .*: .stl, .obj"),
-    (['contact.indenter={shape="mesh",file="closed.stl",size_mm=0.05}'], LLVM, "size_mm = 0.05: allowed is a longest"),
+    (['contact.indenter={shape="mesh",file="closed.stl",size_mm=0.05}'], LLVM, "size_mm = 0.05: allowed are 0.5 to"),
     (['contact.indenter={ shape = "mesh", file = "*.stl", rotation_deg = "any" }'], LLVM, "text.stl"),
     (["sensor.lights.3.position_mm=[0, 0, 3]"], LLVM, r"sensor.lights\[3\].* between the camera and the gel"),
     (["sensor.lights.3.aim_mm=[0.0, -2.9, 2.0]"], LLVM, "aims at itself"),

@@ -195,7 +195,6 @@ def test_every_problem_is_told_once_on_a_short_line_as_are_missing_files(tiny: P
     ("name = ", "not valid TOML"),
     ("", "is empty; a scene may begin with extends"),
     ("extend = 'digit'\n", "extend: unknown key; did you mean 'extends'?"),
-    ("name = 'x'\n", "sensor: is missing"),
     (TEXT.replace('kind = "dots",', ""), "sensor.pattern: lacks the key 'kind'"),
     (TEXT.replace("{ uniform = [90.0, 110.0] }", "0"), "sensor: lights: no light has power; give at least one"),
     (TEXT.replace("width = 32", "widht = 32"), "sensor.camera.width: is missing"),
