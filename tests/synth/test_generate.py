@@ -86,7 +86,7 @@ def test_wrong_numbers_impossible_scenes_useless_images_and_a_missing_ray_are_to
             generate(template, n, tmp_path / "d", seed, scheduling=Scheduling(workers=workers))
         assert not (tmp_path / "d").exists()
     for workers, (override, words) in enumerate(USELESS.items()):
-        template = load_scene(tiny, [f"sensor.{override}", "motion.depth_mm=-1"])
+        template = load_scene(tiny, [f"sensor.{override}", "motion.depth_mm=-1", "numerics={}"])
         generate(template, 3, tmp_path / words, scheduling=Scheduling(workers or None))
         assert re.fullmatch(f"synth: warning: tiny: images .*{words}.*\n", capfd.readouterr().err)  # once
     monkeypatch.setitem(sys.modules, "ray", None)  # what an import of a missing package does
