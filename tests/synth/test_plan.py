@@ -138,7 +138,6 @@ def _write_stl(path: Path, *, closed: bool) -> None:
 @pytest.mark.parametrize(("overrides", "variant", "message"), [
     (['contact.indenter={ shape = "torus", radius_mm = 1, tube_mm = 2 }'], LLVM, "contact.indenter.tube_mm = 2"),
     (['contact.indenter={ shape = "cylinder", radius_mm = 1, fillet_mm = 1 }'], LLVM, "contact.indenter.fillet_mm"),
-    (['contact.indenter={ shape = "mesh", file = "text.stl" }'], LLVM, "text.stl"),
     (['contact.indenter={ shape = "mesh", file = "nan.obj", size_mm = 2 }'], LLVM, "not all .* are finite"),
     (['contact.indenter={ shape = "mesh", file = "tiny.toml" }'], LLVM, "none of the surface files .*: .stl, .obj"),
     (['contact.indenter={shape="mesh",file="closed.stl",size_mm=0.05}'], LLVM, "size_mm = 0.05: allowed are 0.5 to"),

@@ -185,8 +185,7 @@ def test_every_problem_is_told_once_on_a_short_line_as_are_missing_files(tiny: P
     shipped = ", ".join(shipped_scenes())
     assert _refusal("gelsight_mni") == f"there is no scene 'gelsight_mni'; shipped: {shipped}; or give a .toml file"
     assert _refusal(tmp_path / "none.toml") == f"there is no scene file {tmp_path / 'none.toml'}"
-    (tmp_path / "folder.toml").mkdir()
-    assert "is a folder, not a scene: give a .toml file" in _refusal(tmp_path / "folder.toml")
+    assert "is a folder, not a scene: give a .toml file" in _refusal(tmp_path)
     (tmp_path / "noise.toml").write_bytes(bytes(range(256)))
     assert "not valid TOML" in _refusal(tmp_path / "noise.toml")
 
