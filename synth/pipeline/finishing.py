@@ -27,6 +27,9 @@ from synth.scene.sampling import Pair
 from synth.simulate import State
 from synth.simulate.resolution import accuracy
 
+DARKEST, BRIGHTEST, LEAST_GEL = 12, 245, 0.5
+"""Mean grey levels of 255, and share of pixels, beyond which images are warned of."""
+
 
 def finish(context: JobContext, rendered: RenderedTrajectory) -> Outcome:
     """Write a trajectory's samples; InputError where the storage refuses."""
@@ -34,16 +37,28 @@ def finish(context: JobContext, rendered: RenderedTrajectory) -> Outcome:
     diagnostics = _diagnostics(context, simulated)
     sensors = simulated.scene.sensor.views
     views = {name: View(rendered.surface, Optics.of(sensor)) for name, sensor in sensors.items()}
-    count, entries = len(simulated.pairs), []
+    count, entries, warning = len(simulated.pairs), [], ""
     shared = {"simulate": simulated.seconds / count, "render": rendered.seconds / count}
     for pair in simulated.pairs:
         started = time.perf_counter()
         sample = _sample(context, rendered, pair, diagnostics, views)
         traced = time.perf_counter()
+        warning = warning or _warning(sample)
         entry = write_sample_files(context.out, sample, context.job)
         seconds = {**shared, "flow": traced - started, "write": time.perf_counter() - traced}
         entries.append(replace(entry, seconds={stage: round(value, 4) for stage, value in seconds.items()}))
-    return Outcome(tuple(entries), simulated.failures, ())
+    return Outcome(tuple(entries), simulated.failures, (), warning)
+
+
+def _warning(sample: Sample) -> str:
+    """What makes a sample's images useless: too dark, too bright, or little gel in them; empty for others."""
+    level = 255 * float(sample.image1.mean()) / np.iinfo(sample.image1.dtype).max
+    gel = float(np.isfinite(sample.flow.forward).mean())
+    if DARKEST <= level <= BRIGHTEST:
+        found = f"images show gel in {100 * gel:.0f} % of their pixels only: check fx, fy and place of sensor.camera"
+        return found if gel < LEAST_GEL else ""
+    found = f"images are nearly {'black' if level < DARKEST else 'white'} (mean {level:.0f} of 255): check "
+    return found + "the places, aims and power of sensor.lights, and sensor.camera.exposure"
 
 
 def _diagnostics(context: JobContext, simulated: SimulatedTrajectory) -> dict[str, Any]:

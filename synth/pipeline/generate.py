@@ -6,6 +6,7 @@ simulates and renders, and the workers do the rest (`overlapped`). The driver al
 samples' folders are written where they are made. The same command goes on where it stopped.
 """
 
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
@@ -184,6 +185,8 @@ def generate(
                     writer.fail(failure.index, failure.draw, failure.stage, failure.reason, failure.last_good_state)
                 for entry in outcome.entries:
                     writer.record(entry)
+                if outcome.warning and not summary.made:
+                    print(f"synth: warning: {job.scene_name}: {outcome.warning}", file=sys.stderr, flush=True)
                 summary.add(outcome)
                 if progress is not None:
                     progress(summary.found + summary.made + len(summary.given_up), summary.asked_for)

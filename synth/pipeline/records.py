@@ -56,11 +56,12 @@ class Failure:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a task did: manifest lines of the samples on disk, failed instances, and samples given up."""
+    """What a task did: manifest lines of the samples on disk, failed instances, samples given up, and a warning."""
 
     entries: tuple[ManifestEntry, ...]
     failures: tuple[Failure, ...]
     given_up: tuple[int, ...]
+    warning: str = ""
 
 
 @dataclass(frozen=True, eq=False)

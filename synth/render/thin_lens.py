@@ -30,7 +30,7 @@ import numpy as np
 
 from synth.errors import InputError
 from synth.optics import Optics
-from synth.render.lights import check_view
+from synth.render.lights import check_view, image_lights, reaches
 from synth.scene import Sensor
 
 
@@ -73,7 +73,9 @@ class ThinLens:
 
 
 def check_views(sensor: Sensor) -> None:
-    """Refuse, by InputError, lights in a camera's view and lenses that cannot focus; further cameras are named."""
+    """Refuse, by InputError, lights that all shine past the gel or stand in a camera's view, and unfocused lenses."""
+    if not any(reaches(light, sensor.gel.size_mm) for light in (*sensor.lights, *image_lights(sensor))):
+        raise InputError("sensor.lights: no light with power shines toward the gel: check power and aim_mm")
     for name, view in sensor.views.items():
         try:
             check_view(view)

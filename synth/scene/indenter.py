@@ -56,7 +56,7 @@ class Torus(Posed):
 
 
 class MeshIndenter(Part):
-    """Triangle surface from any file that pyvista reads (STL, PLY, OBJ, VTP), in mm after scaling."""
+    """Triangle surface from a file (STL, OBJ, PLY, OFF, VTP), in mm after scaling."""
 
     shape: Literal["mesh"]
     file: str

@@ -134,6 +134,8 @@ class Sensor(Part):
             self._check_beyond()
         if getattr(self.pattern, "placing", "z") == "uv" and self.gel.shape != "file":
             raise ValueError(f'pattern.placing = "uv" needs gel.shape = "file", the shape is "{self.gel.shape}"')
+        if not any(light.power for light in self.lights):
+            raise ValueError("lights: no light has power; give at least one of them a power above 0")
         thickness = self.gel.size_mm[2]
         outside = thickness + self.window.thickness_mm
         for i, light in enumerate(self.lights):

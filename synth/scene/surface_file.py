@@ -16,6 +16,8 @@ import numpy as np
 
 from synth.arrays import FloatArray
 
+FORMATS = (".stl", ".obj", ".ply", ".off", ".vtp")
+
 
 @dataclass(frozen=True, eq=False)
 class Triangles:
@@ -31,6 +33,8 @@ def read_surface(path: Path) -> Triangles:
     """A file's surface in its own unit, cleaned, cached while the file does not change; ValueError if there is none."""
     if not path.is_file():
         raise ValueError(f"there is no file {path}")
+    if path.suffix.lower() not in FORMATS:
+        raise ValueError(f"it is none of the surface files that are read: {', '.join(FORMATS)}")
     try:
         return _read(path, path.stat().st_mtime_ns)
     except (ValueError, OSError, AttributeError) as error:
@@ -47,6 +51,8 @@ def _read(path: Path, changed_ns: int) -> Triangles:
         _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
         if len(first) == 0:
             raise ValueError("it has no triangles")
+        if not np.isfinite(surface.points).all():
+            raise ValueError("not all of its vertices are finite numbers")
         surface = pv.PolyData.from_regular_faces(np.asarray(surface.points, dtype=np.float64), faces[np.sort(first)])
         surface = surface.compute_normals(consistent_normals=True, auto_orient_normals=False, split_vertices=False)
         shells = surface.connectivity("all").cell_data["RegionId"]

@@ -13,9 +13,11 @@ is drawn again (`synth.scene.sampling`).
 import hashlib
 import json
 import os
+import re
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from functools import cached_property, partial
 from glob import glob
 from importlib.resources import files
@@ -151,6 +153,8 @@ def checked_template(content: dict[str, Any], source: Path, changed: tuple[str, 
         if problem:
             raise InputError(f"{template.label}: {where}: {problem}")
     for key, file in template._files():
+        if file.is_dir():
+            raise InputError(f"{template.label}: {key}: {file} is a folder; end it in /*.stl to take its files")
         if not file.is_file():
             raise InputError(f"{template.label}: {key}: there is no file {file}")
     return template
@@ -200,13 +204,18 @@ def _read(path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     if "extends" not in content:
+        if not content:
+            raise InputError(f'{path}: is empty; a scene may begin with extends = "gelsight_mini"')
+        if close := get_close_matches("extends", content, n=1):
+            raise InputError(f"{path}: {close[0]}: unknown key; did you mean 'extends'?")
         return content
     given = str(content.pop("extends"))
     base = _find(path.parent / given if given.endswith(".toml") else given)
     if base in (path, *above):
         raise InputError(f"{path}: extends = {given!r}: a scene cannot extend itself")
     below = with_files(_read(base, (path, *above)), lambda name: str(base.parent.absolute() / name))
-    return _extended({**below, "name": path.stem, "description": "", "references": []}, content)
+    name = re.sub(r"[^A-Za-z0-9_\-]", "_", path.stem)
+    return _extended({**below, "name": name, "description": "", "references": []}, content)
 
 
 def _extended(below: dict[str, Any], content: dict[str, Any]) -> dict[str, Any]:
@@ -222,11 +231,13 @@ def _find(name_or_path: str | Path) -> Path:
     path = Path(name_or_path)
     if path.is_file():
         return path
-    if path.suffix == ".toml":
-        raise InputError(f"there is no scene file {path}")
     shipped = SCENES / f"{name_or_path}.toml"
     if shipped.is_file():
         return shipped
+    if path.is_dir():
+        raise InputError(f"{path} is a folder, not a scene: give a .toml file in it")
+    if path.suffix == ".toml":
+        raise InputError(f"there is no scene file {path}")
     raise InputError(
         f"there is no scene {str(name_or_path)!r}; shipped: {', '.join(shipped_scenes())}; or give a .toml file"
     )
@@ -265,7 +276,8 @@ def _apply(content: dict[str, Any], override: str) -> None:
 
 def _matching(folder: Path, name: str) -> Any:
     """The name of a file in a folder, or a choice of the files that match it."""
-    found = [] if (folder / name).is_file() else sorted(glob(name, root_dir=folder, recursive=True))
+    matches = [] if (folder / name).is_file() else sorted(glob(name, root_dir=folder, recursive=True))
+    found = [match for match in matches if (folder / match).is_file()]
     return {"choice": found} if found else name
 
 

@@ -30,7 +30,9 @@ def validated(content: Any, source: str, model: type[Model], at: str = "") -> Mo
         return model.model_validate_json(json.dumps(content), strict=True)
     except ValidationError as error:
         whole = {at: content} if at else content
-        lines = [_explain(problem, whole, at) for problem in error.errors()]
+        # A list is also called too short where wrong entries of it were left out.
+        told = [p for p in error.errors() if p["type"] != "too_short" or len(p["input"]) < p["ctx"]["min_length"]]
+        lines = [_explain(problem, whole, at) for problem in told]
         raise InputError("\n".join(f"{source}: {line}" for line in dict.fromkeys(lines))) from error
 
 
@@ -65,6 +67,8 @@ def _said(problem: ErrorDetails) -> str:
     message = message.replace("an object", "a table").replace("valid array", "list").replace("item", "entry")
     if problem["type"] in ("int_type", "int_from_float"):
         message = "must be a whole number; to draw one, use { choice = [...] }"
+    if problem["type"] == "string_pattern_mismatch":
+        message = "must consist of letters A to Z, digits, _ and - alone"
     return message.replace(" after validation", "").replace("entrys", "entries")
 
 

@@ -246,6 +246,9 @@ def object_triangles(indenter: MeshIndenter, folder: Path) -> Triangles:
     longest = float(np.ptp(surface.points, axis=0).max())
     scale = indenter.size_mm / longest if indenter.size_mm is not None else indenter.scale
     if not SHORTEST_MM <= scale * longest <= LONGEST_MM:
+        if indenter.size_mm is not None:
+            allowed = f"allowed are {SHORTEST_MM:g} to {LONGEST_MM:g}"
+            raise InputError(f"contact.indenter.size_mm = {indenter.size_mm:g}: {allowed}")
         raise InputError(
             f"contact.indenter.scale = {scale:g}: {indenter.file} is then {scale * longest:.3g} mm long. Is it in "
             "metres (scale = 1000) or inches (scale = 25.4)? size_mm gives its longest edge instead"

@@ -1,6 +1,7 @@
 """The whole chain in one process: what lands on disk, going on, growing, and draws that fail."""
 
 import json
+import re
 import sys
 from itertools import count, islice
 from pathlib import Path
@@ -21,6 +22,7 @@ from synth.scene.template import Template, load_scene
 from synth.verify import verify_dataset
 
 pytestmark = pytest.mark.usefixtures("one_cache")
+USELESS = {"camera.exposure=1e-3": "black", "camera.exposure=50": "white .mean 25", "gel.size_mm=[2, 2, 2.5]": "gel in"}
 
 
 def test_the_dataset_is_what_was_asked_for_and_verifies() -> None:
@@ -70,7 +72,7 @@ def test_three_shards_in_any_order_give_the_same_files(tiny: Path, tmp_path: Pat
     assert fingerprint(out) == fingerprint(reference())
 
 
-def test_wrong_numbers_scenes_that_cannot_be_built_and_a_missing_ray_are_told(tiny, tmp_path, monkeypatch) -> None:
+def test_wrong_numbers_impossible_scenes_useless_images_and_a_missing_ray_are_told(tiny, tmp_path, monkeypatch, capfd):
     sound = load_scene(tiny)
     torus = load_scene(tiny, ['contact.indenter={ shape = "torus", radius_mm = 1, tube_mm = 2 }'])
     for template, n, seed, workers, message in (
@@ -83,6 +85,10 @@ def test_wrong_numbers_scenes_that_cannot_be_built_and_a_missing_ray_are_told(ti
         with pytest.raises(InputError if n < 1.5 else TypeError, match=message):
             generate(template, n, tmp_path / "d", seed, scheduling=Scheduling(workers=workers))
         assert not (tmp_path / "d").exists()
+    for workers, (override, words) in enumerate(USELESS.items()):
+        template = load_scene(tiny, [f"sensor.{override}", "motion.depth_mm=-1", "numerics={}"])
+        generate(template, 3, tmp_path / words, scheduling=Scheduling(workers or None))
+        assert re.fullmatch(f"synth: warning: tiny: images .*{words}.*\n", capfd.readouterr().err)  # once
     monkeypatch.setitem(sys.modules, "ray", None)  # what an import of a missing package does
     with pytest.raises(InputError, match=r"--ray needs Ray: pip install 'gelflow-synth\[cluster\]'"):
         generate(load_scene(tiny), 1, tmp_path / "d", scheduling=Scheduling(ray="local"))

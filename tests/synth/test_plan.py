@@ -20,6 +20,7 @@ from synth.simulate.indenter import rigid_body
 from synth.simulate.press import DEFAULT_TARGET_PX, MeshRule
 
 LLVM, MONO, SCALAR = Variant("llvm_ad_rgb", ""), Variant("llvm_ad_mono", ""), Variant("scalar_rgb", "")
+AWAY = "sensor.lights=[{position_mm=[3, 0, 3], aim_mm=[3, 0, 4], size_mm=[1, 1], color=[1, 1, 1], power=1}]"
 GREY = [f"sensor.lights.{i}.color=[1, 1, 1]" for i in range(5)]
 
 
@@ -137,10 +138,13 @@ def _write_stl(path: Path, *, closed: bool) -> None:
 @pytest.mark.parametrize(("overrides", "variant", "message"), [
     (['contact.indenter={ shape = "torus", radius_mm = 1, tube_mm = 2 }'], LLVM, "contact.indenter.tube_mm = 2"),
     (['contact.indenter={ shape = "cylinder", radius_mm = 1, fillet_mm = 1 }'], LLVM, "contact.indenter.fillet_mm"),
-    (['contact.indenter={ shape = "mesh", file = "text.stl" }'], LLVM, "text.stl"),
+    (['contact.indenter={ shape = "mesh", file = "nan.obj", size_mm = 2 }'], LLVM, "not all .* are finite"),
+    (['contact.indenter={ shape = "mesh", file = "tiny.toml" }'], LLVM, "none of the surface files .*: .stl, .obj"),
+    (['contact.indenter={shape="mesh",file="closed.stl",size_mm=0.05}'], LLVM, "size_mm = 0.05: allowed are 0.5 to"),
     (['contact.indenter={ shape = "mesh", file = "*.stl", rotation_deg = "any" }'], LLVM, "text.stl"),
     (["sensor.lights.3.position_mm=[0, 0, 3]"], LLVM, r"sensor.lights\[3\].* between the camera and the gel"),
     (["sensor.lights.3.aim_mm=[0.0, -2.9, 2.0]"], LLVM, "aims at itself"),
+    (["sensor.window.refractive_index=1", AWAY], LLVM, "sensor.lights: no light with power shines toward the gel"),
     (["sensor.camera.distortion=[0.1, 0, 0, 0, 0]"], SCALAR, "LLVM 16"),
     (["sensor.camera.fy=83"], SCALAR, "LLVM 16"),
     (["sampling.pairs_per_trajectory=4"], LLVM, r"pairs_per_trajectory = 4: .* at most 3"),
@@ -150,6 +154,7 @@ def test_what_cannot_be_built_is_refused_with_the_file_and_the_field(tiny, overr
     monkeypatch.chdir(tiny.parent)
     _write_stl(tiny.parent / "closed.stl", closed=True)
     (tiny.parent / "text.stl").write_text("this is no surface")
+    (tiny.parent / "nan.obj").write_text("v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     assert refused(message, lambda: check_buildable(load_scene(tiny, overrides), variant)).startswith(str(tiny))
 
 

@@ -140,7 +140,7 @@ def test_the_stereo_pair_sees_height() -> None:
 
 @pytest.fixture
 def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    (tmp_path / "objects").mkdir()
+    (tmp_path / "objects" / "folder.stl").mkdir(parents=True)
     for name in ("b.stl", "a.stl", "notes.txt"):
         (tmp_path / "objects" / name).write_text(name)
     monkeypatch.chdir(tmp_path)
@@ -173,6 +173,7 @@ def test_a_pattern_in_a_scenes_file_is_relative_to_it_and_stays_so(tiny: Path, m
 def test_unmatched_patterns_are_refused_new_objects_count_and_names_like_patterns_are_names(tiny: Path) -> None:
     words = rf"contact\.indenter\.file: there is no file {tiny.parent}/objects/\*\.obj"
     refused(words, load_scene, tiny, [ANY.replace("stl", "obj")])
+    refused(r"objects is a folder; end it in /\*\.stl", load_scene, tiny, [ANY.replace("/*.stl", "")])
     before = load_scene(tiny, [ANY]).hash
     assert load_scene(tiny, [ANY]).hash == before
     (tiny.parent / "objects" / "c.stl").touch()

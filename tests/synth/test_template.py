@@ -37,14 +37,14 @@ def test_overrides_set_tables_lists_and_words_and_the_last_wins(tiny: Path) -> N
 
 
 def test_a_scene_extends_another_whose_files_stay_where_they_are(tmp_path: Path) -> None:
-    mine = tmp_path / "mine.toml"
+    mine = tmp_path / "mein Gerät 2.1.toml"
     mine.write_text('extends = "objects"\n[sensor.pattern]\nkind = "speckle"\ngrain_mm = 0.3\n[motion]\nsteps = 2\n')
     found, base = load_scene(mine), load_scene("objects")
-    assert (found.name, found.content["references"]) == ("mine", [])
+    assert (found.name, found.content["references"]) == ("mein_Ger_t_2_1", [])
     assert found.content["sensor"].pop("pattern") == {"kind": "speckle", "grain_mm": 0.3}
     assert found.content["motion"] == {**base.content["motion"], "steps": 2}
     assert found.content["sensor"].items() <= base.content["sensor"].items()
-    mine.write_text('extends = "mine.toml"')
+    mine.write_text(f'extends = "{mine.name}"')
     refused("cannot extend itself", load_scene, mine)
 
 
@@ -114,13 +114,14 @@ WRONG_KEYS_AND_TYPES = [
     ("sensor.gel.size_mm=[8, 6]", "[2]: is missing"),
     ("sensor.gel.size_mm=[8, 6, 2, 1]", " = [8, 6, 2, 1]: must have at most 3 entries, not 4"),
     ("sensor.gel=3", " = 3: must be a table"),
+    ("sensor.lights=[{position_mm=[1,1,2],size_mm=[1,1],color=[1,1,1],power=-1}]", "[0].power = -1: must be"),
     ("sensor.lights=[]", " = []: must have at least 1 entry, not 0"),
     ("sensor.gel.shape=bowl", " = 'bowl': must be 'box', 'dome', 'capsule' or 'file'"),
     ("sensor.gel={ youngs_modulus_kpa = 100.0 }", 'sensor.gel: shape = "box" needs size_mm'),
     ("sensor.gel.radius_mm=9", 'sensor.gel: radius_mm belongs to shape = "capsule", the shape is "box"'),
     ('sensor.pattern={ kind = "bitmap", file = "a.png" }', ': placing = "z" needs width_mm'),
     ('sensor.pattern={ kind = "bitmap", file = "a.png", placing = "uv" }', 'sensor: pattern.placing = "uv" needs gel.'),
-    ("name=two words", " = 'two words': "),
+    ("name=two words", " = 'two words': must consist of letters A to Z, digits, _ and - alone"),
     ("contact.indenter.shape=ball", " = 'ball': allowed are 'sphere', 'cylinder', 'box'"),
     ("contact.indenter={ radius_mm = 1 }", ": lacks the key 'shape'"),
     ("sensor.camera.bit_depth=9", " = 9: must be 8, 10, 12, 14 or 16"),
@@ -185,17 +186,17 @@ def test_every_problem_is_told_once_on_a_short_line_as_are_missing_files(tiny: P
     shipped = ", ".join(shipped_scenes())
     assert _refusal("gelsight_mni") == f"there is no scene 'gelsight_mni'; shipped: {shipped}; or give a .toml file"
     assert _refusal(tmp_path / "none.toml") == f"there is no scene file {tmp_path / 'none.toml'}"
-    (tmp_path / "folder.toml").mkdir()
-    assert "there is no scene file" in _refusal(tmp_path / "folder.toml")
+    assert "is a folder, not a scene: give a .toml file" in _refusal(tmp_path)
     (tmp_path / "noise.toml").write_bytes(bytes(range(256)))
     assert "not valid TOML" in _refusal(tmp_path / "noise.toml")
 
 
 @pytest.mark.parametrize(("content", "message"), [
     ("name = ", "not valid TOML"),
-    ("", "name: is missing"),
-    ("name = 'x'\n", "sensor: is missing"),
+    ("", "is empty; a scene may begin with extends"),
+    ("extend = 'digit'\n", "extend: unknown key; did you mean 'extends'?"),
     (TEXT.replace('kind = "dots",', ""), "sensor.pattern: lacks the key 'kind'"),
+    (TEXT.replace("{ uniform = [90.0, 110.0] }", "0"), "sensor: lights: no light has power; give at least one"),
     (TEXT.replace("width = 32", "widht = 32"), "sensor.camera.width: is missing"),
 ])  # fmt: skip
 def test_files(tmp_path: Path, content: str, message: str) -> None:
