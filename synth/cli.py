@@ -4,7 +4,6 @@ Exit status: 0 done, 1 done with failed samples or a failed check, 2 wrong input
 imported before a command runs.
 """
 
-import os
 import sys
 import traceback
 from collections.abc import Sequence
@@ -85,10 +84,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     tokens = [token for token in tokens if token != "--debug"]
     try:
         status = app(tokens, exit_on_error=False, print_error=False)
-        sys.stdout.flush()
-    except BrokenPipeError:  # who read the output has left, as `head` does; Python would write the rest at its end
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 141
     except (InputError, CycloptsError, OSError, KeyboardInterrupt) as error:
         if debug:
             traceback.print_exc()

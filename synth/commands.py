@@ -282,9 +282,8 @@ def _show_summary(summary: Summary, variant: Variant) -> None:
     stages = ", ".join(f"{name} {share:.0%}" for name, share in shares(summary.stages).items())
     rate = f", {summary.samples_per_second:.2f} pairs/s" if summary.made else ""
     print(
-        f"{summary.made} pair{'s' * (summary.made != 1)} made ({summary.found} were there) in "
-        f"{duration(summary.seconds)}{rate} with {variant.name}: {summary.directory}"
-        + (f", shard {summary.shard}" if summary.shard else "")
+        f"{summary.made} pairs made ({summary.found} were there) in {duration(summary.seconds)}{rate} "
+        f"with {variant.name}: {summary.directory}" + (f", shard {summary.shard}" if summary.shard else "")
     )
     if stages:
         print(f"time: {stages}")

@@ -76,8 +76,5 @@ def _show(result: PairSet, out: Path, as_json: bool) -> None:
         print(json.dumps(answer))
         return
     counts = f"{empty} without enough motion, {len(result.failures)} unreadable"
-    pairs, sources = (
-        f"{n} {word}{'s' * (n != 1)}" for n, word in ((len(motions), "pair"), (len(result.sources), "recording"))
-    )
-    print(f"{pairs} from {sources} ({counts}) in {out}")
+    print(f"{len(motions)} pairs from {len(result.sources)} recordings ({counts}) in {out}")
     print(f"motion (95th percentile over the image, px): {motions[0]:.1f} to {motions[-1]:.1f}, deciles {deciles}")

@@ -71,9 +71,6 @@ def compare(
     ] = 0,
     batch: Annotated[int, Parameter(help="Pairs at once to measure networks' speed and memory; 0: do not.")] = 1,
     every: Annotated[int, Parameter(help="Take only every n-th pair, for slow methods.")] = 1,
-    add: Annotated[
-        bool, Parameter(negative=(), help="Keep the methods that are in --out already; pairs are matched by name.")
-    ] = False,
     size: Size = None,
     device: OnDevice = "auto",
     as_json: AsJson = False,
@@ -83,8 +80,6 @@ def compare(
     from gelflow.baselines.learned import Learned
     from gelflow.data import PairDataset, open_all
 
-    if add and out is None:
-        raise InputError("--add: give the folder of the earlier comparison as --out")
     for option, given, least in (("--every", every, 1), ("--batch", batch, 0), ("--ft", ft, 0)):
         if given < least:
             raise InputError(f"{option} {given}: a number from {least} on is needed")
@@ -104,7 +99,7 @@ def compare(
             raise InputError(f"--ft {ft}: needs --weights of GelFlow, and --out beside which their copies are kept")
         folder = out.with_name(f"{out.name}_ft")
         networks += [fine_tuned(one, dataset, folder / one.label.replace("/", "_"), ft) for one in own]
-    _score(dataset, [*chosen, *networks], out, as_json, batch, add)
+    _score(dataset, [*chosen, *networks], out, as_json, batch)
     return 0
 
 
@@ -122,9 +117,7 @@ def _networks(
     return [open_network(path, name, parse_size(size), device, choice) for choice in choices]
 
 
-def _score(
-    dataset: PairDataset, methods: Sequence[Method], out: Path | None, as_json: bool, batch: int, add: bool = False
-) -> None:
+def _score(dataset: PairDataset, methods: Sequence[Method], out: Path | None, as_json: bool, batch: int) -> None:
     from gelflow.compare.run import FILES, compare
     from gelflow.compare.tables import tables
     from gelflow.terminal import progress, show_table
@@ -132,7 +125,7 @@ def _score(
     done, total = count(1), len(dataset) * len(methods)
     with progress("pairs", not as_json) as advance:
         result = compare(
-            methods, dataset, out, lambda one: advance(next(done), total, f"{one.method}, {one.pair}"), batch, add
+            methods, dataset, out, lambda one: advance(next(done), total, f"{one.method}, {one.pair}"), batch
         )
     if as_json:
         print(result.to_json())

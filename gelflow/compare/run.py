@@ -1,12 +1,13 @@
 """Comparing methods on the same pairs, and the report: tables in Markdown and LaTeX, numbers in CSV and JSON, plots."""
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
 
 from gelflow.baselines.learned import Learned, PublishedRaft
 from gelflow.baselines.method import Method
-from gelflow.compare.comparison import Comparison, read_comparison
+from gelflow.compare.comparison import Comparison
 from gelflow.compare.plots import plot_means, plot_strata, plot_work_precision
 from gelflow.compare.scores import PairScore, evaluate
 from gelflow.compare.speed import Speed, network_speed
@@ -15,9 +16,6 @@ from gelflow.data.pairs import PairDataset
 from gelflow.errors import InputError
 from gelflow.files.atomic import write_csv, write_text
 
-SAME_MOTION_PX = 0.01
-"""Pairs of one name are the same pair if their true motions differ by no more than this in the mean."""
-
 
 def compare(
     methods: Sequence[Method],
@@ -25,15 +23,13 @@ def compare(
     out: Path | None = None,
     progress: Callable[[PairScore], None] | None = None,
     batch: int = 1,
-    add: bool = False,
 ) -> Comparison:
     """Scores every method on every pair, method after method; their names differ.
 
-    `out` is a folder for the report, written anew after each method, so that an interruption loses one method at most.
-    With `add` it keeps the methods that it holds already, except those that are scored again; without, an earlier
-    comparison on the same data is replaced. `progress` is called after each pair. The speed of networks is measured
-    with `batch` pairs at once; 0: it is not. InputError for no method, two of one name, an `out` that holds other
-    things or a comparison of other pairs, or a pair that cannot be read; OSError where a file cannot be written.
+    `out` is a folder for the report, written anew after each method, so that an interruption loses one method at most;
+    an earlier comparison on the same data is replaced. `progress` is called after each pair. The speed of networks is
+    measured with `batch` pairs at once; 0: it is not. InputError for no method, two of one name, an `out` that holds
+    other things, or a pair that cannot be read; OSError where a file cannot be written.
     """
     names = [method.name for method in methods]
     if not names:
@@ -43,14 +39,9 @@ def compare(
             raise InputError(f"two methods are called {name!r}; give one a label of its own: --weights LABEL=FILE")
     result = Comparison((dataset.source,), (), {}, {})
     if out is not None:
-        earlier = _earlier(out, dataset, add)
-        if add and earlier is not None:
-            data = tuple(dict.fromkeys((*earlier.data, dataset.source)))
-            kept = earlier.without(names)
-            result = Comparison(data, kept.scores, kept.strata, kept.speeds)
+        _check_out(out, dataset)
     for method in methods:
         scores = evaluate(method, dataset, progress)
-        _check_pairs(out, result, scores)
         result = result.with_method(scores, _speed(method, dataset, batch))
         if out is not None:
             write_report(out, result)
@@ -65,27 +56,16 @@ def _speed(method: Method, dataset: PairDataset, batch: int) -> Speed | None:
     return network_speed(method.forward, size, batch, method.device)
 
 
-def _earlier(out: Path, dataset: PairDataset, add: bool) -> Comparison | None:
-    """What a folder holds already; InputError for something else, or a comparison of other pairs."""
+def _check_out(out: Path, dataset: PairDataset) -> None:
+    """Refuses a folder that holds anything but a comparison on the same data."""
     if not out.exists() or (out.is_dir() and not any(out.iterdir())):
-        return None
-    if not (out / SCORES).is_file():
-        raise InputError(f"{out}: exists and holds other things; give an empty or a new folder as --out")
-    earlier = read_comparison(out / SCORES)
-    if earlier.pairs != dataset.names or not (add or dataset.source in earlier.data):
-        raise InputError(f"{out}: holds a comparison on {', '.join(earlier.data)} ({len(earlier.pairs)} pairs), not on "
-                         f"{dataset.source} ({len(dataset)} pairs); give another --out")  # fmt: skip
-    return earlier
-
-
-def _check_pairs(out: Path | None, earlier: Comparison, scores: Sequence[PairScore]) -> None:
-    """Refuses to put scores beside those of other pairs of the same names."""
-    known = {score.pair: score.motion_px for score in earlier.scores}
-    for score in scores:
-        before, now = known.get(score.pair, score.motion_px), score.motion_px
-        if (before is None) != (now is None) or (before is not None and abs(before - (now or 0)) > SAME_MOTION_PX):
-            raise InputError(f"{out}: there, pair {score.pair} has a mean true motion of {before} px, here {now} px; "
-                             "these are other pairs; give another --out")  # fmt: skip
+        return
+    try:
+        data = ", ".join(json.loads((out / SCORES).read_text(encoding="utf-8"))["data"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{out}: exists and holds other things; give an empty or a new folder as --out") from error
+    if data != dataset.source:
+        raise InputError(f"{out}: holds a comparison on {data}, not on {dataset.source}; give another --out")
 
 
 SCORES = "scores.json"
