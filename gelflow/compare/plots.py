@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from gelflow.compare.seeds import Group
-from gelflow.compare.strata import EDGE, MOTION, PATTERN, Stratum, pooled
+from gelflow.compare.strata import BARE, EDGE, MOTION, PATTERN, Stratum, pooled
 from gelflow.files.atomic import replacing
 
 UNTIMED = ("no motion", "exact flow")
@@ -101,6 +101,7 @@ def plot_strata(path: Path, strata: Mapping[str, Sequence[Stratum]]) -> None:
     by_method = pooled(strata)
     present = {(one.kind, one.bin) for bins in by_method.values() for one in bins}
     kinds = [kind for kind in (MOTION, EDGE, PATTERN) if sum(kind in each for each in present) > (kind == PATTERN)]
+    kinds = kinds or [kind + BARE for kind in (MOTION, EDGE)]
     looks = _looks(list(by_method))
     figure, axes = _figure(len(kinds), 5.0 * len(kinds) + 1.5, 4.4)
     for axis, kind in zip(axes, kinds, strict=True):
