@@ -148,7 +148,7 @@ def test_bare_gels_are_left_out_of_a_second_table_of_means(tmp_path: Path) -> No
     assert cells["distance to contact edge, bare gel: -4 to 0 px"] == "3.000"
     assert cells["distance to contact edge: -4 to 0 px"] == cells["motion: 0 to 0.5 px"] == "0.250"
     assert "motion: 2 to 4 px" not in cells
-    compare([Constant("zero", 0, 0)], PairDataset(dataset.source, bare.records[:1]), tmp_path / "out")  # bare gels alone
+    compare([Constant("zero", 0, 0)], PairDataset(dataset.source, bare.records[:1]), tmp_path / "out")  # bare alone
     assert len([title for title, _ in tables(compare([Constant("zero", 0, 0)], dataset)) if "Means" in title]) == 1
 
 
