@@ -30,7 +30,7 @@ for command in (train, finetune, evaluate, compare, predict, export, pairs):
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs a command and returns the exit status. A mistake is one line on stderr, or a traceback with --debug."""
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # torch's threads that spin lose most of a busy machine's time
+    os.environ.setdefault("GOMP_SPINCOUNT", "1000")  # torch's threads that spin longer waste most of a busy machine
     tokens = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in tokens
     tokens = [token for token in tokens if token != "--debug"]
