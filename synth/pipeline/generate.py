@@ -122,7 +122,7 @@ Progress = Callable[[int, int], None]
 
 
 def make_job(plan: Plan, n: int, seed: int) -> Job:
-    """The record of what is asked for; InputError for n < 1 or a negative seed, TypeError for no whole numbers."""
+    """The record of what is asked for; InputError for n < 1 or a negative seed, TypeError for fractions."""
     n, seed = index(n), index(seed)
     if n < 1:
         raise InputError(f"--n = {n}: ask for at least 1 sample")

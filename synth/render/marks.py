@@ -77,7 +77,7 @@ def _speckle(pattern: Speckle, x: FloatArray, y: FloatArray, rng: np.random.Gene
 
 
 def _round_dots(pattern: Dots, chart: RoundChart, x: FloatArray, y: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Rows of dots along meridians, halved in number, and even, where dots would be less than their size apart."""
+    """Dots along meridians; where they would be less than their size apart, half as many, evenly spread."""
     softness = max(pattern.softness_mm, x[1] - x[0], y[1] - y[0])
     coverage = np.zeros((len(y), len(x)))
     (across_mm, along_mm), (turned, first) = pattern.spacing_mm, pattern.offset_mm
