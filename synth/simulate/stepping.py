@@ -41,21 +41,20 @@ come to rest on the surface, so that more updates make the tractions uneven."""
 FAILURES = 3
 """Failed updates after which the passes end. Updates are halved after a failure, doubled after a success and kept after
 a relaxation: where a whole one upsets Newton's method a part of it does not."""
-DEEP, TOO_DEEP, MAX_PENETRATION = 0.02, 0.05, 0.1
+DEEP, MAX_PENETRATION = 0.02, 0.1
 """Shares of the press depth (at least 0.1 mm). Where a triangle mesh penetrates by more than the first, passes go on to
-MAX_DEEP_UPDATES or DEEP_FAILURES; where it still does by more than the second, to TOO_DEEP_FAILURES; by more than the
-third, the press ends. A relaxation that fails counts as DEEP_FAILURES. A share is not doubled after the first success
-that follows a failure."""
-MAX_DEEP_UPDATES, DEEP_FAILURES, TOO_DEEP_FAILURES = 6.0, 4, 12
+MAX_DEEP_PASSES, whole updates and failures together; after the first success each doubles the contact stiffness, up to
+MAX_STIFFENING times, because multipliers alone converge slowly at sharp edges (Nocedal & Wright, Numerical
+Optimization, algorithm 17.4). Where it still penetrates by more than the second, the press ends."""
+MAX_DEEP_PASSES, MAX_STIFFENING = 16.0, 8.0
 MULTIPLIER_TOLERANCE = 20.0
 """Tolerance of states that multipliers are updated from, over the full one: two updates do not forget what they began
 with."""
 PENETRATION = 2e-3
 """Passes end when no contact point is deeper inside the indenter than this share of the press depth."""
-MAX_CORRECTION_RATIO, DEEP_CORRECTION_RATIO = 3.0, 10.0
+MAX_CORRECTION_RATIO = 3.0
 """A pass fails that moves a node, in any iteration, farther than so many times the deepest penetration, which is what
-it is to take away: at edges that slip Newton's method can wander off to another equilibrium. The second is that of deep
-meshes, between whose edges the gel moves more."""
+it is to take away: at edges that slip Newton's method can wander off to another equilibrium."""
 
 
 class Stepper:
@@ -91,8 +90,7 @@ class Stepper:
         depth_mm = max(float(path.corners[:, 0].max()), 0.1)
         self._shallow_mm = PENETRATION * depth_mm
         limit_mm = depth_mm if path.body.kind == KINDS["mesh"] else np.inf
-        self._deep_mm, self._too_deep_mm = DEEP * limit_mm, TOO_DEEP * limit_mm
-        self._deepest_mm = MAX_PENETRATION * limit_mm
+        self._deep_mm, self._deepest_mm = DEEP * limit_mm, MAX_PENETRATION * limit_mm
         self._rubs = friction > 0
         self.indenter, self._sticking = pack_indenter(path, friction), pack_indenter(path, STICK_FRICTION)
         self._sticking.centre, self._sticking.rotation = self.indenter.centre, self.indenter.rotation
@@ -207,32 +205,33 @@ class Stepper:
         The last of two whole updates is solved to the full tolerance; where the passes end before it, none is.
         """
         between = min(self._relaxed_tolerance, MULTIPLIER_TOLERANCE * self.numerics.tolerance)
-        share, done, failures, failed = 1.0, 0.0, 0, False
+        share, done, failures = 1.0, 0.0, 0
         if self.system.deepest() > self._shallow_mm:
             solution = self._polished(solution, between)
         while solution.converged and self.system.deepest() > self._shallow_mm:
-            deepest, most, worst = self.system.deepest(), MAX_MULTIPLIER_UPDATES, FAILURES
+            deepest, sharpness = self.system.deepest(), float(self.indenter.sharpness.numpy()[0])
             deep = deepest > self._deep_mm
-            if deep:
-                most, worst = MAX_DEEP_UPDATES, TOO_DEEP_FAILURES if deepest > self._too_deep_mm else DEEP_FAILURES
-            if done >= most or failures >= worst:
+            over = done >= MAX_MULTIPLIER_UPDATES or failures >= FAILURES
+            if done + failures >= MAX_DEEP_PASSES if deep else over:
                 break
             before = self.system.saved_contact()
+            if deep and done > 0:
+                self.indenter.sharpness.fill_(min(2 * sharpness, MAX_STIFFENING * self.path.body.sharpness))
             self.system.augment(self.indenter, share)
             tolerance = between if deep or done + share < MAX_MULTIPLIER_UPDATES else self.numerics.tolerance
-            reach = (DEEP_CORRECTION_RATIO if deep else MAX_CORRECTION_RATIO) * deepest
-            start, limit = solution.state, self.options.correction_iterations
+            start, limit, reach = solution.state, self.options.correction_iterations, MAX_CORRECTION_RATIO * deepest
             better = self._counted(solve(self.system, start, self.indenter, tolerance, limit, reach))
             relaxed = not better.converged and deep and share <= MAX_RELAXED_STEP
             if relaxed:
                 better = self._counted(relax(self.system, start, self.indenter, tolerance))
             if better.converged:
                 solution, done = better, done + share
-                share, failed = share if relaxed or (deep and failed) else min(1.0, 2 * share), False
+                share = share if relaxed else min(1.0, 2 * share)
             else:
                 self.system.restore_contact(before)
+                self.indenter.sharpness.fill_(sharpness)
                 self.system.residual(solution.state, self.indenter)
-                failures, share, failed = failures + (DEEP_FAILURES if relaxed else 1), share / 2, True
+                failures, share = failures + 1, share / 2
         return solution
 
     def _polished(self, solution: Solution, limit: float) -> Solution:
@@ -242,7 +241,7 @@ class Stepper:
         return self._counted(solve(self.system, solution.state, self.indenter, limit, MAX_ITERATIONS))
 
     def _record(self, step: Solution, target: float) -> bool:
-        """Record the corrected state, if it reaches the full tolerance, and put contact back to where the path goes on.
+        """Record the corrected state, if it reaches the full tolerance, and put contact back for the path to go on.
 
         Returns whether it does. A state that is too deep is not recorded either, and ends the press, saying so.
         """
@@ -256,6 +255,7 @@ class Stepper:
         if solution.converged and not self.reason:
             self.states.append(self._recorded_state(solution, target))
             self._iterations = 0
+        self.indenter.sharpness.fill_(self.path.body.sharpness)
         self.system.restore_contact(saved)
         self.system.forget_factor()
         self.system.residual(step.state, self.indenter)

@@ -58,7 +58,7 @@ class Lanes:
             its θ, else 0; part: of the linear step that is tried; trial_error: its error over the residual before.
         trial_held_force: norm of the forces on held nodes; held_force: the least that a relaxation must leave of it.
         failures, done, share: of augmented-Lagrangian passes: those that failed, the shares of the others together, and
-            the share of the next; new_share: of the one that begins; failed: 1 where the last one did.
+            the share of the next; new_share: of the one that begins; sharpness: of the indenter, before it.
         save: whether contact's memory is saved in this cycle; anchor: whether points that have come to touch are
             anchored for passes.
         deepest: penetration at the last evaluation, mm.
@@ -98,7 +98,7 @@ class Lanes:
     trial_held_force: wp.array(dtype=wp.float64)
     held_force: wp.array(dtype=wp.float64)
     failures: wp.array(dtype=wp.int32)
-    failed: wp.array(dtype=wp.int32)
+    sharpness: wp.array(dtype=wp.float64)
     done: wp.array(dtype=wp.float64)
     share: wp.array(dtype=wp.float64)
     new_share: wp.array(dtype=wp.float64)

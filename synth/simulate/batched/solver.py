@@ -139,7 +139,7 @@ class BatchedSolver:
         """Where a Newton solve ended: accept, correct, record, and choose the next step."""
         a, self._part = self._arrays, "stepping"
         s, f, multipliers = self.lanes, a.fields, (a.normal_before, a.tangent_before)
-        self._launch(transitions.finish_solve, self.batch, s, self._presses, self.settings)
+        self._launch(transitions.finish_solve, self.batch, s, self._presses, self.settings, a.indenters)
         self._launch(fields.move_fields, self._value_dim, s, phases.bits(phases.AT_RECORD, phases.CORRECTING), f)
         self._launch(fields.restore_multipliers, a.points, s, *multipliers, a.contact)
         self._sum(phases.AT_RECORD)
@@ -149,7 +149,7 @@ class BatchedSolver:
         self._select(phases.CORRECTING)
         self._launch(reductions.clear_sums, a.sums.shape, a.mask, s, a.sums)
         self._launch(reductions.penetrations, self._face_dim, a.mask, a.gap, s)
-        self._launch(transitions.choose_pass, self.batch, s, self._presses, self.settings)
+        self._launch(transitions.choose_pass, self.batch, s, self._presses, self.settings, a.indenters)
         self._launch(fields.save_multipliers, a.points, s, a.contact, *multipliers)
         found = (a.gap, a.tangential, self.penalty)
         self._launch(augment, a.points, s.new_share, a.indenters, *found, a.contact)
@@ -182,7 +182,7 @@ class BatchedSolver:
         self._launch(reductions.write_tractions, self._face_dim, a.mask, s, *where, a.records)
         self._select(phases.RECORD, phases.ROLLED_BACK)
         self._launch(fields.copy_memory, a.points, a.mask, a.saved, a.memory)
-        self._launch(transitions.finish_record, self.batch, s)
+        self._launch(transitions.finish_record, self.batch, a.mask, s, self._presses, a.indenters)
 
     def _linearise(self) -> None:
         """Linearise all lanes that are ready for a linear solve, and begin it."""

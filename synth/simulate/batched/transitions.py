@@ -16,6 +16,7 @@ import warp as wp
 from synth.simulate import newton, stepping
 from synth.simulate.batched import lanes as phases
 from synth.simulate.batched.lanes import Lanes, Presses, Settings
+from synth.simulate.contact import Indenters
 from synth.simulate.distance import KINDS
 
 
@@ -29,15 +30,12 @@ FORCE_FLOOR, INDIFFERENT, SHORTEST = _doubles(newton.FORCE_FLOOR, newton.INDIFFE
 SUFFICIENT_DECREASE, STALLED_RESIDUAL = _doubles(newton.SUFFICIENT_DECREASE, newton.STALLED_RESIDUAL)
 NEAR, STALL_ITERATIONS = wp.constant(wp.float64(newton.NEAR)), wp.constant(newton.STALL_ITERATIONS)
 GROWTH, SHORTEST_STEP = _doubles(stepping.GROWTH, stepping.SHORTEST_STEP)
-MAX_ITERATIONS_TO_GROW = wp.constant(stepping.MAX_ITERATIONS_TO_GROW)
-FAILURES, DEEP_FAILURES = wp.constant(stepping.FAILURES), wp.constant(stepping.DEEP_FAILURES)
-TOO_DEEP_FAILURES = wp.constant(stepping.TOO_DEEP_FAILURES)
-MAX_MULTIPLIER_UPDATES, MAX_DEEP_UPDATES = _doubles(stepping.MAX_MULTIPLIER_UPDATES, stepping.MAX_DEEP_UPDATES)
+MAX_ITERATIONS_TO_GROW, FAILURES = wp.constant(stepping.MAX_ITERATIONS_TO_GROW), wp.constant(stepping.FAILURES)
+MAX_MULTIPLIER_UPDATES, MAX_DEEP_PASSES = _doubles(stepping.MAX_MULTIPLIER_UPDATES, stepping.MAX_DEEP_PASSES)
 MULTIPLIER_TOLERANCE, PENETRATION = _doubles(stepping.MULTIPLIER_TOLERANCE, stepping.PENETRATION)
-MESH = wp.constant(KINDS["mesh"])
-DEEP, TOO_DEEP, MAX_PENETRATION = _doubles(stepping.DEEP, stepping.TOO_DEEP, stepping.MAX_PENETRATION)
-MAX_CORRECTION_RATIO, DEEP_CORRECTION_RATIO = _doubles(stepping.MAX_CORRECTION_RATIO, stepping.DEEP_CORRECTION_RATIO)
-MAX_RELAXED_STEP, MAX_STEPS = wp.constant(wp.float64(stepping.MAX_RELAXED_STEP)), wp.constant(newton.MAX_STEPS)
+DEEP, MAX_PENETRATION, MAX_STIFFENING = _doubles(stepping.DEEP, stepping.MAX_PENETRATION, stepping.MAX_STIFFENING)
+MAX_CORRECTION_RATIO, MAX_RELAXED_STEP = _doubles(stepping.MAX_CORRECTION_RATIO, stepping.MAX_RELAXED_STEP)
+MESH, MAX_STEPS = wp.constant(KINDS["mesh"]), wp.constant(newton.MAX_STEPS)
 FIRST_VISCOSITY, LEAST_VISCOSITY = _doubles(newton.FIRST_VISCOSITY, newton.LEAST_VISCOSITY)
 MOST_VISCOSITY, LEAST_SHARE = _doubles(newton.MOST_VISCOSITY, newton.LEAST_SHARE)
 LEAST_BORNE, MAX_ERROR, AIM = _doubles(newton.MIN_REACTION_RATIO, newton.MAX_ERROR, newton.AIM)
@@ -150,7 +148,7 @@ def _is_deeper(lanes: Lanes, presses: Presses, s: int, share: wp.float64) -> boo
 
 
 @wp.kernel
-def finish_solve(lanes: Lanes, presses: Presses, settings: Settings):
+def finish_solve(lanes: Lanes, presses: Presses, settings: Settings, indenters: Indenters):
     """After Newton's method: accept, halve, or end the step; count the pass or undo it."""
     s = wp.tid()
     phase = lanes.phase[s]
@@ -179,13 +177,12 @@ def finish_solve(lanes: Lanes, presses: Presses, settings: Settings):
     if correction:
         if phase == phases.SOLVED:
             lanes.done[s] = lanes.done[s] + lanes.share[s]
-            if not (relaxed or (deep and lanes.failed[s] == 1)):
+            if not relaxed:
                 lanes.share[s] = wp.min(ONE, wp.float64(2.0) * lanes.share[s])
-            lanes.failed[s] = 0
             lanes.phase[s] = phases.CORRECTING
         else:
-            lanes.failed[s] = 1
-            lanes.failures[s] = lanes.failures[s] + wp.where(relaxed, DEEP_FAILURES, 1)
+            indenters.sharpness[s] = lanes.sharpness[s]
+            lanes.failures[s] = lanes.failures[s] + 1
             lanes.share[s] = wp.float64(0.5) * lanes.share[s]
             lanes.move[s] = phases.RESTORE_RECORDED
             lanes.phase[s] = phases.RESTORED
@@ -231,7 +228,6 @@ def check_contact(lanes: Lanes, presses: Presses, sums: wp.array2d(dtype=wp.floa
         return
     lanes.save[s] = 1
     lanes.failures[s] = 0
-    lanes.failed[s] = 0
     lanes.share[s] = ONE
     lanes.done[s] = ZERO
     lanes.phase[s] = phases.CORRECTING
@@ -240,7 +236,7 @@ def check_contact(lanes: Lanes, presses: Presses, sums: wp.array2d(dtype=wp.floa
 
 
 @wp.kernel
-def choose_pass(lanes: Lanes, presses: Presses, settings: Settings):
+def choose_pass(lanes: Lanes, presses: Presses, settings: Settings, indenters: Indenters):
     """Another pass, the full tolerance, the record, or the end where passes leave an object too deep."""
     s = wp.tid()
     lanes.new_share[s] = ZERO
@@ -248,11 +244,10 @@ def choose_pass(lanes: Lanes, presses: Presses, settings: Settings):
         return
     j = lanes.press[s]
     corrected = presses.kind_of[j, lanes.next[s]] == 2
-    deep, too_deep = _is_deeper(lanes, presses, s, DEEP), _is_deeper(lanes, presses, s, TOO_DEEP)
+    deep = _is_deeper(lanes, presses, s, DEEP)
     over = lanes.failures[s] >= FAILURES or lanes.done[s] >= MAX_MULTIPLIER_UPDATES
     if deep:
-        failures = wp.where(too_deep, TOO_DEEP_FAILURES, DEEP_FAILURES)
-        over = lanes.failures[s] >= failures or lanes.done[s] >= MAX_DEEP_UPDATES
+        over = lanes.done[s] + wp.float64(lanes.failures[s]) >= MAX_DEEP_PASSES
     if corrected and over and _is_deeper(lanes, presses, s, MAX_PENETRATION):
         lanes.reason[s] = phases.TOO_DEEP
         lanes.phase[s] = phases.ENDED
@@ -267,8 +262,11 @@ def choose_pass(lanes: Lanes, presses: Presses, settings: Settings):
         lanes.limit[s] = settings.limit
     else:
         lanes.new_share[s] = lanes.share[s]
+        lanes.sharpness[s] = indenters.sharpness[s]
+        if deep and lanes.done[s] > ZERO:
+            indenters.sharpness[s] = wp.min(wp.float64(2.0) * lanes.sharpness[s], MAX_STIFFENING * presses.sharpness[j])
         lanes.stage[s] = phases.CORRECTION
-        lanes.most_moved[s] = wp.where(deep, DEEP_CORRECTION_RATIO, MAX_CORRECTION_RATIO) * lanes.deepest[s]
+        lanes.most_moved[s] = MAX_CORRECTION_RATIO * lanes.deepest[s]
         lanes.limit[s] = settings.correction_limit
         lanes.tolerance[s] = wp.max(settings.closer * settings.tolerance, MIN_TOLERANCE)
         if lanes.done[s] + lanes.share[s] < MAX_MULTIPLIER_UPDATES:
@@ -281,9 +279,11 @@ def choose_pass(lanes: Lanes, presses: Presses, settings: Settings):
 
 
 @wp.kernel
-def finish_record(lanes: Lanes):
-    """After the record, or the way back."""
+def finish_record(mask: wp.array(dtype=wp.int32), lanes: Lanes, presses: Presses, indenters: Indenters):
+    """After the record, or back before the step: the contact has its stiffness again."""
     s = wp.tid()
+    if mask[s] == 1:
+        indenters.sharpness[s] = presses.sharpness[lanes.press[s]]
     if lanes.phase[s] == phases.ROLLED_BACK:
         lanes.phase[s] = phases.BEGIN
     if lanes.phase[s] == phases.RECORD:
