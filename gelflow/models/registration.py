@@ -16,7 +16,8 @@ Gauss-Newton steps stay in the basin that they start in. With `propagation_px` e
 flows first (`gelflow.models.propagation`); where a whole neighbourhood mistook dots for the next ones, that does not
 help. With `after`, another registration comes before all stages. Its flow stays wherever the residual that it leaves is
 below its `noise`. So registration for both keeps the motion where motion explains the images, and follows brightness
-elsewhere. Where shading is ignored, each pixel at last takes the window that fits it (`gelflow.models.wider_window`).
+elsewhere. Where shading is ignored, each pixel at last takes the window that fits it (`gelflow.models.wider_window`):
+the last stage's, a wider one, or where the flow bends, that of a further stage.
 
 Lucas and Kanade 1981, with a prior (Simoncelli, Adelson and Heeger, "Probability distributions of optical flow", 1991);
 smoothing the field between the steps: Thirion's demons, 1998.
@@ -29,13 +30,15 @@ from gelflow.arrays import Flow, Images
 from gelflow.config import RegistrationConfig
 from gelflow.models.evidence import TINY, Evidence, evidence, gauss_newton
 from gelflow.models.propagation import propagated
-from gelflow.models.wider_window import TWO_STEPS, best_window
+from gelflow.models.wider_window import TWO_STEPS, bends, best_window, fine_noise
 from gelflow.ops.gaussian import SeparableFilter, smoother, window_sums
 from gelflow.ops.spline import SplineImage
 from gelflow.ops.warp import positions
 
 MAX_STEP_PX = 1.0
 """Limit on a Gauss-Newton step of each component."""
+FINE_WINDOW_PX, FINE_SMOOTHING_PX, FINE_PRIOR_PX = 3.0, 1.0, 0.3
+"""Window, smoothing and prior of the further stage."""
 RESIDUAL_WINDOW_PX, BLENDING_PX = 6.0, 2.0
 """Standard deviations of the window of the residual that decides between two flows, and of the blending at its edge."""
 
@@ -48,24 +51,50 @@ def registered(flow: Flow, image1: Images, image2: Images, config: RegistrationC
         former = flow
         if config.after is not None:
             former = flow = registered(flow, first, image2, config.after)
-        width = config.background_px
-        background = None if width is None else window_sums(flow, width)
         for window_px, smoothing_px in zip(config.windows_px, config.smoothing_px, strict=True):
-            window = window_sums(flow, window_px)
             if config.propagation_px:
                 flow = propagated(flow, first, image2, window_px, config)
-            start = smoother(flow, smoothing_px)(flow)
-            flow = start
-            for _ in range(config.iterations):
-                found = evidence(flow, first, second, background)
-                step = _posterior(found, flow - start, window, config)
-                flow = flow + step.clamp(-MAX_STEP_PX, MAX_STEP_PX)
-        if background is not None:
+            flow = _stage(flow, first, second, window_px, smoothing_px, config)
+        if config.background_px is not None:
             last = gauss_newton(flow, first, second, config)
-            variance = 1 / (1 / (TWO_STEPS * last.variance) + 1 / (2 * config.prior_px**2))
-            flow, _ = best_window(flow, variance, window(last.texture), config.windows_px[-1])
+            variance = posterior_variance(TWO_STEPS * last.variance, config.prior_px)
+            flow = _fitted(flow, variance, last.texture, first, second, config)
         if config.after is not None:
             flow = torch.lerp(former, flow, _unexplained(former, first, second, config.after.noise))
+    return flow
+
+
+def _fitted(
+    flow: Flow, variance: Tensor, texture: Tensor, first: Images, second: SplineImage, config: RegistrationConfig
+) -> Flow:
+    """A flow that was found in the last window, under the window that fits each place.
+
+    `variance` is that of its noise, and `texture` as of `gelflow.models.evidence.Step`.
+    """
+    windows = config.windows_px[-1], FINE_WINDOW_PX
+    best, _ = best_window(flow, variance, window_sums(flow, windows[0])(texture), windows[0])
+    further = config.model_copy(update={"windows_px": (FINE_WINDOW_PX,), "prior_px": FINE_PRIOR_PX})
+    fine = _stage(flow, first, second, FINE_WINDOW_PX, FINE_SMOOTHING_PX, further)
+    noise = fine_noise(*windows)[1] * gauss_newton(fine, first, second, further).variance
+    bent = bends(flow, fine, posterior_variance(noise, FINE_PRIOR_PX), windows, FINE_PRIOR_PX)
+    return torch.where(bent, fine, best)
+
+
+def posterior_variance(variance: Tensor, prior_px: float) -> Tensor:
+    """Of a flow's noise, both components together, px^2, where the flow before was wrong by `prior_px` in each."""
+    return 1 / (1 / variance + 1 / (2 * prior_px**2))
+
+
+def _stage(
+    flow: Flow, first: Images, second: SplineImage, window_px: float, smoothing_px: float, config: RegistrationConfig
+) -> Flow:
+    """Gauss-Newton steps in one window from the smoothed flow."""
+    window = window_sums(flow, window_px)
+    background = None if config.background_px is None else window_sums(flow, config.background_px)
+    start = flow = smoother(flow, smoothing_px)(flow)
+    for _ in range(config.iterations):
+        step = _posterior(evidence(flow, first, second, background), flow - start, window, config)
+        flow = flow + step.clamp(-MAX_STEP_PX, MAX_STEP_PX)
     return flow
 
 

@@ -2,9 +2,9 @@
 
 From the flow V a Gauss-Newton step leads to what the images say under a narrow window, and
 `gelflow.models.wider_window` from there to V*, what they say under the window that fits the place, with its mean square
-error e. What V misses of it is an error, too. Bias within the narrow window is not seen: it has one flow for all its
-texture, which lies at a mean square distance m from x, so that the flow's second derivatives V'' add an error.
-Together,
+error e. What V misses of it is an error, too. Bias within the window is not seen: it has one flow for all its texture,
+which lies at a mean square distance m from x, so that the flow's second derivatives V'' add an error. Of the narrow
+window and the finer one of the registration's further stage, that with the smaller sum of both counts. Together,
 
     sigma^2 = RADIUS^2 / 2 (e + |V - V*|^2 + (CURVATURE m |V''|)^2),
 
@@ -22,8 +22,8 @@ from torch import Tensor
 from gelflow.arrays import Features, Flow, Images
 from gelflow.config import RegistrationConfig
 from gelflow.models.evidence import TINY, gauss_newton
-from gelflow.models.registration import MAX_STEP_PX
-from gelflow.models.wider_window import MIN_VARIANCE, TWO_STEPS, best_window
+from gelflow.models.registration import FINE_SMOOTHING_PX, FINE_WINDOW_PX, MAX_STEP_PX
+from gelflow.models.wider_window import MIN_VARIANCE, TWO_STEPS, best_window, fine_noise
 from gelflow.ops.gaussian import SeparableFilter, smoother, window_sums
 from gelflow.ops.spline import SplineImage
 from gelflow.ops.warp import pixel_indices, positions
@@ -37,6 +37,7 @@ CERTAIN_PX, UNKNOWN_PX, MAX_SIGMA_PX = 0.1, 1.0, 10.0
 RADIUS = math.sqrt(-2 * math.log(1 - 0.68))
 """Radius that holds 68 % of a normal distribution in the plane whose components have a standard deviation of 1."""
 _MOTION = RegistrationConfig()
+_FINER = RegistrationConfig(windows_px=(FINE_WINDOW_PX,), smoothing_px=(FINE_SMOOTHING_PX,))
 
 
 def flow_sigma(flow: Flow, image1: Images, image2: Images) -> tuple[Tensor, Tensor]:
@@ -58,21 +59,29 @@ def flow_sigma(flow: Flow, image1: Images, image2: Images) -> tuple[Tensor, Tens
 
 def error_squares(flow: Flow, image1: Images, image2: Images) -> tuple[Tensor, Tensor]:
     """E + |V - V*|^2 and (m |V''|)^2, both (B, 1, H, W) px^2."""
-    window = window_sums(flow, _MOTION.windows_px[-1])
-    found = gauss_newton(flow, image1, SplineImage(image2), _MOTION)
+    second, narrow_px = SplineImage(image2), _MOTION.windows_px[-1]
+    found, finer = (gauss_newton(flow, image1, second, config) for config in (_MOTION, _FINER))
+    window, fine, wide = (window_sums(flow, width) for width in (narrow_px, FINE_WINDOW_PX, _MOTION.windows_px[0]))
     texture, variance = window(found.texture), (TWO_STEPS * found.variance).clamp(min=MIN_VARIANCE)
     narrow = flow + found.step.clamp(-MAX_STEP_PX, MAX_STEP_PX)
-    best, error = best_window(narrow, variance, texture, _MOTION.windows_px[-1])
-    known = variance < UNKNOWN_PX**2
-    error = torch.where(known, error, variance) + (flow - best).square().sum(dim=1, keepdim=True)
+    best, least = best_window(narrow, variance, texture, narrow_px)
+    known, missed = variance < UNKNOWN_PX**2, (flow - best).square().sum(dim=1, keepdim=True)
+    error = torch.where(known, least, variance)
     moment = torch.where(known, _second_moment(window, found.texture) / texture, 0.0)
+    bend = _curvature_square(flow)
+    # Where the flow bends, the further stage's window errs by less.
+    fine_error = fine_noise(narrow_px, FINE_WINDOW_PX)[1] * finer.variance
+    fine_moment = _second_moment(fine, finer.texture) / fine(finer.texture)
+    narrowed = fine_error + (CURVATURE * fine_moment).square() * bend < error + (CURVATURE * moment).square() * bend
+    narrowed &= known
+    error = torch.where(narrowed, fine_error, error) + missed
+    moment = torch.where(narrowed, fine_moment, moment)
     marks = (variance < 2 * _MOTION.prior_px**2) / variance
-    wide = window_sums(flow, _MOTION.windows_px[0])
     weight = wide(marks)
     between = ~known & (weight > TINY)
     error = torch.where(between, wide(marks * error) / weight, error)
     moment = torch.where(between, _second_moment(wide, marks) / weight, moment)
-    return error, moment.square() * _curvature_square(flow)
+    return error, moment.square() * bend
 
 
 def combined(error: Tensor, curvature: Tensor, factor: float) -> Tensor:

@@ -9,7 +9,8 @@ Which one is best is estimated without bias (Stein 1981; Lepski 1991),
 
     risk_s = <|H_s V - V|^2 / var V> + 2 cov(H_s V, V) / var V - 1,
 
-< > a mean under the window. The narrow window's risk is 1.
+< > a mean under the window. The narrow window's risk is 1. In the same way `bends` tells where a still narrower window,
+whose steps do need the images, is better than V.
 """
 
 import functools
@@ -27,6 +28,8 @@ TWO_STEPS = 11 / 6
 """Variance of the noise after two steps over that of one."""
 MIN_VARIANCE = 1e-8
 """Of a flow, px^2; of equal images it would be zero."""
+BEND_WINDOW_PX = 8.0
+"""Standard deviation of the window in which `bends` compares two flows."""
 FLAT = 0.04
 """Sum of squared gradients in a window below which pixels count alike; what the network's flow is worth by default."""
 
@@ -52,6 +55,32 @@ def best_window(flow: Flow, variance: Tensor, texture: Tensor, window_px: float)
         best, least = torch.where(better, wide, best), torch.where(better, risk, least)
         error = torch.where(better, variance * risk.clamp(min=left), error)
     return best, error
+
+
+def bends(flow: Flow, fine: Flow, variance: Tensor, windows_px: tuple[float, float], reach_px: float) -> Tensor:
+    """Where a flow is worse than what two more steps in a narrower window made of it; bool, (B, 1, H, W).
+
+    `variance` is that of the second flow's noise. Nowhere where the two differ by more than `reach_px`, root mean
+    square: such steps have lost the pattern.
+    """
+    apart = (fine - flow).square().sum(dim=1, keepdim=True)
+    window, alike = window_sums(flow, BEND_WINDOW_PX), torch.ones_like(apart)
+    risk = _mean(apart / variance.clamp(min=MIN_VARIANCE), alike, window) + 2 * fine_noise(*windows_px)[0] - 1
+    return (risk >= 1) & (_mean(apart, alike, window) <= reach_px**2)
+
+
+@functools.cache
+def fine_noise(window_px: float, fine_px: float) -> tuple[float, float]:
+    """Covariance of the noise under a window and after two more steps under a narrower one, over the variance after.
+
+    The second number is the variance after over that of one step in the narrower window alone.
+    """
+    k = np.linspace(0, 5 / fine_px, 1001)
+    wide, fine = (np.exp(-((deviation * k) ** 2) / 2) for deviation in (window_px, fine_px))
+    before = 1 - (1 - wide) ** 2
+    after = 1 - (1 - fine) ** 2 * (1 - before)
+    total = (k * after**2).sum()
+    return float((k * before * after).sum() / total), float(total / (k * fine**2).sum())
 
 
 def _mean(field: Features, weight: Tensor, window: SeparableFilter) -> Features:

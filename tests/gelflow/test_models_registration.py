@@ -12,7 +12,7 @@ from waves import Shifts
 
 from gelflow.config import REGISTRATIONS, ModelConfig, RegistrationConfig, TrainConfig
 from gelflow.config.sources import train_config
-from gelflow.models import GelFlow
+from gelflow.models import GelFlow, registration
 from gelflow.models.estimate import estimate_flow
 from gelflow.models.propagation import propagated
 from gelflow.models.registration import registered
@@ -100,6 +100,16 @@ def test_shading_is_ignored_unless_asked_for_and_equal_brightness_elsewhere_does
     lost = truth.clone()
     lost[..., :24] = torch.tensor([-18.0, 0.0]).view(2, 1, 1)
     assert error(registered(lost, dim, lit, MOTION)[..., 60:], truth[..., 60:]) < 0.1
+
+
+def test_where_the_flow_bends_a_finer_window_follows(monkeypatch: pytest.MonkeyPatch) -> None:
+    x, y = grid(HEIGHT, WIDTH)
+    u = 0.5 * np.sin(2 * np.pi * x / 32)
+    image1, image2 = (torch.from_numpy(im).permute(2, 0, 1)[None] for im in (texture(x + u, y), texture(x, y)))
+    truth = torch.from_numpy(np.stack([u, 0 * u])).float()[None]
+    found = registered(torch.zeros_like(truth), image1, image2, MOTION)
+    monkeypatch.setattr(registration, "bends", lambda *_: torch.tensor(False))
+    assert error(found, truth) < 0.7 * error(registered(torch.zeros_like(truth), image1, image2, MOTION), truth)
 
 
 def test_what_came_first_stays_where_it_explains_the_images() -> None:

@@ -10,7 +10,7 @@ from torch import Tensor
 from gelflow.config import RegistrationConfig
 from gelflow.models.evidence import gauss_newton
 from gelflow.models.uncertainty import MAX_SIGMA_PX, RADIUS, flow_sigma
-from gelflow.models.wider_window import TWO_STEPS, best_window
+from gelflow.models.wider_window import TWO_STEPS, bends, best_window, fine_noise
 from gelflow.ops.gaussian import window_sums
 from gelflow.ops.spline import SplineImage
 
@@ -122,3 +122,26 @@ def test_what_bends_more_than_noise_stays() -> None:
     # The step is a hundred times the noise: no window that reaches it has the smaller risk.
     assert torch.equal(found[..., 90:110], flow[..., 90:110])
     assert found[..., :20].square().mean() < 0.5 * flow[..., :20].square().mean()
+
+
+def test_noise_does_not_bend_what_two_further_steps_follow_does_and_a_jump_is_no_bend() -> None:
+    fine_px, reach = 3.0, 0.3
+    window = window_sums(TEXTURE, fine_px)
+    white = NOISE * torch.randn((1, 2, *SIZE), generator=torch.Generator().manual_seed(0))
+    flow, _ = noise_of_two_steps(0)
+    fine = flow
+    for _ in range(2):
+        fine = fine + window(white - fine) / window(TEXTURE)
+    shared, variance = fine_noise(NARROW, fine_px)
+    variance *= 2 * NOISE**2 / (4 * torch.pi * fine_px**2)
+    found = fine.square().sum(dim=1)[MIDDLE].mean().item()
+    assert found == pytest.approx(variance, rel=0.1)
+    assert (fine * flow).sum(dim=1)[MIDDLE].mean().item() == pytest.approx(shared * found, rel=0.1)
+
+    def bent(wave_px: float) -> float:
+        wave = wave_px * torch.sin(torch.arange(SIZE[1]) / fine_px)
+        return bends(flow, fine + wave, variance * TEXTURE, (NARROW, fine_px), reach)[MIDDLE].float().mean().item()
+
+    assert bent(0.0) < 0.1
+    assert bent(4 * variance**0.5) == 1
+    assert bent(2 * reach) == 0
