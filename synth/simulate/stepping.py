@@ -30,7 +30,7 @@ MAX_ITERATIONS_TO_GROW = 7
 GROWTH = 1.5
 MAX_RELAXED_STEP = 1 / 4
 """A step that fails is relaxed (`synth.simulate.newton`) when it is at most this share of max_step_mm, and a pass
-when it is at most this share of a whole update and begins deeper than DEEP."""
+when it is less than this share of a whole update and begins deeper than DEEP."""
 STICK_FRICTION = 1e6
 """Coefficient of friction at which nothing slides."""
 PATH_DERIVATIVE_STEP = 1e-3
@@ -221,7 +221,7 @@ class Stepper:
             tolerance = between if deep or done + share < MAX_MULTIPLIER_UPDATES else self.numerics.tolerance
             start, limit, reach = solution.state, self.options.correction_iterations, MAX_CORRECTION_RATIO * deepest
             better = self._counted(solve(self.system, start, self.indenter, tolerance, limit, reach))
-            relaxed = not better.converged and deep and share <= MAX_RELAXED_STEP
+            relaxed = not better.converged and deep and share < MAX_RELAXED_STEP
             if relaxed:
                 better = self._counted(relax(self.system, start, self.indenter, tolerance))
             if better.converged:

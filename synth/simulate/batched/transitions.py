@@ -162,7 +162,7 @@ def finish_solve(lanes: Lanes, presses: Presses, settings: Settings, indenters: 
     small = lanes.target[s] - lanes.at[s] <= MAX_RELAXED_STEP * settings.longest
     deep = _is_deeper(lanes, presses, s, DEEP)
     if correction:
-        small = lanes.share[s] <= MAX_RELAXED_STEP and deep
+        small = lanes.share[s] < MAX_RELAXED_STEP and deep
     if phase == phases.FAILED and not relaxed and not polish and small:
         lanes.relaxing[s] = 1
         lanes.viscosity[s] = FIRST_VISCOSITY
