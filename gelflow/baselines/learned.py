@@ -93,10 +93,7 @@ class Learned:
 class PublishedRaft:
     """RAFT, small or large, with published weights; arguments and exceptions as for `Learned`."""
 
-    def __init__(
-        self, path: Path, name: str | None = None, size: tuple[int, int] | None = None, device: str = "auto"
-    ) -> None:
-        self.path = path
+    def __init__(self, path: Path, name: str | None, size: tuple[int, int] | None, device: str) -> None:
         self.device = chosen_device(device)
         self.model: Any = load_raft(path, self.device)
         self.forward = self.model
