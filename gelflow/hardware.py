@@ -4,6 +4,8 @@ import os
 import platform
 from pathlib import Path
 
+import torch
+
 from gelflow.errors import InputError
 
 CPU_INFO = Path("/proc/cpuinfo")
@@ -14,8 +16,6 @@ def chosen_device(device: str) -> str:
 
     InputError where a CUDA device is asked for and there is none.
     """
-    import torch
-
     available = torch.cuda.is_available()
     if device == "cuda" and not available:
         raise InputError("--device cuda: no CUDA device was found; use --device cpu")
@@ -25,8 +25,6 @@ def chosen_device(device: str) -> str:
 def hardware(device: str) -> str:
     """Name of a device, "cpu" or "cuda", for tables: processor and usable cores, or CUDA device."""
     if device == "cuda":
-        import torch
-
         return torch.cuda.get_device_name()
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     # Linux tells the processor's model; elsewhere its architecture has to do.

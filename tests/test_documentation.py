@@ -121,9 +121,7 @@ def test_flow_of_two_images(dataset: Path) -> None:
 
 
 def test_dataloader(dataset: Path, tmp_path: Path) -> None:
-    from synth.cli import main
-
-    assert main(["export", str(dataset), "--format", "webdataset", "--out", str(tmp_path)]) == 0
+    assert synth.cli.main(["export", str(dataset), "--format", "webdataset", "--out", str(tmp_path)]) == 0
     error, motion = found(rf"mean endpoint error {NUMBER} px of {NUMBER} px", run("dataloader.py", tmp_path))
     assert error < motion / 4
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 
+import cv2
 import numpy as np
 
 from gelflow.arrays import FlowArray, Grey8, ImageArray
@@ -18,6 +19,7 @@ from gelflow.baselines.method import as_array, as_tensor, check_images
 from gelflow.config import RegistrationConfig
 from gelflow.errors import InputError
 from gelflow.files.image import to_grey
+from gelflow.models.registration import registered
 
 
 @dataclass(frozen=True)
@@ -28,8 +30,6 @@ class Classical:
     estimate: Callable[[Grey8, Grey8], Any]
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
-        import cv2
-
         check_images(image1, image2)
         try:
             return np.asarray(self.estimate(to_grey(image1), to_grey(image2)))
@@ -48,22 +48,16 @@ def _still(grey1: Grey8, grey2: Grey8) -> FlowArray:
 
 
 def _farneback(grey1: Grey8, grey2: Grey8) -> Any:
-    import cv2
-
     settings = {"pyr_scale": 0.5, "levels": 5, "winsize": 15, "iterations": 5, "poly_n": 7, "poly_sigma": 1.5}
     return cv2.calcOpticalFlowFarneback(grey1, grey2, _still(grey1, grey2), **settings, flags=0)
 
 
 def _dis(preset: str, grey1: Grey8, grey2: Grey8) -> Any:
-    import cv2
-
     number = getattr(cv2, f"DISOPTICAL_FLOW_PRESET_{preset.upper()}")
     return cv2.DISOpticalFlow.create(number).calc(grey1, grey2, None)
 
 
 def _tvl1(grey1: Grey8, grey2: Grey8) -> Any:
-    import cv2
-
     if not hasattr(cv2, "optflow"):
         raise InputError(
             "TV-L1 needs opencv-contrib, and another OpenCV package hides it; "
@@ -95,8 +89,6 @@ class RegisteredDIS:
         return f"DIS medium+{self.aim}"
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
-        from gelflow.models.registration import registered
-
         start = dis("medium").flow(image1, image2)
         first, second = as_tensor(image1, self.device), as_tensor(image2, self.device)
         return as_array(registered(as_tensor(start, self.device), first, second, self.settings))

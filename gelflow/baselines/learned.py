@@ -4,11 +4,18 @@ import re
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from gelflow.arrays import FlowArray, ImageArray
 from gelflow.baselines.method import as_array, as_tensor, check_images
 from gelflow.config import REGISTRATIONS, Registration
 from gelflow.errors import InputError
 from gelflow.hardware import chosen_device
+from gelflow.models.estimate import estimate_flow
+from gelflow.models.raft import load_raft, looks_like_raft
+from gelflow.models.recorded import RecordedNetwork
+from gelflow.models.weights import load_weights
+from gelflow.ops.pyramid import resize_flow, resize_images
 
 _END = re.compile(r"((?:#\d+)?(?:\+ft)?)$")
 """The number of a seed and the mark of fine-tuning, which names end with (see `gelflow.compare.seeds`)."""
@@ -26,8 +33,6 @@ def open_network(
     InputError where the file is missing, damaged or of another network, the device is not there, or `registration` is
     given for RAFT.
     """
-    from gelflow.models.raft import looks_like_raft
-
     if not looks_like_raft(path):
         return Learned(path, name, size, device, registration)
     if registration is not None:
@@ -63,11 +68,6 @@ class Learned:
         device: str = "auto",
         registration: Registration | None = None,
     ) -> None:
-        import torch
-
-        from gelflow.models.recorded import RecordedNetwork
-        from gelflow.models.weights import load_weights
-
         self.path = path
         self.device = chosen_device(device)
         self.registration = registration
@@ -85,8 +85,6 @@ class Learned:
         self.size = size
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
-        from gelflow.models.estimate import estimate_flow
-
         check_images(image1, image2)
         tensors = [as_tensor(image, self.device) for image in (image1, image2)]
         return as_array(estimate_flow(self.model, tensors[0], tensors[1], self.size, self.forward))
@@ -95,12 +93,7 @@ class Learned:
 class PublishedRaft:
     """RAFT, small or large, with published weights; arguments and exceptions as for `Learned`."""
 
-    def __init__(
-        self, path: Path, name: str | None = None, size: tuple[int, int] | None = None, device: str = "auto"
-    ) -> None:
-        from gelflow.models.raft import load_raft
-
-        self.path = path
+    def __init__(self, path: Path, name: str | None, size: tuple[int, int] | None, device: str) -> None:
         self.device = chosen_device(device)
         self.model: Any = load_raft(path, self.device)
         self.forward = self.model
@@ -108,10 +101,6 @@ class PublishedRaft:
         self.size = size
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
-        import torch
-
-        from gelflow.ops.pyramid import resize_flow, resize_images
-
         check_images(image1, image2)
         native = (image1.shape[0], image1.shape[1])
         tensors = [resize_images(as_tensor(image, self.device), self.size or native) for image in (image1, image2)]

@@ -5,6 +5,7 @@ by OpenCV with windows of 21 px over 5 octaves, there and back. Points that do n
 dropped; the others are interpolated as in `gelflow.baselines.method`. 8-bit luma.
 """
 
+import cv2
 import numpy as np
 
 from gelflow.arrays import FlowArray, ImageArray
@@ -30,8 +31,6 @@ class LucasKanade:
             NothingFoundError: Nothing can be tracked: no corner, or none that is found again.
             InputError: See `check_images`.
         """
-        import cv2
-
         check_images(image1, image2)
         first, second = to_grey(image1), to_grey(image2)
         start = cv2.goodFeaturesToTrack(first, CORNERS, QUALITY, DISTANCE_PX)

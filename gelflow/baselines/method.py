@@ -3,12 +3,14 @@
 from typing import Any, Protocol
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from gelflow.arrays import FlowArray, ImageArray, MapArray
 from gelflow.errors import InputError
 from gelflow.files.exr import FlowField
 from gelflow.files.image import MINIMUM_SIDE
+from gelflow.models.uncertainty import flow_sigma
 
 
 class Method(Protocol):
@@ -43,8 +45,6 @@ def check_images(image1: ImageArray, image2: ImageArray) -> None:
 
 def as_tensor(image: ImageArray, device: str) -> Any:
     """An image or flow (H, W, C) float32 as a tensor (1, C, H, W) on a device."""
-    import torch
-
     return torch.from_numpy(np.ascontiguousarray(np.moveaxis(image, -1, 0)))[None].to(device)
 
 
@@ -56,8 +56,6 @@ def as_array(flow: Any) -> FlowArray:
 
 def uncertainty(flow: FlowArray, image1: ImageArray, image2: ImageArray, device: str) -> tuple[MapArray, MapArray]:
     """Sigma in px and the probability to be seen in image 2, see `gelflow.models.uncertainty`; (H, W) float32."""
-    from gelflow.models.uncertainty import flow_sigma
-
     sigma, visible = flow_sigma(*(as_tensor(array, device) for array in (flow, image1, image2)))
     return sigma[0, 0].cpu().numpy(), visible[0, 0].cpu().numpy()
 

@@ -33,8 +33,6 @@ Registration = Annotated[
         "weights state; best: motion."
     ),
 ]
-
-
 METHODS = (
     "none, lucas-kanade, farneback, dis-ultrafast, dis-fast, dis-medium, tvl1, dis-motion, dis-both, "
     "dis-brightness, al-dic"

@@ -11,8 +11,10 @@ the dots that is: a flow that is wrong by a whole pitch of the pattern leads to 
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from gelflow.arrays import FlowArray, Grey8, ImageArray, PointArray
 from gelflow.compare.metrics import moved_points
@@ -70,8 +72,6 @@ def find_dots(image: ImageArray) -> Dots | None:
 
 def dot_distance(flow: FlowArray, dots1: Dots, dots2: Dots) -> DotDistance | None:
     """Compares the dots of image 1, moved by the flow, with those of image 2; None if none stays in the image."""
-    from scipy.spatial import KDTree
-
     moved = moved_points(flow, dots1.centres)
     staying = moved[_inside(moved, flow.shape, dots1.diameter_px)]
     if not len(staying) or len(dots2.centres) < 2:
@@ -91,15 +91,11 @@ def _inside(points: PointArray, shape: tuple[int, ...], margin: float) -> NDArra
 
 def _nearest_other(points: PointArray) -> NDArray[np.float64]:
     """Distance (N,) px of each point to the nearest other."""
-    from scipy.spatial import KDTree
-
     return np.asarray(KDTree(points).query(points, 2)[0][:, 1])
 
 
 def _marks(grey: Grey8, colour: int) -> NDArray[np.float64]:
     """Column, row and diameter, (N, 3) px, of convex marks darker (0) or brighter (255) than what surrounds them."""
-    import cv2
-
     settings = cv2.SimpleBlobDetector.Params()
     settings.minThreshold, settings.maxThreshold, settings.thresholdStep = THRESHOLD_STEP, 255, THRESHOLD_STEP
     settings.minRepeatability, settings.minDistBetweenBlobs = 3, 4

@@ -13,8 +13,10 @@ PSNR and SSIM are those of the GelFlow paper (n = 8 bit); they tell how well ima
 where the gel went.
 """
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from gelflow.arrays import Bytes3, FlowArray, Grey8, ImageArray, MarkerArray, MaskArray, PointArray
 from gelflow.errors import InputError
@@ -61,7 +63,6 @@ def ssim(grey: Grey8, other: Grey8) -> float:
 
 def ssim_map(grey: Grey8, other: Grey8) -> NDArray[np.float64]:
     """Structural similarity at each pixel of two grey 8-bit images, (H, W)."""
-    import cv2
 
     def blurred(values: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(cv2.GaussianBlur(values, (11, 11), 1.5, borderType=cv2.BORDER_REFLECT_101))
@@ -95,8 +96,6 @@ def marker_distance(flow: FlowArray, markers: MarkerArray) -> float:
 
 def moved_points(flow: FlowArray, points: PointArray) -> PointArray:
     """Points (N, 2), moved by a flow that is read bilinearly; NaN where the flow is."""
-    from scipy.ndimage import map_coordinates
-
     at = points[:, ::-1].T
     motion = [map_coordinates(flow[..., k].astype(np.float64), at, order=1, mode="nearest") for k in (0, 1)]
     return points + np.stack(motion, axis=1)

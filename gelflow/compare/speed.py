@@ -9,6 +9,8 @@ import time
 from dataclasses import dataclass
 from typing import Any
 
+import torch
+
 from gelflow.hardware import hardware
 
 WARMUP, REPEATS = 2, 5
@@ -28,8 +30,6 @@ class Speed:
 
 def network_speed(model: Any, size: tuple[int, int], batch: int, device: str) -> Speed:
     """Measures the pass of a network that takes two image batches (B, 3, H, W) on the device."""
-    import torch
-
     random = torch.Generator().manual_seed(0)
     images = [torch.rand(batch, 3, *size, generator=random).to(device) for _ in range(2)]
     synchronise = torch.cuda.synchronize if device == "cuda" else lambda: None

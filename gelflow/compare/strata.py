@@ -14,6 +14,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
 from gelflow.arrays import FlowArray, MaskArray
 from gelflow.compare.seeds import group_name
@@ -66,8 +67,6 @@ def signed_distance(region: MaskArray) -> NDArray[np.float64]:
 
     The edge lies half a px beyond the last pixel's centre.
     """
-    from scipy.ndimage import distance_transform_edt
-
     outside = np.asarray(distance_transform_edt(~region), np.float64)
     inside = np.asarray(distance_transform_edt(region), np.float64)
     return np.where(region, 0.5 - inside, outside - 0.5)

@@ -15,6 +15,7 @@ a percentile near the top, because a local press moves a small part of the gel. 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -81,8 +82,6 @@ class MotionMeter:
     """Measures motion between frames of one size. Holds the reduced frames."""
 
     def __init__(self, frames: Sequence[Bytes3]) -> None:
-        import cv2
-
         height, width = frames[0].shape[:2]
         self.scale = max(1.0, max(height, width) / WORKING_SIDE)
         size = (max(16, round(width / self.scale)), max(16, round(height / self.scale)))
@@ -100,8 +99,6 @@ class MotionMeter:
 
     def closure_px(self, forward: FlowArray, backward: FlowArray) -> float:
         """Median over the image of |forward(x) + backward(x + forward(x))|, px of the recording."""
-        import cv2
-
         columns = self._columns + forward[..., 0] / np.float32(self.scale)
         rows = self._rows + forward[..., 1] / np.float32(self.scale)
         there = cv2.remap(backward, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

@@ -1,5 +1,6 @@
 """Image pairs as a map-style data set for torch."""
 
+import csv
 import hashlib
 import json
 from collections.abc import Sequence
@@ -152,8 +153,6 @@ def read_markers(path: Path) -> MarkerArray:
 
     InputError where it is missing, lacks a column or a row, or holds something other than finite numbers.
     """
-    import csv
-
     columns = ("x1", "y1", "x2", "y2")
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:  # with or without a byte order mark

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
+import OpenEXR
 from numpy.typing import NDArray
 
 from gelflow.arrays import FlowArray, MapArray, MaskArray
@@ -44,8 +45,6 @@ class FlowField(NamedTuple):
 
 def read_channels(path: Path) -> dict[str, NDArray[np.float32]]:
     """All channels (H, W) of an EXR file by name, as float32; InputError if missing, none, truncated or damaged."""
-    import OpenEXR
-
     if not path.is_file():
         raise InputError(f"{path}: there is no such file")
     try:
@@ -80,8 +79,6 @@ def write_flow(
     path: Path, forward: FlowArray, visible: MaskArray | MapArray | None = None, sigma: MapArray | None = None
 ) -> None:
     """Writes a forward flow, and where it is visible and its sigma if they are known; replaces the file as a whole."""
-    import OpenEXR
-
     planes = {f"forward.{name}": np.ascontiguousarray(forward[..., k], np.float32) for k, name in enumerate("UV")}
     if visible is not None:
         planes["forward.visible"] = visible.astype(np.float32)

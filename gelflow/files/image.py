@@ -7,7 +7,9 @@ photograph is turned as its EXIF data say.
 import io
 from pathlib import Path
 
+import cv2
 import numpy as np
+from PIL import Image, UnidentifiedImageError
 
 from gelflow.arrays import Bytes3, Grey8, ImageArray
 from gelflow.errors import InputError
@@ -21,8 +23,6 @@ MINIMUM_SIDE = 16
 
 def _check(path: Path, data: bytes) -> None:
     """Refuses what OpenCV decodes, as far as it goes, without complaint: PNGs by checksums, others by decoding."""
-    from PIL import Image, UnidentifiedImageError
-
     try:
         with Image.open(io.BytesIO(data)) as image:
             if image.format == "PNG":
@@ -37,8 +37,6 @@ def _check(path: Path, data: bytes) -> None:
 
 def read_image(path: Path) -> ImageArray:
     """An image as (H, W, 3) float32, RGB in [0, 1]; InputError if missing, damaged, or neither of 8 nor 16 bits."""
-    import cv2
-
     if not path.is_file():
         raise InputError(f"{path}: there is no such image file")
     data = path.read_bytes()
@@ -72,15 +70,11 @@ def to_bytes(image: ImageArray) -> Bytes3:
 
 def to_grey(image: ImageArray) -> Grey8:
     """Luma of an image as (H, W) uint8: round(.299 R + .587 G + .114 B) of its 8-bit channels (ITU-R BT.601)."""
-    import cv2
-
     return cv2.cvtColor(to_bytes(image), cv2.COLOR_RGB2GRAY)
 
 
 def write_png(path: Path, pixels: Bytes3 | Grey8) -> None:
     """Writes (H, W, 3) RGB or (H, W) grey uint8 as PNG; replaces the file as a whole."""
-    import cv2
-
     bgr = pixels[..., ::-1] if pixels.ndim == 3 else pixels
     encoded, data = cv2.imencode(".png", np.ascontiguousarray(bgr))
     if not encoded:

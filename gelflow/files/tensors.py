@@ -5,11 +5,11 @@ import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from pickle import UnpicklingError
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from zipfile import BadZipFile
 
-if TYPE_CHECKING:
-    from torch import Tensor, nn
+import torch
+from torch import Tensor, nn
 
 DAMAGE = (
     UnpicklingError, RuntimeError, EOFError, LookupError, TypeError, ValueError, AttributeError, AssertionError,
@@ -24,8 +24,6 @@ class Unreadable(Exception):
 
 def load_tensors(path: Path) -> Any:
     """Tensors and plain values, on the CPU; FileNotFoundError where there is no file, Unreadable for anything else."""
-    import torch
-
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # notes on the pickle protocol of files that are refused anyway
@@ -37,7 +35,7 @@ def load_tensors(path: Path) -> Any:
         raise Unreadable(lines[0] if lines else type(error).__name__) from error
 
 
-def misfit(tensors: "Mapping[str, Tensor]", model: "nn.Module") -> str:
+def misfit(tensors: Mapping[str, Tensor], model: nn.Module) -> str:
     """What keeps tensors from being a network's weights, three problems at most; an empty text where they fit."""
     expected = model.state_dict()
     wrong = [f"{name} is missing" for name in expected if name not in tensors]

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
+
 from gelflow.arrays import Bytes3
 from gelflow.errors import InputError
 from gelflow.files.image import SUFFIXES as IMAGE_SUFFIXES
@@ -49,8 +51,6 @@ def describe(path: Path) -> VideoInfo:
         if not files:
             raise InputError(f"{path}: the folder holds no image; allowed: {', '.join(sorted(IMAGE_SUFFIXES))}")
         return VideoInfo(len(files), 25.0)
-    import cv2
-
     capture = _open(path)
     with quiet():
         count, rate = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), float(capture.get(cv2.CAP_PROP_FPS))
@@ -102,8 +102,6 @@ def frame_file(path: Path, index: int) -> Path:
 
 
 def _open(path: Path) -> Any:  # a cv2.VideoCapture; OpenCV has no types
-    import cv2
-
     if not path.is_file():
         raise InputError(f"{path}: there is no such video")
     with quiet():

@@ -59,20 +59,15 @@ def self_supervised_loss(
         if place < scale and (share or smooth_share):
             flow = enlarge_flow(flow, scale, (image1.shape[-2], image1.shape[-1]))
         if share > 0:
-            mask = None if seen is None else seen[place]
-            loss = _photometric(first[place], second[place], flow, config, mask)
+            pixels = inside(flow) if seen is None else inside(flow) * seen[place]
+            warped = warp(second[place], flow, config.warping)
+            loss = appearance_loss(first[place], warped, pixels, config.alpha)
             parts["photometric"] = parts["photometric"] + share * loss
         if smooth_share > 0:
             smooth, deformed = _regulariser(flow, first[place], config, side)
             parts["smoothness"] = parts["smoothness"] + smooth_share * smooth
             parts["deformation"] = parts["deformation"] + smooth_share * deformed
     return torch.stack(list(parts.values())).sum(), {name: value.detach() for name, value in parts.items()}
-
-
-def _photometric(image1: Images, image2: Images, flow: Flow, config: LossConfig, visible: Mask | None) -> Scalar:
-    """Photometric loss of one flow on images of its size."""
-    pixels = inside(flow) if visible is None else inside(flow) * visible
-    return appearance_loss(image1, warp(image2, flow, config.warping), pixels, config.alpha)
 
 
 def _regulariser(flow: Flow, image: Images, config: LossConfig, side: int) -> tuple[Scalar, Scalar]:

@@ -8,6 +8,7 @@ and follows the flow, so that a flow of some hundredths of a px fills the wheel 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -88,8 +89,6 @@ def draw_overlay(frame: Bytes3, flow: FlowArray, scale_px: float) -> Bytes3:
     the motion; where the scale is below 3 px they are enlarged, by a factor that is written on the frame. The picture
     is uint8 RGB, twice as wide as the frame, enlarged to at least 480 rows, both sides even (as video encoders ask).
     """
-    import cv2
-
     height, width = frame.shape[:2]
     zoom = max(1, -(-480 // height))
     left = cv2.resize(frame, (zoom * width, zoom * height), interpolation=cv2.INTER_LINEAR)
@@ -122,8 +121,6 @@ def arrow_factor(scale_px: float) -> float:
 
 
 def _label(picture: Bytes3, text: str, origin: tuple[int, int]) -> None:
-    import cv2
-
     (width, height), below = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.6, 1)
     x, y = origin
     cv2.rectangle(picture, (x - 4, y - height - 5), (x + width + 4, y + below + 2), (255, 255, 255), cv2.FILLED)

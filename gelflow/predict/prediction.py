@@ -9,6 +9,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Literal
 
+import cv2
 import numpy as np
 
 from gelflow.arrays import Bytes3, ImageArray
@@ -154,8 +155,6 @@ def _frame_pairs(path: Path, every: int, reference: Reference) -> Iterator[tuple
 
 
 def _write_overlay(pictures: Iterator[Bytes3], video: Path, frames_per_second: float) -> None:
-    import cv2
-
     first = next(pictures)
     temporary = video.with_name(".overlay.part.mp4")
     try:

@@ -29,6 +29,9 @@ from gelflow.config import TrainConfig
 from gelflow.config.validation import validated
 from gelflow.data.pairs import PairDataset
 from gelflow.errors import InputError
+from gelflow.models.weights import read_metadata
+from gelflow.train.run import train
+from gelflow.train.state import STATE
 
 BATCH = 4
 """Pairs in a batch, the paper's, so that 1600 steps on 8 pairs are its 800 epochs for every network."""
@@ -41,8 +44,6 @@ def fine_tuning_settings(method: Learned, steps: int, pairs: int) -> TrainConfig
 
     InputError where the weights carry no settings.
     """
-    from gelflow.models.weights import read_metadata
-
     text = read_metadata(method.path).get("train")
     if text is None:
         raise InputError(f"{method.path}: its metadata lack the settings of its training, by which --ft goes on")
@@ -76,9 +77,6 @@ def fine_tuned(method: Learned, dataset: PairDataset, out: Path, steps: int) -> 
     flow is registered. InputError where the pairs differ in size and the network has none of its own; see also
     `fine_tuning_settings` and `gelflow.train.train`.
     """
-    from gelflow.train import train
-    from gelflow.train.state import STATE
-
     settings = fine_tuning_settings(method, steps, len(dataset))
     sizes = {dataset.images(index)[0].shape[:2] for index in range(len(dataset))}
     if settings.image_size is None and len(sizes) > 1:

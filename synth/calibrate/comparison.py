@@ -1,15 +1,19 @@
 """The fitted sensor rendered, beside the frame that it is to match."""
 
+import io
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
+from matplotlib.figure import Figure
 
 from synth.arrays import BoolArray, FloatArray
+from synth.calibrate.dots import find_dots
 from synth.calibrate.frames import PLACE
 from synth.mesh import rest_surface
 from synth.render.camera_image import encoded, expected_signal
-from synth.render.pattern import albedo
+from synth.render.pattern import albedo, pixels_per_mm
 from synth.render.renderer import Renderer
 from synth.render.variant import Variant
 from synth.scene import Dots, Render, Sensor
@@ -45,8 +49,6 @@ class Comparison:
 
         A place is a Gaussian neighbourhood of 2 % of the image's width; the worst one hundredth is left out.
         """
-        import cv2
-
         sigma = PLACE * self.frame.shape[1]
         difference = 255 * (self.rendered - self.frame) * self.outside[:, :, None]
         weight = np.maximum(cv2.GaussianBlur(self.outside.astype(np.float64), (0, 0), sigma), 1e-6)
@@ -76,11 +78,6 @@ def compare(frame: FloatArray, rendered: FloatArray, bare: BoolArray, sensor: Se
     """
     outside = bare.copy()
     if isinstance(sensor.pattern, Dots):
-        import cv2
-
-        from synth.calibrate.dots import find_dots
-        from synth.render.pattern import pixels_per_mm
-
         pitch = sensor.pattern.spacing_mm[0] * pixels_per_mm(sensor)
         outside &= ~find_dots(rendered**sensor.camera.gamma, pitch).covered
         outside = cv2.erode(outside.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=1) > 0
@@ -89,10 +86,6 @@ def compare(frame: FloatArray, rendered: FloatArray, bare: BoolArray, sensor: Se
 
 def picture(rows: dict[str, Comparison], title: str) -> bytes:
     """A PNG: a row per comparison with the frame, the fitted sensor, and their difference, amplified around grey."""
-    import io
-
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(12.6, 3.4 * len(rows) + 0.6), dpi=100)
     axes = figure.subplots(len(rows), 3, squeeze=False)
     for line, (name, row) in zip(axes, rows.items(), strict=True):

@@ -6,6 +6,8 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial import cKDTree
 
 from synth.arrays import FloatArray, Pixels
 from synth.errors import InputError
@@ -40,17 +42,13 @@ def fit_dot_grid(sensor: Sensor, pattern: Dots, centres: Pixels, spacing_mm: flo
     are found, or the camera's scale is taken from the preset and the spacing is found. Principal point, tilt and the
     distortion k1 are weakly determined and held near the preset by a prior. The preset's camera has the frame's size.
     """
-    from scipy.optimize import least_squares
-
     used, index = grid_index(centres)
     start = _start(sensor, centres[used], index, spacing_mm)
     camera = sensor.camera
-    distorts = camera.lens == "pinhole"
 
     def build(p: FloatArray) -> tuple[Dots, Camera]:
         scale = 1.0 if spacing_mm is None else float(np.exp(p[5]))
         columns = float(np.exp(p[0])) if spacing_mm is None else spacing_mm
-        distortion = (camera.distortion[0] + _K1 * float(p[10]), *camera.distortion[1:])
         layout = {
             "spacing_mm": (columns, columns * float(np.exp(p[1]))),
             "radius_mm": pattern.radius_mm * columns / pattern.spacing_mm[0],
@@ -64,8 +62,8 @@ def fit_dot_grid(sensor: Sensor, pattern: Dots, centres: Pixels, spacing_mm: flo
             "cy": camera.cy + _CENTRE * camera.width * float(p[7]),
             "look_at_mm": tuple(np.add(camera.look_at_mm, [_TILT_MM * p[8], _TILT_MM * p[9], 0.0]).tolist()),
         }
-        if distorts:
-            view["distortion"] = distortion
+        if camera.lens == "pinhole":
+            view["distortion"] = (camera.distortion[0] + _K1 * float(p[10]), *camera.distortion[1:])
         return pattern.model_copy(update=layout), camera.model_copy(update=view)
 
     def misfit(p: FloatArray) -> FloatArray:
@@ -87,8 +85,6 @@ def grid_index(centres: Pixels) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
     InputError where they form none.
     """
-    from scipy.spatial import cKDTree
-
     tree = cKDTree(centres)
     arms = (centres[tree.query(centres, k=min(5, len(centres)))[1][:, 1:]] - centres[:, None]).reshape(-1, 2)
     arms = np.where((arms.sum(1) < 0)[:, None], -arms, arms)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,8 +36,6 @@ def find_dots(linear: FloatArray, pitch_px: float) -> FoundDots:
 
     InputError for fewer than nine whole dots, or dots of about a pixel.
     """
-    import cv2
-
     middle, extreme = _middles(linear.mean(axis=2), pitch_px)
     _, labels, table, _ = cv2.connectedComponentsWithStats(middle)
     area = table[1:, cv2.CC_STAT_AREA].astype(np.float64)
@@ -65,8 +64,6 @@ def _middles(grey: FloatArray, pitch_px: float) -> tuple[NDArray[np.uint8], floa
 
     InputError where nothing stands out.
     """
-    import cv2
-
     window = 2 * int(pitch_px / 2) + 1
     coarse = cv2.medianBlur(np.round(255 * np.sqrt(np.clip(grey, 0, 1))).astype(np.uint8), window)
     ratio = grey / np.maximum((coarse / 255.0) ** 2, 1e-4)
@@ -88,8 +85,6 @@ def check_size(radius_px: float) -> None:
 
 def _around(linear: FloatArray, covered: BoolArray, sigma: float) -> FloatArray:
     """The coating's brightness, continued beneath the dots: a Gaussian-weighted plane fitted to bare pixels."""
-    import cv2
-
     rows, columns = np.mgrid[: covered.shape[0], : covered.shape[1]].astype(np.float64)
     bare = (~covered).astype(np.float64)
 

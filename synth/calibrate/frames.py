@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from synth.arrays import BoolArray, FloatArray
@@ -39,8 +40,6 @@ def read_frames(paths: Sequence[Path]) -> Frames:
 
     InputError where none is given, one is missing or no image, sizes differ, or frames show different things.
     """
-    import cv2
-
     if not paths:
         raise InputError("no frames: give one or a few images of the undeformed gel")
     images, steps = [], []
@@ -75,8 +74,6 @@ def at_rest(frame: FloatArray, rest: FloatArray) -> tuple[BoolArray, FloatArray]
     Both frames are smoothed by a Gaussian of 2 % of the width. A pixel counts as pressed, or as shaded by what is, if
     they differ by more than 8 of 255 levels in any channel there or within that distance.
     """
-    import cv2
-
     sigma = PLACE * frame.shape[1]
     smooth, plain = (cv2.GaussianBlur(each, (0, 0), sigma) for each in (frame, rest))
     pressed = (np.abs(smooth - plain).max(axis=2) > _PRESSED).astype(np.uint8)

@@ -71,7 +71,9 @@ class FlatGel:
 
     def __init__(self, sensor: Sensor, pixels: Pixels, variant: Variant) -> None:
         mi = variant.load()
-        self._mi, self._pixels = mi, len(pixels)
+        import drjit as dr
+
+        self._mi, self._dr, self._pixels = mi, dr, len(pixels)
         column, row = np.floor(pixels).astype(np.uint32).T
         index = mi.UInt32(row * np.uint32(sensor.camera.width) + column)
         ray, weight, _ = CameraRays(sensor, mi).sample(index, mi.Point2f(0.5))
@@ -107,8 +109,7 @@ class FlatGel:
 
         A light's 9 numbers change its own contribution only, so all derivatives cost 9 pictures of each light.
         """
-        import drjit as dr
-
+        dr = self._dr
         found, unshaded = [], self._all_unshaded(self._parts(lights))
         for part, component in _NUMBERS:
             parts = self._parts(lights)
@@ -128,19 +129,26 @@ class FlatGel:
 
     def _arms(self, parts: tuple[Any, ...]) -> tuple[Any, Any, Any, Any]:
         """For each light, point and cell: vector from point to cell, numbers of point and light, the light's normal."""
-        import drjit as dr
-
-        mi = self._mi
+        mi, dr = self._mi, self._dr
         centre, direction, size, _, along = parts
         lane = dr.arange(mi.UInt32, dr.width(centre) * self._count * _CELLS)
         cell, pixel, light = lane % _CELLS, lane // _CELLS % self._count, lane // (_CELLS * self._count)
         long = dr.maximum(dr.gather(mi.UInt32, along, light), 1)  # lanes that fill up a vector gather 0, and divide too
-        first, second, facing = (dr.gather(mi.Vector3f, axis, light) for axis in _axes(mi, direction))
+        first, second, facing = (dr.gather(mi.Vector3f, axis, light) for axis in self._axes(direction))
         width, height = dr.gather(mi.Float, size.x, light), dr.gather(mi.Float, size.y, light)
         u = (mi.Float(cell % long) + 0.5) / mi.Float(long) - 0.5
         v = (mi.Float(cell // long) + 0.5) * mi.Float(long) / _CELLS - 0.5
         source = dr.gather(mi.Vector3f, centre, light) + first * (u * width) + second * (v * height)
         return source - dr.gather(mi.Vector3f, self._point, pixel), pixel, light, facing
+
+    def _axes(self, direction: Any) -> tuple[Any, Any, Any]:
+        """Unit vectors along a light's first and second size and of its normal, as `synth.render.lights.light_axes`."""
+        mi, dr = self._mi, self._dr
+        facing = dr.normalize(direction)
+        first = dr.cross(mi.Vector3f(0, 0, 1), facing)
+        level = dr.norm(first)
+        first = dr.select(level > 1e-6, first / dr.maximum(level, 1e-6), mi.Vector3f(1, 0, 0))
+        return first, dr.cross(facing, first), facing
 
     def _image(self, parts: tuple[Any, ...]) -> tuple[Any, ...]:
         """The lights' mirror images behind the window."""
@@ -159,9 +167,7 @@ class FlatGel:
 
         The obstacles are `parts` themselves first, then others.
         """
-        import drjit as dr
-
-        mi = self._mi
+        mi, dr = self._mi, self._dr
         arm, pixel, light, _ = self._arms(parts)
         point = dr.gather(mi.Vector3f, self._point, pixel)
         free = mi.Bool(True)
@@ -170,7 +176,7 @@ class FlatGel:
                 number = dr.opaque(mi.UInt32, other)
                 centre, direction = (dr.gather(mi.Vector3f, part, number) for part in (centres, directions))
                 size = dr.gather(mi.Vector2f, sizes, number)
-                first, second, facing = _axes(mi, direction)
+                first, second, facing = self._axes(direction)
                 share = dr.dot(centre - point, facing) / dr.dot(arm, facing)
                 beside = point + arm * share - centre
                 within = (dr.abs(dr.dot(beside, first)) < size.x / 2) & (dr.abs(dr.dot(beside, second)) < size.y / 2)
@@ -187,9 +193,7 @@ class FlatGel:
 
     def _scattered(self, parts: tuple[Any, ...], unshaded: Any, is_image: bool) -> Any:
         """Radiance (m n,) as mi.Color3f under rectangles, or under images of them that the window weakens."""
-        import drjit as dr
-
-        mi = self._mi
+        mi, dr = self._mi, self._dr
         arm, pixel, light, facing = self._arms(parts)
         square = dr.squared_norm(arm)
         away = arm / dr.sqrt(square)
@@ -205,23 +209,10 @@ class FlatGel:
 
     def _numpy(self, color: Any) -> FloatArray:
         """(m, n, 3)."""
-        import drjit as dr
-
-        dr.eval(color)  # one kernel, not one for each channel
+        self._dr.eval(color)  # one kernel, not one for each channel
         stacked = np.stack([np.array(color[k], dtype=np.float64) for k in range(3)], axis=1)
         whole = stacked.reshape(-1, self._count, 3)
         seen, patches = whole[:, : self._pixels], whole[:, self._pixels :]
         return (
             seen if self._returned is None else seen + np.einsum("npc,mpc->mnc", self._returned, patches, optimize=True)
         )
-
-
-def _axes(mi: Any, direction: Any) -> tuple[Any, Any, Any]:
-    """Unit vectors along a light's first and second size and of its normal, as `synth.render.lights.light_axes`."""
-    import drjit as dr
-
-    facing = dr.normalize(direction)
-    first = dr.cross(mi.Vector3f(0, 0, 1), facing)
-    level = dr.norm(first)
-    first = dr.select(level > 1e-6, first / dr.maximum(level, 1e-6), mi.Vector3f(1, 0, 0))
-    return first, dr.cross(facing, first), facing

@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
+from scipy.optimize import least_squares, nnls
 
 from synth.arrays import BoolArray, FloatArray
 from synth.calibrate.irradiance import FlatGel, LightGeometry
@@ -82,8 +83,6 @@ def fit_lights(
     problem = _Problem(gel, target, start, shines, vignetting)
     if steps == 0:
         return problem.result(np.zeros(problem.size), 0)
-    from scipy.optimize import least_squares
-
     low, high = problem.box(bounds)
     first, limits = np.clip(np.zeros(problem.size), low + 1e-6, high - 1e-6), {"ftol": 2e-4, "xtol": 1e-3}
     found = least_squares(problem.residual, first, problem.jacobian, (low, high), max_nfev=steps, **limits)
@@ -172,8 +171,6 @@ class _Problem:
 
 def fit_powers(basis: FloatArray, target: Target, shines: BoolArray) -> FloatArray:
     """Powers (m, 3), by non-negative least squares per channel, of lights with signals (m, n, 3) at power 1."""
-    from scipy.optimize import nnls
-
     powers = np.zeros((len(basis), 3))
     for channel in range(3):
         weight = target.slope[:, channel]

@@ -6,7 +6,9 @@ photon-transfer line of `synth.render.camera_image`, read² + shot² · signal. 
 than the camera made: what is found is what is left in such frames, which is what synthetic ones should have.
 """
 
+import cv2
 import numpy as np
+from scipy.optimize import nnls
 
 from synth.arrays import BoolArray, FloatArray
 
@@ -21,11 +23,7 @@ def fit_noise(encoded: FloatArray, bare: BoolArray, gamma: float, step: float) -
     `bare` (H, W) are pixels whose neighbourhood shows nothing but smooth coating, `step` is that of one level of
     quantisation.
     """
-    import cv2
-    from scipy.optimize import nnls
-
-    kernel = np.ones((3, 3), np.uint8)
-    inner = cv2.erode(bare.astype(np.uint8), kernel, borderValue=0) > 0
+    inner = cv2.erode(bare.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=0) > 0
     signals, variances, counts = [], [], []
     for channel in np.moveaxis(encoded, 2, 0):
         fine = cv2.filter2D(channel, -1, _KERNEL)[inner]

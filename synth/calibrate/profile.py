@@ -11,6 +11,8 @@ pixel's square (variance 1/12 px²) and the dot's own soft edge (w²/12) are tak
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import least_squares
+from scipy.stats import ncx2
 
 from synth.arrays import FloatArray
 from synth.calibrate.dots import SMALLEST_PX, FoundDots, check_size
@@ -37,9 +39,6 @@ def fit_profile(dots: FoundDots) -> DotProfile:
 
     InputError where the dots are too small to have an edge.
     """
-    from scipy.optimize import least_squares
-    from scipy.stats import ncx2
-
     common = float(np.median(dots.radii))
     check_size(common)
     distance, values = _samples(dots, common)

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Any
 
+import cv2
 import numpy as np
 
 from synth.arrays import BoolArray, FloatArray, Pixels
@@ -129,8 +130,6 @@ def _target(encoded: FloatArray, camera: Camera, pixels: Pixels) -> Target:
 
 def _smoothed(encoded: FloatArray, bare: BoolArray) -> FloatArray:
     """Means (H, W, 3) over bare pixels near by, which takes noise away and leaves shading."""
-    import cv2
-
     weight = cv2.GaussianBlur(bare.astype(np.float64), (0, 0), 1.5)
     blurred = cv2.GaussianBlur(encoded * bare[:, :, None], (0, 0), 1.5)
     return np.asarray(blurred / np.maximum(weight, 1e-9)[:, :, None], dtype=np.float64)

@@ -42,7 +42,6 @@ CONVENTIONS = {
 
 _PARTS = ("U", "V", "visible")
 
-
 OPTIONAL: dict[str, tuple[tuple[str, ...], str]] = {
     "depth": (
         ("depth1.Z", "depth2.Z"),

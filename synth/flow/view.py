@@ -78,8 +78,6 @@ class View:
         if not self._is_whole:
             return at
         overlap = may_overlap(target, self.surface.triangles, self._boundary, self.optics)
-        if not overlap.any():
-            return at[:0]
         column, row = pixels[at].astype(np.intp).T
         return at[overlap[row, column]]
 

@@ -173,14 +173,13 @@ class _Mirror:
     """A mirror of `synth.optics.mirror` in the renderer's frame, opaque to Dr.Jit."""
 
     def __init__(self, mirror: FlatMirror, vector: Callable[[FloatArray], Any], mi: Any, dr: Any) -> None:
-        self.centre, self.normal = vector(mirror.centre), vector(mirror.normal)
+        self._dr, self.centre, self.normal = dr, vector(mirror.centre), vector(mirror.normal)
         self.axes = [vector(axis) for axis in mirror.axes]
         self.half = [dr.opaque(mi.Float, value) for value in mirror.half]
 
     def met(self, origin: Any, direction: Any) -> tuple[Any, Any]:
         """How far rays go to the mirror, infinite where they miss it, and whether they meet its front."""
-        import drjit as dr
-
+        dr = self._dr
         slope = dr.dot(direction, self.normal)
         distance = dr.dot(self.centre - origin, self.normal) / slope
         arm = origin + direction * distance - self.centre
@@ -196,7 +195,7 @@ class RoundFace:
     def __init__(self, window: RoundWindow, mi: Any) -> None:
         import drjit as dr
 
-        self._mi = mi
+        self._mi, self._dr = mi, dr
         values = (window.index, window.radius, window.low, window.high)
         self._index, self._radius, self._low, self._high = (dr.opaque(mi.Float, value) for value in values)
 
@@ -206,8 +205,7 @@ class RoundFace:
         Where they meet it, their unit directions beyond it, the cosine of their angle to the normal in air, and whether
         they meet it at all.
         """
-        import drjit as dr
-
+        dr = self._dr
         level = self._mi.Vector2f(air.x, air.y)
         square, half = dr.squared_norm(level), air.x * eye.x + air.y * eye.y
         rest = eye.x * eye.x + eye.y * eye.y - dr.square(self._radius)

@@ -14,7 +14,7 @@ class GelHits:
     def __init__(self, shapes: dict[str, Any], mi: Any) -> None:
         import drjit as dr
 
-        self._mi, self._gel = mi, shapes["gel"]
+        self._mi, self._dr, self._gel = mi, dr, shapes["gel"]
         self._pointers = [mi.ShapePtr(shapes[name]) for name in ("gel", "image") if name in shapes]
         dr.make_opaque(self._pointers)
 
@@ -26,9 +26,7 @@ class GelHits:
 
     def point(self, ray: Any, hit: Any, mirrored: Any, active: Any) -> Any:
         """The gel's point (mi.SurfaceInteraction3f), whose frame is the scene's, where the hit is on gel or image."""
-        import drjit as dr
-
-        mi = self._mi
+        mi, dr = self._mi, self._dr
         ray, hit = mi.Ray3f(ray), mi.PreliminaryIntersection3f(hit)
         ray.d.z = dr.select(mirrored, -ray.d.z, ray.d.z)
         # An image's faces have their corners in reverse order.

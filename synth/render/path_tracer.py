@@ -27,12 +27,9 @@ class PathTracer:
     def __init__(self, sensor: Sensor, scene: Any, shapes: dict[str, Any], max_depth: int, mi: Any) -> None:
         import drjit as dr
 
-        self._mi, self._scene = mi, scene
-        self._reflection, self._gel, self._lights = (
-            shapes["gel"].bsdf(),
-            GelHits(shapes, mi),
-            mi.ShapePtr(shapes["lights"]),
-        )
+        self._mi, self._dr, self._scene = mi, dr, scene
+        self._reflection, self._gel = shapes["gel"].bsdf(), GelHits(shapes, mi)
+        self._lights = mi.ShapePtr(shapes["lights"])
         dr.make_opaque(self._lights)
         self._face = dr.opaque(mi.Float, reflecting_plane(sensor) or 0)
         self._index, self._depth = dr.opaque(mi.Float, sensor.window.refractive_index), dr.opaque(mi.UInt32, max_depth)
@@ -48,9 +45,7 @@ class PathTracer:
 
     def radiance(self, ray: Any, sampler: Any, active: Any) -> tuple[Any, Any]:
         """Radiance (mi.Spectrum) along rays from the camera, and whether they meet the gel (mi.Bool)."""
-        import drjit as dr
-
-        mi = self._mi
+        mi, dr = self._mi, self._dr
         share, total, depth, density = mi.Spectrum(1), mi.Spectrum(0), mi.UInt32(0), mi.Float(0)
         start = (mi.Ray3f(ray), sampler, share, total, depth, density, active, mi.Bool(False))
         _, _, _, total, _, _, _, seen = dr.while_loop(start, lambda *state: state[6], self._step)
@@ -64,9 +59,7 @@ class PathTracer:
         The camera gets `share` of the light that comes along a ray, whose direction was drawn with the `density` per
         solid angle.
         """
-        import drjit as dr
-
-        mi = self._mi
+        mi, dr = self._mi, self._dr
         context = mi.BSDFContext()
         hit = self._scene.ray_intersect_preliminary(ray, active=active)
         met = active & hit.is_valid()
@@ -105,9 +98,7 @@ class PathTracer:
 
         `square` is the squared distance. Both are 0 for a light's back.
         """
-        import drjit as dr
-
-        mi = self._mi
+        mi, dr = self._mi, self._dr
         front = -dr.dot(direction, dr.gather(mi.Vector3f, self._places[3], number, active))
         active = active & (front > 0)
         area = dr.gather(mi.Float, self._areas, number, active)

@@ -139,12 +139,8 @@ def _scale(optics: Optics, sensor: Sensor) -> float:
         with np.errstate(invalid="ignore"):
             seen = np.all(np.abs(points[:, :2]) <= np.array(sensor.gel.size_mm[:2]) / 2, axis=1)
     moved = [(optics.project(points + arm, path) - optics.project(points - arm, path)) / (2 * _STEP_MM) for arm in arms]
-    return _largest_stretch(np.stack(moved, axis=2)[seen])
-
-
-def _largest_stretch(jacobian: FloatArray) -> float:
-    """The largest stretch of Jacobians (n, 2, 2); NaN, where a step left the lens's field, does not count."""
-    jacobian = jacobian[np.isfinite(jacobian).all(axis=(1, 2))]
+    jacobian = np.stack(moved, axis=2)[seen]
+    jacobian = jacobian[np.isfinite(jacobian).all(axis=(1, 2))]  # NaN where a step left the lens's field
     return float(np.linalg.svd(jacobian, compute_uv=False)[:, 0].max(initial=0.0))
 
 

@@ -34,7 +34,7 @@ class PolygonLight:
         corner, first, second, self._front = (
             mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in row)) for row in rectangles((light,))[0]
         )
-        self._mi, self._corner, self._sides = mi, corner, (first, second)
+        self._mi, self._dr, self._corner, self._sides = mi, dr, corner, (first, second)
         self._corners = [corner, corner + first, corner + first + second, corner + second]
         self._area = dr.opaque(mi.Float, light.size_mm[0] * light.size_mm[1])
         self.radiance = [dr.opaque(mi.Float, value) for value in light.radiance]
@@ -44,8 +44,7 @@ class PolygonLight:
 
         `offset` (mi.Point2f in [0, 1)²) is for lights without a closed form.
         """
-        import drjit as dr
-
+        dr = self._dr
         rays = [dr.normalize(corner - point) for corner in self._corners]
         heights = [dr.dot(ray, normal) for ray in rays]
         lowest = dr.minimum(dr.minimum(heights[0], heights[1]), dr.minimum(heights[2], heights[3]))
@@ -57,8 +56,7 @@ class PolygonLight:
 
         The surface's point is a mi.Point3f with the unit normal mi.Vector3f; `offset` is a mi.Point2f in [0, 1)².
         """
-        import drjit as dr
-
+        dr = self._dr
         place = self._corner + self._sides[0] * offset.x + self._sides[1] * offset.y
         arm = place - point
         square = dr.squared_norm(arm)
@@ -66,15 +64,11 @@ class PolygonLight:
         return self._mi.Point3f(place), cosines * self._area / dr.square(square)
 
     def _risen(self, rays: list[Any], heights: list[Any], normal: Any) -> Any:
-        import drjit as dr
-
-        return 0.5 * dr.abs(sum(_edge(rays[i], rays[(i + 1) % 4], normal) for i in range(4)))
+        return 0.5 * self._dr.abs(sum(_edge(rays[i], rays[(i + 1) % 4], normal) for i in range(4)))
 
     def _cut(self, rays: list[Any], heights: list[Any], normal: Any) -> Any:
         """As `_risen`, cut at the horizon: one edge more, from where the outline sets to where it rises."""
-        import drjit as dr
-
-        mi = self._mi
+        mi, dr = self._mi, self._dr
         total, setting, rising = mi.Float(0), mi.Vector3f(0), mi.Vector3f(0)
         for i in range(4):
             (a, b), (high, low) = ((values[i], values[(i + 1) % 4]) for values in (rays, heights))
@@ -95,11 +89,9 @@ class SampledLight(PolygonLight):
     """
 
     def __init__(self, light: Light, index: float | None, mi: Any) -> None:
-        import drjit as dr
-
         super().__init__(light, mi)
-        self._index = None if index is None else dr.opaque(mi.Float, index)
-        self._narrowness = dr.opaque(mi.Float, light.narrowness) if light.narrowness else None
+        self._index = None if index is None else self._dr.opaque(mi.Float, index)
+        self._narrowness = self._dr.opaque(mi.Float, light.narrowness) if light.narrowness else None
 
     def whole(self, point: Any, normal: Any, offset: Any) -> Any:
         parts = [
@@ -108,8 +100,7 @@ class SampledLight(PolygonLight):
         return sum(parts) / _STRATA
 
     def sample(self, point: Any, normal: Any, offset: Any) -> tuple[Any, Any]:
-        import drjit as dr
-
+        dr = self._dr
         place, value = super().sample(point, normal, offset)
         away = dr.normalize(place - point)
         if self._narrowness is not None:

@@ -84,7 +84,7 @@ class SeparatedLight:
     ) -> None:
         import drjit as dr
 
-        self._mi, self._scene, self._parameters = mi, scene, parameters
+        self._mi, self._dr, self._scene, self._parameters = mi, dr, scene, parameters
         self._gel, self._has_image = GelHits(gels, mi), "image" in gels
         self._reflection = gels["gel"].bsdf()
         self._depth, self._channels = max_depth, 1 if is_mono else 3
@@ -117,9 +117,7 @@ class SeparatedLight:
 
     def radiance(self, ray: Any, sampler: Any, active: Any) -> tuple[list[Any], Any]:
         """Radiance (channels of mi.Float) along rays from the camera, and whether they meet the gel (mi.Bool)."""
-        import drjit as dr
-
-        mi = self._mi
+        mi, dr = self._mi, self._dr
         hit = self._scene.ray_intersect_preliminary(ray, active=active)
         seen, _ = self._gel.kinds(hit, active)
         at = self._gel.point(ray, hit, False, seen)
@@ -139,9 +137,7 @@ class SeparatedLight:
 
     def _direct(self, at: Any, normal: Any, face: Any, offset: Any, active: Any) -> list[Any]:
         """Irradiance (channels) of points on faces, by all lights, less what is blocked."""
-        import drjit as dr
-
-        mi = self._mi
+        mi, dr = self._mi, self._dr
         total = [mi.Float(0) for _ in range(self._channels)]
         for number, (light, shaded) in enumerate(zip(self._lights, self._shaded, strict=True)):
             asked = active & dr.gather(mi.Bool, shaded, face, active)
@@ -151,7 +147,7 @@ class SeparatedLight:
 
     def _blocked(self, light: PolygonLight, number: int, at: Any, normal: Any, offset: Any, asked: Any) -> Any:
         """What of `_sampled` is blocked (mi.Float): computed only where it is `asked`, 0 elsewhere."""
-        import drjit as dr
+        dr = self._dr
 
         def sample(at: Any, normal: Any, offset: Any) -> Any:
             value, blocked = self._sampled(light, number, at, normal, offset)
@@ -161,8 +157,7 @@ class SeparatedLight:
 
     def _sampled(self, light: PolygonLight, number: int, at: Any, normal: Any, offset: Any) -> Any:
         """Irradiance per radiance that a point of the light gives unless its ray is blocked, and whether it is."""
-        import drjit as dr
-
+        dr = self._dr
         moved = [offset.x + number * _SHIFT[0] % 1, offset.y + number * _SHIFT[1] % 1]
         place, value = light.sample(at.p, normal, self._mi.Point2f(*(x - dr.floor(x) for x in moved)))
         return value, self._scene.ray_test(at.spawn_ray_to(place), value > 0)
@@ -173,8 +168,7 @@ class SeparatedLight:
 
     def _pilots(self, seed: int) -> FloatArray:
         """(faces, lights + 1) shares of a face's pilots that were blocked before a light, or met the gel."""
-        import drjit as dr
-
+        dr = self._dr
         count = count_per_face(_PILOTS, dr.width(self._corners[0]))
         points = self._points(count, 2, seed)
         shared = points.at, points.normal, next(points.numbers)
@@ -193,9 +187,7 @@ class SeparatedLight:
 
         `met` are the shares (faces,) of pilots that met the gel.
         """
-        import drjit as dr
-
-        mi, count = self._mi, count_per_face(rays, len(met))
+        mi, dr, count = self._mi, self._dr, count_per_face(rays, len(met))
         values = np.zeros((len(met), self._channels, 3), dtype=np.float32)
         if met.any():
             points = self._points(count, 2 * (self._depth - 2), seed + 1)
@@ -212,8 +204,7 @@ class SeparatedLight:
 
     def _fit_returned(self, faces: int, seed: int) -> list[Any]:
         """Coefficients (channels of mi.Float) of what the gel sends to the window and gets back, in `_terms`."""
-        import drjit as dr
-
+        dr = self._dr
         points = self._points(count_per_face(_RETURNED, faces), 2 * (self._depth - 2), seed + 2)
         values = self._bounces(points)
         terms = self._terms(points.at.p, points.normal)
@@ -234,9 +225,7 @@ class SeparatedLight:
 
         Its first step goes by the window, or straight: then `top` is a height that the gel does not reach.
         """
-        import drjit as dr
-
-        mi = self._mi
+        mi, dr = self._mi, self._dr
         at, normal, count = points.at, points.normal, dr.width(points.at.p)
         total = [dr.zeros(mi.Float, count) for _ in range(self._channels)]
         share = [dr.full(mi.Float, 1, count) for _ in range(self._channels)]
@@ -265,9 +254,7 @@ class SeparatedLight:
 
     def _onward(self, at: Any, normal: Any, offset: Any, top: Any | None = None) -> tuple[Any, Any, Any, Any]:
         """Rays in the cosine's distribution, up to `top`; their next hits; whether on the lit side of gel, or image."""
-        import drjit as dr
-
-        mi = self._mi
+        mi, dr = self._mi, self._dr
         ray = at.spawn_ray(mi.Frame3f(normal).to_world(mi.warp.square_to_cosine_hemisphere(offset)))
         if top is not None:
             ray.maxt = dr.select(ray.d.z > 0, (top - at.p.z) / ray.d.z, dr.inf)

@@ -22,7 +22,6 @@ _NEEDED = {
     "file": ("outer", "window", "unit"),
 }
 
-
 Number = TypeVar("Number", float, FloatArray)
 
 

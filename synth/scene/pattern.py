@@ -24,7 +24,6 @@ above_coating: they are matt paint on the camera's side of the coating and take 
 are printed on the gel and the coating is laid over them (GelSight: Yuan et al., Sensors 17(12):2762, 2017, figures 3
 and 4). The paint has no thickness: it moves with the coating, and the flow is that of the coating."""
 
-
 Placing = Literal["z", "spherical", "cylindrical"]
 """How marks are laid on the face. z: along z, so that where it slopes they are longer. The others are for round gels,
 rows along meridians about the axis, and there marks have their true sizes in mm on the face: spherical counts the

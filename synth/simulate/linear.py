@@ -16,6 +16,7 @@ from importlib.metadata import PackageNotFoundError, files
 from typing import Any, Protocol
 
 import numpy as np
+import scipy.sparse as sp
 
 from synth.arrays import FloatArray
 
@@ -240,15 +241,12 @@ class SuperLUFactor:
     """SciPy's SuperLU: everywhere, and several times slower."""
 
     def __init__(self, indptr: np.ndarray, indices: np.ndarray) -> None:
-        import scipy.sparse as sp
-
         size = len(indptr) - 1
         self._matrix = sp.csr_matrix((np.zeros(len(indices)), indices, indptr), shape=(size, size))
         self._factor: Any = None
         self.made = 0
 
     def factorise(self, values: FloatArray) -> bool:
-        import scipy.sparse as sp
         from scipy.sparse.linalg import splu
 
         self.made += 1

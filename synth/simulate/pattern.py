@@ -8,6 +8,7 @@ import hashlib
 from collections import OrderedDict
 
 import numpy as np
+import scipy.sparse as sp
 
 from synth.simulate.linear import Factor, direct_factor
 from synth.simulate.space import Space
@@ -66,8 +67,6 @@ class Pattern:
         return self._factors[single]
 
     def _couple(self, moves: np.ndarray, pressures: np.ndarray | None) -> None:
-        import scipy.sparse as sp
-
         local = moves.reshape(len(moves), -1)
         if pressures is not None:
             local = np.concatenate([local, pressures], axis=1)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 import warp as wp
 
 from synth.arrays import FloatArray
@@ -96,8 +97,6 @@ class System:
 
     def matrix(self, values: FloatArray) -> Any:
         """The upper triangle of a tangent's symmetric part as SciPy CSR."""
-        import scipy.sparse as sp
-
         size = len(self.free)
         return sp.csr_matrix((values, self._pattern.indices, self._pattern.indptr), shape=(size, size))
 
@@ -169,8 +168,6 @@ class System:
 
     def _unsymmetric(self) -> Any:
         """The remainder of friction as a sparse matrix, or None where there is none."""
-        import scipy.sparse as sp
-
         rubbing = np.flatnonzero(self._touching.numpy()[0] == 2)
         if len(rubbing) == 0:
             return None

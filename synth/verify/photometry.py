@@ -23,6 +23,7 @@ The flow tells, wrong in its sign, axes or offset or not: a block is bent where 
 has a median above 0.1 px. Where most blocks are, in images too small for the contact, the check does not apply.
 """
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median
@@ -114,8 +115,6 @@ def _block_medians(channels: list[Textured], side: int) -> dict[tuple[int, int],
 
 def _unexplained(camera: Camera, one: FloatArray, two: FloatArray, flow: FlowArray, usable: BoolArray) -> Textured:
     """Error and standard deviation of its noise (n,) px at textured pixels, and their rows and columns."""
-    import cv2
-
     row, column = np.mgrid[: one.shape[0], : one.shape[1]]
     at = [(base + np.nan_to_num(flow[..., i])).astype(np.float32) for i, base in enumerate((column, row))]
     linear = [image**camera.gamma for image in (one, two)]
@@ -150,8 +149,6 @@ def _noise(linear: FloatArray, camera: Camera) -> FloatArray:
 
 def _usable(flow: FlowArray, visible: FlowArray) -> BoolArray:
     """Pixels whose neighbourhood in image 1 is seen in image 2, away from the border by the filters' reach."""
-    import cv2
-
     seen = (visible > 0.5) & np.isfinite(flow).all(2)
     seen[[0, -1]] = seen[:, [0, -1]] = False
     return cv2.erode(seen.astype(np.uint8), np.ones((9, 9), np.uint8), borderValue=0) > 0

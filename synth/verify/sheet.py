@@ -101,9 +101,7 @@ class Layer:
         cell = at[:, 1] * (self.width + 2) + at[:, 0]
         count = starts[cell + 1] - starts[cell]
         query = np.repeat(np.arange(len(queries)), count)
-        triangle = members[
-            np.repeat(starts[cell], count) + np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-        ]
+        triangle = members[np.arange(count.sum()) + np.repeat(starts[cell] + count - np.cumsum(count), count)]
         a, b, c = np.moveaxis(self._corners[triangle], 1, 0)
         q = queries[query]
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -14,7 +14,7 @@ from textures import REAL, as_bytes, moved
 from gelflow.baselines import CLASSICAL, named_methods
 from gelflow.baselines.aldic import ALDIC, INSTALL
 from gelflow.baselines.classical import dis
-from gelflow.baselines.method import dense_flow
+from gelflow.baselines.method import as_tensor, dense_flow
 from gelflow.baselines.registry import REGISTERED
 from gelflow.compare.metrics import flow_errors, image_similarity, marker_distance, psnr, ssim, ssim_map, warp_image
 from gelflow.compare.scores import score_pair
@@ -66,7 +66,7 @@ def test_a_registered_dis_is_dis_medium_registered() -> None:
     images = moved(72, 96, 0, 0), moved(72, 96, *SHIFT) + shade
     aims: tuple[Registration, ...] = ("motion", "both", "brightness")
     start, *found = (method.flow(*images) for method in named_methods(["dis-medium", *(f"dis-{aim}" for aim in aims)]))
-    tensors = [torch.from_numpy(np.moveaxis(array, -1, 0).copy())[None] for array in (start, *images)]
+    tensors = [as_tensor(array, "cpu") for array in (start, *images)]
     for aim, flow in zip(aims, found, strict=True):
         np.testing.assert_array_equal(np.moveaxis(flow, -1, 0), registered(*tensors, REGISTRATIONS[aim])[0].numpy())
     assert all(np.abs(one - other).max() > 0.01 for one, other in itertools.combinations(found, 2))

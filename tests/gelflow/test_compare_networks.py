@@ -20,6 +20,7 @@ import gelflow.compare.run
 import gelflow.models.gelflow
 from gelflow.arrays import FlowArray, ImageArray
 from gelflow.baselines.learned import Learned
+from gelflow.baselines.method import as_tensor
 from gelflow.cli import main
 from gelflow.compare.plots import pareto_front
 from gelflow.compare.run import compare
@@ -171,10 +172,6 @@ def test_fine_tuning_does_not_look_at_exact_flow_and_needs_one_size(tmp_path: Pa
     assert fine_tuned(Learned(path, size=(64, 80), device="cpu"), *given).path.is_file()
 
 
-def tensor(array: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(np.moveaxis(array, -1, 0).copy())[None]
-
-
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return random_weights(tmp_path_factory.mktemp("plain") / "w.safetensors", SMALL, small(model=SMALL))
@@ -220,7 +217,8 @@ def test_rows_without_and_with_registration_stand_in_one_table_with_one_of_raft(
 def test_a_row_is_what_registration_makes_of_the_networks_flow_in_its_time(plain: Path, tmp_path, monkeypatch) -> None:
     images = PairDataset(write_folder(tmp_path, {"a": (1.0, -0.5)})).images(0)
     start, found = (Learned(plain, device="cpu", registration=choice).flow(*images) for choice in CHOICES)
-    again = registered(*map(tensor, (start, *images)), REGISTRATIONS["brightness"])[0].numpy()
+    tensors = [as_tensor(array, "cpu") for array in (start, *images)]
+    again = registered(*tensors, REGISTRATIONS["brightness"])[0].numpy()
     np.testing.assert_array_equal(np.moveaxis(found, -1, 0), again)
 
     def slow(*arguments: object) -> torch.Tensor:
@@ -238,7 +236,7 @@ def test_the_speed_of_the_network_alone_includes_it(own: Path, tmp_path: Path, m
 
     def kept(passes: Callable[..., torch.Tensor], *_: object) -> Speed:
         with torch.no_grad():
-            measured.append(passes(*map(tensor, dataset.images(0)))[0].numpy())
+            measured.append(passes(*(as_tensor(image, "cpu") for image in dataset.images(0)))[0].numpy())
         return Speed(1.0, None, 1, (64, 80), "here")
 
     monkeypatch.setattr(gelflow.compare.run, "network_speed", kept)

@@ -17,7 +17,6 @@ from tiny_scene import home
 from synth.arrays import BoolArray, FloatArray, Points
 from synth.mesh import PadMesh, pad_mesh
 from synth.mesh.graded import kuhn_tets
-from synth.mesh.pad import boundary_faces
 from synth.scene import Gel, Numerics, Scene
 from synth.simulate import Trajectory, simulate
 from synth.simulate.batched import simulate_presses
@@ -52,10 +51,7 @@ MIXED = ["p1p1", "p2p1"]  # Names of the elements that have a pressure field, to
 
 
 def contact_faces(mesh: PadMesh) -> ContactFaces:
-    faces = boundary_faces(mesh.tets)
-    faces = faces[mesh.on_face[faces].all(axis=1)]
-    nodes = np.unique(faces)
-    return ContactFaces(mesh.points[nodes], np.searchsorted(nodes, faces).astype(np.int32))
+    return function_space(mesh, p1p1()).surface
 
 
 def brick(size: tuple[float, float, float] = SIZE, counts: tuple[int, int, int] = (4, 4, 3)) -> PadMesh:

@@ -99,8 +99,7 @@ sys.path[:0] = sys.argv[4:]
 from samples import job, translation_sample, write
 from synth.dataset.shard import Shard
 from synth.dataset.writer import DatasetWriter
-shard = Shard.parse(sys.argv[2]) if sys.argv[2] else None
-with DatasetWriter(sys.argv[1], job(6), shard, 2) as writer:
+with DatasetWriter(sys.argv[1], job(6), Shard.parse(sys.argv[2]), 2) as writer:
     for index in sys.argv[3].split():
         write(writer, translation_sample(int(index)))
     print("held", flush=True)
@@ -109,7 +108,7 @@ with DatasetWriter(sys.argv[1], job(6), shard, 2) as writer:
 
 
 @contextlib.contextmanager
-def writing_elsewhere(directory: Path, shard: str = "", indices: Sequence[int] = ()) -> Iterator[subprocess.Popen[str]]:
+def writing_elsewhere(directory: Path, shard: str, indices: Sequence[int]) -> Iterator[subprocess.Popen[str]]:
     """Another process that has made samples of a shard and goes on to hold it until it reads a line or is killed."""
     paths = [str(Path(__file__).parent), str(Path(__file__).parents[2])]
     command = [sys.executable, "-c", HOLD, str(directory), shard, " ".join(map(str, indices)), *paths]
@@ -128,7 +127,7 @@ def tree(directory: Path) -> dict[str, bytes]:
     return {str(file.relative_to(directory)): file.read_bytes() for file in files}
 
 
-def synth_sample(index: int, dtype: type = np.uint8, backward: bool = True) -> Sample:
+def synth_sample(index: int, dtype: type = np.uint8) -> Sample:
     """An exchange of any two arrays shows, and of rows or columns; the first rows and columns see no gel."""
     from textures import moved  # of the tests of gelflow
 
@@ -137,5 +136,5 @@ def synth_sample(index: int, dtype: type = np.uint8, backward: bool = True) -> S
     flows = rng.normal(0, 2, (2, 64, 64, 2)).astype(np.float32)
     seen = (rng.random((2, 64, 64)) < 0.7).astype(np.float32)
     flows[:, :4, :9], seen[:, :4, :9] = np.nan, 0
-    flow = FlowField(flows[0], seen[0], flows[1], seen[1]) if backward else FlowField(flows[0], seen[0])
+    flow = FlowField(flows[0], seen[0], flows[1], seen[1])
     return replace(translation_sample(index), image1=images[0], image2=images[1], flow=flow)

@@ -8,6 +8,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import pyvista as pv
 import tomli_w
 from commands import refused
 from pads import areas, brick, capsule, capsule_mesh, complete, contact_faces, simulate_scenes
@@ -49,8 +50,6 @@ def block(size: tuple[float, float, float], low: float, dome_mm: float | None = 
 
 
 def capsule_body(radius: float, length: float, low: float, edge: float = 0.5) -> Body:
-    import pyvista as pv
-
     face = CapsuleFace(radius, radius / 2, length)
     points, triangles = face.triangles(edge)
     shell = pv.PolyData.from_regular_faces(points, triangles[face.holds(points)[triangles].all(axis=1)])
@@ -60,8 +59,6 @@ def capsule_body(radius: float, length: float, low: float, edge: float = 0.5) ->
 
 def write(folder: Path, name: str, *bodies: Body, scale: float = 1.0, shift: float = 0.0) -> None:
     """Bodies as a file of CAD has them: right-handed, anywhere."""
-    import pyvista as pv
-
     parts = [pv.PolyData.from_regular_faces(points * [1, -1, 1], faces[:, ::-1]) for points, faces in bodies]
     pv.merge(parts).extract_surface(algorithm=None).translate([shift, 0.0, -shift]).scale(scale).save(folder / name)
 
@@ -227,12 +224,8 @@ QUADRANTS = np.array([[(255, 0, 0), (0, 255, 0)], [(0, 0, 255), (255, 255, 255)]
 
 
 def test_a_picture_lies_where_the_files_texture_coordinates_say(folder: Path) -> None:
-    path = scene_file(folder, outer="outer.obj")
-    sensor = (
-        load_scene(path, set=[UV.replace("FOLDER", str(folder)), "sensor.coating.reflectance=[1, 1, 1]"])
-        .corners[0]
-        .sensor
-    )
+    painted = [UV.replace("FOLDER", str(folder)), "sensor.coating.reflectance=[1, 1, 1]"]
+    sensor = load_scene(scene_file(folder, outer="outer.obj"), set=painted).corners[0].sensor
     texture, chart = albedo(sensor, np.random.default_rng(0), folder), chart_of(sensor)
     arc, azimuth = (axis.ravel() for axis in np.meshgrid(np.linspace(1.5, 9.5, 40), np.linspace(-3, 3, 61)))
     points = chart.points(arc, azimuth)

@@ -48,13 +48,13 @@ def test_fills_the_box_with_one_topology_and_bounded_shapes(focus: Focus, layers
 
 
 def test_neighbours_share_faces_all_but_the_window_is_touchable_and_mirror_images_are_mirrored() -> None:
-    mesh = graded_box(SIZE, CENTRED, COUNTS)
+    centred = graded_box(SIZE, CENTRED, COUNTS)
     nx, ny, nz = COUNTS.cells(0), COUNTS.cells(1), COUNTS.through
-    assert kuhn_tets(nx, ny, nz) is mesh.tets  # made once
-    assert not mesh.tets.flags.writeable
-    assert len(mesh.points) == (nx + 1) * (ny + 1) * (nz + 1)
-    assert len(boundary_faces(mesh.tets)) == 4 * (nx * ny + ny * nz + nx * nz)
-    assert len(contact_faces(mesh).faces) == 2 * nx * ny
+    assert kuhn_tets(nx, ny, nz) is centred.tets  # made once
+    assert not centred.tets.flags.writeable
+    assert len(centred.points) == (nx + 1) * (ny + 1) * (nz + 1)
+    assert len(boundary_faces(centred.tets)) == 4 * (nx * ny + ny * nz + nx * nz)
+    assert len(contact_faces(centred).faces) == 2 * nx * ny
     mesh = graded_box(SIZE, FOCI["off centre"], COUNTS)
     area = area_vectors(mesh.points, mesh.touchable)
     assert np.linalg.norm(area, axis=1).sum() == pytest.approx(20 * 15 + 2 * (20 + 15) * 4, rel=1e-12)
@@ -64,13 +64,12 @@ def test_neighbours_share_faces_all_but_the_window_is_touchable_and_mirror_image
     assert (np.einsum("ij,ij->i", area, centre - [0, 0, 2.0]) > 0).all()
     assert mesh.touchable.dtype == np.int32
     assert not mesh.bonded[mesh.touchable].all(axis=1).any()
-    mesh = graded_box(SIZE, CENTRED, COUNTS)
-    place = {tuple(point): i for i, point in enumerate(mesh.points)}
+    place = {tuple(point): i for i, point in enumerate(centred.points)}
     for axis in (0, 1):
-        image = mesh.points.copy()
+        image = centred.points.copy()
         image[:, axis] *= -1
-        turned = np.array([place[tuple(point)] for point in image])[mesh.tets]
-        assert {frozenset(tet) for tet in turned.tolist()} == {frozenset(tet) for tet in mesh.tets.tolist()}
+        turned = np.array([place[tuple(point)] for point in image])[centred.tets]
+        assert {frozenset(tet) for tet in turned.tolist()} == {frozenset(tet) for tet in centred.tets.tolist()}
     for low, high in random_spans(200, 20.0):
         planes = lateral_planes(20.0, (low, high), COUNTS, 0)
         assert (lateral_planes(20.0, (-high, -low), COUNTS, 0) == -planes[::-1]).all()

@@ -174,15 +174,6 @@ def test_a_lights_power_is_what_its_radiance_sums_to() -> None:
         assert light.radiance[0] * 2 * 0.5 * (intensity * solid).sum() == pytest.approx(7, rel=1e-6)
 
 
-def _sensor() -> Sensor:
-    """Two wide lights, that chance may find them; the second shines mostly up."""
-    places = [((7.0, 1.0, 3.5), (0.0, 0.0, 2.5)), ((-1.0, -7.2, 2.0), (0.0, 3.0, 5.0))]
-    common = {"size_mm": (3.0, 1.5), "color": (1, 1, 1), "power": 300}
-    lights = tuple(Light(position_mm=at, aim_mm=aim, **common) for at, aim in places)
-    view = {"width": 16, "height": 16, "fx": 28.0, "fy": 28.0, "cx": 8.0, "cy": 8.0}
-    return small_sensor(INDEX, None, lights, **view, position_mm=(0.0, 0.0, 20.0), look_at_mm=(0.0, 0.0, 0.0))
-
-
 def _by_chance(sensor: Sensor, seed: int, reflected: float) -> FloatArray:
     """Mitsuba's path tracer, pinhole and interface around a flat Lambertian face."""
     mi, camera = FAST.load(), sensor.camera
@@ -212,7 +203,12 @@ def _means(image: FloatArray) -> FloatArray:
 
 @needs_llvm
 def test_images_behind_the_window_give_what_a_dielectric_interface_gives_by_chance() -> None:
-    sensor = _sensor()
+    """Two wide lights, that chance may find them; the second shines mostly up."""
+    places = [((7.0, 1.0, 3.5), (0.0, 0.0, 2.5)), ((-1.0, -7.2, 2.0), (0.0, 3.0, 5.0))]
+    common = {"size_mm": (3.0, 1.5), "color": (1, 1, 1), "power": 300}
+    lights = tuple(Light(position_mm=at, aim_mm=aim, **common) for at, aim in places)
+    view = {"width": 16, "height": 16, "fx": 28.0, "fy": 28.0, "cx": 8.0, "cy": 8.0}
+    sensor = small_sensor(INDEX, None, lights, **view, position_mm=(0.0, 0.0, 20.0), look_at_mm=(0.0, 0.0, 0.0))
     found = np.stack([_by_chance(sensor, seed, 1.0) for seed in SEEDS])
     expected, error = found.mean(axis=0), found.std(axis=0, ddof=1).max() / np.sqrt(len(SEEDS))
     for light in ("path_traced", "separated"):

@@ -1,5 +1,6 @@
 """Many trajectories at once against one by one."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -138,15 +139,7 @@ def test_the_product_is_the_tangent_times_the_vector(element, poisson_ratio, sti
     state = Unknowns(u, rng.uniform(-4.0, 0.0, zero.p.shape))
     tangent = dense(body, body.tangent(state, bodies, 0.7))
 
-    def given(array: np.ndarray, dtype: Any) -> wp.array:
-        return warp_array(array, dtype, "cpu")
-
-    def zeros(shape: tuple[int, ...], dtype: Any) -> wp.array:
-        return wp.zeros(shape, dtype=dtype, device="cpu")
-
-    def launch(kernel: Any, size: tuple[int, ...], inputs: list[Any], outputs: list[Any]) -> None:
-        wp.launch(kernel, size, inputs=inputs, outputs=outputs, device="cpu")
-
+    given, zeros, launch = (partial(call, device="cpu") for call in (warp_array, wp.zeros, wp.launch))
     rows, elements, points = padded(len(body.free)), (len(mesh.tets), 1), body.gap.shape
     tables, faces = bulk_tables(space, material, body.mixed, "cpu"), face_tables(space, "cpu")
     numbering = number_rows(space, body.free, rows, tables, "cpu")

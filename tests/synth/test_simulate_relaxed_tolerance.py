@@ -157,14 +157,14 @@ def test_a_press_converges_and_a_start_in_equilibrium_costs_one_iteration(body: 
     assert 2 <= found.iterations <= 12
     assert relative_residual(body.residual(found.state, indenters(scene(), PRESSED))) <= EXACT
     # A start that happens to be within the tolerance is improved once; no force costs nothing.
-    first = press(body)
-    assert solve(body, first.state, indenters(scene(), PRESSED), EXACT).iterations == 1
+    assert solve(body, found.state, indenters(scene(), PRESSED), EXACT).iterations == 1
     away = indenters(scene(motion={"depth_mm": -1.0}), 0.0)
     assert solve(body, body.zero(), away, EXACT).iterations == 0
 
 
 def test_the_limit_is_kept_far_from_equilibrium_doubled_near_it_and_too_far_is_none(body, monkeypatch) -> None:
-    needed = press(body).iterations
+    free = press(body)
+    needed = free.iterations
     for limit in (1, needed):
         found = press(body, limit=limit)
         assert found.iterations == limit
@@ -175,7 +175,6 @@ def test_the_limit_is_kept_far_from_equilibrium_doubled_near_it_and_too_far_is_n
     never = press(body, 1e-30, limit=needed)
     assert not never.converged
     assert needed < never.iterations <= 2 * needed
-    free = press(body)
     moved = float(np.linalg.norm(free.state.u, axis=1).max())
     for share in (0.5, 4.0):
         found = press(body, reach_mm=share * moved)

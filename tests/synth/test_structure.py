@@ -38,7 +38,7 @@ def _modules(package: str) -> dict[str, ast.Module]:
     return found
 
 
-def _imports(name: str, tree: ast.Module, is_package: bool) -> set[str]:
+def _imports(tree: ast.Module) -> set[str]:
     """Dotted names of everything that a module imports, wherever in it; of `from a import b` both a and a.b."""
     found: set[str] = set()
     for node in ast.walk(tree):
@@ -46,9 +46,7 @@ def _imports(name: str, tree: ast.Module, is_package: bool) -> set[str]:
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             base = node.module or ""
-            if node.level:
-                above = name.split(".")[: None if is_package and node.level == 1 else -(node.level - is_package)]
-                base = ".".join([*above, *([base] if base else [])])
+            assert node.level == 0, f"{base}: imports are absolute"
             found |= {base, *(f"{base}.{alias.name}" for alias in node.names)}
     return found
 
@@ -63,9 +61,7 @@ GELFLOW = _modules("gelflow")
 
 
 def _imports_of(modules: dict[str, ast.Module]) -> list[tuple[str, str]]:
-    packages = {name.rpartition(".")[0] for name in modules}
-    found = {name: sorted(_imports(name, tree, name in packages)) for name, tree in modules.items()}
-    return [(name, imported) for name, all_imported in found.items() for imported in all_imported]
+    return [(name, imported) for name, tree in modules.items() for imported in sorted(_imports(tree))]
 
 
 def test_every_module_has_a_stage_and_imports_only_from_earlier_ones() -> None:

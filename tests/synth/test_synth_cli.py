@@ -9,9 +9,11 @@ from pathlib import Path
 import commands
 import numpy as np
 import pytest
+import pyvista as pv
 from samples import tree
 from tiny_scene import fingerprint, reference
 
+import synth.doctor
 from synth.cli import main
 
 pytestmark = pytest.mark.usefixtures("one_cache")
@@ -173,8 +175,6 @@ def test_places_that_cannot_take_the_dataset(complaint: Run, tiny, tmp_path, kin
 
 
 def test_simulate_writes_the_trajectory_of_the_contract(said: Run, tiny: Path, tmp_path: Path) -> None:
-    import pyvista as pv
-
     out = tmp_path / "s"
     out.mkdir()
     (out / "state_009.vtu").write_text('Name="mesh"')  # of an earlier run
@@ -289,7 +289,6 @@ def test_doctor_tells_what_there_is_and_how_to_get_what_is_missing(said: Run, ca
     assert "Mitsuba" in findings["rendering on the CPU"]["detail"]
     assert findings["meshing"]["state"] == "ok"
     assert "Mitsuba" in said("doctor")
-    import synth.doctor
 
     def nothing(name: str) -> str:
         raise synth.doctor.PackageNotFoundError(name)

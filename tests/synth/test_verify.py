@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 from commands import refused
 from kinematic_double import LENS, OBLIQUE, sensor, sheet
@@ -178,8 +179,6 @@ def test_dataset_on_disk(tmp_path, sample):
 
 def _file_problems(folder, scene, **changes):
     """Of a flow.exr with header, channels or meta.json changed."""
-    import OpenEXR
-
     rng = np.random.default_rng(0)
     forward, visible = rng.random((3, 4, 2), np.float32), rng.random((3, 4), np.float32)
     forward[0, 0] = np.nan

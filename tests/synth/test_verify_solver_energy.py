@@ -27,6 +27,7 @@ from synth.simulate.system import System, Unknowns
 PRESS = {"depth_mm": 0.8}
 DRAG = {"depth_mm": 0.8, "shear_mm": [1.2, 0.3]}
 TWIST = {"depth_mm": 0.8, "shear_mm": [0.3, 0.2], "twist_deg": 40.0}
+E_MPA = 0.2
 
 
 @dataclass
@@ -76,20 +77,6 @@ class Ledger(System):
         account.last = now
 
 
-def accounted(scene: Scene, mesh: PadMesh) -> Account:
-    """Run a scene, whose trajectory must be complete, and close the account with the energy of its last state."""
-    gel, numerics = scene.sensor.gel, scene.numerics
-    material = pad_material(gel, mesh)
-    ledger = Ledger(function_space(mesh, ELEMENT[numerics.element]()), material, penalty=numerics.penalty)
-    ledger.account = Account()
-    path = Press.of(scene, mesh).path
-    stepper = Stepper(ledger, path, scene.contact.friction, numerics, gel.youngs_modulus_kpa / 1000)
-    ended = stepper.run()
-    assert (ended.status, ended.reason) == ("complete", "")
-    ledger.account.stored = own_integrals(ledger.space).energy(material, stepper.state.u, stepper.state.p)
-    return ledger.account
-
-
 def landing(mesh: PadMesh, element: str) -> tuple[float, float]:
     """The contact point nearest to the pad's middle: there the ball touches from the start of its way."""
     shape = ELEMENT[element]().face_barycentric
@@ -100,15 +87,23 @@ def landing(mesh: PadMesh, element: str) -> tuple[float, float]:
 
 
 def account(element: str, steps: int, motion: dict, friction=0.0, layers=False, nu=0.4999) -> Account:
+    """Run a scene, whose trajectory must be complete, and close the account with the energy of its last state."""
     mesh = pad(layers)
-    case = scene(
+    posed = scene(
         SIZE,
         gel={"poisson_ratio": nu, "layers": [FILM] if layers else []},
         friction=friction,
         motion={**motion, "steps": steps, "position_mm": landing(mesh, element)},
         numerics={"element": element, "tolerance": 1e-8, "max_step_mm": 1.0, "edge_length_mm": None},
     )
-    return accounted(case, mesh)
+    numerics, material = posed.numerics, pad_material(posed.sensor.gel, mesh)
+    ledger = Ledger(function_space(mesh, ELEMENT[element]()), material, penalty=numerics.penalty)
+    ledger.account = Account()
+    stepper = Stepper(ledger, Press.of(posed, mesh).path, friction, numerics, E_MPA)
+    ended = stepper.run()
+    assert (ended.status, ended.reason) == ("complete", "")
+    ledger.account.stored = own_integrals(ledger.space).energy(material, stepper.state.u, stepper.state.p)
+    return ledger.account
 
 
 @pytest.mark.parametrize(("layers", "nu"), [(False, 0.2), (False, 0.4999), (False, 0.5), (True, 0.4999), (True, 0.5)])
@@ -149,7 +144,6 @@ def test_account_closes_with_the_square_of_the_step(motion: dict) -> None:
     assert abs(fine) < abs(coarse) / 8
 
 
-E_MPA = 0.2
 SLIDE = {"depth_mm": 0.8, "shear_mm": [0.5, -0.3], "twist_deg": 10.0, "position_mm": [0.4, 0.2], "steps": 3}
 LEGS = [{"depth_mm": z, "shear_mm": shear} for z, shear in ((3, (3.1, 0.1)), (3, (2.5, 0.1)), (2.8, (2.5, 0.4)))]
 BESIDE = {"depth_mm": -0.1, "position_mm": [4.0, 0.2], "shear_mm": [3.1, 0.1], "then": LEGS, "steps": 5}

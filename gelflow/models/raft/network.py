@@ -41,8 +41,6 @@ from gelflow.ops.warp import pixel_indices
 
 STRIDE = 8
 """Resolution of the image over that of the features."""
-
-
 LEVELS = 4
 """Resolutions of the correlation."""
 
