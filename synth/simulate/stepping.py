@@ -39,14 +39,14 @@ MAX_MULTIPLIER_UPDATES = 2.0
 """Whole updates of the multipliers at a recorded state, in all. Not every contact point of a face on a curved body can
 come to rest on the surface, so that more updates make the tractions uneven."""
 FAILURES = 3
-"""Failed updates after which the passes end. Updates are halved after a failure, doubled after a success and kept after
-a relaxation: where a whole one upsets Newton's method a part of it does not."""
+"""Failed updates after which the passes end. Updates are halved after a failure and doubled after a success: where a
+whole one upsets Newton's method a part of it does not."""
 DEEP, MAX_PENETRATION = 0.02, 0.1
 """Shares of the press depth (at least 0.1 mm). Where a triangle mesh penetrates by more than the first, passes go on to
-MAX_DEEP_PASSES, whole updates and failures together; after the first success each doubles the contact stiffness, up to
-MAX_STIFFENING times, because multipliers alone converge slowly at sharp edges (Nocedal & Wright, Numerical
-Optimization, algorithm 17.4). Where it still penetrates by more than the second, the press ends."""
-MAX_DEEP_PASSES, MAX_STIFFENING = 16.0, 8.0
+MAX_DEEP_PASSES; after the first success each doubles the contact stiffness, up to MAX_STIFFENING times, because
+multipliers alone converge slowly at sharp edges (Nocedal & Wright, Numerical Optimization, algorithm 17.4). Where it
+still penetrates by more than the second, the press ends."""
+MAX_DEEP_PASSES, MAX_STIFFENING = 16, 8.0
 MULTIPLIER_TOLERANCE = 20.0
 """Tolerance of states that multipliers are updated from, over the full one: two updates do not forget what they began
 with."""
@@ -205,15 +205,16 @@ class Stepper:
         The last of two whole updates is solved to the full tolerance; where the passes end before it, none is.
         """
         between = min(self._relaxed_tolerance, MULTIPLIER_TOLERANCE * self.numerics.tolerance)
-        share, done, failures = 1.0, 0.0, 0
+        share, done, failures, passes = 1.0, 0.0, 0, 0
         if self.system.deepest() > self._shallow_mm:
             solution = self._polished(solution, between)
         while solution.converged and self.system.deepest() > self._shallow_mm:
             deepest, sharpness = self.system.deepest(), float(self.indenter.sharpness.numpy()[0])
             deep = deepest > self._deep_mm
             over = done >= MAX_MULTIPLIER_UPDATES or failures >= FAILURES
-            if done + failures >= MAX_DEEP_PASSES if deep else over:
+            if passes >= MAX_DEEP_PASSES if deep else over:
                 break
+            passes += 1
             before = self.system.saved_contact()
             if deep and done > 0:
                 self.indenter.sharpness.fill_(min(2 * sharpness, MAX_STIFFENING * self.path.body.sharpness))
@@ -226,7 +227,7 @@ class Stepper:
                 better = self._counted(relax(self.system, start, self.indenter, tolerance))
             if better.converged:
                 solution, done = better, done + share
-                share = share if relaxed else min(1.0, 2 * share)
+                share = min(1.0, 2 * share)
             else:
                 self.system.restore_contact(before)
                 self.indenter.sharpness.fill_(sharpness)

@@ -57,8 +57,9 @@ class Lanes:
         relaxing: 1 while a step or pass is relaxed (`synth.simulate.newton`), 2 after a refused step of it; viscosity:
             its θ, else 0; part: of the linear step that is tried; trial_error: its error over the residual before.
         trial_held_force: norm of the forces on held nodes; held_force: the least that a relaxation must leave of it.
-        failures, done, share: of augmented-Lagrangian passes: those that failed, the shares of the others together, and
-            the share of the next; new_share: of the one that begins; sharpness: of the indenter, before it.
+        passes, failures, done, share: of augmented-Lagrangian passes: their number, those that failed, the shares of
+            the others together, and the share of the next; new_share: of the one that begins; sharpness: of the
+            indenter, before it.
         save: whether contact's memory is saved in this cycle; anchor: whether points that have come to touch are
             anchored for passes.
         deepest: penetration at the last evaluation, mm.
@@ -97,6 +98,7 @@ class Lanes:
     trial_error: wp.array(dtype=wp.float64)
     trial_held_force: wp.array(dtype=wp.float64)
     held_force: wp.array(dtype=wp.float64)
+    passes: wp.array(dtype=wp.int32)
     failures: wp.array(dtype=wp.int32)
     sharpness: wp.array(dtype=wp.float64)
     done: wp.array(dtype=wp.float64)

@@ -31,11 +31,12 @@ SUFFICIENT_DECREASE, STALLED_RESIDUAL = _doubles(newton.SUFFICIENT_DECREASE, new
 NEAR, STALL_ITERATIONS = wp.constant(wp.float64(newton.NEAR)), wp.constant(newton.STALL_ITERATIONS)
 GROWTH, SHORTEST_STEP = _doubles(stepping.GROWTH, stepping.SHORTEST_STEP)
 MAX_ITERATIONS_TO_GROW, FAILURES = wp.constant(stepping.MAX_ITERATIONS_TO_GROW), wp.constant(stepping.FAILURES)
-MAX_MULTIPLIER_UPDATES, MAX_DEEP_PASSES = _doubles(stepping.MAX_MULTIPLIER_UPDATES, stepping.MAX_DEEP_PASSES)
 MULTIPLIER_TOLERANCE, PENETRATION = _doubles(stepping.MULTIPLIER_TOLERANCE, stepping.PENETRATION)
+MAX_MULTIPLIER_UPDATES = wp.constant(wp.float64(stepping.MAX_MULTIPLIER_UPDATES))
 DEEP, MAX_PENETRATION, MAX_STIFFENING = _doubles(stepping.DEEP, stepping.MAX_PENETRATION, stepping.MAX_STIFFENING)
 MAX_CORRECTION_RATIO, MAX_RELAXED_STEP = _doubles(stepping.MAX_CORRECTION_RATIO, stepping.MAX_RELAXED_STEP)
 MESH, MAX_STEPS = wp.constant(KINDS["mesh"]), wp.constant(newton.MAX_STEPS)
+MAX_DEEP_PASSES = wp.constant(stepping.MAX_DEEP_PASSES)
 FIRST_VISCOSITY, LEAST_VISCOSITY = _doubles(newton.FIRST_VISCOSITY, newton.LEAST_VISCOSITY)
 MOST_VISCOSITY, LEAST_SHARE = _doubles(newton.MOST_VISCOSITY, newton.LEAST_SHARE)
 LEAST_BORNE, MAX_ERROR, AIM = _doubles(newton.MIN_REACTION_RATIO, newton.MAX_ERROR, newton.AIM)
@@ -160,9 +161,8 @@ def finish_solve(lanes: Lanes, presses: Presses, settings: Settings, indenters: 
     polish = lanes.stage[s] == phases.POLISH
     relaxed = lanes.relaxing[s] > 0
     small = lanes.target[s] - lanes.at[s] <= MAX_RELAXED_STEP * settings.longest
-    deep = _is_deeper(lanes, presses, s, DEEP)
     if correction:
-        small = lanes.share[s] < MAX_RELAXED_STEP and deep
+        small = lanes.share[s] < MAX_RELAXED_STEP and _is_deeper(lanes, presses, s, DEEP)
     if phase == phases.FAILED and not relaxed and not polish and small:
         lanes.relaxing[s] = 1
         lanes.viscosity[s] = FIRST_VISCOSITY
@@ -177,8 +177,7 @@ def finish_solve(lanes: Lanes, presses: Presses, settings: Settings, indenters: 
     if correction:
         if phase == phases.SOLVED:
             lanes.done[s] = lanes.done[s] + lanes.share[s]
-            if not relaxed:
-                lanes.share[s] = wp.min(ONE, wp.float64(2.0) * lanes.share[s])
+            lanes.share[s] = wp.min(ONE, wp.float64(2.0) * lanes.share[s])
             lanes.phase[s] = phases.CORRECTING
         else:
             indenters.sharpness[s] = lanes.sharpness[s]
@@ -228,6 +227,7 @@ def check_contact(lanes: Lanes, presses: Presses, sums: wp.array2d(dtype=wp.floa
         return
     lanes.save[s] = 1
     lanes.failures[s] = 0
+    lanes.passes[s] = 0
     lanes.share[s] = ONE
     lanes.done[s] = ZERO
     lanes.phase[s] = phases.CORRECTING
@@ -247,7 +247,7 @@ def choose_pass(lanes: Lanes, presses: Presses, settings: Settings, indenters: I
     deep = _is_deeper(lanes, presses, s, DEEP)
     over = lanes.failures[s] >= FAILURES or lanes.done[s] >= MAX_MULTIPLIER_UPDATES
     if deep:
-        over = lanes.done[s] + wp.float64(lanes.failures[s]) >= MAX_DEEP_PASSES
+        over = lanes.passes[s] >= MAX_DEEP_PASSES
     if corrected and over and _is_deeper(lanes, presses, s, MAX_PENETRATION):
         lanes.reason[s] = phases.TOO_DEEP
         lanes.phase[s] = phases.ENDED
@@ -262,6 +262,7 @@ def choose_pass(lanes: Lanes, presses: Presses, settings: Settings, indenters: I
         lanes.limit[s] = settings.limit
     else:
         lanes.new_share[s] = lanes.share[s]
+        lanes.passes[s] = lanes.passes[s] + 1
         lanes.sharpness[s] = indenters.sharpness[s]
         if deep and lanes.done[s] > ZERO:
             indenters.sharpness[s] = wp.min(wp.float64(2.0) * lanes.sharpness[s], MAX_STIFFENING * presses.sharpness[j])
