@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Trains weights as the shipped ones were, on NVIDIA GPUs: bash gelflow/weights/train.sh CLIPS OUT
 #
-# CLIPS is a folder of videos of a real gel. DEVICES is the number of GPUs of the fifth stage, PAIRS that of pairs of a
-# scene in the first. The first four stages of the shipped weights used the scenes of version 0.1.0.
+# CLIPS is a folder of videos of a real gel. DEVICES is the number of GPUs of the last two stages, PAIRS that of pairs of
+# a scene in the first. The first four stages of the shipped weights used the scenes of version 0.1.0.
 set -euo pipefail
 clips=$1 out=$2 devices=${DEVICES:-1} n=${PAIRS:-900} here=$(cd "$(dirname "$0")" && pwd)
 others="densetact fingervision gelsight gelsight_fingertip gelslim gelstereo omnitact tac3d"
@@ -19,6 +19,18 @@ finetune() { # NAME FROM STEPS LEARNING_RATE WARMUP_STEPS SEED, folders of pairs
         --set learning_rate="$4" --set warmup_steps="$5" --set seed="$6" --out "$out/$1"
 }
 
+everything() { # FOLDER SEED: pairs of all scenes
+    local scene
+    for scene in allsight deltact densetact dmtac fingervision gelsight gelsight_fingertip gelslim gelstereo omnitact \
+        soft_bubble tac3d tac3d_single "$here/any_pattern.toml" "$here/any_round.toml"; do
+        pairs "$1/$(basename "$scene" .toml)" "$scene" $((n * 5 / 9)) "$2" 5 $together
+    done
+    pairs "$1"/gelsight_mini gelsight_mini $((n * 5 / 2)) "$2" 5 $together
+    pairs "$1"/objects objects $((n * 4 / 3)) "$2" 5 $together
+    pairs "$1"/digit digit $((n * 5 / 3)) "$2" 5 $together
+    pairs "$1"/turned "$here/gelsight_mini_far.toml" "$n" "$2" 5 $together $turned
+}
+
 together="--workers 3 --set numerics.solver=batched"
 turned="--set motion.twist_deg={uniform=[-45.0,45.0]}"
 network="--device cuda --set precision=bf16 --set batch_size=16 --set crop_size=[240,320]"
@@ -31,14 +43,8 @@ pairs far "$here/gelsight_mini_far.toml" "$n" 11 6 --set numerics.target_error_p
 pairs turned "$here/gelsight_mini_far.toml" $((n * 5 / 3)) 32 6 $together $turned
 pairs bare digit $((n * 5)) 31 6 $together
 for scene in $others; do pairs "few/$scene" "$scene" $((n * 2 / 9)) 21 6; done
-for scene in allsight deltact densetact dmtac fingervision gelsight gelsight_fingertip gelslim gelstereo omnitact \
-    soft_bubble tac3d tac3d_single "$here/any_pattern.toml" "$here/any_round.toml"; do
-    pairs "all/$(basename "$scene" .toml)" "$scene" $((n * 5 / 9)) 41 5 $together
-done
-pairs all/gelsight_mini gelsight_mini $((n * 5 / 2)) 41 5 $together
-pairs all/objects objects $((n * 4 / 3)) 41 5 $together
-pairs all/digit digit $((n * 5 / 3)) 41 5 $together
-pairs all/turned "$here/gelsight_mini_far.toml" "$n" 41 5 $together $turned
+everything all 41
+everything again 43
 
 two="$out/first/deltact $out/first/soft_bubble"
 python -m gelflow train "$out"/first/* "$out/far" --config best $network \
@@ -47,3 +53,4 @@ finetune 2 1 5301 1e-4 265 0 "$out/far" $two "$out/first/gelsight_mini"
 finetune 3 2 15062 3e-4 265 0 "$out/far" $two "$out"/few/* "$out/bare"
 finetune 4 3 9646 2e-4 192 1 "$out/far" "$out/turned" $two "$out"/few/* "$out/bare"
 finetune 5 4 8157 3e-4 300 2 "$out"/all/* --devices "$devices"
+finetune 6 5 8500 3e-4 300 3 "$out"/again/* --devices "$devices"
