@@ -13,7 +13,7 @@ from gelflow.files.atomic import replacing
 UNTIMED = ("no motion", "exact flow")
 """Methods that take no time worth drawing."""
 BLUE, RED = "#4477aa", "#cc6677"
-COLOURS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb", "#000000")
+COLOURS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb", "#000000", "#ee7733")
 MARKERS = "osD^vPX"
 
 
