@@ -1,10 +1,11 @@
 """Is the flow's sigma calibrated? Fits CURVATURE of `gelflow.models.uncertainty` to exact flow.
 
 Takes data sets of synth. By scene and pattern: the share of pixels with sigma <= 0.1 px, and how many of these, and of
-those up to 1 px, err by less than sigma (68 % if calibrated). The mean distance of that share from 68 % over the
-scenes is least with the fitted constant, on pixels with sigma <= 0.1 px of gels with a pattern. Beside it, the error
-against the Cramer-Rao bound: that of a flow which is constant in the narrow window, from the noise that the exact flow
-leaves, as medians over pixels. Files of flows in `--out` are used again by a repeated run.
+those up to 1 px, err by less than sigma (68 % if calibrated). The mean distance of that share from 68 % over the scenes
+is least with the fitted constant (the window of a pixel is chosen with the present one), on pixels with sigma <= 0.1 px
+of gels with a pattern. Beside it, the error against the Cramer-Rao bound: that of a flow which is constant in the
+narrow window, from the noise that the exact flow leaves, as medians over pixels. Files of flows in `--out` are used
+again by a repeated run.
 """
 
 from collections.abc import Mapping

@@ -16,7 +16,7 @@ Gauss-Newton steps stay in the basin that they start in. With `propagation_px` e
 flows first (`gelflow.models.propagation`); where a whole neighbourhood mistook dots for the next ones, that does not
 help. With `after`, another registration comes before all stages. Its flow stays wherever the residual that it leaves is
 below its `noise`. So registration for both keeps the motion where motion explains the images, and follows brightness
-elsewhere. Where shading is ignored, each pixel at last takes the window that fits it (`gelflow.models.wider_window`):
+elsewhere. Where shading is ignored, each pixel finally takes the window that fits it (`gelflow.models.wider_window`):
 the last stage's, a wider one, or where the flow bends, that of a further stage.
 
 Lucas and Kanade 1981, with a prior (Simoncelli, Adelson and Heeger, "Probability distributions of optical flow", 1991);
@@ -67,12 +67,14 @@ def registered(flow: Flow, image1: Images, image2: Images, config: RegistrationC
 def _fitted(
     flow: Flow, variance: Tensor, texture: Tensor, first: Images, second: SplineImage, config: RegistrationConfig
 ) -> Flow:
-    """A flow that was found in the last window, under the window that fits each place.
+    """At each pixel, the flow of the window that fits it, from a flow that was found in the last stage's window.
 
     `variance` is that of its noise, and `texture` as of `gelflow.models.evidence.Step`.
     """
     windows = config.windows_px[-1], FINE_WINDOW_PX
     best, _ = best_window(flow, variance, window_sums(flow, windows[0])(texture), windows[0])
+    if windows[0] <= FINE_WINDOW_PX:
+        return best
     further = config.model_copy(update={"windows_px": (FINE_WINDOW_PX,), "prior_px": FINE_PRIOR_PX})
     fine = _stage(flow, first, second, FINE_WINDOW_PX, FINE_SMOOTHING_PX, further)
     noise = fine_noise(*windows)[1] * gauss_newton(fine, first, second, further).variance
@@ -81,7 +83,7 @@ def _fitted(
 
 
 def posterior_variance(variance: Tensor, prior_px: float) -> Tensor:
-    """Of a flow's noise, both components together, px^2, where the flow before was wrong by `prior_px` in each."""
+    """Variance of a flow, both components together, px^2, from that of its noise and a prior of `prior_px` on each."""
     return 1 / (1 / variance + 1 / (2 * prior_px**2))
 
 

@@ -3,8 +3,8 @@
 From the flow V a Gauss-Newton step leads to what the images say under a narrow window, and
 `gelflow.models.wider_window` from there to V*, what they say under the window that fits the place, with its mean square
 error e. What V misses of it is an error, too. Bias within the window is not seen: it has one flow for all its texture,
-which lies at a mean square distance m from x, so that the flow's second derivatives V'' add an error. Of the narrow
-window and the finer one of the registration's further stage, that with the smaller sum of both counts. Together,
+which lies at a mean square distance m from x, so that the flow's second derivatives V'' add an error. Where e and m of
+the finer window of the registration's further stage make the sum smaller, they count instead. Together,
 
     sigma^2 = RADIUS^2 / 2 (e + |V - V*|^2 + (CURVATURE m |V''|)^2),
 
@@ -58,7 +58,7 @@ def flow_sigma(flow: Flow, image1: Images, image2: Images) -> tuple[Tensor, Tens
 
 
 def error_squares(flow: Flow, image1: Images, image2: Images) -> tuple[Tensor, Tensor]:
-    """E + |V - V*|^2 and (m |V''|)^2, both (B, 1, H, W) px^2."""
+    """The squares e + |V - V*|^2 and (m |V''|)^2, both (B, 1, H, W) px^2; CURVATURE decides whose e and m count."""
     second, narrow_px = SplineImage(image2), _MOTION.windows_px[-1]
     found, finer = (gauss_newton(flow, image1, second, config) for config in (_MOTION, _FINER))
     window, fine, wide = (window_sums(flow, width) for width in (narrow_px, FINE_WINDOW_PX, _MOTION.windows_px[0]))
@@ -69,8 +69,8 @@ def error_squares(flow: Flow, image1: Images, image2: Images) -> tuple[Tensor, T
     error = torch.where(known, least, variance)
     moment = torch.where(known, _second_moment(window, found.texture) / texture, 0.0)
     bend = _curvature_square(flow)
-    # Where the flow bends, the further stage's window errs by less.
-    fine_error = fine_noise(narrow_px, FINE_WINDOW_PX)[1] * finer.variance
+    # The further stage's window, where it errs by less: usually where the flow bends.
+    fine_error = (fine_noise(narrow_px, FINE_WINDOW_PX)[1] * finer.variance).clamp(min=MIN_VARIANCE)
     fine_moment = _second_moment(fine, finer.texture) / fine(finer.texture)
     narrowed = fine_error + (CURVATURE * fine_moment).square() * bend < error + (CURVATURE * moment).square() * bend
     narrowed &= known

@@ -58,10 +58,10 @@ def best_window(flow: Flow, variance: Tensor, texture: Tensor, window_px: float)
 
 
 def bends(flow: Flow, fine: Flow, variance: Tensor, windows_px: tuple[float, float], reach_px: float) -> Tensor:
-    """Where a flow is worse than what two more steps in a narrower window made of it; bool, (B, 1, H, W).
+    """Where two more steps in a narrower window improved a flow; bool, (B, 1, H, W).
 
-    `variance` is that of the second flow's noise. Nowhere where the two differ by more than `reach_px`, root mean
-    square: such steps have lost the pattern.
+    `fine` is the flow after them, `variance` that of its noise, `windows_px` the deviations of both windows. False
+    where the flows differ by more than `reach_px` (root mean square): there the steps have lost the pattern.
     """
     apart = (fine - flow).square().sum(dim=1, keepdim=True)
     window, alike = window_sums(flow, BEND_WINDOW_PX), torch.ones_like(apart)
@@ -71,9 +71,10 @@ def bends(flow: Flow, fine: Flow, variance: Tensor, windows_px: tuple[float, flo
 
 @functools.cache
 def fine_noise(window_px: float, fine_px: float) -> tuple[float, float]:
-    """Covariance of the noise under a window and after two more steps under a narrower one, over the variance after.
+    """Two ratios for the noise of a flow after two more steps in a narrower window.
 
-    The second number is the variance after over that of one step in the narrower window alone.
+    The first is its covariance with the noise before these steps over its variance; the second is that variance over
+    that of one step in the narrower window alone.
     """
     k = np.linspace(0, 5 / fine_px, 1001)
     wide, fine = (np.exp(-((deviation * k) ** 2) / 2) for deviation in (window_px, fine_px))

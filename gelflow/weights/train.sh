@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Trains weights as the shipped ones were, on NVIDIA GPUs: bash gelflow/weights/train.sh CLIPS OUT
 #
-# CLIPS is a folder of videos of a real gel. DEVICES is the number of GPUs of the last two stages, PAIRS that of pairs of
-# a scene in the first. The first four stages of the shipped weights used the scenes of version 0.1.0.
+# CLIPS is a folder of videos of a real gel. DEVICES is the number of GPUs of the last two stages, PAIRS that of pairs
+# of a scene in the first. The first four stages of the shipped weights used the scenes of version 0.1.0.
 set -euo pipefail
 clips=$1 out=$2 devices=${DEVICES:-1} n=${PAIRS:-900} here=$(cd "$(dirname "$0")" && pwd)
 others="densetact fingervision gelsight gelsight_fingertip gelslim gelstereo omnitact tac3d"

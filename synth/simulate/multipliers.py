@@ -17,7 +17,7 @@ def augment(
     penalty: wp.float64,
     state: ContactState,
 ):
-    """Multipliers move by a share (B,) of the difference to the present traction.
+    """Normal multipliers grow by a share (B,) of stiffness times penetration; tangential ones follow the traction.
 
     The next solution then needs less penetration and elastic slip.
     """

@@ -39,13 +39,13 @@ MAX_MULTIPLIER_UPDATES = 2.0
 """Whole updates of the multipliers at a recorded state, in all. Not every contact point of a face on a curved body can
 come to rest on the surface, so that more updates make the tractions uneven."""
 FAILURES = 3
-"""Failed updates after which the passes end. Updates are halved after a failure and doubled after a success: where a
-whole one upsets Newton's method a part of it does not."""
+"""Failed updates after which the passes end, unless they begin deeper than DEEP. Updates are halved after a failure and
+doubled after a success: where a whole one upsets Newton's method a part of it does not."""
 DEEP, MAX_PENETRATION = 0.02, 0.1
-"""Shares of the press depth (at least 0.1 mm). Where a triangle mesh penetrates by more than the first, passes go on to
-MAX_DEEP_PASSES; after the first success each doubles the contact stiffness, up to MAX_STIFFENING times, because
-multipliers alone converge slowly at sharp edges (Nocedal & Wright, Numerical Optimization, algorithm 17.4). Where it
-still penetrates by more than the second, the press ends."""
+"""Shares of the press depth (at least 0.1 mm). A triangle mesh that penetrates by more than the first gets up to
+MAX_DEEP_PASSES passes, failed ones included. After the first success each pass doubles the contact stiffness, to at
+most MAX_STIFFENING times the body's own: multipliers alone converge slowly at sharp edges (after Nocedal & Wright,
+Numerical Optimization, framework 17.3). The press ends if penetration then exceeds the second."""
 MAX_DEEP_PASSES, MAX_STIFFENING = 16, 8.0
 MULTIPLIER_TOLERANCE = 20.0
 """Tolerance of states that multipliers are updated from, over the full one: two updates do not forget what they began
@@ -202,7 +202,8 @@ class Stepper:
     def _augmented(self, solution: Solution) -> Solution:
         """Passes of multiplier update and solve, by whole updates or as large a share of them as converges.
 
-        The last of two whole updates is solved to the full tolerance; where the passes end before it, none is.
+        Of two whole updates the last is solved to the full tolerance; passes that begin deeper than DEEP never are. The
+        contact stiffness may end up raised; `_record` resets it.
         """
         between = min(self._relaxed_tolerance, MULTIPLIER_TOLERANCE * self.numerics.tolerance)
         share, done, failures, passes = 1.0, 0.0, 0, 0

@@ -3,10 +3,10 @@
 The rules are those of `synth.simulate.newton` and `stepping`, whose constants they use; what differs is that each lane
 follows them at its own pace, that passes are solved to a share of the full tolerance, and that where intermediate steps
 have a relaxed tolerance the full one holds for what is recorded only. A step that ends at a recorded state, and every
-pass but the last, then has the relaxed tolerance: what they find is changed by the next pass. A state without passes,
-or whose passes end early, because they fail or nothing is deep any more, is brought to the full tolerance before it is
-recorded (POLISH); where that fails, the step is halved as if it had not been taken. The load path goes on from the
-state before, so that it does not depend on which states are corrected.
+pass but the last, then has the relaxed tolerance, and every pass of a deep object at least MULTIPLIER_TOLERANCE times
+the full one: what they find is changed by the next pass. A state without passes, or whose passes end early, is brought
+to the full tolerance before it is recorded (POLISH); where that fails, the step is halved as if it had not been taken.
+The load path goes on from the state before, so that it does not depend on which states are corrected.
 """
 
 from typing import Any
@@ -28,15 +28,15 @@ ZERO, ONE = _doubles(0.0, 1.0)
 MIN_TOLERANCE = wp.constant(wp.float64(1.0e-12))  # of a pass: somewhat more than rounding leaves
 FORCE_FLOOR, INDIFFERENT, SHORTEST = _doubles(newton.FORCE_FLOOR, newton.INDIFFERENT, newton.SHORTEST)
 SUFFICIENT_DECREASE, STALLED_RESIDUAL = _doubles(newton.SUFFICIENT_DECREASE, newton.STALLED_RESIDUAL)
-NEAR, STALL_ITERATIONS = wp.constant(wp.float64(newton.NEAR)), wp.constant(newton.STALL_ITERATIONS)
+NEAR, MAX_STEPS = wp.constant(wp.float64(newton.NEAR)), wp.constant(newton.MAX_STEPS)
+STALL_ITERATIONS = wp.constant(newton.STALL_ITERATIONS)
 GROWTH, SHORTEST_STEP = _doubles(stepping.GROWTH, stepping.SHORTEST_STEP)
 MAX_ITERATIONS_TO_GROW, FAILURES = wp.constant(stepping.MAX_ITERATIONS_TO_GROW), wp.constant(stepping.FAILURES)
 MULTIPLIER_TOLERANCE, PENETRATION = _doubles(stepping.MULTIPLIER_TOLERANCE, stepping.PENETRATION)
 MAX_MULTIPLIER_UPDATES = wp.constant(wp.float64(stepping.MAX_MULTIPLIER_UPDATES))
 DEEP, MAX_PENETRATION, MAX_STIFFENING = _doubles(stepping.DEEP, stepping.MAX_PENETRATION, stepping.MAX_STIFFENING)
 MAX_CORRECTION_RATIO, MAX_RELAXED_STEP = _doubles(stepping.MAX_CORRECTION_RATIO, stepping.MAX_RELAXED_STEP)
-MESH, MAX_STEPS = wp.constant(KINDS["mesh"]), wp.constant(newton.MAX_STEPS)
-MAX_DEEP_PASSES = wp.constant(stepping.MAX_DEEP_PASSES)
+MESH, MAX_DEEP_PASSES = wp.constant(KINDS["mesh"]), wp.constant(stepping.MAX_DEEP_PASSES)
 FIRST_VISCOSITY, LEAST_VISCOSITY = _doubles(newton.FIRST_VISCOSITY, newton.LEAST_VISCOSITY)
 MOST_VISCOSITY, LEAST_SHARE = _doubles(newton.MOST_VISCOSITY, newton.LEAST_SHARE)
 LEAST_BORNE, MAX_ERROR, AIM = _doubles(newton.MIN_REACTION_RATIO, newton.MAX_ERROR, newton.AIM)
@@ -281,7 +281,7 @@ def choose_pass(lanes: Lanes, presses: Presses, settings: Settings, indenters: I
 
 @wp.kernel
 def finish_record(mask: wp.array(dtype=wp.int32), lanes: Lanes, presses: Presses, indenters: Indenters):
-    """After the record, or back before the step: the contact has its stiffness again."""
+    """After a record or a rolled-back step: resets the contact stiffness, and the lane goes on."""
     s = wp.tid()
     if mask[s] == 1:
         indenters.sharpness[s] = presses.sharpness[lanes.press[s]]
