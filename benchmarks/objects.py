@@ -110,7 +110,7 @@ def summary(rows: Sequence[Row]) -> Row:
     if done:
         deep, slow = (np.array([row[name] for row in done]) for name in ("penetration", "times_a_ball"))
         found |= {"times a ball's time, median": float(np.median(slow)), "sunk in, median": f"{np.median(deep):.1%}"}
-        found |= {"largest": f"{deep.max():.1%}", f"at most {DEEP:.0%}": f"{np.mean(deep <= DEEP):.0%}"}
+        found |= {"largest": f"{deep.max():.1%}", f"at most {DEEP:.0%}": f"{np.mean(deep <= DEEP):.1%}"}
     return found
 
 

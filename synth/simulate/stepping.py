@@ -213,7 +213,9 @@ class Stepper:
             deepest, sharpness = self.system.deepest(), float(self.indenter.sharpness.numpy()[0])
             deep = deepest > self._deep_mm
             over = done >= MAX_MULTIPLIER_UPDATES or failures >= FAILURES
-            if passes >= MAX_DEEP_PASSES if deep else over:
+            if deep:
+                over = passes >= MAX_DEEP_PASSES
+            if over:
                 break
             passes += 1
             before = self.system.saved_contact()
