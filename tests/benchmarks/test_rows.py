@@ -111,7 +111,7 @@ def test_the_summary_of_made_up_presses() -> None:
     found = summary([*rows, {"status": "partial"}, {"status": "refused"}])
     assert (found["refused"], found["pressed"], found["complete"]) == (1, 4, 3)
     assert found["times a ball's time, median"] == 1.02
-    assert (found["sunk in, median"], found["largest"], found["at most 2%"]) == ("2.0%", "6.0%", "67%")
+    assert (found["sunk in, median"], found["largest"], found["at most 2%"]) == ("2.0%", "6.0%", "66.7%")
     assert summary([{"status": "refused"}]) == {"refused": 1, "pressed": 0, "complete": 0}
 
 
