@@ -85,6 +85,8 @@ class ModelConfig(_Frozen):
     refine: Literal["none", "half"] = "none"
     """A refinement head after the last decoded flow: local correlation of fine features around the flow so far, at half
     of the resolution. Not in the paper, whose finest flow is an enlargement of V2."""
+    denoise: bool = False
+    """Noise is taken from a flow that was registered for motion, see `gelflow.models.denoiser`. Not in the paper."""
     registration: RegistrationConfig | None = None
     """Correction of the network's flow on the images where it is used (validation, evaluation, prediction; neither the
     training steps nor the exported network); in a configuration, a name of `REGISTRATIONS` or a table. Takes no part in
@@ -168,9 +170,10 @@ class TrainConfig(_Frozen):
 
     model: ModelConfig = ModelConfig()
     loss: LossConfig = LossConfig()
-    supervision: Literal["self", "flow", "mixed"] = "self"
+    supervision: Literal["self", "flow", "mixed", "registered"] = "self"
     """Train on the images alone (the paper), or on the exact flow by the multi-scale endpoint loss, or on whichever a
-    pair has: exact flow where it is known, the images alone where it is not (synthetic and real pairs side by side)."""
+    pair has: exact flow where it is known, the images alone where it is not (synthetic and real pairs side by side).
+    With "registered", the denoiser alone learns, from registered flows and the exact ones."""
     mixed_self: float = Field(default=10.0, gt=0)
     """Weight of the self-supervised loss, which changes less with a px of error, beside the endpoint loss under
     supervision = "mixed"."""
@@ -226,8 +229,15 @@ class TrainConfig(_Frozen):
     nodes: int = Field(default=1, ge=1)
     """Number of machines that train together; the same command is started on each, see Lightning's `num_nodes`."""
 
+    @property
+    def exact(self) -> bool:
+        """Whether every pair needs an exact flow."""
+        return self.supervision in ("flow", "registered")
+
     @model_validator(mode="after")
     def _fits_together(self) -> TrainConfig:
+        if self.supervision == "registered" and not (self.model.denoise and self.model.registration):
+            raise ValueError('supervision = "registered" needs model.denoise = true and model.registration')
         scales = self.model.levels - 1
         if len(self.loss.lambda_s) != scales:
             raise ValueError(f"loss.lambda_s has {len(self.loss.lambda_s)} numbers; model.levels asks for {scales}")

@@ -17,6 +17,7 @@ from gelflow.arrays import Features, Flow, Images
 from gelflow.config import MINIMUM_SIDE, ModelConfig
 from gelflow.errors import InputError
 from gelflow.models import layers
+from gelflow.models.denoiser import Denoiser
 from gelflow.models.registration import registered
 from gelflow.ops.correlation import local_correlation
 from gelflow.ops.pyramid import enlarge_flow
@@ -50,6 +51,8 @@ class GelFlow(nn.Module):
         self.contexts = nn.ModuleList(layers.ContextNetwork() for _ in range(networks))
         self.fusion = layers.LocalFlowFusion() if config.lffm else None
         self.refinement = layers.RefinementHead() if config.refine == "half" else None
+
+        self.denoiser = Denoiser() if config.denoise else None
 
     def forward(self, image1: Images, image2: Images) -> list[Flow]:
         """Flows for s = 0 .. levels-2, finest first: (B, 2, ceil(H / 2^s), ceil(W / 2^s)) float32, px of scale s.
@@ -86,7 +89,14 @@ class GelFlow(nn.Module):
         """
         flow: Flow = self(image1, image2)[0]
         settings = self.config.registration
-        return flow if settings is None else registered(flow, image1, image2, settings)
+        if settings is None:
+            return flow
+        found = registered(flow, image1, image2, settings)
+        if self.denoiser is None or settings.background_px is None:
+            return found
+        with torch.no_grad(), torch.autocast(flow.device.type, enabled=False):
+            denoised: Flow = self.denoiser(found, flow, image1, image2)
+            return denoised
 
     def _decode(self, scale: int, first: Features, second: Features, start: Flow) -> Flow:
         """The flow of one scale from its features (B, C, H, W) and the enlarged flow of the coarser one."""

@@ -19,10 +19,12 @@ from gelflow.config import MINIMUM_SIDE, TrainConfig
 from gelflow.errors import InputError
 from gelflow.losses import flow_loss, self_supervised_loss
 from gelflow.losses.augmentation_consistency import consistency_loss, transformed_pair
+from gelflow.losses.denoising import denoising_loss
 from gelflow.losses.photometric import photometric_loss, visible_in_both_images
 from gelflow.models import GelFlow
 from gelflow.models.estimate import estimate_flow
 from gelflow.models.recorded import GraphedNetwork
+from gelflow.models.registration import registered
 from gelflow.ops.warp import inside, warp
 
 LOG_EVERY = 10
@@ -58,6 +60,9 @@ class FlowModule(L.LightningModule):
         super().__init__()
         self.config = config
         self.model = model
+        if config.supervision == "registered" and model.denoiser is not None:
+            model.requires_grad_(False)
+            model.denoiser.requires_grad_(True)
         self.average = None
         if config.ema_decay > 0:
             self.average = copy.deepcopy(model).eval().requires_grad_(False)
@@ -77,7 +82,7 @@ class FlowModule(L.LightningModule):
 
     def on_fit_start(self) -> None:
         """Records the network's passes on a CUDA device, where the configuration asks for it."""
-        if self.config.cuda_graph and self.device.type == "cuda":
+        if self.config.cuda_graph and self.config.supervision != "registered" and self.device.type == "cuda":
             self._graphed = GraphedNetwork(self.model)
 
     @property
@@ -96,7 +101,9 @@ class FlowModule(L.LightningModule):
     def training_step(self, batch: dict[str, Any], _: int) -> Tensor:
         """The loss of one batch."""
         image1, image2 = batch["image1"], batch["image2"]
-        if self.config.supervision == "flow":
+        if self.config.supervision == "registered":
+            loss, parts = self._denoising(image1, image2, batch["flow"])
+        elif self.config.supervision == "flow":
             loss, parts = flow_loss(self.network(image1, image2), batch["flow"], self.config.loss)
         elif self.config.supervision == "mixed":
             loss, parts = self._mixed(image1, image2, batch.get("flow"))
@@ -108,6 +115,16 @@ class FlowModule(L.LightningModule):
             self.write({"train/loss": float(loss.detach()), "train/learning_rate": rate}
                         | {f"train/{name}": float(value) for name, value in parts.items()}, self.step + 1)  # fmt: skip
         return loss
+
+    def _denoising(self, image1: Tensor, image2: Tensor, truth: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """The loss of the denoiser, on the network's registered flow."""
+        model, settings = self.model, self.config.model.registration
+        assert model.denoiser is not None
+        assert settings is not None
+        with torch.no_grad(), torch.autocast(image1.device.type, enabled=False):
+            network = model(image1, image2)[0]
+        flow = registered(network, image1, image2, settings)
+        return denoising_loss(model.denoiser, flow, network, image1, image2, truth)
 
     def _mixed(self, image1: Tensor, image2: Tensor, truth: Tensor | None) -> tuple[Tensor, dict[str, Tensor]]:
         """The endpoint loss of the pairs with a flow and the weighted self-supervised loss of the others.

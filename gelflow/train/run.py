@@ -23,6 +23,7 @@ from gelflow.errors import InputError
 from gelflow.files.quiet import quiet_logger
 from gelflow.hardware import chosen_device
 from gelflow.models import GelFlow
+from gelflow.models.denoiser import Denoiser
 from gelflow.models.weights import load_weights, save_weights
 from gelflow.terminal import progress
 from gelflow.train.callback import (
@@ -96,7 +97,7 @@ def train(
         raise InputError(f"{'training' if pairs == 0 else 'validation'} set: holds no pair")
     device = _device(config)
     model = _initial_network(config, initial)
-    checked(train_set[0], supervised=config.supervision == "flow")
+    checked(train_set[0], supervised=config.exact)
     if validation_set is not None:
         check_side(_one_pair([validation_set[0]]), config)
     if is_first_process():
@@ -141,7 +142,10 @@ def _initial_network(config: TrainConfig, initial: Path | None) -> GelFlow:
             model = GelFlow(config.model)
     else:
         model = load_weights(initial)
-        # Registration has no weights: a fine-tuning may switch it on or change it.
+        # Registration has no weights: a fine-tuning may switch it on or change it. A denoiser may be added.
+        if config.model.denoise and model.denoiser is None:
+            model.denoiser = Denoiser()
+            model.config = model.config.model_copy(update={"denoise": True})
         model.config = model.config.model_copy(update={"registration": config.model.registration})
         if model.config != config.model:
             theirs, ours = model.config.model_dump(), config.model.model_dump()
@@ -208,7 +212,7 @@ class _Data(L.LightningDataModule):
     ) -> None:
         super().__init__()
         self.config = config
-        self.train_set: CheckedPairs | ResidentPairs = CheckedPairs(train_set, config.supervision == "flow")
+        self.train_set: CheckedPairs | ResidentPairs = CheckedPairs(train_set, config.exact)
         self.validation_set = validation_set
         self.module = module
         self._loading: dict[str, Any] = {"num_workers": config.workers, "worker_init_fn": end_with_run,

@@ -96,7 +96,7 @@ def checked(sample: Sample, supervised: bool = False) -> Sample:
     flow = sample.get("flow")
     if supervised and (flow is None or not torch.isfinite(flow).any()):
         raise InputError(
-            f'pair {sample["name"]}: has no exact flow, which supervision = "flow" needs; use supervision = "self"'
+            f'pair {sample["name"]}: has no exact flow, which this supervision needs; use supervision = "self"'
         )
     return {key: sample[key] for key in ("image1", "image2", "bare", "name", "flow") if key in sample}
 
@@ -140,7 +140,7 @@ def cropped(sample: Sample, config: TrainConfig, random: np.random.Generator) ->
 def _supervised(sample: Sample, config: TrainConfig) -> bool:
     if config.supervision == "mixed":
         return "flow" in sample and bool(torch.isfinite(sample["flow"]).any())
-    return config.supervision == "flow"
+    return config.exact
 
 
 def collate(samples: list[Sample]) -> Sample:
