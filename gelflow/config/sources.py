@@ -13,7 +13,7 @@ from gelflow.config import REGISTRATIONS, TrainConfig
 from gelflow.config.validation import validated
 from gelflow.errors import InputError
 
-PRESETS = ("best", "denoise", "real", "bare", "paper", "selfflow", "arflow")
+PRESETS = ("best", "real", "bare", "paper", "selfflow", "arflow")
 """Names of the configurations that come with the package."""
 
 

@@ -43,16 +43,16 @@ class Denoiser(nn.Module):
         self.down = nn.ModuleList(Block(fine, coarse) for fine, coarse in pairwise(CHANNELS))
         self.bottom = Block(last, last)
         self.up = nn.ModuleList(Block(fine + coarse, fine) for fine, coarse in reversed(list(pairwise(CHANNELS))))
-        self.head = nn.Conv2d(first, 4 * 3, 3, padding=1)
+        self.head = nn.Conv2d(first, 4 * 2, 3, padding=1)
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)  # type: ignore[arg-type]
 
     def forward(self, flow: Flow, network: Flow, image1: Images, image2: Images) -> Flow:
-        """The flow (B, 2, H, W) without its noise, px."""
+        """A registered flow (B, 2, H, W) of two images without its noise; `network` is the flow before registration."""
         return self.estimate(flow, network, image1, image2)[0]
 
-    def estimate(self, flow: Flow, network: Flow, image1: Images, image2: Images) -> tuple[Flow, Tensor, Tensor]:
-        """The flow, its sigma, and s, the latter (B, 1, H, W), px."""
+    def estimate(self, flow: Flow, network: Flow, image1: Images, image2: Images) -> tuple[Flow, Tensor]:
+        """The flow of `forward`, and s, (B, 1, H, W) px."""
         with torch.no_grad(), torch.autocast(flow.device.type, enabled=False):
             inputs, error = evidence_of(flow, network, image1, image2)
         height, width = flow.shape[-2:]
@@ -68,7 +68,7 @@ class Denoiser(nn.Module):
             fine = skipped.pop()
             state = block(torch.cat([fine, F.interpolate(state, scale_factor=2, mode="bilinear")], dim=1))
         found = F.pixel_shuffle(self.head(F.gelu(state)), 2)[..., :height, :width].float()
-        return flow + error * found[:, :2], error * found[:, 2:].exp(), error
+        return flow + error * found, error
 
 
 class Block(nn.Module):

@@ -60,9 +60,10 @@ class FlowModule(L.LightningModule):
         super().__init__()
         self.config = config
         self.model = model
-        if config.supervision == "registered" and model.denoiser is not None:
-            model.requires_grad_(False)
-            model.denoiser.requires_grad_(True)
+        if model.denoiser is not None:
+            alone = config.supervision == "registered"
+            model.requires_grad_(not alone)
+            model.denoiser.requires_grad_(alone)
         self.average = None
         if config.ema_decay > 0:
             self.average = copy.deepcopy(model).eval().requires_grad_(False)
