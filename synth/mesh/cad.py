@@ -28,7 +28,6 @@ class CadFace:
 
     @cached_property
     def surfaces(self) -> GelSurfaces:
-        """Both files' surfaces."""
         return gel_surfaces(self.outer, self.window, self.unit)
 
     def holds(self, points: Points) -> BoolArray:
@@ -41,12 +40,10 @@ class CadFace:
         return inner | (points[:, 2] >= self.surfaces.top_mm - ON_MM) if self.holds_end else inner
 
     def project(self, points: Points) -> Points:
-        """The nearest points of the coated face."""
         return nearest(self.surfaces.face, points)
 
     @property
     def sides(self) -> list[Projection]:
-        """Projections onto all parts of the boundary."""
         found = self.surfaces
         parts = [partial(nearest, part) for part in (found.rest, found.window, found.face)]
         return [lambda points: np.column_stack([points[:, :2], np.full(len(points), found.top_mm)]), *parts]

@@ -26,12 +26,10 @@ class CapsuleFace:
 
     @property
     def top_mm(self) -> float:
-        """Z of the gel's end."""
         return self.radius_mm + self.length_mm
 
     @property
     def volume_mm3(self) -> float:
-        """Volume of the gel."""
         outer, inner = self.radius_mm, self.radius_mm - self.thickness_mm
         return float(np.pi * (2 / 3 * (outer**3 - inner**3) + self.length_mm * (outer**2 - inner**2)))
 

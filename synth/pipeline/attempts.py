@@ -91,7 +91,6 @@ class Attempts:
         return trajectory, space
 
     def fail(self, stage: str, reason: str, last_good_state: dict[str, Any] | None = None) -> None:
-        """Put an instance on record that cannot be used."""
         self.failures.append(Failure(self._first, len(self.failures), stage, reason, last_good_state))
 
     def given_up(self) -> Outcome:

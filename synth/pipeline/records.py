@@ -35,7 +35,6 @@ class JobContext:
         return (mesh_folder(self.out), self.cache) if self.plan.mesh.kind == "tetwild" else None
 
     def stream(self, purpose: str, *numbers: int) -> np.random.Generator:
-        """The job's random stream of one purpose."""
         return stream(self.plan.template, self.job.seed, purpose, *numbers)
 
 

@@ -102,7 +102,6 @@ def predict(plan: Plan) -> Prediction:
 
 
 def _meshes(plan: Plan) -> _Meshes:
-    """Meshes of the first INSTANCES trajectories."""
     template = plan.template
     found: list[tuple[Scene, Resolution]] = []
     for trajectory in range(INSTANCES):

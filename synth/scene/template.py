@@ -96,7 +96,6 @@ class Template:
 
     @property
     def sampling(self) -> Sampling:
-        """Samples of a trajectory, trajectories of a sensor."""
         return self.corners[0].sampling
 
     def distributions(self) -> list[tuple[str, Any, str]]:
@@ -161,7 +160,6 @@ def checked_template(content: dict[str, Any], source: Path, changed: tuple[str, 
 
 
 def shipped_scenes() -> list[str]:
-    """Names of the scenes that come with the program."""
     return sorted(path.stem for path in SCENES.glob("*.toml"))
 
 

@@ -35,7 +35,6 @@ class Space:
 
     @cached_property
     def surface(self) -> ContactFaces:
-        """The coated contact face."""
         nodes = self.surface_nodes
         return ContactFaces(self.points[nodes], np.searchsorted(nodes, self._coated).astype(np.int32))
 

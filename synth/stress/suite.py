@@ -135,7 +135,6 @@ def _last_words(log: Path, status: int) -> str:
 
 
 def record(verdicts: Sequence[Verdict], seconds: float) -> dict[str, Any]:
-    """The whole suite, JSON-able."""
     return {
         "ok": all(verdict.ok for verdict in verdicts),
         "seconds": round(seconds, 1),
@@ -182,7 +181,6 @@ def outcome_table(verdicts: Sequence[Verdict]) -> "Table":
 
 
 def remarks(verdicts: Sequence[Verdict]) -> list[str]:
-    """A line for every run that is not as expected."""
     found = []
     for verdict in verdicts:
         deviation = verdict.result.run.case.deviation
