@@ -132,7 +132,6 @@ def test_storage_that_refuses_ends_with_one_message_and_goes_on(url: str, tiny: 
 def test_places_that_cannot_be_are_told_and_a_file_url_is_a_directory(tiny: Path, tmp_path: Path) -> None:
     for out, workers, message in (
         ("nowhere://bucket/x", 2, "Protocol not known"),
-        ("memory://x", 2, "is seen by one process only"),
         ("memory://x", 1, "is seen by one process only"),
     ):
         refused(message, generate, load_scene(tiny), 1, out, scheduling=Scheduling(workers))
