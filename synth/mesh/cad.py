@@ -31,7 +31,6 @@ class CadFace:
         return gel_surfaces(self.outer, self.window, self.unit)
 
     def holds(self, points: Points) -> BoolArray:
-        """Which points (n, 3) mm lie on the coated face."""
         return np.asarray(distance(self.surfaces.face, points) <= ON_MM)
 
     def bonded(self, points: Points, size_mm: tuple[float, float, float]) -> BoolArray:

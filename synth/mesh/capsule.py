@@ -34,7 +34,6 @@ class CapsuleFace:
         return float(np.pi * (2 / 3 * (outer**3 - inner**3) + self.length_mm * (outer**2 - inner**2)))
 
     def holds(self, points: Points) -> BoolArray:
-        """Which points (n, 3) mm lie on the coated face."""
         return self._has_radius(points, self.radius_mm)
 
     def bonded(self, points: Points, size_mm: tuple[float, float, float]) -> BoolArray:

@@ -122,9 +122,8 @@ def result_of(run: Run, folder: Path, meshes: Path, worker: Sequence[str] = WORK
 
 def comparable(result: Result, results: Sequence[Result]) -> dict[str, Result]:
     """The results that a result is compared with, by their case's name."""
-    runs = {other.run.name: other for other in results}
-    others = compared(result.run, [other.run for other in results])
-    return {other.case.name: runs[other.name] for other in others}
+    runs = compared(result.run, [other.run for other in results])
+    return {other.run.case.name: other for other in results if other.run in runs}
 
 
 def _last_words(log: Path, status: int) -> str:
