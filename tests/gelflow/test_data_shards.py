@@ -138,6 +138,8 @@ def _npy(array: np.ndarray) -> bytes:
     ("image2.png", lambda data: data[:300] + bytes([data[300] ^ 1]) + data[301:], "damaged image .*checksum"),
     ("image2.png", lambda data: data[:-20], "truncated or damaged image"),
     ("image2.png", lambda data: b"GIF" + data[3:], "not a PNG"),
+    ("image2.png", lambda data: b"", "not a PNG"),
+    ("forward.npy", lambda data: b"", r"not a readable \.npy"),
     ("forward.npy", lambda data: data[:-4], r"not a readable \.npy"),
     ("forward.npy", lambda data: data[:50], r"not a readable \.npy"),
     ("forward.npy", lambda data: data.replace(b"'shape': (", b"'shape': ["), r"not a readable \.npy"),
