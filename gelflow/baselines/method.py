@@ -19,7 +19,6 @@ class Method(Protocol):
     @property
     def name(self) -> str:
         """Name in tables."""
-        ...
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
         """Flow (H, W, 2) float32 in px of two images (H, W, 3) float32 in [0, 1].
@@ -27,7 +26,6 @@ class Method(Protocol):
         Raises:
             InputError: The images differ in shape, are too small, or hold values that are not finite.
         """
-        ...
 
 
 def check_images(image1: ImageArray, image2: ImageArray) -> None:

@@ -32,7 +32,6 @@ class Comparison:
 
     @property
     def devices(self) -> str:
-        """Names of the devices that the methods ran on."""
         return " and ".join(dict.fromkeys(score.device for score in self.scores))
 
     def with_method(self, scores: Sequence[PairScore], speed: Speed | None) -> "Comparison":

@@ -56,11 +56,6 @@ def psnr(image: Bytes3, other: Bytes3) -> float:
     return float("inf") if mean_square == 0 else 10.0 * float(np.log10(255.0**2 / mean_square))
 
 
-def ssim(grey: Grey8, other: Grey8) -> float:
-    """Structural similarity of two grey 8-bit images (H, W): the mean of `ssim_map`."""
-    return float(np.mean(ssim_map(grey, other)))
-
-
 def ssim_map(grey: Grey8, other: Grey8) -> NDArray[np.float64]:
     """Structural similarity at each pixel of two grey 8-bit images, (H, W)."""
 
@@ -83,7 +78,8 @@ def image_similarity(image1: ImageArray, image2: ImageArray, flow: FlowArray) ->
     Where the flow is NaN the warped image is black.
     """
     warped = np.nan_to_num(warp_image(image2, flow))
-    return psnr(to_bytes(image1), to_bytes(warped)), ssim(to_grey(image1), to_grey(warped))
+    similarity = ssim_map(to_grey(image1), to_grey(warped))
+    return psnr(to_bytes(image1), to_bytes(warped)), float(np.mean(similarity))
 
 
 def marker_distance(flow: FlowArray, markers: MarkerArray) -> float:

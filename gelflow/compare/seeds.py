@@ -37,7 +37,6 @@ class Group:
 
     @property
     def fine_tuned(self) -> bool:
-        """Whether it was optimised on the very pairs."""
         return self.name.endswith(FINE_TUNED)
 
     @property

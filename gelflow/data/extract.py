@@ -82,13 +82,11 @@ def extract_pairs(inputs: Sequence[str], out: Path, config: ChoiceConfig, progre
         outcome: SourceReport | str
         try:
             outcome, pairs = _extract_one(name, path, out, config)
+            changes = {"sources": content.sources | {name: outcome}, "pairs": content.pairs + tuple(pairs)}
         except InputError as error:
             outcome = str(error)
-            content = content.model_copy(update={"failures": content.failures | {name: outcome}})
-        else:
-            content = content.model_copy(
-                update={"sources": content.sources | {name: outcome}, "pairs": content.pairs + tuple(pairs)}
-            )
+            changes = {"failures": content.failures | {name: outcome}}
+        content = content.model_copy(update=changes)
         write_pair_set(out, content)
         if progress:
             progress(done, len(recordings), name, outcome)

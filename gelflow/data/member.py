@@ -35,7 +35,6 @@ class Member:
         return f"{self.shard}, member {self.name}"
 
     def is_file(self) -> bool:
-        """Whether the shard is there."""
         return self.shard.is_file()
 
     def read_bytes(self) -> bytes:

@@ -63,19 +63,16 @@ class PairSet(_Record):
 
 
 def read_pair_set(folder: Path) -> PairSet:
-    """Reads pairs.json; InputError where it is missing, damaged or of a newer format."""
+    """Reads pairs.json, which is there; InputError where it is damaged or of a newer format."""
     path = folder / FILE
     try:
         return PairSet.model_validate_json(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: there is no such file") from error
     except (ValidationError, UnicodeDecodeError) as error:
         detail = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
         raise InputError(f"{path}: not the description of a pair set ({detail})") from error
 
 
 def write_pair_set(folder: Path, content: PairSet) -> None:
-    """Writes pairs.json as a whole."""
     write_text(folder / FILE, json.dumps(content.model_dump(mode="json"), indent=1) + "\n")
 
 

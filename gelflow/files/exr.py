@@ -49,10 +49,9 @@ def read_channels(path: Path) -> dict[str, NDArray[np.float32]]:
         raise InputError(f"{path}: there is no such file")
     try:
         with quiet(), OpenEXR.File(str(path), separate_channels=True) as file:
-            channels = {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
+            return {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
     except (RuntimeError, ValueError, OSError) as error:
         raise InputError(f"{path}: not a readable EXR file (truncated or damaged?)") from error
-    return channels
 
 
 def read_flow(path: Path, direction: Direction = "forward") -> FlowField:

@@ -76,8 +76,6 @@ def to_grey(image: ImageArray) -> Grey8:
 def write_png(path: Path, pixels: Bytes3 | Grey8) -> None:
     """Writes (H, W, 3) RGB or (H, W) grey uint8 as PNG; replaces the file as a whole."""
     bgr = pixels[..., ::-1] if pixels.ndim == 3 else pixels
-    encoded, data = cv2.imencode(".png", np.ascontiguousarray(bgr))
-    if not encoded:
-        raise OSError(f"cannot encode the picture for {path}")
+    data = cv2.imencode(".png", np.ascontiguousarray(bgr))[1]
     with replacing(path) as temporary:
         temporary.write_bytes(data.tobytes())

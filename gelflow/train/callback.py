@@ -35,18 +35,15 @@ class Throughput:
         self._paused = 0.0
 
     def add(self, pairs: int) -> None:
-        """Counts the pairs of a step that has ended."""
         if self._started is None:
             self._started = time.perf_counter()
         else:
             self._pairs += pairs
 
     def pause(self) -> None:
-        """Stops the clock, for a validation."""
         self._paused = time.perf_counter()
 
     def resume(self) -> None:
-        """Lets the clock run on."""
         if self._started is not None:
             self._started += time.perf_counter() - self._paused
 
@@ -100,7 +97,6 @@ class CheckpointCallback(L.Callback):
             signal.signal(signal.SIGTERM, self.ask_to_stop)  # Lightning restores the one before its own at the end
 
     def validates_at(self, step: int) -> bool:
-        """Whether a validation follows this step."""
         return self.validates and (step % self.config.validate_every == 0 or step == self.config.steps)
 
     def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
@@ -128,7 +124,6 @@ class CheckpointCallback(L.Callback):
             raise Stopped
 
     def on_validation_start(self, *_: Any) -> None:
-        """Stops the clock."""
         self.throughput.pause()
 
     def on_validation_end(self, trainer: L.Trainer, *_: Any) -> None:
@@ -170,12 +165,10 @@ class CheckpointCallback(L.Callback):
 
 
 def weights_metadata(config: TrainConfig, step: int) -> dict[str, str]:
-    """What is kept with the weights: the run's settings and the step they are of."""
     return {"train": config.model_dump_json(), "step": str(step)}
 
 
 def describe(metrics: Mapping[str, float]) -> str:
-    """The results of a validation in words."""
     texts = []
     if "endpoint_error_px" in metrics:
         still = metrics["no_motion_endpoint_error_px"]

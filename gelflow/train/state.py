@@ -46,7 +46,6 @@ class State:
 
 
 def save_state(out: Path, state: State) -> None:
-    """Writes the state, as a whole or not at all."""
     with replacing(out / STATE) as temporary, temporary.open("wb") as file:
         torch.save(dict(vars(state)), file)
 

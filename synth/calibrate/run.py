@@ -122,7 +122,6 @@ def start_sensor(template: Template, size: tuple[int, int]) -> Sensor:
 
 
 def render_settings(template: Template) -> Render:
-    """The preset's render settings at the middle of their distributions."""
     return validated(replaced(template.content.get("render", {}), middle), template.label, Render, "render")
 
 

@@ -39,7 +39,6 @@ class Verdict:
     cannot_tell: tuple[str, ...]
 
     def lines(self) -> list[str]:
-        """The verdict as text; the first line says good or not."""
         levels = " ".join(f"{value:.2f}" for value in self.residual_levels.values())
         head = f"verdict: {'good' if self.good else 'NOT good'}; residual {levels} of 255 (red green blue)"
         head += f", at most {self.allowed_levels:g} is good"

@@ -1,6 +1,5 @@
 """What a dataset was asked for: a scene with its distributions, a seed, a number of samples, and what computes them."""
 
-import platform
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -44,7 +43,7 @@ class Job:
     scene_hash: str
     seed: int
     n: int
-    software: Mapping[str, str] = field(default_factory=lambda: {"python": platform.python_version()})
+    software: Mapping[str, str] = field(default_factory=dict)
     device: Mapping[str, str] = field(default_factory=dict)
 
     def record(self) -> dict[str, Any]:

@@ -204,10 +204,8 @@ class Lease:
 
     def _renew_until_released(self) -> None:
         while not self._ended.wait(RENEWED_S):
-            try:
+            with contextlib.suppress(InputError):  # the samples' own writing meets the same trouble and says so
                 self._renew()
-            except InputError:
-                continue  # the samples' own writing meets the same trouble and says so
 
 
 def _signature() -> str:

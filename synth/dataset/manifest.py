@@ -49,6 +49,21 @@ class ManifestEntry:
         return cls(**{**values, **rows, "index": int(record["index"]), "frames": tuple(record["frames"])})
 
 
+@dataclass(frozen=True)
+class Failure:
+    """A line of failures.jsonl: a random instance that gave no trajectory.
+
+    The index is that of the trajectory's first sample, `draw` 0 for its first failure, and so on; the stage is
+    "sensor", "draw" or "simulate"; the reason is for the user, the last good state a simulation's.
+    """
+
+    index: int
+    draw: int
+    stage: str
+    reason: str
+    last_good_state: dict[str, Any] | None = None
+
+
 def manifest_key(record: dict[str, Any]) -> int:
     """Index of a line of the manifest; KeyError or TypeError where it is not one."""
     return ManifestEntry.from_record(record).index

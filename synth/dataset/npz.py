@@ -14,7 +14,6 @@ from synth.errors import InputError
 
 
 def encode_npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
-    """Compressed .npz file of arrays by name."""
     buffer = io.BytesIO()
     np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]  # `allow_pickle` is no array
     return buffer.getvalue()

@@ -122,7 +122,6 @@ class Dataset:
         return self.path / SAMPLES_FOLDER / sample_name(index)
 
     def entry(self, index: int) -> ManifestEntry:
-        """The sample's line in the manifest."""
         self.folder(index)
         return ManifestEntry.from_record(read_line(self.path / MANIFEST_FILE, self._table.places[index]))
 

@@ -34,5 +34,4 @@ class Shard:
         return f"{self.number}/{self.count}"
 
     def makes(self, trajectory: int) -> bool:
-        """Whether a trajectory is this shard's."""
         return trajectory % self.count == self.number

@@ -97,7 +97,6 @@ class Store:
                 system.get_file(f"{root}/{name}", str(path))
 
     def exists(self, name: str) -> bool:
-        """Whether there is something of that name."""
         system, root = self._place
         with self._errors(name):
             return bool(system.exists(f"{root}/{name}"))

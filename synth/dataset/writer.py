@@ -33,6 +33,7 @@ from synth.dataset.lock import LEASES_FOLDER, LOCK_FILE, DirectoryLock, Lease
 from synth.dataset.manifest import (
     FAILURES_FILE,
     MANIFEST_FILE,
+    Failure,
     ManifestEntry,
     append_line,
     failure_key,
@@ -127,17 +128,12 @@ class DatasetWriter:
         self._append(MANIFEST_FILE, name, vars(entry))
         self._finished.add(entry.index)
 
-    def fail(self, index: int, draw: int, stage: str, reason: str, last_good_state: Any = None) -> None:
-        """Records a draw that failed, once, also over several runs.
-
-        `index` is the sample that it was to become, `draw` 0 for that sample's first draw, `stage` where it failed (say
-        "simulate"), and `last_good_state` JSON-able or None.
-        """
-        if (index, draw) in self._failed:
-            return
-        record = {"index": index, "draw": draw, "stage": stage, "reason": reason, "last_good_state": last_good_state}
-        self._append(FAILURES_FILE, f"{sample_name(index)}-{draw}", record)
-        self._failed.add((index, draw))
+    def fail(self, failure: Failure) -> None:
+        """Records a draw that failed, once, also over several runs."""
+        key = (failure.index, failure.draw)
+        if key not in self._failed:
+            self._append(FAILURES_FILE, f"{sample_name(failure.index)}-{failure.draw}", vars(failure))
+            self._failed.add(key)
 
     @contextlib.contextmanager
     def making_meshes(self) -> Iterator[Path]:

@@ -73,7 +73,6 @@ def _view_body(inspection: Inspection) -> str:
 
 
 def _dataset_body(inspection: Inspection) -> str:
-    """Facts, a row per sample, then each pictured sample in full."""
     pictured = set(inspection.spread(PICTURED))
     rows, sections = [], []
     for number, numbers in enumerate(inspection.numbers):

@@ -100,7 +100,6 @@ def _look(kind: Kind, place: Path) -> View:
 
 
 def _about(place: Path) -> tuple[dict[str, Any], list[Path]]:
-    """Facts of a dataset, and its samples' folders."""
     dataset = read_dataset(place)
     info, indices = dataset.info, dataset.samples
     seconds: Counter[str] = Counter()

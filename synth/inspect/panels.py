@@ -98,7 +98,6 @@ def arrows_of(view: View) -> Arrows:
 
 
 def image_picture(image: Raster) -> Rgb:
-    """8-bit RGB of an image."""
     small = image.astype(np.uint8) if image.dtype == np.uint8 else (image >> 8).astype(np.uint8)
     return np.ascontiguousarray(small if small.ndim == 3 else np.repeat(small[..., None], 3, axis=-1))
 

@@ -28,7 +28,6 @@ def percent(share: float | None) -> str:
 
 
 def vector(values: Sequence[float]) -> str:
-    """Components to three digits."""
     return f"({', '.join(f'{value:.3g}' for value in values)})"
 
 
@@ -88,7 +87,6 @@ _SOLVER = (
 
 
 def about_rows(inspection: Inspection) -> list[tuple[str, str]]:
-    """A dataset's facts as (name, value)."""
     about = inspection.about
     seconds = ", ".join(f"{stage} {value:.3g} s" for stage, value in about["seconds"].items())
     shown = "" if about["inspected"] == about["finished"] else f" ({about['inspected']} of them looked at)"

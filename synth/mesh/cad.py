@@ -28,11 +28,9 @@ class CadFace:
 
     @cached_property
     def surfaces(self) -> GelSurfaces:
-        """Both files' surfaces."""
         return gel_surfaces(self.outer, self.window, self.unit)
 
     def holds(self, points: Points) -> BoolArray:
-        """Which points (n, 3) mm lie on the coated face."""
         return np.asarray(distance(self.surfaces.face, points) <= ON_MM)
 
     def bonded(self, points: Points, size_mm: tuple[float, float, float]) -> BoolArray:
@@ -41,12 +39,10 @@ class CadFace:
         return inner | (points[:, 2] >= self.surfaces.top_mm - ON_MM) if self.holds_end else inner
 
     def project(self, points: Points) -> Points:
-        """The nearest points of the coated face."""
         return nearest(self.surfaces.face, points)
 
     @property
     def sides(self) -> list[Projection]:
-        """Projections onto all parts of the boundary."""
         found = self.surfaces
         parts = [partial(nearest, part) for part in (found.rest, found.window, found.face)]
         return [lambda points: np.column_stack([points[:, :2], np.full(len(points), found.top_mm)]), *parts]

@@ -26,17 +26,14 @@ class CapsuleFace:
 
     @property
     def top_mm(self) -> float:
-        """Z of the gel's end."""
         return self.radius_mm + self.length_mm
 
     @property
     def volume_mm3(self) -> float:
-        """Volume of the gel."""
         outer, inner = self.radius_mm, self.radius_mm - self.thickness_mm
         return float(np.pi * (2 / 3 * (outer**3 - inner**3) + self.length_mm * (outer**2 - inner**2)))
 
     def holds(self, points: Points) -> BoolArray:
-        """Which points (n, 3) mm lie on the coated face."""
         return self._has_radius(points, self.radius_mm)
 
     def bonded(self, points: Points, size_mm: tuple[float, float, float]) -> BoolArray:

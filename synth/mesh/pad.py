@@ -37,7 +37,6 @@ class PadMesh:
     face: Face = FLAT_FACE
 
     def __post_init__(self) -> None:
-        """Fill in the single layer."""
         if self.layer.size == 0:
             object.__setattr__(self, "layer", np.zeros(len(self.tets), dtype=np.int32))
 

@@ -46,8 +46,7 @@ class Background:
 
 def background_of(size_mm: tuple[float, float, float], edge_mm: float, grading: float = 1.0) -> Background:
     """Edges of edge_mm at z = 0 of a bounding box of that size, and linearly up to `grading` times that at its top."""
-    corners = np.array([(x, y, z) for z in (0, size_mm[2]) for y in (-0.5, 0.5) for x in (-0.5, 0.5)], dtype=float)
-    corners[:, :2] *= size_mm[:2]
+    corners, _ = _box(size_mm)
     centre = np.array([0.0, 0.0, size_mm[2] / 2])
     points = centre + ROOM * (corners - centre)
     tets = [(0, 1, 3, 7), (0, 3, 2, 7), (0, 2, 6, 7), (0, 6, 4, 7), (0, 4, 5, 7), (0, 5, 1, 7)]

@@ -76,7 +76,6 @@ class Optics:
 
     @cached_property
     def own(self) -> Rays:
-        """Rays of the centres of all pixels."""
         return self.look(self.centres)
 
     @cached_property

@@ -6,7 +6,7 @@
     finishing            flow, the cameras' noise, encoding, writing
     producer             all of it for one trajectory, in one process
     overlapped           batched simulation beside rendering beside writing
-    worker_pool, ray_pool, threads   processes, clusters and threads that share the work
+    worker_pool, ray_pool   processes and clusters that share the work
     generate             which trajectories are still to do, who does them, and what happened
 
 What a sample holds depends on (scene, seed, index) alone, not on which other trajectories a process has made.

@@ -6,8 +6,9 @@ An object whose press does not complete is pressed again with rounder edges befo
 from dataclasses import dataclass, replace
 from typing import Any
 
+from synth.dataset.manifest import Failure
 from synth.errors import InputError
-from synth.pipeline.records import Failure, JobContext, Outcome, Simulated, SimulatedTrajectory, Task
+from synth.pipeline.records import JobContext, Outcome, Simulated, SimulatedTrajectory, Task
 from synth.scene import Scene
 from synth.scene.sampling import MAX_DRAWS, Pair, SensorInstance, draw, pairs_of
 from synth.simulate import Trajectory
@@ -90,7 +91,6 @@ class Attempts:
         return trajectory, space
 
     def fail(self, stage: str, reason: str, last_good_state: dict[str, Any] | None = None) -> None:
-        """Put an instance on record that cannot be used."""
         self.failures.append(Failure(self._first, len(self.failures), stage, reason, last_good_state))
 
     def given_up(self) -> Outcome:

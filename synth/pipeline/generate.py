@@ -10,7 +10,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from operator import index
@@ -182,7 +182,7 @@ def generate(
         with closing(_outcomes(context, tasks, scheduling)) as outcomes:
             for outcome in outcomes:
                 for failure in outcome.failures:
-                    writer.fail(failure.index, failure.draw, failure.stage, failure.reason, failure.last_good_state)
+                    writer.fail(failure)
                 for entry in outcome.entries:
                     writer.record(entry)
                 if outcome.warning and not summary.made:
@@ -239,16 +239,14 @@ def _store_mesh(context: JobContext, writer: DatasetWriter, gel: Gel) -> None:
 def _outcomes(context: JobContext, tasks: Iterator[Task], scheduling: Scheduling) -> Generator[Outcome, None, None]:
     if scheduling.ray is not None:
         yield from outcomes_of_ray(context, tasks, scheduling.ray, scheduling.workers)
-        return
-    if context.plan.is_batched:
+    elif context.plan.is_batched:
         yield from outcomes_of_batches(context, tasks, _finishers(context, scheduling), scheduling.batch)
-        return
-    if scheduling.workers is not None:
+    elif scheduling.workers is not None:
         yield from outcomes_of_processes(context, tasks, scheduling.workers)
-        return
-    producer = Producer(context)
-    for trajectory, wanted in tasks:
-        yield producer.produce(trajectory, wanted)
+    else:
+        producer = Producer(context)
+        for task in tasks:
+            yield producer.produce(*task)
 
 
 def _finishers(context: JobContext, scheduling: Scheduling) -> int:
@@ -261,8 +259,6 @@ def _finishers(context: JobContext, scheduling: Scheduling) -> int:
 def _versions() -> dict[str, str]:
     found = {}
     for package in PACKAGES:
-        try:
+        with suppress(PackageNotFoundError):
             found[package] = version(package)
-        except PackageNotFoundError:
-            continue
     return found

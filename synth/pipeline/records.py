@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from synth.dataset.job import Job
-from synth.dataset.manifest import ManifestEntry
+from synth.dataset.manifest import Failure, ManifestEntry
 from synth.dataset.store import Output, mesh_folder
 from synth.planning import Plan
 from synth.scene import Scene
@@ -35,23 +35,7 @@ class JobContext:
         return (mesh_folder(self.out), self.cache) if self.plan.mesh.kind == "tetwild" else None
 
     def stream(self, purpose: str, *numbers: int) -> np.random.Generator:
-        """The job's random stream of one purpose."""
         return stream(self.plan.template, self.job.seed, purpose, *numbers)
-
-
-@dataclass(frozen=True)
-class Failure:
-    """A random instance that gave no trajectory.
-
-    The index is that of the trajectory's first sample, `draw` 0 for its first failure, and so on; the stage is
-    "sensor", "draw" or "simulate"; the reason is for the user, the last good state a simulation's.
-    """
-
-    index: int
-    draw: int
-    stage: str
-    reason: str
-    last_good_state: dict[str, Any] | None
 
 
 @dataclass(frozen=True)

@@ -104,9 +104,8 @@ class RenderSession:
             surface = meshed if gel.is_round else rest_surface(gel)
             painted = paint(self._context, number, scene.sensor) if texture is None else texture.result()
             renderer = Renderer(scene.sensor, scene.render, surface, painted, variant)
-            rest = None
-            if not gel.dome_radius_mm:
-                rest = renderer.radiances(surface.material, self._seed("rest", number))
+            seed = self._seed("rest", number)
+            rest = None if gel.dome_radius_mm else renderer.radiances(surface.material, seed)
             self._sensor = SensorRenderer(number, renderer, rest)
         return self._sensor
 

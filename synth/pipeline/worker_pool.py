@@ -143,7 +143,7 @@ def exit_with_parent(parent_death: Connection) -> None:
     os._exit(1)
 
 
-_maker: Maker[Any] | None = None
+_maker: Maker[Any]
 """What a worker process does, set when the process starts."""
 
 
@@ -154,8 +154,6 @@ def _begin(context: JobContext, make: Callable[[JobContext], Maker[Any]], parent
 
 
 def _work(item: Any) -> Outcome:
-    if _maker is None:
-        raise RuntimeError("the worker process was not set up by _begin")
     return _maker(item)
 
 

@@ -116,7 +116,6 @@ def check_buildable(template: Template, variant: Variant) -> None:
 
 
 def _decisions(template: Template, variant: Variant) -> tuple[Decision, ...]:
-    """Feature by feature, from the corners of a template's distributions."""
     corners = template.corners
     outputs = template.outputs
     depth, friction = [c.motion.depth_mm for c in corners], [c.contact.friction for c in corners]
@@ -173,6 +172,5 @@ def _batching(template: Template) -> Decision:
 
 
 def _span(name: str, values: Sequence[float]) -> str:
-    """What a field is at the corners."""
     low, high = min(values), max(values)
     return f"{name} = {low:g}" if low == high else f"{name} = {low:g} to {high:g}"

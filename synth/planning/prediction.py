@@ -5,6 +5,7 @@ factor of two or three either way. Errors are predictions of `synth.simulate.res
 seconds, so that `generate`, which needs none of this, does not ask for it.
 """
 
+import contextlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,15 +103,12 @@ def predict(plan: Plan) -> Prediction:
 
 
 def _meshes(plan: Plan) -> _Meshes:
-    """Meshes of the first INSTANCES trajectories."""
     template = plan.template
     found: list[tuple[Scene, Resolution]] = []
     for trajectory in range(INSTANCES):
-        try:
+        with contextlib.suppress(InputError):  # an impossible draw: generate redraws it
             scene = draw(template, 0, trajectory)
             found.append((scene, plan.mesh.resolution(scene, template.folder)))
-        except InputError:  # an impossible draw: generate redraws it
-            continue
     if not found:
         raise InputError(f"{template.label}: none of {INSTANCES} draws is possible; try `simulate` to see why")
     across = [resolution.across for _, resolution in found]

@@ -28,7 +28,6 @@ from synth.scene import Camera
 
 
 def noise_deviation(signal: FloatArray, camera: Camera) -> FloatArray:
-    """Standard deviation of the noise of an expected linear signal."""
     return np.asarray(np.sqrt(camera.read_noise**2 + camera.shot_noise**2 * signal))
 
 

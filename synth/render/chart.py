@@ -77,7 +77,6 @@ _ROWS = 64
 
 
 def chart_of(sensor: Sensor) -> Chart:
-    """How a sensor's pattern is laid on its face."""
     x, y, top = sensor.gel.size_mm
     if isinstance(sensor.pattern, NoPattern) or getattr(sensor.pattern, "placing", "z") == "z":
         return FlatChart((x, y))

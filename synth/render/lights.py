@@ -128,7 +128,6 @@ def image_lights(sensor: Sensor) -> tuple[Light, ...]:
 
 
 def all_lights(sensor: Sensor) -> tuple[Light, ...]:
-    """What shines: the lights, then their mirror images."""
     return tuple(light for light in (*sensor.lights, *image_lights(sensor)) if light.power > 0)
 
 

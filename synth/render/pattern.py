@@ -62,7 +62,6 @@ def albedo(sensor: Sensor, rng: np.random.Generator, folder: Path | None = None)
 
 
 def _clipped(values: FloatArray) -> Image:
-    """Values limited to [0, 1], as float32."""
     texture: Image = np.empty(values.shape, dtype=np.float32)
     return np.clip(values, 0, 1, out=texture, casting="unsafe")
 

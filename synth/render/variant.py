@@ -71,7 +71,6 @@ class Variant:
 
     @property
     def is_on_gpu(self) -> bool:
-        """Whether it renders on a GPU."""
         return self.name.startswith("cuda")
 
     @property

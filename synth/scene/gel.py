@@ -109,7 +109,6 @@ class Gel(Part):
 
     @property
     def layers_mm(self) -> tuple[float, ...]:
-        """Thicknesses of the layers."""
         return tuple(layer.thickness_mm for layer in self.layers)
 
     @model_validator(mode="after")

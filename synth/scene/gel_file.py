@@ -41,7 +41,6 @@ class GelSurfaces:
 
     @property
     def size_mm(self) -> tuple[float, float, float]:
-        """Size of outer's bounding box."""
         x, y, z = (round(float(edge), 6) for edge in np.ptp(self.outer.points, axis=0))
         return x, y, z
 
@@ -142,7 +141,6 @@ def _checked(outer: Path, window: Path, unit: str, *changed_ns: int) -> GelSurfa
 
 
 def _solid(key: str, path: Path, unit: str) -> Any:
-    """One file's surface in mm."""
     import pyvista as pv
 
     try:

@@ -47,14 +47,12 @@ class Pair:
 
 
 def stream(template: Template, seed: int, purpose: str, *numbers: int) -> np.random.Generator:
-    """The random stream of one purpose."""
     scene = 0 if template.sampling.common_draws else int(template.hash, 16)
     entropy = [scene, seed, zlib.crc32(purpose.encode()), *numbers]
     return np.random.default_rng(np.random.SeedSequence(entropy))
 
 
 def sensor_of(template: Template, trajectory: int) -> int:
-    """Number of the sensor that a trajectory belongs to."""
     return trajectory // template.sampling.trajectories_per_sensor
 
 

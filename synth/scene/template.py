@@ -96,7 +96,6 @@ class Template:
 
     @property
     def sampling(self) -> Sampling:
-        """Samples of a trajectory, trajectories of a sensor."""
         return self.corners[0].sampling
 
     def distributions(self) -> list[tuple[str, Any, str]]:
@@ -161,7 +160,6 @@ def checked_template(content: dict[str, Any], source: Path, changed: tuple[str, 
 
 
 def shipped_scenes() -> list[str]:
-    """Names of the scenes that come with the program."""
     return sorted(path.stem for path in SCENES.glob("*.toml"))
 
 
@@ -310,20 +308,15 @@ def _options(value: Any) -> int:
 
 def _corner(value: Any, high: bool, turn: int) -> Any:
     """The lower or upper end of a part of a template, with the options of its choices that this turn shows."""
-    if _is_distribution(value):
-        ((kind, arguments),) = value.items()
+
+    def choose(kind: str, arguments: list[Any]) -> Any:
         if kind != "choice":
             return float(arguments[0] if kind == "normal" or not high else arguments[1])  # as a draw: never whole
-        turn %= _options(value)
-        for option in arguments:
-            if turn < _options(option):
-                return _corner(option, high, turn)
-            turn -= _options(option)
-    if isinstance(value, dict):
-        return {key: _corner(inner, high, turn) for key, inner in value.items()}
-    if isinstance(value, list):
-        return [_corner(inner, high, turn) for inner in value]
-    return value
+        turns = [(option, own) for option in arguments for own in range(_options(option))]
+        option, own = turns[turn % len(turns)]
+        return _corner(option, high, own)
+
+    return replaced(value, choose)
 
 
 def _distribution_problem(kind: str, arguments: Any, where: str) -> str:

@@ -57,7 +57,6 @@ class Element:
 
     @property
     def has_pressure(self) -> bool:
-        """Whether a pressure field may be used with it."""
         return self.name != "p1"
 
 
@@ -65,7 +64,7 @@ def p2p1(contact_split: int = CONTACT_SPLIT) -> Element:
     """Taylor-Hood. Four points integrate quadratics: exact for the mass-like terms, one order short for det F."""
     a, b = (5 + 3 * np.sqrt(5)) / 20, (5 - np.sqrt(5)) / 20
     points = np.full((4, 4), b) + (a - b) * np.eye(4)
-    derivative = _quadratic_derivative(points)
+    derivative = quadratic_derivative(points)
     face, weights = _face_rule(contact_split)
     return Element("p2p1", 2, points, np.full(4, 0.25), derivative, 0.0, P2_HOLD, face, weights, quadratic_face(face))
 
@@ -77,7 +76,8 @@ def p1p1(contact_split: int = CONTACT_SPLIT) -> Element:
     return Element("p1p1", 1, centre, np.ones(1), np.eye(4)[None], 2.0, 0.0, face, weights, face)
 
 
-def _quadratic_derivative(barycentric: FloatArray) -> FloatArray:
+def quadratic_derivative(barycentric: FloatArray) -> FloatArray:
+    """(n, 10, 4) derivatives of b (2 b - 1) at the vertices and of 4 b_i b_j at the midpoints, at places (n, 4)."""
     derivative = np.zeros((len(barycentric), 10, 4))
     for i in range(4):
         derivative[:, i, i] = 4 * barycentric[:, i] - 1

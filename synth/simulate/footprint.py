@@ -46,11 +46,9 @@ def footprint(path: LoadPath, size_mm: tuple[float, float, float], margin: float
     even = np.linspace(path.press_mm, path.length_mm, POSES)
     after = np.unique(np.concatenate([even, path.ends[path.ends > path.press_mm]]))
     drag = _rectangle(path, [path.pose(float(s)) for s in after], size_mm) if path.length_mm > path.press_mm else None
-    found = []
+    found = [] if drag is None else [drag]
     if press is not None:
         found.append(press + margin / 2 * (press[1] - press[0]) * np.array([[-1.0], [1.0]]))
-    if drag is not None:
-        found.append(drag)
     if not found:
         small = UNTOUCHED * size_mm[2]
         x, y = (float(np.clip(p, -s / 2, s / 2)) for p, s in zip(path.motion.position_mm, size_mm, strict=False))

@@ -114,7 +114,7 @@ def barrier_tangent(
     slot: wp.array3d(dtype=wp.int32),
     values: wp.array2d(dtype=wp.float64),
 ):
-    """One thread per (sample, element); adds to the sparse values as `synth.simulate.bulk.bulk_tangent`."""
+    """One thread per (sample, element); adds to the sparse values as `synth.simulate.stiffness.bulk_tangent`."""
     s, e = wp.tid()
     if active[s] == 0:
         return

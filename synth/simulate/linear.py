@@ -142,7 +142,6 @@ def norm(x: FloatArray) -> float:
 
 @cache
 def has_pardiso() -> bool:
-    """Whether pypardiso and its MKL can be loaded."""
     try:
         _mkl()
     except ImportError:

@@ -63,7 +63,6 @@ class PressFrame:
 
     @classmethod
     def of(cls, motion: Motion, face: RoundFace) -> "PressFrame":
-        """The frame of a motion's place on a face."""
         if isinstance(face, CadFace):
             return cls(*face.frame(motion))
         origin, inward = face.place(motion.polar_deg, motion.height_mm, motion.azimuth_deg)
@@ -159,7 +158,6 @@ class LoadPath:
 
     @property
     def length_mm(self) -> float:
-        """Length of the whole load path."""
         return float(self.ends[-1])
 
     def pose(self, s: float) -> Pose:

@@ -43,7 +43,6 @@ class Grid:
     counts: tuple[int, int, int]
 
     def points(self, where: BoolArray) -> Points:
-        """The places of some samples."""
         return self.corner + self.spacing * np.argwhere(where)
 
     def distance(self, surface: "Nearest", where: BoolArray) -> FloatArray:

@@ -57,7 +57,6 @@ class Pattern:
 
     @property
     def size(self) -> int:
-        """Number of entries."""
         return len(self.indices)
 
     def factor(self, single: bool = True) -> Factor:

@@ -74,7 +74,6 @@ class MeshRule:
 
     @classmethod
     def of(cls, scene: Scene) -> "MeshRule":
-        """The rule of a scene."""
         numerics = scene.numerics
         if numerics.edge_length_mm is not None or scene.sensor.gel.is_round:
             return cls("tetwild", float("nan"))

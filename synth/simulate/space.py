@@ -17,8 +17,6 @@ from synth.surface import FACE_EDGES, ContactFaces
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """See the module's docstring."""
-
     mesh: PadMesh  # the pad's linear tetrahedra
     element: Element  # on each of them
     points: Points  # (n, 3) float64 mm, displacement nodes: the mesh's vertices, then the edges' midpoints for P2
@@ -35,7 +33,6 @@ class Space:
 
     @cached_property
     def surface(self) -> ContactFaces:
-        """The coated contact face."""
         nodes = self.surface_nodes
         return ContactFaces(self.points[nodes], np.searchsorted(nodes, self._coated).astype(np.int32))
 

@@ -25,8 +25,15 @@ from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.pattern import pattern_of
 from synth.simulate.space import Space
 from synth.simulate.stiffness import bulk_tangent, linearise, pressure_tangent, viscous_force
-from synth.simulate.tables import barrier_tables, bulk_tables, face_tables, laplace_table, warp_array, zeros_of
-from synth.surface import broken_linear_face
+from synth.simulate.tables import (
+    barrier_tables,
+    bulk_tables,
+    face_tables,
+    laplace_table,
+    nodal_weights,
+    warp_array,
+    zeros_of,
+)
 
 
 @dataclass(frozen=True)
@@ -118,7 +125,6 @@ class System:
         self._values = _zeros((1, self._pattern.size + 1), wp.float64)
 
     def zero(self) -> Unknowns:
-        """The undeformed pad."""
         return Unknowns(np.zeros((len(self.space.points), 3)), np.zeros(self.space.pressures if self.mixed else 0))
 
     def residual(self, state: Unknowns, indenter: Indenters) -> Residual:
@@ -247,19 +253,11 @@ class System:
         arm = np.einsum("qa,fac->fqc", shape, (self.space.points + state.u)[self.space.faces])
         force = np.einsum("fq,fqc->c", weight, traction)
         moment = np.einsum("fq,fqc->c", weight, np.cross(arm, traction))
-        return force, moment, self._nodal(weight, traction)
-
-    def _nodal(self, weight: FloatArray, traction: FloatArray) -> FloatArray:
-        """Traction at the surface's nodes; the mean with the shape functions themselves would weigh P2 corners by 0."""
-        element = self.space.element
-        hat = element.face_shape if element.order == 1 else broken_linear_face(element.face_barycentric)
-        coated = self.space.coated  # the sides would water down the rim
-        faces, weight, traction = self.space.faces[coated], weight[coated], traction[coated]
-        nodal, area = np.zeros((len(self.space.points), 3)), np.zeros(len(self.space.points))
-        np.add.at(area, faces, np.einsum("fq,qa->fa", weight, hat))
-        np.add.at(nodal, faces, np.einsum("fq,qa,fqc->fac", weight, hat, traction))
-        wanted = self.space.surface_nodes
-        return np.asarray(nodal[wanted] / area[wanted, None])
+        hat, number, area = nodal_weights(self.space, weight).values()
+        coated, nodal = self.space.coated, np.zeros((len(area), 3))
+        shares = np.einsum("fq,qa,fqc->fac", weight[coated], hat, traction[coated])
+        np.add.at(nodal, number[coated], shares)
+        return force, moment, nodal / area[:, None]
 
 
 def _array(values: np.ndarray, dtype: type) -> wp.array:
@@ -271,7 +269,6 @@ def _zeros(shape: tuple[int, ...], dtype: type) -> wp.array:
 
 
 def _on_device(state: Unknowns) -> tuple[wp.array, wp.array]:
-    """Displacement and pressure as the kernels take them."""
     return _array(state.u[None], wp.vec3d), _array(state.p[None], wp.float64)
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import ArrayLike
 
+from synth.arrays import FloatArray
 from synth.mesh.pad import barycentric_gradients
 from synth.simulate.bulk import Bulk
 from synth.simulate.contact import Faces, Indenters
@@ -15,6 +16,7 @@ from synth.simulate.inversion_barrier import SAMPLE_DEGREE, BarrierTables
 from synth.simulate.load_path import LoadPath, Pose
 from synth.simulate.material import Material
 from synth.simulate.space import Space
+from synth.surface import broken_linear_face
 
 
 def warp_array(values: ArrayLike, dtype: type, device: str) -> wp.array:
@@ -98,6 +100,22 @@ def face_tables(space: Space, d: str) -> Faces:
     return struct_of(Faces, d, nodes=space.faces, shape=element.face_shape, weight=weight, points=space.points)
 
 
+def nodal_weights(space: Space, weight: FloatArray) -> dict[str, np.ndarray]:
+    """How points of the coated face, of weights (f, nq) in mm², give tractions to its nodes.
+
+    `hat` (nq, ns) are functions by which a face's points share in its nodes: piecewise linear ones, since the shape
+    functions themselves would weigh P2 corners by 0. `number` (f, ns) is that of a face's nodes among the surface's, -1
+    on other faces, which would water down the rim; `area` (s,) mm² is each node's.
+    """
+    element, coated = space.element, space.coated
+    hat = element.face_shape if element.order == 1 else broken_linear_face(element.face_barycentric)
+    number = np.full(space.faces.shape, -1, dtype=np.int32)
+    number[coated] = np.searchsorted(space.surface_nodes, space.faces[coated])
+    area = np.zeros(len(space.surface_nodes))
+    np.add.at(area, number[coated], np.einsum("fq,qa->fa", weight[coated], hat))
+    return {"hat": hat, "number": number, "area": area}
+
+
 def pack_indenter(path: LoadPath, friction: float) -> Indenters:
     """The body of a path, on the CPU; `place_indenter` says where it is."""
     body, nowhere = path.body, {"centre": np.zeros((1, 3)), "rotation": np.zeros((1, 3, 3))}
@@ -106,6 +124,5 @@ def pack_indenter(path: LoadPath, friction: float) -> Indenters:
 
 
 def place_indenter(packed: Indenters, pose: Pose) -> None:
-    """Put a packed body where a pose says."""
     packed.centre.assign(pose.centre[None])
     packed.rotation.assign(pose.rotation[None])

@@ -125,7 +125,6 @@ def write_trajectory(directory: Path, scene: Scene, trajectory: Trajectory) -> d
 
 
 def _vtu(space: Space, state: State) -> bytes:
-    """The contact surface of a state as a VTK XML file."""
     import pyvista as pv
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 

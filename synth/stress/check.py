@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from synth.arrays import FloatArray
-from synth.simulate.element import EDGES
+from synth.mesh.pad import barycentric_gradients
+from synth.simulate.element import quadratic_derivative
 from synth.stress.cases import Comparison, Expectation, Run
 
 GAUSS = np.full((4, 4), (5 - np.sqrt(5)) / 20) + np.eye(4) / np.sqrt(5)
@@ -116,25 +117,12 @@ def smallest_jacobian(points: FloatArray, nodes: np.ndarray, displacement: Float
     Points are (n, 3) mm, vertices first, for quadratic elements then the midpoints of their edges; nodes are (m, 4) or
     (m, 10), a tetrahedron's vertices, then the midpoints of EDGES; the displacement is (n, 3) mm.
     """
-    corner = points[nodes[:, :4]]
-    inverse = np.linalg.inv(corner[:, 1:] - corner[:, :1])
-    gradient = np.concatenate([-inverse.sum(axis=2, keepdims=True), inverse], axis=2)  # (m, 3, 4) of barycentrics
-    moved = displacement[nodes]
-    found = []
-    for place in at:
-        by_place = np.eye(4) if nodes.shape[1] == 4 else _quadratic_by_place(place)
-        slope = np.einsum("mai,ab,mjb->mij", moved, by_place, gradient)
+    gradient, moved, found = barycentric_gradients(points, nodes[:, :4]), displacement[nodes], []
+    for by_place in np.eye(4)[None] if nodes.shape[1] == 4 else quadratic_derivative(at):
+        slope = np.einsum("mai,ab,mbj->mij", moved, by_place, gradient)
         with np.errstate(invalid="ignore"):
             found.append(np.linalg.det(np.eye(3) + slope).min())
     return float(np.min(found))  # NaN where any is
-
-
-def _quadratic_by_place(place: FloatArray) -> FloatArray:
-    """(10, 4) derivatives of b (2 b - 1) at the vertices and of 4 b_i b_j at the midpoints."""
-    edges = np.zeros((len(EDGES), 4))
-    for k, (i, j) in enumerate(EDGES):
-        edges[k, i], edges[k, j] = 4 * place[j], 4 * place[i]
-    return np.concatenate([np.diag(4 * place - 1), edges])
 
 
 def measured(result: Result) -> dict[str, float]:
@@ -173,7 +161,6 @@ def measured(result: Result) -> dict[str, float]:
 def differences(
     result: Result, quantities: Mapping[str, float], expected: Expectation, others: Mapping[str, Result]
 ) -> list[str]:
-    """What of a result is not as it was written down."""
     found = []
     if result.outcome not in expected.outcome:
         found.append(f"{result.outcome}, expected {' or '.join(expected.outcome)}: {result.message or 'no reason'}")

@@ -122,9 +122,8 @@ def result_of(run: Run, folder: Path, meshes: Path, worker: Sequence[str] = WORK
 
 def comparable(result: Result, results: Sequence[Result]) -> dict[str, Result]:
     """The results that a result is compared with, by their case's name."""
-    runs = {other.run.name: other for other in results}
-    others = compared(result.run, [other.run for other in results])
-    return {other.case.name: runs[other.name] for other in others}
+    runs = compared(result.run, [other.run for other in results])
+    return {other.run.case.name: other for other in results if other.run in runs}
 
 
 def _last_words(log: Path, status: int) -> str:
@@ -135,7 +134,6 @@ def _last_words(log: Path, status: int) -> str:
 
 
 def record(verdicts: Sequence[Verdict], seconds: float) -> dict[str, Any]:
-    """The whole suite, JSON-able."""
     return {
         "ok": all(verdict.ok for verdict in verdicts),
         "seconds": round(seconds, 1),
@@ -182,7 +180,6 @@ def outcome_table(verdicts: Sequence[Verdict]) -> "Table":
 
 
 def remarks(verdicts: Sequence[Verdict]) -> list[str]:
-    """A line for every run that is not as expected."""
     found = []
     for verdict in verdicts:
         deviation = verdict.result.run.case.deviation

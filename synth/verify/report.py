@@ -42,8 +42,6 @@ class Check:
 
 @dataclass(frozen=True)
 class SampleReport:
-    """All checks of one sample."""
-
     index: int
     checks: tuple[Check, ...]
 
@@ -54,8 +52,6 @@ class SampleReport:
 
 @dataclass(frozen=True)
 class Report:
-    """All samples of a dataset."""
-
     path: Path
     samples: tuple[SampleReport, ...]
 

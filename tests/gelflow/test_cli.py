@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from commands import said
+from commands import complaint, said
 from safetensors.torch import load_file, save_file
 from textures import as_bytes, moved, save, write_folder, write_synthetic, write_video
 from waves import random_weights
@@ -23,13 +23,10 @@ from gelflow.models.weights import read_metadata
 
 
 def fails(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
-    """Runs a command that must end with status 2 and one line on stderr; returns the line."""
-    assert main([str(argument) for argument in arguments]) == 2
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    assert captured.err.startswith("gelflow: ")
-    assert captured.err.count("\n") == 1
-    return captured.err
+    """The one line of a command that must end with status 2."""
+    words = complaint(capsys, main, *arguments)
+    assert "\n" not in words
+    return words
 
 
 def video(path: Path) -> Path:

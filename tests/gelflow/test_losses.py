@@ -58,10 +58,10 @@ def test_structural_similarity_follows_its_definition_and_equal_images_cost_noth
     assert photometric_loss(image1, image2, flow[None] * 100) == 0  # nothing left to judge by
 
 
-def affine_flow(matrix: list[list[float]], shift: tuple[float, float] = (1.5, -0.7)) -> Tensor:
-    """(1, 2, 10, 12) float64: V = matrix (x, y) + shift."""
+def affine_flow(matrix: list[list[float]]) -> Tensor:
+    """(1, 2, 10, 12) float64: V = matrix (x, y) + (1.5, -0.7)."""
     x, y = pixel_centres(10, 12)
-    return torch.stack([m[0] * x + m[1] * y + s for m, s in zip(matrix, shift, strict=True)])[None]
+    return torch.stack([m[0] * x + m[1] * y + s for m, s in zip(matrix, (1.5, -0.7), strict=True)])[None]
 
 
 @pytest.mark.parametrize(("matrix", "parts"), [

@@ -153,10 +153,10 @@ def lowered(shape: dict[str, object], depth: float, thickness: float) -> Indente
     return indenters(scene((20.0, 20.0, thickness), indenter=shape, motion={"depth_mm": depth}), depth)
 
 
-def press(quarter: System, indenter: Indenters, penalties: tuple[float, ...] = (20.0, 200.0), passes: int = 2) -> float:
+def press(quarter: System, indenter: Indenters, penalties: tuple[float, ...] = (20.0, 200.0)) -> float:
     """Force of the whole layer over E, mm²: at rising penalties, then with updates that leave less than 0.5 % of it."""
     state: Unknowns = quarter.zero()
-    for k in range(len(penalties) + passes):
+    for k in range(len(penalties) + 2):
         if k < len(penalties):
             quarter.penalty = penalties[k]
         else:

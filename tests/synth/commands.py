@@ -16,6 +16,15 @@ def said(capsys: pytest.CaptureFixture[str], main: Callable, *arguments: object,
     return err if status else out
 
 
+def complaint(capsys: pytest.CaptureFixture[str], main: Callable, *arguments: object) -> str:
+    """The one thing that a command says which must end with status 2: on stderr, without a traceback."""
+    assert main([str(argument) for argument in arguments]) == 2
+    out, err = capsys.readouterr()
+    program, _, words = err.rstrip().partition(": ")
+    assert (out, program, "Traceback" in words) == ("", main.__module__.partition(".")[0], False)
+    return words
+
+
 def refused(message: str, call: Callable[..., object], *arguments: Any, **options: Any) -> str:
     """What the program's InputError says, which the call must raise and the regular expression must match."""
     with pytest.raises((synth.errors.InputError, gelflow.errors.InputError), match=message) as error:

@@ -15,6 +15,7 @@ from tiny_scene import fingerprint
 
 from synth.cli import main
 from synth.dataset import manifest
+from synth.dataset.manifest import Failure
 from synth.dataset.npz import encode_npz
 from synth.dataset.reader import read_dataset
 from synth.dataset.sample_files import write_sample_files
@@ -81,7 +82,7 @@ def test_order_and_interruptions_leave_no_trace(tmp_path):
     _write_all(tmp_path / "b", order=(2, 0, 1))
     killed = DatasetWriter(tmp_path / "c", job(1))
     write(killed, translation_sample(2))
-    killed.fail(1, 0, "simulate", "Newton failed")
+    killed.fail(Failure(1, 0, "simulate", "Newton failed"))
     write_sample_files(tmp_path / "c", translation_sample(0), job())  # Whole, but without its line.
     stale = tmp_path / "c" / "samples" / ".000001.partial-99"
     stale.mkdir()
@@ -92,13 +93,13 @@ def test_order_and_interruptions_leave_no_trace(tmp_path):
     with DatasetWriter(tmp_path / "c", job(3)) as writer:
         assert writer.finished == {2}
         assert not stale.exists()
-        writer.fail(1, 0, "simulate", "Newton failed")
+        writer.fail(Failure(1, 0, "simulate", "Newton failed"))
         for index in (1, 0, 1):  # once more: recorded once
             write(writer, translation_sample(index))
     assert (tmp_path / "b" / "failures.jsonl").read_bytes() == b""
     for name in "ab":
         with DatasetWriter(tmp_path / name, job()) as writer:
-            writer.fail(1, 0, "simulate", "Newton failed")
+            writer.fail(Failure(1, 0, "simulate", "Newton failed"))
     a, b, c = (fingerprint(tmp_path / name) for name in "abc")
     assert a == b == c
     assert len(read_dataset(tmp_path / "c").failures) == 1
@@ -195,7 +196,7 @@ def _make(writer: DatasetWriter, indices: Iterable[int]) -> None:
     for index in indices:
         write(writer, translation_sample(index))
         if index == 4:
-            writer.fail(4, 0, "simulate", "Newton failed")
+            writer.fail(Failure(4, 0, "simulate", "Newton failed"))
 
 
 def test_one_after_the_other(tmp_path: Path) -> None:
@@ -231,7 +232,7 @@ def test_the_last_to_leave_joins(tmp_path: Path) -> None:
     with DatasetWriter(tmp_path / "d", job(N), Shard(0, 2), PAIRS) as writer:
         assert writer.finished == {0, 1, 4}
         _make(writer, [5])
-        writer.fail(4, 0, "simulate", "Newton failed")
+        writer.fail(Failure(4, 0, "simulate", "Newton failed"))
     assert fingerprint(tmp_path / "d") == expected
 
 

@@ -30,9 +30,9 @@ APERTURE = 1.6
 OBLIQUE: dict[str, Any] = {"pattern": SINGLE, "position_mm": (8.0, 9.0, 17.0), "look_at_mm": (1.8, 2.0, 2.0)}
 
 
-def _removed(sensor: Sensor, state: Points | None = None, samples: int = 64) -> FloatArray:
+def _removed(sensor: Sensor, state: Points | None = None) -> FloatArray:
     """The radiance (seeds, H, W) that the dots take away: linear in albedo, so that blur convolves it."""
-    bare, dotted = (_renderer(sensor, texture, samples) for texture in (plain(), None))
+    bare, dotted = (_renderer(sensor, texture, 64) for texture in (plain(), None))
     state = flat_surface(sensor).material if state is None else state
     return np.stack([(bare.radiance(state, s) - dotted.radiance(state, s))[..., 0].astype(np.float64) for s in SEEDS])
 

@@ -47,8 +47,8 @@ def gel(radius: float | None = RADIUS, size: tuple[float, float, float] = SIZE, 
     return Gel.model_validate({"size_mm": size, "youngs_modulus_kpa": 200, **face, **more})
 
 
-def sphere_z(places: FloatArray, radius: float = RADIUS) -> FloatArray:
-    return radius - np.sqrt(radius**2 - places[:, 0] ** 2 - places[:, 1] ** 2)
+def sphere_z(places: FloatArray) -> FloatArray:
+    return RADIUS - np.sqrt(RADIUS**2 - places[:, 0] ** 2 - places[:, 1] ** 2)
 
 
 def cap_volume() -> float:

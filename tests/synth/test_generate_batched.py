@@ -17,6 +17,7 @@ from commands import refused
 from processes_of import end_family, needs_proc, started
 from tiny_scene import TEXT, fingerprint, job_context, write_tiny
 
+from synth.dataset.manifest import Failure
 from synth.dataset.reader import read_dataset
 from synth.dataset.shard import Shard
 from synth.errors import InputError
@@ -25,7 +26,7 @@ from synth.pipeline.batched_simulation import in_batches
 from synth.pipeline.generate import Scheduling, generate
 from synth.pipeline.overlapped import prefetched
 from synth.pipeline.producer import Producer
-from synth.pipeline.records import Failure, JobContext, Outcome, SimulatedTrajectory, Task
+from synth.pipeline.records import JobContext, Outcome, SimulatedTrajectory, Task
 from synth.planning import plan, predict
 from synth.render.variant import Variant
 from synth.scene import Gel, Numerics, Scene

@@ -19,6 +19,7 @@ from synth.commands import inspect as inspect_command
 from synth.dataset.export import export, kitti_png
 from synth.dataset.exr import write_flow
 from synth.dataset.images import read_png
+from synth.dataset.manifest import Failure
 from synth.dataset.writer import DatasetWriter
 from synth.inspect import inspect, tables, write_html, write_sheet
 from synth.inspect.inspection import evenly_spaced
@@ -32,7 +33,7 @@ SHIFTS = {0: (1.25, -0.5), 1: (-3.0, 0.3), 3: (0.01, 0.02)}
 def dataset(tmp_path_factory):
     directory = write_dataset(tmp_path_factory.mktemp("inspect") / "d", map(translation_sample, range(3)))
     with DatasetWriter(directory, job(3)) as writer:
-        writer.fail(1, 0, "simulate", "Newton failed")
+        writer.fail(Failure(1, 0, "simulate", "Newton failed"))
     return directory
 
 

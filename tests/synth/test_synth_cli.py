@@ -32,18 +32,7 @@ def said(capsys: pytest.CaptureFixture[str]) -> Run:
 
 @pytest.fixture
 def complaint(capsys: pytest.CaptureFixture[str]) -> Run:
-    """Run a command that must end with status 2: the one thing that it said, on stderr, without a traceback."""
-
-    def run(*arguments: object) -> str:
-        status = main([str(argument) for argument in arguments])
-        out, err = capsys.readouterr()
-        assert status == 2, err
-        assert out == ""
-        assert err.startswith("synth: ")
-        assert "Traceback" not in err
-        return err.removeprefix("synth: ").rstrip()
-
-    return run
+    return partial(commands.complaint, capsys, main)
 
 
 @pytest.mark.parametrize(("command", "words"), [

@@ -83,8 +83,6 @@ class GatedUnit(nn.Module):
 
 
 class FlowHead(nn.Module):
-    """Change of the flow from the hidden state."""
-
     def __init__(self, inputs: int, inner: int) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(inputs, inner, 3, padding=1)

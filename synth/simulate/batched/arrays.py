@@ -11,18 +11,16 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from synth.arrays import FloatArray
 from synth.simulate.batched.fields import ContactMemory, Fields
 from synth.simulate.batched.krylov import Krylov, flat, shapes
 from synth.simulate.batched.lanes import Lanes
 from synth.simulate.batched.pad import Pad
 from synth.simulate.batched.product import STORED, STORED_YEOH, SingleTables
-from synth.simulate.batched.reductions import SCALARS, SurfaceTables
+from synth.simulate.batched.reductions import SCALARS
 from synth.simulate.bulk import Bulk
 from synth.simulate.contact import ContactState, Indenters
 from synth.simulate.space import Space
 from synth.simulate.tables import struct_of, warp_array, zeros_of
-from synth.surface import broken_linear_face
 
 
 class BatchArrays:
@@ -115,14 +113,3 @@ def number_rows(space: Space, free: np.ndarray, rows: int, bulk: Bulk, device: s
         face_shape=warp_array(element.face_shape.astype(np.float32), wp.float32, device),
         single=struct_of(SingleTables, device, **rows_of, **shapes),
     )
-
-
-def surface_tables(space: Space, weight: FloatArray, device: str) -> SurfaceTables:
-    """How points of the coated face, of weights (f, nq) in mm², give tractions to its nodes, as in `System.forces`."""
-    element, coated = space.element, space.coated
-    hat = element.face_shape if element.order == 1 else broken_linear_face(element.face_barycentric)
-    number = np.full(space.faces.shape, -1, dtype=np.int32)
-    number[coated] = np.searchsorted(space.surface_nodes, space.faces[coated])
-    area = np.zeros(len(space.surface_nodes))
-    np.add.at(area, number[coated], np.einsum("fq,qa->fa", weight[coated], hat))
-    return struct_of(SurfaceTables, device, hat=hat, number=number, area=area)

@@ -11,6 +11,7 @@ import ctypes
 import ctypes.util
 import importlib.util
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
@@ -51,10 +52,8 @@ def call(name: str, function: str, *arguments: Any) -> None:
 @cache
 def _load(name: str) -> ctypes.CDLL | None:
     for path in _places(name):
-        try:
+        with suppress(OSError):
             return ctypes.CDLL(path)
-        except OSError:
-            continue
     return None
 
 

@@ -310,7 +310,6 @@ def rounded(x: wp.float32) -> wp.float32:
 
 @wp.func
 def rounded_four(x: wp.vec4f) -> wp.vec4f:
-    """See rounded."""
     return wp.vec4f(rounded(x[0]), rounded(x[1]), rounded(x[2]), rounded(x[3]))
 
 

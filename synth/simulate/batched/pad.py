@@ -57,7 +57,7 @@ def inverse(matrix: scipy.sparse.csr_array, device: str) -> wp.array:
     except (MemoryError, RuntimeError) as error:
         raise InputError(
             f"the batched solver inverts a matrix of {k:,} unknowns, which takes {12e-9 * k * k:.1f} GB: {error}; "
-            'simulate with numerics.solver="direct"'
+            'simulate with numerics.solver = "single"'
         ) from error
     return found
 
@@ -117,12 +117,10 @@ class Pad:
 
     @property
     def mixed(self) -> bool:
-        """Whether there is a pressure field."""
         return self.material.mixed and self.space.element.has_pressure
 
     @property
     def yeoh(self) -> bool:
-        """Whether the material stiffens."""
         return bool(self.material.yeoh.any())
 
 
@@ -141,7 +139,6 @@ def prepare(scene: Scene, mesh: PadMesh, device: str, products: Dense | None = N
 
 
 def _away(scene: Scene) -> Indenters:
-    """A ball that touches nothing."""
     ball = RigidBody(0, np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]), np.eye(3), 1.0, np.zeros((1, 1, 1)), 1.0)
     path = LoadPath(scene.motion.model_copy(update={"depth_mm": -AWAY_MM}), ball)
     packed = pack_indenter(path, 0.0)

@@ -28,13 +28,7 @@ import warp as wp
 
 from synth.simulate.batched.krylov import RUNNING
 from synth.simulate.bulk import Bulk, _deformation_gradient, _dilation, _slopes
-from synth.simulate.inversion_barrier import (
-    ONSET_JACOBIAN,
-    BarrierTables,
-    corner_gradient,
-    corner_gradients,
-    shape_gradient,
-)
+from synth.simulate.inversion_barrier import ONSET_JACOBIAN, BarrierTables, corner_gradients, shape_gradient
 
 BLOCK, RESIDENT_BLOCKS = 128, 4
 """Threads of a block of `bulk_product`, and blocks that a multiprocessor is to run side by side: the compiler takes
@@ -262,15 +256,6 @@ def contact_product(nodes: int) -> wp.Kernel:
     return product
 
 
-@wp.func
-def _gradient_at(barrier: BarrierTables, u: wp.array2d(dtype=wp.vec3d), s: int, e: int, at: wp.vec4d) -> wp.mat33d:
-    """F at barycentric coordinates."""
-    F = at[0] * corner_gradient(barrier, u, s, e, 0)
-    for i in range(1, 4):
-        F += at[i] * corner_gradient(barrier, u, s, e, i)
-    return F
-
-
 @wp.kernel
 def find_inverting(
     mask: wp.array(dtype=wp.int32),
@@ -305,9 +290,10 @@ def barrier_product(
     e, s = wp.tid()
     if running[s] != RUNNING or inverting[e, s] == 0:
         return
+    F0, F1, F2, F3 = corner_gradients(barrier, u, s, e)
     for p in range(barrier.at.shape[0]):
         at = barrier.at[p]
-        F = _gradient_at(barrier, u, s, e, at)
+        F = at[0] * F0 + at[1] * F1 + at[2] * F2 + at[3] * F3
         J = wp.determinant(F)
         if J < ONSET_JACOBIAN:
             G = wp.mat33d()

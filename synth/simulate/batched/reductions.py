@@ -16,11 +16,7 @@ SCALARS = 12
 
 @wp.struct
 class SurfaceTables:
-    """How points of the coated face give tractions to its nodes, of areas (s,) mm².
-
-    `hat` (nq, ns) are functions by which a face's points share in its nodes; `number` (f, ns) is that of a face's nodes
-    among the surface's, -1 on other faces.
-    """
+    """See `synth.simulate.tables.nodal_weights`."""
 
     hat: wp.array2d(dtype=wp.float64)
     number: wp.array2d(dtype=wp.int32)

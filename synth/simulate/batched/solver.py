@@ -21,7 +21,7 @@ from synth.arrays import FloatArray
 from synth.simulate.batched import fields, reductions, transitions
 from synth.simulate.batched import krylov as gmres
 from synth.simulate.batched import lanes as phases
-from synth.simulate.batched.arrays import BatchArrays, number_rows, surface_tables
+from synth.simulate.batched.arrays import BatchArrays, number_rows
 from synth.simulate.batched.lanes import PATH_DERIVATIVE_STEP, copy_grids, fill_lanes, place_indenters
 from synth.simulate.batched.pad import Pad
 from synth.simulate.batched.product import (
@@ -38,7 +38,7 @@ from synth.simulate.contact import contact_residual, contact_stiffness
 from synth.simulate.inversion_barrier import barrier_residual
 from synth.simulate.multipliers import augment, update_contact_history
 from synth.simulate.stiffness import viscous_force
-from synth.simulate.tables import barrier_tables, bulk_tables, face_tables
+from synth.simulate.tables import barrier_tables, bulk_tables, face_tables, nodal_weights, struct_of
 
 INNER_ITERATIONS = 8
 """Krylov iterations of a cycle: a solve that ends within them waits for their end, on average half of them."""
@@ -71,7 +71,8 @@ class BatchedSolver:
         self.inner, self._presses = inner, presses
         self._barrier = barrier_tables(space, material, device)
         self._rows = number_rows(space, pad.free, rows, self._bulk, device)
-        self._surface = surface_tables(space, self._faces.weight.numpy(), device)
+        surface = nodal_weights(space, self._faces.weight.numpy())
+        self._surface = struct_of(reductions.SurfaceTables, device, **surface)
         self._product = bulk_product(space.nodes.shape[1], pad.mixed, space.element.stabilisation > 0, pad.yeoh)
         self._contact_product = contact_product(space.faces.shape[1])
         self._block = gmres.block_size(rows)
@@ -97,7 +98,6 @@ class BatchedSolver:
         self._launch(phases.select, self.batch, self.lanes, phases.bits(*wanted), self._arrays.mask)
 
     def cycle(self) -> None:
-        """Queue one cycle of all lanes."""
         self._take_solutions()
         for _ in range(LINE_SEARCH_TRIALS):
             self._evaluate()
@@ -108,7 +108,6 @@ class BatchedSolver:
             self._iterate()
 
     def _take_solutions(self) -> None:
-        """Take the solutions of the linear solves that are done."""
         a, self._part = self._arrays, "krylov"
         self._launch_blocks(self._solution, self._block, self.lanes, a.krylov, a.begun)
         self._launch(gmres.release, self.batch, a.krylov)
@@ -160,7 +159,6 @@ class BatchedSolver:
         self._launch(fields.move_fields, self._value_dim, s, 0, f)
 
     def _sum(self, phase: int) -> None:
-        """Sum forces and find the penetration of lanes in a phase."""
         a = self._arrays
         self._select(phase)
         self._launch(reductions.clear_sums, a.sums.shape, a.mask, self.lanes, a.sums)
@@ -185,7 +183,6 @@ class BatchedSolver:
         self._launch(transitions.finish_record, self.batch, a.mask, s, self._presses, a.indenters)
 
     def _linearise(self) -> None:
-        """Linearise all lanes that are ready for a linear solve, and begin it."""
         a, self._part = self._arrays, "tangent"
         s, f, mask, elements = self.lanes, a.fields, a.mask, self._element_dim[::-1]
         self._launch(place_indenters, self.batch, s, self._presses, a.indenters)
@@ -202,7 +199,6 @@ class BatchedSolver:
         self._launch(gmres.begin_solve, self.batch, s, self.settings, a.krylov)
 
     def _iterate(self) -> None:
-        """Queue one Krylov iteration of all running solves."""
         a, k, elements, preconditioner = self._arrays, self.krylov, self._element_dim[::-1], self.pad.preconditioner
         self._part = "preconditioner"
         preconditioner.apply(k)
