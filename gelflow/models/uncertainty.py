@@ -2,14 +2,13 @@
 
 From the flow V a Gauss-Newton step leads to what the images say under a narrow window, and
 `gelflow.models.wider_window` from there to V*, what they say under the window that fits the place, with its mean square
-error e. A denoised V has less of it, NOISE e. It differs from V* by the rest; what it misses beyond that is an error:
-M = max(|V - V*|^2 - (1 - NOISE) e, 0). Bias within the window is not seen: it has one flow for all its texture, which
-lies at a mean square distance m from x, so that the flow's second derivatives V'' add an error. Where e and m of the
-finer window of the registration's further stage make the sum smaller, they count instead. Together,
+error e. What V misses of it is an error, too. Bias within the window is not seen: it has one flow for all its texture,
+which lies at a mean square distance m from x, so that the flow's second derivatives V'' add an error. Where e and m of
+the finer window of the registration's further stage make the sum smaller, they count instead. Together,
 
-    sigma^2 = RADIUS^2 / 2 (NOISE e + M + (CURVATURE m |V''|)^2),
+    sigma^2 = RADIUS^2 / 2 (e + |V - V*|^2 + (CURVATURE m |V''|)^2),
 
-smoothed, because the flow is. Where the narrow window finds nothing, NOISE e + M and m are means under a wider one,
+smoothed, because the flow is. Where the narrow window finds nothing, e + |V - V*|^2 and m are means under a wider one,
 over those places alone of which the images say more than the network: between dots a flow is known unless it bends. A
 bare gel has no such places, so that nothing is known, however plausible its flow. Over all places, wide windows would
 take light for texture. An error that leaves no trace in the images, such as dots taken for the next ones, is not seen.
@@ -29,7 +28,7 @@ from gelflow.ops.gaussian import SeparableFilter, smoother, window_sums
 from gelflow.ops.spline import SplineImage
 from gelflow.ops.warp import pixel_indices, positions
 
-NOISE, CURVATURE = 0.7, 0.17
+CURVATURE = 0.17
 """Fitted to the errors of the shipped network on synthetic pairs by `python -m benchmarks sigma`."""
 SMOOTHING_PX = 2.0
 """Standard deviation of the Gaussian under which sigma^2 is smoothed."""
@@ -59,20 +58,19 @@ def flow_sigma(flow: Flow, image1: Images, image2: Images) -> tuple[Tensor, Tens
 
 
 def error_squares(flow: Flow, image1: Images, image2: Images) -> tuple[Tensor, Tensor]:
-    """The squares NOISE e + M and (m |V''|)^2, both (B, 1, H, W) px^2; CURVATURE decides whose e and m count."""
+    """The squares e + |V - V*|^2 and (m |V''|)^2, both (B, 1, H, W) px^2; CURVATURE decides whose e and m count."""
     second, narrow_px = SplineImage(image2), _MOTION.windows_px[-1]
     found, finer = (gauss_newton(flow, image1, second, config) for config in (_MOTION, _FINER))
     window, fine, wide = (window_sums(flow, width) for width in (narrow_px, FINE_WINDOW_PX, _MOTION.windows_px[0]))
     texture, variance = window(found.texture), (TWO_STEPS * found.variance).clamp(min=MIN_VARIANCE)
     narrow = flow + found.step.clamp(-MAX_STEP_PX, MAX_STEP_PX)
     best, least = best_window(narrow, variance, texture, narrow_px)
-    known = variance < UNKNOWN_PX**2
-    missed = ((flow - best).square().sum(dim=1, keepdim=True) - (1 - NOISE) * least).clamp(min=0)
-    error = NOISE * torch.where(known, least, variance)
+    known, missed = variance < UNKNOWN_PX**2, (flow - best).square().sum(dim=1, keepdim=True)
+    error = torch.where(known, least, variance)
     moment = torch.where(known, _second_moment(window, found.texture) / texture, 0.0)
     bend = _curvature_square(flow)
     # The further stage's window, where it errs by less: usually where the flow bends.
-    fine_error = NOISE * (fine_noise(narrow_px, FINE_WINDOW_PX)[1] * finer.variance).clamp(min=MIN_VARIANCE)
+    fine_error = (fine_noise(narrow_px, FINE_WINDOW_PX)[1] * finer.variance).clamp(min=MIN_VARIANCE)
     fine_moment = _second_moment(fine, finer.texture) / fine(finer.texture)
     narrowed = fine_error + (CURVATURE * fine_moment).square() * bend < error + (CURVATURE * moment).square() * bend
     narrowed &= known

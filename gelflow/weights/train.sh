@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Trains weights as the shipped ones were, on NVIDIA GPUs: bash gelflow/weights/train.sh CLIPS OUT
 #
-# CLIPS is a folder of videos of a real gel. DEVICES is the number of GPUs of the last two stages, PAIRS that of pairs
-# of a scene in the first. The first four stages of the shipped weights used the scenes of version 0.1.0.
+# CLIPS is a folder of videos of a real gel. DEVICES is the number of GPUs of the fifth and sixth stage, PAIRS that of
+# pairs of a scene in the first. The first four stages of the shipped weights used the scenes of version 0.1.0.
 set -euo pipefail
 clips=$1 out=$2 devices=${DEVICES:-1} n=${PAIRS:-900} here=$(cd "$(dirname "$0")" && pwd)
 others="densetact fingervision gelsight gelsight_fingertip gelslim gelstereo omnitact tac3d"
@@ -54,3 +54,6 @@ finetune 3 2 15062 3e-4 265 0 "$out/far" $two "$out"/few/* "$out/bare"
 finetune 4 3 9646 2e-4 192 1 "$out/far" "$out/turned" $two "$out"/few/* "$out/bare"
 finetune 5 4 8157 3e-4 300 2 "$out"/all/* --devices "$devices"
 finetune 6 5 8500 3e-4 300 3 "$out"/again/* --devices "$devices"
+python -m gelflow finetune "$out"/again/* --config real --weights "$out/6/weights.safetensors" $network \
+    --set supervision=registered --set model.denoise=true --set motion.shift_px=0 --set motion.turn_deg=0 \
+    --set motion.zoom=0 --set ema_decay=0.999 --steps 4300 --set learning_rate=1e-3 --set warmup_steps=300 --out "$out/7"
