@@ -99,7 +99,7 @@ def test_names_files_and_the_recipe_of_best(tmp_path: Path, monkeypatch: pytest.
     assert weights_file(own) == own
     refused("worst: there is no such file", load_weights, weights_file(Path("worst")))
     metadata = read_metadata(shipped)
-    assert json.loads(metadata["train"])["supervision"] == "mixed"
+    assert json.loads(metadata["train"])["supervision"] == "registered"
     assert f" {metadata['step']} " in shipped.with_name("train.sh").read_text(encoding="utf-8")
     assert load_weights(shipped).config.registration == REGISTRATIONS["motion"]
 
