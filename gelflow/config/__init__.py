@@ -86,7 +86,8 @@ class ModelConfig(_Frozen):
     """A refinement head after the last decoded flow: local correlation of fine features around the flow so far, at half
     of the resolution. Not in the paper, whose finest flow is an enlargement of V2."""
     denoise: bool = False
-    """Noise is taken from a flow that was registered for motion, see `gelflow.models.denoiser`. Not in the paper."""
+    """Whether a small network takes noise from the flow, where it was registered as by default, for motion; see
+    `gelflow.models.denoiser`. Not in the paper."""
     registration: RegistrationConfig | None = None
     """Correction of the network's flow on the images where it is used (validation, evaluation, prediction; neither the
     training steps nor the exported network); in a configuration, a name of `REGISTRATIONS` or a table. Takes no part in
@@ -173,7 +174,7 @@ class TrainConfig(_Frozen):
     supervision: Literal["self", "flow", "mixed", "registered"] = "self"
     """Train on the images alone (the paper), or on the exact flow by the multi-scale endpoint loss, or on whichever a
     pair has: exact flow where it is known, the images alone where it is not (synthetic and real pairs side by side).
-    With "registered", the denoiser alone learns, from registered flows and the exact ones."""
+    Under "registered", only the denoiser learns: to correct registered flow towards the exact one."""
     mixed_self: float = Field(default=10.0, gt=0)
     """Weight of the self-supervised loss, which changes less with a px of error, beside the endpoint loss under
     supervision = "mixed"."""
@@ -218,7 +219,7 @@ class TrainConfig(_Frozen):
     """Validate and keep an exponential moving average of the weights, decay per step (0.999 is usual); 0: the weights
     themselves (the paper is silent)."""
     cuda_graph: bool = True
-    """On a CUDA device, record the network's two passes at the first step and replay them."""
+    """On a CUDA device, record the network's two passes at the first step and replay them; not under "registered"."""
     cache: bool = True
     """On a CUDA device, decode all pairs at the start (by `workers`) and keep them there, if they take no more than
     half of its free memory. Otherwise the files of a pair are decoded anew whenever a step asks for it."""
@@ -236,8 +237,10 @@ class TrainConfig(_Frozen):
 
     @model_validator(mode="after")
     def _fits_together(self) -> TrainConfig:
-        if self.supervision == "registered" and not (self.model.denoise and self.model.registration):
-            raise ValueError('supervision = "registered" needs model.denoise = true and model.registration')
+        if self.supervision == "registered" and (
+            not self.model.denoise or self.model.registration != RegistrationConfig()
+        ):
+            raise ValueError('supervision = "registered" needs model.denoise = true and model.registration = "motion"')
         scales = self.model.levels - 1
         if len(self.loss.lambda_s) != scales:
             raise ValueError(f"loss.lambda_s has {len(self.loss.lambda_s)} numbers; model.levels asks for {scales}")

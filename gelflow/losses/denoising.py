@@ -1,4 +1,4 @@
-"""The denoiser's loss: its flow's error over the registered flow's nearby, so that all places count alike."""
+"""The denoiser's loss: the error of its flow over the mean error of the registered flow around the pixel."""
 
 import torch
 from torch import Tensor
@@ -25,7 +25,8 @@ def denoising_loss(
     denoised, expected = denoiser.estimate(flow, network, image1, image2)
     error = ((denoised - truth).square().sum(dim=1, keepdim=True) + SOFTNESS_PX**4).sqrt()
     before = (flow - truth).norm(dim=1, keepdim=True)
-    window = window_sums(before, WINDOW_PX)
-    nearby = window(before * known) / window(known.float()).clamp(min=1)
+    with torch.autocast(flow.device.type, enabled=False):
+        window = window_sums(before, WINDOW_PX)
+        nearby = window(before * known) / window(known.float()).clamp(min=1)
     means = [(field * known).sum() / known.sum().clamp(min=1) for field in (error / (expected + nearby), error, before)]
     return means[0], {"endpoint": means[1].detach(), "registered": means[2]}

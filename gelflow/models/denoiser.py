@@ -1,10 +1,10 @@
 """Denoiser: the registered flow without its noise. Learned, by a small U-Net (Ronneberger, Fischer and Brox 2015).
 
-Registration takes each pixel's flow from the texture under a round window. How a gel moves is smoother than the noise
-that this leaves, and bends along lines that no round window follows. The network sees what a Gauss-Newton step finds in
-two windows, and with which variance (`gelflow.models.evidence`), the flow in three bands of frequencies, and the image.
-All displacements are divided by the flow's expected error s, so that what it learns on one sensor fits others, and its
-answer is a correction in units of s.
+Registration estimates each pixel's flow in a round window and leaves noise. The gel's true motion is smoother than this
+noise, but bends along lines, which a round window blurs. The denoiser sees what a Gauss-Newton step finds in two
+windows, and with which variance (`gelflow.models.evidence`), the flow in three bands of frequencies, what registration
+changed, and the image. All displacements are divided by the flow's expected error s, that of the default registration.
+So what it learns on one sensor fits others, and its answer is a correction in units of s.
 """
 
 from itertools import pairwise
@@ -28,7 +28,7 @@ BANDS_PX = (2.0, 6.0, 16.0)
 WINDOWS_PX = (2.0, 5.0)
 """Windows of the Gauss-Newton steps; s is that of the last."""
 TEXTURE_PX = 4.0
-"""Standard deviation of the Gaussian without which the image is shown; its contrast is taken under twice that."""
+"""The image is given less its mean under a Gaussian of this standard deviation, over its contrast under twice that."""
 APPLIED = 0.5
 """Share of the correction that is applied. The whole of it errs less on synthetic pairs, but on real ones it leaves the
 flow further from dots."""

@@ -76,7 +76,8 @@ def gauss_newton(flow: Flow, first: Images, second: SplineImage, config: Registr
     determinant, trace = xx * yy - xy.square(), xx + yy
     variance = one * (yy.square() + xy.square()) - 2 * two * xy * trace + three * (xx.square() + xy.square())
     variance = variance / determinant.square()
-    enough = (determinant > 0) & (trace > 0) & (variance < MAX_VARIANCE)
+    # Terms that cancel leave rounding errors of either sign where there is nothing to see.
+    enough = (determinant > 0) & (trace > 0) & (variance >= 0) & (variance < MAX_VARIANCE)
     step = torch.cat([xy * left - yy * right, xy * right - xx * left], dim=1) / determinant
     return Step(
         torch.where(enough, step, 0.0), torch.where(enough, variance, MAX_VARIANCE), texture[:, :1] + texture[:, 2:]

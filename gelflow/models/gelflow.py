@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from gelflow.arrays import Features, Flow, Images
-from gelflow.config import MINIMUM_SIDE, ModelConfig
+from gelflow.config import MINIMUM_SIDE, ModelConfig, RegistrationConfig
 from gelflow.errors import InputError
 from gelflow.models import layers
 from gelflow.models.denoiser import Denoiser
@@ -92,7 +92,7 @@ class GelFlow(nn.Module):
         if settings is None:
             return flow
         found = registered(flow, image1, image2, settings)
-        if self.denoiser is None or settings.background_px is None:
+        if self.denoiser is None or settings != RegistrationConfig():
             return found
         with torch.no_grad(), torch.autocast(flow.device.type, enabled=False):
             denoised: Flow = self.denoiser(found, flow, image1, image2)

@@ -61,6 +61,7 @@ class FlowModule(L.LightningModule):
         self.config = config
         self.model = model
         if model.denoiser is not None:
+            # What a step does not use must not ask for a gradient: neither several devices nor a recording allow it.
             alone = config.supervision == "registered"
             model.requires_grad_(not alone)
             model.denoiser.requires_grad_(alone)

@@ -136,16 +136,15 @@ def _device(config: TrainConfig) -> str:
 
 
 def _initial_network(config: TrainConfig, initial: Path | None) -> GelFlow:
-    if initial is None:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(config.seed)
-            model = GelFlow(config.model)
-    else:
-        model = load_weights(initial)
-        # Registration has no weights: a fine-tuning may switch it on or change it. A denoiser may be added.
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(config.seed)
+        model = GelFlow(config.model) if initial is None else load_weights(initial)
+        # A fine-tuning may add a denoiser.
         if config.model.denoise and model.denoiser is None:
             model.denoiser = Denoiser()
             model.config = model.config.model_copy(update={"denoise": True})
+    if initial is not None:
+        # Registration has no weights: a fine-tuning may switch it on or change it.
         model.config = model.config.model_copy(update={"registration": config.model.registration})
         if model.config != config.model:
             theirs, ours = model.config.model_dump(), config.model.model_dump()

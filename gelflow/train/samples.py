@@ -96,7 +96,8 @@ def checked(sample: Sample, supervised: bool = False) -> Sample:
     flow = sample.get("flow")
     if supervised and (flow is None or not torch.isfinite(flow).any()):
         raise InputError(
-            f'pair {sample["name"]}: has no exact flow, which this supervision needs; use supervision = "self"'
+            f'pair {sample["name"]}: has no exact flow, which supervision = "flow" and "registered" need; '
+            'use supervision = "self"'
         )
     return {key: sample[key] for key in ("image1", "image2", "bare", "name", "flow") if key in sample}
 

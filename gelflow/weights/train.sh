@@ -54,6 +54,7 @@ finetune 3 2 15062 3e-4 265 0 "$out/far" $two "$out"/few/* "$out/bare"
 finetune 4 3 9646 2e-4 192 1 "$out/far" "$out/turned" $two "$out"/few/* "$out/bare"
 finetune 5 4 8157 3e-4 300 2 "$out"/all/* --devices "$devices"
 finetune 6 5 8500 3e-4 300 3 "$out"/again/* --devices "$devices"
+# The denoiser alone: exact flow only, and no added motion.
 python -m gelflow finetune "$out"/again/* --config real --weights "$out/6/weights.safetensors" $network \
     --set supervision=registered --set model.denoise=true --set motion.shift_px=0 --set motion.turn_deg=0 \
     --set motion.zoom=0 --set ema_decay=0.999 --steps 4300 --set learning_rate=1e-3 --set warmup_steps=300 --out "$out/7"
