@@ -4,7 +4,6 @@ import torch
 from torch import Tensor
 
 from gelflow.arrays import Flow, Images, Scalar
-from gelflow.losses.multiscale import SOFTNESS_PX
 from gelflow.models.denoiser import Denoiser
 from gelflow.ops.gaussian import window_sums
 
@@ -23,8 +22,7 @@ def denoising_loss(
     known = torch.isfinite(truth).all(dim=1, keepdim=True)
     truth = torch.where(known, truth, flow)
     denoised, expected = denoiser.estimate(flow, network, image1, image2)
-    error = ((denoised - truth).square().sum(dim=1, keepdim=True) + SOFTNESS_PX**4).sqrt()
-    before = (flow - truth).norm(dim=1, keepdim=True)
+    error, before = ((found - truth).norm(dim=1, keepdim=True) for found in (denoised, flow))
     with torch.autocast(flow.device.type, enabled=False):
         window = window_sums(before, WINDOW_PX)
         nearby = window(before * known) / window(known.float()).clamp(min=1)

@@ -83,7 +83,7 @@ class GelFlow(nn.Module):
         return [decoded[scale] for scale in range(self.config.levels - 1)]
 
     def flow(self, image1: Images, image2: Images) -> Flow:
-        """The flow as it is used: the finest of `forward`, registered where the configuration says so.
+        """The flow as it is used: the finest of `forward`, registered and denoised where the configuration says so.
 
         Without gradient, except where nothing is registered. Arguments and exceptions as for `forward`.
         """
