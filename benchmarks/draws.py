@@ -24,9 +24,7 @@ from synth.simulate.batched import simulate_presses
 from synth.simulate.batched.pad import prepare
 from synth.simulate.press import BLUNTER, MeshRule, Press, blunter
 from synth.simulate.solve import simulate_press
-
-DEEP = 0.02
-"""Share of the press depth by which a body is to sink in at most."""
+from synth.simulate.stepping import DEEP
 
 
 def drawn(case: Row, settings: Sequence[str] = ()) -> tuple[Press, frozenset[int]] | str:

@@ -28,11 +28,10 @@ from synth.simulate.footprint import footprint
 from synth.simulate.load_path import path_of
 from synth.simulate.press import MeshRule
 from synth.simulate.resolution import MARGIN, graded_mesh
+from synth.simulate.stepping import DEEP
 
 SIZE_MM = 8.0
 BALL = Sphere(shape="sphere", radius_mm=4.0)
-DEEP = 0.02
-"""Share of the press depth by which edges are to sink in at most."""
 NEAR = 0.05
 """Share by which half the spacing is to change a force at most."""
 

@@ -12,8 +12,9 @@ from synth.simulate.indenter import object_radius
 from synth.simulate.load_path import LoadPath, path_of
 from synth.simulate.resolution import Accuracy, Resolution, accuracy, resolve, shared_mesh, shared_spacing_mm
 
-BLUNTER = (1.5, 2.25)
-"""Factors on the radius of an object's edges, one after the other, where its press does not complete."""
+BLUNTER = ((1.5, 1.0), (2.25, 1.0), (2.25, 4.0))
+"""Factors on the radius of an object's edges and on the contact stiffness, one after the other, where its press does
+not complete."""
 ELEMENTS: dict[str, Callable[[], Element]] = {"auto": p2p1, "p1p1": p1p1, "p2p1": p2p1}
 
 
@@ -46,9 +47,11 @@ def blunter(press: Press) -> Iterator[Scene]:
     """Scenes with an object's edges rounder than the mesh resolves; none for other shapes, or if they are so."""
     scene, indenter, radius = press.scene, press.scene.contact.indenter, edge_radius_mm(press.scene, press.mesh) or 0.0
     if isinstance(indenter, MeshIndenter) and (indenter.fillet_mm or 0.0) < radius:
-        for factor in BLUNTER:
+        for factor, stiffer in BLUNTER:
             rounder = indenter.model_copy(update={"fillet_mm": factor * radius})
-            yield scene.model_copy(update={"contact": scene.contact.model_copy(update={"indenter": rounder})})
+            contact = scene.contact.model_copy(update={"indenter": rounder})
+            numerics = scene.numerics.model_copy(update={"penalty": stiffer * scene.numerics.penalty})
+            yield scene.model_copy(update={"contact": contact, "numerics": numerics})
 
 
 def resolution_mm(scene: Scene, mesh: PadMesh) -> float:

@@ -84,11 +84,12 @@ def space_of(press: Press) -> Space:
 
 
 def check_shared(scenes: Sequence[Scene], mesh: PadMesh) -> None:
-    """Refuse scenes that are not of the mesh's pad, or differ from the first in materials or numerics."""
+    """Refuse scenes not of the mesh's pad, or that differ from the first in materials or numerics but the penalty."""
     first = scenes[0]
     for scene in scenes:
         _check_pad(scene.sensor.gel, mesh)
-        if (_elastic(scene.sensor.gel), scene.numerics) != (_elastic(first.sensor.gel), first.numerics):
+        numerics = scene.numerics.model_copy(update={"penalty": first.numerics.penalty})
+        if (_elastic(scene.sensor.gel), numerics) != (_elastic(first.sensor.gel), first.numerics):
             raise InputError("the scenes of a batch must share the gel's materials and numerics")
 
 

@@ -41,11 +41,11 @@ come to rest on the surface, so that more updates make the tractions uneven."""
 FAILURES = 3
 """Failed updates after which the passes end, unless they begin deeper than DEEP. Updates are halved after a failure and
 doubled after a success: where a whole one upsets Newton's method a part of it does not."""
-DEEP, MAX_PENETRATION = 0.02, 0.1
-"""Shares of the press depth (at least 0.1 mm). A triangle mesh that penetrates by more than the first gets up to
-MAX_DEEP_PASSES passes, failed ones included. After the first success each pass doubles the contact stiffness, to at
-most MAX_STIFFENING times the body's own: multipliers alone converge slowly at sharp edges (after Nocedal & Wright,
-Numerical Optimization, framework 17.3). The press ends if penetration then exceeds the second."""
+DEEP = 0.02
+"""Share of the press depth (at least 0.1 mm). A triangle mesh that penetrates by more gets up to MAX_DEEP_PASSES
+passes, failed ones included. After the first success each pass doubles the contact stiffness, to at most
+MAX_STIFFENING times the body's own: multipliers alone converge slowly at sharp edges (after Nocedal & Wright,
+Numerical Optimization, framework 17.3). The press ends if it still penetrates by more."""
 MAX_DEEP_PASSES, MAX_STIFFENING = 16, 8.0
 MULTIPLIER_TOLERANCE = 20.0
 """Tolerance of states that multipliers are updated from, over the full one: two updates do not forget what they began
@@ -89,8 +89,7 @@ class Stepper:
         self._corrected = frozenset(place for k, place in enumerate(records, 1) if frames is None or k in frames)
         depth_mm = max(float(path.corners[:, 0].max()), 0.1)
         self._shallow_mm = PENETRATION * depth_mm
-        limit_mm = depth_mm if path.body.kind == KINDS["mesh"] else np.inf
-        self._deep_mm, self._deepest_mm = DEEP * limit_mm, MAX_PENETRATION * limit_mm
+        self._deep_mm = DEEP * (depth_mm if path.body.kind == KINDS["mesh"] else np.inf)
         self._rubs = friction > 0
         self.indenter, self._sticking = pack_indenter(path, friction), pack_indenter(path, STICK_FRICTION)
         self._sticking.centre, self._sticking.rotation = self.indenter.centre, self.indenter.rotation
@@ -254,8 +253,8 @@ class Stepper:
         if target in self._corrected:
             self.system.update_contact_history(step.state, self.indenter, new_only=1)
             solution = self._polished(self._augmented(step), self.numerics.tolerance)
-            if solution.converged and self.system.deepest() > self._deepest_mm:
-                self.reason = too_deep(self.path.pose(target), MAX_PENETRATION)
+            if solution.converged and self.system.deepest() > self._deep_mm:
+                self.reason = too_deep(self.path.pose(target), DEEP)
         if solution.converged and not self.reason:
             self.states.append(self._recorded_state(solution, target))
             self._iterations = 0

@@ -122,7 +122,7 @@ class Presses:
         over_pad: whether the body comes down on the contact face.
         origin, axes: of `LoadPath.frame`; zeros and the identity for flat pads and domes.
         position, reach, rotation: of the body, as `LoadPath.pose` uses them.
-        kind, shape, friction, sharpness: as `synth.simulate.contact.Indenters`.
+        kind, shape, friction: as `synth.simulate.contact.Indenters`; sharpness: times the contact stiffness, E per mm.
         grid, grids: number of its distance grid among the different ones (g, cells).
     """
 

@@ -9,7 +9,7 @@ from synth.simulate.batched.lanes import COMPLETE, NO_CONTACT, NO_EQUILIBRIUM, T
 from synth.simulate.batched.reductions import SCALARS
 from synth.simulate.press import Press
 from synth.simulate.space import Space
-from synth.simulate.stepping import MAX_PENETRATION
+from synth.simulate.stepping import DEEP
 from synth.simulate.tables import struct_of
 from synth.simulate.trajectory import State, Trajectory, no_contact, not_converged, too_deep, undeformed
 
@@ -55,7 +55,7 @@ def press_tables(
         "grid": [numbers[_grid_key(body.coefficients)] for body in bodies],
         "grids": padded.reshape(len(grids), -1),
         "friction": [press.scene.contact.friction for press in presses],
-        "sharpness": [body.sharpness for body in bodies],
+        "sharpness": [press.scene.numerics.penalty * press.path.body.sharpness for press in presses],
     }
     return struct_of(Presses, d, **columns), (counts[0], counts[1], counts[2])
 
@@ -95,7 +95,7 @@ def trajectory(
         COMPLETE: "",
         NO_EQUILIBRIUM: not_converged(target - reached, press.path.pose(reached)),
         NO_CONTACT: no_contact(target),
-        TOO_DEEP: too_deep(press.path.pose(target), MAX_PENETRATION),
+        TOO_DEEP: too_deep(press.path.pose(target), DEEP),
     }
     return Trajectory(tuple(states), reasons[code], seconds, space)
 

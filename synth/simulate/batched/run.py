@@ -83,7 +83,7 @@ class Run:
         settings.forcing, settings.closer = options.forcing, options.closer
         settings.limit, settings.correction_limit = MAX_ITERATIONS, options.correction_iterations
         records = max(len(press.path.records()) for press in presses)
-        self.solver = BatchedSolver(pad, table, batch, records, grid, settings, numerics.penalty, inner)
+        self.solver = BatchedSolver(pad, table, batch, records, grid, settings, inner)
         self._order = range(len(presses)) if order is None else order
         self._graph: Any = None
         self.cycles = 0

@@ -42,6 +42,8 @@ from synth.simulate.tables import barrier_tables, bulk_tables, face_tables, noda
 
 INNER_ITERATIONS = 8
 """Krylov iterations of a cycle: a solve that ends within them waits for their end, on average half of them."""
+PENALTY = 1.0
+"""Of all presses: their own are in `Presses.sharpness`."""
 LINE_SEARCH_TRIALS = 2
 """Trials of the line search in a cycle; a lane that needs more goes on in the next."""
 
@@ -50,7 +52,7 @@ class BatchedSolver:
     """See the module's docstring.
 
     A trajectory records at most `records` states; `grid` are the counts of the largest distance grid of the indenters.
-    `penalty` is the contact stiffness, E per mm, and `inner` the Krylov iterations of a cycle.
+    `inner` are the Krylov iterations of a cycle.
     """
 
     def __init__(
@@ -61,11 +63,10 @@ class BatchedSolver:
         records: int,
         grid: tuple[int, int, int],
         settings: phases.Settings,
-        penalty: float,
         inner: int,
     ) -> None:
         space, material, device = pad.space, pad.material, pad.device
-        self.pad, self.batch, self.device, self.penalty, self.settings = pad, batch, device, penalty, settings
+        self.pad, self.batch, self.device, self.settings = pad, batch, device, settings
         rows = pad.preconditioner.rows
         self._bulk, self._faces = bulk_tables(space, material, pad.mixed, device), face_tables(space, device)
         self.inner, self._presses = inner, presses
@@ -125,7 +126,7 @@ class BatchedSolver:
         self._launch(bulk_residual, elements, f.trial_u, f.trial_p, mask, self._bulk, *residual)
         if self._barrier is not None:
             self._launch(barrier_residual, elements, f.trial_u, mask, self._barrier, a.force, a.jacobian)
-        law, found = (self._faces, a.indenters, a.contact, self.penalty), (a.force, a.gap, a.tangential, a.traction)
+        law, found = (self._faces, a.indenters, a.contact, PENALTY), (a.force, a.gap, a.tangential, a.traction)
         self._launch(contact_residual, self._face_dim, f.trial_u, mask, *law, *found)
         self._launch_blocks(reductions.residual_norms, reductions.BLOCK, mask, *residual, self._rows.node_row, f, s)
         self._launch(viscous_force, elements, mask, f.iterate_u, f.trial_u, s.viscosity, self._bulk, a.viscous)
@@ -150,7 +151,7 @@ class BatchedSolver:
         self._launch(reductions.penetrations, self._face_dim, a.mask, a.gap, s)
         self._launch(transitions.choose_pass, self.batch, s, self._presses, self.settings, a.indenters)
         self._launch(fields.save_multipliers, a.points, s, a.contact, *multipliers)
-        found = (a.gap, a.tangential, self.penalty)
+        found = (a.gap, a.tangential, PENALTY)
         self._launch(augment, a.points, s.new_share, a.indenters, *found, a.contact)
         self._record()
         self._select(phases.ADVANCE, phases.FIRST)
@@ -168,7 +169,7 @@ class BatchedSolver:
 
     def _settle(self, mask: wp.array, new_only: int) -> None:
         a = self._arrays
-        found = (self._faces, a.indenters, a.gap, a.tangential, self.penalty, new_only, a.contact)
+        found = (self._faces, a.indenters, a.gap, a.tangential, PENALTY, new_only, a.contact)
         self._launch(update_contact_history, a.points, a.fields.state_u, mask, *found)
 
     def _record(self) -> None:
@@ -190,7 +191,7 @@ class BatchedSolver:
         self._launch(store_bulk, elements, mask, f.iterate_u, f.iterate_p, self._bulk, s.viscosity, a.stored)
         if self._barrier is not None:
             self._launch(find_inverting, elements, mask, f.iterate_u, self._barrier, a.inverting)
-        law, matrices = (self._faces, a.indenters, a.contact, self.penalty), (a.symmetric, a.remainder)
+        law, matrices = (self._faces, a.indenters, a.contact, PENALTY), (a.symmetric, a.remainder)
         self._launch(contact_stiffness, self._face_dim, f.iterate_u, mask, *law, np.inf, a.touching, *matrices)
         stored = (a.stored_contact, a.touched)
         self._launch(store_contact, self._face_dim, mask, a.touching, self._faces.weight, *matrices, *stored)

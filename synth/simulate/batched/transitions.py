@@ -34,7 +34,7 @@ GROWTH, SHORTEST_STEP = _doubles(stepping.GROWTH, stepping.SHORTEST_STEP)
 MAX_ITERATIONS_TO_GROW, FAILURES = wp.constant(stepping.MAX_ITERATIONS_TO_GROW), wp.constant(stepping.FAILURES)
 MULTIPLIER_TOLERANCE, PENETRATION = _doubles(stepping.MULTIPLIER_TOLERANCE, stepping.PENETRATION)
 MAX_MULTIPLIER_UPDATES = wp.constant(wp.float64(stepping.MAX_MULTIPLIER_UPDATES))
-DEEP, MAX_PENETRATION, MAX_STIFFENING = _doubles(stepping.DEEP, stepping.MAX_PENETRATION, stepping.MAX_STIFFENING)
+DEEP, MAX_STIFFENING = _doubles(stepping.DEEP, stepping.MAX_STIFFENING)
 MAX_CORRECTION_RATIO, MAX_RELAXED_STEP = _doubles(stepping.MAX_CORRECTION_RATIO, stepping.MAX_RELAXED_STEP)
 MESH, MAX_DEEP_PASSES = wp.constant(KINDS["mesh"]), wp.constant(stepping.MAX_DEEP_PASSES)
 FIRST_VISCOSITY, LEAST_VISCOSITY = _doubles(newton.FIRST_VISCOSITY, newton.LEAST_VISCOSITY)
@@ -142,10 +142,10 @@ def evaluate_trial(lanes: Lanes, settings: Settings):
 
 
 @wp.func
-def _is_deeper(lanes: Lanes, presses: Presses, s: int, share: wp.float64) -> bool:
-    """Whether an object is deeper in the gel than a share of the press depth; at a pass, before it."""
+def _is_deep(lanes: Lanes, presses: Presses, s: int) -> bool:
+    """Whether an object is deeper in the gel than DEEP; at a pass, before it."""
     j = lanes.press[s]
-    return presses.kind[j] == MESH and lanes.deepest[s] > share * presses.deepest[j]
+    return presses.kind[j] == MESH and lanes.deepest[s] > DEEP * presses.deepest[j]
 
 
 @wp.kernel
@@ -162,7 +162,7 @@ def finish_solve(lanes: Lanes, presses: Presses, settings: Settings, indenters: 
     relaxed = lanes.relaxing[s] > 0
     small = lanes.target[s] - lanes.at[s] <= MAX_RELAXED_STEP * settings.longest
     if correction:
-        small = lanes.share[s] < MAX_RELAXED_STEP and _is_deeper(lanes, presses, s, DEEP)
+        small = lanes.share[s] < MAX_RELAXED_STEP and _is_deep(lanes, presses, s)
     if phase == phases.FAILED and not relaxed and not polish and small:
         lanes.relaxing[s] = 1
         lanes.viscosity[s] = FIRST_VISCOSITY
@@ -244,11 +244,11 @@ def choose_pass(lanes: Lanes, presses: Presses, settings: Settings, indenters: I
         return
     j = lanes.press[s]
     corrected = presses.kind_of[j, lanes.next[s]] == 2
-    deep = _is_deeper(lanes, presses, s, DEEP)
+    deep = _is_deep(lanes, presses, s)
     over = lanes.failures[s] >= FAILURES or lanes.done[s] >= MAX_MULTIPLIER_UPDATES
     if deep:
         over = lanes.passes[s] >= MAX_DEEP_PASSES
-    if corrected and over and _is_deeper(lanes, presses, s, MAX_PENETRATION):
+    if corrected and over and deep:
         lanes.reason[s] = phases.TOO_DEEP
         lanes.phase[s] = phases.ENDED
         return
