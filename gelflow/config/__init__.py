@@ -188,6 +188,9 @@ class TrainConfig(_Frozen):
     color_jitter: float = Field(default=0.0, ge=0, le=0.5)
     """Standard deviation of the logarithm of a random gain per colour channel, common to both images of a pair; bare
     gels keep their colours."""
+    compression: float = Field(default=0.0, ge=0, le=1)
+    """Largest step of a random compression of pairs with exact flow, except those of bare gels, in units of white;
+    see `gelflow.ops.compression`. Recordings are compressed, rendered images are not."""
     motion: MotionConfig | None = None
     """Motion added to each pair but those of bare gels, for a network that meets larger motions than its training pairs
     show; None: none (the paper is silent)."""

@@ -1,4 +1,4 @@
-"""The denoiser's loss: the error of its flow over the mean error of the registered flow around the pixel."""
+"""The denoiser's loss: the error of its flow over the root of the registered flow's mean error around the pixel."""
 
 import torch
 from torch import Tensor
@@ -14,7 +14,9 @@ WINDOW_PX = 8.0
 def denoising_loss(
     denoiser: Denoiser, flow: Flow, network: Flow, image1: Images, image2: Images, truth: Flow
 ) -> tuple[Scalar, dict[str, Tensor]]:
-    """Mean of ``|V - V*| / (s + <|R - V*|>)`` where the true flow V* is known (not NaN).
+    """Mean of ``|V - V*| / (s + <|R - V*|>)^(1/2)`` where the true flow V* is known (not NaN).
+
+    Without the denominator, few pixels in contacts decide; without the root, all count alike, however little they err.
 
     V is the denoised flow, R the registered one, (B, 2, H, W), s its expected error; the other arguments are those of
     the denoiser. "endpoint" and "registered" are the mean errors of V and R, px, detached.
@@ -26,5 +28,6 @@ def denoising_loss(
     with torch.autocast(flow.device.type, enabled=False):
         window = window_sums(before, WINDOW_PX)
         nearby = window(before * known) / window(known.float()).clamp(min=1)
-    means = [(field * known).sum() / known.sum().clamp(min=1) for field in (error / (expected + nearby), error, before)]
+        weighted = error / (expected + nearby).sqrt()
+    means = [(field * known).sum() / known.sum().clamp(min=1) for field in (weighted, error, before)]
     return means[0], {"endpoint": means[1].detach(), "registered": means[2]}

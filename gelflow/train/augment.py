@@ -1,4 +1,4 @@
-"""Augmentation of whole batches, on whatever device they are: motion, flips, colours.
+"""Augmentation of whole batches, on whatever device they are: motion, flips, colours, compression.
 
 Motion: image 2 is read at ``A(y) = c + M (y - c) + t``, c its centre and M = s R, so that what lay at A(y) lies at y. A
 point of image 1 that was found at x + V(x) is then found at ``x + V'(x) = c + M^-1 (x + V(x) - c - t)``. The flow stays
@@ -10,6 +10,9 @@ where the lights are that gives slopes their colours. Changed so they would be p
 
 Each pair has its own random numbers. They are sampled on the CPU and copied asynchronously, so that a GPU need not
 finish a step before the CPU prepares the next.
+
+Compression comes last, by a step that is log-uniform between MILDEST times the configured one and that one. Only pairs
+with exact flow are compressed, and those of bare gels are not.
 """
 
 import math
@@ -23,14 +26,17 @@ from torch import Tensor
 
 from gelflow.arrays import Flow, Images
 from gelflow.config import MotionConfig, TrainConfig
+from gelflow.ops.compression import compressed
 from gelflow.ops.warp import from_centre, warp
 
-UNCHANGED = np.array([1, 0, 0, 1, 1, 0, 0, 1, 0, 0, 1, 1, 1, 1, 1], np.float32)
+UNCHANGED = np.array([1, 0, 0, 1, 1, 0, 0, 1, 0, 0, 1, 1, 1, 1, 1, 0], np.float32)
 """Random numbers, in the order of `_sampled`, that leave a pair as it is."""
+MILDEST = 1 / 32
+"""Smallest step of the compression, over the largest."""
 
 
 def augmented(batch: dict[str, Any], config: TrainConfig, randoms: Sequence[np.random.Generator]) -> dict[str, Any]:
-    """A new batch, after the augmentation that `motion`, `flip` and `color_jitter` of the configuration ask for.
+    """A new batch, after the augmentation that the configuration asks for.
 
     It holds image1, image2 (B, 3, H, W); bare, whose gels have no pattern; perhaps flow (B, 2, H, W) px, NaN where
     unknown; what else it holds is passed on. There is a source of random numbers for each pair.
@@ -58,17 +64,23 @@ def augmented(batch: dict[str, Any], config: TrainConfig, randoms: Sequence[np.r
         gain = numbers[:, 12:15, None, None]
         for key in ("image1", "image2"):
             new[key] = (new[key] * gain).clamp(0, 1)
+    if config.compression > 0 and "flow" in new:
+        # Recordings, which have no flow, are compressed already.
+        steps = numbers[:, 15] * torch.isfinite(new["flow"]).flatten(1).any(dim=1)
+        for key in ("image1", "image2"):
+            new[key] = compressed(new[key], steps)
     return new
 
 
 def _sampled(config: TrainConfig, random: np.random.Generator) -> NDArray[np.float32]:
-    """M, M^-1, t of the motion, -1 for a flip along x and y, gain of each colour: 15 numbers."""
+    """M, M^-1, t of the motion, -1 for a flip along x and y, gain of each colour, step of compression: 16 numbers."""
     matrix, shift = np.eye(2), np.zeros(2)
     if config.motion is not None:
         matrix, shift = random_motion(config.motion, random)
     flips = np.where(random.random(2) < 0.5, -1.0, 1.0)
     gain = np.exp(random.normal(0, config.color_jitter, 3))
-    return np.concatenate([matrix.ravel(), np.linalg.inv(matrix).ravel(), shift, flips, gain]).astype(np.float32)
+    step = config.compression * MILDEST ** random.random()
+    return np.r_[matrix.ravel(), np.linalg.inv(matrix).ravel(), shift, flips, gain, step].astype(np.float32)
 
 
 def random_motion(config: MotionConfig, random: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

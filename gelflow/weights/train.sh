@@ -19,6 +19,13 @@ finetune() { # NAME FROM STEPS LEARNING_RATE WARMUP_STEPS SEED, folders of pairs
         --set learning_rate="$4" --set warmup_steps="$5" --set seed="$6" --out "$out/$1"
 }
 
+denoise() { # NAME FROM STEPS SEED COMPRESSION, folders of pairs: trains the denoiser alone, without added motion
+    python -m gelflow finetune "${@:6}" --config real --weights "$out/$2/weights.safetensors" $network --steps "$3" \
+        --set supervision=registered --set model.denoise=true --set motion.shift_px=0 --set motion.turn_deg=0 \
+        --set motion.zoom=0 --set ema_decay=0.999 --set learning_rate=1e-3 --set warmup_steps=200 --set seed="$4" \
+        --set compression="$5" --out "$out/$1"
+}
+
 everything() { # FOLDER SEED: pairs of all scenes
     local scene
     for scene in allsight deltact densetact dmtac fingervision gelsight gelsight_fingertip gelslim gelstereo omnitact \
@@ -45,6 +52,9 @@ pairs bare digit $((n * 5)) 31 6 $together
 for scene in $others; do pairs "few/$scene" "$scene" $((n * 2 / 9)) 21 6; done
 everything all 41
 everything again 43
+n=250 everything fresh 97
+n=285 everything more 101
+n=255 everything most 103
 
 two="$out/first/deltact $out/first/soft_bubble"
 python -m gelflow train "$out"/first/* "$out/far" --config best $network \
@@ -54,7 +64,6 @@ finetune 3 2 15062 3e-4 265 0 "$out/far" $two "$out"/few/* "$out/bare"
 finetune 4 3 9646 2e-4 192 1 "$out/far" "$out/turned" $two "$out"/few/* "$out/bare"
 finetune 5 4 8157 3e-4 300 2 "$out"/all/* --devices "$devices"
 finetune 6 5 8500 3e-4 300 3 "$out"/again/* --devices "$devices"
-# The denoiser alone: exact flow only, and no added motion.
-python -m gelflow finetune "$out"/again/* --config real --weights "$out/6/weights.safetensors" $network \
-    --set supervision=registered --set model.denoise=true --set motion.shift_px=0 --set motion.turn_deg=0 \
-    --set motion.zoom=0 --set ema_decay=0.999 --steps 4300 --set learning_rate=1e-3 --set warmup_steps=300 --out "$out/7"
+denoise 7 6 4300 0 0 "$out"/fresh/*
+denoise 8 7 5800 5 0 "$out"/more/*
+denoise 9 8 5000 5 0.0625 "$out"/most/*

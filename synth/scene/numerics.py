@@ -23,6 +23,7 @@ class Render(Part):
 
 Cells = Annotated[int, Field(ge=4, le=200, multiple_of=2)]
 """An even number of elements, so that a mesh is its own mirror image."""
+MAX_PENALTY = 1e4
 
 
 class Numerics(Part):
@@ -44,7 +45,7 @@ class Numerics(Part):
     """Longest motion of the indenter in one load step; steps are halved when Newton fails."""
     tolerance: Annotated[float, Field(ge=1e-12, le=1e-2)] = 1e-6
     """Newton stops when the residual is below this fraction of the reaction force."""
-    penalty: Annotated[float, Field(ge=1, le=1e4)] = 50.0
+    penalty: Annotated[float, Field(ge=1, le=MAX_PENALTY)] = 50.0
     """Contact stiffness in multiples of E per mm, before augmented-Lagrangian updates; sharp bodies get up to four
     times as much."""
 

@@ -7,6 +7,7 @@ from typing import Literal
 
 from synth.mesh import PadMesh, default_edge_length, pad_mesh
 from synth.scene import MeshIndenter, Scene
+from synth.scene.numerics import MAX_PENALTY
 from synth.simulate.element import Element, p1p1, p2p1
 from synth.simulate.indenter import object_radius
 from synth.simulate.load_path import LoadPath, path_of
@@ -44,13 +45,13 @@ def edge_radius_mm(scene: Scene, mesh: PadMesh) -> float | None:
 
 
 def blunter(press: Press) -> Iterator[Scene]:
-    """Scenes with an object's edges rounder than the mesh resolves; none for other shapes, or if they are so."""
+    """Scenes for pressing an object again, by BLUNTER; none for other shapes, or if the edges are rounder already."""
     scene, indenter, radius = press.scene, press.scene.contact.indenter, edge_radius_mm(press.scene, press.mesh) or 0.0
     if isinstance(indenter, MeshIndenter) and (indenter.fillet_mm or 0.0) < radius:
         for factor, stiffer in BLUNTER:
             rounder = indenter.model_copy(update={"fillet_mm": factor * radius})
             contact = scene.contact.model_copy(update={"indenter": rounder})
-            numerics = scene.numerics.model_copy(update={"penalty": stiffer * scene.numerics.penalty})
+            numerics = scene.numerics.model_copy(update={"penalty": min(stiffer * scene.numerics.penalty, MAX_PENALTY)})
             yield scene.model_copy(update={"contact": contact, "numerics": numerics})
 
 

@@ -84,13 +84,13 @@ def space_of(press: Press) -> Space:
 
 
 def check_shared(scenes: Sequence[Scene], mesh: PadMesh) -> None:
-    """Refuse scenes not of the mesh's pad, or that differ from the first in materials or numerics but the penalty."""
+    """Refuse scenes of another pad than the mesh's, or that differ in materials or in numerics other than penalty."""
     first = scenes[0]
     for scene in scenes:
         _check_pad(scene.sensor.gel, mesh)
         numerics = scene.numerics.model_copy(update={"penalty": first.numerics.penalty})
         if (_elastic(scene.sensor.gel), numerics) != (_elastic(first.sensor.gel), first.numerics):
-            raise InputError("the scenes of a batch must share the gel's materials and numerics")
+            raise InputError("the scenes of a batch must share the gel's materials and all numerics but the penalty")
 
 
 def _check_pad(gel: Gel, mesh: PadMesh) -> None:

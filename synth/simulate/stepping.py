@@ -45,7 +45,7 @@ DEEP = 0.02
 """Share of the press depth (at least 0.1 mm). A triangle mesh that penetrates by more gets up to MAX_DEEP_PASSES
 passes, failed ones included. After the first success each pass doubles the contact stiffness, to at most
 MAX_STIFFENING times the body's own: multipliers alone converge slowly at sharp edges (after Nocedal & Wright,
-Numerical Optimization, framework 17.3). The press ends if it still penetrates by more."""
+Numerical Optimization, framework 17.3). The press ends if that does not suffice."""
 MAX_DEEP_PASSES, MAX_STIFFENING = 16, 8.0
 MULTIPLIER_TOLERANCE = 20.0
 """Tolerance of states that multipliers are updated from, over the full one: two updates do not forget what they began
@@ -252,9 +252,11 @@ class Stepper:
         solution = step
         if target in self._corrected:
             self.system.update_contact_history(step.state, self.indenter, new_only=1)
-            solution = self._polished(self._augmented(step), self.numerics.tolerance)
+            solution = self._augmented(step)
             if solution.converged and self.system.deepest() > self._deep_mm:
                 self.reason = too_deep(self.path.pose(target), DEEP)
+            else:
+                solution = self._polished(solution, self.numerics.tolerance)
         if solution.converged and not self.reason:
             self.states.append(self._recorded_state(solution, target))
             self._iterations = 0

@@ -92,9 +92,9 @@ def not_converged(beyond_mm: float, pose: Pose) -> str:
 
 
 def too_deep(pose: Pose, share: float) -> str:
-    """Why a trajectory ends whose indenter stays deeper inside the gel than this share of its depth."""
+    """Why a trajectory ends whose gel stays further inside an object than this share of the press depth."""
     return (
-        f"at depth {pose.depth_mm:.3g} mm an edge stays inside the gel by more than {share:.0%} of the depth: lower "
+        f"at depth {pose.depth_mm:.3g} mm the gel stays inside the object by more than {share:.0%} of the depth: lower "
         "numerics.target_error_px or edge_length_mm, or raise numerics.penalty"
     )
 

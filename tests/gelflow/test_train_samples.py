@@ -170,7 +170,7 @@ def test_no_motion_leaves_everything_and_any_leaves_a_bare_gel_as_it_is() -> Non
     torch.testing.assert_close(after["image2"], before["image2"], rtol=0, atol=1e-5)
     torch.testing.assert_close(after["flow"], before["flow"], rtol=0, atol=1e-5, equal_nan=True)
     bare, dotted = sample() | {"bare": True}, sample()
-    config = TrainConfig(motion=MotionConfig(), flip=True, color_jitter=0.2)
+    config = TrainConfig(motion=MotionConfig(), flip=True, color_jitter=0.2, compression=0.1)
     for seed in range(4):
         randoms = [np.random.default_rng(number) for number in (seed, seed + 10)]
         after = augmented(collate([bare, dotted]), config, randoms)
@@ -178,6 +178,20 @@ def test_no_motion_leaves_everything_and_any_leaves_a_bare_gel_as_it_is() -> Non
             # As without motion, above.
             torch.testing.assert_close(after[key][0], bare[key], rtol=0, atol=1e-5, equal_nan=True)
             assert not torch.allclose(after[key][1], dotted[key], atol=0.01, equal_nan=True)
+
+
+def test_pairs_with_exact_flow_are_compressed_and_recordings_are_not() -> None:
+    config, pairs = TrainConfig(flip=False, compression=0.1), Shifts(1, 80, 1.0, seed=2)
+    found = [drawn(pairs, config, draw) for draw in range(10)]
+    lost = [(each["image2"] - pairs[0]["image2"]).abs().mean().item() for each in found]
+    assert 0 < 1.5 * min(lost) < max(lost)  # steps differ by up to 32 times; chroma always loses half its resolution
+    assert all(torch.equal(each["flow"], pairs[0]["flow"]) for each in found)
+    recorded = pairs[0] | {"flow": torch.full_like(pairs[0]["flow"], torch.nan)}
+    batch = augmented(collate([pairs[0], recorded]), config, [np.random.default_rng(seed) for seed in (1, 2)])
+    assert not torch.equal(batch["image1"][0], pairs[0]["image1"])
+    assert torch.equal(batch["image1"][1], recorded["image1"])
+    without = Shifts(1, 80, 1.0, seed=2, flow=False)
+    assert torch.equal(drawn(without, config, 3)["image2"], without[0]["image2"])
 
 
 def test_training_draws_it_where_the_configuration_asks_for_it() -> None:

@@ -87,9 +87,9 @@ def test_an_object_is_no_deeper_in_the_gel_than_allowed(folder: Path, monkeypatc
         # Intermediate steps have a relaxed tolerance of 1e-3 on the CPU, which friction remembers.
         np.testing.assert_allclose(one.force_n, other.force_n, atol=5e-3 * one.force_n[2])
     for trajectory in both(soft(0.05)):
-        assert "an edge stays inside the gel by more than 2% of the depth" in trajectory.reason
+        assert "the gel stays inside the object by more than 2% of the depth" in trajectory.reason
     monkeypatch.setattr(stepping, "MAX_STIFFENING", 1.0)
-    assert "an edge stays inside" in simulate_press(soft(4.0)).reason
+    assert "the gel stays inside" in simulate_press(soft(4.0)).reason
 
 
 def test_relaxation_finds_the_equilibrium_of_newtons_method(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -36,7 +36,7 @@ def simulate_presses(
 ) -> Iterator[tuple[int, Trajectory]]:
     """Simulate presses into pads of one mesh, each as if it were alone; their numbers and trajectories, as they end.
 
-    The presses share the gel's materials and the numerics, else InputError; the pad is of
+    The presses share the gel's materials and, but for the penalty, the numerics, else InputError; the pad is of
     `synth.simulate.batched.pad.prepare`. `frames` are the numbers of the states that are wanted, of each press (else
     ValueError), see `synth.simulate.simulate_press`; at most `batch` trajectories run at a time; `options` hold along
     the load paths.

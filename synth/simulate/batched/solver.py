@@ -43,7 +43,7 @@ from synth.simulate.tables import barrier_tables, bulk_tables, face_tables, noda
 INNER_ITERATIONS = 8
 """Krylov iterations of a cycle: a solve that ends within them waits for their end, on average half of them."""
 PENALTY = 1.0
-"""Of all presses: their own are in `Presses.sharpness`."""
+"""What kernels multiply `Indenters.sharpness` by, which here is a press's contact stiffness, E per mm."""
 LINE_SEARCH_TRIALS = 2
 """Trials of the line search in a cycle; a lane that needs more goes on in the next."""
 

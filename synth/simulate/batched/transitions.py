@@ -143,7 +143,7 @@ def evaluate_trial(lanes: Lanes, settings: Settings):
 
 @wp.func
 def _is_deep(lanes: Lanes, presses: Presses, s: int) -> bool:
-    """Whether an object is deeper in the gel than DEEP; at a pass, before it."""
+    """Whether the gel reaches further into an object than DEEP; during a pass, before it."""
     j = lanes.press[s]
     return presses.kind[j] == MESH and lanes.deepest[s] > DEEP * presses.deepest[j]
 
