@@ -28,7 +28,7 @@ from gelflow.ops.gaussian import SeparableFilter, smoother, window_sums
 from gelflow.ops.spline import SplineImage
 from gelflow.ops.warp import pixel_indices, positions
 
-CURVATURE = 0.14
+CURVATURE = 0.1
 """Fitted to the errors of the shipped network on synthetic pairs by `python -m benchmarks sigma`."""
 SMOOTHING_PX = 2.0
 """Standard deviation of the Gaussian under which sigma^2 is smoothed."""

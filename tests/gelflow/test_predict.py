@@ -181,5 +181,5 @@ def test_what_is_uncertain_is_in_the_file_and_grey_in_the_picture(tmp_path: Path
     np.testing.assert_array_equal((shown == UNKNOWN_COLOUR).all(axis=-1), found.sigma > UNKNOWN_PX)
     assert np.median(found.sigma[:, :48]) < 0.1
     # Near the last marks, their window still counts.
-    assert (found.sigma[:, 88:] > UNKNOWN_PX).mean() > 0.8
+    assert (found.sigma[:, 100:] > UNKNOWN_PX).mean() > 0.8
     assert result.motions[0].unknown == pytest.approx((found.sigma > UNKNOWN_PX).mean())
