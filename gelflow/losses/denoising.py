@@ -16,10 +16,9 @@ def denoising_loss(
 ) -> tuple[Scalar, dict[str, Tensor]]:
     """Mean of ``|V - V*| / (s + <|R - V*|>)^(1/2)`` where the true flow V* is known (not NaN).
 
-    Without the denominator, few pixels in contacts decide; without the root, all count alike, however little they err.
-
     V is the denoised flow, R the registered one, (B, 2, H, W), s its expected error; the other arguments are those of
-    the denoiser. "endpoint" and "registered" are the mean errors of V and R, px, detached.
+    the denoiser. "endpoint" and "registered" are the mean errors of V and R, px, detached. Without the denominator, few
+    pixels in contacts decide; without the root, all count alike, however little they err.
     """
     known = torch.isfinite(truth).all(dim=1, keepdim=True)
     truth = torch.where(known, truth, flow)

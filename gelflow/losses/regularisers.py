@@ -4,8 +4,7 @@ Decomposition loss (paper, eq. 3-6): the L1 norm of the parts of the flow's grad
 
 ``L_dc = w ( |e_xx| + |e_yy| + lambda_theta 2 |e_xy| + lambda_zeta 2 |omega| )`` with the linear distortion rates
 ``e_xx = u_x``, ``e_yy = v_y``, the shear distortion rate ``e_xy = (u_y + v_x) / 2``, the rotation
-``omega = (v_x - u_y) / 2`` and a weight w from the gradient of image 1. Forward differences, as in eq. 2; mean over
-the pixels that have a right and a lower neighbour. Zero for every translation.
+``omega = (v_x - u_y) / 2`` and a weight w from the gradient of image 1. Zero for every translation.
 
 The weight (paper, eq. 6) is ``1 - exp(-beta ||grad I||_1)``, ``||grad I||_1 = |I_x| + |I_y|`` as a mean over colours of
 an image in [0, 1]: strong on edges, none where there is no texture.
@@ -23,9 +22,8 @@ Edge-aware smoothness (UFlow, ARFlow), of first order the regulariser of the pap
 Zero for every translation. ARFlow's form of second order takes ``|u_xx| + |v_xx|`` and ``|u_yy| + |v_yy|`` in place of
 the first derivatives; it is zero for every affine flow.
 
-Derivatives are taken on the valid part of the pixel grid only: no value is invented beyond the border. Forward
-differences live on the (H-1) x (W-1) pixels that have a right and a lower neighbour; least-squares slopes over 3x3
-windows (the Prewitt operator over 6) on the (H-2) x (W-2) pixels that have all eight.
+No value is invented beyond the border. Forward differences (eq. 2) live on the (H-1) x (W-1) pixels that have a right
+and a lower neighbour, least-squares slopes over 3x3 windows on the (H-2) x (W-2) pixels that have all eight.
 """
 
 import torch

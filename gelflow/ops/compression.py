@@ -1,8 +1,7 @@
 """Compression of images by quantised block transforms, as in JPEG, MPEG-4 and H.263.
 
 Luma and, at half the resolution, chroma are cut into blocks of 8 px. The coefficients of a block's cosine transform are
-rounded to multiples of a step (Wallace, "The JPEG still picture compression standard", 1991; one step for all
-frequencies, as H.263 has it). Motion compensation between frames is left out.
+rounded to multiples of a step (Wallace 1991), of one for all frequencies as in H.263. Frames are not predicted.
 """
 
 import math
@@ -20,10 +19,7 @@ COLOURS = ((0.299, 0.587, 0.114), (-0.1687, -0.3313, 0.5), (0.5, -0.4187, -0.081
 
 
 def compressed(images: Images, steps: Tensor) -> Images:
-    """Images (B, 3, H, W) in [0, 1], quantised with steps (B,) in units of the brightest value.
-
-    A step of 0 leaves an image as it is; any other also halves the chroma's resolution.
-    """
+    """Images (B, 3, H, W) in [0, 1], quantised with steps (B,) in units of white; a step of 0 changes nothing."""
     height, width = images.shape[-2:]
     to_luma, to_colours = _colour_matrices(images.device, images.dtype)
     luma, chroma = torch.einsum("ij,bjhw->bihw", to_luma, images).split([1, 2], dim=1)

@@ -5,15 +5,9 @@ additional 800 epochs using the validation dataset" and says no more, so everyth
 self-supervised losses, whole images at the network's size, batches of 4, a constant rate.
 
 Losses, gradient clipping, flips, weight decay and seed are those that the network's training recorded with its weights.
-Nothing else of a training carries over, whatever its preset:
-
-- exact flow is not looked at, also where the pairs have it (`supervision`);
-- the pairs are neither moved nor recoloured nor cropped: these very images are to be matched, and most of a large
-  motion would leave a crop;
-- the rate is constant, so that a longer optimisation goes on with a shorter one; the peak of a falling rate is too much
-  for that and is lowered to `RATE`;
-- the weights themselves are kept, not their moving average, which few steps hardly move;
-- what belongs to the machine of the training: its devices and processes.
+Nothing else carries over. Exact flow is not looked at. The pairs are neither moved, recoloured, compressed nor cropped:
+these very images are to be matched. The rate is constant, so that a longer optimisation goes on with a shorter one; the
+peak of a falling rate is lowered to `RATE`. The weights themselves are kept, not their moving average.
 
 Registration has no part in the training steps. The copy keeps what its weights had, and is used with what was asked of
 the network that it came from.
@@ -55,6 +49,7 @@ def fine_tuning_settings(method: Learned, steps: int, pairs: int) -> TrainConfig
         "crop_size": None,
         "motion": None,
         "color_jitter": 0.0,
+        "compression": 0.0,
         "ema_decay": 0.0,
         "schedule": "constant",
         "warmup_steps": 0,

@@ -20,8 +20,7 @@ across and in the plane of incidence. The lens takes the mean of their inverses,
 of that point least; both are e + b / n where the axis is at right angles to the window. (W. T. Welford, Aberrations of
 Optical Systems, 1986.)
 
-The radiance of a pixel is the plain mean over the pupil. The fall-off of light across the image is the camera's
-`vignetting`, as for a pinhole. The LEDs take nothing out of the cone of rays.
+The radiance of a pixel is the plain mean over the pupil; LEDs block no ray. Light falls off by `vignetting`.
 """
 
 from dataclasses import dataclass

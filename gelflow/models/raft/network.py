@@ -1,27 +1,15 @@
 """The RAFT network (Teed, Deng: RAFT: Recurrent All-Pairs Field Transforms for Optical Flow, ECCV 2020).
 
-Features of both images and context of the first at an eighth of the resolution, all-pairs correlation, then a number
-of recurrent updates of the flow, which starts at zero. The result is brought to full resolution bilinearly (small
-network: corner pixels map to corner pixels, as its weights were trained) or as a learned convex combination of 3x3
-neighbours (large network).
+Features of both images and context of the first at an eighth of the resolution (section 3.1), all-pairs correlation
+(section 3.2), then a number of recurrent updates of the flow, which starts at zero. The result is brought to full
+resolution bilinearly (small network: corner pixels map to corner pixels, as its weights were trained) or as a learned
+convex combination of 3x3 neighbours (large network). It runs published weights, for comparison; names of submodules are
+theirs (`gelflow.models.raft.weights`). Memory grows with the square of the number of pixels: 120 MB for 640 x 480 px.
 
-What it cannot do: learn here; it runs published weights, for comparison. Memory grows with the square of the number
-of pixels: a pair of 640 x 480 px holds 4800^2 correlations and their pyramid, 120 MB.
-
-Encoder (Teed and Deng 2020, section 3.1): features at an eighth of the image's resolution.
-
-A strided 7x7 convolution, three stages of two residual units each (the second and third stage halve the resolution
-once more), and a 1x1 convolution. The large network's units are two 3x3 convolutions, the small one's are bottlenecks
-with a quarter of the channels. Names of submodules are those of the published weights, see
-`gelflow.models.raft.weights`.
-
-Correlation and its lookup (Teed and Deng 2020, section 3.2).
-
-``C(x, y) = <f1(x), f2(y)> / sqrt(channels)`` for every pixel x of image 1 and y of image 2, at four resolutions of
-image 2: level k is the mean over blocks of 2^k x 2^k pixels y. The lookup reads C(x, .) bilinearly on a grid of
-(2 r + 1)^2 unit steps of each level around the point that x has moved to; outside the image it reads zero.
-
-Two conventions that the published weights were trained with, and that differ from the rest of gelflow:
+Correlation ``C(x, y) = <f1(x), f2(y)> / sqrt(channels)`` is taken at four resolutions of image 2: level k is the mean
+over blocks of 2^k x 2^k pixels y. The lookup reads C(x, .) bilinearly on a grid of (2 r + 1)^2 unit steps of each level
+around the point that x has moved to; outside the image it reads zero. Two conventions of the published weights differ
+from the rest of gelflow:
 
 - Positions are pixel *indices* at every level: index i of level 0 is read at index i / 2^k of level k, although the
   centre of its block lies at (i + 1/2) / 2^k - 1/2.
