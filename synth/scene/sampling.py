@@ -21,7 +21,7 @@ from synth.scene.validation import validated
 
 TRAJECTORY_PARTS = ("contact", "motion")
 """Drawn anew for every trajectory; everything else belongs to the sensor."""
-MAX_DRAWS = 12
+MAX_DRAWS = 10
 """Most draws of a sensor, and of a trajectory on it, an object's retries included, before the samples are given up."""
 
 
