@@ -1,7 +1,7 @@
-"""Compression of images by quantised block transforms, as in JPEG, MPEG-4 and H.263.
+"""Compression of single images by quantised block transforms, as in JPEG, MPEG-4 and H.263.
 
 Luma and, at half the resolution, chroma are cut into blocks of 8 px. The coefficients of a block's cosine transform are
-rounded to multiples of a step (Wallace 1991), of one for all frequencies as in H.263. Frames are not predicted.
+rounded to multiples of one step (G. K. Wallace, The JPEG still picture compression standard, 1991).
 """
 
 import math
