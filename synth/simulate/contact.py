@@ -10,13 +10,14 @@ slip along the trial direction τ outside. A point that touches during a load st
 place y_0 and gap g_0 > 0 before the step, at a = y - ρ (y - y_0), ρ = -g / (g_0 - g). Linearisation (H is the
 derivative of n, D = -∂m/∂x):
 
-    D = ε I,  for a new point  ε (ρ I - g_0 / (g_0 - g)² (y - y_0) n^T)
-    -∂(t_n n)/∂x = ε n n^T - t_n H
-    -∂(P m)/∂x   = A = P D + (n.m) H + n (H m)^T                              stick
-    -∂t_T/∂x     = μ ε τ n^T + (μ t_n / |P m|) (I - τ τ^T) A                  slip
+    D = ε I,  for a new point  ε (ρ I - s g_0 / (g_0 - g)² (y - y_0) n^T)
+    -∂(t_n n)/∂x = s ε n n^T - t_n H
+    -∂(P m)/∂x   = A = P D + (n.m) H + n (H^T m)^T                            stick
+    -∂t_T/∂x     = μ s ε τ n^T + (μ t_n / |P m|) (I - τ τ^T) A                slip
 
-The linear solver takes a symmetric matrix and what is left over apart (`synth.simulate.linear`): the symmetric share is
-that of all terms but μ ε τ n^T and the (y - y_0) n^T in D. Tractions are per undeformed area. Anchors and λ_T live in
+The gap's gradient is s n. For a true distance s = 1 and H is symmetric, for a mesh's interpolated one only nearly. The
+linear solver takes a symmetric matrix and what is left over apart (`synth.simulate.linear`): the symmetric share is
+that of all terms but μ s ε τ n^T and the (y - y_0) n^T in D. Tractions are per undeformed area. Anchors and λ_T live in
 the indenter's frame and so turn with it. Without friction none of this state is touched. Which points slipped is asked
 again where multipliers are updated (`synth.simulate.multipliers`) and where the slip ratio is summed (`System`, and
 `synth.simulate.batched.reductions`).
@@ -206,8 +207,8 @@ def contact_stiffness(
 ):
     """One thread per (sample, face): -∂t/∂x at its points, as a symmetric matrix and what is left over.
 
-    touching: (B, f) 0: nothing touches, the matrices are not written; 1: without friction; 2: with friction. max_turn:
-    most (rad) that H turns a mesh's normal over what a point is deeper than its multiplier says; infinite: as it is.
+    touching: (B, f) 0: nothing touches, the matrices are not written; 1: nothing is left over; 2: something is.
+    max_turn: most (rad) that H turns a mesh's normal over what a point is deeper than its multiplier says.
     """
     s, f = wp.tid()
     touching[s, f] = 0
@@ -230,13 +231,15 @@ def contact_stiffness(
         pressure = state.normal[s, f, q] - stiffness * d[3]
         if pressure > wp.float64(0.0):
             n = rotation * wp.vec3d(d[0], d[1], d[2])
-            local = normal_derivative(indenters.kind[s], indenters.shape[s], y, s, indenters.coefficients)
+            local, steep = normal_derivative(indenters.kind[s], indenters.shape[s], y, s, indenters.coefficients)
             H = rotation * local * wp.transpose(rotation)
+            touching[s, f] = wp.max(touching[s, f], 1)
             if indenters.kind[s] == 5:
+                touching[s, f] = 2
                 whole = state.normal[s, f, q] + max_turn * stiffness / wp.max(wp.sqrt(wp.ddot(H, H)), TINY)
                 H = wp.min(whole / pressure, wp.float64(1.0)) * H
-            block = stiffness * wp.outer(n, n) - pressure * H
-            touching[s, f] = wp.max(touching[s, f], 1)
+            block = (stiffness * steep) * wp.outer(n, n) - pressure * H
+            remainder[s, f, q] = half * (block - wp.transpose(block))
             anchor = anchor_of(state, y, d[3], s, f, q)
             if friction > wp.float64(0.0) and anchor[3] > wp.float64(0.0):
                 touching[s, f] = 2
@@ -245,21 +248,21 @@ def contact_stiffness(
                 length = wp.length(tangential)
                 limit = friction * pressure
                 P = identity - wp.outer(n, n)
-                A = (stiffness * anchor[3]) * P + wp.dot(n, m) * H + wp.outer(n, H * m)
+                A = (stiffness * anchor[3]) * P + wp.dot(n, m) * H + wp.outer(n, wp.transpose(H) * m)
                 fresh = zero
                 if state.anchored[s, f, q] == 0:
                     before = state.gap[s, f, q]
-                    slope = before / ((before - d[3]) * (before - d[3]))
+                    slope = steep * before / ((before - d[3]) * (before - d[3]))
                     fresh = (-stiffness * slope) * wp.outer(P * (rotation * (y - state.place[s, f, q])), n)
                 onto = identity
                 rest = zero
                 if length > limit:
                     tau = tangential / length
                     onto = (limit / length) * (identity - wp.outer(tau, tau))
-                    rest = (friction * stiffness) * wp.outer(tau, n)
+                    rest = (friction * stiffness * steep) * wp.outer(tau, n)
                 A = onto * A
                 mean = half * (A + wp.transpose(A))
-                remainder[s, f, q] = rest + onto * fresh + (A - mean)
+                remainder[s, f, q] += rest + onto * fresh + (A - mean)
                 block += mean
             symmetric[s, f, q] = half * (block + wp.transpose(block))
 

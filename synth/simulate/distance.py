@@ -190,14 +190,13 @@ def _grid(y: wp.vec3d, shape: shape_vector, s: int, coefficients: wp.array4d(dty
 
 
 @wp.func
-def _grid_normal_derivative(
-    y: wp.vec3d, shape: shape_vector, s: int, coefficients: wp.array4d(dtype=wp.float64)
-) -> wp.mat33d:
-    """Derivative of the normal within the grid: (I - n n^T) H / |g| with the spline's gradient g and Hessian H."""
+def _grid_normal_derivative(y: wp.vec3d, shape: shape_vector, s: int, coefficients: wp.array4d(dtype=wp.float64)):
+    """Derivative of the normal within the grid, (I - n n^T) H / |g| with the spline's gradient g and Hessian H; |g|."""
     _value, slope, d, m = _spline(_in_grid(y, shape), shape, s, coefficients)
     hessian = wp.mat33d(d[0], m[2], m[1], m[2], d[1], m[0], m[1], m[0], d[2])
     n = _unit(slope, wp.vec3d(ZERO, ZERO, ONE))
-    return (hessian - wp.outer(n, hessian * n)) / (shape[4] * wp.max(wp.length(slope), TINY))
+    length = wp.max(wp.length(slope), TINY)
+    return (hessian - wp.outer(n, hessian * n)) / (shape[4] * length), length / shape[4]
 
 
 @wp.func
@@ -225,14 +224,15 @@ def signed_distance(
 
 
 @wp.func
-def normal_derivative(
-    kind: int, shape: shape_vector, y: wp.vec3d, s: int, coefficients: wp.array4d(dtype=wp.float64)
-) -> wp.mat33d:
-    """Symmetrised derivative of the normal (1/mm): of shapes by central differences of it (error about 1e-9)."""
+def normal_derivative(kind: int, shape: shape_vector, y: wp.vec3d, s: int, coefficients: wp.array4d(dtype=wp.float64)):
+    """Derivative of the normal (1/mm), of shapes by central differences of it (error about 1e-9), of meshes not quite
+    symmetric; and the length of the distance's gradient, of meshes not quite 1.
+    """
     h = wp.float64(1.0e-5)
     columns = wp.mat33d()
+    steepness = ONE
     if kind == 5:
-        columns = _grid_normal_derivative(y, shape, s, coefficients)
+        columns, steepness = _grid_normal_derivative(y, shape, s, coefficients)
     else:
         for i in range(3):
             step = wp.vec3d(ZERO, ZERO, ZERO)
@@ -241,4 +241,5 @@ def normal_derivative(
             behind = signed_distance(kind, shape, y - step, s, coefficients)
             for j in range(3):
                 columns[j, i] = (ahead[j] - behind[j]) / (wp.float64(2.0) * h)
-    return wp.float64(0.5) * (columns + wp.transpose(columns))
+        columns = wp.float64(0.5) * (columns + wp.transpose(columns))
+    return columns, steepness

@@ -29,10 +29,10 @@ MAX_ROUGH_ITERATIONS = 5
 ROUGH_ABOVE = 1e-5
 """A tolerance above it is reached with rough directions."""
 NEAR = 1e-2
-"""Relative residual below which the equilibrium is near: directions are exact for a smaller tolerance, and a solve may
-take up to twice its iterations, so that rounding does not decide whether the last of them met the tolerance."""
+"""Relative residual below which the equilibrium is near: MAX_TURN ends, directions are exact for a smaller tolerance,
+and a solve may take up to twice its iterations, so that rounding does not decide whether the last met the tolerance."""
 MAX_TURN = 0.1
-"""`max_turn` of `contact_stiffness`: iterates are far deeper in edges than equilibria; H misleads there."""
+"""`max_turn` of `contact_stiffness` until NEAR: iterates are far deeper in edges than equilibria; H misleads there."""
 SHORTEST = 1 / 1024
 """Shortest step of the line search."""
 FORCE_FLOOR = 1e-6
@@ -83,7 +83,8 @@ def solve(
         if stalled or iterations == 2 * limit or (iterations >= limit and relative > NEAR):
             break
         rough = iterations < MAX_ROUGH_ITERATIONS and (tolerance > ROUGH_ABOVE or relative > NEAR)
-        step = system.newton_step(system.tangent(state, indenter, turn=MAX_TURN), residual.free, rough)
+        turn = MAX_TURN if relative > NEAR else np.inf
+        step = system.newton_step(system.tangent(state, indenter, turn=turn), residual.free, rough)
         found = _line_search(system, state, residual, step, indenter) if np.isfinite(step.u).all() else None
         if found is None:
             break

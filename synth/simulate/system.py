@@ -173,7 +173,7 @@ class System:
         return np.asarray(np.concatenate([force.numpy().ravel(), np.zeros_like(before.p)])[self.free])
 
     def _unsymmetric(self) -> Any:
-        """The remainder of friction as a sparse matrix, or None where there is none."""
+        """What contact leaves over as a sparse matrix, or None where nothing is."""
         rubbing = np.flatnonzero(self._touching.numpy()[0] == 2)
         if len(rubbing) == 0:
             return None
@@ -194,10 +194,7 @@ class System:
         self._linear_solver.forget()
 
     def newton_step(self, tangent: Tangent, residual: FloatArray, rough: bool = False) -> Unknowns:
-        """-K^-1 r for a residual r (k,) of the free unknowns; NaN where the matrix is singular.
-
-        rough: whether a rough direction is enough (`synth.simulate.linear.LinearSolver`).
-        """
+        """-K^-1 r, r (k,) of the free unknowns, NaN where K is singular; rough: see `linear.LinearSolver.solve`."""
         moves = 3 * len(self.space.points)
         full = np.zeros(moves + (self.space.pressures if self.mixed else 0))
         matrix = self.matrix(tangent.values)
@@ -229,10 +226,7 @@ class System:
         return max(0.0, -float(self.gap.numpy().min()))
 
     def slip_ratio(self, indenter: Indenters) -> float:
-        """Area of the points that slip at the last residual over that of all touching points; 0 without any.
-
-        Without friction everything that touches slips.
-        """
+        """Area of the points that slip (without friction all) at the last residual over all touching ones', or 0."""
         weight, traction = self._faces.weight.numpy(), self.traction.numpy()[0]
         along = np.linalg.norm(self.tangential.numpy()[0], axis=2)
         pressure = np.sqrt(np.maximum((traction**2).sum(axis=2) - along**2, 0.0))

@@ -34,7 +34,7 @@ def test_tangent_is_the_derivative_of_the_residual(friction: float, shape: str, 
     made = touch(friction, shape, fresh=fresh, element=element)
     body = made.body
     tangent = body.tangent(made.state, made.indenters)
-    assert (tangent.remainder is None) == (friction == 0)
+    assert (tangent.remainder is None) == (friction == 0 and shape != "mesh")
     matrix = dense(body, tangent)
     rng = np.random.default_rng(3)
     for _ in range(3):

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,13 +19,21 @@ SLIP, STICK = 0.05, 10.0
 """Friction coefficients at which, with the random anchors below, nearly every point slips or sticks."""
 INDENTERS: dict[str, dict[str, Any]] = {
     "sphere": {"shape": "sphere", "radius_mm": RADIUS, "rotation_deg": [10.0, 20.0, 30.0]},
+    "mesh": {
+        "shape": "mesh",
+        "file": str(Path(__file__).parents[2] / "scenes/objects/cube.stl"),
+        "size_mm": 2.4,
+        "cell_mm": 0.3,
+        "fillet_mm": 0.4,
+        "rotation_deg": [10.0, 20.0, 30.0],
+    },
     "torus": {"shape": "torus", "radius_mm": 0.9, "tube_mm": 0.4, "rotation_deg": [10.0, 20.0, 30.0]},
 }
 
 
 @dataclass
 class Touch:
-    """A gel pressed by a turned ball or ring."""
+    """A gel pressed by a turned ball, cube or ring."""
 
     body: System
     state: Unknowns
