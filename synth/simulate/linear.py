@@ -1,6 +1,6 @@
 """Linear systems of Newton's method: a sparse direct factor of the symmetric part, and GMRES for what it leaves.
 
-The tangent is A = S + R: S symmetric (its upper triangle is kept), R the unsymmetric remainder of friction, which has
+The tangent is A = S + R: S symmetric (its upper triangle is kept), R the unsymmetric remainder of contact, which has
 entries at touching faces only. S is factorised in single precision, which halves the time; flexible GMRES (Saad 1993)
 in double precision, preconditioned by the factor, takes away the rounding of the factor and R. Pardiso (through
 pypardiso's MKL) where there is one, else SuperLU in double precision. The pattern is analysed once per mesh.

@@ -226,7 +226,7 @@ class System:
         return max(0.0, -float(self.gap.numpy().min()))
 
     def slip_ratio(self, indenter: Indenters) -> float:
-        """Area of the points that slip (without friction all) at the last residual over all touching ones', or 0."""
+        """Share of the touching area that slips at the last residual: all without friction, 0 without contact."""
         weight, traction = self._faces.weight.numpy(), self.traction.numpy()[0]
         along = np.linalg.norm(self.tangential.numpy()[0], axis=2)
         pressure = np.sqrt(np.maximum((traction**2).sum(axis=2) - along**2, 0.0))
