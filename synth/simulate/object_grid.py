@@ -138,7 +138,7 @@ class Grid:
             if len(contour.faces):
                 cores.append((Nearest(contour), radius_mm))
                 away = self.distance(cores[-1][0], band)
-                found = np.minimum(found, np.where(core <= 0, -away, away) - radius_mm)
+                found = np.where(band, np.minimum(found, np.where(core <= 0, -away, away) - radius_mm), found)
             lost = (values <= 0) & (found > LOST * radius_mm)
             if radius_mm == 0 or not lost.any():
                 return cores, found
