@@ -164,4 +164,4 @@ def test_every_truncation_and_damaged_pixels_are_named(path, capfd):
 def test_foreign_file_is_named(tmp_path, content):
     (tmp_path / "other.exr").write_bytes(content)
     refused(r"other\.exr", read_channels, tmp_path / "other.exr")
-    refused(r"missing\.exr.*No such file", read_channels, tmp_path / "missing.exr")
+    refused(r"missing\.exr.*there is no such file", read_channels, tmp_path / "missing.exr")
