@@ -11,7 +11,7 @@ from PIL import Image
 
 import gelflow
 
-image1, image2 = (np.asarray(Image.open(path).convert("RGB")) for path in sys.argv[1:3])  # uint8, (H, W, 3)
+image1, image2 = (np.asarray(Image.open(path).convert("RGB")) for path in sys.argv[1:3])  # 8-bit files
 
 # %%
 model = gelflow.load_model("best", device="cpu")
