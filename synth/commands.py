@@ -254,7 +254,7 @@ def _show_plan(template: Template, variant: Variant, n: int, as_json: bool) -> i
     scale, camera = pixels_per_mm(sensor), sensor.camera
     print(
         f"picture: {camera.width} x {camera.height} px, principal point {camera.cx:.4g}, {camera.cy:.4g}, {scale:.3g} "
-        f"px per mm of the face, so {camera.width / scale:.3g} x {camera.height / scale:.3g} mm if undistorted\n"
+        f"px per mm on the gel, so {camera.width / scale:.3g} x {camera.height / scale:.3g} mm if undistorted\n"
         f"mesh: {predicted.resolution}, about {predicted.nodes} displacement nodes\n"
         + _error_line(predicted)
         + f"predicted per pair: {stages}; {predicted.bytes_per_pair / 1e6:.2f} MB\n"

@@ -158,7 +158,7 @@ def read_channels(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str | 
             header = dict(file.header())  # the library empties its own on closing
             planes = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
     except FileNotFoundError:
-        raise InputError(f"{path}: there is no such file; the same generate command makes it again") from None
+        raise InputError(f"{path}: there is no such file") from None
     except (RuntimeError, ValueError, OSError, TypeError) as error:
         raise InputError(f"{path}: cannot be decoded as OpenEXR ({error}); it is truncated or damaged") from error
     shapes = {plane.shape for plane in planes.values()}
