@@ -1,27 +1,30 @@
 """Is the flow's sigma calibrated? Fits CURVATURE of `gelflow.models.uncertainty` to exact flow.
 
-Takes data sets of synth. By scene and pattern: the share of pixels with sigma <= 0.1 px, and how many of these, and of
-those up to 1 px, err by less than sigma (68 % if calibrated). The mean distance of that share from 68 % over the scenes
-is least with the fitted constant (the window of a pixel is chosen with the present one), on pixels with sigma <= 0.1 px
-of gels with a pattern. Beside it, the error against the Cramer-Rao bound: that of a flow which is constant in the
-narrow window, from the noise that the exact flow leaves, as medians over pixels. Files of flows in `--out` are used
-again by a repeated run.
+Takes data sets of synth; px are those of the size at which images are worked on. By scene and pattern: the share of
+pixels with sigma <= 0.1 px, and how many of these, and of those up to 1 px, err by less than sigma (68 % if
+calibrated). The mean distance of that share from 68 % over the scenes is least with the fitted constant (the window of
+a pixel is chosen with the present one), on pixels with sigma <= 0.1 px of gels with a pattern. Beside it, the error
+against the Cramer-Rao bound: that of a flow which is constant in the narrow window, from the noise that the exact flow
+leaves, as medians over pixels. Files of flows in `--out` are used again by a repeated run.
 """
 
 from collections.abc import Mapping
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.rows import Row, arguments, show
-from gelflow.baselines.method import as_tensor
+from gelflow.baselines.method import as_array, as_tensor
 from gelflow.compare.metrics import endpoint_error
 from gelflow.config import RegistrationConfig
 from gelflow.data.open import open_all
 from gelflow.data.pairs import PairDataset, without_pattern
 from gelflow.models.evidence import gauss_newton
 from gelflow.models.uncertainty import CURVATURE, combined, error_squares
+from gelflow.models.working_size import working_size
+from gelflow.ops.pyramid import resize_flow, resize_images
 from gelflow.ops.spline import SplineImage
 from gelflow.predict.model import load_model
 
@@ -46,13 +49,16 @@ def pixels(dataset: PairDataset, folder: Path) -> Scenes:
         if not stored.exists():
             np.save(stored, model.flow(image1, image2))
         flow = np.load(stored)
-        exact = np.nan_to_num(truth.flow)
-        moved, true, first, second = (as_tensor(array, "cpu") for array in (flow, exact, image1, image2))
+        given = [as_tensor(array, "cpu") for array in (flow, truth.flow, image1, image2)]
+        size = working_size(given[2])
+        moved, true = (resize_flow(field, size) for field in given[:2])
+        first, second = (resize_images(image, size) for image in given[2:])
         squares = error_squares(moved, first, second)
-        counts = truth.visible & np.isfinite(truth.flow).all(axis=-1)
+        error = endpoint_error(as_array(moved), as_array(true))
+        counts = np.isfinite(error) & (cv2.resize(truth.visible.astype(np.float32), size[::-1]) == 1)
         values = [combined(*squares, factor)[0, 0].double().numpy() for factor in CURVATURES]
-        bound = gauss_newton(true, first, SplineImage(second), RegistrationConfig()).variance
-        values += [bound[0, 0].double().numpy(), endpoint_error(flow, truth.flow)]
+        bound = gauss_newton(true.nan_to_num(), first, SplineImage(second), RegistrationConfig()).variance
+        values += [bound[0, 0].double().numpy(), error]
         found.setdefault(str(record.scene), []).append(np.stack([value[counts][::EVERY] for value in values]))
         print(f"{len(found)} scenes, pair {index + 1} of {len(dataset)}", flush=True)
     return {scene: np.concatenate(parts, axis=1) for scene, parts in found.items()}

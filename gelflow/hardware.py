@@ -14,8 +14,10 @@ CPU_INFO = Path("/proc/cpuinfo")
 def chosen_device(device: str) -> str:
     """The device, "cpu" or "cuda", that an option stands for; "auto" is a CUDA device where there is one.
 
-    InputError where a CUDA device is asked for and there is none.
+    InputError where a CUDA device is asked for and there is none, and for other words.
     """
+    if device not in ("auto", "cpu", "cuda"):
+        raise InputError(f"device {device!r}; allowed: auto, cpu, cuda")
     available = torch.cuda.is_available()
     if device == "cuda" and not available:
         raise InputError("--device cuda: no CUDA device was found; use --device cpu")

@@ -1,5 +1,7 @@
-"""What the command line shows: progress bars with rate and estimate on stderr, tables on stdout."""
+"""What the command line shows: progress on stderr, a bar on a terminal, else a line now and then; tables on stdout."""
 
+import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -10,6 +12,8 @@ from rich.text import Text
 
 Advance = Callable[[int, int, str], None]
 """Takes the number of items done, the number of all, and a word on the present one."""
+LINE_S = 60.0
+"""Seconds between two lines."""
 
 
 class _Rate(ProgressColumn):
@@ -24,13 +28,28 @@ class _Rate(ProgressColumn):
 
 @contextmanager
 def progress(label: str, shown: bool = True) -> Iterator[Advance]:
-    """A progress bar on stderr while the block runs, if that is a terminal; yields the function that moves it."""
+    """Shows progress while the block runs; yields the function that moves it."""
     console = Console(stderr=True)
+    if shown and not console.is_terminal:
+        yield _lines(label)
+        return
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(), TimeRemainingColumn(),
                TextColumn("{task.fields[item]}"))  # fmt: skip
-    with Progress(*columns, console=console, disable=not (shown and console.is_terminal), transient=True) as bar:
+    with Progress(*columns, console=console, disable=not shown, transient=True) as bar:
         task = bar.add_task(label, total=None, item="")
         yield lambda done, total, item: bar.update(task, completed=done, total=total, item=item)
+
+
+def _lines(label: str) -> Advance:
+    told = time.monotonic()
+
+    def advance(done: int, total: int, item: str) -> None:
+        nonlocal told
+        if time.monotonic() - told >= LINE_S and done < total:
+            told = time.monotonic()
+            print(f"gelflow: {label}: {done} of {total}{item and f'; {item}'}", file=sys.stderr, flush=True)
+
+    return advance
 
 
 def show_table(title: str, header: list[str], rows: list[list[str]]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def predict(
-    inputs: Annotated[list[Path], Parameter(help="Two images, or one video or folder of frames.")],
+    inputs: Annotated[list[Path], Parameter(help="Two images, one video or folder of frames, or one set of pairs.")],
     /,
     *,
     out: Out,
@@ -33,15 +34,19 @@ def predict(
     device: OnDevice = "auto",
     as_json: AsJson = False,
 ) -> int:
-    """Writes the flow of two images (EXR, .flo and a picture) or of a video (EXR, motion.csv and a video)."""
+    """Writes the flow of pairs of images (EXR, .flo and a picture) or of a video (EXR, motion.csv and a video)."""
     from gelflow.baselines import named_methods
     from gelflow.baselines.learned import open_network
+    from gelflow.data.open import holds_pairs
+    from gelflow.data.pairs import PairDataset
     from gelflow.models.weights import weights_file
-    from gelflow.predict.prediction import predict_pair, predict_video
+    from gelflow.predict.prediction import predict_pair, predict_pairs, predict_video
     from gelflow.terminal import progress
 
     if len(inputs) not in (1, 2):
-        raise InputError(f"{len(inputs)} inputs given; allowed: two images, or one video or folder of frames")
+        raise InputError(
+            f"{len(inputs)} inputs given; allowed: two images, one video or folder of frames, or one set of pairs"
+        )
     for path in inputs:
         if not path.exists():
             raise InputError(f"{path}: there is no such file or folder")
@@ -59,9 +64,14 @@ def predict(
         estimator = named_methods([method], device)[0]
     if len(inputs) == 2:
         result = predict_pair(estimator, inputs[0], inputs[1], out)
+    elif holds_pairs(inputs[0]):
+        with progress("pairs", not as_json) as advance:
+            result = predict_pairs(estimator, PairDataset(inputs[0]), out, lambda n, total: advance(n, total, ""))
     else:
         with progress("frames, then overlay", not as_json) as advance:
             result = predict_video(estimator, inputs[0], out, reference, every, lambda n, total: advance(n, total, ""))
+    if result.lost:
+        print(f"gelflow: {inputs[0]}: ends {result.lost} frames early (truncated or damaged)", file=sys.stderr)
     _show(result, estimator.name, as_json)
     return 0
 
@@ -69,10 +79,10 @@ def predict(
 def _show(result: Prediction, name: str, as_json: bool) -> None:
     if as_json:
         motions = [asdict(motion) for motion in result.motions]
-        print(json.dumps({"files": [str(file) for file in result.files], "motions": motions}))
+        print(json.dumps({"files": [str(file) for file in result.files], "motions": motions, "lost": result.lost}))
         return
     largest = max(result.motions, key=lambda motion: motion.p95_px)
-    where = f" in frame {largest.frame}, the one with most motion," if len(result.motions) > 1 else ""
+    where = f" in number {largest.frame} ({largest.file}), where most moves," if len(result.motions) > 1 else ""
     print(f"{name}:{where} mean motion {largest.mean_px:.3g} px, 95th percentile {largest.p95_px:.3g} px; "
           f"unknown (sigma above 1 px) on {largest.unknown:.0%} of the picture")  # fmt: skip
     shown = result.files if len(result.files) <= 6 else [result.files[0], "...", *result.files[-3:]]

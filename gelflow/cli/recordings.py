@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 
 
 def pairs(
-    inputs: Annotated[list[str], Parameter(help="Videos, folders of videos or images, patterns like 'day1/*.mp4'.")],
+    inputs: Annotated[
+        list[str], Parameter(help="Videos, folders of videos (also below) or images, patterns like 'day1/*.mp4'.")
+    ],
     /,
     *,
     out: Out,

@@ -1,4 +1,4 @@
-"""Pictures of a comparison: measures side by side, quality against run time with its Pareto front, errors by place."""
+"""Pictures of a comparison: quality against run time with its Pareto front, and errors by place."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -12,41 +12,9 @@ from gelflow.files.atomic import replacing
 
 UNTIMED = ("no motion", "exact flow")
 """Methods that take no time worth drawing."""
-BLUE, RED = "#4477aa", "#cc6677"
+RED = "#cc6677"
 COLOURS = ("#4477aa", "#ee6677", "#228833", "#ccbb44", "#66ccee", "#aa3377", "#bbbbbb", "#000000", "#ee7733")
 MARKERS = "osD^vPX"
-
-
-def plot_means(path: Path, groups: Sequence[Group], note: str) -> None:
-    """Writes a PNG with a panel per measure, a row per method; bars are standard deviations over seeds.
-
-    The note says what the means are over.
-    """
-    candidates: list[tuple[str, str, float, bool]] = [
-        ("PSNR (dB), more is better", "psnr_db", 1, False),
-        ("SSIM, more is better", "ssim", 1, False),
-        ("endpoint error (px), less is better", "endpoint_error_px", 1, True),
-        ("distance from dots (px), less is better", "dot_distance_px", 1, True),
-        ("ms per pair (CPU: of one core)", "cost_seconds", 1000, True),
-    ]
-    panels = [panel for panel in candidates if any(group.mean(panel[1]) is not None for group in groups)]
-    figure, axes = _figure(len(panels), 3.2 * len(panels) + 1.5, 0.45 * len(groups) + 1.3, sharey=True)
-    for axis, (label, field, factor, logarithmic) in zip(axes, panels, strict=True):
-        axis.set_xscale("log" if logarithmic else "linear")
-        for place, group in enumerate(groups):
-            value, spread = group.mean(field), group.spread(field)
-            if value is None or not math.isfinite(value) or (logarithmic and value <= 0):
-                continue
-            bar = None if spread is None else factor * spread
-            axis.errorbar(factor * value, place, xerr=bar, fmt="o", color=BLUE, capsize=3)
-            text = f"{factor * value:.4g}" if factor * value < 1000 else f"{factor * value:.0f}"
-            axis.annotate(text, (factor * value, place), (0, 6), textcoords="offset points", ha="center", fontsize=8)
-        axis.margins(x=0.2)
-        axis.set_title(label, fontsize=9)
-        axis.xaxis.set_minor_formatter("")
-    axes[0].set_yticks(range(len(groups)), [group.label for group in groups])
-    axes[0].set_ylim(len(groups) - 0.4, -0.8)
-    _save(figure, path, f"means over {note}")
 
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
@@ -136,11 +104,11 @@ def _legend(axis: Any) -> None:
         axis.legend(fontsize=7.5, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
-def _figure(panels: int, width: float, height: float, sharey: bool = False) -> tuple[Any, Any]:
+def _figure(panels: int, width: float, height: float) -> tuple[Any, Any]:
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), dpi=110, layout="constrained")
-    return figure, figure.subplots(1, panels, sharey=sharey, squeeze=False)[0]
+    return figure, figure.subplots(1, panels, squeeze=False)[0]
 
 
 def _save(figure: Any, path: Path, title: str) -> None:

@@ -6,15 +6,16 @@ from dataclasses import fields
 from pathlib import Path
 
 from gelflow.baselines.learned import Learned, PublishedRaft
-from gelflow.baselines.method import Method
+from gelflow.baselines.method import Method, as_tensor
 from gelflow.compare.comparison import Comparison
-from gelflow.compare.plots import plot_means, plot_strata, plot_work_precision
+from gelflow.compare.plots import plot_strata, plot_work_precision
 from gelflow.compare.scores import PairScore, evaluate
 from gelflow.compare.speed import Speed, network_speed
 from gelflow.compare.tables import Table, tables, with_pattern
 from gelflow.data.pairs import PairDataset
 from gelflow.errors import InputError
 from gelflow.files.atomic import write_csv, write_text
+from gelflow.models.working_size import working_size
 
 
 def compare(
@@ -51,8 +52,12 @@ def compare(
 def _speed(method: Method, dataset: PairDataset, batch: int) -> Speed | None:
     if batch == 0 or not isinstance(method, Learned | PublishedRaft):
         return None
-    shape = dataset.images(0)[0].shape
-    size = method.size or getattr(method.model, "image_size", None) or (shape[0], shape[1])
+    image = dataset.images(0)[0]
+    size = method.size or getattr(method.model, "image_size", None)
+    if size is None:
+        size = (
+            working_size(as_tensor(image, "cpu")) if isinstance(method, Learned) else (image.shape[0], image.shape[1])
+        )
     return network_speed(method.forward, size, batch, method.device)
 
 
@@ -69,7 +74,7 @@ def _check_out(out: Path, dataset: PairDataset) -> None:
 
 
 SCORES = "scores.json"
-FILES = ("scores.csv", "strata.csv", SCORES, "table.md", "table.tex", "table.png", "work_precision.png", "strata.png")
+FILES = ("scores.csv", "strata.csv", SCORES, "table.md", "table.tex", "work_precision.png", "strata.png")
 """What `write_report` writes; strata.csv and strata.png where some pair has an exact flow."""
 
 _LATEX = {"%": r"\%", "_": r"\_", "&": r"\&", "#": r"\#", ">": r"$>$", "±": r"$\pm$", "×": r"$\times$"}
@@ -107,7 +112,6 @@ def write_report(out: Path, comparison: Comparison) -> None:
     write_text(out / "table.tex", "\n".join(latex(title, table) for title, table in found))
     groups, pairs = with_pattern(comparison)
     note = f"{pairs} pairs" if pairs == len(comparison.pairs) else f"{pairs} pairs of gels with a pattern"
-    plot_means(out / "table.png", groups, note)
     plot_work_precision(out / "work_precision.png", groups, f"{note}; {comparison.devices}")
     if any(comparison.strata.values()):
         rows = [[name, s.kind, s.bin, s.pixels, s.error_px / s.pixels, s.above_1px / s.pixels, s.above_01px / s.pixels]

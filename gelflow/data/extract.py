@@ -28,9 +28,9 @@ Progress = Callable[[int, int, str, SourceReport | str], None]
 def find_recordings(inputs: Sequence[str]) -> dict[str, Path]:
     """Recordings among files, folders and glob patterns, by name, sorted by path.
 
-    A folder stands for the videos in it; if it holds none, for its images as one recording; if it holds neither, for
-    each of its folders of images. InputError where a path does not exist, a pattern matches nothing, or a folder holds
-    nothing to read.
+    A folder stands for all videos in it and below; if there is none, for its images as one recording, or if it has none
+    either, for each folder of images below. InputError where a path does not exist, a pattern matches nothing, or a
+    folder holds nothing to read.
     """
     paths: set[Path] = set()
     for given in inputs:
@@ -40,14 +40,13 @@ def find_recordings(inputs: Sequence[str]) -> dict[str, Path]:
         for match in matches:
             paths.update(_recordings_at(match))
     ordered = sorted(paths)
-    names = [path.stem if path.is_file() else path.name for path in ordered]
-    if len(set(names)) < len(names):
-        names = ["__".join(path.with_suffix("").parts[-2:]) if path.is_file() else "__".join(path.parts[-2:])
-                 for path in ordered]  # fmt: skip
-    repeated = sorted({name for name in names if names.count(name) > 1})
-    if repeated:
-        raise InputError(f"two recordings are called {repeated[0]}; rename one, or make two pair sets")
-    return dict(zip(names, ordered, strict=True))
+    parts = [(path.with_suffix("") if path.is_file() else path).parts for path in ordered]
+    for depth in range(1, max(map(len, parts)) + 1):
+        names = ["__".join(part[-depth:]) for part in parts]
+        if len(set(names)) == len(names):
+            return dict(zip(names, ordered, strict=True))
+    repeated = sorted(name for name in names if names.count(name) > 1)
+    raise InputError(f"two recordings are called {repeated[0]}; rename one, or make two pair sets")
 
 
 def _recordings_at(path: Path) -> list[Path]:
@@ -55,15 +54,13 @@ def _recordings_at(path: Path) -> list[Path]:
         if path.suffix.lower() not in SUFFIXES:
             raise InputError(f"{path}: not a video; allowed: {', '.join(sorted(SUFFIXES))}, or a folder of images")
         return [path]
-    videos = [p for p in path.iterdir() if p.suffix.lower() in SUFFIXES and p.is_file()]
-    if videos:
-        return videos
-    if image_files(path):
-        return [path]
-    folders = [p for p in path.iterdir() if p.is_dir() and image_files(p)]
-    if not folders:
+    below = sorted(p for p in path.rglob("*") if not any(part.startswith(".") for part in p.relative_to(path).parts))
+    found = [p for p in below if p.suffix.lower() in SUFFIXES and p.is_file()]
+    found = found or [path for _ in image_files(path)[:1]]
+    found = found or [p for p in below if p.is_dir() and image_files(p)]
+    if not found:
         raise InputError(f"{path}: the folder holds neither videos ({', '.join(sorted(SUFFIXES))}) nor images")
-    return folders
+    return found
 
 
 def extract_pairs(inputs: Sequence[str], out: Path, config: ChoiceConfig, progress: Progress | None = None) -> PairSet:

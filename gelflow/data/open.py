@@ -10,6 +10,7 @@ from gelflow.data.pairset import pair_set_records
 from gelflow.data.shards import shard_files, shard_records
 from gelflow.data.synthetic import is_synthetic, synthetic_records
 from gelflow.errors import InputError
+from gelflow.files.video import image_files
 
 
 def pair_records(folder: Path) -> list[PairRecord]:
@@ -33,6 +34,15 @@ def pair_records(folder: Path) -> list[PairRecord]:
         f"{folder}: the folder {content}; allowed: a data set of synth (dataset.json), a pair set of "
         "`python -m gelflow pairs` (pairs.json), shards (*.tar), or files NAME_1.png and NAME_2.png"
     )
+
+
+def holds_pairs(path: Path) -> bool:
+    """Whether a file or folder holds pairs rather than a recording; of a folder of images, all must be of pairs."""
+    if shard_files(path) or (path / PAIR_SET_FILE).is_file() or is_synthetic(path):
+        return True
+    images = image_files(path) if path.is_dir() else []
+    names = {image.name[: -len("_1.png")] for image in images if image.name.endswith(("_1.png", "_2.png"))}
+    return bool(names) and len(images) == 2 * len(names)
 
 
 def open_all(paths: Sequence[Path]) -> PairDataset:

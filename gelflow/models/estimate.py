@@ -9,6 +9,7 @@ from gelflow.config import MINIMUM_SIDE
 from gelflow.errors import InputError
 from gelflow.models import GelFlow
 from gelflow.models.gelflow import check_shapes
+from gelflow.models.working_size import working_size
 from gelflow.ops.pyramid import resize_flow, resize_images
 
 
@@ -23,9 +24,9 @@ def estimate_flow(
 
     Images are (B, 3, H, W) float32 in [0, 1]. The network is used on the device that it is on, in evaluation mode, and
     left as it was; `size`, rows and columns at which it works, is by default that to which its training images were
-    resized (`GelFlow.image_size`), or where they were not, the given images'. `flow` is called in place of
-    `GelFlow.flow`, such as a `RecordedNetwork` of the model. InputError for shapes that differ, sides below 64 px where
-    no size is given, other than three colours, values that are not finite.
+    resized (`GelFlow.image_size`), or where they were not, `working_size`. `flow` is called in place of `GelFlow.flow`,
+    such as a `RecordedNetwork` of the model. InputError for shapes that differ, sides below 64 px where no size is
+    given, other than three colours, values that are not finite.
     """
     size = size or model.image_size
     if size is not None and min(size) < MINIMUM_SIDE:
@@ -37,7 +38,9 @@ def estimate_flow(
             raise InputError(f"{name} holds NaN or infinite values; images must be finite, in [0, 1]")
     device = next(model.parameters()).device
     native = (image1.shape[-2], image1.shape[-1])
-    inputs = [resize_images(image.to(device, torch.float32), size or native) for image in (image1, image2)]
+    given = [image.to(device, torch.float32) for image in (image1, image2)]
+    size = size or working_size(given[0])
+    inputs = [resize_images(image, size) for image in given]
     was_training = model.training
     model.eval()
     try:

@@ -1,4 +1,4 @@
-"""Flow of a pair of images or of a video, written as EXR, Middlebury .flo and pictures."""
+"""Flow of pairs of images or of a video, written as EXR, Middlebury .flo and pictures."""
 
 import os
 import re
@@ -14,10 +14,10 @@ import numpy as np
 
 from gelflow.arrays import Bytes3, ImageArray
 from gelflow.baselines.method import Method, uncertainty
+from gelflow.data.pairs import PairDataset, PairRecord
 from gelflow.errors import InputError
 from gelflow.files.atomic import refuse_foreign, write_csv
 from gelflow.files.exr import DIRECTIONS, read_flow, write_flo, write_flow
-from gelflow.files.image import read_pair
 from gelflow.files.quiet import quiet
 from gelflow.files.video import describe, frame_file, frames, image_files
 from gelflow.models.uncertainty import UNKNOWN_PX
@@ -29,9 +29,10 @@ Reference = Literal["first", "previous"]
 
 @dataclass(frozen=True)
 class Motion:
-    """Length of the flow, its mean and percentiles, to a frame of a video (1 for a pair), and the method's run time.
+    """Length of the flow, its mean and percentiles over the picture, and the method's run time.
 
-    `unknown` is the share of the picture in which sigma is above 1 px.
+    `frame` is that of a video, or the number of a pair from 1 on; `unknown` is the share of the picture in which sigma
+    is above 1 px.
     """
 
     frame: int
@@ -45,10 +46,11 @@ class Motion:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What `predict` did: the files it wrote, in order, and the motion of each pair of frames."""
+    """What `predict` did: the files it wrote, in order, the motion of each pair, and how many frames did not decode."""
 
     files: list[Path]
     motions: list[Motion]
+    lost: int = 0
 
 
 def predict_pair(method: Method, path1: Path, path2: Path, out: Path) -> Prediction:
@@ -57,20 +59,34 @@ def predict_pair(method: Method, path1: Path, path2: Path, out: Path) -> Predict
     NAME is what the two file names have in front of _1 and _2, else FIRST_to_SECOND. InputError where an image cannot
     be read, the two do not fit, or files of these names are somebody else's; OSError where a file cannot be written.
     """
-    image1, image2 = read_pair(path1, path2)
     stem1, stem2 = path1.stem, path2.stem
     common = stem1.removesuffix("_1")
     name = common if stem1 == f"{common}_1" and stem2 == f"{common}_2" else f"{stem1}_to_{stem2}"
-    files = [out / f"{name}{suffix}" for suffix in (".exr", ".flo", ".png")]
-    refuse_foreign(files[0], DIRECTIONS.encode(), *files[1:])
-    try:
-        found, motion = _estimate(method, image1, image2, 1, path2.name)
-    except InputError as error:
-        raise InputError(f"{path1} and {path2}, {method.name}: {error}") from error
-    write_flow(files[0], found.flow, found.visible, found.sigma)
-    write_flo(files[1], found.flow)
-    write_flow_picture(files[2], image1, image2, found.flow, found.sigma, f"{name} ({method.name})")
-    return Prediction(files, [motion])
+    return predict_pairs(method, PairDataset(path1, [PairRecord(name, path1, path2)]), out)
+
+
+def predict_pairs(
+    method: Method, dataset: PairDataset, out: Path, progress: Callable[[int, int], None] | None = None
+) -> Prediction:
+    """Writes NAME.exr, NAME.flo and NAME.png for each pair; exceptions as for `predict_pair`."""
+    files: list[Path] = []
+    motions: list[Motion] = []
+    for index, name in enumerate(dataset.names):
+        exr, flo, png = (out / f"{name}{suffix}" for suffix in (".exr", ".flo", ".png"))
+        refuse_foreign(exr, DIRECTIONS.encode(), flo, png)
+        image1, image2 = dataset.images(index)
+        try:
+            found, motion = _estimate(method, image1, image2, index + 1, name)
+        except InputError as error:
+            raise InputError(f"pair {name} of {dataset.source}, {method.name}: {error}") from error
+        write_flow(exr, found.flow, found.visible, found.sigma)
+        write_flo(flo, found.flow)
+        write_flow_picture(png, image1, image2, found.flow, found.sigma, f"{name} ({method.name})")
+        files += [exr, flo, png]
+        motions.append(motion)
+        if progress:
+            progress(index + 1, len(dataset))
+    return Prediction(files, motions)
 
 
 def predict_video(
@@ -90,7 +106,7 @@ def predict_video(
     """
     if every < 1:
         raise InputError(f"every = {every}: at least 1 is needed")
-    total = 2 * max(0, -(-describe(path).frames // every) - 1)
+    expected = max(0, -(-describe(path).frames // every) - 1)
     table, video = out / "motion.csv", out / "overlay.mp4"
     refuse_foreign(table, b"mean_px,p95_px", video)
     for earlier in _earlier_flows(out):
@@ -112,7 +128,7 @@ def predict_video(
         write_flow(files[-1], found.flow, found.visible, found.sigma)
         motions.append(motion)
         if progress:
-            progress(len(motions), total)
+            progress(len(motions), 2 * expected)
     if not motions:
         raise InputError(f"{path}: fewer than two frames decode; a flow needs two")
     write_csv(table, [column.name for column in fields(Motion)], map(astuple, motions))
@@ -123,10 +139,10 @@ def predict_video(
             field = read_flow(out / "flow" / f"{index:06d}.exr")
             yield draw_overlay(frame, certain(field.flow, field.sigma), scale)
             if progress:
-                progress(count, total)
+                progress(count, 2 * expected)
 
     _write_overlay(overlays(), video, describe(path).frames_per_second / every)
-    return Prediction([*files, table, video], motions)
+    return Prediction([*files, table, video], motions, expected - len(motions))
 
 
 def _estimate(method: Method, image1: ImageArray, image2: ImageArray, frame: int, file: str) -> tuple[Estimate, Motion]:

@@ -15,6 +15,7 @@ from safetensors.torch import load_file, save_file
 from textures import as_bytes, moved, save, write_folder, write_synthetic, write_video
 from waves import random_weights
 
+from gelflow import terminal
 from gelflow.cli import main
 from gelflow.cli.options import METHODS
 from gelflow.config import ModelConfig
@@ -85,6 +86,28 @@ def test_compare_and_predict_print_tables_files_and_json(tmp_path: Path, capsys:
     answer = json.loads(said(capsys, main, "predict", video(tmp_path / "v.avi"), *tail, "--json"))
     assert [motion["frame"] for motion in answer["motions"]] == [1, 2, 3]
     assert all(Path(file).is_file() for file in answer["files"])
+    assert "b.flo" in said(capsys, main, "predict", write_folder(tmp_path / "two", {"b": (1, 0)}), *tail)
+
+
+def test_without_a_terminal_progress_is_a_line_now_and_then(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(terminal, "LINE_S", 0.0)
+    with terminal.progress("pairs") as advance, terminal.progress("none", shown=False) as silent:
+        silent(1, 3, "")
+        advance(1, 3, "a")
+        advance(2, 3, "")
+        advance(3, 3, "c")
+    assert capsys.readouterr() == ("", "gelflow: pairs: 1 of 3; a\ngelflow: pairs: 2 of 3\n")
+
+
+def test_a_truncated_video_is_used_as_far_as_it_goes_and_said_to_be_so(tmp_path: Path, capfd) -> None:
+    whole = video(tmp_path / "v.avi").read_bytes()
+    (tmp_path / "v.avi").write_bytes(whole[: int(0.8 * len(whole))])
+    command = ["predict", str(tmp_path / "v.avi"), "--out", str(tmp_path / "out"), "--method", "farneback", "--json"]
+    assert main(command) == 0
+    out, err = capfd.readouterr()
+    answer = json.loads(out)
+    assert len(answer["motions"]) + answer["lost"] == 3
+    assert f"v.avi: ends {answer['lost']} frames early" in err
 
 
 def test_folders_that_cannot_be_used_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -62,7 +62,6 @@ def test_files_hold_every_score(tmp_path: Path) -> None:
     assert [method["method"] for method in content["methods"]] == ["no motion", "Farnebäck", "DIS medium"]
     assert content["methods"][1]["endpoint_error_px"] < content["methods"][0]["endpoint_error_px"] / 3
     assert "| DIS medium |" in (out / "table.md").read_text()
-    assert (out / "table.png").stat().st_size > 5000
 
 
 def test_numbers_that_are_not_finite_are_null_and_markers_are_scored_where_there_are_some(tmp_path: Path) -> None:

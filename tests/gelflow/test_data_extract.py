@@ -1,6 +1,7 @@
 """`pairs`: what is chosen from recordings, that it can be repeated, and what happens to broken ones."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -134,6 +135,11 @@ def test_inputs_are_found_by_file_folder_and_pattern_and_those_that_hold_nothing
     expected = [("a", videos / "a.avi"), ("b", videos / "b.avi")]
     for inputs in ([str(videos)], [f"{videos}/*.avi"], [str(videos / "b.avi"), str(videos / "a.avi")]):
         assert list(find_recordings(inputs).items()) == expected
+    for folder in ("day1/press", "day2/press", ".trash"):
+        (tmp_path / "nested" / folder).mkdir(parents=True)
+        shutil.copy(videos / "a.avi", tmp_path / "nested" / folder)
+    nested = {f"day{day}__press__a": tmp_path / "nested" / f"day{day}" / "press" / "a.avi" for day in (1, 2)}
+    assert find_recordings([str(tmp_path / "nested")]) == nested
     empty = tmp_path / "empty"
     empty.mkdir()
     (empty / "notes.txt").touch()

@@ -10,17 +10,19 @@ import pytest
 import torch
 from commands import refused
 from samples import synth_sample, write_dataset
-from textures import as_bytes, moved, save, table, write_folder, write_video
+from textures import as_bytes, moved, save, table, write_folder, write_synthetic, write_video
 
 import gelflow
 from gelflow.baselines import named_methods
 from gelflow.baselines.learned import Learned
+from gelflow.data.open import holds_pairs
+from gelflow.data.pairs import PairDataset
 from gelflow.files.exr import read_flow
 from gelflow.models.uncertainty import UNKNOWN_PX
 from gelflow.models.weights import weights_file
 from gelflow.predict import pictures
 from gelflow.predict.pictures import UNKNOWN_COLOUR, flow_to_colour, robust_scale
-from gelflow.predict.prediction import predict_pair, predict_video
+from gelflow.predict.prediction import predict_pair, predict_pairs, predict_video
 
 FARNEBACK = named_methods(["farneback"])[0]
 
@@ -47,6 +49,18 @@ def test_pair_gives_one_flow_in_three_files_named_after_the_images(tmp_path: Pat
     assert cv2.imread(str(png)).std() > 20
     images = [frame_folder(tmp_path, ["before", "after"]) / f"{name}.png" for name in ("before", "after")]
     assert predict_pair(FARNEBACK, *images, tmp_path).files[0].name == "before_to_after.exr"
+
+
+def test_a_set_of_pairs_gives_the_flow_of_each_and_a_folder_of_frames_is_none(tmp_path: Path) -> None:
+    folder = write_folder(tmp_path / "in", {"a": (1.5, -0.5), "b": (0.0, 2.0)})
+    data = write_synthetic(tmp_path / "data", [(1.0, 0.0)])
+    assert [holds_pairs(path) for path in (folder, data, tmp_path, folder / "a_1.png")] == [True, True, False, False]
+    result = predict_pairs(FARNEBACK, PairDataset(folder), tmp_path / "out")
+    assert [file.name for file in result.files] == [f"{name}.{end}" for name in "ab" for end in ("exr", "flo", "png")]
+    assert [(motion.frame, motion.file) for motion in result.motions] == [(1, "a"), (2, "b")]
+    assert np.median(read_flow(result.files[3]).flow[..., 1]) == pytest.approx(2.0, abs=0.1)
+    save(folder / "c_3.png", moved(48, 48, 0, 0))
+    assert not holds_pairs(folder)
 
 
 @pytest.mark.parametrize(("reference", "expected"), [("first", [2.0, 4.0, 6.0]), ("previous", [2.0, 2.0, 2.0])])

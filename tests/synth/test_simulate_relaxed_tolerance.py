@@ -116,6 +116,15 @@ def test_a_record_that_is_always_lost_ends_the_path(monkeypatch: pytest.MonkeyPa
     assert steps <= 0.8 / posed.numerics.max_step_mm + 2 * halvings
 
 
+def test_a_step_that_fails_late_ends_the_press(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stepping, "MAX_PRESS_ITERATIONS", 10)
+    _, steps = followed(stepper_of(Press.of(pressed(), MESH)), Losing(monkeypatch, most=0), monkeypatch)
+    losing = Losing(monkeypatch, most=1)
+    result, lost_steps = followed(stepper_of(Press.of(pressed(), MESH)), losing, monkeypatch)
+    assert (result.status, "did not converge" in result.reason, losing.lost) == ("failed", True, 1)
+    assert lost_steps < steps
+
+
 def test_relaxed_steps_end_where_tight_ones_do_and_save_iterations() -> None:
     """With the standard options; friction remembers the load path, and so its error."""
     posed = gentle(friction=0.4)
