@@ -41,7 +41,7 @@ def test_fine_patterns_and_small_images_keep_their_size_and_the_largest_are_redu
     assert 240 < rows < 420
     assert columns / rows == pytest.approx(640 / 480, rel=0.01)
     assert size_of(np.zeros((480, 640, 3), np.uint8)) == (480, 640)
-    assert size_of(noise[:70].repeat(8, axis=1)) == (64, 9362)
+    assert size_of(noise[:100].repeat(8, axis=1)) == (64, 6554)
 
 
 def test_flow_and_sigma_of_an_enlarged_pair_are_those_of_the_pair_enlarged() -> None:
