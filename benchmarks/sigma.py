@@ -23,7 +23,7 @@ from gelflow.data.open import open_all
 from gelflow.data.pairs import PairDataset, without_pattern
 from gelflow.models.evidence import gauss_newton
 from gelflow.models.uncertainty import CURVATURE, combined, error_squares
-from gelflow.models.working_size import working_size
+from gelflow.models.working_size import sized_sigma, working_sizes
 from gelflow.ops.pyramid import resize_flow, resize_images
 from gelflow.ops.spline import SplineImage
 from gelflow.predict.model import load_model
@@ -49,10 +49,11 @@ def pixels(dataset: PairDataset, folder: Path) -> Scenes:
         if not stored.exists():
             np.save(stored, model.flow(image1, image2))
         flow = np.load(stored)
-        given = [as_tensor(array, "cpu") for array in (flow, truth.flow, image1, image2)]
-        size = working_size(given[2])
-        moved, true = (resize_flow(field, size) for field in given[:2])
-        first, second = (resize_images(image, size) for image in given[2:])
+        moved, true, first, second = (as_tensor(array, "cpu") for array in (flow, truth.flow, image1, image2))
+        sigmas = {size: sized_sigma(moved, first, second, size)[0] for size in working_sizes(*image1.shape[:2])}
+        size = min(sigmas, key=lambda one: float(sigmas[one].mean()))
+        moved, true = resize_flow(moved, size), resize_flow(true, size)
+        first, second = resize_images(first, size), resize_images(second, size)
         squares = error_squares(moved, first, second)
         error = endpoint_error(as_array(moved), as_array(true))
         counts = np.isfinite(error) & (cv2.resize(truth.visible.astype(np.float32), size[::-1]) == 1)

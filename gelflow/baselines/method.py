@@ -1,6 +1,5 @@
 """The interface of everything that estimates flow, whose arrays are (H, W, C), and torch's tensors, (1, C, H, W)."""
 
-import math
 from typing import Any, Protocol
 
 import numpy as np
@@ -11,9 +10,7 @@ from gelflow.arrays import FlowArray, ImageArray, MapArray
 from gelflow.errors import InputError
 from gelflow.files.exr import FlowField
 from gelflow.files.image import MINIMUM_SIDE
-from gelflow.models.uncertainty import MAX_SIGMA_PX, flow_sigma
-from gelflow.models.working_size import working_size
-from gelflow.ops.pyramid import resize_flow, resize_images
+from gelflow.models.working_size import sized_sigma, working_sizes
 
 
 class Method(Protocol):
@@ -58,14 +55,12 @@ def as_array(flow: Any) -> FlowArray:
 def uncertainty(flow: FlowArray, image1: ImageArray, image2: ImageArray, device: str) -> tuple[MapArray, MapArray]:
     """Sigma in px and the probability to be seen in image 2, (H, W) float32: `gelflow.models.uncertainty`.
 
-    Of large images they are computed at their `working_size`.
+    Of the sizes at which large images are worked on, the one with the least mean of sigma counts.
     """
     given, first, second = (as_tensor(array, device) for array in (flow, image1, image2))
-    native, size = (flow.shape[0], flow.shape[1]), working_size(first)
-    maps = flow_sigma(resize_flow(given, size), resize_images(first, size), resize_images(second, size))
-    sigma, visible = resize_images(torch.cat(maps, dim=1), native)[0].cpu().numpy()
-    sigma, known = sigma * math.sqrt(math.prod(native) / math.prod(size)), np.isfinite(flow).all(axis=-1)
-    return np.where(known, sigma, np.float32(MAX_SIGMA_PX)).clip(max=MAX_SIGMA_PX), visible * known
+    maps = (sized_sigma(given, first, second, size) for size in working_sizes(*image1.shape[:2]))
+    sigma, visible = min(maps, key=lambda each: float(each[0].mean()))
+    return sigma[0, 0].cpu().numpy(), visible[0, 0].cpu().numpy()
 
 
 class ExactFlow:

@@ -6,7 +6,7 @@ from dataclasses import fields
 from pathlib import Path
 
 from gelflow.baselines.learned import Learned, PublishedRaft
-from gelflow.baselines.method import Method, as_tensor
+from gelflow.baselines.method import Method
 from gelflow.compare.comparison import Comparison
 from gelflow.compare.plots import plot_strata, plot_work_precision
 from gelflow.compare.scores import PairScore, evaluate
@@ -15,7 +15,6 @@ from gelflow.compare.tables import Table, tables, with_pattern
 from gelflow.data.pairs import PairDataset
 from gelflow.errors import InputError
 from gelflow.files.atomic import write_csv, write_text
-from gelflow.models.working_size import working_size
 
 
 def compare(
@@ -52,12 +51,8 @@ def compare(
 def _speed(method: Method, dataset: PairDataset, batch: int) -> Speed | None:
     if batch == 0 or not isinstance(method, Learned | PublishedRaft):
         return None
-    image = dataset.images(0)[0]
-    size = method.size or getattr(method.model, "image_size", None)
-    if size is None:
-        size = (
-            working_size(as_tensor(image, "cpu")) if isinstance(method, Learned) else (image.shape[0], image.shape[1])
-        )
+    shape = dataset.images(0)[0].shape
+    size = method.size or getattr(method.model, "image_size", None) or (shape[0], shape[1])
     return network_speed(method.forward, size, batch, method.device)
 
 

@@ -9,7 +9,7 @@ from gelflow.config import MINIMUM_SIDE
 from gelflow.errors import InputError
 from gelflow.models import GelFlow
 from gelflow.models.gelflow import check_shapes
-from gelflow.models.working_size import working_size
+from gelflow.models.working_size import sized_sigma, working_sizes
 from gelflow.ops.pyramid import resize_flow, resize_images
 
 
@@ -24,9 +24,9 @@ def estimate_flow(
 
     Images are (B, 3, H, W) float32 in [0, 1]. The network is used on the device that it is on, in evaluation mode, and
     left as it was; `size`, rows and columns at which it works, is by default that to which its training images were
-    resized (`GelFlow.image_size`), or where they were not, `working_size`. `flow` is called in place of `GelFlow.flow`,
-    such as a `RecordedNetwork` of the model. InputError for shapes that differ, sides below 64 px where no size is
-    given, other than three colours, values that are not finite.
+    resized (`GelFlow.image_size`), or where they were not, of `working_sizes` the one with the least mean of sigma.
+    `flow` is called in place of `GelFlow.flow`, such as a `RecordedNetwork` of the model. InputError for shapes that
+    differ, sides below 64 px where no size is given, other than three colours, values that are not finite.
     """
     size = size or model.image_size
     if size is not None and min(size) < MINIMUM_SIDE:
@@ -38,14 +38,19 @@ def estimate_flow(
             raise InputError(f"{name} holds NaN or infinite values; images must be finite, in [0, 1]")
     device = next(model.parameters()).device
     native = (image1.shape[-2], image1.shape[-1])
-    given = [image.to(device, torch.float32) for image in (image1, image2)]
-    size = size or working_size(given[0])
-    inputs = [resize_images(image, size) for image in given]
+    first, second = (image.to(device, torch.float32) for image in (image1, image2))
+    sizes = working_sizes(*native) if size is None else [size]
     was_training = model.training
     model.eval()
     try:
         with torch.no_grad():
-            found = resize_flow((flow or model.flow)(*inputs), native)
+            found = [resize_flow((flow or model.flow)(resize_images(first, one), resize_images(second, one)), native)
+                     for one in sizes]  # fmt: skip
     finally:
         model.train(was_training)
-    return found.to(image1.device)
+    best = found[0]
+    if len(found) > 1:
+        sigmas = [sized_sigma(each, first, second, one)[0] for each, one in zip(found, sizes, strict=True)]
+        surest = torch.stack(sigmas).mean(dim=(2, 3, 4)).argmin(dim=0)
+        best = torch.stack(found)[surest, torch.arange(len(best))]
+    return best.to(image1.device)

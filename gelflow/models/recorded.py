@@ -6,7 +6,7 @@ one launch a step stands for five thousand. That recording owns the memory of wh
 between two backward passes it may be called only once.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -18,7 +18,8 @@ from gelflow.models.gelflow import GelFlow
 class RecordedNetwork:
     """A network whose pass over CUDA images is recorded when a shape comes a second time, and replayed from then on.
 
-    The network has to be in evaluation mode when it is called.
+    Two shapes are remembered, those of `gelflow.models.working_size`. The network has to be in evaluation mode when it
+    is called.
 
     Without gradient; on a CPU, and for images of ever other shapes, the network as it is. Its weights may change in
     place, not move.
@@ -26,35 +27,44 @@ class RecordedNetwork:
 
     def __init__(self, model: GelFlow) -> None:
         self.model = model
-        self._shape: torch.Size | None = None
-        self._graph: torch.cuda.CUDAGraph | None = None
-        self._images: list[Tensor] = []
-        self._flow = torch.empty(0)
+        self._recordings: dict[torch.Size, _Recording | None] = {}
 
     @torch.no_grad()
     def __call__(self, image1: Images, image2: Images) -> Flow:
         """Estimates the flow; arguments and exceptions as for `GelFlow.flow`."""
-        if not image1.is_cuda or image1.shape != image2.shape or image1.shape != self._shape:
-            self._shape, self._graph = image1.shape, None
+        shape = image1.shape
+        if not image1.is_cuda or shape != image2.shape:
             return self.model.flow(image1, image2)
-        graph = self._graph or self._record(image1, image2)
-        for kept, new in zip(self._images, (image1, image2), strict=True):
+        if shape not in self._recordings:
+            if len(self._recordings) == 2:
+                self._recordings.clear()
+            self._recordings[shape] = None
+            return self.model.flow(image1, image2)
+        recording = self._recordings[shape] or self._record(image1, image2)
+        for kept, new in zip(recording.images, (image1, image2), strict=True):
             kept.copy_(new)
-        graph.replay()
-        return self._flow.clone()
+        recording.graph.replay()
+        return recording.flow.clone()
 
-    def _record(self, image1: Images, image2: Images) -> torch.cuda.CUDAGraph:
-        self._images = [image1.clone(), image2.clone()]
+    def _record(self, image1: Images, image2: Images) -> "_Recording":
+        images = [image1.clone(), image2.clone()]
         # Once more on a stream of its own, as recording asks for, so that libraries have chosen their kernels.
         aside = torch.cuda.Stream(image1.device)
         aside.wait_stream(torch.cuda.current_stream(image1.device))
         with torch.cuda.stream(aside):
-            self.model.flow(*self._images)
+            self.model.flow(*images)
         torch.cuda.current_stream(image1.device).wait_stream(aside)
-        self._graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(self._graph):
-            self._flow = self.model.flow(*self._images)
-        return self._graph
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            flow = self.model.flow(*images)
+        self._recordings[image1.shape] = recording = _Recording(graph, images, flow)
+        return recording
+
+
+class _Recording(NamedTuple):
+    graph: torch.cuda.CUDAGraph
+    images: list[Tensor]
+    flow: Flow
 
 
 class GraphedNetwork:

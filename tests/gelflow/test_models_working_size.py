@@ -1,4 +1,4 @@
-"""The size at which large images are worked on, and what that makes of wide dots."""
+"""The sizes at which large images are worked on, and what that makes of wide dots."""
 
 import cv2
 import numpy as np
@@ -7,8 +7,11 @@ import torch
 from numpy.typing import NDArray
 
 import gelflow
-from gelflow.models.uncertainty import MAX_SIGMA_PX
-from gelflow.models.working_size import working_size
+from gelflow.arrays import Flow, Images
+from gelflow.models.estimate import estimate_flow
+from gelflow.models.uncertainty import UNKNOWN_PX
+from gelflow.models.weights import load_weights, weights_file
+from gelflow.models.working_size import working_sizes
 from gelflow.ops.pyramid import resize_images
 
 
@@ -23,25 +26,35 @@ def dots(height: int, width: int, pitch: float, shift: float = 0.0) -> NDArray[n
     return cv2.GaussianBlur(image, (0, 0), 0.07 * pitch).astype(np.uint8)
 
 
-def size_of(image: NDArray[np.uint8]) -> tuple[int, int]:
-    return working_size(torch.from_numpy(image).movedim(-1, 0)[None] / 255)
+@pytest.mark.parametrize(("given", "sizes"), [
+    ((240, 320), [(240, 320)]),
+    ((300, 400), [(300, 400)]),
+    ((480, 640), [(480, 640), (240, 320)]),
+    ((480, 480), [(480, 480), (277, 277)]),
+    ((2448, 3264), [(480, 640), (240, 320)]),
+])  # fmt: skip
+def test_large_images_are_worked_on_at_two_sizes(given: tuple[int, int], sizes: list[tuple[int, int]]) -> None:
+    assert working_sizes(*given) == sizes
 
 
-@pytest.mark.parametrize("scale", [2, 3, 8])
-def test_however_large_the_image_wide_dots_are_seen_as_at_320_by_240(scale: int) -> None:
-    assert size_of(dots(240 * scale, 320 * scale, 30.0 * scale)) == (240, 320)
+def test_a_fine_pattern_keeps_its_size_and_each_pair_of_a_batch_has_its_own() -> None:
+    """Of noise whose detail is lost at half the size, and of wide dots."""
+    noise = np.random.default_rng(0).integers(0, 256, (480, 640, 3), np.uint8)
+    pairs = [(cv2.GaussianBlur(noise, (0, 0), 1.0), 2), (dots(480, 640, 60.0), 3)]
+    first = torch.stack([torch.from_numpy(image).movedim(-1, 0) / 255 for image, _ in pairs])
+    second = torch.stack([torch.from_numpy(np.roll(image, by, axis=1)).movedim(-1, 0) / 255 for image, by in pairs])
+    network = load_weights(weights_file(None))
+    sizes: list[tuple[int, int]] = []
 
+    def flow(image1: Images, image2: Images) -> Flow:
+        sizes.append((image1.shape[-2], image1.shape[-1]))
+        shift = torch.tensor([2.0, 3.0]).view(2, 1, 1, 1) * image1.shape[-1] / 640
+        wrong = 0.5 * (torch.tensor([1, 0]) if len(sizes) == 2 else torch.tensor([0, 1])).view(2, 1, 1, 1)
+        return torch.cat([shift + wrong, 0 * shift], dim=1).expand(2, 2, *image1.shape[-2:])
 
-def test_fine_patterns_and_small_images_keep_their_size_and_the_largest_are_reduced() -> None:
-    noise = np.random.default_rng(0).integers(0, 256, (960, 1280, 3), np.uint8)
-    assert size_of(noise[:480, :640]) == (480, 640)
-    assert size_of(noise) == (480, 640)
-    assert size_of(dots(240, 320, 60.0)) == (240, 320)
-    rows, columns = size_of(dots(480, 640, 25.0))
-    assert 240 < rows < 420
-    assert columns / rows == pytest.approx(640 / 480, rel=0.01)
-    assert size_of(np.zeros((480, 640, 3), np.uint8)) == (480, 640)
-    assert size_of(noise[:100].repeat(8, axis=1)) == (64, 6554)
+    found = estimate_flow(network, first, second, flow=flow)
+    assert sizes == [(480, 640), (240, 320)]
+    np.testing.assert_allclose(found[:, 0, 240, 320], [2.0, 3.0], atol=1e-3)
 
 
 def test_flow_and_sigma_of_an_enlarged_pair_are_those_of_the_pair_enlarged() -> None:
@@ -53,6 +66,6 @@ def test_flow_and_sigma_of_an_enlarged_pair_are_those_of_the_pair_enlarged() -> 
     inside = slice(90, -90)
     assert np.abs(large.flow[inside, inside] - (12.0, 0.0)).max() < 0.5
     np.testing.assert_allclose(large.flow[1::3, 1::3], 3 * small.flow, rtol=0, atol=1e-3)
-    np.testing.assert_allclose(large.sigma[1::3, 1::3], np.minimum(3 * small.sigma, MAX_SIGMA_PX), rtol=0.01)
+    assert (large.sigma < UNKNOWN_PX).mean() > 0.95
     assert large.visible.mean() == pytest.approx(small.visible.mean(), abs=0.01)
     assert (large.flow.shape, large.sigma.dtype) == ((720, 960, 2), np.float32)
