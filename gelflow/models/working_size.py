@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from gelflow.arrays import Flow, Images
+from gelflow.config import MINIMUM_SIDE
 from gelflow.models.uncertainty import MAX_SIGMA_PX, flow_sigma
 from gelflow.ops.pyramid import resize_flow, resize_images
 
@@ -27,7 +28,8 @@ def working_sizes(height: int, width: int) -> list[tuple[int, int]]:
     if pixels <= LARGE:
         return [(height, width)]
     scales = (min(1.0, math.sqrt(limit / pixels)) for limit in (MOST, LEAST))
-    return [(round(scale * height), round(scale * width)) for scale in scales]
+    sizes = [(round(scale * height), round(scale * width)) for scale in scales]
+    return [size for size in sizes if min(size) >= MINIMUM_SIDE] or [(height, width)]
 
 
 def sized_sigma(flow: Flow, image1: Images, image2: Images, size: tuple[int, int]) -> tuple[Tensor, Tensor]:

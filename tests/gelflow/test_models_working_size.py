@@ -32,6 +32,8 @@ def dots(height: int, width: int, pitch: float, shift: float = 0.0) -> NDArray[n
     ((480, 640), [(480, 640), (240, 320)]),
     ((480, 480), [(480, 480), (277, 277)]),
     ((2448, 3264), [(480, 640), (240, 320)]),
+    ((100, 2000), [(100, 2000)]),
+    ((64, 20000), [(64, 20000)]),
 ])  # fmt: skip
 def test_large_images_are_worked_on_at_two_sizes(given: tuple[int, int], sizes: list[tuple[int, int]]) -> None:
     assert working_sizes(*given) == sizes
