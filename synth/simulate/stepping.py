@@ -301,7 +301,7 @@ class Stepper:
             self.step = min(self.numerics.max_step_mm, GROWTH * max(taken, self.step / GROWTH))
 
     def _shorten(self, target: float, relaxed: bool) -> None:
-        """After a failure: half the step, a quarter if it was relaxed, too; and the end where it is too short."""
+        """After a failure: half the step, a quarter if it was relaxed; and the end if that is too short or late."""
         self.step = (target - self.at) / (4 if relaxed else 2)
         self._previous = None
         spent = self._iterations + sum(state.newton_iterations for state in self.states)
