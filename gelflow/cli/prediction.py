@@ -71,7 +71,8 @@ def predict(
         with progress("frames, then overlay", not as_json) as advance:
             result = predict_video(estimator, inputs[0], out, reference, every, lambda n, total: advance(n, total, ""))
     if result.lost:
-        print(f"gelflow: {inputs[0]}: ends {result.lost} frames early (truncated or damaged)", file=sys.stderr)
+        words = f"about {result.lost} frames at its end do not decode (truncated or damaged)"
+        print(f"gelflow: {inputs[0]}: {words}", file=sys.stderr)
     _show(result, estimator.name, as_json)
     return 0
 

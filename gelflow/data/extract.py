@@ -9,6 +9,7 @@ import glob
 import hashlib
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import numpy as np
 
 from gelflow.arrays import Bytes3
 from gelflow.data.choose import ChoiceConfig, Choices, choose_pairs
+from gelflow.data.open import holds_pairs
 from gelflow.data.pairset import FILE, ChosenPair, PairSet, SourceReport, read_pair_set, write_pair_set
 from gelflow.errors import InputError
 from gelflow.files.image import MINIMUM_SIDE, write_png
@@ -45,8 +47,8 @@ def find_recordings(inputs: Sequence[str]) -> dict[str, Path]:
         names = ["__".join(part[-depth:]) for part in parts]
         if len(set(names)) == len(names):
             return dict(zip(names, ordered, strict=True))
-    repeated = sorted(name for name in names if names.count(name) > 1)
-    raise InputError(f"two recordings are called {repeated[0]}; rename one, or make two pair sets")
+    one, other = next((ordered[i], ordered[j]) for i, j in combinations(range(len(parts)), 2) if parts[i] == parts[j])
+    raise InputError(f"{one} and {other}: two recordings of one name; rename one, or make two pair sets")
 
 
 def _recordings_at(path: Path) -> list[Path]:
@@ -58,6 +60,8 @@ def _recordings_at(path: Path) -> list[Path]:
     found = [p for p in below if p.suffix.lower() in SUFFIXES and p.is_file()]
     found = found or [path for _ in image_files(path)[:1]]
     found = found or [p for p in below if p.is_dir() and image_files(p)]
+    if ready := [p for p in found if p.is_dir() and holds_pairs(p)]:
+        raise InputError(f"{ready[0]}: holds image pairs already; finetune, compare and predict take it as it is")
     if not found:
         raise InputError(f"{path}: the folder holds neither videos ({', '.join(sorted(SUFFIXES))}) nor images")
     return found

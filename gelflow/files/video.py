@@ -49,7 +49,7 @@ def describe(path: Path) -> VideoInfo:
     if path.is_dir():
         files = image_files(path)
         if not files:
-            raise InputError(f"{path}: the folder holds no image; allowed: {', '.join(sorted(IMAGE_SUFFIXES))}")
+            raise InputError(f"{path}: the folder holds no image ({', '.join(sorted(IMAGE_SUFFIXES))}); give one video")
         return VideoInfo(len(files), 25.0)
     capture = _open(path)
     with quiet():

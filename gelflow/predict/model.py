@@ -76,7 +76,12 @@ class FlowModel:
         raise InputError(f"images of {given}: two NumPy arrays or two torch tensors are needed")
 
     def estimate(self, image1: ImageArray | Bytes3, image2: ImageArray | Bytes3) -> Estimate:
-        """The flow of two arrays, as `flow` gives it, and how certain it is; see `gelflow.models.uncertainty`."""
+        """The flow of two arrays, as `flow` gives it, and how certain it is; see `gelflow.models.uncertainty`.
+
+        InputError as for `flow`, and for tensors.
+        """
+        if isinstance(image1, Tensor):
+            raise InputError("estimate takes arrays; of a tensor (3, H, W) give tensor.movedim(0, -1).numpy()")
         flow = self.flow(image1, image2)
         first, second = _in_unit_range("image 1", image1), _in_unit_range("image 2", image2)
         return Estimate(flow, *uncertainty(flow, first, second, self.device))

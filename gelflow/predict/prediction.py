@@ -142,7 +142,7 @@ def predict_video(
                 progress(count, 2 * expected)
 
     _write_overlay(overlays(), video, describe(path).frames_per_second / every)
-    return Prediction([*files, table, video], motions, max(0, expected - len(motions)))
+    return Prediction([*files, table, video], motions, max(0, every * (expected - len(motions))))
 
 
 def _estimate(method: Method, image1: ImageArray, image2: ImageArray, frame: int, file: str) -> tuple[Estimate, Motion]:

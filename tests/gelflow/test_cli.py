@@ -107,7 +107,7 @@ def test_a_truncated_video_is_used_as_far_as_it_goes_and_said_to_be_so(tmp_path:
     out, err = capfd.readouterr()
     answer = json.loads(out)
     assert len(answer["motions"]) + answer["lost"] == 3
-    assert f"v.avi: ends {answer['lost']} frames early" in err
+    assert f"v.avi: about {answer['lost']} frames at its end do not decode" in err
 
 
 def test_folders_that_cannot_be_used_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -9,7 +9,7 @@ import pytest
 from commands import refused
 from numpy.typing import NDArray
 from samples import tree
-from textures import REAL, as_bytes, moved, save, write_video
+from textures import REAL, as_bytes, moved, save, write_folder, write_video
 
 from gelflow.data import PairDataset
 from gelflow.data.choose import ChoiceConfig, Choices, choose_pairs, usable_frames
@@ -140,6 +140,10 @@ def test_inputs_are_found_by_file_folder_and_pattern_and_those_that_hold_nothing
         shutil.copy(videos / "a.avi", tmp_path / "nested" / folder)
     nested = {f"day{day}__press__a": tmp_path / "nested" / f"day{day}" / "press" / "a.avi" for day in (1, 2)}
     assert find_recordings([str(tmp_path / "nested")]) == nested
+    shutil.copy(videos / "a.avi", videos / "a.mp4")
+    refused(r"a\.avi and .*a\.mp4: two recordings", find_recordings, [str(videos)])
+    ready = write_folder(tmp_path / "pairs", {"a": (1, 0)})
+    refused("holds image pairs already", find_recordings, [str(ready)])
     empty = tmp_path / "empty"
     empty.mkdir()
     (empty / "notes.txt").touch()

@@ -179,6 +179,11 @@ def test_images_that_cannot_be_used(image1: object, image2: object, message: str
     refused(message, gelflow.load_model(device="cpu").flow, image1, image2)  # type: ignore[call-overload]
 
 
+def test_estimate_refuses_tensors() -> None:
+    tensor = torch.zeros(3, 64, 64)
+    refused("estimate takes arrays", gelflow.load_model(device="cpu").estimate, tensor, tensor)
+
+
 def test_what_is_uncertain_is_in_the_file_and_grey_in_the_picture(tmp_path: Path) -> None:
     image1, image2 = (as_bytes(moved(96, 128, shift, 0)) for shift in (0, 2))
     noise = np.random.default_rng(0).normal(0, 2, (2, 96, 64, 3))
