@@ -27,4 +27,4 @@ closure = np.linalg.norm(flow + back[there_row, there_column], axis=-1)
 # %%
 length = np.linalg.norm(flow, axis=-1)
 print(f"motion: mean {length.mean():.2f} px, largest {length.max():.2f} px")
-print(f"there and back: {np.median(closure):.3f} px in the median, above 1 px at {100 * (closure > 1).mean():.1f} %")
+print(f"closure: {np.median(closure):.3f} px in the median, above 1 px at {100 * (closure > 1).mean():.1f} %")

@@ -46,7 +46,7 @@ def stress(
 @app.command
 def calibrate(
     *,
-    frames: Annotated[list[Path], Parameter(consume_multiple=True, help="Images of the gel at rest, to be fitted.")],
+    frames: Annotated[list[Path], Parameter(consume_multiple=True, help="Images of the gel, to be fitted.")],
     scene: SceneName = DEFAULT_SCENE,
     out: Annotated[Path, Parameter(help="Directory for scene.toml, calibration.png and calibration.json.")] = Path(
         "data/calibration"

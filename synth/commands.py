@@ -271,7 +271,7 @@ def _error_line(predicted: Prediction) -> str:
     median, largest = predicted.error_px
     line = f"predicted error of the flow from the simulation: {median:.2g} px (median), {largest:.2g} px (largest)"
     if largest > predicted.target_error_px:
-        return f"{line}; for some draws the mesh does not reach the target of {predicted.target_error_px:g} px\n"
+        return f"{line}; for some trajectories the mesh does not reach the target of {predicted.target_error_px:g} px\n"
     return f"{line}; target {predicted.target_error_px:g} px\n"
 
 
@@ -288,7 +288,7 @@ def _show_summary(summary: Summary, variant: Variant) -> None:
     if stages:
         print(f"time: {stages}")
     if summary.failed_draws:
-        print(f"{summary.failed_draws} draws failed and were drawn again (failures.jsonl):")
+        print(f"{summary.failed_draws} attempts failed and were repeated or replaced (failures.jsonl):")
         for reason, count in summary.failures.most_common(5):
             print(f"  {count} x {reason}")
     if summary.given_up:

@@ -117,7 +117,7 @@ def test_read_exr(dataset: Path) -> None:
 def test_flow_of_two_images(dataset: Path) -> None:
     folder = dataset / "samples" / "000000"
     printed = run("flow_of_two_images.py", folder / "image1.png", folder / "image2.png")
-    assert found(rf"there and back: {NUMBER} px in the median", printed)[0] < 0.5
+    assert found(rf"closure: {NUMBER} px in the median", printed)[0] < 0.5
 
 
 def test_dataloader(dataset: Path, tmp_path: Path) -> None:

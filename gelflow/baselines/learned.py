@@ -47,7 +47,8 @@ class Learned:
         path: Weights, as `gelflow train` writes them.
         name: Name in tables; None: the name of the file's folder and file. Where the flow is registered and the name
             does not say so, "+motion", "+both" or "+brightness" is added in front of a seed's number and of "+ft".
-        size: Rows and columns at which the network works; None: those of its training.
+        size: Rows and columns at which the network works; None: those of its training, or those of
+            `gelflow.models.working_size`.
         device: "auto" (a CUDA device where there is one), "cpu" or "cuda".
         registration: One of `gelflow.config.REGISTRATIONS`; None: what the weights' training asked for.
 

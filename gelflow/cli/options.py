@@ -15,7 +15,7 @@ Paths = Annotated[
     list[Path], Parameter(help="Datasets or *.tar shards of synth, folders by 'pairs', or of NAME_1.png, NAME_2.png.")
 ]
 AsJson = Annotated[bool, Parameter("--json", negative=(), help="Print the answer as JSON on stdout.")]
-Size = Annotated[str | None, Parameter(help="ROWSxCOLUMNS at which the network works; default: as in training.")]
+Size = Annotated[str | None, Parameter(help="ROWSxCOLUMNS at which the network works; see the guide for the default.")]
 Out = Annotated[Path, Parameter(help="Folder for the results.")]
 ShippedOrFile = Annotated[
     Path | None, Parameter(help="File of weights; default: those that come with the package, best.")

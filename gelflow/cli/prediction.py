@@ -53,8 +53,8 @@ def predict(
     estimator: Method
     if method is None:
         estimator = open_network(weights_file(weights), None, parse_size(size), device, registration)
-    elif weights is not None:
-        raise InputError("give either --weights FILE (of a network) or --method NAME (a classical one)")
+    elif weights is not None or size is not None:
+        raise InputError("give either --weights FILE and --size (of a network) or --method NAME (a classical one)")
     elif registration is not None:
         raise InputError(
             "--registration: is for --weights of GelFlow; "
@@ -62,9 +62,12 @@ def predict(
         )
     else:
         estimator = named_methods([method], device)[0]
+    paired = len(inputs) == 2 or holds_pairs(inputs[0])
+    if paired and (reference, every) != ("first", 1):
+        raise InputError("--reference and --every are for a video or a folder of frames, not for pairs of images")
     if len(inputs) == 2:
         result = predict_pair(estimator, inputs[0], inputs[1], out)
-    elif holds_pairs(inputs[0]):
+    elif paired:
         with progress("pairs", not as_json) as advance:
             result = predict_pairs(estimator, PairDataset(inputs[0]), out, lambda n, total: advance(n, total, ""))
     else:
@@ -85,7 +88,7 @@ def _show(result: Prediction, name: str, as_json: bool) -> None:
     largest = max(result.motions, key=lambda motion: motion.p95_px)
     where = f" in number {largest.frame} ({largest.file}), where most moves," if len(result.motions) > 1 else ""
     print(f"{name}:{where} mean motion {largest.mean_px:.3g} px, 95th percentile {largest.p95_px:.3g} px; "
-          f"unknown (sigma above 1 px) on {largest.unknown:.0%} of the picture")  # fmt: skip
+          f"unknown on {largest.unknown:.0%} of the picture")  # fmt: skip
     shown = result.files if len(result.files) <= 6 else [result.files[0], "...", *result.files[-3:]]
     print(f"written: {', '.join(str(file) for file in shown)}")
 

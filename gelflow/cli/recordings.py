@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections import Counter
 from pathlib import Path
 from statistics import quantiles
 from typing import TYPE_CHECKING, Annotated
@@ -53,9 +54,14 @@ def pairs(
     if not result.sources:
         raise InputError(f"none of the {len(result.failures)} recordings can be read; the reasons are in {out / FILE}")
     if not result.pairs:
+        reasons: Counter[str] = Counter()
+        for report in result.sources.values():
+            reasons.update(report.frames_rejected | report.rejected)
+        counts = ", ".join(f"{count} {reason}" for reason, count in reasons.most_common())
         raise InputError(
-            f"no pair of the {len(result.sources)} recordings has a motion of {config.minimum_motion_px:g} to "
-            f"{config.maximum_motion_px:g} px; give a lower --min-motion and another --out"
+            f"the {len(result.sources)} recordings have no pair with a motion of {config.minimum_motion_px:g} to "
+            f"{config.maximum_motion_px:g} px; frames and pairs rejected: {counts or 'none'}; "
+            "to try other limits, give another --out"
         )
     _show(result, out, as_json)
     return 1 if result.failures else 0

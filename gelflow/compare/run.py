@@ -15,6 +15,7 @@ from gelflow.compare.tables import Table, tables, with_pattern
 from gelflow.data.pairs import PairDataset
 from gelflow.errors import InputError
 from gelflow.files.atomic import write_csv, write_text
+from gelflow.models.working_size import working_sizes
 
 
 def compare(
@@ -51,8 +52,8 @@ def compare(
 def _speed(method: Method, dataset: PairDataset, batch: int) -> Speed | None:
     if batch == 0 or not isinstance(method, Learned | PublishedRaft):
         return None
-    shape = dataset.images(0)[0].shape
-    size = method.size or getattr(method.model, "image_size", None) or (shape[0], shape[1])
+    size = method.size or getattr(method.model, "image_size", None)
+    size = size or working_sizes(*dataset.images(0)[0].shape[:2])[0]
     return network_speed(method.forward, size, batch, method.device)
 
 

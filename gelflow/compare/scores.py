@@ -19,7 +19,8 @@ from gelflow.data.pairs import PairDataset
 from gelflow.errors import InputError, NothingFoundError
 from gelflow.files.exr import FlowField
 from gelflow.hardware import hardware
-from gelflow.models.uncertainty import CERTAIN_PX, UNKNOWN_PX
+from gelflow.models.uncertainty import CERTAIN_PX
+from gelflow.models.working_size import unknown_px
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +35,7 @@ class Measures:
         dot_distance_px, dot_p90_px, own_dots: See `gelflow.compare.dots.DotDistance`; where there is no exact flow and
             both images show a pattern of dots.
         closure_px, closure_p90_px: Median and 90th percentile of the closure; where there is no exact flow.
-        unknown, certain: Share of pixels whose sigma (`gelflow.models.uncertainty`) is above 1 px, and up to 0.1 px.
+        unknown, certain: Share of pixels whose sigma is above `working_size.unknown_px`, and up to 0.1 px.
         calibration: Share of the certain pixels whose endpoint error is within sigma; 0.68 if sigma is right.
     """
 
@@ -135,7 +136,7 @@ def score_pair(method: Method, dataset: PairDataset, index: int) -> PairScore:
         processor_seconds=processor_seconds,
         device=hardware(device),
         on_gpu=device == "cuda",
-        unknown=float((sigma > UNKNOWN_PX).mean()),
+        unknown=float((sigma > unknown_px(*sigma.shape)).mean()),
         certain=float((sigma <= CERTAIN_PX).mean()),
         **errors,
     )

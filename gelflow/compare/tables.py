@@ -50,7 +50,7 @@ def summary_table(groups: Sequence[Group]) -> Table:
         ("own dot %", "own_dots", 100, 1),
         ("closure px", "closure_px", 1, 3),
         ("90 % px", "closure_p90_px", 1, 3),
-        ("σ > 1 px %", "unknown", 100, 1),
+        ("unknown %", "unknown", 100, 1),
         ("σ ≤ 0.1 px %", "certain", 100, 1),
         ("error ≤ σ %", "calibration", 100, 1),
         ("ms/pair", "seconds", 1000, 1),

@@ -7,6 +7,7 @@ neither on the other recordings nor on interruptions.
 
 import glob
 import hashlib
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from itertools import combinations
@@ -103,9 +104,9 @@ def _check(config: ChoiceConfig) -> None:
             raise InputError(f"{name} = {getattr(config, name)}: at least 1 is needed")
     if config.frames < 2:
         raise InputError(f"frames = {config.frames}: at least 2 frames of a recording are needed for a pair")
-    if not 0 <= config.minimum_motion_px <= config.maximum_motion_px:
+    if not 0 <= config.minimum_motion_px <= config.maximum_motion_px < math.inf:
         raise InputError(f"motion from {config.minimum_motion_px:g} to {config.maximum_motion_px:g} px: the limits "
-                         "must be at least 0, the lower one first")  # fmt: skip
+                         "must be finite and at least 0, the lower one first")  # fmt: skip
 
 
 def _size(path: Path) -> int:

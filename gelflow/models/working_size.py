@@ -1,4 +1,4 @@
-"""The sizes at which large images are worked on: two, and the one counts of whose flow the images are surer.
+"""The two sizes at which large images are worked on; the flow with the smaller mean sigma is kept.
 
 Most gels that the shipped network learned from have images of 320 x 240 px. In larger ones it may take dots for their
 neighbours, and what is between dots is beyond the windows of registration and uncertainty, which are in px. Reduced
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gelflow.arrays import Flow, Images
 from gelflow.config import MINIMUM_SIDE
-from gelflow.models.uncertainty import MAX_SIGMA_PX, flow_sigma
+from gelflow.models.uncertainty import MAX_SIGMA_PX, UNKNOWN_PX, flow_sigma
 from gelflow.ops.pyramid import resize_flow, resize_images
 
 LARGE = 400 * 300
@@ -30,6 +30,11 @@ def working_sizes(height: int, width: int) -> list[tuple[int, int]]:
     scales = (min(1.0, math.sqrt(limit / pixels)) for limit in (MOST, LEAST))
     sizes = [(round(scale * height), round(scale * width)) for scale in scales]
     return [size for size in sizes if min(size) >= MINIMUM_SIDE] or [(height, width)]
+
+
+def unknown_px(height: int, width: int) -> float:
+    """The sigma above which a flow counts as unknown: `UNKNOWN_PX`, in larger images than LARGE as if reduced to it."""
+    return UNKNOWN_PX * max(1.0, math.sqrt(height * width / LARGE))
 
 
 def sized_sigma(flow: Flow, image1: Images, image2: Images, size: tuple[int, int]) -> tuple[Tensor, Tensor]:

@@ -101,7 +101,8 @@ def load_model(
         device: "cpu", "cuda", or "auto", a CUDA device where there is one.
         registration: "none", "motion", "both" or "brightness": how the flow is corrected on the images; None: what the
             weights ask for, which is "motion" for "best".
-        size: Rows and columns at which the network works; None: those of its training or of the images.
+        size: Rows and columns at which the network works; None: those of its training or, where it had none, of the
+            images, of which those of more than 400 x 300 px are reduced to two sizes.
 
     Raises:
         InputError: No such file, a damaged one or another network's, or no such device.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gelflow.arrays import Bytes3, FlowArray, ImageArray, MapArray
 from gelflow.files.atomic import replacing
 from gelflow.files.image import to_bytes
-from gelflow.models.uncertainty import UNKNOWN_PX
+from gelflow.models.working_size import unknown_px
 from gelflow.ops.warp import warp_image
 
 if TYPE_CHECKING:
@@ -54,8 +54,8 @@ def flow_to_colour(flow: FlowArray, scale_px: float) -> Bytes3:
 
 
 def certain(flow: FlowArray, sigma: MapArray | None) -> FlowArray:
-    """The flow with NaN where its sigma is above `UNKNOWN_PX`."""
-    return flow if sigma is None else np.where(sigma[..., None] > UNKNOWN_PX, np.float32(np.nan), flow)
+    """The flow with NaN where it is unknown (`unknown_px`)."""
+    return flow if sigma is None else np.where(sigma[..., None] > unknown_px(*sigma.shape), np.float32(np.nan), flow)
 
 
 def robust_scale(flow: FlowArray) -> float:
@@ -104,7 +104,7 @@ def draw_overlay(frame: Bytes3, flow: FlowArray, scale_px: float) -> Bytes3:
     if exaggeration > 1:
         _label(left, f"arrows x {exaggeration:g}", (8, 22))
     right = cv2.resize(flow_to_colour(flow, scale_px), (zoom * width, zoom * height), interpolation=cv2.INTER_NEAREST)
-    wheel = legend(zoom * height // 5)
+    wheel = legend(min(zoom * height // 5, zoom * width - 16))
     side = wheel.shape[0]
     right[8 : 8 + side, 8 : 8 + side] = wheel
     _label(right, f"rim: {scale_px:g} px", (8, side + 30))
@@ -136,8 +136,8 @@ def write_flow_picture(
     from matplotlib.figure import Figure
 
     known = certain(flow, sigma)
-    scale, unknown = robust_scale(known), (sigma > UNKNOWN_PX).mean()
     height, width = flow.shape[:2]
+    scale, unknown = robust_scale(known), (sigma > unknown_px(height, width)).mean()
     figure = Figure(figsize=(12, 12 / 3 * 2 * height / width + 1.1), dpi=110, layout="constrained")
     axes = figure.subplots(2, 3)
     before = np.abs(image1 - image2).mean(axis=-1)

@@ -20,11 +20,13 @@ from gelflow.files.atomic import refuse_foreign, write_csv
 from gelflow.files.exr import DIRECTIONS, read_flow, write_flo, write_flow
 from gelflow.files.quiet import quiet
 from gelflow.files.video import describe, frame_file, frames, image_files
-from gelflow.models.uncertainty import UNKNOWN_PX
+from gelflow.models.working_size import unknown_px
 from gelflow.predict.model import Estimate
 from gelflow.predict.pictures import certain, draw_overlay, round_up, write_flow_picture
 
 Reference = Literal["first", "previous"]
+MOTIONS, MOTIONS_BEGIN = "motion.csv", b"mean_px,p95_px"
+"""The table of motions, and what tells it from other tables."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class Motion:
     """Length of the flow, its mean and percentiles over the picture, and the method's run time.
 
     `frame` is that of a video, or the number of a pair from 1 on; `unknown` is the share of the picture in which sigma
-    is above 1 px.
+    is above `gelflow.models.working_size.unknown_px`.
     """
 
     frame: int
@@ -62,31 +64,45 @@ def predict_pair(method: Method, path1: Path, path2: Path, out: Path) -> Predict
     stem1, stem2 = path1.stem, path2.stem
     common = stem1.removesuffix("_1")
     name = common if stem1 == f"{common}_1" and stem2 == f"{common}_2" else f"{stem1}_to_{stem2}"
-    return predict_pairs(method, PairDataset(path1, [PairRecord(name, path1, path2)]), out)
+    files, motion = _predicted(method, PairDataset(path1, [PairRecord(name, path1, path2)]), 0, out)
+    return Prediction(files, [motion])
 
 
 def predict_pairs(
     method: Method, dataset: PairDataset, out: Path, progress: Callable[[int, int], None] | None = None
 ) -> Prediction:
-    """Writes NAME.exr, NAME.flo and NAME.png for each pair; exceptions as for `predict_pair`."""
+    """Writes NAME.exr, NAME.flo and NAME.png for each pair, and motion.csv; exceptions as for `predict_pair`."""
+    refuse_foreign(out / MOTIONS, MOTIONS_BEGIN)
     files: list[Path] = []
     motions: list[Motion] = []
-    for index, name in enumerate(dataset.names):
-        exr, flo, png = (out / f"{name}{suffix}" for suffix in (".exr", ".flo", ".png"))
-        refuse_foreign(exr, DIRECTIONS.encode(), flo, png)
-        image1, image2 = dataset.images(index)
-        try:
-            found, motion = _estimate(method, image1, image2, index + 1, name)
-        except InputError as error:
-            raise InputError(f"pair {name} of {dataset.source}, {method.name}: {error}") from error
-        write_flow(exr, found.flow, found.visible, found.sigma)
-        write_flo(flo, found.flow)
-        write_flow_picture(png, image1, image2, found.flow, found.sigma, f"{name} ({method.name})")
-        files += [exr, flo, png]
+    for index in range(len(dataset)):
+        written, motion = _predicted(method, dataset, index, out)
+        files += written
         motions.append(motion)
         if progress:
             progress(index + 1, len(dataset))
-    return Prediction(files, motions)
+    return Prediction([*files, _write_motions(out, motions)], motions)
+
+
+def _predicted(method: Method, dataset: PairDataset, index: int, out: Path) -> tuple[list[Path], Motion]:
+    """The files written for one pair, and its motion."""
+    name = dataset.names[index]
+    exr, flo, png = (out / f"{name}{suffix}" for suffix in (".exr", ".flo", ".png"))
+    refuse_foreign(exr, DIRECTIONS.encode(), flo, png)
+    image1, image2 = dataset.images(index)
+    try:
+        found, motion = _estimate(method, image1, image2, index + 1, name)
+    except InputError as error:
+        raise InputError(f"pair {name} of {dataset.source}, {method.name}: {error}") from error
+    write_flow(exr, found.flow, found.visible, found.sigma)
+    write_flo(flo, found.flow)
+    write_flow_picture(png, image1, image2, found.flow, found.sigma, f"{name} ({method.name})")
+    return [exr, flo, png], motion
+
+
+def _write_motions(out: Path, motions: list[Motion]) -> Path:
+    write_csv(out / MOTIONS, [column.name for column in fields(Motion)], map(astuple, motions))
+    return out / MOTIONS
 
 
 def predict_video(
@@ -107,8 +123,8 @@ def predict_video(
     if every < 1:
         raise InputError(f"every = {every}: at least 1 is needed")
     expected = max(0, -(-describe(path).frames // every) - 1)
-    table, video = out / "motion.csv", out / "overlay.mp4"
-    refuse_foreign(table, b"mean_px,p95_px", video)
+    video = out / "overlay.mp4"
+    refuse_foreign(out / MOTIONS, MOTIONS_BEGIN, video)
     for earlier in _earlier_flows(out):
         refuse_foreign(earlier, DIRECTIONS.encode())
     sources = dict(enumerate(image_files(path))) if path.is_dir() else {}
@@ -131,7 +147,7 @@ def predict_video(
             progress(len(motions), 2 * expected)
     if not motions:
         raise InputError(f"{path}: fewer than two frames decode; a flow needs two")
-    write_csv(table, [column.name for column in fields(Motion)], map(astuple, motions))
+    table = _write_motions(out, motions)
     scale = round_up(max(motion.p99_px for motion in motions))
 
     def overlays() -> Iterator[Bytes3]:
@@ -152,7 +168,8 @@ def _estimate(method: Method, image1: ImageArray, image2: ImageArray, frame: int
     length = np.hypot(flow[..., 0], flow[..., 1])
     p95, p99 = (float(value) for value in np.nanpercentile(length, (95, 99)))
     sigma, visible = uncertainty(flow, image1, image2, getattr(method, "device", "cpu"))
-    motion = Motion(frame, file, float(np.nanmean(length)), p95, p99, seconds, float((sigma > UNKNOWN_PX).mean()))
+    unknown = float((sigma > unknown_px(*sigma.shape)).mean())
+    motion = Motion(frame, file, float(np.nanmean(length)), p95, p99, seconds, unknown)
     return Estimate(flow, sigma, visible), motion
 
 

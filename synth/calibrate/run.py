@@ -164,6 +164,7 @@ def _compared(
     rows, grids = {"frames": compare(given.encoded, rendered, fit.bare, fit.sensor)}, {"frames": fit.grid}
     for path, other in others.items():
         name = f"not fitted: {Path(path).name}"
+        name = f"not fitted: {path}" if name in rows else name
         _, grids[name], bare = find_grid(fit.sensor, other.encoded**fit.sensor.camera.gamma, None)
         rows[name] = compare(other.encoded, rendered, bare, fit.sensor)
         if fit.grid is None:

@@ -74,6 +74,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
     """
     partial = partial_name(path)
     with storage_errors(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
         try:
             with partial.open("wb") as file:
                 yield file

@@ -93,7 +93,7 @@ def about_rows(inspection: Inspection) -> list[tuple[str, str]]:
     return [
         ("scene, seed", f"{about['scene']}, {about['seed']}"),
         ("finished samples", f"{about['finished']} of {about['n']}{shown}"),
-        ("failed draws", str(about["failed_draws"])),
+        ("failed attempts", str(about["failed_draws"])),
         ("device", ", ".join(f"{key} {value}" for key, value in about["device"].items()) or "not recorded"),
         ("software", ", ".join(f"{key} {value}" for key, value in about["software"].items()) or "not recorded"),
         ("time", seconds or "not recorded"),

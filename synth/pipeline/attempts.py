@@ -1,7 +1,7 @@
 """The random instances of one trajectory, one after the other, until one of them can be used.
 
-An object whose press does not complete is pressed again, with rounder edges and at last a stiffer contact, before
-another instance is drawn.
+An object whose press does not complete is pressed again, with rounder edges or a stiffer contact, before another
+instance is drawn.
 """
 
 from dataclasses import dataclass, replace

@@ -58,8 +58,8 @@ def pad_key(press: Press) -> Gel:
 def in_batches(context: JobContext, tasks: Iterator[Task], batch: int | None) -> Iterator[Result]:
     """Simulate tasks; each comes out once, in no particular order but with a sensor's trajectories together.
 
-    At most `batch` trajectories run at a time, which changes no bit of what comes out. InputError where the storage
-    refuses, or for CUDA without cuBLAS or cuSOLVER.
+    At most `batch` trajectories run at a time, which on a CPU changes no bit of what comes out. InputError where the
+    storage refuses, or for CUDA without cuBLAS or cuSOLVER.
     """
     simulation = _Simulation(context, tasks, batch or BATCH[context.plan.solver_device])
     return by_sensor(context.plan.template, simulation, simulation.open)

@@ -38,8 +38,8 @@ SOLVE_GROWTH = 1.25
 FRICTION = 1.5
 """Time of an iteration with friction over one without."""
 ITERATIONS_PER_STEP, ITERATIONS_PER_RECORD = 4.5, 7.0
-MESH_INDENTER = 7.0
-"""Time of a press by a mesh indenter over a ball's: its edges take more iterations (docs/reports/objects.md)."""
+MESH_INDENTER = 5.5
+"""Time of presses by mesh indenters over that of a ball's, in the mean: some take ten times as long as the median."""
 BATCHED_SECONDS = {"cuda": 5.5e-5, "cpu": 0.8}
 """Seconds of a Newton iteration of one trajectory by the batched solver, with BATCHED_NODES nodes; on a GPU among
 hundreds of trajectories (docs/reports/batched_fem.md)."""
@@ -110,13 +110,15 @@ def _meshes(plan: Plan) -> _Meshes:
             scene = draw(template, 0, trajectory)
             found.append((scene, plan.mesh.resolution(scene, template.folder)))
     if not found:
-        raise InputError(f"{template.label}: none of {INSTANCES} draws is possible; try `simulate` to see why")
+        raise InputError(
+            f"{template.label}: none of {INSTANCES} random instances is possible; try `simulate` to see why"
+        )
     across = [resolution.across for _, resolution in found]
     errors = [resolution.error_px for _, resolution in found]
     spacings = [resolution.spacing_mm for _, resolution in found]
     text = f"{min(across)} to {max(across)} elements across the contact, {min(spacings):.2g} to {max(spacings):.2g} mm"
     if plan.mesh.kind == "even":
-        text = " x ".join(map(str, template.numerics.cells)) + f" elements for all draws of a pad, {text}"
+        text = " x ".join(map(str, template.numerics.cells)) + f" elements for all trajectories of a pad, {text}"
     radii = [edge_radius_mm(scene, resolution.mesh) for scene, resolution in found]
     rounded = [radius for radius in radii if radius is not None]
     if rounded:

@@ -32,7 +32,7 @@ class Numerics(Part):
     element: Literal["auto", "p1p1", "p2p1"] = "auto"
     """auto is p2p1: at every run time it was the more accurate."""
     target_error_px: Positive | None = None
-    """Root-mean-square error that the flow over the contact face may have from the simulation; default 0.5. The mesh is
+    """Root-mean-square error that the flow over the seen face may have from the simulation; default 0.5. The mesh is
     made as fine under each draw's contact as this asks for."""
     edge_length_mm: Positive | None = None
     """Instead of a target: one fTetWild mesh for all draws with tetrahedra of this edge at the contact face."""
@@ -47,7 +47,7 @@ class Numerics(Part):
     """Newton stops when the residual is below this fraction of the reaction force."""
     penalty: Annotated[float, Field(ge=1, le=MAX_PENALTY)] = 50.0
     """Contact stiffness in multiples of E per mm, before augmented-Lagrangian updates; sharp bodies get up to four
-    times as much."""
+    times as much, mesh indenters up to eight times."""
 
     @model_validator(mode="after")
     def _one_resolution(self) -> "Numerics":

@@ -129,8 +129,8 @@ def load_scene(name_or_path: str | Path, set: Sequence[str] = ()) -> Template:
         >>> scene.name, scene.content["motion"]["depth_mm"]
         ('deltact', 1.0)
     """
-    if isinstance(set, str):
-        raise InputError(f"set = {set!r}: a list is needed, as in set=[{set!r}]")
+    if isinstance(set, str) or not all(isinstance(each, str) for each in set):
+        raise InputError(f"set = {set!r}: a list of texts is needed, as in set=['motion.depth_mm=1.2']")
     path = _find(name_or_path)
     content = _read(path)
     for override in set:
@@ -217,11 +217,12 @@ def _read(path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
 
 
 def _extended(below: dict[str, Any], content: dict[str, Any]) -> dict[str, Any]:
-    """A table over another: tables within it alike, but one that says its kind or shape replaces that below it."""
+    """A table over another: tables within it alike, but one that says its kind (or shape) replaces that below it."""
     both = dict(below)
     for key, value in content.items():
         tables = all(isinstance(each, dict) and not _is_distribution(each) for each in (value, below.get(key)))
-        both[key] = _extended(below[key], value) if tables and not {"kind", "shape"} & set(value) else value
+        replaces = not tables or ("kind" if "kind" in below[key] else "shape") in value
+        both[key] = value if replaces else _extended(below[key], value)
     return both
 
 

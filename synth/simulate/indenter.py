@@ -67,7 +67,7 @@ class RigidBody:
         kind: number of its shape.
         shape: (SHAPE_LENGTH,) lengths as `synth.simulate.distance.signed_distance` wants them.
         rotation: (3, 3) its axes as columns, before any twist.
-        reach_mm: from its origin to its farthest point in +z, from which the depth of a press counts.
+        reach_mm: from its origin along +z to where the depth of a press counts from; of a mesh see LOWERED.
         coefficients: (i, j, k) B-spline coefficients of a mesh's distance grid, else (1, 1, 1) zeros.
         sharpest_mm: its smallest radius of curvature: fillet, tip, tube or, of a mesh, the cell of its grid.
     """

@@ -13,8 +13,9 @@ from synth.simulate.indenter import object_radius
 from synth.simulate.load_path import LoadPath, path_of
 from synth.simulate.resolution import Accuracy, Resolution, accuracy, resolve, shared_mesh, shared_spacing_mm
 
-BLUNTER = ((1.5, 1.0), (2.25, 1.0), (2.25, 4.0), (2.25, 2.0), (1.5, 4.0))
-"""Factors on the radius of an object's edges and on the contact stiffness, in turn, where its press is incomplete."""
+BLUNTER = ((1.5, 1.0), (1.5, 2.0), (2.25, 4.0), (1.8, 3.0), (1.0, 2.0))
+"""Factors on the radius of an object's edges and on the contact stiffness, in turn, where its press is incomplete.
+Depth then counts from the rounded edge, as for any stated `fillet_mm`."""
 ELEMENTS: dict[str, Callable[[], Element]] = {"auto": p2p1, "p1p1": p1p1, "p2p1": p2p1}
 
 

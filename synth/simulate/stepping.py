@@ -1,8 +1,8 @@
 """Load stepping: move the indenter along its load path, recording converged states, halving steps that fail.
 
 Each step starts from a linear extrapolation of the last two states; a relaxed tolerance is enough for it. At a state
-that is wanted augmented-Lagrangian passes take penetration and elastic slip away, and the full tolerance holds; what
-the passes begin from and what all but the last find needs less, because the next one changes it
+that is wanted augmented-Lagrangian passes take penetration and elastic slip away, and the full tolerance holds; the
+start of the passes, and the result of each but the last, need less, because the next one changes it
 (MULTIPLIER_TOLERANCE). All of this is for what is recorded only: the path goes on from the intermediate state before,
 because multipliers that stay behind on a moving contact upset Newton's method at sharp edges. An unconverged field is
 never recorded: a press whose step would have to become shorter than SHORTEST_STEP ends at its last good state.
@@ -26,8 +26,7 @@ from synth.simulate.trajectory import State, Trajectory, no_contact, not_converg
 SHORTEST_STEP = 1 / 128
 """Shortest step, as a share of max_step_mm."""
 MAX_PRESS_ITERATIONS = 2000
-"""A step that fails after so many iterations of a press ends it. Presses of objects need some 180 in the mean; of 298
-that completed, the longest needed 1,038."""
+"""A step that fails after so many iterations of a press ends it: of 600 presses that completed none took as many."""
 MAX_ITERATIONS_TO_GROW = 7
 """Most iterations of a step that is followed by a longer one."""
 GROWTH = 1.5

@@ -78,7 +78,7 @@ class Trajectory:
 def no_contact(depth_mm: float) -> str:
     """Why a trajectory ends whose indenter, at the end of its press, bears on nothing."""
     return (
-        f"pressed {depth_mm:.3g} mm deep, the indenter touches no contact point that bears it: it is too "
+        f"pressed {depth_mm:.3g} mm deep, the indenter touches no contact point that supports it: it is too "
         "small for the mesh or for the steps; lower numerics.target_error_px or edge_length_mm, or max_step_mm"
     )
 

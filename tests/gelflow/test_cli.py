@@ -50,6 +50,7 @@ def test_the_module_passes_the_status_on_and_debug_shows_the_traceback(capsys: p
     (["predict", "a.png", "b.png", "--out", "o", "--method", "none"], "a.png"),
     (["predict", ".", ".", ".", "--out", "o", "--method", "none"], "3 inputs"),
     (["predict", ".", "--out", "o", "--weights", "w", "--method", "tvl1"], "--weights"),
+    (["predict", ".", "--out", "o", "--size", "64x80", "--method", "tvl1"], "--size (of a network)"),
     (["predict", ".", "--out", "o"], "holds no image"),
     (["predict", ".", "--out", "o", "--method", "raft"], f"allowed: {METHODS}; in compare"),
     (["evaluate", ".", "--weights", "none.safetensors"], "none.safetensors"),
@@ -134,7 +135,7 @@ def test_pairs_exit_statuses(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert "bad.avi" in captured.err
     assert " pairs from 1 recordings (0 without enough motion, 1 unreadable)" in captured.out
     assert "none of the 1 recordings" in said(capsys, main, "pairs", bad, "--out", tmp_path / "c", status=2)
-    assert "--min-motion" in fails(capsys, "pairs", good, "--out", tmp_path / "d", "--min-motion", "50")
+    assert "little motion" in fails(capsys, "pairs", good, "--out", tmp_path / "d", "--min-motion", "50")
     assert "seed is 0 there and 1 here" in fails(capsys, "pairs", good, "--out", tmp_path / "a", "--seed", "1")
 
 
@@ -221,6 +222,7 @@ def test_images_that_cannot_be_used_are_named(number: int, networks: tuple[Path,
 
     assert "one.png: 1 x 1 px" in predict("one.png", "good.png")
     assert "64 px" in predict("small.png", "small.png")
+    assert "--every are for a video" in predict("good.png", "good.png", "--every", "2")
     assert "good.png has 80 x 64 px, " in predict("good.png", "wide.png")
     assert "nan.tiff" in predict("good.png", "nan.tiff")
     if number == 0:

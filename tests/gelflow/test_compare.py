@@ -80,7 +80,7 @@ def test_numbers_that_are_not_finite_are_null_and_markers_are_scored_where_there
     assert [score.marker_distance_px for score in scores] == [5.0, None]
     assert pair_table(scores, ["marker_distance_px"], "{:.2f}") == (["method", "a"], [["zero", "5.00"]])
     header, rows = summary_table(grouped(summarise(scores[1:])))
-    assert ", ".join(header) == "method, PSNR dB, SSIM, closure px, 90 % px, σ > 1 px %, σ ≤ 0.1 px %, ms/pair, core ms"
+    assert ", ".join(header) == "method, PSNR dB, SSIM, closure px, 90 % px, unknown %, σ ≤ 0.1 px %, ms/pair, core ms"
     assert markdown((header, rows)).splitlines()[1] == "| --- |" + 8 * " ---: |"
 
 

@@ -151,7 +151,10 @@ def test_inputs_are_found_by_file_folder_and_pattern_and_those_that_hold_nothing
         refused(word, find_recordings, [str(empty / given)])
 
 
-@pytest.mark.parametrize("wrong", [{"per_source": 0}, {"frames": 1}, {"tries": 0}, {"minimum_motion_px": 99}])
+@pytest.mark.parametrize(
+    "wrong",
+    [{"per_source": 0}, {"frames": 1}, {"tries": 0}, {"minimum_motion_px": 99}, {"maximum_motion_px": np.inf}],
+)
 def test_settings_out_of_range_are_refused(tmp_path: Path, videos: Path, wrong: dict) -> None:
     refused(".", extract_pairs, [str(videos)], tmp_path / "out", ChoiceConfig(**wrong))
     assert not (tmp_path / "out").exists()

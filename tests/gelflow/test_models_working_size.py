@@ -11,7 +11,7 @@ from gelflow.arrays import Flow, Images
 from gelflow.models.estimate import estimate_flow
 from gelflow.models.uncertainty import UNKNOWN_PX
 from gelflow.models.weights import load_weights, weights_file
-from gelflow.models.working_size import working_sizes
+from gelflow.models.working_size import unknown_px, working_sizes
 from gelflow.ops.pyramid import resize_images
 
 
@@ -68,6 +68,7 @@ def test_flow_and_sigma_of_an_enlarged_pair_are_those_of_the_pair_enlarged() -> 
     inside = slice(90, -90)
     assert np.abs(large.flow[inside, inside] - (12.0, 0.0)).max() < 0.5
     np.testing.assert_allclose(large.flow[1::3, 1::3], 3 * small.flow, rtol=0, atol=1e-3)
+    assert unknown_px(720, 960) == pytest.approx(2.4 * UNKNOWN_PX)
     assert (large.sigma < UNKNOWN_PX).mean() > 0.95
     assert large.visible.mean() == pytest.approx(small.visible.mean(), abs=0.01)
     assert (large.flow.shape, large.sigma.dtype) == ((720, 960, 2), np.float32)

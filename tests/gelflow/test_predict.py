@@ -56,7 +56,9 @@ def test_a_set_of_pairs_gives_the_flow_of_each_and_a_folder_of_frames_is_none(tm
     data = write_synthetic(tmp_path / "data", [(1.0, 0.0)])
     assert [holds_pairs(path) for path in (folder, data, tmp_path, folder / "a_1.png")] == [True, True, False, False]
     result = predict_pairs(FARNEBACK, PairDataset(folder), tmp_path / "out")
-    assert [file.name for file in result.files] == [f"{name}.{end}" for name in "ab" for end in ("exr", "flo", "png")]
+    names = [f"{name}.{end}" for name in "ab" for end in ("exr", "flo", "png")]
+    assert [file.name for file in result.files] == [*names, "motion.csv"]
+    assert [row["file"] for row in table(result.files[-1])] == ["a", "b"]
     assert [(motion.frame, motion.file) for motion in result.motions] == [(1, "a"), (2, "b")]
     assert np.median(read_flow(result.files[3]).flow[..., 1]) == pytest.approx(2.0, abs=0.1)
     save(folder / "c_3.png", moved(48, 48, 0, 0))
@@ -130,6 +132,7 @@ def test_colours_follow_direction_and_length_and_arrows_have_the_true_length() -
     assert tuple(flow_to_colour(np.zeros((1, 1, 2), np.float32), 1.0)[0, 0]) == (255, 255, 255)
     assert tuple(flow_to_colour(np.full((1, 1, 2), np.nan, np.float32), 1.0)[0, 0]) == UNKNOWN_COLOUR
     flow = np.full((241, 321, 2), (12.0, 0.0), np.float32)
+    assert pictures.draw_overlay(np.zeros((480, 96, 3), np.uint8), np.zeros((480, 96, 2)), 1.0).shape == (480, 192, 3)
     picture = pictures.draw_overlay(np.zeros((241, 321, 3), np.uint8), flow, 12.0)
     height, width = picture.shape[:2]
     assert (height % 2, width % 2) == (0, 0)

@@ -131,7 +131,7 @@ def test_generate_says_what_it_did_and_a_job_that_partly_fails_has_status_1(said
     assert main(["generate", "--scene", str(tiny), "--out", str(out), "--n", "1", *impossible]) == 1
     printed, err = capsys.readouterr()
     assert f"synth: 1 samples could not be made, see {out}/failures.jsonl" in err
-    assert "10 draws failed" in printed
+    assert "10 attempts failed" in printed
 
 
 @pytest.mark.parametrize(("kind", "says"), [
@@ -257,8 +257,8 @@ def test_simulate_and_stress_replace_no_others_files(complaint: Run, tiny: Path,
 
 def test_inspect_verify_and_export_take_a_dataset_and_changed_files_have_status_1(said, tmp_path, capsys) -> None:
     data = reference()
-    assert "tiny, 0" in said("inspect", data, "--png", tmp_path / "a.png", "--html", tmp_path / "a.html")
-    assert (tmp_path / "a.png").stat().st_size > 10_000
+    assert "tiny, 0" in said("inspect", data, "--png", tmp_path / "new" / "a.png", "--html", tmp_path / "a.html")
+    assert (tmp_path / "new" / "a.png").stat().st_size > 10_000
     assert (tmp_path / "a.html").read_text().lstrip().lower().startswith("<!doctype html>")
     assert len(json.loads(said("inspect", data, "--json"))["samples"]) == 5
     assert json.loads(said("verify", data, "--json"))["ok"]

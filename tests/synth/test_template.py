@@ -44,6 +44,8 @@ def test_a_scene_extends_another_whose_files_stay_where_they_are(tmp_path: Path)
     assert found.content["sensor"].pop("pattern") == {"kind": "speckle", "grain_mm": 0.3}
     assert found.content["motion"] == {**base.content["motion"], "steps": 2}
     assert found.content["sensor"].items() <= base.content["sensor"].items()
+    mine.write_text('extends = "gelsight_mini"\n[sensor.pattern]\nshape = "diamond"\n')
+    assert load_scene(mine).content["sensor"]["pattern"]["shape"] == "diamond"
     mine.write_text(f'extends = "{mine.name}"')
     refused("cannot extend itself", load_scene, mine)
 
@@ -174,7 +176,7 @@ def test_a_wrong_value_is_named_with_file_place_and_what_is_allowed(tiny: Path, 
 ])  # fmt: skip
 def test_overrides(tiny: Path, override: str, message: str) -> None:
     assert re.match(rf"{re.escape(f'--set {override!r}: ')}.*{re.escape(message)}", _refusal(tiny, override))
-    refused("a list is needed", load_scene, tiny, set=override)
+    refused("a list of texts is needed", load_scene, tiny, set=override)
 
 
 def test_every_problem_is_told_once_on_a_short_line_as_are_missing_files(tiny: Path, tmp_path: Path) -> None:
