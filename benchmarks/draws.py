@@ -4,9 +4,8 @@
     python -m benchmarks draws --draws 300 --workers 16 --device cuda     together on a GPU
 
 Every draw is pressed as `generate` would: on the CPU on a mesh of its own, on a GPU on the batched solver's. An object
-whose press does not complete is pressed again, with rounder edges or a stiffer contact. A draw that does not
-complete then is a failure, which `generate` replaces. A repeated run goes on with the CSV file, on a GPU by whole
-scenes.
+whose press does not complete is pressed again, with rounder edges or a stiffer contact. A draw that does not complete
+then is a failure, which `generate` replaces. A repeated run goes on with the CSV file, on a GPU by whole scenes.
 """
 
 from collections.abc import Iterator, Sequence

@@ -32,8 +32,8 @@ NEAR = 1e-2
 """Relative residual below which the equilibrium is near: MAX_TURN ends, directions are exact for a smaller tolerance,
 and a solve may take up to twice its iterations, so that rounding does not decide whether the last met the tolerance."""
 MAX_TURN = 0.1
-"""`max_turn` of `contact_stiffness` until NEAR: iterates are far deeper in edges than equilibria, and the
-gap's second derivative misleads there."""
+"""`max_turn` of `contact_stiffness` until NEAR: iterates are far deeper in edges than equilibria, and the gap's
+second derivative misleads there."""
 SHORTEST = 1 / 1024
 """Shortest step of the line search."""
 FORCE_FLOOR = 1e-6

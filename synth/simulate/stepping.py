@@ -26,7 +26,7 @@ from synth.simulate.trajectory import State, Trajectory, no_contact, not_converg
 SHORTEST_STEP = 1 / 128
 """Shortest step, as a share of max_step_mm."""
 MAX_PRESS_ITERATIONS = 2000
-"""A step that fails after so many iterations of a press ends it: of 600 presses that completed none took as many."""
+"""A step that fails after so many iterations of a press ends it; no press that completed took as many."""
 MAX_ITERATIONS_TO_GROW = 7
 """Most iterations of a step that is followed by a longer one."""
 GROWTH = 1.5
