@@ -7,7 +7,7 @@ A row tells of a draw whether both end alike (status and reason), and if both ar
 relative displacement and traction, the largest of the states that samples show, and the exact flow from rest to the
 last state in px. With --device cpu --noise 3e-5 the device is the CPU with a preconditioner whose every number is off
 by as much at random, as a GPU's is by its sums; Newton's method corrects that, but for draws that are near a second
-equilibrium. --loose solves intermediate steps, --forcing linear systems more roughly than `generate` does.
+equilibrium. --relaxed solves intermediate steps, --forcing linear systems more roughly than `generate` does.
 """
 
 from collections.abc import Sequence
@@ -99,7 +99,7 @@ class Noisy(Host):
             found[s] *= 1 + self._share * self._rng.standard_normal(found.shape[1], dtype=np.float32)
 
 
-def together(drawn: Sequence[Drawn], pad: Pad, driver: SolverOptions) -> list[Trajectory | str]:
+def together(drawn: Sequence[Drawn], pad: Pad, options: SolverOptions) -> list[Trajectory | str]:
     """All draws in one batch: each one's trajectory, or why its indenter cannot be built."""
     presses, which = [], []
     found: dict[int, Trajectory | str] = {}
@@ -111,19 +111,19 @@ def together(drawn: Sequence[Drawn], pad: Pad, driver: SolverOptions) -> list[Tr
             continue
         which.append(n)
     frames = [drawn[n].frames for n in which]
-    for k, trajectory in simulate_presses(presses, pad, frames, LARGEST_BATCH, driver):
+    for k, trajectory in simulate_presses(presses, pad, frames, LARGEST_BATCH, options):
         found[which[k]] = trajectory
     return [found[n] for n in range(len(drawn))]
 
 
-def one_by_one(drawn: Sequence[Drawn], driver: SolverOptions, processes: int) -> list[Trajectory | str]:
+def one_by_one(drawn: Sequence[Drawn], options: SolverOptions, processes: int) -> list[Trajectory | str]:
     """Each draw in a batch of its own on the CPU; what is returned as of `together`."""
     begin = (drawn[0].scene, drawn[0].mesh)
     if processes == 1:
         _begin(*begin)
-        return [_alone(one, driver) for one in drawn]
+        return [_alone(one, options) for one in drawn]
     with ProcessPoolExecutor(processes, get_context("spawn"), _begin, begin) as pool:
-        return list(pool.map(_alone, drawn, [driver] * len(drawn)))
+        return list(pool.map(_alone, drawn, [options] * len(drawn)))
 
 
 def _begin(scene: Scene, mesh: PadMesh) -> None:
@@ -131,8 +131,8 @@ def _begin(scene: Scene, mesh: PadMesh) -> None:
     _PAD[:] = [prepare(scene, mesh, "cpu")]
 
 
-def _alone(one: Drawn, driver: SolverOptions) -> Trajectory | str:
-    return together([one], _PAD[0], driver)[0]
+def _alone(one: Drawn, options: SolverOptions) -> Trajectory | str:
+    return together([one], _PAD[0], options)[0]
 
 
 def compare(one: Drawn, device: Trajectory | str, cpu: Trajectory | str) -> Row:
@@ -170,10 +170,10 @@ def last_flow(one: Drawn, trajectory: Trajectory) -> FloatArray:
 
 def run(case: Row, drawn: Sequence[Drawn], processes: int) -> list[Row]:
     """A row for each draw."""
-    driver = replace(OPTIONS, relaxed_tolerance=case["loose"], forcing=case["forcing"])
+    options = replace(OPTIONS, relaxed_tolerance=case["relaxed"], forcing=case["forcing"])
     noisy = Noisy(case["noise"]) if case["noise"] else None
-    on_device = together(drawn, prepare(drawn[0].scene, drawn[0].mesh, case["device"], noisy), driver)
-    return list(map(compare, drawn, on_device, one_by_one(drawn, driver, processes)))
+    on_device = together(drawn, prepare(drawn[0].scene, drawn[0].mesh, case["device"], noisy), options)
+    return list(map(compare, drawn, on_device, one_by_one(drawn, options, processes)))
 
 
 def summary(rows: Sequence[Row]) -> Row:
@@ -204,7 +204,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--trajectories", type=int, default=16)
     parser.add_argument("--seed", type=int, default=5)
     parser.add_argument("--processes", type=int, default=1, help="on the CPU")
-    parser.add_argument("--loose", type=float, default=OPTIONS.relaxed_tolerance, help="of intermediate steps")
+    parser.add_argument("--relaxed", type=float, default=OPTIONS.relaxed_tolerance, help="of intermediate steps")
     parser.add_argument("--forcing", type=float, default=OPTIONS.forcing, help="relative residual of linear solves")
     given = parser.parse_args(argv)
     if given.noise and given.device != "cpu":
@@ -216,7 +216,7 @@ def main(argv: list[str]) -> int:
     template = load_scene(given.scene, ['numerics.solver="batched"', f"numerics.cells={given.cells}", *given.set])
     drawn = drawn_of(template, given.trajectories, given.seed)
     print(machine())
-    options = ("device", "noise", "scene", "trajectories", "seed", "loose", "forcing")
+    options = ("device", "noise", "scene", "trajectories", "seed", "relaxed", "forcing")
     case = {**{name: getattr(given, name) for name in options}, "hash": template.hash}
     rows = measure(given.out / "agreement.csv", [case], partial(run, drawn=drawn, processes=given.processes))
     found = summary(rows)

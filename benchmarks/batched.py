@@ -81,7 +81,7 @@ def rate(case: Row, device: str) -> Row:
     pad = pad_of(case["cells"], case["growth"], device)
     rng = np.random.default_rng(0)
     scenes = [random_ball(rng, case) for _ in range(max(DRAWS, case["batch"]))]
-    options = replace(OPTIONS, forcing=case["forcing"], relaxed_tolerance=case["loose"], closer=case["closer"])
+    options = replace(OPTIONS, forcing=case["forcing"], relaxed_tolerance=case["relaxed"], closer=case["closer"])
     order = cycle(range(len(scenes)))
     presses = [Press.of(scene, pad.space.mesh) for scene in scenes]
     run = Run(presses, pad, None, case["batch"], options, order, case["inner"])
@@ -209,7 +209,7 @@ def reference_mesh(scene: Scene, across: int) -> PadMesh:
 def surface_error(case: Row) -> Row:
     """The error of one press on the case's mesh; the reference takes the scenes' own load steps."""
     scene, plain = (nth_ball(case["press"], {**case, "step_mm": step}) for step in (case["step_mm"], None))
-    found = simulate(scene, mesh_of(case), options=replace(OPTIONS, relaxed_tolerance=case["loose"]))
+    found = simulate(scene, mesh_of(case), options=replace(OPTIONS, relaxed_tolerance=case["relaxed"]))
     truth = simulate(plain, reference_mesh(scene, case["reference_across"]))
     row: Row = {
         "radius_mm": round(scene.contact.indenter.model_dump()["radius_mm"], 3),
@@ -238,7 +238,7 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--steps", type=int, default=1, help="recorded states")
     parser.add_argument("--radii", type=float, nargs=2, default=[2.0, 6.0], help="mm; of the balls")
     parser.add_argument("--forcing", type=float, default=OPTIONS.forcing, help="relative residual of linear solves")
-    parser.add_argument("--loose", type=float, default=OPTIONS.relaxed_tolerance, help="of intermediate steps")
+    parser.add_argument("--relaxed", type=float, default=OPTIONS.relaxed_tolerance, help="of intermediate steps")
     parser.add_argument("--closer", type=float, default=OPTIONS.closer, help="tolerance of passes over the scene's")
     parser.add_argument("--step", type=float, help="mm; longest load step, default as in scenes")
     parser.add_argument("--inner", type=int, default=INNER_ITERATIONS, help="Krylov iterations of a cycle")
@@ -248,7 +248,7 @@ def main(argv: list[str]) -> int:
     if any(cells % 2 or cells < 4 for cells in given.cells[:2]):
         raise InputError(f"--cells {given.cells}: along x and y give even numbers of at least 4")
     press = {"cells": "x".join(map(str, given.cells)), "growth": given.growth, "depth_mm": given.depth}
-    press |= {"drag_mm": given.drag, "steps": given.steps, "step_mm": given.step, "loose": given.loose}
+    press |= {"drag_mm": given.drag, "steps": given.steps, "step_mm": given.step, "relaxed": given.relaxed}
     press |= {"smallest_mm": given.radii[0], "largest_mm": given.radii[1]}
     print(machine())
     if given.errors is not None:

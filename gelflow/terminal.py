@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
@@ -33,8 +34,8 @@ def progress(label: str, shown: bool = True) -> Iterator[Advance]:
     if shown and not console.is_terminal:
         yield _lines(label)
         return
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), _Rate(), TimeRemainingColumn(),
-               TextColumn("{task.fields[item]}"))  # fmt: skip
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), _Rate(),
+               TimeRemainingColumn(), TextColumn("{task.fields[item]}", markup=False))  # fmt: skip
     with Progress(*columns, console=console, disable=not shown, transient=True) as bar:
         task = bar.add_task(label, total=None, item="")
         yield lambda done, total, item: bar.update(task, completed=done, total=total, item=item)
@@ -56,9 +57,9 @@ def show_table(title: str, header: list[str], rows: list[list[str]]) -> None:
     """Prints a table on stdout; columns but the first to the right, nothing cut off."""
     table = Table(title=title, title_justify="left", title_style="bold")
     for number, name in enumerate(header):
-        table.add_column(name, justify="right" if number else "left", no_wrap=True)
+        table.add_column(escape(name), justify="right" if number else "left", no_wrap=True)
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(escape, row))
     # Wider than the terminal rather than with cells cut off; a file or pipe has no width at all.
     console = Console(width=max(Console().width, 250))
     console.print(table)

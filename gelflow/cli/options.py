@@ -9,7 +9,7 @@ from cyclopts import Parameter
 from gelflow.errors import InputError
 
 MAXIMUM_PIXELS = 4096 * 4096
-"""Largest size at which a network may be asked to work; it takes some 0.6 kB of memory for each pixel."""
+"""Largest size at which a network may be asked to work; it takes at least 0.9 kB of memory for each pixel."""
 
 Paths = Annotated[
     list[Path], Parameter(help="Datasets or *.tar shards of synth, folders by 'pairs', or of NAME_1.png, NAME_2.png.")
@@ -57,6 +57,6 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
         raise InputError(f"--size {text}: ROWSxCOLUMNS is needed, for instance --size 512x640")
     if int(rows) * int(columns) > MAXIMUM_PIXELS:
         raise InputError(
-            f"--size {text}: at most {MAXIMUM_PIXELS} px are allowed, such as 4096x4096, which takes 10 GB of memory"
+            f"--size {text}: at most {MAXIMUM_PIXELS} px are allowed, such as 4096x4096, which takes 15 GB of memory"
         )
     return int(rows), int(columns)

@@ -52,8 +52,9 @@ def compare(
 def _speed(method: Method, dataset: PairDataset, batch: int) -> Speed | None:
     if batch == 0 or not isinstance(method, Learned | PublishedRaft):
         return None
+    rows, columns = dataset.images(0)[0].shape[:2]
     size = method.size or getattr(method.model, "image_size", None)
-    size = size or working_sizes(*dataset.images(0)[0].shape[:2])[0]
+    size = size or (working_sizes(rows, columns)[0] if isinstance(method, Learned) else (rows, columns))
     return network_speed(method.forward, size, batch, method.device)
 
 
@@ -74,14 +75,15 @@ FILES = ("scores.csv", "strata.csv", SCORES, "table.md", "table.tex", "work_prec
 """What `write_report` writes; strata.csv and strata.png where some pair has an exact flow."""
 
 _LATEX = {"%": r"\%", "_": r"\_", "&": r"\&", "#": r"\#", ">": r"$>$", "±": r"$\pm$", "×": r"$\times$"}
-_LATEX |= {"σ": r"$\sigma$", "≤": r"$\leq$"}
+_LATEX |= {"σ": r"$\sigma$", "≤": r"$\leq$", "{": r"\{", "}": r"\}", "$": r"\$", "\\": r"\textbackslash{}"}
+_LATEX |= {"^": r"\textasciicircum{}", "~": r"\textasciitilde{}"}
 
 
 def markdown(table: Table) -> str:
     """A table in Markdown, numbers to the right."""
     header, rows = table
     lines = [header, ["---"] + ["---:"] * (len(header) - 1), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+    return "\n".join("| " + " | ".join(cell.replace("|", r"\|") for cell in line) + " |" for line in lines) + "\n"
 
 
 def latex(title: str, table: Table) -> str:

@@ -45,8 +45,8 @@ def train_config(
     given = {name: value for name, value in (options or {}).items() if value is not None}
     values |= given
     steps, stated = values.get("steps"), any(text.partition("=")[0].strip() == "warmup_steps" for text in assignments)
-    if str(path) in PRESETS and isinstance(steps, int) and not stated:
-        values["warmup_steps"] = max(0, min(values.get("warmup_steps", 0), steps - 1))
+    if str(path) in PRESETS and isinstance(steps, int | float) and not stated:
+        values["warmup_steps"] = max(0, min(values.get("warmup_steps", 0), int(steps) - 1))
     sources += [f"--{name}" for name in given]
     return validated(TrainConfig, values, " with ".join(sources) or "default configuration")
 

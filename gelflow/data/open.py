@@ -37,12 +37,14 @@ def pair_records(folder: Path) -> list[PairRecord]:
 
 
 def holds_pairs(path: Path) -> bool:
-    """Whether a file or folder holds pairs rather than a recording; of a folder of images, all must be of pairs."""
+    """Whether a file or folder holds pairs rather than a recording, whose frames go on after NAME_1 and NAME_2."""
     if shard_files(path) or (path / PAIR_SET_FILE).is_file() or is_synthetic(path):
         return True
-    images = image_files(path) if path.is_dir() else []
-    names = {image.name[: -len("_1.png")] for image in images if image.name.endswith(("_1.png", "_2.png"))}
-    return bool(names) and len(images) == 2 * len(names)
+    images = {image.name for image in image_files(path)} if path.is_dir() else set()
+    names = {name.removesuffix("_1.png") for name in images if name.endswith("_1.png")}
+    return any(f"{name}_2.png" in images for name in names) and not any(
+        f"{name}_{number}.png" in images for name in names for number in (0, 3)
+    )
 
 
 def open_all(paths: Sequence[Path]) -> PairDataset:
@@ -53,7 +55,7 @@ def open_all(paths: Sequence[Path]) -> PairDataset:
     records: list[PairRecord] = []
     taken: set[str] = set()
     for dataset in datasets:
-        label = stem = Path(dataset.source).name
+        label = stem = Path(dataset.source).resolve().name
         number = 2
         while label in taken:
             label, number = f"{stem}-{number}", number + 1
@@ -64,7 +66,7 @@ def open_all(paths: Sequence[Path]) -> PairDataset:
 
 def _folder_records(folder: Path) -> list[PairRecord]:
     """The pairs NAME_1.png and NAME_2.png of a folder, by name, with NAME_markers.csv where dots were tracked."""
-    stems = {path.name[: -len("_1.png")] for path in (*folder.glob("*_1.png"), *folder.glob("*_2.png"))}
+    stems = {path.name[: -len("_1.png")] for path in (*folder.glob("[!.]*_1.png"), *folder.glob("[!.]*_2.png"))}
     records = []
     for name in sorted(stems):
         image1, image2 = folder / f"{name}_1.png", folder / f"{name}_2.png"

@@ -34,7 +34,7 @@ _END = bytes(2 * _BLOCK)
 def shard_files(path: Path) -> list[Path]:
     """The shards at a path, sorted by name: the file itself, or a folder's *.tar; none where there are none."""
     if path.is_dir():
-        return sorted(file for file in path.glob(f"*{SUFFIX}") if file.is_file())
+        return sorted(file for file in path.glob(f"[!.]*{SUFFIX}") if file.is_file())
     return [path] if path.suffix == SUFFIX and path.is_file() else []
 
 
@@ -59,6 +59,8 @@ def _samples(shard: Path) -> dict[str, dict[str, Member]]:
     """Members by suffix, by key."""
     samples: dict[str, dict[str, Member]] = {}
     for member in _members(shard):
+        if member.name.startswith("/") or ".." in Path(member.name).parts:
+            raise InputError(f"{member}: leads out of its folder; export the shard again")
         folder, slash, base = member.name.rpartition("/")
         stem, _, suffix = base.partition(".")
         parts = samples.setdefault(f"{folder}{slash}{stem}", {})

@@ -1,4 +1,4 @@
-"""Images: PNG (8 or 16 bit, grey or colour, with or without alpha) and 8-bit JPEG, BMP or TIFF.
+"""Images: PNG or TIFF (8 or 16 bit, grey or colour, with or without alpha) and 8-bit JPEG or BMP.
 
 In memory an image is (H, W, 3) float32, RGB in [0, 1]: a grey image has three equal channels, alpha is dropped, and a
 photograph is turned as its EXIF data say.
@@ -17,6 +17,7 @@ from gelflow.files.atomic import replacing
 from gelflow.files.quiet import quiet
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"})
+FORMATS = ("PNG", "JPEG", "BMP", "TIFF")
 MINIMUM_SIDE = 16
 """Optical flow of an image with a side of fewer px is not attempted."""
 
@@ -24,7 +25,7 @@ MINIMUM_SIDE = 16
 def _check(path: Path, data: bytes) -> None:
     """Refuses what OpenCV decodes, as far as it goes, without complaint: PNGs by checksums, others by decoding."""
     try:
-        with Image.open(io.BytesIO(data)) as image:
+        with Image.open(io.BytesIO(data), formats=FORMATS) as image:
             if image.format == "PNG":
                 image.verify()
             else:
@@ -38,7 +39,7 @@ def _check(path: Path, data: bytes) -> None:
 def read_image(path: Path) -> ImageArray:
     """An image as (H, W, 3) float32, RGB in [0, 1]; InputError if missing, damaged, or neither of 8 nor 16 bits."""
     if not path.is_file():
-        raise InputError(f"{path}: there is no such image file")
+        raise InputError(f"{path}: {'is a folder' if Path(str(path)).is_dir() else 'there is no such image file'}")
     data = path.read_bytes()
     _check(path, data)
     with quiet():

@@ -23,7 +23,7 @@ SUFFIXES = frozenset({".avi", ".mp4", ".m4v", ".mov", ".mkv", ".webm", ".mpg", "
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
     """Sorting key under which frame2 comes before frame10."""
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in re.split(r"(\d+)", name) if part]
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", name) if part]
 
 
 def image_files(folder: Path) -> list[Path]:

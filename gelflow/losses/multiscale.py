@@ -60,7 +60,8 @@ def self_supervised_loss(
             flow = enlarge_flow(flow, scale, (image1.shape[-2], image1.shape[-1]))
         if share > 0:
             pixels = inside(flow) if seen is None else inside(flow) * seen[place]
-            warped = warp(second[place], flow, config.warping)
+            # A spline needs three pixels.
+            warped = warp(second[place], flow, config.warping if min(flow.shape[-2:]) > 2 else "bilinear")
             loss = appearance_loss(first[place], warped, pixels, config.alpha)
             parts["photometric"] = parts["photometric"] + share * loss
         if smooth_share > 0:

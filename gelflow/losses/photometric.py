@@ -39,7 +39,7 @@ def structural_similarity(first: Images, second: Images) -> Tensor:
     return luminance * (2 * covariance + C2) / (variance1 + variance2 + C2)
 
 
-def photometric_loss(image1: Images, image2: Images, flow: Flow, alpha: float = 0.85) -> Scalar:
+def photometric_loss(image1: Images, image2: Images, flow: Flow, alpha: float) -> Scalar:
     """The photometric loss at one scale; 0 where the flow takes every pixel out of the image."""
     return appearance_loss(image1, warp(image2, flow), inside(flow), alpha)
 

@@ -91,7 +91,7 @@ def deformation_loss(flow: Flow, weight: Mask) -> Scalar:
     return (weight[..., 1:-1, 1:-1] * (across.abs() + down.abs())).mean()
 
 
-def first_order_loss(flow: Flow, image: Images, beta: float = 10.0) -> Scalar:
+def first_order_loss(flow: Flow, image: Images, beta: float) -> Scalar:
     """The smoothness loss at one scale; 0 for a single row or column.
 
     The mean is over the pixels that have a right and a lower neighbour and over both directions. The flow is in px or
@@ -106,7 +106,7 @@ def first_order_loss(flow: Flow, image: Images, beta: float = 10.0) -> Scalar:
     return (terms[0] + terms[1]).mean() / 2
 
 
-def second_order_loss(flow: Flow, image: Images, beta: float = 10.0) -> Scalar:
+def second_order_loss(flow: Flow, image: Images, beta: float) -> Scalar:
     """The smoothness loss of second order at one scale, 0 where a side is below 3; arguments as for `first_order_loss`.
 
     The second difference of the flow around a pixel is weighted by the image's step from that pixel to the next. The

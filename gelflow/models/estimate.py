@@ -23,10 +23,10 @@ def estimate_flow(
     """The flow from image 1 to image 2: ``I1(x) = I2(x + V(x))``, (B, 2, H, W) float32, px of the images, no gradient.
 
     Images are (B, 3, H, W) float32 in [0, 1]. The network is used on the device that it is on, in evaluation mode, and
-    left as it was; `size`, rows and columns at which it works, is by default that to which its training images were
-    resized (`GelFlow.image_size`), or where they were not, of `working_sizes` the one with the least mean of sigma.
-    `flow` is called in place of `GelFlow.flow`, such as a `RecordedNetwork` of the model. InputError for shapes that
-    differ, sides below 64 px where no size is given, other than three colours, values that are not finite.
+    left as it was. `size` is the rows and columns at which it works, by default `GelFlow.image_size`. Where that is
+    None, all of `working_sizes` are tried, and each pair keeps the flow with the least mean of sigma. `flow` is called
+    in place of `GelFlow.flow`, such as a `RecordedNetwork` of the model. InputError for shapes that differ, sides below
+    64 px (of `size`, or without one of the images), other than three colours, values that are not finite.
     """
     size = size or model.image_size
     if size is not None and min(size) < MINIMUM_SIDE:

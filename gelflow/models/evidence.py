@@ -47,7 +47,10 @@ class Step(NamedTuple):
 
 
 def evidence(flow: Flow, first: Images, second: SplineImage, background: SeparableFilter | None) -> Evidence:
-    """Residual and its derivatives along x and y, (B, C, H, W); 1 where the flow stays in the image and they count."""
+    """Residual, and the gradient along x and y of the mean of both images, (B, C, H, W), zero outside of image 2.
+
+    The last: 1 where the flow stays in the image, else 0, (B, 1, H, W).
+    """
     places = positions(flow)
     counts, moved = inside_at(places), second.at(places)
     residual = counts * (moved - first)

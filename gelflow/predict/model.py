@@ -67,6 +67,8 @@ class FlowModel:
         if isinstance(image1, Tensor) and isinstance(image2, Tensor):
             if image1.ndim == image2.ndim == 3:
                 return self.flow(image1[None], image2[None])[0]
+            if not image1.numel() or not image2.numel():
+                raise InputError("no image given: the batch is empty")
             for name, image in (("image 1", image1), ("image 2", image2)):
                 _check_range(name, str(image.dtype), float(image.min()), float(image.max()))
             return estimate_flow(self._network.model, image1, image2, self._network.size, self._network.forward)
@@ -121,5 +123,6 @@ def _in_unit_range(name: str, image: NDArray[np.generic]) -> ImageArray:
 def _check_range(name: str, dtype: str, lowest: float, highest: float) -> None:
     if lowest < 0.0 or highest > 1.0:
         raise InputError(
-            f"{name} is {dtype} with values from {lowest:g} to {highest:g}; allowed: values in [0, 1], or a uint8 array"
+            f"{name} is {dtype} with values from {lowest:g} to {highest:g}; allowed: values in [0, 1], or an array of "
+            "uint8"
         )

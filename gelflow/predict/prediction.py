@@ -4,6 +4,7 @@ import os
 import re
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import astuple, dataclass, fields
 from itertools import chain
 from pathlib import Path
@@ -22,7 +23,7 @@ from gelflow.files.quiet import quiet
 from gelflow.files.video import describe, frame_file, frames, image_files
 from gelflow.models.working_size import unknown_px
 from gelflow.predict.model import Estimate
-from gelflow.predict.pictures import certain, draw_overlay, round_up, write_flow_picture
+from gelflow.predict.pictures import certain, draw_overlay, robust_scale, write_flow_picture
 
 Reference = Literal["first", "previous"]
 MOTIONS, MOTIONS_BEGIN = "motion.csv", b"mean_px,p95_px"
@@ -130,6 +131,7 @@ def predict_video(
     sources = dict(enumerate(image_files(path))) if path.is_dir() else {}
     files: list[Path] = []
     motions: list[Motion] = []
+    scale = 0.0
     for index, image1, image2 in _frame_pairs(path, every, reference):
         source = sources.get(index, path)
         try:
@@ -143,12 +145,12 @@ def predict_video(
         files.append(out / "flow" / f"{index:06d}.exr")
         write_flow(files[-1], found.flow, found.visible, found.sigma)
         motions.append(motion)
+        scale = max(scale, robust_scale(certain(found.flow, found.sigma)))
         if progress:
             progress(len(motions), 2 * expected)
     if not motions:
         raise InputError(f"{path}: fewer than two frames decode; a flow needs two")
     table = _write_motions(out, motions)
-    scale = round_up(max(motion.p99_px for motion in motions))
 
     def overlays() -> Iterator[Bytes3]:
         for count, (index, _, frame) in enumerate(_frame_pairs(path, every, reference), start=len(motions) + 1):
@@ -192,7 +194,8 @@ def _write_overlay(pictures: Iterator[Bytes3], video: Path, frames_per_second: f
     temporary = video.with_name(".overlay.part.mp4")
     try:
         with quiet():
-            rate, size = max(frames_per_second, 1.0), (first.shape[1], first.shape[0])
+            # MPEG-4 takes no finer fractions.
+            rate, size = round(min(max(frames_per_second, 1.0), 600.0), 2), (first.shape[1], first.shape[0])
             writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
         count = 0
         for picture in chain([first], pictures):
@@ -200,8 +203,10 @@ def _write_overlay(pictures: Iterator[Bytes3], video: Path, frames_per_second: f
             count += 1
         with quiet():
             writer.release()
-        # OpenCV does not report a failed write (a full disk): count what arrived.
-        if not temporary.is_file() or describe(temporary).frames != count:
+        arrived = 0
+        with suppress(InputError):  # OpenCV does not report a failed write (a full disk): count what arrived
+            arrived = describe(temporary).frames
+        if arrived != count:
             raise OSError(f"cannot write {video}: the encoder did not take all {count} frames (is the disk full?)")
         os.replace(temporary, video)
     finally:

@@ -112,4 +112,4 @@ def _packed(value: Any) -> Any:
 
 
 def _unpacked(value: Any) -> Any:
-    return value.float() / 255 if isinstance(value, Tensor) and value.dtype == torch.uint8 else value
+    return (value.double() / 255).float() if isinstance(value, Tensor) and value.dtype == torch.uint8 else value

@@ -232,7 +232,8 @@ def check_side(batch: dict[str, Any], config: TrainConfig) -> None:
 def validation_metrics(batch: dict[str, Any], flow: Tensor, config: TrainConfig) -> dict[str, Tensor]:
     """How good the flow of one pair is: against the truth where there is one, and by the warped image.
 
-    Scalars by the names in `METRICS`; endpoint errors only where a flow is known. PSNR is that of floats over the
+    Scalars by the names in `METRICS`; endpoint errors only where a flow is known. The others are NaN where the flow
+    leads out of the image everywhere. PSNR is that of floats over the
     pixels that stay inside the image, not the 8-bit one of the comparison tables.
     """
     image1, image2 = batch["image1"], batch["image2"]
@@ -242,6 +243,8 @@ def validation_metrics(batch: dict[str, Any], flow: Tensor, config: TrainConfig)
         "no_motion_psnr_db": _psnr(image1, image2, still),
         "photometric_loss": photometric_loss(image1, image2, flow, config.loss.alpha),
     }
+    if not inside(flow).any():  # nothing was compared
+        metrics |= {name: metrics[name] * torch.nan for name in ("psnr_db", "photometric_loss")}
     if "flow" in batch:
         truth = batch["flow"]
         known = torch.isfinite(truth).all(dim=1)

@@ -119,7 +119,7 @@ def train(
         _fit(callback, _Data(config, train_set, validation_set, module), device, state.validation_due)
     weights = out / WEIGHTS
     if validation_set is None and is_first_process():
-        save_weights(weights, module.evaluated.cpu(), **weights_metadata(config, config.steps))
+        save_weights(weights, module.evaluated, **weights_metadata(config, config.steps))
     rate = callback.throughput.pairs_per_second
     return TrainResult(weights, config.steps, callback.metrics, callback.score, rate, peak_memory_mib())
 

@@ -145,13 +145,15 @@ def _supervised(sample: Sample, config: TrainConfig) -> bool:
 
 
 def collate(samples: list[Sample]) -> Sample:
-    """A batch from samples of one size; the flow is kept where all of them have one. InputError for several sizes."""
+    """A batch from samples of one size, NaN for flow that only others have. InputError for several sizes."""
     sizes = {tuple(sample["image1"].shape[-2:]) for sample in samples}
     if len(sizes) > 1:
         names = ", ".join(str(sample["name"]) for sample in samples)
         raise InputError(f"pairs {names} have images of different sizes; set image_size (or crop_size) to one size")
-    keys = ["image1", "image2"] + (["flow"] if all("flow" in sample for sample in samples) else [])
-    batch: Sample = {key: torch.stack([sample[key] for sample in samples]) for key in keys}
+    batch: Sample = {key: torch.stack([sample[key] for sample in samples]) for key in ("image1", "image2")}
+    if any("flow" in sample for sample in samples):
+        unknown = torch.full((2, *sizes.pop()), torch.nan)
+        batch["flow"] = torch.stack([sample.get("flow", unknown) for sample in samples])
     batch["name"] = [sample["name"] for sample in samples]
     batch["bare"] = [bool(sample.get("bare")) for sample in samples]
     return batch

@@ -4,10 +4,10 @@ It cannot be compared with methods that see each pair once; tables list it apart
 additional 800 epochs using the validation dataset" and says no more, so everything else is as in its training: the
 self-supervised losses, whole images at the network's size, batches of 4, a constant rate.
 
-Losses, gradient clipping, flips, weight decay and seed are those that the network's training recorded with its weights.
-Nothing else carries over. Exact flow is not looked at. The pairs are neither moved, recoloured, compressed nor cropped:
-these very images are to be matched. The rate is constant, so that a longer optimisation goes on with a shorter one; the
-peak of a falling rate is lowered to `RATE`. The weights themselves are kept, not their moving average.
+Losses, gradient clipping, flips, weight decay, precision, a constant rate and seed are those that the network's
+training recorded with its weights. Exact flow is not looked at. The pairs are neither moved, recoloured, compressed nor
+cropped: these very images are to be matched. The rate is constant, so that a longer optimisation goes on with a shorter
+one; the peak of a falling rate is lowered to `RATE`. The weights themselves are kept, not their moving average.
 
 Registration has no part in the training steps. The copy keeps what its weights had, and is used with what was asked of
 the network that it came from.
@@ -41,7 +41,10 @@ def fine_tuning_settings(method: Learned, steps: int, pairs: int) -> TrainConfig
     text = read_metadata(method.path).get("train")
     if text is None:
         raise InputError(f"{method.path}: its metadata lack the settings of its training, by which --ft goes on")
-    values = json.loads(text)
+    try:
+        values = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise InputError(f"{method.path}: its metadata do not describe its training") from error
     fixed: dict[str, Any] = {
         "model": method.trained.model_dump(),
         "supervision": "self",

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from synth.arrays import BoolArray, FloatArray
 from synth.calibrate.dots import find_dots
 from synth.calibrate.frames import PLACE
+from synth.errors import InputError
 from synth.mesh import rest_surface
 from synth.render.camera_image import encoded, expected_signal
 from synth.render.pattern import albedo, pixels_per_mm
@@ -79,8 +80,13 @@ def compare(frame: FloatArray, rendered: FloatArray, bare: BoolArray, sensor: Se
     outside = bare.copy()
     if isinstance(sensor.pattern, Dots):
         pitch = sensor.pattern.spacing_mm[0] * pixels_per_mm(sensor)
-        outside &= ~find_dots(rendered**sensor.camera.gamma, pitch).covered
+        try:
+            outside &= ~find_dots(rendered**sensor.camera.gamma, pitch).covered
+        except InputError as error:
+            raise InputError(f"in the picture of the fitted sensor: {error}") from error
         outside = cv2.erode(outside.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=1) > 0
+    if not outside.any():
+        raise InputError("no pixel of the frame is free of dots: give larger frames")
     return Comparison(frame, rendered, outside)
 
 

@@ -53,6 +53,7 @@ def find_dots(linear: FloatArray, pitch_px: float) -> FoundDots:
     contrast = (1 - relative) / (1.0 if extreme < 1 else 1 - extreme)
     whole = [k for k in np.flatnonzero((area > 0.5 * typical) & (area < 2 * typical)) if _inside(table[k + 1], labels)]
     found = [_measure(contrast, labels == k + 1, radius) for k in whole]
+    found = [dot for dot in found if np.isfinite([*dot[0], dot[1]]).all()]
     if len(found) < _FEWEST:
         raise _too_few(len(found), pitch_px)
     centres, radii = (np.array(part) for part in zip(*found, strict=True))

@@ -16,6 +16,7 @@ from synth.calibrate.noise import fit_noise
 from synth.calibrate.profile import DotProfile, blur_of, fit_profile
 from synth.errors import InputError
 from synth.optics import Optics
+from synth.render.camera_image import off_centre
 from synth.render.lights import check_view, light_axes
 from synth.render.pattern import pixels_per_mm
 from synth.render.variant import Variant
@@ -50,7 +51,7 @@ class SensorFit:
 def fit_sensor(start: Sensor, frames: Frames, variant: Variant, spacing_mm: float | None, steps: int) -> SensorFit:
     """Fit everything that undeformed frames tell.
 
-    The preset's camera has the frames' size. Without the spacing of the dots' columns its field of view is trusted. The
+    The preset's camera has the frames' size. Without the spacing of the dots' columns its field of view holds. The
     lights' geometry takes at most `steps` steps. The variant is a vectorised one. InputError for no dots, or no grid,
     where the preset has some; for nothing that tells of the lights; and for overexposure.
     """
@@ -122,10 +123,7 @@ def _target(encoded: FloatArray, camera: Camera, pixels: Pixels) -> Target:
             raise InputError(
                 f"the frames are overexposed: all of the coating is at the top of the range in {name}; take darker ones"
             )
-    x, y = np.abs(pixels - [camera.cx, camera.cy]).T
-    corner = max(abs(camera.cx), abs(camera.width - camera.cx)) ** 2
-    corner += max(abs(camera.cy), abs(camera.height - camera.cy)) ** 2
-    return Target(encoded**camera.gamma, slope, camera.exposure, (x**2 + y**2) / corner)
+    return Target(encoded**camera.gamma, slope, camera.exposure, off_centre(camera, *pixels.T))
 
 
 def _smoothed(encoded: FloatArray, bare: BoolArray) -> FloatArray:

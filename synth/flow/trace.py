@@ -18,9 +18,9 @@ import warp as wp
 from numpy.typing import NDArray
 
 from synth.arrays import FloatArray, Points, Triangles
+from synth.warp_start import start_warp
 
-wp.config.log_level = wp.LOG_WARNING
-wp.set_module_options({"enable_backward": False})
+start_warp()
 
 _MARGIN = 1e-5
 """Share of the largest coordinate by which boxes are widened: about a hundred times what float32 rounds there."""

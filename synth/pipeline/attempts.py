@@ -21,12 +21,13 @@ class Attempt:
     """One instance, to be simulated: its press, and the samples (`pairs`) that are wanted of it.
 
     `frames` are the states that any sample of the trajectory shows, wanted or not: a state's bits must not depend on
-    which samples are still to be made.
+    which samples are still to be made. `again` says that the object was pressed before, by the same instance.
     """
 
     press: Press
     pairs: tuple[Pair, ...]
     frames: frozenset[int]
+    again: bool
 
 
 class Attempts:
@@ -54,9 +55,9 @@ class Attempts:
         plan, seed = self._context.plan, self._context.job.seed
         while not self.is_exhausted:
             self._count += 1
-            stage = "draw"
+            stage, again = "draw", bool(self._waiting)
             try:
-                if not self._waiting:
+                if not again:
                     self._waiting = [draw(plan.template, seed, self.trajectory, self._count - 1, self._sensor)]
                 scene, stage = self._waiting.pop(0), "simulate"
                 press = plan.mesh.press(scene, plan.template.folder, self._context.mesh_folders)
@@ -67,14 +68,15 @@ class Attempts:
                 continue
             every = pairs_of(plan.template, seed, self.trajectory, scene.motion.steps)
             pairs = tuple(pair for pair in every if pair.index in self.wanted)
-            return Attempt(press, pairs, frozenset(frame for pair in every for frame in pair.frames))
+            return Attempt(press, pairs, frozenset(frame for pair in every for frame in pair.frames), again)
         return None
 
     def simulated(self, attempt: Attempt, result: Trajectory) -> Simulated | None:
         """What is handed on of an instance's trajectory; None if it cannot be used, which is put on record."""
         if result.status != "complete":
             self.fail("simulate", result.reason, result.states[-1].summary())
-            self._waiting += blunter(attempt.press)
+            if not attempt.again:
+                self._waiting += blunter(attempt.press)
             return None
         press, space, states = attempt.press, result.space, result.states
         shown = sorted({frame for pair in attempt.pairs for frame in pair.frames})

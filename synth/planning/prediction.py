@@ -19,7 +19,7 @@ from synth.scene.sampling import draw
 from synth.simulate.load_path import TWIST_ARM_MM
 from synth.simulate.press import edge_radius_mm
 from synth.simulate.resolution import Resolution
-from synth.simulate.solve import REACH
+from synth.simulate.solve import VICINITY
 
 _Meshes = tuple[list[tuple[Scene, int]], str, tuple[float, float] | None]
 """Random instances with their displacement nodes; `Prediction.resolution` and `Prediction.error_px`."""
@@ -152,7 +152,7 @@ def _plate(gel: Gel) -> tuple[float, float, float]:
     else:
         middle = (gel.size_mm[0] - thickness) / 2
         around, along = 2 * np.pi * middle, middle + gel.length_mm
-    moved = 2 * (REACH + 1) * thickness
+    moved = 2 * (VICINITY + 1) * thickness
     return min(around, moved), min(along, moved), thickness
 
 

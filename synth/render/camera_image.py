@@ -19,6 +19,7 @@ camera's follows from one pilot, on the safe side. Fewer than the pilot's are ne
 """
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,11 +65,15 @@ def expected_signal(radiance: Image, camera: Camera) -> FloatArray:
 
 def vignette(camera: Camera) -> FloatArray:
     """Relative illumination (H, W) float64 at pixel centres: 1 at (cx, cy), 1 - vignetting at the farthest corner."""
-    x = np.arange(camera.width) + 0.5 - camera.cx
-    y = np.arange(camera.height) + 0.5 - camera.cy
+    x, y = np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5
+    return 1 - camera.vignetting * off_centre(camera, x[None, :], y[:, None])
+
+
+def off_centre(camera: Camera, x: NDArray[Any], y: NDArray[Any]) -> FloatArray:
+    """ρ² of places (x, y) px: squared distance from the principal point over that of the farthest corner."""
     corner = max(abs(camera.cx), abs(camera.width - camera.cx)) ** 2
     corner += max(abs(camera.cy), abs(camera.height - camera.cy)) ** 2
-    return 1 - camera.vignetting * (x[None, :] ** 2 + y[:, None] ** 2) / corner
+    return np.asarray(((x - camera.cx) ** 2 + (y - camera.cy) ** 2) / corner)
 
 
 SHARE = 0.25

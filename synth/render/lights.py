@@ -90,7 +90,7 @@ def light_axes(light: Light) -> FloatArray:
 
 def check_view(sensor: Sensor) -> None:
     """Refuse lights that the camera would see: they would hide gel that the flow says is visible."""
-    optics, camera = Optics.of(sensor), sensor.camera
+    optics = Optics.of(sensor)
     across = np.linspace(-0.5, 0.5, 33)
     u, v = (axis.ravel() for axis in np.meshgrid(across, across))
     for i, light in enumerate(sensor.lights):
@@ -99,7 +99,7 @@ def check_view(sensor: Sensor) -> None:
             np.array(light.position_mm) + np.outer(u * light.size_mm[0], first) + np.outer(v * light.size_mm[1], second)
         )
         pixels = optics.project(points[optics.window.shows(points)])
-        inside = ((pixels > 0) & (pixels < [camera.width, camera.height])).all(1)
+        inside = optics.is_inside(pixels)
         if inside.any():
             x, y = pixels[inside][0]
             raise InputError(

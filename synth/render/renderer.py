@@ -53,13 +53,13 @@ class Renderer:
         if variant.is_mono and not is_grey(sensor):
             raise ValueError(f"{variant.name} renders grey sensors only: choose the variant with grey=is_grey(sensor)")
         self._variant, self._views = variant, sensor.views
-        separated = is_separated(render, sensor.coating, variant)  # every light at every sample
+        separated = is_separated(render, sensor.coating, variant)
         mi = variant.load()
         check_views(sensor)
         refracts = sensor.window.refractive_index != 1
         self._behind = reflecting_plane(sensor) if variant.is_vectorised else None
         lights = all_lights(sensor) if variant.is_vectorised else sensor.lights
-        self._lit = 1 if separated else sum(light.power > 0 for light in lights)
+        self._lit = 1 if separated else sum(light.power > 0 for light in lights)  # separated: all at every sample
         self._set_meshes(surface, chart_of(sensor))
         bsdf = reflection(mi, sensor.coating, albedo, variant.is_mono)
         shapes = {name: _gel(name, mesh, bsdf, mi) for name, mesh in self._meshes.items()}

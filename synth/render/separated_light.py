@@ -75,8 +75,8 @@ def is_separated(render: Render, coating: Coating, variant: Variant) -> bool:
 class SeparatedLight:
     """Light on one renderer's gel, by the lights and the window of a sensor.
 
-    `scene` is Mitsuba's, `gels` are the shapes in it: "gel", and "image" where the window reflects; the gel's vertices
-    are read from its parameters. `max_depth` is the longest path in surfaces and lights.
+    `scene` is Mitsuba's, `gels` holds the shapes "gel" and, where the window reflects, "image"; the gel's vertices are
+    read from its parameters. `max_depth` is the longest path in surfaces and lights.
     """
 
     def __init__(

@@ -121,6 +121,10 @@ class Gel(Part):
             for name in names:
                 if name not in (*needed, *follows) and getattr(self, name) is not None:
                     raise ValueError(f'{name} belongs to shape = "{shape}", the shape is "{self.shape}"')
+        if self.length_mm and self.shape != "capsule":
+            raise ValueError(f'length_mm belongs to shape = "capsule", the shape is "{self.shape}"')
+        if self.cut_end != "free" and not self.is_round:
+            raise ValueError(f'cut_end is for round gels, the shape is "{self.shape}"')
         if self.shape == "file" and "size_mm" not in self.model_fields_set:
             raise ValueError("outer and window must each name one file, which load_scene measures")
         if self.shape != "capsule" or self.radius_mm is None or self.thickness_mm is None:

@@ -8,7 +8,7 @@ from synth.scene.part import Part, Positive
 
 
 class Render(Part):
-    """Path tracing."""
+    """How pictures are rendered: samples, path length and method."""
 
     samples_per_pixel: Annotated[int, Field(ge=1, le=65536)] | Literal["auto"] = 36
     """Rounded up to a full grid and a multiple of the number of lights. auto: for every sensor drawn, as many as it
@@ -44,10 +44,10 @@ class Numerics(Part):
     max_step_mm: Positive = 0.25
     """Longest motion of the indenter in one load step; steps are halved when Newton fails."""
     tolerance: Annotated[float, Field(ge=1e-12, le=1e-2)] = 1e-6
-    """Newton stops when the residual is below this fraction of the reaction force."""
+    """Newton stops when the residual is below this fraction of the norm of all nodal forces."""
     penalty: Annotated[float, Field(ge=1, le=MAX_PENALTY)] = 50.0
     """Contact stiffness in multiples of E per mm, before augmented-Lagrangian updates; sharp bodies get up to four
-    times as much, mesh indenters up to eight times."""
+    times as much, mesh indenters up to eight times. Retries of objects and deep penetration raise it further."""
 
     @model_validator(mode="after")
     def _one_resolution(self) -> "Numerics":

@@ -122,6 +122,8 @@ class Bitmap(Part):
     def _placed(self) -> "Bitmap":
         if (self.placing == "uv") != (self.width_mm is None):
             raise ValueError('placing = "z" needs width_mm; with "uv" the gel\'s file says where the picture lies')
+        if self.placing == "uv" and (any(self.offset_mm) or self.rotation_deg):
+            raise ValueError('offset_mm and rotation_deg are for placing = "z"')
         return self
 
 

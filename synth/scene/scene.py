@@ -80,10 +80,12 @@ class Scene(Part):
             for axis, s, side in zip("xy", pose.shear_mm, size[:2], strict=True):
                 if abs(s) > side:
                     raise ValueError(f"{name}.shear_mm {axis} = {s} is longer than the pad ({side} mm): check its unit")
-        if motion.then and motion.steps < motion.moves:
+        # On a curved face the indenter touches above depth 0, so that a press to depth 0 is a leg, too.
+        moves = motion.moves + (gel.shape in ("dome", "file") and motion.depth_mm <= 0)
+        if motion.then and motion.steps < moves:
             raise ValueError(
-                f"motion.steps = {motion.steps} cannot record every pose of motion.then: there are {motion.moves} "
-                f"moves, press and shear among them, and each needs a step; at least {motion.moves}"
+                f"motion.steps = {motion.steps} cannot record every pose of motion.then: there are {moves} "
+                f"moves, press and shear among them, and each needs a step; at least {moves}"
             )
         edge, thinnest = self.numerics.edge_length_mm, min(*size, gel.depth_mm)
         if edge is not None and not thinnest / 60 <= edge <= thinnest:

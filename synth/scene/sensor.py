@@ -132,8 +132,11 @@ class Sensor(Part):
             self._check_inside()
         else:
             self._check_beyond()
-        if getattr(self.pattern, "placing", "z") == "uv" and self.gel.shape != "file":
-            raise ValueError(f'pattern.placing = "uv" needs gel.shape = "file", the shape is "{self.gel.shape}"')
+        placing, shape = getattr(self.pattern, "placing", "z"), self.gel.shape
+        if placing == "uv" and shape != "file":
+            raise ValueError(f'pattern.placing = "uv" needs gel.shape = "file", the shape is "{shape}"')
+        if placing in ("spherical", "cylindrical") and not self.gel.is_round:
+            raise ValueError(f'pattern.placing = "{placing}" is for round gels, the shape is "{shape}": use "z"')
         if not any(light.power for light in self.lights):
             raise ValueError("lights: no light has power; give at least one of them a power above 0")
         thickness = self.gel.size_mm[2]

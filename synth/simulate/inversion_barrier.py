@@ -1,8 +1,8 @@
 r"""Quadratic elements kept from inverting: a barrier at points where the bulk is not integrated, as Warp kernels.
 
 The bulk sees det F at four points of a P2 element. Under an edge that the mesh does not resolve det F can be positive
-there and negative at a corner, so that the surface folds over. At sample points, a lattice of degree SAMPLE_DEGREE over
-the element (its corners, edges and faces among them), an energy per undeformed volume
+there and negative at a corner, so that the surface turns inside out. At sample points on an even grid of degree
+SAMPLE_DEGREE (corners, edges and faces of the element among them), an energy per undeformed volume
 
 .. math::  ψ(J) = \frac{μ}{3} t^3,  \quad t = \max(0, \ln (J_0 / J)), \qquad
            J ψ' = -μ t^2, \quad J^2 ψ'' + J ψ' = 2 μ t
@@ -20,7 +20,7 @@ import warp as wp
 ONSET = 0.4
 """J_0: below what a resolved mesh reaches in ordinary presses; forces hardly depend on it."""
 SAMPLE_DEGREE = 3
-"""Degree of the lattice of sample points: 20 of them in an element."""
+"""Degree of the grid of sample points: 20 of them in an element."""
 ONSET_JACOBIAN = wp.constant(wp.float64(ONSET))
 
 

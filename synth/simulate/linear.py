@@ -23,7 +23,7 @@ from synth.arrays import FloatArray
 GMRES_TOLERANCE = 1e-3
 """Largest linear residual, relative to the right side; Newton's convergence is then as with an exact solution."""
 GMRES_LIMIT = 40
-"""Most iterations; where they do not do, the direction is used as it is and the line search judges it."""
+"""Most iterations; where they do not do, the direction is used as it is and the line search decides."""
 ROUGH_TOLERANCE = 0.03
 """Largest linear residual of a rough direction, with this tangent's factor or an earlier one's. Far from the solution
 changes of the contact set are what counts."""
@@ -54,7 +54,7 @@ class LinearSolver:
     """Solves the linear systems of one press, one after another; with `reuse` roughly where that is enough.
 
     Neighbouring tangents differ where contact changed: a few iterations of GMRES with the factor of an earlier one cost
-    less than a new factor. The factor may be used by others, too, and then this press begins with a new one.
+    less than a new factor. If another press has replaced the factor meanwhile, a new one is made.
     """
 
     def __init__(self, factor: Factor, reuse: bool) -> None:
@@ -144,7 +144,7 @@ def norm(x: FloatArray) -> float:
 def has_pardiso() -> bool:
     try:
         _mkl()
-    except ImportError:
+    except (ImportError, OSError):  # an MKL that does not load is as good as none
         return False
     return True
 

@@ -128,8 +128,9 @@ class LoadPath:
 
     @property
     def may_touch(self) -> bool:
-        """Whether the body ever goes below the undeformed face: for a dome, below its apex."""
-        return bool(self.corners[:, 0].max() + self.face_mm > 0)
+        """Whether the body ever goes below the highest point of the undeformed gel, which on a dome is its apex."""
+        highest = -self.face_mm if self.frame is None else self.frame.start_mm
+        return bool(self.corners[:, 0].max() > highest)
 
     def _level(self, depth: float) -> float:
         """Z of the body's origin."""

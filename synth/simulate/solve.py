@@ -20,7 +20,7 @@ from synth.simulate.stepping import Stepper
 from synth.simulate.system import System
 from synth.simulate.trajectory import State, Trajectory
 
-REACH = 6.0
+VICINITY = 6.0
 """Distance from the body within which a round gel may move, over its thickness or a film's shear lag, whichever is
 longer: what is left there moves some 1 %."""
 POSES = 9
@@ -56,7 +56,7 @@ def simulate_press(
     share of the load path is done. InputError where the mesh is of another pad, or no element can be built on it.
     """
     gel, whole = press.scene.sensor.gel, space_of(press)
-    if not gel.is_round:
+    if not (gel.is_round and press.path.may_touch):
         return stepper_of(press, frames, options, whole).run(on_progress)
     # A film pulls as far as its shear lag, √(E t h / G) with the gel's thickness h and G = E / 3 of the gel.
     film = sum(layer.youngs_modulus_kpa * layer.thickness_mm for layer in gel.layers) / gel.youngs_modulus_kpa
@@ -94,7 +94,9 @@ def check_shared(scenes: Sequence[Scene], mesh: PadMesh) -> None:
 
 
 def _check_pad(gel: Gel, mesh: PadMesh) -> None:
-    own, other = f"{gel.size_mm} mm {face_of(gel)}", f"{mesh.size_mm} mm {mesh.face}"
+    layers = int(mesh.layer.max())
+    own = f"{gel.size_mm} mm {face_of(gel)} with {len(gel.layers)} layers"
+    other = f"{mesh.size_mm} mm {mesh.face} with {layers} layers"
     if own != other:
         raise InputError(f"the mesh is of a {other}, the scene's is a {own}")
 
@@ -120,7 +122,7 @@ class Vicinity:
 
     def __init__(self, whole: Space, path: LoadPath, decay_mm: float) -> None:
         """Cut the vicinity of a path out of the space of a gel in which displacements die away over such a length."""
-        near = _distance(whole.mesh.points, path) <= REACH * decay_mm
+        near = _distance(whole.mesh.points, path) <= VICINITY * decay_mm
         kept = np.asarray(near[whole.mesh.tets].any(axis=1))
         self._whole, self._nodes = whole, np.unique(whole.nodes[kept])
         self.space = _part(whole, kept, self._nodes)

@@ -72,7 +72,7 @@ def laplace_table(space: Space, material: Material, pairs: np.ndarray) -> wp.arr
 
 
 def barrier_tables(space: Space, material: Material, d: str) -> "BarrierTables | None":
-    """Where `synth.simulate.inversion_barrier` looks, on Warp device d; None for linear elements, which cannot fold."""
+    """The sample points of `synth.simulate.inversion_barrier`, on Warp device d; None for linear elements."""
     if space.element.order == 1:
         return None
     share, along = np.zeros((4, 10)), np.full((4, 10), -1)

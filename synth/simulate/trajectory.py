@@ -25,7 +25,7 @@ class State:
         traction: (s, 3) float64 MPa on the gel at the space's surface nodes, per undeformed area.
         force_n, torque_nmm: of the indenter on the gel, in the sensor's frame; torque about its origin.
         residual: of the unknowns over the norm of the nodal forces.
-        min_jacobian: smallest det F at any quadrature point.
+        min_jacobian: smallest det F at any quadrature point or sample point (`synth.simulate.inversion_barrier`).
         max_penetration_mm: deepest contact point inside the indenter.
         slip_ratio: of the touching area, the part that slipped in the last load step.
     """

@@ -21,7 +21,7 @@ from synth.simulate.batched.run import OPTIONS
 
 TINY = ["numerics.element=p1p1", "sensor.camera.width=32", "sensor.camera.height=24", "motion.steps=2"]
 PRESS: Row = {"depth_mm": 0.3, "drag_mm": 0.0, "steps": 1, "step_mm": None, "smallest_mm": 2.0, "largest_mm": 6.0}
-CASE: Row = {**PRESS, "growth": 2.0, "loose": 0.0, "reference_across": 2, "press": 0}
+CASE: Row = {**PRESS, "growth": 2.0, "relaxed": 0.0, "reference_across": 2, "press": 0}
 
 
 def run(out: Path, *options: str) -> Row:
@@ -56,12 +56,12 @@ def test_the_cpu_agrees_with_itself(tmp_path: Path) -> None:
 
 def test_noise_in_the_directions_stays_within_what_is_wanted(tmp_path: Path) -> None:
     """Loose intermediate steps let friction remember the noise, rougher directions leave more of it."""
-    changes: tuple[list[str], ...] = [], ["--forcing", "0.03"], ["--loose", "1e-3"]
-    found, rough, loose = (run(tmp_path / str(n), "--noise", "3e-4", *one) for n, one in enumerate(changes))
-    assert found["end alike"] == rough["end alike"] == loose["end alike"] == 4
+    changes: tuple[list[str], ...] = [], ["--forcing", "0.03"], ["--relaxed", "1e-3"]
+    found, rough, relaxed = (run(tmp_path / str(n), "--noise", "3e-4", *one) for n, one in enumerate(changes))
+    assert found["end alike"] == rough["end alike"] == relaxed["end alike"] == 4
     assert 0 < found["displacement, largest"] <= WANTED
     assert found["displacement, median"] < rough["displacement, median"]
-    assert 2 * found["displacement, median"] < loose["displacement, median"]
+    assert 2 * found["displacement, median"] < relaxed["displacement, median"]
     # At most some ten px of flow, within 1e-6 of them.
     assert found["mean_flow_px, largest"] <= found["flow_px, largest"] < 1e-4
 
@@ -108,7 +108,7 @@ def test_errors_fall_with_the_elements(monkeypatch: pytest.MonkeyPatch) -> None:
     coarse, finer = (surface_error({**CASE, "cells": cells}) for cells in ("6x4x1", "8x6x2"))
     assert coarse["surface_error_percent"] > finer["surface_error_percent"] > 0
     monkeypatch.setattr(batched, "mesh_of", lambda case: reference_mesh(nth_ball(0, PRESS), 2))
-    same = surface_error({**CASE, "loose": 1e-3})
+    same = surface_error({**CASE, "relaxed": 1e-3})
     assert (same["surface_error_percent"], same["force_error_percent"]) == (0, 0)
 
 
@@ -125,7 +125,7 @@ def test_the_command_and_its_rate_from_the_second_batch_on(tmp_path: Path, capsy
         assert {"ms_residual", "ms_tangent", "ms_krylov", "ms_product", "ms_preconditioner", "ms_stepping"} <= set(row)
     # Another way to intermediate steps leaves another state, since friction remembers it: 0.02 to 0.14 % here.
     press = ["--out", str(tmp_path), "--cells", "8", "6", "2", "--depth", "0.5", "--radii", "5", "6", "--errors", "1"]
-    for way in ([], ["--step", "0.05"], ["--loose", "0.1"]):
+    for way in ([], ["--step", "0.05"], ["--relaxed", "0.1"]):
         assert batched.main([*press, "--across", "4", *way]) == 0
     found: list[dict[str, Any]] = read(tmp_path / "batched_errors.csv")
     assert all(5 <= row["radius_mm"] <= 6 for row in found)

@@ -58,10 +58,10 @@ def test_bins_of_seeds_are_pooled_and_fine_tuned_methods_and_other_devices_come_
 
 
 def test_latex_escapes_distance_is_signed_and_pairs_add_up_pixel_by_pixel() -> None:
-    text = latex("Errors of 50 % & more", (["method", "> 1 px %"], [["a_b (3 seeds)", "1.0 ± 0.5"]]))
+    text = latex("Errors of 50 % & more", (["method", "> 1 px %"], [["a_b^2{ (3 seeds)", "1.0 ± 0.5"]]))
     assert r"\caption{Errors of 50 \% \& more}" in text
     assert r"method & $>$ 1 px \% \\" in text
-    assert r"a\_b (3 seeds) & 1.0 $\pm$ 0.5 \\" in text
+    assert r"a\_b\textasciicircum{}2\{ (3 seeds) & 1.0 $\pm$ 0.5 \\" in text
     assert text.count(r"\begin") == text.count(r"\end") == 2
     region = np.zeros((5, 12), bool)
     region[:, :4] = True

@@ -128,6 +128,12 @@ def test_two_samples_of_one_key_are_named(shard: Path) -> None:
     refused(r"shard-000000\.tar, member 000000\.image1\.png: occurs twice", PairDataset, shard)
 
 
+@pytest.mark.parametrize("place", ["../{}", "/{}"])
+def test_a_shard_does_not_lead_out_of_its_folder(shard: Path, place: str) -> None:
+    rewrite(shard, lambda name, data: iter([(place.format(name), data)]))
+    refused("leads out of its folder", PairDataset, shard)
+
+
 def _npy(array: np.ndarray) -> bytes:
     buffer = io.BytesIO()
     np.lib.format.write_array(buffer, array, allow_pickle=array.dtype == object)

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.autograd import gradcheck
 from waves import moved_pair, pixel_centres, press_flow
 
-from gelflow.config import LossConfig
+from gelflow.config import LossConfig, TrainConfig
 from gelflow.losses import flow_loss, self_supervised_loss
 from gelflow.losses.augmentation_consistency import consistency_loss, transformed_pair
 from gelflow.losses.multiscale import SOFTNESS_PX, endpoint_loss
@@ -30,6 +30,7 @@ from gelflow.losses.regularisers import (
 )
 from gelflow.ops.pyramid import flow_pyramid
 from gelflow.ops.warp import inside, warp
+from gelflow.train.module import validation_metrics
 
 ONES = torch.ones(1, 1, 9, 11, dtype=torch.float64)
 
@@ -45,7 +46,7 @@ def test_structural_similarity_follows_its_definition_and_equal_images_cost_noth
         # differences of squares of size 1 over at least C2 = 9e-4, in double precision
         assert abs(structural_similarity(first, second)[0, 0, row, column] - expected) < 1e-11
     image = torch.rand(1, 3, 12, 15, dtype=torch.float64)
-    loss = photometric_loss(image, image, torch.zeros(1, 2, 12, 15, dtype=torch.float64))
+    loss = photometric_loss(image, image, torch.zeros(1, 2, 12, 15, dtype=torch.float64), 0.85)
     assert 0 <= loss + 1e-11 < 2e-11  # warping errs by 1e-14; SSIM is 1 up to 1e-14 / C2
     image1, image2 = torch.rand(2, 1, 3, 1, 1, dtype=torch.float64)
     loss = photometric_loss(image1, image2, torch.zeros(1, 2, 1, 1, dtype=torch.float64), alpha=0)
@@ -53,9 +54,15 @@ def test_structural_similarity_follows_its_definition_and_equal_images_cost_noth
     flow = torch.zeros(2, 64, 64, dtype=torch.float64)
     flow[0] = 10
     image1, image2 = (image[None] for image in moved_pair(flow, seed=4))
-    assert photometric_loss(image1, image2, flow[None]) < 1e-9  # an integer shift: exact but for rounding, as above
+    # An integer shift: exact but for rounding, as above.
+    assert photometric_loss(image1, image2, flow[None], 0.85) < 1e-9
     assert appearance_loss(image1, warp(image2, flow[None]), torch.ones(1, 1, 64, 64), 0.85) > 0.01
-    assert photometric_loss(image1, image2, flow[None] * 100) == 0  # nothing left to judge by
+    assert photometric_loss(image1, image2, flow[None] * 100, 0.85) == 0  # nothing left to compare
+    pair = {"image1": image1.float(), "image2": image2.float()}
+    found = validation_metrics(pair, flow[None].float() * 100, TrainConfig())
+    assert {name: bool(value.isnan()) for name, value in found.items()} == {
+        "psnr_db": True, "no_motion_psnr_db": False, "photometric_loss": True,
+    }  # fmt: skip
 
 
 def affine_flow(matrix: list[list[float]]) -> Tensor:
@@ -76,7 +83,7 @@ def test_decomposition_separates_stretch_shear_and_rotation_and_affine_flows_cos
     loss = decomposition_loss(flow, ONES, lambda_theta=10, lambda_zeta=100)
     # 100 times differences of numbers up to 5, in double precision
     assert loss.item() == pytest.approx(parts[0] + 10 * parts[1] + 100 * parts[2], abs=1e-11)
-    assert (first_order_loss(flow, torch.rand(1, 3, 10, 12, dtype=torch.float64)) == 0) == (not any(parts))
+    assert (first_order_loss(flow, torch.rand(1, 3, 10, 12, dtype=torch.float64), 10.0) == 0) == (not any(parts))
     assert deformation_loss(flow, ONES) < 1e-13  # rounding: numbers up to 5 give slopes good to 1e-15
 
 
@@ -96,7 +103,7 @@ def test_scales_too_small_for_a_derivative_cost_nothing_and_keep_the_gradient_de
     weight, image = torch.ones(1, 1, size[0] - 1, size[1] - 1), torch.rand(1, 3, *size)
     loss = deformation_loss(flow, weight)
     if size[0] == 1:
-        loss = loss + decomposition_loss(flow, weight, 0.01, 0.01) + first_order_loss(flow, image)
+        loss = loss + decomposition_loss(flow, weight, 0.01, 0.01) + first_order_loss(flow, image, 10.0)
     loss.backward()
     assert loss == 0
     assert not flow.grad.any()
@@ -108,8 +115,8 @@ def test_first_order_smoothness_and_weights_follow_their_definition_at_edges() -
     flow = torch.zeros(1, 2, 4, 6, dtype=torch.float64)
     flow[:, 0, :, 3:] = 2
     # 3 x 5 pixels, 3 of them at the jump: 2 px times exp(-10), halved
-    assert first_order_loss(flow, image).item() == pytest.approx(3 / 15 * 2 * math.exp(-10) / 2, rel=1e-12)
-    assert first_order_loss(flow, torch.zeros_like(image)).item() == pytest.approx(3 / 15 * 2 / 2, rel=1e-12)
+    assert first_order_loss(flow, image, 10.0).item() == pytest.approx(3 / 15 * 2 * math.exp(-10) / 2, rel=1e-12)
+    assert first_order_loss(flow, torch.zeros_like(image), 10.0).item() == pytest.approx(3 / 15 * 2 / 2, rel=1e-12)
     image = torch.zeros(1, 3, 3, 4, dtype=torch.float64)
     image[0, :, :, 2:] = torch.tensor([0.3, 0.1, 0.2], dtype=torch.float64).view(3, 1, 1)  # |grad I| = 0.2 in the mean
     edge = math.exp(-10 * 0.2)
@@ -229,11 +236,11 @@ def test_second_order_is_zero_for_affine_flows_and_known_for_a_parabola() -> Non
     x, y = pixel_centres(10, 12)
     image = torch.zeros(1, 3, 10, 12, dtype=torch.float64)
     affine = torch.stack([0.3 * x - 0.2 * y + 1, 0.1 * x + 0.4 * y])[None]
-    assert second_order_loss(affine, image) < 1e-13  # differences of numbers up to 5
+    assert second_order_loss(affine, image, 10.0) < 1e-13  # differences of numbers up to 5
     bent = torch.stack([0.05 * x**2, 0.1 * y**2])[None]
     # u_xx = 0.1, v_yy = 0.2, each counted once, halved
-    assert second_order_loss(bent, image).item() == pytest.approx(0.15, abs=1e-12)
-    assert second_order_loss(bent[..., :2, :], image[..., :2, :]) == 0
+    assert second_order_loss(bent, image, 10.0).item() == pytest.approx(0.15, abs=1e-12)
+    assert second_order_loss(bent[..., :2, :], image[..., :2, :], 10.0) == 0
 
 
 def test_occlusion_keeps_what_closes_and_hides_nothing_where_nothing_does() -> None:

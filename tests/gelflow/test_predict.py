@@ -27,8 +27,8 @@ from gelflow.predict.prediction import predict_pair, predict_pairs, predict_vide
 FARNEBACK = named_methods(["farneback"])[0]
 
 
-def video(path: Path, frames: int) -> Path:
-    write_video(path, [as_bytes(moved(48, 64, shift, 0)) for shift in range(frames)])
+def video(path: Path, frames: int, rate: float = 25.0) -> Path:
+    write_video(path, [as_bytes(moved(48, 64, shift, 0)) for shift in range(frames)], rate)
     return path
 
 
@@ -61,7 +61,11 @@ def test_a_set_of_pairs_gives_the_flow_of_each_and_a_folder_of_frames_is_none(tm
     assert [row["file"] for row in table(result.files[-1])] == ["a", "b"]
     assert [(motion.frame, motion.file) for motion in result.motions] == [(1, "a"), (2, "b")]
     assert np.median(read_flow(result.files[3]).flow[..., 1]) == pytest.approx(2.0, abs=0.1)
-    save(folder / "c_3.png", moved(48, 48, 0, 0))
+    save(folder / "photograph.png", moved(48, 48, 0, 0))
+    (folder / "._a_1.png").write_bytes(b"left by a Mac")
+    assert len(PairDataset(folder)) == 2
+    assert holds_pairs(folder)
+    save(folder / "a_3.png", moved(48, 48, 0, 0))
     assert not holds_pairs(folder)
 
 
@@ -77,6 +81,11 @@ def test_video_against_its_first_or_previous_frame(tmp_path: Path, reference: st
     assert int(cv2.VideoCapture(str(out / "overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT)) == 3
     assert not list(out.glob(".*"))
     assert calls == [(n, 6) for n in range(1, 7)]
+
+
+def test_a_fast_camera_has_an_overlay_too(tmp_path: Path) -> None:
+    path = video(tmp_path / "a.avi", 3, rate=239.682)
+    assert predict_video(FARNEBACK, path, tmp_path / "out").files[-1].is_file()
 
 
 def test_folder_of_frames_is_a_video_and_flow_files_of_an_earlier_run_go(tmp_path: Path) -> None:
@@ -176,6 +185,7 @@ def test_arrays_and_tensors_give_one_flow_that_follows_a_known_motion(tmp_path: 
     (torch.zeros(3, 64, 64), torch.full((3, 64, 64), -1.0), r"image 2 is torch.float32 with values from -1 to -1"),
     (np.zeros((64, 64)), np.zeros((64, 64)), r"\(rows, columns, 3\) is needed"),
     (torch.zeros(3, 64, 64), torch.zeros(3, 64, 80), "differ in shape"),
+    (torch.zeros(0, 3, 64, 64), torch.zeros(0, 3, 64, 64), "the batch is empty"),
     (np.full((64, 64, 3), np.nan), np.zeros((64, 64, 3)), "NaN or infinite"),
 ])  # fmt: skip
 def test_images_that_cannot_be_used(image1: object, image2: object, message: str) -> None:

@@ -122,4 +122,5 @@ def test_settings_come_from_a_file_a_preset_and_assignments(tmp_path: Path) -> N
     assert (config.steps, config.loss.lambda_dc, config.loss.lambda_df) == (7, 3, 0.5)
     words = r"papier: neither a configuration file nor a preset; presets are best, real, bare, paper"
     refused(words, train_config, "papier")
+    assert train_config("best", ["steps=1e2"]).warmup_steps == 99
     refused("must be below steps = 4", train_config, "best", ["warmup_steps=4"], {"steps": 4})

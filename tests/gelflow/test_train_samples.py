@@ -84,7 +84,9 @@ def test_resizing_keeps_flow_and_batches_need_one_size_and_enough_pixels() -> No
     for side, crop, words in ((48, None, "48x48 px, but each side must be at least 64"),
                               (64, (72, 64), "crop_size 72x64 does not fit")):  # fmt: skip
         refused(words, TrainingSamples(Shifts(1, side, 1.0, seed=8), TrainConfig(crop_size=crop)).__getitem__, (0, 0))
-    assert "flow" not in collate([small, bare])
+    mixed = collate([small, bare])["flow"]
+    assert torch.isfinite(mixed[0]).all()
+    assert torch.isnan(mixed[1]).all()
     assert collate([small, small])["flow"].shape == (2, 2, 64, 64)
 
 

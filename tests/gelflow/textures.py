@@ -49,9 +49,9 @@ def save(path: Path, image: NDArray[np.float32]) -> None:
     assert cv2.imwrite(str(path), as_bytes(image)[..., ::-1])
 
 
-def write_video(path: Path, frames: list[NDArray[np.uint8]]) -> None:
+def write_video(path: Path, frames: list[NDArray[np.uint8]], rate: float = 25.0) -> None:
     height, width = frames[0].shape[:2]
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (width, height))
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), rate, (width, height))
     assert writer.isOpened()
     for frame in frames:
         writer.write(np.ascontiguousarray(frame[..., ::-1]))

@@ -152,16 +152,28 @@ def test_far_from_the_press_the_gel_is_left_out() -> None:
     assert still.mean() > 0.4
 
 
+BOX = {"shape": "box", "size_mm": (9.0, 9.0, 7.0), "radius_mm": None, "thickness_mm": None}
+
+
 @pytest.mark.parametrize(("gel", "message"), [
     ({"radius_mm": None}, "needs radius_mm and thickness_mm"),
     ({"thickness_mm": 4.6}, r"leaves no room for a window in radius_mm = 5.0: at most 4.5"),
     ({"size_mm": (9.0, 9.0, 7.0)}, "follows from radius_mm and length_mm: leave it out"),
     ({"layers": [{"thickness_mm": 2.0, "youngs_modulus_kpa": 900.0}]}, "leave nothing of the gel's 2.0 mm"),
     ({"shape": "box", "size_mm": (9.0, 9.0, 7.0)}, 'radius_mm belongs to shape = "capsule"'),
+    (BOX | {"length_mm": 2.0}, 'length_mm belongs to shape = "capsule"'),
+    (BOX | {"length_mm": 0.0, "cut_end": "held"}, "cut_end is for round gels"),
 ])  # fmt: skip
 def test_impossible_capsules_are_refused(gel: dict[str, Any], message: str) -> None:
     with pytest.raises(ValidationError, match=message):
         Gel.model_validate({**CAPSULE, **gel})
+
+
+def test_an_indenter_that_stays_far_away_leaves_the_gel_at_rest() -> None:
+    away = capsule(motion={"depth_mm": -45.0})
+    found = simulate(away, capsule_mesh(away.sensor.gel, 1.5))
+    assert found.status == "complete"
+    assert not any(state.displacement.any() for state in found.states)
 
 
 @pytest.mark.parametrize(("motion", "message"), [

@@ -177,9 +177,11 @@ def test_the_product_is_the_tangent_times_the_vector(element, poisson_ratio, sti
 
 def test_scenes_must_share_the_pad_which_serves_several_runs() -> None:
     refused(r"mm pad", simulate_scenes, [scene((8.0, 6.0, 3.0))], MESH)
-    soft, stiffening, loose = {"poisson_ratio": 0.45}, {"stiffening": [0.1, 0.0]}, {"max_step_mm": 0.05}
-    for other in (scene(gel=soft), scene(gel=stiffening), scene(numerics=loose)):
+    pad = prepare(scene(), MESH, "cpu")
+    soft, stiffening, short = {"poisson_ratio": 0.45}, {"stiffening": [0.1, 0.0]}, {"max_step_mm": 0.05}
+    for other in (scene(gel=soft), scene(gel=stiffening), scene(numerics=short)):
         refused("must share the gel's materials and all numerics", simulate_scenes, [scene(), other], MESH)
+        refused("must share", list, simulate_presses(presses_of([other], MESH), pad))
     with pytest.raises(ValueError, match="1 sets of frames for 2 presses"):
         simulate_scenes([scene(), scene()], MESH, frames=[frozenset({1})])
     posed = scene(friction=0.4, motion={"depth_mm": 0.2})

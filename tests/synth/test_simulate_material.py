@@ -141,15 +141,15 @@ def squeezed(body: System, size: float) -> Unknowns:
     return Unknowns(size * rng.standard_normal(zero.u.shape), 0.1 * rng.standard_normal(zero.p.shape))
 
 
-def lattice_jacobian(body: System, u: FloatArray) -> tuple[FloatArray, Integrals]:
-    """(m, p) det F at the lattice's points, by shape functions of their own."""
+def sampled_jacobian(body: System, u: FloatArray) -> tuple[FloatArray, Integrals]:
+    """(m, p) det F at the sample points, by shape functions of their own."""
     points = Integrals(body.space, CORNERS, np.full(len(CORNERS), 1 / len(CORNERS)))
     return np.linalg.det(points.deformation(u)), points
 
 
 def barrier(body: System, u: FloatArray) -> float:
     """The energy of `synth.simulate.inversion_barrier`; mu = E / 3 at a Poisson ratio of 0.5."""
-    jacobian, points = lattice_jacobian(body, u)
+    jacobian, points = sampled_jacobian(body, u)
     return float((points.volume * np.log(np.maximum(ONSET / jacobian, 1.0)) ** 3).sum() / 9)
 
 
@@ -157,9 +157,9 @@ def barrier(body: System, u: FloatArray) -> float:
 def state() -> Unknowns:
     body = guarded_pad()
     sizes = np.linspace(0.03, 0.2, 35)
-    valid = [size for size in sizes if lattice_jacobian(body, squeezed(body, size).u)[0].min() > 0.05]
+    valid = [size for size in sizes if sampled_jacobian(body, squeezed(body, size).u)[0].min() > 0.05]
     found = squeezed(body, valid[-1])
-    assert (lattice_jacobian(body, found.u)[0] < ONSET).sum() > 5
+    assert (sampled_jacobian(body, found.u)[0] < ONSET).sum() > 5
     return found
 
 
@@ -188,13 +188,13 @@ def test_forces_are_the_energys_gradient_tangent_their_derivative_and_corners_ar
     found = dense(body, tangent) @ full[body.free]
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
     smallest = body.residual(state, far_away()).smallest_jacobian
-    assert smallest <= lattice_jacobian(body, state.u)[0].min() + 1e-12
+    assert smallest <= sampled_jacobian(body, state.u)[0].min() + 1e-12
 
 
 def test_not_a_bit_is_added_where_nothing_folds() -> None:
     body, bare = guarded_pad(), guarded_pad(guarded=False)
     gentle = squeezed(body, 0.01)
-    assert lattice_jacobian(body, gentle.u)[0].min() > ONSET
+    assert sampled_jacobian(body, gentle.u)[0].min() > ONSET
     np.testing.assert_array_equal(forces(body, gentle), forces(bare, gentle))
 
 
@@ -205,5 +205,5 @@ def test_no_fold_under_a_tip() -> None:
     mesh, _ = graded_mesh(posed.sensor.gel, Focus((0.0, 0.0), (0.8, 0.8)), 4)
     last = complete(posed, mesh).states[-1]
     body = System(function_space(mesh, p2p1()), uniform(len(mesh.tets), 0.5))
-    assert lattice_jacobian(body, last.displacement)[0].min() > 0
+    assert sampled_jacobian(body, last.displacement)[0].min() > 0
     assert last.min_jacobian > 0

@@ -123,6 +123,11 @@ WRONG_KEYS_AND_TYPES = [
     ("sensor.gel.radius_mm=9", 'sensor.gel: radius_mm belongs to shape = "capsule", the shape is "box"'),
     ('sensor.pattern={ kind = "bitmap", file = "a.png" }', ': placing = "z" needs width_mm'),
     ('sensor.pattern={ kind = "bitmap", file = "a.png", placing = "uv" }', 'sensor: pattern.placing = "uv" needs gel.'),
+    ("sensor.pattern.placing=spherical", 'sensor: pattern.placing = "spherical" is for round gels, the shape is "box"'),
+    (
+        'sensor.pattern={ kind = "bitmap", file = "a.png", placing = "uv", rotation_deg = 3.0 }',
+        ': offset_mm and rotation_deg are for placing = "z"',
+    ),
     ("name=two words", " = 'two words': must consist of letters A to Z, digits, _ and - alone"),
     ("contact.indenter.shape=ball", " = 'ball': allowed are 'sphere', 'cylinder', 'box'"),
     ("contact.indenter={ radius_mm = 1 }", ": lacks the key 'shape'"),

@@ -10,6 +10,7 @@ with the CUDA builds of torch (packages nvidia-cublas, nvidia-cusolver) or with 
 import ctypes
 import ctypes.util
 import importlib.util
+import weakref
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import cache
@@ -110,6 +111,7 @@ class Cublas:
         self._workspace = wp.empty(WORKSPACE, dtype=wp.uint8, device=device)
         with wp.ScopedDevice(self._device):
             call("cublas", "cublasCreate_v2", ctypes.byref(self._handle))
+        weakref.finalize(self, call, "cublas", "cublasDestroy_v2", self._handle).atexit = False
         self._one, self._zero = ctypes.c_float(1.0), ctypes.c_float(0.0)
 
     def product(self, a: wp.array, x: wp.array, c: wp.array, wanted: wp.array) -> None:

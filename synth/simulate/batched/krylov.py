@@ -247,7 +247,7 @@ def solution(rows: int) -> wp.Kernel:
 
     @wp.kernel(module="unique", enable_backward=False, launch_bounds=bounds)
     def finish(lanes: Lanes, krylov: Krylov, begun: wp.array(dtype=wp.int32)):
-        """begun: (B,) 1 where the solution is that of a carried first iterate."""
+        """begun: (B,) 1 where the solution is that of the rigid-motion predictor."""
         s, thread = wp.tid()
         if thread == 0:
             begun[s] = 0

@@ -46,7 +46,7 @@ class Lanes:
         phase, stage: see the module.
         move: what becomes of its fields in this cycle.
         iteration, limit: of the present Newton solve; step_iterations: of the load step; total: since the last record.
-        next, at, target, step, previous, has_previous: as `synth.simulate.stepping`'s samples.
+        next, at, target, step, previous, has_previous: as in `synth.simulate.stepping.Stepper`.
         ratio: of the extrapolation.
         predicted: whether the first iterate is another than the last state.
         tolerance, scale: of Newton's method and its line search.
@@ -121,7 +121,7 @@ class Presses:
         press_end: path length of the press, mm; deepest: largest depth, at least 0.1 mm.
         over_pad: whether the body comes down on the contact face.
         origin, axes: of `LoadPath.frame`; zeros and the identity for flat pads and domes.
-        position, reach, rotation: of the body, as `LoadPath.pose` uses them.
+        position, rotation: of the body, as `LoadPath.pose` uses them; reach: the body's less the face's z, mm.
         kind, shape, friction: as `synth.simulate.contact.Indenters`; sharpness: times the contact stiffness, E per mm.
         grid, grids: number of its distance grid among the different ones (g, cells).
     """
@@ -156,7 +156,7 @@ class Settings:
     """
 
     tolerance: wp.float64
-    loose: wp.float64
+    relaxed_tolerance: wp.float64
     closer: wp.float64
     longest: wp.float64
     limit: int

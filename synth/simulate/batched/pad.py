@@ -73,19 +73,30 @@ def _invert_by_cusolver(factors: wp.array, found: wp.array) -> None:
         run("cusolverDnCreate", ctypes.byref(handle))
         run("cusolverDnCreateParams", ctypes.byref(settings))
         run("cusolverDnSetStream", handle, ctypes.c_void_p(device.stream.cuda_stream))
-        given = (handle, settings, size, size, FLOAT64, left, size)
-        run("cusolverDnXgetrf_bufferSize", *given, FLOAT64, ctypes.byref(here), ctypes.byref(there))
-        room, host = wp.empty(here.value, dtype=wp.uint8, device=device), ctypes.create_string_buffer(there.value)
-        run("cusolverDnXgetrf", *given, order, FLOAT64, ctypes.c_void_p(room.ptr), here, host, there, told)
-        if info.numpy()[0]:
-            raise np.linalg.LinAlgError("Singular matrix")
-        for first in range(0, n, COLUMNS):
-            columns = wp.array(np.eye(min(COLUMNS, n - first), n, first), dtype=wp.float64, device=device)
-            right = (ctypes.c_int64(len(columns)), FLOAT64, left, size, order, FLOAT64, ctypes.c_void_p(columns.ptr))
-            run("cusolverDnXgetrs", handle, settings, 0, size, *right, size, told)
-            wp.launch(round_rows, columns.shape, inputs=[columns, first, found], device=device)
-        wp.synchronize_device(device)
-        run("cusolverDnDestroy", handle)
+        try:
+            given = (handle, settings, size, size, FLOAT64, left, size)
+            run("cusolverDnXgetrf_bufferSize", *given, FLOAT64, ctypes.byref(here), ctypes.byref(there))
+            room, host = wp.empty(here.value, dtype=wp.uint8, device=device), ctypes.create_string_buffer(there.value)
+            run("cusolverDnXgetrf", *given, order, FLOAT64, ctypes.c_void_p(room.ptr), here, host, there, told)
+            if info.numpy()[0]:
+                raise np.linalg.LinAlgError("Singular matrix")
+            for first in range(0, n, COLUMNS):
+                columns = wp.array(np.eye(min(COLUMNS, n - first), n, first), dtype=wp.float64, device=device)
+                right = (
+                    ctypes.c_int64(len(columns)),
+                    FLOAT64,
+                    left,
+                    size,
+                    order,
+                    FLOAT64,
+                    ctypes.c_void_p(columns.ptr),
+                )
+                run("cusolverDnXgetrs", handle, settings, 0, size, *right, size, told)
+                wp.launch(round_rows, columns.shape, inputs=[columns, first, found], device=device)
+            wp.synchronize_device(device)
+        finally:
+            run("cusolverDnDestroyParams", settings)
+            run("cusolverDnDestroy", handle)
 
 
 class Preconditioner:
@@ -107,8 +118,9 @@ AWAY_MM = 1e3
 
 @dataclass(frozen=True)
 class Pad:
-    """The pad of a batch; free: (k,) numbers of the unknowns that are not held, displacements first."""
+    """The pad of a batch, prepared for a scene; free: (k,) numbers of the unknowns not held, displacements first."""
 
+    scene: Scene
     space: Space
     material: Material
     free: np.ndarray
@@ -135,7 +147,7 @@ def prepare(scene: Scene, mesh: PadMesh, device: str, products: Dense | None = N
     space = function_space(mesh, ELEMENTS[scene.numerics.element]())
     system = System(space, material)
     preconditioner = Preconditioner(inverse(stiffness(system, _away(scene)), device), products)
-    return Pad(space, material, system.free, preconditioner, device)
+    return Pad(scene, space, material, system.free, preconditioner, device)
 
 
 def _away(scene: Scene) -> Indenters:

@@ -10,8 +10,8 @@ BLOCK = 256
 """Threads that sum a lane's residual."""
 SLIPS = wp.constant(wp.float64(1.0 - 1.0e-6))
 """Share of the friction limit from which a point counts as slipping, as in `System.slip_ratio`."""
-SCALARS = 12
-"""Numbers of a record before its fields: force (3), moment (3), touching and slipping area, then those of `write`."""
+SCALARS = wp.constant(12)
+"""A record's numbers before its fields: force (3), moment (3), touching and slipping area, what `write_record` adds."""
 
 
 @wp.struct
@@ -83,7 +83,7 @@ def relaxation_errors(
     s, thread = wp.tid()
     if mask[s] == 0 or lanes.relaxing[s] == 0:
         return
-    borne = wp.float64(0.0)
+    held = wp.float64(0.0)
     left = (wp.float64(1.0) - lanes.part[s]) * lanes.norm[s]
     total = wp.float64(0.0)
     for i in range(thread, force.shape[1], wp.block_dim()):
@@ -91,14 +91,14 @@ def relaxation_errors(
         if row >= 0:
             total += wp.length_sq(force[s, i] + viscous[s, i] + left * node_step(right, s, row))
         else:
-            borne += wp.length_sq(force[s, i])
+            held += wp.length_sq(force[s, i])
     for i in range(thread, volume.shape[1], wp.block_dim()):
         rest = volume[s, i] + left * wp.float64(right[s, pressure_row[i]])
         total += rest * rest
     total = wp.tile_extract(wp.tile_sum(wp.tile(total)), 0)
-    borne = wp.tile_extract(wp.tile_sum(wp.tile(borne)), 0)
+    held = wp.tile_extract(wp.tile_sum(wp.tile(held)), 0)
     if thread == 0:
-        lanes.trial_held_force[s] = wp.sqrt(borne)
+        lanes.trial_held_force[s] = wp.sqrt(held)
         lanes.trial_error[s] = wp.sqrt(total) / lanes.norm[s]
 
 
@@ -191,11 +191,11 @@ def write_record(
         records[s, r, 9] = lanes.jacobian[s]
         records[s, r, 10] = lanes.deepest[s]
         records[s, r, 11] = wp.float64(lanes.total[s])
-    first = 12 + 3 * i
+    first = SCALARS + 3 * i
     for k in range(3):
         records[s, r, first + k] = u[s, i][k]
     if i < surface:
-        first = 12 + 3 * u.shape[1] + 3 * i
+        first = SCALARS + 3 * u.shape[1] + 3 * i
         for k in range(3):
             records[s, r, first + k] = wp.float64(0.0)
 
@@ -222,4 +222,4 @@ def write_tractions(
         node = surface.number[f, a]
         if wp.length_sq(share) > wp.float64(0.0):
             for k in range(3):
-                wp.atomic_add(records, s, r, 12 + 3 * nodes + 3 * node + k, share[k] / surface.area[node])
+                wp.atomic_add(records, s, r, SCALARS + 3 * nodes + 3 * node + k, share[k] / surface.area[node])

@@ -36,15 +36,14 @@ def simulate_presses(
 ) -> Iterator[tuple[int, Trajectory]]:
     """Simulate presses into pads of one mesh, each as if it were alone; their numbers and trajectories, as they end.
 
-    The presses share the gel's materials and, but for the penalty, the numerics, else InputError; the pad is of
+    The presses share the pad's materials and, but for the penalty, its numerics, else InputError; the pad is of
     `synth.simulate.batched.pad.prepare`. `frames` are the numbers of the states that are wanted, of each press (else
     ValueError), see `synth.simulate.simulate_press`; at most `batch` trajectories run at a time; `options` hold along
     the load paths.
     """
     if frames is not None and len(frames) != len(presses):
         raise ValueError(f"{len(frames)} sets of frames for {len(presses)} presses")
-    if presses:
-        check_shared([press.scene for press in presses], pad.space.mesh)
+    check_shared([pad.scene, *(press.scene for press in presses)], pad.space.mesh)
     touching = []
     for number, press in enumerate(presses):
         if press.path.may_touch:
@@ -78,7 +77,7 @@ class Run:
         self._presses, self._pad, numerics = presses, pad, presses[0].scene.numerics
         table, grid = press_tables(presses, frames, pad.device)
         settings = phases.Settings()
-        settings.tolerance, settings.loose = numerics.tolerance, options.relaxed_tolerance
+        settings.tolerance, settings.relaxed_tolerance = numerics.tolerance, options.relaxed_tolerance
         settings.longest, settings.extrapolate = numerics.max_step_mm, int(options.extrapolate)
         settings.forcing, settings.closer = options.forcing, options.closer
         settings.limit, settings.correction_limit = MAX_ITERATIONS, options.correction_iterations

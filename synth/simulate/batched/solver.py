@@ -132,7 +132,7 @@ class BatchedSolver:
         self._launch(viscous_force, elements, mask, f.iterate_u, f.trial_u, s.viscosity, self._bulk, a.viscous)
         moved = (a.force, a.viscous, a.volume, *where, gmres.flat(a.krylov.basis))
         self._launch_blocks(reductions.relaxation_errors, reductions.BLOCK, mask, *moved, s)
-        self._launch(transitions.evaluate_trial, self.batch, s, self.settings)
+        self._launch(transitions.evaluate_trial, self.batch, s)
         self._launch(fields.move_fields, self._value_dim, s, 0, f)
 
     def _advance(self) -> None:
@@ -145,7 +145,7 @@ class BatchedSolver:
         self._sum(phases.AT_RECORD)
         self._launch(transitions.check_contact, self.batch, s, self._presses, a.sums)
         self._launch(fields.copy_memory, a.points, s.save, a.memory, a.saved)
-        self._settle(s.anchor, 1)
+        self._update_contact_history(s.anchor, 1)
         self._select(phases.CORRECTING)
         self._launch(reductions.clear_sums, a.sums.shape, a.mask, s, a.sums)
         self._launch(reductions.penetrations, self._face_dim, a.mask, a.gap, s)
@@ -155,7 +155,7 @@ class BatchedSolver:
         self._launch(augment, a.points, s.new_share, a.indenters, *found, a.contact)
         self._record()
         self._select(phases.ADVANCE, phases.FIRST)
-        self._settle(a.mask, 0)
+        self._update_contact_history(a.mask, 0)
         self._launch(transitions.choose_target, self.batch, s, self._presses, self.settings)
         self._launch(fields.move_fields, self._value_dim, s, 0, f)
 
@@ -167,7 +167,7 @@ class BatchedSolver:
         found = (a.fields.iterate_u, self._faces, a.indenters, a.traction, a.tangential)
         self._launch(reductions.contact_forces, self._face_dim, a.mask, *found, a.sums)
 
-    def _settle(self, mask: wp.array, new_only: int) -> None:
+    def _update_contact_history(self, mask: wp.array, new_only: int) -> None:
         a = self._arrays
         found = (self._faces, a.indenters, a.gap, a.tangential, PENALTY, new_only, a.contact)
         self._launch(update_contact_history, a.points, a.fields.state_u, mask, *found)

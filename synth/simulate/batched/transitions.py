@@ -7,6 +7,7 @@ pass but the last, then has the relaxed tolerance, and every pass of a deep obje
 the full one: what they find is changed by the next pass. A state without passes, or whose passes end early, is brought
 to the full tolerance before it is recorded (POLISH); where that fails, the step is halved as if it had not been taken.
 The load path goes on from the state before, so that it does not depend on which states are corrected.
+Nothing limits the iterations of a press or the turn of normals, and all directions are exact.
 """
 
 from typing import Any
@@ -39,7 +40,7 @@ MAX_CORRECTION_RATIO, MAX_RELAXED_STEP = _doubles(stepping.MAX_CORRECTION_RATIO,
 MESH, MAX_DEEP_PASSES = wp.constant(KINDS["mesh"]), wp.constant(stepping.MAX_DEEP_PASSES)
 FIRST_VISCOSITY, LEAST_VISCOSITY = _doubles(newton.FIRST_VISCOSITY, newton.LEAST_VISCOSITY)
 MOST_VISCOSITY, LEAST_SHARE = _doubles(newton.MOST_VISCOSITY, newton.LEAST_SHARE)
-LEAST_BORNE, MAX_ERROR, AIM = _doubles(newton.MIN_REACTION_RATIO, newton.MAX_ERROR, newton.AIM)
+MIN_REACTION_RATIO, MAX_ERROR, AIM = _doubles(newton.MIN_REACTION_RATIO, newton.MAX_ERROR, newton.AIM)
 FALL, FALL_AFTER_REFUSAL, RISE = _doubles(newton.FALL, newton.FALL_AFTER_REFUSAL, newton.RISE)
 
 
@@ -78,7 +79,7 @@ def evaluate_relaxation(lanes: Lanes, s: int, valid: bool):
 
 
 @wp.kernel
-def evaluate_trial(lanes: Lanes, settings: Settings):
+def evaluate_trial(lanes: Lanes):
     """After an evaluation: is the trial taken, and is it the solution?"""
     s = wp.tid()
     phase = lanes.phase[s]
@@ -103,7 +104,7 @@ def evaluate_trial(lanes: Lanes, settings: Settings):
             lanes.phase[s] = phases.FAILED
         return
     if phase == phases.START and lanes.relaxing[s] > 0 and lanes.iteration[s] == 0:
-        lanes.held_force[s] = LEAST_BORNE * lanes.trial_held_force[s]
+        lanes.held_force[s] = MIN_REACTION_RATIO * lanes.trial_held_force[s]
     if phase == phases.SEARCH and lanes.relaxing[s] > 0:
         evaluate_relaxation(lanes, s, valid)
         if lanes.phase[s] != phases.SEARCH:
@@ -271,7 +272,7 @@ def choose_pass(lanes: Lanes, presses: Presses, settings: Settings, indenters: I
         lanes.limit[s] = settings.correction_limit
         lanes.tolerance[s] = wp.max(settings.closer * settings.tolerance, MIN_TOLERANCE)
         if lanes.done[s] + lanes.share[s] < MAX_MULTIPLIER_UPDATES:
-            lanes.tolerance[s] = wp.max(settings.loose, lanes.tolerance[s])
+            lanes.tolerance[s] = wp.max(settings.relaxed_tolerance, lanes.tolerance[s])
         if deep:
             lanes.tolerance[s] = wp.max(MULTIPLIER_TOLERANCE * settings.tolerance, lanes.tolerance[s])
     lanes.iteration[s] = 0
@@ -334,7 +335,7 @@ def choose_target(lanes: Lanes, presses: Presses, settings: Settings):
         if parts > ONE:
             lanes.target[s] = at + (goal - at) / parts
         if parts > ONE or presses.kind_of[j, lanes.next[s]] > 0:
-            lanes.tolerance[s] = wp.max(settings.loose, settings.tolerance)
+            lanes.tolerance[s] = wp.max(settings.relaxed_tolerance, settings.tolerance)
         lanes.stage[s] = phases.STEP
         lanes.iteration[s] = 0
         lanes.limit[s] = settings.limit
