@@ -70,7 +70,7 @@ def manifest_key(record: dict[str, Any]) -> int:
 
 
 def failure_key(record: dict[str, Any]) -> tuple[int, int]:
-    """Index and draw of a line of the failures; KeyError or TypeError where it is not one."""
+    """Index and number of a line of the failures; KeyError or TypeError where it is not one."""
     return int(record["index"]), int(record["draw"])
 
 

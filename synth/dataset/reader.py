@@ -108,7 +108,7 @@ class Dataset:
 
     @property
     def failures(self) -> list[dict[str, Any]]:
-        """The records of failures.jsonl, by index and draw."""
+        """The records of failures.jsonl, by index and attempt."""
         path = self.path / FAILURES_FILE
         table = scan_lines(path, failure_key)
         return [read_line(path, table.places[key]) for key in sorted(table.places)]
@@ -126,7 +126,7 @@ class Dataset:
         return ManifestEntry.from_record(read_line(self.path / MANIFEST_FILE, self._table.places[index]))
 
     def scene_of(self, index: int) -> Scene:
-        """The draw that the sample was made from."""
+        """The scene instance that the sample was made from."""
         return read_scene(self.folder(index))
 
     def read(self, index: int, camera: str = "") -> SampleData:

@@ -50,7 +50,7 @@ class Sample(CameraPair):
         trajectory: number of the trajectory that its frames belong to.
         frames: (i, j), states of that trajectory shown in image 1 and image 2.
         seed: of the job.
-        scene: the draw that was simulated and rendered.
+        scene: the instance that was simulated and rendered.
         surface: what was rendered and traced.
         displacement1, displacement2: (n, 3) float64 mm of `surface.coarse.nodes`.
         diagnostics: JSON-able; "solver" is a list with a record for each of the two frames (depth_mm, shear_mm,

@@ -17,7 +17,7 @@ SUMMARY_FILE = "summary.json"
 
 
 def reason_group(stage: str, reason: str) -> str:
-    """Stage and reason with the numbers left out: draws that fail alike fall into one group."""
+    """Stage and reason with the numbers left out: attempts that fail alike fall into one group."""
     line = reason.strip().splitlines()[0] if reason.strip() else "no reason given"
     return f"{stage}: {re.sub(r'[-+]?[0-9]+([.][0-9]+)?(e[-+]?[0-9]+)?', '#', line)[:200]}"
 

@@ -2,7 +2,7 @@
 
     DIR/dataset.json      the job
     DIR/manifest.jsonl    a line per finished sample
-    DIR/failures.jsonl    a line per failed draw
+    DIR/failures.jsonl    a line per failed attempt
     DIR/samples/000000/   image1.png image2.png flow.exr meta.json surface.npz, and for each further camera a folder of
                           its name with its own image1.png image2.png flow.exr
     DIR/summary.json      what it took
@@ -52,7 +52,7 @@ SHARDS_FOLDER = "shards"
 JOURNAL_FOLDER = "journal"
 
 _Known = tuple[set[int], set[tuple[int, int]]]
-"""Indices of finished samples; index and draw of failures."""
+"""Indices of finished samples; index and attempt of failures."""
 
 
 class DatasetWriter:
@@ -129,7 +129,7 @@ class DatasetWriter:
         self._finished.add(entry.index)
 
     def fail(self, failure: Failure) -> None:
-        """Records a draw that failed, once, also over several runs."""
+        """Records an attempt that failed, once, also over several runs."""
         key = (failure.index, failure.draw)
         if key not in self._failed:
             self._append(FAILURES_FILE, f"{sample_name(failure.index)}-{failure.draw}", vars(failure))

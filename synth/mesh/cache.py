@@ -31,8 +31,8 @@ CHORDS = 0.03
 
 
 def default_edge_length(gel: Gel) -> float:
-    """A fifth of the gel's thickness, at most 1 mm; of a round gel, whose one mesh serves all draws, four fifths of it
-    and at most a sixth of the radius.
+    """A fifth of the gel's thickness, at most 1 mm; of a round gel, whose one mesh serves all trajectories, four fifths
+    of it and at most a sixth of the radius.
     """
     if gel.is_round:
         return min(0.8 * gel.depth_mm, gel.size_mm[0] / 12)

@@ -69,8 +69,8 @@ class Summary:
         asked_for: samples that it was to see to.
         found: samples that were there already.
         made: samples written by this call.
-        given_up: indices whose every draw failed.
-        failures: stage and reason, numbers left out -> how many draws failed so and were redrawn.
+        given_up: indices whose every instance failed.
+        failures: stage and reason, numbers left out -> how many instances failed so and were replaced.
         seconds: wall time.
         stages: stage -> its seconds summed over samples.
     """

@@ -80,8 +80,8 @@ def plan(scene: Template | str | Path, variant: Variant | None = None) -> Plan:
 
 
 def job_variant(template: Template, device: Device) -> Variant:
-    """What renders a job: one channel where every draw of it is grey; InputError where the device is not there."""
-    # Corners that are grey say nothing of the draws between them where a single channel is drawn.
+    """What renders a job: one channel where every instance of it is grey; InputError where the device is not there."""
+    # Corners that are grey say nothing of what lies between them where a single channel is drawn.
     drawn = any(re.search(r"\.(color|reflectance)\[\d\]$|\.saturation$", at) for _, _, at in template.distributions())
     return choose_variant(device, grey=not drawn and all(is_grey(scene.sensor) for scene in template.corners))
 

@@ -106,7 +106,7 @@ def _meshes(plan: Plan) -> _Meshes:
     template = plan.template
     found: list[tuple[Scene, Resolution]] = []
     for trajectory in range(INSTANCES):
-        with contextlib.suppress(InputError):  # an impossible draw: generate redraws it
+        with contextlib.suppress(InputError):  # impossible: generate takes another instance
             scene = draw(template, 0, trajectory)
             found.append((scene, plan.mesh.resolution(scene, template.folder)))
     if not found:

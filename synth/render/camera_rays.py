@@ -50,7 +50,7 @@ class CameraRays:
         window = optics.window
         self._refracts = window.index != 1
         self._index = dr.opaque(mi.Float, window.index)
-        self._round = RoundFace(window, mi) if isinstance(window, RoundWindow) else None
+        self._round = RoundWindowFace(window, mi) if isinstance(window, RoundWindow) else None
         self._face = None if isinstance(window, RoundWindow) else dr.opaque(mi.Float, window.face_z)
         self._is_fisheye = camera.lens == "fisheye"
         self._distortion = [dr.opaque(mi.Float, k) for k in camera.distortion] if any(camera.distortion) else None
@@ -189,7 +189,7 @@ class _Mirror:
         return dr.select(hit, distance, dr.inf), slope < 0
 
 
-class RoundFace:
+class RoundWindowFace:
     """The round inner face of `synth.optics.window` in the renderer's frame, opaque to Dr.Jit."""
 
     def __init__(self, window: RoundWindow, mi: Any) -> None:

@@ -26,7 +26,7 @@ _STRATA = 2
 
 
 class PolygonLight:
-    """One light with power. Every number is opaque to Dr.Jit, so that another draw of it needs no compiler."""
+    """One light with power. Every number is opaque to Dr.Jit, so that another instance of it needs no compiler."""
 
     def __init__(self, light: Light, mi: Any) -> None:
         import drjit as dr

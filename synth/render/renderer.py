@@ -1,7 +1,7 @@
 """Path-traced radiance of the gel's coating, as the camera receives it before its sensor adds anything.
 
-One Mitsuba scene per sensor draw: the coated surface, the LEDs, and nothing outside (black). The indenter is hidden by
-the opaque coating and never part of it. For a frame only vertex positions and normals are exchanged; several cameras
+One Mitsuba scene per sensor instance: the coated surface, the LEDs, and nothing outside (black). The indenter is hidden
+by the opaque coating and never part of it. For a frame only vertex positions and normals are exchanged; several cameras
 are several sets of rays in that one scene.
 
 Light that the window's outer face reflects back onto the gel comes from mirror images (`synth.render.lights`);
@@ -41,7 +41,7 @@ _LIGHT_PART = 2**31
 
 
 class Renderer:
-    """The renderer of one sensor draw.
+    """The renderer of one sensor instance.
 
     `samples_per_pixel` is rounded up to the next full grid (see `full_grid`). The albedo, (rows, columns, 3 or 4)
     float32 over the contact face from `pattern.albedo`, must not be changed afterwards. InputError for a light in the

@@ -33,12 +33,12 @@ class Numerics(Part):
     """auto is p2p1: at every run time it was the more accurate."""
     target_error_px: Positive | None = None
     """Root-mean-square error that the flow over the seen face may have from the simulation; default 0.5. The mesh is
-    made as fine under each draw's contact as this asks for."""
+    made as fine under each trajectory's contact as this asks for."""
     edge_length_mm: Positive | None = None
-    """Instead of a target: one fTetWild mesh for all draws with tetrahedra of this edge at the contact face."""
+    """Instead of a target: one fTetWild mesh for all trajectories with tetrahedra of this edge at the contact face."""
     solver: Literal["single", "batched"] = "single"
-    """batched: many trajectories at once on one mesh for all draws of a pad, for GPUs; `cells` or edge_length_mm say
-    which, and a target is only what `plan` compares with. The same laws and tolerances, other meshes: other samples."""
+    """batched: many trajectories at once on one mesh of the pad, for GPUs; `cells` or edge_length_mm say which, and a
+    target is only what `plan` compares with. The same laws and tolerances, other meshes: other samples."""
     cells: tuple[Cells, Cells, Annotated[int, Field(ge=1, le=20)]] = (16, 12, 2)
     """Elements of the batched solver's mesh along x and y, where they are even in size, and through the thickness."""
     max_step_mm: Positive = 0.25

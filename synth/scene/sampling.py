@@ -22,12 +22,13 @@ from synth.scene.validation import validated
 TRAJECTORY_PARTS = ("contact", "motion")
 """Drawn anew for every trajectory; everything else belongs to the sensor."""
 MAX_DRAWS = 10
-"""Most draws of a sensor, and of a trajectory on it, an object's retries included, before the samples are given up."""
+"""Most instances of a sensor, and of a trajectory on it, an object's retries included, before the samples are given
+up."""
 
 
 @dataclass(frozen=True)
 class SensorInstance:
-    """The parts of a scene, by name, that all trajectories of one sensor share; None where no draw can be used.
+    """The parts of a scene, by name, that all trajectories of one sensor share; None where no instance can be used.
 
     `rejected` says why earlier instances, or all of them, could not be used.
     """
@@ -57,7 +58,7 @@ def sensor_of(template: Template, trajectory: int) -> int:
 
 
 def draw_sensor(template: Template, seed: int, sensor: int) -> SensorInstance:
-    """The first draw of a sensor that fits the schema and keeps its lights out of the camera's view."""
+    """The first instance of a sensor that fits the schema and keeps its lights out of the camera's view."""
     rejected: list[str] = []
     for attempt in range(MAX_DRAWS):
         choose = _chooser(stream(template, seed, "sensor", sensor, attempt))
@@ -77,9 +78,9 @@ def draw(
 ) -> Scene:
     """The scene of one trajectory, by its number, of a job's seed.
 
-    `attempt` is how many instances of contact and motion were of no use; `sensor` is the draw of the trajectory's
-    sensor, where the caller has it. InputError where this draw breaks the schema (the tail of a `normal`, say), or no
-    draw of the sensor can be used.
+    `attempt` is how many instances of contact and motion were of no use; `sensor` is the instance of the trajectory's
+    sensor, where the caller has it. InputError where this instance breaks the schema (the tail of a `normal`, say), or
+    no instance of the sensor can be used.
     """
     sensor = sensor or draw_sensor(template, seed, sensor_of(template, trajectory))
     if sensor.content is None:

@@ -37,7 +37,7 @@ class Outputs(Part):
 
 
 class Sampling(Part):
-    """How random instances are shared: samples of a trajectory, trajectories of a sensor, draws of several scenes."""
+    """How random instances are shared: samples of a trajectory, trajectories of a sensor, values of several scenes."""
 
     pairs_per_trajectory: Annotated[int, Field(ge=1, le=1000)] = 2
     trajectories_per_sensor: Annotated[int, Field(ge=1, le=100000)] = 2

@@ -6,8 +6,8 @@
 a choice of the files that match. `extends = "gelsight_mini"` takes the rest from another scene.
 
 A scene is checked when it is loaded: at the lower and upper end of all its distributions and for every choice, so that
-a mistake shows before any work is done. A `normal` is checked at its mean: a draw from its tails that breaks the schema
-is drawn again (`synth.scene.sampling`).
+a mistake shows before any work is done. A `normal` is checked at its mean: a number from its tails that breaks the
+schema is drawn again (`synth.scene.sampling`).
 """
 
 import hashlib
@@ -312,7 +312,7 @@ def _corner(value: Any, high: bool, turn: int) -> Any:
 
     def choose(kind: str, arguments: list[Any]) -> Any:
         if kind != "choice":
-            return float(arguments[0] if kind == "normal" or not high else arguments[1])  # as a draw: never whole
+            return float(arguments[0] if kind == "normal" or not high else arguments[1])  # as drawn: never whole
         turns = [(option, own) for option in arguments for own in range(_options(option))]
         option, own = turns[turn % len(turns)]
         return _corner(option, high, own)

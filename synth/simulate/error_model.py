@@ -11,7 +11,7 @@ the indenter's surface meets the gel), T thickness of the pad, s shear, theta tw
 zone, mu friction, k a number for each shape of indenter and c a factor for certainty. The powers of the lengths add up
 to two: a press of twice the size errs by twice as much, on the same mesh of twice the size.
 
-The powers were set by hand near those of free fits, which predict other draws hardly better; k was fitted
+The powers were set by hand near those of free fits, which predict other trajectories hardly better; k was fitted
 (docs/reports/budget.md). Covered are flat pads of 2.5 to 16 mm and a dome, depths to 40 % of the thickness, friction of
 0.3 to 1, elements 0.4 to 2.7 b wide; all but one of the pads are incompressible.
 """
@@ -39,7 +39,7 @@ CERTAINTY = 1.1
 
 
 def face_error(scene: Scene, focus: Focus, spacing_mm: float) -> float:
-    """E of the error model, mm², of a draw that touches at a focus; 0 for an indenter that does not touch.
+    """E of the error model, mm², of an instance that touches at a focus; 0 for an indenter that does not touch.
 
     `spacing_mm` is the size of the elements under the contact, as `synth.simulate.resolution` has it.
     """

@@ -127,6 +127,11 @@ class LoadPath:
         return np.array([0.0, 0.0, 1.0]) if self.frame is None else self.frame.axes[:, 2]
 
     @property
+    def depth_scale_mm(self) -> float:
+        """The largest depth, at least 0.1 mm, by which penetrations are measured."""
+        return max(float(self.corners[:, 0].max()), 0.1)
+
+    @property
     def may_touch(self) -> bool:
         """Whether the body ever goes below the highest point of the undeformed gel, which on a dome is its apex."""
         highest = -self.face_mm if self.frame is None else self.frame.start_mm

@@ -58,7 +58,7 @@ class Solution:
 
 def relative_residual(residual: Residual) -> float:
     """Norm of the free residual over the norm of all nodal forces, which counts as FORCE_FLOOR at least."""
-    return norm(residual.free) / max(norm(residual.reaction), FORCE_FLOOR)
+    return norm(residual.free) / max(norm(residual.nodal_forces), FORCE_FLOOR)
 
 
 def solve(
@@ -156,7 +156,7 @@ def relax(system: System, start: Unknowns, indenter: Indenters, tolerance: float
 
 def _reaction(system: System, residual: Residual) -> float:
     """Norm of the forces on held nodes, E mm²: what the gel bears, wherever the indenter is by now."""
-    return norm(residual.reaction[system.space.held.any(axis=1)])
+    return norm(residual.nodal_forces[system.space.held.any(axis=1)])
 
 
 def next_viscosity(viscosity: float, error: float, refused: bool = False) -> float:

@@ -14,7 +14,7 @@ from synth.simulate.linear import Factor, direct_factor
 from synth.simulate.space import Space
 
 
-class Pattern:
+class SparsityPattern:
     """Upper triangle (CSR) over the free unknowns: 3 displacements per node, then the pressures.
 
     Attributes:
@@ -95,19 +95,19 @@ def _pairs(count: int) -> np.ndarray:
     return np.array([(a, b) for a in range(count) for b in range(a, count)], dtype=np.int32)
 
 
-_CACHED: OrderedDict[str, Pattern] = OrderedDict()
+_CACHED: OrderedDict[str, SparsityPattern] = OrderedDict()
 _MAX_CACHED, _MAX_ENTRIES = 8, 4_000_000
 """Most patterns that are cached, and most entries of them all, which bounds memory."""
 
 
-def pattern_of(space: Space, mixed: bool) -> Pattern:
+def pattern_of(space: Space, mixed: bool) -> SparsityPattern:
     """The pattern of a space, from the last few if one of them has its topology."""
     digest = hashlib.sha256(bytes([mixed]))
     for array in (space.nodes, space.pressure_nodes, space.held, space.faces):
         digest.update(np.ascontiguousarray(array).tobytes())
     key = digest.hexdigest()
     if key not in _CACHED:
-        _CACHED[key] = Pattern(space, mixed)
+        _CACHED[key] = SparsityPattern(space, mixed)
         while len(_CACHED) > 1 and (len(_CACHED) > _MAX_CACHED or sum(p.size for p in _CACHED.values()) > _MAX_ENTRIES):
             _CACHED.popitem(last=False)
     _CACHED.move_to_end(key)

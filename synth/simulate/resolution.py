@@ -1,13 +1,14 @@
-"""Which mesh a draw is simulated on: as fine under its contact as its error budget asks for.
+"""Which mesh a trajectory is simulated on: as fine under its contact as its error budget asks for.
 
-The mesh is structured and graded around where the draw's indenter will touch: `across` elements across the contact,
+The mesh is structured and graded around where its indenter will touch: `across` elements across the contact,
 as many through the thickness as keep elements under the contact about as high as wide. It is the cheapest mesh whose
 predicted error is within the budget; the prediction (`synth.simulate.error_model`) was calibrated, and is tested,
 against much finer solutions (docs/reports/budget.md).
 
 Draws of a pad that are simulated many at once share one mesh, wherever their indenters touch: it is even along x and y,
 `numerics.cells` says how fine, and graded through the thickness so that elements at the contact face are about as high
-as wide. Each draw has a predicted error of its own, calibrated on meshes graded around the contact: it extrapolates.
+as wide. Each trajectory has a predicted error of its own, calibrated on meshes graded around the contact: it
+extrapolates.
 """
 
 from dataclasses import dataclass
@@ -42,7 +43,8 @@ OUTER = (3, 2)
 
 @dataclass(frozen=True)
 class Accuracy:
-    """How well a mesh resolves one draw, and the predicted root-mean-square error of the flow over the contact face.
+    """How well a mesh resolves one trajectory, and the predicted root-mean-square error of the flow over the contact
+    face.
 
     `across` are whole elements across the contact, along its shorter side; 0 where less than one. Of an fTetWild mesh
     elements are not counted, and the error is NaN.
@@ -54,7 +56,7 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class Resolution(Accuracy):
-    """A draw's mesh and what it is expected to cost in accuracy, with the size of the elements under the contact.
+    """A trajectory's mesh and what it is expected to cost in accuracy, with the size of the elements under the contact.
 
     `through` are the elements through the thickness, without those that layers add; 0 for an fTetWild mesh.
     """
@@ -182,7 +184,8 @@ def scale_px_per_mm(scene: Scene) -> float:
 
 
 def resolve(scene: Scene, folder: Path | None, target_error_px: float) -> Resolution:
-    """The cheapest graded mesh of a draw whose predicted error of the flow is within a target, else the finest.
+    """The cheapest graded mesh of a scene instance whose predicted error of the flow is within a target, else the
+    finest.
 
     InputError where the indenter, whose mesh file is relative to `folder`, or the mesh cannot be built.
     """
@@ -197,7 +200,7 @@ def resolve(scene: Scene, folder: Path | None, target_error_px: float) -> Resolu
 
 
 def shared_mesh(gel: Gel, numerics: Numerics) -> PadMesh:
-    """The mesh of all draws of a pad; its Young's modulus does not enter."""
+    """The mesh of all trajectories of a pad; its Young's modulus does not enter."""
     return _even_mesh(gel.size_mm, gel.dome_radius_mm, gel.layers_mm, numerics.cells)
 
 
@@ -229,7 +232,7 @@ def shared_spacing_mm(gel: Gel, numerics: Numerics) -> float:
 
 
 def accuracy(scene: Scene, folder: Path | None = None) -> Accuracy:
-    """What the shared mesh gives for one draw; InputError where the indenter cannot be built."""
+    """What the shared mesh gives for one instance; InputError where the indenter cannot be built."""
     gel, numerics = scene.sensor.gel, scene.numerics
     focus = footprint(path_of(scene, folder), gel.size_mm, MARGIN)
     error = predicted_error_px(scene, focus, shared_spacing_mm(gel, numerics))

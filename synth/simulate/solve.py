@@ -113,8 +113,9 @@ def _elastic(gel: Gel) -> tuple[float, ...]:
 class Vicinity:
     """The elements of a round gel near the path of a body.
 
-    One mesh serves all draws, and most of it never moves: in a thin layer bonded to its window a displacement dies away
-    by half with each thickness of distance. Elements farther away are left out, and nodes on the cut are held.
+    One mesh serves all trajectories, and most of it never moves: in a thin layer bonded to its window a displacement
+    dies away by half with each thickness of distance. Elements farther away are left out, and nodes on the cut are
+    held.
 
     Attributes:
         space: of these elements, held as the whole gel's and on the cut.

@@ -21,7 +21,7 @@ from synth.simulate.newton import FORCE_FLOOR, MAX_ITERATIONS, Solution, relativ
 from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.system import System, Unknowns
 from synth.simulate.tables import pack_indenter, place_indenter
-from synth.simulate.trajectory import State, Trajectory, no_contact, not_converged, too_deep, undeformed
+from synth.simulate.trajectory import State, Trajectory, at_rest, no_contact, not_converged, too_deep
 
 SHORTEST_STEP = 1 / 128
 """Shortest step, as a share of max_step_mm."""
@@ -89,9 +89,8 @@ class Stepper:
         records = path.records().tolist()
         self._recorded = frozenset(records)
         self._corrected = frozenset(place for k, place in enumerate(records, 1) if frames is None or k in frames)
-        depth_mm = max(float(path.corners[:, 0].max()), 0.1)
-        self._shallow_mm = PENETRATION * depth_mm
-        self._deep_mm = DEEP * (depth_mm if path.body.kind == KINDS["mesh"] else np.inf)
+        self._shallow_mm = PENETRATION * path.depth_scale_mm
+        self._deep_mm = DEEP * (path.depth_scale_mm if path.body.kind == KINDS["mesh"] else np.inf)
         self._rubs = friction > 0
         self.indenter, self._sticking = pack_indenter(path, friction), pack_indenter(path, STICK_FRICTION)
         self._sticking.centre, self._sticking.rotation = self.indenter.centre, self.indenter.rotation
@@ -121,11 +120,10 @@ class Stepper:
     def _start(self) -> None:
         """The undeformed state; a path that never touches stays in it and needs no solve."""
         self.system.forget_factor()
-        untouched = [] if self.path.may_touch else self.path.records().tolist()
-        self.states = [undeformed(self.path.pose(place), self.system.space) for place in (0.0, *untouched)]
+        self.states = at_rest(self.path, self.system.space)
         if not self.path.may_touch:
             self.next = len(self._waypoints)
-        if self.next < len(self._waypoints):
+        else:
             self._place(0.0)
             self.system.residual(self.state, self.indenter)
             self.system.update_contact_history(self.state, self.indenter)

@@ -52,11 +52,11 @@ class Unknowns:
 class Residual:
     """Residual of the equilibrium equations: (k,) of the unknowns that are not held; meaningless where det F <= 0.
 
-    The reaction (n, 3) are all nodal forces including those on held nodes, in units of E mm².
+    `nodal_forces` (n, 3), E mm², are those on all nodes; on held ones they are the reaction.
     """
 
     free: FloatArray
-    reaction: FloatArray
+    nodal_forces: FloatArray
     smallest_jacobian: float
 
 

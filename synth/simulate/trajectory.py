@@ -10,7 +10,7 @@ import numpy as np
 from synth.arrays import FloatArray
 from synth.dataset.storage import replace_file, storage_errors
 from synth.scene import Scene
-from synth.simulate.load_path import Pose
+from synth.simulate.load_path import LoadPath, Pose
 from synth.simulate.space import Space
 
 
@@ -49,11 +49,15 @@ class State:
         return {**numbers, "converged": True}
 
 
-def undeformed(pose: Pose, space: Space) -> State:
-    """The gel at rest, while the indenter is at a pose where it does not touch."""
+def at_rest(path: LoadPath, space: Space) -> list[State]:
+    """The undeformed state at the start of a load path, and of one that never touches at its recorded places."""
+    zero, places = (0.0, 0.0, 0.0), [] if path.may_touch else path.records().tolist()
     fields = np.zeros((len(space.points), 3)), np.zeros((len(space.surface_nodes), 3))
-    zero = (0.0, 0.0, 0.0)
-    return State(pose.depth_mm, pose.shear_mm, pose.twist_deg, *fields, zero, zero, 0, 0.0, 1.0, 0.0, 0.0)
+    poses = [path.pose(place) for place in (0.0, *places)]
+    return [
+        State(pose.depth_mm, pose.shear_mm, pose.twist_deg, *fields, zero, zero, 0, 0.0, 1.0, 0.0, 0.0)
+        for pose in poses
+    ]
 
 
 @dataclass(frozen=True)

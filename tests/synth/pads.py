@@ -199,7 +199,7 @@ class LoadedSystem(System):
     def residual(self, state: Unknowns, indenter: Indenters) -> Residual:
         found = super().residual(state, indenter)
         full = np.concatenate([self.load.ravel(), np.zeros_like(state.p)])
-        return replace(found, free=found.free - full[self.free], reaction=found.reaction - self.load)
+        return replace(found, free=found.free - full[self.free], nodal_forces=found.nodal_forces - self.load)
 
 
 def equilibrium(
@@ -226,7 +226,7 @@ def equilibrium(
         solution = solve(body, start, far_away(), tolerance)
         assert solution.converged, f"step {k} of {steps}: residual {relative_residual(solution.residual):.1e}"
         before, state = state, solution.state
-    return body, state, body.residual(state, far_away()).reaction
+    return body, state, body.residual(state, far_away()).nodal_forces
 
 
 def area_vectors(points: Points, faces: np.ndarray) -> FloatArray:

@@ -70,7 +70,7 @@ def residual(body: System, state: Unknowns) -> FloatArray:
     assert found.smallest_jacobian > 0
     full = np.zeros(state.u.size + state.p.size)
     full[body.free] = found.free
-    full[: state.u.size] = found.reaction.ravel()
+    full[: state.u.size] = found.nodal_forces.ravel()
     return full
 
 

@@ -70,7 +70,7 @@ def test_nodal_forces_and_moments_are_the_tractions(element: str) -> None:
     """`forces` and the residual say the same: what the indenter does to the gel, the nodes get."""
     made = touch(0.7, element=element)
     body, space = made.body, made.body.space
-    reaction = body.residual(made.state, made.indenters).reaction
+    reaction = body.residual(made.state, made.indenters).nodal_forces
     force, moment, nodal = body.forces(made.state)
     # Inner forces sum to zero (test_simulate_bulk), so the whole sum is minus the contact's.
     np.testing.assert_allclose(reaction.sum(axis=0), -force, atol=1e-11)

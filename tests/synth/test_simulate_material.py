@@ -102,8 +102,8 @@ def test_two_layers_of_one_material_are_one_but_for_the_pressure(element: str) -
     shared[two.pressure_nodes] = one.pressure_nodes
     a = bodies[0].residual(state, far_away())
     b = bodies[1].residual(Unknowns(state.u, state.p[shared]), far_away())
-    scale = 1e-12 * np.abs(a.reaction).max()  # sums of some dozen rounded element forces, in another order
-    np.testing.assert_allclose(b.reaction, a.reaction, atol=scale)
+    scale = 1e-12 * np.abs(a.nodal_forces).max()  # sums of some dozen rounded element forces, in another order
+    np.testing.assert_allclose(b.nodal_forces, a.nodal_forces, atol=scale)
     volume: FloatArray = np.zeros(one.pressures)
     np.add.at(volume, shared, b.free[-two.pressures :])
     np.testing.assert_allclose(volume, a.free[-one.pressures :], atol=scale)
@@ -164,7 +164,7 @@ def state() -> Unknowns:
 
 
 def forces(body: System, state: Unknowns) -> FloatArray:
-    return body.residual(state, far_away()).reaction.copy()
+    return body.residual(state, far_away()).nodal_forces.copy()
 
 
 def test_forces_are_the_energys_gradient_tangent_their_derivative_and_corners_are_seen(state: Unknowns) -> None:

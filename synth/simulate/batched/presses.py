@@ -11,7 +11,7 @@ from synth.simulate.press import Press
 from synth.simulate.space import Space
 from synth.simulate.stepping import DEEP
 from synth.simulate.tables import struct_of
-from synth.simulate.trajectory import State, Trajectory, no_contact, not_converged, too_deep, undeformed
+from synth.simulate.trajectory import State, Trajectory, at_rest, no_contact, not_converged, too_deep
 
 
 def press_tables(
@@ -43,7 +43,7 @@ def press_tables(
         "kind_of": _stacked(kinds),
         "stops": [len(path.waypoints()) for path in paths],
         "press_end": [path.press_mm for path in paths],
-        "deepest": [max(float(path.corners[:, 0].max()), 0.1) for path in paths],
+        "deepest": [path.depth_scale_mm for path in paths],
         "over_pad": [path.is_over(size_mm) for path in paths],
         "origin": [np.zeros(3) if path.frame is None else path.frame.origin for path in paths],
         "axes": [np.eye(3) if path.frame is None else path.frame.axes for path in paths],
@@ -75,8 +75,7 @@ def _stacked(arrays: Sequence[np.ndarray]) -> np.ndarray:
 
 def untouched(press: Press, space: Space) -> Trajectory:
     """The trajectory of an indenter that never touches: the gel stays as it is."""
-    places = (0.0, *press.path.records().tolist())
-    return Trajectory(tuple(undeformed(press.path.pose(place), space) for place in places), "", 0.0, space)
+    return Trajectory(tuple(at_rest(press.path, space)), "", 0.0, space)
 
 
 def trajectory(
@@ -87,7 +86,7 @@ def trajectory(
     `records` (r, ...) are what the lane wrote, see `synth.simulate.batched.reductions.write_record`; `ended` is the
     reason's code, the path length reached, and where the next step would have led, mm.
     """
-    states = [undeformed(press.path.pose(0.0), space)]
+    states = at_rest(press.path, space)
     for length, record in zip(press.path.records(), records, strict=False):
         states.append(_state(press, float(length), record, space))
     code, reached, target = ended
