@@ -117,19 +117,23 @@ def test_a_pair_smaller_than_the_crop_is_set_into_it_without_flow_around(supervi
     assert len(places) > 1
 
 
-def test_resident_pairs_are_those_of_the_files() -> None:
+@pytest.mark.parametrize("place", ["cpu", pytest.param("cuda", marks=pytest.mark.cuda)])
+def test_resident_pairs_are_those_of_the_files(place: str) -> None:
+    if place == "cuda" and not torch.cuda.is_available():
+        pytest.skip("no CUDA device")
+
     class Bytes(Shifts):
         def __getitem__(self, index: int) -> dict:
             sample = super().__getitem__(index)
             return sample | {"image1": (255 * sample["image1"]).round() / 255}
 
-    pairs, device = CheckedPairs(Bytes(3, 64, 1.0, seed=8), supervised=True), torch.device("cpu")
+    pairs, device = CheckedPairs(Bytes(3, 64, 1.0, seed=8), supervised=True), torch.device(place)
     kept = resident(pairs, device, room=10**7)
     assert len(kept) == 3
     for index in range(3):
         original, sample = pairs[index], kept[index]
         assert sample.pop("name") == original.pop("name")
-        torch.testing.assert_close(sample, original, rtol=0, atol=0)
+        torch.testing.assert_close(sample, original, rtol=0, atol=0, check_device=False)
     # image1 is kept as bytes, image2, whose values are no whole 255ths, as it is.
     needed = 3 * 64 * 64 * (3 + 12 + 8)
     assert resident(pairs, device, room=needed) is not None
