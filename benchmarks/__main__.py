@@ -44,7 +44,7 @@ def main(argv: list[str]) -> int:
     name = parser.parse_args(argv[:1]).name
     try:
         return int(import_module(f"benchmarks.{name}").main(argv[1:]))
-    except (synth.errors.InputError, gelflow.errors.InputError) as error:
+    except (synth.errors.InputError, gelflow.errors.InputError, OSError) as error:
         print(f"benchmarks: {error}", file=sys.stderr)
         return 2
 

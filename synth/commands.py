@@ -252,9 +252,10 @@ def _show_plan(template: Template, variant: Variant, n: int, as_json: bool) -> i
     stages = ", ".join(f"{stage} {value:.2f} s" for stage, value in predicted.seconds_per_pair.items())
     sensor = template.corners[0].sensor
     scale, camera = pixels_per_mm(sensor), sensor.camera
+    seen = f"so {camera.width / scale:.3g} x {camera.height / scale:.3g} mm if undistorted and seen straight on"
     print(
         f"picture: {camera.width} x {camera.height} px, principal point {camera.cx:.4g}, {camera.cy:.4g}, {scale:.3g} "
-        f"px per mm on the gel, so {camera.width / scale:.3g} x {camera.height / scale:.3g} mm if undistorted\n"
+        f"px per mm on the gel, {seen if sensor.gel.is_flat and camera.lens == 'pinhole' else 'at most'}\n"
         f"mesh: {predicted.resolution}, about {predicted.nodes} displacement nodes\n"
         + _error_line(predicted)
         + f"predicted per pair: {stages}; {predicted.bytes_per_pair / 1e6:.2f} MB\n"

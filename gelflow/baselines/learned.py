@@ -72,6 +72,8 @@ class Learned:
         self.path = path
         self.device = chosen_device(device)
         self.registration = registration
+        if registration is not None and registration not in REGISTRATIONS:
+            raise InputError(f"registration = {registration!r}: allowed are {', '.join(REGISTRATIONS)}")
         self.model: Any = load_weights(path, self.device)
         # Convolutions prefer a pixel's channels side by side: a seventh less time for pairs one at a time.
         self.model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # not in torch's stubs

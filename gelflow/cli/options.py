@@ -1,10 +1,11 @@
 """Options that several commands share."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from cyclopts import Parameter
+from cyclopts import Parameter, Token
 
 from gelflow.errors import InputError
 
@@ -37,6 +38,18 @@ METHODS = (
     "none, lucas-kanade, farneback, dis-ultrafast, dis-fast, dis-medium, tvl1, dis-motion, dis-both, "
     "dis-brightness, al-dic"
 )
+
+
+def whole(at_least: int) -> Callable[[Any, Sequence[Token]], int]:
+    """Converter for a whole number; cyclopts' own would round 1.5 to 2."""
+
+    def convert(_: Any, tokens: Sequence[Token]) -> int:
+        text = tokens[0].value
+        if not re.fullmatch(r"[+-]?\d+", text) or int(text) < at_least:
+            raise ValueError(f"it is {text!r}, allowed are whole numbers from {at_least} on")
+        return int(text)
+
+    return convert
 
 
 def each_key_once(_: Any, given: Sequence[str] | None) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from gelflow.cli.options import METHODS, AsJson, OnDevice, Out, Registration, ShippedOrFile, Size, parse_size
+from gelflow.cli.options import METHODS, AsJson, OnDevice, Out, Registration, ShippedOrFile, Size, parse_size, whole
 from gelflow.errors import InputError
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ def predict(
     reference: Annotated[
         Literal["first", "previous"], Parameter(help="Of a video: flow from its first or from the previous frame.")
     ] = "first",
-    every: Annotated[int, Parameter(help="Of a video: take every n-th frame.")] = 1,
+    every: Annotated[int, Parameter(converter=whole(1), help="Of a video: take every n-th frame.")] = 1,
     size: Size = None,
     device: OnDevice = "auto",
     as_json: AsJson = False,

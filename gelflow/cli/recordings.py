@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from gelflow.cli.options import AsJson, Out
+from gelflow.cli.options import AsJson, Out, whole
 from gelflow.errors import InputError
 
 if TYPE_CHECKING:
@@ -25,15 +25,15 @@ def pairs(
     /,
     *,
     out: Out,
-    per_video: Annotated[int, Parameter(help="Largest number of pairs from one recording.")] = 10,
+    per_video: Annotated[int, Parameter(converter=whole(1), help="Largest number of pairs from one recording.")] = 10,
     min_motion: Annotated[float, Parameter(help="Least motion in px, as the 95th percentile over the image.")] = 2.0,
     max_motion: Annotated[float, Parameter(help="Most motion in px.")] = 60.0,
     min_difference: Annotated[
         float, Parameter(help="Least difference in px between the flows of two pairs of one recording.")
     ] = 1.0,
-    frames: Annotated[int, Parameter(help="Largest number of frames used of a recording.")] = 40,
-    tries: Annotated[int, Parameter(help="Largest number of pairs tried of a recording.")] = 200,
-    seed: Annotated[int, Parameter(help="Seed of the random choice.")] = 0,
+    frames: Annotated[int, Parameter(converter=whole(1), help="Largest number of frames used of a recording.")] = 40,
+    tries: Annotated[int, Parameter(converter=whole(1), help="Largest number of pairs tried of a recording.")] = 200,
+    seed: Annotated[int, Parameter(converter=whole(0), help="Seed of the random choice.")] = 0,
     as_json: AsJson = False,
 ) -> int:
     """Chooses image pairs with enough motion from recordings; continues an interrupted job."""

@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 
-from gelflow.cli.options import AsJson, OnDevice, Paths, Registered, Registration, ShippedOrFile, Size, parse_size
+from gelflow.cli.options import (
+    AsJson,
+    OnDevice,
+    Paths,
+    Registered,
+    Registration,
+    ShippedOrFile,
+    Size,
+    parse_size,
+    whole,
+)
 from gelflow.errors import InputError
 
 if TYPE_CHECKING:
@@ -67,10 +77,16 @@ def compare(
         ),
     ] = None,
     ft: Annotated[
-        int, Parameter(help="Steps of test-time optimisation of each GelFlow network on these pairs, reported apart.")
+        int,
+        Parameter(
+            converter=whole(0),
+            help="Steps of test-time optimisation of each GelFlow network on these pairs, reported apart.",
+        ),
     ] = 0,
-    batch: Annotated[int, Parameter(help="Pairs at once to measure networks' speed and memory; 0: do not.")] = 1,
-    every: Annotated[int, Parameter(help="Take only every n-th pair, for slow methods.")] = 1,
+    batch: Annotated[
+        int, Parameter(converter=whole(0), help="Pairs at once to measure networks' speed and memory; 0: do not.")
+    ] = 1,
+    every: Annotated[int, Parameter(converter=whole(1), help="Take only every n-th pair, for slow methods.")] = 1,
     size: Size = None,
     device: OnDevice = "auto",
     as_json: AsJson = False,
@@ -80,9 +96,6 @@ def compare(
     from gelflow.baselines.learned import Learned
     from gelflow.data import PairDataset, open_all
 
-    for option, given, least in (("--every", every, 1), ("--batch", batch, 0), ("--ft", ft, 0)):
-        if given < least:
-            raise InputError(f"{option} {given}: a number from {least} on is needed")
     chosen = named_methods([name.strip() for name in methods.split(",") if name.strip()], device)
     networks = [network for given in weights or () for network in _networks(given, registration, size, device)]
     own = [network for network in networks if isinstance(network, Learned)]

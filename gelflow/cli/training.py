@@ -6,7 +6,7 @@ from typing import Annotated
 
 from cyclopts import Parameter
 
-from gelflow.cli.options import Device, Out, Paths, ShippedOrFile, each_key_once
+from gelflow.cli.options import Device, Out, Paths, ShippedOrFile, each_key_once, whole
 
 
 @Parameter(name="*")
@@ -26,16 +26,21 @@ class RunOptions:
         list[str] | None,
         Parameter("--set", validator=each_key_once, help="KEY=VALUE, such as loss.lambda_dc=10; repeatable."),
     ] = None
-    steps: Annotated[int | None, Parameter(help="Optimiser steps.")] = None
+    steps: Annotated[int | None, Parameter(converter=whole(1), help="Optimiser steps.")] = None
     device: Annotated[Device | None, Parameter(help="Where to train; auto: a CUDA device where there is one.")] = None
     devices: Annotated[
-        int | None, Parameter(help="Devices (on a CPU: processes) of each machine; each takes batch_size pairs a step.")
+        int | None,
+        Parameter(
+            converter=whole(1),
+            help="Devices (on a CPU: processes) of each machine; each takes batch_size pairs a step.",
+        ),
     ] = None
     nodes: Annotated[
         int | None,
         Parameter(
+            converter=whole(1),
             help="Machines, which share --out. Start the same command on each: by srun, by torchrun, or by hand with "
-            "MASTER_ADDR, MASTER_PORT and NODE_RANK set."
+            "MASTER_ADDR, MASTER_PORT and NODE_RANK set.",
         ),
     ] = None
     resume: Annotated[bool, Parameter(negative=(), help="Continue the run in --out.")] = False

@@ -12,6 +12,9 @@ from gelflow.data.synthetic import is_synthetic, synthetic_records
 from gelflow.errors import InputError
 from gelflow.files.video import image_files
 
+FIRST, SECOND = ("_1.png", "_img1.png"), ("_2.png", "_img2.png")
+"""Ends of the names of a pair's images; the second ones are those of `synth export --format flo`."""
+
 
 def pair_records(folder: Path) -> list[PairRecord]:
     """The pairs of a folder, recognised by what lies in it, or of one shard; see `PairDataset`."""
@@ -32,7 +35,7 @@ def pair_records(folder: Path) -> list[PairRecord]:
     content = "is empty" if not any(folder.iterdir()) else "holds no image pairs"
     raise InputError(
         f"{folder}: the folder {content}; allowed: a data set of synth (dataset.json), a pair set of "
-        "`python -m gelflow pairs` (pairs.json), shards (*.tar), or files NAME_1.png and NAME_2.png"
+        "`python -m gelflow pairs` (pairs.json), shards (*.tar), or files NAME_1.png and NAME_2.png (or _img1, _img2)"
     )
 
 
@@ -41,9 +44,9 @@ def holds_pairs(path: Path) -> bool:
     if shard_files(path) or (path / PAIR_SET_FILE).is_file() or is_synthetic(path):
         return True
     images = {image.name for image in image_files(path)} if path.is_dir() else set()
-    names = {name.removesuffix("_1.png") for name in images if name.endswith("_1.png")}
-    return any(f"{name}_2.png" in images for name in names) and not any(
-        f"{name}_{number}.png" in images for name in names for number in (0, 3)
+    names = {name.removesuffix("1.png") for name in images if name.endswith(FIRST)}
+    return any(f"{name}2.png" in images for name in names) and not any(
+        f"{name}{number}.png" in images for name in names for number in (0, 3)
     )
 
 
@@ -66,13 +69,15 @@ def open_all(paths: Sequence[Path]) -> PairDataset:
 
 def _folder_records(folder: Path) -> list[PairRecord]:
     """The pairs NAME_1.png and NAME_2.png of a folder, by name, with NAME_markers.csv where dots were tracked."""
-    stems = {path.name[: -len("_1.png")] for path in (*folder.glob("[!.]*_1.png"), *folder.glob("[!.]*_2.png"))}
+    images = {path.name for path in folder.glob("*.png") if not path.name.startswith(".")}
+    names = {name[: -len("1.png")] for name in images if name.endswith((*FIRST, *SECOND))}
     records = []
-    for name in sorted(stems):
-        image1, image2 = folder / f"{name}_1.png", folder / f"{name}_2.png"
+    for name in sorted(names):
+        image1, image2 = folder / f"{name}1.png", folder / f"{name}2.png"
         for path, other in ((image1, image2), (image2, image1)):
             if not path.is_file():
                 raise InputError(f"{path}: the file is missing; {other.name} needs it to be a pair")
-        markers = folder / f"{name}_markers.csv"
-        records.append(PairRecord(name, image1, image2, markers=markers if markers.is_file() else None))
+        stem = name.removesuffix("img").removesuffix("_")
+        markers = folder / f"{stem}_markers.csv"
+        records.append(PairRecord(stem, image1, image2, markers=markers if markers.is_file() else None))
     return records

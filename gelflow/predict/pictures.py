@@ -5,6 +5,7 @@ the direction, the saturation the length of the flow over an explicit scale in p
 and follows the flow, so that a flow of some hundredths of a px fills the wheel as well as one of 40 px.
 """
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -163,7 +164,8 @@ def write_flow_picture(
     length = np.hypot(flow[..., 0], flow[..., 1])
     motion = f"mean motion {np.nanmean(length):.3g} px, largest {np.nanmax(length):.3g} px"
     figure.suptitle(f"{title}: {motion}", fontsize=11)
-    with replacing(path) as temporary:
+    with replacing(path) as temporary, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph")  # a name in letters that the font lacks
         figure.savefig(temporary, format="png")
 
 

@@ -19,9 +19,9 @@ CHANNELS = ("red", "green", "blue")
 ALLOWED_LEVELS = 4.0
 """Most mean absolute difference outside the dots, per channel, of 255."""
 ALLOWED_PLACE = 15.0
-"""Most difference of a place, of 255: gels at rest leave up to 13, pressed ones at least 17."""
+"""Most difference of a place, of 255: pressed gels exceed it, gels at rest do not."""
 ALLOWED_OFF_GRID = 0.015
-"""Most common displacement of neighbouring dots, over their pitch: at rest up to 0.013, pressed at least 0.016."""
+"""Most common displacement of neighbouring dots, over their pitch: pressed gels exceed it."""
 
 
 @dataclass(frozen=True)

@@ -73,6 +73,10 @@ def check_record(record: dict[str, Any], where: str) -> dict[str, Any]:
     missing = [key for key in ("schema_version", "scene_hash", "seed", "n", "scene") if key not in record]
     if missing:
         raise InputError(f"{where}: lacks {', '.join(missing)}; the file is damaged or not of a dataset")
+    kinds = {"seed": int, "n": int, "scene": dict, "device": dict, "software": dict}
+    wrong = [key for key, kind in kinds.items() if not isinstance(record.get(key, kind()), kind)]
+    if wrong:
+        raise InputError(f"{where}: the value of {', '.join(wrong)} is of another kind; the file is damaged")
     if record["schema_version"] != SCHEMA_VERSION:
         raise InputError(
             f"{where}: written in version {record['schema_version']} of the format; "

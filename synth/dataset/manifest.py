@@ -45,6 +45,9 @@ class ManifestEntry:
     def from_record(cls, record: Mapping[str, Any]) -> "ManifestEntry":
         """The entry of a line's JSON object; KeyError or TypeError where that is not a sample's."""
         values = {name: record[name] for name in cls.__dataclass_fields__}
+        for name, kind in (("sha256", str), ("seconds", int | float)):
+            if not (isinstance(values[name], dict) and all(isinstance(value, kind) for value in values[name].values())):
+                raise TypeError(name)
         rows = {name: tuple(map(tuple, record[name])) for name in ("force_n", "torque_nmm")}
         return cls(**{**values, **rows, "index": int(record["index"]), "frames": tuple(record["frames"])})
 
@@ -125,7 +128,7 @@ def _key_of(line: bytes, key: Callable[[dict[str, Any]], Key]) -> Any:
         return None
     try:
         return key(json.loads(line))
-    except (ValueError, KeyError, TypeError, IndexError):
+    except (ValueError, KeyError, TypeError, IndexError, OverflowError):
         return None
 
 

@@ -172,6 +172,8 @@ def read_dataset(path: Path | str) -> Dataset:
 def read_sample(folder: Path) -> SampleData:
     """The files of one sample's folder; InputError where they are missing or damaged, or do not fit each other."""
     meta = read_document(folder / "meta.json")
+    if not isinstance(meta.get("scene"), dict):
+        raise InputError(f"{folder / 'meta.json'}: holds no scene; the file is damaged")
     names = ("nodes", "faces", "subdivisions", "displacement1", "displacement2")
     arrays = read_npz(folder / "surface.npz", names)
     nodes = arrays["nodes"]

@@ -211,7 +211,7 @@ class SeparatedLight:
         dr.eval(values, terms)
         design, right = (np.array([np.array(one) for one in part], dtype=np.float64) for part in (terms, values))
         found = np.linalg.lstsq(design @ design.T, design @ right.T, rcond=None)[0]
-        # Each a variable of its own: gathered, they would take a fifth of a frame's time.
+        # Each a variable of its own: gathering them would take longer.
         return [[dr.opaque(self._mi.Float, float(value)) for value in column] for column in found.T]
 
     def _terms(self, point: Any, normal: Any) -> list[Any]:

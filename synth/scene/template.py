@@ -207,8 +207,13 @@ def _read(path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
         if close := get_close_matches("extends", content, n=1):
             raise InputError(f"{path}: {close[0]}: unknown key; did you mean 'extends'?")
         return content
-    given = str(content.pop("extends"))
-    base = _find(path.parent / given if given.endswith(".toml") else given)
+    given = content.pop("extends")
+    if not isinstance(given, str):
+        raise InputError(f"{path}: extends = {given!r}: must be the name of a shipped scene or a TOML file")
+    try:
+        base = _find(path.parent / given if given.endswith(".toml") else given)
+    except InputError as error:
+        raise InputError(f"{path}: extends = {given!r}: {error}") from error
     if base in (path, *above):
         raise InputError(f"{path}: extends = {given!r}: a scene cannot extend itself")
     below = with_files(_read(base, (path, *above)), lambda name: str(base.parent.absolute() / name))

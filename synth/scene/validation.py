@@ -32,8 +32,11 @@ def validated(content: Any, source: str, model: type[Model], at: str = "") -> Mo
         whole = {at: content} if at else content
         # A list is also called too short where wrong entries of it were left out.
         told = [p for p in error.errors() if p["type"] != "too_short" or len(p["input"]) < p["ctx"]["min_length"]]
-        lines = [_explain(problem, whole, at) for problem in told]
-        raise InputError("\n".join(f"{source}: {line}" for line in dict.fromkeys(lines))) from error
+        lines: dict[str, str] = {}  # of a union, each member says what it allows
+        for problem in told:
+            place, must, allowed = _explain(problem, whole, at).partition(": must ")
+            lines[place] = f"{lines[place]} or {allowed}" if place in lines else f"{place}{must}{allowed}"
+        raise InputError("\n".join(f"{source}: {line}" for line in lines.values())) from error
 
 
 def _explain(problem: ErrorDetails, content: Any, at: str) -> str:
@@ -88,12 +91,17 @@ def _dotted(location: Sequence[int | str], content: Any) -> str:
         if isinstance(part, int):
             where += f"[{part}]"
             value = value[part] if isinstance(value, list) and part < len(value) else None
-        elif isinstance(value, dict) and part not in value and part in (value.get(tag) for tag in _TAGS):
+        elif where and _is_member(part, value):
             continue
         else:
             where += f".{part}" if where else part
             value = value.get(part) if isinstance(value, dict) else None
     return where
+
+
+def _is_member(part: str, value: Any) -> bool:
+    """Whether a part of pydantic's location names a member of the union that a value belongs to."""
+    return not isinstance(value, dict) or (part not in value and part in (value.get(tag) for tag in _TAGS))
 
 
 def _keys(location: Sequence[int | str]) -> list[str]:

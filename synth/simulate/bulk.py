@@ -5,9 +5,9 @@ The energy is `synth.simulate.material`'s, stabilised as in `synth.simulate.elem
 .. math::  ½ γ(p) D², \qquad D = J - 1 - p/λ, \qquad γ = C \max(0, -\bar p), γ ≤ λ/2   (p̄: mean over the element)
 
 Mixed elements hold D = 0 in the mean only. Under high pressure the second variation p δ²J of modes that leave that mean
-alone is unstable although the gel is not (Auricchio et al., Comput. Methods Appl. Mech. Eng. 194, 2005): with a fine
-mesh pressed to half its thickness, |p| of 9 μ, single elements collapsed to det F = 0.47. γ (δD)² holds them. D is zero
-for the exact solution, so that nothing is added that the mesh resolves.
+alone is unstable although the gel is not (Auricchio et al., Comput. Methods Appl. Mech. Eng. 194, 2005): single
+elements of fine meshes collapse. γ (δD)² holds them. D is zero for the exact solution, so that nothing is added that
+the mesh resolves.
 
 With g_a the undeformed gradient of shape function a, h_a = F^{-T} g_a, s = I_1 - 3 - 2 ln J, d_a = F g_a - h_a,
 W' = μ/2 (1 + 2 c_2 s + 3 c_3 s²), P = p + γ D and γ_c = ∂γ/∂p_c:

@@ -71,7 +71,7 @@ class Grid:
     def signed_distance(self, surface: Triangles, radius_mm: float) -> FloatArray:
         """Distances of all samples, negative inside, and exact where edges are rounded to that radius.
 
-        Winding numbers take ten times as long and are found near the surface. A closed one lies between neighbouring
+        Winding numbers take longer and are found near the surface only. A closed one lies between neighbouring
         samples of different sign: the signs of others are those next to them toward +z. Around an open one they are
         those of coarse samples, the nearest of which is √3 spacings away, and found, too, where these differ.
         Where shells overlap, faces of one lie within another: distances are then those from a contour around all.

@@ -1,8 +1,7 @@
 """Tangent of the bulk, as Warp kernels: the equations are those of `synth.simulate.bulk`.
 
-A thread does all blocks of an element; one of its own for each block spends most of its time on starting (10 ms instead
-of 5 for 2016 quadratic elements). I ∫ 2 W' g_a.g_b depends on the deformation only where the gel stiffens; elsewhere it
-is a table.
+A thread does all blocks of an element; one for each block would spend most of its time on starting. I ∫ 2 W' g_a.g_b
+depends on the deformation only where the gel stiffens; elsewhere it is a table.
 """
 
 import warp as wp

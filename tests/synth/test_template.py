@@ -128,6 +128,7 @@ WRONG_KEYS_AND_TYPES = [
         'sensor.pattern={ kind = "bitmap", file = "a.png", placing = "uv", rotation_deg = 3.0 }',
         ': offset_mm and rotation_deg are for placing = "z"',
     ),
+    ("render.samples_per_pixel=0", " = 0: must be greater than or equal to 1 or be 'auto'"),
     ("name=two words", " = 'two words': must consist of letters A to Z, digits, _ and - alone"),
     ("contact.indenter.shape=ball", " = 'ball': allowed are 'sphere', 'cylinder', 'box'"),
     ("contact.indenter={ radius_mm = 1 }", ": lacks the key 'shape'"),
@@ -201,6 +202,8 @@ def test_every_problem_is_told_once_on_a_short_line_as_are_missing_files(tiny: P
 @pytest.mark.parametrize(("content", "message"), [
     ("name = ", "not valid TOML"),
     ("", "is empty; a scene may begin with extends"),
+    ("extends = 'nosuch'\n", "extends = 'nosuch': there is no scene 'nosuch'"),
+    ("extends = ['digit']\n", "extends = ['digit']: must be the name of a shipped scene or a TOML file"),
     ("extend = 'digit'\n", "extend: unknown key; did you mean 'extends'?"),
     (TEXT.replace('kind = "dots",', ""), "sensor.pattern: lacks the key 'kind'"),
     (TEXT.replace("{ uniform = [90.0, 110.0] }", "0"), "sensor: lights: no light has power; give at least one"),

@@ -1,8 +1,7 @@
 """The arrays of a batch: the state of its lanes, their fields, contact, the linear solver's vectors, and tables for it.
 
 Rows of the vectors: three for each free node's displacement, then the pressures, then rows that fill up, which stay
-zero. At 512 lanes of an 11,500-unknown P2/P1 mesh all take some 7 GB, most of it contact's memory and the Krylov
-basis.
+zero. Most of the memory is contact's and the Krylov basis.
 """
 
 from dataclasses import dataclass

@@ -73,11 +73,6 @@ def _stacked(arrays: Sequence[np.ndarray]) -> np.ndarray:
     return stacked
 
 
-def untouched(press: Press, space: Space) -> Trajectory:
-    """The trajectory of an indenter that never touches: the gel stays as it is."""
-    return Trajectory(tuple(at_rest(press.path, space)), "", 0.0, space)
-
-
 def trajectory(
     press: Press, records: FloatArray, ended: tuple[int, float, float], seconds: float, space: Space
 ) -> Trajectory:

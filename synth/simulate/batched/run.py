@@ -11,20 +11,20 @@ import warp as wp
 from synth.arrays import FloatArray
 from synth.simulate.batched import lanes as phases
 from synth.simulate.batched.pad import Pad
-from synth.simulate.batched.presses import press_tables, trajectory, untouched
+from synth.simulate.batched.presses import press_tables, trajectory
 from synth.simulate.batched.solver import INNER_ITERATIONS, BatchedSolver
 from synth.simulate.newton import MAX_ITERATIONS
 from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.press import Press
 from synth.simulate.solve import check_shared
-from synth.simulate.trajectory import Trajectory
+from synth.simulate.trajectory import Trajectory, at_rest
 
 MAX_BATCH = 512
 OPTIONS = replace(STANDARD, relaxed_tolerance=0.0, forcing=1e-4, closer=1e-3)
 """The scene's tolerance along the whole load path, because friction remembers the path; linear solves and corrections
 so tight that rounding hardly ever decides which equilibrium is found."""
 CYCLES_PER_POLL = 2
-"""Cycles between looks at which lanes have ended: a lane waits for half of them on average, some 1 % of its time."""
+"""Cycles between looks at which lanes have ended: a lane waits for half of them on average."""
 
 
 def simulate_presses(
@@ -49,7 +49,7 @@ def simulate_presses(
         if press.path.may_touch:
             touching.append(number)
         else:
-            yield number, untouched(press, pad.space)
+            yield number, Trajectory(tuple(at_rest(press.path, pad.space)), "", 0.0, pad.space)
     if touching:
         theirs = None if frames is None else [frames[n] for n in touching]
         run = Run([presses[n] for n in touching], pad, theirs, min(batch, len(touching)), options)

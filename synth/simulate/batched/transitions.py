@@ -5,9 +5,9 @@ follows them at its own pace, that passes are solved to a share of the full tole
 have a relaxed tolerance the full one holds for what is recorded only. A step that ends at a recorded state, and every
 pass but the last, then has the relaxed tolerance, and every pass of a deep object at least MULTIPLIER_TOLERANCE times
 the full one: what they find is changed by the next pass. A state without passes, or whose passes end early, is brought
-to the full tolerance before it is recorded (POLISH); where that fails, the step is halved as if it had not been taken.
-The load path goes on from the state before, so that it does not depend on which states are corrected.
-Nothing limits the iterations of a press or the turn of normals, and all directions are exact.
+to the full tolerance before it is recorded (POLISH); where that fails, the step is halved. The load path goes on from
+the state before, so that it does not depend on which states are corrected. Nothing limits a press's iterations or the
+turn of normals, and no direction is rough.
 """
 
 from typing import Any
