@@ -3,14 +3,20 @@
 from collections.abc import Callable
 
 import torch
+from torch import Tensor
 
 from gelflow.arrays import Flow, Images
 from gelflow.config import MINIMUM_SIDE
 from gelflow.errors import InputError
 from gelflow.models import GelFlow
 from gelflow.models.gelflow import check_shapes
-from gelflow.models.working_size import sized_sigma, working_sizes
+from gelflow.models.working_size import sized_sigma, unknown_px, working_sizes
 from gelflow.ops.pyramid import resize_flow, resize_images
+from gelflow.ops.warp import warp
+
+DIFFERENT = 0.1
+"""Where the flows at two sizes differ on a larger share of the picture, one may have taken dots for their neighbours,
+which sigma does not tell: the flow counts that leaves the picture unclosed on a smaller share."""
 
 
 def estimate_flow(
@@ -24,9 +30,10 @@ def estimate_flow(
 
     Images are (B, 3, H, W) float32 in [0, 1]. The network is used on the device that it is on, in evaluation mode, and
     left as it was. `size` is the rows and columns at which it works, by default `GelFlow.image_size`. Where that is
-    None, all of `working_sizes` are tried, and each pair keeps the flow with the least mean of sigma. `flow` is called
-    in place of `GelFlow.flow`, such as a `RecordedNetwork` of the model. InputError for shapes that differ, sides below
-    64 px (of `size`, or without one of the images), other than three colours, values that are not finite.
+    None, all of `working_sizes` are tried, and each pair keeps the flow with the least mean of sigma or, where they
+    differ much (DIFFERENT), the one that closes best. `flow` is called in place of `GelFlow.flow`, such as a
+    `RecordedNetwork` of the model. InputError for shapes that differ, sides below 64 px (of `size`, or without one of
+    the images), other than three colours, values that are not finite.
     """
     size = size or model.image_size
     if size is not None and min(size) < MINIMUM_SIDE:
@@ -42,15 +49,31 @@ def estimate_flow(
     sizes = working_sizes(*native) if size is None else [size]
     was_training = model.training
     model.eval()
+
+    def flows(one: Images, other: Images) -> list[Flow]:
+        """The flow from one image to the other at each size."""
+        reduced = ((resize_images(one, size), resize_images(other, size)) for size in sizes)
+        return [resize_flow((flow or model.flow)(*images), native) for images in reduced]
+
     try:
         with torch.no_grad():
-            found = [resize_flow((flow or model.flow)(resize_images(first, one), resize_images(second, one)), native)
-                     for one in sizes]  # fmt: skip
+            found = flows(first, second)
+            best = found[0]
+            if len(found) > 1:
+                sigmas = [sized_sigma(each, first, second, size)[0] for each, size in zip(found, sizes, strict=True)]
+                chosen = torch.stack(sigmas).mean(dim=(2, 3, 4)).argmin(dim=0)
+                differ = _share_beyond(found[0] - found[1]) > DIFFERENT
+                if differ.any():
+                    missed = [
+                        there + warp(back, there) for there, back in zip(found, flows(second, first), strict=True)
+                    ]
+                    chosen = torch.where(differ, torch.stack(list(map(_share_beyond, missed))).argmin(dim=0), chosen)
+                best = torch.stack(found)[chosen, torch.arange(len(best))]
     finally:
         model.train(was_training)
-    best = found[0]
-    if len(found) > 1:
-        sigmas = [sized_sigma(each, first, second, one)[0] for each, one in zip(found, sizes, strict=True)]
-        surest = torch.stack(sigmas).mean(dim=(2, 3, 4)).argmin(dim=0)
-        best = torch.stack(found)[surest, torch.arange(len(best))]
     return best.to(image1.device)
+
+
+def _share_beyond(difference: Flow) -> Tensor:
+    """(B,) the share of the picture in which a difference of flows, px, is longer than `unknown_px`."""
+    return (difference.norm(dim=1) > unknown_px(difference.shape[-2], difference.shape[-1])).float().mean(dim=(1, 2))

@@ -1,9 +1,8 @@
-"""The two sizes at which large images are worked on; the flow with the smaller mean sigma is kept.
+"""The two sizes at which large images are worked on; `gelflow.models.estimate` chooses between their flows.
 
 Most gels that the shipped network learned from have images of 320 x 240 px. In larger ones it may take dots for their
 neighbours, and what is between dots is beyond the windows of registration and uncertainty, which are in px. Reduced
-images show such patterns better, and fine ones worse. Sigma tells: where a flow jumps from dots to their neighbours, or
-lies between distant dots, it is large.
+images show such patterns better, and fine ones worse.
 """
 
 import math

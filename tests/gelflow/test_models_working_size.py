@@ -59,6 +59,16 @@ def test_a_fine_pattern_keeps_its_size_and_each_pair_of_a_batch_has_its_own() ->
     np.testing.assert_allclose(found[:, 0, 240, 320], [2.0, 3.0], atol=1e-3)
 
 
+def test_where_the_two_flows_differ_much_the_one_that_closes_is_kept() -> None:
+    """A jump by 20 px in both directions, on images that do not tell."""
+    still = torch.zeros(1, 3, 480, 640)
+
+    def flow(image1: Images, image2: Images) -> Flow:
+        return torch.full((1, 2, *image1.shape[-2:]), 20.0 if image1.shape[-1] == 640 else 0.0)
+
+    assert not estimate_flow(load_weights(weights_file(None)), still, still, flow=flow).any()
+
+
 def test_flow_and_sigma_of_an_enlarged_pair_are_those_of_the_pair_enlarged() -> None:
     images = [dots(720, 960, 90.0, shift).astype(np.float32) / 255 for shift in (0.0, 12.0)]
     tensors = [torch.from_numpy(image).movedim(-1, 0)[None] for image in images]

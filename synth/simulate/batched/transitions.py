@@ -1,13 +1,13 @@
 """What happens next to a lane, as Warp kernels of one thread a lane.
 
-The rules are those of `synth.simulate.newton` and `stepping`, whose constants they use; what differs is that each lane
-follows them at its own pace, that passes are solved to a share of the full tolerance, and that where intermediate steps
-have a relaxed tolerance the full one holds for what is recorded only. A step that ends at a recorded state, and every
-pass but the last, then has the relaxed tolerance, and every pass of a deep object at least MULTIPLIER_TOLERANCE times
-the full one: what they find is changed by the next pass. A state without passes, or whose passes end early, is brought
-to the full tolerance before it is recorded (POLISH); where that fails, the step is halved. The load path goes on from
-the state before, so that it does not depend on which states are corrected. Nothing limits a press's iterations or the
-turn of normals, and no direction is rough.
+The rules are those of `synth.simulate.newton` and `stepping`; what differs is that each lane follows them at its own
+pace, that passes are solved to a share of the full tolerance, and that where intermediate steps have a relaxed
+tolerance the full one holds for what is recorded only. A step that ends at a recorded state, and every pass but the
+last, then has the relaxed tolerance, and every pass of a deep object at least MULTIPLIER_TOLERANCE times the full one:
+what they find is changed by the next pass. A state without passes, or whose passes end early, is brought to the full
+tolerance before it is recorded (POLISH); where that fails, the step is halved. The load path goes on from the state
+before, so that it does not depend on which states are corrected. Nothing limits a press's iterations or the turn of
+normals, and no direction is rough.
 """
 
 from typing import Any
