@@ -30,6 +30,7 @@ class Classical:
     estimate: Callable[[Grey8, Grey8], Any]
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
+        """See `Method.flow`."""
         check_images(image1, image2)
         try:
             return np.asarray(self.estimate(to_grey(image1), to_grey(image2)))
@@ -89,6 +90,7 @@ class RegisteredDIS:
         return f"DIS medium+{self.aim}"
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
+        """See `Method.flow`."""
         start = dis("medium").flow(image1, image2)
         first, second = as_tensor(image1, self.device), as_tensor(image2, self.device)
         return as_array(registered(as_tensor(start, self.device), first, second, self.settings))

@@ -88,6 +88,7 @@ class Learned:
         self.size = size
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
+        """See `Method.flow`."""
         check_images(image1, image2)
         tensors = [as_tensor(image, self.device) for image in (image1, image2)]
         return as_array(estimate_flow(self.model, tensors[0], tensors[1], self.size, self.forward))
@@ -104,6 +105,7 @@ class PublishedRaft:
         self.size = size
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
+        """See `Method.flow`."""
         check_images(image1, image2)
         native = (image1.shape[0], image1.shape[1])
         tensors = [resize_images(as_tensor(image, self.device), self.size or native) for image in (image1, image2)]

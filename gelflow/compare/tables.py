@@ -101,6 +101,7 @@ def strata_table(strata: Mapping[str, Sequence[Stratum]]) -> Table:
 
 
 def speed_table(speeds: Mapping[str, Speed]) -> Table:
+    """A row for the speed and memory of each network."""
     header = ["network", "device", "pairs at once", "size", "pairs/s", "peak memory MiB"]
     rows = [
         [name, s.device, str(s.batch), f"{s.size[0]}x{s.size[1]}", f"{s.pairs_per_second:.2f}", number(s.memory_mib, 0)]
@@ -110,6 +111,7 @@ def speed_table(speeds: Mapping[str, Speed]) -> Table:
 
 
 def tables(comparison: Comparison) -> list[tuple[str, Table]]:
+    """The tables of a comparison with their titles, as they are printed."""
     groups = _ordered(summarise(comparison.scores))
     pairs = len(comparison.pairs)
     means = f"Means over {pairs} pairs; times are medians after a warm-up, core ms is processor time of all threads."

@@ -73,6 +73,7 @@ def read_pair_set(folder: Path) -> PairSet:
 
 
 def write_pair_set(folder: Path, content: PairSet) -> None:
+    """Writes the description of a pair set into its folder."""
     write_text(folder / FILE, json.dumps(content.model_dump(mode="json"), indent=1) + "\n")
 
 

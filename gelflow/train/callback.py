@@ -165,10 +165,12 @@ class CheckpointCallback(L.Callback):
 
 
 def weights_metadata(config: TrainConfig, step: int) -> dict[str, str]:
+    """What weights say of their training."""
     return {"train": config.model_dump_json(), "step": str(step)}
 
 
 def describe(metrics: Mapping[str, float]) -> str:
+    """Validation metrics as one line."""
     texts = []
     if "endpoint_error_px" in metrics:
         still = metrics["no_motion_endpoint_error_px"]

@@ -46,6 +46,7 @@ class State:
 
 
 def save_state(out: Path, state: State) -> None:
+    """Writes what a training continues from, as a whole or not at all."""
     with replacing(out / STATE) as temporary, temporary.open("wb") as file:
         torch.save(dict(vars(state)), file)
 

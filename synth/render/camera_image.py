@@ -29,6 +29,7 @@ from synth.scene import Camera
 
 
 def noise_deviation(signal: FloatArray, camera: Camera) -> FloatArray:
+    """Standard deviation of the camera's noise at linear signals of full scale 1; same shape."""
     return np.asarray(np.sqrt(camera.read_noise**2 + camera.shot_noise**2 * signal))
 
 

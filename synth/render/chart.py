@@ -77,6 +77,7 @@ _ROWS = 64
 
 
 def chart_of(sensor: Sensor) -> Chart:
+    """How the pattern of a sensor lies on its contact face."""
     x, y, top = sensor.gel.size_mm
     if isinstance(sensor.pattern, NoPattern) or getattr(sensor.pattern, "placing", "z") == "z":
         return FlatChart((x, y))

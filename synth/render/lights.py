@@ -128,6 +128,7 @@ def image_lights(sensor: Sensor) -> tuple[Light, ...]:
 
 
 def all_lights(sensor: Sensor) -> tuple[Light, ...]:
+    """The lights with power, and their mirror images behind a window that reflects."""
     return tuple(light for light in (*sensor.lights, *image_lights(sensor)) if light.power > 0)
 
 

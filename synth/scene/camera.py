@@ -80,6 +80,7 @@ class Camera(Part):
 
     @property
     def lowest_mm(self) -> float:
+        """Smallest z of the lens's pupil, mm."""
         along = [at - eye for at, eye in zip(self.look_at_mm, self.position_mm, strict=True)]
         length = math.hypot(*along)
         level = math.hypot(along[0], along[1]) / length if length > 0 else 1.0
@@ -116,6 +117,7 @@ class Mirror(Part):
 
     @property
     def lowest_mm(self) -> float:
+        """Smallest z of the mirror, mm."""
         first, second, _ = np.abs(self.axes[:, 2])
         return float(self.position_mm[2] - (first * self.size_mm[0] + second * self.size_mm[1]) / 2)
 

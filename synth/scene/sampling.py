@@ -48,12 +48,14 @@ class Pair:
 
 
 def stream(template: Template, seed: int, purpose: str, *numbers: int) -> np.random.Generator:
+    """The random numbers of one purpose of a job; see the module's docstring."""
     scene = 0 if template.sampling.common_draws else int(template.hash, 16)
     entropy = [scene, seed, zlib.crc32(purpose.encode()), *numbers]
     return np.random.default_rng(np.random.SeedSequence(entropy))
 
 
 def sensor_of(template: Template, trajectory: int) -> int:
+    """Number of the sensor of a trajectory."""
     return trajectory // template.sampling.trajectories_per_sensor
 
 
