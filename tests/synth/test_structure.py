@@ -12,6 +12,7 @@ ROOT = Path(__file__).parents[2]
 STAGES = (
     "synth",  # the package itself: its version, and where its public names are, which it loads when they are asked for
     "synth.errors", "synth.arrays",
+    "synth.warp_start",
     "synth.dataset.storage",  # how a file gets to the disk as a whole; knows nothing of datasets
     "synth.scene", "synth.surface", "synth.optics", "synth.mesh", "synth.simulate", "synth.flow",
     "synth.render",
