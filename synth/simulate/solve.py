@@ -94,11 +94,11 @@ def check_shared(scenes: Sequence[Scene], mesh: PadMesh) -> None:
 
 
 def _check_pad(gel: Gel, mesh: PadMesh) -> None:
-    layers = int(mesh.layer.max())
-    own = f"{gel.size_mm} mm {face_of(gel)} with {len(gel.layers)} layers"
-    other = f"{mesh.size_mm} mm {mesh.face} with {layers} layers"
+    own, other = f"{gel.size_mm} mm {face_of(gel)}", f"{mesh.size_mm} mm {mesh.face}"
     if own != other:
         raise InputError(f"the mesh is of a {other}, the scene's is a {own}")
+    if mesh.layer.max() != len(gel.layers):
+        raise InputError(f"the mesh has {mesh.layer.max()} layers over the gel, the scene's has {len(gel.layers)}")
 
 
 def _elastic(gel: Gel) -> tuple[float, ...]:

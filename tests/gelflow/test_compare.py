@@ -126,7 +126,7 @@ def test_every_nth_pair_of_several_folders(tmp_path: Path, capsys: pytest.Captur
     scores = json.loads(said(capsys, main, *command, "3"))["scores"]
     assert [(s["pair"], s["motion_px"]) for s in scores] == [("a/000000", 5.0), ("a/000003", 2.0), ("b/000002", 1.0)]
     assert open_all(folders).names[::3] == [s["pair"] for s in scores]
-    assert "--every 0" in said(capsys, main, *command, "0", status=2)
+    assert "--every: it is '0'" in said(capsys, main, *command, "0", status=2)
 
 
 @dataclass(frozen=True)

@@ -77,18 +77,19 @@ def test_mirrored_motion_gives_the_mirrored_state_on_a_mesh_of_the_scenes_pad() 
     np.testing.assert_allclose(other.force_n, np.array(one.force_n) * [-1, 1, 1], rtol=2e-3)
     np.testing.assert_allclose(other.torque_nmm, np.array(one.torque_nmm) * [1, -1, -1], rtol=2e-3, atol=1e-3)
     refused(r"the mesh is of a .* mm pad, the scene's is a", simulate, scene((8.0, 6.0, 3.0)), MESH)
+    refused(r"the mesh has 0 layers over the gel, the scene's has 1", simulate, scene(gel={"layers": [FILM]}), MESH)
 
 
 @pytest.mark.parametrize("layers", [0, 1])
 def test_youngs_moduli_that_differ_alike_scale_forces_only(layers: int) -> None:
     """Deformation depends on ratios of moduli only, so that such scenes may share a batch."""
 
-    def pad(kpa: float) -> dict[str, Any]:
-        return {"youngs_modulus_kpa": kpa, "layers": layers * [{"thickness_mm": 1.0, "youngs_modulus_kpa": 3 * kpa}]}
+    def gel(kpa: float) -> dict[str, Any]:
+        return {"youngs_modulus_kpa": kpa, "layers": layers * [{**FILM, "youngs_modulus_kpa": 3 * kpa}]}
 
-    soft, hard = gentle(gel=pad(200.0)), gentle(gel=pad(200e3))
-    check_shared([soft, hard], MESH)
-    for s, t in zip(*(simulate(posed, MESH).states for posed in (soft, hard)), strict=True):
+    mesh, soft, hard = pad(layers > 0), gentle(gel=gel(200.0)), gentle(gel=gel(200e3))
+    check_shared([soft, hard], mesh)
+    for s, t in zip(*(simulate(posed, mesh).states for posed in (soft, hard)), strict=True):
         assert (s.displacement == t.displacement).all()
         np.testing.assert_allclose(t.force_n, 1000 * np.array(s.force_n), rtol=1e-12)
         np.testing.assert_allclose(t.torque_nmm, 1000 * np.array(s.torque_nmm), rtol=1e-12)
