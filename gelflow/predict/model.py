@@ -107,14 +107,18 @@ def load_model(
             images, of which those of more than 400 x 300 px are reduced to two sizes.
 
     Raises:
-        InputError: No such file, a damaged one or another network's, or no such device.
+        InputError: No such file, a damaged one or another network's, no such device, or no such registration or size.
     """
+    if size is not None and (len(size) != 2 or not all(isinstance(side, int) for side in size)):
+        raise InputError(f"size = {size!r}: rows and columns are needed, such as (240, 320)")
     return FlowModel(Learned(weights_file(Path(name_or_path)), None, size, device, registration))
 
 
 def _in_unit_range(name: str, image: NDArray[np.generic]) -> ImageArray:
     if image.dtype == np.uint8:
         return image.astype(np.float32) / np.float32(255)
+    if image.dtype.kind not in "biuf":
+        raise InputError(f"{name} is {image.dtype}; allowed: real numbers")
     if image.size:
         _check_range(name, str(image.dtype), float(image.min()), float(image.max()))
     return image.astype(np.float32)

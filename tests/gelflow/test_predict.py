@@ -192,6 +192,12 @@ def test_images_that_cannot_be_used(image1: object, image2: object, message: str
     refused(message, gelflow.load_model(device="cpu").flow, image1, image2)  # type: ignore[call-overload]
 
 
+def test_a_network_is_not_loaded_with_wrong_options() -> None:
+    refused("registration = 'foo': allowed are none, motion", gelflow.load_model, device="cpu", registration="foo")
+    refused(r"size = \(240,\): rows and columns", gelflow.load_model, device="cpu", size=(240,))
+    refused("image 1 is complex128", gelflow.load_model(device="cpu").flow, *np.ones((2, 64, 64, 3), complex))
+
+
 def test_estimate_refuses_tensors() -> None:
     tensor = torch.zeros(3, 64, 64)
     refused("estimate takes arrays", gelflow.load_model(device="cpu").estimate, tensor, tensor)

@@ -1,5 +1,6 @@
 """Poses along a path of several legs, and where states are recorded."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,7 @@ from pads import SPHERE, scene
 
 from synth.scene import Motion
 from synth.simulate.indenter import rigid_body, rotation_about
-from synth.simulate.load_path import TWIST_ARM_MM, LoadPath
+from synth.simulate.load_path import TWIST_ARM_MM, LoadPath, PressFrame
 
 
 def path(indenter: dict | None = None, **motion: Any) -> LoadPath:
@@ -65,6 +66,12 @@ BACK_AND_OFF: dict[str, Any] = {
     "shear_mm": [0.6, 0.0],
     "then": [{"depth_mm": 1.0, "shear_mm": [-0.6, 0.0]}, {"depth_mm": 0.0, "shear_mm": [-0.6, 0.0]}],
 }
+
+
+@pytest.mark.parametrize(("start_mm", "touches"), [(-0.1, True), (0.0, False)])
+def test_a_gel_that_begins_above_the_place_is_touched_early(start_mm: float, touches: bool) -> None:
+    frame = PressFrame(np.zeros(3), np.eye(3), start_mm)
+    assert replace(path(depth_mm=-0.05), frame=frame).may_touch == touches
 
 
 def test_legs_follow_one_another_and_turns_are_seen() -> None:
