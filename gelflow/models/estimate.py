@@ -15,8 +15,8 @@ from gelflow.ops.pyramid import resize_flow, resize_images
 from gelflow.ops.warp import warp
 
 DIFFERENT = 0.1
-"""Where the flows at two sizes differ on a larger share of the picture, one may have taken dots for their neighbours,
-which sigma does not tell: the flow counts that leaves the picture unclosed on a smaller share."""
+"""Share of the picture on which the flows at two sizes may differ. Where they differ on more, one of them may have taken
+dots for their neighbours, which sigma does not tell. Then the flow that closes on more of the picture is kept."""
 
 
 def estimate_flow(

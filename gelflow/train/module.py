@@ -233,8 +233,8 @@ def validation_metrics(batch: dict[str, Any], flow: Tensor, config: TrainConfig)
     """How good the flow of one pair is: against the truth where there is one, and by the warped image.
 
     Scalars by the names in `METRICS`; endpoint errors only where a flow is known. The others are NaN where the flow
-    leads out of the image everywhere. PSNR is that of floats over the
-    pixels that stay inside the image, not the 8-bit one of the comparison tables.
+    leads out of the image everywhere. PSNR is that of floats over the pixels that stay inside the image, not the 8-bit
+    one of the comparison tables.
     """
     image1, image2 = batch["image1"], batch["image2"]
     still = torch.zeros_like(flow)

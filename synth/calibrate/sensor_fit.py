@@ -51,7 +51,7 @@ class SensorFit:
 def fit_sensor(start: Sensor, frames: Frames, variant: Variant, spacing_mm: float | None, steps: int) -> SensorFit:
     """Fit everything that undeformed frames tell.
 
-    The preset's camera has the frames' size. Without the spacing of the dots' columns its field of view holds. The
+    The preset's camera has the frames' size. Without the spacing of the dots' columns its field of view is kept. The
     lights' geometry takes at most `steps` steps. The variant is a vectorised one. InputError for no dots, or no grid,
     where the preset has some; for nothing that tells of the lights; and for overexposure.
     """

@@ -26,7 +26,8 @@ from synth.simulate.trajectory import State, Trajectory, at_rest, no_contact, no
 SHORTEST_STEP = 1 / 128
 """Shortest step, as a share of max_step_mm."""
 MAX_PRESS_ITERATIONS = 2000
-"""A step that fails after so many iterations of a press ends it; no press that completed took as many."""
+"""A step that fails after so many iterations of a press ends it; on a CPU no press that completed took as
+many."""
 MAX_ITERATIONS_TO_GROW = 7
 """Most iterations of a step that is followed by a longer one."""
 GROWTH = 1.5
