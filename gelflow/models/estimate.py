@@ -15,8 +15,8 @@ from gelflow.ops.pyramid import resize_flow, resize_images
 from gelflow.ops.warp import warp
 
 DIFFERENT = 0.1
-"""Share of the picture on which the flows at two sizes may differ. Where they differ on more, one of them may have taken
-dots for their neighbours, which sigma does not tell. Then the flow that closes on more of the picture is kept."""
+"""Share of the picture on which the flows at two sizes may differ. Where they differ on more, one of them may have
+taken dots for their neighbours, which sigma does not tell. Then the flow that closes on more of the picture is kept."""
 
 
 def estimate_flow(
