@@ -1,4 +1,4 @@
-"""The command line: `python -m gelflow train|finetune|evaluate|compare|predict|export|pairs`.
+"""The command line: `python -m gelflow train|finetune|evaluate|compare|predict|live|export|pairs`.
 
 Exit status: 0 done, 1 done in part, 2 wrong input, 130 interrupted. Nothing heavy is imported before a command runs.
 """
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from cyclopts import App, CycloptsError
 
 from gelflow import __version__
-from gelflow.cli.prediction import export, predict
+from gelflow.cli.prediction import export, live, predict
 from gelflow.cli.recordings import pairs
 from gelflow.cli.scoring import compare, evaluate
 from gelflow.cli.training import finetune, train
@@ -24,7 +24,7 @@ app = App(
     result_action="return_value",
     suppress_keyboard_interrupt=False,
 )
-for command in (train, finetune, evaluate, compare, predict, export, pairs):
+for command in (train, finetune, evaluate, compare, predict, live, export, pairs):
     app.command(command)
 
 

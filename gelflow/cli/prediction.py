@@ -1,21 +1,38 @@
-"""The commands `predict` and `export`."""
+"""The commands `predict`, `live` and `export`."""
 
 from __future__ import annotations
 
 import json
+import math
 import sys
+import time
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from gelflow.cli.options import METHODS, AsJson, OnDevice, Out, Registration, ShippedOrFile, Size, parse_size, whole
+from gelflow.cli.options import (
+    METHODS,
+    AsJson,
+    Device,
+    OnDevice,
+    Out,
+    Registered,
+    Registration,
+    ShippedOrFile,
+    Size,
+    parse_size,
+    whole,
+)
 from gelflow.errors import InputError
 
 if TYPE_CHECKING:
     from gelflow.baselines import Method
-    from gelflow.predict.prediction import Prediction
+    from gelflow.predict.prediction import Motion, Prediction
+
+InPlace = Annotated[str | None, Parameter(help=f"In place of the network: {METHODS}.")]
 
 
 def predict(
@@ -24,7 +41,7 @@ def predict(
     *,
     out: Out,
     weights: ShippedOrFile = None,
-    method: Annotated[str | None, Parameter(help=f"In place of the network: {METHODS}.")] = None,
+    method: InPlace = None,
     registration: Registration = None,
     reference: Annotated[
         Literal["first", "previous"], Parameter(help="Of a video: flow from its first or from the previous frame.")
@@ -35,11 +52,8 @@ def predict(
     as_json: AsJson = False,
 ) -> int:
     """Writes the flow of pairs of images (EXR, .flo and a picture) or of a video (EXR, motion.csv and a video)."""
-    from gelflow.baselines import named_methods
-    from gelflow.baselines.learned import open_network
     from gelflow.data.open import holds_pairs
     from gelflow.data.pairs import PairDataset
-    from gelflow.models.weights import weights_file
     from gelflow.predict.prediction import predict_pair, predict_pairs, predict_video
     from gelflow.terminal import progress
 
@@ -50,18 +64,7 @@ def predict(
     for path in inputs:
         if not path.exists():
             raise InputError(f"{path}: there is no such file or folder")
-    estimator: Method
-    if method is None:
-        estimator = open_network(weights_file(weights), None, parse_size(size), device, registration)
-    elif weights is not None or size is not None:
-        raise InputError("give either --weights FILE and --size (of a network) or --method NAME (a classical one)")
-    elif registration is not None:
-        raise InputError(
-            "--registration: is for --weights of GelFlow; "
-            "of DIS there are --method dis-motion, dis-both, dis-brightness"
-        )
-    else:
-        estimator = named_methods([method], device)[0]
+    estimator = _estimator(weights, method, registration, size, device)
     paired = len(inputs) == 2 or holds_pairs(inputs[0])
     if paired and (reference, every) != ("first", 1):
         raise InputError("--reference and --every are for a video or a folder of frames, not for pairs of images")
@@ -80,6 +83,79 @@ def predict(
     return 0
 
 
+def live(
+    source: Annotated[str, Parameter(help="A camera's number, such as 0, a stream's address or a video file.")],
+    /,
+    *,
+    weights: ShippedOrFile = None,
+    method: InPlace = None,
+    registration: Registration = None,
+    reference: Annotated[
+        Literal["first", "previous"], Parameter(help="Flow from the first or from the previous frame.")
+    ] = "first",
+    size: Size = None,
+    device: OnDevice = "auto",
+    port: Annotated[int | None, Parameter(converter=whole(0), help="Show the flow at http://127.0.0.1:PORT.")] = None,
+    seconds: Annotated[float, Parameter(help="Stop after so many seconds; default: with the source.")] = math.inf,
+    as_json: AsJson = False,
+) -> int:
+    """Prints the motion of a running camera, a line for each frame, until the camera or Ctrl-C ends it.
+
+    Frames that come while one is computed are left out. With --json each line is JSON.
+    """
+    from gelflow.predict.live import Page, follow
+    from gelflow.predict.pictures import certain, draw_overlay, robust_scale
+
+    estimator = _estimator(weights, method, registration, size, device)
+    page = None if port is None else Page(port)
+    if page:
+        print(f"gelflow: {estimator.name} at {page.address}", file=sys.stderr, flush=True)
+    scale, started = 0.0, time.monotonic()
+    before = started
+    with suppress(KeyboardInterrupt):
+        for frame, found, motion in follow(estimator, source, reference):
+            if page:
+                known = certain(found.flow, found.sigma)
+                scale = max(scale, robust_scale(known))
+                page.show(draw_overlay(frame, known, scale))
+            now = time.monotonic()
+            text = f"{_words(motion)}; {1 / (now - before):.1f} frames/s"
+            print(json.dumps(asdict(motion)) if as_json else f"frame {motion.frame}: {text}", flush=True)
+            before = now
+            if now - started >= seconds:
+                break
+    if page:
+        page.close()
+    return 0
+
+
+def _estimator(
+    weights: Path | None, method: str | None, registration: Registered | None, size: str | None, device: Device
+) -> Method:
+    """The network or classical method that the options name."""
+    from gelflow.baselines import named_methods
+    from gelflow.baselines.learned import open_network
+    from gelflow.models.weights import weights_file
+
+    if method is None:
+        return open_network(weights_file(weights), None, parse_size(size), device, registration)
+    if weights is not None or size is not None:
+        raise InputError("give either --weights FILE and --size (of a network) or --method NAME (a classical one)")
+    if registration is not None:
+        raise InputError(
+            "--registration: is for --weights of GelFlow; "
+            "of DIS there are --method dis-motion, dis-both, dis-brightness"
+        )
+    return named_methods([method], device)[0]
+
+
+def _words(motion: Motion) -> str:
+    return (
+        f"mean motion {motion.mean_px:.3g} px, 95th percentile {motion.p95_px:.3g} px; "
+        f"unknown on {motion.unknown:.0%} of the picture"
+    )
+
+
 def _show(result: Prediction, name: str, as_json: bool) -> None:
     if as_json:
         motions = [asdict(motion) for motion in result.motions]
@@ -87,8 +163,7 @@ def _show(result: Prediction, name: str, as_json: bool) -> None:
         return
     largest = max(result.motions, key=lambda motion: motion.p95_px)
     where = f" in number {largest.frame} ({largest.file}), where most moves," if len(result.motions) > 1 else ""
-    print(f"{name}:{where} mean motion {largest.mean_px:.3g} px, 95th percentile {largest.p95_px:.3g} px; "
-          f"unknown on {largest.unknown:.0%} of the picture")  # fmt: skip
+    print(f"{name}:{where} {_words(largest)}")
     shown = result.files if len(result.files) <= 6 else [result.files[0], "...", *result.files[-3:]]
     print(f"written: {', '.join(str(file) for file in shown)}")
 

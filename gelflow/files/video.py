@@ -1,13 +1,17 @@
-"""Frames of a video file, or of a folder of images in the natural order of their names.
+"""Frames of a video file, of a folder of images in the natural order of their names, or of a running camera.
 
 Frames are (H, W, 3) uint8, RGB, as the decoder gives them.
 """
 
 import re
+import time
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
+from queue import Empty, Queue
+from threading import Event, Thread
 from typing import Any
 
 import cv2
@@ -88,12 +92,55 @@ def frames(path: Path, every: int = 1) -> Iterator[tuple[int, Bytes3 | None]]:
             if not decoded:
                 return
             if frame is not None:
-                if frame.ndim == 2:
-                    frame = frame[..., None].repeat(3, axis=2)
-                yield index, frame[..., ::-1].copy()
+                yield index, _rgb(frame)
             index += 1
     finally:
         capture.release()
+
+
+def newest_frames(source: str) -> Iterator[tuple[int, Bytes3]]:
+    """Yields (index, frame) of a camera, leaving out the frames that come while the caller is busy.
+
+    The source is a camera's number, the address of a stream, or a video file, which is played at its own rate. The
+    iterator ends with it. InputError where it does not open.
+    """
+    with quiet():
+        capture = cv2.VideoCapture(int(source) if source.isdecimal() else source)
+    if not capture.isOpened():
+        raise InputError(
+            f"{source}: it does not open; allowed are a camera's number, such as 0, a stream's address and a video file"
+        )
+    interval = 1 / describe(Path(source)).frames_per_second if Path(source).is_file() else 0.0
+    newest: Queue[tuple[int, Bytes3] | None] = Queue()
+    stopped = Event()
+
+    def read() -> None:
+        started = time.monotonic()
+        for index in count():
+            decoded, frame = capture.read()
+            if not decoded:
+                newest.put(None)
+                return
+            with suppress(Empty):
+                newest.get_nowait()
+            newest.put((index, _rgb(frame)))
+            if stopped.wait(max(0.0, started + (index + 1) * interval - time.monotonic())):
+                return
+
+    thread = Thread(target=read, daemon=True)
+    thread.start()
+    try:
+        while (found := newest.get()) is not None:
+            yield found
+    finally:
+        stopped.set()
+        thread.join()
+        capture.release()
+
+
+def _rgb(frame: Any) -> Bytes3:
+    """OpenCV's frame, BGR or grey."""
+    return frame[..., None].repeat(3, axis=2) if frame.ndim == 2 else frame[..., ::-1].copy()
 
 
 def frame_file(path: Path, index: int) -> Path:

@@ -92,7 +92,7 @@ def _predicted(method: Method, dataset: PairDataset, index: int, out: Path) -> t
     refuse_foreign(exr, DIRECTIONS.encode(), flo, png)
     image1, image2 = dataset.images(index)
     try:
-        found, motion = _estimate(method, image1, image2, index + 1, name)
+        found, motion = estimate(method, image1, image2, index + 1, name)
     except InputError as error:
         raise InputError(f"pair {name} of {dataset.source}, {method.name}: {error}") from error
     write_flow(exr, found.flow, found.visible, found.sigma)
@@ -136,7 +136,7 @@ def predict_video(
         source = sources.get(index, path)
         try:
             first, second = (image.astype(np.float32) / np.float32(255) for image in (image1, image2))
-            found, motion = _estimate(method, first, second, index, source.name)
+            found, motion = estimate(method, first, second, index, source.name)
         except InputError as error:
             raise InputError(f"{source}, frame {index}, {method.name}: {error}") from error
         if not files:
@@ -163,7 +163,8 @@ def predict_video(
     return Prediction([*files, table, video], motions, max(0, every * (expected - len(motions))))
 
 
-def _estimate(method: Method, image1: ImageArray, image2: ImageArray, frame: int, file: str) -> tuple[Estimate, Motion]:
+def estimate(method: Method, image1: ImageArray, image2: ImageArray, frame: int, file: str) -> tuple[Estimate, Motion]:
+    """The flow between two images, how certain it is, and its motion; InputError as `Method.flow` raises it."""
     started = time.perf_counter()
     flow = method.flow(image1, image2)
     seconds = time.perf_counter() - started

@@ -25,7 +25,7 @@ again where multipliers are updated (`synth.simulate.multipliers`) and where the
 
 import warp as wp
 
-from synth.simulate.distance import TINY, normal_derivative, shape_vector, signed_distance
+from synth.simulate.distance import TINY, beyond_grid, normal_derivative, shape_vector, signed_distance
 
 ON_CONE = wp.constant(wp.float64(1.0 - 1.0e-9))
 """A point slips whose traction is this share of the limit. (Inside a kernel 1.0 - 1.0e-9 would be float32: 1.)"""
@@ -130,8 +130,11 @@ def _is_far(faces: Faces, indenters: Indenters, u: wp.array2d(dtype=wp.vec3d), s
         node = faces.nodes[f, a]
         size = wp.max(size, wp.length(faces.points[node] + u[s, node] - centre))
     y = wp.transpose(indenters.rotation[s]) * (centre - indenters.centre[s])
+    reach = wp.float64(1.5) * size + NEAR
+    if beyond_grid(indenters.kind[s], indenters.shape[s], y) > reach:
+        return True
     d = signed_distance(indenters.kind[s], indenters.shape[s], y, s, indenters.coefficients)
-    return d[3] > wp.float64(1.5) * size + NEAR
+    return d[3] > reach
 
 
 @wp.func

@@ -175,6 +175,14 @@ def _spline(held: wp.vec3d, shape: shape_vector, s: int, coefficients: wp.array4
 
 
 @wp.func
+def beyond_grid(kind: int, shape: shape_vector, y: wp.vec3d) -> wp.float64:
+    """How far (mm) a point is outside a mesh's grid, which holds all that can touch; 0 for other shapes."""
+    if kind != 5:
+        return ZERO
+    return wp.length(y - wp.vec3d(shape[1], shape[2], shape[3]) - shape[4] * _in_grid(y, shape))
+
+
+@wp.func
 def _grid(y: wp.vec3d, shape: shape_vector, s: int, coefficients: wp.array4d(dtype=wp.float64)) -> wp.vec4d:
     """Cubic B-spline on a grid (the batch's array is as large as its largest grid); beyond the grid the distance from
     its border is added.

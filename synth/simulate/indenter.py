@@ -38,7 +38,7 @@ USUAL_GRID = 250_000
 MOST_MISSING = 1 / 3
 """Largest share of a closed surface that is made up where a file has holes: half a sphere lacks a quarter."""
 TIP_MM = 0.05  # points that are at most so much higher than a mesh's lowest belong to its tip
-CELLS_PER_RADIUS = 3.0
+CELLS_PER_RADIUS = 2.5
 """Spacings of the grid to the radius of the edges."""
 
 

@@ -5,8 +5,7 @@ entries at touching faces only. S is factorised in single precision, which halve
 in double precision, preconditioned by the factor, takes away the rounding of the factor and R. Pardiso (through
 pypardiso's MKL) where there is one, else SuperLU in double precision. The pattern is analysed once per mesh.
 
-Where Newton's method can do with a rough direction, the factor of an earlier tangent is used for as long as GMRES gets
-along with it (`LinearSolver`).
+The factor of an earlier tangent is used for as long as GMRES gets along with it (`LinearSolver`).
 """
 
 import ctypes
@@ -27,8 +26,9 @@ GMRES_LIMIT = 40
 ROUGH_TOLERANCE = 0.03
 """Largest linear residual of a rough direction, with this tangent's factor or an earlier one's. Far from the solution
 changes of the contact set are what counts."""
-MAX_REUSE_ITERATIONS = 12
-"""Iterations after which an earlier tangent's factor is given up."""
+MAX_REUSE_ITERATIONS, HOPELESS_AFTER = 18, 4
+"""An earlier tangent's factor is given up after so many iterations, or, from the second number on, as soon as their
+mean rate is too slow for that. A new factor takes as long as about fifteen."""
 
 
 class Factor(Protocol):
@@ -51,7 +51,7 @@ def direct_factor(indptr: np.ndarray, indices: np.ndarray, single: bool) -> Fact
 
 
 class LinearSolver:
-    """Solves the linear systems of one press, one after another; with `reuse` roughly where that is enough.
+    """Solves the linear systems of one press, one after another; with `reuse` of factors, and roughly where allowed.
 
     Neighbouring tangents differ where contact changed: a few iterations of GMRES with the factor of an earlier one cost
     less than a new factor. If another press has replaced the factor meanwhile, a new one is made.
@@ -68,15 +68,13 @@ class LinearSolver:
     def solve(self, matrix: Any, remainder: Any, right: FloatArray, rough: bool = False) -> FloatArray:
         """The solution (n,) of (S + R) x = right, NaN where the matrix is singular; arguments as for `gmres`.
 
-        rough: to ROUGH_TOLERANCE, with the factor of an earlier matrix if it serves; else with this matrix's factor.
+        With the factor of an earlier matrix if it serves, else with this one's. Rough ones are to ROUGH_TOLERANCE.
         """
-        factor, tolerance = self._factor, GMRES_TOLERANCE
-        if self._reuse and rough:
-            tolerance = ROUGH_TOLERANCE
-            if factor.made == self._own:
-                solution, _, left = gmres(matrix, remainder, factor, right, tolerance, MAX_REUSE_ITERATIONS)
-                if left < tolerance:
-                    return solution
+        factor, tolerance = self._factor, ROUGH_TOLERANCE if self._reuse and rough else GMRES_TOLERANCE
+        if self._reuse and factor.made == self._own:
+            solution, _, left = gmres(matrix, remainder, factor, right, tolerance, MAX_REUSE_ITERATIONS, HOPELESS_AFTER)
+            if left < tolerance:
+                return solution
         if not factor.factorise(matrix.data):
             return np.full_like(right, np.nan)
         self._own = factor.made
@@ -90,12 +88,14 @@ def gmres(
     right: FloatArray,
     tolerance: float = GMRES_TOLERANCE,
     limit: int = GMRES_LIMIT,
+    hopeless_after: int = GMRES_LIMIT,
 ) -> tuple[FloatArray, int, float]:
     """Solve (S + R) x = right by flexible GMRES without restart, in at most `limit` iterations.
 
     `matrix` is the upper triangle of S and `remainder` R or None, both SciPy CSR; the factor is of S, or of a matrix
-    like it. The tolerance is of the residual, relative to the right side (n,) float64. Returns (n,) the solution, NaN
-    where the factor gave no numbers; the iterations; and the relative residual.
+    like it. The tolerance is of the residual, relative to the right side (n,) float64. From `hopeless_after` iterations
+    on it ends where their mean rate does not reach the tolerance within the limit. Returns (n,) the solution, NaN where
+    the factor gave no numbers; the iterations; and the relative residual.
     """
     diagonal = matrix.diagonal()
     transposed = matrix.T
@@ -126,7 +126,8 @@ def gmres(
         first[0] = size
         weights = np.asarray(np.linalg.lstsq(small, first, rcond=None)[0], dtype=np.float64)
         left = norm(small @ weights - first) / size
-        if left < tolerance or hessenberg[k + 1, k] == 0:
+        hopeless = k + 1 >= hopeless_after and left ** (limit / (k + 1)) > tolerance
+        if left < tolerance or hessenberg[k + 1, k] == 0 or hopeless:
             break
         basis.append(w / hessenberg[k + 1, k])
     solution = np.zeros_like(right)

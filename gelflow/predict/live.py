@@ -1,0 +1,90 @@
+"""Flow of a running camera, and a page that shows it."""
+
+from collections.abc import Iterator
+from contextlib import suppress
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from threading import Condition, Thread
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from gelflow.arrays import Bytes3
+from gelflow.baselines.method import Method
+from gelflow.errors import InputError
+from gelflow.files.video import newest_frames
+from gelflow.predict.model import Estimate
+from gelflow.predict.prediction import Motion, Reference, estimate
+
+
+class LiveFlow(NamedTuple):
+    """The newest frame, the flow that leads to it, and its motion."""
+
+    frame: Bytes3
+    found: Estimate
+    motion: Motion
+
+
+def follow(method: Method, source: str, reference: Reference = "first") -> Iterator[LiveFlow]:
+    """Yields the flow to each newest frame, from the first frame or from the one that was used before.
+
+    The source is as `newest_frames` takes it. InputError where it does not open, its frames change their size, or the
+    method cannot use them.
+    """
+    before: Bytes3 | None = None
+    for index, frame in newest_frames(source):
+        if before is not None:
+            if frame.shape != before.shape:
+                raise InputError(f"{source}, frame {index}: has another size than the frame before it")
+            first, second = (image.astype(np.float32) / np.float32(255) for image in (before, frame))
+            yield LiveFlow(frame, *estimate(method, first, second, index, source))
+        if before is None or reference == "previous":
+            before = frame
+
+
+class Page:
+    """Serves the newest picture to browsers of this machine, as a stream of JPEG images."""
+
+    def __init__(self, port: int) -> None:
+        """OSError where the port, 0 for any free one, is taken."""
+        self._jpeg, self._number, self._changed = b"", 0, Condition()
+        page = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                self.send_response(200)
+                self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=picture")
+                self.end_headers()
+                seen = 0
+                with suppress(ConnectionError):
+                    while True:
+                        seen, jpeg = page._newer_than(seen)
+                        head = f"--picture\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
+                        self.wfile.write(head.encode() + jpeg + b"\r\n")
+
+            def log_message(self, *_: object) -> None:
+                """Nothing is logged."""
+
+        self._server = ThreadingHTTPServer(("127.0.0.1", port), Handler)
+        Thread(target=self._server.serve_forever, daemon=True).start()
+
+    @property
+    def address(self) -> str:
+        return f"http://127.0.0.1:{self._server.server_port}"
+
+    def show(self, picture: Bytes3) -> None:
+        """Replaces the picture, RGB."""
+        jpeg = cv2.imencode(".jpg", picture[..., ::-1])[1].tobytes()
+        with self._changed:
+            self._jpeg, self._number = jpeg, self._number + 1
+            self._changed.notify_all()
+
+    def _newer_than(self, seen: int) -> tuple[int, bytes]:
+        """The number of the newest picture, and the picture; waits for one after those that were seen."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._number > seen)
+            return self._number, self._jpeg
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
