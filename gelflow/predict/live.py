@@ -46,7 +46,7 @@ class Page:
     """Serves the newest picture to browsers of this machine, as a stream of JPEG images."""
 
     def __init__(self, port: int) -> None:
-        """OSError where the port, 0 for any free one, is taken."""
+        """InputError where the port, 0 for any free one, is taken or no port."""
         self._jpeg, self._number, self._changed = b"", 0, Condition()
         page = self
 
@@ -65,7 +65,10 @@ class Page:
             def log_message(self, *_: object) -> None:
                 """Nothing is logged."""
 
-        self._server = ThreadingHTTPServer(("127.0.0.1", port), Handler)
+        try:
+            self._server = ThreadingHTTPServer(("127.0.0.1", port), Handler)
+        except (OSError, OverflowError) as error:
+            raise InputError(f"port {port}: {error}") from None
         Thread(target=self._server.serve_forever, daemon=True).start()
 
     @property

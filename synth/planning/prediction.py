@@ -38,7 +38,7 @@ SOLVE_GROWTH = 1.25
 FRICTION = 1.5
 """Time of an iteration with friction over one without."""
 ITERATIONS_PER_STEP, ITERATIONS_PER_RECORD = 4.5, 7.0
-MESH_INDENTER = 5.5
+MESH_INDENTER = 4.5
 """Time of a press by a mesh indenter over a ball's, in the mean: a few take far longer than the median."""
 BATCHED_SECONDS = {"cuda": 5.5e-5, "cpu": 0.8}
 """Seconds of a Newton iteration of one trajectory by the batched solver, with BATCHED_NODES nodes; on a GPU among

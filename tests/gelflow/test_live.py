@@ -1,6 +1,7 @@
 """`live`: the newest frames of a camera, the flow to them, and the page that shows it."""
 
 import json
+import threading
 import time
 from pathlib import Path
 from urllib.request import urlopen
@@ -61,6 +62,34 @@ def test_a_page_streams_the_newest_picture_as_a_network_camera_does() -> None:
         jpeg = answer.read(int(lines[2].split()[-1]))
     decoded = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)[..., ::-1]
     assert np.abs(decoded.astype(int) - picture).max() <= 5
+    page.close()
+
+
+def test_a_stream_is_followed_over_the_network() -> None:
+    page, stopped = Page(0), threading.Event()
+
+    def film() -> None:
+        for shift in range(1000):
+            page.show(as_bytes(moved(64, 96, shift % 5, 0)))
+            if stopped.wait(0.02):
+                return
+
+    filming = threading.Thread(target=film)
+    filming.start()
+    try:
+        seen = [index for index, _ in zip(range(3), newest_frames(page.address), strict=False)]
+    finally:
+        stopped.set()
+        filming.join()
+        page.close()
+    assert len(seen) == 3
+
+
+def test_a_port_that_is_taken_or_none_is_named() -> None:
+    page = Page(0)
+    for port in (int(page.address.rpartition(":")[2]), 70000):
+        with pytest.raises(InputError, match=f"port {port}: "):
+            Page(port)
     page.close()
 
 
