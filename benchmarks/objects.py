@@ -7,7 +7,8 @@ Each file is pressed, sheared and twisted as the default scene draws it, in a ra
 
     python -m benchmarks objects parts/*.stl --draws 1 --forces
 
-compares the forces of the presses alone with those on meshes of half the spacing, where edges have half the radius.
+compares the forces of the presses alone with those on meshes of half the spacing, where edges have half the radius;
+with --target 0.2 on meshes of a smaller error than the scene asks for.
 """
 
 import time
@@ -42,7 +43,9 @@ def scene_of(case: Row) -> tuple[Scene, Path]:
     content = load_scene(DEFAULT_SCENE, ["motion.steps=2"]).content
     indenter = {"shape": "mesh", "file": file.name, "size_mm": SIZE_MM, "rotation_deg": "any"}
     template = checked_template({**content, "contact": {**content["contact"], "indenter": indenter}}, file)
-    return draw(template, case["seed"], 0), file.parent
+    scene = draw(template, case["seed"], 0)
+    numerics = scene.numerics.model_copy(update={"target_error_px": case["target_px"]})
+    return scene.model_copy(update={"numerics": numerics}), file.parent
 
 
 def timed(scene: Scene, mesh: PadMesh, folder: Path) -> tuple[Trajectory, float, int]:
@@ -120,8 +123,10 @@ def main(argv: list[str]) -> int:
     parser.add_argument("--draws", type=int, default=5, help="orientations of each file; default: 5")
     parser.add_argument("--workers", type=int, default=1, help="presses at once")
     parser.add_argument("--forces", action="store_true", help="compare forces with those on finer meshes, instead")
+    parser.add_argument("--target", type=float, default=0.7, help="px of error that meshes leave; default: the scene's")
     given = parser.parse_args(argv)
-    cases = [{"file": str(path.resolve()), "seed": seed} for path in given.files for seed in range(given.draws)]
+    files, seeds, target = [str(path.resolve()) for path in given.files], range(given.draws), given.target
+    cases: list[Row] = [{"file": file, "seed": seed, "target_px": target} for file in files for seed in seeds]
     if given.forces:
         found = changes(measure(given.out / "object_forces.csv", cases, force, given.workers))
         show([found], list(found))
