@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import sys
 import time
-from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from gelflow.baselines import Method
     from gelflow.predict.prediction import Motion, Prediction
 
+SCALE_DECAY = 0.97
+"""Share of its scale that a live picture keeps at least from one frame to the next."""
 InPlace = Annotated[str | None, Parameter(help=f"In place of the network: {METHODS}.")]
 
 
@@ -96,7 +98,9 @@ def live(
     size: Size = None,
     device: OnDevice = "auto",
     port: Annotated[int | None, Parameter(converter=whole(0), help="Show the flow at http://127.0.0.1:PORT.")] = None,
-    seconds: Annotated[float, Parameter(help="Stop after so many seconds; default: with the source.")] = math.inf,
+    seconds: Annotated[
+        float, Parameter(help="Stop at the first frame after so many seconds; default: with the source.")
+    ] = math.inf,
     as_json: AsJson = False,
 ) -> int:
     """Prints the motion of a running camera, a line for each frame, until the camera or Ctrl-C ends it.
@@ -104,28 +108,35 @@ def live(
     Frames that come while one is computed are left out. With --json each line is JSON.
     """
     from gelflow.predict.live import Page, follow
-    from gelflow.predict.pictures import certain, draw_overlay, robust_scale
+    from gelflow.predict.pictures import certain, draw_overlay, robust_scale, round_up
 
+    if not seconds >= 0:
+        raise InputError(f"--seconds {seconds:g}: allowed are 0 and more")
     estimator = _estimator(weights, method, registration, size, device)
     page = None if port is None else Page(port)
     if page:
         print(f"gelflow: {estimator.name} at {page.address}", file=sys.stderr, flush=True)
-    scale, started = 0.0, time.monotonic()
+    scale, started = 0.0, time.perf_counter()
     before = started
-    with suppress(KeyboardInterrupt):
+    try:
         for frame, found, motion in follow(estimator, source, reference):
             if page:
                 known = certain(found.flow, found.sigma)
-                scale = max(scale, robust_scale(known))
-                page.show(draw_overlay(frame, known, scale))
-            now = time.monotonic()
+                scale = max(SCALE_DECAY * scale, robust_scale(known))
+                page.show(draw_overlay(frame, known, round_up(scale)))
+            now = time.perf_counter()
             text = f"{_words(motion)}; {1 / (now - before):.1f} frames/s"
             print(json.dumps(asdict(motion)) if as_json else f"frame {motion.frame}: {text}", flush=True)
             before = now
             if now - started >= seconds:
                 break
-    if page:
-        page.close()
+    except KeyboardInterrupt:
+        pass
+    except BrokenPipeError:  # whoever read the lines has enough of them
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    finally:
+        if page:
+            page.close()
     return 0
 
 

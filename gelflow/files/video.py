@@ -102,10 +102,12 @@ def newest_frames(source: str) -> Iterator[tuple[int, Bytes3]]:
     """Yields (index, frame) of a camera, leaving out the frames that come while the caller is busy.
 
     The source is a camera's number, the address of a stream, or a video file, which is played at its own rate. The
-    iterator ends with it. InputError where it does not open.
+    iterator ends with it. InputError where it does not open or is a folder.
     """
+    if Path(source).is_dir():
+        raise InputError(f"{source}: a folder of images is no camera; predict takes it")
     with quiet():
-        capture = cv2.VideoCapture(int(source) if source.isdecimal() else source)
+        capture = cv2.VideoCapture(int(source) if re.fullmatch(r"\d{1,4}", source) else source)
     if not capture.isOpened():
         raise InputError(
             f"{source}: it does not open; allowed are a camera's number, such as 0, a stream's address and a video file"
@@ -116,26 +118,25 @@ def newest_frames(source: str) -> Iterator[tuple[int, Bytes3]]:
 
     def read() -> None:
         started = time.monotonic()
-        for index in count():
-            decoded, frame = capture.read()
-            if not decoded:
-                newest.put(None)
-                return
-            with suppress(Empty):
-                newest.get_nowait()
-            newest.put((index, _rgb(frame)))
-            if stopped.wait(max(0.0, started + (index + 1) * interval - time.monotonic())):
-                return
+        try:
+            for index in count():
+                decoded, frame = capture.read()
+                if not decoded or stopped.is_set():
+                    return
+                with suppress(Empty):
+                    newest.get_nowait()
+                newest.put((index, _rgb(frame)))
+                stopped.wait(max(0.0, started + (index + 1) * interval - time.monotonic()))
+        finally:
+            capture.release()
+            newest.put(None)
 
-    thread = Thread(target=read, daemon=True)
-    thread.start()
+    Thread(target=read, daemon=True).start()  # not waited for: a stalled stream keeps it for half a minute
     try:
         while (found := newest.get()) is not None:
             yield found
     finally:
         stopped.set()
-        thread.join()
-        capture.release()
 
 
 def _rgb(frame: Any) -> Bytes3:

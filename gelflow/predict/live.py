@@ -28,18 +28,26 @@ class LiveFlow(NamedTuple):
 def follow(method: Method, source: str, reference: Reference = "first") -> Iterator[LiveFlow]:
     """Yields the flow to each newest frame, from the first frame or from the one that was used before.
 
-    The source is as `newest_frames` takes it. InputError where it does not open, its frames change their size, or the
-    method cannot use them.
+    The source is as `newest_frames` takes it. InputError where it does not open or gives fewer than two frames, its
+    frames change their size, or the method cannot use them.
     """
     before: Bytes3 | None = None
+    used = 0
     for index, frame in newest_frames(source):
         if before is not None:
             if frame.shape != before.shape:
                 raise InputError(f"{source}, frame {index}: has another size than the frame before it")
             first, second = (image.astype(np.float32) / np.float32(255) for image in (before, frame))
-            yield LiveFlow(frame, *estimate(method, first, second, index, source))
+            try:
+                found = estimate(method, first, second, index, source)
+            except InputError as error:
+                raise InputError(f"{source}, frame {index}, {method.name}: {error}") from error
+            yield LiveFlow(frame, *found)
         if before is None or reference == "previous":
             before = frame
+        used += 1
+    if used < 2:
+        raise InputError(f"{source}: fewer than two frames came; does another program use the camera?")
 
 
 class Page:

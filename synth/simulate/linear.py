@@ -5,7 +5,8 @@ entries at touching faces only. S is factorised in single precision, which halve
 in double precision, preconditioned by the factor, takes away the rounding of the factor and R. Pardiso (through
 pypardiso's MKL) where there is one, else SuperLU in double precision. The pattern is analysed once per mesh.
 
-The factor of an earlier tangent is used for as long as GMRES gets along with it (`LinearSolver`).
+Where Newton's method can do with it, the factor of an earlier tangent is used for as long as GMRES gets along with it
+(`LinearSolver`).
 """
 
 import ctypes
@@ -27,8 +28,8 @@ ROUGH_TOLERANCE = 0.03
 """Largest linear residual of a rough direction, with this tangent's factor or an earlier one's. Far from the solution
 changes of the contact set are what counts."""
 MAX_REUSE_ITERATIONS, HOPELESS_AFTER = 18, 4
-"""An earlier tangent's factor is given up after so many iterations, or, from the second number on, as soon as their
-mean rate is too slow for that. A new factor takes as long as about fifteen."""
+"""An earlier tangent's factor is given up after so many iterations or, from the second number on, as soon as their mean
+rate would need more. A new factor takes as long as about fifteen."""
 
 
 class Factor(Protocol):
@@ -51,7 +52,7 @@ def direct_factor(indptr: np.ndarray, indices: np.ndarray, single: bool) -> Fact
 
 
 class LinearSolver:
-    """Solves the linear systems of one press, one after another; with `reuse` of factors, and roughly where allowed.
+    """Solves the linear systems of one press, one after another; without `reuse` always exactly, by new factors.
 
     Neighbouring tangents differ where contact changed: a few iterations of GMRES with the factor of an earlier one cost
     less than a new factor. If another press has replaced the factor meanwhile, a new one is made.
@@ -65,13 +66,16 @@ class LinearSolver:
         """Start with a new factor: what is solved next has nothing to do with what was solved before."""
         self._own = -1
 
-    def solve(self, matrix: Any, remainder: Any, right: FloatArray, rough: bool = False) -> FloatArray:
-        """The solution (n,) of (S + R) x = right, NaN where the matrix is singular; arguments as for `gmres`.
+    def solve(
+        self, matrix: Any, remainder: Any, right: FloatArray, rough: bool = False, reuse: bool = False
+    ) -> FloatArray:
+        """The solution (n,) of (S + R) x = right; arguments as for `gmres`.
 
-        With the factor of an earlier matrix if it serves, else with this one's. Rough ones are to ROUGH_TOLERANCE.
+        rough: to ROUGH_TOLERANCE; reuse: by the factor of an earlier matrix if that serves. NaN where a new factor was
+        needed and the matrix is singular.
         """
         factor, tolerance = self._factor, ROUGH_TOLERANCE if self._reuse and rough else GMRES_TOLERANCE
-        if self._reuse and factor.made == self._own:
+        if self._reuse and reuse and factor.made == self._own:
             solution, _, left = gmres(matrix, remainder, factor, right, tolerance, MAX_REUSE_ITERATIONS, HOPELESS_AFTER)
             if left < tolerance:
                 return solution

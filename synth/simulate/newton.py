@@ -27,7 +27,7 @@ MAX_ITERATIONS = 20
 MAX_ROUGH_ITERATIONS = 5
 """Iterations after which directions are exact: far from the solution rough ones may not get there at all."""
 ROUGH_ABOVE = 1e-5
-"""A tolerance above it is reached with rough directions."""
+"""A tolerance above it is reached with rough directions and earlier factors."""
 NEAR = 1e-2
 """Relative residual below which the equilibrium is near: MAX_TURN ends, directions are exact for a smaller tolerance,
 and a solve may take up to twice its iterations, so that rounding does not decide whether the last met the tolerance."""
@@ -85,7 +85,8 @@ def solve(
             break
         rough = iterations < MAX_ROUGH_ITERATIONS and (tolerance > ROUGH_ABOVE or relative > NEAR)
         turn = MAX_TURN if relative > NEAR else np.inf
-        step = system.newton_step(system.tangent(state, indenter, turn=turn), residual.free, rough)
+        reuse = rough or tolerance > ROUGH_ABOVE
+        step = system.newton_step(system.tangent(state, indenter, turn=turn), residual.free, rough, reuse)
         found = _line_search(system, state, residual, step, indenter) if np.isfinite(step.u).all() else None
         if found is None:
             break
@@ -134,7 +135,8 @@ def relax(system: System, start: Unknowns, indenter: Indenters, tolerance: float
     least = MIN_REACTION_RATIO * _reaction(system, residual)
     viscosity, share, iterations, refused = FIRST_VISCOSITY, 1.0, 0, False
     while residual.smallest_jacobian > 0 and iterations < MAX_STEPS and share >= LEAST_SHARE:
-        step = system.newton_step(system.tangent(state, indenter, viscosity), residual.free)
+        tangent = system.tangent(state, indenter, viscosity)
+        step = system.newton_step(tangent, residual.free, reuse=tolerance > ROUGH_ABOVE)
         trial = state.plus(step, share)
         after = system.residual(trial, indenter)
         iterations += 1

@@ -193,12 +193,12 @@ class System:
         """Forget the factor of an earlier tangent, so that what follows depends on the state alone."""
         self._linear_solver.forget()
 
-    def newton_step(self, tangent: Tangent, residual: FloatArray, rough: bool = False) -> Unknowns:
-        """-K^-1 r, r (k,) of the free unknowns, NaN where K is singular; rough: see `linear.LinearSolver.solve`."""
+    def newton_step(self, tangent: Tangent, residual: FloatArray, rough: bool = False, reuse: bool = False) -> Unknowns:
+        """-K^-1 r, r (k,) of the free unknowns; rough, reuse and NaN as in `linear.LinearSolver.solve`."""
         moves = 3 * len(self.space.points)
         full = np.zeros(moves + (self.space.pressures if self.mixed else 0))
         matrix = self.matrix(tangent.values)
-        full[self.free] = -self._linear_solver.solve(matrix, tangent.remainder, residual, rough)
+        full[self.free] = -self._linear_solver.solve(matrix, tangent.remainder, residual, rough, reuse)
         return Unknowns(full[:moves].reshape(-1, 3), full[moves:])
 
     def augment(self, indenter: Indenters, share: float = 1.0) -> None:

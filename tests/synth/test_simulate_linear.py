@@ -149,23 +149,37 @@ def test_factor_is_reused_while_it_serves_and_made_anew_where_told(monkeypatch: 
     near = nearly(first, 1)  # with the remainder of rank 2 GMRES ends after 4 iterations
     full = whole(near) + remainder(2).toarray()
     for rough, tolerance in ((True, linear.ROUGH_TOLERANCE), (False, linear.GMRES_TOLERANCE)):
-        x = one.solve(near, remainder(2), b, rough)
+        x = one.solve(near, remainder(2), b, rough, reuse=True)
         assert factor.made == 1
         assert np.linalg.norm(full @ x - b) < 1.001 * tolerance * np.linalg.norm(b)
     far = nearly(first, 30)  # takes GMRES more iterations
-    y = one.solve(far, None, b, rough=True)
+    y = one.solve(far, None, b, rough=True, reuse=True)
     assert factor.made == 2
     assert np.linalg.norm(whole(far) @ y - b) < 1.001 * linear.ROUGH_TOLERANCE * np.linalg.norm(b)
     # What another press left in the factor would make the bits depend on it.
     alone = LinearSolver(SuperLUFactor(first.indptr, first.indices), reuse=True)
     LinearSolver(factor, reuse=True).solve(first, None, b)
-    np.testing.assert_array_equal(one.solve(near, None, b, rough=True), alone.solve(near, None, b, rough=True))
+    np.testing.assert_array_equal(one.solve(near, None, b, True, True), alone.solve(near, None, b, True, True))
     factor = SuperLUFactor(first.indptr, first.indices)
     never, one = (LinearSolver(factor, reuse=reuse) for reuse in (False, True))
-    for solver, rough, made in ((never, True, 1), (never, True, 2), (one, False, 3), (one, True, 3)):
-        solver.solve(first, None, b, rough=rough)
+    for solver, reuse, made in ((never, True, 1), (never, True, 2), (one, True, 3), (one, False, 4), (one, True, 4)):
+        solver.solve(first, None, b, reuse=reuse)
         assert factor.made == made
     one.forget()
     for _ in range(2):
-        one.solve(first, None, b, rough=True)
-        assert factor.made == 4
+        one.solve(first, None, b, rough=True, reuse=True)
+        assert factor.made == 5
+
+
+def test_gmres_ends_early_where_its_rate_does_not_do() -> None:
+    first, b = saddle(1), right_side(1)
+    factor = SuperLUFactor(first.indptr, first.indices)
+    factor.factorise(first.data)
+    far = nearly(first, 30)
+    _, patient, left = gmres(far, None, factor, b, limit=40)
+    assert left < linear.GMRES_TOLERANCE
+    assert patient > 12
+    _, hasty, left = gmres(far, None, factor, b, limit=8, hopeless_after=4)
+    assert left > linear.GMRES_TOLERANCE
+    assert 4 <= hasty < 8
+    assert gmres(far, None, factor, b, limit=40, hopeless_after=4)[1] == patient
