@@ -54,6 +54,15 @@ def test_what_does_not_open_is_named(tmp_path: Path) -> None:
             next(newest_frames(str(source)))
 
 
+def test_a_source_of_one_frame_has_no_flow_and_a_folder_is_no_camera(tmp_path: Path) -> None:
+    path = tmp_path / "a.avi"
+    write_video(path, [as_bytes(moved(64, 96, 0, 0))], 10.0)
+    with pytest.raises(InputError, match=r"a\.avi: fewer than two frames"):
+        next(follow(FARNEBACK, str(path)))
+    with pytest.raises(InputError, match="predict takes it"):
+        next(newest_frames(str(tmp_path)))
+
+
 def test_a_page_streams_the_newest_picture_as_a_network_camera_does() -> None:
     page, picture = Page(0), np.full((48, 64, 3), (200, 100, 50), np.uint8)
     page.show(picture)

@@ -59,8 +59,8 @@ def test_centred_press_is_mirror_symmetric(indenter: dict, friction: float, elem
     result = simulate(scene(indenter=indenter, friction=friction, motion=motion, numerics={"element": element}), MESH)
     last, points = result.states[-1], result.space.points
     fx, fy, fz = last.force_n
-    # The mesh is its own mirror image; Newton stops at 1e-6 of the forces, and usually far below.
-    assert max(abs(fx), abs(fy)) < TOLERANCE * fz
+    # The mesh is its own mirror image; Newton stops at 1e-6 of all nodal forces, whose norm is larger than fz.
+    assert max(abs(fx), abs(fy)) < 3 * TOLERANCE * fz
     assert np.abs(last.torque_nmm).max() < 10 * TOLERANCE * fz
     for axis in (0, 1):
         sign = np.ones(3)
