@@ -67,7 +67,7 @@ def test_centred_press_is_mirror_symmetric(indenter: dict, friction: float, elem
         sign[axis] = -1
         image = {tuple(np.round(x, 6) + 0.0): u for x, u in zip(points * sign, last.displacement * sign, strict=True)}
         mirrored = np.array([image[tuple(np.round(x, 6) + 0.0)] for x in points])
-        np.testing.assert_allclose(mirrored, last.displacement, atol=10 * TOLERANCE)
+        np.testing.assert_allclose(mirrored, last.displacement, atol=30 * TOLERANCE)
 
 
 def test_mirrored_motion_gives_the_mirrored_state_on_a_mesh_of_the_scenes_pad() -> None:
