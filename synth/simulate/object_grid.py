@@ -76,7 +76,7 @@ class Grid:
         those of coarse samples, the nearest of which is √3 spacings away, and found, too, where these differ.
         Where shells overlap, faces of one lie within another: distances are then those from a contour around all.
         """
-        nearest, reach, closed = Nearest(surface, winding=True), radius_mm + self.spacing, surface.closed
+        nearest, reach, closed = Nearest(surface, winding=True), radius_mm + 3 * self.spacing, surface.closed
         away, sign = self._away(nearest, reach), np.ones(self.counts) if closed else self._coarse(nearest.signs)
         known = (away < (1.1 if closed else 1.75) * self.spacing) | (np.abs(sign) < 0.99)
         near = self.points(known)
@@ -114,7 +114,7 @@ class Grid:
         shell = sharp_contour(opened - radius_mm, self.corner, self.spacing, outer)
         if not cores or len(shell.faces) == 0:
             return values
-        band = np.abs(values) < radius_mm + self.spacing  # the surface moves by less than the radius
+        band = np.abs(values) < radius_mm + 2 * self.spacing  # the surface moves by less than the radius
         away = self.distance(Nearest(shell), band)
         closed = radius_mm + np.where(opened > radius_mm, away, -away)
         return np.where(band, closed, values)
@@ -124,7 +124,7 @@ class Grid:
         from scipy.ndimage import distance_transform_edt
 
         cores: list[Core] = []
-        band = np.abs(values) < radius_mm + self.spacing
+        band = np.abs(values) < radius_mm + 2 * self.spacing
         found, near = np.where(band, np.inf, values), np.ones(self.counts, dtype=bool)
         while True:
 
