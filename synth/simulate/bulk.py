@@ -2,19 +2,21 @@ r"""Energy and residual of the bulk in displacement and pressure, as Warp kernel
 
 The energy is `synth.simulate.material`'s, stabilised as in `synth.simulate.element` and, with a pressure field p, by
 
-.. math::  ½ γ(p) D², \qquad D = J - 1 - p/λ, \qquad γ = C \max(0, -\bar p), γ ≤ λ/2   (p̄: mean over the element)
+.. math::  ½ γ(p) D², \qquad D = J - 1 - p/λ, \qquad γ = λ f(C \max(0, -\bar p) / λ)   (p̄: mean over the element)
 
 Mixed elements hold D = 0 in the mean only. Under high pressure the second variation p δ²J of modes that leave that mean
 alone is unstable although the gel is not (Auricchio et al., Comput. Methods Appl. Mech. Eng. 194, 2005): single
 elements of fine meshes collapse. γ (δD)² holds them. D is zero for the exact solution, so that nothing is added that
-the mesh resolves.
+the mesh resolves. f(x) is x to ¼, ½ - (¾ - x)² to ¾ and ½ from there on: in a compressible gel γ must stay below λ, and
+a kink of f would be a jump of the residual, by γ_c D²/2 (at p̄ = 0, where D is small, there is one).
 
 With g_a the undeformed gradient of shape function a, h_a = F^{-T} g_a, s = I_1 - 3 - 2 ln J, d_a = F g_a - h_a,
-W' = μ/2 (1 + 2 c_2 s + 3 c_3 s²), P = p + γ D and γ_c = ∂γ/∂p_c:
+W' = μ/2 (1 + 2 c_2 s + 3 c_3 s²), P = p + γ D, and γ_c and γ_cd the derivatives of γ:
 
     r_a  = ∫ 2 W' d_a + P J h_a                 r_c = ∫ N_c (D - γ D / λ) + γ_c D²/2
     K_ab = ∫ 2 W' (g_a.g_b I + h_b h_a^T) + 4 W'' d_a d_b^T + (P J + γ J²) h_a h_b^T - P J h_b h_a^T
     K_ac = ∫ J h_a (N_c (1 - γ/λ) + γ_c D)      K_cd = ∫ -N_c N_d (1/λ - γ/λ²) - D (γ_c N_d + γ_d N_c)/λ
+                                                   + γ_cd D²/2
 
 Without a pressure field P = λ (J - 1), γ J² is λ J² and the pressure rows are left empty. Only the upper triangle of
 the symmetric tangent is assembled. float64; leading axis of every state array is the batch.
@@ -66,11 +68,22 @@ def _dilation(bulk: Bulk, p: wp.array2d(dtype=wp.float64), J: wp.float64, s: int
     if mean < zero:
         gamma = -bulk.hold * mean
         slope = wp.float64(-0.25) * bulk.hold
-        if gamma * bulk.compliance[e] > wp.float64(0.5):
-            gamma = wp.float64(0.5) / bulk.compliance[e]
-            slope = zero
+        share = gamma * bulk.compliance[e]
+        if share > wp.float64(0.25):
+            left = wp.max(wp.float64(0.75) - share, zero)
+            gamma = (wp.float64(0.5) - left * left) / bulk.compliance[e]
+            slope *= wp.float64(2.0) * left
     D = J - wp.float64(1.0) - pressure * bulk.compliance[e]
     return wp.vec4d(pressure + gamma * D, gamma, D, slope)
+
+
+@wp.func
+def _bend(bulk: Bulk, gamma: wp.float64, e: int) -> wp.float64:
+    """γ_cd: the same for all c and d."""
+    share = gamma * bulk.compliance[e]
+    if share <= wp.float64(0.25) or share >= wp.float64(0.5):
+        return wp.float64(0.0)
+    return wp.float64(-0.125) * bulk.hold * bulk.hold * bulk.compliance[e]
 
 
 @wp.func

@@ -6,7 +6,7 @@ depends on the deformation only where the gel stiffens; elsewhere it is a table.
 
 import warp as wp
 
-from synth.simulate.bulk import Bulk, _deformation_gradient, _dilation, _slopes
+from synth.simulate.bulk import Bulk, _bend, _deformation_gradient, _dilation, _slopes
 
 
 @wp.kernel
@@ -133,7 +133,8 @@ def pressure_tangent(
                 nc = bulk.pressure_shape[q, c]
                 nd = bulk.pressure_shape[q, d]
                 soft = inverse * (one - t[1] * inverse)
-                entry -= bulk.weight[e, q] * (nc * nd * soft + t[2] * t[3] * inverse * (nc + nd))
+                bent = wp.float64(0.5) * _bend(bulk, t[1], e) * t[2] * t[2]
+                entry -= bulk.weight[e, q] * (nc * nd * soft + t[2] * t[3] * inverse * (nc + nd) - bent)
             wp.atomic_add(values, s, pressure_slot[e, c, d], entry)
             if c != d:
                 wp.atomic_add(values, s, pressure_slot[e, d, c], entry)

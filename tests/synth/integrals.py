@@ -102,7 +102,8 @@ class Integrals:
         p, inverse = local @ self.barycentric.T, 1 / material.lame[:, None]
         gamma = HOLD[self.space.element.name] * np.maximum(0.0, -local.mean(axis=1, keepdims=True))
         with np.errstate(divide="ignore"):
-            gamma = np.minimum(gamma, 0.5 / inverse)
+            left = np.clip(0.75 - gamma * inverse, 0.0, 0.5)
+            gamma = np.where(left < 0.5, (0.5 - left**2) / inverse, gamma)
         return p, np.linalg.det(F) - 1 - p * inverse, np.broadcast_to(gamma, p.shape)
 
     def pressure(self, material: Material, displacement: FloatArray, nodal: FloatArray) -> FloatArray:

@@ -119,6 +119,16 @@ def test_tangent_is_the_derivative_of_the_residual(case: Case) -> None:
         assert error < 1e-6 * np.linalg.norm(difference)
 
 
+@pytest.mark.parametrize("nu", [0.3, 0.45])
+def test_residual_has_no_jump_where_the_hold_of_dilation_bends(nu: float) -> None:
+    body = Case("p2p1", nu).body()
+    state = random_state(body, np.random.default_rng(3))
+    for share in (0.25, 0.5, 0.75):  # of λ: C |p|, with C = 2
+        ends = [np.full_like(state.p, -(share + h) * lame_modulus(nu) / 2) for h in (-1e-8, 1e-8)]
+        before, after = (residual(body, Unknowns(state.u, p)) for p in ends)
+        assert np.linalg.norm(after - before) < 1e-6 * np.linalg.norm(before)
+
+
 def turn(rng: np.random.Generator) -> FloatArray:
     q = np.linalg.qr(rng.standard_normal((3, 3)))[0]
     return np.asarray(q * np.sign(np.linalg.det(q)))

@@ -7,8 +7,8 @@ With G = Σ_b v_b ⊗ g_b the vector's gradient, δ = F^{-T} : G its dilation ov
 
 with η = (F - F^{-T}) : G and π' = Σ_c π_c (N_c (1 - γ/λ) + γ_c D); node a gets S g_a, pressure c gets
 w J δ (N_c (1 - γ/λ) + γ_c D) + Σ_d K_cd π_d. What depends on the state is evaluated once per Newton iteration, by the
-functions of `synth.simulate.bulk` in double precision, and stored; so is contact's 3 x 3 stiffness at touching points
-with its unsymmetric part, by `contact_stiffness` itself.
+functions of `synth.simulate.bulk` in double precision, and stored (γ_cd D²/2 in K_cd, which is small, is left out); so
+is contact's 3 x 3 stiffness at touching points with its unsymmetric part, by `contact_stiffness` itself.
 
 Vectors are (rows, B): all displacements of a free node in three rows, then the pressures, and neighbouring threads work
 on neighbouring lanes of the same element, so that every access to them is one piece of memory. Elements add to a row in
