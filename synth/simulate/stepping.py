@@ -16,6 +16,7 @@ import numpy as np
 from synth.arrays import FloatArray
 from synth.scene import Numerics
 from synth.simulate.distance import KINDS
+from synth.simulate.indenter import RigidBody
 from synth.simulate.load_path import LoadPath
 from synth.simulate.newton import FORCE_FLOOR, MAX_ITERATIONS, Solution, relative_residual, relax, solve
 from synth.simulate.options import STANDARD, SolverOptions
@@ -50,6 +51,9 @@ passes, failed ones included. After the first success each pass doubles the cont
 MAX_STIFFENING times the body's own: multipliers alone converge slowly at sharp edges (after Nocedal & Wright,
 Numerical Optimization, framework 17.3). The press ends if that does not suffice."""
 MAX_DEEP_PASSES, MAX_STIFFENING = 16, 8.0
+SUNK = 0.2
+"""Share of the press depth (at least 0.1 mm) by which another shape may penetrate where a state is recorded, else the
+press ends: it then bears on what cannot give way, such as a round gel's held rim."""
 MULTIPLIER_TOLERANCE = 20.0
 """Tolerance of states that multipliers are updated from, over the full one: two updates do not forget what they began
 with."""
@@ -58,6 +62,11 @@ PENETRATION = 2e-3
 MAX_CORRECTION_RATIO = 3.0
 """A pass fails that moves a node, in any iteration, farther than so many times the deepest penetration, which is what
 it is to take away: at edges that slip Newton's method can wander off to another equilibrium."""
+
+
+def allowed_share(body: RigidBody) -> float:
+    """Share of the press depth that a recorded state may penetrate."""
+    return DEEP if body.kind == KINDS["mesh"] else SUNK
 
 
 class Stepper:
@@ -91,7 +100,8 @@ class Stepper:
         self._recorded = frozenset(records)
         self._corrected = frozenset(place for k, place in enumerate(records, 1) if frames is None or k in frames)
         self._shallow_mm = PENETRATION * path.depth_scale_mm
-        self._deep_mm = DEEP * (path.depth_scale_mm if path.body.kind == KINDS["mesh"] else np.inf)
+        self._deep_mm = DEEP * path.depth_scale_mm if path.body.kind == KINDS["mesh"] else np.inf
+        self._allowed_mm = allowed_share(path.body) * path.depth_scale_mm
         self._rubs = friction > 0
         self.indenter, self._sticking = pack_indenter(path, friction), pack_indenter(path, STICK_FRICTION)
         self._sticking.centre, self._sticking.rotation = self.indenter.centre, self.indenter.rotation
@@ -254,8 +264,8 @@ class Stepper:
         if target in self._corrected:
             self.system.update_contact_history(step.state, self.indenter, new_only=1)
             solution = self._augmented(step)
-            if solution.converged and self.system.deepest() > self._deep_mm:
-                self.reason = too_deep(self.path.pose(target), DEEP)
+            if solution.converged and self.system.deepest() > self._allowed_mm:
+                self.reason = too_deep(self.path.pose(target), allowed_share(self.path.body))
             else:
                 solution = self._polished(solution, self.numerics.tolerance)
         if solution.converged and not self.reason:

@@ -96,10 +96,10 @@ def not_converged(beyond_mm: float, pose: Pose) -> str:
 
 
 def too_deep(pose: Pose, share: float) -> str:
-    """Why a trajectory ends whose gel stays further inside an object than this share of the press depth."""
+    """Why a trajectory ends whose gel stays further inside the indenter than this share of the press depth."""
     return (
-        f"at depth {pose.depth_mm:.3g} mm the gel stays inside the object by more than {share:.0%} of the depth: lower "
-        "numerics.target_error_px or edge_length_mm, or raise numerics.penalty"
+        f"at depth {pose.depth_mm:.3g} mm the gel stays inside the indenter by more than {share:.0%} of the depth: "
+        "keep it off held rims, lower numerics.target_error_px or edge_length_mm, or raise numerics.penalty"
     )
 
 

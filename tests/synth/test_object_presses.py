@@ -62,15 +62,15 @@ def test_a_cube_is_the_block_of_its_fillet(folder: Path, monkeypatch, turned: tu
         assert 17.0 * np.sqrt((moved**2).sum(axis=1).mean()) < 0.02  # px of the shipped scene gelsight_mini
 
 
-def test_an_object_is_no_deeper_in_the_gel_than_allowed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_body_is_no_deeper_in_the_gel_than_allowed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """On the CPU and by the batched solver, with contacts so soft that updates of the multipliers alone do not do.
 
     The stiffness of the passes is gone after the record: the last state does not depend on those of the first.
     """
     mesh = graded_box(SIZE, Focus((0.0, 0.0), (2.0, 2.0)), Counts((3, 3), (1, 1), 2))
 
-    def soft(penalty: float) -> Press:
-        drawn = pressed(cube())
+    def soft(penalty: float, body: dict[str, Any]) -> Press:
+        drawn = pressed(body)
         numerics = drawn.numerics.model_copy(update={"penalty": penalty})
         return Press.of(drawn.model_copy(update={"numerics": numerics}), mesh, folder)
 
@@ -78,18 +78,19 @@ def test_an_object_is_no_deeper_in_the_gel_than_allowed(folder: Path, monkeypatc
         batched = simulate_presses([press], prepare(press.scene, mesh, "cpu"), frames=frames and [frames])
         return [simulate_press(press, frames), *dict(batched).values()]
 
-    found, allowed = both(soft(4.0)), stepping.DEEP * DEPTH
-    for trajectory, last in zip(found, both(soft(4.0), frozenset({2})), strict=True):
+    found, allowed = both(soft(4.0, cube())), stepping.DEEP * DEPTH
+    for trajectory, last in zip(found, both(soft(4.0, cube()), frozenset({2})), strict=True):
         assert trajectory.status == "complete"
         assert 0 < max(state.max_penetration_mm for state in trajectory.states) <= allowed
         assert same(replace(last, states=last.states[2:]), replace(trajectory, states=trajectory.states[2:]))
     for one, other in zip(*(trajectory.states[1:] for trajectory in found), strict=True):
         # Intermediate steps have a relaxed tolerance of 1e-3 on the CPU, which friction remembers.
         np.testing.assert_allclose(one.force_n, other.force_n, atol=5e-3 * one.force_n[2])
-    for trajectory in both(soft(0.05)):
-        assert "the gel stays inside the object by more than 2% of the depth" in trajectory.reason
+    for body, share in ((cube(), "2%"), ({"shape": "sphere", "radius_mm": 3.0}, "20%")):
+        for trajectory in both(soft(0.05, body)):
+            assert f"the gel stays inside the indenter by more than {share} of the depth" in trajectory.reason
     monkeypatch.setattr(stepping, "MAX_STIFFENING", 1.0)
-    assert "the gel stays inside" in simulate_press(soft(4.0)).reason
+    assert "the gel stays inside" in simulate_press(soft(4.0, cube())).reason
 
 
 def test_relaxation_finds_the_equilibrium_of_newtons_method(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

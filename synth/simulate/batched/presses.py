@@ -9,7 +9,7 @@ from synth.simulate.batched.lanes import COMPLETE, NO_CONTACT, NO_EQUILIBRIUM, T
 from synth.simulate.batched.reductions import SCALARS
 from synth.simulate.press import Press
 from synth.simulate.space import Space
-from synth.simulate.stepping import DEEP
+from synth.simulate.stepping import allowed_share
 from synth.simulate.tables import struct_of
 from synth.simulate.trajectory import State, Trajectory, at_rest, no_contact, not_converged, too_deep
 
@@ -89,7 +89,7 @@ def trajectory(
         COMPLETE: "",
         NO_EQUILIBRIUM: not_converged(target - reached, press.path.pose(reached)),
         NO_CONTACT: no_contact(target),
-        TOO_DEEP: too_deep(press.path.pose(target), DEEP),
+        TOO_DEEP: too_deep(press.path.pose(target), allowed_share(press.path.body)),
     }
     return Trajectory(tuple(states), reasons[code], seconds, space)
 

@@ -25,16 +25,16 @@ def _doubles(*values: float) -> list[Any]:
     return [wp.constant(wp.float64(value)) for value in values]
 
 
-ZERO, ONE = _doubles(0.0, 1.0)
-MIN_TOLERANCE = wp.constant(wp.float64(1.0e-12))  # of a pass: somewhat more than rounding leaves
+ZERO, ONE, MIN_TOLERANCE = _doubles(0.0, 1.0, 1.0e-12)  # of a pass: somewhat more than rounding leaves
 FORCE_FLOOR, INDIFFERENT, SHORTEST = _doubles(newton.FORCE_FLOOR, newton.INDIFFERENT, newton.SHORTEST)
 SUFFICIENT_DECREASE, STALLED_RESIDUAL = _doubles(newton.SUFFICIENT_DECREASE, newton.STALLED_RESIDUAL)
-NEAR, MAX_STEPS = wp.constant(wp.float64(newton.NEAR)), wp.constant(newton.MAX_STEPS)
-STALL_ITERATIONS = wp.constant(newton.STALL_ITERATIONS)
+NEAR = wp.constant(wp.float64(newton.NEAR))
+MAX_STEPS, STALL_ITERATIONS = wp.constant(newton.MAX_STEPS), wp.constant(newton.STALL_ITERATIONS)
 GROWTH, SHORTEST_STEP = _doubles(stepping.GROWTH, stepping.SHORTEST_STEP)
 MAX_ITERATIONS_TO_GROW, FAILURES = wp.constant(stepping.MAX_ITERATIONS_TO_GROW), wp.constant(stepping.FAILURES)
 MULTIPLIER_TOLERANCE, MAX_MULTIPLIER_UPDATES = _doubles(stepping.MULTIPLIER_TOLERANCE, stepping.MAX_MULTIPLIER_UPDATES)
-PENETRATION, DEEP, MAX_STIFFENING = _doubles(stepping.PENETRATION, stepping.DEEP, stepping.MAX_STIFFENING)
+PENETRATION, MAX_STIFFENING = _doubles(stepping.PENETRATION, stepping.MAX_STIFFENING)
+DEEP, SUNK = _doubles(stepping.DEEP, stepping.SUNK)
 MAX_CORRECTION_RATIO, MAX_RELAXED_STEP = _doubles(stepping.MAX_CORRECTION_RATIO, stepping.MAX_RELAXED_STEP)
 MESH, MAX_DEEP_PASSES = wp.constant(KINDS["mesh"]), wp.constant(stepping.MAX_DEEP_PASSES)
 FIRST_VISCOSITY, LEAST_VISCOSITY = _doubles(newton.FIRST_VISCOSITY, newton.LEAST_VISCOSITY)
@@ -237,7 +237,7 @@ def check_contact(lanes: Lanes, presses: Presses, sums: wp.array2d(dtype=wp.floa
 
 @wp.kernel
 def choose_pass(lanes: Lanes, presses: Presses, settings: Settings, indenters: Indenters):
-    """Another pass, the full tolerance, the record, or the end where passes leave an object too deep."""
+    """Another pass, the full tolerance, the record, or the end where passes leave the body too deep."""
     s = wp.tid()
     lanes.new_share[s] = ZERO
     if lanes.phase[s] != phases.CORRECTING:
@@ -248,7 +248,7 @@ def choose_pass(lanes: Lanes, presses: Presses, settings: Settings, indenters: I
     over = lanes.failures[s] >= FAILURES or lanes.done[s] >= MAX_MULTIPLIER_UPDATES
     if deep:
         over = lanes.passes[s] >= MAX_DEEP_PASSES
-    if corrected and over and deep:
+    if corrected and over and (deep or lanes.deepest[s] > SUNK * presses.deepest[j]):
         lanes.reason[s] = phases.TOO_DEEP
         lanes.phase[s] = phases.ENDED
         return
