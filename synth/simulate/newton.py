@@ -113,7 +113,7 @@ def _line_search(
 
 
 MAX_STEPS = 150
-"""Steps of a relaxation at most; see docs/decisions.md."""
+"""Steps of a relaxation at most."""
 FIRST_VISCOSITY = 1.0
 """θ of the first step: the viscous stress of a step is then the elastic one of its strain."""
 LEAST_VISCOSITY = 1e-3

@@ -42,18 +42,19 @@ PATH_DERIVATIVE_STEP = 1e-3
 MAX_MULTIPLIER_UPDATES = 2.0
 """Whole updates of the multipliers at a recorded state, in all. Not every contact point of a face on a curved body can
 come to rest on the surface, so that more updates make the tractions uneven."""
-FAILURES = 3
-"""Failed updates after which the passes end, unless they begin deeper than DEEP. Updates are halved after a failure and
-doubled after a success: where a whole one upsets Newton's method a part of it does not."""
+FAILURES, MAX_FAILURES = 3, 8
+"""Failed updates after which the passes end, the second number where they begin deeper than SINKING; an object's deeper
+than DEEP go on. Updates are halved after a failure and doubled after a success: where a whole one upsets Newton's
+method a part of it does not."""
 DEEP = 0.02
 """Share of the press depth (at least 0.1 mm). A triangle mesh that penetrates by more gets up to MAX_DEEP_PASSES
 passes, failed ones included. After the first success each pass doubles the contact stiffness, to at most
 MAX_STIFFENING times the body's own: multipliers alone converge slowly at sharp edges (after Nocedal & Wright,
 Numerical Optimization, framework 17.3). The press ends if that does not suffice."""
 MAX_DEEP_PASSES, MAX_STIFFENING = 16, 8.0
-SUNK = 0.2
-"""Share of the press depth (at least 0.1 mm) by which another shape may penetrate where a state is recorded, else the
-press ends: it then bears on what cannot give way, such as a round gel's held rim."""
+SINKING, SUNK = 0.05, 0.2
+"""Shares of the press depth (at least 0.1 mm). A press of another shape ends that would have to record a penetration by
+more than the second: it bears on what cannot give way, such as a round gel's held rim."""
 MULTIPLIER_TOLERANCE = 20.0
 """Tolerance of states that multipliers are updated from, over the full one: two updates do not forget what they began
 with."""
@@ -222,7 +223,8 @@ class Stepper:
         while solution.converged and self.system.deepest() > self._shallow_mm:
             deepest, sharpness = self.system.deepest(), float(self.indenter.sharpness.numpy()[0])
             deep = deepest > self._deep_mm
-            over = done >= MAX_MULTIPLIER_UPDATES or failures >= FAILURES
+            allowed = MAX_FAILURES if deepest > SINKING * self.path.depth_scale_mm else FAILURES
+            over = done >= MAX_MULTIPLIER_UPDATES or failures >= allowed
             if deep:
                 over = passes >= MAX_DEEP_PASSES
             if over:

@@ -27,14 +27,13 @@ def _doubles(*values: float) -> list[Any]:
 
 ZERO, ONE, MIN_TOLERANCE = _doubles(0.0, 1.0, 1.0e-12)  # of a pass: somewhat more than rounding leaves
 FORCE_FLOOR, INDIFFERENT, SHORTEST = _doubles(newton.FORCE_FLOOR, newton.INDIFFERENT, newton.SHORTEST)
-SUFFICIENT_DECREASE, STALLED_RESIDUAL = _doubles(newton.SUFFICIENT_DECREASE, newton.STALLED_RESIDUAL)
-NEAR = wp.constant(wp.float64(newton.NEAR))
+SUFFICIENT_DECREASE, STALLED_RESIDUAL, NEAR = _doubles(newton.SUFFICIENT_DECREASE, newton.STALLED_RESIDUAL, newton.NEAR)
 MAX_STEPS, STALL_ITERATIONS = wp.constant(newton.MAX_STEPS), wp.constant(newton.STALL_ITERATIONS)
-GROWTH, SHORTEST_STEP = _doubles(stepping.GROWTH, stepping.SHORTEST_STEP)
-MAX_ITERATIONS_TO_GROW, FAILURES = wp.constant(stepping.MAX_ITERATIONS_TO_GROW), wp.constant(stepping.FAILURES)
+GROWTH, SHORTEST_STEP, PENETRATION = _doubles(stepping.GROWTH, stepping.SHORTEST_STEP, stepping.PENETRATION)
+MAX_ITERATIONS_TO_GROW = wp.constant(stepping.MAX_ITERATIONS_TO_GROW)
+FAILURES, MAX_FAILURES = wp.constant(stepping.FAILURES), wp.constant(stepping.MAX_FAILURES)
 MULTIPLIER_TOLERANCE, MAX_MULTIPLIER_UPDATES = _doubles(stepping.MULTIPLIER_TOLERANCE, stepping.MAX_MULTIPLIER_UPDATES)
-PENETRATION, MAX_STIFFENING = _doubles(stepping.PENETRATION, stepping.MAX_STIFFENING)
-DEEP, SUNK = _doubles(stepping.DEEP, stepping.SUNK)
+DEEP, SINKING, SUNK, MAX_STIFFENING = _doubles(stepping.DEEP, stepping.SINKING, stepping.SUNK, stepping.MAX_STIFFENING)
 MAX_CORRECTION_RATIO, MAX_RELAXED_STEP = _doubles(stepping.MAX_CORRECTION_RATIO, stepping.MAX_RELAXED_STEP)
 MESH, MAX_DEEP_PASSES = wp.constant(KINDS["mesh"]), wp.constant(stepping.MAX_DEEP_PASSES)
 FIRST_VISCOSITY, LEAST_VISCOSITY = _doubles(newton.FIRST_VISCOSITY, newton.LEAST_VISCOSITY)
@@ -245,7 +244,8 @@ def choose_pass(lanes: Lanes, presses: Presses, settings: Settings, indenters: I
     j = lanes.press[s]
     corrected = presses.kind_of[j, lanes.next[s]] == 2
     deep = _is_deep(lanes, presses, s)
-    over = lanes.failures[s] >= FAILURES or lanes.done[s] >= MAX_MULTIPLIER_UPDATES
+    allowed = wp.where(lanes.deepest[s] > SINKING * presses.deepest[j], MAX_FAILURES, FAILURES)
+    over = lanes.failures[s] >= allowed or lanes.done[s] >= MAX_MULTIPLIER_UPDATES
     if deep:
         over = lanes.passes[s] >= MAX_DEEP_PASSES
     if corrected and over and (deep or lanes.deepest[s] > SUNK * presses.deepest[j]):
