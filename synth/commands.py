@@ -193,13 +193,14 @@ def export(
     out: Annotated[Path, Parameter(help="Directory to write to.")],
     camera: Annotated[str, Parameter(help="Name of a further camera; default: the main one.")] = "",
 ) -> int:
-    """Writes a dataset in another layout."""
+    """Writes a dataset in another layout, with all channels, forces and meta.json."""
     from synth.dataset.export import export as write_copies
+    from synth.dataset.export import left_out
     from synth.progress import progress
 
     with progress("export: samples") as advance:
         count = write_copies(path, format, out, advance, camera)
-    print(f"{count} samples written to {out}")
+    print(f"{count} samples written to {out}; left out: {left_out(path, camera)}")
     return 0
 
 
