@@ -22,8 +22,8 @@ from gelflow.config import TrainConfig
 from gelflow.errors import InputError
 from gelflow.models.weights import save_weights
 from gelflow.terminal import Advance
-from gelflow.train.module import LOG_EVERY, FlowModule
-from gelflow.train.state import WEIGHTS, State, save_state
+from gelflow.training.module import LOG_EVERY, FlowModule
+from gelflow.training.state import WEIGHTS, State, save_state
 
 
 class Throughput:
@@ -191,6 +191,17 @@ def stopping(callback: CheckpointCallback) -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGINT, former)
+
+
+@contextmanager
+def told_by_the_run() -> Iterator[None]:
+    """While the block runs, threads print no traceback of an OSError: TensorBoard's writer hands it to the run."""
+    former = threading.excepthook
+    threading.excepthook = lambda args: None if issubclass(args.exc_type, OSError) else former(args)
+    try:
+        yield
+    finally:
+        threading.excepthook = former
 
 
 def is_first_process() -> bool:

@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from gelflow.config import TrainConfig
-from gelflow.train.samples import CheckedPairs, Sample
+from gelflow.training.samples import CheckedPairs, Sample
 
 
 def loading_context(config: TrainConfig) -> BaseContext | None:

@@ -26,19 +26,20 @@ from gelflow.models import GelFlow
 from gelflow.models.denoiser import Denoiser
 from gelflow.models.weights import load_weights, save_weights
 from gelflow.terminal import progress
-from gelflow.train.callback import (
+from gelflow.training.callback import (
     CheckpointCallback,
     Stopped,
     describe,
     is_first_process,
     peak_memory_mib,
     stopping,
+    told_by_the_run,
     weights_metadata,
 )
-from gelflow.train.loading import ResidentPairs, end_with_run, loading_context, resident
-from gelflow.train.module import FlowModule, check_side
-from gelflow.train.samples import CheckedPairs, StepSampler, TrainingSamples, augmented_batch, checked, collate
-from gelflow.train.state import STATE, WEIGHTS, State, load_state, open_run
+from gelflow.training.loading import ResidentPairs, end_with_run, loading_context, resident
+from gelflow.training.module import FlowModule, check_side
+from gelflow.training.samples import CheckedPairs, StepSampler, TrainingSamples, augmented_batch, checked, collate
+from gelflow.training.state import STATE, WEIGHTS, State, load_state, open_run
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class TrainResult:
     """What a run ended with.
 
     `weights` are the best on the validation pairs, without such pairs the last; `metrics` those of the last validation
-    (`gelflow.train.module.METRICS`); `best` the best validation score: endpoint error in px where the flow is known,
+    (`gelflow.training.module.METRICS`); `best` the best validation score: endpoint error in px where the flow is known,
     else photometric loss. Speed (of this session, validation left out) is None where unknown.
     """
 
@@ -80,7 +81,7 @@ def train(
         train_set: Map-style, with a length; samples are dictionaries with `image1` and `image2` (3, H, W) float32 in
             [0, 1], `name`, and where it is known `flow` (2, H, W) float32 in px, NaN where no gel is seen.
         validation_set: The same; None: no validation.
-        out: Folder of the run, see `gelflow.train.state`.
+        out: Folder of the run, see `gelflow.training.state`.
         initial: Weights to start from (fine-tuning); their architecture must be `config.model`.
         resume: Go on with the run that `out` holds.
 
@@ -183,12 +184,18 @@ def _fit(callback: CheckpointCallback, data: "_Data", device: str, validation_du
         )
         callback.advance = stack.enter_context(progress("training", shown=trainer.is_global_zero))
         stack.enter_context(stopping(callback))
+        stack.enter_context(told_by_the_run())
         try:
             trainer.fit(module, datamodule=data)
         except (Stopped, SIGTERMException):  # Lightning raises the latter for a signal before the first step
             if not trainer.is_global_zero:
                 sys.exit()  # message and exit status are the first process's
             raise KeyboardInterrupt(_how_to_go_on(config, out)) from None
+        except OSError as error:
+            if error.errno is None:  # of a process that loads data
+                raise
+            told = f"{error.strerror}; {_how_to_go_on(config, out)}"
+            raise OSError(error.errno, told, error.filename or str(out)) from error
         except InputError as error:  # of a process that loads data it comes with a traceback in its text
             raise InputError(str(error).rpartition(f"{InputError.__name__}: ")[2].strip()) from error
 

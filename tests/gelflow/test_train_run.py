@@ -19,9 +19,9 @@ from gelflow.data import PairDataset
 from gelflow.errors import InputError
 from gelflow.models.estimate import estimate_flow
 from gelflow.models.weights import load_weights, read_metadata
-from gelflow.train import train
-from gelflow.train.module import learning_rate_factor
-from gelflow.train.state import load_state
+from gelflow.training import train
+from gelflow.training.module import learning_rate_factor
+from gelflow.training.state import load_state
 
 
 @pytest.fixture(scope="module")

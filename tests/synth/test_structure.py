@@ -80,7 +80,7 @@ def test_every_module_has_a_stage_and_imports_only_from_earlier_ones() -> None:
 
 ROOMS = (
     "errors", "arrays", "hardware", "terminal", "config", "files", "ops", "models", "losses", "data", "baselines",
-    "predict", "compare", "train", "cli", "__main__",
+    "predict", "compare", "training", "cli", "__main__",
 )  # fmt: skip
 """The same for the parts of gelflow."""
 
@@ -129,7 +129,7 @@ load_weights(weights_file(None))
 print(*sys.modules)"""
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert "gelflow.models.gelflow" in done.stdout.split()
-    assert not [name for name in done.stdout.split() if name.startswith(("gelflow.train", "lightning"))]
+    assert not [name for name in done.stdout.split() if name.startswith(("gelflow.training", "lightning"))]
     assert not _loaded_after("import gelflow.config") & {"torch", "numpy", "lightning"}
     own_cache(monkeypatch)
     scene = write_tiny(tmp_path)
