@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from synth.cli_options import DEFAULT_SCENE, AsJson, Assignments, Dataset, Device, SceneName, whole
@@ -132,7 +132,7 @@ def simulate(
     if as_json:
         print(json.dumps(record))
     else:
-        Console().print(_states_table(trajectory))
+        _console().print(_states_table(trajectory))
         print(f"{trajectory.status} in {trajectory.seconds:.1f} s: {out / 'trajectory.json'}")
     if trajectory.status != "complete":
         print(f"synth: simulation {trajectory.status}: {trajectory.reason}", file=sys.stderr)
@@ -245,10 +245,10 @@ def _show_plan(template: Template, variant: Variant, n: int, as_json: bool) -> i
         print(json.dumps({**planned.record(), **vars(predicted), "n": n}))
         return 0
     title = f"{template.name} with {variant.name}"
-    table = Table("feature", "runs", "because", title=title, title_justify="left")
+    table = Table("feature", "runs", Column("because", overflow="fold"), title=title, title_justify="left")
     for decision in planned.decisions:
         table.add_row(decision.feature, "yes" if decision.runs else "left out", Text(decision.reason))
-    Console().print(table)
+    _console().print(table)
     seconds = sum(predicted.seconds_per_pair.values())
     stages = ", ".join(f"{stage} {value:.2f} s" for stage, value in predicted.seconds_per_pair.items())
     sensor = template.corners[0].sensor

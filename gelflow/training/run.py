@@ -133,6 +133,9 @@ def _device(config: TrainConfig) -> str:
     device = chosen_device(config.device)
     if device == "cuda" and config.devices > torch.cuda.device_count():
         raise InputError(f"devices = {config.devices}: this machine has {torch.cuda.device_count()} CUDA devices")
+    if config.devices > 1 and (hasattr(sys, "ps1") or not Path(sys.argv[0]).is_file()):
+        raise InputError(f"devices = {config.devices}: every device runs your program; it must be a file, not typed or "
+                         "piped into Python")  # fmt: skip
     return device
 
 

@@ -65,6 +65,15 @@ def _imports_of(modules: dict[str, ast.Module]) -> list[tuple[str, str]]:
     return [(name, imported) for name, tree in modules.items() for imported in sorted(_imports(tree))]
 
 
+def test_the_public_names_are_those_of_the_interface() -> None:
+    """In a fresh process, and after everything that they load has left its modules in the packages."""
+    code = "import synth, gelflow; [getattr(package, name) for package in (synth, gelflow) for name in dir(package)]"
+    command = [sys.executable, "-c", f"{code}; print(dir(synth), dir(gelflow)); print(gelflow.train)"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    names = ["generate", "load_scene", "plan", "read_dataset"], ["PairDataset", "load_model", "train"]
+    assert done.stdout.startswith(f"{names[0]} {names[1]}\n<function train"), done.stderr
+
+
 def test_every_module_has_a_stage_and_imports_only_from_earlier_ones() -> None:
     assert len(SYNTH) > 80
     assert ("synth.cli", "synth.errors") in _imports_of(SYNTH), "a finder that sees nothing would pass always"
