@@ -15,8 +15,6 @@ Advance = Callable[[int, int, str], None]
 """Takes the number of items done, the number of all, and a word on the present one."""
 LINE_S = 60.0
 """Seconds between two lines."""
-NO_LIMIT = 10_000
-"""Characters: wider than any table."""
 
 
 class _Rate(ProgressColumn):
@@ -62,12 +60,13 @@ def show_table(title: str, header: list[str], rows: list[list[str]]) -> None:
     """
     console = Console()
     if not console.is_terminal:
-        console.width = NO_LIMIT
+        console.width = 10_000  # wider than any table
     console.print(Text(title, "bold"))
     first, *others = zip(header, *rows, strict=True)
     parts = [[first]]
     for column in others:
-        if len(parts[-1]) > 1 and _width([*parts[-1], column]) > console.width:
+        width = 1 + sum(3 + max(map(cell_len, cells)) for cells in (*parts[-1], column))  # with borders and padding
+        if len(parts[-1]) > 1 and width > console.width:
             parts.append([first])
         parts[-1].append(column)
     for part in parts:
@@ -77,8 +76,3 @@ def show_table(title: str, header: list[str], rows: list[list[str]]) -> None:
         for row in list(zip(*part, strict=True))[1:]:
             table.add_row(*map(Text, row))
         console.print(table)
-
-
-def _width(columns: list[tuple[str, ...]]) -> int:
-    """Characters of a table: two of padding and a border for each column, and the last border."""
-    return 1 + sum(3 + max(map(cell_len, column)) for column in columns)

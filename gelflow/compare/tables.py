@@ -127,8 +127,8 @@ def tables(comparison: Comparison) -> list[tuple[str, Table]]:
     groups = _ordered(summarise(comparison.scores))
     pairs = len(comparison.pairs)
     compared = summary_table([group for group in groups if not group.fine_tuned])
-    means = (
-        ". ".join([f"Means over {pairs} pairs", *(EXPLAINED[name] for name in compared[0] if name in EXPLAINED)]) + "."
+    means = ". ".join(
+        [f"Means over {pairs} pairs", *(EXPLAINED[name] for name in compared[0] if name in EXPLAINED), ""]
     )
     patterned, some = with_pattern(comparison)
     without = f"Means over the {some} pairs of gels with a pattern."

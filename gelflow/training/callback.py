@@ -193,17 +193,6 @@ def stopping(callback: CheckpointCallback) -> Iterator[None]:
         signal.signal(signal.SIGINT, former)
 
 
-@contextmanager
-def told_by_the_run() -> Iterator[None]:
-    """While the block runs, threads print no traceback of an OSError: TensorBoard's writer hands it to the run."""
-    former = threading.excepthook
-    threading.excepthook = lambda args: None if issubclass(args.exc_type, OSError) else former(args)
-    try:
-        yield
-    finally:
-        threading.excepthook = former
-
-
 def is_first_process() -> bool:
     """Whether this is the process that writes files and messages, among those of all devices and machines."""
     return not getattr(rank_zero_only, "rank", 0)

@@ -6,11 +6,9 @@ from pathlib import Path
 from gelflow.config.sources import train_config
 from gelflow.data import open_all
 from gelflow.models.weights import load_weights, weights_file
-from gelflow.training.run import TrainResult
-from gelflow.training.run import train as run_training
+from gelflow.training import run
 
 Places = str | Path | Sequence[str | Path]
-"""A dataset or several: what `gelflow.PairDataset` reads."""
 
 
 def train(
@@ -22,7 +20,7 @@ def train(
     validation: Places = (),
     weights: str | Path | None = None,
     resume: bool = False,
-) -> TrainResult:
+) -> run.TrainResult:
     """Trains a network on image pairs, as `python -m gelflow train` and `finetune` do.
 
     Args:
@@ -35,19 +33,18 @@ def train(
         resume: Go on with the run that `out` holds.
 
     Returns:
-        A record with `weights` (the file), `steps`, `metrics` and `best` (last results and best score on the validation
-        pairs, px), `pairs_per_second` and `memory_mib`.
+        A record with `weights`, the file, and the last `metrics` and the `best` score on the validation pairs.
 
     Raises:
         InputError: Settings, data, folder or weights that cannot be used; a loss that is no longer finite.
         KeyboardInterrupt: Ctrl-C or SIGTERM; the state has been saved, the message says how to go on.
-        OSError: The disk is full, or the folder cannot be written to.
+        OSError: The disk is full or the folder cannot be written to.
     """
     initial = None if weights is None else weights_file(Path(weights))
     start = {} if initial is None else {"model": load_weights(initial).config.model_dump()}
     settings = train_config(config, set, start)
     validation_set = open_all(_listed(validation)) if validation else None
-    return run_training(settings, open_all(_listed(data)), validation_set, Path(out), initial=initial, resume=resume)
+    return run.train(settings, open_all(_listed(data)), validation_set, Path(out), initial=initial, resume=resume)
 
 
 def _listed(places: Places) -> list[Path]:

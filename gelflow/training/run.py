@@ -6,6 +6,7 @@ end with the same weights, bit by bit.
 """
 
 import sys
+import threading
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -33,7 +34,6 @@ from gelflow.training.callback import (
     is_first_process,
     peak_memory_mib,
     stopping,
-    told_by_the_run,
     weights_metadata,
 )
 from gelflow.training.loading import ResidentPairs, end_with_run, loading_context, resident
@@ -74,24 +74,11 @@ def train(
     initial: Path | None = None,
     resume: bool = False,
 ) -> TrainResult:
-    """Trains a network and writes its weights.
+    """Trains a network on data sets that are open; arguments, results and exceptions else as of `job.train`.
 
-    Args:
-        config: The run.
-        train_set: Map-style, with a length; samples are dictionaries with `image1` and `image2` (3, H, W) float32 in
-            [0, 1], `name`, and where it is known `flow` (2, H, W) float32 in px, NaN where no gel is seen.
-        validation_set: The same; None: no validation.
-        out: Folder of the run, see `gelflow.training.state`.
-        initial: Weights to start from (fine-tuning); their architecture must be `config.model`.
-        resume: Go on with the run that `out` holds.
-
-    Returns:
-        Where the weights are, and the last results.
-
-    Raises:
-        InputError: Settings, data, folder or weights that cannot be used; a loss that is no longer finite.
-        KeyboardInterrupt: Ctrl-C or SIGTERM; the state has been saved, the message says how to go on.
-        OSError: The disk is full or the folder cannot be written to.
+    Data sets are map-style and have a length; samples are dictionaries with `image1` and `image2` (3, H, W) float32 in
+    [0, 1], `name`, and where it is known `flow` (2, H, W) float32 in px, NaN where no gel is seen. The architecture of
+    the `initial` weights must be `config.model`.
     """
     pairs, validation_pairs = _length(train_set), 0 if validation_set is None else _length(validation_set)
     if pairs == 0 or (validation_set is not None and validation_pairs == 0):
@@ -187,7 +174,9 @@ def _fit(callback: CheckpointCallback, data: "_Data", device: str, validation_du
         )
         callback.advance = stack.enter_context(progress("training", shown=trainer.is_global_zero))
         stack.enter_context(stopping(callback))
-        stack.enter_context(told_by_the_run())
+        former = threading.excepthook  # TensorBoard's thread hands its OSError to this one, which tells it
+        stack.callback(setattr, threading, "excepthook", former)
+        threading.excepthook = lambda args: None if issubclass(args.exc_type, OSError) else former(args)
         try:
             trainer.fit(module, datamodule=data)
         except (Stopped, SIGTERMException):  # Lightning raises the latter for a signal before the first step

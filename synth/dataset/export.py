@@ -10,8 +10,8 @@
                 and an .npy of each array below but meta
 
 The arrays are forward, forward_visible, backward, backward_visible, the optional channels by their EXR names, force_n
-and torque_nmm (2, 3), per image, and meta, the text of meta.json. In flo and kitti they are in extra/000000.npz, less
-those that the format holds to the bit. No format holds surface.npz.
+and torque_nmm (2, 3), per image, and meta, the text of meta.json. In flo and kitti they are in extra/000000.npz. No
+format holds surface.npz.
 
 Forward is `I1(x) = I2(x + forward(x))` in every format. A pixel that sees no gel is NaN in npz and webdataset,
 Middlebury's "unknown" (above 1e9) in flo and invalid in kitti. KITTI's PNG rounds to 1/64 px (at most 0.0078 px off)
@@ -148,9 +148,7 @@ def _write_flo(out: Path, name: str, source: Path, sample: SampleData) -> None:
     _put(out / "occlusions" / f"{name}.png", encode_png(hidden))
     if sample.flow.backward is not None:
         _put(out / "backward" / f"{name}.flo", flo_bytes(sample.flow.backward))
-    held = ("forward", "forward_visible", "backward")
-    rest = {part: array for part, array in _arrays(sample).items() if part not in held}
-    _put(out / "extra" / f"{name}.npz", encode_npz(rest))
+    _put(out / "extra" / f"{name}.npz", encode_npz(_arrays(sample)))
 
 
 def _write_kitti(out: Path, name: str, source: Path, sample: SampleData) -> None:

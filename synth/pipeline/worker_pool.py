@@ -7,9 +7,8 @@ Workers live and die with the driver: each holds the reading end of a parent-dea
 write to, and leaves when it closes, which the system does when the driver is killed. Ctrl-C reaches all processes of a
 terminal at once; the workers are started with it blocked, and the driver, which gets it, closes the pipe.
 
-Workers import what they need from this package and nothing of the user's program. Python's own way, to run the program
-once more in every process, would begin the job anew where no `if __name__ == "__main__":` guards it, and fails where
-the program comes from standard input.
+Workers do not import the user's program, as Python has it: it would begin the job anew where no
+`if __name__ == "__main__":` guards it, and cannot be found where it comes from standard input.
 
 A worker that dies (killed, out of memory) takes the pool with it. What was under way goes to a new pool: an item may be
 done twice, with the same result.

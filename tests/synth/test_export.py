@@ -84,9 +84,7 @@ def test_every_format_has_channels_forces_and_meta_and_what_it_leaves_out_is_sai
     for sample in samples:
         found = arrays_in(tmp_path / "o", format, f"{sample.index:06d}")
         expected = {**sample.flow.extras, "force_n": sample.force_n, "torque_nmm": sample.torque_nmm}
-        expected |= {"backward_visible": sample.flow.backward_visible}
-        if format != "flo":  # in .flo
-            expected |= {"forward": sample.flow.forward, "backward": sample.flow.backward}
+        expected |= {"forward": sample.flow.forward, "backward_visible": sample.flow.backward_visible}
         for name, values in expected.items():
             np.testing.assert_array_equal(found[name], values)
         meta = json.loads((data / "samples" / f"{sample.index:06d}" / "meta.json").read_text())
