@@ -32,7 +32,7 @@ EXPLAINED = {
     "closure px": "closure px, 90 % px: median and 90th percentile of the motion left after going there and back",
     "unknown %": "unknown %: share of pixels whose σ is too large for use",
     "error ≤ σ %": "error ≤ σ %: share of pixels with σ ≤ 0.1 px that err by at most σ; 68 if σ is calibrated",
-    "ms/pair": "ms/pair: median after a warm-up; core ms: processor time of all threads",
+    "ms/pair": "ms/pair, core ms: median run time after a warm-up, and processor time of all threads",
 }
 """What columns of the table of means say, by their heading, or by the first of two."""
 
@@ -127,9 +127,8 @@ def tables(comparison: Comparison) -> list[tuple[str, Table]]:
     groups = _ordered(summarise(comparison.scores))
     pairs = len(comparison.pairs)
     compared = summary_table([group for group in groups if not group.fine_tuned])
-    means = ". ".join(
-        [f"Means over {pairs} pairs", *(EXPLAINED[name] for name in compared[0] if name in EXPLAINED), ""]
-    )
+    explained = [EXPLAINED[name] for name in compared[0] if name in EXPLAINED]
+    means = ".\n".join([f"Means over {pairs} pairs", *explained]) + "."
     patterned, some = with_pattern(comparison)
     without = f"Means over the {some} pairs of gels with a pattern."
     apart = "Fine-tuned on these very pairs (test-time optimisation, not comparable with the rest)."
