@@ -23,9 +23,6 @@ if TYPE_CHECKING:
     from synth.scene.template import Template
     from synth.simulate import Trajectory
 
-_NO_LIMIT = 10_000
-"""Characters: wider than any table."""
-
 
 def generate(
     *,
@@ -304,5 +301,5 @@ def _console() -> Console:
     """Stdout; tables keep their natural width where it is no terminal."""
     console = Console()
     if not console.is_terminal:
-        console.width = _NO_LIMIT
+        console.width = 10_000  # wider than any table
     return console

@@ -30,20 +30,17 @@ def train_config(
     where the file cannot be read, an assignment is malformed, or a field does not exist or is out of range.
     """
     values: dict[str, Any] = {name: dict(v) if isinstance(v, Mapping) else v for name, v in (start or {}).items()}
-    sources = []
     if path is not None:
         _merge(values, _read(path))
         _spell_out(values)
-        sources.append(str(path))
     for assignment in assignments:
         _assign(values, assignment)
         _spell_out(values)
-    if assignments:
-        sources.append(", ".join(assignments))
     steps, stated = values.get("steps"), any(text.partition("=")[0].strip() == "warmup_steps" for text in assignments)
     if str(path) in PRESETS and isinstance(steps, int | float) and not stated:
         values["warmup_steps"] = max(0, min(values.get("warmup_steps", 0), int(steps) - 1))
-    return validated(TrainConfig, values, " with ".join(sources) or "default configuration")
+    sources = filter(None, (str(path or "default configuration"), ", ".join(assignments)))
+    return validated(TrainConfig, values, " with ".join(sources))
 
 
 def _read(path: Path | str) -> dict[str, Any]:

@@ -54,9 +54,9 @@ def holds_pairs(path: Path) -> bool:
     )
 
 
-def open_all(paths: Sequence[Path]) -> PairDataset:
+def open_all(paths: str | Path | Sequence[str | Path]) -> PairDataset:
     """Folders of pairs or shards as one data set, in order; with more than one, names begin with the folder's name."""
-    datasets = [PairDataset(path) for path in paths]
+    datasets = [PairDataset(path) for path in ([paths] if isinstance(paths, str | Path) else paths)]
     if len(datasets) == 1:
         return datasets[0]
     records: list[PairRecord] = []

@@ -8,16 +8,14 @@ from gelflow.data import open_all
 from gelflow.models.weights import load_weights, weights_file
 from gelflow.training import run
 
-Places = str | Path | Sequence[str | Path]
-
 
 def train(
-    data: Places,
+    data: str | Path | Sequence[str | Path],
     out: str | Path,
     config: str | Path = "best",
     set: Sequence[str] = (),
     *,
-    validation: Places = (),
+    validation: str | Path | Sequence[str | Path] = (),
     weights: str | Path | None = None,
     resume: bool = False,
 ) -> run.TrainResult:
@@ -43,9 +41,5 @@ def train(
     initial = None if weights is None else weights_file(Path(weights))
     start = {} if initial is None else {"model": load_weights(initial).config.model_dump()}
     settings = train_config(config, set, start)
-    validation_set = open_all(_listed(validation)) if validation else None
-    return run.train(settings, open_all(_listed(data)), validation_set, Path(out), initial=initial, resume=resume)
-
-
-def _listed(places: Places) -> list[Path]:
-    return [Path(places)] if isinstance(places, str | Path) else [Path(place) for place in places]
+    validation_set = open_all(validation) if validation else None
+    return run.train(settings, open_all(data), validation_set, Path(out), initial=initial, resume=resume)
