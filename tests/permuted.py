@@ -1,4 +1,4 @@
-"""Another order of the degrees of freedom, so that tests see what rounding decides: ``python -m pytest --permute SEED``.
+"""Another order of the degrees of freedom, so that tests see what rounding decides: `python -m pytest --permute SEED`.
 
 The sparse factors of this process are made of matrices whose unknowns are numbered at random. They answer to the same
 tolerance, with other roundings, as on another processor. Whoever derives a bound runs its test with several seeds, and
