@@ -12,6 +12,7 @@ from synth.simulate.batched.gemm import dense
 from synth.simulate.batched.krylov import Krylov, arnoldi, block_size, flat, padded, round_rows
 from synth.simulate.batched.lanes import PREDICTOR_READY, READY, Lanes, Settings
 from synth.simulate.batched.pad import inverse
+from synth.simulate.linear import GMRES_LIMIT
 from synth.simulate.options import STANDARD
 
 
@@ -96,6 +97,18 @@ def test_every_lane_solves_its_own_system(device: str, batch: int) -> None:
         assert true == pytest.approx(left[i], abs=2e-6)
     for i in range(3):
         assert (solved(np.array([i]))[0][0] == together_found[i]).all()
+
+
+def test_a_solve_that_misses_its_goal_ends_at_the_limit() -> None:
+    krylov = _systems([1.0], [0])[1]
+    krylov.goal.fill_(0.0)
+    krylov.k.fill_(GMRES_LIMIT - 2)
+    product = flat(krylov.product)
+    product.assign(np.random.default_rng(0).standard_normal(product.shape).astype(np.float32))
+    rows = product.shape[1]
+    for then in (kernels.RUNNING, kernels.DONE):
+        wp.launch_tiled(arnoldi(rows), dim=[1], inputs=[krylov], block_dim=block_size(rows), device="cpu")
+        assert krylov.running.numpy() == then
 
 
 def _bits(numbers: np.ndarray) -> np.ndarray:
