@@ -10,7 +10,7 @@ import warp as wp
 from synth.simulate.batched import krylov as kernels
 from synth.simulate.batched.gemm import dense
 from synth.simulate.batched.krylov import Krylov, arnoldi, block_size, flat, padded, round_rows
-from synth.simulate.batched.lanes import PREDICTOR_READY, READY, Lanes, Settings
+from synth.simulate.batched.lanes import PREDICTOR_READY, READY, Lanes, Settings, bits, select
 from synth.simulate.batched.pad import inverse
 from synth.simulate.linear import GMRES_LIMIT
 from synth.simulate.options import STANDARD
@@ -40,6 +40,13 @@ def _systems(
     settings.forcing = forcing
     wp.launch(kernels.begin_solve, batch, inputs=[lanes, settings, krylov], device=device)
     return lanes, krylov, settings
+
+
+def test_lanes_are_selected_by_their_phase() -> None:
+    lanes, mask = Lanes(), wp.zeros(8, dtype=wp.int32, device="cpu")
+    lanes.phase = wp.array(np.arange(8), dtype=wp.int32, device="cpu")
+    wp.launch(select, 8, inputs=[lanes, bits(2, 5), mask], device="cpu")
+    assert mask.numpy().tolist() == [0, 0, 1, 0, 0, 1, 0, 0]
 
 
 def test_linear_solves_are_as_exact_as_newton_needs() -> None:
