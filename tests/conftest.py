@@ -1,6 +1,19 @@
-"""Processes that run tests side by side leave one another a core each."""
+"""Processes that run tests side by side leave one another a core each; `--permute` as `permuted` says."""
 
 import os
 
+import pytest
+
 if "PYTEST_XDIST_WORKER" in os.environ:  # before numpy and PyTorch start their threads
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--permute", type=int, metavar="SEED", help="number the unknowns of sparse factors at random")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("permute") is not None:
+        from permuted import permute
+
+        permute(config.getoption("permute"))

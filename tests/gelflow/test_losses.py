@@ -97,6 +97,16 @@ def test_area_ratios_of_a_stretch_and_of_a_rotation_and_the_cost_of_a_growing_st
     assert deformation_loss(flow, ONES).item() == pytest.approx(0.1, abs=1e-12)
 
 
+def test_the_deformation_loss_is_of_the_flow_in_px_and_smoothness_of_shares_of_the_shorter_side() -> None:
+    x, _ = pixel_centres(10, 12)
+    flow, image = torch.stack([0.05 * x**2, torch.zeros_like(x)])[None], torch.zeros(1, 3, 10, 12, dtype=torch.float64)
+    config = LossConfig(lambda_s=(1.0,), lambda_dc=2.0, lambda_df=3.0, least_weight=1.0)
+    _, parts = self_supervised_loss([flow], image, image, config)
+    # R = 1 + 0.1 x; forward differences 0.1 (x + 0.5) of 1 to 11, with a mean of 0.6 px a pixel, on a side of 10 px.
+    assert parts["deformation"].item() == pytest.approx(3 * 0.1, rel=1e-12)
+    assert parts["smoothness"].item() == pytest.approx(2 * 0.6 / 10, rel=1e-12)
+
+
 @pytest.mark.parametrize("size", [(1, 1), (1, 5), (3, 9)])
 def test_scales_too_small_for_a_derivative_cost_nothing_and_keep_the_gradient_defined(size: tuple[int, int]) -> None:
     flow = torch.randn(1, 2, *size, requires_grad=True)

@@ -12,7 +12,7 @@ from gelflow.config import ModelConfig
 from gelflow.models import GelFlow
 from gelflow.models.estimate import estimate_flow
 from gelflow.models.gelflow import normalised
-from gelflow.models.layers import LocalFlowFusion
+from gelflow.models.layers import ContextNetwork, LocalFlowFusion
 
 
 @pytest.fixture(scope="module")
@@ -98,6 +98,15 @@ def test_estimate_scales_each_component_with_its_side_and_works_at_the_size_of_t
     small = torch.rand(2, 1, 3, 20, 30).unbind()
     assert estimate_flow(network, *small, size=(64, 96)).shape == (1, 2, 20, 30)
     refused("size 10x64", estimate_flow, network, *images, size=(10, 64))
+
+
+def test_the_context_network_sees_33_pixels_far() -> None:
+    """PWC-Net's dilations 1, 2, 4, 8, 16, 1 and the head's 3x3: a pixel farther for each of each layer's."""
+    torch.manual_seed(0)
+    network, seen = ContextNetwork().double(), torch.randn(1, 34, 1, 75, dtype=torch.float64, requires_grad=True)
+    network(seen[:, :32], seen[:, 32:])[..., 37].sum().backward()
+    places = seen.grad.abs().sum(dim=(0, 1, 2)).nonzero()
+    assert (places.min(), places.max(), len(places)) == (37 - 33, 37 + 33, 67)
 
 
 def test_weights_are_a_softmax_over_the_neighbours_inside() -> None:

@@ -14,9 +14,10 @@ from gelflow.config import REGISTRATIONS, ModelConfig, RegistrationConfig, Train
 from gelflow.config.sources import train_config
 from gelflow.models import GelFlow, registration
 from gelflow.models.estimate import estimate_flow
-from gelflow.models.propagation import propagated
+from gelflow.models.propagation import propagated, windowed_residual
 from gelflow.models.registration import registered
 from gelflow.models.weights import load_weights, save_weights
+from gelflow.ops.gaussian import window_sums
 from gelflow.ops.warp import warp
 from gelflow.training import train
 
@@ -202,6 +203,15 @@ def test_without_a_match_flows_stay() -> None:
     found = propagated(flow, image1, other, 3.0, near.model_copy(update={"background_px": None}))
     # A residual is the mean of some 3 x 113 squares, so that two differ by 7 % or so, rarely by a sixth.
     assert (found != flow).float().mean() < 0.03
+
+
+def test_a_window_counts_that_keeps_three_tenths_of_its_weight_in_the_image() -> None:
+    image, flow, column = torch.rand(1, 3, 4, 60), torch.tensor([20.0, 0.0]).view(1, 2, 1, 1), np.arange(60)
+    left = windowed_residual(flow.expand(1, 2, 4, 60), image, image, window_sums(image, 6.0), True)
+    weight = np.exp(-((column[:, None] - column) ** 2) / (2 * 6.0**2)) * (abs(column[:, None] - column) <= 18)
+    share = weight[:, column + 20 <= 59].sum(axis=1) / weight.sum(axis=1)
+    assert abs(share - 0.3).min() > 0.01
+    assert (left.isfinite().numpy() == (share > 0.3)).all()
 
 
 @pytest.mark.parametrize("lost", [(slice(40, 56), slice(None)), (slice(None), slice(60, 76))], ids=["rows", "columns"])

@@ -16,6 +16,7 @@ from gelflow.config import REGISTRATIONS, ModelConfig
 from gelflow.files.exr import read_flow
 from gelflow.files.image import write_png
 from gelflow.models import GelFlow
+from gelflow.models.onnx import _Finest
 from gelflow.models.weights import load_weights, read_metadata, save_weights, weights_file
 from gelflow.ops.correlation import _unfolded, local_correlation
 
@@ -137,6 +138,11 @@ def weights(tmp_path: Path) -> Path:
                 value *= 100
     save_weights(tmp_path / "weights.safetensors", network)
     return tmp_path / "weights.safetensors"
+
+
+def test_what_is_exported_is_the_finest_flow(weights: Path) -> None:
+    images = torch.rand(2, 1, 3, 67, 74).unbind()
+    assert _Finest(load_weights(weights))(*images).shape == (1, 2, 67, 74)
 
 
 @pytest.mark.slow

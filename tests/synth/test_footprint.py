@@ -56,6 +56,20 @@ def test_sphere(depth: float) -> None:
     assert_covers(print_of(SPHERE, depth_mm=depth, position_mm=(1.0, -2.0)), *square(radius, 1.0, -2.0))
 
 
+@pytest.mark.parametrize("side", [(-1, 0), (1, 0), (0, -1), (0, 1)])
+def test_only_what_lies_over_the_pad_counts(side: Pair) -> None:
+    """Of a ball whose centre is 1.5 mm off the pad, a segment; beside one that is farther off, nothing."""
+    edge, axis = np.array(SIZE[:2]) / 2, int(side[1] != 0)
+    out, along = np.array(side), np.abs(side[::-1])
+    chord, height = np.sqrt(7.0 - 1.5**2), np.sqrt(7.0) - 1.5
+    corners = np.sort([(edge[axis] - height) * out, edge[axis] * out], axis=0) + chord * np.outer([-1, 1], along)
+    part = print_of(SPHERE, depth_mm=1.0, position_mm=tuple((edge[axis] + 1.5) * out))
+    # Short by the resolution at most, or beyond by a finest cell: the chord's ends are on the edge.
+    np.testing.assert_allclose(ends(part), corners.ravel(), atol=RESOLUTION * 2 * chord)
+    beside = print_of(SPHERE, depth_mm=1.0, position_mm=tuple((edge[axis] + 3.0) * out))
+    assert max(beside.half_mm) <= UNTOUCHED * SIZE[2]
+
+
 def test_what_lies_inside_the_gel_counts_thin_bodies_and_meshes_too(tmp_path: Path) -> None:
     """A needle's ball has passed the face: its cut there is a point, its overlap as wide as the ball."""
     ball, needle = (Sphere(shape="sphere", radius_mm=radius) for radius in (0.3, 0.05))

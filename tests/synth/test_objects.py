@@ -179,6 +179,14 @@ def test_edges_are_rounded_as_those_of_a_block(tmp_path: Path) -> None:
     assert np.sqrt(np.mean((found - exact)[np.abs(exact) < 0.2] ** 2)) < 2e-3
 
 
+def test_a_tip_that_is_rounded_on_request_counts_from_its_own_end(tmp_path: Path) -> None:
+    """A ball of radius r in a cone of half-angle α ends r (1 / sin α - 1) before the tip."""
+    cone, fillet = pv.Cone(direction=(0, 0, 1), height=4.0, radius=2.0, resolution=80).triangulate().clean(), 0.5
+    body = body_of(saved(tmp_path, cone.points, cone.regular_faces), fillet_mm=fillet)
+    # The tip is 2 mm from the middle; the ball's end lies between points of a grid of 0.1 mm.
+    assert body.reach_mm == pytest.approx(2.0 - fillet * (np.sqrt(5) - 1), abs=CELL / 2)
+
+
 def joined(*pieces: pv.PolyData) -> tuple[FloatArray, np.ndarray]:
     starts = np.cumsum([0, *(len(piece.points) for piece in pieces)])
     faces = [piece.regular_faces + start for piece, start in zip(pieces, starts, strict=False)]

@@ -107,6 +107,15 @@ def test_nan_where_no_image_or_ray_exists():
     refused("looks along x", Optics.of, sensor(position_mm=(0.0, 0.0, 10.0), look_at_mm=(1e8, 0.0, 9.0)))
 
 
+def test_a_lens_model_that_rises_again_beyond_its_field_shows_nothing_there():
+    """The radius r - 0.3 r³ + 0.04 r⁵ rises to 0.792 at r² = 2, falls until r² = 2.5, and rises without end then."""
+    lens = optics(distortion=(-0.3, 0.04, 0.0, 0.0, 0.0)).lens
+    assert lens.field_limit == pytest.approx(2.0, rel=1e-12)
+    radius = np.array([0.5, 0.79, 0.8, 1.0, 2.0, 4.0])
+    found = lens.directions(lens.centre + lens.focal * np.column_stack([radius, 0 * radius]))
+    np.testing.assert_array_equal(np.isnan(found[:, 0]), radius > 0.792)
+
+
 def _fisheye(*distortion: float) -> FisheyeLens:
     return FisheyeLens(np.array([50.0, 52.0]), np.array([31.7, 24.4]), distortion)
 

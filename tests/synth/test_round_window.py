@@ -14,7 +14,7 @@ from synth.flow.exact import exact_flow
 from synth.flow.trace import trace
 from synth.flow.view import View
 from synth.optics import Optics
-from synth.optics.window import RoundWindow
+from synth.optics.window import RoundWindow, _far_root
 from synth.render.chart import RoundChart, chart_of
 from synth.render.gel_mesh import GelMesh
 from synth.render.marks import marks_coverage
@@ -80,6 +80,12 @@ def test_rays_are_bent_by_snells_law_in_the_plane_of_eye_centre_and_point():
 
         polar = np.arccos((crossing - (0, 0, RADIUS)) @ offset / away / INNER)
         assert polar == pytest.approx(brentq(beyond, 0, between, xtol=1e-15), abs=1e-9)  # arccos loses half the digits
+
+
+def test_a_root_near_zero_keeps_its_digits():
+    """Of t² + 2 half t - c with a small c: c / (2 half) before the face, and -2 half - c / (2 half) behind it."""
+    roots = _far_root(np.ones(2), np.array([0.5, -0.5]), np.array([-1e-20, -1e-20]))
+    np.testing.assert_allclose(roots, [1e-20, 1.0], rtol=1e-15)
 
 
 def test_crossings_of_a_capsule_take_the_shortest_optical_length():

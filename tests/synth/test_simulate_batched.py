@@ -30,6 +30,7 @@ from synth.simulate.batched.product import (
 from synth.simulate.batched.run import OPTIONS
 from synth.simulate.contact import contact_stiffness
 from synth.simulate.material import uniform
+from synth.simulate.options import SolverOptions
 from synth.simulate.space import function_space
 from synth.simulate.system import System, Unknowns
 from synth.simulate.tables import barrier_tables, bulk_tables, face_tables, warp_array
@@ -173,6 +174,14 @@ def test_the_product_is_the_tangent_times_the_vector(element, poisson_ratio, sti
     expected = tangent @ x[: len(body.free), 0].astype(np.float64)
     # Sums of some 100 products rounded to 6e-8, of terms some times larger than the sum.
     assert np.linalg.norm(image.numpy()[: len(body.free), 0] - expected) < 2e-6 * np.linalg.norm(expected)
+
+
+def test_extrapolation_saves_iterations() -> None:
+    """Three steps of the load path; without it each begins at the last state."""
+    posed, mesh = scene(motion={"depth_mm": 0.6, "steps": 3}), brick(counts=(4, 4, 2))
+    made = [simulate_scenes([posed], mesh, options=SolverOptions(extrapolate=ahead))[0] for ahead in (True, False)]
+    ahead, behind = (sum(state.newton_iterations for state in result.states) for result in made)
+    assert ahead < behind
 
 
 def test_scenes_must_share_the_pad_which_serves_several_runs() -> None:

@@ -210,3 +210,16 @@ def test_laplace_table_is_the_integral(element: str) -> None:
     whole = np.einsum("e,eq,eqac,eqbc->eab", material.shear, rule.volume, rule.gradient, rule.gradient)
     # Sums of some dozen products, and an inverse of a matrix of condition 10 to 100.
     np.testing.assert_allclose(table, whole[:, pairs[:, 0], pairs[:, 1]], rtol=0, atol=1e-13 * np.abs(whole).max())
+
+
+@pytest.mark.parametrize("element", MIXED)
+def test_the_viscous_force_is_what_viscosity_adds_to_the_tangent(element: str) -> None:
+    body, rng = Case(element, 0.45).body(), np.random.default_rng(3)
+    before, step = random_state(body, rng), random_state(body, rng)
+    step.u[body.space.held] = 0.0
+    thick, thin = (dense(body, body.tangent(before, far_away(), viscosity)) for viscosity in (0.7, 0.0))
+    expected = (thick - thin) @ np.concatenate([step.u.ravel(), step.p])[body.free]
+    found = body.viscous_force(before, before.plus(step, 1.0), 0.7)
+    # Sums of some hundred terms; the difference of two tangents leaves 1e-16 of their entries, of size 1 to 100.
+    np.testing.assert_allclose(found, expected, atol=1e-12 * np.abs(expected).max() + 1e-13)
+    assert np.abs(found).max() > 1e-3

@@ -10,8 +10,9 @@ import warp as wp
 from synth.simulate.batched import krylov as kernels
 from synth.simulate.batched.gemm import dense
 from synth.simulate.batched.krylov import Krylov, arnoldi, block_size, flat, padded, round_rows
-from synth.simulate.batched.lanes import PREDICTOR_READY, READY, Lanes, Settings
+from synth.simulate.batched.lanes import PREDICTOR_READY, READY, Lanes, Settings, bits, select
 from synth.simulate.batched.pad import inverse
+from synth.simulate.linear import GMRES_LIMIT
 from synth.simulate.options import STANDARD
 
 
@@ -39,6 +40,13 @@ def _systems(
     settings.forcing = forcing
     wp.launch(kernels.begin_solve, batch, inputs=[lanes, settings, krylov], device=device)
     return lanes, krylov, settings
+
+
+def test_lanes_are_selected_by_their_phase() -> None:
+    lanes, mask = Lanes(), wp.zeros(8, dtype=wp.int32, device="cpu")
+    lanes.phase = wp.array(np.arange(8), dtype=wp.int32, device="cpu")
+    wp.launch(select, 8, inputs=[lanes, bits(2, 5), mask], device="cpu")
+    assert mask.numpy().tolist() == [0, 0, 1, 0, 0, 1, 0, 0]
 
 
 def test_linear_solves_are_as_exact_as_newton_needs() -> None:
@@ -96,6 +104,18 @@ def test_every_lane_solves_its_own_system(device: str, batch: int) -> None:
         assert true == pytest.approx(left[i], abs=2e-6)
     for i in range(3):
         assert (solved(np.array([i]))[0][0] == together_found[i]).all()
+
+
+def test_a_solve_that_misses_its_goal_ends_at_the_limit() -> None:
+    krylov = _systems([1.0], [0])[1]
+    krylov.goal.fill_(0.0)
+    krylov.k.fill_(GMRES_LIMIT - 2)
+    product = flat(krylov.product)
+    product.assign(np.random.default_rng(0).standard_normal(product.shape).astype(np.float32))
+    rows = product.shape[1]
+    for then in (kernels.RUNNING, kernels.DONE):
+        wp.launch_tiled(arnoldi(rows), dim=[1], inputs=[krylov], block_dim=block_size(rows), device="cpu")
+        assert krylov.running.numpy() == then
 
 
 def _bits(numbers: np.ndarray) -> np.ndarray:

@@ -84,11 +84,14 @@ def followed(stepper: Stepper, losing: Losing, monkeypatch: pytest.MonkeyPatch) 
 
     def step() -> None:
         before, lost, length = memory(stepper), losing.lost, stepper.target() - stepper.at
+        allowed = stepper.step  # of the next step, unless this one, half as long again, is longer
         advance()
         steps[0] += 1
         if losing.lost > lost:
             assert all((a == b).all() for a, b in zip(memory(stepper), before, strict=True))
             assert stepper.step == length / 2
+        else:
+            assert stepper.step <= max(allowed, stepping.GROWTH * length)
 
     monkeypatch.setattr(stepper, "_advance", step)
     return stepper.run(), steps[0]

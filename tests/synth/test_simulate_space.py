@@ -95,6 +95,17 @@ def field(points: Points, degree: int) -> FloatArray:
     return 0.3 + 0.7 * x - 0.4 * y + (degree == 2) * (0.2 * x**2 - 0.5 * x * y + 0.1 * y**2)
 
 
+@pytest.mark.parametrize("element", ["p1p1", "p2p1"])
+def test_quadrature_points_are_exact_to_the_order_of_the_element(element: str) -> None:
+    """The mean over a tetrahedron of a barycentric coordinate is 1/4, of the product of two (1 + δ) / 20."""
+    found = ELEMENT[element]()
+    np.testing.assert_allclose(found.barycentric.sum(axis=1), 1, atol=1e-15)
+    np.testing.assert_allclose(found.weights @ found.barycentric, np.full(4, 1 / 4), atol=1e-15)
+    if element == "p2p1":
+        products = np.einsum("q,qa,qb->ab", found.weights, found.barycentric, found.barycentric)
+        np.testing.assert_allclose(products, (1 + np.eye(4)) / 20, atol=1e-15)
+
+
 @pytest.mark.parametrize(("element", "degree"), [("p1p1", 1), ("p2p1", 2)])
 def test_probe_reproduces_the_elements_polynomials(element: str, degree: int) -> None:
     space = space_of(element, crooked((6.0, 4.0, 2.0)))

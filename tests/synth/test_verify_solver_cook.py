@@ -41,7 +41,8 @@ def tip(element: str, cells: int) -> float:
     shear = np.array([0.0, 100.0 / (YOUNG * END * THICKNESS), 0.0])
     load = face_load(space, lambda x: np.isclose(x[:, 0], 48.0), shear)
     assert load.sum(axis=0) == pytest.approx([0.0, 100.0 / YOUNG, 0.0])
-    _, state, _ = equilibrium(space, uniform(len(mesh.tets), POISSON), load=load, steps=5, tolerance=1e-8)
+    # Ten steps: from the second last of five, which nearly locked elements overshoot, Newton's method arrives by luck.
+    _, state, _ = equilibrium(space, uniform(len(mesh.tets), POISSON), load=load, steps=10, tolerance=1e-8)
     corner = np.flatnonzero(np.isclose(space.points, [48.0, 60.0, 0.0]).all(axis=1))
     return float(state.u[corner[0], 1])
 
