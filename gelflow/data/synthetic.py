@@ -61,9 +61,9 @@ def scene_and_pattern(header: Any, meta: Path | None = None) -> str | None:
         scene = header["scene"]
         kind = scene["sensor"]["pattern"].get("kind")
         if not isinstance(kind, str) and meta is not None:
-            kind = parsed(json.loads, read_file(meta), str(meta))["scene"]["sensor"]["pattern"]["kind"]
+            kind = json.loads(read_file(meta))["scene"]["sensor"]["pattern"]["kind"]
         return f"{scene['name']}, {kind}"
-    except (KeyError, TypeError, AttributeError, OSError, ValueError):
+    except (KeyError, TypeError, AttributeError, OSError, ValueError, RecursionError):
         return None  # written by another program, or before patterns were recorded
 
 

@@ -76,8 +76,8 @@ def read_flow(path: Path, direction: Direction = "forward") -> FlowField:
         present = ", ".join(sorted(channels)) or "none"
         raise InputError(f"{path}: lacks the channel {' and '.join(missing)}; it has: {present}")
     flow = np.stack([channels[name] for name in needed], axis=-1)
-    if np.isinf(flow).any():
-        raise InputError(f"{path}: holds infinite flow; it must be finite, or NaN where no gel is seen")
+    if (np.abs(flow) > 1e6).any():
+        raise InputError(f"{path}: holds a flow of more than 1e6 px; where no gel is seen it must be NaN")
     finite = np.isfinite(flow).all(axis=-1)
     visible = channels.get(f"{direction}.visible")
     seen = finite if visible is None else np.logical_and(finite, visible > 0.5)

@@ -127,8 +127,8 @@ def _direction(path: Path, channels: Mapping[str, NDArray[Any]], direction: str)
         present = ", ".join(sorted(channels)) or "none"
         raise InputError(f"{path}: lacks the channel {' and '.join(missing)}; it has {present}")
     u, v, visible = (channels[name].astype(np.float32) for name in names)
-    if np.isinf(u).any() or np.isinf(v).any() or not (np.abs(visible) <= 1).all():
-        raise InputError(f"{path}: {direction} flow must be finite, or NaN without gel, and visible between 0 and 1")
+    if (np.abs([u, v]) > 1e6).any() or not (np.abs(visible) <= 1).all():
+        raise InputError(f"{path}: {direction} flow must be below 1e6 px, or NaN, and visible between 0 and 1")
     return np.stack([u, v], axis=-1), visible
 
 

@@ -85,7 +85,7 @@ def test_what_weights_say_is_bounded(tmp_path: Path, texts: Callable[[], dict], 
 def test_flow_is_finite_flat_and_of_one_size(tmp_path: Path) -> None:
     field = np.full((8, 9, 2), np.inf, np.float32)
     write_flow(tmp_path / "a.exr", field)
-    refused("infinite flow", read_flow, tmp_path / "a.exr")
+    refused("more than 1e6 px", read_flow, tmp_path / "a.exr")
     planes = {f"forward.{name}": np.zeros((8, 9), np.float32) for name in "UV"}
     parts = [OpenEXR.Part({"name": name}, planes) for name in "ab"]
     OpenEXR.File(parts).write(str(tmp_path / "b.exr"))

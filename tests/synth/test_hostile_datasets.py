@@ -101,7 +101,8 @@ def png(width: int, height: int) -> bytes:
 
 
 HARMS: dict[str, tuple[Harm, str]] = {
-    "infinite flow": (flow(np.inf), "flow must be finite"),
+    "infinite flow": (flow(np.inf), "flow must be below 1e6 px"),
+    "endless flow": (flow(3e38), "flow must be below 1e6 px"),
     "window": (vast_window, "not one flat image of at most"),
     "indices": (arrays(faces=lambda faces: faces + 10**6), "are no surface"),
     "subdivisions": (arrays(subdivisions=lambda _: np.array(10**6)), "are no surface"),
