@@ -5,8 +5,8 @@ Displacement Measurement", its losses and its trainer. Inside the network images
 flow is (B, 2, H, W) float32 in px, U to the right, V downward, and points from image 1 to image 2:
 ``I1(x) = I2(x + V(x))``. The centre of the pixel in column c and row r is at (c + 0.5, r + 0.5).
 
-The public interface is `load_model` and `PairDataset`; everything else may change without notice. Importing the package
-imports nothing heavy: each of the two is loaded when it is first asked for.
+The public interface is `load_model`, `PairDataset` and `train`; everything else may change without notice. Importing
+the package imports nothing heavy: each of the three is loaded when it is first asked for.
 """
 
 from importlib import import_module
@@ -16,15 +16,24 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from gelflow.data.pairs import PairDataset
     from gelflow.predict.model import load_model
+    from gelflow.training.job import train
 
-__all__ = ["PairDataset", "load_model"]
+__all__ = ["PairDataset", "load_model", "train"]
 
 try:
     __version__ = version("gelflow-synth")
 except PackageNotFoundError:  # a checkout that is not installed
     __version__ = "unknown"
 
-_MODULES = {"PairDataset": "gelflow.data.pairs", "load_model": "gelflow.predict.model"}
+_MODULES = {
+    "PairDataset": "gelflow.data.pairs",
+    "load_model": "gelflow.predict.model",
+    "train": "gelflow.training.job",
+}
+
+
+def __dir__() -> list[str]:
+    return __all__
 
 
 def __getattr__(name: str) -> Any:

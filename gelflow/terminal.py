@@ -5,8 +5,8 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from rich.cells import cell_len
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
@@ -56,12 +56,25 @@ def _lines(label: str) -> Advance:
 
 
 def show_table(title: str, header: list[str], rows: list[list[str]]) -> None:
-    """Prints a table on stdout; columns but the first to the right, nothing cut off."""
-    table = Table(title=title, title_justify="left", title_style="bold")
-    for number, name in enumerate(header):
-        table.add_column(escape(name), justify="right" if number else "left", no_wrap=True)
-    for row in rows:
-        table.add_row(*(escape(printable(cell)) for cell in row))
-    # Wider than the terminal rather than with cells cut off; a file or pipe has no width at all.
-    console = Console(width=max(Console().width, 250))
-    console.print(table)
+    """Prints a table on stdout; columns but the first to the right, nothing cut off.
+
+    Columns that are too many for the width of a terminal follow in further tables, which repeat the first one.
+    """
+    console = Console()
+    if not console.is_terminal:
+        console.width = 10_000  # wider than any table
+    console.print(Text(title, "bold"))
+    first, *others = zip(header, *rows, strict=True)
+    parts = [[first]]
+    for column in others:
+        width = 1 + sum(3 + max(map(cell_len, cells)) for cells in (*parts[-1], column))  # with borders and padding
+        if len(parts[-1]) > 1 and width > console.width:
+            parts.append([first])
+        parts[-1].append(column)
+    for part in parts:
+        table = Table()
+        for number, (name, *_) in enumerate(part):
+            table.add_column(Text(name), justify="right" if number else "left", no_wrap=number > 0, overflow="fold")
+        for row in list(zip(*part, strict=True))[1:]:
+            table.add_row(*map(Text, map(printable, row)))
+        console.print(table)

@@ -87,14 +87,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (InputError, CycloptsError, OSError, MemoryError, RecursionError, KeyboardInterrupt) as error:
         if debug:
             traceback.print_exc()
-        print(f"synth: {printable(_message(error))}", file=sys.stderr)
+        print(f"synth: {printable(_message(error, tokens[0]))}", file=sys.stderr)
         return 130 if isinstance(error, KeyboardInterrupt) else 2
     return status if isinstance(status, int) else 0
 
 
-def _message(error: BaseException) -> str:
+def _message(error: BaseException, command: str) -> str:
     if isinstance(error, KeyboardInterrupt):
-        return "interrupted; finished samples are kept: run the same command again to go on"
+        kept = "; finished samples are kept: run the same command again to go on" if command == "generate" else ""
+        return f"interrupted{kept}"
     if isinstance(error, MemoryError | RecursionError):
         return f"out of memory, or nested too deeply ({error}); give less at once"
     if isinstance(error, OSError) and error.filename is not None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from synth.cli_options import DEFAULT_SCENE, AsJson, Assignments, Dataset, Device, SceneName, whole
@@ -22,9 +22,6 @@ if TYPE_CHECKING:
     from synth.render.variant import Variant
     from synth.scene.template import Template
     from synth.simulate import Trajectory
-
-_NO_LIMIT = 10_000
-"""Characters: wider than any table."""
 
 
 def generate(
@@ -132,7 +129,7 @@ def simulate(
     if as_json:
         print(json.dumps(record))
     else:
-        Console().print(_states_table(trajectory))
+        _console().print(_states_table(trajectory))
         print(f"{trajectory.status} in {trajectory.seconds:.1f} s: {out / 'trajectory.json'}")
     if trajectory.status != "complete":
         print(f"synth: simulation {trajectory.status}: {trajectory.reason}", file=sys.stderr)
@@ -193,13 +190,14 @@ def export(
     out: Annotated[Path, Parameter(help="Directory to write to.")],
     camera: Annotated[str, Parameter(help="Name of a further camera; default: the main one.")] = "",
 ) -> int:
-    """Writes a dataset in another layout."""
+    """Writes a dataset in another layout, with all channels, forces and meta.json."""
     from synth.dataset.export import export as write_copies
+    from synth.dataset.export import left_out
     from synth.progress import progress
 
     with progress("export: samples") as advance:
         count = write_copies(path, format, out, advance, camera)
-    print(f"{count} samples written to {out}")
+    print(f"{count} samples written to {out}; left out: {left_out(path, camera)}")
     return 0
 
 
@@ -244,10 +242,10 @@ def _show_plan(template: Template, variant: Variant, n: int, as_json: bool) -> i
         print(json.dumps({**planned.record(), **vars(predicted), "n": n}))
         return 0
     title = f"{template.name} with {variant.name}"
-    table = Table("feature", "runs", "because", title=title, title_justify="left")
+    table = Table("feature", "runs", Column("because", overflow="fold"), title=title, title_justify="left")
     for decision in planned.decisions:
         table.add_row(decision.feature, "yes" if decision.runs else "left out", Text(decision.reason))
-    Console().print(table)
+    _console().print(table)
     seconds = sum(predicted.seconds_per_pair.values())
     stages = ", ".join(f"{stage} {value:.2f} s" for stage, value in predicted.seconds_per_pair.items())
     sensor = template.corners[0].sensor
@@ -303,5 +301,5 @@ def _console() -> Console:
     """Stdout; tables keep their natural width where it is no terminal."""
     console = Console()
     if not console.is_terminal:
-        console.width = _NO_LIMIT
+        console.width = 10_000  # wider than any table
     return console

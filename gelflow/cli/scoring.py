@@ -106,7 +106,7 @@ def compare(
     dataset = open_all(data)
     dataset = PairDataset(dataset.source, dataset.records[::every])
     if ft > 0:
-        from gelflow.train.test_time import fine_tuned
+        from gelflow.training.test_time import fine_tuned
 
         if out is None or not own:
             raise InputError(f"--ft {ft}: needs --weights of GelFlow, and --out beside which their copies are kept")

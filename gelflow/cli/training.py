@@ -56,23 +56,20 @@ def train(data: Paths, /, *, out: Out, options: RunOptions = DEFAULTS) -> int:
 
 def finetune(data: Paths, /, *, out: Out, weights: ShippedOrFile = None, options: RunOptions = DEFAULTS) -> int:
     """Continues training from given weights and keeps their architecture."""
-    from gelflow.models.weights import weights_file
-
-    return _train(data, out, options, options.config or "real", weights_file(weights))
+    return _train(data, out, options, options.config or "real", weights or "best")
 
 
-def _train(data: list[Path], out: Path, options: RunOptions, config: str, initial: Path | None) -> int:
-    from gelflow.config.sources import train_config
-    from gelflow.data import open_all
-    from gelflow.models.weights import load_weights
-    from gelflow.train import train
-    from gelflow.train.callback import is_first_process
+def _train(data: list[Path], out: Path, options: RunOptions, config: str, weights: str | Path | None) -> int:
+    from gelflow.training.callback import is_first_process
+    from gelflow.training.job import train
 
-    start = {} if initial is None else {"model": load_weights(initial).config.model_dump()}
     given = {name: getattr(options, name) for name in ("steps", "device", "devices", "nodes")}
-    settings = train_config(config, options.assignments or [], given, start)
-    validation_set = open_all(options.validation) if options.validation else None
-    result = train(settings, open_all(data), validation_set, out, initial=initial, resume=options.resume)
+    settings = [
+        *(options.assignments or ()),
+        *(f"{name}={value}" for name, value in given.items() if value is not None),
+    ]
+    validation = options.validation or ()
+    result = train(data, out, config, settings, validation=validation, weights=weights, resume=options.resume)
     if is_first_process():
         print(result)
     return 0

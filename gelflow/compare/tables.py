@@ -23,6 +23,19 @@ Table = tuple[list[str], list[list[str]]]
 
 NONE = "-"
 
+EXPLAINED = {
+    "EPE px": "EPE px, median px: mean and median endpoint error",
+    "dots px": "dots px, 90 % px: median and 90th percentile distance of dots of image 1, moved by the flow, from the "
+    "nearest dots of image 2",
+    "own dot %": "own dot %: share of these dots that reach a dot of their own, within a quarter of the pitch and "
+    "nearer to it than any other (as they also do if the flow is wrong by a whole pitch)",
+    "closure px": "closure px, 90 % px: median and 90th percentile of the motion left after going there and back",
+    "unknown %": "unknown %: share of pixels whose σ is too large for use",
+    "error ≤ σ %": "error ≤ σ %: share of pixels with σ ≤ 0.1 px that err by at most σ; 68 if σ is calibrated",
+    "ms/pair": "ms/pair, core ms: median run time after a warm-up, and processor time of all threads",
+}
+"""What columns of the table of means say, by their heading, or by the first of two."""
+
 
 def number(value: float | None, digits: int, spread: float | None = None) -> str:
     """A number for a table, with its standard deviation if there is one; a dash where there is none."""
@@ -34,9 +47,8 @@ def number(value: float | None, digits: int, spread: float | None = None) -> str
 def summary_table(groups: Sequence[Group]) -> Table:
     """Means over the pairs, a row per method; columns that no method has are left out.
 
-    "error ≤ σ" counts pixels with σ ≤ 0.1 px; it is 68 % if σ is calibrated. The distance to tracked dots is not
-    averaged here: tracks differ too much in how far they can be trusted. Where all ran on one device its column is left
-    out, too.
+    The distance to tracked dots is not averaged here: tracks differ too much in how far they can be trusted. Where all
+    ran on one device its column is left out, too.
     """
     columns = [
         ("PSNR dB", "psnr_db", 1, 2),
@@ -114,12 +126,14 @@ def tables(comparison: Comparison) -> list[tuple[str, Table]]:
     """The tables of a comparison with their titles, as they are printed."""
     groups = _ordered(summarise(comparison.scores))
     pairs = len(comparison.pairs)
-    means = f"Means over {pairs} pairs; times are medians after a warm-up, core ms is processor time of all threads."
+    compared = summary_table([group for group in groups if not group.fine_tuned])
+    explained = [EXPLAINED[name] for name in compared[0] if name in EXPLAINED]
+    means = ".\n".join([f"Means over {pairs} pairs", *explained]) + "."
     patterned, some = with_pattern(comparison)
     without = f"Means over the {some} pairs of gels with a pattern."
     apart = "Fine-tuned on these very pairs (test-time optimisation, not comparable with the rest)."
     found = [
-        (means, summary_table([group for group in groups if not group.fine_tuned])),
+        (means, compared),
         (without, summary_table(patterned) if some < pairs else ([], [])),
         (apart, summary_table([group for group in groups if group.fine_tuned])),
     ]
@@ -128,7 +142,7 @@ def tables(comparison: Comparison) -> list[tuple[str, Table]]:
             ("PSNR dB / SSIM", "{:.2f} / {:.3f}", ("psnr_db", "ssim")),
             ("mean endpoint error in px", "{:.3f}", ("endpoint_error_px",)),
             ("median distance to tracked dots in px", "{:.2f}", ("marker_distance_px",)),
-            ("distance from dots, median / 90th percentile in px / share that reach one of their own",
+            ("distance from dots, median / 90th percentile in px / share that reach a dot of their own",
              "{:.3f} / {:.3f} / {:.0%}", ("dot_distance_px", "dot_p90_px", "own_dots")),
             ("closure, median / 90th percentile in px", "{:.3f} / {:.3f}", ("closure_px", "closure_p90_px")),
         ]  # fmt: skip

@@ -169,7 +169,7 @@ class LossConfig(_Frozen):
 
 
 class MotionConfig(_Frozen):
-    """Motion added to training pairs by moving image 2, see `gelflow.train.augment`.
+    """Motion added to training pairs by moving image 2, see `gelflow.training.augment`.
 
     Uniform up to these limits, times a common factor that is uniform between 0 and 1.
     """

@@ -1,4 +1,4 @@
-"""A training configuration from a preset or TOML file, `--set` assignments and options, the later ones winning.
+"""A training configuration from a preset or TOML file and assignments, the later ones winning.
 
 Presets are TOML files in `gelflow/presets`; the comment at the head of each says what it is and where it comes from.
 """
@@ -21,35 +21,27 @@ PRESETS = ("best", "real", "bare", "paper", "selfflow", "arflow")
 def train_config(
     path: Path | str | None = None,
     assignments: Sequence[str] = (),
-    options: Mapping[str, Any] | None = None,
     start: Mapping[str, Any] | None = None,
 ) -> TrainConfig:
     """Puts a configuration together and validates it once.
 
     The path is a preset's name, or a TOML file with the fields of `TrainConfig`; tables [model] and [loss]. Assignments
-    are `key=value`, key with dots (`loss.lambda_dc=10`), value in TOML; a value that is no TOML is text. `options` are
-    top-level fields given by options of their own; None values are left out. The fields of `start` stand before the
-    file is read. A preset's warm-up is shortened where the run would end in it. InputError where the file cannot be
-    read, an assignment is malformed, or a field does not exist or is out of range.
+    are `key=value`, key with dots (`loss.lambda_dc=10`), value in TOML; a value that is no TOML is text. The fields of
+    `start` stand before the file is read. A preset's warm-up is shortened where the run would end in it. InputError
+    where the file cannot be read, an assignment is malformed, or a field does not exist or is out of range.
     """
     values: dict[str, Any] = {name: dict(v) if isinstance(v, Mapping) else v for name, v in (start or {}).items()}
-    sources = []
     if path is not None:
         _merge(values, _read(path))
         _spell_out(values)
-        sources.append(str(path))
     for assignment in assignments:
         _assign(values, assignment)
         _spell_out(values)
-    if assignments:
-        sources.append("--set")
-    given = {name: value for name, value in (options or {}).items() if value is not None}
-    values |= given
     steps, stated = values.get("steps"), any(text.partition("=")[0].strip() == "warmup_steps" for text in assignments)
     if str(path) in PRESETS and isinstance(steps, int | float) and not stated:
         values["warmup_steps"] = max(0, min(values.get("warmup_steps", 0), int(steps) - 1))
-    sources += [f"--{name}" for name in given]
-    return validated(TrainConfig, values, " with ".join(sources) or "default configuration")
+    sources = filter(None, (str(path or "default configuration"), ", ".join(assignments)))
+    return validated(TrainConfig, values, " with ".join(sources))
 
 
 def _read(path: Path | str) -> dict[str, Any]:

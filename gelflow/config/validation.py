@@ -33,13 +33,13 @@ def validated(kind: type[Config], values: Mapping[str, Any], source: str) -> Con
     except ValidationError as error:
         lines = []
         for item in error.errors():
-            field = ".".join(str(part) for part in item["loc"]) or "(whole configuration)"
+            field = ".".join(str(part) for part in item["loc"])
             given = "" if item["type"] in ("value_error", "missing") else f" (given: {item['input']!r})"
             if item["type"] == "extra_forbidden":
                 allowed = _fields_at(kind, item["loc"][:-1])
                 lines.append(f"{field}: there is no such setting; allowed: {', '.join(allowed)}")
             else:
-                lines.append(f"{field}: {item['msg'].removeprefix('Value error, ')}{given}")
+                lines.append(f"{field and f'{field}: '}{item['msg'].removeprefix('Value error, ')}{given}")
         raise InputError(f"{source}: " + "; ".join(lines)) from error
 
 

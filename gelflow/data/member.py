@@ -58,16 +58,17 @@ class Member:
 
 @dataclass(frozen=True, slots=True)
 class FlowMembers:
-    """The exact flow of one pair in a shard: `.npy` files of flow and visibility, forward."""
+    """The exact flow of one pair in a shard: `.npy` files of flow and visibility, forward, and of contact or None."""
 
     forward: Member
     forward_visible: Member
+    contact: Member | None = None
 
     def __str__(self) -> str:
         return str(self.forward)
 
     def read(self) -> FlowField:
-        """The flow, as `gelflow.files.exr.read_flow` gives it; shards hold no contact.
+        """The flow, as `gelflow.files.exr.read_flow` gives it.
 
         InputError where an array is damaged or of another type or shape.
         """
@@ -75,8 +76,11 @@ class FlowMembers:
         if flow.ndim != 3 or flow.shape[2] != 2 or visible.shape != flow.shape[:2]:
             raise InputError(f"{self}: shapes {flow.shape} and {visible.shape} of flow and visibility; "
                              "(rows, columns, 2) and (rows, columns) are needed")  # fmt: skip
+        contact = None if self.contact is None else _read_array(self.contact, np.float32) > 0.5
+        if contact is not None and contact.shape != visible.shape:
+            raise InputError(f"{self.contact}: shape {contact.shape}; {visible.shape} is needed")
         finite = np.isfinite(flow).all(axis=-1)
-        return FlowField(flow, np.asarray(finite & (visible > 0), np.bool_))
+        return FlowField(flow, np.asarray(finite & (visible > 0), np.bool_), contact)
 
 
 def _read_array(member: Member, dtype: type[np.generic]) -> NDArray[Any]:

@@ -12,8 +12,10 @@ from gelflow.data.synthetic import is_synthetic, synthetic_records
 from gelflow.errors import InputError
 from gelflow.files.video import image_files
 
-FIRST, SECOND = ("_1.png", "_img1.png"), ("_2.png", "_img2.png")
-"""Ends of the names of a pair's images; the second ones are those of `synth export --format flo`."""
+ENDS = (("_1.png", "_2.png"), ("_img1.png", "_img2.png"), ("_img1.ppm", "_img2.ppm"))
+"""Ends of the names of a pair's images; the last ones are FlyingChairs', as `synth export --format flo` writes them."""
+FLYING_CHAIRS = "FlyingChairs_train_val.txt"
+"""File beside a folder `data` that holds the pairs."""
 
 
 def pair_records(folder: Path) -> list[PairRecord]:
@@ -28,14 +30,15 @@ def pair_records(folder: Path) -> list[PairRecord]:
         return pair_set_records(folder)
     if is_synthetic(folder):
         return synthetic_records(folder)
-    if records := _folder_records(folder):
+    if records := _folder_records(_folder_of_images(folder)):
         return records
     if shards := shard_files(folder):
         return shard_records(shards)
     content = "is empty" if not any(folder.iterdir()) else "holds no image pairs"
     raise InputError(
         f"{folder}: the folder {content}; allowed: a data set of synth (dataset.json), a pair set of "
-        "`python -m gelflow pairs` (pairs.json), shards (*.tar), or files NAME_1.png and NAME_2.png (or _img1, _img2)"
+        "`python -m gelflow pairs` (pairs.json), shards (*.tar), or files NAME_1.png and NAME_2.png "
+        "(or NAME_img1 and NAME_img2, .png or .ppm)"
     )
 
 
@@ -43,16 +46,17 @@ def holds_pairs(path: Path) -> bool:
     """Whether a file or folder holds pairs rather than a recording, whose frames go on after NAME_1 and NAME_2."""
     if shard_files(path) or (path / PAIR_SET_FILE).is_file() or is_synthetic(path):
         return True
-    images = {image.name for image in image_files(path)} if path.is_dir() else set()
-    names = {name.removesuffix("1.png") for name in images if name.endswith(FIRST)}
-    return any(f"{name}2.png" in images for name in names) and not any(
-        f"{name}{number}.png" in images for name in names for number in (0, 3)
+    folder = _folder_of_images(path)
+    images = {image.name for image in image_files(folder)} if folder.is_dir() else set()
+    pairs = [(name.removesuffix(first), first) for name in images for first, _ in ENDS if name.endswith(first)]
+    return any(f"{name}{first.replace('1', '2')}" in images for name, first in pairs) and not any(
+        f"{name}{first.replace('1', number)}" in images for name, first in pairs for number in "03"
     )
 
 
-def open_all(paths: Sequence[Path]) -> PairDataset:
+def open_all(paths: str | Path | Sequence[str | Path]) -> PairDataset:
     """Folders of pairs or shards as one data set, in order; with more than one, names begin with the folder's name."""
-    datasets = [PairDataset(path) for path in paths]
+    datasets = [PairDataset(path) for path in ([paths] if isinstance(paths, str | Path) else paths)]
     if len(datasets) == 1:
         return datasets[0]
     records: list[PairRecord] = []
@@ -67,17 +71,20 @@ def open_all(paths: Sequence[Path]) -> PairDataset:
     return PairDataset(", ".join(dataset.source for dataset in datasets), records)
 
 
+def _folder_of_images(folder: Path) -> Path:
+    return folder / "data" if (folder / FLYING_CHAIRS).is_file() else folder
+
+
 def _folder_records(folder: Path) -> list[PairRecord]:
-    """The pairs NAME_1.png and NAME_2.png of a folder, by name, with NAME_markers.csv where dots were tracked."""
-    images = {path.name for path in folder.glob("*.png") if not path.name.startswith(".")}
-    names = {name[: -len("1.png")] for name in images if name.endswith((*FIRST, *SECOND))}
+    """The pairs of a folder by name, their images named by `ENDS`, with NAME_markers.csv where dots were tracked."""
+    images = {path.name for path in folder.iterdir() if not path.name.startswith(".")} if folder.is_dir() else set()
+    found = {(name.removesuffix(end), ends) for name in images for ends in ENDS for end in ends if name.endswith(end)}
     records = []
-    for name in sorted(names):
-        image1, image2 = folder / f"{name}1.png", folder / f"{name}2.png"
+    for stem, ends in sorted(found):
+        image1, image2 = (folder / f"{stem}{end}" for end in ends)
         for path, other in ((image1, image2), (image2, image1)):
             if not path.is_file():
                 raise InputError(f"{path}: the file is missing; {other.name} needs it to be a pair")
-        stem = name.removesuffix("img").removesuffix("_")
         markers = folder / f"{stem}_markers.csv"
         records.append(PairRecord(stem, image1, image2, markers=markers if markers.is_file() else None))
     return records

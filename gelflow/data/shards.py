@@ -1,15 +1,15 @@
 """Shards in WebDataset's layout, as `python -m synth export --format webdataset` writes them.
 
     shard-000000.tar   uncompressed; for each sample 000000.{image1.png, image2.png, forward.npy, forward_visible.npy,
-                       json}, others are passed over; the key ends at the first dot
+                       json} and, if it was asked for, contact.Y.npy; others are passed over;
+                       the key ends at the first dot
 
 Opening reads every tar header once, in each process, and keeps where each member lies. A pair is then read by seeking,
 in any order, so that a shard data set is used like a directory. The order is that of the shards' names, then that
 within a shard.
 
-Limits: local or mounted files, no URLs. Shards hold no channels beside the flow (no contact), and do not say how many
-of them belong together: that one is missing altogether is noticed only by `--resume`, which compares the number of
-pairs.
+Limits: local or mounted files, no URLs. Shards do not say how many of them belong together: that one is missing
+altogether is noticed only by `--resume`, which compares the number of pairs.
 
 Reference: POSIX.1-1988 ustar; https://github.com/webdataset/webdataset.
 """
@@ -102,7 +102,7 @@ def _record(shard: Path, key: str, members: dict[str, Member]) -> PairRecord:
     if missing:
         raise InputError(f"{shard}: sample {key} lacks {' and '.join(missing)}; allowed are shards of "
                          "`python -m synth export --format webdataset`; export it again")  # fmt: skip
-    flow = FlowMembers(members["forward.npy"], members["forward_visible.npy"])
+    flow = FlowMembers(members["forward.npy"], members["forward_visible.npy"], members.get("contact.Y.npy"))
     try:
         meta = parsed(json.loads, members["json"].read_bytes(), key)
     except ValueError:

@@ -1,4 +1,4 @@
-"""Images: PNG or TIFF (8 or 16 bit, grey or colour, with or without alpha) and 8-bit JPEG or BMP.
+"""Images: PNG, TIFF or PPM (8 or 16 bit, grey or colour, with or without alpha) and 8-bit JPEG or BMP.
 
 In memory an image is (H, W, 3) float32, RGB in [0, 1]: a grey image has three equal channels, alpha is dropped, and a
 photograph is turned as its EXIF data say.
@@ -18,8 +18,8 @@ from gelflow.files.atomic import replacing
 from gelflow.files.quiet import quiet
 from gelflow.untrusted import MOST_PIXELS, read_file
 
-SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"})
-FORMATS = ("PNG", "JPEG", "BMP", "TIFF")
+SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm"})
+FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "PPM")
 MINIMUM_SIDE = 16
 """Optical flow of an image with a side of fewer px is not attempted."""
 
@@ -35,7 +35,7 @@ def _check(path: Path, data: bytes) -> None:
             else:
                 image.load()
     except UnidentifiedImageError as error:
-        raise InputError(f"{path}: not an image; allowed: PNG, JPEG, BMP, TIFF") from error
+        raise InputError(f"{path}: not an image; allowed: {', '.join(FORMATS)}") from error
     except Exception as error:  # of whatever kind a damaged header causes
         raise InputError(f"{path}: truncated or damaged image ({error})") from error
 

@@ -1,12 +1,17 @@
 """Finished samples in the formats of other programs; equal datasets give equal bytes.
 
-    flo         FlyingChairs' names: 000000_img1.png 000000_img2.png 000000_flow.flo (forward, Middlebury .flo),
-                beside them backward/000000.flo and occlusions/000000.png (255 where the forward point is hidden)
+    flo         FlyingChairs' files: data/000000_img1.ppm data/000000_img2.ppm data/000000_flow.flo (forward, Middlebury
+                .flo) and FlyingChairs_train_val.txt (all for training); beside them backward/000000.flo and
+                occlusions/000000.png (255 where the forward point is hidden)
     kitti       KITTI 2015's folders: training/image_2/000000_{10,11}.png, flow_occ/ and flow_noc/000000_10.png
                 (forward; all pixels with gel, and those whose point is seen in image 2)
-    npz         000000.npz with image1, image2, forward, forward_visible, backward, backward_visible, extras by name
-    webdataset  shard-000000.tar of at most 512 samples: 000000.{image1.png, image2.png, forward.npy,
-                forward_visible.npy, backward.npy, backward_visible.npy, json}
+    npz         000000.npz with image1, image2, and the arrays below
+    webdataset  shard-000000.tar of at most 512 samples: 000000.{image1.png, image2.png, json}, the latter meta.json,
+                and an .npy of each array below but meta
+
+The arrays are forward, forward_visible, backward, backward_visible, the optional channels by their EXR names, force_n
+and torque_nmm (2, 3), per image, and meta, the text of meta.json. In flo and kitti they are in extra/000000.npz. No
+format holds surface.npz.
 
 Forward is `I1(x) = I2(x + forward(x))` in every format. A pixel that sees no gel is NaN in npz and webdataset,
 Middlebury's "unknown" (above 1e9) in flo and invalid in kitti. KITTI's PNG rounds to 1/64 px (at most 0.0078 px off)
@@ -26,12 +31,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.arrays import BoolArray
-from synth.dataset.images import encode_png
+from synth.dataset.images import Raster, encode_png
 from synth.dataset.jsontext import to_document
 from synth.dataset.npz import encode_npz
 from synth.dataset.reader import Dataset, SampleData, read_dataset
-from synth.dataset.sample import SAMPLES_FOLDER, sample_name
-from synth.dataset.storage import PARTIAL, storage_errors
+from synth.dataset.sample import SAMPLES_FOLDER, further_cameras, sample_name
+from synth.dataset.storage import PARTIAL
 from synth.errors import InputError
 from synth.flow.field import FlowArray
 
@@ -63,29 +68,41 @@ def export(
         InputError: Unknown camera, `out` is not empty, no finished sample, a damaged file, a flow beyond
             KITTI's range, or the storage refuses.
     """
-    final = Path(out)
+    final = Path(out).absolute()
     dataset = read_dataset(path)
     if not dataset.samples:
         raise InputError(f"{dataset.path}: has no finished sample to export")
     if final.exists() and (not final.is_dir() or any(final.iterdir())):
         raise InputError(f"{final}: exists and is not empty; export never overwrites, give another --out")
     partial = final.with_name(f".{final.name}{PARTIAL}export")
-    with storage_errors(final):
-        try:
-            shutil.rmtree(partial, ignore_errors=True)
-            partial.mkdir(parents=True)
-            _write_all(dataset, format, partial, progress, camera)
-            if final.exists():
-                final.rmdir()
-            partial.rename(final)
-        except BaseException:
-            shutil.rmtree(partial, ignore_errors=True)
-            raise
+    try:
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir(parents=True)
+        _write_all(dataset, format, partial, progress, camera)
+        if final.exists():
+            final.rmdir()
+        partial.rename(final)
+    except OSError as error:
+        reason = error.strerror or error
+        raise InputError(
+            f"{final}: cannot be written: {reason}; nothing is kept of an export that ends early"
+        ) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
     return len(dataset.samples)
+
+
+def left_out(path: Path | str, camera: str = "") -> str:
+    """What an export of one camera leaves out of a dataset, in words."""
+    cameras = ["the main camera", *further_cameras(read_dataset(path).info["scene"])]
+    others = [name for name in cameras if name != (camera or cameras[0])]
+    return ", ".join(["surface.npz (the gel's surface, for verify)", *(f"pairs of {name}" for name in others)])
 
 
 def _write_all(dataset: Dataset, format: ExportFormat, out: Path, progress: Progress | None, camera: str) -> None:
     """Writes sample after sample; OSError where the storage refuses."""
+    if format == "flo":  # torchvision wants two lines at least
+        (out / "FlyingChairs_train_val.txt").write_text("1\n" * max(2, len(dataset.samples)))
     write = {"flo": _write_flo, "kitti": _write_kitti, "npz": _write_npz, "webdataset": _append_to_shard}[format]
     total = len(dataset.samples)
     for done, index in enumerate(dataset.samples):
@@ -115,14 +132,23 @@ def kitti_png(flow: FlowArray, valid: BoolArray) -> bytes:
     return encode_png(np.dstack([coded, known]).astype(np.uint16))
 
 
+def ppm(image: Raster) -> bytes:
+    """Binary PPM of an image, always RGB; 8 or 16 bits, which readers of 8 bits scale."""
+    import cv2
+
+    colours = image[..., None].repeat(3, axis=-1) if image.ndim == 2 else image[..., ::-1]
+    return bytes(cv2.imencode(".ppm", np.ascontiguousarray(colours))[1])
+
+
 def _write_flo(out: Path, name: str, source: Path, sample: SampleData) -> None:
-    for number in (1, 2):
-        shutil.copyfile(source / f"image{number}.png", out / f"{name}_img{number}.png")
-    (out / f"{name}_flow.flo").write_bytes(flo_bytes(sample.flow.forward))
+    for number, image in enumerate(sample.images, start=1):
+        _put(out / "data" / f"{name}_img{number}.ppm", ppm(image))
+    _put(out / "data" / f"{name}_flow.flo", flo_bytes(sample.flow.forward))
     hidden = np.where(sample.flow.forward_visible > 0.5, 0, 255).astype(np.uint8)
     _put(out / "occlusions" / f"{name}.png", encode_png(hidden))
     if sample.flow.backward is not None:
         _put(out / "backward" / f"{name}.flo", flo_bytes(sample.flow.backward))
+    _put(out / "extra" / f"{name}.npz", encode_npz(_arrays(sample)))
 
 
 def _write_kitti(out: Path, name: str, source: Path, sample: SampleData) -> None:
@@ -136,20 +162,21 @@ def _write_kitti(out: Path, name: str, source: Path, sample: SampleData) -> None
         _put(training / "image_2" / f"{name}_{9 + number}.png", (source / f"image{number}.png").read_bytes())
     _put(training / "flow_occ" / f"{name}_10.png", everywhere)
     _put(training / "flow_noc" / f"{name}_10.png", seen)
+    _put(out / "extra" / f"{name}.npz", encode_npz(_arrays(sample)))
 
 
 def _write_npz(out: Path, name: str, source: Path, sample: SampleData) -> None:
-    arrays = {"image1": sample.image1, "image2": sample.image2, **_flow_arrays(sample)}
-    (out / f"{name}.npz").write_bytes(encode_npz({**arrays, **sample.flow.extras}))
+    _put(out / f"{name}.npz", encode_npz({"image1": sample.image1, "image2": sample.image2, **_arrays(sample)}))
 
 
 def _append_to_shard(shard: Path, name: str, source: Path, sample: SampleData) -> None:
     members = {f"image{number}.png": (source / f"image{number}.png").read_bytes() for number in (1, 2)}
-    for part, array in _flow_arrays(sample).items():
+    arrays = _arrays(sample)
+    members["json"] = str(arrays.pop("meta")).encode("utf-8")
+    for part, array in arrays.items():
         buffer = io.BytesIO()
         np.lib.format.write_array(buffer, np.ascontiguousarray(array), allow_pickle=False)
         members[f"{part}.npy"] = buffer.getvalue()
-    members["json"] = to_document(sample.meta).encode("utf-8")
     with tarfile.open(shard, "a", format=tarfile.USTAR_FORMAT) as archive:
         for suffix, content in members.items():
             info = tarfile.TarInfo(f"{name}.{suffix}")  # Date, owner and group 0: the same bytes every time.
@@ -157,13 +184,15 @@ def _append_to_shard(shard: Path, name: str, source: Path, sample: SampleData) -
             archive.addfile(info, io.BytesIO(content))
 
 
-def _flow_arrays(sample: SampleData) -> dict[str, NDArray[Any]]:
-    """Float32 flows and uint8 visibilities of the directions that there are."""
+def _arrays(sample: SampleData) -> dict[str, NDArray[Any]]:
+    """All but images and surface: float32 flows and channels, uint8 visibilities, float64 forces, meta as text."""
     flow = sample.flow
     arrays: dict[str, NDArray[Any]] = {"forward": flow.forward, "forward_visible": _as_byte(flow.forward_visible)}
     if flow.backward is not None and flow.backward_visible is not None:
         arrays |= {"backward": flow.backward, "backward_visible": _as_byte(flow.backward_visible)}
-    return arrays
+    known = (name for name in ("force_n", "torque_nmm") if name in sample.meta)
+    forces = {name: np.array(sample.meta[name], np.float64) for name in known}
+    return {**arrays, **flow.extras, **forces, "meta": np.array(to_document(sample.meta))}
 
 
 def _as_byte(visible: FlowArray) -> NDArray[np.uint8]:

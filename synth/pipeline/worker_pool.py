@@ -7,6 +7,9 @@ Workers live and die with the driver: each holds the reading end of a parent-dea
 write to, and leaves when it closes, which the system does when the driver is killed. Ctrl-C reaches all processes of a
 terminal at once; the workers are started with it blocked, and the driver, which gets it, closes the pipe.
 
+Workers do not import the user's program, as Python has it: it would begin the job anew where no
+`if __name__ == "__main__":` guards it, and cannot be found where it comes from standard input.
+
 A worker that dies (killed, out of memory) takes the pool with it. What was under way goes to a new pool: an item may be
 done twice, with the same result.
 
@@ -26,6 +29,7 @@ from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
+from types import ModuleType
 from typing import Any, TypeAlias, TypeVar
 
 from synth.errors import InputError
@@ -100,7 +104,7 @@ def _outcomes_of_pool(
                 begins = room and bool(again)
                 if begins:
                     item = again[0]  # not lost should the pool be broken already
-                    with interrupts_blocked():
+                    with interrupts_blocked(), main_left_out():
                         under_way[_submit(pool, item)] = item
                     again.popleft()
                 if not under_way:
@@ -134,6 +138,17 @@ def interrupts_blocked() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextlib.contextmanager
+def main_left_out() -> Iterator[None]:
+    """Processes started meanwhile do not import this process's main module."""
+    main = sys.modules["__main__"]
+    sys.modules["__main__"] = ModuleType("__main__")
+    try:
+        yield
+    finally:
+        sys.modules["__main__"] = main
 
 
 def exit_with_parent(parent_death: Connection) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -91,6 +92,26 @@ def test_compare_and_predict_print_tables_files_and_json(tmp_path: Path, capsys:
     assert [motion["frame"] for motion in answer["motions"]] == [1, 2, 3]
     assert all(Path(file).is_file() for file in answer["files"])
     assert "b.flo" in said(capsys, main, "predict", write_folder(tmp_path / "two", {"b": (1, 0)}), *tail)
+
+
+@pytest.mark.parametrize("width", [30, 60, 200])
+def test_tables_fit_any_terminal_and_nothing_is_cut(
+    monkeypatch, capsys: pytest.CaptureFixture[str], width: int
+) -> None:
+    header, names = ["method", *(f"pair {k:03d}" for k in range(30))], ["DIS [medium]", "a network (3 seeds)"]
+    table = header, [[name, *(f"{number}.{k:03d}" for k in range(30))] for number, name in enumerate(names)]
+    terminal.show_table("Each pair.", *table)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 7  # no terminal: one table, as wide as it is
+    monkeypatch.setenv("COLUMNS", str(width))
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    terminal.show_table("Each pair.", *table)
+    lines = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out).splitlines()
+    assert max(map(len, lines)) <= width
+    words = " ".join(lines).split()
+    assert {f"{number}.{k:03d}" for k in range(30) for number in (0, 1)} <= set(words)
+    assert len(lines) > 7
+    assert words.count("[medium]") == words.count("method")
 
 
 def test_without_a_terminal_progress_is_a_line_now_and_then(monkeypatch, capsys: pytest.CaptureFixture[str]) -> None:

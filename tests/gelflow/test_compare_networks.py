@@ -33,8 +33,8 @@ from gelflow.files.exr import read_flow
 from gelflow.models.raft import RAFT
 from gelflow.models.registration import registered
 from gelflow.models.weights import read_metadata
-from gelflow.train import train
-from gelflow.train.test_time import fine_tuned, fine_tuning_settings
+from gelflow.training import train
+from gelflow.training.test_time import fine_tuned, fine_tuning_settings
 
 OWN = RegistrationConfig(windows_px=(8,), smoothing_px=(4,))
 CHOICES: tuple[Registration, Registration] = ("none", "brightness")

@@ -18,7 +18,7 @@ from gelflow.compare.run import compare, latex
 from gelflow.compare.scores import evaluate, summarise
 from gelflow.compare.seeds import group_name, grouped
 from gelflow.compare.strata import EDGE, MOTION, PATTERN, SCENE, merged, pair_strata, signed_distance
-from gelflow.compare.tables import pair_table, strata_table, summary_table, tables
+from gelflow.compare.tables import EXPLAINED, pair_table, strata_table, summary_table, tables
 from gelflow.data import PairDataset
 from gelflow.files.image import read_image
 
@@ -55,6 +55,18 @@ def test_bins_of_seeds_are_pooled_and_fine_tuned_methods_and_other_devices_come_
     assert (header[-1], rows[1][-1]) == ("on", "NVIDIA H200")
     # A GPU is charged time as it passes, a processor that of a core.
     assert [one.cost_seconds for one in means] == [0.5, 2.0]
+
+
+def test_columns_that_need_words_have_them(tmp_path: Path) -> None:
+    result = compare([Constant("net", 1, 0)], PairDataset(write_synthetic(tmp_path, [(1.0, 0.0)])))
+    known = {"dot_distance_px": 0.1, "dot_p90_px": 0.3, "own_dots": 0.9, "closure_px": 0.1, "closure_p90_px": 0.2}
+    known |= {"unknown": 0.1, "certain": 0.8, "calibration": 0.7}
+    title, (header, _) = tables(replace(result, scores=(replace(result.scores[0], **known),)))[0]
+    explained = {line.partition(":")[0].split(", ")[0]: line for line in title.splitlines()[1:]}
+    assert list(explained) == list(EXPLAINED)
+    assert set(explained) < set(header)
+    assert "within a quarter of the pitch" in explained["own dot %"]
+    assert "own dot %" not in tables(result)[0][0]
 
 
 def test_latex_escapes_distance_is_signed_and_pairs_add_up_pixel_by_pixel() -> None:

@@ -15,6 +15,7 @@ from commands import refused
 from samples import synth_sample, write_dataset
 
 from gelflow.data import PairDataset
+from gelflow.data.open import holds_pairs
 from synth.dataset import export as exporting
 from synth.dataset.sample import Sample
 
@@ -61,6 +62,27 @@ def test_shards_give_the_bits_of_the_data_set(tmp_path: Path, dtype: type) -> No
     assert set(shards[0]) == {"image1", "image2", "name", "bare", "flow", "visible"}
     assert shards[0]["bare"] is True
     assert all_bits(shards) == all_bits(data)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_exports_as_flo_are_pairs_and_shards_have_the_contact(tmp_path: Path, dtype: type) -> None:
+    samples = [synth_sample(index, dtype) for index in (0, 1)]
+    contact = np.zeros((64, 64), np.float32)
+    contact[20:30, 5:9] = 1.0
+    samples[1].flow.extras["contact.Y"] = contact
+    folders = write_both(tmp_path, samples)
+    data, shards = map(PairDataset, folders)
+    np.testing.assert_array_equal(shards.truth(1).contact, contact == 1)
+    assert shards.truth(0).contact is data.truth(0).contact is None
+    exporting.export(folders[0], "flo", tmp_path / "flo")
+    for folder in (tmp_path / "flo", tmp_path / "flo" / "data"):
+        assert holds_pairs(folder)
+        chairs = PairDataset(folder)
+        assert chairs.names == data.names
+        for index in (0, 1):
+            np.testing.assert_array_equal(chairs.images(index), data.images(index))
+    (tmp_path / "flo" / "data" / "000001_img2.ppm").unlink()
+    refused(r"000001_img2\.ppm: the file is missing", PairDataset, tmp_path / "flo")
 
 
 def test_one_shard_alone_workers_and_copies_read_the_same(both: tuple[Path, Path]) -> None:

@@ -30,7 +30,7 @@ from gelflow.losses.regularisers import (
 )
 from gelflow.ops.pyramid import flow_pyramid
 from gelflow.ops.warp import inside, warp
-from gelflow.train.module import validation_metrics
+from gelflow.training.module import validation_metrics
 
 ONES = torch.ones(1, 1, 9, 11, dtype=torch.float64)
 

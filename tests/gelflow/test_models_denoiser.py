@@ -11,7 +11,7 @@ from gelflow.config import REGISTRATIONS, ModelConfig, TrainConfig
 from gelflow.config.sources import train_config
 from gelflow.models.denoiser import Denoiser
 from gelflow.models.weights import load_weights, weights_file
-from gelflow.train import train
+from gelflow.training import train
 
 MODEL = ModelConfig(levels=4, projected_channels=8, registration=REGISTRATIONS["motion"])
 LOSS = {"lambda_s": [1.0, 1.0, 1.0]}

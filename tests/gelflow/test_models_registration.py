@@ -18,7 +18,7 @@ from gelflow.models.propagation import propagated
 from gelflow.models.registration import registered
 from gelflow.models.weights import load_weights, save_weights
 from gelflow.ops.warp import warp
-from gelflow.train import train
+from gelflow.training import train
 
 HEIGHT, WIDTH = 96, 128
 MOTION, BOTH, BRIGHTNESS = RegistrationConfig(), REGISTRATIONS["both"], REGISTRATIONS["brightness"]

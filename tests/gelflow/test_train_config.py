@@ -15,7 +15,7 @@ from gelflow.config import REGISTRATIONS, LossConfig, ModelConfig, RegistrationC
 from gelflow.config.sources import PRESETS, train_config
 from gelflow.config.validation import validated
 from gelflow.models.gelflow import CORRELATION_RADIUS, FINEST_SCALE
-from gelflow.train import train
+from gelflow.training import train
 
 
 def test_defaults_are_the_readings_of_the_paper_and_its_preset_states_them() -> None:
@@ -123,4 +123,4 @@ def test_settings_come_from_a_file_a_preset_and_assignments(tmp_path: Path) -> N
     words = r"papier: neither a configuration file nor a preset; presets are best, real, bare, paper"
     refused(words, train_config, "papier")
     assert train_config("best", ["steps=1e2"]).warmup_steps == 99
-    refused("must be below steps = 4", train_config, "best", ["warmup_steps=4"], {"steps": 4})
+    refused("must be below steps = 4", train_config, "best", ["warmup_steps=4", "steps=4"])

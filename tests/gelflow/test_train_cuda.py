@@ -13,7 +13,7 @@ from gelflow.models.recorded import GraphedNetwork, RecordedNetwork
 from gelflow.models.registration import registered
 from gelflow.models.weights import load_weights
 from gelflow.ops.correlation import local_correlation
-from gelflow.train import train
+from gelflow.training import train
 
 pytestmark = [pytest.mark.cuda, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")]
 

@@ -22,10 +22,10 @@ from gelflow.config.sources import train_config
 from gelflow.data import PairDataset
 from gelflow.losses import flow_loss, self_supervised_loss
 from gelflow.models import GelFlow
-from gelflow.train import module, train
-from gelflow.train.module import FlowModule
-from gelflow.train.samples import checked, collate
-from gelflow.train.state import load_state
+from gelflow.training import module, train
+from gelflow.training.module import FlowModule
+from gelflow.training.samples import checked, collate
+from gelflow.training.state import load_state
 
 EVERYTHING = {"lambda_s": [1.0, 1.0, 1.0], "occlusion": "forward_backward", "lambda_ar": 0.01}
 LOSS = LossConfig(lambda_s=(1, 1, 1))

@@ -1,9 +1,13 @@
 """Whole runs, small: they learn, they resume bit by bit, they refuse what is not theirs."""
 
+import errno
 import json
 import multiprocessing
 import os
+import resource
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +18,16 @@ from textures import table, write_folder
 from torch.utils.data import Dataset
 from waves import Shifts, same_weights, small, weights_of
 
+import gelflow
+from gelflow.cli import main
 from gelflow.config import TrainConfig
 from gelflow.data import PairDataset
 from gelflow.errors import InputError
 from gelflow.models.estimate import estimate_flow
 from gelflow.models.weights import load_weights, read_metadata
-from gelflow.train import train
-from gelflow.train.module import learning_rate_factor
-from gelflow.train.state import load_state
+from gelflow.training import train
+from gelflow.training.module import learning_rate_factor
+from gelflow.training.state import load_state
 
 
 @pytest.fixture(scope="module")
@@ -115,6 +121,68 @@ def test_a_pair_that_a_loading_process_cannot_use_is_named_and_the_process_ends(
         process.terminate()
         process.join(10)
         assert process.exitcode == 0
+
+
+UNGUARDED = """
+import torch
+from torch.utils.data import DataLoader
+from gelflow.config import TrainConfig
+from gelflow.training.loading import end_with_run, loading_context
+print("begins", flush=True)
+context = loading_context(TrainConfig(devices=2, workers=1))
+loader = DataLoader(torch.arange(3), num_workers=1, multiprocessing_context=context, worker_init_fn=end_with_run)
+print([int(one) for one in loader])
+"""
+
+
+def test_loading_processes_beside_several_devices_need_no_main_guard(tmp_path: Path) -> None:
+    (tmp_path / "load.py").write_text(UNGUARDED)
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    command = [sys.executable, str(tmp_path / "load.py")]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.stdout == "begins\n[0, 1, 2]\n", done.stderr
+
+
+def test_several_devices_from_a_program_that_is_no_file_are_refused(pairs: Shifts, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["-"])
+    refused("devices = 2: .* not typed or piped", train, small(steps=2, devices=2), pairs, None, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_full_disk_is_one_error_that_says_how_to_go_on(pairs: Shifts, tmp_path: Path, monkeypatch, capfd) -> None:
+    """The kernel refuses what goes beyond 8 KiB of a file; then TensorBoard's thread, which prints what it meets."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (8192, before[1]))
+    try:
+        with pytest.raises(OSError, match="File too large; stopped; nothing has been saved yet") as caught:
+            train(small(steps=2), pairs, None, tmp_path / "state")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert caught.value.filename == str(tmp_path / "state" / "state.ckpt")
+    assert sorted(path.name for path in (tmp_path / "state").iterdir()) == ["logs", "run.json"]
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("tensorboard.summary.writer.record_writer.RecordWriter.write", refuse)
+    with pytest.raises(OSError, match="No space left on device; stopped") as caught:
+        train(small(steps=2), pairs, None, tmp_path / "logs")
+    assert caught.value.filename == str(tmp_path / "logs")
+    assert "Traceback" not in capfd.readouterr().err
+
+
+def test_python_trains_as_the_command_does(tmp_path: Path) -> None:
+    folder, settings = write_folder(tmp_path / "data", {"a": (1, 0), "b": (0, 1)}), ["device=cpu", "batch_size=1"]
+    settings += ["image_size=[64, 64]", "seed=3"]
+    first = gelflow.train(str(folder), tmp_path / "first", "paper", [*settings, "steps=1"], validation=[folder])
+    assert first.weights == tmp_path / "first" / "weights.safetensors"
+    assert first.metrics["psnr_db"] > 0
+    second = gelflow.train([folder], tmp_path / "second", "paper", [*settings, "steps=1"], weights=first.weights)
+    command = ["finetune", folder, "--out", tmp_path / "third", "--weights", first.weights, "--config", "paper"]
+    command += ["--steps", 1, *(word for setting in settings for word in ("--set", setting))]
+    assert main(list(map(str, command))) == 0
+    assert same_weights(second.weights, tmp_path / "third" / "weights.safetensors")
+    assert not same_weights(first.weights, second.weights)
 
 
 @pytest.mark.parametrize("steps", [4, 2])

@@ -10,9 +10,17 @@ from waves import Shifts, pixel_centres, wave_image
 from gelflow.config import MotionConfig, TrainConfig
 from gelflow.config.sources import train_config
 from gelflow.ops.warp import inside, warp
-from gelflow.train.augment import augmented
-from gelflow.train.loading import resident
-from gelflow.train.samples import CheckedPairs, StepSampler, TrainingSamples, augmented_batch, checked, collate, resized
+from gelflow.training.augment import augmented
+from gelflow.training.loading import resident
+from gelflow.training.samples import (
+    CheckedPairs,
+    StepSampler,
+    TrainingSamples,
+    augmented_batch,
+    checked,
+    collate,
+    resized,
+)
 
 
 def test_passes_see_every_pair_once_a_later_start_goes_on_and_processes_share_batches() -> None:

@@ -4,13 +4,14 @@ import json
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from commands import refused
 from render_scenes import FAST, SCALAR, flat_surface, plain, rendered, small_sensor
 from tiny_scene import CONTACT, LIGHTS, SENSOR, fingerprint, own_cache, write_tiny
 
-from synth.dataset.export import export
+from synth.dataset.export import export, left_out
 from synth.dataset.exr import read_flow, write_flow
 from synth.dataset.reader import read_dataset
 from synth.inspect import inspect, tables, write_html, write_sheet
@@ -49,9 +50,11 @@ def test_each_camera_has_its_files_and_is_read_and_exported_by_its_name(dataset,
     np.testing.assert_array_equal(main.further["left"].image2, left.image2)
     refused(r"no camera 'right'.*left", data.read, 0, "right")
     assert export(dataset, "flo", tmp_path / "left", camera="left") == 2
-    assert np.frombuffer((tmp_path / "left" / "000000_flow.flo").read_bytes()[4:12], "<i4").tolist() == [40, 30]
-    source = dataset / "samples" / "000000" / "left" / "image2.png"
-    assert (tmp_path / "left" / "000000_img2.png").read_bytes() == source.read_bytes()
+    files = tmp_path / "left" / "data"
+    assert np.frombuffer((files / "000000_flow.flo").read_bytes()[4:12], "<i4").tolist() == [40, 30]
+    np.testing.assert_array_equal(cv2.imread(str(files / "000000_img2.ppm"))[..., ::-1], left.image2)
+    assert left_out(dataset).endswith(", pairs of left")
+    assert left_out(dataset, "left").endswith(", pairs of the main camera")
 
 
 def test_verify_checks_every_camera(dataset, tmp_path):

@@ -65,6 +65,15 @@ def _imports_of(modules: dict[str, ast.Module]) -> list[tuple[str, str]]:
     return [(name, imported) for name, tree in modules.items() for imported in sorted(_imports(tree))]
 
 
+def test_the_public_names_are_those_of_the_interface() -> None:
+    """In a fresh process, and after everything that they load has left its modules in the packages."""
+    code = "import synth, gelflow; [getattr(package, name) for package in (synth, gelflow) for name in dir(package)]"
+    command = [sys.executable, "-c", f"{code}; print(dir(synth), dir(gelflow)); print(gelflow.train)"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    names = ["generate", "load_scene", "plan", "read_dataset"], ["PairDataset", "load_model", "train"]
+    assert done.stdout.startswith(f"{names[0]} {names[1]}\n<function train"), done.stderr
+
+
 def test_every_module_has_a_stage_and_imports_only_from_earlier_ones() -> None:
     assert len(SYNTH) > 80
     assert ("synth.cli", "synth.errors") in _imports_of(SYNTH), "a finder that sees nothing would pass always"
@@ -80,7 +89,7 @@ def test_every_module_has_a_stage_and_imports_only_from_earlier_ones() -> None:
 
 ROOMS = (
     "errors", "arrays", "untrusted", "hardware", "terminal", "config", "files", "ops", "models", "losses", "data",
-    "baselines", "predict", "compare", "train", "cli", "__main__",
+    "baselines", "predict", "compare", "training", "cli", "__main__",
 )  # fmt: skip
 """The same for the parts of gelflow."""
 
@@ -129,7 +138,7 @@ load_weights(weights_file(None))
 print(*sys.modules)"""
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert "gelflow.models.gelflow" in done.stdout.split()
-    assert not [name for name in done.stdout.split() if name.startswith(("gelflow.train", "lightning"))]
+    assert not [name for name in done.stdout.split() if name.startswith(("gelflow.training", "lightning"))]
     assert not _loaded_after("import gelflow.config") & {"torch", "numpy", "lightning"}
     own_cache(monkeypatch)
     scene = write_tiny(tmp_path)

@@ -1,6 +1,8 @@
 """Worker processes and threads: one core each, the bits of a run without them, textures painted ahead."""
 
 import os
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -22,6 +24,7 @@ from synth.pipeline.worker_pool import THREADS, one_thread_each, outcomes_of_pro
 from synth.scene import Sensor
 from synth.scene.template import load_scene
 
+ROOT = Path(__file__).parents[2]
 pytestmark = pytest.mark.usefixtures("one_cache")
 
 
@@ -30,6 +33,25 @@ def test_a_worker_changes_no_bit(tmp_path: Path) -> None:
     out = tmp_path / "d"
     generate(load_scene(write_tiny(tmp_path)), 5, out, scheduling=Scheduling(workers=1))
     assert fingerprint(out) == fingerprint(reference())
+
+
+UNGUARDED = """
+import sys, synth
+from synth.pipeline.generate import Scheduling
+print("begins", flush=True)
+print(synth.generate(sys.argv[1], n=2, out=sys.argv[2], scheduling=Scheduling(workers=2)).made)
+"""
+
+
+@pytest.mark.parametrize("piped", [True, False])
+def test_a_script_needs_no_main_guard(tmp_path: Path, piped: bool) -> None:
+    (tmp_path / "make.py").write_text(UNGUARDED)
+    command = [sys.executable, "-" if piped else "make.py", str(write_tiny(tmp_path)), "out"]
+    given, environment = UNGUARDED if piped else None, os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        command, cwd=tmp_path, input=given, env=environment, capture_output=True, text=True, check=False
+    )
+    assert (done.stdout, done.stderr) == ("begins\n2\n", "")
 
 
 def _threads(context: JobContext) -> Callable[[Task], tuple[int, ...]]:

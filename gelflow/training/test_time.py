@@ -24,8 +24,8 @@ from gelflow.config.validation import validated
 from gelflow.data.pairs import PairDataset
 from gelflow.errors import InputError
 from gelflow.models.weights import read_metadata
-from gelflow.train.run import train
-from gelflow.train.state import STATE
+from gelflow.training.run import train
+from gelflow.training.state import STATE
 from gelflow.untrusted import parsed
 
 BATCH = 4
@@ -74,7 +74,7 @@ def fine_tuned(method: Learned, dataset: PairDataset, out: Path, steps: int) -> 
 
     A run of the same settings in the folder `out` is resumed, or used if it is finished. It is the same run however the
     flow is registered. InputError where the pairs differ in size and the network has none of its own; see also
-    `fine_tuning_settings` and `gelflow.train.train`.
+    `fine_tuning_settings` and `gelflow.training.train`.
     """
     settings = fine_tuning_settings(method, steps, len(dataset))
     sizes = {dataset.images(index)[0].shape[:2] for index in range(len(dataset))}

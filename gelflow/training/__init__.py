@@ -1,5 +1,5 @@
 """Training: one run in one folder, resumable, with logs and weights."""
 
-from gelflow.train.run import train
+from gelflow.training.run import train
 
 __all__ = ["train"]

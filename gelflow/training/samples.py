@@ -15,7 +15,7 @@ from torch.utils.data import Dataset, Sampler
 from gelflow.config import MINIMUM_SIDE, TrainConfig
 from gelflow.errors import InputError
 from gelflow.ops.pyramid import resize_flow, resize_images
-from gelflow.train.augment import augmented
+from gelflow.training.augment import augmented
 
 Sample = dict[str, Any]
 """image1, image2: (3, H, W) float32 in [0, 1]; name; perhaps bare: whether the gel has no pattern; perhaps flow:

@@ -12,10 +12,12 @@ by bit.
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from multiprocessing import forkserver, resource_tracker
-from multiprocessing.context import BaseContext
+from multiprocessing.context import BaseContext, ForkServerContext, ForkServerProcess
 from multiprocessing.process import BaseProcess
+from types import ModuleType
 from typing import Any
 
 import torch
@@ -23,7 +25,23 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from gelflow.config import TrainConfig
-from gelflow.train.samples import CheckedPairs, Sample
+from gelflow.training.samples import CheckedPairs, Sample
+
+
+class _Loader(ForkServerProcess):
+    """A process that does not run the user's script again, which would train in it where no main guard keeps it."""
+
+    def start(self) -> None:
+        main = sys.modules["__main__"]
+        sys.modules["__main__"] = ModuleType("__main__")
+        try:
+            super().start()
+        finally:
+            sys.modules["__main__"] = main
+
+
+class _ForkServerContext(ForkServerContext):
+    Process = _Loader
 
 
 def loading_context(config: TrainConfig) -> BaseContext | None:
@@ -34,7 +52,7 @@ def loading_context(config: TrainConfig) -> BaseContext | None:
     """
     if config.workers == 0 or config.devices * config.nodes == 1:
         return None
-    context = multiprocessing.get_context("forkserver")
+    context = _ForkServerContext()
     context.set_forkserver_preload([__package__])
     resource_tracker.ensure_running()  # would else be started by the next call but one, and unblock the signals
     former = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})  # inherited by the server

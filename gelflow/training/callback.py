@@ -22,8 +22,8 @@ from gelflow.config import TrainConfig
 from gelflow.errors import InputError
 from gelflow.models.weights import save_weights
 from gelflow.terminal import Advance
-from gelflow.train.module import LOG_EVERY, FlowModule
-from gelflow.train.state import WEIGHTS, State, save_state
+from gelflow.training.module import LOG_EVERY, FlowModule
+from gelflow.training.state import WEIGHTS, State, save_state
 
 
 class Throughput:

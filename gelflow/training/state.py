@@ -8,6 +8,7 @@ logs/                TensorBoard and CSV, a subfolder per session
 """
 
 import hashlib
+import io
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -47,8 +48,10 @@ class State:
 
 def save_state(out: Path, state: State) -> None:
     """Writes what a training continues from, as a whole or not at all."""
-    with replacing(out / STATE) as temporary, temporary.open("wb") as file:
-        torch.save(dict(vars(state)), file)
+    content = io.BytesIO()  # torch.save into a file reports a full disk as an error of its own, which names no file
+    torch.save(dict(vars(state)), content)
+    with replacing(out / STATE) as temporary:
+        temporary.write_bytes(content.getbuffer())
 
 
 def load_state(out: Path) -> State:

@@ -6,6 +6,7 @@ end with the same weights, bit by bit.
 """
 
 import sys
+import threading
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -26,7 +27,7 @@ from gelflow.models import GelFlow
 from gelflow.models.denoiser import Denoiser
 from gelflow.models.weights import load_weights, save_weights
 from gelflow.terminal import progress
-from gelflow.train.callback import (
+from gelflow.training.callback import (
     CheckpointCallback,
     Stopped,
     describe,
@@ -35,10 +36,10 @@ from gelflow.train.callback import (
     stopping,
     weights_metadata,
 )
-from gelflow.train.loading import ResidentPairs, end_with_run, loading_context, resident
-from gelflow.train.module import FlowModule, check_side
-from gelflow.train.samples import CheckedPairs, StepSampler, TrainingSamples, augmented_batch, checked, collate
-from gelflow.train.state import STATE, WEIGHTS, State, load_state, open_run
+from gelflow.training.loading import ResidentPairs, end_with_run, loading_context, resident
+from gelflow.training.module import FlowModule, check_side
+from gelflow.training.samples import CheckedPairs, StepSampler, TrainingSamples, augmented_batch, checked, collate
+from gelflow.training.state import STATE, WEIGHTS, State, load_state, open_run
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class TrainResult:
     """What a run ended with.
 
     `weights` are the best on the validation pairs, without such pairs the last; `metrics` those of the last validation
-    (`gelflow.train.module.METRICS`); `best` the best validation score: endpoint error in px where the flow is known,
+    (`gelflow.training.module.METRICS`); `best` the best validation score: endpoint error in px where the flow is known,
     else photometric loss. Speed (of this session, validation left out) is None where unknown.
     """
 
@@ -73,24 +74,11 @@ def train(
     initial: Path | None = None,
     resume: bool = False,
 ) -> TrainResult:
-    """Trains a network and writes its weights.
+    """Trains a network on data sets that are open; arguments, results and exceptions else as of `job.train`.
 
-    Args:
-        config: The run.
-        train_set: Map-style, with a length; samples are dictionaries with `image1` and `image2` (3, H, W) float32 in
-            [0, 1], `name`, and where it is known `flow` (2, H, W) float32 in px, NaN where no gel is seen.
-        validation_set: The same; None: no validation.
-        out: Folder of the run, see `gelflow.train.state`.
-        initial: Weights to start from (fine-tuning); their architecture must be `config.model`.
-        resume: Go on with the run that `out` holds.
-
-    Returns:
-        Where the weights are, and the last results.
-
-    Raises:
-        InputError: Settings, data, folder or weights that cannot be used; a loss that is no longer finite.
-        KeyboardInterrupt: Ctrl-C or SIGTERM; the state has been saved, the message says how to go on.
-        OSError: The disk is full or the folder cannot be written to.
+    Data sets are map-style and have a length; samples are dictionaries with `image1` and `image2` (3, H, W) float32 in
+    [0, 1], `name`, and where it is known `flow` (2, H, W) float32 in px, NaN where no gel is seen. The architecture of
+    the `initial` weights must be `config.model`.
     """
     pairs, validation_pairs = _length(train_set), 0 if validation_set is None else _length(validation_set)
     if pairs == 0 or (validation_set is not None and validation_pairs == 0):
@@ -132,6 +120,9 @@ def _device(config: TrainConfig) -> str:
     device = chosen_device(config.device)
     if device == "cuda" and config.devices > torch.cuda.device_count():
         raise InputError(f"devices = {config.devices}: this machine has {torch.cuda.device_count()} CUDA devices")
+    if config.devices > 1 and (hasattr(sys, "ps1") or not Path(sys.argv[0]).is_file()):
+        raise InputError(f"devices = {config.devices}: every device runs your program; it must be a file, not typed or "
+                         "piped into Python")  # fmt: skip
     return device
 
 
@@ -183,12 +174,20 @@ def _fit(callback: CheckpointCallback, data: "_Data", device: str, validation_du
         )
         callback.advance = stack.enter_context(progress("training", shown=trainer.is_global_zero))
         stack.enter_context(stopping(callback))
+        former = threading.excepthook  # TensorBoard's thread hands its OSError to this one, which tells it
+        stack.callback(setattr, threading, "excepthook", former)
+        threading.excepthook = lambda args: None if issubclass(args.exc_type, OSError) else former(args)
         try:
             trainer.fit(module, datamodule=data)
         except (Stopped, SIGTERMException):  # Lightning raises the latter for a signal before the first step
             if not trainer.is_global_zero:
                 sys.exit()  # message and exit status are the first process's
             raise KeyboardInterrupt(_how_to_go_on(config, out)) from None
+        except OSError as error:
+            if error.errno is None:  # of a process that loads data
+                raise
+            told = f"{error.strerror}; {_how_to_go_on(config, out)}"
+            raise OSError(error.errno, told, error.filename or str(out)) from error
         except InputError as error:  # of a process that loads data it comes with a traceback in its text
             raise InputError(str(error).rpartition(f"{InputError.__name__}: ")[2].strip()) from error
 
