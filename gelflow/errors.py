@@ -9,5 +9,10 @@ class InputError(ValueError):
     """
 
 
+def printable(text: str) -> str:
+    """The text with what a terminal would obey, or cannot show, written as an escape; lines stay lines."""
+    return "".join(char if char.isprintable() or char == "\n" else ascii(char)[1:-1] for char in text)
+
+
 class NothingFoundError(InputError):
     """A method that follows single points found none in a pair; `evaluate` scores it as no motion there."""

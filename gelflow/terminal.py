@@ -11,6 +11,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.table import Table
 from rich.text import Text
 
+from gelflow.errors import printable
+
 Advance = Callable[[int, int, str], None]
 """Takes the number of items done, the number of all, and a word on the present one."""
 LINE_S = 60.0
@@ -38,7 +40,7 @@ def progress(label: str, shown: bool = True) -> Iterator[Advance]:
                TimeRemainingColumn(), TextColumn("{task.fields[item]}", markup=False))  # fmt: skip
     with Progress(*columns, console=console, disable=not shown, transient=True) as bar:
         task = bar.add_task(label, total=None, item="")
-        yield lambda done, total, item: bar.update(task, completed=done, total=total, item=item)
+        yield lambda done, total, item: bar.update(task, completed=done, total=total, item=printable(item))
 
 
 def _lines(label: str) -> Advance:
@@ -48,7 +50,7 @@ def _lines(label: str) -> Advance:
         nonlocal told
         if time.monotonic() - told >= LINE_S and done < total:
             told = time.monotonic()
-            print(f"gelflow: {label}: {done} of {total}{item and f'; {item}'}", file=sys.stderr, flush=True)
+            print(printable(f"gelflow: {label}: {done} of {total}{item and f'; {item}'}"), file=sys.stderr, flush=True)
 
     return advance
 
@@ -74,5 +76,5 @@ def show_table(title: str, header: list[str], rows: list[list[str]]) -> None:
         for number, (name, *_) in enumerate(part):
             table.add_column(Text(name), justify="right" if number else "left", no_wrap=number > 0, overflow="fold")
         for row in list(zip(*part, strict=True))[1:]:
-            table.add_row(*map(Text, row))
+            table.add_row(*map(Text, map(printable, row)))
         console.print(table)

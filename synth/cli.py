@@ -15,7 +15,7 @@ from cyclopts import App, CycloptsError, Parameter
 from synth import __version__
 from synth.cli_options import DEFAULT_SCENE, AsJson, Assignments, SceneName, whole
 from synth.commands import export, generate, inspect, plan, simulate, verify
-from synth.errors import InputError
+from synth.errors import InputError, printable
 
 app = App(
     name="synth",
@@ -84,10 +84,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     tokens = [token for token in tokens if token != "--debug"]
     try:
         status = app(tokens, exit_on_error=False, print_error=False)
-    except (InputError, CycloptsError, OSError, KeyboardInterrupt) as error:
+    except (InputError, CycloptsError, OSError, MemoryError, RecursionError, KeyboardInterrupt) as error:
         if debug:
             traceback.print_exc()
-        print(f"synth: {_message(error, tokens[0])}", file=sys.stderr)
+        print(f"synth: {printable(_message(error, tokens[0]))}", file=sys.stderr)
         return 130 if isinstance(error, KeyboardInterrupt) else 2
     return status if isinstance(status, int) else 0
 
@@ -96,6 +96,8 @@ def _message(error: BaseException, command: str) -> str:
     if isinstance(error, KeyboardInterrupt):
         kept = "; finished samples are kept: run the same command again to go on" if command == "generate" else ""
         return f"interrupted{kept}"
+    if isinstance(error, MemoryError | RecursionError):
+        return f"out of memory, or nested too deeply ({error}); give less at once"
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
     return str(error).strip()

@@ -14,7 +14,7 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from synth.cli_options import DEFAULT_SCENE, AsJson, Assignments, Dataset, Device, SceneName, whole
-from synth.errors import InputError
+from synth.errors import InputError, printable
 
 if TYPE_CHECKING:
     from synth.pipeline.generate import Summary
@@ -222,7 +222,7 @@ def _loaded(scene: str, assignments: Sequence[str] | None) -> Template:
 
     template = load_scene(scene, assignments or [])
     for warning in dict.fromkeys(line for corner in template.corners for line in corner.warnings):
-        print(f"synth: warning: {template.label}: {warning}", file=sys.stderr)
+        print(printable(f"synth: warning: {template.label}: {warning}"), file=sys.stderr)
     return template
 
 

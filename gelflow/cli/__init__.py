@@ -15,7 +15,7 @@ from gelflow.cli.prediction import export, live, predict
 from gelflow.cli.recordings import pairs
 from gelflow.cli.scoring import compare, evaluate
 from gelflow.cli.training import finetune, train
-from gelflow.errors import InputError
+from gelflow.errors import InputError, printable
 
 app = App(
     name="gelflow",
@@ -36,15 +36,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     tokens = [token for token in tokens if token != "--debug"]
     try:
         status = app(tokens, exit_on_error=False, print_error=False)
-    except (InputError, CycloptsError, OSError, KeyboardInterrupt) as error:
+    except (InputError, CycloptsError, OSError, MemoryError, RecursionError, KeyboardInterrupt) as error:
         if debug:
             traceback.print_exc()
-        print(f"gelflow: {_one_line(error)}", file=sys.stderr)
+        print(f"gelflow: {printable(_one_line(error))}", file=sys.stderr)
         return 130 if isinstance(error, KeyboardInterrupt) else 2
     return status if isinstance(status, int) else 0
 
 
 def _one_line(error: BaseException) -> str:
+    if isinstance(error, MemoryError | RecursionError):
+        return f"out of memory, or nested too deeply ({error}); give less at once"
     if isinstance(error, FileExistsError | NotADirectoryError):
         return f"{error.filename}: is a file or lies in one; a folder is needed"
     if isinstance(error, OSError) and error.filename is not None:

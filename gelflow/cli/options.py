@@ -45,7 +45,7 @@ def whole(at_least: int) -> Callable[[Any, Sequence[Token]], int]:
 
     def convert(_: Any, tokens: Sequence[Token]) -> int:
         text = tokens[0].value
-        if not re.fullmatch(r"[+-]?\d+", text) or int(text) < at_least:
+        if not re.fullmatch(r"[+-]?\d{1,18}", text) or int(text) < at_least:
             raise ValueError(f"it is {text!r}, allowed are whole numbers from {at_least} on")
         return int(text)
 
@@ -66,7 +66,7 @@ def parse_size(text: str | None) -> tuple[int, int] | None:
     if text is None:
         return None
     rows, _, columns = text.lower().partition("x")
-    if not (rows.isdigit() and columns.isdigit()):
+    if not all(re.fullmatch(r"[0-9]{1,9}", side) for side in (rows, columns)):
         raise InputError(f"--size {text}: ROWSxCOLUMNS is needed, for instance --size 512x640")
     if int(rows) * int(columns) > MAXIMUM_PIXELS:
         raise InputError(

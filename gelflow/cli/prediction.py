@@ -26,7 +26,7 @@ from gelflow.cli.options import (
     parse_size,
     whole,
 )
-from gelflow.errors import InputError
+from gelflow.errors import InputError, printable
 
 if TYPE_CHECKING:
     from gelflow.baselines import Method
@@ -174,9 +174,9 @@ def _show(result: Prediction, name: str, as_json: bool) -> None:
         return
     largest = max(result.motions, key=lambda motion: motion.p95_px)
     where = f" in number {largest.frame} ({largest.file}), where most moves," if len(result.motions) > 1 else ""
-    print(f"{name}:{where} {_words(largest)}")
+    print(printable(f"{name}:{where} {_words(largest)}"))
     shown = result.files if len(result.files) <= 6 else [result.files[0], "...", *result.files[-3:]]
-    print(f"written: {', '.join(str(file) for file in shown)}")
+    print(printable(f"written: {', '.join(str(file) for file in shown)}"))
 
 
 def export(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 from cyclopts import Parameter
 
 from gelflow.cli.options import AsJson, Out, whole
-from gelflow.errors import InputError
+from gelflow.errors import InputError, printable
 
 if TYPE_CHECKING:
     from gelflow.data.pairset import PairSet, SourceReport
@@ -47,7 +47,7 @@ def pairs(
 
         def step(done: int, total: int, name: str, outcome: SourceReport | str) -> None:
             if isinstance(outcome, str):
-                print(f"gelflow: skipped: {outcome}", file=sys.stderr)
+                print(printable(f"gelflow: skipped: {outcome}"), file=sys.stderr)
             advance(done, total, name)
 
         result = extract_pairs(inputs, out, config, step)

@@ -16,28 +16,42 @@ MINIMUM_SIDE = 64
 """Images with a side below this many px have no coarsest scale worth decoding."""
 
 
+MAXIMUM_PIXELS = 2048 * 1536
+"""Largest size that weights may ask for; a network takes at least 0.9 kB of memory for each pixel."""
+
+
+def size_problem(rows: int, columns: int) -> str:
+    """What keeps a size from being one at which a network works; an empty text where nothing does."""
+    if min(rows, columns) < MINIMUM_SIDE:
+        return f"[{rows}, {columns}]: each side must be at least {MINIMUM_SIDE} px"
+    return f"[{rows}, {columns}]: at most {MAXIMUM_PIXELS} px" if rows * columns > MAXIMUM_PIXELS else ""
+
+
 class _Frozen(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+Pixels = Annotated[float, Field(le=1000)]
 
 
 class RegistrationConfig(_Frozen):
     """Registration of the images from the network's flow on, see `gelflow.models.registration`. Not learned."""
 
-    windows_px: tuple[float, ...] = (12.0, 8.0, 5.0)
+    windows_px: Annotated[tuple[Pixels, ...], Field(max_length=16)] = (12.0, 8.0, 5.0)
     """Standard deviation of the Gaussian window of each stage, px of the images that the network sees."""
-    smoothing_px: tuple[float, ...] = (6.0, 2.0, 1.0)
+    smoothing_px: Annotated[tuple[Pixels, ...], Field(max_length=16)] = (6.0, 2.0, 1.0)
     """Standard deviation of the Gaussian that smooths the flow before each stage, px; 0: none."""
     iterations: int = Field(default=2, ge=1, le=100)
     """Gauss-Newton steps of each stage."""
     prior_px: float = Field(default=0.2, gt=0)
     """Error of each component of the flow that a stage starts from, as far as anybody knows without the images."""
-    background_px: float | None = Field(default=4.0, gt=0)
+    background_px: float | None = Field(default=4.0, gt=0, le=1000)
     """The residual counts without its mean under a Gaussian of this standard deviation, px: shading does not move with
     the gel. None: as it is, flow that explains shading, too."""
     noise: float = Field(default=0.04, gt=0)
     """Standard deviation that the residual has at least in each colour, of a white of 1: the camera's noise, and what
     shading changes. The larger, the more texture a window needs before it outweighs the network."""
-    propagation_px: tuple[Annotated[int, Field(ge=1)], ...] = (4, 8, 16, 32)
+    propagation_px: Annotated[tuple[Annotated[int, Field(ge=1, le=4096)], ...], Field(max_length=16)] = (4, 8, 16, 32)
     """Distances of the neighbours whose flow is tried before each stage, under its window; none: no such step."""
     after: RegistrationConfig | None = None
     """Registration that comes before the stages. Its flow stays where it leaves a residual below its `noise`. Setting
@@ -50,6 +64,8 @@ class RegistrationConfig(_Frozen):
             raise ValueError(f"windows_px and smoothing_px need one number each for every stage, at least one: {given}")
         if min(self.windows_px) < 1 or min(self.smoothing_px) < 0:
             raise ValueError("windows_px must be at least 1, smoothing_px at least 0")
+        if self.after is not None and self.after.after is not None:
+            raise ValueError("after: comes before the stages, and nothing before that")
         return self
 
 
@@ -248,8 +264,8 @@ class TrainConfig(_Frozen):
         if len(self.loss.lambda_s) != scales:
             raise ValueError(f"loss.lambda_s has {len(self.loss.lambda_s)} numbers; model.levels asks for {scales}")
         for name, size in (("image_size", self.image_size), ("crop_size", self.crop_size)):
-            if size is not None and min(size) < MINIMUM_SIDE:
-                raise ValueError(f"{name} = {list(size)}: each side must be at least {MINIMUM_SIDE} px")
+            if size is not None and (problem := size_problem(*size)):
+                raise ValueError(f"{name} = {problem}")
         if self.image_size and self.crop_size and any(map(gt, self.crop_size, self.image_size)):
             raise ValueError(f"crop_size = {list(self.crop_size)} does not fit into image_size {list(self.image_size)}")
         if self.warmup_steps >= self.steps:

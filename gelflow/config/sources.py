@@ -12,6 +12,7 @@ from typing import Any
 from gelflow.config import REGISTRATIONS, TrainConfig
 from gelflow.config.validation import validated
 from gelflow.errors import InputError
+from gelflow.untrusted import DEEPEST, MOST_TEXT, assigned_value, parsed, read_file
 
 PRESETS = ("best", "real", "bare", "paper", "selfflow", "arflow")
 """Names of the configurations that come with the package."""
@@ -44,17 +45,14 @@ def train_config(
 
 
 def _read(path: Path | str) -> dict[str, Any]:
+    place = Path(str(files("gelflow"))) / "presets" / f"{path}.toml" if str(path) in PRESETS else Path(path)
     try:
-        if str(path) in PRESETS:
-            text = files("gelflow").joinpath("presets", f"{path}.toml").read_text(encoding="utf-8")
-        else:
-            text = Path(path).read_text(encoding="utf-8")
-        return tomllib.loads(text)
+        return dict(parsed(tomllib.loads, read_file(place, MOST_TEXT).decode(), str(path)))
     except FileNotFoundError as error:
         raise InputError(
             f"{path}: neither a configuration file nor a preset; presets are {', '.join(PRESETS)}"
         ) from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path}: cannot be read as a TOML configuration: {error}") from error
 
 
@@ -80,12 +78,9 @@ def _spell_out(values: dict[str, Any]) -> None:
 def _assign(values: dict[str, Any], assignment: str) -> None:
     key, equals, text = assignment.partition("=")
     names = key.strip().split(".")
-    if not equals or not all(names):
-        raise InputError(f"--set {assignment}: KEY=VALUE is needed, for instance --set loss.lambda_dc=10")
-    try:
-        value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        value = text
+    if not equals or not all(names) or len(names) > DEEPEST or len(assignment.splitlines()) > 1:
+        raise InputError(f"--set {assignment!r}: KEY=VALUE is needed, such as loss.lambda_dc=10, in one line")
+    value = assigned_value(text, f"--set {key}")
     table = values
     for name in names[:-1]:
         if table.get(name) is None:  # what is switched off, such as model.registration, is switched on by its fields

@@ -7,6 +7,7 @@ a flipped bit among their numbers is not noticed.
 Reference: NumPy's file format, numpy.lib.format.
 """
 
+import errno
 import io
 import tokenize
 from dataclasses import dataclass
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from gelflow.errors import InputError
 from gelflow.files.exr import FlowField
+from gelflow.untrusted import MOST_BYTES, open_file
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
@@ -40,7 +42,9 @@ class Member:
     def read_bytes(self) -> bytes:
         """The content; InputError where the shard cannot be read or has become shorter, or a .png is none."""
         try:
-            with self.shard.open("rb") as file:
+            if self.size > MOST_BYTES:
+                raise OSError(errno.EFBIG, f"is larger than {MOST_BYTES} bytes")
+            with open_file(self.shard) as file:
                 file.seek(self.offset)
                 data = file.read(self.size)
         except OSError as error:
@@ -83,7 +87,7 @@ def _read_array(member: Member, dtype: type[np.generic]) -> NDArray[Any]:
     stream = io.BytesIO(member.read_bytes())
     try:
         array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
-    except (ValueError, TypeError, SyntaxError, MemoryError, tokenize.TokenError) as error:
+    except (ValueError, TypeError, SyntaxError, RecursionError, MemoryError, tokenize.TokenError) as error:
         raise InputError(f"{member}: not a readable .npy file, truncated or damaged ({error})") from error
     if array.dtype != dtype:
         raise InputError(f"{member}: {array.dtype} values; {np.dtype(dtype)} is needed")

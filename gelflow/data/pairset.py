@@ -15,15 +15,17 @@
 
 import json
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 
 from gelflow.data.pairs import PairRecord
 from gelflow.errors import InputError
 from gelflow.files.atomic import write_text
+from gelflow.untrusted import inside, read_file
 
 FILE = "pairs.json"
+FileName = Annotated[str, AfterValidator(inside)]
 
 
 class _Record(BaseModel):
@@ -33,9 +35,9 @@ class _Record(BaseModel):
 class ChosenPair(_Record):
     """One pair of the set; `motion_px` is the 95th percentile of the length of a cheap flow, in px."""
 
-    name: str
-    image1: str
-    image2: str
+    name: FileName
+    image1: FileName
+    image2: FileName
     source: str
     frames: tuple[int, int]
     motion_px: float
@@ -66,8 +68,8 @@ def read_pair_set(folder: Path) -> PairSet:
     """Reads pairs.json, which is there; InputError where it is damaged or of a newer format."""
     path = folder / FILE
     try:
-        return PairSet.model_validate_json(path.read_text(encoding="utf-8"))
-    except (ValidationError, UnicodeDecodeError) as error:
+        return PairSet.model_validate_json(read_file(path))
+    except (ValidationError, OSError) as error:
         detail = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
         raise InputError(f"{path}: not the description of a pair set ({detail})") from error
 

@@ -23,6 +23,7 @@ from gelflow.data.member import FlowMembers, Member
 from gelflow.data.pairs import PairRecord
 from gelflow.data.synthetic import origin, scene_and_pattern
 from gelflow.errors import InputError
+from gelflow.untrusted import inside, parsed
 
 SUFFIX = ".tar"
 _NEEDED = ("image1.png", "image2.png", "forward.npy", "forward_visible.npy", "json")
@@ -59,8 +60,10 @@ def _samples(shard: Path) -> dict[str, dict[str, Member]]:
     """Members by suffix, by key."""
     samples: dict[str, dict[str, Member]] = {}
     for member in _members(shard):
-        if member.name.startswith("/") or ".." in Path(member.name).parts:
-            raise InputError(f"{member}: leads out of its folder; export the shard again")
+        try:
+            inside(member.name)
+        except ValueError as error:
+            raise InputError(f"{shard}: member {error}; export the shard again") from None
         folder, slash, base = member.name.rpartition("/")
         stem, _, suffix = base.partition(".")
         parts = samples.setdefault(f"{folder}{slash}{stem}", {})
@@ -76,13 +79,15 @@ def _members(shard: Path) -> Iterator[Member]:
     try:
         with tarfile.open(shard, "r:") as archive:
             for info in archive:
+                if info.size < 0:
+                    raise tarfile.ReadError(f"{info.name!r} has a negative size")
                 end = info.offset_data + -(-info.size // _BLOCK) * _BLOCK
                 if info.isfile():
                     yield Member(shard, info.name, info.offset_data, info.size)
         with shard.open("rb") as file:
             file.seek(end)
             closing = file.read(len(_END))
-    except tarfile.TarError as error:
+    except (tarfile.TarError, ValueError, RecursionError, MemoryError) as error:
         raise InputError(f"{shard}: truncated, damaged or not an uncompressed tar file ({error}); copy or export it "
                          "again") from error  # fmt: skip
     except OSError as error:
@@ -99,7 +104,7 @@ def _record(shard: Path, key: str, members: dict[str, Member]) -> PairRecord:
                          "`python -m synth export --format webdataset`; export it again")  # fmt: skip
     flow = FlowMembers(members["forward.npy"], members["forward_visible.npy"], members.get("contact.Y.npy"))
     try:
-        meta = json.loads(members["json"].read_bytes())
+        meta = parsed(json.loads, members["json"].read_bytes(), key)
     except ValueError:
         meta = None  # written by another program
     images = (members["image1.png"], members["image2.png"])

@@ -13,6 +13,7 @@ from typing import Any
 
 from gelflow.data.pairs import PairRecord
 from gelflow.errors import InputError
+from gelflow.untrusted import parsed, read_file
 
 SCHEMA_VERSION = 1
 """Version of the format that is understood here."""
@@ -60,19 +61,17 @@ def scene_and_pattern(header: Any, meta: Path | None = None) -> str | None:
         scene = header["scene"]
         kind = scene["sensor"]["pattern"].get("kind")
         if not isinstance(kind, str) and meta is not None:
-            kind = json.loads(meta.read_text(encoding="utf-8"))["scene"]["sensor"]["pattern"]["kind"]
+            kind = json.loads(read_file(meta))["scene"]["sensor"]["pattern"]["kind"]
         return f"{scene['name']}, {kind}"
-    except (KeyError, TypeError, AttributeError, OSError, ValueError):
+    except (KeyError, TypeError, AttributeError, OSError, ValueError, RecursionError):
         return None  # written by another program, or before patterns were recorded
 
 
 def _read_header(path: Path) -> dict[str, Any]:
     try:
-        header = json.loads(path.read_text(encoding="utf-8"))
+        header = parsed(json.loads, read_file(path), str(path))
     except FileNotFoundError as error:
         raise InputError(f"{path}: the file is missing; this is not a whole synth data set") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid JSON ({error})") from error
     version = header.get("schema_version") if isinstance(header, dict) else None
     if version != SCHEMA_VERSION:
         raise InputError(f"{path}: schema_version is {version!r}; this gelflow reads {SCHEMA_VERSION}")
@@ -82,7 +81,7 @@ def _read_header(path: Path) -> dict[str, Any]:
 def _indices(path: Path) -> set[int]:
     """Indices in the manifest. A last line without its line end was cut by an interruption and does not count."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_file(path).decode("utf-8")
     except FileNotFoundError as error:
         raise InputError(f"{path}: the file is missing; no sample has been finished") from error
     except UnicodeDecodeError as error:
@@ -92,8 +91,7 @@ def _indices(path: Path) -> set[int]:
         if not line.strip():
             continue
         try:
-            entry: Any = json.loads(line)
-            indices.add(int(entry["index"]))
-        except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+            indices.add(int(json.loads(line)["index"]))
+        except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
             raise InputError(f"{path}, line {number}: not a sample's entry with an `index`") from error
     return indices

@@ -24,6 +24,7 @@ from gelflow.arrays import FlowArray, MapArray, MaskArray
 from gelflow.errors import InputError
 from gelflow.files.atomic import replacing
 from gelflow.files.quiet import quiet
+from gelflow.untrusted import MOST_VALUES
 
 DIRECTIONS = "U right, V down; I1(x) = I2(x + forward(x))"
 """Text in the header of every flow that gelflow writes, by which its files are known."""
@@ -48,10 +49,19 @@ def read_channels(path: Path) -> dict[str, NDArray[np.float32]]:
     if not path.is_file():
         raise InputError(f"{path}: there is no such file")
     try:
+        with quiet(), OpenEXR.File(str(path), header_only=True) as file:
+            header, parts = dict(file.header()), len(file.parts)  # the library empties its own on closing
+        low, high = (corner.astype(float) for corner in header["dataWindow"])
+        flat = parts == 1 and header["type"] in (OpenEXR.scanlineimage, OpenEXR.tiledimage)
+        if not flat or len(header["channels"]) * float(np.prod(high - low + 1)) > MOST_VALUES:
+            raise ValueError(f"it is not one flat image of at most {MOST_VALUES} values in all channels")
         with quiet(), OpenEXR.File(str(path), separate_channels=True) as file:
-            return {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
-    except (RuntimeError, ValueError, OSError) as error:
-        raise InputError(f"{path}: not a readable EXR file (truncated or damaged?)") from error
+            planes = {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
+        if len({plane.shape for plane in planes.values()}) != 1:
+            raise ValueError("its channels differ in size")
+        return planes
+    except (RuntimeError, ValueError, OSError, TypeError, LookupError, MemoryError) as error:
+        raise InputError(f"{path}: not a readable EXR file ({error}); truncated or damaged?") from error
 
 
 def read_flow(path: Path, direction: Direction = "forward") -> FlowField:
@@ -66,6 +76,8 @@ def read_flow(path: Path, direction: Direction = "forward") -> FlowField:
         present = ", ".join(sorted(channels)) or "none"
         raise InputError(f"{path}: lacks the channel {' and '.join(missing)}; it has: {present}")
     flow = np.stack([channels[name] for name in needed], axis=-1)
+    if (np.abs(flow) > 1e6).any():
+        raise InputError(f"{path}: holds a flow of more than 1e6 px; where no gel is seen it must be NaN")
     finite = np.isfinite(flow).all(axis=-1)
     visible = channels.get(f"{direction}.visible")
     seen = finite if visible is None else np.logical_and(finite, visible > 0.5)

@@ -5,6 +5,7 @@ photograph is turned as its EXIF data say.
 """
 
 import io
+import warnings
 from pathlib import Path
 
 import cv2
@@ -15,6 +16,7 @@ from gelflow.arrays import Bytes3, Grey8, ImageArray
 from gelflow.errors import InputError
 from gelflow.files.atomic import replacing
 from gelflow.files.quiet import quiet
+from gelflow.untrusted import MOST_PIXELS, read_file
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm"})
 FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "PPM")
@@ -25,14 +27,16 @@ MINIMUM_SIDE = 16
 def _check(path: Path, data: bytes) -> None:
     """Refuses what OpenCV decodes, as far as it goes, without complaint: PNGs by checksums, others by decoding."""
     try:
-        with Image.open(io.BytesIO(data), formats=FORMATS) as image:
+        with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(data), formats=FORMATS) as image:
+            if image.width * image.height > MOST_PIXELS:
+                raise ValueError(f"{image.width} x {image.height} px; at most {MOST_PIXELS} px are read")
             if image.format == "PNG":
                 image.verify()
             else:
                 image.load()
     except UnidentifiedImageError as error:
         raise InputError(f"{path}: not an image; allowed: {', '.join(FORMATS)}") from error
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+    except Exception as error:  # of whatever kind a damaged header causes
         raise InputError(f"{path}: truncated or damaged image ({error})") from error
 
 
@@ -40,7 +44,7 @@ def read_image(path: Path) -> ImageArray:
     """An image as (H, W, 3) float32, RGB in [0, 1]; InputError if missing, damaged, or neither of 8 nor 16 bits."""
     if not path.is_file():
         raise InputError(f"{path}: {'is a folder' if Path(str(path)).is_dir() else 'there is no such image file'}")
-    data = path.read_bytes()
+    data = read_file(path) if isinstance(path, Path) else path.read_bytes()
     _check(path, data)
     with quiet():
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)

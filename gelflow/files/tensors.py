@@ -1,19 +1,22 @@
 """Tensors from files: what `torch.save` wrote, read without running code in it, and whether tensors fit a network."""
 
+import os
 import struct
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
-from zipfile import BadZipFile
+from zipfile import BadZipFile, ZipFile, is_zipfile
 
 import torch
 from torch import Tensor, nn
 
+from gelflow.untrusted import MOST_BYTES, open_file
+
 DAMAGE = (
     UnpicklingError, RuntimeError, EOFError, LookupError, TypeError, ValueError, AttributeError, AssertionError,
-    ArithmeticError, OSError, struct.error, BadZipFile,
+    ArithmeticError, OSError, MemoryError, struct.error, BadZipFile,
 )  # fmt: skip
 """Exceptions of torch's restricted reader at bytes that are no tensors; it interprets them as far as it can."""
 
@@ -27,6 +30,12 @@ def load_tensors(path: Path) -> Any:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # notes on the pickle protocol of files that are refused anyway
+            with open_file(path) as file:
+                size = os.fstat(file.fileno()).st_size
+                if is_zipfile(file):
+                    size = sum(member.file_size for member in ZipFile(file).infolist())
+            if size > MOST_BYTES:
+                raise Unreadable(f"it unpacks to {size} bytes; at most {MOST_BYTES} are read")
             return torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         raise

@@ -106,6 +106,8 @@ def newest_frames(source: str) -> Iterator[tuple[int, Bytes3]]:
     """
     if Path(source).is_dir():
         raise InputError(f"{source}: a folder of images is no camera; predict takes it")
+    if Path(source).is_fifo():
+        raise InputError(f"{source}: is a pipe, which may never open; give a camera, a stream's address or a video")
     with quiet():
         capture = cv2.VideoCapture(int(source) if re.fullmatch(r"\d{1,4}", source) else source)
     if not capture.isOpened():

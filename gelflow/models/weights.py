@@ -13,12 +13,13 @@ from safetensors.torch import save
 from torch import Tensor
 
 from gelflow import __version__
-from gelflow.config import ModelConfig
+from gelflow.config import ModelConfig, size_problem
 from gelflow.config.validation import validated
 from gelflow.errors import InputError
 from gelflow.files.atomic import replacing
 from gelflow.files.tensors import misfit
 from gelflow.models import GelFlow
+from gelflow.untrusted import MOST_BYTES, parsed
 
 SHIPPED = "best"
 """Name of the weights that come with the package; `gelflow/weights/README.md` says what they were trained on."""
@@ -59,14 +60,16 @@ def load_weights(path: Path, device: str = "cpu") -> GelFlow:
     """
     metadata, tensors = _read(path)
     try:
-        values = json.loads(metadata["model"])
-        size = json.loads(metadata.get("image_size", "null"))
-    except (KeyError, json.JSONDecodeError) as error:
+        values = parsed(json.loads, metadata["model"], "model")
+        size = parsed(json.loads, metadata.get("image_size", "null"), "image_size")
+    except (KeyError, InputError) as error:
         raise InputError(f"{path}: its metadata do not describe a network ({error!r}); {RETRAIN}") from error
     if not isinstance(values, dict):
         raise InputError(f"{path}: its metadata do not describe a network (given: {values!r}); {RETRAIN}")
     if not (size is None or (isinstance(size, list) and [type(side) for side in size] == [int, int])):
         raise InputError(f"{path}: image_size in its metadata must be null or [rows, columns], not {size!r}; {RETRAIN}")
+    if size is not None and (problem := size_problem(size[0], size[1])):
+        raise InputError(f"{path}: image_size in its metadata: {problem}; {RETRAIN}")
     model = GelFlow(validated(ModelConfig, values, f"{path}, architecture in its metadata"))
     if problem := misfit(tensors, model):
         raise InputError(f"{path}: its weights do not fit its architecture: {problem}; {RETRAIN}")
@@ -78,6 +81,8 @@ def load_weights(path: Path, device: str = "cpu") -> GelFlow:
 def _read(path: Path) -> tuple[dict[str, str], dict[str, Tensor]]:
     if not path.is_file():
         raise InputError(f"{path}: there is no such file; {RETRAIN}")
+    if path.stat().st_size > MOST_BYTES:
+        raise InputError(f"{path}: has more than {MOST_BYTES} bytes; {RETRAIN}")
     try:
         with safe_open(str(path), framework="pt") as file:
             metadata = file.metadata() or {}

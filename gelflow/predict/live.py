@@ -60,6 +60,9 @@ class Page:
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
+                if self.headers.get("Host", "").partition(":")[0] not in ("127.0.0.1", "localhost"):
+                    self.send_error(403, "Ask for 127.0.0.1 or localhost")  # another name may be a stranger's page
+                    return
                 self.send_response(200)
                 self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=picture")
                 self.end_headers()

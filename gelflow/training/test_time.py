@@ -26,6 +26,7 @@ from gelflow.errors import InputError
 from gelflow.models.weights import read_metadata
 from gelflow.training.run import train
 from gelflow.training.state import STATE
+from gelflow.untrusted import parsed
 
 BATCH = 4
 """Pairs in a batch, the paper's, so that 1600 steps on 8 pairs are its 800 epochs for every network."""
@@ -42,8 +43,8 @@ def fine_tuning_settings(method: Learned, steps: int, pairs: int) -> TrainConfig
     if text is None:
         raise InputError(f"{method.path}: its metadata lack the settings of its training, by which --ft goes on")
     try:
-        values = json.loads(text)
-    except json.JSONDecodeError as error:
+        values = dict(parsed(json.loads, text, "train"))
+    except (ValueError, TypeError) as error:
         raise InputError(f"{method.path}: its metadata do not describe its training") from error
     fixed: dict[str, Any] = {
         "model": method.trained.model_dump(),

@@ -9,6 +9,7 @@ import numpy as np
 
 from synth.arrays import BoolArray, FloatArray
 from synth.errors import InputError
+from synth.untrusted import check_picture, read_file
 
 PLACE = 0.02
 """Standard deviation of the Gaussian neighbourhood that makes a place, over the image's width."""
@@ -44,9 +45,12 @@ def read_frames(paths: Sequence[Path]) -> Frames:
         raise InputError("no frames: give one or a few images of the undeformed gel")
     images, steps = [], []
     for path in paths:
-        if not path.is_file():
-            raise InputError(f"{path}: there is no such file")
-        raw = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+        try:
+            content = read_file(path)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
+        check_picture(content, str(path))
+        raw = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
         if raw is None or raw.dtype not in (np.uint8, np.uint16):
             raise InputError(f"{path}: is no image of 8 or 16 bits that OpenCV can read, such as a PNG")
         steps.append(1.0 / float(np.iinfo(raw.dtype).max))

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from synth.errors import InputError
 from synth.flow.field import FlowArray, FlowField
+from synth.untrusted import MOST_VALUES, open_file
 
 ALIASES = {"R": "forward.U", "G": "forward.V", "B": "forward.visible"}
 CONVENTIONS = {
@@ -126,6 +127,8 @@ def _direction(path: Path, channels: Mapping[str, NDArray[Any]], direction: str)
         present = ", ".join(sorted(channels)) or "none"
         raise InputError(f"{path}: lacks the channel {' and '.join(missing)}; it has {present}")
     u, v, visible = (channels[name].astype(np.float32) for name in names)
+    if (np.abs([u, v]) > 1e6).any() or not (np.abs(visible) <= 1).all():
+        raise InputError(f"{path}: {direction} flow must be below 1e6 px, or NaN, and visible between 0 and 1")
     return np.stack([u, v], axis=-1), visible
 
 
@@ -153,13 +156,18 @@ def read_channels(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, str | 
     import OpenEXR
 
     try:
-        path.open("rb").close()
+        open_file(path).close()
+        with _silenced(), OpenEXR.File(str(path), header_only=True) as file:
+            header, parts = dict(file.header()), len(file.parts)  # the library empties its own on closing
+            low, high = (corner.astype(float) for corner in header["dataWindow"])
+        flat = parts == 1 and header["type"] in (OpenEXR.scanlineimage, OpenEXR.tiledimage)
+        if not flat or len(header["channels"]) * float(np.prod(high - low + 1)) > MOST_VALUES:
+            raise ValueError(f"it is not one flat image of at most {MOST_VALUES} values in all channels")
         with _silenced(), OpenEXR.File(str(path), separate_channels=True) as file:
-            header = dict(file.header())  # the library empties its own on closing
             planes = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file") from None
-    except (RuntimeError, ValueError, OSError, TypeError) as error:
+    except (RuntimeError, ValueError, OSError, TypeError, LookupError, MemoryError) as error:
         raise InputError(f"{path}: cannot be decoded as OpenEXR ({error}); it is truncated or damaged") from error
     shapes = {plane.shape for plane in planes.values()}
     if len(shapes) != 1 or len(next(iter(shapes))) != 2:

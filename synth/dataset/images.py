@@ -1,6 +1,5 @@
 """Images as PNG: RGB or grey, 8 or 16 bits, the same bytes for the same pixels (no time stamps, fixed compression)."""
 
-import io
 from pathlib import Path
 from typing import TypeAlias
 
@@ -8,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.errors import InputError
+from synth.untrusted import check_picture, read_file
 
 Raster: TypeAlias = NDArray[np.uint8] | NDArray[np.uint16]
 """(H, W) grey or (H, W, 3) RGB; uint8 with full scale 255 or uint16 with full scale 65535."""
@@ -34,19 +34,12 @@ def read_png(path: Path) -> Raster:
     something other than grey or RGB.
     """
     import cv2
-    from PIL import Image, UnidentifiedImageError
 
     try:
-        data = path.read_bytes()
+        data = read_file(path)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
-    try:  # OpenCV fills a truncated image up with black
-        with Image.open(io.BytesIO(data), formats=["PNG"]) as stored:
-            stored.verify()
-    except UnidentifiedImageError as error:
-        raise InputError(f"{path}: not a PNG file") from error
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-        raise InputError(f"{path}: the PNG file is truncated or damaged ({error})") from error
+    check_picture(data, str(path), ("PNG",))  # OpenCV fills a truncated image up with black
     image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None:
         raise InputError(f"{path}: OpenCV cannot decode this PNG; the file is damaged")

@@ -13,6 +13,7 @@ import numpy as np
 from pydantic_core import to_jsonable_python
 
 from synth.errors import InputError
+from synth.untrusted import parsed, read_file
 
 _BREAK = re.compile(r"\n\s+")
 
@@ -47,17 +48,14 @@ def to_document(value: object) -> str:
 def read_document(path: Path) -> dict[str, Any]:
     """The object in a .json file; InputError where it is missing, unreadable, or holds no JSON object."""
     try:
-        return parse_document(path.read_bytes(), str(path))
+        return parse_document(read_file(path), str(path))
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 def parse_document(content: bytes, where: str) -> dict[str, Any]:
     """The object in the content of a .json file; InputError where it holds none, with `where` in the message."""
-    try:
-        parsed = json.loads(content)
-    except ValueError as error:
-        raise InputError(f"{where}: not valid JSON ({error}); the file is damaged") from error
-    if not isinstance(parsed, dict):
-        raise InputError(f"{where}: holds a JSON {type(parsed).__name__}, not an object; the file is damaged")
-    return parsed
+    value = parsed(json.loads, content, where)
+    if not isinstance(value, dict):
+        raise InputError(f"{where}: holds a JSON {type(value).__name__}, not an object; the file is damaged")
+    return value

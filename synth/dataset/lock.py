@@ -21,11 +21,13 @@ import fcntl
 import json
 import os
 import socket
+import stat
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from synth.dataset.jsontext import parse_document
 from synth.dataset.shard import Shard
 from synth.dataset.storage import storage_errors
 from synth.dataset.store import Store
@@ -48,7 +50,11 @@ class DirectoryLock:
         self._directory = directory
         self._path = directory / LOCK_FILE
         with storage_errors(self._path):
-            self._descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT, 0o644)
+            self._descriptor = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o644)
+            found = os.fstat(self._descriptor)
+            if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
+                self.release()
+                raise OSError(errno.ELOOP, "is a link, a pipe or a device; remove it")
 
     @contextlib.contextmanager
     def join(self, shard: Shard | None) -> Iterator[bool]:
@@ -187,11 +193,12 @@ class Lease:
     def _refuse_if_alive(self, name: str) -> None:
         content = self._store.read(name)
         try:
-            note = json.loads(content or b"{}")
-            age, host, pid = time.time() - note["time"], note["host"], note["pid"]
-        except (ValueError, KeyError):
+            note = parse_document(content or b"{}", name)
+            age, host, pid = time.time() - float(note["time"]), str(note["host"]), int(note["pid"])
+        except (ValueError, KeyError, TypeError, OverflowError):
             return
-        if age > EXPIRES_S or (host == socket.gethostname() and not Path(f"/proc/{pid}").exists()):
+        # A note from the future, beyond what clocks may differ by, says nothing of a living process.
+        if not abs(age) <= EXPIRES_S or (host == socket.gethostname() and not Path(f"/proc/{pid}").exists()):
             return
         raise InputError(
             f"{self._store.out}: another process (pid {pid} on {host}) is writing this dataset, last heard of "

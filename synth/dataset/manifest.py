@@ -17,9 +17,12 @@ from typing import Any, BinaryIO, Generic, TypeVar
 from synth.dataset.jsontext import to_line
 from synth.dataset.storage import replacing, storage_errors
 from synth.errors import InputError
+from synth.untrusted import open_file
 
 MANIFEST_FILE = "manifest.jsonl"
 FAILURES_FILE = "failures.jsonl"
+_LONGEST_LINE = 2**24
+"""Bytes; a longer line is damaged."""
 
 
 @dataclass(frozen=True)
@@ -100,8 +103,8 @@ def scan_lines(path: Path, key: Callable[[dict[str, Any]], Key]) -> LineTable[Ke
     places: dict[Key, tuple[int, int]] = {}
     end, torn, tidy, previous = 0, False, True, None
     try:
-        with path.open("rb") as file:
-            for number, line in enumerate(file):
+        with open_file(path) as file:
+            for number, line in enumerate(iter(lambda: file.readline(_LONGEST_LINE), b"")):
                 if torn:
                     raise InputError(
                         f"{path}: line {number} is damaged; delete that line "
@@ -128,7 +131,7 @@ def _key_of(line: bytes, key: Callable[[dict[str, Any]], Key]) -> Any:
         return None
     try:
         return key(json.loads(line))
-    except (ValueError, KeyError, TypeError, IndexError, OverflowError):
+    except (ValueError, KeyError, TypeError, IndexError, OverflowError, RecursionError):
         return None
 
 

@@ -1,13 +1,14 @@
 """Reading a dataset, a sample's folder, or a part of either; nothing is cached and nothing is written."""
 
 import hashlib
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from synth.arrays import FloatArray
 from synth.dataset.exr import read_flow
@@ -30,6 +31,29 @@ from synth.errors import InputError
 from synth.flow.field import FlowArray
 from synth.scene import Scene
 from synth.surface import ContactFaces, GelSurface
+from synth.untrusted import inside, open_file
+
+META_FILE = "meta.json"
+_FAR_MM = 1e6
+_MOST_TRIANGLES = 5_000_000
+"""Of a surface when its faces are subdivided."""
+_Rows = tuple[tuple[float, float, float], tuple[float, float, float]]
+
+
+class _Diagnostics(BaseModel):
+    solver: list[dict[str, list[float] | float | bool | str | None]] = []
+
+
+class _Meta(BaseModel):
+    """What is relied on of meta.json, where more may stand."""
+
+    index: int
+    trajectory: int
+    frames: tuple[int, int]
+    force_n: _Rows
+    torque_nmm: _Rows
+    diagnostics: _Diagnostics = _Diagnostics()
+    scene: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -139,11 +163,14 @@ class Dataset:
         for name, expected in self.entry(index).sha256.items():
             path = self.folder(index) / name
             try:
-                found = hashlib.sha256(path.read_bytes()).hexdigest()
+                with open_file(self.folder(index) / inside(name)) as file:
+                    found = hashlib.file_digest(file, "sha256").hexdigest()
                 if found != expected:
                     problems.append(f"{path}: sha256 is {found[:16]}..., the manifest says {expected[:16]}...")
             except OSError as error:
                 problems.append(f"{path}: cannot be read: {error.strerror or error}")
+            except ValueError as error:
+                problems.append(f"the manifest's {error}")
         return problems
 
 
@@ -171,22 +198,42 @@ def read_dataset(path: Path | str) -> Dataset:
 
 def read_sample(folder: Path) -> SampleData:
     """The files of one sample's folder; InputError where they are missing or damaged, or do not fit each other."""
-    meta = read_document(folder / "meta.json")
-    if not isinstance(meta.get("scene"), dict):
-        raise InputError(f"{folder / 'meta.json'}: holds no scene; the file is damaged")
-    names = ("nodes", "faces", "subdivisions", "displacement1", "displacement2")
-    arrays = read_npz(folder / "surface.npz", names)
-    nodes = arrays["nodes"]
-    if any(arrays[name].shape != nodes.shape for name in ("displacement1", "displacement2")):
-        raise InputError(f"{folder / 'surface.npz'}: nodes and displacements differ in shape; the file is damaged")
-    return SampleData(
-        **vars(read_pair(folder)),
-        surface=GelSurface(ContactFaces(nodes, arrays["faces"].astype(np.int32)), int(arrays["subdivisions"])),
-        displacement1=arrays["displacement1"],
-        displacement2=arrays["displacement2"],
-        meta=meta,
-        further={name: read_pair(folder / name) for name in further_cameras(meta.get("scene", {}))},
+    meta = read_meta(folder)
+    surface, displacement1, displacement2 = _read_surface(folder / "surface.npz")
+    further = {name: read_pair(folder / name) for name in further_cameras(meta["scene"])}
+    return SampleData(**vars(read_pair(folder)), surface=surface, displacement1=displacement1,
+                      displacement2=displacement2, meta=meta, further=further)  # fmt: skip
+
+
+def read_meta(folder: Path) -> dict[str, Any]:
+    """A sample's meta.json; InputError where it is missing or damaged, or lacks something that is relied on."""
+    meta = read_document(folder / META_FILE)
+    try:
+        _Meta.model_validate(meta)
+        for name in further_cameras(meta["scene"]):
+            inside(name)
+    except ValueError as error:
+        what = " ".join(str(error).splitlines()[-3:-1]) if isinstance(error, ValidationError) else error
+        raise InputError(f"{folder / META_FILE}: {what}; the file is damaged") from error
+    return meta
+
+
+def _read_surface(path: Path) -> tuple[GelSurface, FloatArray, FloatArray]:
+    """The surface and both displacements; InputError where the arrays are no surface."""
+    arrays = read_npz(path, ("nodes", "faces", "subdivisions", "displacement1", "displacement2"))
+    nodes, faces, parts, *moved = arrays.values()
+    shaped = all(
+        each.ndim == 2 and each.shape == (len(nodes), 3) and each.dtype.kind == "f" for each in (nodes, *moved)
     )
+    near = shaped and all((np.abs(each) < _FAR_MM).all() for each in (nodes, *moved))
+    indices = near and faces.ndim == 2 and faces.shape[1] in (3, 6) and faces.dtype.kind in "iu" and len(faces) > 0
+    split = indices and 0 <= faces.min() <= faces.max() < len(nodes) and parts.shape == () and parts.dtype.kind in "iu"
+    if not (split and 1 <= parts <= math.sqrt(_MOST_TRIANGLES / len(faces))):
+        raise InputError(
+            f"{path}: its arrays are no surface; nodes and displacements are (n, 3) mm, faces (k, 3) or (k, 6) numbers "
+            f"of nodes, subdivisions from 1 on give at most {_MOST_TRIANGLES} triangles; the file is damaged"
+        )
+    return GelSurface(ContactFaces(nodes, faces.astype(np.int32)), int(parts)), moved[0], moved[1]
 
 
 def read_pair(folder: Path) -> CameraPair:
@@ -203,11 +250,8 @@ def read_pair(folder: Path) -> CameraPair:
 
 def read_scene(folder: Path) -> Scene:
     """The drawn scene in a sample's meta.json; InputError where that is damaged, or of another version's schema."""
-    path = folder / "meta.json"
-    meta = read_document(path)
     try:
-        return Scene.model_validate(meta["scene"])
-    except KeyError as error:
-        raise InputError(f"{path}: holds no scene; the file is damaged") from error
+        return Scene.model_validate(read_meta(folder)["scene"])
     except ValidationError as error:
-        raise InputError(f"{path}: its scene does not fit this version of synth: {error.errors()[0]['msg']}") from error
+        what = error.errors()[0]["msg"]
+        raise InputError(f"{folder / META_FILE}: its scene does not fit this version of synth: {what}") from error

@@ -20,7 +20,7 @@ class Shard:
     @classmethod
     def parse(cls, text: str) -> "Shard":
         """The shard that "i/N" means; InputError for another form, or i not in 0 .. N - 1."""
-        found = re.fullmatch(r"(\d+)/(\d+)", text.strip())
+        found = re.fullmatch(r"(\d{1,9})/(\d{1,9})", text.strip())
         if found is None or int(found[1]) >= int(found[2]):
             last = f"; the last of {found[2]} is {int(found[2]) - 1}/{found[2]}" if found and int(found[2]) else ""
             raise InputError(f"--shard {text}: give i/N with 0 <= i < N, such as 0/16{last}")

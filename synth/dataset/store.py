@@ -16,6 +16,7 @@ from urllib.parse import unquote, urlparse
 
 from synth.dataset.storage import replace_file
 from synth.errors import InputError
+from synth.untrusted import read_file
 
 Output = Path | str
 """A local directory, or a URL."""
@@ -67,7 +68,9 @@ class Store:
         """The content; None where there is nothing of that name."""
         system, root = self._place
         with self._errors(name), contextlib.suppress(FileNotFoundError):
-            return bytes(system.cat_file(f"{root}/{name}"))
+            return (
+                bytes(system.cat_file(f"{root}/{name}")) if self.directory is None else read_file(self.directory / name)
+            )
         return None
 
     def write(self, name: str, content: bytes) -> None:

@@ -19,7 +19,6 @@ to leave. Under a URL none knows to be the last, and a plain run does it.
 """
 
 import contextlib
-import json
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -194,6 +193,9 @@ class DatasetWriter:
         """Refuses a file, and a folder with something else in it, before anything in it is touched."""
         if self._directory is not None and self._directory.exists() and not self._directory.is_dir():
             raise InputError(f"{self._directory}: is a file; --out needs a directory")
+        for path in [] if self._directory is None else map(self._directory.joinpath, self._store.names()):
+            if path.is_symlink():
+                raise InputError(f"{path}: is a link; a dataset is written in its own folder alone")
         ours = (LOCK_FILE, LEASES_FOLDER)
         strange = [name for name in self._store.names() if name not in ours and PARTIAL not in name]
         if strange and not self._store.exists(DATASET_FILE):
@@ -226,8 +228,8 @@ class DatasetWriter:
         for name in (MANIFEST_FILE, FAILURES_FILE):
             self._store.get(name, self._whole / name)
         for name in self._store.names(JOURNAL_FOLDER):
-            line = json.loads(self._store.read(f"{JOURNAL_FOLDER}/{name}") or b"null")
-            if line is not None:
+            if content := self._store.read(f"{JOURNAL_FOLDER}/{name}"):
+                line = parse_document(content, name)
                 append_line(self._whole / (FAILURES_FILE if "draw" in line else MANIFEST_FILE), line)
 
     def _merge(self) -> _Known:

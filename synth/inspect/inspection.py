@@ -10,12 +10,11 @@ import numpy as np
 
 from synth.arrays import BoolArray, FloatArray
 from synth.dataset.job import DATASET_FILE
-from synth.dataset.jsontext import read_document
-from synth.dataset.reader import read_dataset
+from synth.dataset.reader import META_FILE, read_dataset, read_meta
 from synth.dataset.sample import further_cameras
 from synth.errors import InputError
 from synth.flow.field import FlowArray
-from synth.inspect.view import META_FILE, View, view_flow, view_sample
+from synth.inspect.view import View, view_flow, view_sample
 
 Kind = Literal["dataset", "sample", "flow"]
 
@@ -76,8 +75,8 @@ def inspect(path: Path | str, limit: int = 100) -> Inspection:
         places = [folders[i] for i in evenly_spaced(len(folders), limit)]
         about["inspected"] = len(places)
     names: list[str] = []
-    if places and (meta := places[0] / META_FILE).exists():
-        names = further_cameras(read_document(meta).get("scene", {}))
+    if places and (places[0] / META_FILE).exists():
+        names = further_cameras(read_meta(places[0])["scene"])
     places = [folder / name for folder in places for name in ("", *names)]
     numbers = tuple(numbers_of(_look(kind, item)) for item in places)
     return Inspection(kind, place, about, tuple(places), numbers, 1 + len(names))

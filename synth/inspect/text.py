@@ -7,6 +7,7 @@ from rich.cells import cell_len
 from rich.table import Table
 from rich.text import Text
 
+from synth.errors import printable
 from synth.inspect.inspection import Inspection
 
 NONE = "–"
@@ -158,14 +159,14 @@ def _samples(columns: list[Column]) -> Table:
     for name, _ in columns:
         rows.add_column(name, justify="right", overflow="fold")
     for cells in zip(*(cells for _, cells in columns), strict=True):
-        rows.add_row(*map(Text, cells))
+        rows.add_row(*map(Text, map(printable, cells)))
     return rows
 
 
 def _pairs(title: str, rows: list[tuple[str, str]]) -> Table:
-    table = Table(title=Text(title, style="table.title"), title_justify="left", show_header=False)
+    table = Table(title=Text(printable(title), style="table.title"), title_justify="left", show_header=False)
     table.add_column(style="bold", no_wrap=True)
     table.add_column(overflow="fold")
     for name, value in rows:
-        table.add_row(name, Text(value))
+        table.add_row(name, Text(printable(value)))
     return table

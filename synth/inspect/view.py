@@ -21,11 +21,8 @@ from numpy.typing import NDArray
 from synth.arrays import BoolArray, FloatArray
 from synth.dataset.exr import flow_of, read_channels
 from synth.dataset.images import Raster
-from synth.dataset.jsontext import read_document
-from synth.dataset.reader import read_pair
+from synth.dataset.reader import META_FILE, read_meta, read_pair
 from synth.flow.field import FlowField
-
-META_FILE = "meta.json"
 
 
 @dataclass(frozen=True)
@@ -95,7 +92,7 @@ class View:
 def view_sample(folder: Path) -> View:
     """The view of a sample's or a further camera's folder; InputError where files are missing or damaged."""
     is_further = not (folder / META_FILE).exists() and (folder.parent / META_FILE).exists()
-    meta = read_document((folder.parent if is_further else folder) / META_FILE)
+    meta = read_meta(folder.parent if is_further else folder)
     pair = read_pair(folder)
     name = f"{folder.parent.name}/{folder.name}" if is_further else folder.name
     return View(name, pair.flow, image1=pair.image1, image2=pair.image2, meta=meta)
@@ -109,7 +106,9 @@ def view_flow(path: Path) -> View:
         parts = [channels.get(f"{direction}.{part}") for part in ("U", "V")]
         if f"{direction}.visible" not in channels and parts[0] is not None and parts[1] is not None:
             channels[f"{direction}.visible"] = np.isfinite(parts[0] + parts[1]).astype(np.float32)
-    return View(path.name, flow_of(path, channels), known, meta=header)
+    kinds = {"index": int, "trajectory": int, "frames": str}
+    numbers = {key: header[key] for key, kind in kinds.items() if isinstance(header.get(key), kind)}
+    return View(path.name, flow_of(path, channels), known, meta=numbers)
 
 
 def _linear(image: Raster) -> FloatArray:

@@ -22,6 +22,7 @@ from synth.mesh.layered import layered
 from synth.mesh.pad import PadMesh
 from synth.mesh.tetrahedralise import ENVELOPE, GRADING, background_of, box_sides, tetrahedralise, tetrahedralise_box
 from synth.scene import Gel, Numerics
+from synth.untrusted import open_file
 
 SURFACE, ROOM = 0.5, 1.5
 """Edge length of the surface that fTetWild is given, over that of the mesh; and fTetWild's envelope, over the distance
@@ -99,9 +100,9 @@ def _made(gel: Gel, face: Face, edge_mm: float) -> PadMesh:
 def _read(path: Path, gel: Gel, face: Face) -> PadMesh | None:
     """A cached mesh, or None where there is none or the file is damaged (it is then made again)."""
     try:
-        with np.load(path) as data:
+        with open_file(path) as file, np.load(file, allow_pickle=False) as data:
             return PadMesh(data["points"], data["tets"], gel.size_mm, face=face)
-    except (OSError, EOFError, ValueError, KeyError, BadZipFile):
+    except (OSError, EOFError, ValueError, KeyError, MemoryError, BadZipFile):
         return None
 
 

@@ -16,6 +16,10 @@ from synth.arrays import FloatArray, Image
 from synth.errors import InputError
 from synth.render.chart import texture_coordinates
 from synth.scene import Bitmap, Sensor
+from synth.untrusted import check_picture, read_file
+
+MOST_PIXELS = 2**25
+"""Of a picture, such as 8192 x 4096; in linear light each takes some 50 bytes."""
 
 
 def painted(
@@ -42,14 +46,15 @@ def read_picture(pattern: Bitmap, folder: Path) -> Image:
 
     path = folder / pattern.file
     try:
-        data = path.read_bytes()
+        data = read_file(path)
     except OSError as error:
         raise InputError(f"sensor.pattern.file: {path} cannot be read: {error.strerror or error}") from error
+    check_picture(data, f"sensor.pattern.file: {path}", most=MOST_PIXELS)
     try:
         stored = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         if stored is not None and stored.shape[2:] != (4,):  # no opacity: turned as EXIF says, three channels
             stored = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
-    except cv2.error:  # an empty file, or one of absurd size
+    except cv2.error:
         stored = None
     if stored is None or stored.dtype not in (np.uint8, np.uint16):
         raise InputError(

@@ -14,12 +14,10 @@ import hashlib
 import json
 import os
 import re
-import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import cached_property, partial
-from glob import glob
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -28,15 +26,20 @@ from synth.errors import InputError
 from synth.scene import Bitmap, MeshIndenter, Numerics, Outputs, Sampling, Scene
 from synth.scene.gel_file import measured
 from synth.scene.validation import DISTRIBUTIONS, validated
+from synth.untrusted import DEEPEST, MOST_FOLDERS, assigned_value, matching_files, open_file, read_toml
 
 _INSTALLED = Path(str(files("synth"))).resolve() / "scenes"
 SCENES = _INSTALLED if _INSTALLED.is_dir() else _INSTALLED.parents[1] / "scenes"
 """The shipped scene files: in the package where it is installed, beside it in a checkout."""
 FIXED = ("name", "description", "references", "numerics", "outputs", "sampling")
 """Parts that all samples of a dataset share."""
+MOST_OPTIONS = 10_000
+"""Of all choices of a scene: each is checked when the scene is loaded."""
 FILES = ("file", "outer", "window")
 """Keys under which names of files stand."""
 
+_Turns = dict[int, list[tuple[Any, int]]]
+"""By the identity of a choice's list: its options, each once for every corner that it takes, with their numbers."""
 Chooser = Callable[[str, list[Any]], Any]
 """Kind and arguments of a distribution -> a value; of a choice, the option, which may hold distributions again."""
 
@@ -67,7 +70,8 @@ class Template:
         decisive = {key: value for key, value in self.content.items() if key not in ("description", "references")}
         digest = hashlib.sha256(json.dumps(decisive, sort_keys=True).encode())
         for _, file in self._files():
-            digest.update(hashlib.sha256(file.read_bytes()).digest())
+            with open_file(file) as opened:
+                digest.update(hashlib.file_digest(opened, "sha256").digest())
         return digest.hexdigest()[:16]
 
     @cached_property
@@ -76,8 +80,11 @@ class Template:
 
         InputError where one of them breaks the schema.
         """
-        turns = range(_options(self.content))
-        contents = [_corner(self.content, high, turn) for turn in turns for high in (False, True)]
+        count = _options(self.content)
+        if count > MOST_OPTIONS:
+            raise InputError(f"{self.label}: its choices have {count} options; allowed are {MOST_OPTIONS}")
+        turns: _Turns = {}
+        contents = (_corner(self.content, high, turn, turns) for turn in range(count) for high in (False, True))
         return tuple(dict.fromkeys(validated(content, self.label, Scene) for content in contents))
 
     @property
@@ -137,7 +144,7 @@ def load_scene(name_or_path: str | Path, set: Sequence[str] = ()) -> Template:
         _apply(content, override)
     changed = tuple(override.partition("=")[0].strip() for override in set)
     content = json.loads(json.dumps(content, default=str))  # TOML's dates become text
-    return checked_template(with_files(content, partial(_matching, path.parent)), path, changed)
+    return checked_template(with_files(content, partial(_matching, path.parent, [MOST_FOLDERS])), path, changed)
 
 
 def checked_template(content: dict[str, Any], source: Path, changed: tuple[str, ...] = ()) -> Template:
@@ -195,12 +202,7 @@ def _read(path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
 
     `above` are the files that extend it.
     """
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    content = read_toml(path)
     if "extends" not in content:
         if not content:
             raise InputError(f'{path}: is empty; a scene may begin with extends = "gelsight_mini"')
@@ -250,12 +252,9 @@ def _find(name_or_path: str | Path) -> Path:
 def _apply(content: dict[str, Any], override: str) -> None:
     key, equals, text = override.partition("=")
     steps = key.strip().split(".")
-    if not equals or not all(steps):
-        raise InputError(f"--set {override!r}: give key=value, for instance --set motion.depth_mm=1.2")
-    try:
-        value = tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        value = text.strip()  # a bare word is a string
+    if not equals or not all(steps) or len(steps) > DEEPEST or len(override.splitlines()) > 1:
+        raise InputError(f"--set {override!r}: give key=value, for instance --set motion.depth_mm=1.2, in one line")
+    value = assigned_value(text, f"--set {key}")
     target: Any = content
     for depth, step in enumerate(steps):
         place: Any = int(step) if isinstance(target, list) and step.isdigit() else step
@@ -278,10 +277,9 @@ def _apply(content: dict[str, Any], override: str) -> None:
             target = target[place]
 
 
-def _matching(folder: Path, name: str) -> Any:
-    """The name of a file in a folder, or a choice of the files that match it."""
-    matches = [] if (folder / name).is_file() else sorted(glob(name, root_dir=folder, recursive=True))
-    found = [match for match in matches if (folder / match).is_file()]
+def _matching(folder: Path, left: list[int], name: str) -> Any:
+    """The name of a file in a folder, or a choice of the files that match it; `left` as for `matching_files`."""
+    found = [] if (folder / name).is_file() else matching_files(folder, name, left)
     return {"choice": found} if found else name
 
 
@@ -312,15 +310,16 @@ def _options(value: Any) -> int:
     return max((_options(part) for part in inner), default=1)
 
 
-def _corner(value: Any, high: bool, turn: int) -> Any:
+def _corner(value: Any, high: bool, turn: int, turns: _Turns) -> Any:
     """The lower or upper end of a part of a template, with the options of its choices that this turn shows."""
 
     def choose(kind: str, arguments: list[Any]) -> Any:
         if kind != "choice":
             return float(arguments[0] if kind == "normal" or not high else arguments[1])  # as drawn: never whole
-        turns = [(option, own) for option in arguments for own in range(_options(option))]
-        option, own = turns[turn % len(turns)]
-        return _corner(option, high, own)
+        if id(arguments) not in turns:
+            turns[id(arguments)] = [(option, own) for option in arguments for own in range(_options(option))]
+        option, own = turns[id(arguments)][turn % len(turns[id(arguments)])]
+        return _corner(option, high, own, turns)
 
     return replaced(value, choose)
 

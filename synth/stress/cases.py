@@ -1,17 +1,17 @@
 """Cases and their expected outcomes, as `scenes/extreme/expected.toml` writes them down."""
 
 import fnmatch
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
 from synth.errors import InputError
 from synth.scene import Part
 from synth.scene.template import SCENES
+from synth.untrusted import read_toml
 
 EXTREME = SCENES / "extreme"
 """Folder of the base scene and the expectations."""
@@ -112,12 +112,7 @@ class Run:
 def load_expectations(path: Path) -> Expectations:
     """Read the file; InputError where it is missing, not TOML, or breaks the schema above."""
     try:
-        content: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
-        return Expectations.model_validate(content)
-    except FileNotFoundError as error:
-        raise InputError(f"there is no file {path}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from error
+        return Expectations.model_validate(read_toml(path))
     except ValidationError as error:
         problems = [f"{'.'.join(map(str, p['loc']))}: {p['msg']}" for p in error.errors()]
         raise InputError("\n".join(f"{path}: {problem}" for problem in problems)) from error

@@ -75,13 +75,14 @@ def _view_checks(sensor: Sensor, backward: bool, sample: SampleData) -> list[Che
 
 
 def _verify_files(dataset: Dataset, index: int) -> SampleReport:
-    problems = dataset.check_hashes(index)
+    problems: list[str] = []
     try:
+        problems += dataset.check_hashes(index)
         scene, sample = dataset.scene_of(index), dataset.read(index)
         problems += flow_file_problems(dataset.folder(index), scene, sample.meta)
         return verify_sample(index, scene, sample, problems)
-    except InputError as error:
-        return SampleReport(index, (_files([*problems, str(error)]),))
+    except (InputError, OSError, MemoryError, RecursionError) as error:
+        return SampleReport(index, (_files([*problems, str(error) or "out of memory"]),))
 
 
 def _files(problems: Sequence[str]) -> Check:

@@ -66,6 +66,8 @@ def check_motion(name: str, near: Sheet, far: Sheet, flow: FlowArray, visible: F
     size = (near.height, near.width)
     if flow.shape != (*size, 2) or visible.shape != size:
         return [Check(f"{name} flow", float("nan"), 0, "px", f"{flow.shape[:2]} pixels where the camera has {size}")]
+    if not np.isfinite(flow).any():
+        return [Check(f"{name} flow", float("nan"), 0, "px", "no pixel of the picture sees the gel")]
     row, column = np.mgrid[: near.height, : near.width]
     places = np.column_stack([column.ravel() + 0.5, row.ravel() + 0.5])
     recorded = flow.reshape(-1, 2).astype(np.float64)

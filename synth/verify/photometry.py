@@ -63,6 +63,8 @@ def check_photometry(sensor: Sensor, image1: Raster, image2: Raster, flow: FlowA
     if isinstance(sensor.pattern, NoPattern):
         return _not_applicable(ALLOWANCE_PX, "the coating is bare")
     usable = _usable(flow, visible)
+    if not usable.any():
+        return _not_applicable(ALLOWANCE_PX, "no pixel is seen in both images")
     side = min(usable.shape) // _BLOCKS
     pairs = _channels(image1, image2)
     moved, still = (

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from synth.dataset.jsontext import jsonable
+from synth.errors import printable
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -79,7 +80,7 @@ class Report:
             failed = [str(sample.index) for sample in self.samples if not sample.ok]
             more = f" and {len(failed) - 10} more" if len(failed) > 10 else ""
             caption = f"failed: samples {', '.join(failed[:10])}{more}" if failed else _AGREED
-        title = Text(f"{self.path}: {len(self.samples)} samples", style="table.title")
+        title = Text(printable(f"{self.path}: {len(self.samples)} samples"), style="table.title")
         table = Table("check", title=title, caption=caption, caption_justify="left")
         for column in ("worst", "tolerance", "sample"):
             table.add_column(column, justify="right")
@@ -97,5 +98,5 @@ class Report:
         for index, check in every:
             if not check.passed:
                 shown = Text(check.name, style="red")
-                table.add_row(shown, f"{check.figure:.3g} {check.unit}", "", str(index), Text(check.detail))
+                table.add_row(shown, f"{check.figure:.3g} {check.unit}", "", str(index), Text(printable(check.detail)))
         return table

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.arrays import BoolArray, FloatArray, Pixels, Points, Triangles
+from synth.errors import InputError
 from synth.verify.camera import ForwardCamera
 
 _CONVERGED_PX = 1e-8
@@ -25,6 +26,8 @@ _INSIDE = -1e-7
 """Barycentric coordinates from here up count as inside: edges belong to both triangles; Newton leaves about 1e-9."""
 _CHORD_STEPS, _NEWTON_STEPS, _LONGEST_STEP = 8, 20, 0.5
 """Most steps with the constant Jacobian and with Newton's, and the longest step in barycentric coordinates."""
+_MOST_OVERLAP = 32
+"""Pixels that the triangles touch, over pixels and triangles; surfaces of the shipped scenes have 2.4 to 2.6."""
 _STARTS = np.array([(i, j, 3 - i - j) for i in range(4) for j in range(4 - i)]) / 3
 
 
@@ -86,6 +89,8 @@ class Layer:
         last = np.clip(np.floor(high[near]), -1, limits).astype(int) + 1
         span = last - first + 1
         count = span.prod(1)
+        if count.sum() > _MOST_OVERLAP * (self.width * self.height + len(member)):
+            raise InputError("the surface's triangles lie over one another in the picture; the surface is torn")
         owner = np.repeat(np.arange(len(member)), count)
         place = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
         row, column = np.divmod(place, span[owner, 0])

@@ -236,7 +236,7 @@ def test_frames_that_do_not_belong_together_are_refused(tmp_path: Path) -> None:
     (tmp_path / "text.png").write_text("no image")
     for names, message in (
         ("ab", r"a\.png: half of it differs .* median by .* of 255"), ("ac", r"c\.png: has 40 x 20 pixels"),
-        (["text"], r"text\.png: is no image"), (["missing"], r"missing\.png: there is no such file"), ([], "no frames"),
+        (["text"], r"text\.png is no whole picture"), (["missing"], r"missing\.png: cannot be read"), ([], "no frames"),
     ):  # fmt: skip
         refused(message, read_frames, [tmp_path / f"{name}.png" for name in names])
 

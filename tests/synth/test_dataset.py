@@ -175,7 +175,7 @@ def test_unreadable_datasets_are_named(tmp_path):
         ("samples/000000/surface.npz", lambda data: data[:-40], r"000000/surface\.npz"),
         ("samples/000000/surface.npz", lambda _: encode_npz({}), r"000000/surface\.npz: lacks the array"),
         ("samples/000000/meta.json", lambda data: data[:-40], r"000000/meta\.json.*not valid JSON"),
-        ("samples/000000/meta.json", lambda _: b'{"scene": 3}', r"000000/meta\.json: holds no scene"),
+        ("samples/000000/meta.json", lambda _: b'{"scene": 3}', r"000000/meta\.json: scene"),
         ("dataset.json", lambda data: data.replace(b'"seed": ', b'"seed": "a", "before": '), "the value of seed is of"),
         ("manifest.jsonl", lambda data: data.replace(b'"sha256": {', b'"sha256": 3, "before": {'), "is damaged"),
     ):

@@ -11,7 +11,7 @@ from tiny_scene import own_cache, write_tiny
 ROOT = Path(__file__).parents[2]
 STAGES = (
     "synth",  # the package itself: its version, and where its public names are, which it loads when they are asked for
-    "synth.errors", "synth.arrays",
+    "synth.errors", "synth.arrays", "synth.untrusted",
     "synth.warp_start",
     "synth.dataset.storage",  # how a file gets to the disk as a whole; knows nothing of datasets
     "synth.scene", "synth.surface", "synth.optics", "synth.mesh", "synth.simulate", "synth.flow",
@@ -88,8 +88,8 @@ def test_every_module_has_a_stage_and_imports_only_from_earlier_ones() -> None:
 
 
 ROOMS = (
-    "errors", "arrays", "hardware", "terminal", "config", "files", "ops", "models", "losses", "data", "baselines",
-    "predict", "compare", "training", "cli", "__main__",
+    "errors", "arrays", "untrusted", "hardware", "terminal", "config", "files", "ops", "models", "losses", "data",
+    "baselines", "predict", "compare", "training", "cli", "__main__",
 )  # fmt: skip
 """The same for the parts of gelflow."""
 
