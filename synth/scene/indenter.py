@@ -11,6 +11,8 @@ class Posed(Part):
     """Base of the indenters: turned about x, then y, then z before it is pressed with its lowest point first."""
 
     rotation_deg: Vector3 = (0.0, 0.0, 0.0)
+    offset_mm: Vector3 = (0.0, 0.0, 0.0)
+    """The point of the body, in its own axes before it is turned, that comes down on the place of the press."""
 
 
 class Sphere(Posed):
@@ -56,7 +58,7 @@ class Torus(Posed):
 
 
 class MeshIndenter(Part):
-    """Triangle surface from a file (STL, OBJ, PLY, OFF, VTP), in mm after scaling."""
+    """Triangle surface from a file (`synth.scene.surface_file.FORMATS`), in mm after scaling."""
 
     shape: Literal["mesh"]
     file: str
@@ -66,6 +68,10 @@ class MeshIndenter(Part):
     """Longest edge of the bounding box before it is turned; in place of `scale`."""
     rotation_deg: Vector3 | Literal["any"] = (0.0, 0.0, 0.0)
     """Angles as for the other shapes; "any" draws an orientation, all alike likely."""
+    offset_mm: Vector3 | Literal["origin", "lowest"] | None = None
+    """The point that comes down on the place of the press: mm from the centre of the bounding box, in the file's axes
+    before it is turned; the file's origin; or the point that is lowest once it is turned. Default the lowest on a round
+    gel, the centre on others."""
     fillet_mm: Annotated[float, Field(ge=0, le=100)] | None = None
     """Radius to which edges and notches are rounded; default what the gel's mesh resolves, and never less."""
     cell_mm: Annotated[float, Field(ge=0.01, le=10)] | None = None

@@ -214,8 +214,11 @@ def signed_distance(
     """Outward unit normal (first three) and signed distance (last) at y, mm in the indenter's frame.
 
     shape: [fillet, then: sphere radius | cylinder radius, half length | box half edges | cone base radius, height
-    | torus ring radius | mesh grid corner x, y, z, cell, counts x, y, z], of the sharp shape.
+    | torus ring radius | mesh grid corner x, y, z, cell, counts x, y, z], of the sharp shape. The last three of all
+    but meshes are the place of the frame's origin in the body's own.
     """
+    if kind != 5:
+        y += wp.vec3d(shape[5], shape[6], shape[7])
     if kind == 0:
         d = _sphere(y, shape[1])
     elif kind == 1:

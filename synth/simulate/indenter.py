@@ -134,6 +134,7 @@ def rigid_body(
             lengths, reach, sharpest = [tube, radius], radius * radial + tube, tube
     shape = np.zeros(SHAPE_LENGTH)
     shape[: len(lengths)] = lengths
+    shape[5:] = rotation.T @ (rotation @ indenter.offset_mm * [1, 1, 0])
     return RigidBody(KINDS[indenter.shape], shape, rotation, reach, np.zeros((1, 1, 1)), sharpest)
 
 
@@ -155,15 +156,21 @@ def _object(indenter: MeshIndenter, folder: Path, resolution_mm: float, touchabl
     """A triangle mesh. It is turned before it is sampled, so that the grid holds the part that touches alone."""
     from scipy.ndimage import spline_filter
 
-    surface = object_triangles(indenter, folder)
+    surface, origin = object_triangles(indenter, folder)
     if indenter.rotation_deg == "any":
         raise InputError('contact.indenter.rotation_deg = "any": draw a scene first; a body has three angles')
-    turned = replace(surface, points=np.asarray(surface.points @ turned_by(indenter.rotation_deg).T))
+    rotation = turned_by(indenter.rotation_deg)
+    turned = replace(surface, points=np.asarray(surface.points @ rotation.T))
     radius = object_radius(indenter, resolution_mm)
     lowest = turned.points.max(axis=0)[2]
-    if touchable.at_tip:
-        tip = turned.points[turned.points[:, 2] > lowest - TIP_MM].mean(axis=0)
-        turned = replace(turned, points=turned.points - tip * [1, 1, 0])
+    match indenter.offset_mm or ("lowest" if touchable.at_tip else (0.0, 0.0, 0.0)):
+        case "lowest":
+            place = turned.points[turned.points[:, 2] > lowest - TIP_MM].mean(axis=0)
+        case "origin":
+            place = rotation @ origin
+        case offset:
+            place = rotation @ np.multiply(offset, [1, -1, 1])
+    turned = replace(turned, points=turned.points - place * [1, 1, 0])
     grid = _grid_over(turned, indenter, radius, touchable)
     values = _rounded_distance(turned, grid, radius, f"contact.indenter.file = {indenter.file!r}")
     shape = np.array([0.0, *grid.corner, grid.spacing, *grid.counts])
@@ -200,8 +207,9 @@ def _rounded_distance(turned: Triangles, grid: Grid, radius: float, named: str) 
             f"{named}: it is an open sheet, {missing:.0%} of a closed surface would have to be made up; give it a "
             "thickness"
         )
+    values, boundary = grid.boundary(values, turned, radius)
     if radius > 0:
-        values = grid.rounded(values, turned, radius)
+        values = grid.rounded(values, boundary, radius)
     if not (values < 0).any():
         raise InputError(
             f"{named}: it encloses no volume that a grid of {grid.spacing:.2g} mm resolves; a single sheet needs a "
@@ -232,12 +240,12 @@ SHORTEST_MM, LONGEST_MM = 0.5, 1000.0
 """Longest edges beyond which a file is taken to be in another unit."""
 
 
-def object_triangles(indenter: MeshIndenter, folder: Path) -> Triangles:
-    """An object's surface in mm, not turned, its bounding box centred on the origin; its file is relative to `folder`.
+def object_triangles(indenter: MeshIndenter, folder: Path) -> tuple[Triangles, FloatArray]:
+    """An object's surface in mm, not turned, its bounding box centred on the origin; and the file's origin (3,) then.
 
-    Files have right-handed axes; the scene's are left-handed, because y points down in the image. So y changes its
-    sign: a letter can be read in the picture, a screw keeps its hand. InputError for a file that is missing or no
-    surface, or of a size that speaks for another unit.
+    The file is relative to `folder`. Files have right-handed axes; the scene's are left-handed, because y points down
+    in the image. So y changes its sign: a letter can be read in the picture, a screw keeps its hand. InputError for a
+    file that is missing or no surface, or of a size that speaks for another unit.
     """
     try:
         surface = read_surface(folder / indenter.file)
@@ -251,7 +259,8 @@ def object_triangles(indenter: MeshIndenter, folder: Path) -> Triangles:
             raise InputError(f"contact.indenter.size_mm = {indenter.size_mm:g}: {allowed}")
         raise InputError(
             f"contact.indenter.scale = {scale:g}: {indenter.file} is then {scale * longest:.3g} mm long. Is it in "
-            "metres (scale = 1000) or inches (scale = 25.4)? size_mm gives its longest edge instead"
+            "metres (scale = 1000), inches (25.4) or, as a GLB, in mm (0.001)? size_mm gives its longest edge instead"
         )
     centre = (surface.points.min(axis=0) + surface.points.max(axis=0)) / 2
-    return Triangles(scale * (surface.points - centre) * [1, -1, 1], surface.faces[:, ::-1], surface.closed)
+    moved = scale * (np.concatenate([surface.points, np.zeros((1, 3))]) - centre) * [1, -1, 1]
+    return Triangles(moved[:-1], surface.faces[:, ::-1], surface.closed), moved[-1]

@@ -12,7 +12,7 @@ does.
 On a round gel all of this happens in the frame of the place (`PressFrame`): depth counts along the inward normal from
 the tangent plane, and shear lies in that plane. A convex gel does not reach beyond it; where one from files does, as
 where it is pressed along z beside its tip, the path starts level with its farthest point. A mesh's lowest point comes
-down on the place.
+down on the place, unless its offset_mm names another.
 """
 
 from dataclasses import dataclass
@@ -86,7 +86,7 @@ class LoadPath:
         return float(face_height(np.array([self.motion.position_mm]), self.dome_radius_mm)[0])
 
     def is_over(self, size_mm: tuple[float, float, float]) -> bool:
-        """Whether the body's lowest point, a ring's rim for a torus, comes down on the contact face of a gel.
+        """Whether the body's place, a ring's rim about it for a torus, comes down on the contact face of a gel.
 
         On a round gel rings may pass it by, or touch later than at depth 0.
         """

@@ -27,9 +27,9 @@ STRIDE = 3
 LOST = 1.25
 """What an opening by r leaves out farther than this times r is a thin part or a sharp tip. A right-angled edge loses
 0.41 r, its corner 0.73 r, a tetrahedron's edge 0.73 r and its corner 2 r."""
-TWICE = 1.5
-"""A winding number above this is that of a place within two shells."""
-TOUCHING_MM = 1e-4
+BEYOND = 0.05
+"""Spacings beyond a face where a place within the solid shows that the face is inside, not on its boundary."""
+TOUCHING_MM = wp.constant(1e-4)
 """Points that are nearer to a surface have its normal for the gradient of their distance."""
 Core = tuple["Nearest", float]
 
@@ -74,21 +74,25 @@ class Grid:
         Winding numbers take longer and are found near the surface only. A closed one lies between neighbouring
         samples of different sign: the signs of others are those next to them toward +z. Around an open one they are
         those of coarse samples, the nearest of which is √3 spacings away, and found, too, where these differ.
-        Where shells overlap, faces of one lie within another: distances are then those from a contour around all.
         """
-        nearest, reach, closed = Nearest(surface, winding=True), radius_mm + 3 * self.spacing, surface.closed
-        away, sign = self._away(nearest, reach), np.ones(self.counts) if closed else self._coarse(nearest.signs)
+        nearest, closed = Nearest(surface, winding=True), surface.closed
+        away = self._away(nearest, radius_mm + 3 * self.spacing)
+        sign = np.ones(self.counts) if closed else self._coarse(nearest.signs)
         known = (away < (1.1 if closed else 1.75) * self.spacing) | (np.abs(sign) < 0.99)
-        near = self.points(known)
-        sign[known] = near_sign = nearest.signs(near)
+        sign[known] = nearest.signs(self.points(known))
         if closed:
             above = np.where(known, np.arange(self.counts[2]), self.counts[2] - 1)
             sign = np.take_along_axis(sign, np.minimum.accumulate(above[:, :, ::-1], axis=2)[:, :, ::-1], axis=2)
-        values = away * sign
-        if (nearest.signs(near[near_sign < 0], TWICE) > 0).all():
-            return values
+        return away * sign
+
+    def boundary(self, values: FloatArray, surface: Triangles, radius_mm: float) -> tuple[FloatArray, Triangles]:
+        """Signed distances from the boundary alone, and the boundary: a contour if any face lies inside."""
+        nearest, within = Nearest(surface, winding=True), (values < 0) & (values > -1.1 * self.spacing)
+        if (nearest.signs(self.points(within), BEYOND * self.spacing) > 0).all():
+            return values, surface
         outer = sharp_contour(values, self.corner, self.spacing, nearest.depth)
-        return np.where(values < 0, -1.0, 1.0) * self._away(Nearest(outer), reach)
+        away = self._away(Nearest(outer), radius_mm + 3 * self.spacing)
+        return np.where(values < 0, -1.0, 1.0) * away, outer
 
     def missing(self, values: FloatArray) -> float:
         """The share of the boundary of what is inside that is far from the surface: where holes were closed.
@@ -173,10 +177,13 @@ class Nearest:
         toward = (nearest - points) / np.maximum(away, TOUCHING_MM)[:, None]
         return -away, np.where(away[:, None] < TOUCHING_MM, normal, toward)
 
-    def signs(self, points: Points, least: float = 0.5) -> FloatArray:
-        """-1 for points (n, 3) inside, where the winding number is above the least, else 1."""
+    def signs(self, points: Points, beyond_mm: float = 0.0) -> FloatArray:
+        """-1 for points (n, 3) inside, with a winding number above 1/2, else 1; or for places beyond the nearest faces.
+
+        Those are 1, too, where another face is nearer.
+        """
         found = wp.empty(len(points), dtype=wp.float32, device="cpu")
-        inputs = [self._mesh.id, wp.array(points.astype(np.float32), dtype=wp.vec3, device="cpu"), least]
+        inputs = [self._mesh.id, wp.array(points.astype(np.float32), dtype=wp.vec3, device="cpu"), beyond_mm]
         wp.launch(_signs, len(points), inputs=inputs, outputs=[found], device="cpu")
         return found.numpy().astype(np.float64)
 
@@ -192,6 +199,16 @@ def _nearest(
 
 
 @wp.kernel
-def _signs(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), least: float, found: wp.array(dtype=wp.float32)):
+def _signs(mesh: wp.uint64, points: wp.array(dtype=wp.vec3), beyond: float, found: wp.array(dtype=wp.float32)):
     i = wp.tid()
-    found[i] = wp.mesh_query_point_sign_winding_number(mesh, points[i], wp.inf, 2.0, least).sign
+    place = points[i]
+    if beyond > 0.0:
+        near = wp.mesh_query_point_no_sign(mesh, place, wp.inf)
+        nearest = wp.mesh_eval_position(mesh, near.face, near.u, near.v)
+        along = wp.mesh_eval_face_normal(mesh, near.face)
+        if wp.length(nearest - place) > TOUCHING_MM:
+            along = wp.normalize(nearest - place)
+        place = nearest + beyond * along
+    found[i] = 1.0
+    if beyond == 0.0 or not wp.mesh_query_point_no_sign(mesh, place, 0.9 * beyond).result:
+        found[i] = wp.mesh_query_point_sign_winding_number(mesh, place, wp.inf, 2.0, 0.5).sign
