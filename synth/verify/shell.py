@@ -123,6 +123,6 @@ def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(np.einsum("in,in->n", a, b))
 
 
-def _later(square: FloatArray | float, half: FloatArray, constant: float) -> FloatArray:
+def _later(square: FloatArray | float, half: FloatArray, constant: FloatArray | float) -> FloatArray:
     """The later root of square t² + 2 half t + constant = 0."""
     return np.asarray((np.sqrt(half**2 - square * constant) - half) / square)
