@@ -124,7 +124,8 @@ def numbers_of(view: View) -> dict[str, Any]:
     Name, width, height, bits, forward and backward (min_px, median_px, p95_px, max_px over the pixels that see gel;
     nan_share of all pixels; visible_share of those with gel), closure, sigma (median_px, p95_px, max_px, pixels),
     difference (before_rmse, after_rmse as shares of full scale over visible pixels), and from a sample's meta.json
-    index, trajectory, frames, force_n, torque_nmm, solver.
+    index, trajectory, frames, force_n, torque_nmm, solver; and of the forces the part along the inward normal of the
+    press (+z but on round gels), and the length of the rest: normal_force_n, side_force_n.
     """
     height, width = view.size
     flow, meta = view.flow, view.meta
@@ -134,9 +135,17 @@ def numbers_of(view: View) -> dict[str, Any]:
     difference = None
     if view.differences is not None:
         difference = dict(zip(("before_rmse", "after_rmse"), map(_rms, view.differences), strict=True))
+    diagnostics = meta["diagnostics"] if isinstance(meta.get("diagnostics"), dict) else {}
+    normal, side = None, None
+    if (forces := meta.get("force_n")) is not None:
+        inward = np.array(diagnostics.get("inward_normal", (0.0, 0.0, 1.0)))
+        normal = [float(np.dot(force, inward)) for force in forces]
+        side = [float(np.linalg.norm(force - n * inward)) for force, n in zip(forces, normal, strict=True)]
     return {
         "name": view.name,
         **{key: meta.get(key) for key in ("index", "trajectory", "frames", "force_n", "torque_nmm")},
+        "normal_force_n": normal,
+        "side_force_n": side,
         "width": width,
         "height": height,
         "bits": None if view.image1 is None else 8 * view.image1.itemsize,
@@ -145,7 +154,7 @@ def numbers_of(view: View) -> dict[str, Any]:
         "closure": None if view.closure is None else _spread(view.closure),
         "sigma": None if view.sigma is None else _spread(view.sigma),
         "difference": difference,
-        "solver": meta.get("diagnostics", {}).get("solver") if isinstance(meta.get("diagnostics"), dict) else None,
+        "solver": diagnostics.get("solver"),
         "channels": sorted(flow.extras),
     }
 

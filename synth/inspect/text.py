@@ -73,6 +73,8 @@ def _states(numbers: Mapping[str, Any]) -> list[tuple[str, str]]:
     for key, name, unit in (("force_n", "force", "N"), ("torque_nmm", "torque", "N mm")):
         if numbers[key] is not None:
             rows.append((f"{name} in frames 1, 2", "; ".join(vector(row) for row in numbers[key]) + f" {unit}"))
+    for part in ("normal", "side") if numbers["force_n"] is not None else ():
+        rows.append((f"{part} force in frames 1, 2", "; ".join(map(short, numbers[f"{part}_force_n"])) + " N"))
     for name in _SOLVER if numbers["solver"] else ():
         values = [state.get(name) for state in numbers["solver"] if isinstance(state, dict)]
         if any(value is not None for value in values):
@@ -110,7 +112,7 @@ COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
     ("size\npx", lambda n: f"{n['width']}x{n['height']}"),
     ("frames", lambda n: "-".join(str(frame) for frame in n["frames"])),
     ("depth\nmm", lambda n: short(_solver(n).get("depth_mm"))),
-    ("Fz\nN", lambda n: short(float(n["force_n"][1][2]))),
+    ("Fn\nN", lambda n: short(n["normal_force_n"][1])),
     ("flow\nmedian, px", lambda n: short(n["forward"]["median_px"])),
     ("flow\n95 %, px", lambda n: short(n["forward"]["p95_px"])),
     ("flow\nmax, px", lambda n: short(n["forward"]["max_px"])),

@@ -9,7 +9,8 @@ import numpy as np
 from synth.arrays import BoolArray, FloatArray, Points, Projection, Triangles
 from synth.errors import InputError
 from synth.scene import Motion
-from synth.scene.gel_file import UNITS_MM, GelSurfaces, distance, gel_surfaces, nearest
+from synth.scene.gel_file import UNITS_MM, GelSurfaces, distance, gel_surfaces, in_frame, nearest
+from synth.scene.part import Vector3
 
 ON_MM = 1e-6
 """Distance at which a node lies on a surface."""
@@ -22,13 +23,14 @@ class CadFace:
     outer: Path
     window: Path
     unit: str
+    rotation_deg: Vector3
     holds_end: bool
     volume_mm3 = None
     """Not known before the gel is meshed."""
 
     @cached_property
     def surfaces(self) -> GelSurfaces:
-        return gel_surfaces(self.outer, self.window, self.unit)
+        return gel_surfaces(self.outer, self.window, self.unit, self.rotation_deg)
 
     def holds(self, points: Points) -> BoolArray:
         return np.asarray(distance(self.surfaces.face, points) <= ON_MM)
@@ -60,7 +62,7 @@ class CadFace:
             raise InputError(
                 f'sensor.pattern.placing = "uv": {self.outer.name} has no texture coordinates; save it as OBJ or PLY'
             )
-        points = UNITS_MM[self.unit] * np.asarray(read.points, float) * [1, -1, 1]
+        points = in_frame(UNITS_MM[self.unit] * np.asarray(read.points, float), self.rotation_deg)
         points += self.surfaces.outer.points.min(axis=0) - points[faces].min(axis=(0, 1))
         return points, faces.astype(np.int32), np.asarray(places, float)
 

@@ -48,7 +48,8 @@ def face_of(gel: Gel, folder: Path = Path()) -> Face:
     if gel.radius_mm is not None and gel.thickness_mm is not None:
         return CapsuleFace(gel.radius_mm, gel.thickness_mm, gel.length_mm, gel.cut_end == "held")
     if gel.outer is not None and gel.window is not None:
-        return CadFace(folder / gel.outer, folder / gel.window, gel.unit or "mm", gel.cut_end == "held")
+        files = folder / gel.outer, folder / gel.window
+        return CadFace(*files, gel.unit or "mm", gel.rotation_deg, gel.cut_end == "held")
     return PadFace(gel.dome_radius_mm)
 
 

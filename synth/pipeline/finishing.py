@@ -18,6 +18,8 @@ from synth.dataset.sample_files import write_sample_files
 from synth.flow.exact import exact_flow
 from synth.flow.field import FlowField
 from synth.flow.view import View
+from synth.mesh import face_of
+from synth.mesh.face import PadFace
 from synth.optics import Optics
 from synth.pipeline.records import JobContext, Outcome, SimulatedTrajectory
 from synth.pipeline.render_session import Frame, RenderedTrajectory
@@ -25,6 +27,7 @@ from synth.render.camera_image import camera_image
 from synth.scene import Camera, Outputs
 from synth.scene.sampling import Pair
 from synth.simulate import State
+from synth.simulate.load_path import PressFrame
 from synth.simulate.resolution import accuracy
 
 DARKEST, BRIGHTEST, LEAST_GEL = 12, 245, 0.5
@@ -65,8 +68,10 @@ def _diagnostics(context: JobContext, simulated: SimulatedTrajectory) -> dict[st
     found = simulated.accuracy or accuracy(simulated.scene, context.plan.template.folder)
     error = None if np.isnan(found.error_px) else round(found.error_px, 4)
     radius = simulated.edge_radius_mm
-    rounded = {} if radius is None else {"edge_radius_mm": round(radius, 4)}
-    return {**simulated.mesh, "elements_across_contact": found.across, "predicted_error_px": error, **rounded}
+    more: dict[str, Any] = {} if radius is None else {"edge_radius_mm": round(radius, 4)}
+    if not isinstance(face := face_of(simulated.scene.sensor.gel, context.plan.template.folder), PadFace):
+        more["inward_normal"] = PressFrame.of(simulated.scene.motion, face).axes[:, 2].round(6).tolist()
+    return {**simulated.mesh, "elements_across_contact": found.across, "predicted_error_px": error, **more}
 
 
 def _sample(

@@ -155,7 +155,6 @@ def _decisions(template: Template, variant: Variant) -> tuple[Decision, ...]:
         Decision("colour", not variant.is_mono, hue),
         Decision("backward flow", outputs.backward, f"outputs.backward = {str(outputs.backward).lower()}"),
         Decision("optional channels", bool(optional), ", ".join(optional) or "none asked for in outputs"),
-        Decision("indenter in the picture", False, "the coating is opaque"),
     )
 
 

@@ -6,13 +6,17 @@ from typing import Annotated, Literal, TypeVar
 from pydantic import Field, model_validator
 
 from synth.arrays import FloatArray
-from synth.scene.part import NonNegative, Part, Positive
+from synth.scene.part import NonNegative, Part, Positive, Vector3
 
 THINNEST = 0.3
 """A domed pad keeps at least this share of its thickness at the corners. Elements there are flattened to that share of
 their height at the apex, see `synth.mesh.dome` for what becomes of their quality."""
 STEEPEST_DEG = 60.0
 """Largest slope of a dome's face, at its corners."""
+LARGEST_MM = 400.0
+"""Longest side of a gel, as of a robot's arm that is covered in one; beyond, a wrong unit is more likely."""
+THICKEST_MM = 50.0
+"""Largest thickness of a layer of gel, alike."""
 THICKEST = 0.9
 """Largest share of a capsule's radius that its layer of gel takes."""
 _NEEDED = {
@@ -49,9 +53,9 @@ class Gel(Part):
     """
 
     size_mm: tuple[
-        Annotated[float, Field(ge=1, le=200)],
-        Annotated[float, Field(ge=1, le=200)],
-        Annotated[float, Field(ge=0.2, le=50)],
+        Annotated[float, Field(ge=1, le=LARGEST_MM)],
+        Annotated[float, Field(ge=1, le=LARGEST_MM)],
+        Annotated[float, Field(ge=0.2, le=LARGEST_MM)],
     ] = (0.0, 0.0, 0.0)
     """The third is the thickness, of a domed pad that at the apex. Follows from the shape of round gels."""
     shape: Literal["box", "dome", "capsule", "file"] = "box"
@@ -60,9 +64,9 @@ class Gel(Part):
     flat. Patterns are laid on it along z: their places are x and y."""
     radius_mm: Annotated[float, Field(ge=1, le=100)] | None = None
     """Radius of a capsule's contact face."""
-    thickness_mm: Annotated[float, Field(ge=0.2, le=50)] | None = None
+    thickness_mm: Annotated[float, Field(ge=0.2, le=THICKEST_MM)] | None = None
     """Thickness of a capsule's layer of gel; of a gel from files that on the axis, which follows from them."""
-    length_mm: Annotated[float, Field(ge=0, le=200)] = 0.0
+    length_mm: Annotated[float, Field(ge=0, le=LARGEST_MM)] = 0.0
     """Length of a capsule's cylinder; 0: a hemisphere."""
     cut_end: Literal["free", "held"] = "free"
     """Whether the plane of largest z, in which a round gel ends, is held, as by a rigid frame."""
@@ -73,8 +77,10 @@ class Gel(Part):
     """File of the closed surface that the gel is bonded to, in the same axes; optics are those of [sensor.window]."""
     unit: Literal["mm", "cm", "m", "inch"] | None = None
     """Unit of lengths in the files."""
+    rotation_deg: Vector3 = (0.0, 0.0, 0.0)
+    """Turns both files' bodies about the files' x, then y, then z axis, right-handed, before they are placed."""
     digest: str = ""
-    """Digest of the files' content; filled in when a scene is loaded."""
+    """Digest of the files' content and their rotation; filled in when a scene is loaded."""
     youngs_modulus_kpa: Annotated[float, Field(ge=0.1, le=1e6)]
     poisson_ratio: Annotated[float, Field(ge=0, le=0.5)] = 0.4999
     """0.5 is exactly incompressible; below 0.3 no pressure field is needed."""
@@ -121,8 +127,14 @@ class Gel(Part):
             for name in names:
                 if name not in (*needed, *follows) and getattr(self, name) is not None:
                     raise ValueError(f'{name} belongs to shape = "{shape}", the shape is "{self.shape}"')
+        if not self.is_round and self.size_mm[2] > THICKEST_MM:
+            raise ValueError(
+                f"size_mm[2] = {self.size_mm[2]} is a pad's thickness, at most {THICKEST_MM:g} mm: check its unit"
+            )
         if self.length_mm and self.shape != "capsule":
             raise ValueError(f'length_mm belongs to shape = "capsule", the shape is "{self.shape}"')
+        if any(self.rotation_deg) and self.shape != "file":
+            raise ValueError(f'rotation_deg belongs to shape = "file", the shape is "{self.shape}"')
         if self.cut_end != "free" and not self.is_round:
             raise ValueError(f'cut_end is for round gels, the shape is "{self.shape}"')
         if self.shape == "file" and "size_mm" not in self.model_fields_set:

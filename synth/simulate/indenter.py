@@ -211,6 +211,11 @@ def _rounded_distance(turned: Triangles, grid: Grid, radius: float, named: str) 
     if radius > 0:
         values = grid.rounded(values, boundary, radius)
     if not (values < 0).any():
+        if turned.closed and (turned.points.min(axis=0) < grid.corner)[:2].any():
+            raise InputError(
+                f"{named}: only a hole or a hollow of it lies over the gel, or a wall thinner than {grid.spacing:.2g} "
+                "mm; move it with motion.position_mm, or give another size_mm"
+            )
         raise InputError(
             f"{named}: it encloses no volume that a grid of {grid.spacing:.2g} mm resolves; a single sheet needs a "
             "thickness"

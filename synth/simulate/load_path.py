@@ -36,6 +36,8 @@ BULGE, SLACK_MM = 1.5, 1.0
 """Gel beside a contact rises toward the body: no higher than this share of the depth, and so much."""
 TOUCH_MM = 1e-6
 """The path starts so far off the gel, at most."""
+OVER = 65
+"""Places along each side of a flat gel or dome at which it is asked whether a body reaches into it."""
 
 
 @dataclass(frozen=True)
@@ -86,14 +88,22 @@ class LoadPath:
         return float(face_height(np.array([self.motion.position_mm]), self.dome_radius_mm)[0])
 
     def is_over(self, size_mm: tuple[float, float, float]) -> bool:
-        """Whether the body's place, a ring's rim about it for a torus, comes down on the contact face of a gel.
+        """Whether the body's middle is over the face of a gel and the body, pressed in, reaches into it at all.
 
-        On a round gel rings may pass it by, or touch later than at depth 0.
+        The hole of a ring or an object, or the hollow between its feet, may be all that is over it. On a round gel the
+        place alone is looked at: beside it the face recedes.
         """
-        if self.frame is not None:
-            return self.body.kind != KINDS["torus"]
         rim = float(self.body.shape[1]) if self.body.kind == KINDS["torus"] else 0.0
-        return bool(np.all(np.abs(self.motion.position_mm) + rim < np.array(size_mm[:2]) / 2))
+        if self.frame is not None:
+            places = self.frame.origin[None]
+        elif np.any(np.abs(self.motion.position_mm) + rim >= np.array(size_mm[:2]) / 2):
+            return False
+        else:
+            x, y = (axis.ravel() for axis in np.meshgrid(*(np.linspace(-s / 2, s / 2, OVER) for s in size_mm[:2])))
+            places = np.column_stack([x, y, face_height(np.column_stack([x, y]), self.dome_radius_mm)])
+        pose, near = self.pose(self.press_mm), 0.0 if self.frame is not None else max(size_mm[:2]) / (OVER - 1)
+        distance = Distance(self.body, pose.centre[None], pose.rotation[None])
+        return bool(distance(places, np.zeros(len(places), dtype=np.int32))[1].min() < near)
 
     @cached_property
     def touch_mm(self) -> float:

@@ -32,6 +32,8 @@ _TOUCHING_MM, _NEAR_MM = 1e-7, 0.01
 """Distance up to which parts of the surface may touch: at one place, and within a thousandth of a px of it."""
 _SAME_PLACE_PX = 1e-4
 """Difference up to which the recorded flow stands for the derived one."""
+_TILE = 8192
+"""Places at once: what they need fits into a processor's cache, and memory hardly grows with the image."""
 Indices = NDArray[np.intp]
 _AROUND = BAND_PX * np.array([(x, y) for x in (-1, 0, 1) for y in (-1, 0, 1) if x or y], dtype=np.float64)
 
@@ -100,6 +102,12 @@ def check_motion(name: str, near: Sheet, far: Sheet, flow: FlowArray, visible: F
 
 def derive(near: Sheet, far: Sheet, places: Pixels, recorded: FloatArray) -> Derived:
     """Derives the motion at places (n, 2) and follows the recorded one (n, 2) there and back."""
+    ends = range(0, max(len(places), 1), _TILE)
+    tiles = [_derive_tile(near, far, places[at : at + _TILE], recorded[at : at + _TILE]) for at in ends]
+    return Derived(*(np.concatenate(part) for part in zip(*(vars(tile).values() for tile in tiles), strict=True)))
+
+
+def _derive_tile(near: Sheet, far: Sheet, places: Pixels, recorded: FloatArray) -> Derived:
     seen = near.seen(places)
     points = seen.positions(near.triangles, far.positions)
     flow = np.full(places.shape, np.nan)

@@ -1,6 +1,7 @@
 """Gels from CAD files: against boxes, domes and capsules of the same shape, bad files, and a verified dataset."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -13,21 +14,25 @@ import tomli_w
 from commands import refused
 from pads import areas, brick, capsule, capsule_mesh, complete, contact_faces, simulate_scenes
 from pads import scene as pad_scene
+from pydantic import ValidationError
 from render_scenes import needs_llvm
+from scipy.spatial.transform import Rotation
 
 from synth.arrays import FloatArray, Points, Triangles
 from synth.flow.exact import exact_flow
 from synth.flow.view import View
 from synth.mesh import check_mesh, domed
 from synth.mesh.capsule import CapsuleFace
+from synth.mesh.face import face_of
 from synth.mesh.pad import boundary_faces
 from synth.optics import Optics
 from synth.pipeline.generate import generate
 from synth.planning import check_buildable, job_variant
 from synth.render.chart import chart_of
 from synth.render.pattern import albedo
-from synth.scene import Scene
+from synth.scene import Gel, Scene
 from synth.scene.gel_file import measured
+from synth.scene.part import Vector3
 from synth.scene.template import load_scene
 from synth.simulate import Trajectory
 from synth.simulate.element import p2p1
@@ -192,6 +197,42 @@ def test_the_batched_solver_presses_its_layers(folder: Path, is_file: bool) -> N
     assert batched.status == "complete", batched.reason
     # Both within the tolerance of 1e-6 at the recorded states; steps between are solved to other tolerances.
     np.testing.assert_allclose(batched.states[-1].force_n, single.force_n, atol=2e-3 * np.linalg.norm(single.force_n))
+
+
+TURNS = {(180.0, 0.0, 0.0): "head", (0.0, 90.0, 0.0): "side", (30.0, -50.0, 70.0): "any"}
+
+
+@pytest.mark.parametrize("turn", TURNS, ids=TURNS.values())
+def test_files_in_other_axes_are_turned_to_the_same_gel(folder: Path, tmp_path: Path, turn: Vector3) -> None:
+    """What CAD has with its tip at +z or on its side."""
+    back = Rotation.from_euler("xyz", turn, degrees=True).inv().as_matrix()
+    for name in ("outer.stl", "outer.obj", "window.stl"):
+        body = pv.read(folder / name)
+        body.points = body.points @ back.T
+        body.save(tmp_path / name)
+    upright, turned = from_files(capsule(), folder), from_files(capsule(), tmp_path, rotation_deg=list(turn))
+    faces = [face_of(scene.sensor.gel, at) for scene, at in ((upright, folder), (turned, tmp_path))]
+    for part in ("outer", "window", "face"):
+        own, other = (getattr(face.surfaces, part).points for face in faces)
+        np.testing.assert_allclose(other, own, atol=1e-5)  # files hold single precision
+    assert upright.sensor.gel.digest != turned.sensor.gel.digest
+    if TURNS[turn] != "any":
+        says = str([float(angle) for angle in turn]).replace(".0", "")
+        refused(re.escape(f"rotation_deg = {says} turns its face"), load_scene, scene_file(tmp_path))
+    textured = scene_file(tmp_path, outer="outer.stl", rotation_deg={"uniform": [0.0, 1.0]})
+    refused("must be three fixed angles", load_scene, textured)
+
+
+def test_a_finger_of_55_mm_is_accepted_and_read_again(tmp_path: Path) -> None:
+    write(tmp_path, "outer.stl", capsule_body(12.0, 43.0, 0.0, 4.0))
+    write(tmp_path, "window.stl", capsule_body(8.0, 44.0, 4.0, 4.0))
+    gel = from_files(capsule(), tmp_path).sensor.gel
+    assert gel.size_mm[2] == pytest.approx(55.0, abs=1e-3)
+    built_in = Gel(shape="capsule", radius_mm=12.0, thickness_mm=3.0, length_mm=43.0, youngs_modulus_kpa=200.0)
+    for each in (gel, built_in):
+        assert Gel.model_validate_json(each.model_dump_json()) == each
+    with pytest.raises(ValidationError, match="a pad's thickness, at most 50 mm"):
+        Gel(size_mm=(20.0, 20.0, 55.0), youngs_modulus_kpa=200.0)
 
 
 SCENE = """

@@ -21,6 +21,7 @@ from synth.dataset.writer import DatasetWriter
 from synth.inspect import inspect, tables, write_html, write_sheet
 from synth.inspect.inspection import evenly_spaced
 from synth.inspect.panels import NO_GEL, arrows_of, flow_colours, robust_scale, wheel_legend
+from synth.inspect.text import COLUMNS, facts
 from synth.inspect.view import View, sample_at
 
 
@@ -200,3 +201,21 @@ def test_arrows_can_be_seen_at_any_flow(size):
     # Spacing 2 px: at most 1.6 of it; steps 1 2 3 5 7 10 at least half of that, less 5 % for the scale's rounding.
     assert (drawn <= 1.6 * 2 + 1e-9).all()
     assert (drawn >= 0.45 * 1.6 * 2).all()
+
+
+def test_forces_on_round_gels_are_told_along_the_inward_normal_of_the_press(tmp_path) -> None:
+    """A press at the equator pushes along -x: its force has no z, and would be called all shear."""
+    sample = translation_sample()
+    pressed = dataclasses.replace(
+        sample,
+        force_n=np.array([[0.0, 0.0, 0.0], [-1.5, 0.3, 0.4]]),
+        diagnostics={**sample.diagnostics, "inward_normal": [-1.0, 0.0, 0.0]},
+    )
+    directory = write_dataset(tmp_path / "d", [pressed])
+    found = inspect(directory)
+    assert found.numbers[0]["normal_force_n"] == [0.0, 1.5]
+    assert found.numbers[0]["side_force_n"] == [0.0, 0.5]
+    cells = {name: text(found.numbers[0]) for name, text in COLUMNS}
+    assert cells["Fn\nN"] == "1.5"
+    rows = dict(facts(found.numbers[0]))
+    assert (rows["normal force in frames 1, 2"], rows["side force in frames 1, 2"]) == ("0; 1.5 N", "0; 0.5 N")

@@ -11,12 +11,14 @@ import pyvista as pv
 from pads import complete, same, scene
 
 from benchmarks.probe import probe
+from synth.errors import InputError
 from synth.mesh import Counts, Focus, graded_box
 from synth.scene import Scene
 from synth.scene.template import SCENES
 from synth.simulate import indenter, simulate, stepping
 from synth.simulate.batched import simulate_presses
 from synth.simulate.batched.pad import prepare
+from synth.simulate.load_path import path_of
 from synth.simulate.newton import AIM, LEAST_VISCOSITY, MAX_ERROR, MOST_VISCOSITY, Solution, next_viscosity, solve
 from synth.simulate.options import STANDARD, SolverOptions
 from synth.simulate.press import Press
@@ -133,3 +135,38 @@ def test_relaxation_goes_on_where_newtons_method_ends_and_viscosity_follows_the_
     assert least < next_viscosity(1.0, 0.0, refused=True) <= less < same < more <= most
     assert next_viscosity(LEAST_VISCOSITY, 0.0) == 0.0
     assert next_viscosity(MOST_VISCOSITY, np.inf) == MOST_VISCOSITY
+
+
+def ring_file(folder: Path, hole_mm: float) -> Path:
+    file = folder / "ring.stl"
+    disc = pv.Disc(inner=hole_mm, outer=hole_mm + 3.0, c_res=128).triangulate()
+    disc.extrude((0.0, 0.0, 2.0), capping=True).triangulate().clean().save(file)
+    return file
+
+
+@pytest.mark.parametrize("is_batched", [False, True], ids=["single", "batched"])
+def test_a_hole_around_the_gel_touches_nothing_and_is_not_called_too_small(tmp_path: Path, is_batched: bool) -> None:
+    size = (4.0, 4.0, 2.0)
+    file = ring_file(tmp_path, 3.2)  # the pad's corners are 2.8 mm from its middle
+    body = {"shape": "mesh", "file": str(file), "cell_mm": 0.2, "fillet_mm": 0.3}
+    around = scene(size, indenter=body, motion={"depth_mm": 0.5, "steps": 1}, numerics={"element": "p1p1"})
+    mesh = graded_box(size, Focus((0.0, 0.0), (1.0, 1.0)), Counts((4, 4), (2, 2), 2))
+    made = Press.of(around, mesh, tmp_path)
+    batched = simulate_presses([made], prepare(around, mesh, "cpu")) if is_batched else [(0, simulate_press(made))]
+    ((_, found),) = batched
+    assert found.status == "complete", found.reason
+    assert found.states[-1].force_n == (0.0, 0.0, 0.0)
+
+
+def test_a_body_whose_hole_is_far_wider_than_the_gel_is_named_so(tmp_path: Path) -> None:
+    body = {"shape": "mesh", "file": str(ring_file(tmp_path, 9.0))}
+    with pytest.raises(InputError, match="only a hole or a hollow of it lies over the gel"):
+        path_of(scene((4.0, 4.0, 2.0), indenter=body, motion={"depth_mm": 0.5}))
+
+
+def test_a_body_that_slips_between_contact_points_is_still_too_small() -> None:
+    needle = {"shape": "sphere", "radius_mm": 0.05}
+    found = simulate(
+        scene(SIZE, indenter=needle, motion={"depth_mm": 0.02, "steps": 1, "position_mm": [5.3, 4.1]}), MESH
+    )
+    assert "too small for the mesh" in found.reason

@@ -136,7 +136,7 @@ WRONG_KEYS_AND_TYPES = [
 ]
 IMPOSSIBLE_PHYSICS = [
     ("sensor.gel.poisson_ratio=0.51", " = 0.51: must be less than or equal to 0.5"),
-    ("sensor.gel.size_mm=[20000, 6, 2.5]", "[0] = 20000: must be less than or equal to 200"),
+    ("sensor.gel.size_mm=[20000, 6, 2.5]", "[0] = 20000: must be less than or equal to 400"),
     ("sensor.gel.youngs_modulus_kpa=0", " = 0: must be greater than or equal to 0.1"),
     ("motion.depth_mm=2.4", " = 2.4 is more than 85 % of the gel's thickness (2.5 mm)"),
     ("motion.depth_mm={ uniform = [0.1, 2.4] }", " = 2.4 is more than 85 %"),
