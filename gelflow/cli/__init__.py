@@ -8,6 +8,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 from cyclopts import App, CycloptsError
 
@@ -46,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return status if isinstance(status, int) else 0
 
 
-def _say(message: Warning | str, *_: object) -> None:
+def _say(message: Warning | str, *_: Any, **__: Any) -> None:
     """Prints a warning of ours or of a library as one line."""
     print(f"gelflow: {message}", file=sys.stderr)
 

@@ -5,7 +5,7 @@ Frames are (H, W, 3), RGB, as the decoder gives them: uint8, of images uint16, t
 
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import count
@@ -122,7 +122,7 @@ def _rate(capture: Any) -> float:
     return rate if 1.0 <= rate <= 1000.0 else NOMINAL_RATE
 
 
-def newest_frames(source: str) -> Iterator[tuple[int, float, Bytes3]]:
+def newest_frames(source: str) -> Generator[tuple[int, float, Bytes3], None, None]:
     """Yields (index, time, frame) of a camera, leaving out the frames that come while the caller is busy.
 
     The source is a camera's number, the address of a stream, or a video file, which is played as its time stamps say.

@@ -1,6 +1,6 @@
 """Flow of a running camera, and a page that shows it."""
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import closing, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Condition, Thread
@@ -25,7 +25,7 @@ class LiveFlow(NamedTuple):
     motion: Motion
 
 
-def follow(method: Method, source: str, reference: Reference = "first") -> Iterator[LiveFlow]:
+def follow(method: Method, source: str, reference: Reference = "first") -> Generator[LiveFlow, None, None]:
     """Yields the flow to each newest frame, from the first frame or from the one that was used before.
 
     The source is as `newest_frames` takes it. InputError where it does not open or gives fewer than two frames, its

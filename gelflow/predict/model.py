@@ -2,13 +2,13 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple, overload
+from typing import Any, NamedTuple, cast, overload
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gelflow.arrays import Bytes3, Flow, FlowArray, ImageArray, Images, MapArray
+from gelflow.arrays import Bytes3, Flow, FlowArray, Frame, ImageArray, Images, MapArray
 from gelflow.baselines.learned import Learned
 from gelflow.baselines.method import uncertainty
 from gelflow.config import Registration
@@ -153,7 +153,7 @@ def _images(image1: NDArray[np.generic], image2: NDArray[np.generic]) -> tuple[I
 
 def _in_unit_range(name: str, image: NDArray[np.generic]) -> ImageArray:
     if image.dtype in (np.uint8, np.uint16):
-        return in_unit_range(image)
+        return in_unit_range(cast(Frame, image))
     if image.dtype.kind not in "biuf":
         raise InputError(f"{name} is {image.dtype}; allowed: real numbers")
     if image.size:

@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import astuple, dataclass, fields
 from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -225,7 +225,7 @@ def _places(times: list[float], frames_per_second: float) -> tuple[list[int], fl
 def _write_overlay(pictures: Iterator[Bytes3], video: Path, places: list[int], rate: float) -> None:
     """Writes a video in which each picture stays until the place of the next."""
     temporary = video.with_name(".overlay.part.mp4")
-    writer = None
+    writer: Any = None  # OpenCV has no types
     try:
         for picture, place, following in zip(pictures, places, [*places[1:], places[-1] + 1], strict=True):
             if writer is None:
