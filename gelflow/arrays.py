@@ -18,6 +18,7 @@ Scalar = Annotated[Tensor, "() float32"]
 
 ImageArray = Annotated[NDArray[np.float32], "(H, W, 3) float32, RGB in [0, 1]"]
 Bytes3 = Annotated[NDArray[np.uint8], "(H, W, 3) uint8, RGB"]
+Frame = Annotated[NDArray[np.uint8] | NDArray[np.uint16], "(H, W, 3), RGB of 8 or 16 bits"]
 Grey8 = Annotated[NDArray[np.uint8], "(H, W) uint8"]
 FlowArray = Annotated[NDArray[np.float32], "(H, W, 2) float32, (U right, V down) in px; NaN where no gel is seen"]
 MapArray = Annotated[NDArray[np.float32], "(H, W) float32"]

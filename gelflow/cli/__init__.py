@@ -6,7 +6,9 @@ Exit status: 0 done, 1 done in part, 2 wrong input, 130 interrupted. Nothing hea
 import os
 import sys
 import traceback
+import warnings
 from collections.abc import Sequence
+from typing import Any
 
 from cyclopts import App, CycloptsError
 
@@ -34,6 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     tokens = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in tokens
     tokens = [token for token in tokens if token != "--debug"]
+    warnings.showwarning = _say
     try:
         status = app(tokens, exit_on_error=False, print_error=False)
     except (InputError, CycloptsError, OSError, MemoryError, RecursionError, KeyboardInterrupt) as error:
@@ -42,6 +45,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"gelflow: {printable(_one_line(error))}", file=sys.stderr)
         return 130 if isinstance(error, KeyboardInterrupt) else 2
     return status if isinstance(status, int) else 0
+
+
+def _say(message: Warning | str, *_: Any, **__: Any) -> None:
+    """Prints a warning of ours or of a library as one line."""
+    print(f"gelflow: {message}", file=sys.stderr)
 
 
 def _one_line(error: BaseException) -> str:

@@ -7,6 +7,7 @@ import math
 import os
 import sys
 import time
+from contextlib import closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -119,17 +120,18 @@ def live(
     scale, started = 0.0, time.perf_counter()
     before = started
     try:
-        for frame, found, motion in follow(estimator, source, reference):
-            if page:
-                known = certain(found.flow, found.sigma)
-                scale = max(SCALE_DECAY * scale, robust_scale(known))
-                page.show(draw_overlay(frame, known, round_up(scale)))
-            now = time.perf_counter()
-            text = f"{_words(motion)}; {1 / (now - before):.1f} frames/s"
-            print(json.dumps(asdict(motion)) if as_json else f"frame {motion.frame}: {text}", flush=True)
-            before = now
-            if now - started >= seconds:
-                break
+        with closing(follow(estimator, source, reference)) as flows:
+            for frame, found, motion in flows:
+                if page:
+                    known = certain(found.flow, found.sigma)
+                    scale = max(SCALE_DECAY * scale, robust_scale(known))
+                    page.show(draw_overlay(frame, known, round_up(scale)))
+                now = time.perf_counter()
+                text = f"{_words(motion)}; {1 / (now - before):.1f} frames/s"
+                print(json.dumps(asdict(motion)) if as_json else f"frame {motion.frame}: {text}", flush=True)
+                before = now
+                if now - started >= seconds:
+                    break
     except KeyboardInterrupt:
         pass
     except BrokenPipeError:  # whoever read the lines has enough of them

@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from gelflow.arrays import Bytes3
+from gelflow.arrays import Frame
 from gelflow.data.choose import ChoiceConfig, Choices, choose_pairs
 from gelflow.data.open import holds_pairs
 from gelflow.data.pairset import FILE, ChosenPair, PairSet, SourceReport, read_pair_set, write_pair_set
 from gelflow.errors import InputError
-from gelflow.files.image import MINIMUM_SIDE, write_png
+from gelflow.files.image import MINIMUM_SIDE, in_unit_range, range_factor, to_bytes, write_png
 from gelflow.files.video import SUFFIXES, describe, frames, image_files
 
 Progress = Callable[[int, int, str, SourceReport | str], None]
@@ -55,7 +55,7 @@ def find_recordings(inputs: Sequence[str]) -> dict[str, Path]:
 def _recordings_at(path: Path) -> list[Path]:
     if path.is_file():
         if path.suffix.lower() not in SUFFIXES:
-            raise InputError(f"{path}: not a video; allowed: {', '.join(sorted(SUFFIXES))}, or a folder of images")
+            describe(path)  # what it holds decides, not its name
         return [path]
     below = sorted(p for p in path.rglob("*") if not any(part.startswith(".") for part in p.relative_to(path).parts))
     found = [p for p in below if p.suffix.lower() in SUFFIXES and p.is_file()]
@@ -136,11 +136,12 @@ def _differences(there: dict[str, Any], here: dict[str, Any]) -> list[str]:
 
 
 def _extract_one(name: str, path: Path, out: Path, config: ChoiceConfig) -> tuple[SourceReport, list[ChosenPair]]:
-    count = describe(path).frames
+    info = describe(path)
+    count = info.frames + info.lost
     every = max(1, -(-count // config.frames))
     indices: list[int] = []
-    pictures: list[Bytes3] = []
-    for index, frame in frames(path, every):
+    pictures: list[Frame] = []
+    for index, _, frame in frames(path, every):
         if frame is None:
             continue
         if pictures and frame.shape != pictures[0].shape:
@@ -153,7 +154,9 @@ def _extract_one(name: str, path: Path, out: Path, config: ChoiceConfig) -> tupl
     if min(height, width) < MINIMUM_SIDE:
         raise InputError(f"{path}: frames of {width} x {height} px; each side needs {MINIMUM_SIDE}")
     digest = hashlib.sha256(f"{config.seed}:{name}".encode()).digest()
-    choices = choose_pairs(pictures, config, np.random.default_rng(int.from_bytes(digest[:16], "big")))
+    factor = range_factor(max(picture.max() / np.iinfo(picture.dtype).max for picture in pictures))
+    shown = [to_bytes(factor * in_unit_range(picture)) for picture in pictures]
+    choices = choose_pairs(shown, config, np.random.default_rng(int.from_bytes(digest[:16], "big")))
     lost = -(-count // every) - len(pictures)
     pairs = _write(name, choices, indices, pictures, out)
     report = SourceReport(
@@ -167,7 +170,7 @@ def _extract_one(name: str, path: Path, out: Path, config: ChoiceConfig) -> tupl
 
 
 def _write(
-    source: str, choices: Choices, indices: Sequence[int], pictures: Sequence[Bytes3], out: Path
+    source: str, choices: Choices, indices: Sequence[int], pictures: Sequence[Frame], out: Path
 ) -> list[ChosenPair]:
     pairs = []
     for choice in sorted(choices.pairs, key=lambda c: (c.first, c.second)):

@@ -5,6 +5,7 @@ photograph is turned as its EXIF data say.
 """
 
 import io
+import math
 import warnings
 from pathlib import Path
 
@@ -12,7 +13,7 @@ import cv2
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from gelflow.arrays import Bytes3, Grey8, ImageArray
+from gelflow.arrays import Bytes3, Frame, Grey8, ImageArray
 from gelflow.errors import InputError
 from gelflow.files.atomic import replacing
 from gelflow.files.quiet import quiet
@@ -22,6 +23,8 @@ SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".ppm"})
 FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "PPM")
 MINIMUM_SIDE = 16
 """Optical flow of an image with a side of fewer px is not attempted."""
+SMALL_RANGE = 0.25
+"""Images whose largest value, white being 1, is at most this have fewer bits than their file, or hardly any light."""
 
 
 def _check(path: Path, data: bytes) -> None:
@@ -40,8 +43,8 @@ def _check(path: Path, data: bytes) -> None:
         raise InputError(f"{path}: truncated or damaged image ({error})") from error
 
 
-def read_image(path: Path) -> ImageArray:
-    """An image as (H, W, 3) float32, RGB in [0, 1]; InputError if missing, damaged, or neither of 8 nor 16 bits."""
+def read_pixels(path: Path) -> Frame:
+    """An image as (H, W, 3), RGB; InputError if missing, damaged, or neither of 8 nor 16 bits."""
     if not path.is_file():
         raise InputError(f"{path}: {'is a folder' if Path(str(path)).is_dir() else 'there is no such image file'}")
     data = read_file(path) if isinstance(path, Path) else path.read_bytes()
@@ -52,12 +55,47 @@ def read_image(path: Path) -> ImageArray:
         raise InputError(f"{path}: the image does not decode")
     if pixels.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{path}: {pixels.dtype} pixels; allowed: 8 or 16 bits per channel")
-    largest = np.iinfo(pixels.dtype).max
-    return np.ascontiguousarray(pixels[..., ::-1], np.float32) / np.float32(largest)
+    return np.ascontiguousarray(pixels[..., ::-1])
+
+
+def read_image(path: Path) -> ImageArray:
+    """An image as (H, W, 3) float32, RGB in [0, 1]; exceptions as for `read_pixels`."""
+    return in_unit_range(read_pixels(path))
+
+
+def in_unit_range(frame: Frame) -> ImageArray:
+    """Pixels as float32, white of 8 or 16 bits as 1."""
+    return frame.astype(np.float32) / np.float32(np.iinfo(frame.dtype).max)
+
+
+def full_range(image1: ImageArray, image2: ImageArray) -> tuple[ImageArray, ImageArray]:
+    """Both images times their `range_factor`."""
+    factor = np.float32(range_factor(max(image1.max(initial=0.0), image2.max(initial=0.0))))
+    return (image1, image2) if factor == 1 else (factor * image1, factor * image2)
+
+
+def range_factor(largest: float) -> float:
+    """The power of two by which images are multiplied that fill at most `SMALL_RANGE`; warns where it is not 1.
+
+    `largest` is their largest value. 10 bits in files of 16 fill 1/64, and no method sees motion in so faint a picture.
+    """
+    if not 0 < largest <= SMALL_RANGE:
+        return 1.0
+    factor = 2 ** math.floor(-math.log2(largest))
+    bits = 17 - factor.bit_length()
+    warnings.warn(
+        f"images that fill at most 1/{factor} of their range of values, such as {bits} bits in files of 16, are "
+        f"multiplied by {factor}",
+        stacklevel=2,
+    )
+    return float(factor)
 
 
 def read_pair(path1: Path, path2: Path) -> tuple[ImageArray, ImageArray]:
-    """Two images; InputError where one cannot be read or is smaller than `MINIMUM_SIDE`, or their sizes differ."""
+    """Two images in `full_range`.
+
+    InputError where one cannot be read or is smaller than `MINIMUM_SIDE`, or their sizes differ.
+    """
     image1, image2 = read_image(path1), read_image(path2)
     size1, size2 = (f"{image.shape[1]} x {image.shape[0]} px" for image in (image1, image2))
     for path, image, size in ((path1, image1, size1), (path2, image2, size2)):
@@ -65,7 +103,7 @@ def read_pair(path1: Path, path2: Path) -> tuple[ImageArray, ImageArray]:
             raise InputError(f"{path}: {size} are too few for optical flow; each side needs {MINIMUM_SIDE} px or more")
     if image1.shape != image2.shape:
         raise InputError(f"{path1} has {size1}, {path2} has {size2}; both images of a pair need one size")
-    return image1, image2
+    return full_range(image1, image2)
 
 
 def to_bytes(image: ImageArray) -> Bytes3:
@@ -78,8 +116,8 @@ def to_grey(image: ImageArray) -> Grey8:
     return cv2.cvtColor(to_bytes(image), cv2.COLOR_RGB2GRAY)
 
 
-def write_png(path: Path, pixels: Bytes3 | Grey8) -> None:
-    """Writes (H, W, 3) RGB or (H, W) grey uint8 as PNG; replaces the file as a whole."""
+def write_png(path: Path, pixels: Frame | Grey8) -> None:
+    """Writes (H, W, 3) RGB of 8 or 16 bits or (H, W) grey uint8 as PNG; replaces the file as a whole."""
     bgr = pixels[..., ::-1] if pixels.ndim == 3 else pixels
     data = cv2.imencode(".png", np.ascontiguousarray(bgr))[1]
     with replacing(path) as temporary:

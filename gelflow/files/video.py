@@ -1,11 +1,11 @@
 """Frames of a video file, of a folder of images in the natural order of their names, or of a running camera.
 
-Frames are (H, W, 3) uint8, RGB, as the decoder gives them.
+Frames are (H, W, 3), RGB, as the decoder gives them: uint8, of images uint16, too.
 """
 
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import count
@@ -16,13 +16,21 @@ from typing import Any
 
 import cv2
 
-from gelflow.arrays import Bytes3
+from gelflow.arrays import Bytes3, Frame
 from gelflow.errors import InputError
 from gelflow.files.image import SUFFIXES as IMAGE_SUFFIXES
-from gelflow.files.image import read_image, to_bytes
+from gelflow.files.image import read_pixels
 from gelflow.files.quiet import quiet
 
-SUFFIXES = frozenset({".avi", ".mp4", ".m4v", ".mov", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv"})
+SUFFIXES = frozenset(
+    {".avi", ".mp4", ".m4v", ".mov", ".mkv", ".webm", ".mpg", ".mpeg", ".wmv", ".flv", ".ts", ".mts", ".3gp", ".ogv"}
+)
+COUNTED_SUFFIXES = frozenset({".avi", ".mp4", ".m4v", ".mov"})
+"""Files whose headers count frames; others estimate their number from duration and rate."""
+STALL_S = 10
+"""A stream that gives no frame for so long has ended."""
+NOMINAL_RATE = 25.0
+"""Frames per second of what has no rate of its own."""
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
@@ -38,107 +46,131 @@ def image_files(folder: Path) -> list[Path]:
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """Number of frames and their rate per second. Of a damaged video fewer frames may decode."""
+    """Number of frames that decode, their nominal rate per second, and how many more the header counts at the end."""
 
     frames: int
     frames_per_second: float
+    lost: int = 0
 
 
 def describe(path: Path) -> VideoInfo:
     """Number of frames and their rate; a folder of images has a nominal rate of 25 frames/s.
 
-    The number is the header's; where the header does not know it, frames are counted. InputError where the video is
-    missing or does not open, or the folder holds no image.
+    The frames of a video are counted by decoding it. InputError where the video is missing or does not open, or the
+    folder holds no image.
     """
     if path.is_dir():
         files = image_files(path)
         if not files:
             raise InputError(f"{path}: the folder holds no image ({', '.join(sorted(IMAGE_SUFFIXES))}); give one video")
-        return VideoInfo(len(files), 25.0)
+        return VideoInfo(len(files), NOMINAL_RATE)
     capture = _open(path)
-    with quiet():
-        count, rate = int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), float(capture.get(cv2.CAP_PROP_FPS))
-        if count < 1:
-            count = 0
-            while capture.grab():
-                count += 1
-        capture.release()
-    return VideoInfo(count, rate if 1.0 <= rate <= 1000.0 else 25.0)
+    rate, promised = _rate(capture), int(capture.get(cv2.CAP_PROP_FRAME_COUNT))
+    frames, last_s = 0, 0.0
+    for frames, last_s in enumerate(_times(capture, rate), start=1):  # noqa: B007  # the last ones are what counts
+        pass
+    # Frames that were dropped in recording count in the header and take time, but are none. Other containers estimate.
+    lost = promised - max(frames, round(last_s * rate) + 1) if path.suffix.lower() in COUNTED_SUFFIXES else 0
+    return VideoInfo(frames, rate, max(0, lost))
 
 
-def frames(path: Path, every: int = 1) -> Iterator[tuple[int, Bytes3 | None]]:
-    """Yields (index, frame) of every `every`-th frame, beginning with frame 0.
+def frames(path: Path, every: int = 1) -> Iterator[tuple[int, float | None, Frame | None]]:
+    """Yields (index, time, frame) of every `every`-th frame, beginning with frame 0.
 
-    A video ends at the first frame that does not decode. An image of a folder that cannot be read is yielded as None.
-    InputError where the video is missing or does not open.
+    The time is the file's time stamp in s, None for the images of a folder. A video ends at the first frame that does
+    not decode. An image of a folder that cannot be read is yielded as None. InputError where the video is missing or
+    does not open.
     """
     if path.is_dir():
-        for index, file in enumerate(image_files(path)):
-            if index % every == 0:
-                image = None
-                with suppress(InputError):
-                    image = to_bytes(read_image(file))
-                yield index, image
+        for index, file in enumerate(image_files(path)[::every]):
+            image = None
+            with suppress(InputError):
+                image = read_pixels(file)
+            yield index * every, None, image
         return
     capture = _open(path)
-    index = 0
+    for index, time_s in enumerate(_times(capture, _rate(capture))):
+        if index % every == 0:
+            with quiet():
+                decoded, frame = capture.retrieve()
+            if decoded:
+                yield index, time_s, _rgb(frame)
+
+
+def _times(capture: Any, rate: float) -> Iterator[float]:
+    """Grabs one frame after the other, and yields the time of each, s; releases the video in the end."""
+    last_s = -1 / rate
     try:
         while True:
-            frame = None
             with quiet():
-                decoded = capture.grab()
-                if decoded and index % every == 0:
-                    decoded, frame = capture.retrieve()
-            if not decoded:
-                return
-            if frame is not None:
-                yield index, _rgb(frame)
-            index += 1
+                if not capture.grab():
+                    return
+                last_s = _stamp(capture, last_s, rate)
+            yield last_s
     finally:
         capture.release()
 
 
-def newest_frames(source: str) -> Iterator[tuple[int, Bytes3]]:
-    """Yields (index, frame) of a camera, leaving out the frames that come while the caller is busy.
+def _stamp(capture: Any, last_s: float, rate: float) -> float:
+    """The time of the frame that was grabbed; without time stamps, frames follow at the nominal rate."""
+    time_s = float(capture.get(cv2.CAP_PROP_POS_MSEC)) / 1000
+    return round(time_s if time_s > last_s else last_s + 1 / rate, 6)
 
-    The source is a camera's number, the address of a stream, or a video file, which is played at its own rate. The
-    iterator ends with it. InputError where it does not open or is a folder.
+
+def _rate(capture: Any) -> float:
+    rate = float(capture.get(cv2.CAP_PROP_FPS))
+    return rate if 1.0 <= rate <= 1000.0 else NOMINAL_RATE
+
+
+def newest_frames(source: str) -> Generator[tuple[int, float, Bytes3], None, None]:
+    """Yields (index, time, frame) of a camera, leaving out the frames that come while the caller is busy.
+
+    The source is a camera's number, the address of a stream, or a video file, which is played as its time stamps say.
+    The time of a camera's frame is that of its arrival, s since the camera was opened. The iterator ends with the
+    source, and where a stream gives nothing for `STALL_S`. When it is closed, it waits for a frame that is being read.
+    InputError where the source does not open or is a folder.
     """
     if Path(source).is_dir():
         raise InputError(f"{source}: a folder of images is no camera; predict takes it")
     if Path(source).is_fifo():
         raise InputError(f"{source}: is a pipe, which may never open; give a camera, a stream's address or a video")
+    limits = [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, 1000 * STALL_S, cv2.CAP_PROP_READ_TIMEOUT_MSEC, 1000 * STALL_S]
     with quiet():
-        capture = cv2.VideoCapture(int(source) if re.fullmatch(r"\d{1,4}", source) else source)
+        camera = int(source) if re.fullmatch(r"\d{1,4}", source) else source
+        capture = cv2.VideoCapture(camera, cv2.CAP_ANY, limits if "://" in source else [])
     if not capture.isOpened():
         raise InputError(
             f"{source}: it does not open; allowed are a camera's number, such as 0, a stream's address and a video file"
         )
-    interval = 1 / describe(Path(source)).frames_per_second if Path(source).is_file() else 0.0
-    newest: Queue[tuple[int, Bytes3] | None] = Queue()
+    recorded, rate = Path(source).is_file(), _rate(capture)
+    newest: Queue[tuple[int, float, Bytes3] | None] = Queue()
     stopped = Event()
 
     def read() -> None:
-        started = time.monotonic()
+        started, time_s = time.monotonic(), -1 / rate
         try:
             for index in count():
                 decoded, frame = capture.read()
-                if not decoded or stopped.is_set():
+                if not decoded:
+                    return
+                time_s = _stamp(capture, time_s, rate) if recorded else time.monotonic() - started
+                if stopped.wait(max(0.0, started + time_s - time.monotonic())):
                     return
                 with suppress(Empty):
                     newest.get_nowait()
-                newest.put((index, _rgb(frame)))
-                stopped.wait(max(0.0, started + (index + 1) * interval - time.monotonic()))
+                newest.put((index, time_s, _rgb(frame)))
         finally:
             capture.release()
             newest.put(None)
 
-    Thread(target=read, daemon=True).start()  # not waited for: a stalled stream keeps it for half a minute
+    reader = Thread(target=read, daemon=True)
+    reader.start()
     try:
         while (found := newest.get()) is not None:
             yield found
     finally:
         stopped.set()
+        reader.join(STALL_S + 1)  # Python aborts where it ends while a library's call is about to return
 
 
 def _rgb(frame: Any) -> Bytes3:

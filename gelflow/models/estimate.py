@@ -8,6 +8,7 @@ from torch import Tensor
 from gelflow.arrays import Flow, Images
 from gelflow.config import MINIMUM_SIDE
 from gelflow.errors import InputError
+from gelflow.files.image import MINIMUM_SIDE as SMALLEST
 from gelflow.models import GelFlow
 from gelflow.models.gelflow import check_shapes
 from gelflow.models.working_size import sized_sigma, unknown_px, working_sizes
@@ -32,14 +33,13 @@ def estimate_flow(
     left as it was. `size` is the rows and columns at which it works, by default `GelFlow.image_size`. Where that is
     None, all of `working_sizes` are tried, and each pair keeps the flow with the least mean of sigma or, where they
     differ much (DIFFERENT), the one that closes best. `flow` is called in place of `GelFlow.flow`, such as a
-    `RecordedNetwork` of the model. InputError for shapes that differ, sides below 64 px (of `size`, or without one of
-    the images), other than three colours, values that are not finite.
+    `RecordedNetwork` of the model. InputError for shapes that differ, sides of `size` below 64 px or, without one, of
+    the images below 16 px, other than three colours, values that are not finite.
     """
     size = size or model.image_size
     if size is not None and min(size) < MINIMUM_SIDE:
         raise InputError(f"size {size[0]}x{size[1]}: each side must be at least {MINIMUM_SIDE} px")
-    if size is None or image1.shape != image2.shape or image1.ndim != 4 or image1.shape[1] != 3:
-        check_shapes(image1, image2)
+    check_shapes(image1, image2, least=1 if size else SMALLEST)
     for name, image in (("image 1", image1), ("image 2", image2)):
         if not torch.isfinite(image).all():
             raise InputError(f"{name} holds NaN or infinite values; images must be finite, in [0, 1]")

@@ -120,14 +120,14 @@ def normalised(first: Features, second: Features) -> tuple[Tensor, Tensor]:
     return one, two
 
 
-def check_shapes(image1: Images, image2: Images) -> None:
-    """Refuses images that the network cannot take, as `GelFlow.forward` says."""
+def check_shapes(image1: Images, image2: Images, least: int = MINIMUM_SIDE) -> None:
+    """Refuses images that the network cannot take, as `GelFlow.forward` says, or with sides below `least`."""
     if image1.shape != image2.shape:
         raise InputError(f"the two images differ in shape: {_size(image1)} and {_size(image2)}; give two of one size")
     if image1.ndim != 4 or image1.shape[1] != 3:
         raise InputError(f"images of shape {tuple(image1.shape)}: (pairs, 3 colours, rows, columns) are needed")
-    if min(image1.shape[-2:]) < MINIMUM_SIDE:
-        raise InputError(f"image of {_size(image1)} px: each side must be at least {MINIMUM_SIDE} px; enlarge it first")
+    if min(image1.shape[-2:]) < least:
+        raise InputError(f"image of {_size(image1)} px: each side must be at least {least} px; enlarge it first")
 
 
 def _size(image: Tensor) -> str:

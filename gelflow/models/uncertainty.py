@@ -11,7 +11,8 @@ the finer window of the registration's further stage make the sum smaller, they 
 smoothed, because the flow is. Where the narrow window finds nothing, e + |V - V*|^2 and m are means under a wider one,
 over those places alone of which the images say more than the network: between dots a flow is known unless it bends. A
 bare gel has no such places, so that nothing is known, however plausible its flow. Over all places, wide windows would
-take light for texture. An error that leaves no trace in the images, such as dots taken for the next ones, is not seen.
+take light for texture. Near specks in the optics, the error of `gelflow.models.specks` is added to e. An error that
+leaves no trace in the images, such as dots taken for the next ones, is not seen.
 """
 
 import math
@@ -23,6 +24,7 @@ from gelflow.arrays import Features, Flow, Images
 from gelflow.config import RegistrationConfig
 from gelflow.models.evidence import TINY, gauss_newton
 from gelflow.models.registration import FINE_SMOOTHING_PX, FINE_WINDOW_PX, MAX_STEP_PX
+from gelflow.models.specks import speck_error
 from gelflow.models.wider_window import MIN_VARIANCE, TWO_STEPS, best_window, fine_noise
 from gelflow.ops.gaussian import SeparableFilter, smoother, window_sums
 from gelflow.ops.spline import SplineImage
@@ -81,7 +83,8 @@ def error_squares(flow: Flow, image1: Images, image2: Images) -> tuple[Tensor, T
     between = ~known & (weight > TINY)
     error = torch.where(between, wide(marks * error) / weight, error)
     moment = torch.where(between, _second_moment(wide, marks) / weight, moment)
-    return error, moment.square() * bend
+    textured = torch.where(known, found.texture, 0.0)
+    return error + speck_error(flow, image1, image2, textured), moment.square() * bend
 
 
 def combined(error: Tensor, curvature: Tensor, factor: float) -> Tensor:

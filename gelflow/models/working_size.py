@@ -22,13 +22,14 @@ MOST, LEAST = 640 * 480, 320 * 240
 
 
 def working_sizes(height: int, width: int) -> list[tuple[int, int]]:
-    """Rows and columns of one or two sizes for images of that size."""
-    pixels = height * width
+    """Rows and columns of one or two sizes for images of that size; the network's least where they are smaller."""
+    pixels, enlarged = height * width, max(1.0, MINIMUM_SIDE / min(height, width))
+    least = [(round(enlarged * height), round(enlarged * width))]
     if pixels <= LARGE:
-        return [(height, width)]
+        return least
     scales = (min(1.0, math.sqrt(limit / pixels)) for limit in (MOST, LEAST))
     sizes = [(round(scale * height), round(scale * width)) for scale in scales]
-    return [size for size in sizes if min(size) >= MINIMUM_SIDE] or [(height, width)]
+    return [size for size in sizes if min(size) >= MINIMUM_SIDE] or least
 
 
 def unknown_px(height: int, width: int) -> float:

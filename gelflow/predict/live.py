@@ -1,17 +1,17 @@
 """Flow of a running camera, and a page that shows it."""
 
-from collections.abc import Iterator
-from contextlib import suppress
+from collections.abc import Generator
+from contextlib import closing, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Condition, Thread
 from typing import NamedTuple
 
 import cv2
-import numpy as np
 
 from gelflow.arrays import Bytes3
 from gelflow.baselines.method import Method
 from gelflow.errors import InputError
+from gelflow.files.image import full_range, in_unit_range, to_bytes
 from gelflow.files.video import newest_frames
 from gelflow.predict.model import Estimate
 from gelflow.predict.prediction import Motion, Reference, estimate
@@ -25,7 +25,7 @@ class LiveFlow(NamedTuple):
     motion: Motion
 
 
-def follow(method: Method, source: str, reference: Reference = "first") -> Iterator[LiveFlow]:
+def follow(method: Method, source: str, reference: Reference = "first") -> Generator[LiveFlow, None, None]:
     """Yields the flow to each newest frame, from the first frame or from the one that was used before.
 
     The source is as `newest_frames` takes it. InputError where it does not open or gives fewer than two frames, its
@@ -33,19 +33,20 @@ def follow(method: Method, source: str, reference: Reference = "first") -> Itera
     """
     before: Bytes3 | None = None
     used = 0
-    for index, frame in newest_frames(source):
-        if before is not None:
-            if frame.shape != before.shape:
-                raise InputError(f"{source}, frame {index}: has another size than the frame before it")
-            first, second = (image.astype(np.float32) / np.float32(255) for image in (before, frame))
-            try:
-                found = estimate(method, first, second, index, source)
-            except InputError as error:
-                raise InputError(f"{source}, frame {index}, {method.name}: {error}") from error
-            yield LiveFlow(frame, *found)
-        if before is None or reference == "previous":
-            before = frame
-        used += 1
+    with closing(newest_frames(source)) as newest:
+        for index, time_s, frame in newest:
+            if before is not None:
+                if frame.shape != before.shape:
+                    raise InputError(f"{source}, frame {index}: has another size than the frame before it")
+                first, second = full_range(in_unit_range(before), in_unit_range(frame))
+                try:
+                    found = estimate(method, first, second, index, source, time_s)
+                except InputError as error:
+                    raise InputError(f"{source}, frame {index}, {method.name}: {error}") from error
+                yield LiveFlow(to_bytes(second), *found)
+            if before is None or reference == "previous":
+                before = frame
+            used += 1
     if used < 2:
         raise InputError(f"{source}: fewer than two frames came; does another program use the camera?")
 

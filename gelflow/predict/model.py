@@ -1,19 +1,24 @@
 """The network of the public Python interface: flow between two images, as arrays or as tensors."""
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple, overload
+from typing import Any, NamedTuple, cast, overload
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gelflow.arrays import Bytes3, Flow, FlowArray, ImageArray, Images, MapArray
+from gelflow.arrays import Bytes3, Flow, FlowArray, Frame, ImageArray, Images, MapArray
 from gelflow.baselines.learned import Learned
 from gelflow.baselines.method import uncertainty
 from gelflow.config import Registration
 from gelflow.errors import InputError
+from gelflow.files.image import full_range, in_unit_range, range_factor
 from gelflow.models.estimate import estimate_flow
 from gelflow.models.weights import SHIPPED, weights_file
+
+THREE_OF = {1: [0, 0, 0], 4: [0, 1, 2]}
+"""Channels that stand for red, green and blue in grey images and in those with alpha, by their number of channels."""
 
 
 class Estimate(NamedTuple):
@@ -47,13 +52,15 @@ class FlowModel:
         """Estimates the motion from image 1 to image 2, at their own size.
 
         Args:
-            image1: An RGB array (H, W, 3), uint8 or float in [0, 1]; or a tensor (3, H, W) or (B, 3, H, W) in [0, 1],
-                on any device. Each side has 64 px or more.
+            image1: An array (H, W, 3), uint8, uint16 or float in [0, 1]; or a tensor (3, H, W) in [0, 1], on any
+                device. Each side has 16 px or more. Images may be grey, with one channel or no axis for it, or RGBA,
+                whose alpha is left out. Batches have one axis more in front.
             image2: The same kind and shape.
 
         Returns:
             Flow in px, U right and V down, ``I1(x) = I2(x + flow(x))`` at pixel centres (c + 0.5, r + 0.5). Of arrays
-            (H, W, 2) float32; of tensors (2, H, W) or (B, 2, H, W) float32 on their device, without gradient.
+            (H, W, 2) float32; of tensors (2, H, W) float32 on their device, without gradient. Of batches (B, H, W, 2)
+            or (B, 2, H, W). Images that fill a small part of the range are scaled, with a warning.
 
         Raises:
             InputError: Other kinds, shapes or values, or an array beside a tensor.
@@ -65,28 +72,41 @@ class FlowModel:
             (64, 80, 2)
         """
         if isinstance(image1, Tensor) and isinstance(image2, Tensor):
+            if image1.ndim == image2.ndim == 2:
+                return self.flow(image1[None], image2[None])
             if image1.ndim == image2.ndim == 3:
                 return self.flow(image1[None], image2[None])[0]
             if not image1.numel() or not image2.numel():
                 raise InputError("no image given: the batch is empty")
-            for name, image in (("image 1", image1), ("image 2", image2)):
+            first, second = (
+                image[:, THREE_OF[image.shape[1]]] if image.ndim == 4 and image.shape[1] in THREE_OF else image
+                for image in (image1, image2)
+            )
+            for name, image in (("image 1", first), ("image 2", second)):
                 _check_range(name, str(image.dtype), float(image.min()), float(image.max()))
-            return estimate_flow(self._network.model, image1, image2, self._network.size, self._network.forward)
+            factor = range_factor(float(max(first.max(), second.max())))
+            return estimate_flow(
+                self._network.model, factor * first, factor * second, self._network.size, self._network.forward
+            )
         if isinstance(image1, np.ndarray) and isinstance(image2, np.ndarray):
-            return self._network.flow(_in_unit_range("image 1", image1), _in_unit_range("image 2", image2))
+            if image1.ndim == image2.ndim == 4:
+                return np.stack([self.flow(*each) for each in _pairs(image1, image2)])
+            return self._network.flow(*_images(image1, image2))
         given = f"{type(image1).__name__} and {type(image2).__name__}"
         raise InputError(f"images of {given}: two NumPy arrays or two torch tensors are needed")
 
     def estimate(self, image1: ImageArray | Bytes3, image2: ImageArray | Bytes3) -> Estimate:
         """The flow of two arrays, as `flow` gives it, and how certain it is; see `gelflow.models.uncertainty`.
 
-        InputError as for `flow`, and for tensors.
+        Of batches, all three have an axis more in front. InputError as for `flow`, and for tensors.
         """
         if isinstance(image1, Tensor):
             raise InputError("estimate takes arrays; of a tensor (3, H, W) give tensor.movedim(0, -1).numpy()")
+        if image1.ndim == image2.ndim == 4:
+            found = [self.estimate(*each) for each in _pairs(image1, image2)]
+            return Estimate(*map(np.stack, zip(*found, strict=True)))
         flow = self.flow(image1, image2)
-        first, second = _in_unit_range("image 1", image1), _in_unit_range("image 2", image2)
-        return Estimate(flow, *uncertainty(flow, first, second, self.device))
+        return Estimate(flow, *uncertainty(flow, *_images(image1, image2), self.device))
 
 
 def load_model(
@@ -114,9 +134,26 @@ def load_model(
     return FlowModel(Learned(weights_file(Path(name_or_path)), None, size, device, registration))
 
 
+def _pairs(image1: NDArray[np.generic], image2: NDArray[np.generic]) -> Iterator[Any]:
+    """The pairs of two batches of arrays."""
+    if not 0 < len(image1) == len(image2):
+        raise InputError(f"batches of {len(image1)} and {len(image2)} images; give as many of both, and at least one")
+    return zip(image1, image2, strict=True)
+
+
+def _images(image1: NDArray[np.generic], image2: NDArray[np.generic]) -> tuple[ImageArray, ImageArray]:
+    """Two arrays as images are in memory."""
+    first, second = (image[..., None] if image.ndim == 2 else image for image in (image1, image2))
+    first, second = (
+        image[..., THREE_OF[image.shape[2]]] if image.ndim == 3 and image.shape[2] in THREE_OF else image
+        for image in (first, second)
+    )
+    return full_range(_in_unit_range("image 1", first), _in_unit_range("image 2", second))
+
+
 def _in_unit_range(name: str, image: NDArray[np.generic]) -> ImageArray:
-    if image.dtype == np.uint8:
-        return image.astype(np.float32) / np.float32(255)
+    if image.dtype in (np.uint8, np.uint16):
+        return in_unit_range(cast(Frame, image))
     if image.dtype.kind not in "biuf":
         raise InputError(f"{name} is {image.dtype}; allowed: real numbers")
     if image.size:

@@ -6,19 +6,20 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import astuple, dataclass, fields
-from itertools import chain
+from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
 
-from gelflow.arrays import Bytes3, ImageArray
+from gelflow.arrays import Bytes3, Frame, ImageArray
 from gelflow.baselines.method import Method, uncertainty
 from gelflow.data.pairs import PairDataset, PairRecord
 from gelflow.errors import InputError
 from gelflow.files.atomic import refuse_foreign, write_csv
 from gelflow.files.exr import DIRECTIONS, read_flow, write_flo, write_flow
+from gelflow.files.image import full_range, in_unit_range, to_bytes
 from gelflow.files.quiet import quiet
 from gelflow.files.video import describe, frame_file, frames, image_files
 from gelflow.models.working_size import unknown_px
@@ -26,6 +27,8 @@ from gelflow.predict.model import Estimate
 from gelflow.predict.pictures import certain, draw_overlay, robust_scale, write_flow_picture
 
 Reference = Literal["first", "previous"]
+MAX_RATE = 600.0
+"""Largest number of frames per second of an overlay."""
 MOTIONS, MOTIONS_BEGIN = "motion.csv", b"mean_px,p95_px"
 """The table of motions, and what tells it from other tables."""
 
@@ -34,16 +37,18 @@ MOTIONS, MOTIONS_BEGIN = "motion.csv", b"mean_px,p95_px"
 class Motion:
     """Length of the flow, its mean and percentiles over the picture, and the method's run time.
 
-    `frame` is that of a video, or the number of a pair from 1 on; `unknown` is the share of the picture in which sigma
-    is above `gelflow.models.working_size.unknown_px`.
+    `frame` is that of a video, or the number of a pair from 1 on; `time_s` is when the video or camera says that it
+    was, None for files of images. `unknown` is the share of the picture in which sigma is above
+    `gelflow.models.working_size.unknown_px`.
     """
 
     frame: int
     file: str
+    time_s: float | None
     mean_px: float
     p95_px: float
     p99_px: float
-    seconds: float
+    compute_s: float
     unknown: float
 
 
@@ -123,7 +128,13 @@ def predict_video(
     """
     if every < 1:
         raise InputError(f"every = {every}: at least 1 is needed")
-    expected = max(0, -(-describe(path).frames // every) - 1)
+    info = describe(path)
+    expected = -(-info.frames // every) - 1
+    if info.frames < 2:
+        raise InputError(f"{path}: fewer than two frames decode; a flow needs two")
+    if expected < 1:
+        words = f"takes one of the {info.frames} frames, a flow needs two; allowed are 1 to {info.frames - 1}"
+        raise InputError(f"{path}: every = {every} {words}")
     video = out / "overlay.mp4"
     refuse_foreign(out / MOTIONS, MOTIONS_BEGIN, video)
     for earlier in _earlier_flows(out):
@@ -131,12 +142,15 @@ def predict_video(
     sources = dict(enumerate(image_files(path))) if path.is_dir() else {}
     files: list[Path] = []
     motions: list[Motion] = []
+    times: list[float] = []
     scale = 0.0
-    for index, image1, image2 in _frame_pairs(path, every, reference):
+    for index, time_s, first, second in _frame_pairs(path, every, reference):
+        times.append(index / info.frames_per_second if time_s is None else time_s)
+        if index == 0:
+            continue
         source = sources.get(index, path)
         try:
-            first, second = (image.astype(np.float32) / np.float32(255) for image in (image1, image2))
-            found, motion = estimate(method, first, second, index, source.name)
+            found, motion = estimate(method, first, second, index, source.name, time_s)
         except InputError as error:
             raise InputError(f"{source}, frame {index}, {method.name}: {error}") from error
         if not files:
@@ -148,22 +162,25 @@ def predict_video(
         scale = max(scale, robust_scale(certain(found.flow, found.sigma)))
         if progress:
             progress(len(motions), 2 * expected)
-    if not motions:
-        raise InputError(f"{path}: fewer than two frames decode; a flow needs two")
     table = _write_motions(out, motions)
 
     def overlays() -> Iterator[Bytes3]:
-        for count, (index, _, frame) in enumerate(_frame_pairs(path, every, reference), start=len(motions) + 1):
-            field = read_flow(out / "flow" / f"{index:06d}.exr")
-            yield draw_overlay(frame, certain(field.flow, field.sigma), scale)
-            if progress:
+        for count, (index, _, first, second) in enumerate(_frame_pairs(path, every, reference), len(motions)):
+            flow = np.zeros((*first.shape[:2], 2), np.float32)
+            if index > 0:
+                field = read_flow(out / "flow" / f"{index:06d}.exr")
+                flow = certain(field.flow, field.sigma)
+            yield draw_overlay(to_bytes(second), flow, scale)
+            if progress and index > 0:
                 progress(count, 2 * expected)
 
-    _write_overlay(overlays(), video, describe(path).frames_per_second / every)
-    return Prediction([*files, table, video], motions, max(0, every * (expected - len(motions))))
+    _write_overlay(overlays(), video, *_places(times, info.frames_per_second / every))
+    return Prediction([*files, table, video], motions, info.lost)
 
 
-def estimate(method: Method, image1: ImageArray, image2: ImageArray, frame: int, file: str) -> tuple[Estimate, Motion]:
+def estimate(
+    method: Method, image1: ImageArray, image2: ImageArray, frame: int, file: str, time_s: float | None = None
+) -> tuple[Estimate, Motion]:
     """The flow between two images, how certain it is, and its motion; InputError as `Method.flow` raises it."""
     started = time.perf_counter()
     flow = method.flow(image1, image2)
@@ -172,39 +189,54 @@ def estimate(method: Method, image1: ImageArray, image2: ImageArray, frame: int,
     p95, p99 = (float(value) for value in np.nanpercentile(length, (95, 99)))
     sigma, visible = uncertainty(flow, image1, image2, getattr(method, "device", "cpu"))
     unknown = float((sigma > unknown_px(*sigma.shape)).mean())
-    motion = Motion(frame, file, float(np.nanmean(length)), p95, p99, seconds, unknown)
+    motion = Motion(frame, file, time_s, float(np.nanmean(length)), p95, p99, seconds, unknown)
     return Estimate(flow, sigma, visible), motion
 
 
-def _frame_pairs(path: Path, every: int, reference: Reference) -> Iterator[tuple[int, Bytes3, Bytes3]]:
-    """(index of the second frame, reference frame, second frame)."""
-    before: Bytes3 | None = None
-    for index, frame in frames(path, every):
+def _frame_pairs(
+    path: Path, every: int, reference: Reference
+) -> Iterator[tuple[int, float | None, ImageArray, ImageArray]]:
+    """(index and time of the second frame, reference frame, second frame); first, the first frame with itself."""
+    before: Frame | None = None
+    for index, time_s, frame in frames(path, every):
         if frame is None:
             raise InputError(f"{frame_file(path, index)}: cannot be read (truncated or damaged)")
-        if before is not None:
-            if frame.shape != before.shape:
-                raise InputError(f"{frame_file(path, index)}, frame {index}: has another size than the frame before it")
-            yield index, before, frame
-        if before is None or reference == "previous":
+        before = frame if before is None else before
+        if frame.shape != before.shape:
+            raise InputError(f"{frame_file(path, index)}, frame {index}: has another size than the frame before it")
+        yield index, time_s, *full_range(in_unit_range(before), in_unit_range(frame))
+        if reference == "previous":
             before = frame
 
 
-def _write_overlay(pictures: Iterator[Bytes3], video: Path, frames_per_second: float) -> None:
-    first = next(pictures)
+def _places(times: list[float], frames_per_second: float) -> tuple[list[int], float]:
+    """Numbers of the frames in a video of a constant rate, and the rate, as fine as keeps the frames apart.
+
+    OpenCV writes no time stamps. MPEG-4 takes no rates above `MAX_RATE`, and no finer fractions.
+    """
+    while True:
+        rate = round(min(max(frames_per_second, 1.0), MAX_RATE), 2)
+        places = [round((time_s - times[0]) * rate) for time_s in times]
+        if frames_per_second >= MAX_RATE or all(one < other for one, other in pairwise(places)):
+            return places, rate
+        frames_per_second *= 2
+
+
+def _write_overlay(pictures: Iterator[Bytes3], video: Path, places: list[int], rate: float) -> None:
+    """Writes a video in which each picture stays until the place of the next."""
     temporary = video.with_name(".overlay.part.mp4")
+    writer: Any = None  # OpenCV has no types
     try:
-        with quiet():
-            # MPEG-4 takes no finer fractions.
-            rate, size = round(min(max(frames_per_second, 1.0), 600.0), 2), (first.shape[1], first.shape[0])
-            writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
-        count = 0
-        for picture in chain([first], pictures):
-            writer.write(np.ascontiguousarray(picture[..., ::-1]))
-            count += 1
+        for picture, place, following in zip(pictures, places, [*places[1:], places[-1] + 1], strict=True):
+            if writer is None:
+                size = (picture.shape[1], picture.shape[0])
+                with quiet():
+                    writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), rate, size)
+            for _ in range(place, following):
+                writer.write(np.ascontiguousarray(picture[..., ::-1]))
         with quiet():
             writer.release()
-        arrived = 0
+        count, arrived = places[-1] + 1, 0
         with suppress(InputError):  # OpenCV does not report a failed write (a full disk): count what arrived
             arrived = describe(temporary).frames
         if arrived != count:

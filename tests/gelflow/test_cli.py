@@ -234,7 +234,7 @@ def test_a_state_to_resume_from_cannot_run_code(tmp_path: Path, capsys: pytest.C
 @pytest.mark.parametrize("number", [0, 1], ids=["gelflow", "raft"])
 def test_images_that_cannot_be_used_are_named(number: int, networks: tuple[Path, Path], tmp_path: Path, capsys) -> None:
     tail = ["--weights", networks[number], "--out", tmp_path / "out", "--device", "cpu"]
-    for name, size in (("one", (1, 1)), ("small", (40, 80)), ("good", (64, 80)), ("wide", (64, 96))):
+    for name, size in (("one", (1, 1)), ("small", (12, 80)), ("good", (64, 80)), ("wide", (64, 96))):
         save(tmp_path / f"{name}.png", moved(*size, 0, 0))
     good = moved(64, 80, 0, 0)
     broken = good.copy()
@@ -245,7 +245,7 @@ def test_images_that_cannot_be_used_are_named(number: int, networks: tuple[Path,
         return fails(capsys, "predict", tmp_path / first, tmp_path / second, *tail, *options)
 
     assert "one.png: 1 x 1 px" in predict("one.png", "good.png")
-    assert "64 px" in predict("small.png", "small.png")
+    assert "each side needs 16 px" in predict("small.png", "small.png")
     assert "--every are for a video" in predict("good.png", "good.png", "--every", "2")
     assert "good.png has 80 x 64 px, " in predict("good.png", "wide.png")
     assert "nan.tiff" in predict("good.png", "nan.tiff")

@@ -40,11 +40,20 @@ def test_flow_leads_from_the_reference_to_each_newest_frame(tmp_path: Path, refe
 
 def test_frames_that_come_while_the_caller_is_busy_are_left_out(tmp_path: Path) -> None:
     seen = []
-    for index, _ in newest_frames(str(video(tmp_path / "a.avi", 20.0))):
+    for index, *_ in newest_frames(str(video(tmp_path / "a.avi", 20.0))):
         seen.append(index)
         time.sleep(0.15)  # three frames' time
     assert seen == sorted(set(seen))
     assert 2 <= len(seen) < 8
+
+
+def test_a_reader_that_is_left_ends_before_its_frames_do(tmp_path: Path) -> None:
+    newest = newest_frames(str(video(tmp_path / "a.avi", 10.0)))
+    others = set(threading.enumerate())
+    next(newest)
+    (reader,) = set(threading.enumerate()) - others
+    newest.close()
+    assert not reader.is_alive()  # Python would abort while it ends, if the thread came back from OpenCV then
 
 
 def test_what_does_not_open_is_named(tmp_path: Path) -> None:

@@ -1,0 +1,84 @@
+"""Specks in the optics: dust, bubbles and scratches, which stand still while the gel around them moves.
+
+They draw the flow to zero and bring the images together there, so that nothing near them tells. The motion P of a
+pixel's surroundings does: a linear function of position, fitted to the flow of textured places in a ring around the
+pixel. Outliers count less (iteratively reweighted least squares, Cauchy's weights), and so do places that may be specks
+themselves: texture of image 1 that image 2 shows at the same pixels, where the flow says nothing better. Of those, a
+speck is where P is not small, the flow is, and the images differ under P. Near specks, the flow errs by what it lacks
+of P, and by the misfit s of P:
+
+    e = |V - P|^2 + s^2.
+
+A mark of the gel that stands still while all around it moves looks the same. A speck that covers a ring is not seen.
+"""
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from gelflow.arrays import Flow, Images
+from gelflow.models.evidence import TINY
+from gelflow.models.propagation import windowed_residual
+from gelflow.ops.gaussian import window_sums
+from gelflow.ops.pyramid import resize_images
+
+CELL_PX, RING_CELLS, INNER_PX, WIDTH_PX = 6, 6, 10.0, 18.0
+"""The ring: side of the cells to which the flow is reduced, half its side, its inner radius, and the standard deviation
+of the Gaussian that weighs it."""
+NEAR_CELLS = 2
+"""How far specks draw the flow."""
+WINDOW_PX, MAX_RATIO = 2.0, 0.2
+"""Window in which images are compared, and the largest ratio of squared differences where one of them is none."""
+MIN_CONTRAST, NOISE = 0.02, 0.002
+"""Least contrast of a speck, and differences of images that are none; white is 1."""
+DOUBT = 0.1
+"""What a place that may be a speck counts in the fit of P."""
+MIN_MOTION_PX, MISFITS, MAX_SHARE = 0.5, 2.0, 0.5
+"""Least motion P, in px and in units of s, and the largest share of it that a speck leaves to the flow."""
+FLOOR_PX, REWEIGHTINGS = 0.1, 6
+"""Least misfit, and the number of fits."""
+
+
+def speck_error(flow: Flow, image1: Images, image2: Images, texture: Tensor) -> Tensor:
+    """E in px^2 near specks, else 0; (B, 1, H, W). `texture` is as of `Step`, 0 where it does not tell the flow."""
+    window, none = window_sums(flow, WINDOW_PX), torch.zeros_like(flow)
+    still, left = (windowed_residual(each, image1, image2, window, True) for each in (none, flow))
+    contrast = windowed_residual(none, image1, torch.zeros_like(image2), window, True)
+    stands = (still < MAX_RATIO * contrast) & (contrast > MIN_CONTRAST**2) & (still < 2 * left + NOISE**2)
+    texture = texture.clamp(min=0)
+    motion, misfit = surroundings(flow, texture, torch.where(stands, DOUBT * texture, texture))
+    moved = windowed_residual(motion, image1, image2, window, True)
+    fast, drawn = (each.square().sum(dim=1, keepdim=True) for each in (motion, flow))
+    speck = stands & (fast > MIN_MOTION_PX**2 + MISFITS**2 * misfit) & (drawn < MAX_SHARE**2 * fast)
+    speck &= still < MAX_RATIO * moved
+    near = F.max_pool2d(speck.float(), CELL_PX, ceil_mode=True)
+    near = F.max_pool2d(near, 2 * NEAR_CELLS + 1, 1, NEAR_CELLS)
+    error = (flow - motion).square().sum(dim=1, keepdim=True) + misfit
+    return resize_images(near, (flow.shape[-2], flow.shape[-1])) * error
+
+
+def surroundings(flow: Flow, texture: Tensor, trusted: Tensor) -> tuple[Flow, Tensor]:
+    """P (B, 2, H, W), px, and s^2 (B, 1, H, W), px^2; `trusted` is the part of the texture that counts."""
+    height, width = flow.shape[-2:]
+    cells = F.avg_pool2d(torch.cat([texture, trusted, flow], dim=1), CELL_PX, ceil_mode=True)
+    weight = cells[:, 1:2] / (cells[:, :1] + cells[:, :1].mean(dim=(2, 3), keepdim=True) + TINY)
+    steps = CELL_PX * torch.arange(-RING_CELLS, RING_CELLS + 1, device=flow.device, dtype=flow.dtype)
+    down, right = (step.flatten() for step in torch.meshgrid(steps, steps, indexing="ij"))
+    square = down.square() + right.square()
+    ring = torch.where(square > INNER_PX**2, torch.exp(-square / (2 * WIDTH_PX**2)), 0.0)
+    around = F.unfold(torch.cat([weight, cells[:, 2:]], dim=1), len(steps), padding=RING_CELLS)
+    weight, flows = around.unflatten(1, (3, -1)).transpose(2, 3).split([1, 2], dim=1)  # (B, C, N, K)
+    base = (weight + TINY) * ring
+    design = torch.stack([torch.ones_like(down), right / WIDTH_PX, down / WIDTH_PX], dim=1)  # (K, 3)
+    products = (design[:, :, None] * design[:, None]).flatten(1)
+    weights, ridge = base, TINY * torch.eye(3, device=flow.device)
+    for _ in range(REWEIGHTINGS):
+        total = weights.sum(dim=3, keepdim=True)
+        normal = (weights @ products / total).unflatten(3, (3, 3)) + ridge
+        found = torch.linalg.solve(normal, (weights * flows @ design / total)[..., None])[..., 0]  # (B, 2, N, 3)
+        apart = (flows - found @ design.T).square().sum(dim=1, keepdim=True)
+        misfit = (weights * apart).sum(dim=3, keepdim=True) / total + FLOOR_PX**2
+        weights = base / (1 + apart / misfit)
+    maps = torch.cat([found[..., 0], misfit[..., 0]], dim=1).unflatten(2, cells.shape[-2:])
+    motion, misfit = resize_images(maps, (height, width)).split([2, 1], dim=1)
+    return motion, misfit

@@ -1,0 +1,125 @@
+"""Specks in the optics: sigma is raised where they draw the flow to zero, and nowhere else."""
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from textures import grid, texture
+
+import gelflow
+from gelflow.models.specks import speck_error, surroundings
+from gelflow.models.uncertainty import flow_sigma
+
+HEIGHT, WIDTH, REACH_PX = 144, 192, 8.0
+PLACES = ((40, 45), (70, 100), (150, 40), (120, 100), (165, 115))
+"""Columns and rows of the specks' centres, between and upon the dots."""
+Array = NDArray[np.float64]
+
+
+def motion(kind: str) -> tuple[Array, Array]:
+    """Where the gel at each pixel of image 2 was in image 1, px to the left and up."""
+    x, y = grid(HEIGHT, WIDTH)
+    if kind == "turn":
+        return 0.06 * (y - 150) + 3, -0.06 * (x - 96)
+    height = (
+        np.exp(-((x - 90) ** 2 + (y - 70) ** 2) / (2 * 45**2)) if kind == "press" else float(kind == "shift") + 0 * x
+    )
+    return 3.0 * height, -2.0 * height
+
+
+def gel(kind: str, x: Array, y: Array) -> Array:
+    if kind == "waves":
+        return texture(x, y).astype(float)
+    radius = np.hypot(x % 24 - 12, y % 24 - 12)
+    return (0.5 - 0.35 / (1 + np.exp((radius - 4) / 0.6)))[..., None] * np.ones(3)
+
+
+def opacity(kind: str, x: Array, y: Array) -> Array:
+    """Of blurred specks: white discs, dark grains, rims of bubbles, and scratches; 0 to 1."""
+    total = np.zeros_like(x)
+    for column, row in PLACES if kind != "none" else ():
+        right, down = x - column, y - row
+        edge = np.hypot(right, down) - 3.5
+        if kind == "bubble":
+            edge = np.abs(edge) - 1.0
+        elif kind == "scratch":
+            edge = np.maximum(np.abs(right + down) / np.sqrt(2) - 1.2, np.hypot(right, down) - 12)
+        total = np.maximum(total, 0.9 / (1 + np.exp(edge / 0.7)))
+    return total
+
+
+def pair(kind: str, moves: str, specks: str) -> tuple[Array, Array, Array, Array]:
+    """Both images, the true flow (H, W, 2) to first order, and where specks are."""
+    x, y = grid(HEIGHT, WIDTH)
+    u, v = motion(moves)
+    cover, noise = opacity(specks, x, y), np.random.default_rng(0)
+    colour = 0.1 if specks == "dust" else 0.95
+    seen = [each + cover[..., None] * (colour - each) for each in (gel(kind, x, y), gel(kind, x - u, y - v))]
+    noisy = [np.clip(each + 0.005 * noise.standard_normal(each.shape), 0, 1) for each in seen]
+    # V(x) = d(x + V(x)) of a displacement d that is smooth: three steps of the iteration leave less than .02 px here.
+    flow = np.stack([u, v], axis=-1)
+    start = flow
+    for _ in range(3):
+        flow = start + np.einsum("hwcd,hwd->hwc", np.stack(np.gradient(start, axis=(1, 0)), axis=-1), flow)
+    return (*noisy, flow, cover > 0.3)
+
+
+def distance_to(mask: Array) -> Array:
+    x, y = grid(HEIGHT, WIDTH)
+    rows, columns = np.nonzero(mask)
+    return np.min(
+        [np.hypot(x - column - 0.5, y - row - 0.5) for row, column in zip(rows, columns, strict=True)], axis=0
+    )
+
+
+def tensor(image: Array) -> torch.Tensor:
+    return torch.from_numpy(np.moveaxis(image, -1, 0)[None]).float()
+
+
+def wrong_share(flow: Array, truth: Array, sigma: Array, near: Array) -> float:
+    """The share of a place's pixels that err by more than 1 px with a sigma below .5."""
+    return float(((np.linalg.norm(flow - truth, axis=-1) > 1) & (sigma < 0.5))[near].mean())
+
+
+@pytest.mark.parametrize("kind", ["dots", "waves"])
+@pytest.mark.parametrize("moves", ["shift", "press", "turn"])
+@pytest.mark.parametrize("specks", ["disc", "dust", "bubble", "scratch"])
+def test_where_specks_draw_the_flow_to_zero_it_is_uncertain(kind: str, moves: str, specks: str) -> None:
+    image1, image2, truth, mask = pair(kind, moves, specks)
+    distance = distance_to(mask)
+    drawn = truth * (1 - np.exp(-(np.maximum(distance - 1, 0) ** 2) / (2 * 4**2)))[..., None]
+    images = tensor(image1), tensor(image2)
+    sigma = flow_sigma(tensor(drawn), *images)[0][0, 0].numpy()
+    assert wrong_share(drawn, truth, sigma, distance <= REACH_PX) <= 0.05
+    # 6 px by the window, three cells of 6 px along the diagonal, and one more by interpolation: 38 px.
+    added = speck_error(tensor(drawn), *images, torch.ones(1, 1, HEIGHT, WIDTH))[0, 0].numpy()
+    assert added[distance > 38].max(initial=0) == 0
+
+
+@pytest.mark.parametrize("kind", ["dots", "waves"])
+@pytest.mark.parametrize(
+    ("moves", "specks"), [("none", "disc"), ("shift", "none"), ("press", "none"), ("turn", "none")]
+)
+def test_without_motion_or_without_specks_nothing_is_added(kind: str, moves: str, specks: str) -> None:
+    image1, image2, truth, _ = pair(kind, moves, specks)
+    assert speck_error(tensor(truth), tensor(image1), tensor(image2), torch.ones(1, 1, HEIGHT, WIDTH)).max() == 0
+
+
+def test_the_surroundings_of_a_linear_flow_are_that_flow_whatever_a_fifth_of_it_says() -> None:
+    x, y = grid(HEIGHT, WIDTH)
+    linear = np.stack([0.03 * x - 0.02 * y + 2, 0.01 * x + 0.04 * y - 3], axis=-1)
+    holes = (np.random.default_rng(0).random((HEIGHT // 12, WIDTH // 12)) < 0.2).repeat(12, 0).repeat(12, 1)
+    flow, texture = tensor(np.where(holes[..., None], 0, linear)), torch.ones(1, 1, HEIGHT, WIDTH)
+    found, misfit = surroundings(flow, texture, texture)
+    inner = (..., slice(24, -24), slice(24, -24))
+    # Cauchy's weight of an outlier by r is (s / r)^2: a fifth of 3 px at s = .5 px pulls by some .02 to .1 px.
+    assert (found - tensor(linear))[inner].abs().max() < 0.3
+    assert misfit[inner].max() < 1.0
+
+
+def test_the_network_is_uncertain_near_specks() -> None:
+    image1, image2, truth, mask = pair("dots", "shift", "bubble")
+    found = gelflow.load_model("best", device="cpu").estimate(*(image.astype(np.float32) for image in (image1, image2)))
+    near = distance_to(mask) <= REACH_PX
+    assert (np.linalg.norm(found.flow - truth, axis=-1) > 1)[near].mean() > 0.2, "the specks do nothing"
+    assert wrong_share(found.flow, truth, found.sigma, near) <= 0.05
