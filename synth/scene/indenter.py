@@ -6,6 +6,11 @@ from pydantic import Field, model_validator
 
 from synth.scene.part import Part, Positive, Vector3
 
+DEFAULT_FILLET_MM = 0.2
+Fillet = Annotated[float, Field(ge=0.01, le=100)] | None
+"""Radius of edges. A stated one is kept: the gel's mesh is made fine enough, or the press fails. None: what the mesh
+resolves, of analytic shapes at least DEFAULT_FILLET_MM."""
+
 
 class Posed(Part):
     """Base of the indenters: turned about x, then y, then z before it is pressed with its lowest point first."""
@@ -26,7 +31,7 @@ class Cylinder(Posed):
     shape: Literal["cylinder"]
     radius_mm: Annotated[float, Field(ge=0.05, le=500)]
     length_mm: Annotated[float, Field(ge=0.1, le=500)] = 20.0
-    fillet_mm: Annotated[float, Field(ge=0.01, le=100)] = 0.2
+    fillet_mm: Fillet = None
 
 
 class Box(Posed):
@@ -34,7 +39,7 @@ class Box(Posed):
 
     shape: Literal["box"]
     size_mm: tuple[Positive, Positive, Positive]
-    fillet_mm: Annotated[float, Field(ge=0.01, le=100)] = 0.2
+    fillet_mm: Fillet = None
 
 
 class Cone(Posed):
@@ -43,7 +48,7 @@ class Cone(Posed):
     shape: Literal["cone"]
     half_angle_deg: Annotated[float, Field(ge=5, le=85)]
     height_mm: Annotated[float, Field(ge=0.1, le=500)] = 10.0
-    fillet_mm: Annotated[float, Field(ge=0.01, le=100)] = 0.2
+    fillet_mm: Fillet = None
     """Radius of the tip and of the base's edge."""
 
 
@@ -66,8 +71,8 @@ class MeshIndenter(Part):
     """Longest edge of the bounding box before it is turned; in place of `scale`."""
     rotation_deg: Vector3 | Literal["any"] = (0.0, 0.0, 0.0)
     """Angles as for the other shapes; "any" draws an orientation, all alike likely."""
-    fillet_mm: Annotated[float, Field(ge=0, le=100)] | None = None
-    """Radius to which edges and notches are rounded; default what the gel's mesh resolves, and never less."""
+    fillet_mm: Fillet = None
+    """Radius to which edges and notches are rounded."""
     cell_mm: Annotated[float, Field(ge=0.01, le=10)] | None = None
     """Spacing of the grid on which its signed distance is sampled; default a third of the radius."""
 
