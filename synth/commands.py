@@ -108,7 +108,7 @@ def simulate(
     from synth.dataset.storage import refuse_foreign, storage_errors
     from synth.progress import progress
     from synth.scene.sampling import draw
-    from synth.simulate.press import MeshRule
+    from synth.simulate.press import MeshRule, as_pressed
     from synth.simulate.solve import simulate_press
     from synth.simulate.trajectory import write_trajectory
 
@@ -121,11 +121,13 @@ def simulate(
         out.mkdir(parents=True, exist_ok=True)  # before minutes of work, not after
     try:
         with progress("simulate: percent of the load path", 100) as advance:
-            press = MeshRule.of(instance).press(instance, template.folder)
+            rule = MeshRule.of(instance)
+            press = rule.press(instance, template.folder)
+            _warn(template, rule.lost_detail(instance, press.path.body, press.accuracy))
             trajectory = simulate_press(press, on_progress=lambda share: advance(int(100 * share), 100))
     except InputError as error:
         raise InputError(f"{template.label}: {error}") from error
-    record = write_trajectory(out, instance, trajectory)
+    record = write_trajectory(out, as_pressed(instance, press.path.body), trajectory)
     if as_json:
         print(json.dumps(record))
     else:
@@ -222,8 +224,13 @@ def _loaded(scene: str, assignments: Sequence[str] | None) -> Template:
 
     template = load_scene(scene, assignments or [])
     for warning in dict.fromkeys(line for corner in template.corners for line in corner.warnings):
-        print(printable(f"synth: warning: {template.label}: {warning}"), file=sys.stderr)
+        _warn(template, warning)
     return template
+
+
+def _warn(template: Template, warning: str) -> None:
+    if warning:
+        print(printable(f"synth: warning: {template.label}: {warning}"), file=sys.stderr)
 
 
 def _say_hint(variant: Variant) -> None:
@@ -238,6 +245,7 @@ def _show_plan(template: Template, variant: Variant, n: int, as_json: bool) -> i
 
     planned = plan(template, variant)
     predicted = predict(planned)
+    _warn(template, predicted.warning)
     if as_json:
         print(json.dumps({**planned.record(), **vars(predicted), "n": n}))
         return 0

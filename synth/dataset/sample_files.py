@@ -17,6 +17,11 @@ from synth.dataset.sample import SAMPLES_FOLDER, Sample, largest_motion, sample_
 from synth.dataset.storage import install_folder, partial_name, storage_errors
 from synth.dataset.store import Output, Store
 
+SOLVER_MEANINGS = {
+    "solver.slip_ratio": "of the area in contact, the part that slid over the indenter in the last load step, 0 to 1",
+    "solver.contact_area_mm2": "of the deformed contact face, where its gap to the indenter is closed",
+}
+
 
 def write_sample_files(out: Output, sample: Sample, job: Job) -> ManifestEntry:
     """Writes samples/NNNNNN, in a directory whole or not at all; equal samples give equal bytes (without times).
@@ -106,7 +111,7 @@ def _meta(sample: Sample, job: Job) -> dict[str, object]:
         "force_n": sample.force_n,
         "torque_nmm": sample.torque_nmm,
         "diagnostics": sample.diagnostics,
-        "conventions": CONVENTIONS,
+        "conventions": {**CONVENTIONS, **SOLVER_MEANINGS},
         "scene": sample.scene,
     }
 

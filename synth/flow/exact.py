@@ -10,9 +10,11 @@ lies inside that image (0 <= x < width, 0 <= y < height), that pixel looks by th
 mirror, and no mirror stands before it), and nothing of the surface lies in front of it along the ray of that pixel.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 
-from synth.arrays import FloatArray, Points
+from synth.arrays import BoolArray, FloatArray, Points
 from synth.errors import InputError
 from synth.flow.field import FlowArray, FlowField
 from synth.flow.view import View
@@ -29,7 +31,7 @@ def exact_flow(
     normal: bool = False,
     displacement: bool = False,
     traction: FloatArray | None = None,
-    contact: FloatArray | None = None,
+    contact: Callable[[Points, Points], BoolArray] | None = None,
 ) -> FlowField:
     """Exact flow between two states, and what else the surface knows at each pixel.
 
@@ -46,8 +48,8 @@ def exact_flow(
         displacement: displacement.X/Y/Z, mm: state 2 minus state 1 at the pixels of image 1.
         traction: (v, 3) float64 MPa at the vertices, in the state the caller chooses; gives traction.X/Y/Z at the
             pixels of image 1.
-        contact: (v,) 0 or 1 at the vertices; gives contact.Y, 1 where the linear interpolation is at least one half, at
-            the pixels of image 1.
+        contact: whether material points touch in state 2, by their places (n, 3) mm undeformed and in that state;
+            gives contact.Y, 0 or 1 at the pixels of image 1.
 
     Returns:
         The flow, float32. Beside pixels that see no gel, NaN marks the rare material point that has no image at all
@@ -60,8 +62,6 @@ def exact_flow(
     for name, array in (("positions1", positions1), ("positions2", positions2), ("traction", traction)):
         if array is not None and array.shape != (vertices, 3):
             raise InputError(f"{name} has shape {array.shape}; this surface needs ({vertices}, 3), one row per vertex")
-    if contact is not None and contact.shape != (vertices,):
-        raise InputError(f"contact has shape {contact.shape}; this surface needs ({vertices},), one value per vertex")
     hits1 = view.first_hits(positions1)
     forward, forward_visible = view.motion(hits1, positions2)
     extras: dict[str, FlowArray] = {}
@@ -79,8 +79,10 @@ def exact_flow(
     if traction is not None:
         extras |= view.vector("traction", hits1.interpolate(triangles, traction))
     if contact is not None:
-        share = hits1.interpolate(triangles, np.asarray(contact, dtype=np.float64)[:, None])[:, 0]
-        extras["contact.Y"] = view.image(np.where(np.isnan(share), np.nan, share >= 0.5))
+        material, moved = (hits1.interpolate(triangles, at) for at in (view.surface.material, positions2))
+        on_gel, touching = np.isfinite(moved[:, 0]), np.full(len(moved), np.nan)
+        touching[on_gel] = contact(material[on_gel], moved[on_gel])
+        extras["contact.Y"] = view.image(touching)
     if not backward or hits2 is None:
         return FlowField(forward, forward_visible, extras=extras)
     return FlowField(forward, forward_visible, *view.motion(hits2, positions1), extras=extras)

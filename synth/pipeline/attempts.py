@@ -13,7 +13,7 @@ from synth.pipeline.records import JobContext, Outcome, Simulated, SimulatedTraj
 from synth.scene import Scene
 from synth.scene.sampling import MAX_DRAWS, Pair, SensorInstance, draw, pairs_of
 from synth.simulate import Trajectory
-from synth.simulate.press import Press, blunter, edge_radius_mm
+from synth.simulate.press import Press, blunter
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,8 @@ class Attempts:
             attempt.pairs,
             {n: replace(states[n], displacement=states[n].displacement[space.surface_nodes]) for n in shown},
             {"mesh": press.mesh.hash, "element": space.element.name},
-            edge_radius_mm(press.scene, press.mesh),
+            press.path,
+            self._context.plan.mesh.lost_detail(press.scene, press.path.body, press.accuracy),
             press.accuracy,
             tuple(self.failures),
             result.seconds,

@@ -18,16 +18,15 @@ from synth.dataset.sample_files import write_sample_files
 from synth.flow.exact import exact_flow
 from synth.flow.field import FlowField
 from synth.flow.view import View
-from synth.mesh import face_of
-from synth.mesh.face import PadFace
 from synth.optics import Optics
 from synth.pipeline.records import JobContext, Outcome, SimulatedTrajectory
 from synth.pipeline.render_session import Frame, RenderedTrajectory
 from synth.render.camera_image import camera_image
-from synth.scene import Camera, Outputs
+from synth.scene import Camera, MeshIndenter, Outputs
 from synth.scene.sampling import Pair
 from synth.simulate import State
-from synth.simulate.load_path import PressFrame
+from synth.simulate.contact_patch import ContactPatch
+from synth.simulate.press import as_pressed
 from synth.simulate.resolution import accuracy
 
 DARKEST, BRIGHTEST, LEAST_GEL = 12, 245, 0.5
@@ -50,7 +49,7 @@ def finish(context: JobContext, rendered: RenderedTrajectory) -> Outcome:
         entry = write_sample_files(context.out, sample, context.job)
         seconds = {**shared, "flow": traced - started, "write": time.perf_counter() - traced}
         entries.append(replace(entry, seconds={stage: round(value, 4) for stage, value in seconds.items()}))
-    return Outcome(tuple(entries), simulated.failures, (), warning)
+    return Outcome(tuple(entries), simulated.failures, (), tuple(filter(None, (simulated.warning, warning))))
 
 
 def _warning(sample: Sample) -> str:
@@ -67,10 +66,10 @@ def _warning(sample: Sample) -> str:
 def _diagnostics(context: JobContext, simulated: SimulatedTrajectory) -> dict[str, Any]:
     found = simulated.accuracy or accuracy(simulated.scene, context.plan.template.folder)
     error = None if np.isnan(found.error_px) else round(found.error_px, 4)
-    radius = simulated.edge_radius_mm
-    more: dict[str, Any] = {} if radius is None else {"edge_radius_mm": round(radius, 4)}
-    if not isinstance(face := face_of(simulated.scene.sensor.gel, context.plan.template.folder), PadFace):
-        more["inward_normal"] = PressFrame.of(simulated.scene.motion, face).axes[:, 2].round(6).tolist()
+    radius, is_mesh = simulated.path.body.fillet_mm, isinstance(simulated.scene.contact.indenter, MeshIndenter)
+    more: dict[str, Any] = {"edge_radius_mm": round(radius, 4)} if is_mesh else {}
+    if (frame := simulated.path.frame) is not None:
+        more["inward_normal"] = frame.axes[:, 2].round(6).tolist()
     return {**simulated.mesh, "elements_across_contact": found.across, "predicted_error_px": error, **more}
 
 
@@ -82,8 +81,13 @@ def _sample(
     views: Mapping[str, View],
 ) -> Sample:
     """`views` are the trajectory's cameras by name."""
-    scene, states = rendered.simulated.scene, rendered.simulated.states
-    first, second = (states[frame] for frame in pair.frames)
+    simulated = rendered.simulated
+    scene, path = simulated.scene, simulated.path
+    first, second = (simulated.states[frame] for frame in pair.frames)
+    patch = None
+    if scene.outputs.contact:
+        face, pose = rendered.surface.coarse, path.recorded(pair.frames[1])
+        patch = ContactPatch(face, second.displacement, path.body, pose, second.max_penetration_mm)
     frames = [rendered.frames[frame] for frame in pair.frames]
     cameras = {}
     for k, (name, sensor) in enumerate(scene.sensor.views.items()):
@@ -92,7 +96,7 @@ def _sample(
             expose(context, sensor.camera, frame.radiance[name], (pair.index, number, *own))
             for number, frame in enumerate(frames)
         )
-        cameras[name] = CameraPair(image1, image2, _flow(scene.outputs, views[name], frames, second))
+        cameras[name] = CameraPair(image1, image2, _flow(scene.outputs, views[name], frames, second, patch))
     main = cameras.pop("")
     return Sample(
         index=pair.index,
@@ -100,7 +104,7 @@ def _sample(
         frames=pair.frames,
         seed=context.job.seed,
         **vars(main),
-        scene=scene,
+        scene=as_pressed(scene, path.body),
         surface=rendered.surface,
         displacement1=first.displacement,
         displacement2=second.displacement,
@@ -119,16 +123,15 @@ def expose(context: JobContext, camera: Camera, radiance: Image, numbers: tuple[
     return camera_image(radiance, camera, rng)
 
 
-def _flow(outputs: Outputs, view: View, frames: list[Frame], pressed: State) -> FlowField:
+def _flow(outputs: Outputs, view: View, frames: list[Frame], pressed: State, patch: ContactPatch | None) -> FlowField:
     """The exact flow between two frames, with what else the outputs ask for; `pressed` is the second state."""
     surface = view.surface
     traction = surface.interpolate_linear(pressed.traction) if outputs.traction else None
-    touching = (np.linalg.norm(pressed.traction, axis=1, keepdims=True) > 0).astype(np.float64)
     return exact_flow(
         view,
         frames[0].positions,
         frames[1].positions,
         **outputs.model_dump(include={"backward", "depth", "normal", "displacement"}),
         traction=traction,
-        contact=surface.interpolate_linear(touching)[:, 0] if outputs.contact else None,
+        contact=patch.holds if patch else None,
     )

@@ -178,15 +178,16 @@ def generate(
         asked = sum(shard.makes(i // count) for i in range(n))
         found = sum(i < n and shard.makes(i // count) for i in finished)
         summary = Summary(out, str(shard) if scheduling.shard else None, asked, found)
-        tasks = _tasks(context, writer, n, finished, shard)
+        tasks, warned = _tasks(context, writer, n, finished, shard), False
         with closing(_outcomes(context, tasks, scheduling)) as outcomes:
             for outcome in outcomes:
                 for failure in outcome.failures:
                     writer.fail(failure)
                 for entry in outcome.entries:
                     writer.record(entry)
-                if outcome.warning and not summary.made:
-                    print(f"synth: warning: {job.scene_name}: {outcome.warning}", file=sys.stderr, flush=True)
+                for warning in () if warned else outcome.warnings:
+                    print(f"synth: warning: {job.scene_name}: {warning}", file=sys.stderr, flush=True)
+                warned = warned or bool(outcome.warnings)
                 summary.add(outcome)
                 if progress is not None:
                     progress(summary.found + summary.made + len(summary.given_up), summary.asked_for)

@@ -13,6 +13,7 @@ from synth.planning import Plan
 from synth.scene import Scene
 from synth.scene.sampling import Pair, stream
 from synth.simulate import State
+from synth.simulate.load_path import LoadPath
 from synth.simulate.resolution import Accuracy
 from synth.simulate.space import Space
 
@@ -40,12 +41,12 @@ class JobContext:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a task did: manifest lines of the samples on disk, failed instances, samples given up, and a warning."""
+    """What a task did: manifest lines of the samples on disk, failed instances, samples given up, and warnings."""
 
     entries: tuple[ManifestEntry, ...]
     failures: tuple[Failure, ...]
     given_up: tuple[int, ...]
-    warning: str = ""
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +58,8 @@ class SimulatedTrajectory:
     pairs: tuple[Pair, ...]  # the samples that are wanted
     states: dict[int, State]  # by number, those that the samples show; displacements are those of the contact face
     mesh: dict[str, Any]  # what is said of the mesh: hash and element
-    edge_radius_mm: float | None  # of a mesh indenter, else None
+    path: LoadPath  # of its press
+    warning: str  # of detail that rounding takes off
     accuracy: Accuracy | None  # of the mesh; None where it is left to whoever finishes the samples
     failures: tuple[Failure, ...]  # instances that failed before
     seconds: float  # of the simulation

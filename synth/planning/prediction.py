@@ -16,9 +16,9 @@ from synth.mesh.layered import elements_through
 from synth.planning.plan import Plan
 from synth.scene import Gel, MeshIndenter, Scene
 from synth.scene.sampling import draw
-from synth.simulate.load_path import TWIST_ARM_MM
+from synth.simulate.load_path import TWIST_ARM_MM, path_of
 from synth.simulate.press import edge_radius_mm
-from synth.simulate.resolution import Resolution
+from synth.simulate.resolution import Resolution, resolution_mm
 from synth.simulate.solve import VICINITY
 
 _Meshes = tuple[list[tuple[Scene, int]], str, tuple[float, float] | None]
@@ -61,6 +61,7 @@ class Prediction:
 
     Attributes:
         resolution: how fine the meshes are, in words.
+        warning: of detail that rounding takes off an object, see `MeshRule.lost_detail`.
         error_px: error of the flow from the simulation: median and largest of INSTANCES trajectories; None where the
             mesh is given by an edge length, for which nothing is predicted.
         target_error_px: what was asked for; None with an edge length.
@@ -70,6 +71,7 @@ class Prediction:
     """
 
     resolution: str
+    warning: str
     error_px: tuple[float, float] | None
     target_error_px: float | None
     nodes: int
@@ -90,6 +92,7 @@ def predict(plan: Plan) -> Prediction:
     directions = 2 if plan.template.outputs.backward else 1
     return Prediction(
         resolution=resolution,
+        warning=_lost_detail(plan),
         error_px=error_px,
         target_error_px=None if error_px is None else plan.mesh.target_error_px,
         nodes=round(float(np.mean([nodes for _, nodes in presses]))),
@@ -102,17 +105,36 @@ def predict(plan: Plan) -> Prediction:
     )
 
 
+def _lost_detail(plan: Plan) -> str:
+    """The first warning of those that some instances give."""
+    template, rule = plan.template, plan.mesh
+    for trajectory in range(INSTANCES):
+        with contextlib.suppress(InputError):
+            scene = draw(template, 0, trajectory)
+            indenter = scene.contact.indenter
+            if isinstance(indenter, MeshIndenter) and indenter.fillet_mm is None:
+                found = None if rule.kind == "tetwild" else rule.resolution(scene, template.folder)
+                edge_mm = scene.numerics.edge_length_mm or default_edge_length(scene.sensor.gel)
+                spacing = found.mesh.spacing_mm if found else edge_mm
+                body = path_of(scene, template.folder, resolution_mm(scene, spacing)).body
+                return rule.lost_detail(scene, body, found)
+    return ""
+
+
 def _meshes(plan: Plan) -> _Meshes:
     template = plan.template
     found: list[tuple[Scene, Resolution]] = []
+    reason = ""
     for trajectory in range(INSTANCES):
-        with contextlib.suppress(InputError):  # impossible: generate takes another instance
+        try:
             scene = draw(template, 0, trajectory)
-            found.append((scene, plan.mesh.resolution(scene, template.folder)))
+            resolution = plan.mesh.resolution(scene, template.folder)
+            plan.mesh.check_edges(scene, resolution.mesh)
+            found.append((scene, resolution))
+        except InputError as error:  # impossible: generate takes another instance
+            reason = str(error)
     if not found:
-        raise InputError(
-            f"{template.label}: none of {INSTANCES} random instances is possible; try `simulate` to see why"
-        )
+        raise InputError(f"{template.label}: none of {INSTANCES} random instances is possible: {reason}")
     across = [resolution.across for _, resolution in found]
     errors = [resolution.error_px for _, resolution in found]
     spacings = [resolution.spacing_mm for _, resolution in found]

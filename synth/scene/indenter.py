@@ -6,6 +6,11 @@ from pydantic import Field, model_validator
 
 from synth.scene.part import Part, Positive, Vector3
 
+DEFAULT_FILLET_MM = 0.2
+Fillet = Annotated[float, Field(ge=0.01, le=100)] | None
+"""Radius of edges. A stated one is kept: the gel's mesh is made fine enough, or the press fails. None: what the mesh
+resolves, of analytic shapes at least DEFAULT_FILLET_MM."""
+
 
 class Posed(Part):
     """Base of the indenters: turned about x, then y, then z before it is pressed with its lowest point first."""
@@ -28,7 +33,7 @@ class Cylinder(Posed):
     shape: Literal["cylinder"]
     radius_mm: Annotated[float, Field(ge=0.05, le=500)]
     length_mm: Annotated[float, Field(ge=0.1, le=500)] = 20.0
-    fillet_mm: Annotated[float, Field(ge=0.01, le=100)] = 0.2
+    fillet_mm: Fillet = None
 
 
 class Box(Posed):
@@ -36,7 +41,7 @@ class Box(Posed):
 
     shape: Literal["box"]
     size_mm: tuple[Positive, Positive, Positive]
-    fillet_mm: Annotated[float, Field(ge=0.01, le=100)] = 0.2
+    fillet_mm: Fillet = None
 
 
 class Cone(Posed):
@@ -45,7 +50,7 @@ class Cone(Posed):
     shape: Literal["cone"]
     half_angle_deg: Annotated[float, Field(ge=5, le=85)]
     height_mm: Annotated[float, Field(ge=0.1, le=500)] = 10.0
-    fillet_mm: Annotated[float, Field(ge=0.01, le=100)] = 0.2
+    fillet_mm: Fillet = None
     """Radius of the tip and of the base's edge."""
 
 
@@ -72,8 +77,8 @@ class MeshIndenter(Part):
     """The point that comes down on the place of the press: mm from the centre of the bounding box, in the file's axes
     before it is turned; the file's origin; or the point that is lowest once it is turned. Default the lowest on a round
     gel, the centre on others."""
-    fillet_mm: Annotated[float, Field(ge=0, le=100)] | None = None
-    """Radius to which edges and notches are rounded; default what the gel's mesh resolves, and never less."""
+    fillet_mm: Fillet = None
+    """Radius to which edges and notches are rounded."""
     cell_mm: Annotated[float, Field(ge=0.01, le=10)] | None = None
     """Spacing of the grid on which its signed distance is sampled; default a third of the radius."""
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from synth.mesh import Focus
 from synth.scene import Box, Cone, Cylinder, Indenter, MeshIndenter, Scene, Sphere, Torus
+from synth.scene.indenter import DEFAULT_FILLET_MM
 
 RATE = 1.6
 """Power of the spacing h."""
@@ -82,9 +83,10 @@ def _band(indenter: Indenter, focus: Focus, depth_mm: float) -> float:
         case Sphere():
             radius = indenter.radius_mm
         case Cylinder():
-            radius = indenter.radius_mm if _class_of(indenter) == "bar" else indenter.fillet_mm
+            fillet = indenter.fillet_mm or DEFAULT_FILLET_MM
+            radius = indenter.radius_mm if _class_of(indenter) == "bar" else fillet
         case Box():
-            radius = indenter.fillet_mm
+            radius = indenter.fillet_mm or DEFAULT_FILLET_MM
         case Torus():
             radius = indenter.tube_mm
         case Cone() | MeshIndenter():  # a cone's is its contact's radius; of a mesh nothing is known but the zone

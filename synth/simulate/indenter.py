@@ -12,6 +12,7 @@ import numpy as np
 from synth.arrays import FloatArray
 from synth.errors import InputError
 from synth.scene import Box, Cone, Cylinder, Indenter, MeshIndenter, Sphere, Torus, Vector3
+from synth.scene.indenter import DEFAULT_FILLET_MM
 from synth.scene.surface_file import Triangles, read_surface
 from synth.simulate.distance import KINDS, SHAPE_LENGTH
 from synth.simulate.object_grid import Grid
@@ -34,7 +35,7 @@ MOST_RAISED = 0.3
 LARGEST_GRID = 4_000_000
 """Points of a mesh's distance grid (32 MB)."""
 USUAL_GRID = 250_000
-"""Points that a grid has at most by default."""
+"""Points that a grid has at most by default, where no radius is stated."""
 MOST_MISSING = 1 / 3
 """Largest share of a closed surface that is made up where a file has holes: half a sphere lacks a quarter."""
 TIP_MM = 0.05  # points that are at most so much higher than a mesh's lowest belong to its tip
@@ -70,6 +71,8 @@ class RigidBody:
         reach_mm: from its origin along +z to where the depth of a press counts from; of a mesh see LOWERED.
         coefficients: (i, j, k) B-spline coefficients of a mesh's distance grid, else (1, 1, 1) zeros.
         sharpest_mm: its smallest radius of curvature: fillet, tip, tube or, of a mesh, the cell of its grid.
+        fillet_mm: radius that its edges have; 0 for shapes without edges.
+        lost_mm: how far a mesh's surface is moved by rounding, at most, within the depth of the press.
     """
 
     kind: int
@@ -78,6 +81,8 @@ class RigidBody:
     reach_mm: float
     coefficients: FloatArray
     sharpest_mm: float
+    fillet_mm: float = 0.0
+    lost_mm: float = 0.0
 
     @property
     def sharpness(self) -> float:
@@ -104,28 +109,29 @@ def rigid_body(
 ) -> RigidBody:
     """Pack an indenter, of which the part that is touchable matters; what a mesh has beyond is left out.
 
-    Edges and tips that are sharper than `resolution_mm`, the smallest radius that the gel's mesh resolves, are rounded
-    to it. A mesh indenter's relative file name is relative to the folder. InputError for a fillet or tube too large for
-    its shape; a mesh file that is missing, no solid or too fine for a grid.
+    Where no radius is stated, edges and tips that are sharper than `resolution_mm`, the smallest radius that the gel's
+    mesh resolves, are rounded to it. A mesh indenter's relative file name is relative to the folder. InputError for a
+    fillet or tube too large for its shape; a mesh file that is missing, no solid or too fine for a grid.
     """
     if isinstance(indenter, MeshIndenter):
         return _object(indenter, folder or Path(), resolution_mm, touchable)
     rotation = turned_by(indenter.rotation_deg)
     up = rotation.T @ np.array([0.0, 0.0, 1.0])
     radial, axial = float(np.hypot(up[0], up[1])), float(up[2])
+    fillet = 0.0
     match indenter:
         case Sphere(radius_mm=radius):
             lengths, reach, sharpest = [0.0, radius], radius, radius
-        case Cylinder(radius_mm=radius, length_mm=length, fillet_mm=fillet):
-            fillet = sharpest = _fillet(indenter, fillet, resolution_mm, min(radius, length / 2))
+        case Cylinder(radius_mm=radius, length_mm=length):
+            fillet = sharpest = _fillet(indenter, resolution_mm, min(radius, length / 2))
             core, half = radius - fillet, length / 2 - fillet
             lengths, reach = [fillet, core, half], core * radial + half * abs(axial) + fillet
-        case Box(size_mm=size, fillet_mm=fillet):
-            fillet = sharpest = _fillet(indenter, fillet, resolution_mm, min(size) / 2)
+        case Box(size_mm=size):
+            fillet = sharpest = _fillet(indenter, resolution_mm, min(size) / 2)
             half_edges = np.array(size) / 2 - fillet
             lengths, reach = [fillet, *half_edges], float(np.abs(up) @ half_edges) + fillet
-        case Cone(half_angle_deg=angle, height_mm=height, fillet_mm=fillet):
-            fillet = sharpest = _fillet(indenter, fillet, resolution_mm, height / 2)
+        case Cone(half_angle_deg=angle, height_mm=height):
+            fillet = sharpest = _fillet(indenter, resolution_mm, height / 2)
             core = height - 2 * fillet
             base = core * float(np.tan(np.radians(angle)))
             lengths, reach = [fillet, base, core], max(0.0, base * radial - core * axial) + fillet
@@ -135,13 +141,15 @@ def rigid_body(
     shape = np.zeros(SHAPE_LENGTH)
     shape[: len(lengths)] = lengths
     shape[5:] = rotation.T @ (rotation @ indenter.offset_mm * [1, 1, 0])
-    return RigidBody(KINDS[indenter.shape], shape, rotation, reach, np.zeros((1, 1, 1)), sharpest)
+    return RigidBody(KINDS[indenter.shape], shape, rotation, reach, np.zeros((1, 1, 1)), sharpest, fillet)
 
 
-def _fillet(indenter: Indenter, fillet: float, resolution: float, half_thickness: float) -> float:
-    """The fillet that is simulated; rounding up to a resolution stops at 90 % of what the body's thickness allows."""
-    _require(fillet < half_thickness, indenter, "fillet_mm", f"less than {half_thickness}")
-    return max(fillet, min(resolution, 0.9 * half_thickness))
+def _fillet(indenter: Cylinder | Box | Cone, resolution: float, half_thickness: float) -> float:
+    """The stated fillet, or the default one or a resolution, at most 90 % of what the body's thickness allows."""
+    if indenter.fillet_mm is None:
+        return min(max(DEFAULT_FILLET_MM, resolution), 0.9 * half_thickness)
+    _require(indenter.fillet_mm < half_thickness, indenter, "fillet_mm", f"less than {half_thickness}")
+    return indenter.fillet_mm
 
 
 def _require(holds: bool, indenter: Indenter, field: str, allowed: str) -> None:
@@ -172,14 +180,16 @@ def _object(indenter: MeshIndenter, folder: Path, resolution_mm: float, touchabl
             place = rotation @ np.multiply(offset, [1, -1, 1])
     turned = replace(turned, points=turned.points - place * [1, 1, 0])
     grid = _grid_over(turned, indenter, radius, touchable)
-    values = _rounded_distance(turned, grid, radius, f"contact.indenter.file = {indenter.file!r}")
+    values, moved = _rounded_distance(turned, grid, radius, f"contact.indenter.file = {indenter.file!r}")
+    pressed = int(np.clip((lowest - touchable.depth_mm - grid.corner[2]) / grid.spacing, 0, grid.counts[2] - 1))
     shape = np.array([0.0, *grid.corner, grid.spacing, *grid.counts])
     coefficients = np.asarray(spline_filter(values, order=3, mode="mirror"), dtype=np.float64)
     near = values < radius + grid.spacing
     reach = min(lowest, float((grid.points(near)[:, 2] - values[near]).max()))  # also of balls beside the solid
-    kept = max(min((indenter.fillet_mm or 0.0) / radius, 1.0), LOWERED) if radius > 0 else 0.0
+    kept = LOWERED if indenter.fillet_mm is None else 1.0
     reach = lowest - max(kept * (lowest - reach), lowest - reach - MOST_RAISED * touchable.depth_mm)
-    return RigidBody(KINDS["mesh"], shape, np.eye(3), reach, coefficients, max(radius, grid.spacing))
+    lost = float(moved[:, :, pressed:].max())
+    return RigidBody(KINDS["mesh"], shape, np.eye(3), reach, coefficients, max(radius, grid.spacing), radius, lost)
 
 
 def _grid_over(turned: Triangles, indenter: MeshIndenter, radius: float, touchable: Touchable) -> Grid:
@@ -187,7 +197,12 @@ def _grid_over(turned: Triangles, indenter: MeshIndenter, radius: float, touchab
     low, high = turned.points.min(axis=0), turned.points.max(axis=0)
     low = np.maximum(low, [-touchable.radius_mm, -touchable.radius_mm, high[2] - touchable.height_mm])
     high = np.minimum(high, [touchable.radius_mm, touchable.radius_mm, np.inf])
-    spacing = indenter.cell_mm or _spacing(radius, high - low)
+    spacing = indenter.cell_mm or _spacing(radius, high - low, indenter.fillet_mm is not None)
+    if indenter.fillet_mm is not None and spacing > radius:
+        raise InputError(
+            f"contact.indenter.fillet_mm = {radius:g}: {indenter.file} needs a grid with cells no larger, allowed are "
+            f"{spacing:.2g} mm and more; state a larger radius or a smaller cell_mm, or press a smaller part"
+        )
     margin = radius + 4 * spacing
     counts = np.ceil((high - low + 2 * margin) / spacing).astype(int) + 1
     if counts.prod() > LARGEST_GRID:
@@ -198,8 +213,11 @@ def _grid_over(turned: Triangles, indenter: MeshIndenter, radius: float, touchab
     return Grid(low - margin, spacing, (int(counts[0]), int(counts[1]), int(counts[2])))
 
 
-def _rounded_distance(turned: Triangles, grid: Grid, radius: float, named: str) -> FloatArray:
-    """A surface's signed distance on a grid after rounding; InputError, beginning as `named`, where it is no solid."""
+def _rounded_distance(turned: Triangles, grid: Grid, radius: float, named: str) -> tuple[FloatArray, FloatArray]:
+    """A surface's signed distance on a grid after rounding, and how far that moved the surface where a sample is on it.
+
+    InputError, beginning as `named`, where it is no solid.
+    """
     values = grid.signed_distance(turned, radius)
     missing = 0.0 if turned.closed else grid.missing(values)
     if missing > MOST_MISSING:
@@ -208,6 +226,7 @@ def _rounded_distance(turned: Triangles, grid: Grid, radius: float, named: str) 
             "thickness"
         )
     values, boundary = grid.boundary(values, turned, radius)
+    sharp = values
     if radius > 0:
         values = grid.rounded(values, boundary, radius)
     if not (values < 0).any():
@@ -220,18 +239,19 @@ def _rounded_distance(turned: Triangles, grid: Grid, radius: float, named: str) 
             f"{named}: it encloses no volume that a grid of {grid.spacing:.2g} mm resolves; a single sheet needs a "
             "thickness"
         )
-    return values
+    return values, np.where(np.abs(sharp) < grid.spacing, np.abs(values - sharp), 0.0)
 
 
 def object_radius(indenter: MeshIndenter, resolution_mm: float) -> float:
     """Radius, mm, that the edges of a mesh are rounded to: the stated one, or what the gel's mesh can follow."""
-    return max(indenter.fillet_mm or 0.0, OBJECT_RADIUS * resolution_mm)
+    return OBJECT_RADIUS * resolution_mm if indenter.fillet_mm is None else indenter.fillet_mm
 
 
-def _spacing(radius_mm: float, extent_mm: FloatArray) -> float:
+def _spacing(radius_mm: float, extent_mm: FloatArray, stated: bool) -> float:
     """Spacing of a grid over an extent (3,): a share of the radius, coarser where that were too many points."""
+    most = LARGEST_GRID / 2 if stated else USUAL_GRID  # the half: margins grow where the spacing does
     wanted = radius_mm / CELLS_PER_RADIUS if radius_mm > 0 else float(extent_mm.max()) / 80
-    affordable = float((np.prod(extent_mm + 2 * radius_mm + 8 * wanted) / USUAL_GRID) ** (1 / 3))
+    affordable = float((np.prod(extent_mm + 2 * radius_mm + 8 * wanted) / most) ** (1 / 3))
     return max(wanted, affordable)
 
 

@@ -201,6 +201,10 @@ class LoadPath:
         parts = [np.linspace(a, b, n + 1)[1:] for a, b, n in zip(self.ends[:-1], self.ends[1:], share, strict=True)]
         return np.concatenate(parts)
 
+    def recorded(self, state: int) -> Pose:
+        """The indenter in a trajectory's state of that number, of which 0 is the undeformed one."""
+        return self.pose(float(self.records()[state - 1]) if state else 0.0)
+
     def waypoints(self) -> FloatArray:
         """(k,) the records and the ends of the legs, where the path turns; rising, without the start."""
         stops = np.unique(np.concatenate([self.records(), self.ends]))

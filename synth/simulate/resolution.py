@@ -11,6 +11,7 @@ as wide. Each trajectory has a predicted error of its own, calibrated on meshes 
 extrapolates.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -22,13 +23,19 @@ from synth.mesh import Counts, Focus, PadMesh, domed, graded_box
 from synth.mesh.face import face_height
 from synth.mesh.graded import spacing
 from synth.optics import Optics
-from synth.scene import Gel, Numerics, Scene
+from synth.scene import Gel, MeshIndenter, Numerics, Scene
+from synth.simulate.element import Element, p1p1, p2p1
 from synth.simulate.error_model import face_error
 from synth.simulate.footprint import footprint
 from synth.simulate.load_path import path_of
 
 ELEMENTS_ACROSS = (4, 6, 8, 10, 12, 14, 16)
 """Elements across the contact to choose from."""
+FINER = (20, 24, 32)
+"""More of them, for a stated `fillet_mm` alone: they take minutes."""
+CONTACT_ACROSS = 12
+"""Fewest elements across the contact where outputs.contact asks for its edge."""
+ELEMENTS: dict[str, Callable[[], Element]] = {"auto": p2p1, "p1p1": p1p1, "p2p1": p2p1}
 TALLEST = 1.8
 """Largest height over width of the elements under the contact."""
 WORTHWHILE = 0.97
@@ -73,11 +80,11 @@ class Fineness(NamedTuple):
     through: int
 
 
-def mesh_levels(gel: Gel, focus: Focus) -> list[Fineness]:
+def mesh_levels(gel: Gel, focus: Focus, elements: Sequence[int] = ELEMENTS_ACROSS) -> list[Fineness]:
     """Meshes worth having for a zone, cheapest first; each is finer than all that cost less."""
     size = gel.size_mm
     found = []
-    for number in ELEMENTS_ACROSS:
+    for number in elements:
         counts = Counts((number, number), OUTER)
         wide, fewest = lateral_spacing(gel, focus, counts), 2
         while size[2] / wide > TALLEST * _reach(fewest):
@@ -183,18 +190,37 @@ def scale_px_per_mm(scene: Scene) -> float:
     return float(np.sqrt(abs(u[0] * v[1] - u[1] * v[0])))
 
 
-def resolve(scene: Scene, folder: Path | None, target_error_px: float) -> Resolution:
-    """The cheapest graded mesh of a scene instance whose predicted error of the flow is within a target, else the
-    finest.
+def resolution_mm(scene: Scene, spacing_mm: float) -> float:
+    """Smallest radius of an indenter's edges that the contact points of a mesh resolve: half their distance."""
+    return spacing_mm / (2 * ELEMENTS[scene.numerics.element]().order)
 
-    InputError where the indenter, whose mesh file is relative to `folder`, or the mesh cannot be built.
+
+def _focus(scene: Scene, folder: Path | None) -> Focus:
+    """Where the indenter will touch; a mesh with its edges as sharp as its file has them, which takes less time."""
+    if isinstance(scene.contact.indenter, MeshIndenter):
+        sharp = scene.contact.indenter.model_copy(update={"fillet_mm": None})
+        scene = scene.model_copy(update={"contact": scene.contact.model_copy(update={"indenter": sharp})})
+    return footprint(path_of(scene, folder), scene.sensor.gel.size_mm, MARGIN)
+
+
+def resolve(scene: Scene, folder: Path | None, target_error_px: float) -> Resolution:
+    """The cheapest graded mesh of a scene instance that is fine enough, else the finest.
+
+    Its predicted error of the flow is within the target, it resolves a stated `fillet_mm`, and the contact's edge where
+    that is asked for. InputError where the indenter, whose mesh file is relative to `folder`, or the mesh cannot be
+    built.
     """
     gel = scene.sensor.gel
-    focus = footprint(path_of(scene, folder), gel.size_mm, MARGIN)
-    for fineness in mesh_levels(gel, focus):
+    focus = _focus(scene, folder)
+    stated = getattr(scene.contact.indenter, "fillet_mm", None)
+    least = CONTACT_ACROSS if scene.outputs.contact else 0
+    usual = mesh_levels(gel, focus)
+    finer = [] if stated is None else mesh_levels(gel, focus, FINER)
+    for number, fineness in enumerate([*usual, *finer], 1):
         mesh, fine = graded_mesh(gel, focus, *fineness)
         error = predicted_error_px(scene, focus, fine)
-        if error <= target_error_px:
+        enough = number >= len(usual) or (error <= target_error_px and fineness.across >= least)
+        if enough and (stated is None or resolution_mm(scene, mesh.spacing_mm) <= stated):
             break
     return Resolution(fineness.across, error, mesh, fineness.through, fine)
 
@@ -234,6 +260,6 @@ def shared_spacing_mm(gel: Gel, numerics: Numerics) -> float:
 def accuracy(scene: Scene, folder: Path | None = None) -> Accuracy:
     """What the shared mesh gives for one instance; InputError where the indenter cannot be built."""
     gel, numerics = scene.sensor.gel, scene.numerics
-    focus = footprint(path_of(scene, folder), gel.size_mm, MARGIN)
+    focus = _focus(scene, folder)
     error = predicted_error_px(scene, focus, shared_spacing_mm(gel, numerics))
     return Accuracy(int(2 * min(focus.half_mm) / _width(gel.size_mm, numerics.cells)), error)

@@ -14,7 +14,8 @@ from synth.simulate.load_path import LoadPath
 from synth.simulate.material import pad_material
 from synth.simulate.measure import Distance
 from synth.simulate.options import STANDARD, SolverOptions
-from synth.simulate.press import ELEMENTS, Press
+from synth.simulate.press import Press
+from synth.simulate.resolution import ELEMENTS
 from synth.simulate.space import Space, function_space
 from synth.simulate.stepping import Stepper
 from synth.simulate.system import System

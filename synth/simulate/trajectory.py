@@ -28,6 +28,7 @@ class State:
         min_jacobian: smallest det F at any quadrature point or sample point (`synth.simulate.inversion_barrier`).
         max_penetration_mm: deepest contact point inside the indenter.
         slip_ratio: of the touching area, the part that slipped in the last load step.
+        contact_area_mm2: of the deformed contact face, see `synth.simulate.contact_patch`.
     """
 
     depth_mm: float
@@ -42,6 +43,7 @@ class State:
     min_jacobian: float
     max_penetration_mm: float
     slip_ratio: float
+    contact_area_mm2: float
 
     def summary(self) -> dict[str, Any]:
         """The state without its fields, as trajectory.json has it."""
@@ -55,7 +57,7 @@ def at_rest(path: LoadPath, space: Space) -> list[State]:
     fields = np.zeros((len(space.points), 3)), np.zeros((len(space.surface_nodes), 3))
     poses = [path.pose(place) for place in (0.0, *places)]
     return [
-        State(pose.depth_mm, pose.shear_mm, pose.twist_deg, *fields, zero, zero, 0, 0.0, 1.0, 0.0, 0.0)
+        State(pose.depth_mm, pose.shear_mm, pose.twist_deg, *fields, zero, zero, 0, 0.0, 1.0, 0.0, 0.0, 0.0)
         for pose in poses
     ]
 

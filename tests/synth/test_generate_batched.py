@@ -37,7 +37,7 @@ from synth.simulate.resolution import accuracy, shared_mesh, shared_spacing_mm
 from synth.simulate.solve import simulate_press
 
 SPHERE = '{ shape = "sphere", radius_mm = { uniform = [1.5, 2.5] } }'
-BOX = '{ shape = "box", size_mm = [{ uniform = [1.4, 2.4] }, 2.4, 2.4], fillet_mm = { uniform = [0.4, 1.1] } }'
+BOX = '{ shape = "box", size_mm = [{ uniform = [1.4, 2.4] }, 2.4, 2.4], fillet_mm = { uniform = [0.68, 1.1] } }'
 NEEDLE = '{ shape = "sphere", radius_mm = 0.06 }'
 BATCHED = (
     TEXT.replace("edge_length_mm = 1.25", 'solver = "batched", cells = [6, 4, 2]')

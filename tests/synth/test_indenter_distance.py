@@ -238,12 +238,14 @@ def test_meshes_are_scaled_and_turned_and_edges_rounded_to_what_the_pads_mesh_re
     distance, _, _ = measure(body, np.array([[1.1, 0.0, 0.0], [0.0, 3.1, 0.0], [0.0, 0.0, 2.1], [0.7, 0.0, 0.0]]))
     # Away from edges the distance is linear and the spline exact, but for the filter's tail from the edges.
     np.testing.assert_allclose(distance, [0.1, 0.1, 0.1, -0.3], atol=1e-3)
-    sharp, blunt = rigid_body(CYLINDER), rigid_body(CYLINDER, resolution_mm=0.6)
-    assert (sharp.shape[0], blunt.shape[0]) == (0.3, 0.6)
+    assert rigid_body(CYLINDER, resolution_mm=0.6).shape[0] == 0.3  # stated: kept
+    unstated = CYLINDER.model_copy(update={"fillet_mm": None})
+    sharp, blunt = rigid_body(unstated), rigid_body(unstated, resolution_mm=0.6)
+    assert (sharp.fillet_mm, blunt.fillet_mm) == (sharp.shape[0], blunt.shape[0]) == (0.2, 0.6)
     assert blunt.reach_mm == pytest.approx(sharp.reach_mm)
     axis = np.array([[0.0, 0.0, 1.3], [1.4, 0.0, 0.0]])
     np.testing.assert_allclose(measure(blunt, axis)[0], measure(sharp, axis)[0], atol=1e-12)
-    assert rigid_body(CYLINDER, resolution_mm=5.0).shape[0] == pytest.approx(0.9)  # 90 % of half the length
+    assert rigid_body(unstated, resolution_mm=5.0).shape[0] == pytest.approx(0.9)  # 90 % of half the length
 
 
 UNUSABLE: dict[str, tuple[pv.PolyData | bytes | None, str]] = {

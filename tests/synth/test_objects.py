@@ -230,4 +230,6 @@ def test_what_cannot_touch_has_no_grid_and_the_radius_is_what_the_gel_can_follow
     top = around((2.0, 1.5, 0.1)) + np.array([0.0, 0.0, 0.9])
     assert_equal_near(distances(part, top), distances(whole, top), 0.2, 0.01)
     stated = MeshIndenter(shape="mesh", file="object.stl", fillet_mm=0.5)
-    assert [object_radius(stated, spacing) for spacing in (0.1, 0.4)] == [0.5, OBJECT_RADIUS * 0.4]
+    assert [object_radius(stated, spacing) for spacing in (0.1, 0.4)] == [0.5, 0.5]
+    unstated = MeshIndenter(shape="mesh", file="object.stl")
+    assert object_radius(unstated, 0.4) == OBJECT_RADIUS * 0.4

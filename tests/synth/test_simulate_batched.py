@@ -35,8 +35,8 @@ from synth.simulate.space import function_space
 from synth.simulate.system import System, Unknowns
 from synth.simulate.tables import barrier_tables, bulk_tables, face_tables, warp_array
 
-BAR = {"shape": "cylinder", "radius_mm": 1.5, "length_mm": 4.0, "fillet_mm": 0.6, "rotation_deg": [90, 0, 30]}
-BOX = {"shape": "box", "size_mm": [3.0, 2.5, 4.0], "fillet_mm": 0.6, "rotation_deg": [0, 0, 20]}
+BAR = {"shape": "cylinder", "radius_mm": 1.5, "length_mm": 4.0, "fillet_mm": 0.75, "rotation_deg": [90, 0, 30]}
+BOX = {"shape": "box", "size_mm": [3.0, 2.5, 4.0], "fillet_mm": 0.75, "rotation_deg": [0, 0, 20]}
 WIRE = {"shape": "torus", "radius_mm": 1.5, "tube_mm": 0.3}
 MESH = brick(counts=(4, 4, 2))
 TOLERANCE = 1e-9

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("one_cache")
 Run = Callable[..., str]
 STEP = {
     "depth_mm", "shear_mm", "twist_deg", "force_n", "torque_nmm", "converged", "newton_iterations", "residual",
-    "min_jacobian", "max_penetration_mm", "slip_ratio",
+    "min_jacobian", "max_penetration_mm", "slip_ratio", "contact_area_mm2",
 }  # fmt: skip
 
 

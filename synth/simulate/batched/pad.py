@@ -24,7 +24,7 @@ from synth.simulate.contact import Indenters
 from synth.simulate.indenter import RigidBody
 from synth.simulate.load_path import LoadPath
 from synth.simulate.material import Material, pad_material
-from synth.simulate.solve import ELEMENTS
+from synth.simulate.resolution import ELEMENTS
 from synth.simulate.space import Space, function_space
 from synth.simulate.system import System
 from synth.simulate.tables import pack_indenter, place_indenter
