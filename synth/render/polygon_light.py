@@ -11,6 +11,7 @@ first quotient is smooth in 1 - cos(θ/2) up to θ = π and is taken from a poly
 The rectangles are those of `synth.render.lights`, in the renderer's frame, and shine to their front only.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,8 +26,18 @@ _STRATA = 2
 """Points of a light without closed form for each of a pixel's samples, spread along its first side."""
 
 
+@dataclass(init=False, eq=False)
 class PolygonLight:
-    """One light with power. Every number is opaque to Dr.Jit, so that another instance of it needs no compiler."""
+    """One light with power. Every number is opaque to Dr.Jit, so that another instance needs no new recording."""
+
+    radiance: list[Any]
+    _mi: Any
+    _dr: Any
+    _front: Any
+    _corner: Any
+    _sides: tuple[Any, Any]
+    _corners: list[Any]
+    _area: Any
 
     def __init__(self, light: Light, mi: Any) -> None:
         import drjit as dr
@@ -81,12 +92,16 @@ class PolygonLight:
         return 0.5 * dr.abs(total)
 
 
+@dataclass(init=False, eq=False)
 class SampledLight(PolygonLight):
     """A light without a closed form: narrower than Lambertian, or a mirror image (`synth.render.lights`).
 
     What of an image arrives depends on the angle at the face of a window of this index. `whole` is the mean over a few
     points.
     """
+
+    _index: Any
+    _narrowness: Any
 
     def __init__(self, light: Light, index: float | None, mi: Any) -> None:
         super().__init__(light, mi)
