@@ -1,6 +1,8 @@
 """What those who make samples are given, and what they hand on and give back."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,7 @@ from synth.scene import Scene
 from synth.scene.sampling import Pair, stream
 from synth.simulate import State
 from synth.simulate.resolution import Accuracy
-from synth.simulate.space import Space
+from synth.surface import ContactFaces
 
 Task = tuple[int, tuple[int, ...]]
 """A trajectory and its samples that are wanted."""
@@ -47,6 +49,14 @@ class Outcome:
     given_up: tuple[int, ...]
     warning: str = ""
 
+    @staticmethod
+    def of_all(outcomes: Iterable["Outcome"]) -> "Outcome":
+        """Several tasks as one."""
+        every = list(outcomes)
+        entries, failures = (tuple(chain(*(getattr(one, name) for one in every))) for name in ("entries", "failures"))
+        given_up = tuple(number for one in every for number in one.given_up)
+        return Outcome(entries, failures, given_up, next((one.warning for one in every if one.warning), ""))
+
 
 @dataclass(frozen=True, eq=False)
 class SimulatedTrajectory:
@@ -57,6 +67,7 @@ class SimulatedTrajectory:
     pairs: tuple[Pair, ...]  # the samples that are wanted
     states: dict[int, State]  # by number, those that the samples show; displacements are those of the contact face
     mesh: dict[str, Any]  # what is said of the mesh: hash and element
+    faces: ContactFaces  # of the mesh
     edge_radius_mm: float | None  # of a mesh indenter, else None
     accuracy: Accuracy | None  # of the mesh; None where it is left to whoever finishes the samples
     failures: tuple[Failure, ...]  # instances that failed before
@@ -65,7 +76,3 @@ class SimulatedTrajectory:
     @property
     def sensor(self) -> int:
         return self.pairs[0].sensor
-
-
-Simulated = tuple[SimulatedTrajectory, Space]
-"""A simulated trajectory, and the finite-element space that it was simulated in."""

@@ -317,7 +317,7 @@ def _centres(optics: Optics, camera: Camera) -> FloatArray:
 
     (H·W, 2) or (H·W, 3) float64, NaN where the lens does not look.
     """
-    local = optics.lens.directions(optics.centres)
+    local = optics.local
     if camera.lens == "fisheye":
         return np.column_stack([local[:, :2], np.arctan2(np.hypot(local[:, 0], local[:, 1]), local[:, 2])])
     return local[:, :2] / local[:, 2:]

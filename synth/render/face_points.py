@@ -15,40 +15,41 @@ _STEP = 4
 class FacePoints:
     """Points on faces, each face's one after another: surface interactions, barycentric weights, and unit normals.
 
-    These, mi.Vector3f, point into the gel; `numbers` are random (mi.Point2f), stratified within each face; `face` is
-    the number of each point's face (mi.UInt32).
+    These, mi.Vector3f, point into the gel; `numbers` are random (mi.Point2f), stratified within each face.
     """
 
     at: Any
     normal: Any
     weights: tuple[Any, Any, Any]
     numbers: Iterator[Any]
-    face: Any
 
     @staticmethod
-    def on(gel: GelHits, count: int, draws: int, seed: Any, mi: Any, chosen: Any = None) -> "FacePoints":
-        """`count` points, each with as many `draws` of numbers, on each of the gel's faces, or of the `chosen` ones.
+    def on(gel: GelHits, count: int, draws: int, seed: Any, mi: Any, nodes: Any = None) -> "FacePoints":
+        """`count` points, each with as many `draws` of numbers, on each of the gel's faces, or at each of the nodes.
 
-        The seed and the chosen faces' numbers are mi.UInt32.
+        The seed is mi.UInt32; nodes are from `smooth_light.Nodes.numbers`.
         """
         import drjit as dr
 
-        total = dr.width(gel.corners[0] if chosen is None else chosen) * count
+        total = dr.width(gel.corners[0] if nodes is None else nodes[0]) * count
         sampler = mi.load_dict({"type": "multijitter", "sample_count": count})
         sampler.set_samples_per_wavefront(count)
         sampler.seed(seed, total)
         first, *numbers = (sampler.next_2d() for _ in range(1 + draws))
         dr.eval(first, numbers)  # by a kernel of their own: the sampler's size is compiled into it
         face = dr.arange(mi.UInt32, total) // dr.opaque(mi.UInt32, count)
-        face = face if chosen is None else dr.gather(mi.UInt32, chosen, face)
-        place = mi.warp.square_to_uniform_triangle(first)
-        weights = (1 - place.x - place.y, place.x, place.y)
+        if nodes is None:
+            place = mi.warp.square_to_uniform_triangle(first)
+            weights = (1 - place.x - place.y, place.x, place.y)
+        else:
+            first, second, third = (dr.gather(mi.Float, weight, face) for weight in nodes[1])
+            weights, face = (first, second, third), dr.gather(mi.UInt32, nodes[0], face)
         vertices = [dr.gather(mi.UInt32, column, face) for column in gel.corners]
         a, b, c = (dr.gather(mi.Point3f, gel.positions, vertex) for vertex in vertices)
         at = dr.zeros(mi.SurfaceInteraction3f, total)
         at.p = a * weights[0] + b * weights[1] + c * weights[2]
         at.n = mi.Normal3f(dr.normalize(dr.cross(b - a, c - a)))
-        return FacePoints(at, -gel.normal(face, weights), weights, iter(numbers), face)
+        return FacePoints(at, -gel.normal(face, weights), weights, iter(numbers))
 
 
 def count_per_face(total: int, faces: int) -> int:

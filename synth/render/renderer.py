@@ -19,10 +19,10 @@ from typing import Any, cast
 import numpy as np
 
 from synth.arrays import Image, Points
+from synth.render.albedo_map import AlbedoMap
 from synth.render.camera_image import PILOT, needed_samples
 from synth.render.camera_rays import CameraRays, pinhole
 from synth.render.chart import Chart, chart_of
-from synth.render.albedo_map import AlbedoMap
 from synth.render.coating import reflection
 from synth.render.gel_hits import GelHits
 from synth.render.gel_mesh import GelMesh
@@ -85,7 +85,7 @@ class Renderer:
             self._integrator = mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": True})
         self._use(sensor, albedo)
 
-    def reuse(self, sensor: Sensor, albedo: Image) -> bool:
+    def reuse(self, sensor: Sensor, surface: GelSurface, albedo: Image) -> bool:
         """Render this sensor from now on, if light is separated and it differs in numbers alone; else say False.
 
         What Dr.Jit has recorded of frames serves it, too.
@@ -94,7 +94,7 @@ class Renderer:
             return False
         check_views(sensor)
         self._behind = reflecting_plane(sensor)
-        self._set_meshes(self._meshes["gel"].surface, chart_of(sensor))
+        self.take(surface)
         self._parameters["lights.vertex_positions"] = panel_corners(all_lights(sensor))
         self._use(sensor, albedo)
         return True

@@ -39,7 +39,7 @@ from synth.render.gel_hits import GelHits
 from synth.render.gel_mesh import GelMesh
 from synth.render.lights import image_lights, reaches, reflectance, reflecting_plane
 from synth.render.polygon_light import PolygonLight, SampledLight
-from synth.render.smooth_light import SmoothFit, fitted, spread_faces
+from synth.render.smooth_light import Nodes, SmoothFit, fitted
 from synth.render.variant import Variant
 from synth.scene import Coating, Render, Sensor
 
@@ -47,8 +47,8 @@ _PILOTS = 2**14
 """Rays to each light, and to the gel, from a gel of few faces; 16 from each face where there are many."""
 _MANY = 0.25
 """Share of a face's pilots that must see gel for its bounced light to be linear and not constant."""
-_RETURNING_FACES, _RETURNING_PATHS = 1024, 16
-"""Faces at which light that comes back from the window is sampled, and paths from each."""
+_RETURNING_NODES, _RETURNING_PATHS = 1024, 16
+"""Points at which light that comes back from the window is sampled, and paths from each."""
 _CLEARANCE_MM = 1e-3
 """Height above the gel's highest point at which rays end that look for gel alone: far more than rounding."""
 _NEGLIGIBLE = 1e-4
@@ -88,12 +88,13 @@ class FrameGeometry:
         self.top = float(high[2]) + _CLEARANCE_MM
         self.sizes = len(placed), len(faces)
         self.bounces = is_deep and bool(high[2] - low[2] > _CLEARANCE_MM)
-        self.cavity = SmoothFit(placed, faces, low, high) if self.bounces and sensor.gel.is_round else None
-        self.returning, self.window = None, None
+        self.cavity, self.window, self.returning = None, None, None
+        if self.bounces and sensor.gel.is_round:
+            self.cavity = SmoothFit(placed, faces, Nodes.centres(faces), low, high)
         if is_deep and reflecting_plane(sensor) is not None:
             half = np.array(sensor.gel.size_mm[:2]) / 2
-            self.returning = spread_faces(placed, faces, _RETURNING_FACES)
-            self.window = SmoothFit(placed, faces[self.returning], -half, half)
+            self.returning = Nodes.spread(placed, faces, _RETURNING_NODES)
+            self.window = SmoothFit(placed, faces, self.returning, -half, half)
 
     def numbers(self, seed: int, mi: Any) -> dict[str, Any]:
         """The frame's numbers on the device, with three seeds."""
@@ -104,7 +105,7 @@ class FrameGeometry:
             "top": dr.opaque(mi.Float, self.top),
             "cavity": self.cavity and self.cavity.numbers(mi),
             "window": self.window and self.window.numbers(mi),
-            "returning": None if self.returning is None else mi.UInt32(self.returning.astype(np.uint32)),
+            "returning": self.returning and self.returning.numbers(mi),
         }
 
 
@@ -194,7 +195,7 @@ class SeparatedLight:
         return [dr.select(seen, a * e / dr.pi, 0) for a, e in zip(albedo, light, strict=True)], seen
 
     def _smooth(self, fit: dict[str, Any], values: list[Any], count: int) -> list[list[Any]]:
-        """Irradiance at faces' corners, fitted to `count` samples (channels of mi.Float) on each of the fit's faces."""
+        """Irradiance at faces' corners, fitted to `count` samples (channels of mi.Float) at each of the fit's nodes."""
         mi, dr, gel = self._mi, self._dr, self._gel
         dr.eval(values)
         means = [dr.block_sum(value, count) / count for value in values]

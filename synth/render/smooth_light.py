@@ -10,6 +10,7 @@ of least squares for the irradiance sampled on faces. The least squares depend o
 the host before anything is sampled, so that what is sampled stays on the device.
 """
 
+from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
@@ -20,30 +21,55 @@ from synth.arrays import FloatArray, Points, Triangles
 
 _DEGREE = 4
 """Degree of V's polynomials."""
+_R2 = (0.7548776662466927, 0.5698402909980532)
+"""Steps of the R2 sequence."""
 _RANK = 1e-14
 """Relative eigenvalue below which directions are not fitted: on flat gel, those of V along it."""
 
 
-def spread_faces(positions: Points, triangles: Triangles, count: int) -> NDArray[np.intp]:
-    """About `count` faces, spread evenly over the area of a surface, in rising order and each once."""
-    a, b, c = (positions[corner] for corner in triangles.T)
-    area = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=1))
-    return np.unique(np.searchsorted(area, (np.arange(count) + 0.5) / count * area[-1]))
+@dataclass(frozen=True, eq=False)
+class Nodes:
+    """Points of a surface at which light is sampled: their faces (n,), and weights (n, 3) of the faces' corners."""
+
+    faces: NDArray[np.intp]
+    weights: FloatArray
+
+    @staticmethod
+    def spread(positions: Points, triangles: Triangles, count: int) -> "Nodes":
+        """`count` points spread evenly over the area, at low-discrepancy places of their faces (R2, Roberts 2018)."""
+        a, b, c = (positions[corner] for corner in triangles.T)
+        area = np.cumsum(np.linalg.norm(np.cross(b - a, c - a), axis=1))
+        faces = np.searchsorted(area, (np.arange(count) + 0.5) / count * area[-1])
+        u, v = np.outer(_R2, np.arange(1, count + 1)) % 1
+        root = np.sqrt(u)
+        return Nodes(faces, np.column_stack([1 - root, root * (1 - v), root * v]))
+
+    @staticmethod
+    def centres(triangles: Triangles) -> "Nodes":
+        """The middle of each face."""
+        return Nodes(np.arange(len(triangles)), np.full((len(triangles), 3), 1 / 3))
+
+    def numbers(self, mi: Any) -> tuple[Any, list[Any]]:
+        """Faces (mi.UInt32) and weights (3 of mi.Float) on the device."""
+        weights = [mi.Float(np.ascontiguousarray(column, dtype=np.float32)) for column in self.weights.T]
+        return mi.UInt32(self.faces.astype(np.uint32)), weights
 
 
 class SmoothFit:
-    """The fit on some faces (n, 3) of a surface with vertices at positions (v, 3) mm, its normals out of the gel.
+    """The fit at nodes of a surface with vertices at positions (v, 3) mm, whose faces' normals point out of the gel.
 
     Places count in the first axes of a box from `low` to `high` mm. A Dr.Jit PyTree by `numbers`.
     """
 
-    def __init__(self, positions: Points, faces: Triangles, low: FloatArray, high: FloatArray) -> None:
-        corners = positions[faces]
+    def __init__(
+        self, positions: Points, triangles: Triangles, nodes: Nodes, low: FloatArray, high: FloatArray
+    ) -> None:
+        corners = positions[triangles[nodes.faces]]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         self._centre, self._half = (low + high) / 2, (high - low) / 2
-        places = (corners.mean(axis=1)[:, : len(low)] - self._centre) / self._half
-        design = np.stack(_terms(list(places.T), list(normals.T)))
+        points = np.einsum("nk,nkc->nc", nodes.weights, corners)[:, : len(low)]
+        design = np.stack(_terms(list(((points - self._centre) / self._half).T), list(normals.T)))
         self._solution = np.linalg.pinv(design @ design.T, rcond=_RANK, hermitian=True) @ design
 
     def numbers(self, mi: Any) -> dict[str, Any]:
@@ -55,7 +81,7 @@ class SmoothFit:
 
 
 def fitted(fit: dict[str, Any], samples: list[Any], positions: Any, normals: Any, mi: Any) -> list[Any]:
-    """Irradiance (channels of mi.Float) of vertices, from its means (channels of n of mi.Float) on the fit's faces.
+    """Irradiance (channels of mi.Float) of vertices, from its means (channels of n of mi.Float) at the fit's nodes.
 
     Positions and unit normals of the vertices are mi.Point3f and mi.Vector3f, in the frame of the fit's.
     """
