@@ -24,6 +24,7 @@ fixed order: the same seed gives the same bits.
 Nothing here depends on a value that is read back, so that a frame is recorded once and replayed (`drjit.freeze`).
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import reduce
 from operator import or_
@@ -38,10 +39,10 @@ from synth.render.face_points import FacePoints, count_per_face, projected
 from synth.render.gel_hits import GelHits
 from synth.render.gel_mesh import GelMesh
 from synth.render.lights import image_lights, reaches, reflectance, reflecting_plane
-from synth.render.polygon_light import PolygonLight, SampledLight
+from synth.render.polygon_light import LightTable, PolygonLight
 from synth.render.smooth_light import Nodes, SmoothFit, fitted
 from synth.render.variant import Variant
-from synth.scene import Coating, Render, Sensor
+from synth.scene import Coating, Light, Render, Sensor
 
 _PILOTS = 2**14
 """Rays to each light, and to the gel, from a gel of few faces; 16 from each face where there are many."""
@@ -125,7 +126,8 @@ class SeparatedLight:
     _albedo: AlbedoMap
     _channels: int
     _index: Any
-    _lights: list[Any]
+    _words: int
+    _lights: list[LightTable]
 
     def __init__(self, sensor: Sensor, scene: Any, gel: GelHits, albedo: AlbedoMap, max_depth: int, mi: Any) -> None:
         import drjit as dr
@@ -137,8 +139,14 @@ class SeparatedLight:
         self._index = dr.opaque(mi.Float, index)  # used only where the window reflects
         size = sensor.gel.size_mm
         own = [light for light in sensor.lights if reaches(light, size)]
-        self._lights = [SampledLight(light, None, mi) if light.narrowness else PolygonLight(light, mi) for light in own]
-        self._lights += [SampledLight(light, index, mi) for light in image_lights(sensor) if reaches(light, size)]
+        images = [light for light in image_lights(sensor) if reaches(light, size)]
+        kinds: list[tuple[list[Light], dict[str, Any]]] = [
+            ([light for light in own if not light.narrowness], {}),
+            ([light for light in own if light.narrowness], {"sampled": True}),
+            (images, {"sampled": True, "index": index}),
+        ]
+        self._lights = [LightTable(lights, albedo.channels, mi, **kind) for lights, kind in kinds if lights]
+        self._words = -(-(len(own) + len(images)) // _BITS)
 
     def prepare(
         self, frame: dict[str, Any], sizes: tuple[int, int], primary: int, bounces: bool
@@ -207,15 +215,35 @@ class SeparatedLight:
     def _direct(self, at: Any, normal: Any, face: Any, offset: Any, shaded: list[Any], active: Any) -> list[Any]:
         """Irradiance (channels) of points on faces, by all lights, less what is blocked."""
         mi, dr = self._mi, self._dr
-        total = [mi.Float(0) for _ in range(self._channels)]
         masks = [dr.gather(mi.UInt32, mask, face, active) for mask in shaded]
-        for number, light in enumerate(self._lights):
-            asked = active & ((masks[number // _BITS] & (1 << number % _BITS)) != 0)
-            value = light.whole(at.p, normal, offset) - self._blocked(light, number, at, normal, offset, asked)
-            total = [dr.fma(value, color, sum_) for color, sum_ in zip(light.radiance, total, strict=False)]
-        return total
 
-    def _blocked(self, light: PolygonLight, number: int, at: Any, normal: Any, offset: Any, asked: Any) -> Any:
+        def add(light: PolygonLight, number: Any, *total: Any) -> list[Any]:
+            mask = mi.UInt32(0)
+            for word, own in enumerate(masks):
+                mask = dr.select(number // _BITS == word, own, mask)
+            asked = active & (((mask >> (number % _BITS)) & 1) != 0)
+            value = light.whole(at.p, normal, offset) - self._blocked(light, number, at, normal, offset, asked)
+            return [dr.fma(value, color, sum_) for color, sum_ in zip(light.radiance, total, strict=True)]
+
+        return self._over_lights(add, [mi.Float(0) for _ in range(self._channels)])
+
+    def _over_lights(self, add: Callable[..., list[Any]], sums: list[Any]) -> list[Any]:
+        """Sums after `add`, called with each light, its number (mi.UInt32) and the sums so far."""
+        mi, dr = self._mi, self._dr
+        before = mi.UInt32(0)
+        for table in self._lights:
+
+            def step(k: Any, *sums: Any, table: LightTable = table, before: Any = before) -> tuple[Any, ...]:
+                return k + 1, *add(table.light(k), before + k, *sums)
+
+            def goes_on(k: Any, *_: Any, table: LightTable = table) -> Any:
+                return k < table.count
+
+            _, *sums = dr.while_loop((mi.UInt32(0), *sums), goes_on, step)
+            before = before + table.count
+        return sums
+
+    def _blocked(self, light: PolygonLight, number: Any, at: Any, normal: Any, offset: Any, asked: Any) -> Any:
         """What of `_sampled` is blocked (mi.Float): computed only where it is `asked`, 0 elsewhere."""
         dr = self._dr
 
@@ -225,12 +253,15 @@ class SeparatedLight:
 
         return dr.if_stmt((at, normal, offset), asked, sample, lambda *_: self._mi.Float(0))
 
-    def _sampled(self, light: PolygonLight, number: int, at: Any, normal: Any, offset: Any) -> Any:
+    def _sampled(self, light: PolygonLight, number: Any, at: Any, normal: Any, offset: Any) -> Any:
         """Irradiance per radiance that a point of the light gives unless its ray is blocked, and whether it is."""
-        dr = self._dr
-        moved = [offset.x + number * _SHIFT[0] % 1, offset.y + number * _SHIFT[1] % 1]
-        place, value = light.sample(at.p, normal, self._mi.Point2f(*(x - dr.floor(x) for x in moved)))
+        place, value = self._point(light, number, at, normal, offset)
         return value, self._scene.ray_test(at.spawn_ray_to(place), value > 0)
+
+    def _point(self, light: PolygonLight, number: Any, at: Any, normal: Any, offset: Any) -> Any:
+        mi, dr = self._mi, self._dr
+        moved = mi.Point2f(offset) + mi.Float(number) * mi.Point2f(*_SHIFT)
+        return light.sample(at.p, normal, moved - dr.floor(moved))
 
     def _pilots(self, seed: Any, faces: int) -> tuple[list[Any], Any]:
         """Masks of the lights before which a pilot of a face was blocked; whether many pilots met the gel (mi.Bool)."""
@@ -238,13 +269,21 @@ class SeparatedLight:
         count = count_per_face(_PILOTS, faces)
         points = FacePoints.on(self._gel, count, 2, seed, mi)
         shared = points.at, points.normal, next(points.numbers)
-        sampled = [self._sampled(light, number, *shared) for number, light in enumerate(self._lights)]
-        given = [[value * c for c in light.radiance] for light, (value, _) in zip(self._lights, sampled, strict=True)]
-        least = [_NEGLIGIBLE * sum(channel) for channel in zip(*given, strict=True)]
-        counted = [reduce(or_, (c > limit for c, limit in zip(one, least, strict=True))) for one in given]
-        masks = [mi.UInt32(0) for _ in range(0, len(sampled), _BITS)]
-        for number, ((_, blocked), counts) in enumerate(zip(sampled, counted, strict=True)):
-            masks[number // _BITS] |= dr.select(blocked & counts, mi.UInt32(1 << number % _BITS), 0)
+
+        def add(light: PolygonLight, number: Any, *total: Any) -> list[Any]:
+            _, value = self._point(light, number, *shared)
+            return [dr.fma(value, color, sum_) for color, sum_ in zip(light.radiance, total, strict=True)]
+
+        whole = self._over_lights(add, [mi.Float(0) for _ in range(self._channels)])
+
+        def mark(light: PolygonLight, number: Any, *masks: Any) -> list[Any]:
+            value, blocked = self._sampled(light, number, *shared)
+            given = zip(light.radiance, whole, strict=True)
+            counts = reduce(or_, (value * color > _NEGLIGIBLE * total for color, total in given))
+            bit = dr.select(blocked & counts, mi.UInt32(1) << (number % _BITS), 0)
+            return [mask | dr.select(number // _BITS == word, bit, 0) for word, mask in enumerate(masks)]
+
+        masks = self._over_lights(mark, [mi.UInt32(0) for _ in range(self._words)])
         _, _, straight, _ = self._onward(points.at, points.normal, next(points.numbers))  # the image is no bounce
         met = dr.select(straight, mi.UInt32(1), 0)
         dr.eval(masks, met)

@@ -160,7 +160,7 @@ def _alone(attempts: Attempts) -> SimulatedTrajectory:
     while (attempt := attempts.next()) is not None:
         simulated = attempts.simulated(attempt, simulate_press(attempt.press, attempt.frames))
         if simulated is not None:
-            return simulated[0]
+            return simulated
     raise AssertionError("no draw could be used")
 
 
@@ -206,7 +206,7 @@ def test_the_shared_mesh_is_even_and_the_predicted_error_falls_with_its_spacing(
     # Coordinates are multiples of 2e-10 mm.
     assert coarse.error_px / better.error_px == pytest.approx(ratio**1.6, rel=1e-8)
     assert better.across > coarse.across >= 0
-    found = MeshRule.of(fine).resolution(fine)
+    found = MeshRule.of(fine, is_batched=True).resolution(fine)
     assert (found.across, found.error_px, found.through) == (better.across, better.error_px, 2)
     assert len(found.mesh.tets) == 6 * 16 * 12 * 2
 

@@ -13,7 +13,7 @@ from synth.mesh import rest_surface
 from synth.render.camera_rays import pinhole
 from synth.render.gel_mesh import MIRROR
 from synth.render.lights import emitters, light_axes
-from synth.render.polygon_light import PolygonLight
+from synth.render.polygon_light import LightTable
 from synth.render.renderer import Renderer
 from synth.scene import Coating, Gel, Light, Render, Sensor
 
@@ -48,7 +48,9 @@ def test_closed_form_is_the_sum_over_the_light() -> None:
     assert (expected == 0).any()
     assert (expected > 0.1).any()
     place, normal = (mi.Vector3f(*(values * MIRROR).astype(np.float32).T) for values in (points, normals))
-    found = np.array(PolygonLight(light, mi).whole(mi.Point3f(place), mi.Normal3f(normal), mi.Point2f(0.5)))
+    found = np.array(
+        LightTable([light], 1, mi).light(mi.UInt32(0)).whole(mi.Point3f(place), mi.Normal3f(normal), mi.Point2f(0.5))
+    )
     # The midpoint rule errs by the second order of a patch's size over the distance, 5/400 and at least some 0.5 mm,
     # and where the horizon cuts patches by a part of one in 400 rows of the light, at grazing angle.
     np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-5)
