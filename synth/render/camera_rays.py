@@ -92,6 +92,12 @@ class CameraRays:
         return mi.Vector3f(*(dr.opaque(mi.Float, value) for value in vector * MIRROR))
 
     @property
+    def static(self) -> tuple[Any, ...]:
+        """What of the camera is compiled into kernels."""
+        optional = (self._round, self._distortion, self._radius)
+        return self._refracts, self._is_fisheye, len(self._mirrors), *(value is None for value in optional)
+
+    @property
     def has_aperture(self) -> bool:
         """Whether `sample` needs points of a pupil; without an aperture none may be drawn for it."""
         return self._radius is not None

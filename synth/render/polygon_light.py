@@ -146,6 +146,11 @@ class LightTable:
         self._narrowness = _floats(narrowness, mi) if any(narrowness) else None
         self._index = None if index is None else dr.opaque(mi.Float, index)
 
+    @property
+    def static(self) -> tuple[bool, ...]:
+        """What of the table is compiled into kernels."""
+        return self._sampled, self._narrowness is None, self._index is None
+
     def light(self, number: Any) -> PolygonLight:
         """A light by its number (mi.UInt32)."""
         import drjit as dr

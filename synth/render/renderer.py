@@ -11,10 +11,9 @@ Pixels are box-filtered. In vectorised variants the samples of one pixel are nei
 in a fixed order, not by atomic adds: the same seed gives the same bits with any number of threads.
 """
 
-import functools
 import math
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -40,7 +39,7 @@ _MAX_WAVEFRONT, _MAX_WAVEFRONT_GPU = 2**22, 2**24
 
 _PILOT_SEEDS = (1, 2)
 _RECORDINGS = 16
-"""Recordings of frames that are kept of each kind: every size of mesh and of picture has its own."""
+"""Recordings of frames that are kept: every size of mesh and of picture has its own."""
 
 _LIGHT_PART = 2**31
 """Stands for the number of a pass in the seed of what all pixels share."""
@@ -58,7 +57,7 @@ class Renderer:
     def __init__(self, sensor: Sensor, render: Render, surface: GelSurface, albedo: Image, variant: Variant) -> None:
         if variant.is_mono and not is_grey(sensor):
             raise ValueError(f"{variant.name} renders grey sensors only: choose the variant with grey=is_grey(sensor)")
-        self._variant, self._render = variant, render
+        self._variant, self._render, self._recordings = variant, render, Recordings()
         self._separated = is_separated(render, sensor.coating, variant)
         mi = variant.load()
         check_views(sensor)
@@ -199,7 +198,8 @@ class Renderer:
             frame = FrameGeometry(self._sensor, self._meshes["gel"], positions, self._render.max_depth > 2)
             numbers = frame.numbers(_mitsuba_seed(seed, _LIGHT_PART, 0), mi)
             primary = camera.width * camera.height * self.samples_per_pixel
-            self._prepared = recorded(prepare)(self._light, numbers, frame.sizes, primary, frame.bounces)
+            static = (self._light.static, frame.sizes, primary, frame.bounces)
+            self._prepared = self._recordings.of(prepare, *static)(self._light, numbers)
 
     def _trace(self, mi: Any, name: str, seed: int, number: int) -> Image:
         """All pixels in passes of whole pixels, each pixel's samples one after another in the wavefront."""
@@ -211,9 +211,13 @@ class Renderer:
         parts = []
         for k, first in enumerate(range(0, pixels, step)):
             starts = dr.opaque(mi.UInt32, first), dr.opaque(mi.UInt32, _mitsuba_seed(seed, k, number))
-            shared = (self._light, self._prepared, self._rays[name], *starts)
-            trace = recorded(traced) if self._separated else traced  # Mitsuba's textures cannot be replayed on a GPU
-            parts.append(trace(*shared, min(step, pixels - first), samples, self._variant.is_mono))
+            values = (self._light, self._prepared, self._rays[name], *starts)
+            static: tuple[Any, ...] = (None, min(step, pixels - first), samples, self._variant.is_mono)
+            if self._separated:  # Mitsuba's textures, which a path tracer looks up, cannot be replayed on a GPU
+                static = ((self._light.static, self._rays[name].static), *static[1:])
+                parts.append(self._recordings.of(traced, *static)(*values))
+            else:
+                parts.append(traced(*values, *static))
         # Read when all passes are queued: a GPU works on one while the next is being recorded.
         sums = np.concatenate([np.stack([np.array(channel) for channel in part], axis=-1) for part in parts])
         image: Image = np.empty((camera.height, camera.width, 3), dtype=np.float32)
@@ -236,24 +240,39 @@ class Renderer:
         return mi.load_dict(description)
 
 
-@functools.cache
-def recorded(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function, recorded by Dr.Jit at its first call with arguments of a kind, and replayed at later ones.
+class Recordings:
+    """Functions that Dr.Jit records at their first call and replays at later ones.
 
-    Numbers that may change from call to call are Dr.Jit's; a change of Python's numbers makes another recording.
+    What changes from call to call are Dr.Jit's numbers. Python's own, `static`, are part of the key: Dr.Jit 1.5 does
+    not always notice that a bool has changed, and replays the other branch.
     """
-    import drjit as dr
 
-    return cast(Callable[..., Any], dr.freeze(function, limit=_RECORDINGS, warn_after=10**9))
+    def __init__(self) -> None:
+        self._known: dict[tuple[Any, ...], Callable[..., Any]] = {}
+
+    def of(self, function: Callable[..., Any], *static: Any) -> Callable[..., Any]:
+        """The function with its last arguments given."""
+        import drjit as dr
+
+        key = (function, *static)
+        if key not in self._known:
+            if len(self._known) == _RECORDINGS:
+                del self._known[next(iter(self._known))]
+
+            def called(*values: Any) -> Any:
+                return function(*values, *static)
+
+            self._known[key] = dr.freeze(called, warn_after=10**9)
+        return self._known[key]
 
 
-def prepare(light: SeparatedLight, *arguments: Any) -> Any:
+def prepare(light: SeparatedLight, frame: Any, _: Any, *arguments: Any) -> Any:
     """See `SeparatedLight.prepare`."""
-    return light.prepare(*arguments)
+    return light.prepare(frame, *arguments)
 
 
 def traced(
-    light: Any, prepared: Any, rays: CameraRays, first: Any, seed: Any, count: int, samples: int, is_mono: bool
+    light: Any, prepared: Any, rays: CameraRays, first: Any, seed: Any, _: Any, count: int, samples: int, is_mono: bool
 ) -> list[Any]:
     """Summed samples of `count` pixels from `first` (mi.UInt32) on: (count,) mi.Float of each channel, queued."""
     import drjit as dr

@@ -48,7 +48,7 @@ _PILOTS = 2**14
 """Rays to each light, and to the gel, from a gel of few faces; 16 from each face where there are many."""
 _MANY = 0.25
 """Share of a face's pilots that must see gel for its bounced light to be linear and not constant."""
-_RETURNING_NODES, _RETURNING_PATHS = 1024, 16
+_RETURNING_NODES, _RETURNING_PATHS = 1024, 144
 """Points at which light that comes back from the window is sampled, and paths from each."""
 _CLEARANCE_MM = 1e-3
 """Height above the gel's highest point at which rays end that look for gel alone: far more than rounding."""
@@ -147,6 +147,11 @@ class SeparatedLight:
         ]
         self._lights = [LightTable(lights, albedo.channels, mi, **kind) for lights, kind in kinds if lights]
         self._words = -(-(len(own) + len(images)) // _BITS)
+
+    @property
+    def static(self) -> tuple[Any, ...]:
+        """What of the light is compiled into kernels."""
+        return self.max_depth, self._channels, self._words, tuple(table.static for table in self._lights)
 
     def prepare(
         self, frame: dict[str, Any], sizes: tuple[int, int], primary: int, bounces: bool
