@@ -1,7 +1,6 @@
 """Frames that Dr.Jit replays are those that it would record: the same bits, whatever was rendered before."""
 
 import numpy as np
-import pytest
 from render_scenes import FAST, flat_surface, needs_llvm, plain, small_sensor
 
 from synth.render.renderer import Recordings, Renderer
