@@ -77,7 +77,7 @@ def press(template: Template, seed: int) -> Press:
             continue
         if result.status == "complete":
             finer = FINER_DOME if scene.sensor.gel.dome_radius_mm else 1
-            surface = GelSurface(result.space.surface, SUBDIVISIONS[result.space.element.order] * finer)
+            surface = GelSurface(result.space.surface, SUBDIVISIONS[result.space.surface.is_quadratic] * finer)
             pressed = surface.positions(result.states[-1].displacement[result.space.surface_nodes])
             return Press(template, seed, scene, surface, pressed)
         reason = result.reason

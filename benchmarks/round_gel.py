@@ -68,7 +68,7 @@ def _background(size_mm: tuple[float, float, float], edge_mm: float) -> Backgrou
 def flow_of(scene: Scene, found: Trajectory) -> FlowArray:
     """(height, width, 2) px: flow from rest to the last state."""
     space = found.space
-    surface = GelSurface(space.surface, SUBDIVISIONS[space.element.order])
+    surface = GelSurface(space.surface, SUBDIVISIONS[space.surface.is_quadratic])
     pressed = surface.positions(found.states[-1].displacement[space.surface_nodes])
     view = View(surface, Optics.of(scene.sensor))
     return exact_flow(view, surface.material, pressed, backward=False).forward

@@ -35,7 +35,7 @@ class Job:
         seed: of the whole job.
         n: samples asked for.
         software: package -> version, for the record.
-        device: what decides rounding and Monte Carlo noise, e.g. {"device": "cpu", "variant": "llvm_ad_rgb"}.
+        device: what decides rounding and Monte Carlo noise: {"variant": "llvm_ad_rgb", "solver": "single"}.
     """
 
     scene: Mapping[str, Any]
@@ -98,7 +98,9 @@ def refuse_another_job(job: Job, record: Mapping[str, Any], where: str) -> None:
         changed = _changed({**jsonable(record["scene"]), **unhashed}, {**jsonable(job.scene), **unhashed}, "scene")
         different += changed or _changed(record["scene_hash"], job.scene_hash, "scene_hash")
     different += _changed(record["seed"], job.seed, "seed")
-    different += _changed(record.get("device", {}), jsonable(job.device), "device")
+    known = record.get("device", {})
+    asked = {key: value for key, value in jsonable(job.device).items() if key in known}  # older ones lack some
+    different += _changed(known, asked, "device")
     if different:
         listed = "".join(f"\n  {line}" for line in different[:20])
         more = f"\n  and {len(different) - 20} more" if len(different) > 20 else ""

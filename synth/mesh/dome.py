@@ -50,14 +50,15 @@ def domed(mesh: PadMesh, dome_radius_mm: float | None) -> PadMesh:
 
 
 def rest_surface(gel: Gel) -> GelSurface:
-    """The undeformed contact face of a pad: two triangles, or quadratic ones where it is curved.
+    """The undeformed contact face of a pad, in quadratic triangles where it is curved.
 
-    It does not depend on the meshes of trajectories, so that neither does the picture of a sensor at rest.
+    Light that varies smoothly is linear on each triangle. The surface does not depend on the meshes of trajectories, so
+    that neither does the picture of a sensor at rest.
     """
     x, y = gel.size_mm[0] / 2, gel.size_mm[1] / 2
     if gel.dome_radius_mm is None:
         corners_of_pad = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])
-        return GelSurface(ContactFaces(corners_of_pad, np.array([[0, 2, 1], [0, 3, 2]], dtype=np.int32)), 1)
+        return GelSurface(ContactFaces(corners_of_pad, np.array([[0, 2, 1], [0, 3, 2]], dtype=np.int32)), REST_CELLS)
     cell = 2 * max(x, y) / REST_CELLS
     columns, rows = int(np.ceil(2 * x / cell)), int(np.ceil(2 * y / cell))
     # Every second line of the grid holds mid-edge nodes.

@@ -75,8 +75,13 @@ class Optics:
         return np.column_stack([column.ravel() + 0.5, row.ravel() + 0.5])
 
     @cached_property
+    def local(self) -> Points:
+        """(n, 3) directions of the pixels' centres in the camera's frame, from the lens."""
+        return self.lens.directions(self.centres)
+
+    @cached_property
     def own(self) -> Rays:
-        return self.look(self.centres)
+        return self._follow(self.local)
 
     @cached_property
     def poses(self) -> tuple[Pose, ...]:
@@ -106,7 +111,11 @@ class Optics:
 
     def look(self, pixels: Pixels) -> Rays:
         """Rays along which pixels (n, 2) look, anywhere, also between pixel centres, and their paths."""
-        air = self.pose.world(self.lens.directions(np.asarray(pixels, dtype=np.float64)))
+        return self._follow(self.lens.directions(np.asarray(pixels, dtype=np.float64)))
+
+    def _follow(self, local: Points) -> Rays:
+        """Rays of directions (n, 3) in the camera's frame."""
+        air = self.pose.world(local)
         if not self.mirrors:
             origins, directions = self.window.enter(self.pose.position, air)
             return Rays(origins, directions, np.where(np.isnan(directions[:, 0]), NOTHING, DIRECT))

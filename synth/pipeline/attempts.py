@@ -9,7 +9,7 @@ from typing import Any
 
 from synth.dataset.manifest import Failure
 from synth.errors import InputError
-from synth.pipeline.records import JobContext, Outcome, Simulated, SimulatedTrajectory, Task
+from synth.pipeline.records import JobContext, Outcome, SimulatedTrajectory, Task
 from synth.scene import Scene
 from synth.scene.sampling import MAX_DRAWS, Pair, SensorInstance, draw, pairs_of
 from synth.simulate import Trajectory
@@ -71,7 +71,7 @@ class Attempts:
             return Attempt(press, pairs, frozenset(frame for pair in every for frame in pair.frames), again)
         return None
 
-    def simulated(self, attempt: Attempt, result: Trajectory) -> Simulated | None:
+    def simulated(self, attempt: Attempt, result: Trajectory) -> SimulatedTrajectory | None:
         """What is handed on of an instance's trajectory; None if it cannot be used, which is put on record."""
         if result.status != "complete":
             self.fail("simulate", result.reason, result.states[-1].summary())
@@ -80,19 +80,19 @@ class Attempts:
             return None
         press, space, states = attempt.press, result.space, result.states
         shown = sorted({frame for pair in attempt.pairs for frame in pair.frames})
-        trajectory = SimulatedTrajectory(
+        return SimulatedTrajectory(
             self.trajectory,
             press.scene,
             attempt.pairs,
             {n: replace(states[n], displacement=states[n].displacement[space.surface_nodes]) for n in shown},
             {"mesh": press.mesh.hash, "element": space.element.name},
+            space.surface,
             press.path,
             self._context.plan.mesh.lost_detail(press.scene, press.path.body, press.accuracy),
             press.accuracy,
             tuple(self.failures),
             result.seconds,
         )
-        return trajectory, space
 
     def fail(self, stage: str, reason: str, last_good_state: dict[str, Any] | None = None) -> None:
         self.failures.append(Failure(self._first, len(self.failures), stage, reason, last_good_state))

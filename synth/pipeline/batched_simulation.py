@@ -4,8 +4,8 @@ Tasks are taken some chunks ahead, drawn, sorted by their pads, and run through 
 an instance that fails is followed by its trajectory's next one in the next chunk. What a trajectory comes out as does
 not depend on which others ran beside it.
 
-The trajectories of one sensor are handed on one after the other, whenever they end: a sensor's renderer is worth as
-much as some ten frames. Those that wait for one of their sensor's are a few hundred kilobytes each.
+The trajectories of one sensor are handed on together: its renderer is worth as much as some ten frames. Those that wait
+for one of their sensor's are a few hundred kilobytes each.
 """
 
 from collections import Counter
@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 from itertools import islice
 
 from synth.pipeline.attempts import Attempt, Attempts
-from synth.pipeline.records import JobContext, Outcome, Simulated, Task
+from synth.pipeline.records import JobContext, Outcome, SimulatedTrajectory, Task
 from synth.scene import Gel
 from synth.scene.sampling import SensorInstance, draw_sensor, sensor_of
 from synth.scene.template import Template
@@ -29,7 +29,7 @@ chunk is one batch, because nothing can be rendered before it has been drawn."""
 MIN_PER_SENSOR = 16
 """Waiting trajectories of a sensor that are worth building its renderer for."""
 
-Result = Simulated | Outcome
+Result = SimulatedTrajectory | Outcome
 """A simulated trajectory, or the record of one whose every instance failed."""
 
 
@@ -55,8 +55,8 @@ def pad_key(press: Press) -> Gel:
     return gel if gel.layers else gel.model_copy(update={"youngs_modulus_kpa": 1.0})
 
 
-def in_batches(context: JobContext, tasks: Iterator[Task], batch: int | None) -> Iterator[Result]:
-    """Simulate tasks; each comes out once, in no particular order but with a sensor's trajectories together.
+def in_batches(context: JobContext, tasks: Iterator[Task], batch: int | None) -> Iterator[list[Result]]:
+    """Simulate tasks; each comes out once, in no particular order, in groups of one sensor's trajectories.
 
     At most `batch` trajectories run at a time, which on a CPU changes no bit of what comes out. InputError where the
     storage refuses, or for CUDA without cuBLAS or cuSOLVER.
@@ -111,18 +111,16 @@ class _Simulation:
         return begun
 
 
-def by_sensor(template: Template, ended: Iterable[tuple[int, Result]], open: Counter[int]) -> Iterator[Result]:
-    """Results of one sensor together: at once after one of the same, else when enough or all of them are there.
+def by_sensor(template: Template, ended: Iterable[tuple[int, Result]], open: Counter[int]) -> Iterator[list[Result]]:
+    """Results of one sensor together, when enough or all of them are there.
 
     `open` says how many of each sensor are still to come; it is counted down.
     """
     waiting: dict[int, list[Result]] = {}
-    present: int | None = None
     for trajectory, result in ended:
         sensor = sensor_of(template, trajectory)
         open[sensor] -= 1
         mine = waiting.setdefault(sensor, [])
         mine.append(result)
-        if sensor == present or len(mine) >= MIN_PER_SENSOR or open[sensor] == 0:
-            present = sensor
-            yield from waiting.pop(sensor)
+        if len(mine) >= MIN_PER_SENSOR or open[sensor] == 0:
+            yield waiting.pop(sensor)

@@ -1,8 +1,8 @@
 """Scheduling: which trajectories are still to do, who does them, and what happened.
 
-In this process by default, which renders on all cores; with workers, in processes of one core each (`worker_pool`);
-with Ray, on a cluster (`ray_pool`); or one shard of the job, beside others. With the batched solver this process
-simulates and renders, and the workers do the rest (`overlapped`). The driver alone writes manifest and failures;
+Without a GPU in this process by default, which renders on all cores; with workers, in processes of one core each
+(`worker_pool`); with Ray, on a cluster (`ray_pool`); or one shard of the job, beside others. With the batched solver
+this process simulates, and the workers do the rest (`overlapped`). The driver alone writes manifest and failures;
 samples' folders are written where they are made. The same command goes on where it stopped.
 """
 
@@ -16,6 +16,8 @@ from importlib.metadata import PackageNotFoundError, version
 from operator import index
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from synth import __version__
 from synth.dataset.job import Job
@@ -37,6 +39,8 @@ from synth.scene import Gel
 from synth.scene.sampling import draw_sensor, sensor_of
 from synth.scene.template import Template
 
+SOLVER_BYTES, WORKER_BYTES = 6 * 2**30, 2 * 2**30
+"""GPU memory of the batched solver, and of a worker that renders."""
 PACKAGES = ("mitsuba", "drjit", "warp-lang", "pytetwild", "pypardiso", "numpy", "scipy", "OpenEXR")
 
 
@@ -45,9 +49,9 @@ class Scheduling:
     """Who makes a job's samples; they are the same whoever does.
 
     Attributes:
-        workers: processes that make samples, on one core each; None: this process alone, which renders on all cores.
-            With the batched solver: processes beside this one, 1 for none, None for one for every other core where
-            there is a GPU, else none. With Ray: tasks at once, None for all cores of the cluster.
+        workers: processes that make samples, on one core each; None: with a GPU, as many as there are cores beside
+            this process's and as the GPU's memory holds, else this process alone, which renders on all cores. With
+            the batched solver 1 is for none. With Ray: tasks at once, None for all cores of the cluster.
         ray: address of a Ray cluster, or "local".
         shard: make this part of the job only.
         batch: most trajectories that the batched solver has under way at a time; None for what suits the device.
@@ -135,7 +139,7 @@ def make_job(plan: Plan, n: int, seed: int) -> Job:
         seed=seed,
         n=n,
         software={"gelflow-synth": __version__, **_versions()},
-        device={"variant": plan.variant.name},
+        device={"variant": plan.variant.name, "solver": "batched" if plan.is_batched else "single"},
     )
 
 
@@ -240,21 +244,29 @@ def _store_mesh(context: JobContext, writer: DatasetWriter, gel: Gel) -> None:
 def _outcomes(context: JobContext, tasks: Iterator[Task], scheduling: Scheduling) -> Generator[Outcome, None, None]:
     if scheduling.ray is not None:
         yield from outcomes_of_ray(context, tasks, scheduling.ray, scheduling.workers)
-    elif context.plan.is_batched:
-        yield from outcomes_of_batches(context, tasks, _finishers(context, scheduling), scheduling.batch)
-    elif scheduling.workers is not None:
-        yield from outcomes_of_processes(context, tasks, scheduling.workers)
+        return
+    workers = scheduling.workers or _workers_of_gpu(context)
+    if context.plan.is_batched:
+        yield from outcomes_of_batches(context, tasks, workers or 1, scheduling.batch)
+    elif workers is not None:
+        yield from outcomes_of_processes(context, tasks, workers)
     else:
         producer = Producer(context)
         for task in tasks:
             yield producer.produce(*task)
 
 
-def _finishers(context: JobContext, scheduling: Scheduling) -> int:
-    """Worker processes beside the one that simulates and renders; 1 for none."""
-    if scheduling.workers is not None or not context.plan.variant.is_on_gpu or not is_shared(context.out):
-        return scheduling.workers or 1
-    return max(1, cores() - 1)
+def _workers_of_gpu(context: JobContext) -> int | None:
+    """Worker processes that share a GPU, as many as its memory holds; None where nothing is rendered on one."""
+    if not context.plan.variant.is_on_gpu or not is_shared(context.out):
+        return None
+    from synth.warp_start import start_warp
+
+    start_warp()
+    import warp as wp
+
+    room = wp.get_device("cuda").free_memory - SOLVER_BYTES
+    return int(np.clip(room // WORKER_BYTES, 1, max(1, cores() - 1)))
 
 
 def _versions() -> dict[str, str]:

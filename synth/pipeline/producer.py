@@ -41,5 +41,5 @@ class Producer:
                 attempts.fail("simulate", str(error))
                 continue
             if (simulated := attempts.simulated(attempt, result)) is not None:
-                return finish(self._context, self._session.render_frames(*simulated))
+                return finish(self._context, self._session.render_frames(simulated))
         return attempts.given_up()

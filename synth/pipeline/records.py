@@ -1,6 +1,8 @@
 """What those who make samples are given, and what they hand on and give back."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ from synth.scene.sampling import Pair, stream
 from synth.simulate import State
 from synth.simulate.load_path import LoadPath
 from synth.simulate.resolution import Accuracy
-from synth.simulate.space import Space
+from synth.surface import ContactFaces
 
 Task = tuple[int, tuple[int, ...]]
 """A trajectory and its samples that are wanted."""
@@ -48,6 +50,15 @@ class Outcome:
     given_up: tuple[int, ...]
     warnings: tuple[str, ...] = ()
 
+    @staticmethod
+    def of_all(outcomes: Iterable["Outcome"]) -> "Outcome":
+        """Several tasks as one."""
+        every = list(outcomes)
+        entries, failures = (tuple(chain(*(getattr(one, name) for one in every))) for name in ("entries", "failures"))
+        given_up = tuple(number for one in every for number in one.given_up)
+        warnings = tuple(dict.fromkeys(chain(*(one.warnings for one in every))))
+        return Outcome(entries, failures, given_up, warnings)
+
 
 @dataclass(frozen=True, eq=False)
 class SimulatedTrajectory:
@@ -58,6 +69,7 @@ class SimulatedTrajectory:
     pairs: tuple[Pair, ...]  # the samples that are wanted
     states: dict[int, State]  # by number, those that the samples show; displacements are those of the contact face
     mesh: dict[str, Any]  # what is said of the mesh: hash and element
+    faces: ContactFaces  # of the mesh
     path: LoadPath  # of its press
     warning: str  # of detail that rounding takes off
     accuracy: Accuracy | None  # of the mesh; None where it is left to whoever finishes the samples
@@ -67,7 +79,3 @@ class SimulatedTrajectory:
     @property
     def sensor(self) -> int:
         return self.pairs[0].sensor
-
-
-Simulated = tuple[SimulatedTrajectory, Space]
-"""A simulated trajectory, and the finite-element space that it was simulated in."""

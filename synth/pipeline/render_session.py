@@ -6,7 +6,6 @@ of (scene, seed, sensor), and every frame has a seed of its own.
 
 import time
 from collections.abc import Mapping
-from concurrent.futures import Future
 from dataclasses import dataclass
 
 from synth.arrays import FloatArray, Image
@@ -14,12 +13,11 @@ from synth.mesh import rest_surface
 from synth.pipeline.records import JobContext, SimulatedTrajectory
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
-from synth.scene import Gel, Scene, Sensor
-from synth.simulate.space import Space
+from synth.scene import Scene
 from synth.surface import GelSurface
 
-SUBDIVISIONS = {1: 4, 2: 3}
-"""Parts of a contact face's edge in the rendered surface, by the element's order."""
+SUBDIVISIONS = {False: 4, True: 3}
+"""Parts of a contact face's edge in the rendered surface; True: of a quadratic element's."""
 FINER_DOME = 2
 """Factor on that for domes, which are curved away from the contact, too, where faces are large."""
 
@@ -63,18 +61,13 @@ class RenderSession:
     def __init__(self, context: JobContext) -> None:
         self._context = context
         self._sensor: SensorRenderer | None = None
-        self._surface: tuple[Space, GelSurface] | None = None
+        self._surface: tuple[tuple[object, ...], GelSurface] | None = None
 
-    def render_frames(
-        self, simulated: SimulatedTrajectory, space: Space, texture: Future[Image] | None = None
-    ) -> RenderedTrajectory:
-        """Render the frames of a trajectory that its wanted samples show.
-
-        The texture is that of its sensor, where it is being painted already.
-        """
+    def render_frames(self, simulated: SimulatedTrajectory) -> RenderedTrajectory:
+        """Render the frames of a trajectory that its wanted samples show."""
         started = time.perf_counter()
-        surface = self._surface_of(space, simulated.scene.sensor.gel)
-        sensor = self._prepared(simulated.scene, simulated.sensor, surface, texture)
+        surface = self._surface_of(simulated)
+        sensor = self._prepared(simulated.scene, simulated.sensor, surface)
         frames: dict[int, Frame] = {}
         for number, state in sorted(simulated.states.items()):
             if number == 0 and sensor.rest is not None:
@@ -86,13 +79,15 @@ class RenderSession:
             frames[number] = Frame(positions, sensor.renderer.radiances(positions, seed))
         return RenderedTrajectory(simulated, surface, frames, time.perf_counter() - started)
 
-    def _surface_of(self, space: Space, gel: Gel) -> GelSurface:
-        if self._surface is None or self._surface[0] is not space:
-            parts = SUBDIVISIONS[space.element.order] * (FINER_DOME if gel.dome_radius_mm else 1)
-            self._surface = space, GelSurface(space.surface, parts)
+    def _surface_of(self, simulated: SimulatedTrajectory) -> GelSurface:
+        gel = simulated.scene.sensor.gel
+        key = *simulated.mesh.values(), gel.dome_radius_mm
+        if self._surface is None or self._surface[0] != key:
+            parts = SUBDIVISIONS[simulated.faces.is_quadratic] * (FINER_DOME if gel.dome_radius_mm else 1)
+            self._surface = key, GelSurface(simulated.faces, parts)
         return self._surface[1]
 
-    def _prepared(self, scene: Scene, number: int, meshed: GelSurface, texture: Future[Image] | None) -> SensorRenderer:
+    def _prepared(self, scene: Scene, number: int, meshed: GelSurface) -> SensorRenderer:
         """Renderer and undeformed frame of a sensor, kept until another one is wanted.
 
         `meshed` is a trajectory's surface; round gels have the same in all trajectories.
@@ -100,19 +95,16 @@ class RenderSession:
         if self._sensor is None or self._sensor.sensor != number:
             variant = self._context.plan.variant
             variant.load()
-            gel = scene.sensor.gel
-            surface = meshed if gel.is_round else rest_surface(gel)
-            painted = paint(self._context, number, scene.sensor) if texture is None else texture.result()
-            renderer = Renderer(scene.sensor, scene.render, surface, painted, variant)
+            sensor = scene.sensor
+            painted = albedo(sensor, self._context.stream("pattern", number), self._context.plan.template.folder)
+            surface = meshed if sensor.gel.is_round else rest_surface(sensor.gel)
+            renderer = self._sensor.renderer if self._sensor else None
+            if renderer is None or not renderer.reuse(sensor, surface, painted):
+                renderer = Renderer(sensor, scene.render, surface, painted, variant)
             seed = self._seed("rest", number)
-            rest = None if gel.dome_radius_mm else renderer.radiances(surface.material, seed)
+            rest = None if sensor.gel.dome_radius_mm else renderer.radiances(surface.material, seed)
             self._sensor = SensorRenderer(number, renderer, rest)
         return self._sensor
 
     def _seed(self, purpose: str, *numbers: int) -> int:
         return int(self._context.stream(f"render {purpose}", *numbers).integers(2**31))
-
-
-def paint(context: JobContext, number: int, sensor: Sensor) -> Image:
-    """The texture of a sensor, by its number."""
-    return albedo(sensor, context.stream("pattern", number), context.plan.template.folder)

@@ -97,6 +97,10 @@ def _outcomes_of_pool(
     pool = ProcessPoolExecutor(workers, spawn, _begin, (context, make, parent_death))
     with parent_death, parents_end, one_thread_each(), pool:
         try:
+            # All begin at once: the first items may be long in coming. Items find out if the pool is broken.
+            with interrupts_blocked(), contextlib.suppress(OSError, ValueError, BrokenProcessPool):
+                for _ in range(workers):
+                    pool.submit(int)
             while True:
                 room = len(under_way) < 2 * workers
                 if room and not again:

@@ -76,7 +76,9 @@ def plan(scene: Template | str | Path, variant: Variant | None = None) -> Plan:
     variant = variant or job_variant(scene, "auto")
     check_buildable(scene, variant)
     round_first = sorted(scene.corners, key=lambda corner: not corner.sensor.gel.is_round)
-    return Plan(scene, variant, scene.numerics.is_batched, MeshRule.of(round_first[0]), _decisions(scene, variant))
+    batched, reason = _batching(scene, variant)
+    decisions = (Decision("batched simulation", batched, reason), *_decisions(scene, variant))
+    return Plan(scene, variant, batched, MeshRule.of(round_first[0], batched), decisions)
 
 
 def job_variant(template: Template, device: Device) -> Variant:
@@ -140,7 +142,6 @@ def _decisions(template: Template, variant: Variant) -> tuple[Decision, ...]:
     foam = "" if mixed else ": a compressible foam needs none"
     smooth = "" if max(friction) > 0 else ": half the matrix is enough"
     return (
-        _batching(template),
         Decision("simulation", max(depth) > 0, _span("motion.depth_mm", depth)),
         Decision("friction state", max(friction) > 0, _span("contact.friction", friction) + smooth),
         Decision("pressure field", mixed, _span("sensor.gel.poisson_ratio", poisson) + foam),
@@ -158,16 +159,18 @@ def _decisions(template: Template, variant: Variant) -> tuple[Decision, ...]:
     )
 
 
-def _batching(template: Template) -> Decision:
-    """Whether trajectories are simulated many at once, and whether that is worth it."""
-    reason = f'numerics.solver = "{template.numerics.solver}"'
-    if template.numerics.is_batched:
-        # Without layers stiffness only scales forces, so that pads which differ in nothing else share a mesh.
-        alike = () if template.corners[0].sensor.gel.layers else ("sensor.gel.youngs_modulus_kpa",)
-        drawn = [at for _, _, at in template.distributions() if at.startswith("sensor.gel.") and at not in alike]
-        if drawn:
-            reason += f": but {', '.join(drawn)} make each sensor's pad another, with a mesh and a batch of its own"
-    return Decision("batched simulation", template.numerics.is_batched, reason)
+def _batching(template: Template, variant: Variant) -> tuple[bool, str]:
+    """Whether trajectories are simulated many at once, and why."""
+    solver = template.numerics.solver
+    reason = f'numerics.solver = "{solver}"'
+    # Without layers stiffness only scales forces, so that pads which differ in nothing else share a mesh.
+    alike = () if template.corners[0].sensor.gel.layers else ("sensor.gel.youngs_modulus_kpa",)
+    drawn = [at for _, _, at in template.distributions() if at.startswith("sensor.gel.") and at not in alike]
+    if drawn and (solver == "batched" or variant.is_on_gpu):
+        reason += f": but {', '.join(drawn)} make each sensor's pad another, with a mesh and a batch of its own"
+    elif solver == "auto":
+        reason += f", and {variant.name} renders"
+    return solver == "batched" or (solver == "auto" and variant.is_on_gpu and not drawn), reason
 
 
 def _span(name: str, values: Sequence[float]) -> str:

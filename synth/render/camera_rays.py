@@ -15,6 +15,7 @@ lens distortion, fisheye, mirror, aperture or round window.
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -33,8 +34,30 @@ _START_MM = 1e-3
 """How far inside the window's face rays start, so that rounding cannot put them outside."""
 
 
+@dataclass(init=False, eq=False)
 class CameraRays:
-    """Primary rays of a vectorised variant. Every number is opaque to Dr.Jit, so that no camera is compiled anew."""
+    """Primary rays of a vectorised variant. Every number is opaque to Dr.Jit, so that no camera is recorded anew."""
+
+    _mi: Any
+    _dr: Any
+    _width: Any
+    _focal: list[Any]
+    _centre: list[Any]
+    _right: Any
+    _down: Any
+    _forward: Any
+    _position: Any
+    _mirrors: list["_Mirror"]
+    _refracts: bool
+    _index: Any
+    _round: "RoundWindowFace | None"
+    _face: Any
+    _is_fisheye: bool
+    _distortion: list[Any] | None
+    _radius: Any
+    _focus: Any
+    _seen: Any = None
+    _start: Any = None
 
     def __init__(self, sensor: Sensor, mi: Any) -> None:
         import drjit as dr
@@ -67,6 +90,12 @@ class CameraRays:
         """A vector (3,) of the scene in the renderer's frame."""
         mi, dr = self._mi, self._dr
         return mi.Vector3f(*(dr.opaque(mi.Float, value) for value in vector * MIRROR))
+
+    @property
+    def static(self) -> tuple[Any, ...]:
+        """What of the camera is compiled into kernels."""
+        optional = (self._round, self._distortion, self._radius)
+        return self._refracts, self._is_fisheye, len(self._mirrors), *(value is None for value in optional)
 
     @property
     def has_aperture(self) -> bool:
@@ -169,8 +198,15 @@ class CameraRays:
         return u, v
 
 
+@dataclass(init=False, eq=False)
 class _Mirror:
     """A mirror of `synth.optics.mirror` in the renderer's frame, opaque to Dr.Jit."""
+
+    centre: Any
+    normal: Any
+    axes: list[Any]
+    half: list[Any]
+    _dr: Any
 
     def __init__(self, mirror: FlatMirror, vector: Callable[[FloatArray], Any], mi: Any, dr: Any) -> None:
         self._dr, self.centre, self.normal = dr, vector(mirror.centre), vector(mirror.normal)
@@ -189,8 +225,16 @@ class _Mirror:
         return dr.select(hit, distance, dr.inf), slope < 0
 
 
+@dataclass(init=False, eq=False)
 class RoundWindowFace:
     """The round inner face of `synth.optics.window` in the renderer's frame, opaque to Dr.Jit."""
+
+    _mi: Any
+    _dr: Any
+    _index: Any
+    _radius: Any
+    _low: Any
+    _high: Any
 
     def __init__(self, window: RoundWindow, mi: Any) -> None:
         import drjit as dr
@@ -279,7 +323,7 @@ def _centres(optics: Optics, camera: Camera) -> FloatArray:
 
     (H·W, 2) or (H·W, 3) float64, NaN where the lens does not look.
     """
-    local = optics.lens.directions(optics.centres)
+    local = optics.local
     if camera.lens == "fisheye":
         return np.column_stack([local[:, :2], np.arctan2(np.hypot(local[:, 0], local[:, 1]), local[:, 2])])
     return local[:, :2] / local[:, 2:]

@@ -5,6 +5,7 @@ mirrored in what Mitsuba gets, for geometry, lights and camera alike, and nothin
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +37,16 @@ class GelMesh:
         triangles = self.surface.triangles
         return np.ascontiguousarray(triangles[:, ::-1] if self.behind is None else triangles).astype(np.uint32).ravel()
 
+    @cached_property
+    def incident(self) -> NDArray[np.uint32]:
+        """(v, k) faces at each vertex in rising order; the number of faces, f, stands for none."""
+        corners = self.surface.triangles.ravel()
+        order = np.argsort(corners, kind="stable")
+        vertices, count = corners[order], np.bincount(corners, minlength=len(self.surface.material))
+        found = np.full((len(count), count.max()), len(self.surface.triangles), dtype=np.uint32)
+        found[vertices, np.arange(len(order)) - (np.cumsum(count) - count)[vertices]] = order // 3
+        return found
+
     def texture_coordinates(self) -> NDArray[np.float32]:
         """(2 v,) u along +x and v along +y, each 0..1 over the chart; Mitsuba's v = 0 is a texture's first row.
 
@@ -59,7 +70,7 @@ class GelMesh:
     def normals(self, positions: Points) -> NDArray[np.float32]:
         """(3 v,) area-weighted unit normals in the renderer's frame, from positions (v, 3) float64 mm.
 
-        Mitsuba's own sums are atomic, so their rounding depends on the number of threads; this one's does not.
+        For scalar variants: Mitsuba's own sums are atomic, so their rounding depends on the number of threads.
         """
         # Components of a cross product of mirrored vectors are the mirrored components, negated. The faces are turned
         # over as well, which negates once more.

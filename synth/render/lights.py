@@ -21,6 +21,7 @@ from itertools import product
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from synth.arrays import FloatArray
 from synth.errors import InputError
@@ -51,15 +52,20 @@ def emitters(lights: tuple[Light, ...], mi: Any) -> dict[str, Any]:
 
 def panels(lights: tuple[Light, ...], mi: Any) -> Any:
     """One mesh of rectangles, two triangles each, for vectorised variants: black, as Mitsuba knows no light in it."""
-    corner, first, second, _ = rectangles(lights).swapaxes(0, 1)
-    vertices = np.stack([corner, corner + first, corner + first + second, corner + second], axis=1)
     faces = np.array([[0, 1, 2], [0, 2, 3]]) + 4 * np.arange(len(lights))[:, None, None]
     shape = mi.Mesh("lights", 4 * len(lights), 2 * len(lights))
     parameters = mi.traverse(shape)
     parameters["faces"] = faces.ravel().astype(np.uint32)
-    parameters["vertex_positions"] = vertices.ravel().astype(np.float32)
+    parameters["vertex_positions"] = panel_corners(lights)
     parameters.update()
     return shape
+
+
+def panel_corners(lights: tuple[Light, ...]) -> NDArray[np.float32]:
+    """(12 n,) the vertices of `panels`: four corners of each light, in the renderer's frame."""
+    corner, first, second, _ = rectangles(lights).swapaxes(0, 1)
+    corners = np.stack([corner, corner + first, corner + first + second, corner + second], axis=1)
+    return corners.ravel().astype(np.float32)
 
 
 def rectangles(lights: tuple[Light, ...]) -> FloatArray:

@@ -8,6 +8,7 @@ Paths that the window reflects go on in the space behind it (`synth.render.light
 image of the gel is mirrored back onto the gel there, so that each of its rays starts in front of the window.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from synth.render.lights import all_lights, rectangles, reflectance, reflecting_
 from synth.scene import Sensor
 
 
+@dataclass(init=False, eq=False)
 class PathTracer:
     """Light on one renderer's gel, by the lights and the window of a sensor.
 
@@ -24,11 +26,29 @@ class PathTracer:
     is the longest path in surfaces and lights.
     """
 
-    def __init__(self, sensor: Sensor, scene: Any, shapes: dict[str, Any], max_depth: int, mi: Any) -> None:
+    _mi: Any
+    _dr: Any
+    _scene: Any
+    _gel: GelHits
+    _reflection: Any
+    _lights: Any
+    _face: Any
+    _index: Any
+    _depth: Any
+    _count: Any
+    _before: Any
+    _places: list[Any]
+    _areas: Any
+    _radiance: Any
+    _narrowness: Any
+
+    def __init__(
+        self, sensor: Sensor, scene: Any, gel: GelHits, shapes: dict[str, Any], max_depth: int, mi: Any
+    ) -> None:
         import drjit as dr
 
         self._mi, self._dr, self._scene = mi, dr, scene
-        self._reflection, self._gel = shapes["gel"].bsdf(), GelHits(shapes, mi)
+        self._reflection, self._gel = shapes["gel"].bsdf(), gel
         self._lights = mi.ShapePtr(shapes["lights"])
         dr.make_opaque(self._lights)
         self._face = dr.opaque(mi.Float, reflecting_plane(sensor) or 0)
@@ -43,7 +63,7 @@ class PathTracer:
         narrowness = [light.narrowness for light in lights]
         self._narrowness = mi.Float(narrowness) if any(narrowness) else None
 
-    def radiance(self, ray: Any, sampler: Any, active: Any) -> tuple[Any, Any]:
+    def radiance(self, ray: Any, sampler: Any, active: Any, prepared: None = None) -> tuple[Any, Any]:
         """Radiance (mi.Spectrum) along rays from the camera, and whether they meet the gel (mi.Bool)."""
         mi, dr = self._mi, self._dr
         share, total, depth, density = mi.Spectrum(1), mi.Spectrum(0), mi.UInt32(0), mi.Float(0)

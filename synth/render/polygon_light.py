@@ -11,6 +11,8 @@ first quotient is smooth in 1 - cos(θ/2) up to θ = π and is taken from a poly
 The rectangles are those of `synth.render.lights`, in the renderer's frame, and shine to their front only.
 """
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,50 +27,55 @@ _STRATA = 2
 """Points of a light without closed form for each of a pixel's samples, spread along its first side."""
 
 
+@dataclass(eq=False)
 class PolygonLight:
-    """One light with power. Every number is opaque to Dr.Jit, so that another instance of it needs no compiler."""
+    """One light, all of whose numbers are Dr.Jit's; its radiance has a list of channels."""
 
-    def __init__(self, light: Light, mi: Any) -> None:
-        import drjit as dr
-
-        corner, first, second, self._front = (
-            mi.Vector3f(*(dr.opaque(mi.Float, float(value)) for value in row)) for row in rectangles((light,))[0]
-        )
-        self._mi, self._dr, self._corner, self._sides = mi, dr, corner, (first, second)
-        self._corners = [corner, corner + first, corner + first + second, corner + second]
-        self._area = dr.opaque(mi.Float, light.size_mm[0] * light.size_mm[1])
-        self.radiance = [dr.opaque(mi.Float, value) for value in light.radiance]
+    mi: Any
+    corner: Any
+    sides: tuple[Any, Any]
+    front: Any
+    area: Any
+    radiance: list[Any]
 
     def whole(self, point: Any, normal: Any, offset: Any) -> Any:
         """Irradiance per radiance (mi.Float) of surface points with unit normals where nothing stands in between.
 
         `offset` (mi.Point2f in [0, 1)²) is for lights without a closed form.
         """
-        dr = self._dr
-        rays = [dr.normalize(corner - point) for corner in self._corners]
+        import drjit as dr
+
+        (first, second), corner = self.sides, self.corner
+        corners = [corner, corner + first, corner + first + second, corner + second]
+        rays = [dr.normalize(corner - point) for corner in corners]
         heights = [dr.dot(ray, normal) for ray in rays]
         lowest = dr.minimum(dr.minimum(heights[0], heights[1]), dr.minimum(heights[2], heights[3]))
         value = dr.if_stmt((rays, heights, normal), lowest >= 0, self._risen, self._cut)
-        return dr.select(dr.dot(point - self._corner, self._front) > 0, value, 0)
+        return dr.select(dr.dot(point - self.corner, self.front) > 0, value, 0)
 
     def sample(self, point: Any, normal: Any, offset: Any) -> tuple[Any, Any]:
         """A point of the light, and the irradiance per radiance as if all of it stood there, whose mean is `whole`.
 
         The surface's point is a mi.Point3f with the unit normal mi.Vector3f; `offset` is a mi.Point2f in [0, 1)².
         """
-        dr = self._dr
-        place = self._corner + self._sides[0] * offset.x + self._sides[1] * offset.y
+        import drjit as dr
+
+        place = self.corner + self.sides[0] * offset.x + self.sides[1] * offset.y
         arm = place - point
         square = dr.squared_norm(arm)
-        cosines = dr.maximum(dr.dot(arm, normal), 0) * dr.maximum(-dr.dot(arm, self._front), 0)
-        return self._mi.Point3f(place), cosines * self._area / dr.square(square)
+        cosines = dr.maximum(dr.dot(arm, normal), 0) * dr.maximum(-dr.dot(arm, self.front), 0)
+        return self.mi.Point3f(place), cosines * self.area / dr.square(square)
 
     def _risen(self, rays: list[Any], heights: list[Any], normal: Any) -> Any:
-        return 0.5 * self._dr.abs(sum(_edge(rays[i], rays[(i + 1) % 4], normal) for i in range(4)))
+        import drjit as dr
+
+        return 0.5 * dr.abs(sum(_edge(rays[i], rays[(i + 1) % 4], normal) for i in range(4)))
 
     def _cut(self, rays: list[Any], heights: list[Any], normal: Any) -> Any:
         """As `_risen`, cut at the horizon: one edge more, from where the outline sets to where it rises."""
-        mi, dr = self._mi, self._dr
+        import drjit as dr
+
+        mi = self.mi
         total, setting, rising = mi.Float(0), mi.Vector3f(0), mi.Vector3f(0)
         for i in range(4):
             (a, b), (high, low) = ((values[i], values[(i + 1) % 4]) for values in (rays, heights))
@@ -81,6 +88,7 @@ class PolygonLight:
         return 0.5 * dr.abs(total)
 
 
+@dataclass(eq=False)
 class SampledLight(PolygonLight):
     """A light without a closed form: narrower than Lambertian, or a mirror image (`synth.render.lights`).
 
@@ -88,26 +96,82 @@ class SampledLight(PolygonLight):
     points.
     """
 
-    def __init__(self, light: Light, index: float | None, mi: Any) -> None:
-        super().__init__(light, mi)
-        self._index = None if index is None else self._dr.opaque(mi.Float, index)
-        self._narrowness = self._dr.opaque(mi.Float, light.narrowness) if light.narrowness else None
+    narrowness: Any | None
+    index: Any | None
 
     def whole(self, point: Any, normal: Any, offset: Any) -> Any:
         parts = [
-            self.sample(point, normal, self._mi.Point2f((offset.x + k) / _STRATA, offset.y))[1] for k in range(_STRATA)
+            self.sample(point, normal, self.mi.Point2f((offset.x + k) / _STRATA, offset.y))[1] for k in range(_STRATA)
         ]
         return sum(parts) / _STRATA
 
     def sample(self, point: Any, normal: Any, offset: Any) -> tuple[Any, Any]:
-        dr = self._dr
+        import drjit as dr
+
         place, value = super().sample(point, normal, offset)
         away = dr.normalize(place - point)
-        if self._narrowness is not None:
-            value *= dr.power(dr.maximum(-dr.dot(away, self._front), 0), self._narrowness)
-        if self._index is not None:
-            value *= reflectance(dr.abs(away.z), self._index, self._mi)
+        if self.narrowness is not None:
+            value *= dr.power(dr.maximum(-dr.dot(away, self.front), 0), self.narrowness)
+        if self.index is not None:
+            value *= reflectance(dr.abs(away.z), self.index, self.mi)
         return place, value
+
+
+@dataclass(init=False, eq=False)
+class LightTable:
+    """Lights of one kind, in tables that loops look them up in: kernels do not grow with their number.
+
+    `sampled`: without a closed form; with an `index` they are mirror images behind a window of that index.
+    """
+
+    count: Any
+    _mi: Any
+    _sampled: bool
+    _places: list[Any]
+    _areas: Any
+    _radiance: list[Any]
+    _narrowness: Any | None
+    _index: Any | None
+
+    def __init__(
+        self, lights: Sequence[Light], channels: int, mi: Any, sampled: bool = False, index: float | None = None
+    ) -> None:
+        import drjit as dr
+
+        self.count, self._mi, self._sampled = dr.opaque(mi.UInt32, len(lights)), mi, sampled
+        self._places = [_floats(column, mi) for column in rectangles(tuple(lights)).swapaxes(0, 1)]
+        self._areas = _floats([light.size_mm[0] * light.size_mm[1] for light in lights], mi)
+        self._radiance = [_floats([light.radiance[channel] for light in lights], mi) for channel in range(channels)]
+        narrowness = [light.narrowness for light in lights]
+        self._narrowness = _floats(narrowness, mi) if any(narrowness) else None
+        self._index = None if index is None else dr.opaque(mi.Float, index)
+
+    @property
+    def static(self) -> tuple[bool, ...]:
+        """What of the table is compiled into kernels."""
+        return self._sampled, self._narrowness is None, self._index is None
+
+    def light(self, number: Any) -> PolygonLight:
+        """A light by its number (mi.UInt32)."""
+        import drjit as dr
+
+        mi = self._mi
+        corner, first, second, front = (dr.gather(mi.Vector3f, places, number) for places in self._places)
+        radiance = [dr.gather(mi.Float, values, number) for values in self._radiance]
+        shared = (mi, corner, (first, second), front, dr.gather(mi.Float, self._areas, number), radiance)
+        if not self._sampled:
+            return PolygonLight(*shared)
+        narrowness = None if self._narrowness is None else dr.gather(mi.Float, self._narrowness, number)
+        return SampledLight(*shared, narrowness, self._index)
+
+
+def _floats(values: Any, mi: Any) -> Any:
+    """Numbers as mi.Float in memory, never as a literal."""
+    import drjit as dr
+
+    found = mi.Float(np.asarray(values, dtype=np.float32).ravel())
+    dr.make_opaque(found)
+    return found
 
 
 def _edge(a: Any, b: Any, normal: Any) -> Any:

@@ -12,20 +12,23 @@ in a fixed order, not by atomic adds: the same seed gives the same bits with any
 """
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from synth.arrays import Image, Points
+from synth.render.albedo_map import AlbedoMap
 from synth.render.camera_image import PILOT, needed_samples
 from synth.render.camera_rays import CameraRays, pinhole
 from synth.render.chart import Chart, chart_of
 from synth.render.coating import reflection
+from synth.render.gel_hits import GelHits
 from synth.render.gel_mesh import GelMesh
-from synth.render.lights import all_lights, emitters, panels, reflecting_plane
+from synth.render.lights import all_lights, emitters, panel_corners, panels, reflecting_plane
 from synth.render.path_tracer import PathTracer
 from synth.render.pattern import is_grey
-from synth.render.separated_light import SeparatedLight, is_separated
+from synth.render.separated_light import FrameGeometry, SeparatedLight, is_separated
 from synth.render.thin_lens import check_views
 from synth.render.variant import Variant
 from synth.scene import Render, Sensor
@@ -35,13 +38,15 @@ _MAX_WAVEFRONT, _MAX_WAVEFRONT_GPU = 2**22, 2**24
 """Samples traced at once. Constants, because the split into passes decides the random numbers."""
 
 _PILOT_SEEDS = (1, 2)
+_RECORDINGS = 16
+"""Recordings of frames that are kept: every size of mesh and of picture has its own."""
 
 _LIGHT_PART = 2**31
 """Stands for the number of a pass in the seed of what all pixels share."""
 
 
 class Renderer:
-    """The renderer of one sensor instance.
+    """The renderer of one sensor instance, or of one after another.
 
     `samples_per_pixel` is rounded up to the next full grid (see `full_grid`). The albedo, (rows, columns, 3 or 4)
     float32 over the contact face from `pattern.albedo`, must not be changed afterwards. InputError for a light in the
@@ -52,45 +57,75 @@ class Renderer:
     def __init__(self, sensor: Sensor, render: Render, surface: GelSurface, albedo: Image, variant: Variant) -> None:
         if variant.is_mono and not is_grey(sensor):
             raise ValueError(f"{variant.name} renders grey sensors only: choose the variant with grey=is_grey(sensor)")
-        self._variant, self._views = variant, sensor.views
-        separated = is_separated(render, sensor.coating, variant)
+        self._variant, self._render, self._recordings = variant, render, Recordings()
+        self._separated = is_separated(render, sensor.coating, variant)
         mi = variant.load()
         check_views(sensor)
+        self._built = self._parts(sensor)
         refracts = sensor.window.refractive_index != 1
         self._behind = reflecting_plane(sensor) if variant.is_vectorised else None
-        lights = all_lights(sensor) if variant.is_vectorised else sensor.lights
-        self._lit = 1 if separated else sum(light.power > 0 for light in lights)  # separated: all at every sample
         self._set_meshes(surface, chart_of(sensor))
-        bsdf = reflection(mi, sensor.coating, albedo, variant.is_mono)
-        shapes = {name: _gel(name, mesh, bsdf, mi) for name, mesh in self._meshes.items()}
+        bsdf = (
+            mi.load_dict({"type": "null"})
+            if self._separated
+            else reflection(mi, sensor.coating, albedo, variant.is_mono)
+        )
+        shapes = {name: _gel(name, mesh, bsdf, not variant.is_vectorised, mi) for name, mesh in self._meshes.items()}
         if variant.is_vectorised:
-            shapes["lights"] = panels(lights, mi)
-            contents = shapes
+            contents = self._shapes = shapes | {"lights": panels(all_lights(sensor), mi)}
         else:
-            contents = shapes | emitters(lights, mi) | ({"window": _window(sensor, mi)} if refracts else {})
+            contents = shapes | emitters(sensor.lights, mi) | ({"window": _window(sensor, mi)} if refracts else {})
         self._scene = mi.load_dict({"type": "scene", **contents}, optimize=False)
         self._parameters = mi.traverse(self._scene)
-        self._light: Any = None
-        if separated:
-            shared = (self._scene, shapes, self._parameters, render.max_depth, variant.is_mono, mi)
-            self._light = SeparatedLight(sensor, *shared)
-        elif variant.is_vectorised:
-            self._light = PathTracer(sensor, self._scene, shapes, render.max_depth, mi)
+        if variant.is_vectorised:
+            self._hits = GelHits(shapes, self._meshes["gel"], mi)
         else:  # a path through Mitsuba's window is one interaction longer than one that starts inside
             depth = render.max_depth + refracts
             self._integrator = mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": True})
-        if variant.is_vectorised:
+        self._use(sensor, albedo)
+
+    def reuse(self, sensor: Sensor, surface: GelSurface, albedo: Image) -> bool:
+        """Render this sensor from now on, if light is separated and it differs in numbers alone; else say False.
+
+        What Dr.Jit has recorded of frames serves it, too.
+        """
+        if not self._separated or self._parts(sensor) != self._built:
+            return False
+        check_views(sensor)
+        self._behind = reflecting_plane(sensor)
+        self.take(surface)
+        self._parameters["lights.vertex_positions"] = panel_corners(all_lights(sensor))
+        self._use(sensor, albedo)
+        return True
+
+    def _parts(self, sensor: Sensor) -> tuple[Any, ...]:
+        """What of a sensor is built into Mitsuba's scene, and is no number in it."""
+        return len(all_lights(sensor)), reflecting_plane(sensor) is None, chart_of(sensor)
+
+    def _use(self, sensor: Sensor, albedo: Image) -> None:
+        mi, render = self._variant.load(), self._render
+        self._sensor, self._views = sensor, sensor.views
+        lit = len(all_lights(sensor)) if self._variant.is_vectorised else sum(x.power > 0 for x in sensor.lights)
+        self._lit = 1 if self._separated else lit  # separated: all at every sample
+        self._light: Any = None
+        if self._separated:
+            colors = albedo.mean(axis=2, keepdims=True) if self._variant.is_mono else albedo
+            self._light = SeparatedLight(sensor, self._scene, self._hits, AlbedoMap(colors, mi), render.max_depth, mi)
+        elif self._variant.is_vectorised:
+            self._light = PathTracer(sensor, self._scene, self._hits, self._shapes, render.max_depth, mi)
+        if self._variant.is_vectorised:
             self._rays = {name: CameraRays(view, mi) for name, view in self._views.items()}
         wanted = render.samples_per_pixel
         self._set_samples(mi, PILOT if wanted == "auto" else wanted)
         if wanted == "auto":  # fixed seeds, so that a sensor always gets the same number
-            first, second = (self.radiance(surface.material, seed) for seed in _PILOT_SEEDS)
+            at_rest = self._meshes["gel"].surface.material
+            first, second = (self.radiance(at_rest, seed) for seed in _PILOT_SEEDS)
             self._set_samples(mi, needed_samples(first, second, self._views[""].camera, self.samples_per_pixel))
 
     def _set_samples(self, mi: Any, wanted: int) -> None:
         self.samples_per_pixel = full_grid(wanted, self._lit)
-        self._sampler = mi.load_dict({"type": "multijitter", "sample_count": self.samples_per_pixel})
         if not self._variant.is_vectorised:
+            self._sampler = mi.load_dict({"type": "multijitter", "sample_count": self.samples_per_pixel})
             self._sensors = {name: self._build_pinhole(mi, view) for name, view in self._views.items()}
 
     def take(self, surface: GelSurface) -> None:
@@ -103,8 +138,11 @@ class Renderer:
             self._replace(f"{name}.faces", mesh.faces())
             self._replace(f"{name}.vertex_texcoords", mesh.texture_coordinates())
             self._replace(f"{name}.vertex_positions", mesh.positions(surface.material))
-            self._replace(f"{name}.vertex_normals", mesh.normals(surface.material))
+            if not self._variant.is_vectorised:
+                self._replace(f"{name}.vertex_normals", mesh.normals(surface.material))
         self._parameters.update()
+        if self._variant.is_vectorised:
+            self._hits.take(self._meshes["gel"])
 
     def _set_meshes(self, surface: GelSurface, chart: Chart) -> None:
         self._meshes = {"gel": GelMesh(surface, chart)}
@@ -144,52 +182,47 @@ class Renderer:
         return np.array(image, dtype=np.float32)
 
     def _deform(self, positions: Points, seed: int) -> None:
-        """Move the vertices, and find what light is the same for all cameras.
-
-        Normals go in a second update, since one of positions makes Mitsuba recompute normals.
-        """
+        """Move the vertices, and find what light is the same for all cameras."""
         for name, mesh in self._meshes.items():
             self._parameters[f"{name}.vertex_positions"] = mesh.positions(positions)
         self._parameters.update()
-        for name, mesh in self._meshes.items():
-            self._parameters[f"{name}.vertex_normals"] = mesh.normals(positions)
-        self._parameters.update()
-        if isinstance(self._light, SeparatedLight):
-            camera = self._views[""].camera
+        if not self._variant.is_vectorised:  # normals come second: positions make Mitsuba compute its own
+            for name, mesh in self._meshes.items():
+                self._parameters[f"{name}.vertex_normals"] = mesh.normals(positions)
+            self._parameters.update()
+            return
+        self._hits.place(self._parameters["gel.vertex_positions"])
+        self._prepared = None
+        if self._separated:
+            mi, camera = self._variant.load(), self._views[""].camera
+            frame = FrameGeometry(self._sensor, self._meshes["gel"], positions, self._render.max_depth > 2)
+            numbers = frame.numbers(_mitsuba_seed(seed, _LIGHT_PART, 0), mi)
             primary = camera.width * camera.height * self.samples_per_pixel
-            self._light.prepare(self._meshes["gel"], primary, _mitsuba_seed(seed, _LIGHT_PART, 0))
+            static = (self._light.static, frame.sizes, primary, frame.bounces)
+            self._prepared = self._recordings.of(prepare, *static)(self._light, numbers)
 
     def _trace(self, mi: Any, name: str, seed: int, number: int) -> Image:
         """All pixels in passes of whole pixels, each pixel's samples one after another in the wavefront."""
+        import drjit as dr
+
         camera, samples = self._views[name].camera, self.samples_per_pixel
         pixels = camera.width * camera.height
         step = max(1, (_MAX_WAVEFRONT_GPU if self._variant.is_on_gpu else _MAX_WAVEFRONT) // samples)
-        parts = [
-            self._trace_pixels(mi, self._rays[name], first, min(step, pixels - first), _mitsuba_seed(seed, k, number))
-            for k, first in enumerate(range(0, pixels, step))
-        ]
+        parts = []
+        for k, first in enumerate(range(0, pixels, step)):
+            starts = dr.opaque(mi.UInt32, first), dr.opaque(mi.UInt32, _mitsuba_seed(seed, k, number))
+            values = (self._light, self._prepared, self._rays[name], *starts)
+            static: tuple[Any, ...] = (None, min(step, pixels - first), samples, self._variant.is_mono)
+            if self._separated:  # Mitsuba's textures, which a path tracer looks up, cannot be replayed on a GPU
+                static = ((self._light.static, self._rays[name].static), *static[1:])
+                parts.append(self._recordings.of(traced, *static)(*values))
+            else:
+                parts.append(traced(*values, *static))
         # Read when all passes are queued: a GPU works on one while the next is being recorded.
         sums = np.concatenate([np.stack([np.array(channel) for channel in part], axis=-1) for part in parts])
         image: Image = np.empty((camera.height, camera.width, 3), dtype=np.float32)
         image.reshape(pixels, 3)[:] = sums / samples  # a single channel fills all three
         return image
-
-    def _trace_pixels(self, mi: Any, rays: CameraRays, first: int, count: int, seed: int) -> list[Any]:
-        """Summed samples of `count` pixels from `first` on: (count,) mi.Float of each channel, queued."""
-        import drjit as dr
-
-        sampler = self._sampler
-        sampler.set_samples_per_wavefront(self.samples_per_pixel)
-        sampler.seed(seed, count * self.samples_per_pixel)
-        pixel = dr.arange(mi.UInt32, count * self.samples_per_pixel) // dr.opaque(mi.UInt32, self.samples_per_pixel)
-        pixel += dr.opaque(mi.UInt32, first)
-        offset = sampler.next_2d()
-        pupil = sampler.next_2d() if rays.has_aperture else None
-        ray, weight, valid = rays.sample(pixel, offset, pupil)
-        color, seen = self._light.radiance(ray, sampler, valid)
-        channels = [dr.select(valid & seen, color[i] * weight, 0) for i in range(1 if self._variant.is_mono else 3)]
-        dr.eval(channels)  # all at once: each sum alone would trace everything anew
-        return [dr.block_sum(channel, self.samples_per_pixel) for channel in channels]
 
     def _build_pinhole(self, mi: Any, sensor: Sensor) -> Any:
         camera = sensor.camera
@@ -207,13 +240,64 @@ class Renderer:
         return mi.load_dict(description)
 
 
-def _gel(name: str, mesh: GelMesh, bsdf: Any, mi: Any) -> Any:
-    """The mesh with its coating; smooth-shaded, seen from either side."""
+class Recordings:
+    """Functions that Dr.Jit records at their first call and replays at later ones.
+
+    What changes from call to call are Dr.Jit's numbers. Python's own, `static`, are part of the key: Dr.Jit 1.5 does
+    not always notice that a bool has changed, and replays the other branch.
+    """
+
+    def __init__(self) -> None:
+        self._known: dict[tuple[Any, ...], Callable[..., Any]] = {}
+
+    def of(self, function: Callable[..., Any], *static: Any) -> Callable[..., Any]:
+        """The function with its last arguments given."""
+        import drjit as dr
+
+        key = (function, *static)
+        if key not in self._known:
+            if len(self._known) == _RECORDINGS:
+                del self._known[next(iter(self._known))]
+
+            def called(*values: Any) -> Any:
+                return function(*values, *static)
+
+            self._known[key] = dr.freeze(called, warn_after=10**9)
+        return self._known[key]
+
+
+def prepare(light: SeparatedLight, frame: Any, _: Any, *arguments: Any) -> Any:
+    """See `SeparatedLight.prepare`."""
+    return light.prepare(frame, *arguments)
+
+
+def traced(
+    light: Any, prepared: Any, rays: CameraRays, first: Any, seed: Any, _: Any, count: int, samples: int, is_mono: bool
+) -> list[Any]:
+    """Summed samples of `count` pixels from `first` (mi.UInt32) on: (count,) mi.Float of each channel, queued."""
+    import drjit as dr
+    import mitsuba as mi
+
+    sampler = mi.load_dict({"type": "multijitter", "sample_count": samples})
+    sampler.set_samples_per_wavefront(samples)
+    sampler.seed(seed, count * samples)
+    pixel = dr.arange(mi.UInt32, count * samples) // dr.opaque(mi.UInt32, samples) + first
+    offset = sampler.next_2d()
+    pupil = sampler.next_2d() if rays.has_aperture else None
+    ray, weight, valid = rays.sample(pixel, offset, pupil)
+    color, seen = light.radiance(ray, sampler, valid, prepared)
+    channels = [dr.select(valid & seen, color[i] * weight, 0) for i in range(1 if is_mono else 3)]
+    dr.eval(channels)  # all at once: each sum alone would trace everything anew
+    return [dr.block_sum(channel, samples) for channel in channels]
+
+
+def _gel(name: str, mesh: GelMesh, bsdf: Any, smooth: bool, mi: Any) -> Any:
+    """The mesh with its coating, seen from either side; `smooth`: shaded by Mitsuba with normals of its vertices."""
     properties = mi.Properties()
     properties["bsdf"] = bsdf
     surface = mesh.surface
-    counts, fields = (len(surface.material), len(surface.triangles)), ("has_vertex_normals", "has_vertex_texcoords")
-    shape = mi.Mesh(name, *counts, props=properties, **dict.fromkeys(fields, True))
+    counts = len(surface.material), len(surface.triangles)
+    shape = mi.Mesh(name, *counts, props=properties, has_vertex_normals=smooth, has_vertex_texcoords=True)
     parameters = mi.traverse(shape)
     parameters["faces"] = mesh.faces()
     parameters["vertex_texcoords"] = mesh.texture_coordinates()

@@ -12,46 +12,50 @@ A Lambertian surface's radiance is its albedo ρ times its irradiance E over π,
   to a light that gives next to nothing there count as having reached it.
 - E_bounced, light that the gel reflects onto itself, does not depend on the view. It is sampled at points of the gel's
   faces and projected (L²) onto functions that are linear on each face, or constant where few of the face's pilots saw
-  gel: such faces get little, and its mean is less noisy than its slope. Where no pilot at all saw gel there is none.
-  In a round gel, all of which sees itself, it is smooth and is fitted (`synth.render.face_points`).
+  gel: such faces get little, and its mean is less noisy than its slope. A plane has none.
+  In a round gel, all of which sees itself, it is smooth and is fitted (`synth.render.smooth_light`).
 - The lights l include their mirror images behind the window (`synth.render.lights`), which have no closed form.
-- E_returned, light that the gel sends to the window and gets back, is smooth. It is n · V with the normal n, and V is
-  fitted to sampled paths as polynomials of the place on the pad.
+- E_returned, light that the gel sends to the window and gets back, is smooth and fitted as well.
 
 What remains of systematic error: shadows that all pilot rays of a neighbourhood missed, and how bounced light departs
 from linear within one triangle; docs/reports/light.md measures both. Random numbers are the sampler's, sums are of
 fixed order: the same seed gives the same bits.
+
+Nothing here depends on a value that is read back, so that a frame is recorded once and replayed (`drjit.freeze`).
 """
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import reduce
 from operator import or_
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from synth.arrays import BoolArray, FloatArray
+from synth.arrays import Points
 from synth.errors import InputError
-from synth.render.face_points import FacePoints, across_cavity, count_per_face, projected
+from synth.render.albedo_map import AlbedoMap
+from synth.render.face_points import FacePoints, count_per_face, projected
 from synth.render.gel_hits import GelHits
 from synth.render.gel_mesh import GelMesh
 from synth.render.lights import image_lights, reaches, reflectance, reflecting_plane
-from synth.render.polygon_light import PolygonLight, SampledLight
+from synth.render.polygon_light import LightTable, PolygonLight
+from synth.render.smooth_light import Nodes, SmoothFit, fitted
 from synth.render.variant import Variant
-from synth.scene import Coating, Render, Sensor
+from synth.scene import Coating, Light, Render, Sensor
 
 _PILOTS = 2**14
 """Rays to each light, and to the gel, from a gel of few faces; 16 from each face where there are many."""
 _MANY = 0.25
 """Share of a face's pilots that must see gel for its bounced light to be linear and not constant."""
-_DEGREE = 4
-"""Degree of the polynomials for light that comes back from the window, which is smooth after so long a path."""
-_RETURNED = 2**17
-"""Paths by the window, to which they are fitted; more where there are many faces."""
+_RETURNING_NODES, _RETURNING_PATHS = 1024, 144
+"""Points at which light that comes back from the window is sampled, and paths from each."""
 _CLEARANCE_MM = 1e-3
 """Height above the gel's highest point at which rays end that look for gel alone: far more than rounding."""
 _NEGLIGIBLE = 1e-4
 """Share of all light on a point up to which a light's shadows are not sampled."""
+_BITS = 32
+"""Lights in a word of a face's mask."""
 _SHIFT = (0.7548776662466927, 0.5698402909980532)
 """Shift of shadow rays from one light to the next: R2 sequence (Roberts 2018), on a torus to keep the strata."""
 
@@ -72,80 +76,179 @@ def is_separated(render: Render, coating: Coating, variant: Variant) -> bool:
     return variant.is_vectorised
 
 
+class FrameGeometry:
+    """How a gel lies in one frame, as `SeparatedLight.prepare` needs it: solved for on the host.
+
+    `positions` are (v, 3) mm of the mesh's vertices. A plane sends itself no light.
+    """
+
+    def __init__(self, sensor: Sensor, mesh: GelMesh, positions: Points, is_deep: bool) -> None:
+        placed = mesh.positions(positions).reshape(-1, 3).astype(np.float64)
+        faces = mesh.faces().reshape(-1, 3).astype(np.int32)
+        low, high = placed.min(axis=0), placed.max(axis=0)
+        self.top = float(high[2]) + _CLEARANCE_MM
+        self.sizes = len(placed), len(faces)
+        self.bounces = is_deep and bool(high[2] - low[2] > _CLEARANCE_MM)
+        self.cavity, self.window, self.returning = None, None, None
+        if self.bounces and sensor.gel.is_round:
+            self.cavity = SmoothFit(placed, faces, Nodes.centres(faces), low, high)
+        if is_deep and reflecting_plane(sensor) is not None:
+            half = np.array(sensor.gel.size_mm[:2]) / 2
+            self.returning = Nodes.spread(placed, faces, _RETURNING_NODES)
+            self.window = SmoothFit(placed, faces, self.returning, -half, half)
+
+    def numbers(self, seed: int, mi: Any) -> dict[str, Any]:
+        """The frame's numbers on the device, with three seeds."""
+        import drjit as dr
+
+        return {
+            "seeds": [dr.opaque(mi.UInt32, (seed + part) % 2**32) for part in range(3)],
+            "top": dr.opaque(mi.Float, self.top),
+            "cavity": self.cavity and self.cavity.numbers(mi),
+            "window": self.window and self.window.numbers(mi),
+            "returning": self.returning and self.returning.numbers(mi),
+        }
+
+
+@dataclass(init=False, eq=False)
 class SeparatedLight:
     """Light on one renderer's gel, by the lights and the window of a sensor.
 
-    `scene` is Mitsuba's, `gels` holds the shapes "gel" and, where the window reflects, "image"; the gel's vertices are
-    read from its parameters. `max_depth` is the longest path in surfaces and lights.
+    `scene` is Mitsuba's, which holds the gel and, where the window reflects, its image. `max_depth` is the longest path
+    in surfaces and lights.
     """
 
-    def __init__(
-        self, sensor: Sensor, scene: Any, gels: dict[str, Any], parameters: Any, max_depth: int, is_mono: bool, mi: Any
-    ) -> None:
+    max_depth: int
+    _mi: Any
+    _dr: Any
+    _scene: Any
+    _gel: GelHits
+    _albedo: AlbedoMap
+    _channels: int
+    _index: Any
+    _words: int
+    _lights: list[LightTable]
+
+    def __init__(self, sensor: Sensor, scene: Any, gel: GelHits, albedo: AlbedoMap, max_depth: int, mi: Any) -> None:
         import drjit as dr
 
-        self._mi, self._dr, self._scene, self._parameters = mi, dr, scene, parameters
-        self._gel, self._has_image = GelHits(gels, mi), "image" in gels
-        self._reflection = gels["gel"].bsdf()
-        self._depth, self._channels = max_depth, 1 if is_mono else 3
-        self._is_round = sensor.gel.is_round
+        self._mi, self._dr, self._scene = mi, dr, scene
+        self._gel, self._albedo = gel, albedo
+        self.max_depth, self._channels = max_depth, albedo.channels
         index = sensor.window.refractive_index
-        # Used only where the window reflects.
-        self._face, self._index = dr.opaque(mi.Float, reflecting_plane(sensor) or 0), dr.opaque(mi.Float, index)
+        self._index = dr.opaque(mi.Float, index)  # used only where the window reflects
         size = sensor.gel.size_mm
         own = [light for light in sensor.lights if reaches(light, size)]
-        self._lights = [SampledLight(light, None, mi) if light.narrowness else PolygonLight(light, mi) for light in own]
-        self._lights += [SampledLight(light, index, mi) for light in image_lights(sensor) if reaches(light, size)]
-        self._half = [dr.opaque(mi.Float, side / 2) for side in size[:2]]
+        images = [light for light in image_lights(sensor) if reaches(light, size)]
+        kinds: list[tuple[list[Light], dict[str, Any]]] = [
+            ([light for light in own if not light.narrowness], {}),
+            ([light for light in own if light.narrowness], {"sampled": True}),
+            (images, {"sampled": True, "index": index}),
+        ]
+        self._lights = [LightTable(lights, albedo.channels, mi, **kind) for lights, kind in kinds if lights]
+        self._words = -(-(len(own) + len(images)) // _BITS)
 
-    def prepare(self, mesh: GelMesh, primary: int, seed: int) -> None:
-        """Pilots and bounced light for the gel as it lies now in the scene, for all cameras.
+    @property
+    def static(self) -> tuple[Any, ...]:
+        """What of the light is compiled into kernels."""
+        return self.max_depth, self._channels, self._words, tuple(table.static for table in self._lights)
 
-        `primary` are the samples that a camera takes of it in all; the seed is non-negative, below 2^32.
+    def prepare(
+        self, frame: dict[str, Any], sizes: tuple[int, int], primary: int, bounces: bool
+    ) -> tuple[list[Any], list[list[Any]]]:
+        """What all cameras share of the gel as it lies now in the scene: for `radiance`.
+
+        Args:
+            frame: from `FrameGeometry.numbers`.
+            sizes: numbers of vertices and faces.
+            primary: samples that a camera takes of the gel in all.
+            bounces: whether the gel may light itself.
+
+        Returns:
+            Faces' masks of lights that something may block (mi.UInt32 for each 32 lights), and indirect irradiance at
+            faces' corners (channels of 3 of mi.Float), without channels where there is none.
         """
-        mi = self._mi
-        triangles = mesh.faces().reshape(-1, 3)
-        self._corners = [mi.UInt32(column) for column in np.ascontiguousarray(triangles.T)]
-        met = self._pilots(seed)
-        touched: BoolArray = np.zeros((len(mesh.surface.material), len(self._lights)), dtype=bool)
-        for corner in triangles.T:
-            np.logical_or.at(touched, corner, met[:, :-1] > 0)
-        near: BoolArray = np.any(touched[triangles], axis=1)
-        self._shaded = [mi.Bool(np.ascontiguousarray(near[:, number])) for number in range(len(self._lights))]
-        self._bounced = self._gather(triangles, met[:, -1], primary, seed) if self._depth > 2 else None
-        self._returned = self._fit_returned(len(triangles), seed) if self._has_image and self._depth > 2 else None
+        mi, dr, gel, faces = self._mi, self._dr, self._gel, sizes[1]
+        masks, seen = self._pilots(frame["seeds"][0], faces)
+        shaded = [self._with_neighbours(mask, sizes[0]) for mask in masks]
+        indirect: list[list[Any]] = []
+        if bounces:
+            count = count_per_face(primary, faces)
+            points = FacePoints.on(gel, count, 2 * (self.max_depth - 2), frame["seeds"][1], mi)
+            values = self._bounces(points, shaded, frame["top"])
+            if frame["cavity"] is None:
+                indirect = projected(values, points.weights, count, seen)
+            else:
+                indirect = self._smooth(frame["cavity"], values, count)
+        if frame["returning"] is not None:
+            draws = 2 * (self.max_depth - 2)
+            points = FacePoints.on(gel, _RETURNING_PATHS, draws, frame["seeds"][2], mi, frame["returning"])
+            returned = self._smooth(frame["window"], self._bounces(points, shaded), _RETURNING_PATHS)
+            both = zip(indirect or returned, returned, strict=True)
+            indirect = [[a + b for a, b in zip(*pair, strict=True)] for pair in both] if indirect else returned
+        dr.eval(shaded, indirect)
+        return shaded, indirect
 
-    def radiance(self, ray: Any, sampler: Any, active: Any) -> tuple[list[Any], Any]:
+    def radiance(
+        self, ray: Any, sampler: Any, active: Any, prepared: tuple[list[Any], list[list[Any]]]
+    ) -> tuple[list[Any], Any]:
         """Radiance (channels of mi.Float) along rays from the camera, and whether they meet the gel (mi.Bool)."""
         mi, dr = self._mi, self._dr
+        shaded, indirect = prepared
         hit = self._scene.ray_intersect_preliminary(ray, active=active)
         seen, _ = self._gel.kinds(hit, active)
         at = self._gel.point(ray, hit, False, seen)
         normal = dr.mulsign(mi.Vector3f(at.sh_frame.n), at.wi.z)  # the coating reflects on either side
-        light = self._direct(at, normal, hit.prim_index, sampler.next_2d(), seen)
-        if self._bounced is not None:
-            weights = (1 - hit.prim_uv.x - hit.prim_uv.y, hit.prim_uv.x, hit.prim_uv.y)
-            for channel, values in enumerate(self._bounced):
-                for value, weight in zip(values, weights, strict=True):
-                    light[channel] += dr.gather(mi.Float, value, hit.prim_index, seen) * weight
-        if self._returned is not None:
-            terms = self._terms(at.p, normal)
-            for channel, values in enumerate(self._returned):
-                light[channel] += dr.maximum(sum(a * b for a, b in zip(values, terms, strict=True)), 0)
-        albedo = self._albedo(at, seen)
+        light = self._direct(at, normal, hit.prim_index, sampler.next_2d(), shaded, seen)
+        weights = (1 - hit.prim_uv.x - hit.prim_uv.y, hit.prim_uv.x, hit.prim_uv.y)
+        for channel, values in enumerate(indirect):
+            for value, weight in zip(values, weights, strict=True):
+                light[channel] += dr.gather(mi.Float, value, hit.prim_index, seen) * weight
+        albedo = self._albedo.at(at.uv, seen)
         return [dr.select(seen, a * e / dr.pi, 0) for a, e in zip(albedo, light, strict=True)], seen
 
-    def _direct(self, at: Any, normal: Any, face: Any, offset: Any, active: Any) -> list[Any]:
+    def _smooth(self, fit: dict[str, Any], values: list[Any], count: int) -> list[list[Any]]:
+        """Irradiance at faces' corners, fitted to `count` samples (channels of mi.Float) at each of the fit's nodes."""
+        mi, dr, gel = self._mi, self._dr, self._gel
+        dr.eval(values)
+        means = [dr.block_sum(value, count) / count for value in values]
+        dr.eval(means)
+        smooth = fitted(fit, means, gel.positions, gel.normals, mi)
+        dr.eval(smooth)
+        return [[dr.gather(mi.Float, channel, corner) for corner in gel.corners] for channel in smooth]
+
+    def _direct(self, at: Any, normal: Any, face: Any, offset: Any, shaded: list[Any], active: Any) -> list[Any]:
         """Irradiance (channels) of points on faces, by all lights, less what is blocked."""
         mi, dr = self._mi, self._dr
-        total = [mi.Float(0) for _ in range(self._channels)]
-        for number, (light, shaded) in enumerate(zip(self._lights, self._shaded, strict=True)):
-            asked = active & dr.gather(mi.Bool, shaded, face, active)
-            value = light.whole(at.p, normal, offset) - self._blocked(light, number, at, normal, offset, asked)
-            total = [dr.fma(value, color, sum_) for color, sum_ in zip(light.radiance, total, strict=False)]
-        return total
+        masks = [dr.gather(mi.UInt32, mask, face, active) for mask in shaded]
 
-    def _blocked(self, light: PolygonLight, number: int, at: Any, normal: Any, offset: Any, asked: Any) -> Any:
+        def add(light: PolygonLight, number: Any, *total: Any) -> list[Any]:
+            mask = mi.UInt32(0)
+            for word, own in enumerate(masks):
+                mask = dr.select(number // _BITS == word, own, mask)
+            asked = active & (((mask >> (number % _BITS)) & 1) != 0)
+            value = light.whole(at.p, normal, offset) - self._blocked(light, number, at, normal, offset, asked)
+            return [dr.fma(value, color, sum_) for color, sum_ in zip(light.radiance, total, strict=True)]
+
+        return self._over_lights(add, [mi.Float(0) for _ in range(self._channels)])
+
+    def _over_lights(self, add: Callable[..., list[Any]], sums: list[Any]) -> list[Any]:
+        """Sums after `add`, called with each light, its number (mi.UInt32) and the sums so far."""
+        mi, dr = self._mi, self._dr
+        before = mi.UInt32(0)
+        for table in self._lights:
+
+            def step(k: Any, *sums: Any, table: LightTable = table, before: Any = before) -> tuple[Any, ...]:
+                return k + 1, *add(table.light(k), before + k, *sums)
+
+            def goes_on(k: Any, *_: Any, table: LightTable = table) -> Any:
+                return k < table.count
+
+            _, *sums = dr.while_loop((mi.UInt32(0), *sums), goes_on, step)
+            before = before + table.count
+        return sums
+
+    def _blocked(self, light: PolygonLight, number: Any, at: Any, normal: Any, offset: Any, asked: Any) -> Any:
         """What of `_sampled` is blocked (mi.Float): computed only where it is `asked`, 0 elsewhere."""
         dr = self._dr
 
@@ -155,101 +258,76 @@ class SeparatedLight:
 
         return dr.if_stmt((at, normal, offset), asked, sample, lambda *_: self._mi.Float(0))
 
-    def _sampled(self, light: PolygonLight, number: int, at: Any, normal: Any, offset: Any) -> Any:
+    def _sampled(self, light: PolygonLight, number: Any, at: Any, normal: Any, offset: Any) -> Any:
         """Irradiance per radiance that a point of the light gives unless its ray is blocked, and whether it is."""
-        dr = self._dr
-        moved = [offset.x + number * _SHIFT[0] % 1, offset.y + number * _SHIFT[1] % 1]
-        place, value = light.sample(at.p, normal, self._mi.Point2f(*(x - dr.floor(x) for x in moved)))
+        place, value = self._point(light, number, at, normal, offset)
         return value, self._scene.ray_test(at.spawn_ray_to(place), value > 0)
 
-    def _albedo(self, at: Any, active: Any) -> list[Any]:
-        color = self._reflection.eval_diffuse_reflectance(at, active)
-        return [color[channel] for channel in range(self._channels)]
+    def _point(self, light: PolygonLight, number: Any, at: Any, normal: Any, offset: Any) -> Any:
+        mi, dr = self._mi, self._dr
+        moved = mi.Point2f(offset) + mi.Float(number) * mi.Point2f(*_SHIFT)
+        return light.sample(at.p, normal, moved - dr.floor(moved))
 
-    def _pilots(self, seed: int) -> FloatArray:
-        """(faces, lights + 1) shares of a face's pilots that were blocked before a light, or met the gel."""
-        dr = self._dr
-        count = count_per_face(_PILOTS, dr.width(self._corners[0]))
-        points = self._points(count, 2, seed)
+    def _pilots(self, seed: Any, faces: int) -> tuple[list[Any], Any]:
+        """Masks of the lights before which a pilot of a face was blocked; whether many pilots met the gel (mi.Bool)."""
+        mi, dr = self._mi, self._dr
+        count = count_per_face(_PILOTS, faces)
+        points = FacePoints.on(self._gel, count, 2, seed, mi)
         shared = points.at, points.normal, next(points.numbers)
-        sampled = [self._sampled(light, number, *shared) for number, light in enumerate(self._lights)]
-        given = [[value * c for c in light.radiance] for light, (value, _) in zip(self._lights, sampled, strict=True)]
-        least = [_NEGLIGIBLE * sum(channel) for channel in zip(*given, strict=True)]
-        counted = [reduce(or_, (c > limit for c, limit in zip(one, least, strict=True))) for one in given]
-        met = [blocked & counts for (_, blocked), counts in zip(sampled, counted, strict=True)]
-        met.append(self._onward(points.at, points.normal, next(points.numbers))[2])  # the image is no bounce
-        counts = [dr.select(one, self._mi.UInt32(1), 0) for one in met]
-        dr.eval(counts)
-        return np.stack([np.array(dr.block_sum(one, count)) for one in counts], axis=-1) / count
 
-    def _gather(self, triangles: NDArray[np.uint32], met: FloatArray, rays: int, seed: int) -> list[list[Any]]:
-        """Bounced light (channels of 3 corners of mi.Float) on all faces from about `rays` rays.
+        def add(light: PolygonLight, number: Any, *total: Any) -> list[Any]:
+            _, value = self._point(light, number, *shared)
+            return [dr.fma(value, color, sum_) for color, sum_ in zip(light.radiance, total, strict=True)]
 
-        `met` are the shares (faces,) of pilots that met the gel.
-        """
-        mi, dr, count = self._mi, self._dr, count_per_face(rays, len(met))
-        values = np.zeros((len(met), self._channels, 3), dtype=np.float32)
-        if met.any():
-            points = self._points(count, 2 * (self._depth - 2), seed + 1)
-            top = np.array(self._parameters["gel.vertex_positions"])[2::3].max() + _CLEARANCE_MM
-            parts = self._bounces(points, dr.opaque(mi.Float, float(top)))
-            values = projected(parts, points.weights, count, met >= _MANY)
-        if met.any() and self._is_round:
-            positions, normals = (
-                np.array(self._parameters[f"gel.vertex_{name}"], dtype=np.float64).reshape(-1, 3)
-                for name in ("positions", "normals")
-            )
-            values = across_cavity(values.mean(axis=2), positions, normals, triangles)
-        return [[mi.Float(np.ascontiguousarray(one)) for one in rows.T] for rows in values.swapaxes(0, 1)]
+        whole = self._over_lights(add, [mi.Float(0) for _ in range(self._channels)])
 
-    def _fit_returned(self, faces: int, seed: int) -> list[Any]:
-        """Coefficients (channels of mi.Float) of what the gel sends to the window and gets back, in `_terms`."""
-        dr = self._dr
-        points = self._points(count_per_face(_RETURNED, faces), 2 * (self._depth - 2), seed + 2)
-        values = self._bounces(points)
-        terms = self._terms(points.at.p, points.normal)
-        dr.eval(values, terms)
-        design, right = (np.array([np.array(one) for one in part], dtype=np.float64) for part in (terms, values))
-        found = np.linalg.lstsq(design @ design.T, design @ right.T, rcond=None)[0]
-        # Each a variable of its own: gathering them would take longer.
-        return [[dr.opaque(self._mi.Float, float(value)) for value in column] for column in found.T]
+        def mark(light: PolygonLight, number: Any, *masks: Any) -> list[Any]:
+            value, blocked = self._sampled(light, number, *shared)
+            given = zip(light.radiance, whole, strict=True)
+            counts = reduce(or_, (value * color > _NEGLIGIBLE * total for color, total in given))
+            bit = dr.select(blocked & counts, mi.UInt32(1) << (number % _BITS), 0)
+            return [mask | dr.select(number // _BITS == word, bit, 0) for word, mask in enumerate(masks)]
 
-    def _terms(self, point: Any, normal: Any) -> list[Any]:
-        """Monomials of the place on the pad up to a degree, times each component of the normal."""
-        x, y = (coordinate / half for coordinate, half in zip((point.x, point.y), self._half, strict=True))
-        powers = [x**i * y**j for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
-        return [power * component for power in powers for component in (normal.x, normal.y, normal.z)]
+        masks = self._over_lights(mark, [mi.UInt32(0) for _ in range(self._words)])
+        _, _, straight, _ = self._onward(points.at, points.normal, next(points.numbers))  # the image is no bounce
+        met = dr.select(straight, mi.UInt32(1), 0)
+        dr.eval(masks, met)
+        masks = [dr.block_reduce(dr.ReduceOp.Or, mask, count) for mask in masks]
+        return masks, dr.block_sum(met, count) >= _MANY * count
 
-    def _bounces(self, points: FacePoints, top: Any | None = None) -> list[Any]:
+    def _with_neighbours(self, mask: Any, vertices: int) -> Any:
+        """Masks of faces (mi.UInt32), each with those of all faces that share a vertex with it."""
+        mi, dr = self._mi, self._dr
+        touched = dr.zeros(mi.UInt32, vertices)
+        for corner in self._gel.corners:
+            dr.scatter_reduce(dr.ReduceOp.Or, touched, mask, corner)
+        return reduce(or_, (dr.gather(mi.UInt32, touched, corner) for corner in self._gel.corners))
+
+    def _bounces(self, points: FacePoints, shaded: list[Any], top: Any | None = None) -> list[Any]:
         """Irradiance (channels) from the gel itself, one path from each point.
 
         Its first step goes by the window, or straight: then `top` is a height that the gel does not reach.
         """
         mi, dr = self._mi, self._dr
-        at, normal, count = points.at, points.normal, dr.width(points.at.p)
-        total = [dr.zeros(mi.Float, count) for _ in range(self._channels)]
-        share = [dr.full(mi.Float, 1, count) for _ in range(self._channels)]
-        start = dr.arange(mi.UInt32, count)
-        for step in range(self._depth - 2):
-            offset = dr.gather(mi.Point2f, next(points.numbers), start)
-            ray, hit, straight, mirrored = self._onward(at, normal, offset, None if step else top)
-            active = straight | mirrored if step else mirrored if top is None else straight
-            offset = dr.gather(mi.Point2f, next(points.numbers), start)
-            dr.eval(ray, hit, active, mirrored, offset)  # each gather alone would trace everything anew
-            onward = dr.compress(active)  # few paths meet the gel: only these go on
-            if dr.width(onward) == 0:
-                break
-            ray, hit, mirrored, offset, start = (
-                dr.gather(type(x), x, onward) for x in (ray, hit, mirrored, offset, start)
-            )
-            at = self._gel.point(ray, hit, mirrored, mi.Bool(True))
+        at, normal, active = points.at, points.normal, mi.Bool(True)
+        total, share = ([mi.Float(value) for _ in range(self._channels)] for value in (0, 1))
+
+        def dark(*_: Any) -> tuple[Any, ...]:
+            return tuple(mi.Float(0) for _ in range(self._channels))
+
+        def direct(at: Any, normal: Any, face: Any, offset: Any) -> tuple[Any, ...]:
+            return tuple(self._direct(at, normal, face, offset, shaded, mi.Bool(True)))
+
+        for step in range(self.max_depth - 2):
+            ray, hit, straight, mirrored = self._onward(at, normal, next(points.numbers), None if step else top)
+            active &= straight | mirrored if step else mirrored if top is None else straight
+            at = self._gel.point(ray, hit, mirrored, active)
             normal = -mi.Vector3f(at.sh_frame.n)
             kept = dr.select(mirrored, reflectance(dr.abs(ray.d.z), self._index, mi), 1)
-            albedo = self._albedo(at, mi.Bool(True))
-            share = [dr.gather(mi.Float, s, onward) * a * kept for s, a in zip(share, albedo, strict=True)]
-            light = self._direct(at, normal, hit.prim_index, offset, mi.Bool(True))
-            for sum_, s, e in zip(total, share, light, strict=True):
-                dr.scatter_add(sum_, s * e, start, mode=dr.ReduceMode.NoConflicts)
+            share = [s * a * kept for s, a in zip(share, self._albedo.at(at.uv, active), strict=True)]
+            # Few paths meet the gel: only their light is computed.
+            light = dr.if_stmt((at, normal, hit.prim_index, next(points.numbers)), active, direct, dark)
+            total = [sum_ + dr.select(active, s * e, 0) for sum_, s, e in zip(total, share, light, strict=True)]
         return total
 
     def _onward(self, at: Any, normal: Any, offset: Any, top: Any | None = None) -> tuple[Any, Any, Any, Any]:
@@ -262,6 +340,3 @@ class SeparatedLight:
         straight, mirrored = self._gel.kinds(hit, mi.Bool(True))
         lit = self._gel.point(ray, hit, mirrored, straight | mirrored).wi.z < 0
         return ray, hit, lit & straight, lit & mirrored
-
-    def _points(self, count: int, draws: int, seed: int) -> FacePoints:
-        return FacePoints.on(self._corners, self._parameters, count, draws, seed, self._mi)

@@ -36,9 +36,10 @@ class Numerics(Part):
     made as fine under each trajectory's contact as this asks for."""
     edge_length_mm: Positive | None = None
     """Instead of a target: one fTetWild mesh for all trajectories with tetrahedra of this edge at the contact face."""
-    solver: Literal["single", "batched"] = "single"
+    solver: Literal["auto", "single", "batched"] = "auto"
     """batched: many trajectories at once on one mesh of the pad, for GPUs; `cells` or edge_length_mm say which, and a
-    target is only what `plan` compares with. The same laws and tolerances, other meshes: other samples."""
+    target is only what `plan` compares with. The same laws and tolerances, other meshes: other samples. auto: batched
+    where a GPU renders and all sensors' pads can share a mesh."""
     cells: tuple[Cells, Cells, Annotated[int, Field(ge=1, le=20)]] = (16, 12, 2)
     """Elements of the batched solver's mesh along x and y, where they are even in size, and through the thickness."""
     max_step_mm: Positive = 0.25
@@ -54,8 +55,3 @@ class Numerics(Part):
         if self.target_error_px is not None and self.edge_length_mm is not None:
             raise ValueError("target_error_px and edge_length_mm both fix the mesh: give one of them")
         return self
-
-    @property
-    def is_batched(self) -> bool:
-        """Whether many trajectories are simulated at once, on one mesh for all of a pad."""
-        return self.solver == "batched"

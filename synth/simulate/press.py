@@ -94,11 +94,12 @@ class MeshRule:
     target_error_px: float
 
     @classmethod
-    def of(cls, scene: Scene) -> "MeshRule":
+    def of(cls, scene: Scene, is_batched: bool = False) -> "MeshRule":
+        """The rule of a scene; `is_batched`: many trajectories are simulated at once."""
         numerics = scene.numerics
         if numerics.edge_length_mm is not None or scene.sensor.gel.is_round:
             return cls("tetwild", float("nan"))
-        return cls("even" if numerics.is_batched else "graded", numerics.target_error_px or DEFAULT_TARGET_PX)
+        return cls("even" if is_batched else "graded", numerics.target_error_px or DEFAULT_TARGET_PX)
 
     def resolution(
         self, scene: Scene, folder: Path | None = None, mesh_folders: Sequence[Path] | None = None

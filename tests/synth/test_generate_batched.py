@@ -115,7 +115,7 @@ def test_one_trajectory_alone_is_the_same_failed_draws_are_replaced_and_the_mesh
 
 def test_a_batch_agrees_with_the_single_solver_and_hopeless_trajectories_are_given_up(context: JobContext) -> None:
     """On the same meshes: the same draws fail for the same reasons, and what is left is the same motion."""
-    results = {found.number: found for found, *_ in in_batches(context, _tasks(range(5)), 4)}
+    results = {found.number: found for group in in_batches(context, _tasks(range(5)), 4) for found in group}
     assert sorted(results) == list(range(5))
     for task in _tasks(range(5)):
         template = context.plan.template
@@ -160,7 +160,7 @@ def _alone(attempts: Attempts) -> SimulatedTrajectory:
     while (attempt := attempts.next()) is not None:
         simulated = attempts.simulated(attempt, simulate_press(attempt.press, attempt.frames))
         if simulated is not None:
-            return simulated[0]
+            return simulated
     raise AssertionError("no draw could be used")
 
 
@@ -206,7 +206,7 @@ def test_the_shared_mesh_is_even_and_the_predicted_error_falls_with_its_spacing(
     # Coordinates are multiples of 2e-10 mm.
     assert coarse.error_px / better.error_px == pytest.approx(ratio**1.6, rel=1e-8)
     assert better.across > coarse.across >= 0
-    found = MeshRule.of(fine).resolution(fine)
+    found = MeshRule.of(fine, is_batched=True).resolution(fine)
     assert (found.across, found.error_px, found.through) == (better.across, better.error_px, 2)
     assert len(found.mesh.tets) == 6 * 16 * 12 * 2
 

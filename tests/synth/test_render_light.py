@@ -9,11 +9,10 @@ from render_scenes import FAST, SCALAR, flat_surface, needs_llvm, plain, rendere
 from round_gels import RADIUS, SPHERE, capsule, sensor
 
 from synth.arrays import FloatArray
-from synth.mesh import rest_surface
 from synth.render.camera_rays import pinhole
 from synth.render.gel_mesh import MIRROR
 from synth.render.lights import emitters, light_axes
-from synth.render.polygon_light import PolygonLight
+from synth.render.polygon_light import LightTable
 from synth.render.renderer import Renderer
 from synth.scene import Coating, Gel, Light, Render, Sensor
 
@@ -48,7 +47,9 @@ def test_closed_form_is_the_sum_over_the_light() -> None:
     assert (expected == 0).any()
     assert (expected > 0.1).any()
     place, normal = (mi.Vector3f(*(values * MIRROR).astype(np.float32).T) for values in (points, normals))
-    found = np.array(PolygonLight(light, mi).whole(mi.Point3f(place), mi.Normal3f(normal), mi.Point2f(0.5)))
+    found = np.array(
+        LightTable([light], 1, mi).light(mi.UInt32(0)).whole(mi.Point3f(place), mi.Normal3f(normal), mi.Point2f(0.5))
+    )
     # The midpoint rule errs by the second order of a patch's size over the distance, 5/400 and at least some 0.5 mm,
     # and where the horizon cuts patches by a part of one in 400 rows of the light, at grazing angle.
     np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-5)
@@ -91,7 +92,7 @@ def test_a_small_shadow_falls_on_two_triangles_as_on_many() -> None:
     light = Light(position_mm=(8.0, 2.0, 2.0), size_mm=(0.05, 0.05), color=(1, 1, 1), power=100)
     panel = Light(position_mm=(5.8, 0.5, 0.7), aim_mm=(0.0, 0.0, 0.0), size_mm=(0.3, 0.3), color=(1, 1, 1), power=1e-9)
     shaded, render = small_sensor(lights=(light, panel)), Render(samples_per_pixel=16, light="separated")
-    surfaces = (rest_surface(shaded.gel), flat_surface(shaded))
+    surfaces = (flat_surface(shaded, 1), flat_surface(shaded))
     few, many = (Renderer(shaded, render, each, plain(), FAST).radiance(each.material, 0)[..., 0] for each in surfaces)
     assert 0.001 < np.mean(many < 0.01 * np.median(many)) < 0.01
     # The same samples, at places that differ by rounding: at its edge one of 16 may be lit that was not.

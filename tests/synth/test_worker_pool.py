@@ -1,27 +1,21 @@
-"""Worker processes and threads: one core each, the bits of a run without them, textures painted ahead."""
+"""Worker processes and threads: one core each, the bits of a run without them."""
 
 import os
 import subprocess
 import sys
-import threading
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from processes_of import HAS_PROC, workers_of
 from tiny_scene import TEXT, fingerprint, job_context, reference, write_tiny
 
-from synth.arrays import Image
-from synth.pipeline import overlapped
 from synth.pipeline import worker_pool as pool
 from synth.pipeline.generate import Scheduling, generate
 from synth.pipeline.overlapped import outcomes_of_batches
 from synth.pipeline.records import JobContext, Task
 from synth.pipeline.worker_pool import THREADS, one_thread_each, outcomes_of_processes
-from synth.scene import Sensor
 from synth.scene.template import load_scene
 
 ROOT = Path(__file__).parents[2]
@@ -79,10 +73,10 @@ def test_a_worker_is_a_process_that_takes_one_core(tmp_path: Path, monkeypatch, 
 def test_a_pool_that_breaks_while_it_starts_a_worker(tmp_path: Path, monkeypatch, capsys) -> None:
     submit, errors = pool.ProcessPoolExecutor.submit, [OSError("handle is closed"), ValueError("bad value(s)")]
 
-    def submit_late(*args: Any) -> Any:
-        if errors:
+    def submit_late(executor: Any, function: Any, *args: Any) -> Any:
+        if errors and function is pool._work:
             raise errors.pop()
-        return submit(*args)
+        return submit(executor, function, *args)
 
     monkeypatch.setattr(pool.ProcessPoolExecutor, "submit", submit_late)
     monkeypatch.setattr(pool, "_trajectory_maker", _threads)
@@ -97,29 +91,7 @@ def context(tmp_path: Path) -> JobContext:
     return job_context(load_scene(write_tiny(tmp_path, text)), 2, tmp_path / "d")
 
 
-def test_textures_are_painted_in_order_and_one_thread_each_leaves_the_environment(context, monkeypatch) -> None:
-    begun: list[int] = []
-    lock = threading.Lock()
-
-    def painted(_: JobContext, sensor: int, scene: Sensor) -> Image:
-        with lock:
-            begun.append(sensor)
-        if sensor == 5:
-            raise MemoryError("no room for sensor 5")
-        return np.full((1, 1, 3), sensor, dtype=np.float32)
-
-    monkeypatch.setattr(overlapped, "paint", painted)
-    scene = context.plan.template.corners[0].sensor
-    with ThreadPoolExecutor(1) as threads:
-        early = overlapped.Textures(context, threads, room=2)
-        asked = [early.request(sensor, scene) for sensor in range(6)]
-        for sensor, texture in enumerate(asked[:5]):
-            assert texture.result(10)[0, 0, 0] == sensor
-            assert begun == list(range(len(begun)))
-            assert len(begun) <= sensor + 2
-            early.release()
-        with pytest.raises(MemoryError, match="sensor 5"):
-            asked[5].result(10)
+def test_one_thread_each_leaves_the_environment(monkeypatch) -> None:
     monkeypatch.setenv(THREADS[0], "3")
     monkeypatch.delenv(THREADS[1], raising=False)
     with one_thread_each():
