@@ -15,6 +15,7 @@ where it is pressed along z beside its tip, the path starts level with its farth
 down on the place, unless its offset_mm names another.
 """
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
@@ -88,10 +89,10 @@ class LoadPath:
         return float(face_height(np.array([self.motion.position_mm]), self.dome_radius_mm)[0])
 
     def is_over(self, size_mm: tuple[float, float, float]) -> bool:
-        """Whether the body's middle is over the face of a gel and the body, pressed in, reaches into it at all.
+        """Whether the body's middle is over the face of a gel and the body, being pressed in, reaches into it at all.
 
-        The hole of a ring or an object, or the hollow between its feet, may be all that is over it. On a round gel the
-        place alone is looked at: beside it the face recedes.
+        The hole of a ring or an object, or the hollow between its feet, may be all that is over it. A needle goes
+        through the face on its path. On a round gel the place alone is looked at: beside it the face recedes.
         """
         rim = float(self.body.shape[1]) if self.body.kind == KINDS["torus"] else 0.0
         if self.frame is not None:
@@ -101,9 +102,14 @@ class LoadPath:
         else:
             x, y = (axis.ravel() for axis in np.meshgrid(*(np.linspace(-s / 2, s / 2, OVER) for s in size_mm[:2])))
             places = np.column_stack([x, y, face_height(np.column_stack([x, y]), self.dome_radius_mm)])
-        pose, near = self.pose(self.press_mm), 0.0 if self.frame is not None else max(size_mm[:2]) / (OVER - 1)
-        distance = Distance(self.body, pose.centre[None], pose.rotation[None])
-        return bool(distance(places, np.zeros(len(places), dtype=np.int32))[1].min() < near)
+        near = max(size_mm[:2]) / (OVER - 1)
+        number = np.zeros(len(places), dtype=np.int32)
+        for depth in np.linspace(self.press_mm, 0.0, 1 + math.ceil(max(self.press_mm, 0.0) / near)):
+            pose = self.pose(float(depth))
+            distance = Distance(self.body, pose.centre[None], pose.rotation[None])
+            if distance(places, number)[1].min() < (near if self.frame is None else 0.0):
+                return True
+        return False
 
     @cached_property
     def touch_mm(self) -> float:

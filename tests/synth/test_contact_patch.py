@@ -47,9 +47,10 @@ def test_what_lies_on_a_ball_is_a_cap_at_every_point_of_the_face() -> None:
 
     found, displacement = patch(Sphere(shape="sphere", radius_mm=radius), depth, height)
     # The cap's area is 2 π R times its height. The face leaves the ball at a slope of .3 + .44, so that it is 1e-3 mm
-    # off within .001 mm; P2 faces of .25 mm round the kink off over some tenth of that, 2 % of the radius.
+    # off within .001 mm. Where a P2 face has the kink inside, it leaves the ball up to an eighth of its edge of .25 mm
+    # earlier: 2.6 % of the radius, 5.3 % of the area.
     cap = 2 * np.pi * radius * (radius - np.sqrt(radius**2 - edge**2))
-    assert found.area_mm2 == pytest.approx(cap, rel=0.04)
+    assert found.area_mm2 == pytest.approx(cap, rel=0.06)
     fine = GelSurface(FACE, 5)
     r = np.hypot(*fine.material[:, :2].T)
     holds = found.holds(fine.material, fine.positions(displacement))

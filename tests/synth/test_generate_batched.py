@@ -46,7 +46,7 @@ BATCHED = (
     .replace("steps = 2", "steps = 3")
     .replace("position_mm = [{ uniform = [-1.0, 1.0] }", "position_mm = [{ normal = [0.0, 3.0] }")
 )
-SAMPLES, SEED = 10, 10  # Five trajectories of three sensors and two pads; draws of every kind fail
+SAMPLES, SEED = 10, 9  # Five trajectories of three sensors and two pads; draws of every kind fail
 
 pytestmark = pytest.mark.usefixtures("one_cache")
 GEL = Gel(size_mm=(20.0, 15.0, 4.0), youngs_modulus_kpa=200.0)
@@ -131,7 +131,7 @@ def test_a_batch_agrees_with_the_single_solver_and_hopeless_trajectories_are_giv
             np.testing.assert_allclose(other.force_n, state.force_n, rtol=0, atol=1e-3 * np.linalg.norm(state.force_n))
     hopeless = [f"contact.indenter={NEEDLE}", "motion.position_mm=[0.3, 0.2]"]
     planned = plan(load_scene(context.plan.template.source, hopeless))
-    (result,) = in_batches(replace(context, plan=planned), _tasks([0]), 2)
+    ((result,),) = in_batches(replace(context, plan=planned), _tasks([0]), 2)
     assert isinstance(result, Outcome)
     assert (result.given_up, len(result.failures)) == ((0, 1), MAX_DRAWS)
 
@@ -198,7 +198,7 @@ def test_the_shared_mesh_is_even_and_the_predicted_error_falls_with_its_spacing(
     assert z[1] == pytest.approx(max(1.25, 4.0 / 3.2), abs=1e-6)  # 1 + growth of at most 2.2
     assert shared_spacing_mm(GEL, numerics) == pytest.approx(1.25, abs=1e-6)
     # By the model's exponent of 1.6, at equal proportions of the elements; and the rule says the same.
-    drawn = draw(template, SEED, 0)
+    drawn = draw(template, SEED, 1)
     fine = drawn.model_copy(update={"numerics": drawn.numerics.model_copy(update={"cells": (16, 12, 2)})})
     coarse, better = accuracy(drawn), accuracy(fine)
     ratio = _spacing_of(drawn) / _spacing_of(fine)

@@ -241,5 +241,6 @@ class BatchedSolver:
         s = self.lanes
         count, reason, at, target = (array.numpy() for array in (s.records, s.reason, s.at, s.target))
         for lane in map(int, lanes):
-            records = np.asarray(self._arrays.records[lane].numpy()[: count[lane]])
+            # A copy: on a processor the lane's next press writes into the same memory.
+            records = np.array(self._arrays.records[lane].numpy()[: count[lane]])
             yield lane, records, (int(reason[lane]), float(at[lane]), float(target[lane]))
