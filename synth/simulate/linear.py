@@ -27,7 +27,7 @@ GMRES_LIMIT = 40
 ROUGH_TOLERANCE = 0.03
 """Largest linear residual of a rough direction, with this tangent's factor or an earlier one's. Far from the solution
 changes of the contact set are what counts."""
-MAX_REUSE_ITERATIONS, HOPELESS_AFTER = 12, 4
+MAX_REUSE_ITERATIONS, HOPELESS_AFTER = 8, 4
 """An earlier tangent's factor is given up after so many iterations or, from the second number on, as soon as their mean
 rate would need more. A new factor takes as long as about eight."""
 
