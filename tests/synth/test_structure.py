@@ -18,6 +18,7 @@ STAGES = (
     "synth.render",
     "synth.scene.sampling",  # draws again what could not be rendered
     "synth.dataset", "synth.verify", "synth.inspect", "synth.planning", "synth.pipeline",
+    "synth.preview",
     "synth.progress", "synth.calibrate", "synth.stress", "synth.doctor", "synth.cli_options", "synth.commands",
     "synth.cli", "synth.__main__",
 )  # fmt: skip
