@@ -15,6 +15,7 @@ from functools import cache
 
 import numpy as np
 
+from benchmarks.capsule_surface import surface_at_rest
 from benchmarks.flow_change import Images, Truth, changes
 from benchmarks.image_error import LEVELS, Halves, camera_noise, errors, reference_noise, rendered
 from benchmarks.pressed_gel import Press, main_camera, press, without_window
@@ -22,7 +23,6 @@ from benchmarks.rows import Row, arguments, machine, measure, plot, show
 from gelflow.baselines.registry import named_methods
 from synth.cli_options import DEFAULT_SCENE
 from synth.errors import InputError
-from synth.mesh import rest_surface
 from synth.planning import job_variant
 from synth.render.camera_image import render_noise
 from synth.render.pattern import albedo
@@ -163,7 +163,7 @@ def auto_row(job: Job, number: int) -> Row:
     scene = draw(template, seed, number * template.corners[0].sampling.trajectories_per_sensor)
     sensor = main_camera(scene.sensor, job.given.scale)
     texture = albedo(sensor, stream(template, seed, "pattern", number), template.source.parent)
-    surface = rest_surface(sensor.gel)
+    surface = surface_at_rest(sensor.gel)
     row: Row = {}
     for name, samples in (("auto", "auto"), ("scene", scene.render.samples_per_pixel)):
         render = scene.render.model_copy(update={"samples_per_pixel": samples})

@@ -98,9 +98,7 @@ def plan(
 def preview(
     *,
     scene: SceneName = DEFAULT_SCENE,
-    out: Annotated[Path, Parameter(help="PNG file; further cameras' pictures stand beside the main one's.")] = Path(
-        "preview.png"
-    ),
+    out: Annotated[Path, Parameter(help="PNG file; further cameras stand beside the main one.")] = Path("preview.png"),
     seed: Annotated[int, Parameter(converter=whole(0), help="Seed of everything random.")] = 0,
     assignments: Assignments = None,
     device: Device = "auto",
@@ -108,7 +106,6 @@ def preview(
 ) -> int:
     """Makes one picture of the gel at rest in seconds, and says whether its light suits the camera."""
     from synth.preview import preview as photograph
-    from synth.preview import table_of
     from synth.render.variant import job_variant
 
     template = _loaded(scene, assignments)
@@ -118,8 +115,10 @@ def preview(
         print(json.dumps(found))
         return 0
     _say_hint(variant)
-    _console().print(table_of(found))
     for name, camera in found["cameras"].items():
+        for channel, one in camera["levels"].items():
+            shares = f"at white {one['clipped']:.1%}, dark (below 5% of white) {one['dark']:.1%}"
+            print(f"{name}, {channel}: mean {one['mean']:.1%} of white; pixels {shares}")
         print(f"{name}: {camera['advice']}")
     print(f"{found['pixels_per_mm']:.3g} px per mm on the gel: {out}")
     return 0

@@ -1,11 +1,10 @@
 """Tetrahedral meshes of the gel pad."""
 
 from synth.mesh.cache import default_edge_length, mesh_key, pad_mesh
-from synth.mesh.dome import domed
+from synth.mesh.dome import domed, rest_surface
 from synth.mesh.face import face_height, face_of
 from synth.mesh.graded import Counts, Focus, graded_box
 from synth.mesh.pad import PadMesh, check_mesh
-from synth.mesh.rest import rest_surface
 
 __all__ = [
     "Counts", "Focus", "PadMesh", "check_mesh", "default_edge_length", "domed", "face_height", "face_of",

@@ -46,7 +46,7 @@ def finish(context: JobContext, rendered: RenderedTrajectory) -> Outcome:
         started = time.perf_counter()
         sample = _sample(context, rendered, pair, diagnostics, views)
         traced = time.perf_counter()
-        warning = warning or _warning(sample)
+        warning = _warning(sample) if pair is simulated.pairs[0] else warning
         entry = write_sample_files(context.out, sample, context.job)
         seconds = {**shared, "flow": traced - started, "write": time.perf_counter() - traced}
         entries.append(replace(entry, seconds={stage: round(value, 4) for stage, value in seconds.items()}))
@@ -55,13 +55,13 @@ def finish(context: JobContext, rendered: RenderedTrajectory) -> Outcome:
 
 def _warning(sample: Sample) -> str:
     """What makes a sample's images useless: little gel in them, or light that is clipped, dark or flat; or empty."""
-    gel = np.isfinite(sample.flow.forward).all(axis=2)
+    gel = np.isfinite(sample.flow.forward[:, :, 0])
     if gel.mean() < LEAST_GEL:
         return (
             f"images show gel in {100 * gel.mean():.0f} % of their pixels only: check fx, fy and place of sensor.camera"
         )
     found = fault(levels_of(sample.image1, gel))
-    return f"light is {found}; `python -m synth preview` shows what to change, at once" if found else ""
+    return f"light is {found}; `python -m synth preview` of this scene says what to change" if found else ""
 
 
 def _diagnostics(context: JobContext, simulated: SimulatedTrajectory) -> dict[str, Any]:

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from benchmarks.capsule_surface import capsule_surface
 from synth.arrays import Points
 from synth.mesh.capsule import CapsuleFace
-from synth.mesh.rest import capsule_surface
 from synth.scene import Camera, Gel, Light, NoPattern, Sensor, Window
 from synth.surface import GelSurface
 

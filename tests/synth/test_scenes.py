@@ -9,9 +9,10 @@ from commands import refused
 from scipy import stats
 from tiny_scene import TEXT, write_tiny
 
+from benchmarks.capsule_surface import surface_at_rest
 from synth.dataset.reader import read_dataset
 from synth.flow.trace import trace
-from synth.mesh import face_of, rest_surface
+from synth.mesh import face_of
 from synth.optics import Optics
 from synth.pipeline.generate import generate
 from synth.planning import job_variant, plan, predict
@@ -58,7 +59,7 @@ def test_round_sensors_see_gel_and_no_light_and_are_pressed_where_a_camera_looks
         is_seen = []
         for sensor in scene.sensor.views.values():
             check_view(sensor)
-            surface, optics = rest_surface(sensor.gel), Optics.of(sensor)
+            surface, optics = surface_at_rest(sensor.gel), Optics.of(sensor)
             rays = optics.look(optics.centres)
             hits = trace(surface.material, surface.triangles, rays.origins, rays.directions)
             assert np.mean(hits.triangle >= 0) >= share
