@@ -126,7 +126,7 @@ def test_faces_at_rest_need_no_mesh(folder: Path) -> None:
         found = rest_surface(gel, folder)
         # Chords of edges h on a radius R take h² / 8 R² = 1.3e-3 off a length, at edges of .5 mm.
         assert areas(found.material, found.triangles).sum() == pytest.approx(area, rel=most)
-        assert len(found.triangles) > 4_000
+        assert len(found.triangles) >= 2 * 24**2  # as many as a pad has
         assert area_vectors(found.material, found.triangles)[:, 2].sum() < 0  # out of the gel
 
 
