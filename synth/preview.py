@@ -37,9 +37,8 @@ def preview(template: Template, out: Path, seed: int, variant: Variant) -> dict[
     if instance.content is None:
         raise InputError(f"{template.label}: {instance.rejected[-1]}")
     sensor, render = Sensor(**instance.content["sensor"]), Render(**instance.content.get("render", {}))
-    rays = MOST_RAYS // sum(camera.width * camera.height for camera in sensor.cameras.values())
-    most = int(np.clip(rays, 1, MOST_SAMPLES))
-    samples = most if render.samples_per_pixel == "auto" else min(most, render.samples_per_pixel)
+    pixels, samples = sum(one.width * one.height for one in sensor.cameras.values()), render.samples_per_pixel
+    samples = max(1, min(MOST_SAMPLES if samples == "auto" else samples, MOST_SAMPLES, MOST_RAYS // pixels))
     try:
         surface, scale = rest_surface(sensor.gel, template.folder), pixels_per_mm(sensor)
         painted = albedo(sensor, stream(template, seed, "pattern", 0), template.folder)
@@ -60,8 +59,8 @@ def preview(template: Template, out: Path, seed: int, variant: Variant) -> dict[
 
 def _png(images: list[Raster]) -> bytes:
     """Images (H, W, 1 or 3) side by side, with 8 bits, and MARK behind PNG's header of 33 bytes."""
-    eight = [np.round(image * (255 / np.iinfo(image.dtype).max)).astype(np.uint8) for image in images]
-    tall = max(map(len, eight))
+    tall = max(map(len, images))
+    eight = (np.round(image * (255 / np.iinfo(image.dtype).max)).astype(np.uint8) for image in images)
     parts = [np.pad(image, ((0, tall - len(image)), (0, 0), (0, 0))) for image in eight]
     png, size, check = encode_png(np.hstack(parts).squeeze()), len(MARK) - len(b"tEXt"), zlib.crc32(MARK)
     return png[:33] + struct.pack(">I", size) + MARK + struct.pack(">I", check) + png[33:]

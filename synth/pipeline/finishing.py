@@ -56,10 +56,8 @@ def finish(context: JobContext, rendered: RenderedTrajectory) -> Outcome:
 def _warning(sample: Sample) -> str:
     """What makes a sample's images useless: little gel in them, or light that is clipped, dark or flat; or empty."""
     gel = np.isfinite(sample.flow.forward[:, :, 0])
-    if gel.mean() < LEAST_GEL:
-        return (
-            f"images show gel in {100 * gel.mean():.0f} % of their pixels only: check fx, fy and place of sensor.camera"
-        )
+    if (share := gel.mean()) < LEAST_GEL:
+        return f"images show gel in {100 * share:.0f} % of their pixels only: check fx, fy and place of sensor.camera"
     found = fault(levels_of(sample.image1, gel))
     return f"light is {found}; `python -m synth preview` of this scene says what to change" if found else ""
 

@@ -26,20 +26,20 @@ def levels_of(image: NDArray[np.uint8] | NDArray[np.uint16], gel: BoolArray) -> 
     """The levels of an image (H, W) or (H, W, 3) where pixels (H, W) show gel: at least one."""
     import cv2
 
-    found: Levels = {}
+    found, side = {}, max(3, max(image.shape) // AROUND)
     for k, name in enumerate(("grey",) if image.ndim == 2 else ("red", "green", "blue")):
         level = image.reshape(*gel.shape, -1)[:, :, k] / np.float32(np.iinfo(image.dtype).max)
-        shown, side = level[gel], max(3, max(image.shape) // AROUND)
-        blind = cv2.blur((level == 1).astype(np.float32), (side, side))[gel] > 0.5
-        found[name] = {"mean": shown.mean(), "spread": shown.std(), "bright": np.percentile(shown, 99)}
-        found[name] |= {"clipped": (shown == 1).mean(), "dark": (shown < DARK).mean(), "blind": blind.mean()}
-    return {name: {key: round(float(value), 4) for key, value in one.items()} for name, one in found.items()}
+        shown, around = level[gel], cv2.blur((level == 1).astype(np.float32), (side, side))[gel]
+        one = {"mean": shown.mean(), "spread": shown.std(), "bright": np.percentile(shown, 99)}
+        one |= {"clipped": (shown == 1).mean(), "dark": (shown < DARK).mean(), "blind": (around > 0.5).mean()}
+        found[name] = {key: round(float(value), 4) for key, value in one.items()}
+    return found
 
 
 def fault(levels: Levels) -> str:
     """What is wrong with a picture's light; empty where nothing is."""
-    bright, spread = (max(one[key] for one in levels.values()) for key in ("bright", "spread"))
     worst = max(levels, key=lambda name: levels[name]["blind"])
+    bright, spread = (max(one[key] for one in levels.values()) for key in ("bright", "spread"))
     if levels[worst]["blind"] > MOST_BLIND:
         return f"clipped: {100 * levels[worst]['clipped']:.0f} % of the gel's pixels are at white in {worst}"
     if bright < LEAST_BRIGHT:
@@ -48,12 +48,10 @@ def fault(levels: Levels) -> str:
 
 
 def advice(trouble: str, radiance: Image, gel: BoolArray, camera: Camera) -> str:
-    """What to do about a `fault`: radiance (H, W, C) is not clipped, so that its factor holds for any light."""
+    """What to do about a `fault`, by radiance (H, W, C), which is not clipped, so that the factor always holds."""
     peak = float(np.percentile(expected_signal(radiance, camera)[gel], 99, axis=0).max())
-    if not trouble:
-        return "light suits the camera"
-    if trouble.startswith("flat") or peak == 0:
-        return f"{trouble}; check places and aims of sensor.lights, and sensor.pattern"
+    if not trouble or trouble.startswith("flat") or peak == 0:
+        return f"{trouble}; check aims of sensor.lights, and sensor.pattern" if trouble else "light suits the camera"
     factor = AIM**camera.gamma / peak
     return (
         f"{trouble}; multiply the power of all sensor.lights by {factor:.3g}, or give --set sensor.camera.exposure="

@@ -69,7 +69,7 @@ def test_a_scene_without_light_has_a_picture_and_a_word(said, tmp_path: Path) ->
     end = "color = [1, 1, 1]\npower = 10.0\n[contact.indenter]\nshape = 'sphere'\nradius_mm = 2.0\n"
     end += "[motion]\ndepth_mm = 0.1\n"
     scene.write_text(SENSOR.replace("window.thickness_mm = 3.0", "window.refractive_index = 1.0") + away + end)
-    told = r"main: dark: the brightest per cent .* is at \d % of white; check places and aims of sensor.lights, "
+    told = r"main: dark: the brightest per cent .* is at \d % of white; check aims of sensor.lights, "
     assert re.search(told, said(scene))  # what is there is read noise
     assert (tmp_path / "p.png").exists()
 
