@@ -119,7 +119,7 @@ def preview(
         for channel, one in camera["levels"].items():
             shares = f"at white {one['clipped']:.1%}, dark (below 5% of white) {one['dark']:.1%}"
             print(f"{name}, {channel}: mean {one['mean']:.1%} of white; pixels {shares}")
-        print(f"{name}: {camera['advice']}")
+        print(f"{name}: {camera['advice'] or 'light suits the camera'}")
     print(f"{found['pixels_per_mm']:.3g} px per mm on the gel: {out}")
     return 0
 

@@ -12,7 +12,7 @@ from synth.dataset.storage import refuse_foreign, replace_file
 from synth.errors import InputError
 from synth.mesh import rest_surface
 from synth.render.camera_image import camera_image
-from synth.render.exposure import advice, fault, levels_of
+from synth.render.exposure import advice, levels_of
 from synth.render.pattern import albedo, pixels_per_mm
 from synth.render.renderer import Renderer
 from synth.render.variant import Variant
@@ -52,7 +52,7 @@ def preview(template: Template, out: Path, seed: int, variant: Variant) -> dict[
         gel = np.asarray(radiance.any(axis=2) | ~radiance.any())  # all pixels where none is lit
         images.append(camera_image(radiance[:, :, :1] if variant.is_mono else radiance, camera, noise))
         levels = levels_of(images[-1].squeeze(), gel)
-        cameras[name or "main"] = {"levels": levels, "advice": advice(fault(levels), radiance, gel, camera)}
+        cameras[name or "main"] = {"levels": levels, "advice": advice(levels, radiance, gel, camera)}
     replace_file(out, _png(images))
     return {"picture": str(out), "pixels_per_mm": scale, "cameras": cameras}
 

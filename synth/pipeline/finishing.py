@@ -22,7 +22,7 @@ from synth.optics import Optics
 from synth.pipeline.records import JobContext, Outcome, SimulatedTrajectory
 from synth.pipeline.render_session import Frame, RenderedTrajectory
 from synth.render.camera_image import camera_image
-from synth.render.exposure import fault, levels_of
+from synth.render.exposure import advice, levels_of
 from synth.scene import Camera, MeshIndenter, Outputs
 from synth.scene.sampling import Pair
 from synth.simulate import State
@@ -46,20 +46,22 @@ def finish(context: JobContext, rendered: RenderedTrajectory) -> Outcome:
         started = time.perf_counter()
         sample = _sample(context, rendered, pair, diagnostics, views)
         traced = time.perf_counter()
-        warning = _warning(sample) if pair is simulated.pairs[0] else warning
+        warning = (
+            _warning(sample, rendered.frames[pair.frames[0]].radiance[""]) if pair is simulated.pairs[0] else warning
+        )
         entry = write_sample_files(context.out, sample, context.job)
         seconds = {**shared, "flow": traced - started, "write": time.perf_counter() - traced}
         entries.append(replace(entry, seconds={stage: round(value, 4) for stage, value in seconds.items()}))
     return Outcome(tuple(entries), simulated.failures, (), tuple(filter(None, (simulated.warning, warning))))
 
 
-def _warning(sample: Sample) -> str:
+def _warning(sample: Sample, radiance: Image) -> str:
     """What makes a sample's images useless: little gel in them, or light that is clipped, dark or flat; or empty."""
     gel = np.isfinite(sample.flow.forward[:, :, 0])
     if (share := gel.mean()) < LEAST_GEL:
         return f"images show gel in {100 * share:.0f} % of their pixels only: check fx, fy and place of sensor.camera"
-    found = fault(levels_of(sample.image1, gel))
-    return f"light is {found}; `python -m synth preview` of this scene says what to change" if found else ""
+    found = advice(levels_of(sample.image1, gel), radiance, gel, sample.scene.sensor.camera)
+    return f"light is {found} (see `python -m synth preview`)" if found else ""
 
 
 def _diagnostics(context: JobContext, simulated: SimulatedTrajectory) -> dict[str, Any]:

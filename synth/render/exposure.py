@@ -36,22 +36,26 @@ def levels_of(image: NDArray[np.uint8] | NDArray[np.uint16], gel: BoolArray) -> 
     return found
 
 
-def fault(levels: Levels) -> str:
-    """What is wrong with a picture's light; empty where nothing is."""
+def advice(levels: Levels, radiance: Image, gel: BoolArray, camera: Camera) -> str:
+    """What is wrong with a picture's light, and what to do about it; empty where nothing is.
+
+    The radiance (H, W, C) is not clipped, so that the factor holds for any light.
+    """
     worst = max(levels, key=lambda name: levels[name]["blind"])
     bright, spread = (max(one[key] for one in levels.values()) for key in ("bright", "spread"))
-    if levels[worst]["blind"] > MOST_BLIND:
-        return f"clipped: {100 * levels[worst]['clipped']:.0f} % of the gel's pixels are at white in {worst}"
-    if bright < LEAST_BRIGHT:
-        return f"dark: the brightest per cent of the gel's pixels is at {100 * bright:.0f} % of white"
-    return "" if spread >= LEAST_SPREAD else f"flat: levels on the gel spread by {100 * spread:.1f} % of white"
-
-
-def advice(trouble: str, radiance: Image, gel: BoolArray, camera: Camera) -> str:
-    """What to do about a `fault`, by radiance (H, W, C), which is not clipped, so that the factor always holds."""
     peak = float(np.percentile(expected_signal(radiance, camera)[gel], 99, axis=0).max())
-    if not trouble or trouble.startswith("flat") or peak == 0:
-        return f"{trouble}; check aims of sensor.lights, and sensor.pattern" if trouble else "light suits the camera"
+    if peak == 0:
+        return "dark: no light reaches the gel that the camera sees; check places and aims of sensor.lights"
+    if levels[worst]["blind"] > MOST_BLIND:
+        trouble = f"clipped: {100 * levels[worst]['clipped']:.0f} % of the gel's pixels are at white in {worst}"
+    elif bright < LEAST_BRIGHT:
+        trouble = f"dark: the brightest per cent of the gel's pixels is at {100 * bright:.0f} % of white"
+    elif spread < LEAST_SPREAD:
+        return (
+            f"flat: levels on the gel spread by {100 * spread:.1f} % of white; check aims of sensor.lights, and pattern"
+        )
+    else:
+        return ""
     factor = AIM**camera.gamma / peak
     return (
         f"{trouble}; multiply the power of all sensor.lights by {factor:.3g}, or give --set sensor.camera.exposure="
