@@ -12,7 +12,7 @@ from synth.scene import Camera
 
 AIM, DARK = 0.85, 0.05
 """Level of the rule of thumb; level below which pixels are dark."""
-MOST_BLIND, LEAST_BRIGHT, LEAST_SPREAD = 0.02, 0.4, 0.02
+MOST_BLIND, LEAST_BRIGHT, LEAST_SPREAD = 0.04, 0.4, 0.02
 """Beyond these light is amiss: share of blind pixels, level of the brightest per cent, standard deviation of levels."""
 AROUND = 20
 """Side of the square in which most pixels around a blind one are white: the picture's longest over this number."""
