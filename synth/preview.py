@@ -48,7 +48,8 @@ def preview(template: Template, out: Path, seed: int, variant: Variant) -> dict[
     radiances = renderer.radiances(surface.material, int(stream(template, seed, "render rest", 0).integers(2**31)))
     images, cameras = [], {}
     for number, (name, radiance) in enumerate(radiances.items()):
-        camera, noise = sensor.views[name].camera, stream(template, seed, "noise", 0, 0, *[number][:number])
+        further = [number] if number else []  # as `generate` numbers the noise of a sample's images
+        camera, noise = sensor.views[name].camera, stream(template, seed, "noise", 0, 0, *further)
         gel = np.asarray(radiance.any(axis=2) | ~radiance.any())  # all pixels where none is lit
         images.append(camera_image(radiance[:, :, :1] if variant.is_mono else radiance, camera, noise))
         levels = levels_of(images[-1].squeeze(), gel)
