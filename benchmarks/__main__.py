@@ -21,6 +21,7 @@ QUESTIONS = {
     "light": "separated light against path tracing",
     "flow": "the flow's error against its run time",
     "scale": "pairs a second, and where the time goes",
+    "throughput": "the main job on this machine: pairs a second, and what limits them",
     "round_gel": "the flow's error against run time for a round gel, by mesh",
     "synthetic_set": "makes the synthetic test set of the report on gelflow",
     "sigma": "is the flow's uncertainty calibrated? fits its constants",

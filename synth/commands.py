@@ -38,9 +38,9 @@ def generate(
         int | None,
         Parameter(
             converter=whole(1),
-            help="Processes that make samples, on one core each. Default: this process makes them and renders on all "
-            "cores. The samples are the same. With numerics.solver = batched: processes beside the one that simulates "
-            "and renders, 1 for none; default on a GPU: one for each further core.",
+            help="Processes that make samples, on one core each; the samples are the same. Default: on a GPU one for "
+            "each core beside this process's, else none: this process makes them and renders on all cores. With the "
+            "batched solver this process simulates, and 1 is for no others.",
         ),
     ] = None,
     ray: Annotated[
@@ -156,7 +156,7 @@ def simulate(
             trajectory = simulate_press(press, on_progress=lambda share: advance(int(100 * share), 100))
     except InputError as error:
         raise InputError(f"{template.label}: {error}") from error
-    record = write_trajectory(out, as_pressed(instance, press.path.body), trajectory)
+    record = write_trajectory(out, as_pressed(instance, press.path.body), press.path, trajectory)
     if as_json:
         print(json.dumps(record))
     else:

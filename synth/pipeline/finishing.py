@@ -84,11 +84,12 @@ def _sample(
     """`views` are the trajectory's cameras by name."""
     simulated = rendered.simulated
     scene, path = simulated.scene, simulated.path
-    first, second = (simulated.states[frame] for frame in pair.frames)
-    patch = None
+    first, second = states = [simulated.states[frame] for frame in pair.frames]
+    solver, patch = [state.summary() for state in states], None
     if scene.outputs.contact:
-        face, pose = rendered.surface.coarse, path.recorded(pair.frames[1])
-        patch = ContactPatch(face, second.displacement, path.body, pose, second.max_penetration_mm)
+        for state, frame, summary in zip(states, pair.frames, solver, strict=True):
+            patch = ContactPatch.of(simulated.faces, state.displacement, path, frame, state.max_penetration_mm)
+            summary["contact_area_mm2"] = patch.area_mm2
     frames = [rendered.frames[frame] for frame in pair.frames]
     cameras = {}
     for k, (name, sensor) in enumerate(scene.sensor.views.items()):
@@ -109,7 +110,7 @@ def _sample(
         surface=rendered.surface,
         displacement1=first.displacement,
         displacement2=second.displacement,
-        diagnostics={"solver": [first.summary(), second.summary()], **diagnostics},
+        diagnostics={"solver": solver, **diagnostics},
         force_n=np.array([first.force_n, second.force_n]),
         torque_nmm=np.array([first.torque_nmm, second.torque_nmm]),
         further=cameras,

@@ -98,7 +98,7 @@ def _outcomes_of_pool(
     with parent_death, parents_end, one_thread_each(), pool:
         try:
             # All begin at once: the first items may be long in coming. Items find out if the pool is broken.
-            with interrupts_blocked(), contextlib.suppress(OSError, ValueError, BrokenProcessPool):
+            with interrupts_blocked(), main_left_out(), contextlib.suppress(OSError, ValueError, BrokenProcessPool):
                 for _ in range(workers):
                     pool.submit(int)
             while True:

@@ -6,14 +6,13 @@ Dr.Jit cannot replay what looks up a texture in the GPU's own units, which moreo
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from synth.arrays import Image
+from synth.render.aligned import aligned
 
 
 @dataclass(init=False, eq=False)
 class AlbedoMap:
-    """A texture (rows, columns, channels) float32 in [0, 1], which must not be changed afterwards."""
+    """A texture (rows, columns, channels) float32 in [0, 1]."""
 
     channels: int
     _mi: Any
@@ -26,7 +25,7 @@ class AlbedoMap:
 
         self._mi, self._dr = mi, dr
         rows, columns, self.channels = texture.shape
-        self._values = mi.Float(np.ascontiguousarray(texture).ravel())
+        self._values = mi.Float(aligned(texture))
         self._size = mi.Vector2i(*(dr.opaque(mi.Int32, count) for count in (columns, rows)))
 
     def at(self, place: Any, active: Any) -> list[Any]:

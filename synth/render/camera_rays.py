@@ -25,6 +25,7 @@ from synth.errors import InputError
 from synth.optics import Optics
 from synth.optics.mirror import FlatMirror
 from synth.optics.window import RoundWindow
+from synth.render.aligned import aligned
 from synth.render.gel_mesh import MIRROR
 from synth.render.thin_lens import ThinLens
 from synth.render.variant import LLVM_HINT
@@ -82,9 +83,9 @@ class CameraRays:
         self._focus = dr.opaque(mi.Float, thin.distance_mm) if thin else None
         if self._distortion is not None or self._is_fisheye:
             local = _centres(optics, camera)
-            self._seen = mi.Bool(np.isfinite(local[:, 0]))
+            self._seen = mi.Bool(aligned(np.isfinite(local[:, 0]), np.bool_))
             start = np.nan_to_num(local).astype(np.float32)
-            self._start = [mi.Float(np.ascontiguousarray(start[:, axis])) for axis in range(start.shape[1])]
+            self._start = [mi.Float(aligned(start[:, axis])) for axis in range(start.shape[1])]
 
     def _vector(self, vector: FloatArray) -> Any:
         """A vector (3,) of the scene in the renderer's frame."""

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from synth.render.aligned import aligned
 from synth.render.gel_mesh import GelMesh
 
 
@@ -47,8 +48,8 @@ class GelHits:
     def take(self, mesh: GelMesh) -> None:
         """Faces of another surface."""
         mi = self._mi
-        self.corners = [mi.UInt32(column) for column in np.ascontiguousarray(mesh.faces().reshape(-1, 3).T)]
-        self._incident = [mi.UInt32(column) for column in np.ascontiguousarray(mesh.incident.T)]
+        self.corners = [mi.UInt32(aligned(column, np.uint32)) for column in mesh.faces().reshape(-1, 3).T]
+        self._incident = [mi.UInt32(aligned(column, np.uint32)) for column in mesh.incident.T]
 
     def place(self, positions: Any) -> None:
         """How the gel lies now, by its vertices (3 v of mi.Float)."""

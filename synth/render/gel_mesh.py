@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.arrays import Points
+from synth.render.aligned import aligned
 from synth.render.chart import Chart
 from synth.surface import GelSurface, vertex_normals
 
 MIRROR = np.array([1.0, -1.0, 1.0])
 """Componentwise factor from the scene's frame to the renderer's and back."""
-_ALIGNED = 16
-"""Numbers of float32 in the widest of a processor's registers, 64 bytes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,24 +47,15 @@ class GelMesh:
         return found
 
     def texture_coordinates(self) -> NDArray[np.float32]:
-        """(2 v,) u along +x and v along +y, each 0..1 over the chart; Mitsuba's v = 0 is a texture's first row.
-
-        Aligned: on a processor Dr.Jit uses this memory, and reads pairs from it by other code if it is not.
-        """
+        """(2 v,) u along +x and v along +y, each 0..1 over the chart; Mitsuba's v = 0 is a texture's first row."""
         places, (width, height) = self.chart.flattened(self.surface.material), self.chart.size_mm
-        u = places[:, 0] / width + 0.5
-        v = places[:, 1] / height + 0.5
-        room = np.empty(2 * len(u) + _ALIGNED, dtype=np.float32)
-        start = -room.ctypes.data // room.itemsize % _ALIGNED
-        found = room[start : start + 2 * len(u)]
-        found[::2], found[1::2] = u, v
-        return found
+        return aligned(places / (width, height) + 0.5)
 
     def positions(self, positions: Points) -> NDArray[np.float32]:
         """(3 v,) in the renderer's frame, from positions (v, 3) float64 mm."""
         if self.behind is not None:
             positions = mirrored(positions, self.behind)
-        return (positions * MIRROR).astype(np.float32).ravel()
+        return aligned(positions * MIRROR)
 
     def normals(self, positions: Points) -> NDArray[np.float32]:
         """(3 v,) area-weighted unit normals in the renderer's frame, from positions (v, 3) float64 mm.

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.polynomial import Chebyshev, Polynomial
 
+from synth.render.aligned import aligned
 from synth.render.lights import rectangles, reflectance
 from synth.scene import Light
 
@@ -169,7 +170,7 @@ def _floats(values: Any, mi: Any) -> Any:
     """Numbers as mi.Float in memory, never as a literal."""
     import drjit as dr
 
-    found = mi.Float(np.asarray(values, dtype=np.float32).ravel())
+    found = mi.Float(aligned(values))
     dr.make_opaque(found)
     return found
 

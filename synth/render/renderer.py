@@ -38,7 +38,7 @@ _MAX_WAVEFRONT, _MAX_WAVEFRONT_GPU = 2**22, 2**24
 """Samples traced at once. Constants, because the split into passes decides the random numbers."""
 
 _PILOT_SEEDS = (1, 2)
-_RECORDINGS = 16
+_RECORDINGS = 8
 """Recordings of frames that are kept: every size of mesh and of picture has its own."""
 
 _LIGHT_PART = 2**31
@@ -255,15 +255,17 @@ class Recordings:
         import drjit as dr
 
         key = (function, *static)
-        if key not in self._known:
-            if len(self._known) == _RECORDINGS:
-                del self._known[next(iter(self._known))]
+        found = self._known.pop(key, None)
+        if found is None:
 
             def called(*values: Any) -> Any:
                 return function(*values, *static)
 
-            self._known[key] = dr.freeze(called, warn_after=10**9)
-        return self._known[key]
+            found = dr.freeze(called, warn_after=10**9)
+        self._known[key] = found  # the last used comes last
+        if len(self._known) > _RECORDINGS:
+            del self._known[next(iter(self._known))]
+        return found
 
 
 def prepare(light: SeparatedLight, frame: Any, _: Any, *arguments: Any) -> Any:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.arrays import FloatArray, Points, Triangles
+from synth.render.aligned import aligned
 
 _DEGREE = 4
 """Degree of V's polynomials."""
@@ -51,8 +52,8 @@ class Nodes:
 
     def numbers(self, mi: Any) -> tuple[Any, list[Any]]:
         """Faces (mi.UInt32) and weights (3 of mi.Float) on the device."""
-        weights = [mi.Float(np.ascontiguousarray(column, dtype=np.float32)) for column in self.weights.T]
-        return mi.UInt32(self.faces.astype(np.uint32)), weights
+        weights = [mi.Float(aligned(column)) for column in self.weights.T]
+        return mi.UInt32(aligned(self.faces, np.uint32)), weights
 
 
 class SmoothFit:
@@ -77,7 +78,7 @@ class SmoothFit:
         import drjit as dr
 
         centre, half = ([dr.opaque(mi.Float, float(x)) for x in of] for of in (self._centre, self._half))
-        return {"solution": mi.Float(self._solution.astype(np.float32).ravel()), "centre": centre, "half": half}
+        return {"solution": mi.Float(aligned(self._solution)), "centre": centre, "half": half}
 
 
 def fitted(fit: dict[str, Any], samples: list[Any], positions: Any, normals: Any, mi: Any) -> list[Any]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from synth.arrays import BoolArray, FloatArray, Points
 from synth.simulate.indenter import RigidBody
-from synth.simulate.load_path import Pose
+from synth.simulate.load_path import LoadPath, Pose
 from synth.simulate.measure import Distance
 from synth.surface import ContactFaces, GelSurface
 
@@ -50,6 +50,13 @@ class ContactPatch:
         a, b, c = (deformed[corner] for corner in surface.triangles.T)
         shares = self.holds(material, deformed)[surface.triangles].mean(axis=1)
         self.area_mm2 = float(np.linalg.norm(np.cross(b - a, c - a), axis=1) @ shares / 2)
+
+    @classmethod
+    def of(
+        cls, face: ContactFaces, displacement: FloatArray, path: LoadPath, number: int, deepest_mm: float
+    ) -> "ContactPatch":
+        """That of a trajectory's state by its number, 0 for the undeformed one."""
+        return cls(face, displacement, path.body, path.recorded(number), deepest_mm)
 
     def holds(self, material: Points, deformed: Points) -> BoolArray:
         """(n,) which material points (n, 3) mm, by their undeformed and deformed places, touch."""

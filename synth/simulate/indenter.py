@@ -180,15 +180,16 @@ def _object(indenter: MeshIndenter, folder: Path, resolution_mm: float, touchabl
             place = rotation @ np.multiply(offset, [1, -1, 1])
     turned = replace(turned, points=turned.points - place * [1, 1, 0])
     grid = _grid_over(turned, indenter, radius, touchable)
-    values, moved = _rounded_distance(turned, grid, radius, f"contact.indenter.file = {indenter.file!r}")
-    pressed = int(np.clip((lowest - touchable.depth_mm - grid.corner[2]) / grid.spacing, 0, grid.counts[2] - 1))
+    sharp, values = _rounded_distance(turned, grid, radius, f"contact.indenter.file = {indenter.file!r}")
     shape = np.array([0.0, *grid.corner, grid.spacing, *grid.counts])
     coefficients = np.asarray(spline_filter(values, order=3, mode="mirror"), dtype=np.float64)
     near = values < radius + grid.spacing
     reach = min(lowest, float((grid.points(near)[:, 2] - values[near]).max()))  # also of balls beside the solid
     kept = LOWERED if indenter.fillet_mm is None else 1.0
     reach = lowest - max(kept * (lowest - reach), lowest - reach - MOST_RAISED * touchable.depth_mm)
-    lost = float(moved[:, :, pressed:].max())
+    corners = turned.points[turned.points[:, 2] >= lowest - touchable.depth_mm]
+    corners = corners[np.abs(grid.at(corners, sharp)) < grid.spacing]  # not those of walls within the solid
+    lost = float(np.abs(grid.at(corners, values)).max(initial=0.0))
     return RigidBody(KINDS["mesh"], shape, np.eye(3), reach, coefficients, max(radius, grid.spacing), radius, lost)
 
 
@@ -214,7 +215,7 @@ def _grid_over(turned: Triangles, indenter: MeshIndenter, radius: float, touchab
 
 
 def _rounded_distance(turned: Triangles, grid: Grid, radius: float, named: str) -> tuple[FloatArray, FloatArray]:
-    """A surface's signed distance on a grid after rounding, and how far that moved the surface where a sample is on it.
+    """A surface's signed distance on a grid before and after rounding.
 
     InputError, beginning as `named`, where it is no solid.
     """
@@ -239,7 +240,7 @@ def _rounded_distance(turned: Triangles, grid: Grid, radius: float, named: str) 
             f"{named}: it encloses no volume that a grid of {grid.spacing:.2g} mm resolves; a single sheet needs a "
             "thickness"
         )
-    return values, np.where(np.abs(sharp) < grid.spacing, np.abs(values - sharp), 0.0)
+    return sharp, values
 
 
 def object_radius(indenter: MeshIndenter, resolution_mm: float) -> float:

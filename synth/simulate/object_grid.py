@@ -45,6 +45,12 @@ class Grid:
     def points(self, where: BoolArray) -> Points:
         return self.corner + self.spacing * np.argwhere(where)
 
+    def at(self, points: Points, values: FloatArray) -> FloatArray:
+        """Samples' values between them, linearly, at points (n, 3); beyond the grid those of its edge."""
+        from scipy.ndimage import map_coordinates
+
+        return np.asarray(map_coordinates(values, ((points - self.corner) / self.spacing).T, order=1, mode="nearest"))
+
     def distance(self, surface: "Nearest", where: BoolArray) -> FloatArray:
         """Distances of some samples from a surface, mm; infinite elsewhere."""
         found = np.full(self.counts, np.inf)

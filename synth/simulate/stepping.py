@@ -15,7 +15,6 @@ import numpy as np
 
 from synth.arrays import FloatArray
 from synth.scene import Numerics
-from synth.simulate.contact_patch import ContactPatch
 from synth.simulate.distance import KINDS
 from synth.simulate.indenter import RigidBody
 from synth.simulate.load_path import LoadPath
@@ -284,8 +283,6 @@ class Stepper:
         """A solution that was just found, in the units of a trajectory."""
         pose = self.path.pose(target)
         force, torque, traction = (self._modulus * value for value in self.system.forces(solution.state))
-        face, deepest = self.system.space.surface, self.system.deepest()
-        moved = solution.state.u[self.system.space.surface_nodes]
         return State(
             depth_mm=pose.depth_mm,
             shear_mm=pose.shear_mm,
@@ -297,9 +294,8 @@ class Stepper:
             newton_iterations=self._iterations,
             residual=relative_residual(solution.residual),
             min_jacobian=solution.residual.smallest_jacobian,
-            max_penetration_mm=deepest,
+            max_penetration_mm=self.system.deepest(),
             slip_ratio=self.system.slip_ratio(self.indenter),
-            contact_area_mm2=ContactPatch(face, moved, self.path.body, pose, deepest).area_mm2,
         )
 
     def _lengthen(self, target: float, iterations: int, relaxed: bool) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from synth.arrays import FloatArray
 from synth.dataset.storage import replace_file, storage_errors
 from synth.scene import Scene
+from synth.simulate.contact_patch import ContactPatch
 from synth.simulate.load_path import LoadPath, Pose
 from synth.simulate.space import Space
 
@@ -28,7 +29,6 @@ class State:
         min_jacobian: smallest det F at any quadrature point or sample point (`synth.simulate.inversion_barrier`).
         max_penetration_mm: deepest contact point inside the indenter.
         slip_ratio: of the touching area, the part that slipped in the last load step.
-        contact_area_mm2: of the deformed contact face, see `synth.simulate.contact_patch`.
     """
 
     depth_mm: float
@@ -43,7 +43,6 @@ class State:
     min_jacobian: float
     max_penetration_mm: float
     slip_ratio: float
-    contact_area_mm2: float
 
     def summary(self) -> dict[str, Any]:
         """The state without its fields, as trajectory.json has it."""
@@ -57,7 +56,7 @@ def at_rest(path: LoadPath, space: Space) -> list[State]:
     fields = np.zeros((len(space.points), 3)), np.zeros((len(space.surface_nodes), 3))
     poses = [path.pose(place) for place in (0.0, *places)]
     return [
-        State(pose.depth_mm, pose.shear_mm, pose.twist_deg, *fields, zero, zero, 0, 0.0, 1.0, 0.0, 0.0, 0.0)
+        State(pose.depth_mm, pose.shear_mm, pose.twist_deg, *fields, zero, zero, 0, 0.0, 1.0, 0.0, 0.0)
         for pose in poses
     ]
 
@@ -105,16 +104,25 @@ def too_deep(pose: Pose, share: float) -> str:
     )
 
 
-def write_trajectory(directory: Path, scene: Scene, trajectory: Trajectory) -> dict[str, Any]:
+def write_trajectory(directory: Path, scene: Scene, path: LoadPath, trajectory: Trajectory) -> dict[str, Any]:
     """Write DIR/trajectory.json and DIR/state_000.vtu and so on, in the place of an earlier trajectory's.
 
     The VTU files hold the deformed contact surface with the fields displacement (mm) and traction (MPa), and the mesh's
     hash as the field datum "mesh". On round gels shear_mm lies in the tangent plane at the place of the press, and
-    force_n and torque_nmm are in the sensor's frame. Returns the JSON's content.
+    force_n and torque_nmm are in the sensor's frame. contact_area_mm2 is of the deformed contact face, see
+    `synth.simulate.contact_patch`. Returns the JSON's content.
     """
+    space, states = trajectory.space, trajectory.states
+    touching = [
+        ContactPatch.of(space.surface, state.displacement[space.surface_nodes], path, number, state.max_penetration_mm)
+        for number, state in enumerate(states)
+    ]
     record = {
         "scene": scene.model_dump(mode="json"),
-        "steps": [state.summary() for state in trajectory.states],
+        "steps": [
+            {**state.summary(), "contact_area_mm2": patch.area_mm2}
+            for state, patch in zip(states, touching, strict=True)
+        ],
         "status": trajectory.status,
         "reason": trajectory.reason,
         "seconds": trajectory.seconds,

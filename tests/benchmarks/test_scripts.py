@@ -127,6 +127,19 @@ def test_round_gel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert even["flow_percent"] == pytest.approx(whole["flow_percent"], rel=0.1)
 
 
+def test_throughput_keeps_earlier_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table = tmp_path / "throughput.csv"
+    for label in ("before", "after"):
+        command = ["throughput", "--scene", str(write_tiny(tmp_path)), "--n", "4", "--table", str(table)]
+        assert main([*command, "--size", "32x24", "--label", label]) == 0
+    before, after = read(table)
+    assert (before["label"], after["label"], after["size"], after["pairs"]) == ("before", "after", "32x24", 4)
+    for row in (before, after):
+        assert 0 < row["first_s"] < row["total_s"]
+        assert row["share_of_limit"] == pytest.approx(row["pairs_per_second"] / row["cores_limit"], rel=1e-3)
+    assert "before" in capsys.readouterr().out
+
+
 def test_scale(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["scale", "--scene", str(write_tiny(tmp_path)), "--n", "4", "--size", "32x24", "--workers", "1"]
     ((alone, row),) = again([*command, "--set", "motion.depth_mm=-1.0"], tmp_path / "out", "scale.csv")

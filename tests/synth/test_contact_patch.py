@@ -95,7 +95,11 @@ def pressed(indenter: Indenter, across: int, depth: float, element: str = "p2p1"
     numerics = {"element": element}
     drawn = scene(SIZE, indenter=indenter.model_dump(), motion={"depth_mm": depth}, numerics=numerics)
     mesh = graded_mesh(drawn.sensor.gel, Focus((0.0, 0.0), (1.6, 1.6)), across)[0]
-    return simulate_press(Press.of(drawn, mesh)).states[-1].contact_area_mm2
+    press = Press.of(drawn, mesh)
+    found = simulate_press(press)
+    space, state = found.space, found.states[-1]
+    moved = state.displacement[space.surface_nodes]
+    return ContactPatch.of(space.surface, moved, press.path, len(found.states) - 1, state.max_penetration_mm).area_mm2
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import numpy as np
 from synth.arrays import FloatArray
 from synth.simulate.batched.lanes import COMPLETE, NO_CONTACT, NO_EQUILIBRIUM, TOO_DEEP, Presses
 from synth.simulate.batched.reductions import SCALARS
-from synth.simulate.contact_patch import ContactPatch
 from synth.simulate.press import Press
 from synth.simulate.space import Space
 from synth.simulate.stepping import allowed_share
@@ -102,7 +101,6 @@ def _state(press: Press, length: float, record: FloatArray, space: Space) -> Sta
     fx, fy, fz, mx, my, mz = (modulus_mpa * value for value in scalars[:6])
     touching, slipping, residual, smallest, deepest, iterations = scalars[6:]
     displacement = fields[:end].reshape(-1, 3).copy()
-    patch = ContactPatch(space.surface, displacement[space.surface_nodes], press.path.body, pose, deepest)
     return State(
         depth_mm=pose.depth_mm,
         shear_mm=pose.shear_mm,
@@ -116,5 +114,4 @@ def _state(press: Press, length: float, record: FloatArray, space: Space) -> Sta
         min_jacobian=smallest,
         max_penetration_mm=deepest,
         slip_ratio=slipping / touching if touching > 0 else 0.0,
-        contact_area_mm2=patch.area_mm2,
     )
