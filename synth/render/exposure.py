@@ -43,9 +43,6 @@ def advice(levels: Levels, radiance: Image, gel: BoolArray, camera: Camera) -> s
     """
     worst = max(levels, key=lambda name: levels[name]["blind"])
     bright, spread = (max(one[key] for one in levels.values()) for key in ("bright", "spread"))
-    peak = float(np.percentile(expected_signal(radiance, camera)[gel], 99, axis=0).max())
-    if peak == 0:
-        return "dark: no light reaches the gel that the camera sees; check places and aims of sensor.lights"
     if levels[worst]["blind"] > MOST_BLIND:
         trouble = f"clipped: {100 * levels[worst]['clipped']:.0f} % of the gel's pixels are at white in {worst}"
     elif bright < LEAST_BRIGHT:
@@ -56,6 +53,9 @@ def advice(levels: Levels, radiance: Image, gel: BoolArray, camera: Camera) -> s
         )
     else:
         return ""
+    peak = float(np.percentile(expected_signal(radiance, camera)[gel], 99, axis=0).max())
+    if peak == 0:
+        return "dark: no light reaches the gel that the camera sees; check places and aims of sensor.lights"
     factor = AIM**camera.gamma / peak
     return (
         f"{trouble}; multiply the power of all sensor.lights by {factor:.3g}, or give --set sensor.camera.exposure="
