@@ -1,4 +1,4 @@
-"""The command line: `python -m synth generate|plan|simulate|stress|calibrate|inspect|verify|export|doctor`.
+"""The command line: `python -m synth generate|plan|preview|simulate|stress|calibrate|inspect|verify|export|doctor`.
 
 Exit status: 0 done, 1 done with failed samples or a failed check, 2 wrong input, 130 interrupted. Nothing heavy is
 imported before a command runs.
@@ -14,7 +14,7 @@ from cyclopts import App, CycloptsError, Parameter
 
 from synth import __version__
 from synth.cli_options import DEFAULT_SCENE, AsJson, Assignments, SceneName, whole
-from synth.commands import export, generate, inspect, plan, simulate, verify
+from synth.commands import export, generate, inspect, plan, preview, simulate, verify
 from synth.errors import InputError, printable
 
 app = App(
@@ -25,7 +25,7 @@ app = App(
     result_action="return_value",
     suppress_keyboard_interrupt=False,
 )
-for command in (generate, plan, simulate, inspect, verify, export):
+for command in (generate, plan, preview, simulate, inspect, verify, export):
     app.command(command)
 
 

@@ -95,6 +95,35 @@ def plan(
     return _show_plan(template, variant, n, as_json)
 
 
+def preview(
+    *,
+    scene: SceneName = DEFAULT_SCENE,
+    out: Annotated[Path, Parameter(help="PNG file; further cameras stand beside the main one.")] = Path("preview.png"),
+    seed: Annotated[int, Parameter(converter=whole(0), help="Seed of everything random.")] = 0,
+    assignments: Assignments = None,
+    device: Device = "auto",
+    as_json: AsJson = False,
+) -> int:
+    """Makes one picture of the gel at rest in seconds, and says whether its light suits the camera."""
+    from synth.preview import preview as photograph
+    from synth.render.variant import job_variant
+
+    template = _loaded(scene, assignments)
+    variant = job_variant(template, device)
+    found = photograph(template, out, seed, variant)
+    if as_json:
+        print(json.dumps(found))
+        return 0
+    _say_hint(variant)
+    for name, camera in found["cameras"].items():
+        for channel, one in camera["levels"].items():
+            shares = f"at white {one['clipped']:.1%}, dark (below 5% of white) {one['dark']:.1%}"
+            print(f"{name}, {channel}: mean {one['mean']:.1%} of white; pixels {shares}")
+        print(f"{name}: {camera['advice'] or 'light suits the camera'}")
+    print(f"{found['pixels_per_mm']:.3g} px per mm on the gel: {out}")
+    return 0
+
+
 def simulate(
     *,
     scene: SceneName,

@@ -15,11 +15,13 @@ mid-edge nodes of the face back on the sphere, for contact and for the picture.
 """
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
 from synth.errors import InputError
-from synth.mesh.face import PadFace, face_height
+from synth.mesh.capsule import CapsuleFace
+from synth.mesh.face import PadFace, face_height, face_of
 from synth.mesh.pad import PadMesh
 from synth.scene import Gel
 from synth.surface import FACE_EDGES, ContactFaces, GelSurface
@@ -49,12 +51,21 @@ def domed(mesh: PadMesh, dome_radius_mm: float | None) -> PadMesh:
     return bulged
 
 
-def rest_surface(gel: Gel) -> GelSurface:
-    """The undeformed contact face of a pad, in quadratic triangles where it is curved.
+def rest_surface(gel: Gel, folder: Path = Path()) -> GelSurface:
+    """The undeformed contact face, of a dome in quadratic triangles; a gel's files are relative to `folder`.
 
     Light that varies smoothly is linear on each triangle. The surface does not depend on the meshes of trajectories, so
     that neither does the picture of a sensor at rest.
     """
+    face = face_of(gel, folder)
+    if not isinstance(face, PadFace):
+        if isinstance(face, CapsuleFace):
+            points, triangles = face.triangles(gel.size_mm[0] / (2 * REST_CELLS))
+            triangles = triangles[face.holds(points)[triangles].all(axis=1)]
+        else:
+            points, triangles = np.asarray(face.surfaces.face.points, float), face.surfaces.face.regular_faces
+        parts = int(np.ceil(2 * REST_CELLS / len(triangles) ** 0.5))  # of a file's triangles, which may be few
+        return GelSurface(ContactFaces(points, triangles), parts)
     x, y = gel.size_mm[0] / 2, gel.size_mm[1] / 2
     if gel.dome_radius_mm is None:
         corners_of_pad = np.array([[-x, -y, 0.0], [x, -y, 0.0], [x, y, 0.0], [-x, y, 0.0]])

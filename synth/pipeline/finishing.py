@@ -22,6 +22,7 @@ from synth.optics import Optics
 from synth.pipeline.records import JobContext, Outcome, SimulatedTrajectory
 from synth.pipeline.render_session import Frame, RenderedTrajectory
 from synth.render.camera_image import camera_image
+from synth.render.exposure import advice, levels_of
 from synth.scene import Camera, MeshIndenter, Outputs
 from synth.scene.sampling import Pair
 from synth.simulate import State
@@ -29,8 +30,8 @@ from synth.simulate.contact_patch import ContactPatch
 from synth.simulate.press import as_pressed
 from synth.simulate.resolution import accuracy
 
-DARKEST, BRIGHTEST, LEAST_GEL = 12, 245, 0.5
-"""Mean grey levels of 255, and share of pixels, beyond which images are warned of."""
+LEAST_GEL = 0.5
+"""Share of pixels that show gel, below which images are warned of."""
 
 
 def finish(context: JobContext, rendered: RenderedTrajectory) -> Outcome:
@@ -45,22 +46,22 @@ def finish(context: JobContext, rendered: RenderedTrajectory) -> Outcome:
         started = time.perf_counter()
         sample = _sample(context, rendered, pair, diagnostics, views)
         traced = time.perf_counter()
-        warning = warning or _warning(sample)
+        warning = (
+            _warning(sample, rendered.frames[pair.frames[0]].radiance[""]) if pair is simulated.pairs[0] else warning
+        )
         entry = write_sample_files(context.out, sample, context.job)
         seconds = {**shared, "flow": traced - started, "write": time.perf_counter() - traced}
         entries.append(replace(entry, seconds={stage: round(value, 4) for stage, value in seconds.items()}))
     return Outcome(tuple(entries), simulated.failures, (), tuple(filter(None, (simulated.warning, warning))))
 
 
-def _warning(sample: Sample) -> str:
-    """What makes a sample's images useless: too dark, too bright, or little gel in them; empty for others."""
-    level = 255 * float(sample.image1.mean()) / np.iinfo(sample.image1.dtype).max
-    gel = float(np.isfinite(sample.flow.forward).mean())
-    if DARKEST <= level <= BRIGHTEST:
-        found = f"images show gel in {100 * gel:.0f} % of their pixels only: check fx, fy and place of sensor.camera"
-        return found if gel < LEAST_GEL else ""
-    found = f"images are nearly {'black' if level < DARKEST else 'white'} (mean {level:.0f} of 255): check "
-    return found + "the places, aims and power of sensor.lights, and sensor.camera.exposure"
+def _warning(sample: Sample, radiance: Image) -> str:
+    """What makes a sample's images useless: little gel in them, or light that is clipped, dark or flat; or empty."""
+    gel = np.isfinite(sample.flow.forward[:, :, 0])
+    if (share := gel.mean()) < LEAST_GEL:
+        return f"images show gel in {100 * share:.0f} % of their pixels only: check fx, fy and place of sensor.camera"
+    found = advice(levels_of(sample.image1, gel), radiance, gel, sample.scene.sensor.camera)
+    return f"light is {found} (see `python -m synth preview`)" if found else ""
 
 
 def _diagnostics(context: JobContext, simulated: SimulatedTrajectory) -> dict[str, Any]:

@@ -1,6 +1,5 @@
 """What a scene needs, decided once; what comes later is handed the plan and asks nothing again."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ from synth.render.camera_rays import pinhole
 from synth.render.pattern import check_pattern, is_grey
 from synth.render.separated_light import is_separated
 from synth.render.thin_lens import check_views
-from synth.render.variant import Device, Variant, choose_variant
+from synth.render.variant import Variant, job_variant
 from synth.scene import MeshIndenter
 from synth.scene.sampling import check_pairs
 from synth.scene.template import Template, load_scene
@@ -79,13 +78,6 @@ def plan(scene: Template | str | Path, variant: Variant | None = None) -> Plan:
     batched, reason = _batching(scene, variant)
     decisions = (Decision("batched simulation", batched, reason), *_decisions(scene, variant))
     return Plan(scene, variant, batched, MeshRule.of(round_first[0], batched), decisions)
-
-
-def job_variant(template: Template, device: Device) -> Variant:
-    """What renders a job: one channel where every instance of it is grey; InputError where the device is not there."""
-    # Corners that are grey say nothing of what lies between them where a single channel is drawn.
-    drawn = any(re.search(r"\.(color|reflectance)\[\d\]$|\.saturation$", at) for _, _, at in template.distributions())
-    return choose_variant(device, grey=not drawn and all(is_grey(scene.sensor) for scene in template.corners))
 
 
 def check_buildable(template: Template, variant: Variant) -> None:

@@ -21,6 +21,8 @@ from types import ModuleType
 from typing import Literal
 
 from synth.errors import InputError
+from synth.render.pattern import is_grey
+from synth.scene.template import Template
 
 Device = Literal["auto", "cpu", "cuda"]
 Version = tuple[int, int, int]
@@ -109,6 +111,13 @@ def choose_variant(device: Device = "auto", grey: bool = False) -> Variant:
         if device == "cuda":
             raise InputError(f"device 'cuda' was asked for, but {trouble}; use device 'auto' or 'cpu'")
     return cpu_variant(llvm_candidates(), llvm_version, kind)
+
+
+def job_variant(template: Template, device: Device) -> Variant:
+    """What renders a job: one channel where every instance of it is grey; InputError where the device is not there."""
+    # Corners that are grey say nothing of what lies between them where a single channel is drawn.
+    drawn = any(re.search(r"\.(color|reflectance)\[\d\]$|\.saturation$", at) for _, _, at in template.distributions())
+    return choose_variant(device, grey=not drawn and all(is_grey(scene.sensor) for scene in template.corners))
 
 
 def cpu_variant(candidates: Iterable[Path], version_of: Callable[[Path], Version | None], kind: str) -> Variant:

@@ -11,7 +11,6 @@ V_p is the patch's signed volume about the shell's centre. A wall between two ch
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.optimize import linprog
 from scipy.sparse.csgraph import connected_components
 
 from synth.arrays import FloatArray
@@ -50,6 +49,8 @@ def outward(points: FloatArray, faces: np.ndarray) -> np.ndarray:
     boundary = sp.csr_matrix(((run * sign[face])[meet], places), shape=(meet.sum(), len(volumes)))
     among = np.unique(boundary.nonzero()[1])
     if len(among):
+        from scipy.optimize import linprog  # takes a third of a second
+
         balance, none = boundary[:, among], np.zeros(boundary.shape[0])
         found = linprog(-volumes[among], None, None, balance, none, (-1, 1), options={"time_limit": MOST_SECONDS}).x
         if found is None:

@@ -12,7 +12,7 @@ import pytest
 import pyvista as pv
 import tomli_w
 from commands import refused
-from pads import areas, brick, capsule, capsule_mesh, complete, contact_faces, simulate_scenes
+from pads import area_vectors, areas, brick, capsule, capsule_mesh, complete, contact_faces, simulate_scenes
 from pads import scene as pad_scene
 from pydantic import ValidationError
 from render_scenes import needs_llvm
@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from synth.arrays import FloatArray, Points, Triangles
 from synth.flow.exact import exact_flow
 from synth.flow.view import View
-from synth.mesh import check_mesh, domed
+from synth.mesh import check_mesh, domed, rest_surface
 from synth.mesh.capsule import CapsuleFace
 from synth.mesh.face import face_of
 from synth.mesh.pad import boundary_faces
@@ -113,6 +113,21 @@ def test_a_box_and_a_dome_agree_with_their_files(tmp_path: Path, dome_mm: float 
     assert np.isfinite(off).all()
     assert np.sqrt(np.mean(off**2)) < TARGET_PX
     assert np.nanmax(np.linalg.norm(truth, axis=-1)) > 2
+
+
+def test_faces_at_rest_need_no_mesh(folder: Path) -> None:
+    """Of a capsule, of its files with edges of .5 mm, and of a box's file, whose face is two triangles."""
+    write(folder, "block.stl", block((10.0, 8.0, 4.0), 0.0))
+    write(folder, "plate.stl", block((12.0, 11.0, 2.0), 3.0))
+    capsule = Gel(shape="capsule", radius_mm=5, thickness_mm=2, length_mm=2, youngs_modulus_kpa=200)
+    box = Gel(**{**FILE, "outer": "block.stl", "window": "plate.stl"}, size_mm=(10, 8, 4), thickness_mm=3)
+    files = Gel(**FILE, size_mm=(10, 10, 7), thickness_mm=2)
+    for gel, area, most in ((capsule, 70 * np.pi, 1e-3), (files, 70 * np.pi, 5e-3), (box, 80.0, 1e-9)):
+        found = rest_surface(gel, folder)
+        # Chords of edges h on a radius R take h² / 8 R² = 1.3e-3 off a length, at edges of .5 mm.
+        assert areas(found.material, found.triangles).sum() == pytest.approx(area, rel=most)
+        assert len(found.triangles) >= 2 * 24**2  # as many as a pad has
+        assert area_vectors(found.material, found.triangles)[:, 2].sum() < 0  # out of the gel
 
 
 def write_textured(path: Path, points: Points, faces: Triangles) -> None:

@@ -18,6 +18,7 @@ STAGES = (
     "synth.render",
     "synth.scene.sampling",  # draws again what could not be rendered
     "synth.dataset", "synth.verify", "synth.inspect", "synth.planning", "synth.pipeline",
+    "synth.preview",
     "synth.progress", "synth.calibrate", "synth.stress", "synth.doctor", "synth.cli_options", "synth.commands",
     "synth.cli", "synth.__main__",
 )  # fmt: skip
@@ -130,7 +131,9 @@ def test_help_loads_nothing_heavy(code: str, arguments: tuple[str, ...]) -> None
     assert _loaded_after(code, *arguments) & HEAVY == set()
 
 
-def test_prediction_loads_nothing_of_training_and_simulate_no_renderer(tmp_path: Path, monkeypatch) -> None:
+def test_prediction_loads_nothing_of_training_simulate_no_renderer_and_preview_no_solver(
+    tmp_path: Path, monkeypatch
+) -> None:
     code = """
 import gelflow.predict.prediction, gelflow.baselines.learned, gelflow.compare.run, sys
 from gelflow.models.weights import load_weights, weights_file
@@ -147,6 +150,9 @@ print(*sys.modules)"""
     assert "warp" in loaded
     assert not loaded & {"mitsuba", "drjit", "torch", "matplotlib", "OpenEXR"}
     assert (tmp_path / "out" / "trajectory.json").exists()
+    loaded = _loaded_after(MAIN.format("synth"), "preview", "--scene", str(scene), "--out", str(tmp_path / "p.png"))
+    assert "mitsuba" in loaded
+    assert not loaded & {"warp", "pytetwild", "torch", "matplotlib", "OpenEXR", "pyvista"}
 
 
 def test_files_stay_short() -> None:

@@ -1,0 +1,67 @@
+"""One picture of a sensor at rest, without simulation, and whether its light suits the camera."""
+
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from synth.dataset.images import Raster, encode_png
+from synth.dataset.storage import refuse_foreign, replace_file
+from synth.errors import InputError
+from synth.mesh import rest_surface
+from synth.render.camera_image import camera_image
+from synth.render.exposure import advice, levels_of
+from synth.render.pattern import albedo, pixels_per_mm
+from synth.render.renderer import Renderer
+from synth.render.variant import Variant
+from synth.scene import Render, Sensor
+from synth.scene.sampling import draw_sensor, stream
+from synth.scene.template import Template
+
+MARK = b"tEXtSoftware\0synth preview"
+"""Chunk of the PNG by which a later run knows its own picture."""
+MOST_SAMPLES, MOST_RAYS = 16, 5_000_000
+"""Most samples of a pixel and of all pixels."""
+
+
+def preview(template: Template, out: Path, seed: int, variant: Variant) -> dict[str, Any]:
+    """Write a picture of a job's first sensor, all cameras side by side; its levels and advice by camera.
+
+    Boxes look as in the first pair of `generate`, to the bit where that takes no more samples. InputError for what
+    cannot be rendered, and for a file of somebody else.
+    """
+    refuse_foreign(out, MARK)
+    instance = draw_sensor(template, seed, 0)
+    if instance.content is None:
+        raise InputError(f"{template.label}: {instance.rejected[-1]}")
+    sensor, render = Sensor(**instance.content["sensor"]), Render(**instance.content.get("render", {}))
+    pixels, samples = sum(one.width * one.height for one in sensor.cameras.values()), render.samples_per_pixel
+    samples = max(1, min(MOST_SAMPLES if samples == "auto" else samples, MOST_SAMPLES, MOST_RAYS // pixels))
+    try:
+        surface, scale = rest_surface(sensor.gel, template.folder), pixels_per_mm(sensor)
+        painted = albedo(sensor, stream(template, seed, "pattern", 0), template.folder)
+        renderer = Renderer(sensor, render.model_copy(update={"samples_per_pixel": samples}), surface, painted, variant)
+    except InputError as error:
+        raise InputError(f"{template.label}: {error}") from error
+    radiances = renderer.radiances(surface.material, int(stream(template, seed, "render rest", 0).integers(2**31)))
+    images, cameras = [], {}
+    for number, (name, radiance) in enumerate(radiances.items()):
+        further = [number] if number else []  # as `generate` numbers the noise of a sample's images
+        camera, noise = sensor.views[name].camera, stream(template, seed, "noise", 0, 0, *further)
+        gel = np.asarray(radiance.any(axis=2) | ~radiance.any())  # all pixels where none is lit
+        images.append(camera_image(radiance[:, :, :1] if variant.is_mono else radiance, camera, noise))
+        levels = levels_of(images[-1].squeeze(), gel)
+        cameras[name or "main"] = {"levels": levels, "advice": advice(levels, radiance, gel, camera)}
+    replace_file(out, _png(images))
+    return {"picture": str(out), "pixels_per_mm": scale, "cameras": cameras}
+
+
+def _png(images: list[Raster]) -> bytes:
+    """Images (H, W, 1 or 3) side by side, with 8 bits, and MARK behind PNG's header of 33 bytes."""
+    tall = max(map(len, images))
+    eight = (np.round(image * (255 / np.iinfo(image.dtype).max)).astype(np.uint8) for image in images)
+    parts = [np.pad(image, ((0, tall - len(image)), (0, 0), (0, 0))) for image in eight]
+    png, size, check = encode_png(np.hstack(parts).squeeze()), len(MARK) - len(b"tEXt"), zlib.crc32(MARK)
+    return png[:33] + struct.pack(">I", size) + MARK + struct.pack(">I", check) + png[33:]
