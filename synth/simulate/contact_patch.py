@@ -49,7 +49,8 @@ class ContactPatch:
         self._apart = material[_away(material, self._closed) > self._reach]
         a, b, c = (deformed[corner] for corner in surface.triangles.T)
         shares = self.holds(material, deformed)[surface.triangles].mean(axis=1)
-        self.area_mm2 = float(np.linalg.norm(np.cross(b - a, c - a), axis=1) @ shares / 2)
+        # Not a product by BLAS, whose last bits depend on threads and on where arrays lie.
+        self.area_mm2 = float((np.linalg.norm(np.cross(b - a, c - a), axis=1) * shares).sum() / 2)
 
     @classmethod
     def of(

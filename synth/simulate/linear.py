@@ -27,9 +27,9 @@ GMRES_LIMIT = 40
 ROUGH_TOLERANCE = 0.03
 """Largest linear residual of a rough direction, with this tangent's factor or an earlier one's. Far from the solution
 changes of the contact set are what counts."""
-MAX_REUSE_ITERATIONS, HOPELESS_AFTER = 8, 4
+MAX_REUSE_ITERATIONS, HOPELESS_AFTER = 18, 4
 """An earlier tangent's factor is given up after so many iterations or, from the second number on, as soon as their mean
-rate would need more. A new factor takes as long as about eight."""
+rate would need more. A new factor takes as long as about fifteen."""
 
 
 class Factor(Protocol):
@@ -156,7 +156,7 @@ def has_pardiso() -> bool:
 
 @cache
 def _mkl() -> Any:
-    """MKL, one thread: pip's, or what pypardiso finds, which searches the whole environment twice."""
+    """MKL, one thread, reproducible: pip's, or what pypardiso finds, which searches the whole environment twice."""
     try:
         packaged = [file.locate() for file in files("mkl") or [] if "mkl_rt" in file.name]
     except PackageNotFoundError:
@@ -168,15 +168,15 @@ def _mkl() -> Any:
 
         library = PyPardisoSolver().libmkl
     library.MKL_Set_Num_Threads(1)
+    library.MKL_CBWR_Set(2)  # MKL_CBWR_AUTO: same result whatever the memory alignment
     return library
 
 
 class PardisoFactor:
     """MKL Pardiso, symmetric indefinite (mtype -2), one thread: two presses side by side use two cores better.
 
-    It does not pivot, which is faster by a third and as accurate on tangents; GMRES takes away what it leaves. Matching
-    and scaling are off: they would make the analysis, and so the last bits of every later solution, depend on the
-    values of the first matrix, that is on which press came first.
+    Matching and scaling are off: they would make the analysis, and so the last bits of every later solution, depend on
+    the values of the first matrix, that is on which press came first.
     """
 
     ANALYSE, FACTORISE, SOLVE, RELEASE = 11, 22, 33, -1
@@ -189,9 +189,9 @@ class PardisoFactor:
         self._values = np.zeros(len(indices), dtype=self._type)
         self._handle = np.zeros(64, dtype=np.int64)
         self._settings = np.zeros(64, dtype=np.int32)
-        # own settings; METIS; pivots of 1e-8 (1e-5 in single precision) replace smaller ones; no pivoting; single;
+        # own settings; METIS; pivots of 1e-8 (1e-5 in single precision) replace smaller ones; Bunch-Kaufman; single;
         # indices from 0; no refinement of its own
-        for place, value in ((1, 1), (2, 2), (8, 0), (10, 5 if single else 8), (21, 0), (28, int(single)), (35, 1)):
+        for place, value in ((1, 1), (2, 2), (8, 0), (10, 5 if single else 8), (21, 1), (28, int(single)), (35, 1)):
             self._settings[place - 1] = value
         self._analysed = False
         self.made = 0

@@ -82,19 +82,6 @@ def test_answer_does_not_depend_on_what_was_solved_before(kind: Any) -> None:
     assert (used.apply(b) == fresh.apply(b)).all()
 
 
-@needs_mkl
-def test_bits_do_not_depend_on_where_memory_lies() -> None:
-    """Vector instructions must not treat the ends of a misaligned array in another order."""
-    matrix, found = saddle(1), set()
-    for offset in range(16):
-        factor = PardisoFactor(matrix.indptr, matrix.indices, single=True)
-        shifted = np.zeros(len(matrix.data) + offset, dtype=np.float32)
-        factor._values = shifted[offset:]
-        factor.factorise(matrix.data)
-        found.add(factor.apply(right_side(1)).tobytes())
-    assert len(found) == 1
-
-
 @each_factor
 @pytest.mark.parametrize("values", [0.0, np.nan])
 def test_matrix_without_inverse_gives_no_step_to_trust(kind: Any, values: float) -> None:
