@@ -104,7 +104,8 @@ def _run(
     if hasattr(os, "sched_setaffinity"):
         cores = sorted(os.sched_getaffinity(0))
         if len(cores) >= _FREE_CORES * devices:
-            os.sched_setaffinity(0, cores[number::devices])
+            share = len(cores) // devices  # neighbours, which share caches
+            os.sched_setaffinity(0, cores[number * share : (number + 1) * share])
     try:
         last: _Told[Made] = _Told()
 
