@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 
 from benchmarks.pressed_gel import View, main_camera, without_window
-from synth.arrays import BoolArray, FloatArray, Pixels, Points
+from synth.arrays import BoolArray, FloatArray, Points
 from synth.flow.exact import exact_flow
 from synth.flow.field import FlowArray
 from synth.flow.view import View as Tracer
@@ -27,15 +27,15 @@ Generator = Callable[[Points, Points], tuple[Motion, Motion]]
 class _TestedTracer(Tracer):
     """Looks at every pixel for what hides its point."""
 
-    def _may_be_hidden(self, pixels: Pixels, inside: BoolArray, target: Points) -> np.ndarray:
-        return np.flatnonzero(inside)
+    def overlap(self, positions: Points) -> None:
+        return None
 
 
 class _UntestedTracer(Tracer):
     """Takes all that lies inside the image for visible."""
 
-    def _may_be_hidden(self, pixels: Pixels, inside: BoolArray, target: Points) -> np.ndarray:
-        return np.flatnonzero(inside)[:0]
+    def overlap(self, positions: Points) -> BoolArray:
+        return np.zeros(self.optics.size[::-1], dtype=bool)
 
 
 def traced(view: View, kind: type[Tracer] = Tracer, sensor: Sensor | None = None) -> Generator:
@@ -111,7 +111,7 @@ def affine(view: View) -> Generator:
         maps[path] = np.linalg.lstsq(across, tracer.optics.centres[known], rcond=None)[0][:2]
 
     def one(near: Points, far: Points) -> Motion:
-        moved = tracer.first_hits(near).interpolate(tracer.surface.triangles, far - near)
+        moved = tracer.state(near).hits.interpolate(tracer.surface.triangles, far - near)
         flow = np.full(tracer.optics.centres.shape, np.nan)
         for path, at in _paths(tracer):
             flow[at] = moved[at, :2] @ maps[path]
@@ -166,7 +166,7 @@ def _tracer(view: View, kind: type[Tracer] = Tracer, sensor: Sensor | None = Non
 def _rest_points(tracer: Tracer) -> Points:
     """(n, 3) mm, where the pixels' rays meet the undeformed gel; NaN where they do not."""
     rest = tracer.surface.material
-    return tracer.first_hits(rest).interpolate(tracer.surface.triangles, rest)
+    return tracer.state(rest).hits.interpolate(tracer.surface.triangles, rest)
 
 
 def _paths(tracer: Tracer) -> Iterator[tuple[int, BoolArray]]:

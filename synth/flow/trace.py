@@ -83,7 +83,7 @@ class Tree:
 
     def _given(self, array: Any, kind: type, element: Any) -> Any:
         """A Warp array that kernels only read: on the CPU in the caller's own memory."""
-        given = np.ascontiguousarray(array, dtype=kind)
+        given: Any = np.ascontiguousarray(array, dtype=kind)
         return wp.array(given, dtype=element, device=self._device, copy=self._device != "cpu")
 
 

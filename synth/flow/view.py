@@ -41,16 +41,21 @@ class View:
     device: str = "cpu"
 
     @cached_property
-    def is_whole(self) -> bool:
+    def _is_whole(self) -> bool:
         """Whether every place in the image looks straight at the window."""
         width, height = self.optics.size
         corners = np.array([(x, y) for x in (0.0, width) for y in (0.0, height)])
         return bool((self.optics.own.path == 0).all() and (self.optics.look(corners).path == 0).all())
 
     @cached_property
-    def boundary(self) -> Triangles:
-        """The surface's edges that one triangle has."""
+    def _boundary(self) -> Triangles:
         return boundary_edges(self.surface.triangles)
+
+    def overlap(self, positions: Points) -> BoolArray | None:
+        """Pixels (H, W) in which one part of a state may hide another; None for any place of the image."""
+        if not self._is_whole:
+            return None
+        return may_overlap(positions, self.surface.triangles, self._boundary, self.optics)
 
     @cached_property
     def _seen(self) -> "deque[SeenState]":
@@ -114,11 +119,7 @@ class SeenState:
 
     @cached_property
     def _overlap(self) -> BoolArray | None:
-        """Pixels in which one part of the surface may hide another; None for any place of the image."""
-        view = self.view
-        if not view.is_whole:
-            return None
-        return may_overlap(self.positions, view.surface.triangles, view.boundary, view.optics)
+        return self.view.overlap(self.positions)
 
     def doubtful(self, pixels: Pixels, inside: BoolArray) -> NDArray[np.intp]:
         """Numbers of the points, seen in pixels (n, 2) if `inside`, whose visibility must be traced."""

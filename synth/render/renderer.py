@@ -34,6 +34,8 @@ from synth.render.variant import Variant
 from synth.scene import Render, Sensor
 from synth.surface import GelSurface
 
+_PIXELS = 320 * 240
+"""Pixels of a picture up to which bounced light is sampled as often as pixels are: more see the same faces."""
 _MAX_WAVEFRONT, _MAX_WAVEFRONT_GPU = 2**22, 2**24
 """Samples traced at once. Constants, because the split into passes decides the random numbers."""
 
@@ -197,7 +199,7 @@ class Renderer:
             mi, camera = self._variant.load(), self._views[""].camera
             frame = FrameGeometry(self._sensor, self._meshes["gel"], positions, self._render.max_depth > 2)
             numbers = frame.numbers(_mitsuba_seed(seed, _LIGHT_PART, 0), mi)
-            primary = camera.width * camera.height * self.samples_per_pixel
+            primary = min(camera.width * camera.height, _PIXELS) * self.samples_per_pixel
             static = (self._light.static, frame.sizes, primary, frame.bounces)
             self._prepared = self._recordings.of(prepare, *static)(self._light, numbers)
 
@@ -208,7 +210,7 @@ class Renderer:
         camera, samples = self._views[name].camera, self.samples_per_pixel
         pixels = camera.width * camera.height
         step = max(1, (_MAX_WAVEFRONT_GPU if self._variant.is_on_gpu else _MAX_WAVEFRONT) // samples)
-        parts = []
+        parts: list[Any] = []
         for k, first in enumerate(range(0, pixels, step)):
             starts = dr.opaque(mi.UInt32, first), dr.opaque(mi.UInt32, _mitsuba_seed(seed, k, number))
             values = (self._light, self._prepared, self._rays[name], *starts)
@@ -218,8 +220,9 @@ class Renderer:
                 parts.append(self._recordings.of(traced, *static)(*values))
             else:
                 parts.append(traced(*values, *static))
-        # Read when all passes are queued: a GPU works on one while the next is being recorded.
-        sums = np.concatenate([np.stack([np.array(channel) for channel in part], axis=-1) for part in parts])
+            # Read when the next one is queued: the device works while that is recorded, and holds two.
+            parts[-2:-1] = map(_read, parts[-2:-1])
+        sums = np.concatenate([*parts[:-1], _read(parts[-1])])
         image: Image = np.empty((camera.height, camera.width, 3), dtype=np.float32)
         image.reshape(pixels, 3)[:] = sums / samples  # a single channel fills all three
         return image
@@ -291,6 +294,11 @@ def traced(
     channels = [dr.select(valid & seen, color[i] * weight, 0) for i in range(1 if is_mono else 3)]
     dr.eval(channels)  # all at once: each sum alone would trace everything anew
     return [dr.block_sum(channel, samples) for channel in channels]
+
+
+def _read(channels: list[Any]) -> Image:
+    """(count, channels) float32 numbers of the device, which are waited for."""
+    return np.stack([np.array(channel) for channel in channels], axis=-1)
 
 
 def _gel(name: str, mesh: GelMesh, bsdf: Any, smooth: bool, mi: Any) -> Any:

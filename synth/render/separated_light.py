@@ -161,7 +161,7 @@ class SeparatedLight:
         Args:
             frame: from `FrameGeometry.numbers`.
             sizes: numbers of vertices and faces.
-            primary: samples that a camera takes of the gel in all.
+            primary: paths of bounced light in all.
             bounces: whether the gel may light itself.
 
         Returns:
