@@ -298,6 +298,7 @@ def _show_plan(template: Template, variant: Variant, n: int, as_json: bool) -> i
         + _error_line(predicted)
         + f"predicted per pair: {stages}; {predicted.bytes_per_pair / 1e6:.2f} MB\n"
         f"predicted for {n} pairs: {duration(n * seconds)} on one core, {n * predicted.bytes_per_pair / 1e9:.2f} GB\n"
+        f"predicted memory: {predicted.memory_bytes / 1e9:.1f} GB for each process that renders\n"
         "times are predicted within a factor of three"
     )
     return 0

@@ -53,6 +53,8 @@ SECONDS_PER_MILLION_SAMPLES = {"llvm": 0.4, "scalar": 1.0, "cuda": 0.002}
 FLOW_SECONDS_PER_MEGAPIXEL = 1.0
 BYTES_PER_PIXEL_OF_FLOW = 14.0
 BYTES_PER_PIXEL_OF_IMAGE = 1.4
+MEMORY, MEMORY_PER_SAMPLE, SAMPLES_AT_ONCE, MEMORY_PER_PIXEL, MEMORY_PER_NODE = 4e8, 70, 2**22, 290, 12e3
+"""Bytes of a process that simulates and renders on a CPU; samples count up to those that are traced at once."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,7 @@ class Prediction:
         nodes: displacement nodes, mean of the trajectories.
         seconds_per_pair: by stage, on one core.
         bytes_per_pair: size on disk.
+        memory_bytes: most memory of a process that simulates and renders on a CPU.
     """
 
     resolution: str
@@ -77,6 +80,7 @@ class Prediction:
     nodes: int
     seconds_per_pair: dict[str, float]
     bytes_per_pair: int
+    memory_bytes: int
 
 
 def predict(plan: Plan) -> Prediction:
@@ -89,19 +93,23 @@ def predict(plan: Plan) -> Prediction:
     pixels = sum(camera.width * camera.height for camera in cameras)
     samples = AUTO_SAMPLES if corner.render.samples_per_pixel == "auto" else corner.render.samples_per_pixel
     frame = pixels * samples / 1e6 * SECONDS_PER_MILLION_SAMPLES[variant.name.split("_")[0]]
+    nodes = float(np.mean([count for _, count in presses]))
+    memory = MEMORY + MEMORY_PER_PIXEL * pixels + MEMORY_PER_NODE * nodes
+    memory += MEMORY_PER_SAMPLE * min(SAMPLES_AT_ONCE, samples * max(one.width * one.height for one in cameras))
     directions = 2 if plan.template.outputs.backward else 1
     return Prediction(
         resolution=resolution,
         warning=_lost_detail(plan),
         error_px=error_px,
         target_error_px=None if error_px is None else plan.mesh.target_error_px,
-        nodes=round(float(np.mean([nodes for _, nodes in presses]))),
+        nodes=round(nodes),
         seconds_per_pair={
             "simulate": round(simulate / pairs, 3),
             "render": round(frame * (1 + 1 / pairs), 3),
             "flow": round(directions * pixels / 1e6 * FLOW_SECONDS_PER_MEGAPIXEL, 3),
         },
         bytes_per_pair=round(pixels * (BYTES_PER_PIXEL_OF_FLOW * directions / 2 + 2 * BYTES_PER_PIXEL_OF_IMAGE)),
+        memory_bytes=round(memory),
     )
 
 

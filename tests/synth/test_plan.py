@@ -1,6 +1,8 @@
 """What `plan` decides and predicts, and what it refuses before any work is done."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -169,3 +171,25 @@ def test_a_folder_of_surfaces_can_be_built(tiny: Path, monkeypatch: pytest.Monke
     assert {Path(indenter.file).name for indenter in drawn} == {"True.stl", "False.stl"}
     # A tetrahedron with corners √3 mm from the origin reaches between its inscribed and circumscribed radius.
     assert all(1 / np.sqrt(3) <= rigid_body(indenter, tiny.parent).reach_mm <= np.sqrt(3) for indenter in drawn)
+
+
+MEASURED = """
+import resource, sys
+from synth import generate
+generate(sys.argv[1], 1, sys.argv[2])
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [320, 1920])
+def test_memory_is_as_predicted(tiny: Path, tmp_path: Path, width: int) -> None:
+    share = width / 32
+    scene = tmp_path / "large.toml"
+    camera = "\n".join(f"{key} = {share * value}" for key, value in (("fx", 82), ("fy", 82), ("cx", 16), ("cy", 12)))
+    size = f"width = {width}\nheight = {width * 3 // 4}\n"
+    scene.write_text(f'extends = "{tiny}"\n[render]\nsamples_per_pixel = 4\n[sensor.camera]\n{size}{camera}\n')
+    command = [sys.executable, "-c", MEASURED, str(scene), str(tmp_path / "d")]
+    taken = int(subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()[-1])
+    template = load_scene(scene)
+    assert 1 / 1.5 < predict(plan(template, job_variant(template, "cpu"))).memory_bytes / taken < 1.5
