@@ -10,6 +10,7 @@ from synth.mesh import default_edge_length, face_of
 from synth.mesh.cad import CadFace
 from synth.render.camera_rays import pinhole
 from synth.render.pattern import check_pattern, is_grey
+from synth.render.rest_map import read_rest_map
 from synth.render.separated_light import is_separated
 from synth.render.thin_lens import check_views
 from synth.render.variant import Variant, job_variant
@@ -85,13 +86,15 @@ def check_buildable(template: Template, variant: Variant) -> None:
 
     InputError, at a corner of the distributions, for an indenter whose parts do not fit or whose file is no surface, a
     gel from files that is too thin or is pressed beside its face, a light in the camera's view, a lens or a kind of
-    light that this variant or coating cannot have, a pattern that no pixel could show or whose file is no picture, or
-    more pairs than a trajectory has.
+    light that this variant or coating cannot have, a pattern that no pixel could show or whose file is no picture, a
+    rest map that does not fit its camera, or more pairs than a trajectory has.
     """
     try:
         for sensor in dict.fromkeys(corner.sensor for corner in template.corners):
             check_views(sensor)
             check_pattern(sensor, template.folder)
+            for camera in sensor.cameras.values():
+                read_rest_map(camera, template.folder)
             for view in () if variant.is_vectorised else sensor.views.values():
                 pinhole(view)
         for indenter in dict.fromkeys(corner.contact.indenter for corner in template.corners):
@@ -127,7 +130,9 @@ def _decisions(template: Template, variant: Variant) -> tuple[Decision, ...]:
     separated = is_separated(corners[0].render, corners[0].sensor.coating, variant)
     instead = f", but {variant.name} path-traces" if light == "separated" and not separated else ""
     grey = all(is_grey(c.sensor) for c in corners)
-    hue = "lights, coating and pattern are grey" if grey else "a light, the coating or the pattern has colour"
+    hue = (
+        "lights, coating and pattern are grey" if grey else "a light, the coating, the pattern or a rest map has colour"
+    )
     if grey and not variant.is_mono:
         hue += f", but {variant.name} has no grey counterpart here"
     optional = [name for name in ("depth", "normal", "displacement", "traction", "contact") if getattr(outputs, name)]
