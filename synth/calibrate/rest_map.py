@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.arrays import FloatArray
 from synth.calibrate.comparison import Comparison
 from synth.calibrate.frames import PLACE
 
@@ -31,7 +30,11 @@ def measured_rest_map(row: Comparison, gamma: float) -> NDArray[np.uint16]:
     useful = [(image > low) & (image < high) for image in (row.frame, row.rendered)]
     known = np.asarray(row.outside & (useful[0] & useful[1]).all(axis=2))[:, :, None].astype(np.float64)
     frame, rendered = known * row.frame**gamma, known * row.rendered**gamma
-    above, below = _around(frame, row), _around(rendered, row)
+    near = PLACE * row.frame.shape[1]
+    above, below = (
+        cv2.GaussianBlur(image, (0, 0), near) + _SHARE * cv2.GaussianBlur(image, (0, 0), _WIDE * near)
+        for image in (frame, rendered)
+    )
     field = np.where(below > 0, above / np.maximum(below, 1e-300), 1.0)
     detail = known * (row.frame - (rendered * field) ** (1 / gamma))  # encoded: there noise differs least
     local = np.abs(cv2.GaussianBlur(detail, (0, 0), 1.0))
@@ -43,12 +46,4 @@ def measured_rest_map(row: Comparison, gamma: float) -> NDArray[np.uint16]:
 
 def with_rest_map(row: Comparison, rest_map: NDArray[np.uint16], gamma: float) -> Comparison:
     """The comparison with the map in the fitted sensor's picture."""
-    mapped = np.clip(row.rendered**gamma * (rest_map / _ONE), 0, 1) ** (1 / gamma)
-    return replace(row, rendered=mapped)
-
-
-def _around(image: FloatArray, row: Comparison) -> FloatArray:
-    """An image's weighted sum around each pixel: a place, and with little weight a wide neighbourhood."""
-    sigma = PLACE * row.frame.shape[1]
-    near, wide = (cv2.GaussianBlur(image, (0, 0), factor * sigma) for factor in (1, _WIDE))
-    return np.asarray(near + _SHARE * wide)
+    return replace(row, rendered=np.clip(row.rendered**gamma * (rest_map / _ONE), 0, 1) ** (1 / gamma))

@@ -111,8 +111,10 @@ def start_sensor(template: Template, size: tuple[int, int]) -> Sensor:
             f"{template.label}: sensor.pattern.kind = {sensor.pattern.kind!r}: calibration needs a pattern that "
             "leaves smooth coating to see the lights by; allowed are 'dots' and 'none'"
         )
-    if sensor.mirrors or sensor.further_cameras:
-        raise InputError(f"{template.label}: calibration knows one camera without mirrors; take them out of the preset")
+    if sensor.mirrors or sensor.further_cameras or sensor.measured_light:
+        raise InputError(
+            f"{template.label}: calibration knows one camera without mirrors or measured_light: remove them"
+        )
     if sensor.camera.aperture_mm:
         raise InputError(
             f"{template.label}: sensor.camera.aperture_mm = {sensor.camera.aperture_mm}: calibration fits one blur "

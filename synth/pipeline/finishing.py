@@ -47,11 +47,8 @@ def finish(context: JobContext, rendered: RenderedTrajectory) -> Outcome:
         started = time.perf_counter()
         sample = _sample(context, rendered, pair, diagnostics, views)
         traced = time.perf_counter()
-        warning = (
-            _warning(context, sample, rendered.frames[pair.frames[0]].radiance[""])
-            if pair is simulated.pairs[0]
-            else warning
-        )
+        if pair is simulated.pairs[0]:
+            warning = _warning(context, sample, rendered.frames[pair.frames[0]].radiance[""])
         entry = write_sample_files(context.out, sample, context.job)
         seconds = {**shared, "flow": traced - started, "write": time.perf_counter() - traced}
         entries.append(replace(entry, seconds={stage: round(value, 4) for stage, value in seconds.items()}))

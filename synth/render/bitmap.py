@@ -64,8 +64,7 @@ def decoded(path: Path, where: str, kinds: tuple[type, ...]) -> NDArray[Any]:
     check_picture(data, f"{where}: {path}", most=MOST_PIXELS)
     try:
         stored = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        if stored is not None and stored.dtype != np.float32 and stored.shape[2:] != (4,):
-            # no opacity: turned as EXIF says, three channels
+        if stored is not None and stored.dtype != np.float32 and stored.shape[2:] != (4,):  # turned as EXIF says
             stored = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     except cv2.error:
         stored = None

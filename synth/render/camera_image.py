@@ -7,8 +7,7 @@ Per channel, with full scale 1 and all steps but the last two linear:
     value  = quantise(clip(noisy, 0, 1) ** (1 / gamma))
 
 The radiance of a wide-angle lens falls off towards the corners; the vignette 1 - v ρ² (ρ = 1 at the image's farthest
-corner from the principal point) stands for natural and mechanical vignetting together. A scene may have a rest map
-(`synth.render.rest_map`).
+corner from the principal point) stands for natural and mechanical vignetting together. For rest maps see there.
 
 A pixel has enough samples when nobody sees the renderer's noise behind the camera's own. Two pilot pictures with
 different seeds differ by √2 times the renderer's noise, after the lens's blur and in encoded values, as they are seen.
