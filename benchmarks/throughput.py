@@ -21,7 +21,7 @@ from benchmarks.rows import Row, arguments, machine, read, show, write
 from benchmarks.scale import STAGES, at_size
 from synth.cli_options import DEFAULT_SCENE
 from synth.dataset.manifest import MANIFEST_FILE
-from synth.pipeline.generate import generate
+from synth.pipeline.generate import Scheduling, generate
 from synth.pipeline.worker_pool import cores
 from synth.planning import job_variant, plan
 from synth.scene.template import Template
@@ -34,6 +34,7 @@ def main(argv: list[str]) -> int:
     parser = arguments("throughput", __doc__)
     parser.add_argument("--scene", default=DEFAULT_SCENE, help="name or TOML file")
     parser.add_argument("--n", type=int, default=1000, help="pairs of a run")
+    parser.add_argument("--devices", type=int, default=1, help="GPUs")
     parser.add_argument("--size", action="append", default=[], help="WIDTHxHEIGHT; default the scene's own")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="changes of the scene")
     parser.add_argument("--table", type=Path, default=TABLE, help="CSV file of all runs")
@@ -46,14 +47,14 @@ def main(argv: list[str]) -> int:
         device = _gpu("name") or f"{cores()} cores"
         case = {"date": date.today().isoformat(), "label": given.label, "device": device, "scene": given.scene}
         template = at_size(given.scene, given.set, width, height)
-        rows.append({**case, "size": text, "changes": " ".join(given.set), **run(template, given.n)})
+        rows.append({**case, "size": text, "changes": " ".join(given.set), **run(template, given.n, given.devices)})
         write(given.table, rows)
     print(machine())
     show(rows, [key for key in rows[-1] if key not in ("date", "changes")], "Runs, newest last")
     return 0
 
 
-def run(template: Template, n: int) -> Row:
+def run(template: Template, n: int, devices: int) -> Row:
     """Make n pairs by default settings; rates, and seconds a pair of each stage."""
     variant = job_variant(template, "auto")
     times: list[tuple[int, float]] = []
@@ -64,7 +65,7 @@ def run(template: Template, n: int) -> Row:
     with tempfile.TemporaryDirectory(prefix="throughput-") as folder:
         generate(
             template, n, Path(folder) / "pairs", 0, variant,
-            progress=lambda done, _: times.append((done, time.perf_counter() - started)),
+            Scheduling(devices=devices), progress=lambda done, _: times.append((done, time.perf_counter() - started)),
         )  # fmt: skip
         entries = [json.loads(line) for line in (Path(folder) / "pairs" / MANIFEST_FILE).read_text().splitlines()]
     ended.set()
@@ -85,6 +86,7 @@ def run(template: Template, n: int) -> Row:
         "total_s": float(seconds[-1]),
         "pairs_per_second": float(rate),
         "states_per_second": float(rate * per_pair),
+        "devices": devices,
         "cores": cores(),
         "cores_limit": float(limit),
         "share_of_limit": float(rate / limit),

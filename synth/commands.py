@@ -52,6 +52,9 @@ def generate(
             help="i/N: make every N-th trajectory, from number i (0 to N - 1) on; other processes make the rest."
         ),
     ] = None,
+    devices: Annotated[
+        int | None, Parameter(converter=whole(1), help="GPUs of this machine that share the job; default: all.")
+    ] = None,
     dry_run: Annotated[bool, Parameter(negative=(), help="Only show the plan.")] = False,
     as_json: AsJson = False,
 ) -> int:
@@ -62,7 +65,7 @@ def generate(
     from synth.planning import job_variant
     from synth.progress import progress
 
-    scheduling = pipeline.Scheduling(workers, ray, Shard.parse(shard) if shard else None)
+    scheduling = pipeline.Scheduling(workers, ray, Shard.parse(shard) if shard else None, devices=devices)
     template = _loaded(scene, assignments)
     variant = job_variant(template, device)
     if dry_run:

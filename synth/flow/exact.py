@@ -62,10 +62,10 @@ def exact_flow(
     for name, array in (("positions1", positions1), ("positions2", positions2), ("traction", traction)):
         if array is not None and array.shape != (vertices, 3):
             raise InputError(f"{name} has shape {array.shape}; this surface needs ({vertices}, 3), one row per vertex")
-    hits1 = view.first_hits(positions1)
+    hits1 = view.state(positions1).hits
     forward, forward_visible = view.motion(hits1, positions2)
     extras: dict[str, FlowArray] = {}
-    hits2 = view.first_hits(positions2) if backward or depth or normal else None
+    hits2 = view.state(positions2).hits if backward or depth or normal else None
     if hits2 is not None:
         for number, hits, positions in (("1", hits1, positions1), ("2", hits2, positions2)):
             if depth:

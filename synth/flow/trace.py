@@ -39,15 +39,13 @@ class Hits:
     barycentric: FloatArray
     distance: FloatArray
 
+    def __getitem__(self, part: slice) -> "Hits":
+        return Hits(self.triangle[part], self.barycentric[part], self.distance[part])
+
     def interpolate(self, triangles: Triangles, values: FloatArray) -> FloatArray:
         """Values (n, c) at the hits from values (v, c) at the vertices; NaN where nothing is hit."""
         corners = (values[vertices] for vertices in triangles[self.triangle].T)  # where nothing is hit, of the last one
         return np.asarray(sum(weight[:, None] * of for weight, of in zip(self.barycentric.T, corners, strict=True)))
-
-
-def as_warp(array: Any, kind: type, element: Any) -> Any:
-    """A Warp array in the caller's own memory, which kernels only read."""
-    return wp.array(np.ascontiguousarray(array, dtype=kind), dtype=element, device="cpu", copy=False)
 
 
 def trace(positions: Points, triangles: Triangles, origins: Points, directions: Points) -> Hits:
@@ -56,17 +54,37 @@ def trace(positions: Points, triangles: Triangles, origins: Points, directions: 
     Positions are (v, 3) float64 mm, triangles (f, 3) int32; origins (n, 3) float64 mm and unit directions (n, 3) are
     NaN for rays that do not exist.
     """
-    rays = len(origins)
-    margin = _MARGIN * max(np.abs(positions).max(), np.nanmax(np.abs(origins), initial=0.0))
-    corners = positions[triangles]
-    boxes = (corners.min(axis=1) - margin, corners.max(axis=1) + margin)
-    tree = wp.Bvh(*(as_warp(box, np.float32, wp.vec3) for box in boxes), leaf_size=_TRIANGLES_PER_LEAF)
-    surface = [as_warp(positions, np.float64, wp.vec3d), as_warp(triangles, np.int32, wp.int32)]
-    given = [as_warp(array, np.float64, wp.vec3d) for array in (origins, directions)]
-    outputs = [wp.empty(rays, dtype=kind, device="cpu") for kind in (wp.int32, wp.vec3d, wp.float64)]
-    inputs = [tree.id, float(margin), *surface, *given]
-    wp.launch(_nearest_hit, dim=rays, inputs=inputs, outputs=outputs, device="cpu")
-    return Hits(*(array.numpy() for array in outputs))
+    return Tree(positions, triangles).first_hits(origins, directions)
+
+
+class Tree:
+    """A surface that is ready to be hit by rays on "cpu" or "cuda": see `trace`. Its arrays must not be changed."""
+
+    def __init__(self, positions: Points, triangles: Triangles, device: str = "cpu") -> None:
+        self._device, self._largest = device, float(np.abs(positions).max())
+        corners = positions[triangles]
+        margin = _MARGIN * self._largest
+        boxes = [
+            self._given(box, np.float32, wp.vec3)
+            for box in (corners.min(axis=1) - margin, corners.max(axis=1) + margin)
+        ]
+        self._tree = wp.Bvh(*boxes, leaf_size=_TRIANGLES_PER_LEAF)
+        self._surface = [self._given(positions, np.float64, wp.vec3d), self._given(triangles, np.int32, wp.int32)]
+
+    def first_hits(self, origins: Points, directions: Points) -> Hits:
+        """Nearest hits of n rays."""
+        margin = _MARGIN * max(self._largest, float(np.nanmax(np.abs(origins), initial=0.0)))
+        rays = [self._given(array, np.float64, wp.vec3d) for array in (origins, directions)]
+        kinds = (wp.int32, wp.vec3d, wp.float64)
+        outputs = [wp.empty(len(origins), dtype=kind, device=self._device) for kind in kinds]
+        inputs = [self._tree.id, margin, *self._surface, *rays]
+        wp.launch(_nearest_hit, dim=len(origins), inputs=inputs, outputs=outputs, device=self._device)
+        return Hits(*(array.numpy() for array in outputs))
+
+    def _given(self, array: Any, kind: type, element: Any) -> Any:
+        """A Warp array that kernels only read: on the CPU in the caller's own memory."""
+        given = np.ascontiguousarray(array, dtype=kind)
+        return wp.array(given, dtype=element, device=self._device, copy=self._device != "cpu")
 
 
 @wp.func

@@ -5,6 +5,7 @@ in both directions. Visibility is traced only where one part of the surface may 
 """
 
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from synth.arrays import BoolArray, FloatArray, Pixels, Points, Triangles
 from synth.flow.field import FlowArray
 from synth.flow.overlap import boundary_edges, may_overlap
-from synth.flow.trace import Hits, trace
+from synth.flow.trace import Hits, Tree
 from synth.optics import Optics, Rays
 from synth.surface import GelSurface
 
@@ -26,67 +27,63 @@ and meets its own surface within 1e-12 mm / sin(grazing angle): below the tolera
 Parts of the surface less than 1e-6 mm apart touch.
 """
 _CACHED_STATES = 3
-"""States whose first hits are cached: those of a pair, and the undeformed one."""
+"""States of which the first hits are cached: those of a pair, and the undeformed one."""
+_TILE = 1 << 14
+"""Pixels worked on at a time: their float64 stays in a core's cache, and memory is that of the results."""
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One camera looking at states of one surface, of which the triangles are used."""
+    """One camera looking at states of one surface, of which the triangles are used; rays are traced on the device."""
 
     surface: GelSurface
     optics: Optics
+    device: str = "cpu"
 
     @cached_property
-    def _is_whole(self) -> bool:
+    def is_whole(self) -> bool:
         """Whether every place in the image looks straight at the window."""
         width, height = self.optics.size
         corners = np.array([(x, y) for x in (0.0, width) for y in (0.0, height)])
         return bool((self.optics.own.path == 0).all() and (self.optics.look(corners).path == 0).all())
 
     @cached_property
-    def _boundary(self) -> Triangles:
+    def boundary(self) -> Triangles:
+        """The surface's edges that one triangle has."""
         return boundary_edges(self.surface.triangles)
 
     @cached_property
-    def _seen(self) -> "deque[tuple[Points, Hits]]":
+    def _seen(self) -> "deque[SeenState]":
         return deque(maxlen=_CACHED_STATES)
 
-    def first_hits(self, positions: Points) -> Hits:
-        """What the pixel centres see of a state (v, 3) mm; the array must not be changed afterwards."""
-        for known, hits in self._seen:
-            if known is positions:
-                return hits
-        hits = trace(positions, self.surface.triangles, self.optics.own.origins, self.optics.own.directions)
-        self._seen.append((positions, hits))
-        return hits
+    def state(self, positions: Points) -> "SeenState":
+        """The surface in a state (v, 3) mm; the array must not be changed afterwards."""
+        for known in self._seen:
+            if known.positions is positions:
+                return known
+        self._seen.append(SeenState(self, positions))
+        return self._seen[-1]
 
     def motion(self, hits: Hits, target: Points) -> tuple[FlowArray, FlowArray]:
         """Flow (H, W, 2) and visibility (H, W) of the hits' material points when the surface moves to `target`."""
-        points = hits.interpolate(self.surface.triangles, target)
-        pixels = self.optics.project(points, self.optics.own.path)
-        visible = self.optics.is_inside(pixels)
-        doubtful = self._may_be_hidden(pixels, visible, target)
-        rays = self.optics.look(pixels[doubtful])
-        same = rays.path == self.optics.own.path[doubtful]
-        visible[doubtful] = same & self._is_unobstructed(points[doubtful], rays, target)
-        width, height = self.optics.size
-        return (pixels - self.optics.centres).astype(np.float32).reshape(height, width, 2), self.image(visible)
+        optics, state = self.optics, self.state(target)
+        width, height = optics.size
+        motion, visible = np.empty((width * height, 2), dtype=np.float32), np.empty(width * height, dtype=np.float32)
+        for tile in self.tiles():
+            points, path = hits[tile].interpolate(self.surface.triangles, target), optics.own.path[tile]
+            pixels = optics.project(points, path)
+            motion[tile] = pixels - optics.centres[tile]
+            seen = optics.is_inside(pixels)
+            if (doubtful := state.doubtful(pixels, seen)).size:
+                rays = optics.look(pixels[doubtful])
+                seen[doubtful] = (rays.path == path[doubtful]) & state.is_unobstructed(points[doubtful], rays)
+            visible[tile] = seen
+        return motion.reshape(height, width, 2), visible.reshape(height, width)
 
-    def _may_be_hidden(self, pixels: Pixels, inside: BoolArray, target: Points) -> NDArray[np.intp]:
-        """Numbers of the points, seen in pixels (n, 2) if in any, whose visibility must be traced."""
-        at = np.flatnonzero(inside)
-        if not self._is_whole:
-            return at
-        overlap = may_overlap(target, self.surface.triangles, self._boundary, self.optics)
-        column, row = pixels[at].astype(np.intp).T
-        return at[overlap[row, column]]
-
-    def _is_unobstructed(self, points: Points, rays: Rays, positions: Points) -> BoolArray:
-        if len(points) == 0:
-            return np.ones(0, dtype=bool)
-        distance = np.linalg.norm(points - rays.origins, axis=1)
-        first = trace(positions, self.surface.triangles, rays.origins, rays.directions).distance
-        return first >= distance - OCCLUSION_TOLERANCE_MM
+    def tiles(self) -> Iterator[slice]:
+        """Parts of the pixels, row by row."""
+        pixels = self.optics.size[0] * self.optics.size[1]
+        return (slice(start, min(start + _TILE, pixels)) for start in range(0, pixels, _TILE))
 
     def image(self, values: FloatArray | BoolArray) -> FlowArray:
         """Values (n,) of the pixels as an image (H, W)."""
@@ -96,3 +93,42 @@ class View:
     def vector(self, name: str, values: FloatArray) -> dict[str, FlowArray]:
         """Vectors (n, 3) of the pixels as three channels."""
         return {f"{name}.{axis}": self.image(values[:, i]) for i, axis in enumerate("XYZ")}
+
+
+@dataclass(frozen=True, eq=False)
+class SeenState:
+    """What a view has found out of one state of its surface, positions (v, 3) mm."""
+
+    view: View
+    positions: Points
+
+    @cached_property
+    def _tree(self) -> Tree:
+        return Tree(self.positions, self.view.surface.triangles, self.view.device)
+
+    @cached_property
+    def hits(self) -> Hits:
+        """What the pixel centres see."""
+        own = self.view.optics.own
+        return self._tree.first_hits(own.origins, own.directions)
+
+    @cached_property
+    def _overlap(self) -> BoolArray | None:
+        """Pixels in which one part of the surface may hide another; None for any place of the image."""
+        view = self.view
+        if not view.is_whole:
+            return None
+        return may_overlap(self.positions, view.surface.triangles, view.boundary, view.optics)
+
+    def doubtful(self, pixels: Pixels, inside: BoolArray) -> NDArray[np.intp]:
+        """Numbers of the points, seen in pixels (n, 2) if `inside`, whose visibility must be traced."""
+        at = np.flatnonzero(inside)
+        if self._overlap is None:
+            return at
+        column, row = pixels[at].astype(np.intp).T
+        return at[self._overlap[row, column]]
+
+    def is_unobstructed(self, points: Points, rays: Rays) -> BoolArray:
+        """Whether rays (n) reach these points (n, 3) mm of the state before anything else of it."""
+        first = self._tree.first_hits(rays.origins, rays.directions).distance
+        return first >= np.linalg.norm(points - rays.origins, axis=1) - OCCLUSION_TOLERANCE_MM

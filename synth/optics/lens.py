@@ -55,7 +55,7 @@ class PinholeLens:
         undistorted = self._undistort((pixels - self.centre) / self.focal)
         return np.column_stack([undistorted, np.ones(len(undistorted))])
 
-    @property
+    @cached_property
     def field_limit(self) -> float:
         """Square of the undistorted radius (dimensionless) up to which the lens model is one-to-one."""
         k1, k2, _, _, k3 = self.distortion

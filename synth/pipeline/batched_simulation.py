@@ -12,6 +12,8 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from itertools import islice
 
+import warp as wp
+
 from synth.pipeline.attempts import Attempt, Attempts
 from synth.pipeline.records import JobContext, Outcome, SimulatedTrajectory, Task
 from synth.scene import Gel
@@ -75,6 +77,8 @@ class _Simulation:
         self.open: Counter[int] = Counter()
 
     def __iter__(self) -> Iterator[tuple[int, Result]]:
+        if self._context.plan.solver_device == "cuda":  # on a new machine several modules compile at once
+            wp.load_module("synth.simulate", "cuda", recursive=True)
         again: list[Attempts] = []
         most = self._batch
         while chunk := [*again, *self._begun(most - len(again))]:

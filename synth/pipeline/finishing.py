@@ -40,7 +40,8 @@ def finish(context: JobContext, rendered: RenderedTrajectory) -> Outcome:
     simulated = rendered.simulated
     diagnostics = _diagnostics(context, simulated)
     sensors = simulated.scene.sensor.views
-    views = {name: View(rendered.surface, Optics.of(sensor)) for name, sensor in sensors.items()}
+    device = "cuda" if context.plan.variant.is_on_gpu else "cpu"
+    views = {name: View(rendered.surface, Optics.of(sensor), device) for name, sensor in sensors.items()}
     count, entries, warning = len(simulated.pairs), [], ""
     shared = {"simulate": simulated.seconds / count, "render": rendered.seconds / count}
     for pair in simulated.pairs:

@@ -1,9 +1,11 @@
 """Scheduling: which trajectories are still to do, who does them, and what happened.
 
 Without a GPU in this process by default, which renders on all cores; with workers, in processes of one core each
-(`worker_pool`); with Ray, on a cluster (`ray_pool`); or one shard of the job, beside others. With the batched solver
-this process simulates, and the workers do the rest (`overlapped`). The driver alone writes manifest and failures;
-samples' folders are written where they are made. The same command goes on where it stopped.
+(`worker_pool`); with Ray, on a cluster (`ray_pool`); or one shard of the job, beside others, such as those of several
+GPUs (`devices`). With the batched solver this process simulates, and the workers do the rest (`overlapped`).
+
+The driver alone writes manifest and failures; samples' folders are written where they are made. The same command goes
+on where it stopped.
 """
 
 import sys
@@ -11,7 +13,8 @@ import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from operator import index
 from pathlib import Path
@@ -28,6 +31,8 @@ from synth.dataset.writer import DatasetWriter
 from synth.errors import InputError
 from synth.mesh import mesh_key, pad_mesh
 from synth.mesh.cache import user_cache
+from synth.pipeline.batched_simulation import BATCH
+from synth.pipeline.devices import cuda_devices, on_devices
 from synth.pipeline.overlapped import outcomes_of_batches
 from synth.pipeline.producer import Producer
 from synth.pipeline.ray_pool import outcomes_of_ray
@@ -55,12 +60,15 @@ class Scheduling:
         ray: address of a Ray cluster, or "local".
         shard: make this part of the job only.
         batch: most trajectories that the batched solver has under way at a time; None for what suits the device.
+        devices: GPUs of this machine that share the job, each with `workers` of its own; None for all, where each has
+            a batch to do.
     """
 
     workers: int | None = None
     ray: str | None = None
     shard: Shard | None = None
     batch: int | None = None
+    devices: int | None = None
 
 
 @dataclass
@@ -95,6 +103,17 @@ class Summary:
         self.failures.update(reason_group(failure.stage, failure.reason) for failure in outcome.failures)
         for entry in outcome.entries:
             self.stages.update(entry.seconds)
+
+    @classmethod
+    def of_all(cls, parts: list["Summary"]) -> "Summary":
+        """The summary of a job from those of all its shards, without the time."""
+        whole = cls(parts[0].directory, None, sum(part.asked_for for part in parts), sum(part.found for part in parts))
+        for part in parts:
+            whole.made += part.made
+            whole.given_up = sorted([*whole.given_up, *part.given_up])
+            whole.failures += part.failures
+            whole.stages += part.stages
+        return whole
 
     @property
     def failed_draws(self) -> int:
@@ -175,6 +194,13 @@ def generate(
     planned = plan(scene, variant)
     job = make_job(planned, n, seed)
     count = planned.template.sampling.pairs_per_trajectory
+    if (devices := _devices(planned, n // count, out, scheduling)) > 1:
+        make = partial(_shard_on_device, planned.template, n, out, seed, planned.variant, scheduling, devices)
+        summary = Summary.of_all(on_devices(make, devices, progress or (lambda done, asked_for: None)))
+        with DatasetWriter(out, job, None, count) as writer:
+            summary.seconds = time.perf_counter() - started
+            writer.run = summary.record()
+        return summary
     with DatasetWriter(out, job, scheduling.shard, count) as writer:
         context = JobContext(planned, job, out, user_cache())
         finished = writer.finished
@@ -198,6 +224,36 @@ def generate(
         summary.seconds = time.perf_counter() - started
         writer.run = summary.record()
     return summary
+
+
+def _shard_on_device(
+    template: Template,
+    n: int,
+    out: Output,
+    seed: int,
+    variant: Variant,
+    scheduling: Scheduling,
+    devices: int,
+    number: int,
+    progress: Progress,
+) -> Summary:
+    """What the process of GPU `number` does."""
+    own = replace(scheduling, shard=Shard(number, devices), devices=1)
+    return generate(template, n, out, seed, variant, own, progress)
+
+
+def _devices(planned: Plan, trajectories: int, out: Output, scheduling: Scheduling) -> int:
+    """How many GPUs share the job; InputError for more than there are, or than it can use."""
+    asked = scheduling.devices
+    alone = scheduling.shard is not None or scheduling.ray is not None or not isinstance(out, Path)
+    if alone or not planned.variant.is_on_gpu or asked == 1:
+        if asked is not None and asked > 1:
+            raise InputError(f"--devices = {asked}: needs GPUs, a directory for --out, and neither --ray nor --shard")
+        return 1
+    there = cuda_devices()
+    if asked is not None and asked > there:
+        raise InputError(f"--devices = {asked}: there are {there}")
+    return asked or max(1, min(there, trajectories // BATCH["cuda"]))
 
 
 def _check(scheduling: Scheduling, out: Output) -> None:

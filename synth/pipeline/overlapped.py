@@ -39,7 +39,7 @@ def outcomes_of_batches(
     """
     groups = in_batches(context, tasks, batch)
     if workers == 1:
-        yield from map(_finisher(context), groups)
+        yield from map(_finisher(context, RenderSession(context)), groups)
         return
     pairs = context.plan.template.sampling.pairs_per_trajectory
 
@@ -73,14 +73,15 @@ def prefetched(items: Iterable[Item], limit: int) -> Iterator[Iterator[Item]]:
 
 
 def _finisher_on_one_core(context: JobContext) -> Maker[list[Result]]:
-    """What a worker process does with a group."""
+    """What a worker process does with a group; on a GPU kernels are compiled while the first group is simulated."""
     render_on_one_core(context.plan.variant)
-    return _finisher(context)
-
-
-def _finisher(context: JobContext) -> Maker[list[Result]]:
     session = RenderSession(context)
+    if context.plan.variant.is_on_gpu:
+        session.warm_up()
+    return _finisher(context, session)
 
+
+def _finisher(context: JobContext, session: RenderSession) -> Maker[list[Result]]:
     def made(result: Result) -> Outcome:
         return result if isinstance(result, Outcome) else finish(context, session.render_frames(result))
 

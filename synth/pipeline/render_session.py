@@ -6,15 +6,18 @@ of (scene, seed, sensor), and every frame has a seed of its own.
 
 import time
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 
 from synth.arrays import FloatArray, Image
+from synth.errors import InputError
 from synth.mesh import rest_surface
 from synth.pipeline.records import JobContext, SimulatedTrajectory
 from synth.render.measured_light import read_measured_light
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
 from synth.scene import Scene
+from synth.scene.sampling import draw
 from synth.surface import GelSurface
 
 SUBDIVISIONS = {False: 4, True: 3}
@@ -63,6 +66,13 @@ class RenderSession:
         self._context = context
         self._sensor: SensorRenderer | None = None
         self._surface: tuple[tuple[object, ...], GelSurface] | None = None
+
+    def warm_up(self) -> None:
+        """Have kernels compiled, by the picture of the first sensor at rest, if its gel is flat."""
+        with suppress(InputError):  # a job whose first sensor cannot be drawn or rendered says so in its turn
+            scene = draw(self._context.plan.template, self._context.job.seed, 0)
+            if scene.sensor.gel.is_flat:
+                self._prepared(scene, 0, rest_surface(scene.sensor.gel))
 
     def render_frames(self, simulated: SimulatedTrajectory) -> RenderedTrajectory:
         """Render the frames of a trajectory that its wanted samples show."""

@@ -29,6 +29,7 @@ from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
+from multiprocessing.synchronize import Lock
 from types import ModuleType
 from typing import Any, TypeAlias, TypeVar
 
@@ -94,7 +95,7 @@ def _outcomes_of_pool(
     spawn = get_context("spawn")  # Dr.Jit and Warp do not survive a fork
     parent_death, parents_end = spawn.Pipe(duplex=False)
     under_way: dict[Future[Outcome], Item] = {}
-    pool = ProcessPoolExecutor(workers, spawn, _begin, (context, make, parent_death))
+    pool = ProcessPoolExecutor(workers, spawn, _begin, (context, make, parent_death, spawn.Lock()))
     with parent_death, parents_end, one_thread_each(), pool:
         try:
             # All begin at once: the first items may be long in coming. Items find out if the pool is broken.
@@ -166,9 +167,19 @@ _maker: Maker[Any]
 """What a worker process does, set when the process starts."""
 
 
-def _begin(context: JobContext, make: Callable[[JobContext], Maker[Any]], parent_death: Connection) -> None:
+def _begin(
+    context: JobContext, make: Callable[[JobContext], Maker[Any]], parent_death: Connection, first: Lock
+) -> None:
     global _maker
     threading.Thread(target=exit_with_parent, args=(parent_death,), daemon=True).start()
+    if first.acquire(block=False):
+        try:
+            _maker = make(context)
+        finally:
+            first.release()
+        return
+    with first:  # what the first worker has compiled is then found on disk
+        pass
     _maker = make(context)
 
 
