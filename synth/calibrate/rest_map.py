@@ -26,8 +26,7 @@ _SPECK = 5.0
 
 def measured_rest_map(row: Comparison, gamma: float) -> NDArray[np.uint16]:
     """The map (H, W, 3) RGB, to be stored as a PNG of 16 bits, from a comparison of frames at rest."""
-    low, high = _RANGE
-    useful = [(image > low) & (image < high) for image in (row.frame, row.rendered)]
+    useful = [(image > _RANGE[0]) & (image < _RANGE[1]) for image in (row.frame, row.rendered)]
     known = np.asarray(row.outside & (useful[0] & useful[1]).all(axis=2))[:, :, None].astype(np.float64)
     frame, rendered = known * row.frame**gamma, known * row.rendered**gamma
     near = PLACE * row.frame.shape[1]

@@ -59,8 +59,7 @@ def read_measured_light(sensor: Sensor, folder: Path) -> LightModel | None:
         text = read_file(path, MOST_TEXT).decode("utf-8", "replace")
     except OSError as error:
         raise InputError(f"{where} cannot be read: {error.strerror or error}") from error
-    parts = re.split(r"^(\w+):", text, flags=re.MULTILINE)
-    sections = dict(zip(parts[1::2], parts[2::2], strict=True))
+    sections = dict(re.findall(r"^(\w+):(.*?)(?=^\w|\Z)", text, re.MULTILINE | re.DOTALL))
     try:
         count, width, height = (int(sections[key]) for key in ("nL", "width", "height"))
         pitch, values = float(sections["mmperpixel"]), _numbers(sections["quadfit"], "values", where)
@@ -96,7 +95,7 @@ def _flat_field(path: Path, scale: FloatArray) -> Image:
 
 def _numbers(section: str, key: str, where: str) -> FloatArray:
     """A list of numbers in a section; ValueError where there is none, or one is not finite."""
-    found = re.search(rf"\b{key}:\s*(\[[^\]]*\])", section)
+    found = re.search(rf"\b{key}:\s*(\[[^\[\]]*\])", section)
     values = np.array(parsed(json.loads, found[1] if found else "[]", where), dtype=np.float64)
     if not (values.size and np.isfinite(values).all()):
         raise ValueError(f"{key} is no list of finite numbers")

@@ -11,7 +11,7 @@ import numpy as np
 from synth.arrays import FloatArray
 from synth.errors import InputError
 from synth.render.bitmap import decoded
-from synth.scene import Camera
+from synth.scene import Camera, FurtherCamera
 
 
 def read_rest_map(camera: Camera, folder: Path) -> FloatArray | float:
@@ -21,8 +21,8 @@ def read_rest_map(camera: Camera, folder: Path) -> FloatArray | float:
     """
     if camera.rest_map is None:
         return 1.0
-    path = folder / camera.rest_map
-    where = f"sensor.{getattr(camera, 'name', 'camera')}.rest_map"
+    name = f"further_cameras.{camera.name}" if isinstance(camera, FurtherCamera) else "camera"
+    path, where = folder / camera.rest_map, f"sensor.{name}.rest_map"
     stored = np.atleast_3d(decoded(path, where, (np.uint8, np.uint16, np.float32)))[:, :, 2::-1]
     height, width = stored.shape[:2]
     if (width, height) != (camera.width, camera.height):
