@@ -60,13 +60,16 @@ def calibrate(
     steps: Annotated[
         int, Parameter(converter=whole(0), help="Most steps of the fit of the lights' geometry; 0: powers only.")
     ] = 30,
+    rest_map: Annotated[
+        bool, Parameter(negative="", help="Also write what lights do not explain as rest_map.png, for the scene.")
+    ] = False,
     assignments: Assignments = None,
     as_json: AsJson = False,
 ) -> int:
     """Fits a scene's lights, dots and camera to images of your own sensor."""
     from synth.calibrate import run_calibrate
 
-    return run_calibrate(scene, frames, judge or [], out, assignments or [], spacing_mm, steps, as_json)
+    return run_calibrate(scene, frames, judge or [], out, assignments or [], spacing_mm, steps, as_json, rest_map)
 
 
 @app.command

@@ -13,8 +13,10 @@ from synth.errors import InputError
 from synth.mesh import rest_surface
 from synth.render.camera_image import camera_image
 from synth.render.exposure import advice, levels_of
+from synth.render.measured_light import read_measured_light
 from synth.render.pattern import albedo, pixels_per_mm
 from synth.render.renderer import Renderer
+from synth.render.rest_map import read_rest_map
 from synth.render.variant import Variant
 from synth.scene import Render, Sensor
 from synth.scene.sampling import draw_sensor, stream
@@ -39,10 +41,13 @@ def preview(template: Template, out: Path, seed: int, variant: Variant) -> dict[
     sensor, render = Sensor(**instance.content["sensor"]), Render(**instance.content.get("render", {}))
     pixels, samples = sum(one.width * one.height for one in sensor.cameras.values()), render.samples_per_pixel
     samples = max(1, min(MOST_SAMPLES if samples == "auto" else samples, MOST_SAMPLES, MOST_RAYS // pixels))
+    folder = template.folder
     try:
-        surface, scale = rest_surface(sensor.gel, template.folder), pixels_per_mm(sensor)
-        painted = albedo(sensor, stream(template, seed, "pattern", 0), template.folder)
-        renderer = Renderer(sensor, render.model_copy(update={"samples_per_pixel": samples}), surface, painted, variant)
+        surface, scale = rest_surface(sensor.gel, folder), pixels_per_mm(sensor)
+        painted = albedo(sensor, stream(template, seed, "pattern", 0), folder)
+        maps = {name: read_rest_map(view.camera, folder) for name, view in sensor.views.items()}
+        render, measured = render.model_copy(update={"samples_per_pixel": samples}), read_measured_light(sensor, folder)
+        renderer = Renderer(sensor, render, surface, painted, variant, measured)
     except InputError as error:
         raise InputError(f"{template.label}: {error}") from error
     radiances = renderer.radiances(surface.material, int(stream(template, seed, "render rest", 0).integers(2**31)))
@@ -51,9 +56,9 @@ def preview(template: Template, out: Path, seed: int, variant: Variant) -> dict[
         further = [number] if number else []  # as `generate` numbers the noise of a sample's images
         camera, noise = sensor.views[name].camera, stream(template, seed, "noise", 0, 0, *further)
         gel = np.asarray(radiance.any(axis=2) | ~radiance.any())  # all pixels where none is lit
-        images.append(camera_image(radiance[:, :, :1] if variant.is_mono else radiance, camera, noise))
+        images.append(camera_image(radiance[:, :, :1] if variant.is_mono else radiance, camera, noise, maps[name]))
         levels = levels_of(images[-1].squeeze(), gel)
-        cameras[name or "main"] = {"levels": levels, "advice": advice(levels, radiance, gel, camera)}
+        cameras[name or "main"] = {"levels": levels, "advice": advice(levels, radiance, gel, camera, maps[name])}
     replace_file(out, _png(images))
     return {"picture": str(out), "pixels_per_mm": scale, "cameras": cameras}
 

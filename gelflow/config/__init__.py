@@ -98,6 +98,8 @@ class ModelConfig(_Frozen):
     third of the weights and takes more steps to follow the motion. The paper names both ancestors and does not say."""
     lffm: bool = True
     """The local flow fusion module; False for the ablation."""
+    lffm_scale: Literal["inverse_sqrt", "none"] = "inverse_sqrt"
+    """Factor on the module's dot products before the softmax: 1/sqrt(C) for C channels, or 1 as published."""
     refine: Literal["none", "half"] = "none"
     """A refinement head after the last decoded flow: local correlation of fine features around the flow so far, at half
     of the resolution. Not in the paper, whose finest flow is an enlargement of V2."""
@@ -125,8 +127,8 @@ class LossConfig(_Frozen):
     image holds no evidence: none (the paper is silent), or those whose flow there and back does not close within a
     tolerance (Meister et al.). The latter estimates both directions and trains on both, which takes twice the time."""
     smoothness: Literal["helmholtz", "first_order", "second_order"] = "helmholtz"
-    """Regulariser with weight lambda_dc: the paper's decomposition loss, or the edge-aware first-order smoothness of
-    SelfFlow (the paper's comparison), or ARFlow's of second order. The deformation loss goes with the first only."""
+    """Regulariser with weight lambda_dc: the paper's decomposition loss, or ARFlow's edge-aware smoothness of first
+    order (SelfFlow, the paper's comparison) or of second (ARFlow). The deformation loss goes with the first only."""
     smoothness_s: tuple[NonNegativeFloat, ...] | None = None
     """Weight of the regulariser at each scale, finest first, in place of lambda_s; None: lambda_s (the paper). ARFlow:
     1 at s = 0 only."""

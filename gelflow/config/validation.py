@@ -12,7 +12,7 @@ Config = TypeVar("Config", bound=BaseModel)
 
 RETIRED: Mapping[str, tuple[Any, ...]] = {
     "finest_scale": (2,), "correlation_radius": (4,), "normalise_features": (True,), "lffm_region": (3,),
-    "lffm_scale": ("inverse_sqrt",), "refine_iterations": (3,), "loss.lambda_ph": (1,), "loss.lambda_census": (0,),
+    "refine_iterations": (3,), "loss.lambda_ph": (1,), "loss.lambda_census": (0,),
     "loss.mask_outside": (True,), "loss.flow_normalisation": ("min_side",), "loss.ratio": ("product",),
     "loss.weight": ("anti_edge",), "loss.weight_floor": (0.1,), "compile": (False, True),
 }  # fmt: skip

@@ -14,9 +14,8 @@ from gelflow.losses.photometric import appearance_loss
 from gelflow.losses.regularisers import (
     decomposition_loss,
     deformation_loss,
-    first_order_loss,
+    edge_aware_loss,
     regulariser_weight,
-    second_order_loss,
 )
 from gelflow.ops.pyramid import enlarge_flow, flow_pyramid, image_pyramid
 from gelflow.ops.warp import inside, warp
@@ -75,8 +74,8 @@ def _regulariser(flow: Flow, image: Images, config: LossConfig, side: int) -> tu
     """Weighted smoothness and deformation loss of one flow on image 1 of its size."""
     zero = flow.new_zeros(())
     if config.smoothness != "helmholtz":
-        loss = first_order_loss if config.smoothness == "first_order" else second_order_loss
-        return config.lambda_dc * loss(flow / side, image, config.beta), zero
+        order = 1 if config.smoothness == "first_order" else 2
+        return config.lambda_dc * edge_aware_loss(flow / side, image, config.beta, order), zero
     weight = regulariser_weight(image, config.beta, config.least_weight)
     smooth = decomposition_loss(flow / side, weight, config.lambda_theta, config.lambda_zeta)
     deformed = config.lambda_df * deformation_loss(flow, weight) if config.lambda_df > 0 else zero

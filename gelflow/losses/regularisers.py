@@ -16,14 +16,18 @@ over 3x3 windows, which is exactly ``R_x = 1 + Prewitt_x(u) / 6``, ``R_y = 1 + P
 ``R = R_x R_y``, which rotations change, unlike the true ratio of areas. It is constant, and the loss zero, for every
 affine flow.
 
-Edge-aware smoothness (UFlow, ARFlow), of first order the regulariser of the paper's comparison "SelfFlow".
+Edge-aware smoothness as lliuz/ARFlow has it (losses/loss_blocks.py), of first order the regulariser of the paper's
+comparison "SelfFlow", of second that of ARFlow. Each mean is over u and v and all pixels that have the derivative:
 
-``L_sm = ( exp(-beta |I_x|) (|u_x| + |v_x|) + exp(-beta |I_y|) (|u_y| + |v_y|) ) / 2``, |I_x| as a mean over colours.
-Zero for every translation. ARFlow's form of second order takes ``|u_xx| + |v_xx|`` and ``|u_yy| + |v_yy|`` in place of
-the first derivatives; it is zero for every affine flow.
+``L_1 = ( mean[ exp(-beta |I_x|) |V_x| ] + mean[ exp(-beta |I_y|) |V_y| ] ) / 4``,
+``L_2 = ( mean[ exp(-beta |I_x|) |V_xx| ] + mean[ exp(-beta |I_y|) |V_yy| ] ) / 2``,
 
-No value is invented beyond the border. Forward differences (eq. 2) live on the (H-1) x (W-1) pixels that have a right
-and a lower neighbour, least-squares slopes over 3x3 windows on the (H-2) x (W-2) pixels that have all eight.
+|I_x| as a mean over colours, for L_2 from the pixel around which V is differentiated to the next. L_1 is zero for every
+translation, L_2 for every affine flow. L_1 is halved twice there, which UFlow does not do.
+
+No value is invented beyond the border. The paper's forward differences (eq. 2) live on the (H-1) x (W-1) pixels that
+have a right and a lower neighbour, least-squares slopes over 3x3 windows on the (H-2) x (W-2) pixels that have all
+eight.
 """
 
 import torch
@@ -91,34 +95,16 @@ def deformation_loss(flow: Flow, weight: Mask) -> Scalar:
     return (weight[..., 1:-1, 1:-1] * (across.abs() + down.abs())).mean()
 
 
-def first_order_loss(flow: Flow, image: Images, beta: float) -> Scalar:
-    """The smoothness loss at one scale; 0 for a single row or column.
+def edge_aware_loss(flow: Flow, image: Images, beta: float, order: int) -> Scalar:
+    """The edge-aware smoothness of order 1 or 2 at one scale; 0 where a side of the image has no such derivative.
 
-    The mean is over the pixels that have a right and a lower neighbour and over both directions. The flow is in px or
-    divided by the image's shorter side; `beta` is the weight's steepness in the image gradient.
+    The flow is in px or divided by the image's shorter side; `beta` is the weight's steepness in the image gradient.
     """
-    if min(flow.shape[-2:]) < 2:
+    if min(flow.shape[-2:]) <= order:
         return flow.sum() * 0
-    terms = [
-        torch.exp(-beta * brightness.abs().mean(dim=1, keepdim=True)) * motion.abs().sum(dim=1, keepdim=True)
-        for brightness, motion in zip(forward_differences(image), forward_differences(flow), strict=True)
-    ]
-    return (terms[0] + terms[1]).mean() / 2
-
-
-def second_order_loss(flow: Flow, image: Images, beta: float) -> Scalar:
-    """The smoothness loss of second order at one scale, 0 where a side is below 3; arguments as for `first_order_loss`.
-
-    The second difference of the flow around a pixel is weighted by the image's step from that pixel to the next. The
-    mean is over the pixels that have all four neighbours and over both directions.
-    """
-    if min(flow.shape[-2:]) < 3:
-        return flow.sum() * 0
-    centre = 2 * flow[..., 1:-1, 1:-1]
-    across = flow[..., 1:-1, 2:] + flow[..., 1:-1, :-2] - centre
-    down = flow[..., 2:, 1:-1] + flow[..., :-2, 1:-1] - centre
-    terms = [
-        torch.exp(-beta * brightness[..., 1:, 1:].abs().mean(dim=1, keepdim=True)) * bend.abs().sum(dim=1, keepdim=True)
-        for brightness, bend in zip(forward_differences(image), (across, down), strict=True)
-    ]
-    return (terms[0] + terms[1]).mean() / 2
+    means = []
+    for axis in (-1, -2):
+        derivative = flow.diff(n=order, dim=axis)
+        step = image.diff(dim=axis).narrow(axis, order - 1, derivative.shape[axis])
+        means.append((torch.exp(-beta * step.abs().mean(dim=1, keepdim=True)) * derivative.abs()).mean())
+    return (means[0] + means[1]) / (4 if order == 1 else 2)

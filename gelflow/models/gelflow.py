@@ -49,7 +49,7 @@ class GelFlow(nn.Module):
         self.projections = nn.ModuleList(layers.convolution(layers.CHANNELS[s - 1], projected, side=1) for s in scales)
         self.estimators = nn.ModuleList(layers.Estimator(costs + projected + 2) for _ in range(networks))
         self.contexts = nn.ModuleList(layers.ContextNetwork() for _ in range(networks))
-        self.fusion = layers.LocalFlowFusion() if config.lffm else None
+        self.fusion = layers.LocalFlowFusion(config.lffm_scale) if config.lffm else None
         self.refinement = layers.RefinementHead() if config.refine == "half" else None
 
         self.denoiser = Denoiser() if config.denoise else None

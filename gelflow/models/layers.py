@@ -116,16 +116,21 @@ class LocalFlowFusion(nn.Module):
     """Local flow fusion (paper, section 3.2): a flow smoothed where neighbouring context features agree.
 
     ``V'(x) = sum_d w(x, d) V(x + d)``,  ``w(x, .) = softmax_d( k <C(x), C(x + d)> )`` over the neighbours d of a 3x3
-    window that lie inside the image. The paper has k = 1; here k = 1/sqrt(number of channels), as in scaled dot-product
-    attention, because with k = 1 the weight of the centre tends to one as features grow. Neighbours beyond the border
-    get no weight, so a constant flow stays exactly as it is, and every fused flow lies between the flows that it was
-    made from. There are no parameters.
+    window that lie inside the image. The paper has k = 1 (`scale` = "none"); "inverse_sqrt" is k = 1/sqrt(number of
+    channels), as in scaled dot-product attention, because in a new network with k = 1 the weight of the centre tends to
+    one as features grow. Neighbours beyond the border get no weight, so a constant flow stays exactly as it is, and
+    every fused flow lies between the flows that it was made from. There are no parameters.
     """
+
+    def __init__(self, scale: str) -> None:
+        super().__init__()
+        self.scale = scale
 
     def weights(self, context: Features) -> Tensor:
         """Weight of each neighbour, (B, 9, H, W), row by row; at every pixel they sum to one."""
         channels, height, width = context.shape[1:]
-        similarity = math.sqrt(channels) * local_correlation(context, context, 1)  # which is a mean over C
+        share = math.sqrt(channels) if self.scale == "inverse_sqrt" else channels
+        similarity = share * local_correlation(context, context, 1)  # which is a mean over C
         beyond = F.unfold(context.new_ones(1, 1, height, width), 3, padding=1).view(1, 9, height, width) == 0
         return torch.softmax(similarity.masked_fill(beyond, -torch.inf), dim=1)
 

@@ -98,9 +98,9 @@ def picture(rows: dict[str, Comparison], title: str) -> bytes:
         difference = 0.5 + AMPLIFIED * (row.rendered - row.frame)
         errors = " ".join(f"{value:.1f}" for value in row.numbers()["mean_absolute_outside_dots"])
         titles = (name, "fitted sensor, rendered", f"difference x {AMPLIFIED}; outside dots {errors} of 255")
-        for axis, image, title in zip(line, (row.frame, row.rendered, difference), titles, strict=True):
+        for axis, image, caption in zip(line, (row.frame, row.rendered, difference), titles, strict=True):
             axis.imshow(np.clip(image, 0, 1), interpolation="nearest")
-            axis.set_title(title, fontsize=9)
+            axis.set_title(caption, fontsize=9)
             axis.set_axis_off()
     figure.suptitle(title, fontsize=10)
     figure.tight_layout()

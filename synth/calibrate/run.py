@@ -18,8 +18,10 @@ from synth.calibrate.comparison import Comparison, compare, picture, render_unde
 from synth.calibrate.dot_grid import DotGridFit
 from synth.calibrate.frames import Frames, at_rest, read_frames
 from synth.calibrate.report import fitted_content, numbers, summary
+from synth.calibrate.rest_map import measured_rest_map, with_rest_map
 from synth.calibrate.sensor_fit import SensorFit, find_grid, fit_sensor
 from synth.calibrate.verdict import verdict
+from synth.dataset.images import encode_png
 from synth.dataset.storage import refuse_foreign, replace_file, storage_errors
 from synth.errors import InputError
 from synth.render.variant import LLVM_HINT, choose_variant
@@ -27,7 +29,7 @@ from synth.scene import Dots, NoPattern, Render, Sensor
 from synth.scene.template import Template, checked_template, load_scene, replaced
 from synth.scene.validation import validated
 
-SCENE, PICTURE, NUMBERS = "scene.toml", "calibration.png", "calibration.json"
+SCENE, PICTURE, NUMBERS, MAP = "scene.toml", "calibration.png", "calibration.json", "rest_map.png"
 MARK = "Fitted by `synth calibrate"
 """How the scene that is written begins."""
 _SPACINGS = 4.0
@@ -43,8 +45,11 @@ def run_calibrate(
     spacing_mm: float | None,
     steps: int,
     as_json: bool,
+    rest_map: bool = False,
 ) -> int:
     """Fit a preset to frames of a user's sensor; write OUT/scene.toml, calibration.png and calibration.json.
+
+    With `rest_map` also OUT/rest_map.png, which the scene then names, and comparisons with it.
 
     Arguments are the options of the command (`synth.cli`); returns 0 if the fit is good, 1 if it is not. InputError
     where frames, preset or storage are at fault, or this machine has no differentiable variant.
@@ -66,6 +71,12 @@ def run_calibrate(
     rows, grids = _compared(fit, render_undeformed(fit.sensor, render_settings(template), variant), given, others)
     found = verdict(rows, grids, fit.sensor, spacing_mm is not None)
     content = _checked_content(template, fit, out, scene)
+    if rest_map:
+        gamma = fit.sensor.camera.gamma
+        factors = measured_rest_map(rows["frames"], gamma)
+        rows |= {f"{name}, with the rest map": with_rest_map(row, factors, gamma) for name, row in rows.items()}
+        content["sensor"]["camera"]["rest_map"] = MAP
+        replace_file(out / MAP, encode_png(factors))
     record = numbers(template.name, frames, fit, start, rows, found, given, time.perf_counter() - started)
     comment = f"# {MARK} --scene {scene}` to {len(frames)} frame(s); numbers in {NUMBERS}.\n"
     replace_file(out / SCENE, (comment + tomli_w.dumps(content)).encode())
@@ -100,8 +111,10 @@ def start_sensor(template: Template, size: tuple[int, int]) -> Sensor:
             f"{template.label}: sensor.pattern.kind = {sensor.pattern.kind!r}: calibration needs a pattern that "
             "leaves smooth coating to see the lights by; allowed are 'dots' and 'none'"
         )
-    if sensor.mirrors or sensor.further_cameras:
-        raise InputError(f"{template.label}: calibration knows one camera without mirrors; take them out of the preset")
+    if sensor.mirrors or sensor.further_cameras or sensor.measured_light:
+        raise InputError(
+            f"{template.label}: calibration knows one camera without mirrors or measured_light: remove them"
+        )
     if sensor.camera.aperture_mm:
         raise InputError(
             f"{template.label}: sensor.camera.aperture_mm = {sensor.camera.aperture_mm}: calibration fits one blur "
@@ -117,6 +130,7 @@ def start_sensor(template: Template, size: tuple[int, int]) -> Sensor:
         "cx": width / 2 + (camera.cx - camera.width / 2) * scale,
         "cy": height / 2 + (camera.cy - camera.height / 2) * scale,
         "blur_px": camera.blur_px * scale,
+        "rest_map": None,  # of other frames and lights
     }
     return sensor.model_copy(update={"camera": camera.model_copy(update=view)})
 
@@ -130,7 +144,7 @@ def _check_places(template: Template, out: Path) -> None:
     gel = template.corners[0].sensor.gel
     if not gel.is_flat:
         raise InputError(f"{template.label}: sensor.gel.shape: calibrate fits flat gels only, not a {gel.shape}")
-    refuse_foreign(out / SCENE, MARK.encode(), out / PICTURE, out / NUMBERS)
+    refuse_foreign(out / SCENE, MARK.encode(), out / PICTURE, out / NUMBERS, out / MAP)
     if (out / SCENE).resolve() == template.source.resolve():
         raise InputError(f"--out {out}: its {SCENE} is what --scene starts from and would be lost; give another --out")
 

@@ -23,6 +23,7 @@ from synth.pipeline.records import JobContext, Outcome, SimulatedTrajectory
 from synth.pipeline.render_session import Frame, RenderedTrajectory
 from synth.render.camera_image import camera_image
 from synth.render.exposure import advice, levels_of
+from synth.render.rest_map import read_rest_map
 from synth.scene import Camera, MeshIndenter, Outputs
 from synth.scene.sampling import Pair
 from synth.simulate import State
@@ -47,21 +48,22 @@ def finish(context: JobContext, rendered: RenderedTrajectory) -> Outcome:
         started = time.perf_counter()
         sample = _sample(context, rendered, pair, diagnostics, views)
         traced = time.perf_counter()
-        warning = (
-            _warning(sample, rendered.frames[pair.frames[0]].radiance[""]) if pair is simulated.pairs[0] else warning
-        )
+        if pair is simulated.pairs[0]:
+            warning = _warning(context, sample, rendered.frames[pair.frames[0]].radiance[""])
         entry = write_sample_files(context.out, sample, context.job)
         seconds = {**shared, "flow": traced - started, "write": time.perf_counter() - traced}
         entries.append(replace(entry, seconds={stage: round(value, 4) for stage, value in seconds.items()}))
     return Outcome(tuple(entries), simulated.failures, (), tuple(filter(None, (simulated.warning, warning))))
 
 
-def _warning(sample: Sample, radiance: Image) -> str:
+def _warning(context: JobContext, sample: Sample, radiance: Image) -> str:
     """What makes a sample's images useless: little gel in them, or light that is clipped, dark or flat; or empty."""
     gel = np.isfinite(sample.flow.forward[:, :, 0])
     if (share := gel.mean()) < LEAST_GEL:
         return f"images show gel in {100 * share:.0f} % of their pixels only: check fx, fy and place of sensor.camera"
-    found = advice(levels_of(sample.image1, gel), radiance, gel, sample.scene.sensor.camera)
+    camera = sample.scene.sensor.camera
+    rest_map = read_rest_map(camera, context.plan.template.folder)
+    found = advice(levels_of(sample.image1, gel), radiance, gel, camera, rest_map)
     return f"light is {found} (see `python -m synth preview`)" if found else ""
 
 
@@ -123,7 +125,7 @@ def expose(context: JobContext, camera: Camera, radiance: Image, numbers: tuple[
     rng = context.stream("noise", *numbers)
     if context.plan.variant.is_mono:
         return camera_image(radiance[:, :, :1], camera, rng)[:, :, 0]
-    return camera_image(radiance, camera, rng)
+    return camera_image(radiance, camera, rng, read_rest_map(camera, context.plan.template.folder))
 
 
 def _flow(outputs: Outputs, view: View, frames: list[Frame], pressed: State, patch: ContactPatch | None) -> FlowField:

@@ -13,6 +13,7 @@ from synth.arrays import FloatArray, Image
 from synth.errors import InputError
 from synth.mesh import rest_surface
 from synth.pipeline.records import JobContext, SimulatedTrajectory
+from synth.render.measured_light import read_measured_light
 from synth.render.pattern import albedo
 from synth.render.renderer import Renderer
 from synth.scene import Scene
@@ -106,11 +107,13 @@ class RenderSession:
             variant = self._context.plan.variant
             variant.load()
             sensor = scene.sensor
-            painted = albedo(sensor, self._context.stream("pattern", number), self._context.plan.template.folder)
+            folder = self._context.plan.template.folder
+            painted = albedo(sensor, self._context.stream("pattern", number), folder)
+            measured = read_measured_light(sensor, folder)
             surface = meshed if sensor.gel.is_round else rest_surface(sensor.gel)
             renderer = self._sensor.renderer if self._sensor else None
-            if renderer is None or not renderer.reuse(sensor, surface, painted):
-                renderer = Renderer(sensor, scene.render, surface, painted, variant)
+            if renderer is None or not renderer.reuse(sensor, surface, painted, measured):
+                renderer = Renderer(sensor, scene.render, surface, painted, variant, measured)
             seed = self._seed("rest", number)
             rest = None if sensor.gel.dome_radius_mm else renderer.radiances(surface.material, seed)
             self._sensor = SensorRenderer(number, renderer, rest)

@@ -9,7 +9,9 @@ from synth.errors import InputError
 from synth.mesh import default_edge_length, face_of
 from synth.mesh.cad import CadFace
 from synth.render.camera_rays import pinhole
+from synth.render.measured_light import read_measured_light
 from synth.render.pattern import check_pattern, is_grey
+from synth.render.rest_map import read_rest_map
 from synth.render.separated_light import is_separated
 from synth.render.thin_lens import check_views
 from synth.render.variant import Variant, job_variant
@@ -85,13 +87,16 @@ def check_buildable(template: Template, variant: Variant) -> None:
 
     InputError, at a corner of the distributions, for an indenter whose parts do not fit or whose file is no surface, a
     gel from files that is too thin or is pressed beside its face, a light in the camera's view, a lens or a kind of
-    light that this variant or coating cannot have, a pattern that no pixel could show or whose file is no picture, or
-    more pairs than a trajectory has.
+    light that this variant or coating cannot have, a pattern that no pixel could show or whose file is no picture, a
+    rest map or measured light that does not fit camera or lights, or more pairs than a trajectory has.
     """
     try:
         for sensor in dict.fromkeys(corner.sensor for corner in template.corners):
             check_views(sensor)
             check_pattern(sensor, template.folder)
+            read_measured_light(sensor, template.folder)
+            for camera in sensor.cameras.values():
+                read_rest_map(camera, template.folder)
             for view in () if variant.is_vectorised else sensor.views.values():
                 pinhole(view)
         for indenter in dict.fromkeys(corner.contact.indenter for corner in template.corners):
@@ -103,7 +108,7 @@ def check_buildable(template: Template, variant: Variant) -> None:
             gel = corner.sensor.gel
             if isinstance(face := face_of(gel, template.folder), CadFace):
                 face.check(corner.motion, corner.numerics.edge_length_mm or default_edge_length(gel))
-            is_separated(corner.render, corner.sensor.coating, variant)
+            is_separated(corner.render, corner.sensor, variant)
             check_pairs(corner)
     except InputError as error:
         raise InputError(f"{template.label}: {error}") from error
@@ -124,10 +129,13 @@ def _decisions(template: Template, variant: Variant) -> tuple[Decision, ...]:
     pinhole = "" if max(apertures) > 0 else ": a pinhole"
     mirrors, further = len(corners[0].sensor.mirrors), len(corners[0].sensor.further_cameras)
     light = corners[0].render.light
-    separated = is_separated(corners[0].render, corners[0].sensor.coating, variant)
+    separated = is_separated(corners[0].render, corners[0].sensor, variant)
     instead = f", but {variant.name} path-traces" if light == "separated" and not separated else ""
+    contained = "" if corners[0].sensor.measured_light is None else ": measured light contains it"
     grey = all(is_grey(c.sensor) for c in corners)
-    hue = "lights, coating and pattern are grey" if grey else "a light, the coating or the pattern has colour"
+    hue = (
+        "lights, coating and pattern are grey" if grey else "a light, the coating, the pattern or a rest map has colour"
+    )
     if grey and not variant.is_mono:
         hue += f", but {variant.name} has no grey counterpart here"
     optional = [name for name in ("depth", "normal", "displacement", "traction", "contact") if getattr(outputs, name)]
@@ -144,7 +152,7 @@ def _decisions(template: Template, variant: Variant) -> tuple[Decision, ...]:
         Decision("mirrors", mirrors > 0, f"{mirrors} in sensor.mirrors"),
         Decision("further cameras", further > 0, f"{further} in sensor.further_cameras"),
         Decision("separated light", separated, f"render.light = {light}{instead}"),
-        Decision("indirect light", max(bounces) > 2, _span("render.max_depth", bounces)),
+        Decision("indirect light", max(bounces) > 2 and not contained, _span("render.max_depth", bounces) + contained),
         Decision("colour", not variant.is_mono, hue),
         Decision("backward flow", outputs.backward, f"outputs.backward = {str(outputs.backward).lower()}"),
         Decision("optional channels", bool(optional), ", ".join(optional) or "none asked for in outputs"),

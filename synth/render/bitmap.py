@@ -9,8 +9,10 @@ detail becomes its mean; then it is interpolated linearly at the texels' centres
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from synth.arrays import FloatArray, Image
 from synth.errors import InputError
@@ -42,27 +44,33 @@ def read_picture(pattern: Bitmap, folder: Path) -> Image:
     Red, green and blue, each multiplied by the opacity, and the opacity. InputError where there is no such file, or no
     picture of 8 or 16 bits that OpenCV can read.
     """
+    stored = decoded(folder / pattern.file, "sensor.pattern.file", (np.uint8, np.uint16))
+    values: Image = stored.astype(np.float32) / np.float32(np.iinfo(stored.dtype).max)
+    opacity = values[:, :, 3:] if values.shape[2] == 4 else np.ones((*values.shape[:2], 1), np.float32)
+    return np.concatenate([_linear(values[:, :, 2::-1]) * opacity, opacity], axis=2)
+
+
+def decoded(path: Path, where: str, kinds: tuple[type, ...]) -> NDArray[Any]:
+    """A picture as it is stored, (h, w, 3) in the order BGR, (h, w, 4) with opacity or (h, w) floats; of these dtypes.
+
+    InputError, which names `where`, for no such file, and for none that OpenCV can read.
+    """
     import cv2
 
-    path = folder / pattern.file
     try:
         data = read_file(path)
     except OSError as error:
-        raise InputError(f"sensor.pattern.file: {path} cannot be read: {error.strerror or error}") from error
-    check_picture(data, f"sensor.pattern.file: {path}", most=MOST_PIXELS)
+        raise InputError(f"{where}: {path} cannot be read: {error.strerror or error}") from error
+    check_picture(data, f"{where}: {path}", most=MOST_PIXELS)
     try:
         stored = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        if stored is not None and stored.shape[2:] != (4,):  # no opacity: turned as EXIF says, three channels
+        if stored is not None and stored.dtype != np.float32 and stored.shape[2:] != (4,):  # turned as EXIF says
             stored = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
     except cv2.error:
         stored = None
-    if stored is None or stored.dtype not in (np.uint8, np.uint16):
-        raise InputError(
-            f"sensor.pattern.file: {path} is no whole picture of 8 or 16 bits that OpenCV can read; save it as PNG"
-        )
-    values = stored.astype(np.float32) / np.iinfo(stored.dtype).max
-    opacity = values[:, :, 3:] if values.shape[2] == 4 else np.ones((*values.shape[:2], 1), np.float32)
-    return np.concatenate([_linear(values[:, :, 2::-1]) * opacity, opacity], axis=2)
+    if stored is None or stored.dtype not in kinds:
+        raise InputError(f"{where}: {path} is no whole picture of 8 or 16 bits that OpenCV can read; save it as PNG")
+    return stored
 
 
 def _placed(pattern: Bitmap, tall: float, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

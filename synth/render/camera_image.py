@@ -2,12 +2,12 @@
 
 Per channel, with full scale 1 and all steps but the last two linear:
 
-    signal = exposure · vignette · (radiance * Gaussian point spread)
+    signal = exposure · vignette · rest map · (radiance * Gaussian point spread)
     noisy  = signal + N(0, read_noise² + shot_noise² · signal)          (EMVA 1288, photon-transfer model)
     value  = quantise(clip(noisy, 0, 1) ** (1 / gamma))
 
 The radiance of a wide-angle lens falls off towards the corners; the vignette 1 - v ρ² (ρ = 1 at the image's farthest
-corner from the principal point) stands for natural and mechanical vignetting together.
+corner from the principal point) stands for natural and mechanical vignetting together. For rest maps see there.
 
 A pixel has enough samples when nobody sees the renderer's noise behind the camera's own. Two pilot pictures with
 different seeds differ by √2 times the renderer's noise, after the lens's blur and in encoded values, as they are seen.
@@ -33,14 +33,16 @@ def noise_deviation(signal: FloatArray, camera: Camera) -> FloatArray:
     return np.asarray(np.sqrt(camera.read_noise**2 + camera.shot_noise**2 * signal))
 
 
-def camera_image(radiance: Image, camera: Camera, rng: np.random.Generator) -> NDArray[np.uint8] | NDArray[np.uint16]:
+def camera_image(
+    radiance: Image, camera: Camera, rng: np.random.Generator, rest_map: FloatArray | float = 1.0
+) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """The image as it is read from the camera: (H, W, 3) uint8 for 8 bits, for 10 to 16 bits uint16.
 
     That is stretched to the full 16-bit range (a 10-bit value q is stored as round(q · 65535 / 1023)), as readers of
     16-bit PNGs expect; the steps between values stay 10-bit. The radiance (H, W, 3) float32 is linear, and exposure 1
-    maps 1 to full scale. `rng` gives the noise; two images need two states of it.
+    maps 1 to full scale. `rng` gives the noise; two images need two states of it. `rest_map`: (H, W, 3 or 1), or 1.
     """
-    signal = expected_signal(radiance, camera)
+    signal = expected_signal(radiance, camera, rest_map)
     noisy = signal + noise_deviation(signal, camera) * rng.standard_normal(signal.shape)
     levels = 2**camera.bit_depth - 1
     quantised = np.floor(encoded(noisy, camera) * levels + 0.5)
@@ -49,8 +51,8 @@ def camera_image(radiance: Image, camera: Camera, rng: np.random.Generator) -> N
     return np.floor(quantised * (65535 / levels) + 0.5).astype(np.uint16)
 
 
-def expected_signal(radiance: Image, camera: Camera) -> FloatArray:
-    """The noiseless linear signal (H, W, 3) float64, full scale 1, not clipped: blurred, vignetted, exposed."""
+def expected_signal(radiance: Image, camera: Camera, rest_map: FloatArray | float = 1.0) -> FloatArray:
+    """The noiseless linear signal (H, W, 3) float64, full scale 1, not clipped: blurred, vignetted, mapped, exposed."""
     signal = radiance.astype(np.float64)
     if camera.blur_px > 0:
         import cv2
@@ -61,7 +63,7 @@ def expected_signal(radiance: Image, camera: Camera) -> FloatArray:
         signal = blurred.reshape(signal.shape)  # OpenCV drops the axis of a single channel
     if camera.vignetting > 0:
         signal = signal * vignette(camera)[:, :, None]
-    return camera.exposure * signal
+    return camera.exposure * signal * rest_map
 
 
 def vignette(camera: Camera) -> FloatArray:

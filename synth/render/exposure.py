@@ -6,7 +6,7 @@ Levels are shares of white. Rule of thumb: the brightest per cent of the gel lie
 import numpy as np
 from numpy.typing import NDArray
 
-from synth.arrays import BoolArray, Image
+from synth.arrays import BoolArray, FloatArray, Image
 from synth.render.camera_image import expected_signal
 from synth.scene import Camera
 
@@ -36,7 +36,7 @@ def levels_of(image: NDArray[np.uint8] | NDArray[np.uint16], gel: BoolArray) -> 
     return found
 
 
-def advice(levels: Levels, radiance: Image, gel: BoolArray, camera: Camera) -> str:
+def advice(levels: Levels, radiance: Image, gel: BoolArray, camera: Camera, rest_map: FloatArray | float = 1.0) -> str:
     """What is wrong with a picture's light, and what to do about it; empty where nothing is.
 
     The radiance (H, W, C) is not clipped, so that the factor holds for any light.
@@ -53,7 +53,7 @@ def advice(levels: Levels, radiance: Image, gel: BoolArray, camera: Camera) -> s
         )
     else:
         return ""
-    peak = float(np.percentile(expected_signal(radiance, camera)[gel], 99, axis=0).max())
+    peak = float(np.percentile(expected_signal(radiance, camera, rest_map)[gel], 99, axis=0).max())
     if peak == 0:
         return "dark: no light reaches the gel that the camera sees; check places and aims of sensor.lights"
     factor = AIM**camera.gamma / peak

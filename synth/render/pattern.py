@@ -146,6 +146,8 @@ def _scale(optics: Optics, sensor: Sensor) -> float:
 def is_grey(sensor: Sensor) -> bool:
     """Whether coating, pattern and lights are all grey, so that one channel tells everything."""
     pattern = sensor.pattern
+    if any(camera.rest_map for camera in sensor.cameras.values()):
+        return False
     if isinstance(pattern, Bitmap) or (isinstance(pattern, RandomColor) and pattern.saturation > 0):
         return False
     colors = [sensor.coating.reflectance, *(light.color for light in sensor.lights)]

@@ -12,7 +12,6 @@ in a fixed order, not by atomic adds: the same seed gives the same bits with any
 """
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -26,9 +25,12 @@ from synth.render.coating import reflection
 from synth.render.gel_hits import GelHits
 from synth.render.gel_mesh import GelMesh
 from synth.render.lights import all_lights, emitters, panel_corners, panels, reflecting_plane
+from synth.render.measured_light import LightModel
 from synth.render.path_tracer import PathTracer
 from synth.render.pattern import is_grey
-from synth.render.separated_light import FrameGeometry, SeparatedLight, is_separated
+from synth.render.recordings import Recordings
+from synth.render.separated_light import SeparatedLight, is_separated
+from synth.render.smooth_light import FrameGeometry
 from synth.render.thin_lens import check_views
 from synth.render.variant import Variant
 from synth.scene import Render, Sensor
@@ -40,8 +42,6 @@ _MAX_WAVEFRONT, _MAX_WAVEFRONT_GPU = 2**22, 2**24
 """Samples traced at once. Constants, because the split into passes decides the random numbers."""
 
 _PILOT_SEEDS = (1, 2)
-_RECORDINGS = 8
-"""Recordings of frames that are kept: every size of mesh and of picture has its own."""
 
 _LIGHT_PART = 2**31
 """Stands for the number of a pass in the seed of what all pixels share."""
@@ -51,16 +51,24 @@ class Renderer:
     """The renderer of one sensor instance, or of one after another.
 
     `samples_per_pixel` is rounded up to the next full grid (see `full_grid`). The albedo, (rows, columns, 3 or 4)
-    float32 over the contact face from `pattern.albedo`, must not be changed afterwards. InputError for a light in the
-    camera's view, a lens that cannot focus or that a scalar variant cannot render, and separated light with a coating
-    that shines; ValueError for a mono variant with a sensor that is not grey.
+    float32 over the contact face from `pattern.albedo`, must not be changed afterwards; `measured` is from
+    `read_measured_light`. InputError for a light in the camera's view, a lens that cannot focus, and a lens or light
+    that this variant or coating cannot have; ValueError for a mono variant with a sensor that is not grey.
     """
 
-    def __init__(self, sensor: Sensor, render: Render, surface: GelSurface, albedo: Image, variant: Variant) -> None:
+    def __init__(
+        self,
+        sensor: Sensor,
+        render: Render,
+        surface: GelSurface,
+        albedo: Image,
+        variant: Variant,
+        measured: LightModel | None = None,
+    ) -> None:
         if variant.is_mono and not is_grey(sensor):
             raise ValueError(f"{variant.name} renders grey sensors only: choose the variant with grey=is_grey(sensor)")
         self._variant, self._render, self._recordings = variant, render, Recordings()
-        self._separated = is_separated(render, sensor.coating, variant)
+        self._separated = is_separated(render, sensor, variant)
         mi = variant.load()
         check_views(sensor)
         self._built = self._parts(sensor)
@@ -84,9 +92,9 @@ class Renderer:
         else:  # a path through Mitsuba's window is one interaction longer than one that starts inside
             depth = render.max_depth + refracts
             self._integrator = mi.load_dict({"type": "path", "max_depth": depth, "hide_emitters": True})
-        self._use(sensor, albedo)
+        self._use(sensor, albedo, measured)
 
-    def reuse(self, sensor: Sensor, surface: GelSurface, albedo: Image) -> bool:
+    def reuse(self, sensor: Sensor, surface: GelSurface, albedo: Image, measured: LightModel | None = None) -> bool:
         """Render this sensor from now on, if light is separated and it differs in numbers alone; else say False.
 
         What Dr.Jit has recorded of frames serves it, too.
@@ -97,14 +105,14 @@ class Renderer:
         self._behind = reflecting_plane(sensor)
         self.take(surface)
         self._parameters["lights.vertex_positions"] = panel_corners(all_lights(sensor))
-        self._use(sensor, albedo)
+        self._use(sensor, albedo, measured)
         return True
 
     def _parts(self, sensor: Sensor) -> tuple[Any, ...]:
         """What of a sensor is built into Mitsuba's scene, and is no number in it."""
         return len(all_lights(sensor)), reflecting_plane(sensor) is None, chart_of(sensor)
 
-    def _use(self, sensor: Sensor, albedo: Image) -> None:
+    def _use(self, sensor: Sensor, albedo: Image, measured: LightModel | None) -> None:
         mi, render = self._variant.load(), self._render
         self._sensor, self._views = sensor, sensor.views
         lit = len(all_lights(sensor)) if self._variant.is_vectorised else sum(x.power > 0 for x in sensor.lights)
@@ -112,7 +120,8 @@ class Renderer:
         self._light: Any = None
         if self._separated:
             colors = albedo.mean(axis=2, keepdims=True) if self._variant.is_mono else albedo
-            self._light = SeparatedLight(sensor, self._scene, self._hits, AlbedoMap(colors, mi), render.max_depth, mi)
+            painted = AlbedoMap(colors, mi)
+            self._light = SeparatedLight(sensor, self._scene, self._hits, painted, measured, render.max_depth, mi)
         elif self._variant.is_vectorised:
             self._light = PathTracer(sensor, self._scene, self._hits, self._shapes, render.max_depth, mi)
         if self._variant.is_vectorised:
@@ -197,7 +206,8 @@ class Renderer:
         self._prepared = None
         if self._separated:
             mi, camera = self._variant.load(), self._views[""].camera
-            frame = FrameGeometry(self._sensor, self._meshes["gel"], positions, self._render.max_depth > 2)
+            is_deep = self._render.max_depth > 2 and self._sensor.measured_light is None
+            frame = FrameGeometry(self._sensor, self._meshes["gel"], positions, is_deep)
             numbers = frame.numbers(_mitsuba_seed(seed, _LIGHT_PART, 0), mi)
             primary = min(camera.width * camera.height, _PIXELS) * self.samples_per_pixel
             static = (self._light.static, frame.sizes, primary, frame.bounces)
@@ -241,34 +251,6 @@ class Renderer:
         }
         description["sampler"] = self._sampler
         return mi.load_dict(description)
-
-
-class Recordings:
-    """Functions that Dr.Jit records at their first call and replays at later ones.
-
-    What changes from call to call are Dr.Jit's numbers. Python's own, `static`, are part of the key: Dr.Jit 1.5 does
-    not always notice that a bool has changed, and replays the other branch.
-    """
-
-    def __init__(self) -> None:
-        self._known: dict[tuple[Any, ...], Callable[..., Any]] = {}
-
-    def of(self, function: Callable[..., Any], *static: Any) -> Callable[..., Any]:
-        """The function with its last arguments given."""
-        import drjit as dr
-
-        key = (function, *static)
-        found = self._known.pop(key, None)
-        if found is None:
-
-            def called(*values: Any) -> Any:
-                return function(*values, *static)
-
-            found = dr.freeze(called, warn_after=10**9)
-        self._known[key] = found  # the last used comes last
-        if len(self._known) > _RECORDINGS:
-            del self._known[next(iter(self._known))]
-        return found
 
 
 def prepare(light: SeparatedLight, frame: Any, _: Any, *arguments: Any) -> Any:

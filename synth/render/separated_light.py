@@ -17,6 +17,9 @@ A Lambertian surface's radiance is its albedo ρ times its irradiance E over π,
 - The lights l include their mirror images behind the window (`synth.render.lights`), which have no closed form.
 - E_returned, light that the gel sends to the window and gets back, is smooth and fitted as well.
 
+Measured light (`synth.render.measured_light`) replaces E_l where the sampled point of light l is not blocked. It was
+measured with what is bounced and returned at rest, so that neither is added.
+
 What remains of systematic error: shadows that all pilot rays of a neighbourhood missed, and how bounced light departs
 from linear within one triangle; docs/reports/light.md measures both. Random numbers are the sampler's, sums are of
 fixed order: the same seed gives the same bits.
@@ -30,28 +33,23 @@ from functools import reduce
 from operator import or_
 from typing import Any
 
-import numpy as np
-
-from synth.arrays import Points
 from synth.errors import InputError
 from synth.render.albedo_map import AlbedoMap
 from synth.render.face_points import FacePoints, count_per_face, projected
 from synth.render.gel_hits import GelHits
-from synth.render.gel_mesh import GelMesh
-from synth.render.lights import image_lights, reaches, reflectance, reflecting_plane
+from synth.render.lights import image_lights, reaches, reflectance
+from synth.render.measured_light import LightModel, MeasuredLight
 from synth.render.polygon_light import LightTable, PolygonLight
-from synth.render.smooth_light import Nodes, SmoothFit, fitted
-from synth.render.variant import Variant
-from synth.scene import Coating, Light, Render, Sensor
+from synth.render.smooth_light import fitted
+from synth.render.variant import LLVM_HINT, Variant
+from synth.scene import Light, Render, Sensor
 
 _PILOTS = 2**14
 """Rays to each light, and to the gel, from a gel of few faces; 16 from each face where there are many."""
 _MANY = 0.25
 """Share of a face's pilots that must see gel for its bounced light to be linear and not constant."""
-_RETURNING_NODES, _RETURNING_PATHS = 1024, 144
-"""Points at which light that comes back from the window is sampled, and paths from each."""
-_CLEARANCE_MM = 1e-3
-"""Height above the gel's highest point at which rays end that look for gel alone: far more than rounding."""
+_RETURNING_PATHS = 144
+"""Paths from each point at which light that comes back from the window is sampled."""
 _NEGLIGIBLE = 1e-4
 """Share of all light on a point up to which a light's shadows are not sampled."""
 _BITS = 32
@@ -60,11 +58,17 @@ _SHIFT = (0.7548776662466927, 0.5698402909980532)
 """Shift of shadow rays from one light to the next: R2 sequence (Roberts 2018), on a torus to keep the strata."""
 
 
-def is_separated(render: Render, coating: Coating, variant: Variant) -> bool:
+def is_separated(render: Render, sensor: Sensor, variant: Variant) -> bool:
     """Whether light is separated or path traced: decided here alone. Scalar variants path-trace.
 
-    InputError where separated light is asked for, and the coating shines.
+    InputError where separated light is asked for, and the coating shines, and for measured light without it.
     """
+    coating = sensor.coating
+    if sensor.measured_light is not None and not (render.light == "separated" and variant.is_vectorised):
+        raise InputError(
+            f'sensor.measured_light needs render.light = "separated" (given: "{render.light}") and a vectorised '
+            f"variant (here: {variant.name}): {LLVM_HINT}"
+        )
     if render.light != "separated":
         return False
     if not coating.is_matt:
@@ -74,40 +78,6 @@ def is_separated(render: Render, coating: Coating, variant: Variant) -> bool:
             'set render.light to "path_traced"'
         )
     return variant.is_vectorised
-
-
-class FrameGeometry:
-    """How a gel lies in one frame, as `SeparatedLight.prepare` needs it: solved for on the host.
-
-    `positions` are (v, 3) mm of the mesh's vertices. A plane sends itself no light.
-    """
-
-    def __init__(self, sensor: Sensor, mesh: GelMesh, positions: Points, is_deep: bool) -> None:
-        placed = mesh.positions(positions).reshape(-1, 3).astype(np.float64)
-        faces = mesh.faces().reshape(-1, 3).astype(np.int32)
-        low, high = placed.min(axis=0), placed.max(axis=0)
-        self.top = float(high[2]) + _CLEARANCE_MM
-        self.sizes = len(placed), len(faces)
-        self.bounces = is_deep and bool(high[2] - low[2] > _CLEARANCE_MM)
-        self.cavity, self.window, self.returning = None, None, None
-        if self.bounces and sensor.gel.is_round:
-            self.cavity = SmoothFit(placed, faces, Nodes.centres(faces), low, high)
-        if is_deep and reflecting_plane(sensor) is not None:
-            half = np.array(sensor.gel.size_mm[:2]) / 2
-            self.returning = Nodes.spread(placed, faces, _RETURNING_NODES)
-            self.window = SmoothFit(placed, faces, self.returning, -half, half)
-
-    def numbers(self, seed: int, mi: Any) -> dict[str, Any]:
-        """The frame's numbers on the device, with three seeds."""
-        import drjit as dr
-
-        return {
-            "seeds": [dr.opaque(mi.UInt32, (seed + part) % 2**32) for part in range(3)],
-            "top": dr.opaque(mi.Float, self.top),
-            "cavity": self.cavity and self.cavity.numbers(mi),
-            "window": self.window and self.window.numbers(mi),
-            "returning": self.returning and self.returning.numbers(mi),
-        }
 
 
 @dataclass(init=False, eq=False)
@@ -128,18 +98,32 @@ class SeparatedLight:
     _index: Any
     _words: int
     _lights: list[LightTable]
+    _measured: MeasuredLight | None
 
-    def __init__(self, sensor: Sensor, scene: Any, gel: GelHits, albedo: AlbedoMap, max_depth: int, mi: Any) -> None:
+    def __init__(
+        self,
+        sensor: Sensor,
+        scene: Any,
+        gel: GelHits,
+        albedo: AlbedoMap,
+        measured: LightModel | None,
+        depth: int,
+        mi: Any,
+    ) -> None:
         import drjit as dr
 
         self._mi, self._dr, self._scene = mi, dr, scene
         self._gel, self._albedo = gel, albedo
-        self.max_depth, self._channels = max_depth, albedo.channels
+        self.max_depth, self._channels = depth, albedo.channels
         index = sensor.window.refractive_index
         self._index = dr.opaque(mi.Float, index)  # used only where the window reflects
         size = sensor.gel.size_mm
+        self._measured = None if measured is None else MeasuredLight(measured, sensor, self._channels, mi)
         own = [light for light in sensor.lights if reaches(light, size)]
         images = [light for light in image_lights(sensor) if reaches(light, size)]
+        if measured is not None:  # all that shine, in their order, for their shadows alone
+            lambertian = {"viewing_angle_deg": 120.0}
+            own, images = [light.model_copy(update=lambertian) for light in sensor.lights if light.power > 0], []
         kinds: list[tuple[list[Light], dict[str, Any]]] = [
             ([light for light in own if not light.narrowness], {}),
             ([light for light in own if light.narrowness], {"sampled": True}),
@@ -151,7 +135,8 @@ class SeparatedLight:
     @property
     def static(self) -> tuple[Any, ...]:
         """What of the light is compiled into kernels."""
-        return self.max_depth, self._channels, self._words, tuple(table.static for table in self._lights)
+        tables = tuple(table.static for table in self._lights)
+        return self.max_depth, self._channels, self._words, tables, self._measured and self._measured.degree
 
     def prepare(
         self, frame: dict[str, Any], sizes: tuple[int, int], primary: int, bounces: bool
@@ -227,8 +212,12 @@ class SeparatedLight:
             for word, own in enumerate(masks):
                 mask = dr.select(number // _BITS == word, own, mask)
             asked = active & (((mask >> (number % _BITS)) & 1) != 0)
-            value = light.whole(at.p, normal, offset) - self._blocked(light, number, at, normal, offset, asked)
-            return [dr.fma(value, color, sum_) for color, sum_ in zip(light.radiance, total, strict=True)]
+            blocked = self._blocked(light, number, at, normal, offset, asked)
+            if self._measured is None:
+                value, given = light.whole(at.p, normal, offset) - blocked, light.radiance
+            else:
+                value, given = dr.select(blocked > 0, 0, 1), self._measured.irradiance(number, at, normal, active)
+            return [dr.fma(value, color, sum_) for color, sum_ in zip(given, total, strict=True)]
 
         return self._over_lights(add, [mi.Float(0) for _ in range(self._channels)])
 

@@ -19,11 +19,18 @@ from numpy.typing import NDArray
 
 from synth.arrays import FloatArray, Points, Triangles
 from synth.render.aligned import aligned
+from synth.render.gel_mesh import GelMesh
+from synth.render.lights import reflecting_plane
+from synth.scene import Sensor
 
 _DEGREE = 4
 """Degree of V's polynomials."""
 _R2 = (0.7548776662466927, 0.5698402909980532)
 """Steps of the R2 sequence."""
+_RETURNING_NODES = 1024
+"""Points at which light that comes back from the window is sampled."""
+_CLEARANCE_MM = 1e-3
+"""Height above the gel's highest point at which rays end that look for gel alone: far more than rounding."""
 _RANK = 1e-14
 """Relative eigenvalue below which directions are not fitted: on flat gel, those of V along it."""
 
@@ -79,6 +86,40 @@ class SmoothFit:
 
         centre, half = ([dr.opaque(mi.Float, float(x)) for x in of] for of in (self._centre, self._half))
         return {"solution": mi.Float(aligned(self._solution)), "centre": centre, "half": half}
+
+
+class FrameGeometry:
+    """How a gel lies in one frame, as `SeparatedLight.prepare` needs it.
+
+    `positions` are (v, 3) mm of the mesh's vertices. A plane sends itself no light.
+    """
+
+    def __init__(self, sensor: Sensor, mesh: GelMesh, positions: Points, is_deep: bool) -> None:
+        placed = mesh.positions(positions).reshape(-1, 3).astype(np.float64)
+        faces = mesh.faces().reshape(-1, 3).astype(np.int32)
+        low, high = placed.min(axis=0), placed.max(axis=0)
+        self.top = float(high[2]) + _CLEARANCE_MM
+        self.sizes = len(placed), len(faces)
+        self.bounces = is_deep and bool(high[2] - low[2] > _CLEARANCE_MM)
+        self.cavity, self.window, self.returning = None, None, None
+        if self.bounces and sensor.gel.is_round:
+            self.cavity = SmoothFit(placed, faces, Nodes.centres(faces), low, high)
+        if is_deep and reflecting_plane(sensor) is not None:
+            half = np.array(sensor.gel.size_mm[:2]) / 2
+            self.returning = Nodes.spread(placed, faces, _RETURNING_NODES)
+            self.window = SmoothFit(placed, faces, self.returning, -half, half)
+
+    def numbers(self, seed: int, mi: Any) -> dict[str, Any]:
+        """The frame's numbers on the device, with three seeds."""
+        import drjit as dr
+
+        return {
+            "seeds": [dr.opaque(mi.UInt32, (seed + part) % 2**32) for part in range(3)],
+            "top": dr.opaque(mi.Float, self.top),
+            "cavity": self.cavity and self.cavity.numbers(mi),
+            "window": self.window and self.window.numbers(mi),
+            "returning": self.returning and self.returning.numbers(mi),
+        }
 
 
 def fitted(fit: dict[str, Any], samples: list[Any], positions: Any, normals: Any, mi: Any) -> list[Any]:

@@ -11,10 +11,11 @@ from synth.scene.numerics import Numerics, Render
 from synth.scene.part import Part, Vector3
 from synth.scene.pattern import Bitmap, Dots, NoPattern, Pattern, RandomColor, Speckle
 from synth.scene.scene import Contact, Outputs, Sampling, Scene
-from synth.scene.sensor import Coating, Light, Sensor, Window
+from synth.scene.sensor import Coating, Light, MeasuredLight, Sensor, Window
 
 __all__ = [
     "Bitmap", "Box", "Camera", "Coating", "Cone", "Contact", "Cylinder", "Dots", "FurtherCamera", "Gel", "Indenter",
-    "Layer", "Light", "MeshIndenter", "Mirror", "Motion", "NoPattern", "Numerics", "Outputs", "Part", "Pattern", "Pose",
-    "RandomColor", "Render", "Sampling", "Scene", "Sensor", "Speckle", "Sphere", "Torus", "Vector3", "Window",
+    "Layer", "Light", "MeasuredLight", "MeshIndenter", "Mirror", "Motion", "NoPattern", "Numerics", "Outputs",
+    "Part", "Pattern", "Pose", "RandomColor", "Render", "Sampling", "Scene", "Sensor", "Speckle", "Sphere", "Torus",
+    "Vector3", "Window",
 ]  # fmt: skip

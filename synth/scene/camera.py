@@ -41,6 +41,10 @@ class Camera(Part):
     a camera that looks straight down, its own z less that of the sharp plane. Only an aperture needs it."""
     vignetting: Fraction = 0.0
     """Relative loss of light at the image's corner, growing with the square of the distance from (cx, cy)."""
+    rest_map: Annotated[str, Field(min_length=1)] | None = None
+    """Picture of the camera's size, relative to the scene file, of factors of the linear image that stay fixed to it:
+    what lights and vignetting do not explain of a real sensor at rest, such as dust. Of 8 or 16 bits, 128 or 32768 is
+    a factor of 1; a grey TIFF of floats holds the factors themselves. Scenes with one are rendered in colour."""
     read_noise: Annotated[float, Field(ge=0, le=0.5)] = 0.0
     """Standard deviation as a fraction of full scale, linear, independent of the signal."""
     shot_noise: Annotated[float, Field(ge=0, le=0.5)] = 0.0

@@ -98,6 +98,18 @@ class Light(Part):
         return (level * self.color[0], level * self.color[1], level * self.color[2])
 
 
+class MeasuredLight(Part):
+    """Light as GelSight publishes it (github.com/gelsightinc/gssim), in place of what the lights would give.
+
+    Its LEDs are the lights in their order: power and color scale what was measured, places decide what is in shadow.
+    """
+
+    file: Annotated[str, Field(min_length=1)]
+    """The device's YAML file, relative to the scene file."""
+    flat_field: Annotated[str, Field(min_length=1)] | None = None
+    """The picture that the file names as modelfile, relative to the scene file; None: light as corrected by it."""
+
+
 class Sensor(Part):
     """Everything but contact and motion: gel, optics and light."""
 
@@ -106,6 +118,7 @@ class Sensor(Part):
     coating: Coating = Coating()
     pattern: Pattern
     lights: tuple[Light, ...] = Field(min_length=1)
+    measured_light: MeasuredLight | None = None
     camera: Camera
     further_cameras: tuple[FurtherCamera, ...] = ()
     mirrors: tuple[Mirror, ...] = ()

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from synth.errors import InputError
-from synth.scene import Bitmap, MeshIndenter, Numerics, Outputs, Sampling, Scene
+from synth.scene import Numerics, Outputs, Sampling, Scene
 from synth.scene.gel_file import measured
 from synth.scene.validation import DISTRIBUTIONS, validated
 from synth.untrusted import DEEPEST, MOST_FOLDERS, assigned_value, matching_files, open_file, read_toml
@@ -35,7 +35,7 @@ FIXED = ("name", "description", "references", "numerics", "outputs", "sampling")
 """Parts that all samples of a dataset share."""
 MOST_OPTIONS = 10_000
 """Of all choices of a scene: each is checked when the scene is loaded."""
-FILES = ("file", "outer", "window")
+FILES = ("file", "outer", "window", "rest_map", "flat_field")
 """Keys under which names of files stand."""
 
 _Turns = dict[int, list[tuple[Any, int]]]
@@ -48,7 +48,7 @@ Chooser = Callable[[str, list[Any]], Any]
 class Template:
     """A loaded scene file: the parsed TOML after overrides, and the keys that these gave values.
 
-    The source is the file, for messages and as the place that meshes and bitmaps are relative to.
+    The source is the file, for messages and as the place that files are relative to.
     """
 
     content: dict[str, Any]
@@ -66,7 +66,7 @@ class Template:
 
     @cached_property
     def hash(self) -> str:
-        """SHA-256 (16 hex digits) of what decides pixels: scene less description and references, meshes, bitmaps."""
+        """SHA-256 (16 hex digits) of what decides pixels: scene less description and references, and files."""
         decisive = {key: value for key, value in self.content.items() if key not in ("description", "references")}
         digest = hashlib.sha256(json.dumps(decisive, sort_keys=True).encode())
         for _, file in self._files():
@@ -110,11 +110,15 @@ class Template:
         return list(_distributions(self.content, ""))
 
     def _files(self) -> list[tuple[str, Path]]:
-        """Every file that an indenter or a pattern is read from, with the key that names it, without repetition."""
-        parts: list[tuple[str, Any]] = [("contact.indenter", corner.contact.indenter) for corner in self.corners]
-        parts += [("sensor.pattern", corner.sensor.pattern) for corner in self.corners]
-        names = sorted({(f"{key}.file", part.file) for key, part in parts if isinstance(part, MeshIndenter | Bitmap)})
-        return [(key, self.folder / name) for key, name in names]
+        """Every file that a scene is read from but the gel's, with the key that names it, without repetition."""
+        names = set()
+        for contact, sensor in ((corner.contact, corner.sensor) for corner in self.corners):
+            parts: dict[str, Any] = {"contact.indenter": contact.indenter, "sensor.pattern": sensor.pattern}
+            parts |= {f"sensor.{key}": camera for key, camera in sensor.cameras.items()}
+            parts["sensor.measured_light"] = sensor.measured_light
+            given = [(where, key, getattr(part, key, None)) for where, part in parts.items() for key in FILES]
+            names |= {(f"{where}.{key}", name) for where, key, name in given if name}
+        return [(key, self.folder / name) for key, name in sorted(names)]
 
 
 def load_scene(name_or_path: str | Path, set: Sequence[str] = ()) -> Template:

@@ -24,9 +24,8 @@ from gelflow.losses.regularisers import (
     area_ratio,
     decomposition_loss,
     deformation_loss,
-    first_order_loss,
+    edge_aware_loss,
     regulariser_weight,
-    second_order_loss,
 )
 from gelflow.ops.pyramid import flow_pyramid
 from gelflow.ops.warp import inside, warp
@@ -83,7 +82,7 @@ def test_decomposition_separates_stretch_shear_and_rotation_and_affine_flows_cos
     loss = decomposition_loss(flow, ONES, lambda_theta=10, lambda_zeta=100)
     # 100 times differences of numbers up to 5, in double precision
     assert loss.item() == pytest.approx(parts[0] + 10 * parts[1] + 100 * parts[2], abs=1e-11)
-    assert (first_order_loss(flow, torch.rand(1, 3, 10, 12, dtype=torch.float64), 10.0) == 0) == (not any(parts))
+    assert (edge_aware_loss(flow, torch.rand(1, 3, 10, 12, dtype=torch.float64), 10.0, 1) == 0) == (not any(parts))
     assert deformation_loss(flow, ONES) < 1e-13  # rounding: numbers up to 5 give slopes good to 1e-15
 
 
@@ -113,20 +112,29 @@ def test_scales_too_small_for_a_derivative_cost_nothing_and_keep_the_gradient_de
     weight, image = torch.ones(1, 1, size[0] - 1, size[1] - 1), torch.rand(1, 3, *size)
     loss = deformation_loss(flow, weight)
     if size[0] == 1:
-        loss = loss + decomposition_loss(flow, weight, 0.01, 0.01) + first_order_loss(flow, image, 10.0)
+        loss = loss + decomposition_loss(flow, weight, 0.01, 0.01) + edge_aware_loss(flow, image, 10.0, 1)
     loss.backward()
     assert loss == 0
     assert not flow.grad.any()
 
 
-def test_first_order_smoothness_and_weights_follow_their_definition_at_edges() -> None:
-    image = torch.zeros(1, 3, 4, 6, dtype=torch.float64)
-    image[..., 3:] = 1
-    flow = torch.zeros(1, 2, 4, 6, dtype=torch.float64)
-    flow[:, 0, :, 3:] = 2
-    # 3 x 5 pixels, 3 of them at the jump: 2 px times exp(-10), halved
-    assert first_order_loss(flow, image, 10.0).item() == pytest.approx(3 / 15 * 2 * math.exp(-10) / 2, rel=1e-12)
-    assert first_order_loss(flow, torch.zeros_like(image), 10.0).item() == pytest.approx(3 / 15 * 2 / 2, rel=1e-12)
+def test_edge_aware_smoothness_is_that_of_arflow_computed_by_hand() -> None:
+    step = math.log(2) / 10  # at beta = 10, of weight 1/2
+    down = torch.tensor([0.0, step], dtype=torch.float64).view(1, 1, 2, 1).expand(1, 3, 2, 3)
+    u, v = [[0, 1, 3], [0, 1, 3]], [[0, 0, 0], [4, 4, 8]]
+    flow = torch.tensor([[u, v]], dtype=torch.float64)
+    # Along x 1 + 2 + 1 + 2 of u and 4 of v over 8 numbers, along y half of 4 + 4 + 8 of v over 6; both over 4.
+    assert edge_aware_loss(flow, down, 10.0, 1).item() == pytest.approx((10 / 8 + 8 / 6) / 4, rel=1e-14)
+    assert edge_aware_loss(flow[..., :1], down[..., :1], 10.0, 1) == 0
+    across = torch.tensor([0.0, 0.0, step, step], dtype=torch.float64).view(1, 1, 1, 4).expand(1, 3, 3, 4)
+    u, v = [[0, 1, 3, 7]] * 3, [[0] * 4, [2] * 4, [8] * 4]
+    flow = torch.tensor([[u, v]], dtype=torch.float64)
+    # Of three rows half of u_xx = 1 and all of 2 over 12 numbers, of four columns v_yy = 4 over 8; both over 2.
+    assert edge_aware_loss(flow, across, 10.0, 2).item() == pytest.approx((3 * 2.5 / 12 + 4 * 4 / 8) / 2, rel=1e-14)
+    assert edge_aware_loss(flow[..., :2, :], across[..., :2, :], 10.0, 2) == 0
+
+
+def test_the_anti_edge_weight_follows_its_definition_at_edges() -> None:
     image = torch.zeros(1, 3, 3, 4, dtype=torch.float64)
     image[0, :, :, 2:] = torch.tensor([0.3, 0.1, 0.2], dtype=torch.float64).view(3, 1, 1)  # |grad I| = 0.2 in the mean
     edge = math.exp(-10 * 0.2)
@@ -242,15 +250,10 @@ def test_supervised_and_consistency_losses_have_the_gradients_of_finite_differen
     assert gradcheck(lambda f: consistency_loss(f, target, pixels), (flow,))
 
 
-def test_second_order_is_zero_for_affine_flows_and_known_for_a_parabola() -> None:
+def test_second_order_smoothness_of_affine_flows_is_zero() -> None:
     x, y = pixel_centres(10, 12)
-    image = torch.zeros(1, 3, 10, 12, dtype=torch.float64)
     affine = torch.stack([0.3 * x - 0.2 * y + 1, 0.1 * x + 0.4 * y])[None]
-    assert second_order_loss(affine, image, 10.0) < 1e-13  # differences of numbers up to 5
-    bent = torch.stack([0.05 * x**2, 0.1 * y**2])[None]
-    # u_xx = 0.1, v_yy = 0.2, each counted once, halved
-    assert second_order_loss(bent, image, 10.0).item() == pytest.approx(0.15, abs=1e-12)
-    assert second_order_loss(bent[..., :2, :], image[..., :2, :], 10.0) == 0
+    assert edge_aware_loss(affine, torch.zeros(1, 3, 10, 12), 10.0, 2) < 1e-13  # differences of numbers up to 5
 
 
 def test_occlusion_keeps_what_closes_and_hides_nothing_where_nothing_does() -> None:

@@ -110,21 +110,22 @@ def test_the_context_network_sees_33_pixels_far() -> None:
     assert (places.min(), places.max(), len(places)) == (37 - 33, 37 + 33, 67)
 
 
-def test_weights_are_a_softmax_over_the_neighbours_inside() -> None:
+@pytest.mark.parametrize(("scale", "factor"), [("inverse_sqrt", 8**-0.5), ("none", 1.0)])
+def test_weights_are_a_softmax_over_the_neighbours_inside(scale: str, factor: float) -> None:
     context = torch.randn(2, 8, 6, 7, dtype=torch.float64)
-    weights = LocalFlowFusion().weights(context)
+    weights = GelFlow(ModelConfig(levels=4, lffm_scale=scale)).fusion.weights(context)
     # a softmax of at most 9 terms in double precision
     torch.testing.assert_close(weights.sum(dim=1), torch.ones(2, 6, 7, dtype=torch.float64), rtol=0, atol=1e-14)
     row, column = 0, 5
     logits = torch.full((9,), -torch.inf, dtype=torch.float64)
     for place, (dy, dx) in enumerate(itertools.product((-1, 0, 1), repeat=2)):
         if 0 <= row + dy < 6 and 0 <= column + dx < 7:
-            logits[place] = 8**-0.5 * context[0, :, row, column] @ context[0, :, row + dy, column + dx]
+            logits[place] = factor * context[0, :, row, column] @ context[0, :, row + dy, column + dx]
     torch.testing.assert_close(weights[0, :, row, column], logits.softmax(dim=0), rtol=0, atol=1e-14)
 
 
 def test_a_fused_flow_lies_between_its_neighbours_and_a_constant_one_stays() -> None:
-    fuse, context = LocalFlowFusion(), torch.randn(1, 32, 9, 8, dtype=torch.float64)
+    fuse, context = LocalFlowFusion("inverse_sqrt"), torch.randn(1, 32, 9, 8, dtype=torch.float64)
     constant = torch.tensor([3.0, -1.5], dtype=torch.float64).view(1, 2, 1, 1).expand(1, 2, 9, 8)
     # weights sum to one within 1e-14, times 3 px
     torch.testing.assert_close(fuse(constant, context), constant, rtol=0, atol=1e-13)
@@ -138,7 +139,7 @@ def test_a_fused_flow_lies_between_its_neighbours_and_a_constant_one_stays() -> 
 
 def test_fusion_has_the_gradients_of_differences_and_refinement_corrects_two_scales() -> None:
     flow, context = torch.randn(1, 2, 3, 4, dtype=torch.float64), torch.randn(1, 3, 3, 4, dtype=torch.float64)
-    assert gradcheck(LocalFlowFusion(), (flow.requires_grad_(), context.requires_grad_()))
+    assert gradcheck(LocalFlowFusion("inverse_sqrt"), (flow.requires_grad_(), context.requires_grad_()))
     torch.manual_seed(0)
     network = GelFlow(ModelConfig(levels=4, refine="half"))
     images = torch.rand(2, 1, 3, 66, 71).unbind()

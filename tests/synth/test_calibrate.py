@@ -201,10 +201,13 @@ def test_the_command_writes_a_scene_that_loads_and_generates(tmp_path: Path, cap
     command = ["calibrate", "--scene", str(preset), "--frames", str(frame), "--judge", str(other), "--out", str(out)]
     record = json.loads(said(capsys, main, *command, "--steps", 0, "--json"))
     assert record == json.loads((out / "calibration.json").read_text())
-    assert "verdict: good; residual" in said(capsys, main, *command, "--steps", 6)  # in place of the first
+    told = said(capsys, main, *command, "--steps", 6, "--rest-map")  # in place of the first
+    assert "verdict: good; residual" in told
+    assert "other.png, with the rest map: mean absolute difference" in told
     record = json.loads((out / "calibration.json").read_text())
     assert (record["verdict"]["good"], record["verdict"]["reasons"]) == (True, [])
-    assert set(record["differences"]) == {"frames", "not fitted: other.png"}
+    rows = {"frames", "not fitted: other.png"}
+    assert set(record["differences"]) == rows | {f"{name}, with the rest map" for name in rows}
     for difference in record["differences"].values():
         # The fit itself leaves below 0.5; rounding to 8 bits and the camera's noise of 1 level, 0.8 on average.
         assert max(difference["mean_absolute_outside_dots"]) < 2
@@ -212,8 +215,8 @@ def test_the_command_writes_a_scene_that_loads_and_generates(tmp_path: Path, cap
     fitted = load_scene(out / "scene.toml")
     assert fitted.corners[0].contact.indenter.radius_mm == 2.0  # what no frame tells keeps its distribution
     assert fitted.content["contact"]["indenter"]["radius_mm"] == {"uniform": [2.0, 3.0]}
-    small = ["--set", "sensor.camera.width=40", "--set", "sensor.camera.height=30"]
-    said(capsys, main, "generate", "--scene", out / "scene.toml", "--n", 1, "--out", tmp_path / "data", *small)
+    assert fitted.corners[0].sensor.camera.rest_map == "rest_map.png"
+    said(capsys, main, "generate", "--scene", out / "scene.toml", "--n", 1, "--out", tmp_path / "data")
 
 
 def _preset() -> dict:
