@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 
 from gelflow.arrays import FlowArray, Grey8, ImageArray
-from gelflow.baselines.method import as_array, as_tensor, check_images
+from gelflow.baselines.method import as_array, as_tensor
 from gelflow.config import RegistrationConfig
 from gelflow.errors import InputError
-from gelflow.files.image import to_grey
+from gelflow.files.image import check_images, to_grey
 from gelflow.models.registration import registered
 
 

@@ -48,7 +48,7 @@ def best_window(flow: Flow, variance: Tensor, texture: Tensor, window_px: float)
         window = window_sums(flow, width)
         wide = _mean(flow, weight, window)
         wide = wide + _mean(flow - wide, weight, window)
-        shared, left = _noise_shares(window_px, width)
+        shared, left = noise_shares(window_px, width)
         apart = (wide - flow).square().sum(dim=1, keepdim=True)
         risk = _mean(apart / variance, weight, window) + 2 * shared - 1
         better = risk < least
@@ -90,7 +90,7 @@ def _mean(field: Features, weight: Tensor, window: SeparableFilter) -> Features:
 
 
 @functools.cache
-def _noise_shares(window_px: float, width: float) -> tuple[float, float]:
+def noise_shares(window_px: float, width: float) -> tuple[float, float]:
     """Covariance of the noise before and after smoothing, and variance after it, over the variance before."""
     k = np.linspace(0, 5 / window_px, 1001)
     steps, wide = (1 - (1 - np.exp(-((deviation * k) ** 2) / 2)) ** 2 for deviation in (window_px, width))

@@ -8,12 +8,11 @@ from typing import NamedTuple
 
 import cv2
 
-from gelflow.arrays import Bytes3
+from gelflow.arrays import Bytes3, Estimate
 from gelflow.baselines.method import Method
 from gelflow.errors import InputError
 from gelflow.files.image import full_range, in_unit_range, to_bytes
 from gelflow.files.video import newest_frames
-from gelflow.predict.model import Estimate
 from gelflow.predict.prediction import Motion, Reference, estimate
 
 

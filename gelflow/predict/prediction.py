@@ -2,7 +2,6 @@
 
 import os
 import re
-import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import astuple, dataclass, fields
@@ -13,8 +12,8 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
-from gelflow.arrays import Bytes3, Frame, ImageArray
-from gelflow.baselines.method import Method, uncertainty
+from gelflow.arrays import Bytes3, Estimate, Frame, ImageArray
+from gelflow.baselines.method import Method, estimated
 from gelflow.data.pairs import PairDataset, PairRecord
 from gelflow.errors import InputError
 from gelflow.files.atomic import refuse_foreign, write_csv
@@ -23,7 +22,6 @@ from gelflow.files.image import full_range, in_unit_range, to_bytes
 from gelflow.files.quiet import quiet
 from gelflow.files.video import describe, frame_file, frames, image_files
 from gelflow.models.working_size import unknown_px
-from gelflow.predict.model import Estimate
 from gelflow.predict.pictures import certain, draw_overlay, robust_scale, write_flow_picture
 
 Reference = Literal["first", "previous"]
@@ -182,15 +180,16 @@ def estimate(
     method: Method, image1: ImageArray, image2: ImageArray, frame: int, file: str, time_s: float | None = None
 ) -> tuple[Estimate, Motion]:
     """The flow between two images, how certain it is, and its motion; InputError as `Method.flow` raises it."""
-    started = time.perf_counter()
-    flow = method.flow(image1, image2)
-    seconds = time.perf_counter() - started
-    length = np.hypot(flow[..., 0], flow[..., 1])
+    found, seconds = estimated(method, image1, image2)
+    return found, motion_of(found, frame, file, time_s, seconds)
+
+
+def motion_of(found: Estimate, frame: int, file: str, time_s: float | None, seconds: float) -> Motion:
+    """What `Motion` tells of a flow that took so many seconds."""
+    length = np.hypot(found.flow[..., 0], found.flow[..., 1])
     p95, p99 = (float(value) for value in np.nanpercentile(length, (95, 99)))
-    sigma, visible = uncertainty(flow, image1, image2, getattr(method, "device", "cpu"))
-    unknown = float((sigma > unknown_px(*sigma.shape)).mean())
-    motion = Motion(frame, file, time_s, float(np.nanmean(length)), p95, p99, seconds, unknown)
-    return Estimate(flow, sigma, visible), motion
+    unknown = float((found.sigma > unknown_px(*found.sigma.shape)).mean())
+    return Motion(frame, file, time_s, float(np.nanmean(length)), p95, p99, seconds, unknown)
 
 
 def _frame_pairs(
