@@ -2,8 +2,8 @@
 
 As `gelflow.models.evidence`, `gelflow.models.wider_window` and `gelflow.models.uncertainty`, which hold the equations,
 with two differences. What the flow misses is the Gauss-Newton step that is left. Where the flow leaves more than
-`UNEXPLAINED` of what unrelated images would, it has lost the pattern and nothing is known. Specks in the optics are not
-looked for.
+`UNEXPLAINED` of what unrelated images would, and more than the camera's noise, it has lost the pattern. Specks in the
+optics are not looked for.
 """
 
 from typing import NamedTuple
@@ -97,7 +97,8 @@ def refined(flow: FlowArray, first: Prepared, second: Prepared) -> Refined:
     error = np.where(between, errors / weight.clip(TINY), error)
     moment = np.where(between, _second_moment(marks, wide_px / CELL) / weight.clip(TINY), moment)
     square = RADIUS**2 / 2 * (error + (CURVATURE * moment) ** 2 * _bend(best))
-    lost = resized(unexplained(best, first, second, wide_px)[1], grid) > UNEXPLAINED
+    left, share = (resized(each, grid) for each in unexplained(best, first, second, wide_px))
+    lost = (share > UNEXPLAINED) & (left > (CONFIG.noise / 2) ** 2)
     sigma = np.where(lost, MAX_SIGMA_PX, np.sqrt(square.clip(0, MAX_SIGMA_PX**2)))
     return Refined(best, sigma.astype(np.float32), lost)
 

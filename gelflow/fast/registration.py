@@ -91,6 +91,12 @@ class Prepared:
         rows, columns = self.size
         return resized(resized(field, self.grey.shape)[:rows, :columns], self.shape)
 
+    def on_levels(self, flow: FlowArray) -> FlowArray:
+        """A flow at each pixel of the image as it was given, in its px, as a start of registration."""
+        rows, columns = self.grey.shape
+        beyond = (0, rows - self.size[0], 0, columns - self.size[1])
+        return cv2.copyMakeBorder(resized(flow, self.size) / self.scale, *beyond, cv2.BORDER_REPLICATE)
+
     @property
     def scale(self) -> NDArray[np.float32]:
         """Px of the image as it was given in one px, along x and y."""
@@ -141,15 +147,15 @@ def slopes(image: NDArray[np.float32], factor: float = 1.0) -> tuple[NDArray[np.
 def products(pairs: Sequence[tuple[ImageArray, ImageArray]], grid: tuple[int, int]) -> list[MapArray]:
     """Products of images, summed over the colours, as means over the cells of a grid."""
     ones = np.ones((1, 3), np.float32)
-    return [cv2.transform(resized(one * other, grid, cv2.INTER_AREA), ones) for one, other in pairs]
+    return [resized(cv2.transform(one * other, ones), grid) for one, other in pairs]
 
 
 def inside(flow: FlowArray, level: Level) -> MapArray:
     """1 where the flow, on the level's grid, stays in the image, else 0; (h, w)."""
     height, width = flow.shape[:2]
-    places = (indices(height, width) + 0.5) * (2 * level.pixel) + flow
-    last = np.array([width, height], np.float32) * (2 * level.pixel)
-    return ((places >= 0) & (places <= last)).all(axis=-1).astype(np.float32)
+    half = np.array([width, height], np.float32) * level.pixel
+    inside = np.abs((indices(height, width) + 0.5) * (2 * level.pixel) - half + flow) <= half
+    return (inside[..., 0] & inside[..., 1]).astype(np.float32)
 
 
 def unexplained(flow: FlowArray, first: Prepared, second: Prepared, window_px: float) -> tuple[MapArray, MapArray]:

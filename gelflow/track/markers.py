@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gelflow.arrays import Estimate, ImageArray, MapArray
-from gelflow.fast.registration import indices
+from gelflow.fast.registration import indices, resized
 from gelflow.files.image import to_grey
 from gelflow.models.working_size import unknown_px
 from gelflow.ops.blobs import SIZES, blob_centre, blobs, inside_by
@@ -37,7 +37,7 @@ class Markers:
             size = found[:, 2] / np.median(found[:, 2])
             whole = inside_by(found[:, :2], grey.shape, 0.6 * float(np.median(found[:, 2])))
             found = found[(size > SIZES[0]) & (size < SIZES[1]) & whole]
-        self._reference = reference.mean(axis=-1)
+        self._reference = cv2.cvtColor(reference, cv2.COLOR_RGB2GRAY)
         self._deviation = float(np.median(found[:, 2])) / 2 if len(found) else 1.0
         self._centres = np.array([blob_centre(values, *blob) for blob in found]).reshape(-1, 2)
 
@@ -58,23 +58,21 @@ class Markers:
         markers["x"], markers["y"] = (self._centres + 0.5).T
         markers["u"], markers["v"] = read(found.flow).T
         markers["sigma"] = read(found.sigma)
-        places = indices(*found.sigma.shape) + np.nan_to_num(found.flow)
-        moved = cv2.remap(frame.mean(axis=-1), places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        likeness = _likeness(self._reference, moved, self._deviation)
+        places, grey = indices(*found.sigma.shape) + np.nan_to_num(found.flow), cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
+        moved = cv2.remap(grey, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        likeness = resized(_likeness(self._reference, moved, self._deviation), grey.shape)
         known = markers["sigma"] < unknown_px(*found.sigma.shape)
         markers["visible"] = known & (read(found.visible) > 0.5) & (read(likeness) > MIN_LIKENESS)
         return markers
 
 
 def _likeness(image1: MapArray, image2: MapArray, deviation: float) -> MapArray:
-    """Covariance of two grey images (H, W) under a Gaussian over the mean of their variances; at most 1."""
-
-    def mean(field: MapArray) -> MapArray:
-        return cv2.GaussianBlur(field, (0, 0), deviation)
-
-    mean1, mean2 = mean(image1), mean(image2)
-    both = mean(image1 * image1) + mean(image2 * image2) - mean1**2 - mean2**2
-    return 2 * (mean(image1 * image2) - mean1 * mean2) / both.clip(1e-9)
+    """Covariance of grey images under a Gaussian over the mean of their variances, at half their size; at most 1."""
+    half = (image1.shape[0] // 2, image1.shape[1] // 2)
+    one, two = resized(image1, half), resized(image2, half)
+    sums = [cv2.GaussianBlur(field, (0, 0), deviation / 2) for field in (one, two, one * two, one * one + two * two)]
+    mean1, mean2, mixed, square = sums
+    return 2 * (mixed - mean1 * mean2) / (square - mean1**2 - mean2**2).clip(1e-9)
 
 
 def marker_rows(frame: int, time_s: float | None, markers: Iterable[Any]) -> Iterator[tuple[Any, ...]]:

@@ -2,12 +2,13 @@
 
 The start of a frame is the last flow, moved on by what DIS sees between the last two frames:
 ``V(x) = U(x) + D(x + U(x))``. Registration between the reference and the frame then corrects it, so that errors do not
-add up, and motion may grow beyond what a direct flow finds. Where the result leaves more between the images than noise,
-or its flow explains no more than chance (`gelflow.fast.certainty`), it is lost there, and starts that know nothing of
-the stream compete with it: DIS from the reference, and the network where there is one. In a frame that most of the
-picture is lost in, such as one of a ramp of exposure, nothing is known, and the next one starts afresh.
+add up, and motion may grow beyond what a direct flow finds. Where the result explains hardly more of the frame than
+chance (`gelflow.fast.certainty`), it is lost, and starts that know nothing of the stream compete with it: DIS from the
+reference, and the network where there is one. After a frame in which most of the picture is lost, such as a cut or one
+of a ramp of exposure, the next one starts afresh. A flow that took dots for the next ones is not noticed.
 """
 
+import math
 import time
 from pathlib import Path
 from typing import NamedTuple
@@ -24,11 +25,14 @@ from gelflow.fast.method import FAST, Fast
 from gelflow.fast.registration import STAGES, Prepared, indices, register, resized
 from gelflow.fast.start import dis, fresh_start
 from gelflow.files.image import as_image, check_images, range_factor
+from gelflow.models.uncertainty import MAX_SIGMA_PX
 from gelflow.models.weights import weights_file
 from gelflow.track.markers import Markers
 
 MOST_LOST = 0.01
-"""Share of the picture that may be lost before fresh starts compete."""
+"""Share of the picture that may be lost, beyond what the last fresh start left, before fresh starts compete."""
+RETRY = 10
+"""Frames after which they compete again for what the last ones left."""
 CUT = 0.5
 """Share of the picture that is lost in a frame which has nothing to do with the one before."""
 
@@ -57,10 +61,10 @@ class Tracker:
             float in [0, 1]; each side has 16 px or more. Larger images than 400 x 300 px are reduced.
         weights: What takes over where the stream is lost: "fast", DIS alone; "best" or a file of weights, that network,
             too, for such frames only. A network takes as long as `load_model` does.
-        scene: Not used yet; motion and markers are in px.
+        scene: None alone is allowed; motion and markers are in px.
 
     Raises:
-        InputError: An image that is none, or no such weights.
+        InputError: An image that is none, no such weights, or a scene.
 
     Examples:
         >>> import gelflow, numpy as np
@@ -69,7 +73,9 @@ class Tracker:
         (64, 80, 2)
     """
 
-    def __init__(self, reference: ImageArray | Bytes3, weights: str | Path = FAST) -> None:
+    def __init__(self, reference: ImageArray | Bytes3, weights: str | Path = FAST, scene: None = None) -> None:
+        if scene is not None:
+            raise InputError(f"scene = {scene!r}: millimetres are not known here; give None, and take px")
         method = open_network(weights_file(Path(weights)))
         self._network = None if isinstance(method, Fast) else method
         self.reset(reference)
@@ -83,7 +89,8 @@ class Tracker:
             self._image = self._factor * image
             self._first, self._markers = Prepared(self._image), Markers(self._image)
         self._last: tuple[Prepared, FlowArray] | None = None
-        self._time_s: float | None = None
+        self._since, self._accepted = 0, 0.0
+        self._time_s = -math.inf
 
     def update(self, frame: ImageArray | Bytes3, time_s: float | None = None) -> Tracked:
         """Finds the flow from the reference to the next frame.
@@ -100,39 +107,42 @@ class Tracker:
         image = self._factor * as_image("the frame", frame)
         check_images(self._image, image)
         if time_s is not None:
-            if self._time_s is not None and not time_s > self._time_s:
-                raise InputError(
-                    f"time_s = {time_s:g} after {self._time_s:g}: times must rise; for another stream, reset()"
-                )
+            if not time_s > self._time_s:
+                words = "times must rise; for another stream, reset()"
+                raise InputError(f"time_s = {time_s:g} after {self._time_s:g}: {words}")
             self._time_s = time_s
-        second = Prepared(image)
-        afresh = self._last is None
-        if self._last is not None:
-            flow = self._moved_on(*self._last, second)
-            found = refined(register(flow, self._first, second, STAGES[1:]), self._first, second)
-            afresh = bool(self._lost(found, second) > MOST_LOST)
-        if afresh:
-            found = self._afresh(image, second, [] if self._last is None else [flow])
-        lost = found.lost.mean() > CUT
-        self._last = None if lost else (second, found.flow)
+        found, afresh = self._follow(image)
         estimate = found.estimate(self._first)
         markers = self._markers.at(estimate, image)
         return Tracked(*estimate, markers, time.perf_counter() - started, afresh)
 
-    def _moved_on(self, before: Prepared, flow: FlowArray, second: Prepared) -> FlowArray:
-        """The last flow and the motion since, on its grid."""
-        since = resized(dis("ultrafast", before.grey, second.grey), flow.shape[:2])
-        height, width = flow.shape[:2]
-        places = indices(height, width) + flow * (width / second.grey.shape[1])
-        return flow + cv2.remap(since, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    def _follow(self, image: ImageArray) -> tuple[Refined, bool]:
+        """The flow to a frame, and whether it started afresh."""
+        second, flows = Prepared(image), list[FlowArray]()
+        self._since += 1
+        if self._last is not None:
+            flows.append(_moved_on(*self._last, second))
+            found = self._registered(flows[0], second)
+            lost = float(found.lost.mean())
+            self._accepted = min(self._accepted, lost)
+        if self._last is None or lost > (self._accepted if self._since < RETRY else 0.0) + MOST_LOST:
+            if self._network is not None:
+                flows.append(self._first.on_levels(self._network.flow(self._image, image)))
+            found = self._registered(fresh_start(self._first, second, flows), second)
+            self._since, self._accepted = 0, float(found.lost.mean())
+        if found.lost.mean() > CUT:
+            self._last = None
+            return found._replace(sigma=np.full_like(found.sigma, MAX_SIGMA_PX)), True
+        self._last = (second, found.flow)
+        return found, self._since == 0
 
-    def _lost(self, found: Refined, second: Prepared) -> float:
-        """The share of the picture in which a flow explains nothing."""
-        return float(found.lost.mean())
-
-    def _afresh(self, image: ImageArray, second: Prepared, starts: list[FlowArray]) -> Refined:
-        if self._network is not None:
-            flow = self._network.flow(self._image, image)
-            starts = [*starts, flow]
-        flow = fresh_start(self._first, second, starts)
+    def _registered(self, flow: FlowArray, second: Prepared) -> Refined:
         return refined(register(flow, self._first, second, STAGES[1:]), self._first, second)
+
+
+def _moved_on(before: Prepared, flow: FlowArray, second: Prepared) -> FlowArray:
+    """The flow to the frame before, and what DIS sees since, on the flow's grid."""
+    height, width = flow.shape[:2]
+    since = resized(dis("ultrafast", before.grey, second.grey), (height, width))
+    places = indices(height, width) + flow * (width / second.grey.shape[1])
+    return flow + cv2.remap(since, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
