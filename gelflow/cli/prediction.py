@@ -137,7 +137,7 @@ def live(
             if table:
                 csv.writer(table).writerow(COLUMNS)
             for frame, found, motion, moved in flows:
-                if table:
+                if table and moved is not None:
                     csv.writer(table).writerows(marker_rows(motion.frame, motion.time_s, moved))
                     table.flush()
                 if page:

@@ -87,7 +87,8 @@ def refined(flow: FlowArray, first: Prepared, second: Prepared) -> Refined:
     missed = np.where(enough, (step**2).sum(axis=-1), 0.0)
     known = variance < UNKNOWN_PX**2
     flow = resized(flow, grid)
-    best, error = _best_window(flow, 1 / (1 / variance + 1 / (2 * CONFIG.prior_px**2)), trace)
+    posterior = 1 / (1 / variance + 1 / (2 * CONFIG.prior_px**2))
+    best, error = _best_window(flow, posterior.astype(np.float32), trace)
     error = np.where(known, error, variance) + missed
     gradient = cells[..., 0] + cells[..., 2]
     moment = np.where(known, _second_moment(gradient, narrow_px / CELL) / trace.clip(TINY), 0.0)

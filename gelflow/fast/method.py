@@ -1,7 +1,8 @@
 """The weights "fast", which are none: DIS, then fast registration, then sigma, on one core of the processor.
 
-Nothing is learned. Against exact flow its error is a third to a half of that of the best DIS preset, two to three times
-that of the network; in motion by half the distance between marks, the network loses fewer of them.
+Nothing is learned. Against exact flow its error is mostly a quarter to a half of that of the best DIS preset, and 1.4
+to 3 times that of the network. Of two images alone, between which marks move by half their distance or more, the
+network loses far fewer.
 """
 
 from pathlib import Path

@@ -10,6 +10,7 @@ of a ramp of exposure, the next one starts afresh. A flow that took dots for the
 
 import math
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,13 +23,15 @@ from gelflow.baselines.learned import open_network
 from gelflow.errors import InputError
 from gelflow.fast.certainty import Refined, refined
 from gelflow.fast.method import FAST, Fast
-from gelflow.fast.registration import STAGES, Prepared, indices, register, resized
+from gelflow.fast.registration import STAGES, Prepared, Stage, indices, register, resized
 from gelflow.fast.start import dis, fresh_start
 from gelflow.files.image import as_image, check_images, range_factor
 from gelflow.models.uncertainty import MAX_SIGMA_PX
 from gelflow.models.weights import weights_file
 from gelflow.track.markers import Markers
 
+TRACKING = (STAGES[0], STAGES[-1])
+"""Stages from the last flow on. The first smooths it, so that errors between marks do not add up over frames."""
 MOST_LOST = 0.01
 """Share of the picture that may be lost, beyond what the last fresh start left, before fresh starts compete."""
 RETRY = 10
@@ -122,13 +125,13 @@ class Tracker:
         self._since += 1
         if self._last is not None:
             flows.append(_moved_on(*self._last, second))
-            found = self._registered(flows[0], second)
+            found = self._registered(flows[0], second, TRACKING)
             lost = float(found.lost.mean())
             self._accepted = min(self._accepted, lost)
         if self._last is None or lost > (self._accepted if self._since < RETRY else 0.0) + MOST_LOST:
             if self._network is not None:
                 flows.append(self._first.on_levels(self._network.flow(self._image, image)))
-            found = self._registered(fresh_start(self._first, second, flows), second)
+            found = self._registered(fresh_start(self._first, second, flows), second, STAGES[1:])
             self._since, self._accepted = 0, float(found.lost.mean())
         if found.lost.mean() > CUT:
             self._last = None
@@ -136,8 +139,8 @@ class Tracker:
         self._last = (second, found.flow)
         return found, self._since == 0
 
-    def _registered(self, flow: FlowArray, second: Prepared) -> Refined:
-        return refined(register(flow, self._first, second, STAGES[1:]), self._first, second)
+    def _registered(self, flow: FlowArray, second: Prepared, stages: Sequence[Stage]) -> Refined:
+        return refined(register(flow, self._first, second, stages), self._first, second)
 
 
 def _moved_on(before: Prepared, flow: FlowArray, second: Prepared) -> FlowArray:
