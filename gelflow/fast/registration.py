@@ -46,15 +46,6 @@ STAGES = tuple(
 )
 
 
-class Fields(NamedTuple):
-    """Residual of a flow, and the gradient along x and y of the mean of both images, per px of the image, (h, w, 3)."""
-
-    residual: ImageArray
-    across: ImageArray
-    down: ImageArray
-    moved: ImageArray
-
-
 class Level:
     """An image without its local mean, (h, w, 3), each of whose px is `pixel` px of the image wide."""
 
@@ -128,14 +119,14 @@ def _posterior(sums: NDArray[np.float32], so_far: FlowArray) -> FlowArray:
     return cv2.merge([yy * u - xy * v, xx * v - xy * u]) / (xx * yy - xy * xy)[..., None]
 
 
-def fields(flow: FlowArray, first: Level, second: Level) -> Fields:
-    """Residual and gradients under a flow on the level's grid."""
+def fields(flow: FlowArray, first: Level, second: Level) -> tuple[ImageArray, ImageArray, ImageArray, ImageArray]:
+    """Under a flow on the level's grid: residual, gradient along x and y of both images' mean, and image 2 moved."""
     height, width = first.image.shape[:2]
     places = resized(flow, (height, width)) * (2 / first.pixel) + (2 * indices(height, width) + 0.5)
     moved = cv2.remap(second.enlarged, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     # The mean of both images' gradients converges from further away than either alone.
     across, down = slopes(moved + first.image, 0.5 / first.pixel)
-    return Fields(moved - first.image, across, down, moved)
+    return moved - first.image, across, down, moved
 
 
 def slopes(image: NDArray[np.float32], factor: float = 1.0) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -209,10 +200,10 @@ def resized(field: NDArray[np.float32], grid: tuple[int, int], how: int | None =
 
 
 @functools.cache
-def gaussian(deviation: float, power: int = 0) -> NDArray[np.float32]:
-    """x^power exp(-x^2 / 2 s^2) at whole x up to three deviations."""
+def gaussian(deviation: float) -> NDArray[np.float32]:
+    """exp(-x^2 / 2 s^2) at whole x up to three deviations."""
     x = np.arange(-math.ceil(3 * deviation), math.ceil(3 * deviation) + 1)
-    return (np.exp(-(x**2) / (2 * deviation**2)) * x**power).astype(np.float32)
+    return np.exp(-(x**2) / (2 * deviation**2)).astype(np.float32)
 
 
 @functools.lru_cache(8)

@@ -47,10 +47,9 @@ def best_of(flows: Sequence[FlowArray], first: Prepared, second: Prepared) -> Fl
 
 
 def dis(kind: str, grey1: Grey8, grey2: Grey8) -> FlowArray:
-    """DIS "ultrafast" or "medium", or "large": ultrafast with patches of 16 px, four px apart."""
-    method: Any = cv2.DISOpticalFlow.create(
-        cv2.DISOPTICAL_FLOW_PRESET_MEDIUM if kind == "medium" else cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST
-    )
+    """DIS with one of OpenCV's presets, or "large": ultrafast with patches of 16 px, four px apart."""
+    preset = "ULTRAFAST" if kind == "large" else kind.upper()
+    method: Any = cv2.DISOpticalFlow.create(getattr(cv2, f"DISOPTICAL_FLOW_PRESET_{preset}"))
     if kind == "large":
         method.setPatchSize(16)
         method.setPatchStride(4)

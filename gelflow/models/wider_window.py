@@ -34,21 +34,21 @@ FLAT = 0.04
 """Sum of squared gradients in a window below which pixels count alike; what the network's flow is worth by default."""
 
 
-def best_window(flow: Flow, variance: Tensor, texture: Tensor, window_px: float) -> tuple[Flow, Tensor]:
+def best_window(flow: Flow, variance: Tensor, texture: Tensor, window_px: float, pixel: int = 1) -> tuple[Flow, Tensor]:
     """Smooths a flow (B, 2, H, W) where that makes it more precise; the flow, and its mean square error, px^2.
 
     It was found by two steps in a window of the standard deviation `window_px`. `variance` is that of its noise, both
     components together, (B, 1, H, W) px^2; `texture` is the sum of the squares of the gradient in the window, (B, 1, H,
-    W).
+    W). All are known at every `pixel`-th px along each axis.
     """
     variance, weight = variance.clamp(min=MIN_VARIANCE), texture.clamp(min=0) + FLAT
     least, error = torch.ones_like(variance), variance
     best = flow
     for width in WIDTHS_PX:
-        window = window_sums(flow, width)
+        window = window_sums(flow, width / pixel)
         wide = _mean(flow, weight, window)
         wide = wide + _mean(flow - wide, weight, window)
-        shared, left = noise_shares(window_px, width)
+        shared, left = _noise_shares(window_px, width)
         apart = (wide - flow).square().sum(dim=1, keepdim=True)
         risk = _mean(apart / variance, weight, window) + 2 * shared - 1
         better = risk < least
@@ -90,7 +90,7 @@ def _mean(field: Features, weight: Tensor, window: SeparableFilter) -> Features:
 
 
 @functools.cache
-def noise_shares(window_px: float, width: float) -> tuple[float, float]:
+def _noise_shares(window_px: float, width: float) -> tuple[float, float]:
     """Covariance of the noise before and after smoothing, and variance after it, over the variance before."""
     k = np.linspace(0, 5 / window_px, 1001)
     steps, wide = (1 - (1 - np.exp(-((deviation * k) ** 2) / 2)) ** 2 for deviation in (window_px, width))
