@@ -95,10 +95,10 @@ def refined(flow: FlowArray, first: Prepared, second: Prepared) -> Refined:
     moment = torch.where(known, second_moment(window, gradient) / textured, 0.0)
     error, moment = between_marks(error, moment, variance, wide)
     square = RADIUS**2 / 2 * (error + (CURVATURE * CELL**2 * moment).square() * curvature_square(best, CELL))
-    best, sigma = best[0].movedim(0, -1).contiguous().numpy(), square.clamp(max=MAX_SIGMA_PX**2).sqrt()[0, 0].numpy()
-    left, share = (resized(each, grid) for each in unexplained(best, first, second, wide_px))
+    fitted, sigma = best[0].movedim(0, -1).contiguous().numpy(), square.clamp(max=MAX_SIGMA_PX**2).sqrt()[0, 0].numpy()
+    left, share = (resized(each, grid) for each in unexplained(fitted, first, second, wide_px))
     lost = (share > UNEXPLAINED) & (left > (CONFIG.noise / 2) ** 2)
-    return Refined(best, np.where(lost, np.float32(MAX_SIGMA_PX), sigma), lost)
+    return Refined(fitted, np.where(lost, np.float32(MAX_SIGMA_PX), sigma), lost)
 
 
 def _tensor(field: NDArray[np.float32]) -> Tensor:
