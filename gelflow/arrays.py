@@ -4,7 +4,7 @@ Inside the network data are tensors with channels first: B pairs of a batch, C c
 image or of the scale in question. Around it they are NumPy rasters with channels last.
 """
 
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,3 +25,15 @@ MapArray = Annotated[NDArray[np.float32], "(H, W) float32"]
 MaskArray = Annotated[NDArray[np.bool_], "(H, W) bool"]
 PointArray = Annotated[NDArray[np.float64], "(N, 2) float64: column, row in px from the centre of the first pixel"]
 MarkerArray = Annotated[NDArray[np.float64], "(N, 4) float64: x1, y1, x2, y2 in px"]
+
+
+class Estimate(NamedTuple):
+    """A flow (H, W, 2) px, and how certain it is, both (H, W) float32.
+
+    Sigma is the radius in px within which 68 % of such flows are right, at most 10; `visible` the probability that the
+    pixel's point is seen in image 2.
+    """
+
+    flow: FlowArray
+    sigma: MapArray
+    visible: MapArray

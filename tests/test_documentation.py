@@ -9,6 +9,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 import gelflow.cli
@@ -104,7 +106,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_examples_are_short() -> None:
     programs = sorted(EXAMPLES.glob("*.py"))
-    assert len(programs) == 6
+    assert len(programs) == 7
     assert [program.name for program in programs if len(program.read_text().splitlines()) > 40] == []
 
 
@@ -118,6 +120,17 @@ def test_flow_of_two_images(dataset: Path) -> None:
     folder = dataset / "samples" / "000000"
     printed = run("flow_of_two_images.py", folder / "image1.png", folder / "image2.png")
     assert found(rf"closure: {NUMBER} px in the median", printed)[0] < 0.5
+
+
+def test_camera_loop(tmp_path: Path) -> None:
+    frames = [np.roll(np.random.default_rng(0).integers(0, 256, (64, 80, 3), np.uint8), shift, 1) for shift in range(4)]
+    writer = cv2.VideoWriter(str(tmp_path / "a.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, (80, 64))
+    for frame in frames:
+        writer.write(cv2.GaussianBlur(frame, (0, 0), 2))
+    writer.release()
+    printed = run("camera_loop.py", tmp_path / "a.avi")
+    # JPEG's blocks stand still while the picture moves by 3 px.
+    assert found(rf"frame 3: mean motion {NUMBER} px", printed)[0] == pytest.approx(3, abs=0.5)
 
 
 def test_dataloader(dataset: Path, tmp_path: Path) -> None:

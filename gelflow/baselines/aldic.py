@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 
 from gelflow.arrays import FlowArray, ImageArray
-from gelflow.baselines.method import check_images, dense_flow
+from gelflow.baselines.method import dense_flow
 from gelflow.errors import InputError
+from gelflow.files.image import check_images
 
 INSTALL = "pip install --no-deps al-dic && pip install numba imageio"
 LUMA = np.array([0.299, 0.587, 0.114])

@@ -15,10 +15,11 @@ import cv2
 import numpy as np
 
 from gelflow.arrays import FlowArray, Grey8, ImageArray
-from gelflow.baselines.method import as_array, as_tensor, check_images
+from gelflow.baselines.method import as_array, as_tensor
 from gelflow.config import RegistrationConfig
 from gelflow.errors import InputError
-from gelflow.files.image import to_grey
+from gelflow.fast import start
+from gelflow.files.image import check_images, to_grey
 from gelflow.models.registration import registered
 
 
@@ -41,7 +42,7 @@ class Classical:
 
 def dis(preset: Literal["ultrafast", "fast", "medium"]) -> Classical:
     """Dense inverse search with one of OpenCV's presets."""
-    return Classical(f"DIS {preset}", partial(_dis, preset))
+    return Classical(f"DIS {preset}", partial(start.dis, preset))
 
 
 def _still(grey1: Grey8, grey2: Grey8) -> FlowArray:
@@ -51,11 +52,6 @@ def _still(grey1: Grey8, grey2: Grey8) -> FlowArray:
 def _farneback(grey1: Grey8, grey2: Grey8) -> Any:
     settings = {"pyr_scale": 0.5, "levels": 5, "winsize": 15, "iterations": 5, "poly_n": 7, "poly_sigma": 1.5}
     return cv2.calcOpticalFlowFarneback(grey1, grey2, _still(grey1, grey2), **settings, flags=0)
-
-
-def _dis(preset: str, grey1: Grey8, grey2: Grey8) -> Any:
-    number = getattr(cv2, f"DISOPTICAL_FLOW_PRESET_{preset.upper()}")
-    return cv2.DISOpticalFlow.create(number).calc(grey1, grey2, None)
 
 
 def _tvl1(grey1: Grey8, grey2: Grey8) -> Any:
@@ -91,6 +87,6 @@ class RegisteredDIS:
 
     def flow(self, image1: ImageArray, image2: ImageArray) -> FlowArray:
         """See `Method.flow`."""
-        start = dis("medium").flow(image1, image2)
+        begin = dis("medium").flow(image1, image2)
         first, second = as_tensor(image1, self.device), as_tensor(image2, self.device)
-        return as_array(registered(as_tensor(start, self.device), first, second, self.settings))
+        return as_array(registered(as_tensor(begin, self.device), first, second, self.settings))

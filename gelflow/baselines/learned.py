@@ -7,9 +7,11 @@ from typing import Any
 import torch
 
 from gelflow.arrays import FlowArray, ImageArray
-from gelflow.baselines.method import as_array, as_tensor, check_images
+from gelflow.baselines.method import as_array, as_tensor
 from gelflow.config import REGISTRATIONS, Registration
 from gelflow.errors import InputError
+from gelflow.fast.method import Fast, fast, is_fast
+from gelflow.files.image import check_images
 from gelflow.hardware import chosen_device
 from gelflow.models.estimate import estimate_flow
 from gelflow.models.raft import load_raft, looks_like_raft
@@ -27,12 +29,14 @@ def open_network(
     size: tuple[int, int] | None = None,
     device: str = "auto",
     registration: Registration | None = None,
-) -> "Learned | PublishedRaft":
-    """The network that a file of weights belongs to: GelFlow (.safetensors) or RAFT (.pth); see `Learned`.
+) -> "Learned | PublishedRaft | Fast":
+    """What a file of weights belongs to: GelFlow (.safetensors) or RAFT (.pth), see `Learned`; or `Fast`, by its name.
 
     InputError where the file is missing, damaged or of another network, the device is not there, or `registration` is
-    given for RAFT.
+    given for RAFT, or anything for `Fast`.
     """
+    if is_fast(path):
+        return fast(size, device, registration)
     if not looks_like_raft(path):
         return Learned(path, name, size, device, registration)
     if registration is not None:

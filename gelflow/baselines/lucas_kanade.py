@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 
 from gelflow.arrays import FlowArray, ImageArray
-from gelflow.baselines.method import check_images, dense_flow
+from gelflow.baselines.method import dense_flow
 from gelflow.errors import NothingFoundError
-from gelflow.files.image import to_grey
+from gelflow.files.image import check_images, to_grey
 
 CORNERS, QUALITY, DISTANCE_PX = 2000, 0.01, 5.0
 WINDOW_PX, OCTAVES = 21, 4

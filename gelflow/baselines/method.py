@@ -1,15 +1,16 @@
 """The interface of everything that estimates flow, whose arrays are (H, W, C), and torch's tensors, (1, C, H, W)."""
 
+import time
 from typing import Any, Protocol
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gelflow.arrays import FlowArray, ImageArray, MapArray
+from gelflow.arrays import Estimate, FlowArray, ImageArray, MapArray
 from gelflow.errors import InputError
+from gelflow.fast.method import Fast
 from gelflow.files.exr import FlowField
-from gelflow.files.image import MINIMUM_SIDE
 from gelflow.models.working_size import sized_sigma, working_sizes
 
 
@@ -26,19 +27,6 @@ class Method(Protocol):
         Raises:
             InputError: The images differ in shape, are too small, or hold values that are not finite.
         """
-
-
-def check_images(image1: ImageArray, image2: ImageArray) -> None:
-    """Refuses images that differ in shape, are not (H, W, 3), are too small, or hold values that are not finite."""
-    for name, image in (("image 1", image1), ("image 2", image2)):
-        if image.ndim != 3 or image.shape[2] != 3:
-            raise InputError(f"{name} has shape {image.shape}; (rows, columns, 3) is needed, a grey image repeated")
-        if min(image.shape[:2]) < MINIMUM_SIDE:
-            raise InputError(f"{name} has {image.shape[1]} x {image.shape[0]} px; each side needs {MINIMUM_SIDE} px")
-        if not np.isfinite(image).all():
-            raise InputError(f"{name} holds NaN or infinite values; values in [0, 1] are needed")
-    if image1.shape != image2.shape:
-        raise InputError(f"image 1 has shape {image1.shape} and image 2 {image2.shape}; they must be equal")
 
 
 def as_tensor(image: ImageArray, device: str) -> Any:
@@ -61,6 +49,16 @@ def uncertainty(flow: FlowArray, image1: ImageArray, image2: ImageArray, device:
     maps = (sized_sigma(given, first, second, size) for size in working_sizes(*image1.shape[:2]))
     sigma, visible = min(maps, key=lambda each: float(each[0].mean()))
     return sigma[0, 0].cpu().numpy(), visible[0, 0].cpu().numpy()
+
+
+def estimated(method: Method, image1: ImageArray, image2: ImageArray) -> tuple[Estimate, float]:
+    """A method's flow with its uncertainty, and the time in s; of all but `Fast`, whose own it is, the flow's alone."""
+    started = time.perf_counter()
+    if isinstance(method, Fast):
+        return method.estimate(image1, image2), time.perf_counter() - started
+    flow = method.flow(image1, image2)
+    seconds = time.perf_counter() - started
+    return Estimate(flow, *uncertainty(flow, image1, image2, getattr(method, "device", "cpu"))), seconds
 
 
 class ExactFlow:

@@ -19,7 +19,7 @@ AsJson = Annotated[bool, Parameter("--json", negative=(), help="Print the answer
 Size = Annotated[str | None, Parameter(help="ROWSxCOLUMNS at which the network works; see the guide for the default.")]
 Out = Annotated[Path, Parameter(help="Folder for the results.")]
 ShippedOrFile = Annotated[
-    Path | None, Parameter(help="File of weights; default: those that come with the package, best.")
+    Path | None, Parameter(help="File of weights, or fast; default: those that come with the package, best.")
 ]
 Device = Literal["auto", "cpu", "cuda"]
 OnDevice = Annotated[

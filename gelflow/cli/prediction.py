@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import math
 import os
 import sys
 import time
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -50,6 +51,9 @@ def predict(
         Literal["first", "previous"], Parameter(help="Of a video: flow from its first or from the previous frame.")
     ] = "first",
     every: Annotated[int, Parameter(converter=whole(1), help="Of a video: take every n-th frame.")] = 1,
+    markers: Annotated[
+        bool, Parameter(negative=(), help="Of a video: write the motion of the first frame's dots to markers.csv.")
+    ] = False,
     size: Size = None,
     device: OnDevice = "auto",
     as_json: AsJson = False,
@@ -69,8 +73,8 @@ def predict(
             raise InputError(f"{path}: there is no such file or folder")
     estimator = _estimator(weights, method, registration, size, device)
     paired = len(inputs) == 2 or holds_pairs(inputs[0])
-    if paired and (reference, every) != ("first", 1):
-        raise InputError("--reference and --every are for a video or a folder of frames, not for pairs of images")
+    if paired and (reference, every, markers) != ("first", 1, False):
+        raise InputError("--reference, --every and --markers are for a video or a folder of frames, not for pairs")
     if len(inputs) == 2:
         result = predict_pair(estimator, inputs[0], inputs[1], out)
     elif paired:
@@ -78,7 +82,9 @@ def predict(
             result = predict_pairs(estimator, PairDataset(inputs[0]), out, lambda n, total: advance(n, total, ""))
     else:
         with progress("frames, then overlay", not as_json) as advance:
-            result = predict_video(estimator, inputs[0], out, reference, every, lambda n, total: advance(n, total, ""))
+            result = predict_video(
+                estimator, inputs[0], out, reference, every, lambda n, total: advance(n, total, ""), markers
+            )
     if result.lost:
         words = f"about {result.lost} frames at its end do not decode (truncated or damaged)"
         print(f"gelflow: {inputs[0]}: {words}", file=sys.stderr)
@@ -96,6 +102,9 @@ def live(
     reference: Annotated[
         Literal["first", "previous"], Parameter(help="Flow from the first or from the previous frame.")
     ] = "first",
+    markers: Annotated[
+        Path | None, Parameter(help="File to write the motion of the first frame's dots to, as it comes (CSV).")
+    ] = None,
     size: Size = None,
     device: OnDevice = "auto",
     port: Annotated[int | None, Parameter(converter=whole(0), help="Show the flow at http://127.0.0.1:PORT.")] = None,
@@ -110,6 +119,7 @@ def live(
     """
     from gelflow.predict.live import Page, follow
     from gelflow.predict.pictures import certain, draw_overlay, robust_scale, round_up
+    from gelflow.track.markers import COLUMNS, marker_rows
 
     if not seconds >= 0:
         raise InputError(f"--seconds {seconds:g}: allowed are 0 and more")
@@ -120,8 +130,16 @@ def live(
     scale, started = 0.0, time.perf_counter()
     before = started
     try:
-        with closing(follow(estimator, source, reference)) as flows:
-            for frame, found, motion in flows:
+        with (
+            closing(follow(estimator, source, reference, markers is not None)) as flows,
+            nullcontext() if markers is None else markers.open("w", newline="", encoding="utf-8") as table,
+        ):
+            if table:
+                csv.writer(table).writerow(COLUMNS)
+            for frame, found, motion, moved in flows:
+                if table and moved is not None:
+                    csv.writer(table).writerows(marker_rows(motion.frame, motion.time_s, moved))
+                    table.flush()
                 if page:
                     known = certain(found.flow, found.sigma)
                     scale = max(SCALE_DECAY * scale, robust_scale(known))

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from gelflow.baselines import Method
     from gelflow.baselines.learned import Learned, PublishedRaft
     from gelflow.data import PairDataset
+    from gelflow.fast.method import Fast
 
 
 def evaluate(
@@ -118,7 +119,7 @@ def compare(
 
 def _networks(
     given: str, registrations: Sequence[Registered] | None, size: str | None, device: str
-) -> list[Learned | PublishedRaft]:
+) -> list[Learned | PublishedRaft | Fast]:
     """The rows of one --weights: of GelFlow one for each --registration, of RAFT, which it does not concern, one."""
     from gelflow.baselines.learned import open_network
     from gelflow.models.raft import looks_like_raft

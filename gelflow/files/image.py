@@ -8,9 +8,11 @@ import io
 import math
 import warnings
 from pathlib import Path
+from typing import cast
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 
 from gelflow.arrays import Bytes3, Frame, Grey8, ImageArray
@@ -68,6 +70,36 @@ def in_unit_range(frame: Frame) -> ImageArray:
     return frame.astype(np.float32) / np.float32(np.iinfo(frame.dtype).max)
 
 
+THREE_OF = {1: [0, 0, 0], 4: [0, 1, 2]}
+"""Channels that stand for red, green and blue in grey images and in those with alpha, by their number of channels."""
+
+
+def as_image(name: str, array: NDArray[np.generic]) -> ImageArray:
+    """A user's array, (H, W) or (H, W, 1, 3 or 4), uint8, uint16 or real in [0, 1], as images are in memory.
+
+    InputError for other values; the shape is checked by `check_images`.
+    """
+    image = array[..., None] if array.ndim == 2 else array
+    if image.ndim == 3 and image.shape[2] in THREE_OF:
+        image = image[..., THREE_OF[image.shape[2]]]
+    if image.dtype in (np.uint8, np.uint16):
+        return in_unit_range(cast(Frame, image))
+    if image.dtype.kind not in "biuf":
+        raise InputError(f"{name} is {image.dtype}; allowed: real numbers")
+    if image.size:
+        check_range(name, str(image.dtype), float(image.min()), float(image.max()))
+    return image.astype(np.float32)
+
+
+def check_range(name: str, dtype: str, lowest: float, highest: float) -> None:
+    """Refuses values that are none of an image."""
+    if lowest < 0.0 or highest > 1.0:
+        raise InputError(
+            f"{name} is {dtype} with values from {lowest:g} to {highest:g}; allowed: values in [0, 1], or an array of "
+            "uint8"
+        )
+
+
 def full_range(image1: ImageArray, image2: ImageArray) -> tuple[ImageArray, ImageArray]:
     """Both images times their `range_factor`."""
     factor = np.float32(range_factor(max(image1.max(initial=0.0), image2.max(initial=0.0))))
@@ -104,6 +136,19 @@ def read_pair(path1: Path, path2: Path) -> tuple[ImageArray, ImageArray]:
     if image1.shape != image2.shape:
         raise InputError(f"{path1} has {size1}, {path2} has {size2}; both images of a pair need one size")
     return full_range(image1, image2)
+
+
+def check_images(image1: ImageArray, image2: ImageArray) -> None:
+    """Refuses images that differ in shape, are not (H, W, 3), are too small, or hold values that are not finite."""
+    for name, image in (("image 1", image1), ("image 2", image2)):
+        if image.ndim != 3 or image.shape[2] != 3:
+            raise InputError(f"{name} has shape {image.shape}; (rows, columns, 3) is needed, a grey image repeated")
+        if min(image.shape[:2]) < MINIMUM_SIDE:
+            raise InputError(f"{name} has {image.shape[1]} x {image.shape[0]} px; each side needs {MINIMUM_SIDE} px")
+        if not np.isfinite(image).all():
+            raise InputError(f"{name} holds NaN or infinite values; values in [0, 1] are needed")
+    if image1.shape != image2.shape:
+        raise InputError(f"image 1 has shape {image1.shape} and image 2 {image2.shape}; they must be equal")
 
 
 def to_bytes(image: ImageArray) -> Bytes3:

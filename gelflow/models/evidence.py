@@ -73,8 +73,13 @@ def gauss_newton(flow: Flow, first: Images, second: SplineImage, config: Registr
     texture = _squares(across, down) - _squares(*noise)
     pull = torch.stack([across * residual, down * residual], dim=1).sum(dim=2)
     z = window_sums(flow, CORRELATION_PX)(pull) / (math.sqrt(math.pi) * CORRELATION_PX)
+    return solved(texture, _squares(*z.split(1, dim=1)), pull, window)
+
+
+def solved(texture: Tensor, z: Tensor, pull: Tensor, window: SeparableFilter) -> Step:
+    """The step in a window, of what each pixel adds: to A and to z z^T, (B, 3, H, W) each, and to -b, (B, 2, H, W)."""
     # The sum under w^2 is about half of that under w.
-    sums = window(torch.cat([texture, _squares(*z.split(1, dim=1)) / 2, pull], dim=1))
+    sums = window(torch.cat([texture, z / 2, pull], dim=1))
     xx, xy, yy, one, two, three, right, left = sums.split(1, dim=1)
     determinant, trace = xx * yy - xy.square(), xx + yy
     variance = one * (yy.square() + xy.square()) - 2 * two * xy * trace + three * (xx.square() + xy.square())

@@ -69,20 +69,16 @@ def error_squares(flow: Flow, image1: Images, image2: Images) -> tuple[Tensor, T
     best, least = best_window(narrow, variance, texture, narrow_px)
     known, missed = variance < UNKNOWN_PX**2, (flow - best).square().sum(dim=1, keepdim=True)
     error = torch.where(known, least, variance)
-    moment = torch.where(known, _second_moment(window, found.texture) / texture, 0.0)
-    bend = _curvature_square(flow)
+    moment = torch.where(known, second_moment(window, found.texture) / texture, 0.0)
+    bend = curvature_square(flow)
     # The further stage's window, where it errs by less: usually where the flow bends.
     fine_error = (fine_noise(narrow_px, FINE_WINDOW_PX)[1] * finer.variance).clamp(min=MIN_VARIANCE)
-    fine_moment = _second_moment(fine, finer.texture) / fine(finer.texture)
+    fine_moment = second_moment(fine, finer.texture) / fine(finer.texture)
     narrowed = fine_error + (CURVATURE * fine_moment).square() * bend < error + (CURVATURE * moment).square() * bend
     narrowed &= known
     error = torch.where(narrowed, fine_error, error) + missed
     moment = torch.where(narrowed, fine_moment, moment)
-    marks = (variance < 2 * _MOTION.prior_px**2) / variance
-    weight = wide(marks)
-    between = ~known & (weight > TINY)
-    error = torch.where(between, wide(marks * error) / weight, error)
-    moment = torch.where(between, _second_moment(wide, marks) / weight, moment)
+    error, moment = between_marks(error, moment, variance, wide)
     textured = torch.where(known, found.texture, 0.0)
     return error + speck_error(flow, image1, image2, textured), moment.square() * bend
 
@@ -94,15 +90,24 @@ def combined(error: Tensor, curvature: Tensor, factor: float) -> Tensor:
     return (window(square.clamp(max=MAX_SIGMA_PX**2)) / window(torch.ones_like(square))).sqrt()
 
 
-def _second_moment(window: SeparableFilter, field: Features) -> Features:
+def between_marks(error: Tensor, moment: Tensor, variance: Tensor, wide: SeparableFilter) -> tuple[Tensor, Tensor]:
+    """Error and moment, where the variance of the narrow window is that of nothing known, from marks around."""
+    marks = (variance < 2 * _MOTION.prior_px**2) / variance
+    weight = wide(marks)
+    between = (variance >= UNKNOWN_PX**2) & (weight > TINY)
+    error = torch.where(between, wide(marks * error) / weight, error)
+    return error, torch.where(between, second_moment(wide, marks) / weight, moment)
+
+
+def second_moment(window: SeparableFilter, field: Features) -> Features:
     """The sum of w(y - x) |y - x|^2 f(y)."""
     x, y = pixel_indices(field)
     down, across = (m * (p.view(-1, 1) - p).square() for m, p in zip(window, (y[:, 0], x[0]), strict=True))
     return SeparableFilter(down, window.across)(field) + SeparableFilter(window.down, across)(field)
 
 
-def _curvature_square(flow: Flow) -> Tensor:
-    """|V''|^2 of the flow under the last stage's smoothing, px^-2; (B, 1, H, W)."""
-    smooth = smoother(flow, _MOTION.smoothing_px[-1])(flow)
+def curvature_square(flow: Flow, pixel: int = 1) -> Tensor:
+    """|V''|^2 of a flow at every `pixel`-th px under the last stage's smoothing, px^-2; (B, 1, H, W)."""
+    smooth = smoother(flow, _MOTION.smoothing_px[-1] / pixel)(flow) / pixel**2
     slopes = torch.cat(torch.gradient(smooth, dim=(-1, -2)), dim=1)
     return torch.cat(torch.gradient(slopes, dim=(-1, -2)), dim=1).square().sum(dim=1, keepdim=True)

@@ -34,18 +34,18 @@ FLAT = 0.04
 """Sum of squared gradients in a window below which pixels count alike; what the network's flow is worth by default."""
 
 
-def best_window(flow: Flow, variance: Tensor, texture: Tensor, window_px: float) -> tuple[Flow, Tensor]:
+def best_window(flow: Flow, variance: Tensor, texture: Tensor, window_px: float, pixel: int = 1) -> tuple[Flow, Tensor]:
     """Smooths a flow (B, 2, H, W) where that makes it more precise; the flow, and its mean square error, px^2.
 
     It was found by two steps in a window of the standard deviation `window_px`. `variance` is that of its noise, both
     components together, (B, 1, H, W) px^2; `texture` is the sum of the squares of the gradient in the window, (B, 1, H,
-    W).
+    W). All are known at every `pixel`-th px along each axis.
     """
     variance, weight = variance.clamp(min=MIN_VARIANCE), texture.clamp(min=0) + FLAT
     least, error = torch.ones_like(variance), variance
     best = flow
     for width in WIDTHS_PX:
-        window = window_sums(flow, width)
+        window = window_sums(flow, width / pixel)
         wide = _mean(flow, weight, window)
         wide = wide + _mean(flow - wide, weight, window)
         shared, left = _noise_shares(window_px, width)

@@ -4,49 +4,52 @@ from collections.abc import Generator
 from contextlib import closing, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Condition, Thread
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
+from numpy.typing import NDArray
 
-from gelflow.arrays import Bytes3
+from gelflow.arrays import Bytes3, Estimate
 from gelflow.baselines.method import Method
 from gelflow.errors import InputError
 from gelflow.files.image import full_range, in_unit_range, to_bytes
 from gelflow.files.video import newest_frames
-from gelflow.predict.model import Estimate
-from gelflow.predict.prediction import Motion, Reference, estimate
+from gelflow.predict.prediction import Motion, motion_of
+from gelflow.predict.stream import Reference, Stream
 
 
 class LiveFlow(NamedTuple):
-    """The newest frame, the flow that leads to it, and its motion."""
+    """The newest frame, the flow that leads to it, its motion, and the markers, if they were asked for."""
 
     frame: Bytes3
     found: Estimate
     motion: Motion
+    markers: NDArray[Any] | None
 
 
-def follow(method: Method, source: str, reference: Reference = "first") -> Generator[LiveFlow, None, None]:
+def follow(
+    method: Method, source: str, reference: Reference = "first", markers: bool = False
+) -> Generator[LiveFlow, None, None]:
     """Yields the flow to each newest frame, from the first frame or from the one that was used before.
 
     The source is as `newest_frames` takes it. InputError where it does not open or gives fewer than two frames, its
     frames change their size, or the method cannot use them.
     """
-    before: Bytes3 | None = None
+    stream: Stream | None = None
     used = 0
     with closing(newest_frames(source)) as newest:
         for index, time_s, frame in newest:
-            if before is not None:
-                if frame.shape != before.shape:
-                    raise InputError(f"{source}, frame {index}: has another size than the frame before it")
-                first, second = full_range(in_unit_range(before), in_unit_range(frame))
-                try:
-                    found = estimate(method, first, second, index, source, time_s)
-                except InputError as error:
-                    raise InputError(f"{source}, frame {index}, {method.name}: {error}") from error
-                yield LiveFlow(to_bytes(second), *found)
-            if before is None or reference == "previous":
-                before = frame
             used += 1
+            try:
+                if stream is None:
+                    stream = Stream(method, frame, reference, markers)
+                    continue
+                found, seconds, moved = stream.update(frame)
+            except InputError as error:
+                raise InputError(f"{source}, frame {index}, {method.name}: {error}") from error
+            image = in_unit_range(frame)
+            motion = motion_of(found, index, source, time_s, seconds)
+            yield LiveFlow(to_bytes(full_range(image, image)[0]), found, motion, moved)
     if used < 2:
         raise InputError(f"{source}: fewer than two frames came; does another program use the camera?")
 

@@ -2,41 +2,28 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple, cast, overload
+from typing import Any, overload
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gelflow.arrays import Bytes3, Flow, FlowArray, Frame, ImageArray, Images, MapArray
+from gelflow.arrays import Bytes3, Estimate, Flow, FlowArray, ImageArray, Images
 from gelflow.baselines.learned import Learned
-from gelflow.baselines.method import uncertainty
+from gelflow.baselines.method import estimated
 from gelflow.config import Registration
 from gelflow.errors import InputError
-from gelflow.files.image import full_range, in_unit_range, range_factor
+from gelflow.fast.method import Fast, fast, is_fast
+from gelflow.files.image import THREE_OF, as_image, check_range, full_range, range_factor
 from gelflow.models.estimate import estimate_flow
 from gelflow.models.weights import SHIPPED, weights_file
 
-THREE_OF = {1: [0, 0, 0], 4: [0, 1, 2]}
-"""Channels that stand for red, green and blue in grey images and in those with alpha, by their number of channels."""
-
-
-class Estimate(NamedTuple):
-    """A flow (H, W, 2) px, see `FlowModel.flow`, and how certain it is, both (H, W) float32.
-
-    Sigma is the radius in px within which 68 % of such flows are right, at most 10; `visible` the probability that the
-    pixel's point is seen in image 2.
-    """
-
-    flow: FlowArray
-    sigma: MapArray
-    visible: MapArray
-
 
 class FlowModel:
-    """A trained GelFlow network; `load_model` makes one."""
+    """A trained GelFlow network, or the method "fast"; `load_model` makes one."""
 
-    def __init__(self, network: Learned) -> None:
+    def __init__(self, network: Learned | Fast) -> None:
         self._network = network
 
     @property
@@ -83,8 +70,12 @@ class FlowModel:
                 for image in (image1, image2)
             )
             for name, image in (("image 1", first), ("image 2", second)):
-                _check_range(name, str(image.dtype), float(image.min()), float(image.max()))
+                check_range(name, str(image.dtype), float(image.min()), float(image.max()))
             factor = range_factor(float(max(first.max(), second.max())))
+            if isinstance(self._network, Fast):
+                arrays = zip(*(image.movedim(1, -1).float().cpu().numpy() for image in (first, second)), strict=True)
+                flows = [self._network.flow(factor * one, factor * other) for one, other in arrays]
+                return torch.from_numpy(np.stack(flows)).movedim(-1, 1).to(image1.device)
             return estimate_flow(
                 self._network.model, factor * first, factor * second, self._network.size, self._network.forward
             )
@@ -105,8 +96,7 @@ class FlowModel:
         if image1.ndim == image2.ndim == 4:
             found = [self.estimate(*each) for each in _pairs(image1, image2)]
             return Estimate(*map(np.stack, zip(*found, strict=True)))
-        flow = self.flow(image1, image2)
-        return Estimate(flow, *uncertainty(flow, *_images(image1, image2), self.device))
+        return estimated(self._network, *_images(image1, image2))[0]
 
 
 def load_model(
@@ -115,11 +105,12 @@ def load_model(
     registration: Registration | None = None,
     size: tuple[int, int] | None = None,
 ) -> FlowModel:
-    """Loads a trained network.
+    """Loads a trained network, or the method that needs none.
 
     Args:
-        name_or_path: "best", the weights that come with the package, or a file that `gelflow train` or `finetune`
-            wrote (weights.safetensors).
+        name_or_path: "best", the weights that come with the package; a file that `gelflow train` or `finetune` wrote
+            (weights.safetensors); or "fast", DIS with fast registration on one core, which has no weights and takes a
+            thirtieth of the time (see `gelflow.fast.method`).
         device: "cpu", "cuda", or "auto", a CUDA device where there is one.
         registration: "none", "motion", "both" or "brightness": how the flow is corrected on the images; None: what the
             weights ask for, which is "motion" for "best".
@@ -127,11 +118,15 @@ def load_model(
             images, of which those of more than 400 x 300 px are reduced to two sizes.
 
     Raises:
-        InputError: No such file, a damaged one or another network's, no such device, or no such registration or size.
+        InputError: No such file, a damaged one or another network's, no such device, or no such registration or size;
+            of "fast", a CUDA device and any registration or size.
     """
     if size is not None and (len(size) != 2 or not all(isinstance(side, int) for side in size)):
         raise InputError(f"size = {size!r}: rows and columns are needed, such as (240, 320)")
-    return FlowModel(Learned(weights_file(Path(name_or_path)), None, size, device, registration))
+    path = weights_file(Path(name_or_path))
+    if is_fast(path):
+        return FlowModel(fast(size, device, registration))
+    return FlowModel(Learned(path, None, size, device, registration))
 
 
 def _pairs(image1: NDArray[np.generic], image2: NDArray[np.generic]) -> Iterator[Any]:
@@ -143,27 +138,4 @@ def _pairs(image1: NDArray[np.generic], image2: NDArray[np.generic]) -> Iterator
 
 def _images(image1: NDArray[np.generic], image2: NDArray[np.generic]) -> tuple[ImageArray, ImageArray]:
     """Two arrays as images are in memory."""
-    first, second = (image[..., None] if image.ndim == 2 else image for image in (image1, image2))
-    first, second = (
-        image[..., THREE_OF[image.shape[2]]] if image.ndim == 3 and image.shape[2] in THREE_OF else image
-        for image in (first, second)
-    )
-    return full_range(_in_unit_range("image 1", first), _in_unit_range("image 2", second))
-
-
-def _in_unit_range(name: str, image: NDArray[np.generic]) -> ImageArray:
-    if image.dtype in (np.uint8, np.uint16):
-        return in_unit_range(cast(Frame, image))
-    if image.dtype.kind not in "biuf":
-        raise InputError(f"{name} is {image.dtype}; allowed: real numbers")
-    if image.size:
-        _check_range(name, str(image.dtype), float(image.min()), float(image.max()))
-    return image.astype(np.float32)
-
-
-def _check_range(name: str, dtype: str, lowest: float, highest: float) -> None:
-    if lowest < 0.0 or highest > 1.0:
-        raise InputError(
-            f"{name} is {dtype} with values from {lowest:g} to {highest:g}; allowed: values in [0, 1], or an array of "
-            "uint8"
-        )
+    return full_range(as_image("image 1", image1), as_image("image 2", image2))

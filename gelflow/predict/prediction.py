@@ -2,19 +2,19 @@
 
 import os
 import re
-import time
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import astuple, dataclass, fields
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from gelflow.arrays import Bytes3, Frame, ImageArray
-from gelflow.baselines.method import Method, uncertainty
+from gelflow.arrays import Bytes3, Estimate, Frame
+from gelflow.baselines.method import Method, estimated
 from gelflow.data.pairs import PairDataset, PairRecord
 from gelflow.errors import InputError
 from gelflow.files.atomic import refuse_foreign, write_csv
@@ -23,14 +23,16 @@ from gelflow.files.image import full_range, in_unit_range, to_bytes
 from gelflow.files.quiet import quiet
 from gelflow.files.video import describe, frame_file, frames, image_files
 from gelflow.models.working_size import unknown_px
-from gelflow.predict.model import Estimate
 from gelflow.predict.pictures import certain, draw_overlay, robust_scale, write_flow_picture
+from gelflow.predict.stream import Reference, Stream
+from gelflow.track.markers import COLUMNS, marker_rows
 
-Reference = Literal["first", "previous"]
 MAX_RATE = 600.0
 """Largest number of frames per second of an overlay."""
 MOTIONS, MOTIONS_BEGIN = "motion.csv", b"mean_px,p95_px"
 """The table of motions, and what tells it from other tables."""
+MARKERS, MARKERS_BEGIN = "markers.csv", ",".join(COLUMNS).encode()
+"""The table of markers, likewise."""
 
 
 @dataclass(frozen=True)
@@ -97,13 +99,13 @@ def _predicted(method: Method, dataset: PairDataset, index: int, out: Path) -> t
     refuse_foreign(exr, DIRECTIONS.encode(), flo, png)
     image1, image2 = dataset.images(index)
     try:
-        found, motion = estimate(method, image1, image2, index + 1, name)
+        found, seconds = estimated(method, image1, image2)
     except InputError as error:
         raise InputError(f"pair {name} of {dataset.source}, {method.name}: {error}") from error
     write_flow(exr, found.flow, found.visible, found.sigma)
     write_flo(flo, found.flow)
     write_flow_picture(png, image1, image2, found.flow, found.sigma, f"{name} ({method.name})")
-    return [exr, flo, png], motion
+    return [exr, flo, png], motion_of(found, index + 1, name, None, seconds)
 
 
 def _write_motions(out: Path, motions: list[Motion]) -> Path:
@@ -118,13 +120,15 @@ def predict_video(
     reference: Reference = "first",
     every: int = 1,
     progress: Callable[[int, int], None] | None = None,
+    markers: bool = False,
 ) -> Prediction:
     """Writes flow/000001.exr ... (numbered by frame), motion.csv and overlay.mp4 in place of an earlier run's.
 
     Every `every`-th frame of a video file or a folder of images is taken; the flow leads to it from the first one or
-    from its predecessor. `progress` is called with the number of frames done and to be done; each counts twice, for
-    flow and overlay. InputError where the video does not open, fewer than two frames decode, a frame cannot be used, or
-    files of these names are somebody else's; OSError where a file cannot be written.
+    from its predecessor. With `markers`, markers.csv holds those of the first frame in each other. `progress` is called
+    with the number of frames done and to be done; each counts twice, for flow and overlay. InputError where the video
+    does not open, fewer than two frames decode, a frame cannot be used, or files of these names are somebody else's;
+    OSError where a file cannot be written.
     """
     if every < 1:
         raise InputError(f"every = {every}: at least 1 is needed")
@@ -137,22 +141,28 @@ def predict_video(
         raise InputError(f"{path}: every = {every} {words}")
     video = out / "overlay.mp4"
     refuse_foreign(out / MOTIONS, MOTIONS_BEGIN, video)
+    refuse_foreign(out / MARKERS, MARKERS_BEGIN)
     for earlier in _earlier_flows(out):
         refuse_foreign(earlier, DIRECTIONS.encode())
     sources = dict(enumerate(image_files(path))) if path.is_dir() else {}
     files: list[Path] = []
     motions: list[Motion] = []
     times: list[float] = []
-    scale = 0.0
-    for index, time_s, first, second in _frame_pairs(path, every, reference):
+    marked: list[tuple[int, float | None, NDArray[Any]]] = []
+    scale, stream = 0.0, None
+    for index, time_s, frame in _frames(path, every):
         times.append(index / info.frames_per_second if time_s is None else time_s)
-        if index == 0:
-            continue
         source = sources.get(index, path)
         try:
-            found, motion = estimate(method, first, second, index, source.name, time_s)
+            if stream is None:
+                stream = Stream(method, frame, reference, markers)
+                continue
+            found, seconds, moved = stream.update(frame)
         except InputError as error:
             raise InputError(f"{source}, frame {index}, {method.name}: {error}") from error
+        motion = motion_of(found, index, source.name, time_s, seconds)
+        if moved is not None:
+            marked.append((index, time_s, moved))
         if not files:
             for earlier in _earlier_flows(out):
                 earlier.unlink()
@@ -162,51 +172,43 @@ def predict_video(
         scale = max(scale, robust_scale(certain(found.flow, found.sigma)))
         if progress:
             progress(len(motions), 2 * expected)
-    table = _write_motions(out, motions)
+    tables = [_write_motions(out, motions)]
+    if markers:
+        rows = (row for index, time_s, moved in marked for row in marker_rows(index, time_s, moved))
+        write_csv(out / MARKERS, COLUMNS, rows)
+        tables.append(out / MARKERS)
+    elif (out / MARKERS).exists():
+        (out / MARKERS).unlink()
 
     def overlays() -> Iterator[Bytes3]:
-        for count, (index, _, first, second) in enumerate(_frame_pairs(path, every, reference), len(motions)):
-            flow = np.zeros((*first.shape[:2], 2), np.float32)
+        for count, (index, _, frame) in enumerate(_frames(path, every), len(motions)):
+            flow = np.zeros((*frame.shape[:2], 2), np.float32)
             if index > 0:
                 field = read_flow(out / "flow" / f"{index:06d}.exr")
                 flow = certain(field.flow, field.sigma)
-            yield draw_overlay(to_bytes(second), flow, scale)
+            image = in_unit_range(frame)
+            yield draw_overlay(to_bytes(full_range(image, image)[0]), flow, scale)
             if progress and index > 0:
                 progress(count, 2 * expected)
 
     _write_overlay(overlays(), video, *_places(times, info.frames_per_second / every))
-    return Prediction([*files, table, video], motions, info.lost)
+    return Prediction([*files, *tables, video], motions, info.lost)
 
 
-def estimate(
-    method: Method, image1: ImageArray, image2: ImageArray, frame: int, file: str, time_s: float | None = None
-) -> tuple[Estimate, Motion]:
-    """The flow between two images, how certain it is, and its motion; InputError as `Method.flow` raises it."""
-    started = time.perf_counter()
-    flow = method.flow(image1, image2)
-    seconds = time.perf_counter() - started
-    length = np.hypot(flow[..., 0], flow[..., 1])
+def motion_of(found: Estimate, frame: int, file: str, time_s: float | None, seconds: float) -> Motion:
+    """What `Motion` tells of a flow that took so many seconds."""
+    length = np.hypot(found.flow[..., 0], found.flow[..., 1])
     p95, p99 = (float(value) for value in np.nanpercentile(length, (95, 99)))
-    sigma, visible = uncertainty(flow, image1, image2, getattr(method, "device", "cpu"))
-    unknown = float((sigma > unknown_px(*sigma.shape)).mean())
-    motion = Motion(frame, file, time_s, float(np.nanmean(length)), p95, p99, seconds, unknown)
-    return Estimate(flow, sigma, visible), motion
+    unknown = float((found.sigma > unknown_px(*found.sigma.shape)).mean())
+    return Motion(frame, file, time_s, float(np.nanmean(length)), p95, p99, seconds, unknown)
 
 
-def _frame_pairs(
-    path: Path, every: int, reference: Reference
-) -> Iterator[tuple[int, float | None, ImageArray, ImageArray]]:
-    """(index and time of the second frame, reference frame, second frame); first, the first frame with itself."""
-    before: Frame | None = None
+def _frames(path: Path, every: int) -> Iterator[tuple[int, float | None, Frame]]:
+    """Index, time and pixels of each frame; InputError for one that cannot be read."""
     for index, time_s, frame in frames(path, every):
         if frame is None:
             raise InputError(f"{frame_file(path, index)}: cannot be read (truncated or damaged)")
-        before = frame if before is None else before
-        if frame.shape != before.shape:
-            raise InputError(f"{frame_file(path, index)}, frame {index}: has another size than the frame before it")
-        yield index, time_s, *full_range(in_unit_range(before), in_unit_range(frame))
-        if reference == "previous":
-            before = frame
+        yield index, time_s, frame
 
 
 def _places(times: list[float], frames_per_second: float) -> tuple[list[int], float]:

@@ -246,7 +246,7 @@ def test_images_that_cannot_be_used_are_named(number: int, networks: tuple[Path,
 
     assert "one.png: 1 x 1 px" in predict("one.png", "good.png")
     assert "each side needs 16 px" in predict("small.png", "small.png")
-    assert "--every are for a video" in predict("good.png", "good.png", "--every", "2")
+    assert "--markers are for a video" in predict("good.png", "good.png", "--every", "2")
     assert "good.png has 80 x 64 px, " in predict("good.png", "wide.png")
     assert "nan.tiff" in predict("good.png", "nan.tiff")
     if number == 0:

@@ -28,7 +28,7 @@ def video(path: Path, rate: float) -> Path:
 @pytest.mark.parametrize("reference", ["first", "previous"])
 def test_flow_leads_from_the_reference_to_each_newest_frame(tmp_path: Path, reference: str) -> None:
     path, used = video(tmp_path / "a.avi", 10.0), [0]
-    for frame, found, motion in follow(FARNEBACK, str(path), reference):
+    for frame, found, motion, _ in follow(FARNEBACK, str(path), reference):
         assert frame.shape == (64, 96, 3)
         expected = motion.frame - (0 if reference == "first" else used[-1])
         # The limit of test_predict for videos.

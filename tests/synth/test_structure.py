@@ -71,7 +71,7 @@ def test_the_public_names_are_those_of_the_interface() -> None:
     code = "import synth, gelflow; [getattr(package, name) for package in (synth, gelflow) for name in dir(package)]"
     command = [sys.executable, "-c", f"{code}; print(dir(synth), dir(gelflow)); print(gelflow.train)"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    names = ["generate", "load_scene", "plan", "read_dataset"], ["PairDataset", "load_model", "train"]
+    names = ["generate", "load_scene", "plan", "read_dataset"], ["PairDataset", "Tracker", "load_model", "train"]
     assert done.stdout.startswith(f"{names[0]} {names[1]}\n<function train"), done.stderr
 
 
@@ -90,7 +90,7 @@ def test_every_module_has_a_stage_and_imports_only_from_earlier_ones() -> None:
 
 ROOMS = (
     "errors", "arrays", "untrusted", "hardware", "terminal", "config", "files", "ops", "models", "losses", "data",
-    "baselines", "predict", "compare", "training", "cli", "__main__",
+    "fast", "baselines", "track", "predict", "compare", "training", "cli", "__main__",
 )  # fmt: skip
 """The same for the parts of gelflow."""
 

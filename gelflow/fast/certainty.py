@@ -1,0 +1,106 @@
+"""How certain a registered flow is, and the window that fits each place; on every fourth pixel of the image.
+
+As `gelflow.models.evidence`, `gelflow.models.wider_window` and `gelflow.models.uncertainty`, which hold the equations,
+with two differences. What the flow misses is the Gauss-Newton step that is left. Where the flow leaves more than
+`UNEXPLAINED` of what unrelated images would, and more than the camera's noise, it has lost the pattern. Specks in the
+optics are not looked for.
+"""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.special import ndtr
+from torch import Tensor
+
+from gelflow.arrays import Estimate, FlowArray, MapArray
+from gelflow.fast.registration import (
+    CELL,
+    CONFIG,
+    Prepared,
+    fields,
+    indices,
+    inside,
+    products,
+    resized,
+    slopes,
+    unexplained,
+)
+from gelflow.models.evidence import MAX_VARIANCE, solved
+from gelflow.models.registration import posterior_variance
+from gelflow.models.uncertainty import (
+    CURVATURE,
+    MAX_SIGMA_PX,
+    RADIUS,
+    UNKNOWN_PX,
+    between_marks,
+    curvature_square,
+    second_moment,
+)
+from gelflow.models.wider_window import MIN_VARIANCE, TWO_STEPS, best_window
+from gelflow.ops.gaussian import window_sums
+
+UNEXPLAINED = 0.6
+"""Share of the residual of unrelated images above which a flow explains nothing; that of propagation."""
+NEAR = 0.25
+"""Weight of the neighbouring cells in the sum z of a window's pull; its square sum over the centre's is `_Z`."""
+_Z = 1 + 2 * NEAR**2
+
+
+class Refined(NamedTuple):
+    """A flow (h, w, 2), px, on every fourth pixel, with sigma in px; whether it is lost there, (h, w)."""
+
+    flow: FlowArray
+    sigma: MapArray
+    lost: NDArray[np.bool_]
+
+    def estimate(self, image: Prepared) -> Estimate:
+        """The same at each pixel of an image as it was given, in its px, with the probability to stay in it."""
+        height, width = self.sigma.shape
+        place, spread = CELL * (indices(height, width) + 0.5) + self.flow, self.sigma[..., None] / RADIUS
+        last = np.array(image.size[::-1], np.float32)
+        seen = (ndtr((last - place) / spread) - ndtr(-place / spread)).prod(axis=-1)
+        sigma = image.on_image(self.sigma) * np.sqrt(image.scale.prod())
+        flow, visible = image.on_image(self.flow) * image.scale, image.on_image(seen.astype(np.float32))
+        return Estimate(flow, sigma.clip(max=MAX_SIGMA_PX), visible)
+
+
+def refined(flow: FlowArray, first: Prepared, second: Prepared) -> Refined:
+    """At each place the flow of the window that fits it, from one that `register` found, and how certain that is."""
+    narrow_px, wide_px = CONFIG.windows_px[-1], CONFIG.windows_px[0]
+    one = first.levels[1]
+    residual, across, down, _ = fields(flow, one, second.levels[1])
+    noise = slopes(residual, 0.5)
+    squares = [(across, across), (across, down), (down, down)]
+    noises = [(noise[0], noise[0]), (noise[0], noise[1]), (noise[1], noise[1])]
+    found = products([*squares, *noises, (across, residual), (down, residual)], one.grid)
+    counted = 4 * inside(flow, one)
+    texture = [counted * (square - noise) for square, noise in zip(found[:3], found[3:6], strict=True)]
+    pull = cv2.merge([counted * found[6], counted * found[7]])
+    kernel = np.array([NEAR, 1, NEAR], np.float32)
+    zx, zy = cv2.split(cv2.sepFilter2D(pull, -1, kernel, kernel, borderType=cv2.BORDER_CONSTANT))
+    squares_of_z = [product / _Z for product in (zx * zx, zx * zy, zy * zy)]
+    grid = (one.grid[0] // 2, one.grid[1] // 2)
+    cells = _tensor(4 * resized(cv2.merge([*texture, *squares_of_z, *cv2.split(pull)]), grid))
+    window, wide = (window_sums(cells, width / CELL) for width in (narrow_px, wide_px))
+    gradients, gradient = cells[:, :3], cells[:, :1] + cells[:, 2:3]
+    step, variance, _ = solved(gradients, cells[:, 3:6], cells[:, 6:], window)
+    variance = (TWO_STEPS * variance).clamp(MIN_VARIANCE, MAX_VARIANCE)
+    known, textured = variance < UNKNOWN_PX**2, window(gradient)
+    posterior = posterior_variance(variance, CONFIG.prior_px)
+    best, error = best_window(_tensor(resized(flow, grid)), posterior, textured, narrow_px, CELL)
+    error = torch.where(known, error, variance) + step.square().sum(dim=1, keepdim=True)
+    moment = torch.where(known, second_moment(window, gradient) / textured, 0.0)
+    error, moment = between_marks(error, moment, variance, wide)
+    square = RADIUS**2 / 2 * (error + (CURVATURE * CELL**2 * moment).square() * curvature_square(best, CELL))
+    fitted, sigma = best[0].movedim(0, -1).contiguous().numpy(), square.clamp(max=MAX_SIGMA_PX**2).sqrt()[0, 0].numpy()
+    left, share = (resized(each, grid) for each in unexplained(fitted, first, second, wide_px))
+    lost = (share > UNEXPLAINED) & (left > (CONFIG.noise / 2) ** 2)
+    return Refined(fitted, np.where(lost, np.float32(MAX_SIGMA_PX), sigma), lost)
+
+
+def _tensor(field: NDArray[np.float32]) -> Tensor:
+    """(h, w, C) as (1, C, h, w)."""
+    return torch.from_numpy(np.ascontiguousarray(np.moveaxis(field, -1, 0)))[None]

@@ -1,0 +1,53 @@
+"""Frames of a recording or a camera, one after the other: the flow to each, and the markers that move with it."""
+
+from typing import Any, Literal, NamedTuple
+
+from numpy.typing import NDArray
+
+from gelflow.arrays import Estimate, Frame
+from gelflow.baselines.method import Method, estimated
+from gelflow.errors import InputError
+from gelflow.fast.method import Fast
+from gelflow.files.image import full_range, in_unit_range
+from gelflow.track.markers import Markers
+from gelflow.track.tracker import Tracker
+
+Reference = Literal["first", "previous"]
+
+
+class Followed(NamedTuple):
+    """The flow to a frame, how long it took, s, and the markers, if they were asked for."""
+
+    found: Estimate
+    seconds: float
+    markers: NDArray[Any] | None
+
+
+class Stream:
+    """The flow of a method from the first frame, or from the previous one, to each next frame.
+
+    The method "fast" tracks (`gelflow.track.tracker`) from the first frame; others see each frame on its own. Markers
+    are those of the first frame; InputError where the flow does not come from there.
+    """
+
+    def __init__(self, method: Method, first: Frame, reference: Reference, markers: bool) -> None:
+        if markers and reference == "previous":
+            raise InputError("--markers: they are followed from the first frame; leave out --reference previous")
+        self._method, self._before, self._reference, self._with_markers = method, first, reference, markers
+        image = in_unit_range(first)
+        self._tracker = Tracker(image) if isinstance(method, Fast) and reference == "first" else None
+        self._markers = Markers(full_range(image, image)[0]) if markers and self._tracker is None else None
+
+    def update(self, frame: Frame) -> Followed:
+        """Finds the flow to the next frame; InputError where it has another size or the method cannot use it."""
+        if frame.shape != self._before.shape:
+            raise InputError("has another size than the frame before it")
+        if self._tracker is not None:
+            tracked = self._tracker.update(in_unit_range(frame))
+            found = Estimate(tracked.flow, tracked.sigma, tracked.visible)
+            return Followed(found, tracked.seconds, tracked.markers if self._with_markers else None)
+        images = full_range(in_unit_range(self._before), in_unit_range(frame))
+        found, seconds = estimated(self._method, *images)
+        if self._reference == "previous":
+            self._before = frame
+        return Followed(found, seconds, None if self._markers is None else self._markers.at(found, images[1]))

@@ -1,0 +1,1 @@
+"""Flow of a stream of frames from one reference, and the markers that move with it."""

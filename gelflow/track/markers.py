@@ -1,0 +1,82 @@
+"""Markers: dots, blobs or pins of the reference, moved by the flow. No grid is assumed, and none is fitted.
+
+Each marker is read from the flow at its own centre, so that a missing or broken one disturbs no other. It is visible
+where it stays in the image, sigma is known, and the two images resemble each other in a window of its own size.
+"""
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.arrays import Estimate, ImageArray, MapArray
+from gelflow.fast.registration import indices, resized
+from gelflow.files.image import to_grey
+from gelflow.models.working_size import unknown_px
+from gelflow.ops.blobs import SIZES, blob_centre, blobs, inside_by
+
+MARKERS = np.dtype(
+    [("id", np.int32), *((name, np.float32) for name in ("x", "y", "u", "v", "sigma")), ("visible", np.bool_)]
+)
+"""A marker: its number, its centre in the reference (pixel centres are at (c + 0.5, r + 0.5)), its motion since, the
+sigma of the flow there, all px, and whether it is seen."""
+MIN_LIKENESS = 0.4
+"""Correlation of a marker's surroundings in the two images below which it is not seen."""
+COLUMNS = ("id", "frame", "time_s", "x", "y", "u", "v", "sigma", "visible")
+
+
+class Markers:
+    """The markers of a reference image (H, W, 3) in [0, 1], as long as it is the reference."""
+
+    def __init__(self, reference: ImageArray) -> None:
+        grey, values = to_grey(reference), reference.mean(axis=-1, dtype=np.float64)
+        found = blobs(grey)
+        if len(found):
+            size = found[:, 2] / np.median(found[:, 2])
+            whole = inside_by(found[:, :2], grey.shape, 0.6 * float(np.median(found[:, 2])))
+            found = found[(size > SIZES[0]) & (size < SIZES[1]) & whole]
+        self._reference = cv2.cvtColor(reference, cv2.COLOR_RGB2GRAY)
+        self._deviation = float(np.median(found[:, 2])) / 2 if len(found) else 1.0
+        self._centres = np.array([blob_centre(values, *blob) for blob in found]).reshape(-1, 2)
+
+    def __len__(self) -> int:
+        return len(self._centres)
+
+    def at(self, found: Estimate, frame: ImageArray) -> NDArray[np.void]:
+        """All markers, (N,) of `MARKERS`, under the flow from the reference to a frame."""
+        centres = self._centres.astype(np.float32).reshape(1, -1, 2)
+
+        def read(field: MapArray) -> NDArray[np.float32]:
+            return cv2.remap(field, centres, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
+
+        markers = np.zeros(len(self), MARKERS)
+        if not len(self):
+            return markers
+        markers["id"] = np.arange(len(self))
+        markers["x"], markers["y"] = (self._centres + 0.5).T
+        markers["u"], markers["v"] = read(found.flow).T
+        markers["sigma"] = read(found.sigma)
+        places, grey = indices(*found.sigma.shape) + np.nan_to_num(found.flow), cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY)
+        moved = cv2.remap(grey, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        likeness = resized(_likeness(self._reference, moved, self._deviation), grey.shape)
+        known = markers["sigma"] < unknown_px(*found.sigma.shape)
+        markers["visible"] = known & (read(found.visible) > 0.5) & (read(likeness) > MIN_LIKENESS)
+        return markers
+
+
+def _likeness(image1: MapArray, image2: MapArray, deviation: float) -> MapArray:
+    """Covariance of grey images under a Gaussian over the mean of their variances, at half their size; at most 1."""
+    half = (image1.shape[0] // 2, image1.shape[1] // 2)
+    one, two = resized(image1, half), resized(image2, half)
+    sums = [cv2.GaussianBlur(field, (0, 0), deviation / 2) for field in (one, two, one * two, one * one + two * two)]
+    mean1, mean2, mixed, square = sums
+    return 2 * (mixed - mean1 * mean2) / (square - mean1**2 - mean2**2).clip(1e-9)
+
+
+def marker_rows(frame: int, time_s: float | None, markers: Iterable[Any]) -> Iterator[tuple[Any, ...]]:
+    """The rows of `COLUMNS` for the markers of one frame."""
+    for marker in markers:
+        numbers = (round(float(marker[name]), 4) for name in COLUMNS[3:-1])
+        yield marker["id"], frame, time_s, *numbers, int(marker["visible"])

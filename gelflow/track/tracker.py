@@ -1,0 +1,151 @@
+"""Flow of a stream: each frame against one reference, from where the frame before has led.
+
+The start of a frame is the last flow, moved on by what DIS sees between the last two frames:
+``V(x) = U(x) + D(x + U(x))``. Registration between the reference and the frame then corrects it, so that errors do not
+add up, and motion may grow beyond what a direct flow finds. Where the result explains hardly more of the frame than
+chance (`gelflow.fast.certainty`), it is lost, and starts that know nothing of the stream compete with it: DIS from the
+reference, and the network where there is one. After a frame in which most of the picture is lost, such as a cut or one
+of a ramp of exposure, the next one starts afresh. A flow that took dots for the next ones is not noticed.
+"""
+
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gelflow.arrays import Bytes3, FlowArray, ImageArray, MapArray
+from gelflow.baselines.learned import open_network
+from gelflow.errors import InputError
+from gelflow.fast.certainty import Refined, refined
+from gelflow.fast.method import FAST, Fast
+from gelflow.fast.registration import STAGES, Prepared, Stage, indices, register, resized
+from gelflow.fast.start import dis, fresh_start
+from gelflow.files.image import as_image, check_images, range_factor
+from gelflow.models.uncertainty import MAX_SIGMA_PX
+from gelflow.models.weights import weights_file
+from gelflow.track.markers import Markers
+
+TRACKING = (STAGES[0], STAGES[-1])
+"""Stages from the last flow on. The first smooths it, so that errors between marks do not add up over frames."""
+MOST_LOST = 0.01
+"""Share of the picture that may be lost, beyond what the last fresh start left, before fresh starts compete."""
+RETRY = 10
+"""Frames after which they compete again for what the last ones left."""
+CUT = 0.5
+"""Share of the picture that is lost in a frame which has nothing to do with the one before."""
+
+
+class Tracked(NamedTuple):
+    """What a frame shows, from the reference on.
+
+    `flow` (H, W, 2), px; `sigma` (H, W), px, at most 10: the radius within which 68 % of such flows are right;
+    `visible` (H, W), the probability that the point is seen in the frame; `markers` (N,), structured: id, x, y (in the
+    reference), u, v, sigma, px, and visible; `seconds` that the update took; and whether it started `afresh`.
+    """
+
+    flow: FlowArray
+    sigma: MapArray
+    visible: MapArray
+    markers: NDArray[np.void]
+    seconds: float
+    afresh: bool
+
+
+class Tracker:
+    """Follows a stream of frames from a reference, on one core of the processor. Memory does not grow with frames.
+
+    Args:
+        reference: The gel at rest, or whatever motion is counted from: (H, W, 3), (H, W, 4) or (H, W), uint8, uint16 or
+            float in [0, 1]; each side has 16 px or more. Larger images than 400 x 300 px are reduced.
+        weights: What takes over where the stream is lost: "fast", DIS alone; "best" or a file of weights, that network,
+            too, for such frames only. A network takes as long as `load_model` does.
+        scene: None alone is allowed; motion and markers are in px.
+
+    Raises:
+        InputError: An image that is none, no such weights, or a scene.
+
+    Examples:
+        >>> import gelflow, numpy as np
+        >>> reference = np.random.default_rng(0).integers(0, 256, (64, 80, 3), np.uint8)
+        >>> gelflow.Tracker(reference).update(np.roll(reference, 1, axis=1)).flow.shape
+        (64, 80, 2)
+    """
+
+    def __init__(self, reference: ImageArray | Bytes3, weights: str | Path = FAST, scene: None = None) -> None:
+        if scene is not None:
+            raise InputError(f"scene = {scene!r}: millimetres are not known here; give None, and take px")
+        method = open_network(weights_file(Path(weights)))
+        self._network = None if isinstance(method, Fast) else method
+        self.reset(reference)
+
+    def reset(self, reference: ImageArray | Bytes3 | None = None) -> None:
+        """Forgets the stream; a reference, of any size, replaces the former one and its markers."""
+        if reference is not None:
+            image = as_image("the reference", reference)
+            check_images(image, image)
+            self._factor = np.float32(range_factor(float(image.max())))
+            self._image = self._factor * image
+            self._first, self._markers = Prepared(self._image), Markers(self._image)
+        self._last: tuple[Prepared, FlowArray] | None = None
+        self._since, self._accepted = 0, 0.0
+        self._time_s = -math.inf
+
+    def update(self, frame: ImageArray | Bytes3, time_s: float | None = None) -> Tracked:
+        """Finds the flow from the reference to the next frame.
+
+        Args:
+            frame: As the reference, of its size.
+            time_s: When the frame was taken, s; later than the frame before. It is only checked.
+
+        Raises:
+            InputError: Another size than the reference's, values that are none of an image, or a time that is not
+                later. The frame then counts as not given.
+        """
+        started = time.perf_counter()
+        image = self._factor * as_image("the frame", frame)
+        check_images(self._image, image)
+        if time_s is not None:
+            if not time_s > self._time_s:
+                words = "times must rise; for another stream, reset()"
+                raise InputError(f"time_s = {time_s:g} after {self._time_s:g}: {words}")
+            self._time_s = time_s
+        found, afresh = self._follow(image)
+        estimate = found.estimate(self._first)
+        markers = self._markers.at(estimate, image)
+        return Tracked(*estimate, markers, time.perf_counter() - started, afresh)
+
+    def _follow(self, image: ImageArray) -> tuple[Refined, bool]:
+        """The flow to a frame, and whether it started afresh."""
+        second, flows = Prepared(image), list[FlowArray]()
+        self._since += 1
+        if self._last is not None:
+            flows.append(_moved_on(*self._last, second))
+            found = self._registered(flows[0], second, TRACKING)
+            lost = float(found.lost.mean())
+            self._accepted = min(self._accepted, lost)
+        if self._last is None or lost > (self._accepted if self._since < RETRY else 0.0) + MOST_LOST:
+            if self._network is not None:
+                flows.append(self._first.on_levels(self._network.flow(self._image, image)))
+            found = self._registered(fresh_start(self._first, second, flows), second, STAGES[1:])
+            self._since, self._accepted = 0, float(found.lost.mean())
+        if found.lost.mean() > CUT:
+            self._last = None
+            return found._replace(sigma=np.full_like(found.sigma, MAX_SIGMA_PX)), True
+        self._last = (second, found.flow)
+        return found, self._since == 0
+
+    def _registered(self, flow: FlowArray, second: Prepared, stages: Sequence[Stage]) -> Refined:
+        return refined(register(flow, self._first, second, stages), self._first, second)
+
+
+def _moved_on(before: Prepared, flow: FlowArray, second: Prepared) -> FlowArray:
+    """The flow to the frame before, and what DIS sees since, on the flow's grid."""
+    height, width = flow.shape[:2]
+    since = resized(dis("ultrafast", before.grey, second.grey), (height, width))
+    places = indices(height, width) + flow * (width / second.grey.shape[1])
+    return flow + cv2.remap(since, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
