@@ -24,7 +24,7 @@ import numpy as np
 from scipy.optimize import least_squares, nnls
 
 from synth.arrays import BoolArray, FloatArray
-from synth.calibrate.irradiance import FlatGel, LightGeometry
+from synth.calibrate.irradiance import LitGel, LightGeometry
 
 CENTRE_MM, DIRECTION, LOG_SIZE, LOG_ANGLE, VIGNETTING = 2.0, 0.4, 0.5, 0.4, 0.3
 """Standard deviations of the prior: of a light's place, of its unit direction, of the logarithms of its sizes and of
@@ -72,7 +72,7 @@ class LightFit:
 
 
 def fit_lights(
-    gel: FlatGel, target: Target, start: LightGeometry, shines: BoolArray, vignetting: float, bounds: Bounds, steps: int
+    gel: LitGel, target: Target, start: LightGeometry, shines: BoolArray, vignetting: float, bounds: Bounds, steps: int
 ) -> LightFit:
     """Fit powers, geometry and vignetting to a target at the pixels of a gel.
 
@@ -93,7 +93,7 @@ class _Problem:
     """J of the module's docstring."""
 
     def __init__(
-        self, gel: FlatGel, target: Target, start: LightGeometry, shines: BoolArray, vignetting: float
+        self, gel: LitGel, target: Target, start: LightGeometry, shines: BoolArray, vignetting: float
     ) -> None:
         unit = start.direction / np.linalg.norm(start.direction, axis=1, keepdims=True)
         self._start = replace(start, direction=unit)

@@ -10,7 +10,7 @@ from synth.arrays import BoolArray, FloatArray, Pixels
 from synth.calibrate.dot_grid import DotGridFit, fit_dot_grid
 from synth.calibrate.dots import FoundDots, find_dots
 from synth.calibrate.frames import Frames
-from synth.calibrate.irradiance import FlatGel, LightGeometry
+from synth.calibrate.irradiance import LitGel, LightGeometry
 from synth.calibrate.lights import Bounds, LightFit, Target, fit_lights
 from synth.calibrate.noise import fit_noise
 from synth.calibrate.profile import DotProfile, blur_of, fit_profile
@@ -66,7 +66,7 @@ def fit_sensor(start: Sensor, frames: Frames, variant: Variant, spacing_mm: floa
         raise InputError("no pixel between the dots sees the gel of the preset; check its sensor.gel and sensor.camera")
     at = (pixels[:, 1].astype(int), pixels[:, 0].astype(int))
     smooth = _smoothed(frames.encoded, bare)[at]
-    gel = FlatGel(sensor, pixels, variant)
+    gel = LitGel(sensor, pixels, variant)
     target = _target(smooth, sensor.camera, pixels)
     shines = np.array([light.color for light in sensor.lights]) > 0
     fit = fit_lights(
