@@ -10,14 +10,14 @@ from synth.arrays import BoolArray, FloatArray, Pixels
 from synth.calibrate.dot_grid import DotGridFit, fit_dot_grid
 from synth.calibrate.dots import FoundDots, find_dots
 from synth.calibrate.frames import Frames
-from synth.calibrate.irradiance import LitGel, LightGeometry
-from synth.calibrate.lights import Bounds, LightFit, Target, fit_lights
+from synth.calibrate.irradiance import LightGeometry, LitGel
+from synth.calibrate.lights import LightFit, Room, Target, fit_lights
 from synth.calibrate.noise import fit_noise
 from synth.calibrate.profile import DotProfile, blur_of, fit_profile
 from synth.errors import InputError
 from synth.optics import Optics
 from synth.render.camera_image import off_centre
-from synth.render.lights import check_view, light_axes
+from synth.render.lights import check_view
 from synth.render.pattern import pixels_per_mm
 from synth.render.variant import Variant
 from synth.scene import Camera, Dots, Light, Sensor
@@ -70,11 +70,11 @@ def fit_sensor(start: Sensor, frames: Frames, variant: Variant, spacing_mm: floa
     target = _target(smooth, sensor.camera, pixels)
     shines = np.array([light.color for light in sensor.lights]) > 0
     fit = fit_lights(
-        gel, target, LightGeometry.of(sensor.lights), shines, sensor.camera.vignetting, _bounds(sensor), steps
+        (gel,), target, LightGeometry.of(sensor.lights), shines, sensor.camera.vignetting, room_of(sensor), steps
     )
     if steps > 0:
         clear = _clear_of_view(sensor, fit.geometry)
-        again = fit_lights(gel, target, clear, shines, fit.vignetting, _bounds(sensor), 0)
+        again = fit_lights((gel,), target, clear, shines, fit.vignetting, room_of(sensor), 0)
         fit = replace(again, steps=fit.steps)
     read, shot = fit_noise(frames.single, bare, gamma, frames.step)
     noise: dict[str, Any] = {"read_noise": round(read, 6), "shot_noise": round(shot, 6)}
@@ -150,25 +150,20 @@ def _sees_gel(sensor: Sensor) -> BoolArray:
     return np.asarray(inside.reshape(camera.height, camera.width))
 
 
-def _bounds(sensor: Sensor) -> Bounds:
-    """Each light stays near its place, in the body, and on its side of what the camera sees of the contact face."""
+def room_of(sensor: Sensor, reach_mm: float = _REACH_MM) -> Room:
+    """Each light stays near its place, in the body, and outside what the camera sees."""
     camera = sensor.camera
     u, v = np.meshgrid(np.linspace(0, camera.width, 5), np.linspace(0, camera.height, 5))
-    seen = Optics.of(sensor).look(np.column_stack([u.ravel(), v.ravel()])).on_flat_face[:, :2]
-    geometry = LightGeometry.of(sensor.lights)
-    centre = geometry.centre
-    low, high = centre - _REACH_MM, centre + _REACH_MM
-    face = sensor.gel.size_mm[2] + sensor.window.thickness_mm
-    low[:, 2], high[:, 2] = np.maximum(low[:, 2], 0.4), np.minimum(high[:, 2], face - 0.4)
-    axes = np.array([light_axes(light)[:2] for light in sensor.lights])
-    extent = (np.abs(axes) * geometry.size[:, :, None] / 2).sum(axis=1)
-    for axis in range(2):
-        least = np.nanmin(seen[:, axis]) - _VIEW_MM - extent[:, axis]
-        most = np.nanmax(seen[:, axis]) + _VIEW_MM + extent[:, axis]
-        at = centre[:, axis]
-        high[:, axis] = np.where(at < least, np.minimum(high[:, axis], least), high[:, axis])
-        low[:, axis] = np.where(at > most, np.maximum(low[:, axis], most), low[:, axis])
-    return low, high
+    rays = Optics.of(sensor).look(np.column_stack([u.ravel(), v.ravel()]))
+    top = sensor.gel.size_mm[2] + sensor.window.thickness_mm
+    levels = []
+    for z in (0.0, top):
+        seen = (rays.on_flat_face + rays.directions * (z / rays.directions[:, 2:]))[:, :2]
+        levels.append(np.stack([np.nanmin(seen, axis=0) - _VIEW_MM, np.nanmax(seen, axis=0) + _VIEW_MM]))
+    centre = np.array([light.position_mm for light in sensor.lights])
+    low, high = centre - reach_mm, centre + reach_mm
+    low[:, 2], high[:, 2] = np.maximum(low[:, 2], 0.4), np.minimum(high[:, 2], top - 0.4)
+    return Room(low, high, levels[0], (levels[1] - levels[0]) / top)
 
 
 def _clear_of_view(sensor: Sensor, geometry: LightGeometry) -> LightGeometry:

@@ -20,7 +20,7 @@ from synth.arrays import FloatArray
 from synth.calibrate.dot_grid import fit_dot_grid, grid_index, pattern_points
 from synth.calibrate.dots import find_dots
 from synth.calibrate.frames import Frames, read_frames
-from synth.calibrate.irradiance import LitGel, LightGeometry
+from synth.calibrate.irradiance import LightGeometry, LitGel
 from synth.calibrate.noise import fit_noise
 from synth.calibrate.profile import fit_profile
 from synth.calibrate.run import MARK, start_sensor
