@@ -10,7 +10,7 @@ geometry θ are a small least-squares problem per channel with one exact answer 
 .. math::  J(\theta) = \min_{P \ge 0} \frac{M}{2 σ^2 n} \sum_{pc} w_{pc}^2 (s_{pc} - \hat s_{pc})^2
                        + \frac12 |\theta|^2,
 
-depends on θ alone (variable projection, Golub and Pereyra 1973). Gauss-Newton steps descend it, with the derivatives of
+depends on θ alone (variable projection, Golub and Pereyra 1973). Levenberg-Marquardt steps descend it, with the derivatives of
 E from Dr.Jit and Kaufman's Jacobian (BIT 15, 1975): what a change of θ does to the picture, less what other powers
 would make of it. w is the slope of the camera's response, so that residuals are in encoded values, as they are seen. θ
 are displacements from where the fit starts, in units of how far a light may plausibly be from there: what the picture
@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
-from scipy.optimize import least_squares, nnls
+from scipy.optimize import nnls
 
 from synth.arrays import BoolArray, FloatArray
 from synth.calibrate.irradiance import LightGeometry, LitGel
@@ -39,8 +39,11 @@ RESIDUAL = 1 / 255
 INDEPENDENT = 300.0
 """Number of independent values that a smooth picture counts for."""
 
-_SEEN_MM, _STEP = 0.02, 1e-4
+_SEEN_MM, _STEP = 0.05, 1e-4
 """Standard deviation of a light's intrusion into the view, and the step of its derivatives in standard deviations."""
+
+_DAMPINGS, _LEAST_GAIN = (0.0, 1.0, 10.0, 100.0, 1e3, 1e4, 1e5), 1e-3
+"""What is added to the curvature, in that of the prior; share of the misfit that a step must take away to be followed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,16 +108,41 @@ def fit_lights(
 ) -> LightFit:
     """Fit powers, geometry and vignetting to a target at the pixels of gels, one after the other.
 
-    The geometry starts from `start`, the distance from which is what the prior penalises, and stays in the room. `shines` (m, 3) are the channels in which each light may have power. At most `steps` Gauss-Newton steps are
-    taken; 0 fits the powers alone.
+    The geometry starts from `start`, the distance from which is what the prior penalises, and stays in the room.
+    `shines` (m, 3) are the channels in which each light may have power. At most `steps` steps are taken; 0 fits the
+    powers alone.
     """
     problem = _Problem(gels, target, start, shines, vignetting, room)
     if steps == 0:
         return problem.result(np.zeros(problem.size), 0)
+    theta, taken = _descend(problem, steps)
+    return problem.result(theta, taken)
+
+
+def _descend(problem: "_Problem", most: int) -> tuple[FloatArray, int]:
+    """Levenberg-Marquardt steps within the box, and their number; of each step all dampings are tried.
+
+    A light that comes into the way of another's makes the misfit jump. A trust region would shrink there to nothing.
+    """
     low, high = problem.box()
-    first, limits = np.clip(np.zeros(problem.size), low + 1e-6, high - 1e-6), {"ftol": 2e-4, "xtol": 1e-3}
-    found = least_squares(problem.residual, first, problem.jacobian, (low, high), max_nfev=steps, **limits)
-    return problem.result(found.x, int(found.njev))
+    theta = np.clip(np.zeros(problem.size), low, high)
+    cost = np.sum(problem.residual(theta) ** 2)
+    for number in range(most):
+        jacobian = problem.jacobian(theta)
+        slope = jacobian.T @ problem.residual(theta)
+        free = ((theta > low) | (slope < 0)) & ((theta < high) | (slope > 0))
+        curvature = (jacobian.T @ jacobian)[np.ix_(free, free)]
+        best = theta, cost
+        for damping in _DAMPINGS:
+            moved = theta.copy()
+            moved[free] -= np.linalg.solve(curvature + damping * np.eye(free.sum()), slope[free])
+            moved = np.clip(moved, low, high)
+            best = min(best, (moved, np.sum(problem.residual(moved) ** 2)), key=lambda each: each[1])
+        done = best[1] > (1 - _LEAST_GAIN) * cost
+        theta, cost = best
+        if done:
+            return theta, number + 1
+    return theta, most
 
 
 class _Problem:
@@ -142,7 +170,7 @@ class _Problem:
     def box(self) -> tuple[FloatArray, FloatArray]:
         low, high = np.full((self._lights, 9), -4.0), np.full((self._lights, 9), 4.0)
         low[:, 6:8], high[:, 6:8] = -_SIZES, _SIZES
-        low[:, 8], high[:, 8] = 0, 1 * (self._scale[:, 8] == 0)  # room where it has no effect: steps end at bounds
+        low[:, 8], high[:, 8] = 0, 0
         for box, centre, angle in ((low, self._room.low, _NARROWEST_DEG), (high, self._room.high, _WIDEST_DEG)):
             box[:, :3] = (centre - self._start.centre) / CENTRE_MM
             box[:, 8:] += np.log(angle / self._start.viewing_angle_deg) / LOG_ANGLE
