@@ -115,10 +115,13 @@ class LitGel:
         self._count, self._weight = len(weight), mi.Float(weight)
         self._point, self._toward, self._normal = mi.Vector3f(point), mi.Vector3f(toward), mi.Vector3f(normal)
 
-    def contributions(self, lights: LightGeometry) -> FloatArray:
-        """E (m, n, 3) float64: radiance per channel and unit of power, on the camera's side of the window."""
+    def contributions(self, lights: LightGeometry, alone: bool = False) -> FloatArray:
+        """E (m, n, 3) float64: radiance per channel and unit of power, on the camera's side of the window.
+
+        `alone`: as if each light were the only one, and none threw shade on another's.
+        """
         parts = self._parts(lights)
-        return self._numpy(self._lit(parts, self._all_unshaded(parts)))
+        return self._numpy(self._lit(parts, self._all_unshaded(parts, alone)))
 
     def derivatives(self, lights: LightGeometry) -> FloatArray:
         """Derivatives of E (m, 9, n, 3) float64 by each light's centre, direction, size and angle, in forward mode.
@@ -171,12 +174,13 @@ class LitGel:
         flip, behind = self._mi.Vector3f(1, 1, -1), self._mi.Vector3f(0, 0, 2 * self._face)
         return parts[0] * flip + behind, parts[1] * flip, *parts[2:]
 
-    def _all_unshaded(self, parts: tuple[Any, ...]) -> tuple[Any, ...]:
+    def _all_unshaded(self, parts: tuple[Any, ...], alone: bool = False) -> tuple[Any, ...]:
         """`_unshaded` of the lights and, where the window reflects, of their images."""
         if not self._reflects:
-            return (self._unshaded(parts, (parts,)),)
+            return (self._unshaded(parts, () if alone else (parts,)),)
         image = self._image(parts)
-        return self._unshaded(parts, (parts,)), self._unshaded(image, (image, parts))
+        obstacles = ((), ()) if alone else ((parts,), (image, parts))
+        return self._unshaded(parts, obstacles[0]), self._unshaded(image, obstacles[1])
 
     def _unshaded(self, parts: tuple[Any, ...], obstacles: tuple[tuple[Any, ...], ...]) -> Any:
         """1 where no rectangle but its own stands between a point and a light's cell, else 0.
@@ -186,7 +190,7 @@ class LitGel:
         mi, dr = self._mi, self._dr
         arm, pixel, light, _ = self._arms(parts)
         point = dr.gather(mi.Vector3f, self._point, pixel)
-        free = mi.Bool(True)
+        free = dr.full(mi.Bool, True, dr.width(arm))
         for centres, directions, sizes, *_ in obstacles:
             for other in range(dr.width(centres)):
                 number = dr.opaque(mi.UInt32, other)
@@ -236,6 +240,20 @@ class LitGel:
         return (
             seen if self._returned is None else seen + np.einsum("npc,mpc->mnc", self._returned, patches, optimize=True)
         )
+
+
+@dataclass(frozen=True, eq=False)
+class PressChange:
+    """What a press changes at pixels: the light of the pressed face less that of the face at rest, as of a `LitGel`."""
+
+    pressed: LitGel
+    rest: LitGel
+
+    def contributions(self, lights: LightGeometry, alone: bool = False) -> FloatArray:
+        return self.pressed.contributions(lights, alone) - self.rest.contributions(lights, alone)
+
+    def derivatives(self, lights: LightGeometry) -> FloatArray:
+        return self.pressed.derivatives(lights) - self.rest.derivatives(lights)
 
 
 def _relief(surface: GelSurface, positions: Points, mi: Any) -> Any:

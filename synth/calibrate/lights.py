@@ -25,7 +25,7 @@ import numpy as np
 from scipy.optimize import nnls
 
 from synth.arrays import BoolArray, FloatArray
-from synth.calibrate.irradiance import LightGeometry, LitGel
+from synth.calibrate.irradiance import LightGeometry, LitGel, PressChange
 
 CENTRE_MM, DIRECTION, LOG_SIZE, LOG_ANGLE, VIGNETTING = 2.0, 0.4, 0.5, 0.4, 0.3
 """Standard deviations of the prior: of a light's place, of its unit direction, of the logarithms of its sizes and of
@@ -60,8 +60,8 @@ class Target:
     corner: FloatArray
 
 
-Gels: TypeAlias = Sequence[LitGel]
-"""The gel at rest, and pressed."""
+Gels: TypeAlias = Sequence[LitGel | PressChange]
+"""The gel at rest, and what presses change."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,9 +238,9 @@ class _Problem:
         return 1 - (self._vignetting + VIGNETTING * theta[-1]) * self._target.corner
 
 
-def contributions(gels: Gels, lights: LightGeometry) -> FloatArray:
+def contributions(gels: Gels, lights: LightGeometry, alone: bool = False) -> FloatArray:
     """(m, n, 3): those of `LitGel` at the pixels of all gels."""
-    return np.concatenate([gel.contributions(lights) for gel in gels], axis=1)
+    return np.concatenate([gel.contributions(lights, alone) for gel in gels], axis=1)
 
 
 def fit_powers(basis: FloatArray, target: Target, shines: BoolArray) -> FloatArray:

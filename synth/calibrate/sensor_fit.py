@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from synth.arrays import BoolArray, FloatArray, Pixels
+from synth.calibrate.ball_fit import BallFit, Balls, find_presses, fit_balls
 from synth.calibrate.dot_grid import DotGridFit, fit_dot_grid
 from synth.calibrate.dots import FoundDots, find_dots
 from synth.calibrate.frames import Frames
@@ -46,10 +47,13 @@ class SensorFit:
     dots: FoundDots | None
     grid: DotGridFit | None
     bare: BoolArray
+    pressed: BallFit | None = None
 
 
-def fit_sensor(start: Sensor, frames: Frames, variant: Variant, spacing_mm: float | None, steps: int) -> SensorFit:
-    """Fit everything that undeformed frames tell.
+def fit_sensor(
+    start: Sensor, frames: Frames, variant: Variant, spacing_mm: float | None, steps: int, balls: Balls | None = None
+) -> SensorFit:
+    """Fit everything that undeformed frames tell, and the lights also to frames of a ball, if there are any.
 
     The preset's camera has the frames' size. Without the spacing of the dots' columns its field of view is kept. The
     lights' geometry takes at most `steps` steps. The variant is a vectorised one. InputError for no dots, or no grid,
@@ -69,13 +73,18 @@ def fit_sensor(start: Sensor, frames: Frames, variant: Variant, spacing_mm: floa
     gel = LitGel(sensor, pixels, variant)
     target = _target(smooth, sensor.camera, pixels)
     shines = np.array([light.color for light in sensor.lights]) > 0
-    fit = fit_lights(
-        (gel,), target, LightGeometry.of(sensor.lights), shines, sensor.camera.vignetting, room_of(sensor), steps
-    )
+    room, vignetting = room_of(sensor), sensor.camera.vignetting
+    fit = fit_lights((gel,), target, LightGeometry.of(sensor.lights), shines, vignetting, room, steps)
     if steps > 0:
         clear = _clear_of_view(sensor, fit.geometry)
-        again = fit_lights((gel,), target, clear, shines, fit.vignetting, room_of(sensor), 0)
+        again = fit_lights((gel,), target, clear, shines, fit.vignetting, room, 0)
         fit = replace(again, steps=fit.steps)
+    pressed = None
+    if balls is not None:
+        beside = {name: bare & find_bare(sensor, frame) for name, frame in balls.frames.items()}
+        presses = find_presses(sensor, balls, _smoothed(frames.encoded, bare), beside)
+        pressed = fit_balls(sensor, gel, target, fit, shines, room, presses, balls, variant, steps)
+        fit = pressed.lights
     read, shot = fit_noise(frames.single, bare, gamma, frames.step)
     noise: dict[str, Any] = {"read_noise": round(read, 6), "shot_noise": round(shot, 6)}
     camera = sensor.camera.model_copy(update={"vignetting": round(fit.vignetting, 4), **noise})
@@ -84,7 +93,7 @@ def fit_sensor(start: Sensor, frames: Frames, variant: Variant, spacing_mm: floa
         raise InputError("no light of the preset explains any of the frames' brightness; are the frames black?")
     lights = tuple(_shining(_placed(sensor.lights[i], fit.geometry, i), fit.powers[i]) for i in lit)
     sensor = sensor.model_copy(update={"camera": camera, "lights": lights})
-    return SensorFit(sensor, fit, dots, grid, bare)
+    return SensorFit(sensor, fit, dots, grid, bare, pressed)
 
 
 def find_grid(
@@ -95,6 +104,13 @@ def find_grid(
         return None, None, np.ones(linear.shape[:2], dtype=bool)
     dots = find_dots(linear, sensor.pattern.spacing_mm[0] * pixels_per_mm(sensor))
     return dots, fit_dot_grid(sensor, sensor.pattern, dots.centres, spacing_mm), ~dots.covered
+
+
+def find_bare(sensor: Sensor, encoded: FloatArray) -> BoolArray:
+    """(H, W): a frame's pixels beside dots, wherever these are."""
+    if not isinstance(sensor.pattern, Dots):
+        return np.ones(encoded.shape[:2], dtype=bool)
+    return ~find_dots(encoded**sensor.camera.gamma, sensor.pattern.spacing_mm[0] * pixels_per_mm(sensor)).covered
 
 
 def _look(start: Sensor, grid: DotGridFit, profile: DotProfile) -> dict[str, Any]:
