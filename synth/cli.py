@@ -54,6 +54,11 @@ def calibrate(
     judge: Annotated[
         list[Path] | None, Parameter(consume_multiple=True, help="Further images, compared but not fitted.")
     ] = None,
+    ball: Annotated[
+        list[Path] | None,
+        Parameter(consume_multiple=True, help="Images of one ball pressed in, which tell the lights."),
+    ] = None,
+    radius_mm: Annotated[float | None, Parameter(help="Radius of that ball.")] = None,
     spacing_mm: Annotated[
         float | None, Parameter(help="Distance between columns of dots; default: keep the scene's field of view.")
     ] = None,
@@ -66,7 +71,8 @@ def calibrate(
     """Fits a scene's lights, dots and camera to images of your own sensor."""
     from synth.calibrate import run_calibrate
 
-    return run_calibrate(scene, frames, judge or [], out, assignments or [], spacing_mm, steps, as_json)
+    pressed = (ball or [], radius_mm)
+    return run_calibrate(scene, frames, judge or [], out, assignments or [], spacing_mm, steps, as_json, pressed)
 
 
 @app.command

@@ -10,11 +10,11 @@ geometry θ are a small least-squares problem per channel with one exact answer 
 .. math::  J(\theta) = \min_{P \ge 0} \frac{M}{2 σ^2 n} \sum_{pc} w_{pc}^2 (s_{pc} - \hat s_{pc})^2
                        + \frac12 |\theta|^2,
 
-depends on θ alone (variable projection, Golub and Pereyra 1973). Levenberg-Marquardt steps descend it, with the derivatives of
-E from Dr.Jit and Kaufman's Jacobian (BIT 15, 1975): what a change of θ does to the picture, less what other powers
-would make of it. w is the slope of the camera's response, so that residuals are in encoded values, as they are seen. θ
-are displacements from where the fit starts, in units of how far a light may plausibly be from there: what the picture
-does not tell stays where it was.
+depends on θ alone (variable projection, Golub and Pereyra 1973). Levenberg-Marquardt steps descend it, with the
+derivatives of E from Dr.Jit and Kaufman's Jacobian (BIT 15, 1975): what a change of θ does to the picture, less what
+other powers would make of it. w is the slope of the camera's response, so that residuals are in encoded values, as they
+are seen. θ are displacements from where the fit starts, in units of how far a light may plausibly be from there: what
+the picture does not tell stays where it was.
 """
 
 from collections.abc import Sequence
@@ -43,7 +43,7 @@ _SEEN_MM, _STEP = 0.05, 1e-4
 """Standard deviation of a light's intrusion into the view, and the step of its derivatives in standard deviations."""
 
 _DAMPINGS, _LEAST_GAIN = (0.0, 1.0, 10.0, 100.0, 1e3, 1e4, 1e5), 1e-3
-"""What is added to the curvature, in that of the prior; share of the misfit that a step must take away to be followed."""
+"""What is added to the curvature, in that of the prior; least share that a step must take off the misfit."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ _PARTS = 6
 
 @dataclass(frozen=True, eq=False)
 class PressedBall:
-    """The face's vertices (v, 3) mm under a ball that is pressed in straight at a place (2,) mm, and the contact's radius."""
+    """The face's vertices (v, 3) mm under a ball that is pressed in straight, and the contact's radius."""
 
     surface: GelSurface
     positions: Points
