@@ -101,7 +101,7 @@ def _found(sensor: Sensor, balls: Balls, name: str, rest: FloatArray, bare: Bool
     for _ in range(2):
         ball = press_ball(sensor, balls.radius_mm, depth, place, balls.friction)
         depth *= np.clip((radius_mm / max(ball.contact_mm, 1e-3)) ** 2, 0.4, 2.5)
-    pixels = np.column_stack([columns, rows]) + 0.5
+    pixels = np.column_stack([columns, rows]).astype(np.float64) + 0.5
     at_rest = 255 * rest[rows, columns]
     return Press(name, contact, pixels, at_rest, changed[rows, columns], np.array([*place, np.log(depth)]))
 

@@ -91,7 +91,7 @@ def _balls(template: Template, given: Frames, paths: Sequence[Path], radius_mm: 
     for name, one in frames.items():
         if one.size != given.size:
             raise InputError(f"{name}: has {one.size} pixels, the frames at rest have {given.size}")
-    friction = float(replaced(template.content["contact"], middle)["friction"])
+    friction = template.corners[0].contact.friction
     return Balls({name: one.encoded for name, one in frames.items()}, radius_mm, friction)
 
 
