@@ -54,6 +54,11 @@ def calibrate(
     judge: Annotated[
         list[Path] | None, Parameter(consume_multiple=True, help="Further images, compared but not fitted.")
     ] = None,
+    ball: Annotated[
+        list[Path] | None,
+        Parameter(consume_multiple=True, help="Images of one ball pressed in, which tell the lights."),
+    ] = None,
+    radius_mm: Annotated[float | None, Parameter(help="Radius of that ball.")] = None,
     spacing_mm: Annotated[
         float | None, Parameter(help="Distance between columns of dots; default: keep the scene's field of view.")
     ] = None,
@@ -69,7 +74,8 @@ def calibrate(
     """Fits a scene's lights, dots and camera to images of your own sensor."""
     from synth.calibrate import run_calibrate
 
-    return run_calibrate(scene, frames, judge or [], out, assignments or [], spacing_mm, steps, as_json, rest_map)
+    balls, others, changes = (ball or [], radius_mm), judge or [], assignments or []
+    return run_calibrate(scene, frames, others, out, changes, spacing_mm, steps, as_json, rest_map, balls)
 
 
 @app.command

@@ -25,13 +25,15 @@ from typing import Any
 
 import numpy as np
 
-from synth.arrays import FloatArray, Pixels
+from synth.arrays import FloatArray, Pixels, Points
 from synth.render.camera_rays import CameraRays
+from synth.render.chart import FlatChart
 from synth.render.coating import coat
-from synth.render.gel_mesh import MIRROR
+from synth.render.gel_mesh import MIRROR, GelMesh
 from synth.render.lights import reflectance, reflecting_plane
 from synth.render.variant import Variant
 from synth.scene import Light, Sensor
+from synth.surface import GelSurface
 
 _CELLS = 24
 """Midpoints on each light; its longer side gets more of them."""
@@ -39,6 +41,9 @@ _ALONG = np.array([2, 3, 4, 6, 8, 12, 24], dtype=np.uint32)
 """Numbers of midpoints that may lie along a light's first side: divisors of `_CELLS`."""
 _PATCHES = 16
 """Patches along each side of the pad that send light back by way of the window; it is smooth, so few will do."""
+
+_ABOVE_MM = 1e-3
+"""How far above a pressed face rays to the lights start, so that it does not shade itself by rounding."""
 
 _NUMBERS = (*((part, axis) for part in (0, 1) for axis in range(3)), (2, 0), (2, 1), (3, 0))
 """Part and component of each of a light's 9 numbers; parts: centre (0), direction (1), size (2), viewing angle (3)."""
@@ -63,13 +68,16 @@ class LightGeometry:
         return LightGeometry(centre, aim - centre, size, angle)
 
 
-class FlatGel:
-    """Pixels of the undeformed gel, ready to be lit: their centres (n, 2) float64 px see its face.
+class LitGel:
+    """Pixels of the gel, ready to be lit: their centres (n, 2) float64 px see its undeformed or its pressed face.
 
-    Of the sensor camera, window and coating count, not its pattern and lights; the variant is a vectorised one.
+    Of the sensor camera, window and coating count, not its pattern and lights; the variant is a vectorised one. A
+    pressed face, as a surface and its vertices' positions (v, 3) mm, throws shadows on itself.
     """
 
-    def __init__(self, sensor: Sensor, pixels: Pixels, variant: Variant) -> None:
+    def __init__(
+        self, sensor: Sensor, pixels: Pixels, variant: Variant, pressed: tuple[GelSurface, Points] | None = None
+    ) -> None:
         mi = variant.load()
         import drjit as dr
 
@@ -78,6 +86,13 @@ class FlatGel:
         index = mi.UInt32(row * np.uint32(sensor.camera.width) + column)
         ray, weight, _ = CameraRays(sensor, mi).sample(index, mi.Point2f(0.5))
         point, toward = np.array(ray.o - ray.d * (ray.o.z / ray.d.z)), np.array(-ray.d)
+        normal = np.tile([[0.0], [0], [1]], self._pixels)
+        self._relief = None
+        if pressed is not None:
+            self._relief = _relief(*pressed, mi)
+            met = self._relief.ray_intersect(mi.Ray3f(ray))
+            hit = np.array(met.is_valid())
+            point, normal = np.where(hit, np.array(met.p), point), np.where(hit, -np.array(met.sh_frame.n), normal)
         weight = np.broadcast_to(np.array(weight), self._pixels)
         plane = reflecting_plane(sensor)
         self._reflects = plane is not None
@@ -94,15 +109,19 @@ class FlatGel:
             back = np.array(reflectance(mi.Float((2 * plane / np.sqrt(square)).ravel()), self._index, mi))
             form = back.reshape(square.shape) * 4 * plane**2 / square**2 * (width * height / np.pi)
             self._returned = (weight[:, None] * form)[..., None] * np.array(sensor.coating.reflectance)
-            point, toward = np.c_[point, patches], np.c_[toward, np.tile([[0.0], [0], [1]], patches.shape[1])]
+            upward = np.tile([[0.0], [0], [1]], patches.shape[1])
+            point, toward, normal = np.c_[point, patches], np.c_[toward, upward], np.c_[normal, upward]
             weight = np.r_[weight, np.ones(patches.shape[1])]
         self._count, self._weight = len(weight), mi.Float(weight)
-        self._point, self._toward = mi.Vector3f(point), mi.Vector3f(toward)
+        self._point, self._toward, self._normal = mi.Vector3f(point), mi.Vector3f(toward), mi.Vector3f(normal)
 
-    def contributions(self, lights: LightGeometry) -> FloatArray:
-        """E (m, n, 3) float64: radiance per channel and unit of power, on the camera's side of the window."""
+    def contributions(self, lights: LightGeometry, alone: bool = False) -> FloatArray:
+        """E (m, n, 3) float64: radiance per channel and unit of power, on the camera's side of the window.
+
+        `alone`: as if each light were the only one, and none threw shade on another's.
+        """
         parts = self._parts(lights)
-        return self._numpy(self._lit(parts, self._all_unshaded(parts)))
+        return self._numpy(self._lit(parts, self._all_unshaded(parts, alone)))
 
     def derivatives(self, lights: LightGeometry) -> FloatArray:
         """Derivatives of E (m, 9, n, 3) float64 by each light's centre, direction, size and angle, in forward mode.
@@ -155,12 +174,13 @@ class FlatGel:
         flip, behind = self._mi.Vector3f(1, 1, -1), self._mi.Vector3f(0, 0, 2 * self._face)
         return parts[0] * flip + behind, parts[1] * flip, *parts[2:]
 
-    def _all_unshaded(self, parts: tuple[Any, ...]) -> tuple[Any, ...]:
+    def _all_unshaded(self, parts: tuple[Any, ...], alone: bool = False) -> tuple[Any, ...]:
         """`_unshaded` of the lights and, where the window reflects, of their images."""
         if not self._reflects:
-            return (self._unshaded(parts, (parts,)),)
+            return (self._unshaded(parts, () if alone else (parts,)),)
         image = self._image(parts)
-        return self._unshaded(parts, (parts,)), self._unshaded(image, (image, parts))
+        obstacles = ((), ()) if alone else ((parts,), (image, parts))
+        return self._unshaded(parts, obstacles[0]), self._unshaded(image, obstacles[1])
 
     def _unshaded(self, parts: tuple[Any, ...], obstacles: tuple[tuple[Any, ...], ...]) -> Any:
         """1 where no rectangle but its own stands between a point and a light's cell, else 0.
@@ -170,7 +190,7 @@ class FlatGel:
         mi, dr = self._mi, self._dr
         arm, pixel, light, _ = self._arms(parts)
         point = dr.gather(mi.Vector3f, self._point, pixel)
-        free = mi.Bool(True)
+        free = dr.full(mi.Bool, True, dr.width(arm))
         for centres, directions, sizes, *_ in obstacles:
             for other in range(dr.width(centres)):
                 number = dr.opaque(mi.UInt32, other)
@@ -182,6 +202,9 @@ class FlatGel:
                 within = (dr.abs(dr.dot(beside, first)) < size.x / 2) & (dr.abs(dr.dot(beside, second)) < size.y / 2)
                 itself = (light == number) & (centres is parts[0])
                 free &= ~(within & (share > 0) & (share < 1) & ~itself)
+        if self._relief is not None:
+            start = mi.Point3f(point + dr.gather(mi.Vector3f, self._normal, pixel) * _ABOVE_MM)
+            free &= ~self._relief.ray_test(mi.Ray3f(start, dr.normalize(arm), dr.norm(arm), 0, []))
         lit = dr.select(free, mi.Float(1), 0)
         dr.eval(lit)
         return lit
@@ -198,8 +221,9 @@ class FlatGel:
         square = dr.squared_norm(arm)
         away = arm / dr.sqrt(square)
         interaction = dr.zeros(mi.SurfaceInteraction3f, dr.width(arm))
-        interaction.wi = dr.gather(mi.Vector3f, self._toward, pixel)
-        scattered = self._bsdf.eval(mi.BSDFContext(), interaction, away)
+        frame = mi.Frame3f(dr.gather(mi.Vector3f, self._normal, pixel))
+        interaction.wi = frame.to_local(dr.gather(mi.Vector3f, self._toward, pixel))
+        scattered = self._bsdf.eval(mi.BSDFContext(), interaction, frame.to_local(away))
         power = -dr.log(2) / dr.log(dr.cos(dr.deg2rad(parts[3][0] / 2)))  # of the intensity: Light.narrowness + 1
         share = unshaded * reflectance(dr.abs(away.z), self._index, mi) if is_image else unshaded
         cosine = dr.power(dr.maximum(-dr.dot(away, facing), 1e-6), dr.gather(mi.Float, power, light)) * share
@@ -216,3 +240,28 @@ class FlatGel:
         return (
             seen if self._returned is None else seen + np.einsum("npc,mpc->mnc", self._returned, patches, optimize=True)
         )
+
+
+@dataclass(frozen=True, eq=False)
+class PressChange:
+    """What a press changes at pixels: the light of the pressed face less that of the face at rest, as of a `LitGel`."""
+
+    pressed: LitGel
+    rest: LitGel
+
+    def contributions(self, lights: LightGeometry, alone: bool = False) -> FloatArray:
+        return self.pressed.contributions(lights, alone) - self.rest.contributions(lights, alone)
+
+    def derivatives(self, lights: LightGeometry) -> FloatArray:
+        return self.pressed.derivatives(lights) - self.rest.derivatives(lights)
+
+
+def _relief(surface: GelSurface, positions: Points, mi: Any) -> Any:
+    """Mitsuba's scene of a pressed face alone."""
+    mesh = GelMesh(surface, FlatChart((1.0, 1.0)))
+    shape = mi.Mesh("gel", len(positions), len(surface.triangles), has_vertex_normals=True)
+    parameters = mi.traverse(shape)
+    parameters["faces"], parameters["vertex_positions"] = mesh.faces(), mesh.positions(positions)
+    parameters["vertex_normals"] = mesh.normals(positions)
+    parameters.update()
+    return mi.load_dict({"type": "scene", "gel": shape})

@@ -10,21 +10,22 @@ geometry θ are a small least-squares problem per channel with one exact answer 
 .. math::  J(\theta) = \min_{P \ge 0} \frac{M}{2 σ^2 n} \sum_{pc} w_{pc}^2 (s_{pc} - \hat s_{pc})^2
                        + \frac12 |\theta|^2,
 
-depends on θ alone (variable projection, Golub and Pereyra 1973). Gauss-Newton steps descend it, with the derivatives of
-E from Dr.Jit and Kaufman's Jacobian (BIT 15, 1975): what a change of θ does to the picture, less what other powers
-would make of it. w is the slope of the camera's response, so that residuals are in encoded values, as they are seen. θ
-are displacements from where the fit starts, in units of how far a light may plausibly be from there: what the picture
-does not tell stays where it was.
+depends on θ alone (variable projection, Golub and Pereyra 1973). Levenberg-Marquardt steps descend it, with the
+derivatives of E from Dr.Jit and Kaufman's Jacobian (BIT 15, 1975): what a change of θ does to the picture, less what
+other powers would make of it. w is the slope of the camera's response, so that residuals are in encoded values, as they
+are seen. θ are displacements from where the fit starts, in units of how far a light may plausibly be from there: what
+the picture does not tell stays where it was.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
-from scipy.optimize import least_squares, nnls
+from scipy.optimize import nnls
 
 from synth.arrays import BoolArray, FloatArray
-from synth.calibrate.irradiance import FlatGel, LightGeometry
+from synth.calibrate.irradiance import LightGeometry, LitGel, PressChange
 
 CENTRE_MM, DIRECTION, LOG_SIZE, LOG_ANGLE, VIGNETTING = 2.0, 0.4, 0.5, 0.4, 0.3
 """Standard deviations of the prior: of a light's place, of its unit direction, of the logarithms of its sizes and of
@@ -37,6 +38,12 @@ RESIDUAL = 1 / 255
 """Standard deviation of the misfit that the model may leave, in encoded values."""
 INDEPENDENT = 300.0
 """Number of independent values that a smooth picture counts for."""
+
+_SEEN_MM, _STEP = 0.05, 1e-4
+"""Standard deviation of a light's intrusion into the view, and the step of its derivatives in standard deviations."""
+
+_DAMPINGS, _LEAST_GAIN = (0.0, 1.0, 10.0, 100.0, 1e3, 1e4, 1e5), 1e-3
+"""What is added to the curvature, in that of the prior; least share that a step must take off the misfit."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +60,33 @@ class Target:
     corner: FloatArray
 
 
-Bounds: TypeAlias = tuple[FloatArray, FloatArray]
-"""Least and largest places of the lights' centres, (m, 3) mm each: in the body and outside the camera's view."""
+Gels: TypeAlias = Sequence[LitGel | PressChange]
+"""The gel at rest, and what presses change."""
+
+
+@dataclass(frozen=True, eq=False)
+class Room:
+    """Where lights may be: centres from `low` to `high`, (m, 3) mm each, and no part within the camera's view.
+
+    At the height z the view reaches from `view[0] + z slope[0]` to `view[1] + z slope[1]`, each (2,) mm along x and y.
+    """
+
+    low: FloatArray
+    high: FloatArray
+    view: FloatArray
+    slope: FloatArray
+
+    def intrusion(self, lights: LightGeometry) -> FloatArray:
+        """(m, 9) mm by which points of the lights are within the view: 0 outside; the corners, middles and centre."""
+        facing = lights.direction / np.linalg.norm(lights.direction, axis=1, keepdims=True)
+        first = np.cross([0.0, 0.0, 1.0], facing)
+        first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-6)
+        along, across = first * lights.size[:, :1], np.cross(facing, first) * lights.size[:, 1:]
+        u, v = (axis.ravel()[:, None] for axis in np.meshgrid(*2 * [np.linspace(-0.5, 0.5, 3)]))
+        points = lights.centre[:, None] + u * along[:, None] + v * across[:, None]
+        low, high = self.view[:, None, None] + self.slope[:, None, None] * points[..., 2:]
+        inside = np.minimum(points[..., :2] - low, high - points[..., :2]).min(axis=2)
+        return np.asarray(np.maximum(inside, 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,32 +104,56 @@ class LightFit:
 
 
 def fit_lights(
-    gel: FlatGel, target: Target, start: LightGeometry, shines: BoolArray, vignetting: float, bounds: Bounds, steps: int
+    gels: Gels, target: Target, start: LightGeometry, shines: BoolArray, vignetting: float, room: Room, steps: int
 ) -> LightFit:
-    """Fit powers, geometry and vignetting to a target at the pixels of a gel.
+    """Fit powers, geometry and vignetting to a target at the pixels of gels, one after the other.
 
-    The geometry starts from `start`, the distance from which is what the prior penalises, and keeps its centres in
-    bounds. `shines` (m, 3) are the channels in which each light may have power. At most `steps` Gauss-Newton steps are
-    taken; 0 fits the powers alone.
+    The geometry starts from `start`, the distance from which is what the prior penalises, and stays in the room.
+    `shines` (m, 3) are the channels in which each light may have power. At most `steps` steps are taken; 0 fits the
+    powers alone.
     """
-    problem = _Problem(gel, target, start, shines, vignetting)
+    problem = _Problem(gels, target, start, shines, vignetting, room)
     if steps == 0:
         return problem.result(np.zeros(problem.size), 0)
-    low, high = problem.box(bounds)
-    first, limits = np.clip(np.zeros(problem.size), low + 1e-6, high - 1e-6), {"ftol": 2e-4, "xtol": 1e-3}
-    found = least_squares(problem.residual, first, problem.jacobian, (low, high), max_nfev=steps, **limits)
-    return problem.result(found.x, int(found.njev))
+    theta, taken = _descend(problem, steps)
+    return problem.result(theta, taken)
+
+
+def _descend(problem: "_Problem", most: int) -> tuple[FloatArray, int]:
+    """Levenberg-Marquardt steps within the box, and their number; of each step all dampings are tried.
+
+    A light that comes into the way of another's makes the misfit jump. A trust region would shrink there to nothing.
+    """
+    low, high = problem.box()
+    theta = np.clip(np.zeros(problem.size), low, high)
+    cost = np.sum(problem.residual(theta) ** 2)
+    for number in range(most):
+        jacobian = problem.jacobian(theta)
+        slope = jacobian.T @ problem.residual(theta)
+        free = ((theta > low) | (slope < 0)) & ((theta < high) | (slope > 0))
+        curvature = (jacobian.T @ jacobian)[np.ix_(free, free)]
+        best = theta, cost
+        for damping in _DAMPINGS:
+            moved = theta.copy()
+            moved[free] -= np.linalg.solve(curvature + damping * np.eye(free.sum()), slope[free])
+            moved = np.clip(moved, low, high)
+            best = min(best, (moved, np.sum(problem.residual(moved) ** 2)), key=lambda each: each[1])
+        done = best[1] > (1 - _LEAST_GAIN) * cost
+        theta, cost = best
+        if done:
+            return theta, number + 1
+    return theta, most
 
 
 class _Problem:
     """J of the module's docstring."""
 
     def __init__(
-        self, gel: FlatGel, target: Target, start: LightGeometry, shines: BoolArray, vignetting: float
+        self, gels: Gels, target: Target, start: LightGeometry, shines: BoolArray, vignetting: float, room: Room
     ) -> None:
         unit = start.direction / np.linalg.norm(start.direction, axis=1, keepdims=True)
         self._start = replace(start, direction=unit)
-        self._gel, self._target, self._shines, self._vignetting = gel, target, shines, vignetting
+        self._gels, self._target, self._shines, self._vignetting, self._room = gels, target, shines, vignetting, room
         self._cached: tuple[FloatArray, tuple[FloatArray, FloatArray, LightGeometry]] | None = None
         self._lights = len(start.centre)
         self._scale = _SCALE * np.ones((self._lights, 1))
@@ -111,28 +167,31 @@ class _Problem:
         angles = start.viewing_angle_deg * np.exp(angle)
         return LightGeometry(start.centre + centre, start.direction + direction, start.size * np.exp(size), angles)
 
-    def box(self, bounds: Bounds) -> tuple[FloatArray, FloatArray]:
+    def box(self) -> tuple[FloatArray, FloatArray]:
         low, high = np.full((self._lights, 9), -4.0), np.full((self._lights, 9), 4.0)
         low[:, 6:8], high[:, 6:8] = -_SIZES, _SIZES
-        low[:, 8], high[:, 8] = 0, 1 * (self._scale[:, 8] == 0)  # room where it has no effect: steps end at bounds
-        for box, centre, angle in ((low, bounds[0], _NARROWEST_DEG), (high, bounds[1], _WIDEST_DEG)):
+        low[:, 8], high[:, 8] = 0, 0
+        for box, centre, angle in ((low, self._room.low, _NARROWEST_DEG), (high, self._room.high, _WIDEST_DEG)):
             box[:, :3] = (centre - self._start.centre) / CENTRE_MM
             box[:, 8:] += np.log(angle / self._start.viewing_angle_deg) / LOG_ANGLE
         dark = (np.array([0, 0.9]) - self._vignetting) / VIGNETTING
         return np.r_[low.ravel(), dark[0]], np.r_[high.ravel(), dark[1]]
 
     def residual(self, theta: FloatArray) -> FloatArray:
-        """(3 n + len(theta),): weighted misfit by channel, and the prior."""
-        basis, powers, _ = self._solved(theta)
+        """(3 n + len(theta) + 9 m,): weighted misfit by channel, the prior, and how far lights are in the view."""
+        basis, powers, geometry = self._solved(theta)
         miss = np.einsum("mpc,mc->pc", basis, powers) - self._target.signal
-        return np.concatenate([(self._factor * self._target.slope * miss).T.ravel(), theta])
+        seen = self._room.intrusion(geometry).ravel() / _SEEN_MM
+        return np.concatenate([(self._factor * self._target.slope * miss).T.ravel(), theta, seen])
 
     def jacobian(self, theta: FloatArray) -> FloatArray:
         """Kaufman's, of `residual`."""
         basis, powers, geometry = self._solved(theta)
         weight = self._factor * self._target.slope
         vignette = self._vignette(theta)[None, None, :, None]
-        change = self._gel.derivatives(geometry) * (self._target.gain * vignette)
+        change = np.concatenate([gel.derivatives(geometry) for gel in self._gels], axis=2) * (
+            self._target.gain * vignette
+        )
         logarithmic = np.c_[np.ones((self._lights, 6)), geometry.size, geometry.viewing_angle_deg]
         change *= (self._scale * logarithmic)[:, :, None, None]
         radiance = np.einsum("mpc,mc->pc", basis, powers) / self._vignette(theta)[:, None]
@@ -148,7 +207,17 @@ class _Problem:
                 span = np.linalg.qr((basis[lit, :, channel] * weight[:, channel]).T)[0]
                 columns = columns - span @ (span.T @ columns)
             blocks.append(columns)
-        return np.vstack([*blocks, np.eye(self.size)])
+        return np.vstack([*blocks, np.eye(self.size), self._seen(theta)])
+
+    def _seen(self, theta: FloatArray) -> FloatArray:
+        """(9 m, len(theta)): derivatives of the lights' intrusion into the view; a light's numbers move it alone."""
+        found = np.zeros((self._lights, 9, self._lights, 9))
+        number = np.arange(self._lights)
+        for k in range(9):
+            move = np.append(np.tile(_STEP * np.eye(9)[k], self._lights), 0.0)
+            more, less = (self._room.intrusion(self.geometry(theta + sign * move)) for sign in (1, -1))
+            found[number, :, number, k] = (more - less) / (2 * _STEP * _SEEN_MM)
+        return np.column_stack([found.reshape(9 * self._lights, -1), np.zeros(9 * self._lights)])
 
     def result(self, theta: FloatArray, steps: int) -> LightFit:
         basis, powers, geometry = self._solved(theta)
@@ -161,12 +230,17 @@ class _Problem:
         if self._cached is None or not np.array_equal(self._cached[0], theta):
             geometry = self.geometry(theta)
             gain = self._target.gain * self._vignette(theta)
-            basis = self._gel.contributions(geometry) * gain[None, :, None]
+            basis = contributions(self._gels, geometry) * gain[None, :, None]
             self._cached = (theta.copy(), (basis, fit_powers(basis, self._target, self._shines), geometry))
         return self._cached[1]
 
     def _vignette(self, theta: FloatArray) -> FloatArray:
         return 1 - (self._vignetting + VIGNETTING * theta[-1]) * self._target.corner
+
+
+def contributions(gels: Gels, lights: LightGeometry, alone: bool = False) -> FloatArray:
+    """(m, n, 3): those of `LitGel` at the pixels of all gels."""
+    return np.concatenate([gel.contributions(lights, alone) for gel in gels], axis=1)
 
 
 def fit_powers(basis: FloatArray, target: Target, shines: BoolArray) -> FloatArray:

@@ -14,6 +14,7 @@ import numpy as np
 import tomli_w
 
 from synth.arrays import FloatArray
+from synth.calibrate.ball_fit import Balls
 from synth.calibrate.comparison import Comparison, compare, picture, render_undeformed
 from synth.calibrate.dot_grid import DotGridFit
 from synth.calibrate.frames import Frames, at_rest, read_frames
@@ -46,13 +47,15 @@ def run_calibrate(
     steps: int,
     as_json: bool,
     rest_map: bool = False,
+    pressed: tuple[Sequence[Path], float | None] = ((), None),
 ) -> int:
     """Fit a preset to frames of a user's sensor; write OUT/scene.toml, calibration.png and calibration.json.
 
     With `rest_map` also OUT/rest_map.png, which the scene then names, and comparisons with it.
 
-    Arguments are the options of the command (`synth.cli`); returns 0 if the fit is good, 1 if it is not. InputError
-    where frames, preset or storage are at fault, or this machine has no differentiable variant.
+    Arguments are the options of the command (`synth.cli`), `pressed` the frames of a ball and its radius; returns
+    0 if the fit is good, 1 if it is not. InputError where frames, preset or storage are at fault, or this machine has
+    no differentiable variant.
     """
     started = time.perf_counter()
     template = load_scene(scene, assignments)
@@ -61,15 +64,15 @@ def run_calibrate(
     if not variant.is_vectorised:
         raise InputError(f"calibration differentiates the rendering, which needs LLVM or an NVIDIA GPU: {LLVM_HINT}")
     given, others = _read(frames, judge)
-    start = start_sensor(template, given.size)
+    start, balls = start_sensor(template, given.size), _balls(template, given, *pressed)
     if spacing_mm is not None:
         _check_spacing(spacing_mm, start, scene)
     with storage_errors(out):
         out.mkdir(parents=True, exist_ok=True)  # before minutes of work, not after
     print("synth: fitting the sensor to the frames", file=sys.stderr, flush=True)
-    fit = fit_sensor(start, given, variant, spacing_mm, steps)
+    fit = fit_sensor(start, given, variant, spacing_mm, steps, balls)
     rows, grids = _compared(fit, render_undeformed(fit.sensor, render_settings(template), variant), given, others)
-    found = verdict(rows, grids, fit.sensor, spacing_mm is not None)
+    found = verdict(rows, grids, fit.sensor, spacing_mm is not None, fit.pressed)
     content = _checked_content(template, fit, out, scene)
     if rest_map:
         gamma = fit.sensor.camera.gamma
@@ -85,6 +88,22 @@ def run_calibrate(
     text = "\n".join([*summary(record), f"written: {out / SCENE}", *found.lines()])
     print(json.dumps(record) if as_json else text)
     return 0 if found.good else 1
+
+
+def _balls(template: Template, given: Frames, paths: Sequence[Path], radius_mm: float | None) -> Balls | None:
+    """The frames of a ball, None without any."""
+    if not paths and radius_mm is None:
+        return None
+    if not paths or radius_mm is None or not 0.3 <= radius_mm <= 100:
+        raise InputError(
+            "--ball and --radius-mm belong together: frames of one ball, and its radius from 0.3 to 100 mm"
+        )
+    frames = {str(path): read_frames([path]) for path in paths}
+    for name, one in frames.items():
+        if one.size != given.size:
+            raise InputError(f"{name}: has {one.size} pixels, the frames at rest have {given.size}")
+    friction = template.corners[0].contact.friction
+    return Balls({name: one.encoded for name, one in frames.items()}, radius_mm, friction)
 
 
 def middle(kind: str, arguments: list[Any]) -> Any:

@@ -7,17 +7,18 @@ import cv2
 import numpy as np
 
 from synth.arrays import BoolArray, FloatArray, Pixels
+from synth.calibrate.ball_fit import BallFit, Balls, find_presses, fit_balls
 from synth.calibrate.dot_grid import DotGridFit, fit_dot_grid
 from synth.calibrate.dots import FoundDots, find_dots
 from synth.calibrate.frames import Frames
-from synth.calibrate.irradiance import FlatGel, LightGeometry
-from synth.calibrate.lights import Bounds, LightFit, Target, fit_lights
+from synth.calibrate.irradiance import LightGeometry, LitGel
+from synth.calibrate.lights import LightFit, Room, Target, fit_lights
 from synth.calibrate.noise import fit_noise
 from synth.calibrate.profile import DotProfile, blur_of, fit_profile
 from synth.errors import InputError
 from synth.optics import Optics
 from synth.render.camera_image import off_centre
-from synth.render.lights import check_view, light_axes
+from synth.render.lights import check_view
 from synth.render.pattern import pixels_per_mm
 from synth.render.variant import Variant
 from synth.scene import Camera, Dots, Light, Sensor
@@ -46,10 +47,13 @@ class SensorFit:
     dots: FoundDots | None
     grid: DotGridFit | None
     bare: BoolArray
+    pressed: BallFit | None = None
 
 
-def fit_sensor(start: Sensor, frames: Frames, variant: Variant, spacing_mm: float | None, steps: int) -> SensorFit:
-    """Fit everything that undeformed frames tell.
+def fit_sensor(
+    start: Sensor, frames: Frames, variant: Variant, spacing_mm: float | None, steps: int, balls: Balls | None = None
+) -> SensorFit:
+    """Fit everything that undeformed frames tell, and the lights also to frames of a ball, if there are any.
 
     The preset's camera has the frames' size. Without the spacing of the dots' columns its field of view is kept. The
     lights' geometry takes at most `steps` steps. The variant is a vectorised one. InputError for no dots, or no grid,
@@ -66,16 +70,21 @@ def fit_sensor(start: Sensor, frames: Frames, variant: Variant, spacing_mm: floa
         raise InputError("no pixel between the dots sees the gel of the preset; check its sensor.gel and sensor.camera")
     at = (pixels[:, 1].astype(int), pixels[:, 0].astype(int))
     smooth = _smoothed(frames.encoded, bare)[at]
-    gel = FlatGel(sensor, pixels, variant)
+    gel = LitGel(sensor, pixels, variant)
     target = _target(smooth, sensor.camera, pixels)
     shines = np.array([light.color for light in sensor.lights]) > 0
-    fit = fit_lights(
-        gel, target, LightGeometry.of(sensor.lights), shines, sensor.camera.vignetting, _bounds(sensor), steps
-    )
+    room, vignetting = room_of(sensor), sensor.camera.vignetting
+    fit = fit_lights((gel,), target, LightGeometry.of(sensor.lights), shines, vignetting, room, steps)
     if steps > 0:
         clear = _clear_of_view(sensor, fit.geometry)
-        again = fit_lights(gel, target, clear, shines, fit.vignetting, _bounds(sensor), 0)
+        again = fit_lights((gel,), target, clear, shines, fit.vignetting, room, 0)
         fit = replace(again, steps=fit.steps)
+    pressed = None
+    if balls is not None:
+        beside = {name: bare & find_bare(sensor, frame) for name, frame in balls.frames.items()}
+        presses = find_presses(sensor, balls, _smoothed(frames.encoded, bare), beside)
+        pressed = fit_balls(sensor, gel, target, fit, shines, room, presses, balls, variant, steps)
+        fit = pressed.lights
     read, shot = fit_noise(frames.single, bare, gamma, frames.step)
     noise: dict[str, Any] = {"read_noise": round(read, 6), "shot_noise": round(shot, 6)}
     camera = sensor.camera.model_copy(update={"vignetting": round(fit.vignetting, 4), **noise})
@@ -84,7 +93,7 @@ def fit_sensor(start: Sensor, frames: Frames, variant: Variant, spacing_mm: floa
         raise InputError("no light of the preset explains any of the frames' brightness; are the frames black?")
     lights = tuple(_shining(_placed(sensor.lights[i], fit.geometry, i), fit.powers[i]) for i in lit)
     sensor = sensor.model_copy(update={"camera": camera, "lights": lights})
-    return SensorFit(sensor, fit, dots, grid, bare)
+    return SensorFit(sensor, fit, dots, grid, bare, pressed)
 
 
 def find_grid(
@@ -95,6 +104,13 @@ def find_grid(
         return None, None, np.ones(linear.shape[:2], dtype=bool)
     dots = find_dots(linear, sensor.pattern.spacing_mm[0] * pixels_per_mm(sensor))
     return dots, fit_dot_grid(sensor, sensor.pattern, dots.centres, spacing_mm), ~dots.covered
+
+
+def find_bare(sensor: Sensor, encoded: FloatArray) -> BoolArray:
+    """(H, W): a frame's pixels beside dots, wherever these are."""
+    if not isinstance(sensor.pattern, Dots):
+        return np.ones(encoded.shape[:2], dtype=bool)
+    return ~find_dots(encoded**sensor.camera.gamma, sensor.pattern.spacing_mm[0] * pixels_per_mm(sensor)).covered
 
 
 def _look(start: Sensor, grid: DotGridFit, profile: DotProfile) -> dict[str, Any]:
@@ -150,25 +166,20 @@ def _sees_gel(sensor: Sensor) -> BoolArray:
     return np.asarray(inside.reshape(camera.height, camera.width))
 
 
-def _bounds(sensor: Sensor) -> Bounds:
-    """Each light stays near its place, in the body, and on its side of what the camera sees of the contact face."""
+def room_of(sensor: Sensor, reach_mm: float = _REACH_MM) -> Room:
+    """Each light stays near its place, in the body, and outside what the camera sees."""
     camera = sensor.camera
     u, v = np.meshgrid(np.linspace(0, camera.width, 5), np.linspace(0, camera.height, 5))
-    seen = Optics.of(sensor).look(np.column_stack([u.ravel(), v.ravel()])).on_flat_face[:, :2]
-    geometry = LightGeometry.of(sensor.lights)
-    centre = geometry.centre
-    low, high = centre - _REACH_MM, centre + _REACH_MM
-    face = sensor.gel.size_mm[2] + sensor.window.thickness_mm
-    low[:, 2], high[:, 2] = np.maximum(low[:, 2], 0.4), np.minimum(high[:, 2], face - 0.4)
-    axes = np.array([light_axes(light)[:2] for light in sensor.lights])
-    extent = (np.abs(axes) * geometry.size[:, :, None] / 2).sum(axis=1)
-    for axis in range(2):
-        least = np.nanmin(seen[:, axis]) - _VIEW_MM - extent[:, axis]
-        most = np.nanmax(seen[:, axis]) + _VIEW_MM + extent[:, axis]
-        at = centre[:, axis]
-        high[:, axis] = np.where(at < least, np.minimum(high[:, axis], least), high[:, axis])
-        low[:, axis] = np.where(at > most, np.maximum(low[:, axis], most), low[:, axis])
-    return low, high
+    rays = Optics.of(sensor).look(np.column_stack([u.ravel(), v.ravel()]))
+    top = sensor.gel.size_mm[2] + sensor.window.thickness_mm
+    levels = []
+    for z in (0.0, top):
+        seen = (rays.on_flat_face + rays.directions * (z / rays.directions[:, 2:]))[:, :2]
+        levels.append(np.stack([np.nanmin(seen, axis=0) - _VIEW_MM, np.nanmax(seen, axis=0) + _VIEW_MM]))
+    centre = np.array([light.position_mm for light in sensor.lights])
+    low, high = centre - reach_mm, centre + reach_mm
+    low[:, 2], high[:, 2] = np.maximum(low[:, 2], 0.4), np.minimum(high[:, 2], top - 0.4)
+    return Room(low, high, levels[0], (levels[1] - levels[0]) / top)
 
 
 def _clear_of_view(sensor: Sensor, geometry: LightGeometry) -> LightGeometry:

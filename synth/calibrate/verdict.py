@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from synth.arrays import Pixels
+from synth.calibrate.ball_fit import BallFit
 from synth.calibrate.comparison import Comparison
 from synth.calibrate.dot_grid import DotGridFit
 from synth.scene import Dots, Sensor
@@ -22,6 +23,9 @@ ALLOWED_PLACE = 15.0
 """Most difference of a place, of 255: pressed gels exceed it, gels at rest do not."""
 ALLOWED_OFF_GRID = 0.015
 """Most common displacement of neighbouring dots, over their pitch: pressed gels exceed it."""
+
+ALLOWED_TURN, ALLOWED_RISE = 15.0, 0.2
+"""Most difference of the azimuth on a ball's contact, degrees, and of the rise there, relative."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +51,16 @@ class Verdict:
 
 
 def verdict(
-    rows: dict[str, Comparison], grids: dict[str, DotGridFit | None], sensor: Sensor, spacing_is_known: bool
+    rows: dict[str, Comparison],
+    grids: dict[str, DotGridFit | None],
+    sensor: Sensor,
+    spacing_is_known: bool,
+    pressed: BallFit | None = None,
 ) -> Verdict:
-    """Judge a fit by comparisons, and grids of dots if there are any, of the fitted frames and of others, by name."""
+    """Judge a fit by comparisons, and grids of dots if there are any, of the fitted frames and of others, by name.
+
+    Presses are judged by the azimuth and the rise of each channel, where it rises by more than ALLOWED_LEVELS.
+    """
     residuals = {name: row.numbers()["mean_absolute_outside_dots"] for name, row in rows.items()}
     reasons = []
     for name, residual in residuals.items():
@@ -73,6 +84,16 @@ def verdict(
                 f"{name}: neighbouring dots are off the grid by {100 * shared:.1f} % of their pitch (at most "
                 f"{100 * ALLOWED_OFF_GRID:g}): pressed or stretched; such a frame does not tell pitch or lens"
             )
+    for press, fitted in zip(pressed.presses, pressed.fitted, strict=True) if pressed else ():
+        (azimuth, rise), (own_azimuth, own_rise) = map(press.azimuth_and_rise, (press.changed, fitted))
+        turned = np.abs((own_azimuth - azimuth + 180) % 360 - 180)
+        for k, channel in enumerate(CHANNELS):
+            agrees = turned[k] <= ALLOWED_TURN and abs(own_rise[k] - rise[k]) <= ALLOWED_RISE * rise[k]
+            if rise[k] > ALLOWED_LEVELS and not agrees:
+                reasons.append(
+                    f"{press.name}: {channel} light comes from {own_azimuth[k]:.0f} degrees and rises "
+                    f"{own_rise[k]:.0f} levels on the ball, in the frame from {azimuth[k]:.0f} and {rise[k]:.0f}"
+                )
     worst = np.max(list(residuals.values()), axis=0)
     return Verdict(
         good=not reasons,

@@ -24,6 +24,8 @@ from synth.scene import Light
 
 _DEGREE = 9
 """Degree of the polynomial, which errs by 2e-8, less than float32's rounding."""
+_LEAST = 1e-6
+"""Least cosine at a light that is raised to a power: 0 to the power 0, of a Lambertian light seen edge-on, is NaN."""
 _STRATA = 2
 """Points of a light without closed form for each of a pixel's samples, spread along its first side."""
 
@@ -112,7 +114,7 @@ class SampledLight(PolygonLight):
         place, value = super().sample(point, normal, offset)
         away = dr.normalize(place - point)
         if self.narrowness is not None:
-            value *= dr.power(dr.maximum(-dr.dot(away, self.front), 0), self.narrowness)
+            value *= dr.power(dr.maximum(-dr.dot(away, self.front), _LEAST), self.narrowness)
         if self.index is not None:
             value *= reflectance(dr.abs(away.z), self.index, self.mi)
         return place, value

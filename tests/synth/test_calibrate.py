@@ -20,7 +20,7 @@ from synth.arrays import FloatArray
 from synth.calibrate.dot_grid import fit_dot_grid, grid_index, pattern_points
 from synth.calibrate.dots import find_dots
 from synth.calibrate.frames import Frames, read_frames
-from synth.calibrate.irradiance import FlatGel, LightGeometry
+from synth.calibrate.irradiance import LightGeometry, LitGel
 from synth.calibrate.noise import fit_noise
 from synth.calibrate.profile import fit_profile
 from synth.calibrate.run import MARK, start_sensor
@@ -145,7 +145,7 @@ def test_contributions_are_what_the_renderer_renders(
     render = Render(samples_per_pixel=256, max_depth=2 if coating else 3)  # a matt gel lights itself by the window
     image = Renderer(sensor, render, surface, plain(), FAST).radiance(surface.material, 0)
     columns, rows = _every(8)
-    gel = FlatGel(sensor, np.column_stack([columns, rows]) + 0.5, FAST)
+    gel = LitGel(sensor, np.column_stack([columns, rows]) + 0.5, FAST)
     lit = 200 * gel.contributions(LightGeometry.of(sensor.lights))[0]
     # Half of 256 samples, stratified, leave some 1 % at a pixel and 0.1 % in the mean over 300 pixels. The shade, 20 %
     # of the light, has an edge that the light's 24 cells resolve in steps of 4 %: below 1 % of the mean remains.
@@ -164,7 +164,7 @@ def test_a_matt_gel_is_lit_by_itself_by_way_of_the_window() -> None:
     pictures = (Renderer(bright, one, surface, plain(0.9), FAST).radiance(surface.material, 0) for one in renders)
     direct, both = (picture[rows, columns, 0].mean() for picture in pictures)
     pixels, lights = np.column_stack([columns, rows]) + 0.5, LightGeometry.of(bright.lights)
-    lit = [300 * FlatGel(sensor, pixels, FAST).contributions(lights).sum(axis=0).mean() for sensor in (bright, dim)]
+    lit = [300 * LitGel(sensor, pixels, FAST).contributions(lights).sum(axis=0).mean() for sensor in (bright, dim)]
     # Direct light goes as the reflectance, what comes back as its square; shade on the images is left out: 3 %.
     assert both > 1.1 * direct
     assert 2 * (lit[0] - 2 * lit[1]) == pytest.approx(both - direct, rel=0.05)
@@ -175,7 +175,7 @@ def test_a_matt_gel_is_lit_by_itself_by_way_of_the_window() -> None:
 def test_derivatives_agree_with_finite_differences(index: float) -> None:
     start = _start()
     sensor = start.model_copy(update={"window": start.window.model_copy(update={"refractive_index": index})})
-    gel, geometry = FlatGel(sensor, np.column_stack(_every(16)) + 0.5, FAST), LightGeometry.of(sensor.lights)
+    gel, geometry = LitGel(sensor, np.column_stack(_every(16)) + 0.5, FAST), LightGeometry.of(sensor.lights)
     geometry = replace(geometry, viewing_angle_deg=np.array([[119.0], [60.0], [30.0]]))
     exact = gel.derivatives(geometry)
     step = 0.02

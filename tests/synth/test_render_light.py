@@ -153,9 +153,12 @@ def test_what_shines_is_refused_and_scalar_variants_path_trace() -> None:
 
 @needs_llvm
 @pytest.mark.parametrize("index", [1.0, 1.45])
-def test_a_narrow_light_is_the_same_separated_and_path_traced(index: float) -> None:
+@pytest.mark.parametrize("wide", [0.0, 30.0], ids=["alone", "beside a Lambertian one"])
+def test_a_narrow_light_is_the_same_separated_and_path_traced(index: float, wide: float) -> None:
+    """A part of the gel is behind the mirror image of the Lambertian light."""
     light = Light(position_mm=(6.5, 1, 3), size_mm=(2, 1), color=(1, 0.5, 0.2), power=300, viewing_angle_deg=40)
-    sensor = small_sensor(index, None, (light,))
+    beside = Light(position_mm=(-6.5, 0, 4), aim_mm=(-3.5, 0, 0), size_mm=(2, 1), color=(1, 1, 1), power=wide)
+    sensor = small_sensor(index, None, (light, beside))
     kinds = (("separated", 64), ("path_traced", 256))
     renders = (Render(samples_per_pixel=count, max_depth=2, light=kind) for kind, count in kinds)
     separated, traced = (rendered(sensor, render=render).mean(axis=0) for render in renders)

@@ -1,0 +1,183 @@
+"""Lights fitted to presses of a ball, together with the gel at rest: from several layouts, with place and depth."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import minimize
+
+from synth.arrays import BoolArray, FloatArray, Pixels
+from synth.calibrate.contact import Contact, change, find_contact, flanks
+from synth.calibrate.irradiance import LightGeometry, LitGel, PressChange
+from synth.calibrate.layouts import chosen
+from synth.calibrate.lights import LightFit, Room, Target, fit_lights, fit_powers
+from synth.calibrate.pressed_ball import press_ball
+from synth.errors import InputError
+from synth.optics import Optics
+from synth.render.camera_image import off_centre
+from synth.render.pattern import pixels_per_mm
+from synth.render.variant import Variant
+from synth.scene import Sensor
+
+_WEIGHT = 1.5
+"""Weight of what presses change against the gel at rest."""
+_AROUND, _ACROSS = 1.7, 16
+"""Pixels that count around a contact, over its radius, and how many across."""
+_MOVED_LEVELS = 6.0
+"""Levels of 255 by which half of a frame may differ from the gel at rest beside the contact."""
+_SIMULATIONS, _TOLERANCE = 22, 0.05
+"""Presses simulated to find one's place and depth, and how near (mm, and share of the depth) is enough."""
+_EDGE = 0.9
+"""Share of the circle's radius within which flanks are measured."""
+
+
+@dataclass(frozen=True, eq=False)
+class Balls:
+    """Frames (H, W, 3) of the gel under one ball, encoded, by name, and the friction that is taken for all."""
+
+    frames: dict[str, FloatArray]
+    radius_mm: float
+    friction: float
+
+
+@dataclass(frozen=True, eq=False)
+class Press:
+    """One frame's contact, and what the press changes at pixels (n, 2): levels of 255 (n, 3), beside the level at rest.
+
+    `pose` (3,) is the ball's place, mm, and the logarithm of its depth in mm.
+    """
+
+    name: str
+    contact: Contact
+    pixels: Pixels
+    rest: FloatArray
+    changed: FloatArray
+    pose: FloatArray
+
+    def azimuth_and_rise(self, changed: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Those of `synth.calibrate.contact.flanks`, of a change (n, 3) at the pixels."""
+        return flanks(self.pixels, changed, replace(self.contact, radius=_EDGE * self.contact.radius))
+
+
+@dataclass(frozen=True, eq=False)
+class BallFit:
+    """Lights that explain rest and presses; the presses, and of each the change as fitted, levels (n, 3)."""
+
+    lights: LightFit
+    presses: tuple[Press, ...]
+    fitted: tuple[FloatArray, ...]
+
+
+def find_presses(sensor: Sensor, balls: Balls, rest: FloatArray, bare: dict[str, BoolArray]) -> tuple[Press, ...]:
+    """Contacts in all frames; InputError for one without, of another gel, or that the ball cannot make.
+
+    `rest` (H, W, 3) is the gel at rest, encoded; `bare` (H, W) are each frame's pixels beside dots.
+    """
+    return tuple(_found(sensor, balls, name, rest, bare[name]) for name in balls.frames)
+
+
+def _found(sensor: Sensor, balls: Balls, name: str, rest: FloatArray, bare: BoolArray) -> Press:
+    changed = change(balls.frames[name], rest, bare)
+    contact = find_contact(changed, name)
+    y, x = np.mgrid[: rest.shape[0], : rest.shape[1]] + 0.5
+    away = np.hypot(x - contact.middle[0], y - contact.middle[1]) / contact.radius
+    beside = np.median(np.abs(changed[(away > 2) & bare]), axis=0) if ((away > 2) & bare).any() else np.zeros(3)
+    if beside.max() > _MOVED_LEVELS:
+        raise InputError(
+            f"{name}: beside the ball it differs by {beside.max():.1f} of 255 from the frames at rest; the camera "
+            "moved, or it is another sensor's"
+        )
+    step = max(1, round(2 * _AROUND * contact.radius / _ACROSS))
+    use = (away < _AROUND) & bare & (x.astype(int) % step == 0) & (y.astype(int) % step == 0)
+    rows, columns = np.nonzero(use)
+    radius_mm = contact.radius / pixels_per_mm(sensor)
+    if radius_mm > 0.95 * balls.radius_mm:
+        raise InputError(
+            f"{name}: its contact has a radius of {radius_mm:.2g} mm, which no ball of "
+            f"--radius-mm = {balls.radius_mm:g} makes; check the radius"
+        )
+    place = Optics.of(sensor).look(np.array([contact.middle])).on_flat_face[0, :2]
+    depth = 0.7 * radius_mm**2 / balls.radius_mm
+    for _ in range(2):
+        ball = press_ball(sensor, balls.radius_mm, depth, place, balls.friction)
+        depth *= np.clip((radius_mm / max(ball.contact_mm, 1e-3)) ** 2, 0.4, 2.5)
+    pixels = np.column_stack([columns, rows]).astype(np.float64) + 0.5
+    at_rest = 255 * rest[rows, columns]
+    return Press(name, contact, pixels, at_rest, changed[rows, columns], np.array([*place, np.log(depth)]))
+
+
+def fit_balls(
+    sensor: Sensor, gel: LitGel, target: Target, first: LightFit, shines: BoolArray, room: Room,
+    presses: Sequence[Press], balls: Balls, variant: Variant, steps: int,
+) -> BallFit:  # fmt: skip
+    """Fit lights to the gel at rest, with its target, and to presses.
+
+    They start from the fit to the gel at rest and from lights chosen all around; the better one is followed, with
+    the balls' places and depths found between two fits.
+    """
+    whole = _with_changes(target, sensor, presses)
+    flats = [LitGel(sensor, press.pixels, variant) for press in presses]
+
+    def change_of(number: int, pose: FloatArray) -> PressChange:
+        ball = press_ball(sensor, balls.radius_mm, float(np.exp(pose[2])), pose[:2], balls.friction)
+        return PressChange(
+            LitGel(sensor, presses[number].pixels, variant, (ball.surface, ball.positions)), flats[number]
+        )
+
+    def fitted(start: LightGeometry, vignetting: float, most: int, limits: Room) -> LightFit:
+        return fit_lights((gel, *changes), whole, start, shines, vignetting, limits, most)
+
+    changes = [change_of(k, press.pose) for k, press in enumerate(presses)]
+    like = first.geometry
+    everywhere = chosen((gel, *changes), whole, like, shines, first.vignetting, room)
+    reach = (room.high - room.low) / 2
+    low = np.maximum(everywhere.centre - reach, [-np.inf, -np.inf, room.low[:, 2].min()])
+    high = np.minimum(everywhere.centre + reach, [np.inf, np.inf, room.high[:, 2].max()])
+    rooms = room, replace(room, low=low, high=high)
+    fits = [fitted(start, first.vignetting, max(steps // 2, 1), limits)
+            for start, limits in zip((like, everywhere), rooms, strict=True)]  # fmt: skip
+    best = int(np.argmin([fit.residual for fit in fits]))
+    fit, limits = fits[best], rooms[best]
+    refined = list(presses)
+    for number, press in enumerate(presses):
+        part = _with_changes(target, sensor, [press])
+        base = gel.contributions(fit.geometry)
+        gain = part.gain * (1 - fit.vignetting * part.corner)
+
+        def misfit(pose: FloatArray, number: int = number, part: Target = part, gain: FloatArray = gain,
+                   base: FloatArray = base, fit: LightFit = fit) -> float:  # fmt: skip
+            try:
+                basis = np.concatenate([base, change_of(number, pose).contributions(fit.geometry)], axis=1)
+            except InputError:
+                return np.inf
+            basis = basis * gain[None, :, None]
+            miss = part.slope * (np.einsum("mpc,mc->pc", basis, fit_powers(basis, part, shines)) - part.signal)
+            return float(np.sum(miss**2))
+
+        simplex = press.pose + np.vstack([np.zeros(3), np.diag([0.2, 0.2, -0.25])])
+        options = {"maxfev": _SIMULATIONS, "initial_simplex": simplex, "xatol": _TOLERANCE, "fatol": 1e-9}
+        pose = minimize(misfit, press.pose, method="Nelder-Mead", options=options).x
+        changes[number], refined[number] = change_of(number, pose), replace(press, pose=pose)
+    fit = fitted(fit.geometry, fit.vignetting, steps, limits)
+    models = []
+    for press, each in zip(presses, changes, strict=True):
+        gain = target.gain * (1 - fit.vignetting * off_centre(sensor.camera, *press.pixels.T))
+        before, more = (np.einsum("mpc,mc->pc", one.contributions(fit.geometry), fit.powers) * gain[:, None]
+                        for one in (each.rest, each))  # fmt: skip
+        level = np.maximum(before, 0) ** (1 / sensor.camera.gamma)
+        models.append(255 * (np.maximum(before + more, 0) ** (1 / sensor.camera.gamma) - level))
+    return BallFit(fit, tuple(refined), tuple(models))
+
+
+def _with_changes(target: Target, sensor: Sensor, presses: Sequence[Press]) -> Target:
+    """The target at rest, and what presses change after it."""
+    gamma = sensor.camera.gamma
+    signals, slopes, corners = [target.signal], [target.slope], [target.corner]
+    for press in presses:
+        before, after = (np.clip(level / 255, 2 / 255, 1) for level in (press.rest, press.rest + press.changed))
+        slope = _WEIGHT * ((before + after) / 2) ** (1 - gamma) / gamma
+        slope[(after > 253 / 255) | (before > 253 / 255)] = 0
+        signals.append(after**gamma - before**gamma)
+        slopes.append(slope)
+        corners.append(off_centre(sensor.camera, *press.pixels.T))
+    return Target(np.vstack(signals), np.vstack(slopes), target.gain, np.concatenate(corners))

@@ -1,0 +1,74 @@
+"""Starts of the lights' fit that do not depend on where the preset's lights are.
+
+Lights of the preset's size and viewing angle are tried all around the gel, at several heights and tilts. What each of
+them adds is known, so that few are chosen one by one for what they explain, and then each once more given the others.
+"""
+
+from itertools import product
+
+import numpy as np
+from scipy.optimize import nnls
+
+from synth.arrays import BoolArray, FloatArray
+from synth.calibrate.irradiance import LightGeometry
+from synth.calibrate.lights import Gels, Room, Target, contributions
+
+_AZIMUTHS, _HEIGHTS, _TILTS = 24, (0.15, 0.35, 0.6, 0.85), (-45.0, -20.0, 0.0, 15.0)
+"""Lights around the gel, their heights over the body's, and the elevations (degrees) of where they aim."""
+_BESIDE_MM, _APART_MM = 1.0, 2.0
+"""How far lights are outside the view, and from each other."""
+_TRIED, _ROUNDS, _CHUNK = 30, 2, 32
+
+
+def around(like: LightGeometry, room: Room) -> LightGeometry:
+    """Lights around the gel, of the median size and viewing angle of others."""
+    top, angles = room.high[:, 2].max(), np.radians(np.arange(_AZIMUTHS) * 360 / _AZIMUTHS)
+    centres, directions = [], []
+    for angle, height, tilt in product(angles, _HEIGHTS, np.radians(_TILTS)):
+        outward = np.array([np.cos(angle), np.sin(angle)])
+        z = height * top
+        low, high = room.view + z * room.slope
+        half = np.maximum(-low, high) + _BESIDE_MM
+        centres.append([*(outward * np.min(half / np.maximum(np.abs(outward), 1e-9))), z])
+        directions.append([*(-outward * np.cos(tilt)), np.sin(tilt)])
+    size, angle = np.median(like.size, axis=0), np.median(like.viewing_angle_deg, axis=0)
+    count = len(centres)
+    return LightGeometry(np.array(centres), np.array(directions), np.tile(size, (count, 1)), np.tile(angle, (count, 1)))
+
+
+def chosen(
+    gels: Gels, target: Target, like: LightGeometry, shines: BoolArray, vignetting: float, room: Room
+) -> LightGeometry:
+    """For each of the preset's lights, which shine in channels (m, 3), one of those around."""
+    every = around(like, room)
+    fields = (every.centre, every.direction, every.size, every.viewing_angle_deg)
+    parts = [LightGeometry(*(field[k : k + _CHUNK] for field in fields)) for k in range(0, len(every.centre), _CHUNK)]
+    lit = np.concatenate([contributions(gels, part, alone=True) for part in parts])
+    lit = lit * (target.gain * (1 - vignetting * target.corner))[None, :, None] * target.slope
+    wanted = target.signal * target.slope
+    norm = np.linalg.norm(lit, axis=1)
+    strong = norm > 0.01 * norm.max(axis=0)  # beyond, a light that hardly reaches the gel needs any power
+
+    def missed(picks: dict[int, int]) -> FloatArray:
+        """Misfit (n, 3) under the best powers."""
+        left = wanted.copy()
+        for channel in range(3):
+            use = [pick for light, pick in picks.items() if shines[light, channel]]
+            if use:
+                columns = lit[use, :, channel].T / norm[use, channel]
+                left[:, channel] -= columns @ nnls(columns, wanted[:, channel], maxiter=1000)[0]
+        return left
+
+    picks: dict[int, int] = {}
+    for light in [*range(len(shines)), *(_ROUNDS - 1) * [*range(len(shines))]]:
+        others = {other: pick for other, pick in picks.items() if other != light}
+        away = np.ones(len(every.centre), dtype=bool)
+        for pick in others.values():
+            away &= np.linalg.norm(every.centre - every.centre[pick], axis=1) > _APART_MM
+        left = missed(others)
+        gain = np.einsum("mpc,pc->mc", lit, left) / np.maximum(norm, 1e-12)
+        gain = (np.maximum(gain, 0) ** 2 * strong)[:, shines[light]].sum(axis=1) * away
+        tried = np.argsort(-gain)[:_TRIED]
+        picks[light] = min(tried, key=lambda pick: float(np.sum(missed({**others, light: int(pick)}) ** 2)))
+    order = [picks[light] for light in range(len(shines))]
+    return LightGeometry(*(field[order] for field in fields))
