@@ -14,7 +14,7 @@ from synth.verify import verify_dataset
 
 CAMERA = {"width": 64, "height": 48, "fx": 90.0, "fy": 90.0, "cx": 32.0, "cy": 24.0}
 TINY = [f"sensor.camera.{name}={value}" for name, value in CAMERA.items()]
-TINY += ["render.samples_per_pixel=144", "motion.steps=2", "motion.depth_mm=0.5", "motion.shear_mm=[0.2, 0.1]"]
+TINY += ["render.samples_per_pixel=144", "motion.steps=2", "motion.depth_mm=0.25", "motion.shear_mm=[0.2, 0.1]"]
 TINY += ['contact.indenter={shape="sphere", radius_mm=4.0}']
 
 
@@ -50,7 +50,7 @@ def test_batched_on_a_gpu_with_workers_verifies_and_agrees_with_the_cpu(cuda: Va
     assert verify_dataset(tmp_path / "cuda").ok
     on_gpu, on_cpu = (read_dataset(tmp_path / name) for name in ("cuda", "cpu"))
     for index in range(6):
-        # Displacements of 0.5 mm agree to 3e-5 (docs/reports/batched_fem.md), at some 3 px per mm: 5e-5 px.
+        # Displacements of 0.25 mm agree to 3e-5 (docs/reports/batched_fem.md), at some 3 px per mm: 5e-5 px.
         forward = on_gpu.read(index).flow.forward
         np.testing.assert_allclose(forward, on_cpu.read(index).flow.forward, atol=1e-3)
         assert np.isfinite(forward).any()
