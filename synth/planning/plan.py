@@ -9,10 +9,10 @@ from synth.errors import InputError
 from synth.mesh import default_edge_length, face_of
 from synth.mesh.cad import CadFace
 from synth.render.camera_rays import pinhole
+from synth.render.coating import is_separated
 from synth.render.measured_light import read_measured_light
 from synth.render.pattern import check_pattern, is_grey
 from synth.render.rest_map import read_rest_map
-from synth.render.separated_light import is_separated
 from synth.render.thin_lens import check_views
 from synth.render.variant import Variant, job_variant
 from synth.scene import MeshIndenter

@@ -16,9 +16,9 @@ from synth.arrays import FloatArray, Points
 from synth.cli import main
 from synth.dataset.images import encode_png, read_png
 from synth.dataset.reader import read_dataset
+from synth.render.coating import is_separated
 from synth.render.measured_light import read_measured_light
 from synth.render.renderer import Renderer
-from synth.render.separated_light import is_separated
 from synth.scene import Light, MeasuredLight, Render, Sensor
 from synth.scene.template import load_scene
 
