@@ -13,26 +13,29 @@ from torch.autograd.function import once_differentiable
 
 from gelflow.arrays import Features
 
+ROWS = 30
+"""Rows whose costs are added up at a time, so that they stay in a processor's cache."""
+
 
 class _LocalCorrelation(torch.autograd.Function):
-    """Displacement by displacement through one buffer; autograd itself would hold all (2 r + 1)^2 products."""
+    """Channel by channel into the costs; autograd itself would hold all (2 r + 1)^2 products."""
 
     @staticmethod
     def forward(ctx: Any, first: Tensor, second: Tensor, radius: int) -> Tensor:
         ctx.save_for_backward(first, second)
         ctx.radius = radius
-        batch, _, height, width = first.shape
-        padded = F.pad(second, (radius,) * 4)
-        if first.is_cuda:  # three launches in place of two for each displacement, and memory for all products
-            side = 2 * radius + 1
-            windows = padded.unfold(2, side, 1).unfold(3, side, 1)
+        batch, channels, height, width = first.shape
+        side = 2 * radius + 1
+        windows = F.pad(second, (radius,) * 4).unfold(2, side, 1).unfold(3, side, 1)
+        if first.is_cuda:  # three launches in place of one for each channel, and memory for all products
             return (first[..., None, None] * windows).mean(dim=1).flatten(3).permute(0, 3, 1, 2).contiguous()
-        product = torch.empty_like(first)
-        costs = first.new_empty(batch, (2 * radius + 1) ** 2, height, width)
-        for channel, (rows, columns) in enumerate(_windows(height, width, radius)):
-            torch.mul(first, padded[:, :, rows, columns], out=product)
-            torch.mean(product, dim=1, out=costs[:, channel])
-        return costs
+        costs = first.new_zeros(batch, side, side, height, width)
+        windows = windows.permute(0, 1, 4, 5, 2, 3)
+        for top in range(0, height, ROWS):
+            rows = slice(top, top + ROWS)
+            for channel in range(channels):
+                costs[..., rows, :].addcmul_(first[:, channel, None, None, rows], windows[:, channel, ..., rows, :])
+        return costs.div_(channels).flatten(1, 2)
 
     @staticmethod
     @once_differentiable
