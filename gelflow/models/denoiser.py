@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from gelflow.arrays import Features, Flow, Images
 from gelflow.config import RegistrationConfig
-from gelflow.models.evidence import gauss_newton
+from gelflow.models.evidence import evidence, step
 from gelflow.models.registration import posterior_variance
 from gelflow.models.wider_window import TWO_STEPS
 from gelflow.ops.gaussian import smoother
@@ -93,8 +93,9 @@ class Block(nn.Module):
 
 def evidence_of(flow: Flow, network: Flow, image1: Images, image2: Images) -> tuple[Features, Tensor]:
     """What the denoiser sees, (B, C, H, W), and the flow's expected error s, (B, 1, H, W) px."""
-    second, config = SplineImage(image2), RegistrationConfig()
-    steps = [gauss_newton(flow, image1, second, config.model_copy(update={"windows_px": (w,)})) for w in WINDOWS_PX]
+    config = RegistrationConfig()
+    found = evidence(flow, image1, SplineImage(image2).near, config.background_px or 0.0)
+    steps = [step(found, width) for width in WINDOWS_PX]
     variance = posterior_variance(TWO_STEPS * steps[-1].variance, config.prior_px)
     error = variance.sqrt().clamp(min=MIN_ERROR_PX)
     smooth = [flow, *(smoother(flow, width)(flow) for width in BANDS_PX)]
@@ -102,10 +103,8 @@ def evidence_of(flow: Flow, network: Flow, image1: Images, image2: Images) -> tu
     grey = image1.mean(dim=1, keepdim=True)
     texture = grey - smoother(grey, TEXTURE_PX)(grey)
     contrast = smoother(grey, 2 * TEXTURE_PX)(texture.square()).clamp(min=MIN_CONTRAST**2).sqrt()
-    seen = [
-        compressed(displacement / error) for displacement in (network - flow, *bands, *(step.step for step in steps))
-    ]
-    seen += [step.variance.clamp(min=MIN_ERROR_PX**2).log() for step in steps]
+    seen = [compressed(displacement / error) for displacement in (network - flow, *bands, *(one.step for one in steps))]
+    seen += [one.variance.clamp(min=MIN_ERROR_PX**2).log() for one in steps]
     return torch.cat([*seen, error.log(), texture / contrast, contrast.log()], dim=1), error
 
 

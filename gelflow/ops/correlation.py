@@ -13,12 +13,12 @@ from torch.autograd.function import once_differentiable
 
 from gelflow.arrays import Features
 
-ROWS = 30
-"""Rows whose costs are added up at a time, so that they stay in a processor's cache."""
+BLOCK = 20
+"""Pixels of a row that are multiplied with all that any of them may be displaced to."""
 
 
 class _LocalCorrelation(torch.autograd.Function):
-    """Channel by channel into the costs; autograd itself would hold all (2 r + 1)^2 products."""
+    """Blocks of pixels of a row against a row of the other image; autograd would hold all (2 r + 1)^2 products."""
 
     @staticmethod
     def forward(ctx: Any, first: Tensor, second: Tensor, radius: int) -> Tensor:
@@ -26,16 +26,22 @@ class _LocalCorrelation(torch.autograd.Function):
         ctx.radius = radius
         batch, channels, height, width = first.shape
         side = 2 * radius + 1
-        windows = F.pad(second, (radius,) * 4).unfold(2, side, 1).unfold(3, side, 1)
-        if first.is_cuda:  # three launches in place of one for each channel, and memory for all products
+        if first.is_cuda:  # three launches in place of two for each row, and memory for all products
+            windows = F.pad(second, (radius,) * 4).unfold(2, side, 1).unfold(3, side, 1)
             return (first[..., None, None] * windows).mean(dim=1).flatten(3).permute(0, 3, 1, 2).contiguous()
-        costs = first.new_zeros(batch, side, side, height, width)
-        windows = windows.permute(0, 1, 4, 5, 2, 3)
-        for top in range(0, height, ROWS):
-            rows = slice(top, top + ROWS)
-            for channel in range(channels):
-                costs[..., rows, :].addcmul_(first[:, channel, None, None, rows], windows[:, channel, ..., rows, :])
-        return costs.div_(channels).flatten(1, 2)
+        blocks, reach = -(-width // BLOCK), BLOCK + 2 * radius
+        beyond = blocks * BLOCK - width
+        here = F.pad(first / channels, (0, beyond)).permute(0, 2, 3, 1).reshape(-1, BLOCK, channels)
+        there = F.pad(second, (radius, radius + beyond, radius, radius)).unfold(3, reach, BLOCK)
+        there = there.permute(0, 2, 3, 1, 4).contiguous()
+        costs = first.new_empty(batch, side, side, height, blocks * BLOCK)
+        for row in range(side):
+            with torch.autocast("cpu", enabled=False):
+                products = here @ there[:, row : row + height].reshape(-1, channels, reach)
+            # Each pixel's own 2 r + 1 of the block's products lie one further than those of the pixel before.
+            own = products.as_strided((len(products), side, BLOCK), (BLOCK * reach, 1, reach + 1))
+            costs[:, row] = own.view(batch, height, blocks, side, BLOCK).permute(0, 3, 1, 2, 4).flatten(3)
+        return costs[..., :width].flatten(1, 2)
 
     @staticmethod
     @once_differentiable
