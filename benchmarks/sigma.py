@@ -18,16 +18,17 @@ from numpy.typing import NDArray
 from benchmarks.rows import Row, arguments, show
 from gelflow.baselines.method import as_array, as_tensor
 from gelflow.compare.metrics import endpoint_error
-from gelflow.config import RegistrationConfig
 from gelflow.data.open import open_all
 from gelflow.data.pairs import PairDataset, without_pattern
-from gelflow.models.evidence import gauss_newton
+from gelflow.models.evidence import evidence, step
 from gelflow.models.uncertainty import CURVATURE, combined, error_squares
 from gelflow.models.working_size import sized_sigma, working_sizes
 from gelflow.ops.pyramid import resize_flow, resize_images
 from gelflow.ops.spline import SplineImage
 from gelflow.predict.model import load_model
 
+WINDOW_PX, BACKGROUND_PX = 5.0, 4.0
+"""The last window of registration for motion, and the neighbourhood whose mean does not count."""
 EVERY = 7
 """Every so many-th pixel counts; neighbours hardly differ."""
 CURVATURES = (0.0, 0.1, 0.14, 0.17, 0.2, 0.24, 0.28, 0.4)
@@ -58,7 +59,7 @@ def pixels(dataset: PairDataset, folder: Path) -> Scenes:
         error = endpoint_error(as_array(moved), as_array(true))
         counts = np.isfinite(error) & (cv2.resize(truth.visible.astype(np.float32), size[::-1]) == 1)
         values = [combined(*squares, factor)[0, 0].double().numpy() for factor in CURVATURES]
-        bound = gauss_newton(true.nan_to_num(), first, SplineImage(second), RegistrationConfig()).variance
+        bound = step(evidence(true.nan_to_num(), first, SplineImage(second).at, BACKGROUND_PX), WINDOW_PX).variance
         values += [bound[0, 0].double().numpy(), error]
         found.setdefault(str(record.scene), []).append(np.stack([value[counts][::EVERY] for value in values]))
         print(f"{len(found)} scenes, pair {index + 1} of {len(dataset)}", flush=True)

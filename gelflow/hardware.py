@@ -1,5 +1,6 @@
 """The machine: which device a computation runs on and what it is called."""
 
+import functools
 import os
 import platform
 from pathlib import Path
@@ -22,6 +23,12 @@ def chosen_device(device: str) -> str:
     if device == "cuda" and not available:
         raise InputError("--device cuda: no CUDA device was found; use --device cpu")
     return ("cuda" if available else "cpu") if device == "auto" else device
+
+
+@functools.cache
+def has_bfloat16() -> bool:
+    """Whether the processor multiplies bfloat16 (AVX-512 BF16, AMX), as Linux tells; False where nothing does."""
+    return CPU_INFO.is_file() and " avx512_bf16 " in CPU_INFO.read_text(encoding="utf-8")
 
 
 def hardware(device: str) -> str:

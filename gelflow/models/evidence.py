@@ -12,21 +12,21 @@ any estimate (Cramer-Rao). It is correlated between colours and between pixels, 
     C = A^-1 (sum_y w(y - x)^2 z z^T) A^-1,
 
 z the sum of g r over a small neighbourhood (Newey and West 1987).
+
 """
 
 import math
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from gelflow.arrays import Features, Flow, Images
-from gelflow.config import RegistrationConfig
-from gelflow.ops.gaussian import SeparableFilter, window_sums
-from gelflow.ops.spline import SplineImage
+from gelflow.ops.gaussian import SeparableFilter, interpolator, window_sums
 from gelflow.ops.warp import inside_at, positions
 
-Evidence = tuple[Features, Features, Features, Tensor]
 TINY = 1e-6
 CORRELATION_PX = 1.0
 """Standard deviation of the Gaussian under which g r is summed."""
@@ -35,10 +35,9 @@ MAX_VARIANCE = 100.0
 
 
 class Step(NamedTuple):
-    """A Gauss-Newton step (B, 2, H, W), px, zero where the window holds no texture.
+    """A Gauss-Newton step (B, 2, h, w), px, zero where the window holds no texture.
 
-    The variance is Tr C, at most `MAX_VARIANCE`, (B, 1, H, W) px^2, the texture the sum of the squares of the gradient
-    that each pixel adds to tr A, (B, 1, H, W).
+    The variance is Tr C, at most `MAX_VARIANCE`, (B, 1, h, w) px^2, the texture Tr A, (B, 1, h, w).
     """
 
     step: Flow
@@ -46,34 +45,60 @@ class Step(NamedTuple):
     texture: Tensor
 
 
-def evidence(flow: Flow, first: Images, second: SplineImage, background: SeparableFilter | None) -> Evidence:
-    """Residual, and the gradient along x and y of the mean of both images, (B, C, H, W), zero outside of image 2.
+Sample = Callable[[Tensor], Images]
+"""Image 2 at places (B, 2, H, W): `SplineImage.at` or `.near`, for which dampened patterns count as noise."""
 
-    The last: 1 where the flow stays in the image, else 0, (B, 1, H, W).
-    """
+
+def compared(flow: Flow, first: Images, second: Sample) -> tuple[Images, Images, Tensor]:
+    """Image 2 less image 1 under a flow, the mean of both, (B, C, H, W), and where the flow stays, (B, 1, H, W)."""
     places = positions(flow)
-    counts, moved = inside_at(places), second.at(places)
-    residual = counts * (moved - first)
-    if background is not None:
-        mean, weight = background(torch.cat([residual, counts], dim=1)).split([residual.shape[1], 1], dim=1)
-        residual = counts * (residual - mean / weight.clamp(min=TINY))
+    moved = second(places)
     # The mean of both images' gradients converges from further away than either alone.
-    across, down = torch.gradient((moved + first) / 2, dim=(-1, -2))
-    return residual, counts * across, counts * down, counts
+    return moved - first, (moved + first) / 2, inside_at(places)
 
 
-def gauss_newton(flow: Flow, first: Images, second: SplineImage, config: RegistrationConfig) -> Step:
-    """The step from a flow in the last window of a registration for motion, without a prior, and its variance."""
-    background = window_sums(flow, config.background_px or 0.0)
-    window = window_sums(flow, config.windows_px[-1])
-    residual, across, down, counts = evidence(flow, first, second, background)
-    weight = background(counts).clamp(min=TINY)
-    across, down = (gradient - counts * background(gradient) / weight for gradient in (across, down))
-    noise = (counts * slope / 2 for slope in torch.gradient(residual, dim=(-1, -2)))
-    texture = _squares(across, down) - _squares(*noise)
-    pull = torch.stack([across * residual, down * residual], dim=1).sum(dim=2)
-    z = window_sums(flow, CORRELATION_PX)(pull) / (math.sqrt(math.pi) * CORRELATION_PX)
-    return solved(texture, _squares(*z.split(1, dim=1)), pull, window)
+def without_mean(image: Features, counts: Tensor, deviation: float) -> Features:
+    """An image less its mean in a Gaussian over the pixels that count, (B, 1, H, W)."""
+    window, to_pixels = window_sums(image, deviation, 2), interpolator(image, 2)
+    return image - to_pixels(window(counts * image) / window(counts).clamp(min=TINY))
+
+
+def slopes(image: Features) -> tuple[Features, Features]:
+    """Central differences along x and y; half of one-sided ones at the border."""
+    padded = F.pad(image / 2, (1, 1, 1, 1), mode="replicate")
+    rows, columns = padded[..., 1:-1, :], padded[..., 1:-1]
+    return rows[..., 2:] - rows[..., :-2], columns[..., 2:, :] - columns[..., :-2, :]
+
+
+def moments(flow: Flow, first: Images, second: Sample, background_px: float | None) -> Tensor:
+    """Of a flow: xx, xy, xr, yy, yr and rr of gradient and residual, and the number of samples.
+
+    They are sums over the colours, zero where the flow leaves the image, (B, 7, H, W).
+    """
+    residual, mean, counts = compared(flow, first, second)
+    if background_px is not None:
+        residual = without_mean(residual, counts, background_px)
+    across, down = slopes(mean)
+    pairs = ((across, across), (across, down), (across, residual), (down, down), (down, residual), (residual, residual))
+    return torch.cat([counts * _products(pairs), residual.shape[1] * counts], dim=1)
+
+
+def evidence(flow: Flow, first: Images, second: Sample, background_px: float) -> Tensor:
+    """What each pixel adds to A and to z z^T under a flow, three each, and to -b: (B, 8, H, W)."""
+    residual, mean, counts = compared(flow, first, second)
+    both = without_mean(torch.cat([residual, mean], dim=1), counts, background_px)
+    residual, mean = both.chunk(2, dim=1)
+    (right, below), (across, down) = slopes(residual / 2), slopes(mean)
+    gradients = ((across, across), (across, down), (down, down))
+    noise = ((right, right), (right, below), (below, below))
+    found = counts * _products((*gradients, *noise, (across, residual), (down, residual)))
+    z = window_sums(flow, CORRELATION_PX)(found[:, 6:]) / (math.sqrt(math.pi) * CORRELATION_PX)
+    return torch.cat([found[:, :3] - found[:, 3:6], _squares(z), found[:, 6:]], dim=1)
+
+
+def step(found: Tensor, window_px: float, spacing: int = 1) -> Step:
+    """The step of `evidence` in a window of that standard deviation, without a prior, at places at a spacing."""
+    return solved(found[:, :3], found[:, 3:6], found[:, 6:], window_sums(found, window_px, spacing))
 
 
 def solved(texture: Tensor, z: Tensor, pull: Tensor, window: SeparableFilter) -> Step:
@@ -87,11 +112,15 @@ def solved(texture: Tensor, z: Tensor, pull: Tensor, window: SeparableFilter) ->
     # Terms that cancel leave rounding errors of either sign where there is nothing to see.
     enough = (determinant > 0) & (trace > 0) & (variance >= 0) & (variance < MAX_VARIANCE)
     step = torch.cat([xy * left - yy * right, xy * right - xx * left], dim=1) / determinant
-    return Step(
-        torch.where(enough, step, 0.0), torch.where(enough, variance, MAX_VARIANCE), texture[:, :1] + texture[:, 2:]
-    )
+    return Step(torch.where(enough, step, 0.0), torch.where(enough, variance, MAX_VARIANCE), trace)
 
 
-def _squares(x: Features, y: Features) -> Tensor:
-    """x^2, x y and y^2, summed over the colours: (B, 3, H, W) of (B, C, H, W)."""
-    return torch.stack([x * x, x * y, y * y], dim=1).sum(dim=2)
+def _products(pairs: Sequence[tuple[Features, Features]]) -> Tensor:
+    """Products of images, summed over the colours: (B, N, H, W)."""
+    return torch.cat([(one * other).sum(dim=1, keepdim=True) for one, other in pairs], dim=1)
+
+
+def _squares(z: Flow) -> Tensor:
+    """x^2, x y and y^2 of (B, 2, h, w): (B, 3, h, w)."""
+    x, y = z.split(1, dim=1)
+    return torch.cat([x * x, x * y, y * y], dim=1)

@@ -31,7 +31,7 @@ def convolution(inputs: int, outputs: int, *, side: int = 3, stride: int = 1, di
     layer = nn.Conv2d(inputs, outputs, side, stride=stride, padding=side // 2 * dilation, dilation=dilation)
     nn.init.kaiming_normal_(layer.weight, a=SLOPE)
     nn.init.zeros_(layer.bias)  # type: ignore[arg-type]
-    return nn.Sequential(layer, nn.LeakyReLU(SLOPE))
+    return nn.Sequential(layer, nn.LeakyReLU(SLOPE, inplace=True))
 
 
 def flow_head(inputs: int) -> nn.Conv2d:

@@ -39,6 +39,8 @@ MAX_RESIDUAL_RATIO, MAX_RESIDUAL_RATIO_WITHOUT_SHADING = 0.85, 0.6
 """A proposal is taken if its residual is below this share of the pixel's own."""
 PIXELS_PER_DEVIATION = 3
 """Largest standard deviation of a window in the reduced images, px."""
+CACHED_PX = 20000
+"""Px of proposals that are compared at a time on a processor."""
 SLOPE_WINDOW_PX = 2.0
 """Standard deviation of the Gaussian under which a flow is smoothed before it is extrapolated, reduced px."""
 MIN_SHARE_INSIDE = 0.3
@@ -66,18 +68,20 @@ def propagated(flow: Flow, image1: Images, image2: Images, window_px: float, con
         return left.unflatten(0, (len(candidates), -1))
 
     now = residuals(start.unsqueeze(0))[0]
+    taken = now > (2 * config.noise) ** 2
+    if not flow.is_cuda and not taken.any():  # a recorded CUDA graph cannot choose
+        return flow
     best, least = start, (MAX_RESIDUAL_RATIO_WITHOUT_SHADING if ignore_shading else MAX_RESIDUAL_RATIO) * now
     steps = [max(1, round(distance / pixel)) for distance in config.propagation_px]
     proposals = _Proposals(start, max(steps), extrapolate=ignore_shading)
     places = [(step * right, step * down) for step in steps for right, down in DIRECTIONS]
-    # Launches are what takes time on a GPU, all neighbours together are too much for a processor's cache.
-    at_once = len(places) if flow.is_cuda else 1
+    # Launches are what takes time, but all neighbours together may be too much for a processor's cache.
+    at_once = len(places) if flow.is_cuda else max(1, CACHED_PX // start[:, 0].numel())
     for i in range(0, len(places), at_once):
         proposed = proposals(places[i : i + at_once])
         left, which = residuals(proposed).min(dim=0)
         found = proposed.gather(0, which.expand_as(start).unsqueeze(0))[0]
         best, least = torch.where(left < least, found, best), torch.minimum(left, least)
-    taken = now > (2 * config.noise) ** 2
     if ignore_shading:
         # Var F1 + Var F2 is the mean of the variances of difference and sum.
         difference, total = (windowed_residual(best, image, second, window, True) for image in (first, -first))

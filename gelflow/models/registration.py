@@ -28,13 +28,16 @@ from torch import Tensor
 
 from gelflow.arrays import Flow, Images
 from gelflow.config import RegistrationConfig
-from gelflow.models.evidence import TINY, Evidence, evidence, gauss_newton
+from gelflow.models.evidence import TINY, evidence, moments, step
 from gelflow.models.propagation import propagated
 from gelflow.models.wider_window import TWO_STEPS, bends, best_window, fine_noise
-from gelflow.ops.gaussian import SeparableFilter, smoother, window_sums
+from gelflow.ops.gaussian import interpolator, smoother, window_sums
+from gelflow.ops.pyramid import halve
 from gelflow.ops.spline import SplineImage
 from gelflow.ops.warp import positions
 
+HALF_SIZE_PX, SPACED_PX, SPACING = 12.0, 3.0, 2
+"""Windows from which on images of half the size suffice, and a flow at every second px."""
 MAX_STEP_PX = 1.0
 """Limit on a Gauss-Newton step of each component."""
 FINE_WINDOW_PX, FINE_SMOOTHING_PX, FINE_PRIOR_PX = 3.0, 1.0, 0.3
@@ -47,39 +50,50 @@ def registered(flow: Flow, image1: Images, image2: Images, config: RegistrationC
     """Corrects a flow; same shape, float32, without gradient. Each pair of a batch is treated on its own."""
     with torch.no_grad(), torch.autocast(flow.device.type, enabled=False):
         flow, first, image2 = flow.float(), image1.float(), image2.float()
-        second = SplineImage(image2)
+        second, half1, half2 = SplineImage(image2), halve(first), SplineImage(halve(image2))
+        coarse = config.model_copy(update={"background_px": config.background_px and config.background_px / 2})
         former = flow
         if config.after is not None:
             former = flow = registered(flow, first, image2, config.after)
         for window_px, smoothing_px in zip(config.windows_px, config.smoothing_px, strict=True):
             if config.propagation_px:
                 flow = propagated(flow, first, image2, window_px, config)
-            flow = _stage(flow, first, second, window_px, smoothing_px, config)
+            if window_px >= HALF_SIZE_PX:
+                found = 2 * _stage(halve(flow) / 2, half1, half2, window_px / 2, smoothing_px / 2, coarse)
+                flow = interpolator(flow, 2 * SPACING)(found)
+            else:
+                found = _stage(flow, first, second, window_px, smoothing_px, config)
+                flow = interpolator(flow, _spacing(window_px))(found)
         if config.background_px is not None:
-            last = gauss_newton(flow, first, second, config)
-            variance = posterior_variance(TWO_STEPS * last.variance, config.prior_px)
-            flow = _fitted(flow, variance, last.texture, first, second, config)
+            flow = _fitted(found, flow, first, second, config)
         if config.after is not None:
             flow = torch.lerp(former, flow, _unexplained(former, first, second, config.after.noise))
     return flow
 
 
-def _fitted(
-    flow: Flow, variance: Tensor, texture: Tensor, first: Images, second: SplineImage, config: RegistrationConfig
-) -> Flow:
-    """At each pixel, the flow of the window that fits it, from a flow that was found in the last stage's window.
+def _spacing(window_px: float) -> int:
+    """Px between the places at which a window of that deviation finds a flow."""
+    return SPACING if window_px >= SPACED_PX else 1
 
-    `variance` is that of its noise, and `texture` as of `gelflow.models.evidence.Step`.
+
+def _fitted(found: Flow, flow: Flow, first: Images, second: SplineImage, config: RegistrationConfig) -> Flow:
+    """At each pixel, the flow of the window that fits it.
+
+    The last stage found a flow at its places, which is `flow` at each pixel.
     """
-    windows = config.windows_px[-1], FINE_WINDOW_PX
-    best, _ = best_window(flow, variance, window_sums(flow, windows[0])(texture), windows[0])
-    if windows[0] <= FINE_WINDOW_PX:
-        return best
-    further = config.model_copy(update={"windows_px": (FINE_WINDOW_PX,), "prior_px": FINE_PRIOR_PX})
-    fine = _stage(flow, first, second, FINE_WINDOW_PX, FINE_SMOOTHING_PX, further)
-    noise = fine_noise(*windows)[1] * gauss_newton(fine, first, second, further).variance
-    bent = bends(flow, fine, posterior_variance(noise, FINE_PRIOR_PX), windows, FINE_PRIOR_PX)
-    return torch.where(bent, fine, best)
+    windows, background_px = (config.windows_px[-1], FINE_WINDOW_PX), config.background_px or 0.0
+    spacing = _spacing(windows[0])
+    last = step(evidence(flow, first, second.near, background_px), windows[0], spacing)
+    variance = posterior_variance(TWO_STEPS * last.variance, config.prior_px)
+    best, _ = best_window(found, variance, last.texture, windows[0], spacing)
+    to_pixels = interpolator(flow, spacing)
+    if windows[0] > FINE_WINDOW_PX:
+        further = config.model_copy(update={"prior_px": FINE_PRIOR_PX})
+        fine = _stage(flow, first, second, FINE_WINDOW_PX, FINE_SMOOTHING_PX, further)
+        there = step(evidence(to_pixels(fine), first, second.near, background_px), FINE_WINDOW_PX, spacing)
+        variance = posterior_variance(fine_noise(*windows)[1] * there.variance, FINE_PRIOR_PX)
+        best = torch.where(bends(found, fine, variance, windows, FINE_PRIOR_PX, spacing), fine, best)
+    return to_pixels(best)
 
 
 def posterior_variance(variance: Tensor, prior_px: float) -> Tensor:
@@ -90,14 +104,15 @@ def posterior_variance(variance: Tensor, prior_px: float) -> Tensor:
 def _stage(
     flow: Flow, first: Images, second: SplineImage, window_px: float, smoothing_px: float, config: RegistrationConfig
 ) -> Flow:
-    """Gauss-Newton steps in one window from the smoothed flow."""
-    window = window_sums(flow, window_px)
-    background = None if config.background_px is None else window_sums(flow, config.background_px)
-    start = flow = smoother(flow, smoothing_px)(flow)
+    """Gauss-Newton steps in one window from the smoothed flow; what they find at places as far apart as it allows."""
+    spacing = _spacing(window_px)
+    window, to_pixels = window_sums(flow, window_px, spacing), interpolator(flow, spacing)
+    start = found = smoother(flow, smoothing_px, spacing)(flow)
+    sample = second.near if spacing > 1 else second.at
     for _ in range(config.iterations):
-        step = _posterior(evidence(flow, first, second, background), flow - start, window, config)
-        flow = flow + step.clamp(-MAX_STEP_PX, MAX_STEP_PX)
-    return flow
+        sums = window(moments(to_pixels(found), first, sample, config.background_px))
+        found = found + _posterior(sums, found - start, config).clamp(-MAX_STEP_PX, MAX_STEP_PX)
+    return found
 
 
 def _unexplained(flow: Flow, first: Images, second: SplineImage, noise: float) -> Tensor:
@@ -112,15 +127,10 @@ def _unexplained(flow: Flow, first: Images, second: SplineImage, noise: float) -
     return edge(left) / edge(all_of_it)
 
 
-def _posterior(found: Evidence, so_far: Flow, window: SeparableFilter, config: RegistrationConfig) -> Flow:
-    """The Gauss-Newton step (B, 2, H, W): the solution of a system of two equations at each pixel."""
-    residual, across, down, counts = found
-    three = torch.stack([across, down, residual], dim=1)
-    products = torch.cat(
-        [across.unsqueeze(1) * three, down.unsqueeze(1) * three[:, 1:], residual.square().unsqueeze(1)], dim=1
-    )
-    xx, xy, xr, yy, yr, rr, pixels = window(torch.cat([products.sum(dim=2), counts], dim=1)).split(1, dim=1)
-    variance = rr / (residual.shape[1] * pixels).clamp(min=TINY) + config.noise**2
+def _posterior(sums: Tensor, so_far: Flow, config: RegistrationConfig) -> Flow:
+    """The Gauss-Newton step (B, 2, h, w) from `moments` in a window: the solution of two equations at each place."""
+    xx, xy, xr, yy, yr, rr, samples = sums.split(1, dim=1)
+    variance = rr / samples.clamp(min=TINY) + config.noise**2
     weight = variance / config.prior_px**2
     xx, yy = xx + weight, yy + weight
     u, v = (-torch.cat([xr, yr], dim=1) - weight * so_far).split(1, dim=1)

@@ -12,6 +12,8 @@ of P, and by the misfit s of P:
 A mark of the gel that stands still while all around it moves looks the same. A speck that covers a ring is not seen.
 """
 
+import math
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -19,12 +21,14 @@ from torch import Tensor
 from gelflow.arrays import Flow, Images
 from gelflow.models.evidence import TINY
 from gelflow.models.propagation import windowed_residual
-from gelflow.ops.gaussian import window_sums
+from gelflow.ops.gaussian import smoother, window_sums
 from gelflow.ops.pyramid import resize_images
 
 CELL_PX, RING_CELLS, INNER_PX, WIDTH_PX = 6, 6, 10.0, 18.0
 """The ring: side of the cells to which the flow is reduced, half its side, its inner radius, and the standard deviation
 of the Gaussian that weighs it."""
+STRIDE = 2
+"""Cells from one fit to the next, along each axis."""
 NEAR_CELLS = 2
 """How far specks draw the flow."""
 WINDOW_PX, MAX_RATIO = 2.0, 0.2
@@ -41,20 +45,22 @@ FLOOR_PX, REWEIGHTINGS = 0.1, 6
 
 def speck_error(flow: Flow, image1: Images, image2: Images, texture: Tensor) -> Tensor:
     """E in px^2 near specks, else 0; (B, 1, H, W). `texture` is as of `Step`, 0 where it does not tell the flow."""
-    window, none = window_sums(flow, WINDOW_PX), torch.zeros_like(flow)
+    window, none = window_sums(flow, WINDOW_PX, 2), torch.zeros_like(flow)
     still, left = (windowed_residual(each, image1, image2, window, True) for each in (none, flow))
     contrast = windowed_residual(none, image1, torch.zeros_like(image2), window, True)
     stands = (still < MAX_RATIO * contrast) & (contrast > MIN_CONTRAST**2) & (still < 2 * left + NOISE**2)
-    texture = texture.clamp(min=0)
-    motion, misfit = surroundings(flow, texture, torch.where(stands, DOUBT * texture, texture))
+    texture, size = texture.clamp(min=0), (flow.shape[-2], flow.shape[-1])
+    doubtful = F.interpolate(stands.float(), scale_factor=2.0)[..., : size[0], : size[1]] > 0
+    motion, misfit = surroundings(flow, texture, torch.where(doubtful, DOUBT * texture, texture))
     moved = windowed_residual(motion, image1, image2, window, True)
-    fast, drawn = (each.square().sum(dim=1, keepdim=True) for each in (motion, flow))
-    speck = stands & (fast > MIN_MOTION_PX**2 + MISFITS**2 * misfit) & (drawn < MAX_SHARE**2 * fast)
+    at_places = smoother(flow, 0.0, 2)
+    fast, drawn = (at_places(each).square().sum(dim=1, keepdim=True) for each in (motion, flow))
+    speck = stands & (fast > MIN_MOTION_PX**2 + MISFITS**2 * at_places(misfit)) & (drawn < MAX_SHARE**2 * fast)
     speck &= still < MAX_RATIO * moved
-    near = F.max_pool2d(speck.float(), CELL_PX, ceil_mode=True)
+    near = F.max_pool2d(speck.float(), CELL_PX // 2, ceil_mode=True)
     near = F.max_pool2d(near, 2 * NEAR_CELLS + 1, 1, NEAR_CELLS)
     error = (flow - motion).square().sum(dim=1, keepdim=True) + misfit
-    return resize_images(near, (flow.shape[-2], flow.shape[-1])) * error
+    return resize_images(near, size) * error
 
 
 def surroundings(flow: Flow, texture: Tensor, trusted: Tensor) -> tuple[Flow, Tensor]:
@@ -66,7 +72,7 @@ def surroundings(flow: Flow, texture: Tensor, trusted: Tensor) -> tuple[Flow, Te
     down, right = (step.flatten() for step in torch.meshgrid(steps, steps, indexing="ij"))
     square = down.square() + right.square()
     ring = torch.where(square > INNER_PX**2, torch.exp(-square / (2 * WIDTH_PX**2)), 0.0)
-    around = F.unfold(torch.cat([weight, cells[:, 2:]], dim=1), len(steps), padding=RING_CELLS)
+    around = F.unfold(torch.cat([weight, cells[:, 2:]], dim=1), len(steps), padding=RING_CELLS, stride=STRIDE)
     weight, flows = around.unflatten(1, (3, -1)).transpose(2, 3).split([1, 2], dim=1)  # (B, C, N, K)
     base = (weight + TINY) * ring
     design = torch.stack([torch.ones_like(down), right / WIDTH_PX, down / WIDTH_PX], dim=1)  # (K, 3)
@@ -79,6 +85,9 @@ def surroundings(flow: Flow, texture: Tensor, trusted: Tensor) -> tuple[Flow, Te
         apart = (flows - found @ design.T).square().sum(dim=1, keepdim=True)
         misfit = (weights * apart).sum(dim=3, keepdim=True) / total + FLOOR_PX**2
         weights = base / (1 + apart / misfit)
-    maps = torch.cat([found[..., 0], misfit[..., 0]], dim=1).unflatten(2, cells.shape[-2:])
+    # In the middle of STRIDE x STRIDE cells, of which the first has been fitted.
+    middle = found[..., 0] + CELL_PX * (STRIDE - 1) / 2 / WIDTH_PX * found[..., 1:].sum(dim=3)
+    grid = [math.ceil(side / STRIDE) for side in cells.shape[-2:]]
+    maps = torch.cat([middle, misfit[..., 0]], dim=1).unflatten(2, grid)
     motion, misfit = resize_images(maps, (height, width)).split([2, 1], dim=1)
     return motion, misfit

@@ -18,12 +18,13 @@ leaves no trace in the images, such as dots taken for the next ones, is not seen
 import math
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from gelflow.arrays import Features, Flow, Images
 from gelflow.config import RegistrationConfig
-from gelflow.models.evidence import TINY, gauss_newton
-from gelflow.models.registration import FINE_SMOOTHING_PX, FINE_WINDOW_PX, MAX_STEP_PX
+from gelflow.models.evidence import TINY, evidence, step
+from gelflow.models.registration import FINE_WINDOW_PX, MAX_STEP_PX, SPACING
 from gelflow.models.specks import speck_error
 from gelflow.models.wider_window import MIN_VARIANCE, TWO_STEPS, best_window, fine_noise
 from gelflow.ops.gaussian import SeparableFilter, smoother, window_sums
@@ -39,7 +40,6 @@ CERTAIN_PX, UNKNOWN_PX, MAX_SIGMA_PX = 0.1, 1.0, 10.0
 RADIUS = math.sqrt(-2 * math.log(1 - 0.68))
 """Radius that holds 68 % of a normal distribution in the plane whose components have a standard deviation of 1."""
 _MOTION = RegistrationConfig()
-_FINER = RegistrationConfig(windows_px=(FINE_WINDOW_PX,), smoothing_px=(FINE_SMOOTHING_PX,))
 
 
 def flow_sigma(flow: Flow, image1: Images, image2: Images) -> tuple[Tensor, Tensor]:
@@ -61,26 +61,34 @@ def flow_sigma(flow: Flow, image1: Images, image2: Images) -> tuple[Tensor, Tens
 
 def error_squares(flow: Flow, image1: Images, image2: Images) -> tuple[Tensor, Tensor]:
     """The squares e + |V - V*|^2 and (m |V''|)^2, both (B, 1, H, W) px^2; CURVATURE decides whose e and m count."""
-    second, narrow_px = SplineImage(image2), _MOTION.windows_px[-1]
-    found, finer = (gauss_newton(flow, image1, second, config) for config in (_MOTION, _FINER))
-    window, fine, wide = (window_sums(flow, width) for width in (narrow_px, FINE_WINDOW_PX, _MOTION.windows_px[0]))
-    texture, variance = window(found.texture), (TWO_STEPS * found.variance).clamp(min=MIN_VARIANCE)
-    narrow = flow + found.step.clamp(-MAX_STEP_PX, MAX_STEP_PX)
-    best, least = best_window(narrow, variance, texture, narrow_px)
-    known, missed = variance < UNKNOWN_PX**2, (flow - best).square().sum(dim=1, keepdim=True)
+    narrow_px = _MOTION.windows_px[-1]
+    seen = evidence(flow, image1, SplineImage(image2).at, _MOTION.background_px or 0.0)
+    found, finer = (step(seen, width, SPACING) for width in (narrow_px, FINE_WINDOW_PX))
+    window, fine = (window_sums(flow, width, SPACING) for width in (narrow_px, FINE_WINDOW_PX))
+    gradient = seen[:, :1] + seen[:, 2:3]
+    variance = (TWO_STEPS * found.variance).clamp(min=MIN_VARIANCE)
+    given = smoother(flow, 0.0, SPACING)(flow)
+    narrow = given + found.step.clamp(-MAX_STEP_PX, MAX_STEP_PX)
+    best, least = best_window(narrow, variance, found.texture, narrow_px, SPACING)
+    known, missed = variance < UNKNOWN_PX**2, (given - best).square().sum(dim=1, keepdim=True)
     error = torch.where(known, least, variance)
-    moment = torch.where(known, second_moment(window, found.texture) / texture, 0.0)
-    bend = curvature_square(flow)
+    moment = torch.where(known, second_moment(window, gradient) / found.texture, 0.0)
+    bend = curvature_square(given, SPACING)
     # The further stage's window, where it errs by less: usually where the flow bends.
     fine_error = (fine_noise(narrow_px, FINE_WINDOW_PX)[1] * finer.variance).clamp(min=MIN_VARIANCE)
-    fine_moment = second_moment(fine, finer.texture) / fine(finer.texture)
+    fine_moment = second_moment(fine, gradient) / finer.texture
     narrowed = fine_error + (CURVATURE * fine_moment).square() * bend < error + (CURVATURE * moment).square() * bend
     narrowed &= known
     error = torch.where(narrowed, fine_error, error) + missed
     moment = torch.where(narrowed, fine_moment, moment)
-    error, moment = between_marks(error, moment, variance, wide)
-    textured = torch.where(known, found.texture, 0.0)
-    return error + speck_error(flow, image1, image2, textured), moment.square() * bend
+    # Its windows see places, not px.
+    wide = window_sums(error, _MOTION.windows_px[0] / SPACING)
+    error, moment = between_marks(error, moment / SPACING**2, variance, wide)
+    moment = SPACING**2 * moment
+    maps = torch.cat([error, moment.square() * bend, known.to(error.dtype)], dim=1)
+    maps = F.interpolate(maps, scale_factor=float(SPACING), mode="bilinear")[..., : flow.shape[-2], : flow.shape[-1]]
+    error, curvature, known = maps.split(1, dim=1)
+    return error + speck_error(flow, image1, image2, known * gradient), curvature
 
 
 def combined(error: Tensor, curvature: Tensor, factor: float) -> Tensor:
@@ -101,8 +109,10 @@ def between_marks(error: Tensor, moment: Tensor, variance: Tensor, wide: Separab
 
 def second_moment(window: SeparableFilter, field: Features) -> Features:
     """The sum of w(y - x) |y - x|^2 f(y)."""
+    spacing = math.ceil(field.shape[-2] / len(window.down))
     x, y = pixel_indices(field)
-    down, across = (m * (p.view(-1, 1) - p).square() for m, p in zip(window, (y[:, 0], x[0]), strict=True))
+    squares = (((spacing - 1) / 2 + p[::spacing].view(-1, 1) - p).square() for p in (y[:, 0], x[0]))
+    down, across = (matrix * square for matrix, square in zip(window, squares, strict=True))
     return SeparableFilter(down, window.across)(field) + SeparableFilter(window.down, across)(field)
 
 

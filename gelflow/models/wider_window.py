@@ -57,14 +57,17 @@ def best_window(flow: Flow, variance: Tensor, texture: Tensor, window_px: float,
     return best, error
 
 
-def bends(flow: Flow, fine: Flow, variance: Tensor, windows_px: tuple[float, float], reach_px: float) -> Tensor:
+def bends(
+    flow: Flow, fine: Flow, variance: Tensor, windows_px: tuple[float, float], reach_px: float, pixel: int = 1
+) -> Tensor:
     """Where two more steps in a narrower window improved a flow; bool, (B, 1, H, W).
 
     `fine` is the flow after them, `variance` that of its noise, `windows_px` the deviations of both windows. False
-    where the flows differ by more than `reach_px` (root mean square): there the steps have lost the pattern.
+    where the flows differ by more than `reach_px` (root mean square): there the steps have lost the pattern. All are
+    known at every `pixel`-th px along each axis.
     """
     apart = (fine - flow).square().sum(dim=1, keepdim=True)
-    window, alike = window_sums(flow, BEND_WINDOW_PX), torch.ones_like(apart)
+    window, alike = window_sums(flow, BEND_WINDOW_PX / pixel), torch.ones_like(apart)
     risk = _mean(apart / variance.clamp(min=MIN_VARIANCE), alike, window) + 2 * fine_noise(*windows_px)[0] - 1
     return (risk >= 1) & (_mean(apart, alike, window) <= reach_px**2)
 

@@ -13,26 +13,27 @@ from torch.autograd.function import once_differentiable
 
 from gelflow.arrays import Features
 
+MANY_CHANNELS = 100
+"""Pixels for each channel below which blocks are faster than channels."""
+ROWS, BLOCK = 30, 20
+"""Rows of a strip, and columns of a block."""
+
 
 class _LocalCorrelation(torch.autograd.Function):
-    """Displacement by displacement through one buffer; autograd itself would hold all (2 r + 1)^2 products."""
+    """Through small buffers; autograd itself would hold all (2 r + 1)^2 products."""
 
     @staticmethod
     def forward(ctx: Any, first: Tensor, second: Tensor, radius: int) -> Tensor:
         ctx.save_for_backward(first, second)
         ctx.radius = radius
-        batch, _, height, width = first.shape
-        padded = F.pad(second, (radius,) * 4)
-        if first.is_cuda:  # three launches in place of two for each displacement, and memory for all products
+        channels, height, width = first.shape[1:]
+        if first.is_cuda:  # three launches, and memory for all products
             side = 2 * radius + 1
-            windows = padded.unfold(2, side, 1).unfold(3, side, 1)
+            windows = F.pad(second, (radius,) * 4).unfold(2, side, 1).unfold(3, side, 1)
             return (first[..., None, None] * windows).mean(dim=1).flatten(3).permute(0, 3, 1, 2).contiguous()
-        product = torch.empty_like(first)
-        costs = first.new_empty(batch, (2 * radius + 1) ** 2, height, width)
-        for channel, (rows, columns) in enumerate(_windows(height, width, radius)):
-            torch.mul(first, padded[:, :, rows, columns], out=product)
-            torch.mean(product, dim=1, out=costs[:, channel])
-        return costs
+        if MANY_CHANNELS * channels < height * width:
+            return _by_channels(first, second, radius)
+        return _by_blocks(first, second, radius)
 
     @staticmethod
     @once_differentiable
@@ -64,6 +65,37 @@ def local_correlation(first: Features, second: Features, radius: int) -> Tensor:
         return _unfolded(first, second, radius)
     costs: Tensor = _LocalCorrelation.apply(first.contiguous(), second.contiguous(), radius)
     return costs
+
+
+def _by_channels(first: Tensor, second: Tensor, radius: int) -> Tensor:
+    """Channel by channel, in strips of rows that stay in a processor's cache."""
+    batch, channels, height, width = first.shape
+    side = 2 * radius + 1
+    costs = first.new_zeros(batch, side, side, height, width)
+    windows = F.pad(second, (radius,) * 4).unfold(2, height, 1).unfold(3, width, 1)
+    for top in range(0, height, ROWS):
+        rows = slice(top, top + ROWS)
+        for channel in range(channels):
+            costs[..., rows, :].addcmul_(first[:, channel, None, None, rows], windows[:, channel, ..., rows, :])
+    return costs.div_(channels).flatten(1, 2)
+
+
+def _by_blocks(first: Tensor, second: Tensor, radius: int) -> Tensor:
+    """Blocks of pixels of a row against a row of the other image, as matrices."""
+    batch, channels, height, width = first.shape
+    side, blocks, reach = 2 * radius + 1, -(-width // BLOCK), BLOCK + 2 * radius
+    beyond = blocks * BLOCK - width
+    here = F.pad(first / channels, (0, beyond)).permute(0, 2, 3, 1).reshape(-1, BLOCK, channels)
+    there = F.pad(second, (radius, radius + beyond, radius, radius)).unfold(3, reach, BLOCK)
+    there = there.permute(0, 2, 3, 1, 4).contiguous()
+    costs = first.new_empty(batch, side, side, height, blocks * BLOCK)
+    for row in range(side):
+        with torch.autocast("cpu", enabled=False):
+            products = here @ there[:, row : row + height].reshape(-1, channels, reach)
+        # Each pixel's own 2 r + 1 of the block's products lie one further than those of the pixel before.
+        own = products.as_strided((len(products), side, BLOCK), (BLOCK * reach, 1, reach + 1))
+        costs[:, row] = own.view(batch, height, blocks, side, BLOCK).permute(0, 3, 1, 2, 4).flatten(3)
+    return costs[..., :width].flatten(1, 2)
 
 
 def _unfolded(first: Tensor, second: Tensor, radius: int) -> Tensor:

@@ -1,6 +1,8 @@
 """Gaussian windows over images, as one dense matrix for each axis: ``G_y F G_x^T`` for a field F (B, C, H, W).
 
 Windows end at three standard deviations. On a processor the matrices are faster than the same windows as convolutions.
+What a wide window leaves is as well known at every second pixel: with a `spacing` s, windows lie around the places
+``s i + (s - 1) / 2`` alone, ceil(H / s) and ceil(W / s) of them, and `interpolator` leads back to each pixel.
 """
 
 import math
@@ -20,54 +22,78 @@ class SeparableFilter(NamedTuple):
     across: Tensor
 
     def __call__(self, field: Features) -> Features:
-        """Filters each channel of (B, C, H, W); same shape."""
+        """Filters each channel of (B, C, H, W)."""
         return self.down @ field @ self.across.T
 
 
-def window_sums(like: Tensor, deviation: float) -> SeparableFilter:
-    """Sums under a Gaussian of height one around each pixel; nothing is added where the window leaves the image.
+def window_sums(like: Tensor, deviation: float, spacing: int = 1) -> SeparableFilter:
+    """Sums under a Gaussian of height one around each place; nothing is added where the window leaves the image.
 
     `like` is a (..., H, W) with the fields' sides, dtype and device; `deviation` is the standard deviation in px.
     """
-    return SeparableFilter(*(_sums(pixels, deviation, like.dtype, like.device) for pixels in like.shape[-2:]))
+    return SeparableFilter(*(_sums(pixels, deviation, spacing, like.dtype, like.device) for pixels in like.shape[-2:]))
 
 
-def smoother(like: Tensor, deviation: float) -> SeparableFilter:
-    """Means under a Gaussian around each pixel; arguments as for `window_sums`, a deviation of 0 changes nothing.
+def smoother(like: Tensor, deviation: float, spacing: int = 1) -> SeparableFilter:
+    """Means under a Gaussian around each place; arguments as for `window_sums`, a deviation of 0 changes nothing.
 
     Beyond the border fields go on turned about their border's pixel, so that affine fields stay as they are up to the
     border; under a mean over what lies inside, the border of a rotation or an enlargement would follow the inside.
     """
-    return SeparableFilter(*(_mean(pixels, deviation, like.dtype, like.device) for pixels in like.shape[-2:]))
+    return SeparableFilter(*(_mean(pixels, deviation, spacing, like.dtype, like.device) for pixels in like.shape[-2:]))
+
+
+def interpolator(like: Tensor, spacing: int) -> SeparableFilter:
+    """From places at a spacing to each pixel of a (..., H, W), by Keys' cubic convolution, turned beyond the border."""
+    return SeparableFilter(*(_cubic(pixels, spacing, like.dtype, like.device) for pixels in like.shape[-2:]))
 
 
 @cached
-def _sums(pixels: int, deviation: float, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Matrix (n, n) of the sums along one axis."""
-    return _window(pixels, 0, deviation, math.ceil(3 * deviation), device).to(dtype)
+def _sums(pixels: int, deviation: float, spacing: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Matrix (n / s, n) of the sums along one axis."""
+    distance = _distances(pixels, spacing, 0, device)
+    return _gaussian(distance, deviation, math.ceil(3 * deviation)).to(dtype)
 
 
 @cached
-def _mean(pixels: int, deviation: float, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """Matrix (n, n) of the mean along one axis."""
+def _mean(pixels: int, deviation: float, spacing: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Matrix (n / s, n) of the mean along one axis."""
+    deviation = max(deviation, (spacing - 1) / 2)  # no less than a place stands for
     if deviation == 0:
         return torch.eye(pixels, dtype=dtype, device=device)
     beyond = min(math.ceil(3 * deviation), pixels - 1)
-    weight = _window(pixels, beyond, deviation, beyond, device)
-    before, matrix, after = (weight / weight.sum(dim=1, keepdim=True)).split([beyond, pixels, beyond], dim=1)
-    # F(-k) = 2 F(0) - F(k), and the same at the other end.
+    weight = _gaussian(_distances(pixels, spacing, beyond, device), deviation, beyond)
+    return _turned(weight / weight.sum(dim=1, keepdim=True), beyond).to(dtype)
+
+
+@cached
+def _cubic(pixels: int, spacing: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Matrix (n, n / s) of the interpolation along one axis."""
+    places = math.ceil(pixels / spacing)
+    nodes = spacing * torch.arange(-2, places + 2, dtype=torch.float64, device=device) + (spacing - 1) / 2
+    pixel = torch.arange(pixels, dtype=torch.float64, device=device)
+    x = (pixel.view(-1, 1) - nodes).abs() / spacing
+    near, far = (1.5 * x - 2.5) * x.square() + 1, ((-0.5 * x + 2.5) * x - 4) * x + 2
+    return _turned(torch.where(x < 1, near, torch.where(x < 2, far, 0.0)), 2).to(dtype)
+
+
+def _distances(pixels: int, spacing: int, beyond: int, device: torch.device) -> Tensor:
+    """Of places at a spacing and pixels up to `beyond` outside, (n / s, n + 2 beyond) px, float64."""
+    places = spacing * torch.arange(math.ceil(pixels / spacing), dtype=torch.float64, device=device) + (spacing - 1) / 2
+    return (places.view(-1, 1) - torch.arange(-beyond, pixels + beyond, dtype=torch.float64, device=device)).abs()
+
+
+def _gaussian(distance: Tensor, deviation: float, reach: int) -> Tensor:
+    """exp(-d² / 2 s²) of distances, zero beyond `reach`."""
+    return torch.where(distance <= reach, torch.exp(-distance.square() / (2 * deviation**2)), 0.0)
+
+
+def _turned(weight: Tensor, beyond: int) -> Tensor:
+    """A matrix without its `beyond` columns at each end: F(-k) = 2 F(0) - F(k), and the same at the other end."""
+    before, matrix, after = weight.split([beyond, weight.shape[1] - 2 * beyond, beyond], dim=1)
     matrix = matrix.clone()
     matrix[:, 0] += 2 * before.sum(dim=1)
     matrix[:, -1] += 2 * after.sum(dim=1)
     matrix[:, 1 : beyond + 1] -= before.flip(1)
     matrix[:, -beyond - 1 : -1] -= after.flip(1)
-    return matrix.to(dtype)
-
-
-def _window(pixels: int, beyond: int, deviation: float, reach: int, device: torch.device) -> Tensor:
-    """exp(-d² / 2 s²) of the distance d of pixels and positions up to `beyond` outside, (n, n + 2 beyond), float64."""
-    place = torch.arange(-beyond, pixels + beyond, device=device)
-    distance = place[beyond : beyond + pixels].view(-1, 1) - place.view(1, -1)
-    weight = torch.exp(-torch.arange(pixels + 2 * beyond, device=device).double().square() / (2 * deviation**2))
-    weight[reach + 1 :] = 0.0
-    return weight[distance.abs()]
+    return matrix

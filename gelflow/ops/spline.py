@@ -9,7 +9,9 @@ Unser, "Splines: a perfect fit for signal and image processing", 1999; the value
 Hadwiger, "Fast third-order texture filtering", GPU Gems 2, 2005.
 """
 
+import functools
 import math
+from collections.abc import Callable
 
 import torch
 import torch.nn.functional as F
@@ -23,20 +25,32 @@ MARGIN = 2
 POLE = math.sqrt(3) - 2
 """Pole of the filter from samples to coefficients, whose response to one pixel is sqrt(3) POLE^|distance|."""
 
+NOTHING = 1e-20
+"""Responses of the filter that count as zero."""
+
 
 class SplineImage:
     """An image that can be sampled anywhere.
 
-    Its sides are at least 3 px long.
+    Its sides are at least 3 px long. `at` is exact. `near` takes a tenth of the time: it reads bilinearly between the
+    spline's values at the centres of the four quarters of each pixel, which dampens a pattern without moving it.
     """
 
     def __init__(self, image: Features) -> None:
-        height, width = image.shape[-2:]
-        with torch.autocast(image.device.type, enabled=False):  # bfloat16 keeps three digits
-            rows, columns = (_prefilter(pixels, image.dtype, image.device) for pixels in (height, width))
-            coefficients = rows @ image @ columns.T
-        self._coefficients = F.pad(coefficients, (MARGIN,) * 4, mode="reflect")
-        self._size = (height, width)
+        self._image, self._size = image, (image.shape[-2], image.shape[-1])
+
+    @functools.cached_property
+    def _coefficients(self) -> Features:
+        return F.pad(self._along_axes(_prefilter), (MARGIN,) * 4, mode="reflect")
+
+    @functools.cached_property
+    def _quarters(self) -> Features:
+        return self._along_axes(_to_quarters)
+
+    def _along_axes(self, matrix: Callable[[int, torch.dtype, torch.device], Tensor]) -> Features:
+        down, across = (matrix(pixels, self._image.dtype, self._image.device) for pixels in self._size)
+        with torch.autocast(self._image.device.type, enabled=False):  # bfloat16 keeps three digits
+            return down @ self._image @ across.T
 
     def at(self, places: Tensor) -> Features:
         """The image (B, C, H', W') at places in it; outside, the nearest value of its border.
@@ -49,6 +63,15 @@ class SplineImage:
         shares = weights[:, :, 1].unsqueeze(2) * weights[:, :, 0].unsqueeze(1)
         sampled = self._bilinear(taps[:, :, 0], taps[:, :, 1])
         return (sampled * shares.flatten(1, 2).unsqueeze(1)).sum(dim=2)
+
+    def near(self, places: Tensor) -> Features:
+        """Nearly the same."""
+        height, width = self._size
+        x, y = places[:, 0] * (2 / width) + (1 / width - 1), places[:, 1] * (2 / height) + (1 / height - 1)
+        sampled: Tensor = F.grid_sample(
+            self._quarters, torch.stack([x, y], dim=-1), padding_mode="border", align_corners=False
+        )
+        return sampled
 
     def _bilinear(self, x: Tensor, y: Tensor) -> Features:
         """At all pairs of two x and two y of each place, both (B, 2, H', W'): (B, C, 4, H', W'), y by y."""
@@ -74,11 +97,23 @@ def _prefilter(pixels: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     period = 2 * pixels - 2
     distance = torch.arange(period + 1, dtype=torch.float64, device=device)
     response = math.sqrt(3) * (POLE**distance + POLE ** (period - distance)) / (1 - POLE**period)
+    # In float32 they would become denormal numbers, with which a processor takes twenty times as long.
+    response[response.abs() < NOTHING] = 0.0
     place = torch.arange(pixels, device=device)
     direct = response[(place.view(-1, 1) - place).abs()]
     mirrored = response[place.view(-1, 1) + place]
     mirrored = torch.where((place == 0) | (place == pixels - 1), 0.0, mirrored)
     return (direct + mirrored).to(dtype)
+
+
+@cached
+def _to_quarters(pixels: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """Matrix (2 n, n) from samples to the values of the spline a quarter of a pixel before and after each."""
+    coefficients = _prefilter(pixels, torch.float64, device)
+    coefficients = F.pad(coefficients.T[None], (MARGIN, MARGIN), mode="reflect")[0].T
+    near = coefficients.unfold(0, 4, 1)  # (n + 1, n, 4), the first of them before the first pixel
+    weights = torch.tensor([1, 121, 235, 27], dtype=torch.float64, device=device) / 384  # at 7, 3, 1 and 5 quarters
+    return torch.stack([near[:-1] @ weights, near[1:] @ weights.flip(0)], dim=1).flatten(0, 1).to(dtype)
 
 
 def _linear_taps(places: Tensor) -> tuple[Tensor, Tensor]:
