@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from synth.dataset.reader import SampleData, read_dataset
+from synth.dataset.reader import read_dataset
+from synth.dataset.sample_reader import SampleData
 from synth.inspect.panels import flow_colours, image_picture, robust_scale
 
 
