@@ -66,9 +66,9 @@ def _clip_pairs(name: str, clip: Path, frames: int, apart: int | None, has_previ
     for first, second in pairs:
         direction: Direction = "previous" if first else "forward"
         known = first == 0 or (apart == 1 and has_previous)
-        images = (clip / "frames" / f"{frame:06d}.png" for frame in (first, second))
+        image1, image2 = (clip / "frames" / f"{frame:06d}.png" for frame in (first, second))
         flow = clip / "flow" / f"{second:06d}.exr" if known else None
-        records.append(PairRecord(f"{name}-{first:06d}-{second:06d}", *images, flow, direction=direction))
+        records.append(PairRecord(f"{name}-{first:06d}-{second:06d}", image1, image2, flow, direction=direction))
     return records
 
 

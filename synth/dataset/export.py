@@ -182,7 +182,10 @@ def _write_kitti(out: Path, name: str, source: Path, sample: SampleData) -> None
 
 
 def _write_npz(out: Path, name: str, source: Path, sample: SampleData) -> None:
-    _put(out / f"{name}.npz", encode_npz({"image1": sample.image1, "image2": sample.image2, **_arrays(sample)}))
+    _put(
+        out / f"{name}.npz",
+        encode_npz({**dict(zip(("image1", "image2"), sample.images, strict=True)), **_arrays(sample)}),
+    )
 
 
 def _append_to_shard(shard: Path, name: str, source: Path, sample: SampleData) -> None:

@@ -96,7 +96,7 @@ class CameraFrames:
     size: tuple[int, int]
     images: tuple[Raster, ...]
     flows: Iterable[FlowField]
-    markers: FloatArray | None = None
+    markers: FloatArray = field(default_factory=lambda: np.zeros((0, 7)))
 
 
 @dataclass(frozen=True)

@@ -59,8 +59,7 @@ def _write_folder(final: Path, sample: Sample, job: Job, layout: Layout) -> Mani
                     write_flow(path, flow, _attributes(sample, job, camera, shown))
                     motions += [largest_motion(flow)] if not camera else []
                 if layout.is_of_clips:
-                    rows = [] if seen.markers is None else seen.markers
-                    (partial / camera / MARKERS_FILE).write_bytes(encode_table(MARKERS, rows))
+                    (partial / camera / MARKERS_FILE).write_bytes(encode_table(MARKERS, seen.markers))
             if layout.is_of_clips:
                 rate = sample.scene.sampling.frames_per_second
                 rows = states_of(sample.diagnostics["solver"], sample.force_n, sample.torque_nmm, rate)

@@ -188,8 +188,8 @@ class ClipData:
         if first == 0:
             seen = read_pair(self.folder / self.camera, self._layout, second)
         else:
-            images = [self.images[frame] for frame in frames] if self._layout.has_images else [None, None]
-            seen = CameraPair(*images, self._flow_between(*moved))
+            image1, image2 = (self.images[frame] if self.images else None for frame in frames)
+            seen = CameraPair(image1, image2, self._flow_between(*moved))
         return SampleData(**vars(seen), surface=self.surface, displacement1=moved[0], displacement2=moved[1], meta=meta)
 
     def _flow_between(self, first: FloatArray, second: FloatArray) -> FlowField:

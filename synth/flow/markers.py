@@ -25,6 +25,8 @@ def tracks(view: View, flattened: Pixels, dots: Pixels, states: Sequence[Points]
         (tracks * states, 7) rows of number, state, x, y, u, v (px, u and v since the first state), and whether it is
         seen, 1 or 0, of the dots that are seen in some state. NaN beyond the lens model's field.
     """
+    if not len(dots):
+        return np.zeros((0, 7))
     flat, ahead = np.column_stack([flattened, np.zeros(len(flattened))]), np.array([0.0, 0.0, 1.0])
     origins = np.column_stack([dots, -np.ones(len(dots))])
     hits = trace(flat, view.surface.triangles, origins, np.tile(ahead, (len(dots), 1)))

@@ -112,20 +112,19 @@ def _sample(
             patches.append(ContactPatch.of(simulated.faces, nodal, simulated.path, number, deepest))
             summary["contact_area_mm2"] = patches[-1].area_mm2
     frames = [rendered.frames[frame] for frame in shown.frames]
-    dots = dots_of(scene.sensor, context.stream("pattern", shown.sensor)) if is_clip else None
+    dots = dots_of(scene.sensor, context.stream("pattern", shown.sensor)) if is_clip else np.zeros((0, 2))
     flattened = chart_of(scene.sensor).flattened(rendered.surface.material)
     cameras = {}
     for k, (name, sensor) in enumerate(scene.sensor.views.items()):
         own = (k,) if k else ()  # of each further camera's noise
         numbered = enumerate(frames) if outputs.images else ()
-        flows, markers = _flows(outputs, views[name], frames, states, patches, tracing), None
+        flows = _flows(outputs, views[name], frames, states, patches, tracing)
         with tracing:
             images = tuple(
                 expose(context, sensor.camera, frame.radiance[name], (shown.index, number, *own))
                 for number, frame in numbered
             )
-            if dots is not None:
-                markers = tracks(views[name], flattened, dots, [frame.positions for frame in frames])
+            markers = tracks(views[name], flattened, dots, [frame.positions for frame in frames])
         cameras[name] = CameraFrames((sensor.camera.height, sensor.camera.width), images, flows, markers)
     return Sample(
         index=shown.index,
